@@ -1,0 +1,55 @@
+"""
+foveasim: what an image sensor of polygon photosites would see.
+
+A scene goes through a lens to a power map; the map is integrated exactly over every photosite; photons become
+electrons, electrons get noise, volts become codes::
+
+    import foveasim as fs
+
+    layout = fs.layout.log_polar(n_sectors=128, min_size_um=2.0, r_max_um=600.0)
+    camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=fs.Sensor(layout))
+    capture = camera.capture(scene, exposure_s=1 / 30, seed=0)
+"""
+
+from __future__ import annotations
+
+from foveasim import errors, layout, optics, reconstruct, scene, sensor, units
+from foveasim._version import __version__
+from foveasim.camera import Camera
+from foveasim.capture import Capture
+from foveasim.errors import FoveasimError
+from foveasim.fields import Grid, PowerMap
+from foveasim.integrate import Integrator
+from foveasim.layout import DesignRules, Layout
+from foveasim.optics import Optics
+from foveasim.reconstruct import Picture
+from foveasim.scene import Scene
+from foveasim.sensor import FilterSet, GaussianCurve, PolynomialCurve, Sensor, SiliconQE, rgb_filters
+
+__all__ = [
+    "Camera",
+    "Capture",
+    "DesignRules",
+    "FilterSet",
+    "FoveasimError",
+    "GaussianCurve",
+    "Grid",
+    "Integrator",
+    "Layout",
+    "Optics",
+    "Picture",
+    "PolynomialCurve",
+    "PowerMap",
+    "Scene",
+    "Sensor",
+    "SiliconQE",
+    "__version__",
+    "errors",
+    "layout",
+    "optics",
+    "reconstruct",
+    "rgb_filters",
+    "scene",
+    "sensor",
+    "units",
+]

@@ -1,0 +1,168 @@
+"""Array types, and the shared checks that every value passes once, where it enters the package."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim.errors import ParameterError
+
+__all__ = [
+    "Bools",
+    "Floats",
+    "Images",
+    "Ints",
+    "check_choice",
+    "check_count",
+    "check_number",
+    "finite_array",
+    "read_only",
+    "unit_of",
+]
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+#: Pictures and maps: (n_band, n_y, n_x), float32 unless float64 was asked for.
+Images = NDArray[np.floating[Any]]
+
+_Array = TypeVar("_Array", bound=NDArray[Any])
+
+#: Suffixes of names, longest first, and the unit that each stands for in messages.
+UNIT_SUFFIXES = {
+    "_w_m2_sr_nm": "W/(m² sr nm)",
+    "_w_m2_sr": "W/(m² sr)",
+    "_e_per_s": "e-/s",
+    "_e_per_j": "e-/J",
+    "_j_per_k": "J/K",
+    "_m_per_s": "m/s",
+    "_e_per_dn": "e-/DN",
+    "_w_m2_um2": "(W/m²)·µm²",
+    "_w_m2": "W/m²",
+    "_w_sr": "W/sr",
+    "_j_s": "J s",
+    "_um2": "µm²",
+    "_um": "µm",
+    "_mm": "mm",
+    "_nm": "nm",
+    "_rad": "rad",
+    "_deg": "degrees",
+    "_dn": "DN",
+    "_m": "m",
+    "_s": "s",
+    "_k": "K",
+    "_f": "F",
+    "_v": "V",
+    "_e": "e-",
+    "_j": "J",
+    "_c": "C",
+    "_w": "W",
+}
+
+
+def unit_of(name: str) -> str:
+    """Unit that a name carries, ``""`` for a dimensionless one."""
+    return next((unit for suffix, unit in UNIT_SUFFIXES.items() if name.lower().endswith(suffix)), "")
+
+
+def check_number(
+    name: str,
+    value: object,
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    at_most: float | None = None,
+    cure: str = "",
+) -> float:
+    """
+    The value as a finite float within its bounds.
+
+    Raises
+    ------
+    ParameterError
+        When it is no number, not finite, or out of bounds.
+    """
+    if value is None or isinstance(value, bool | str | bytes) or np.ndim(value) != 0:  # type: ignore[arg-type]
+        raise ParameterError(name, "must be one number", value, cure=cure)
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise ParameterError(name, "must be one number", value, cure=cure) from None
+    unit = unit_of(name)
+    if not np.isfinite(number):
+        raise ParameterError(name, "must be finite", number, unit, cure)
+    if above is not None and not number > above:
+        raise ParameterError(name, f"must be > {above:g}", number, unit, cure)
+    if at_least is not None and not number >= at_least:
+        raise ParameterError(name, f"must be >= {at_least:g}", number, unit, cure)
+    if at_most is not None and not number <= at_most:
+        raise ParameterError(name, f"must be <= {at_most:g}", number, unit, cure)
+    return number
+
+
+def check_count(name: str, value: object, *, at_least: int = 1, at_most: int | None = None, cure: str = "") -> int:
+    """
+    The value as an integer within its bounds.
+
+    Raises
+    ------
+    ParameterError
+        When it is no whole number, or out of bounds.
+    """
+    number = check_number(name, value, at_least=at_least, at_most=at_most, cure=cure)
+    if number != int(number):
+        raise ParameterError(name, "must be a whole number", number, cure=cure)
+    return int(number)
+
+
+def check_choice(name: str, value: object, choices: Collection[str]) -> str:
+    """
+    The value, when it is one of the choices.
+
+    Raises
+    ------
+    ParameterError
+        When it is none of them; the message names them all.
+    """
+    if not isinstance(value, str) or value not in choices:
+        raise ParameterError(name, f"must be one of {', '.join(repr(c) for c in choices)}", value)
+    return value
+
+
+def finite_array(
+    name: str, value: ArrayLike, *, ndim: int | None = None, at_least: float | None = None, above: float | None = None
+) -> Floats:
+    """
+    The value as a float64 array of finite numbers.
+
+    Raises
+    ------
+    ParameterError
+        When it is not numeric, has another number of dimensions, or a value that is not finite or out of bounds;
+        the message gives the first such value's position.
+    """
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ParameterError(name, "must be an array of numbers", value) from None
+    if ndim is not None and array.ndim != ndim:
+        raise ParameterError(name, f"must have {ndim} dimension{'s' * (ndim != 1)}, got the shape {array.shape}")
+    for is_bad, rule in (
+        (~np.isfinite(array), "must be finite"),
+        (array < at_least if at_least is not None else None, f"must be >= {at_least}"),
+        (array <= above if above is not None else None, f"must be > {above}"),
+    ):
+        if is_bad is not None and np.any(is_bad):
+            where = tuple(int(i) for i in np.argwhere(is_bad)[0])
+            place = f" at [{', '.join(map(str, where))}]" if where else ""
+            raise ParameterError(name, f"{rule} everywhere", float(array[where]), unit_of(name) + place)
+    return array
+
+
+def read_only(array: _Array) -> _Array:
+    """The same array, no longer writeable."""
+    array.flags.writeable = False
+    return array

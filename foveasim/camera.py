@@ -1,0 +1,215 @@
+"""
+The camera: a lens and a sensor, joined.
+
+The only place that knows the order of the stages, and that makes random streams.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from foveasim.arrays import Floats
+from foveasim.capture import Capture
+from foveasim.errors import ParameterError, SimulationError
+from foveasim.fields import Grid, PowerMap
+from foveasim.integrate import Integrator
+from foveasim.layout import Layout
+from foveasim.optics import Optics
+from foveasim.parallel import thread_count
+from foveasim.records import described, versions
+from foveasim.scene import Scene
+from foveasim.sensor import Sensor
+from foveasim.streams import Streams
+from foveasim.units import w_from_w_m2_um2
+
+__all__ = ["Camera"]
+
+#: Compiled layouts that a camera keeps, one for each grid it met.
+KEPT_INTEGRATORS = 4
+
+
+class Camera:
+    """
+    A lens in front of a sensor.
+
+    Parameters
+    ----------
+    optics : Optics
+    sensor : Sensor
+    n_threads : int, optional
+        All cores of the process by default. Results do not depend on it, bit for bit.
+
+    Raises
+    ------
+    ParameterError
+        When ``n_threads`` is no positive whole number.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0)
+    >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=fs.Sensor(layout))
+    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=10.0, distance_m=0.5, radiance_w_m2_sr_nm=0.1, band_width_nm=10.0)
+    >>> camera.capture(scene, exposure_s=0.01, seed=0).code.shape
+    (64,)
+    """
+
+    def __init__(self, *, optics: Optics, sensor: Sensor, n_threads: int | None = None) -> None:
+        self.optics = optics
+        self.sensor = sensor
+        self.n_threads = thread_count(n_threads)
+        self._integrators: dict[Grid, Integrator] = {}
+
+    def __repr__(self) -> str:
+        return f"Camera(optics={self.optics!r}, sensor=<{self.sensor.layout!r}, {self.sensor.bits} bits>)"
+
+    def integrator(self, grid: Grid) -> Integrator:
+        """The sensor's layout compiled for a grid; kept for the grids met last."""
+        if grid not in self._integrators:
+            while len(self._integrators) >= KEPT_INTEGRATORS:
+                del self._integrators[next(iter(self._integrators))]
+            self._integrators[grid] = Integrator(self.sensor.layout, grid, n_threads=self.n_threads)
+        return self._integrators[grid]
+
+    def photoelectrons_per_s(self, light: Scene | PowerMap) -> Floats:
+        """
+        Expected photoelectrons of every site in a second, (n_site,) e-/s.
+
+        Parameters
+        ----------
+        light : Scene or PowerMap
+            A scene to be imaged, or a map that any other optics program made.
+
+        Raises
+        ------
+        ParameterError
+            When the light is neither, or a wavelength outside the sensor's tables.
+        SimulationError
+            When the map is not finite under a site.
+        """
+        return self._photoelectrons_per_s(light, _Clock())
+
+    def capture(self, light: Scene | PowerMap, *, exposure_s: float, seed: int, frame: int = 0) -> Capture:
+        """
+        One exposure.
+
+        Parameters
+        ----------
+        light : Scene or PowerMap
+            A scene to be imaged, or a map that any other optics program made.
+        exposure_s : float, s
+        seed, frame : int
+            Of the noise. The same numbers give the same capture, bit for bit.
+
+        Returns
+        -------
+        Capture
+
+        Raises
+        ------
+        ParameterError, SimulationError
+            When a value is out of range, or parts do not fit together.
+        """
+        streams = Streams(seed, frame)
+        sensor = self.sensor
+        clock = _Clock()
+        photo_e_per_s = self._photoelectrons_per_s(light, clock)
+        with clock.stage("sensor"):
+            expected_e = sensor.expected_electrons(photo_e_per_s, exposure_s)
+            electrons = sensor.collect(expected_e, streams=streams)
+            code = sensor.read(electrons, streams=streams)
+        layout = sensor.layout
+        assert isinstance(layout, Layout)
+        return Capture(
+            layout=layout,
+            code=code,
+            electrons=electrons,
+            expected_e=expected_e,
+            filter_of_site=sensor.filter_of_site,
+            filter_names=sensor.filter_names,
+            bits=sensor.bits,
+            white_dn=self._white(light),
+            settings={
+                "light": _light_described(light),
+                "optics": described(self.optics),
+                "sensor": {k: v for k, v in described(sensor).items() if k != "layout"},
+                "layout": described(dict(layout.provenance)),
+                "exposure_s": float(exposure_s),
+                "seed": streams.seed,
+                "frame": streams.frame,
+                "versions": versions(),
+            },
+            stage_s=clock.stage_s,
+        )
+
+    def _photoelectrons_per_s(self, light: Scene | PowerMap, clock: _Clock) -> Floats:
+        """One inverse transform and one pass over the map for each colour filter, whatever the number of wavelengths."""
+        if not isinstance(light, Scene | PowerMap):
+            raise ParameterError("light", f"must be a Scene or a PowerMap, got a {type(light).__name__}")
+        sensor, layout = self.sensor, self.sensor.layout
+        filter_of_site = sensor.filter_of_site
+        weights = sensor.responsivity_e_per_j(light.wavelength_nm)
+        used = np.unique(filter_of_site)
+        grid = light.grid if isinstance(light, PowerMap) else self.optics.grid(light)
+        with clock.stage("compile layout"):
+            integrator = self.integrator(grid)
+        rate_e_per_s = np.zeros(layout.n_sites)
+        if isinstance(light, PowerMap):
+            with clock.stage("integration"):
+                power_w = w_from_w_m2_um2(integrator(light.data))
+                rate_e_per_s = np.einsum("sk,ks->s", weights[filter_of_site], power_w)
+        else:
+            maps = self.optics.weighted_maps(light, weights[used], n_threads=self.n_threads)
+            for c in used:
+                with clock.stage("optics"):
+                    cells = next(maps)
+                with clock.stage("integration"):
+                    rates = w_from_w_m2_um2(integrator(cells))
+                    del cells
+                rate_e_per_s = np.where(filter_of_site == c, rates, rate_e_per_s)
+        if not np.isfinite(rate_e_per_s).all():
+            bad = int(np.flatnonzero(~np.isfinite(rate_e_per_s))[0])
+            raise SimulationError(
+                f"the light on site {bad} is not finite: the power map has a NaN or an infinity there"
+            )
+        # A diffraction-limited map rings by rounding only; what falls below darkness by that is darkness.
+        return np.maximum(rate_e_per_s, 0.0)
+
+    def _white(self, light: Scene | PowerMap) -> Floats:
+        """Response of every filter to equal light in all bands, the strongest being the highest code."""
+        width_nm = light.band_width_nm if isinstance(light, Scene) else np.ones(light.wavelength_nm.size)
+        response = self.sensor.responsivity_e_per_j(light.wavelength_nm) @ width_nm
+        highest = float(response.max())
+        return response / highest * (2**self.sensor.bits - 1) if highest > 0.0 else np.ones(response.size)
+
+
+class _Clock:
+    """Adds up the seconds of named stages."""
+
+    def __init__(self) -> None:
+        self.stage_s: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start_s = time.perf_counter()
+        yield
+        self.stage_s[name] = self.stage_s.get(name, 0.0) + time.perf_counter() - start_s
+
+
+def _light_described(light: Scene | PowerMap) -> dict[str, object]:
+    if isinstance(light, PowerMap):
+        return {"kind": "PowerMap", "grid": described(light.grid), "wavelength_nm": light.wavelength_nm.tolist()}
+    return {
+        "kind": "Scene",
+        "source": light.source,
+        "shape": list(light.basis.shape),
+        "pitch_um": light.pitch_um,
+        "distance_m": light.distance_m,
+        "wavelength_nm": light.wavelength_nm.tolist(),
+        "band_width_nm": light.band_width_nm.tolist(),
+        "spectrum_w_m2_sr_nm": described(light.spectrum_w_m2_sr_nm),
+    }

@@ -1,0 +1,86 @@
+"""
+Every error and warning that foveasim raises on purpose.
+
+::
+
+    FoveasimError
+    ├── ParameterError   (ValueError)    one value is wrong: .name .value .unit
+    ├── GeometryError    (ValueError)    outlines that are no photosites: .site_ids
+    ├── FileError        (ValueError)    a file that cannot be read or written: .path
+    │   └── ConfigError                  a settings file with a wrong key or value
+    └── SimulationError  (RuntimeError)  parts that do not fit together, found while running
+
+    FoveasimWarning (UserWarning)
+    └── SamplingWarning                  the discretisation is coarser than the physics asks for
+
+Each message says what is wrong, where, what was got, what was expected, and the cure.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+__all__ = [
+    "ConfigError",
+    "FileError",
+    "FoveasimError",
+    "FoveasimWarning",
+    "GeometryError",
+    "ParameterError",
+    "SamplingWarning",
+    "SimulationError",
+]
+
+
+class FoveasimError(Exception):
+    """Base of all errors of the package."""
+
+
+class ParameterError(FoveasimError, ValueError):
+    """One parameter has a value that cannot be: raise it where a value enters the package."""
+
+    def __init__(self, name: str, rule: str, value: object = None, unit: str = "", cure: str = "") -> None:
+        self.name = name
+        self.value = value
+        self.unit = unit
+        got = f", got {_shown(value)}{' ' + unit if unit else ''}" if value is not None else ""
+        super().__init__(f"'{name}' {rule}{got}{'; ' + cure if cure else ''}")
+
+
+class GeometryError(FoveasimError, ValueError):
+    """Outlines that are no photosites; ``site_ids`` are the positions of the bad ones."""
+
+    def __init__(self, message: str, site_ids: tuple[int, ...] = ()) -> None:
+        self.site_ids = site_ids
+        super().__init__(message)
+
+
+class FileError(FoveasimError, ValueError):
+    """A file that is missing, broken, of the wrong kind, or too large."""
+
+    def __init__(self, path: str | Path, message: str) -> None:
+        self.path = Path(path)
+        super().__init__(f"{path}: {message}")
+
+
+class ConfigError(FileError):
+    """A settings file with an unknown key, a wrong type, or an impossible value."""
+
+
+class SimulationError(FoveasimError, RuntimeError):
+    """Parts that are right alone and do not fit together."""
+
+
+class FoveasimWarning(UserWarning):
+    """Base of all warnings of the package."""
+
+
+class SamplingWarning(FoveasimWarning):
+    """The picture or the grid is too coarse or too small for the optics it meets."""
+
+
+def _shown(value: Any) -> str:
+    """Short text of a value for a message."""
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."

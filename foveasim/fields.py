@@ -1,0 +1,190 @@
+"""
+The carriers that rooms hand to each other: the grid, the power map, and what a scene and a set of outlines are.
+
+One right-handed frame: origin on the optical axis, x to the right, y **up**. Row 0 of every array is its lowest
+y, and a picture file's first row is its highest: :func:`from_file_rows` and :func:`to_file_rows` are the only
+places where rows are turned over.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim.arrays import Floats, Images, Ints, check_count, check_number, finite_array, read_only
+from foveasim.errors import ParameterError
+
+__all__ = ["Grid", "PackedRings", "PowerMap", "SceneLike", "from_file_rows", "to_file_rows"]
+
+
+class PackedRings(Protocol):
+    """Outlines as the integrator needs them; :class:`foveasim.Layout` is one."""
+
+    @property
+    def xy_um(self) -> Floats:
+        """Vertices (n_vertex, 2), rings one after the other, first vertex not repeated."""
+
+    @property
+    def ring_offsets(self) -> Ints:
+        """Ring r has the vertices ``ring_offsets[r] : ring_offsets[r + 1]``; (n_ring + 1,)."""
+
+    @property
+    def site_offsets(self) -> Ints:
+        """Site s has the rings ``site_offsets[s] : site_offsets[s + 1]``, outer ones counter-clockwise; (n_site + 1,)."""
+
+
+class SceneLike(Protocol):
+    """
+    Light from a plane in front of the lens, as the optics needs it; :class:`foveasim.Scene` is one.
+
+    The spectral radiance of pixel [iy, ix] at wavelength k is ``sum_b basis[b, iy, ix] * spectrum[b, k]`` in
+    W/(m² sr nm), and every wavelength stands for a band of ``band_width_nm[k]``.
+    """
+
+    @property
+    def basis(self) -> Images:
+        """Basis images (n_basis, n_y, n_x)."""
+
+    @property
+    def spectrum_w_m2_sr_nm(self) -> Floats:
+        """Their spectra (n_basis, n_wavelength)."""
+
+    @property
+    def wavelength_nm(self) -> Floats:
+        """Wavelengths (n_wavelength,)."""
+
+    @property
+    def band_width_nm(self) -> Floats:
+        """Widths of the wavelengths' bands (n_wavelength,)."""
+
+    @property
+    def pitch_um(self) -> float:
+        """Distance of two pixels in the scene."""
+
+    @property
+    def distance_m(self) -> float:
+        """Distance of the scene from the pupil."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """
+    A grid of square cells in the sensor plane.
+
+    Parameters
+    ----------
+    shape : (n_y, n_x)
+        Numbers of rows and columns.
+    pitch_um : float, µm
+        Side of a cell.
+    origin_um : (x0, y0), µm
+        Lower left corner of cell [0, 0].
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range.
+
+    Examples
+    --------
+    >>> grid = Grid(shape=(2, 4), pitch_um=0.5, origin_um=(-1.0, -0.5))
+    >>> grid.bounds_um
+    (-1.0, -0.5, 1.0, 0.5)
+    """
+
+    shape: tuple[int, int]
+    pitch_um: float
+    origin_um: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if np.shape(self.shape) != (2,):
+            raise ParameterError("shape", "must be two whole numbers (n_y, n_x)", self.shape)
+        if np.shape(self.origin_um) != (2,):
+            raise ParameterError("origin_um", "must be two numbers (x0, y0)", self.origin_um, "µm")
+        n_y, n_x = (check_count(f"shape[{i}]", n, at_most=2**30) for i, n in enumerate(self.shape))
+        x0, y0 = (check_number(f"origin_um[{i}]", x) for i, x in enumerate(self.origin_um))
+        object.__setattr__(self, "shape", (n_y, n_x))
+        object.__setattr__(self, "origin_um", (x0, y0))
+        object.__setattr__(self, "pitch_um", check_number("pitch_um", self.pitch_um, above=0.0, at_most=1e7))
+
+    @classmethod
+    def centred(cls, shape: tuple[int, int], pitch_um: float) -> Grid:
+        """Grid whose middle lies on the optical axis."""
+        check_number("pitch_um", pitch_um, above=0.0)
+        return cls(shape, pitch_um, (-0.5 * shape[1] * pitch_um, -0.5 * shape[0] * pitch_um))
+
+    @property
+    def cell_area_um2(self) -> float:
+        """Area of a cell in µm²."""
+        return self.pitch_um**2
+
+    @property
+    def bounds_um(self) -> tuple[float, float, float, float]:
+        """The grid's (x_min, y_min, x_max, y_max) in µm."""
+        x0, y0 = self.origin_um
+        return x0, y0, x0 + self.shape[1] * self.pitch_um, y0 + self.shape[0] * self.pitch_um
+
+    @property
+    def x_um(self) -> Floats:
+        """Cell centres along x, (n_x,), µm."""
+        return np.asarray(self.origin_um[0] + (np.arange(self.shape[1]) + 0.5) * self.pitch_um)
+
+    @property
+    def y_um(self) -> Floats:
+        """Cell centres along y, (n_y,), µm, the lowest first."""
+        return np.asarray(self.origin_um[1] + (np.arange(self.shape[0]) + 0.5) * self.pitch_um)
+
+
+@dataclass(frozen=True, eq=False)
+class PowerMap:
+    """
+    Light on the sensor plane.
+
+    Parameters
+    ----------
+    data : (n_band, n_y, n_x) float32 or float64, W/m² per band
+        Mean irradiance of each cell, within the band of each wavelength.
+    grid : Grid
+        Where the cells are.
+    wavelength_nm : (n_band,) float64, nm
+        The bands' wavelengths.
+
+    Raises
+    ------
+    ParameterError
+        When the shapes do not fit together, or a wavelength is not positive.
+    """
+
+    data: Images
+    grid: Grid
+    wavelength_nm: Floats
+
+    def __post_init__(self) -> None:
+        data = np.asarray(self.data)
+        if data.dtype not in (np.float32, np.float64):
+            data = data.astype(np.float64)
+        wavelength_nm = finite_array("wavelength_nm", np.atleast_1d(np.asarray(self.wavelength_nm)), ndim=1, above=0.0)
+        if data.shape != (wavelength_nm.size, *self.grid.shape):
+            raise ParameterError(
+                "data",
+                f"must have the shape (n_band, n_y, n_x) = {(wavelength_nm.size, *self.grid.shape)} of the "
+                f"wavelengths and the grid, got {data.shape}",
+            )
+        data = data.view()
+        object.__setattr__(self, "data", read_only(data))
+        object.__setattr__(self, "wavelength_nm", read_only(wavelength_nm.copy()))
+
+
+def from_file_rows(picture: NDArray[Any]) -> NDArray[Any]:
+    """(n_y, n_x) or (n_y, n_x, n_channel), first row on top, to (n_channel, n_y, n_x), first row lowest (a view)."""
+    channels = picture[np.newaxis] if picture.ndim == 2 else np.moveaxis(picture, -1, 0)
+    return channels[:, ::-1, :]
+
+
+def to_file_rows(picture: ArrayLike) -> NDArray[Any]:
+    """(n_y, n_x) or (n_channel, n_y, n_x), first row lowest, to (n_y, n_x[, n_channel]), first row on top (a view)."""
+    picture = np.asarray(picture)
+    return picture[::-1] if picture.ndim == 2 else np.moveaxis(picture, 0, -1)[::-1]

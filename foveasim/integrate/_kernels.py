@@ -1,0 +1,387 @@
+"""
+The integrator's numba kernels: outlines to spans of cells, spans in the order of the map, a map through them.
+
+Coordinates are in *cells* of the grid, ``u = (x - x0) / pitch`` to the right and ``v = (y - y0) / pitch`` up, so
+that cell ``[iy, ix]`` is the unit square from ``(ix, iy)`` to ``(ix + 1, iy + 1)``.
+
+By Green's theorem the overlap of a site with a cell is a sum over the site's edges (:func:`trace_sites`). What
+is kept is the result, run-length coded. A **span** is one row of ``spans``, five integers: a site, a row of
+the grid, a first column, ``n_partial`` cells from there on that each have a weight of their own (their overlap
+with the site, 0 to 1), then ``n_run`` cells that share one weight (the site's interior: 1). A frame then costs
+one reading of the map, a multiplication for each cell that an outline cuts, and additions inside
+(:func:`gather`). No sum runs along a whole row, so a bright source costs a dark site beside it no digits.
+
+The kernels know arrays only, release the interpreter lock, and are compiled for explicit types when this module
+is imported; the machine code is cached on disk.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, types
+
+__all__ = ["COLUMN", "N_PARTIAL", "N_RUN", "ROW", "SITE", "gather", "place_spans", "scatter", "trace_sites"]
+
+#: Columns of ``spans``. In a finished plan the first holds the accumulator's index instead of the site's.
+SITE, ROW, COLUMN, N_PARTIAL, N_RUN = range(5)
+
+#: Cells that one block of a row's partial sums holds. Eight float32 make one vector of eight float64: measured best.
+BLOCK = 8
+#: Shorter runs are stored cell by cell, which costs less than a header and a sum of their own.
+MIN_RUN = 12
+#: A winding sum below this is rounding (a few additions of numbers up to 1), not coverage.
+NO_COVERAGE = 4e-15
+#: End of a linked list.
+END = -1
+
+
+def _input(dtype, ndim):
+    """Type of an argument that is only read: read-only and writeable arrays, C-contiguous."""
+    return types.Array(dtype, ndim, "C", readonly=True)
+
+
+_ints = _input(types.int64, 1)
+_floats = _input(types.float64, 1)
+_points = _input(types.float64, 2)
+_spans = _input(types.int32, 2)
+_count = types.int64
+_span_list = types.int32[:, ::1]
+_float_list = types.float64[::1]
+_int_list = types.int64[::1]
+
+
+@njit(cache=True, nogil=True)
+def _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x):
+    """Upper bound of the number of cells on the grid that the rings' edges touch."""
+    bound = 0
+    for ring in range(first_ring, last_ring):
+        start, stop = ring_offsets[ring], ring_offsets[ring + 1]
+        a = stop - 1
+        for b in range(start, stop):
+            rows = min(max(uv[b, 1], 0.0), float(n_y)) - min(max(uv[a, 1], 0.0), float(n_y))
+            columns = min(max(uv[b, 0], 0.0), float(n_x)) - min(max(uv[a, 0], 0.0), float(n_x))
+            bound += int(abs(rows)) + int(abs(columns)) + 4
+            a = b
+    return bound
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _find_cell(head, links, n_cells, row, column, cursor):
+    """
+    Scratch cell (row, column): its index, and the count of cells, one higher when it had to be made.
+
+    ``links[i]`` is (column, next cell of the row); a row's list is in order of columns. ``cursor`` is a cell of
+    the same row to begin the search at, or END.
+    """
+    if cursor != END and links[cursor, 0] == column:
+        return cursor, n_cells
+    previous = cursor if cursor != END and links[cursor, 0] < column else END
+    here = head[row] if previous == END else links[previous, 1]
+    while here != END and links[here, 0] < column:
+        previous = here
+        here = links[here, 1]
+    if here != END and links[here, 0] == column:
+        return here, n_cells
+    links[n_cells, 0] = column
+    links[n_cells, 1] = here
+    if previous == END:
+        head[row] = n_cells
+    else:
+        links[previous, 1] = n_cells
+    return n_cells, n_cells + 1
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _trace_edge(ua, va, ub, vb, n_y, n_x, bottom, head, links, cover, n_cells):
+    """
+    Add one edge to the scratch cells; returns their count.
+
+    ``cover[i]`` is (height, area): the signed height of the edge's pieces in the cell, and the area between
+    them and the cell's left border.
+    """
+    sign = 1.0
+    if va > vb:  # always upwards, so that two neighbours cut a shared edge at the same points
+        ua, va, ub, vb = ub, vb, ua, va
+        sign = -1.0
+    if va == vb or va >= n_y or vb <= 0.0:
+        return n_cells
+    slope = (ub - ua) / (vb - va)
+    u_low, u_high = min(ua, ub), max(ua, ub)
+    top = min(vb, float(n_y))
+    row = int(np.floor(max(va, 0.0)))
+    while row < top:
+        low = max(va, float(row))
+        high = min(vb, row + 1.0)
+        left = ua if low == va else min(max(ua + (low - va) * slope, u_low), u_high)
+        right = ub if high == vb else min(max(ua + (high - va) * slope, u_low), u_high)
+        if left > right:
+            left, right = right, left
+        if right > 0.0 or left == 0.0:  # what is left of the map has no cell on its left
+            rise = high - low
+            steepness = rise / (right - left) if right > left else 0.0
+            u = max(left, 0.0)
+            climbed = (u - left) * steepness
+            column = int(min(u, float(n_x)))
+            cell = END
+            while True:
+                # Right of the map an edge has every cell of the row on its left: column n_x stands for it.
+                is_last = right <= column + 1.0 or column == n_x
+                u_next = right if is_last else column + 1.0
+                height = rise if is_last else (u_next - left) * steepness
+                piece = sign * (height - climbed)
+                climbed = height
+                cell, count = _find_cell(head, links, n_cells, row - bottom, column, cell)
+                if count > n_cells:
+                    cover[cell, 0] = 0.0
+                    cover[cell, 1] = 0.0
+                    n_cells = count
+                cover[cell, 0] += piece
+                if column < n_x:
+                    cover[cell, 1] += piece * (0.5 * (u + u_next) - column)
+                if is_last:
+                    break
+                u = u_next
+                column += 1
+        row += 1
+    return n_cells
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _grown(array, n_used, n_more):
+    """The array itself, or a longer copy when ``n_more`` further rows would not fit."""
+    if n_used + n_more <= array.shape[0]:
+        return array
+    larger = np.empty((2 * array.shape[0] + n_more, *array.shape[1:]), array.dtype)
+    larger[:n_used] = array[:n_used]
+    return larger
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _write_row(first_cell, links, cover, n_x, site, row, spans, n_spans, weights, n_weights):
+    """Append the spans of one row of one site; returns the arrays, their counts, and the area covered."""
+    winding = 0.0  # weight of the cells before the next touched one: the sum of the heights from there on
+    here = first_cell
+    while here != END:
+        winding += cover[here, 0]
+        here = links[here, 1]
+    covered = 0.0
+    column = 0  # the next one to be written
+    is_open = False  # whether the last span goes on
+    here = first_cell
+    while here != END:
+        n_between = links[here, 0] - column
+        is_run = n_between >= MIN_RUN
+        spans = _grown(spans, n_spans, 2)
+        weights = _grown(weights, n_weights, MIN_RUN + 1)
+        for is_touched in (False, True):
+            if is_touched:
+                column = links[here, 0]
+                n_cells = 1 if column < n_x else 0
+                weight = cover[here, 1] + (winding - cover[here, 0])
+            else:
+                n_cells = n_between
+                weight = winding
+                if n_cells > 0 and abs(weight) <= NO_COVERAGE:
+                    is_open = False
+                    continue
+            if n_cells == 0:
+                continue
+            if not is_open:
+                spans[n_spans, SITE] = site
+                spans[n_spans, ROW] = row
+                spans[n_spans, COLUMN] = column
+                spans[n_spans, N_PARTIAL] = 0
+                spans[n_spans, N_RUN] = 0
+                n_spans += 1
+            covered += weight * n_cells
+            if is_run and not is_touched:
+                spans[n_spans - 1, N_RUN] = n_cells
+                weights[n_weights] = weight
+                n_weights += 1
+                is_open = False
+            else:
+                spans[n_spans - 1, N_PARTIAL] += n_cells
+                for _ in range(n_cells):
+                    weights[n_weights] = weight
+                    n_weights += 1
+                is_open = True
+        winding -= cover[here, 0]
+        column = links[here, 0] + 1
+        here = links[here, 1]
+    return spans, n_spans, weights, n_weights, covered
+
+
+@njit(
+    types.Tuple((_span_list, _float_list, _float_list))(_points, _ints, _ints, _count, _count, _count, _count),
+    cache=True,
+    nogil=True,
+)
+def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x):
+    """
+    Spans of the sites ``first_site .. last_site - 1`` on a grid of ``n_y`` rows and ``n_x`` columns.
+
+    ``F(u)``, the integral of the map along a row from its left end to ``u``, makes the integral over a polygon
+    the sum over its edges of (height climbed) x (mean of F). Split at the cell borders, a piece of height
+    ``d`` with its middle at ``u_m`` in column ``c`` gives the weight ``d * (u_m - c)`` to cell ``c`` and ``d`` to
+    every cell left of it. What lies off the grid gives nothing.
+
+    Returns
+    -------
+    spans : (n_span, 5) int32
+        Site by site, each site's in the order of row and column.
+    weights : (n_weight,) float64
+        Per span its ``n_partial`` weights, then one for the run where ``n_run > 0``.
+    covered : (last_site - first_site,) float64, cells
+        Area of each site that lies on the grid.
+    """
+    n_sites = last_site - first_site
+    covered = np.zeros(n_sites, np.float64)
+    spans = np.empty((4 * n_sites + 64, 5), np.int32)
+    weights = np.empty(16 * n_sites + 64, np.float64)
+    n_spans = 0
+    n_weights = 0
+    head = np.empty(64, np.int32)
+    links = np.empty((256, 2), np.int32)
+    cover = np.empty((256, 2), np.float64)
+
+    for site in range(first_site, last_site):
+        first_ring, last_ring = site_offsets[site], site_offsets[site + 1]
+        v_low, v_high = np.inf, -np.inf
+        for i in range(ring_offsets[first_ring], ring_offsets[last_ring]):
+            v_low = min(v_low, uv[i, 1])
+            v_high = max(v_high, uv[i, 1])
+        if not (v_high > 0.0 and v_low < n_y):
+            continue
+        bottom = int(np.floor(max(v_low, 0.0)))
+        n_rows = int(np.ceil(min(v_high, float(n_y)))) - bottom
+        size = _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x)
+        if head.size < n_rows:
+            head = np.empty(2 * n_rows, np.int32)
+        if links.shape[0] < size:
+            links = np.empty((2 * size, 2), np.int32)
+            cover = np.empty((2 * size, 2), np.float64)
+        head[:n_rows] = END
+        n_cells = 0
+        for ring in range(first_ring, last_ring):
+            start, stop = ring_offsets[ring], ring_offsets[ring + 1]
+            a = stop - 1
+            for b in range(start, stop):
+                n_cells = _trace_edge(
+                    uv[a, 0], uv[a, 1], uv[b, 0], uv[b, 1], n_y, n_x, bottom, head, links, cover, n_cells
+                )
+                a = b
+        for row in range(n_rows):
+            spans, n_spans, weights, n_weights, area = _write_row(
+                head[row], links, cover, n_x, site, bottom + row, spans, n_spans, weights, n_weights
+            )
+            covered[site - first_site] += area
+    return spans[:n_spans].copy(), weights[:n_weights].copy(), covered
+
+
+@njit(
+    types.void(_spans, _floats, _int_list, _int_list, _ints, _count, _span_list, _float_list),
+    cache=True,
+    nogil=True,
+)
+def place_spans(spans, weights, next_span, next_weight, first_slot, rows_per_band, out_spans, out_weights):
+    """
+    Copy spans from the order of sites into the order of rows.
+
+    ``next_span[row]`` and ``next_weight[row]`` say where the row's next span and weights go, and are moved on.
+    A site has one accumulator, a *slot*, for each band of rows that it reaches: ``first_slot[site]`` minus the
+    site's first band, plus the band, is written in the place of the site.
+    """
+    p = 0
+    for i in range(spans.shape[0]):
+        row = spans[i, ROW]
+        to = next_span[row]
+        next_span[row] += 1
+        out_spans[to, SITE] = first_slot[spans[i, SITE]] + row // rows_per_band
+        out_spans[to, ROW] = row
+        out_spans[to, COLUMN] = spans[i, COLUMN]
+        out_spans[to, N_PARTIAL] = spans[i, N_PARTIAL]
+        out_spans[to, N_RUN] = spans[i, N_RUN]
+        n = spans[i, N_PARTIAL] + (1 if spans[i, N_RUN] > 0 else 0)
+        at = next_weight[row]
+        next_weight[row] += n
+        for k in range(n):
+            out_weights[at + k] = weights[p + k]
+        p += n
+
+
+@njit(
+    [
+        types.void(_input(cell, 2), _count, _count, _ints, _ints, _spans, _floats, _float_list)
+        for cell in (types.float32, types.float64)
+    ],
+    cache=True,
+    nogil=True,
+)
+def gather(cells, first_row, last_row, row_spans, row_weights, spans, weights, slots):
+    """
+    Add weight x cell over the rows ``first_row .. last_row - 1`` of a map into the slots.
+
+    The only reading of the map: each row is summed by blocks of ``BLOCK`` cells, which a span's run then uses.
+    """
+    n_x = cells.shape[1]
+    blocks = np.empty(n_x // BLOCK + 1, np.float64)
+    for row in range(first_row, last_row):
+        if row_spans[row] == row_spans[row + 1]:
+            continue
+        line = cells[row]
+        for b in range(n_x // BLOCK):
+            total = 0.0
+            for k in range(BLOCK):
+                total += line[b * BLOCK + k]
+            blocks[b] = total
+        p = row_weights[row]
+        for i in range(row_spans[row], row_spans[row + 1]):
+            column = spans[i, COLUMN]
+            n_partial = spans[i, N_PARTIAL]
+            n_run = spans[i, N_RUN]
+            total = 0.0
+            for k in range(n_partial):
+                total += weights[p + k] * line[column + k]
+            p += n_partial
+            if n_run > 0:
+                column += n_partial
+                end = column + n_run
+                first_block = (column + BLOCK - 1) // BLOCK
+                last_block = end // BLOCK
+                inside = 0.0
+                if last_block > first_block:
+                    for k in range(column, first_block * BLOCK):
+                        inside += line[k]
+                    for b in range(first_block, last_block):
+                        inside += blocks[b]
+                    for k in range(last_block * BLOCK, end):
+                        inside += line[k]
+                else:
+                    for k in range(column, end):
+                        inside += line[k]
+                total += weights[p] * inside
+                p += 1
+            slots[spans[i, SITE]] += total
+
+
+@njit(
+    types.void(_floats, _count, _count, _ints, _ints, _spans, _floats, types.float64[:, ::1]),
+    cache=True,
+    nogil=True,
+)
+def scatter(values, first_row, last_row, row_spans, row_weights, spans, weights, cells):
+    """The transpose of :func:`gather`: add weight x (value of the slot) to the cells of some rows."""
+    for row in range(first_row, last_row):
+        p = row_weights[row]
+        for i in range(row_spans[row], row_spans[row + 1]):
+            value = values[spans[i, SITE]]
+            column = spans[i, COLUMN]
+            for _ in range(spans[i, N_PARTIAL]):
+                cells[row, column] += weights[p] * value
+                column += 1
+                p += 1
+            if spans[i, N_RUN] > 0:
+                for _ in range(spans[i, N_RUN]):
+                    cells[row, column] += weights[p] * value
+                    column += 1
+                p += 1

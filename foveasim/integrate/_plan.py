@@ -1,0 +1,218 @@
+"""The compiled plan of a set of outlines on a grid, and the three things that are done with it."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from foveasim.arrays import Floats, Ints
+from foveasim.fields import Grid, PackedRings
+from foveasim.parallel import each
+from foveasim.rings import site_bounds_um
+
+__all__ = ["Plan", "compile_plan"]
+
+_log = logging.getLogger("foveasim")
+
+#: Sites that are traced as one piece of work; fixed, so that a plan does not depend on the number of threads.
+SITES_PER_PIECE = 2048
+#: A map has at most this many bands of rows, each summed by one thread into slots of its own ...
+MAX_BANDS = 64
+#: ... and none is thinner than this, where handing out the work would cost more than the work.
+MIN_ROWS_PER_BAND = 32
+#: Below this many cells a frame is done by the calling thread.
+SMALL_MAP = 1 << 16
+
+
+@cache
+def kernels() -> ModuleType:
+    """The compiled kernels; loaded when first needed, since numba takes a second and compiling some seconds more."""
+    if not any((Path(__file__).parent / "__pycache__").glob("_kernels.*.nbi")):
+        _log.warning("compiling the integration kernels for this machine, once (about 10 s)")
+    from foveasim.integrate import _kernels
+
+    return _kernels
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """
+    Spans of cells in the order of a map's rows (see ``_kernels``).
+
+    Attributes
+    ----------
+    grid : Grid
+    n_sites : int
+    row_spans, row_weights : (n_y + 1,) int64
+        Where each row's spans and weights begin.
+    spans : (n_span, 5) int32
+    weights : (n_weight,) float64
+    rows_per_band : int
+        Height of the bands of rows that are summed apart.
+    first_slot : (n_site + 1,) int64
+        Site s has the slots ``first_slot[s] : first_slot[s + 1]``, one a band.
+    covered_um2 : (n_site,) float64, µm²
+        Area of each site that lies on the grid.
+    """
+
+    grid: Grid
+    n_sites: int
+    row_spans: Ints
+    row_weights: Ints
+    spans: NDArray[np.int32]
+    weights: Floats
+    rows_per_band: int
+    first_slot: Ints
+    covered_um2: Floats
+
+    def _bands(self) -> range:
+        return range(0, self.grid.shape[0], self.rows_per_band)
+
+    def _band_end(self, first_row: int) -> int:
+        return min(first_row + self.rows_per_band, self.grid.shape[0])
+
+    def _threads(self, n_threads: int) -> int:
+        return 1 if self.grid.shape[0] * self.grid.shape[1] <= SMALL_MAP else n_threads
+
+    def gather(self, cells: NDArray[Any], n_threads: int) -> Floats:
+        """Sum of weight x cell for every site, (n_site,), of one map (n_y, n_x) float32 or float64, C-contiguous."""
+        slots = np.zeros(int(self.first_slot[-1]))
+        run = kernels().gather
+
+        def band(first_row: int) -> None:
+            run(
+                cells,
+                first_row,
+                self._band_end(first_row),
+                self.row_spans,
+                self.row_weights,
+                self.spans,
+                self.weights,
+                slots,
+            )
+
+        each(band, self._bands(), self._threads(n_threads))
+        sums = np.zeros(self.n_sites)
+        is_on_grid = np.diff(self.first_slot) > 0
+        if is_on_grid.any():
+            sums[is_on_grid] = np.add.reduceat(slots, self.first_slot[:-1][is_on_grid])
+        return sums
+
+    def scatter(self, values: Floats, n_threads: int) -> Floats:
+        """Sum of weight x value of the site for every cell, (n_y, n_x): the transpose of :meth:`gather`."""
+        cells = np.zeros(self.grid.shape)
+        slots = np.repeat(values, np.diff(self.first_slot))
+        run = kernels().scatter
+
+        def band(first_row: int) -> None:
+            run(
+                slots,
+                first_row,
+                self._band_end(first_row),
+                self.row_spans,
+                self.row_weights,
+                self.spans,
+                self.weights,
+                cells,
+            )
+
+        each(band, self._bands(), self._threads(n_threads))
+        return cells
+
+    def matrix(self) -> scipy.sparse.csr_array[Any]:
+        """The plan as a sparse matrix (n_site, n_y * n_x) of overlaps in cells; runs are written out."""
+        n_partial = self.spans[:, kernels().N_PARTIAL].astype(np.int64)
+        n_run = self.spans[:, kernels().N_RUN].astype(np.int64)
+        n_cells = n_partial + n_run
+        # A span's k-th cell has its k-th weight, and every cell of the run the one after the partial ones.
+        first_cell = np.cumsum(n_cells) - n_cells
+        n_weights = n_partial + (n_run > 0)
+        first_weight = np.cumsum(n_weights) - n_weights
+        k = np.arange(int(n_cells.sum())) - np.repeat(first_cell, n_cells)
+        weight = self.weights[np.repeat(first_weight, n_cells) + np.minimum(k, np.repeat(n_partial, n_cells))]
+        n_y, n_x = self.grid.shape
+        start = self.spans[:, kernels().ROW].astype(np.int64) * n_x + self.spans[:, kernels().COLUMN]
+        cell = np.repeat(start, n_cells) + k
+        slot_site = np.repeat(np.arange(self.n_sites), np.diff(self.first_slot))
+        site = np.repeat(slot_site[self.spans[:, kernels().SITE]], n_cells)
+        matrix = scipy.sparse.coo_array((weight, (site, cell)), shape=(self.n_sites, n_y * n_x)).tocsr()
+        matrix.sort_indices()
+        return matrix
+
+
+def compile_plan(rings: PackedRings, grid: Grid, n_threads: int) -> Plan:
+    """Trace every outline on the grid, and put what it covers in the order of the grid's rows."""
+    n_y, n_x = grid.shape
+    n_sites = rings.site_offsets.size - 1
+    uv = np.ascontiguousarray((rings.xy_um - np.asarray(grid.origin_um)) / grid.pitch_um)
+    ring_offsets = np.ascontiguousarray(rings.ring_offsets)
+    site_offsets = np.ascontiguousarray(rings.site_offsets)
+    compiled = kernels()
+
+    pieces = range(0, n_sites, SITES_PER_PIECE)
+
+    def trace(first_site: int) -> tuple[NDArray[np.int32], Floats, Floats, Ints, Ints]:
+        last_site = min(first_site + SITES_PER_PIECE, n_sites)
+        spans, weights, covered = compiled.trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x)
+        rows = spans[:, compiled.ROW]
+        n_weights = spans[:, compiled.N_PARTIAL] + (spans[:, compiled.N_RUN] > 0)
+        return (
+            spans,
+            weights,
+            covered,
+            np.bincount(rows, minlength=n_y),
+            np.bincount(rows, n_weights, minlength=n_y).astype(np.int64),
+        )
+
+    traced = each(trace, pieces, n_threads)
+
+    # Where the next span of (piece, row) goes: behind all lower rows, and the same row of the pieces before.
+    row_spans, next_span = _starts([t[3] for t in traced], n_y)
+    row_weights, next_weight = _starts([t[4] for t in traced], n_y)
+
+    rows_per_band = max(MIN_ROWS_PER_BAND, -(-n_y // MAX_BANDS))
+    bounds = site_bounds_um(uv, ring_offsets, site_offsets)  # in cells
+    first_row = np.floor(np.clip(bounds[:, 1], 0, n_y)).astype(np.int64)
+    last_row = np.ceil(np.clip(bounds[:, 3], 0, n_y)).astype(np.int64)
+    n_bands = np.where(last_row > first_row, (last_row - 1) // rows_per_band - first_row // rows_per_band + 1, 0)
+    first_slot = np.concatenate(([0], np.cumsum(n_bands)))
+
+    out_spans = np.empty((int(row_spans[-1]), 5), np.int32)
+    out_weights = np.empty(int(row_weights[-1]))
+    slot_of_band_0 = first_slot[:-1] - first_row // rows_per_band
+
+    def place(i: int) -> None:
+        spans, weights = traced[i][:2]
+        compiled.place_spans(
+            spans, weights, next_span[i], next_weight[i], slot_of_band_0, rows_per_band, out_spans, out_weights
+        )
+
+    each(place, range(len(traced)), n_threads)
+    covered = np.concatenate([t[2] for t in traced]) if traced else np.zeros(0)
+    return Plan(
+        grid=grid,
+        n_sites=n_sites,
+        row_spans=row_spans,
+        row_weights=row_weights,
+        spans=out_spans,
+        weights=out_weights,
+        rows_per_band=rows_per_band,
+        first_slot=first_slot,
+        covered_um2=covered * grid.cell_area_um2,
+    )
+
+
+def _starts(counts: list[NDArray[np.int64]], n_y: int) -> tuple[Ints, Ints]:
+    """Offsets of the rows (n_y + 1,), and of each piece within each row (n_piece, n_y)."""
+    by_piece = np.array(counts, dtype=np.int64).reshape(len(counts), n_y)
+    offsets = np.concatenate(([0], np.cumsum(by_piece.sum(axis=0))))
+    within = np.cumsum(by_piece, axis=0) - by_piece
+    return offsets, np.ascontiguousarray(offsets[:-1] + within)

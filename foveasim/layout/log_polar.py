@@ -1,0 +1,178 @@
+"""The log-polar layout: rings whose sites grow with their distance from the axis."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from foveasim.arrays import Floats, Ints, check_count, check_number
+from foveasim.errors import ParameterError
+from foveasim.layout._model import Layout
+
+__all__ = ["log_polar", "square_ring_ratio"]
+
+#: More sites than this are a slip in the parameters.
+MAX_SITES = 50_000_000
+
+
+def square_ring_ratio(n_sectors: int) -> float:
+    """
+    Ratio of a ring's outer to its inner radius that makes its sites as high as they are wide.
+
+    Notes
+    -----
+    Height ``r_c * 2 (q - 1) / (q + 1)`` equal to the chord ``2 r_c sin(π / n)`` on the centre line gives
+    ``q = (1 + sin(π / n)) / (1 - sin(π / n))``.
+    """
+    s = math.sin(math.pi / n_sectors)
+    return (1.0 + s) / (1.0 - s)
+
+
+def log_polar(
+    *,
+    n_sectors: int,
+    r_max_um: float,
+    min_size_um: float | None = None,
+    r_min_um: float | None = None,
+    n_rings: int | None = None,
+    ring_ratio: float | None = None,
+    stagger: bool = False,
+    chords_per_arc: int = 1,
+) -> Layout:
+    """
+    Rings of ``n_sectors`` sites around the optical axis, each ring ``ring_ratio`` times as large as the one inside.
+
+    ::
+
+                     ╭──────┬──────╮  r_max_um
+                   ╱  ╭─────┼────╮   ╲
+                  │ ╱   ╭───┼──╮   ╲  │       ring k: r_k to r_k · ring_ratio
+                  ├─┼───┤ blind├───┼──┤
+                  │ ╲   ╰───┼──╯   ╱  │       site: one of n_sectors parts of a ring,
+                   ╲  ╰─────┼────╯   ╱              its arcs cut into chords_per_arc chords
+                     ╰──────┴──────╯
+                       ├─┤ r_min_um
+
+    Parameters
+    ----------
+    n_sectors : int
+        Sites a ring, at least 3.
+    r_max_um : float, µm
+        No ring reaches further out.
+    min_size_um : float, optional, µm
+        Smallest pixel that can be made. Rings whose sites would be smaller are left out: that is the **blind spot**.
+        Its radius on the first ring's centre line is ``min_size * n_sectors / 2π`` where the sites are squarish.
+    r_min_um : float, optional, µm
+        Inner radius of the first ring; by default the smallest that ``min_size_um`` allows.
+    n_rings : int, optional
+        Number of rings between ``r_min_um`` and ``r_max_um``, in the place of ``ring_ratio``.
+    ring_ratio : float, optional
+        Outer to inner radius of a ring; :func:`square_ring_ratio` by default.
+    stagger : bool
+        Turn every second ring by half a sector.
+    chords_per_arc : int
+        Straight edges that stand for an arc. The area is that of the arcs times ``sin(d)/d``, with d the angle of one
+        chord. Where ``stagger`` would set odd numbers of chords against each other, arcs get twice as many, so that
+        neighbours always share their corners and nothing is left open or covered twice.
+
+    Returns
+    -------
+    Layout
+        Ring by ring from the inside, with the columns ``ring``, ``sector``, ``readout_line`` (the sector: a spoke).
+        ``provenance`` tells ``blind_radius_um``, the inner radius of the first ring.
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range, or no ring fits.
+    """
+    n_sectors = check_count("n_sectors", n_sectors, at_least=3)
+    chords_per_arc = check_count("chords_per_arc", chords_per_arc, at_most=1000)
+    r_max_um = check_number("r_max_um", r_max_um, above=0.0)
+    for name, length_um in (("min_size_um", min_size_um), ("r_min_um", r_min_um)):
+        if length_um is not None:
+            check_number(name, length_um, above=0.0, at_most=r_max_um)
+    if r_min_um is None and min_size_um is None:
+        raise ParameterError("r_min_um", "or 'min_size_um' must be given: without either the rings would never end")
+    if n_rings is not None:
+        n_rings = check_count("n_rings", n_rings, at_most=MAX_SITES // n_sectors)
+        if ring_ratio is not None or r_min_um is None or not r_min_um < r_max_um:
+            raise ParameterError("n_rings", "takes 'r_min_um' below 'r_max_um', and no 'ring_ratio'", n_rings)
+        ratio = (r_max_um / r_min_um) ** (1.0 / n_rings)
+    elif ring_ratio is not None:
+        ratio = check_number("ring_ratio", ring_ratio, above=1.0)
+    else:
+        ratio = square_ring_ratio(n_sectors)
+
+    radii_um = _ring_radii_um(n_sectors, ratio, r_min_um, r_max_um, min_size_um, n_rings)
+    rings_um, ring, sector = _sites(radii_um, n_sectors, stagger, chords_per_arc)
+    return Layout.from_equal_rings(
+        rings_um,
+        {"ring": ring, "sector": sector, "readout_line": sector},
+        {
+            "generator": "log_polar",
+            "parameters": {
+                "n_sectors": n_sectors,
+                "r_max_um": r_max_um,
+                "min_size_um": min_size_um,
+                "r_min_um": r_min_um,
+                "n_rings": n_rings,
+                "ring_ratio": ring_ratio,
+                "stagger": stagger,
+                "chords_per_arc": chords_per_arc,
+            },
+            "blind_radius_um": float(radii_um[0]),
+        },
+    )
+
+
+def _ring_radii_um(
+    n_sectors: int,
+    ratio: float,
+    r_min_um: float | None,
+    r_max_um: float,
+    min_size_um: float | None,
+    n_rings: int | None,
+) -> Floats:
+    """Radii of the circles between the rings that are kept, (n_ring + 1,)."""
+    # Size of a site over its centre-line radius: its arc, less where rings are thinner than squarish ones.
+    half_height = (ratio - 1.0) / (ratio + 1.0)
+    size_per_radius = (2.0 * math.pi / n_sectors) * min(1.0, half_height / math.sin(math.pi / n_sectors))
+    smallest_um = 0.0 if min_size_um is None else min_size_um / size_per_radius * 2.0 / (1.0 + ratio)
+    first_um = smallest_um if r_min_um is None else r_min_um
+    rounding = 1.0 + 1e-12
+    n = math.log(r_max_um * rounding / first_um) / math.log(ratio) if first_um < r_max_um else 0.0
+    if (n + 1) * n_sectors > MAX_SITES:
+        raise ParameterError(
+            "ring_ratio", f"gives more than {MAX_SITES} sites", ratio, cure="take a larger ratio or r_min_um"
+        )
+    radii_um = first_um * np.power(ratio, np.arange((int(n) if n_rings is None else n_rings) + 1))
+    radii_um = radii_um[radii_um * rounding >= smallest_um]
+    if radii_um.size < 2:
+        raise ParameterError(
+            "r_max_um",
+            f"leaves no room for a ring: the first would reach from {max(first_um, smallest_um):g} to "
+            f"{max(first_um, smallest_um) * ratio:g} µm",
+            r_max_um,
+            "µm",
+            "enlarge it, or take fewer sectors or a smaller minimum size",
+        )
+    return radii_um
+
+
+def _sites(radii_um: Floats, n_sectors: int, stagger: bool, chords_per_arc: int) -> tuple[Floats, Ints, Ints]:
+    """Outlines (n_site, n_vertex, 2) µm, and the ring and sector of each."""
+    n_chords = chords_per_arc * (2 if stagger and chords_per_arc % 2 else 1)
+    # All corners lie on steps of a whole turn, so that neighbours' corners are equal bit for bit.
+    steps_per_sector = 2 * n_chords if stagger and n_chords % 2 else n_chords
+    n_steps = n_sectors * steps_per_sector
+    angle_rad = 2.0 * math.pi * np.arange(n_steps) / n_steps
+    direction = np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
+    ring, sector = (index.ravel() for index in np.divmod(np.arange((radii_um.size - 1) * n_sectors), n_sectors))
+    turn = np.where(stagger & (ring % 2 == 1), steps_per_sector // 2, 0)
+    start = sector * steps_per_sector + turn
+    arc = np.arange(0, steps_per_sector + 1, steps_per_sector // n_chords)
+    inner = direction[(start[:, np.newaxis] + arc[::-1]) % n_steps] * radii_um[ring][:, np.newaxis, np.newaxis]
+    outer = direction[(start[:, np.newaxis] + arc) % n_steps] * radii_um[ring + 1][:, np.newaxis, np.newaxis]
+    return np.concatenate((outer, inner), axis=1), ring, sector

@@ -1,0 +1,114 @@
+"""
+The optics' numba kernels: falloff and padding in one writing, the transfer function in one pass over a spectrum.
+
+They know arrays only, release the interpreter lock, and are compiled for explicit types when this module is
+imported; the machine code is cached on disk.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, types
+
+__all__ = ["expose", "transfer"]
+
+
+@njit(
+    [
+        types.void(
+            types.Array(cell, 2, "A", readonly=True),
+            types.Array(real, 1, "C", readonly=True),
+            types.Array(real, 1, "C", readonly=True),
+            types.int64,
+            types.Array(types.int64, 1, "C", readonly=True),
+            types.int64,
+            types.int64,
+            real[:, ::1],
+        )
+        for cell in (types.float32, types.float64)
+        for real in (types.float32, types.float64)
+    ],
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+)
+def expose(image, x2, y2, power, source_column, before, first_row, out):
+    """
+    Write some rows of a picture, from ``first_row`` on, times ``cos(theta) ** power``, padded on both sides.
+
+    ``x2`` and ``y2`` are (x0/H)² and (y0/H)² of the picture's columns and rows, so that ``cos² = 1 / (1 + x2 + y2)``.
+    ``source_column`` names the picture's column of each column of ``out``, -1 for darkness; the picture's own
+    column 0 comes to lie at column ``before``.
+    """
+    n_x = image.shape[1]
+    one = x2.dtype.type(1.0)
+    for row in range(out.shape[0]):
+        source = image[first_row + row]
+        line = out[row]
+        middle = line[before : before + n_x]
+        base = one + y2[first_row + row]
+        if power == 4:
+            for ix in range(n_x):
+                cos2 = one / (base + x2[ix])
+                middle[ix] = source[ix] * (cos2 * cos2)
+        else:
+            for ix in range(n_x):
+                cos2 = one / (base + x2[ix])
+                middle[ix] = source[ix] * (cos2 * np.sqrt(cos2))
+        for column in range(line.size):
+            if column < before or column >= before + n_x:
+                line[column] = middle[source_column[column]] if source_column[column] >= 0 else 0.0
+
+
+@njit(
+    [
+        types.void(
+            types.Array(c, 2, "C", readonly=True),
+            types.Array(r, 1, "C", readonly=True),
+            r,
+            types.Array(r, 2, "C", readonly=True),
+            types.Array(r, 2, "C", readonly=True),
+            types.Array(r, 2, "C", readonly=True),
+            types.Array(r, 2, "C", readonly=True),
+            types.boolean,
+            types.int64,
+            types.int64,
+            c[:, ::1],
+        )
+        for c, r in ((types.complex64, types.float32), (types.complex128, types.float64))
+    ],
+    cache=True,
+    nogil=True,
+)
+def transfer(spectrum, table, per_step, fx, fy, gain_x, gain_y, is_added, first_row, last_row, out):
+    """
+    ``out = spectrum * H`` or ``out += spectrum * H`` over some rows of frequencies.
+
+    ``H`` is a sum over the aliases ``k`` of each frequency: ``table(|f + k|) * gain_x[k] * gain_y[k]``. The table
+    holds a radial function at equal steps, 0 beyond its end; ``per_step`` is steps over frequency.
+    ``fx``, ``gain_x`` are (n_alias, n_x) and ``fy``, ``gain_y`` (n_alias, n_y). ``out`` may be ``spectrum``.
+    """
+    n_alias, n_x = fx.shape
+    last = table.size - 1
+    h = np.empty(n_x, table.dtype)
+    for row in range(first_row, last_row):
+        h[:] = 0.0
+        for ky in range(n_alias):
+            v = fy[ky, row] * per_step
+            if abs(v) >= last:
+                continue
+            for kx in range(n_alias):
+                for ix in range(n_x):
+                    u = fx[kx, ix] * per_step
+                    r = np.sqrt(u * u + v * v)
+                    i = int(min(r, table.dtype.type(last)))
+                    t = r - i
+                    a = table[i]
+                    b = table[min(i + 1, last)]
+                    h[ix] += (a + t * (b - a)) * gain_x[kx, ix] * gain_y[ky, row] if i < last else table.dtype.type(0.0)
+        if is_added:
+            for ix in range(n_x):
+                out[row, ix] += spectrum[row, ix] * h[ix]
+        else:
+            for ix in range(n_x):
+                out[row, ix] = spectrum[row, ix] * h[ix]

@@ -1,0 +1,390 @@
+"""The lens: from the light of a scene to the light on the sensor plane."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from types import ModuleType
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from foveasim.arrays import Floats, Images, Ints, check_choice, check_count, check_number
+from foveasim.errors import ParameterError, SamplingWarning, SimulationError
+from foveasim.fields import Grid, PowerMap, SceneLike
+from foveasim.optics.otf import circular_otf
+from foveasim.parallel import each, thread_count
+from foveasim.units import m_from_mm, m_from_um, um_from_nm
+
+__all__ = ["Optics"]
+
+#: Points of a radial table of transfer factors. Linear interpolation errs by less than 1e-7 (float32; the table
+#: fits the first-level cache) and 1e-9 (float64), relative to the factor at zero frequency.
+TABLE_POINTS = {"single": 1 << 13, "double": 1 << 15}
+#: Default padding: the radius that holds all but this share of a point's light ...
+LOST_SHARE = 0.01
+#: ... which for a clear circle is about ``2 / (π² share)`` in units of wavelength x f-number.
+REACH_SHARE = 2.0 / math.pi**2
+#: The paper's Eq. 5 asks for an aperture radius much larger than H λ / (p0 min(M, N)): this many times.
+MUCH_LARGER = 10.0
+#: Rows that one thread works on at a time.
+ROWS_PER_PIECE = 64
+
+_PADDING: dict[str, dict[str, Any]] = {
+    "reflect": {"mode": "reflect"},
+    "edge": {"mode": "edge"},
+    "zero": {"mode": "constant", "constant_values": -1},
+    "periodic": {"mode": "wrap"},
+}
+
+
+@cache
+def kernels() -> ModuleType:
+    """The compiled kernels; loaded when first needed, since numba takes a second."""
+    from foveasim.optics import _kernels
+
+    return _kernels
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Optics:
+    """
+    A thin lens with a clear circular pupil, in focus.
+
+    Parameters
+    ----------
+    focal_length_mm : float, mm
+    f_number : float
+        As engraved on the lens: focal length over pupil diameter.
+    emission : {"lambertian", "isotropic"}
+        ``"lambertian"``: the scene has a radiance L that is the same in all directions; irradiance falls as cos⁴ and
+        is ``π L / (1 + 4 N²)`` on the axis, N the image-side f-number. ``"isotropic"``: Eq. 3 of the paper, points
+        that radiate L (W/m²) evenly into a hemisphere; it falls as cos³ and is ``L / (8 N²)`` on the axis.
+    transmission : float
+        Share of the light that the glass lets through.
+    source_pixel : {"point", "square"}
+        Whether a picture's pixel shines from its centre (the paper) or evenly from its square.
+    padding : {"reflect", "edge", "zero", "periodic"}
+        What lies beyond the picture. ``"periodic"`` adds nothing: light that leaves on one side enters on the other,
+        so that none is lost.
+    padding_cells : int, optional
+        Width of the padding; by default the radius that holds 99 % of a point's light.
+    precision : {"single", "double"}
+        Of the Fourier transforms and the maps.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range.
+
+    Notes
+    -----
+    Each cell of a map is the *mean* irradiance over the cell: the point spread function is integrated over the cell
+    exactly, whatever its size (for cells wider than λN/2 the aliases of every frequency are summed).
+
+    The Gauss conditions (pupil much smaller than the distances, small angles) make the point spread function the same
+    all over the field, so a map is ``IFFT(FFT(scene * falloff) * OTF)``. On the axis the light that the pupil takes is
+    exact for any aperture; the small-angle form ``π L / 4 N²`` is its limit.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
+
+    focal_length_mm: float
+    f_number: float
+    emission: Literal["lambertian", "isotropic"] = "lambertian"
+    transmission: float = 1.0
+    source_pixel: Literal["point", "square"] = "point"
+    padding: Literal["reflect", "edge", "zero", "periodic"] = "reflect"
+    padding_cells: int | None = None
+    precision: Literal["single", "double"] = "single"
+
+    def __post_init__(self) -> None:
+        check_number("focal_length_mm", self.focal_length_mm, above=0.0, at_most=1e6)
+        check_number("f_number", self.f_number, above=0.0, at_most=1e4)
+        check_choice("emission", self.emission, ("lambertian", "isotropic"))
+        check_number("transmission", self.transmission, above=0.0, at_most=1.0)
+        check_choice("source_pixel", self.source_pixel, ("point", "square"))
+        check_choice("padding", self.padding, tuple(_PADDING))
+        if self.padding_cells is not None:
+            check_count("padding_cells", self.padding_cells, at_least=0, at_most=2**20)
+        check_choice("precision", self.precision, ("single", "double"))
+
+    # -- geometry -------------------------------------------------------------------------------------------------
+
+    def magnification(self, distance_m: float) -> float:
+        """
+        Size of the image over the size of the scene, ``D / H`` with ``1/f = 1/H + 1/D``.
+
+        Raises
+        ------
+        ParameterError
+            When the scene is not further away than the focal length.
+        """
+        focal_m = float(m_from_mm(self.focal_length_mm))
+        distance_m = check_number("distance_m", distance_m, above=0.0)
+        if distance_m <= focal_m:
+            raise ParameterError(
+                "distance_m",
+                f"must be larger than the focal length, {focal_m:g} m, for an image to form",
+                distance_m,
+                "m",
+            )
+        return focal_m / (distance_m - focal_m)
+
+    def working_f_number(self, distance_m: float) -> float:
+        """Image-side f-number ``D / 2a`` when focused at a distance: the engraved one times (1 + magnification)."""
+        return self.f_number * (1.0 + self.magnification(distance_m))
+
+    def grid(self, scene: SceneLike) -> Grid:
+        """The sensor-plane grid on which a scene's pixels are imaged, upright and centred on the axis."""
+        shape = scene.basis.shape
+        return Grid.centred((shape[1], shape[2]), scene.pitch_um * self.magnification(scene.distance_m))
+
+    def irradiance_per_radiance(self, distance_m: float) -> float:
+        """Irradiance on the axis over the scene's radiance (sr), transmission included."""
+        n = self.working_f_number(distance_m)
+        gain = math.pi / (1.0 + 4.0 * n * n) if self.emission == "lambertian" else 1.0 / (8.0 * n * n)
+        return gain * self.transmission
+
+    # -- light ----------------------------------------------------------------------------------------------------
+
+    def power_map(self, scene: SceneLike, *, n_threads: int | None = None) -> PowerMap:
+        """
+        Irradiance on the sensor plane, one map for each wavelength.
+
+        Parameters
+        ----------
+        scene : Scene
+        n_threads : int, optional
+            All cores by default.
+
+        Returns
+        -------
+        PowerMap
+            (n_wavelength, n_y, n_x), float32 or float64 as ``precision`` says, W/m² within each wavelength's band.
+
+        Raises
+        ------
+        ParameterError, SimulationError
+            When the scene is too near, or not finite.
+        """
+        n_bands = scene.wavelength_nm.size
+        data = np.empty((n_bands, *scene.basis.shape[1:]), self._real_type())
+        for band, cells in enumerate(self.weighted_maps(scene, np.eye(n_bands), n_threads=n_threads)):
+            data[band] = cells
+        return PowerMap(data, self.grid(scene), scene.wavelength_nm)
+
+    def weighted_maps(
+        self, scene: SceneLike, weights: Floats, *, n_threads: int | None = None
+    ) -> Iterator[NDArray[Any]]:
+        """
+        Weighted sums of the power maps of all wavelengths, one after the other.
+
+        Parameters
+        ----------
+        scene : Scene
+        weights : (n_output, n_wavelength) float64
+            Output c is ``sum_k weights[c, k] * power_map[k]``.
+        n_threads : int, optional
+            All cores by default.
+
+        Yields
+        ------
+        map : (n_y, n_x) float32 or float64
+
+        Notes
+        -----
+        Since a sum over wavelengths can be taken before the inverse transform, and the scene is a sum of B basis
+        images, the cost is B forward transforms and one inverse transform an output, for any number of wavelengths.
+        """
+        weights = np.asarray(weights, dtype=np.float64)
+        n_threads = thread_count(n_threads)
+        working_n = self.working_f_number(scene.distance_m)
+        cutoff_per_um = 1.0 / (um_from_nm(scene.wavelength_nm) * working_n)
+        grid = self.grid(scene)
+        self._warn_if_too_small(cutoff_per_um, grid)
+
+        transform = _Transform(
+            shape=grid.shape,
+            rows=self._source_pixels(grid.shape[0], float(cutoff_per_um.min()), grid),
+            columns=self._source_pixels(grid.shape[1], float(cutoff_per_um.min()), grid),
+            pitch_um=grid.pitch_um,
+            f_max_per_um=float(cutoff_per_um.max()),
+            sinc_power=1 if self.source_pixel == "point" else 2,
+            real=self._real_type(),
+            n_threads=n_threads,
+        )
+        table_of = _RadialTables(cutoff_per_um, TABLE_POINTS[self.precision], self._real_type())
+        light = scene.spectrum_w_m2_sr_nm * scene.band_width_nm * self.irradiance_per_radiance(scene.distance_m)
+        is_needed = np.array([[bool(np.any(output * spectrum)) for spectrum in light] for output in weights], bool)
+        spectra: dict[int, NDArray[Any]] = {}
+        for c, output in enumerate(weights):
+            total: NDArray[Any] | None = None
+            for b in (int(b) for b in np.flatnonzero(is_needed[c])):
+                if b not in spectra:
+                    spectra[b] = transform.forward(
+                        scene.basis[b], *self._squared_tangents(scene), self._falloff_power()
+                    )
+                # The last use of a spectrum may overwrite it.
+                is_last_use = not is_needed[c + 1 :, b].any()
+                is_first_term = total is None
+                if total is None:
+                    total = spectra[b] if is_last_use else np.empty_like(spectra[b])
+                transform.multiply(spectra[b], *table_of(output * light[b]), total, is_added=not is_first_term)
+                if is_last_use:
+                    del spectra[b]
+            yield np.zeros(grid.shape, self._real_type()) if total is None else transform.inverse(total)
+
+    # -- parts ----------------------------------------------------------------------------------------------------
+
+    def _real_type(self) -> type[np.floating[Any]]:
+        return np.float32 if self.precision == "single" else np.float64
+
+    def _warn_if_too_small(self, cutoff_per_um: Floats, grid: Grid) -> None:
+        """Warn where the paper's Eq. 5, a >> H λ / (p0 min(M, N)), does not hold."""
+        # On the sensor side the ratio of its two sides is min(M, N) p / (2 λ N).
+        ratio = 0.5 * min(grid.shape) * grid.pitch_um * float(cutoff_per_um.min())
+        if ratio < MUCH_LARGER:
+            warnings.warn(
+                f"the aperture's radius is only {ratio:.3g} times H λ / (p0 min(M, N)) (Eq. 5 asks for much more, here "
+                f"{MUCH_LARGER:g} times): the diffraction pattern is not small against the picture; take a larger picture "
+                "or a smaller f-number",
+                SamplingWarning,
+                stacklevel=4,
+            )
+
+    def _source_pixels(self, n: int, cutoff_per_um: float, grid: Grid) -> Ints:
+        """Along one axis, the scene's pixel that each padded cell shows; -1 is darkness."""
+        if self.padding == "periodic":
+            return np.arange(n)
+        if self.padding_cells is None:
+            pad = math.ceil(REACH_SHARE / LOST_SHARE / (cutoff_per_um * grid.pitch_um))
+        else:
+            pad = self.padding_cells
+        extra = int(scipy.fft.next_fast_len(n + 2 * pad, real=True)) - n
+        return np.pad(np.arange(n), (extra // 2, extra - extra // 2), **_PADDING[self.padding])
+
+    def _squared_tangents(self, scene: SceneLike) -> tuple[Floats, Floats]:
+        """(x0/H)² of the scene's columns and (y0/H)² of its rows."""
+        _, n_y, n_x = scene.basis.shape
+        step = float(m_from_um(scene.pitch_um)) / scene.distance_m
+        return ((np.arange(n_x) - 0.5 * (n_x - 1)) * step) ** 2, ((np.arange(n_y) - 0.5 * (n_y - 1)) * step) ** 2
+
+    def _falloff_power(self) -> int:
+        return 4 if self.emission == "lambertian" else 3
+
+
+class _RadialTables:
+    """Makes tables of ``sum_k weight[k] * OTF_k(|f|)`` over ``|f|`` at equal steps, the last one beyond every cut-off."""
+
+    def __init__(self, cutoff_per_um: Floats, n_points: int, real: type[np.floating[Any]]) -> None:
+        self.f_max_per_um = float(cutoff_per_um.max())
+        self._real = real
+        self._otf = circular_otf(np.linspace(0.0, self.f_max_per_um, n_points) / cutoff_per_um[:, np.newaxis])
+
+    def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
+        """The table, and its steps over frequency (µm)."""
+        return (weight @ self._otf).astype(self._real), (self._otf.shape[1] - 1) / self.f_max_per_um
+
+
+class _Transform:
+    """
+    Fourier transforms of pictures of one size and what is done to their spectra, with nothing computed that is not used.
+
+    A spectrum has the padded number of rows, and only the columns whose frequencies pass the pupil; the rows of the
+    padding are copies of the picture's, so neither they nor the padded picture are ever transformed or stored.
+    """
+
+    def __init__(
+        self,
+        *,
+        shape: tuple[int, int],
+        rows: Ints,
+        columns: Ints,
+        pitch_um: float,
+        f_max_per_um: float,
+        sinc_power: int,
+        real: type[np.floating[Any]],
+        n_threads: int,
+    ) -> None:
+        self._shape, self._rows, self._columns = shape, rows, columns
+        self._real, self._n_threads = real, n_threads
+        # Points at cell centres have a spectrum that repeats with 1/p. The mean over a cell multiplies frequency f by
+        # sinc(f p), a square source pixel once more; each alias f + k/p passes with the pupil's factor at f + k/p.
+        n_alias = max(0, math.ceil(f_max_per_um * pitch_um - 0.5))
+        k = np.arange(-n_alias, n_alias + 1)[:, np.newaxis]
+        cycles_y = scipy.fft.fftfreq(rows.size) + k
+        cycles_x = scipy.fft.rfftfreq(columns.size) + k
+        if n_alias == 0:
+            cycles_x = cycles_x[:, : int(np.searchsorted(cycles_x[0], f_max_per_um * pitch_um)) + 1]
+        self._n_columns = cycles_x.shape[1]
+        self._fx_per_um, self._fy_per_um = (cycles_x / pitch_um).astype(real), (cycles_y / pitch_um).astype(real)
+        self._gain_x, self._gain_y = ((np.sinc(c) ** sinc_power).astype(real) for c in (cycles_x, cycles_y))
+
+    def _each_rows(self, work: Callable[[int, int], None], n_rows: int) -> None:
+        each(
+            lambda first: work(first, min(first + ROWS_PER_PIECE, n_rows)),
+            range(0, n_rows, ROWS_PER_PIECE),
+            self._n_threads,
+        )
+
+    def forward(self, image: Images, x2: Floats, y2: Floats, falloff_power: int) -> NDArray[Any]:
+        """Spectrum of a picture with falloff and padding."""
+        n_y, n_x = self._shape
+        top, left = (self._rows.size - n_y) // 2, (self._columns.size - n_x) // 2
+        spectrum = np.empty((self._rows.size, self._n_columns), np.result_type(self._real, np.complex64))
+        x2, y2 = x2.astype(self._real), y2.astype(self._real)
+
+        def some_rows(first: int, last: int) -> None:
+            padded = np.empty((last - first, self._columns.size), self._real)
+            kernels().expose(image, x2, y2, falloff_power, self._columns, left, first, padded)
+            spectrum[top + first : top + last] = scipy.fft.rfft(padded, axis=1, overwrite_x=True)[:, : self._n_columns]
+
+        self._each_rows(some_rows, n_y)
+        for row in (*range(top), *range(top + n_y, self._rows.size)):
+            spectrum[row] = spectrum[top + self._rows[row]] if self._rows[row] >= 0 else 0.0
+        spectrum = scipy.fft.fft(spectrum, axis=0, overwrite_x=True, workers=self._n_threads)
+        if not np.isfinite(spectrum[0, 0]):
+            raise SimulationError("the scene has values that are not finite")
+        return spectrum
+
+    def multiply(
+        self, spectrum: NDArray[Any], table: NDArray[Any], per_step: float, out: NDArray[Any], *, is_added: bool
+    ) -> None:
+        """Write a spectrum times a radial table to ``out``, or add it; ``out`` may be the spectrum."""
+
+        def some_rows(first: int, last: int) -> None:
+            kernels().transfer(
+                spectrum,
+                table,
+                self._real(per_step),
+                self._fx_per_um,
+                self._fy_per_um,
+                self._gain_x,
+                self._gain_y,
+                is_added,
+                first,
+                last,
+                out,
+            )
+
+        self._each_rows(some_rows, spectrum.shape[0])
+
+    def inverse(self, spectrum: NDArray[Any]) -> NDArray[Any]:
+        """The picture of a spectrum, without its padding; the spectrum is used up."""
+        n_y, n_x = self._shape
+        top, left = (self._rows.size - n_y) // 2, (self._columns.size - n_x) // 2
+        lines = scipy.fft.ifft(spectrum, axis=0, overwrite_x=True, workers=self._n_threads)
+        image = np.empty(self._shape, self._real)
+
+        def some_rows(first: int, last: int) -> None:
+            padded = scipy.fft.irfft(lines[top + first : top + last], n=self._columns.size, axis=1)
+            image[first:last] = padded[:, left : left + n_x]
+
+        self._each_rows(some_rows, n_y)
+        return image

@@ -1,0 +1,45 @@
+"""Threads: how many there are, and one way to spread independent pieces of work over them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+from foveasim.arrays import check_count
+
+__all__ = ["each", "thread_count"]
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
+def thread_count(n_threads: int | None = None) -> int:
+    """
+    The number of threads to use: the one asked for, or all the cores that this process may use.
+
+    Raises
+    ------
+    ParameterError
+        When it is not a whole number of at least 1.
+    """
+    if n_threads is not None:
+        return check_count("n_threads", n_threads)
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def each(work: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: int) -> list[_Result]:
+    """
+    ``[work(item) for item in items]`` on several threads; the first error is raised.
+
+    The pieces must not depend on each other, nor their sizes on ``n_threads``: that is what makes results the
+    same, bit for bit, for any number of threads.
+    """
+    items = list(items)
+    if n_threads == 1 or len(items) <= 1:
+        return [work(item) for item in items]
+    with ThreadPoolExecutor(min(n_threads, len(items))) as pool:
+        return list(pool.map(work, items))

@@ -1,0 +1,49 @@
+"""What a result was made from, as plain data that can be written to a file: settings and versions."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from foveasim._version import __version__
+
+__all__ = ["described", "versions"]
+
+#: Arrays up to this size are written out; of longer ones the shape and a checksum are kept.
+WRITTEN_OUT = 64
+
+
+def described(value: Any) -> Any:
+    """
+    Plain data (numbers, text, lists, dicts) that tells what an object is.
+
+    A dataclass becomes a dict of its fields and its class; a long array its shape, type and SHA-256.
+    """
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        if value.size <= WRITTEN_OUT:
+            return value.tolist()
+        digest = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+        return {"shape": list(value.shape), "dtype": str(value.dtype), "sha256": digest}
+    if isinstance(value, Mapping):
+        return {str(key): described(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [described(item) for item in value]
+    if is_dataclass(value):
+        return {"kind": type(value).__name__, **{f.name: described(getattr(value, f.name)) for f in fields(value)}}
+    return repr(value)
+
+
+def versions() -> dict[str, str]:
+    """Versions of the package, of Python, and of the libraries that results depend on."""
+    libraries = {name: version(name) for name in ("numpy", "scipy", "numba", "shapely")}
+    return {"foveasim": __version__, "python": platform.python_version(), **libraries}

@@ -1,0 +1,347 @@
+"""The scene: light from a plane in front of the lens."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim.arrays import Floats, Images, check_choice, check_number, finite_array, read_only
+from foveasim.errors import FileError, ParameterError
+from foveasim.fields import from_file_rows
+from foveasim.pictures import read_picture
+
+__all__ = ["Scene", "decoded"]
+
+#: Wavelengths that a colour picture's red, green and blue stand for, and a grey one's, unless told otherwise.
+RGB_NM = (620.0, 550.0, 450.0)
+GREY_NM = (550.0,)
+#: Weights of red, green and blue in the brightness of a colour (Rec. ITU-R BT.709).
+BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722], np.float32)
+
+Encoding = Literal["srgb", "sqrt", "linear"]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """
+    Light from a plane at some distance in front of the lens.
+
+    Usually made by :meth:`from_picture`, :meth:`flat` or :meth:`point_sources`.
+
+    Parameters
+    ----------
+    basis : (n_basis, n_y, n_x) float32 or float64
+        Images, row 0 lowest, values of at least 0.
+    spectrum_w_m2_sr_nm : (n_basis, n_wavelength) float64, W/(m² sr nm)
+        The spectral radiance that the value 1 of each image stands for.
+    wavelength_nm : (n_wavelength,) float64, nm
+    band_width_nm : (n_wavelength,) float64, nm
+        Width of the band that each wavelength stands for.
+    pitch_um : float, µm
+        Distance of two pixels in the scene.
+    distance_m : float, m
+        Distance of the scene from the lens's pupil.
+
+    Raises
+    ------
+    ParameterError
+        When the arrays do not fit together, are not finite, or negative.
+
+    Notes
+    -----
+    Spectral radiance of pixel [iy, ix] at wavelength k: ``sum_b basis[b, iy, ix] * spectrum[b, k]``.
+    """
+
+    basis: Images
+    spectrum_w_m2_sr_nm: Floats
+    wavelength_nm: Floats
+    band_width_nm: Floats
+    pitch_um: float
+    distance_m: float
+    source: str = field(default="arrays", kw_only=True)
+
+    def __post_init__(self) -> None:
+        basis = np.asarray(self.basis)
+        if basis.dtype not in (np.float32, np.float64):
+            basis = basis.astype(np.float64)
+        if basis.ndim != 3 or 0 in basis.shape:
+            raise ParameterError("basis", f"must have the shape (n_basis, n_y, n_x), got {basis.shape}")
+        lowest, highest = float(basis.min()), float(basis.max())
+        if not (np.isfinite(lowest) and np.isfinite(highest)):
+            raise ParameterError("basis", "must be finite everywhere; the picture has a NaN or an infinity")
+        if lowest < 0.0:
+            raise ParameterError("basis", "must be >= 0 everywhere, since light is not negative", lowest)
+        wavelength_nm = finite_array("wavelength_nm", np.atleast_1d(self.wavelength_nm), ndim=1, above=0.0)
+        width_nm = finite_array("band_width_nm", np.atleast_1d(self.band_width_nm), ndim=1, above=0.0)
+        spectrum = finite_array("spectrum_w_m2_sr_nm", self.spectrum_w_m2_sr_nm, ndim=2, at_least=0.0)
+        if width_nm.shape != wavelength_nm.shape:
+            raise ParameterError(
+                "band_width_nm", f"must have one width for each of the {wavelength_nm.size} wavelengths", width_nm
+            )
+        if spectrum.shape != (basis.shape[0], wavelength_nm.size):
+            raise ParameterError(
+                "spectrum_w_m2_sr_nm",
+                f"must have the shape (n_basis, n_wavelength) = {(basis.shape[0], wavelength_nm.size)}, got {spectrum.shape}",
+            )
+        object.__setattr__(self, "basis", read_only(basis.view()))
+        object.__setattr__(self, "spectrum_w_m2_sr_nm", read_only(spectrum.copy()))
+        object.__setattr__(self, "wavelength_nm", read_only(wavelength_nm.copy()))
+        object.__setattr__(self, "band_width_nm", read_only(width_nm.copy()))
+        object.__setattr__(self, "pitch_um", check_number("pitch_um", self.pitch_um, above=0.0, at_most=1e9))
+        object.__setattr__(self, "distance_m", check_number("distance_m", self.distance_m, above=0.0, at_most=1e9))
+
+    def __repr__(self) -> str:
+        n_basis, n_y, n_x = self.basis.shape
+        return (
+            f"Scene({n_x} x {n_y} pixels of {self.pitch_um:g} µm at {self.distance_m:g} m, {n_basis} basis images, "
+            f"{self.wavelength_nm.size} wavelengths, from {self.source})"
+        )
+
+    @classmethod
+    def from_picture(
+        cls,
+        picture: str | Path | ArrayLike,
+        *,
+        pitch_um: float,
+        distance_m: float,
+        peak_radiance_w_m2_sr_nm: float,
+        wavelength_nm: Sequence[float] | None = None,
+        band_width_nm: float | Sequence[float] | None = None,
+        spectrum: Sequence[Sequence[float]] | Floats | None = None,
+        encoding: Encoding = "srgb",
+    ) -> Scene:
+        """
+        Scene from a photograph.
+
+        Parameters
+        ----------
+        picture : path, or (n_y, n_x) or (n_y, n_x, n_channel) array
+            A file, or an array as image libraries give it, the first row on top: grey or colour, with alpha or without.
+            8-bit and 16-bit numbers reach from 0 to the type's maximum; of floating-point numbers 1 is the peak, and more
+            is allowed. What is transparent gives no light.
+        pitch_um : float, µm
+            Distance of two pixels in the scene.
+        distance_m : float, m
+            Distance of the scene from the lens.
+        peak_radiance_w_m2_sr_nm : float, W/(m² sr nm)
+            Spectral radiance of the value 1 (where ``spectrum`` is given: of the value 1 in it).
+        wavelength_nm : sequence, optional, nm
+            One a channel; (620, 550, 450) for colour and 550 for grey by default. A grey picture shines alike at all of
+            them; a colour one at one wavelength is first made grey. With ``spectrum`` any number.
+        band_width_nm : number or sequence, optional, nm
+            Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+        spectrum : (n_channel, n_wavelength), optional
+            Relative spectrum that each channel's value 1 stands for.
+        encoding : {"srgb", "sqrt", "linear"}
+            What the numbers are: sRGB (photographs), the square root of the radiance (the paper), the radiance.
+
+        Raises
+        ------
+        FileError
+            When the file cannot be read.
+        ParameterError
+            When channels, wavelengths and spectra do not fit together, or a value is out of range.
+        """
+        check_choice("encoding", encoding, ("srgb", "sqrt", "linear"))
+        peak = check_number("peak_radiance_w_m2_sr_nm", peak_radiance_w_m2_sr_nm, above=0.0)
+        is_file = isinstance(picture, str | Path)
+        pixels = read_picture(picture) if is_file else np.asarray(picture)  # type: ignore[arg-type]
+        if (
+            pixels.ndim not in (2, 3)
+            or 0 in pixels.shape
+            or (pixels.ndim == 3 and pixels.shape[2] > 4 and spectrum is None)
+        ):
+            raise ParameterError(
+                "picture", f"must have the shape (n_y, n_x) or (n_y, n_x, 1 to 4 channels), got {pixels.shape}"
+            )
+        try:
+            channels = _light(pixels, encoding, has_alpha=pixels.ndim == 3 and pixels.shape[2] in (2, 4))
+        except ParameterError as error:
+            raise (FileError(str(picture), str(error)) if is_file else error) from None
+        n_channels = channels.shape[0]
+        if wavelength_nm is None:
+            wavelength_nm = RGB_NM if n_channels == 3 else GREY_NM
+        waves_nm = finite_array("wavelength_nm", np.atleast_1d(np.asarray(wavelength_nm)), ndim=1, above=0.0)
+        if spectrum is not None:
+            relative = finite_array("spectrum", spectrum, ndim=2, at_least=0.0)
+            if relative.shape != (n_channels, waves_nm.size):
+                raise ParameterError(
+                    "spectrum",
+                    f"must have the shape (n_channel, n_wavelength) = {(n_channels, waves_nm.size)}, got {relative.shape}",
+                )
+        elif n_channels == waves_nm.size:
+            relative = np.eye(n_channels)
+        elif n_channels == 1:
+            relative = np.ones((1, waves_nm.size))
+        elif n_channels == 3 and waves_nm.size == 1:
+            channels, relative = np.tensordot(BRIGHTNESS, channels, axes=1)[np.newaxis], np.ones((1, 1))
+        else:
+            raise ParameterError(
+                "wavelength_nm",
+                f"must have as many values as the picture has channels, {n_channels}, or one",
+                list(waves_nm),
+                "nm",
+                "or give 'spectrum', the spectrum of each channel",
+            )
+        return cls(
+            channels,
+            peak * relative,
+            waves_nm,
+            _band_widths_nm(waves_nm, band_width_nm),
+            pitch_um,
+            distance_m,
+            source=str(picture) if is_file else "a picture array",
+        )
+
+    @classmethod
+    def flat(
+        cls,
+        *,
+        shape: tuple[int, int],
+        pitch_um: float,
+        distance_m: float,
+        radiance_w_m2_sr_nm: float,
+        wavelength_nm: Sequence[float] = GREY_NM,
+        band_width_nm: float | Sequence[float] | None = None,
+    ) -> Scene:
+        """
+        Scene of the same spectral radiance everywhere and at every wavelength.
+
+        Parameters
+        ----------
+        shape : (n_y, n_x)
+        pitch_um, distance_m, wavelength_nm, band_width_nm
+            As for :meth:`from_picture`.
+        radiance_w_m2_sr_nm : float, W/(m² sr nm)
+
+        Raises
+        ------
+        ParameterError
+            When a value is out of range.
+        """
+        return cls.from_picture(
+            np.ones(shape, np.float32),
+            pitch_um=pitch_um,
+            distance_m=distance_m,
+            peak_radiance_w_m2_sr_nm=radiance_w_m2_sr_nm,
+            wavelength_nm=wavelength_nm,
+            band_width_nm=band_width_nm,
+            encoding="linear",
+        )
+
+    @classmethod
+    def point_sources(
+        cls,
+        *,
+        shape: tuple[int, int],
+        pixels: Sequence[tuple[int, int]],
+        intensity_w_sr_nm: float | Sequence[float],
+        pitch_um: float,
+        distance_m: float,
+        wavelength_nm: Sequence[float] = GREY_NM,
+        band_width_nm: float | Sequence[float] | None = None,
+    ) -> Scene:
+        """
+        Dark scene with points of light.
+
+        Parameters
+        ----------
+        shape : (n_y, n_x)
+        pixels : sequence of (iy, ix)
+            The pixels that shine; row 0 is the lowest.
+        intensity_w_sr_nm : number, or one a point, W/(sr nm)
+            Spectral radiant intensity of the points.
+        pitch_um, distance_m, wavelength_nm, band_width_nm
+            As for :meth:`from_picture`.
+
+        Raises
+        ------
+        ParameterError
+            When a pixel lies outside, or a value is out of range.
+        """
+        pitch_um = check_number("pitch_um", pitch_um, above=0.0)
+        points = np.asarray(pixels)
+        if points.ndim != 2 or points.shape[1] != 2 or points.dtype.kind not in "iu":
+            raise ParameterError("pixels", "must be pairs (iy, ix) of whole numbers", pixels)
+        if np.any(points < 0) or np.any(points >= np.asarray(shape)):
+            raise ParameterError("pixels", f"must lie in a picture of {shape[0]} rows and {shape[1]} columns", pixels)
+        intensity = finite_array("intensity_w_sr_nm", intensity_w_sr_nm, at_least=0.0)
+        if intensity.ndim > 1 or (intensity.ndim == 1 and intensity.size != points.shape[0]):
+            raise ParameterError(
+                "intensity_w_sr_nm", f"must be one number, or one for each of the {points.shape[0]} points"
+            )
+        image = np.zeros((1, *shape))
+        np.add.at(image[0], (points[:, 0], points[:, 1]), intensity)
+        waves_nm = finite_array("wavelength_nm", np.atleast_1d(np.asarray(wavelength_nm)), ndim=1, above=0.0)
+        # A pixel of the pitch p0 with the radiance I / p0² has the intensity I.
+        per_area = np.full((1, waves_nm.size), 1.0 / (pitch_um * 1e-6) ** 2)
+        return cls(
+            image,
+            per_area,
+            waves_nm,
+            _band_widths_nm(waves_nm, band_width_nm),
+            pitch_um,
+            distance_m,
+            source="point sources",
+        )
+
+
+def decoded(values: Floats, encoding: Encoding) -> Floats:
+    """Relative radiance of encoded values; sRGB as in IEC 61966-2-1, continued above 1."""
+    if encoding == "sqrt":
+        return values * values
+    if encoding == "srgb":
+        return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    return values
+
+
+def _light(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Images:
+    """Relative radiance (n_channel, n_y, n_x) float32 of a picture as in its file, transparency taken off."""
+    if pixels.dtype == np.bool_:
+        pixels = pixels.astype(np.uint8) * np.uint8(255)
+    if pixels.dtype in (np.uint8, np.uint16):
+        peak = float(np.iinfo(pixels.dtype).max)
+        table = decoded(np.arange(peak + 1) / peak, encoding).astype(np.float32)
+        values = np.arange(peak + 1, dtype=np.float32) / np.float32(peak)
+        colours = pixels[..., :-1] if has_alpha else pixels
+        light = table[np.ascontiguousarray(from_file_rows(colours))]
+        alpha = values[from_file_rows(pixels[..., -1])] if has_alpha else None
+    elif pixels.dtype.kind == "f":
+        if not np.isfinite(pixels).all() or pixels.min() < 0:
+            raise ParameterError("picture", "must be finite and >= 0 everywhere")
+        colours = pixels[..., :-1] if has_alpha else pixels
+        light = decoded(np.ascontiguousarray(from_file_rows(colours)), encoding).astype(np.float32)
+        alpha = from_file_rows(pixels[..., -1]).astype(np.float32) if has_alpha else None
+    else:
+        raise ParameterError("picture", f"must hold uint8, uint16 or floating-point numbers, got {pixels.dtype}")
+    if alpha is not None:
+        light *= alpha
+    return light
+
+
+def _band_widths_nm(wavelength_nm: Floats, band_width_nm: float | Sequence[float] | None) -> Floats:
+    """Widths as given, or reaching half-way to the neighbouring wavelengths."""
+    if band_width_nm is not None:
+        widths = finite_array("band_width_nm", band_width_nm, above=0.0)
+        if widths.ndim > 1 or (widths.ndim == 1 and widths.size != wavelength_nm.size):
+            raise ParameterError(
+                "band_width_nm", f"must be one number, or one for each of the {wavelength_nm.size} wavelengths"
+            )
+        return np.broadcast_to(widths, wavelength_nm.shape).astype(np.float64)
+    if wavelength_nm.size == 1:
+        raise ParameterError(
+            "band_width_nm", "must be given for a single wavelength: it has no neighbours to reach half-way to"
+        )
+    order = np.argsort(wavelength_nm)
+    steps = np.diff(wavelength_nm[order])
+    if np.any(steps <= 0):
+        raise ParameterError("wavelength_nm", "must be different from each other", wavelength_nm.tolist(), "nm")
+    # The outermost bands reach as far out as they reach in.
+    widths = np.empty(wavelength_nm.size)
+    widths[order] = 0.5 * (np.concatenate((steps[:1], steps)) + np.concatenate((steps, steps[-1:])))
+    return widths

@@ -1,0 +1,48 @@
+"""Random numbers: one stream for each effect, named, so that an effect more or less leaves all others as they were."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from zlib import crc32
+
+import numpy as np
+
+from foveasim.arrays import check_count
+
+__all__ = ["Streams"]
+
+
+@dataclass(frozen=True, slots=True)
+class Streams:
+    """
+    The random streams of one frame.
+
+    Parameters
+    ----------
+    seed : int
+        Of the whole run, at least 0.
+    frame : int
+        Number of the frame, at least 0.
+
+    Raises
+    ------
+    ParameterError
+        When a number is negative or not whole.
+
+    Notes
+    -----
+    A stream depends on (seed, frame, name of the effect) and on nothing else: not on the order of calls, nor on the
+    number of threads or processes.
+    """
+
+    seed: int
+    frame: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "seed", check_count("seed", self.seed, at_least=0))
+        object.__setattr__(self, "frame", check_count("frame", self.frame, at_least=0))
+
+    def of(self, effect: str) -> np.random.Generator:
+        """A fresh generator of the effect's stream, at its beginning."""
+        key = (self.frame, crc32(effect.encode()))
+        return np.random.Generator(np.random.PCG64DXSM(np.random.SeedSequence(self.seed, spawn_key=key)))

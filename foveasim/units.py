@@ -1,0 +1,86 @@
+"""
+Physical constants and the conversions between the units that names in this package carry.
+
+Constants are the exact values of the 2019 SI (CODATA 2018).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from foveasim.arrays import Floats
+
+__all__ = [
+    "BOLTZMANN_J_PER_K",
+    "ELEMENTARY_CHARGE_C",
+    "LIGHT_SPEED_M_PER_S",
+    "PLANCK_J_S",
+    "electrons_to_volts",
+    "m_from_mm",
+    "m_from_nm",
+    "m_from_um",
+    "photon_energy_j",
+    "um_from_m",
+    "um_from_nm",
+    "volts_to_electrons",
+    "w_from_w_m2_um2",
+]
+
+PLANCK_J_S = 6.62607015e-34
+LIGHT_SPEED_M_PER_S = 299_792_458.0
+ELEMENTARY_CHARGE_C = 1.602176634e-19
+BOLTZMANN_J_PER_K = 1.380649e-23
+
+
+def m_from_um(length_um: Floats | float) -> Floats:
+    """Metres from micrometres."""
+    return np.asarray(length_um, dtype=np.float64) * 1e-6
+
+
+def m_from_mm(length_mm: Floats | float) -> Floats:
+    """Metres from millimetres."""
+    return np.asarray(length_mm, dtype=np.float64) * 1e-3
+
+
+def m_from_nm(length_nm: Floats | float) -> Floats:
+    """Metres from nanometres."""
+    return np.asarray(length_nm, dtype=np.float64) * 1e-9
+
+
+def um_from_m(length_m: Floats | float) -> Floats:
+    """Micrometres from metres."""
+    return np.asarray(length_m, dtype=np.float64) * 1e6
+
+
+def um_from_nm(length_nm: Floats | float) -> Floats:
+    """Micrometres from nanometres."""
+    return np.asarray(length_nm, dtype=np.float64) * 1e-3
+
+
+def w_from_w_m2_um2(power_w_m2_um2: Floats | float) -> Floats:
+    """Watts from (W/m²)·µm², the unit of a map in W/m² integrated over an area in µm²."""
+    return np.asarray(power_w_m2_um2, dtype=np.float64) * 1e-12
+
+
+def photon_energy_j(wavelength_nm: Floats | float) -> Floats:
+    """
+    Energy of one photon, ``h c / wavelength``.
+
+    Examples
+    --------
+    1 W/m² on 1 µm² for 1 s at 550 nm is 2.769 million photons:
+
+    >>> float(round(1e-12 / photon_energy_j(550.0)))
+    2768764.0
+    """
+    return PLANCK_J_S * LIGHT_SPEED_M_PER_S / m_from_nm(wavelength_nm)
+
+
+def electrons_to_volts(charge_e: Floats | float, capacitance_f: Floats | float) -> Floats:
+    """Voltage of a charge on a capacitance, ``q n / C``."""
+    return ELEMENTARY_CHARGE_C * np.asarray(charge_e, dtype=np.float64) / np.asarray(capacitance_f, dtype=np.float64)
+
+
+def volts_to_electrons(voltage_v: Floats | float, capacitance_f: Floats | float) -> Floats:
+    """Charge that makes a voltage on a capacitance, ``C U / q``, in electrons."""
+    return np.asarray(voltage_v, dtype=np.float64) * np.asarray(capacitance_f, dtype=np.float64) / ELEMENTARY_CHARGE_C
