@@ -92,14 +92,15 @@ def check_number(
     except (TypeError, ValueError):
         raise ParameterError(name, "must be one number", value, cure=cure) from None
     unit = unit_of(name)
+    got = value if isinstance(value, int) else number
     if not np.isfinite(number):
-        raise ParameterError(name, "must be finite", number, unit, cure)
+        raise ParameterError(name, "must be finite", got, unit, cure)
     if above is not None and not number > above:
-        raise ParameterError(name, f"must be > {above:g}", number, unit, cure)
+        raise ParameterError(name, f"must be > {above:g}", got, unit, cure)
     if at_least is not None and not number >= at_least:
-        raise ParameterError(name, f"must be >= {at_least:g}", number, unit, cure)
+        raise ParameterError(name, f"must be >= {at_least:g}", got, unit, cure)
     if at_most is not None and not number <= at_most:
-        raise ParameterError(name, f"must be <= {at_most:g}", number, unit, cure)
+        raise ParameterError(name, f"must be <= {at_most:g}", got, unit, cure)
     return number
 
 

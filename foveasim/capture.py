@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +27,18 @@ FILE_VERSION = 1
 #: Arrays of a capture file, and how a column of the layout is named among them.
 ARRAYS = ("code", "electrons", "expected_e", "filter_of_site", "xy_um", "ring_offsets", "site_offsets")
 COLUMN_PREFIX = "column_"
+#: What numpy, zipfile and zlib raise for a file that is broken in one way or another.
+UNREADABLE = (
+    FoveasimError,
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    EOFError,
+    RuntimeError,  # a member that claims to be encrypted; unknown compression is a NotImplementedError, its child
+    zipfile.BadZipFile,
+    zlib.error,
+)
 #: A file that would unpack to more than this is refused.
 MAX_UNPACKED_BYTES = 8 * 2**30
 
@@ -193,5 +206,5 @@ class Capture:
             )
         except FileError:
             raise
-        except (FoveasimError, OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        except UNREADABLE as error:
             raise FileError(source, f"is broken or no foveasim capture ({error})") from None

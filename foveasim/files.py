@@ -23,7 +23,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     Raises
     ------
     FileError
-        When the folder does not exist, or nothing can be written there.
+        When the folder does not exist, or writing fails: the disk is full, say.
     """
     target = Path(path)
     if not target.parent.is_dir():
@@ -42,6 +42,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
         temporary.replace(target)
-    except BaseException:
+    except OSError as error:
+        raise FileError(target, f"cannot be written: {error.strerror or error}") from None
+    finally:
         temporary.unlink(missing_ok=True)
-        raise

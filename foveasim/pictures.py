@@ -173,7 +173,4 @@ def write_picture(path: str | Path, picture: NDArray[np.uint8]) -> None:
     if Image.registered_extensions().get(target.suffix.lower()) not in PILLOW_FORMATS:
         raise FileError(target, "must end in the name of a picture format, such as .png")
     with written_whole(target) as temporary:
-        try:
-            Image.fromarray(np.ascontiguousarray(picture)).save(temporary)
-        except OSError as error:
-            raise FileError(target, f"cannot be written: {error}") from None
+        Image.fromarray(np.ascontiguousarray(picture)).save(temporary)

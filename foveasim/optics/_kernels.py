@@ -10,7 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, types
 
-__all__ = ["expose", "transfer"]
+__all__ = ["alias_sum", "expose", "transfer"]
+
+_floats = types.Array(types.float64, 1, "C", readonly=True)
 
 
 @njit(
@@ -70,6 +72,8 @@ def expose(image, x2, y2, power, source_column, before, first_row, out):
             types.Array(r, 2, "C", readonly=True),
             types.Array(r, 2, "C", readonly=True),
             types.Array(r, 2, "C", readonly=True),
+            types.Array(r, 2, "C", readonly=True),
+            types.Array(r, 2, "C", readonly=True),
             types.boolean,
             types.int64,
             types.int64,
@@ -80,19 +84,23 @@ def expose(image, x2, y2, power, source_column, before, first_row, out):
     cache=True,
     nogil=True,
 )
-def transfer(spectrum, table, per_step, fx, fy, gain_x, gain_y, is_added, first_row, last_row, out):
+def transfer(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is_added, first_row, last_row, out):
     """
     ``out = spectrum * H`` or ``out += spectrum * H`` over some rows of frequencies.
 
-    ``H`` is a sum over the aliases ``k`` of each frequency: ``table(|f + k|) * gain_x[k] * gain_y[k]``. The table
-    holds a radial function at equal steps, 0 beyond its end; ``per_step`` is steps over frequency.
-    ``fx``, ``gain_x`` are (n_alias, n_x) and ``fy``, ``gain_y`` (n_alias, n_y). ``out`` may be ``spectrum``.
+    ``H`` is a sum over the aliases ``k`` of each frequency: ``table(|f + k|) * gain_x[k] * gain_y[k]``, and over the
+    products ``far_x[r] * far_y[r]``, which stand for many aliases together. The table holds a radial function at equal
+    steps, 0 beyond its end; ``per_step`` is steps over frequency. ``fx``, ``gain_x`` are (n_alias, n_x), ``far_x``
+    (n_rank, n_x), and the same for y. ``out`` may be ``spectrum``.
     """
     n_alias, n_x = fx.shape
     last = table.size - 1
     h = np.empty(n_x, table.dtype)
     for row in range(first_row, last_row):
         h[:] = 0.0
+        for r in range(far_x.shape[0]):
+            for ix in range(n_x):
+                h[ix] += far_x[r, ix] * far_y[r, row]
         for ky in range(n_alias):
             v = fy[ky, row] * per_step
             if abs(v) >= last:
@@ -112,3 +120,39 @@ def transfer(spectrum, table, per_step, fx, fy, gain_x, gain_y, is_added, first_
         else:
             for ix in range(n_x):
                 out[row, ix] = spectrum[row, ix] * h[ix]
+
+
+@njit(
+    types.float64[:, ::1](
+        types.Array(types.float64, 1, "C", readonly=True), types.float64, _floats, types.int64, types.int64
+    ),
+    cache=True,
+    nogil=True,
+)
+def alias_sum(table, per_step, cycles, n_alias, sinc_power):
+    """
+    Sum of ``table(|f + k|) * (sinc(f_x + k_x) * sinc(f_y + k_y)) ** sinc_power`` over all aliases but ``k = 0``.
+
+    At the frequencies ``cycles`` x ``cycles``, in cycles per cell; ``per_step`` is steps of the table over them.
+    """
+    n = cycles.size
+    last = table.size - 1
+    k = np.arange(-n_alias, n_alias + 1)
+    gain = np.empty((k.size, n))
+    for a in range(k.size):
+        for i in range(n):
+            gain[a, i] = np.sinc(cycles[i] + k[a]) ** sinc_power
+    total = np.zeros((n, n))
+    for a in range(k.size):
+        for b in range(k.size):
+            if k[a] == 0 and k[b] == 0:
+                continue
+            for i in range(n):
+                v = (cycles[i] + k[a]) * per_step
+                for j in range(n):
+                    u = (cycles[j] + k[b]) * per_step
+                    r = np.sqrt(u * u + v * v)
+                    if r < last:
+                        at = int(r)
+                        total[i, j] += gain[a, i] * gain[b, j] * (table[at] + (r - at) * (table[at + 1] - table[at]))
+    return total

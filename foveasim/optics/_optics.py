@@ -32,6 +32,14 @@ LOST_SHARE = 0.01
 REACH_SHARE = 2.0 / math.pi**2
 #: The paper's Eq. 5 asks for an aperture radius much larger than H λ / (p0 min(M, N)): this many times.
 MUCH_LARGER = 10.0
+#: Up to so many aliases to a side are added frequency by frequency ...
+DIRECT_ALIASES = 3
+#: ... and more by a smooth function of the frequency, through this many Chebyshev nodes an axis, ...
+ALIAS_NODES = 32
+#: ... of the rank that keeps this accuracy.
+ALIAS_ACCURACY = 1e-9
+#: For cells wider than this many λN diffraction is that of cells of this width: 0.3 % of the light goes astray, or less.
+MAX_ALIASES = 128
 #: Rows that one thread works on at a time.
 ROWS_PER_PIECE = 64
 
@@ -205,8 +213,9 @@ class Optics:
         weights = np.asarray(weights, dtype=np.float64)
         n_threads = thread_count(n_threads)
         working_n = self.working_f_number(scene.distance_m)
-        cutoff_per_um = 1.0 / (um_from_nm(scene.wavelength_nm) * working_n)
         grid = self.grid(scene)
+        cutoff_per_um = 1.0 / (um_from_nm(scene.wavelength_nm) * working_n)
+        cutoff_per_um = np.minimum(cutoff_per_um, MAX_ALIASES / grid.pitch_um)
         self._warn_if_too_small(cutoff_per_um, grid)
 
         transform = _Transform(
@@ -316,15 +325,40 @@ class _Transform:
         self._real, self._n_threads = real, n_threads
         # Points at cell centres have a spectrum that repeats with 1/p. The mean over a cell multiplies frequency f by
         # sinc(f p), a square source pixel once more; each alias f + k/p passes with the pupil's factor at f + k/p.
-        n_alias = max(0, math.ceil(f_max_per_um * pitch_um - 0.5))
-        k = np.arange(-n_alias, n_alias + 1)[:, np.newaxis]
+        self._n_alias = max(0, math.ceil(f_max_per_um * pitch_um - 0.5))
+        self._pitch_um, self._sinc_power = pitch_um, sinc_power
+        n_near = self._n_alias if self._n_alias <= DIRECT_ALIASES else 0
+        k = np.arange(-n_near, n_near + 1)[:, np.newaxis]
         cycles_y = scipy.fft.fftfreq(rows.size) + k
         cycles_x = scipy.fft.rfftfreq(columns.size) + k
-        if n_alias == 0:
+        if self._n_alias == 0:
             cycles_x = cycles_x[:, : int(np.searchsorted(cycles_x[0], f_max_per_um * pitch_um)) + 1]
         self._n_columns = cycles_x.shape[1]
         self._fx_per_um, self._fy_per_um = (cycles_x / pitch_um).astype(real), (cycles_y / pitch_um).astype(real)
         self._gain_x, self._gain_y = ((np.sinc(c) ** sinc_power).astype(real) for c in (cycles_x, cycles_y))
+        self._cycles_x, self._cycles_y = np.abs(cycles_x[n_near]), np.abs(cycles_y[n_near])
+
+    def _far_aliases(self, table: NDArray[Any], per_step: float) -> tuple[Images, Images]:
+        """
+        Aliases beyond the frequency itself as a sum of products, (n_rank, n_x) and (n_rank, n_y), when they are many.
+
+        Within half a cycle per cell their sum is smooth and even, so that a few Chebyshev polynomials hold it.
+        """
+        if self._n_alias <= DIRECT_ALIASES:
+            return np.zeros((0, self._cycles_x.size), self._real), np.zeros((0, self._cycles_y.size), self._real)
+        nodes = np.polynomial.chebyshev.chebpts1(ALIAS_NODES)
+        at_nodes = kernels().alias_sum(
+            table.astype(np.float64), per_step / self._pitch_um, 0.25 * (nodes + 1.0), self._n_alias, self._sinc_power
+        )
+        y_modes, sizes, x_modes = np.linalg.svd(at_nodes)
+        rank = int(np.searchsorted(-sizes, -ALIAS_ACCURACY * max(float(table[0]), 0.0)))
+        to_coefficients = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, ALIAS_NODES - 1))
+
+        def at(cycles: Floats, modes: Floats) -> Images:
+            polynomials = np.polynomial.chebyshev.chebvander(4.0 * cycles - 1.0, ALIAS_NODES - 1)
+            return np.ascontiguousarray((polynomials @ (to_coefficients @ modes)).T.astype(self._real))
+
+        return at(self._cycles_x, x_modes[:rank].T), at(self._cycles_y, y_modes[:, :rank] * sizes[:rank])
 
     def _each_rows(self, work: Callable[[int, int], None], n_rows: int) -> None:
         each(
@@ -357,6 +391,7 @@ class _Transform:
         self, spectrum: NDArray[Any], table: NDArray[Any], per_step: float, out: NDArray[Any], *, is_added: bool
     ) -> None:
         """Write a spectrum times a radial table to ``out``, or add it; ``out`` may be the spectrum."""
+        far_x, far_y = self._far_aliases(table, per_step)
 
         def some_rows(first: int, last: int) -> None:
             kernels().transfer(
@@ -367,6 +402,8 @@ class _Transform:
                 self._fy_per_um,
                 self._gain_x,
                 self._gain_y,
+                far_x,
+                far_y,
                 is_added,
                 first,
                 last,

@@ -1,0 +1,7 @@
+"""Looking at layouts and captures. Needs matplotlib, which is loaded when something is drawn."""
+
+from __future__ import annotations
+
+from foveasim.view.plots import plot_capture, plot_layout, save_figure
+
+__all__ = ["plot_capture", "plot_layout", "save_figure"]

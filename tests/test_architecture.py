@@ -1,0 +1,161 @@
+"""The house rules that a reader relies on: who imports whom, what is loaded when, units in names, no global randomness."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import foveasim
+from foveasim.arrays import UNIT_SUFFIXES
+
+PACKAGE = Path(foveasim.__file__).parent
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+#: Rooms from the bottom up: a room may import from lower lines, and not from its own line or a higher one.
+FLOORS = [
+    {"errors", "_version"},
+    {"arrays", "files"},
+    {"units", "parallel", "records", "streams", "rings", "pictures"},
+    {"fields"},
+    {"layout", "scene", "optics", "integrate", "sensor"},
+    {"reconstruct"},
+    {"capture"},
+    {"camera"},
+    {"config", "view"},
+    {"shots"},
+    {"cli"},
+]
+#: Loaded when they are used, not before.
+HEAVY = {
+    "cv2", "dask", "exactextract", "manifold3d", "matplotlib", "numba", "pydantic", "pyvista", "rich", "skimage", "tifffile",
+    "torch", "trimesh", "typer", "vtk", "yaml",
+}  # fmt: skip
+#: Names of numbers without a unit, or with the unit of what they are measured with.
+DIMENSIONLESS = {
+    "aspect", "at_least", "at_most", "above", "angle", "bits", "colours", "coverage", "curves", "dpi", "factor", "f_number",
+    "figure_inches", "height", "limit", "n", "qe", "ratio", "relative", "ring_ratio", "s", "transmission", "value", "values",
+    "weight", "weights", "wavelength", "white", "worst", "results", "peak", "spectrum", "channels", "share", "seconds", "zone",
+}  # fmt: skip
+#: Parts that no user sees, where geometry is in cells or pitches as the docstring says.
+IN_CELLS = {
+    "x",
+    "y",
+    "x2",
+    "y2",
+    "uv",
+    "table",
+    "per_step",
+    "pitches",
+    "sides",
+    "light",
+    "cycles",
+    "modes",
+    "power",
+    "of_um",
+}
+FLOATING = re.compile(r"\b(float|Floats|PerSite)\b")
+
+
+def room_of(path):
+    relative = path.relative_to(PACKAGE)
+    return relative.parts[0].removesuffix(".py")
+
+
+def imported_rooms(path):
+    rooms = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        names = []
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module, *(f"{node.module}.{a.name}" for a in node.names if node.module == "foveasim")]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        rooms |= {name.split(".")[1] for name in names if name.startswith("foveasim.")}
+    return {room for room in rooms if not room.startswith("__")}
+
+
+def test_every_room_stands_on_a_floor():
+    rooms = {room_of(path) for path in MODULES} - {"__init__"}
+
+    assert rooms == set().union(*FLOORS)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_go_one_way(path):
+    room = room_of(path)
+    if room == "__init__":
+        return
+    floor = next(i for i, rooms in enumerate(FLOORS) if room in rooms)
+    allowed = set().union(*FLOORS[:floor]) | {room}
+
+    assert imported_rooms(path) <= allowed
+
+
+def test_nothing_heavy_is_loaded_by_import():
+    code = "import sys, json, foveasim; print(json.dumps(sorted({m.split('.')[0] for m in sys.modules})))"
+    loaded = json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
+
+    assert "foveasim" in loaded
+    assert set(loaded) & HEAVY == set()
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_random_numbers_come_from_named_streams_only(path):
+    used = {
+        node.attr
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Attribute)
+        and node.value.attr == "random"
+        and isinstance(node.value.value, ast.Name)
+        and node.value.value.id in {"np", "numpy"}
+    }
+    modules = {
+        alias.name
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Import)
+        for alias in node.names
+    }
+
+    assert used <= ({"Generator", "PCG64DXSM", "SeedSequence"} if path.name == "streams.py" else set())
+    assert "random" not in modules
+
+
+def floating_names(path):
+    """Names of parameters and dataclass fields that are annotated as floating-point numbers."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef):
+            arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+            pairs = [(a.arg, a.annotation) for a in arguments if a.annotation is not None]
+        elif isinstance(node, ast.ClassDef):
+            pairs = [
+                (s.target.id, s.annotation)
+                for s in node.body
+                if isinstance(s, ast.AnnAssign) and isinstance(s.target, ast.Name)
+            ]
+        else:
+            continue
+        yield from (name for name, kind in pairs if FLOATING.search(ast.unparse(kind)))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_floating_point_names_carry_their_unit(path):
+    bad = {
+        name
+        for name in floating_names(path)
+        if not name.endswith(tuple(UNIT_SUFFIXES)) and name not in DIMENSIONLESS and name not in IN_CELLS
+    }
+
+    assert bad == set()
+
+
+def test_the_unit_rule_sees_a_name_without_unit(tmp_path):
+    bad = tmp_path / "bad.py"
+    bad.write_text("def f(radius: float, r_um: float | None = None) -> None: ...\n")
+
+    assert [n for n in floating_names(bad) if not n.endswith(tuple(UNIT_SUFFIXES))] == ["radius"]

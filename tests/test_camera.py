@@ -1,0 +1,300 @@
+"""The whole chain: photometry by hand, two routes, repeatable draws, and what a capture keeps."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+
+import numpy as np
+import pytest
+import shapely
+
+import foveasim as fs
+from foveasim.errors import FileError, ParameterError, SimulationError
+
+H_J_S, C_M_S, Q_C = 6.62607015e-34, 299792458.0, 1.602176634e-19
+OPTICS = fs.Optics(focal_length_mm=22.0, f_number=4.0)
+SCENE = {"pitch_um": 20.0, "distance_m": 0.56}
+
+
+def flat_scene(radiance=0.05, n=300, **changes):
+    return fs.Scene.flat(
+        **{"shape": (n, n), "radiance_w_m2_sr_nm": radiance, "band_width_nm": 10.0, **SCENE, **changes}
+    )
+
+
+def picture_scene(n_wavelengths=3, shape=(200, 240), **changes):
+    picture = np.random.default_rng(1).random((*shape, 3)).astype(np.float32)
+    wavelength_nm = np.linspace(430.0, 680.0, n_wavelengths)
+    spectrum = np.random.default_rng(2).random((3, n_wavelengths))
+    values = {"peak_radiance_w_m2_sr_nm": 0.02, "wavelength_nm": wavelength_nm, "spectrum": spectrum, **SCENE}
+    return fs.Scene.from_picture(picture, encoding="linear", **{**values, **changes})
+
+
+def rgb_layout():
+    layout = fs.layout.log_polar(n_sectors=36, min_size_um=3.0, r_max_um=75.0, stagger=True)
+    return fs.layout.mosaic(layout, ("RG", "GB"))
+
+
+def test_a_flat_scene_gives_the_electrons_that_photometry_says():
+    """n = E A t λ/(hc) QE with E = π L Δλ / (1 + 4 N²), on the axis."""
+    layout = fs.Layout.from_rectangles([[0.0, 0.0]], [[3.0, 2.0]])
+    camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout, qe=0.4, dark_e_per_s=7.0))
+    scene = flat_scene(0.05)
+    image_distance_mm = 1 / (1 / 22.0 - 1 / 560.0)
+    n_image = image_distance_mm / (22.0 / 4.0)
+    irradiance_w_m2 = np.pi * 0.05 * 10.0 / (1 + 4 * n_image**2)
+    photons = irradiance_w_m2 * 6e-12 * 0.02 * 550e-9 / (H_J_S * C_M_S)
+
+    capture = camera.capture(scene, exposure_s=0.02, seed=0)
+
+    assert capture.expected_e[0] == pytest.approx(0.4 * photons + 7.0 * 0.02, rel=2e-5)
+
+
+def test_a_power_map_of_any_other_program_is_taken_as_it_is():
+    """1 W/m² on 1 µm² for 1 s at 550 nm are 2.76876e6 photons; two bands add up."""
+    layout = fs.Layout.from_rectangles([[2.0, 2.0]], 1.0)
+    grid = fs.Grid((4, 4), 1.0)
+    one = fs.PowerMap(np.ones((1, 4, 4)), grid, np.array([550.0]))
+    two = fs.PowerMap(np.ones((2, 4, 4)), grid, np.array([550.0, 1100.0]))
+    camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout))
+
+    assert camera.photoelectrons_per_s(one)[0] == pytest.approx(2.76876e6, rel=2e-6)
+    assert camera.photoelectrons_per_s(two)[0] == pytest.approx(3 * 2.76876e6, rel=2e-6)
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("filters", [None, "rgb"])
+def test_a_scene_and_its_power_map_give_the_same_electrons(precision, filters):
+    optics = fs.Optics(focal_length_mm=22.0, f_number=4.0, precision=precision)
+    sensor = fs.Sensor(rgb_layout(), qe=fs.SiliconQE(depth_um=3.0), filters=filters)
+    camera = fs.Camera(optics=optics, sensor=sensor)
+    scene = picture_scene(n_wavelengths=11)
+
+    collapsed = camera.photoelectrons_per_s(scene)
+    by_wavelength = camera.photoelectrons_per_s(optics.power_map(scene))
+
+    assert collapsed == pytest.approx(by_wavelength, rel=2e-5 if precision == "single" else 1e-7)
+
+
+def test_each_site_sees_through_its_own_filter():
+    """Light of one narrow band per channel: a site's electrons are those of its own filter's curve."""
+    layout = fs.Layout.from_rectangles([[-6.0, 0.0], [0.0, 0.0], [6.0, 0.0]], 2.0, channel=[2, 0, 1])
+    filters = fs.FilterSet(tuple(fs.GaussianCurve(centre_nm=c, fwhm_nm=80.0, peak=0.9) for c in (600.0, 550.0, 450.0)))
+    rate = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout, filters=filters)).photoelectrons_per_s(flat_scene())
+    plain = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout)).photoelectrons_per_s(flat_scene())
+
+    at_550 = [0.9 * 2.0 ** -((2 * abs(c - 550) / 80) ** 2) for c in (450.0, 600.0, 550.0)]
+    assert rate / plain == pytest.approx(at_550, rel=1e-6)
+
+
+def test_electrons_double_with_exposure_and_light():
+    camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(rgb_layout()))
+    once = camera.capture(flat_scene(0.01), exposure_s=0.01, seed=0).expected_e
+
+    assert camera.capture(flat_scene(0.01), exposure_s=0.02, seed=0).expected_e == pytest.approx(2 * once, rel=1e-12)
+    assert camera.capture(flat_scene(0.02), exposure_s=0.01, seed=0).expected_e == pytest.approx(2 * once, rel=1e-6)
+
+
+@pytest.mark.parametrize("qe", [0.3, 1.0])
+def test_variance_over_mean_of_electrons_is_one_for_any_quantum_efficiency(qe):
+    layout = fs.layout.grid(n_x=200, n_y=200, pitch_um=0.5)
+    capture = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout, qe=qe)).capture(
+        flat_scene(0.5), exposure_s=0.01, seed=3
+    )
+    deviation = (capture.electrons - capture.expected_e) / np.sqrt(capture.expected_e)
+
+    # Over n sites: the mean has the standard error 1/sqrt(n), the variance sqrt(2/n).
+    assert capture.expected_e.min() > 50
+    assert abs(deviation.mean()) < 5 / np.sqrt(40_000)
+    assert abs(deviation.var() - 1) < 5 * np.sqrt(2 / 40_000)
+
+
+def test_the_same_seed_gives_the_same_capture_on_any_number_of_threads():
+    sensor = fs.Sensor(rgb_layout(), filters="rgb", read_noise_e=2.0)
+    scene = picture_scene(shape=(500, 600))
+    one, two, again = (
+        fs.Camera(optics=OPTICS, sensor=sensor, n_threads=n).capture(scene, exposure_s=0.01, seed=11) for n in (1, 2, 2)
+    )
+
+    for name in ("expected_e", "electrons", "code"):
+        assert np.array_equal(getattr(one, name), getattr(two, name))
+        assert np.array_equal(getattr(again, name), getattr(two, name))
+
+
+def test_other_seeds_and_frames_give_other_draws_of_the_same_expectation():
+    camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(rgb_layout()))
+    first = camera.capture(flat_scene(), exposure_s=0.01, seed=0)
+    for other in (
+        camera.capture(flat_scene(), exposure_s=0.01, seed=1),
+        camera.capture(flat_scene(), exposure_s=0.01, seed=0, frame=1),
+    ):
+        assert np.array_equal(other.expected_e, first.expected_e)
+        assert np.mean(other.electrons != first.electrons) > 0.9
+
+
+def test_sites_off_the_scene_are_dark():
+    layout = fs.Layout.from_rectangles([[0.0, 0.0], [1e4, 0.0]], 2.0)
+    camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout))
+
+    assert camera.photoelectrons_per_s(flat_scene())[1] == 0.0
+
+
+def test_a_nan_under_a_site_is_told_with_the_site():
+    data = np.ones((1, 4, 4))
+    data[0, 3, 3] = np.nan
+    layout = fs.Layout.from_rectangles([[0.5, 0.5], [3.5, 3.5]], 1.0)
+    camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout))
+
+    with pytest.raises(SimulationError, match="the light on site 1 is not finite"):
+        camera.photoelectrons_per_s(fs.PowerMap(data, fs.Grid((4, 4), 1.0), np.array([550.0])))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"exposure_s": -1.0}, "'exposure_s' must be >= 0, got -1.0 s"),
+        ({"exposure_s": float("nan")}, "'exposure_s' must be finite"),
+        ({"seed": -3}, "'seed' must be >= 0"),
+        ({"seed": 1.5}, "'seed' must be a whole number"),
+        ({"frame": -1}, "'frame' must be >= 0"),
+        ({"light": "scene"}, "'light' must be a Scene or a PowerMap, got a str"),
+    ],
+)
+def test_bad_arguments_are_refused_by_name(arguments, message):
+    camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(rgb_layout()))
+    values = {"light": flat_scene(), "exposure_s": 0.01, "seed": 0, **arguments}
+
+    with pytest.raises(ParameterError, match=message):
+        camera.capture(values.pop("light"), **values)
+
+
+# -- captures ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def capture():
+    sensor = fs.Sensor(rgb_layout(), filters="rgb", qe=fs.SiliconQE(depth_um=3.0), read_noise_e=1.5, bits=12)
+    return fs.Camera(optics=OPTICS, sensor=sensor).capture(picture_scene(), exposure_s=0.02, seed=5)
+
+
+def test_a_saved_capture_comes_back_whole(capture, tmp_path):
+    capture.save(tmp_path / "c.npz")
+    loaded = fs.Capture.load(tmp_path / "c.npz")
+
+    for name in ("code", "electrons", "expected_e", "filter_of_site", "white_dn"):
+        assert np.array_equal(getattr(loaded, name), getattr(capture, name))
+        assert getattr(loaded, name).dtype == getattr(capture, name).dtype
+    for name in ("xy_um", "ring_offsets", "site_offsets", "channel", "readout_line"):
+        assert np.array_equal(getattr(loaded.layout, name), getattr(capture.layout, name))
+    assert (loaded.bits, loaded.filter_names, loaded.settings) == (capture.bits, capture.filter_names, capture.settings)
+    assert loaded.layout.provenance["generator"] == "log_polar"
+
+
+def test_a_capture_tells_how_it_was_made(capture):
+    settings = json.loads(json.dumps(capture.settings))
+
+    assert settings["seed"] == 5
+    assert settings["exposure_s"] == 0.02
+    assert settings["optics"]["f_number"] == 4.0
+    assert settings["sensor"]["qe"] == {"kind": "SiliconQE", "depth_um": 3.0, "transmission": 1.0}
+    assert settings["versions"]["foveasim"] == fs.__version__
+    assert settings["layout"]["parameters"]["n_sectors"] == 36
+
+
+def test_a_flat_white_scene_looks_white_after_white_balance():
+    sensor = fs.Sensor(rgb_layout(), filters="rgb", qe=fs.SiliconQE(depth_um=3.0), bits=14, shot_noise="off",
+                       capacitance_f=rgb_layout().area_um2 * 3e-16)  # fmt: skip
+    scene = flat_scene(0.004, wavelength_nm=np.linspace(420, 680, 14), band_width_nm=20.0)
+    capture = fs.Camera(optics=OPTICS, sensor=sensor).capture(scene, exposure_s=0.02, seed=0)
+    balanced = capture.picture(max_pixels=60).data / capture.white_dn[:, np.newaxis, np.newaxis]
+    levels = np.nanmedian(balanced, axis=(1, 2))
+
+    assert capture.saturated == 0.0
+    assert levels == pytest.approx(np.full(3, levels.mean()), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda p: p.unlink(), "no such file"),
+        (lambda p: p.write_bytes(b""), "is broken or no foveasim capture"),
+        (lambda p: p.write_bytes(b"PK\x03\x04 and nothing else"), "is broken or no foveasim capture"),
+        (lambda p: p.write_bytes(p.read_bytes()[:-200]), "is broken or no foveasim capture"),
+        (lambda p: p.write_bytes(p.read_bytes()[: p.stat().st_size // 2]), "is broken or no foveasim capture"),
+        (lambda p: np.savez(p, code=np.zeros(3)), "is broken or no foveasim capture"),
+        (lambda p: np.savez(p, about=np.array('{"format": "other"}')), "is no foveasim capture"),
+        (lambda p: np.savez(p, about=np.array({"a": 1}, dtype=object)), "is broken or no foveasim capture"),
+    ],
+)
+def test_a_broken_capture_file_is_refused_in_one_sentence(capture, tmp_path, spoil, message):
+    path = tmp_path / "c.npz"
+    capture.save(path)
+    spoil(path)
+
+    with pytest.raises(FileError, match=message) as caught:
+        fs.Capture.load(path)
+    assert caught.value.path == path
+
+
+def test_flipped_bits_give_the_capture_or_one_sentence(capture, tmp_path):
+    path = tmp_path / "c.npz"
+    capture.save(path)
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    for _ in range(400):
+        spoiled = bytearray(whole)
+        for position in rng.integers(0, len(whole), 3):
+            spoiled[position] ^= 1 << int(rng.integers(0, 8))
+        path.write_bytes(spoiled)
+        try:
+            fs.Capture.load(path)
+        except FileError as error:
+            assert "\n" not in str(error)
+
+
+def test_a_capture_that_cannot_be_written_leaves_nothing_behind(capture, tmp_path, monkeypatch):
+    (tmp_path / "kept.npz").write_text("before")
+
+    def fail(*_args, **_kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    with pytest.raises(FileError, match="cannot be written: No space left on device"):
+        capture.save(tmp_path / "kept.npz")
+
+    assert [p.name for p in tmp_path.iterdir()] == ["kept.npz"]
+    assert (tmp_path / "kept.npz").read_text() == "before"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("c.txt", "must end in .npz"), ("no/such/c.npz", "the folder .* does not exist")]
+)
+def test_a_target_that_cannot_be_is_refused(capture, tmp_path, name, message):
+    with pytest.raises(FileError, match=message):
+        capture.save(tmp_path / name)
+
+
+def test_a_file_that_would_unpack_to_too_much_is_refused(capture, tmp_path, monkeypatch):
+    capture.save(tmp_path / "c.npz")
+    with zipfile.ZipFile(tmp_path / "c.npz") as archive:
+        size = sum(item.file_size for item in archive.infolist())
+    monkeypatch.setattr("foveasim.capture.MAX_UNPACKED_BYTES", size - 1)
+
+    with pytest.raises(FileError, match="would unpack to more than"):
+        fs.Capture.load(tmp_path / "c.npz")
+
+
+def test_a_picture_of_a_mosaic_has_a_channel_for_each_filter(capture):
+    assert capture.picture(max_pixels=40).data.shape[0] == 3
+    with pytest.raises(ParameterError, match="'method' must be one of 'cells', got 'magic'"):
+        capture.picture("magic")
+
+
+def test_layouts_with_holes_and_any_shape_go_through_the_whole_chain():
+    ring = shapely.Point(0, 0).buffer(6.0).difference(shapely.Point(0, 0).buffer(2.0))
+    layout = fs.Layout.from_polygons([ring, shapely.Point(0, 0).buffer(2.0)])
+    capture = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout)).capture(flat_scene(), exposure_s=0.01, seed=0)
+
+    # Even light: electrons in proportion to area, but for the falloff over a few µm.
+    assert capture.expected_e[0] / capture.expected_e[1] == pytest.approx(ring.area / layout.area_um2[1], rel=1e-4)

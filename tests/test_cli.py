@@ -1,0 +1,152 @@
+"""The command line as a user meets it: in a process of its own, with its exit codes and its files."""
+
+from __future__ import annotations
+
+import json
+import struct
+import subprocess
+import sys
+import zlib
+from importlib.resources import files
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import foveasim as fs
+from foveasim.pictures import read_picture
+
+SHOT = """
+scene: {kind: picture, picture: photo.png, pitch_um: 100, distance_m: 1.0, peak_radiance_w_m2_sr_nm: 0.2}
+optics: {focal_length_mm: 8, f_number: 2.8}
+layout: {generator: grid, parameters: {n_x: 20, n_y: 20, pitch_um: 3}}
+exposure_s: 0.01
+"""
+
+
+def foveasim(*arguments, cwd):
+    command = [sys.executable, "-m", "foveasim.cli", *arguments]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+
+
+def huge_png(png):
+    """A small PNG file that claims 65536 x 65536 pixels, with a right checksum."""
+    header = b"IHDR" + struct.pack(">II", 65536, 65536) + png[24:29]
+    return png[:12] + header + struct.pack(">I", zlib.crc32(header)) + png[33:]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "shot.yaml").write_text(SHOT)
+    rng = np.random.default_rng(0)
+    Image.fromarray(rng.integers(0, 255, (120, 160, 3), np.uint8)).save(tmp_path / "photo.png")
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo")
+    return folder / "out", foveasim("demo", "-o", "out", cwd=folder)
+
+
+def test_the_demo_ends_well_and_writes_its_files(demo):
+    out, result = demo
+
+    assert result.returncode == 0, result.stderr
+    assert sorted(p.name for p in out.iterdir()) == [
+        f"{shot}_{what}" for shot in ("four_zones", "foveal") for what in ("capture.npz", "layout.png", "picture.png")
+    ]
+    for word in ("14,208", "13,312", "blind-spot radius", "60.12", "saturated", "optics / s"):
+        assert word in result.stdout
+
+
+def test_the_demos_foveal_picture_shows_the_astronaut_upright_with_no_data_in_the_blind_spot(demo):
+    """Against the photograph itself: the picture correlates with it as it is, and not with it turned over."""
+    out, _ = demo
+    seen = read_picture(out / "foveal_picture.png").astype(float)
+    capture = fs.Capture.load(out / "foveal_capture.npz")
+    photograph = read_picture(str(files("skimage.data") / "astronaut.png")).astype(float)
+    # Where each pixel of the picture lies in the photograph: 500 µm a pixel, 8 mm lens at 1 m, axis at its middle.
+    cell_um = 500.0 * 8 / (1000 - 8)
+    grid = capture.picture(max_pixels=1024).grid
+    column = np.clip(np.round(grid.x_um / cell_um + 255.5).astype(int), 0, 511)
+    row = np.clip(np.round(255.5 - grid.y_um[::-1] / cell_um).astype(int), 0, 511)
+    is_seen = seen[..., 3] == 255
+
+    def likeness(picture):
+        expected = picture[np.ix_(row, column)]
+        return np.corrcoef(seen[..., 0][is_seen], expected[..., 0][is_seen])[0, 1]
+
+    assert likeness(photograph) > 0.9
+    assert max(likeness(photograph[::-1]), likeness(photograph[:, ::-1])) < 0.5
+    assert not seen[505:519, 505:519, 3].any()
+
+
+def test_a_run_writes_the_capture_that_the_settings_describe(folder):
+    result = foveasim("run", "shot.yaml", "--set", "sensor.bits=12", "--set", "seed=4", "-o", "out", cwd=folder)
+    capture = fs.Capture.load(folder / "out" / "shot_capture.npz")
+
+    assert result.returncode == 0, result.stderr
+    assert (capture.bits, capture.settings["seed"], capture.layout.n_sites) == (12, 4, 400)
+    assert sorted(p.name for p in (folder / "out").iterdir()) == [
+        "shot_capture.npz",
+        "shot_layout.png",
+        "shot_picture.png",
+    ]
+
+
+def test_the_schema_is_json(tmp_path):
+    assert json.loads(foveasim("schema", cwd=tmp_path).stdout)["title"]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("sensor.bitz=3", "shot.yaml: sensor.bitz: no such setting"),
+        ("sensor.bits=ten", "shot.yaml: sensor.bits: must be a valid integer"),
+        ("optics.f_number=0", "shot.yaml: optics.f_number: must be > 0, got 0"),
+        ("layout.parameters.n_x=0", "shot.yaml: layout.parameters.n_x: must be >= 1"),
+        ("scene.distance_m=0.002", "shot.yaml: scene.distance_m: must be larger than the focal length"),
+        ("exposure_s=[1]", "shot.yaml: exposure_s: must be a valid number"),
+        ("layout={generator: none}", "shot.yaml: layout.generator: must be one of"),
+    ],
+)
+def test_bad_settings_end_with_one_sentence_and_leave_nothing(folder, change, words):
+    result = foveasim("run", "shot.yaml", "--set", change, "-o", "out", cwd=folder)
+
+    assert result.returncode == 2
+    assert result.stderr.startswith(f"error: {words}")
+    assert result.stderr.count("\n") == 1
+    assert not (folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda p: p.unlink(), "no such file"),
+        (lambda p: p.write_text("I am no picture"), "is not a picture in a format that can be read"),
+        (lambda p: p.write_bytes(b""), "is not a picture in a format that can be read"),
+        (lambda p: p.write_bytes(p.read_bytes()[:20_000]), "is broken or cut short"),
+        (lambda p: (p.unlink(), p.mkdir()), "is not a file"),
+        (lambda p: Image.new("RGB", (9, 9)).save(p, "GIF", save_all=True, append_images=[Image.new("RGB", (9, 9), "red")]), "holds 2 pictures"),
+        (lambda p: p.write_bytes(huge_png(p.read_bytes())), "has 65536 x 65536 pixels, more than the limit|has more than"),
+    ],
+)  # fmt: skip
+def test_a_bad_picture_ends_with_one_sentence_and_leaves_nothing(folder, spoil, words):
+    spoil(folder / "photo.png")
+    result = foveasim("run", "shot.yaml", "-o", "out", cwd=folder)
+
+    assert result.returncode == 2
+    assert result.stderr.startswith("error: shot.yaml: scene: photo.png: ")
+    assert any(word in result.stderr for word in words.split("|"))
+    assert result.stderr.count("\n") == 1
+    assert not (folder / "out").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_told(folder):
+    (folder / "out").write_text("I am a file")
+    result = foveasim("run", "shot.yaml", "-o", "out", cwd=folder)
+
+    assert result.returncode == 2
+    assert "out: cannot be written" in result.stderr
+    assert (folder / "out").read_text() == "I am a file"

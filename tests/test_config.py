@@ -1,0 +1,253 @@
+"""Settings files: what they build, and one clear sentence for everything that is wrong with them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import foveasim as fs
+from foveasim.config import read_layout_file, read_shot, schema
+from foveasim.errors import ConfigError, FileError
+from foveasim.shots import demo_settings
+
+REPOSITORY = Path(fs.__file__).parents[1]
+SHOT = """
+scene: {kind: flat, shape: [80, 90], pitch_um: 400, distance_m: 1.0, radiance_w_m2_sr_nm: 0.2, band_width_nm: 100}
+optics: {focal_length_mm: 8, f_number: 2.8}
+layout:
+  generator: hexagonal
+  parameters: {n_columns: 10, n_rows: 12, pitch_um: 8}
+sensor: {bits: 10, capacitance_f: {per_um2: 1e-15}}
+exposure_s: 0.01
+seed: 7
+"""
+
+
+@pytest.fixture
+def shot_file(tmp_path):
+    path = tmp_path / "shot.yaml"
+    path.write_text(SHOT)
+    return path
+
+
+def test_a_file_builds_what_the_same_calls_build(shot_file):
+    shot = read_shot(shot_file)
+    layout = fs.layout.hexagonal(n_columns=10, n_rows=12, pitch_um=8.0)
+    sensor = fs.Sensor(layout, bits=10, capacitance_f=1e-15 * layout.area_um2)
+    camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    scene = fs.Scene.flat(shape=(80, 90), pitch_um=400.0, distance_m=1.0, radiance_w_m2_sr_nm=0.2, band_width_nm=100.0)
+    by_hand = camera.capture(scene, exposure_s=0.01, seed=7)
+    by_file = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
+
+    assert np.array_equal(by_file.code, by_hand.code)
+    assert by_file.settings == by_hand.settings
+
+
+def test_numbers_without_a_point_in_front_of_the_exponent_are_numbers(shot_file):
+    assert read_shot(shot_file, ["sensor.v_sat_v=3e0"]).camera.sensor.v_sat_v == 3.0
+
+
+@pytest.mark.parametrize(
+    ("change", "value"),
+    [
+        ("sensor.bits=12", lambda s: s.camera.sensor.bits == 12),
+        ("sensor.qe={kind: silicon, depth_um: 2.5}", lambda s: s.camera.sensor.qe == fs.SiliconQE(depth_um=2.5)),
+        ("optics.emission=isotropic", lambda s: s.camera.optics.emission == "isotropic"),
+        ("layout.mosaic=[RG, GB]", lambda s: s.camera.sensor.layout.channel.max() == 2),
+        ("layout.move_um=[5.0, -3.0]", lambda s: abs(s.camera.sensor.layout.centroid_um.mean(0) - [5, -3]).max() < 1),
+        ("sensor.filters=rgb", lambda s: s.camera.sensor.n_filters == 3),
+        (
+            "sensor.filters={curves: [{kind: gaussian, centre_nm: 550, fwhm_nm: 90}, {kind: constant, value: 0.5}]}",
+            lambda s: s.camera.sensor.filter_names == ("0", "1"),
+        ),
+        ("exposure_s=0.5", lambda s: s.exposure_s == 0.5),
+    ],
+)
+def test_a_change_replaces_one_setting(shot_file, change, value):
+    assert value(read_shot(shot_file, [change]))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("sensor.bitz=3", r"sensor\.bitz: no such setting"),
+        ("colour=red", r"colour: no such setting"),
+        ("layout.parameters.rings=3", r"layout\.parameters\.rings: no such setting"),
+        ("sensor.bits=ten", r'sensor\.bits: must be a valid integer, got "ten"'),
+        ("sensor.bits=true", r"sensor\.bits: must be a valid integer, got true"),
+        ("sensor.bits=17", r"sensor\.bits: must be <= 16, got 17"),
+        ("optics.f_number=-1", r"optics\.f_number: must be > 0, got -1"),
+        ("optics.f_number=.nan", r"optics\.f_number: must be finite"),
+        ("optics.padding=mirror", r"optics\.padding: must be 'reflect', 'edge', 'zero' or 'periodic', got \"mirror\""),
+        ("optics=3", r"optics: must be an object, got 3"),
+        ("layout.generator=sunflower", r"layout\.generator: must be one of 'grid', .*, got 'sunflower'"),
+        ("layout.parameters.pitch_um=0", r"layout\.parameters\.pitch_um: must be > 0, got 0"),
+        ("layout={}", r"layout: needs the key 'generator'"),
+        ("layout.mosaic=[RX]", r"layout\.mosaic\.block: must use the letters 'RGB', got 'X'"),
+        ("layout=other.yaml", r"other\.yaml: no such file"),
+        ("scene.kind=foto", r"scene\.kind: must be one of 'picture', 'flat', 'point_sources', got 'foto'"),
+        ("scene.distance_m=0.001", r"scene\.distance_m: must be larger than the focal length"),
+        ("scene.shape=[40]", r"scene\.shape\.1: is missing"),
+        ("sensor.qe={kind: silicon}", r"sensor\.qe\.depth_um: is missing"),
+        ("sensor.qe={kind: silicon, depth_um: -3}", r"sensor\.qe\.depth_um: must be > 0, got -3"),
+        ("sensor.qe=2", r"sensor\.qe: must be <= 1, got 2"),
+        (
+            "sensor.read_noise_e=[1.0, 2.0]",
+            r"sensor\.read_noise_e: must be one number, or one for each of the 120 sites",
+        ),
+        ("exposure_s=-1", r"exposure_s: must be >= 0, got -1"),
+        ("exposure_s=1/30", r'exposure_s: must be a valid number, got "1/30"'),
+        ("seed=-1", r"seed: must be >= 0, got -1"),
+        ("seed=1.5", r"seed: must be a valid integer, got 1.5"),
+        ("seed", r"a change must be 'key=value'"),
+        ("seed.x=3", r"'seed\.x=3' cannot be set: seed is no section but 7"),
+        ("sensor.bits=[1", r"is not YAML"),
+        ("seed=2026-01-01", r'seed: must be a valid integer, got "2026-01-01"'),
+    ],
+)
+def test_a_wrong_setting_is_told_with_its_place(shot_file, change, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        read_shot(shot_file, [change])
+
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(str(shot_file.parent))
+
+
+def test_wavelengths_outside_the_sensors_tables_are_told_before_the_capture(shot_file):
+    with pytest.raises(
+        ConfigError, match=r"scene\.wavelength_nm: must lie in the table of silicon's absorption.*1500.0 nm"
+    ):
+        read_shot(shot_file, ["sensor.qe={kind: silicon, depth_um: 3}", "scene.wavelength_nm=[1500]"])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "must hold settings as 'key: value', got nothing"),
+        ("just words", "must hold settings as 'key: value', got 'just words'"),
+        ("- a\n- b\n", "must hold settings as 'key: value', got"),
+        ("scene: {kind: flat\noptics: 3", "is not YAML, line 2"),
+        ("a: 1\na: 2\n", r"the key 'a' stands there twice \(line 2\)"),
+        ("1: 2\n", r"the key 1 must be a text \(line 1\)"),
+        ("a: &x [1]\nb: *x\n", r"anchors and aliases are not allowed \(line 1\)"),
+        ("a: !!python/object/apply:os.system [ls]\n", "is not YAML, line 1: could not determine a constructor"),
+        ("a: !!set {b}\n", "is not YAML|holds a value that cannot be read|no such setting"),
+        ("a: !!binary aGk=\n", "holds a value that cannot be read|is not YAML"),
+        ("[" * 5000 + "]" * 5000, "is nested too deeply|must hold settings"),
+        ("a: " + "{b: " * 3000 + "1" + "}" * 3000, "is nested too deeply|no such setting|cannot be read"),
+        ("exposure_s: 1.0", r"scene: is missing; optics: is missing; layout: is missing"),
+        ("a: 1\nb: 2\nc: 3\nd: 4\n", "; and 5 more"),
+    ],
+)
+def test_a_file_that_is_no_settings_file_is_refused_in_one_sentence(tmp_path, text, message):
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+
+    with pytest.raises(ConfigError, match=message) as caught:
+        read_shot(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(b"\xff\xfe\x00", "is no text file in UTF-8"), (b"a: 1 # " + b"x" * (1 << 20), "is larger than 1048576 bytes")],
+)
+def test_a_file_that_is_no_text_is_refused(tmp_path, content, message):
+    path = tmp_path / "bad.yaml"
+    path.write_bytes(content)
+
+    with pytest.raises(ConfigError, match=message):
+        read_shot(path)
+
+
+@pytest.mark.parametrize(("name", "message"), [("none.yaml", "no such file"), (".", "is not a file")])
+def test_a_file_that_is_not_there_is_told(tmp_path, name, message):
+    with pytest.raises(ConfigError, match=message):
+        read_shot(tmp_path / name)
+
+
+def test_pictures_are_looked_for_beside_the_file_and_among_the_bundled(shot_file):
+    picture = {"kind": "picture", "picture": "mine.png", "pitch_um": 400.0, "distance_m": 1.0, "band_width_nm": 10.0}
+    picture["peak_radiance_w_m2_sr_nm"] = 0.1
+    data = {**yaml.safe_load(SHOT.replace("1e-15", "1.0e-15")), "scene": picture}
+    shot_file.write_text(yaml.safe_dump(data))
+
+    with pytest.raises(FileError, match=r"mine\.png: no such file"):
+        read_shot(shot_file)
+    with pytest.raises(ConfigError, match="scikit-image brings no picture 'mona_lisa', only astronaut, "):
+        read_shot(shot_file, ["scene.picture='skimage:mona_lisa'"])
+    assert read_shot(shot_file, ["scene.picture='skimage:camera'"]).scene.basis.shape == (1, 512, 512)
+
+
+def test_the_schema_names_every_setting_of_the_calls():
+    text = json.dumps(schema())
+
+    for name in (
+        "peak_radiance_w_m2_sr_nm",
+        "focal_length_mm",
+        "min_size_um",
+        "orientation",
+        "depth_um",
+        "per_um2",
+        "die_um",
+    ):
+        assert f'"{name}"' in text
+    assert schema()["required"] == ["scene", "optics", "layout", "exposure_s"]
+
+
+@pytest.mark.parametrize("path", sorted((REPOSITORY / "layouts").glob("*.yaml")), ids=lambda p: p.stem)
+def test_a_shipped_layout_keeps_its_rules_and_names_its_source(path):
+    file = read_layout_file(path)
+
+    assert file.layout.n_sites > 100
+    assert file.rules is not None
+    assert file.layout.check(file.rules).ok
+    assert len(file.source) > 20
+
+
+@pytest.mark.parametrize(
+    "path", [*sorted((REPOSITORY / "gallery").glob("*.yaml")), *demo_settings()], ids=lambda p: p.stem
+)
+def test_a_shipped_shot_can_be_built(path):
+    shot = read_shot(path)
+
+    assert shot.camera.sensor.layout.n_sites > 100
+    assert shot.exposure_s > 0
+
+
+def test_a_layout_file_builds_what_the_call_builds(tmp_path):
+    path = tmp_path / "rings.yaml"
+    path.write_text(
+        "generator: log_polar\nparameters: {n_sectors: 32, min_size_um: 2, r_max_um: 50, stagger: true}\n"
+        "mosaic: [RG, GB]\nmove_um: [1.0, 2.0]\nrules: {min_width_um: 1.5}\nsource: made up for this test\n"
+    )
+    file = read_layout_file(path)
+    expected = fs.layout.log_polar(n_sectors=32, min_size_um=2.0, r_max_um=50.0, stagger=True).translate(1.0, 2.0)
+
+    assert np.array_equal(file.layout.xy_um, expected.xy_um)
+    assert file.rules == fs.DesignRules(min_width_um=1.5)
+    assert file.layout.channel.tolist() == fs.layout.mosaic(expected, ("RG", "GB")).channel.tolist()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("generator: spiral\nparameters: {}\n", r"the file\.generator: must be one of .*got 'spiral'"),
+        ("generator: grid\n", r"parameters: is missing"),
+        ("generator: grid\nparameters: {n_x: 3, n_y: 0, pitch_um: 1}\n", r"parameters\.n_y: must be >= 1, got 0"),
+        (
+            "generator: grid\nparameters: {n_x: 3, n_y: 3, pitch_um: 1}\nrules: {min_width_um: -1}\n",
+            r"rules\.min_width_um: must be >= 0",
+        ),
+    ],
+)
+def test_a_wrong_layout_file_is_told_with_the_place(tmp_path, text, message):
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+
+    with pytest.raises(ConfigError, match=message):
+        read_layout_file(path)

@@ -1,0 +1,533 @@
+"""Laws of the design rules: planted violations are found alone, with their sites and values, and clean layouts pass."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+from shapely import affinity
+
+from foveasim.errors import GeometryError, ParameterError
+from foveasim.layout import DesignRules, Layout, grid, hexagonal, log_polar, zones
+from foveasim.layout.rules import min_width_um
+
+relaxed = settings(deadline=None, derandomize=True, max_examples=40)
+
+#: Every rule; a layout of 25 unit squares around the origin keeps them all.
+ALL_RULES = DesignRules(
+    min_size_um=0.9, min_width_um=0.2, max_overlap_um2=0.0, max_gap_um2=0.0, die_um=(-2.5, -2.5, 2.5, 2.5)
+)
+RULE_NAMES = ("min_size_um", "min_width_um", "max_overlap_um2", "max_gap_um2", "die_um")
+
+
+def squares():
+    """25 unit squares that tile the die; site 12 is the middle one, 13 is on its right, 24 is the upper right one."""
+    return list(grid(n_x=5, n_y=5, pitch_um=1.0).polygons())
+
+
+def replaced(changes, dropped=()):
+    """The 25 squares with some replaced and others left out."""
+    shapes = [changes.get(i, square) for i, square in enumerate(squares()) if i not in dropped]
+    return Layout.from_polygons(shapes)
+
+
+def box_at(left_um, low_um, width_um, height_um):
+    return shapely.box(left_um, low_um, left_um + width_um, low_um + height_um)
+
+
+def found(layout, rules=ALL_RULES):
+    """All violations as (rule, sites, value)."""
+    return [(v.rule, v.site_ids, pytest.approx(v.value, rel=1e-9)) for v in layout.check(rules).violations]
+
+
+def regular(n_corners, radius_um=1.0, turn_rad=0.0):
+    angle = 2 * np.pi * np.arange(n_corners) / n_corners + turn_rad
+    return shapely.Polygon(radius_um * np.stack((np.cos(angle), np.sin(angle)), axis=1))
+
+
+# -- planted violations ----------------------------------------------------------------------------------------------
+
+ARM = box_at(0.5, -0.02, 0.4, 0.05)
+
+PLANTED = {
+    "small site": (
+        # The middle square gives a quarter to its neighbour: sqrt(0.75) is too small, 0.75 wide enough.
+        replaced({12: box_at(-0.5, -0.5, 0.75, 1), 13: box_at(0.25, -0.5, 1.25, 1)}),
+        ("min_size_um", (12,), math.sqrt(0.75)),
+    ),
+    "thin arm": (
+        replaced({12: squares()[12].union(ARM), 13: squares()[13].difference(ARM)}),
+        ("min_width_um", (12,), 0.05),
+    ),
+    "overlap": (
+        replaced({12: box_at(-0.5, -0.5, 1.25, 1)}),
+        ("max_overlap_um2", (12, 13), 0.25),
+    ),
+    "site missing in the middle": (
+        replaced({}, dropped=(12,)),
+        ("max_gap_um2", (6, 7, 8, 11, 12, 15, 16, 17), 1.0),
+    ),
+    "site missing in the corner": (
+        replaced({}, dropped=(24,)),
+        ("max_gap_um2", (18, 19, 23), 1.0),
+    ),
+    "hole in a site": (
+        replaced({12: squares()[12].difference(box_at(-0.1, -0.1, 0.2, 0.2))}),
+        ("max_gap_um2", (12,), 0.04),
+    ),
+    "site outside the die": (
+        Layout.from_polygons([*squares(), box_at(2.5, 0.5, 0.95, 1)]),
+        ("die_um", (25,), 0.95),
+    ),
+    "site across the edge of the die": (
+        replaced({24: box_at(1.5, 1.5, 1, 1.125)}),
+        ("die_um", (24,), 0.125),
+    ),
+}
+
+
+def test_the_unit_squares_keep_every_rule():
+    report = replaced({}).check(ALL_RULES)
+
+    assert report.ok
+    assert report.violations == ()
+    assert [result.rule for result in report.results] == list(RULE_NAMES)
+
+
+@pytest.mark.parametrize(("layout", "violation"), PLANTED.values(), ids=PLANTED)
+def test_a_planted_violation_is_found_alone_with_its_site_and_value(layout, violation):
+    assert found(layout) == [violation]
+    assert not layout.check(ALL_RULES).ok
+
+
+@pytest.mark.parametrize(("layout", "violation"), PLANTED.values(), ids=PLANTED)
+def test_a_rule_that_is_left_out_finds_nothing(layout, violation):
+    assert found(layout, replace(ALL_RULES, **{violation[0]: None})) == []
+
+
+@pytest.mark.parametrize(("layout", "violation"), PLANTED.values(), ids=PLANTED)
+def test_a_violation_tells_its_limit_unit_and_place(layout, violation):
+    (v,) = layout.check(ALL_RULES).violations
+    rule, sites, value = violation
+    polygons = layout.polygons()
+
+    assert v.limit == (0.0 if rule == "die_um" else getattr(ALL_RULES, rule))
+    assert v.unit == ("µm²" if rule.endswith("um2") else "µm")
+    if rule.endswith("um2"):
+        assert v.marker.area == pytest.approx(value, rel=1e-9)
+        assert all(v.marker.intersects(polygons[site]) for site in sites)
+    else:
+        assert v.marker.equals(polygons[sites[0]])
+
+
+# -- min_size --------------------------------------------------------------------------------------------------------
+
+
+def test_small_sites_come_worst_first():
+    layout = Layout.from_rectangles([[0, 0], [10, 0], [20, 0], [30, 0]], [1.0, 3.0, 0.5, 2.0])
+
+    assert found(layout, DesignRules(min_size_um=2.5)) == [
+        ("min_size_um", (2,), 0.5),
+        ("min_size_um", (0,), 1.0),
+        ("min_size_um", (3,), 2.0),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("width_um", "height_um", "limit_um", "ok"),
+    [(2.0, 2.0, 2.0, True), (1.0, 4.0, 2.0, True), (1.0, 4.0, 2.001, False), (2.0, 2.0, 2.0 + 1e-8, True)],
+)
+def test_a_site_of_the_smallest_size_passes(width_um, height_um, limit_um, ok):
+    layout = Layout.from_rectangles([[0, 0]], [[width_um, height_um]])
+
+    assert layout.check(DesignRules(min_size_um=limit_um)).ok is ok
+
+
+def test_the_size_of_a_site_leaves_out_its_holes():
+    layout = Layout.from_polygons([box_at(0, 0, 5, 5).difference(box_at(1, 1, 3, 3))])
+
+    assert found(layout, DesignRules(min_size_um=4.5)) == [("min_size_um", (0,), 4.0)]
+
+
+# -- min_width -------------------------------------------------------------------------------------------------------
+
+WIDTHS = {
+    "square": (box_at(0, 0, 3, 3), 3.0),
+    "bar": (box_at(0, 0, 30, 0.5), 0.5),
+    "equilateral triangle": (regular(3), 1.5),
+    "right triangle": (shapely.Polygon([(0, 0), (3, 0), (0, 4)]), 2.4),
+    "needle": (shapely.Polygon([(0, 0), (100, 0), (0, 1)]), 100 / math.hypot(100, 1)),
+    "pentagon": (regular(5), 1 + math.cos(math.pi / 5)),
+    "hexagon": (regular(6), math.sqrt(3)),
+    "octagon": (regular(8), 2 * math.cos(math.pi / 8)),
+    "rhombus": (shapely.Polygon([(0, 0), (2, 0), (3, math.sqrt(3)), (1, math.sqrt(3))]), math.sqrt(3)),
+    "flat rhombus": (shapely.Polygon([(-5, 0), (0, -1), (5, 0), (0, 1)]), 10 / math.sqrt(26)),
+    "parallelogram": (shapely.Polygon([(0, 0), (10, 0), (30, 1), (20, 1)]), 10 / math.hypot(20, 1)),
+    "L": (shapely.Polygon([(0, 0), (5, 0), (5, 0.3), (1, 0.3), (1, 5), (0, 5)]), 0.3),
+    "U": (shapely.Polygon([(0, 0), (6, 0), (6, 5), (5.6, 5), (5.6, 2), (2, 2), (2, 5), (0, 5)]), 0.4),
+    "U with a thin foot": (shapely.Polygon([(0, 0), (6, 0), (6, 5), (4, 5), (4, 0.1), (2, 0.1), (2, 5), (0, 5)]), 0.1),
+    "U with a narrow slot": (
+        shapely.Polygon([(0, 0), (6, 0), (6, 5), (3.1, 5), (3.1, 2), (2.9, 2), (2.9, 5), (0, 5)]),
+        2.0,
+    ),
+    "T": (shapely.Polygon([(0, 4), (0, 3), (2, 3), (2, 0), (2.7, 0), (2.7, 3), (6, 3), (6, 4)]), 0.7),
+    "cross": (box_at(0, 2, 5, 0.9).union(box_at(2, 0, 0.6, 5)), 0.6),
+    "hourglass": (shapely.Polygon([(0, 0), (4, 0), (2.2, 2), (4, 4), (0, 4), (1.8, 2)]), 0.4),
+    "frame": (box_at(0, 0, 10, 10).difference(box_at(1, 2, 8, 5)), 1.0),
+    "frame with a thin wall": (box_at(0, 0, 10, 10).difference(box_at(1, 2, 8.75, 5)), 0.25),
+    "wall between two holes": (
+        box_at(0, 0, 10, 10).difference(box_at(2, 2, 2.9, 6)).difference(box_at(5, 2, 3, 6)),
+        0.1,
+    ),
+    "notch down to a neck": (
+        shapely.Polygon([(0, 0), (10, 0), (10, 10), (5.5, 10), (5, 0.1), (4.5, 10), (0, 10)]),
+        0.1,
+    ),
+    "square with vertices on its sides": (
+        shapely.Polygon([(0, 0), (1, 0), (2, 0), (3, 0), (3, 1.5), (3, 3), (0.2, 3), (0.1, 3), (0, 3), (0, 2)]),
+        3.0,
+    ),
+}
+
+
+@pytest.mark.parametrize(("shape", "width_um"), WIDTHS.values(), ids=WIDTHS)
+def test_widths_of_known_shapes(shape, width_um):
+    assert min_width_um(Layout.from_polygons([shape]))[0] == pytest.approx(width_um, rel=1e-9)
+
+
+@pytest.mark.parametrize("shape", [shape for shape, _ in WIDTHS.values()], ids=WIDTHS)
+@given(angle_deg=st.floats(0, 360), factor=st.floats(0.1, 10), shift_um=st.integers(-1000, 1000))
+@settings(relaxed, max_examples=15)
+def test_widths_turn_and_grow_with_their_shapes(shape, angle_deg, factor, shift_um):
+    layout = Layout.from_polygons([shape])
+    moved = layout.rotate(angle_deg).scale(factor).translate(shift_um, -shift_um)
+
+    assert min_width_um(moved)[0] == pytest.approx(factor * min_width_um(layout)[0], rel=1e-6)
+
+
+@given(st.integers(3, 16), st.floats(1.05, 2.0), st.integers(1, 4), st.booleans())
+@example(n_sectors=8, ring_ratio=2.0, chords_per_arc=1, stagger=False)
+@relaxed
+def test_all_sites_of_a_ring_have_the_same_width(n_sectors, ring_ratio, chords_per_arc, stagger):
+    layout = log_polar(
+        n_sectors=n_sectors,
+        r_min_um=10.0,
+        r_max_um=40.0,
+        ring_ratio=ring_ratio,
+        chords_per_arc=chords_per_arc,
+        stagger=stagger,
+    )
+    width_um = min_width_um(layout).reshape(-1, n_sectors)
+
+    np.testing.assert_allclose(width_um, np.broadcast_to(width_um[:, :1], width_um.shape), rtol=1e-9)
+
+
+@given(st.floats(0.1, 50.0), st.floats(0.1, 50.0), st.floats(-180, 180))
+@relaxed
+def test_the_width_of_a_rectangle_is_its_shorter_side(width_um, height_um, angle_deg):
+    layout = Layout.from_rectangles([[0, 0]], [[width_um, height_um]]).rotate(angle_deg)
+
+    assert min_width_um(layout)[0] == pytest.approx(min(width_um, height_um), rel=1e-9)
+
+
+@pytest.mark.parametrize("n_corners", [16, 64, 257])
+def test_the_width_of_a_disc_is_its_diameter_to_five_percent(n_corners):
+    assert min_width_um(Layout.from_polygons([regular(n_corners, 3.0)]))[0] == pytest.approx(6.0, rel=0.05)
+
+
+@pytest.mark.parametrize("orientation", ["pointy", "flat"])
+def test_the_width_of_hexagons_is_their_width(orientation):
+    layout = hexagonal(n_columns=3, n_rows=4, pitch_um=100.0, width_um=85.0, orientation=orientation)
+
+    np.testing.assert_allclose(min_width_um(layout), 85.0, rtol=1e-9)
+    assert layout.check(DesignRules(min_width_um=85.0)).ok
+    assert len(layout.check(DesignRules(min_width_um=85.01)).violations) == 12
+
+
+def test_each_site_has_its_own_width_whatever_lies_beside_it():
+    shapes = [affinity.translate(shape, 200.0 * k, 0.0) for k, (shape, _) in enumerate(WIDTHS.values())]
+    together = min_width_um(Layout.from_polygons(shapes))
+
+    assert together.tolist() == pytest.approx(
+        [min_width_um(Layout.from_polygons([shape]))[0] for shape in shapes], rel=1e-12
+    )
+
+
+# -- overlap ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("shapes", "expected"),
+    [
+        pytest.param([box_at(0, 0, 2, 2), box_at(2, 0, 2, 2)], [], id="common edge"),
+        pytest.param([box_at(0, 0, 2, 2), box_at(2, 2, 2, 2)], [], id="common corner"),
+        pytest.param([box_at(0, 0, 2, 2), box_at(5, 0, 2, 2)], [], id="apart"),
+        pytest.param([box_at(0, 0, 2, 2), box_at(0, 0, 2, 2)], [((0, 1), 4.0)], id="same site twice"),
+        pytest.param([box_at(0, 0, 4, 4), box_at(1, 1, 1, 1)], [((0, 1), 1.0)], id="one in the other"),
+        pytest.param([box_at(0, 0, 4, 4).difference(box_at(1, 1, 1, 1)), box_at(1, 1, 1, 1)], [], id="one in a hole"),
+        pytest.param([box_at(0, 1, 3, 1), box_at(1, 0, 1, 3)], [((0, 1), 1.0)], id="crossed bars"),
+        pytest.param(
+            [box_at(0, 0, 2, 2), box_at(1, 0, 2, 2), box_at(1.5, 0, 2, 2)],
+            [((1, 2), 3.0), ((0, 1), 2.0), ((0, 2), 1.0)],
+            id="three, worst first",
+        ),
+    ],
+)
+def test_overlaps_are_pairs_with_their_common_area(shapes, expected):
+    layout = Layout.from_polygons(shapes)
+
+    assert found(layout, DesignRules(max_overlap_um2=0.0)) == [("max_overlap_um2", *pair) for pair in expected]
+
+
+@pytest.mark.parametrize(("limit_um2", "ok"), [(0.24, False), (0.25, True), (0.3, True)])
+def test_an_overlap_up_to_the_limit_passes(limit_um2, ok):
+    layout = PLANTED["overlap"][0]
+
+    assert layout.check(DesignRules(max_overlap_um2=limit_um2)).ok is ok
+
+
+@given(st.integers(0, 2**32 - 1))
+@relaxed
+def test_overlaps_of_random_rectangles_are_those_of_all_pairs(seed):
+    rng = np.random.default_rng(seed)
+    centre, size = rng.uniform(-5, 5, (12, 2)), rng.uniform(0.5, 4.0, (12, 2))
+    violations = Layout.from_rectangles(centre, size).check(DesignRules(max_overlap_um2=0.0)).violations
+    expected = {}
+    for i, j in combinations(range(12), 2):
+        reach = np.minimum(centre[i] + size[i] / 2, centre[j] + size[j] / 2)
+        common = reach - np.maximum(centre[i] - size[i] / 2, centre[j] - size[j] / 2)
+        if np.all(common > 0):
+            expected[i, j] = pytest.approx(common[0] * common[1], rel=1e-7)
+
+    assert {v.site_ids: v.value for v in violations} == expected
+
+
+# -- gap -------------------------------------------------------------------------------------------------------------
+
+
+def test_without_a_die_a_gap_is_what_sites_surround():
+    missing = replaced({}, dropped=(7, 24))
+
+    assert found(missing, DesignRules(max_gap_um2=0.0)) == [("max_gap_um2", (1, 2, 3, 6, 7, 10, 11, 12), 1.0)]
+
+
+def test_with_a_die_a_gap_is_all_that_is_left_open_of_it():
+    missing = replaced({}, dropped=(7, 24))
+    rules = DesignRules(max_gap_um2=0.0, die_um=(-2.5, -2.5, 3.5, 2.5))
+
+    assert found(missing, rules) == [
+        ("max_gap_um2", (4, 8, 13, 17, 18, 22), 6.0),
+        ("max_gap_um2", (1, 2, 3, 6, 7, 10, 11, 12), 1.0),
+    ]
+
+
+@pytest.mark.parametrize("die_um", [None, (0.0, 0.0, 10.0, 10.0)])
+def test_an_island_in_a_gap_is_no_part_of_it(die_um):
+    ring = box_at(0, 0, 10, 10).difference(box_at(2, 2, 6, 6))
+    layout = Layout.from_polygons([ring, box_at(4, 4, 2, 2)])
+
+    assert found(layout, DesignRules(max_gap_um2=0.0, die_um=die_um)) == [("max_gap_um2", (0, 1), 32.0)]
+
+
+def test_trenches_that_reach_the_outside_are_a_gap_only_in_a_die():
+    layout = grid(n_x=3, n_y=3, pitch_um=1.0, width_um=0.9)
+
+    assert layout.check(DesignRules(max_gap_um2=0.0)).ok
+    assert found(layout, DesignRules(max_gap_um2=0.0, die_um=(-1.5, -1.5, 1.5, 1.5))) == [
+        ("max_gap_um2", tuple(range(9)), 9 * 0.19)
+    ]
+
+
+@pytest.mark.parametrize(("limit_um2", "ok"), [(0.9, False), (1.0, True), (2.0, True)])
+def test_a_gap_up_to_the_limit_passes(limit_um2, ok):
+    layout = PLANTED["site missing in the middle"][0]
+
+    assert layout.check(DesignRules(max_gap_um2=limit_um2)).ok is ok
+
+
+@pytest.mark.parametrize("stagger", [False, True])
+@pytest.mark.parametrize("n_sectors", [8, 33])
+def test_the_blind_spot_is_the_only_gap_of_a_log_polar_layout(n_sectors, stagger):
+    layout = log_polar(n_sectors=n_sectors, r_min_um=10.0, r_max_um=50.0, n_rings=4, stagger=stagger, chords_per_arc=2)
+    n_corners = 2 * n_sectors
+    blind_um2 = 0.5 * n_corners * math.sin(2 * math.pi / n_corners) * 100.0
+
+    assert found(layout, DesignRules(max_gap_um2=0.0)) == [("max_gap_um2", tuple(range(n_sectors)), blind_um2)]
+
+
+def test_a_die_without_sites_is_one_gap():
+    report = replaced({})[:0].check(DesignRules(max_gap_um2=0.0, die_um=(0, 0, 3, 2)))
+
+    assert [(v.site_ids, v.value) for v in report.violations] == [((), 6.0)]
+
+
+# -- die -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("die_um", "expected"),
+    [
+        pytest.param((-1, -1, 1, 1), [], id="touching"),
+        pytest.param((-0.75, -1, 1, 1), [((0,), 0.25), ((2,), 0.25)], id="left"),
+        pytest.param((-1, -0.75, 1, 1), [((0,), 0.25), ((1,), 0.25)], id="low"),
+        pytest.param((-1, -1, 0.5, 1), [((1,), 0.5), ((3,), 0.5)], id="right"),
+        pytest.param((-1, -1, 1, 0.5), [((2,), 0.5), ((3,), 0.5)], id="high"),
+        pytest.param((-1, -1, 0.5, 0.25), [((2,), 0.75), ((3,), 0.75), ((1,), 0.5)], id="two sides, worst first"),
+        pytest.param((10, 10, 11, 11), [((0,), 11.0), ((1,), 11.0), ((2,), 11.0), ((3,), 10.0)], id="elsewhere"),
+    ],
+)
+def test_how_far_sites_reach_out_of_the_die(die_um, expected):
+    layout = grid(n_x=2, n_y=2, pitch_um=1.0)
+
+    assert found(layout, DesignRules(die_um=die_um)) == [("die_um", *violation) for violation in expected]
+
+
+# -- clean layouts ---------------------------------------------------------------------------------------------------
+
+TILING = DesignRules(max_overlap_um2=0.0, max_gap_um2=0.0)
+
+
+@pytest.mark.parametrize(
+    ("layout", "size_um", "width_um"),
+    [
+        pytest.param(grid(n_x=9, n_y=7, pitch_um=0.7), 0.7, 0.7, id="grid"),
+        pytest.param(grid(n_x=9, n_y=7, pitch_um=0.7, width_um=0.6), 0.6, 0.6, id="grid with trenches"),
+        pytest.param(
+            hexagonal(n_columns=9, n_rows=7, pitch_um=0.7), 0.7 * math.sqrt(math.sqrt(0.75)), 0.7, id="hexagons"
+        ),
+        pytest.param(zones(side_um=(6.4, 12.8, 25.6), pitch_um=(0.8, 1.6, 3.2)), 0.8, 0.8, id="zones"),
+    ],
+)
+@pytest.mark.parametrize("angle_deg", [0.0, 33.0])
+@pytest.mark.parametrize("shift_um", [0.0, 12_345.678])
+def test_clean_layouts_pass_wherever_they_lie(layout, size_um, width_um, angle_deg, shift_um):
+    moved = layout.rotate(angle_deg).translate(shift_um, -shift_um)
+    die_um = np.add(moved.bounds_um, (-1.0, -1.0, 1.0, 1.0))
+
+    assert found(moved, TILING) == []
+    assert found(moved, DesignRules(min_size_um=size_um, min_width_um=width_um, die_um=tuple(die_um))) == []
+
+
+@given(st.integers(3, 14), st.integers(1, 5), st.integers(1, 4), st.booleans(), st.floats(0, 360))
+@relaxed
+def test_log_polar_layouts_have_no_overlap_and_only_their_blind_spot_as_gap(
+    n_sectors, n_rings, chords_per_arc, stagger, angle_deg
+):
+    layout = log_polar(
+        n_sectors=n_sectors,
+        r_min_um=3.0,
+        r_max_um=40.0,
+        n_rings=n_rings,
+        chords_per_arc=chords_per_arc,
+        stagger=stagger,
+    )
+    violations = layout.rotate(angle_deg).check(TILING).violations
+
+    assert [(v.rule, v.site_ids) for v in violations] == [("max_gap_um2", tuple(range(n_sectors)))]
+
+
+def test_a_layout_without_sites_keeps_every_rule_but_leaves_the_die_open():
+    none = replaced({})[:0]
+    report = none.check(ALL_RULES)
+
+    assert report.n_sites == 0
+    assert [v.rule for v in report.violations] == ["max_gap_um2"]
+    assert none.check(DesignRules(min_size_um=1, min_width_um=1, max_overlap_um2=0, max_gap_um2=0)).ok
+
+
+# -- report ----------------------------------------------------------------------------------------------------------
+
+
+def test_only_rules_with_a_limit_are_in_the_report():
+    layout = replaced({})
+
+    assert layout.check(DesignRules()).results == ()
+    assert layout.check(DesignRules()).ok
+    assert [r.rule for r in layout.check(DesignRules(die_um=(0, 0, 1, 1), min_size_um=0)).results] == [
+        "min_size_um",
+        "die_um",
+    ]
+
+
+def test_raise_if_failed_says_nothing_of_a_clean_layout():
+    report = replaced({}).check(ALL_RULES)
+
+    assert (report.raise_if_failed(), report.n_sites) == (None, 25)
+
+
+def test_raise_if_failed_names_each_broken_rule_with_count_worst_and_limit():
+    layout = Layout.from_rectangles([[0, 0], [5, 0], [10, 0]], [[1, 1], [0.5, 3], [0.25, 30]])
+    report = layout.check(DesignRules(min_size_um=1.5, min_width_um=0.75, max_overlap_um2=0.0, die_um=(-9, -9, 9, 9)))
+
+    with pytest.raises(GeometryError, match="the layout breaks its design rules: ") as caught:
+        report.raise_if_failed()
+    assert caught.value.site_ids == (0, 1, 2)
+    assert str(caught.value).split(": ", 1)[1].split("; ") == [
+        "min_size_um: 2 violations, worst 1 µm for a limit of 1.5 µm",
+        "min_width_um: 2 violations, worst 0.25 µm for a limit of 0.75 µm",
+        "die_um: 1 violations, worst 6 µm for a limit of 0 µm",
+    ]
+
+
+def test_the_worst_value_is_that_furthest_beyond_the_limit():
+    layout = Layout.from_rectangles([[0, 0], [5, 0], [10, 0]], [1.0, 0.5, 2.0])
+    size, die = layout.check(DesignRules(min_size_um=1.5, die_um=(0, -9, 9, 9))).results
+
+    assert (size.worst, die.worst) == (0.5, 2.0)
+    assert layout.check(DesignRules(min_size_um=0.1)).results[0].worst is None
+
+
+def test_the_table_has_a_line_for_each_rule():
+    layout = Layout.from_rectangles([[0, 0], [5, 0]], [[1, 1], [0.5, 3]])
+    report = layout.check(DesignRules(min_size_um=1.1, min_width_um=0.25))
+    screen = io.StringIO()
+    Console(file=screen, width=120, color_system=None).print(report)
+    lines = [line.split() for line in screen.getvalue().replace("│", " ").splitlines()]
+
+    assert ["Design", "rules", "on", "2", "photosites"] in lines
+    assert ["min_size_um", "fail", "1", "1", "1.1", "µm"] in lines
+    assert ["min_width_um", "pass", "0", "0.25", "µm"] in lines
+
+
+# -- the limits themselves -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["min_size_um", "min_width_um", "max_overlap_um2", "max_gap_um2"])
+@pytest.mark.parametrize(
+    ("limit", "message"),
+    [
+        (-1, "must be >= 0, got -1.0 µm"),
+        (np.nan, "must be finite, got nan µm"),
+        (np.inf, "must be finite, got inf µm"),
+        ("1", "must be one number, got '1'"),
+        (True, "must be one number, got True"),
+    ],
+)
+def test_limits_that_cannot_be_are_refused(name, limit, message):
+    with pytest.raises(ParameterError, match=f"'{name}' {message}"):
+        DesignRules(**{name: limit})
+
+
+@pytest.mark.parametrize(
+    ("die_um", "message"),
+    [
+        ((0, 0, 1), r"'die_um' must be \(x_min, y_min, x_max, y_max\)"),
+        ((1, 0, 0, 1), r"'die_um' must be \(x_min, y_min, x_max, y_max\), got \(1, 0, 0, 1\) µm"),
+        ((0, 0, 1, 0), r"'die_um' must be \(x_min, y_min, x_max, y_max\)"),
+        (((0, 0), (1, 1)), "'die_um' must have 1 dimension, got the shape"),
+        ((0, 0, np.nan, 1), r"'die_um' must be finite .* at \[2\]"),
+        ("all", "'die_um' must be an array of numbers, got 'all'"),
+        (5.0, "'die_um' must have 1 dimension, got the shape"),
+    ],
+)
+def test_dies_that_cannot_be_are_refused(die_um, message):
+    with pytest.raises(ParameterError, match=message):
+        DesignRules(die_um=die_um)

@@ -1,0 +1,637 @@
+"""Picture files: what is in them comes back upright and unchanged, and what is wrong with them ends in one sentence."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
+from foveasim import pictures
+from foveasim.errors import FileError
+from foveasim.pictures import read_picture, write_picture
+
+#: A letter without any symmetry, the first row on top, as in a file.
+F = np.array(
+    [
+        [0, 0, 0, 0, 0],
+        [0, 1, 1, 1, 0],
+        [0, 1, 0, 0, 0],
+        [0, 1, 1, 0, 0],
+        [0, 1, 0, 0, 0],
+        [0, 1, 0, 0, 0],
+        [0, 0, 0, 0, 0],
+    ],
+    np.uint8,
+)
+GREY8 = F * np.uint8(200) + np.uint8(7)
+GREY16 = F * np.uint16(40_001) + np.uint16(258)
+COLOUR8 = np.stack([F * 201, F * 102 + 3, 250 - F * 50], axis=-1).astype(np.uint8)
+COLOUR16 = np.stack([F * np.uint16(50_001), F * np.uint16(301) + 5, 65_000 - F * np.uint16(999)], axis=-1).astype(
+    np.uint16
+)
+ALPHA8 = np.arange(F.size, dtype=np.uint8).reshape(F.shape) + np.uint8(220)
+ALPHA16 = np.arange(F.size, dtype=np.uint16).reshape(F.shape) + np.uint16(65_500)
+#: Float values that float32 holds exactly, one above 1.
+RADIANCE = (F * np.float32(1.75) + np.float32(0.125)).astype(np.float32)
+#: The letter of 16 x 16 pixels a cell, and noise, which every compression must write in full.
+LARGE_F = np.kron(F, np.ones((16, 16), np.uint8)) * np.uint8(255)
+NOISE = np.random.default_rng(5).integers(0, 256, (40, 30, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def cv2():
+    return pytest.importorskip("cv2", reason="needs the extra 'pictures'")
+
+
+def encoded(array, picture_format, **options):
+    """Bytes of a file that Pillow writes."""
+    image = array if isinstance(array, Image.Image) else Image.fromarray(array)
+    file = io.BytesIO()
+    image.save(file, format=picture_format, **options)
+    return file.getvalue()
+
+
+def tiff(array, **options):
+    """Bytes of a file that tifffile writes."""
+    file = io.BytesIO()
+    tifffile.imwrite(file, array, **options)
+    return file.getvalue()
+
+
+def png_chunk(kind, body):
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def png(*, width, height, depth, colour_type, rows):
+    """A PNG byte by byte, the header saying what it likes."""
+    header = struct.pack(">IIBBBBB", width, height, depth, colour_type, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(png_chunk(*chunk) for chunk in chunks)
+
+
+def palette_image(*, values=F, **info):
+    image = Image.frombytes("P", values.shape[::-1], values.tobytes())
+    image.putpalette([10, 20, 30, 200, 100, 50])
+    image.info.update(info)
+    return image
+
+
+def is_letter(grey):
+    """Whether a picture is the letter, upright, 16 pixels a cell, through a lossy compression."""
+    cells = grey.astype(float).reshape(7, 16, 5, 16).mean(axis=(1, 3))
+    return np.array_equal(cells > 127.5, F == 1)
+
+
+def read_bytes(tmp_path, content, name="picture.bin"):
+    path = tmp_path / name
+    path.write_bytes(content)
+    return read_picture(path)
+
+
+def assert_is_refused(tmp_path, content, match, name="picture.bin"):
+    """The file ends in a FileError of one line that begins with its path."""
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(FileError, match=match) as caught:
+        read_picture(path)
+    assert caught.value.path == path
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+# -- what is read ---------------------------------------------------------------------------------------------------
+
+LOSSLESS = {
+    "grey png": (encoded(GREY8, "PNG"), GREY8),
+    "16-bit grey png": (encoded(GREY16, "PNG"), GREY16),
+    "colour png": (encoded(COLOUR8, "PNG"), COLOUR8),
+    "grey and alpha png": (encoded(np.dstack([GREY8, ALPHA8]), "PNG"), np.dstack([GREY8, ALPHA8])),
+    "colour and alpha png": (encoded(np.dstack([COLOUR8, ALPHA8]), "PNG"), np.dstack([COLOUR8, ALPHA8])),
+    "1-bit png": (encoded(Image.fromarray(F * np.uint8(255)).convert("1"), "PNG"), F * np.uint8(255)),
+    "palette png": (encoded(palette_image(), "PNG"), np.array([[10, 20, 30], [200, 100, 50]], np.uint8)[F]),
+    "palette png with transparency": (
+        encoded(palette_image(), "PNG", transparency=b"\x40\xff"),
+        np.array([[10, 20, 30, 64], [200, 100, 50, 255]], np.uint8)[F],
+    ),
+    "gif": (encoded(palette_image(), "GIF"), np.array([[10, 20, 30], [200, 100, 50]], np.uint8)[F]),
+    "bmp": (encoded(COLOUR8, "BMP"), COLOUR8),
+    "lossless webp": (encoded(COLOUR8, "WEBP", lossless=True), COLOUR8),
+    "lossless jpeg 2000": (encoded(COLOUR8, "JPEG2000"), COLOUR8),
+    "16-bit jpeg 2000": (encoded(GREY16, "JPEG2000"), GREY16),
+    "tga": (encoded(COLOUR8, "TGA"), COLOUR8),
+    "colour ppm": (encoded(COLOUR8, "PPM"), COLOUR8),
+    "8-bit pgm": (b"P5 5 7 255\n" + GREY8.tobytes(), GREY8),
+    "16-bit pgm": (b"P5 5 7 65535\n" + GREY16.astype(">u2").tobytes(), GREY16),
+    "float pfm": (encoded(RADIANCE, "PPM"), RADIANCE),
+    "grey tiff": (tiff(GREY8), GREY8),
+    "16-bit grey tiff": (tiff(GREY16), GREY16),
+    "16-bit tiff of the other byte order": (tiff(GREY16, byteorder=">"), GREY16),
+    "large tiff": (tiff(GREY16, bigtiff=True), GREY16),
+    "float tiff": (tiff(RADIANCE), RADIANCE),
+    "half float tiff": (tiff(RADIANCE.astype(np.float16)), RADIANCE),
+    "double tiff": (tiff(RADIANCE.astype(np.float64)), RADIANCE),
+    "colour tiff": (tiff(COLOUR8, photometric="rgb"), COLOUR8),
+    "16-bit colour tiff": (tiff(COLOUR16, photometric="rgb"), COLOUR16),
+    "colour tiff in planes": (
+        tiff(np.moveaxis(COLOUR16, -1, 0), photometric="rgb", planarconfig="separate"),
+        COLOUR16,
+    ),
+    "colour and alpha tiff": (
+        tiff(np.dstack([COLOUR8, ALPHA8]), photometric="rgb", extrasamples=["unassalpha"]),
+        np.dstack([COLOUR8, ALPHA8]),
+    ),
+    "1-bit tiff": (encoded(Image.fromarray(F * np.uint8(255)).convert("1"), "TIFF"), F * np.uint8(255)),
+    "palette tiff": (
+        tiff(F, photometric="palette", colormap=np.tile(np.array([257, 51_400], np.uint16), (3, 128))),
+        np.tile(np.array([257, 51_400], np.uint16)[F][..., np.newaxis], 3),
+    ),
+    "tiff whose 0 is white": (tiff(255 - GREY8, photometric="miniswhite"), GREY8),
+    "deflated tiff": (encoded(COLOUR8, "TIFF", compression="tiff_deflate"), COLOUR8),
+    "packbits tiff": (encoded(COLOUR8, "TIFF", compression="packbits"), COLOUR8),
+    "lzw tiff": (encoded(COLOUR8, "TIFF", compression="tiff_lzw"), COLOUR8),
+}
+
+
+@pytest.mark.parametrize(("content", "picture"), LOSSLESS.values(), ids=LOSSLESS)
+def test_every_number_is_read_as_it_was_written(tmp_path, content, picture):
+    read = read_bytes(tmp_path, content)
+    np.testing.assert_array_equal(read, picture, strict=True)
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [COLOUR16, np.dstack([COLOUR16, ALPHA16])],
+    ids=["colour", "colour and alpha"],
+)
+def test_a_png_of_16_bits_in_colour_keeps_them_all(tmp_path, cv2, picture):
+    order = [2, 1, 0, 3][: picture.shape[2]]  # OpenCV writes blue first
+    content = cv2.imencode(".png", np.ascontiguousarray(picture[..., order]))[1].tobytes()
+    np.testing.assert_array_equal(read_bytes(tmp_path, content), picture, strict=True)
+
+
+def test_a_png_of_16_bits_grey_and_alpha_keeps_grey_and_alpha(tmp_path, cv2):
+    assert cv2 is not None
+    samples = np.dstack([GREY16, ALPHA16]).astype(">u2")
+    rows = b"".join(b"\0" + row.tobytes() for row in samples)
+    read = read_bytes(tmp_path, png(width=5, height=7, depth=16, colour_type=4, rows=rows))
+    for channel in np.moveaxis(read[..., :-1], -1, 0):
+        np.testing.assert_array_equal(channel, GREY16)
+    np.testing.assert_array_equal(read[..., -1], ALPHA16)
+
+
+def test_a_radiance_hdr_is_read_to_the_8_bits_of_its_mantissa(tmp_path, cv2):
+    colour = np.stack([F * 3.0 + 0.1, F * 0.5 + 0.2, F * 1.0 + 0.3], axis=-1).astype(np.float32)
+    content = cv2.imencode(".hdr", np.ascontiguousarray(colour[..., ::-1]))[1].tobytes()
+    # The brightest channel of a pixel lies between 128 and 256 steps of the exponent that all three share.
+    step = colour.max(axis=-1, keepdims=True) / 128.0
+    assert np.all(np.abs(read_bytes(tmp_path, content) - colour) <= step)
+
+
+def exr():
+    """An uncompressed EXR byte by byte: magic, header of attributes, offsets of the lines, lines of B, G, R."""
+    colour = np.stack([RADIANCE, RADIANCE * 2, RADIANCE * 3], axis=-1)
+    height, width = F.shape
+
+    def attribute(name, kind, value):
+        return name + b"\0" + kind + b"\0" + struct.pack("<i", len(value)) + value
+
+    channels = b"".join(name + b"\0" + struct.pack("<iBxxxii", 2, 0, 1, 1) for name in (b"B", b"G", b"R")) + b"\0"
+    window = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    header = (
+        struct.pack("<II", 20000630, 2)
+        + attribute(b"channels", b"chlist", channels)
+        + attribute(b"compression", b"compression", b"\0")
+        + attribute(b"dataWindow", b"box2i", window)
+        + attribute(b"displayWindow", b"box2i", window)
+        + attribute(b"lineOrder", b"lineOrder", b"\0")
+        + attribute(b"pixelAspectRatio", b"float", struct.pack("<f", 1.0))
+        + attribute(b"screenWindowCenter", b"v2f", struct.pack("<2f", 0.0, 0.0))
+        + attribute(b"screenWindowWidth", b"float", struct.pack("<f", 1.0))
+        + b"\0"
+    )
+    lines = [
+        struct.pack("<ii", y, 12 * width) + np.moveaxis(colour[y, :, ::-1], -1, 0).astype("<f4").tobytes()
+        for y in range(height)
+    ]
+    first = len(header) + 8 * height
+    offsets = struct.pack(f"<{height}Q", *(first + len(lines[0]) * y for y in range(height)))
+    return header + offsets + b"".join(lines), colour
+
+
+def test_an_exr_is_read_or_the_missing_reader_is_named(tmp_path, cv2):
+    # Some builds of OpenCV come without EXR; a sound file is not to be called broken then.
+    content, colour = exr()
+    if any("OpenEXR" in line and "NO" not in line.split() for line in cv2.getBuildInformation().splitlines()):
+        np.testing.assert_array_equal(read_bytes(tmp_path, content), colour, strict=True)
+    else:
+        assert_is_refused(tmp_path, content, r": (?!is broken).*EXR")
+
+
+@pytest.mark.parametrize(
+    ("picture_format", "options"),
+    [("JPEG", {}), ("JPEG", {"progressive": True}), ("WEBP", {})],
+    ids=["jpeg", "progressive jpeg", "webp"],
+)
+def test_a_lossy_picture_is_upright(tmp_path, picture_format, options):
+    colour = np.repeat(LARGE_F[..., np.newaxis], 3, axis=-1)
+    assert is_letter(read_bytes(tmp_path, encoded(colour, picture_format, **options))[..., 1])
+
+
+def test_a_cmyk_jpeg_is_read_in_its_colours(tmp_path):
+    red = np.stack([LARGE_F, LARGE_F * 0, LARGE_F * 0], axis=-1)
+    read = read_bytes(tmp_path, encoded(Image.fromarray(red).convert("CMYK"), "JPEG", quality=95))
+    assert is_letter(read[..., 0])
+    # Quantisation of quality 95 moves no mean by more than a few codes.
+    assert read[..., 1:].mean() < 10.0
+
+
+@pytest.mark.parametrize("mode", ["CMYK", "YCbCr", "LAB"])
+def test_a_tiff_in_other_colours_is_not_taken_for_red_green_and_blue(tmp_path, mode):
+    red = np.zeros((7, 5, 3), np.uint8)
+    red[..., 0] = 255
+    try:
+        read = read_bytes(tmp_path, encoded(Image.fromarray(red).convert(mode), "TIFF"))
+    except FileError as error:
+        assert "\n" not in str(error)  # refused, which is right too
+    else:
+        assert read.shape == red.shape
+        assert np.abs(read.astype(int) - red).max() <= 2
+
+
+# Exif 2.32, tag 274: what the first row and the first column of the file are in the picture.
+HELD = {
+    1: F,
+    2: F[:, ::-1],  # top, right
+    3: F[::-1, ::-1],  # bottom, right
+    4: F[::-1],  # bottom, left
+    5: F.T,  # left, top
+    6: F[:, ::-1].T,  # right, top
+    7: F[::-1, ::-1].T,  # right, bottom
+    8: F[::-1].T,  # left, bottom
+}
+
+
+@pytest.mark.parametrize(("orientation", "stored"), HELD.items())
+@pytest.mark.parametrize("picture_format", ["JPEG", "PNG", "TIFF"])
+def test_a_picture_is_upright_however_the_camera_was_held(tmp_path, orientation, stored, picture_format):
+    large = np.ascontiguousarray(np.kron(stored, np.ones((16, 16), np.uint8)) * np.uint8(255))
+    exif = Image.Exif()
+    exif[274] = orientation
+    assert is_letter(read_bytes(tmp_path, encoded(large, picture_format, exif=exif)))
+
+
+@pytest.mark.parametrize(
+    "exif",
+    [
+        b"Exif\0\0II*\0\x08\0\0\0\x05\0",  # five notes are announced, none follows
+        b"Exif\0\0II*\0\xff\xff\0\0",  # the notes lie beyond the end
+        b"Exif\0\0nonsense",
+        # orientation 6, and a width that is text
+        bytes.fromhex(
+            "4578696600004d4d002a000000080002010000020000000600000026011200030000000100060000000000006d616b657200"
+        ),
+    ],
+    ids=["cut short", "beyond the end", "nonsense", "text for a number"],
+)
+@pytest.mark.parametrize("picture_format", ["JPEG", "PNG", "WEBP"])
+def test_a_broken_note_of_the_camera_does_not_spoil_the_picture(tmp_path, exif, picture_format):
+    read = read_bytes(tmp_path, encoded(np.full((16, 16, 3), 200, np.uint8), picture_format, exif=exif))
+    assert np.abs(read.astype(int) - 200).max() <= 2
+
+
+@pytest.mark.parametrize(
+    ("picture", "key", "clear"),
+    [
+        (GREY8, 7, F == 0),
+        (GREY16, 258, F == 0),
+        (COLOUR8, (0, 3, 250), F == 0),
+    ],
+    ids=["grey", "16-bit grey", "colour"],
+)
+def test_a_colour_that_a_png_calls_transparent_is_transparent(tmp_path, picture, key, clear):
+    read = read_bytes(tmp_path, encoded(picture, "PNG", transparency=key))
+    assert read.ndim == 3
+    assert read.shape[2] in (2, 4)
+    np.testing.assert_array_equal(read[..., -1] == 0, clear)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        encoded(GREY8[1:2, 1:2], "PNG"),
+        encoded(np.full((1, 1), 207, np.uint8), "JPEG", quality=100),
+        tiff(GREY8[1:2, 1:2]),
+        encoded(GREY8[1:2, 1:2], "BMP"),
+    ],
+    ids=["png", "jpeg", "tiff", "bmp"],
+)
+def test_a_picture_may_be_one_pixel(tmp_path, content):
+    assert read_bytes(tmp_path, content).tolist() == [[207]]
+
+
+@pytest.mark.parametrize("picture", [GREY8[1:2], GREY8[:, 1:2], GREY8[:, :4], GREY8[:3]], ids=lambda p: str(p.shape))
+def test_a_few_rows_or_columns_are_not_taken_for_channels(tmp_path, picture):
+    np.testing.assert_array_equal(read_bytes(tmp_path, tiff(picture)), picture, strict=True)
+
+
+def test_the_content_counts_and_not_the_ending(tmp_path):
+    np.testing.assert_array_equal(read_bytes(tmp_path, tiff(GREY16), name="picture.png"), GREY16, strict=True)
+
+
+# -- what is refused ------------------------------------------------------------------------------------------------
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(FileError, match=r"nowhere\.png: no such file$"):
+        read_picture(tmp_path / "nowhere.png")
+
+
+def test_a_folder_is_refused(tmp_path):
+    folder = tmp_path / "folder.png"
+    folder.mkdir()
+    with pytest.raises(FileError, match=r"folder\.png: is not a file$"):
+        read_picture(folder)
+
+
+def test_a_file_that_may_not_be_opened_is_refused(tmp_path, monkeypatch):
+    path = tmp_path / "secret.png"
+    path.write_bytes(encoded(GREY8, "PNG"))
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr("pathlib.Path.open", refuse)
+    monkeypatch.setattr("builtins.open", refuse)
+    with pytest.raises(FileError, match=r"(?i)secret\.png: .*permission"):
+        read_picture(path)
+
+
+def test_a_name_too_long_for_the_system_is_refused(tmp_path):
+    with pytest.raises(FileError, match=r"\.png: "):
+        read_picture(tmp_path / ("x" * 300 + ".png"))
+
+
+INT_TIFFS = {
+    str(dtype): (tiff(F.astype(dtype)), f"must hold 8-bit, 16-bit or floating-point numbers, got {dtype}$")
+    for dtype in ("int8", "int16", "int32", "uint32", "int64")
+}
+BAD = {
+    "empty file": (b"", "is not a picture in a format that can be read$"),
+    "text": (b"This is a letter, and no picture of one.\n" * 9, "is not a picture in a format that can be read$"),
+    "animated gif": (
+        encoded(GREY8, "GIF", save_all=True, append_images=[Image.fromarray(255 - GREY8)]),
+        "holds 2 pictures; give a file with one$",
+    ),
+    "animated png": (
+        encoded(GREY8, "PNG", save_all=True, append_images=[Image.fromarray(255 - GREY8)]),
+        "holds 2 pictures; give a file with one$",
+    ),
+    "animated webp": (
+        encoded(COLOUR8, "WEBP", save_all=True, append_images=[Image.fromarray(255 - COLOUR8)]),
+        "holds 2 pictures; give a file with one$",
+    ),
+    "tiff of 3 pages": (tiff(np.stack([GREY8] * 3), photometric="minisblack"), "holds 3 pages; give a file with one$"),
+    "png of no columns": (png(width=0, height=5, depth=8, colour_type=0, rows=b""), "is not a picture|is broken"),
+    **{f"{dtype} tiff": case for dtype, case in INT_TIFFS.items()},
+}
+
+
+@pytest.mark.parametrize(("content", "sentence"), BAD.values(), ids=BAD)
+def test_what_is_no_picture_of_a_scene_is_refused_in_one_sentence(tmp_path, content, sentence):
+    assert_is_refused(tmp_path, content, sentence, name="picture.png")
+
+
+WHOLE = {
+    "png": encoded(NOISE, "PNG"),
+    "jpeg": encoded(NOISE, "JPEG"),
+    "progressive jpeg": encoded(NOISE, "JPEG", progressive=True),
+    "tiff": tiff(NOISE, photometric="rgb"),
+    "tiff in strips": tiff(NOISE, photometric="rgb", rowsperstrip=5),
+    "deflated tiff": tiff(NOISE, photometric="rgb", compression="zlib", rowsperstrip=5),
+    "webp": encoded(NOISE, "WEBP"),
+    "bmp": encoded(NOISE, "BMP"),
+    "gif": encoded(NOISE, "GIF"),
+    "ppm": encoded(NOISE, "PPM"),
+    "16-bit colour png": png(
+        width=5, height=40, depth=16, colour_type=2, rows=b"".join(b"\0" + row[:10].tobytes() for row in NOISE)
+    ),
+}
+
+
+@pytest.mark.parametrize("share", [0.001, 0.02, 0.1, 0.25, 0.5, 0.75, 0.95])
+@pytest.mark.parametrize("content", WHOLE.values(), ids=WHOLE)
+def test_a_picture_cut_short_is_refused(tmp_path, content, share):
+    cut = content[: 1 + int(share * (len(content) - 1))]
+    assert_is_refused(tmp_path, cut, "is broken or cut short|is not a picture in a format that can be read")
+
+
+def giant_tiff():
+    """A TIFF whose header says 60000 x 60000."""
+    content = bytearray(tiff(GREY8))
+    with tifffile.TiffFile(io.BytesIO(content)) as file:
+        places = [file.pages[0].tags[tag].offset for tag in (256, 257)]
+    for place in places:
+        content[place + 2 : place + 12] = struct.pack("<HII", 4, 1, 60_000)
+    return bytes(content)
+
+
+def giant_jpeg():
+    """A JPEG whose header says 60000 x 60000."""
+    content = bytearray(encoded(NOISE, "JPEG"))
+    frame = content.index(b"\xff\xc0")
+    content[frame + 5 : frame + 9] = struct.pack(">HH", 60_000, 60_000)
+    return bytes(content)
+
+
+BOMBS = {
+    "png": png(width=60_000, height=60_000, depth=8, colour_type=0, rows=b"\0" * 99),
+    "largest png": png(width=2**31 - 1, height=2**31 - 1, depth=8, colour_type=0, rows=b"\0" * 99),
+    "16-bit colour png": png(width=60_000, height=60_000, depth=16, colour_type=2, rows=b"\0" * 99),
+    "jpeg": giant_jpeg(),
+    "tiff": giant_tiff(),
+}
+
+
+@pytest.mark.parametrize("content", BOMBS.values(), ids=BOMBS)
+def test_a_header_of_too_many_pixels_is_refused_as_that(tmp_path, content):
+    assert_is_refused(tmp_path, content, r": has .*more than .*268435456")
+
+
+def test_a_picture_below_the_limit_is_not_called_too_large(tmp_path):
+    # 144 million of the 268 million pixels allowed; their data are missing.
+    content = png(width=12_000, height=12_000, depth=8, colour_type=0, rows=b"\0" * 99)
+    assert_is_refused(tmp_path, content, r": is broken or cut short")
+
+
+@pytest.mark.parametrize("planes", ["contig", "separate"])
+def test_the_planes_of_a_tiff_do_not_hide_its_size(tmp_path, monkeypatch, planes):
+    monkeypatch.setattr(pictures, "MAX_PIXELS", 1000)
+    picture = NOISE if planes == "contig" else np.moveaxis(NOISE, -1, 0)
+    assert_is_refused(tmp_path, tiff(picture, photometric="rgb", planarconfig=planes), "more than the limit of 1000$")
+
+
+# -- broken at random -----------------------------------------------------------------------------------------------
+
+NOTES = PngInfo()
+NOTES.add_text("Title", "F" * 99, zip=True)
+NOTES.add_itxt("Author", "unknown", zip=True)
+HOW_HELD = Image.Exif()
+HOW_HELD[274] = 6
+HOW_HELD[271] = "maker"
+SEEDS = {
+    "png": encoded(COLOUR8, "PNG"),
+    "png with notes": encoded(COLOUR8, "PNG", pnginfo=NOTES, exif=HOW_HELD),
+    "palette png": encoded(palette_image(), "PNG", transparency=b"\x40\xff"),
+    "jpeg": encoded(COLOUR8, "JPEG"),
+    "progressive jpeg": encoded(COLOUR8, "JPEG", progressive=True),
+    "jpeg with notes": encoded(COLOUR8, "JPEG", exif=HOW_HELD),
+    "tiff": tiff(COLOUR8, photometric="rgb"),
+    "deflated tiff": tiff(GREY16, compression="zlib", predictor=True),
+    "palette tiff": encoded(palette_image(), "TIFF"),
+    "1-bit tiff": encoded(Image.fromarray(F * np.uint8(255)).convert("1"), "TIFF"),
+}
+
+
+def with_true_sums(content):
+    """A PNG whose checksums fit its chunks, so that a reader believes what is in them."""
+    fixed, place = bytearray(content), 8
+    while place + 12 <= len(fixed):
+        end = place + 8 + int.from_bytes(fixed[place : place + 4])
+        if end + 4 > len(fixed):
+            break
+        fixed[end : end + 4] = struct.pack(">I", zlib.crc32(fixed[place + 4 : end]))
+        place = end + 4
+    return bytes(fixed)
+
+
+@pytest.mark.parametrize("name", SEEDS)
+def test_flipped_bits_leave_a_picture_or_one_sentence(tmp_path, name):
+    rng = np.random.default_rng([11, *name.encode()])
+    path = tmp_path / "picture.bin"
+    for case in range(300):
+        content = bytearray(SEEDS[name])
+        for place in rng.integers(len(content), size=rng.integers(1, 4)):
+            content[place] ^= 1 << rng.integers(8)
+        path.write_bytes(with_true_sums(content) if "png" in name and case % 2 else content)
+        try:
+            picture = read_picture(path)
+        except FileError as error:
+            assert "\n" not in str(error), f"case {case}: {error}"
+        except Exception as error:
+            raise AssertionError(f"case {case}: {error!r}") from error
+        else:
+            assert picture.dtype in (np.uint8, np.uint16, np.float32), f"case {case}"
+            assert 0 not in picture.shape, f"case {case}"
+
+
+# -- writing --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [GREY8, np.dstack([GREY8, ALPHA8]), COLOUR8, np.dstack([COLOUR8, ALPHA8]), GREY8[1:2, 1:2]],
+    ids=["grey", "grey and alpha", "colour", "colour and alpha", "one pixel"],
+)
+def test_a_png_keeps_every_number(tmp_path, picture):
+    write_picture(tmp_path / "f.png", picture)
+    np.testing.assert_array_equal(read_picture(tmp_path / "f.png"), picture, strict=True)
+
+
+def test_a_picture_of_one_channel_is_grey(tmp_path):
+    write_picture(tmp_path / "f.png", GREY8[..., np.newaxis])
+    np.testing.assert_array_equal(read_picture(tmp_path / "f.png"), GREY8, strict=True)
+
+
+@pytest.mark.parametrize("name", ["f.png", "f.PNG", "f.bmp", "f.ppm", "f.tga", "f.jp2"])
+def test_a_view_with_its_rows_turned_over_is_written_as_it_looks(tmp_path, name):
+    write_picture(tmp_path / name, COLOUR8[::-1, ::-1])
+    np.testing.assert_array_equal(read_picture(tmp_path / name), COLOUR8[::-1, ::-1])
+
+
+def test_a_jpeg_is_written_upright(tmp_path):
+    write_picture(tmp_path / "f.jpg", LARGE_F)
+    assert is_letter(read_picture(tmp_path / "f.jpg"))
+
+
+def test_a_written_picture_is_as_readable_as_other_new_files(tmp_path):
+    write_picture(tmp_path / "f.png", GREY8)
+    (tmp_path / "other").touch()
+    assert (tmp_path / "f.png").stat().st_mode == (tmp_path / "other").stat().st_mode
+
+
+@pytest.mark.parametrize("name", ["f.xyz", "f", "f.txt", ".png"])
+def test_an_ending_of_no_known_format_is_refused(tmp_path, name):
+    with pytest.raises(FileError, match=r"must end in the name of a picture format, such as \.png$"):
+        write_picture(tmp_path / name, GREY8)
+    assert list(tmp_path.iterdir()) == []
+
+
+UNWRITABLE = {
+    "alpha in a jpeg": ("f.jpg", np.dstack([COLOUR8, ALPHA8])),
+    "float": ("f.png", RADIANCE),
+    "64-bit numbers": ("f.png", GREY8.astype(np.int64)),
+    "five channels": ("f.png", np.zeros((7, 5, 5), np.uint8)),
+    "no rows": ("f.png", np.zeros((0, 5), np.uint8)),
+    "too wide for webp": ("f.webp", np.zeros((1, 20_000), np.uint8)),
+    "too wide for jpeg": ("f.jpg", np.zeros((1, 70_000), np.uint8)),
+}
+
+
+@pytest.mark.parametrize(("name", "picture"), UNWRITABLE.values(), ids=UNWRITABLE)
+def test_what_cannot_be_written_is_refused_in_one_sentence(tmp_path, name, picture):
+    with pytest.raises(FileError, match=rf"{name}: [^\n]*$"):
+        write_picture(tmp_path / name, picture)
+
+
+@pytest.mark.parametrize(("name", "picture"), UNWRITABLE.values(), ids=UNWRITABLE)
+def test_what_cannot_be_written_leaves_the_folder_as_it_was(tmp_path, name, picture):
+    (tmp_path / name).write_bytes(b"older")
+    with pytest.raises(Exception, match=r"."):  # which one is the test above's
+        write_picture(tmp_path / name, picture)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {name: b"older"}
+
+
+@pytest.mark.parametrize("failure", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=repr)
+@pytest.mark.parametrize("is_older", [False, True], ids=["new file", "older file"])
+def test_a_write_that_breaks_off_leaves_the_folder_as_it_was(tmp_path, monkeypatch, failure, is_older):
+    target = tmp_path / "f.png"
+    if is_older:
+        target.write_bytes(b"older")
+
+    def break_off(_, path, **__):
+        path.write_bytes(b"half a pic")
+        raise failure
+
+    monkeypatch.setattr(Image.Image, "save", break_off)
+    with pytest.raises(FileError if isinstance(failure, OSError) else type(failure), match=r"No space left|^$"):
+        write_picture(target, GREY8)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == ({"f.png": b"older"} if is_older else {})
+
+
+def test_an_older_picture_is_replaced(tmp_path):
+    write_picture(tmp_path / "f.png", GREY8)
+    write_picture(tmp_path / "f.png", COLOUR8)
+    np.testing.assert_array_equal(read_picture(tmp_path / "f.png"), COLOUR8)
+    assert [path.name for path in tmp_path.iterdir()] == ["f.png"]
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(FileError, match=r"cannot be written: the folder .*nowhere does not exist$"):
+        write_picture(tmp_path / "nowhere" / "f.png", GREY8)
+
+
+def test_a_folder_is_not_overwritten(tmp_path):
+    (tmp_path / "f.png").mkdir()
+    with pytest.raises(FileError, match=r"cannot be written: it is a folder$"):
+        write_picture(tmp_path / "f.png", GREY8)
+
+
+def test_a_name_too_long_to_write_is_refused(tmp_path):
+    with pytest.raises(FileError, match=r"\.png: cannot be written"):
+        write_picture(tmp_path / ("x" * 300 + ".png"), GREY8)

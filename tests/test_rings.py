@@ -1,0 +1,171 @@
+"""Laws of the measures of packed rings, against exact rational arithmetic, closed forms and plain loops."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from foveasim.rings import next_vertex, ring_moments, site_bounds_um, site_moments
+
+relaxed = settings(deadline=None, derandomize=True, max_examples=60)
+
+#: Multiples of 2^-16 µm, which stay exact under shifts by whole µm.
+dyadic = st.integers(-(2**20), 2**20).map(lambda k: k / 2**16)
+points = st.tuples(dyadic, dyadic)
+rings = st.lists(points, min_size=3, max_size=9)
+sites = st.lists(st.lists(rings, min_size=1, max_size=3), min_size=1, max_size=5)
+
+
+def packed(nested):
+    """Packed rings of sites given as nested lists."""
+    all_rings = [ring for site in nested for ring in site]
+    xy_um = np.array([point for ring in all_rings for point in ring], float).reshape(-1, 2)
+    ring_offsets = np.cumsum([0, *map(len, all_rings)])
+    return xy_um, ring_offsets, np.cumsum([0, *map(len, nested)])
+
+
+def exact_area_and_moment(ring):
+    """Signed area and first moments of a ring as fractions, summed over the triangles that its edges span with (1, 2)."""
+    px, py = Fraction(1), Fraction(2)
+    area, moment = Fraction(0), [Fraction(0), Fraction(0)]
+    exact = [(Fraction(x), Fraction(y)) for x, y in ring]
+    for (ax, ay), (bx, by) in pairwise([*exact, exact[0]]):
+        triangle = ((ax - px) * (by - py) - (bx - px) * (ay - py)) / 2
+        area += triangle
+        moment[0] += triangle * (px + ax + bx) / 3
+        moment[1] += triangle * (py + ay + by) / 3
+    return area, moment
+
+
+@pytest.mark.parametrize(
+    ("lengths", "after"),
+    [
+        ((), []),
+        ((1,), [0]),
+        ((3,), [1, 2, 0]),
+        ((3, 4), [1, 2, 0, 4, 5, 6, 3]),
+        ((4, 1, 3), [1, 2, 3, 0, 4, 6, 7, 5]),
+    ],
+)
+def test_next_vertex_closes_each_ring_on_itself(lengths, after):
+    assert next_vertex(np.cumsum([0, *lengths])).tolist() == after
+
+
+@given(sites)
+@relaxed
+def test_ring_moments_are_those_of_exact_arithmetic(nested):
+    xy_um, ring_offsets, _ = packed(nested)
+    area_um2, moment_um3 = ring_moments(xy_um, ring_offsets)
+    expected = [exact_area_and_moment(ring) for site in nested for ring in site]
+
+    np.testing.assert_allclose(area_um2, [float(a) for a, _ in expected], rtol=1e-13, atol=1e-11)
+    np.testing.assert_allclose(moment_um3, [[float(m) for m in ms] for _, ms in expected], rtol=1e-12, atol=1e-9)
+
+
+@given(rings)
+@relaxed
+def test_a_reversed_ring_has_the_opposite_area(ring):
+    offsets = np.array([0, len(ring)])
+    forward, _ = ring_moments(np.array(ring), offsets)
+    backward, _ = ring_moments(np.array(ring[::-1]), offsets)
+
+    np.testing.assert_allclose(backward, -forward, rtol=1e-13, atol=1e-11)
+
+
+@given(sites, st.integers(-(10**7), 10**7), st.integers(-(10**7), 10**7))
+@relaxed
+def test_areas_keep_all_their_digits_far_from_the_origin(nested, dx_um, dy_um):
+    xy_um, ring_offsets, _ = packed(nested)
+    here, _ = ring_moments(xy_um, ring_offsets)
+    there, _ = ring_moments(xy_um + np.array([dx_um, dy_um]), ring_offsets)
+
+    assert there.tolist() == here.tolist()
+
+
+@given(st.lists(rings, min_size=1, max_size=6))
+@relaxed
+def test_the_measures_of_a_ring_do_not_depend_on_its_neighbours(all_rings):
+    xy_um, ring_offsets, _ = packed([all_rings])
+    area_um2, moment_um3 = ring_moments(xy_um, ring_offsets)
+    alone = [ring_moments(np.array(ring), np.array([0, len(ring)])) for ring in all_rings]
+
+    assert area_um2.tolist() == [float(area[0]) for area, _ in alone]
+    assert moment_um3.tolist() == [moment[0].tolist() for _, moment in alone]
+
+
+@pytest.mark.parametrize(
+    ("site", "area_um2", "centroid_um"),
+    [
+        pytest.param([[(0, 0), (4, 0), (4, 2), (0, 2)]], 8.0, (2.0, 1.0), id="rectangle"),
+        pytest.param([[(0, 0), (6, 0), (0, 3)]], 9.0, (2.0, 1.0), id="triangle"),
+        pytest.param([[(0, 0), (3, 0), (3, 1), (1, 1), (1, 3), (0, 3)]], 5.0, (1.1, 1.1), id="L"),
+        pytest.param(
+            [[(0, 0), (4, 0), (4, 4), (0, 4)], [(1, 1), (1, 3), (3, 3), (3, 1)]], 12.0, (2.0, 2.0), id="middle hole"
+        ),
+        pytest.param(
+            [[(0, 0), (4, 0), (4, 4), (0, 4)], [(0, 0), (0, 4), (2, 4), (2, 0)]], 8.0, (3.0, 2.0), id="left half open"
+        ),
+        pytest.param(
+            [
+                [(0, 0), (6, 0), (6, 2), (0, 2)],
+                [(1, 0.5), (1, 1.5), (2, 1.5), (2, 0.5)],
+                [(4, 0.5), (4, 1.5), (5, 1.5), (5, 0.5)],
+            ],
+            10.0,
+            (3.0, 1.0),
+            id="two holes",
+        ),
+    ],
+)
+def test_area_and_centroid_of_known_shapes(site, area_um2, centroid_um):
+    area, centroid = site_moments(*packed([site]))
+
+    assert area.tolist() == pytest.approx([area_um2], rel=1e-14)
+    assert centroid[0].tolist() == pytest.approx(centroid_um, rel=1e-14)
+
+
+def test_the_parts_of_a_split_site_add_up_to_the_whole():
+    whole = [(0, 0), (7, 1), (9, 6), (3, 8), (-2, 4)]
+    parts = [[whole[0], whole[1], whole[2]], [whole[0], whole[2], whole[3]], [whole[0], whole[3], whole[4]]]
+    area, centroid = site_moments(*packed([[whole]]))
+    part_area, part_centroid = site_moments(*packed([[part] for part in parts]))
+
+    assert part_area.sum() == pytest.approx(area[0], rel=1e-14)
+    assert (part_area @ part_centroid / part_area.sum()).tolist() == pytest.approx(centroid[0].tolist(), rel=1e-14)
+
+
+@given(sites)
+@relaxed
+def test_bounds_are_the_extremes_of_the_vertices(nested):
+    bounds = site_bounds_um(*packed(nested))
+    expected = []
+    for site in nested:
+        xs = [x for ring in site for x, _ in ring]
+        ys = [y for ring in site for _, y in ring]
+        expected.append([min(xs), min(ys), max(xs), max(ys)])
+
+    assert bounds.tolist() == expected
+
+
+def test_no_rings_have_no_measures():
+    nothing = np.zeros((0, 2)), np.zeros(1, np.int64)
+
+    assert [a.shape for a in ring_moments(*nothing)] == [(0,), (0, 2)]
+    assert [a.shape for a in site_moments(*nothing, np.zeros(1, np.int64))] == [(0,), (0, 2)]
+    assert site_bounds_um(*nothing, np.zeros(1, np.int64)).shape == (0, 4)
+
+
+def test_measures_accept_read_only_arrays_and_leave_them_unchanged():
+    arrays = packed([[[(0, 0), (2, 0), (2, 2)]], [[(5, 5), (6, 5), (6, 7), (5, 7)]]])
+    before = [array.copy() for array in arrays]
+    for array in arrays:
+        array.flags.writeable = False
+
+    assert site_moments(*arrays)[0].tolist() == [2.0, 2.0]
+    assert site_bounds_um(*arrays)[1].tolist() == [5.0, 5.0, 6.0, 7.0]
+    assert all(np.array_equal(a, b) for a, b in zip(arrays, before, strict=True))
