@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TextIO
 
 import typer
 from rich.console import Console
@@ -99,11 +99,17 @@ def main() -> None:
         sys.exit(130)
 
 
-def _show_warning(message: Warning | str, category: type[Warning], *details: object) -> None:
-    if issubclass(category, FoveasimWarning):
-        errors.print(f"warning: {message}", soft_wrap=True, highlight=False, markup=False)
-    else:
-        errors.print(warnings.formatwarning(message, category, *details[:2]), markup=False)  # type: ignore[arg-type]
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,  # noqa: ARG001 -- the signature is that of warnings.showwarning
+    line: str | None = None,
+) -> None:
+    is_ours = issubclass(category, FoveasimWarning)
+    text = f"warning: {message}" if is_ours else warnings.formatwarning(message, category, filename, lineno, line)
+    errors.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
 if __name__ == "__main__":

@@ -92,7 +92,7 @@ _CURVES: dict[str, Callable[..., Any]] = {
 }
 
 _CurveSection = _one_of("kind", {name: _model(name, curve) for name, curve in _CURVES.items()})
-_FilterSection = _model("filter set", FilterSet, curves=list[_CurveSection])
+_FilterSection = _model("filter set", FilterSet, curves=list[_CurveSection])  # type: ignore[valid-type]
 _PerSite = float | PerArea | list[float]
 _SceneSection = _one_of(
     "kind", {k: _model(k, call, picture=str, spectrum=list[list[float]] | None) for k, call in _SCENES.items()}
@@ -132,9 +132,9 @@ _LayoutUnion = _one_of(
 class _ShotSection(_Section):
     """A whole shot: scene, optics, layout, sensor, exposure."""
 
-    scene: _SceneSection
+    scene: _SceneSection  # type: ignore[valid-type]
     optics: _model("optics", Optics)  # type: ignore[valid-type]
-    layout: str | _LayoutUnion
+    layout: str | _LayoutUnion  # type: ignore[valid-type]
     sensor: _SensorSection = Field(default_factory=_SensorSection)  # type: ignore[valid-type]
     exposure_s: float
     seed: int = 0
@@ -323,12 +323,12 @@ class _Loader(yaml.SafeLoader):
         event = self.peek_event()  # type: ignore[no-untyped-call]
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
             raise yaml.YAMLError(f"anchors and aliases are not allowed (line {event.start_mark.line + 1})")
-        return super().compose_node(parent, index)  # type: ignore[no-untyped-call]
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         seen = set()
         for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)  # type: ignore[no-untyped-call]
+            key = self.construct_object(key_node, deep=True)
             line = key_node.start_mark.line + 1
             if not isinstance(key, str):
                 raise yaml.YAMLError(f"the key {key!r} must be a text (line {line})")

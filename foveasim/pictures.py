@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps, UnidentifiedImageError
 
 from foveasim.errors import FileError
 from foveasim.files import written_whole
@@ -66,6 +65,8 @@ def read_picture(path: str | Path) -> NDArray[Any]:
 
 
 def _read_with_pillow(path: Path) -> NDArray[Any]:
+    from PIL import Image, ImageOps, UnidentifiedImageError
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -169,6 +170,8 @@ def write_picture(path: str | Path, picture: NDArray[np.uint8]) -> None:
     FileError
         When the ending names no known format, or nothing can be written.
     """
+    from PIL import Image
+
     target = Path(path)
     if Image.registered_extensions().get(target.suffix.lower()) not in PILLOW_FORMATS:
         raise FileError(target, "must end in the name of a picture format, such as .png")

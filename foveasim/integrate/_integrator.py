@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import ArrayLike
 
 from foveasim.arrays import Floats, finite_array, read_only
@@ -15,6 +14,9 @@ from foveasim.fields import Grid, PackedRings
 from foveasim.integrate._plan import Plan, compile_plan
 from foveasim.parallel import thread_count
 from foveasim.rings import site_moments
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 __all__ = ["Integrator"]
 
@@ -131,7 +133,7 @@ class Integrator:
         cells *= self.grid.cell_area_um2
         return cells
 
-    def weights(self) -> scipy.sparse.csr_array[Any]:
+    def weights(self) -> csr_array[Any]:
         """
         The operator as a sparse matrix.
 

@@ -106,6 +106,7 @@ def _trace_edge(ua, va, ub, vb, n_y, n_x, bottom, head, links, cover, n_cells):
     if va == vb or va >= n_y or vb <= 0.0:
         return n_cells
     slope = (ub - ua) / (vb - va)
+    steepness = (vb - va) / abs(ub - ua) if ub != ua else 0.0
     u_low, u_high = min(ua, ub), max(ua, ub)
     top = min(vb, float(n_y))
     row = int(np.floor(max(va, 0.0)))
@@ -118,7 +119,6 @@ def _trace_edge(ua, va, ub, vb, n_y, n_x, bottom, head, links, cover, n_cells):
             left, right = right, left
         if right > 0.0 or left == 0.0:  # what is left of the map has no cell on its left
             rise = high - low
-            steepness = rise / (right - left) if right > left else 0.0
             u = max(left, 0.0)
             climbed = (u - left) * steepness
             column = int(min(u, float(n_x)))
@@ -158,7 +158,7 @@ def _grown(array, n_used, n_more):
 
 @njit(cache=True, nogil=True, inline="always")
 def _write_row(first_cell, links, cover, n_x, site, row, spans, n_spans, weights, n_weights):
-    """Append the spans of one row of one site; returns the arrays, their counts, and the area covered."""
+    """Append the spans of one row of one site; returns the new counts, and the area covered."""
     winding = 0.0  # weight of the cells before the next touched one: the sum of the heights from there on
     here = first_cell
     while here != END:
@@ -171,8 +171,6 @@ def _write_row(first_cell, links, cover, n_x, site, row, spans, n_spans, weights
     while here != END:
         n_between = links[here, 0] - column
         is_run = n_between >= MIN_RUN
-        spans = _grown(spans, n_spans, 2)
-        weights = _grown(weights, n_weights, MIN_RUN + 1)
         for is_touched in (False, True):
             if is_touched:
                 column = links[here, 0]
@@ -208,7 +206,7 @@ def _write_row(first_cell, links, cover, n_x, site, row, spans, n_spans, weights
         winding -= cover[here, 0]
         column = links[here, 0] + 1
         here = links[here, 1]
-    return spans, n_spans, weights, n_weights, covered
+    return n_spans, n_weights, covered
 
 
 @njit(
@@ -270,8 +268,11 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x)
                     uv[a, 0], uv[a, 1], uv[b, 0], uv[b, 1], n_y, n_x, bottom, head, links, cover, n_cells
                 )
                 a = b
+        # A touched cell gives at most two spans, its own weight, and a run or the weights of a short one.
+        spans = _grown(spans, n_spans, 2 * n_cells)
+        weights = _grown(weights, n_weights, MIN_RUN * n_cells)
         for row in range(n_rows):
-            spans, n_spans, weights, n_weights, area = _write_row(
+            n_spans, n_weights, area = _write_row(
                 head[row], links, cover, n_x, site, bottom + row, spans, n_spans, weights, n_weights
             )
             covered[site - first_site] += area

@@ -7,16 +7,18 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from foveasim.arrays import Floats, Ints
 from foveasim.fields import Grid, PackedRings
 from foveasim.parallel import each
 from foveasim.rings import site_bounds_um
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 __all__ = ["Plan", "compile_plan"]
 
@@ -127,8 +129,10 @@ class Plan:
         each(band, self._bands(), self._threads(n_threads))
         return cells
 
-    def matrix(self) -> scipy.sparse.csr_array[Any]:
+    def matrix(self) -> csr_array[Any]:
         """The plan as a sparse matrix (n_site, n_y * n_x) of overlaps in cells; runs are written out."""
+        from scipy.sparse import coo_array
+
         n_partial = self.spans[:, kernels().N_PARTIAL].astype(np.int64)
         n_run = self.spans[:, kernels().N_RUN].astype(np.int64)
         n_cells = n_partial + n_run
@@ -143,7 +147,7 @@ class Plan:
         cell = np.repeat(start, n_cells) + k
         slot_site = np.repeat(np.arange(self.n_sites), np.diff(self.first_slot))
         site = np.repeat(slot_site[self.spans[:, kernels().SITE]], n_cells)
-        matrix = scipy.sparse.coo_array((weight, (site, cell)), shape=(self.n_sites, n_y * n_x)).tocsr()
+        matrix = coo_array((weight, (site, cell)), shape=(self.n_sites, n_y * n_x)).tocsr()
         matrix.sort_indices()
         return matrix
 

@@ -4,59 +4,31 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
-from types import ModuleType
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, Images, Ints, check_choice, check_count, check_number
-from foveasim.errors import ParameterError, SamplingWarning, SimulationError
+from foveasim.arrays import Floats, check_choice, check_count, check_number
+from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.fields import Grid, PowerMap, SceneLike
-from foveasim.optics.otf import circular_otf
-from foveasim.parallel import each, thread_count
+from foveasim.optics.otf import RadialTables
+from foveasim.parallel import thread_count
 from foveasim.units import m_from_mm, m_from_um, um_from_nm
 
 __all__ = ["Optics"]
 
-#: Points of a radial table of transfer factors. Linear interpolation errs by less than 1e-7 (float32; the table
-#: fits the first-level cache) and 1e-9 (float64), relative to the factor at zero frequency.
-TABLE_POINTS = {"single": 1 << 13, "double": 1 << 15}
 #: Default padding: the radius that holds all but this share of a point's light ...
 LOST_SHARE = 0.01
 #: ... which for a clear circle is about ``2 / (π² share)`` in units of wavelength x f-number.
 REACH_SHARE = 2.0 / math.pi**2
 #: The paper's Eq. 5 asks for an aperture radius much larger than H λ / (p0 min(M, N)): this many times.
 MUCH_LARGER = 10.0
-#: Up to so many aliases to a side are added frequency by frequency ...
-DIRECT_ALIASES = 3
-#: ... and more by a smooth function of the frequency, through this many Chebyshev nodes an axis, ...
-ALIAS_NODES = 32
-#: ... of the rank that keeps this accuracy.
-ALIAS_ACCURACY = 1e-9
 #: For cells wider than this many λN diffraction is that of cells of this width: 0.3 % of the light goes astray, or less.
 MAX_ALIASES = 128
-#: Rows that one thread works on at a time.
-ROWS_PER_PIECE = 64
-
-_PADDING: dict[str, dict[str, Any]] = {
-    "reflect": {"mode": "reflect"},
-    "edge": {"mode": "edge"},
-    "zero": {"mode": "constant", "constant_values": -1},
-    "periodic": {"mode": "wrap"},
-}
-
-
-@cache
-def kernels() -> ModuleType:
-    """The compiled kernels; loaded when first needed, since numba takes a second."""
-    from foveasim.optics import _kernels
-
-    return _kernels
+PADDINGS = ("reflect", "edge", "zero", "periodic")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,7 +89,7 @@ class Optics:
         check_choice("emission", self.emission, ("lambertian", "isotropic"))
         check_number("transmission", self.transmission, above=0.0, at_most=1.0)
         check_choice("source_pixel", self.source_pixel, ("point", "square"))
-        check_choice("padding", self.padding, tuple(_PADDING))
+        check_choice("padding", self.padding, PADDINGS)
         if self.padding_cells is not None:
             check_count("padding_cells", self.padding_cells, at_least=0, at_most=2**20)
         check_choice("precision", self.precision, ("single", "double"))
@@ -210,6 +182,8 @@ class Optics:
         Since a sum over wavelengths can be taken before the inverse transform, and the scene is a sum of B basis
         images, the cost is B forward transforms and one inverse transform an output, for any number of wavelengths.
         """
+        from foveasim.optics._transform import Transform, source_pixels
+
         weights = np.asarray(weights, dtype=np.float64)
         n_threads = thread_count(n_threads)
         working_n = self.working_f_number(scene.distance_m)
@@ -218,17 +192,20 @@ class Optics:
         cutoff_per_um = np.minimum(cutoff_per_um, MAX_ALIASES / grid.pitch_um)
         self._warn_if_too_small(cutoff_per_um, grid)
 
-        transform = _Transform(
+        pad = self.padding_cells
+        if pad is None:
+            pad = math.ceil(REACH_SHARE / LOST_SHARE / (float(cutoff_per_um.min()) * grid.pitch_um))
+        transform = Transform(
             shape=grid.shape,
-            rows=self._source_pixels(grid.shape[0], float(cutoff_per_um.min()), grid),
-            columns=self._source_pixels(grid.shape[1], float(cutoff_per_um.min()), grid),
+            rows=source_pixels(grid.shape[0], self.padding, pad),
+            columns=source_pixels(grid.shape[1], self.padding, pad),
             pitch_um=grid.pitch_um,
             f_max_per_um=float(cutoff_per_um.max()),
             sinc_power=1 if self.source_pixel == "point" else 2,
             real=self._real_type(),
             n_threads=n_threads,
         )
-        table_of = _RadialTables(cutoff_per_um, TABLE_POINTS[self.precision], self._real_type())
+        table_of = RadialTables(cutoff_per_um, self._real_type())
         light = scene.spectrum_w_m2_sr_nm * scene.band_width_nm * self.irradiance_per_radiance(scene.distance_m)
         is_needed = np.array([[bool(np.any(output * spectrum)) for spectrum in light] for output in weights], bool)
         spectra: dict[int, NDArray[Any]] = {}
@@ -267,17 +244,6 @@ class Optics:
                 stacklevel=4,
             )
 
-    def _source_pixels(self, n: int, cutoff_per_um: float, grid: Grid) -> Ints:
-        """Along one axis, the scene's pixel that each padded cell shows; -1 is darkness."""
-        if self.padding == "periodic":
-            return np.arange(n)
-        if self.padding_cells is None:
-            pad = math.ceil(REACH_SHARE / LOST_SHARE / (cutoff_per_um * grid.pitch_um))
-        else:
-            pad = self.padding_cells
-        extra = int(scipy.fft.next_fast_len(n + 2 * pad, real=True)) - n
-        return np.pad(np.arange(n), (extra // 2, extra - extra // 2), **_PADDING[self.padding])
-
     def _squared_tangents(self, scene: SceneLike) -> tuple[Floats, Floats]:
         """(x0/H)² of the scene's columns and (y0/H)² of its rows."""
         _, n_y, n_x = scene.basis.shape
@@ -286,142 +252,3 @@ class Optics:
 
     def _falloff_power(self) -> int:
         return 4 if self.emission == "lambertian" else 3
-
-
-class _RadialTables:
-    """Makes tables of ``sum_k weight[k] * OTF_k(|f|)`` over ``|f|`` at equal steps, the last one beyond every cut-off."""
-
-    def __init__(self, cutoff_per_um: Floats, n_points: int, real: type[np.floating[Any]]) -> None:
-        self.f_max_per_um = float(cutoff_per_um.max())
-        self._real = real
-        self._otf = circular_otf(np.linspace(0.0, self.f_max_per_um, n_points) / cutoff_per_um[:, np.newaxis])
-
-    def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
-        """The table, and its steps over frequency (µm)."""
-        return (weight @ self._otf).astype(self._real), (self._otf.shape[1] - 1) / self.f_max_per_um
-
-
-class _Transform:
-    """
-    Fourier transforms of pictures of one size and what is done to their spectra, with nothing computed that is not used.
-
-    A spectrum has the padded number of rows, and only the columns whose frequencies pass the pupil; the rows of the
-    padding are copies of the picture's, so neither they nor the padded picture are ever transformed or stored.
-    """
-
-    def __init__(
-        self,
-        *,
-        shape: tuple[int, int],
-        rows: Ints,
-        columns: Ints,
-        pitch_um: float,
-        f_max_per_um: float,
-        sinc_power: int,
-        real: type[np.floating[Any]],
-        n_threads: int,
-    ) -> None:
-        self._shape, self._rows, self._columns = shape, rows, columns
-        self._real, self._n_threads = real, n_threads
-        # Points at cell centres have a spectrum that repeats with 1/p. The mean over a cell multiplies frequency f by
-        # sinc(f p), a square source pixel once more; each alias f + k/p passes with the pupil's factor at f + k/p.
-        self._n_alias = max(0, math.ceil(f_max_per_um * pitch_um - 0.5))
-        self._pitch_um, self._sinc_power = pitch_um, sinc_power
-        n_near = self._n_alias if self._n_alias <= DIRECT_ALIASES else 0
-        k = np.arange(-n_near, n_near + 1)[:, np.newaxis]
-        cycles_y = scipy.fft.fftfreq(rows.size) + k
-        cycles_x = scipy.fft.rfftfreq(columns.size) + k
-        if self._n_alias == 0:
-            cycles_x = cycles_x[:, : int(np.searchsorted(cycles_x[0], f_max_per_um * pitch_um)) + 1]
-        self._n_columns = cycles_x.shape[1]
-        self._fx_per_um, self._fy_per_um = (cycles_x / pitch_um).astype(real), (cycles_y / pitch_um).astype(real)
-        self._gain_x, self._gain_y = ((np.sinc(c) ** sinc_power).astype(real) for c in (cycles_x, cycles_y))
-        self._cycles_x, self._cycles_y = np.abs(cycles_x[n_near]), np.abs(cycles_y[n_near])
-
-    def _far_aliases(self, table: NDArray[Any], per_step: float) -> tuple[Images, Images]:
-        """
-        Aliases beyond the frequency itself as a sum of products, (n_rank, n_x) and (n_rank, n_y), when they are many.
-
-        Within half a cycle per cell their sum is smooth and even, so that a few Chebyshev polynomials hold it.
-        """
-        if self._n_alias <= DIRECT_ALIASES:
-            return np.zeros((0, self._cycles_x.size), self._real), np.zeros((0, self._cycles_y.size), self._real)
-        nodes = np.polynomial.chebyshev.chebpts1(ALIAS_NODES)
-        at_nodes = kernels().alias_sum(
-            table.astype(np.float64), per_step / self._pitch_um, 0.25 * (nodes + 1.0), self._n_alias, self._sinc_power
-        )
-        y_modes, sizes, x_modes = np.linalg.svd(at_nodes)
-        rank = int(np.searchsorted(-sizes, -ALIAS_ACCURACY * max(float(table[0]), 0.0)))
-        to_coefficients = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, ALIAS_NODES - 1))
-
-        def at(cycles: Floats, modes: Floats) -> Images:
-            polynomials = np.polynomial.chebyshev.chebvander(4.0 * cycles - 1.0, ALIAS_NODES - 1)
-            return np.ascontiguousarray((polynomials @ (to_coefficients @ modes)).T.astype(self._real))
-
-        return at(self._cycles_x, x_modes[:rank].T), at(self._cycles_y, y_modes[:, :rank] * sizes[:rank])
-
-    def _each_rows(self, work: Callable[[int, int], None], n_rows: int) -> None:
-        each(
-            lambda first: work(first, min(first + ROWS_PER_PIECE, n_rows)),
-            range(0, n_rows, ROWS_PER_PIECE),
-            self._n_threads,
-        )
-
-    def forward(self, image: Images, x2: Floats, y2: Floats, falloff_power: int) -> NDArray[Any]:
-        """Spectrum of a picture with falloff and padding."""
-        n_y, n_x = self._shape
-        top, left = (self._rows.size - n_y) // 2, (self._columns.size - n_x) // 2
-        spectrum = np.empty((self._rows.size, self._n_columns), np.result_type(self._real, np.complex64))
-        x2, y2 = x2.astype(self._real), y2.astype(self._real)
-
-        def some_rows(first: int, last: int) -> None:
-            padded = np.empty((last - first, self._columns.size), self._real)
-            kernels().expose(image, x2, y2, falloff_power, self._columns, left, first, padded)
-            spectrum[top + first : top + last] = scipy.fft.rfft(padded, axis=1, overwrite_x=True)[:, : self._n_columns]
-
-        self._each_rows(some_rows, n_y)
-        for row in (*range(top), *range(top + n_y, self._rows.size)):
-            spectrum[row] = spectrum[top + self._rows[row]] if self._rows[row] >= 0 else 0.0
-        spectrum = scipy.fft.fft(spectrum, axis=0, overwrite_x=True, workers=self._n_threads)
-        if not np.isfinite(spectrum[0, 0]):
-            raise SimulationError("the scene has values that are not finite")
-        return spectrum
-
-    def multiply(
-        self, spectrum: NDArray[Any], table: NDArray[Any], per_step: float, out: NDArray[Any], *, is_added: bool
-    ) -> None:
-        """Write a spectrum times a radial table to ``out``, or add it; ``out`` may be the spectrum."""
-        far_x, far_y = self._far_aliases(table, per_step)
-
-        def some_rows(first: int, last: int) -> None:
-            kernels().transfer(
-                spectrum,
-                table,
-                self._real(per_step),
-                self._fx_per_um,
-                self._fy_per_um,
-                self._gain_x,
-                self._gain_y,
-                far_x,
-                far_y,
-                is_added,
-                first,
-                last,
-                out,
-            )
-
-        self._each_rows(some_rows, spectrum.shape[0])
-
-    def inverse(self, spectrum: NDArray[Any]) -> NDArray[Any]:
-        """The picture of a spectrum, without its padding; the spectrum is used up."""
-        n_y, n_x = self._shape
-        top, left = (self._rows.size - n_y) // 2, (self._columns.size - n_x) // 2
-        lines = scipy.fft.ifft(spectrum, axis=0, overwrite_x=True, workers=self._n_threads)
-        image = np.empty(self._shape, self._real)
-
-        def some_rows(first: int, last: int) -> None:
-            padded = scipy.fft.irfft(lines[top + first : top + last], n=self._columns.size, axis=1)
-            image[first:last] = padded[:, left : left + n_x]
-
-        self._each_rows(some_rows, n_y)
-        return image

@@ -1,13 +1,18 @@
-"""The transfer function of a clear circular pupil."""
+"""The transfer function of a clear circular pupil, and radial tables of weighted sums of it."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim.arrays import Floats
 
-__all__ = ["circular_otf"]
+__all__ = ["RadialTables", "circular_otf"]
+
+#: Points of a radial table: the one of float32 fits the first-level cache.
+TABLE_POINTS = {np.float32: 1 << 13, np.float64: 1 << 15}
 
 
 def circular_otf(s: ArrayLike) -> Floats:
@@ -31,3 +36,16 @@ def circular_otf(s: ArrayLike) -> Floats:
     """
     s = np.minimum(np.abs(np.asarray(s, dtype=np.float64)), 1.0)
     return np.asarray((2.0 / np.pi) * (np.arccos(s) - s * np.sqrt(1.0 - s * s)))
+
+
+class RadialTables:
+    """Makes tables of ``sum_k weight[k] * OTF_k(|f|)`` over ``|f|`` at equal steps, the last one beyond every cut-off."""
+
+    def __init__(self, cutoff_per_um: Floats, real: type[np.floating[Any]]) -> None:
+        self.f_max_per_um = float(cutoff_per_um.max())
+        self._real = real
+        self._otf = circular_otf(np.linspace(0.0, self.f_max_per_um, TABLE_POINTS[real]) / cutoff_per_um[:, np.newaxis])
+
+    def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
+        """The table, and its steps over frequency (µm)."""
+        return (weight @ self._otf).astype(self._real), (self._otf.shape[1] - 1) / self.f_max_per_um

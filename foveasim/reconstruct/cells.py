@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from foveasim.arrays import Floats, Images, Ints, check_count, finite_array
 from foveasim.errors import ParameterError
@@ -129,6 +128,8 @@ def fill_channels(layout: PackedRings, values: Floats, channel: Ints, n_channels
         A site's own value in its own channel; in the others the mean of the nearest sites of that channel, weighted by
         the inverse of their distance. NaN for a channel without sites.
     """
+    from scipy.spatial import cKDTree
+
     _, centroid_um = site_moments(layout.xy_um, layout.ring_offsets, layout.site_offsets)
     filled = np.full((n_channels, values.size), np.nan)
     for c in range(n_channels):

@@ -1,0 +1,275 @@
+"""
+What the hot paths cost, as ratios to a limit of the machine or to a peer, all measured in one run.
+
+Single times on shared machines mean little; each figure is the best of several runs, taken in turns with what it is
+compared with. A ratio that misses its bound is marked; the program then ends with exit code 1.
+
+    python benchmarks/run.py            everything, about two minutes
+    python benchmarks/run.py --quick    the same on a picture of a sixteenth of the pixels (bounds are not judged)
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import scipy.fft
+import shapely
+from rich.console import Console
+from rich.table import Table
+
+import foveasim as fs
+from foveasim.parallel import thread_count
+
+#: The largest picture of the paper.
+FULL_SHAPE = (4640, 8256)
+N_SECTORS, N_RINGS = 240, 126
+console = Console(width=130)
+
+
+def best_s(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """Least seconds of each call, called in turns, so that a slow spell of the machine hits all of them."""
+    seconds = dict.fromkeys(calls, float("inf"))
+    for _ in range(repeats):
+        for name, call in calls.items():
+            start = time.perf_counter()
+            call()
+            seconds[name] = min(seconds[name], time.perf_counter() - start)
+    return seconds
+
+
+class Report:
+    def __init__(self, is_judged: bool) -> None:
+        self.table = Table(title="Ratios, each within one run")
+        for heading, justify in (
+            ("what", "left"),
+            ("time", "right"),
+            ("against", "left"),
+            ("its time", "right"),
+            ("ratio", "right"),
+            ("bound", "right"),
+            ("", "left"),
+        ):
+            self.table.add_column(heading, justify=justify)
+        self.is_judged = is_judged
+        self.missed = 0
+
+    def slower_than(self, what: str, s: float, against: str, s_against: float, at_most: float | None = None) -> None:
+        """A line: how many times as long as the limit."""
+        self._line(
+            what, s, against, s_against, s / s_against, at_most, at_most is None or s / s_against <= at_most, "≤"
+        )
+
+    def faster_than(self, what: str, s: float, against: str, s_against: float, at_least: float | None = None) -> None:
+        """A line: how many times as fast as the peer."""
+        self._line(
+            what, s, against, s_against, s_against / s, at_least, at_least is None or s_against / s >= at_least, "≥"
+        )
+
+    def _line(self, what, s, against, s_against, ratio, bound, is_kept, sign):
+        verdict = (
+            "" if bound is None or not self.is_judged else "[green]kept[/green]" if is_kept else "[red]missed[/red]"
+        )
+        self.missed += self.is_judged and not is_kept
+        self.table.add_row(
+            what,
+            f"{s:.4g} s",
+            against,
+            f"{s_against:.4g} s",
+            f"{ratio:.3g}",
+            "" if bound is None else f"{sign} {bound:g}",
+            verdict,
+        )
+
+
+def paper_scene(shape: tuple[int, int], spectrum: np.ndarray, wavelength_nm: np.ndarray) -> fs.Scene:
+    """A picture of noise, as large as the paper's largest, with its pitch and distance."""
+    rng = np.random.default_rng(0)
+    basis = rng.random((spectrum.shape[0], *shape), dtype=np.float32)
+    widths_nm = np.full(wavelength_nm.size, 300.0 / wavelength_nm.size)
+    return fs.Scene(basis, 0.2 * spectrum, wavelength_nm, widths_nm, 11.6, 0.56)
+
+
+def paper_layout(grid: fs.Grid) -> fs.Layout:
+    """30,240 log-polar sites that fill the picture's height."""
+    r_max_um = 0.495 * grid.shape[0] * grid.pitch_um
+    return fs.layout.log_polar(n_sectors=N_SECTORS, n_rings=N_RINGS, r_min_um=0.026 * r_max_um, r_max_um=r_max_um)
+
+
+def bench_integrator(report: Report, shape: tuple[int, int]) -> None:
+    from exactextract import exact_extract
+    from exactextract.feature import JSONFeatureSource
+    from exactextract.raster import NumPyRasterSource
+
+    grid = fs.Grid.centred(shape, 0.5)
+    layout = paper_layout(grid)
+    cells = np.random.default_rng(0).random(shape, dtype=np.float32)
+    top_first = np.ascontiguousarray(cells[::-1])
+    features = [
+        {"type": "Feature", "id": str(i), "properties": {}, "geometry": json.loads(g)}
+        for i, g in enumerate(shapely.to_geojson(layout.polygons()))
+    ]
+    integrator = fs.Integrator(layout, grid)
+    peer_sums = None
+
+    def peer(strategy: str) -> None:
+        nonlocal peer_sums
+        raster = NumPyRasterSource(top_first, *grid.bounds_um)
+        found = exact_extract(raster, JSONFeatureSource(features), ["sum"], strategy=strategy)
+        peer_sums = np.array([f["properties"]["sum"] for f in found])
+
+    peer_s = min(best_s({s: lambda s=s: peer(s) for s in ("feature-sequential", "raster-sequential")}, 2).values())
+    ours = best_s(
+        {"frame": lambda: integrator(cells), "sum": cells.sum, "compile": lambda: fs.Integrator(layout, grid)}, 12
+    )
+    difference = np.abs(integrator(cells) / grid.cell_area_um2 / peer_sums - 1).max()
+    n_y, n_x = shape
+    console.print(
+        f"map {n_y} x {n_x} float32, {layout.n_sites:,} log-polar sites, {thread_count()} threads; largest relative difference from exactextract {difference:.1e}"
+    )
+    report.faster_than("frame", ours["frame"], "exactextract", peer_s, 30)
+    report.faster_than("compile + frame", ours["frame"] + ours["compile"], "exactextract", peer_s, 12)
+    report.slower_than("frame", ours["frame"], "map.sum(), float32", ours["sum"], 6)
+
+    small = fs.Grid.centred((116, 206), 0.5)
+    few = fs.layout.hexagonal(n_columns=16, n_rows=12, pitch_um=3.7)
+    cells_small = np.random.default_rng(1).random(small.shape)
+
+    def clipped() -> np.ndarray:
+        x, y = np.meshgrid(small.x_um - 0.25, small.y_um - 0.25)
+        boxes = shapely.box(x, y, x + 0.5, y + 0.5).ravel()
+        return np.array(
+            [(shapely.area(shapely.intersection(p, boxes)) * cells_small.ravel()).sum() for p in few.polygons()]
+        )
+
+    once = best_s({"ours": lambda: fs.Integrator(few, small)(cells_small), "clipped": clipped}, 2)
+    report.faster_than("compile + frame, 192 hexagons", once["ours"], "shapely clipping, 116 x 206", once["clipped"])
+
+
+def bench_optics(report: Report, shape: tuple[int, int]) -> None:
+    n_threads = thread_count()
+    optics = fs.Optics(focal_length_mm=22.0, f_number=4.0)
+    mono = paper_scene(shape, np.ones((1, 1)), np.array([550.0]))
+    grid = optics.grid(mono)
+    layout = paper_layout(grid)
+    sensor = fs.Sensor(layout, qe=0.6, dark_e_per_s=20.0, full_well_e=1e6, read_noise_e=1.0, bits=12)
+    camera = fs.Camera(optics=optics, sensor=sensor)
+    # The padded size: 99 % of a point's light lies within 20.3 λN.
+    pad = int(np.ceil(20.3 * 0.55 * optics.working_f_number(0.56) / grid.pitch_um))
+    padded = tuple(int(scipy.fft.next_fast_len(n + 2 * pad, real=True)) for n in shape)
+    picture = np.random.default_rng(0).random(padded, dtype=np.float32)
+
+    def pair() -> None:
+        spectrum = scipy.fft.rfft2(picture, workers=n_threads)
+        scipy.fft.irfft2(spectrum, s=padded, workers=n_threads, overwrite_x=True)
+
+    times = best_s(
+        {
+            "pair": pair,
+            "optics": lambda: list(optics.weighted_maps(mono, np.ones((1, 1)))),
+            "capture": lambda: camera.capture(mono, exposure_s=0.02, seed=0),
+            "first": lambda: fs.Camera(optics=optics, sensor=sensor).capture(mono, exposure_s=0.02, seed=0),
+        },
+        6,
+    )
+    report.slower_than(
+        "optics, one band", times["optics"], f"rfft2 + irfft2, {padded[0]} x {padded[1]}", times["pair"], 1.3
+    )
+    report.slower_than("mono capture, all noise", times["capture"], "rfft2 + irfft2", times["pair"], 1.7)
+    report.slower_than("the same, layout not yet compiled", times["first"], "rfft2 + irfft2", times["pair"])
+
+
+def bench_wavelengths(report: Report, shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(3)
+    optics = fs.Optics(focal_length_mm=22.0, f_number=4.0)
+    few = paper_scene(shape, rng.random((3, 3)), np.array([450.0, 550.0, 620.0]))
+    many = fs.Scene(few.basis, rng.random((3, 31)), np.linspace(450.0, 620.0, 31), np.full(31, 5.0), 11.6, 0.56)
+    layout = fs.layout.mosaic(paper_layout(optics.grid(few)), ("RG", "GB"))
+    camera = fs.Camera(optics=optics, sensor=fs.Sensor(layout, filters="rgb"))
+    times = best_s(
+        {
+            "31": lambda: camera.capture(many, exposure_s=0.02, seed=0),
+            "3": lambda: camera.capture(few, exposure_s=0.02, seed=0),
+        },
+        4,
+    )
+    report.slower_than("RGB picture at 31 wavelengths", times["31"], "the same at 3", times["3"], 1.3)
+
+
+MEMORY_PROBE = """
+import sys, numpy as np
+sys.path.insert(0, sys.argv[1])
+import run, foveasim as fs
+shape = tuple(int(n) for n in sys.argv[2:4])
+def status(key):
+    return next(int(l.split()[1]) * 1024 for l in open("/proc/self/status") if l.startswith(key))
+optics = fs.Optics(focal_length_mm=22.0, f_number=4.0)
+def camera_for(scene):
+    layout = run.paper_layout(optics.grid(scene))
+    return fs.Camera(optics=optics, sensor=fs.Sensor(layout, qe=0.6, dark_e_per_s=20.0, read_noise_e=1.0))
+small = run.paper_scene((464, 825), np.ones((1, 1)), np.array([550.0]))
+camera_for(small).capture(small, exposure_s=0.02, seed=0)
+scene = run.paper_scene(shape, np.ones((1, 1)), np.array([550.0]))
+camera = camera_for(scene)
+before = status("VmRSS")
+open("/proc/self/clear_refs", "w").write("5")
+camera.capture(scene, exposure_s=0.02, seed=0)
+print((status("VmHWM") - before) / (4 * shape[0] * shape[1]))
+"""
+
+
+def bench_memory(report: Report, shape: tuple[int, int]) -> None:
+    if not Path("/proc/self/clear_refs").exists():
+        return
+    arguments = [sys.executable, "-c", MEMORY_PROBE, str(Path(__file__).parent), *map(str, shape)]
+    maps = float(subprocess.run(arguments, capture_output=True, text=True, check=True).stdout)
+    is_kept = maps <= 4
+    report.missed += report.is_judged and not is_kept
+    verdict = ("[green]kept[/green]" if is_kept else "[red]missed[/red]") if report.is_judged else ""
+    report.table.add_row(
+        "peak memory of a mono capture", "", "float32 maps above the input", "", f"{maps:.2f}", "≤ 4", verdict
+    )
+
+
+def bench_import(report: Report) -> None:
+    def start(code: str) -> Callable[[], object]:
+        return lambda: subprocess.run([sys.executable, "-c", code], check=True)
+
+    times = best_s({"bare": start("pass"), "ours": start("import foveasim")}, 5)
+    extra = times["ours"] - times["bare"]
+    is_kept = extra < 0.5
+    report.missed += report.is_judged and not is_kept
+    verdict = ("[green]kept[/green]" if is_kept else "[red]missed[/red]") if report.is_judged else ""
+    report.table.add_row(
+        "import foveasim",
+        f"{extra:.3g} s",
+        "beyond Python's own start",
+        f"{times['bare']:.3g} s",
+        "",
+        "≤ 0.5 s",
+        verdict,
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    is_quick = parser.parse_args().quick
+    shape = (FULL_SHAPE[0] // 4, FULL_SHAPE[1] // 4) if is_quick else FULL_SHAPE
+    report = Report(is_judged=not is_quick)
+    for bench in (bench_integrator, bench_optics, bench_wavelengths, bench_memory):
+        with console.status(bench.__name__.replace("_", " ")):
+            bench(report, shape)
+    bench_import(report)
+    console.print(report.table)
+    return 1 if report.missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

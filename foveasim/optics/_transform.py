@@ -1,0 +1,181 @@
+"""
+Fourier transforms of pictures of one size, and what is done to their spectra.
+
+Cells are means of the irradiance: points at cell centres have a spectrum that repeats with 1/p, and the mean over a cell
+multiplies frequency f by sinc(f p), a square source pixel once more. Every alias f + k/p passes with the pupil's factor at
+f + k/p, so that a cell's mean is exact whether it is smaller than the diffraction pattern or larger.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from foveasim.arrays import Floats, Images, Ints
+from foveasim.errors import SimulationError
+from foveasim.parallel import each
+
+__all__ = ["Transform", "source_pixels"]
+
+#: Up to so many aliases to a side are added frequency by frequency ...
+DIRECT_ALIASES = 3
+#: ... and more by a smooth function of the frequency, through this many Chebyshev nodes an axis, ...
+ALIAS_NODES = 32
+#: ... of the rank that keeps this accuracy.
+ALIAS_ACCURACY = 1e-9
+#: Rows that one thread works on at a time.
+ROWS_PER_PIECE = 64
+#: How numpy calls our paddings; -1 stands for darkness.
+NUMPY_PADDING: dict[str, dict[str, Any]] = {
+    "reflect": {"mode": "reflect"},
+    "edge": {"mode": "edge"},
+    "zero": {"mode": "constant", "constant_values": -1},
+    "periodic": {"mode": "wrap"},
+}
+
+
+@cache
+def kernels() -> ModuleType:
+    """The compiled kernels; loaded when first needed, since numba takes a second."""
+    from foveasim.optics import _kernels
+
+    return _kernels
+
+
+def source_pixels(n: int, padding: str, pad: int) -> Ints:
+    """Along one axis of n cells, the picture's cell that each padded cell shows, or -1; the padded size is a fast one."""
+    if padding == "periodic":
+        return np.arange(n)
+    extra = int(scipy.fft.next_fast_len(n + 2 * pad, real=True)) - n
+    return np.pad(np.arange(n), (extra // 2, extra - extra // 2), **NUMPY_PADDING[padding])
+
+
+class Transform:
+    """
+    The transforms of one size of picture, with nothing computed that is not used.
+
+    A spectrum has the padded number of rows, and only the columns whose frequencies pass the pupil; the rows of the
+    padding are copies of the picture's, so neither they nor the padded picture are ever transformed or stored.
+    """
+
+    def __init__(
+        self,
+        *,
+        shape: tuple[int, int],
+        rows: Ints,
+        columns: Ints,
+        pitch_um: float,
+        f_max_per_um: float,
+        sinc_power: int,
+        real: type[np.floating[Any]],
+        n_threads: int,
+    ) -> None:
+        self._shape, self._rows, self._columns = shape, rows, columns
+        self._real, self._n_threads = real, n_threads
+        self._n_alias = max(0, math.ceil(f_max_per_um * pitch_um - 0.5))
+        self._pitch_um, self._sinc_power = pitch_um, sinc_power
+        n_near = self._n_alias if self._n_alias <= DIRECT_ALIASES else 0
+        k = np.arange(-n_near, n_near + 1)[:, np.newaxis]
+        cycles_y = scipy.fft.fftfreq(rows.size) + k
+        cycles_x = scipy.fft.rfftfreq(columns.size) + k
+        if self._n_alias == 0:
+            cycles_x = cycles_x[:, : int(np.searchsorted(cycles_x[0], f_max_per_um * pitch_um)) + 1]
+        self._n_columns = cycles_x.shape[1]
+        self._fx_per_um, self._fy_per_um = (cycles_x / pitch_um).astype(real), (cycles_y / pitch_um).astype(real)
+        self._gain_x, self._gain_y = ((np.sinc(c) ** sinc_power).astype(real) for c in (cycles_x, cycles_y))
+        self._cycles_x, self._cycles_y = np.abs(cycles_x[n_near]), np.abs(cycles_y[n_near])
+
+    def _far_aliases(self, table: NDArray[Any], per_step: float) -> tuple[Images, Images]:
+        """
+        Aliases beyond the frequency itself as a sum of products, (n_rank, n_x) and (n_rank, n_y), when they are many.
+
+        Within half a cycle per cell their sum is smooth and even, so that a few Chebyshev polynomials hold it.
+        """
+        if self._n_alias <= DIRECT_ALIASES:
+            return np.zeros((0, self._cycles_x.size), self._real), np.zeros((0, self._cycles_y.size), self._real)
+        nodes = np.polynomial.chebyshev.chebpts1(ALIAS_NODES)
+        at_nodes = kernels().alias_sum(
+            table.astype(np.float64), per_step / self._pitch_um, 0.25 * (nodes + 1.0), self._n_alias, self._sinc_power
+        )
+        y_modes, sizes, x_modes = np.linalg.svd(at_nodes)
+        rank = int(np.searchsorted(-sizes, -ALIAS_ACCURACY * max(float(table[0]), 0.0)))
+        to_coefficients = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, ALIAS_NODES - 1))
+
+        def at(cycles: Floats, modes: Floats) -> Images:
+            polynomials = np.polynomial.chebyshev.chebvander(4.0 * cycles - 1.0, ALIAS_NODES - 1)
+            return np.ascontiguousarray((polynomials @ (to_coefficients @ modes)).T.astype(self._real))
+
+        return at(self._cycles_x, x_modes[:rank].T), at(self._cycles_y, y_modes[:, :rank] * sizes[:rank])
+
+    def _each_rows(self, work: Callable[[int, int], None], n_rows: int) -> None:
+        each(
+            lambda first: work(first, min(first + ROWS_PER_PIECE, n_rows)),
+            range(0, n_rows, ROWS_PER_PIECE),
+            self._n_threads,
+        )
+
+    def forward(self, image: Images, x2: Floats, y2: Floats, falloff_power: int) -> NDArray[Any]:
+        """Spectrum of a picture with falloff and padding."""
+        n_y, n_x = self._shape
+        top, left = (self._rows.size - n_y) // 2, (self._columns.size - n_x) // 2
+        spectrum = np.empty((self._rows.size, self._n_columns), np.result_type(self._real, np.complex64))
+        x2, y2 = x2.astype(self._real), y2.astype(self._real)
+
+        def some_rows(first: int, last: int) -> None:
+            padded = np.empty((last - first, self._columns.size), self._real)
+            kernels().expose(image, x2, y2, falloff_power, self._columns, left, first, padded)
+            spectrum[top + first : top + last] = scipy.fft.rfft(padded, axis=1, overwrite_x=True)[:, : self._n_columns]
+
+        self._each_rows(some_rows, n_y)
+        for row in (*range(top), *range(top + n_y, self._rows.size)):
+            spectrum[row] = spectrum[top + self._rows[row]] if self._rows[row] >= 0 else 0.0
+        spectrum = scipy.fft.fft(spectrum, axis=0, overwrite_x=True, workers=self._n_threads)
+        if not np.isfinite(spectrum[0, 0]):
+            raise SimulationError("the scene has values that are not finite")
+        return spectrum
+
+    def multiply(
+        self, spectrum: NDArray[Any], table: NDArray[Any], per_step: float, out: NDArray[Any], *, is_added: bool
+    ) -> None:
+        """Write a spectrum times a radial table to ``out``, or add it; ``out`` may be the spectrum."""
+        far_x, far_y = self._far_aliases(table, per_step)
+
+        def some_rows(first: int, last: int) -> None:
+            kernels().transfer(
+                spectrum,
+                table,
+                self._real(per_step),
+                self._fx_per_um,
+                self._fy_per_um,
+                self._gain_x,
+                self._gain_y,
+                far_x,
+                far_y,
+                is_added,
+                first,
+                last,
+                out,
+            )
+
+        self._each_rows(some_rows, spectrum.shape[0])
+
+    def inverse(self, spectrum: NDArray[Any]) -> NDArray[Any]:
+        """The picture of a spectrum, without its padding; the spectrum is used up."""
+        n_y, n_x = self._shape
+        top, left = (self._rows.size - n_y) // 2, (self._columns.size - n_x) // 2
+        lines = scipy.fft.ifft(spectrum, axis=0, overwrite_x=True, workers=self._n_threads)
+        image = np.empty(self._shape, self._real)
+
+        def some_rows(first: int, last: int) -> None:
+            padded = scipy.fft.irfft(lines[top + first : top + last], n=self._columns.size, axis=1)
+            image[first:last] = padded[:, left : left + n_x]
+
+        self._each_rows(some_rows, n_y)
+        return image
