@@ -1,0 +1,38 @@
+"""Every script of the gallery runs, asserts its own number, and writes only where it is told."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+import foveasim
+
+GALLERY = Path(foveasim.__file__).parents[1] / "gallery"
+SCRIPTS = sorted(GALLERY.glob("*.py"))
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda p: p.stem)
+def test_a_script_runs_and_writes_its_pictures(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out").mkdir()
+    spec = importlib.util.spec_from_file_location(f"gallery_{path.stem}", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+    module.main(tmp_path / "out")
+
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+    written = sorted((tmp_path / "out").iterdir())
+    assert written
+    assert all(p.name.startswith(path.stem[:3]) and p.stat().st_size > 1000 for p in written)
+
+
+def test_scripts_are_numbered_through_and_say_what_to_expect():
+    assert [path.name[:3] for path in SCRIPTS] == [f"{k:02d}_" for k in range(1, len(SCRIPTS) + 1)]
+    for path in SCRIPTS:
+        text = path.read_text()
+        assert re.search(r'^"""\n.*\?\n\nNew here: .*\n\nExpect: ', text, re.DOTALL)
+        assert "assert " in text
