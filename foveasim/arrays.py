@@ -15,8 +15,10 @@ __all__ = [
     "Floats",
     "Images",
     "Ints",
+    "as_numbers",
     "check_choice",
     "check_count",
+    "check_length_um",
     "check_number",
     "finite_array",
     "read_only",
@@ -30,6 +32,9 @@ Bools = NDArray[np.bool_]
 Images = NDArray[np.floating[Any]]
 
 _Array = TypeVar("_Array", bound=NDArray[Any])
+
+#: Lengths on a sensor outside this range are a slip of units: less than a picometre, more than ten metres.
+MIN_LENGTH_UM, MAX_LENGTH_UM = 1e-6, 1e7
 
 #: Suffixes of names, longest first, and the unit that each stands for in messages.
 UNIT_SUFFIXES = {
@@ -119,6 +124,21 @@ def check_count(name: str, value: object, *, at_least: int = 1, at_most: int | N
     return int(number)
 
 
+def check_length_um(name: str, value: object, *, at_most: float | None = None, cure: str = "") -> float:
+    """
+    The value as a length on a sensor, in µm.
+
+    Raises
+    ------
+    ParameterError
+        When it is no number, not positive, longer than allowed, or of a size that no sensor has.
+    """
+    length_um = check_number(name, value, above=0.0, at_most=at_most, cure=cure)
+    return check_number(
+        name, length_um, at_least=MIN_LENGTH_UM, at_most=MAX_LENGTH_UM, cure=cure or "lengths on a sensor are in µm"
+    )
+
+
 def check_choice(name: str, value: object, choices: Collection[str]) -> str:
     """
     The value, when it is one of the choices.
@@ -133,6 +153,21 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> str:
     return value
 
 
+def as_numbers(name: str, value: ArrayLike) -> Floats:
+    """
+    The value as a float64 array, whatever its numbers.
+
+    Raises
+    ------
+    ParameterError
+        When it is ragged, or not numeric.
+    """
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ParameterError(name, "must be an array of numbers", value) from None
+
+
 def finite_array(
     name: str, value: ArrayLike, *, ndim: int | None = None, at_least: float | None = None, above: float | None = None
 ) -> Floats:
@@ -145,10 +180,7 @@ def finite_array(
         When it is not numeric, has another number of dimensions, or a value that is not finite or out of bounds;
         the message gives the first such value's position.
     """
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ParameterError(name, "must be an array of numbers", value) from None
+    array = as_numbers(name, value)
     if ndim is not None and array.ndim != ndim:
         raise ParameterError(name, f"must have {ndim} dimension{'s' * (ndim != 1)}, got the shape {array.shape}")
     for is_bad, rule in (

@@ -82,5 +82,5 @@ class SamplingWarning(FoveasimWarning):
 
 def _shown(value: Any) -> str:
     """Short text of a value for a message."""
-    text = repr(value)
+    text = " ".join(repr(value).split())
     return text if len(text) <= 80 else text[:77] + "..."

@@ -12,7 +12,7 @@ import numpy as np
 
 from foveasim.arrays import Floats, Ints
 
-__all__ = ["next_vertex", "ring_moments", "site_bounds_um", "site_moments"]
+__all__ = ["next_vertex", "ring_moments", "ring_spread_um2", "site_bounds_um", "site_moments"]
 
 
 def next_vertex(ring_offsets: Ints) -> Ints:
@@ -47,6 +47,15 @@ def ring_moments(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats]:
     area_um2 = 0.5 * np.add.reduceat(cross, starts)
     local_moment = np.add.reduceat((local + after) * cross[:, np.newaxis], starts, axis=0) / 6.0
     return area_um2, local_moment + anchor * area_um2[:, np.newaxis]
+
+
+def ring_spread_um2(xy_um: Floats, ring_offsets: Ints) -> Floats:
+    """Sum of the areas of each ring's triangles with its first vertex, all counted positive, (n_ring,): 0 for a line."""
+    if ring_offsets.size == 1:
+        return np.zeros(0)
+    local = xy_um - np.repeat(xy_um[ring_offsets[:-1]], np.diff(ring_offsets), axis=0)
+    after = local[next_vertex(ring_offsets)]
+    return 0.5 * np.add.reduceat(np.abs(local[:, 0] * after[:, 1] - local[:, 1] * after[:, 0]), ring_offsets[:-1])
 
 
 def site_moments(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> tuple[Floats, Floats]:

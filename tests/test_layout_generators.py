@@ -517,7 +517,7 @@ def test_zones_refuse_what_does_not_fit(side_um, pitch_um, message):
         (grid, {"n_x": 1, "n_y": 1, "pitch_um": 0.0}, "'pitch_um' must be > 0, got 0.0 µm"),
         (grid, {"n_x": 1, "n_y": 1, "pitch_um": np.nan}, "'pitch_um' must be finite, got nan µm"),
         (grid, {"n_x": 1, "n_y": 1, "pitch_um": 1.0, "width_um": 1.5}, "'width_um' must be <= 1, got 1.5 µm"),
-        (grid, {"n_x": 1, "n_y": 1, "pitch_um": 1.0, "width_um": 0}, "'width_um' must be > 0, got 0.0 µm"),
+        (grid, {"n_x": 1, "n_y": 1, "pitch_um": 1.0, "width_um": 0.0}, "'width_um' must be > 0, got 0.0 µm"),
         (grid, {"n_x": 2, "n_y": 2, "pitch_um": 1e308}, "pitch_um"),
         (grid, {"n_x": 2, "n_y": 2, "pitch_um": 1.0, "width_um": 1e-300}, "width_um"),
         (hexagonal, {"n_columns": 0, "n_rows": 1, "pitch_um": 1.0}, "'n_columns' must be >= 1, got 0"),

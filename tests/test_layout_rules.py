@@ -174,6 +174,14 @@ WIDTHS = {
     "L": (shapely.Polygon([(0, 0), (5, 0), (5, 0.3), (1, 0.3), (1, 5), (0, 5)]), 0.3),
     "U": (shapely.Polygon([(0, 0), (6, 0), (6, 5), (5.6, 5), (5.6, 2), (2, 2), (2, 5), (0, 5)]), 0.4),
     "U with a thin foot": (shapely.Polygon([(0, 0), (6, 0), (6, 5), (4, 5), (4, 0.1), (2, 0.1), (2, 5), (0, 5)]), 0.1),
+    "U with a foot that thins to its left": (
+        shapely.Polygon([(0, 0), (6, 0), (6, 5), (4, 5), (4, 0.3), (2, 0.1), (2, 5), (0, 5)]),
+        0.1,
+    ),
+    "U with a foot that thins to its right": (
+        shapely.Polygon([(0, 0), (6, 0), (6, 5), (4, 5), (4, 0.1), (2, 0.3), (2, 5), (0, 5)]),
+        0.1,
+    ),
     "U with a narrow slot": (
         shapely.Polygon([(0, 0), (6, 0), (6, 5), (3.1, 5), (3.1, 2), (2.9, 2), (2.9, 5), (0, 5)]),
         2.0,
@@ -238,7 +246,7 @@ def test_the_width_of_a_rectangle_is_its_shorter_side(width_um, height_um, angle
     assert min_width_um(layout)[0] == pytest.approx(min(width_um, height_um), rel=1e-9)
 
 
-@pytest.mark.parametrize("n_corners", [16, 64, 257])
+@pytest.mark.parametrize("n_corners", [32, 64, 257])
 def test_the_width_of_a_disc_is_its_diameter_to_five_percent(n_corners):
     assert min_width_um(Layout.from_polygons([regular(n_corners, 3.0)]))[0] == pytest.approx(6.0, rel=0.05)
 
@@ -335,6 +343,22 @@ def test_an_island_in_a_gap_is_no_part_of_it(die_um):
     layout = Layout.from_polygons([ring, box_at(4, 4, 2, 2)])
 
     assert found(layout, DesignRules(max_gap_um2=0.0, die_um=die_um)) == [("max_gap_um2", (0, 1), 32.0)]
+
+
+@pytest.mark.parametrize(
+    ("dropped", "sites_um2"),
+    [
+        ((6, 17, 18), [((10, 11, 12, 13, 15, 16, 18, 19, 20, 21), 2.0), ((0, 1, 2, 5, 6, 9, 10, 11), 1.0)]),
+        ((6, 7, 18), [((0, 1, 2, 3, 5, 6, 8, 9, 10, 11), 2.0), ((10, 11, 12, 15, 16, 19, 20, 21), 1.0)]),
+    ],
+)
+@pytest.mark.parametrize("die_um", [None, ALL_RULES.die_um])
+def test_gaps_come_worst_first(dropped, sites_um2, die_um):
+    layout = replaced({}, dropped=dropped)
+
+    assert found(layout, DesignRules(max_gap_um2=0.0, die_um=die_um)) == [
+        ("max_gap_um2", sites, value) for sites, value in sites_um2
+    ]
 
 
 def test_trenches_that_reach_the_outside_are_a_gap_only_in_a_die():
@@ -504,7 +528,7 @@ def test_the_table_has_a_line_for_each_rule():
 @pytest.mark.parametrize(
     ("limit", "message"),
     [
-        (-1, "must be >= 0, got -1.0 µm"),
+        (-1.0, "must be >= 0, got -1.0 µm"),
         (np.nan, "must be finite, got nan µm"),
         (np.inf, "must be finite, got inf µm"),
         ("1", "must be one number, got '1'"),

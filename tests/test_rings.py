@@ -30,7 +30,7 @@ def packed(nested):
 
 
 def exact_area_and_moment(ring):
-    """Signed area and first moments of a ring as fractions, summed over the triangles that its edges span with (1, 2)."""
+    """Signed area and first moments of a ring as fractions: sums over the triangles of its edges with (1, 2)."""
     px, py = Fraction(1), Fraction(2)
     area, moment = Fraction(0), [Fraction(0), Fraction(0)]
     exact = [(Fraction(x), Fraction(y)) for x, y in ring]

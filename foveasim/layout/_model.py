@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
@@ -12,17 +12,15 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Bools, Floats, Ints, check_number, finite_array, read_only
+from foveasim.arrays import MAX_LENGTH_UM, Bools, Floats, Ints, as_numbers, check_number, finite_array, read_only
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.rings import ring_moments, site_bounds_um, site_moments
+from foveasim.rings import next_vertex, ring_moments, ring_spread_um2, site_bounds_um, site_moments
 
 if TYPE_CHECKING:
     from foveasim.layout.rules import DesignRules, Report
 
 __all__ = ["Layout"]
 
-#: Positions further out than this are a slip of units, not a sensor (10 m).
-MAX_COORDINATE_UM = 1e7
 #: A ring whose area is below this share of its bounding box is a line to float64.
 ZERO_AREA_SHARE = 1e-14
 #: How many bad sites a message names.
@@ -75,16 +73,18 @@ class Layout:
             raise ParameterError("xy_um", f"must have the shape (n_vertex, 2), got {xy_um.shape}")
         ring_offsets = _offsets("ring_offsets", self.ring_offsets, 3, xy_um.shape[0], "vertices")
         site_offsets = _offsets("site_offsets", self.site_offsets, 1, ring_offsets.size - 1, "rings")
+        if xy_um.size and np.abs(xy_um).max() > MAX_LENGTH_UM:
+            raise GeometryError(
+                f"the layout lies further than {MAX_LENGTH_UM:g} µm from the origin; coordinates are in µm"
+            )
         columns = {}
         for name, values in self.columns.items():
-            column = np.array(values)
+            column = _column(name, values)
             if column.shape != (site_offsets.size - 1,):
                 raise ParameterError(
                     name,
                     f"must have one value for each of the {site_offsets.size - 1} sites, got the shape {column.shape}",
                 )
-            if column.dtype.hasobject:
-                raise ParameterError(name, "must be an array of numbers or text", values)
             columns[name] = read_only(column)
         object.__setattr__(self, "xy_um", read_only(np.array(xy_um, order="C")))
         object.__setattr__(self, "ring_offsets", read_only(ring_offsets))
@@ -149,7 +149,7 @@ class Layout:
             rings_um.reshape(-1, 2),
             np.arange(n_sites + 1) * n_vertices,
             np.arange(n_sites + 1),
-            {name: np.asarray(values) for name, values in (columns or {}).items()},
+            {name: _column(name, values) for name, values in (columns or {}).items()},
             provenance or {},
         )
 
@@ -195,20 +195,21 @@ class Layout:
             xy_um, ring_offsets, site_offsets = _unpacked(polygons)
         _require(_per_site(~np.isfinite(xy_um), ring_offsets, site_offsets), "has a coordinate that is not finite")
         _require(
-            _per_site(np.abs(xy_um) > MAX_COORDINATE_UM, ring_offsets, site_offsets),
-            f"lies further than {MAX_COORDINATE_UM:g} µm from the origin; coordinates are in µm",
+            _per_site(np.abs(xy_um) > MAX_LENGTH_UM, ring_offsets, site_offsets),
+            f"lies further than {MAX_LENGTH_UM:g} µm from the origin; coordinates are in µm",
         )
         xy_um, ring_offsets = _without_repeats(xy_um, ring_offsets)
         _require(
             np.logical_or.reduceat(np.diff(ring_offsets) < 3, site_offsets[:-1]),
             "has a ring of fewer than 3 different vertices",
         )
-        area_um2, _ = ring_moments(xy_um, ring_offsets)
         box = site_bounds_um(xy_um, ring_offsets, np.arange(ring_offsets.size))
         box_um2 = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])
-        is_flat = np.abs(area_um2) <= ZERO_AREA_SHARE * np.maximum(box_um2, np.finfo(np.float64).tiny)
-        _require(np.logical_or.reduceat(is_flat, site_offsets[:-1]), "has a ring without area")
+        rounding_um2 = ZERO_AREA_SHARE * np.maximum(box_um2, np.finfo(np.float64).tiny)
+        is_line = ring_spread_um2(xy_um, ring_offsets) <= rounding_um2
+        _require(np.logical_or.reduceat(is_line, site_offsets[:-1]), "has a ring without area")
         _require_simple(xy_um, ring_offsets, site_offsets)
+        area_um2, _ = ring_moments(xy_um, ring_offsets)
         is_outline = np.zeros(area_um2.size, bool)
         is_outline[site_offsets[:-1]] = True
         xy_um = _wound(xy_um, ring_offsets, (area_um2 > 0) != is_outline)
@@ -219,7 +220,7 @@ class Layout:
             xy_um,
             ring_offsets,
             site_offsets,
-            {name: np.asarray(values) for name, values in columns.items()},
+            {name: _column(name, values) for name, values in columns.items()},
             provenance or {"made_by": "from_polygons"},
         )
 
@@ -232,6 +233,11 @@ class Layout:
 
     def __len__(self) -> int:
         return self.n_sites
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Read-only mappings cannot be pickled as they are.
+        fields = (self.xy_um, self.ring_offsets, self.site_offsets, dict(self.columns), dict(self.provenance))
+        return Layout, fields
 
     def __repr__(self) -> str:
         origin = self.provenance.get("generator", self.provenance.get("made_by", "packed rings"))
@@ -248,8 +254,19 @@ class Layout:
         return self._index_column("readout_line")
 
     def _index_column(self, name: str) -> Ints:
+        return self.index_column(name) if name in self.columns else np.zeros(self.n_sites, np.int64)
+
+    def index_column(self, name: str) -> Ints:
+        """
+        A column of whole numbers from 0, (n_site,) int64.
+
+        Raises
+        ------
+        ParameterError
+            When the layout has no such column, or it holds something else.
+        """
         if name not in self.columns:
-            return np.zeros(self.n_sites, np.int64)
+            raise ParameterError(name, f"must be a column of the layout, which has {sorted(self.columns)}")
         column = self.columns[name]
         if column.dtype.kind not in "iu" or (column.size and column.min() < 0):
             raise ParameterError(name, "must hold whole numbers of at least 0", column)
@@ -300,6 +317,8 @@ class Layout:
     def __getitem__(self, selection: Any) -> Layout:
         """Layout of the selected sites: a boolean mask, a slice, or an array of site numbers."""
         ids = np.atleast_1d(np.arange(self.n_sites)[selection])
+        if ids.ndim != 1:
+            raise ParameterError("selection", f"must be a mask, a slice or a list of sites, got {ids.ndim} dimensions")
         rings = _ranges(self.site_offsets[ids], self.site_offsets[ids + 1])
         vertices = _ranges(self.ring_offsets[rings], self.ring_offsets[rings + 1])
         return Layout(
@@ -312,7 +331,7 @@ class Layout:
 
     def with_columns(self, **columns: ArrayLike) -> Layout:
         """Layout with these columns added or replaced."""
-        merged = {**self.columns, **{name: np.asarray(values) for name, values in columns.items()}}
+        merged = {**self.columns, **{name: _column(name, values) for name, values in columns.items()}}
         return Layout(self.xy_um, self.ring_offsets, self.site_offsets, merged, self.provenance)
 
     def translate(self, dx_um: float, dy_um: float) -> Layout:
@@ -321,12 +340,12 @@ class Layout:
         return self._moved(self.xy_um + step, f"moved by ({dx_um:g}, {dy_um:g}) µm")
 
     def rotate(self, angle_deg: float, origin_um: tuple[float, float] = (0.0, 0.0)) -> Layout:
-        """Layout turned counter-clockwise about a point; quarter turns are exact."""
+        """Layout turned counter-clockwise about a point; quarter turns about the origin are exact."""
         angle_deg = check_number("angle_deg", angle_deg)
         quarters, rest = divmod(angle_deg, 90.0)
         exact = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
         c, s = exact if rest == 0.0 else (np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg)))
-        centre = finite_array("origin_um", origin_um, ndim=1)
+        centre = _point("origin_um", origin_um)
         # (A @ xy) row by row: x' = c x - s y, y' = s x + c y
         turned = (self.xy_um - centre) @ np.array([[c, s], [-s, c]]) + centre
         return self._moved(turned, f"turned by {angle_deg:g} degrees")
@@ -334,7 +353,7 @@ class Layout:
     def scale(self, factor: float, origin_um: tuple[float, float] = (0.0, 0.0)) -> Layout:
         """Layout enlarged about a point."""
         factor = check_number("factor", factor, above=0.0)
-        centre = finite_array("origin_um", origin_um, ndim=1)
+        centre = _point("origin_um", origin_um)
         return self._moved((self.xy_um - centre) * factor + centre, f"scaled by {factor:g}")
 
     def _moved(self, xy_um: Floats, step: str) -> Layout:
@@ -371,8 +390,26 @@ def _offsets(name: str, offsets: ArrayLike, at_least: int, total: int, of_what: 
     return array
 
 
+def _column(name: str, values: ArrayLike) -> NDArray[Any]:
+    """A column of data as an array of numbers or text."""
+    try:
+        column = np.array(values)
+    except ValueError:
+        raise ParameterError(name, "must have one value for each site", values) from None
+    if column.dtype.hasobject:
+        raise ParameterError(name, "must be an array of numbers or text", values)
+    return column
+
+
+def _point(name: str, value: ArrayLike) -> Floats:
+    point = finite_array(name, value, ndim=1)
+    if point.size != 2:
+        raise ParameterError(name, "must be two numbers (x, y)", value, "µm")
+    return point
+
+
 def _packed(xy_um: ArrayLike, ring_offsets: ArrayLike, site_offsets: ArrayLike) -> tuple[Floats, Ints, Ints]:
-    xy = np.asarray(xy_um, dtype=np.float64)
+    xy = as_numbers("xy_um", xy_um)
     if xy.ndim != 2 or xy.shape[1] != 2:
         raise ParameterError("xy_um", f"must have the shape (n_vertex, 2), got {xy.shape}")
     rings = _offsets("ring_offsets", ring_offsets, 1, xy.shape[0], "vertices")
@@ -382,7 +419,9 @@ def _packed(xy_um: ArrayLike, ring_offsets: ArrayLike, site_offsets: ArrayLike) 
 def _unpacked(polygons: Any) -> tuple[Floats, Ints, Ints]:
     """Packed rings of shapely polygons, closing vertex included."""
     items = polygons.geoms if hasattr(polygons, "geoms") else polygons
-    geometries = np.array(list(items), dtype=object)
+    if isinstance(items, str | bytes | shapely.Geometry) or not isinstance(items, Iterable):
+        raise ParameterError("polygons", "must be a sequence of shapely polygons, or packed rings", items)
+    geometries = np.fromiter(items, dtype=object)
     is_polygon = np.array([isinstance(g, shapely.Polygon) for g in geometries], bool)
     if not is_polygon.all():
         bad = int(np.flatnonzero(~is_polygon)[0])
@@ -426,12 +465,10 @@ def _require_simple(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> No
 
 
 def _without_repeats(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Ints]:
-    """Rings without vertices that equal the one before; so also without a closing vertex."""
+    """Rings without vertices that equal the one after; so also without a closing vertex."""
     if ring_offsets.size == 1:
         return xy_um, ring_offsets
-    before = np.arange(-1, xy_um.shape[0] - 1)
-    before[ring_offsets[:-1]] = ring_offsets[1:] - 1
-    is_new = (xy_um != xy_um[before]).any(axis=1)
+    is_new = (xy_um != xy_um[next_vertex(ring_offsets)]).any(axis=1)
     n_left = np.add.reduceat(is_new.astype(np.int64), ring_offsets[:-1])
     return xy_um[is_new], np.concatenate(([0], np.cumsum(n_left)))
 

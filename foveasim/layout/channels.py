@@ -34,12 +34,12 @@ def mosaic(layout: Layout, block: Sequence[str], names: str = "RGB") -> Layout:
     ParameterError
         When the block is not a rectangle of known letters, or the layout has no such columns.
     """
-    rows = [str(row) for row in ([block] if isinstance(block, str) else block)]
-    if not rows or not rows[0] or any(len(row) != len(rows[0]) for row in rows):
+    rows = [block] if isinstance(block, str) else list(block) if isinstance(block, Sequence) else []
+    if not rows or not all(isinstance(row, str) and row and len(row) == len(rows[0]) for row in rows):
         raise ParameterError("block", "must be rows of letters of equal length, such as ('RG', 'GB')", block)
     unknown = sorted(set("".join(rows)) - set(names))
     if unknown:
-        raise ParameterError("block", f"must use the letters {names!r}, got {', '.join(map(repr, unknown))}", block)
+        raise ParameterError("block", f"must use the letters {names!r}, got {', '.join(map(repr, unknown))}")
     pair = next((pair for pair in INDEX_COLUMNS if all(name in layout.columns for name in pair)), None)
     if pair is None:
         raise ParameterError(
@@ -48,5 +48,5 @@ def mosaic(layout: Layout, block: Sequence[str], names: str = "RGB") -> Layout:
             cure="set its channel column with with_columns(channel=...)",
         )
     channels = np.array([[names.index(letter) for letter in row] for row in rows])
-    row, column = (layout.columns[name] for name in pair)
+    row, column = (layout.index_column(name) for name in pair)
     return layout.with_columns(channel=channels[row % channels.shape[0], column % channels.shape[1]])

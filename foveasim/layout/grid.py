@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from foveasim.arrays import Floats, check_count, check_number
+from foveasim.arrays import Floats, check_count, check_length_um
 from foveasim.layout._model import Layout
 
 __all__ = ["grid"]
@@ -43,9 +43,9 @@ def grid(*, n_x: int, n_y: int, pitch_um: float, width_um: float | None = None) 
         When a number is out of range, or the width larger than the pitch.
     """
     n_x, n_y = check_count("n_x", n_x), check_count("n_y", n_y)
-    pitch_um = check_number("pitch_um", pitch_um, above=0.0)
+    pitch_um = check_length_um("pitch_um", pitch_um)
     if width_um is not None:
-        width_um = check_number("width_um", width_um, above=0.0, at_most=pitch_um)
+        width_um = check_length_um("width_um", width_um, at_most=pitch_um)
     row, column = (index.ravel() for index in np.divmod(np.arange(n_y * n_x), n_x))
     corners = square_corners_um(column - 0.5 * n_x, row - 0.5 * n_y, pitch_um, width_um)
     return Layout.from_equal_rings(

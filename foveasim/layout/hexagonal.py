@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from foveasim.arrays import check_choice, check_count, check_number
+from foveasim.arrays import check_choice, check_count, check_length_um
 from foveasim.layout._model import Layout
 
 __all__ = ["hexagonal"]
@@ -56,9 +56,9 @@ def hexagonal(
         When a number is out of range, or the width larger than the pitch.
     """
     n_columns, n_rows = check_count("n_columns", n_columns), check_count("n_rows", n_rows)
-    pitch_um = check_number("pitch_um", pitch_um, above=0.0)
+    pitch_um = check_length_um("pitch_um", pitch_um)
     if width_um is not None:
-        width_um = check_number("width_um", width_um, above=0.0, at_most=pitch_um)
+        width_um = check_length_um("width_um", width_um, at_most=pitch_um)
     check_choice("orientation", orientation, ("pointy", "flat"))
     row, column = (index.ravel() for index in np.divmod(np.arange(n_rows * n_columns), n_columns))
     # Every corner of the packing lies on a lattice of half pitches and half sides: neighbours' corners are equal.

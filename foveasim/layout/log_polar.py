@@ -6,12 +6,14 @@ import math
 
 import numpy as np
 
-from foveasim.arrays import Floats, Ints, check_count, check_number
+from foveasim.arrays import Floats, Ints, check_count, check_length_um, check_number
 from foveasim.errors import ParameterError
 from foveasim.layout._model import Layout
 
 __all__ = ["log_polar", "square_ring_ratio"]
 
+#: Rings thinner than this share of their radius are rounding.
+RATIO_ROUNDING = 1e-12
 #: More sites than this are a slip in the parameters.
 MAX_SITES = 50_000_000
 
@@ -25,7 +27,7 @@ def square_ring_ratio(n_sectors: int) -> float:
     Height ``r_c * 2 (q - 1) / (q + 1)`` equal to the chord ``2 r_c sin(π / n)`` on the centre line gives
     ``q = (1 + sin(π / n)) / (1 - sin(π / n))``.
     """
-    s = math.sin(math.pi / n_sectors)
+    s = math.sin(math.pi / check_count("n_sectors", n_sectors, at_least=3))
     return (1.0 + s) / (1.0 - s)
 
 
@@ -61,8 +63,10 @@ def log_polar(
     r_max_um : float, µm
         No ring reaches further out.
     min_size_um : float, optional, µm
-        Smallest pixel that can be made. Rings whose sites would be smaller are left out: that is the **blind spot**.
-        Its radius on the first ring's centre line is ``min_size * n_sectors / 2π`` where the sites are squarish.
+        Smallest pixel that can be made, measured as the arc on a ring's centre line (and less where rings are thinner
+        than squarish ones). Rings whose sites would be smaller are left out: that is the **blind spot**, of the radius
+        ``min_size * n_sectors / 2π`` on the first ring's centre line where the sites are squarish. A design rule measures
+        a site by its area or its narrowest place instead, which are a little less than the arc.
     r_min_um : float, optional, µm
         Inner radius of the first ring; by default the smallest that ``min_size_um`` allows.
     n_rings : int, optional
@@ -87,21 +91,23 @@ def log_polar(
     ParameterError
         When a number is out of range, or no ring fits.
     """
-    n_sectors = check_count("n_sectors", n_sectors, at_least=3)
+    n_sectors = check_count("n_sectors", n_sectors, at_least=3, at_most=MAX_SITES)
     chords_per_arc = check_count("chords_per_arc", chords_per_arc, at_most=1000)
-    r_max_um = check_number("r_max_um", r_max_um, above=0.0)
+    r_max_um = check_length_um("r_max_um", r_max_um)
     for name, length_um in (("min_size_um", min_size_um), ("r_min_um", r_min_um)):
         if length_um is not None:
-            check_number(name, length_um, above=0.0, at_most=r_max_um)
+            check_length_um(name, length_um, at_most=r_max_um)
     if r_min_um is None and min_size_um is None:
         raise ParameterError("r_min_um", "or 'min_size_um' must be given: without either the rings would never end")
     if n_rings is not None:
-        n_rings = check_count("n_rings", n_rings, at_most=MAX_SITES // n_sectors)
+        n_rings = check_count("n_rings", n_rings, at_most=max(1, MAX_SITES // n_sectors))
         if ring_ratio is not None or r_min_um is None or not r_min_um < r_max_um:
             raise ParameterError("n_rings", "takes 'r_min_um' below 'r_max_um', and no 'ring_ratio'", n_rings)
         ratio = (r_max_um / r_min_um) ** (1.0 / n_rings)
+        if ratio <= 1.0 + RATIO_ROUNDING:
+            raise ParameterError("r_min_um", f"must leave {n_rings} rings some width below 'r_max_um'", r_min_um, "µm")
     elif ring_ratio is not None:
-        ratio = check_number("ring_ratio", ring_ratio, above=1.0)
+        ratio = check_number("ring_ratio", ring_ratio, above=1.0 + RATIO_ROUNDING)
     else:
         ratio = square_ring_ratio(n_sectors)
 
@@ -165,14 +171,13 @@ def _sites(radii_um: Floats, n_sectors: int, stagger: bool, chords_per_arc: int)
     """Outlines (n_site, n_vertex, 2) µm, and the ring and sector of each."""
     n_chords = chords_per_arc * (2 if stagger and chords_per_arc % 2 else 1)
     # All corners lie on steps of a whole turn, so that neighbours' corners are equal bit for bit.
-    steps_per_sector = 2 * n_chords if stagger and n_chords % 2 else n_chords
-    n_steps = n_sectors * steps_per_sector
+    n_steps = n_sectors * n_chords
     angle_rad = 2.0 * math.pi * np.arange(n_steps) / n_steps
     direction = np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
     ring, sector = (index.ravel() for index in np.divmod(np.arange((radii_um.size - 1) * n_sectors), n_sectors))
-    turn = np.where(stagger & (ring % 2 == 1), steps_per_sector // 2, 0)
-    start = sector * steps_per_sector + turn
-    arc = np.arange(0, steps_per_sector + 1, steps_per_sector // n_chords)
+    turn = np.where(stagger & (ring % 2 == 1), n_chords // 2, 0)
+    start = sector * n_chords + turn
+    arc = np.arange(n_chords + 1)
     inner = direction[(start[:, np.newaxis] + arc[::-1]) % n_steps] * radii_um[ring][:, np.newaxis, np.newaxis]
     outer = direction[(start[:, np.newaxis] + arc) % n_steps] * radii_um[ring + 1][:, np.newaxis, np.newaxis]
     return np.concatenate((outer, inner), axis=1), ring, sector

@@ -201,14 +201,16 @@ def min_width_um(layout: Layout) -> Floats:
     """
     Smallest width of every site, (n_site,) µm.
 
-    The smallest distance between two edges of the site, not neighbours, that face each other across it (opposite
-    within 45 degrees), or the width of the narrowest strip along one of its edges that holds the site.
+    The smallest of: the distance between two edges, not neighbours, that face each other across the site (opposite
+    within 26 degrees); the distance from an inward corner straight across the site to an edge; the width of the
+    narrowest strip along one of its edges that holds the site.
     """
     from foveasim.layout import _kernels
 
-    widths: Floats = _kernels.min_widths(
-        layout.xy_um, next_vertex(layout.ring_offsets), layout.ring_offsets, layout.site_offsets
-    )
+    after = next_vertex(layout.ring_offsets)
+    before = np.empty_like(after)
+    before[after] = np.arange(after.size)
+    widths: Floats = _kernels.min_widths(layout.xy_um, after, before, layout.ring_offsets, layout.site_offsets)
     return widths
 
 
@@ -252,7 +254,8 @@ def _gaps(layout: Layout, polygons: NDArray[Any], rules: DesignRules) -> list[Vi
         opened = shapely.get_parts(shapely.difference(shapely.box(*rules.die_um), covered))
     else:
         parts = shapely.get_parts(covered)
-        opened = shapely.polygons(shapely.get_rings(parts)[_is_hole(parts)])
+        holes = shapely.union_all(shapely.polygons(shapely.get_rings(parts)[_is_hole(parts)]))
+        opened = shapely.get_parts(shapely.difference(holes, covered))
     area_um2 = shapely.area(opened)
     rounding_um2 = AREA_ROUNDING * (layout.area_um2.min() if layout.n_sites else 0.0)
     bad = np.flatnonzero(area_um2 > limit_um2 + rounding_um2)

@@ -6,13 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from foveasim.arrays import check_number, finite_array
+from foveasim.arrays import MAX_LENGTH_UM, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout._model import Layout
 from foveasim.layout.grid import square_corners_um
 
 __all__ = ["zones"]
 
+#: Pixels along the side of a zone, at most.
+MAX_PIXELS = 2**14
 #: Ratios of lengths may be this far from whole numbers.
 WHOLE_NUMBER_ROUNDING = 1e-9
 
@@ -58,12 +60,14 @@ def zones(*, side_um: Sequence[float], pitch_um: Sequence[float]) -> Layout:
     >>> zones(side_um=(64, 128, 256, 512), pitch_um=(1, 2, 4, 8)).n_sites
     13312
     """
-    sides = finite_array("side_um", list(side_um), ndim=1, above=0.0)
-    pitches = finite_array("pitch_um", list(pitch_um), ndim=1, above=0.0)
+    sides = finite_array("side_um", side_um, ndim=1, above=0.0)
+    pitches = finite_array("pitch_um", pitch_um, ndim=1, above=0.0)
     if sides.size == 0 or sides.size != pitches.size:
         raise ParameterError(
             "side_um", f"and 'pitch_um' must have the same length of at least 1, got {sides.size} and {pitches.size}"
         )
+    if sides.max() > MAX_LENGTH_UM:
+        raise ParameterError("side_um", f"must be <= {MAX_LENGTH_UM:g}", float(sides.max()), "µm")
     if np.any(np.diff(sides) <= 0):
         raise ParameterError("side_um", "must grow from zone to zone", sides.tolist(), "µm")
     corners, columns = [], []
@@ -71,7 +75,9 @@ def zones(*, side_um: Sequence[float], pitch_um: Sequence[float]) -> Layout:
     inner_um = 0.0
     for zone, (outer_um, p_um) in enumerate(zip(sides, pitches, strict=True)):
         n = _whole(f"side_um[{zone}]", outer_um, p_um, outer_um / p_um)
-        border = _whole(f"pitch_um[{zone}]", p_um, outer_um - inner_um, 0.5 * (outer_um - inner_um) / p_um)
+        border = 0
+        if zone > 0:
+            border = _whole(f"pitch_um[{zone}]", p_um, outer_um - inner_um, 0.5 * (outer_um - inner_um) / p_um)
         row, column = (index.ravel() for index in np.divmod(np.arange(n * n), n))
         is_inside = (np.minimum(row, column) >= border) & (np.maximum(row, column) < n - border)
         if inner_um > 0.0:
@@ -92,8 +98,9 @@ def zones(*, side_um: Sequence[float], pitch_um: Sequence[float]) -> Layout:
 
 
 def _whole(name: str, value: float, of_um: float, ratio: float) -> int:
-    check_number(name, ratio, at_most=2**14)
-    if abs(ratio - round(ratio)) > WHOLE_NUMBER_ROUNDING * max(ratio, 1.0):
+    if ratio > MAX_PIXELS:
+        raise ParameterError(name, f"asks for {ratio:g} pixels in a row, more than {MAX_PIXELS}")
+    if round(ratio) < 1 or abs(ratio - round(ratio)) > WHOLE_NUMBER_ROUNDING * max(ratio, 1.0):
         raise ParameterError(
             name,
             f"must fit whole pixels between the zones' borders ({of_um:g} µm gives {ratio:g} pixels)",

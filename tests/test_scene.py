@@ -1,0 +1,436 @@
+"""Scenes: which way up they are, how bright, and at which wavelengths, against published values and by hand."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+import skimage.color
+import tifffile
+from PIL import Image
+
+from foveasim.errors import FileError, ParameterError
+from foveasim.scene import Scene, decoded
+
+EPS32 = float(np.finfo(np.float32).eps)
+
+#: A letter without any symmetry, the first row on top, as in a file.
+F = np.array(
+    [
+        [0, 0, 0, 0, 0],
+        [0, 1, 1, 1, 0],
+        [0, 1, 0, 0, 0],
+        [0, 1, 1, 0, 0],
+        [0, 1, 0, 0, 0],
+        [0, 1, 0, 0, 0],
+        [0, 0, 0, 0, 0],
+    ],
+    np.uint8,
+)
+
+
+def scene_of(picture, **changed):
+    """A scene of 1 W/(m² sr nm) where the picture is white."""
+    given = {"pitch_um": 10.0, "distance_m": 0.5, "peak_radiance_w_m2_sr_nm": 1.0, "band_width_nm": 10.0}
+    return Scene.from_picture(picture, **(given | changed))
+
+
+def radiance(scene):
+    """Spectral radiance (n_wavelength, n_y, n_x), by the definition of a scene."""
+    return np.einsum("byx,bk->kyx", scene.basis, scene.spectrum_w_m2_sr_nm)
+
+
+def points(**changed):
+    given = {
+        "shape": (4, 6),
+        "pixels": [(1, 2)],
+        "intensity_w_sr_nm": 1.0,
+        "pitch_um": 10.0,
+        "distance_m": 0.5,
+        "band_width_nm": 10.0,
+    }
+    return Scene.point_sources(**(given | changed))
+
+
+def flat(**changed):
+    given = {"shape": (4, 6), "pitch_um": 10.0, "distance_m": 0.5, "radiance_w_m2_sr_nm": 0.25, "band_width_nm": 10.0}
+    return Scene.flat(**(given | changed))
+
+
+# -- numbers to light -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "light"),
+    [
+        (0.0, 0.0),
+        (0.04045, 0.0031308),  # where the straight part of IEC 61966-2-1 ends
+        (0.1, 0.01002283),
+        (0.5, 0.21404114),
+        (0.735357, 0.5),
+        (1.0, 1.0),
+    ],
+)
+def test_srgb_numbers_are_the_light_of_the_standard(value, light):
+    assert abs(decoded(np.array(value), "srgb") - light) < 1e-6
+
+
+def test_srgb_codes_are_the_light_that_another_library_finds():
+    codes = np.arange(256, dtype=np.uint8)
+    greys = np.repeat(codes[np.newaxis, :, np.newaxis], 3, axis=2)
+    brightness = skimage.color.rgb2xyz(greys)[0, :, 1]
+    np.testing.assert_allclose(radiance(scene_of(codes[np.newaxis]))[0, 0], brightness, rtol=2e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize(("encoding", "power"), [("linear", 1), ("sqrt", 2)])
+def test_linear_and_square_root_numbers_are_powers(encoding, power):
+    values = np.array([[0.0, 0.25, 0.5, 1.0, 1.5]])
+    np.testing.assert_allclose(radiance(scene_of(values, encoding=encoding))[0], values**power, rtol=EPS32)
+
+
+@pytest.mark.parametrize("encoding", ["srgb", "sqrt", "linear"])
+def test_more_light_has_larger_numbers_in_every_encoding(encoding):
+    assert np.all(np.diff(decoded(np.linspace(0.0, 2.0, 2001), encoding)) > 0.0)
+
+
+@pytest.mark.parametrize("encoding", ["srgb", "sqrt", "linear"])
+@pytest.mark.parametrize(
+    ("black", "white"),
+    [
+        (np.uint8(0), np.uint8(255)),
+        (np.uint16(0), np.uint16(65_535)),
+        (np.float16(0), np.float16(1)),
+        (np.float32(0), np.float32(1)),
+        (np.float64(0), np.float64(1)),
+        (np.bool_(0), np.bool_(1)),
+    ],
+    ids=lambda value: value.dtype.name,
+)
+def test_black_gives_no_light_and_white_the_peak_whatever_the_type(black, white, encoding):
+    scene = scene_of(np.array([[black, white]]), encoding=encoding, peak_radiance_w_m2_sr_nm=0.25)
+    np.testing.assert_allclose(radiance(scene), [[[0.0, 0.25]]], rtol=EPS32)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_a_half_is_decoded_to_the_accuracy_of_single_precision_whatever_the_type(dtype):
+    light = float(radiance(scene_of(np.full((1, 1), 0.5, dtype)))[0, 0, 0])
+    assert math.isclose(light, 0.21404114048223255, rel_tol=4 * EPS32)
+
+
+def test_eight_bits_are_the_same_light_as_sixteen():
+    # 65535 = 257 x 255, so that code k of 8 bits is code 257 k of 16.
+    codes = np.arange(256, dtype=np.uint8)[np.newaxis]
+    np.testing.assert_array_equal(scene_of(codes).basis, scene_of(codes.astype(np.uint16) * np.uint16(257)).basis)
+
+
+def test_the_byte_order_of_an_array_does_not_matter():
+    codes = F * np.uint16(40_000)
+    np.testing.assert_array_equal(scene_of(codes.astype(">u2")).basis, scene_of(codes.astype("<u2")).basis)
+
+
+def test_floats_above_1_are_brighter_than_the_peak():
+    assert radiance(scene_of(np.array([[4.0]]), encoding="linear"))[0, 0, 0] == 4.0
+
+
+def test_radiance_is_proportional_to_the_peak():
+    one, seven = (radiance(scene_of(F * np.uint8(99), peak_radiance_w_m2_sr_nm=peak)) for peak in (1.0, 7.0))
+    np.testing.assert_allclose(seven, 7.0 * one, rtol=1e-15)
+
+
+# -- which way up ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.bool_])
+def test_row_0_is_the_lowest(dtype):
+    picture = F.astype(dtype) * dtype(1 if dtype in (np.float32, np.bool_) else np.iinfo(dtype).max)
+    np.testing.assert_array_equal(scene_of(picture).basis[0], F[::-1])
+
+
+def test_row_0_of_a_file_is_the_lowest(tmp_path):
+    Image.fromarray(F * np.uint8(255)).save(tmp_path / "f.png")
+    np.testing.assert_array_equal(scene_of(tmp_path / "f.png").basis[0], F[::-1])
+
+
+def test_a_file_gives_the_scene_of_its_array(tmp_path):
+    colour = np.random.default_rng(1).integers(0, 256, (7, 5, 3), dtype=np.uint8)
+    Image.fromarray(colour).save(tmp_path / "f.png")
+    np.testing.assert_array_equal(scene_of(str(tmp_path / "f.png")).basis, scene_of(colour).basis)
+
+
+def test_channels_keep_their_order():
+    colour = np.stack([F, np.zeros_like(F), 1 - F], axis=-1) * np.uint8(255)
+    red, green, blue = scene_of(colour).basis
+    np.testing.assert_array_equal(red, F[::-1])
+    np.testing.assert_array_equal(green, 0.0)
+    np.testing.assert_array_equal(blue, 1.0 - F[::-1])
+
+
+# -- transparency ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("picture", "share"),
+    [
+        (np.full((1, 1, 2), [255, 0], np.uint8), 0.0),
+        (np.full((1, 1, 2), [255, 51], np.uint8), 0.2),
+        (np.full((1, 1, 4), [255, 255, 255, 51], np.uint8), 0.2),
+        (np.full((1, 1, 4), [65_535, 65_535, 65_535, 13_107], np.uint16), 0.2),
+        (np.full((1, 1, 4), [1.0, 1.0, 1.0, 0.2]), 0.2),
+        (np.full((1, 1, 4), [255, 255, 255, 255], np.uint8), 1.0),
+    ],
+    ids=["clear grey", "grey", "colour", "16-bit colour", "float colour", "opaque colour"],
+)
+def test_what_is_transparent_gives_its_share_of_the_light(picture, share):
+    np.testing.assert_allclose(radiance(scene_of(picture)), share, rtol=EPS32)
+
+
+# -- colours and wavelengths ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("colour", "brightness"),  # Rec. ITU-R BT.709
+    [((255, 0, 0), 0.2126), ((0, 255, 0), 0.7152), ((0, 0, 255), 0.0722), ((255, 255, 255), 1.0), ((0, 0, 0), 0.0)],
+)
+def test_a_colour_picture_at_one_wavelength_is_its_brightness(colour, brightness):
+    scene = scene_of(np.full((1, 1, 3), colour, np.uint8), wavelength_nm=[550.0])
+    assert math.isclose(radiance(scene)[0, 0, 0], brightness, rel_tol=4 * EPS32)
+
+
+def test_a_grey_picture_shines_alike_at_many_wavelengths():
+    wavelength_nm = np.arange(400.0, 701.0, 10.0)
+    at_all = radiance(scene_of(F * np.uint8(255), wavelength_nm=wavelength_nm))
+    np.testing.assert_array_equal(at_all, np.tile(F[::-1], (31, 1, 1)))
+
+
+def test_a_colour_picture_shines_each_colour_at_its_own_wavelength():
+    scene = scene_of(np.full((1, 1, 3), [255, 0, 0], np.uint8), wavelength_nm=[650.0, 540.0, 460.0])
+    assert radiance(scene)[:, 0, 0].tolist() == [1.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("shape", "wavelength_nm"), [((1, 1), [550.0]), ((1, 1, 1), [550.0]), ((1, 1, 3), [620.0, 550.0, 450.0])]
+)
+def test_wavelengths_not_given_are_those_of_the_papers_colours(shape, wavelength_nm):
+    assert scene_of(np.ones(shape)).wavelength_nm.tolist() == wavelength_nm
+
+
+def test_channels_shine_in_their_spectra():
+    spectrum = [[1.0, 0.0, 0.5, 0.0], [0.0, 2.0, 0.5, 0.0], [0.0, 0.0, 0.5, 3.0]]
+    scene = scene_of(
+        np.full((1, 1, 3), [1.0, 0.5, 0.25]),
+        encoding="linear",
+        wavelength_nm=[400.0, 500.0, 600.0, 700.0],
+        spectrum=spectrum,
+        peak_radiance_w_m2_sr_nm=2.0,
+    )
+    np.testing.assert_allclose(radiance(scene)[:, 0, 0], [2.0, 2.0, 1.75, 1.5], rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("wavelength_nm", "width_nm"),
+    [
+        ([400.0, 410.0, 420.0], [10.0, 10.0, 10.0]),
+        ([450.0, 550.0, 620.0], [100.0, 85.0, 70.0]),  # 400 to 500, 500 to 585, 585 to 655
+        ([620.0, 550.0, 450.0], [70.0, 85.0, 100.0]),
+        ([550.0, 620.0, 450.0], [85.0, 70.0, 100.0]),
+        ([500.0, 600.0], [100.0, 100.0]),
+    ],
+)
+def test_bands_reach_half_way_to_the_neighbours(wavelength_nm, width_nm):
+    scene = scene_of(F * np.uint8(255), wavelength_nm=wavelength_nm, band_width_nm=None)
+    np.testing.assert_allclose(scene.band_width_nm, width_nm, rtol=1e-15)
+
+
+@pytest.mark.parametrize(("given", "width_nm"), [(12.0, [12.0, 12.0]), ([5.0, 7.0], [5.0, 7.0])])
+def test_bands_given_are_kept(given, width_nm):
+    scene = scene_of(F * np.uint8(255), wavelength_nm=[600.0, 500.0], band_width_nm=given)
+    assert scene.band_width_nm.tolist() == width_nm
+
+
+# -- flat scenes and points -----------------------------------------------------------------------------------------
+
+
+def test_a_flat_scene_has_its_radiance_everywhere_at_every_wavelength():
+    np.testing.assert_array_equal(radiance(flat(wavelength_nm=[450.0, 550.0])), np.full((2, 4, 6), 0.25))
+
+
+@pytest.mark.parametrize("pitch_um", [0.5, 10.0, 11.6])
+def test_a_point_has_its_intensity_as_radiance_times_area(pitch_um):
+    scene = points(pitch_um=pitch_um, intensity_w_sr_nm=3e-6, wavelength_nm=[450.0, 550.0])
+    area_m2 = (pitch_um * 1e-6) ** 2
+    np.testing.assert_allclose(radiance(scene).sum(axis=(1, 2)) * area_m2, 3e-6, rtol=1e-14)
+
+
+def test_points_shine_where_they_are_and_nowhere_else():
+    light = radiance(points(pixels=[(0, 0), (3, 5), (1, 4)], intensity_w_sr_nm=[1.0, 2.0, 3.0]))[0] * (10e-6) ** 2
+    expected = np.zeros((4, 6))
+    expected[0, 0], expected[3, 5], expected[1, 4] = 1.0, 2.0, 3.0
+    np.testing.assert_allclose(light, expected, rtol=1e-14)
+
+
+def test_two_points_in_one_pixel_add_up():
+    np.testing.assert_array_equal(
+        points(pixels=[(1, 2), (1, 2)], intensity_w_sr_nm=[1.0, 2.0]).basis, points(intensity_w_sr_nm=3.0).basis
+    )
+
+
+# -- what is refused ------------------------------------------------------------------------------------------------
+
+WHITE = np.ones((2, 2))
+COLOUR = np.ones((2, 2, 3))
+
+
+@pytest.mark.parametrize(
+    ("picture", "sentence"),
+    [
+        (np.array([[1.0, math.nan]]), "'picture' must be finite"),
+        (np.array([[1.0, math.inf]]), "'picture' must be finite"),
+        (np.array([[1.0, -0.1]]), "'picture' must be finite and >= 0"),
+        (np.ones((2, 2), np.int64), "'picture' must hold uint8, uint16 or floating-point numbers, got int64"),
+        ([[1, 2], [3, 4]], "'picture' must hold uint8, uint16 or floating-point numbers, got int64"),
+        (np.ones((2, 2), np.int8), "'picture' must hold uint8, uint16 or floating-point numbers, got int8"),
+        (np.ones((2, 2), complex), "'picture' must hold uint8, uint16 or floating-point numbers, got complex128"),
+        (np.ones(4), "'picture' must have the shape"),
+        (np.ones((2, 2, 5)), "'picture' must have the shape"),
+        (np.ones((1, 2, 2, 3)), "'picture' must have the shape"),
+        (np.ones((0, 2)), "'picture' must have the shape"),
+        (np.ones((2, 2, 0)), "'picture' must have the shape"),
+        ([[1.0, 2.0], [3.0]], "'picture' must"),
+        (None, "'picture' must"),
+    ],
+    ids=[
+        "nan",
+        "inf",
+        "negative",
+        "int64",
+        "list of ints",
+        "int8",
+        "complex",
+        "1-D",
+        "5 channels",
+        "4-D",
+        "no rows",
+        "no channels",
+        "ragged",
+        "none",
+    ],
+)
+def test_an_array_that_is_no_picture_is_refused_in_one_sentence(picture, sentence):
+    with pytest.raises(ParameterError, match=rf"^{re.escape(sentence)}[^\n]*$"):
+        scene_of(picture)
+
+
+@pytest.mark.parametrize(
+    ("picture", "changed", "sentence"),
+    [
+        (
+            COLOUR,
+            {"wavelength_nm": [500.0, 600.0]},
+            "'wavelength_nm' must have as many values as the picture has channels, 3",
+        ),
+        (COLOUR, {"wavelength_nm": np.arange(400.0, 701.0, 10.0)}, "'wavelength_nm' must have as many values"),
+        (COLOUR, {"wavelength_nm": [500.0, 600.0], "spectrum": np.ones((2, 2))}, "'spectrum' must have the shape"),
+        (WHITE, {"wavelength_nm": [500.0, 600.0], "spectrum": [[1.0, -1.0]]}, "'spectrum' must be >= 0"),
+        (WHITE, {"wavelength_nm": [500.0, -600.0]}, "'wavelength_nm' must be > 0"),
+        (WHITE, {"wavelength_nm": [500.0, math.nan]}, "'wavelength_nm' must be finite"),
+        (WHITE, {"wavelength_nm": [500.0, 500.0], "band_width_nm": None}, "'wavelength_nm' must be different"),
+        (WHITE, {"band_width_nm": None}, "'band_width_nm' must be given for a single wavelength"),
+        (COLOUR, {"band_width_nm": [10.0, 10.0]}, "'band_width_nm' must be one number, or one for each of the 3"),
+        (COLOUR, {"band_width_nm": [10.0, 0.0, 10.0]}, "'band_width_nm' must be > 0"),
+        (WHITE, {"encoding": "gamma"}, "'encoding' must be one of 'srgb', 'sqrt', 'linear', got 'gamma'"),
+        (WHITE, {"pitch_um": 0.0}, "'pitch_um' must be > 0"),
+        (WHITE, {"pitch_um": "10"}, "'pitch_um' must be one number"),
+        (WHITE, {"distance_m": -1.0}, "'distance_m' must be > 0"),
+        (WHITE, {"distance_m": math.inf}, "'distance_m' must be finite"),
+        (WHITE, {"peak_radiance_w_m2_sr_nm": -1.0}, "'peak_radiance_w_m2_sr_nm' must be >"),
+        (WHITE, {"peak_radiance_w_m2_sr_nm": math.nan}, "'peak_radiance_w_m2_sr_nm' must be finite"),
+    ],
+)
+def test_a_scene_that_cannot_be_is_refused_in_one_sentence(picture, changed, sentence):
+    with pytest.raises(ParameterError, match=rf"^{re.escape(sentence)}[^\n]*$"):
+        scene_of(picture, **changed)
+
+
+def test_a_message_shows_plain_numbers():
+    with pytest.raises(ParameterError, match=r"got \[500\.0, 600\.0\] nm"):
+        scene_of(COLOUR, wavelength_nm=[500.0, 600.0])
+
+
+def test_a_file_with_a_negative_number_is_refused_by_its_name(tmp_path):
+    tifffile.imwrite(tmp_path / "f.tif", np.array([[1.0, -1.0], [0.0, 0.0]], np.float32))
+    with pytest.raises(FileError, match=r"f\.tif: 'picture' must be finite and >= 0 everywhere$"):
+        scene_of(tmp_path / "f.tif")
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(FileError, match=r"nowhere\.png: no such file$"):
+        scene_of(tmp_path / "nowhere.png")
+
+
+@pytest.mark.parametrize(
+    ("changed", "name"),
+    [
+        ({"pixels": [(4, 0)]}, "pixels"),
+        ({"pixels": [(0, 6)]}, "pixels"),
+        ({"pixels": [(-1, 0)]}, "pixels"),
+        ({"pixels": [(0.5, 0)]}, "pixels"),
+        ({"pixels": [(1, 2, 3)]}, "pixels"),
+        ({"pixels": [(1, 2), (1,)]}, "pixels"),
+        ({"pixels": []}, "pixels"),
+        ({"intensity_w_sr_nm": -1.0}, "intensity_w_sr_nm"),
+        ({"intensity_w_sr_nm": math.nan}, "intensity_w_sr_nm"),
+        ({"intensity_w_sr_nm": [1.0, 2.0]}, "intensity_w_sr_nm"),
+        ({"band_width_nm": None}, "band_width_nm"),
+        ({"pitch_um": 0.0}, "pitch_um"),
+        ({"shape": (4,)}, "shape"),
+        ({"shape": (4, 6, 3)}, "shape"),
+    ],
+)
+def test_points_that_cannot_be_are_refused(changed, name):
+    with pytest.raises(ParameterError, match=rf"^'{name}' [^\n]*$"):
+        points(**changed)
+
+
+@pytest.mark.parametrize("shape", [(0, 6), (-1, 6), (4.5, 6), (4,), (4, 6, 3)], ids=str)
+def test_a_flat_scene_of_no_possible_shape_is_refused_by_the_name_of_the_parameter(shape):
+    with pytest.raises(ParameterError, match=r"^'shape' "):
+        flat(shape=shape)
+
+
+@pytest.mark.parametrize(
+    ("changed", "name"),
+    [
+        ({"basis": np.ones((2, 2))}, "basis"),
+        ({"basis": np.ones((1, 0, 2))}, "basis"),
+        ({"basis": np.full((1, 2, 2), math.nan)}, "basis"),
+        ({"basis": np.full((1, 2, 2), math.inf)}, "basis"),
+        ({"basis": np.full((1, 2, 2), -1.0)}, "basis"),
+        ({"spectrum_w_m2_sr_nm": np.ones((1, 2))}, "spectrum_w_m2_sr_nm"),
+        ({"spectrum_w_m2_sr_nm": np.ones((2, 1))}, "spectrum_w_m2_sr_nm"),
+        ({"spectrum_w_m2_sr_nm": -np.ones((1, 1))}, "spectrum_w_m2_sr_nm"),
+        ({"wavelength_nm": [-550.0]}, "wavelength_nm"),
+        ({"band_width_nm": [10.0, 10.0]}, "band_width_nm"),
+        ({"pitch_um": math.nan}, "pitch_um"),
+        ({"distance_m": 0.0}, "distance_m"),
+    ],
+)
+def test_arrays_that_do_not_fit_together_are_refused(changed, name):
+    given = {
+        "basis": np.ones((1, 2, 2)),
+        "spectrum_w_m2_sr_nm": np.ones((1, 1)),
+        "wavelength_nm": [550.0],
+        "band_width_nm": [10.0],
+        "pitch_um": 10.0,
+        "distance_m": 0.5,
+    }
+    with pytest.raises(ParameterError, match=rf"^'{name}' must [^\n]*$"):
+        Scene(**(given | changed))
+
+
+@pytest.mark.parametrize("name", ["basis", "spectrum_w_m2_sr_nm", "wavelength_nm", "band_width_nm"])
+def test_a_scene_cannot_be_written_into(name):
+    array = getattr(scene_of(F * np.uint8(255)), name)
+    with pytest.raises(ValueError, match=r"read-only"):
+        array[...] = 0.0
