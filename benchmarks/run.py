@@ -45,47 +45,43 @@ def best_s(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, fl
 
 
 class Report:
-    def __init__(self, is_judged: bool) -> None:
+    """The table of ratios, and how many of them miss their bounds."""
+
+    def __init__(self, *, is_judged: bool) -> None:
         self.table = Table(title="Ratios, each within one run")
-        for heading, justify in (
-            ("what", "left"),
-            ("time", "right"),
-            ("against", "left"),
-            ("its time", "right"),
-            ("ratio", "right"),
-            ("bound", "right"),
-            ("", "left"),
-        ):
-            self.table.add_column(heading, justify=justify)
+        for heading in ("what", "time", "against", "its time", "ratio", "bound", ""):
+            self.table.add_column(heading, justify="left" if heading in {"what", "against", ""} else "right")
         self.is_judged = is_judged
         self.missed = 0
 
     def slower_than(self, what: str, s: float, against: str, s_against: float, at_most: float | None = None) -> None:
-        """A line: how many times as long as the limit."""
-        self._line(
-            what, s, against, s_against, s / s_against, at_most, at_most is None or s / s_against <= at_most, "≤"
-        )
+        """Add how many times as long as a limit something takes."""
+        self.add(what, f"{s:.4g} s", against, f"{s_against:.4g} s", s / s_against, at_most)
 
     def faster_than(self, what: str, s: float, against: str, s_against: float, at_least: float | None = None) -> None:
-        """A line: how many times as fast as the peer."""
-        self._line(
-            what, s, against, s_against, s_against / s, at_least, at_least is None or s_against / s >= at_least, "≥"
-        )
+        """Add how many times as fast as a peer something is."""
+        self.add(what, f"{s:.4g} s", against, f"{s_against:.4g} s", s_against / s, at_least, is_lower_bound=True)
 
-    def _line(self, what, s, against, s_against, ratio, bound, is_kept, sign):
-        verdict = (
-            "" if bound is None or not self.is_judged else "[green]kept[/green]" if is_kept else "[red]missed[/red]"
-        )
-        self.missed += self.is_judged and not is_kept
-        self.table.add_row(
-            what,
-            f"{s:.4g} s",
-            against,
-            f"{s_against:.4g} s",
-            f"{ratio:.3g}",
-            "" if bound is None else f"{sign} {bound:g}",
-            verdict,
-        )
+    def add(
+        self,
+        what: str,
+        took: str,
+        against: str,
+        other_took: str,
+        figure: float,
+        bound: float | None,
+        *,
+        is_lower_bound: bool = False,
+    ) -> None:
+        """Add a figure, and whether it keeps its bound."""
+        sign = "≥" if is_lower_bound else "≤"
+        verdict = ""
+        if bound is not None and self.is_judged:
+            is_kept = figure >= bound if is_lower_bound else figure <= bound
+            self.missed += not is_kept
+            verdict = "[green]kept[/green]" if is_kept else "[red]missed[/red]"
+        shown = "" if bound is None else f"{sign} {bound:g}"
+        self.table.add_row(what, took, against, other_took, f"{figure:.3g}", shown, verdict)
 
 
 def paper_scene(shape: tuple[int, int], spectrum: np.ndarray, wavelength_nm: np.ndarray) -> fs.Scene:
@@ -103,6 +99,7 @@ def paper_layout(grid: fs.Grid) -> fs.Layout:
 
 
 def bench_integrator(report: Report, shape: tuple[int, int]) -> None:
+    """Compare the integrator with exactextract, with reading the map, and with clipping polygons."""
     from exactextract import exact_extract
     from exactextract.feature import JSONFeatureSource
     from exactextract.raster import NumPyRasterSource
@@ -130,9 +127,8 @@ def bench_integrator(report: Report, shape: tuple[int, int]) -> None:
     )
     difference = np.abs(integrator(cells) / grid.cell_area_um2 / peer_sums - 1).max()
     n_y, n_x = shape
-    console.print(
-        f"map {n_y} x {n_x} float32, {layout.n_sites:,} log-polar sites, {thread_count()} threads; largest relative difference from exactextract {difference:.1e}"
-    )
+    console.print(f"map {n_y} x {n_x} float32, {layout.n_sites:,} log-polar sites, {thread_count()} threads")
+    console.print(f"largest relative difference of a site from exactextract: {difference:.1e}")
     report.faster_than("frame", ours["frame"], "exactextract", peer_s, 30)
     report.faster_than("compile + frame", ours["frame"] + ours["compile"], "exactextract", peer_s, 12)
     report.slower_than("frame", ours["frame"], "map.sum(), float32", ours["sum"], 6)
@@ -153,6 +149,7 @@ def bench_integrator(report: Report, shape: tuple[int, int]) -> None:
 
 
 def bench_optics(report: Report, shape: tuple[int, int]) -> None:
+    """Compare optics and whole captures with the two Fourier transforms that they cannot do without."""
     n_threads = thread_count()
     optics = fs.Optics(focal_length_mm=22.0, f_number=4.0)
     mono = paper_scene(shape, np.ones((1, 1)), np.array([550.0]))
@@ -186,6 +183,7 @@ def bench_optics(report: Report, shape: tuple[int, int]) -> None:
 
 
 def bench_wavelengths(report: Report, shape: tuple[int, int]) -> None:
+    """Compare a colour capture at many wavelengths with one at three."""
     rng = np.random.default_rng(3)
     optics = fs.Optics(focal_length_mm=22.0, f_number=4.0)
     few = paper_scene(shape, rng.random((3, 3)), np.array([450.0, 550.0, 620.0]))
@@ -225,39 +223,26 @@ print((status("VmHWM") - before) / (4 * shape[0] * shape[1]))
 
 
 def bench_memory(report: Report, shape: tuple[int, int]) -> None:
+    """Measure the most memory that a capture holds, in a process of its own (Linux)."""
     if not Path("/proc/self/clear_refs").exists():
         return
     arguments = [sys.executable, "-c", MEMORY_PROBE, str(Path(__file__).parent), *map(str, shape)]
     maps = float(subprocess.run(arguments, capture_output=True, text=True, check=True).stdout)
-    is_kept = maps <= 4
-    report.missed += report.is_judged and not is_kept
-    verdict = ("[green]kept[/green]" if is_kept else "[red]missed[/red]") if report.is_judged else ""
-    report.table.add_row(
-        "peak memory of a mono capture", "", "float32 maps above the input", "", f"{maps:.2f}", "≤ 4", verdict
-    )
+    report.add("peak memory of a mono capture", "", "float32 maps above the input", "", maps, 4)
 
 
 def bench_import(report: Report) -> None:
+    """Measure what importing the package adds to Python's own start."""
+
     def start(code: str) -> Callable[[], object]:
         return lambda: subprocess.run([sys.executable, "-c", code], check=True)
 
     times = best_s({"bare": start("pass"), "ours": start("import foveasim")}, 5)
-    extra = times["ours"] - times["bare"]
-    is_kept = extra < 0.5
-    report.missed += report.is_judged and not is_kept
-    verdict = ("[green]kept[/green]" if is_kept else "[red]missed[/red]") if report.is_judged else ""
-    report.table.add_row(
-        "import foveasim",
-        f"{extra:.3g} s",
-        "beyond Python's own start",
-        f"{times['bare']:.3g} s",
-        "",
-        "≤ 0.5 s",
-        verdict,
-    )
+    report.add("import foveasim", "", "seconds beyond Python's own start", "", times["ours"] - times["bare"], 0.5)
 
 
 def main() -> int:
+    """Run the benchmarks; the exit code tells whether every bound is kept."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
     is_quick = parser.parse_args().quick

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,6 +20,7 @@ __all__ = [
     "check_count",
     "check_length_um",
     "check_number",
+    "check_shape",
     "finite_array",
     "read_only",
     "unit_of",
@@ -90,12 +91,14 @@ def check_number(
     ParameterError
         When it is no number, not finite, or out of bounds.
     """
-    if value is None or isinstance(value, bool | str | bytes) or np.ndim(value) != 0:  # type: ignore[arg-type]
-        raise ParameterError(name, "must be one number", value, cure=cure)
     try:
+        if value is None or isinstance(value, bool | str | bytes) or np.ndim(value) != 0:  # type: ignore[arg-type]
+            raise TypeError
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         raise ParameterError(name, "must be one number", value, cure=cure) from None
+    except OverflowError:
+        raise ParameterError(name, "is larger than any floating-point number", cure=cure) from None
     unit = unit_of(name)
     got = value if isinstance(value, int) else number
     if not np.isfinite(number):
@@ -118,10 +121,33 @@ def check_count(name: str, value: object, *, at_least: int = 1, at_most: int | N
     ParameterError
         When it is no whole number, or out of bounds.
     """
-    number = check_number(name, value, at_least=at_least, at_most=at_most, cure=cure)
-    if number != int(number):
-        raise ParameterError(name, "must be a whole number", number, cure=cure)
-    return int(number)
+    if isinstance(value, int | np.integer) and not isinstance(value, bool):
+        number = int(value)  # of any size: seeds have more digits than a float
+    else:
+        floating = check_number(name, value, cure=cure)
+        number = int(floating)
+        if number != floating:
+            raise ParameterError(name, "must be a whole number", floating, cure=cure)
+    if number < at_least:
+        raise ParameterError(name, f"must be >= {at_least}", number, cure=cure)
+    if at_most is not None and number > at_most:
+        raise ParameterError(name, f"must be <= {at_most}", number, cure=cure)
+    return number
+
+
+def check_shape(name: str, value: object) -> tuple[int, int]:
+    """
+    The value as the shape (n_y, n_x) of a picture or a grid.
+
+    Raises
+    ------
+    ParameterError
+        When it is not two whole numbers of at least 1.
+    """
+    if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or len(value) != 2:
+        raise ParameterError(name, "must be two whole numbers (n_y, n_x)", value)
+    n_y, n_x = (check_count(f"{name}[{i}]", n, at_most=2**30) for i, n in enumerate(value))
+    return n_y, n_x
 
 
 def check_length_um(name: str, value: object, *, at_most: float | None = None, cure: str = "") -> float:
@@ -191,7 +217,7 @@ def finite_array(
         if is_bad is not None and np.any(is_bad):
             where = tuple(int(i) for i in np.argwhere(is_bad)[0])
             place = f" at [{', '.join(map(str, where))}]" if where else ""
-            raise ParameterError(name, f"{rule} everywhere", float(array[where]), unit_of(name) + place)
+            raise ParameterError(name, f"{rule} everywhere", float(array[where]), (unit_of(name) + place).strip())
     return array
 
 

@@ -53,7 +53,9 @@ class Camera:
     >>> import foveasim as fs
     >>> layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0)
     >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=fs.Sensor(layout))
-    >>> scene = fs.Scene.flat(shape=(64, 64), pitch_um=10.0, distance_m=0.5, radiance_w_m2_sr_nm=0.1, band_width_nm=10.0)
+    >>> scene = fs.Scene.flat(
+    ...     shape=(200, 200), pitch_um=10.0, distance_m=0.5, radiance_w_m2_sr_nm=0.1, band_width_nm=10.0
+    ... )
     >>> camera.capture(scene, exposure_s=0.01, seed=0).code.shape
     (64,)
     """

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Images, Ints, check_count, check_number, finite_array, read_only
+from foveasim.arrays import Floats, Images, Ints, check_number, check_shape, finite_array, read_only
 from foveasim.errors import ParameterError
 
 __all__ = ["Grid", "PackedRings", "PowerMap", "SceneLike", "from_file_rows", "to_file_rows"]
@@ -100,13 +100,10 @@ class Grid:
     origin_um: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if np.shape(self.shape) != (2,):
-            raise ParameterError("shape", "must be two whole numbers (n_y, n_x)", self.shape)
         if np.shape(self.origin_um) != (2,):
             raise ParameterError("origin_um", "must be two numbers (x0, y0)", self.origin_um, "µm")
-        n_y, n_x = (check_count(f"shape[{i}]", n, at_most=2**30) for i, n in enumerate(self.shape))
         x0, y0 = (check_number(f"origin_um[{i}]", x) for i, x in enumerate(self.origin_um))
-        object.__setattr__(self, "shape", (n_y, n_x))
+        object.__setattr__(self, "shape", check_shape("shape", self.shape))
         object.__setattr__(self, "origin_um", (x0, y0))
         object.__setattr__(self, "pitch_um", check_number("pitch_um", self.pitch_um, above=0.0, at_most=1e7))
 

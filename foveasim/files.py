@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from foveasim.errors import FileError
@@ -26,23 +26,17 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         When the folder does not exist, or writing fails: the disk is full, say.
     """
     target = Path(path)
-    if not target.parent.is_dir():
-        raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
-    if target.is_dir():
-        raise FileError(target, "cannot be written: it is a folder")
+    temporary = target.with_name(f".foveasim-{secrets.token_hex(8)}{target.suffix}")
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
-    except OSError as error:
-        raise FileError(target, f"cannot be written: {error.strerror}") from None
-    os.close(handle)
-    temporary = Path(name)
-    try:
+        if not target.parent.is_dir():
+            raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
+        if target.is_dir():
+            raise FileError(target, "cannot be written: it is a folder")
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
         temporary.replace(target)
     except OSError as error:
         raise FileError(target, f"cannot be written: {error.strerror or error}") from None
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # a name too long for the system was never made
+            temporary.unlink(missing_ok=True)

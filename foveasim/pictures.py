@@ -1,15 +1,17 @@
 """
 Picture files, in and out: what a photograph's file holds as an array, and arrays as files.
 
-Arrays here are as in the file: (n_y, n_x) or (n_y, n_x, n_channel), the first row on top.
+Arrays here are as one sees the picture: (n_y, n_x) or (n_y, n_x, n_channel), the first row on top.
 """
 
 from __future__ import annotations
 
-import os
+import struct
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +19,29 @@ from numpy.typing import NDArray
 from foveasim.errors import FileError
 from foveasim.files import written_whole
 
+if TYPE_CHECKING:
+    from PIL import Image
+
 __all__ = ["read_picture", "write_picture"]
 
 #: Larger pictures are refused: 2**28 pixels are 3 GiB as three float32 channels.
 MAX_PIXELS = 2**28
 #: Formats that Pillow is asked for; its other readers are for files that are no pictures of scenes.
 PILLOW_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "PPM", "JPEG2000", "TGA")
-#: Pillow's modes that hold the numbers of the file, and what every other mode is converted to.
-PLAIN_MODES = ("L", "LA", "RGB", "RGBA", "I;16", "F")
+#: Pillow's modes that hold the numbers of the file as they are, and what others are converted to.
+PLAIN_MODES = ("L", "LA", "RGB", "RGBA", "F")
+CONVERTED_MODES = {
+    "1": "L",
+    "PA": "RGBA",
+    "La": "LA",
+    "RGBa": "RGBA",
+    "I;16": "I",
+    "I;16B": "I",
+    "I;16L": "I",
+    "I": "I",
+}
+#: Tag of TIFF and EXIF that tells how the camera was held.
+ORIENTATION_TAG = 274
 
 
 def read_picture(path: str | Path) -> NDArray[Any]:
@@ -34,8 +51,7 @@ def read_picture(path: str | Path) -> NDArray[Any]:
     Parameters
     ----------
     path : path
-        PNG, JPEG, TIFF, WebP, BMP, GIF, PPM, JPEG 2000; with the extra ``pictures`` also EXR and Radiance HDR, and PNG of
-        16 bits in colour.
+        PNG, JPEG, TIFF, WebP, BMP, GIF, PPM, JPEG 2000, Radiance HDR; with the extra ``pictures`` also EXR.
 
     Returns
     -------
@@ -49,109 +65,195 @@ def read_picture(path: str | Path) -> NDArray[Any]:
         When the file is missing, no picture, cut short, too large, or holds several pictures.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileError(path, "no such file" if not path.exists() else "is not a file")
-    with path.open("rb") as file:
-        head = file.read(32)
-    if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
-        picture = _read_tiff(path)
-    elif head[:4] == b"\x76\x2f\x31\x01" or head[:2] == b"#?" or _is_deep_colour_png(head):
-        picture = _read_deep(path)
-    else:
-        picture = _read_with_pillow(path)
+    try:
+        if not path.is_file():
+            raise FileError(path, "is not a file" if path.exists() else "no such file")
+        with path.open("rb") as file:
+            head = file.read(32)
+    except OSError as error:
+        raise FileError(path, f"cannot be opened: {error.strerror or error}") from None
+    try:
+        picture = _reader_of(head)(path)
+    except FileError:
+        raise
+    except Exception as error:  # noqa: BLE001 -- readers raise whatever a broken file made them trip over
+        raise FileError(
+            path, f"is broken or cut short ({' '.join(str(error).split()) or type(error).__name__})"
+        ) from None
     if picture.ndim not in (2, 3) or 0 in picture.shape or (picture.ndim == 3 and picture.shape[2] > 4):
         raise FileError(path, f"must be one picture of 1 to 4 channels, got an array of the shape {picture.shape}")
     return picture
 
 
+def _reader_of(head: bytes) -> Any:
+    """The reader for a file that begins with these bytes."""
+    if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        return _read_tiff
+    if head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:25] == b"\x10":
+        return _read_deep_png
+    if head[:4] == b"\x76\x2f\x31\x01":
+        return _read_exr
+    if head[:2] == b"#?":
+        return _read_radiance
+    return _read_with_pillow
+
+
+# -- readers: each gives the numbers of the file, upright, or raises anything ----------------------------------------
+
+
 def _read_with_pillow(path: Path) -> NDArray[Any]:
-    from PIL import Image, ImageOps, UnidentifiedImageError
+    from PIL import Image, UnidentifiedImageError
 
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
+        with _pillow_limit(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about notes beside the picture
             with Image.open(path, formats=PILLOW_FORMATS) as image:
                 _check_size(path, image.width, image.height)
                 n_pictures = getattr(image, "n_frames", 1)
-                if n_pictures > 1:
+                if n_pictures > 1 and image.format != "MPO":  # phones put small pictures behind the photograph
                     raise FileError(path, f"holds {n_pictures} pictures; give a file with one")
-                if image.mode == "I":
-                    # Pillow's 32-bit mode is where 16-bit grey files may land.
-                    return np.asarray(image).astype(np.float32)
-                upright = ImageOps.exif_transpose(image)
-                if upright.mode not in PLAIN_MODES:
-                    upright = upright.convert("RGBA" if "transparency" in upright.info else _target_mode(upright.mode))
-                return np.asarray(upright)
-    except FileError:
-        raise
+                orientation = _orientation(image)
+                plain = _plain(image)
+                numbers = np.asarray(plain)
     except UnidentifiedImageError:
         raise FileError(path, "is not a picture in a format that can be read") from None
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+    except Image.DecompressionBombError:
         raise FileError(path, f"has more than {MAX_PIXELS} pixels") from None
-    except (OSError, ValueError, SyntaxError, EOFError) as error:
-        raise FileError(path, f"is broken or cut short ({error})") from None
+    if plain.mode == "I":
+        is_16_bit = numbers.min() >= 0 and numbers.max() <= np.iinfo(np.uint16).max
+        numbers = numbers.astype(np.uint16 if is_16_bit else np.float32)
+    return _upright(numbers, orientation)
 
 
-def _target_mode(mode: str) -> str:
-    return {"1": "L", "PA": "RGBA", "La": "LA", "RGBa": "RGBA", "I;16B": "I;16", "I;16L": "I;16"}.get(mode, "RGB")
+def _plain(image: Image.Image) -> Image.Image:
+    """The image in a mode whose numbers are those of the file, with transparency as a channel."""
+    if "transparency" in image.info and image.mode in ("1", "L", "RGB", "P"):
+        return image.convert("LA" if image.mode in ("1", "L") else "RGBA")
+    return image if image.mode in PLAIN_MODES else image.convert(CONVERTED_MODES.get(image.mode, "RGB"))
+
+
+def _orientation(image: Image.Image) -> Any:
+    """The camera's note of how it was held; 1, upright, where the note is broken."""
+    try:
+        return image.getexif().get(ORIENTATION_TAG, 1)
+    except Exception:  # noqa: BLE001 -- a broken note does not make a broken picture
+        return 1
+
+
+@contextmanager
+def _pillow_limit() -> Iterator[None]:
+    """Pillow's own limit of pixels set to ours."""
+    from PIL import Image
+
+    before = Image.MAX_IMAGE_PIXELS
+    Image.MAX_IMAGE_PIXELS = MAX_PIXELS
+    try:
+        yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = before
 
 
 def _read_tiff(path: Path) -> NDArray[Any]:
     import tifffile
+    from tifffile import PHOTOMETRIC
 
-    try:
-        with tifffile.TiffFile(path) as file:
-            if len(file.series) != 1 or len(file.pages) != 1:
-                raise FileError(path, f"holds {len(file.pages)} pictures; give a file with one")
-            page = file.pages[0]
-            _check_size(path, page.shape[1], page.shape[0])
-            picture = page.asarray()
-            if page.photometric == tifffile.PHOTOMETRIC.PALETTE and page.colormap is not None:
-                picture = np.moveaxis(page.colormap[:, picture], 0, -1)
-            if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and picture.ndim == 3:
-                picture = np.moveaxis(picture, 0, -1)
-    except FileError:
-        raise
-    except Exception as error:  # noqa: BLE001 -- tifffile raises whatever a broken file made it trip over
-        raise FileError(path, f"is broken or cut short ({error})") from None
+    with tifffile.TiffFile(path) as file:
+        if len(file.pages) != 1:
+            raise FileError(path, f"holds {len(file.pages)} pictures; give a file with one")
+        page = file.pages[0]
+        _check_size(path, page.imagewidth, page.imagelength)
+        if page.photometric not in (
+            PHOTOMETRIC.MINISWHITE,
+            PHOTOMETRIC.MINISBLACK,
+            PHOTOMETRIC.RGB,
+            PHOTOMETRIC.PALETTE,
+        ):
+            name = getattr(page.photometric, "name", page.photometric)
+            raise FileError(path, f"is a TIFF in {name}; save it as grey or RGB")
+        if page.samplesperpixel > 4:
+            raise FileError(path, f"must be one picture of 1 to 4 channels, got {page.samplesperpixel}")
+        picture = page.asarray()
+        if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and picture.ndim == 3:
+            picture = np.moveaxis(picture, 0, -1)
+        if page.photometric == PHOTOMETRIC.PALETTE:
+            picture = np.moveaxis(np.asarray(page.colormap)[:, picture], 0, -1)
+        orientation = page.tags[ORIENTATION_TAG].value if ORIENTATION_TAG in page.tags else 1
+        is_inverted = page.photometric == PHOTOMETRIC.MINISWHITE
+        has_dimmed_colours = tifffile.EXTRASAMPLE.ASSOCALPHA in (page.extrasamples or ())
     if picture.dtype == np.bool_:
-        return picture.astype(np.uint8) * 255
-    if picture.dtype in (np.uint8, np.uint16):
-        return picture
-    if picture.dtype.kind == "f":
-        return picture.astype(np.float32)
-    raise FileError(path, f"must hold 8-bit, 16-bit or floating-point numbers, got {picture.dtype}")
+        picture = picture.astype(np.uint8) * np.uint8(255)
+    if picture.dtype not in (np.uint8, np.uint16) and picture.dtype.kind != "f":
+        raise FileError(path, f"must hold 8-bit, 16-bit or floating-point numbers, got {picture.dtype}")
+    if is_inverted:
+        picture = (1 if picture.dtype.kind == "f" else np.iinfo(picture.dtype).max) - picture
+    if has_dimmed_colours and picture.ndim == 3:
+        picture = picture[..., :-1]  # its colours are over black already
+    return _upright(picture.astype(np.float32) if picture.dtype.kind == "f" else picture, orientation)
 
 
-def _is_deep_colour_png(head: bytes) -> bool:
-    """Whether a file is a PNG of 16 bits in colour or with alpha, which Pillow would cut to 8 bits."""
-    return head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:25] == b"\x10" and head[25:26] in (b"\x02", b"\x04", b"\x06")
+def _read_deep_png(path: Path) -> NDArray[Any]:
+    """PNG of 16 bits, which Pillow would cut to 8 in colour."""
+    import imagecodecs
+
+    content = path.read_bytes()
+    _check_size(path, *struct.unpack(">II", content[16:24]))
+    return np.asarray(imagecodecs.png_decode(content))
 
 
-def _read_deep(path: Path) -> NDArray[Any]:
-    os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
-    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))
+def _read_radiance(path: Path) -> NDArray[Any]:
+    import imagecodecs
+
+    content = path.read_bytes()
+    size = next((line.split() for line in content[:4096].split(b"\n") if line[:2] in (b"-Y", b"+Y")), [])
+    if len(size) != 4:
+        raise FileError(path, "is broken or cut short (no size)")
+    _check_size(path, int(size[3]), int(size[1]))
+    return np.asarray(imagecodecs.rgbe_decode(content))
+
+
+def _read_exr(path: Path) -> NDArray[Any]:
     try:
-        import cv2
+        import OpenEXR
     except ImportError:
-        raise FileError(
-            path, "needs a reader for EXR, HDR and 16-bit colour: pip install 'foveasim[pictures]'"
-        ) from None
-    try:
-        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise FileError(path, f"is broken or cut short ({str(error).strip().splitlines()[-1]})") from None
-    if picture is None:
-        raise FileError(path, "is broken or cut short, or not a picture that can be read")
-    _check_size(path, picture.shape[1], picture.shape[0])
-    if picture.ndim == 3 and picture.shape[2] >= 3:
-        picture = picture[..., [2, 1, 0, 3][: picture.shape[2]]]  # OpenCV's colours come as blue, green, red
-    return picture if picture.dtype in (np.uint8, np.uint16) else picture.astype(np.float32)
+        raise FileError(path, "needs a reader for EXR: pip install 'foveasim[pictures]'") from None
+    with OpenEXR.File(str(path), header_only=True) as file:
+        if len(file.parts) != 1:
+            raise FileError(path, f"holds {len(file.parts)} pictures; give a file with one")
+        low, high = file.header()["dataWindow"]
+        _check_size(path, *(int(n) for n in np.asarray(high) - np.asarray(low) + 1))
+    with OpenEXR.File(str(path)) as file:
+        layers = {name: channel.pixels for name, channel in file.channels().items()}
+    if len(layers) != 1:
+        raise FileError(path, f"must have the channels of one picture, got {', '.join(layers)}")
+    return np.asarray(next(iter(layers.values())), dtype=np.float32)
+
+
+def _upright(picture: NDArray[Any], orientation: object) -> NDArray[Any]:
+    """A picture turned as its note says (EXIF and TIFF, tag 274); other values than 2 to 8 mean upright."""
+    match orientation:
+        case 2:
+            return picture[:, ::-1]
+        case 3:
+            return picture[::-1, ::-1]
+        case 4:
+            return picture[::-1]
+        case 5:
+            return picture.swapaxes(0, 1)
+        case 6:
+            return np.rot90(picture, -1)
+        case 7:
+            return picture[::-1, ::-1].swapaxes(0, 1)
+        case 8:
+            return np.rot90(picture)
+    return picture
 
 
 def _check_size(path: Path, width: int, height: int) -> None:
     if width * height > MAX_PIXELS:
         raise FileError(path, f"has {width} x {height} pixels, more than the limit of {MAX_PIXELS}")
+
+
+# -- writing ---------------------------------------------------------------------------------------------------------
 
 
 def write_picture(path: str | Path, picture: NDArray[np.uint8]) -> None:
@@ -168,12 +270,27 @@ def write_picture(path: str | Path, picture: NDArray[np.uint8]) -> None:
     Raises
     ------
     FileError
-        When the ending names no known format, or nothing can be written.
+        When the ending names no known format, the array is no such picture, or nothing can be written.
     """
     from PIL import Image
 
     target = Path(path)
     if Image.registered_extensions().get(target.suffix.lower()) not in PILLOW_FORMATS:
         raise FileError(target, "must end in the name of a picture format, such as .png")
+    if picture.ndim == 3 and picture.shape[2] == 1:
+        picture = picture[..., 0]
+    if (
+        picture.dtype != np.uint8
+        or picture.ndim not in (2, 3)
+        or 0 in picture.shape
+        or (picture.shape[2:] or (1,))[0] > 4
+    ):
+        raise FileError(
+            target,
+            f"cannot hold an array of the shape {picture.shape} and type {picture.dtype}, only 1 to 4 channels of uint8",
+        )
     with written_whole(target) as temporary:
-        Image.fromarray(np.ascontiguousarray(picture)).save(temporary)
+        try:
+            Image.fromarray(np.ascontiguousarray(picture)).save(temporary)
+        except ValueError as error:
+            raise FileError(target, f"cannot be written in this format: {error}") from None

@@ -20,7 +20,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 #: Rooms from the bottom up: a room may import from lower lines, and not from its own line or a higher one.
 FLOORS = [
     {"errors", "_version"},
-    {"arrays", "files"},
+    {"arrays", "compiled", "files"},
     {"units", "parallel", "records", "streams", "rings", "pictures"},
     {"fields"},
     {"layout", "scene", "optics", "integrate", "sensor"},
@@ -33,7 +33,7 @@ FLOORS = [
 ]
 #: Loaded when they are used, not before.
 HEAVY = {
-    "cv2", "dask", "exactextract", "manifold3d", "matplotlib", "numba", "pydantic", "pyvista", "rich", "skimage", "tifffile",
+    "OpenEXR", "PIL", "cv2", "dask", "exactextract", "imagecodecs", "manifold3d", "matplotlib", "numba", "pydantic", "pyvista", "rich", "skimage", "tifffile",
     "torch", "trimesh", "typer", "vtk", "yaml",
 }  # fmt: skip
 #: Names of numbers without a unit, or with the unit of what they are measured with.

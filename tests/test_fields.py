@@ -48,7 +48,7 @@ def test_a_centred_grid_has_its_middle_on_the_axis():
         ({"shape": (2.5, 3)}, r"'shape\[0\]' must be a whole number"),
         ({"shape": 7}, r"'shape' must be two whole numbers"),
         ({"pitch_um": 0.0}, r"'pitch_um' must be > 0, got 0.0 µm"),
-        ({"pitch_um": -1}, r"'pitch_um' must be > 0, got -1.0 µm"),
+        ({"pitch_um": -1}, r"'pitch_um' must be > 0, got -1 µm"),
         ({"pitch_um": float("inf")}, r"'pitch_um' must be finite"),
         ({"origin_um": (0.0, float("nan"))}, r"'origin_um\[1\]' must be finite"),
         ({"origin_um": (1, 2, 3)}, r"'origin_um' must be two numbers"),

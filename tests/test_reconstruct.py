@@ -91,7 +91,7 @@ def test_a_raster_covers_the_layout_with_square_pixels():
     [
         (lambda p: p.to_image(white=0.0), "'white' must be > 0"),
         (lambda p: p.to_image(white=[1.0, 2.0]), "'white' must be one number, or one for each of the 1 channels"),
-        (lambda p: raster_grid(FOVEAL, 0), "'max_pixels' must be >= 1"),
+        (lambda _: raster_grid(FOVEAL, 0), "'max_pixels' must be >= 1"),
         (lambda p: cells(FOVEAL, np.ones(3), p.grid), "'values' must have the shape"),
         (lambda p: cells(FOVEAL, np.full(FOVEAL.n_sites, np.nan), p.grid), "'values' must be finite everywhere"),
     ],

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foveasim.arrays import Floats, Ints
+from foveasim.compiled import kernels
 from foveasim.fields import Grid, PackedRings
 from foveasim.parallel import each
 from foveasim.rings import site_bounds_um
@@ -22,8 +19,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Plan", "compile_plan"]
 
-_log = logging.getLogger("foveasim")
-
 #: Sites that are traced as one piece of work; fixed, so that a plan does not depend on the number of threads.
 SITES_PER_PIECE = 2048
 #: A map has at most this many bands of rows, each summed by one thread into slots of its own ...
@@ -32,16 +27,6 @@ MAX_BANDS = 64
 MIN_ROWS_PER_BAND = 32
 #: Below this many cells a frame is done by the calling thread.
 SMALL_MAP = 1 << 16
-
-
-@cache
-def kernels() -> ModuleType:
-    """The compiled kernels; loaded when first needed, since numba takes a second and compiling some seconds more."""
-    if not any((Path(__file__).parent / "__pycache__").glob("_kernels.*.nbi")):
-        _log.warning("compiling the integration kernels for this machine, once (about 10 s)")
-    from foveasim.integrate import _kernels
-
-    return _kernels
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +72,7 @@ class Plan:
     def gather(self, cells: NDArray[Any], n_threads: int) -> Floats:
         """Sum of weight x cell for every site, (n_site,), of one map (n_y, n_x) float32 or float64, C-contiguous."""
         slots = np.zeros(int(self.first_slot[-1]))
-        run = kernels().gather
+        run = kernels("integrate").gather
 
         def band(first_row: int) -> None:
             run(
@@ -112,7 +97,7 @@ class Plan:
         """Sum of weight x value of the site for every cell, (n_y, n_x): the transpose of :meth:`gather`."""
         cells = np.zeros(self.grid.shape)
         slots = np.repeat(values, np.diff(self.first_slot))
-        run = kernels().scatter
+        run = kernels("integrate").scatter
 
         def band(first_row: int) -> None:
             run(
@@ -133,8 +118,8 @@ class Plan:
         """The plan as a sparse matrix (n_site, n_y * n_x) of overlaps in cells; runs are written out."""
         from scipy.sparse import coo_array
 
-        n_partial = self.spans[:, kernels().N_PARTIAL].astype(np.int64)
-        n_run = self.spans[:, kernels().N_RUN].astype(np.int64)
+        column_of = kernels("integrate")
+        n_partial, n_run = (self.spans[:, column].astype(np.int64) for column in (column_of.N_PARTIAL, column_of.N_RUN))
         n_cells = n_partial + n_run
         # A span's k-th cell has its k-th weight, and every cell of the run the one after the partial ones.
         first_cell = np.cumsum(n_cells) - n_cells
@@ -143,10 +128,10 @@ class Plan:
         k = np.arange(int(n_cells.sum())) - np.repeat(first_cell, n_cells)
         weight = self.weights[np.repeat(first_weight, n_cells) + np.minimum(k, np.repeat(n_partial, n_cells))]
         n_y, n_x = self.grid.shape
-        start = self.spans[:, kernels().ROW].astype(np.int64) * n_x + self.spans[:, kernels().COLUMN]
+        start = self.spans[:, column_of.ROW].astype(np.int64) * n_x + self.spans[:, column_of.COLUMN]
         cell = np.repeat(start, n_cells) + k
         slot_site = np.repeat(np.arange(self.n_sites), np.diff(self.first_slot))
-        site = np.repeat(slot_site[self.spans[:, kernels().SITE]], n_cells)
+        site = np.repeat(slot_site[self.spans[:, column_of.SITE]], n_cells)
         matrix = coo_array((weight, (site, cell)), shape=(self.n_sites, n_y * n_x)).tocsr()
         matrix.sort_indices()
         return matrix
@@ -159,7 +144,7 @@ def compile_plan(rings: PackedRings, grid: Grid, n_threads: int) -> Plan:
     uv = np.ascontiguousarray((rings.xy_um - np.asarray(grid.origin_um)) / grid.pitch_um)
     ring_offsets = np.ascontiguousarray(rings.ring_offsets)
     site_offsets = np.ascontiguousarray(rings.site_offsets)
-    compiled = kernels()
+    compiled = kernels("integrate")
 
     pieces = range(0, n_sites, SITES_PER_PIECE)
 

@@ -17,6 +17,7 @@ import shapely
 from numpy.typing import NDArray
 
 from foveasim.arrays import Floats, check_number, finite_array
+from foveasim.compiled import kernels
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._model import Layout
 from foveasim.rings import next_vertex
@@ -205,12 +206,10 @@ def min_width_um(layout: Layout) -> Floats:
     within 26 degrees); the distance from an inward corner straight across the site to an edge; the width of the
     narrowest strip along one of its edges that holds the site.
     """
-    from foveasim.layout import _kernels
-
     after = next_vertex(layout.ring_offsets)
     before = np.empty_like(after)
     before[after] = np.arange(after.size)
-    widths: Floats = _kernels.min_widths(layout.xy_um, after, before, layout.ring_offsets, layout.site_offsets)
+    widths: Floats = kernels("layout").min_widths(layout.xy_um, after, before, layout.ring_offsets, layout.site_offsets)
     return widths
 
 

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -19,6 +17,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from foveasim.arrays import Floats, Images, Ints
+from foveasim.compiled import kernels
 from foveasim.errors import SimulationError
 from foveasim.parallel import each
 
@@ -39,14 +38,6 @@ NUMPY_PADDING: dict[str, dict[str, Any]] = {
     "zero": {"mode": "constant", "constant_values": -1},
     "periodic": {"mode": "wrap"},
 }
-
-
-@cache
-def kernels() -> ModuleType:
-    """The compiled kernels; loaded when first needed, since numba takes a second."""
-    from foveasim.optics import _kernels
-
-    return _kernels
 
 
 def source_pixels(n: int, padding: str, pad: int) -> Ints:
@@ -101,7 +92,7 @@ class Transform:
         if self._n_alias <= DIRECT_ALIASES:
             return np.zeros((0, self._cycles_x.size), self._real), np.zeros((0, self._cycles_y.size), self._real)
         nodes = np.polynomial.chebyshev.chebpts1(ALIAS_NODES)
-        at_nodes = kernels().alias_sum(
+        at_nodes = kernels("optics").alias_sum(
             table.astype(np.float64), per_step / self._pitch_um, 0.25 * (nodes + 1.0), self._n_alias, self._sinc_power
         )
         y_modes, sizes, x_modes = np.linalg.svd(at_nodes)
@@ -130,7 +121,7 @@ class Transform:
 
         def some_rows(first: int, last: int) -> None:
             padded = np.empty((last - first, self._columns.size), self._real)
-            kernels().expose(image, x2, y2, falloff_power, self._columns, left, first, padded)
+            kernels("optics").expose(image, x2, y2, falloff_power, self._columns, left, first, padded)
             spectrum[top + first : top + last] = scipy.fft.rfft(padded, axis=1, overwrite_x=True)[:, : self._n_columns]
 
         self._each_rows(some_rows, n_y)
@@ -148,7 +139,7 @@ class Transform:
         far_x, far_y = self._far_aliases(table, per_step)
 
         def some_rows(first: int, last: int) -> None:
-            kernels().transfer(
+            kernels("optics").transfer(
                 spectrum,
                 table,
                 self._real(per_step),

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Images, check_choice, check_number, finite_array, read_only
+from foveasim.arrays import Floats, Images, check_choice, check_number, check_shape, finite_array, read_only
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import from_file_rows
 from foveasim.pictures import read_picture
@@ -54,6 +54,8 @@ class Scene:
 
     Notes
     -----
+    The arrays are used as they are, without a copy.
+
     Spectral radiance of pixel [iy, ix] at wavelength k: ``sum_b basis[b, iy, ix] * spectrum[b, k]``.
     """
 
@@ -148,9 +150,9 @@ class Scene:
             When channels, wavelengths and spectra do not fit together, or a value is out of range.
         """
         check_choice("encoding", encoding, ("srgb", "sqrt", "linear"))
-        peak = check_number("peak_radiance_w_m2_sr_nm", peak_radiance_w_m2_sr_nm, above=0.0)
+        peak = check_number("peak_radiance_w_m2_sr_nm", peak_radiance_w_m2_sr_nm, at_least=0.0)
         is_file = isinstance(picture, str | Path)
-        pixels = read_picture(picture) if is_file else np.asarray(picture)  # type: ignore[arg-type]
+        pixels = read_picture(picture) if is_file else _picture_array(picture)  # type: ignore[arg-type]
         if (
             pixels.ndim not in (2, 3)
             or 0 in pixels.shape
@@ -159,8 +161,11 @@ class Scene:
             raise ParameterError(
                 "picture", f"must have the shape (n_y, n_x) or (n_y, n_x, 1 to 4 channels), got {pixels.shape}"
             )
+        has_alpha = (
+            pixels.ndim == 3 and pixels.shape[2] in (2, 4) and (spectrum is None or len(spectrum) != pixels.shape[2])
+        )
         try:
-            channels = _light(pixels, encoding, has_alpha=pixels.ndim == 3 and pixels.shape[2] in (2, 4))
+            channels = _light(pixels, encoding, has_alpha=has_alpha)
         except ParameterError as error:
             raise (FileError(str(picture), str(error)) if is_file else error) from None
         n_channels = channels.shape[0]
@@ -184,7 +189,7 @@ class Scene:
             raise ParameterError(
                 "wavelength_nm",
                 f"must have as many values as the picture has channels, {n_channels}, or one",
-                list(waves_nm),
+                waves_nm.tolist(),
                 "nm",
                 "or give 'spectrum', the spectrum of each channel",
             )
@@ -225,7 +230,7 @@ class Scene:
             When a value is out of range.
         """
         return cls.from_picture(
-            np.ones(shape, np.float32),
+            np.ones(check_shape("shape", shape), np.float32),
             pitch_um=pitch_um,
             distance_m=distance_m,
             peak_radiance_w_m2_sr_nm=radiance_w_m2_sr_nm,
@@ -265,17 +270,21 @@ class Scene:
             When a pixel lies outside, or a value is out of range.
         """
         pitch_um = check_number("pitch_um", pitch_um, above=0.0)
-        points = np.asarray(pixels)
+        n_y, n_x = check_shape("shape", shape)
+        try:
+            points = np.asarray(pixels)
+        except ValueError:
+            raise ParameterError("pixels", "must be pairs (iy, ix) of whole numbers", pixels) from None
         if points.ndim != 2 or points.shape[1] != 2 or points.dtype.kind not in "iu":
             raise ParameterError("pixels", "must be pairs (iy, ix) of whole numbers", pixels)
-        if np.any(points < 0) or np.any(points >= np.asarray(shape)):
-            raise ParameterError("pixels", f"must lie in a picture of {shape[0]} rows and {shape[1]} columns", pixels)
+        if np.any(points < 0) or np.any(points >= (n_y, n_x)):
+            raise ParameterError("pixels", f"must lie in a picture of {n_y} rows and {n_x} columns", pixels)
         intensity = finite_array("intensity_w_sr_nm", intensity_w_sr_nm, at_least=0.0)
         if intensity.ndim > 1 or (intensity.ndim == 1 and intensity.size != points.shape[0]):
             raise ParameterError(
                 "intensity_w_sr_nm", f"must be one number, or one for each of the {points.shape[0]} points"
             )
-        image = np.zeros((1, *shape))
+        image = np.zeros((1, n_y, n_x))
         np.add.at(image[0], (points[:, 0], points[:, 1]), intensity)
         waves_nm = finite_array("wavelength_nm", np.atleast_1d(np.asarray(wavelength_nm)), ndim=1, above=0.0)
         # A pixel of the pitch p0 with the radiance I / p0² has the intensity I.
@@ -300,8 +309,16 @@ def decoded(values: Floats, encoding: Encoding) -> Floats:
     return values
 
 
+def _picture_array(picture: ArrayLike) -> NDArray[Any]:
+    try:
+        return np.asarray(picture)
+    except ValueError:
+        raise ParameterError("picture", "must be a file or an array of numbers", picture) from None
+
+
 def _light(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Images:
     """Relative radiance (n_channel, n_y, n_x) float32 of a picture as in its file, transparency taken off."""
+    pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     if pixels.dtype == np.bool_:
         pixels = pixels.astype(np.uint8) * np.uint8(255)
     if pixels.dtype in (np.uint8, np.uint16):
@@ -315,7 +332,8 @@ def _light(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Imag
         if not np.isfinite(pixels).all() or pixels.min() < 0:
             raise ParameterError("picture", "must be finite and >= 0 everywhere")
         colours = pixels[..., :-1] if has_alpha else pixels
-        light = decoded(np.ascontiguousarray(from_file_rows(colours)), encoding).astype(np.float32)
+        precise = colours.astype(np.float32) if pixels.dtype == np.float16 else colours
+        light = decoded(np.ascontiguousarray(from_file_rows(precise)), encoding).astype(np.float32)
         alpha = from_file_rows(pixels[..., -1]).astype(np.float32) if has_alpha else None
     else:
         raise ParameterError("picture", f"must hold uint8, uint16 or floating-point numbers, got {pixels.dtype}")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from foveasim.arrays import Floats, Ints, check_choice, check_count, check_number, finite_array, read_only
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.fields import PackedRings
-from foveasim.sensor.noise import ShotNoise, draw_shot_noise
+from foveasim.sensor.noise import LARGEST_CHARGE_E, ShotNoise, draw_shot_noise
 from foveasim.sensor.spectral import ConstantCurve, Curve, FilterSet, rgb_filters
 from foveasim.streams import Streams
 from foveasim.units import electrons_to_volts, photon_energy_j
@@ -92,7 +92,8 @@ class Sensor:
     def __post_init__(self) -> None:
         if not callable(self.qe):
             check_number("qe", self.qe, at_least=0.0, at_most=1.0)
-        if self.filters is not None and self.filters != "rgb" and not isinstance(self.filters, FilterSet):
+        is_rgb = isinstance(self.filters, str) and self.filters == "rgb"
+        if self.filters is not None and not is_rgb and not isinstance(self.filters, FilterSet):
             raise ParameterError("filters", "must be None, 'rgb' or a FilterSet", self.filters)
         for name, above in (
             ("dark_e_per_s", None),
@@ -101,10 +102,10 @@ class Sensor:
             ("capacitance_f", 0.0),
         ):
             value = getattr(self, name)
-            if value is not None:
+            if value is not None or name != "full_well_e":
                 object.__setattr__(self, name, self._per_site(name, value, above))
         check_number("v_sat_v", self.v_sat_v, above=0.0)
-        check_count("bits", self.bits, at_least=1, at_most=16)
+        object.__setattr__(self, "bits", check_count("bits", self.bits, at_least=1, at_most=16))
         check_choice("shot_noise", self.shot_noise, ("auto", "exact", "off"))
         check_number("gaussian_above_e", self.gaussian_above_e, at_least=10.0)
         highest = int(self.layout.channel.max(initial=0))
@@ -190,7 +191,7 @@ class Sensor:
         electrons = draw_shot_noise(expected_e, self.shot_noise, self.gaussian_above_e, streams)
         if self.full_well_e is None:
             return electrons
-        return np.minimum(electrons, np.floor(self.full_well_e).astype(np.int64))
+        return np.minimum(electrons, np.floor(np.minimum(self.full_well_e, LARGEST_CHARGE_E)).astype(np.int64))
 
     def read(self, electrons: Ints, *, streams: Streams) -> NDArray[Any]:
         """

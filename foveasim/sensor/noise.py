@@ -9,7 +9,7 @@ import numpy as np
 from foveasim.arrays import Floats, Ints
 from foveasim.streams import Streams
 
-__all__ = ["ShotNoise", "draw_shot_noise"]
+__all__ = ["LARGEST_CHARGE_E", "ShotNoise", "draw_shot_noise"]
 
 ShotNoise = Literal["auto", "exact", "off"]
 
@@ -17,6 +17,8 @@ ShotNoise = Literal["auto", "exact", "off"]
 ROUNDING_VARIANCE = 1.0 / 12.0
 #: Expectations beyond this are beyond numpy's Poisson generator; the Gaussian is exact to 1e-9 long before.
 LARGEST_EXACT_E = 1e18
+#: No charge is larger: 2**62 fits int64 with room for sums.
+LARGEST_CHARGE_E = 2.0**62
 
 
 def draw_shot_noise(expected_e: Floats, how: ShotNoise, gaussian_above_e: float, streams: Streams) -> Ints:
@@ -39,13 +41,17 @@ def draw_shot_noise(expected_e: Floats, how: ShotNoise, gaussian_above_e: float,
         Never below 0. Mean and variance are those of Poisson on both sides of the switch.
     """
     if how == "off":
-        return np.rint(expected_e).astype(np.int64)
+        return _whole(expected_e)
     is_gaussian = expected_e > (gaussian_above_e if how == "auto" else LARGEST_EXACT_E)
     electrons = streams.of("shot").poisson(np.where(is_gaussian, 0.0, expected_e))
     if is_gaussian.any():
-        # One number a site, used or not: a site's draw does not depend on how bright the others are.
+        # One number a site, used or not: a Gaussian draw does not depend on how bright the other sites are.
         z = streams.of("shot_gaussian").standard_normal(expected_e.size)[is_gaussian]
         mean_e = expected_e[is_gaussian]
-        drawn = np.rint(mean_e + np.sqrt(np.maximum(mean_e - ROUNDING_VARIANCE, 0.0)) * z)
-        electrons[is_gaussian] = np.maximum(drawn, 0.0).astype(np.int64)
+        electrons[is_gaussian] = _whole(mean_e + np.sqrt(np.maximum(mean_e - ROUNDING_VARIANCE, 0.0)) * z)
     return electrons
+
+
+def _whole(charge_e: Floats) -> Ints:
+    """Whole electrons, from 0 to the largest number that int64 holds with certainty."""
+    return np.rint(np.clip(charge_e, 0.0, LARGEST_CHARGE_E)).astype(np.int64)

@@ -88,7 +88,7 @@ class PolynomialCurve:
             raise ParameterError("value", "must be <= 1 everywhere", float(values.max()))
         if np.unique(waves_nm).size != waves_nm.size:
             raise ParameterError("wavelength_nm", "must not repeat a wavelength", self.wavelength_nm, "nm")
-        check_count("degree", self.degree, at_least=0, at_most=values.size - 1)
+        object.__setattr__(self, "degree", check_count("degree", self.degree, at_least=0, at_most=values.size - 1))
         object.__setattr__(self, "wavelength_nm", tuple(float(x) for x in waves_nm))
         object.__setattr__(self, "value", tuple(float(x) for x in values))
 
@@ -98,9 +98,7 @@ class PolynomialCurve:
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Values at the wavelengths, of the same shape."""
-        _check_range(
-            wavelength_nm, min(self.wavelength_nm), max(self.wavelength_nm), "the table of the quantum efficiency"
-        )
+        _check_range(wavelength_nm, min(self.wavelength_nm), max(self.wavelength_nm), "the table of the fit")
         return np.clip(self._fit(np.asarray(wavelength_nm, dtype=np.float64)), 0.0, 1.0)
 
 
@@ -238,8 +236,8 @@ def rgb_filters() -> FilterSet:
 
 def _check_range(wavelength_nm: ArrayLike, low_nm: float, high_nm: float, what: str) -> None:
     waves_nm = np.asarray(wavelength_nm, dtype=np.float64)
-    if waves_nm.size and not (waves_nm.min() >= low_nm and waves_nm.max() <= high_nm):
-        outside = waves_nm[(waves_nm < low_nm) | (waves_nm > high_nm)]
+    outside = waves_nm[~((waves_nm >= low_nm) & (waves_nm <= high_nm))]
+    if outside.size:
         raise ParameterError(
             "wavelength_nm", f"must lie in {what}, {low_nm:g} to {high_nm:g} nm", float(outside[0]), "nm"
         )
