@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -60,33 +61,20 @@ class Plan:
     first_slot: Ints
     covered_um2: Floats
 
-    def _bands(self) -> range:
-        return range(0, self.grid.shape[0], self.rows_per_band)
+    def _pass(self, kernel: Callable[..., None], read: NDArray[Any], written: NDArray[Any], n_threads: int) -> None:
+        """Run a kernel over all bands of rows: bands write to different places, and none depends on ``n_threads``."""
+        n_y, n_x = self.grid.shape
 
-    def _band_end(self, first_row: int) -> int:
-        return min(first_row + self.rows_per_band, self.grid.shape[0])
+        def band(first_row: int) -> None:
+            last_row = min(first_row + self.rows_per_band, n_y)
+            kernel(read, first_row, last_row, self.row_spans, self.row_weights, self.spans, self.weights, written)
 
-    def _threads(self, n_threads: int) -> int:
-        return 1 if self.grid.shape[0] * self.grid.shape[1] <= SMALL_MAP else n_threads
+        each(band, range(0, n_y, self.rows_per_band), 1 if n_y * n_x <= SMALL_MAP else n_threads)
 
     def gather(self, cells: NDArray[Any], n_threads: int) -> Floats:
         """Sum of weight x cell for every site, (n_site,), of one map (n_y, n_x) float32 or float64, C-contiguous."""
         slots = np.zeros(int(self.first_slot[-1]))
-        run = kernels("integrate").gather
-
-        def band(first_row: int) -> None:
-            run(
-                cells,
-                first_row,
-                self._band_end(first_row),
-                self.row_spans,
-                self.row_weights,
-                self.spans,
-                self.weights,
-                slots,
-            )
-
-        each(band, self._bands(), self._threads(n_threads))
+        self._pass(kernels("integrate").gather, cells, slots, n_threads)
         sums = np.zeros(self.n_sites)
         is_on_grid = np.diff(self.first_slot) > 0
         if is_on_grid.any():
@@ -97,21 +85,7 @@ class Plan:
         """Sum of weight x value of the site for every cell, (n_y, n_x): the transpose of :meth:`gather`."""
         cells = np.zeros(self.grid.shape)
         slots = np.repeat(values, np.diff(self.first_slot))
-        run = kernels("integrate").scatter
-
-        def band(first_row: int) -> None:
-            run(
-                slots,
-                first_row,
-                self._band_end(first_row),
-                self.row_spans,
-                self.row_weights,
-                self.spans,
-                self.weights,
-                cells,
-            )
-
-        each(band, self._bands(), self._threads(n_threads))
+        self._pass(kernels("integrate").scatter, slots, cells, n_threads)
         return cells
 
     def matrix(self) -> csr_array[Any]:
