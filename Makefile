@@ -3,9 +3,10 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-OUT ?= out/demo
+OUT ?= out
 
 .PHONY: demo test lint bench clean
+.NOTPARALLEL:
 
 demo: $(VENV)/.installed
 	$(BIN)/foveasim demo --out $(OUT)
@@ -25,15 +26,19 @@ clean:
 	rm -rf $(VENV) out .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find foveasim tests -name __pycache__ -type d -exec rm -rf {} +
 
-$(BIN)/python:
+$(VENV)/.made:
+	@command -v $(PYTHON) >/dev/null || { echo "there is no $(PYTHON); name a Python with: make PYTHON=..."; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "foveasim needs Python 3.11 or later; name one with: make PYTHON=python3.12"; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+	$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }
+	touch $@
 
-$(VENV)/.installed: $(BIN)/python pyproject.toml
+$(VENV)/.installed: $(VENV)/.made pyproject.toml
+	@echo "installing foveasim and what it needs into $(VENV) (a minute or so)"
 	$(BIN)/python -m pip install --quiet --editable .
 	touch $@
 
-$(VENV)/.installed-dev: $(BIN)/python pyproject.toml
+$(VENV)/.installed-dev: $(VENV)/.made pyproject.toml
+	@echo "installing foveasim and its development tools into $(VENV) (a minute or so)"
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	touch $@ $(VENV)/.installed

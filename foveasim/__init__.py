@@ -13,7 +13,7 @@ electrons, electrons get noise, volts become codes::
 
 from __future__ import annotations
 
-from foveasim import errors, layout, optics, reconstruct, scene, sensor, units
+from foveasim import errors, layout, optics, reconstruct, scene, sensor, units, view
 from foveasim._version import __version__
 from foveasim.camera import Camera
 from foveasim.capture import Capture
@@ -52,4 +52,5 @@ __all__ = [
     "scene",
     "sensor",
     "units",
+    "view",
 ]

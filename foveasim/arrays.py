@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim.errors import ParameterError
 
 __all__ = [
+    "MAX_LENGTH_UM",
+    "UNIT_SUFFIXES",
     "Bools",
     "Floats",
     "Images",
@@ -24,6 +26,7 @@ __all__ = [
     "finite_array",
     "read_only",
     "unit_of",
+    "wavelengths_nm",
 ]
 
 Floats = NDArray[np.float64]
@@ -34,8 +37,10 @@ Images = NDArray[np.floating[Any]]
 
 _Array = TypeVar("_Array", bound=NDArray[Any])
 
-#: Lengths on a sensor outside this range are a slip of units: less than a picometre, more than ten metres.
-MIN_LENGTH_UM, MAX_LENGTH_UM = 1e-6, 1e7
+#: Lengths on a sensor outside this range are a slip of units: less than an atom, more than ten metres.
+MIN_LENGTH_UM, MAX_LENGTH_UM = 1e-4, 1e7
+#: Wavelengths outside this range are, too: from hard ultraviolet to a millimetre.
+MIN_WAVELENGTH_NM, MAX_WAVELENGTH_NM = 10.0, 1e6
 
 #: Suffixes of names, longest first, and the unit that each stands for in messages.
 UNIT_SUFFIXES = {
@@ -219,6 +224,28 @@ def finite_array(
             place = f" at [{', '.join(map(str, where))}]" if where else ""
             raise ParameterError(name, f"{rule} everywhere", float(array[where]), (unit_of(name) + place).strip())
     return array
+
+
+def wavelengths_nm(name: str, value: ArrayLike) -> Floats:
+    """
+    The value as a read-only list of wavelengths, (n,) nm.
+
+    Raises
+    ------
+    ParameterError
+        When it is no list of numbers, or one is no wavelength of light in nm.
+    """
+    waves_nm = finite_array(name, np.atleast_1d(as_numbers(name, value)), ndim=1, above=0.0)
+    is_odd = (waves_nm < MIN_WAVELENGTH_NM) | (waves_nm > MAX_WAVELENGTH_NM)
+    if waves_nm.size == 0 or is_odd.any():
+        raise ParameterError(
+            name,
+            f"must be from {MIN_WAVELENGTH_NM:g} to {MAX_WAVELENGTH_NM:g}",
+            waves_nm[is_odd].tolist()[:3],
+            "nm",
+            "wavelengths are in nm",
+        )
+    return read_only(waves_nm.copy())
 
 
 def read_only(array: _Array) -> _Array:

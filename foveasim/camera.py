@@ -7,6 +7,7 @@ The only place that knows the order of the stages, and that makes random streams
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -14,7 +15,8 @@ import numpy as np
 
 from foveasim.arrays import Floats
 from foveasim.capture import Capture
-from foveasim.errors import ParameterError, SimulationError
+from foveasim.compiled import kernels
+from foveasim.errors import CoverageWarning, ParameterError, SimulationError
 from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
@@ -28,6 +30,10 @@ from foveasim.units import w_from_w_m2_um2
 
 __all__ = ["Camera"]
 
+#: A map made by Fourier transforms may fall below darkness by this share of the brightest site: rounding of float32.
+NEGATIVE_ROUNDING = 1e-4
+#: A filter that passes less than this share of the strongest one's light cannot be balanced against it.
+DIMMEST_WHITE = 0.01
 #: Compiled layouts that a camera keeps, one for each grid it met.
 KEPT_INTEGRATORS = 4
 
@@ -46,7 +52,12 @@ class Camera:
     Raises
     ------
     ParameterError
-        When ``n_threads`` is no positive whole number.
+        When an argument is none of the above.
+
+    Warns
+    -----
+    CoverageWarning
+        On a capture, when photosites lie off the image.
 
     Examples
     --------
@@ -61,21 +72,39 @@ class Camera:
     """
 
     def __init__(self, *, optics: Optics, sensor: Sensor, n_threads: int | None = None) -> None:
-        self.optics = optics
-        self.sensor = sensor
-        self.n_threads = thread_count(n_threads)
+        for name, part, kind in (("optics", optics, Optics), ("sensor", sensor, Sensor)):
+            if not isinstance(part, kind):
+                raise ParameterError(name, f"must be a foveasim.{kind.__name__}, got a {type(part).__name__}")
+        if not isinstance(sensor.layout, Layout):
+            raise ParameterError("sensor", f"must have a foveasim.Layout, got a {type(sensor.layout).__name__}")
+        self._optics = optics
+        self._sensor = sensor
+        self._layout = sensor.layout
+        self._n_threads = thread_count(n_threads)
         self._integrators: dict[Grid, Integrator] = {}
 
     def __repr__(self) -> str:
-        return f"Camera(optics={self.optics!r}, sensor=<{self.sensor.layout!r}, {self.sensor.bits} bits>)"
+        return f"Camera({self._optics!r}, {self._sensor!r})"
+
+    @property
+    def optics(self) -> Optics:
+        """The lens. For another one make another camera."""
+        return self._optics
+
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor. For another one make another camera."""
+        return self._sensor
 
     def integrator(self, grid: Grid) -> Integrator:
-        """The sensor's layout compiled for a grid; kept for the grids met last."""
-        if grid not in self._integrators:
-            while len(self._integrators) >= KEPT_INTEGRATORS:
-                del self._integrators[next(iter(self._integrators))]
-            self._integrators[grid] = Integrator(self.sensor.layout, grid, n_threads=self.n_threads)
-        return self._integrators[grid]
+        """The sensor's layout compiled for a grid; kept for the grids used last."""
+        integrator = self._integrators.pop(grid, None)
+        if integrator is None:
+            integrator = Integrator(self._layout, grid, n_threads=self._n_threads)
+        self._integrators[grid] = integrator
+        while len(self._integrators) > KEPT_INTEGRATORS:
+            del self._integrators[next(iter(self._integrators))]
+        return integrator
 
     def photoelectrons_per_s(self, light: Scene | PowerMap) -> Floats:
         """
@@ -117,17 +146,15 @@ class Camera:
             When a value is out of range, or parts do not fit together.
         """
         streams = Streams(seed, frame)
-        sensor = self.sensor
+        sensor = self._sensor
         clock = _Clock()
         photo_e_per_s = self._photoelectrons_per_s(light, clock)
         with clock.stage("sensor"):
             expected_e = sensor.expected_electrons(photo_e_per_s, exposure_s)
             electrons = sensor.collect(expected_e, streams=streams)
             code = sensor.read(electrons, streams=streams)
-        layout = sensor.layout
-        assert isinstance(layout, Layout)
         return Capture(
-            layout=layout,
+            layout=self._layout,
             code=code,
             electrons=electrons,
             expected_e=expected_e,
@@ -139,7 +166,7 @@ class Camera:
                 "light": _light_described(light),
                 "optics": described(self.optics),
                 "sensor": {k: v for k, v in described(sensor).items() if k != "layout"},
-                "layout": described(dict(layout.provenance)),
+                "layout": described(dict(self._layout.provenance)),
                 "exposure_s": float(exposure_s),
                 "seed": streams.seed,
                 "frame": streams.frame,
@@ -152,20 +179,22 @@ class Camera:
         """One inverse transform and one pass over the map for each colour filter, whatever the number of wavelengths."""
         if not isinstance(light, Scene | PowerMap):
             raise ParameterError("light", f"must be a Scene or a PowerMap, got a {type(light).__name__}")
-        sensor, layout = self.sensor, self.sensor.layout
-        filter_of_site = sensor.filter_of_site
-        weights = sensor.responsivity_e_per_j(light.wavelength_nm)
-        used = np.unique(filter_of_site)
-        grid = light.grid if isinstance(light, PowerMap) else self.optics.grid(light)
+        filter_of_site = self._sensor.filter_of_site
+        weights = self._sensor.responsivity_e_per_j(light.wavelength_nm)
+        with clock.stage("load kernels"):
+            for room in ("integrate",) if isinstance(light, PowerMap) else ("integrate", "optics"):
+                kernels(room)
         with clock.stage("compile layout"):
-            integrator = self.integrator(grid)
-        rate_e_per_s = np.zeros(layout.n_sites)
+            integrator = self.integrator(light.grid if isinstance(light, PowerMap) else self._optics.grid(light))
+        self._warn_of_uncovered(integrator)
+        rate_e_per_s = np.zeros(self._layout.n_sites)
         if isinstance(light, PowerMap):
             with clock.stage("integration"):
-                power_w = w_from_w_m2_um2(integrator(light.data))
-                rate_e_per_s = np.einsum("sk,ks->s", weights[filter_of_site], power_w)
+                for band, cells in enumerate(light.data):
+                    rate_e_per_s += weights[filter_of_site, band] * w_from_w_m2_um2(integrator(cells))
         else:
-            maps = self.optics.weighted_maps(light, weights[used], n_threads=self.n_threads)
+            used = np.unique(filter_of_site)
+            maps = self._optics.weighted_maps(light, weights[used], n_threads=self._n_threads)
             for c in used:
                 with clock.stage("optics"):
                     cells = next(maps)
@@ -178,15 +207,35 @@ class Camera:
             raise SimulationError(
                 f"the light on site {bad} is not finite: the power map has a NaN or an infinity there"
             )
-        # A diffraction-limited map rings by rounding only; what falls below darkness by that is darkness.
+        rounding_e_per_s = NEGATIVE_ROUNDING * float(rate_e_per_s.max(initial=0.0))
+        if rate_e_per_s.min(initial=0.0) < -rounding_e_per_s:
+            bad = int(rate_e_per_s.argmin())
+            raise SimulationError(f"the light on site {bad} is negative: the power map is below 0 there")
         return np.maximum(rate_e_per_s, 0.0)
+
+    def _warn_of_uncovered(self, integrator: Integrator) -> None:
+        """Tell of sites that the map of light does not reach: their darkness is no property of the scene."""
+        n_uncovered = int(np.count_nonzero(integrator.uncovered_um2))
+        if n_uncovered:
+            x_min, y_min, x_max, y_max = integrator.grid.bounds_um
+            left, bottom, right, top = self._layout.bounds_um
+            warnings.warn(
+                f"{n_uncovered:,} of {self._layout.n_sites:,} photosites lie partly or wholly off the image and get less light "
+                f"or none: the image reaches from ({x_min:.4g}, {y_min:.4g}) to ({x_max:.4g}, {y_max:.4g}) µm, the layout "
+                f"from ({left:.4g}, {bottom:.4g}) to ({right:.4g}, {top:.4g}) µm; enlarge the scene (pitch_um), or shrink or "
+                "move the layout",
+                CoverageWarning,
+                stacklevel=4,
+            )
 
     def _white(self, light: Scene | PowerMap) -> Floats:
         """Response of every filter to equal light in all bands, the strongest being the highest code."""
         width_nm = light.band_width_nm if isinstance(light, Scene) else np.ones(light.wavelength_nm.size)
-        response = self.sensor.responsivity_e_per_j(light.wavelength_nm) @ width_nm
-        highest = float(response.max())
-        return response / highest * (2**self.sensor.bits - 1) if highest > 0.0 else np.ones(response.size)
+        response = self._sensor.responsivity_e_per_j(light.wavelength_nm) @ width_nm
+        highest = float(response.max(initial=0.0))
+        if highest == 0.0:
+            return np.ones(response.size)
+        return np.maximum(response / highest, DIMMEST_WHITE) * (2**self._sensor.bits - 1)
 
 
 class _Clock:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,12 +12,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, Ints, check_choice
-from foveasim.errors import FileError, FoveasimError, ParameterError
+from foveasim.arrays import Floats, Ints, check_choice, check_count, read_only
+from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid
 from foveasim.files import written_whole
 from foveasim.layout import Layout
 from foveasim.reconstruct import Picture, cells, fill_channels, raster_grid
+from foveasim.records import described
 
 __all__ = ["Capture"]
 
@@ -27,18 +27,6 @@ FILE_VERSION = 1
 #: Arrays of a capture file, and how a column of the layout is named among them.
 ARRAYS = ("code", "electrons", "expected_e", "filter_of_site", "xy_um", "ring_offsets", "site_offsets")
 COLUMN_PREFIX = "column_"
-#: What numpy, zipfile and zlib raise for a file that is broken in one way or another.
-UNREADABLE = (
-    FoveasimError,
-    OSError,
-    ValueError,
-    KeyError,
-    TypeError,
-    EOFError,
-    RuntimeError,  # a member that claims to be encrypted; unknown compression is a NotImplementedError, its child
-    zipfile.BadZipFile,
-    zlib.error,
-)
 #: A file that would unpack to more than this is refused.
 MAX_UNPACKED_BYTES = 8 * 2**30
 
@@ -82,11 +70,32 @@ class Capture:
     settings: Mapping[str, Any]
     stage_s: Mapping[str, float] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        n_filters = len(self.filter_names)
+        highest = 2 ** check_count("bits", self.bits, at_least=1, at_most=16) - 1
+        for name, shape, kinds, limit in (
+            ("code", (self.layout.n_sites,), "u", highest),
+            ("electrons", (self.layout.n_sites,), "i", None),
+            ("expected_e", (self.layout.n_sites,), "f", None),
+            ("filter_of_site", (self.layout.n_sites,), "i", n_filters - 1),
+            ("white_dn", (n_filters,), "f", None),
+        ):
+            values = np.asarray(getattr(self, name))
+            if values.shape != shape or values.dtype.kind not in kinds:
+                raise ParameterError(
+                    name, f"must be numbers of the shape {shape}, got {values.dtype} of {values.shape}"
+                )
+            if values.size and not (np.isfinite(values).all() and values.min() >= 0):
+                raise ParameterError(name, "must be finite and >= 0 everywhere")
+            if limit is not None and values.size and values.max() > limit:
+                raise ParameterError(name, f"must be <= {limit} everywhere", int(values.max()))
+            object.__setattr__(self, name, read_only(values.view()))
+
     def __repr__(self) -> str:
-        return f"Capture({self.layout.n_sites} sites, {self.bits} bits, {100 * self.saturated:.1f} % saturated)"
+        return f"Capture({self.layout.n_sites} sites, {self.bits} bits, {100 * self.saturated_share:.1f} % saturated)"
 
     @property
-    def saturated(self) -> float:
+    def saturated_share(self) -> float:
         """Share of the sites that gave the highest code."""
         return float(np.mean(self.code == 2**self.bits - 1)) if self.code.size else 0.0
 
@@ -151,7 +160,7 @@ class Capture:
             "bits": self.bits,
             "white_dn": self.white_dn.tolist(),
             "settings": self.settings,
-            "provenance": dict(self.layout.provenance),
+            "provenance": described(dict(self.layout.provenance)),
         }
         arrays = {name: getattr(self if hasattr(self, name) else self.layout, name) for name in ARRAYS}
         arrays |= {COLUMN_PREFIX + name: values for name, values in self.layout.columns.items()}
@@ -170,7 +179,7 @@ class Capture:
         """
         source = Path(path)
         if not source.is_file():
-            raise FileError(source, "no such file")
+            raise FileError(source, "is not a file" if source.exists() else "no such file")
         try:
             with zipfile.ZipFile(source) as archive:
                 if sum(item.file_size for item in archive.infolist()) > MAX_UNPACKED_BYTES:
@@ -190,9 +199,6 @@ class Capture:
             layout = Layout(
                 arrays["xy_um"], arrays["ring_offsets"], arrays["site_offsets"], columns, about["provenance"]
             )
-            for name in ("code", "electrons", "expected_e", "filter_of_site"):
-                if arrays[name].shape != (layout.n_sites,):
-                    raise ParameterError(name, f"must have one value for each of the {layout.n_sites} sites")
             return cls(
                 layout=layout,
                 code=arrays["code"],
@@ -206,5 +212,6 @@ class Capture:
             )
         except FileError:
             raise
-        except UNREADABLE as error:
-            raise FileError(source, f"is broken or no foveasim capture ({error})") from None
+        except Exception as error:  # noqa: BLE001 -- a broken file makes its readers trip over anything
+            told = " ".join(str(error).split())
+            raise FileError(source, f"is broken or no foveasim capture ({told})") from None

@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, TextIO
+from typing import Annotated, NoReturn, TextIO
 
 import typer
 from rich.console import Console
@@ -19,22 +19,35 @@ __all__ = ["main"]
 
 #: Exit code of a run that failed for what it was given.
 BAD_INPUT = 2
+#: Exit code of a run that the user stopped, as shells have it.
+STOPPED = 130
 
 app = typer.Typer(
     help="Simulates image sensors whose photosites are arbitrary polygons.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
 console = Console()
-errors = Console(stderr=True)
+console_of_errors = Console(stderr=True)
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; made when it does not exist.")]
 Threads = Annotated[int | None, typer.Option("--threads", help="Threads to use; all cores by default.")]
 
 
+@app.callback(invoke_without_command=True)
+def options(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and end.")] = False,
+) -> None:
+    """Simulate image sensors whose photosites are arbitrary polygons."""
+    if version:
+        sys.stdout.write(f"foveasim {__version__}\n")
+    elif context.invoked_subcommand is None:
+        sys.stdout.write(context.get_help() + "\n")
+
+
 @app.command()
-def demo(out: Out = Path("foveasim-demo"), threads: Threads = None) -> None:
+def demo(out: Out = Path("out"), threads: Threads = None) -> None:
     """Show a photograph to a foveal colour sensor and to a four-zone sensor."""
     from foveasim.shots import demo_settings
 
@@ -60,27 +73,23 @@ def schema() -> None:
     sys.stdout.write(json.dumps(json_schema(), indent=2) + "\n")
 
 
-@app.command()
-def version() -> None:
-    """Print the version."""
-    sys.stdout.write(f"{__version__}\n")
-
-
 def _run(settings: Sequence[Path], changes: Sequence[str], out: Path, threads: int | None) -> None:
     from foveasim.config import read_shot
-    from foveasim.shots import results_table, take, write_results
+    from foveasim.shots import check_folder, results_table, run_shot
 
-    results = {}
+    check_folder(out)
+    results = []
     written = []
-    with console.status("reading settings") as status:
-        shots = [read_shot(path, changes, n_threads=threads) for path in settings]
-        for shot in shots:
-            status.update(f"{shot.name}: capturing with {shot.camera.sensor.layout.n_sites:,} photosites")
-            capture = take(shot)
-            status.update(f"{shot.name}: drawing and writing")
-            paths, seconds = write_results(shot, capture, out)
-            written += paths
-            results[shot.name] = (capture, seconds)
+    try:
+        with console.status("reading settings") as status:
+            shots = [read_shot(path, changes, n_threads=threads) for path in settings]
+            for shot in shots:
+                status.update(f"{shot.name}: capturing with {shot.camera.sensor.layout.n_sites:,} photosites")
+                result, paths = run_shot(shot, out)
+                results.append(result)
+                written += paths
+    except KeyboardInterrupt:
+        _end("stopped", STOPPED)
     console.print(results_table(results))
     for path in written:
         console.print(f"wrote {path}", soft_wrap=True, highlight=False)
@@ -88,15 +97,23 @@ def _run(settings: Sequence[Path], changes: Sequence[str], out: Path, threads: i
 
 def main() -> None:
     """Run the command line; bad input ends with one sentence and the exit code 2."""
+    show_warning = warnings.showwarning
     warnings.showwarning = _show_warning
     try:
-        app(standalone_mode=True)
+        app()
     except FoveasimError as error:
-        errors.print(f"error: {error}", soft_wrap=True, highlight=False, markup=False)
-        sys.exit(BAD_INPUT)
-    except KeyboardInterrupt:
-        errors.print("stopped")
-        sys.exit(130)
+        _end(f"error: {error}", BAD_INPUT)
+    except MemoryError:
+        _end("error: there is not enough memory for this; take a smaller picture or fewer photosites", BAD_INPUT)
+    except OSError as error:
+        _end(f"error: {error.strerror or error}", BAD_INPUT)
+    finally:
+        warnings.showwarning = show_warning
+
+
+def _end(sentence: str, code: int) -> NoReturn:
+    console_of_errors.print(sentence, soft_wrap=True, highlight=False, markup=False)
+    sys.exit(code)
 
 
 def _show_warning(
@@ -109,7 +126,7 @@ def _show_warning(
 ) -> None:
     is_ours = issubclass(category, FoveasimWarning)
     text = f"warning: {message}" if is_ours else warnings.formatwarning(message, category, filename, lineno, line)
-    errors.print(text, soft_wrap=True, highlight=False, markup=False)
+    console_of_errors.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
 if __name__ == "__main__":

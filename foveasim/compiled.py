@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import sys
+import tempfile
 from pathlib import Path
+from threading import Lock
 from types import ModuleType
 
 __all__ = ["kernels"]
 
 _log = logging.getLogger("foveasim")
+_lock = Lock()
 
 
 def kernels(room: str) -> ModuleType:
@@ -18,15 +22,28 @@ def kernels(room: str) -> ModuleType:
     The compiled kernels of a room.
 
     numba itself takes half a second to load, and compiling some seconds more, once a machine: so neither happens at
-    ``import foveasim``.
+    ``import foveasim``. Where no folder can keep the machine code, it is kept in the temporary one.
     """
     name = f"foveasim.{room}._kernels"
-    if name not in sys.modules and not _is_cached(room):
-        _log.warning("compiling the kernels of foveasim.%s for this machine, once (a few seconds)", room)
-    return importlib.import_module(name)
+    with _lock:
+        if name in sys.modules:
+            return sys.modules[name]
+        if not _is_cached(room):
+            _log.warning("compiling the kernels of foveasim.%s for this machine, once (a few seconds)", room)
+        try:
+            return importlib.import_module(name)
+        except RuntimeError as error:
+            if "no locator available" not in str(error):
+                raise
+            import numba
+
+            os.environ["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR = str(Path(tempfile.gettempdir()) / "foveasim-numba")
+            return importlib.import_module(name)
 
 
 def _is_cached(room: str) -> bool:
-    """Whether machine code lies beside the source; elsewhere, as for a package that cannot be written to, is not looked."""
+    """Whether machine code lies beside the source, or may lie elsewhere because the source's folder cannot be written."""
     folder = Path(__file__).parent / room
-    return any((folder / "__pycache__").glob("_kernels.*.nbi"))
+    is_elsewhere = bool(os.environ.get("NUMBA_CACHE_DIR")) or not os.access(folder, os.W_OK)
+    pattern = f"_kernels.*py{sys.version_info.major}{sys.version_info.minor}*.nbi"
+    return is_elsewhere or any((folder / "__pycache__").glob(pattern))

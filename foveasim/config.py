@@ -36,6 +36,8 @@ __all__ = ["LayoutFile", "Shot", "read_layout_file", "read_shot", "schema"]
 MAX_FILE_BYTES = 1 << 20
 #: Pictures that come with scikit-image are named with this in front.
 BUNDLED_PICTURE = "skimage:"
+#: Settings whose value may be the name of a file.
+FILE_SETTINGS = ("scene.picture", "layout")
 #: Problems of a file that one message names.
 SHOWN_PROBLEMS = 3
 
@@ -52,13 +54,29 @@ class _Section(BaseModel):
 def _model(name: str, call: Callable[..., Any], skip: Sequence[str] = (), **types: Any) -> type[_Section]:
     """Section with the names, types and defaults of a call's parameters: some skipped, some of other types in files."""
     hints = get_type_hints(call)
+    summary, sentences = _documentation(call)
     keys: dict[str, Any] = {
-        p.name: (types.get(p.name, hints.get(p.name)), ... if p.default is inspect.Parameter.empty else p.default)
+        p.name: (
+            types.get(p.name, hints.get(p.name)),
+            Field(... if p.default is inspect.Parameter.empty else p.default, description=sentences.get(p.name)),
+        )
         for p in inspect.signature(call).parameters.values()
         if p.name not in skip
     }
-    summary = (inspect.getdoc(call) or "").split("\n\n")[0].replace("\n", " ")
     return create_model(name, __base__=_Section, __doc__=summary, **keys)
+
+
+def _documentation(call: Callable[..., Any]) -> tuple[str, dict[str, str]]:
+    """The first paragraph of a numpydoc docstring, and what it says of each parameter."""
+    text = inspect.getdoc(call) or ""
+    sentences: dict[str, str] = {}
+    names: list[str] = []
+    for line in text.partition("Parameters\n----------\n")[2].split("\n\n")[0].splitlines():
+        if line.startswith("    "):
+            sentences.update({name: f"{sentences.get(name, '')} {line.strip()}".strip() for name in names})
+        else:
+            names = [name.strip() for name in line.partition(" : ")[0].split(",")]
+    return text.split("\n\n")[0].replace("\n", " "), sentences
 
 
 def _one_of(tag: str, models: Mapping[str, type[_Section]]) -> Any:
@@ -173,6 +191,8 @@ class Shot:
         The file's name without its ending.
     scene : Scene
     camera : Camera
+    rules : DesignRules or None
+        Rules that the sensor's layout is meant to keep.
     exposure_s : float, s
     seed : int
     """
@@ -180,6 +200,7 @@ class Shot:
     name: str
     scene: Scene
     camera: Camera
+    rules: DesignRules | None
     exposure_s: float
     seed: int
 
@@ -194,7 +215,8 @@ def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int |
         YAML. Pictures and layouts that it names are looked for beside it; ``skimage:astronaut`` and its like are the
         pictures that come with scikit-image.
     changes : sequence of "key=value"
-        Settings to be replaced: ``sensor.bits=10``; the value is read as YAML.
+        Settings to be replaced: ``sensor.bits=10``; the value is read as YAML. Files named here are looked for in the
+        current folder.
     n_threads : int, optional
         For the camera.
 
@@ -211,9 +233,10 @@ def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int |
         _replace(path, data, change)
     settings = _validated(path, _ShotSection, data)
     if isinstance(settings.layout, str):
-        layout = read_layout_file(path.parent / settings.layout).layout
+        file = _call(path, "layout", read_layout_file, {"path": path.parent / settings.layout})
     else:
-        layout = _built_layout(path, "layout.", settings.layout).layout
+        file = _built_layout(path, "layout.", settings.layout)
+    layout = file.layout
     sensor_values = {
         name: value.per_um2 * layout.area_um2 if isinstance(value, PerArea) else value
         for name, value in _values(path, "sensor.", settings.sensor).items()
@@ -223,6 +246,7 @@ def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int |
     scene_values = _values(path, "scene.", settings.scene)
     if "picture" in scene_values:
         scene_values["picture"] = _picture_path(path, scene_values["picture"])
+    # A picture's own faults are told with its name.
     scene = _call(path, "scene", _SCENES[scene_values.pop("kind")], scene_values)
     # What would end the capture is told before it begins, with its place in the file.
     _call(path, "scene", optics.grid, {"scene": scene})
@@ -233,6 +257,7 @@ def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int |
         name=path.stem,
         scene=scene,
         camera=Camera(optics=optics, sensor=sensor, n_threads=n_threads),
+        rules=file.rules,
         exposure_s=exposure_s,
         seed=streams.seed,
     )
@@ -253,7 +278,8 @@ def read_layout_file(path: str | Path) -> LayoutFile:
 
 def schema() -> dict[str, Any]:
     """JSON schema of a settings file."""
-    return TypeAdapter(_ShotSection).json_schema()
+    described = TypeAdapter(_ShotSection).json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **described, "title": "foveasim settings"}
 
 
 def _built_layout(path: Path, place: str, section: Any) -> LayoutFile:
@@ -289,8 +315,6 @@ def _call(path: Path, place: str, function: Callable[..., Any], arguments: Mappi
     """Call, with the place in the file put in front of what it raises."""
     try:
         return function(**arguments)
-    except ConfigError:
-        raise
     except ParameterError as error:
         where = f"{place}.{error.name}" if place else error.name
         rule = str(error).removeprefix(f"'{error.name}' ")
@@ -389,7 +413,10 @@ def _replace(path: Path, data: dict[str, Any], change: str) -> None:
         place = place.setdefault(name, {})
         if not isinstance(place, dict):
             raise ConfigError(path, f"'{change}' cannot be set: {'.'.join(names[: i + 1])} is no section but {place!r}")
-    place[names[-1]] = _parsed(path, value)
+    new = _parsed(path, value)
+    if key.strip() in FILE_SETTINGS and isinstance(new, str) and not new.startswith(BUNDLED_PICTURE):
+        new = str(Path(new).absolute())
+    place[names[-1]] = new
 
 
 def _validated(path: Path, kind: Any, data: dict[str, Any]) -> Any:
@@ -429,15 +456,24 @@ def _problems(data: dict[str, Any], error: ValidationError) -> list[str]:
 def _place(data: Any, error: Any) -> tuple[str, ...]:
     """Keys and positions that lead to a problem, without the names of alternatives that pydantic puts among them."""
     place = []
+    tags = _tags(data)
     for i, part in enumerate(error["loc"]):
-        if (isinstance(data, dict) and part in data) or (
+        if part in tags:  # the alternative that a section's key chose, which may be the name of another key
+            tags = ()
+        elif (isinstance(data, dict) and part in data) or (
             isinstance(data, list) and isinstance(part, int) and part < len(data)
         ):
             data = data[part]
+            tags = _tags(data)
             place.append(str(part))
         elif i == len(error["loc"]) - 1 and error["type"] == "missing":
             place.append(str(part))
     return tuple(place)
+
+
+def _tags(data: Any) -> tuple[Any, ...]:
+    """What a section's key may have chosen among alternatives."""
+    return (data.get("kind"), data.get("generator")) if isinstance(data, dict) else ()
 
 
 def _sentence(error: Any) -> str:
@@ -453,4 +489,5 @@ def _sentence(error: Any) -> str:
             return f".{key}: must be one of {error['ctx']['expected_tags']}, got '{error['ctx']['tag']}'"
         case _:
             got = "" if isinstance(error["input"], dict | list) else f", got {json.dumps(error['input'])}"
-            return f": {error['msg'].replace('Input should', 'must')}{got}"
+            rule = re.sub(r"^\w+ should", "must", error["msg"]).replace(" after validation", "")
+            return f": {rule}{got}"

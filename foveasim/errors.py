@@ -11,7 +11,8 @@ Every error and warning that foveasim raises on purpose.
     └── SimulationError  (RuntimeError)  parts that do not fit together, found while running
 
     FoveasimWarning (UserWarning)
-    └── SamplingWarning                  the discretisation is coarser than the physics asks for
+    ├── SamplingWarning                  the discretisation is coarser than the physics asks for
+    └── CoverageWarning                  photosites lie off the picture
 
 Each message says what is wrong, where, what was got, what was expected, and the cure.
 """
@@ -23,6 +24,7 @@ from typing import Any
 
 __all__ = [
     "ConfigError",
+    "CoverageWarning",
     "FileError",
     "FoveasimError",
     "FoveasimWarning",
@@ -33,6 +35,10 @@ __all__ = [
 ]
 
 
+#: No value is to be shown; None is a value.
+_UNSAID = object()
+
+
 class FoveasimError(Exception):
     """Base of all errors of the package."""
 
@@ -40,11 +46,11 @@ class FoveasimError(Exception):
 class ParameterError(FoveasimError, ValueError):
     """One parameter has a value that cannot be: raise it where a value enters the package."""
 
-    def __init__(self, name: str, rule: str, value: object = None, unit: str = "", cure: str = "") -> None:
+    def __init__(self, name: str, rule: str, value: object = _UNSAID, unit: str = "", cure: str = "") -> None:
         self.name = name
-        self.value = value
+        self.value = None if value is _UNSAID else value
         self.unit = unit
-        got = f", got {_shown(value)}{' ' + unit if unit else ''}" if value is not None else ""
+        got = f", got {_shown(value)}{' ' + unit if unit else ''}" if value is not _UNSAID else ""
         super().__init__(f"'{name}' {rule}{got}{'; ' + cure if cure else ''}")
 
 
@@ -78,6 +84,10 @@ class FoveasimWarning(UserWarning):
 
 class SamplingWarning(FoveasimWarning):
     """The picture or the grid is too coarse or too small for the optics it meets."""
+
+
+class CoverageWarning(FoveasimWarning):
+    """Photosites lie partly or wholly off the map of light and receive less, or nothing."""
 
 
 def _shown(value: Any) -> str:

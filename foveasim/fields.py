@@ -14,7 +14,17 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Images, Ints, check_number, check_shape, finite_array, read_only
+from foveasim.arrays import (
+    Floats,
+    Images,
+    Ints,
+    as_numbers,
+    check_length_um,
+    check_number,
+    check_shape,
+    read_only,
+    wavelengths_nm,
+)
 from foveasim.errors import ParameterError
 
 __all__ = ["Grid", "PackedRings", "PowerMap", "SceneLike", "from_file_rows", "to_file_rows"]
@@ -100,17 +110,18 @@ class Grid:
     origin_um: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if np.shape(self.origin_um) != (2,):
+        if as_numbers("origin_um", self.origin_um).shape != (2,):
             raise ParameterError("origin_um", "must be two numbers (x0, y0)", self.origin_um, "µm")
         x0, y0 = (check_number(f"origin_um[{i}]", x) for i, x in enumerate(self.origin_um))
         object.__setattr__(self, "shape", check_shape("shape", self.shape))
         object.__setattr__(self, "origin_um", (x0, y0))
-        object.__setattr__(self, "pitch_um", check_number("pitch_um", self.pitch_um, above=0.0, at_most=1e7))
+        object.__setattr__(self, "pitch_um", check_length_um("pitch_um", self.pitch_um))
 
     @classmethod
     def centred(cls, shape: tuple[int, int], pitch_um: float) -> Grid:
         """Grid whose middle lies on the optical axis."""
-        check_number("pitch_um", pitch_um, above=0.0)
+        check_shape("shape", shape)
+        check_length_um("pitch_um", pitch_um)
         return cls(shape, pitch_um, (-0.5 * shape[1] * pitch_um, -0.5 * shape[0] * pitch_um))
 
     @property
@@ -143,7 +154,7 @@ class PowerMap:
     Parameters
     ----------
     data : (n_band, n_y, n_x) float32 or float64, W/m² per band
-        Mean irradiance of each cell, within the band of each wavelength.
+        Mean irradiance of each cell, within the band of each wavelength. Used as it is, without a copy.
     grid : Grid
         Where the cells are.
     wavelength_nm : (n_band,) float64, nm
@@ -161,9 +172,13 @@ class PowerMap:
 
     def __post_init__(self) -> None:
         data = np.asarray(self.data)
+        if not np.can_cast(data.dtype, np.float64):
+            raise ParameterError("data", f"must have real numbers, got the type {data.dtype}")
         if data.dtype not in (np.float32, np.float64):
             data = data.astype(np.float64)
-        wavelength_nm = finite_array("wavelength_nm", np.atleast_1d(np.asarray(self.wavelength_nm)), ndim=1, above=0.0)
+        if not isinstance(self.grid, Grid):
+            raise ParameterError("grid", f"must be a Grid, got a {type(self.grid).__name__}")
+        wavelength_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)
         if data.shape != (wavelength_nm.size, *self.grid.shape):
             raise ParameterError(
                 "data",
@@ -172,7 +187,7 @@ class PowerMap:
             )
         data = data.view()
         object.__setattr__(self, "data", read_only(data))
-        object.__setattr__(self, "wavelength_nm", read_only(wavelength_nm.copy()))
+        object.__setattr__(self, "wavelength_nm", wavelength_nm)
 
 
 def from_file_rows(picture: NDArray[Any]) -> NDArray[Any]:

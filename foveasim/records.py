@@ -6,6 +6,7 @@ import hashlib
 import platform
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from functools import cache
 from importlib.metadata import version
 from typing import Any
 
@@ -43,7 +44,12 @@ def described(value: Any) -> Any:
     return repr(value)
 
 
-def versions() -> dict[str, str]:
-    """Versions of the package, of Python, and of the libraries that results depend on."""
+@cache
+def _versions() -> dict[str, str]:
     libraries = {name: version(name) for name in ("numpy", "scipy", "numba", "shapely")}
     return {"foveasim": __version__, "python": platform.python_version(), **libraries}
+
+
+def versions() -> dict[str, str]:
+    """Versions of the package, of Python, and of the libraries that results depend on."""
+    return dict(_versions())

@@ -12,7 +12,7 @@ import numpy as np
 
 from foveasim.arrays import Floats, Ints
 
-__all__ = ["next_vertex", "ring_moments", "ring_spread_um2", "site_bounds_um", "site_moments"]
+__all__ = ["next_vertex", "ring_moments", "ring_spread_um2", "site_area_um2", "site_bounds_um", "site_moments"]
 
 
 def next_vertex(ring_offsets: Ints) -> Ints:
@@ -63,8 +63,15 @@ def site_moments(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> tuple
     if site_offsets.size == 1:
         return np.zeros(0), np.zeros((0, 2))
     area_um2, moment_um3 = ring_moments(xy_um, ring_offsets)
-    site_area_um2 = np.add.reduceat(area_um2, site_offsets[:-1])
-    return site_area_um2, np.add.reduceat(moment_um3, site_offsets[:-1], axis=0) / site_area_um2[:, np.newaxis]
+    site_area = np.add.reduceat(area_um2, site_offsets[:-1])
+    return site_area, np.add.reduceat(moment_um3, site_offsets[:-1], axis=0) / site_area[:, np.newaxis]
+
+
+def site_area_um2(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floats:
+    """Area of every site, holes taken off, (n_site,) µm²; negative when its outline is clockwise."""
+    if site_offsets.size == 1:
+        return np.zeros(0)
+    return np.add.reduceat(ring_moments(xy_um, ring_offsets)[0], site_offsets[:-1])
 
 
 def site_bounds_um(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floats:

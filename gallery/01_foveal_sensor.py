@@ -28,7 +28,7 @@ def main(out_dir: Path) -> None:
         astronaut(),
         pitch_um=PITCH_UM,
         distance_m=DISTANCE_M,
-        peak_radiance_w_m2_sr_nm=0.2,
+        peak_radiance_w_m2_sr_nm=0.02,
         wavelength_nm=(620, 550, 450),
     )
 
@@ -39,7 +39,7 @@ def main(out_dir: Path) -> None:
         layout,
         qe=fs.SiliconQE(depth_um=3.0),
         filters="rgb",
-        capacitance_f=1e-14 * layout.area_um2,
+        capacitance_f=1e-15 * layout.area_um2,
         read_noise_e=1.0,
         bits=10,
     )

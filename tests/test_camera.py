@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import shapely
 
 import foveasim as fs
-from foveasim.errors import FileError, ParameterError, SimulationError
+from foveasim.errors import CoverageWarning, FileError, ParameterError, SimulationError
 
 H_J_S, C_M_S, Q_C = 6.62607015e-34, 299792458.0, 1.602176634e-19
 OPTICS = fs.Optics(focal_length_mm=22.0, f_number=4.0)
@@ -137,7 +138,52 @@ def test_sites_off_the_scene_are_dark():
     layout = fs.Layout.from_rectangles([[0.0, 0.0], [1e4, 0.0]], 2.0)
     camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout))
 
-    assert camera.photoelectrons_per_s(flat_scene())[1] == 0.0
+    with pytest.warns(CoverageWarning, match="1 of 2 photosites lie partly or wholly off the image"):
+        assert camera.photoelectrons_per_s(flat_scene())[1] == 0.0
+
+
+def test_a_negative_map_is_told_with_the_site():
+    layout = fs.Layout.from_rectangles([[0.5, 0.5], [3.5, 3.5]], 1.0)
+    data = np.ones((1, 4, 4))
+    data[0, 3, 3] = -0.1
+
+    with pytest.raises(SimulationError, match="the light on site 1 is negative"):
+        fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout)).photoelectrons_per_s(
+            fs.PowerMap(data, fs.Grid((4, 4), 1.0), np.array([550.0]))
+        )
+
+
+def test_a_camera_keeps_its_parts():
+    camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(rgb_layout()))
+
+    with pytest.raises(AttributeError, match="sensor"):
+        camera.sensor = fs.Sensor(rgb_layout())
+
+
+def test_compiled_layouts_of_the_grids_used_last_are_kept():
+    camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(rgb_layout()))
+    grids = [fs.Grid.centred((n, n), 1.0) for n in range(200, 206)]
+    first = camera.integrator(grids[0])
+    for grid in grids[1:4]:
+        camera.integrator(grid)
+
+    assert camera.integrator(grids[0]) is first
+    camera.integrator(grids[4])
+    assert camera.integrator(grids[0]) is first
+    assert camera.integrator(grids[4]).grid == grids[4]
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"optics": "lens"}, r"'optics' must be a foveasim\.Optics, got a str"),
+        ({"sensor": rgb_layout()}, r"'sensor' must be a foveasim\.Sensor, got a Layout"),
+        ({"sensor": OPTICS, "optics": fs.Sensor(rgb_layout())}, r"'optics' must be a foveasim\.Optics, got a Sensor"),
+    ],
+)
+def test_parts_of_the_wrong_kind_are_refused(parts, message):
+    with pytest.raises(ParameterError, match=message):
+        fs.Camera(**{"optics": OPTICS, "sensor": fs.Sensor(rgb_layout()), **parts})
 
 
 def test_a_nan_under_a_site_is_told_with_the_site():
@@ -210,8 +256,46 @@ def test_a_flat_white_scene_looks_white_after_white_balance():
     balanced = capture.picture(max_pixels=60).data / capture.white_dn[:, np.newaxis, np.newaxis]
     levels = np.nanmedian(balanced, axis=(1, 2))
 
-    assert capture.saturated == 0.0
+    assert capture.saturated_share == 0.0
     assert levels == pytest.approx(np.full(3, levels.mean()), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"code": np.full(3, 7.0)}, "'code' must be numbers of the shape"),
+        ({"bits": 4}, "'code' must be <= 15 everywhere"),
+        ({"filter_names": ("R", "G")}, "'filter_of_site' must be <= 1 everywhere"),
+        ({"white_dn": np.array([1.0, np.nan, 1.0])}, "'white_dn' must be finite"),
+    ],
+)
+def test_a_capture_whose_parts_do_not_fit_is_refused(capture, changes, message):
+    with pytest.raises(ParameterError, match=message):
+        replace(capture, **changes)
+
+
+def test_a_capture_is_read_only(capture):
+    for name in ("code", "electrons", "expected_e", "filter_of_site", "white_dn"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(capture, name)[0] = 1
+
+
+def test_any_provenance_can_be_saved(tmp_path):
+    origin = {"n": np.int64(3), "a": np.arange(100), "b": 1 + 2j}
+    layout = fs.Layout.from_polygons([shapely.box(0, 0, 4, 4)], provenance=origin)
+    capture = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout)).capture(flat_scene(), exposure_s=0.01, seed=0)
+    capture.save(tmp_path / "c.npz")
+
+    assert fs.Capture.load(tmp_path / "c.npz").layout.provenance["n"] == 3
+
+
+def test_a_filter_that_sees_nothing_does_not_spoil_the_picture():
+    layout = fs.layout.mosaic(fs.layout.grid(n_x=20, n_y=20, pitch_um=2.0), ("RG", "GR"))
+    curves = (fs.GaussianCurve(centre_nm=550, fwhm_nm=80), fs.GaussianCurve(centre_nm=400, fwhm_nm=5))
+    camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout, filters=fs.FilterSet(curves, ("R", "G"))))
+    capture = camera.capture(flat_scene(), exposure_s=0.01, seed=0)
+
+    assert capture.white_dn.tolist() == [255.0, pytest.approx(2.55)]
 
 
 @pytest.mark.parametrize(

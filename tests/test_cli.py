@@ -148,5 +148,5 @@ def test_a_folder_that_cannot_be_made_is_told(folder):
     result = foveasim("run", "shot.yaml", "-o", "out", cwd=folder)
 
     assert result.returncode == 2
-    assert "out: cannot be written" in result.stderr
+    assert "out: cannot hold results: out is a file, and must be a folder" in result.stderr
     assert (folder / "out").read_text() == "I am a file"

@@ -59,16 +59,16 @@ def test_numbers_without_a_point_in_front_of_the_exponent_are_numbers(shot_file)
         ("optics.emission=isotropic", lambda s: s.camera.optics.emission == "isotropic"),
         ("layout.mosaic=[RG, GB]", lambda s: s.camera.sensor.layout.channel.max() == 2),
         ("layout.move_um=[5.0, -3.0]", lambda s: abs(s.camera.sensor.layout.centroid_um.mean(0) - [5, -3]).max() < 1),
-        ("sensor.filters=rgb", lambda s: s.camera.sensor.n_filters == 3),
+        ("layout.mosaic=[RG, GB]; sensor.filters=rgb", lambda s: s.camera.sensor.n_filters == 3),
         (
-            "sensor.filters={curves: [{kind: gaussian, centre_nm: 550, fwhm_nm: 90}, {kind: constant, value: 0.5}]}",
+            "layout.mosaic=[GR, RG]; sensor.filters={curves: [{kind: gaussian, centre_nm: 550, fwhm_nm: 90}, {kind: constant, value: 0.5}]}",
             lambda s: s.camera.sensor.filter_names == ("0", "1"),
         ),
         ("exposure_s=0.5", lambda s: s.exposure_s == 0.5),
     ],
 )
 def test_a_change_replaces_one_setting(shot_file, change, value):
-    assert value(read_shot(shot_file, [change]))
+    assert value(read_shot(shot_file, change.split("; ")))
 
 
 @pytest.mark.parametrize(
@@ -115,6 +115,50 @@ def test_a_wrong_setting_is_told_with_its_place(shot_file, change, message):
 
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith(str(shot_file.parent))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("scene.pitch_um=abc", r'scene\.pitch_um: must be a valid number, got "abc"'),
+        ("scene.pitchum=3", r"scene\.pitchum: no such setting"),
+        ("scene.wavelength_nm=550", r"scene\.wavelength_nm: must be a valid array, got 550"),
+        ("scene.encoding=gamma", r"scene\.encoding: must be 'srgb', 'sqrt' or 'linear', got \"gamma\""),
+        ("scene.band_width_nm=[1.0, x]", r'scene\.band_width_nm\.1: must be a valid number, got "x"'),
+        ("scene.picture=3", r"scene\.picture: must be a valid string, got 3"),
+        ("scene={kind: picture, picture: a.png}", r"scene\.pitch_um: is missing; scene\.distance_m: is missing"),
+        (
+            "scene={kind: point_sources, shape: [4, 5], pixels: [[1, 2, 3]]}",
+            r"scene\.pixels\.0: must have at most 2 items, not 3",
+        ),
+        ("scene.peak_radiance_w_m2_sr_nm=-1", r"scene\.peak_radiance_w_m2_sr_nm: must be >= 0, got -1"),
+    ],
+)
+def test_a_wrong_setting_of_a_picture_is_told_with_its_place(shot_file, change, message):
+    scene = {
+        "kind": "picture",
+        "picture": "skimage:camera",
+        "pitch_um": 400.0,
+        "distance_m": 1.0,
+        "band_width_nm": 10.0,
+    }
+    scene["peak_radiance_w_m2_sr_nm"] = 0.1
+    shot_file.write_text(yaml.safe_dump({**yaml.safe_load(SHOT.replace("1e-15", "1.0e-15")), "scene": scene}))
+
+    with pytest.raises(ConfigError, match=message):
+        read_shot(shot_file, [change])
+
+
+def test_files_named_in_a_change_are_looked_for_in_the_current_folder(shot_file, tmp_path, monkeypatch):
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    layout = "generator: grid\nparameters: {n_x: 3, n_y: 2, pitch_um: 5.0}\nrules: {min_size_um: 6.0}\nsource: a test\n"
+    (tmp_path / "elsewhere" / "six.yaml").write_text(layout)
+
+    shot = read_shot(shot_file, ["layout=six.yaml"])
+
+    assert shot.camera.sensor.layout.n_sites == 6
+    assert shot.rules == fs.DesignRules(min_size_um=6.0)
 
 
 def test_wavelengths_outside_the_sensors_tables_are_told_before_the_capture(shot_file):
@@ -196,6 +240,8 @@ def test_the_schema_names_every_setting_of_the_calls():
         "die_um",
     ):
         assert f'"{name}"' in text
+    assert schema()["title"] == "foveasim settings"
+    assert "Smallest pixel that can be made" in text
     assert schema()["required"] == ["scene", "optics", "layout", "exposure_s"]
 
 

@@ -11,7 +11,7 @@ from reference.clipping import exact_weights, shapely_weights
 from reference.polygons import ZOO, polygons
 
 import foveasim as fs
-from foveasim.errors import ParameterError
+from foveasim.errors import GeometryError, ParameterError
 from foveasim.integrate import _plan
 
 SHAPE = (7, 9)
@@ -162,7 +162,7 @@ def test_the_parts_of_a_split_site_add_up(name):
 
 @settings(max_examples=50, deadline=None, derandomize=True)
 @given(
-    pitch_um=st.floats(1e-3, 1e3), x0=st.floats(-1e4, 1e4), y0=st.floats(-1e4, 1e4), name=st.sampled_from(sorted(ZOO))
+    pitch_um=st.floats(2.0, 1e3), x0=st.floats(-1e4, 1e4), y0=st.floats(-1e4, 1e4), name=st.sampled_from(sorted(ZOO))
 )
 def test_pitch_and_origin_only_scale_and_move(pitch_um, x0, y0, name):
     moved = shapely.transform(ZOO[name], lambda xy: xy * pitch_um + np.array([x0, y0]))
@@ -249,6 +249,74 @@ def test_a_nan_stays_with_the_sites_that_see_it():
 
     assert np.isnan(power[0])
     assert power[1] == pytest.approx(80 * 10)
+
+
+def test_a_nan_beside_a_site_is_none_of_its_business():
+    layout = fs.Layout.from_rectangles([[1.5, 1.5]], 1.0)
+    integrator = fs.Integrator(layout, fs.Grid((3, 3), 1.0))
+    cells = np.full((3, 3), np.nan)
+    cells[1, 1] = 2.0
+
+    assert integrator(cells)[0] == 2.0
+    assert integrator.weights().nnz == 1
+
+
+@pytest.mark.parametrize("turn", [0, 180])
+def test_a_comb_of_a_thousand_fingers_is_exact_either_way_up(turn):
+    """Many edges cross each row, in ascending order of columns one way up and in descending the other."""
+    x = np.arange(1000) * 7.0 + 1.3
+    finger = np.array([[0, 90.2], [3.1, 90.2], [3.1, 5.7], [7.0, 5.7]])
+    teeth = (finger + np.stack((x, np.zeros(1000)), axis=1)[:, np.newaxis]).reshape(-1, 2)
+    ring = np.concatenate((teeth, [[x[-1] + 7.0, 2.5], [1.3, 2.5]]))
+    comb = fs.Layout.from_polygons([shapely.Polygon(ring)]).rotate(turn, (3510.0, 50.0))
+    integrator = fs.Integrator(comb, fs.Grid((100, 7020), 1.0))
+
+    # A back of 3.2 and fingers of 84.5, each 3.1 wide.
+    assert integrator(np.ones((100, 7020)))[0] == pytest.approx(1000 * (7.0 * 3.2 + 3.1 * 84.5), rel=1e-11)
+
+
+def test_an_almost_vertical_edge_is_vertical():
+    layout = fs.Layout.from_polygons([shapely.Polygon([(0, 0), (1, 0), (1, 1), (1e-310, 1)])])
+
+    assert fs.Integrator(layout, fs.Grid((2, 2), 1.0))(np.ones((2, 2)))[0] == 1.0
+
+
+def test_many_edges_in_a_row_leave_nothing_outside():
+    angle = np.linspace(0, 2 * np.pi, 100_000, endpoint=False)
+    ring = np.stack((1002.0 + 2.0 * np.cos(angle), 0.5 + 0.4 * np.sin(angle)), axis=1)
+    layout = fs.Layout.from_polygons([shapely.Polygon(ring)])
+    weights = fs.Integrator(layout, fs.Grid((1, 1200), 1.0)).weights().tocoo()
+
+    assert weights.coords[1].min() == 1000
+    assert weights.sum() == pytest.approx(np.pi * 0.8, rel=1e-8)
+
+
+def test_small_sites_far_from_the_origin_are_wholly_covered():
+    rng = np.random.default_rng(8)
+    grid = fs.Grid((400, 8000), 0.37, (-1500.0, -100.0))
+    centre = rng.uniform((-1499, -99), (1400, 40), (2000, 2))
+
+    assert fs.Integrator(fs.Layout.from_rectangles(centre, 0.01), grid).uncovered_um2.max() == 0.0
+
+
+def test_a_clockwise_outline_is_refused():
+    layout = fs.Layout(np.array([[0.0, 0], [0, 1], [1, 1], [1, 0]]), np.array([0, 4]), np.array([0, 1]))
+
+    with pytest.raises(GeometryError, match="site 0 has no positive area: its outline must be counter-clockwise"):
+        fs.Integrator(layout, GRID)
+
+
+@pytest.mark.parametrize(
+    ("layout", "grid", "message"),
+    [
+        (GRID, TILINGS["grid"], "'layout' must be a Layout, or packed rings, got a Grid"),
+        ([shapely.box(0, 0, 1, 1)], GRID, "'layout' must be a Layout, or packed rings, got a list"),
+        (TILINGS["grid"], (7, 9), "'grid' must be a Grid, got a tuple"),
+    ],
+)
+def test_swapped_or_wrong_arguments_are_refused(layout, grid, message):
+    with pytest.raises(ParameterError, match=message):
+        fs.Integrator(layout, grid)
 
 
 def test_thousands_of_edges_in_one_cell_add_up():

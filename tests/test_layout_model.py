@@ -706,6 +706,7 @@ def test_provenance_is_kept_and_every_change_noted():
         "moved by (1, 2) µm",
         "turned by 90 degrees",
         "scaled by 2",
+        "columns zone set",
         "selected 1 of 2 sites",
     ]
 

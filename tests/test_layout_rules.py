@@ -497,7 +497,7 @@ def test_raise_if_failed_names_each_broken_rule_with_count_worst_and_limit():
     assert str(caught.value).split(": ", 1)[1].split("; ") == [
         "min_size_um: 2 violations, worst 1 µm for a limit of 1.5 µm",
         "min_width_um: 2 violations, worst 0.25 µm for a limit of 0.75 µm",
-        "die_um: 1 violations, worst 6 µm for a limit of 0 µm",
+        "die_um: 1 violation, worst 6 µm for a limit of 0 µm",
     ]
 
 

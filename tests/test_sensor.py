@@ -9,6 +9,7 @@ import pytest
 import scipy.constants
 import scipy.stats
 
+import foveasim as fs
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
 from foveasim.sensor import ConstantCurve, FilterSet, Sensor, SiliconQE, draw_shot_noise
@@ -18,6 +19,7 @@ from foveasim.streams import Streams
 N = 200_000
 MANY = grid(n_x=500, n_y=400, pitch_um=2.0)
 FOUR = grid(n_x=4, n_y=1, pitch_um=2.0)
+COLOURED = FOUR.with_columns(channel=[0, 1, 1, 0])
 #: Five standard errors: a right sensor is outside once in 1.7 million.
 SIGMAS = 5.0
 GREEN_NM = np.array([550.0])
@@ -68,7 +70,9 @@ def test_electrons_per_joule_grow_with_wavelength():
 
 def test_electrons_per_joule_are_the_product_of_efficiency_and_filter():
     filters = FilterSet([ConstantCurve(0.25), ConstantCurve(1.0)])
-    at = Sensor(FOUR, qe=SiliconQE(depth_um=1.561), filters=filters).responsivity_e_per_j(GREEN_NM)[:, 0] * light_w(1.0)
+    at = Sensor(COLOURED, qe=SiliconQE(depth_um=1.561), filters=filters).responsivity_e_per_j(GREEN_NM)[:, 0] * light_w(
+        1.0
+    )
     np.testing.assert_allclose(at, [0.25 * (1.0 - 1.0 / math.e), 1.0 - 1.0 / math.e], rtol=1e-9)
 
 
@@ -425,7 +429,7 @@ def test_an_exposure_that_cannot_be_is_refused(exposure_s):
 @pytest.mark.parametrize("value", [1.5, -0.5, math.nan])
 @pytest.mark.parametrize("filters", [None, "rgb"])
 def test_an_efficiency_beyond_0_to_1_is_refused_in_one_line(value, filters):
-    sensor = Sensor(FOUR, qe=lambda wavelength_nm: np.full(np.shape(wavelength_nm), value), filters=filters)
+    sensor = Sensor(COLOURED, qe=lambda wavelength_nm: np.full(np.shape(wavelength_nm), value), filters=filters)
     with pytest.raises(ParameterError, match=r"values from 0 to 1 at every wavelength[^\n]*$") as caught:
         sensor.responsivity_e_per_j(np.array([450.0, 540.0, 610.0]))
     assert "\n" not in str(caught.value)
@@ -436,3 +440,38 @@ def test_arrays_given_per_site_are_kept_from_later_changes():
     sensor = Sensor(FOUR, read_noise_e=noise_e)
     noise_e[...] = 99.0
     assert sensor.read_noise_e.tolist() == [1.0] * 4
+
+
+@pytest.mark.parametrize("v_sat_v", [1.0, 1.8, 3.0, 3.3])
+@pytest.mark.parametrize("bits", [8, 10, 12, 16])
+@pytest.mark.parametrize("e_per_dn", [1, 2, 4])
+def test_a_charge_on_the_border_of_a_code_has_that_code(v_sat_v, bits, e_per_dn):
+    """With a whole number of electrons to a code every border is met."""
+    layout = fs.layout.grid(n_x=2**bits, n_y=1, pitch_um=1.0)
+    capacitance_f = 1.602176634e-19 * e_per_dn * 2**bits / v_sat_v
+    sensor = fs.Sensor(layout, capacitance_f=capacitance_f, v_sat_v=v_sat_v, bits=bits)
+    codes = np.arange(2**bits)
+
+    assert np.array_equal(sensor.read(codes * e_per_dn, streams=Streams(0)), codes)
+    if e_per_dn > 1:
+        assert np.array_equal(sensor.read(codes * e_per_dn + e_per_dn - 1, streams=Streams(0)), codes)
+
+
+def test_filters_need_a_layout_that_says_which_site_has_which():
+    with pytest.raises(
+        SimulationError, match="the sensor has 3 filters, but the layout does not say which site has which"
+    ):
+        fs.Sensor(fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0), filters="rgb")
+
+
+def test_one_filter_does_not_serve_a_mosaic_of_three():
+    layout = fs.layout.mosaic(fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0), ("RG", "GB"))
+
+    with pytest.raises(SimulationError, match="sites of channel 2, but the sensor only the filters 0 to 0"):
+        fs.Sensor(layout, filters=fs.FilterSet((fs.GaussianCurve(centre_nm=550, fwhm_nm=80),)))
+
+
+@pytest.mark.parametrize("capacitance_f", [100.0, 1e-30])
+def test_a_capacitance_in_other_units_is_refused(capacitance_f):
+    with pytest.raises(ParameterError, match=r"'capacitance_f' must be from .* capacitances are in farad"):
+        fs.Sensor(fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0), capacitance_f=capacitance_f)

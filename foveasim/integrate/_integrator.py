@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim.arrays import Floats, finite_array, read_only
-from foveasim.errors import ParameterError
+from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate._plan import Plan, compile_plan
 from foveasim.parallel import thread_count
-from foveasim.rings import site_moments
+from foveasim.rings import site_area_um2, site_bounds_um
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 __all__ = ["Integrator"]
 
-#: A site counts as lying wholly on the grid when less than this share of it is off: rounding of its area.
+#: A site lies on the grid when no corner is further off than this share of the grid's coordinates: their rounding.
 UNCOVERED_ROUNDING = 1e-12
 
 
@@ -40,7 +40,9 @@ class Integrator:
     Raises
     ------
     ParameterError
-        When ``n_threads`` is no positive whole number; on a call, when a map does not fit the grid.
+        When an argument is none of the above; on a call, when a map does not fit the grid.
+    GeometryError
+        When an outline is clockwise.
 
     Notes
     -----
@@ -63,10 +65,21 @@ class Integrator:
     """
 
     def __init__(self, layout: PackedRings, grid: Grid, *, n_threads: int | None = None) -> None:
+        if not all(hasattr(layout, name) for name in ("xy_um", "ring_offsets", "site_offsets")):
+            raise ParameterError("layout", f"must be a Layout, or packed rings, got a {type(layout).__name__}")
+        if not isinstance(grid, Grid):
+            raise ParameterError("grid", f"must be a Grid, got a {type(grid).__name__}")
         self.grid = grid
         self.n_threads = thread_count(n_threads)
+        self._area_um2 = site_area_um2(layout.xy_um, layout.ring_offsets, layout.site_offsets)
+        inside_out = np.flatnonzero(self._area_um2 <= 0.0)
+        if inside_out.size:
+            raise GeometryError(
+                f"site {inside_out[0]} has no positive area: its outline must be counter-clockwise, as from_polygons makes it",
+                tuple(int(i) for i in inside_out),
+            )
         self._plan: Plan = compile_plan(layout, grid, self.n_threads)
-        self._area_um2 = site_moments(layout.xy_um, layout.ring_offsets, layout.site_offsets)[0]
+        self._bounds_um = site_bounds_um(layout.xy_um, layout.ring_offsets, layout.site_offsets)
 
     def __repr__(self) -> str:
         return f"Integrator({self.n_sites} sites on {self.grid})"
@@ -79,8 +92,14 @@ class Integrator:
     @cached_property
     def uncovered_um2(self) -> Floats:
         """Area of each site that lies off the grid and receives nothing, (n_site,) µm²."""
-        rest = self._area_um2 - self._plan.covered_um2
-        return read_only(np.where(rest > UNCOVERED_ROUNDING * self._area_um2, rest, 0.0))
+        x_min, y_min, x_max, y_max = self.grid.bounds_um
+        rounding_um = UNCOVERED_ROUNDING * max(map(abs, self.grid.bounds_um))
+        low_um, high_um = self._bounds_um[:, :2], self._bounds_um[:, 2:]
+        beyond_um = np.maximum(np.array([x_min, y_min]) - low_um, high_um - np.array([x_max, y_max])).max(
+            axis=1, initial=-np.inf
+        )
+        rest_um2 = np.clip(self._area_um2 - self._plan.covered_um2, 0.0, self._area_um2)
+        return read_only(np.where(beyond_um > rounding_um, rest_um2, 0.0))
 
     def __call__(self, power_map: ArrayLike) -> Floats:
         """
@@ -95,7 +114,14 @@ class Integrator:
         -------
         power : (..., n_site) float64, the map's unit times µm²
         """
-        cells = np.asarray(power_map)
+        try:
+            cells = np.asarray(power_map)
+        except ValueError:
+            raise ParameterError("power_map", "must be an array of numbers", power_map) from None
+        if cells.dtype.hasobject:
+            raise ParameterError(
+                "power_map", f"must be an array, got a {type(power_map).__name__}", cure="of a PowerMap give its .data"
+            )
         if cells.ndim < 2 or cells.shape[-2:] != self.grid.shape:
             raise ParameterError(
                 "power_map",

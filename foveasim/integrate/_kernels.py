@@ -29,8 +29,9 @@ SITE, ROW, COLUMN, N_PARTIAL, N_RUN = range(5)
 BLOCK = 8
 #: Shorter runs are stored cell by cell, which costs less than a header and a sum of their own.
 MIN_RUN = 12
-#: A winding sum below this is rounding (a few additions of numbers up to 1), not coverage.
-NO_COVERAGE = 4e-15
+#: A weight below this share of all that the outline climbs in a row is the rounding of a sum of up to eight pieces, not
+#: coverage; of more pieces, in proportion.
+NO_COVERAGE = 2e-15
 #: End of a linked list.
 END = -1
 
@@ -51,7 +52,7 @@ _int_list = types.int64[::1]
 
 
 @njit(cache=True, nogil=True)
-def _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x):
+def _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_rows):
     """Upper bound of the number of cells on the grid that the rings' edges touch."""
     bound = 0
     for ring in range(first_ring, last_ring):
@@ -62,42 +63,54 @@ def _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x):
             columns = min(max(uv[b, 0], 0.0), float(n_x)) - min(max(uv[a, 0], 0.0), float(n_x))
             bound += int(abs(rows)) + int(abs(columns)) + 4
             a = b
-    return bound
+    return min(bound, n_rows * (n_x + 1))
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _find_cell(head, links, n_cells, row, column, cursor):
+def _find_cell(head, recent, links, n_cells, row, column):
     """
     Scratch cell (row, column): its index, and the count of cells, one higher when it had to be made.
 
-    ``links[i]`` is (column, next cell of the row); a row's list is in order of columns. ``cursor`` is a cell of
-    the same row to begin the search at, or END.
+    ``links[i]`` is (column, next, previous cell of the row); a row's list is in order of columns. The search begins at
+    the row's most recent cell: an outline is continuous, so the next one is near.
     """
-    if cursor != END and links[cursor, 0] == column:
-        return cursor, n_cells
-    previous = cursor if cursor != END and links[cursor, 0] < column else END
-    here = head[row] if previous == END else links[previous, 1]
-    while here != END and links[here, 0] < column:
-        previous = here
-        here = links[here, 1]
-    if here != END and links[here, 0] == column:
-        return here, n_cells
-    links[n_cells, 0] = column
-    links[n_cells, 1] = here
-    if previous == END:
+    here = recent[row]
+    if here == END:
+        links[n_cells, 0] = column
+        links[n_cells, 1] = END
+        links[n_cells, 2] = END
         head[row] = n_cells
-    else:
-        links[previous, 1] = n_cells
-    return n_cells, n_cells + 1
+        recent[row] = n_cells
+        return n_cells, n_cells + 1
+    while links[here, 0] < column and links[here, 1] != END:
+        here = links[here, 1]
+    while links[here, 0] > column and links[here, 2] != END:
+        here = links[here, 2]
+    if links[here, 0] != column:
+        before = here if links[here, 0] < column else END
+        behind = links[here, 1] if links[here, 0] < column else here
+        here = n_cells
+        links[here, 0] = column
+        links[here, 1] = behind
+        links[here, 2] = before
+        if behind != END:
+            links[behind, 2] = here
+        if before != END:
+            links[before, 1] = here
+        else:
+            head[row] = here
+        n_cells += 1
+    recent[row] = here
+    return here, n_cells
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _trace_edge(ua, va, ub, vb, n_y, n_x, bottom, head, links, cover, n_cells):
+def _trace_edge(ua, va, ub, vb, n_y, n_x, bottom, head, recent, climb, links, cover, n_cells):
     """
     Add one edge to the scratch cells; returns their count.
 
     ``cover[i]`` is (height, area): the signed height of the edge's pieces in the cell, and the area between
-    them and the cell's left border.
+    them and the cell's left border. ``climb[row]`` is (height of all pieces in the row without their signs, number of them).
     """
     sign = 1.0
     if va > vb:  # always upwards, so that two neighbours cut a shared edge at the same points
@@ -107,6 +120,8 @@ def _trace_edge(ua, va, ub, vb, n_y, n_x, bottom, head, links, cover, n_cells):
         return n_cells
     slope = (ub - ua) / (vb - va)
     steepness = (vb - va) / abs(ub - ua) if ub != ua else 0.0
+    if not np.isfinite(steepness):  # as good as vertical
+        steepness = 0.0
     u_low, u_high = min(ua, ub), max(ua, ub)
     top = min(vb, float(n_y))
     row = int(np.floor(max(va, 0.0)))
@@ -119,18 +134,19 @@ def _trace_edge(ua, va, ub, vb, n_y, n_x, bottom, head, links, cover, n_cells):
             left, right = right, left
         if right > 0.0 or left == 0.0:  # what is left of the map has no cell on its left
             rise = high - low
+            climb[row - bottom, 0] += rise
             u = max(left, 0.0)
             climbed = (u - left) * steepness
             column = int(min(u, float(n_x)))
-            cell = END
             while True:
                 # Right of the map an edge has every cell of the row on its left: column n_x stands for it.
                 is_last = right <= column + 1.0 or column == n_x
                 u_next = right if is_last else column + 1.0
                 height = rise if is_last else (u_next - left) * steepness
                 piece = sign * (height - climbed)
+                climb[row - bottom, 1] += 1.0
                 climbed = height
-                cell, count = _find_cell(head, links, n_cells, row - bottom, column, cell)
+                cell, count = _find_cell(head, recent, links, n_cells, row - bottom, column)
                 if count > n_cells:
                     cover[cell, 0] = 0.0
                     cover[cell, 1] = 0.0
@@ -157,13 +173,14 @@ def _grown(array, n_used, n_more):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _write_row(first_cell, links, cover, n_x, site, row, spans, n_spans, weights, n_weights):
+def _write_row(first_cell, links, cover, climb, n_x, site, row, spans, n_spans, weights, n_weights):
     """Append the spans of one row of one site; returns the new counts, and the area covered."""
     winding = 0.0  # weight of the cells before the next touched one: the sum of the heights from there on
     here = first_cell
     while here != END:
         winding += cover[here, 0]
         here = links[here, 1]
+    rounding = NO_COVERAGE * climb[0] * max(climb[1] / 8.0, 1.0)
     covered = 0.0
     column = 0  # the next one to be written
     is_open = False  # whether the last span goes on
@@ -179,10 +196,10 @@ def _write_row(first_cell, links, cover, n_x, site, row, spans, n_spans, weights
             else:
                 n_cells = n_between
                 weight = winding
-                if n_cells > 0 and abs(weight) <= NO_COVERAGE:
-                    is_open = False
-                    continue
             if n_cells == 0:
+                continue
+            if abs(weight) <= rounding:
+                is_open = False
                 continue
             if not is_open:
                 spans[n_spans, SITE] = site
@@ -239,7 +256,9 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x)
     n_spans = 0
     n_weights = 0
     head = np.empty(64, np.int32)
-    links = np.empty((256, 2), np.int32)
+    recent = np.empty(64, np.int32)
+    climb = np.empty((64, 2), np.float64)
+    links = np.empty((256, 3), np.int32)
     cover = np.empty((256, 2), np.float64)
 
     for site in range(first_site, last_site):
@@ -252,20 +271,36 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x)
             continue
         bottom = int(np.floor(max(v_low, 0.0)))
         n_rows = int(np.ceil(min(v_high, float(n_y)))) - bottom
-        size = _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x)
+        size = _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_rows)
         if head.size < n_rows:
             head = np.empty(2 * n_rows, np.int32)
+            recent = np.empty(2 * n_rows, np.int32)
+            climb = np.empty((2 * n_rows, 2), np.float64)
         if links.shape[0] < size:
-            links = np.empty((2 * size, 2), np.int32)
+            links = np.empty((2 * size, 3), np.int32)
             cover = np.empty((2 * size, 2), np.float64)
         head[:n_rows] = END
+        recent[:n_rows] = END
+        climb[:n_rows] = 0.0
         n_cells = 0
         for ring in range(first_ring, last_ring):
             start, stop = ring_offsets[ring], ring_offsets[ring + 1]
             a = stop - 1
             for b in range(start, stop):
                 n_cells = _trace_edge(
-                    uv[a, 0], uv[a, 1], uv[b, 0], uv[b, 1], n_y, n_x, bottom, head, links, cover, n_cells
+                    uv[a, 0],
+                    uv[a, 1],
+                    uv[b, 0],
+                    uv[b, 1],
+                    n_y,
+                    n_x,
+                    bottom,
+                    head,
+                    recent,
+                    climb,
+                    links,
+                    cover,
+                    n_cells,
                 )
                 a = b
         # A touched cell gives at most two spans, its own weight, and a run or the weights of a short one.
@@ -273,7 +308,7 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x)
         weights = _grown(weights, n_weights, MIN_RUN * n_cells)
         for row in range(n_rows):
             n_spans, n_weights, area = _write_row(
-                head[row], links, cover, n_x, site, bottom + row, spans, n_spans, weights, n_weights
+                head[row], links, cover, climb[row], n_x, site, bottom + row, spans, n_spans, weights, n_weights
             )
             covered[site - first_site] += area
     return spans[:n_spans].copy(), weights[:n_weights].copy(), covered

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Layout"]
 
+#: A layout that is smaller as a whole was given in other units.
+MIN_LAYOUT_UM = 1e-3
 #: A ring whose area is below this share of its bounding box is a line to float64.
 ZERO_AREA_SHARE = 1e-14
 #: How many bad sites a message names.
@@ -198,6 +200,10 @@ class Layout:
             _per_site(np.abs(xy_um) > MAX_LENGTH_UM, ring_offsets, site_offsets),
             f"lies further than {MAX_LENGTH_UM:g} µm from the origin; coordinates are in µm",
         )
+        if xy_um.size and np.ptp(xy_um, axis=0).max() < MIN_LAYOUT_UM:
+            raise GeometryError(
+                f"the whole layout is only {np.ptp(xy_um, axis=0).max():g} µm wide; coordinates are in µm"
+            )
         xy_um, ring_offsets = _without_repeats(xy_um, ring_offsets)
         _require(
             np.logical_or.reduceat(np.diff(ring_offsets) < 3, site_offsets[:-1]),
@@ -331,8 +337,11 @@ class Layout:
 
     def with_columns(self, **columns: ArrayLike) -> Layout:
         """Layout with these columns added or replaced."""
+        return self._with_columns(columns, f"columns {', '.join(columns)} set")
+
+    def _with_columns(self, columns: Mapping[str, ArrayLike], step: str) -> Layout:
         merged = {**self.columns, **{name: _column(name, values) for name, values in columns.items()}}
-        return Layout(self.xy_um, self.ring_offsets, self.site_offsets, merged, self.provenance)
+        return Layout(self.xy_um, self.ring_offsets, self.site_offsets, merged, self._then(step))
 
     def translate(self, dx_um: float, dy_um: float) -> Layout:
         """Layout moved by (dx, dy) in µm."""

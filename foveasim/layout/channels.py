@@ -49,4 +49,7 @@ def mosaic(layout: Layout, block: Sequence[str], names: str = "RGB") -> Layout:
         )
     channels = np.array([[names.index(letter) for letter in row] for row in rows])
     row, column = (layout.index_column(name) for name in pair)
-    return layout.with_columns(channel=channels[row % channels.shape[0], column % channels.shape[1]])
+    return layout._with_columns(  # noqa: SLF001 -- of the same room
+        {"channel": channels[row % channels.shape[0], column % channels.shape[1]]},
+        f"mosaic {' '.join(rows)} of {names}",
+    )

@@ -111,6 +111,12 @@ class RuleResult:
     unit: str
     violations: tuple[Violation, ...]
 
+    def __str__(self) -> str:
+        if self.worst is None:
+            return f"{self.rule}: kept"
+        count = f"{len(self.violations)} violation{'s' * (len(self.violations) != 1)}"
+        return f"{self.rule}: {count}, worst {self.worst:.6g} {self.unit} for a limit of {self.limit:g} {self.unit}"
+
     @property
     def worst(self) -> float | None:
         """The value furthest beyond the limit, or None."""
@@ -150,16 +156,15 @@ class Report:
         Raises
         ------
         GeometryError
-            With a line for every broken rule, and the sites in ``.site_ids``.
+            Naming every broken rule, with the sites in ``.site_ids``.
         """
         if not self.ok:
-            lines = [
-                f"{r.rule}: {len(r.violations)} violations, worst {r.worst:.6g} {r.unit} for a limit of {r.limit:g} {r.unit}"
-                for r in self.results
-                if r.violations
-            ]
+            lines = [str(result) for result in self.results if result.violations]
             ids = sorted({site for violation in self.violations for site in violation.site_ids})
             raise GeometryError("the layout breaks its design rules: " + "; ".join(lines), tuple(ids))
+
+    def __str__(self) -> str:
+        return "\n".join([f"design rules on {self.n_sites} photosites", *map(str, self.results)])
 
     def __rich__(self) -> Table:
         from rich.table import Table
@@ -188,6 +193,8 @@ def check(layout: Layout, rules: DesignRules) -> Report:
     Report
         One result for each rule that has a limit.
     """
+    if not isinstance(rules, DesignRules):
+        raise ParameterError("rules", f"must be DesignRules, got a {type(rules).__name__}")
     polygons = layout.polygons()
     results = []
     for name, (sentence, unit, find) in RULES.items():
@@ -259,17 +266,11 @@ def _gaps(layout: Layout, polygons: NDArray[Any], rules: DesignRules) -> list[Vi
     rounding_um2 = AREA_ROUNDING * (layout.area_um2.min() if layout.n_sites else 0.0)
     bad = np.flatnonzero(area_um2 > limit_um2 + rounding_um2)
     bad = bad[np.argsort(-area_um2[bad], kind="stable")]
-    around, site = shapely.STRtree(polygons).query(opened[bad], predicate="intersects")
+    gap, site = shapely.STRtree(polygons).query(opened[bad], predicate="intersects")
+    around = np.split(site[np.argsort(gap, kind="stable")], np.cumsum(np.bincount(gap, minlength=bad.size)))[: bad.size]
     return [
-        Violation(
-            "max_gap_um2",
-            tuple(sorted(int(s) for s in site[around == k])),
-            float(area_um2[i]),
-            limit_um2,
-            "µm²",
-            opened[i],
-        )
-        for k, i in enumerate(bad)
+        Violation("max_gap_um2", tuple(sorted(map(int, sites))), float(area_um2[i]), limit_um2, "µm²", opened[i])
+        for i, sites in zip(bad, around, strict=True)
     ]
 
 

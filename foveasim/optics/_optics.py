@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,11 +68,10 @@ class Optics:
     exactly, whatever its size (for cells wider than λN/2 the aliases of every frequency are summed).
 
     The Gauss conditions (pupil much smaller than the distances, small angles) make the point spread function the same
-    all over the field, so a map is ``IFFT(FFT(scene * falloff) * OTF)``. On the axis the light that the pupil takes is
-    exact for any aperture; the small-angle form ``π L / 4 N²`` is its limit.
+    all over the field, so a map is ``IFFT(FFT(scene * falloff) * OTF)``. ``π L / (1 + 4 N²)`` is the light from the cone
+    that a flat pupil fills, seen from the image, where ISETCam's camera equation takes it too; ``π L / 4 N²`` is its limit for
+    small apertures, and the isotropic ``L / (8 N²)`` is of that small-angle kind.
     """
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     focal_length_mm: float
     f_number: float
@@ -84,14 +83,22 @@ class Optics:
     precision: Literal["single", "double"] = "single"
 
     def __post_init__(self) -> None:
-        check_number("focal_length_mm", self.focal_length_mm, above=0.0, at_most=1e6)
-        check_number("f_number", self.f_number, above=0.0, at_most=1e4)
+        numbers = {
+            "focal_length_mm": check_number(
+                "focal_length_mm", self.focal_length_mm, above=0.0, at_most=1e6, cure="focal lengths are in mm"
+            ),
+            "f_number": check_number("f_number", self.f_number, above=0.0, at_most=1e4),
+            "transmission": check_number("transmission", self.transmission, above=0.0, at_most=1.0),
+        }
+        check_number("focal_length_mm", self.focal_length_mm, at_least=0.01, cure="focal lengths are in mm")
+        check_number("f_number", self.f_number, at_least=0.5, cure="no lens in air is faster than f/0.5")
+        if self.padding_cells is not None:
+            numbers["padding_cells"] = check_count("padding_cells", self.padding_cells, at_least=0, at_most=2**20)
+        for name, number in numbers.items():
+            object.__setattr__(self, name, number)
         check_choice("emission", self.emission, ("lambertian", "isotropic"))
-        check_number("transmission", self.transmission, above=0.0, at_most=1.0)
         check_choice("source_pixel", self.source_pixel, ("point", "square"))
         check_choice("padding", self.padding, PADDINGS)
-        if self.padding_cells is not None:
-            check_count("padding_cells", self.padding_cells, at_least=0, at_most=2**20)
         check_choice("precision", self.precision, ("single", "double"))
 
     # -- geometry -------------------------------------------------------------------------------------------------
@@ -173,25 +180,28 @@ class Optics:
         n_threads : int, optional
             All cores by default.
 
-        Yields
-        ------
-        map : (n_y, n_x) float32 or float64
+        Returns
+        -------
+        maps : iterator of (n_y, n_x) float32 or float64
+            Each is computed when it is asked for.
 
         Notes
         -----
         Since a sum over wavelengths can be taken before the inverse transform, and the scene is a sum of B basis
         images, the cost is B forward transforms and one inverse transform an output, for any number of wavelengths.
         """
+        weights = np.asarray(weights, dtype=np.float64)
+        cutoff_per_um = 1.0 / (um_from_nm(scene.wavelength_nm) * self.working_f_number(scene.distance_m))
+        cutoff_per_um = np.minimum(cutoff_per_um, MAX_ALIASES / self.grid(scene).pitch_um)
+        self._warn_if_too_small(cutoff_per_um, self.grid(scene))
+        return self._weighted_maps(scene, weights, cutoff_per_um, thread_count(n_threads))
+
+    def _weighted_maps(
+        self, scene: SceneLike, weights: Floats, cutoff_per_um: Floats, n_threads: int
+    ) -> Iterator[NDArray[Any]]:
         from foveasim.optics._transform import Transform, source_pixels
 
-        weights = np.asarray(weights, dtype=np.float64)
-        n_threads = thread_count(n_threads)
-        working_n = self.working_f_number(scene.distance_m)
         grid = self.grid(scene)
-        cutoff_per_um = 1.0 / (um_from_nm(scene.wavelength_nm) * working_n)
-        cutoff_per_um = np.minimum(cutoff_per_um, MAX_ALIASES / grid.pitch_um)
-        self._warn_if_too_small(cutoff_per_um, grid)
-
         pad = self.padding_cells
         if pad is None:
             pad = math.ceil(REACH_SHARE / LOST_SHARE / (float(cutoff_per_um.min()) * grid.pitch_um))
@@ -236,10 +246,12 @@ class Optics:
         # On the sensor side the ratio of its two sides is min(M, N) p / (2 λ N).
         ratio = 0.5 * min(grid.shape) * grid.pitch_um * float(cutoff_per_um.min())
         if ratio < MUCH_LARGER:
+            height, width = (n * grid.pitch_um for n in grid.shape)
             warnings.warn(
-                f"the aperture's radius is only {ratio:.3g} times H λ / (p0 min(M, N)) (Eq. 5 asks for much more, here "
-                f"{MUCH_LARGER:g} times): the diffraction pattern is not small against the picture; take a larger picture "
-                "or a smaller f-number",
+                f"the image of the scene is only {width:.4g} x {height:.4g} µm, and the lens spreads a point over "
+                f"{2.44 / float(cutoff_per_um.min()):.3g} µm: the paper's Eq. 5 wants the aperture's radius to be much "
+                f"larger than H λ / (p0 min(M, N)), and it is {ratio:.3g} times that; take a larger picture or a smaller "
+                "f-number, and see that pitch_um, distance_m and focal_length_mm are in their units",
                 SamplingWarning,
                 stacklevel=4,
             )

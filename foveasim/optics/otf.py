@@ -11,9 +11,11 @@ from foveasim.arrays import Floats
 
 __all__ = ["RadialTables", "circular_otf"]
 
-#: Points of a radial table; the one of float32 fits the first-level cache. Linear interpolation errs by at most 2.4e-7 of the
-#: value at zero frequency in float32 and 3.0e-8 in float64, next to the cut-off, and by far less elsewhere.
+#: Points of a radial table up to the smallest cut-off; the one of float32 fits the first-level cache. Linear interpolation
+#: errs by at most 2.4e-7 of the value at zero frequency in float32 and 3.0e-8 in float64, next to the cut-off.
 TABLE_POINTS = {np.float32: 1 << 13, np.float64: 1 << 15}
+#: Numbers that the tables of all wavelengths may hold together, 128 MiB; beyond that their steps grow.
+MAX_TABLE_SIZE = 1 << 24
 
 
 def circular_otf(s: ArrayLike) -> Floats:
@@ -45,7 +47,9 @@ class RadialTables:
     def __init__(self, cutoff_per_um: Floats, real: type[np.floating[Any]]) -> None:
         self.f_max_per_um = float(cutoff_per_um.max())
         self._real = real
-        self._otf = circular_otf(np.linspace(0.0, self.f_max_per_um, TABLE_POINTS[real]) / cutoff_per_um[:, np.newaxis])
+        wanted = TABLE_POINTS[real] * float(self.f_max_per_um / cutoff_per_um.min())
+        n_points = max(TABLE_POINTS[real], int(min(wanted, MAX_TABLE_SIZE / cutoff_per_um.size)))
+        self._otf = circular_otf(np.linspace(0.0, self.f_max_per_um, n_points) / cutoff_per_um[:, np.newaxis])
 
     def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
         """The table, and its steps over frequency (µm)."""

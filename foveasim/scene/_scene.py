@@ -10,16 +10,28 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Images, check_choice, check_number, check_shape, finite_array, read_only
+from foveasim.arrays import (
+    Floats,
+    Images,
+    check_choice,
+    check_number,
+    check_shape,
+    finite_array,
+    read_only,
+    wavelengths_nm,
+)
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import from_file_rows
 from foveasim.pictures import read_picture
+from foveasim.units import m_from_um
 
 __all__ = ["Scene", "decoded"]
 
 #: Wavelengths that a colour picture's red, green and blue stand for, and a grey one's, unless told otherwise.
 RGB_NM = (620.0, 550.0, 450.0)
 GREY_NM = (550.0,)
+#: Encoded floating-point numbers above this are no picture from 0 to 1, but one from 0 to 255.
+MAX_ENCODED = 16.0
 #: Weights of red, green and blue in the brightness of a colour (Rec. ITU-R BT.709).
 BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
@@ -78,7 +90,7 @@ class Scene:
             raise ParameterError("basis", "must be finite everywhere; the picture has a NaN or an infinity")
         if lowest < 0.0:
             raise ParameterError("basis", "must be >= 0 everywhere, since light is not negative", lowest)
-        wavelength_nm = finite_array("wavelength_nm", np.atleast_1d(self.wavelength_nm), ndim=1, above=0.0)
+        wavelength_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)
         width_nm = finite_array("band_width_nm", np.atleast_1d(self.band_width_nm), ndim=1, above=0.0)
         spectrum = finite_array("spectrum_w_m2_sr_nm", self.spectrum_w_m2_sr_nm, ndim=2, at_least=0.0)
         if width_nm.shape != wavelength_nm.shape:
@@ -92,7 +104,7 @@ class Scene:
             )
         object.__setattr__(self, "basis", read_only(basis.view()))
         object.__setattr__(self, "spectrum_w_m2_sr_nm", read_only(spectrum.copy()))
-        object.__setattr__(self, "wavelength_nm", read_only(wavelength_nm.copy()))
+        object.__setattr__(self, "wavelength_nm", wavelength_nm)
         object.__setattr__(self, "band_width_nm", read_only(width_nm.copy()))
         object.__setattr__(self, "pitch_um", check_number("pitch_um", self.pitch_um, above=0.0, at_most=1e9))
         object.__setattr__(self, "distance_m", check_number("distance_m", self.distance_m, above=0.0, at_most=1e9))
@@ -171,7 +183,7 @@ class Scene:
         n_channels = channels.shape[0]
         if wavelength_nm is None:
             wavelength_nm = RGB_NM if n_channels == 3 else GREY_NM
-        waves_nm = finite_array("wavelength_nm", np.atleast_1d(np.asarray(wavelength_nm)), ndim=1, above=0.0)
+        waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
         if spectrum is not None:
             relative = finite_array("spectrum", spectrum, ndim=2, at_least=0.0)
             if relative.shape != (n_channels, waves_nm.size):
@@ -286,9 +298,9 @@ class Scene:
             )
         image = np.zeros((1, n_y, n_x))
         np.add.at(image[0], (points[:, 0], points[:, 1]), intensity)
-        waves_nm = finite_array("wavelength_nm", np.atleast_1d(np.asarray(wavelength_nm)), ndim=1, above=0.0)
+        waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
         # A pixel of the pitch p0 with the radiance I / p0² has the intensity I.
-        per_area = np.full((1, waves_nm.size), 1.0 / (pitch_um * 1e-6) ** 2)
+        per_area = np.full((1, waves_nm.size), 1.0 / float(m_from_um(pitch_um)) ** 2)
         return cls(
             image,
             per_area,
@@ -331,6 +343,13 @@ def _light(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Imag
     elif pixels.dtype.kind == "f":
         if not np.isfinite(pixels).all() or pixels.min() < 0:
             raise ParameterError("picture", "must be finite and >= 0 everywhere")
+        if encoding != "linear" and pixels.max() > MAX_ENCODED:
+            raise ParameterError(
+                "picture",
+                f"must be <= {MAX_ENCODED:g} where encoding='{encoding}'",
+                float(pixels.max()),
+                cure="of floating-point numbers 1 is the peak; divide by 255, or give uint8",
+            )
         colours = pixels[..., :-1] if has_alpha else pixels
         precise = colours.astype(np.float32) if pixels.dtype == np.float16 else colours
         light = decoded(np.ascontiguousarray(from_file_rows(precise)), encoding).astype(np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -18,6 +19,11 @@ from foveasim.units import electrons_to_volts, photon_energy_j
 
 __all__ = ["PerSite", "Photosites", "Sensor"]
 
+#: Capacitances outside this range are a slip of units.
+MIN_CAPACITANCE_F, MAX_CAPACITANCE_F = 1e-18, 1e-6
+#: A charge this share of a code below a code's border is on it: the rounding of a division.
+CODE_ROUNDING = 1e-9
+
 #: One value for all sites, or an array (n_site,).
 PerSite = float | NDArray[np.float64]
 
@@ -33,8 +39,12 @@ class Photosites(PackedRings, Protocol):
     def channel(self) -> Ints:
         """Index of each site's colour filter, (n_site,)."""
 
+    @property
+    def columns(self) -> Mapping[str, NDArray[Any]]:
+        """Data per site by name; ``channel`` is among them where sites differ in colour."""
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Sensor:
     """
     Photosites with their electronics.
@@ -51,7 +61,7 @@ class Sensor:
         Quantum efficiency, electrons per photon: a number, or a function of the wavelength in nm, such as
         :class:`SiliconQE` or :class:`PolynomialCurve`.
     filters : None, "rgb", or FilterSet
-        Colour filters; None for a sensor without, "rgb" for :func:`rgb_filters`.
+        Colour filters; None for a sensor without, whatever the layout's channels, "rgb" for :func:`rgb_filters`.
     dark_e_per_s : float or (n_site,), e-/s
         Dark current.
     full_well_e : float or (n_site,), optional, e-
@@ -90,8 +100,10 @@ class Sensor:
     gaussian_above_e: float = 100.0
 
     def __post_init__(self) -> None:
+        if not all(hasattr(self.layout, name) for name in ("n_sites", "channel", "columns")):
+            raise ParameterError("layout", f"must be a Layout, got a {type(self.layout).__name__}")
         if not callable(self.qe):
-            check_number("qe", self.qe, at_least=0.0, at_most=1.0)
+            object.__setattr__(self, "qe", check_number("qe", self.qe, at_least=0.0, at_most=1.0))
         is_rgb = isinstance(self.filters, str) and self.filters == "rgb"
         if self.filters is not None and not is_rgb and not isinstance(self.filters, FilterSet):
             raise ParameterError("filters", "must be None, 'rgb' or a FilterSet", self.filters)
@@ -104,16 +116,39 @@ class Sensor:
             value = getattr(self, name)
             if value is not None or name != "full_well_e":
                 object.__setattr__(self, name, self._per_site(name, value, above))
-        check_number("v_sat_v", self.v_sat_v, above=0.0)
+        if not np.all(
+            (np.asarray(self.capacitance_f) >= MIN_CAPACITANCE_F)
+            & (np.asarray(self.capacitance_f) <= MAX_CAPACITANCE_F)
+        ):
+            raise ParameterError(
+                "capacitance_f",
+                f"must be from {MIN_CAPACITANCE_F:g} to {MAX_CAPACITANCE_F:g}",
+                self.capacitance_f,
+                "F",
+                "capacitances are in farad: 1 fF is 1e-15",
+            )
+        object.__setattr__(self, "v_sat_v", check_number("v_sat_v", self.v_sat_v, above=0.0))
         object.__setattr__(self, "bits", check_count("bits", self.bits, at_least=1, at_most=16))
         check_choice("shot_noise", self.shot_noise, ("auto", "exact", "off"))
-        check_number("gaussian_above_e", self.gaussian_above_e, at_least=10.0)
+        object.__setattr__(
+            self, "gaussian_above_e", check_number("gaussian_above_e", self.gaussian_above_e, at_least=10.0)
+        )
+        if self.filters is None:
+            return
+        if self.n_filters > 1 and "channel" not in self.layout.columns:
+            raise SimulationError(
+                f"the sensor has {self.n_filters} filters, but the layout does not say which site has which; give it a column "
+                "'channel', for example with foveasim.layout.mosaic(layout, ('RG', 'GB'))"
+            )
         highest = int(self.layout.channel.max(initial=0))
-        if highest >= self.n_filters and self.n_filters > 1:
+        if highest >= self.n_filters:
             raise SimulationError(
                 f"the layout has sites of channel {highest}, but the sensor only the filters 0 to {self.n_filters - 1} "
                 f"({', '.join(self.filter_names)})"
             )
+
+    def __repr__(self) -> str:
+        return f"Sensor({self.layout!r}, filters {', '.join(self.filter_names)}, {self.bits} bits)"
 
     def _per_site(self, name: str, value: PerSite, above: float | None) -> PerSite:
         if np.ndim(value) == 0:
@@ -146,7 +181,7 @@ class Sensor:
     @property
     def filter_of_site(self) -> Ints:
         """Index of each site's filter, (n_site,)."""
-        return self.layout.channel if self.n_filters > 1 else np.zeros(self.layout.n_sites, np.int64)
+        return np.zeros(self.layout.n_sites, np.int64) if self.filters is None else self.layout.channel
 
     def responsivity_e_per_j(self, wavelength_nm: Floats) -> Floats:
         """
@@ -205,5 +240,5 @@ class Sensor:
             charge_e += self.read_noise_e * streams.of("read").standard_normal(charge_e.size)
         voltage_v = np.clip(electrons_to_volts(charge_e, self.capacitance_f), 0.0, self.v_sat_v)
         n_codes = 2**self.bits
-        code = np.minimum(np.floor(voltage_v * (n_codes / self.v_sat_v)), n_codes - 1)
+        code = np.minimum(np.floor(voltage_v * (n_codes / self.v_sat_v) + CODE_ROUNDING), n_codes - 1)
         return code.astype(np.uint8 if self.bits <= 8 else np.uint16)

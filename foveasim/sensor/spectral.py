@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,8 +39,6 @@ class ConstantCurve:
         When it is not.
     """
 
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
-
     value: float = 1.0
 
     def __post_init__(self) -> None:
@@ -72,8 +70,6 @@ class PolynomialCurve:
     -----
     What the polynomial makes of a table near 0 or 1 is limited to that range.
     """
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     wavelength_nm: Sequence[float]
     value: Sequence[float]
@@ -131,8 +127,6 @@ class SiliconQE:
     ``transmission * (1 - exp(-depth / l))`` with the absorption length ``l(wavelength)`` (Beer and Lambert).
     """
 
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
-
     depth_um: float
     transmission: float = 1.0
 
@@ -167,8 +161,6 @@ class GaussianCurve:
         When a value is out of range.
     """
 
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
-
     centre_nm: float
     fwhm_nm: float
     peak: float = 1.0
@@ -202,13 +194,11 @@ class FilterSet:
         When there is no curve, or names and curves differ in number.
     """
 
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
-
-    curves: Sequence[ConstantCurve | GaussianCurve | PolynomialCurve]
+    curves: Sequence[Curve]
     names: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
-        curves = tuple(self.curves)
+        curves = tuple(self.curves) if isinstance(self.curves, Sequence) else ()
         if not curves or not all(callable(curve) for curve in curves):
             raise ParameterError("curves", "must be one or more functions of wavelength", self.curves)
         names = tuple(str(k) for k in range(len(curves))) if self.names is None else tuple(self.names)

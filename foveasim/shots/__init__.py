@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from foveasim.shots._shots import demo_settings, results_table, take, write_results
+from foveasim.shots._shots import Result, check_folder, demo_settings, results_table, run_shot, write_results
 
-__all__ = ["demo_settings", "results_table", "take", "write_results"]
+__all__ = ["Result", "check_folder", "demo_settings", "results_table", "run_shot", "write_results"]

@@ -1,9 +1,11 @@
-"""Taking a shot and writing its results."""
+"""Taking a shot, writing its results, and telling of them."""
 
 from __future__ import annotations
 
-import tempfile
+import os
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
@@ -13,9 +15,10 @@ from rich.table import Table
 from foveasim.capture import Capture
 from foveasim.config import Shot
 from foveasim.errors import FileError
+from foveasim.layout import Layout, Report
 from foveasim.view import plot_capture, save_figure
 
-__all__ = ["demo_settings", "results_table", "take", "write_results"]
+__all__ = ["Result", "check_folder", "demo_settings", "results_table", "run_shot", "write_results"]
 
 #: The demo's shots, in the order shown.
 DEMO_SHOTS = ("foveal", "four_zones")
@@ -28,9 +31,22 @@ def demo_settings() -> list[Path]:
     return [Path(str(files("foveasim.shots") / f"{name}.yaml")) for name in DEMO_SHOTS]
 
 
-def take(shot: Shot) -> Capture:
-    """Capture of a shot."""
-    return shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
+def check_folder(folder: str | Path) -> Path:
+    """
+    The folder for results, before anything is computed for it.
+
+    Raises
+    ------
+    FileError
+        When there is a file of its name, or it could not be made.
+    """
+    folder = Path(folder)
+    present = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not present.is_dir():
+        raise FileError(folder, f"cannot hold results: {present} is a file, and must be a folder")
+    if not os.access(present, os.W_OK | os.X_OK):
+        raise FileError(folder, f"cannot hold results: nothing may be written in {present}")
+    return folder
 
 
 def write_results(shot: Shot, capture: Capture, folder: str | Path) -> tuple[list[Path], float]:
@@ -42,7 +58,7 @@ def write_results(shot: Shot, capture: Capture, folder: str | Path) -> tuple[lis
     shot : Shot
     capture : Capture
     folder : path
-        Made when it does not exist. Nothing is put in it before every file is complete.
+        Made when it does not exist. Each file is put in it when it is complete.
 
     Returns
     -------
@@ -56,49 +72,88 @@ def write_results(shot: Shot, capture: Capture, folder: str | Path) -> tuple[lis
         When the folder cannot be made or written.
     """
     start_s = time.perf_counter()
-    folder = Path(folder)
+    folder = check_folder(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".foveasim-", dir=folder) as staging:
-            stage = Path(staging)
-            capture.picture(max_pixels=PICTURE_PIXELS).save(
-                stage / f"{shot.name}_picture.png", capture.white_dn, encode_srgb=True
-            )
-            axes = plot_capture(capture)
-            axes.set_title(f"{shot.name}: {capture.layout.n_sites} photosites")
-            save_figure(axes.figure, stage / f"{shot.name}_layout.png")  # type: ignore[arg-type]
-            capture.save(stage / f"{shot.name}_capture.npz")
-            paths = [path.replace(folder / path.name) for path in sorted(stage.iterdir())]
     except OSError as error:
-        raise FileError(folder, f"cannot be written: {error.strerror or error}") from None
-    return paths, time.perf_counter() - start_s
+        raise FileError(folder, f"cannot be made: {error.strerror or error}") from None
+    picture, layout, saved = (folder / f"{shot.name}_{what}" for what in ("picture.png", "layout.png", "capture.npz"))
+    capture.picture(max_pixels=PICTURE_PIXELS).save(picture, capture.white_dn, encode_srgb=True)
+    axes = plot_capture(capture)
+    axes.set_title(f"{shot.name}: {capture.layout.n_sites} photosites")
+    save_figure(axes.figure, layout)  # type: ignore[arg-type]
+    capture.save(saved)
+    return [picture, layout, saved], time.perf_counter() - start_s
 
 
-def results_table(results: dict[str, tuple[Capture, float]]) -> Table:
-    """Table of captures by name, each with the seconds that writing its files took."""
+@dataclass(frozen=True)
+class Result:
+    """A shot with its capture, the report of its design rules, and the seconds that writing its files took."""
+
+    shot: Shot
+    capture: Capture
+    report: Report | None
+    writing_s: float
+
+
+def run_shot(shot: Shot, folder: str | Path) -> tuple[Result, list[Path]]:
+    """
+    Take a shot, check its layout against its rules, and write its files.
+
+    Returns
+    -------
+    result : Result
+    paths : list of path
+        The files written.
+
+    Raises
+    ------
+    FoveasimError
+        When parts do not fit together, or files cannot be written.
+    """
+    capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
+    report = None if shot.rules is None else capture.layout.check(shot.rules)
+    paths, writing_s = write_results(shot, capture, folder)
+    return Result(shot, capture, report, writing_s), paths
+
+
+def results_table(results: Sequence[Result]) -> Table:
+    """Table of what the shots' sensors saw, a column a shot."""
     table = Table(title="What the sensors saw")
     table.add_column("")
-    for name in results:
-        table.add_column(name, justify="right")
-
-    def row(title: str, of: list[str]) -> None:
-        table.add_row(title, *of)
-
-    captures = [capture for capture, _ in results.values()]
-    row("photosites", [f"{c.layout.n_sites:,}" for c in captures])
-    row("smallest pixel / µm", [f"{np.sqrt(c.layout.area_um2.min()):.2f}" for c in captures])
-    row("largest pixel / µm", [f"{np.sqrt(c.layout.area_um2.max()):.2f}" for c in captures])
-    row("blind-spot radius / µm", [_blind_spot(c) for c in captures])
-    row("median electrons", [f"{np.median(c.electrons):,.0f}" for c in captures])
-    row("most electrons", [f"{c.electrons.max():,}" for c in captures])
-    row("saturated sites / %", [f"{100 * c.saturated:.2f}" for c in captures])
-    stages = list(dict.fromkeys(stage for c in captures for stage in c.stage_s))
-    for stage in stages:
-        row(f"{stage} / s", [f"{c.stage_s.get(stage, 0.0):.3f}" for c in captures])
-    row("pictures and files / s", [f"{seconds:.3f}" for _, seconds in results.values()])
+    for result in results:
+        table.add_column(result.shot.name, justify="right")
+    captures = [result.capture for result in results]
+    rows = {
+        "photosites": [f"{c.layout.n_sites:,}" for c in captures],
+        "design rules": [_verdict(result.report) for result in results],
+        "smallest pixel / µm": [f"{np.sqrt(c.layout.area_um2.min()):.2f}" for c in captures],
+        "largest pixel / µm": [f"{np.sqrt(c.layout.area_um2.max()):.2f}" for c in captures],
+        "blind-spot radius / µm": [_blind_spot(c.layout) for c in captures],
+        "median electrons": [f"{np.median(c.electrons):,.0f}" for c in captures],
+        "most electrons": [f"{c.electrons.max():,}" for c in captures],
+        "median code / DN": [f"{np.median(c.code):,.0f} of {2**c.bits - 1:,}" for c in captures],
+        "sites at code 0 / %": [f"{100 * np.mean(c.code == 0):.2f}" for c in captures],
+        "saturated sites / %": [f"{100 * c.saturated_share:.2f}" for c in captures],
+    }
+    for stage in dict.fromkeys(stage for c in captures for stage in c.stage_s):
+        rows[f"{stage} / s"] = [f"{c.stage_s.get(stage, 0.0):.3f}" for c in captures]
+    rows["pictures and files / s"] = [f"{result.writing_s:.3f}" for result in results]
+    for title, values in rows.items():
+        table.add_row(title, *values)
     return table
 
 
-def _blind_spot(capture: Capture) -> str:
-    radius_um = capture.layout.provenance.get("blind_radius_um")
-    return "none" if radius_um is None else f"{radius_um:.2f}"
+def _verdict(report: Report | None) -> str:
+    if report is None:
+        return "none given"
+    return "kept" if report.ok else f"{len(report.violations):,} violations"
+
+
+def _blind_spot(layout: Layout) -> str:
+    """Radius of the hole in the middle of the innermost ring."""
+    if "ring" not in layout.columns:
+        return "none"
+    innermost = layout[layout.columns["ring"] == layout.columns["ring"].min()]
+    middle_um = innermost.centroid_um.mean(axis=0)
+    return f"{np.linalg.norm(innermost.xy_um - middle_um, axis=1).min():.2f}"
