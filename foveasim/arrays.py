@@ -12,6 +12,7 @@ from foveasim.errors import ParameterError
 
 __all__ = [
     "MAX_LENGTH_UM",
+    "MAX_SITES",
     "UNIT_SUFFIXES",
     "Bools",
     "Floats",
@@ -23,6 +24,7 @@ __all__ = [
     "check_length_um",
     "check_number",
     "check_shape",
+    "check_sites",
     "finite_array",
     "read_only",
     "unit_of",
@@ -39,6 +41,8 @@ _Array = TypeVar("_Array", bound=NDArray[Any])
 
 #: Lengths on a sensor outside this range are a slip of units: less than an atom, more than ten metres.
 MIN_LENGTH_UM, MAX_LENGTH_UM = 1e-4, 1e7
+#: More photosites than this are a slip in a generator's parameters.
+MAX_SITES = 50_000_000
 #: Wavelengths outside this range are, too: from hard ultraviolet to a millimetre.
 MIN_WAVELENGTH_NM, MAX_WAVELENGTH_NM = 10.0, 1e6
 
@@ -168,6 +172,18 @@ def check_length_um(name: str, value: object, *, at_most: float | None = None, c
     return check_number(
         name, length_um, at_least=MIN_LENGTH_UM, at_most=MAX_LENGTH_UM, cure=cure or "lengths on a sensor are in µm"
     )
+
+
+def check_sites(n_sites: int) -> int:
+    """
+    A number of sites that a generator is about to make.
+
+    Raises
+    ------
+    ParameterError
+        When there would be too many.
+    """
+    return check_count("n_sites", n_sites, at_most=MAX_SITES, cure="take fewer or larger photosites")
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> str:

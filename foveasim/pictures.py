@@ -276,7 +276,7 @@ def write_picture(path: str | Path, picture: NDArray[np.uint8]) -> None:
 
     target = Path(path)
     if Image.registered_extensions().get(target.suffix.lower()) not in PILLOW_FORMATS:
-        raise FileError(target, "must end in the name of a picture format, such as .png")
+        raise FileError(target, "must end in .png, .webp, .jpg, .bmp, .tga, .ppm or .jp2; .png keeps every number")
     if picture.ndim == 3 and picture.shape[2] == 1:
         picture = picture[..., 0]
     if (
@@ -292,5 +292,5 @@ def write_picture(path: str | Path, picture: NDArray[np.uint8]) -> None:
     with written_whole(target) as temporary:
         try:
             Image.fromarray(np.ascontiguousarray(picture)).save(temporary)
-        except ValueError as error:
-            raise FileError(target, f"cannot be written in this format: {error}") from None
+        except (OSError, ValueError) as error:
+            raise FileError(target, f"cannot be written in this format ({error}); take .png") from None

@@ -21,7 +21,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 FLOORS = [
     {"errors", "_version"},
     {"arrays", "compiled", "files"},
-    {"units", "parallel", "records", "streams", "rings", "pictures"},
+    {"encodings", "units", "parallel", "records", "streams", "rings", "pictures"},
     {"fields"},
     {"layout", "scene", "optics", "integrate", "sensor"},
     {"reconstruct"},

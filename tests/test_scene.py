@@ -11,8 +11,9 @@ import skimage.color
 import tifffile
 from PIL import Image
 
+from foveasim.encodings import decoded
 from foveasim.errors import FileError, ParameterError
-from foveasim.scene import Scene, decoded
+from foveasim.scene import Scene
 
 EPS32 = float(np.finfo(np.float32).eps)
 

@@ -435,8 +435,10 @@ def _unpacked(polygons: Any) -> tuple[Floats, Ints, Ints]:
     if not is_polygon.all():
         bad = int(np.flatnonzero(~is_polygon)[0])
         kind = type(geometries[bad]).__name__
+        is_geometry = isinstance(geometries[bad], shapely.Geometry)
+        cure = "give each part of it as a site of its own" if is_geometry else "make one with shapely.Polygon(vertices)"
         raise GeometryError(
-            f"site {bad} must be a shapely Polygon, got a {kind}; give each part of a multi-part site as a site of its own",
+            f"site {bad} must be a shapely Polygon, got a {kind}; {cure}",
             (bad,),
         )
     _require(shapely.is_empty(geometries), "is empty")
@@ -470,7 +472,7 @@ def _require_simple(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> No
     is_bad = ~shapely.is_valid(polygons)
     if is_bad.any():
         reason = str(shapely.is_valid_reason(polygons[np.flatnonzero(is_bad)[0]]))
-        _require(is_bad, f"crosses or touches itself ({reason}); repair it, for example with shapely.make_valid")
+        _require(is_bad, f"crosses or touches itself ({reason}); repair its outline")
 
 
 def _without_repeats(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Ints]:

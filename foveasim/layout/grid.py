@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from foveasim.arrays import Floats, check_count, check_length_um
+from foveasim.arrays import Floats, check_count, check_length_um, check_sites
 from foveasim.layout._model import Layout
 
 __all__ = ["grid"]
@@ -45,7 +45,8 @@ def grid(*, n_x: int, n_y: int, pitch_um: float, width_um: float | None = None) 
     n_x, n_y = check_count("n_x", n_x), check_count("n_y", n_y)
     pitch_um = check_length_um("pitch_um", pitch_um)
     if width_um is not None:
-        width_um = check_length_um("width_um", width_um, at_most=pitch_um)
+        width_um = check_length_um("width_um", width_um, at_most=pitch_um, cure="it is no larger than 'pitch_um'")
+    check_sites(n_x * n_y)
     row, column = (index.ravel() for index in np.divmod(np.arange(n_y * n_x), n_x))
     corners = square_corners_um(column - 0.5 * n_x, row - 0.5 * n_y, pitch_um, width_um)
     return Layout.from_equal_rings(

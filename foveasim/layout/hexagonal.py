@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from foveasim.arrays import check_choice, check_count, check_length_um
+from foveasim.arrays import check_choice, check_count, check_length_um, check_sites
 from foveasim.layout._model import Layout
 
 __all__ = ["hexagonal"]
@@ -58,8 +58,9 @@ def hexagonal(
     n_columns, n_rows = check_count("n_columns", n_columns), check_count("n_rows", n_rows)
     pitch_um = check_length_um("pitch_um", pitch_um)
     if width_um is not None:
-        width_um = check_length_um("width_um", width_um, at_most=pitch_um)
+        width_um = check_length_um("width_um", width_um, at_most=pitch_um, cure="it is no larger than 'pitch_um'")
     check_choice("orientation", orientation, ("pointy", "flat"))
+    check_sites(n_columns * n_rows)
     row, column = (index.ravel() for index in np.divmod(np.arange(n_rows * n_columns), n_columns))
     # Every corner of the packing lies on a lattice of half pitches and half sides: neighbours' corners are equal.
     half_um = np.array([0.5 * pitch_um, 0.5 * pitch_um / math.sqrt(3.0)])

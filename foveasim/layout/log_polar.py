@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from foveasim.arrays import Floats, Ints, check_count, check_length_um, check_number
+from foveasim.arrays import MAX_SITES, Floats, Ints, check_count, check_length_um, check_number
 from foveasim.errors import ParameterError
 from foveasim.layout._model import Layout
 
@@ -14,8 +14,6 @@ __all__ = ["log_polar", "square_ring_ratio"]
 
 #: Rings thinner than this share of their radius are rounding.
 RATIO_ROUNDING = 1e-12
-#: More sites than this are a slip in the parameters.
-MAX_SITES = 50_000_000
 
 
 def square_ring_ratio(n_sectors: int) -> float:
@@ -96,7 +94,7 @@ def log_polar(
     r_max_um = check_length_um("r_max_um", r_max_um)
     for name, length_um in (("min_size_um", min_size_um), ("r_min_um", r_min_um)):
         if length_um is not None:
-            check_length_um(name, length_um, at_most=r_max_um)
+            check_length_um(name, length_um, at_most=r_max_um, cure="it is no larger than 'r_max_um'")
     if r_min_um is None and min_size_um is None:
         raise ParameterError("r_min_um", "or 'min_size_um' must be given: without either the rings would never end")
     if n_rings is not None:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim.arrays import Floats, Images, Ints, check_count, finite_array
-from foveasim.errors import ParameterError
+from foveasim.encodings import encoded_srgb
+from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, PackedRings, to_file_rows
 from foveasim.integrate import Integrator
 from foveasim.pictures import write_picture
@@ -75,7 +76,7 @@ class Picture:
             )
         share = np.clip(np.nan_to_num(self.data) / levels.reshape(-1, 1, 1), 0.0, 1.0)
         if encode_srgb:
-            share = np.where(share <= 0.0031308, 12.92 * share, 1.055 * share ** (1.0 / 2.4) - 0.055)
+            share = encoded_srgb(share)
         layers = np.concatenate((share, np.clip(self.coverage, 0.0, 1.0)[np.newaxis]))
         return np.ascontiguousarray(np.rint(255.0 * to_file_rows(layers)).astype(np.uint8))
 
@@ -148,6 +149,8 @@ def fill_channels(layout: PackedRings, values: Floats, channel: Ints, n_channels
 def raster_grid(layout: PackedRings, max_pixels: int) -> Grid:
     """Grid of square pixels over the layout, the longer side ``max_pixels`` long."""
     max_pixels = check_count("max_pixels", max_pixels, at_most=2**15)
+    if layout.xy_um.size == 0:
+        raise GeometryError("the layout has no sites, and so no picture")
     low, high = layout.xy_um.min(axis=0), layout.xy_um.max(axis=0)
     pitch_um = float((high - low).max()) / max_pixels
     n_x, n_y = (max(1, math.ceil(length / pitch_um - 1e-6)) for length in high - low)

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from foveasim.scene._scene import Scene, decoded
+from foveasim.scene._scene import Scene
 
-__all__ = ["Scene", "decoded"]
+__all__ = ["Scene"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,12 +20,13 @@ from foveasim.arrays import (
     read_only,
     wavelengths_nm,
 )
+from foveasim.encodings import Encoding, decoded
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import from_file_rows
 from foveasim.pictures import read_picture
 from foveasim.units import m_from_um
 
-__all__ = ["Scene", "decoded"]
+__all__ = ["Scene"]
 
 #: Wavelengths that a colour picture's red, green and blue stand for, and a grey one's, unless told otherwise.
 RGB_NM = (620.0, 550.0, 450.0)
@@ -34,8 +35,6 @@ GREY_NM = (550.0,)
 MAX_ENCODED = 16.0
 #: Weights of red, green and blue in the brightness of a colour (Rec. ITU-R BT.709).
 BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722], np.float32)
-
-Encoding = Literal["srgb", "sqrt", "linear"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +160,7 @@ class Scene:
         ParameterError
             When channels, wavelengths and spectra do not fit together, or a value is out of range.
         """
-        check_choice("encoding", encoding, ("srgb", "sqrt", "linear"))
+        check_choice("encoding", encoding, get_args(Encoding))
         peak = check_number("peak_radiance_w_m2_sr_nm", peak_radiance_w_m2_sr_nm, at_least=0.0)
         is_file = isinstance(picture, str | Path)
         pixels = read_picture(picture) if is_file else _picture_array(picture)  # type: ignore[arg-type]
@@ -310,15 +309,6 @@ class Scene:
             distance_m,
             source="point sources",
         )
-
-
-def decoded(values: Floats, encoding: Encoding) -> Floats:
-    """Relative radiance of encoded values; sRGB as in IEC 61966-2-1, continued above 1."""
-    if encoding == "sqrt":
-        return values * values
-    if encoding == "srgb":
-        return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-    return values
 
 
 def _picture_array(picture: ArrayLike) -> NDArray[Any]:

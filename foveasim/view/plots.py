@@ -9,7 +9,7 @@ import numpy as np
 
 from foveasim.arrays import Floats, check_choice, finite_array
 from foveasim.capture import Capture
-from foveasim.errors import ParameterError
+from foveasim.errors import FileError, ParameterError
 from foveasim.files import written_whole
 from foveasim.layout import Layout
 
@@ -68,9 +68,9 @@ def plot_layout(
     if ax is None:
         ax = Figure(figsize=(figure_inches, figure_inches), layout="constrained").add_subplot()
     for name, array in (("values", values), ("colours", colours)):
-        if array is not None and np.shape(array)[0] != layout.n_sites:
+        if array is not None and np.shape(array)[:1] != (layout.n_sites,):
             raise ParameterError(
-                name, f"must have one row for each of the {layout.n_sites} sites, got {np.shape(array)[0]}"
+                name, f"must have one row for each of the {layout.n_sites} sites, got {np.shape(array)}"
             )
     outlines = []
     for site in range(layout.n_sites):  # matplotlib wants an object for each site
@@ -135,7 +135,10 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = 150.0) -> None:
         When nothing can be written there.
     """
     with written_whole(path) as temporary:
-        figure.savefig(temporary, dpi=dpi)
+        try:
+            figure.savefig(temporary, dpi=dpi)
+        except ValueError as error:
+            raise FileError(path, f"cannot be written in this format: {' '.join(str(error).split())}") from None
 
 
 def _closed(ring_um: Floats) -> Floats:
