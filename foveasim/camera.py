@@ -13,7 +13,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from foveasim.arrays import Floats
+from foveasim.arrays import Floats, check_number
 from foveasim.capture import Capture
 from foveasim.compiled import kernels
 from foveasim.errors import CoverageWarning, ParameterError, SimulationError
@@ -146,6 +146,7 @@ class Camera:
             When a value is out of range, or parts do not fit together.
         """
         streams = Streams(seed, frame)
+        exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
         sensor = self._sensor
         clock = _Clock()
         photo_e_per_s = self._photoelectrons_per_s(light, clock)
@@ -164,10 +165,10 @@ class Camera:
             white_dn=self._white(light),
             settings={
                 "light": _light_described(light),
-                "optics": described(self.optics),
+                "optics": described(self._optics),
                 "sensor": {k: v for k, v in described(sensor).items() if k != "layout"},
                 "layout": described(dict(self._layout.provenance)),
-                "exposure_s": float(exposure_s),
+                "exposure_s": exposure_s,
                 "seed": streams.seed,
                 "frame": streams.frame,
                 "versions": versions(),
@@ -207,8 +208,9 @@ class Camera:
             raise SimulationError(
                 f"the light on site {bad} is not finite: the power map has a NaN or an infinity there"
             )
+        # What falls below darkness by rounding is darkness; a map from elsewhere may be negative by more than that.
         rounding_e_per_s = NEGATIVE_ROUNDING * float(rate_e_per_s.max(initial=0.0))
-        if rate_e_per_s.min(initial=0.0) < -rounding_e_per_s:
+        if isinstance(light, PowerMap) and rate_e_per_s.min(initial=0.0) < -rounding_e_per_s:
             bad = int(rate_e_per_s.argmin())
             raise SimulationError(f"the light on site {bad} is negative: the power map is below 0 there")
         return np.maximum(rate_e_per_s, 0.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -88,6 +88,7 @@ class Sensor:
     """
 
     layout: Photosites
+    _: KW_ONLY
     qe: float | Curve = 1.0
     filters: FilterSet | Literal["rgb"] | None = None
     dark_e_per_s: PerSite = 0.0
