@@ -132,7 +132,7 @@ _RulesSection = _model("design rules", DesignRules)
 class _LayoutSection(_Section):
     """A layout: a generator and its parameters, colour filters, a move, design rules, and its source."""
 
-    mosaic: list[str] | None = None
+    mosaic: str | list[str] | None = None
     move_um: tuple[float, float] = (0.0, 0.0)
     rules: _RulesSection | None = None  # type: ignore[valid-type]
     source: str = ""

@@ -1,26 +1,44 @@
-"""Photosites: the layout model, generators (one file a family), colour filters, design rules."""
+"""Photosites: the layout model, generators (one file a family), edits, neighbours, colour filters, readout, design rules."""
 
 from __future__ import annotations
 
 from foveasim.layout._model import Layout
-from foveasim.layout.channels import mosaic
+from foveasim.layout.adjacency import adjacency
+from foveasim.layout.channels import MOSAICS, colouring, mosaic, random_channels
+from foveasim.layout.edits import clip, inset, merge, node, punch, snap, split, union
 from foveasim.layout.grid import grid
 from foveasim.layout.hexagonal import hexagonal
 from foveasim.layout.log_polar import log_polar, square_ring_ratio
+from foveasim.layout.readout import nearest_bus, readout_by, readout_order
 from foveasim.layout.rules import DesignRules, Report, RuleResult, Violation, min_width_um
 from foveasim.layout.zones import zones
 
 __all__ = [
+    "MOSAICS",
     "DesignRules",
     "Layout",
     "Report",
     "RuleResult",
     "Violation",
+    "adjacency",
+    "clip",
+    "colouring",
     "grid",
     "hexagonal",
+    "inset",
     "log_polar",
+    "merge",
     "min_width_um",
     "mosaic",
+    "nearest_bus",
+    "node",
+    "punch",
+    "random_channels",
+    "readout_by",
+    "readout_order",
+    "snap",
+    "split",
     "square_ring_ratio",
+    "union",
     "zones",
 ]

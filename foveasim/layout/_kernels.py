@@ -1,13 +1,16 @@
-"""The layout room's numba kernel: widths of photosites."""
+"""The layout room's numba kernels: widths of photosites, lengths of the edges that they share, colours of neighbours."""
 
 from __future__ import annotations
+
+from heapq import heappop, heappush
 
 import numpy as np
 from numba import njit, types
 
-__all__ = ["min_widths"]
+__all__ = ["colour_greedily", "min_widths", "shared_lengths"]
 
 _ints = types.Array(types.int64, 1, "C", readonly=True)
+_floats = types.Array(types.float64, 1, "C", readonly=True)
 _points = types.Array(types.float64, 2, "C", readonly=True)
 
 #: Edges face each other across the site when they run opposite ways within 26 degrees. At 45 degrees, say, the corners of
@@ -94,3 +97,77 @@ def min_widths(xy, after, before, ring_offsets, site_offsets):
             smallest = min(smallest, _across_from_inward_corner(xy, before[b], b, after, first, last))
         widths[site] = smallest
     return widths
+
+
+#: Edges that overlap by less than this share of their length meet in a corner.
+CORNER = 1e-9
+
+
+@njit(types.float64[::1](_points, _ints, _ints, _ints, _ints, types.float64), cache=True, nogil=True)
+def shared_lengths(xy, after, first_vertex, first, second, max_gap):
+    """
+    Length over which the outlines of two sites run along each other, for every pair (first[i], second[i]).
+
+    ``first_vertex[s] : first_vertex[s + 1]`` are a site's vertices, ``after[v]`` the one that follows in its ring. Edges run
+    along each other when they go opposite ways and are nowhere further apart than ``max_gap`` where they overlap.
+    """
+    lengths = np.zeros(first.size)
+    for pair in range(first.size):
+        i, j = first[pair], second[pair]
+        for a in range(first_vertex[i], first_vertex[i + 1]):
+            ax, ay = xy[a, 0], xy[a, 1]
+            ex, ey = xy[after[a], 0] - ax, xy[after[a], 1] - ay
+            length = np.hypot(ex, ey)
+            ex, ey = ex / length, ey / length
+            for c in range(first_vertex[j], first_vertex[j + 1]):
+                cx, cy = xy[c, 0] - ax, xy[c, 1] - ay
+                dx, dy = xy[after[c], 0] - ax, xy[after[c], 1] - ay
+                high = cx * ex + cy * ey  # the other edge comes back: it begins where this one ends
+                low = dx * ex + dy * ey
+                begin, end = max(low, 0.0), min(high, length)
+                if end - begin <= CORNER * length:
+                    continue
+                slope = ((cy - dy) * ex - (cx - dx) * ey) / (high - low)
+                away = dy * ex - dx * ey - slope * low  # distance of the other edge's line at the start of this one
+                if abs(away + slope * begin) <= max_gap and abs(away + slope * end) <= max_gap:
+                    lengths[pair] += end - begin
+    return lengths
+
+
+@njit(types.int64[::1](_ints, _ints, _floats, types.int64), cache=True, nogil=True)
+def colour_greedily(first, neighbour, shared, n_colours):
+    """
+    A colour for every site: the one with the least shared edge to coloured neighbours, and of those the rarest so far.
+
+    ``neighbour[first[s] : first[s + 1]]`` are a site's neighbours, ``shared`` the lengths of the common edges. Next comes the
+    site whose neighbours have the most different colours already (Brélaz, Commun. ACM 22, 1979), then the lowest number.
+    """
+    n_sites = first.size - 1
+    colour = np.full(n_sites, -1, np.int64)
+    used = np.zeros(n_colours, np.int64)
+    conflict = np.empty(n_colours)
+    seen = np.zeros(n_sites, np.uint64)  # colours of the neighbours, a bit each
+    variety = np.zeros(n_sites, np.int64)  # and how many they are
+    queue = [(0, s) for s in range(n_sites)]
+    while len(queue) > 0:
+        saturation, site = heappop(queue)
+        if colour[site] >= 0 or -saturation < variety[site]:
+            continue  # told again with more colours around it
+        conflict[:] = 0.0
+        for k in range(first[site], first[site + 1]):
+            if colour[neighbour[k]] >= 0:
+                conflict[colour[neighbour[k]]] += shared[k]
+        best = 0
+        for c in range(1, n_colours):
+            if conflict[c] < conflict[best] or (conflict[c] == conflict[best] and used[c] < used[best]):
+                best = c
+        colour[site] = best
+        used[best] += 1
+        bit = np.uint64(1) << np.uint64(best)
+        for k in range(first[site], first[site + 1]):
+            other = neighbour[k]
+            if colour[other] < 0 and not seen[other] & bit:
+                seen[other] |= bit
+                variety[other] += 1
+                heappush(queue, (-variety[other], other))
+    return colour

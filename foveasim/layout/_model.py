@@ -17,6 +17,8 @@ from foveasim.errors import GeometryError, ParameterError
 from foveasim.rings import next_vertex, ring_moments, ring_spread_um2, site_bounds_um, site_moments
 
 if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
     from foveasim.layout.rules import DesignRules, Report
 
 __all__ = ["Layout"]
@@ -370,6 +372,14 @@ class Layout:
 
     def _then(self, step: str) -> dict[str, Any]:
         return {**self.provenance, "steps": [*self.provenance.get("steps", []), step]}
+
+    # -- neighbours ----------------------------------------------------------------------------------------------
+
+    def adjacency(self, *, max_gap_um: float | None = None) -> csr_array[Any]:
+        """Lengths of the edges that sites share, csr_array (n_site, n_site) µm; see :func:`foveasim.layout.adjacency`."""
+        from foveasim.layout.adjacency import adjacency
+
+        return adjacency(self) if max_gap_um is None else adjacency(self, max_gap_um=max_gap_um)
 
     # -- rules --------------------------------------------------------------------------------------------------
 

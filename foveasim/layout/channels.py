@@ -5,17 +5,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from foveasim.arrays import check_count, finite_array
+from foveasim.compiled import kernels
 from foveasim.errors import ParameterError
 from foveasim.layout._model import Layout
+from foveasim.layout.adjacency import adjacency
+from foveasim.streams import Streams
 
-__all__ = ["mosaic"]
+__all__ = ["MOSAICS", "colouring", "mosaic", "random_channels"]
 
 #: Pairs of columns that number a layout's sites in two directions, in order of preference.
 INDEX_COLUMNS = (("row", "column"), ("ring", "sector"))
+#: Blocks with names, row 0 lowest. ``rgbw`` is a Bayer block with one of its greens left clear.
+MOSAICS = {
+    "bayer": ("RG", "GB"),
+    "quad_bayer": ("RRGG", "RRGG", "GGBB", "GGBB"),
+    "nona": ("RRRGGG", "RRRGGG", "RRRGGG", "GGGBBB", "GGGBBB", "GGGBBB"),
+    "x_trans": ("RBGBRG", "GGRGGB", "GGBGGR", "BRGRBG", "GGBGGR", "GGRGGB"),
+    "rgbw": ("RG", "WB"),
+}
 
 
-def mosaic(layout: Layout, block: Sequence[str], names: str = "RGB") -> Layout:
+def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None) -> Layout:
     """
     The layout with a repeating block of colour filters.
 
@@ -23,20 +36,27 @@ def mosaic(layout: Layout, block: Sequence[str], names: str = "RGB") -> Layout:
     ----------
     layout : Layout
         With the columns ``row`` and ``column``, or ``ring`` and ``sector``.
-    block : sequence of str
-        Rows of the block, a letter a site: ``("RG", "GB")`` is a Bayer block with red at row 0, column 0. Row 0 is
-        the lowest.
-    names : str
-        The filters' letters in the order of the sensor's filters: a site's ``channel`` is its letter's position.
+    block : str or sequence of str
+        One of :data:`MOSAICS` by name, or rows of letters, a letter a site: ``("RG", "GB")`` is a Bayer block with red at
+        row 0, column 0. Row 0 is the lowest.
+    names : str, optional
+        The filters' letters in the order of the sensor's filters: a site's ``channel`` is its letter's position. "RGB" by
+        default, "RGBW" for a block with a W.
 
     Raises
     ------
     ParameterError
         When the block is not a rectangle of known letters, or the layout has no such columns.
     """
-    rows = [block] if isinstance(block, str) else list(block) if isinstance(block, Sequence) else []
+    if isinstance(block, str):
+        block = MOSAICS.get(block, (block,))
+    rows = list(block) if isinstance(block, Sequence) else []
     if not rows or not all(isinstance(row, str) and row and len(row) == len(rows[0]) for row in rows):
         raise ParameterError("block", "must be rows of letters of equal length, such as ('RG', 'GB')", block)
+    if names is None:
+        names = "RGBW" if any("W" in row for row in rows) else "RGB"
+    if len(set(names)) != len(names):
+        raise ParameterError("names", "must not name a filter twice", names)
     unknown = sorted(set("".join(rows)) - set(names))
     if unknown:
         raise ParameterError("block", f"must use the letters {names!r}, got {', '.join(map(repr, unknown))}")
@@ -53,3 +73,64 @@ def mosaic(layout: Layout, block: Sequence[str], names: str = "RGB") -> Layout:
         {"channel": channels[row % channels.shape[0], column % channels.shape[1]]},
         f"mosaic {' '.join(rows)} of {names}",
     )
+
+
+def random_channels(layout: Layout, shares: ArrayLike, *, seed: int) -> Layout:
+    """
+    The layout with colour filters strewn at random, in exact numbers.
+
+    Parameters
+    ----------
+    layout : Layout
+    shares : (n_filter,)
+        Relative numbers of the filters: ``(1, 2, 1)`` for twice as much green.
+    seed : int
+
+    Returns
+    -------
+    Layout
+        With the column ``channel``: as many sites of each filter as its share asks for, to within one.
+
+    Raises
+    ------
+    ParameterError
+        When a share is negative, or all are 0.
+    """
+    parts = finite_array("shares", shares, ndim=1, at_least=0.0)
+    if not parts.sum() > 0.0:
+        raise ParameterError("shares", "must not all be 0", shares)
+    borders = np.round(np.cumsum(parts) / parts.sum() * layout.n_sites).astype(np.int64)
+    ordered = np.repeat(np.arange(parts.size), np.diff(borders, prepend=0))
+    return layout.with_columns(channel=Streams(seed).of("layout channels").permutation(ordered))
+
+
+def colouring(layout: Layout, n_channels: int, *, max_gap_um: float | None = None) -> Layout:
+    """
+    The layout with colour filters such that neighbours differ wherever they can.
+
+    Parameters
+    ----------
+    layout : Layout
+        Any tiling: rings, Voronoi cells, what has no rows and columns.
+    n_channels : int
+        Number of filters. Four suffice for neighbours to differ on most layouts, three on hexagons.
+    max_gap_um : float, optional, µm
+        Distance at which sites count as neighbours, as in :meth:`Layout.adjacency`.
+
+    Returns
+    -------
+    Layout
+        With the column ``channel``. Site after site, those first whose neighbours show the most filters already, takes the
+        filter that shares the least edge with neighbours of the same filter, and of those the one used least so far.
+
+    Raises
+    ------
+    ParameterError
+        When ``n_channels`` is not from 1 to 64.
+    """
+    n_channels = check_count("n_channels", n_channels, at_most=64)
+    shared_um = adjacency(layout) if max_gap_um is None else adjacency(layout, max_gap_um=max_gap_um)
+    channel = kernels("layout").colour_greedily(
+        shared_um.indptr.astype(np.int64), shared_um.indices.astype(np.int64), shared_um.data, n_channels
+    )
+    return layout.with_columns(channel=channel)

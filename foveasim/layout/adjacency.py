@@ -1,0 +1,79 @@
+"""Which photosites share an edge, and how long it is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+
+from foveasim.arrays import check_number
+from foveasim.compiled import kernels
+from foveasim.layout._model import Layout
+from foveasim.rings import next_vertex
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+__all__ = ["adjacency"]
+
+#: Edges that are this close touch: far below any manufacturing grid, far above the rounding of positions.
+TOUCHING_UM = 1e-6
+
+
+def adjacency(layout: Layout, *, max_gap_um: float = TOUCHING_UM) -> csr_array[Any]:
+    """
+    Lengths of the edges that photosites share.
+
+    Parameters
+    ----------
+    layout : Layout
+    max_gap_um : float, µm
+        Edges that face each other at up to this distance count as shared: set it to the width of the trench where sites
+        are separated by one.
+
+    Returns
+    -------
+    shared_um : csr_array (n_site, n_site) float64, µm
+        Symmetric, its diagonal empty: the length over which the outlines of two sites run along each other. Corners that
+        only touch share nothing. A long edge against several short ones (a T-junction) is shared with each of them.
+
+    Raises
+    ------
+    ParameterError
+        When the gap is negative.
+
+    Notes
+    -----
+    Without gaps the lengths of a site surrounded by others add up to its perimeter. Cost: the pairs of sites whose boxes
+    meet, times the edges of one times those of the other.
+
+    Examples
+    --------
+    >>> from foveasim.layout import grid
+    >>> adjacency(grid(n_x=2, n_y=1, pitch_um=3.0)).toarray()
+    array([[0., 3.],
+           [3., 0.]])
+    """
+    from scipy.sparse import coo_array
+
+    max_gap_um = check_number("max_gap_um", max_gap_um, at_least=0.0)
+    box = layout.site_bounds_um
+    reach = box + max(max_gap_um, TOUCHING_UM) * np.array([-0.5, -0.5, 0.5, 0.5])
+    boxes = shapely.box(*reach.T)
+    a, b = shapely.STRtree(boxes).query(boxes)
+    is_first = a < b
+    a, b = a[is_first], b[is_first]
+    length_um = kernels("layout").shared_lengths(
+        layout.xy_um,
+        next_vertex(layout.ring_offsets),
+        layout.ring_offsets[layout.site_offsets],
+        a,
+        b,
+        max(max_gap_um, TOUCHING_UM),
+    )
+    touches = length_um > 0.0
+    a, b, length_um = a[touches], b[touches], length_um[touches]
+    n = layout.n_sites
+    both = (np.concatenate((length_um, length_um)), (np.concatenate((a, b)), np.concatenate((b, a))))
+    return coo_array(both, shape=(n, n)).tocsr()

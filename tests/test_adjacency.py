@@ -1,0 +1,102 @@
+"""Neighbours: every shared edge is found once, with its length, T-junctions included."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import foveasim as fs
+from foveasim.errors import ParameterError
+
+TILINGS = {
+    "grid": fs.layout.grid(n_x=7, n_y=5, pitch_um=1.7),
+    "hexagonal": fs.layout.hexagonal(n_columns=7, n_rows=6, pitch_um=2.3),
+    "log_polar": fs.layout.log_polar(n_sectors=16, r_min_um=3.0, r_max_um=30.0),
+    "log_polar staggered": fs.layout.log_polar(
+        n_sectors=14, r_min_um=3.0, r_max_um=30.0, stagger=True, chords_per_arc=3
+    ),
+    "zones": fs.layout.zones(side_um=(4, 12, 28), pitch_um=(1, 2, 4)),
+}
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 17.3, 90.0])
+@pytest.mark.parametrize("name", TILINGS)
+def test_shared_edges_and_the_outer_border_make_up_every_perimeter(name, angle_deg):
+    layout = TILINGS[name].rotate(angle_deg).translate(321.0, -123.0)
+    polygons = layout.polygons()
+    outside_um = 2 * shapely.length(polygons).sum() - 2 * layout.adjacency().sum()
+    border_um = 2 * shapely.length(shapely.union_all(shapely.set_precision(polygons, 1e-7)))
+
+    assert outside_um == pytest.approx(border_um, rel=1e-6)
+
+
+def test_a_hexagon_in_the_middle_shares_a_side_with_each_of_six():
+    shared_um = TILINGS["hexagonal"].adjacency().toarray()
+    middle = shared_um[3 * 7 + 3]
+
+    assert np.count_nonzero(middle) == 6
+    assert middle[middle > 0] == pytest.approx(2.3 / np.sqrt(3))
+
+
+def test_squares_that_touch_in_a_corner_are_no_neighbours():
+    shared_um = fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0).adjacency().toarray()
+
+    assert shared_um.tolist() == [[0, 1, 1, 0], [1, 0, 0, 1], [1, 0, 0, 1], [0, 1, 1, 0]]
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 31.7])
+def test_a_long_edge_is_shared_with_every_short_one_along_it(angle_deg):
+    boxes = [shapely.box(0, 0, 4, 2), shapely.box(0, 2, 1, 3), shapely.box(1, 2, 3, 3), shapely.box(3, 2, 4.5, 3)]
+    layout = fs.Layout.from_polygons(boxes).rotate(angle_deg, (7.0, -3.0))
+
+    assert layout.adjacency().toarray()[0] == pytest.approx([0, 1, 2, 1], abs=1e-9)
+
+
+def test_a_site_in_a_hole_is_a_neighbour():
+    frame = shapely.box(0, 0, 8, 8).difference(shapely.box(2, 2, 5, 5))
+    layout = fs.Layout.from_polygons([frame, shapely.box(2, 2, 5, 5)])
+
+    assert layout.adjacency().toarray().tolist() == [[0, 12], [12, 0]]
+
+
+def test_sites_across_a_trench_are_neighbours_when_asked():
+    layout = fs.layout.grid(n_x=3, n_y=1, pitch_um=2.0, width_um=1.8)
+
+    assert layout.adjacency().nnz == 0
+    assert layout.adjacency(max_gap_um=0.25).toarray() == pytest.approx(
+        np.array([[0, 1.8, 0], [1.8, 0, 1.8], [0, 1.8, 0]])
+    )
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 10_000), angle_deg=st.floats(0, 360))
+def test_random_tilings_agree_with_shapely(seed, angle_deg):
+    """Cells of random guillotine cuts; the twin measures the common line of each pair before the turn."""
+    rng = np.random.default_rng(seed)
+    boxes = [(0.0, 0.0, 16.0, 16.0)]
+    for _ in range(12):
+        x0, y0, x1, y1 = boxes.pop(int(rng.integers(len(boxes))))
+        cut = float(rng.integers(1, 16)) / 16
+        if rng.random() < 0.5:
+            boxes += [(x0, y0, x0 + cut * (x1 - x0), y1), (x0 + cut * (x1 - x0), y0, x1, y1)]
+        else:
+            boxes += [(x0, y0, x1, y0 + cut * (y1 - y0)), (x0, y0 + cut * (y1 - y0), x1, y1)]
+    polygons = [shapely.box(*box) for box in boxes]
+    expected = [[0.0 if a is b else shapely.length(shapely.intersection(a, b)) for b in polygons] for a in polygons]
+
+    shared_um = fs.Layout.from_polygons(polygons).rotate(angle_deg).adjacency().toarray()
+
+    assert shared_um == pytest.approx(np.array(expected), abs=1e-9)
+    assert np.array_equal(shared_um, shared_um.T)
+
+
+def test_a_layout_without_sites_has_no_neighbours():
+    assert TILINGS["grid"][[]].adjacency().shape == (0, 0)
+
+
+def test_a_negative_gap_is_refused():
+    with pytest.raises(ParameterError, match="'max_gap_um' must be >= 0"):
+        TILINGS["grid"].adjacency(max_gap_um=-1.0)
