@@ -6,6 +6,7 @@ from foveasim.layout._model import Layout
 from foveasim.layout.adjacency import adjacency
 from foveasim.layout.channels import MOSAICS, colouring, mosaic, random_channels
 from foveasim.layout.edits import clip, inset, merge, node, punch, snap, split, union
+from foveasim.layout.enforce import Change, enforce
 from foveasim.layout.grid import grid
 from foveasim.layout.hexagonal import hexagonal
 from foveasim.layout.log_polar import log_polar, square_ring_ratio
@@ -15,6 +16,7 @@ from foveasim.layout.zones import zones
 
 __all__ = [
     "MOSAICS",
+    "Change",
     "DesignRules",
     "Layout",
     "Report",
@@ -23,6 +25,7 @@ __all__ = [
     "adjacency",
     "clip",
     "colouring",
+    "enforce",
     "grid",
     "hexagonal",
     "inset",

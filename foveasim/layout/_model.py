@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import shapely
@@ -19,6 +19,7 @@ from foveasim.rings import next_vertex, ring_moments, ring_spread_um2, site_boun
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
+    from foveasim.layout.enforce import Change
     from foveasim.layout.rules import DesignRules, Report
 
 __all__ = ["Layout"]
@@ -388,6 +389,14 @@ class Layout:
         from foveasim.layout.rules import check
 
         return check(self, rules)
+
+    def enforce(
+        self, rules: DesignRules, *, repair: Literal["drop", "merge"] = "drop"
+    ) -> tuple[Layout, tuple[Change, ...]]:
+        """Layout that keeps the rules, and what was changed for it; see :func:`foveasim.layout.enforce`."""
+        from foveasim.layout.enforce import enforce
+
+        return enforce(self, rules, repair=repair)
 
 
 # -- checks of polygons from outside --------------------------------------------------------------------------------

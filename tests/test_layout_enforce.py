@@ -1,0 +1,103 @@
+"""Repair: the result keeps its rules, and the changes tell exactly what was done."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import foveasim as fs
+from foveasim.errors import GeometryError, ParameterError
+
+RINGS = fs.layout.log_polar(n_sectors=32, r_min_um=2.0, r_max_um=50.0)
+
+
+def changed(changes):
+    return {site for change in changes for site in change.site_ids}
+
+
+def test_a_smallest_size_leaves_the_blind_spot():
+    legal, changes = RINGS.enforce(fs.DesignRules(min_size_um=1.0))
+    is_small = np.sqrt(RINGS.area_um2) < 1.0
+
+    assert [change.action for change in changes] == ["dropped"]
+    assert changed(changes) == set(np.flatnonzero(is_small))
+    assert legal.n_sites == np.count_nonzero(~is_small)
+    assert legal.columns["ring"].min() == RINGS.columns["ring"][is_small].max() + 1
+
+
+def test_merging_keeps_the_area_and_reaches_the_size():
+    rules = fs.DesignRules(min_size_um=1.0, max_overlap_um2=0.0)
+    legal, changes = RINGS.enforce(rules, repair="merge")
+
+    assert legal.check(rules).ok
+    assert legal.area_um2.sum() == pytest.approx(RINGS.area_um2.sum(), rel=1e-12)
+    assert {change.action for change in changes} == {"merged"}
+    assert set(np.flatnonzero(np.sqrt(RINGS.area_um2) < 1.0)) <= changed(changes)
+
+
+def test_of_two_that_overlap_the_smaller_goes():
+    layout = fs.Layout.from_rectangles([[0, 0], [1.5, 0], [10, 0]], [2.0, 1.8, 2.0])
+    legal, changes = layout.enforce(fs.DesignRules(max_overlap_um2=0.0))
+
+    assert [(change.rule, change.action, change.site_ids) for change in changes] == [
+        ("max_overlap_um2", "dropped", (1,))
+    ]
+    assert legal.n_sites == 2
+
+
+def test_one_site_that_meets_several_goes_alone():
+    layout = fs.Layout.from_rectangles(
+        [[0, 0], [2, 0], [-2, 0], [0, 2]], [[1.0, 1.0], [3.2, 0.7], [3.2, 0.7], [0.7, 3.2]]
+    )
+    legal, changes = layout.enforce(fs.DesignRules(max_overlap_um2=0.0))
+
+    assert legal.check(fs.DesignRules(max_overlap_um2=0.0)).ok
+    assert changed(changes) == {0}
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 10_000), repair=st.sampled_from(["drop", "merge"]))
+def test_any_layout_keeps_the_rules_afterwards_and_nothing_else_changed(seed, repair):
+    rng = np.random.default_rng(seed)
+    layout = fs.Layout.from_rectangles(rng.uniform(0, 15, (30, 2)), rng.uniform(0.3, 2.5, (30, 2)))
+    rules = fs.DesignRules(min_width_um=0.6, max_overlap_um2=0.0, min_space_um=0.3, die_um=(0, 0, 15, 15))
+    legal, changes = layout.enforce(rules, repair=repair)
+    untouched = [i for i in range(30) if i not in changed(changes)]
+
+    assert legal.check(rules).ok
+    kept = {polygon.normalize() for polygon in legal.polygons()}
+    assert {polygon.normalize() for polygon in layout.polygons()[untouched]} <= kept
+
+
+def test_waived_rules_are_left_broken():
+    rules = fs.DesignRules(min_size_um=1.0, waivers={"min_size_um": "made of test sites"})
+
+    assert RINGS.enforce(rules) == (RINGS, ())
+
+
+def test_a_layout_that_keeps_its_rules_is_left_as_it_is():
+    assert RINGS.enforce(fs.DesignRules(min_size_um=0.1)) == (RINGS, ())
+
+
+def test_what_no_dropping_mends_is_told():
+    with pytest.raises(GeometryError, match="taking away sites does not mend every rule: max_gap_um2: 1 violation"):
+        RINGS.enforce(fs.DesignRules(min_size_um=1.0, max_gap_um2=0.0))
+    with pytest.raises(GeometryError, match="max_sites: 1 violation"):
+        RINGS.enforce(fs.DesignRules(max_sites=10))
+
+
+def test_an_unknown_repair_is_refused():
+    with pytest.raises(ParameterError, match="'repair' must be one of 'drop', 'merge', got 'shrink'"):
+        RINGS.enforce(fs.DesignRules(), repair="shrink")
+
+
+def test_a_site_in_a_hole_can_be_merged_with_its_frame():
+    frame = shapely.box(0, 0, 9, 9).difference(shapely.box(4, 4, 4.5, 4.5))
+    layout = fs.Layout.from_polygons([frame, shapely.box(4, 4, 4.5, 4.5)])
+    legal, changes = layout.enforce(fs.DesignRules(min_size_um=1.0), repair="merge")
+
+    assert legal.area_um2.tolist() == [81.0]
+    assert changes[0].site_ids == (0, 1)
