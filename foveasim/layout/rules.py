@@ -274,13 +274,13 @@ def check(layout: Layout, rules: DesignRules) -> Report:
     """
     if not isinstance(rules, DesignRules):
         raise ParameterError("rules", f"must be DesignRules, got a {type(rules).__name__}")
-    polygons = layout.polygons()
+    case = _Case(layout, rules)
     results = []
     for name, rule in RULES.items():
         limit = getattr(rules, name)
         if limit is not None:
             bound = 0.0 if rule.is_deviation else float(limit)
-            violations = _violations(name, rule, rule.measure(layout, polygons, rules), bound, polygons)
+            violations = _violations(name, rule, rule.measure(case), bound, case)
             results.append(
                 RuleResult(name, rule.sentence, bound, rule.unit, violations, (rules.waivers or {}).get(name))
             )
@@ -305,6 +305,24 @@ def min_width_um(layout: Layout) -> Floats:
 # -- measures: what each rule looks at ------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class _Case:
+    """A layout and its rules, with what several measures need, computed once."""
+
+    layout: Layout
+    rules: DesignRules
+
+    @cached_property
+    def polygons(self) -> NDArray[Any]:
+        """The sites as shapely polygons."""
+        return self.layout.polygons()
+
+    @cached_property
+    def is_coverage(self) -> bool:
+        """Whether neighbours meet edge to edge all over: then nothing overlaps, and the union is quickly had."""
+        return bool(shapely.coverage_is_valid(self.polygons))
+
+
 @dataclass(frozen=True, slots=True)
 class _Measured:
     """Values, and for each the sites it is about ((n, k) ints; by default site i) and where it is (the site by default)."""
@@ -320,21 +338,18 @@ class _Rule:
     How a rule is checked.
 
     ``measure`` gives values; those above the limit (``is_upper``) or below it by more than ``rounding`` (in the unit of the
-    value) are violations. A deviation is compared with 0, the limit being a
-    step or a field.
+    value) are violations. A deviation is compared with 0, the limit being a step or a field.
     """
 
     sentence: str
     unit: str
-    measure: Callable[[Layout, NDArray[Any], DesignRules], _Measured]
+    measure: Callable[[_Case], _Measured]
     is_upper: bool = False
     is_deviation: bool = False
     rounding: float = LENGTH_ROUNDING_UM
 
 
-def _violations(
-    name: str, rule: _Rule, found: _Measured, limit: float, polygons: NDArray[Any]
-) -> tuple[Violation, ...]:
+def _violations(name: str, rule: _Rule, found: _Measured, limit: float, case: _Case) -> tuple[Violation, ...]:
     """The values that break the limit, the worst first."""
     beyond = found.values - limit if rule.is_upper else limit - found.values
     bad = np.flatnonzero(beyond > rule.rounding)
@@ -346,72 +361,74 @@ def _violations(
             float(found.values[i]),
             limit,
             rule.unit,
-            polygons[i] if found.markers is None else found.markers[i],
+            case.polygons[i] if found.markers is None else found.markers[i],
         )
         for i in bad
     )
 
 
-def _sizes(layout: Layout, _: NDArray[Any], __: DesignRules) -> _Measured:
-    return _Measured(np.sqrt(layout.area_um2))
+def _sizes(case: _Case) -> _Measured:
+    return _Measured(np.sqrt(case.layout.area_um2))
 
 
-def _areas(layout: Layout, _: NDArray[Any], __: DesignRules) -> _Measured:
-    return _Measured(layout.area_um2)
+def _areas(case: _Case) -> _Measured:
+    return _Measured(case.layout.area_um2)
 
 
-def _widths(layout: Layout, _: NDArray[Any], __: DesignRules) -> _Measured:
-    return _Measured(min_width_um(layout))
+def _widths(case: _Case) -> _Measured:
+    return _Measured(min_width_um(case.layout))
 
 
-def _holes(layout: Layout, _: NDArray[Any], __: DesignRules) -> _Measured:
-    area_um2, _moments = ring_moments(layout.xy_um, layout.ring_offsets)
+def _holes(case: _Case) -> _Measured:
+    area_um2, _moments = ring_moments(case.layout.xy_um, case.layout.ring_offsets)
     holes = np.flatnonzero(area_um2 < 0.0)
-    site = np.searchsorted(layout.site_offsets, holes, side="right") - 1
-    rings = [layout.xy_um[layout.ring_offsets[r] : layout.ring_offsets[r + 1]] for r in holes]
+    site = np.searchsorted(case.layout.site_offsets, holes, side="right") - 1
+    rings = [case.layout.xy_um[case.layout.ring_offsets[r] : case.layout.ring_offsets[r + 1]] for r in holes]
     markers = np.array([shapely.Polygon(ring) for ring in rings], dtype=object)
     return _Measured(-area_um2[holes], site[:, np.newaxis], markers)
 
 
-def _spaces(_: Layout, polygons: NDArray[Any], rules: DesignRules) -> _Measured:
-    limit_um = float(rules.min_space_um or 0.0)
-    a, b = shapely.STRtree(polygons).query(polygons, predicate="dwithin", distance=limit_um)
+def _spaces(case: _Case) -> _Measured:
+    limit_um = float(case.rules.min_space_um or 0.0)
+    a, b = shapely.STRtree(case.polygons).query(case.polygons, predicate="dwithin", distance=limit_um)
     a, b = a[a < b], b[a < b]
-    distance_um = shapely.distance(polygons[a], polygons[b])
+    distance_um = shapely.distance(case.polygons[a], case.polygons[b])
     # Sites that abut share their border; with a manufacturing grid, to within one step of it.
-    is_apart = distance_um > max(LENGTH_ROUNDING_UM, rules.grid_um or 0.0)
+    is_apart = distance_um > max(LENGTH_ROUNDING_UM, case.rules.grid_um or 0.0)
     a, b = a[is_apart], b[is_apart]
-    return _Measured(distance_um[is_apart], np.stack((a, b), axis=1), shapely.shortest_line(polygons[a], polygons[b]))
+    return _Measured(
+        distance_um[is_apart], np.stack((a, b), axis=1), shapely.shortest_line(case.polygons[a], case.polygons[b])
+    )
 
 
-def _aspect_ratios(layout: Layout, polygons: NDArray[Any], _: DesignRules) -> _Measured:
-    if layout.n_sites == 0:
+def _aspect_ratios(case: _Case) -> _Measured:
+    if case.layout.n_sites == 0:
         return _Measured(np.zeros(0))
-    corners = shapely.get_coordinates(shapely.oriented_envelope(polygons)).reshape(-1, 5, 2)
+    corners = shapely.get_coordinates(shapely.oriented_envelope(case.polygons)).reshape(-1, 5, 2)
     sides_um = np.linalg.norm(np.diff(corners[:, :3], axis=1), axis=2)
     return _Measured(sides_um.max(axis=1) / sides_um.min(axis=1))
 
 
-def _corner_angles(layout: Layout, _: NDArray[Any], __: DesignRules) -> _Measured:
-    after = next_vertex(layout.ring_offsets)
-    out = layout.xy_um[after] - layout.xy_um
+def _corner_angles(case: _Case) -> _Measured:
+    after = next_vertex(case.layout.ring_offsets)
+    out = case.layout.xy_um[after] - case.layout.xy_um
     into = np.empty_like(out)
     into[after] = out
     turn_rad = np.arctan2(into[:, 0] * out[:, 1] - into[:, 1] * out[:, 0], np.einsum("ij,ij->i", into, out))
-    return _Measured(_per_site(np.minimum, 180.0 - np.degrees(turn_rad), layout))
+    return _Measured(_per_site(np.minimum, 180.0 - np.degrees(turn_rad), case.layout))
 
 
-def _edge_angles(layout: Layout, _: NDArray[Any], rules: DesignRules) -> _Measured:
-    step_deg = float(rules.edge_angle_step_deg or 90.0)
-    along = layout.xy_um[next_vertex(layout.ring_offsets)] - layout.xy_um
+def _edge_angles(case: _Case) -> _Measured:
+    step_deg = float(case.rules.edge_angle_step_deg or 90.0)
+    along = case.layout.xy_um[next_vertex(case.layout.ring_offsets)] - case.layout.xy_um
     angle_deg = np.degrees(np.arctan2(along[:, 1], along[:, 0]))
-    return _Measured(_per_site(np.maximum, np.abs(angle_deg - step_deg * np.round(angle_deg / step_deg)), layout))
+    return _Measured(_per_site(np.maximum, np.abs(angle_deg - step_deg * np.round(angle_deg / step_deg)), case.layout))
 
 
-def _grid_deviations(layout: Layout, _: NDArray[Any], rules: DesignRules) -> _Measured:
-    step_um = float(rules.grid_um or 1.0)
-    off_um = np.abs(layout.xy_um - step_um * np.round(layout.xy_um / step_um)).max(axis=1)
-    return _Measured(_per_site(np.maximum, off_um, layout))
+def _grid_deviations(case: _Case) -> _Measured:
+    step_um = float(case.rules.grid_um or 1.0)
+    off_um = np.abs(case.layout.xy_um - step_um * np.round(case.layout.xy_um / step_um)).max(axis=1)
+    return _Measured(_per_site(np.maximum, off_um, case.layout))
 
 
 def _per_site(reduction: np.ufunc, per_vertex: Floats, layout: Layout) -> Floats:
@@ -421,25 +438,28 @@ def _per_site(reduction: np.ufunc, per_vertex: Floats, layout: Layout) -> Floats
     return np.asarray(reduction.reduceat(per_vertex, layout.ring_offsets[layout.site_offsets[:-1]]))
 
 
-def _overlaps(layout: Layout, polygons: NDArray[Any], _: DesignRules) -> _Measured:
-    a, b = shapely.STRtree(polygons).query(polygons, predicate="intersects")
+def _overlaps(case: _Case) -> _Measured:
+    if case.is_coverage:
+        return _Measured(np.zeros(0))
+    a, b = shapely.STRtree(case.polygons).query(case.polygons, predicate="intersects")
     a, b = a[a < b], b[a < b]
-    common = shapely.intersection(polygons[a], polygons[b])
+    common = shapely.intersection(case.polygons[a], case.polygons[b])
     area_um2 = shapely.area(common)
-    is_real = area_um2 > AREA_ROUNDING * np.minimum(layout.area_um2[a], layout.area_um2[b])
+    is_real = area_um2 > AREA_ROUNDING * np.minimum(case.layout.area_um2[a], case.layout.area_um2[b])
     return _Measured(area_um2[is_real], np.stack((a, b), axis=1)[is_real], common[is_real])
 
 
-def _gaps(layout: Layout, polygons: NDArray[Any], rules: DesignRules) -> _Measured:
-    covered = shapely.disjoint_subset_union_all(polygons)
-    if rules.die_um is not None:
-        opened = shapely.get_parts(shapely.difference(shapely.box(*rules.die_um), covered))
+def _gaps(case: _Case) -> _Measured:
+    union = shapely.coverage_union_all if case.is_coverage else shapely.disjoint_subset_union_all
+    covered = union(case.polygons)
+    if case.rules.die_um is not None:
+        opened = shapely.get_parts(shapely.difference(shapely.box(*case.rules.die_um), covered))
     else:
         parts = shapely.get_parts(covered)
         holes = shapely.union_all(shapely.polygons(shapely.get_rings(parts)[_is_hole(parts)]))
         opened = shapely.get_parts(shapely.difference(holes, covered))
-    opened = opened[shapely.area(opened) > AREA_ROUNDING * (layout.area_um2.min() if layout.n_sites else 0.0)]
-    gap, site = shapely.STRtree(polygons).query(opened, predicate="intersects")
+    opened = opened[shapely.area(opened) > AREA_ROUNDING * (case.layout.area_um2.min() if case.layout.n_sites else 0.0)]
+    gap, site = shapely.STRtree(case.polygons).query(opened, predicate="intersects")
     around = np.split(site[np.lexsort((site, gap))], np.cumsum(np.bincount(gap, minlength=opened.size)))[: opened.size]
     return _Measured(shapely.area(opened), around, opened)
 
@@ -452,34 +472,34 @@ def _is_hole(polygons: NDArray[Any]) -> NDArray[np.bool_]:
     return is_hole
 
 
-def _reach_beyond_die(layout: Layout, _: NDArray[Any], rules: DesignRules) -> _Measured:
-    die = np.asarray(rules.die_um)
-    box = layout.site_bounds_um
+def _reach_beyond_die(case: _Case) -> _Measured:
+    die = np.asarray(case.rules.die_um)
+    box = case.layout.site_bounds_um
     return _Measured(np.maximum(die[:2] - box[:, :2], box[:, 2:] - die[2:]).max(axis=1, initial=-np.inf))
 
 
-def _growths(layout: Layout, polygons: NDArray[Any], _: DesignRules) -> _Measured:
+def _growths(case: _Case) -> _Measured:
     """Of the rings in their order, the mean pixel size over that of the ring before; marked at the outer one's first site."""
-    rings, first, ring = np.unique(layout.index_column("ring"), return_index=True, return_inverse=True)
-    size_um = np.bincount(ring, np.sqrt(layout.area_um2)) / np.bincount(ring) if rings.size else np.zeros(0)
+    rings, first, ring = np.unique(case.layout.index_column("ring"), return_index=True, return_inverse=True)
+    size_um = np.bincount(ring, np.sqrt(case.layout.area_um2)) / np.bincount(ring) if rings.size else np.zeros(0)
     order = np.argsort(ring, kind="stable")
     members = np.split(order, np.cumsum(np.bincount(ring))[:-1])[1:] if rings.size else []
-    return _Measured(size_um[1:] / size_um[:-1], members, polygons[first[1:]])
+    return _Measured(size_um[1:] / size_um[:-1], members, case.polygons[first[1:]])
 
 
-def _neighbour_ratios(layout: Layout, polygons: NDArray[Any], _: DesignRules) -> _Measured:
-    pairs = adjacency(layout).tocoo()
+def _neighbour_ratios(case: _Case) -> _Measured:
+    pairs = adjacency(case.layout).tocoo()
     a, b = (index[pairs.coords[0] < pairs.coords[1]] for index in pairs.coords)
-    size_um = np.sqrt(layout.area_um2)
+    size_um = np.sqrt(case.layout.area_um2)
     ratio = np.maximum(size_um[a] / size_um[b], size_um[b] / size_um[a])
     return _Measured(
-        ratio, np.stack((a, b), axis=1), shapely.shortest_line(*shapely.centroid([polygons[a], polygons[b]]))
+        ratio, np.stack((a, b), axis=1), shapely.shortest_line(*shapely.centroid([case.polygons[a], case.polygons[b]]))
     )
 
 
-def _counts(layout: Layout, polygons: NDArray[Any], _: DesignRules) -> _Measured:
-    everything = np.array([shapely.box(*shapely.total_bounds(polygons))], dtype=object)
-    return _Measured(np.array([float(layout.n_sites)]), [()], everything)
+def _counts(case: _Case) -> _Measured:
+    everything = np.array([shapely.box(*shapely.total_bounds(case.polygons))], dtype=object)
+    return _Measured(np.array([float(case.layout.n_sites)]), [()], everything)
 
 
 #: Every rule in the order of reports.
