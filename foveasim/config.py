@@ -92,9 +92,15 @@ class PerArea(_Section):
 
 
 _GENERATORS: dict[str, Callable[..., Layout]] = {
+    "foveal_cartesian": layouts.foveal_cartesian,
+    "fovi": layouts.fovi,
+    "giotto": layouts.giotto,
     "grid": layouts.grid,
     "hexagonal": layouts.hexagonal,
     "log_polar": layouts.log_polar,
+    "octagonal": layouts.octagonal,
+    "penrose": layouts.penrose,
+    "sunflower": layouts.sunflower,
     "zones": layouts.zones,
 }
 _SCENES: dict[str, Callable[..., Scene]] = {

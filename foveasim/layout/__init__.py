@@ -7,11 +7,19 @@ from foveasim.layout.adjacency import adjacency
 from foveasim.layout.channels import MOSAICS, colouring, mosaic, random_channels
 from foveasim.layout.edits import clip, inset, merge, node, punch, snap, split, union
 from foveasim.layout.enforce import Change, enforce
+from foveasim.layout.foveal_cartesian import foveal_cartesian
+from foveasim.layout.fovi import fovi
+from foveasim.layout.giotto import giotto, giotto_ratio
 from foveasim.layout.grid import grid
 from foveasim.layout.hexagonal import hexagonal
 from foveasim.layout.log_polar import log_polar, square_ring_ratio
+from foveasim.layout.octagonal import octagonal
+from foveasim.layout.penrose import penrose
+from foveasim.layout.quadtree import quadtree
 from foveasim.layout.readout import nearest_bus, readout_by, readout_order
 from foveasim.layout.rules import DesignRules, Report, RuleResult, Violation, min_width_um
+from foveasim.layout.sunflower import sunflower
+from foveasim.layout.voronoi import voronoi
 from foveasim.layout.zones import zones
 
 __all__ = [
@@ -26,6 +34,10 @@ __all__ = [
     "clip",
     "colouring",
     "enforce",
+    "foveal_cartesian",
+    "fovi",
+    "giotto",
+    "giotto_ratio",
     "grid",
     "hexagonal",
     "inset",
@@ -35,13 +47,18 @@ __all__ = [
     "mosaic",
     "nearest_bus",
     "node",
+    "octagonal",
+    "penrose",
     "punch",
+    "quadtree",
     "random_channels",
     "readout_by",
     "readout_order",
     "snap",
     "split",
     "square_ring_ratio",
+    "sunflower",
     "union",
+    "voronoi",
     "zones",
 ]

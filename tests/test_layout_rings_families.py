@@ -1,0 +1,624 @@
+"""Laws of the Giotto, foveal Cartesian and octagonal layouts: published numbers, closed forms, exact tilings, refusals."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from decimal import Decimal, localcontext
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from foveasim.errors import ParameterError
+from foveasim.layout.foveal_cartesian import foveal_cartesian
+from foveasim.layout.giotto import giotto, giotto_ratio
+from foveasim.layout.grid import grid
+from foveasim.layout.octagonal import octagonal
+
+relaxed = settings(deadline=None, derandomize=True, max_examples=40)
+
+units_um = st.floats(0.05, 50.0)
+
+
+def assert_tiles(layout):
+    """Neighbours share whole edges, no two sites overlap, and areas add up to what the sites cover together."""
+    polygons = layout.polygons()
+    a, b = shapely.STRtree(polygons).query(polygons, predicate="intersects")
+    common_um2 = shapely.area(shapely.intersection(polygons[a[a < b]], polygons[b[a < b]]))
+
+    assert bool(np.all(shapely.is_valid(polygons)))
+    assert bool(shapely.coverage_is_valid(polygons))
+    assert common_um2.max(initial=0.0) <= 1e-9 * layout.area_um2.min()
+    assert layout.area_um2.sum() == pytest.approx(shapely.union_all(polygons).area, rel=1e-9)
+
+
+def covered(layout):
+    """All sites together, made without dissolving anything that is not shared exactly."""
+    return shapely.coverage_union_all(layout.polygons())
+
+
+def edge_counts(layout):
+    """How many edges belong to one site, to two, and so on: vertices are the same only when bit for bit so."""
+    edges = Counter()
+    for polygon in layout.polygons():
+        xy = (shapely.get_coordinates(polygon) + 0.0).tolist()  # a zero has no sign
+        edges.update(frozenset((tuple(p), tuple(q))) for p, q in pairwise(xy))
+    return Counter(edges.values())
+
+
+def regular_polygon_um2(n_corners, radius_um):
+    return 0.5 * n_corners * math.sin(2 * math.pi / n_corners) * radius_um**2
+
+
+def ring_radii_um(layout):
+    """Inner and outer radius of each ring, from its vertices."""
+    site = np.repeat(np.arange(layout.n_sites), np.diff(layout.ring_offsets))
+    ring = layout.columns["ring"][site] - layout.columns["ring"].min()
+    radius_um = np.hypot(*layout.xy_um.T)
+    inner_um = np.full(ring.max() + 1, np.inf)
+    outer_um = np.zeros(ring.max() + 1)
+    np.minimum.at(inner_um, ring, radius_um)
+    np.maximum.at(outer_um, ring, radius_um)
+    return inner_um, outer_um
+
+
+# -- Giotto ----------------------------------------------------------------------------------------------------------
+
+GIOTTO_1 = {"n_rho": 76, "n_theta": 128, "n_fovea": 20, "n_across": 600}
+GIOTTO_2 = {"n_rho": 152, "n_theta": 252, "n_fovea": 42, "n_across": 1090}
+
+
+@st.composite
+def giotto_parameters(draw):
+    n_fovea = draw(st.integers(1, 6))
+    n_rho = n_fovea + draw(st.integers(1, 6))
+    return {
+        "n_rho": n_rho,
+        "n_theta": draw(st.integers(3 * n_fovea, 8 * n_fovea + 2)),
+        "n_fovea": n_fovea,
+        "n_across": draw(st.integers(2 * n_rho, 12 * n_rho)),
+        "unit_um": draw(units_um),
+        "fovea": draw(st.sampled_from(["rings", "none"])),
+        "stagger": draw(st.booleans()),
+        "chords_per_arc": draw(st.integers(1, 7)),
+    }
+
+
+def outer_corners(parameters):
+    """Corners of a circle outside the fovea: odd numbers of chords are doubled where rings are staggered."""
+    chords = parameters["chords_per_arc"]
+    return parameters["n_theta"] * (2 * chords if parameters["stagger"] and chords % 2 else chords)
+
+
+def decimal_ratio(n_rho, n_fovea, n_across):
+    """The ratio by bisection of the summed powers, in forty digits."""
+    with localcontext() as context:
+        context.prec = 40
+        low, high = Decimal(1), Decimal(n_across)
+        width = Decimal(n_across) / 2 - n_fovea + Decimal("0.5")
+        for _ in range(110):
+            middle = (low + high) / 2
+            is_large = sum(middle**i for i in range(1, n_rho - n_fovea + 1)) > width
+            low, high = (low, middle) if is_large else (middle, high)
+        return float(low)
+
+
+def test_the_ratio_of_giotto_2_is_the_published_one():
+    assert abs(giotto_ratio(n_rho=152, n_fovea=42, n_across=1090) - 1.02314422608633) < 1e-12
+
+
+def test_the_ratio_of_giotto_1_is_the_published_one():
+    assert giotto_ratio(n_rho=76, n_fovea=20, n_across=600) == pytest.approx(1.0481, abs=5e-5)
+
+
+@pytest.mark.parametrize(
+    ("n_rho", "n_fovea", "n_across"),
+    [(152, 42, 1090), (76, 20, 600), (2, 1, 4), (2, 1, 10**6), (50, 1, 100), (300, 299, 600), (40, 3, 10**9)],
+)
+def test_the_ratio_solves_the_rule_to_twelve_digits(n_rho, n_fovea, n_across):
+    ratio = giotto_ratio(n_rho=n_rho, n_fovea=n_fovea, n_across=n_across)
+
+    assert ratio == pytest.approx(decimal_ratio(n_rho, n_fovea, n_across), rel=1e-12)
+
+
+def test_one_ring_around_the_fovea_is_as_high_as_the_room_it_has():
+    assert giotto_ratio(n_rho=5, n_fovea=4, n_across=31) == pytest.approx(15.5 - 3.5, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "n_in_fovea", "n_around"), [(GIOTTO_2, 5167, 27_720), (GIOTTO_1, 1141, 7168)], ids=["2", "1"]
+)
+@pytest.mark.parametrize("chords_per_arc", [1, 2])
+def test_giotto_has_the_published_numbers_of_sites(parameters, n_in_fovea, n_around, chords_per_arc):
+    layout = giotto(**parameters, unit_um=6.45, chords_per_arc=chords_per_arc)
+    is_fovea = layout.columns["ring"] < parameters["n_fovea"]
+
+    assert (is_fovea.sum(), (~is_fovea).sum()) == (n_in_fovea, n_around)
+
+
+def test_the_log_part_of_giotto_2_spans_41_5_to_545_units_and_ends_with_a_ring_of_12_39():
+    layout = giotto(**GIOTTO_2, unit_um=6.45, fovea="none")
+    inner_um, outer_um = ring_radii_um(layout)
+
+    assert layout.n_sites == 27_720
+    assert inner_um[0] / 6.45 == pytest.approx(41.5, rel=1e-12)
+    assert outer_um[-1] / 6.45 == pytest.approx(545.0, rel=1e-12)
+    assert (outer_um[-1] - inner_um[-1]) / 6.45 == pytest.approx(12.39, abs=5e-3)
+
+
+@pytest.mark.parametrize("parameters", [GIOTTO_1, GIOTTO_2], ids=["1", "2"])
+def test_the_edges_of_rings_are_those_of_the_rule(parameters):
+    n_fovea, n_rho = parameters["n_fovea"], parameters["n_rho"]
+    ratio = decimal_ratio(n_rho, n_fovea, parameters["n_across"])
+    inner_um, outer_um = ring_radii_um(giotto(**parameters, unit_um=2.0))
+    b = ratio / (ratio - 1)
+    edges = n_fovea - b - 0.5 + b * ratio ** np.arange(n_rho - n_fovea + 1)
+
+    np.testing.assert_allclose(outer_um[:n_fovea], 2.0 * (np.arange(n_fovea) + 0.5), rtol=1e-12)
+    np.testing.assert_allclose(inner_um[1:n_fovea], outer_um[: n_fovea - 1], rtol=1e-12)
+    np.testing.assert_allclose(inner_um[n_fovea:], 2.0 * edges[:-1], rtol=1e-11)
+    np.testing.assert_allclose(outer_um[n_fovea:], 2.0 * edges[1:], rtol=1e-11)
+
+
+@given(giotto_parameters())
+@settings(relaxed, max_examples=80)
+def test_a_giotto_layout_tiles_its_disc_or_its_annulus(parameters):
+    layout = giotto(**parameters)
+    n_corners = outer_corners(parameters)
+    disc_um2 = regular_polygon_um2(n_corners, 0.5 * parameters["n_across"] * parameters["unit_um"])
+    blind_um2 = regular_polygon_um2(n_corners, (parameters["n_fovea"] - 0.5) * parameters["unit_um"])
+    is_open = parameters["fovea"] == "none"
+
+    assert_tiles(layout)
+    assert (covered(layout).geom_type, len(covered(layout).interiors)) == ("Polygon", int(is_open))
+    assert layout.area_um2.sum() == pytest.approx(disc_um2 - is_open * blind_um2, rel=1e-9)
+
+
+@given(giotto_parameters())
+@relaxed
+def test_neighbours_in_a_giotto_layout_share_their_edges_bit_for_bit(parameters):
+    counts = edge_counts(giotto(**parameters))
+    n_borders = 1 if parameters["fovea"] == "rings" else 2
+
+    assert counts[1] == n_borders * outer_corners(parameters)
+    assert set(counts) == {1, 2}
+
+
+@pytest.mark.parametrize("chords_per_arc", [1, 2, 3, 4, 7])
+@pytest.mark.parametrize("stagger", [False, True])
+@pytest.mark.parametrize("fovea", ["rings", "none"])
+def test_giotto_1_is_without_gap_or_overlap_for_any_number_of_chords(fovea, stagger, chords_per_arc):
+    parameters = {**GIOTTO_1, "unit_um": 3.0, "fovea": fovea, "stagger": stagger, "chords_per_arc": chords_per_arc}
+    layout = giotto(**parameters)
+    n_corners = outer_corners(parameters)
+
+    assert_tiles(layout)
+    assert len(covered(layout).interiors) == (fovea == "none")
+    assert covered(layout).exterior.length == pytest.approx(
+        n_corners * 2 * 900.0 * math.sin(math.pi / n_corners), rel=1e-9
+    )
+
+
+@given(st.integers(1, 12), st.integers(3, 9), st.integers(0, 50))
+@relaxed
+def test_ring_rho_of_the_fovea_holds_rho_times_as_many_sites_as_ring_1(n_fovea, n_per_rho, rest):
+    n_theta = n_per_rho * n_fovea + rest % n_fovea
+    layout = giotto(n_rho=n_fovea + 2, n_theta=n_theta, n_fovea=n_fovea, n_across=4 * n_fovea + 8, unit_um=1.0)
+    counts = [1] + [n_per_rho * rho for rho in range(1, n_fovea)] + [n_theta, n_theta]
+
+    assert np.bincount(layout.columns["ring"]).tolist() == counts
+    assert layout.columns["sector"].tolist() == [s for n in counts for s in range(n)]
+
+
+def test_sites_of_the_fovea_have_one_area_all_over():
+    layout = giotto(n_rho=14, n_theta=72, n_fovea=12, n_across=40, unit_um=2.0, chords_per_arc=60)
+    unit_areas = layout.area_um2[layout.columns["ring"] < 12] / 4.0
+
+    np.testing.assert_allclose(unit_areas[0], math.pi / 4, rtol=1e-4)
+    np.testing.assert_allclose(unit_areas[1:], 2 * math.pi / 6, rtol=1e-4)
+
+
+@pytest.mark.parametrize("chords_per_arc", [1, 2, 3])
+@pytest.mark.parametrize("fovea", ["rings", "none"])
+@pytest.mark.parametrize(("stagger", "turn"), [(False, 0.0), (True, 0.5)])
+def test_every_second_ring_around_the_fovea_is_turned_by_half_a_sector(stagger, turn, fovea, chords_per_arc):
+    layout = giotto(
+        n_rho=9,
+        n_theta=31,
+        n_fovea=5,
+        n_across=40,
+        unit_um=1.0,
+        fovea=fovea,
+        stagger=stagger,
+        chords_per_arc=chords_per_arc,
+    )
+    x, y = layout.centroid_um[layout.columns["ring"] > 5].T
+    angle = (np.arctan2(y, x) / (2 * math.pi / 31)).reshape(3, 31) % 31
+
+    np.testing.assert_allclose(angle[1], np.arange(31) + 0.5, atol=1e-9)
+    np.testing.assert_allclose(angle[[0, 2]], np.tile((np.arange(31) + 0.5 + turn) % 31, (2, 1)), atol=1e-9)
+
+
+def test_a_giotto_layout_without_fovea_is_the_outer_part_of_the_whole():
+    parameters = {**GIOTTO_1, "unit_um": 2.2, "chords_per_arc": 2}
+    whole, part = giotto(**parameters), giotto(**parameters, fovea="none")
+    outer = whole[whole.columns["ring"] >= 20]
+
+    assert {name: values.tolist() for name, values in part.columns.items()} == {
+        name: values.tolist() for name, values in outer.columns.items()
+    }
+    assert part.area_um2[128:].tolist() == outer.area_um2[128:].tolist()  # ring 20 touches the fovea
+    assert part.provenance["blind_radius_um"] == pytest.approx(19.5 * 2.2, rel=1e-14)
+    assert "blind_radius_um" not in whole.provenance
+
+
+def test_the_readout_line_is_the_spoke_in_which_a_site_begins():
+    layout = giotto(**GIOTTO_1, unit_um=1.0, stagger=False)
+    ring = layout.columns["ring"]
+    n_in_ring = np.where(ring < 20, np.maximum(1, 6 * ring), 128)
+    spoke = layout.columns["sector"] / n_in_ring * 128
+
+    assert layout.readout_line[ring >= 20].tolist() == layout.columns["sector"][ring >= 20].tolist()
+    assert bool(np.all((layout.readout_line <= spoke + 1e-9) & (spoke < layout.readout_line + 1)))
+
+
+def test_a_giotto_layout_scales_with_its_unit():
+    small, large = (giotto(**GIOTTO_1, unit_um=unit_um) for unit_um in (1.0, 8.0))
+
+    assert (8.0 * small.xy_um).tolist() == large.xy_um.tolist()
+    assert small.provenance["ring_ratio"] == large.provenance["ring_ratio"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"n_rho": 1}, "'n_rho' must be >= 2, got 1"),
+        ({"n_fovea": 0}, "'n_fovea' must be >= 1, got 0"),
+        ({"n_fovea": 76}, "'n_fovea' must be <= 75, got 76; 'n_rho' counts the fovea's rings and at least one"),
+        ({"n_across": 151}, "'n_across' must be > 151, the diameter of 76 rings that do not grow, got 151; take more"),
+        ({"n_across": 600.5}, "'n_across' must be a whole number, got 600.5"),
+        ({"n_across": "600"}, "'n_across' must be one number, got '600'"),
+        ({"n_theta": 2, "fovea": "none"}, "'n_theta' must be >= 3, got 2"),
+        ({"n_theta": 59}, "'n_theta' must be >= 60, three times 'n_fovea', got 59; or take fovea='none'"),
+        ({"n_theta": 10_000_000}, "'n_sites' must be <= 50000000"),
+        ({"unit_um": 0.0}, "'unit_um' must be > 0, got 0.0 µm"),
+        ({"unit_um": 1e5}, "'unit_um' must be <= 33333.3, got 100000.0 µm"),
+        ({"fovea": "hexagons"}, "'fovea' must be one of 'rings', 'none', got 'hexagons'"),
+        ({"chords_per_arc": 0}, "'chords_per_arc' must be >= 1, got 0"),
+    ],
+)
+def test_giotto_refuses_what_cannot_be(changed, message):
+    with pytest.raises(ParameterError, match=message):
+        giotto(**{**GIOTTO_1, "unit_um": 1.0, **changed})
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"n_rho": 20}, "'n_fovea' must be <= 19"),
+        ({"n_across": 0}, "'n_across'"),
+        ({"n_rho": 1e9}, "'n_rho' must be <="),
+    ],
+)
+def test_the_ratio_refuses_what_has_no_growing_rings(changed, message):
+    with pytest.raises(ParameterError, match=message):
+        giotto_ratio(**{"n_rho": 76, "n_fovea": 20, "n_across": 600, **changed})
+
+
+# -- foveal Cartesian ------------------------------------------------------------------------------------------------
+
+
+@st.composite
+def foveal_parameters(draw):
+    n_rings = draw(st.integers(1, 9))
+    return {
+        "n_rings": n_rings,
+        # Ratios of small whole numbers let corners of two rings meet, but for rounding.
+        "ring_ratio": draw(st.floats(1.01, 4.0) | st.fractions(1, 5, max_denominator=9).filter(lambda q: q > 1)),
+        "pitch_um": draw(units_um),
+        "n_fovea": draw(st.integers(1, n_rings)),
+    }
+
+
+def half_sides_um(n_rings, ring_ratio, pitch_um, n_fovea=1):
+    return [
+        (r + 0.5) * pitch_um if r < n_fovea else (n_fovea - 0.5) * pitch_um * float(ring_ratio) ** (r - n_fovea + 1)
+        for r in range(n_rings)
+    ]
+
+
+@given(foveal_parameters())
+@settings(relaxed, max_examples=80)
+def test_a_foveal_cartesian_layout_tiles_its_square_with_2n_minus_1_squared_sites(parameters):
+    layout = foveal_cartesian(**parameters)
+    half_um = half_sides_um(**parameters)[-1]
+
+    assert layout.n_sites == (2 * parameters["n_rings"] - 1) ** 2
+    assert_tiles(layout)
+    assert (covered(layout).geom_type, len(covered(layout).interiors)) == ("Polygon", 0)
+    assert layout.area_um2.sum() == pytest.approx(4 * half_um**2, rel=1e-9)
+    assert layout.bounds_um == pytest.approx((-half_um, -half_um, half_um, half_um), rel=1e-12)
+
+
+@given(foveal_parameters())
+@relaxed
+def test_neighbours_in_a_foveal_cartesian_layout_share_their_edges_bit_for_bit(parameters):
+    counts = edge_counts(foveal_cartesian(**parameters))
+
+    assert counts[1] == 4 * (2 * parameters["n_rings"] - 1)
+    assert set(counts) <= {1, 2}
+
+
+@given(foveal_parameters())
+@example({"n_rings": 7, "ring_ratio": 5 / 3, "pitch_um": 0.7, "n_fovea": 1})
+@example({"n_rings": 8, "ring_ratio": 1.4, "pitch_um": 0.1, "n_fovea": 3})
+@relaxed
+def test_every_edge_of_a_foveal_cartesian_layout_is_parallel_to_an_axis_and_none_is_a_rounding(parameters):
+    layout = foveal_cartesian(**parameters)
+    edges_um = np.concatenate([np.diff(shapely.get_coordinates(p), axis=0) for p in layout.polygons()])
+
+    assert set(np.count_nonzero(edges_um, axis=1).tolist()) == {1}
+    assert np.abs(edges_um).sum(axis=1).min() > 1e-12 * layout.bounds_um[2]
+
+
+@given(foveal_parameters())
+@relaxed
+def test_ring_r_has_8r_rectangles_of_the_sizes_in_closed_form(parameters):
+    layout = foveal_cartesian(**parameters)
+    half_um = half_sides_um(**parameters)
+    sizes_um = layout.site_bounds_um[:, 2:] - layout.site_bounds_um[:, :2]
+
+    np.testing.assert_allclose(layout.area_um2, sizes_um.prod(axis=1), rtol=1e-9)
+    np.testing.assert_allclose(sizes_um[0], 2 * half_um[0], rtol=1e-12)
+    for r in range(1, parameters["n_rings"]):
+        high, wide = half_um[r] - half_um[r - 1], 2 * half_um[r - 1] / (2 * r - 1)
+        in_ring = np.sort(sizes_um[layout.columns["ring"] == r], axis=1)
+        expected = [[high, high]] * 4 + [sorted((high, wide))] * (8 * r - 4)
+
+        np.testing.assert_allclose(in_ring[np.lexsort(in_ring.T[::-1])], sorted(expected), rtol=1e-9)
+
+
+@given(foveal_parameters())
+@relaxed
+def test_sites_keep_the_order_of_the_grid_that_they_are_numbered_as(parameters):
+    layout = foveal_cartesian(**parameters)
+    n = 2 * parameters["n_rings"] - 1
+    row, column = layout.columns["row"], layout.columns["column"]
+    x, y = np.zeros((2, n, n))
+    x[row, column], y[row, column] = layout.centroid_um.T
+
+    assert len(set(zip(row.tolist(), column.tolist(), strict=True))) == n * n
+    assert layout.readout_line.tolist() == column.tolist()
+    assert np.maximum(abs(row - n // 2), abs(column - n // 2)).tolist() == layout.columns["ring"].tolist()
+    # In its ring a site's neighbours along a row or column lie to its right, or above it.
+    ring = np.zeros((n, n), int)
+    ring[row, column] = layout.columns["ring"]
+    assert bool(np.all(np.diff(x, axis=1)[ring[:, 1:] == ring[:, :-1]] > 0))
+    assert bool(np.all(np.diff(y, axis=0)[ring[1:] == ring[:-1]] > 0))
+
+
+@given(st.integers(1, 8), units_um)
+@relaxed
+def test_a_foveal_cartesian_layout_that_is_all_fovea_is_a_grid(n_rings, pitch_um):
+    layout = foveal_cartesian(n_rings=n_rings, ring_ratio=1.5, pitch_um=pitch_um, n_fovea=n_rings)
+    uniform = grid(n_x=2 * n_rings - 1, n_y=2 * n_rings - 1, pitch_um=pitch_um)
+    order = np.lexsort((layout.columns["column"], layout.columns["row"]))
+
+    assert bool(np.all(np.diff(layout.ring_offsets) == 4))
+    np.testing.assert_allclose(
+        layout.site_bounds_um[order], uniform.site_bounds_um, rtol=1e-12, atol=1e-12 * pitch_um * n_rings
+    )
+
+
+def test_a_ratio_of_three_around_one_square_makes_each_ring_of_squares_in_its_corners():
+    layout = foveal_cartesian(n_rings=3, ring_ratio=3.0, pitch_um=2.0)
+
+    assert layout.area_um2[:9].tolist() == [4.0] * 9
+    assert Counter(layout.area_um2[9:].tolist()) == {36.0: 4, 12.0: 12}
+    assert layout.columns["sector"].tolist() == [0, *range(8), *range(16)]
+    assert layout.centroid_um[[1, 2, 3, 9]].tolist() == [[-2, -2], [0, -2], [2, -2], [-6, -6]]
+
+
+@given(st.integers(1, 6), st.integers(1, 8), st.floats(0.0, 1.0))
+@relaxed
+def test_no_site_is_below_the_pitch_where_the_ratio_is_at_least_that_of_the_fovea(n_fovea, n_growing, more):
+    ratio = 1 + 2 / (2 * n_fovea - 1) + more
+    layout = foveal_cartesian(n_rings=n_fovea + n_growing, ring_ratio=ratio, pitch_um=2.2, n_fovea=n_fovea)
+    sizes_um = layout.site_bounds_um[:, 2:] - layout.site_bounds_um[:, :2]
+
+    assert sizes_um.min() == pytest.approx(2.2, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"n_rings": 0}, "'n_rings' must be >= 1, got 0"),
+        ({"n_rings": 3600}, "'n_sites' must be <= 50000000, got 51825601"),
+        ({"ring_ratio": 1.0}, "'ring_ratio' must be > 1, got 1.0"),
+        ({"ring_ratio": math.inf}, "'ring_ratio' must be finite"),
+        (
+            {"ring_ratio": 10.0},
+            "'ring_ratio' makes 9 rings reach further than 1e.07 µm, got 10.0; take a smaller ratio",
+        ),
+        ({"pitch_um": -1}, "'pitch_um' must be > 0, got -1 µm"),
+        ({"n_fovea": 0}, "'n_fovea' must be >= 1, got 0"),
+        ({"n_fovea": 11}, "'n_fovea' must be <= 10, got 11; it is no larger than 'n_rings'"),
+    ],
+)
+def test_foveal_cartesian_refuses_what_cannot_be(changed, message):
+    with pytest.raises(ParameterError, match=message):
+        foveal_cartesian(**{"n_rings": 10, "ring_ratio": 1.2, "pitch_um": 1.0, **changed})
+
+
+# -- octagonal -------------------------------------------------------------------------------------------------------
+
+
+@st.composite
+def octagonal_parameters(draw):
+    pitch_um = draw(units_um)
+    return {
+        "n_x": draw(st.integers(1, 6)),
+        "n_y": draw(st.integers(1, 6)),
+        "pitch_um": pitch_um,
+        "diamond_um": draw(st.none() | st.floats(0.01, 0.7).map(lambda share: share * pitch_um)),
+        "border": draw(st.sampled_from(["whole", "cut"])),
+    }
+
+
+@given(octagonal_parameters())
+@settings(relaxed, max_examples=60)
+def test_octagons_and_diamonds_tile_without_a_hole(parameters):
+    layout = octagonal(**parameters)
+
+    assert_tiles(layout)
+    assert (covered(layout).geom_type, len(covered(layout).interiors)) == ("Polygon", 0)
+
+
+@given(octagonal_parameters())
+@relaxed
+def test_cut_diamonds_complete_the_rectangle(parameters):
+    layout = octagonal(**{**parameters, "border": "cut"})
+    wide_um, high_um = (parameters[n] * parameters["pitch_um"] for n in ("n_x", "n_y"))
+
+    assert layout.area_um2.sum() == pytest.approx(wide_um * high_um, rel=1e-9)
+    assert covered(layout).area == pytest.approx(shapely.box(*layout.bounds_um).area, rel=1e-9)
+    assert layout.bounds_um == pytest.approx((-wide_um / 2, -high_um / 2, wide_um / 2, high_um / 2), rel=1e-12)
+
+
+@given(octagonal_parameters())
+@relaxed
+def test_an_octagon_and_a_diamond_make_a_cell(parameters):
+    layout = octagonal(**parameters)
+    pitch_um = parameters["pitch_um"]
+    diamond_um = parameters["diamond_um"] or (math.sqrt(2) - 1) * pitch_um
+    n_x, n_y = parameters["n_x"], parameters["n_y"]
+    is_cut = parameters["border"] == "cut"
+    octagons, diamonds = (layout.area_um2[layout.columns["kind"] == kind] for kind in (0, 1))
+    parts = Counter({1.0: (n_x - 1) * (n_y - 1)})
+    parts.update({0.5: is_cut * 2 * (n_x + n_y - 2), 0.25: is_cut * 4})
+
+    np.testing.assert_allclose(octagons, [pitch_um**2 - diamond_um**2] * (n_x * n_y), rtol=1e-9)
+    np.testing.assert_allclose(np.sort(diamonds), sorted(p * diamond_um**2 for p in parts.elements()), rtol=1e-9)
+
+
+@given(octagonal_parameters())
+@relaxed
+def test_octagons_and_diamonds_share_their_edges_bit_for_bit(parameters):
+    n_x, n_y = parameters["n_x"], parameters["n_y"]
+    is_cut = parameters["border"] == "cut"
+    counts = edge_counts(octagonal(**parameters))
+    flat, slanted = n_x * (n_y - 1) + n_y * (n_x - 1), 4 * (n_x * n_y if is_cut else (n_x - 1) * (n_y - 1))
+
+    assert counts[2] == flat + slanted
+    # Along the border lie the octagons' flat sides and, cut, a side of each half and two of each quarter.
+    n_on_border = 2 * (n_x + n_y) + (2 * (n_x + n_y - 2) + 8 if is_cut else 4 * n_x * n_y - slanted)
+    assert counts[1] == n_on_border
+    assert set(counts) <= {1, 2}
+
+
+@given(st.integers(1, 4), st.integers(1, 4), units_um)
+@relaxed
+def test_octagons_are_regular_by_default(n_x, n_y, pitch_um):
+    layout = octagonal(n_x=n_x, n_y=n_y, pitch_um=pitch_um)
+    octagons = layout.xy_um[: 8 * n_x * n_y].reshape(-1, 8, 2)
+    sides_um = np.roll(octagons, -1, axis=1) - octagons
+    ahead_um = np.roll(sides_um, -1, axis=1)
+    turn_rad = np.arctan2(
+        sides_um[..., 0] * ahead_um[..., 1] - sides_um[..., 1] * ahead_um[..., 0], (sides_um * ahead_um).sum(axis=2)
+    )
+
+    np.testing.assert_allclose(np.hypot(*np.moveaxis(sides_um, 2, 0)), (math.sqrt(2) - 1) * pitch_um, rtol=1e-9)
+    np.testing.assert_allclose(turn_rad, math.pi / 4, rtol=1e-9)
+
+
+def test_diamonds_are_squares_on_their_corners_where_four_octagons_meet():
+    layout = octagonal(n_x=3, n_y=2, pitch_um=4.0, diamond_um=math.sqrt(2))
+    diamonds = layout[layout.columns["kind"] == 1]
+
+    np.testing.assert_allclose(diamonds.centroid_um, [[-2, 0], [2, 0]], atol=1e-12)
+    np.testing.assert_allclose(diamonds.xy_um[:4], [[-2, -1], [-1, 0], [-2, 1], [-3, 0]], atol=1e-12)
+
+
+def test_octagons_are_numbered_row_by_row_and_diamonds_after_them():
+    layout = octagonal(n_x=3, n_y=3, pitch_um=2.0)
+
+    assert layout.columns["kind"].tolist() == [0] * 9 + [1] * 4
+    assert layout.columns["row"].tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 0, 0, 1, 1]
+    assert layout.columns["column"].tolist() == [0, 1, 2] * 3 + [0, 1] * 2
+    assert layout.readout_line.tolist() == [0, 1, 2] * 3 + [3, 4] * 2
+    np.testing.assert_allclose(layout.centroid_um[[0, 1, 3, 9]], [[-2, -2], [0, -2], [-2, 0], [-1, -1]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"n_x": 0}, "'n_x' must be >= 1, got 0"),
+        ({"n_y": 1.5}, "'n_y' must be a whole number, got 1.5"),
+        ({"n_x": 10_000, "n_y": 10_000}, "'n_sites' must be <= 50000000"),
+        ({"pitch_um": math.nan}, "'pitch_um' must be finite, got nan µm"),
+        ({"diamond_um": 0.0}, "'diamond_um' must be > 0, got 0.0 µm"),
+        ({"diamond_um": math.sqrt(2.0)}, "'diamond_um' must be <= 1.41421, got 1.41.* µm; .* would touch"),
+        ({"border": "open"}, "'border' must be one of 'whole', 'cut', got 'open'"),
+    ],
+)
+def test_octagonal_refuses_what_cannot_be(changed, message):
+    with pytest.raises(ParameterError, match=message):
+        octagonal(**{"n_x": 3, "n_y": 3, "pitch_um": 2.0, **changed})
+
+
+# -- all three ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "parameters", "n_sites", "area_um2"),
+    [
+        pytest.param(
+            giotto,
+            {"n_rho": 700, "n_theta": 2000, "n_fovea": 330, "n_across": 5000, "unit_um": 1.0},
+            1 + 6 * 330 * 329 // 2 + 370 * 2000,
+            regular_polygon_um2(4000, 2500.0),
+            id="giotto",
+        ),
+        pytest.param(
+            foveal_cartesian,
+            {"n_rings": 500, "ring_ratio": 1.01, "pitch_um": 2.0, "n_fovea": 100},
+            999**2,
+            (2 * 99.5 * 2.0 * 1.01**400) ** 2,
+            id="foveal Cartesian",
+        ),
+        pytest.param(
+            octagonal,
+            {"n_x": 710, "n_y": 700, "pitch_um": 2.0, "border": "cut"},
+            710 * 700 + 711 * 701,
+            710 * 700 * 4.0,
+            id="octagonal",
+        ),
+    ],
+)
+def test_a_million_sites_have_the_area_that_they_must(make, parameters, n_sites, area_um2):
+    layout = make(**parameters)
+
+    assert layout.n_sites == n_sites
+    assert layout.area_um2.min() > 0.0
+    assert layout.area_um2.sum() == pytest.approx(area_um2, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("make", "parameters"),
+    [
+        (giotto, {**GIOTTO_1, "unit_um": 6.45, "fovea": "none", "stagger": False, "chords_per_arc": 3}),
+        (foveal_cartesian, {"n_rings": 6, "ring_ratio": 1.3, "pitch_um": 2.2, "n_fovea": 2}),
+        (octagonal, {"n_x": 4, "n_y": 3, "pitch_um": 5.0, "diamond_um": None, "border": "cut"}),
+        (octagonal, {"n_x": 4, "n_y": 3, "pitch_um": 5.0, "diamond_um": 1.5, "border": "whole"}),
+    ],
+)
+def test_a_layout_of_these_families_can_be_made_again_from_its_provenance(make, parameters):
+    layout = make(**parameters)
+
+    assert layout.provenance["generator"] == make.__name__
+    assert layout.provenance["parameters"] == parameters
+    assert make(**layout.provenance["parameters"]).xy_um.tolist() == layout.xy_um.tolist()
