@@ -20,7 +20,7 @@ from foveasim.capture import Capture
 from foveasim.errors import FoveasimError
 from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator
-from foveasim.layout import DesignRules, Layout
+from foveasim.layout import DesignRules, Layout, read_layout
 from foveasim.optics import Optics
 from foveasim.reconstruct import Picture
 from foveasim.scene import Scene
@@ -47,6 +47,7 @@ __all__ = [
     "errors",
     "layout",
     "optics",
+    "read_layout",
     "reconstruct",
     "rgb_filters",
     "scene",

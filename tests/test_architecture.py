@@ -33,14 +33,14 @@ FLOORS = [
 ]
 #: Loaded when they are used, not before.
 HEAVY = {
-    "OpenEXR", "PIL", "cv2", "dask", "exactextract", "imagecodecs", "manifold3d", "matplotlib", "numba", "pydantic", "pyvista", "rich", "skimage", "tifffile",
+    "OpenEXR", "PIL", "cv2", "dask", "exactextract", "gdstk", "imagecodecs", "klayout", "manifold3d", "matplotlib", "pyarrow", "numba", "pydantic", "pyvista", "rich", "skimage", "tifffile",
     "torch", "trimesh", "typer", "vtk", "yaml",
 }  # fmt: skip
 #: Names of numbers without a unit, or with the unit of what they are measured with.
 DIMENSIONLESS = {
     "above", "at_least", "at_most", "colours", "dpi", "f_number", "factor", "figure_inches", "limit", "max_aspect_ratio",
     "max_growth", "max_neighbour_ratio", "min_growth", "peak", "per_vertex", "qe", "ratio", "rounding",
-    "ring_ratio", "spectrum", "transmission", "value", "values", "weight", "weights", "white",
+    "ring_ratio", "spectrum", "transmission", "value", "values", "weight", "weights", "white", "worst_area_error",
 }  # fmt: skip
 #: Names of parts that no user sees, in cells, pitches or steps as their docstrings say.
 INTERNAL = {"cycles", "modes", "per_step", "x", "x2", "y", "y2"}

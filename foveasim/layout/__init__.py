@@ -7,6 +7,7 @@ from foveasim.layout.adjacency import adjacency
 from foveasim.layout.channels import MOSAICS, colouring, mosaic, random_channels
 from foveasim.layout.edits import clip, inset, merge, node, punch, snap, split, union
 from foveasim.layout.enforce import Change, enforce
+from foveasim.layout.files import WrittenLayout, read_layout, write_layout
 from foveasim.layout.foveal_cartesian import foveal_cartesian
 from foveasim.layout.fovi import fovi
 from foveasim.layout.giotto import giotto, giotto_ratio
@@ -30,6 +31,7 @@ __all__ = [
     "Report",
     "RuleResult",
     "Violation",
+    "WrittenLayout",
     "adjacency",
     "clip",
     "colouring",
@@ -52,6 +54,7 @@ __all__ = [
     "punch",
     "quadtree",
     "random_channels",
+    "read_layout",
     "readout_by",
     "readout_order",
     "snap",
@@ -60,5 +63,6 @@ __all__ = [
     "sunflower",
     "union",
     "voronoi",
+    "write_layout",
     "zones",
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from foveasim.layout.enforce import Change
+    from foveasim.layout.files import WrittenLayout
     from foveasim.layout.rules import DesignRules, Report
 
 __all__ = ["Layout"]
@@ -373,6 +375,12 @@ class Layout:
 
     def _then(self, step: str) -> dict[str, Any]:
         return {**self.provenance, "steps": [*self.provenance.get("steps", []), step]}
+
+    def write(self, path: str | Path, **options: Any) -> WrittenLayout:
+        """Write to a file whose ending tells the format; see :func:`foveasim.layout.write_layout`."""
+        from foveasim.layout.files import write_layout
+
+        return write_layout(self, path, **options)
 
     # -- neighbours ----------------------------------------------------------------------------------------------
 

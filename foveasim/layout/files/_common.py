@@ -1,0 +1,224 @@
+"""What all layout formats share: limits, checks of files from strangers, and the report of a written file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.arrays import MAX_SITES, Floats
+from foveasim.errors import FileError, FoveasimError, ParameterError
+from foveasim.layout._model import Layout
+from foveasim.records import described
+from foveasim.rings import site_area_um2
+
+__all__ = [
+    "MAX_UNPACKED_BYTES",
+    "WrittenLayout",
+    "check_header",
+    "check_sites_of",
+    "checked_layout",
+    "head_of",
+    "header",
+    "lossless",
+    "one_sentence",
+    "restored_column",
+    "rounding",
+]
+
+#: Written in every file that keeps columns and origin.
+FILE_FORMAT = "foveasim layout"
+FILE_VERSION = 1
+#: Larger files are refused, and so are those that would unpack to more: 50 million hexagons take 5 GiB.
+MAX_FILE_BYTES = 8 * 2**30
+MAX_UNPACKED_BYTES = 8 * 2**30
+#: Enough to tell the formats apart, white space and a byte order mark before the first brace included.
+HEAD_BYTES = 256
+#: Longer messages of other libraries are cut.
+MAX_TOLD = 200
+#: Kinds of numpy types that text formats keep: truth values, whole numbers, floating-point numbers, text.
+PLAIN_KINDS = "biufU"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WrittenLayout:
+    """
+    What became of a layout in a file.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    n_sites : int
+        Photosites in it.
+    worst_move_um : float, µm
+        How far rounding moved the vertex that it moved furthest.
+    worst_area_error : float
+        Change of a site's area by rounding, relative to its area, of the site with the largest.
+    """
+
+    path: Path
+    n_sites: int
+    worst_move_um: float
+    worst_area_error: float
+
+
+def lossless(layout: Layout, path: Path) -> WrittenLayout:
+    """Report of a format that keeps every digit."""
+    return WrittenLayout(path=path, n_sites=layout.n_sites, worst_move_um=0.0, worst_area_error=0.0)
+
+
+def rounding(layout: Layout, rounded_um: Floats, path: Path) -> WrittenLayout:
+    """Report of a format that holds these vertices instead of the layout's."""
+    if layout.n_sites == 0:
+        return lossless(layout, path)
+    move_um = np.hypot(*(rounded_um - layout.xy_um).T)
+    area_um2 = layout.area_um2
+    error = site_area_um2(rounded_um, layout.ring_offsets, layout.site_offsets) / area_um2 - 1.0
+    return WrittenLayout(
+        path=path,
+        n_sites=layout.n_sites,
+        worst_move_um=float(move_um.max()),
+        worst_area_error=float(np.abs(error).max()),
+    )
+
+
+def head_of(path: Path) -> bytes:
+    """
+    The first bytes of a file.
+
+    Raises
+    ------
+    FileError
+        When it is missing, unreadable, empty or too large.
+    """
+    try:
+        if not path.is_file():
+            raise FileError(path, "is not a file" if path.exists() else "no such file")
+        n_bytes = path.stat().st_size
+        if n_bytes > MAX_FILE_BYTES:
+            raise FileError(path, f"has {n_bytes} bytes, more than the {MAX_FILE_BYTES} that are read")
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+    except (OSError, ValueError) as error:
+        if isinstance(error, FileError):
+            raise
+        raise FileError(path, f"cannot be opened: {getattr(error, 'strerror', None) or error}") from None
+    if not head:
+        raise FileError(path, "is empty")
+    return head
+
+
+@contextmanager
+def one_sentence(path: Path, kind: str) -> Iterator[None]:
+    """Whatever a broken file makes its readers trip over, as one FileError of one sentence."""
+    try:
+        yield
+    except FileError:
+        raise
+    except FoveasimError as error:
+        raise FileError(path, str(error)) from None
+    except Exception as error:  # noqa: BLE001 -- a broken file makes its readers trip over anything
+        told = " ".join(str(error).split()) or type(error).__name__
+        told = told if len(told) <= MAX_TOLD else told[: MAX_TOLD - 3] + "..."
+        raise FileError(path, f"is broken, or no {kind} layout ({told})") from None
+
+
+def check_sites_of(path: Path, n_sites: int) -> None:
+    """
+    Refuse a file with too many sites.
+
+    Raises
+    ------
+    FileError
+        When there are more than any sensor has.
+    """
+    if n_sites > MAX_SITES:
+        raise FileError(path, f"has {n_sites} sites, more than the {MAX_SITES} that are read")
+
+
+def checked_layout(
+    polygons: NDArray[Any] | tuple[NDArray[Any], NDArray[Any], NDArray[Any]],
+    columns: Mapping[str, NDArray[Any]],
+    provenance: Mapping[str, Any],
+) -> Layout:
+    """
+    Layout of outlines from a stranger, all checks of :meth:`Layout.from_polygons` passed.
+
+    Raises
+    ------
+    GeometryError, ParameterError
+        When outlines are no photosites, or a column does not fit.
+    """
+    bare = Layout.from_polygons(polygons)
+    return Layout(bare.xy_um, bare.ring_offsets, bare.site_offsets, columns, provenance)
+
+
+# -- origin and types of columns, as text in the file -----------------------------------------------------------------
+
+
+def header(layout: Layout) -> dict[str, Any]:
+    """Plain data that stands beside the outlines in a file: format, unit, origin."""
+    provenance = described(dict(layout.provenance))
+    return {"format": FILE_FORMAT, "version": FILE_VERSION, "unit": "um", "provenance": provenance}
+
+
+def check_header(path: Path, about: Any) -> dict[str, Any]:
+    """
+    The origin that a file tells.
+
+    Raises
+    ------
+    FileError
+        When the file is of another format or version, or tells no origin.
+    """
+    if not isinstance(about, dict) or about.get("format") != FILE_FORMAT:
+        got = about.get("format") if isinstance(about, dict) else None
+        cure = "; load it with Capture.load, whose .layout it holds" if got == "foveasim capture" else ""
+        raise FileError(path, f"is no {FILE_FORMAT}{cure}")
+    if about.get("version") != FILE_VERSION:
+        raise FileError(path, f"has the format version {about.get('version')!r:.40}, expected {FILE_VERSION}")
+    provenance = about.get("provenance")
+    if not isinstance(provenance, dict) or about.get("unit") != "um":
+        raise FileError(path, "does not tell its origin and unit (µm) as this format asks")
+    return provenance
+
+
+def plain_columns(layout: Layout, format_name: str) -> dict[str, NDArray[Any]]:
+    """
+    The columns, when a format for numbers and text can hold them.
+
+    Raises
+    ------
+    ParameterError
+        When a column holds something else.
+    """
+    for name, column in layout.columns.items():
+        if column.dtype.kind not in PLAIN_KINDS or (column.dtype.itemsize > 8 and column.dtype.kind == "f"):
+            raise ParameterError(
+                name, f"of the type {column.dtype} cannot be kept in {format_name}", cure="write a .npz file"
+            )
+    return dict(layout.columns)
+
+
+def dtype_text(layout: Layout) -> dict[str, str]:
+    """Type of each column as text, such as ``<i8``."""
+    return {name: column.dtype.str for name, column in layout.columns.items()}
+
+
+def restored_column(values: NDArray[Any], dtype: object) -> NDArray[Any]:
+    """A column in the type that the file names, where that is a plain one and holds the same values."""
+    if not isinstance(dtype, str) or len(dtype) > 16 or dtype[1:2] not in PLAIN_KINDS:
+        return values
+    try:
+        with np.errstate(all="ignore"):
+            restored = values.astype(np.dtype(dtype))
+    except (TypeError, ValueError, OverflowError):
+        return values
+    is_floating = values.dtype.kind == restored.dtype.kind == "f"
+    return restored if np.array_equal(restored, values, equal_nan=is_floating) else values

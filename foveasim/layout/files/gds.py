@@ -1,0 +1,413 @@
+"""
+Chip layout files: GDSII and OASIS, through gdstk.
+
+A photosite is a polygon on one layer, its channel the data type, its number a property: attribute 1 with the text
+``photosite 17`` in GDSII, the property ``photosite`` in OASIS, so that the order survives programs that sort shapes.
+Coordinates are whole multiples of the database unit. Neither format has holes, and a GDSII polygon has at most 8,190
+vertices, the closing one included: other sites are written as several polygons (``photosite 17 part 1 of 3``) that
+share edges and add no vertex, and are put together again when read, exactly.
+
+References: Calma, GDSII Stream Format Manual 6.0 (1987); SEMI P39, OASIS.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import zlib
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from foveasim.arrays import MAX_SITES, Floats, Ints, check_count, check_number
+from foveasim.errors import FileError, GeometryError, ParameterError
+from foveasim.files import written_whole
+from foveasim.layout._model import Layout
+from foveasim.layout.files._common import WrittenLayout, check_sites_of, checked_layout, one_sentence, rounding
+from foveasim.rings import ring_moments
+
+__all__ = ["GDS_MAGIC", "OASIS_MAGIC", "read", "write"]
+
+GDS_MAGIC = b"\x00\x06\x00\x02"
+OASIS_MAGIC = b"%SEMI-OASIS\r\n"
+
+DEFAULT_DBU_UM = 1e-4
+#: Layers and data types beyond this are negative to some programs, which read 16 bits with sign.
+MAX_NUMBER = 32767
+#: Vertices of a GDSII polygon: with the closing one 8,190, beyond which gdstk warns that others may not read it.
+MAX_GDS_VERTICES = 8189
+#: Coordinates are 32-bit with sign.
+MAX_DBU = 2**31 - 1
+#: Layouts made at different times are the same bytes.
+TIMESTAMP = datetime(2000, 1, 1)  # noqa: DTZ001 -- GDSII knows no time zones
+CELL_NAME = "SENSOR"
+
+#: Of the reading program: memory, vertices, and time, with more of both for a large file.
+MIN_MEMORY_BYTES, MEMORY_PER_BYTE, MAX_MEMORY_BYTES = 8 * 2**30, 64, 32 * 2**30
+MAX_VERTICES = 2**29
+MAX_S, BYTES_PER_S = 30, 2**20
+#: Data type that each GDSII record has: none, bits, 16-bit, 32-bit, 64-bit floating, text.
+RECORD_TYPES = {
+    **dict.fromkeys(b"\x04\x07\x08\x09\x0a\x0b\x0c\x11\x15\x2d\x38", 0),
+    **dict.fromkeys(b"\x17\x1a\x26\x34", 1),
+    **dict.fromkeys(b"\x00\x01\x05\x0d\x0e\x13\x16\x21\x22\x25\x2a\x2b\x2e\x32\x33\x36\x39\x3b", 2),
+    **dict.fromkeys(b"\x0f\x10\x27\x2f\x30\x31", 3),
+    **dict.fromkeys(b"\x03\x1b\x1c", 5),
+    **dict.fromkeys(b"\x02\x06\x12\x19\x1f\x20\x23\x24\x2c\x37\x3a", 6),
+}
+END_OF_LIBRARY = 0x04
+#: Of OASIS: the END record fills the last bytes of the file; a checksum follows the scheme's number.
+OASIS_END_BYTES = 256
+OASIS_END = 2
+CRC32_SCHEME = 1
+
+
+# -- writing ----------------------------------------------------------------------------------------------------------
+
+
+def write(layout: Layout, path: Path, *, layer: int = 1, dbu_um: float = DEFAULT_DBU_UM) -> WrittenLayout:
+    """
+    Write GDSII or OASIS, by the ending.
+
+    Raises
+    ------
+    GeometryError
+        When sites collapse or cross themselves on the database grid.
+    ParameterError
+        When the layer, a channel or a coordinate is beyond what the format holds.
+    FileError
+        When gdstk is missing, or nothing can be written there.
+    """
+    gdstk = _gdstk(path)
+    layer = check_count("layer", layer, at_least=0, at_most=MAX_NUMBER)
+    dbu_um = check_number("dbu_um", dbu_um, at_least=1e-9, at_most=1e3)
+    channel = layout.channel
+    if channel.size and channel.max() > MAX_NUMBER:
+        raise ParameterError("channel", f"must be <= {MAX_NUMBER} in GDSII and OASIS", int(channel.max()))
+    is_oasis = path.suffix.lower() in (".oas", ".oasis")
+    snapped = _snapped(layout, dbu_um)
+    report = rounding(layout, snapped.xy_um, path)
+    site, part, n_parts, rings_um = _pieces(snapped, None if is_oasis else MAX_GDS_VERTICES)
+    tags = zip(rings_um, channel[site].tolist(), site.tolist(), part.tolist(), n_parts.tolist(), strict=True)
+    if is_oasis:
+        polygons = [
+            gdstk.Polygon(ring, layer, c).set_property("photosite", [s] if n == 0 else [s, k, n])
+            for ring, c, s, k, n in tags
+        ]
+    else:
+        polygons = [
+            gdstk.Polygon(ring, layer, c).set_gds_property(
+                1, f"photosite {s}" if n == 0 else f"photosite {s} part {k} of {n}"
+            )
+            for ring, c, s, k, n in tags
+        ]
+    library = gdstk.Library("FOVEASIM", unit=1e-6, precision=dbu_um * 1e-6)
+    library.new_cell(CELL_NAME).add(*polygons)
+    with written_whole(path) as temporary:
+        if is_oasis:
+            library.write_oas(temporary, validation="crc32")
+        else:
+            library.write_gds(temporary, max_points=0, timestamp=TIMESTAMP)
+        _check_end(temporary, is_oasis)
+    return report
+
+
+def _gdstk(path: Path) -> Any:
+    try:
+        import gdstk
+    except ImportError:
+        raise FileError(path, "needs gdstk; install it with: pip install 'foveasim[layout]'") from None
+    return gdstk
+
+
+def _in_um(xy_dbu: NDArray[Any], dbu_um: float) -> Floats:
+    """Coordinates in µm: the nearest number to the decimal, where a µm is a whole number of database units."""
+    per_um = round(1.0 / dbu_um)
+    is_whole = per_um >= 1 and abs(per_um * dbu_um - 1.0) < 1e-12
+    return np.asarray(xy_dbu / per_um if is_whole else xy_dbu * dbu_um, dtype=np.float64)
+
+
+def _snapped(layout: Layout, dbu_um: float) -> Layout:
+    """The layout with its vertices on the database grid, photosites still."""
+    xy_dbu = np.rint(layout.xy_um / dbu_um)
+    if xy_dbu.size and np.abs(xy_dbu).max() > MAX_DBU:
+        raise ParameterError(
+            "dbu_um", f"must be >= {np.abs(layout.xy_um).max() / MAX_DBU:.3g} for this layout", dbu_um, "µm"
+        )
+    snapped = Layout(_in_um(xy_dbu, dbu_um), layout.ring_offsets, layout.site_offsets)
+    if layout.n_sites:
+        area_um2 = ring_moments(snapped.xy_um, snapped.ring_offsets)[0]
+        is_hole = np.ones(area_um2.size, bool)
+        is_hole[layout.site_offsets[:-1]] = False
+        is_flat = np.where(is_hole, area_um2 >= 0.0, area_um2 <= 0.0)
+        is_bad = np.logical_or.reduceat(is_flat, layout.site_offsets[:-1]) | ~shapely.is_valid(snapped.polygons())
+        if is_bad.any():
+            bad = np.flatnonzero(is_bad)
+            raise GeometryError(
+                f"site {bad[0]}{f' and {bad.size - 1} more' if bad.size > 1 else ''} would collapse or cross itself on "
+                f"the database grid of {dbu_um:g} µm; take a smaller dbu_um",
+                tuple(int(i) for i in bad),
+            )
+    return snapped
+
+
+def _check_end(path: Path, is_oasis: bool) -> None:
+    """No word comes from gdstk when a disk is full: a whole file ends as its format asks."""
+    data = path.read_bytes()[-OASIS_END_BYTES:]
+    is_whole = data[:1] == bytes([OASIS_END]) if is_oasis else data[-4:] == b"\x00\x04\x04\x00"
+    if not is_whole:
+        raise OSError("not all of it was written")
+
+
+# -- sites as polygons without holes ----------------------------------------------------------------------------------
+
+
+def _pieces(layout: Layout, max_vertices: int | None) -> tuple[Ints, Ints, Ints, list[Floats]]:
+    """
+    Hole-free rings of all sites, in their order.
+
+    Returns
+    -------
+    site, part, n_parts : (n_ring,) int64
+        Number of the site; which of how many parts from 1, or 0 and 0 for a whole site.
+    rings_um : list of (n, 2), µm
+    """
+    rings_of_site = np.diff(layout.site_offsets)
+    outline = layout.site_offsets[:-1]
+    starts, stops = layout.ring_offsets[outline], layout.ring_offsets[outline + 1]
+    rings_um = [layout.xy_um[a:b] for a, b in zip(starts.tolist(), stops.tolist(), strict=True)]
+    is_cut = rings_of_site > 1
+    if max_vertices is not None:
+        is_cut |= stops - starts > max_vertices
+    n_parts = np.zeros(layout.n_sites, np.int64)
+    if not is_cut.any():
+        return np.arange(layout.n_sites), n_parts, n_parts, rings_um
+    cut = np.flatnonzero(is_cut)
+    parts_of = {
+        int(s): _hole_free_parts(polygon, max_vertices) for s, polygon in zip(cut, layout[cut].polygons(), strict=True)
+    }
+    n_parts[cut] = [len(parts) for parts in parts_of.values()]
+    n_rings = np.maximum(n_parts, 1)
+    site = np.repeat(np.arange(layout.n_sites), n_rings)
+    part = np.arange(site.size) - np.repeat(np.cumsum(n_rings) - n_rings, n_rings) + 1
+    pieces = [ring for s, whole in enumerate(rings_um) for ring in parts_of.get(s, [whole])]
+    return site, np.where(n_parts[site] > 0, part, 0), n_parts[site], pieces
+
+
+def _hole_free_parts(polygon: Any, max_vertices: int | None) -> list[Floats]:
+    """
+    Rings without holes that fill a polygon and have no other vertices than it has.
+
+    Notes
+    -----
+    Triangles of a constrained Delaunay triangulation are joined as long as each brings a new vertex: such a part has
+    no vertex twice, so it is simple and surrounds nothing.
+    """
+    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
+    corners = shapely.get_coordinates(shapely.normalize(triangles)).reshape(-1, 4, 2)[:, :3]
+    points, ids = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+    corner_ids = ids.reshape(-1, 3).tolist()
+    beside: dict[tuple[int, int], list[int]] = {}
+    for t, (a, b, c) in enumerate(corner_ids):
+        for u, v in ((a, b), (b, c), (c, a)):
+            beside.setdefault((min(u, v), max(u, v)), []).append(t)
+    is_free = [True] * len(corner_ids)
+    parts = []
+    for first in range(len(corner_ids)):
+        if is_free[first]:
+            is_free[first] = False
+            parts.append(points[_grown(first, corner_ids, beside, is_free, max_vertices)])
+    return parts
+
+
+def _grown(
+    first: int,
+    corner_ids: list[list[int]],
+    beside: dict[tuple[int, int], list[int]],
+    is_free: list[bool],
+    max_vertices: int | None,
+) -> list[int]:
+    """Vertices, in order, of a part that grows from one triangle; its triangles are no longer free."""
+    after = dict(zip(corner_ids[first], [*corner_ids[first][1:], corner_ids[first][0]], strict=True))
+    edges = list(after.items())
+    while edges and (max_vertices is None or len(after) < max_vertices):
+        u, v = edges.pop()
+        for t in beside[min(u, v), max(u, v)]:
+            apex = next(w for w in corner_ids[t] if w not in (u, v))
+            if is_free[t] and apex not in after:
+                is_free[t] = False
+                after[u], after[apex] = apex, v
+                edges += [(u, apex), (apex, v)]
+                break
+    start = next(iter(after))
+    ring = [start]
+    while after[ring[-1]] != start:
+        ring.append(after[ring[-1]])
+    return ring
+
+
+# -- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read(path: Path, *, layer: int | None = None, cell: str | None = None) -> Layout:
+    """
+    Read GDSII or OASIS, by the content; cells flattened, sites in the order of their numbers.
+
+    Raises
+    ------
+    FileError
+        When gdstk is missing, or the file is broken, cut short, hostile, or holds no photosites.
+    """
+    _gdstk(path)
+    kind = "GDSII or OASIS"
+    if layer is not None:
+        layer = check_count("layer", layer, at_least=0, at_most=2**31 - 1)
+    with one_sentence(path, kind):
+        data = path.read_bytes()
+        is_oasis = data.startswith(OASIS_MAGIC)
+        (_check_oasis if is_oasis else _check_records)(path, data)
+        n_bytes = len(data)
+        del data
+        answer, xy_dbu, counts, tags = _isolated(path, is_oasis, layer, cell, n_bytes)
+        check_sites_of(path, counts.size)
+        xy_um = _in_um(xy_dbu, answer["dbu_um"])
+        polygons, channel = _sites(path, xy_um, counts, tags)
+        columns = {"channel": channel}
+        about = {
+            "made_by": "read_layout",
+            "file": path.name,
+            "format": "OASIS" if is_oasis else "GDSII",
+            "cell": answer["cell"],
+            "dbu_um": float(f"{answer['dbu_um']:.12g}"),
+        }
+        try:
+            return checked_layout(polygons, columns, about)
+        except GeometryError:
+            return checked_layout(_without_keyholes(polygons), columns, about)
+
+
+def _check_records(path: Path, data: bytes) -> None:
+    """Records of GDSII must have lengths that lead to the end of the library, and types that are known."""
+    known = [-1] * 256
+    for record, kind in RECORD_TYPES.items():
+        known[record] = kind
+    at, n_bytes, record = 0, len(data), -1
+    while at + 4 <= n_bytes:
+        length = data[at] << 8 | data[at + 1]
+        record = data[at + 2]
+        if length < 4 or length & 1 or known[record] != data[at + 3]:
+            raise FileError(path, f"is broken: byte {at} begins no GDSII record")
+        at += length
+        if record == END_OF_LIBRARY:
+            break
+    if record != END_OF_LIBRARY or at > n_bytes:
+        raise FileError(path, "is cut short: its GDSII records do not reach the end of the library")
+    if data[at:].strip(b"\0"):
+        raise FileError(path, f"is broken: something follows the end of the GDSII library at byte {at}")
+
+
+def _check_oasis(path: Path, data: bytes) -> None:
+    """The END record must be there, and its CRC-32, where it tells one, must be that of the file."""
+    end = data[-OASIS_END_BYTES:]
+    if len(data) < len(OASIS_MAGIC) + OASIS_END_BYTES or end[0] != OASIS_END:
+        raise FileError(path, "is cut short or broken: it does not end with the END record of OASIS")
+    if end[-5] == CRC32_SCHEME and int.from_bytes(end[-4:], "little") != zlib.crc32(memoryview(data)[:-4]):
+        raise FileError(path, "is broken: its CRC-32 is not that of its content")
+
+
+def _isolated(
+    path: Path, is_oasis: bool, layer: int | None, cell: str | None, n_bytes: int
+) -> tuple[dict[str, Any], Floats, Ints, Ints]:
+    """What gdstk finds in the file, read by a program of its own, which a hostile file may crash."""
+    with tempfile.TemporaryDirectory(prefix="foveasim-") as folder:
+        out = Path(folder) / "shapes"
+        max_s = MAX_S + n_bytes // BYTES_PER_S
+        task = {
+            "path": str(path.resolve()),
+            "out": str(out),
+            "is_oasis": is_oasis,
+            "layer": layer,
+            "cell": cell,
+            "sys_path": sys.path,
+            "max_sites": MAX_SITES,
+            "max_vertices": MAX_VERTICES,
+            "max_memory_bytes": min(MIN_MEMORY_BYTES + MEMORY_PER_BYTE * n_bytes, MAX_MEMORY_BYTES),
+            "max_s": max_s,
+        }
+        try:
+            done = subprocess.run(  # noqa: S603 -- our own program
+                [sys.executable, "-P", str(Path(__file__).with_name("_isolated.py"))],
+                input=json.dumps(task).encode(),
+                capture_output=True,
+                timeout=max_s,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise FileError(path, f"is broken or hostile: reading it took more than {max_s} s") from None
+        if done.returncode != 0 or not done.stdout:
+            raise FileError(path, "is broken or hostile: gdstk crashed on it")
+        answer = json.loads(done.stdout)
+        if "refused" in answer:
+            raise FileError(path, answer["refused"])
+        if "broken" in answer:
+            raise FileError(path, f"is broken ({answer['broken']:.160})")
+        with out.open("rb") as file:
+            xy_dbu, counts, tags = (np.load(file, allow_pickle=False) for _ in range(3))
+        return answer, xy_dbu, counts, tags
+
+
+def _sites(path: Path, xy_um: Floats, counts: Ints, tags: Ints) -> tuple[NDArray[Any], Ints]:
+    """Polygons of the sites in the order of their numbers, and their channels."""
+    if counts.size == 0:
+        return np.zeros(0, object), np.zeros(0, np.int64)
+    if counts.min() < 3:
+        raise FileError(path, f"holds a polygon of {counts.min()} vertices")
+    channel, site, part, n_parts, placement = tags[:, 1:].T
+    # Sites without a number keep their place behind those that have one.
+    number = np.where(site >= 0, site, site.max() + 1)
+    order = np.lexsort((part, number, placement))
+    packed = Layout(xy_um, np.concatenate(([0], np.cumsum(counts))), np.arange(counts.size + 1))[order]
+    polygons = packed.polygons()
+    if not n_parts.any():
+        return polygons, channel[order]
+    key = np.stack((placement, number, n_parts), 1)[order]
+    is_first = np.concatenate(([True], (key[1:] != key[:-1]).any(axis=1))) | (n_parts[order] == 0)
+    first = np.flatnonzero(is_first)
+    size = np.diff(np.append(first, order.size))
+    expected = np.concatenate([np.arange(1, n + 1) if n > 1 else [n] for n in size])
+    is_wrong = (n_parts[order] > 0) & ((n_parts[order] != np.repeat(size, size)) | (part[order] != expected))
+    if is_wrong.any():
+        bad = order[np.flatnonzero(is_wrong)[0]]
+        raise FileError(path, f"has other parts of photosite {site[bad]} than the {n_parts[bad]} that it was cut into")
+    whole = polygons[first]
+    for i in np.flatnonzero(size > 1):
+        whole[i] = shapely.coverage_union_all(polygons[first[i] : first[i] + size[i]])
+    return whole, channel[order][first]
+
+
+def _without_keyholes(polygons: NDArray[Any]) -> NDArray[Any]:
+    """
+    Polygons as they are, and those whose outline reaches a hole through a slit of no width as one with that hole.
+
+    Other programs write holes this way.
+    """
+    is_bad = ~shapely.is_valid(polygons)
+    if is_bad.any():
+        mended = shapely.make_valid(polygons[is_bad], method="structure", keep_collapsed=False)
+        is_same = (shapely.get_type_id(mended) == shapely.GeometryType.POLYGON) & np.isclose(
+            shapely.area(mended), _shoelace_um2(polygons[is_bad]), rtol=1e-9, atol=0.0
+        )
+        polygons[np.flatnonzero(is_bad)[is_same]] = mended[is_same]
+    return polygons
+
+
+def _shoelace_um2(polygons: NDArray[Any]) -> Floats:
+    """Area that the outlines go round, a part gone round twice counting twice."""
+    rings, owner = shapely.get_rings(polygons, return_index=True)
+    return np.asarray(np.bincount(owner, shapely.area(shapely.polygons(rings)), len(polygons)), dtype=np.float64)

@@ -1,0 +1,162 @@
+"""
+Layouts as GeoParquet 1.1, through pyarrow: outlines as WKB, columns as columns; exact, small, and read by map programs.
+
+Coordinates are µm in the sensor's plane, without a coordinate reference system. Unit and origin stand in the metadata
+``foveasim``.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from foveasim.errors import FileError, ParameterError
+from foveasim.files import written_whole
+from foveasim.layout._model import Layout
+from foveasim.layout.files._common import (
+    MAX_UNPACKED_BYTES,
+    WrittenLayout,
+    check_header,
+    check_sites_of,
+    checked_layout,
+    dtype_text,
+    header,
+    lossless,
+    one_sentence,
+    plain_columns,
+    restored_column,
+)
+
+__all__ = ["MAGIC", "read", "write"]
+
+MAGIC = b"PAR1"
+GEOMETRY = "geometry"
+VERSION = "1.1.0"
+#: Rows that are unpacked at a time.
+BATCH = 4096
+
+
+def write(layout: Layout, path: Path) -> WrittenLayout:
+    """
+    Write a table with one row a site.
+
+    Raises
+    ------
+    ParameterError
+        When a column holds neither numbers nor text, or is called like the outlines.
+    FileError
+        When pyarrow is missing, or nothing can be written there.
+    """
+    pa, parquet = _pyarrow(path)
+    columns = plain_columns(layout, "GeoParquet")
+    if GEOMETRY in columns:
+        raise ParameterError(GEOMETRY, "is the name of the outlines in GeoParquet", cure="rename the column")
+    column: dict[str, Any] = {
+        "encoding": "WKB",
+        "geometry_types": ["Polygon"],
+        "crs": None,
+        "edges": "planar",
+        "orientation": "counterclockwise",
+    }
+    if layout.n_sites:
+        column["bbox"] = list(layout.bounds_um)
+    geo = {"version": VERSION, "primary_column": GEOMETRY, "columns": {GEOMETRY: column}}
+    about = {**header(layout), "columns": dtype_text(layout)}
+    outlines = pa.array(shapely.to_wkb(layout.polygons(), byte_order=1), type=pa.binary())
+    # numpy's text of fixed width has no null, and other byte orders no place in Arrow.
+    native = {name: values.astype(values.dtype.newbyteorder("=")) for name, values in columns.items()}
+    table = pa.table({GEOMETRY: outlines, **{name: pa.array(values) for name, values in native.items()}})
+    table = table.replace_schema_metadata({"geo": json.dumps(geo), "foveasim": json.dumps(about)})
+    with written_whole(path) as temporary:
+        parquet.write_table(table, temporary, compression="zstd", write_page_checksum=True)
+    return lossless(layout, path)
+
+
+def read(path: Path) -> Layout:
+    """
+    Read a table of polygons, in the order of its rows.
+
+    Raises
+    ------
+    FileError
+        When pyarrow is missing, or the file is broken, too large, or holds something else than polygons.
+    """
+    pa, parquet = _pyarrow(path)
+    with one_sentence(path, "GeoParquet"), parquet.ParquetFile(path, page_checksum_verification=True) as file:
+        check_sites_of(path, file.metadata.num_rows)
+        if sum(file.metadata.row_group(i).total_byte_size for i in range(file.num_row_groups)) > MAX_UNPACKED_BYTES:
+            raise FileError(path, f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
+        metadata = file.metadata.metadata or {}
+        if b"geo" not in metadata:
+            raise FileError(path, "is a Parquet table without outlines: it has no metadata 'geo'")
+        geo = json.loads(metadata[b"geo"])
+        name = geo["primary_column"]
+        if geo["columns"][name]["encoding"] != "WKB":
+            raise FileError(path, f"has outlines in the encoding {geo['columns'][name]['encoding']!r:.40}, not WKB")
+        kind = file.schema_arrow.field(name).type
+        if not (pa.types.is_binary(kind) or pa.types.is_large_binary(kind)):
+            raise FileError(path, f"has outlines as {str(kind)[:40]}, not as bytes of WKB")
+        table = _table(path, pa, file)
+        table.validate(full=True)
+        polygons = _polygons(path, table.column(name).to_numpy(zero_copy_only=False))
+        types: Any = {}
+        provenance: dict[str, Any] = {"made_by": "read_layout", "file": path.name, "format": "GeoParquet"}
+        if b"foveasim" in metadata:
+            about = json.loads(metadata[b"foveasim"])
+            provenance = check_header(path, about)
+            types = about.get("columns")
+        types = types if isinstance(types, dict) else {}
+        columns, left_out = {}, []
+        for other in table.column_names:
+            kind = table.schema.field(other).type
+            if other == name:
+                continue
+            is_number = pa.types.is_boolean(kind) or pa.types.is_integer(kind) or pa.types.is_floating(kind)
+            is_text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
+            has_null = table.column(other).null_count > 0
+            if not (is_number or is_text) or (has_null and not pa.types.is_floating(kind)):
+                left_out.append(other)
+                continue
+            values = table.column(other).to_numpy(zero_copy_only=False)
+            columns[other] = restored_column(values.astype(str) if is_text else values, types.get(other))
+        if left_out:
+            provenance = {**provenance, "left_out_columns": left_out}
+        return checked_layout(polygons, columns, provenance)
+
+
+def _pyarrow(path: Path) -> tuple[Any, Any]:
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError:
+        raise FileError(path, "needs pyarrow; install it with: pip install 'foveasim[layout]'") from None
+    return pa, parquet
+
+
+def _table(path: Path, pa: Any, file: Any) -> Any:
+    """All rows, a few at a time: one long value may stand in a small file for very many rows."""
+    batches, n_bytes = [], 0
+    for batch in file.iter_batches(batch_size=BATCH, use_threads=False):
+        n_bytes += batch.nbytes
+        if n_bytes > MAX_UNPACKED_BYTES:
+            raise FileError(path, f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
+        batches.append(batch)
+    return pa.Table.from_batches(batches, schema=file.schema_arrow)
+
+
+def _polygons(path: Path, outlines: NDArray[Any]) -> NDArray[Any]:
+    """Polygons of WKB; a row that holds one in a multipolygon gives that."""
+    geometries = np.asarray(shapely.from_wkb(outlines, on_invalid="raise"), dtype=object)
+    is_multi = shapely.get_type_id(geometries) == shapely.GeometryType.MULTIPOLYGON
+    is_single = is_multi & (shapely.get_num_geometries(geometries) == 1)
+    geometries[is_single] = shapely.get_geometry(geometries[is_single], 0)
+    is_polygon = shapely.get_type_id(geometries) == shapely.GeometryType.POLYGON
+    if not is_polygon.all():
+        row = int(np.flatnonzero(~is_polygon)[0])
+        raise FileError(path, f"row {row} must be one polygon; a site is one piece")
+    return geometries

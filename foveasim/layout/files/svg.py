@@ -1,0 +1,82 @@
+"""Layouts as drawings: one filled path a site, holes by the even-odd rule, y up. Written only."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from foveasim.arrays import check_count
+from foveasim.errors import ParameterError
+from foveasim.files import written_whole
+from foveasim.layout._model import Layout
+from foveasim.layout.files._common import WrittenLayout, rounding
+
+__all__ = ["write"]
+
+#: Digits behind the point of a µm: a drawing to a tenth of a nanometre.
+DIGITS = 4
+#: Longer side of the drawing on a page, in the pixels of CSS.
+SHOWN_PX = 1000
+DEFAULT_COLOUR = "#9a9a9a"
+#: Names of CSS, and numbers as #rgb or #rrggbb; nothing that could end an attribute.
+COLOUR = re.compile(r"#[0-9a-fA-F]{3}|#[0-9a-fA-F]{6}|[a-zA-Z]{3,24}")
+#: Sites that are made into text at a time.
+CHUNK = 10_000
+
+
+def write(layout: Layout, path: Path, *, colours: Mapping[int, str] | None = None) -> WrittenLayout:
+    """
+    Draw the layout.
+
+    Raises
+    ------
+    ParameterError
+        When a colour is none.
+    FileError
+        When nothing can be written there.
+    """
+    colours = _checked(colours or {})
+    x_min, y_min, x_max, y_max = layout.bounds_um if layout.n_sites else (0.0, 0.0, 1.0, 1.0)
+    width_um, height_um = x_max - x_min, y_max - y_min
+    px_per_um = SHOWN_PX / max(width_um, height_um)
+    fills = [colours.get(c, DEFAULT_COLOUR) for c in layout.channel.tolist()]
+    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write(
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width_um * px_per_um:.3f}" '
+            f'height="{height_um * px_per_um:.3f}" '
+            f'viewBox="{x_min:.{DIGITS}f} {-y_max:.{DIGITS}f} {width_um:.{DIGITS}f} {height_um:.{DIGITS}f}">\n'
+            f"<title>{layout.n_sites} photosites, 1 unit is 1 µm</title>\n"
+            '<g transform="scale(1,-1)" fill-rule="evenodd" stroke="none">\n'
+        )
+        for start in range(0, layout.n_sites, CHUNK):
+            outlines = _outlines(layout[start : start + CHUNK])
+            file.writelines(f'<path id="site{i}" fill="{fills[i]}" d="{d}"/>\n' for i, d in enumerate(outlines, start))
+        file.write("</g>\n</svg>\n")
+    return rounding(layout, np.round(layout.xy_um, DIGITS), path)
+
+
+def _checked(colours: Mapping[int, str]) -> dict[int, str]:
+    checked = {}
+    for channel, colour in colours.items():
+        if not isinstance(colour, str) or not COLOUR.fullmatch(colour):
+            raise ParameterError(
+                f"colours[{channel!r:.20}]", "must be a name or #rrggbb", colour, cure='say "#c23b22" or "green"'
+            )
+        checked[check_count("colours", channel, at_least=0)] = colour
+    return checked
+
+
+def _outlines(layout: Layout) -> list[str]:
+    """Path data of each site: every ring closed."""
+    n_vertices = layout.xy_um.shape[0]
+    point = f"%.{DIGITS}f %.{DIGITS}f"
+    parts = np.full(n_vertices, "L" + point, dtype=object)
+    parts[layout.ring_offsets[:-1]] = "M" + point
+    parts[layout.ring_offsets[1:] - 1] += "Z"
+    parts[layout.ring_offsets[layout.site_offsets[1:]] - 1] += "\n"
+    # Adding 0 turns -0 into 0.
+    numbers = np.round(layout.xy_um, DIGITS) + 0.0
+    return ("".join(parts) % tuple(numbers.ravel().tolist())).splitlines()

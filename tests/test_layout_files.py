@@ -1,0 +1,792 @@
+"""Layout files: what a round trip keeps, what other programs see, and how broken files end."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import subprocess
+import sys
+import time
+import xml.etree.ElementTree as ET
+import zipfile
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import shapely
+
+from foveasim.errors import FileError, GeometryError, ParameterError
+from foveasim.layout import Layout, hexagonal
+from foveasim.layout.files import read_layout, write_layout
+
+gdstk = pytest.importorskip("gdstk")
+klayout = pytest.importorskip("klayout.db")
+pq = pytest.importorskip("pyarrow.parquet")
+
+EXACT = ["npz", "geojson", "parquet"]
+CHIP = ["gds", "oas"]
+DBU_UM = 1e-4
+
+
+def ring(n, radius_um, centre_um=(0.0, 0.0), turn_rad=0.1):
+    angle = turn_rad + 2.0 * np.pi * np.arange(n) / n
+    return np.asarray(centre_um) + radius_um * np.stack((np.cos(angle), np.sin(angle)), 1)
+
+
+@pytest.fixture(scope="module")
+def zoo():
+    """Sites of 3 to 40 vertices off any grid, a third of them with one or two holes, in no spatial order."""
+    rng = np.random.default_rng(5)
+    polygons = []
+    for i in range(60):
+        centre = np.array([i % 10, i // 10]) * 7.3 - 20.0 + rng.uniform(-0.3, 0.3, 2)
+        holes = [ring(5, 0.5, (centre[0] + s, centre[1] + 0.3), 0.7) for s in ([], [0.1], [-1.0, 1.1])[i % 3]]
+        polygons.append(shapely.Polygon(ring(3 + (7 * i) % 38 if i % 3 == 0 else 12 + i % 9, 3.1, centre), holes))
+    order = rng.permutation(60)
+    return Layout.from_polygons(
+        [polygons[i] for i in order],
+        channel=rng.integers(0, 5, 60),
+        readout_line=rng.integers(0, 9, 60).astype(np.int32),
+        provenance={"made_by": "zoo", "steps": ["α", 1.5, None]},
+        gain=rng.normal(size=60).astype(np.float32),
+        weight=np.where(rng.random(60) < 0.2, np.nan, rng.normal(size=60) * 1e-300),
+        name=np.array([f"µ\"{i}'," for i in order]),
+        is_dead=rng.random(60) < 0.5,
+    )
+
+
+def assert_same(a, b):
+    for name in ("xy_um", "ring_offsets", "site_offsets"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    assert list(a.columns) == list(b.columns)
+    for name, column in a.columns.items():
+        assert column.dtype == b.columns[name].dtype, name
+        np.testing.assert_array_equal(column, b.columns[name])
+
+
+def lattice(layout):
+    """Vertices as whole numbers of database units, by decimal rounding."""
+    return np.round(layout.xy_um, 4) * 10**4
+
+
+def same_outlines(a, b):
+    return all(shapely.equals(p, q) for p, q in zip(a, b, strict=True))
+
+
+# -- round trips ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", EXACT)
+def test_exact_formats_give_back_every_bit_every_column_and_the_origin(zoo, tmp_path, ending):
+    report = write_layout(zoo, tmp_path / f"a.{ending}")
+    again = read_layout(tmp_path / f"a.{ending}")
+
+    assert_same(zoo, again)
+    assert dict(again.provenance) == dict(zoo.provenance)
+    assert (report.n_sites, report.worst_move_um, report.worst_area_error) == (60, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("ending", CHIP)
+def test_chip_formats_give_back_holes_order_and_channels_on_the_database_grid(zoo, tmp_path, ending):
+    write_layout(zoo, tmp_path / f"a.{ending}")
+    again = read_layout(tmp_path / f"a.{ending}")
+    expected = Layout(np.round(zoo.xy_um, 4), zoo.ring_offsets, zoo.site_offsets).polygons()
+
+    assert again.n_sites == 60
+    assert same_outlines(again.polygons(), expected)
+    assert [len(p.interiors) for p in again.polygons()] == [len(p.interiors) for p in zoo.polygons()]
+    np.testing.assert_array_equal(again.channel, zoo.channel)
+    np.testing.assert_allclose(again.area_um2, shapely.area(expected), rtol=1e-12)
+
+
+@pytest.mark.parametrize("ending", CHIP)
+def test_sites_without_holes_keep_their_first_vertex(tmp_path, ending):
+    layout = hexagonal(pitch_um=3.3, n_columns=9, n_rows=7)
+    write_layout(layout, tmp_path / f"a.{ending}")
+    again = read_layout(tmp_path / f"a.{ending}")
+
+    np.testing.assert_array_equal(again.xy_um, np.round(layout.xy_um, 4))
+    np.testing.assert_array_equal(again.ring_offsets, layout.ring_offsets)
+
+
+@pytest.mark.parametrize("ending", CHIP)
+def test_a_second_round_trip_changes_nothing_and_writes_the_same_bytes(tmp_path, ending):
+    first, second = tmp_path / f"a.{ending}", tmp_path / f"b.{ending}"
+    write_layout(hexagonal(pitch_um=3.3, n_columns=9, n_rows=7), first)
+    report = write_layout(read_layout(first), second)
+
+    assert first.read_bytes() == second.read_bytes()
+    assert report.worst_move_um == 0.0
+
+
+@pytest.mark.parametrize("ending", EXACT + CHIP)
+def test_a_layout_without_sites_stays_one(tmp_path, ending):
+    empty = hexagonal(pitch_um=3.3, n_columns=3, n_rows=3)[:0]
+    write_layout(empty, tmp_path / f"a.{ending}")
+
+    assert read_layout(tmp_path / f"a.{ending}").n_sites == 0
+
+
+@pytest.mark.parametrize("ending", EXACT + CHIP)
+def test_content_decides_and_not_the_ending(zoo, tmp_path, ending):
+    write_layout(zoo, tmp_path / f"a.{ending}")
+    expected = read_layout(tmp_path / f"a.{ending}")
+    for wrong in ("yaml", "gds", "npz", "geojson"):
+        (tmp_path / f"wrong.{wrong}").write_bytes((tmp_path / f"a.{ending}").read_bytes())
+        assert_same(read_layout(tmp_path / f"wrong.{wrong}"), expected)
+
+
+def test_npz_keeps_columns_of_any_type(tmp_path):
+    bare = hexagonal(pitch_um=3.3, n_columns=2, n_rows=2)
+    layout = bare.with_columns(
+        when=np.array(["2020-01-01"] * 4, "M8[D]"),
+        z=np.arange(4) * 1j,
+        raw=np.array([b"a"] * 4),
+        half=np.ones(4, ">f2"),
+    )
+    write_layout(layout, tmp_path / "a.npz")
+
+    assert_same(read_layout(tmp_path / "a.npz"), layout)
+
+
+@pytest.mark.parametrize("ending", ["geojson", "parquet"])
+def test_text_formats_refuse_columns_that_they_would_change(tmp_path, ending):
+    layout = hexagonal(pitch_um=3.3, n_columns=2, n_rows=2).with_columns(z=np.arange(4) * 1j)
+    with pytest.raises(ParameterError, match=r"'z' of the type complex128 cannot be kept"):
+        write_layout(layout, tmp_path / f"a.{ending}")
+
+
+@pytest.mark.parametrize("ending", EXACT)
+def test_infinite_and_large_numbers_survive(tmp_path, ending):
+    layout = hexagonal(pitch_um=3.3, n_columns=2, n_rows=2).with_columns(
+        a=np.array([np.inf, -np.inf, np.nan, -0.0]),
+        b=np.array([2**63 - 1, -(2**63), 0, 1]),
+        c=np.full(4, 2**64 - 1, np.uint64),
+        d=np.full(4, np.nan),
+    )
+    write_layout(layout, tmp_path / f"a.{ending}")
+    again = read_layout(tmp_path / f"a.{ending}")
+
+    assert_same(again, layout)
+    assert np.signbit(again.columns["a"][3])
+
+
+# -- what other programs see ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", CHIP)
+def test_klayout_sees_each_site_with_its_area_layer_and_channel(zoo, tmp_path, ending):
+    write_layout(zoo, tmp_path / f"a.{ending}", layer=7)
+    other = klayout.Layout()
+    other.read(str(tmp_path / f"a.{ending}"))
+    twice_area_dbu2 = dict.fromkeys(range(60), 0)
+    channels = {}
+    assert other.dbu == pytest.approx(DBU_UM)
+    for info in other.layer_infos():
+        assert info.layer == 7
+        for shape in other.top_cell().shapes(other.layer(info)).each():
+            text = shape.property(1) if ending == "gds" else shape.property("photosite")
+            words = str(text[0] if isinstance(text, list) else text).split()
+            site = int(words[1] if ending == "gds" else words[0])
+            twice_area_dbu2[site] += shape.polygon.area2()
+            channels[site] = info.datatype
+    dbu = lattice(zoo)
+    exact = []
+    for s in range(60):
+        twice = 0
+        for r in range(zoo.site_offsets[s], zoo.site_offsets[s + 1]):
+            xy = [(round(x), round(y)) for x, y in dbu[zoo.ring_offsets[r] : zoo.ring_offsets[r + 1]]]
+            twice += sum(a[0] * b[1] - b[0] * a[1] for a, b in zip(xy, xy[1:] + xy[:1], strict=True))
+        exact.append(twice)
+
+    assert [twice_area_dbu2[s] for s in range(60)] == exact
+    assert [channels[s] for s in range(60)] == zoo.channel.tolist()
+
+
+@pytest.mark.parametrize("ending", CHIP)
+def test_order_survives_klayout_which_sorts_shapes_and_turns_rings(zoo, tmp_path, ending):
+    write_layout(zoo, tmp_path / f"a.{ending}")
+    other = klayout.Layout()
+    other.read(str(tmp_path / f"a.{ending}"))
+    other.write(str(tmp_path / f"b.{ending}"))
+    first, again = read_layout(tmp_path / f"a.{ending}"), read_layout(tmp_path / f"b.{ending}")
+
+    assert same_outlines(first.polygons(), again.polygons())
+    np.testing.assert_array_equal(first.channel, again.channel)
+
+
+def test_holes_that_klayout_writes_as_slits_are_holes(tmp_path):
+    other = klayout.Layout()
+    polygon = klayout.DPolygon([klayout.DPoint(*p) for p in ((0, 0), (0, 10), (10, 10), (10, 0))])
+    polygon.insert_hole([klayout.DPoint(*p) for p in ((2, 2), (2, 5), (5, 5), (5, 2))])
+    other.create_cell("A").shapes(other.layer(1, 3)).insert(polygon)
+    other.write(str(tmp_path / "a.gds"))
+    layout = read_layout(tmp_path / "a.gds")
+
+    assert layout.area_um2.tolist() == pytest.approx([91.0])
+    assert layout.channel.tolist() == [3]
+    assert np.diff(layout.site_offsets).tolist() == [2]
+
+
+@pytest.mark.parametrize("ending", CHIP)
+def test_a_hierarchy_is_flattened_as_klayout_flattens_it(tmp_path, ending):
+    rng = np.random.default_rng(3)
+    library = gdstk.Library(unit=1e-6, precision=1e-10)
+    pixel, block, top = (library.new_cell(name) for name in ("PIXEL", "BLOCK", "TOP"))
+    pixel.add(gdstk.Polygon([(0, 0), (2, 0), (2, 1), (0.5, 1.5)], 1, 2))
+    block.add(
+        gdstk.Reference(pixel, (1, 2), rotation=np.pi / 2, columns=3, rows=2, spacing=(4, 5)),
+        gdstk.rectangle((-3, -3), (-2, -2), 1, 4),
+    )
+    for _ in range(6):
+        top.add(
+            gdstk.Reference(
+                block,
+                tuple(np.round(rng.uniform(-300, 300, 2), 4)),
+                rotation=rng.integers(0, 4) * np.pi / 2,
+                x_reflection=bool(rng.integers(2)),
+            )
+        )
+    top.add(
+        gdstk.Reference(pixel, (500, 500), magnification=2.0),
+        gdstk.FlexPath([(600, 0), (620, 0)], 2.0, layer=1, datatype=0),
+    )
+    (library.write_gds if ending == "gds" else library.write_oas)(tmp_path / f"a.{ending}")
+    layout = read_layout(tmp_path / f"a.{ending}")
+    other = klayout.Layout()
+    other.read(str(tmp_path / f"a.{ending}"))
+    expected = []
+    for info in other.layer_infos():
+        shapes = other.top_cell().begin_shapes_rec(other.layer(info))
+        while not shapes.at_end():
+            p = shapes.shape().polygon.transformed(shapes.trans())
+            points = [(q.x, q.y) for q in p.each_point_hull()]
+            expected.append((info.datatype, p.area(), *np.min(points, 0), *np.max(points, 0)))
+            shapes.next()
+    got = [
+        (c, round(a / DBU_UM**2), *np.rint(b / DBU_UM).astype(int).tolist())
+        for c, a, b in zip(layout.channel, layout.area_um2, layout.site_bounds_um, strict=True)
+    ]
+
+    assert layout.n_sites == 6 * 7 + 2
+    assert sorted(got) == sorted(expected)
+
+
+def test_numbers_of_a_cell_that_stands_twice_do_not_join_its_copies(zoo, tmp_path):
+    write_layout(zoo, tmp_path / "a.gds")
+    library = gdstk.read_gds(tmp_path / "a.gds")
+    sensor = library.cells[0]
+    library.new_cell("DIE").add(gdstk.Reference(sensor, (0, 0)), gdstk.Reference(sensor, (200, 0)))
+    library.write_gds(tmp_path / "b.gds", max_points=0)
+    once, twice = read_layout(tmp_path / "a.gds"), read_layout(tmp_path / "b.gds")
+
+    assert twice.n_sites == 120
+    np.testing.assert_allclose(twice.area_um2, np.tile(once.area_um2, 2), rtol=1e-9)
+    assert_same(read_layout(tmp_path / "b.gds", cell="SENSOR"), once)
+
+
+def test_geojson_is_what_other_readers_expect(zoo, tmp_path):
+    write_layout(zoo, tmp_path / "a.geojson")
+    data = json.loads((tmp_path / "a.geojson").read_text(), parse_constant=pytest.fail)
+    geometries = shapely.get_parts(shapely.from_geojson((tmp_path / "a.geojson").read_text()))
+
+    assert [f["id"] for f in data["features"]] == list(range(60))
+    assert all(shapely.equals_exact(g, p) for g, p in zip(geometries, zoo.polygons(), strict=True))
+    assert [f["properties"]["name"] for f in data["features"]] == zoo.columns["name"].tolist()
+
+
+def test_geojson_of_others_gives_columns_and_tells_what_it_leaves_out(tmp_path):
+    features = [
+        {"type": "Feature", "properties": {"channel": i, "q": None if i else 1, "note": {"a": 1}}, "geometry": g}
+        for i, g in enumerate(
+            [
+                {"type": "Polygon", "coordinates": [[[0, 0, 9], [0, 2, 9], [2, 2, 9], [2, 0, 9], [0, 0, 9]]]},
+                {"type": "MultiPolygon", "coordinates": [[[[4, 0], [6, 0], [6, 2], [4, 2], [4, 0]]]]},
+            ]
+        )
+    ]
+    (tmp_path / "a").write_text("\ufeff " + json.dumps({"features": features, "type": "FeatureCollection"}))
+    layout = read_layout(tmp_path / "a")
+
+    assert layout.area_um2.tolist() == [4.0, 4.0]
+    assert layout.channel.tolist() == [0, 1]
+    np.testing.assert_array_equal(layout.columns["q"], [1.0, np.nan])
+    assert layout.provenance["left_out_properties"] == ["note"]
+
+
+def test_geoparquet_tells_its_outlines_as_the_standard_asks(zoo, tmp_path):
+    write_layout(zoo, tmp_path / "a.parquet")
+    table = pq.read_table(tmp_path / "a.parquet")
+    geo = json.loads(table.schema.metadata[b"geo"])
+
+    assert geo["version"] == "1.1.0"
+    assert geo["columns"][geo["primary_column"]]["encoding"] == "WKB"
+    assert geo["columns"]["geometry"]["bbox"] == list(zoo.bounds_um)
+    assert same_outlines(shapely.from_wkb(table["geometry"].to_numpy(zero_copy_only=False)), zoo.polygons())
+
+
+def test_svg_draws_every_ring_y_up_in_its_colour(zoo, tmp_path):
+    report = write_layout(zoo, tmp_path / "a.svg", colours={1: "#ff0000", 2: "green"})
+    root = ET.parse(tmp_path / "a.svg").getroot()
+    group = root.find("{*}g")
+    paths = group.findall("{*}path")
+    left, top, width, height = map(float, root.get("viewBox").split())
+
+    assert (group.get("transform"), group.get("fill-rule")) == ("scale(1,-1)", "evenodd")
+    assert [p.get("fill") for p in paths] == [{1: "#ff0000", 2: "green"}.get(c, "#9a9a9a") for c in zoo.channel]
+    assert (left, -top, left + width, -top - height) == pytest.approx(
+        [zoo.bounds_um[i] for i in (0, 3, 2, 1)], abs=1e-3
+    )
+    for path, site in zip(paths, zoo.polygons(), strict=True):
+        rings = [
+            [tuple(map(float, v.split())) for v in part.strip("MZ").split("L")]
+            for part in path.get("d").split("Z")[:-1]
+        ]
+        assert shapely.Polygon(rings[0], rings[1:]).area == pytest.approx(site.area, abs=1e-3)
+    assert 0.0 < report.worst_move_um <= 0.5e-4 * 2**0.5 + 1e-9
+
+
+@pytest.mark.parametrize("colour", ['red"/><script>', "url(#a)", "", "#12345", 7])
+def test_svg_takes_no_colour_that_could_be_more(zoo, tmp_path, colour):
+    with pytest.raises(ParameterError, match="must be a name or #rrggbb"):
+        write_layout(zoo, tmp_path / "a.svg", colours={0: colour})
+
+
+# -- rounding ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", CHIP)
+@pytest.mark.parametrize("dbu_um", [1e-4, 1e-3, 5e-3, 0.0137])
+def test_the_report_tells_what_a_reader_finds(tmp_path, ending, dbu_um):
+    layout = hexagonal(pitch_um=3.3, n_columns=20, n_rows=20).rotate(17.3)
+    report = write_layout(layout, tmp_path / f"a.{ending}", dbu_um=dbu_um)
+    again = read_layout(tmp_path / f"a.{ending}")
+    move_um = max(np.hypot(*(a - b)) for a, b in zip(layout.xy_um, again.xy_um, strict=True))
+    area = [q.area / p.area - 1 for p, q in zip(layout.polygons(), again.polygons(), strict=True)]
+
+    assert report.worst_move_um == pytest.approx(move_um, rel=1e-6)
+    assert 0.25 * dbu_um < report.worst_move_um <= dbu_um * 0.5**0.5 * (1 + 1e-9)
+    assert report.worst_area_error == pytest.approx(np.abs(area).max(), rel=1e-4)
+
+
+def test_sites_that_the_grid_would_flatten_are_named(tmp_path):
+    layout = Layout.from_polygons([shapely.box(0, 0, 5, 5), shapely.box(6, 0, 6.04, 5), shapely.box(7, 0, 9, 5)])
+    with pytest.raises(GeometryError, match=r"site 1 would collapse .* take a smaller dbu_um") as caught:
+        write_layout(layout, tmp_path / "a.gds", dbu_um=0.1)
+    assert caught.value.site_ids == (1,)
+    assert not list(tmp_path.iterdir())
+
+
+def test_coordinates_beyond_32_bits_ask_for_a_larger_unit(tmp_path):
+    layout = Layout.from_polygons([shapely.box(3e5, 0, 3.1e5, 5)])
+    with pytest.raises(ParameterError, match=r"'dbu_um' must be >= 0\.000144"):
+        write_layout(layout, tmp_path / "a.gds")
+
+
+@pytest.mark.parametrize("ending", CHIP)
+@pytest.mark.parametrize("n", [8190, 8191, 12_000])
+def test_a_site_of_many_vertices_is_one_site_again(tmp_path, ending, n):
+    star = ring(n, 400.0) * (1.0 + 0.3 * np.sin(40.0 * np.pi * np.arange(n) / n))[:, np.newaxis]
+    layout = Layout.from_polygons([shapely.box(600, 0, 601, 1), shapely.Polygon(star)], channel=[3, 1])
+    write_layout(layout, tmp_path / f"a.{ending}")
+    again = read_layout(tmp_path / f"a.{ending}")
+    other = klayout.Layout()
+    other.read(str(tmp_path / f"a.{ending}"))
+    sizes = [s.polygon.num_points() for s in other.top_cell().shapes(other.layer(1, 1)).each()]
+
+    assert max(sizes) <= (8190 if ending == "gds" else n)
+    assert again.n_sites == 2
+    assert again.channel.tolist() == [3, 1]
+    assert shapely.equals(again.polygons()[1], shapely.Polygon(np.round(star, 4)))
+    assert np.diff(again.ring_offsets)[1] == n
+
+
+def test_a_site_whose_parts_are_not_all_there_is_refused(zoo, tmp_path):
+    write_layout(zoo, tmp_path / "a.gds")
+    library = gdstk.read_gds(tmp_path / "a.gds")
+    cell = library.cells[0]
+    cell.remove(next(p for p in cell.polygons if b"part 1" in p.properties[0][2]))
+    library.write_gds(tmp_path / "b.gds", max_points=0)
+    with pytest.raises(FileError, match=r"has other parts of photosite \d+ than the \d+ that it was cut into"):
+        read_layout(tmp_path / "b.gds")
+
+
+# -- choices ----------------------------------------------------------------------------------------------------------
+
+
+def test_several_layers_or_top_cells_must_be_chosen_from(tmp_path):
+    library = gdstk.Library()
+    library.new_cell("A").add(gdstk.rectangle((0, 0), (1, 1), 1), gdstk.rectangle((2, 0), (4, 1), 5))
+    library.write_gds(tmp_path / "a.gds")
+    with pytest.raises(FileError, match=r"shapes on the layers 1, 5; say which to read with layer="):
+        read_layout(tmp_path / "a.gds")
+    assert read_layout(tmp_path / "a.gds", layer=5).area_um2.tolist() == pytest.approx([2.0])
+    with pytest.raises(FileError, match="has no shape on layer 9"):
+        read_layout(tmp_path / "a.gds", layer=9)
+    library.new_cell("B").add(gdstk.rectangle((0, 0), (3, 1), 1))
+    library.write_gds(tmp_path / "b.gds")
+    with pytest.raises(FileError, match="has several cells on top, 'A', 'B'; say which to read with cell="):
+        read_layout(tmp_path / "b.gds")
+    assert read_layout(tmp_path / "b.gds", cell="B").area_um2.tolist() == pytest.approx([3.0])
+    with pytest.raises(FileError, match="has no cell 'C'"):
+        read_layout(tmp_path / "b.gds", cell="C")
+
+
+@pytest.mark.parametrize(
+    ("options", "ending"),
+    [({"layer": 1}, "npz"), ({"dbu_um": 1e-3}, "geojson"), ({"colours": {}}, "gds"), ({"layer": 2}, "svg")],
+)
+def test_options_of_other_formats_are_refused(zoo, tmp_path, options, ending):
+    with pytest.raises(ParameterError, match=f"does not belong to .{ending} files"):
+        write_layout(zoo, tmp_path / f"a.{ending}", **options)
+
+
+def test_an_option_of_chip_files_is_refused_for_others(zoo, tmp_path):
+    write_layout(zoo, tmp_path / "a.npz")
+    with pytest.raises(ParameterError, match="'layer' belongs to GDSII and OASIS files"):
+        read_layout(tmp_path / "a.npz", layer=1)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"layer": -1}, "layer"),
+        ({"layer": 40_000}, "layer"),
+        ({"dbu_um": 0.0}, "dbu_um"),
+        ({"dbu_um": np.nan}, "dbu_um"),
+    ],
+)
+def test_impossible_options_are_named(zoo, tmp_path, options, match):
+    with pytest.raises(ParameterError, match=match):
+        write_layout(zoo, tmp_path / "a.gds", **options)
+
+
+def test_a_channel_beyond_16_bits_is_refused(tmp_path):
+    layout = hexagonal(pitch_um=3.3, n_columns=2, n_rows=2).with_columns(channel=[0, 1, 2, 40_000])
+    with pytest.raises(ParameterError, match="'channel' must be <= 32767"):
+        write_layout(layout, tmp_path / "a.gds")
+
+
+def test_an_unknown_ending_names_the_known_ones(zoo, tmp_path):
+    with pytest.raises(FileError, match=r"must end in one of .*\.gds"):
+        write_layout(zoo, tmp_path / "a.dxf")
+
+
+# -- files from strangers ---------------------------------------------------------------------------------------------
+
+
+def outcome(path):
+    """What reading gives: a layout, or the one sentence of a FileError; anything else fails the test."""
+    try:
+        layout = read_layout(path)
+    except FileError as error:
+        text = str(error)
+        assert "\n" not in text
+        assert len(text) < 600
+        return text
+    assert np.isfinite(layout.xy_um).all()
+    return layout
+
+
+def mutilated(data, rng, n):
+    """Seeded truncations, bit flips, and runs of noise of a file."""
+    for i in range(n):
+        if i % 3 == 0:
+            yield data[: rng.integers(1, len(data))]
+            continue
+        broken = bytearray(data)
+        # Half of the flips near the beginning, where the structure is.
+        where = rng.integers(0, len(data) if i % 2 else min(len(data), 400), 1 + i % 4)
+        for at in where:
+            broken[at] ^= 1 << rng.integers(8)
+        if i % 7 == 0:
+            at = rng.integers(0, len(data))
+            broken[at : at + 8] = rng.bytes(8)
+        yield bytes(broken)
+
+
+@pytest.fixture(scope="module")
+def small():
+    bare = hexagonal(pitch_um=3.3, n_columns=3, n_rows=3)
+    holed = [shapely.Polygon(p.exterior.coords, [ring(4, 0.4, p.centroid.coords[0])]) for p in bare.polygons()]
+    return Layout.from_polygons(holed, channel=np.arange(9) % 3, name=np.array(list("abcdefghi")))
+
+
+@pytest.mark.parametrize("ending", [*EXACT, *CHIP])
+def test_mutilated_files_give_a_layout_or_one_sentence_in_seconds(small, tmp_path, ending):
+    write_layout(small, tmp_path / f"a.{ending}")
+    data = (tmp_path / f"a.{ending}").read_bytes()
+    rng = np.random.default_rng(11)
+    n = 300 if ending in EXACT else 200
+    paths = []
+    for i, broken in enumerate(mutilated(data, rng, n)):
+        paths.append(tmp_path / f"{i}.{ending}")
+        paths[-1].write_bytes(broken)
+    began_s = time.perf_counter()
+    with ThreadPoolExecutor(2) as pool:
+        results = list(pool.map(outcome, paths)) if ending in CHIP else [outcome(p) for p in paths]
+
+    assert sum(isinstance(r, str) for r in results) > n // 4
+    assert time.perf_counter() - began_s < 120
+
+
+def test_an_oasis_file_with_a_right_checksum_over_broken_content_cannot_harm(small, tmp_path):
+    write_layout(small, tmp_path / "a.oas")
+    data = (tmp_path / "a.oas").read_bytes()
+    rng = np.random.default_rng(12)
+    paths = []
+    for i in range(40):
+        broken = bytearray(data[:-4])
+        for at in rng.integers(13, len(broken) - 256, 1 + i % 3):
+            broken[at] ^= 1 << rng.integers(8)
+        paths.append(tmp_path / f"{i}.oas")
+        paths[-1].write_bytes(bytes(broken) + struct.pack("<I", zlib.crc32(bytes(broken))))
+    with ThreadPoolExecutor(2) as pool:
+        results = list(pool.map(outcome, paths))
+
+    assert len(results) == 40
+    assert not [r for r in results if "took more than" in str(r)]
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        (b"", "is empty"),
+        (b"hello", "is no layout file"),
+        (b"<svg/>", "an SVG drawing is written and not read"),
+        (b"\x1f\x8b\x08", "compressed with gzip"),
+        (b"{", "GeoJSON"),
+        (b'{"type": "Topology"}', "no GeoJSON FeatureCollection"),
+        (b"{" + b'"a":{' * 100_000, "GeoJSON"),
+        (b'{"type": "FeatureCollection", "features": [1]}', "feature 0 must be one polygon"),
+        (b'{"type": "FeatureCollection", "features": [' + b"[" * 200_000, "GeoJSON"),
+        (b"PK\x03\x04", "npz"),
+        (b"PAR1" + bytes(50) + b"PAR1", "GeoParquet"),
+        (b"%SEMI-OASIS\r\n", "cut short"),
+        (b"%SEMI-OASIS\r\n" + bytes(300), "does not end with the END record"),
+        (b"\x00\x06\x00\x02\x00\x05", "cut short"),
+        (b"\x00\x06\x00\x02\x00\x05\x00\x00\x00\x00", "byte 6 begins no GDSII record"),
+        (b"\x00\x06\x00\x02\x00\x05\x00\x04\x04\x00junk", "something follows the end"),
+    ],
+)
+def test_files_of_nonsense_are_told_apart(tmp_path, content, match):
+    (tmp_path / "a").write_bytes(content)
+    with pytest.raises(FileError, match=match):
+        read_layout(tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("geometry", "match"),
+    [
+        ('{"type": "Polygon", "coordinates": [[[0,0],[4,4],[4,0],[0,4],[0,0]]]}', "site 0 crosses"),
+        ('{"type": "Polygon", "coordinates": [[[0,0],[1e999,4],[4,0],[0,0]]]}', "not finite"),
+        ('{"type": "Polygon", "coordinates": [[[0,0],[NaN,4],[4,0],[0,0]]]}', "not finite"),
+        ('{"type": "Polygon", "coordinates": [[["0",0],[4,4],[4,0],[0,0]]]}', "not two numbers"),
+        ('{"type": "Polygon", "coordinates": [[[true,0],[4,4],[4,0],[0,0]]]}', "not two numbers"),
+        ('{"type": "Polygon", "coordinates": [[[0],[4,4],[4,0],[0,0]]]}', "not two numbers"),
+        ('{"type": "Polygon", "coordinates": [[[0,0],[4,4]]]}', "fewer than 4 positions"),
+        ('{"type": "Polygon", "coordinates": 3}', "must be one polygon"),
+        ('{"type": "Point", "coordinates": [0, 0]}', "got Point"),
+        ('{"type": "Polygon", "coordinates": [[[0,0],[' + "9" * 5000 + ",4],[4,0],[0,0]]]}", "GeoJSON"),
+        ("null", "must be one polygon"),
+    ],
+)
+def test_geojson_of_no_photosites_is_refused(tmp_path, geometry, match):
+    (tmp_path / "a").write_text(
+        f'{{"type": "FeatureCollection", "features": [{{"type": "Feature", "geometry": {geometry}}}]}}'
+    )
+    with pytest.raises(FileError, match=match):
+        read_layout(tmp_path / "a")
+
+
+def test_a_cell_that_holds_itself_is_refused(tmp_path):
+    library = gdstk.Library()
+    a, b, c = (library.new_cell(n) for n in "ABC")
+    c.add(gdstk.Reference(a, (0, 0)))
+    a.add(gdstk.Reference(b, (1, 1)), gdstk.rectangle((0, 0), (1, 1)))
+    b.add(gdstk.Reference(a, (1, 1)))
+    library.write_gds(tmp_path / "a.gds")
+    with pytest.raises(FileError, match="has a cell that holds itself"):
+        read_layout(tmp_path / "a.gds")
+
+
+def test_a_hierarchy_that_would_flatten_to_billions_is_refused_at_once(tmp_path):
+    library = gdstk.Library()
+    inner = library.new_cell("C0").add(gdstk.rectangle((0, 0), (1, 1)))
+    for i in range(1, 12):
+        inner = library.new_cell(f"C{i}").add(gdstk.Reference(inner, (0, 0), columns=30, rows=30, spacing=(2, 2)))
+    library.write_gds(tmp_path / "a.gds")
+    began_s = time.perf_counter()
+    with pytest.raises(FileError, match="more than the 50000000 sites"):
+        read_layout(tmp_path / "a.gds")
+    assert time.perf_counter() - began_s < 10
+
+
+def test_a_reference_to_nowhere_is_refused(tmp_path):
+    library = gdstk.Library()
+    library.new_cell("A").add(gdstk.rectangle((0, 0), (1, 1)), gdstk.Reference("NOWHERE", (0, 0)))
+    library.write_gds(tmp_path / "a.gds")
+    with pytest.raises(FileError, match="NOWHERE"):
+        read_layout(tmp_path / "a.gds")
+
+
+def npz(path, **changes):
+    about = {"format": "foveasim layout", "version": 1, "unit": "um", "provenance": {}}
+    arrays = {
+        "about": np.array(json.dumps(about)),
+        "xy_um": np.array([[0.0, 0], [1, 0], [0, 1]]),
+        "ring_offsets": np.array([0, 3]),
+        "site_offsets": np.array([0, 1]),
+    }
+    np.savez(path, **arrays | changes)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"column_evil": np.array([{"a": 1}], dtype=object)}, "array of objects"),
+        ({"xy_um": np.array([[0.0, 0], [0, 1], [1, 0]])}, "wound the wrong way"),
+        ({"xy_um": np.array([[0.0, 0], [np.nan, 1], [1, 0]])}, "finite"),
+        ({"ring_offsets": np.array([0, 9])}, "ring_offsets"),
+        ({"ring_offsets": np.array([0, -5, 3])}, "ring_offsets"),
+        ({"site_offsets": np.array([0.0, 1.0])}, "site_offsets"),
+        ({"column_a": np.arange(5)}, "one value for each"),
+        ({"about": np.array("[]")}, "is no foveasim layout"),
+        ({"about": np.array('{"format": "foveasim capture"}')}, r"load it with Capture\.load"),
+        ({"about": np.array('{"format": "foveasim layout", "version": 99}')}, "format version 99, expected 1"),
+    ],
+)
+def test_npz_of_no_layout_is_refused(tmp_path, changes, match):
+    with pytest.raises(FileError, match=match):
+        read_layout(npz(tmp_path / "a.npz", **changes))
+
+
+def test_npz_that_claims_a_huge_array_is_refused_before_it_is_made(tmp_path):
+    npz(tmp_path / "a.npz")
+    with zipfile.ZipFile(tmp_path / "a.npz") as old, zipfile.ZipFile(tmp_path / "b.npz", "w") as new:
+        for name in old.namelist():
+            if name == "xy_um.npy":
+                buffer = io.BytesIO()
+                np.lib.format.write_array_header_1_0(
+                    buffer, {"descr": "<f8", "fortran_order": False, "shape": (2**50, 2)}
+                )
+                new.writestr(name, buffer.getvalue() + bytes(48))
+            else:
+                new.writestr(name, old.read(name))
+    with pytest.raises(FileError, match="another size than its header tells"):
+        read_layout(tmp_path / "b.npz")
+
+
+def test_npz_that_would_unpack_to_too_much_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("foveasim.layout.files.npz.MAX_UNPACKED_BYTES", 1000)
+    with pytest.raises(FileError, match="would unpack to more than 1000 bytes"):
+        read_layout(npz(tmp_path / "a.npz", column_a=np.zeros(200)))
+
+
+@pytest.mark.parametrize("ending", EXACT)
+def test_too_many_sites_are_refused(small, tmp_path, monkeypatch, ending):
+    write_layout(small, tmp_path / f"a.{ending}")
+    monkeypatch.setattr("foveasim.layout.files._common.MAX_SITES", 8)
+    with pytest.raises(FileError, match="sites, more than the 8 that are read"):
+        read_layout(tmp_path / f"a.{ending}")
+
+
+def test_parquet_that_repeats_a_long_value_without_end_is_refused(small, tmp_path, monkeypatch):
+    pa = pytest.importorskip("pyarrow")
+    monkeypatch.setattr("foveasim.layout.files.geoparquet.MAX_UNPACKED_BYTES", 2**28)
+    write_layout(small, tmp_path / "a.parquet")
+    metadata = pq.read_table(tmp_path / "a.parquet").schema.metadata
+    values = pa.DictionaryArray.from_arrays(pa.array(np.zeros(10**6, np.int32)), pa.array([bytes(10**5)]))
+    pq.write_table(
+        pa.table({"geometry": values}).replace_schema_metadata(metadata), tmp_path / "b.parquet", compression="zstd"
+    )
+    with pytest.raises(FileError, match="has outlines as dictionary"):
+        read_layout(tmp_path / "b.parquet")
+    table = pa.table({"geometry": values})
+    with pq.ParquetWriter(tmp_path / "b.parquet", table.schema, compression="zstd", store_schema=False) as writer:
+        writer.write_table(table)
+        writer.add_key_value_metadata({"geo": metadata[b"geo"]})
+    assert (tmp_path / "b.parquet").stat().st_size < 10**6
+    with pytest.raises(FileError, match="would unpack to more than 268435456 bytes"):
+        read_layout(tmp_path / "b.parquet")
+
+
+def test_too_large_files_are_refused(small, tmp_path, monkeypatch):
+    write_layout(small, tmp_path / "a.npz")
+    monkeypatch.setattr("foveasim.layout.files._common.MAX_FILE_BYTES", 100)
+    with pytest.raises(FileError, match="more than the 100 that are read"):
+        read_layout(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize(("path", "match"), [("nowhere.gds", "no such file"), (".", "is not a file")])
+def test_what_is_no_file_is_told(tmp_path, path, match):
+    with pytest.raises(FileError, match=match):
+        read_layout(tmp_path / path)
+
+
+# -- writing whole, and what is not installed -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", [*EXACT, *CHIP, "svg"])
+def test_a_failed_writing_leaves_the_old_file_and_nothing_else(small, tmp_path, monkeypatch, ending):
+    path = tmp_path / f"a.{ending}"
+    path.write_bytes(b"old")
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.replace", full)
+    with pytest.raises(FileError, match="cannot be written: No space left on device"):
+        write_layout(small, path)
+
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("ending", CHIP)
+def test_a_disk_that_is_full_is_noticed_though_gdstk_says_nothing(small, tmp_path, monkeypatch, ending):
+    path = tmp_path / f"a.{ending}"
+
+    class Library(gdstk.Library):
+        def write_gds(self, target, **_):
+            target.write_bytes(b"\x00\x06\x00\x02")
+
+        write_oas = write_gds
+
+    monkeypatch.setattr(gdstk, "Library", Library)
+    with pytest.raises(FileError, match="not all of it was written"):
+        write_layout(small, path)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("ending", "module"), [("gds", "gdstk"), ("oas", "gdstk"), ("parquet", "pyarrow")])
+def test_a_missing_extra_is_one_sentence_with_its_cure(small, tmp_path, monkeypatch, ending, module):
+    path = tmp_path / f"a.{ending}"
+    write_layout(small, path)
+    monkeypatch.setitem(sys.modules, module, None)
+    for call in (lambda: write_layout(small, path), lambda: read_layout(path)):
+        with pytest.raises(FileError, match=rf"needs {module}; install it with: pip install 'foveasim\[layout\]'"):
+            call()
+
+
+def test_the_libraries_are_loaded_only_when_needed(tmp_path):
+    code = (
+        "import sys, foveasim.layout.files as f; from foveasim.layout import hexagonal;"
+        f"f.write_layout(hexagonal(pitch_um=2., n_columns=2, n_rows=2), {str(tmp_path / 'a.npz')!r});"
+        "print({'gdstk', 'pyarrow', 'klayout'} & set(sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
+
+
+@pytest.mark.parametrize("ending", CHIP)
+def test_twenty_thousand_sites_go_out_and_in_within_seconds(tmp_path, ending):
+    layout = hexagonal(pitch_um=3.3, n_columns=200, n_rows=100)
+    began_s = time.perf_counter()
+    write_layout(layout, tmp_path / f"a.{ending}")
+    again = read_layout(tmp_path / f"a.{ending}")
+
+    assert again.n_sites == 20_000
+    assert time.perf_counter() - began_s < 5
