@@ -19,6 +19,8 @@ __all__ = ["main"]
 
 #: Exit code of a run that failed for what it was given.
 BAD_INPUT = 2
+#: Exit code of a check that found a broken rule.
+BROKEN_RULE = 1
 #: Exit code of a run that the user stopped, as shells have it.
 STOPPED = 130
 
@@ -63,6 +65,52 @@ def run(
 ) -> None:
     """Take the shot that a settings file describes."""
     _run([settings], changes or [], out, threads)
+
+
+@app.command()
+def check(
+    layout: Annotated[Path, typer.Argument(help="YAML, GDSII, OASIS, GeoJSON, GeoParquet or npz file.")],
+    rules: Annotated[
+        Path | None, typer.Option("--rules", help="YAML file of rules; by default those in LAYOUT.")
+    ] = None,
+    lyrdb: Annotated[Path | None, typer.Option("--lyrdb", help="Write the violations for KLayout.")] = None,
+) -> None:
+    """Check a layout against design rules; the exit code is 1 when one is broken."""
+    from foveasim.config import read_any_layout, read_rules
+
+    file = read_any_layout(layout)
+    limits = file.rules if rules is None else read_rules(rules)
+    if limits is None:
+        _end(f"error: {layout}: holds no rules; name a file of rules with --rules", BAD_INPUT)
+    report = file.layout.check(limits)
+    console.print(report)
+    if lyrdb is not None:
+        report.write(lyrdb)
+        console.print(f"wrote {lyrdb}", soft_wrap=True, highlight=False)
+    if not report.ok:
+        raise typer.Exit(BROKEN_RULE)
+
+
+@app.command()
+def convert(
+    source: Annotated[Path, typer.Argument(help="YAML, GDSII, OASIS, GeoJSON, GeoParquet or npz file.")],
+    target: Annotated[Path, typer.Argument(help="Its ending names the format: .gds .oas .geojson .parquet .npz .svg")],
+    layer: Annotated[int | None, typer.Option("--layer", help="Layer of the photosites in a chip file.")] = None,
+    dbu_um: Annotated[
+        float | None, typer.Option("--dbu-um", help="Database unit of a chip file to be written.")
+    ] = None,
+) -> None:
+    """Write a layout in another format, and tell what rounding did to it."""
+    from foveasim.config import read_any_layout
+    from foveasim.layout import write_layout
+
+    written = write_layout(read_any_layout(source).layout, target, layer=layer, dbu_um=dbu_um)
+    console.print(
+        f"wrote {written.path}: {written.n_sites:,} photosites, vertices moved by at most {written.worst_move_um:.3g} µm, "
+        f"areas changed by at most {100 * written.worst_area_error:.3g} %",
+        soft_wrap=True,
+        highlight=False,
+    )
 
 
 @app.command()

@@ -24,18 +24,20 @@ from foveasim import layout as layouts
 from foveasim.arrays import check_number
 from foveasim.camera import Camera
 from foveasim.errors import ConfigError, FoveasimError, ParameterError
-from foveasim.layout import DesignRules, Layout, mosaic
+from foveasim.layout import DesignRules, Layout, mosaic, read_layout
 from foveasim.optics import Optics
 from foveasim.scene import Scene
 from foveasim.sensor import ConstantCurve, FilterSet, GaussianCurve, PolynomialCurve, Sensor, SiliconQE
 from foveasim.streams import Streams
 
-__all__ = ["LayoutFile", "Shot", "read_layout_file", "read_shot", "schema"]
+__all__ = ["LayoutFile", "Shot", "read_any_layout", "read_layout_file", "read_rules", "read_shot", "schema"]
 
 #: A settings file is written by hand; a longer one is something else.
 MAX_FILE_BYTES = 1 << 20
 #: Pictures that come with scikit-image are named with this in front.
 BUNDLED_PICTURE = "skimage:"
+#: Endings of files that hold settings; a layout in any other file is told by its content.
+YAML_ENDINGS = (".yaml", ".yml")
 #: Settings whose value may be the name of a file.
 FILE_SETTINGS = ("scene.picture", "layout")
 #: Problems of a file that one message names.
@@ -239,7 +241,7 @@ def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int |
         _replace(path, data, change)
     settings = _validated(path, _ShotSection, data)
     if isinstance(settings.layout, str):
-        file = _call(path, "layout", read_layout_file, {"path": path.parent / settings.layout})
+        file = _call(path, "layout", read_any_layout, {"path": path.parent / settings.layout})
     else:
         file = _built_layout(path, "layout.", settings.layout)
     layout = file.layout
@@ -280,6 +282,36 @@ def read_layout_file(path: str | Path) -> LayoutFile:
     """
     path = Path(path)
     return _built_layout(path, "", _validated(path, _LayoutUnion, _read_yaml(path)))
+
+
+def read_any_layout(path: str | Path) -> LayoutFile:
+    """
+    Read a layout from a YAML file or from a file of any other format.
+
+    Raises
+    ------
+    FileError
+        When it cannot be read.
+    """
+    path = Path(path)
+    if path.suffix.lower() in YAML_ENDINGS:
+        return read_layout_file(path)
+    return LayoutFile(layout=read_layout(path), rules=None, source=str(path))
+
+
+def read_rules(path: str | Path) -> DesignRules:
+    """
+    Read a YAML file of design rules: limits by their names, and waivers.
+
+    Raises
+    ------
+    ConfigError
+        With the file, the place in it, what was expected and got.
+    """
+    path = Path(path)
+    section = _validated(path, _RulesSection, _read_yaml(path))
+    rules: DesignRules = _call(path, "", DesignRules, _values(path, "", section))
+    return rules
 
 
 def schema() -> dict[str, Any]:

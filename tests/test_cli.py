@@ -150,3 +150,59 @@ def test_a_folder_that_cannot_be_made_is_told(folder):
     assert result.returncode == 2
     assert "out: cannot hold results: out is a file, and must be a folder" in result.stderr
     assert (folder / "out").read_text() == "I am a file"
+
+
+LAYOUT = """
+generator: log_polar
+parameters: {n_sectors: 16, r_min_um: 2.0, r_max_um: 20.0}
+rules: {min_size_um: 1.0, max_overlap_um2: 0.0}
+source: made for this test
+"""
+
+
+def test_a_broken_rule_ends_with_the_exit_code_1_and_a_kept_one_with_0(tmp_path):
+    (tmp_path / "rings.yaml").write_text(LAYOUT)
+    (tmp_path / "loose.yaml").write_text("min_size_um: 0.1\n")
+    broken = foveasim("check", "rings.yaml", "--lyrdb", "rings.lyrdb", cwd=tmp_path)
+    kept = foveasim("check", "rings.yaml", "--rules", "loose.yaml", cwd=tmp_path)
+
+    assert broken.returncode == 1
+    assert "fail" in broken.stdout
+    assert (tmp_path / "rings.lyrdb").read_text().count("<item>") == 16
+    assert kept.returncode == 0, kept.stderr
+    assert "pass" in kept.stdout
+
+
+def test_a_layout_goes_from_yaml_to_a_chip_file_and_is_checked_there(tmp_path):
+    (tmp_path / "rings.yaml").write_text(LAYOUT)
+    (tmp_path / "rules.yaml").write_text("min_size_um: 1.0\n")
+    converted = foveasim("convert", "rings.yaml", "rings.gds", "--dbu-um", "0.001", cwd=tmp_path)
+    checked = foveasim("check", "rings.gds", "--rules", "rules.yaml", cwd=tmp_path)
+
+    assert converted.returncode == 0, converted.stderr
+    assert "vertices moved by at most 0.000" in converted.stdout
+    assert checked.returncode == 1
+    assert "80 photosites" in checked.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("check", "rings.gds"), "rings.gds: no such file"),
+        (("check", "bare.yaml"), "bare.yaml: holds no rules"),
+        (("check", "rings.yaml", "--rules", "none.yaml"), "none.yaml: no such file"),
+        (("check", "rings.yaml", "--rules", "wrong.yaml"), "wrong.yaml: min_sise_um: no such setting"),
+        (("convert", "rings.yaml", "rings.docx"), "rings.docx: "),
+        (("convert", "wrong.gds", "rings.npz"), "wrong.gds: is no layout file"),
+    ],
+)
+def test_bad_layout_files_end_with_one_sentence(tmp_path, arguments, words):
+    (tmp_path / "rings.yaml").write_text(LAYOUT)
+    (tmp_path / "bare.yaml").write_text("generator: grid\nparameters: {n_x: 3, n_y: 3, pitch_um: 2.0}\n")
+    (tmp_path / "wrong.yaml").write_text("min_sise_um: 1.0\n")
+    (tmp_path / "wrong.gds").write_text("I am no layout")
+    result = foveasim(*arguments, cwd=tmp_path)
+
+    assert result.returncode == 2
+    assert result.stderr.startswith(f"error: {words}")
+    assert result.stderr.count("\n") == 1

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -235,6 +236,12 @@ class Report:
             }
             for violation in self.violations
         ]
+
+    def write(self, path: str | Path) -> None:
+        """Write a KLayout report database (``.lyrdb``); see :func:`foveasim.layout.lyrdb.write_lyrdb`."""
+        from foveasim.layout.lyrdb import write_lyrdb
+
+        write_lyrdb(self, path)
 
     def __str__(self) -> str:
         return "\n".join([f"design rules on {self.n_sites} photosites", *map(str, self.results)])
