@@ -101,3 +101,16 @@ def test_a_site_in_a_hole_can_be_merged_with_its_frame():
 
     assert legal.area_um2.tolist() == [81.0]
     assert changes[0].site_ids == (0, 1)
+
+
+def test_when_every_site_goes_an_empty_layout_is_left_that_every_rule_accepts():
+    rules = fs.DesignRules(
+        min_size_um=1e3, max_size_um=2e3, min_area_um2=1.0, min_hole_um2=1.0, min_width_um=1.0, min_space_um=1.0,
+        max_aspect_ratio=9.0, min_angle_deg=1.0, edge_angle_step_deg=45.0, grid_um=0.1, max_overlap_um2=0.0, max_gap_um2=0.0,
+        die_um=(0, 0, 1, 1), max_growth=3.0, min_growth=0.1, max_neighbour_ratio=2.0, max_sites=5,
+        waivers={"max_gap_um2": "nothing is left to close the die"},
+    )  # fmt: skip
+    legal, changes = RINGS.enforce(rules)
+
+    assert legal.n_sites == 0
+    assert changed(changes) == set(range(RINGS.n_sites))

@@ -505,7 +505,8 @@ def _neighbour_ratios(case: _Case) -> _Measured:
 
 
 def _counts(case: _Case) -> _Measured:
-    everything = np.array([shapely.box(*shapely.total_bounds(case.polygons))], dtype=object)
+    bounds_um = case.layout.bounds_um if case.layout.n_sites else (0.0, 0.0, 0.0, 0.0)
+    everything = np.array([shapely.box(*bounds_um)], dtype=object)
     return _Measured(np.array([float(case.layout.n_sites)]), [()], everything)
 
 

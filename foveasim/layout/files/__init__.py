@@ -82,11 +82,6 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
         When the file is missing, broken, cut short, too large, or no layout.
     ParameterError
         When an option does not belong to the file's format.
-
-    Examples
-    --------
-    >>> read_layout("die.gds", layer=1)  # doctest: +SKIP
-    Layout(32887 sites from read_layout, columns ['channel'])
     """
     path = Path(path)
     head = head_of(path)
