@@ -194,3 +194,14 @@ def test_a_waived_rule_does_not_raise_and_the_others_do():
 
     with pytest.raises(GeometryError, match=r"max_sites: 1 violation, worst 101 for a limit of 50$"):
         layout.check(rules).raise_if_failed()
+
+
+def test_giotto_at_a_unit_pixel_of_6_45_um_has_504_sites_narrower_than_6_8_um():
+    """What KLayout's own width check finds on these sites, once each: the two innermost rings of the 110 around the fovea."""
+    rings = fs.layout.giotto(n_rho=152, n_theta=252, n_fovea=42, n_across=1090, unit_um=6.45, fovea="none")
+    report = rings.check(fs.DesignRules(min_width_um=6.8))
+    ids = [violation.site_ids[0] for violation in report.violations]
+
+    assert rings.n_sites == 27_720
+    assert len(ids) == len(set(ids)) == 504
+    assert np.unique(rings.columns["ring"][ids]).tolist() == [42, 43]
