@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, check_number, finite_array
+from foveasim.arrays import Floats, Ints, check_number, finite_array
 from foveasim.compiled import kernels
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._model import Layout
@@ -325,6 +325,11 @@ class _Case:
         return self.layout.polygons()
 
     @cached_property
+    def tree(self) -> shapely.STRtree:
+        """The sites by place."""
+        return shapely.STRtree(self.polygons)
+
+    @cached_property
     def is_coverage(self) -> bool:
         """Whether neighbours meet edge to edge all over: then nothing overlaps, and the union is quickly had."""
         return bool(shapely.coverage_is_valid(self.polygons))
@@ -332,11 +337,14 @@ class _Case:
 
 @dataclass(frozen=True, slots=True)
 class _Measured:
-    """Values, and for each the sites it is about ((n, k) ints; by default site i) and where it is (the site by default)."""
+    """Values, and for each the sites it is about ((n, k) ints; by default site i) and where it is (the site by default).
+
+    Markers are made for the values that break the rule only: ``markers(positions)``.
+    """
 
     values: Floats
     sites: Any = None
-    markers: NDArray[Any] | None = None
+    markers: Callable[[Ints], Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -361,6 +369,7 @@ def _violations(name: str, rule: _Rule, found: _Measured, limit: float, case: _C
     beyond = found.values - limit if rule.is_upper else limit - found.values
     bad = np.flatnonzero(beyond > rule.rounding)
     bad = bad[np.argsort(-beyond[bad], kind="stable")]
+    markers = case.polygons[bad] if found.markers is None else found.markers(bad)
     return tuple(
         Violation(
             name,
@@ -368,9 +377,9 @@ def _violations(name: str, rule: _Rule, found: _Measured, limit: float, case: _C
             float(found.values[i]),
             limit,
             rule.unit,
-            case.polygons[i] if found.markers is None else found.markers[i],
+            marker,
         )
-        for i in bad
+        for i, marker in zip(bad, markers, strict=True)
     )
 
 
@@ -390,21 +399,26 @@ def _holes(case: _Case) -> _Measured:
     area_um2, _moments = ring_moments(case.layout.xy_um, case.layout.ring_offsets)
     holes = np.flatnonzero(area_um2 < 0.0)
     site = np.searchsorted(case.layout.site_offsets, holes, side="right") - 1
-    rings = [case.layout.xy_um[case.layout.ring_offsets[r] : case.layout.ring_offsets[r + 1]] for r in holes]
-    markers = np.array([shapely.Polygon(ring) for ring in rings], dtype=object)
+
+    def markers(positions: Ints) -> list[Any]:
+        starts, stops = case.layout.ring_offsets[holes[positions]], case.layout.ring_offsets[holes[positions] + 1]
+        return [shapely.Polygon(case.layout.xy_um[a:b]) for a, b in zip(starts, stops, strict=True)]
+
     return _Measured(-area_um2[holes], site[:, np.newaxis], markers)
 
 
 def _spaces(case: _Case) -> _Measured:
     limit_um = float(case.rules.min_space_um or 0.0)
-    a, b = shapely.STRtree(case.polygons).query(case.polygons, predicate="dwithin", distance=limit_um)
+    a, b = case.tree.query(case.polygons, predicate="dwithin", distance=limit_um)
     a, b = a[a < b], b[a < b]
     distance_um = shapely.distance(case.polygons[a], case.polygons[b])
     # Sites that abut share their border; with a manufacturing grid, to within one step of it.
     is_apart = distance_um > max(LENGTH_ROUNDING_UM, case.rules.grid_um or 0.0)
     a, b = a[is_apart], b[is_apart]
     return _Measured(
-        distance_um[is_apart], np.stack((a, b), axis=1), shapely.shortest_line(case.polygons[a], case.polygons[b])
+        distance_um[is_apart],
+        np.stack((a, b), axis=1),
+        lambda k: shapely.shortest_line(case.polygons[a[k]], case.polygons[b[k]]),
     )
 
 
@@ -448,12 +462,12 @@ def _per_site(reduction: np.ufunc, per_vertex: Floats, layout: Layout) -> Floats
 def _overlaps(case: _Case) -> _Measured:
     if case.is_coverage:
         return _Measured(np.zeros(0))
-    a, b = shapely.STRtree(case.polygons).query(case.polygons, predicate="intersects")
+    a, b = case.tree.query(case.polygons, predicate="intersects")
     a, b = a[a < b], b[a < b]
     common = shapely.intersection(case.polygons[a], case.polygons[b])
     area_um2 = shapely.area(common)
     is_real = area_um2 > AREA_ROUNDING * np.minimum(case.layout.area_um2[a], case.layout.area_um2[b])
-    return _Measured(area_um2[is_real], np.stack((a, b), axis=1)[is_real], common[is_real])
+    return _Measured(area_um2[is_real], np.stack((a, b), axis=1)[is_real], common[is_real].take)
 
 
 def _gaps(case: _Case) -> _Measured:
@@ -466,9 +480,9 @@ def _gaps(case: _Case) -> _Measured:
         holes = shapely.union_all(shapely.polygons(shapely.get_rings(parts)[_is_hole(parts)]))
         opened = shapely.get_parts(shapely.difference(holes, covered))
     opened = opened[shapely.area(opened) > AREA_ROUNDING * (case.layout.area_um2.min() if case.layout.n_sites else 0.0)]
-    gap, site = shapely.STRtree(case.polygons).query(opened, predicate="intersects")
+    gap, site = case.tree.query(opened, predicate="intersects")
     around = np.split(site[np.lexsort((site, gap))], np.cumsum(np.bincount(gap, minlength=opened.size)))[: opened.size]
-    return _Measured(shapely.area(opened), around, opened)
+    return _Measured(shapely.area(opened), around, opened.take)
 
 
 def _is_hole(polygons: NDArray[Any]) -> NDArray[np.bool_]:
@@ -491,7 +505,7 @@ def _growths(case: _Case) -> _Measured:
     size_um = np.bincount(ring, np.sqrt(case.layout.area_um2)) / np.bincount(ring) if rings.size else np.zeros(0)
     order = np.argsort(ring, kind="stable")
     members = np.split(order, np.cumsum(np.bincount(ring))[:-1])[1:] if rings.size else []
-    return _Measured(size_um[1:] / size_um[:-1], members, case.polygons[first[1:]])
+    return _Measured(size_um[1:] / size_um[:-1], members, lambda k: case.polygons[first[1:][k]])
 
 
 def _neighbour_ratios(case: _Case) -> _Measured:
@@ -499,15 +513,18 @@ def _neighbour_ratios(case: _Case) -> _Measured:
     a, b = (index[pairs.coords[0] < pairs.coords[1]] for index in pairs.coords)
     size_um = np.sqrt(case.layout.area_um2)
     ratio = np.maximum(size_um[a] / size_um[b], size_um[b] / size_um[a])
+    centre_um = case.layout.centroid_um
     return _Measured(
-        ratio, np.stack((a, b), axis=1), shapely.shortest_line(*shapely.centroid([case.polygons[a], case.polygons[b]]))
+        ratio,
+        np.stack((a, b), axis=1),
+        lambda k: shapely.linestrings(np.stack((centre_um[a[k]], centre_um[b[k]]), axis=1)),
     )
 
 
 def _counts(case: _Case) -> _Measured:
     bounds_um = case.layout.bounds_um if case.layout.n_sites else (0.0, 0.0, 0.0, 0.0)
     everything = np.array([shapely.box(*bounds_um)], dtype=object)
-    return _Measured(np.array([float(case.layout.n_sites)]), [()], everything)
+    return _Measured(np.array([float(case.layout.n_sites)]), [()], everything.take)
 
 
 #: Every rule in the order of reports.
