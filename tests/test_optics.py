@@ -317,8 +317,10 @@ def test_a_map_is_the_padded_picture_convolved_with_the_pattern(shape, padding, 
     expected = np.real(np.fft.ifft2(np.fft.fft2(padded) * np.fft.fft2(wrapped)))
     expected = expected[widths[0][0] :, widths[1][0] :][: shape[0], : shape[1]]
 
-    # The pattern's own picture ends at 200 cells; a few thousandths of its light lie beyond where it is widest.
-    assert got == pytest.approx(expected, abs=0.02 * cells_per_lambda_n / 4.1 + 1e-4)
+    # The pattern's own picture ends at 200 cells: 2 / (π² r) of its light lies beyond r = 200 cells in units of λN, and comes
+    # back on its other side.
+    astray = 2 / np.pi**2 / (200 / cells_per_lambda_n)
+    assert got == pytest.approx(expected, abs=astray * lit.max() + 1e-6)
 
 
 # -- wavelengths --------------------------------------------------------------------------------------------------------
