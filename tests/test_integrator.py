@@ -29,6 +29,14 @@ TILINGS = {
         n_sectors=20, r_min_um=0.4, r_max_um=5.5, stagger=True, chords_per_arc=3
     ),
     "zones": fs.layout.zones(side_um=(1.4, 4.2, 9.8), pitch_um=(0.35, 0.7, 1.4)),
+    "octagonal": fs.layout.octagonal(n_x=9, n_y=9, pitch_um=1.1, border="cut"),
+    "giotto": fs.layout.giotto(n_rho=12, n_theta=40, n_fovea=5, n_across=40, unit_um=0.25),
+    "fovi": fs.layout.fovi(fov_um=9.0, a_um=0.5, n_rings=14),
+    "foveal_cartesian": fs.layout.foveal_cartesian(n_rings=7, ring_ratio=1.4, pitch_um=0.4, n_fovea=3),
+    "sunflower": fs.layout.sunflower(n_sites=250, spacing_um=0.6),
+    "voronoi": fs.layout.voronoi(n_sites=200, size_um=(9.0, 9.0), n_iterations=3).translate(0.1, 0.1),
+    "quadtree": fs.layout.quadtree(np.random.default_rng(1).random((32, 32)), pitch_um=0.3, limit=9.0, n_levels=5),
+    "penrose": fs.layout.penrose(side_um=0.9, size_um=10.0),
 }
 
 
