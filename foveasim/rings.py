@@ -12,7 +12,15 @@ import numpy as np
 
 from foveasim.arrays import Floats, Ints
 
-__all__ = ["next_vertex", "ring_moments", "ring_spread_um2", "site_area_um2", "site_bounds_um", "site_moments"]
+__all__ = [
+    "next_vertex",
+    "positions_in_runs",
+    "ring_moments",
+    "ring_spread_um2",
+    "site_area_um2",
+    "site_bounds_um",
+    "site_moments",
+]
 
 
 def next_vertex(ring_offsets: Ints) -> Ints:
@@ -20,6 +28,11 @@ def next_vertex(ring_offsets: Ints) -> Ints:
     after = np.arange(1, ring_offsets[-1] + 1)
     after[ring_offsets[1:] - 1] = ring_offsets[:-1]
     return after
+
+
+def positions_in_runs(lengths: Ints) -> Ints:
+    """0, 1, 2, ... within each of several runs, one run after the other: (sum of lengths,)."""
+    return np.arange(int(lengths.sum())) - np.repeat(np.cumsum(lengths) - lengths, lengths)
 
 
 def ring_moments(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats]:

@@ -206,3 +206,27 @@ def test_bad_layout_files_end_with_one_sentence(tmp_path, arguments, words):
     assert result.returncode == 2
     assert result.stderr.startswith(f"error: {words}")
     assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("layout", "radius"),
+    [
+        (
+            "{generator: log_polar, parameters: {n_sectors: 32, r_min_um: 10, r_max_um: 100}, move_um: [5.0, 3.0]}",
+            "10.00",
+        ),
+        ("{generator: giotto, parameters: {n_rho: 12, n_theta: 40, n_fovea: 5, n_across: 40, unit_um: 4}}", "none"),
+        ("{generator: fovi, parameters: {fov_um: 200, a_um: 10, n_rings: 12}}", "none"),
+        ("{generator: grid, parameters: {n_x: 9, n_y: 9, pitch_um: 5}}", "none"),
+    ],
+)
+def test_only_a_hole_in_the_middle_is_told_as_a_blind_spot(tmp_path, layout, radius):
+    scene = (
+        "{kind: flat, shape: [400, 400], pitch_um: 100, distance_m: 1.0, radiance_w_m2_sr_nm: 0.1, band_width_nm: 10}"
+    )
+    (tmp_path / "shot.yaml").write_text(
+        f"scene: {scene}\noptics: {{focal_length_mm: 8, f_number: 2.8}}\nlayout: {layout}\nexposure_s: 0.01\n"
+    )
+    line = next(row for row in foveasim("run", "shot.yaml", cwd=tmp_path).stdout.splitlines() if "blind-spot" in row)
+
+    assert line.split("│")[2].strip() == radius

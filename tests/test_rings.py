@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from foveasim.rings import next_vertex, ring_moments, site_bounds_um, site_moments
+from foveasim.rings import next_vertex, positions_in_runs, ring_moments, site_bounds_um, site_moments
 
 relaxed = settings(deadline=None, derandomize=True, max_examples=60)
 
@@ -169,3 +169,7 @@ def test_measures_accept_read_only_arrays_and_leave_them_unchanged():
     assert site_moments(*arrays)[0].tolist() == [2.0, 2.0]
     assert site_bounds_um(*arrays)[1].tolist() == [5.0, 5.0, 6.0, 7.0]
     assert all(np.array_equal(a, b) for a, b in zip(arrays, before, strict=True))
+
+
+def test_positions_in_runs_count_from_0_in_each_run():
+    assert positions_in_runs(np.array([3, 0, 1, 2])).tolist() == [0, 1, 2, 0, 0, 1]

@@ -13,7 +13,7 @@ from foveasim.arrays import Floats, Ints
 from foveasim.compiled import kernels
 from foveasim.fields import Grid, PackedRings
 from foveasim.parallel import each
-from foveasim.rings import site_bounds_um
+from foveasim.rings import positions_in_runs, site_bounds_um
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -96,10 +96,9 @@ class Plan:
         n_partial, n_run = (self.spans[:, column].astype(np.int64) for column in (column_of.N_PARTIAL, column_of.N_RUN))
         n_cells = n_partial + n_run
         # A span's k-th cell has its k-th weight, and every cell of the run the one after the partial ones.
-        first_cell = np.cumsum(n_cells) - n_cells
         n_weights = n_partial + (n_run > 0)
         first_weight = np.cumsum(n_weights) - n_weights
-        k = np.arange(int(n_cells.sum())) - np.repeat(first_cell, n_cells)
+        k = positions_in_runs(n_cells)
         weight = self.weights[np.repeat(first_weight, n_cells) + np.minimum(k, np.repeat(n_partial, n_cells))]
         n_y, n_x = self.grid.shape
         start = self.spans[:, column_of.ROW].astype(np.int64) * n_x + self.spans[:, column_of.COLUMN]

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim.arrays import MAX_LENGTH_UM, Bools, Floats, Ints, as_numbers, check_number, finite_array, read_only
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.rings import next_vertex, ring_moments, ring_spread_um2, site_bounds_um, site_moments
+from foveasim.rings import next_vertex, positions_in_runs, ring_moments, ring_spread_um2, site_bounds_um, site_moments
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -316,8 +316,7 @@ class Layout:
         n_vertices = np.diff(self.ring_offsets)
         # A closed ring has its first vertex once more at its end.
         ring_of = np.repeat(np.arange(n_vertices.size), n_vertices + 1)
-        position = np.arange(ring_of.size) - (self.ring_offsets[:-1] + np.arange(n_vertices.size))[ring_of]
-        closed = self.xy_um[self.ring_offsets[:-1][ring_of] + position % n_vertices[ring_of]]
+        closed = self.xy_um[self.ring_offsets[:-1][ring_of] + positions_in_runs(n_vertices + 1) % n_vertices[ring_of]]
         rings = shapely.linearrings(closed, indices=ring_of)
         return np.asarray(
             shapely.polygons(rings, indices=np.repeat(np.arange(self.n_sites), np.diff(self.site_offsets)))
@@ -515,13 +514,11 @@ def _wound(xy_um: Floats, ring_offsets: Ints, is_reversed: Bools) -> Floats:
     """Vertices with some rings turned round, their first vertex staying first."""
     n_vertices = np.diff(ring_offsets)
     ring_of = np.repeat(np.arange(n_vertices.size), n_vertices)
-    position = np.arange(ring_of.size) - ring_offsets[:-1][ring_of]
+    position = positions_in_runs(n_vertices)
     turned = np.where(is_reversed[ring_of], -position % n_vertices[ring_of], position)
     return xy_um[ring_offsets[:-1][ring_of] + turned]
 
 
 def _ranges(starts: Ints, stops: Ints) -> Ints:
     """The numbers of all half-open ranges, one range after the other."""
-    lengths = stops - starts
-    shift = np.repeat(starts - (np.cumsum(lengths) - lengths), lengths)
-    return np.arange(int(lengths.sum())) + shift
+    return np.repeat(starts, stops - starts) + positions_in_runs(stops - starts)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim.arrays import MAX_LENGTH_UM, Ints, check_choice, check_count, check_length_um, check_sites, finite_array
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._model import Layout
-from foveasim.rings import next_vertex
+from foveasim.rings import next_vertex, positions_in_runs
 
 __all__ = ["clip", "inset", "merge", "node", "punch", "snap", "split", "union"]
 
@@ -162,7 +162,7 @@ def merge(layout: Layout, groups: ArrayLike) -> Layout:
     # One row a group, filled up with nothing, so that GEOS joins all groups in one call.
     order = np.argsort(group, kind="stable")
     rows = np.full((count.size, int(count.max(initial=1))), None, dtype=object)
-    rows[group[order], np.arange(order.size) - np.repeat(np.cumsum(count) - count, count)] = layout.polygons()[order]
+    rows[group[order], positions_in_runs(count)] = layout.polygons()[order]
     joined = shapely.union_all(rows, axis=1) if count.size else np.zeros(0, dtype=object)
     apart = shapely.get_type_id(joined) != shapely.GeometryType.POLYGON
     if apart.any():

@@ -10,6 +10,7 @@ from foveasim.arrays import Floats, Ints, check_count, check_length_um, check_si
 from foveasim.errors import ParameterError
 from foveasim.layout._model import Layout
 from foveasim.layout._voronoi import cells_of, disc
+from foveasim.rings import positions_in_runs
 
 __all__ = ["fovi"]
 
@@ -78,7 +79,7 @@ def fovi(*, fov_um: float, a_um: float, n_rings: int, n_chords: int | None = Non
     counts = _counts(r_um)
     check_sites(int(counts.sum()))
     ring = np.repeat(np.arange(n_rings + 1), counts)
-    sector = np.arange(ring.size) - np.repeat(np.cumsum(counts) - counts, counts)
+    sector = positions_in_runs(counts)
     angle_rad = 2.0 * math.pi * sector / counts[ring]
     centres_um = r_um[ring][:, np.newaxis] * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
 

@@ -82,7 +82,7 @@ def log_polar(
     -------
     Layout
         Ring by ring from the inside, with the columns ``ring``, ``sector``, ``readout_line`` (the sector: a spoke).
-        ``provenance`` tells ``blind_radius_um``, the inner radius of the first ring.
+        ``provenance`` tells ``blind_radius_um``, the inner radius of the first ring as generated.
 
     Raises
     ------

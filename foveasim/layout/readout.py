@@ -10,6 +10,7 @@ import shapely
 
 from foveasim.errors import ParameterError
 from foveasim.layout._model import Layout
+from foveasim.rings import positions_in_runs
 
 __all__ = ["nearest_bus", "readout_by", "readout_order"]
 
@@ -83,5 +84,5 @@ def readout_order(layout: Layout) -> Layout:
     order = np.lexsort((layout.centroid_um[:, 0], layout.centroid_um[:, 1], line))
     counts = np.bincount(line) if line.size else np.zeros(0, np.int64)
     position = np.empty(layout.n_sites, np.int64)
-    position[order] = np.arange(layout.n_sites) - np.repeat(np.cumsum(counts) - counts, counts)
+    position[order] = positions_in_runs(counts)
     return layout.with_columns(readout_order=position)

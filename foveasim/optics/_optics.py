@@ -85,13 +85,23 @@ class Optics:
     def __post_init__(self) -> None:
         numbers = {
             "focal_length_mm": check_number(
-                "focal_length_mm", self.focal_length_mm, above=0.0, at_most=1e6, cure="focal lengths are in mm"
+                "focal_length_mm",
+                self.focal_length_mm,
+                above=0.0,
+                at_least=0.01,
+                at_most=1e6,
+                cure="focal lengths are in mm",
             ),
-            "f_number": check_number("f_number", self.f_number, above=0.0, at_most=1e4),
+            "f_number": check_number(
+                "f_number",
+                self.f_number,
+                above=0.0,
+                at_least=0.5,
+                at_most=1e4,
+                cure="no lens in air is faster than f/0.5",
+            ),
             "transmission": check_number("transmission", self.transmission, above=0.0, at_most=1.0),
         }
-        check_number("focal_length_mm", self.focal_length_mm, at_least=0.01, cure="focal lengths are in mm")
-        check_number("f_number", self.f_number, at_least=0.5, cure="no lens in air is faster than f/0.5")
         if self.padding_cells is not None:
             numbers["padding_cells"] = check_count("padding_cells", self.padding_cells, at_least=0, at_most=2**20)
         for name, number in numbers.items():

@@ -10,6 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
+import shapely
 from rich.table import Table
 
 from foveasim.capture import Capture
@@ -151,9 +152,11 @@ def _verdict(report: Report | None) -> str:
 
 
 def _blind_spot(layout: Layout) -> str:
-    """Radius of the hole in the middle of the innermost ring."""
+    """Radius of the hole in the middle of the innermost ring, when there is one."""
     if "ring" not in layout.columns:
         return "none"
     innermost = layout[layout.columns["ring"] == layout.columns["ring"].min()]
     middle_um = innermost.centroid_um.mean(axis=0)
+    if shapely.intersects_xy(innermost.polygons(), *middle_um).any():
+        return "none"
     return f"{np.linalg.norm(innermost.xy_um - middle_um, axis=1).min():.2f}"

@@ -30,7 +30,7 @@ from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.files import written_whole
 from foveasim.layout._model import Layout
 from foveasim.layout.files._common import WrittenLayout, check_sites_of, checked_layout, one_sentence, rounding
-from foveasim.rings import ring_moments
+from foveasim.rings import positions_in_runs, ring_moments
 
 __all__ = ["GDS_MAGIC", "OASIS_MAGIC", "read", "write"]
 
@@ -195,7 +195,7 @@ def _pieces(layout: Layout, max_vertices: int | None) -> tuple[Ints, Ints, Ints,
     n_parts[cut] = [len(parts) for parts in parts_of.values()]
     n_rings = np.maximum(n_parts, 1)
     site = np.repeat(np.arange(layout.n_sites), n_rings)
-    part = np.arange(site.size) - np.repeat(np.cumsum(n_rings) - n_rings, n_rings) + 1
+    part = positions_in_runs(n_rings) + 1
     pieces = [ring for s, whole in enumerate(rings_um) for ring in parts_of.get(s, [whole])]
     return site, np.where(n_parts[site] > 0, part, 0), n_parts[site], pieces
 
