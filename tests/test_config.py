@@ -10,9 +10,11 @@ import pytest
 import yaml
 
 import foveasim as fs
-from foveasim.config import read_layout_file, read_shot, schema
+from foveasim.config import read_any_layout, read_layout_file, read_shot, schema, shipped_layouts
 from foveasim.errors import ConfigError, FileError
+from foveasim.pictures import read_picture, write_picture
 from foveasim.shots import demo_settings
+from foveasim.view import plot_layout, save_figure
 
 REPOSITORY = Path(fs.__file__).parents[1]
 SHOT = """
@@ -245,14 +247,140 @@ def test_the_schema_names_every_setting_of_the_calls():
     assert schema()["required"] == ["scene", "optics", "layout", "exposure_s"]
 
 
-@pytest.mark.parametrize("path", sorted((REPOSITORY / "layouts").glob("*.yaml")), ids=lambda p: p.stem)
-def test_a_shipped_layout_keeps_its_rules_and_names_its_source(path):
-    file = read_layout_file(path)
+#: Sites of the layouts that come with the package.
+SHIPPED = {
+    "bayer_grid": 320 * 240,
+    "four_zones": 13_312,
+    "foveal_blind_spot": 14_208,
+    "giotto_1": 56 * 128 + 1 + 6 * (19 * 20 // 2),
+    "giotto_2": 5_167 + 27_720,
+    "ibidem": 64 * 128,
+    "log_polar_ccd": 30 * 64,
+    "pixirad_1": 476 * 512,
+    "prima_100": 378,
+    "prima_75": 142,
+    "quad_bayer": 128 * 128,
+    "x_trans": 144 * 96,
+}
 
-    assert file.layout.n_sites > 100
+
+def test_every_shipped_layout_is_listed():
+    assert list(shipped_layouts()) == sorted(SHIPPED)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_layout_keeps_its_rules_names_its_source_and_can_be_drawn(name, tmp_path):
+    file = read_any_layout(name)
+    ax = plot_layout(file.layout[:: max(1, file.layout.n_sites // 2000)], figure_inches=2.0)
+    save_figure(ax.figure, tmp_path / "layout.png", dpi=50)
+
+    assert file.layout.n_sites == SHIPPED[name]
     assert file.rules is not None
     assert file.layout.check(file.rules).ok
     assert len(file.source) > 20
+    assert read_picture(tmp_path / "layout.png").std() > 5
+
+
+@pytest.mark.parametrize(("name", "fill"), [("prima_100", 0.7225), ("prima_75", 0.8711), ("quad_bayer", (0.6 / 0.7) ** 2)])
+def test_shipped_arrays_have_the_published_fill_factors(name, fill):
+    file = read_any_layout(name)
+    pitch_um = float(np.hypot(*np.diff(file.layout.centroid_um[:2], axis=0).T)[0])
+    cell_um2 = pitch_um**2 * (1.0 if name == "quad_bayer" else 0.5 * np.sqrt(3.0))
+
+    assert file.layout.area_um2[0] / cell_um2 == pytest.approx(fill, abs=1e-4)
+
+
+def test_a_layout_of_its_own_is_taken_before_a_shipped_one_of_the_same_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0).write("layout.npz")
+    (tmp_path / "layout.npz").rename(tmp_path / "giotto_2")
+
+    assert read_any_layout("giotto_2").layout.n_sites == 2
+    with pytest.raises(FileError, match="giotto_3"):
+        read_any_layout("giotto_3")
+
+
+@pytest.fixture
+def picture_file(tmp_path):
+    """A grey picture of 64 x 32 pixels with a white square in its upper left corner."""
+    picture = np.full((32, 64), 10, np.uint8)
+    picture[:8, :8] = 255
+    write_picture(tmp_path / "where.png", picture)
+    return tmp_path / "where.png"
+
+
+def test_a_quadtree_is_fine_where_its_picture_is_bright(tmp_path, picture_file):
+    path = tmp_path / "tree.yaml"
+    path.write_text(
+        "generator: quadtree\n"
+        f"parameters: {{importance: {picture_file.name}, pitch_um: 2.0, limit: 0.5, n_levels: 4, measure: peak}}\n"
+    )
+    layout = read_layout_file(path).layout
+    is_fine = layout.area_um2 == 4.0
+
+    assert layout.area_um2.sum() == 64 * 32 * 4.0
+    assert (layout.centroid_um[is_fine, 0] < -40).all()
+    assert (layout.centroid_um[is_fine, 1] > 10).all()
+    assert is_fine.sum() >= 64
+
+
+def test_density_driven_sites_are_dense_where_their_picture_is_bright(tmp_path, picture_file):
+    path = tmp_path / "cells.yaml"
+    path.write_text(
+        "generator: voronoi\n"
+        f"parameters: {{n_sites: 300, density: {picture_file.name}, size_um: [128.0, 64.0], n_iterations: 3, seed: 4}}\n"
+        "inset_um: 0.1\nsnap_um: 0.005\n"
+    )
+    layout = read_layout_file(path).layout
+    is_bright = (layout.centroid_um[:, 0] < -48) & (layout.centroid_um[:, 1] > 16)
+
+    # 64 pixels of 255 and 1,984 of 10.
+    assert is_bright.mean() == pytest.approx(64 * 255 / (64 * 255 + 1984 * 10), abs=0.08)
+    assert layout.check(fs.DesignRules(grid_um=0.005)).ok
+    assert layout.adjacency().nnz == 0
+
+
+@pytest.mark.usefixtures("picture_file")
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        (
+            "{n_sites: 9, density: where.png}",
+            "parameters.density: needs 'size_um', the rectangle that the picture covers",
+        ),
+        (
+            "{n_sites: 9, density: where.png, size_um: [9.0, 9.0]}",
+            "density: has 64 x 32 pixels, which do not fit 'size_um'",
+        ),
+        ("{n_sites: 9, density: gone.png, size_um: [9.0, 9.0]}", "gone.png: no such file"),
+        (
+            "{n_sites: 9, density: 'skimage:gone', size_um: [9.0, 9.0]}",
+            "parameters.density: scikit-image brings no picture",
+        ),
+        ("{n_sites: 9, size_um: [9.0, 9.0], density_grid: 3}", "parameters.density_grid: no such setting"),
+        ("{n_sites: 9, region: POLYGON}", "'region' must be a shapely Polygon|region"),
+    ],
+)
+def test_densities_that_cannot_be_are_refused_with_their_place(tmp_path, parameters, message):
+    path = tmp_path / "cells.yaml"
+    path.write_text(f"generator: voronoi\nparameters: {parameters}\n")
+
+    with pytest.raises((ConfigError, FileError), match=message):
+        read_layout_file(path)
+
+
+def test_regions_and_outlines_stand_in_files_as_vertices_or_as_text(tmp_path):
+    path = tmp_path / "zones.yaml"
+    path.write_text(
+        "generator: zones\n"
+        "parameters:\n"
+        "  pitch_um: [1.0, 2.0]\n"
+        "  outlines_um: [[[0.0, 0.0], [8.0, 0.0], [0.0, 8.0]], 'POLYGON ((-9 -9, 19 -9, -9 19, -9 -9))']\n"
+    )
+    layout = read_layout_file(path).layout
+
+    assert layout.area_um2.sum() == pytest.approx(0.5 * 28**2)
+    assert layout.area_um2[layout.columns["zone"] == 0].sum() == pytest.approx(32.0)
 
 
 @pytest.mark.parametrize(

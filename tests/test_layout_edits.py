@@ -162,7 +162,8 @@ def test_a_union_has_the_sites_of_all_and_the_columns_of_each():
     [
         (lambda: union([]), "'layouts' must be one or more layouts"),
         (lambda: union([GRID, 3]), "'layouts' must be one or more layouts"),
-        (lambda: clip(GRID, (0, 0, 1, 1)), "'region' must be a valid shapely Polygon or MultiPolygon, got a tuple"),
+        (lambda: clip(GRID, (0, 0, 1, 1)), "'region' must have 2 dimensions, got the shape"),
+        (lambda: clip(GRID, shapely.Point(0, 0)), "'region' must be a shapely Polygon or MultiPolygon, got a Point"),
         (lambda: clip(GRID, shapely.Polygon([(0, 0), (1, 1), (1, 0), (0, 1)])), "'region' must be a valid"),
         (lambda: clip(GRID, DISC, cut="shrink"), "'cut' must be one of 'pieces', 'drop'"),
         (lambda: inset(GRID, -0.1), "'margin_um' must be >= 0"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from inspect import signature
 from itertools import pairwise
 
 import numpy as np
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from foveasim.errors import ParameterError
-from foveasim.layout import Layout, grid, hexagonal, log_polar, mosaic, square_ring_ratio, zones
+from foveasim.layout import Layout, grid, hexagonal, log_polar, mosaic, square_ring_ratio, tiling, zones
 
 relaxed = settings(deadline=None, derandomize=True, max_examples=30)
 
@@ -496,7 +497,7 @@ def test_the_fovea_may_have_an_odd_number_of_pixels_a_side(side_um, pitch_um, n_
         pytest.param([1e-10], [1.0], r"must fit whole pixels", id="no pixel"),
         pytest.param([8, 8 + 1e-9], [1, 1], r"must fit whole pixels", id="no pixel in the border"),
         pytest.param([1e6], [1.0], "pixels.* 16384", id="too many pixels"),
-        pytest.param(8, 1, "'side_um' must", id="numbers"),
+        pytest.param(8, 1, "'pitch_um' must have 1 dimension", id="numbers"),
         pytest.param(["a"], [1], "'side_um' must be an array of numbers", id="text"),
     ],
 )
@@ -554,7 +555,14 @@ def test_grids_refuse_what_cannot_be(make, parameters, message):
                 "chords_per_arc": 3,
             },
         ),
+        (log_polar, {"n_sectors": 24, "r_max_um": 60.0, "min_size_um": 2.2, "fovea": "linear"}),
+        (log_polar, {"n_sectors": 24, "r_max_um": 60.0, "min_size_um": 2.2, "fovea": "hexagons"}),
+        (grid, {"n_x": 3, "n_y": 2, "pitch_um": 2.0, "pitch_y_um": 3.0, "trench_um": 0.25, "stagger": True}),
         (zones, {"side_um": [4.0, 8.0], "pitch_um": [1.0, 2.0]}),
+        (zones, {"side_um": [4.0, 9.5], "pitch_um": [1.0, 2.0], "cells": "hexagons"}),
+        (zones, {"outlines_um": [[[0.0, 0.0], [8.0, 0.0], [0.0, 8.0]]], "pitch_um": [1.0], "cells": ["squares"]}),
+        (tiling, {"pitch_um": 2.0, "radius_um": 9.0, "border": "cut", "origin_um": [0.5, 0.25]}),
+        (tiling, {"pitch_um": 2.0, "region": "POLYGON ((0 0, 9 0, 0 7, 0 0))", "cells": "squares"}),
     ],
 )
 def test_a_layout_can_be_made_again_from_its_provenance(make, parameters):
@@ -562,7 +570,9 @@ def test_a_layout_can_be_made_again_from_its_provenance(make, parameters):
     moved = layout.rotate(10.0)[1:]
 
     assert layout.provenance["generator"] == moved.provenance["generator"] == make.__name__
-    assert layout.provenance["parameters"] == moved.provenance["parameters"] == parameters
+    assert layout.provenance["parameters"] == moved.provenance["parameters"]
+    assert layout.provenance["parameters"].keys() == signature(make).parameters.keys()
+    assert layout.provenance["parameters"].items() >= parameters.items()
     assert make(**layout.provenance["parameters"]).xy_um.tolist() == layout.xy_um.tolist()
 
 

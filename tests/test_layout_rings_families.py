@@ -82,7 +82,7 @@ def giotto_parameters(draw):
         "n_fovea": n_fovea,
         "n_across": draw(st.integers(2 * n_rho, 12 * n_rho)),
         "unit_um": draw(units_um),
-        "fovea": draw(st.sampled_from(["rings", "none"])),
+        "fovea": draw(st.sampled_from(["rings", "linear", "none"])),
         "stagger": draw(st.booleans()),
         "chords_per_arc": draw(st.integers(1, 7)),
     }
@@ -182,7 +182,7 @@ def test_a_giotto_layout_tiles_its_disc_or_its_annulus(parameters):
 @relaxed
 def test_neighbours_in_a_giotto_layout_share_their_edges_bit_for_bit(parameters):
     counts = edge_counts(giotto(**parameters))
-    n_borders = 1 if parameters["fovea"] == "rings" else 2
+    n_borders = 2 if parameters["fovea"] == "none" else 1
 
     assert counts[1] == n_borders * outer_corners(parameters)
     assert set(counts) == {1, 2}
@@ -287,7 +287,7 @@ def test_a_giotto_layout_scales_with_its_unit():
         ({"n_theta": 10_000_000}, "'n_sites' must be <= 50000000"),
         ({"unit_um": 0.0}, "'unit_um' must be > 0, got 0.0 µm"),
         ({"unit_um": 1e5}, "'unit_um' must be <= 33333.3, got 100000.0 µm"),
-        ({"fovea": "hexagons"}, "'fovea' must be one of 'rings', 'none', got 'hexagons'"),
+        ({"fovea": "squares"}, "'fovea' must be one of 'none', 'rings', 'linear', 'hexagons', got 'squares'"),
         ({"chords_per_arc": 0}, "'chords_per_arc' must be >= 1, got 0"),
     ],
 )

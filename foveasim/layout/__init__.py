@@ -5,7 +5,7 @@ from __future__ import annotations
 from foveasim.layout._model import Layout
 from foveasim.layout.adjacency import adjacency
 from foveasim.layout.channels import MOSAICS, colouring, mosaic, random_channels
-from foveasim.layout.edits import clip, inset, merge, node, punch, snap, split, union
+from foveasim.layout.edits import clip, inset, merge, merge_small, node, punch, snap, split, union
 from foveasim.layout.enforce import Change, enforce
 from foveasim.layout.files import WrittenLayout, read_layout, write_layout
 from foveasim.layout.foveal_cartesian import foveal_cartesian
@@ -20,6 +20,7 @@ from foveasim.layout.quadtree import quadtree
 from foveasim.layout.readout import nearest_bus, readout_by, readout_order
 from foveasim.layout.rules import DesignRules, Report, RuleResult, Violation, min_width_um
 from foveasim.layout.sunflower import sunflower
+from foveasim.layout.tiling import fill, tiling
 from foveasim.layout.voronoi import voronoi
 from foveasim.layout.zones import zones
 
@@ -36,6 +37,7 @@ __all__ = [
     "clip",
     "colouring",
     "enforce",
+    "fill",
     "foveal_cartesian",
     "fovi",
     "giotto",
@@ -45,6 +47,7 @@ __all__ = [
     "inset",
     "log_polar",
     "merge",
+    "merge_small",
     "min_width_um",
     "mosaic",
     "nearest_bus",
@@ -61,6 +64,7 @@ __all__ = [
     "split",
     "square_ring_ratio",
     "sunflower",
+    "tiling",
     "union",
     "voronoi",
     "write_layout",

@@ -17,9 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim.arrays import MAX_LENGTH_UM, Ints, check_choice, check_count, check_length_um, check_sites, finite_array
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._model import Layout
+from foveasim.layout._regions import as_region
+from foveasim.layout.adjacency import adjacency
 from foveasim.rings import next_vertex, positions_in_runs
 
-__all__ = ["clip", "inset", "merge", "node", "punch", "snap", "split", "union"]
+__all__ = ["clip", "inset", "joining_groups", "merge", "merge_small", "node", "punch", "snap", "split", "union"]
 
 #: A piece of a site smaller than this share of it is rounding at the border of a cut.
 SLIVER = 1e-9
@@ -59,14 +61,14 @@ def union(layouts: Sequence[Layout]) -> Layout:
     )
 
 
-def clip(layout: Layout, region: shapely.Polygon, *, cut: Literal["pieces", "drop"] = "pieces") -> Layout:
+def clip(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "pieces") -> Layout:
     """
     The part of a layout inside a region.
 
     Parameters
     ----------
     layout : Layout
-    region : shapely Polygon or MultiPolygon, µm
+    region : shapely Polygon or MultiPolygon, or (n, 2) vertices, µm
         A die, a zone, an image circle.
     cut : {"pieces", "drop"}
         What becomes of sites that the border cuts: their pieces inside, each a site of its own; or nothing.
@@ -80,22 +82,22 @@ def clip(layout: Layout, region: shapely.Polygon, *, cut: Literal["pieces", "dro
     ParameterError
         When the region is no valid polygon.
     """
-    return _kept(layout, _region(region), shapely.intersection, shapely.covers, cut, "clipped to a region")
+    return _kept(layout, as_region("region", region), shapely.intersection, shapely.covers, cut, "clipped to a region")
 
 
-def punch(layout: Layout, region: shapely.Polygon, *, cut: Literal["pieces", "drop"] = "pieces") -> Layout:
+def punch(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "pieces") -> Layout:
     """
     The part of a layout outside a region; parameters and errors as for :func:`clip`.
 
     Parameters
     ----------
     layout : Layout
-    region : shapely Polygon or MultiPolygon, µm
+    region : shapely Polygon or MultiPolygon, or (n, 2) vertices, µm
         What is taken out: room for a circuit, a fiducial mark, a fovea to be filled.
     cut : {"pieces", "drop"}
         As for :func:`clip`.
     """
-    return _kept(layout, _region(region), shapely.difference, shapely.disjoint, cut, "punched by a region")
+    return _kept(layout, as_region("region", region), shapely.difference, shapely.disjoint, cut, "punched by a region")
 
 
 def inset(layout: Layout, margin_um: ArrayLike) -> Layout:
@@ -171,6 +173,58 @@ def merge(layout: Layout, groups: ArrayLike) -> Layout:
             f"site {bad[0]} does not hang together with the other sites of its group", tuple(int(i) for i in bad)
         )
     return _rebuilt(layout, joined, first, "merged by groups")
+
+
+def merge_small(layout: Layout, *, min_size_um: float) -> Layout:
+    """
+    Sites below a size made part of the neighbour with which they share most edge, as often as it takes.
+
+    Parameters
+    ----------
+    layout : Layout
+    min_size_um : float, µm
+        Smallest size, the square root of a site's area.
+
+    Returns
+    -------
+    Layout
+        In the order of each site's first part, with that part's columns. A small site without neighbours stays.
+
+    Raises
+    ------
+    ParameterError
+        When the size is not positive.
+    """
+    min_size_um = check_length_um("min_size_um", min_size_um)
+    while True:
+        small = np.flatnonzero(layout.area_um2 < min_size_um**2)
+        groups = joining_groups(layout, small[np.argsort(layout.area_um2[small], kind="stable")])
+        if np.array_equal(groups, np.arange(layout.n_sites)):
+            return layout
+        layout = merge(layout, groups)
+
+
+def joining_groups(layout: Layout, small: Ints) -> Ints:
+    """
+    Groups for :func:`merge` that join each small site, in this order, to the neighbour with which it shares most edge.
+
+    A site is joined once: later ones that need it stay alone for now.
+    """
+    groups = np.arange(layout.n_sites)
+    if small.size == 0:
+        return groups
+    shared_um = adjacency(layout)
+    is_taken = np.zeros(layout.n_sites, bool)
+    for site in small.tolist():
+        row = slice(shared_um.indptr[site], shared_um.indptr[site + 1])
+        others, lengths_um = shared_um.indices[row], shared_um.data[row]
+        is_free = ~is_taken[others]
+        if is_taken[site] or not is_free.any():
+            continue
+        partner = int(others[is_free][lengths_um[is_free].argmax()])
+        is_taken[[site, partner]] = True
+        groups[max(site, partner)] = min(site, partner)
+    return groups
 
 
 def split(layout: Layout, *, n_x: int = 2, n_y: int = 1) -> Layout:
@@ -290,17 +344,9 @@ def _joined(offsets: Sequence[Ints]) -> Ints:
     return np.concatenate(([0], np.cumsum(steps)))
 
 
-def _region(region: Any) -> Any:
-    if not isinstance(region, shapely.Polygon | shapely.MultiPolygon) or region.is_empty or not region.is_valid:
-        raise ParameterError(
-            "region", f"must be a valid shapely Polygon or MultiPolygon, got a {type(region).__name__}"
-        )
-    shapely.prepare(region)
-    return region
-
-
 def _kept(layout: Layout, region: Any, operation: Any, keeps_whole: Any, cut: str, step: str) -> Layout:
     check_choice("cut", cut, ("pieces", "drop"))
+    shapely.prepare(region)
     polygons = layout.polygons()
     is_whole = keeps_whole(region, polygons)
     if cut == "drop":

@@ -17,8 +17,8 @@ from foveasim.arrays import (
     check_sites,
 )
 from foveasim.errors import ParameterError
+from foveasim.layout._annuli import ring_outlines
 from foveasim.layout._model import Layout
-from foveasim.layout.giotto import ring_outlines
 
 __all__ = ["foveal_cartesian"]
 

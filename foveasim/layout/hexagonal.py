@@ -9,6 +9,7 @@ import numpy as np
 
 from foveasim.arrays import check_choice, check_count, check_length_um, check_sites
 from foveasim.layout._model import Layout
+from foveasim.layout.grid import light_share
 
 __all__ = ["hexagonal"]
 
@@ -19,6 +20,8 @@ def hexagonal(
     n_rows: int,
     pitch_um: float,
     width_um: float | None = None,
+    trench_um: float | None = None,
+    fill_factor: float | None = None,
     orientation: Literal["pointy", "flat"] = "pointy",
 ) -> Layout:
     """
@@ -40,8 +43,11 @@ def hexagonal(
     pitch_um : float, µm
         Distance of two neighbours' centres.
     width_um : float, optional, µm
-        Distance of two opposite flat sides of the light-sensitive hexagon; the pitch by default. The fill factor is
-        ``(width / pitch)²``.
+        Distance of two opposite flat sides of the light-sensitive hexagon; the pitch by default.
+    trench_um : float, optional, µm
+        In the place of the width: what is left open between two sites.
+    fill_factor : float, optional
+        In the place of the width: share of a cell that is sensitive to light, ``(width / pitch)²``.
     orientation : {"pointy", "flat"}
         Whether a corner or a flat side is on top.
 
@@ -53,12 +59,11 @@ def hexagonal(
     Raises
     ------
     ParameterError
-        When a number is out of range, or the width larger than the pitch.
+        When a number is out of range, the width larger than the pitch, or the width told twice.
     """
     n_columns, n_rows = check_count("n_columns", n_columns), check_count("n_rows", n_rows)
     pitch_um = check_length_um("pitch_um", pitch_um)
-    if width_um is not None:
-        width_um = check_length_um("width_um", width_um, at_most=pitch_um, cure="it is no larger than 'pitch_um'")
+    share = light_share(pitch_um, width_um, trench_um, fill_factor)
     check_choice("orientation", orientation, ("pointy", "flat"))
     check_sites(n_columns * n_rows)
     row, column = (index.ravel() for index in np.divmod(np.arange(n_rows * n_columns), n_columns))
@@ -66,9 +71,8 @@ def hexagonal(
     half_um = np.array([0.5 * pitch_um, 0.5 * pitch_um / math.sqrt(3.0)])
     centre = np.stack((2 * column + row % 2, 3 * row), axis=1)
     middle = np.array([n_columns - 1 + 0.5 * (n_rows > 1), 1.5 * (n_rows - 1)])
-    shrink = 1.0 if width_um is None else width_um / pitch_um
     corners = np.array([(1, -1), (1, 1), (0, 2), (-1, 1), (-1, -1), (0, -2)])
-    rings_um = ((centre - middle)[:, np.newaxis] + shrink * corners) * half_um
+    rings_um = ((centre - middle)[:, np.newaxis] + (1.0 if share is None else share) * corners) * half_um
     if orientation == "flat":
         rings_um = np.stack((-rings_um[..., 1], rings_um[..., 0]), axis=-1)
     return Layout.from_equal_rings(
@@ -81,6 +85,8 @@ def hexagonal(
                 "n_rows": n_rows,
                 "pitch_um": pitch_um,
                 "width_um": width_um,
+                "trench_um": trench_um,
+                "fill_factor": fill_factor,
                 "orientation": orientation,
             },
         },

@@ -3,15 +3,30 @@
 from __future__ import annotations
 
 import math
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from foveasim.arrays import MAX_SITES, Floats, Ints, check_count, check_length_um, check_number
+from foveasim.arrays import (
+    MAX_SITES,
+    Floats,
+    Ints,
+    check_choice,
+    check_count,
+    check_length_um,
+    check_number,
+    check_sites,
+)
 from foveasim.errors import ParameterError
+from foveasim.layout._annuli import MIN_SITES_PER_RHO, Annuli, Fovea, Ring, annuli, fovea_rings
 from foveasim.layout._model import Layout
+from foveasim.layout.tiling import with_hexagons
+from foveasim.rings import ring_moments
 
 __all__ = ["log_polar", "square_ring_ratio"]
 
+#: Sites that each ring of the fovea has more than the one inside it: their arcs are π/3 times as wide as they are high.
+SITES_PER_RHO = 6
 #: Rings thinner than this share of their radius are rounding.
 RATIO_ROUNDING = 1e-12
 
@@ -37,6 +52,7 @@ def log_polar(
     r_min_um: float | None = None,
     n_rings: int | None = None,
     ring_ratio: float | None = None,
+    fovea: Fovea = "none",
     stagger: bool = False,
     chords_per_arc: int = 1,
 ) -> Layout:
@@ -48,7 +64,7 @@ def log_polar(
                      ╭──────┬──────╮  r_max_um
                    ╱  ╭─────┼────╮   ╲
                   │ ╱   ╭───┼──╮   ╲  │       ring k: r_k to r_k · ring_ratio
-                  ├─┼───┤ blind├───┼──┤
+                  ├─┼───┤ fovea├───┼──┤
                   │ ╲   ╰───┼──╯   ╱  │       site: one of n_sectors parts of a ring,
                    ╲  ╰─────┼────╯   ╱              its arcs cut into chords_per_arc chords
                      ╰──────┴──────╯
@@ -71,8 +87,13 @@ def log_polar(
         Number of rings between ``r_min_um`` and ``r_max_um``, in the place of ``ring_ratio``.
     ring_ratio : float, optional
         Outer to inner radius of a ring; :func:`square_ring_ratio` by default.
+    fovea : {"none", "rings", "linear", "hexagons"}
+        What fills the middle: nothing; ``λ / (λ - 1)`` rings of equal heights (λ the ring ratio), the height that a next
+        ring inside would have, fewer where a site would be below ``min_size_um``. Ring 0 is one site, ring ρ holds 6ρ sites
+        (``"rings"``) or is linear-polar, cut by those of the spokes that leave its sites as wide as high (``"linear"``).
+        ``"hexagons"`` are of ``min_size_um`` (without it, of the first ring's size), pieces at the border joined to others.
     stagger : bool
-        Turn every second ring by half a sector.
+        Turn every second ring outside the fovea by half a sector.
     chords_per_arc : int
         Straight edges that stand for an arc. The area is that of the arcs times ``sin(d)/d``, with d the angle of one
         chord. Where ``stagger`` would set odd numbers of chords against each other, arcs get twice as many, so that
@@ -81,8 +102,9 @@ def log_polar(
     Returns
     -------
     Layout
-        Ring by ring from the inside, with the columns ``ring``, ``sector``, ``readout_line`` (the sector: a spoke).
-        ``provenance`` tells ``blind_radius_um``, the inner radius of the first ring as generated.
+        Ring by ring from the inside, with the columns ``ring`` (hexagons are ring 0), ``sector``, ``readout_line`` (the
+        spoke in which the site begins, of a hexagon that of its middle). ``provenance`` tells ``blind_radius_um``, the inner
+        radius of the first ring as generated, where the middle is left open.
 
     Raises
     ------
@@ -90,6 +112,7 @@ def log_polar(
         When a number is out of range, or no ring fits.
     """
     n_sectors = check_count("n_sectors", n_sectors, at_least=3, at_most=MAX_SITES)
+    check_choice("fovea", fovea, get_args(Fovea))
     chords_per_arc = check_count("chords_per_arc", chords_per_arc, at_most=1000)
     r_max_um = check_length_um("r_max_um", r_max_um)
     for name, length_um in (("min_size_um", min_size_um), ("r_min_um", r_min_um)):
@@ -110,25 +133,68 @@ def log_polar(
         ratio = square_ring_ratio(n_sectors)
 
     radii_um = _ring_radii_um(n_sectors, ratio, r_min_um, r_max_um, min_size_um, n_rings)
-    rings_um, ring, sector = _sites(radii_um, n_sectors, stagger, chords_per_arc)
-    return Layout.from_equal_rings(
-        rings_um,
-        {"ring": ring, "sector": sector, "readout_line": sector},
-        {
-            "generator": "log_polar",
-            "parameters": {
-                "n_sectors": n_sectors,
-                "r_max_um": r_max_um,
-                "min_size_um": min_size_um,
-                "r_min_um": r_min_um,
-                "n_rings": n_rings,
-                "ring_ratio": ring_ratio,
-                "stagger": stagger,
-                "chords_per_arc": chords_per_arc,
-            },
-            "blind_radius_um": float(radii_um[0]),
+    n_chords = chords_per_arc * (2 if stagger and chords_per_arc % 2 else 1)
+    rings = [Ring(n_sectors, int(stagger and i % 2 == 1), n_chords) for i in range(radii_um.size - 1)]
+    if fovea in {"rings", "linear"}:
+        sites, n_sites = _with_fovea(
+            "rings" if fovea == "rings" else "linear", radii_um, rings, ratio, min_size_um or 0.0, chords_per_arc
+        )
+    else:
+        sites, n_sites = annuli(radii_um, rings), np.full(len(rings), n_sectors)
+    provenance: dict[str, Any] = {
+        "generator": "log_polar",
+        "parameters": {
+            "n_sectors": n_sectors,
+            "r_max_um": r_max_um,
+            "min_size_um": min_size_um,
+            "r_min_um": r_min_um,
+            "n_rings": n_rings,
+            "ring_ratio": ring_ratio,
+            "fovea": fovea,
+            "stagger": stagger,
+            "chords_per_arc": chords_per_arc,
         },
+    }
+    if fovea == "none":
+        provenance["blind_radius_um"] = float(radii_um[0])
+    layout = Layout(
+        sites.xy_um,
+        sites.ring_offsets,
+        np.arange(sites.ring_offsets.size),
+        {"ring": sites.ring, "sector": sites.sector, "readout_line": sites.sector * n_sectors // n_sites[sites.ring]},
+        provenance,
     )
+    if fovea == "hexagons":
+        size_um = math.sqrt(layout.area_um2[:n_sectors].min()) if min_size_um is None else min_size_um
+        return with_hexagons(layout, size_um, n_sectors)
+    return layout
+
+
+def _with_fovea(
+    filling: Literal["rings", "linear"],
+    radii_um: Floats,
+    rings: list[Ring],
+    ratio: float,
+    min_size_um: float,
+    n_chords: int,
+) -> tuple[Annuli, Ints]:
+    """Rings with a fovea of so many rings that none of its sites is below the minimum size, and the sites of each ring."""
+    n_sectors = rings[0].n_sites
+    n_rings = max(1, min(round(ratio / (ratio - 1.0) + 0.5), n_sectors // MIN_SITES_PER_RHO))
+    while True:
+        heights, inside = fovea_rings(
+            filling, n_rings=n_rings, n_sectors=n_sectors, n_per_ring=SITES_PER_RHO, n_chords=n_chords
+        )
+        inside_um = heights * (radii_um[0] / heights[-1])
+        # The ring around the fovea gives corners to its border.
+        sites = annuli(np.concatenate((inside_um, radii_um[1:2])), [*inside, rings[0]])
+        area_um2, _ = ring_moments(sites.xy_um, sites.ring_offsets)
+        if n_rings == 1 or math.sqrt(area_um2[sites.ring < n_rings].min()) >= min_size_um:
+            all_rings = [*inside, *rings]
+            n_sites = np.array([ring.n_sites for ring in all_rings])
+            check_sites(int(n_sites.sum()))
+            return annuli(np.concatenate((inside_um, radii_um[1:])), all_rings), n_sites
+        n_rings -= 1
 
 
 def _ring_radii_um(
@@ -163,19 +229,3 @@ def _ring_radii_um(
             "enlarge it, or take fewer sectors or a smaller minimum size",
         )
     return radii_um
-
-
-def _sites(radii_um: Floats, n_sectors: int, stagger: bool, chords_per_arc: int) -> tuple[Floats, Ints, Ints]:
-    """Outlines (n_site, n_vertex, 2) µm, and the ring and sector of each."""
-    n_chords = chords_per_arc * (2 if stagger and chords_per_arc % 2 else 1)
-    # All corners lie on steps of a whole turn, so that neighbours' corners are equal bit for bit.
-    n_steps = n_sectors * n_chords
-    angle_rad = 2.0 * math.pi * np.arange(n_steps) / n_steps
-    direction = np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
-    ring, sector = (index.ravel() for index in np.divmod(np.arange((radii_um.size - 1) * n_sectors), n_sectors))
-    turn = np.where(stagger & (ring % 2 == 1), n_chords // 2, 0)
-    start = sector * n_chords + turn
-    arc = np.arange(n_chords + 1)
-    inner = direction[(start[:, np.newaxis] + arc[::-1]) % n_steps] * radii_um[ring][:, np.newaxis, np.newaxis]
-    outer = direction[(start[:, np.newaxis] + arc) % n_steps] * radii_um[ring + 1][:, np.newaxis, np.newaxis]
-    return np.concatenate((outer, inner), axis=1), ring, sector

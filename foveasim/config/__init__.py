@@ -1,0 +1,29 @@
+"""
+Settings files: YAML to the package's objects, and the JSON schema of what may stand in them.
+
+A file names a call of the package and its parameters: the file and the Python call have the same names, defaults and limits.
+"""
+
+from __future__ import annotations
+
+from foveasim.config._objects import (
+    LayoutFile,
+    Shot,
+    read_any_layout,
+    read_layout_file,
+    read_rules,
+    read_shot,
+    schema,
+    shipped_layouts,
+)
+
+__all__ = [
+    "LayoutFile",
+    "Shot",
+    "read_any_layout",
+    "read_layout_file",
+    "read_rules",
+    "read_shot",
+    "schema",
+    "shipped_layouts",
+]

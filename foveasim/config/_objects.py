@@ -1,0 +1,313 @@
+"""What settings files give: layouts with their rules, and whole shots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, TypeAdapter
+
+import foveasim
+from foveasim.arrays import check_number
+from foveasim.camera import Camera
+from foveasim.config._models import PICTURES, LayoutUnion, PerArea, RulesSection, ShotSection, call_of
+from foveasim.config._problems import validated
+from foveasim.config._yaml import parsed, read_yaml
+from foveasim.errors import ConfigError, FoveasimError, ParameterError
+from foveasim.fields import Grid
+from foveasim.layout import DesignRules, Layout, inset, mosaic, read_layout, snap
+from foveasim.optics import Optics
+from foveasim.pictures import read_picture
+from foveasim.scene import Scene
+from foveasim.sensor import Sensor
+from foveasim.streams import Streams
+
+__all__ = [
+    "LayoutFile",
+    "Shot",
+    "read_any_layout",
+    "read_layout_file",
+    "read_rules",
+    "read_shot",
+    "schema",
+    "shipped_layouts",
+]
+
+#: Pictures that come with scikit-image are named with this in front.
+BUNDLED_PICTURE = "skimage:"
+#: Endings of files that hold settings; a layout in any other file is told by its content.
+YAML_ENDINGS = (".yaml", ".yml")
+#: Settings whose value may be the name of a file.
+FILE_SETTINGS = ("scene.picture", "layout", "layout.parameters.importance", "layout.parameters.density")
+#: A picture's sides may have this relative difference from those of the rectangle that it covers.
+SHAPE_ROUNDING = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayoutFile:
+    """
+    A layout with what its file says about it.
+
+    Attributes
+    ----------
+    layout : Layout
+    rules : DesignRules or None
+        Rules that the layout is meant to keep.
+    source : str
+        Where its figures come from.
+    """
+
+    layout: Layout
+    rules: DesignRules | None
+    source: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """
+    A camera, a scene and an exposure: what a settings file describes.
+
+    Attributes
+    ----------
+    name : str
+        The file's name without its ending.
+    scene : Scene
+    camera : Camera
+    rules : DesignRules or None
+        Rules that the sensor's layout is meant to keep.
+    exposure_s : float, s
+    seed : int
+    """
+
+    name: str
+    scene: Scene
+    camera: Camera
+    rules: DesignRules | None
+    exposure_s: float
+    seed: int
+
+
+def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int | None = None) -> Shot:
+    """
+    Read a settings file and build what it describes.
+
+    Parameters
+    ----------
+    path : path
+        YAML. Pictures and layouts that it names are looked for beside it; ``skimage:astronaut`` and its like are the
+        pictures that come with scikit-image.
+    changes : sequence of "key=value"
+        Settings to be replaced: ``sensor.bits=10``; the value is read as YAML. Files named here are looked for in the
+        current folder.
+    n_threads : int, optional
+        For the camera.
+
+    Raises
+    ------
+    ConfigError
+        With the file, the place in it, what was expected and got.
+    FileError
+        When a picture that the file names cannot be read.
+    """
+    path = Path(path)
+    data = read_yaml(path)
+    for change in changes:
+        _replace(path, data, change)
+    settings = validated(path, ShotSection, data)
+    if isinstance(settings.layout, str):
+        beside = path.parent / settings.layout
+        name = settings.layout if settings.layout in shipped_layouts() and not beside.exists() else beside
+        file = _call(path, "layout", read_any_layout, {"path": name})
+    else:
+        file = _built_layout(path, "layout.", settings.layout)
+    layout = file.layout
+    sensor_values = {
+        name: value.per_um2 * layout.area_um2 if isinstance(value, PerArea) else value
+        for name, value in _values(path, "sensor.", settings.sensor).items()
+    }
+    sensor = _call(path, "sensor", Sensor, {"layout": layout, **sensor_values})
+    optics = _call(path, "optics", Optics, _values(path, "optics.", settings.optics))
+    scene_values = _values(path, "scene.", settings.scene)
+    if "picture" in scene_values:
+        scene_values["picture"] = _picture_path(path, scene_values["picture"])
+    # A picture's own faults are told with its name.
+    scene = _call(path, "scene", _callable(settings.scene), scene_values)
+    # What would end the capture is told before it begins, with its place in the file.
+    _call(path, "scene", optics.grid, {"scene": scene})
+    _call(path, "scene", sensor.responsivity_e_per_j, {"wavelength_nm": scene.wavelength_nm})
+    streams = _call(path, "", Streams, {"seed": settings.seed})
+    exposure_s = _call(path, "", check_number, {"name": "exposure_s", "value": settings.exposure_s, "at_least": 0.0})
+    return Shot(
+        name=path.stem,
+        scene=scene,
+        camera=Camera(optics=optics, sensor=sensor, n_threads=n_threads),
+        rules=file.rules,
+        exposure_s=exposure_s,
+        seed=streams.seed,
+    )
+
+
+def read_layout_file(path: str | Path) -> LayoutFile:
+    """
+    Read a YAML file with a layout: generator, parameters, colour filters, rules, source.
+
+    Raises
+    ------
+    ConfigError
+        With the file, the place in it, what was expected and got.
+    """
+    path = Path(path)
+    return _built_layout(path, "", validated(path, LayoutUnion, read_yaml(path)))
+
+
+def read_any_layout(path: str | Path) -> LayoutFile:
+    """
+    Read a layout from a YAML file, from a file of any other format, or by the name of a layout that comes with the package.
+
+    Raises
+    ------
+    FileError
+        When it cannot be read.
+    """
+    path = shipped_layouts().get(str(path), path) if not Path(path).exists() else path
+    path = Path(path)
+    if path.suffix.lower() in YAML_ENDINGS:
+        return read_layout_file(path)
+    return LayoutFile(layout=read_layout(path), rules=None, source=str(path))
+
+
+def shipped_layouts() -> dict[str, Path]:
+    """Files of the layouts that come with the package, by their names: real sensors and those of the paper."""
+    package = Path(foveasim.__file__).parent
+    # An installed package has them inside; a checkout beside it.
+    folder = next(place / "layouts" for place in (package, package.parent) if (place / "layouts").is_dir())
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def read_rules(path: str | Path) -> DesignRules:
+    """
+    Read a YAML file of design rules: limits by their names, and waivers.
+
+    Raises
+    ------
+    ConfigError
+        With the file, the place in it, what was expected and got.
+    """
+    path = Path(path)
+    rules: DesignRules = _built(path, "", validated(path, RulesSection, read_yaml(path)))
+    return rules
+
+
+def schema() -> dict[str, Any]:
+    """JSON schema of a settings file."""
+    described = TypeAdapter(ShotSection).json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **described, "title": "foveasim settings"}
+
+
+def _built_layout(path: Path, place: str, section: Any) -> LayoutFile:
+    parameters = place + "parameters"
+    values = _values(path, parameters + ".", section.parameters)
+    picture = PICTURES.get(section.generator)
+    if picture is not None and values[picture] is not None:
+        values |= _picture_values(path, f"{parameters}.{picture}", values)
+    layout = _call(path, parameters, _callable(section.parameters), values)
+    if section.mosaic is not None:
+        layout = _call(path, place + "mosaic", mosaic, {"layout": layout, "block": section.mosaic})
+    if any(section.move_um):
+        layout = _call(
+            path, place + "move_um", layout.translate, dict(zip(("dx_um", "dy_um"), section.move_um, strict=True))
+        )
+    if section.inset_um:
+        layout = _call(path, place + "inset_um", inset, {"layout": layout, "margin_um": section.inset_um})
+    if section.snap_um is not None:
+        layout = _call(path, place + "snap_um", snap, {"layout": layout, "grid_um": section.snap_um})
+    rules = None if section.rules is None else _built(path, place + "rules", section.rules)
+    return LayoutFile(layout=layout, rules=rules, source=section.source)
+
+
+def _picture_values(path: Path, place: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """A picture's values from 0 to 1, colours averaged, in the place of its name; for a density also where its pixels are."""
+    name = place.rpartition(".")[2]
+    picture = read_picture(_picture_path(path, values[name], place))
+    scale = np.iinfo(picture.dtype).max if picture.dtype.kind == "u" else 1.0
+    n_colours = {2: 1, 4: 3}.get(picture.shape[2], picture.shape[2]) if picture.ndim == 3 else 1
+    grey = picture.reshape(*picture.shape[:2], -1)[::-1, :, :n_colours].mean(axis=2, dtype=np.float64) / scale
+    if name != "density":
+        return {name: grey}
+    if values["size_um"] is None:
+        raise ConfigError(path, f"{place}: needs 'size_um', the rectangle that the picture covers")
+    (width_um, height_um), (n_y, n_x) = values["size_um"], grey.shape
+    if abs(width_um * n_y - height_um * n_x) > SHAPE_ROUNDING * abs(width_um * n_y):
+        raise ConfigError(
+            path, f"{place}: has {n_x} x {n_y} pixels, which do not fit 'size_um' of {width_um:g} x {height_um:g} µm"
+        )
+    grid = _call(path, place, Grid.centred, {"shape": grey.shape, "pitch_um": width_um / n_x})
+    return {name: grey, "density_grid": grid}
+
+
+def _values(path: Path, place: str, section: BaseModel) -> dict[str, Any]:
+    """A section's values as arguments of its call, sections inside it built."""
+    return {
+        name: _built(path, place + name, getattr(section, name))
+        for name in type(section).model_fields
+        if name not in {"kind", "generator"}
+    }
+
+
+def _built(path: Path, place: str, value: Any) -> Any:
+    if isinstance(value, list):
+        return [_built(path, f"{place}[{i}]", item) for i, item in enumerate(value)]
+    if not isinstance(value, BaseModel) or isinstance(value, PerArea):
+        return value
+    return _call(path, place, _callable(value), _values(path, place + ".", value))
+
+
+def _callable(section: BaseModel) -> Callable[..., Any]:
+    call = call_of(section)
+    assert call is not None
+    return call
+
+
+def _call(path: Path, place: str, function: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
+    """Call, with the place in the file put in front of what it raises."""
+    try:
+        return function(**arguments)
+    except ParameterError as error:
+        where = f"{place}.{error.name}" if place else error.name
+        rule = str(error).removeprefix(f"'{error.name}' ")
+        raise ConfigError(path, f"{where}: {rule}") from None
+    except FoveasimError as error:
+        raise ConfigError(path, f"{place}: {error}") from None
+
+
+def _picture_path(path: Path, picture: str, place: str = "scene.picture") -> Path:
+    if not picture.startswith(BUNDLED_PICTURE):
+        return path.parent / picture
+    name = picture.removeprefix(BUNDLED_PICTURE)
+    bundled = {
+        Path(str(f)).stem: Path(str(f)) for f in files("skimage.data").iterdir() if f.name.endswith((".png", ".jpg"))
+    }
+    if name not in bundled:
+        raise ConfigError(path, f"{place}: scikit-image brings no picture '{name}', only {', '.join(sorted(bundled))}")
+    return bundled[name]
+
+
+def _replace(path: Path, data: dict[str, Any], change: str) -> None:
+    """Replace one setting by a "key=value" of the command line."""
+    key, equals, value = change.partition("=")
+    names = key.strip().split(".")
+    if not equals or not all(names):
+        raise ConfigError(path, f"a change must be 'key=value', such as sensor.bits=10, got '{change}'")
+    place: Any = data
+    for i, name in enumerate(names[:-1]):
+        place = place.setdefault(name, {})
+        if not isinstance(place, dict):
+            raise ConfigError(path, f"'{change}' cannot be set: {'.'.join(names[: i + 1])} is no section but {place!r}")
+    new = parsed(path, value)
+    if key.strip() in FILE_SETTINGS and isinstance(new, str) and not new.startswith(BUNDLED_PICTURE):
+        new = str(Path(new).absolute())
+    place[names[-1]] = new

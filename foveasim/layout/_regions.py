@@ -1,0 +1,87 @@
+"""Regions of the sensor plane that users give: rectangles, discs, outlines, shapely polygons."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import shapely
+
+from foveasim.arrays import MAX_LENGTH_UM, as_numbers, check_length_um, finite_array
+from foveasim.errors import ParameterError
+
+__all__ = ["as_region", "disc", "one_region", "told_region"]
+
+#: Corners of a disc that nothing else gives corners to: its area is that of the circle to 7 ppm.
+DISC_CORNERS = 960
+
+
+def one_region(*, size_um: Any = None, radius_um: float | None = None, region: Any = None) -> Any:
+    """
+    The one region that was given, as a shapely Polygon or MultiPolygon in µm.
+
+    Parameters
+    ----------
+    size_um : (width, height), optional, µm
+        Rectangle around the optical axis.
+    radius_um : float, optional, µm
+        Disc around the optical axis.
+    region : shapely polygon or (n, 2) vertices, optional, µm
+
+    Raises
+    ------
+    ParameterError
+        When not exactly one is given, or it is no region.
+    """
+    if sum(x is not None for x in (size_um, radius_um, region)) != 1:
+        raise ParameterError("region", "or 'size_um' or 'radius_um' must be given: one of them")
+    if size_um is not None:
+        if as_numbers("size_um", size_um).shape != (2,):
+            raise ParameterError("size_um", "must be two numbers (width, height)", size_um, "µm")
+        x_um, y_um = (0.5 * check_length_um(f"size_um[{i}]", x) for i, x in enumerate(size_um))
+        return shapely.box(-x_um, -y_um, x_um, y_um)
+    if radius_um is not None:
+        return disc(check_length_um("radius_um", radius_um), DISC_CORNERS)
+    return as_region("region", region)
+
+
+def as_region(name: str, region: Any) -> Any:
+    """
+    A shapely Polygon or MultiPolygon with area, from one, from its well-known text, or from (n, 2) vertices in µm.
+
+    Raises
+    ------
+    ParameterError
+        When it is neither, crosses itself, is empty, or lies too far from the origin.
+    """
+    outline = region
+    if isinstance(region, str):
+        outline = shapely.from_wkt(region, on_invalid="ignore")
+    elif not isinstance(region, shapely.Geometry):
+        vertices = finite_array(name, region, ndim=2)
+        if vertices.shape[1] != 2 or vertices.shape[0] < 3:
+            raise ParameterError(name, f"must have the shape (n, 2) with n >= 3, got {vertices.shape}")
+        outline = shapely.Polygon(vertices)
+    if not isinstance(outline, shapely.Polygon | shapely.MultiPolygon):
+        raise ParameterError(name, f"must be a shapely Polygon or MultiPolygon, got a {type(outline).__name__}")
+    if outline.is_empty or not outline.is_valid or not outline.area > 0.0:
+        raise ParameterError(name, "must be a valid polygon, which does not cross itself and has an area")
+    if np.abs(outline.bounds).max() > MAX_LENGTH_UM:
+        raise ParameterError(name, f"must lie within {MAX_LENGTH_UM:g} µm of the origin", cure="it is in µm")
+    return outline
+
+
+def disc(radius_um: float, n_chords: int) -> shapely.Polygon:
+    """Disc around the axis as a regular polygon with its corners on the circle, the first at angle 0."""
+    angle_rad = 2.0 * math.pi * np.arange(n_chords) / n_chords
+    return shapely.Polygon(radius_um * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1))
+
+
+def told_region(region: Any) -> Any:
+    """A region as a provenance tells it: the vertices that were given, or the well-known text of a geometry."""
+    if isinstance(region, str):
+        return region
+    if isinstance(region, shapely.Geometry):
+        return shapely.to_wkt(region, rounding_precision=-1)
+    return np.asarray(region, dtype=np.float64).tolist()
