@@ -69,7 +69,9 @@ def run(
 
 @app.command()
 def check(
-    layout: Annotated[Path, typer.Argument(help="YAML, GDSII, OASIS, GeoJSON, GeoParquet or npz file.")],
+    layout: Annotated[
+        Path, typer.Argument(help="YAML, GDSII, OASIS, GeoJSON, GeoParquet or npz file, or a shipped layout's name.")
+    ],
     rules: Annotated[
         Path | None, typer.Option("--rules", help="YAML file of rules; by default those in LAYOUT.")
     ] = None,
@@ -92,8 +94,47 @@ def check(
 
 
 @app.command()
+def layouts() -> None:
+    """List the layouts that come with the package; their names stand for their files in every command."""
+    from rich.table import Table
+
+    from foveasim.config import read_layout_file, shipped_layouts
+
+    table = Table(box=None)
+    for heading in ("name", "photosites", "field / µm", "pixel size / µm", "generator"):
+        table.add_column(heading, justify="left" if heading in {"name", "generator"} else "right")
+    with console.status("reading layouts"):
+        for name, path in shipped_layouts().items():
+            found = read_layout_file(path).layout.describe()
+            x0, y0, x1, y1 = found.bounds_um
+            sizes = f"{found.size_um[0]:.3g} to {found.size_um[-1]:.3g}"
+            table.add_row(name, f"{found.n_sites:,}", f"{x1 - x0:.5g} x {y1 - y0:.5g}", sizes, found.origin)
+    console.print(table)
+
+
+@app.command()
+def describe(
+    layout: Annotated[Path, typer.Argument(help="File of a layout, or the name of one that comes with the package.")],
+    frames_per_s: Annotated[float | None, typer.Option("--fps", help="Frames a second, for the data rate.")] = None,
+    bits: Annotated[int, typer.Option("--bits", help="Bits of a site's value.")] = 10,
+    blanking: Annotated[float, typer.Option("--blanking", help="Time without data over time with data.")] = 0.0,
+    lanes: Annotated[int, typer.Option("--lanes", help="Outputs that share the data.")] = 1,
+) -> None:
+    """Tell a layout's counts, areas, fill factor, pixel sizes, channels and data rate."""
+    from foveasim.config import read_any_layout
+    from foveasim.layout import Readout
+
+    readout = None
+    if frames_per_s is not None:
+        readout = Readout(frames_per_s=frames_per_s, bits=bits, blanking=blanking, n_lanes=lanes)
+    console.print(read_any_layout(layout).layout.describe(readout), highlight=False)
+
+
+@app.command()
 def convert(
-    source: Annotated[Path, typer.Argument(help="YAML, GDSII, OASIS, GeoJSON, GeoParquet or npz file.")],
+    source: Annotated[
+        Path, typer.Argument(help="YAML, GDSII, OASIS, GeoJSON, GeoParquet or npz file, or a shipped layout's name.")
+    ],
     target: Annotated[Path, typer.Argument(help="Its ending names the format: .gds .oas .geojson .parquet .npz .svg")],
     layer: Annotated[int | None, typer.Option("--layer", help="Layer of the photosites in a chip file.")] = None,
     dbu_um: Annotated[

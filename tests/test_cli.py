@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 import foveasim as fs
+from foveasim.config import shipped_layouts
 from foveasim.pictures import read_picture
 
 SHOT = """
@@ -230,3 +231,39 @@ def test_only_a_hole_in_the_middle_is_told_as_a_blind_spot(tmp_path, layout, rad
     line = next(row for row in foveasim("run", "shot.yaml", cwd=tmp_path).stdout.splitlines() if "blind-spot" in row)
 
     assert line.split("│")[2].strip() == radius
+
+
+def test_layouts_lists_what_comes_with_the_package(tmp_path):
+    result = foveasim("layouts", cwd=tmp_path)
+
+    assert result.returncode == 0, result.stderr
+    assert all(name in result.stdout for name in shipped_layouts())
+    assert "243,712" in result.stdout
+
+
+def test_describe_tells_counts_sizes_and_the_data_rate_of_a_file_or_a_shipped_layout(tmp_path):
+    fs.layout.zones(side_um=(64, 128), pitch_um=(1, 2)).write(tmp_path / "two.npz")
+    by_file = foveasim("describe", "two.npz", cwd=tmp_path)
+    by_name = foveasim("describe", "four_zones", "--fps", "30", "--bits", "10", "--blanking", "0.2", cwd=tmp_path)
+
+    assert by_file.returncode == by_name.returncode == 0
+    assert all(text in by_file.stdout for text in ("7,168", "100 %", "4,096", "3,072", "zones"))
+    assert all(text in by_name.stdout for text in ("13,312", "100 % of the convex hull", "4.792 Mbit/s", "4 to 32 µm"))
+
+
+def test_describe_refuses_what_cannot_be_in_one_sentence(tmp_path):
+    gone = foveasim("describe", "gone.gds", cwd=tmp_path)
+    bad = foveasim("describe", "four_zones", "--fps", "-1", cwd=tmp_path)
+
+    assert (gone.returncode, bad.returncode) == (2, 2)
+    assert gone.stderr.strip() == "error: gone.gds: no such file"
+    assert bad.stderr.startswith("error: 'frames_per_s' must be > 0, got -1.0")
+
+
+def test_a_shipped_layout_is_checked_and_converted_by_its_name(tmp_path):
+    checked = foveasim("check", "prima_100", cwd=tmp_path)
+    converted = foveasim("convert", "prima_100", "prima.gds", cwd=tmp_path)
+
+    assert checked.returncode == 0, checked.stderr
+    assert converted.returncode == 0, converted.stderr
+    assert fs.layout.read_layout(tmp_path / "prima.gds").n_sites == 378

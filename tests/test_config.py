@@ -281,7 +281,9 @@ def test_a_shipped_layout_keeps_its_rules_names_its_source_and_can_be_drawn(name
     assert read_picture(tmp_path / "layout.png").std() > 5
 
 
-@pytest.mark.parametrize(("name", "fill"), [("prima_100", 0.7225), ("prima_75", 0.8711), ("quad_bayer", (0.6 / 0.7) ** 2)])
+@pytest.mark.parametrize(
+    ("name", "fill"), [("prima_100", 0.7225), ("prima_75", 0.8711), ("quad_bayer", (0.6 / 0.7) ** 2)]
+)
 def test_shipped_arrays_have_the_published_fill_factors(name, fill):
     file = read_any_layout(name)
     pitch_um = float(np.hypot(*np.diff(file.layout.centroid_um[:2], axis=0).T)[0])

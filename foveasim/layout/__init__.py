@@ -18,7 +18,9 @@ from foveasim.layout.octagonal import octagonal
 from foveasim.layout.penrose import penrose
 from foveasim.layout.quadtree import quadtree
 from foveasim.layout.readout import nearest_bus, readout_by, readout_order
+from foveasim.layout.routing import Readout, Routing, crossings
 from foveasim.layout.rules import DesignRules, Report, RuleResult, Violation, min_width_um
+from foveasim.layout.summary import Summary, describe
 from foveasim.layout.sunflower import sunflower
 from foveasim.layout.tiling import fill, tiling
 from foveasim.layout.voronoi import voronoi
@@ -29,13 +31,18 @@ __all__ = [
     "Change",
     "DesignRules",
     "Layout",
+    "Readout",
     "Report",
+    "Routing",
     "RuleResult",
+    "Summary",
     "Violation",
     "WrittenLayout",
     "adjacency",
     "clip",
     "colouring",
+    "crossings",
+    "describe",
     "enforce",
     "fill",
     "foveal_cartesian",

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 
     from foveasim.layout.enforce import Change
     from foveasim.layout.files import WrittenLayout
+    from foveasim.layout.routing import Readout
     from foveasim.layout.rules import DesignRules, Report
+    from foveasim.layout.summary import Summary
 
 __all__ = ["Layout"]
 
@@ -325,8 +327,8 @@ class Layout:
     # -- changing: every verb gives a new layout ----------------------------------------------------------------
 
     def __getitem__(self, selection: Any) -> Layout:
-        """Layout of the selected sites: a boolean mask, a slice, or an array of site numbers."""
-        ids = np.atleast_1d(np.arange(self.n_sites)[selection])
+        """Layout of the selected sites: a mask, a slice, site numbers, or a function of the layout that gives one of these."""
+        ids = np.atleast_1d(np.arange(self.n_sites)[selection(self) if callable(selection) else selection])
         if ids.ndim != 1:
             raise ParameterError("selection", f"must be a mask, a slice or a list of sites, got {ids.ndim} dimensions")
         rings = _ranges(self.site_offsets[ids], self.site_offsets[ids + 1])
@@ -337,6 +339,50 @@ class Layout:
             np.concatenate(([0], np.cumsum(np.diff(self.site_offsets)[ids]))),
             {name: column[ids] for name, column in self.columns.items()},
             self._then(f"selected {ids.size} of {self.n_sites} sites"),
+        )
+
+    def sort_by(self, *keys: str | ArrayLike, descending: bool = False) -> Layout:
+        """
+        Layout with its sites in the order of one or more keys, the first the most important; equal sites keep their order.
+
+        Parameters
+        ----------
+        *keys : str or (n_site,) array
+            Names of columns, or values.
+        descending : bool
+            The largest first.
+
+        Raises
+        ------
+        ParameterError
+            When there is no key, or one is no column or has not one value a site.
+
+        Examples
+        --------
+        >>> layout = Layout.from_rectangles([[0, 0], [5, 0]], [3.0, 1.0])
+        >>> layout.sort_by(layout.area_um2).area_um2.tolist()
+        [1.0, 9.0]
+        """
+        values = []
+        for key in keys:
+            if isinstance(key, str) and key not in self.columns:
+                raise ParameterError(
+                    "keys", f"must be values or columns of the layout, which has {sorted(self.columns)}", key
+                )
+            value = self.columns[key] if isinstance(key, str) else np.asarray(key)
+            if value.shape != (self.n_sites,):
+                raise ParameterError(
+                    "keys", f"must have one value for each of the {self.n_sites} sites, got {value.shape}"
+                )
+            # Ranks, so that texts can be turned round as numbers can.
+            rank = np.unique(value, return_inverse=True)[1]
+            values.append(-rank if descending else rank)
+        if not values:
+            raise ParameterError("keys", "must be one or more columns or arrays")
+        names = ", ".join(key if isinstance(key, str) else "values" for key in keys)
+        ordered = self[np.lexsort(values[::-1])]
+        return Layout(
+            ordered.xy_um, ordered.ring_offsets, ordered.site_offsets, ordered.columns, self._then(f"sorted by {names}")
         )
 
     def with_columns(self, **columns: ArrayLike) -> Layout:
@@ -380,6 +426,12 @@ class Layout:
         from foveasim.layout.files import write_layout
 
         return write_layout(self, path, **options)
+
+    def describe(self, readout: Readout | None = None) -> Summary:
+        """Counts, sizes, areas, channels and lines, for a table; see :func:`foveasim.layout.describe`."""
+        from foveasim.layout.summary import describe
+
+        return describe(self, readout)
 
     # -- neighbours ----------------------------------------------------------------------------------------------
 

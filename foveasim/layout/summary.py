@@ -1,0 +1,173 @@
+"""What a layout is, in a dozen numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+
+from foveasim.arrays import Floats, Ints
+from foveasim.errors import ParameterError
+from foveasim.layout._model import Layout
+from foveasim.layout.routing import Readout
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+__all__ = ["Summary", "describe"]
+
+#: Classes of size in a histogram, at most.
+SIZE_CLASSES = 12
+#: Sizes that differ by less than this share are one class.
+SIZE_ROUNDING = 1e-6
+#: Characters of the longest bar of a histogram.
+BAR_WIDTH = 40
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Summary:
+    """
+    A layout in numbers.
+
+    Attributes
+    ----------
+    n_sites, n_vertices : int
+    bounds_um : (x_min, y_min, x_max, y_max), µm
+    area_um2 : float, µm²
+        Of all sites together.
+    fill_factor : float
+        That area as a share of the layout's convex hull.
+    size_um : (5,) float64, µm
+        Smallest, lower quartile, median, upper quartile and largest pixel size, the square root of a site's area.
+    size_edges_um, size_counts : (n_class + 1,) float64 µm and (n_class,) int64
+        Histogram of the sizes, classes of equal ratios.
+    channels : mapping of int to int
+        Sites of each colour filter.
+    n_lines : int
+        Readout lines.
+    readout : Readout or None
+    origin : str
+        The generator, or how the layout was made.
+    """
+
+    n_sites: int
+    n_vertices: int
+    bounds_um: tuple[float, float, float, float]
+    area_um2: float
+    fill_factor: float
+    size_um: Floats
+    size_edges_um: Floats
+    size_counts: Ints
+    channels: Mapping[int, int]
+    n_lines: int
+    readout: Readout | None
+    origin: str
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Names and values as text, in the order of the table."""
+        x0, y0, x1, y1 = self.bounds_um
+        low, lower, middle, upper, high = self.size_um
+        rows = [
+            ("origin", self.origin),
+            ("photosites", f"{self.n_sites:,}"),
+            ("vertices", f"{self.n_vertices:,}"),
+            ("field", f"{x1 - x0:.6g} x {y1 - y0:.6g} µm, from ({x0:.6g}, {y0:.6g}) to ({x1:.6g}, {y1:.6g})"),
+            ("area", f"{self.area_um2:,.6g} µm²"),
+            ("fill factor", f"{100.0 * self.fill_factor:.4g} % of the convex hull"),
+            ("pixel size", f"{low:.4g} to {high:.4g} µm, median {middle:.4g}, half of them {lower:.4g} to {upper:.4g}"),
+            ("channels", ", ".join(f"{channel}: {n:,}" for channel, n in self.channels.items())),
+            ("readout lines", f"{self.n_lines:,}"),
+        ]
+        if self.readout is not None:
+            r = self.readout
+            lanes = f" on each of {r.n_lanes} lanes" if r.n_lanes > 1 else ""
+            terms = f"{r.frames_per_s:g} frames/s, {r.bits} bits, {100.0 * r.blanking:g} % blanking"
+            rate = r.gbit_per_s(self.n_sites)
+            shown = f"{rate:.4g} Gbit/s" if rate >= 1.0 else f"{1e3 * rate:.4g} Mbit/s"
+            rows.append(("data rate", f"{shown}{lanes} ({terms})"))
+        return rows
+
+    def records(self) -> list[dict[str, Any]]:
+        """One dict a class of the size histogram: its limits in µm and the number of sites."""
+        edges = self.size_edges_um.tolist()
+        return [
+            {"from_um": low, "to_um": high, "n_sites": int(n)}
+            for low, high, n in zip(edges[:-1], edges[1:], self.size_counts, strict=True)
+        ]
+
+    def __str__(self) -> str:
+        return "\n".join(f"{name}: {value}" for name, value in self.rows())
+
+    def __rich__(self) -> RenderableType:
+        from rich.console import Group
+        from rich.table import Table
+
+        facts = Table(show_header=False, box=None)
+        for name, value in self.rows():
+            facts.add_row(name, value)
+        sizes = Table(title="Pixel sizes", title_justify="left", box=None)
+        for heading in ("from µm", "to µm", "sites"):
+            sizes.add_column(heading, justify="right")
+        sizes.add_column("")
+        most = max((int(n) for n in self.size_counts), default=0)
+        for row in self.records():
+            bar = "█" * max(int(row["n_sites"] > 0), round(BAR_WIDTH * row["n_sites"] / max(most, 1)))
+            sizes.add_row(f"{row['from_um']:.4g}", f"{row['to_um']:.4g}", f"{row['n_sites']:,}", bar)
+        return Group(facts, sizes)
+
+
+def describe(layout: Layout, readout: Readout | None = None) -> Summary:
+    """
+    Counts, sizes, areas, channels and lines of a layout.
+
+    Parameters
+    ----------
+    layout : Layout
+    readout : Readout, optional
+        For the data rate.
+
+    Returns
+    -------
+    Summary
+        Prints as a table with a histogram in rich's console.
+
+    Raises
+    ------
+    GeometryError
+        When the layout has no sites.
+    ParameterError
+        When the readout is no Readout.
+    """
+    if readout is not None and not isinstance(readout, Readout):
+        raise ParameterError("readout", "must be a Readout", readout)
+    bounds_um = layout.bounds_um
+    hull_um2 = float(shapely.MultiPoint(layout.xy_um).convex_hull.area)
+    size_um = np.sqrt(layout.area_um2)
+    edges_um = _classes_um(float(size_um.min()), float(size_um.max()))
+    channel, counts = np.unique(layout.channel, return_counts=True)
+    return Summary(
+        n_sites=layout.n_sites,
+        n_vertices=len(layout.xy_um),
+        bounds_um=bounds_um,
+        area_um2=float(layout.area_um2.sum()),
+        fill_factor=float(layout.area_um2.sum()) / hull_um2,
+        size_um=np.quantile(size_um, [0.0, 0.25, 0.5, 0.75, 1.0]),
+        size_edges_um=edges_um,
+        size_counts=np.histogram(size_um, edges_um)[0],
+        channels={int(c): int(n) for c, n in zip(channel, counts, strict=True)},
+        n_lines=int(np.unique(layout.readout_line).size),
+        readout=readout,
+        origin=str(layout.provenance.get("generator", layout.provenance.get("made_by", "packed rings"))),
+    )
+
+
+def _classes_um(low_um: float, high_um: float) -> Floats:
+    """Limits of classes of equal ratios that hold all sizes; one class where all are equal."""
+    if high_um <= low_um * (1.0 + SIZE_ROUNDING):
+        return np.array([low_um * (1.0 - SIZE_ROUNDING), high_um * (1.0 + SIZE_ROUNDING)])
+    edges_um = np.geomspace(low_um, high_um, SIZE_CLASSES + 1)
+    edges_um[0], edges_um[-1] = low_um, high_um
+    return np.asarray(edges_um)
