@@ -1,0 +1,91 @@
+"""
+Which layouts can be made, and what does the middle of a foveal one look like?
+
+New here: every generator of ``foveasim.layout``, the fillings of a fovea, ``colouring``, ``plot_layout``.
+
+Expect: fifteen layouts, none with two sites over each other; four foveas that differ in the middle alone: 1,740 sites around a
+blind spot, and 169, 144 and 235 sites in it, none below the minimum size of 2 µm.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import foveasim as fs
+from foveasim.view import plot_layout, save_figure
+
+MIN_SIZE_UM = 2.0
+FOVEA = {"n_sectors": 60, "min_size_um": MIN_SIZE_UM, "r_max_um": 380.0, "stagger": True, "chords_per_arc": 2}
+
+
+def foveal_density(xy_um: np.ndarray) -> np.ndarray:
+    """Sites per area that fall off from the axis."""
+    return 1.0 / (1.0 + (xy_um**2).sum(axis=1) / 100.0)
+
+
+def families() -> dict[str, fs.Layout]:
+    """One small layout of each family."""
+    make = fs.layout
+    r, c = np.mgrid[-32:32, -32:32] + 0.5
+    return {
+        "grid, staggered": make.grid(n_x=14, n_y=14, pitch_um=2.0, trench_um=0.3, stagger=True),
+        "hexagonal": make.hexagonal(n_columns=14, n_rows=16, pitch_um=2.0),
+        "octagonal": make.octagonal(n_x=12, n_y=12, pitch_um=2.0),
+        "tiling of a disc": make.tiling(pitch_um=2.0, radius_um=14.0),
+        "zones": make.zones(side_um=(8, 16, 32), pitch_um=(1, 2, 4)),
+        "zones of hexagons": make.zones(side_um=(9, 19, 36), pitch_um=(1, 2, 4), cells="hexagons"),
+        "foveal Cartesian": make.foveal_cartesian(n_rings=12, pitch_um=1.0, n_fovea=4, ring_ratio=1.2),
+        "quadtree": make.quadtree(np.exp(-np.hypot(r, c) / 6), pitch_um=0.5, limit=1.0, n_levels=4),
+        "log-polar": make.log_polar(n_sectors=36, min_size_um=1.0, r_max_um=18.0, fovea="hexagons"),
+        "Giotto": make.giotto(n_rho=16, n_theta=36, n_fovea=6, n_across=60, unit_um=0.6),
+        "FOVI": make.fovi(fov_um=36.0, a_um=3.0, n_rings=12),
+        "sunflower": make.sunflower(n_sites=300, spacing_um=1.6),
+        "Voronoi, foveal density": make.voronoi(n_sites=300, size_um=(32.0, 32.0), density=foveal_density),
+        "dual pixels": make.split(make.grid(n_x=10, n_y=10, pitch_um=3.0)),
+        "Penrose": make.penrose(side_um=2.0, size_um=30.0),
+    }
+
+
+def main(out_dir: Path) -> None:
+    """Write the sheet of families and the foveas to a folder."""
+    # %% One of each, coloured so that neighbours differ.
+    layouts = families()
+    figure = Figure(figsize=(18, 11), layout="constrained")
+    colours = np.array([(0.55, 0.7, 0.86), (0.98, 0.85, 0.55), (0.75, 0.85, 0.65), (0.9, 0.65, 0.6)])
+    for position, (name, layout) in enumerate(layouts.items(), start=1):
+        axes = figure.add_subplot(3, 5, position)
+        plot_layout(layout, colours=colours[fs.layout.colouring(layout, 4).channel], ax=axes)
+        axes.set_title(f"{name}: {layout.n_sites} sites")
+    save_figure(figure, out_dir / "04_families.png", dpi=80)
+
+    # %% What may be done with the blind spot.
+    foveas = {
+        filling: fs.layout.log_polar(**FOVEA, fovea=filling) for filling in ("none", "rings", "linear", "hexagons")
+    }
+    figure = Figure(figsize=(16, 4.4), layout="constrained")
+    for position, (name, layout) in enumerate(foveas.items(), start=1):
+        axes = figure.add_subplot(1, 4, position)
+        plot_layout(layout, ax=axes)
+        axes.set_xlim(-45, 45)
+        axes.set_ylim(-45, 45)
+        axes.set_title(f"fovea={name!r}: {layout.n_sites} sites")
+    save_figure(figure, out_dir / "04_foveas.png", dpi=80)
+
+    # %% The numbers.
+    no_overlap = fs.DesignRules(max_overlap_um2=0.0)
+    for name, layout in (layouts | foveas).items():
+        assert layout.check(no_overlap).ok, name
+    n_around = foveas["none"].n_sites
+    for name, layout in foveas.items():
+        size_um = np.sqrt(layout.area_um2[: layout.n_sites - n_around])
+        print(f"{name:>9}: {size_um.size:4d} sites in the middle, {n_around:,} around it")
+        assert np.all(size_um >= MIN_SIZE_UM)
+    assert [layout.n_sites - n_around for layout in foveas.values()] == [0, 169, 144, 235]
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "."))
