@@ -4,7 +4,7 @@ What the hot paths cost, as ratios to a limit of the machine or to a peer, all m
 Single times on shared machines mean little; each figure is the best of several runs, taken in turns with what it is
 compared with. A ratio that misses its bound is marked; the program then ends with exit code 1.
 
-    python benchmarks/run.py            everything, about two minutes
+    python benchmarks/run.py            everything, about five minutes
     python benchmarks/run.py --quick    the same on a picture of a sixteenth of the pixels (bounds are not judged)
 """
 
@@ -14,74 +14,23 @@ import argparse
 import json
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import scipy.fft
 import shapely
+from report import Report, best_s
 from rich.console import Console
-from rich.table import Table
 
 import foveasim as fs
 from foveasim.parallel import thread_count
+from layouts import bench_layouts
 
 #: The largest picture of the paper.
 FULL_SHAPE = (4640, 8256)
 N_SECTORS, N_RINGS = 240, 126
 console = Console(width=130)
-
-
-def best_s(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """Least seconds of each call, called in turns, so that a slow spell of the machine hits all of them."""
-    seconds = dict.fromkeys(calls, float("inf"))
-    for _ in range(repeats):
-        for name, call in calls.items():
-            start = time.perf_counter()
-            call()
-            seconds[name] = min(seconds[name], time.perf_counter() - start)
-    return seconds
-
-
-class Report:
-    """The table of ratios, and how many of them miss their bounds."""
-
-    def __init__(self, *, is_judged: bool) -> None:
-        self.table = Table(title="Ratios, each within one run")
-        for heading in ("what", "time", "against", "its time", "ratio", "bound", ""):
-            self.table.add_column(heading, justify="left" if heading in {"what", "against", ""} else "right")
-        self.is_judged = is_judged
-        self.missed = 0
-
-    def slower_than(self, what: str, s: float, against: str, s_against: float, at_most: float | None = None) -> None:
-        """Add how many times as long as a limit something takes."""
-        self.add(what, f"{s:.4g} s", against, f"{s_against:.4g} s", s / s_against, at_most)
-
-    def faster_than(self, what: str, s: float, against: str, s_against: float, at_least: float | None = None) -> None:
-        """Add how many times as fast as a peer something is."""
-        self.add(what, f"{s:.4g} s", against, f"{s_against:.4g} s", s_against / s, at_least, is_lower_bound=True)
-
-    def add(
-        self,
-        what: str,
-        took: str,
-        against: str,
-        other_took: str,
-        figure: float,
-        bound: float | None,
-        *,
-        is_lower_bound: bool = False,
-    ) -> None:
-        """Add a figure, and whether it keeps its bound."""
-        sign = "≥" if is_lower_bound else "≤"
-        verdict = ""
-        if bound is not None and self.is_judged:
-            is_kept = figure >= bound if is_lower_bound else figure <= bound
-            self.missed += not is_kept
-            verdict = "[green]kept[/green]" if is_kept else "[red]missed[/red]"
-        shown = "" if bound is None else f"{sign} {bound:g}"
-        self.table.add_row(what, took, against, other_took, f"{figure:.3g}", shown, verdict)
 
 
 def paper_scene(shape: tuple[int, int], spectrum: np.ndarray, wavelength_nm: np.ndarray) -> fs.Scene:
@@ -251,6 +200,8 @@ def main() -> int:
     for bench in (bench_integrator, bench_optics, bench_wavelengths, bench_memory):
         with console.status(bench.__name__.replace("_", " ")):
             bench(report, shape)
+    with console.status("bench layouts"):
+        bench_layouts(report, 10_000 if is_quick else 1_000_000)
     bench_import(report)
     console.print(report.table)
     return 1 if report.missed else 0

@@ -73,7 +73,11 @@ def check(
         Path, typer.Argument(help="YAML, GDSII, OASIS, GeoJSON, GeoParquet or npz file, or a shipped layout's name.")
     ],
     rules: Annotated[
-        Path | None, typer.Option("--rules", help="YAML file of rules; by default those in LAYOUT.")
+        Path | None,
+        typer.Option(
+            "--rules",
+            help="YAML file of rules, or a preset's name such as sky130_met1; by default the rules in LAYOUT.",
+        ),
     ] = None,
     lyrdb: Annotated[Path | None, typer.Option("--lyrdb", help="Write the violations for KLayout.")] = None,
 ) -> None:

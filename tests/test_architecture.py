@@ -38,8 +38,8 @@ HEAVY = {
 }  # fmt: skip
 #: Names of numbers without a unit, or with the unit of what they are measured with.
 DIMENSIONLESS = {
-    "above", "at_least", "at_most", "colours", "dpi", "f_number", "factor", "figure_inches", "fill_factor", "limit", "max_aspect_ratio",
-    "max_growth", "max_neighbour_ratio", "min_growth", "peak", "per_vertex", "qe", "ratio", "rounding",
+    "above", "at_least", "at_most", "blanking", "colours", "dpi", "f_number", "factor", "figure_inches", "fill_factor", "limit", "max_aspect_ratio",
+    "max_density", "max_growth", "max_neighbour_ratio", "max_track_use", "min_density", "min_growth", "peak", "per_vertex", "qe", "ratio", "rounding",
     "ring_ratio", "spectrum", "transmission", "value", "values", "weight", "weights", "white", "worst_area_error",
 }  # fmt: skip
 #: Names of parts that no user sees, in cells, pitches or steps as their docstrings say.

@@ -59,7 +59,7 @@ def test_one_site_that_meets_several_goes_alone():
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
-@given(seed=st.integers(0, 10_000), repair=st.sampled_from(["drop", "merge"]))
+@given(seed=st.integers(0, 10_000), repair=st.sampled_from(["drop", "merge", "refill"]))
 def test_any_layout_keeps_the_rules_afterwards_and_nothing_else_changed(seed, repair):
     rng = np.random.default_rng(seed)
     layout = fs.Layout.from_rectangles(rng.uniform(0, 15, (30, 2)), rng.uniform(0.3, 2.5, (30, 2)))
@@ -70,6 +70,32 @@ def test_any_layout_keeps_the_rules_afterwards_and_nothing_else_changed(seed, re
     assert legal.check(rules).ok
     kept = {polygon.normalize() for polygon in legal.polygons()}
     assert {polygon.normalize() for polygon in layout.polygons()[untouched]} <= kept
+
+
+def test_refilling_leaves_no_blind_spot_and_no_site_below_the_smallest_size():
+    rules = fs.DesignRules(min_size_um=1.0, max_overlap_um2=0.0, max_gap_um2=0.0)
+    legal, changes = RINGS.enforce(rules, repair="refill")
+    n_kept = int((np.sqrt(RINGS.area_um2) >= 1.0).sum())
+    new = legal[n_kept:]
+
+    assert legal.check(rules).ok
+    assert [(change.rule, change.action) for change in changes] == [("min_size_um", "replaced")]
+    assert changed(changes) == set(np.flatnonzero(np.sqrt(RINGS.area_um2) < 1.0))
+    assert legal.area_um2.sum() == pytest.approx(shapely.Polygon(shapely.union_all(RINGS.polygons()).exterior).area)
+    assert np.median(new.area_um2) == pytest.approx(1.0, rel=1e-6)
+    assert set(legal.columns) == set(RINGS.columns)
+    assert new.columns["ring"].max() < legal.columns["ring"][:n_kept].min()
+    assert legal.provenance["generator"] == "log_polar"
+
+
+def test_refilling_keeps_a_smallest_width_too():
+    rules = fs.DesignRules(min_size_um=1.0, min_width_um=0.9, max_overlap_um2=0.0)
+    legal, changes = RINGS.enforce(rules, repair="refill")
+
+    assert legal.check(rules).ok
+    assert {change.action for change in changes} == {"replaced"}
+    hole_um2 = shapely.Polygon(shapely.union_all(RINGS.polygons()).exterior).area - legal.area_um2.sum()
+    assert 0.0 <= hole_um2 < 0.02 * legal.area_um2.sum()
 
 
 def test_waived_rules_are_left_broken():
@@ -90,7 +116,7 @@ def test_what_no_dropping_mends_is_told():
 
 
 def test_an_unknown_repair_is_refused():
-    with pytest.raises(ParameterError, match="'repair' must be one of 'drop', 'merge', got 'shrink'"):
+    with pytest.raises(ParameterError, match="'repair' must be one of 'drop', 'merge', 'refill', got 'shrink'"):
         RINGS.enforce(fs.DesignRules(), repair="shrink")
 
 

@@ -669,3 +669,26 @@ def test_a_mosaic_refuses_rows_that_are_no_numbers_of_rows(row):
 
     with pytest.raises(ParameterError, match="'row' must hold whole numbers"):
         mosaic(layout, ("RG", "GB"))
+
+
+def test_hexagons_need_13_4_percent_fewer_samples_than_squares_for_a_circular_band():
+    """The replicas of a circular band of radius W, at the points of the reciprocal lattice, may not overlap."""
+    band_per_um = 0.25
+
+    def nearest_replica_per_um(layout):
+        """Shortest vector of the reciprocal lattice of the sites' centres."""
+        centre_um = layout.centroid_um
+        offsets = centre_um[1:] - centre_um[0]
+        order = np.argsort(np.hypot(*offsets.T), kind="stable")
+        first = offsets[order[0]]
+        second = next(v for v in offsets[order] if abs(first[0] * v[1] - first[1] * v[0]) > 1e-6)
+        reciprocal = np.linalg.inv(np.stack((first, second))).T
+        k = np.stack(np.meshgrid(np.arange(-3, 4), np.arange(-3, 4)), axis=-1).reshape(-1, 2)
+        return np.hypot(*(k[(k != 0).any(axis=1)] @ reciprocal).T).min()
+
+    squares = grid(n_x=6, n_y=6, pitch_um=1 / (2 * band_per_um))
+    hexagons = hexagonal(n_columns=6, n_rows=6, pitch_um=1 / (2 * band_per_um) * 2 / math.sqrt(3))
+
+    assert nearest_replica_per_um(squares) == pytest.approx(2 * band_per_um)
+    assert nearest_replica_per_um(hexagons) == pytest.approx(2 * band_per_um)
+    assert 1 - squares.area_um2[0] / hexagons.area_um2[0] == pytest.approx(0.134, abs=5e-4)

@@ -134,7 +134,13 @@ _SensorSection = _model(
     read_noise_e=_PerSite,
     capacitance_f=_PerSite,
 )
-RulesSection = _model("design rules", DesignRules)
+RulesSection = _model(
+    "design rules",
+    DesignRules,
+    preset=str | None,
+    readout=_model("readout", layouts.Readout) | None,
+    routing=_model("routing", layouts.Routing) | None,
+)
 
 
 class _LayoutSection(_Section):

@@ -19,7 +19,7 @@ from foveasim.config._problems import validated
 from foveasim.config._yaml import parsed, read_yaml
 from foveasim.errors import ConfigError, FoveasimError, ParameterError
 from foveasim.fields import Grid
-from foveasim.layout import DesignRules, Layout, inset, mosaic, read_layout, snap
+from foveasim.layout import PRESETS, DesignRules, Layout, inset, mosaic, read_layout, snap
 from foveasim.optics import Optics
 from foveasim.pictures import read_picture
 from foveasim.scene import Scene
@@ -190,7 +190,7 @@ def shipped_layouts() -> dict[str, Path]:
 
 def read_rules(path: str | Path) -> DesignRules:
     """
-    Read a YAML file of design rules: limits by their names, and waivers.
+    Read a YAML file of design rules (limits by their names, and waivers), or take a preset by its name.
 
     Raises
     ------
@@ -198,6 +198,8 @@ def read_rules(path: str | Path) -> DesignRules:
         With the file, the place in it, what was expected and got.
     """
     path = Path(path)
+    if str(path) in PRESETS and not path.exists():
+        return DesignRules(preset=str(path))
     rules: DesignRules = _built(path, "", validated(path, RulesSection, read_yaml(path)))
     return rules
 

@@ -16,6 +16,7 @@ from foveasim.layout.hexagonal import hexagonal
 from foveasim.layout.log_polar import log_polar, square_ring_ratio
 from foveasim.layout.octagonal import octagonal
 from foveasim.layout.penrose import penrose
+from foveasim.layout.presets import PRESETS, Preset
 from foveasim.layout.quadtree import quadtree
 from foveasim.layout.readout import nearest_bus, readout_by, readout_order
 from foveasim.layout.routing import Readout, Routing, crossings
@@ -28,9 +29,11 @@ from foveasim.layout.zones import zones
 
 __all__ = [
     "MOSAICS",
+    "PRESETS",
     "Change",
     "DesignRules",
     "Layout",
+    "Preset",
     "Readout",
     "Report",
     "Routing",

@@ -1,4 +1,4 @@
-"""The layout room's numba kernels: widths of photosites, lengths of the edges that they share, colours of neighbours."""
+"""The layout room's numba kernels: widths and shapes of photosites, how they meet their neighbours, colours of neighbours."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from heapq import heappop, heappush
 import numpy as np
 from numba import njit, types
 
-__all__ = ["colour_greedily", "min_widths", "shared_lengths"]
+__all__ = ["aspect_ratios", "colour_greedily", "contacts", "meeting_boxes", "min_widths", "overhangs", "shared_lengths"]
 
 _ints = types.Array(types.int64, 1, "C", readonly=True)
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 _points = types.Array(types.float64, 2, "C", readonly=True)
+_flags = types.Array(types.boolean, 1, "C")
 
 #: Edges face each other across the site when they run opposite ways within 26 degrees. At 45 degrees, say, the corners of
 #: octagons and the near-right corners between a chord and a side would be measured as widths; this cosine is that of no
@@ -97,6 +98,307 @@ def min_widths(xy, after, before, ring_offsets, site_offsets):
             smallest = min(smallest, _across_from_inward_corner(xy, before[b], b, after, first, last))
         widths[site] = smallest
     return widths
+
+
+#: Rectangles whose areas differ by less than this share are equally small.
+EQUAL_AREAS = 1e-9
+
+
+@njit(cache=True, nogil=True)
+def _next_hull_corner(xy, corner, first, last):
+    """The vertex that no other one lies on the right of, seen from a corner of the hull; of several the furthest."""
+    best = -1
+    for k in range(first, last):
+        kx, ky = xy[k, 0] - xy[corner, 0], xy[k, 1] - xy[corner, 1]
+        if kx == 0.0 and ky == 0.0:
+            continue
+        if best >= 0:
+            bx, by = xy[best, 0] - xy[corner, 0], xy[best, 1] - xy[corner, 1]
+            turn = bx * ky - by * kx
+            if turn > 0.0 or (turn == 0.0 and kx * kx + ky * ky <= bx * bx + by * by):
+                continue
+        best = k
+    return best
+
+
+@njit(types.float64[::1](_points, _ints, _ints), cache=True, nogil=True)
+def aspect_ratios(xy, ring_offsets, site_offsets):
+    """
+    Longer over shorter side of the smallest rectangle around every site; of equally small ones the least elongated.
+
+    The smallest rectangle has a side along an edge of the convex hull. O(vertices times corners of the hull) a site.
+    """
+    n_sites = site_offsets.size - 1
+    ratios = np.empty(n_sites)
+    for site in range(n_sites):
+        first, last = ring_offsets[site_offsets[site]], ring_offsets[site_offsets[site] + 1]
+        start = first
+        for k in range(first, last):
+            if xy[k, 0] < xy[start, 0] or (xy[k, 0] == xy[start, 0] and xy[k, 1] < xy[start, 1]):
+                start = k
+        smallest, ratio = np.inf, np.inf
+        corner = start
+        for _ in range(first, last):
+            beyond = _next_hull_corner(xy, corner, first, last)
+            ex, ey = xy[beyond, 0] - xy[corner, 0], xy[beyond, 1] - xy[corner, 1]
+            length = np.hypot(ex, ey)
+            ex, ey = ex / length, ey / length
+            low, high, depth = 0.0, 0.0, 0.0
+            for k in range(first, last):
+                kx, ky = xy[k, 0] - xy[corner, 0], xy[k, 1] - xy[corner, 1]
+                along = ex * kx + ey * ky
+                low, high, depth = min(low, along), max(high, along), max(depth, ex * ky - ey * kx)
+            area = (high - low) * depth
+            shape = max(high - low, depth) / min(high - low, depth)
+            if area < (1.0 - EQUAL_AREAS) * smallest or (area < (1.0 + EQUAL_AREAS) * smallest and shape < ratio):
+                smallest, ratio = min(area, smallest), shape
+            corner = beyond
+            if corner == start:
+                break
+        ratios[site] = ratio
+    return ratios
+
+
+@njit(types.int64[::1](_points, _ints), cache=True, nogil=True)
+def meeting_boxes(box, order):
+    """
+    Pairs (i, j), i < j, of boxes (x_min, y_min, x_max, y_max) that meet, as i n + j; ``order`` is that of x_min.
+
+    Boxes are listed in every strip that they reach, the strips being about as high as the mean box, and swept from left to
+    right; a pair counts in its lowest strip.
+    """
+    n = box.shape[0]
+    bottom, top, mean = np.inf, -np.inf, 0.0
+    for i in range(n):
+        bottom, top, mean = min(bottom, box[i, 1]), max(top, box[i, 3]), mean + (box[i, 3] - box[i, 1]) / n
+    n_strips = max(min(n, int((top - bottom) / mean)), 1) if mean > 0.0 else 1
+    per_height = n_strips / (top - bottom) if mean > 0.0 else 0.0
+    lowest, highest = np.empty(n, np.int64), np.empty(n, np.int64)
+    start = np.zeros(n_strips + 2, np.int64)
+    for i in range(n):
+        lowest[i] = min(int((box[i, 1] - bottom) * per_height), n_strips - 1)
+        highest[i] = min(int((box[i, 3] - bottom) * per_height), n_strips - 1)
+        for strip in range(lowest[i], highest[i] + 1):
+            start[strip + 2] += 1
+    for strip in range(n_strips):
+        start[strip + 2] += start[strip + 1]
+    listed = np.empty(start[n_strips + 1], np.int64)
+    for i in order:
+        for strip in range(lowest[i], highest[i] + 1):
+            listed[start[strip + 1]] = i
+            start[strip + 1] += 1
+    pairs = np.empty(0, np.int64)
+    for is_filling in range(2):
+        found = 0
+        for strip in range(n_strips):
+            for p in range(start[strip], start[strip + 1]):
+                i = listed[p]
+                for q in range(p + 1, start[strip + 1]):
+                    j = listed[q]
+                    if box[j, 0] > box[i, 2]:
+                        break
+                    if box[j, 1] <= box[i, 3] and box[i, 1] <= box[j, 3] and max(lowest[i], lowest[j]) == strip:
+                        if is_filling:
+                            pairs[found] = min(i, j) * n + max(i, j)
+                        found += 1
+        if not is_filling:
+            pairs = np.empty(found, np.int64)
+    return pairs
+
+
+@njit(types.float64[::1](_points, _ints, _ints), cache=True, nogil=True)
+def overhangs(xy, after, first_vertex):
+    """How far every edge's site reaches out beyond the edge's line, to its right; 0 all around a convex site."""
+    reach = np.zeros(xy.shape[0])
+    for site in range(first_vertex.size - 1):
+        first, last = first_vertex[site], first_vertex[site + 1]
+        for a in range(first, last):
+            ex, ey = xy[after[a], 0] - xy[a, 0], xy[after[a], 1] - xy[a, 1]
+            furthest = 0.0
+            for k in range(first, last):
+                furthest = max(furthest, ey * (xy[k, 0] - xy[a, 0]) - ex * (xy[k, 1] - xy[a, 1]))
+            if furthest > 0.0:
+                reach[a] = furthest / np.hypot(ex, ey)
+    return reach
+
+
+@njit(cache=True, nogil=True)
+def _is_same(xy, a, c):
+    """Whether two vertices coincide, bit for bit."""
+    return xy[a, 0] == xy[c, 0] and xy[a, 1] == xy[c, 1]
+
+
+@njit(cache=True, nogil=True)
+def _edge_to_edge(xy, a, b, c, d):
+    """Distance of the segments from a to b and from c to d; 0 where they cross."""
+    ax, ay, bx, by = xy[a, 0], xy[a, 1], xy[b, 0], xy[b, 1]
+    cx, cy, dx, dy = xy[c, 0], xy[c, 1], xy[d, 0], xy[d, 1]
+    ex, ey, fx, fy = bx - ax, by - ay, dx - cx, dy - cy
+    # Ends on both sides of each other; where all four are in line to rounding, only boxes that meet tell.
+    if (
+        (ex * (cy - ay) - ey * (cx - ax)) * (ex * (dy - ay) - ey * (dx - ax)) < 0.0
+        and (fx * (ay - cy) - fy * (ax - cx)) * (fx * (by - cy) - fy * (bx - cx)) < 0.0
+        and min(ax, bx) <= max(cx, dx)
+        and min(cx, dx) <= max(ax, bx)
+        and min(ay, by) <= max(cy, dy)
+        and min(cy, dy) <= max(ay, by)
+    ):
+        return 0.0
+    near = min(_point_to_edge(ax, ay, cx, cy, dx, dy), _point_to_edge(bx, by, cx, cy, dx, dy))
+    near = min(near, _point_to_edge(cx, cy, ax, ay, bx, by))
+    return min(near, _point_to_edge(dx, dy, ax, ay, bx, by))
+
+
+@njit(cache=True, nogil=True)
+def _edges_meeting(xy, a, b, c, d):
+    """Distance of the edges from a to b and from c to d, and how near they come besides one common end."""
+    is_ac, is_ad, is_bc, is_bd = _is_same(xy, a, c), _is_same(xy, a, d), _is_same(xy, b, c), _is_same(xy, b, d)
+    if is_ac and is_bd:
+        return 0.0, 0.0
+    if not (is_ac or is_ad or is_bc or is_bd):
+        near = _edge_to_edge(xy, a, b, c, d)
+        return near, near
+    p = b if is_ac or is_ad else a
+    q = d if is_ac or is_bc else c
+    near = _point_to_edge(xy[p, 0], xy[p, 1], xy[c, 0], xy[c, 1], xy[d, 0], xy[d, 1])
+    return 0.0, min(near, _point_to_edge(xy[q, 0], xy[q, 1], xy[a, 0], xy[a, 1], xy[b, 0], xy[b, 1]))
+
+
+@njit(cache=True, nogil=True)
+def _is_inside(xy, after, first, last, x, y):
+    """Whether a point lies in a site."""
+    is_inside = False
+    for a in range(first, last):
+        ay, by = xy[a, 1], xy[after[a], 1]
+        if (ay > y) != (by > y) and x < xy[a, 0] + (y - ay) / (by - ay) * (xy[after[a], 0] - xy[a, 0]):
+            is_inside = not is_inside
+    return is_inside
+
+
+@njit(cache=True, nogil=True)
+def _has_edge_inside(xy, after, i_first, i_last, j_first, j_last):
+    """Whether the middle of an edge of one site, that is no edge of the other, lies in the other."""
+    for a in range(i_first, i_last):
+        b = after[a]
+        is_common = False
+        for c in range(j_first, j_last):
+            if _is_same(xy, a, after[c]) and _is_same(xy, b, c):
+                is_common = True
+        x, y = 0.5 * (xy[a, 0] + xy[b, 0]), 0.5 * (xy[a, 1] + xy[b, 1])
+        if not is_common and _is_inside(xy, after, j_first, j_last, x, y):
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _is_parted(xy, after, overhang, depth, i_first, i_last, j_first, j_last):
+    """Whether two sites lie on the two sides of an edge of the first, but for a strip of some depth."""
+    for a in range(i_first, i_last):
+        if overhang[a] > depth:
+            continue
+        ex, ey = xy[after[a], 0] - xy[a, 0], xy[after[a], 1] - xy[a, 1]
+        least = 0.0
+        for c in range(j_first, j_last):
+            least = min(least, ey * (xy[c, 0] - xy[a, 0]) - ex * (xy[c, 1] - xy[a, 1]))
+        if overhang[a] - least / np.hypot(ex, ey) <= depth:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _is_in_box(x, y, box, site):
+    """Whether a point lies in a site's box."""
+    return box[site, 0] <= x <= box[site, 2] and box[site, 1] <= y <= box[site, 3]
+
+
+@njit(cache=True, nogil=True)
+def _common_edges(xy, after, box, overhang, depth, i_first, i_last, j, j_first, j_last, is_shared):
+    """Whether two sites have a common vertex, and whether a common edge parts them; such edges are flagged."""
+    is_met, is_parted = False, False
+    for a in range(i_first, i_last):
+        if not _is_in_box(xy[a, 0], xy[a, 1], box, j):
+            continue
+        for c in range(j_first, j_last):
+            if _is_same(xy, a, after[c]):
+                is_met = True
+                if _is_same(xy, after[a], c):
+                    is_shared[a] = is_shared[c] = True
+                    is_parted = is_parted or overhang[a] + overhang[c] <= depth
+    return is_met, is_parted
+
+
+@njit(cache=True, nogil=True)
+def _nearest_edges(xy, after, box, i_first, i_last, j, j_first, j_last, reach, touching):
+    """Distance of two outlines up to a reach, and how near they come besides common vertices and edges."""
+    nearest, besides = np.inf, np.inf
+    for a in range(i_first, i_last):
+        b = after[a]
+        within = max(min(reach, nearest), touching)
+        left, right = min(xy[a, 0], xy[b, 0]) - within, max(xy[a, 0], xy[b, 0]) + within
+        low, high = min(xy[a, 1], xy[b, 1]) - within, max(xy[a, 1], xy[b, 1]) + within
+        if left > box[j, 2] or right < box[j, 0] or low > box[j, 3] or high < box[j, 1]:
+            continue
+        for c in range(j_first, j_last):
+            d = after[c]
+            if min(xy[c, 0], xy[d, 0]) > right or max(xy[c, 0], xy[d, 0]) < left:
+                continue
+            if min(xy[c, 1], xy[d, 1]) > high or max(xy[c, 1], xy[d, 1]) < low:
+                continue
+            if _is_same(xy, a, d) and _is_same(xy, b, c):
+                nearest = 0.0
+                continue
+            near, beside = _edges_meeting(xy, a, b, c, d)
+            nearest, besides = min(nearest, near), min(besides, beside)
+    return nearest, besides
+
+
+@njit(
+    types.Tuple((types.float64[::1], types.boolean[::1]))(
+        _points, _ints, _ints, _points, _floats, _floats, _ints, _ints, types.float64, types.float64, _flags
+    ),
+    cache=True,
+    nogil=True,
+)
+def contacts(xy, after, first_vertex, box, overhang, depth, first, second, reach, touching, is_shared):
+    """
+    How the sites of every pair (first[i], second[i]) lie to each other: their distance, and whether they surely do not overlap.
+
+    Distances above ``reach`` are infinite, those of sites that overlap 0. Sites do not overlap where a line along an edge
+    parts them but for a strip of the smaller one's ``depth``; or where their outlines meet in common vertices and edges
+    only, else staying further apart than ``touching``, and no edge of one lies in the other.
+
+    Edges that are an edge of the other site, backwards, are flagged in ``is_shared``.
+    """
+    distances = np.zeros(first.size)
+    is_apart = np.ones(first.size, np.bool_)
+    for pair in range(first.size):
+        i, j = first[pair], second[pair]
+        i_first, i_last, j_first, j_last = first_vertex[i], first_vertex[i + 1], first_vertex[j], first_vertex[j + 1]
+        strip = min(depth[i], depth[j])
+        is_met, is_parted = _common_edges(
+            xy, after, box, overhang, strip, i_first, i_last, j, j_first, j_last, is_shared
+        )
+        for _ in range(2):
+            if is_met and not is_parted:
+                is_parted = _is_parted(xy, after, overhang, strip, i_first, i_last, j_first, j_last)
+            i, i_first, i_last, j, j_first, j_last = j, j_first, j_last, i, i_first, i_last
+        if is_met and is_parted:
+            continue
+        nearest, besides = _nearest_edges(xy, after, box, i_first, i_last, j, j_first, j_last, reach, touching)
+        is_clean = besides > touching
+        for _ in range(2):
+            if nearest > touching:
+                x, y = xy[i_first, 0], xy[i_first, 1]
+                if _is_in_box(x, y, box, j) and _is_inside(xy, after, j_first, j_last, x, y):
+                    nearest, is_clean = 0.0, False
+            elif is_clean:
+                is_clean = not _has_edge_inside(xy, after, i_first, i_last, j_first, j_last)
+            elif not is_parted:
+                is_parted = _is_parted(xy, after, overhang, strip, i_first, i_last, j_first, j_last)
+            i, i_first, i_last, j, j_first, j_last = j, j_first, j_last, i, i_first, i_last
+        is_apart[pair] = is_parted or is_clean
+        distances[pair] = nearest if nearest <= reach else np.inf
+    return distances, is_apart
 
 
 #: Edges that overlap by less than this share of their length meet in a corner.

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
+import shapely
 
 from foveasim.arrays import Bools, Ints, check_choice
 from foveasim.errors import GeometryError
 from foveasim.layout._model import Layout
-from foveasim.layout.adjacency import adjacency
-from foveasim.layout.edits import merge
+from foveasim.layout.edits import joining_groups, merge, union
 from foveasim.layout.rules import RULES, DesignRules, Report, RuleResult
+from foveasim.layout.tiling import fill
 
 __all__ = ["Change", "enforce"]
+
+Repair: TypeAlias = Literal["drop", "merge", "refill"]
 
 #: Rules that a site breaks by itself, so that taking it away mends them.
 SITE_RULES = (
@@ -37,19 +41,17 @@ class Change:
     Attributes
     ----------
     rule : str
-    action : {"dropped", "merged"}
+    action : {"dropped", "merged", "replaced"}
     site_ids : tuple of int
         Numbers of the sites in the layout that was given; merged sites with the ones they were joined to.
     """
 
     rule: str
-    action: Literal["dropped", "merged"]
+    action: Literal["dropped", "merged", "replaced"]
     site_ids: tuple[int, ...]
 
 
-def enforce(
-    layout: Layout, rules: DesignRules, *, repair: Literal["drop", "merge"] = "drop"
-) -> tuple[Layout, tuple[Change, ...]]:
+def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> tuple[Layout, tuple[Change, ...]]:
     """
     A layout that keeps the rules, made from one that may not.
 
@@ -58,10 +60,12 @@ def enforce(
     layout : Layout
     rules : DesignRules
         Waived rules are left broken.
-    repair : {"drop", "merge"}
+    repair : {"drop", "merge", "refill"}
         ``"drop"`` takes away the sites that break a rule (of two that overlap or are too near, the smaller one): a minimum
         size leaves the blind spot of a foveal layout. ``"merge"`` first joins sites that are too small to the neighbour with
-        which they share most edge, as often as it takes, and drops what is left.
+        which they share most edge, as often as it takes, and drops what is left. ``"refill"`` drops, and fills the room of
+        sites that were too small, with what they surround, with hexagons of the smallest size; a new site has the columns of
+        the nearest one that was there.
 
     Returns
     -------
@@ -81,15 +85,27 @@ def enforce(
     >>> rings.n_sites, legal.n_sites, changes[0].action
     (512, 352, 'dropped')
     """
-    check_choice("repair", repair, ("drop", "merge"))
+    check_choice("repair", repair, get_args(Repair))
     waivers = rules.waivers or {}
     mendable = (*SITE_RULES, *PAIR_RULES)
     active = replace(rules, **{name: None for name in RULES if name in waivers or name not in mendable})
     now = np.arange(layout.n_sites)  # where each given site is now; -1 for one that was dropped
     changes: list[Change] = []
+    given = layout
     if repair == "merge":
         layout, now = _merged(layout, active, now, changes)
-    report = layout.check(active)
+    layout, now = _without_guilty(layout, active, now, changes)
+    if repair == "refill":
+        layout = _refilled(layout, given, active, changes)
+    rest = layout.check(replace(rules, **dict.fromkeys(mendable)))
+    if not rest.ok:
+        raise GeometryError(f"taking away sites does not mend every rule: {_broken(rest)}")
+    return layout, tuple(changes)
+
+
+def _without_guilty(layout: Layout, rules: DesignRules, now: Ints, changes: list[Change]) -> tuple[Layout, Ints]:
+    """Sites that break a rule taken away, round after round."""
+    report = layout.check(rules)
     while not report.ok:
         gone = np.zeros(layout.n_sites, bool)
         for result in report.results:
@@ -100,11 +116,40 @@ def enforce(
                 changes.append(Change(result.rule, "dropped", tuple(int(i) for i in ids)))
         now = np.where((now >= 0) & ~gone[now], (np.cumsum(~gone) - 1)[now], -1)
         layout = layout[~gone]
-        report = layout.check(active)
-    rest = layout.check(replace(rules, **dict.fromkeys(mendable)))
-    if not rest.ok:
-        raise GeometryError(f"taking away sites does not mend every rule: {_broken(rest)}")
-    return layout, tuple(changes)
+        report = layout.check(rules)
+    return layout, now
+
+
+def _refilled(layout: Layout, given: Layout, rules: DesignRules, changes: list[Change]) -> Layout:
+    """The room of sites that were too small in hexagons that are not."""
+    is_small = [change.action == "dropped" and change.rule in SMALLNESS_RULES for change in changes]
+    gone = np.array([i for change, small in zip(changes, is_small, strict=True) if small for i in change.site_ids], int)
+    if gone.size == 0:
+        return layout
+    dropped = given[np.sort(gone)]
+    room = shapely.get_parts(shapely.union_all(dropped.polygons()))
+    room = shapely.union_all(shapely.polygons(shapely.get_exterior_ring(room)))
+    n_kept = layout.n_sites
+    filled = fill(layout, room, size_um=_smallest_size_um(rules), columns_of=dropped)
+    # Sites at the border may be narrower than a hexagon, or break rules of another kind.
+    new, _ = _merged(filled[n_kept:], rules, np.arange(filled.n_sites - n_kept), [])
+    layout, _ = _without_guilty(union([layout, new]), rules, np.zeros(0, np.int64), [])
+    for k, (change, small) in enumerate(zip(changes, is_small, strict=True)):
+        if small:
+            changes[k] = replace(change, action="replaced")
+    return Layout(
+        layout.xy_um,
+        layout.ring_offsets,
+        layout.site_offsets,
+        layout.columns,
+        given._then("refilled by rules"),  # noqa: SLF001
+    )
+
+
+def _smallest_size_um(rules: DesignRules) -> float:
+    """Size of a hexagon that no limit of smallness forbids."""
+    across_um = (rules.min_width_um or 0.0) * math.sqrt(0.5 * math.sqrt(3.0))
+    return max(rules.min_size_um or 0.0, math.sqrt(rules.min_area_um2 or 0.0), across_um)
 
 
 def _guilty(layout: Layout, result: RuleResult, gone: Bools) -> Ints:
@@ -126,32 +171,19 @@ def _merged(layout: Layout, rules: DesignRules, now: Ints, changes: list[Change]
         report = layout.check(smallness)
         if report.ok:
             break
-        shared_um = adjacency(layout)
-        group = np.arange(layout.n_sites)
-        rule_of: dict[int, str] = {}
-        is_taken = np.zeros(layout.n_sites, bool)
-        for result in report.results:
-            for violation in result.violations:
-                site = violation.site_ids[0]
-                row = slice(shared_um.indptr[site], shared_um.indptr[site + 1])
-                others, lengths = shared_um.indices[row], shared_um.data[row]
-                free = ~is_taken[others]
-                if is_taken[site] or not free.any():
-                    continue
-                partner = int(others[free][lengths[free].argmax()])
-                is_taken[[site, partner]] = True
-                group[max(site, partner)] = min(site, partner)
-                rule_of[min(site, partner)] = result.rule
-        if not rule_of:
+        rule_of = {v.site_ids[0]: result.rule for result in reversed(report.results) for v in result.violations}
+        group = joining_groups(layout, np.array(list(rule_of), dtype=np.int64))
+        if np.array_equal(group, np.arange(layout.n_sites)):
             break
         kept, label = np.unique(group, return_inverse=True)
         layout, now = merge(layout, label), label[now]
         order = np.argsort(now, kind="stable")
         borders = np.searchsorted(now[order], np.arange(kept.size + 1))
-        for k, name in enumerate(kept.tolist()):
-            if name in rule_of:
-                ids = order[borders[k] : borders[k + 1]]
-                changes.append(Change(rule_of[name], "merged", tuple(sorted(int(i) for i in ids))))
+        is_joined = np.bincount(label) > 1
+        rule_of_group = {int(label[site]): rule for site, rule in rule_of.items()}
+        for k in np.flatnonzero(is_joined).tolist():
+            ids = order[borders[k] : borders[k + 1]]
+            changes.append(Change(rule_of_group[k], "merged", tuple(sorted(int(i) for i in ids))))
     return layout, now
 
 

@@ -1,0 +1,59 @@
+"""Times taken in turns, and the table of their ratios."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from rich.table import Table
+
+
+def best_s(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """Least seconds of each call, called in turns, so that a slow spell of the machine hits all of them."""
+    seconds = dict.fromkeys(calls, float("inf"))
+    for _ in range(repeats):
+        for name, call in calls.items():
+            start = time.perf_counter()
+            call()
+            seconds[name] = min(seconds[name], time.perf_counter() - start)
+    return seconds
+
+
+class Report:
+    """The table of ratios, and how many of them miss their bounds."""
+
+    def __init__(self, *, is_judged: bool) -> None:
+        self.table = Table(title="Ratios, each within one run")
+        for heading in ("what", "time", "against", "its time", "ratio", "bound", ""):
+            self.table.add_column(heading, justify="left" if heading in {"what", "against", ""} else "right")
+        self.is_judged = is_judged
+        self.missed = 0
+
+    def slower_than(self, what: str, s: float, against: str, s_against: float, at_most: float | None = None) -> None:
+        """Add how many times as long as a limit something takes."""
+        self.add(what, f"{s:.4g} s", against, f"{s_against:.4g} s", s / s_against, at_most)
+
+    def faster_than(self, what: str, s: float, against: str, s_against: float, at_least: float | None = None) -> None:
+        """Add how many times as fast as a peer something is."""
+        self.add(what, f"{s:.4g} s", against, f"{s_against:.4g} s", s_against / s, at_least, is_lower_bound=True)
+
+    def add(
+        self,
+        what: str,
+        took: str,
+        against: str,
+        other_took: str,
+        figure: float,
+        bound: float | None,
+        *,
+        is_lower_bound: bool = False,
+    ) -> None:
+        """Add a figure, and whether it keeps its bound."""
+        sign = "≥" if is_lower_bound else "≤"
+        verdict = ""
+        if bound is not None and self.is_judged:
+            is_kept = figure >= bound if is_lower_bound else figure <= bound
+            self.missed += not is_kept
+            verdict = "[green]kept[/green]" if is_kept else "[red]missed[/red]"
+        shown = "" if bound is None else f"{sign} {bound:g}"
+        self.table.add_row(what, took, against, other_took, f"{figure:.3g}", shown, verdict)

@@ -1,0 +1,423 @@
+"""
+Design rules measured again: loops over vertices and pairs, one polygon at a time; and small layouts to measure.
+
+A twin takes a layout and its rules and gives what it measures as pairs of site numbers and value, whatever the limit; the
+value is nan where rounding alone decides what is measured.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations, pairwise
+
+import numpy as np
+import shapely
+from hypothesis import strategies as st
+from shapely.affinity import rotate, scale
+from shapely.geometry.polygon import orient
+
+import foveasim as fs
+
+#: Sites that are closer than this touch, and smaller overlaps and gaps, as shares of a site, are the rounding of vertices.
+TOUCHING_UM = 1e-6
+AREA_ROUNDING = 1e-9
+#: Between sites that meet along an edge, rounding may leave slits up to this wide; to so many of these, gaps reach a site.
+SLIT_UM = 1e-7
+N_SLITS = 100
+
+
+def _edges(polygon):
+    """Edges (a, b) of all rings, the polygon on their left; ring after ring."""
+    turned = orient(polygon)
+    return [list(pairwise(ring.coords)) for ring in (turned.exterior, *turned.interiors)]
+
+
+def _heading_rad(edge):
+    (ax, ay), (bx, by) = edge
+    return math.atan2(by - ay, bx - ax)
+
+
+def _is_left(edge, point):
+    """Whether a point lies on the left of an edge's line."""
+    (ax, ay), (bx, by) = edge
+    return (bx - ax) * (point[1] - ay) - (by - ay) * (point[0] - ax) > 0.0
+
+
+def _inner_angle_deg(before, corner, after):
+    """Angle on the left of the path over a corner, 0 to 360."""
+    u = np.subtract(before, corner)
+    v = np.subtract(after, corner)
+    angle_deg = math.degrees(math.acos(np.clip(u @ v / (np.linalg.norm(u) * np.linalg.norm(v)), -1.0, 1.0)))
+    return angle_deg if _is_left((before, corner), after) else 360.0 - angle_deg
+
+
+# -- one site at a time -------------------------------------------------------------------------------------------------
+
+
+def sizes(layout, _rules):
+    return [((i,), math.sqrt(polygon.area)) for i, polygon in enumerate(layout.polygons())]
+
+
+def areas(layout, _rules):
+    return [((i,), polygon.area) for i, polygon in enumerate(layout.polygons())]
+
+
+def holes(layout, _rules):
+    return [
+        ((i,), shapely.Polygon(ring).area) for i, polygon in enumerate(layout.polygons()) for ring in polygon.interiors
+    ]
+
+
+def _width_um(polygon, facing_deg, slack):
+    """As in the description of ``min_width_um``; ``slack`` is how far below a right angle still counts as across."""
+    rings = _edges(polygon)
+    edges = [edge for ring in rings for edge in ring]
+    lines = [shapely.LineString(edge) for edge in edges]
+    smallest = math.inf
+    for edge in edges:
+        _, low, _, high = rotate(polygon, -_heading_rad(edge), origin=(0, 0), use_radians=True).bounds
+        smallest = min(smallest, high - low)
+    for (e, a), (f, b) in combinations(zip(edges, lines, strict=True), 2):
+        if e[1] == f[0] or f[1] == e[0]:
+            continue
+        turn_rad = math.remainder(_heading_rad(e) - _heading_rad(f) - math.pi, 2 * math.pi)
+        faces = any(_is_left(e, p) for p in f) and any(_is_left(f, p) for p in e)
+        if faces and abs(turn_rad) <= math.radians(facing_deg):
+            smallest = min(smallest, a.distance(b))
+    for ring in rings:
+        for into, out in pairwise([*ring, ring[0]]):
+            if _inner_angle_deg(into[0], into[1], out[1]) <= 180.0:
+                continue
+            corner = shapely.Point(into[1])
+            steps = [shapely.LineString(edge).interpolate(1e-3, normalized=True) for edge in (into[::-1], out)]
+            for edge, line in zip(edges, lines, strict=True):
+                if edge in (into, out) or not _is_left(edge, into[1]):
+                    continue
+                foot = line.interpolate(line.project(corner))
+                # Straight across: nobody comes nearer by leaving the corner along one of its edges.
+                if all(
+                    math.cos(_inner_angle_deg(step.coords[0], into[1], foot.coords[0]) * math.pi / 180.0) <= slack
+                    for step in steps
+                ):
+                    smallest = min(smallest, corner.distance(foot))
+    return smallest
+
+
+def widths(layout, _rules):
+    """Nan where edges face each other within 26 degrees or a right angle just so, and where a ring touches another."""
+    measured = []
+    for i, polygon in enumerate(layout.polygons()):
+        vertices = [tuple(vertex) for ring in _edges(polygon) for vertex, _ in ring]
+        if len(set(vertices)) < len(vertices):
+            measured.append(((i,), math.nan))
+            continue
+        strict, lenient = _width_um(polygon, 25.8, -1e-9), _width_um(polygon, 26.0, 1e-9)
+        measured.append(((i,), strict if math.isclose(strict, lenient, rel_tol=1e-9) else math.nan))
+    return measured
+
+
+def aspect_ratios(layout, _rules):
+    """Of the smallest rectangle with a side along the hull, the least elongated of several as small."""
+    measured = []
+    for i, polygon in enumerate(layout.polygons()):
+        boxes = []
+        for edge in pairwise(polygon.convex_hull.exterior.coords):
+            x0, y0, x1, y1 = rotate(polygon, -_heading_rad(edge), origin=(0, 0), use_radians=True).bounds
+            boxes.append(((x1 - x0) * (y1 - y0), max(x1 - x0, y1 - y0) / min(x1 - x0, y1 - y0)))
+        least = min(boxes)[0]
+        measured.append(((i,), min(ratio for area, ratio in boxes if math.isclose(area, least, rel_tol=1e-9))))
+    return measured
+
+
+def corner_angles(layout, _rules):
+    return [
+        (
+            (i,),
+            min(_inner_angle_deg(a, b, c) for ring in _edges(polygon) for (a, b), (_, c) in pairwise([*ring, ring[0]])),
+        )
+        for i, polygon in enumerate(layout.polygons())
+    ]
+
+
+def edge_angles(layout, rules):
+    step_deg = rules.edge_angle_step_deg
+    return [
+        (
+            (i,),
+            max(
+                abs(math.remainder(math.degrees(_heading_rad(edge)), step_deg))
+                for ring in _edges(polygon)
+                for edge in ring
+            ),
+        )
+        for i, polygon in enumerate(layout.polygons())
+    ]
+
+
+def grid_deviations(layout, rules):
+    return [
+        ((i,), max(abs(math.remainder(x, rules.grid_um)) for x in shapely.get_coordinates(polygon).ravel().tolist()))
+        for i, polygon in enumerate(layout.polygons())
+    ]
+
+
+def reaches(layout, rules):
+    x_min, y_min, x_max, y_max = rules.die_um
+    return [
+        (
+            (i,),
+            max(max(x_min - x, x - x_max, y_min - y, y - y_max) for x, y in shapely.get_coordinates(polygon).tolist()),
+        )
+        for i, polygon in enumerate(layout.polygons())
+    ]
+
+
+# -- pairs --------------------------------------------------------------------------------------------------------------
+
+
+def spaces(layout, rules):
+    touching_um = max(TOUCHING_UM, rules.grid_um or 0.0)
+    pairs = combinations(enumerate(layout.polygons()), 2)
+    measured = [((i, j), a.distance(b)) for (i, a), (j, b) in pairs]
+    return [(sites, space_um) for sites, space_um in measured if space_um > touching_um]
+
+
+def overlaps(layout, _rules):
+    pairs = combinations(enumerate(layout.polygons()), 2)
+    measured = [((i, j), a.intersection(b).area, min(a.area, b.area)) for (i, a), (j, b) in pairs]
+    return [(sites, common) for sites, common, smaller in measured if common > AREA_ROUNDING * smaller]
+
+
+def _shares_an_edge(a, b):
+    """Whether some points on an edge of one, not just where it crosses, have the other right behind them."""
+    for edge in (edge for ring in _edges(a) for edge in ring):
+        if shapely.LineString(edge).distance(b) > TOUCHING_UM:
+            continue
+        start, end = np.array(edge)
+        along = end - start
+        right = np.array([along[1], -along[0]]) / np.hypot(*along)
+        on = start + along * (np.arange(200)[:, np.newaxis] + 0.5) / 200.0
+        is_shared = (
+            (shapely.distance(shapely.points(on), b.boundary) < TOUCHING_UM)
+            & shapely.contains_xy(a, on - 1e-5 * right)
+            & shapely.contains_xy(b, on + 1e-5 * right)
+        )
+        if np.count_nonzero(is_shared) > 1:
+            return True
+    return False
+
+
+def neighbour_ratios(layout, _rules):
+    measured = []
+    for (i, a), (j, b) in combinations(enumerate(layout.polygons()), 2):
+        if a.distance(b) < TOUCHING_UM and (_shares_an_edge(a, b) or _shares_an_edge(b, a)):
+            small, large = sorted([math.sqrt(a.area), math.sqrt(b.area)])
+            measured.append(((i, j), large / small))
+    return measured
+
+
+# -- the whole layout ---------------------------------------------------------------------------------------------------
+
+
+def gaps(layout, rules):
+    polygons = layout.polygons()
+    covered = shapely.union_all(polygons, grid_size=SLIT_UM)
+    if rules.die_um is None:
+        field = shapely.box(*covered.bounds).buffer(10.0, join_style="mitre")
+    else:
+        field = shapely.box(*rules.die_um)
+    parts = shapely.get_parts(shapely.difference(field, covered, grid_size=SLIT_UM))
+    return [
+        (tuple(i for i, polygon in enumerate(polygons) if polygon.distance(part) < N_SLITS * SLIT_UM), part.area)
+        for part in parts
+        if part.area > part.length * SLIT_UM and (rules.die_um is not None or part.distance(field.exterior) > 1.0)
+    ]
+
+
+def growths(layout, _rules):
+    rings = {}
+    for i, (ring, polygon) in enumerate(zip(layout.columns["ring"].tolist(), layout.polygons(), strict=True)):
+        rings.setdefault(ring, []).append((i, math.sqrt(polygon.area)))
+    mean = {ring: sum(size for _, size in members) / len(members) for ring, members in rings.items()}
+    return [(tuple(i for i, _ in rings[outer]), mean[outer] / mean[inner]) for inner, outer in pairwise(sorted(rings))]
+
+
+def counts(layout, _rules):
+    return [((), float(len(list(layout.polygons()))))]
+
+
+#: The twin of every rule.
+TWINS = {
+    "min_size_um": sizes,
+    "max_size_um": sizes,
+    "min_area_um2": areas,
+    "min_hole_um2": holes,
+    "min_width_um": widths,
+    "min_space_um": spaces,
+    "max_aspect_ratio": aspect_ratios,
+    "min_angle_deg": corner_angles,
+    "edge_angle_step_deg": edge_angles,
+    "grid_um": grid_deviations,
+    "max_overlap_um2": overlaps,
+    "max_gap_um2": gaps,
+    "die_um": reaches,
+    "min_growth": growths,
+    "max_growth": growths,
+    "max_neighbour_ratio": neighbour_ratios,
+    "max_sites": counts,
+}
+
+
+# -- layouts ------------------------------------------------------------------------------------------------------------
+
+
+def _star(rng):
+    """Around the origin: convex or not, with a hole or without, in either winding."""
+    n = int(rng.integers(3, 13))
+    angle = (np.arange(n) + rng.uniform(0.0, 0.7, n)) * 2 * np.pi / n
+    ring = rng.uniform(rng.choice([0.35, 1.0]), 1.0, (n, 1)) * np.stack((np.cos(angle), np.sin(angle)), axis=1)
+    ring = rng.uniform(0.4, 2.0) * ring[:: rng.choice([-1, 1])]
+    polygon = shapely.Polygon(ring, [rng.uniform(0.2, 0.6) * ring] if n > 4 and rng.random() < 0.4 else [])
+    return polygon if polygon.is_valid else polygon.convex_hull
+
+
+def _hull(rng):
+    return shapely.MultiPoint(rng.normal(0.0, 0.8, (int(rng.integers(5, 12)), 2))).convex_hull
+
+
+def _turned_rectangle(rng):
+    return rotate(shapely.box(0.0, 0.0, *rng.uniform(0.3, 3.0, 2)), rng.uniform(0.0, 360.0))
+
+
+def _rugged(rng):
+    """Crossed bars, so with notches, courts and corners of all sorts, cut into by a wedge."""
+    bars = [
+        shapely.box(*low, *(low + size))
+        for low, size in zip(rng.integers(0, 6, (5, 2)), rng.integers(1, 6, (5, 2)), strict=True)
+    ]
+    wedge = shapely.Polygon(rng.uniform(0.0, 8.0, (3, 2)))
+    parts = shapely.get_parts(shapely.union_all(bars).difference(wedge))
+    return scale(rotate(max(parts, key=shapely.area), rng.choice([0.0, rng.uniform(0.0, 360.0)])), 0.5, 0.5)
+
+
+def _scattered(shape):
+    """Shapes of one kind, from crowded, with overlaps, to far apart."""
+
+    def make(rng, n_sites):
+        side_um = rng.choice([0.8, 1.5, 4.0, 10.0]) * math.sqrt(n_sites)
+        places = rng.uniform(-side_um, side_um, (n_sites, 2))
+        return [shapely.transform(shape(rng), lambda xy, place=place: xy + place) for place in places]
+
+    return make
+
+
+def _lattice(rng, n_sites):
+    """Rectangles with whole-numbered corners anywhere: they abut, overlap, coincide or leave gaps."""
+    low = rng.integers(0, 14, (n_sites, 2))
+    return [shapely.box(*a, *(a + size)) for a, size in zip(low, rng.integers(1, 6, (n_sites, 2)), strict=True)]
+
+
+def _cut(rng, n_sites):
+    """A square cut on and on along lines of a lattice, some pieces left out."""
+    boxes = [(0, 0, 24, 24)]
+    while len(boxes) < n_sites + 3:
+        x0, y0, x1, y1 = box = boxes[int(rng.integers(len(boxes)))]
+        is_across = bool(rng.integers(2)) if min(x1 - x0, y1 - y0) > 1 else x1 - x0 > 1
+        if (x1 - x0 if is_across else y1 - y0) < 2:
+            continue
+        boxes.remove(box)
+        cut = int(rng.integers(x0 + 1, x1) if is_across else rng.integers(y0 + 1, y1))
+        boxes += [(x0, y0, cut, y1), (cut, y0, x1, y1)] if is_across else [(x0, y0, x1, cut), (x0, cut, x1, y1)]
+    return [shapely.box(*boxes[k]) for k in rng.permutation(len(boxes))[:n_sites]]
+
+
+def _bricks(rng, n_sites):
+    """Courses of bricks, each shifted against the one below, hardly a corner on another; some are left out."""
+    n_rows = int(rng.integers(2, 6))
+    height_um, shift_um = rng.integers(8, 17, n_rows) / 8, rng.integers(0, 24, n_rows) / 8
+    floor_um = np.cumsum(height_um) - height_um
+    bricks = [
+        shapely.box(3.0 * k + shift, floor, 3.0 * k + 3.0 + shift, floor + height)
+        for height, shift, floor in zip(height_um, shift_um, floor_um, strict=True)
+        for k in range(max(2, n_sites // n_rows))
+    ]
+    return [brick for brick in bricks if rng.random() < 0.9] or bricks
+
+
+def _rings(rng, n_sites):
+    n_sectors = int(rng.integers(3, 9))
+    rings = fs.layout.log_polar(
+        n_sectors=n_sectors,
+        r_min_um=3.0,
+        r_max_um=14.0,
+        n_rings=max(2, n_sites // n_sectors),
+        stagger=bool(rng.integers(2)),
+        chords_per_arc=int(rng.integers(1, 4)),
+    )
+    return list(rings.polygons())
+
+
+def _hexagons(rng, n_sites):
+    n_rows = int(rng.integers(2, 6))
+    width_um = rng.choice([2.0, 1.8])
+    return list(
+        fs.layout.hexagonal(
+            n_columns=max(2, n_sites // n_rows), n_rows=n_rows, pitch_um=2.0, width_um=width_um
+        ).polygons()
+    )
+
+
+def _cells(rng, n_sites):
+    cells = fs.layout.voronoi(n_sites=n_sites, size_um=(15.0, 12.0), n_iterations=2, seed=int(rng.integers(1000)))
+    return list(cells.polygons())
+
+
+def _moved(rng, polygons):
+    """Up to three vertices moved, in one site or in all that meet there; unchanged where that would cross an outline."""
+    for _ in range(int(rng.integers(0, 4))):
+        k = int(rng.integers(len(polygons)))
+        vertex = rng.choice(shapely.get_coordinates(polygons[k]))
+        move = rng.uniform(-0.3, 0.3, 2) * math.sqrt(polygons[k].area)
+        is_alone = bool(rng.integers(2))
+
+        def change(xy, vertex=vertex, move=move):
+            return np.where((xy == vertex).all(axis=1, keepdims=True), xy + move, xy)
+
+        moved = [
+            shapely.transform(polygon, change) if i == k or not is_alone else polygon
+            for i, polygon in enumerate(polygons)
+        ]
+        if all(polygon.is_valid for polygon in moved):
+            polygons = moved
+    return polygons
+
+
+#: Families of layouts by name, and those of them where outlines may cross.
+CROSSING = {
+    "stars": _scattered(_star),
+    "hulls": _scattered(_hull),
+    "turned rectangles": _scattered(_turned_rectangle),
+    "rugged": _scattered(_rugged),
+}
+FAMILIES = {
+    **CROSSING,
+    "lattice": _lattice,
+    "cut square": _cut,
+    "bricks": _bricks,
+    "rings": _rings,
+    "hexagons": _hexagons,
+    "cells": _cells,
+}
+
+
+@st.composite
+def layouts(draw, *, turns=True):
+    """Layouts of 5 to 30 sites with a column ``ring``; with turns, some lie at any angle far from the origin."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    family = draw(st.sampled_from(sorted(FAMILIES)))
+    polygons = FAMILIES[family](rng, int(rng.integers(5, 31)))
+    if family not in CROSSING:
+        polygons = _moved(rng, polygons)
+    layout = fs.Layout.from_polygons(polygons, ring=rng.choice([0, 1, 2, 3, 5, 8], len(polygons)))
+    is_turned = rng.random() < 0.5
+    return layout.rotate(rng.uniform(0, 360)).translate(*rng.uniform(-1e4, 1e4, 2)) if turns and is_turned else layout

@@ -1,0 +1,232 @@
+"""Design rules against KLayout's own checks, on what it reads from our files and on the same polygons."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference.rules import layouts
+from shapely.affinity import rotate
+
+import foveasim as fs
+
+kdb = pytest.importorskip("klayout.db")
+rdb = pytest.importorskip("klayout.rdb")
+
+relaxed = settings(deadline=None, derandomize=True, max_examples=40)
+seeds = st.integers(0, 2**32 - 1)
+
+#: Database unit of what is compared in memory.
+DBU_UM = 0.001
+
+
+def on_grid(polygons):
+    """The polygons with their vertices moved to the database grid, without those that this spoils."""
+    rounded = [shapely.transform(polygon, lambda xy: np.round(xy / DBU_UM) * DBU_UM) for polygon in polygons]
+    return fs.Layout.from_polygons([polygon for polygon in rounded if polygon.is_valid])
+
+
+def points(ring):
+    return [kdb.Point(*xy) for xy in np.round(shapely.get_coordinates(ring)[:-1] / DBU_UM).astype(int).tolist()]
+
+
+def klayout_polygon(polygon):
+    same = kdb.Polygon(points(polygon.exterior))
+    for ring in polygon.interiors:
+        same.insert_hole(points(ring))
+    return same
+
+
+def region_of(layout):
+    """The sites as a region in which every polygon stays what it is, also where it abuts or overlaps another."""
+    region = kdb.Region([klayout_polygon(polygon) for polygon in layout.polygons()])
+    region.merged_semantics = False
+    return region
+
+
+def read(path):
+    """Polygons and database unit of a chip file."""
+    chip = kdb.Layout()
+    chip.read(str(path))
+    region = kdb.Region()
+    for info in chip.layer_infos():
+        region.insert(chip.top_cell().begin_shapes_rec(chip.layer(info)))
+    region.merged_semantics = False
+    return region, chip.dbu
+
+
+def middle(edge):
+    return shapely.Point(0.5 * (edge.x1 + edge.x2), 0.5 * (edge.y1 + edge.y2))
+
+
+def trenched(seed):
+    """Turned rectangles, or hexagons of several sizes, that keep apart."""
+    rng = np.random.default_rng(seed)
+    angle = np.arange(6) * math.pi / 3
+    hexagon = shapely.Polygon(np.stack((np.cos(angle), np.sin(angle)), axis=1))
+    is_turned = rng.random() < 0.7
+    polygons = []
+    for place in np.stack(np.meshgrid(np.arange(6), np.arange(5)), axis=2).reshape(-1, 2) * 3.0:
+        half = rng.uniform(0.3, 0.95, 2)
+        shape = (
+            shapely.box(*-half, *half)
+            if rng.random() < 0.6
+            else shapely.transform(hexagon, lambda xy, r=half[0] * 1.4: xy * r)
+        )
+        shape = rotate(shape, rng.uniform(0, 360), origin=(0, 0)) if is_turned else shape
+        move = place + rng.uniform(-0.1, 0.1, 2)
+        polygons.append(shapely.transform(shape, lambda xy, move=move: xy + move))
+    return on_grid(polygons)
+
+
+# -- widths -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def giotto():
+    """Giotto 2 with rings into its middle, at a unit pixel of 6.45 µm."""
+    return fs.layout.giotto(n_rho=152, n_theta=252, n_fovea=42, n_across=1090, unit_um=6.45, fovea="none")
+
+
+def test_klayout_finds_the_same_504_narrow_sites_of_giotto_in_its_chip_file(giotto, tmp_path):
+    giotto.write(tmp_path / "giotto.gds")
+    region, dbu_um = read(tmp_path / "giotto.gds")
+    pairs = region.width_check(round(6.8 / dbu_um), False, kdb.Region.Projection, 80.0, None, None)
+    # A pair of edges belongs to the site that its middle lies in.
+    middles = [kdb.Edge(pair.first.bbox().center(), pair.second.bbox().center()) for pair in pairs.each()]
+    places = shapely.transform([middle(edge) for edge in middles], lambda xy: xy * dbu_um)
+    pair, site = shapely.STRtree(giotto.polygons()).query(places, predicate="intersects")
+    narrow = {violation.site_ids[0] for violation in giotto.check(fs.DesignRules(min_width_um=6.8)).violations}
+
+    assert region.count() == giotto.n_sites == 27_720
+    assert np.bincount(pair).tolist() == [1] * pairs.count()
+    assert len(set(site.tolist())) == 504
+    assert set(site.tolist()) == narrow
+
+
+# -- spaces -------------------------------------------------------------------------------------------------------------
+
+
+@given(seeds, st.integers(150, 1500))
+@relaxed
+def test_near_sites_are_those_of_klayouts_space_check(seed, limit_dbu):
+    layout = trenched(seed)
+    tree = shapely.STRtree(layout.polygons())
+    found = set()
+    for pair in region_of(layout).isolated_check(limit_dbu, False, kdb.Region.Euclidian).each():
+        sites = {
+            int(tree.nearest(shapely.transform(middle(edge), lambda xy: xy * DBU_UM)))
+            for edge in (pair.first, pair.second)
+        }
+        found.add(tuple(sorted(sites)))
+    violations = layout.check(fs.DesignRules(min_space_um=limit_dbu * DBU_UM)).violations
+
+    assert {violation.site_ids for violation in violations} == found
+
+
+# -- areas --------------------------------------------------------------------------------------------------------------
+
+
+@given(layouts(), st.floats(0.1, 6.0))
+@relaxed
+def test_small_sites_are_those_of_klayouts_area(layout, limit_um2):
+    layout = on_grid(layout.polygons())
+    areas_um2 = [klayout_polygon(polygon).area2() / 2 * DBU_UM**2 for polygon in layout.polygons()]
+    violations = layout.check(fs.DesignRules(min_area_um2=limit_um2)).violations
+
+    assert layout.area_um2 == pytest.approx(areas_um2, rel=1e-9)
+    assert sorted(violation.site_ids[0] for violation in violations) == [
+        i for i, area_um2 in enumerate(areas_um2) if area_um2 < limit_um2 - 1e-6
+    ]
+
+
+FAMILIES = {
+    "grid": fs.layout.grid(n_x=9, n_y=8, pitch_um=1.23456),
+    "hexagonal": fs.layout.hexagonal(n_columns=9, n_rows=8, pitch_um=1.7, width_um=1.5),
+    "log_polar": fs.layout.log_polar(n_sectors=31, r_min_um=3.0, r_max_um=60.0),
+    "voronoi": fs.layout.voronoi(n_sites=200, size_um=(50.0, 40.0), n_iterations=3),
+    "zones": fs.layout.zones(side_um=(4, 12, 28), pitch_um=(1, 2, 4)).rotate(10.0),
+}
+
+
+@pytest.mark.parametrize("dbu_um", [1e-4, 1e-3, 5e-3])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_areas_in_chip_files_are_ours_but_for_the_rounding_of_vertices(family, dbu_um, tmp_path):
+    layout = FAMILIES[family]
+    layout.write(tmp_path / "a.gds", dbu_um=dbu_um)
+    region, read_dbu_um = read(tmp_path / "a.gds")
+    area_um2 = np.full(layout.n_sites, np.nan)
+    for polygon in region.each():
+        area_um2[int(polygon.property(1).split()[1])] = polygon.area2() / 2 * dbu_um**2
+    # A vertex moves by at most half a unit along x and y.
+    most_um2 = shapely.length(layout.polygons()) * dbu_um / math.sqrt(2.0)
+
+    assert read_dbu_um == pytest.approx(dbu_um)
+    assert np.all(np.abs(area_um2 - layout.area_um2) <= most_um2)
+
+
+# -- overlaps -----------------------------------------------------------------------------------------------------------
+
+
+def overlap_um2(layout):
+    """Sum over pairs of sites of what they share: a place under k sites counts k (k - 1) / 2 times."""
+    region = region_of(layout)
+    total = 0
+    for n_sites in range(2, layout.n_sites + 1):
+        covered = region.merged(False, n_sites)
+        if covered.is_empty():
+            break
+        total += (n_sites - 1) * covered.area()
+    return total * DBU_UM**2
+
+
+@given(seeds)
+@relaxed
+def test_overlaps_of_upright_rectangles_add_up_to_klayouts(seed):
+    rng = np.random.default_rng(seed)
+    low = rng.integers(0, 9000, (25, 2))
+    boxes = [shapely.box(*a, *(a + size)) for a, size in zip(low, rng.integers(200, 4000, (25, 2)), strict=True)]
+    layout = on_grid([shapely.transform(box, lambda xy: xy * DBU_UM) for box in boxes])
+    violations = layout.check(fs.DesignRules(max_overlap_um2=0.0)).violations
+
+    assert sum(violation.value for violation in violations) == pytest.approx(overlap_um2(layout), rel=1e-9)
+
+
+@given(layouts())
+@relaxed
+def test_overlaps_of_any_sites_add_up_to_klayouts_but_for_the_rounding_of_crossings(layout):
+    layout = on_grid(layout.polygons())
+    violations = layout.check(fs.DesignRules(max_overlap_um2=0.0)).violations
+    perimeter_um = shapely.length([violation.marker for violation in violations]).sum()
+
+    assert sum(violation.value for violation in violations) == pytest.approx(
+        overlap_um2(layout), rel=1e-9, abs=DBU_UM * perimeter_um + DBU_UM**2
+    )
+
+
+# -- reports ------------------------------------------------------------------------------------------------------------
+
+
+def test_klayout_counts_as_many_items_of_every_rule_as_the_report(giotto, tmp_path):
+    rules = fs.DesignRules(
+        min_width_um=6.8,
+        min_angle_deg=89.9,
+        edge_angle_step_deg=45.0,
+        max_gap_um2=0.0,
+        max_neighbour_ratio=1.02,
+        max_sites=9,
+    )
+    ring = giotto.columns["ring"]
+    report = giotto[(ring > 35) & (ring < 50)].check(rules)
+    report.write(tmp_path / "report.lyrdb")
+    database = rdb.ReportDatabase("")
+    database.load(str(tmp_path / "report.lyrdb"))
+    counts = {category.name(): category.num_items() for category in database.each_category()}
+
+    assert counts == {result.rule: len(result.violations) for result in report.results}
+    assert counts["max_sites"] == 1
+    assert min(counts.values()) > 0
