@@ -30,16 +30,16 @@ def bench_layouts(report: Report, n_sites: int) -> None:
 
 
 def every_rule(layout: Layout, **changes: Any) -> DesignRules:
-    """Limits for every rule, all kept by hexagons and rings of these sizes."""
+    """Limits for every rule, all but the gaps kept by hexagons and rings of these sizes."""
     x0, y0, x1, y1 = layout.bounds_um
     limits: dict[str, Any] = {
         "min_size_um": 0.1, "max_size_um": 1e3, "min_area_um2": 0.1, "min_hole_um2": 0.1, "min_width_um": 0.1,
-        "min_space_um": 0.1, "max_aspect_ratio": 50.0, "min_angle_deg": 20.0, "edge_angle_step_deg": 30.0,
-        "grid_um": 1e-5, "max_overlap_um2": 0.0, "max_gap_um2": 0.0, "die_um": (x0 - 1.0, y0 - 1.0, x1 + 1.0, y1 + 1.0),
+        "min_space_um": 0.1, "max_aspect_ratio": 50.0, "min_angle_deg": 20.0, "edge_angle_step_deg": 1e-4,
+        "grid_um": 1e-6, "max_overlap_um2": 0.0, "max_gap_um2": 0.0, "die_um": (x0 - 1.0, y0 - 1.0, x1 + 1.0, y1 + 1.0),
         "max_neighbour_ratio": 3.0, "max_sites": 10**9, "min_density": 0.0, "max_density": 1.0,
         "density_window_um": 400.0, "max_data_rate_gbit_per_s": 1e6, "readout": Readout(frames_per_s=30.0, bits=10),
         "max_track_use": 1e6, "routing": Routing(width_um=0.14, space_um=0.14),
-        "waivers": {"edge_angle_step_deg": "round", "grid_um": "before snapping", "max_gap_um2": "the die around it"},
+        "waivers": {"max_gap_um2": "the die around it"},
     }  # fmt: skip
     if "ring" in layout.columns:
         limits |= {"min_growth": 0.9, "max_growth": 1.1}

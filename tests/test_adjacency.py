@@ -100,3 +100,9 @@ def test_a_layout_without_sites_has_no_neighbours():
 def test_a_negative_gap_is_refused():
     with pytest.raises(ParameterError, match="'max_gap_um' must be >= 0"):
         TILINGS["grid"].adjacency(max_gap_um=-1.0)
+
+
+def test_corners_that_overlap_by_rounding_share_no_edge():
+    layout = fs.Layout.from_polygons([shapely.box(0, 0, 2, 2), shapely.box(2 + 1e-8, 2 - 1e-8, 4, 4)])
+
+    assert layout.adjacency().nnz == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from itertools import combinations
 
 import numpy as np
@@ -205,3 +206,20 @@ def test_giotto_at_a_unit_pixel_of_6_45_um_has_504_sites_narrower_than_6_8_um():
     assert rings.n_sites == 27_720
     assert len(ids) == len(set(ids)) == 504
     assert np.unique(rings.columns["ring"][ids]).tolist() == [42, 43]
+
+
+@pytest.mark.parametrize("step_deg", [50.0, 75.0, 90.0, 45.0, 7.0])
+def test_an_edge_has_no_direction_for_the_rule_of_angles(step_deg):
+    upright = SQUARES.check(fs.DesignRules(edge_angle_step_deg=step_deg))
+    expected = min(90.0 % step_deg, step_deg - 90.0 % step_deg)
+
+    assert {round(v.value, 9) for v in upright.violations} == ({round(expected, 9)} if expected else set())
+
+
+def test_a_report_can_be_sent_to_another_process():
+    report = planted(shapely.box(0, 0, 3, 3)).check(fs.DesignRules(max_size_um=2.5, max_sites=50))
+    back = pickle.loads(pickle.dumps(report))
+
+    assert back.records() == report.records()
+    assert str(back) == str(report)
+    assert [len(result) for result in back.results] == [1, 1]

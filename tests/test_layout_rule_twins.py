@@ -105,7 +105,6 @@ def test_gaps_and_their_twin_name_the_same_places_with_the_same_values(layout, s
     compare("max_gap_um2", layout, limited("max_gap_um2", layout, share, has_field))
 
 
-@pytest.mark.xfail(reason="slits that rounding leaves between turned sites join gaps, or open them to the outside")
 @given(layout=layouts(), share=shares, has_field=st.booleans())
 @relaxed
 def test_gaps_and_their_twin_have_the_same_areas_at_any_angle_and_place(layout, share, has_field):

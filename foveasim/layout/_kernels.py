@@ -276,15 +276,22 @@ def _is_inside(xy, after, first, last, x, y):
 
 
 @njit(cache=True, nogil=True)
-def _has_edge_inside(xy, after, i_first, i_last, j_first, j_last):
+def _is_in_box(x, y, box, site):
+    """Whether a point lies in a site's box."""
+    return box[site, 0] <= x <= box[site, 2] and box[site, 1] <= y <= box[site, 3]
+
+
+@njit(cache=True, nogil=True)
+def _has_edge_inside(xy, after, box, i_first, i_last, j, j_first, j_last):
     """Whether the middle of an edge of one site, that is no edge of the other, lies in the other."""
     for a in range(i_first, i_last):
         b = after[a]
+        x, y = 0.5 * (xy[a, 0] + xy[b, 0]), 0.5 * (xy[a, 1] + xy[b, 1])
+        if not _is_in_box(x, y, box, j):
+            continue
         is_common = False
         for c in range(j_first, j_last):
-            if _is_same(xy, a, after[c]) and _is_same(xy, b, c):
-                is_common = True
-        x, y = 0.5 * (xy[a, 0] + xy[b, 0]), 0.5 * (xy[a, 1] + xy[b, 1])
+            is_common = is_common or (_is_same(xy, a, after[c]) and _is_same(xy, b, c))
         if not is_common and _is_inside(xy, after, j_first, j_last, x, y):
             return True
     return False
@@ -306,12 +313,6 @@ def _is_parted(xy, after, overhang, depth, i_first, i_last, j_first, j_last):
 
 
 @njit(cache=True, nogil=True)
-def _is_in_box(x, y, box, site):
-    """Whether a point lies in a site's box."""
-    return box[site, 0] <= x <= box[site, 2] and box[site, 1] <= y <= box[site, 3]
-
-
-@njit(cache=True, nogil=True)
 def _common_edges(xy, after, box, overhang, depth, i_first, i_last, j, j_first, j_last, is_shared):
     """Whether two sites have a common vertex, and whether a common edge parts them; such edges are flagged."""
     is_met, is_parted = False, False
@@ -328,9 +329,9 @@ def _common_edges(xy, after, box, overhang, depth, i_first, i_last, j, j_first, 
 
 
 @njit(cache=True, nogil=True)
-def _nearest_edges(xy, after, box, i_first, i_last, j, j_first, j_last, reach, touching):
-    """Distance of two outlines up to a reach, and how near they come besides common vertices and edges."""
-    nearest, besides = np.inf, np.inf
+def _nearest_edges(xy, after, box, i_first, i_last, j, j_first, j_last, nearest, reach, touching):
+    """Distance of two outlines, up to what is known and a reach; how near they come besides common vertices and edges."""
+    besides = np.inf
     for a in range(i_first, i_last):
         b = after[a]
         within = max(min(reach, nearest), touching)
@@ -344,11 +345,9 @@ def _nearest_edges(xy, after, box, i_first, i_last, j, j_first, j_last, reach, t
                 continue
             if min(xy[c, 1], xy[d, 1]) > high or max(xy[c, 1], xy[d, 1]) < low:
                 continue
-            if _is_same(xy, a, d) and _is_same(xy, b, c):
-                nearest = 0.0
-                continue
-            near, beside = _edges_meeting(xy, a, b, c, d)
-            nearest, besides = min(nearest, near), min(besides, beside)
+            if not (_is_same(xy, a, d) and _is_same(xy, b, c)):
+                near, beside = _edges_meeting(xy, a, b, c, d)
+                nearest, besides = min(nearest, near), min(besides, beside)
     return nearest, besides
 
 
@@ -384,7 +383,9 @@ def contacts(xy, after, first_vertex, box, overhang, depth, first, second, reach
             i, i_first, i_last, j, j_first, j_last = j, j_first, j_last, i, i_first, i_last
         if is_met and is_parted:
             continue
-        nearest, besides = _nearest_edges(xy, after, box, i_first, i_last, j, j_first, j_last, reach, touching)
+        nearest, besides = _nearest_edges(
+            xy, after, box, i_first, i_last, j, j_first, j_last, 0.0 if is_met else np.inf, reach, touching
+        )
         is_clean = besides > touching
         for _ in range(2):
             if nearest > touching:
@@ -392,7 +393,7 @@ def contacts(xy, after, first_vertex, box, overhang, depth, first, second, reach
                 if _is_in_box(x, y, box, j) and _is_inside(xy, after, j_first, j_last, x, y):
                     nearest, is_clean = 0.0, False
             elif is_clean:
-                is_clean = not _has_edge_inside(xy, after, i_first, i_last, j_first, j_last)
+                is_clean = not _has_edge_inside(xy, after, box, i_first, i_last, j, j_first, j_last)
             elif not is_parted:
                 is_parted = _is_parted(xy, after, overhang, strip, i_first, i_last, j_first, j_last)
             i, i_first, i_last, j, j_first, j_last = j, j_first, j_last, i, i_first, i_last
@@ -401,8 +402,8 @@ def contacts(xy, after, first_vertex, box, overhang, depth, first, second, reach
     return distances, is_apart
 
 
-#: Edges that overlap by less than this share of their length meet in a corner.
-CORNER = 1e-9
+#: Edges that run along each other for less than this, in µm, meet in a corner: the rounding of positions.
+CORNER_UM = 1e-6
 
 
 @njit(types.float64[::1](_points, _ints, _ints, _ints, _ints, types.float64), cache=True, nogil=True)
@@ -427,7 +428,7 @@ def shared_lengths(xy, after, first_vertex, first, second, max_gap):
                 high = cx * ex + cy * ey  # the other edge comes back: it begins where this one ends
                 low = dx * ex + dy * ey
                 begin, end = max(low, 0.0), min(high, length)
-                if end - begin <= CORNER * length:
+                if end - begin <= CORNER_UM:
                     continue
                 slope = ((cy - dy) * ex - (cx - dx) * ey) / (high - low)
                 away = dy * ex - dx * ey - slope * low  # distance of the other edge's line at the start of this one

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,10 +15,11 @@ from numpy.typing import NDArray
 from foveasim.arrays import Bools, Floats, Ints
 from foveasim.compiled import kernels
 from foveasim.layout._model import Layout
+from foveasim.layout._noding import noded_edges
 from foveasim.layout.adjacency import TOUCHING_UM
 from foveasim.layout.routing import crossings
 from foveasim.parallel import each, thread_count
-from foveasim.rings import next_vertex, ring_moments
+from foveasim.rings import next_vertex, positions_in_runs, ring_moments
 
 if TYPE_CHECKING:
     from foveasim.layout.rules import DesignRules
@@ -85,9 +87,10 @@ class Case:
         is_mixed = (site < n) & (box >= n)
         return box[is_mixed] - n, site[is_mixed]
 
-    def sites_at(self, geometries: NDArray[Any], reach_um: float = 0.0) -> tuple[Ints, Ints]:
-        """Pairs of some geometries and sites that are at most so far apart, ordered by the sites."""
+    def sites_at(self, geometries: NDArray[Any], among: Bools, reach_um: float = 0.0) -> tuple[Ints, Ints]:
+        """Pairs of some geometries and sites, of those flagged, that are at most so far apart, ordered by the sites."""
         geometry, site = self.sites_near(shapely.bounds(geometries), reach_um)
+        geometry, site = geometry[among[site]], site[among[site]]
         shapely.prepare(geometries)
         is_met = shapely.dwithin(geometries[geometry], self.shapes(site), reach_um)
         return geometry[is_met], site[is_met]
@@ -123,6 +126,30 @@ class Case:
         found = each(meet, _pieces(first.size), thread_count())
         distance_um, is_apart = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return Contacts(first, second, distance_um, is_apart, is_shared)
+
+    @cached_property
+    def windows(self) -> tuple[Floats, Floats, Floats]:
+        """Windows of the density rule, lower left and upper right corners (n, 2) µm, and the area that sites fill in each."""
+        layout, window_um = self.layout, float(self.rules.density_window_um or 0.0)
+        field = np.asarray(self.rules.die_um or (layout.bounds_um if layout.n_sites else (0.0, 0.0, 0.0, 0.0)))
+        sides_um = np.minimum(window_um, field[2:] - field[:2])
+        if sides_um.min() <= 0.0:
+            return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
+        starts, lines = [], []
+        for i in (0, 1):
+            # The last window of a row ends at the die's border.
+            room_um = field[i + 2] - field[i] - sides_um[i]
+            n = math.ceil(room_um / (0.5 * sides_um[i]) - LENGTH_ROUNDING_UM) + 1
+            starts.append(np.minimum(field[i] + 0.5 * sides_um[i] * np.arange(n), field[i + 2] - sides_um[i]))
+            lines.append(np.unique(np.concatenate((starts[i], starts[i] + sides_um[i]))))
+        total_um2 = np.zeros((lines[1].size, lines[0].size))
+        total_um2[1:, 1:] = _filled_um2(layout, *lines).cumsum(axis=0).cumsum(axis=1)
+        x, y = (index.ravel() for index in np.meshgrid(*starts))
+        x0, x1 = np.searchsorted(lines[0], x), np.searchsorted(lines[0], x + sides_um[0])
+        y0, y1 = np.searchsorted(lines[1], y), np.searchsorted(lines[1], y + sides_um[1])
+        filled_um2 = total_um2[y1, x1] - total_um2[y0, x1] - total_um2[y1, x0] + total_um2[y0, x0]
+        low = np.stack((x, y), axis=1)
+        return low, low + sides_um, np.maximum(filled_um2, 0.0)
 
 
 def _pieces(n: int) -> list[slice]:
@@ -223,8 +250,10 @@ def _corner_angles(case: Case) -> Measured:
 def _edge_angles(case: Case) -> Measured:
     step_deg = float(case.rules.edge_angle_step_deg or 90.0)
     along = case.layout.xy_um[case.after] - case.layout.xy_um
-    angle_deg = np.degrees(np.arctan2(along[:, 1], along[:, 0]))
-    return Measured(_per_site(np.maximum, np.abs(angle_deg - step_deg * np.round(angle_deg / step_deg)), case.layout))
+    # An edge has no direction: 180 degrees are 0.
+    angle_deg = np.degrees(np.arctan2(along[:, 1], along[:, 0])) % 180.0
+    off_deg = np.minimum(np.abs(angle_deg - step_deg * np.round(angle_deg / step_deg)), 180.0 - angle_deg)
+    return Measured(_per_site(np.maximum, off_deg, case.layout))
 
 
 def _grid_deviations(case: Case) -> Measured:
@@ -258,10 +287,14 @@ def _gaps(case: Case) -> Measured:
     """
     layout = case.layout
     area_um2 = layout.area_um2
-    least_um2 = AREA_ROUNDING * area_um2.min(initial=np.inf) if layout.n_sites else 0.0
+    least_um2 = AREA_ROUNDING * float(area_um2.min()) if layout.n_sites else 0.0
+    if _open_um2(case) <= max(least_um2, float(case.rules.max_gap_um2 or 0.0)):
+        return Measured(np.zeros(0))
     is_alone = _is_alone(case)
-    is_border = ~case.contacts.is_shared & ~np.repeat(is_alone, np.diff(case.first_vertex))
-    lines = shapely.linestrings(np.stack((layout.xy_um[is_border], layout.xy_um[case.after[is_border]]), axis=1))
+    border = np.flatnonzero(~case.contacts.is_shared & ~np.repeat(is_alone, np.diff(case.first_vertex)))
+    border_um = np.stack((layout.xy_um[border], layout.xy_um[case.after[border]]), axis=1)
+    # A corner on the middle of a turned edge misses it by rounding: without noding the slit would join what it divides.
+    lines = shapely.linestrings(np.stack(noded_edges(border_um[:, 0], border_um[:, 1]), axis=1))
     if case.rules.die_um is not None:
         lines = np.append(lines, shapely.box(*case.rules.die_um).exterior)
     faces = shapely.get_parts(shapely.polygonize([shapely.union_all(lines)]))
@@ -272,7 +305,10 @@ def _gaps(case: Case) -> Measured:
     gaps = np.flatnonzero(open_um2 > least_um2)
 
     def sites(positions: Ints) -> list[Ints]:
-        gap, around = case.sites_at(faces[gaps[positions]], LENGTH_ROUNDING_UM)
+        is_rim = is_alone.copy()
+        rim_um = np.concatenate((border_um.min(axis=1), border_um.max(axis=1)), axis=1)
+        is_rim[case.sites_near(rim_um, LENGTH_ROUNDING_UM)[1]] = True
+        gap, around = case.sites_at(faces[gaps[positions]], is_rim, LENGTH_ROUNDING_UM)
         return _grouped(gap, around, positions.size)
 
     def markers(positions: Ints) -> list[Any]:
@@ -280,6 +316,20 @@ def _gaps(case: Case) -> Measured:
         return [_punched(faces[k], contents[k], case) for k in gaps[positions]]
 
     return Measured(open_um2[gaps], sites, markers)
+
+
+def _open_um2(case: Case) -> float:
+    """The most that all gaps have together: what sites leave of the die, or of the rectangle around them."""
+    layout = case.layout
+    if not case.contacts.is_apart.all():
+        return np.inf
+    if case.rules.die_um is None:
+        field = np.asarray(layout.bounds_um if layout.n_sites else np.zeros(4))
+    else:
+        field = np.asarray(case.rules.die_um)
+        if _reach_beyond_die(case).values.max(initial=0.0) > 0.0:
+            return np.inf
+    return float((field[2:] - field[:2]).prod() - layout.area_um2.sum())
 
 
 def _is_alone(case: Case) -> Bools:
@@ -302,8 +352,7 @@ def _open_faces(faces: NDArray[Any], is_alone: Bools, case: Case) -> NDArray[Any
     is_open = np.ones(faces.size, bool)
     if case.rules.die_um is not None:
         is_open = np.asarray(shapely.contains(shapely.box(*case.rules.die_um), inner))
-    point, site = case.sites_at(inner)
-    is_open[point[~is_alone[site]]] = False
+    is_open[case.sites_at(inner, ~is_alone)[0]] = False
     return faces[is_open]
 
 
@@ -383,24 +432,32 @@ def _everything(case: Case) -> Any:
 
 def _densities(case: Case) -> Measured:
     """Of windows that move over the die by half their side, the share that sites fill."""
-    layout = case.layout
-    window_um = float(case.rules.density_window_um or 0.0)
-    field = np.asarray(case.rules.die_um or (layout.bounds_um if layout.n_sites else (0.0, 0.0, 0.0, 0.0)))
-    sides_um = np.minimum(window_um, field[2:] - field[:2])
-    if sides_um.min() <= 0.0:
-        return Measured(np.zeros(0))
-    # The last window of a row ends at the die's border.
-    n = np.ceil((field[2:] - field[:2] - sides_um) / (0.5 * sides_um) - LENGTH_ROUNDING_UM).astype(np.int64) + 1
-    x, y = (np.minimum(field[i] + 0.5 * sides_um[i] * np.arange(n[i]), field[i + 2] - sides_um[i]) for i in (0, 1))
-    low = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    box = np.concatenate((low, low + sides_um), axis=1)
-    window, site = case.sites_near(box)
-    inside_um2 = layout.area_um2[site]
-    sticks_out = ((layout.site_bounds_um[site] - box[window]) * np.array([1, 1, -1, -1]) < 0.0).any(axis=1)
-    cut = np.flatnonzero(sticks_out)
-    inside_um2[cut] = shapely.area(shapely.intersection(case.shapes(site[cut]), shapely.box(*box[window[cut]].T)))
-    filled = np.bincount(window, inside_um2, box.shape[0]) / sides_um.prod()
-    return Measured(filled, lambda k: [()] * k.size, lambda k: shapely.box(*box[k].T))
+    low, high, filled_um2 = case.windows
+    share = filled_um2 / np.maximum((high - low).prod(axis=1), np.finfo(np.float64).tiny)
+    return Measured(share, lambda k: [()] * k.size, lambda k: shapely.box(low[k, 0], low[k, 1], high[k, 0], high[k, 1]))
+
+
+def _filled_um2(layout: Layout, x_um: Floats, y_um: Floats) -> Floats:
+    """Area that sites fill in every cell between some lines, (n_y - 1, n_x - 1) µm²."""
+    box = layout.site_bounds_um
+    columns, rows = x_um.size - 1, y_um.size - 1
+    first_x, last_x = (np.clip(np.searchsorted(x_um, box[:, i], "right") - 1, 0, columns - 1) for i in (0, 2))
+    first_y, last_y = (np.clip(np.searchsorted(y_um, box[:, i], "right") - 1, 0, rows - 1) for i in (1, 3))
+    inside = (box[:, 0] >= x_um[0]) & (box[:, 2] <= x_um[-1]) & (box[:, 1] >= y_um[0]) & (box[:, 3] <= y_um[-1])
+    is_whole = inside & (first_x == last_x) & (first_y == last_y)
+    cell, area_um2 = (first_y * columns + first_x)[is_whole], layout.area_um2[is_whole]
+    # The others are cut along the lines: all cells that their boxes reach.
+    cut = np.flatnonzero(~is_whole)
+    wide, high = (last_x - first_x + 1)[cut], (last_y - first_y + 1)[cut]
+    place = positions_in_runs(wide * high)
+    owner = np.repeat(np.arange(cut.size), wide * high)
+    ix, iy = first_x[cut][owner] + place % wide[owner], first_y[cut][owner] + place // wide[owner]
+    pieces = shapely.intersection(
+        layout[cut].polygons()[owner], shapely.box(x_um[ix], y_um[iy], x_um[ix + 1], y_um[iy + 1])
+    )
+    cells = np.concatenate((cell, iy * columns + ix))
+    filled = np.bincount(cells, np.concatenate((area_um2, shapely.area(pieces))), rows * columns)
+    return np.asarray(filled.reshape(rows, columns), dtype=np.float64)
 
 
 def _data_rates(case: Case) -> Measured:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim.arrays import MAX_LENGTH_UM, Ints, check_choice, check_count, check_length_um, check_sites, finite_array
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._model import Layout
+from foveasim.layout._noding import points_on_edges
 from foveasim.layout._regions import as_region
 from foveasim.layout.adjacency import adjacency
 from foveasim.rings import next_vertex, positions_in_runs
@@ -25,8 +26,6 @@ __all__ = ["clip", "inset", "joining_groups", "merge", "merge_small", "node", "p
 
 #: A piece of a site smaller than this share of it is rounding at the border of a cut.
 SLIVER = 1e-9
-#: A vertex this close to a neighbour's edge lies on it.
-ON_EDGE_UM = 1e-6
 
 
 def union(layouts: Sequence[Layout]) -> Layout:
@@ -279,14 +278,7 @@ def node(layout: Layout) -> Layout:
     points, _ = np.unique(layout.xy_um, axis=0, return_index=True)
     after = next_vertex(layout.ring_offsets)
     begin, end = layout.xy_um, layout.xy_um[after]
-    edges = shapely.linestrings(np.stack((begin, end), axis=1))
-    edge, point = shapely.STRtree(shapely.points(points)).query(edges, predicate="dwithin", distance=ON_EDGE_UM)
-    along = end[edge] - begin[edge]
-    length2 = np.einsum("ij,ij->i", along, along)
-    t = np.einsum("ij,ij->i", points[point] - begin[edge], along) / length2
-    margin = ON_EDGE_UM / np.sqrt(length2)
-    is_inside = (t > margin) & (t < 1.0 - margin)
-    edge, point, t = edge[is_inside], point[is_inside], t[is_inside]
+    edge, point, t = points_on_edges(points, begin, end)
     # The new vertices come behind the edge's first one, in the order along it.
     owner = np.concatenate((np.arange(begin.shape[0]), edge))
     order = np.lexsort((np.concatenate((np.zeros(begin.shape[0]), t)), owner))

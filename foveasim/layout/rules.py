@@ -7,15 +7,15 @@ beyond the limit is a violation, one a photosite (or pair, or gap, or ring), and
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import InitVar, dataclass, fields
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from foveasim.arrays import check_choice, check_number, finite_array
+from foveasim.arrays import Floats, check_choice, check_number, finite_array
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._measures import RULES, Case, Measured, Rule, min_width_um
 from foveasim.layout._model import Layout
@@ -198,26 +198,63 @@ class Violation:
     marker: Any
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False)
 class RuleResult:
-    """One rule's verdict: its name, sentence, limit and unit, the violations, the worst first, and why they are waived."""
+    """
+    One rule's verdict.
+
+    Attributes
+    ----------
+    rule, sentence : str
+        Name, and what it asks.
+    limit : float
+        In ``unit``.
+    unit : str
+    values : (n_violation,) float64
+        What was measured where the rule is broken, the worst first.
+    waiver : str or None
+        Why the rule may be broken.
+    """
 
     rule: str
     sentence: str
     limit: float
     unit: str
-    violations: tuple[Violation, ...]
-    waiver: str | None = None
+    values: Floats
+    waiver: str | None
+    _places: Callable[[], tuple[Any, Any]]
+
+    @cached_property
+    def violations(self) -> tuple[Violation, ...]:
+        """The places where the rule is broken, the worst first; made when they are asked for."""
+        if self.values.size == 0:
+            return ()
+        sites, markers = self._places()
+        return tuple(
+            Violation(self.rule, tuple(int(site) for site in ids), value, self.limit, self.unit, marker)
+            for ids, value, marker in zip(sites, self.values.tolist(), markers, strict=True)
+        )
+
+    def __len__(self) -> int:
+        return self.values.size
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # The places are functions of the layout: only what they give can be sent.
+        found = self.violations
+        places = ([v.site_ids for v in found], [v.marker for v in found])
+        return RuleResult, (
+            self.rule, self.sentence, self.limit, self.unit, self.values, self.waiver, partial(tuple, places)
+        )  # fmt: skip
 
     @property
     def ok(self) -> bool:
         """Whether the rule is kept, or waived."""
-        return not self.violations or self.waiver is not None
+        return self.values.size == 0 or self.waiver is not None
 
     def __str__(self) -> str:
         if self.worst is None:
             return f"{self.rule}: kept"
-        count = f"{len(self.violations)} violation{'s' * (len(self.violations) != 1)}"
+        count = f"{self.values.size} violation{'s' * (self.values.size != 1)}"
         waived = "" if self.waiver is None else f" (waived: {self.waiver})"
         unit = f" {self.unit}" if self.unit else ""
         return f"{self.rule}: {count}, worst {self.worst:.6g}{unit} for a limit of {self.limit:g}{unit}{waived}"
@@ -225,7 +262,7 @@ class RuleResult:
     @property
     def worst(self) -> float | None:
         """The value furthest beyond the limit, or None."""
-        return self.violations[0].value if self.violations else None
+        return float(self.values[0]) if self.values.size else None
 
 
 @dataclass(frozen=True)
@@ -303,12 +340,12 @@ class Report:
             worst = "" if r.worst is None else f"{r.worst:.6g}"
             verdict = (
                 "[green]pass[/green]"
-                if not r.violations
+                if r.values.size == 0
                 else "[red]fail[/red]"
                 if not r.ok
                 else "[yellow]waived[/yellow]"
             )
-            table.add_row(r.rule, verdict, str(len(r.violations)), worst, f"{r.limit:g}", r.unit)
+            table.add_row(r.rule, verdict, f"{r.values.size}", worst, f"{r.limit:g}", r.unit)
         return table
 
 
@@ -334,23 +371,22 @@ def check(layout: Layout, rules: DesignRules) -> Report:
         limit = getattr(rules, name)
         if limit is not None:
             bound = 0.0 if rule.is_deviation else float(limit)
-            violations = _violations(name, rule, rule.measure(case), bound, case)
-            results.append(
-                RuleResult(name, rule.sentence, bound, rule.unit, violations, (rules.waivers or {}).get(name))
-            )
+            values, places = _broken(rule, rule.measure(case), bound, case)
+            waiver = (rules.waivers or {}).get(name)
+            results.append(RuleResult(name, rule.sentence, bound, rule.unit, values, waiver, places))
     return Report(layout.n_sites, tuple(results))
 
 
-def _violations(name: str, rule: Rule, found: Measured, limit: float, case: Case) -> tuple[Violation, ...]:
-    """The values that break the limit, the worst first."""
+def _broken(rule: Rule, found: Measured, limit: float, case: Case) -> tuple[Floats, Callable[[], tuple[Any, Any]]]:
+    """The values that break the limit, the worst first, and what gives their sites and markers."""
     beyond = found.values - limit if rule.is_upper else limit - found.values
     bad = np.flatnonzero(beyond > rule.rounding)
-    if bad.size == 0:
-        return ()
     bad = bad[np.argsort(-beyond[bad], kind="stable")]
-    sites = bad[:, np.newaxis] if found.sites is None else found.sites(bad)
-    markers = case.shapes(bad) if found.markers is None else found.markers(bad)
-    return tuple(
-        Violation(name, tuple(int(site) for site in ids), float(value), limit, rule.unit, marker)
-        for ids, value, marker in zip(sites, found.values[bad], markers, strict=True)
-    )
+
+    def places() -> tuple[Any, Any]:
+        return (
+            bad[:, np.newaxis] if found.sites is None else found.sites(bad),
+            case.shapes(bad) if found.markers is None else found.markers(bad),
+        )
+
+    return found.values[bad], places

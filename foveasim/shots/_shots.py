@@ -148,7 +148,7 @@ def results_table(results: Sequence[Result]) -> Table:
 def _verdict(report: Report | None) -> str:
     if report is None:
         return "none given"
-    return "kept" if report.ok else f"{len(report.violations):,} violations"
+    return "kept" if report.ok else f"{sum(len(result) for result in report.results):,} violations"
 
 
 def _blind_spot(layout: Layout) -> str:

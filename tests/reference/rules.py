@@ -220,17 +220,22 @@ def neighbour_ratios(layout, _rules):
 
 
 def gaps(layout, rules):
+    """With sites a little too large, so that no slit is left; the gaps are then as much too small."""
     polygons = layout.polygons()
-    covered = shapely.union_all(polygons, grid_size=SLIT_UM)
+    covered = shapely.unary_union([polygon.buffer(SLIT_UM, join_style="mitre") for polygon in polygons])
     if rules.die_um is None:
         field = shapely.box(*covered.bounds).buffer(10.0, join_style="mitre")
     else:
         field = shapely.box(*rules.die_um)
-    parts = shapely.get_parts(shapely.difference(field, covered, grid_size=SLIT_UM))
+    parts = [
+        part.buffer(SLIT_UM, join_style="mitre", mitre_limit=1e4).intersection(field)
+        for part in shapely.get_parts(field.difference(covered))
+        if rules.die_um is not None or part.disjoint(field.exterior)
+    ]
     return [
         (tuple(i for i, polygon in enumerate(polygons) if polygon.distance(part) < N_SLITS * SLIT_UM), part.area)
         for part in parts
-        if part.area > part.length * SLIT_UM and (rules.die_um is not None or part.distance(field.exterior) > 1.0)
+        if part.area > part.length * SLIT_UM
     ]
 
 

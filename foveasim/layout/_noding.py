@@ -1,0 +1,81 @@
+"""Points that lie on edges but for rounding: what noding a layout and looking for gaps have in common."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+
+from foveasim.arrays import Floats, Ints
+
+__all__ = ["ON_EDGE_UM", "noded_edges", "points_on_edges"]
+
+#: A point this close to an edge lies on it, and two points this close are one.
+ON_EDGE_UM = 1e-6
+
+
+def points_on_edges(points_um: Floats, begin_um: Floats, end_um: Floats) -> tuple[Ints, Ints, Floats]:
+    """
+    Points that lie on edges, not at their ends.
+
+    Parameters
+    ----------
+    points_um : (n_point, 2) float64, µm
+    begin_um, end_um : (n_edge, 2) float64, µm
+
+    Returns
+    -------
+    edge, point : (n,) int64
+    share : (n,) float64
+        How far along the edge, from 0 to 1.
+    """
+    edges = shapely.linestrings(np.stack((begin_um, end_um), axis=1))
+    edge, point = shapely.STRtree(shapely.points(points_um)).query(edges, predicate="dwithin", distance=ON_EDGE_UM)
+    along = end_um[edge] - begin_um[edge]
+    length2 = np.einsum("ij,ij->i", along, along)
+    share = np.einsum("ij,ij->i", points_um[point] - begin_um[edge], along) / length2
+    margin = ON_EDGE_UM / np.sqrt(length2)
+    is_inside = (share > margin) & (share < 1.0 - margin)
+    return edge[is_inside], point[is_inside], share[is_inside]
+
+
+def noded_edges(begin_um: Floats, end_um: Floats) -> tuple[Floats, Floats]:
+    """
+    Edges with ends that are one wherever they are as good as one, cut at all ends of others that lie on them.
+
+    Parameters
+    ----------
+    begin_um, end_um : (n_edge, 2) float64, µm
+
+    Returns
+    -------
+    begin_um, end_um : (n, 2) float64, µm
+    """
+    points, ends = _one_point_each(np.concatenate((begin_um, end_um)))
+    first, last = np.split(ends, 2)
+    is_edge = first != last
+    first, last = first[is_edge], last[is_edge]
+    if first.size == 0:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    edge, point, share = points_on_edges(points, points[first], points[last])
+    # Every edge as a run of points: its first one, those on it in their order, its last one.
+    owner = np.concatenate((np.arange(first.size), edge, np.arange(first.size)))
+    order = np.lexsort((np.concatenate((np.full(first.size, -1.0), share, np.full(first.size, 2.0))), owner))
+    run = np.concatenate((first, point, last))[order]
+    is_step = np.diff(owner[order]) == 0
+    return points[run[:-1][is_step]], points[run[1:][is_step]]
+
+
+def _one_point_each(xy_um: Floats) -> tuple[Floats, Ints]:
+    """Points without those that are another one but for rounding, and which of them each is."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    points, index = np.unique(xy_um, axis=0, return_inverse=True)
+    pairs = cKDTree(points).query_pairs(ON_EDGE_UM, output_type="ndarray")
+    if pairs.size == 0:
+        return points, index.ravel()
+    graph = coo_array((np.ones(pairs.shape[0], bool), (pairs[:, 0], pairs[:, 1])), shape=(points.shape[0],) * 2)
+    group = np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+    _, first = np.unique(group, return_index=True)
+    return points[first], group[index.ravel()]
