@@ -61,7 +61,8 @@ class DesignRules:
         Smallest distance between two sites that do not touch. Sites that abut keep it: check what is sensitive to light,
         after an inset, where that is what must be apart.
     max_aspect_ratio : float, optional
-        Longer over shorter side of the smallest rectangle, at any angle, around a site.
+        Longer over shorter side of the smallest rectangle, at any angle, around a site; of equally small ones the least
+        elongated.
     min_angle_deg : float, optional, degrees
         Smallest inner angle of a corner.
     edge_angle_step_deg : float, optional, degrees
