@@ -10,7 +10,7 @@ import yaml
 
 from foveasim.errors import ConfigError
 
-__all__ = ["parsed", "read_yaml"]
+__all__ = ["MAX_FILE_BYTES", "parsed", "read_text", "read_yaml"]
 
 #: A settings file is written by hand; a longer one is something else.
 MAX_FILE_BYTES = 1 << 20
@@ -69,6 +69,25 @@ def parsed(path: Path, text: str) -> Any:
         raise ConfigError(path, f"is not YAML as settings need it: {error}") from None
 
 
+def read_text(path: Path) -> str:
+    """
+    A text that was written by hand or by a small program.
+
+    Raises
+    ------
+    ConfigError
+        When it is no file, too large, or no text in UTF-8.
+    """
+    if not path.is_file():
+        raise ConfigError(path, "no such file" if not path.exists() else "is not a file")
+    if path.stat().st_size > MAX_FILE_BYTES:
+        raise ConfigError(path, f"is larger than {MAX_FILE_BYTES} bytes, and so no settings file")
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        raise ConfigError(path, "is no text file in UTF-8") from None
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """
     The settings in a file.
@@ -78,14 +97,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     ConfigError
         When it is no file, too large, no text, no YAML, or no mapping.
     """
-    if not path.is_file():
-        raise ConfigError(path, "no such file" if not path.exists() else "is not a file")
-    if path.stat().st_size > MAX_FILE_BYTES:
-        raise ConfigError(path, f"is larger than {MAX_FILE_BYTES} bytes, and so no settings file")
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        raise ConfigError(path, "is no text file in UTF-8") from None
+    text = read_text(path)
     data = parsed(path, text)
     if not isinstance(data, dict):
         raise ConfigError(

@@ -21,7 +21,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 FLOORS = [
     {"errors", "_version"},
     {"arrays", "compiled", "files"},
-    {"encodings", "units", "parallel", "records", "streams", "rings", "pictures"},
+    {"documents", "encodings", "parallel", "pictures", "records", "rings", "streams", "units"},
     {"fields"},
     {"layout", "scene", "optics", "integrate", "sensor"},
     {"reconstruct"},

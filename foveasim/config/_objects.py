@@ -16,7 +16,7 @@ from foveasim.arrays import check_number
 from foveasim.camera import Camera
 from foveasim.config._models import PICTURES, LayoutUnion, PerArea, RulesSection, ShotSection, call_of
 from foveasim.config._problems import validated
-from foveasim.config._yaml import parsed, read_yaml
+from foveasim.documents import parsed, read_yaml
 from foveasim.errors import ConfigError, FoveasimError, ParameterError
 from foveasim.fields import Grid
 from foveasim.layout import PRESETS, DesignRules, Layout, inset, mosaic, read_layout, snap
