@@ -14,12 +14,13 @@ from scipy.spatial import cKDTree
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid
 from foveasim.layout import Layout
-from foveasim.layout._voronoi import cells_of, disc
+from foveasim.layout._regions import disc
+from foveasim.layout._voronoi import MovingCells, cells_of, edges_of_rings
 from foveasim.layout.fovi import fovi
 from foveasim.layout.penrose import penrose
 from foveasim.layout.quadtree import quadtree
 from foveasim.layout.sunflower import sunflower
-from foveasim.layout.voronoi import voronoi
+from foveasim.layout.voronoi import _capacities, _density, _first_centres, _follow_equal, _slopes, voronoi
 
 relaxed = settings(deadline=None, derandomize=True, max_examples=30)
 GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
@@ -129,6 +130,24 @@ def test_a_part_that_a_notch_cuts_off_goes_to_its_neighbour():
     assert bool(np.all(shapely.get_type_id(layout.polygons()) == shapely.GeometryType.POLYGON))
 
 
+@given(st.sampled_from([NOTCH, STAR]), st.integers(8, 80), seeds)
+@settings(relaxed, max_examples=60)
+def test_a_part_that_is_cut_off_goes_where_it_has_the_longest_border(region, n, seed):
+    """The oracle's cells are shapely's; layouts with one such part."""
+    centres = points_in(region, n, seed)
+    whole = shapely.voronoi_polygons(shapely.multipoints(centres), extend_to=region, ordered=True)
+    cells = shapely.intersection(shapely.get_parts(whole), region)
+    parts, owner = shapely.get_parts(cells, return_index=True)
+    is_left = ~shapely.intersects(parts, shapely.points(centres[owner]))
+    assume(is_left.sum() == 1)
+    part, mains = parts[is_left][0], parts[~is_left]
+    shared_um = shapely.length(shapely.intersection(shapely.buffer(part, 1e-6), shapely.boundary(mains)))
+    layout = as_layout(*cells_of(centres, region))
+    assume(np.diff(np.sort(shared_um)[-2:])[0] > 1e-3)
+
+    assert bool(shapely.contains(layout.polygons()[shared_um.argmax()], part.point_on_surface()))
+
+
 def test_one_centre_takes_the_whole_region():
     layout = as_layout(*cells_of(np.array([(0.3, -0.2)]), STAR))
 
@@ -164,6 +183,101 @@ def test_a_hundred_thousand_cells_tile():
 def test_centres_without_a_cell_are_refused(centres, region, error, message):
     with pytest.raises(error, match=message):
         cells_of(np.array(centres, float), region)
+
+
+# -- cells that follow their centres -----------------------------------------------------------------------------------
+
+
+def areas_um2(edges, n):
+    """Shoelace sums of edges in any order."""
+    (x0, y0), (x1, y1) = edges.start_um.T, edges.stop_um.T
+    return np.bincount(edges.cell, 0.5 * (x0 * y1 - x1 * y0), minlength=n)
+
+
+@given(st.sampled_from([BOX, NOTCH, STAR, FRAME]), st.integers(5, 120), st.sampled_from([0.05, 0.3, 1.0]), seeds)
+@relaxed
+def test_cells_that_follow_their_centres_are_those_made_anew(region, n, share_of_way, seed):
+    """Also where a notch cuts cells apart, and whether centres move a little or anywhere."""
+    centres, targets = points_in(region, n, seed), points_in(region, n, seed + 1)
+    cells = MovingCells(region)
+    for _ in range(4):
+        edges = cells.follow(centres)
+        expected = as_layout(*cells_of(centres, region)) if region is not FRAME else None
+        tolerance_um2 = 1e-9 * region.area / n
+
+        assert areas_um2(edges, n).sum() == pytest.approx(region.area, rel=1e-9)
+        np.testing.assert_allclose(
+            areas_um2(edges, n), areas_um2(MovingCells(region).follow(centres), n), atol=tolerance_um2
+        )
+        if expected is not None:
+            np.testing.assert_allclose(areas_um2(edges, n), expected.area_um2, atol=tolerance_um2)
+            assert_tiles(as_layout(*cells.rings()), region.area)
+        moved = centres + share_of_way * (targets - centres)
+        centres = np.where(shapely.contains_xy(region, moved)[:, np.newaxis], moved, centres)
+
+
+@given(st.sampled_from([BOX, disc(7.0, 31)]), st.integers(1, 60), st.floats(0.0, 3.0), seeds)
+@relaxed
+def test_every_point_of_a_power_cell_has_the_least_power_from_its_centre(region, n, spread, seed):
+    """Twice: for weights met first, and after other weights."""
+    centres, points = points_in(region, n, seed), points_in(region, 500, seed + 1)
+    rng = np.random.default_rng(seed)
+    cells = MovingCells(region)
+    for _ in range(2):
+        weights = rng.random(n) * spread * region.area / n
+        if cells.follow(centres, weights) is None:
+            continue
+        layout = as_layout(*cells.rings())
+        power = ((points[:, np.newaxis] - centres) ** 2).sum(axis=2) - weights
+
+        assert_tiles(layout, region.area)
+        assert bool(np.all(shapely.covers(layout.polygons()[power.argmin(axis=1)].tolist(), shapely.points(points))))
+
+
+def test_a_power_cell_need_not_hold_its_centre():
+    cells = MovingCells(BOX)
+    cells.follow(np.array([(0.0, 0.0), (2.0, 0.0)]), np.array([0.0, 10.0]))
+    layout = as_layout(*cells.rings())
+
+    # |x|² = (x - 2)² - 10 at x = -1.5, left of the first centre
+    assert layout.bounds_um == BOX.bounds
+    assert layout.polygons()[0].bounds == (-10.0, -5.0, -1.5, 8.0)
+
+
+def test_a_centre_of_too_little_weight_has_no_cell():
+    centres = points_in(BOX, 30, 0)
+    weights = np.zeros(30)
+    weights[4] = -1e3
+    cells = MovingCells(BOX)
+
+    assert cells.follow(centres, weights) is None
+    assert cells.follow(centres) is not None
+    assert cells.follow(centres, weights) is None
+
+
+@pytest.mark.parametrize("more", [-1e5, 1e5])
+def test_only_differences_of_weights_count(more):
+    centres, weights = points_in(BOX, 30, 0), np.random.default_rng(0).random(30)
+
+    np.testing.assert_allclose(
+        areas_um2(MovingCells(BOX).follow(centres, weights + more), 30),
+        areas_um2(MovingCells(BOX).follow(centres, weights), 30),
+        rtol=1e-6,
+    )
+
+
+def test_edges_that_two_cells_share_are_found_from_both_sides():
+    centres = points_in(STAR, 80, 3)
+    edges = MovingCells(STAR).follow(centres)
+    one, other = edges.twins()
+    is_shared = np.zeros(edges.cell.size, bool)
+    is_shared[one] = is_shared[other] = True
+    rest = shapely.linestrings(np.stack((edges.start_um, edges.stop_um), axis=1)[~is_shared])
+
+    assert np.array_equal(edges.start_um[one], edges.stop_um[other])
+    assert np.array_equal(edges.stop_um[one], edges.start_um[other])
+    assert shapely.length(rest).sum() == pytest.approx(STAR.length, rel=1e-9)
+    assert shapely.distance(STAR.boundary, shapely.centroid(rest)).max() < 1e-9
 
 
 # -- isotropic foveal rings ------------------------------------------------------------------------------------------
@@ -408,19 +522,256 @@ def test_few_sites_lie_where_a_picture_is_black():
     assert ((x < 15) & (y < 10)).sum() > 0.8 * 600
 
 
+def slope(xy_um):
+    return 20.0 + xy_um[:, 0] - 0.5 * xy_um[:, 1]
+
+
+def rough(region):
+    """A picture that jumps from cell to cell, over a region."""
+    low, high = np.reshape(region.bounds, (2, 2))
+    pitch_um = (high - low).max() / 16
+    return np.random.default_rng(8).random((16, 16)) + 0.05, Grid((16, 16), pitch_um, tuple(low))
+
+
+def of_picture(region, picture=None):
+    values, grid = rough(region)
+    return {"density": values if picture is None else picture, "density_grid": grid}
+
+
+def picture_in(polygon, values, grid, power=1):
+    """Integrals over a polygon of a picture's power, and of that times x and y: cell by cell of the picture."""
+    rows, columns = np.divmod(np.arange(values.size), values.shape[1])
+    x0, y0 = grid.origin_um[0] + columns * grid.pitch_um, grid.origin_um[1] + rows * grid.pitch_um
+    common = shapely.intersection(shapely.box(x0, y0, x0 + grid.pitch_um, y0 + grid.pitch_um), polygon)
+    weight = values.ravel() ** power * shapely.area(common)
+    middle = np.where(weight[:, np.newaxis] > 0, shapely.get_coordinates(shapely.centroid(polygon)), 0.0)
+    middle[weight > 0] = shapely.get_coordinates(shapely.centroid(common[weight > 0]))
+    return weight.sum(), weight @ middle
+
+
+def function_in(ring, centre, function):
+    """The same of a function's square, by three points of each triangle of an edge and the centre."""
+    mass, moment = 0.0, np.zeros(2)
+    for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+        area_um2 = 0.5 * ((a - centre)[0] * (b - centre)[1] - (a - centre)[1] * (b - centre)[0])
+        for corners in ((centre, centre, a, b), (a, centre, a, b), (b, centre, a, b)):
+            point = (3 * np.array(corners[0]) + np.sum(corners[1:], axis=0)) / 6
+            mass += area_um2 / 3 * function(point[np.newaxis])[0] ** 2
+            moment += area_um2 / 3 * function(point[np.newaxis])[0] ** 2 * point
+    return mass, moment
+
+
+@given(regions, st.integers(1, 25), st.sampled_from(["even", "function", "picture"]), st.integers(1, 3), seeds)
+@settings(relaxed, max_examples=15)
+def test_lloyds_quick_steps_are_those_of_whole_cells(region, n_sites, kind, n_iterations, seed):
+    """The twin makes all cells each time, and takes them one by one."""
+    density, grid = {"even": (None, None), "function": (fovea, None), "picture": rough(region)}[kind]
+    centres = _first_centres(n_sites, *_density(density, grid, region)[1:], region, seed)
+    for _ in range(n_iterations):
+        cells = as_layout(*cells_of(centres, region))
+        for i, polygon in enumerate(cells.polygons()):
+            if kind == "even":
+                mass, moment = polygon.area, polygon.area * shapely.get_coordinates(polygon.centroid)[0]
+            elif kind == "function":
+                mass, moment = function_in(shapely.get_coordinates(polygon)[:-1], centres[i], fovea)
+            else:
+                mass, moment = picture_in(polygon, density, grid, power=2)
+            if shapely.contains_xy(region, *(moment / mass)):
+                centres[i] = moment / mass
+    twin = as_layout(*cells_of(centres, region))
+    layout = voronoi(
+        n_sites=n_sites, region=region, density=density, density_grid=grid, n_iterations=n_iterations, seed=seed
+    )
+
+    np.testing.assert_allclose(layout.area_um2, twin.area_um2, rtol=1e-9)
+    np.testing.assert_allclose(layout.centroid_um, twin.centroid_um, atol=1e-8)
+    np.testing.assert_allclose(shapely.length(layout.polygons()), shapely.length(twin.polygons()), rtol=1e-9)
+
+
+@pytest.mark.parametrize("capacity", ["free", "equal"])
+def test_shares_are_the_integrals_of_a_picture(capacity):
+    values, grid = rough(STAR)
+    layout = voronoi(n_sites=40, region=STAR, density=values, density_grid=grid, n_iterations=3, capacity=capacity)
+    mass = np.array([picture_in(polygon, values, grid)[0] for polygon in layout.polygons()])
+
+    np.testing.assert_allclose(layout.columns["share"], mass / mass.mean(), rtol=1e-9)
+
+
+@pytest.mark.parametrize("capacity", ["free", "equal"])
+def test_shares_are_the_integrals_of_a_function(capacity):
+    """Of one that is linear in x and y: the area times the value in the middle."""
+    layout = voronoi(n_sites=40, region=NOTCH, density=slope, n_iterations=3, capacity=capacity)
+    mass = layout.area_um2 * slope(layout.centroid_um)
+
+    np.testing.assert_allclose(layout.columns["share"], mass / mass.mean(), rtol=1e-9)
+
+
+@pytest.mark.parametrize("width_um", [0.5, 2.0, 20.0])
+@pytest.mark.parametrize("n_sites", [1, 40])
+def test_a_functions_integrals_are_right_to_seven_digits(width_um, n_sites):
+    """A bell over a box, of closed form, narrower and wider than sites."""
+
+    def bell(xy_um):
+        return np.exp(-(xy_um**2).sum(axis=1) / (2 * width_um**2))
+
+    layout = voronoi(n_sites=n_sites, region=BOX, n_iterations=2)
+    field = _density(bell, None, BOX)[0]
+    mass, _ = field.moments(edges_of_rings(layout.xy_um, layout.ring_offsets), layout.centroid_um)
+    x, y = (
+        math.erf(high / width_um / math.sqrt(2)) - math.erf(low / width_um / math.sqrt(2))
+        for low, high in ((-10, 20), (-5, 8))
+    )
+
+    assert mass.sum() == pytest.approx(0.5 * math.pi * width_um**2 * x * y, rel=1e-7)
+
+
+@given(
+    st.integers(1, 60),
+    st.sampled_from([BOX, NOTCH, disc(7.0, 31)]),
+    st.sampled_from(["even", "fovea", "picture"]),
+    st.integers(0, 4),
+    seeds,
+)
+@relaxed
+def test_sites_of_equal_capacity_tile_and_hold_the_same(n_sites, region, kind, n_iterations, seed):
+    density = {"even": {}, "fovea": {"density": fovea}, "picture": of_picture(region)}[kind]
+    layout = voronoi(n_sites=n_sites, region=region, n_iterations=n_iterations, capacity="equal", seed=seed, **density)
+
+    assert layout.n_sites == n_sites
+    assert_tiles(layout, region.area)
+    np.testing.assert_allclose(layout.columns["share"], 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("region", [BOX, NOTCH, STAR, FRAME], ids=["box", "notch", "star", "frame"])
+@pytest.mark.parametrize("n_sites", [30, 300])
+def test_equal_capacity_of_an_even_density_is_equal_area(n_sites, region):
+    """With a star's notches, too, that cut cells apart: capacities jump there, and centres have to move on."""
+    layout = voronoi(n_sites=n_sites, region=region, capacity="equal", n_iterations=5)
+
+    assert_tiles(layout, region.area)
+    np.testing.assert_allclose(layout.area_um2, region.area / n_sites, rtol=1e-6)
+
+
+def test_sites_of_equal_capacity_are_as_even_as_free_ones():
+    """Closest pairs, and the perimeter of a site of unit area: of a hexagon 3.72, of a square 4."""
+    free, equal = (voronoi(n_sites=1000, size_um=(40.0, 25.0), capacity=capacity) for capacity in ("free", "equal"))
+    around_free, around_equal = (
+        np.median(shapely.length(layout.polygons()) / np.sqrt(layout.area_um2)) for layout in (free, equal)
+    )
+
+    assert nearest_um(equal.centroid_um).min() > 0.7 * math.sqrt(2 / math.sqrt(3))
+    assert around_equal == pytest.approx(around_free, abs=0.05)
+    assert free.columns["share"].std() > 0.05
+
+
+def test_equal_capacity_holds_where_a_density_falls_to_a_ten_thousandth():
+    layout = voronoi(
+        n_sites=2000, region=disc(100.0, 360), density=lambda xy_um: fovea(5 * xy_um) ** 1.5, capacity="equal"
+    )
+
+    assert layout.area_um2.max() > 1000 * layout.area_um2.min()
+    assert_tiles(layout, regular_polygon_um2(360, 100.0))
+    np.testing.assert_allclose(layout.columns["share"], 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("n_sites", [5, 40])
+def test_equal_capacity_reaches_over_black_parts_of_a_picture(n_sites):
+    """White squares on black, whose numbers of sites would not be whole."""
+    picture = np.zeros((16, 16))
+    picture[1:4, 1:4] = picture[1:4, 11:15] = picture[10:15, 6:9] = 1.0
+    layout = voronoi(n_sites=n_sites, region=BOX, capacity="equal", n_iterations=4, **of_picture(BOX, picture))
+
+    assert_tiles(layout, BOX.area)
+    np.testing.assert_allclose(layout.columns["share"], 1.0, atol=1e-6)
+
+
+def test_of_a_cell_that_a_notch_cuts_apart_the_heaviest_part_stays():
+    """White in the two arms of an angle: a cell's larger part may be black, and its smaller one hold all."""
+    picture = np.zeros((60, 60))
+    picture[15:50, 20:55] = 1.0
+    grid = Grid((60, 60), 1 / 6)
+    layout = voronoi(n_sites=30, region=NOTCH, density=picture, density_grid=grid, n_iterations=0, capacity="equal")
+
+    assert_tiles(layout, NOTCH.area)
+    np.testing.assert_allclose(layout.columns["share"], 1.0, atol=1e-6)
+
+
+def test_centres_move_on_where_they_have_no_cells_of_equal_capacity():
+    """No weights do with these first centres in a star: parts that its notches cut off are too large."""
+    layout = voronoi(n_sites=150, region=STAR, n_iterations=0, capacity="equal", seed=1)
+
+    np.testing.assert_allclose(layout.columns["share"], 1.0, atol=1e-6)
+
+
+def test_centres_come_to_lie_in_the_middle_of_cells_of_equal_capacity():
+    field = _density(fovea, None, BOX)[0]
+    centres = points_in(BOX, 200, 0)
+    for n_moves, furthest in ((2, 0.2), (8, 0.08)):
+        cells = MovingCells(BOX)
+        _follow_equal(cells, centres, field, n_moves)
+        layout = as_layout(*cells.rings())
+        mass, moment = field.moments(edges_of_rings(layout.xy_um, layout.ring_offsets), layout.centroid_um)
+        off_um = np.hypot(*(moment / mass[:, np.newaxis] - cells.centres_um).T)
+
+        np.testing.assert_allclose(mass, mass.mean(), rtol=1e-6)
+        assert (off_um / np.sqrt(layout.area_um2)).max() < furthest
+
+
+@pytest.mark.parametrize("is_own", [True, False], ids=["own", "given"])
+@pytest.mark.parametrize("kind", ["even", "fovea", "picture"])
+def test_masses_change_with_weights_as_the_edges_sweep(kind, is_own):
+    """In a star, whose notches cut cells apart; measured by small steps of each weight."""
+    density, grid = {"even": (None, None), "fovea": (fovea, None), "picture": rough(STAR)}[kind]
+    field = _density(density, grid, STAR)[0]
+    centres, n, step_um2 = points_in(STAR, 25, 10), 25, 1e-5
+    cells = MovingCells(STAR)
+
+    def mass(weights):
+        edges = cells.follow(centres, weights)
+        assert (edges.cell != edges.owner).any()
+        return _capacities(edges, weights, field, is_own=is_own).mass
+
+    measured = np.stack([mass(w) - mass(-w) for w in step_um2 * np.eye(n)], axis=1) / (2 * step_um2)
+    slopes = _slopes(centres, field, cells.follow(centres, np.zeros(n)), is_own=is_own).toarray()
+
+    np.testing.assert_allclose(slopes, measured, atol=1e-3 * np.abs(slopes).max())
+    np.testing.assert_allclose(slopes.sum(axis=0), 0.0, atol=1e-12)
+
+
+def test_one_seed_gives_one_layout_of_equal_capacity():
+    one, again = (voronoi(n_sites=40, region=STAR, density=fovea, capacity="equal", seed=3) for _ in range(2))
+
+    assert_same(one, again)
+
+
+def test_equal_capacity_of_a_function_that_jumps_is_refused():
+    with pytest.raises(
+        GeometryError, match=r"found no cells of equal capacity: the best ones differ .*a picture of it"
+    ):
+        voronoi(
+            n_sites=20,
+            size_um=(10.0, 10.0),
+            density=lambda xy_um: 1.0 + 99.0 * (np.hypot(*xy_um.T) < 3.3),
+            capacity="equal",
+            n_iterations=0,
+            seed=1,
+        )
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"n_sites": 0}, "'n_sites' must be >= 1"),
         ({"n_iterations": -1}, "'n_iterations' must be >= 0"),
+        ({"capacity": "same"}, "'capacity' must be one of 'free', 'equal'"),
         ({"seed": -1}, "'seed' must be >= 0"),
         ({"size_um": None}, "'size_um' or 'region' or 'density_grid' must tell"),
         ({"size_um": (1.0, 2.0, 3.0)}, "'size_um' must be two numbers"),
         ({"size_um": (1.0, 0.0)}, r"'size_um\[1\]' must be > 0"),
         ({"region": BOX}, "'region' and 'size_um' exclude each other"),
         ({"size_um": None, "region": [(0, 0), (1, 1)]}, "'region' must have the shape"),
-        ({"size_um": None, "region": [(0, 0), (1, 1), (1, 0), (0, 1)]}, "'region' must be one polygon"),
-        ({"size_um": None, "region": shapely.Point(0, 0)}, "'region' must be one polygon"),
+        ({"size_um": None, "region": [(0, 0), (1, 1), (1, 0), (0, 1)]}, "'region' must be (one|a valid|a shapely) [pP]olygon"),
+        ({"size_um": None, "region": shapely.Point(0, 0)}, "'region' must be (one|a valid|a shapely) [pP]olygon"),
         ({"size_um": None, "region": shapely.box(0, 0, 1e8, 1)}, "'region' must lie within"),
         ({"density": np.ones((2, 2))}, "'density_grid' must be the Grid"),
         (
@@ -667,6 +1018,13 @@ def test_irregular_layouts_tell_their_origin(layout, generator):
 def test_the_told_origin_of_density_driven_sites_makes_the_same_sites():
     layout = voronoi(n_sites=30, region=STAR, n_iterations=2, seed=7)
 
+    assert_same(voronoi(**layout.provenance["parameters"]), layout)
+
+
+def test_the_told_origin_of_sites_of_equal_capacity_makes_the_same_sites():
+    layout = voronoi(n_sites=30, region=STAR, n_iterations=2, capacity="equal", seed=7)
+
+    assert layout.provenance["parameters"]["capacity"] == "equal"
     assert_same(voronoi(**layout.provenance["parameters"]), layout)
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 import shapely
@@ -12,15 +13,11 @@ from numpy.typing import NDArray
 from foveasim.arrays import Bools, Floats, Ints
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._model import Layout
-from foveasim.rings import ring_moments
+from foveasim.layout._power import N_FAR, PowerDiagram, far_points_um
+from foveasim.rings import next_vertex, ring_moments
 
-if TYPE_CHECKING:
-    from scipy.spatial import Voronoi
+__all__ = ["CellEdges", "MovingCells", "cells_of", "edges_of_rings"]
 
-__all__ = ["cells_of", "disc"]
-
-#: Points outside that close the outer cells: further from every point of the region than any centre is.
-N_FAR, FAR_RADII = 8, 4.0
 #: Edges shorter than this share of their centres' distance are one corner that rounding split, as on a square grid.
 SHORT_EDGE = 1e-9
 #: Areas of all cells together, against the region's.
@@ -58,39 +55,144 @@ def cells_of(centres_um: Floats, region: shapely.Polygon) -> tuple[Floats, Ints]
     cell goes to the neighbour with which it shares the longest border.
     """
     centres_um = np.ascontiguousarray(centres_um, np.float64)
-    n = centres_um.shape[0]
     _require_apart_and_inside(centres_um, region)
-    low, high = np.reshape(region.bounds, (2, 2))
-    middle = 0.5 * (low + high)
-    turn = 2.0 * math.pi * (np.arange(N_FAR) + 0.5) / N_FAR
-    far = FAR_RADII * 0.5 * math.hypot(*(high - low)) * np.stack((np.cos(turn), np.sin(turn)), axis=1)
-    from scipy.spatial import Voronoi
-
-    diagram = Voronoi(np.concatenate((centres_um - middle, far)))
-    xy_um = diagram.vertices + middle
-    sites, corners = _edges(diagram, n)
-    site, start, stop = _walks(centres_um, xy_um, sites, corners)
-    offsets = np.concatenate(([0], np.cumsum(np.bincount(site, minlength=n))))
-    _require_closed(start, stop, offsets)
-
-    cells = _polygons(xy_um[start], offsets)
+    diagram = _voronoi(centres_um, region)
+    whole = _whole_rings(diagram, centres_um)
     shapely.prepare(region)
-    is_inside = shapely.contains_properly(region, cells)
-    border = np.flatnonzero(~is_inside)
-    if border.size:
-        is_border_edge = ~is_inside[site]
-        ends = np.unique(np.sort(np.stack((start, stop), axis=1)[is_border_edge], axis=1), axis=0)
-        clipped = _clipped(centres_um, xy_um[ends], region, ~is_inside)
-        rings_um, clipped_offsets = _rings(clipped, border)
-    else:
-        rings_um, clipped_offsets = np.zeros((0, 2)), np.zeros(1, np.int64)
-    return _merged(xy_um[start], offsets, rings_um, clipped_offsets, border, float(region.area))
+    return _clipped(diagram, *whole, shapely.contains_properly(region, _polygons(*whole)), region)
 
 
-def disc(radius_um: float, n_chords: int) -> shapely.Polygon:
-    """Disc around the axis as a regular polygon with its corners on the circle, the first at angle 0."""
-    angle_rad = 2.0 * math.pi * np.arange(n_chords) / n_chords
-    return shapely.Polygon(radius_um * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1))
+@dataclass(frozen=True)
+class CellEdges:
+    """
+    Edges of all cells, each seen from the cell that it runs around counter-clockwise.
+
+    Parameters
+    ----------
+    cell : (n_edge,) int64
+        The cell.
+    owner : (n_edge,) int64
+        The centre to which the cell's part at this edge is nearest: another one where a notch of the region cut the
+        part off its cell.
+    start_um, stop_um : (n_edge, 2) float64, µm
+        Ends.
+    n_twins : int
+        The first ``n_twins`` edges are the next ``n_twins`` ones, seen from the other side.
+    """
+
+    cell: Ints
+    owner: Ints
+    start_um: Floats
+    stop_um: Floats
+    n_twins: int = 0
+
+    def twins(self) -> tuple[Ints, Ints]:
+        """Edges that are the same, seen from both sides: numbers of the ones, numbers of the others."""
+        one, other = np.arange(self.n_twins), np.arange(self.n_twins, 2 * self.n_twins)
+        ends = np.concatenate((self.start_um, self.stop_um), axis=1)[2 * self.n_twins :]
+        is_backward = (ends[:, 0] > ends[:, 2]) | ((ends[:, 0] == ends[:, 2]) & (ends[:, 1] > ends[:, 3]))
+        ends[is_backward] = ends[is_backward][:, (2, 3, 0, 1)]
+        order = np.lexsort(ends.T)
+        at = np.flatnonzero((ends[order][1:] == ends[order][:-1]).all(axis=1))
+        rest = order + 2 * self.n_twins
+        return np.concatenate((one, rest[at])), np.concatenate((other, rest[at + 1]))
+
+
+def edges_of_rings(xy_um: Floats, ring_offsets: Ints) -> CellEdges:
+    """Edges of cells that are packed rings."""
+    cell = np.repeat(np.arange(ring_offsets.size - 1), np.diff(ring_offsets))
+    return CellEdges(cell, cell, xy_um, xy_um[next_vertex(ring_offsets)])
+
+
+#: Masses (n,) of n polygons from their edges.
+MassOf: TypeAlias = Callable[[CellEdges, int], Any]
+
+
+class MovingCells:
+    """
+    Cells in a region that follow their centres: as edges in no order, enough for areas and masses, and quick to have.
+
+    Parts of cells that the region's notches cut off go to neighbours as those of :func:`cells_of` do, and are edges of
+    their own.
+
+    Parameters
+    ----------
+    region : shapely Polygon, µm
+        Convex or not.
+    mass_of : callable, optional
+        Gives the masses (n,) of n polygons from their edges: a cell that a notch cuts apart is its heaviest part then, and
+        the one with its centre otherwise.
+
+    Attributes
+    ----------
+    centres_um : (n, 2) float64, µm
+        The centres that were followed last.
+    """
+
+    def __init__(self, region: shapely.Polygon, mass_of: MassOf | None = None) -> None:
+        self.region, self._boundary, self._mass_of = region, region.boundary, mass_of
+        self._power = PowerDiagram(*np.reshape(region.bounds, (2, 2)))
+        self._weights_um2: Floats | None = None
+        self.centres_um, self._clearance_um = np.zeros((0, 2)), np.zeros(0)
+        self._is_inside = np.zeros(0, bool)
+        shapely.prepare(self.region)
+        shapely.prepare(self._boundary)
+
+    def follow(self, centres_um: Floats, weights_um2: Floats | None = None) -> CellEdges | None:
+        """
+        Edges of the Voronoi cells of centres (n, 2) inside the region, or of their power cells.
+
+        With weights (n,) a point x belongs to the centre c of the least power ``|x - c|² - weight``. None when a centre has
+        no cell in the region: there are no :meth:`rings` then.
+        """
+        if not self._power.follow(centres_um, weights_um2):
+            return None
+        is_inside = self._sure_inside(centres_um)
+        self.centres_um, self._weights_um2 = centres_um, weights_um2
+        diagram = self._diagram()
+        parts, is_inside = _border_parts(diagram, is_inside, self.region, self._mass_of)
+        inner, self._is_inside = _edges_around(diagram, is_inside), is_inside
+        if parts is None:
+            return inner
+        if parts.lost.size:
+            return None
+        outer = parts.edges
+        return CellEdges(
+            np.concatenate((inner.cell, parts.cell[outer.cell])),
+            np.concatenate((inner.owner, parts.owner[outer.cell])),
+            np.concatenate((inner.start_um, outer.start_um)),
+            np.concatenate((inner.stop_um, outer.stop_um)),
+            inner.n_twins,
+        )
+
+    def rings(self) -> tuple[Floats, Ints]:
+        """
+        The last cells as packed rings: corners (n_vertex, 2) and offsets (n + 1,), as of :func:`cells_of`.
+
+        Raises
+        ------
+        GeometryError
+            When centres are too close for float64, or a cell goes round a hole of the region.
+        """
+        diagram = _without_short_edges(self._diagram())
+        whole = _whole_rings(diagram, self.centres_um if self._weights_um2 is None else _middles_um(diagram))
+        return _clipped(diagram, *whole, self._is_inside, self.region, self._mass_of)
+
+    def _diagram(self) -> _Diagram:
+        power = self._power
+        return _Diagram(self.centres_um, self._weights_um2, power.points_um, power.corners_um, power.sites, power.ends)
+
+    def _sure_inside(self, centres_um: Floats) -> Bools:
+        """Whether each cell is surely inside the region: its corners are closer to its centre than the boundary is."""
+        reach_um = self._power.reach_um()
+        if self.centres_um.shape == centres_um.shape:
+            # The boundary has come closer by no more than the centre has moved.
+            self._clearance_um = self._clearance_um - np.hypot(*(centres_um - self.centres_um).T)
+        else:
+            self._clearance_um = np.zeros(centres_um.shape[0])
+        unsure = np.flatnonzero(reach_um >= self._clearance_um)
+        self._clearance_um[unsure] = shapely.distance(self._boundary, shapely.points(centres_um[unsure]))
+        return np.asarray(reach_um < (1.0 - SHORT_EDGE) * self._clearance_um)
 
 
 def _require_apart_and_inside(centres_um: Floats, region: shapely.Polygon) -> None:
@@ -113,42 +215,111 @@ def _require_apart_and_inside(centres_um: Floats, region: shapely.Polygon) -> No
         )
 
 
-def _edges(diagram: Voronoi, n_centres: int) -> tuple[Ints, Ints]:
-    """Centres (n, 2) on both sides of each edge, and its two corners (n, 2), corners that are one having one number."""
-    sites = np.asarray(diagram.ridge_points, dtype=np.int64)
-    corners = np.asarray(diagram.ridge_vertices, dtype=np.int64)
+@dataclass(frozen=True)
+class _Diagram:
+    """
+    Edges of Voronoi or power cells, as far as they reach.
+
+    Centres (n, 2) and weights (n,), the same and far points (n + N_FAR, 2), corners of cells (n_corner, 2), and of each
+    edge: points on its sides (n_edge, 2), and corners at its ends (n_edge, 2).
+    """
+
+    centres_um: Floats
+    weights_um2: Floats | None
+    points_um: Floats
+    xy_um: Floats
+    sites: Ints
+    corners: Ints
+
+    def with_edges(self, is_chosen: Bools) -> _Diagram:
+        return replace(self, sites=self.sites[is_chosen], corners=self.corners[is_chosen])
+
+
+def _voronoi(centres_um: Floats, region: shapely.Polygon) -> _Diagram:
+    from scipy.spatial import Voronoi
+
+    low, high = np.reshape(region.bounds, (2, 2))
+    middle = 0.5 * (low + high)
+    found = Voronoi(np.concatenate((centres_um - middle, far_points_um(low, high))))
+    sites = np.asarray(found.ridge_points, dtype=np.int64)
+    corners = np.asarray(found.ridge_vertices, dtype=np.int64)
     # Edges of far points alone belong to no cell, and only they can be endless.
-    is_ours = (sites < n_centres).any(axis=1)
-    sites, corners = sites[is_ours], corners[is_ours]
-    if (corners < 0).any():
+    is_ours = (sites < centres_um.shape[0]).any(axis=1)
+    if (corners[is_ours] < 0).any():
         raise GeometryError("the centres lie too close together for float64")
-    length_um = np.hypot(*(diagram.vertices[corners[:, 0]] - diagram.vertices[corners[:, 1]]).T)
-    distance_um = np.hypot(*(diagram.points[sites[:, 0]] - diagram.points[sites[:, 1]]).T)
+    diagram = _Diagram(centres_um, None, found.points, found.vertices, sites[is_ours], corners[is_ours])
+    return replace(_without_short_edges(diagram), xy_um=found.vertices + middle)
+
+
+def _without_short_edges(diagram: _Diagram) -> _Diagram:
+    """The edges that are longer than rounding, corners that are one having one number."""
+    sites, corners = diagram.sites, diagram.corners
+    length_um = np.hypot(*(diagram.xy_um[corners[:, 0]] - diagram.xy_um[corners[:, 1]]).T)
+    distance_um = np.hypot(*(diagram.points_um[sites[:, 0]] - diagram.points_um[sites[:, 1]]).T)
     is_short = length_um <= SHORT_EDGE * distance_um
-    if is_short.any():
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components
+    if not is_short.any():
+        return diagram
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
 
-        n_vertices = diagram.vertices.shape[0]
-        graph = coo_array(
-            (np.ones(int(is_short.sum()), bool), (corners[is_short, 0], corners[is_short, 1])),
-            shape=(n_vertices, n_vertices),
-        )
-        group = np.asarray(connected_components(graph, directed=False, return_labels=True)[1], dtype=np.int64)
-        _, first = np.unique(group, return_index=True)
-        corners = np.asarray(first, dtype=np.int64)[group][corners]
-        is_left = corners[:, 0] != corners[:, 1]
-        sites, corners = sites[is_left], corners[is_left]
-    return sites, corners
+    n_corners = diagram.xy_um.shape[0]
+    graph = coo_array(
+        (np.ones(int(is_short.sum()), bool), (corners[is_short, 0], corners[is_short, 1])), shape=(n_corners, n_corners)
+    )
+    group = np.asarray(connected_components(graph, directed=False, return_labels=True)[1], dtype=np.int64)
+    _, first = np.unique(group, return_index=True)
+    corners = np.asarray(first, dtype=np.int64)[group][corners]
+    return replace(diagram, corners=corners).with_edges(corners[:, 0] != corners[:, 1])
 
 
-def _walks(centres_um: Floats, xy_um: Floats, sites: Ints, corners: Ints) -> tuple[Ints, Ints, Ints]:
-    """All edges of all cells, cell by cell and counter-clockwise: cell, first corner, second corner."""
+def _at_border(diagram: _Diagram, is_inside: Bools) -> tuple[_Diagram, _Diagram]:
+    """The diagram with the edges of cells that are not all inside, and with the others."""
+    is_inner = np.append(is_inside, np.zeros(N_FAR, bool))
+    is_both = np.asarray(is_inner[diagram.sites[:, 0]] & is_inner[diagram.sites[:, 1]])
+    return _without_short_edges(diagram.with_edges(~is_both)), diagram.with_edges(is_both)
+
+
+def _edges_around(diagram: _Diagram, is_inside: Bools) -> CellEdges:
+    """Edges around the cells that are inside: the twins first, then those with cells at the border."""
+    one, both = _at_border(diagram, is_inside)
+    is_inner = np.append(is_inside, np.zeros(N_FAR, bool))
+    first, second = is_inner[one.sites[:, 0]], is_inner[one.sites[:, 1]]
+    cell = np.concatenate((both.sites[:, 0], both.sites[:, 1], one.sites[first, 0], one.sites[second, 1]))
+    start, stop = (
+        np.concatenate((both.corners[:, i], both.corners[:, j], one.corners[first, i], one.corners[second, j]))
+        for i, j in ((0, 1), (1, 0))
+    )
+    return CellEdges(cell, cell, both.xy_um.take(start, 0), both.xy_um.take(stop, 0), both.sites.shape[0])
+
+
+def _middles_um(diagram: _Diagram) -> Floats:
+    """Means of the corners of each cell, which lie inside it, (n, 2)."""
+    n = diagram.centres_um.shape[0]
+    middle_um = diagram.xy_um[diagram.corners].mean(axis=1)
+    total_um, count = np.zeros((n, 2)), np.zeros(n)
+    for site in diagram.sites.T:
+        is_ours = site < n
+        count += np.bincount(site[is_ours], minlength=n)
+        for i in (0, 1):
+            total_um[:, i] += np.bincount(site[is_ours], middle_um[is_ours, i], minlength=n)
+    return total_um / np.maximum(count, 1.0)[:, np.newaxis]
+
+
+def _whole_rings(diagram: _Diagram, inside_um: Floats) -> tuple[Floats, Ints]:
+    """Packed rings of the cells as far as they reach; a point (n, 2) lies inside each."""
+    site, start, stop = _walks(inside_um, diagram.xy_um, diagram.sites, diagram.corners)
+    offsets = np.concatenate(([0], np.cumsum(np.bincount(site, minlength=inside_um.shape[0]))))
+    _require_closed(start, stop, offsets)
+    return diagram.xy_um[start], offsets
+
+
+def _walks(inside_um: Floats, xy_um: Floats, sites: Ints, corners: Ints) -> tuple[Ints, Ints, Ints]:
+    """All edges of all cells, cell by cell and counter-clockwise around a point in each: cell, first corner, second."""
     site = sites.ravel()
     start, stop = np.repeat(corners, 2, axis=0).T
-    is_ours = site < centres_um.shape[0]
+    is_ours = site < inside_um.shape[0]
     site, start, stop = site[is_ours], start[is_ours], stop[is_ours]
-    a, b = xy_um[start] - centres_um[site], xy_um[stop] - centres_um[site]
+    a, b = xy_um[start] - inside_um[site], xy_um[stop] - inside_um[site]
     is_clockwise = a[:, 0] * b[:, 1] < a[:, 1] * b[:, 0]
     start, stop = np.where(is_clockwise, stop, start), np.where(is_clockwise, start, stop)
     a = np.where(is_clockwise[:, np.newaxis], b, a)
@@ -172,37 +343,139 @@ def _polygons(xy_um: Floats, offsets: Ints) -> NDArray[Any]:
     return Layout(xy_um, offsets, np.arange(offsets.size)).polygons()
 
 
-def _clipped(centres_um: Floats, edges_um: Floats, region: shapely.Polygon, is_border: Bools) -> NDArray[Any]:
-    """The cells at the border within the region, in order, as polygons: faces of the edges (n, 2, 2) and the outline."""
-    lines = np.append(shapely.linestrings(edges_um), region.boundary)
+def _clipped(
+    diagram: _Diagram,
+    whole_um: Floats,
+    offsets: Ints,
+    is_inside: Bools,
+    region: shapely.Polygon,
+    mass_of: MassOf | None = None,
+) -> tuple[Floats, Ints]:
+    """Packed rings of the cells within the region, of those as far as they reach: the ones not inside are clipped."""
+    parts, is_inside = _border_parts(diagram, is_inside, region, mass_of)
+    border = np.flatnonzero(~is_inside)
+    rings_um, ring_offsets = np.zeros((0, 2)), np.zeros(1, np.int64)
+    if parts is not None:
+        if parts.lost.size:
+            raise GeometryError(
+                f"centre {parts.lost[0]} lies too close to others for float64", tuple(parts.lost.tolist())
+            )
+        rings_um, ring_offsets = _rings(parts.joined(border), border)
+    return _merged(whole_um, offsets, rings_um, ring_offsets, border, float(region.area))
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """
+    The cells at the border within the region.
+
+    Their parts: polygons, the centre of the least power, and the cell each belongs to; their edges; and centres without.
+    """
+
+    polygons: NDArray[Any]
+    owner: Ints
+    cell: Ints
+    edges: CellEdges
+    lost: Ints
+
+    def joined(self, border: Ints) -> NDArray[Any]:
+        """The cells with these numbers, each one polygon if its parts touch."""
+        order = np.argsort(self.cell, kind="stable")
+        polygons, cell = self.polygons[order], self.cell[order]
+        is_first = np.append(True, cell[1:] != cell[:-1])
+        cells = polygons[is_first]
+        for i in np.flatnonzero(~is_first):
+            at = int(np.searchsorted(border, cell[i]))
+            cells[at] = shapely.union(cells[at], polygons[i])
+        return np.asarray(shapely.orient_polygons(cells))
+
+
+def _border_parts(
+    diagram: _Diagram, is_inside: Bools, region: shapely.Polygon, mass_of: MassOf | None
+) -> tuple[_Parts | None, Bools]:
+    """Parts of the cells that are not inside, None when all are; and which are, but for those that may get a part."""
+    if is_inside.all():
+        return None, is_inside
+    parts = _parts(_at_border(diagram, is_inside)[0], region, ~is_inside, mass_of)
+    if np.unique(parts.owner).size < parts.owner.size:
+        owner, count = np.unique(parts.owner, return_counts=True)
+        is_apart = np.zeros(diagram.points_um.shape[0], bool)
+        is_apart[owner[count > 1]] = True
+        beside = np.unique(diagram.sites[is_apart[diagram.sites[:, 0]] | is_apart[diagram.sites[:, 1]]])
+        beside = beside[beside < is_inside.size]
+        if is_inside[beside].any():
+            is_inside = is_inside.copy()
+            is_inside[beside] = False
+            parts = _parts(_at_border(diagram, is_inside)[0], region, ~is_inside, mass_of)
+    return parts, is_inside
+
+
+def _parts(diagram: _Diagram, region: shapely.Polygon, is_border: Bools, mass_of: MassOf | None) -> _Parts:
+    """Faces of the edges of the cells at the border, which are all in the diagram, and of the region's outline."""
+    ends = np.unique(np.sort(diagram.corners, axis=1), axis=0)
+    lines = np.append(shapely.linestrings(diagram.xy_um[ends]), region.boundary)
     faces = shapely.get_parts(shapely.polygonize(shapely.get_parts(shapely.union_all(lines))))
     points = shapely.point_on_surface(faces)
     is_inside = shapely.contains(region, points)
     faces, points = faces[is_inside], points[is_inside]
+    owner = _least_power(shapely.get_coordinates(points), diagram)
+    is_ours = is_border[owner]
+    faces, owner = shapely.orient_polygons(faces[is_ours]), owner[is_ours]
+    # The first face of each owner is the one with its centre, or the heaviest; others are parts that the outline cut off.
+    edges = _edges_of(faces)
+    if mass_of is None:
+        size, has_centre = shapely.area(faces), shapely.intersects(faces, shapely.points(diagram.centres_um[owner]))
+    else:
+        size, has_centre = mass_of(edges, faces.size), np.zeros(faces.size, bool)
+    order = np.lexsort((-size, ~has_centre, owner))
+    is_first = np.append(True, np.diff(owner[order]) != 0)
+    cell = np.full(faces.size, -1)
+    cell[order[is_first]] = owner[order[is_first]]
+    return _Parts(faces, owner, _adopted(cell, owner, edges), edges, np.setdiff1d(np.flatnonzero(is_border), owner))
+
+
+def _least_power(points_um: Floats, diagram: _Diagram) -> Ints:
+    """The centre of the least power from each point, of those at the edges of the diagram."""
     from scipy.spatial import cKDTree
 
-    owner = np.asarray(cKDTree(centres_um).query(shapely.get_coordinates(points))[1], dtype=np.int64)
-    is_border_face = is_border[owner]
-    faces, owner = faces[is_border_face], owner[is_border_face]
-    # The first face of each owner is the one with its centre, the others are parts that the outline cut off.
-    has_centre = shapely.intersects(faces, shapely.points(centres_um[owner]))
-    order = np.lexsort((-shapely.area(faces), ~has_centre, owner))
-    faces, owner = faces[order], owner[order]
-    is_first = np.append(True, owner[1:] != owner[:-1])
-    cells, left = faces[is_first], faces[~is_first]
-    border = np.flatnonzero(is_border)
-    if not np.array_equal(owner[is_first], border):
-        lost = np.setdiff1d(border, owner)
-        raise GeometryError(f"centre {lost[0]} lies too close to others for float64", tuple(lost.tolist()))
-    for _ in range(left.size):
+    near = np.unique(diagram.sites)
+    near = near[near < diagram.centres_um.shape[0]]
+    centres_um = diagram.centres_um[near]
+    if diagram.weights_um2 is not None:
+        # The nearest one, when each is lifted by what its weight lacks from the largest.
+        weights_um2 = diagram.weights_um2[near]
+        centres_um = np.column_stack((centres_um, np.sqrt(weights_um2.max() - weights_um2)))
+        points_um = np.column_stack((points_um, np.zeros(points_um.shape[0])))
+    return np.asarray(near[cKDTree(centres_um).query(points_um)[1]], dtype=np.int64)
+
+
+def _adopted(cell: Ints, owner: Ints, edges: CellEdges) -> Ints:
+    """Cells of all parts, those without one (-1) given to the neighbours with which they share the longest border."""
+    cell = cell.copy()
+    if (cell >= 0).all():
+        return cell
+    one, other = edges.twins()
+    length_um = np.hypot(*(edges.stop_um[one] - edges.start_um[one]).T)
+    part, beside = edges.cell[np.stack((np.append(one, other), np.append(other, one)))]
+    length_um = np.append(length_um, length_um)
+    while True:
         # A part may hang on another part: those with a neighbour go first, round by round.
-        shared_um = np.array([shapely.length(shapely.intersection(cells, part)) for part in left])
-        if shared_um.size == 0:
-            break
-        part, cell = np.unravel_index(int(shared_um.argmax()), shared_um.shape)
-        cells[cell] = shapely.union(cells[cell], left[part])
-        left = np.delete(left, part)
-    return np.asarray(shapely.orient_polygons(cells))
+        is_open = (cell[part] < 0) & (cell[beside] >= 0)
+        if not is_open.any():
+            return np.where(cell < 0, owner, cell)
+        pairs, number = np.unique(np.stack((part, cell[beside])).T[is_open], axis=0, return_inverse=True)
+        shared_um = np.bincount(number.ravel(), length_um[is_open])
+        at = int(shared_um.argmax())
+        cell[pairs[at, 0]] = pairs[at, 1]
+
+
+def _edges_of(polygons: NDArray[Any]) -> CellEdges:
+    """Edges of polygons that are wound as packed rings are: outlines counter-clockwise, holes clockwise."""
+    rings, polygon = shapely.get_rings(polygons, return_index=True)
+    closed_um, ring = shapely.get_coordinates(rings, return_index=True)
+    is_start = ring[1:] == ring[:-1]
+    cell = np.asarray(polygon[ring[:-1][is_start]], dtype=np.int64)
+    return CellEdges(cell, cell, closed_um[:-1][is_start], closed_um[1:][is_start])
 
 
 def _rings(polygons: NDArray[Any], ids: Ints) -> tuple[Floats, Ints]:

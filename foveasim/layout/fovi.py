@@ -9,7 +9,8 @@ import numpy as np
 from foveasim.arrays import Floats, Ints, check_count, check_length_um, check_sites
 from foveasim.errors import ParameterError
 from foveasim.layout._model import Layout
-from foveasim.layout._voronoi import cells_of, disc
+from foveasim.layout._regions import disc
+from foveasim.layout._voronoi import cells_of
 from foveasim.rings import positions_in_runs
 
 __all__ = ["fovi"]

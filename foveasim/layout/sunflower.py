@@ -8,7 +8,8 @@ import numpy as np
 
 from foveasim.arrays import Floats, Ints, check_count, check_length_um, check_sites
 from foveasim.layout._model import Layout
-from foveasim.layout._voronoi import cells_of, disc
+from foveasim.layout._regions import disc
+from foveasim.layout._voronoi import cells_of
 
 __all__ = ["sunflower"]
 
