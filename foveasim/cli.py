@@ -145,14 +145,15 @@ def convert(
         float | None, typer.Option("--dbu-um", help="Database unit of a chip file to be written.")
     ] = None,
 ) -> None:
-    """Write a layout in another format, and tell what rounding did to it."""
+    """Write a layout in another format, and tell what was lost."""
     from foveasim.config import read_any_layout
     from foveasim.layout import write_layout
 
     written = write_layout(read_any_layout(source).layout, target, layer=layer, dbu_um=dbu_um)
+    lost = f"; the format holds no {', '.join(written.lost_columns)}" if written.lost_columns else ""
     console.print(
         f"wrote {written.path}: {written.n_sites:,} photosites, vertices moved by at most {written.worst_move_um:.3g} µm, "
-        f"areas changed by at most {100 * written.worst_area_error:.3g} %",
+        f"areas changed by at most {100 * written.worst_area_error:.3g} %{lost}",
         soft_wrap=True,
         highlight=False,
     )

@@ -267,3 +267,10 @@ def test_a_shipped_layout_is_checked_and_converted_by_its_name(tmp_path):
     assert checked.returncode == 0, checked.stderr
     assert converted.returncode == 0, converted.stderr
     assert fs.layout.read_layout(tmp_path / "prima.gds").n_sites == 378
+
+
+def test_convert_tells_what_a_drawing_does_not_hold(tmp_path):
+    result = foveasim("convert", "prima_75", "prima.svg", cwd=tmp_path)
+
+    assert result.returncode == 0, result.stderr
+    assert "the format holds no column, readout_line, row" in result.stdout

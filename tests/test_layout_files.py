@@ -66,6 +66,10 @@ def assert_same(a, b):
         np.testing.assert_array_equal(column, b.columns[name])
 
 
+def same_bits(a, b):
+    return a.dtype == b.dtype and a.tobytes() == b.tobytes()
+
+
 def lattice(layout):
     """Vertices as whole numbers of database units, by decimal rounding."""
     return np.round(layout.xy_um, 4) * 10**4
@@ -86,6 +90,7 @@ def test_exact_formats_give_back_every_bit_every_column_and_the_origin(zoo, tmp_
     assert_same(zoo, again)
     assert dict(again.provenance) == dict(zoo.provenance)
     assert (report.n_sites, report.worst_move_um, report.worst_area_error) == (60, 0.0, 0.0)
+    assert report.lost_columns == ()
 
 
 @pytest.mark.parametrize("ending", CHIP)
@@ -171,6 +176,239 @@ def test_infinite_and_large_numbers_survive(tmp_path, ending):
 
     assert_same(again, layout)
     assert np.signbit(again.columns["a"][3])
+
+
+@pytest.mark.parametrize("ending", EXACT)
+def test_small_and_large_whole_numbers_together_stay_what_they_are(small, tmp_path, ending):
+    layout = small.with_columns(a=np.array([2**64 - 1, 0, 2**63, 1, 2, 3, 4, 5, 6], np.uint64))
+    write_layout(layout, tmp_path / f"a.{ending}")
+
+    assert_same(read_layout(tmp_path / f"a.{ending}"), layout)
+
+
+# -- columns in chip files --------------------------------------------------------------------------------------------
+
+#: Numbers that are easily changed on the way: signs of nothing, neighbours of 1/n, the largest and the smallest.
+HARD_FLOATS = [
+    *(np.nan, np.inf, -np.inf, -0.0, 0.0, 0.1, np.nextafter(0.1, 0), np.nextafter(1 / 3, 1), 5e-324, -1e-310),
+    *(1.7976931348623157e308, 2.0**63, -(2.0**64), 1e300, 3.0, 0.30000000000000004, -1 / 49, 1e16, 1e-5, 0.5),
+]
+HARD_INTS = [0, -1, 2**53 + 1, 2**63 - 1, -(2**63), -(2**63) + 1, 2**32, -(2**31)]
+
+
+@pytest.mark.parametrize("ending", CHIP)
+@pytest.mark.parametrize(
+    "column",
+    [
+        np.array(HARD_FLOATS),
+        np.array(HARD_INTS),
+        np.array([2**64 - 1, 0, 2**63], np.uint64),
+        np.array([True, False, False]),
+        np.array([True, True]),
+        np.array(["", " ", "a b", 'say "=3"', "µ\n\t\\", "true", "17", "\ud83d", "x=1 y=2", "\x7f\x00b"]),
+    ],
+    ids=["floats", "ints", "uints", "both", "true", "texts"],
+)
+def test_chip_formats_give_back_columns_to_the_last_bit(tmp_path, ending, column):
+    layout = hexagonal(pitch_um=3.3, n_columns=column.size, n_rows=1).with_columns(
+        a=column, last=np.arange(column.size)
+    )
+    report = write_layout(layout, tmp_path / f"a.{ending}")
+    again = read_layout(tmp_path / f"a.{ending}")
+
+    assert report.lost_columns == ()
+    assert sorted(again.columns) == sorted({*layout.columns, "channel"})
+    assert same_bits(again.columns["a"], column)
+    np.testing.assert_array_equal(again.columns["last"], layout.columns["last"])
+
+
+@pytest.mark.parametrize("ending", CHIP)
+def test_columns_of_narrow_types_come_back_as_the_same_numbers(tmp_path, ending):
+    narrow = {"a": np.array([-7, 8], np.int8), "b": np.array([0.1, 1e30], np.float32), "c": np.array([1.5, 6e4], ">f2")}
+    write_layout(hexagonal(pitch_um=3.3, n_columns=2, n_rows=1).with_columns(**narrow), tmp_path / f"a.{ending}")
+    columns = read_layout(tmp_path / f"a.{ending}").columns
+
+    assert [columns[name].dtype for name in narrow] == [np.int64, np.float64, np.float64]
+    assert all((columns[name] == values).all() for name, values in narrow.items())
+
+
+@pytest.mark.parametrize("ending", CHIP)
+def test_sites_in_parts_and_in_any_order_keep_their_columns(zoo, tmp_path, ending):
+    report = write_layout(zoo, tmp_path / f"a.{ending}")
+    again = read_layout(tmp_path / f"a.{ending}")
+
+    assert report.lost_columns == (("is_dead",) if ending == "gds" else ())
+    assert {*again.columns} == {*zoo.columns} - {*report.lost_columns}
+    for name, column in again.columns.items():
+        np.testing.assert_array_equal(column, zoo.columns[name], err_msg=name)
+
+
+@pytest.mark.parametrize(("n_chars", "lost"), [(101, ()), (102, ("long",))])
+def test_a_column_that_a_gds_property_cannot_hold_for_one_site_is_left_out_for_all(tmp_path, capfd, n_chars, lost):
+    square_um = np.stack((np.arange(10.0) * 2, np.zeros(10)), 1)
+    layout = Layout.from_rectangles(square_um, 1.0, first=np.arange(10), long=["a" * n_chars] + ["a"] * 9)
+    report = write_layout(layout, tmp_path / "a.gds")
+    polygons = gdstk.read_gds(tmp_path / "a.gds").cells[0].polygons
+    n_bytes = max(sum(2 * -(-len(v[2].rstrip(b"\0")) // 2) for v in p.properties) for p in polygons)
+
+    assert report.lost_columns == lost
+    assert {*read_layout(tmp_path / "a.gds").columns} == {"channel", "first", "long"} - {*lost}
+    assert n_bytes == (128 if not lost else 20)
+    # gdstk speaks up when properties are longer than the format allows.
+    assert capfd.readouterr().err == ""
+    assert write_layout(layout, tmp_path / "a.oas").lost_columns == ()
+
+
+def test_very_many_different_texts_are_left_out_of_oasis_which_would_take_minutes(tmp_path):
+    layout = hexagonal(pitch_um=3.3, n_columns=200, n_rows=110).with_columns(
+        name=np.array([f"site{i}" for i in range(22_000)]), kind=np.array(["a", "b"] * 11_000)
+    )
+    report = write_layout(layout, tmp_path / "a.oas")
+
+    assert report.lost_columns == ("name",)
+    assert (read_layout(tmp_path / "a.oas").columns["kind"] == layout.columns["kind"]).all()
+
+
+@pytest.mark.parametrize("ending", [*CHIP, "svg"])
+def test_what_a_format_does_not_hold_is_reported(tmp_path, ending):
+    layout = hexagonal(pitch_um=3.3, n_columns=2, n_rows=2).with_columns(
+        when=np.array(["2020-01-01"] * 4, "M8[D]"), z=np.arange(4) * 1j, raw=np.array([b"a"] * 4), a=np.arange(4)
+    )
+    kept = () if ending == "svg" else ("a", "column", "readout_line", "row")
+
+    assert write_layout(layout, tmp_path / f"a.{ending}").lost_columns == tuple(sorted({*layout.columns} - {*kept}))
+    # No shape is there to tell a column.
+    assert write_layout(layout[:0], tmp_path / f"a.{ending}").lost_columns == tuple(sorted(layout.columns))
+
+
+@pytest.mark.parametrize("ending", CHIP)
+@pytest.mark.parametrize("name", ["a b", "a=b", 'say "a"', "µ", "", "1", '"a"', "%s", "a\n", "photosite"])
+def test_columns_keep_odd_names(tmp_path, ending, name):
+    layout = hexagonal(pitch_um=3.3, n_columns=2, n_rows=2).with_columns(**{name: np.arange(4), "b": np.arange(4) + 5})
+    report = write_layout(layout, tmp_path / f"a.{ending}")
+    columns = read_layout(tmp_path / f"a.{ending}").columns
+
+    assert report.lost_columns == ()
+    assert columns[name].tolist() == [0, 1, 2, 3]
+    assert columns["b"].tolist() == [5, 6, 7, 8]
+
+
+@pytest.mark.parametrize(("ending", "then"), [("gds", "gds"), ("gds", "oas"), ("oas", "oas")])
+def test_columns_survive_klayout(zoo, tmp_path, ending, then):
+    write_layout(zoo, tmp_path / f"a.{ending}")
+    other = klayout.Layout()
+    other.read(str(tmp_path / f"a.{ending}"))
+    other.write(str(tmp_path / f"b.{then}"))
+    first, again = read_layout(tmp_path / f"a.{ending}"), read_layout(tmp_path / f"b.{then}")
+
+    assert list(again.columns) == list(first.columns)
+    for name, column in first.columns.items():
+        assert same_bits(again.columns[name], column), name
+
+
+def test_klayout_shows_columns_as_words(tmp_path):
+    write_layout(hexagonal(pitch_um=3.3, n_columns=2, n_rows=1).with_columns(gain=[0.5, 2.0]), tmp_path / "a.gds")
+    other = klayout.Layout()
+    other.read(str(tmp_path / "a.gds"))
+    told = {s.property(1): s.property(2) for s in other.top_cell().shapes(other.layer(1, 0)).each()}
+
+    assert told == {f"photosite {i}": f"row=0 column={i} readout_line={i} gain={g}" for i, g in enumerate([0.5, 2.0])}
+
+
+def edited(tmp_path, edit):
+    """Columns that are read from a file of nine sites after another program changed its polygons."""
+    layout = hexagonal(pitch_um=3.3, n_columns=3, n_rows=3).with_columns(a=np.arange(9), b=np.arange(9) * 0.5)
+    write_layout(layout, tmp_path / "a.gds")
+    library = gdstk.read_gds(tmp_path / "a.gds")
+    edit(library.cells[0])
+    library.write_gds(tmp_path / "b.gds", max_points=0)
+    return read_layout(tmp_path / "b.gds").columns
+
+
+@pytest.mark.parametrize("text", [None, "", "ring", "\x01", "a=1\nb=2", "é=1", "=1 =2"])
+def test_one_shape_that_tells_no_columns_keeps_all_from_being_restored(tmp_path, text):
+    def edit(cell):
+        polygon = cell.polygons[4]
+        polygon.delete_gds_property(2)
+        if text is not None:
+            polygon.set_gds_property(2, text)
+
+    assert list(edited(tmp_path, edit)) == ["channel"]
+
+
+@pytest.mark.parametrize(
+    ("text", "left"),
+    [
+        ("b=3.5", ["b"]),
+        ("b=3.5 readout_line=2 c=5", ["b", "readout_line"]),
+        ("b=2 a=7", ["a", "b"]),
+        ("a=1 a=2 b=1", ["b"]),
+        ("a=1.5 b=0", ["a", "b"]),
+        ("a=true b=0.5", ["b"]),
+        ("a=x b=0x10", []),
+        ("a=99999999999999999999 b=1", ["b"]),
+        ('a="1" b=1', ["b"]),
+        ("a b=1", ["b"]),
+        ("a= b=1", ["b"]),
+        ("a=__import__('os') b=1", ["b"]),
+    ],
+)
+def test_a_column_is_restored_for_all_sites_or_not_at_all(tmp_path, text, left):
+    columns = edited(tmp_path, lambda cell: cell.polygons[4].set_gds_property(2, text))
+
+    assert sorted({*columns} - {"channel"}) == left
+    if "a" in left:
+        assert [v for v, i in zip(columns["a"], range(9), strict=True) if i != 4] == [0, 1, 2, 3, 5, 6, 7, 8]
+
+
+def test_a_columns_text_that_names_the_channel_does_not_change_it(tmp_path):
+    def edit(cell):
+        for polygon in cell.polygons:
+            polygon.set_gds_property(2, "channel=9 a=1")
+
+    columns = edited(tmp_path, edit)
+
+    assert columns["channel"].tolist() == [0] * 9
+    assert columns["a"].tolist() == [1] * 9
+
+
+def test_parts_of_a_site_that_tell_different_values_keep_the_column_from_being_restored(zoo, tmp_path):
+    write_layout(zoo, tmp_path / "a.gds")
+    library = gdstk.read_gds(tmp_path / "a.gds")
+    part = next(p for p in library.cells[0].polygons if "part 2" in p.get_gds_property(1))
+    part.set_gds_property(2, part.get_gds_property(2).replace("readout_line=", "readout_line=1"))
+    library.write_gds(tmp_path / "b.gds", max_points=0)
+
+    assert {*zoo.columns} - {*read_layout(tmp_path / "b.gds").columns} == {"readout_line", "is_dead"}
+
+
+@pytest.mark.parametrize(
+    "values",
+    [["a"], ["a", 1, "b"], [1, 2], ["a", b"\xff"], ["a b", 1], ["a", "1 b=2"], ["a=", 1], ["a", 1] * 100, [b"\xff", 1]],
+    ids=str,
+)
+def test_oasis_properties_of_strangers_give_columns_or_none(tmp_path, values):
+    library = gdstk.Library()
+    library.new_cell("A").add(*(gdstk.rectangle((i, 0), (i + 1, 1)).set_property("columns", values) for i in range(3)))
+    library.write_oas(tmp_path / "a.oas")
+    layout = read_layout(tmp_path / "a.oas")
+
+    assert layout.n_sites == 3
+    assert all(column.shape == (3,) for column in layout.columns.values())
+
+
+def test_columns_of_the_shapes_that_are_not_read_are_not_asked_for(tmp_path):
+    library = gdstk.Library()
+    inner = library.new_cell("IN").add(
+        gdstk.rectangle((0, 0), (1, 1), 1).set_gds_property(2, "a=1"),
+        gdstk.rectangle((2, 0), (3, 1), 1).set_gds_property(2, "a=2"),
+        gdstk.rectangle((4, 0), (5, 1), 2),
+    )
+    library.new_cell("TOP").add(gdstk.Reference(inner, (0, 0), columns=2, rows=1, spacing=(10, 0)))
+    library.write_gds(tmp_path / "a.gds")
+
+    assert read_layout(tmp_path / "a.gds", layer=1).columns["a"].tolist() == [1, 2, 1, 2]
+    assert list(read_layout(tmp_path / "a.gds", layer=2).columns) == ["channel"]
 
 
 # -- what other programs see ------------------------------------------------------------------------------------------
@@ -407,7 +645,7 @@ def test_a_site_whose_parts_are_not_all_there_is_refused(zoo, tmp_path):
     write_layout(zoo, tmp_path / "a.gds")
     library = gdstk.read_gds(tmp_path / "a.gds")
     cell = library.cells[0]
-    cell.remove(next(p for p in cell.polygons if b"part 1" in p.properties[0][2]))
+    cell.remove(next(p for p in cell.polygons if "part 1" in p.get_gds_property(1)))
     library.write_gds(tmp_path / "b.gds", max_points=0)
     with pytest.raises(FileError, match=r"has other parts of photosite \d+ than the \d+ that it was cut into"):
         read_layout(tmp_path / "b.gds")
@@ -681,7 +919,7 @@ def test_npz_that_claims_a_huge_array_is_refused_before_it_is_made(tmp_path):
 
 
 def test_npz_that_would_unpack_to_too_much_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("foveasim.layout.files.npz.MAX_UNPACKED_BYTES", 1000)
+    monkeypatch.setattr("foveasim.layout.files._common.MAX_UNPACKED_BYTES", 1000)
     with pytest.raises(FileError, match="would unpack to more than 1000 bytes"):
         read_layout(npz(tmp_path / "a.npz", column_a=np.zeros(200)))
 
@@ -696,7 +934,7 @@ def test_too_many_sites_are_refused(small, tmp_path, monkeypatch, ending):
 
 def test_parquet_that_repeats_a_long_value_without_end_is_refused(small, tmp_path, monkeypatch):
     pa = pytest.importorskip("pyarrow")
-    monkeypatch.setattr("foveasim.layout.files.geoparquet.MAX_UNPACKED_BYTES", 2**28)
+    monkeypatch.setattr("foveasim.layout.files._common.MAX_UNPACKED_BYTES", 2**26)
     write_layout(small, tmp_path / "a.parquet")
     metadata = pq.read_table(tmp_path / "a.parquet").schema.metadata
     values = pa.DictionaryArray.from_arrays(pa.array(np.zeros(10**6, np.int32)), pa.array([bytes(10**5)]))
@@ -710,7 +948,7 @@ def test_parquet_that_repeats_a_long_value_without_end_is_refused(small, tmp_pat
         writer.write_table(table)
         writer.add_key_value_metadata({"geo": metadata[b"geo"]})
     assert (tmp_path / "b.parquet").stat().st_size < 10**6
-    with pytest.raises(FileError, match="would unpack to more than 268435456 bytes"):
+    with pytest.raises(FileError, match="would unpack to more than 67108864 bytes"):
         read_layout(tmp_path / "b.parquet")
 
 

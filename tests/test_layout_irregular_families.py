@@ -770,7 +770,10 @@ def test_equal_capacity_of_a_function_that_jumps_is_refused():
         ({"size_um": (1.0, 0.0)}, r"'size_um\[1\]' must be > 0"),
         ({"region": BOX}, "'region' and 'size_um' exclude each other"),
         ({"size_um": None, "region": [(0, 0), (1, 1)]}, "'region' must have the shape"),
-        ({"size_um": None, "region": [(0, 0), (1, 1), (1, 0), (0, 1)]}, "'region' must be (one|a valid|a shapely) [pP]olygon"),
+        (
+            {"size_um": None, "region": [(0, 0), (1, 1), (1, 0), (0, 1)]},
+            "'region' must be (one|a valid|a shapely) [pP]olygon",
+        ),
         ({"size_um": None, "region": shapely.Point(0, 0)}, "'region' must be (one|a valid|a shapely) [pP]olygon"),
         ({"size_um": None, "region": shapely.box(0, 0, 1e8, 1)}, "'region' must lie within"),
         ({"density": np.ones((2, 2))}, "'density_grid' must be the Grid"),

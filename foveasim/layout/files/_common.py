@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,17 +18,20 @@ from foveasim.records import described
 from foveasim.rings import site_area_um2
 
 __all__ = [
-    "MAX_UNPACKED_BYTES",
     "WrittenLayout",
     "check_header",
     "check_sites_of",
+    "check_unpacked",
     "checked_layout",
     "head_of",
     "header",
     "lossless",
+    "max_unpacked",
     "one_sentence",
     "restored_column",
     "rounding",
+    "texts",
+    "whole_numbers",
 ]
 
 #: Written in every file that keeps columns and origin.
@@ -37,6 +40,10 @@ FILE_VERSION = 1
 #: Larger files are refused, and so are those that would unpack to more: 50 million hexagons take 5 GiB.
 MAX_FILE_BYTES = 8 * 2**30
 MAX_UNPACKED_BYTES = 8 * 2**30
+#: What a small file may unpack to, and for each byte of a larger one: regular grids, packed, unpack to 30 bytes a byte.
+MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**26, 128
+#: A column of text takes the room of its longest in every row: what that may come to, and for each letter there is.
+MIN_TEXT_BYTES, TEXT_BYTES_PER_LETTER = 2**28, 64
 #: Enough to tell the formats apart, white space and a byte order mark before the first brace included.
 HEAD_BYTES = 256
 #: Longer messages of other libraries are cut.
@@ -60,23 +67,28 @@ class WrittenLayout:
         How far rounding moved the vertex that it moved furthest.
     worst_area_error : float
         Change of a site's area by rounding, relative to its area, of the site with the largest.
+    lost_columns : tuple of str
+        Names of the columns that the file does not hold, sorted.
     """
 
     path: Path
     n_sites: int
     worst_move_um: float
     worst_area_error: float
+    lost_columns: tuple[str, ...]
 
 
-def lossless(layout: Layout, path: Path) -> WrittenLayout:
+def lossless(layout: Layout, path: Path, lost_columns: tuple[str, ...] = ()) -> WrittenLayout:
     """Report of a format that keeps every digit."""
-    return WrittenLayout(path=path, n_sites=layout.n_sites, worst_move_um=0.0, worst_area_error=0.0)
+    return WrittenLayout(
+        path=path, n_sites=layout.n_sites, worst_move_um=0.0, worst_area_error=0.0, lost_columns=lost_columns
+    )
 
 
-def rounding(layout: Layout, rounded_um: Floats, path: Path) -> WrittenLayout:
-    """Report of a format that holds these vertices instead of the layout's."""
+def rounding(layout: Layout, rounded_um: Floats, path: Path, lost_columns: tuple[str, ...] = ()) -> WrittenLayout:
+    """Report of a format that holds these vertices instead of the layout's, and not these columns."""
     if layout.n_sites == 0:
-        return lossless(layout, path)
+        return lossless(layout, path, lost_columns)
     move_um = np.hypot(*(rounded_um - layout.xy_um).T)
     area_um2 = layout.area_um2
     error = site_area_um2(rounded_um, layout.ring_offsets, layout.site_offsets) / area_um2 - 1.0
@@ -85,6 +97,7 @@ def rounding(layout: Layout, rounded_um: Floats, path: Path) -> WrittenLayout:
         n_sites=layout.n_sites,
         worst_move_um=float(move_um.max()),
         worst_area_error=float(np.abs(error).max()),
+        lost_columns=lost_columns,
     )
 
 
@@ -112,6 +125,24 @@ def head_of(path: Path) -> bytes:
     if not head:
         raise FileError(path, "is empty")
     return head
+
+
+def max_unpacked(path: Path) -> int:
+    """Bytes that a file of its size may unpack to."""
+    return min(MIN_UNPACKED_BYTES + UNPACKED_PER_BYTE * path.stat().st_size, MAX_UNPACKED_BYTES)
+
+
+def check_unpacked(path: Path, n_bytes: int) -> None:
+    """
+    Refuse a file that would unpack to too much.
+
+    Raises
+    ------
+    FileError
+        When it was made to fill the memory.
+    """
+    if n_bytes > max_unpacked(path):
+        raise FileError(path, f"would unpack to more than {max_unpacked(path)} bytes")
 
 
 @contextmanager
@@ -216,9 +247,26 @@ def restored_column(values: NDArray[Any], dtype: object) -> NDArray[Any]:
     if not isinstance(dtype, str) or len(dtype) > 16 or dtype[1:2] not in PLAIN_KINDS:
         return values
     try:
+        if np.dtype(dtype).itemsize * values.size > max(2 * values.nbytes, MIN_TEXT_BYTES):
+            return values
         with np.errstate(all="ignore"):
             restored = values.astype(np.dtype(dtype))
     except (TypeError, ValueError, OverflowError):
         return values
     is_floating = values.dtype.kind == restored.dtype.kind == "f"
     return restored if np.array_equal(restored, values, equal_nan=is_floating) else values
+
+
+def whole_numbers(values: Sequence[int]) -> NDArray[Any] | None:
+    """A column of whole numbers, exactly; nothing where 64 bits do not hold them."""
+    low, high = min(values), max(values)
+    if low >= -(2**63) and high < 2**63:
+        return np.array(values, np.int64)
+    return np.array(values, np.uint64) if low >= 0 and high < 2**64 else None
+
+
+def texts(values: Sequence[str]) -> NDArray[Any] | None:
+    """A column of text; nothing where one text is so long that the column would fill the memory."""
+    n_letters = list(map(len, values))
+    n_bytes = 4 * max(n_letters, default=0) * len(n_letters)
+    return np.array(values, dtype=str) if n_bytes <= MIN_TEXT_BYTES + TEXT_BYTES_PER_LETTER * sum(n_letters) else None

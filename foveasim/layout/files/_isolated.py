@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
+import warnings
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +25,17 @@ __all__: list[str] = []
 KLAYOUT_NOTES = "$$$CONTEXT_INFO$$$"
 #: How many names a message shows.
 SHOWN = 5
+#: Memory of a vertex and of a polygon while cells are flattened: what is there, what is made of it, and both together.
+VERTEX_BYTES, POLYGON_BYTES = 48, 192
+#: How often the sites that are read at most may be copied from cell to cell.
+COPIES = 2
+#: Attributes of GDSII properties that tell a photosite's number and its columns.
+NUMBER_PROPERTY, COLUMNS_PROPERTY = 1, 2
+NUMBER = re.compile(r"photosite ([0-9]{1,9})(?: part ([0-9]{1,9}) of ([0-9]{1,9}))?\0*")
+MAX_SITE = 10**9
+#: Names and values of a shape's columns, and their length as text; more is no columns.
+MAX_WORDS = 128
+MAX_CHARS = 1024
 
 
 class Refusal(Exception):  # noqa: N818 -- not an error of this program, but its answer
@@ -38,8 +51,9 @@ class Shapes:
     xy : (n_vertex, 2) float64, in database units
     counts : (n,) int64
         Vertices of each polygon.
-    tags : (n, 6) int64
-        Layer, data type, photosite (-1: not told), part and number of parts (0: whole), placement of the cell.
+    tags : (n, 7) int64
+        Layer, data type, photosite (-1: not told), part and number of parts (0: whole), placement of the cell, line of
+        its columns in the text of all (-1: not told).
     n_placements : int
     """
 
@@ -64,7 +78,9 @@ class Shapes:
 def main() -> None:
     """Do the task."""
     task = json.load(sys.stdin)
-    _limit(task)
+    _limit("RLIMIT_CORE", 0)
+    _limit("RLIMIT_CPU", task["max_cpu_s"])
+    _limit("RLIMIT_AS", task["max_reading_bytes"])
     sys.path[:] = task["sys_path"]
     try:
         answer = _read(task)
@@ -77,28 +93,27 @@ def main() -> None:
     sys.stdout.write(json.dumps(answer))
 
 
-def _limit(task: dict[str, Any]) -> None:
-    """Bounds of memory and time, where the system has them."""
+def _limit(kind: str, most: int) -> None:
+    """A bound of memory or time, where the system has them."""
     try:
         import resource
     except ImportError:
         return
-    for kind, most in (
-        (resource.RLIMIT_AS, task["max_memory_bytes"]),
-        (resource.RLIMIT_CPU, task["max_s"]),
-        (resource.RLIMIT_CORE, 0),
-    ):
-        hard = resource.getrlimit(kind)[1]
-        bound = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        resource.setrlimit(kind, (bound, hard))
+    number = getattr(resource, kind)
+    hard = resource.getrlimit(number)[1]
+    resource.setrlimit(number, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
 
 
 def _read(task: dict[str, Any]) -> dict[str, Any]:
     import gdstk
     import numpy as np
 
-    read = gdstk.read_oas if task["is_oasis"] else gdstk.read_gds
-    library = read(task["path"])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        library = (gdstk.read_oas if task["is_oasis"] else gdstk.read_gds)(task["path"])
+    if task["is_oasis"] and caught:
+        # Where it meets what it does not know, it leaves out what follows; GDSII tells how much to skip.
+        raise Refusal(f"is broken, or holds what gdstk does not read ({caught[0].message})")
     dbu_um = library.precision * 1e6
     if not (math.isfinite(dbu_um) and 1e-9 <= dbu_um <= 1e3 and 1e-12 <= library.unit <= 1.0):
         raise Refusal(f"has the impossible database unit {dbu_um:g} µm")
@@ -106,12 +121,21 @@ def _read(task: dict[str, Any]) -> dict[str, Any]:
     top = _top(cells, task["cell"])
     order = _from_the_bottom(cells, top)
     _check_numbers(cells, order, task)
+    # What follows is known to be bounded.
+    _limit("RLIMIT_AS", task["max_memory_bytes"])
+    _limit("RLIMIT_CPU", task["max_s"])
     flat: dict[str, Shapes] = {}
+    lines: list[str] = []
+    last_use = {child: name for name in order for child in _held(cells, name)}
     for name in order:
-        flat[name] = _flat(cells[name], flat, library.unit * 1e6, dbu_um)
+        flat[name] = _flat(cells[name], flat, lines, library.unit * 1e6, dbu_um)
+        for child in _held(cells, name):
+            if last_use[child] == name:
+                del flat[child]
     shapes = _on_one_layer(flat[top], task["layer"])
+    text = _text_of_columns(shapes, lines, task["max_text_bytes"])
     with open(task["out"], "wb") as file:  # noqa: PTH123 -- a plain name from the task
-        for array in (shapes.xy, shapes.counts, shapes.tags):
+        for array in (shapes.xy, shapes.counts, shapes.tags, text):
             np.save(file, array, allow_pickle=False)
     return {"dbu_um": dbu_um, "cell": top}
 
@@ -164,26 +188,40 @@ def _held(cells: dict[str, Any], name: str) -> Iterator[str]:
 
 
 def _check_numbers(cells: dict[str, Any], order: list[str], task: dict[str, Any]) -> None:
-    """Refuse what would flatten to more than any sensor has, before it is done."""
+    """Refuse what would flatten to more than any sensor has, or take too much memory or time, before it is done."""
     n_polygons: dict[str, int] = {}
     n_vertices: dict[str, int] = {}
+    max_sites, max_vertices = task["max_sites"], task["max_memory_bytes"] // VERTEX_BYTES
+    n_copied = 0
     for name in order:
         cell = cells[name]
-        polygons = [(p.size, _times(p)) for p in cell.polygons]
-        polygons += [(2, _times(path)) for path in cell.paths]
         references = [(r.cell_name, _times(r)) for r in cell.references]
-        n_polygons[name] = sum(k for _, k in polygons) + sum(k * n_polygons[c] for c, k in references)
-        n_vertices[name] = sum(n * k for n, k in polygons) + sum(k * n_vertices[c] for c, k in references)
+        own = sum(map(_times, cell.polygons)) + sum(map(_times, cell.paths))
+        n_polygons[name] = own + sum(k * n_polygons[c] for c, k in references)
+        n_copied += n_polygons[name]
         # A reference without shapes costs as well.
-        if max(n_polygons[name], sum(k for _, k in references)) > task["max_sites"]:
-            raise Refusal(f"has more than the {task['max_sites']} sites that are read")
-        if n_vertices[name] > task["max_vertices"]:
-            raise Refusal(f"has more than the {task['max_vertices']} vertices that are read")
+        if max(n_polygons[name], sum(k for _, k in references)) > max_sites or n_copied > COPIES * max_sites:
+            raise Refusal(f"has more than the {max_sites} sites that are read")
+        n_vertices[name] = _own_vertices(cell, max_vertices) + sum(k * n_vertices[c] for c, k in references)
+        if VERTEX_BYTES * n_vertices[name] + POLYGON_BYTES * n_polygons[name] > task["max_memory_bytes"]:
+            raise Refusal("would unpack to more sites and vertices than are read from a file of its size")
+
+
+def _own_vertices(cell: Any, most: int) -> int:
+    """Vertices of a cell's polygons and paths; paths, some of which have very many, are counted while there are not more."""
+    n = sum(p.size * _times(p) for p in cell.polygons)
+    for path in cell.paths:
+        if n > most:
+            break
+        n += _times(path) * sum(p.size for p in path.to_polygons())
+    return n
 
 
 def _times(element: Any) -> int:
-    """How often an element stands there."""
-    return max(1, element.repetition.size)
+    """How often an element stands there; columns times rows may be more than the number that gdstk has for it."""
+    repetition = element.repetition
+    n = repetition.size if repetition.columns is None else repetition.columns * repetition.rows
+    return max(1, n)
 
 
 def _listed(names: Any) -> str:
@@ -198,11 +236,11 @@ def _own(cell: Any) -> bool:
     return bool(cell.polygons or cell.paths)
 
 
-def _flat(cell: Any, flat: dict[str, Shapes], unit_um: float, dbu_um: float) -> Shapes:
-    """The polygons of a cell and of all cells below, in database units."""
+def _flat(cell: Any, flat: dict[str, Shapes], lines: list[str], unit_um: float, dbu_um: float) -> Shapes:
+    """The polygons of a cell and of all cells below, in database units; lines of columns are added."""
     import numpy as np
 
-    parts = [_own_shapes(cell, unit_um, dbu_um)]
+    parts = [_own_shapes(cell, lines, unit_um, dbu_um)]
     n_placements = 1
     groups: dict[tuple[Any, ...], list[NDArray[np.float64]]] = {}
     for r in cell.references:
@@ -216,8 +254,9 @@ def _flat(cell: Any, flat: dict[str, Shapes], unit_um: float, dbu_um: float) -> 
         copies.tags[:, 5] += n_placements
         n_placements += copies.n_placements
         parts.append(copies)
+    parts = [p for p in parts if p.counts.size] or parts[:1]
     if len(parts) == 1:
-        return parts[0]
+        return Shapes(parts[0].xy, parts[0].counts, parts[0].tags, n_placements)
     return Shapes(
         np.concatenate([p.xy for p in parts]),
         np.concatenate([p.counts for p in parts]),
@@ -237,7 +276,7 @@ def _turn(angle_rad: float) -> NDArray[np.float64]:
     return np.array([[c, -s], [s, c]])
 
 
-def _own_shapes(cell: Any, unit_um: float, dbu_um: float) -> Shapes:
+def _own_shapes(cell: Any, lines: list[str], unit_um: float, dbu_um: float) -> Shapes:
     """The polygons of one cell, paths as polygons, repetitions written out."""
     import numpy as np
 
@@ -249,26 +288,56 @@ def _own_shapes(cell: Any, unit_um: float, dbu_um: float) -> Shapes:
     for path in cell.paths:
         polygons += [q for p in (path, *path.apply_repetition()) for q in p.to_polygons()]
     points = [p.points for p in polygons]
-    xy = np.rint(np.concatenate(points) * (unit_um / dbu_um)) if points else np.zeros((0, 2))
     counts = np.fromiter(map(len, points), np.int64, len(points))
-    tags = np.array([(p.layer, p.datatype, *_site(p.properties), 0) for p in polygons], np.int64).reshape(-1, 6)
+    xy = np.concatenate(points) if points else np.zeros((0, 2))
+    del points
+    xy *= unit_um / dbu_um
+    np.rint(xy, out=xy)
+    tags = np.array([(p.layer, p.datatype, *_site(p), 0, -1) for p in polygons], np.int64).reshape(-1, 7)
+    told = [_columns(p) for p in polygons]
+    tags[:, 6] = np.where(list(map(bool, told)), len(lines) + np.arange(len(told)), -1)
+    lines += told
     return Shapes(xy, counts, tags, 1)
 
 
-def _site(properties: Any) -> tuple[int, int, int]:
+def _site(polygon: Any) -> tuple[int, int, int]:
     """Photosite, part and number of parts that a polygon's properties tell."""
-    for name, *values in properties:
-        if name == "S_GDS_PROPERTY" and len(values) == 2 and values[0] == 1 and isinstance(values[1], bytes):
-            words = values[1].rstrip(b"\0").split()
-            numbers = [int(w) for w in words[1::2] if w.isdigit() and len(w) < 10]
-            if words[::2] in ([b"photosite"], [b"photosite", b"part", b"of"]) and len(numbers) == len(words) // 2:
-                break
-        elif name == "photosite" and all(isinstance(v, int) and 0 <= v < 10**9 for v in values):
-            numbers = values
-            break
-    else:
+    text = polygon.get_gds_property(NUMBER_PROPERTY)
+    match = NUMBER.fullmatch(text) if isinstance(text, str) else None
+    if match:
+        return int(match[1]), int(match[2] or 0), int(match[3] or 0)
+    numbers = polygon.get_property("photosite")
+    if not numbers or not all(isinstance(n, int) and 0 <= n < MAX_SITE for n in numbers):
         return -1, 0, 0
-    return (numbers[0], numbers[1], numbers[2]) if len(numbers) == 3 else (numbers[0] if numbers else -1, 0, 0)
+    return (numbers[0], numbers[1], numbers[2]) if len(numbers) == 3 else (numbers[0], 0, 0)
+
+
+def _columns(polygon: Any) -> str:
+    """One line of words ``name=value`` of a polygon's properties; nothing where they tell no such words."""
+    text = polygon.get_gds_property(COLUMNS_PROPERTY)
+    if text is None:
+        values = polygon.get_property("columns")
+        if not values or len(values) % 2 or len(values) > MAX_WORDS:
+            return ""
+        told = [v.decode("ascii", "replace") if isinstance(v, bytes) else str(v) for v in values]
+        text = " ".join(map("=".join, zip(told[::2], told[1::2], strict=True)))
+    if not isinstance(text, str):
+        return ""
+    text = text.rstrip("\0")
+    return text if len(text) <= MAX_CHARS and text.isascii() and text.isprintable() else ""
+
+
+def _text_of_columns(shapes: Shapes, lines: list[str], max_bytes: int) -> NDArray[np.uint8]:
+    """The lines that the shapes tell, each once, and the shapes' tags made to fit; none if a shape tells none."""
+    import numpy as np
+
+    told, tags = np.unique(shapes.tags[:, 6], return_inverse=True)
+    shapes.tags[:, 6] = tags
+    if told.size == 0 or told[0] < 0:
+        return np.zeros(0, np.uint8)
+    kept = lines if told.size == len(lines) else [lines[i] for i in told.tolist()]
+    n_bytes = sum(map(len, kept)) + len(kept)
+    return np.frombuffer("\n".join(kept).encode(), np.uint8) if n_bytes <= max_bytes else np.zeros(0, np.uint8)
 
 
 def _on_one_layer(shapes: Shapes, wanted: int | None) -> Shapes:

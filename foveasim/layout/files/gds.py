@@ -7,19 +7,30 @@ Coordinates are whole multiples of the database unit. Neither format has holes, 
 vertices, the closing one included: other sites are written as several polygons (``photosite 17 part 1 of 3``) that
 share edges and add no vertex, and are put together again when read, exactly.
 
+The other columns are a second property: attribute 2 with the text ``ring=3 gain=0.25 is_dead=true name="a"`` in GDSII,
+the property ``columns`` with names and values in turn in OASIS. Whole numbers come back as int64 (uint64 where it takes
+that), others as float64, to the last bit. A column whose values do not fit for some site is left out for all, and
+reported: the properties of a GDSII polygon hold 128 bytes together, and gdstk takes very long for very many different
+texts in OASIS. A column that not every photosite of a file tells is not read.
+
 References: Calma, GDSII Stream Format Manual 6.0 (1987); SEMI P39, OASIS.
 """
 
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import tempfile
 import zlib
+from bisect import bisect_left, bisect_right
+from collections import Counter
+from dataclasses import replace
 from datetime import datetime
+from itertools import chain, pairwise, repeat
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import shapely
@@ -29,10 +40,13 @@ from foveasim.arrays import MAX_SITES, Floats, Ints, check_count, check_number
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.files import written_whole
 from foveasim.layout._model import Layout
+from foveasim.layout.files._columns import MAX_COLUMN_BYTES, columns_of, kept_columns, texts_of
 from foveasim.layout.files._common import WrittenLayout, check_sites_of, checked_layout, one_sentence, rounding
 from foveasim.rings import positions_in_runs, ring_moments
 
 __all__ = ["GDS_MAGIC", "OASIS_MAGIC", "read", "write"]
+
+Point: TypeAlias = tuple[float, float]
 
 GDS_MAGIC = b"\x00\x06\x00\x02"
 OASIS_MAGIC = b"%SEMI-OASIS\r\n"
@@ -42,26 +56,37 @@ DEFAULT_DBU_UM = 1e-4
 MAX_NUMBER = 32767
 #: Vertices of a GDSII polygon: with the closing one 8,190, beyond which gdstk warns that others may not read it.
 MAX_GDS_VERTICES = 8189
+#: Bytes of a GDSII property, and of all properties of a polygon together, that any program reads.
+MAX_GDS_TEXT, MAX_GDS_PROPERTIES = 126, 128
+#: Bytes of a site's columns in OASIS that are read again.
+MAX_OASIS_TEXT = 1024
+#: gdstk looks for each text of an OASIS file among all different ones before it: a second's worth of looking.
+OASIS_TEXT_STEPS = 4e8
 #: Coordinates are 32-bit with sign.
 MAX_DBU = 2**31 - 1
 #: Layouts made at different times are the same bytes.
 TIMESTAMP = datetime(2000, 1, 1)  # noqa: DTZ001 -- GDSII knows no time zones
 CELL_NAME = "SENSOR"
 
-#: Of the reading program: memory, vertices, and time, with more of both for a large file.
-MIN_MEMORY_BYTES, MEMORY_PER_BYTE, MAX_MEMORY_BYTES = 8 * 2**30, 64, 32 * 2**30
-MAX_VERTICES = 2**29
-MAX_S, BYTES_PER_S = 30, 2**20
-#: Data type that each GDSII record has: none, bits, 16-bit, 32-bit, 64-bit floating, text.
-RECORD_TYPES = {
-    **dict.fromkeys(b"\x04\x07\x08\x09\x0a\x0b\x0c\x11\x15\x2d\x38", 0),
-    **dict.fromkeys(b"\x17\x1a\x26\x34", 1),
-    **dict.fromkeys(b"\x00\x01\x05\x0d\x0e\x13\x16\x21\x22\x25\x2a\x2b\x2e\x32\x33\x36\x39\x3b", 2),
-    **dict.fromkeys(b"\x0f\x10\x27\x2f\x30\x31", 3),
-    **dict.fromkeys(b"\x03\x1b\x1c", 5),
-    **dict.fromkeys(b"\x02\x06\x12\x19\x1f\x20\x23\x24\x2c\x37\x3a", 6),
+#: Of the reading program: memory while gdstk reads, and in all; texts of columns; time; more of each for a large file.
+MIN_READING_BYTES, READING_PER_BYTE = 2**30, 256
+MIN_MEMORY_BYTES, MEMORY_PER_BYTE, MAX_MEMORY_BYTES = 2**31, 64, 2**35
+MIN_TEXT_BYTES, TEXT_PER_BYTE = 2**27, 32
+MAX_CPU_S, BYTES_PER_S = 5, 2**20
+#: On a busy computer the same takes longer; and flattening, once it is known how much that is, may.
+PATIENCE = 5
+#: GDSII records by the data type that they have: none, bits, 16-bit, 32-bit, 64-bit floating, text.
+RECORDS_OF_TYPE = {
+    0: b"\x04\x07\x08\x09\x0a\x0b\x0c\x11\x15\x2d\x38",
+    1: b"\x17\x1a\x26\x34",
+    2: b"\x00\x01\x05\x0d\x0e\x13\x16\x21\x22\x25\x2a\x2b\x2e\x32\x33\x36\x39\x3b",
+    3: b"\x0f\x10\x27\x2f\x30\x31",
+    5: b"\x03\x1b\x1c",
+    6: b"\x02\x06\x12\x19\x1f\x20\x23\x24\x2c\x37\x3a",
 }
-END_OF_LIBRARY = 0x04
+END_OF_LIBRARY = 0x0400
+#: Vertices that an outline passes on its way through slits, for each that it has.
+MAX_STOPS = 16
 #: Of OASIS: the END record fills the last bytes of the file; a checksum follows the scheme's number.
 OASIS_END_BYTES = 256
 OASIS_END = 2
@@ -94,19 +119,9 @@ def write(layout: Layout, path: Path, *, layer: int = 1, dbu_um: float = DEFAULT
     snapped = _snapped(layout, dbu_um)
     report = rounding(layout, snapped.xy_um, path)
     site, part, n_parts, rings_um = _pieces(snapped, None if is_oasis else MAX_GDS_VERTICES)
-    tags = zip(rings_um, channel[site].tolist(), site.tolist(), part.tolist(), n_parts.tolist(), strict=True)
-    if is_oasis:
-        polygons = [
-            gdstk.Polygon(ring, layer, c).set_property("photosite", [s] if n == 0 else [s, k, n])
-            for ring, c, s, k, n in tags
-        ]
-    else:
-        polygons = [
-            gdstk.Polygon(ring, layer, c).set_gds_property(
-                1, f"photosite {s}" if n == 0 else f"photosite {s} part {k} of {n}"
-            )
-            for ring, c, s, k, n in tags
-        ]
+    polygons = [gdstk.Polygon(r, layer, c) for r, c in zip(rings_um, channel[site].tolist(), strict=True)]
+    set_properties = _set_oasis_properties if is_oasis else _set_gds_properties
+    lost = set_properties(polygons, layout, site.tolist(), part.tolist(), n_parts.tolist())
     library = gdstk.Library("FOVEASIM", unit=1e-6, precision=dbu_um * 1e-6)
     library.new_cell(CELL_NAME).add(*polygons)
     with written_whole(path) as temporary:
@@ -115,7 +130,41 @@ def write(layout: Layout, path: Path, *, layer: int = 1, dbu_um: float = DEFAULT
         else:
             library.write_gds(temporary, max_points=0, timestamp=TIMESTAMP)
         _check_end(temporary, is_oasis)
-    return report
+    return replace(report, lost_columns=lost)
+
+
+def _set_gds_properties(
+    polygons: list[Any], layout: Layout, site: list[int], part: list[int], n_parts: list[int]
+) -> tuple[str, ...]:
+    """Give each polygon its site's number and columns; the names of the columns that do not fit."""
+    numbers = [
+        f"photosite {s}" if n == 0 else f"photosite {s} part {k} of {n}"
+        for s, k, n in zip(site, part, n_parts, strict=True)
+    ]
+    longest = max(map(len, numbers), default=0)
+    kept, lost = kept_columns(layout, min(MAX_GDS_TEXT, MAX_GDS_PROPERTIES - longest - longest % 2))
+    texts = texts_of(kept)
+    if texts:
+        # gdstk writes first what was set last.
+        for polygon, s in zip(polygons, site, strict=True):
+            polygon.set_gds_property(2, texts[s])
+    for polygon, number in zip(polygons, numbers, strict=True):
+        polygon.set_gds_property(1, number)
+    return lost
+
+
+def _set_oasis_properties(
+    polygons: list[Any], layout: Layout, site: list[int], part: list[int], n_parts: list[int]
+) -> tuple[str, ...]:
+    """Give each polygon its site's number and columns; the names of the columns that would take too long."""
+    kept, lost = kept_columns(layout, MAX_OASIS_TEXT, int(OASIS_TEXT_STEPS // max(len(polygons), 1)))
+    rows = list(zip(*chain.from_iterable((repeat(key), values) for key, values in kept.items()), strict=False))
+    if rows:
+        for polygon, s in zip(polygons, site, strict=True):
+            polygon.set_property("columns", rows[s])
+    for polygon, s, k, n in zip(polygons, site, part, n_parts, strict=True):
+        polygon.set_property("photosite", [s] if n == 0 else [s, k, n])
+    return lost
 
 
 def _gdstk(path: Path) -> Any:
@@ -274,11 +323,11 @@ def read(path: Path, *, layer: int | None = None, cell: str | None = None) -> La
         (_check_oasis if is_oasis else _check_records)(path, data)
         n_bytes = len(data)
         del data
-        answer, xy_dbu, counts, tags = _isolated(path, is_oasis, layer, cell, n_bytes)
+        answer, xy_dbu, counts, tags, texts = _isolated(path, is_oasis, layer, cell, n_bytes)
         check_sites_of(path, counts.size)
         xy_um = _in_um(xy_dbu, answer["dbu_um"])
-        polygons, channel = _sites(path, xy_um, counts, tags)
-        columns = {"channel": channel}
+        pieces, piece, first = _sites(path, xy_um, counts, tags)
+        columns = {"channel": tags[piece[first], 1], **_columns(texts, tags[piece, 6], first)}
         about = {
             "made_by": "read_layout",
             "file": path.name,
@@ -286,27 +335,25 @@ def read(path: Path, *, layer: int | None = None, cell: str | None = None) -> La
             "cell": answer["cell"],
             "dbu_um": float(f"{answer['dbu_um']:.12g}"),
         }
+        is_whole = first.size == piece.size
+        packed = (pieces.xy_um, pieces.ring_offsets, pieces.site_offsets)
         try:
-            return checked_layout(polygons, columns, about)
+            return checked_layout(packed if is_whole else _outlines(pieces, first), columns, about)
         except GeometryError:
-            return checked_layout(_without_keyholes(polygons), columns, about)
+            return checked_layout(_without_keyholes(_outlines(pieces, first)), columns, about)
 
 
 def _check_records(path: Path, data: bytes) -> None:
     """Records of GDSII must have lengths that lead to the end of the library, and types that are known."""
-    known = [-1] * 256
-    for record, kind in RECORD_TYPES.items():
-        known[record] = kind
-    at, n_bytes, record = 0, len(data), -1
-    while at + 4 <= n_bytes:
-        length = data[at] << 8 | data[at + 1]
-        record = data[at + 2]
-        if length < 4 or length & 1 or known[record] != data[at + 3]:
-            raise FileError(path, f"is broken: byte {at} begins no GDSII record")
-        at += length
-        if record == END_OF_LIBRARY:
-            break
-    if record != END_OF_LIBRARY or at > n_bytes:
+    from foveasim.layout.files._kernels import walk_records
+
+    is_known = np.zeros(2**16, bool)
+    for kind, records in RECORDS_OF_TYPE.items():
+        is_known[[record << 8 | kind for record in records]] = True
+    at, record = walk_records(np.frombuffer(data, np.uint8), is_known, END_OF_LIBRARY)
+    if record == -1:
+        raise FileError(path, f"is broken: byte {at} begins no GDSII record")
+    if record != END_OF_LIBRARY or at > len(data):
         raise FileError(path, "is cut short: its GDSII records do not reach the end of the library")
     if data[at:].strip(b"\0"):
         raise FileError(path, f"is broken: something follows the end of the GDSII library at byte {at}")
@@ -323,11 +370,12 @@ def _check_oasis(path: Path, data: bytes) -> None:
 
 def _isolated(
     path: Path, is_oasis: bool, layer: int | None, cell: str | None, n_bytes: int
-) -> tuple[dict[str, Any], Floats, Ints, Ints]:
+) -> tuple[dict[str, Any], Floats, Ints, Ints, bytes]:
     """What gdstk finds in the file, read by a program of its own, which a hostile file may crash."""
     with tempfile.TemporaryDirectory(prefix="foveasim-") as folder:
         out = Path(folder) / "shapes"
-        max_s = MAX_S + n_bytes // BYTES_PER_S
+        max_cpu_s = MAX_CPU_S + n_bytes // BYTES_PER_S
+        max_memory_bytes = min(MIN_MEMORY_BYTES + MEMORY_PER_BYTE * n_bytes, MAX_MEMORY_BYTES)
         task = {
             "path": str(path.resolve()),
             "out": str(out),
@@ -336,20 +384,27 @@ def _isolated(
             "cell": cell,
             "sys_path": sys.path,
             "max_sites": MAX_SITES,
-            "max_vertices": MAX_VERTICES,
-            "max_memory_bytes": min(MIN_MEMORY_BYTES + MEMORY_PER_BYTE * n_bytes, MAX_MEMORY_BYTES),
-            "max_s": max_s,
+            "max_reading_bytes": min(MIN_READING_BYTES + READING_PER_BYTE * n_bytes, max_memory_bytes),
+            "max_memory_bytes": max_memory_bytes,
+            "max_text_bytes": max(MIN_TEXT_BYTES, TEXT_PER_BYTE * n_bytes),
+            "max_cpu_s": max_cpu_s,
+            "max_s": PATIENCE * max_cpu_s,
         }
         try:
+            # gdstk may say the same of a broken file a million times.
             done = subprocess.run(  # noqa: S603 -- our own program
                 [sys.executable, "-P", str(Path(__file__).with_name("_isolated.py"))],
                 input=json.dumps(task).encode(),
-                capture_output=True,
-                timeout=max_s,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                timeout=PATIENCE * max_cpu_s,
                 check=False,
             )
+            is_late = done.returncode == -getattr(signal, "SIGXCPU", 0)
         except subprocess.TimeoutExpired:
-            raise FileError(path, f"is broken or hostile: reading it took more than {max_s} s") from None
+            is_late = True
+        if is_late:
+            raise FileError(path, f"is broken or hostile: reading it took more than {max_cpu_s} s")
         if done.returncode != 0 or not done.stdout:
             raise FileError(path, "is broken or hostile: gdstk crashed on it")
         answer = json.loads(done.stdout)
@@ -358,37 +413,68 @@ def _isolated(
         if "broken" in answer:
             raise FileError(path, f"is broken ({answer['broken']:.160})")
         with out.open("rb") as file:
-            xy_dbu, counts, tags = (np.load(file, allow_pickle=False) for _ in range(3))
-        return answer, xy_dbu, counts, tags
+            xy_dbu, counts, tags, texts = (np.load(file, allow_pickle=False) for _ in range(4))
+        return answer, xy_dbu, counts, tags, texts.tobytes()
 
 
-def _sites(path: Path, xy_um: Floats, counts: Ints, tags: Ints) -> tuple[NDArray[Any], Ints]:
-    """Polygons of the sites in the order of their numbers, and their channels."""
-    if counts.size == 0:
-        return np.zeros(0, object), np.zeros(0, np.int64)
-    if counts.min() < 3:
+def _sites(path: Path, xy_um: Floats, counts: Ints, tags: Ints) -> tuple[Layout, Ints, Ints]:
+    """
+    The polygons of the file in the order of their sites' numbers, and which of them are the parts of one site.
+
+    Returns
+    -------
+    pieces : Layout
+        Each polygon a site, unchecked.
+    piece : (n_piece,) int64
+        Their places in the file.
+    first : (n_site,) int64
+        The first piece of each site.
+    """
+    if counts.size and counts.min() < 3:
         raise FileError(path, f"holds a polygon of {counts.min()} vertices")
-    channel, site, part, n_parts, placement = tags[:, 1:].T
+    site, part, n_parts, placement = tags[:, 2:6].T
     # Sites without a number keep their place behind those that have one.
-    number = np.where(site >= 0, site, site.max() + 1)
+    number = np.where(site >= 0, site, site.max(initial=-1) + 1)
     order = np.lexsort((part, number, placement))
-    packed = Layout(xy_um, np.concatenate(([0], np.cumsum(counts))), np.arange(counts.size + 1))[order]
-    polygons = packed.polygons()
+    pieces = Layout(xy_um, np.concatenate(([0], np.cumsum(counts))), np.arange(counts.size + 1))
+    if (np.diff(order) != 1).any():
+        pieces = pieces[order]
     if not n_parts.any():
-        return polygons, channel[order]
+        return pieces, order, np.arange(order.size)
     key = np.stack((placement, number, n_parts), 1)[order]
     is_first = np.concatenate(([True], (key[1:] != key[:-1]).any(axis=1))) | (n_parts[order] == 0)
     first = np.flatnonzero(is_first)
     size = np.diff(np.append(first, order.size))
-    expected = np.concatenate([np.arange(1, n + 1) if n > 1 else [n] for n in size])
-    is_wrong = (n_parts[order] > 0) & ((n_parts[order] != np.repeat(size, size)) | (part[order] != expected))
+    is_wrong = (n_parts[order] != np.repeat(size, size)) | (part[order] != positions_in_runs(size) + 1)
+    is_wrong &= n_parts[order] > 0
     if is_wrong.any():
         bad = order[np.flatnonzero(is_wrong)[0]]
         raise FileError(path, f"has other parts of photosite {site[bad]} than the {n_parts[bad]} that it was cut into")
+    return pieces, order, first
+
+
+def _outlines(pieces: Layout, first: Ints) -> NDArray[Any]:
+    """Polygons of the sites, put together of their pieces."""
+    polygons = pieces.polygons()
     whole = polygons[first]
+    size = np.diff(np.append(first, polygons.size))
     for i in np.flatnonzero(size > 1):
         whole[i] = shapely.coverage_union_all(polygons[first[i] : first[i] + size[i]])
-    return whole, channel[order][first]
+    return whole
+
+
+def _columns(texts: bytes, line: Ints, first: Ints) -> dict[str, NDArray[Any]]:
+    """The columns that all pieces of all sites tell, the pieces of a site the same; ``line`` of each piece."""
+    columns = {}
+    size = np.diff(np.append(first, line.size))
+    for name, told in columns_of(texts).items() if texts else ():
+        if told.itemsize * line.size > MAX_COLUMN_BYTES:
+            continue
+        pieces = told[line]
+        column = pieces[first]
+        if np.array_equal(np.repeat(column, size), pieces, equal_nan=told.dtype.kind == "f"):
+            columns[name] = column
+    return columns
 
 
 def _without_keyholes(polygons: NDArray[Any]) -> NDArray[Any]:
@@ -397,17 +483,67 @@ def _without_keyholes(polygons: NDArray[Any]) -> NDArray[Any]:
 
     Other programs write holes this way.
     """
-    is_bad = ~shapely.is_valid(polygons)
-    if is_bad.any():
-        mended = shapely.make_valid(polygons[is_bad], method="structure", keep_collapsed=False)
-        is_same = (shapely.get_type_id(mended) == shapely.GeometryType.POLYGON) & np.isclose(
-            shapely.area(mended), _shoelace_um2(polygons[is_bad]), rtol=1e-9, atol=0.0
-        )
-        polygons[np.flatnonzero(is_bad)[is_same]] = mended[is_same]
+    for i in np.flatnonzero(~shapely.is_valid(polygons)):
+        if not polygons[i].interiors:
+            walk = list(map(tuple, shapely.get_coordinates(polygons[i]).tolist()))
+            mended = _of_loops(_loops(_with_all_vertices(walk)))
+            if mended is not None and shapely.is_valid(mended):
+                polygons[i] = mended
     return polygons
 
 
-def _shoelace_um2(polygons: NDArray[Any]) -> Floats:
-    """Area that the outlines go round, a part gone round twice counting twice."""
-    rings, owner = shapely.get_rings(polygons, return_index=True)
-    return np.asarray(np.bincount(owner, shapely.area(shapely.polygons(rings)), len(polygons)), dtype=np.float64)
+def _with_all_vertices(walk: list[Point]) -> list[Point]:
+    """A closed walk that stops at each of its vertices wherever it passes one, on horizontal and vertical ways."""
+    stops: tuple[dict[float, list[float]], ...] = ({}, {})
+    for axis, of_line in enumerate(stops):
+        for vertex in set(walk):
+            of_line.setdefault(vertex[axis], []).append(vertex[1 - axis])
+        for values in of_line.values():
+            values.sort()
+    whole = walk[:1]
+    for a, b in pairwise(walk):
+        axis = 0 if a[0] == b[0] else 1
+        # A walk that passes very many is no outline.
+        if a[axis] == b[axis] and len(whole) < MAX_STOPS * len(walk):
+            values, (low, high) = stops[axis][a[axis]], sorted((a[1 - axis], b[1 - axis]))
+            passed = values[bisect_right(values, low) : bisect_left(values, high)]
+            on_line = [(a[0], v) if axis == 0 else (v, a[1]) for v in passed]
+            whole += on_line if a < b else on_line[::-1]
+        whole.append(b)
+    return whole
+
+
+def _loops(walk: list[Point]) -> list[list[Point]]:
+    """Rings that are left of a closed walk without the ways that it goes there and back again."""
+    n_times = Counter(pairwise(walk))
+    ways: dict[Point, list[Point]] = {}
+    for (a, b), n in n_times.items():
+        if a != b:
+            ways.setdefault(a, []).extend([b] * (n - n_times[b, a]))
+    loops = []
+    for start in ways:
+        path, place = [start], {start: 0}
+        while ways[path[-1]]:
+            vertex = ways[path[-1]].pop()
+            at = place.setdefault(vertex, len(path))
+            if at == len(path):
+                path.append(vertex)
+                continue
+            loops.append(path[at:])
+            for passed in path[at + 1 :]:
+                del place[passed]
+            del path[at + 1 :]
+    return loops
+
+
+def _of_loops(loops: list[list[Point]]) -> Any:
+    """The polygon of the largest ring, with the others as holes; nothing if one goes round the same way as that."""
+    if not loops:
+        return None
+    offsets = np.cumsum([0, *map(len, loops)])
+    area_um2 = ring_moments(np.array([vertex for loop in loops for vertex in loop]), offsets)[0]
+    outline = int(np.argmax(np.abs(area_um2)))
+    is_hole = area_um2 * area_um2[outline] < 0.0
+    if np.count_nonzero(is_hole) != len(loops) - 1:
+        return None
+    return shapely.Polygon(loops[outline], [loop for loop, is_in in zip(loops, is_hole, strict=True) if is_in])

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import re
 from array import array
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
@@ -34,6 +35,8 @@ from foveasim.layout.files._common import (
     one_sentence,
     plain_columns,
     restored_column,
+    texts,
+    whole_numbers,
 )
 
 __all__ = ["read", "write"]
@@ -43,6 +46,8 @@ CHUNK = 10_000
 #: JSON has no infinity, but numbers beyond float64, which are read as such.
 INFINITY = "1e999"
 NUMBERS = {int, float}
+#: Among more names of properties, only those of all features are columns: other names could be new for every feature.
+MAX_NAMES = 256
 _BLANK = re.compile(r"[ \t\r\n]*")
 
 
@@ -168,10 +173,12 @@ class _Document:
 
     def columns(self, types: Mapping[str, Any]) -> tuple[dict[str, NDArray[Any]], list[str]]:
         """Columns of the features' properties, and the names of those that are none."""
-        names = dict.fromkeys(chain(types, chain.from_iterable(self._rows)))
+        n_rows = Counter(chain.from_iterable(self._rows))
+        names = dict.fromkeys(chain(types, n_rows))
         columns, left_out = {}, []
         for name in names:
-            column = _column([row.get(name) for row in self._rows], types.get(name))
+            is_looked_at = len(names) <= MAX_NAMES or n_rows[name] == len(self._rows)
+            column = _column([row.get(name) for row in self._rows], types.get(name)) if is_looked_at else None
             if column is None:
                 left_out.append(name)
             else:
@@ -223,10 +230,13 @@ def _column(values: list[Any], dtype: Any) -> NDArray[Any] | None:
     if not values:
         return restored_column(np.zeros(0), dtype)
     if plain == {str}:
-        return restored_column(np.array(["" if v is None else v for v in values]), dtype)
-    if kinds in ({bool}, {int}):
-        column = np.array(values)
-        return None if column.dtype.hasobject else restored_column(column, dtype)
+        text = texts(["" if v is None else v for v in values])
+        return None if text is None else restored_column(text, dtype)
+    if kinds == {bool}:
+        return restored_column(np.array(values), dtype)
+    if kinds == {int}:
+        column = whole_numbers(values)
+        return None if column is None else restored_column(column, dtype)
     if (plain and plain <= {int, float}) or (not plain and str(dtype)[1:2] == "f"):
         return restored_column(np.array([np.nan if v is None else v for v in values], dtype=np.float64), dtype)
     return None

@@ -19,17 +19,19 @@ from foveasim.errors import FileError, ParameterError
 from foveasim.files import written_whole
 from foveasim.layout._model import Layout
 from foveasim.layout.files._common import (
-    MAX_UNPACKED_BYTES,
     WrittenLayout,
     check_header,
     check_sites_of,
+    check_unpacked,
     checked_layout,
     dtype_text,
     header,
     lossless,
+    max_unpacked,
     one_sentence,
     plain_columns,
     restored_column,
+    texts,
 )
 
 __all__ = ["MAGIC", "read", "write"]
@@ -39,6 +41,18 @@ GEOMETRY = "geometry"
 VERSION = "1.1.0"
 #: Rows that are unpacked at a time.
 BATCH = 4096
+#: Numbers of WKB's polygons and multipolygons, and the bit of those that tell a reference system before anything else.
+POLYGON, MULTIPOLYGON = 3, 6
+WITH_SRID = 1 << 29
+#: The first five bytes of both, in either byte order, with or without heights and other extras.
+HEADS = {
+    kind: {
+        bytes([is_little]) + number.to_bytes(4, "little" if is_little else "big"): number
+        for is_little in (0, 1)
+        for number in (kind + extra | flags << 29 for extra in (0, 1000, 2000, 3000) for flags in range(8))
+    }
+    for kind in (POLYGON, MULTIPOLYGON)
+}
 
 
 def write(layout: Layout, path: Path) -> WrittenLayout:
@@ -73,7 +87,8 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     table = pa.table({GEOMETRY: outlines, **{name: pa.array(values) for name, values in native.items()}})
     table = table.replace_schema_metadata({"geo": json.dumps(geo), "foveasim": json.dumps(about)})
     with written_whole(path) as temporary:
-        parquet.write_table(table, temporary, compression="zstd", write_page_checksum=True)
+        # No outline stands there twice.
+        parquet.write_table(table, temporary, compression="zstd", use_dictionary=[*columns], write_page_checksum=True)
     return lossless(layout, path)
 
 
@@ -89,8 +104,7 @@ def read(path: Path) -> Layout:
     pa, parquet = _pyarrow(path)
     with one_sentence(path, "GeoParquet"), parquet.ParquetFile(path, page_checksum_verification=True) as file:
         check_sites_of(path, file.metadata.num_rows)
-        if sum(file.metadata.row_group(i).total_byte_size for i in range(file.num_row_groups)) > MAX_UNPACKED_BYTES:
-            raise FileError(path, f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
+        check_unpacked(path, sum(file.metadata.row_group(i).total_byte_size for i in range(file.num_row_groups)))
         metadata = file.metadata.metadata or {}
         if b"geo" not in metadata:
             raise FileError(path, "is a Parquet table without outlines: it has no metadata 'geo'")
@@ -102,6 +116,8 @@ def read(path: Path) -> Layout:
         if not (pa.types.is_binary(kind) or pa.types.is_large_binary(kind)):
             raise FileError(path, f"has outlines as {str(kind)[:40]}, not as bytes of WKB")
         table = _table(path, pa, file)
+        if table.num_rows != file.metadata.num_rows:
+            raise FileError(path, f"holds {table.num_rows} rows, and tells of {file.metadata.num_rows}")
         table.validate(full=True)
         polygons = _polygons(path, table.column(name).to_numpy(zero_copy_only=False))
         types: Any = {}
@@ -122,8 +138,11 @@ def read(path: Path) -> Layout:
             if not (is_number or is_text) or (has_null and not pa.types.is_floating(kind)):
                 left_out.append(other)
                 continue
-            values = table.column(other).to_numpy(zero_copy_only=False)
-            columns[other] = restored_column(values.astype(str) if is_text else values, types.get(other))
+            values = texts(table.column(other).to_pylist()) if is_text else table.column(other).to_numpy()
+            if values is None:
+                left_out.append(other)
+            else:
+                columns[other] = restored_column(values, types.get(other))
         if left_out:
             provenance = {**provenance, "left_out_columns": left_out}
         return checked_layout(polygons, columns, provenance)
@@ -141,22 +160,42 @@ def _pyarrow(path: Path) -> tuple[Any, Any]:
 def _table(path: Path, pa: Any, file: Any) -> Any:
     """All rows, a few at a time: one long value may stand in a small file for very many rows."""
     batches, n_bytes = [], 0
-    for batch in file.iter_batches(batch_size=BATCH, use_threads=False):
+    for batch in file.iter_batches(batch_size=_rows_at_a_time(path, file.metadata), use_threads=False):
         n_bytes += batch.nbytes
-        if n_bytes > MAX_UNPACKED_BYTES:
-            raise FileError(path, f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
+        check_unpacked(path, n_bytes)
         batches.append(batch)
     return pa.Table.from_batches(batches, schema=file.schema_arrow)
 
 
+def _rows_at_a_time(path: Path, metadata: Any) -> int:
+    """Rows that do not unpack to too much even if all of them are the longest value of a dictionary."""
+    chunks = [
+        metadata.row_group(i).column(j) for i in range(metadata.num_row_groups) for j in range(metadata.num_columns)
+    ]
+    longest = max(
+        (c.total_uncompressed_size for c in chunks if c.has_dictionary_page and c.physical_type == "BYTE_ARRAY"),
+        default=1,
+    )
+    return int(min(max(max_unpacked(path) // max(longest, 1), 1), BATCH))
+
+
 def _polygons(path: Path, outlines: NDArray[Any]) -> NDArray[Any]:
     """Polygons of WKB; a row that holds one in a multipolygon gives that."""
+    plain = HEADS[POLYGON]
+    others = [row for row, wkb in enumerate(outlines) if wkb is None or wkb[:5] not in plain]
+    for row in others:
+        # What holds itself over and over would crash GEOS.
+        if not _is_multipolygon_of_one(outlines[row]):
+            raise FileError(path, f"row {row} must be one polygon; a site is one piece")
     geometries = np.asarray(shapely.from_wkb(outlines, on_invalid="raise"), dtype=object)
-    is_multi = shapely.get_type_id(geometries) == shapely.GeometryType.MULTIPOLYGON
-    is_single = is_multi & (shapely.get_num_geometries(geometries) == 1)
-    geometries[is_single] = shapely.get_geometry(geometries[is_single], 0)
-    is_polygon = shapely.get_type_id(geometries) == shapely.GeometryType.POLYGON
-    if not is_polygon.all():
-        row = int(np.flatnonzero(~is_polygon)[0])
-        raise FileError(path, f"row {row} must be one polygon; a site is one piece")
+    geometries[others] = shapely.get_geometry(geometries[others], 0)
     return geometries
+
+
+def _is_multipolygon_of_one(wkb: bytes | None) -> bool:
+    number = None if wkb is None else HEADS[MULTIPOLYGON].get(wkb[:5])
+    if wkb is None or number is None:
+        return False
+    at = 9 if number & WITH_SRID else 5
+    n_parts = int.from_bytes(wkb[at : at + 4], "little" if wkb[0] else "big")
+    return n_parts == 1 and wkb[at + 4 : at + 9] in HEADS[POLYGON]

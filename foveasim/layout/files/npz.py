@@ -12,14 +12,15 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from foveasim.arrays import MAX_SITES
 from foveasim.errors import FileError
 from foveasim.files import written_whole
 from foveasim.layout._model import Layout
 from foveasim.layout.files._common import (
-    MAX_UNPACKED_BYTES,
     WrittenLayout,
     check_header,
     check_sites_of,
+    check_unpacked,
     header,
     lossless,
     one_sentence,
@@ -63,8 +64,9 @@ def read(path: Path) -> Layout:
     """
     with one_sentence(path, "npz"), zipfile.ZipFile(path) as archive:
         items = {item.filename.removesuffix(SUFFIX): item for item in archive.infolist()}
-        if sum(item.file_size for item in items.values()) > MAX_UNPACKED_BYTES:
-            raise FileError(path, f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
+        check_unpacked(path, sum(item.file_size for item in items.values()))
+        if not {item.compress_type for item in items.values()} <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+            raise FileError(path, "is packed in a way that numpy does not use")
         if "about" not in items:
             raise FileError(path, "is no foveasim layout")
         provenance = check_header(path, json.loads(str(_array(archive, items["about"]))))
@@ -90,9 +92,11 @@ def _array(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> NDArray[Any]:
         shape, is_fortran, dtype = read_header(file)
         if dtype.hasobject:
             raise ValueError("an array of objects")
-        if math.prod(shape) * dtype.itemsize != item.file_size - file.tell():
+        # What takes no room may be there any number of times.
+        n = math.prod(shape)
+        if n * dtype.itemsize != item.file_size - file.tell() or not 0 <= n <= max(item.file_size, MAX_SITES):
             raise ValueError("an array of another size than its header tells")
-        flat = np.frombuffer(file.read(), dtype) if dtype.itemsize else np.zeros(math.prod(shape), dtype)
+        flat = np.frombuffer(file.read(), dtype) if dtype.itemsize else np.zeros(n, dtype)
     return flat.reshape(shape, order="F" if is_fortran else "C")
 
 

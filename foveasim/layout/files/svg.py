@@ -55,7 +55,7 @@ def write(layout: Layout, path: Path, *, colours: Mapping[int, str] | None = Non
             outlines = _outlines(layout[start : start + CHUNK])
             file.writelines(f'<path id="site{i}" fill="{fills[i]}" d="{d}"/>\n' for i, d in enumerate(outlines, start))
         file.write("</g>\n</svg>\n")
-    return rounding(layout, np.round(layout.xy_um, DIGITS), path)
+    return rounding(layout, np.round(layout.xy_um, DIGITS), path, tuple(sorted(layout.columns)))
 
 
 def _checked(colours: Mapping[int, str]) -> dict[int, str]:
