@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from foveasim.arrays import MAX_SITES, Floats
-from foveasim.errors import FileError, FoveasimError, ParameterError
+from foveasim.errors import FileError, FoveasimError, GeometryError, ParameterError
 from foveasim.layout._model import Layout
 from foveasim.records import described
 from foveasim.rings import site_area_um2
@@ -20,6 +21,7 @@ from foveasim.rings import site_area_um2
 __all__ = [
     "WrittenLayout",
     "check_header",
+    "check_holes",
     "check_sites_of",
     "check_unpacked",
     "checked_layout",
@@ -44,6 +46,8 @@ MAX_UNPACKED_BYTES = 8 * 2**30
 MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**26, 128
 #: A column of text takes the room of its longest in every row: what that may come to, and for each letter there is.
 MIN_TEXT_BYTES, TEXT_BYTES_PER_LETTER = 2**28, 64
+#: Rings that may meet each other in the same sites, and more of them for each ring that there is.
+MAX_RING_PAIRS, RING_PAIRS_PER_RING = 2_000_000, 100
 #: Enough to tell the formats apart, white space and a byte order mark before the first brace included.
 HEAD_BYTES = 256
 #: Longer messages of other libraries are cut.
@@ -173,6 +177,21 @@ def check_sites_of(path: Path, n_sites: int) -> None:
         raise FileError(path, f"has {n_sites} sites, more than the {MAX_SITES} that are read")
 
 
+def check_holes(n_rings: NDArray[Any]) -> None:
+    """
+    Refuse sites with so many rings that to check each with each would take minutes.
+
+    Raises
+    ------
+    GeometryError
+        When there are more than photosites have.
+    """
+    n_pairs = np.sum(n_rings.astype(np.float64) ** 2)
+    if n_pairs > MAX_RING_PAIRS + RING_PAIRS_PER_RING * n_rings.sum():
+        site = int(np.argmax(n_rings))
+        raise GeometryError(f"site {site} has {n_rings[site] - 1} holes, more than photosites have", (site,))
+
+
 def checked_layout(
     polygons: NDArray[Any] | tuple[NDArray[Any], NDArray[Any], NDArray[Any]],
     columns: Mapping[str, NDArray[Any]],
@@ -186,6 +205,7 @@ def checked_layout(
     GeometryError, ParameterError
         When outlines are no photosites, or a column does not fit.
     """
+    check_holes(np.diff(polygons[2]) if isinstance(polygons, tuple) else shapely.get_num_interior_rings(polygons) + 1)
     bare = Layout.from_polygons(polygons)
     return Layout(bare.xy_um, bare.ring_offsets, bare.site_offsets, columns, provenance)
 

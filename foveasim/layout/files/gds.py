@@ -41,7 +41,14 @@ from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.files import written_whole
 from foveasim.layout._model import Layout
 from foveasim.layout.files._columns import MAX_COLUMN_BYTES, columns_of, kept_columns, texts_of
-from foveasim.layout.files._common import WrittenLayout, check_sites_of, checked_layout, one_sentence, rounding
+from foveasim.layout.files._common import (
+    WrittenLayout,
+    check_holes,
+    check_sites_of,
+    checked_layout,
+    one_sentence,
+    rounding,
+)
 from foveasim.rings import positions_in_runs, ring_moments
 
 __all__ = ["GDS_MAGIC", "OASIS_MAGIC", "read", "write"]
@@ -483,13 +490,14 @@ def _without_keyholes(polygons: NDArray[Any]) -> NDArray[Any]:
 
     Other programs write holes this way.
     """
-    for i in np.flatnonzero(~shapely.is_valid(polygons)):
-        if not polygons[i].interiors:
-            walk = list(map(tuple, shapely.get_coordinates(polygons[i]).tolist()))
-            mended = _of_loops(_loops(_with_all_vertices(walk)))
-            if mended is not None and shapely.is_valid(mended):
-                polygons[i] = mended
-    return polygons
+    walks = np.flatnonzero(~shapely.is_valid(polygons) & (shapely.get_num_interior_rings(polygons) == 0))
+    mended = np.full(len(polygons), None)
+    for i in walks:
+        mended[i] = _of_loops(
+            _loops(_with_all_vertices(list(map(tuple, shapely.get_coordinates(polygons[i]).tolist()))))
+        )
+    check_holes(np.maximum(shapely.get_num_interior_rings(mended), 0) + 1)
+    return np.where(shapely.is_valid(mended), mended, polygons)
 
 
 def _with_all_vertices(walk: list[Point]) -> list[Point]:

@@ -1,0 +1,632 @@
+"""Layout files made to harm: each ends in a layout or in one sentence, within seconds and within two gigabytes."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import subprocess
+import sys
+import zipfile
+import zlib
+
+import numpy as np
+import pytest
+import shapely
+
+gdstk = pytest.importorskip("gdstk")
+pa = pytest.importorskip("pyarrow")
+pq = pytest.importorskip("pyarrow.parquet")
+
+MAX_S = 10.0
+HANGING_S = 60.0
+MAX_BYTES = 2 * 2**30
+#: What reading may raise.
+ERRORS = {"ConfigError", "FileError", "GeometryError", "ParameterError"}
+READ = """
+import json, resource, sys, time
+from foveasim.config import read_any_layout
+from foveasim.errors import FoveasimError
+import foveasim.layout.files._kernels
+
+for path in sys.stdin.read().splitlines():
+    began_s = time.perf_counter()
+    try:
+        answer = ["Layout", str(read_any_layout(path).layout.n_sites)]
+    except FoveasimError as error:
+        answer = [type(error).__name__, str(error)]
+    except BaseException as error:
+        answer = ["!" + type(error).__name__, str(error)]
+    seconds = time.perf_counter() - began_s
+    # What getrusage tells of a program itself includes the one that started it.
+    own = next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmHWM")) * 1024
+    children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
+    print(json.dumps([*answer, seconds, own, children]), flush=True)
+"""
+
+
+def read_apart(paths):
+    """
+    What a program of its own makes of files, one after the other: kind, sentence, seconds, bytes of it and of its children.
+
+    A file that ends the program is a kind of its own, and the next program goes on after it.
+    """
+    answers = []
+    while len(answers) < len(paths):
+        rest = paths[len(answers) :]
+        with subprocess.Popen(
+            [sys.executable, "-c", READ],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as program:
+            try:
+                out, err = program.communicate("\n".join(map(str, rest)), timeout=HANGING_S + len(rest))
+            except subprocess.TimeoutExpired:
+                program.kill()
+                out, err = program.communicate()
+        answers += map(json.loads, out.splitlines())
+        if len(answers) < len(paths):
+            answers.append([f"!ended with {program.returncode}", err[-300:], 0.0, 0, 0])
+    return answers
+
+
+def assert_harmless(answer, *, may_be_layout=False):
+    kind, sentence, seconds, own_bytes, child_bytes = answer
+    assert kind in (ERRORS | {"Layout"} if may_be_layout else ERRORS), answer
+    assert sentence.isprintable(), answer
+    assert len(sentence) < 700
+    assert seconds < MAX_S, answer
+    assert own_bytes + child_bytes < MAX_BYTES, answer
+
+
+# -- GDSII ------------------------------------------------------------------------------------------------------------
+
+
+def gds_real(value):
+    """An 8-byte number of GDSII: sign, exponent of 16, 56 bits of mantissa."""
+    exponent = 64
+    while value and abs(value) >= 1.0:
+        value, exponent = value / 16, exponent + 1
+    while value and abs(value) < 1 / 16:
+        value, exponent = value * 16, exponent - 1
+    return struct.pack(">Q", (value < 0) << 63 | exponent << 56 | round(abs(value) * 2**56))
+
+
+def record(kind, data_type, payload=b""):
+    return struct.pack(">HBB", 4 + len(payload), kind, data_type) + payload
+
+
+def text_record(kind, text):
+    return record(kind, 6, text + b"\0" * (len(text) % 2))
+
+
+def gds(*cells, dbu_m=1e-10):
+    """A GDSII file of cells as (name, elements)."""
+    now = struct.pack(">12h", *[1] * 12)
+    data = record(0x00, 2, b"\x02\x58") + record(0x01, 2, now) + text_record(0x02, b"LIB")
+    data += record(0x03, 5, gds_real(dbu_m * 1e6) + gds_real(dbu_m))
+    for name, elements in cells:
+        data += record(0x05, 2, now) + text_record(0x06, name) + elements + record(0x07, 0)
+    return data + record(0x04, 0)
+
+
+def gds_shape(*xy, properties=()):
+    shape = record(0x08, 0) + record(0x0D, 2, b"\0\1") + record(0x0E, 2, b"\0\0")
+    shape += record(0x10, 3, struct.pack(f">{len(xy)}i", *xy))
+    for attribute, text in properties:
+        shape += record(0x2B, 2, struct.pack(">h", attribute)) + text_record(0x2C, text)
+    return shape + record(0x11, 0)
+
+
+SQUARE = gds_shape(0, 0, 10000, 0, 10000, 10000, 0, 10000, 0, 0)
+
+
+def gds_reference(name, n_columns=None, n_rows=None, *, magnification=None, angle=None, step=20000, x=0):
+    """One reference to a cell, or an array of them."""
+    is_array = n_columns is not None
+    element = record(0x0B if is_array else 0x0A, 0) + text_record(0x12, name)
+    if magnification is not None or angle is not None:
+        element += record(0x1A, 1, b"\0\0")
+        element += record(0x1B, 5, magnification) if magnification is not None else b""
+        element += record(0x1C, 5, angle) if angle is not None else b""
+    xy = (x, 0)
+    if is_array:
+        element += record(0x13, 2, struct.pack(">hh", n_columns, n_rows))
+        limit = 2**31 - 1
+        xy = (x, 0, min(step * abs(n_columns), limit), 0, 0, min(step * abs(n_rows), limit))
+    return element + record(0x10, 3, struct.pack(f">{len(xy)}i", *xy)) + record(0x11, 0)
+
+
+def gds_path(width, end, n=2):
+    xy = [v for i in range(n) for v in (i * 1000, (i % 2) * 1000)]
+    path = record(0x09, 0) + record(0x0D, 2, b"\0\1") + record(0x0E, 2, b"\0\0")
+    path += record(0x21, 2, struct.pack(">h", end)) + record(0x0F, 3, struct.pack(">i", width))
+    return path + record(0x10, 3, struct.pack(f">{len(xy)}i", *xy)) + record(0x11, 0)
+
+
+def nested(n_levels, n_each, base=SQUARE):
+    """Cells of which each holds many of the one before."""
+    cells = [(b"C0", base)]
+    for i in range(1, n_levels + 1):
+        inner = b"C%d" % (i - 1)
+        cells.append((b"C%d" % i, b"".join(gds_reference(inner, x=20000 * k) for k in range(n_each))))
+    return gds(*cells)
+
+
+def columns(text):
+    return [(1, b"photosite 0"), (2, text)]
+
+
+GDS_BOMBS = {
+    "array of 32767 x 32767": lambda: gds((b"C", SQUARE), (b"TOP", gds_reference(b"C", 32767, 32767))),
+    "10 levels of 10": lambda: nested(10, 10),
+    "60 levels of 2": lambda: nested(60, 2),
+    "arrays of arrays of nothing": lambda: gds(
+        (b"C", b""),
+        (b"D", gds_reference(b"C", 32767, 32767)),
+        (b"TOP", gds_reference(b"D", 32767, 32767)),
+    ),
+    "array of 7000 x 7000": lambda: gds((b"C", SQUARE), (b"TOP", gds_reference(b"C", 7000, 7000, step=11000))),
+    "array of 0 x -1": lambda: gds((b"C", SQUARE), (b"TOP", gds_reference(b"C", 0, -1))),
+    "array of -32768 x -32768": lambda: gds((b"C", SQUARE), (b"TOP", gds_reference(b"C", -32768, -32768))),
+    "chain of 1000 cells about 20000 squares": lambda: gds(
+        (b"C0", SQUARE * 20_000),
+        *((b"C%d" % i, gds_reference(b"C%d" % (i - 1))) for i in range(1, 1000)),
+    ),
+    "5000 cells in a chain": lambda: gds(
+        (b"C0", SQUARE), *((b"C%d" % i, gds_reference(b"C%d" % (i - 1))) for i in range(1, 5000))
+    ),
+    "5000 cells on top": lambda: gds(*((b"C%d" % i, SQUARE) for i in range(5000))),
+    "round paths, wide": lambda: gds((b"C", gds_path(2**31 - 1, 1) * 20_000)),
+    "array of round paths": lambda: gds((b"C", gds_path(2**31 - 1, 1)), (b"TOP", gds_reference(b"C", 3000, 3000))),
+    "path of no width": lambda: gds((b"C", gds_path(0, 0))),
+    "path of 8000 spikes": lambda: gds((b"C", gds_path(2**30, 1, 8000))),
+    "magnified to infinity": lambda: gds(
+        (b"C", SQUARE), (b"TOP", gds_reference(b"C", magnification=b"\x7f" + b"\xff" * 7))
+    ),
+    "turned by a huge angle": lambda: gds((b"C", SQUARE), (b"TOP", gds_reference(b"C", angle=b"\x7f" + b"\xff" * 7))),
+    "magnified by nothing": lambda: gds((b"C", SQUARE), (b"TOP", gds_reference(b"C", magnification=bytes(8)))),
+    "unit of nothing": lambda: gds((b"C", SQUARE), dbu_m=0.0),
+    "unit of a light year": lambda: gds((b"C", SQUARE), dbu_m=1e16),
+    "cell names with line ends": lambda: gds((b"A\n\x1b[31m\xff", SQUARE), (b"B\r\n", SQUARE)),
+    "shape of two vertices": lambda: gds((b"C", gds_shape(0, 0, 5, 5, 0, 0))),
+    "shape without vertices": lambda: gds((b"C", gds_shape())),
+    "shapes of four billion vertices": lambda: gds(
+        (b"C", gds_shape(*range(16_000)) * 50), (b"TOP", gds_reference(b"C", 100, 100))
+    ),
+    "outline of 8000 random vertices": lambda: gds(
+        (b"C", gds_shape(*np.random.default_rng(1).integers(-(10**6), 10**6, 16_000).tolist()))
+    ),
+    "outline that goes to and fro on a line": lambda: gds(
+        (b"C", gds_shape(*[v for i in range(4000) for v in ((i % 2) * 10**6 - i, (i % 5) * 10)]))
+    ),
+    "outline on one line": lambda: gds((b"C", gds_shape(*[v for i in range(8000) for v in (i * 7919 % 8009, 0)]))),
+    "3000 parts of a site that overlap": lambda: gds(
+        (
+            b"C",
+            b"".join(
+                gds_shape(
+                    0, 0, 10**6, i, 10**6 - i, 10**6, 0, 0, properties=[(1, b"photosite 0 part %d of 3000" % (i + 1))]
+                )
+                for i in range(3000)
+            ),
+        )
+    ),
+    "parts of a site, most missing": lambda: gds(
+        (b"C", gds_shape(0, 0, 9, 0, 9, 9, 0, 0, properties=[(1, b"photosite 0 part 1 of 999999999")]))
+    ),
+    "same part twice": lambda: gds(
+        (b"C", gds_shape(0, 0, 9, 0, 9, 9, 0, 0, properties=[(1, b"photosite 0 part 1 of 2")]) * 2)
+    ),
+    "properties of 60000 bytes": lambda: gds(
+        (b"C", gds_shape(0, 0, 9999, 0, 9999, 9999, 0, 0, properties=columns(b"a" * 60_000)) * 300)
+    ),
+    "columns of endless digits": lambda: gds(
+        (b"C", gds_shape(0, 0, 9999, 0, 9999, 9999, 0, 0, properties=columns(b"a=" + b"9" * 900)) * 300)
+    ),
+    "columns of a thousand names": lambda: gds(
+        (b"C", gds_shape(0, 0, 9999, 0, 9999, 9999, 0, 0, properties=columns(b"a=1 b= " * 140)) * 2000)
+    ),
+    "columns of other names for each shape": lambda: gds(
+        (
+            b"C",
+            b"".join(
+                gds_shape(0, 0, 9999, 0, 9999, 9999, 0, 0, properties=columns(b"a%d=1" % i)) for i in range(20_000)
+            ),
+        )
+    ),
+    "long texts in an array": lambda: gds(
+        (b"C", gds_shape(0, 0, 9999, 0, 9999, 9999, 0, 0, properties=columns(b'a="' + b"a" * 900 + b'"'))),
+        (b"TOP", gds_reference(b"C", 400, 400)),
+    ),
+    "columns that would be evaluated": lambda: gds(
+        (b"C", gds_shape(0, 0, 9999, 0, 9999, 9999, 0, 0, properties=columns(b"a=__import__('os').abort()")))
+    ),
+}
+
+
+# -- OASIS ------------------------------------------------------------------------------------------------------------
+
+
+def number(value):
+    """An unsigned whole number of OASIS: 7 bits a byte, the lowest first."""
+    data = bytearray()
+    while value >= 128:
+        data.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*data, value])
+
+
+def string(text):
+    return number(len(text)) + text
+
+
+def oasis(content, scheme=0):
+    """An OASIS file: a start, a cell of the content, and an end of 256 bytes."""
+    data = b"%SEMI-OASIS\r\n" + b"\x01" + string(b"1.0") + b"\x00" + number(10_000) + b"\x00" + bytes(12)
+    data += b"\x0e" + string(b"C") + content
+    return data + b"\x02" + number(252) + bytes(252) + bytes([scheme])
+
+
+def packed(content, n_bytes=None):
+    """A compressed block that claims to unpack to a number of bytes."""
+    deflate = zlib.compressobj(9, zlib.DEFLATED, -15)
+    data = deflate.compress(content) + deflate.flush()
+    return b"\x22\x00" + number(len(content) if n_bytes is None else n_bytes) + number(len(data)) + data
+
+
+def packed_zeros(n_bytes):
+    """A compressed block of very many empty records."""
+    deflate, piece = zlib.compressobj(9, zlib.DEFLATED, -15), bytes(2**20)
+    data = b"".join(deflate.compress(piece) for _ in range(n_bytes // 2**20)) + deflate.flush()
+    return b"\x22\x00" + number(n_bytes) + number(len(data)) + data
+
+
+def oasis_rectangle(repetition=b""):
+    """A square on layer 1, perhaps repeated."""
+    side = number(20_000)
+    return bytes([20, 0b01111011 | (0b100 if repetition else 0)]) + b"\x01\x00" + 2 * side + b"\x00\x00" + repetition
+
+
+def repeated(n_columns, n_rows):
+    return b"\x01" + number(n_columns - 2) + number(n_rows - 2) + b"\x10\x10"
+
+
+def oasis_polygon(n_claimed, data=b""):
+    return bytes([21, 0b00111011]) + b"\x01\x00" + b"\x04" + number(n_claimed) + data + b"\x00\x00"
+
+
+def oasis_property(values, name=b"columns"):
+    """A property with its name and values, then once more without."""
+    head = bytes([28, 0b00000100 | (min(len(values), 15) << 4)]) + string(name)
+    return head + (number(len(values)) if len(values) >= 15 else b"") + b"".join(values)
+
+
+OASIS_BOMBS = {
+    "a million times a million": lambda: oasis(oasis_rectangle(repeated(10**6, 10**6))),
+    "2^32 x 2^32, no number of 64 bits": lambda: oasis(oasis_rectangle(repeated(2**32, 2**32))),
+    "2^63 x 4, no number of 64 bits": lambda: oasis(oasis_rectangle(repeated(2**63 + 2, 4))),
+    "2^33 x (2^31 + 1)": lambda: oasis(oasis_rectangle(repeated(2**33, 2**31 + 1))),
+    "list of 2^40 places": lambda: oasis(oasis_rectangle(b"\x0a" + number(2**40) + b"\x10\x10")),
+    "list of 2^26 places in a row": lambda: oasis(oasis_rectangle(b"\x04" + number(2**26) + b"\x10\x10")),
+    "polygon of 2^60 vertices": lambda: oasis(oasis_polygon(2**60)),
+    "polygon of a billion vertices": lambda: oasis(oasis_polygon(10**9)),
+    "polygon of 2^26 vertices": lambda: oasis(oasis_polygon(2**26)),
+    "name of 2^40 bytes": lambda: oasis(b"\x0e" + number(2**40) + b"C"),
+    "name of 2^30 bytes": lambda: oasis(b"\x0e" + number(2**30) + b"C"),
+    "endless number": lambda: oasis(b"\x0e" + b"\xff" * 10**6),
+    "block that claims 2^40 bytes": lambda: oasis(packed(oasis_rectangle(), 2**40)),
+    "block that claims 2^30 bytes": lambda: oasis(packed(oasis_rectangle(), 2**30)),
+    "block that claims 3 bytes": lambda: oasis(packed(oasis_rectangle() * 1000, 3)),
+    "block of a hundred million empty records": lambda: oasis(packed_zeros(100 * 2**20)),
+    "block in a block": lambda: oasis(packed(packed(packed(oasis_rectangle() * 1000)))),
+    "block of ten million squares": lambda: oasis(packed(oasis_rectangle() * 10**7)),
+    "block of a property said a million times": lambda: oasis(
+        packed(oasis_rectangle() + oasis_property([b"\x08\x01"] * 10**4) + (oasis_rectangle() + b"\x1d") * 10**6)
+    ),
+    "million properties of a square": lambda: oasis(
+        packed(oasis_rectangle() + oasis_property([b"\x08\x01"]) + b"\x1d" * 10**6)
+    ),
+    "columns of long words on 20000 squares": lambda: oasis(
+        packed((oasis_rectangle() + oasis_property([b"\x0a" + string(b"a" * 500)] * 8)) * 20_000)
+    ),
+    "circle of 2^50": lambda: oasis(bytes([27, 0b00111011]) + b"\x01\x00" + number(2**50) + b"\x00\x00"),
+    "trapezoid of type 255": lambda: oasis(bytes([26, 0b11111011]) + b"\x01\x00\xff\x08\x08\x00\x00"),
+    "cell that places itself": lambda: oasis(bytes([17, 0b10110000]) + string(b"C") + b"\x00\x00"),
+    "cell number 2^60": lambda: oasis(oasis_rectangle() + b"\x0d" + number(2**60) + oasis_rectangle()),
+    "unknown record": lambda: oasis(b"\x7f"),
+    "unknown checksum": lambda: oasis(oasis_rectangle(), scheme=77),
+}
+
+
+# -- npz --------------------------------------------------------------------------------------------------------------
+
+ABOUT = json.dumps({"format": "foveasim layout", "version": 1, "unit": "um", "provenance": {}})
+
+
+def npy(descr, shape, data):
+    """An array file with any header."""
+    head = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}".encode()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + data
+
+
+def zipped(items, compression=zipfile.ZIP_STORED):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", compression) as archive:
+        for name, data in items.items():
+            archive.writestr(name, data)
+    return buffer.getvalue()
+
+
+def npz(compression=zipfile.ZIP_STORED, **changes):
+    """A layout of one triangle, some of its arrays replaced by others."""
+    arrays = {
+        "about": npy(f"'<U{len(ABOUT)}'", (), ABOUT.encode("utf-32-le")),
+        "xy_um": npy("'<f8'", (3, 2), np.array([[0.0, 0], [1, 0], [0, 1]]).tobytes()),
+        "ring_offsets": npy("'<i8'", (2,), struct.pack("<2q", 0, 3)),
+        "site_offsets": npy("'<i8'", (2,), struct.pack("<2q", 0, 1)),
+    }
+    return zipped({f"{name}.npy": data for name, data in {**arrays, **changes}.items()}, compression)
+
+
+def pickled():
+    buffer = io.BytesIO()
+    np.save(buffer, np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    return buffer.getvalue()
+
+
+def lying(data):
+    """An archive that says of its arrays that they are much larger than they are."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        sizes = [item.file_size for item in archive.infolist() if item.filename == "xy_um.npy"]
+    return data.replace(struct.pack("<I", sizes[0]), struct.pack("<I", 2**32 - 2))
+
+
+NPZ_BOMBS = {
+    "a billion points declared": lambda: npz(xy_um=npy("'<f8'", (10**9, 2), bytes(48))),
+    "200 MB of zeros": lambda: npz(zipfile.ZIP_DEFLATED, xy_um=npy("'<f8'", (12_500_000, 2), bytes(200_000_000))),
+    "50 MB of zeros": lambda: npz(zipfile.ZIP_DEFLATED, xy_um=npy("'<f8'", (3_000_000, 2), bytes(48_000_000))),
+    "a million zeros as offsets": lambda: npz(
+        zipfile.ZIP_DEFLATED, ring_offsets=npy("'<i8'", (10**6,), bytes(8 * 10**6))
+    ),
+    "objects": lambda: npz(column_evil=pickled()),
+    "objects for outlines": lambda: npz(xy_um=pickled()),
+    "nothing, 10^18 times": lambda: npz(column_a=npy("'|V0'", (10**18,), b"")),
+    "empty texts, 10^15 times": lambda: npz(column_a=npy("'<U0'", (10**15,), b"")),
+    "rows of a billion": lambda: npz(column_a=npy("('<f8', (1000000000,))", (0,), b"")),
+    "2^62 dimensions of nothing": lambda: npz(column_a=npy("'<f8'", (2**62, 2**62, 0), b"")),
+    "shape below nothing": lambda: npz(xy_um=npy("'<f8'", (-3, -2), bytes(48))),
+    "shape of 60 dimensions": lambda: npz(column_a=npy("'<f8'", (1,) * 60, bytes(8))),
+    "header that would be evaluated": lambda: npz(column_a=npy("__import__('os').abort()", (1,), bytes(8))),
+    "header of nested brackets": lambda: npz(column_a=npy("(" * 3000 + ")" * 3000, (1,), bytes(8))),
+    "header of many fields": lambda: npz(
+        column_a=npy([(f"f{i}", "<f8") for i in range(400)], (1,), bytes(3200)),
+    ),
+    "origin nested deeply": lambda: npz(about=npy("'<U100000'", (), ("[" * 100_000).encode("utf-32-le"))),
+    "archive that lies": lambda: lying(npz()),
+    "archive of 100000 names": lambda: zipped({f"column_{i}.npy": b"" for i in range(100_000)}),
+    "archive packed by lzma": lambda: npz(zipfile.ZIP_LZMA, xy_um=npy("'<f8'", (3_000_000, 2), bytes(48_000_000))),
+    "times beyond counting": lambda: npz(column_a=npy("'<M8[as]'", (1,), b"\xff" * 8)),
+}
+
+
+# -- GeoJSON ----------------------------------------------------------------------------------------------------------
+
+RING = "[[0,0],[9,0],[9,9],[0,0]]"
+
+
+def collection(*features, **members):
+    text = "".join(f', "{name}": {value}' for name, value in members.items())
+    return f'{{"type": "FeatureCollection", "features": [{",".join(features)}]{text}}}'.encode()
+
+
+def feature(coordinates=f"[{RING}]", properties="{}"):
+    return (
+        f'{{"type": "Feature", "properties": {properties}, "geometry": '
+        f'{{"type": "Polygon", "coordinates": {coordinates}}}}}'
+    )
+
+
+def origin(**columns):
+    about = {"format": "foveasim layout", "version": 1, "unit": "um", "provenance": {}, "columns": columns}
+    return json.dumps(about)
+
+
+GEOJSON_BOMBS = {
+    "coordinates nested 100000 deep": lambda: collection(feature("[" * 100_000 + "]" * 100_000)),
+    "properties nested 100000 deep": lambda: collection(feature(properties='{"a":' * 100_000 + "1" + "}" * 100_000)),
+    "a million positions": lambda: collection(feature("[[" + "[0,0]," * 10**6 + "[0,0]]]")),
+    "100000 rings": lambda: collection(feature("[" + f"{RING}," * 10**5 + f"{RING}]")),
+    "another property for each of 20000": lambda: collection(
+        *(feature(properties=f'{{"a{i}": 1}}') for i in range(20_000))
+    ),
+    "200 properties of 20000 features": lambda: collection(
+        feature(properties=json.dumps({f"a{i}": 1 for i in range(200)})), *[feature()] * 20_000
+    ),
+    "100000 columns promised": lambda: collection(
+        *[feature()] * 1000, foveasim=origin(**{f"a{i}": "<i8" for i in range(10**5)})
+    ),
+    "one long text among 1000": lambda: collection(
+        feature(properties=json.dumps({"a": "x" * 10**6})), *[feature(properties='{"a": "y"}')] * 1000
+    ),
+    "texts promised to be long": lambda: collection(
+        *[feature(properties='{"a": "y"}')] * 20, foveasim=origin(a="<U99999999")
+    ),
+    "column of a huge type": lambda: collection(
+        *[feature(properties='{"a": 1}')] * 10, foveasim=origin(a="V999999999")
+    ),
+    "numbers of 4000 digits": lambda: collection(*[feature(properties=f'{{"a": {"9" * 4000}}}')] * 300),
+    "positions of 4000 digits": lambda: collection(feature(f"[[[0,0],[{'9' * 4000},0],[9,9],[0,0]]]")),
+    "exponent of a billion": lambda: collection(feature("[[[0,0],[1e1000000000,0],[9,9],[0,0]]]")),
+    "bytes that are no text": lambda: collection(feature()) + b"\xff\xfe",
+    "text of 16 bits": lambda: collection(feature()).decode().encode("utf-16"),
+    "text that ends in a text": lambda: b'{"type": "FeatureCollection", "features": [], "a": "' + b"\\" * 10**6,
+    "200000 members": lambda: b"{" + b",".join(b'"a%d": 0' % i for i in range(200_000)) + b"}",
+    "10 MB of blanks": lambda: b"{" + b" " * 10**7,
+    "half a pair": lambda: collection(feature(properties='{"\\ud800": "\\udfff"}')),
+}
+
+
+# -- GeoParquet -------------------------------------------------------------------------------------------------------
+
+GEO = json.dumps({"primary_column": "geometry", "columns": {"geometry": {"encoding": "WKB"}}})
+TRIANGLE = shapely.to_wkb(shapely.Polygon([(0, 0), (9, 0), (9, 9)]), byte_order=1)
+
+
+def parquet(*tables, geo=GEO, about=None, **options):
+    """A table with the outlines' description, its types as in the file alone."""
+    buffer = io.BytesIO()
+    with pq.ParquetWriter(buffer, tables[0].schema, store_schema=False, compression="zstd", **options) as writer:
+        for table in tables:
+            writer.write_table(table)
+        writer.add_key_value_metadata({"geo": geo} | ({} if about is None else {"foveasim": about}))
+    return buffer.getvalue()
+
+
+def outlines(*wkb, **others):
+    return pa.table({"geometry": pa.array(wkb, pa.binary()), **others})
+
+
+def same(value, n_rows):
+    """A column that says one value many times, in a few bytes."""
+    return pa.DictionaryArray.from_arrays(pa.array(np.zeros(n_rows, np.int32)), pa.array([value]))
+
+
+def varint(value):
+    """A whole number of Thrift, by twice itself; minus one half is said as minus one is."""
+    return number(int(abs(2 * value)))
+
+
+def declared(n_rows):
+    """A table of 777 rows that says it has more."""
+    data = parquet(outlines(*[TRIANGLE] * 777))
+    length = int.from_bytes(data[-8:-4], "little")
+    footer = data[-8 - length : -8].replace(b"\x16" + varint(777), b"\x16" + varint(n_rows))
+    return data[: -8 - length] + footer + struct.pack("<I", len(footer)) + b"PAR1"
+
+
+def nested_wkb(n, kind):
+    return struct.pack("<BII", 1, kind, 1) * n + TRIANGLE
+
+
+PARQUET_BOMBS = {
+    "a billion rows declared": lambda: declared(10**9),
+    "40 million rows declared": lambda: declared(4 * 10**7),
+    "rows below nothing": lambda: declared(-0.5),
+    "40 million rows of one outline": lambda: parquet(*[pa.table({"geometry": same(TRIANGLE, 10**6)})] * 40),
+    "outlines of a megabyte, said 4000 times": lambda: parquet(
+        pa.table({"geometry": same(bytes(2**20), 4000)}), dictionary_pagesize_limit=2**24
+    ),
+    "a text of 4 MB, said 5000 times": lambda: parquet(
+        outlines(*[TRIANGLE] * 5000, a=same("x" * 2**22, 5000)), dictionary_pagesize_limit=2**24
+    ),
+    "one long text among 10000": lambda: parquet(
+        outlines(*[TRIANGLE] * 10_000, a=pa.array(["x" * 10**6] + ["y"] * 9999)), use_dictionary=False
+    ),
+    "100 MB of zeros": lambda: parquet(outlines(bytes(100_000_000)), use_dictionary=False),
+    "multipolygons in multipolygons, 100000 deep": lambda: parquet(outlines(nested_wkb(100_000, 6))),
+    "collections in collections, 100000 deep": lambda: parquet(outlines(nested_wkb(100_000, 7))),
+    "collections in a multipolygon": lambda: parquet(
+        outlines(struct.pack("<BII", 1, 6, 1) + nested_wkb(100_000, 7)),
+    ),
+    "collections behind a polygon": lambda: parquet(
+        outlines(struct.pack("<BII", 1, 6, 2) + TRIANGLE + nested_wkb(100_000, 7)),
+    ),
+    "curved polygons, 100000 deep": lambda: parquet(outlines(nested_wkb(100_000, 10))),
+    "outline of 2^32 rings": lambda: parquet(outlines(struct.pack("<BII", 1, 3, 2**32 - 1) + bytes(100))),
+    "outline of 2^32 vertices": lambda: parquet(outlines(struct.pack("<BIII", 1, 3, 1, 2**32 - 1) + bytes(100))),
+    "outline of no bytes": lambda: parquet(outlines(b"")),
+    "outline that is not there": lambda: parquet(outlines(None)),
+    "description nested deeply": lambda: parquet(outlines(TRIANGLE), geo="[" * 100_000),
+    "description of something else": lambda: parquet(outlines(TRIANGLE), geo="[]"),
+    "types that are none": lambda: parquet(
+        outlines(TRIANGLE, a=pa.array([1])), about=origin(a="<U999999999", geometry="<f8")
+    ),
+    "lists in lists": lambda: parquet(outlines(TRIANGLE, a=pa.array([[[[[[[1] * 1000]]]]]]))),
+    "3000 columns": lambda: parquet(outlines(TRIANGLE, **{f"a{i}": pa.array([i]) for i in range(3000)})),
+    "end of the wrong length": lambda: parquet(outlines(TRIANGLE))[:-8] + b"\xff\xff\xff\x7fPAR1",
+}
+
+
+# -- YAML -------------------------------------------------------------------------------------------------------------
+
+
+def yaml_layout(parameters, generator="grid"):
+    return f"generator: {generator}\nparameters: {{{parameters}}}\n".encode()
+
+
+YAML_BOMBS = {
+    "an object of Python": lambda: b"!!python/object/apply:os._exit [3]\n",
+    "an object of Python as a value": lambda: yaml_layout(
+        "n_x: !!python/object/apply:os._exit [3], n_y: 3, pitch_um: 2.0"
+    ),
+    "a name of Python": lambda: b"generator: !!python/name:os.system\n",
+    "a tag of its own": lambda: b"generator: !evil grid\n",
+    "a billion laughs": lambda: (
+        b"a: &a [x, x, x, x, x, x, x, x, x]\n"
+        + b"".join(b"%c: &%c [%s]\n" % (c, c, b", ".join([b"*%c" % (c - 1)] * 9)) for c in range(98, 110))
+    ),
+    "a list that holds itself": lambda: b"a: &a [*a]\n",
+    "a merge": lambda: b"a: &a {b: 1}\nc: {<<: *a}\n",
+    "a billion columns": lambda: yaml_layout("n_x: 1000000000, n_y: 2, pitch_um: 0.001"),
+    "a billion columns and rows": lambda: yaml_layout("n_x: 1000000000, n_y: 1000000000, pitch_um: 2.0"),
+    "columns of 4000 digits": lambda: yaml_layout(f"n_x: {'9' * 4000}, n_y: 2, pitch_um: 2.0"),
+    "columns of 900000 digits": lambda: yaml_layout(f"n_x: {'9' * 900_000}, n_y: 2, pitch_um: 2.0"),
+    "a pitch of 1e-300": lambda: yaml_layout("n_x: 10, n_y: 2, pitch_um: 1e-300"),
+    "a pitch of infinity": lambda: yaml_layout("n_x: 10, n_y: 2, pitch_um: .inf"),
+    "a billion sectors": lambda: yaml_layout("r_min_um: 1.0, r_max_um: 100.0, n_sectors: 1000000000", "log_polar"),
+    "rings of rings of rings": lambda: yaml_layout(
+        "r_min_um: 1e-3, r_max_um: 1e7, n_sectors: 3, ring_ratio: 1.0000001", "log_polar"
+    ),
+    "a billion seeds": lambda: yaml_layout("n_sites: 1000000000, spacing_um: 1.0", "sunflower"),
+    "rhombs without number": lambda: yaml_layout("side_um: 1e-3, size_um: [1e6, 1e6]", "penrose"),
+    "a place beyond all numbers": lambda: yaml_layout(
+        "n_sites: 10, region: 'POLYGON ((0 0, 1e999 0, 1 1, 0 0))'", "voronoi"
+    ),
+    "a billion vertices declared": lambda: yaml_layout("n_sites: 10, region: [[0, 0], [1e9, 0], [0, 1e9]]", "voronoi"),
+    "lists nested 100000 deep": lambda: b"[" * 100_000,
+    "mappings nested 20000 deep": lambda: b"{a: " * 20_000,
+    "blocks nested 100000 deep": lambda: b"- " * 100_000,
+    "blocks nested by blanks": lambda: b"".join(b" " * i + b"a:\n" for i in range(1000)),
+    "a file of 2 MB": lambda: b"#" * (2 * 2**20),
+    "bytes that are no text": lambda: b"\xff\xfe\x00",
+    "a key twice": lambda: b"generator: grid\ngenerator: grid\n",
+    "a key that is a list": lambda: b"? [1, 2]\n: 3\n",
+    "two documents": lambda: b"a: 1\n---\nb: 2\n",
+    "100000 numbers": lambda: b"- 1\n" * 100_000,
+}
+
+
+# -- reading them -----------------------------------------------------------------------------------------------------
+
+BOMBS = {
+    "gds": GDS_BOMBS,
+    "oas": OASIS_BOMBS,
+    "npz": NPZ_BOMBS,
+    "geojson": GEOJSON_BOMBS,
+    "parquet": PARQUET_BOMBS,
+    "yaml": YAML_BOMBS,
+}
+
+
+@pytest.fixture(scope="module")
+def answers(tmp_path_factory):
+    """What reading gives, by format and name; the files of a format are read when it is first asked for."""
+    folder, known = tmp_path_factory.mktemp("bombs"), {}
+
+    def answer(ending, name):
+        if ending not in known:
+            paths = [folder / f"{i}.{ending}" for i in range(len(BOMBS[ending]))]
+            for path, make in zip(paths, BOMBS[ending].values(), strict=True):
+                path.write_bytes(make())
+            known[ending] = dict(zip(BOMBS[ending], read_apart(paths), strict=True))
+        return known[ending][name]
+
+    return answer
+
+
+@pytest.mark.parametrize(("ending", "name"), [(ending, name) for ending, bombs in BOMBS.items() for name in bombs])
+def test_a_file_made_to_harm_ends_in_a_layout_or_in_one_sentence(answers, ending, name):
+    assert_harmless(answers(ending, name), may_be_layout=True)
