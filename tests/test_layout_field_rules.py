@@ -32,14 +32,14 @@ def test_a_periodic_layout_has_its_fill_factor_in_every_window():
 
 
 def test_one_planted_block_is_found_in_the_windows_that_hold_it_and_nowhere_else():
-    squares = grid(n_x=300, n_y=300, pitch_um=2.0, width_um=1.0)
+    squares = grid(n_x=320, n_y=320, pitch_um=2.0, width_um=1.0)
     gone = (np.abs(squares.centroid_um - np.array([103.0, -51.0])) < 4.5).all(axis=1)
     report = squares[~gone].check(
-        DesignRules(min_density=0.249, density_window_um=20.0, die_um=(-300.0, -300.0, 300.0, 300.0))
+        DesignRules(min_density=0.249, density_window_um=20.0, die_um=(-320.0, -320.0, 320.0, 320.0))
     )
     hole = shapely.box(98, -56, 108, -46)  # 25 cells
 
-    assert report.n_sites == 90_000 - 25
+    assert report.n_sites == 102_400 - 25
     assert len(report.violations) == 9
     assert all(shapely.intersects(violation.marker, hole) for violation in report.violations)
     lost = [shapely.area(shapely.intersection(v.marker, hole)) / 4.0 / 400.0 for v in report.violations]
@@ -111,6 +111,22 @@ def test_columns_that_are_wider_than_the_sensor_are_told():
     report = layout.check(DesignRules(**rules, routing=wide))
     assert [v.value for v in report.violations] == pytest.approx([100 / math.floor(50 / 0.8)])
     assert report.violations[0].marker.length == 50.0
+
+
+def test_one_site_or_line_too_many_among_a_hundred_thousand_sites_is_told():
+    layout = log_polar(n_sectors=500, r_min_um=100.0, r_max_um=1300.0, n_rings=200)
+    readout = Readout(frames_per_s=1000.0, bits=10)
+    outer_um = math.hypot(*layout.xy_um[0])
+    pitch_um = 2 * math.pi * outer_um / 499.5
+    routing = Routing(width_um=0.5 * pitch_um, space_um=0.5 * pitch_um)
+    rules = DesignRules(max_data_rate_gbit_per_s=0.99999, readout=readout, max_track_use=1.0, routing=routing)
+    report = layout.check(rules)
+
+    assert layout.n_sites == 100_000
+    assert [v.value for v in report.violations] == pytest.approx([1.0, 500 / 499])
+    assert [v.site_ids for v in report.violations] == [(), tuple(range(500))]
+    one_less = layout[(layout.readout_line != 7) | (layout.columns["ring"] > 0)]
+    assert [v.rule for v in one_less[1:].check(rules).violations] == []
 
 
 def test_lines_without_any_track_are_told():
