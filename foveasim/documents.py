@@ -66,7 +66,7 @@ def parsed(path: Path, text: str) -> Any:
         line = "" if error.problem_mark is None else f", line {error.problem_mark.line + 1}"
         raise ConfigError(path, f"is not YAML{line}: {error.problem}") from None
     except (yaml.YAMLError, ValueError) as error:
-        raise ConfigError(path, f"is not YAML as settings need it: {error}") from None
+        raise ConfigError(path, f"is not YAML as settings need it: {' '.join(str(error).split())}") from None
 
 
 def read_text(path: Path) -> str:

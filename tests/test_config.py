@@ -427,3 +427,13 @@ def test_a_wrong_layout_file_is_told_with_the_place(tmp_path, text, message):
 
     with pytest.raises(ConfigError, match=message):
         read_layout_file(path)
+
+
+@pytest.mark.parametrize("character", ["\x00", "\x08", "\x95"])
+def test_a_character_that_yaml_forbids_is_told_in_one_line(tmp_path, character):
+    path = tmp_path / "layout.yaml"
+    path.write_text(f"generator: gr{character}id\n", encoding="utf-8")
+
+    with pytest.raises(ConfigError, match="special characters are not allowed") as caught:
+        read_layout_file(path)
+    assert "\n" not in str(caught.value)
