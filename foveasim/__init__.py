@@ -13,7 +13,7 @@ electrons, electrons get noise, volts become codes::
 
 from __future__ import annotations
 
-from foveasim import errors, layout, optics, reconstruct, scene, sensor, units, view
+from foveasim import distortion, errors, layout, optics, reconstruct, scene, sensor, units, view
 from foveasim._version import __version__
 from foveasim.camera import Camera
 from foveasim.capture import Capture
@@ -44,6 +44,7 @@ __all__ = [
     "Sensor",
     "SiliconQE",
     "__version__",
+    "distortion",
     "errors",
     "layout",
     "optics",

@@ -16,6 +16,7 @@ import numpy as np
 from foveasim.arrays import Floats, check_number
 from foveasim.capture import Capture
 from foveasim.compiled import kernels
+from foveasim.distortion import Lens
 from foveasim.errors import CoverageWarning, ParameterError, SimulationError
 from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator
@@ -46,6 +47,9 @@ class Camera:
     ----------
     optics : Optics
     sensor : Sensor
+    distortion : lens model of foveasim.distortion, optional
+        Where the lens puts light that an ideal one would put elsewhere: photosites' outlines are carried back, once, and no
+        picture is resampled.
     n_threads : int, optional
         All cores of the process by default. Results do not depend on it, bit for bit.
 
@@ -57,7 +61,7 @@ class Camera:
     Warns
     -----
     CoverageWarning
-        On a capture, when photosites lie off the image.
+        On a capture, when photosites lie off the image, or where the lens sends no light.
 
     Examples
     --------
@@ -71,14 +75,21 @@ class Camera:
     (64,)
     """
 
-    def __init__(self, *, optics: Optics, sensor: Sensor, n_threads: int | None = None) -> None:
+    def __init__(
+        self, *, optics: Optics, sensor: Sensor, distortion: Lens | None = None, n_threads: int | None = None
+    ) -> None:
         for name, part, kind in (("optics", optics, Optics), ("sensor", sensor, Sensor)):
             if not isinstance(part, kind):
                 raise ParameterError(name, f"must be a foveasim.{kind.__name__}, got a {type(part).__name__}")
         if not isinstance(sensor.layout, Layout):
             raise ParameterError("sensor", f"must have a foveasim.Layout, got a {type(sensor.layout).__name__}")
+        if distortion is not None and not isinstance(distortion, Lens):
+            raise ParameterError(
+                "distortion", f"must be a lens of foveasim.distortion, got a {type(distortion).__name__}"
+            )
         self._optics = optics
         self._sensor = sensor
+        self._distortion = distortion
         self._layout = sensor.layout
         self._n_threads = thread_count(n_threads)
         self._integrators: dict[Grid, Integrator] = {}
@@ -96,11 +107,16 @@ class Camera:
         """The sensor. For another one make another camera."""
         return self._sensor
 
+    @property
+    def distortion(self) -> Lens | None:
+        """Where the lens puts light that an ideal one would put elsewhere, or None. For another one make another camera."""
+        return self._distortion
+
     def integrator(self, grid: Grid) -> Integrator:
         """The sensor's layout compiled for a grid; kept for the grids used last."""
         integrator = self._integrators.pop(grid, None)
         if integrator is None:
-            integrator = Integrator(self._layout, grid, n_threads=self._n_threads)
+            integrator = Integrator(self._layout, grid, distortion=self._distortion, n_threads=self._n_threads)
         self._integrators[grid] = integrator
         while len(self._integrators) > KEPT_INTEGRATORS:
             del self._integrators[next(iter(self._integrators))]
@@ -166,6 +182,7 @@ class Camera:
             settings={
                 "light": _light_described(light),
                 "optics": described(self._optics),
+                "distortion": None if self._distortion is None else described(self._distortion),
                 "sensor": {k: v for k, v in described(sensor).items() if k != "layout"},
                 "layout": described(dict(self._layout.provenance)),
                 "exposure_s": exposure_s,
@@ -217,7 +234,15 @@ class Camera:
 
     def _warn_of_uncovered(self, integrator: Integrator) -> None:
         """Tell of sites that the map of light does not reach: their darkness is no property of the scene."""
-        n_uncovered = int(np.count_nonzero(integrator.uncovered_um2))
+        n_lost = integrator.lost_sites.size
+        if n_lost:
+            warnings.warn(
+                f"{n_lost:,} of {self._layout.n_sites:,} photosites lie outside the lens's image circle and get no light: "
+                "shrink or move the layout, or take a lens model that reaches further",
+                CoverageWarning,
+                stacklevel=4,
+            )
+        n_uncovered = int(np.count_nonzero(integrator.uncovered_um2)) - n_lost
         if n_uncovered:
             x_min, y_min, x_max, y_max = integrator.grid.bounds_um
             left, bottom, right, top = self._layout.bounds_um

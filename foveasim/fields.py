@@ -27,7 +27,7 @@ from foveasim.arrays import (
 )
 from foveasim.errors import ParameterError
 
-__all__ = ["Grid", "PackedRings", "PowerMap", "SceneLike", "from_file_rows", "to_file_rows"]
+__all__ = ["Grid", "PackedRings", "PointMap", "PowerMap", "SceneLike", "from_file_rows", "to_file_rows"]
 
 
 class PackedRings(Protocol):
@@ -44,6 +44,13 @@ class PackedRings(Protocol):
     @property
     def site_offsets(self) -> Ints:
         """Site s has the rings ``site_offsets[s] : site_offsets[s + 1]``, outer ones counter-clockwise; (n_site + 1,)."""
+
+
+class PointMap(Protocol):
+    """A lens as the integrator needs it; the models of :mod:`foveasim.distortion` are such."""
+
+    def undistort(self, xy_um: ArrayLike, *, outside: Any = "error") -> Floats:
+        """Where an ideal lens would put what this one puts at (..., 2) points, µm; with "mask" NaN where there is no light."""
 
 
 class SceneLike(Protocol):

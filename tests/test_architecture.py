@@ -23,7 +23,7 @@ FLOORS = [
     {"arrays", "compiled", "files"},
     {"documents", "encodings", "parallel", "pictures", "records", "rings", "streams", "units"},
     {"fields"},
-    {"layout", "scene", "optics", "integrate", "sensor"},
+    {"distortion", "integrate", "layout", "optics", "scene", "sensor"},
     {"reconstruct"},
     {"capture"},
     {"camera"},
@@ -38,12 +38,16 @@ HEAVY = {
 }  # fmt: skip
 #: Names of numbers without a unit, or with the unit of what they are measured with.
 DIMENSIONLESS = {
-    "above", "at_least", "at_most", "blanking", "colours", "dpi", "f_number", "factor", "figure_inches", "fill_factor", "limit", "max_aspect_ratio",
-    "max_density", "max_growth", "max_neighbour_ratio", "max_track_use", "min_density", "min_growth", "peak", "per_vertex", "qe", "ratio", "rounding",
-    "ring_ratio", "spectrum", "transmission", "value", "values", "weight", "weights", "white", "worst_area_error",
+    "a", "above", "at_least", "at_most", "blanking", "colours", "dpi", "f_number", "factor", "figure_inches", "fill_factor", "k", "k1", "k2", "k3", "k4", "k5", "k6",
+    "limit", "max_aspect_ratio",
+    "max_density", "max_growth", "max_neighbour_ratio", "max_track_use", "min_density", "min_growth", "p1", "p2", "peak", "per_vertex", "qe", "ratio", "rounding",
+    "ring_ratio", "spectrum", "stretch", "transmission", "value", "values", "weight", "weights", "white", "worst_area_error",
 }  # fmt: skip
 #: Names of parts that no user sees, in cells, pitches or steps as their docstrings say.
-INTERNAL = {"cycles", "modes", "per_step", "shares", "x", "x2", "y", "y2"}
+INTERNAL = {
+    "cycles", "function", "height", "modes", "new_radius", "per_step", "pixel", "r2", "radius", "shares", "slope", "upper", "x",
+    "x2", "xy", "y", "y2",
+}  # fmt: skip
 FLOATING = re.compile(r"\b(float|Floats|PerSite)\b")
 
 

@@ -59,6 +59,14 @@ def test_numbers_without_a_point_in_front_of_the_exponent_are_numbers(shot_file)
         ("sensor.bits=12", lambda s: s.camera.sensor.bits == 12),
         ("sensor.qe={kind: silicon, depth_um: 2.5}", lambda s: s.camera.sensor.qe == fs.SiliconQE(depth_um=2.5)),
         ("optics.emission=isotropic", lambda s: s.camera.optics.emission == "isotropic"),
+        (
+            "distortion={kind: brown_conrady, focal_um: 8000.0, k1: -0.1}",
+            lambda s: s.camera.distortion == fs.distortion.BrownConrady(focal_um=8000.0, k1=-0.1),
+        ),
+        (
+            "distortion={kind: scaramuzza, a: [1.57e3, -2.75e-4, 3.76e-8, -3.64e-11], pixel_um: 2.2, focal_um: 22e3}",
+            lambda s: s.camera.distortion.a == (1570.0, -2.75e-4, 3.76e-8, -3.64e-11),
+        ),
         ("layout.mosaic=[RG, GB]", lambda s: s.camera.sensor.layout.channel.max() == 2),
         ("layout.move_um=[5.0, -3.0]", lambda s: abs(s.camera.sensor.layout.centroid_um.mean(0) - [5, -3]).max() < 1),
         ("layout.mosaic=[RG, GB]; sensor.filters=rgb", lambda s: s.camera.sensor.n_filters == 3),

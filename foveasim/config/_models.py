@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, Union, get_type_hints
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from foveasim import layout as layouts
+from foveasim.distortion import BrownConrady, Fisheye, Lens, PolynomialFisheye, Scaramuzza
 from foveasim.layout import DesignRules, Layout
 from foveasim.optics import Optics
 from foveasim.scene import Scene
@@ -110,6 +111,12 @@ _SCENES: dict[str, Callable[..., Scene]] = {
     "flat": Scene.flat,
     "point_sources": Scene.point_sources,
 }
+_LENSES: dict[str, Callable[..., Lens]] = {
+    "brown_conrady": BrownConrady,
+    "fisheye": Fisheye,
+    "polynomial_fisheye": PolynomialFisheye,
+    "scaramuzza": Scaramuzza,
+}
 _CURVES: dict[str, Callable[..., Any]] = {
     "constant": ConstantCurve,
     "gaussian": GaussianCurve,
@@ -117,6 +124,7 @@ _CURVES: dict[str, Callable[..., Any]] = {
     "silicon": SiliconQE,
 }
 
+_LensSection = _one_of("kind", {name: _model(name, lens) for name, lens in _LENSES.items()})
 _CurveSection = _one_of("kind", {name: _model(name, curve) for name, curve in _CURVES.items()})
 _FilterSection = _model("filter set", FilterSet, curves=list[_CurveSection])  # type: ignore[valid-type]
 _PerSite = float | PerArea | list[float]
@@ -168,10 +176,11 @@ LayoutUnion = _one_of(
 
 
 class ShotSection(_Section):
-    """A whole shot: scene, optics, layout, sensor, exposure."""
+    """A whole shot: scene, optics, distortion, layout, sensor, exposure."""
 
     scene: _SceneSection  # type: ignore[valid-type]
     optics: _model("optics", Optics)  # type: ignore[valid-type]
+    distortion: _LensSection | None = None  # type: ignore[valid-type]
     layout: str | LayoutUnion  # type: ignore[valid-type]
     sensor: _SensorSection = Field(default_factory=_SensorSection)  # type: ignore[valid-type]
     exposure_s: float

@@ -131,6 +131,7 @@ def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int |
     }
     sensor = _call(path, "sensor", Sensor, {"layout": layout, **sensor_values})
     optics = _call(path, "optics", Optics, _values(path, "optics.", settings.optics))
+    distortion = _built(path, "distortion", settings.distortion)
     scene_values = _values(path, "scene.", settings.scene)
     if "picture" in scene_values:
         scene_values["picture"] = _picture_path(path, scene_values["picture"])
@@ -144,7 +145,7 @@ def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int |
     return Shot(
         name=path.stem,
         scene=scene,
-        camera=Camera(optics=optics, sensor=sensor, n_threads=n_threads),
+        camera=Camera(optics=optics, sensor=sensor, distortion=distortion, n_threads=n_threads),
         rules=file.rules,
         exposure_s=exposure_s,
         seed=streams.seed,

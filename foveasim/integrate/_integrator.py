@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, finite_array, read_only
+from foveasim.arrays import Floats, Ints, check_choice, finite_array, read_only
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.fields import Grid, PackedRings
+from foveasim.fields import Grid, PackedRings, PointMap
+from foveasim.integrate._outlines import carried_back
 from foveasim.integrate._plan import Plan, compile_plan
 from foveasim.parallel import thread_count
 from foveasim.rings import site_area_um2, site_bounds_um
@@ -34,6 +35,12 @@ class Integrator:
         Outlines in the sensor plane, outer rings counter-clockwise and holes clockwise.
     grid : Grid
         The cells of the maps to come.
+    distortion : object with ``undistort(xy_um, outside="mask")``, optional
+        A lens of :mod:`foveasim.distortion`: the outlines are carried back into the map's plane, once. Maps are those of the
+        ideal lens.
+    conserve : {"flux", "density"}
+        What the lens keeps: the power that falls on a piece of the image, which is physics; or its power per area, as when a
+        picture is warped.
     n_threads : int, optional
         All cores of the process by default. Results do not depend on it, bit for bit.
 
@@ -64,7 +71,15 @@ class Integrator:
            [0.25, 0.5 , 0.25]])
     """
 
-    def __init__(self, layout: PackedRings, grid: Grid, *, n_threads: int | None = None) -> None:
+    def __init__(
+        self,
+        layout: PackedRings,
+        grid: Grid,
+        *,
+        distortion: PointMap | None = None,
+        conserve: Literal["flux", "density"] = "flux",
+        n_threads: int | None = None,
+    ) -> None:
         if not all(hasattr(layout, name) for name in ("xy_um", "ring_offsets", "site_offsets")):
             raise ParameterError("layout", f"must be a Layout, or packed rings, got a {type(layout).__name__}")
         if not isinstance(grid, Grid):
@@ -78,8 +93,33 @@ class Integrator:
                 f"site {inside_out[0]} has no positive area: its outline must be counter-clockwise, as from_polygons makes it",
                 tuple(int(i) for i in inside_out),
             )
+        check_choice("conserve", conserve, ("flux", "density"))
+        self._gain: Floats | None = None
+        self._is_lost = np.zeros(self._area_um2.size, bool)
+        if distortion is not None:
+            if not hasattr(distortion, "undistort"):
+                raise ParameterError("distortion", "must be a lens of foveasim.distortion", distortion)
+            layout = self._carried(layout, distortion, conserve)
         self._plan: Plan = compile_plan(layout, grid, self.n_threads)
         self._bounds_um = site_bounds_um(layout.xy_um, layout.ring_offsets, layout.site_offsets)
+
+    def _carried(self, layout: PackedRings, distortion: PointMap, conserve: str) -> PackedRings:
+        """Outlines in the map's plane, their areas there, and the factor of each site's integral."""
+        carried = carried_back(layout, distortion, self.grid.pitch_um)
+        self._is_lost = carried.is_lost
+        area_um2 = site_area_um2(carried.xy_um, carried.ring_offsets, carried.site_offsets)
+        gain = np.where(carried.is_lost, 0.0, 1.0)
+        if conserve == "density":
+            gain *= self._area_um2 / area_um2
+        if conserve == "density" or carried.is_lost.any():
+            self._gain = gain
+        self._area_um2 = area_um2
+        return carried
+
+    @property
+    def lost_sites(self) -> Ints:
+        """Sites outside the lens's image circle, which receive nothing."""
+        return np.flatnonzero(self._is_lost)
 
     def __repr__(self) -> str:
         return f"Integrator({self.n_sites} sites on {self.grid})"
@@ -91,7 +131,7 @@ class Integrator:
 
     @cached_property
     def uncovered_um2(self) -> Floats:
-        """Area of each site that lies off the grid and receives nothing, (n_site,) µm²."""
+        """Area of each site, in the map's plane, that lies off the grid or gets no light through the lens, (n_site,) µm²."""
         x_min, y_min, x_max, y_max = self.grid.bounds_um
         rounding_um = UNCOVERED_ROUNDING * max(map(abs, self.grid.bounds_um))
         low_um, high_um = self._bounds_um[:, :2], self._bounds_um[:, 2:]
@@ -99,7 +139,8 @@ class Integrator:
             axis=1, initial=-np.inf
         )
         rest_um2 = np.clip(self._area_um2 - self._plan.covered_um2, 0.0, self._area_um2)
-        return read_only(np.where(beyond_um > rounding_um, rest_um2, 0.0))
+        rest_um2 = np.where(beyond_um > rounding_um, rest_um2, 0.0)
+        return read_only(np.where(self._is_lost, self._area_um2, rest_um2))
 
     def __call__(self, power_map: ArrayLike) -> Floats:
         """
@@ -135,6 +176,8 @@ class Integrator:
         for band in np.ndindex(*cells.shape[:-2]):
             power[band] = self._plan.gather(np.ascontiguousarray(cells[band]), self.n_threads)
         power *= self.grid.cell_area_um2
+        if self._gain is not None:
+            power *= self._gain
         return power
 
     def spread(self, values: ArrayLike) -> Floats:
@@ -153,6 +196,8 @@ class Integrator:
         values = finite_array("values", values)
         if values.shape[-1:] != (self.n_sites,):
             raise ParameterError("values", f"must have the shape (..., {self.n_sites}), got {values.shape}")
+        if self._gain is not None:
+            values = values * self._gain
         cells = np.empty((*values.shape[:-1], *self.grid.shape))
         for band in np.ndindex(*values.shape[:-1]):
             cells[band] = self._plan.scatter(values[band], self.n_threads)
@@ -168,4 +213,7 @@ class Integrator:
         weights : csr_array (n_site, n_y * n_x) float64, µm²
             ``area(site ∩ cell)``; ``weights @ power_map.ravel()`` is ``integrator(power_map)``.
         """
-        return self._plan.matrix() * self.grid.cell_area_um2
+        matrix = self._plan.matrix() * self.grid.cell_area_um2
+        if self._gain is not None:
+            matrix = matrix.multiply(self._gain[:, np.newaxis]).tocsr()
+        return matrix

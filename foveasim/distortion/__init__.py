@@ -1,0 +1,24 @@
+"""
+Where a lens puts light that an ideal one would put elsewhere.
+
+A model maps points of the sensor plane, nothing else: :meth:`distort` from the ideal (pinhole) position to the real one,
+:meth:`undistort` back. Pictures are never resampled: the integrator carries the outlines of photosites back once. To look
+at a distorted map, there is :func:`distort_map`.
+"""
+
+from __future__ import annotations
+
+from foveasim.distortion._brown_conrady import BrownConrady
+from foveasim.distortion._calibration import Lens, from_opencv, read_calibration, to_opencv
+from foveasim.distortion._fisheye import Fisheye, PolynomialFisheye, Scaramuzza
+
+__all__ = [
+    "BrownConrady",
+    "Fisheye",
+    "Lens",
+    "PolynomialFisheye",
+    "Scaramuzza",
+    "from_opencv",
+    "read_calibration",
+    "to_opencv",
+]

@@ -1,0 +1,216 @@
+"""The Brown-Conrady model: radial and tangential distortion of a nearly ideal lens."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from foveasim.arrays import Bools, Floats, check_number
+from foveasim.compiled import kernels
+from foveasim.distortion._lens import Placed
+from foveasim.distortion._solve import smallest_roots
+from foveasim.parallel import each, thread_count
+
+__all__ = ["BrownConrady"]
+
+#: Directions in which the fold is looked for.
+N_DIRECTIONS = 720
+#: Points that a thread takes at once.
+POINTS_A_PIECE = 50_000
+#: A start beyond the fold is moved inwards so often, at most.
+MAX_MOVES = 30
+#: The fold is looked for up to this radius in focal lengths: 89.4 degrees from the axis.
+MAX_RADIUS = 100.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class BrownConrady(Placed):
+    """
+    Radial and tangential distortion (Brown 1966; the paper's Eq. 6; OpenCV's model up to eight coefficients).
+
+    Parameters
+    ----------
+    focal_um : float or (x, y), µm
+        Distance of the image plane: what positions are divided by. Two where a calibration found two.
+    k1, k2, k3 : float
+        Radial coefficients: ``1 + k1 r² + k2 r⁴ + k3 r⁶``.
+    k4, k5, k6 : float
+        Of the rational model, which divides by ``1 + k4 r² + k5 r⁴ + k6 r⁶``.
+    p1, p2 : float
+        Tangential coefficients, with y **up**: the paper's r1 and r2. OpenCV's p1, for y down, has the other sign.
+    centre_um : (x, y), µm
+        Where the axis meets the sensor.
+
+    Raises
+    ------
+    ParameterError
+        When a number is not finite, or the focal length not positive.
+
+    Notes
+    -----
+    With x, y the ideal and r their distance from the centre, all over the focal length::
+
+        x_d = x R + 2 p1 x y + p2 (r² + 2 x²)
+        y_d = y R + 2 p2 x y + p1 (r² + 2 y²)
+
+    The model can be inverted up to its fold, where the Jacobian's determinant is 0; the inverse is Newton's method.
+
+    Examples
+    --------
+    >>> barrel = BrownConrady(focal_um=1000.0, k1=-0.1)
+    >>> barrel.distort([[500.0, 0.0]]).tolist()
+    [[487.5, 0.0]]
+    >>> round(barrel.max_radius_um[0], 3)
+    1825.742
+    """
+
+    focal_um: float | tuple[float, float]
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    centre_um: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"):
+            object.__setattr__(self, name, check_number(name, getattr(self, name)))
+        self._check_place()
+
+    def _radial(self, r2: Floats) -> tuple[Floats, Floats]:
+        """The radial factor and its derivative by r²."""
+        above = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        below = 1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
+        above_slope = self.k1 + r2 * (2.0 * self.k2 + 3.0 * r2 * self.k3)
+        below_slope = self.k4 + r2 * (2.0 * self.k5 + 3.0 * r2 * self.k6)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            factor = above / below
+            return factor, (above_slope - factor * below_slope) / below
+
+    def _map(self, xy: Floats) -> Floats:
+        x, y = xy[:, 0], xy[:, 1]
+        r2 = x * x + y * y
+        factor, _ = self._radial(r2)
+        return np.stack(
+            (
+                x * factor + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x),
+                y * factor + 2.0 * self.p2 * x * y + self.p1 * (r2 + 2.0 * y * y),
+            ),
+            axis=1,
+        )
+
+    def _jacobian(self, xy: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Derivatives of x_d by x and y, and of y_d by x and y."""
+        x, y = xy[:, 0], xy[:, 1]
+        factor, slope = self._radial(x * x + y * y)
+        across = 2.0 * (x * y * slope + self.p1 * x + self.p2 * y)
+        return (
+            factor + 2.0 * x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x,
+            across,
+            across,
+            factor + 2.0 * y * y * slope + 2.0 * self.p2 * x + 6.0 * self.p1 * y,
+        )
+
+    def _determinant(self, xy: Floats) -> Floats:
+        a, b, c, d = self._jacobian(xy)
+        return np.asarray(a * d - b * c)
+
+    @cached_property
+    def _fold(self) -> Floats:
+        """Ideal radius at which the determinant first vanishes, in each of the directions; infinite without a fold."""
+        angle_rad = 2.0 * math.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
+        if self.p1 == self.p2 == 0.0:
+            return np.full(N_DIRECTIONS, self._radial_fold)
+        # Along each direction the determinant times the denominator's fourth power is a polynomial of the radius.
+        c, s = np.cos(angle_rad)[:, np.newaxis], np.sin(angle_rad)[:, np.newaxis]
+        above, below, r = self._parts()
+        plain = above * below
+        # r times the factor's slope by r, and r, both times the denominator's square.
+        slope = (r * (above.deriv() * below - above * below.deriv())).coef
+        linear = (below * below * r).coef
+        size = max(slope.size, linear.size, plain.coef.size)
+        slope, linear, base = (np.pad(part, (0, size - part.size)) for part in (slope, linear, plain.coef))
+        xx = base + c * c * slope + linear * (2.0 * self.p1 * s + 6.0 * self.p2 * c)
+        yy = base + s * s * slope + linear * (2.0 * self.p2 * c + 6.0 * self.p1 * s)
+        xy = c * s * slope + linear * (2.0 * self.p1 * c + 2.0 * self.p2 * s)
+        product = [np.convolve(a, b) - np.convolve(d, d) for a, b, d in zip(xx, yy, xy, strict=True)]
+        return np.minimum(smallest_roots(np.array(product)), smallest_roots(below.coef)[0])
+
+    def _parts(self) -> tuple[Any, Any, Any]:
+        """Numerator and denominator of the radial factor as polynomials of the radius, and the radius."""
+        polynomial = np.polynomial.Polynomial
+        return (
+            polynomial([1.0, 0.0, self.k1, 0.0, self.k2, 0.0, self.k3]),
+            polynomial([1.0, 0.0, self.k4, 0.0, self.k5, 0.0, self.k6]),
+            polynomial([0.0, 1.0]),
+        )
+
+    @cached_property
+    def _radial_fold(self) -> float:
+        """Without tangential terms: where r times the radial factor stops growing, or the factor has a pole."""
+        above, below, r = self._parts()
+        growth = (above + r * above.deriv()) * below - r * above * below.deriv()
+        return float(min(smallest_roots(p.coef)[0] for p in (growth, above, below)))
+
+    def _limits(self) -> tuple[float, float]:
+        ideal = float(self._fold.min())
+        if math.isinf(ideal):
+            return math.inf, math.inf
+        angle_rad = 2.0 * math.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
+        border = ideal * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
+        return ideal, float(np.hypot(*self._map(border).T).min())
+
+    def _is_inside(self, xy: Floats) -> Bools:
+        """Whether points lie within the fold."""
+        turn = np.arctan2(xy[:, 1], xy[:, 0]) / (2.0 * math.pi) * N_DIRECTIONS
+        low = np.floor(turn).astype(np.int64)
+        # Between two directions the fold is a curve: the larger of the two, with the determinant, tells.
+        most = np.maximum(self._fold[low % N_DIRECTIONS], self._fold[(low + 1) % N_DIRECTIONS])
+        return np.asarray((np.hypot(xy[:, 0], xy[:, 1]) <= most * (1.0 + 1e-3)) & (self._determinant(xy) > 0.0))
+
+    def _forward(self, xy: Floats) -> Floats:
+        return np.where(self._is_inside(xy)[:, np.newaxis], self._map(xy), np.nan)
+
+    def _backward(self, xy: Floats) -> Floats:
+        most = float(self._fold.max()) * (1.0 + 1e-3)
+        k = np.array([self.k1, self.k2, self.k3, self.k4, self.k5, self.k6])
+        points = np.ascontiguousarray(xy)
+        start = self._start(points)
+
+        def inverse(piece: slice) -> Floats:
+            return np.asarray(
+                kernels("distortion").brown_conrady_inverse(
+                    points[piece], start[piece], k, self.p1, self.p2, min(most * most, np.finfo(np.float64).max)
+                )
+            )
+
+        pieces = [slice(i, i + POINTS_A_PIECE) for i in range(0, max(len(points), 1), POINTS_A_PIECE)]
+        found = np.concatenate(each(inverse, pieces, thread_count()))
+        error = np.hypot(*(self._map(found) - points).T)
+        is_solved = (error <= 1e-12 * np.maximum(np.hypot(*xy.T), 1.0)) & self._is_inside(found)
+        return np.where(is_solved[:, np.newaxis], found, np.nan)
+
+    def _start(self, xy: Floats) -> Floats:
+        """The inverse of the radial part, from a table along the radius."""
+        end = min(self._radial_fold, float(self._fold.max()), MAX_RADIUS)
+        table = end * np.linspace(0.0, 1.0, 2049)
+        factor, _ = self._radial(table * table)
+        reach = np.maximum.accumulate(table * factor)
+        radius = np.hypot(*xy.T)
+        ideal = np.minimum(np.interp(radius, reach, table), 0.98 * end)
+        scale = np.divide(ideal, radius, out=np.ones_like(radius), where=radius > 0.0)
+        start = np.asarray(xy * scale[:, np.newaxis])
+        # Near the fold tangential terms may put the start beyond it.
+        for _ in range(MAX_MOVES):
+            is_beyond = ~self._is_inside(start)
+            if not is_beyond.any():
+                break
+            start[is_beyond] *= 0.8
+        return start

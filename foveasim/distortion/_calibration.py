@@ -1,0 +1,279 @@
+"""
+Lens models from the calibrations of other programs, and back: OpenCV, ROS, MATLAB, OCamCalib.
+
+Other programs count pixels from the upper left one with y down; here the origin is the middle of the image and y is up. A
+calibration's principal point becomes ``centre_um``. Positions of pixels are their centres.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from foveasim.arrays import Floats, check_count, check_number, finite_array
+from foveasim.distortion._brown_conrady import BrownConrady
+from foveasim.distortion._fisheye import Fisheye, PolynomialFisheye, Scaramuzza
+from foveasim.errors import ConfigError, ParameterError
+
+__all__ = ["Lens", "from_opencv", "read_calibration", "to_opencv"]
+
+Lens: TypeAlias = BrownConrady | Fisheye | PolynomialFisheye | Scaramuzza
+
+#: OpenCV's order of coefficients; it takes the first 4, 5 or 8 of them.
+OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+#: Names of the same thing in calibration files, in lower case without underscores.
+MATRIX_KEYS = ("cameramatrix", "k", "intrinsicmatrix")
+COEFFICIENT_KEYS = ("distortioncoefficients", "distcoeffs", "d")
+MODEL_KEYS = ("distortionmodel", "cameramodel", "model")
+WIDTH_KEYS, HEIGHT_KEYS = ("imagewidth", "width"), ("imageheight", "height")
+FISHEYE_MODELS = ("fisheye", "equidistant", "kannalabrandt4", "kannala_brandt")
+PINHOLE_MODELS = ("plumb_bob", "rational_polynomial", "pinhole", "radtan", "brown_conrady", "opencv")
+
+
+def from_opencv(
+    camera_matrix: ArrayLike,
+    coefficients: ArrayLike,
+    *,
+    image_size: tuple[int, int],
+    pixel_um: float,
+    fisheye: bool = False,
+) -> BrownConrady | PolynomialFisheye:
+    """
+    A lens from OpenCV's camera matrix and distortion coefficients.
+
+    Parameters
+    ----------
+    camera_matrix : (3, 3), pixels
+        ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``.
+    coefficients : (4,), (5,) or (8,)
+        ``k1, k2, p1, p2[, k3[, k4, k5, k6]]``; with ``fisheye`` the four of ``cv2.fisheye``.
+    image_size : (width, height), pixels
+        Of the images that were calibrated.
+    pixel_um : float, µm
+        Side of a pixel.
+    fisheye : bool
+        Whether the coefficients are those of ``cv2.fisheye``.
+
+    Returns
+    -------
+    BrownConrady or PolynomialFisheye
+
+    Raises
+    ------
+    ParameterError
+        When a shape or a number is not as above, or the matrix has a skew.
+    """
+    matrix = finite_array("camera_matrix", camera_matrix, ndim=2)
+    if matrix.shape != (3, 3) or matrix[0, 1] or matrix[1, 0] or not (matrix[2] == (0.0, 0.0, 1.0)).all():
+        raise ParameterError("camera_matrix", "must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", matrix.tolist())
+    k = finite_array("coefficients", coefficients).ravel()
+    allowed = (4,) if fisheye else (4, 5, 8)
+    if k.size not in allowed:
+        raise ParameterError("coefficients", f"must be {', '.join(map(str, allowed))} numbers", k.tolist())
+    pixel_um = check_number("pixel_um", pixel_um, above=0.0)
+    place: dict[str, Any] = {
+        "focal_um": (matrix[0, 0] * pixel_um, matrix[1, 1] * pixel_um),
+        "centre_um": _centre_um((matrix[0, 2], matrix[1, 2]), image_size, pixel_um),
+    }
+    if fisheye:
+        return PolynomialFisheye(k=k.tolist(), **place)
+    values: dict[str, Any] = dict(zip(OPENCV_ORDER, k.tolist(), strict=False))
+    # With y up instead of down, the tangential term along y changes its sign.
+    values["p1"] = -values["p1"]
+    return BrownConrady(**values, **place)
+
+
+def to_opencv(
+    lens: BrownConrady | PolynomialFisheye, *, image_size: tuple[int, int], pixel_um: float
+) -> tuple[Floats, Floats]:
+    """
+    OpenCV's camera matrix (3, 3) and coefficients, (8,) or for a fisheye (4,); the inverse of :func:`from_opencv`.
+
+    Raises
+    ------
+    ParameterError
+        When the lens has no such form.
+    """
+    if not isinstance(lens, BrownConrady | PolynomialFisheye):
+        raise ParameterError("lens", "must be a BrownConrady or a PolynomialFisheye", lens)
+    pixel_um = check_number("pixel_um", pixel_um, above=0.0)
+    width, height = _size(image_size)
+    fx, fy = np.broadcast_to(np.asarray(lens.focal_um), (2,)) / pixel_um
+    cx = lens.centre_um[0] / pixel_um + 0.5 * (width - 1)
+    cy = -lens.centre_um[1] / pixel_um + 0.5 * (height - 1)
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    if isinstance(lens, PolynomialFisheye):
+        return matrix, np.array(lens.k)
+    values = [getattr(lens, name) for name in OPENCV_ORDER]
+    values[OPENCV_ORDER.index("p1")] *= -1.0
+    return matrix, np.array(values)
+
+
+def read_calibration(
+    path: str | Path,
+    *,
+    pixel_um: float,
+    focal_um: float | None = None,
+    image_size: tuple[int, int] | None = None,
+) -> Lens:
+    """
+    Read a lens from a calibration file.
+
+    Parameters
+    ----------
+    path : path
+        YAML or JSON of OpenCV or ROS (camera matrix, distortion coefficients, model), JSON of MATLAB's ``cameraParameters`` or
+        ``fisheyeParameters``, or ``calib_results.txt`` of OCamCalib.
+    pixel_um : float, µm
+        Side of a pixel.
+    focal_um : float, optional, µm
+        Distance of the ideal image plane, for Scaramuzza's model, which knows none.
+    image_size : (width, height), optional, pixels
+        Where the file does not tell it.
+
+    Raises
+    ------
+    ConfigError
+        When the file is none of these, or lacks what a lens needs.
+    """
+    from foveasim.documents import parsed, read_text
+
+    path = Path(path)
+    text = read_text(path)
+    pixel_um = check_number("pixel_um", pixel_um, above=0.0)
+    try:
+        if text.lstrip().startswith("#polynomial"):
+            return _from_ocamcalib(path, text, pixel_um, focal_um)
+        data = parsed(path, _plain_yaml(text))
+        if not isinstance(data, dict):
+            raise ConfigError(path, "holds no calibration: keys with a camera matrix and distortion coefficients")
+        keys = {re.sub("[_ -]", "", str(key)).lower(): value for key, value in data.items()}
+        if "mappingcoefficients" in keys or "intrinsics" in keys:
+            return _from_matlab_fisheye(path, keys, pixel_um, focal_um)
+        if "radialdistortion" in keys:
+            return _from_matlab(path, keys, pixel_um)
+        return _from_keys(path, keys, pixel_um, image_size)
+    except ParameterError as error:
+        raise ConfigError(path, str(error)) from None
+
+
+def _plain_yaml(text: str) -> str:
+    """OpenCV's YAML without its own header and tags."""
+    return re.sub(r"!!opencv-[\w-]+", "", re.sub(r"\A%YAML[: ]1\.\d\s*\n", "", text))
+
+
+def _from_keys(path: Path, keys: Mapping[str, Any], pixel_um: float, image_size: tuple[int, int] | None) -> Lens:
+    matrix = _numbers(path, _value(path, keys, MATRIX_KEYS, "a camera matrix")).reshape(-1)
+    if matrix.size != 9:
+        raise ConfigError(path, f"the camera matrix must have 9 numbers, got {matrix.size}")
+    coefficients = _numbers(path, _value(path, keys, COEFFICIENT_KEYS, "distortion coefficients")).reshape(-1)
+    model = str(next((keys[key] for key in MODEL_KEYS if key in keys), PINHOLE_MODELS[0])).lower()
+    if model not in FISHEYE_MODELS + PINHOLE_MODELS:
+        raise ConfigError(path, f"the distortion model must be one of {FISHEYE_MODELS + PINHOLE_MODELS}, got '{model}'")
+    size: list[Any] = [next((keys[key] for key in names if key in keys), None) for names in (WIDTH_KEYS, HEIGHT_KEYS)]
+    if None in size:
+        if image_size is None:
+            raise ConfigError(path, "tells no image_width and image_height; give 'image_size'")
+        size = list(image_size)
+    return from_opencv(
+        matrix.reshape(3, 3),
+        coefficients,
+        image_size=(size[0], size[1]),
+        pixel_um=pixel_um,
+        fisheye=model in FISHEYE_MODELS,
+    )
+
+
+def _from_matlab(path: Path, keys: Mapping[str, Any], pixel_um: float) -> Lens:
+    if "k" in keys:
+        matrix = _numbers(path, keys["k"]).reshape(3, 3)
+    else:  # MATLAB's older form is transposed
+        matrix = _numbers(path, _value(path, keys, ("intrinsicmatrix",), "an intrinsic matrix")).reshape(3, 3).T
+    radial = _numbers(path, keys["radialdistortion"]).ravel()
+    tangential = _numbers(path, keys.get("tangentialdistortion", [0.0, 0.0])).ravel()
+    size = _numbers(path, _value(path, keys, ("imagesize",), "an image size")).ravel()
+    if radial.size not in (2, 3) or tangential.size != 2 or size.size != 2:
+        raise ConfigError(path, "must have 2 or 3 radial and 2 tangential coefficients, and two image sizes")
+    matrix = matrix - np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])  # pixels counted from 1
+    coefficients = [*radial[:2], *tangential, *radial[2:]]
+    return from_opencv(matrix, coefficients, image_size=(int(size[1]), int(size[0])), pixel_um=pixel_um)
+
+
+def _from_matlab_fisheye(path: Path, keys: Mapping[str, Any], pixel_um: float, focal_um: float | None) -> Lens:
+    inner = keys.get("intrinsics", None)
+    if isinstance(inner, dict):
+        keys = {re.sub("[_ -]", "", str(key)).lower(): value for key, value in inner.items()}
+    a = _numbers(path, _value(path, keys, ("mappingcoefficients",), "mapping coefficients")).ravel()
+    centre = _numbers(path, _value(path, keys, ("distortioncenter",), "a distortion centre")).ravel() - 1.0
+    size = _numbers(path, _value(path, keys, ("imagesize",), "an image size")).ravel()
+    matrix = _numbers(path, keys.get("stretchmatrix", [[1.0, 0.0], [0.0, 1.0]])).reshape(2, 2)
+    if centre.size != 2 or size.size != 2:
+        raise ConfigError(path, "must have two numbers of the distortion centre and two of the image size")
+    return Scaramuzza(
+        a=a.tolist(),
+        pixel_um=pixel_um,
+        focal_um=_given(path, focal_um),
+        stretch=(matrix * np.array([[1.0, -1.0], [-1.0, 1.0]])).tolist(),
+        centre_um=_centre_um((centre[0], centre[1]), (int(size[1]), int(size[0])), pixel_um),
+    )
+
+
+def _from_ocamcalib(path: Path, text: str, pixel_um: float, focal_um: float | None) -> Scaramuzza:
+    lines = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    try:
+        rows = [[float(x) for x in line] for line in lines]
+        n = int(rows[0][0])
+        direct = rows[0][1:]
+        centre, affine, size = rows[2][:2], rows[3][:3], rows[4][:2]
+    except (ValueError, IndexError):
+        raise ConfigError(
+            path, "is no calib_results.txt: five lines of numbers (polynomial, inverse, centre, affine, size)"
+        ) from None
+    if n != len(direct) or n != 5 or direct[1] != 0.0 or len(centre) + len(affine) + len(size) != 7:
+        raise ConfigError(path, "must have the five coefficients a0, 0, a2, a3, a4, a centre, c d e, and an image size")
+    c, d, e = affine
+    # Their x runs along rows, downwards, and their y along columns, to the right.
+    return Scaramuzza(
+        a=[direct[0], direct[2], direct[3], direct[4]],
+        pixel_um=pixel_um,
+        focal_um=_given(path, focal_um),
+        stretch=[[1.0, -e], [-d, c]],
+        centre_um=_centre_um((centre[1], centre[0]), (int(size[1]), int(size[0])), pixel_um),
+    )
+
+
+def _given(path: Path, focal_um: float | None) -> float:
+    if focal_um is None:
+        raise ConfigError(path, "holds Scaramuzza's model, which has no focal length; give 'focal_um'")
+    return focal_um
+
+
+def _value(path: Path, keys: Mapping[str, Any], names: tuple[str, ...], what: str) -> Any:
+    for name in names:
+        if name in keys:
+            return keys[name]
+    raise ConfigError(path, f"lacks {what} (one of the keys {', '.join(names)})")
+
+
+def _numbers(path: Path, value: Any) -> Floats:
+    """A list of numbers, or the data of a matrix as OpenCV and ROS write it."""
+    try:
+        return finite_array("data", value["data"] if isinstance(value, dict) else value)
+    except (ParameterError, KeyError):
+        raise ConfigError(path, f"must hold finite numbers, got {str(value)[:60]}") from None
+
+
+def _size(image_size: tuple[int, int]) -> tuple[int, int]:
+    if np.shape(image_size) != (2,):
+        raise ParameterError("image_size", "must be two numbers (width, height)", image_size, "pixels")
+    return check_count("image_size[0]", image_size[0]), check_count("image_size[1]", image_size[1])
+
+
+def _centre_um(pixel: tuple[float, float], image_size: tuple[int, int], pixel_um: float) -> tuple[float, float]:
+    width, height = _size(image_size)
+    return (float(pixel[0]) - 0.5 * (width - 1)) * pixel_um, (0.5 * (height - 1) - float(pixel[1])) * pixel_um

@@ -1,0 +1,291 @@
+"""Fisheye lenses: the image height as a function of the angle to the axis, in closed form or as a polynomial."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, get_args
+
+import numpy as np
+
+from foveasim.arrays import Floats, check_choice, check_number, finite_array
+from foveasim.distortion._lens import Placed
+from foveasim.distortion._solve import growing_inverse, smallest_roots
+from foveasim.errors import ParameterError
+
+__all__ = ["Fisheye", "PolynomialFisheye", "Scaramuzza"]
+
+Projection = Literal["equidistant", "equisolid", "stereographic", "orthographic"]
+#: Points as near to the axis as this are mapped to themselves, times the scale there.
+NEAR = 1e-12
+#: A pinhole has no image of rays at right angles to its axis: angles end this much before.
+GRAZING = 1e-9
+
+
+class _ByAngle(Placed):
+    """A model that is a function of the angle θ to the axis alone: image height over the focal length, and back."""
+
+    def _height(self, theta_rad: Floats) -> Floats:
+        raise NotImplementedError
+
+    def _theta_rad(self, height: Floats) -> Floats:
+        raise NotImplementedError
+
+    def _max_theta_rad(self) -> float:
+        raise NotImplementedError
+
+    def _limits(self) -> tuple[float, float]:
+        most_rad = self._max_theta_rad()
+        ideal = math.inf if most_rad >= 0.5 * math.pi - GRAZING else math.tan(most_rad)
+        return ideal, float(self._height(np.array([most_rad]))[0])
+
+    def _forward(self, xy: Floats) -> Floats:
+        radius = np.hypot(xy[:, 0], xy[:, 1])
+        theta_rad = np.arctan(radius)
+        is_inside = theta_rad <= self._max_theta_rad()
+        height = self._height(np.where(is_inside, theta_rad, 0.0))
+        return _scaled(xy, radius, np.where(is_inside, height, np.nan), float(self._slope()))
+
+    def _backward(self, xy: Floats) -> Floats:
+        radius = np.hypot(xy[:, 0], xy[:, 1])
+        is_inside = radius <= self._limits()[1]
+        theta_rad = self._theta_rad(np.where(is_inside, radius, 0.0))
+        return _scaled(xy, radius, np.where(is_inside, np.tan(theta_rad), np.nan), 1.0 / float(self._slope()))
+
+    def _slope(self) -> float:
+        """Image height over angle at the axis."""
+        return 1.0
+
+
+def _scaled(xy: Floats, radius: Floats, new_radius: Floats, slope: float) -> Floats:
+    """Points moved along their direction to new radii."""
+    is_near = radius < NEAR
+    scale = np.where(is_near, slope, new_radius / np.where(is_near, 1.0, radius))
+    return np.asarray(xy * scale[:, np.newaxis])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fisheye(_ByAngle):
+    """
+    Fisheye by one of the classical projections.
+
+    Parameters
+    ----------
+    projection : {"equidistant", "equisolid", "stereographic", "orthographic"}
+        Image height f θ, 2 f sin(θ/2), 2 f tan(θ/2) or f sin θ of a ray at the angle θ to the axis.
+    focal_um : float or (x, y), µm
+        Distance of the image plane, f.
+    centre_um : (x, y), µm
+        Where the axis meets the sensor.
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range, or the projection unknown.
+
+    Notes
+    -----
+    The scene is a plane in front of the lens: rays up to 90° from the axis have an ideal position, f tan θ.
+
+    Examples
+    --------
+    >>> lens = Fisheye(projection="equidistant", focal_um=1000.0)
+    >>> lens.distort([[1000.0, 0.0]]).round(3).tolist()
+    [[785.398, 0.0]]
+    """
+
+    projection: Projection
+    focal_um: float | tuple[float, float]
+    centre_um: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_choice("projection", self.projection, get_args(Projection))
+        self._check_place()
+
+    def _height(self, theta_rad: Floats) -> Floats:
+        match self.projection:
+            case "equidistant":
+                return theta_rad
+            case "equisolid":
+                return 2.0 * np.sin(0.5 * theta_rad)
+            case "stereographic":
+                return 2.0 * np.tan(0.5 * theta_rad)
+            case _:
+                return np.sin(theta_rad)
+
+    def _theta_rad(self, height: Floats) -> Floats:
+        match self.projection:
+            case "equidistant":
+                return height
+            case "equisolid":
+                return 2.0 * np.arcsin(0.5 * height)
+            case "stereographic":
+                return 2.0 * np.arctan(0.5 * height)
+            case _:
+                return np.arcsin(height)
+
+    def _max_theta_rad(self) -> float:
+        return 0.5 * math.pi - GRAZING
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolynomialFisheye(_ByAngle):
+    """
+    Fisheye whose image height is a polynomial of the angle: OpenCV's ``fisheye`` model (Kannala and Brandt 2006).
+
+    Parameters
+    ----------
+    k : (4,)
+        ``height = f · (θ + k[0] θ³ + k[1] θ⁵ + k[2] θ⁷ + k[3] θ⁹)``.
+    focal_um : float or (x, y), µm
+        Distance of the image plane, f.
+    centre_um : (x, y), µm
+        Where the axis meets the sensor.
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range.
+
+    Notes
+    -----
+    The model ends where the height stops growing, or at 90°.
+    """
+
+    k: Sequence[float]
+    focal_um: float | tuple[float, float]
+    centre_um: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        k = finite_array("k", self.k, ndim=1)
+        if k.shape != (4,):
+            raise ParameterError("k", "must be four numbers", self.k)
+        object.__setattr__(self, "k", tuple(k.tolist()))
+        self._check_place()
+
+    @cached_property
+    def _series(self) -> np.polynomial.Polynomial:
+        k = self.k
+        return np.polynomial.Polynomial([0, 1, 0, k[0], 0, k[1], 0, k[2], 0, k[3]])
+
+    @cached_property
+    def _most_rad(self) -> float:
+        return min(float(smallest_roots(self._series.deriv().coef)[0]), 0.5 * math.pi - GRAZING)
+
+    def _max_theta_rad(self) -> float:
+        return self._most_rad
+
+    def _height(self, theta_rad: Floats) -> Floats:
+        return np.asarray(self._series(theta_rad))
+
+    def _theta_rad(self, height: Floats) -> Floats:
+        return growing_inverse(self._series, self._series.deriv(), height, self._most_rad)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scaramuzza(_ByAngle):
+    """
+    Scaramuzza's model, as OCamCalib and MATLAB fit it: the ray through a pixel is a polynomial of its distance to the centre.
+
+    Parameters
+    ----------
+    a : (4,), pixels
+        ``a0, a2, a3, a4`` of ``f(r) = a0 + a2 r² + a3 r³ + a4 r⁴``, r in pixels: a pixel at (x, y) sees along (x, y, f(r)).
+        Coefficients with a negative a0 (an axis into the camera) are turned round.
+    pixel_um : float, µm
+        Side of the pixels in which the coefficients are.
+    focal_um : float or (x, y), µm
+        Distance of the ideal image plane behind the pupil: that of the power map.
+    stretch : (2, 2)
+        Matrix S of Eq. 8: distorted positions are S times those above, with x to the right and y up.
+    centre_um : (x, y), µm
+        Where the axis meets the sensor.
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range, a0 is 0, or the stretch cannot be undone.
+
+    Notes
+    -----
+    Eqs. 7 and 8 of the paper, with r̃ = sqrt(x̃² + ỹ²). The model ends at 90°, or where the angle stops growing with r.
+    """
+
+    a: Sequence[float]
+    pixel_um: float
+    focal_um: float | tuple[float, float]
+    stretch: Sequence[Sequence[float]] = ((1.0, 0.0), (0.0, 1.0))
+    centre_um: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        a = finite_array("a", self.a, ndim=1)
+        if a.shape != (4,) or a[0] == 0.0:
+            raise ParameterError("a", "must be four numbers a0, a2, a3, a4, a0 not 0", self.a)
+        stretch = finite_array("stretch", self.stretch, ndim=2)
+        if stretch.shape != (2, 2) or not np.linalg.det(stretch) > 0.0:
+            raise ParameterError("stretch", "must be a 2 x 2 matrix with a positive determinant", self.stretch)
+        object.__setattr__(self, "a", tuple((a * np.sign(a[0])).tolist()))
+        object.__setattr__(self, "stretch", tuple(map(tuple, stretch.tolist())))
+        object.__setattr__(self, "pixel_um", check_number("pixel_um", self.pixel_um, above=0.0))
+        self._check_place()
+
+    @cached_property
+    def _matrix(self) -> Floats:
+        return np.array(self.stretch)
+
+    @cached_property
+    def _depth(self) -> np.polynomial.Polynomial:
+        """Depth of the ray against height, both in focal lengths."""
+        unit = self.pixel_um / float(np.max(self.focal_um))
+        a0, a2, a3, a4 = self.a
+        return np.polynomial.Polynomial([a0 * unit, 0.0, a2 / unit, a3 / unit**2, a4 / unit**3])
+
+    @cached_property
+    def _max_height(self) -> float:
+        depth = self._depth
+        growth = depth - np.polynomial.Polynomial([0.0, 1.0]) * depth.deriv()
+        return float(min(*smallest_roots(depth.coef), *smallest_roots(growth.coef)))
+
+    def _limits(self) -> tuple[float, float]:
+        # Stretched circles are ellipses: the radius is that of the largest circle inside.
+        ideal, height = super()._limits()
+        return ideal, height * float(np.linalg.svd(self._matrix, compute_uv=False).min())
+
+    def _slope(self) -> float:
+        return 1.0 / float(self._depth.coef[0])
+
+    def _max_theta_rad(self) -> float:
+        if math.isinf(self._max_height):
+            return 0.5 * math.pi - GRAZING
+        return min(float(self._angle_rad(np.array([self._max_height]))[0]), 0.5 * math.pi - GRAZING)
+
+    def _angle_rad(self, height: Floats) -> Floats:
+        return np.asarray(np.arctan2(height, self._depth(height)))
+
+    def _angle_slope(self, height: Floats) -> Floats:
+        depth = self._depth(height)
+        return np.asarray((depth - height * self._depth.deriv()(height)) / (depth**2 + height**2))
+
+    def _theta_rad(self, height: Floats) -> Floats:
+        return self._angle_rad(height)
+
+    def _height(self, theta_rad: Floats) -> Floats:
+        upper = self._max_height
+        if math.isinf(upper):  # without an end the height at the largest angle is one
+            upper = 1.0
+            most_rad = float(np.max(theta_rad, initial=0.0))
+            while float(self._angle_rad(np.array([upper]))[0]) < most_rad and upper < 1e12:
+                upper *= 2.0
+        return growing_inverse(self._angle_rad, self._angle_slope, theta_rad, upper)
+
+    def _forward(self, xy: Floats) -> Floats:
+        return np.asarray(super()._forward(xy) @ self._matrix.T)
+
+    def _backward(self, xy: Floats) -> Floats:
+        plain = xy @ np.linalg.inv(self._matrix).T
+        radius = np.hypot(plain[:, 0], plain[:, 1])
+        is_inside = radius <= super()._limits()[1]
+        theta_rad = self._theta_rad(np.where(is_inside, radius, 0.0))
+        return _scaled(plain, radius, np.where(is_inside, np.tan(theta_rad), np.nan), 1.0 / self._slope())

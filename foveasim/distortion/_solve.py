@@ -1,0 +1,57 @@
+"""Inverses of growing functions, for many values at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from foveasim.arrays import Floats
+
+__all__ = ["growing_inverse", "smallest_roots"]
+
+#: Steps of Newton's method kept inside a bracket: bisection alone would take 60.
+MAX_STEPS = 100
+#: A root is real when its imaginary part is this much smaller; one beyond the reciprocal of TINY is none.
+REAL, TINY = 1e-9, 1e-12
+
+
+def growing_inverse(
+    function: Callable[[Floats], Floats], slope: Callable[[Floats], Floats], values: Floats, upper: float
+) -> Floats:
+    """
+    Where a function that grows from 0 at 0 has some values, all of them at most that at ``upper``.
+
+    Newton's steps, replaced by halving wherever they leave the bracket.
+    """
+    low, high = np.zeros_like(values), np.full_like(values, upper)
+    x = np.minimum(values / max(float(slope(np.zeros(1))[0]), 1e-300), 0.5 * upper)
+    for _ in range(MAX_STEPS):
+        excess = function(x) - values
+        low, high = np.where(excess <= 0.0, x, low), np.where(excess >= 0.0, x, high)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = x - excess / slope(x)
+        new = np.where((step > low) & (step < high), step, 0.5 * (low + high))
+        new = np.where(excess == 0.0, x, new)
+        if np.all(np.abs(new - x) <= 2.0 * np.spacing(np.maximum(x, 1e-300))):
+            return new
+        x = new
+    return x
+
+
+def smallest_roots(coefficients: Any) -> Floats:
+    """Smallest positive roots of polynomials (n, degree + 1), lowest power first; infinite where there is none."""
+    table = np.atleast_2d(np.asarray(coefficients, dtype=np.float64))
+    roots = np.full(table.shape[0], np.inf)
+    # The reversed polynomial has the roots' reciprocals, and never a leading 0: these polynomials are not 0 at 0.
+    degree = table.shape[1] - 1
+    if degree == 0:
+        return roots
+    companion = np.zeros((table.shape[0], degree, degree))
+    companion[:, np.arange(1, degree), np.arange(degree - 1)] = 1.0
+    companion[:, 0, :] = -table[:, 1:] / table[:, :1]
+    reciprocal = np.linalg.eigvals(companion)
+    is_real = (np.abs(reciprocal.imag) <= REAL * np.abs(reciprocal)) & (reciprocal.real > TINY)
+    largest = np.where(is_real, reciprocal.real, 0.0).max(axis=1)
+    return np.divide(1.0, largest, out=roots, where=largest > 0.0)

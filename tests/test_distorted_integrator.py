@@ -1,0 +1,181 @@
+"""Outlines carried back through a lens: brute force agrees, light is conserved, nothing is lost but what gets no light."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import foveasim as fs
+from foveasim.distortion import BrownConrady, Fisheye, Scaramuzza
+from foveasim.errors import CoverageWarning, ParameterError
+
+BARREL = BrownConrady(focal_um=200.0, k1=-0.12, k2=0.02, p1=0.03, p2=-0.02)
+GRID = fs.Grid.centred((240, 240), 0.5)
+LAYOUTS = {
+    "hexagons": fs.layout.tiling(pitch_um=9.0, radius_um=50.0),
+    "rings": fs.layout.log_polar(n_sectors=16, r_min_um=6.0, r_max_um=50.0, fovea="rings", chords_per_arc=3),
+    "quads": fs.layout.quadtree(np.eye(16), pitch_um=6.0, limit=0.5, n_levels=3),
+}
+
+
+def field(x_um, y_um):
+    """A smooth irradiance in the ideal plane."""
+    return 2.0 + np.sin(0.05 * x_um + 0.3) * np.cos(0.04 * y_um) + 0.01 * x_um
+
+
+def field_means(grid, n=3):
+    """Means over cells, by Gauss points."""
+    nodes, weights = np.polynomial.legendre.leggauss(n)
+    x, y = grid.x_um[np.newaxis, :], grid.y_um[:, np.newaxis]
+    return sum(
+        0.25 * wx * wy * field(x + 0.5 * grid.pitch_um * nx, y + 0.5 * grid.pitch_um * ny)
+        for nx, wx in zip(nodes, weights, strict=True)
+        for ny, wy in zip(nodes, weights, strict=True)
+    )
+
+
+def real_irradiance(lens, grid, *, density):
+    """What falls on the cells of the sensor plane: the ideal field there, times the Jacobian where the flux is kept."""
+    x, y = np.meshgrid(grid.x_um, grid.y_um)
+    points = np.stack((x.ravel(), y.ravel()), axis=1)
+    h = 1e-4
+    right, up = np.array([h, 0.0]), np.array([0.0, h])
+    ideal = lens.undistort(points)
+    dx = (lens.undistort(points + right) - lens.undistort(points - right)) / (2 * h)
+    dy = (lens.undistort(points + up) - lens.undistort(points - up)) / (2 * h)
+    stretch = 1.0 if density else dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]
+    return (field(*ideal.T) * stretch).reshape(grid.shape)
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_warping_a_finer_and_finer_map_tends_to_what_carried_outlines_give(name):
+    layout = LAYOUTS[name]
+    fine = fs.Grid.centred((1000, 1000), 0.14)
+    carried = fs.Integrator(layout, fine, distortion=BARREL)(field_means(fine))
+    errors = []
+    for n in (48, 150, 600):
+        grid = fs.Grid.centred((n, n), 120.0 / n)
+        warped = fs.Integrator(layout, grid)(real_irradiance(BARREL, grid, density=False))
+        errors.append(float(np.abs(warped / carried - 1).max()))
+
+    assert errors[0] > 3 * errors[1]
+    assert errors[1] > 3 * errors[2]
+    assert errors[2] < 4e-5
+
+
+@pytest.mark.parametrize("name", ["hexagons", "rings", "quads"])
+def test_the_light_of_a_tiling_is_that_of_the_whole(name):
+    layout = LAYOUTS[name]
+    whole = fs.Layout.from_polygons([shapely.coverage_union_all(layout.polygons())])
+    cells = field_means(GRID)
+    parts = fs.Integrator(layout, GRID, distortion=BARREL)(cells)
+    total = fs.Integrator(whole, GRID, distortion=BARREL)(cells)
+
+    assert parts.sum() == pytest.approx(total[0], rel=1e-9)
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_lens_that_keeps_densities_shows_an_even_field_as_even(name):
+    layout = LAYOUTS[name]
+    even = fs.Integrator(layout, GRID, distortion=BARREL, conserve="density")(np.full(GRID.shape, 3.0))
+    flux = fs.Integrator(layout, GRID, distortion=BARREL)(np.full(GRID.shape, 3.0))
+
+    np.testing.assert_allclose(even, 3.0 * layout.area_um2, rtol=1e-12)
+    assert np.ptp(flux / layout.area_um2) > 0.05
+
+
+def test_a_lens_that_changes_nothing_changes_nothing():
+    for layout in LAYOUTS.values():
+        plain = fs.Integrator(layout, GRID)
+        carried = fs.Integrator(layout, GRID, distortion=BrownConrady(focal_um=100.0))
+        np.testing.assert_allclose(carried(field_means(GRID)), plain(field_means(GRID)), rtol=1e-12)
+        assert carried.lost_sites.size == 0
+
+
+@pytest.mark.parametrize("conserve", ["flux", "density"])
+def test_the_operator_its_transpose_and_its_matrix_are_one(conserve):
+    layout = LAYOUTS["hexagons"]
+    integrator = fs.Integrator(layout, GRID, distortion=BARREL, conserve=conserve)
+    cells = field_means(GRID)
+    values = np.linspace(1, 2, layout.n_sites)
+
+    np.testing.assert_allclose(integrator.weights() @ cells.ravel(), integrator(cells), rtol=1e-12)
+    assert (integrator.spread(values) * cells).sum() == pytest.approx((integrator(cells) * values).sum(), rel=1e-12)
+
+
+@settings(deadline=None, derandomize=True, max_examples=12)
+@given(x_um=st.floats(-40, 40), y_um=st.floats(-40, 40))
+def test_a_point_of_light_is_seen_where_the_lens_puts_it(x_um, y_um):
+    """Of an asymmetric lens, in all four quadrants: left is left, and up is up."""
+    layout = fs.layout.grid(n_x=100, n_y=100, pitch_um=1.0)
+    grid = fs.Grid.centred((400, 400), 0.3)
+    column, row = (int(np.floor((v + 60.0) / 0.3)) for v in (x_um, y_um))
+    cells = np.zeros(grid.shape)
+    cells[row, column] = 1.0
+    lens = BrownConrady(focal_um=100.0, k1=-0.2, p1=0.1, p2=-0.05)
+    seen = fs.Integrator(layout, grid, distortion=lens)(cells)
+    place_um = lens.distort([[grid.x_um[column], grid.y_um[row]]])[0]
+    centre_um = (layout.centroid_um * seen[:, np.newaxis]).sum(axis=0) / seen.sum()
+
+    assert seen.sum() == pytest.approx(grid.cell_area_um2, rel=1e-9)
+    assert np.hypot(*(centre_um - place_um)) < 0.8
+
+
+def test_sites_that_get_no_light_receive_nothing_and_are_told():
+    layout = fs.layout.grid(n_x=30, n_y=30, pitch_um=10.0)
+    lens = Fisheye(projection="orthographic", focal_um=100.0)
+    grid = fs.Grid.centred((400, 400), 4.0)
+    integrator = fs.Integrator(layout, grid, distortion=lens)
+    power = integrator(np.ones(grid.shape))
+    corner_um = np.hypot(*np.abs(layout.xy_um.reshape(-1, 4, 2)).max(axis=1).T)
+
+    assert set(integrator.lost_sites) == set(np.flatnonzero(corner_um > 100.0))
+    assert np.all(power[integrator.lost_sites] == 0.0)
+    assert np.all(integrator.uncovered_um2[integrator.lost_sites] > 0.0)
+    inner = np.flatnonzero(corner_um < 60.0)
+    assert np.all(power[inner] > layout.area_um2[inner])
+
+
+def test_a_camera_has_a_lens_of_any_model():
+    layout = fs.layout.hexagonal(n_columns=12, n_rows=12, pitch_um=8.0)
+    optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)
+    scene = fs.Scene.flat(
+        shape=(150, 150), pitch_um=200.0, distance_m=1.0, radiance_w_m2_sr_nm=0.2, band_width_nm=100.0
+    )
+    plain = fs.Camera(optics=optics, sensor=fs.Sensor(layout))
+    lens = Scaramuzza(a=(3600.0, -2e-5, 0.0, 0.0), pixel_um=2.2, focal_um=8000.0)
+    bent = fs.Camera(optics=optics, sensor=fs.Sensor(layout), distortion=lens)
+    captures = [camera.capture(scene, exposure_s=0.01, seed=1) for camera in (plain, bent)]
+
+    assert captures[1].settings["distortion"]["a"] == list(lens.a)
+    assert captures[0].settings["distortion"] is None
+    assert bent.distortion == lens
+    assert not np.allclose(captures[0].expected_e, captures[1].expected_e, rtol=1e-6)
+
+
+def test_a_camera_warns_of_sites_that_its_lens_leaves_dark():
+    layout = fs.layout.hexagonal(n_columns=12, n_rows=12, pitch_um=8.0)
+    optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)
+    scene = fs.Scene.flat(
+        shape=(600, 600), pitch_um=800.0, distance_m=1.0, radiance_w_m2_sr_nm=0.2, band_width_nm=100.0
+    )
+    camera = fs.Camera(
+        optics=optics, sensor=fs.Sensor(layout), distortion=Fisheye(projection="orthographic", focal_um=40.0)
+    )
+    with pytest.warns(CoverageWarning, match=r"\d+ of 144 photosites lie outside the lens's image circle"):
+        camera.capture(scene, exposure_s=0.01, seed=1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"distortion": 3.0}, "'distortion' must be a lens of foveasim.distortion, got 3.0"),
+        ({"distortion": BARREL, "conserve": "light"}, "'conserve' must be one of 'flux', 'density', got 'light'"),
+    ],
+)
+def test_distortions_that_cannot_be_are_refused(options, message):
+    with pytest.raises(ParameterError, match=message):
+        fs.Integrator(LAYOUTS["hexagons"], GRID, **options)
