@@ -21,8 +21,8 @@ from foveasim.rings import site_area_um2
 __all__ = [
     "WrittenLayout",
     "check_header",
-    "check_holes",
     "check_sites_of",
+    "check_sizes",
     "check_unpacked",
     "checked_layout",
     "head_of",
@@ -46,8 +46,9 @@ MAX_UNPACKED_BYTES = 8 * 2**30
 MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**26, 128
 #: A column of text takes the room of its longest in every row: what that may come to, and for each letter there is.
 MIN_TEXT_BYTES, TEXT_BYTES_PER_LETTER = 2**28, 64
-#: Rings that may meet each other in the same sites, and more of them for each ring that there is.
-MAX_RING_PAIRS, RING_PAIRS_PER_RING = 2_000_000, 100
+#: Rings and edges of a site are looked at in pairs where they may meet: pairs of either in all sites, and for each there is.
+MAX_RING_PAIRS, PAIRS_PER_RING = 2_000_000, 100
+MAX_VERTEX_PAIRS, PAIRS_PER_VERTEX = 1_000_000_000, 1000
 #: Enough to tell the formats apart, white space and a byte order mark before the first brace included.
 HEAD_BYTES = 256
 #: Longer messages of other libraries are cut.
@@ -177,19 +178,22 @@ def check_sites_of(path: Path, n_sites: int) -> None:
         raise FileError(path, f"has {n_sites} sites, more than the {MAX_SITES} that are read")
 
 
-def check_holes(n_rings: NDArray[Any]) -> None:
+def check_sizes(n_rings: NDArray[Any], n_vertices: NDArray[Any]) -> None:
     """
-    Refuse sites with so many rings that to check each with each would take minutes.
+    Refuse sites of so many rings or vertices that it would take minutes to see whether any two of them meet.
 
     Raises
     ------
     GeometryError
         When there are more than photosites have.
     """
-    n_pairs = np.sum(n_rings.astype(np.float64) ** 2)
-    if n_pairs > MAX_RING_PAIRS + RING_PAIRS_PER_RING * n_rings.sum():
-        site = int(np.argmax(n_rings))
-        raise GeometryError(f"site {site} has {n_rings[site] - 1} holes, more than photosites have", (site,))
+    for what, n, at_most, more in (
+        ("rings", n_rings, MAX_RING_PAIRS, PAIRS_PER_RING),
+        ("vertices", n_vertices, MAX_VERTEX_PAIRS, PAIRS_PER_VERTEX),
+    ):
+        if np.sum(n.astype(np.float64) ** 2) > at_most + more * n.sum():
+            site = int(np.argmax(n))
+            raise GeometryError(f"site {site} has {n[site]} {what}, more than photosites have", (site,))
 
 
 def checked_layout(
@@ -205,7 +209,11 @@ def checked_layout(
     GeometryError, ParameterError
         When outlines are no photosites, or a column does not fit.
     """
-    check_holes(np.diff(polygons[2]) if isinstance(polygons, tuple) else shapely.get_num_interior_rings(polygons) + 1)
+    if isinstance(polygons, tuple):
+        _, ring_offsets, site_offsets = polygons
+        check_sizes(np.diff(site_offsets), np.diff(ring_offsets[site_offsets]))
+    else:
+        check_sizes(shapely.get_num_interior_rings(polygons) + 1, shapely.get_num_coordinates(polygons))
     bare = Layout.from_polygons(polygons)
     return Layout(bare.xy_um, bare.ring_offsets, bare.site_offsets, columns, provenance)
 

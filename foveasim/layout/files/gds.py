@@ -43,8 +43,8 @@ from foveasim.layout._model import Layout
 from foveasim.layout.files._columns import MAX_COLUMN_BYTES, columns_of, kept_columns, texts_of
 from foveasim.layout.files._common import (
     WrittenLayout,
-    check_holes,
     check_sites_of,
+    check_sizes,
     checked_layout,
     one_sentence,
     rounding,
@@ -342,6 +342,7 @@ def read(path: Path, *, layer: int | None = None, cell: str | None = None) -> La
             "cell": answer["cell"],
             "dbu_um": float(f"{answer['dbu_um']:.12g}"),
         }
+        check_sizes(np.ones(counts.size), counts)
         is_whole = first.size == piece.size
         packed = (pieces.xy_um, pieces.ring_offsets, pieces.site_offsets)
         try:
@@ -496,7 +497,7 @@ def _without_keyholes(polygons: NDArray[Any]) -> NDArray[Any]:
         mended[i] = _of_loops(
             _loops(_with_all_vertices(list(map(tuple, shapely.get_coordinates(polygons[i]).tolist()))))
         )
-    check_holes(np.maximum(shapely.get_num_interior_rings(mended), 0) + 1)
+    check_sizes(np.maximum(shapely.get_num_interior_rings(mended), 0) + 1, shapely.get_num_coordinates(mended))
     return np.where(shapely.is_valid(mended), mended, polygons)
 
 
