@@ -149,6 +149,40 @@ def bench_wavelengths(report: Report, shape: tuple[int, int]) -> None:
     report.slower_than("RGB picture at 31 wavelengths", times["31"], "the same at 3", times["3"], 1.3)
 
 
+def bench_distortion(report: Report, shape: tuple[int, int]) -> None:
+    """Compare a distorted capture with an undistorted one, and carried outlines with a warped map."""
+    import cv2
+
+    scene = paper_scene(shape, np.ones((1, 1)), np.array([550.0]))
+    optics = fs.Optics(focal_length_mm=22.0, f_number=4.0)
+    grid = optics.grid(scene)
+    layout = paper_layout(grid)
+    sensor = fs.Sensor(layout, qe=0.6, dark_e_per_s=20.0, full_well_e=1e6, read_noise_e=1.0, bits=12)
+    lens = fs.distortion.BrownConrady(focal_um=4.0 * layout.bounds_um[2], k1=-0.08, k2=0.01, p1=1e-3)
+    plain = fs.Camera(optics=optics, sensor=sensor)
+    bent = fs.Camera(optics=optics, sensor=sensor, distortion=lens)
+    cells = np.random.default_rng(0).random(grid.shape, dtype=np.float32)
+    straight, carried = plain.integrator(grid), bent.integrator(grid)
+    # Where each cell of the warped map comes from, in cells.
+    x, y = np.meshgrid(grid.x_um, grid.y_um)
+    source = lens.undistort(np.stack((x, y), axis=-1), outside="mask")
+    index = ((source - np.array([grid.x_um[0], grid.y_um[0]])) / grid.pitch_um).astype(np.float32)
+    times = best_s(
+        {
+            "bent": lambda: bent.capture(scene, exposure_s=0.02, seed=0),
+            "plain": lambda: plain.capture(scene, exposure_s=0.02, seed=0),
+            "frame": lambda: carried(cells),
+            "remap": lambda: straight(cv2.remap(cells, index, None, cv2.INTER_LINEAR)),
+            "compile bent": lambda: fs.Integrator(layout, grid, distortion=lens),
+            "compile": lambda: fs.Integrator(layout, grid),
+        },
+        6,
+    )
+    report.slower_than("distorted mono capture", times["bent"], "the same undistorted", times["plain"], 1.1)
+    report.faster_than("distorted frame", times["frame"], "cv2.remap + undistorted frame", times["remap"], 3)
+    report.slower_than("compiling a distorted layout", times["compile bent"], "undistorted", times["compile"], 2)
+
+
 MEMORY_PROBE = """
 import sys, numpy as np
 sys.path.insert(0, sys.argv[1])
@@ -197,7 +231,7 @@ def main() -> int:
     is_quick = parser.parse_args().quick
     shape = (FULL_SHAPE[0] // 4, FULL_SHAPE[1] // 4) if is_quick else FULL_SHAPE
     report = Report(is_judged=not is_quick)
-    for bench in (bench_integrator, bench_optics, bench_wavelengths, bench_memory):
+    for bench in (bench_integrator, bench_optics, bench_distortion, bench_wavelengths, bench_memory):
         with console.status(bench.__name__.replace("_", " ")):
             bench(report, shape)
     with console.status("bench layouts"):

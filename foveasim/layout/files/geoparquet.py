@@ -168,14 +168,9 @@ def _table(path: Path, pa: Any, file: Any) -> Any:
 
 
 def _rows_at_a_time(path: Path, metadata: Any) -> int:
-    """Rows that do not unpack to too much even if all of them are the longest value of a dictionary."""
-    chunks = [
-        metadata.row_group(i).column(j) for i in range(metadata.num_row_groups) for j in range(metadata.num_columns)
-    ]
-    longest = max(
-        (c.total_uncompressed_size for c in chunks if c.has_dictionary_page and c.physical_type == "BYTE_ARRAY"),
-        default=1,
-    )
+    """Rows that do not unpack to too much even if each is the longest value there can be, out of a dictionary."""
+    # Nothing is asked about single columns: pyarrow ends the program where what the file tells of them is wrong.
+    longest = max((metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups)), default=1)
     return int(min(max(max_unpacked(path) // max(longest, 1), 1), BATCH))
 
 
