@@ -425,6 +425,10 @@ NPZ_BOMBS = {
     "origin nested deeply": lambda: npz(about=npy("'<U100000'", (), ("[" * 100_000).encode("utf-32-le"))),
     "archive that lies": lambda: lying(npz()),
     "archive of 100000 names": lambda: zipped({f"column_{i}.npy": b"" for i in range(100_000)}),
+    "array of another name": lambda: npz(columm_a=npy("'<i8'", (1,), bytes(8))),
+    "column with line ends and many letters": lambda: npz(
+        **{"column_\n\x1b[31m" + "a" * 60_000: npy("'<i8'", (2,), bytes(16))}
+    ),
     "archive packed by lzma": lambda: npz(zipfile.ZIP_LZMA, xy_um=npy("'<f8'", (3_000_000, 2), bytes(48_000_000))),
     "times beyond counting": lambda: npz(column_a=npy("'<M8[as]'", (1,), b"\xff" * 8)),
 }
@@ -502,6 +506,7 @@ GEOJSON_BOMBS = {
     "text that ends in a text": lambda: b'{"type": "FeatureCollection", "features": [], "a": "' + b"\\" * 10**6,
     "200000 members": lambda: b"{" + b",".join(b'"a%d": 0' % i for i in range(200_000)) + b"}",
     "10 MB of blanks": lambda: b"{" + b" " * 10**7,
+    "kind with line ends": lambda: collection(feature().replace("Polygon", "Poly\\n\\u001b[31mgon")),
     "half a pair": lambda: collection(feature(properties='{"\\ud800": "\\udfff"}')),
 }
 
@@ -740,12 +745,12 @@ def truncated(data, n):
     return [data[: len(data) * i // n] for i in range(n)] + [data[:-i] for i in (1, 2, 3, 4, 8, 16)]
 
 
-def flipped(data, rng, n, ending):
-    """A file with one to three bits changed; OASIS with a checksum that fits nevertheless."""
+def flipped(data, rng, n, ending, first=0):
+    """A file with one to three bits changed from some place on; OASIS with a checksum that fits nevertheless."""
     files = []
     for i in range(n):
         broken = bytearray(data)
-        for at in rng.integers(0, len(data), 1 + i % 3):
+        for at in rng.integers(first, len(data), 1 + i % 3):
             broken[at] ^= 1 << rng.integers(8)
         files.append(
             bytes(broken[:-4]) + struct.pack("<I", zlib.crc32(broken[:-4])) if ending == "oas" else bytes(broken)
@@ -777,6 +782,15 @@ def test_files_that_are_cut_short_or_noise_are_refused(whole, tmp_path, ending):
 @pytest.mark.parametrize("ending", FORMATS)
 def test_files_with_changed_bits_end_in_a_layout_or_in_one_sentence(whole, tmp_path, ending):
     files = flipped(whole[ending], np.random.default_rng(22), 30, ending)
+
+    for answer in read_apart(numbered(tmp_path, files, ending)):
+        assert_harmless(answer, ERRORS | {"Layout"})
+
+
+@pytest.mark.parametrize("ending", ["npz", "parquet"])
+def test_a_changed_table_of_contents_ends_in_a_layout_or_in_one_sentence(whole, tmp_path, ending):
+    data = whole[ending]
+    files = flipped(data, np.random.default_rng(23), 400, ending, first=max(0, len(data) - 3000))
 
     for answer in read_apart(numbered(tmp_path, files, ending)):
         assert_harmless(answer, ERRORS | {"Layout"})

@@ -1,16 +1,18 @@
 """
 Layouts as files: chip layout (GDSII, OASIS), maps (GeoJSON, GeoParquet), exact arrays (npz), and drawings (SVG).
 
-=============  ==========================  =======================================================================
-ending         format                      what a round trip keeps
-=============  ==========================  =======================================================================
-.npz           numpy arrays                everything, to the last bit
-.parquet       GeoParquet                  everything, to the last bit; small
-.geojson       GeoJSON                     everything; numbers and text in columns
-.gds, .oas     GDSII, OASIS                outlines on the database grid, order of the sites, column ``channel``
-.svg           SVG                         nothing: a drawing, written only
-=============  ==========================  =======================================================================
+=============  ==================  =================================================================================
+ending         format              what a round trip keeps
+=============  ==================  =================================================================================
+.npz           numpy arrays        everything, to the last bit
+.parquet       GeoParquet          everything, to the last bit; small
+.geojson       GeoJSON             everything; numbers and text in columns
+.gds, .oas     GDSII, OASIS        outlines on the database grid, order of the sites, ``channel``; columns of numbers to
+                                   the last bit, as 64 bits, of truth values and of short texts
+.svg           SVG                 nothing: a drawing, written only
+=============  ==================  =================================================================================
 
+What a file does not hold of a layout's columns is told when it is written: :attr:`WrittenLayout.lost_columns`.
 Files are read by what they hold, whatever their ending; a file that is broken, cut short or hostile ends in one
 :class:`~foveasim.errors.FileError`.
 """
@@ -74,7 +76,8 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
     Returns
     -------
     Layout
-        In the order in which the sites were written. From GDSII and OASIS, the data type is the column ``channel``.
+        In the order in which the sites were written. From GDSII and OASIS, the data type is the column ``channel``, and
+        there are those others that every site tells.
 
     Raises
     ------
@@ -130,7 +133,7 @@ def write_layout(
     Returns
     -------
     WrittenLayout
-        What rounding did to the outlines; zero for formats that keep every digit.
+        What rounding did to the outlines, zero for formats that keep every digit; and the columns left out.
 
     Raises
     ------
@@ -144,7 +147,7 @@ def write_layout(
     Examples
     --------
     >>> from foveasim.layout import grid
-    >>> written = write_layout(grid(pitch_um=2.0, shape=(3, 3)), "die.gds")  # doctest: +SKIP
+    >>> written = write_layout(grid(n_x=3, n_y=3, pitch_um=2.0), "die.gds")  # doctest: +SKIP
     >>> written.worst_move_um  # doctest: +SKIP
     0.0
     """

@@ -51,8 +51,9 @@ MAX_RING_PAIRS, PAIRS_PER_RING = 2_000_000, 100
 MAX_VERTEX_PAIRS, PAIRS_PER_VERTEX = 1_000_000_000, 1000
 #: Enough to tell the formats apart, white space and a byte order mark before the first brace included.
 HEAD_BYTES = 256
-#: Longer messages of other libraries are cut.
+#: Longer messages are cut: of other libraries, and of our own.
 MAX_TOLD = 200
+MAX_SENTENCE = 500
 #: Kinds of numpy types that text formats keep: truth values, whole numbers, floating-point numbers, text.
 PLAIN_KINDS = "biufU"
 
@@ -155,14 +156,17 @@ def one_sentence(path: Path, kind: str) -> Iterator[None]:
     """Whatever a broken file makes its readers trip over, as one FileError of one sentence."""
     try:
         yield
-    except FileError:
-        raise
     except FoveasimError as error:
-        raise FileError(path, str(error)) from None
+        raise FileError(path, _one_line(str(error).removeprefix(f"{path}: "), MAX_SENTENCE)) from None
     except Exception as error:  # noqa: BLE001 -- a broken file makes its readers trip over anything
-        told = " ".join(str(error).split()) or type(error).__name__
-        told = told if len(told) <= MAX_TOLD else told[: MAX_TOLD - 3] + "..."
+        told = _one_line(str(error), MAX_TOLD) or type(error).__name__
         raise FileError(path, f"is broken, or no {kind} layout ({told})") from None
+
+
+def _one_line(text: str, at_most: int) -> str:
+    """A text of another program, or with names of a file in it, so that it can be shown."""
+    line = " ".join("".join(c if c.isprintable() else " " for c in text[: 2 * at_most]).split())
+    return line if len(line) <= at_most else line[: at_most - 3] + "..."
 
 
 def check_sites_of(path: Path, n_sites: int) -> None:

@@ -77,7 +77,7 @@ CELL_NAME = "SENSOR"
 
 #: Of the reading program: memory while gdstk reads, and in all; texts of columns; time; more of each for a large file.
 MIN_READING_BYTES, READING_PER_BYTE = 2**30, 256
-MIN_MEMORY_BYTES, MEMORY_PER_BYTE, MAX_MEMORY_BYTES = 2**31, 64, 2**35
+MIN_MEMORY_BYTES, MEMORY_PER_BYTE, MAX_MEMORY_BYTES = 2**31, 256, 2**35
 MIN_TEXT_BYTES, TEXT_PER_BYTE = 2**27, 32
 MAX_CPU_S, BYTES_PER_S = 5, 2**20
 #: On a busy computer the same takes longer; and flattening, once it is known how much that is, may.

@@ -159,12 +159,14 @@ def _pyarrow(path: Path) -> tuple[Any, Any]:
 
 def _table(path: Path, pa: Any, file: Any) -> Any:
     """All rows, a few at a time: one long value may stand in a small file for very many rows."""
-    batches, n_bytes = [], 0
+    batches, n_bytes, most = [], 0, max_unpacked(path)
     for batch in file.iter_batches(batch_size=_rows_at_a_time(path, file.metadata), use_threads=False):
         n_bytes += batch.nbytes
-        check_unpacked(path, n_bytes)
+        if n_bytes > most:
+            break
         batches.append(batch)
-    return pa.Table.from_batches(batches, schema=file.schema_arrow)
+    check_unpacked(path, n_bytes)
+    return pa.Table.from_batches(batches, schema=file.schema_arrow).combine_chunks()
 
 
 def _rows_at_a_time(path: Path, metadata: Any) -> int:

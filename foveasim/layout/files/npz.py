@@ -70,6 +70,9 @@ def read(path: Path) -> Layout:
         if "about" not in items:
             raise FileError(path, "is no foveasim layout")
         provenance = check_header(path, json.loads(str(_array(archive, items["about"]))))
+        unknown = [n for n in items if n not in {"about", *ARRAYS} and not n.startswith(COLUMN_PREFIX)]
+        if unknown:
+            raise FileError(path, f"is broken: {unknown[0]!r:.40} is no array of a layout")
         xy_um, ring_offsets, site_offsets = (_array(archive, items[name]) for name in ARRAYS)
         check_sites_of(path, site_offsets.size - 1)
         columns = {
