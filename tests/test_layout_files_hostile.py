@@ -634,6 +634,7 @@ YAML_BOMBS = {
     "blocks nested by blanks": lambda: b"".join(b" " * i + b"a:\n" for i in range(1000)),
     "a file of 2 MB": lambda: b"#" * (2 * 2**20),
     "bytes that are no text": lambda: b"\xff\xfe\x00",
+    "control characters": lambda: b"generator: \x00\x1b[31m\n",
     "a key twice": lambda: b"generator: grid\ngenerator: grid\n",
     "a key that is a list": lambda: b"? [1, 2]\n: 3\n",
     "two documents": lambda: b"a: 1\n---\nb: 2\n",

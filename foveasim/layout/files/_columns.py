@@ -1,9 +1,9 @@
 r"""
 Columns of a layout as a short text of each site, for formats that know shapes and their properties but no tables.
 
-A text is made of words as ``ring=3 gain=0.25 is_dead=true name="a"``: a key, and a value that is a number of as
-many digits as it takes to be the same again, a truth value, or text as JSON quotes it, blanks as \u0020. A key is a plain
-name, or any name quoted as text is. Nothing that is read is evaluated.
+A text is made of words as ``ring=3 gain=0.25 is_dead=true name="a"``: a key, and a value that is a number of as many
+digits as it takes to be the same again, a truth value, or text as JSON quotes it, blanks as \u0020. A key is a plain name,
+or any name quoted as text is. Nothing that is read is evaluated.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ __all__ = ["CHANNEL", "MAX_COLUMN_BYTES", "columns_of", "kept_columns", "texts_o
 CHANNEL = "channel"
 #: Columns of a file that are read.
 MAX_COLUMNS = 64
+#: More different texts in a column than any layout has sites.
+MAX_TEXTS = 2**62
 #: Texts with different keys in a file; more are no columns.
 MAX_KINDS = 64
 #: A column of long texts, read from a small file whose cell stands there often, would take more than all outlines.
@@ -37,10 +39,6 @@ ESCAPES = str.maketrans({" ": "\\u0020", "=": "\\u003d"})
 TRUTHS = {b"true": True, b"false": False}
 QUOTED = re.compile(rb'"(?:[^"\\]|\\.)*"')
 _VALUE = re.compile(rb"=\S*")
-
-
-#: More different texts in a column than any layout has sites.
-MAX_TEXTS = 2**62
 
 
 # -- writing ----------------------------------------------------------------------------------------------------------
