@@ -27,7 +27,7 @@ from foveasim.arrays import (
 )
 from foveasim.errors import ParameterError
 
-__all__ = ["Grid", "PackedRings", "PointMap", "PowerMap", "SceneLike", "from_file_rows", "to_file_rows"]
+__all__ = ["Grid", "PackedRings", "PointMap", "PowerMap", "SceneLike", "from_file_rows", "rising", "to_file_rows"]
 
 
 class PackedRings(Protocol):
@@ -196,6 +196,61 @@ class PowerMap:
         object.__setattr__(self, "data", read_only(data))
         object.__setattr__(self, "wavelength_nm", wavelength_nm)
 
+    @classmethod
+    def from_array(
+        cls,
+        data: ArrayLike,
+        *,
+        pitch_um: float,
+        wavelength_nm: ArrayLike,
+        origin_um: tuple[float, float] | None = None,
+        top_row_first: bool = False,
+    ) -> PowerMap:
+        """
+        Map of a plain array.
+
+        Parameters
+        ----------
+        data : (n_y, n_x) or (n_band, n_y, n_x), W/m² per band
+            Mean irradiance of each cell; two dimensions are one band.
+        pitch_um : float, µm
+            Side of a cell.
+        wavelength_nm : number or (n_band,), nm
+            The bands' wavelengths.
+        origin_um : (x0, y0), optional, µm
+            Lower left corner of the lowest row's first cell; by default the map's middle lies on the optical axis.
+        top_row_first : bool
+            Whether the first row is the one on top, as in pictures; by default it is the lowest.
+
+        Returns
+        -------
+        PowerMap
+
+        Raises
+        ------
+        ParameterError
+            When the array has another number of dimensions or no real numbers, or does not fit the wavelengths.
+
+        Examples
+        --------
+        >>> spot = PowerMap.from_array([[0.0, 1.0], [0.0, 0.0]], pitch_um=2.0, wavelength_nm=550.0, top_row_first=True)
+        >>> spot.data[0, 1].tolist(), spot.grid.origin_um
+        ([0.0, 1.0], (-2.0, -2.0))
+        """
+        try:
+            images = np.asarray(data)
+        except ValueError:
+            raise ParameterError("data", "must be an array of numbers", data) from None
+        if images.ndim not in (2, 3) or 0 in images.shape:
+            raise ParameterError("data", f"must have the shape (n_y, n_x) or (n_band, n_y, n_x), got {images.shape}")
+        images = images.reshape(-1, *images.shape[-2:])
+        n_y, n_x = images.shape[1:]
+        centred = Grid.centred((n_y, n_x), pitch_um)
+        grid = centred if origin_um is None else Grid((n_y, n_x), pitch_um, origin_um)
+        return cls(
+            rising(images, is_y_falling=top_row_first), grid, np.atleast_1d(as_numbers("wavelength_nm", wavelength_nm))
+        )
+
 
 def from_file_rows(picture: NDArray[Any]) -> NDArray[Any]:
     """(n_y, n_x) or (n_y, n_x, n_channel), first row on top, to (n_channel, n_y, n_x), first row lowest (a view)."""
@@ -207,3 +262,9 @@ def to_file_rows(picture: ArrayLike) -> NDArray[Any]:
     """(n_y, n_x) or (n_channel, n_y, n_x), first row lowest, to (n_y, n_x[, n_channel]), first row on top (a view)."""
     picture = np.asarray(picture)
     return picture[::-1] if picture.ndim == 2 else np.moveaxis(picture, 0, -1)[::-1]
+
+
+def rising(images: NDArray[Any], *, is_x_falling: bool = False, is_y_falling: bool = False) -> NDArray[Any]:
+    """(..., n_y, n_x) along axes that fall or rise, to axes that rise: lowest row first, leftmost column first."""
+    turned = images[..., :: -1 if is_y_falling else 1, :: -1 if is_x_falling else 1]
+    return np.ascontiguousarray(turned)

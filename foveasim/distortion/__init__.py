@@ -11,6 +11,7 @@ from __future__ import annotations
 from foveasim.distortion._brown_conrady import BrownConrady
 from foveasim.distortion._calibration import Lens, from_opencv, read_calibration, to_opencv
 from foveasim.distortion._fisheye import Fisheye, PolynomialFisheye, Scaramuzza
+from foveasim.distortion._map import distort_map
 
 __all__ = [
     "BrownConrady",
@@ -18,6 +19,7 @@ __all__ = [
     "Lens",
     "PolynomialFisheye",
     "Scaramuzza",
+    "distort_map",
     "from_opencv",
     "read_calibration",
     "to_opencv",

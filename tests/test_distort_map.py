@@ -1,0 +1,277 @@
+"""Distorted maps: light and directions are kept, other programs' remapping agrees, and so do carried outlines."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import foveasim as fs
+from foveasim.distortion import BrownConrady, Fisheye, PolynomialFisheye, Scaramuzza, distort_map
+from foveasim.errors import ParameterError
+
+PLAIN = BrownConrady(focal_um=200.0)
+BARREL = BrownConrady(focal_um=200.0, k1=-0.12, k2=0.02, p1=0.03, p2=-0.02)
+PINCUSHION = BrownConrady(focal_um=200.0, k1=0.15)
+LENSES = {
+    "barrel": BARREL,
+    "pincushion": PINCUSHION,
+    "off centre": BrownConrady(focal_um=(200.0, 210.0), k1=-0.2, centre_um=(9.0, -4.0)),
+    "equidistant": Fisheye(projection="equidistant", focal_um=80.0),
+    "polynomial": PolynomialFisheye(focal_um=90.0, k=(-0.05, 0.01, 0.0, 0.0)),
+    "Scaramuzza": Scaramuzza(a=(157.0, -2.75e-3, 0.0, 0.0), pixel_um=1.0, focal_um=157.0),
+}
+#: A letter without any symmetry, the first row on top.
+F = np.array(
+    [
+        [0, 0, 0, 0, 0],
+        [0, 1, 1, 1, 0],
+        [0, 1, 0, 0, 0],
+        [0, 1, 1, 0, 0],
+        [0, 1, 0, 0, 0],
+        [0, 1, 0, 0, 0],
+        [0, 0, 0, 0, 0],
+    ]
+)
+
+
+def blob(grid, x0=8.0, y0=-5.0, width=11.0):
+    """Light that is nothing at the map's border."""
+    x, y = np.meshgrid(grid.x_um, grid.y_um)
+    return np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / (2 * width**2))
+
+
+def power_map(data, grid):
+    data = np.asarray(data)
+    return fs.PowerMap(
+        data if data.ndim == 3 else data[np.newaxis], grid, np.full(1 if data.ndim == 2 else len(data), 550.0)
+    )
+
+
+def middle_of(light, grid):
+    x, y = np.meshgrid(grid.x_um, grid.y_um)
+    return (light * x).sum() / light.sum(), (light * y).sum() / light.sum()
+
+
+@pytest.mark.parametrize("order", range(6))
+@pytest.mark.parametrize("conserve", ["flux", "density"])
+def test_an_ideal_lens_changes_nothing(conserve, order):
+    grid = fs.Grid((37, 53), 0.7, (-11.0, 3.3))
+    light = power_map(np.random.default_rng(1).random((2, 37, 53)), grid)
+
+    same = distort_map(light, PLAIN, conserve=conserve, order=order)
+
+    assert same.grid == grid
+    # Splines of order 5 are solved for to 1e-11; the Jacobian of a difference of coordinates of 20 µm over 0.7 to 1e-13.
+    np.testing.assert_allclose(same.data, light.data, rtol=1e-9, atol=1e-10)
+    assert np.array_equal(same.wavelength_nm, light.wavelength_nm)
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+def test_a_uniform_map_stays_uniform_where_density_is_kept(lens):
+    light = power_map(np.full((80, 120), 3.0, np.float32), fs.Grid.centred((80, 120), 1.0))
+
+    warped = distort_map(light, lens, conserve="density")
+
+    assert warped.data.dtype == np.float32
+    assert np.all(np.isin(warped.data, (0.0, 3.0)))
+    assert (warped.data == 3.0).mean() > 0.6
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+def test_the_default_grid_holds_all_the_light_and_no_empty_row(lens):
+    grid = fs.Grid.centred((80, 120), 1.0)
+
+    warped = distort_map(power_map(np.ones((80, 120)), grid), lens)
+    x0, y0, x1, y1 = warped.grid.bounds_um
+    edges = np.linspace(-1.0, 1.0, 201)
+    border = np.array([(60 * a, 40 * b) for e in edges for a, b in ((e, 1), (e, -1), (1, e), (-1, e))])
+    real = lens.distort(border)
+
+    assert np.all(real >= np.array([x0, y0]) - 1e-6)
+    assert np.all(real <= np.array([x1, y1]) + 1e-6)
+    assert np.all(real.min(axis=0) - (x0, y0) < 1.0)
+    assert np.all((x1, y1) - real.max(axis=0) < 1.0)
+    # On the map's own cell edges.
+    np.testing.assert_allclose(np.array(warped.grid.origin_um) % 1.0, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+@pytest.mark.parametrize("order", [1, 3])
+def test_all_the_light_of_a_blob_arrives_the_better_the_finer_the_map(lens, order):
+    errors = []
+    for n in (30, 60, 120):
+        grid = fs.Grid.centred((2 * n, 3 * n), 40.0 / n)
+        light = blob(grid)
+        warped = distort_map(power_map(light, grid), lens, order=order)
+        errors.append(abs(warped.data.sum() / light.sum() - 1.0))
+
+    # A sum of samples of a blob is exact but for its border; the lens and interpolation leave second order.
+    assert errors[-1] < (2e-4 if order == 1 else 5e-5)
+    assert errors[-1] < max(errors[0] / 3.5, 3e-5)
+
+
+def test_keeping_density_does_not_keep_the_light():
+    grid = fs.Grid.centred((120, 180), 0.7)
+    light = blob(grid)
+
+    warped = distort_map(power_map(light, grid), PINCUSHION, conserve="density")
+
+    assert warped.data.sum() / light.sum() > 1.004
+
+
+def off_carried_outlines(n, conserve):
+    """How far, at most, photosites on the warped map are off those carried back, for cells of 40 µm / n."""
+    layout = fs.layout.tiling(pitch_um=6.0, radius_um=25.0)
+    grid = fs.Grid.centred((2 * n, 3 * n), 40.0 / n)
+    light = power_map(blob(grid, x0=0.0, y0=0.0, width=30.0), grid)
+    carried = fs.Integrator(layout, grid, distortion=BARREL, conserve=conserve)(light.data)[0]
+    warped = distort_map(light, BARREL, conserve=conserve)
+    return np.abs(fs.Integrator(layout, warped.grid)(warped.data)[0] / carried - 1.0).max()
+
+
+def test_photosites_on_a_warped_map_get_what_carried_outlines_get_the_closer_the_finer():
+    errors = [off_carried_outlines(n, "flux") for n in (20, 40, 80, 160, 320)]
+
+    assert errors[-1] < 2e-5
+    # Between first order, of the cells that outlines cut, and second, of interpolation.
+    assert all(fine < coarse / 2.0 for coarse, fine in pairwise(errors))
+
+
+def test_photosites_that_keep_density_agree_but_for_the_lens_within_a_site():
+    # The integrator takes one ratio of areas for a site: the Jacobian changes by p / f over it, light by p / width.
+    assert off_carried_outlines(80, "density") < 0.12 * 6.0 / 200.0 * 6.0 / 30.0
+
+
+@pytest.mark.parametrize("lens", [BARREL, PINCUSHION], ids=["barrel", "pincushion"])
+def test_a_letter_stays_upright(lens):
+    letter = np.kron(F, np.ones((12, 12)))
+    light = fs.PowerMap.from_array(letter, pitch_um=1.0, wavelength_nm=550.0, top_row_first=True)
+
+    warped = distort_map(light, lens, grid=light.grid, conserve="density", order=0)
+    cells = warped.data[0].reshape(7, 12, 5, 12).mean(axis=(1, 3))[::-1]
+
+    assert np.array_equal(cells > 0.5, F == 1)
+
+
+def test_a_barrel_draws_the_corners_in_and_a_pincushion_pushes_them_out():
+    grid = fs.Grid.centred((160, 240), 0.5)
+    sizes = {
+        name: distort_map(power_map(np.ones(grid.shape), grid), LENSES[name]).grid for name in ("barrel", "pincushion")
+    }
+
+    corner = BrownConrady(focal_um=200.0, k1=-0.12).distort([[60.0, 40.0]])[0]
+    only_k1 = distort_map(power_map(np.ones(grid.shape), grid), BrownConrady(focal_um=200.0, k1=-0.12))
+    lit = only_k1.data[0] > 0.0
+    # The corner of the lit cells is the border's corner, which lies further in than the middle of the sides.
+    assert corner[0] < only_k1.grid.bounds_um[2]
+    assert not lit[-1, -1]
+    assert lit[-1, lit.shape[1] // 2]
+    assert sizes["pincushion"].shape[0] > grid.shape[0]
+
+
+@pytest.mark.parametrize(("p1", "p2", "axis"), [(0.05, 0.0, 1), (0.0, 0.05, 0)], ids=["p1 is up", "p2 is right"])
+def test_tangential_distortion_moves_light_along_its_axis(p1, p2, axis):
+    grid = fs.Grid.centred((161, 161), 1.0)
+    dots = sum(blob(grid, x0=x, y0=y, width=4.0) for x, y in ((40, 0), (-40, 0), (0, 40), (0, -40)))
+    lens = BrownConrady(focal_um=200.0, p1=p1, p2=p2)
+
+    moved = middle_of(distort_map(power_map(dots, grid), lens).data[0], distort_map(power_map(dots, grid), lens).grid)
+
+    # x_d = x + p2 (r² + 2 x²), y_d = y + p1 (r² + 2 y²) in focal lengths: on the mean of the four, 2 p r² f.
+    assert moved[axis] == pytest.approx(2.0 * 0.05 * (40.0 / 200.0) ** 2 * 200.0, rel=0.03)
+    assert abs(moved[1 - axis]) < 1e-3
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+def test_opencv_remaps_to_the_same_numbers(lens):
+    cv2 = pytest.importorskip("cv2")
+    grid = fs.Grid.centred((96, 128), 0.9)
+    light = np.random.default_rng(2).random((1, 96, 128)).astype(np.float32)
+    warped = distort_map(power_map(light, grid), lens, grid=grid, conserve="density")
+
+    # OpenCV's way: rows from the top, the source's pixel positions for each pixel.
+    x_um = (np.arange(128) - 63.5) * 0.9
+    y_um = (47.5 - np.arange(96)) * 0.9
+    source = lens.undistort(np.stack(np.meshgrid(x_um, y_um), axis=-1), outside="mask")
+    columns, rows = source[..., 0] / 0.9 + 63.5, 47.5 - source[..., 1] / 0.9
+    picture = np.ascontiguousarray(light[0, ::-1])
+    remapped = cv2.remap(picture, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR)[::-1]
+    is_inside = ((columns > 0) & (columns < 127) & (rows > 0) & (rows < 95))[::-1]
+
+    assert is_inside.mean() > 0.5
+    # OpenCV may round positions to 1/32 of a pixel: a light step of 1 then moves by 1/64 along each axis.
+    assert np.abs(remapped - warped.data[0])[is_inside].max() < 2.0 / 64.0 + 1e-4
+
+
+def test_nothing_comes_from_outside_the_image_circle():
+    lens = BrownConrady(focal_um=200.0, k1=-0.5)  # folds at 0.816 focal lengths: a circle of 109 µm
+    grid = fs.Grid.centred((500, 500), 1.0)
+
+    warped = distort_map(power_map(np.ones(grid.shape), grid), lens, conserve="density")
+    x, y = np.meshgrid(warped.grid.x_um, warped.grid.y_um)
+    radius = np.hypot(x, y)
+    limit = lens.max_radius_um[1]
+
+    assert limit == pytest.approx(200.0 * (2.0 / 3.0) * np.sqrt(2.0 / 3.0))
+    assert np.all(warped.data[0][radius > limit] == 0.0)
+    np.testing.assert_allclose(warped.data[0][radius < limit - 1e-6], 1.0, rtol=1e-14)
+    assert np.allclose(warped.grid.bounds_um, np.array([-1, -1, 1, 1]) * np.ceil(limit))
+
+
+def test_all_the_light_within_the_image_circle_arrives():
+    lens = BrownConrady(focal_um=200.0, k1=-0.5)
+    grid = fs.Grid.centred((500, 500), 1.0)
+    warped = distort_map(power_map(np.ones(grid.shape), grid), lens)
+    ideal_um2 = np.pi * lens.max_radius_um[0] ** 2
+
+    # Density grows as 1 / sqrt(distance to the circle): samples of it miss some.
+    assert np.isfinite(warped.data).all()
+    assert warped.data.sum() == pytest.approx(ideal_um2, rel=0.05)
+
+
+def test_all_bands_are_warped_alike():
+    grid = fs.Grid.centred((40, 50), 1.0)
+    band = np.random.default_rng(3).random((40, 50))
+    both = fs.PowerMap(np.stack([band, 2.0 * band]), grid, np.array([450.0, 550.0]))
+
+    warped = distort_map(both, BARREL)
+
+    assert np.array_equal(warped.data[1], 2.0 * warped.data[0])
+    assert warped.wavelength_nm.tolist() == [450.0, 550.0]
+
+
+def test_rows_are_worked_on_in_pieces_without_a_seam(monkeypatch):
+    from foveasim.distortion import _map
+
+    light = power_map(np.random.default_rng(4).random((60, 70)), fs.Grid.centred((60, 70), 1.0))
+    whole = distort_map(light, BARREL)
+    monkeypatch.setattr(_map, "CELLS_A_PIECE", 300)
+
+    assert np.array_equal(distort_map(light, BARREL).data, whole.data)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"power_map": np.ones((2, 2))}, r"'power_map' must be a PowerMap, got a ndarray"),
+        ({"lens": None}, r"'lens' must be a lens of foveasim\.distortion"),
+        ({"grid": (3, 3)}, r"'grid' must be a Grid, got a tuple"),
+        ({"conserve": "energy"}, r"'conserve' must be one of 'flux', 'density', got 'energy'"),
+        ({"order": 6}, r"'order' must be <= 5, got 6"),
+        ({"grid": fs.Grid((2**20, 2**20), 1.0)}, r"'grid' must have at most 268435456 cells"),
+    ],
+)
+def test_what_cannot_be_is_refused(arguments, message):
+    light = power_map(np.ones((3, 4)), fs.Grid((3, 4), 1.0))
+
+    with pytest.raises(ParameterError, match=message):
+        distort_map(**{"power_map": light, "lens": BARREL, **arguments})
+
+
+def test_a_lens_that_throws_the_border_far_out_asks_for_a_grid():
+    far = BrownConrady(focal_um=1.0, k1=1.0)
+
+    with pytest.raises(ParameterError, match=r"'grid' must be given: the whole distorted map has"):
+        distort_map(power_map(np.ones((40, 40)), fs.Grid.centred((40, 40), 1.0)), far)
