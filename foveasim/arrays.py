@@ -59,6 +59,7 @@ UNIT_SUFFIXES = {
     "_w_m2": "W/m²",
     "_w_sr": "W/sr",
     "_j_s": "J s",
+    "_per_mm": "per mm",
     "_um2": "µm²",
     "_um": "µm",
     "_mm": "mm",

@@ -17,7 +17,7 @@ from foveasim import layout as layouts
 from foveasim.distortion import BrownConrady, Fisheye, Lens, PolynomialFisheye, Scaramuzza
 from foveasim.layout import DesignRules, Layout
 from foveasim.optics import Optics
-from foveasim.scene import Scene
+from foveasim.scene import Scene, charts
 from foveasim.sensor import ConstantCurve, FilterSet, GaussianCurve, PolynomialCurve, Sensor, SiliconQE
 
 __all__ = ["PICTURES", "LayoutUnion", "PerArea", "RulesSection", "ShotSection", "call_of"]
@@ -110,6 +110,16 @@ _SCENES: dict[str, Callable[..., Scene]] = {
     "picture": Scene.from_picture,
     "flat": Scene.flat,
     "point_sources": Scene.point_sources,
+    "bars": charts.bars,
+    "checkerboard": charts.checkerboard,
+    "colour_chart": charts.colour_chart,
+    "grey_scale": charts.grey_scale,
+    "letter_f": charts.letter_f,
+    "point_grid": charts.point_grid,
+    "siemens_star": charts.siemens_star,
+    "sine": charts.sine,
+    "slanted_edge": charts.slanted_edge,
+    "zone_plate": charts.zone_plate,
 }
 _LENSES: dict[str, Callable[..., Lens]] = {
     "brown_conrady": BrownConrady,

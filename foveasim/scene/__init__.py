@@ -1,7 +1,8 @@
-"""Scenes: photographs, flat fields and point sources as light in physical units."""
+"""Scenes: photographs, flat fields, point sources and test charts as light in physical units."""
 
 from __future__ import annotations
 
+from foveasim.scene import charts
 from foveasim.scene._scene import Scene
 
-__all__ = ["Scene"]
+__all__ = ["Scene", "charts"]

@@ -208,7 +208,7 @@ class Scene:
             channels,
             peak * relative,
             waves_nm,
-            _band_widths_nm(waves_nm, band_width_nm),
+            band_widths_nm(waves_nm, band_width_nm),
             pitch_um,
             distance_m,
             source=str(picture) if is_file else "a picture array",
@@ -304,7 +304,7 @@ class Scene:
             image,
             per_area,
             waves_nm,
-            _band_widths_nm(waves_nm, band_width_nm),
+            band_widths_nm(waves_nm, band_width_nm),
             pitch_um,
             distance_m,
             source="point sources",
@@ -351,7 +351,7 @@ def _light(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Imag
     return light
 
 
-def _band_widths_nm(wavelength_nm: Floats, band_width_nm: float | Sequence[float] | None) -> Floats:
+def band_widths_nm(wavelength_nm: Floats, band_width_nm: float | Sequence[float] | Floats | None) -> Floats:
     """Widths as given, or reaching half-way to the neighbouring wavelengths."""
     if band_width_nm is not None:
         widths = finite_array("band_width_nm", band_width_nm, above=0.0)

@@ -1,0 +1,305 @@
+"""What all charts share: the picture that they are drawn on, its light, and exact means over pixels."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.arrays import Bools, Floats, check_choice, check_number, check_shape, finite_array, wavelengths_nm
+from foveasim.errors import ParameterError, SamplingWarning
+from foveasim.scene._scene import Scene, band_widths_nm
+from foveasim.units import m_from_um
+
+__all__ = [
+    "Canvas",
+    "OneOrMore",
+    "Shares",
+    "add_rectangle",
+    "checked_contrast",
+    "half_plane",
+    "inked",
+    "interval",
+    "sampled",
+]
+
+#: A number, or one for each wavelength.
+OneOrMore = float | Sequence[float]
+Shares = NDArray[np.float32]
+
+#: Pixels that are drawn at once: a few arrays of float64 of this size stay in the cache of a processor.
+BLOCK_PIXELS = 2**18
+#: Samples on each side of a pixel whose mean has no closed form.
+SAMPLES = 32
+#: Fewer pixels in a period of a pattern do not show it (Nyquist).
+MIN_PIXELS_PER_PERIOD = 2.0
+#: Sizes that fit but for this relative rounding fit.
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Canvas:
+    """
+    The picture that a chart is drawn on, and the light on it.
+
+    Parameters
+    ----------
+    shape : (n_y, n_x)
+    pitch_um : float, µm
+    distance_m : float, m
+    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
+    wavelength_nm : sequence, nm
+    band_width_nm : number or sequence or None, nm
+        As for :meth:`Scene.from_picture`.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range.
+    """
+
+    shape: tuple[int, int]
+    pitch_um: float
+    distance_m: float
+    radiance_w_m2_sr_nm: OneOrMore
+    wavelength_nm: Sequence[float] | Floats
+    band_width_nm: OneOrMore | Floats | None
+
+    def __post_init__(self) -> None:
+        waves_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)
+        radiance = finite_array("radiance_w_m2_sr_nm", self.radiance_w_m2_sr_nm, at_least=0.0)
+        if radiance.ndim > 1 or radiance.size not in (1, waves_nm.size):
+            raise ParameterError(
+                "radiance_w_m2_sr_nm", f"must be one number, or one for each of the {waves_nm.size} wavelengths"
+            )
+        for name, value in {
+            "shape": check_shape("shape", self.shape),
+            "pitch_um": check_number("pitch_um", self.pitch_um, above=0.0, at_most=1e9),
+            "distance_m": check_number("distance_m", self.distance_m, above=0.0, at_most=1e9),
+            "radiance_w_m2_sr_nm": np.broadcast_to(radiance, waves_nm.shape),
+            "wavelength_nm": waves_nm,
+            "band_width_nm": band_widths_nm(waves_nm, self.band_width_nm),
+        }.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def pitch_mm(self) -> float:
+        """Side of a pixel."""
+        return 1e3 * float(m_from_um(self.pitch_um))
+
+    @property
+    def size_mm(self) -> tuple[float, float]:
+        """Width and height of the picture."""
+        return self.shape[1] * self.pitch_mm, self.shape[0] * self.pitch_mm
+
+    @property
+    def x_edges_mm(self) -> Floats:
+        """Borders of the columns (n_x + 1,), the middle of the picture being 0."""
+        return np.asarray((np.arange(self.shape[1] + 1) - 0.5 * self.shape[1]) * self.pitch_mm)
+
+    @property
+    def y_edges_mm(self) -> Floats:
+        """Borders of the rows (n_y + 1,), the lowest first."""
+        return np.asarray((np.arange(self.shape[0] + 1) - 0.5 * self.shape[0]) * self.pitch_mm)
+
+    @property
+    def x_mm(self) -> Floats:
+        """Middles of the columns (n_x,)."""
+        return np.asarray((np.arange(self.shape[1]) - 0.5 * (self.shape[1] - 1)) * self.pitch_mm)
+
+    @property
+    def y_mm(self) -> Floats:
+        """Middles of the rows (n_y,), the lowest first."""
+        return np.asarray((np.arange(self.shape[0]) - 0.5 * (self.shape[0] - 1)) * self.pitch_mm)
+
+    def row_blocks(self) -> Iterator[slice]:
+        """Rows in blocks that stay in the cache."""
+        n_rows = max(1, BLOCK_PIXELS // self.shape[1])
+        yield from (slice(i, min(i + n_rows, self.shape[0])) for i in range(0, self.shape[0], n_rows))
+
+    def filled(self, function: Callable[[slice], Floats]) -> Shares:
+        """Picture (n_y, n_x) float32 of a function that gives the shares of white in some rows."""
+        shares = np.empty(self.shape, np.float32)
+        for rows in self.row_blocks():
+            np.clip(function(rows), 0.0, 1.0, out=shares[rows], casting="same_kind")
+        return shares
+
+    def check_fits(self, name: str, width_mm: float, height_mm: float) -> None:
+        """
+        Refuse a chart that is larger than the picture.
+
+        Raises
+        ------
+        ParameterError
+            With the name of the parameter that makes it so large.
+        """
+        picture_width_mm, picture_height_mm = self.size_mm
+        if width_mm > picture_width_mm * (1 + ROUNDING) or height_mm > picture_height_mm * (1 + ROUNDING):
+            raise ParameterError(
+                name,
+                f"must leave the chart in the picture of {picture_width_mm:.4g} x {picture_height_mm:.4g} mm; "
+                f"it would be {width_mm:.4g} x {height_mm:.4g} mm",
+            )
+
+    def radius_mm(self, radius_mm: float | None) -> float:
+        """
+        Radius of a round chart: the one given, or the largest that the picture holds.
+
+        Raises
+        ------
+        ParameterError
+            When it is no length, or larger than the picture.
+        """
+        largest_mm = 0.5 * min(self.size_mm)
+        if radius_mm is None:
+            return largest_mm
+        radius_mm = check_number("radius_mm", radius_mm, above=0.0)
+        self.check_fits("radius_mm", 2.0 * radius_mm, 2.0 * radius_mm)
+        return radius_mm
+
+    def warn_if_fine(self, name: str, period_mm: float) -> None:
+        """Warn of a pattern with less than two pixels a period; called by a chart that a user calls."""
+        n_pixels = period_mm / self.pitch_mm
+        if n_pixels < MIN_PIXELS_PER_PERIOD * (1 - ROUNDING):
+            warnings.warn(
+                f"'{name}' gives a pattern of {n_pixels:.3g} pixels a period where it is finest, and with less than 2 it is "
+                f"averaged away; take a coarser pattern, or pixels of at most {500.0 * period_mm:.4g} µm",
+                SamplingWarning,
+                stacklevel=3,
+            )
+
+    def scene(self, shares: Shares, contrast: float, source: str) -> Scene:
+        """
+        Scene of a chart in black and white.
+
+        Parameters
+        ----------
+        shares : (n_y, n_x) float32
+            Share of white in each pixel; it is written over.
+        contrast : float
+            Michelson's.
+        source : str
+        """
+        black = (1.0 - contrast) / (1.0 + contrast)
+        shares *= np.float32(1.0 - black)
+        shares += np.float32(black)
+        return self.scene_of(shares[np.newaxis], np.asarray(self.radiance_w_m2_sr_nm)[np.newaxis], source)
+
+    def scene_of(self, basis: Shares, spectrum_w_m2_sr_nm: Floats, source: str) -> Scene:
+        """Scene of basis images (n_basis, n_y, n_x) and their spectra (n_basis, n_wavelength)."""
+        return Scene(
+            basis,
+            spectrum_w_m2_sr_nm,
+            np.asarray(self.wavelength_nm),
+            np.asarray(self.band_width_nm),
+            self.pitch_um,
+            self.distance_m,
+            source=source,
+        )
+
+
+def checked_contrast(contrast: float) -> float:
+    """
+    Michelson's contrast.
+
+    Raises
+    ------
+    ParameterError
+        When it is not from 0 to 1.
+    """
+    return check_number("contrast", contrast, at_least=0.0, at_most=1.0)
+
+
+def inked(shares: Shares, ink: str) -> Shares:
+    """
+    Shares of white where these are the shares of ink, written over.
+
+    Raises
+    ------
+    ParameterError
+        When the ink is neither dark nor bright.
+    """
+    if check_choice("ink", ink, ("dark", "bright")) == "dark":
+        np.subtract(np.float32(1.0), shares, out=shares)
+    return shares
+
+
+def interval(edges_mm: Floats, low_mm: float, high_mm: float) -> Floats:
+    """Share of each pixel (n,) of a row with these borders (n + 1,) that lies from one place to another: exact."""
+    inside_mm = np.clip(edges_mm, low_mm, high_mm)
+    return np.asarray(np.diff(inside_mm) / np.diff(edges_mm))
+
+
+def add_rectangle(
+    picture: Shares, canvas: Canvas, x_mm: tuple[float, float], y_mm: tuple[float, float], value: float = 1.0
+) -> None:
+    """Add a rectangle from one x to another and one y to another to a picture: exact."""
+    columns, rows = interval(canvas.x_edges_mm, *x_mm), interval(canvas.y_edges_mm, *y_mm)
+    (i_x,), (i_y,) = np.nonzero(columns), np.nonzero(rows)
+    if i_x.size and i_y.size:
+        x, y = slice(i_x[0], i_x[-1] + 1), slice(i_y[0], i_y[-1] + 1)
+        picture[y, x] += (value * np.outer(rows[y], columns[x])).astype(np.float32)
+
+
+def half_plane(height: Floats, x: Floats | float, y: Floats | float) -> Floats:
+    """
+    Share of a square pixel on the one side of a straight line: exact.
+
+    Parameters
+    ----------
+    height : (...) float64, pixels
+        Distance of the pixel's middle from the line, positive on that side.
+    x, y : float, or (...) float64
+        The unit vector across the line.
+
+    Returns
+    -------
+    share : (...) float64
+
+    Notes
+    -----
+    The distance of a point of the square from a line through its middle is spread as the sum of two uniform numbers of the
+    widths ``|x|`` and ``|y|``, a trapezium; the share is its integral.
+    """
+    wide = np.maximum(np.abs(x), np.abs(y))
+    narrow = np.maximum(np.minimum(np.abs(x), np.abs(y)), np.finfo(np.float64).tiny)
+    distance = np.minimum(np.abs(height), 0.5 * (wide + narrow))
+    beyond = 0.5 * (wide + narrow) - distance
+    corner = np.minimum(beyond, narrow)
+    share = np.where(
+        distance <= 0.5 * (wide - narrow), 0.5 + distance / wide, 1.0 - 0.5 * (corner / narrow) * (corner / wide)
+    )
+    return np.where(height < 0.0, 1.0 - share, share)
+
+
+def sampled(canvas: Canvas, chosen: Bools, rows: slice, function: Callable[[Floats, Floats], Floats]) -> Floats:
+    """
+    Means over some pixels from 32 x 32 points in each: within 1/64 of the exact one at a sharp edge.
+
+    Parameters
+    ----------
+    canvas : Canvas
+    chosen : (n_row, n_x) bool
+        The pixels, in the rows of a block.
+    rows : slice
+        Those rows.
+    function : callable
+        The chart's share of white at x and y (...), mm.
+
+    Returns
+    -------
+    means : (n_chosen,) float64
+    """
+    i_y, i_x = np.nonzero(chosen)
+    x_mm, y_mm = canvas.x_mm[i_x], canvas.y_mm[rows][i_y]
+    offsets_mm = ((np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5) * canvas.pitch_mm
+    means = np.empty(i_x.size)
+    n_block = max(1, BLOCK_PIXELS // SAMPLES**2)
+    for block in (slice(i, i + n_block) for i in range(0, i_x.size, n_block)):
+        x = x_mm[block, np.newaxis, np.newaxis] + offsets_mm
+        y = y_mm[block, np.newaxis, np.newaxis] + offsets_mm[:, np.newaxis]
+        means[block] = function(x, y).mean(axis=(1, 2))
+    return means

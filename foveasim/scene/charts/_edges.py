@@ -1,0 +1,403 @@
+"""Charts of straight edges: exact means over pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from foveasim.arrays import Floats, check_count, check_number, check_shape
+from foveasim.errors import ParameterError
+from foveasim.scene._scene import GREY_NM, Scene
+from foveasim.scene.charts._canvas import (
+    Canvas,
+    OneOrMore,
+    add_rectangle,
+    checked_contrast,
+    half_plane,
+    inked,
+    interval,
+)
+
+__all__ = ["BarElement", "bar_elements", "bars", "checkerboard", "letter_f", "slanted_edge"]
+
+Ink = Literal["dark", "bright"]
+
+#: Elements of a group, each finer than the one before by the sixth root of 2.
+N_ELEMENTS = 6
+#: Bars of an element, and their length in widths.
+N_BARS, BAR_LENGTH = 3, 5.0
+#: Gaps in widths of a bar: between the two halves of an element, below it, and right of a group's first one.
+INNER_GAP, LOWER_GAP, COLUMN_GAP = 2.0, 2.0, 4.0
+#: Groups outside this range are a slip: 1e-9 and 1e9 line pairs per mm.
+MAX_GROUP = 30
+#: The F in fifths of its height, (x0, x1, y0, y1) from its lower left corner: stem, upper arm, lower arm.
+F_STROKES = ((0.0, 1.0, 0.0, 5.0), (1.0, 3.0, 4.0, 5.0), (1.0, 2.0, 2.0, 3.0))
+F_WIDTH, F_HEIGHT = 3.0, 5.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BarElement:
+    """
+    One half of an element of :func:`bars`: three bars that fill a square.
+
+    Attributes
+    ----------
+    group, element : int
+    direction : {"vertical", "horizontal"}
+        Of the bars: vertical ones show what a lens resolves across.
+    line_pairs_per_mm : float, 1/mm
+        In the scene.
+    x_mm, y_mm : float, mm
+        Middle of the square.
+    side_mm : float, mm
+        Side of the square, five widths of a bar.
+    """
+
+    group: int
+    element: int
+    direction: Literal["vertical", "horizontal"]
+    line_pairs_per_mm: float
+    x_mm: float
+    y_mm: float
+    side_mm: float
+
+
+def checkerboard(
+    *,
+    square_mm: float,
+    n_squares: tuple[int, int] | None = None,
+    contrast: float = 1.0,
+    shape: tuple[int, int],
+    pitch_um: float,
+    distance_m: float,
+    radiance_w_m2_sr_nm: OneOrMore,
+    wavelength_nm: Sequence[float] = GREY_NM,
+    band_width_nm: OneOrMore | None = None,
+) -> Scene:
+    """
+    Black and white squares: for calibrations of lenses, and for moiré. Exact.
+
+    Parameters
+    ----------
+    square_mm : float, mm
+        Side of a square.
+    n_squares : (n_y, n_x), optional
+        A board of so many squares in the middle of white, its lower left square black. By default the squares fill the
+        picture, four of them meet in its middle, and the one right of and above it is black.
+    contrast : float
+        (white - black) / (white + black).
+    shape : (n_y, n_x)
+        Numbers of pixels.
+    pitch_um : float, µm
+        Distance of two pixels in the scene.
+    distance_m : float, m
+        Distance of the scene from the lens.
+    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
+        Spectral radiance of white.
+    wavelength_nm : sequence, nm
+        Wavelengths.
+    band_width_nm : number or sequence, optional, nm
+        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+
+    Returns
+    -------
+    scene : Scene
+        One basis image.
+
+    Raises
+    ------
+    ParameterError
+        When the board does not fit, or a value is out of range.
+
+    Warns
+    -----
+    SamplingWarning
+        When a square is smaller than a pixel.
+    """
+    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
+    contrast = checked_contrast(contrast)
+    square_mm = check_number("square_mm", square_mm, above=0.0)
+    edges_mm = canvas.y_edges_mm, canvas.x_edges_mm
+    inside: list[Floats] = [np.ones(n) for n in canvas.shape]
+    first_mm = [0.0, 0.0]
+    if n_squares is not None:
+        counts = check_shape("n_squares", n_squares)
+        canvas.check_fits("n_squares", counts[1] * square_mm, counts[0] * square_mm)
+        first_mm = [-0.5 * n * square_mm for n in counts]
+        inside = [interval(e, low, -low) for e, low in zip(edges_mm, first_mm, strict=True)]
+        edges_mm = tuple(np.clip(e, low, -low) for e, low in zip(edges_mm, first_mm, strict=True))  # type: ignore[assignment]
+    canvas.warn_if_fine("square_mm", 2.0 * square_mm)
+    y, x = (
+        np.diff(_integral_of_square_wave_mm(e - low, square_mm)) / canvas.pitch_mm
+        for e, low in zip(edges_mm, first_mm, strict=True)
+    )
+    # Black where the signs of column and row are the same.
+    shares = canvas.filled(
+        lambda rows: 1.0 - 0.5 * (np.multiply.outer(inside[0][rows], inside[1]) + np.multiply.outer(y[rows], x))
+    )
+    return canvas.scene(shares, contrast, "a checkerboard")
+
+
+def slanted_edge(
+    *,
+    angle_deg: float = 5.0,
+    contrast: float = 0.6,
+    shape: tuple[int, int],
+    pitch_um: float,
+    distance_m: float,
+    radiance_w_m2_sr_nm: OneOrMore,
+    wavelength_nm: Sequence[float] = GREY_NM,
+    band_width_nm: OneOrMore | None = None,
+) -> Scene:
+    """
+    A straight edge through the middle, black on the left, white on the right: for the MTF after ISO 12233. Exact.
+
+    Parameters
+    ----------
+    angle_deg : float, degrees
+        Of the edge from the vertical, counter-clockwise; 90 is a horizontal edge with white above it.
+    contrast : float
+        (white - black) / (white + black); 0.6 by default, where white is four times black, as ISO 12233 has it.
+    shape : (n_y, n_x)
+        Numbers of pixels.
+    pitch_um : float, µm
+        Distance of two pixels in the scene.
+    distance_m : float, m
+        Distance of the scene from the lens.
+    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
+        Spectral radiance of white.
+    wavelength_nm : sequence, nm
+        Wavelengths.
+    band_width_nm : number or sequence, optional, nm
+        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+
+    Returns
+    -------
+    scene : Scene
+        One basis image.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range.
+    """
+    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
+    contrast = checked_contrast(contrast)
+    angle = np.deg2rad(check_number("angle_deg", angle_deg, at_least=-180.0, at_most=180.0))
+    across_x, across_y = float(np.cos(angle)), float(np.sin(angle))
+    x = across_x * canvas.x_mm / canvas.pitch_mm
+    y = across_y * canvas.y_mm / canvas.pitch_mm
+    shares = canvas.filled(lambda rows: half_plane(np.add.outer(y[rows], x), across_x, across_y))
+    return canvas.scene(shares, contrast, "a slanted edge")
+
+
+def bars(
+    *,
+    groups: Sequence[int],
+    ink: Ink = "dark",
+    contrast: float = 1.0,
+    shape: tuple[int, int],
+    pitch_um: float,
+    distance_m: float,
+    radiance_w_m2_sr_nm: OneOrMore,
+    wavelength_nm: Sequence[float] = GREY_NM,
+    band_width_nm: OneOrMore | None = None,
+) -> Scene:
+    """
+    Groups of three bars, upright and lying, that grow finer as those of the USAF 1951 target do. Exact.
+
+    Parameters
+    ----------
+    groups : sequence of int
+        Each has six elements of ``2**(group + (element - 1) / 6)`` line pairs per mm in the scene.
+    ink : {"dark", "bright"}
+        Black bars on white, or white ones on black.
+    contrast : float
+        (white - black) / (white + black).
+    shape : (n_y, n_x)
+        Numbers of pixels.
+    pitch_um : float, µm
+        Distance of two pixels in the scene.
+    distance_m : float, m
+        Distance of the scene from the lens.
+    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
+        Spectral radiance of white.
+    wavelength_nm : sequence, nm
+        Wavelengths.
+    band_width_nm : number or sequence, optional, nm
+        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+
+    Returns
+    -------
+    scene : Scene
+        One basis image.
+
+    Raises
+    ------
+    ParameterError
+        When the groups do not fit, or a value is out of range.
+
+    Warns
+    -----
+    SamplingWarning
+        When the finest element has less than two pixels a period.
+
+    Notes
+    -----
+    Bars are as far apart as they are wide and five times as long (MIL-STD-150A). The standard's spiral of numbered groups
+    is not followed: each group is a column, its first element on top, the coarsest group on the left, and an element's
+    upright bars are left of its lying ones. Where they are, :func:`bar_elements` says.
+    """
+    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
+    contrast = checked_contrast(contrast)
+    elements = bar_elements(groups)
+    canvas.check_fits(
+        "groups",
+        2.0 * max(abs(e.x_mm) + 0.5 * e.side_mm for e in elements),
+        2.0 * max(abs(e.y_mm) + 0.5 * e.side_mm for e in elements),
+    )
+    canvas.warn_if_fine("groups", min(1.0 / e.line_pairs_per_mm for e in elements))
+    shares = np.zeros(canvas.shape, np.float32)
+    for e in elements:
+        low, high = -0.5 * e.side_mm, 0.5 * e.side_mm
+        for k in range(N_BARS):
+            left = low + 2 * k * e.side_mm / BAR_LENGTH
+            across, along = (left, left + e.side_mm / BAR_LENGTH), (low, high)
+            x, y = (across, along) if e.direction == "vertical" else (along, across)
+            add_rectangle(shares, canvas, (e.x_mm + x[0], e.x_mm + x[1]), (e.y_mm + y[0], e.y_mm + y[1]))
+    return canvas.scene(inked(shares, ink), contrast, "bars")
+
+
+def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
+    """
+    Where :func:`bars` puts its elements, and how fine they are.
+
+    Parameters
+    ----------
+    groups : sequence of int
+
+    Returns
+    -------
+    elements : tuple of BarElement
+        Group by group from the coarsest, element by element, upright bars before lying ones.
+
+    Raises
+    ------
+    ParameterError
+        When the groups are no whole numbers, or one is given twice.
+
+    Examples
+    --------
+    >>> finest = bar_elements([0, 1])[-1]
+    >>> finest.group, finest.element, finest.direction, round(finest.line_pairs_per_mm, 2)
+    (1, 6, 'horizontal', 3.56)
+    """
+    if not isinstance(groups, Sequence | np.ndarray) or len(groups) == 0:
+        raise ParameterError("groups", "must be a list of whole numbers", groups)
+    numbers = sorted(
+        check_count(f"groups[{i}]", g, at_least=-MAX_GROUP, at_most=MAX_GROUP) for i, g in enumerate(groups)
+    )
+    if len(set(numbers)) != len(numbers):
+        raise ParameterError("groups", "must be different from each other", list(groups))
+    placed = []
+    left_mm = lowest_mm = right_mm = 0.0
+    for group in numbers:
+        top_mm = 0.0
+        for element in range(1, N_ELEMENTS + 1):
+            line_pairs_per_mm = 2.0 ** (group + (element - 1) / N_ELEMENTS)
+            width_mm = 0.5 / line_pairs_per_mm
+            side_mm = BAR_LENGTH * width_mm
+            y_mm = top_mm - 0.5 * side_mm
+            x_mm = left_mm + 0.5 * side_mm
+            placed.append((group, element, "vertical", line_pairs_per_mm, x_mm, y_mm, side_mm))
+            x_mm += side_mm + INNER_GAP * width_mm
+            placed.append((group, element, "horizontal", line_pairs_per_mm, x_mm, y_mm, side_mm))
+            right_mm = max(right_mm, x_mm + 0.5 * side_mm)
+            lowest_mm = min(lowest_mm, y_mm - 0.5 * side_mm)
+            top_mm -= side_mm + LOWER_GAP * width_mm
+        left_mm += (2.0 * BAR_LENGTH + INNER_GAP + COLUMN_GAP) * 0.5 / 2.0**group
+    return tuple(
+        BarElement(
+            group=group,
+            element=element,
+            direction=direction,  # type: ignore[arg-type]
+            line_pairs_per_mm=line_pairs_per_mm,
+            x_mm=x_mm - 0.5 * right_mm,
+            y_mm=y_mm - 0.5 * lowest_mm,
+            side_mm=side_mm,
+        )
+        for group, element, direction, line_pairs_per_mm, x_mm, y_mm, side_mm in placed
+    )
+
+
+def letter_f(
+    *,
+    height_mm: float,
+    ink: Ink = "dark",
+    contrast: float = 1.0,
+    shape: tuple[int, int],
+    pitch_um: float,
+    distance_m: float,
+    radiance_w_m2_sr_nm: OneOrMore,
+    wavelength_nm: Sequence[float] = GREY_NM,
+    band_width_nm: OneOrMore | None = None,
+) -> Scene:
+    """
+    A letter F in the middle, which looks different however it is turned or mirrored. Exact.
+
+    Parameters
+    ----------
+    height_mm : float, mm
+        Its strokes are a fifth of it, its width three fifths.
+    ink : {"dark", "bright"}
+        A black letter on white, or a white one on black.
+    contrast : float
+        (white - black) / (white + black).
+    shape : (n_y, n_x)
+        Numbers of pixels.
+    pitch_um : float, µm
+        Distance of two pixels in the scene.
+    distance_m : float, m
+        Distance of the scene from the lens.
+    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
+        Spectral radiance of white.
+    wavelength_nm : sequence, nm
+        Wavelengths.
+    band_width_nm : number or sequence, optional, nm
+        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+
+    Returns
+    -------
+    scene : Scene
+        One basis image.
+
+    Raises
+    ------
+    ParameterError
+        When the letter does not fit, or a value is out of range.
+
+    Warns
+    -----
+    SamplingWarning
+        When a stroke is narrower than a pixel.
+    """
+    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
+    contrast = checked_contrast(contrast)
+    height_mm = check_number("height_mm", height_mm, above=0.0)
+    unit_mm = height_mm / F_HEIGHT
+    canvas.check_fits("height_mm", F_WIDTH * unit_mm, height_mm)
+    canvas.warn_if_fine("height_mm", 2.0 * unit_mm)
+    shares = np.zeros(canvas.shape, np.float32)
+    for x0, x1, y0, y1 in F_STROKES:
+        x_mm = ((x0 - 0.5 * F_WIDTH) * unit_mm, (x1 - 0.5 * F_WIDTH) * unit_mm)
+        y_mm = ((y0 - 0.5 * F_HEIGHT) * unit_mm, (y1 - 0.5 * F_HEIGHT) * unit_mm)
+        add_rectangle(shares, canvas, x_mm, y_mm)
+    return canvas.scene(inked(shares, ink), contrast, "a letter F")
+
+
+def _integral_of_square_wave_mm(x_mm: Floats, half_mm: float) -> Floats:
+    """Integral from 0 of a wave that is 1 from 0 to half a period, and -1 from there to a period."""
+    return np.asarray(half_mm - np.abs(np.mod(x_mm, 2.0 * half_mm) - half_mm))

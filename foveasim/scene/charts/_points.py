@@ -1,0 +1,105 @@
+"""Points of light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from foveasim.arrays import check_number, check_shape
+from foveasim.errors import ParameterError
+from foveasim.scene._scene import GREY_NM, Scene
+from foveasim.scene.charts._canvas import Canvas, OneOrMore
+
+__all__ = ["point_grid"]
+
+#: A spacing is a whole number of pixels when it is one but for this share of a pixel.
+ROUNDING_PIXELS = 1e-6
+
+
+def point_grid(
+    *,
+    spacing_mm: float,
+    n_points: tuple[int, int] | None = None,
+    intensity_w_sr_nm: float,
+    shape: tuple[int, int],
+    pitch_um: float,
+    distance_m: float,
+    wavelength_nm: Sequence[float] = GREY_NM,
+    band_width_nm: OneOrMore | None = None,
+) -> Scene:
+    """
+    Points of light in rows and columns, on black: for point spread functions all over the field, and for distortion.
+
+    Parameters
+    ----------
+    spacing_mm : float, mm
+        Distance of two points: a whole number of pixels.
+    n_points : (n_y, n_x), optional
+        Numbers of points up and across; by default an odd number that fills the picture.
+    intensity_w_sr_nm : float, W/(sr nm)
+        Spectral radiant intensity of each point.
+    shape : (n_y, n_x)
+        Numbers of pixels.
+    pitch_um : float, µm
+        Distance of two pixels in the scene.
+    distance_m : float, m
+        Distance of the scene from the lens.
+    wavelength_nm : sequence, nm
+        Wavelengths; the points shine alike at all of them.
+    band_width_nm : number or sequence, optional, nm
+        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+
+    Returns
+    -------
+    scene : Scene
+        One basis image.
+
+    Raises
+    ------
+    ParameterError
+        When the spacing is no whole number of pixels, the points do not fit, or a value is out of range.
+
+    Warns
+    -----
+    SamplingWarning
+        When every pixel is a point.
+
+    Notes
+    -----
+    Each point lights the pixel that holds it. A point on the border of two lights the right or upper one: where the
+    middle of the picture is such a border, the whole grid lies half a pixel to the right, or up.
+    """
+    canvas = Canvas(shape, pitch_um, distance_m, 1.0, wavelength_nm, band_width_nm)
+    spacing_mm = check_number("spacing_mm", spacing_mm, above=0.0)
+    step = round(spacing_mm / canvas.pitch_mm)
+    if step < 1 or abs(spacing_mm / canvas.pitch_mm - step) > ROUNDING_PIXELS:
+        raise ParameterError(
+            "spacing_mm",
+            f"must be a whole number of pixels of {canvas.pitch_mm:g} mm",
+            spacing_mm,
+            "mm",
+            f"the nearest is {max(step, 1) * canvas.pitch_mm:.6g} mm",
+        )
+    counts = tuple(2 * ((n - n // 2 - 1) // step) + 1 for n in canvas.shape)
+    if n_points is not None:
+        counts = check_shape("n_points", n_points)
+        # The outermost points lie in the middles of pixels, or on their borders.
+        canvas.check_fits(
+            "n_points", ((counts[1] - 1) * step + 1) * canvas.pitch_mm, ((counts[0] - 1) * step + 1) * canvas.pitch_mm
+        )
+    canvas.warn_if_fine("spacing_mm", spacing_mm)
+    i_y, i_x = (
+        np.asarray([(n_pixels + (2 * j - n + 1) * step) // 2 for j in range(n)], np.int64)
+        for n_pixels, n in zip(canvas.shape, counts, strict=True)
+    )
+    pixels = np.stack(np.meshgrid(i_y, i_x, indexing="ij"), axis=-1).reshape(-1, 2)
+    return Scene.point_sources(
+        shape=canvas.shape,
+        pixels=pixels,  # type: ignore[arg-type]
+        intensity_w_sr_nm=check_number("intensity_w_sr_nm", intensity_w_sr_nm, at_least=0.0),
+        pitch_um=canvas.pitch_um,
+        distance_m=canvas.distance_m,
+        wavelength_nm=canvas.wavelength_nm,  # type: ignore[arg-type]
+        band_width_nm=canvas.band_width_nm,  # type: ignore[arg-type]
+    )

@@ -1,0 +1,292 @@
+"""Charts of periods: a wave, rings and spokes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from foveasim.arrays import Floats, check_choice, check_count, check_number
+from foveasim.scene._scene import GREY_NM, Scene
+from foveasim.scene.charts._canvas import Canvas, OneOrMore, checked_contrast, half_plane, sampled
+
+__all__ = ["siemens_star", "sine", "zone_plate"]
+
+#: More spokes are a slip, and their middle would take minutes.
+MAX_SPOKES = 1000
+#: A pixel is cut by one edge of a star at most where a spoke is wider than this many pixels: more than its diagonal.
+CLEAR_WIDTH_PIXELS = 1.5
+#: Half the diagonal of a pixel, and a little more.
+HALF_DIAGONAL_PIXELS = 0.7072
+#: Height of the wave whose middle is cut out for black and white; what lies on an edge is half of either.
+STEEP = 1e9
+#: Gauss and Legendre's three points and weights for means from -1/2 to 1/2.
+GAUSS = ((-0.5 * np.sqrt(0.6), 5.0 / 18.0), (0.0, 8.0 / 18.0), (0.5 * np.sqrt(0.6), 5.0 / 18.0))
+
+
+def sine(
+    *,
+    line_pairs_per_mm: float,
+    angle_deg: float = 0.0,
+    phase_deg: float = 0.0,
+    contrast: float = 1.0,
+    shape: tuple[int, int],
+    pitch_um: float,
+    distance_m: float,
+    radiance_w_m2_sr_nm: OneOrMore,
+    wavelength_nm: Sequence[float] = GREY_NM,
+    band_width_nm: OneOrMore | None = None,
+) -> Scene:
+    """
+    A sinusoidal wave of one frequency and direction: what each of them becomes is the MTF itself. Exact.
+
+    Parameters
+    ----------
+    line_pairs_per_mm : float, 1/mm
+        Frequency in the scene.
+    angle_deg : float, degrees
+        Direction in which the wave runs, counter-clockwise from x; at 0 the lines are upright.
+    phase_deg : float, degrees
+        By which the white line through the middle is moved on; 90 is a quarter of a period.
+    contrast : float
+        (white - black) / (white + black), of the ideal wave; the means over pixels have a little less.
+    shape : (n_y, n_x)
+        Numbers of pixels.
+    pitch_um : float, µm
+        Distance of two pixels in the scene.
+    distance_m : float, m
+        Distance of the scene from the lens.
+    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
+        Spectral radiance of white, the wave's highest.
+    wavelength_nm : sequence, nm
+        Wavelengths.
+    band_width_nm : number or sequence, optional, nm
+        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+
+    Returns
+    -------
+    scene : Scene
+        One basis image.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range.
+
+    Warns
+    -----
+    SamplingWarning
+        When a period is less than two pixels.
+    """
+    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
+    contrast = checked_contrast(contrast)
+    per_mm = check_number("line_pairs_per_mm", line_pairs_per_mm, above=0.0)
+    angle = np.deg2rad(check_number("angle_deg", angle_deg, at_least=-180.0, at_most=180.0))
+    phase = np.deg2rad(check_number("phase_deg", phase_deg, at_least=-360.0, at_most=360.0))
+    canvas.warn_if_fine("line_pairs_per_mm", 1.0 / per_mm)
+    along_x, along_y = per_mm * np.cos(angle), per_mm * np.sin(angle)
+    # The mean of a wave over a pixel is its value in the middle, times a sinc along either side.
+    height = 0.5 * np.sinc(along_x * canvas.pitch_mm) * np.sinc(along_y * canvas.pitch_mm)
+    x = np.exp(2j * np.pi * along_x * canvas.x_mm - 1j * phase)
+    y = height * np.exp(2j * np.pi * along_y * canvas.y_mm)
+    shares = canvas.filled(
+        lambda rows: 0.5 + np.multiply.outer(y.real[rows], x.real) - np.multiply.outer(y.imag[rows], x.imag)
+    )
+    return canvas.scene(shares, contrast, "a sine wave")
+
+
+def zone_plate(
+    *,
+    line_pairs_per_mm: float,
+    radius_mm: float | None = None,
+    contrast: float = 1.0,
+    shape: tuple[int, int],
+    pitch_um: float,
+    distance_m: float,
+    radiance_w_m2_sr_nm: OneOrMore,
+    wavelength_nm: Sequence[float] = GREY_NM,
+    band_width_nm: OneOrMore | None = None,
+) -> Scene:
+    """
+    Sinusoidal rings whose frequency grows with the radius: every frequency in every direction, and its aliases.
+
+    Parameters
+    ----------
+    line_pairs_per_mm : float, 1/mm
+        Frequency at the rim, in the scene.
+    radius_mm : float, optional, mm
+        Of the rim; by default the largest that the picture holds.
+    contrast : float
+        (white - black) / (white + black).
+    shape : (n_y, n_x)
+        Numbers of pixels.
+    pitch_um : float, µm
+        Distance of two pixels in the scene.
+    distance_m : float, m
+        Distance of the scene from the lens.
+    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
+        Spectral radiance of white, that of the middle.
+    wavelength_nm : sequence, nm
+        Wavelengths.
+    band_width_nm : number or sequence, optional, nm
+        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+
+    Returns
+    -------
+    scene : Scene
+        One basis image.
+
+    Raises
+    ------
+    ParameterError
+        When the rings do not fit, or a value is out of range.
+
+    Warns
+    -----
+    SamplingWarning
+        When a period at the rim is less than two pixels.
+
+    Notes
+    -----
+    The share of white is ``(1 + cos(π f r² / R)) / 2`` with the frequency f at the rim R, so that the frequency at r is
+    ``f r / R``; outside there is the mean of black and white. The means are exact (Fresnel's integrals), except in the
+    pixels that the rim cuts, which are sampled at 32 x 32 points.
+    """
+    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
+    contrast = checked_contrast(contrast)
+    per_mm = check_number("line_pairs_per_mm", line_pairs_per_mm, above=0.0)
+    radius_mm = canvas.radius_mm(radius_mm)
+    canvas.warn_if_fine("line_pairs_per_mm", 1.0 / per_mm)
+    # Fresnel's integrals are those of cos(π t² / 2): t is this many times a length.
+    scale_per_mm = float(np.sqrt(2.0 * per_mm / radius_mm))
+    (cos_x, sin_x), (cos_y, sin_y) = (_mean_chirp(e, scale_per_mm) for e in (canvas.x_edges_mm, canvas.y_edges_mm))
+
+    def ideal(x: Floats, y: Floats) -> Floats:
+        r2 = x * x + y * y
+        return np.where(r2 < radius_mm**2, 0.5 + 0.5 * np.cos(0.5 * np.pi * scale_per_mm**2 * r2), 0.5)
+
+    def block(rows: slice) -> Floats:
+        r = np.hypot(canvas.x_mm, canvas.y_mm[rows, np.newaxis])
+        rings = 0.5 + 0.5 * (np.multiply.outer(cos_y[rows], cos_x) - np.multiply.outer(sin_y[rows], sin_x))
+        rings[r > radius_mm] = 0.5
+        is_rim = np.abs(r - radius_mm) < HALF_DIAGONAL_PIXELS * canvas.pitch_mm
+        rings[is_rim] = sampled(canvas, is_rim, rows, ideal)
+        return rings
+
+    return canvas.scene(canvas.filled(block), contrast, "a zone plate")
+
+
+def siemens_star(
+    *,
+    n_spokes: int = 36,
+    radius_mm: float | None = None,
+    profile: Literal["square", "sine"] = "square",
+    contrast: float = 1.0,
+    shape: tuple[int, int],
+    pitch_um: float,
+    distance_m: float,
+    radiance_w_m2_sr_nm: OneOrMore,
+    wavelength_nm: Sequence[float] = GREY_NM,
+    band_width_nm: OneOrMore | None = None,
+) -> Scene:
+    """
+    Spokes that meet in the middle: every frequency in every direction, without a lattice of its own.
+
+    Parameters
+    ----------
+    n_spokes : int
+        White spokes, and as many black ones; the middle of a white one points to the right. At the radius r there are
+        ``n_spokes / (2 π r)`` line pairs per mm.
+    radius_mm : float, optional, mm
+        By default the largest that the picture holds.
+    profile : {"square", "sine"}
+        Across the spokes: black and white, or a wave (the star of ISO 12233:2014, which has 144 spokes).
+    contrast : float
+        (white - black) / (white + black).
+    shape : (n_y, n_x)
+        Numbers of pixels.
+    pitch_um : float, µm
+        Distance of two pixels in the scene.
+    distance_m : float, m
+        Distance of the scene from the lens.
+    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
+        Spectral radiance of white.
+    wavelength_nm : sequence, nm
+        Wavelengths.
+    band_width_nm : number or sequence, optional, nm
+        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+
+    Returns
+    -------
+    scene : Scene
+        One basis image.
+
+    Raises
+    ------
+    ParameterError
+        When the star does not fit, or a value is out of range.
+
+    Warns
+    -----
+    SamplingWarning
+        When a period is less than two pixels even at the rim. In the middle it always is.
+
+    Notes
+    -----
+    Outside there is the mean of black and white. Where a spoke is wider than 1.5 pixels its edges are exact, and waves
+    within 1e-4; nearer to the middle, and in the pixels that the rim cuts, pixels are sampled at 32 x 32 points.
+    """
+    canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
+    contrast = checked_contrast(contrast)
+    n_spokes = check_count("n_spokes", n_spokes, at_least=2, at_most=MAX_SPOKES)
+    check_choice("profile", profile, ("square", "sine"))
+    radius_mm = canvas.radius_mm(radius_mm)
+    canvas.warn_if_fine("n_spokes", 2.0 * np.pi * radius_mm / n_spokes)
+    mean_of_spokes = _mean_of_edges if profile == "square" else _mean_of_waves
+
+    def ideal(x: Floats, y: Floats) -> Floats:
+        height = STEEP if profile == "square" else 0.5
+        spokes = np.clip(0.5 + height * np.cos(n_spokes * np.arctan2(y, x)), 0.0, 1.0)
+        return np.where(x * x + y * y < radius_mm**2, spokes, 0.5)
+
+    def block(rows: slice) -> Floats:
+        x, y = canvas.x_mm / canvas.pitch_mm, canvas.y_mm[rows, np.newaxis] / canvas.pitch_mm
+        r, rim = np.hypot(x, y), radius_mm / canvas.pitch_mm
+        spokes = mean_of_spokes(x, y, n_spokes)
+        spokes[r > rim] = 0.5
+        is_middle = r * np.sin(np.pi / n_spokes) < CLEAR_WIDTH_PIXELS
+        is_cut = (is_middle & (r < rim)) | (np.abs(r - rim) < HALF_DIAGONAL_PIXELS)
+        spokes[is_cut] = sampled(canvas, is_cut, rows, ideal)
+        return spokes
+
+    return canvas.scene(canvas.filled(block), contrast, "a Siemens star")
+
+
+def _mean_of_edges(x: Floats, y: Floats, n_spokes: int) -> Floats:
+    """Share of white spokes in pixels at x (n_x,) and y (n_row, 1), in pixels, where one edge at most cuts them."""
+    angle = np.arctan2(y, x)
+    number = np.rint(angle * n_spokes / np.pi - 0.5)
+    edge = (number + 0.5) * np.pi / n_spokes
+    across_x, across_y = -np.sin(edge), np.cos(edge)
+    share = half_plane(across_x * x + across_y * y, across_x, across_y)
+    # Counter-clockwise of the first edge is black, of the next one white, and so on.
+    return np.where(np.mod(number, 2.0) == 0.0, 1.0 - share, share)
+
+
+def _mean_of_waves(x: Floats, y: Floats, n_spokes: int) -> Floats:
+    """Mean of the wave around the middle in pixels at x (n_x,) and y (n_row, 1), in pixels, where it is not too fine."""
+    mean = np.full(np.broadcast_shapes(x.shape, y.shape), 0.5)
+    for dx, weight_x in GAUSS:
+        for dy, weight_y in GAUSS:
+            mean += 0.5 * weight_x * weight_y * np.cos(n_spokes * np.arctan2(y + dy, x + dx))
+    return mean
+
+
+def _mean_chirp(edges_mm: Floats, scale_per_mm: float) -> tuple[Floats, Floats]:
+    """Means (n,) of cos(π (s x)² / 2) and its sine between borders (n + 1,): Fresnel's integrals."""
+    from scipy.special import fresnel
+
+    sines, cosines = fresnel(scale_per_mm * edges_mm)
+    steps = scale_per_mm * np.diff(edges_mm)
+    return np.diff(cosines) / steps, np.diff(sines) / steps
