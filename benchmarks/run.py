@@ -61,7 +61,7 @@ def bench_integrator(report: Report, shape: tuple[int, int]) -> None:
         {"type": "Feature", "id": str(i), "properties": {}, "geometry": json.loads(g)}
         for i, g in enumerate(shapely.to_geojson(layout.polygons()))
     ]
-    integrator = fs.Integrator(layout, grid)
+    integrator, second = fs.Integrator(layout, grid), fs.Integrator(layout, grid, order=2)
     peer_sums = None
 
     def peer(strategy: str) -> None:
@@ -72,7 +72,13 @@ def bench_integrator(report: Report, shape: tuple[int, int]) -> None:
 
     peer_s = min(best_s({s: lambda s=s: peer(s) for s in ("feature-sequential", "raster-sequential")}, 2).values())
     ours = best_s(
-        {"frame": lambda: integrator(cells), "sum": cells.sum, "compile": lambda: fs.Integrator(layout, grid)}, 12
+        {
+            "frame": lambda: integrator(cells),
+            "second": lambda: second(cells),
+            "sum": cells.sum,
+            "compile": lambda: fs.Integrator(layout, grid),
+        },
+        12,
     )
     difference = np.abs(integrator(cells) / grid.cell_area_um2 / peer_sums - 1).max()
     n_y, n_x = shape
@@ -81,6 +87,7 @@ def bench_integrator(report: Report, shape: tuple[int, int]) -> None:
     report.faster_than("frame", ours["frame"], "exactextract", peer_s, 30)
     report.faster_than("compile + frame", ours["frame"] + ours["compile"], "exactextract", peer_s, 12)
     report.slower_than("frame", ours["frame"], "map.sum(), float32", ours["sum"], 6)
+    report.slower_than("frame of second order", ours["second"], "frame", ours["frame"], 2)
 
     small = fs.Grid.centred((116, 206), 0.5)
     few = fs.layout.hexagonal(n_columns=16, n_rows=12, pitch_um=3.7)

@@ -45,7 +45,7 @@ DIMENSIONLESS = {
 }  # fmt: skip
 #: Names of parts that no user sees, in cells, pitches or steps as their docstrings say.
 INTERNAL = {
-    "cycles", "function", "height", "modes", "new_radius", "per_step", "pixel", "r2", "radius", "shares", "slope", "upper", "x",
+    "cycles", "function", "height", "modes", "moments", "new_radius", "per_step", "pixel", "r2", "radius", "shares", "slope", "upper", "x",
     "x2", "xy", "y", "y2",
 }  # fmt: skip
 FLOATING = re.compile(r"\b(float|Floats|PerSite)\b")

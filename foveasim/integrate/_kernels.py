@@ -11,6 +11,12 @@ with the site, 0 to 1), then ``n_run`` cells that share one weight (the site's i
 one reading of the map, a multiplication for each cell that an outline cuts, and additions inside
 (:func:`gather`). No sum runs along a whole row, so a bright source costs a dark site beside it no digits.
 
+At **second order** the cells that an outline cuts are listed a second time, as rows of ``cuts`` (a site, a row, a
+column), each with its row of ``moments``: the overlap's first moments about the cell's centre, along u and along v,
+over the distance in cells of the two neighbours whose difference is the gradient (2; 1 at the map's borders, where the
+cell stands in for the neighbour that is not there). Cells that are covered wholly have none, and their neighbours are
+not looked at. At first order both are empty.
+
 The kernels know arrays only, release the interpreter lock, and are compiled for explicit types when this module
 is imported; the machine code is cached on disk.
 """
@@ -20,9 +26,21 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, types
 
-__all__ = ["COLUMN", "N_PARTIAL", "N_RUN", "ROW", "SITE", "gather", "place_spans", "scatter", "trace_sites"]
+__all__ = [
+    "COLUMN",
+    "N_PARTIAL",
+    "N_RUN",
+    "ROW",
+    "SITE",
+    "gather",
+    "place_cuts",
+    "place_spans",
+    "scatter",
+    "trace_sites",
+]
 
-#: Columns of ``spans``. In a finished plan the first holds the accumulator's index instead of the site's.
+#: Columns of ``spans``, and the first three of ``cuts``. In a finished plan the first holds the accumulator's index
+#: instead of the site's.
 SITE, ROW, COLUMN, N_PARTIAL, N_RUN = range(5)
 
 #: Cells that one block of a row's partial sums holds. Eight float32 make one vector of eight float64: measured best.
@@ -45,9 +63,12 @@ _ints = _input(types.int64, 1)
 _floats = _input(types.float64, 1)
 _points = _input(types.float64, 2)
 _spans = _input(types.int32, 2)
+_cuts = _input(types.int32, 2)
 _count = types.int64
 _span_list = types.int32[:, ::1]
+_cut_list = types.int32[:, ::1]
 _float_list = types.float64[::1]
+_moment_list = types.float64[:, ::1]
 _int_list = types.int64[::1]
 
 
@@ -105,12 +126,28 @@ def _find_cell(head, recent, links, n_cells, row, column):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _trace_edge(ua, va, ub, vb, n_y, n_x, bottom, head, recent, climb, links, cover, n_cells):
+def _add_moments(moment, ua, ub, va, vb, height):
+    """
+    Add the moments of a piece from (ua, va) to (ub, vb), relative to its cell's centre, that climbs ``height``.
+
+    ``moment`` is (of every cell on the left, along v; of the area between the piece and the cell's left border, along u;
+    the same, along v). Along u a whole row of a cell has none.
+    """
+    u_mean, v_mean = 0.5 * (ua + ub), 0.5 * (va + vb)
+    spread = (ub - ua) / 12.0
+    moment[0] += height * v_mean
+    moment[1] += 0.5 * height * (u_mean * u_mean + (ub - ua) * spread - 0.25)
+    moment[2] += height * (v_mean * (u_mean + 0.5) + (vb - va) * spread)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _trace_edge(ua, va, ub, vb, n_y, n_x, bottom, head, recent, climb, links, cover, moment, n_cells):
     """
     Add one edge to the scratch cells; returns their count.
 
     ``cover[i]`` is (height, area): the signed height of the edge's pieces in the cell, and the area between
     them and the cell's left border. ``climb[row]`` is (height of all pieces in the row without their signs, number of them).
+    ``moment[i]`` is what :func:`_add_moments` says, at second order.
     """
     sign = 1.0
     if va > vb:  # always upwards, so that two neighbours cut a shared edge at the same points
@@ -130,8 +167,12 @@ def _trace_edge(ua, va, ub, vb, n_y, n_x, bottom, head, recent, climb, links, co
         high = min(vb, row + 1.0)
         left = ua if low == va else min(max(ua + (low - va) * slope, u_low), u_high)
         right = ub if high == vb else min(max(ua + (high - va) * slope, u_low), u_high)
+        v_left = low - (row + 0.5)  # from the row's middle
+        upwards = 1.0
         if left > right:
             left, right = right, left
+            v_left = high - (row + 0.5)
+            upwards = -1.0
         if right > 0.0 or left == 0.0:  # what is left of the map has no cell on its left
             rise = high - low
             climb[row - bottom, 0] += rise
@@ -145,18 +186,26 @@ def _trace_edge(ua, va, ub, vb, n_y, n_x, bottom, head, recent, climb, links, co
                 height = rise if is_last else (u_next - left) * steepness
                 piece = sign * (height - climbed)
                 climb[row - bottom, 1] += 1.0
-                climbed = height
                 cell, count = _find_cell(head, recent, links, n_cells, row - bottom, column)
                 if count > n_cells:
                     cover[cell, 0] = 0.0
                     cover[cell, 1] = 0.0
+                    if moment.shape[0] > 0:
+                        moment[cell, 0] = 0.0
+                        moment[cell, 1] = 0.0
+                        moment[cell, 2] = 0.0
                     n_cells = count
                 cover[cell, 0] += piece
                 if column < n_x:
                     cover[cell, 1] += piece * (0.5 * (u + u_next) - column)
+                if moment.shape[0] > 0:
+                    middle = column + 0.5
+                    v, v_next = v_left + upwards * climbed, v_left + upwards * height
+                    _add_moments(moment[cell], u - middle, u_next - middle, v, v_next, piece)
                 if is_last:
                     break
                 u = u_next
+                climbed = height
                 column += 1
         row += 1
     return n_cells
@@ -173,6 +222,12 @@ def _grown(array, n_used, n_more):
 
 
 @njit(cache=True, nogil=True, inline="always")
+def _rounding(climb):
+    """Largest weight or moment in a row that is nothing but rounding."""
+    return NO_COVERAGE * climb[0] * max(climb[1] / 8.0, 1.0)
+
+
+@njit(cache=True, nogil=True, inline="always")
 def _write_row(first_cell, links, cover, climb, n_x, site, row, spans, n_spans, weights, n_weights):
     """Append the spans of one row of one site; returns the new counts, and the area covered."""
     winding = 0.0  # weight of the cells before the next touched one: the sum of the heights from there on
@@ -180,7 +235,7 @@ def _write_row(first_cell, links, cover, climb, n_x, site, row, spans, n_spans, 
     while here != END:
         winding += cover[here, 0]
         here = links[here, 1]
-    rounding = NO_COVERAGE * climb[0] * max(climb[1] / 8.0, 1.0)
+    rounding = _rounding(climb)
     covered = 0.0
     column = 0  # the next one to be written
     is_open = False  # whether the last span goes on
@@ -226,19 +281,63 @@ def _write_row(first_cell, links, cover, climb, n_x, site, row, spans, n_spans, 
     return n_spans, n_weights, covered
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _gradient_share(index, n):
+    """One over the distance of the neighbours that the gradient at a cell is taken from; 0 along a single cell."""
+    if n == 1:
+        return 0.0
+    return 0.5 if 0 < index < n - 1 else 1.0
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _write_cuts(first_cell, links, moment, climb, n_y, n_x, site, row, cuts, moments, n_cuts):
+    """Append the cuts of one row of one site; returns their new count."""
+    tilt = 0.0  # moment along v of the cells before the next touched one
+    here = first_cell
+    while here != END:
+        tilt += moment[here, 0]
+        here = links[here, 1]
+    rounding = _rounding(climb)
+    column = 0  # the next one to be written
+    here = first_cell
+    while here != END:
+        touched = links[here, 0]
+        if abs(tilt) <= rounding:
+            column = touched
+        for c in range(column, min(touched + 1, n_x)):
+            u_moment, v_moment = 0.0, tilt
+            if c == touched:
+                u_moment, v_moment = moment[here, 1], moment[here, 2] + (tilt - moment[here, 0])
+            u_moment = u_moment if abs(u_moment) > rounding else 0.0
+            v_moment = v_moment if abs(v_moment) > rounding else 0.0
+            if u_moment != 0.0 or v_moment != 0.0:
+                cuts[n_cuts, SITE] = site
+                cuts[n_cuts, ROW] = row
+                cuts[n_cuts, COLUMN] = c
+                moments[n_cuts, 0] = u_moment * _gradient_share(c, n_x)
+                moments[n_cuts, 1] = v_moment * _gradient_share(row, n_y)
+                n_cuts += 1
+        tilt -= moment[here, 0]
+        column = touched + 1
+        here = links[here, 1]
+    return n_cuts
+
+
 @njit(
-    types.Tuple((_span_list, _float_list, _float_list))(_points, _ints, _ints, _count, _count, _count, _count),
+    types.Tuple((_span_list, _float_list, _cut_list, _moment_list, _float_list))(
+        _points, _ints, _ints, _count, _count, _count, _count, _count
+    ),
     cache=True,
     nogil=True,
 )
-def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x):
+def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x, order):
     """
     Spans of the sites ``first_site .. last_site - 1`` on a grid of ``n_y`` rows and ``n_x`` columns.
 
     ``F(u)``, the integral of the map along a row from its left end to ``u``, makes the integral over a polygon
     the sum over its edges of (height climbed) x (mean of F). Split at the cell borders, a piece of height
     ``d`` with its middle at ``u_m`` in column ``c`` gives the weight ``d * (u_m - c)`` to cell ``c`` and ``d`` to
-    every cell left of it. What lies off the grid gives nothing.
+    every cell left of it. What lies off the grid gives nothing. The moments come from the same pieces.
 
     Returns
     -------
@@ -246,6 +345,9 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x)
         Site by site, each site's in the order of row and column.
     weights : (n_weight,) float64
         Per span its ``n_partial`` weights, then one for the run where ``n_run > 0``.
+    cuts : (n_cut, 3) int32
+        At second order, in the order of the spans; empty at first.
+    moments : (n_cut, 2) float64
     covered : (last_site - first_site,) float64, cells
         Area of each site that lies on the grid.
     """
@@ -253,6 +355,14 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x)
     covered = np.zeros(n_sites, np.float64)
     spans = np.empty((4 * n_sites + 64, 5), np.int32)
     weights = np.empty(16 * n_sites + 64, np.float64)
+    has_moments = order == 2
+    n_cuts = 0
+    room = 0  # for all cuts, but for those along horizontal edges
+    if has_moments:
+        first_ring, last_ring = site_offsets[first_site], site_offsets[last_site]
+        room = n_x + _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_y * n_sites)
+    cuts = np.empty((room, 3), np.int32)
+    moments = np.empty((cuts.shape[0], 2), np.float64)
     n_spans = 0
     n_weights = 0
     head = np.empty(64, np.int32)
@@ -260,6 +370,7 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x)
     climb = np.empty((64, 2), np.float64)
     links = np.empty((256, 3), np.int32)
     cover = np.empty((256, 2), np.float64)
+    moment = np.empty((256 if has_moments else 0, 3), np.float64)
 
     for site in range(first_site, last_site):
         first_ring, last_ring = site_offsets[site], site_offsets[site + 1]
@@ -279,6 +390,7 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x)
         if links.shape[0] < size:
             links = np.empty((2 * size, 3), np.int32)
             cover = np.empty((2 * size, 2), np.float64)
+            moment = np.empty((2 * size if has_moments else 0, 3), np.float64)
         head[:n_rows] = END
         recent[:n_rows] = END
         climb[:n_rows] = 0.0
@@ -300,6 +412,7 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x)
                     climb,
                     links,
                     cover,
+                    moment,
                     n_cells,
                 )
                 a = b
@@ -311,7 +424,15 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x)
                 head[row], links, cover, climb[row], n_x, site, bottom + row, spans, n_spans, weights, n_weights
             )
             covered[site - first_site] += area
-    return spans[:n_spans].copy(), weights[:n_weights].copy(), covered
+        if has_moments:
+            for row in range(n_rows):
+                if n_cuts + n_x > cuts.shape[0]:
+                    cuts = _grown(cuts, n_cuts, n_x)
+                    moments = _grown(moments, n_cuts, n_x)
+                n_cuts = _write_cuts(
+                    head[row], links, moment, climb[row], n_y, n_x, site, bottom + row, cuts, moments, n_cuts
+                )
+    return spans[:n_spans].copy(), weights[:n_weights].copy(), cuts[:n_cuts], moments[:n_cuts], covered
 
 
 @njit(
@@ -346,23 +467,61 @@ def place_spans(spans, weights, next_span, next_weight, first_slot, rows_per_ban
 
 
 @njit(
+    types.void(_cuts, _points, _int_list, _ints, _count, _cut_list, _moment_list),
+    cache=True,
+    nogil=True,
+)
+def place_cuts(cuts, moments, next_cut, first_slot, rows_per_band, out_cuts, out_moments):
+    """Copy cuts and their moments into the order of rows, as :func:`place_spans` does with spans and weights."""
+    i = 0
+    while i < cuts.shape[0]:
+        site, row = cuts[i, SITE], cuts[i, ROW]
+        slot = first_slot[site] + row // rows_per_band
+        to = next_cut[row]
+        while i < cuts.shape[0] and cuts[i, ROW] == row and cuts[i, SITE] == site:
+            out_cuts[to, SITE] = slot
+            out_cuts[to, ROW] = row
+            out_cuts[to, COLUMN] = cuts[i, COLUMN]
+            out_moments[to, 0] = moments[i, 0]
+            out_moments[to, 1] = moments[i, 1]
+            to += 1
+            i += 1
+        next_cut[row] = to
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add_gradients(cells, row, row_cuts, cuts, moments, slots):
+    """Add moment x gradient over the cuts of a row into the slots."""
+    n_y, n_x = cells.shape
+    line, below, above = cells[row], cells[max(row - 1, 0)], cells[min(row + 1, n_y - 1)]
+    for i in range(row_cuts[row], row_cuts[row + 1]):
+        c = cuts[i, COLUMN]
+        along_u = float(line[min(c + 1, n_x - 1)]) - float(line[max(c - 1, 0)])
+        along_v = float(above[c]) - float(below[c])
+        slots[cuts[i, SITE]] += moments[i, 0] * along_u + moments[i, 1] * along_v
+
+
+@njit(
     [
-        types.void(_input(cell, 2), _count, _count, _ints, _ints, _spans, _floats, _float_list)
+        types.void(_input(cell, 2), _count, _count, _ints, _ints, _spans, _floats, _ints, _cuts, _points, _float_list)
         for cell in (types.float32, types.float64)
     ],
     cache=True,
     nogil=True,
 )
-def gather(cells, first_row, last_row, row_spans, row_weights, spans, weights, slots):
+def gather(cells, first_row, last_row, row_spans, row_weights, spans, weights, row_cuts, cuts, moments, slots):
     """
     Add weight x cell over the rows ``first_row .. last_row - 1`` of a map into the slots.
 
-    The only reading of the map: each row is summed by blocks of ``BLOCK`` cells, which a span's run then uses.
+    The only reading of the map: each row is summed by blocks of ``BLOCK`` cells, which a span's run then uses. Of a
+    cell in ``cuts`` the four neighbours are read again, for moment x gradient, while they are in the processor's cache.
     """
     n_x = cells.shape[1]
     blocks = np.empty(n_x // BLOCK + 1, np.float64)
-    for row in range(first_row, last_row):
-        if row_spans[row] == row_spans[row + 1]:
+    for row in range(first_row, last_row + 2):
+        if row >= first_row + 2:  # the rows on either side of it have been read
+            _add_gradients(cells, row - 2, row_cuts, cuts, moments, slots)
+        if row >= last_row or row_spans[row] == row_spans[row + 1]:
             continue
         line = cells[row]
         for b in range(n_x // BLOCK):
@@ -401,12 +560,18 @@ def gather(cells, first_row, last_row, row_spans, row_weights, spans, weights, s
 
 
 @njit(
-    types.void(_floats, _count, _count, _ints, _ints, _spans, _floats, types.float64[:, ::1]),
+    types.void(_floats, _count, _count, _ints, _ints, _spans, _floats, _ints, _cuts, _points, _moment_list),
     cache=True,
     nogil=True,
 )
-def scatter(values, first_row, last_row, row_spans, row_weights, spans, weights, cells):
-    """The transpose of :func:`gather`: add weight x (value of the slot) to the cells of some rows."""
+def scatter(values, first_row, last_row, row_spans, row_weights, spans, weights, row_cuts, cuts, moments, cells):
+    """
+    The transpose of :func:`gather`: add weight x (value of the slot) to the cells of some rows.
+
+    What the cuts of the rows just outside give to those inside is added, and nothing to the rows outside, which are
+    another call's.
+    """
+    n_y, n_x = cells.shape
     for row in range(first_row, last_row):
         p = row_weights[row]
         for i in range(row_spans[row], row_spans[row + 1]):
@@ -421,3 +586,13 @@ def scatter(values, first_row, last_row, row_spans, row_weights, spans, weights,
                     cells[row, column] += weights[p] * value
                     column += 1
                 p += 1
+        for i in range(row_cuts[row], row_cuts[row + 1]):
+            c = cuts[i, COLUMN]
+            along_u = moments[i, 0] * values[cuts[i, SITE]]
+            cells[row, min(c + 1, n_x - 1)] += along_u
+            cells[row, max(c - 1, 0)] -= along_u
+    for row in range(max(first_row - 1, 0), min(last_row + 1, n_y)):
+        for neighbour, sign in ((min(row + 1, n_y - 1), 1.0), (max(row - 1, 0), -1.0)):
+            if first_row <= neighbour < last_row:
+                for i in range(row_cuts[row], row_cuts[row + 1]):
+                    cells[neighbour, cuts[i, COLUMN]] += sign * moments[i, 1] * values[cuts[i, SITE]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,12 @@ class Plan:
         Where each row's spans and weights begin.
     spans : (n_span, 5) int32
     weights : (n_weight,) float64
+    row_cuts : (n_y + 1,) int64
+        Where each row's cuts begin.
+    cuts : (n_cut, 3) int32
+        Cells that an outline cuts; none at first order.
+    moments : (n_cut, 2) float64
+        What the differences of their neighbours along x and along y weigh.
     rows_per_band : int
         Height of the bands of rows that are summed apart.
     first_slot : (n_site + 1,) int64
@@ -57,6 +63,9 @@ class Plan:
     row_weights: Ints
     spans: NDArray[np.int32]
     weights: Floats
+    row_cuts: Ints
+    cuts: NDArray[np.int32]
+    moments: Floats
     rows_per_band: int
     first_slot: Ints
     covered_um2: Floats
@@ -64,10 +73,11 @@ class Plan:
     def _pass(self, kernel: Callable[..., None], read: NDArray[Any], written: NDArray[Any], n_threads: int) -> None:
         """Run a kernel over all bands of rows: bands write to different places, and none depends on ``n_threads``."""
         n_y, n_x = self.grid.shape
+        plan = (self.row_spans, self.row_weights, self.spans, self.weights, self.row_cuts, self.cuts, self.moments)
 
         def band(first_row: int) -> None:
             last_row = min(first_row + self.rows_per_band, n_y)
-            kernel(read, first_row, last_row, self.row_spans, self.row_weights, self.spans, self.weights, written)
+            kernel(read, first_row, last_row, *plan, written)
 
         each(band, range(0, n_y, self.rows_per_band), 1 if n_y * n_x <= SMALL_MAP else n_threads)
 
@@ -89,7 +99,7 @@ class Plan:
         return cells
 
     def matrix(self) -> csr_array[Any]:
-        """The plan as a sparse matrix (n_site, n_y * n_x) of overlaps in cells; runs are written out."""
+        """The plan as a sparse matrix (n_site, n_y * n_x), of overlaps in cells at first order; runs are written out."""
         from scipy.sparse import coo_array
 
         column_of = kernels("integrate")
@@ -99,46 +109,58 @@ class Plan:
         n_weights = n_partial + (n_run > 0)
         first_weight = np.cumsum(n_weights) - n_weights
         k = positions_in_runs(n_cells)
-        weight = self.weights[np.repeat(first_weight, n_cells) + np.minimum(k, np.repeat(n_partial, n_cells))]
+        at = np.repeat(first_weight, n_cells) + np.minimum(k, np.repeat(n_partial, n_cells))
         n_y, n_x = self.grid.shape
         start = self.spans[:, column_of.ROW].astype(np.int64) * n_x + self.spans[:, column_of.COLUMN]
         cell = np.repeat(start, n_cells) + k
         slot_site = np.repeat(np.arange(self.n_sites), np.diff(self.first_slot))
         site = np.repeat(slot_site[self.spans[:, column_of.SITE]], n_cells)
+        parts = zip((self.weights[at], site, cell), self._gradients(slot_site), strict=True)
+        weight, site, cell = (np.concatenate(part) for part in parts)
         matrix = coo_array((weight, (site, cell)), shape=(self.n_sites, n_y * n_x)).tocsr()
         matrix.sort_indices()
         return matrix
 
+    def _gradients(self, slot_site: Ints) -> tuple[Floats, Ints, Ints]:
+        """What the cuts add to the matrix: its entries' weights, sites and cells."""
+        slot, row, column = self.cuts.T.astype(np.int64)
+        weights, sites, cells = [], [], []
+        # The neighbours (rows up, columns to the right), and the axis of their difference.
+        for up, right, axis, sign in ((0, 1, 0, 1), (0, -1, 0, -1), (1, 0, 1, 1), (-1, 0, 1, -1)):
+            is_cut = self.moments[:, axis] != 0.0
+            weights.append(sign * self.moments[is_cut, axis])
+            sites.append(slot_site[slot[is_cut]])
+            neighbour = (row[is_cut] + up, column[is_cut] + right)
+            cells.append(np.ravel_multi_index(neighbour, self.grid.shape, mode="clip"))
+        return np.concatenate(weights), np.concatenate(sites), np.concatenate(cells)
 
-def compile_plan(rings: PackedRings, grid: Grid, n_threads: int) -> Plan:
+
+class _Traced(NamedTuple):
+    """What tracing some sites gives (see ``_kernels``), and how much of it belongs to each row."""
+
+    spans: NDArray[np.int32]
+    weights: Floats
+    cuts: NDArray[np.int32]
+    moments: Floats
+    covered_um2: Floats
+    row_spans: Ints
+    row_weights: Ints
+    row_cuts: Ints
+
+
+def compile_plan(rings: PackedRings, grid: Grid, n_threads: int, order: int = 1) -> Plan:
     """Trace every outline on the grid, and put what it covers in the order of the grid's rows."""
-    n_y, n_x = grid.shape
-    n_sites = rings.site_offsets.size - 1
+    n_y = grid.shape[0]
     uv = np.ascontiguousarray((rings.xy_um - np.asarray(grid.origin_um)) / grid.pitch_um)
     ring_offsets = np.ascontiguousarray(rings.ring_offsets)
     site_offsets = np.ascontiguousarray(rings.site_offsets)
     compiled = kernels("integrate")
-
-    pieces = range(0, n_sites, SITES_PER_PIECE)
-
-    def trace(first_site: int) -> tuple[NDArray[np.int32], Floats, Floats, Ints, Ints]:
-        last_site = min(first_site + SITES_PER_PIECE, n_sites)
-        spans, weights, covered = compiled.trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x)
-        rows = spans[:, compiled.ROW]
-        n_weights = spans[:, compiled.N_PARTIAL] + (spans[:, compiled.N_RUN] > 0)
-        return (
-            spans,
-            weights,
-            covered,
-            np.bincount(rows, minlength=n_y),
-            np.bincount(rows, n_weights, minlength=n_y).astype(np.int64),
-        )
-
-    traced = each(trace, pieces, n_threads)
+    traced = _trace(uv, ring_offsets, site_offsets, grid, n_threads, order)
 
     # Where the next span of (piece, row) goes: behind all lower rows, and the same row of the pieces before.
-    row_spans, next_span = _starts([t[3] for t in traced], n_y)
-    row_weights, next_weight = _starts([t[4] for t in traced], n_y)
+    row_spans, next_span = _starts([t.row_spans for t in traced], n_y)
+    row_weights, next_weight = _starts([t.row_weights for t in traced], n_y)
+    row_cuts, next_cut = _starts([t.row_cuts for t in traced], n_y)
 
     rows_per_band = max(MIN_ROWS_PER_BAND, -(-n_y // MAX_BANDS))
     bounds = site_bounds_um(uv, ring_offsets, site_offsets)  # in cells
@@ -149,27 +171,56 @@ def compile_plan(rings: PackedRings, grid: Grid, n_threads: int) -> Plan:
 
     out_spans = np.empty((int(row_spans[-1]), 5), np.int32)
     out_weights = np.empty(int(row_weights[-1]))
+    out_cuts = np.empty((int(row_cuts[-1]), 3), np.int32)
+    out_moments = np.empty((int(row_cuts[-1]), 2))
     slot_of_band_0 = first_slot[:-1] - first_row // rows_per_band
 
     def place(i: int) -> None:
-        spans, weights = traced[i][:2]
-        compiled.place_spans(
-            spans, weights, next_span[i], next_weight[i], slot_of_band_0, rows_per_band, out_spans, out_weights
-        )
+        t, slots = traced[i], (slot_of_band_0, rows_per_band)
+        compiled.place_spans(t.spans, t.weights, next_span[i], next_weight[i], *slots, out_spans, out_weights)
+        compiled.place_cuts(t.cuts, t.moments, next_cut[i], *slots, out_cuts, out_moments)
 
     each(place, range(len(traced)), n_threads)
-    covered = np.concatenate([t[2] for t in traced]) if traced else np.zeros(0)
     return Plan(
         grid=grid,
-        n_sites=n_sites,
+        n_sites=site_offsets.size - 1,
         row_spans=row_spans,
         row_weights=row_weights,
         spans=out_spans,
         weights=out_weights,
+        row_cuts=row_cuts,
+        cuts=out_cuts,
+        moments=out_moments,
         rows_per_band=rows_per_band,
         first_slot=first_slot,
-        covered_um2=covered * grid.cell_area_um2,
+        covered_um2=np.concatenate([np.zeros(0), *(t.covered_um2 for t in traced)]),
     )
+
+
+def _trace(xy: Floats, ring_offsets: Ints, site_offsets: Ints, grid: Grid, n_threads: int, order: int) -> list[_Traced]:
+    """Trace the sites, piece by piece; ``xy`` are the vertices in cells."""
+    compiled = kernels("integrate")
+    n_y, n_x = grid.shape
+    n_sites = site_offsets.size - 1
+
+    def trace(first_site: int) -> _Traced:
+        last_site = min(first_site + SITES_PER_PIECE, n_sites)
+        spans, weights, cuts, moments, covered = compiled.trace_sites(
+            xy, ring_offsets, site_offsets, first_site, last_site, n_y, n_x, order
+        )
+        n_weights = spans[:, compiled.N_PARTIAL] + (spans[:, compiled.N_RUN] > 0)
+        return _Traced(
+            spans,
+            weights,
+            cuts,
+            moments,
+            covered * grid.cell_area_um2,
+            row_spans=np.bincount(spans[:, compiled.ROW], minlength=n_y),
+            row_weights=np.bincount(spans[:, compiled.ROW], n_weights, minlength=n_y).astype(np.int64),
+            row_cuts=np.bincount(cuts[:, compiled.ROW], minlength=n_y),
+        )
+
+    return each(trace, range(0, n_sites, SITES_PER_PIECE), n_threads)
 
 
 def _starts(counts: list[NDArray[np.int64]], n_y: int) -> tuple[Ints, Ints]:
