@@ -35,7 +35,7 @@ __all__ = ["Camera"]
 NEGATIVE_ROUNDING = 1e-4
 #: A filter that passes less than this share of the strongest one's light cannot be balanced against it.
 DIMMEST_WHITE = 0.01
-#: Compiled layouts that a camera keeps, one for each grid it met.
+#: Compiled layouts that a camera keeps, one for each grid it met: those of this many kinds of light.
 KEPT_INTEGRATORS = 4
 
 
@@ -112,13 +112,13 @@ class Camera:
         """Where the lens puts light that an ideal one would put elsewhere, or None. For another one make another camera."""
         return self._distortion
 
-    def integrator(self, grid: Grid) -> Integrator:
-        """The sensor's layout compiled for a grid; kept for the grids used last."""
+    def integrator(self, grid: Grid, *, n_grids: int = 1) -> Integrator:
+        """The sensor's layout compiled for a grid; kept for the grids used last, of which ``n_grids`` are used together."""
         integrator = self._integrators.pop(grid, None)
         if integrator is None:
             integrator = Integrator(self._layout, grid, distortion=self._distortion, n_threads=self._n_threads)
         self._integrators[grid] = integrator
-        while len(self._integrators) > KEPT_INTEGRATORS:
+        while len(self._integrators) > KEPT_INTEGRATORS * n_grids:
             del self._integrators[next(iter(self._integrators))]
         return integrator
 
@@ -194,7 +194,11 @@ class Camera:
         )
 
     def _photoelectrons_per_s(self, light: Scene | PowerMap, clock: _Clock) -> Floats:
-        """One inverse transform and one pass over the map for each colour filter, whatever the number of wavelengths."""
+        """
+        One inverse transform and one pass over the map for each colour filter, whatever the number of wavelengths.
+
+        Lateral colour makes images of several sizes, each with its own grid, and the same for each of them.
+        """
         if not isinstance(light, Scene | PowerMap):
             raise ParameterError("light", f"must be a Scene or a PowerMap, got a {type(light).__name__}")
         filter_of_site = self._sensor.filter_of_site
@@ -202,24 +206,30 @@ class Camera:
         with clock.stage("load kernels"):
             for room in ("integrate",) if isinstance(light, PowerMap) else ("integrate", "optics"):
                 kernels(room)
+        if isinstance(light, PowerMap):
+            grids = [(light.grid, np.ones(light.wavelength_nm.size, bool))]
+        else:
+            grids = self._optics.image_grids(light)
         with clock.stage("compile layout"):
-            integrator = self.integrator(light.grid if isinstance(light, PowerMap) else self._optics.grid(light))
-        self._warn_of_uncovered(integrator)
+            integrators = [self.integrator(grid, n_grids=len(grids)) for grid, _ in grids]
+        self._warn_of_uncovered(min(integrators, key=lambda integrator: integrator.grid.pitch_um))
         rate_e_per_s = np.zeros(self._layout.n_sites)
         if isinstance(light, PowerMap):
+            integrator = integrators[0]
             with clock.stage("integration"):
                 for band, cells in enumerate(light.data):
                     rate_e_per_s += weights[filter_of_site, band] * w_from_w_m2_um2(integrator(cells))
         else:
             used = np.unique(filter_of_site)
-            maps = self._optics.weighted_maps(light, weights[used], n_threads=self._n_threads)
-            for c in used:
-                with clock.stage("optics"):
-                    cells = next(maps)
-                with clock.stage("integration"):
-                    rates = w_from_w_m2_um2(integrator(cells))
-                    del cells
-                rate_e_per_s = np.where(filter_of_site == c, rates, rate_e_per_s)
+            for (grid, is_on_it), integrator in zip(grids, integrators, strict=True):
+                maps = self._optics.weighted_maps(light, weights[used] * is_on_it, grid=grid, n_threads=self._n_threads)
+                for c in used:
+                    with clock.stage("optics"):
+                        cells = next(maps)
+                    with clock.stage("integration"):
+                        rates = w_from_w_m2_um2(integrator(cells))
+                        del cells
+                    rate_e_per_s += np.where(filter_of_site == c, rates, 0.0)
         if not np.isfinite(rate_e_per_s).all():
             bad = int(np.flatnonzero(~np.isfinite(rate_e_per_s))[0])
             raise SimulationError(

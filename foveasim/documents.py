@@ -17,7 +17,7 @@ MAX_FILE_BYTES = 1 << 20
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML without tags, anchors and repeated keys, and with 1e-13 as a number."""
+    """YAML without tags, anchors and repeated keys, with 1e-13 as a number, and with all keys as texts, as JSON has them."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         event = self.peek_event()  # type: ignore[no-untyped-call]
@@ -30,12 +30,12 @@ class _Loader(yaml.SafeLoader):
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
             line = key_node.start_mark.line + 1
-            if not isinstance(key, str):
-                raise yaml.YAMLError(f"the key {key!r} must be a text (line {line})")
-            if key in seen:
+            if not isinstance(key, str) and (not isinstance(key, int) or isinstance(key, bool)):
+                raise yaml.YAMLError(f"the key {key!r} must be a text or a whole number (line {line})")
+            if str(key) in seen:
                 raise yaml.YAMLError(f"the key '{key}' stands there twice (line {line})")
-            seen.add(key)
-        return super().construct_mapping(node, deep)
+            seen.add(str(key))
+        return {str(key): value for key, value in super().construct_mapping(node, deep).items()}
 
 
 _Loader.yaml_implicit_resolvers = {

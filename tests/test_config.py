@@ -60,6 +60,24 @@ def test_numbers_without_a_point_in_front_of_the_exponent_are_numbers(shot_file)
         ("sensor.qe={kind: silicon, depth_um: 2.5}", lambda s: s.camera.sensor.qe == fs.SiliconQE(depth_um=2.5)),
         ("optics.emission=isotropic", lambda s: s.camera.optics.emission == "isotropic"),
         (
+            "optics.pupil={kind: blades, n_blades: 5, angle_deg: 18}",
+            lambda s: s.camera.optics.pupil == fs.optics.Blades(5, angle_deg=18.0),
+        ),
+        (
+            "optics.pupil=[{kind: annulus, obscuration: 0.3}, {kind: spider, n_vanes: 4, width_fraction: 0.02}]",
+            lambda s: list(s.camera.optics.pupil) == [fs.optics.Annulus(0.3), fs.optics.Spider(4, 0.02)],
+        ),
+        (
+            "optics.zernike={coefficients: {7: 0.1, 4: [0.0, 0.2]}, unit: waves, wavelength_nm: [450, 650]}",
+            lambda s: s.camera.optics.zernike.coefficients == {7: 0.1, 4: (0.0, 0.2)},
+        ),
+        ("optics.seidel={coma_um: 0.3}", lambda s: s.camera.optics.seidel == fs.optics.Seidel(coma_um=0.3)),
+        ("optics.focus_distance_m=2.0", lambda s: s.camera.optics.defocus_um(1.0) > 0.0),
+        (
+            "optics.lateral_colour={wavelength_nm: [450, 650], magnification: [0.999, 1.001]}",
+            lambda s: s.camera.optics.lateral_colour.magnification == (0.999, 1.001),
+        ),
+        (
             "distortion={kind: brown_conrady, focal_um: 8000.0, k1: -0.1}",
             lambda s: s.camera.distortion == fs.distortion.BrownConrady(focal_um=8000.0, k1=-0.1),
         ),
@@ -117,6 +135,13 @@ def test_a_change_replaces_one_setting(shot_file, change, value):
         ("seed.x=3", r"'seed\.x=3' cannot be set: seed is no section but 7"),
         ("sensor.bits=[1", r"is not YAML"),
         ("seed=2026-01-01", r'seed: must be a valid integer, got "2026-01-01"'),
+        ("optics.pupil={kind: star}", r"optics\.pupil"),
+        ("optics.pupil={kind: annulus, obscuration: 2}", r"optics\.pupil\.obscuration: must be <= 0\.999, got 2"),
+        ("optics.pupil=[{kind: slit, width_fraction: 0}]", r"optics\.pupil\[0\]\.width_fraction: must be > 0"),
+        ("optics.pupil={kind: image, picture: no.png}", r"no\.png: no such file"),
+        ("optics.zernike={coefficients: {0: 0.1}}", r"optics\.zernike\.coefficients: has an index that must be >= 1"),
+        ("optics.zernike={coefficients: {coma: 0.1}}", r"optics\.zernike\.coefficients"),
+        ("optics.focus_distance_m=0.001", r"optics\.focus_distance_m: must be larger than the focal length"),
     ],
 )
 def test_a_wrong_setting_is_told_with_its_place(shot_file, change, message):
@@ -186,7 +211,9 @@ def test_wavelengths_outside_the_sensors_tables_are_told_before_the_capture(shot
         ("- a\n- b\n", "must hold settings as 'key: value', got"),
         ("scene: {kind: flat\noptics: 3", "is not YAML, line 2"),
         ("a: 1\na: 2\n", r"the key 'a' stands there twice \(line 2\)"),
-        ("1: 2\n", r"the key 1 must be a text \(line 1\)"),
+        ("1.5: 2\n", r"the key 1.5 must be a text or a whole number \(line 1\)"),
+        ("yes: 2\n", r"the key True must be a text or a whole number \(line 1\)"),
+        ("1: 2\n'1': 3\n", r"the key '1' stands there twice \(line 2\)"),
         ("a: &x [1]\nb: *x\n", r"anchors and aliases are not allowed \(line 1\)"),
         ("a: !!python/object/apply:os.system [ls]\n", "is not YAML, line 1: could not determine a constructor"),
         ("a: !!set {b}\n", "is not YAML|holds a value that cannot be read|no such setting"),

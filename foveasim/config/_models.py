@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from foveasim import layout as layouts
 from foveasim.distortion import BrownConrady, Fisheye, Lens, PolynomialFisheye, Scaramuzza
 from foveasim.layout import DesignRules, Layout
-from foveasim.optics import Optics
+from foveasim.optics import Annulus, Blades, LateralColour, Optics, PupilImage, Seidel, Slit, Spider, Zernike
 from foveasim.scene import Scene, charts
 from foveasim.sensor import ConstantCurve, FilterSet, GaussianCurve, PolynomialCurve, Sensor, SiliconQE
 
@@ -127,6 +127,13 @@ _LENSES: dict[str, Callable[..., Lens]] = {
     "polynomial_fisheye": PolynomialFisheye,
     "scaramuzza": Scaramuzza,
 }
+_PUPILS: dict[str, Callable[..., Any]] = {
+    "annulus": Annulus,
+    "blades": Blades,
+    "image": PupilImage,
+    "slit": Slit,
+    "spider": Spider,
+}
 _CURVES: dict[str, Callable[..., Any]] = {
     "constant": ConstantCurve,
     "gaussian": GaussianCurve,
@@ -135,6 +142,17 @@ _CURVES: dict[str, Callable[..., Any]] = {
 }
 
 _LensSection = _one_of("kind", {name: _model(name, lens) for name, lens in _LENSES.items()})
+_PupilSection = _one_of(
+    "kind", {name: _model(name, pupil, skip=("wavefront_um",), picture=str) for name, pupil in _PUPILS.items()}
+)
+_OpticsSection = _model(
+    "optics",
+    Optics,
+    pupil=_PupilSection | list[_PupilSection] | None,  # type: ignore[valid-type]
+    zernike=_model("zernike", Zernike) | None,
+    seidel=_model("seidel", Seidel) | None,
+    lateral_colour=_model("lateral colour", LateralColour) | None,
+)
 _CurveSection = _one_of("kind", {name: _model(name, curve) for name, curve in _CURVES.items()})
 _FilterSection = _model("filter set", FilterSet, curves=list[_CurveSection])  # type: ignore[valid-type]
 _PerSite = float | PerArea | list[float]
@@ -189,7 +207,7 @@ class ShotSection(_Section):
     """A whole shot: scene, optics, distortion, layout, sensor, exposure."""
 
     scene: _SceneSection  # type: ignore[valid-type]
-    optics: _model("optics", Optics)  # type: ignore[valid-type]
+    optics: _OpticsSection  # type: ignore[valid-type]
     distortion: _LensSection | None = None  # type: ignore[valid-type]
     layout: str | LayoutUnion  # type: ignore[valid-type]
     sensor: _SensorSection = Field(default_factory=_SensorSection)  # type: ignore[valid-type]

@@ -42,7 +42,13 @@ BUNDLED_PICTURE = "skimage:"
 #: Endings of files that hold settings; a layout in any other file is told by its content.
 YAML_ENDINGS = (".yaml", ".yml")
 #: Settings whose value may be the name of a file.
-FILE_SETTINGS = ("scene.picture", "layout", "layout.parameters.importance", "layout.parameters.density")
+FILE_SETTINGS = (
+    "scene.picture",
+    "optics.pupil.picture",
+    "layout",
+    "layout.parameters.importance",
+    "layout.parameters.density",
+)
 #: A picture's sides may have this relative difference from those of the rectangle that it covers.
 SHAPE_ROUNDING = 1e-6
 
@@ -132,11 +138,7 @@ def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int |
     sensor = _call(path, "sensor", Sensor, {"layout": layout, **sensor_values})
     optics = _call(path, "optics", Optics, _values(path, "optics.", settings.optics))
     distortion = _built(path, "distortion", settings.distortion)
-    scene_values = _values(path, "scene.", settings.scene)
-    if "picture" in scene_values:
-        scene_values["picture"] = _picture_path(path, scene_values["picture"])
-    # A picture's own faults are told with its name.
-    scene = _call(path, "scene", _callable(settings.scene), scene_values)
+    scene = _built(path, "scene", settings.scene)
     # What would end the capture is told before it begins, with its place in the file.
     _call(path, "scene", optics.grid, {"scene": scene})
     _call(path, "scene", sensor.responsivity_e_per_j, {"wavelength_nm": scene.wavelength_nm})
@@ -253,7 +255,7 @@ def _picture_values(path: Path, place: str, values: Mapping[str, Any]) -> dict[s
 
 
 def _values(path: Path, place: str, section: BaseModel) -> dict[str, Any]:
-    """A section's values as arguments of its call, sections inside it built."""
+    """A section's values as arguments of its call: sections inside it built, names of pictures as paths."""
     return {
         name: _built(path, place + name, getattr(section, name))
         for name in type(section).model_fields
@@ -264,6 +266,8 @@ def _values(path: Path, place: str, section: BaseModel) -> dict[str, Any]:
 def _built(path: Path, place: str, value: Any) -> Any:
     if isinstance(value, list):
         return [_built(path, f"{place}[{i}]", item) for i, item in enumerate(value)]
+    if isinstance(value, str) and place.rpartition(".")[2] == "picture":
+        return _picture_path(path, value, place)
     if not isinstance(value, BaseModel) or isinstance(value, PerArea):
         return value
     return _call(path, place, _callable(value), _values(path, place + ".", value))
@@ -287,7 +291,7 @@ def _call(path: Path, place: str, function: Callable[..., Any], arguments: Mappi
         raise ConfigError(path, f"{place}: {error}") from None
 
 
-def _picture_path(path: Path, picture: str, place: str = "scene.picture") -> Path:
+def _picture_path(path: Path, picture: str, place: str) -> Path:
     if not picture.startswith(BUNDLED_PICTURE):
         return path.parent / picture
     name = picture.removeprefix(BUNDLED_PICTURE)

@@ -3,6 +3,25 @@
 from __future__ import annotations
 
 from foveasim.optics._optics import Optics
+from foveasim.optics._point_images import PointSpread
+from foveasim.optics.aberrations import LateralColour, Seidel, Zernike, noll_to_nm, osa_to_nm, zernike
 from foveasim.optics.otf import circular_otf
+from foveasim.optics.pupils import Annulus, Blades, Pupil, PupilImage, Slit, Spider
 
-__all__ = ["Optics", "circular_otf"]
+__all__ = [
+    "Annulus",
+    "Blades",
+    "LateralColour",
+    "Optics",
+    "PointSpread",
+    "Pupil",
+    "PupilImage",
+    "Seidel",
+    "Slit",
+    "Spider",
+    "Zernike",
+    "circular_otf",
+    "noll_to_nm",
+    "osa_to_nm",
+    "zernike",
+]

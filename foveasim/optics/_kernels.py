@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, types
 
-__all__ = ["alias_sum", "expose", "transfer"]
+__all__ = ["alias_sum", "alias_sum_plane", "expose", "transfer", "transfer_plane"]
 
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 
@@ -120,6 +120,102 @@ def transfer(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is
         else:
             for ix in range(n_x):
                 out[row, ix] = spectrum[row, ix] * h[ix]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _in_plane(table, u, v):
+    """
+    Value between the points of a plane of frequencies, linear in both; 0 beyond its border.
+
+    ``u`` and ``v`` are in steps of the table, whose middle point is zero frequency.
+    """
+    half = table.shape[0] // 2
+    u += half
+    v += half
+    last = table.shape[0] - 1
+    if u < 0 or v < 0 or u >= last or v >= last:
+        return table.dtype.type(0.0)
+    i = int(u)
+    j = int(v)
+    u -= i
+    v -= j
+    low = table[j, i] + u * (table[j, i + 1] - table[j, i])
+    high = table[j + 1, i] + u * (table[j + 1, i + 1] - table[j + 1, i])
+    return low + v * (high - low)
+
+
+@njit(
+    [
+        types.void(
+            types.Array(c, 2, "C", readonly=True),
+            types.Array(c, 2, "C", readonly=True),
+            r,
+            types.Array(r, 2, "C", readonly=True),
+            types.Array(r, 2, "C", readonly=True),
+            types.Array(r, 2, "C", readonly=True),
+            types.Array(r, 2, "C", readonly=True),
+            types.Array(c, 2, "C", readonly=True),
+            types.Array(c, 2, "C", readonly=True),
+            types.boolean,
+            types.int64,
+            types.int64,
+            c[:, ::1],
+        )
+        for c, r in ((types.complex64, types.float32), (types.complex128, types.float64))
+    ],
+    cache=True,
+    nogil=True,
+)
+def transfer_plane(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is_added, first_row, last_row, out):
+    """As :func:`transfer`, for a transfer function of any form: a square of complex numbers over f_y and f_x."""
+    n_alias, n_x = fx.shape
+    half = table.shape[0] // 2
+    h = np.empty(n_x, table.dtype)
+    for row in range(first_row, last_row):
+        h[:] = 0.0
+        for r in range(far_x.shape[0]):
+            for ix in range(n_x):
+                h[ix] += far_x[r, ix] * far_y[r, row]
+        for ky in range(n_alias):
+            v = fy[ky, row] * per_step
+            if abs(v) >= half:
+                continue
+            for kx in range(n_alias):
+                for ix in range(n_x):
+                    h[ix] += _in_plane(table, fx[kx, ix] * per_step, v) * (gain_x[kx, ix] * gain_y[ky, row])
+        if is_added:
+            for ix in range(n_x):
+                out[row, ix] += spectrum[row, ix] * h[ix]
+        else:
+            for ix in range(n_x):
+                out[row, ix] = spectrum[row, ix] * h[ix]
+
+
+@njit(
+    types.complex128[:, ::1](
+        types.Array(types.complex128, 2, "C", readonly=True), types.float64, _floats, types.int64, types.int64
+    ),
+    cache=True,
+    nogil=True,
+)
+def alias_sum_plane(table, per_step, cycles, n_alias, sinc_power):
+    """As :func:`alias_sum`, for a transfer function of any form: a square of complex numbers over f_y and f_x."""
+    n = cycles.size
+    k = np.arange(-n_alias, n_alias + 1)
+    gain = np.empty((k.size, n))
+    for a in range(k.size):
+        for i in range(n):
+            gain[a, i] = np.sinc(cycles[i] + k[a]) ** sinc_power
+    total = np.zeros((n, n), np.complex128)
+    for a in range(k.size):
+        for b in range(k.size):
+            if k[a] == 0 and k[b] == 0:
+                continue
+            for i in range(n):
+                v = (cycles[i] + k[a]) * per_step
+                for j in range(n):
+                    total[i, j] += gain[a, i] * gain[b, j] * _in_plane(table, (cycles[j] + k[b]) * per_step, v)
+    return total
 
 
 @njit(

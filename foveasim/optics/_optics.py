@@ -4,49 +4,63 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, check_choice, check_count, check_number
+from foveasim.arrays import Bools, Floats, check_choice, check_count, check_number, finite_array, wavelengths_nm
 from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.fields import Grid, PowerMap, SceneLike
-from foveasim.optics.otf import RadialTables
+from foveasim.optics._aperture import Aperture, Wavefront, overlaps
+from foveasim.optics._imaging import Imaging, patchwork, patchwork_error, reach_cells
+from foveasim.optics._point_images import Point, PointImages
+from foveasim.optics.aberrations import LateralColour, Seidel, Zernike
+from foveasim.optics.otf import MAX_ALIASES, PlaneTables, RadialTables, TableCache, Tables
+from foveasim.optics.pupils import Pupil
 from foveasim.parallel import thread_count
-from foveasim.units import m_from_mm, m_from_um, um_from_nm
+from foveasim.units import m_from_mm, m_from_um, um_from_m, um_from_nm
 
 __all__ = ["Optics"]
 
-#: Default padding: the radius that holds all but this share of a point's light ...
+#: Default padding: the radius that holds all but this share of a point's light.
 LOST_SHARE = 0.01
-#: ... which for a clear circle is about ``2 / (π² share)`` in units of wavelength x f-number.
-REACH_SHARE = 2.0 / math.pi**2
 #: The paper's Eq. 5 asks for an aperture radius much larger than H λ / (p0 min(M, N)): this many times.
 MUCH_LARGER = 10.0
-#: For cells wider than this many λN diffraction is that of cells of this width: 0.3 % of the light goes astray, or less.
-MAX_ALIASES = 128
 PADDINGS = ("reflect", "edge", "zero", "periodic")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Optics:
+class Optics(PointImages):
     """
-    A thin lens with a clear circular pupil, in focus.
+    A thin lens: diffraction at its pupil, aberrations, defocus, falloff.
 
     Parameters
     ----------
     focal_length_mm : float, mm
     f_number : float
-        As engraved on the lens: focal length over pupil diameter.
+        As engraved on the lens: focal length over the diameter of the circle around the pupil.
     emission : {"lambertian", "isotropic"}
         ``"lambertian"``: the scene has a radiance L that is the same in all directions; irradiance falls as cos⁴ and
         is ``π L / (1 + 4 N²)`` on the axis, N the image-side f-number. ``"isotropic"``: Eq. 3 of the paper, points
         that radiate L (W/m²) evenly into a hemisphere; it falls as cos³ and is ``L / (8 N²)`` on the axis.
     transmission : float
         Share of the light that the glass lets through.
+    pupil : Annulus, Spider, Blades, Slit, PupilImage, callable, or a sequence of them, optional
+        Its shape within the circle; several are multiplied. A callable ``T(x, y, wavelength_nm)`` gives real or complex
+        amplitudes of at most 1 at points in units of the circle's radius. By default a clear circle.
+    zernike : Zernike, optional
+        Aberrations that are the same all over the field; any of them may depend on the colour.
+    seidel : Seidel, optional
+        Aberrations that grow with the distance from the axis.
+    focus_distance_m : float, optional, m
+        Distance at which the lens is focused; by default that of the scene. Other scenes are blurred by defocus.
+    lateral_colour : LateralColour, optional
+        Image sizes of different colours.
+    field_patches : int
+        Where aberrations differ over the field: so many patterns along each side of the picture, linear in between.
     source_pixel : {"point", "square"}
         Whether a picture's pixel shines from its centre (the paper) or evenly from its square.
     padding : {"reflect", "edge", "zero", "periodic"}
@@ -71,16 +85,31 @@ class Optics:
     all over the field, so a map is ``IFFT(FFT(scene * falloff) * OTF)``. ``π L / (1 + 4 N²)`` is the light from the cone
     that a flat pupil fills, seen from the image, where ISETCam's camera equation takes it too; ``π L / 4 N²`` is its limit for
     small apertures, and the isotropic ``L / (8 N²)`` is of that small-angle kind.
+
+    The clear circle in focus has the closed-form OTF. Any other pupil's is the autocorrelation of the sampled pupil, complex
+    where it is not symmetric, sampled finely enough for the light that aberrations throw aside, and within 7e-4 of the closed
+    form for a circle. In either case OTF(0) = 1: the light is what the pupil lets through, exactly. A scene out of focus has
+    the path difference ``(a²/2) (1/H - 1/H_focus)`` at the edge of a pupil of radius a: Goodman, Introduction to Fourier
+    Optics, section on focusing errors.
+
+    The pupil, like the picture, is seen upright: light goes to where a wavefront in the sensor's coordinates grows.
     """
 
     focal_length_mm: float
     f_number: float
     emission: Literal["lambertian", "isotropic"] = "lambertian"
     transmission: float = 1.0
+    pupil: Pupil | Sequence[Pupil] | None = None
+    zernike: Zernike | None = None
+    seidel: Seidel | None = None
+    focus_distance_m: float | None = None
+    lateral_colour: LateralColour | None = None
+    field_patches: int = 5
     source_pixel: Literal["point", "square"] = "point"
     padding: Literal["reflect", "edge", "zero", "periodic"] = "reflect"
     padding_cells: int | None = None
     precision: Literal["single", "double"] = "single"
+    _cache: TableCache = field(default_factory=TableCache, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         numbers = {
@@ -102,6 +131,9 @@ class Optics:
             ),
             "transmission": check_number("transmission", self.transmission, above=0.0, at_most=1.0),
         }
+        if self.focus_distance_m is not None:
+            numbers["focus_distance_m"] = self._check_distance("focus_distance_m", self.focus_distance_m)
+        numbers["field_patches"] = check_count("field_patches", self.field_patches, at_most=64)
         if self.padding_cells is not None:
             numbers["padding_cells"] = check_count("padding_cells", self.padding_cells, at_least=0, at_most=2**20)
         for name, number in numbers.items():
@@ -110,37 +142,88 @@ class Optics:
         check_choice("source_pixel", self.source_pixel, ("point", "square"))
         check_choice("padding", self.padding, PADDINGS)
         check_choice("precision", self.precision, ("single", "double"))
+        for name, kind in (("zernike", Zernike), ("seidel", Seidel), ("lateral_colour", LateralColour)):
+            part = getattr(self, name)
+            if part is not None and not isinstance(part, kind):
+                raise ParameterError(name, f"must be a foveasim.optics.{kind.__name__}, got a {type(part).__name__}")
+        if not all(callable(pupil) for pupil in self._pupils()):
+            raise ParameterError(
+                "pupil", "must be a pupil of foveasim.optics, or a callable T(x, y, wavelength_nm)", self.pupil
+            )
+        if self._is_varying() and self.padding == "periodic":
+            raise ParameterError(
+                "padding",
+                "must not be 'periodic' where aberrations differ over the field",
+                cure="a periodic picture has no field",
+            )
 
     # -- geometry -------------------------------------------------------------------------------------------------
 
+    def _check_distance(self, name: str, distance_m: float) -> float:
+        focal_m = float(m_from_mm(self.focal_length_mm))
+        distance_m = check_number(name, distance_m, above=0.0)
+        if distance_m <= focal_m:
+            raise ParameterError(
+                name, f"must be larger than the focal length, {focal_m:g} m, for an image to form", distance_m, "m"
+            )
+        return distance_m
+
+    def _image_distance_mm(self, distance_m: float) -> float:
+        """Distance of the sensor from the pupil, ``1/f = 1/H + 1/D``, for a scene that sets the focus unless that is set."""
+        focus_m = distance_m if self.focus_distance_m is None else self.focus_distance_m
+        return self.focal_length_mm / (1.0 - float(m_from_mm(self.focal_length_mm)) / focus_m)
+
     def magnification(self, distance_m: float) -> float:
         """
-        Size of the image over the size of the scene, ``D / H`` with ``1/f = 1/H + 1/D``.
+        Size of the image over the size of the scene, ``D / H`` with ``1/f = 1/H + 1/D``, H the distance in focus for D.
 
         Raises
         ------
         ParameterError
             When the scene is not further away than the focal length.
         """
-        focal_m = float(m_from_mm(self.focal_length_mm))
-        distance_m = check_number("distance_m", distance_m, above=0.0)
-        if distance_m <= focal_m:
-            raise ParameterError(
-                "distance_m",
-                f"must be larger than the focal length, {focal_m:g} m, for an image to form",
-                distance_m,
-                "m",
-            )
-        return focal_m / (distance_m - focal_m)
+        distance_m = self._check_distance("distance_m", distance_m)
+        return float(m_from_mm(self._image_distance_mm(distance_m))) / distance_m
 
     def working_f_number(self, distance_m: float) -> float:
-        """Image-side f-number ``D / 2a`` when focused at a distance: the engraved one times (1 + magnification)."""
-        return self.f_number * (1.0 + self.magnification(distance_m))
+        """Image-side f-number ``D / 2a``: when focused at the scene, the engraved one times (1 + magnification)."""
+        distance_m = self._check_distance("distance_m", distance_m)
+        return self.f_number * self._image_distance_mm(distance_m) / self.focal_length_mm
+
+    def defocus_um(self, distance_m: float) -> float:
+        """
+        Path difference at the pupil's edge for a scene out of focus, µm; positive for a scene nearer than the focus.
+
+        Raises
+        ------
+        ParameterError
+            When the scene is not further away than the focal length.
+        """
+        return self._defocus_um(self._check_distance("distance_m", distance_m))
+
+    def _defocus_um(self, distance_m: float) -> float:
+        if self.focus_distance_m is None:
+            return 0.0
+        radius_m = 0.5 * float(m_from_mm(self.focal_length_mm)) / self.f_number
+        return float(um_from_m(0.5 * radius_m**2 * (1.0 / distance_m - 1.0 / self.focus_distance_m)))
 
     def grid(self, scene: SceneLike) -> Grid:
         """The sensor-plane grid on which a scene's pixels are imaged, upright and centred on the axis."""
         shape = scene.basis.shape
         return Grid.centred((shape[1], shape[2]), scene.pitch_um * self.magnification(scene.distance_m))
+
+    def image_grids(self, scene: SceneLike) -> list[tuple[Grid, Bools]]:
+        """
+        Grids on which the pixels are imaged, each with the wavelengths that it is of, (n_wavelength,) bool.
+
+        One, unless lateral colour makes images of different sizes: the pixels of a larger image are larger, and no picture is
+        resampled.
+        """
+        grid = self.grid(scene)
+        if self.lateral_colour is None:
+            return [(grid, np.ones(scene.wavelength_nm.size, bool))]
+        sizes = self.lateral_colour.at(scene.wavelength_nm)
+        return [(Grid.centred(grid.shape, grid.pitch_um * float(size)), sizes == size) for size in np.unique(sizes)]
 
     def irradiance_per_radiance(self, distance_m: float) -> float:
         """Irradiance on the axis over the scene's radiance (sr), transmission included."""
@@ -177,7 +260,7 @@ class Optics:
         return PowerMap(data, self.grid(scene), scene.wavelength_nm)
 
     def weighted_maps(
-        self, scene: SceneLike, weights: Floats, *, n_threads: int | None = None
+        self, scene: SceneLike, weights: Floats, *, grid: Grid | None = None, n_threads: int | None = None
     ) -> Iterator[NDArray[Any]]:
         """
         Weighted sums of the power maps of all wavelengths, one after the other.
@@ -187,6 +270,9 @@ class Optics:
         scene : Scene
         weights : (n_output, n_wavelength) float64
             Output c is ``sum_k weights[c, k] * power_map[k]``.
+        grid : Grid, optional
+            One of :meth:`image_grids`, whose wavelengths alone have weights. By default :meth:`grid`: images of other sizes are
+            put on it by the areas that their pixels share with its cells.
         n_threads : int, optional
             All cores by default.
 
@@ -199,67 +285,161 @@ class Optics:
         -----
         Since a sum over wavelengths can be taken before the inverse transform, and the scene is a sum of B basis
         images, the cost is B forward transforms and one inverse transform an output, for any number of wavelengths.
+        Lateral colour costs that for each size of image, and aberrations that differ over the field for each patch.
         """
         weights = np.asarray(weights, dtype=np.float64)
-        cutoff_per_um = 1.0 / (um_from_nm(scene.wavelength_nm) * self.working_f_number(scene.distance_m))
-        cutoff_per_um = np.minimum(cutoff_per_um, MAX_ALIASES / self.grid(scene).pitch_um)
-        self._warn_if_too_small(cutoff_per_um, self.grid(scene))
-        return self._weighted_maps(scene, weights, cutoff_per_um, thread_count(n_threads))
+        self._warn_if_too_small(self._lambda_n_um(scene), self.grid(scene))
+        if grid is not None or self.lateral_colour is None:
+            return self._maps(scene, weights, grid or self.grid(scene), thread_count(n_threads))
+        return self._maps_on_one_grid(scene, weights, thread_count(n_threads))
 
-    def _weighted_maps(
-        self, scene: SceneLike, weights: Floats, cutoff_per_um: Floats, n_threads: int
-    ) -> Iterator[NDArray[Any]]:
-        from foveasim.optics._transform import Transform, source_pixels
+    def _maps_on_one_grid(self, scene: SceneLike, weights: Floats, n_threads: int) -> Iterator[NDArray[Any]]:
+        to = self.grid(scene)
+        groups = self.image_grids(scene)
+        onto = [[overlaps(n, to.pitch_um, n, grid.pitch_um) for n in to.shape] for grid, _ in groups]
+        for output in weights:
+            total = np.zeros(to.shape)
+            for (grid, is_of_it), (along_y, along_x) in zip(groups, onto, strict=True):
+                if np.any(output * is_of_it):
+                    cells = next(self._maps(scene, (output * is_of_it)[np.newaxis], grid, n_threads))
+                    total += (along_x @ (along_y @ cells).T).T
+            yield total.astype(self._real_type())
 
-        grid = self.grid(scene)
-        pad = self.padding_cells
-        if pad is None:
-            pad = math.ceil(REACH_SHARE / LOST_SHARE / (float(cutoff_per_um.min()) * grid.pitch_um))
-        transform = Transform(
-            shape=grid.shape,
-            rows=source_pixels(grid.shape[0], self.padding, pad),
-            columns=source_pixels(grid.shape[1], self.padding, pad),
-            pitch_um=grid.pitch_um,
-            f_max_per_um=float(cutoff_per_um.max()),
+    def _maps(self, scene: SceneLike, weights: Floats, grid: Grid, n_threads: int) -> Iterator[NDArray[Any]]:
+        lambda_n_um = self._lambda_n_um(scene)
+        aperture = self._aperture(scene.distance_m)
+        is_clear_circle = self._is_clear_circle(aperture)
+        if is_clear_circle:
+            lambda_n_um = np.maximum(lambda_n_um, grid.pitch_um / MAX_ALIASES)
+        share = np.array([aperture.transmittance(float(w)) for w in scene.wavelength_nm])
+        light_w_m2 = (
+            scene.spectrum_w_m2_sr_nm * scene.band_width_nm * share * self.irradiance_per_radiance(scene.distance_m)
+        )
+        tangent2_x, tangent2_y = self._squared_tangents(scene)
+        imaging = Imaging(
+            basis=scene.basis,
+            light_w_m2=light_w_m2 * (scene.pitch_um * self.magnification(scene.distance_m) / grid.pitch_um) ** 2,
+            weights=weights,
+            tangent2_x=tangent2_x,
+            tangent2_y=tangent2_y,
+            falloff_power=4 if self.emission == "lambertian" else 3,
+            grid=grid,
+            padding=self.padding,
+            pad=self._pad(scene, grid, aperture, lambda_n_um),
+            f_max_per_um=1.0 / float(lambda_n_um.min()),
             sinc_power=1 if self.source_pixel == "point" else 2,
             real=self._real_type(),
             n_threads=n_threads,
         )
-        table_of = RadialTables(cutoff_per_um, self._real_type())
-        light = scene.spectrum_w_m2_sr_nm * scene.band_width_nm * self.irradiance_per_radiance(scene.distance_m)
-        is_needed = np.array([[bool(np.any(output * spectrum)) for spectrum in light] for output in weights], bool)
-        spectra: dict[int, NDArray[Any]] = {}
-        for c, output in enumerate(weights):
-            total: NDArray[Any] | None = None
-            for b in (int(b) for b in np.flatnonzero(is_needed[c])):
-                if b not in spectra:
-                    spectra[b] = transform.forward(
-                        scene.basis[b], *self._squared_tangents(scene), self._falloff_power()
-                    )
-                # The last use of a spectrum may overwrite it.
-                is_last_use = not is_needed[c + 1 :, b].any()
-                is_first_term = total is None
-                if total is None:
-                    total = spectra[b] if is_last_use else np.empty_like(spectra[b])
-                transform.multiply(spectra[b], *table_of(output * light[b]), total, is_added=not is_first_term)
-                if is_last_use:
-                    del spectra[b]
-            yield np.zeros(grid.shape, self._real_type()) if total is None else transform.inverse(total)
+        if is_clear_circle:
+            return imaging.maps(RadialTables(1.0 / lambda_n_um, self._real_type()))
+
+        def tables_at(field_um: tuple[float, float]) -> Tables:
+            key = scene.wavelength_nm.tobytes(), scene.distance_m, field_um
+
+            def made() -> PlaneTables:
+                return PlaneTables(aperture, scene.wavelength_nm, lambda_n_um, field_um, self._real_type())
+
+            return self._cache.prepared(key, made, imaging.sums())
+
+        if not self._is_varying():
+            return imaging.maps(tables_at((0.0, 0.0)))
+        return patchwork(imaging, (self.field_patches, self.field_patches), tables_at)
+
+    def patchwork_error(self, scene: SceneLike) -> float:
+        """
+        Largest share of a point's light that the patchwork puts in a wrong place.
+
+        Half the integral of the difference between the pattern half-way between patches and the mean of theirs: the pattern of
+        a point is exact in the middle of a patch, and for patterns that change smoothly no point errs by more. It falls with
+        the square of ``field_patches``. Of a single patch: the same between the corners of the picture and its middle.
+
+        Parameters
+        ----------
+        scene : Scene
+
+        Returns
+        -------
+        share : float
+            The largest over the wavelengths and the neighbouring patches; 0 where the pattern is the same everywhere.
+        """
+        if not self._is_varying():
+            return 0.0
+        aperture, n = self._aperture(scene.distance_m), self.field_patches
+        return max(
+            patchwork_error(aperture, self.grid(scene), (n, n), float(wave_nm), float(near_um))
+            for wave_nm, near_um in zip(scene.wavelength_nm, self._lambda_n_um(scene), strict=True)
+        )
+
+    def _point(self, wavelength_nm: float, distance_m: float | None, field_um: tuple[float, float]) -> Point:
+        wave_nm = float(wavelengths_nm("wavelength_nm", check_number("wavelength_nm", wavelength_nm))[0])
+        if distance_m is None:
+            distance_m = float("inf") if self.focus_distance_m is None else self.focus_distance_m
+        if distance_m != float("inf"):
+            distance_m = self._check_distance("distance_m", distance_m)
+        place = finite_array("field_um", field_um, ndim=1)
+        if place.size != 2:
+            raise ParameterError("field_um", "must be two numbers (x, y)", field_um, "µm")
+        n = self.f_number * self._image_distance_mm(distance_m) / self.focal_length_mm
+        aperture = self._aperture(distance_m)
+        return Point(
+            aperture=aperture,
+            is_clear_circle=self._is_clear_circle(aperture),
+            wavelength_nm=wave_nm,
+            lambda_n_um=float(um_from_nm(wave_nm)) * n,
+            field_um=(float(place[0]), float(place[1])),
+        )
 
     # -- parts ----------------------------------------------------------------------------------------------------
+
+    def _pupils(self) -> tuple[Pupil, ...]:
+        if self.pupil is None:
+            return ()
+        return tuple(self.pupil) if isinstance(self.pupil, Sequence) else (self.pupil,)
+
+    def _aperture(self, distance_m: float) -> Aperture:
+        wavefronts: list[Wavefront] = [part for part in (self.zernike, self.seidel) if part is not None]
+        return self._cache.aperture(
+            distance_m, lambda: Aperture(self._pupils(), wavefronts, self._defocus_um(distance_m))
+        )
+
+    def _is_varying(self) -> bool:
+        return self.seidel is not None and self.seidel.is_varying
+
+    @staticmethod
+    def _is_clear_circle(aperture: Aperture) -> bool:
+        return not aperture.pupils and not aperture.wavefronts and aperture.defocus_um == 0.0
+
+    def _lambda_n_um(self, scene: SceneLike) -> Floats:
+        return np.asarray(um_from_nm(scene.wavelength_nm) * self.working_f_number(scene.distance_m))
+
+    def _pad(self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats) -> int:
+        if self.padding_cells is not None:
+            return self.padding_cells
+        half_x_um, half_y_um = (0.5 * n * grid.pitch_um for n in grid.shape[::-1])
+        places_um = [
+            (0.0, 0.0),
+            *((sx * half_x_um, sy * half_y_um) for sx in (-1, 1) for sy in (-1, 1) if self._is_varying()),
+        ]
+        return max(
+            reach_cells(LOST_SHARE, float(near_um), aperture.blur_lambda_n(float(wave_nm), place_um), grid.pitch_um)
+            for wave_nm, near_um in zip(scene.wavelength_nm, lambda_n_um, strict=True)
+            for place_um in places_um
+        )
 
     def _real_type(self) -> type[np.floating[Any]]:
         return np.float32 if self.precision == "single" else np.float64
 
-    def _warn_if_too_small(self, cutoff_per_um: Floats, grid: Grid) -> None:
+    def _warn_if_too_small(self, lambda_n_um: Floats, grid: Grid) -> None:
         """Warn where the paper's Eq. 5, a >> H λ / (p0 min(M, N)), does not hold."""
         # On the sensor side the ratio of its two sides is min(M, N) p / (2 λ N).
-        ratio = 0.5 * min(grid.shape) * grid.pitch_um * float(cutoff_per_um.min())
+        widest_um = float(max(lambda_n_um.max(), grid.pitch_um / MAX_ALIASES))
+        ratio = 0.5 * min(grid.shape) * grid.pitch_um / widest_um
         if ratio < MUCH_LARGER:
             height, width = (n * grid.pitch_um for n in grid.shape)
             warnings.warn(
                 f"the image of the scene is only {width:.4g} x {height:.4g} µm, and the lens spreads a point over "
-                f"{2.44 / float(cutoff_per_um.min()):.3g} µm: the paper's Eq. 5 wants the aperture's radius to be much "
+                f"{2.44 * widest_um:.3g} µm: the paper's Eq. 5 wants the aperture's radius to be much "
                 f"larger than H λ / (p0 min(M, N)), and it is {ratio:.3g} times that; take a larger picture or a smaller "
                 "f-number, and see that pitch_um, distance_m and focal_length_mm are in their units",
                 SamplingWarning,
@@ -271,6 +451,3 @@ class Optics:
         _, n_y, n_x = scene.basis.shape
         step = float(m_from_um(scene.pitch_um)) / scene.distance_m
         return ((np.arange(n_x) - 0.5 * (n_x - 1)) * step) ** 2, ((np.arange(n_y) - 0.5 * (n_y - 1)) * step) ** 2
-
-    def _falloff_power(self) -> int:
-        return 4 if self.emission == "lambertian" else 3

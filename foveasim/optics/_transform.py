@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from foveasim.arrays import Floats, Images, Ints
 from foveasim.compiled import kernels
 from foveasim.errors import SimulationError
+from foveasim.optics.otf import MAX_ALIASES
 from foveasim.parallel import each
 
 __all__ = ["Transform", "source_pixels"]
@@ -69,10 +70,10 @@ class Transform:
         real: type[np.floating[Any]],
         n_threads: int,
     ) -> None:
-        self._shape, self._rows, self._columns = shape, rows, columns
+        self.shape, self._rows, self._columns = shape, rows, columns
         self._real, self._n_threads = real, n_threads
         self._kernels = kernels("optics")  # once, before there are threads
-        self._n_alias = max(0, math.ceil(f_max_per_um * pitch_um - 0.5))
+        self._n_alias = min(MAX_ALIASES, max(0, math.ceil(f_max_per_um * pitch_um - 0.5)))
         self._pitch_um, self._sinc_power = pitch_um, sinc_power
         n_near = self._n_alias if self._n_alias <= DIRECT_ALIASES else 0
         k = np.arange(-n_near, n_near + 1)[:, np.newaxis]
@@ -83,33 +84,43 @@ class Transform:
         self._n_columns = cycles_x.shape[1]
         self._fx_per_um, self._fy_per_um = (cycles_x / pitch_um).astype(real), (cycles_y / pitch_um).astype(real)
         self._gain_x, self._gain_y = ((np.sinc(c) ** sinc_power).astype(real) for c in (cycles_x, cycles_y))
-        self._cycles_x, self._cycles_y = np.abs(cycles_x[n_near]), np.abs(cycles_y[n_near])
+        self._cycles_x, self._cycles_y = cycles_x[n_near], cycles_y[n_near]
 
-    def _far_aliases(self, table: NDArray[Any], per_step: float) -> tuple[Images, Images]:
+    def _far_aliases(self, table: NDArray[Any], per_step: float) -> tuple[NDArray[Any], NDArray[Any]]:
         """
         Aliases beyond the frequency itself as a sum of products, (n_rank, n_x) and (n_rank, n_y), when they are many.
 
-        Within half a cycle per cell their sum is smooth and even, so that a few Chebyshev polynomials hold it.
+        Within half a cycle per cell their sum is smooth, so that a few Chebyshev polynomials hold it; that of a radial table is
+        even too, and half the range does.
         """
         if self._n_alias <= DIRECT_ALIASES:
-            return np.zeros((0, self._cycles_x.size), self._real), np.zeros((0, self._cycles_y.size), self._real)
-        nodes = np.polynomial.chebyshev.chebpts1(ALIAS_NODES)
-        at_nodes = self._kernels.alias_sum(
-            table.astype(np.float64), per_step / self._pitch_um, 0.25 * (nodes + 1.0), self._n_alias, self._sinc_power
+            return np.zeros((0, self._cycles_x.size), table.dtype), np.zeros((0, self._cycles_y.size), table.dtype)
+        is_radial = table.ndim == 1
+        n_nodes = ALIAS_NODES if is_radial else 2 * ALIAS_NODES
+        sums = self._kernels.alias_sum if is_radial else self._kernels.alias_sum_plane
+        nodes = np.polynomial.chebyshev.chebpts1(n_nodes)
+        at_nodes = sums(
+            table.astype(np.float64 if is_radial else np.complex128),
+            per_step / self._pitch_um,
+            0.25 * (nodes + 1.0) if is_radial else 0.5 * nodes,
+            self._n_alias,
+            self._sinc_power,
         )
         y_modes, sizes, x_modes = np.linalg.svd(at_nodes)
-        rank = int(np.searchsorted(-sizes, -ALIAS_ACCURACY * max(float(table[0]), 0.0)))
-        to_coefficients = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, ALIAS_NODES - 1))
+        zero = table[0] if is_radial else table[table.shape[0] // 2, table.shape[0] // 2]
+        rank = int(np.searchsorted(-sizes, -ALIAS_ACCURACY * max(float(zero.real), 0.0)))
+        to_coefficients = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, n_nodes - 1))
 
-        def at(cycles: Floats, modes: Floats) -> Images:
-            polynomials = np.polynomial.chebyshev.chebvander(4.0 * cycles - 1.0, ALIAS_NODES - 1)
-            return np.ascontiguousarray((polynomials @ (to_coefficients @ modes)).T.astype(self._real))
+        def at(cycles: Floats, modes: NDArray[Any]) -> NDArray[Any]:
+            place = 4.0 * np.abs(cycles) - 1.0 if is_radial else 2.0 * cycles
+            polynomials = np.polynomial.chebyshev.chebvander(place, n_nodes - 1)
+            return np.ascontiguousarray((polynomials @ (to_coefficients @ modes)).T.astype(table.dtype))
 
         far_x = at(self._cycles_x, x_modes[:rank].T)
         far_y = at(self._cycles_y, y_modes[:, :rank] * sizes[:rank])
         # At zero frequency every alias has the factor 0: one more product takes off what the polynomials leave there,
         # so that no light is lost or made.
-        dc_x, dc_y = np.zeros((1, far_x.shape[1]), self._real), np.zeros((1, far_y.shape[1]), self._real)
+        dc_x, dc_y = np.zeros((1, far_x.shape[1]), table.dtype), np.zeros((1, far_y.shape[1]), table.dtype)
         dc_x[0, 0], dc_y[0, 0] = 1.0, -(far_x[:, 0] @ far_y[:, 0])
         return np.concatenate((far_x, dc_x)), np.concatenate((far_y, dc_y))
 
@@ -122,7 +133,7 @@ class Transform:
 
     def forward(self, image: Images, x2: Floats, y2: Floats, falloff_power: int) -> NDArray[Any]:
         """Spectrum of a picture with falloff and padding."""
-        n_y, n_x = self._shape
+        n_y, n_x = self.shape
         top, left = (self._rows.size - n_y) // 2, (self._columns.size - n_x) // 2
         spectrum = np.empty((self._rows.size, self._n_columns), np.result_type(self._real, np.complex64))
         x2, y2 = x2.astype(self._real), y2.astype(self._real)
@@ -143,11 +154,17 @@ class Transform:
     def multiply(
         self, spectrum: NDArray[Any], table: NDArray[Any], per_step: float, out: NDArray[Any], *, is_added: bool
     ) -> None:
-        """Write a spectrum times a radial table to ``out``, or add it; ``out`` may be the spectrum."""
+        """
+        Write a spectrum times a transfer function to ``out``, or add it; ``out`` may be the spectrum.
+
+        The table is a radial one (n,) from zero frequency on, or a square (2 n + 1, 2 n + 1) around it, at ``per_step`` steps
+        over the frequency (µm).
+        """
         far_x, far_y = self._far_aliases(table, per_step)
+        kernel = self._kernels.transfer if table.ndim == 1 else self._kernels.transfer_plane
 
         def some_rows(first: int, last: int) -> None:
-            self._kernels.transfer(
+            kernel(
                 spectrum,
                 table,
                 self._real(per_step),
@@ -167,10 +184,10 @@ class Transform:
 
     def inverse(self, spectrum: NDArray[Any]) -> NDArray[Any]:
         """The picture of a spectrum, without its padding; the spectrum is used up."""
-        n_y, n_x = self._shape
+        n_y, n_x = self.shape
         top, left = (self._rows.size - n_y) // 2, (self._columns.size - n_x) // 2
         lines = scipy.fft.ifft(spectrum, axis=0, overwrite_x=True, workers=self._n_threads)
-        image = np.empty(self._shape, self._real)
+        image = np.empty(self.shape, self._real)
 
         def some_rows(first: int, last: int) -> None:
             padded = scipy.fft.irfft(lines[top + first : top + last], n=self._columns.size, axis=1)

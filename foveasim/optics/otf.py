@@ -1,19 +1,29 @@
-"""The transfer function of a clear circular pupil, and radial tables of weighted sums of it."""
+"""Transfer functions: that of a clear circular pupil, and tables of weighted sums of any."""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from collections.abc import Callable, Hashable, Sequence
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim.arrays import Floats
+from foveasim.optics._aperture import Aperture
 
-__all__ = ["RadialTables", "circular_otf"]
+__all__ = ["MAX_ALIASES", "PlaneTables", "RadialTables", "Tables", "circular_otf"]
+
+#: More aliases to a side than this are left out, and of a clear circle the pattern is widened to have no more: 0.3 % of the
+#: light or less goes astray.
+MAX_ALIASES = 128
 
 #: Points of a radial table up to the smallest cut-off; the one of float32 fits the first-level cache. Linear interpolation
 #: errs by at most 2.4e-7 of the value at zero frequency in float32 and 3.0e-8 in float64, next to the cut-off.
 TABLE_POINTS = {np.float32: 1 << 13, np.float64: 1 << 15}
+#: Distances of scenes whose apertures are kept.
+KEPT_APERTURES = 4
 #: Numbers that the tables of all wavelengths may hold together, 128 MiB; beyond that their steps grow.
 MAX_TABLE_SIZE = 1 << 24
 
@@ -41,16 +51,106 @@ def circular_otf(s: ArrayLike) -> Floats:
     return np.asarray((2.0 / np.pi) * (np.arccos(s) - s * np.sqrt(1.0 - s * s)))
 
 
+class Tables(Protocol):
+    """Transfer functions of weighted sums of wavelengths, as :class:`foveasim.optics._transform.Transform` takes them."""
+
+    def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
+        """Table of ``sum_k weight[k] * OTF_k``, and its steps over frequency (µm)."""
+
+
 class RadialTables:
-    """Makes tables of ``sum_k weight[k] * OTF_k(|f|)`` over ``|f|`` at equal steps, the last one beyond every cut-off."""
+    """Those of a clear circle in focus: over ``|f|`` at equal steps, the last one beyond every cut-off."""
 
     def __init__(self, cutoff_per_um: Floats, real: type[np.floating[Any]]) -> None:
-        self.f_max_per_um = float(cutoff_per_um.max())
+        f_max_per_um = float(cutoff_per_um.max())
         self._real = real
-        wanted = TABLE_POINTS[real] * float(self.f_max_per_um / cutoff_per_um.min())
+        wanted = TABLE_POINTS[real] * float(f_max_per_um / cutoff_per_um.min())
         n_points = max(TABLE_POINTS[real], int(min(wanted, MAX_TABLE_SIZE / cutoff_per_um.size)))
-        self._otf = circular_otf(np.linspace(0.0, self.f_max_per_um, n_points) / cutoff_per_um[:, np.newaxis])
+        self._otf = circular_otf(np.linspace(0.0, f_max_per_um, n_points) / cutoff_per_um[:, np.newaxis])
+        self._per_step = (n_points - 1) / f_max_per_um
 
     def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
         """The table, and its steps over frequency (µm)."""
-        return (weight @ self._otf).astype(self._real), (self._otf.shape[1] - 1) / self.f_max_per_um
+        return (weight @ self._otf).astype(self._real), self._per_step
+
+
+class PlaneTables:
+    """
+    Those of any aperture, for one point of the field: a square of complex numbers around zero frequency.
+
+    The aperture is sampled anew for each wavelength, so that the steps of all its transfer functions are the same and they
+    simply add up.
+    """
+
+    def __init__(
+        self,
+        aperture: Aperture,
+        wavelength_nm: Floats,
+        lambda_n_um: Floats,
+        field_um: tuple[float, float],
+        real: type[np.floating[Any]],
+    ) -> None:
+        self._aperture, self._field_um, self._real = aperture, field_um, real
+        self._wavelength_nm, self._lambda_n_um = wavelength_nm, lambda_n_um
+        self._kept: dict[bytes, NDArray[Any]] = {}
+
+    @cached_property
+    def _per_step(self) -> float:
+        n_across = np.array([self._aperture.n_across(float(w), self._field_um) for w in self._wavelength_nm])
+        return float((n_across * self._lambda_n_um).max())
+
+    def prepare(self, weights: Sequence[Floats]) -> None:
+        """Make the tables of many sums in one go through the wavelengths, as far as they fit the memory."""
+        n_lags = math.ceil(self._per_step / float(self._lambda_n_um.min()))
+        n_kept = max(1, MAX_TABLE_SIZE // (2 * n_lags + 1) ** 2)
+        weights = [w for w in weights if w.tobytes() not in self._kept][:n_kept]
+        if len(self._kept) + len(weights) > n_kept:
+            self._kept.clear()
+        if not weights:
+            return
+        sums = np.zeros((len(weights), 2 * n_lags + 1, 2 * n_lags + 1), np.result_type(self._real, np.complex64))
+        for k in np.flatnonzero(np.any(weights, axis=0)):
+            n_across = self._per_step / float(self._lambda_n_um[k])
+            otf = self._aperture.transfer(float(self._wavelength_nm[k]), n_across, n_lags, self._field_um, self._real)
+            for i, weight in enumerate(weights):
+                if weight[k]:
+                    sums[i] += self._real(weight[k]) * otf
+        self._kept |= {weight.tobytes(): total for weight, total in zip(weights, sums, strict=True)}
+
+    def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
+        """The table, and its steps over frequency (µm)."""
+        if weight.tobytes() not in self._kept:
+            self.prepare([weight])
+        return self._kept[weight.tobytes()], self._per_step
+
+    @property
+    def size(self) -> int:
+        """Numbers that it keeps."""
+        return sum(table.size for table in self._kept.values())
+
+
+class TableCache:
+    """What a lens made before, up to a size in memory: the frames of a video need the same. It is never pickled."""
+
+    def __init__(self) -> None:
+        self._made: dict[Hashable, PlaneTables] = {}
+        self._apertures: dict[float, Aperture] = {}
+
+    def __reduce__(self) -> tuple[type[TableCache], tuple[()]]:
+        return TableCache, ()
+
+    def aperture(self, distance_m: float, made: Callable[[], Aperture]) -> Aperture:
+        """The aperture that a scene at a distance sees; the ones used last are kept."""
+        self._apertures[distance_m] = self._apertures.pop(distance_m) if distance_m in self._apertures else made()
+        while len(self._apertures) > KEPT_APERTURES:
+            del self._apertures[next(iter(self._apertures))]
+        return self._apertures[distance_m]
+
+    def prepared(self, key: Hashable, made: Callable[[], PlaneTables], weights: Sequence[Floats]) -> PlaneTables:
+        """The tables of a key, with those of some weighted sums; the ones used last are kept."""
+        tables = self._made.pop(key, None) or made()
+        tables.prepare(weights)
+        self._made[key] = tables
+        while len(self._made) > 1 and sum(t.size for t in self._made.values()) > 2 * MAX_TABLE_SIZE:
+            del self._made[next(iter(self._made))]
+        return tables

@@ -1,0 +1,273 @@
+"""
+The light in the aperture, sampled, and the transfer functions and patterns that it makes.
+
+The amplitude ``P(r)`` in the aperture of radius a makes at the point x of the sensor, at the image distance D, the amplitude
+``∫ P(r) exp(-2πi x·r / (λD)) dr``; the transfer function is the normalised autocorrelation of P, at lags ``λ D f``.
+In units of the aperture's radius, with the image-side f-number ``N = D / 2a``, the lag is ``2 λN f``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from foveasim.arrays import Bools, Floats
+from foveasim.errors import ParameterError
+from foveasim.optics.pupils import Annulus, Blades, Pupil, PupilImage, Slit, Spider
+from foveasim.units import um_from_nm
+
+__all__ = ["Aperture", "Wavefront"]
+
+#: Samples across the aperture when the pupil's shape alone spreads the light: its transfer function is right to 4e-4 ...
+MIN_ACROSS = 192
+#: ... and so many for each λN by which aberrations throw the light aside: at that distance the pattern has 1.3 % too little.
+ACROSS_PER_BLUR = 16
+#: More samples than this are refused: the light would be thrown over 250 λN.
+MAX_ACROSS = 2048
+#: Points across the aperture at which a pupil's shape is looked up, odd so that edges at simple fractions lie between them.
+FINE = 1535
+#: Points across the aperture at which slopes of the wavefront are looked for.
+SLOPE_POINTS = 193
+#: An aperture that lets less than this share of the power through is closed.
+CLOSED = 1e-9
+
+
+class Wavefront(Protocol):
+    """An aberration: path differences in µm at points of the aperture, in its radius."""
+
+    def wavefront_um(self, x: Floats, y: Floats, wavelength_nm: float, field_um: tuple[float, float]) -> Floats:
+        """Path differences for a point of the image at ``field_um`` (x, y) on the sensor."""
+
+
+def overlaps(n_to: int, to_step: float, n_from: int, from_step: float) -> Any:
+    """Shares of the cells of one centred line of cells in the cells of another, a sparse (n_to, n_from) matrix."""
+    from scipy.sparse import diags_array
+
+    to_edges = (np.arange(n_to + 1) - 0.5 * n_to) * to_step
+    from_edges = (np.arange(n_from + 1) - 0.5 * n_from) * from_step
+    cuts = np.unique(np.concatenate((to_edges, from_edges)))
+    middles, lengths = 0.5 * (cuts[1:] + cuts[:-1]), np.diff(cuts)
+    row = np.searchsorted(to_edges, middles) - 1
+    column = np.searchsorted(from_edges, middles) - 1
+    is_both = (row >= 0) & (row < n_to) & (column >= 0) & (column < n_from)
+    from scipy.sparse import coo_array
+
+    shares = coo_array((lengths[is_both], (row[is_both], column[is_both])), shape=(n_to, n_from))
+    return diags_array(np.full(n_to, 1.0 / to_step)) @ shares.tocsr()
+
+
+@dataclass(frozen=True, eq=False)
+class Aperture:
+    """
+    Everything that shapes the light in the aperture.
+
+    Attributes
+    ----------
+    pupils : sequence of callables
+        Their amplitudes are multiplied; outside the unit circle it is dark.
+    wavefronts : sequence of Wavefront
+        Their path differences add up.
+    defocus_um : float, µm
+        Path difference at the aperture's edge, growing with the square of the radius.
+    """
+
+    pupils: Sequence[Pupil]
+    wavefronts: Sequence[Wavefront]
+    defocus_um: float
+
+    @cached_property
+    def is_grey(self) -> bool:
+        """Whether every pupil is known to be the same in all colours."""
+        plain = (Annulus, Blades, Slit, Spider)
+        return all(isinstance(p, plain) or (isinstance(p, PupilImage) and p.wavefront_um is None) for p in self.pupils)
+
+    @cached_property
+    def _kept(self) -> dict[Any, Any]:
+        """What was computed before: the last shape, and of every wavelength its transmittance and slope."""
+        return {}
+
+    def _shape(self, wavelength_nm: float, n: int) -> NDArray[Any]:
+        """Amplitudes (n, n) at points of the square around the aperture."""
+        key = "shape", 0.0 if self.is_grey else wavelength_nm, n
+        if self._kept.get("shape of", None) != key:
+            at: Floats = np.asarray((np.arange(n) + 0.5) * (2.0 / n) - 1.0, np.float64)
+            x, y = at[np.newaxis, :], at[:, np.newaxis]
+            disc = x * x + y * y <= 1.0
+            shape: NDArray[Any] = disc.astype(np.float64)
+            for i, pupil in enumerate(self.pupils):
+                shape = shape * self._amplitudes(i, pupil, x, y, wavelength_nm, disc)
+            self._kept["shape of"], self._kept["shape"] = key, shape
+        return np.asarray(self._kept["shape"])
+
+    def _amplitudes(
+        self, i: int, pupil: Pupil, x: Floats, y: Floats, wavelength_nm: float, disc: Bools
+    ) -> NDArray[Any]:
+        name = "pupil" if len(self.pupils) == 1 else f"pupil[{i}]"
+        values = np.asarray(pupil(x, y, wavelength_nm))
+        if values.dtype.kind not in "biufc":
+            raise ParameterError(name, f"must give real or complex amplitudes, got the type {values.dtype}")
+        try:
+            values = np.where(disc, values, 0.0)
+        except ValueError:
+            raise ParameterError(
+                name, f"must give an amplitude for each of the points x and y, got the shape {values.shape}"
+            ) from None
+        highest = float(np.abs(values).max())
+        if not highest <= 1.0 + 1e-9:
+            raise ParameterError(name, f"must give amplitudes of at most 1 at {wavelength_nm:g} nm", highest)
+        return values
+
+    def _share_and_slope(self, wavelength_nm: float) -> tuple[float, float]:
+        """Share of the power that the shape passes, and its own phase's slope in waves for the aperture's radius."""
+        key = 0.0 if self.is_grey else wavelength_nm
+        if key not in self._kept:
+            shape = self._shape(wavelength_nm, FINE)
+            at = (np.arange(FINE) + 0.5) * (2.0 / FINE) - 1.0
+            share = float(np.sum(np.abs(shape) ** 2) / np.count_nonzero(at**2 + at[:, np.newaxis] ** 2 <= 1.0))
+            if share < CLOSED:
+                raise ParameterError("pupil", f"is empty: no light of {wavelength_nm:g} nm passes it")
+            slope = 0.0
+            for a, b in ((shape[1:], shape[:-1]), (shape[:, 1:], shape[:, :-1])) if np.iscomplexobj(shape) else ():
+                turn = np.abs(np.angle(a * np.conj(b)))[(a != 0.0) & (b != 0.0)]
+                # A jump is diffraction, no slope: that is what all but a few points keep below.
+                slope += float(np.quantile(turn, 0.99)) / (2.0 * np.pi) * 0.5 * FINE if turn.size else 0.0
+            self._kept[key] = share, slope
+        share, slope = self._kept[key]
+        return share, slope
+
+    def transmittance(self, wavelength_nm: float) -> float:
+        """
+        Power that passes over the power that would pass the clear circle.
+
+        Raises
+        ------
+        ParameterError
+            When it is none.
+        """
+        return self._share_and_slope(wavelength_nm)[0] if self.pupils else 1.0
+
+    def path_um(self, x: Floats, y: Floats, wavelength_nm: float, field_um: tuple[float, float]) -> Floats:
+        """The whole wavefront in µm at points of the aperture."""
+        total_um = self.defocus_um * (x * x + y * y)
+        for part in self.wavefronts:
+            total_um = total_um + part.wavefront_um(x, y, wavelength_nm, field_um)
+        return np.asarray(total_um)
+
+    def blur_lambda_n(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
+        """How far geometry throws the light from the image point, in units of λN: twice the wavefront's slope in waves."""
+        slope = self._share_and_slope(wavelength_nm)[1] if self.pupils else 0.0
+        key = wavelength_nm, field_um
+        if (self.wavefronts or self.defocus_um) and key not in self._kept:
+            at = np.linspace(-1.0, 1.0, SLOPE_POINTS)
+            x, y = at[np.newaxis, :], at[:, np.newaxis]
+            step_waves = (at[1] - at[0]) * float(um_from_nm(wavelength_nm))
+            dy, dx = np.gradient(self.path_um(x, y, wavelength_nm, field_um) / step_waves)
+            self._kept[key] = float(np.hypot(dx, dy)[x * x + y * y <= 1.0].max())
+        return 2.0 * (slope + float(self._kept.get(key, 0.0)))
+
+    def n_across(self, wavelength_nm: float, field_um: tuple[float, float]) -> int:
+        """
+        Samples across the aperture that its transfer function needs.
+
+        Raises
+        ------
+        ParameterError
+            When the light is thrown over more than the largest transform holds.
+        """
+        blur = self.blur_lambda_n(wavelength_nm, field_um)
+        if blur * ACROSS_PER_BLUR > MAX_ACROSS:
+            raise ParameterError(
+                "aberrations",
+                f"throw light of {wavelength_nm:g} nm {blur:.0f} times λN aside, more than {MAX_ACROSS // ACROSS_PER_BLUR}",
+                cure="see that coefficients are in their unit and focus_distance_m is in m; diffraction plays no "
+                "part in such a blur, and a picture that was blurred beforehand does as well",
+            )
+        return max(MIN_ACROSS, math.ceil(blur * ACROSS_PER_BLUR))
+
+    def samples(
+        self, wavelength_nm: float, n_across: float, field_um: tuple[float, float]
+    ) -> tuple[NDArray[np.complex128], Floats, float]:
+        """
+        Amplitudes at points of the aperture.
+
+        Parameters
+        ----------
+        n_across : float
+            Samples over the diameter, not necessarily a whole number.
+
+        Returns
+        -------
+        amplitude : (n, n) complex128
+            Means of the pupil's shape over squares around the points, with the wavefront's phase at the points.
+        at : (n,) float64
+            The points along either axis, in aperture radii.
+        power : float
+            Sum of the squares that finer samples would have.
+        """
+        n = math.ceil(n_across)
+        pitch = 2.0 / n_across
+        fine = self._shape(wavelength_nm, max(FINE, n))
+        mean = overlaps(n, pitch, fine.shape[0], 2.0 / fine.shape[0])
+        amplitude = mean @ (mean @ fine).T
+        at: Floats = np.asarray((np.arange(n) - 0.5 * (n - 1)) * pitch, np.float64)
+        amplitude = amplitude.T * np.exp(
+            2j
+            * np.pi
+            / float(um_from_nm(wavelength_nm))
+            * self.path_um(at[np.newaxis, :], at[:, np.newaxis], wavelength_nm, field_um)
+        )
+        return amplitude, at, self.transmittance(wavelength_nm) * np.pi / pitch**2
+
+    def transfer(
+        self,
+        wavelength_nm: float,
+        n_across: float,
+        n_lags: int,
+        field_um: tuple[float, float],
+        real: type[np.floating[Any]],
+    ) -> NDArray[np.complexfloating[Any]]:
+        """
+        Transfer function at lags of whole samples: its autocorrelation, normalised.
+
+        Returns
+        -------
+        otf : (2 n_lags + 1, 2 n_lags + 1) complex64 or complex128
+            At frequencies ``k / (n_across λN)``, k from -n_lags to n_lags, rows along y.
+        """
+        amplitude, _, power = self.samples(wavelength_nm, n_across, field_um)
+        n = amplitude.shape[0]
+        size = scipy.fft.next_fast_len(2 * n)
+        complex_type = np.result_type(real, np.complex64)
+        wave = scipy.fft.fft2(amplitude.astype(complex_type), (size, size), overwrite_x=True)
+        pattern = wave.real**2 + wave.imag**2
+        otf = scipy.fft.fft2(pattern, overwrite_x=True)
+        otf /= size * size * power
+        k = min(n_lags, n - 1)
+        whole = np.zeros((2 * n_lags + 1, 2 * n_lags + 1), complex_type)
+        lags = np.arange(-k, k + 1)
+        whole[n_lags - k : n_lags + k + 1, n_lags - k : n_lags + k + 1] = otf[np.ix_(lags, lags)]
+        whole[n_lags, n_lags] = 1.0  # no light is lost
+        return whole
+
+    def pattern_per_um2(
+        self, wavelength_nm: float, lambda_n_um: float, x_um: Floats, y_um: Floats, field_um: tuple[float, float]
+    ) -> Floats:
+        """Share of a point's light in a µm² at the points (y, x) of a rectangle, (n_y, n_x)."""
+        reach = 2.0 * max(np.abs(x_um).max(), np.abs(y_um).max()) / lambda_n_um
+        n_across = max(self.n_across(wavelength_nm, field_um), min(MAX_ACROSS, math.ceil(4.0 * reach)))
+        amplitude, at, power = self.samples(wavelength_nm, n_across, field_um)
+        wave_y, wave_x = (np.exp(-1j * np.pi / lambda_n_um * np.outer(u, at)) for u in (y_um, x_um))
+        field = wave_y @ amplitude @ wave_x.T
+        return np.asarray(np.abs(field) ** 2 / power / (n_across * lambda_n_um) ** 2)
+
+    def strehl(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
+        """Height of the pattern's middle over that of the same aperture without any phase."""
+        amplitude, _, _ = self.samples(wavelength_nm, self.n_across(wavelength_nm, field_um), field_um)
+        return float(np.abs(amplitude.sum()) ** 2 / np.abs(amplitude).sum() ** 2)

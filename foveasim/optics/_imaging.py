@@ -1,0 +1,245 @@
+"""
+From a scene's basis images to maps of light: one forward transform an image, one inverse transform a map.
+
+Where aberrations differ over the field, the picture is cut into overlapping patches, each fading linearly into the next, and
+every patch has the pattern of its own middle (overlap-add): in between the pattern is interpolated linearly.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.arrays import Bools, Floats, Images, Ints
+from foveasim.fields import Grid
+from foveasim.optics._aperture import Aperture
+from foveasim.optics._transform import Transform, source_pixels
+from foveasim.optics.otf import Tables
+
+__all__ = ["Imaging", "patchwork", "patchwork_error", "reach_cells"]
+
+#: Patterns of neighbouring patches are compared at so many points along either axis, so far beyond what geometry throws aside.
+COMPARED_POINTS, COMPARED_LAMBDA_N = 257, 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Imaging:
+    """
+    What maps are made from.
+
+    Attributes
+    ----------
+    basis : (n_basis, n_y, n_x)
+    light_w_m2 : (n_basis, n_wavelength)
+        Irradiance on the axis that the value 1 of an image makes in each band, W/m².
+    weights : (n_output, n_wavelength)
+    tangent2_x, tangent2_y : (n_x,), (n_y,)
+        Squares of the tangents of the angles to the axis.
+    falloff_power : int
+        Of the cosine.
+    grid : Grid
+    padding : str
+    pad : int
+        Cells of padding on each side, at least.
+    f_max_per_um : float
+        Highest frequency that passes.
+    sinc_power : int
+        1 for points, 2 for square source pixels.
+    real : float32 or float64
+    n_threads : int
+    """
+
+    basis: Images
+    light_w_m2: Floats
+    weights: Floats
+    tangent2_x: Floats
+    tangent2_y: Floats
+    falloff_power: int
+    grid: Grid
+    padding: str
+    pad: int
+    f_max_per_um: float
+    sinc_power: int
+    real: type[np.floating[Any]]
+    n_threads: int
+
+    def is_needed(self) -> Bools:
+        """Which basis images shine in which output, (n_output, n_basis)."""
+        return np.array(
+            [[bool(np.any(output * light_w_m2)) for light_w_m2 in self.light_w_m2] for output in self.weights], bool
+        )
+
+    def sums(self) -> list[Floats]:
+        """Weights of the wavelengths in all the tables that will be asked for."""
+        return [self.weights[c] * self.light_w_m2[b] for c, b in np.argwhere(self.is_needed())]
+
+    def transform(self, shape: tuple[int, int], padding: str, pad: int) -> Transform:
+        """Transforms of pictures of a size."""
+        return Transform(
+            shape=shape,
+            rows=source_pixels(shape[0], padding, pad),
+            columns=source_pixels(shape[1], padding, pad),
+            pitch_um=self.grid.pitch_um,
+            f_max_per_um=self.f_max_per_um,
+            sinc_power=self.sinc_power,
+            real=self.real,
+            n_threads=self.n_threads,
+        )
+
+    def maps(self, table_of: Tables) -> Iterator[NDArray[Any]]:
+        """Maps with the same pattern all over the field, each computed when it is asked for."""
+        transform = self.transform(self.grid.shape, self.padding, self.pad)
+
+        def spectrum(b: int) -> NDArray[Any]:
+            return transform.forward(self.basis[b], self.tangent2_x, self.tangent2_y, self.falloff_power)
+
+        return self._maps(transform, spectrum, table_of)
+
+    def _maps(
+        self, transform: Transform, spectrum_of: Callable[[int], NDArray[Any]], table_of: Tables
+    ) -> Iterator[NDArray[Any]]:
+        is_needed = self.is_needed()
+        spectra: dict[int, NDArray[Any]] = {}
+        for c, output in enumerate(self.weights):
+            total: NDArray[Any] | None = None
+            for b in (int(b) for b in np.flatnonzero(is_needed[c])):
+                if b not in spectra:
+                    spectra[b] = spectrum_of(b)
+                # The last use of a spectrum may overwrite it.
+                is_last_use = not is_needed[c + 1 :, b].any()
+                is_first_term = total is None
+                if total is None:
+                    total = spectra[b] if is_last_use else np.empty_like(spectra[b])
+                transform.multiply(
+                    spectra[b], *table_of(output * self.light_w_m2[b]), total, is_added=not is_first_term
+                )
+                if is_last_use:
+                    del spectra[b]
+            yield np.zeros(transform.shape, self.real) if total is None else transform.inverse(total)
+
+    def patch_maps(self, patch: _Patch, table_of: Tables) -> Iterator[NDArray[Any]]:
+        """What a patch gives to every map, with ``pad`` cells around it."""
+        n_y, n_x = patch.source_rows.size, patch.source_columns.size
+        transform = self.transform((n_y + 2 * self.pad, n_x + 2 * self.pad), "zero", 0)
+        window = np.outer(patch.fade_rows, patch.fade_columns).astype(self.real)
+        x2, y2 = self.tangent2_x[patch.source_columns], self.tangent2_y[patch.source_rows]
+        window *= ((1.0 + x2 + y2[:, np.newaxis]) ** (-0.5 * self.falloff_power)).astype(self.real)
+        picture = np.zeros(transform.shape, self.real)
+        middle = (slice(self.pad, self.pad + n_y), slice(self.pad, self.pad + n_x))
+        on_axis = np.zeros(transform.shape[1]), np.zeros(transform.shape[0])
+
+        def spectrum(b: int) -> NDArray[Any]:
+            picture[middle] = self.basis[b][np.ix_(patch.source_rows, patch.source_columns)] * window
+            return transform.forward(picture, *on_axis, self.falloff_power)
+
+        return self._maps(transform, spectrum, table_of)
+
+
+@dataclass(frozen=True)
+class _Patch:
+    """A piece of the padded picture: the pixels that it shows, how it fades, where it begins in the picture, its middle."""
+
+    source_rows: Ints
+    source_columns: Ints
+    fade_rows: Floats
+    fade_columns: Floats
+    first_row: int
+    first_column: int
+    middle_um: tuple[float, float]
+
+
+def patchwork(
+    imaging: Imaging, n_patches: tuple[int, int], tables_at: Callable[[tuple[float, float]], Tables]
+) -> Iterator[NDArray[Any]]:
+    """Maps with patterns that differ over the field; all maps are in memory together."""
+    maps = np.zeros((len(imaging.weights), *imaging.grid.shape), imaging.real)
+    n_y, n_x = imaging.grid.shape
+    for patch in _patches(imaging, n_patches):
+        height, width = (n.size + 2 * imaging.pad for n in (patch.source_rows, patch.source_columns))
+        top, left = patch.first_row - imaging.pad, patch.first_column - imaging.pad
+        to = slice(max(top, 0), min(top + height, n_y)), slice(max(left, 0), min(left + width, n_x))
+        if to[0].start >= to[0].stop or to[1].start >= to[1].stop:
+            continue
+        for c, piece in enumerate(imaging.patch_maps(patch, tables_at(patch.middle_um))):
+            maps[c][to] += piece[to[0].start - top : to[0].stop - top, to[1].start - left : to[1].stop - left]
+    yield from maps
+
+
+def patchwork_error(
+    aperture: Aperture, grid: Grid, n_patches: tuple[int, int], wavelength_nm: float, lambda_n_um: float
+) -> float:
+    """Largest share of a point's light astray half-way between patches, or of one patch at the corners of the picture."""
+    node_y_um, node_x_um = _nodes_um(grid, n_patches)
+    if n_patches == (1, 1):
+        half_y_um, half_x_um = (0.5 * n * grid.pitch_um for n in grid.shape)
+        wrong_um = [(sx * half_x_um, sy * half_y_um) for sx in (-1, 1) for sy in (-1, 1)]
+        known_um = [[(0.0, 0.0)]] * 4
+    else:
+        steps = [(y, x) for y in itertools.pairwise(node_y_um) for x in itertools.pairwise(node_x_um)]
+        known_um = [[(float(x), float(y)) for y in ys for x in xs] for ys, xs in steps]
+        wrong_um = [(float(np.mean(xs)), float(np.mean(ys))) for ys, xs in steps]
+    places_um = {place for places in (wrong_um, *known_um) for place in places}
+    reach_um = lambda_n_um * (
+        COMPARED_LAMBDA_N + max(aperture.blur_lambda_n(wavelength_nm, place) for place in places_um)
+    )
+    at_um = np.linspace(-reach_um, reach_um, COMPARED_POINTS)
+    share = {place: aperture.pattern_per_um2(wavelength_nm, lambda_n_um, at_um, at_um, place) for place in places_um}
+    cell_um2 = float(at_um[1] - at_um[0]) ** 2
+    return max(
+        0.5 * cell_um2 * float(np.abs(share[there] - sum(share[node] for node in nodes) / len(nodes)).sum())
+        for there, nodes in zip(wrong_um, known_um, strict=True)
+    )
+
+
+def _nodes_um(grid: Grid, n_patches: tuple[int, int]) -> tuple[Floats, Floats]:
+    """Middles of the patches along y and x: from border to border, or on the axis when there is one."""
+    y, x = (
+        np.linspace(-0.5, 0.5, n) * size * grid.pitch_um if n > 1 else np.zeros(1)
+        for n, size in zip(n_patches, grid.shape, strict=True)
+    )
+    return y, x
+
+
+def _patches(imaging: Imaging, n_patches: tuple[int, int]) -> Iterator[_Patch]:
+    node_y_um, node_x_um = _nodes_um(imaging.grid, n_patches)
+    rows = list(_pieces(imaging, imaging.grid.shape[0], node_y_um))
+    columns = list(_pieces(imaging, imaging.grid.shape[1], node_x_um))
+    for y_um, (source_rows, fade_rows, first_row) in zip(node_y_um, rows, strict=True):
+        for x_um, (source_columns, fade_columns, first_column) in zip(node_x_um, columns, strict=True):
+            yield _Patch(
+                source_rows,
+                source_columns,
+                fade_rows,
+                fade_columns,
+                first_row,
+                first_column,
+                (float(x_um), float(y_um)),
+            )
+
+
+def _pieces(imaging: Imaging, n: int, node_um: Floats) -> Iterator[tuple[Ints, Floats, int]]:
+    """Along one axis, for each node: the picture's pixels that its patch shows, their weights, and where the patch begins."""
+    sources = source_pixels(n, imaging.padding, imaging.pad)
+    first = -((sources.size - n) // 2)
+    half_um = 0.5 * n * imaging.grid.pitch_um
+    at_um = np.clip((first + np.arange(sources.size) + 0.5) * imaging.grid.pitch_um - half_um, -half_um, half_um)
+    for k in range(node_um.size):
+        fade = np.ones(sources.size)
+        if node_um.size > 1:
+            fade = np.interp(at_um, node_um, np.arange(node_um.size) == k)
+        fade = np.where(sources >= 0, fade, 0.0)
+        used = np.flatnonzero(fade > 0.0)
+        low, high = (int(used[0]), int(used[-1]) + 1) if used.size else (0, 1)
+        yield np.maximum(sources[low:high], 0), fade[low:high], first + low
+
+
+def reach_cells(share: float, lambda_n_um: float, blur_lambda_n: float, pitch_um: float) -> int:
+    """Cells from a point's image that hold all but a share of its light: what diffraction throws aside, and geometry."""
+    # Of a clear circle 2 / (π² r) of the light lies beyond the radius r in λN.
+    return math.ceil((2.0 / math.pi**2 / share + blur_lambda_n) * lambda_n_um / pitch_um)

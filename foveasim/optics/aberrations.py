@@ -1,0 +1,289 @@
+"""
+Aberrations: how far the wavefront in the pupil is from the sphere that would meet in a point.
+
+A wavefront ``W(x, y)`` in µm is the optical path difference at points of the aperture, in units of its radius, x to the right
+and y up as in the picture on the sensor. The amplitude there has the phase ``exp(2πi W / λ)``, and light goes to where W
+grows: a positive tilt in y moves a point up, positive coma in y throws its flare up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from foveasim.arrays import Floats, check_choice, check_count, check_number, finite_array, wavelengths_nm
+from foveasim.errors import ParameterError
+from foveasim.units import um_from_nm
+
+__all__ = ["LateralColour", "Seidel", "Zernike", "noll_to_nm", "osa_to_nm", "zernike"]
+
+#: Highest index: radial order 100, whose polynomials are still exact to 1e-12.
+MAX_INDEX = 5151
+
+
+def noll_to_nm(j: int) -> tuple[int, int]:
+    """
+    Radial order n and azimuthal order m (negative for sines) of the Zernike polynomial j = 1, 2, ... in Noll's order.
+
+    R. J. Noll, Zernike polynomials and atmospheric turbulence, J. Opt. Soc. Am. 66 (1976) 207, Table I.
+
+    Examples
+    --------
+    Defocus, coma in y, spherical:
+
+    >>> noll_to_nm(4), noll_to_nm(7), noll_to_nm(11)
+    ((2, 0), (3, -1), (4, 0))
+    """
+    j = check_count("j", j, at_least=1, at_most=MAX_INDEX)
+    n = (math.isqrt(8 * j - 7) - 1) // 2
+    # Within a row |m| rises by two; of a pair the even j is the cosine.
+    k = j - n * (n + 1) // 2
+    m = 2 * (k // 2) if n % 2 == 0 else 2 * ((k - 1) // 2) + 1
+    return n, m if j % 2 == 0 else -m
+
+
+def osa_to_nm(j: int) -> tuple[int, int]:
+    """
+    Radial order n and azimuthal order m (negative for sines) of the Zernike polynomial j = 0, 1, ... in OSA/ANSI order.
+
+    Thibos et al., Standards for reporting the optical aberrations of eyes, J. Refract. Surg. 18 (2002) S652; ANSI Z80.28.
+
+    Examples
+    --------
+    Defocus, coma in y, spherical:
+
+    >>> osa_to_nm(4), osa_to_nm(7), osa_to_nm(12)
+    ((2, 0), (3, -1), (4, 0))
+    """
+    j = check_count("j", j, at_least=0, at_most=MAX_INDEX)
+    n = (math.isqrt(8 * j + 1) - 1) // 2
+    return n, 2 * j - n * (n + 2)
+
+
+def zernike(n: int, m: int, x: ArrayLike, y: ArrayLike) -> Floats:
+    """
+    Zernike polynomial of unit variance over the unit disc.
+
+    Parameters
+    ----------
+    n, m : int
+        Radial and azimuthal order, ``n >= |m|`` of the same parity; sines for negative m.
+    x, y : array
+        Points, in units of the aperture's radius.
+
+    Returns
+    -------
+    value : array, float64
+        ``sqrt(n + 1) R(r)`` for m = 0, else ``sqrt(2 (n + 1)) R(r) cos(m t)`` or ``sin(|m| t)``, as for Noll and OSA/ANSI.
+
+    Raises
+    ------
+    ParameterError
+        When there is no such polynomial.
+
+    Notes
+    -----
+    ``R`` by the Jacobi polynomials, which lose no digits at high orders: Born and Wolf, Principles of Optics, section 9.2.1.
+    """
+    from scipy.special import eval_jacobi
+
+    if n < abs(m) or (n - m) % 2:
+        raise ParameterError("m", f"must be from -n to n = {n} in steps of two", m)
+    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+    r2 = x * x + y * y
+    k = (n - abs(m)) // 2
+    radial = (-1) ** k * eval_jacobi(k, abs(m), 0, 1.0 - 2.0 * r2)
+    if m == 0:
+        return np.asarray(math.sqrt(n + 1) * radial)
+    power = (x + 1j * y) ** abs(m)  # r^|m| times cosine and sine
+    return np.asarray(math.sqrt(2 * (n + 1)) * radial * (power.real if m > 0 else power.imag))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Zernike:
+    """
+    Wavefront as a sum of Zernike polynomials of unit variance, the same all over the field.
+
+    Parameters
+    ----------
+    coefficients : {index: number, or one for each wavelength}
+        RMS wavefront error of each polynomial.
+    index : {"noll", "osa"}
+        What the indices are: Noll's (defocus 4, coma 7 in y and 8 in x, spherical 11), or those of OSA and ANSI (4; 7, 8; 12).
+    unit : {"um", "waves"}
+    wavelength_nm : number or sequence, optional, nm
+        For "waves": the wavelength that they are of; by default each one's own, whatever it is. Where the coefficients are
+        sequences: their wavelengths, rising. In between the wavefront is linear, and constant beyond.
+
+    Raises
+    ------
+    ParameterError
+        When an index does not exist, or numbers and wavelengths do not fit together.
+
+    Examples
+    --------
+    A quarter of a wave of coma that throws light upwards, and defocus that depends on the colour:
+
+    >>> coma = Zernike(coefficients={7: 0.25}, unit="waves", wavelength_nm=550.0)
+    >>> colour = Zernike(coefficients={4: [0.1, 0.0, 0.05]}, wavelength_nm=[450.0, 550.0, 650.0])
+    >>> coma.coefficients_um(550.0)
+    {(3, -1): 0.1375}
+    """
+
+    coefficients: Mapping[int, float | Sequence[float]]
+    index: Literal["noll", "osa"] = "noll"
+    unit: Literal["um", "waves"] = "um"
+    wavelength_nm: float | Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        check_choice("index", self.index, ("noll", "osa"))
+        check_choice("unit", self.unit, ("um", "waves"))
+        if not isinstance(self.coefficients, Mapping) or not self.coefficients:
+            raise ParameterError(
+                "coefficients", "must be numbers by their indices, such as {4: 0.1}", self.coefficients
+            )
+        waves_nm = None if self.wavelength_nm is None else wavelengths_nm("wavelength_nm", self.wavelength_nm)
+        if waves_nm is not None and np.any(np.diff(waves_nm) <= 0.0):
+            raise ParameterError("wavelength_nm", "must rise", self.wavelength_nm, "nm")
+        n_waves = 1 if waves_nm is None else waves_nm.size
+        clean: dict[int, float | tuple[float, ...]] = {}
+        for j, value in self.coefficients.items():
+            self._orders(j)
+            numbers = finite_array(f"coefficients[{j}]", value)
+            if numbers.ndim > 1 or (numbers.ndim == 1 and numbers.size != n_waves):
+                raise ParameterError(
+                    f"coefficients[{j}]", f"must be one number, or one for each of the {n_waves} wavelengths", value
+                )
+            clean[int(j)] = float(numbers) if numbers.ndim == 0 else tuple(numbers.tolist())
+        object.__setattr__(self, "coefficients", clean)
+
+    def _orders(self, j: int) -> tuple[int, int]:
+        try:
+            return noll_to_nm(j) if self.index == "noll" else osa_to_nm(j)
+        except ParameterError as error:
+            rule = str(error).removeprefix(f"'{error.name}' ")
+            raise ParameterError("coefficients", f"has an index that {rule}") from None
+
+    def coefficients_um(self, wavelength_nm: float) -> dict[tuple[int, int], float]:
+        """Coefficients at a wavelength in µm, by the orders (n, m)."""
+        own_um = float(um_from_nm(wavelength_nm))
+        table_nm = None if self.wavelength_nm is None else np.atleast_1d(np.asarray(self.wavelength_nm, np.float64))
+        um = {}
+        for j, value in self.coefficients.items():
+            if table_nm is None:
+                number = float(np.ravel(value)[0]) * (own_um if self.unit == "waves" else 1.0)
+            else:
+                table_um = np.broadcast_to(value, table_nm.shape) * (
+                    um_from_nm(table_nm) if self.unit == "waves" else 1.0
+                )
+                number = float(np.interp(wavelength_nm, table_nm, table_um))
+            um[self._orders(j)] = number
+        return um
+
+    def wavefront_um(self, x: Floats, y: Floats, wavelength_nm: float, field_um: tuple[float, float]) -> Floats:  # noqa: ARG002
+        """Wavefront in µm at points of the aperture."""
+        total_um = np.zeros(np.broadcast(x, y).shape)
+        for (n, m), number_um in self.coefficients_um(wavelength_nm).items():
+            if number_um:
+                total_um += number_um * zernike(n, m, x, y)
+        return total_um
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seidel:
+    """
+    The third-order aberrations of a lens, which grow from the axis to the border of the field.
+
+    At a point of the image at h times ``field_radius_um`` from the axis, in the direction t, and a point of the aperture at the
+    radius r in the direction t + u: ``W = spherical r⁴ + coma h r³ cos u + astigmatism h² r² cos² u + field_curvature h² r²``.
+
+    Parameters
+    ----------
+    spherical_um, coma_um, astigmatism_um, field_curvature_um : float, µm
+        Each one's largest wavefront error: at the edge of the aperture, for a point at ``field_radius_um``.
+    field_radius_um : float, µm
+        Distance from the axis, on the sensor, that the numbers are of.
+
+    Raises
+    ------
+    ParameterError
+        When a value is not finite, or the radius not positive.
+
+    Notes
+    -----
+    W. T. Welford, Aberrations of Optical Systems, chapter 7: the wave aberration coefficients W040, W131, W222, W220. The
+    fifth, distortion, is a lens model of ``foveasim.distortion``.
+    """
+
+    spherical_um: float = 0.0
+    coma_um: float = 0.0
+    astigmatism_um: float = 0.0
+    field_curvature_um: float = 0.0
+    field_radius_um: float = field(default=1000.0)
+
+    def __post_init__(self) -> None:
+        for name in ("spherical_um", "coma_um", "astigmatism_um", "field_curvature_um"):
+            object.__setattr__(self, name, check_number(name, getattr(self, name)))
+        radius_um = check_number("field_radius_um", self.field_radius_um, above=0.0, at_most=1e7)
+        object.__setattr__(self, "field_radius_um", radius_um)
+
+    @property
+    def is_varying(self) -> bool:
+        """Whether the aberrations differ between points of the field."""
+        return any((self.coma_um, self.astigmatism_um, self.field_curvature_um))
+
+    def wavefront_um(self, x: Floats, y: Floats, wavelength_nm: float, field_um: tuple[float, float]) -> Floats:  # noqa: ARG002
+        """Wavefront in µm at points of the aperture, for a point of the image."""
+        hx, hy = (c / self.field_radius_um for c in field_um)
+        r2 = x * x + y * y
+        along = x * hx + y * hy  # h r cos u
+        return np.asarray(
+            self.spherical_um * r2 * r2
+            + self.coma_um * r2 * along
+            + self.astigmatism_um * along * along
+            + self.field_curvature_um * (hx * hx + hy * hy) * r2
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LateralColour:
+    """
+    Images of different sizes in different colours.
+
+    Parameters
+    ----------
+    wavelength_nm : sequence, nm, rising
+    magnification : sequence
+        Size of the image at each wavelength over that of the ideal lens; linear in between, constant beyond.
+
+    Raises
+    ------
+    ParameterError
+        When the sequences do not fit together, or a size differs from 1 by more than a tenth.
+    """
+
+    wavelength_nm: Sequence[float]
+    magnification: Sequence[float]
+
+    def __post_init__(self) -> None:
+        waves_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)
+        sizes = finite_array("magnification", self.magnification, ndim=1)
+        if sizes.shape != waves_nm.shape or np.any(np.diff(waves_nm) <= 0.0):
+            raise ParameterError(
+                "wavelength_nm", "must rise, and be as many as the magnifications", self.wavelength_nm, "nm"
+            )
+        if np.any(np.abs(sizes - 1.0) > 0.1):
+            raise ParameterError(
+                "magnification", "must be from 0.9 to 1.1, relative to the ideal lens", self.magnification
+            )
+        object.__setattr__(self, "wavelength_nm", tuple(waves_nm.tolist()))
+        object.__setattr__(self, "magnification", tuple(sizes.tolist()))
+
+    def at(self, wavelength_nm: Any) -> Floats:
+        """Relative size of the image at wavelengths."""
+        return np.asarray(np.interp(wavelength_nm, self.wavelength_nm, self.magnification))

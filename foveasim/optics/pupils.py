@@ -1,0 +1,226 @@
+"""
+Pupils: the share of the light's amplitude that passes at each point of the aperture.
+
+A pupil is a callable ``T(x, y, wavelength_nm)`` of arrays x, y in units of the aperture's radius, x to the right and y up as
+in the picture on the sensor; it gives real or complex amplitudes (the power is their square). The circle of the f-number
+surrounds it: what lies outside the unit circle is dark.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim.arrays import Bools, Floats, as_numbers, check_choice, check_count, check_number, finite_array, read_only
+from foveasim.errors import ParameterError
+from foveasim.fields import from_file_rows
+from foveasim.pictures import read_picture
+
+__all__ = ["Annulus", "Blades", "Pupil", "PupilImage", "Slit", "Spider"]
+
+#: Amplitudes (real or complex) at points x, y in aperture radii, for a wavelength in nm.
+Pupil = Callable[[Floats, Floats, float], NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Annulus:
+    """
+    Circle with a dark disc in its middle, as of a telescope with a secondary mirror.
+
+    Parameters
+    ----------
+    obscuration : float
+        Radius of the dark disc over that of the aperture, 0 to 1.
+
+    Raises
+    ------
+    ParameterError
+        When it is out of range.
+    """
+
+    obscuration: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(
+            self, "obscuration", check_number("obscuration", self.obscuration, at_least=0.0, at_most=0.999)
+        )
+
+    def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002 -- the form of all pupils
+        """Amplitudes at points of the aperture."""
+        return np.asarray(x * x + y * y >= self.obscuration**2)
+
+
+@dataclass(frozen=True, slots=True)
+class Spider:
+    """
+    Vanes that hold a secondary mirror: straight bars from the axis outwards.
+
+    Parameters
+    ----------
+    n_vanes : int
+    width_fraction : float
+        Width of a vane over the aperture's diameter, 0 to 1.
+    angle_deg : float, degrees
+        Direction of the first vane, counter-clockwise from the x axis.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range.
+    """
+
+    n_vanes: int
+    width_fraction: float
+    angle_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "n_vanes", check_count("n_vanes", self.n_vanes, at_most=360))
+        width = check_number("width_fraction", self.width_fraction, at_least=0.0, at_most=1.0)
+        object.__setattr__(self, "width_fraction", width)
+        object.__setattr__(self, "angle_deg", check_number("angle_deg", self.angle_deg))
+
+    def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002
+        """Amplitudes at points of the aperture."""
+        is_open = np.ones(np.broadcast(x, y).shape, bool)
+        for angle in np.radians(self.angle_deg + 360.0 / self.n_vanes * np.arange(self.n_vanes)):
+            along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+            is_open &= (along < 0.0) | (np.abs(across) > self.width_fraction)
+        return is_open
+
+
+@dataclass(frozen=True, slots=True)
+class Blades:
+    """
+    Regular polygon with its corners on the circle: the iris of a camera lens.
+
+    Parameters
+    ----------
+    n_blades : int
+        At least 3.
+    angle_deg : float, degrees
+        Direction of the first corner, counter-clockwise from the x axis.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range.
+    """
+
+    n_blades: int
+    angle_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "n_blades", check_count("n_blades", self.n_blades, at_least=3, at_most=360))
+        object.__setattr__(self, "angle_deg", check_number("angle_deg", self.angle_deg))
+
+    def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002
+        """Amplitudes at points of the aperture."""
+        is_open = np.ones(np.broadcast(x, y).shape, bool)
+        inner = np.cos(np.pi / self.n_blades)
+        for angle in np.radians(self.angle_deg + 360.0 / self.n_blades * (np.arange(self.n_blades) + 0.5)):
+            is_open &= x * np.cos(angle) + y * np.sin(angle) <= inner
+        return is_open
+
+
+@dataclass(frozen=True, slots=True)
+class Slit:
+    """
+    Straight slit across the circle.
+
+    Parameters
+    ----------
+    width_fraction : float
+        Width over the aperture's diameter, above 0, to 1.
+    angle_deg : float, degrees
+        Direction of the slit's long side, counter-clockwise from the x axis.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range.
+    """
+
+    width_fraction: float
+    angle_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        width = check_number("width_fraction", self.width_fraction, above=0.0, at_most=1.0)
+        object.__setattr__(self, "width_fraction", width)
+        object.__setattr__(self, "angle_deg", check_number("angle_deg", self.angle_deg))
+
+    def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002
+        """Amplitudes at points of the aperture."""
+        angle = np.radians(self.angle_deg)
+        return np.asarray(np.abs(y * np.cos(angle) - x * np.sin(angle)) <= self.width_fraction)
+
+
+@dataclass(frozen=True, eq=False)
+class PupilImage:
+    """
+    Pupil given by a picture, or by measured amplitudes and a wavefront.
+
+    Parameters
+    ----------
+    picture : path, or (n, n) array, the first row on top
+        Transmission, 0 to 1 (of whole numbers up to the type's maximum), over the square around the aperture's circle. The
+        pixels are squares; a colour picture counts by its mean.
+    values : {"amplitude", "power"}
+        Whether a value is the share of the amplitude or of the power (its square) that passes.
+    wavefront_um : (n, n) array, the first row on top, optional, µm
+        Optical path difference at the pixels' centres, interpolated linearly in between: light goes to where it grows.
+
+    Raises
+    ------
+    FileError
+        When the file cannot be read.
+    ParameterError
+        When an array is not square, not finite, or a transmission not from 0 to 1.
+    """
+
+    picture: str | Path | ArrayLike = field(repr=False)
+    values: Literal["amplitude", "power"] = "amplitude"
+    wavefront_um: ArrayLike | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        check_choice("values", self.values, ("amplitude", "power"))
+        is_file = isinstance(self.picture, str | Path)
+        pixels = read_picture(self.picture) if is_file else np.asarray(self.picture)  # type: ignore[arg-type]
+        peak = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else 1.0
+        amplitude = finite_array("picture", pixels, at_least=0.0) / peak
+        if amplitude.ndim not in (2, 3) or amplitude.shape[0] != amplitude.shape[1]:
+            raise ParameterError("picture", f"must be square, got the shape {amplitude.shape}")
+        if amplitude.max(initial=0.0) > 1.0:
+            raise ParameterError("picture", "must be from 0 to 1", float(amplitude.max()))
+        amplitude = from_file_rows(amplitude).mean(axis=0)
+        if self.values == "power":
+            amplitude = np.sqrt(amplitude)
+        object.__setattr__(self, "picture", read_only(np.ascontiguousarray(amplitude[::-1])))
+        object.__setattr__(self, "values", "amplitude")
+        if self.wavefront_um is not None:
+            wavefront_um = finite_array("wavefront_um", self.wavefront_um, ndim=2)
+            if wavefront_um.shape[0] != wavefront_um.shape[1]:
+                raise ParameterError("wavefront_um", f"must be square, got the shape {wavefront_um.shape}")
+            object.__setattr__(self, "wavefront_um", read_only(wavefront_um.copy()))
+
+    def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> NDArray[Any]:
+        """Amplitudes at points of the aperture."""
+        amplitude = as_numbers("picture", self.picture)  # type: ignore[arg-type]
+        n = amplitude.shape[0]
+        row, column = (
+            np.clip(np.floor(0.5 * n * (1.0 + s * c)).astype(np.int64), 0, n - 1) for s, c in ((-1, y), (1, x))
+        )
+        there = amplitude[row, column]
+        if self.wavefront_um is None:
+            return there
+        from scipy.ndimage import map_coordinates
+
+        wavefront_um = as_numbers("wavefront_um", self.wavefront_um)
+        n = wavefront_um.shape[0]
+        rows, columns = np.broadcast_arrays(0.5 * n * (1.0 - y) - 0.5, 0.5 * n * (1.0 + x) - 0.5)
+        path_um = map_coordinates(wavefront_um, [rows, columns], order=1, mode="nearest")
+        return np.asarray(there * np.exp(2j * np.pi * path_um / (1e-3 * wavelength_nm)))
