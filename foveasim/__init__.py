@@ -13,7 +13,7 @@ electrons, electrons get noise, volts become codes::
 
 from __future__ import annotations
 
-from foveasim import distortion, errors, layout, optics, reconstruct, scene, sensor, units, view
+from foveasim import distortion, errors, layout, maps, optics, reconstruct, scene, sensor, units, view
 from foveasim._version import __version__
 from foveasim.camera import Camera
 from foveasim.capture import Capture
@@ -21,6 +21,7 @@ from foveasim.errors import FoveasimError
 from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator
 from foveasim.layout import DesignRules, Layout, read_layout
+from foveasim.maps import read_power_map, write_power_map
 from foveasim.optics import Optics
 from foveasim.reconstruct import Picture
 from foveasim.scene import Scene
@@ -47,12 +48,15 @@ __all__ = [
     "distortion",
     "errors",
     "layout",
+    "maps",
     "optics",
     "read_layout",
+    "read_power_map",
     "reconstruct",
     "rgb_filters",
     "scene",
     "sensor",
     "units",
     "view",
+    "write_power_map",
 ]

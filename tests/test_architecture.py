@@ -23,7 +23,7 @@ FLOORS = [
     {"arrays", "compiled", "files"},
     {"documents", "encodings", "parallel", "pictures", "records", "rings", "streams", "units"},
     {"fields"},
-    {"distortion", "integrate", "layout", "optics", "scene", "sensor"},
+    {"distortion", "integrate", "layout", "maps", "optics", "scene", "sensor"},
     {"reconstruct"},
     {"capture"},
     {"camera"},

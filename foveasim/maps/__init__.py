@@ -1,0 +1,183 @@
+"""
+Light on the sensor from other programs: power maps as files, and as labelled arrays.
+
+==============  ==============================  =====================================================================
+ending          format                          what a file tells
+==============  ==============================  =====================================================================
+.npy            numpy array                     nothing; read only
+.npz            numpy arrays with names         everything, to the last bit
+.fits           FITS image                      everything, to the last bit
+.tif, .tiff     TIFF, a page a band             everything, to the last bit; from others nothing
+.exr            EXR, a channel a band           everything, to the last bit of float32; from others wavelengths and unit
+.nc             netCDF                          everything, to the last bit
+.zarr           zarr folder                     everything, to the last bit
+.mat            optical image of ISETCam        everything; read only
+==============  ==============================  =====================================================================
+
+Files are read by what they hold, whatever their ending. What one does not tell must be said; what is said goes before what
+it tells. A file that is broken, cut short or hostile ends in one :class:`~foveasim.errors.FileError`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from foveasim.errors import FileError, ParameterError
+from foveasim.fields import PowerMap
+from foveasim.files import written_whole
+from foveasim.maps import _dataset, _exr, _fits, _isetcam, _npy, _tiff
+from foveasim.maps._apart import read_apart
+from foveasim.maps._common import Found, Given, finished, head_of, one_sentence
+from foveasim.maps._units import Unit
+from foveasim.maps._xarray import from_xarray, to_xarray
+
+__all__ = ["Unit", "from_xarray", "read_power_map", "to_xarray", "write_power_map"]
+
+_WRITERS: dict[str, Any] = {
+    ".npz": _npy.write_npz,
+    ".fits": _fits.write,
+    ".fit": _fits.write,
+    ".tif": _tiff.write,
+    ".tiff": _tiff.write,
+    ".exr": _exr.write,
+    ".nc": _dataset.write_netcdf,
+    ".nc4": _dataset.write_netcdf,
+}
+ZARR = ".zarr"
+#: Beginnings of files, and their readers in this program, or their kind for one of its own.
+_READERS: dict[tuple[bytes, ...], Any] = {
+    (_npy.NPY_MAGIC,): _npy.read_npy,
+    _npy.ZIP_MAGICS: _npy.read_npz,
+    (_fits.MAGIC,): _fits.read,
+    _tiff.MAGICS: _tiff.read,
+    (_exr.MAGIC,): "EXR",
+    (_isetcam.MAT73_MAGIC,): "MAT 7.3",
+    (_isetcam.MAT5_MAGIC,): "MAT",
+    (_dataset.HDF5_MAGIC, *_dataset.NETCDF3_MAGICS): "netCDF",
+}
+
+
+def read_power_map(
+    path: str | Path,
+    *,
+    pitch_um: float | None = None,
+    wavelength_nm: ArrayLike | None = None,
+    band_width_nm: ArrayLike | None = None,
+    unit: Unit | None = None,
+    origin_um: tuple[float, float] | None = None,
+    top_row_first: bool | None = None,
+    name: str | None = None,
+) -> PowerMap:
+    """
+    Read the light on a sensor, from a file of any program.
+
+    Parameters
+    ----------
+    path : path
+        A file of one of the formats above, told by its content, or a zarr folder.
+    pitch_um : float, optional, µm
+        Side of a cell, where the file does not tell it.
+    wavelength_nm : number or sequence, optional, nm
+        The bands' wavelengths, where the file does not tell them.
+    band_width_nm : number or sequence, optional, nm
+        Of light per nm: the bands' widths; by default they reach half-way to the neighbours.
+    unit : {"w_m2", "w_m2_nm", "photons_s_m2", "photons_s_m2_nm"}, optional
+        What the numbers are, where the file does not tell: power or photons a second, on a square metre, in the band or in
+        each nm of it.
+    origin_um : (x0, y0), optional, µm
+        Lower left corner of the map; by default what the file tells, or its middle on the axis. With ``pitch_um`` the file
+        is not asked.
+    top_row_first : bool, optional
+        Whether the file's first row is the one on top; by default what the format says: TIFF, EXR and ISETCam yes; npy, npz
+        and FITS no; netCDF and zarr by their coordinate y.
+    name : str, optional
+        Of the array, the variable or the extension, where the file holds several.
+
+    Returns
+    -------
+    PowerMap
+        float32 where the file has no more digits, W/m² per band.
+
+    Raises
+    ------
+    FileError
+        When the file is missing, broken, cut short, too large, no map, holds what light cannot be, or lacks what nobody
+        said.
+    ParameterError
+        When what is said is out of range, or does not fit the file.
+
+    Notes
+    -----
+    Power is ``photons * h c / wavelength * width``. Negative light is refused, but for rounding: 1e-5 of the brightest.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> np.save("spot.npy", np.ones((20, 30)))  # doctest: +SKIP
+    >>> read_power_map("spot.npy", pitch_um=0.5, wavelength_nm=550.0, unit="w_m2").grid.bounds_um  # doctest: +SKIP
+    (-7.5, -5.0, 7.5, 5.0)
+    """
+    path = Path(path)
+    given = Given(
+        pitch_um=pitch_um,
+        wavelength_nm=wavelength_nm,
+        band_width_nm=band_width_nm,
+        unit=unit,
+        origin_um=origin_um,
+        top_row_first=top_row_first,
+    )
+    with one_sentence(path):
+        return finished(_found(path, name), given)
+
+
+def _found(path: Path, name: str | None) -> Found:
+    if _dataset.is_zarr(path):
+        return read_apart(path, "zarr", name)
+    head = head_of(path)
+    for magics, reader in _READERS.items():
+        if head.startswith(magics):
+            found: Found = read_apart(path, reader, name) if isinstance(reader, str) else reader(path, name)
+            return found
+    if head.startswith(b"\x1f\x8b"):
+        raise FileError(path, "is compressed with gzip; unpack it first")
+    raise FileError(path, "is no power map: expected npy, npz, FITS, TIFF, EXR, netCDF, zarr or MAT")
+
+
+def write_power_map(power_map: PowerMap, path: str | Path) -> None:
+    """
+    Write a map to a file, whole or not at all.
+
+    Parameters
+    ----------
+    power_map : PowerMap
+    path : path
+        Its ending names the format: ``.npz``, ``.fits``, ``.tif``, ``.exr``, ``.nc`` or ``.zarr``.
+
+    Raises
+    ------
+    FileError
+        When the ending is unknown, a library is missing, or nothing can be written there.
+    ParameterError
+        When it is no map, or the format cannot hold it.
+
+    Examples
+    --------
+    >>> write_power_map(power_map, "light.fits")  # doctest: +SKIP
+    """
+    if not isinstance(power_map, PowerMap):
+        raise ParameterError("power_map", f"must be a PowerMap, got a {type(power_map).__name__}")
+    path = Path(path)
+    if path.suffix.lower() == ZARR:
+        _dataset.write_zarr(power_map, path)
+        return
+    writer = _WRITERS.get(path.suffix.lower())
+    if writer is None:
+        raise FileError(path, f"must end in one of {', '.join(sorted([*_WRITERS, ZARR]))}")
+    with written_whole(path) as temporary:
+        try:
+            writer(power_map, temporary)
+        except FileError as error:
+            raise FileError(path, str(error).removeprefix(f"{temporary}: ")) from None

@@ -1,0 +1,254 @@
+"""
+Maps as netCDF files and zarr folders, through xarray.
+
+Nothing that such a file names outside itself is opened, and nothing in it is unpickled: what could ask for it is looked for
+before xarray sees the file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from foveasim.errors import FileError
+from foveasim.fields import PowerMap
+from foveasim.maps._common import Found, Refusal, check_size
+from foveasim.maps._xarray import NAME, X, Y, found_in_array, to_xarray
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["HDF5_MAGIC", "NETCDF3_MAGICS", "is_zarr", "read_netcdf", "read_zarr", "write_netcdf", "write_zarr"]
+
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+NETCDF3_MAGICS = (b"CDF\x01", b"CDF\x02")
+ZARR_FILES = ("zarr.json", ".zgroup", ".zarray", ".zattrs", ".zmetadata")
+#: Parts of zarr's metadata that name programs to run on the chunks, and those that only pack numbers.
+ZARR_CODEC_KEYS = ("codecs", "index_codecs", "filters", "compressor", "storage_transformers")
+ZARR_CODECS = frozenset(
+    {
+        "bytes",
+        "endian",
+        "transpose",
+        "crc32c",
+        "sharding_indexed",
+        "gzip",
+        "zlib",
+        "zstd",
+        "blosc",
+        "lz4",
+        "bz2",
+        "lzma",
+    }
+    | {"numcodecs." + name for name in ("zlib", "zstd", "blosc", "lz4", "bz2", "lzma", "gzip", "shuffle")}
+    | {"shuffle"}
+)
+#: More groups, arrays and links than this are no map.
+MAX_OBJECTS = 1000
+MAX_METADATA_BYTES = 2**22
+
+
+# -- writing ----------------------------------------------------------------------------------------------------------
+
+
+def write_netcdf(power_map: PowerMap, path: Path) -> None:
+    """Write netCDF 4, unpacked."""
+    _needs(path, "h5netcdf")
+    to_xarray(power_map).to_dataset().to_netcdf(path, engine="h5netcdf", encoding={NAME: {"_FillValue": None}})
+
+
+def write_zarr(power_map: PowerMap, path: Path) -> None:
+    """
+    Write a zarr folder, unpacked, whole or not at all.
+
+    Raises
+    ------
+    FileError
+        When zarr is missing, the folder's place is taken by something else, or nothing can be written there.
+    """
+    _needs(path, "zarr")
+    if path.exists() and not is_zarr(path):
+        raise FileError(path, "cannot be written: something else is there")
+    if not path.parent.is_dir():
+        raise FileError(path, f"cannot be written: the folder {path.parent} does not exist")
+    token = secrets.token_hex(8)
+    new, old = (path.with_name(f".foveasim-{token}-{which}.zarr") for which in ("new", "old"))
+    try:
+        dataset = to_xarray(power_map).to_dataset()
+        encoding: dict[str, dict[str, Any]] = {str(name): {"compressors": None} for name in dataset.variables}
+        dataset.to_zarr(new, mode="w-", encoding=encoding, consolidated=False, zarr_format=3)
+        if path.exists():
+            path.rename(old)
+        new.rename(path)
+    except OSError as error:
+        if old.exists() and not path.exists():
+            old.rename(path)
+        raise FileError(path, f"cannot be written: {error.strerror or error}") from None
+    finally:
+        for folder in (new, old):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+# -- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read_netcdf(path: Path, name: str | None) -> Found:
+    """Read the variable of that name, or ``irradiance``, or the only one that is a map."""
+    import xarray as xr
+
+    with path.open("rb") as file:
+        is_hdf5 = not file.read(4).startswith(b"CDF")
+    if is_hdf5:
+        _check_hdf5(path)
+    options: dict[str, Any] = {"phony_dims": "sort"} if is_hdf5 else {}
+    with xr.open_dataset(
+        path, engine="h5netcdf" if is_hdf5 else "scipy", decode_times=False, cache=False, **options
+    ) as dataset:
+        return _found(dataset, name, path.stat().st_size)
+
+
+def read_zarr(path: Path, name: str | None) -> Found:
+    """Read the array of that name, or ``irradiance``, or the only one that is a map."""
+    import xarray as xr
+
+    n_bytes = _check_zarr(path)
+    with xr.open_zarr(path, consolidated=False, chunks=None, decode_times=False) as dataset:
+        return _found(dataset, name, n_bytes)
+
+
+def is_zarr(path: Path) -> bool:
+    """Whether a folder is a zarr group or array."""
+    return path.is_dir() and any((path / name).is_file() for name in ZARR_FILES[:3])
+
+
+def _found(dataset: xr.Dataset, name: str | None, n_bytes: int) -> Found:
+    variable = dataset[_chosen(dataset, name)]
+    check_size(variable.shape, variable.dtype.itemsize, n_bytes)
+    for coordinate in variable.coords.values():
+        check_size(coordinate.shape, coordinate.dtype.itemsize, n_bytes)
+    return found_in_array(variable)
+
+
+def _chosen(dataset: xr.Dataset, name: str | None) -> str:
+    names = [str(n) for n in dataset.data_vars]
+    if name is not None:
+        if name not in names:
+            raise Refusal(f"has no variable {name!r:.40}; there are {', '.join(n[:40] for n in names[:5])}")
+        return name
+    if NAME in names:
+        return NAME
+    maps = [n for n in names if dataset[n].ndim >= 2 and dataset[n].dtype.kind in "iufc"]
+    with_axes = [n for n in maps if {str(d).lower() for d in dataset[n].dims} & set(X + Y)]
+    for candidates in (with_axes, maps):
+        if len(candidates) == 1:
+            return candidates[0]
+    told = f"holds {len(maps)} arrays of numbers with rows and columns"
+    raise Refusal(f"{told}: {', '.join(n[:40] for n in maps[:5])}; say which is the map with name=" if maps else told)
+
+
+# -- what a file may not do -------------------------------------------------------------------------------------------
+
+
+def _check_hdf5(path: Path) -> None:
+    """Refuse files that point outside themselves, or hold more than any map."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        groups, n_objects = [file["/"]], 0
+        seen = set()
+        while groups:
+            group = groups.pop()
+            for key in group:
+                n_objects += 1
+                if n_objects > MAX_OBJECTS:
+                    raise Refusal(f"holds more than {MAX_OBJECTS} arrays and groups")
+                if not isinstance(group.get(key, getlink=True), h5py.HardLink):
+                    raise Refusal(
+                        "holds a link to another place, which is not followed; copy what it names into the file"
+                    )
+                part = group[key]
+                address = h5py.h5o.get_info(part.id).addr
+                if address in seen:
+                    continue
+                seen.add(address)
+                if isinstance(part, h5py.Group):
+                    groups.append(part)
+                elif isinstance(part, h5py.Dataset) and (part.external or part.is_virtual):
+                    raise Refusal("keeps its numbers in another file, which is not opened; copy them into this one")
+
+
+def _check_zarr(path: Path) -> int:
+    """Refuse folders that name programs other than known packers; the bytes in the folder."""
+    for number, found in enumerate(_metadata_files(path)):
+        if number > MAX_OBJECTS:
+            raise Refusal(f"holds more than {MAX_OBJECTS} arrays and groups")
+        if found.is_symlink() or found.stat().st_size > MAX_METADATA_BYTES:
+            raise Refusal(f"has a broken {found.name}")
+        try:
+            _check_codecs(json.loads(found.read_text(encoding="utf-8")))
+        except (ValueError, RecursionError) as error:
+            raise Refusal(f"has a broken {found.name} ({error})") from None
+    return sum(
+        (Path(folder) / file).stat().st_size for folder, _, files in os.walk(path, followlinks=False) for file in files
+    )
+
+
+def _metadata_files(path: Path) -> Iterator[Path]:
+    """Files of metadata, in folders that have some, from the outermost inwards."""
+    folders = [path]
+    while folders:
+        folder = folders.pop()
+        here = [folder / name for name in ZARR_FILES if (folder / name).exists()]
+        yield from here
+        if here:
+            with contextlib.suppress(OSError):
+                folders += [Path(entry) for entry in os.scandir(folder) if entry.is_dir()]
+
+
+def _check_codecs(metadata: Any) -> None:
+    """
+    Walk all of the metadata.
+
+    Raises
+    ------
+    Refusal
+        When it names a program that is not known to do nothing but unpack numbers, or a type of Python objects.
+    """
+    stack = [metadata]
+    while stack:
+        part = stack.pop()
+        if isinstance(part, list):
+            stack += part
+        if not isinstance(part, dict):
+            continue
+        stack += part.values()
+        for key in ZARR_CODEC_KEYS:
+            for codec in np.atleast_1d(np.array(part.get(key) or [], dtype=object)).tolist():
+                named = codec.get("name", codec.get("id")) if isinstance(codec, dict) else codec
+                if named not in ZARR_CODECS:
+                    raise Refusal(f"is packed with {named!r:.40}, which is not known to hold nothing but numbers")
+        shape, kind = part.get("shape"), part.get("dtype", part.get("data_type"))
+        if isinstance(kind, str) and ("O" in kind or "object" in kind):
+            raise Refusal("holds Python objects, expected numbers")
+        if isinstance(shape, list) and not all(isinstance(n, int) and 0 <= n < 2**40 for n in shape):
+            raise Refusal("has an array of an impossible shape")
+        for chunk in (part.get("chunks"), part.get("chunk_shape")):
+            if isinstance(chunk, list) and not 0 < math.prod(n if isinstance(n, int) else 0 for n in chunk) < 2**33:
+                raise Refusal("has chunks of an impossible size")
+
+
+def _needs(path: Path, engine: str) -> None:
+    try:
+        __import__(engine)
+        __import__("xarray")
+    except ImportError:
+        raise FileError(path, f"needs {engine} and xarray; install them with: pip install 'foveasim[maps]'") from None

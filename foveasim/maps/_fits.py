@@ -1,0 +1,162 @@
+"""
+Maps as FITS images: the first axis is x, the second y, the third the wavelength; the first row is the lowest.
+
+Read is a linear world coordinate system (FITS standard 4.0, section 8: ``CTYPE``, ``CRPIX``, ``CRVAL``, ``CDELT`` or a diagonal
+``CD``) whose ``CUNIT`` is a length, or the size of a pixel in µm, ``XPIXSZ`` and ``YPIXSZ``; and ``BUNIT``. What we write
+says the same, and once more as JSON in the keyword ``FOVEASIM``, since numbers in a header are rounded.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from foveasim.errors import FileError
+from foveasim.fields import PowerMap
+from foveasim.maps._common import UNEVEN, Found, Refusal, check_size
+from foveasim.maps._text import about_map, found_in_text
+from foveasim.maps._units import length_in_um
+
+__all__ = ["MAGIC", "read", "write"]
+
+MAGIC = b"SIMPLE  ="
+KEYWORD = "FOVEASIM"
+#: More parts of a file are not looked through.
+MAX_HDUS = 64
+#: Axes of light waves: wavelength in vacuum and in air.
+WAVES = ("WAVE", "AWAV", "WAVELENGTH", "LAMBDA")
+
+
+def write(power_map: PowerMap, path: Path) -> None:
+    """Write one image (n_band, n_y, n_x)."""
+    fits = _astropy(path)
+    grid, waves_nm = power_map.grid, power_map.wavelength_nm
+    hdu = fits.PrimaryHDU(power_map.data.astype(power_map.data.dtype.newbyteorder(">")))
+    header = hdu.header
+    header["BUNIT"] = "W m-2"
+    for axis, start in ((1, grid.origin_um[0]), (2, grid.origin_um[1])):
+        header[f"CTYPE{axis}"] = "LINEAR"
+        header[f"CUNIT{axis}"] = "um"
+        header[f"CRPIX{axis}"] = 0.5
+        header[f"CRVAL{axis}"] = start
+        header[f"CDELT{axis}"] = grid.pitch_um
+    step_nm = np.diff(waves_nm)
+    if step_nm.size == 0 or np.ptp(step_nm) <= UNEVEN * abs(step_nm[0]):
+        header["CTYPE3"], header["CUNIT3"], header["CRPIX3"] = "WAVE", "nm", 1.0
+        header["CRVAL3"], header["CDELT3"] = float(waves_nm[0]), float(step_nm[0]) if step_nm.size else 1.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about a long text
+        header[KEYWORD] = json.dumps(about_map(power_map))
+        hdu.writeto(path, overwrite=True)
+
+
+def read(path: Path, name: str | None) -> Found:
+    """Read the image of that name or number, or the first."""
+    fits = _astropy(path)
+    n_bytes = path.stat().st_size
+    with (
+        warnings.catch_warnings(),
+        fits.open(path, mode="readonly", memmap=False, disable_image_compression=True, lazy_load_hdus=True) as file,
+    ):
+        warnings.simplefilter("ignore")  # about what is beside the standard
+        hdu = _image(file, name)
+        header = hdu.header
+        check_size(hdu.shape, max(abs(int(header["BITPIX"])) // 8, 1), n_bytes)
+        if math.prod(hdu.shape) * abs(int(header["BITPIX"])) // 8 > n_bytes:
+            raise Refusal("is cut short")
+        data = np.asarray(hdu.data)
+        n_axes = data.ndim
+        text = header.get(KEYWORD)
+        found = found_in_text(text if isinstance(text, str) else "", data, is_y_falling=False)
+        if found.pitch_um is not None:
+            return found
+        return replace(found, **_told(header, data.shape, n_axes))
+
+
+def _image(file: Any, name: str | None) -> Any:
+    """The part of the file that is the map."""
+    for number in range(MAX_HDUS):
+        try:
+            hdu = file[number]
+        except IndexError:
+            break
+        if name is not None and name not in (str(number), hdu.name):
+            continue
+        if hdu.is_image and hdu.shape and 0 not in hdu.shape:
+            return hdu
+        if hdu.header.get("ZIMAGE") is True:
+            raise Refusal("is compressed; unpack it first, with funpack")
+        if name is not None:
+            break
+    raise Refusal("holds no image" if name is None else f"holds no image {name!r:.40}")
+
+
+def _told(header: Any, shape: tuple[int, ...], n_axes: int) -> dict[str, Any]:
+    """What a header tells of pitch, place, wavelengths and unit."""
+    told: dict[str, Any] = _told_plane(header, shape)
+    if n_axes >= 3 and str(header.get("CTYPE3", "")).strip().upper() in WAVES:
+        per = length_in_um(str(header.get("CUNIT3", "m")))
+        step, start = _step(header, 3), _number(header, "CRVAL3", 0)
+        if per is None:
+            raise Refusal(f"tells wavelengths in {str(header.get('CUNIT3'))!r:.20}, expected a length")
+        if step is not None:
+            channel = np.arange(shape[-3]) + 1.0 - _number(header, "CRPIX3", 1)
+            told["wavelength_nm"] = ((start + step * channel) * (per * 1e3)).tolist()
+    unit = header.get("BUNIT")
+    if isinstance(unit, str) and unit.strip():
+        told["unit"] = unit
+    return told
+
+
+def _told_plane(header: Any, shape: tuple[int, ...]) -> dict[str, Any]:
+    steps = [_step(header, axis) for axis in (1, 2)]
+    units = [length_in_um(str(header.get(f"CUNIT{axis}", ""))) for axis in (1, 2)]
+    if None not in steps and None not in units:
+        told: dict[str, Any] = {"is_x_falling": steps[0] < 0.0, "is_y_falling": steps[1] < 0.0}  # type: ignore[operator]
+        pitch, low = [], []
+        for axis, (step, per, n) in enumerate(zip(steps, units, shape[::-1][:2], strict=True), start=1):
+            assert step is not None
+            assert per is not None
+            start, at = _number(header, f"CRVAL{axis}", 0), _number(header, f"CRPIX{axis}", 1)
+            edges = (start + step * (0.5 - at), start + step * (n + 0.5 - at))
+            pitch.append(abs(step) * per)
+            low.append(min(edges) * per)
+        return {**told, "pitch_um": tuple(pitch), "origin_um": tuple(low)}
+    sizes = [header.get("XPIXSZ"), header.get("YPIXSZ", header.get("XPIXSZ"))]
+    if all(isinstance(size, int | float) and size > 0 for size in sizes):
+        return {"pitch_um": tuple(map(float, sizes))}
+    return {}
+
+
+def _step(header: Any, axis: int) -> float | None:
+    """Step along an axis, None where the header tells none."""
+    for one in (1, 2, 3):
+        for prefix in ("CD", "PC"):
+            if one != axis and (
+                _number(header, f"{prefix}{axis}_{one}", 0) or _number(header, f"{prefix}{one}_{axis}", 0)
+            ):
+                raise Refusal("is turned against its coordinates; resample it first")
+    if f"CD{axis}_{axis}" in header:
+        return _number(header, f"CD{axis}_{axis}", 0) or None
+    return _number(header, f"CDELT{axis}", 0) * _number(header, f"PC{axis}_{axis}", 1) or None
+
+
+def _number(header: Any, keyword: str, default: int) -> float:
+    value = header.get(keyword, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise Refusal(f"tells {value!r:.20} as its {keyword}, expected a number")
+    return float(value)
+
+
+def _astropy(path: Path) -> Any:
+    try:
+        from astropy.io import fits
+    except ImportError:
+        raise FileError(path, "needs astropy; install it with: pip install 'foveasim[maps]'") from None
+    return fits

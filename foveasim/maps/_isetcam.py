@@ -1,0 +1,183 @@
+"""
+Optical images of ISETCam and ISETBio, as MATLAB saves them: the struct ``oi``, or its fields.
+
+``data.photons`` (row, column, wave) are photons/(s m² nm), the first row on top; ``spectrum.wave`` is in nm. The middle of
+the image lies on the axis, and its width is ``2 f tan(wAngular / 2)``, f the focal length (``oiGet(oi, 'width')`` since
+November 2021; before, the distance of the image). A single wavelength stands for 1 nm, as ISETCam's ``bin width`` does.
+Whole numbers, of before 2017, are unpacked between ``dmin`` and ``dmax``.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+from typing import IO, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.fields import from_file_rows
+from foveasim.maps._common import Found, Refusal, check_size, max_unpacked
+
+__all__ = ["MAT5_MAGIC", "MAT73_MAGIC", "read_mat5", "read_mat73"]
+
+MAT5_MAGIC, MAT73_MAGIC = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
+#: Names of the struct: as scripts save it, and as vcExportObject does.
+NAMES = ("oi", "opticalimage", "opticalImage")
+PHOTONS, WAVES = ("data/photons", "photons"), ("spectrum/wave", "wave", "data/wave")
+FIELDS = ("data", "photons", "spectrum", "wave", "wAngular", "optics")
+#: Of a MAT file of version 5: its header; types of elements; bytes of a packed element that are unpacked at a time.
+HEADER_BYTES, TAG_BYTES, COMPRESSED, MATRIX = 128, 8, 15, 14
+PIECE_BYTES = 2**20
+#: Values of a field that is no map.
+MAX_VALUES = 10_000
+
+#: Looks up a field by its path, ``optics/focalLength``; None where there is none, or it is no array of numbers or text.
+Field: TypeAlias = Callable[[str], "NDArray[Any] | None"]
+
+
+def read_mat5(path: Path, name: str | None) -> Found:
+    """Read a MAT file of version 5 or 7."""
+    from scipy.io import loadmat, whosmat
+
+    unpacked: Any = BytesIO(_unpacked(path))
+    names = [str(variable[0]) for variable in whosmat(unpacked)]
+    unpacked.seek(0)
+    struct = _struct(names, name)
+    variables = list(FIELDS) if struct is None else [struct]
+    tree: Any = loadmat(unpacked, variable_names=variables, struct_as_record=False, squeeze_me=False)
+
+    def field(where: str) -> NDArray[Any] | None:
+        first, *rest = where.split("/") if struct is None else (struct, *where.split("/"))
+        part: Any = tree.get(first)
+        for key in rest:
+            if isinstance(part, np.ndarray) and part.dtype == object and part.size == 1:
+                part = part.ravel()[0]
+            part = getattr(part, key, None) if key in getattr(part, "_fieldnames", ()) else None
+        return part if isinstance(part, np.ndarray) and part.dtype.kind in "iufcU" else None
+
+    return _found(field)
+
+
+def read_mat73(path: Path, name: str | None) -> Found:
+    """Read a MAT file of version 7.3, which is HDF5 with the axes the other way round."""
+    import h5py
+
+    n_bytes = path.stat().st_size
+    with h5py.File(path, "r") as file:
+        struct = _struct(list(file), name)
+
+        def field(where: str) -> NDArray[Any] | None:
+            part: Any = file
+            for key in (where if struct is None else f"{struct}/{where}").split("/"):
+                if not isinstance(part, h5py.Group) or not isinstance(part.get(key, getlink=True), h5py.HardLink):
+                    return None
+                part = part[key]
+            if not isinstance(part, h5py.Dataset) or part.dtype.kind not in "iuf" or part.external or part.is_virtual:
+                return None
+            check_size(part.shape, part.dtype.itemsize, n_bytes)
+            if where not in PHOTONS and part.size > MAX_VALUES:
+                return None
+            values = np.asarray(part[()]).transpose()
+            is_text = part.attrs.get("MATLAB_class") in (b"char", "char")
+            return np.array("".join(map(chr, values.ravel().tolist()))) if is_text else values
+
+        return _found(field)
+
+
+def _struct(names: list[str], name: str | None) -> str | None:
+    """The variable that is the optical image; none when the variables are its fields."""
+    for one in NAMES if name is None else (name,):
+        if one in names:
+            return one
+    if name is None and {"data", "photons"} & set(names):
+        return None
+    told = ", ".join(n[:40] for n in names[:5])
+    raise Refusal(f"holds no optical image {name or 'oi'!r:.40}; there are {told or 'no variables'}")
+
+
+def _found(field: Field) -> Found:
+    photons, waves = (next((v for n in names if (v := field(n)) is not None), None) for names in (PHOTONS, WAVES))
+    if photons is None:
+        raise Refusal("holds no optical image with data.photons; compute it first, with oiCompute")
+    if photons.ndim not in (2, 3) or 0 in photons.shape:
+        raise Refusal(f"has photons of the shape {photons.shape[:5]}, expected (row, column, wave)")
+    images = from_file_rows(_whole(photons, field))
+    pitch = _pitch_um(field, photons.shape[1])
+    return Found(
+        data=images,  # turned already
+        pitch_um=None if pitch is None else (pitch, pitch),
+        wavelength_nm=None if waves is None else waves.ravel().tolist(),
+        band_width_nm=[1.0] if images.shape[0] == 1 else None,
+        unit="photons_s_m2_nm",
+    )
+
+
+def _whole(photons: NDArray[Any], field: Field) -> NDArray[Any]:
+    """Photon rates out of the whole numbers that old versions kept."""
+    if photons.dtype.kind != "u":
+        return photons
+    low, high = _number(field("data/dmin")), _number(field("data/dmax"))
+    if low is None or high is None or not low <= high:
+        raise Refusal("has photons as whole numbers, without the dmin and dmax that they stand between")
+    return low + (high - low) / float(np.iinfo(photons.dtype).max) * photons.astype(np.float64)
+
+
+def _pitch_um(field: Field, n_columns: int) -> float | None:
+    """Side of a cell, from the field of view; nothing for a pinhole, and what has neither."""
+    angle_deg, focal_m = _number(field("wAngular")), _number(field("optics/focalLength"))
+    model = field("optics/model")
+    if model is not None and "".join(model.ravel().astype(str).tolist()).lower().replace(" ", "") == "raytrace":
+        focal_mm = _number(field("optics/rayTrace/effectiveFocalLength"))
+        focal_m = None if focal_mm is None else focal_mm * 1e-3
+    if angle_deg is None or focal_m is None or not 0.0 < angle_deg < 180.0 or not focal_m > 0.0:
+        return None
+    return 2.0 * focal_m * math.tan(math.radians(0.5 * angle_deg)) / n_columns * 1e6
+
+
+def _number(values: NDArray[Any] | None) -> float | None:
+    if values is None or values.size != 1 or values.dtype.kind not in "iuf":
+        return None
+    number = float(values.ravel()[0])
+    return number if math.isfinite(number) else None
+
+
+# -- unpacking, with a limit --------------------------------------------------------------------------------------------
+
+
+def _unpacked(path: Path) -> bytes:
+    """The file with its packed elements unpacked, as far as such a file may be."""
+    n_bytes = path.stat().st_size
+    most = max_unpacked(n_bytes)
+    with path.open("rb") as file:
+        header = file.read(HEADER_BYTES)
+        order = "little" if header[126:128] == b"IM" else "big"
+        pieces, size = [header], HEADER_BYTES
+        while len(tag := file.read(TAG_BYTES)) == TAG_BYTES:
+            kind, length = int.from_bytes(tag[:4], order), int.from_bytes(tag[4:], order)  # type: ignore[arg-type]
+            if kind not in (COMPRESSED, MATRIX) or length > n_bytes:
+                raise Refusal("is broken: an element of the file is no variable, or longer than the file")
+            element = _inflated(file, length, most - size) if kind == COMPRESSED else tag + file.read(length)
+            pieces.append(element)
+            size += len(element)
+            if size > most:
+                raise Refusal(f"would unpack to more than {most} bytes; save it unpacked, with -v6")
+    return b"".join(pieces)
+
+
+def _inflated(file: IO[bytes], length: int, most: int) -> bytes:
+    """One packed element, not much more than ``most`` bytes of it."""
+    inflater, parts, size = zlib.decompressobj(), [], 0
+    while length > 0 and size <= most:
+        packed = file.read(min(length, PIECE_BYTES))
+        if not packed:
+            raise Refusal("is cut short")
+        length -= len(packed)
+        while packed and size <= most:
+            parts.append(inflater.decompress(packed, PIECE_BYTES))
+            size += len(parts[-1])
+            packed = inflater.unconsumed_tail
+    return b"".join(parts)

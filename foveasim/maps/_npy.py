@@ -1,0 +1,141 @@
+"""
+Maps as numpy arrays: one array (npy), or named arrays in an archive (npz). Nothing is ever unpickled.
+
+Names in an archive are ``data``, ``pitch_um``, ``origin_um``, ``wavelength_nm``, ``band_width_nm`` and ``unit``, as
+``np.savez(path, data=..., pitch_um=0.5, wavelength_nm=[450, 550], unit="w_m2")`` writes them; the lowest row is first.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from foveasim.fields import PowerMap
+from foveasim.maps._common import Found, Refusal, check_size
+
+__all__ = ["NPY_MAGIC", "ZIP_MAGICS", "read_npy", "read_npz", "write_npz"]
+
+NPY_MAGIC = b"\x93NUMPY"
+#: A zip archive, and an empty one.
+ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06")
+DATA = "data"
+ABOUT = ("pitch_um", "origin_um", "wavelength_nm", "band_width_nm", "unit")
+SUFFIX = ".npy"
+#: What stands beside the map is small.
+MAX_ABOUT_BYTES = 2**20
+
+
+def write_npz(power_map: PowerMap, path: Path) -> None:
+    """Write the map's arrays, unpacked."""
+    with path.open("wb") as file:
+        np.savez(
+            file,
+            data=power_map.data,
+            pitch_um=power_map.grid.pitch_um,
+            origin_um=power_map.grid.origin_um,
+            wavelength_nm=power_map.wavelength_nm,
+            unit="w_m2",
+        )
+
+
+def read_npy(path: Path, name: str | None) -> Found:
+    """Read one array, which tells nothing of itself."""
+    _check_no_name(name)
+    n_bytes = path.stat().st_size
+    with path.open("rb") as file:
+        return Found(data=_array(file, n_bytes, n_bytes))
+
+
+def read_npz(path: Path, name: str | None) -> Found:
+    """Read the array of that name, or ``data``, or the only one, and what stands beside it."""
+    n_bytes = path.stat().st_size
+    with zipfile.ZipFile(path) as archive:
+        items = {item.filename.removesuffix(SUFFIX): item for item in archive.infolist()}
+        if not {item.compress_type for item in items.values()} <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+            raise Refusal("is packed in a way that numpy does not use")
+        chosen = _chosen(list(items), name)
+        about = {key: _member(archive, items[key], n_bytes) for key in ABOUT if key in items and key != chosen}
+        data = _member(archive, items[chosen], n_bytes)
+    pitch = about.get("pitch_um")
+    origin = about.get("origin_um")
+    return Found(
+        data=data,
+        pitch_um=None if pitch is None else _pair(np.broadcast_to(pitch, (2,))),
+        origin_um=None if origin is None else _pair(origin),
+        wavelength_nm=_list(about.get("wavelength_nm")),
+        band_width_nm=_list(about.get("band_width_nm")),
+        unit=None if "unit" not in about else str(about["unit"]),
+    )
+
+
+def _check_no_name(name: str | None) -> None:
+    if name is not None:
+        raise Refusal("holds one array without a name; leave name= out")
+
+
+def _chosen(names: list[str], name: str | None) -> str:
+    others = [n for n in names if n not in ABOUT]
+    if name is not None:
+        if name not in names:
+            raise Refusal(f"has no array {name!r:.40}; there are {', '.join(map(repr, names[:5]))}")
+        return name
+    if DATA in others:
+        return DATA
+    if len(others) != 1:
+        raise Refusal(f"holds {len(others)} arrays, none called 'data'; say which is the map with name=")
+    return others[0]
+
+
+def _pair(values: NDArray[Any]) -> tuple[float, float]:
+    along_x, along_y = np.asarray(values, dtype=np.float64).reshape(2).tolist()
+    return along_x, along_y
+
+
+def _list(values: NDArray[Any] | None) -> list[float] | None:
+    return None if values is None else np.atleast_1d(np.asarray(values, dtype=np.float64)).ravel().tolist()
+
+
+def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo, n_bytes: int) -> NDArray[Any]:
+    if item.filename.removesuffix(SUFFIX) in ABOUT and item.file_size > MAX_ABOUT_BYTES:
+        raise Refusal(f"is broken: {item.filename!r:.40} has {item.file_size} bytes")
+    check_size((item.file_size,), 1, n_bytes)
+    with archive.open(item) as file:
+        return _array(file, item.file_size, n_bytes)
+
+
+def _array(file: IO[bytes], size: int, n_bytes: int) -> NDArray[Any]:
+    """One array, after its header was found to fit what follows it: no array is made larger than the file says."""
+    version = npy.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"array format {version}")
+    read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, is_fortran, dtype = read_header(file)
+    if dtype.hasobject or not dtype.itemsize:
+        raise Refusal("holds Python objects or nothing; save an array of numbers")
+    check_size(shape, dtype.itemsize, n_bytes)
+    rest = size - file.tell()
+    if math.prod(shape) * dtype.itemsize != rest or any(n < 0 for n in shape):
+        raise ValueError("an array of another size than its header tells")
+    data = np.empty(rest, np.uint8)
+    if _read_into(file, data) != rest:
+        raise ValueError("cut short")
+    return data.view(dtype).reshape(shape, order="F" if is_fortran else "C")
+
+
+def _read_into(file: IO[bytes], data: NDArray[np.uint8]) -> int:
+    """Fill an array from a file, a piece at a time; the bytes that there were."""
+    done = 0
+    while done < data.size:
+        piece = file.read(min(data.size - done, io.DEFAULT_BUFFER_SIZE * 128))
+        if not piece:
+            break
+        data[done : done + len(piece)] = np.frombuffer(piece, np.uint8)
+        done += len(piece)
+    return done

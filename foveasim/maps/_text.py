@@ -1,0 +1,69 @@
+"""What a format has no place for, as JSON in a text that it has: pitch, origin, wavelengths, unit."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from numpy.typing import NDArray
+
+from foveasim.fields import PowerMap
+from foveasim.maps._common import Found, Refusal
+
+__all__ = ["about_map", "found_in_text"]
+
+FILE_FORMAT = "foveasim power map"
+FILE_VERSION = 1
+#: A longer text is somebody else's.
+MAX_CHARS = 2**20
+
+
+def about_map(power_map: PowerMap) -> dict[str, Any]:
+    """What is told of a map: Python's JSON keeps every bit of a float64."""
+    return {
+        "format": FILE_FORMAT,
+        "version": FILE_VERSION,
+        "unit": "w_m2",
+        "pitch_um": power_map.grid.pitch_um,
+        "origin_um": list(power_map.grid.origin_um),
+        "wavelength_nm": power_map.wavelength_nm.tolist(),
+    }
+
+
+def found_in_text(text: str, data: NDArray[Any], *, is_y_falling: bool) -> Found:
+    """
+    The map with what its text tells, when that is ours.
+
+    Raises
+    ------
+    Refusal
+        When the text is ours, and broken.
+    """
+    about = _parsed(text)
+    if not isinstance(about, dict) or about.get("format") != FILE_FORMAT:
+        return Found(data=data, is_y_falling=is_y_falling)
+    if about.get("version") != FILE_VERSION:
+        raise Refusal(f"has the format version {about.get('version')!r:.40}, expected {FILE_VERSION}")
+    try:
+        pitch_um = float(about["pitch_um"])
+        x0, y0 = map(float, about["origin_um"])
+        waves = [float(w) for w in about["wavelength_nm"]]
+    except (KeyError, TypeError, ValueError):
+        raise Refusal("tells a pitch, an origin or wavelengths that are no numbers") from None
+    return Found(
+        data=data,
+        is_y_falling=is_y_falling,
+        pitch_um=(pitch_um, pitch_um),
+        origin_um=(x0, y0),
+        wavelength_nm=waves,
+        unit=str(about.get("unit")),
+    )
+
+
+def _parsed(text: str) -> Any:
+    if not text.startswith("{") or len(text) > MAX_CHARS:
+        return None
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None

@@ -1,0 +1,78 @@
+"""
+Maps as TIFF: a page a band, or one page whose samples are the bands; the first row is on top.
+
+What a TIFF has no place for stands as JSON in the first page's description: pitch, origin, wavelengths and unit.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.fields import PowerMap, to_file_rows
+from foveasim.maps._common import MAX_BANDS, Found, Refusal, check_size
+from foveasim.maps._text import about_map, found_in_text
+
+__all__ = ["MAGICS", "read", "write"]
+
+MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+#: Tag and values of TIFF that tell where the first row lies: on top, and below.
+ORIENTATION_TAG, ON_TOP, BELOW = 274, 1, 4
+#: Room for what stands beside the pages of a classic TIFF.
+CLASSIC_BYTES = 2**32 - 2**24
+
+
+def write(power_map: PowerMap, path: Path) -> None:
+    """Write a page a band, unpacked."""
+    import tifffile
+
+    description = json.dumps(about_map(power_map))
+    is_big = power_map.data.nbytes > CLASSIC_BYTES
+    with tifffile.TiffWriter(path, bigtiff=is_big) as file:
+        for band, image in enumerate(power_map.data):
+            file.write(
+                np.ascontiguousarray(to_file_rows(image)),
+                photometric="minisblack",
+                description=description if band == 0 else "",
+                metadata=None,
+                contiguous=False,
+            )
+
+
+def read(path: Path, name: str | None) -> Found:
+    """Read all pages as bands, or the samples of one."""
+    import tifffile
+
+    if name is not None:
+        raise Refusal("holds one map without a name; leave name= out")
+    n_bytes = path.stat().st_size
+    with tifffile.TiffFile(path) as file:
+        n_pages = len(file.pages)
+        if not 1 <= n_pages <= MAX_BANDS:
+            raise Refusal(f"holds {n_pages} pages, expected one for each band")
+        pages = [file.pages[i] for i in range(n_pages)]
+        first: Any = pages[0]
+        for page in pages:
+            if page.shape != first.shape or page.dtype != first.dtype or page.dtype is None:
+                raise Refusal("holds pages of different sizes or types, expected one for each band")
+            if page.photometric not in (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB):
+                raise Refusal("holds colours of a picture; save numbers, with 0 as black")
+        check_size((n_pages, *first.shape), first.dtype.itemsize, n_bytes)
+        if n_pages > 1 and first.ndim != 2:
+            raise Refusal(f"holds {n_pages} pages of the shape {first.shape}, expected one for each band")
+        data = first.asarray()[np.newaxis] if n_pages == 1 else np.stack([page.asarray() for page in pages])
+        if first.ndim == 3:
+            data = _samples_first(data[0], first, tifffile)
+        orientation = first.tags[ORIENTATION_TAG].value if ORIENTATION_TAG in first.tags else ON_TOP
+        description = str(first.description)
+    if orientation not in (ON_TOP, BELOW):
+        raise Refusal(f"is turned, as its orientation {orientation!s:.10} tells; save it upright")
+    return found_in_text(description, data, is_y_falling=orientation == ON_TOP)
+
+
+def _samples_first(data: NDArray[Any], page: Any, tifffile: Any) -> NDArray[Any]:
+    return data if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE else np.moveaxis(data, -1, 0)

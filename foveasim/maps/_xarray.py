@@ -1,0 +1,230 @@
+"""Maps as labelled arrays: dimensions (wavelength, y, x), coordinates in the middle of cells, units as attributes."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from foveasim.arrays import Floats
+from foveasim.errors import ParameterError
+from foveasim.fields import Grid, PowerMap
+from foveasim.maps._common import Found, Given, Refusal, finished, pitch_of_axes
+from foveasim.maps._units import Unit, length_in_um
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from numpy.typing import ArrayLike
+
+__all__ = ["NAME", "found_in_array", "from_xarray", "to_xarray"]
+
+#: What the map is called in a file of several arrays.
+NAME = "irradiance"
+#: Names of dimensions, ours first.
+X = ("x", "x_um", "col", "cols", "column", "n_x")
+Y = ("y", "y_um", "row", "rows", "n_y")
+BAND = ("wavelength", "wavelength_nm", "wavelengths", "wave", "wl", "lambda", "band", "bands", "channel")
+#: What libraries call dimensions that a file does not name.
+NAMELESS = ("phony_dim_", "dim_")
+#: Pitch and origin as attributes are those of the coordinates when no coordinate is off by more of a cell: rounding.
+ROUNDING = 1e-6
+
+
+def to_xarray(power_map: PowerMap) -> xr.DataArray:
+    """
+    The map as a labelled array.
+
+    Parameters
+    ----------
+    power_map : PowerMap
+
+    Returns
+    -------
+    xarray.DataArray (wavelength, y, x), W/m² per band
+        Coordinates are the wavelengths in nm and the middles of cells in µm, each with its ``units``. Pitch and origin also
+        stand as attributes, exactly.
+
+    Raises
+    ------
+    ParameterError
+        When it is no map, or xarray is missing.
+    """
+    if not isinstance(power_map, PowerMap):
+        raise ParameterError("power_map", f"must be a PowerMap, got a {type(power_map).__name__}")
+    xr = _xarray()
+    grid = power_map.grid
+    return xr.DataArray(
+        power_map.data,
+        dims=("wavelength", "y", "x"),
+        coords={
+            "wavelength": ("wavelength", power_map.wavelength_nm, {"units": "nm"}),
+            "y": ("y", grid.y_um, {"units": "um"}),
+            "x": ("x", grid.x_um, {"units": "um"}),
+        },
+        name=NAME,
+        attrs={
+            "units": "W m-2",
+            "long_name": "irradiance per band",
+            "pitch_um": grid.pitch_um,
+            "origin_um": list(grid.origin_um),
+        },
+    )
+
+
+def from_xarray(
+    data_array: xr.DataArray,
+    *,
+    pitch_um: float | None = None,
+    wavelength_nm: ArrayLike | None = None,
+    band_width_nm: ArrayLike | None = None,
+    unit: Unit | None = None,
+    origin_um: tuple[float, float] | None = None,
+) -> PowerMap:
+    """
+    Map of a labelled array.
+
+    Parameters
+    ----------
+    data_array : xarray.DataArray (y, x) or (wavelength, y, x), in any order
+        Coordinates with ``units`` give pitch, place and wavelengths; they may rise or fall, in even steps.
+    pitch_um, wavelength_nm, band_width_nm, unit, origin_um
+        As for :func:`read_power_map`.
+
+    Returns
+    -------
+    PowerMap
+
+    Raises
+    ------
+    ParameterError
+        When it is no such array, or lacks what nobody said.
+    """
+    xr = _xarray()
+    if not isinstance(data_array, xr.DataArray):
+        raise ParameterError("data_array", f"must be an xarray.DataArray, got a {type(data_array).__name__}")
+    given = Given(
+        pitch_um=pitch_um, wavelength_nm=wavelength_nm, band_width_nm=band_width_nm, unit=unit, origin_um=origin_um
+    )
+    try:
+        return finished(found_in_array(data_array), given)
+    except Refusal as refusal:
+        raise ParameterError("data_array", str(refusal)) from None
+
+
+def found_in_array(array: xr.DataArray) -> Found:
+    """
+    What a labelled array tells.
+
+    Raises
+    ------
+    Refusal
+        When its dimensions are not those of a map, or its coordinates uneven.
+    """
+    array = array.squeeze([d for d in array.dims if array.sizes[d] == 1 and d not in (*X, *Y, *BAND)], drop=True)
+    names = list(array.dims)
+    if len(names) in (2, 3) and all(str(d).startswith(NAMELESS) for d in names):
+        return Found(data=array.to_numpy(), unit=_unit(array))
+    if 0 in array.shape:
+        raise Refusal(f"holds an array of the shape {array.shape}, which is empty")
+    x, y = _one_of(names, X), _one_of(names, Y)
+    rest = [d for d in names if d not in (x, y)]
+    if x is None or y is None or len(rest) > 1:
+        told = ", ".join(str(d)[:20] for d in names[:6])
+        raise Refusal(f"has the dimensions ({told}), expected (wavelength, y, x); rename them")
+    array = array.transpose(*rest, y, x)
+    along_x, along_y = (_coordinate(array, d) for d in (x, y))
+    if along_x is None or along_y is None:
+        falling = (along is not None and bool(along[0] > along[-1]) for along in (along_x, along_y))
+        place: dict[str, Any] = dict(zip(("is_x_falling", "is_y_falling"), falling, strict=True))
+    else:
+        place = _place(array, along_x, along_y, (x, y))
+    return Found(
+        data=array.to_numpy(),
+        wavelength_nm=_wavelengths_nm(array, rest[0] if rest else None),
+        unit=_unit(array),
+        **place,
+    )
+
+
+def _one_of(names: list[Hashable], known: tuple[str, ...]) -> Hashable | None:
+    found = [name for name in names if str(name).lower() in known]
+    return found[0] if len(found) == 1 else None
+
+
+def _coordinate(array: xr.DataArray, name: Hashable) -> Floats | None:
+    if name not in array.coords or array.coords[name].dims != (name,):
+        return None
+    values = array.coords[name].to_numpy()
+    if values.dtype.kind not in "iuf":
+        raise Refusal(f"has coordinates along {name!s:.20} that are no numbers")
+    return values.astype(np.float64)
+
+
+def _place(array: xr.DataArray, x: Floats, y: Floats, names: tuple[Hashable, Hashable]) -> dict[str, Any]:
+    """Directions of the axes, and pitch and origin where the coordinates have units of length."""
+    step_x, step_y = pitch_of_axes(x, y)
+    told: dict[str, Any] = {"is_x_falling": (step_x or 1.0) < 0.0, "is_y_falling": (step_y or 1.0) < 0.0}
+    per = [_per_um(array.coords[name], name) for name in names]
+    if None in per:
+        return told
+    per_x, per_y = (p for p in per if p is not None)
+    exact = _exact(array, x * per_x, y * per_y)
+    if exact is not None:
+        return {**told, "pitch_um": (exact.pitch_um, exact.pitch_um), "origin_um": exact.origin_um}
+    if step_x is None and step_y is None:
+        return told
+    pitch_x = abs(step_x) * per_x if step_x is not None else None
+    pitch_y = abs(step_y) * per_y if step_y is not None else None
+    pitch = (pitch_x or pitch_y or 0.0, pitch_y or pitch_x or 0.0)
+    low = (float(x.min()) * per_x - 0.5 * pitch[0], float(y.min()) * per_y - 0.5 * pitch[1])
+    return {**told, "pitch_um": pitch, "origin_um": low}
+
+
+def _per_um(coordinate: xr.DataArray, name: Hashable) -> float | None:
+    units = coordinate.attrs.get("units")
+    return length_in_um(units) if isinstance(units, str) else 1.0 if str(name).endswith("_um") else None
+
+
+def _exact(array: xr.DataArray, x_um: Floats, y_um: Floats) -> Grid | None:
+    """The grid that the attributes tell to the last bit, when the coordinates are its: a cut-out keeps the attributes."""
+    pitch, origin = array.attrs.get("pitch_um"), array.attrs.get("origin_um")
+    if pitch is None or origin is None:
+        return None
+    try:
+        x0, y0 = np.asarray(origin, dtype=np.float64).tolist()
+        grid = Grid((y_um.size, x_um.size), float(pitch), (x0, y0))
+    except (TypeError, ValueError):
+        return None
+    far = max(np.abs(np.sort(x_um) - grid.x_um).max(), np.abs(np.sort(y_um) - grid.y_um).max())
+    return grid if far <= ROUNDING * grid.pitch_um else None
+
+
+def _wavelengths_nm(array: xr.DataArray, dimension: Hashable | None) -> list[float] | None:
+    """Wavelengths of the bands: the coordinate of their dimension, or one along it that is called so."""
+    for name in (dimension, *BAND[:6]):
+        if name not in array.coords:
+            continue
+        coordinate = array.coords[name]
+        is_along = coordinate.dims in ((dimension,), ()) and coordinate.dtype.kind in "iuf"
+        per_um = _per_um(coordinate, str(name))
+        if per_um is None and str(name).endswith("_nm") and "units" not in coordinate.attrs:
+            per_um = 1e-3
+        if is_along and per_um is not None:
+            waves_nm = np.atleast_1d(coordinate.to_numpy()).astype(np.float64)
+            per_nm = per_um * 1e3
+            return (waves_nm if per_nm == 1.0 else waves_nm * per_nm).tolist()
+    return None
+
+
+def _unit(array: xr.DataArray) -> str | None:
+    units = array.attrs.get("units", array.attrs.get("unit"))
+    return units if isinstance(units, str) and units.strip() else None
+
+
+def _xarray() -> Any:
+    try:
+        import xarray as xr
+    except ImportError:
+        raise ParameterError("xarray", "is missing; install it with: pip install 'foveasim[maps]'") from None
+    return xr

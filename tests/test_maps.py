@@ -1,0 +1,1249 @@
+"""Power maps as files: round trips to the last bit, other programs' files in their units, and one sentence for the rest."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import struct
+import subprocess
+import sys
+import threading
+import zipfile
+import zlib
+
+import numpy as np
+import pytest
+import scipy.constants
+import scipy.io
+import tifffile
+
+import foveasim as fs
+from foveasim import maps
+from foveasim.errors import FileError, ParameterError
+from foveasim.maps import _apart, _dataset, from_xarray, read_power_map, to_xarray, write_power_map
+from foveasim.maps._apart import read_apart
+from foveasim.maps._readers import READERS
+from foveasim.maps._units import length_in_um, light_unit
+
+h5py = pytest.importorskip("h5py")
+xr = pytest.importorskip("xarray")
+zarr = pytest.importorskip("zarr")
+fits = pytest.importorskip("astropy.io.fits")
+OpenEXR = pytest.importorskip("OpenEXR")
+pytest.importorskip("h5netcdf")
+
+ENDINGS = ("npz", "fits", "tif", "exr", "nc", "zarr")
+#: A letter without any symmetry, the first row on top, and as a map has it.
+F = np.array([[1, 1, 1, 0], [1, 0, 0, 0], [1, 1, 0, 0], [1, 0, 0, 0], [1, 0, 0, 2]], np.float32)
+UPRIGHT = F[::-1]
+TOLD = {"pitch_um": 0.5, "wavelength_nm": 550.0, "unit": "w_m2"}
+#: Energy of a photon of 550 nm, J.
+GREEN_J = scipy.constants.h * scipy.constants.c / 550e-9
+
+
+def random_map(dtype=np.float32, n_band=3):
+    """A map none of whose numbers is a short decimal."""
+    rng = np.random.default_rng(7)
+    grid = fs.Grid((5, 7), 7.0 / 30.0, (-1.234567890123456e-5, np.pi))
+    return fs.PowerMap(rng.random((n_band, 5, 7)).astype(dtype), grid, rng.random(n_band).cumsum() * 100 + 400.1)
+
+
+def read_here(path, kind, name):
+    return READERS[kind](path, name)
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch):
+    """Reads all formats in this program, which takes no second for each file to start another."""
+    monkeypatch.setattr(maps, "read_apart", read_here)
+
+
+@pytest.fixture
+def apart(monkeypatch):
+    """Reads as users do."""
+    monkeypatch.setattr(maps, "read_apart", read_apart)
+
+
+def letter_map():
+    return fs.PowerMap.from_array(F, pitch_um=0.5, wavelength_nm=550.0, top_row_first=True)
+
+
+def assert_same(read, power_map):
+    np.testing.assert_array_equal(read.data, power_map.data, strict=True)
+    assert read.grid == power_map.grid
+    assert read.wavelength_nm.tolist() == power_map.wavelength_nm.tolist()
+
+
+def saved(tmp_path, array, name="map.npy"):
+    np.save(tmp_path / name, array)
+    return tmp_path / name
+
+
+def refused(path, match, error=FileError, **told):
+    with pytest.raises(error, match=match) as caught:
+        read_power_map(path, **told)
+    assert "\n" not in str(caught.value)
+    if error is FileError:
+        assert str(caught.value).startswith(f"{path}: ")
+    return caught.value
+
+
+# -- plain arrays -----------------------------------------------------------------------------------------------------
+
+
+def test_a_plain_array_is_a_band_in_the_middle():
+    spot = fs.PowerMap.from_array(F, pitch_um=0.5, wavelength_nm=550)
+
+    assert spot.data.shape == (1, 5, 4)
+    assert np.array_equal(spot.data[0], F)
+    assert spot.grid == fs.Grid((5, 4), 0.5, (-1.0, -1.25))
+    assert np.array_equal(letter_map().data[0], UPRIGHT)
+
+
+def test_a_plain_array_of_bands_is_used_without_a_copy():
+    data = np.ones((2, 3, 4), np.float32)
+
+    bands = fs.PowerMap.from_array(data, pitch_um=1.0, wavelength_nm=[450.0, 550.0], origin_um=(1.0, 2.0))
+
+    assert np.shares_memory(bands.data, data)
+    assert bands.grid.origin_um == (1.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("data", "told", "message"),
+    [
+        (np.ones(3), {}, r"'data' must have the shape \(n_y, n_x\) or \(n_band, n_y, n_x\), got \(3,\)"),
+        (np.ones((1, 1, 3, 3)), {}, r"'data' must have the shape"),
+        (np.ones((0, 3)), {}, r"'data' must have the shape"),
+        ([[1.0], [1.0, 2.0]], {}, r"'data' must be an array of numbers"),
+        (np.ones((3, 3), complex), {}, r"'data' must have real numbers"),
+        (np.ones((3, 3)), {"pitch_um": 0.0}, r"'pitch_um' must be > 0"),
+        (np.ones((2, 3, 3)), {}, r"'data' must have the shape \(n_band, n_y, n_x\) = \(1, 3, 3\)"),
+        (np.ones((3, 3)), {"wavelength_nm": "green"}, r"'wavelength_nm' must be an array of numbers"),
+    ],
+)
+def test_a_plain_array_that_is_no_map_is_refused(data, told, message):
+    with pytest.raises(ParameterError, match=message):
+        fs.PowerMap.from_array(data, **{"pitch_um": 1.0, "wavelength_nm": 550.0, **told})
+
+
+# -- round trips ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.usefixtures("apart")
+def test_a_map_comes_back_to_the_last_bit(tmp_path, ending, dtype):
+    power_map, path = random_map(dtype), tmp_path / f"map.{ending}"
+    if (ending, dtype) == ("exr", np.float64):
+        with pytest.raises(ParameterError, match="must be float32 for EXR"):
+            write_power_map(power_map, path)
+    else:
+        write_power_map(power_map, path)
+        assert_same(read_power_map(path), power_map)
+    assert [p.name for p in tmp_path.iterdir()] == ([path.name] if path.exists() else [])
+
+
+@pytest.mark.parametrize("ending", [e for e in ENDINGS if e not in ("nc", "zarr")])
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 5), (1, 6, 1), (4, 1, 1), (3, 4, 3)])
+def test_small_maps_come_back(tmp_path, ending, shape):
+    power_map = fs.PowerMap(
+        np.arange(np.prod(shape), dtype=np.float32).reshape(shape),
+        fs.Grid(shape[1:], 0.1),
+        400.0 + 0.1 * np.arange(shape[0]),
+    )
+    fs.write_power_map(power_map, tmp_path / f"map.{ending}")
+
+    assert_same(fs.read_power_map(tmp_path / f"map.{ending}"), power_map)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 5), (4, 6, 1)])
+def test_small_labelled_maps_come_back(shape):
+    power_map = fs.PowerMap(np.ones(shape), fs.Grid(shape[1:], 0.1, (3.0, 4.0)), 400.0 + 0.1 * np.arange(shape[0]))
+
+    assert_same(from_xarray(to_xarray(power_map)), power_map)
+
+
+def test_a_map_is_written_over_another(tmp_path):
+    for ending in ENDINGS:
+        for power_map in (letter_map(), random_map()):
+            write_power_map(power_map, tmp_path / f"map.{ending}")
+    assert_same(read_power_map(tmp_path / "map.zarr"), random_map())
+    assert_same(read_power_map(tmp_path / "map.fits"), random_map())
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_map_that_cannot_be_written_leaves_nothing(tmp_path, ending, monkeypatch):
+    def full(*_args, **_options):
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(FileError, match=r"the folder .* does not exist"):
+        write_power_map(letter_map(), tmp_path / "nowhere" / f"map.{ending}")
+    monkeypatch.setattr(_dataset, "to_xarray", full)
+    monkeypatch.setattr("foveasim.maps._npy.np.savez", full)
+    monkeypatch.setattr("tifffile.TiffWriter", full)
+    monkeypatch.setattr("astropy.io.fits.PrimaryHDU", full)
+    monkeypatch.setattr("OpenEXR.File", full)
+    path = tmp_path / f"map.{ending}"
+    with pytest.raises(FileError, match="No space left"):
+        write_power_map(letter_map(), path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_zarr_folder_does_not_take_the_place_of_something_else(tmp_path):
+    (tmp_path / "map.zarr").mkdir()
+    (tmp_path / "map.zarr" / "thesis.txt").write_text("years of work")
+
+    with pytest.raises(FileError, match="something else is there"):
+        write_power_map(letter_map(), tmp_path / "map.zarr")
+
+    assert (tmp_path / "map.zarr" / "thesis.txt").read_text() == "years of work"
+
+
+@pytest.mark.parametrize(("name", "match"), [("map.jpg", r"must end in one of \.exr, "), ("map", r"must end in")])
+def test_an_unknown_ending_is_refused(tmp_path, name, match):
+    with pytest.raises(FileError, match=match):
+        write_power_map(letter_map(), tmp_path / name)
+    with pytest.raises(ParameterError, match="'power_map' must be a PowerMap"):
+        write_power_map(F, tmp_path / "map.npz")
+
+
+MISSING = {"fits": "astropy", "exr": "OpenEXR", "nc": "h5netcdf", "zarr": "zarr"}
+
+
+@pytest.mark.parametrize(("ending", "library"), MISSING.items())
+def test_a_missing_library_is_named_with_the_command_that_installs_it(tmp_path, monkeypatch, ending, library):
+    write_power_map(letter_map(), tmp_path / f"there.{ending}")
+    monkeypatch.setitem(sys.modules, library, None)
+    for name in [n for n in sys.modules if n.startswith(f"{library}.")]:
+        monkeypatch.setitem(sys.modules, name, None)
+
+    with pytest.raises(FileError, match=rf"map\.{ending}: needs {library}.*pip install 'foveasim\[maps\]'"):
+        write_power_map(letter_map(), tmp_path / f"map.{ending}")
+    if ending == "fits":
+        refused(tmp_path / f"there.{ending}", r"needs .*pip install 'foveasim\[maps\]'")
+
+
+def test_without_xarray_one_sentence_tells_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "xarray", None)
+
+    with pytest.raises(ParameterError, match=r"pip install 'foveasim\[maps\]'"):
+        to_xarray(letter_map())
+
+
+# -- which way is up ----------------------------------------------------------------------------------------------------
+
+
+def tiff_letter(path):
+    tifffile.imwrite(path, F)
+
+
+def tiff_letter_from_below(path):
+    tifffile.imwrite(path, F[::-1], extratags=[(274, "H", 1, 4, True)])
+
+
+def fits_letter(path):
+    fits.writeto(path, UPRIGHT)
+
+
+def fits_letter_falling(path):
+    header = fits.Header({"CUNIT1": "um", "CUNIT2": "um", "CDELT1": -0.5, "CDELT2": -0.5})
+    fits.writeto(path, F[:, ::-1], header)
+
+
+def exr_letter(path):
+    with OpenEXR.File({"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}, {"550nm": F}) as file:
+        file.write(str(path))
+
+
+def npy_letter(path):
+    with path.open("wb") as file:
+        np.save(file, UPRIGHT)
+
+
+def netcdf_letter(path):
+    rows = xr.DataArray(F, dims=("row", "col"), coords={"row": np.arange(5.0)[::-1], "col": np.arange(4.0)})
+    rows.to_dataset(name="light").to_netcdf(path, engine="h5netcdf")
+
+
+def netcdf3_letter(path):
+    rows = xr.DataArray(UPRIGHT, dims=("y", "x"), coords={"y": np.arange(5.0), "x": np.arange(4.0)})
+    rows.to_dataset(name="light").to_netcdf(path, engine="scipy")
+
+
+def zarr_letter(path):
+    rows = xr.DataArray(F.T, dims=("x", "y"), coords={"y": -np.arange(5.0), "x": np.arange(4.0)})
+    rows.to_dataset(name="light").to_zarr(path, zarr_format=2)
+
+
+def mat_letter(path):
+    scipy.io.savemat(path, {"oi": {"data": {"photons": F[:, :, np.newaxis]}, "spectrum": {"wave": 550.0}}})
+
+
+LETTERS = [
+    tiff_letter,
+    tiff_letter_from_below,
+    fits_letter,
+    fits_letter_falling,
+    exr_letter,
+    npy_letter,
+    netcdf_letter,
+    netcdf3_letter,
+    zarr_letter,
+    mat_letter,
+]
+
+
+@pytest.mark.parametrize("make", LETTERS)
+@pytest.mark.filterwarnings("ignore:Consolidated metadata")
+def test_a_letter_of_another_program_is_upright(tmp_path, make):
+    make(tmp_path / "map")
+
+    read = read_power_map(tmp_path / "map", **TOLD)
+
+    assert np.array_equal(read.data[0], UPRIGHT)
+    assert read.grid == fs.Grid.centred((5, 4), 0.5)
+
+
+@pytest.mark.parametrize("ending", [e for e in ENDINGS if e != "zarr"])
+def test_what_we_write_is_upright_for_others(tmp_path, ending):
+    path = tmp_path / f"map.{ending}"
+    write_power_map(letter_map(), path)
+    others = {
+        "npz": lambda: np.load(path)["data"][0],
+        "fits": lambda: fits.getdata(path)[0],
+        "tif": lambda: tifffile.imread(path)[::-1],
+        "exr": lambda: OpenEXR.File(str(path)).channels()["S0.550,0nm"].pixels[::-1],
+        "nc": lambda: xr.load_dataset(path, engine="h5netcdf")["irradiance"].sortby("y").to_numpy()[0],
+    }
+
+    assert np.array_equal(others[ending](), UPRIGHT)
+
+
+def test_top_row_first_turns_an_array_over(tmp_path):
+    read = read_power_map(saved(tmp_path, F), **TOLD, top_row_first=True)
+
+    assert np.array_equal(read.data[0], UPRIGHT)
+
+
+# -- what other programs' files tell ----------------------------------------------------------------------------------
+
+
+def test_an_archive_of_arrays_tells_all(tmp_path):
+    path = tmp_path / "map.npz"
+    np.savez_compressed(
+        path, data=np.ones((2, 3, 4)), pitch_um=0.25, wavelength_nm=[450.0, 550.0], unit="photons/s/m2/nm"
+    )
+
+    read = read_power_map(path)
+
+    assert read.grid == fs.Grid.centred((3, 4), 0.25)
+    assert read.data[1, 0, 0] == pytest.approx(100.0 * GREEN_J, rel=1e-12)
+
+
+def test_one_of_several_arrays_is_chosen_by_its_name(tmp_path):
+    np.savez(tmp_path / "map.npz", a=np.ones((3, 4)), b=2.0 * np.ones((3, 4)))
+
+    assert read_power_map(tmp_path / "map.npz", name="b", **TOLD).data.max() == 2.0
+    refused(tmp_path / "map.npz", r"holds 2 arrays, none called 'data'; say which is the map with name=", **TOLD)
+    refused(tmp_path / "map.npz", r"has no array 'c'; there are 'a', 'b'", name="c", **TOLD)
+
+
+def test_a_fits_image_tells_pitch_place_wavelengths_and_unit(tmp_path):
+    header = fits.Header(
+        {
+            "CTYPE1": "LINEAR",
+            "CUNIT1": "mm",
+            "CRPIX1": 1.0,
+            "CRVAL1": 0.01,
+            "CDELT1": 0.002,
+            "CTYPE2": "LINEAR",
+            "CUNIT2": "mm",
+            "CRPIX2": 2.0,
+            "CRVAL2": 0.0,
+            "CDELT2": 0.002,
+            "CTYPE3": "WAVE",
+            "CUNIT3": "m",
+            "CRPIX3": 1.0,
+            "CRVAL3": 4.5e-7,
+            "CDELT3": 1e-7,
+            "BUNIT": "mW/cm2",
+        }
+    )
+    fits.writeto(tmp_path / "map.fits", np.ones((2, 3, 4), np.int16), header)
+
+    read = read_power_map(tmp_path / "map.fits")
+
+    assert read.grid.pitch_um == pytest.approx(2.0)
+    # The first column's middle is at 10 µm, the second row's at 0.
+    np.testing.assert_allclose(read.grid.origin_um, (9.0, -3.0))
+    np.testing.assert_allclose(read.wavelength_nm, (450.0, 550.0))
+    np.testing.assert_allclose(read.data, 10.0)
+
+
+def test_a_fits_image_in_an_extension_with_the_size_of_pixels(tmp_path):
+    images = [fits.ImageHDU(n * np.ones((3, 4)), name=f"N{n}") for n in (1, 2)]
+    for image in images:
+        image.header["XPIXSZ"] = 3.5
+    fits.HDUList([fits.PrimaryHDU(), *images]).writeto(tmp_path / "map.fits")
+    told = {"wavelength_nm": 550.0, "unit": "w_m2"}
+
+    assert read_power_map(tmp_path / "map.fits", **told).data.max() == 1.0
+    assert read_power_map(tmp_path / "map.fits", **told, name="N2").data.max() == 2.0
+    assert read_power_map(tmp_path / "map.fits", **told, name="2").grid.pitch_um == 3.5
+    refused(tmp_path / "map.fits", r"holds no image 'N3'", **told, name="N3")
+
+
+def test_a_fits_image_of_the_sky_asks_for_the_pitch(tmp_path):
+    fits.writeto(
+        tmp_path / "map.fits",
+        np.ones((3, 4)),
+        fits.Header({"CUNIT1": "deg", "CUNIT2": "deg", "CDELT1": 0.1, "CDELT2": 0.1}),
+    )
+
+    refused(
+        tmp_path / "map.fits", "does not tell the size of its cells; give pitch_um=", wavelength_nm=550.0, unit="w_m2"
+    )
+
+
+def test_a_turned_fits_image_is_refused(tmp_path):
+    fits.writeto(tmp_path / "map.fits", np.ones((3, 4)), fits.Header({"CD1_1": 0.1, "CD1_2": 0.1, "CD2_2": 0.1}))
+
+    refused(tmp_path / "map.fits", "is turned against its coordinates", wavelength_nm=550.0, unit="w_m2")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"compression": "deflate"},
+        {"byteorder": ">"},
+        {"bigtiff": True},
+        {"photometric": "minisblack", "tile": (16, 16)},
+    ],
+    ids=str,
+)
+def test_pages_of_a_tiff_are_bands(tmp_path, options):
+    bands = np.arange(3 * 20 * 30, dtype=np.uint16).reshape(3, 20, 30)
+    tifffile.imwrite(tmp_path / "map.tif", bands, **{"photometric": "minisblack", **options})
+
+    read = read_power_map(tmp_path / "map.tif", pitch_um=1.0, wavelength_nm=[450, 550, 650], unit="w_m2")
+
+    assert np.array_equal(read.data, bands[:, ::-1])
+
+
+@pytest.mark.parametrize("planar", ["contig", "separate"])
+def test_samples_of_a_tiff_are_bands(tmp_path, planar):
+    bands = np.arange(3 * 20 * 30, dtype=np.float32).reshape(3, 20, 30)
+    samples = bands if planar == "separate" else np.moveaxis(bands, 0, -1)
+    tifffile.imwrite(tmp_path / "map.tif", samples, photometric="rgb", planarconfig=planar)
+
+    read = read_power_map(tmp_path / "map.tif", pitch_um=1.0, wavelength_nm=[450, 550, 650], unit="w_m2")
+
+    assert np.array_equal(read.data, bands[:, ::-1])
+
+
+def write_exr(path, channels, **header):
+    with OpenEXR.File(
+        {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}, channels
+    ) as file:
+        file.write(str(path))
+
+
+def test_channels_of_a_spectral_exr_are_bands_by_their_wavelengths(tmp_path):
+    channels = {f"S0.{w}nm": np.full((3, 4), i, np.float32) for i, w in enumerate(("1000,5", "450", "550,25"))}
+    write_exr(tmp_path / "map.exr", channels | {"R": np.zeros((3, 4), np.float32)}, emissiveUnits="W.m^-2.nm^-1")
+
+    read = read_power_map(tmp_path / "map.exr", pitch_um=1.0, band_width_nm=10.0)
+
+    assert read.wavelength_nm.tolist() == [450.0, 550.25, 1000.5]
+    assert read.data[:, 0, 0].tolist() == [10.0, 20.0, 0.0]
+
+
+def test_an_exr_of_radiance_or_of_colours_is_refused(tmp_path):
+    ones = np.ones((3, 4), np.float32)
+    write_exr(tmp_path / "scene.exr", {"S0.550nm": ones}, emissiveUnits="W.m^-2.sr^-1.nm^-1")
+    write_exr(tmp_path / "colours.exr", dict.fromkeys("RGB", ones))
+
+    refused(
+        tmp_path / "scene.exr", r"is in 'W\.m\^-2\.sr\^-1\.nm\^-1', which is no irradiance; .* give unit=", pitch_um=1.0
+    )
+    refused(tmp_path / "colours.exr", "colours of a picture", **TOLD)
+    assert read_power_map(tmp_path / "scene.exr", pitch_um=1.0, unit="w_m2").data.max() == 1.0
+
+
+def labelled(**changes):
+    """An array as another program labels it, in SI, y falling."""
+    coords = {
+        "wl": ("wl", np.array([0.45, 0.55, 0.65]), {"units": "um"}),
+        "y": ("y", np.arange(4)[::-1] * 2e-6, {"units": "m"}),
+        "x": ("x", np.arange(5) * 2e-6 + 1e-5, {"units": "m"}),
+    }
+    data = np.arange(60.0).reshape(3, 4, 5)
+    return xr.DataArray(data, dims=("wl", "y", "x"), coords=coords, attrs={"units": "W m-2 um-1"}).assign_attrs(
+        **changes
+    )
+
+
+def test_a_labelled_array_is_turned_upright_and_into_our_units():
+    read = from_xarray(labelled())
+
+    assert read.grid.pitch_um == pytest.approx(2.0)
+    np.testing.assert_allclose(read.grid.origin_um, (9.0, -1.0))
+    np.testing.assert_allclose(read.wavelength_nm, (450.0, 550.0, 650.0))
+    # W/(m² µm), bands of 100 nm: a tenth.
+    np.testing.assert_allclose(read.data, labelled().to_numpy()[:, ::-1] / 10.0)
+
+
+def test_dimensions_may_come_in_any_order_and_a_single_time_may_be_there():
+    array = labelled().expand_dims("time").transpose("x", "time", "wl", "y")
+
+    np.testing.assert_array_equal(from_xarray(array).data, from_xarray(labelled()).data)
+
+
+def test_a_cut_out_of_our_own_array_lies_where_it_was():
+    power_map = random_map()
+
+    part = from_xarray(to_xarray(power_map)[1:, 2:4, 3:])
+
+    np.testing.assert_array_equal(part.data, power_map.data[1:, 2:4, 3:])
+    x0, y0 = power_map.grid.origin_um
+    pitch_um = power_map.grid.pitch_um
+    np.testing.assert_allclose(part.grid.origin_um, (x0 + 3 * pitch_um, y0 + 2 * pitch_um))
+    assert part.grid.pitch_um == pytest.approx(pitch_um)
+
+
+def test_one_wavelength_may_stand_beside_the_array():
+    read = from_xarray(labelled().isel(wl=1), band_width_nm=20.0)
+
+    assert read.wavelength_nm == pytest.approx(550.0)
+    assert read.data.max() == pytest.approx(39.0 * 1e-3 * 20.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda a: a.rename(x="theta"),
+            r"has the dimensions \(wl, y, theta\), expected \(wavelength, y, x\); rename them",
+        ),
+        (lambda a: a.expand_dims(time=2), r"has the dimensions \(time, wl, y, x\)"),
+        (lambda a: a.assign_coords(x=[0, 1, 2, 3, 5]), r"uneven steps along x"),
+        (lambda a: a.assign_coords(x=[0, 1, 2, 3, np.nan]), r"coordinates along x that are no numbers"),
+        (lambda a: a.assign_coords(x=list("abcde")), r"coordinates along x that are no numbers"),
+        (
+            lambda a: a.assign_coords(x=("x", np.arange(5) * 3e-6, {"units": "m"})),
+            r"cells of 3 µm by 2 µm; they must be square",
+        ),
+        (lambda a: a.drop_vars("x"), r"does not tell the size of its cells; give pitch_um="),
+        (lambda a: a.assign_coords(x=np.arange(5.0)), r"does not tell the size of its cells; give pitch_um="),
+        (
+            lambda a: a.drop_vars("wl"),
+            r"does not tell the wavelengths of its bands; give wavelength_nm=\.\.\., 3 in nm",
+        ),
+        (lambda a: a.assign_coords(wl=("wl", [0.0, 1.0, 2.0], {"units": "um"})), r"tells no wavelengths"),
+        (lambda a: a.assign_attrs(units="K"), r"is in 'K', which is no irradiance"),
+        (lambda a: a.drop_attrs(deep=False), r"does not tell its unit; give unit=\.\.\., one of 'w_m2', 'w_m2_nm'"),
+        (lambda a: a.isel(wl=[1, 1, 1]), r"does not tell how wide its bands are; give band_width_nm="),
+        (lambda a: a.where(a != 7), r"holds nan at \[band, row, column\] = \[0, 1, 2\]; light is finite"),
+        (lambda a: a - 1.0, r"holds negative light, -0\.1 W/m² at .*; clip it first"),
+        (lambda a: a * 1j, r"holds complex numbers"),
+        (lambda a: a > 1, r"of the type bool, expected numbers"),
+        (lambda a: a[:, :0], r"shape \(3, 0, 5\)"),
+    ],
+)
+def test_a_labelled_array_that_is_no_map_is_refused(change, message):
+    with xr.set_options(keep_attrs=True):
+        array = change(labelled())
+
+    with pytest.raises(ParameterError, match=message):
+        from_xarray(array)
+
+
+def test_only_labelled_arrays_are_labelled_arrays():
+    with pytest.raises(ParameterError, match=r"'data_array' must be an xarray\.DataArray, got a ndarray"):
+        from_xarray(np.ones((3, 3)))
+    with pytest.raises(ParameterError, match=r"'power_map' must be a PowerMap"):
+        to_xarray(np.ones((3, 3)))
+
+
+def test_the_map_of_a_netcdf_is_the_only_one_or_named(tmp_path):
+    two = xr.Dataset({"a": labelled(), "b": 2.0 * labelled(), "note": ("z", [1.0, 2.0])})
+    two["b"].attrs = labelled().attrs
+    two.to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
+
+    np.testing.assert_allclose(read_power_map(tmp_path / "map.nc", name="b").data, 2.0 * from_xarray(labelled()).data)
+    refused(
+        tmp_path / "map.nc", r"holds 2 arrays of numbers with rows and columns: a, b; say which is the map with name="
+    )
+    refused(tmp_path / "map.nc", r"has no variable 'c'; there are a, b, note", name="c")
+
+
+def test_packed_numbers_of_a_netcdf_are_unpacked(tmp_path):
+    packing = {"light": {"dtype": "int16", "scale_factor": 0.5, "add_offset": 10.0, "zlib": True, "_FillValue": -32768}}
+    labelled().to_dataset(name="light").to_netcdf(tmp_path / "map.nc", engine="h5netcdf", encoding=packing)
+
+    np.testing.assert_allclose(read_power_map(tmp_path / "map.nc").data, from_xarray(labelled()).data)
+
+
+def test_an_array_of_plain_hdf5_is_read_when_all_is_told(tmp_path):
+    with h5py.File(tmp_path / "map.h5", "w") as file:
+        file["fields/power"] = np.ones((3, 4))
+        file["power"] = np.arange(12.0).reshape(3, 4)
+
+    read = read_power_map(tmp_path / "map.h5", **TOLD)
+
+    np.testing.assert_array_equal(read.data[0], np.arange(12.0).reshape(3, 4))
+
+
+# -- optical images of ISETCam --------------------------------------------------------------------------------------
+
+
+def optical_image(photons, wave, **changes):
+    """A struct ``oi`` as ISETCam keeps it, of a lens of 4 mm and a field of 10 degrees."""
+    return {
+        "type": "opticalimage",
+        "wAngular": 10.0,
+        "data": {"photons": photons},
+        "spectrum": {"wave": np.asarray(wave, float).reshape(-1, 1)},
+        "optics": {"focalLength": 0.004, "model": "diffractionlimited", "fNumber": 4.0},
+        **changes,
+    }
+
+
+def save_v73(path, tree):
+    """A MAT file of version 7.3 as MATLAB lays it out: axes the other way round, text as numbers, a header before HDF5."""
+
+    def fill(group, values):
+        for name, value in values.items():
+            if isinstance(value, dict):
+                fill(group.create_group(name), value)
+            elif isinstance(value, str):
+                group[name] = np.array([[ord(c)] for c in value], np.uint16)
+                group[name].attrs["MATLAB_class"] = np.bytes_("char")
+            else:
+                group[name] = np.atleast_2d(value).T
+                group[name].attrs["MATLAB_class"] = np.bytes_("double")
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        fill(file, tree)
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+
+
+SAVERS = {
+    "v7": lambda path, tree: scipy.io.savemat(path, tree, do_compression=True),
+    "v6": scipy.io.savemat,
+    "v7.3": save_v73,
+}
+
+
+@pytest.mark.parametrize("save", SAVERS.values(), ids=SAVERS)
+def test_a_watt_of_an_optical_image_is_a_watt(tmp_path, save):
+    wave = np.array([540.0, 550.0, 560.0])
+    photon_j = scipy.constants.h * scipy.constants.c / (wave * 1e-9)
+    # 1 W/(m² nm) at every wavelength; at 550 nm 2.769e18 photons.
+    photons = np.ones((4, 6, 3)) / photon_j
+    photons[0, 1] *= 3.0
+    assert photons[3, 0, 1] == pytest.approx(2.7688e18, rel=1e-4)
+    save(tmp_path / "oi.mat", {"oi": optical_image(photons, wave)})
+
+    read = read_power_map(tmp_path / "oi.mat")
+
+    expected = np.full((3, 4, 6), 10.0)
+    expected[:, 3, 1] = 30.0  # row 1 of ISETCam is on top
+    np.testing.assert_allclose(read.data, expected, rtol=1e-12)
+    assert read.wavelength_nm.tolist() == wave.tolist()
+    # Width 2 f tan(fov / 2) = 2 · 4000 µm · 0.0874887 = 699.909 µm, on 6 columns.
+    assert read.grid.pitch_um == pytest.approx(116.6516, rel=1e-6)
+    np.testing.assert_allclose(read.grid.bounds_um, (-349.9547, -233.3031, 349.9547, 233.3031), rtol=1e-6)
+
+
+@pytest.mark.parametrize("save", SAVERS.values(), ids=SAVERS)
+def test_optical_images_come_under_other_names_too(tmp_path, save):
+    photons = np.random.default_rng(8).random((4, 6, 2)).astype(np.float32) * np.float32(1e18)
+    image = optical_image(photons, [450.0, 550.0])
+    trees = {"oi": {"oi": image}, "opticalimage": {"opticalimage": image}, "fields": image}
+    for name, tree in trees.items():
+        save(tmp_path / f"{name}.mat", tree)
+    save(tmp_path / "mine.mat", {"mine": image, "other": {"a": 1.0}})
+
+    maps = [read_power_map(tmp_path / f"{name}.mat") for name in trees]
+    maps.append(read_power_map(tmp_path / "mine.mat", name="mine"))
+
+    assert maps[0].data.dtype == np.float32
+    for power_map in maps[1:]:
+        assert_same(power_map, maps[0])
+    refused(tmp_path / "mine.mat", r"holds no optical image 'oi'; there are mine, other")
+
+
+@pytest.mark.parametrize("save", SAVERS.values(), ids=SAVERS)
+def test_ray_traced_images_have_the_focal_length_of_the_rays_in_mm(tmp_path, save):
+    optics = {"focalLength": 1.0, "model": "raytrace", "rayTrace": {"effectiveFocalLength": 8.0}}
+    save(tmp_path / "oi.mat", {"oi": optical_image(np.ones((4, 6)), [550.0], optics=optics)})
+
+    read = read_power_map(tmp_path / "oi.mat")
+
+    assert read.grid.pitch_um == pytest.approx(2 * 116.6516, rel=1e-6)
+    # One wavelength stands for 1 nm.
+    assert read.data.max() == pytest.approx(GREEN_J, rel=1e-12)
+
+
+def test_photons_that_old_versions_packed_are_unpacked(tmp_path):
+    packed = np.array([[0, 65535], [32768, 1]], np.uint16)
+    data = {"photons": packed, "dmin": 1e17, "dmax": 3e17, "bitDepth": 16.0}
+    scipy.io.savemat(tmp_path / "oi.mat", {"oi": optical_image(0, [550.0], data=data)})
+
+    rates = read_power_map(tmp_path / "oi.mat").data[0, ::-1] / GREEN_J
+
+    np.testing.assert_allclose(rates, [[1e17, 3e17], [1e17 + 2e17 * 32768 / 65535, 1e17 + 2e17 / 65535]], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"wAngular": 200.0}, "does not tell the size of its cells; give pitch_um="),
+        ({"optics": {"focalLength": np.nan}}, "does not tell the size of its cells; give pitch_um="),
+        ({"spectrum": 1.0}, "does not tell the wavelengths"),
+        ({"data": {"illuminance": 1.0}}, r"holds no optical image with data\.photons; compute it first"),
+        ({"data": {"photons": np.ones((2, 2, 2, 2))}}, r"photons of the shape \(2, 2, 2, 2\)"),
+        ({"data": {"photons": np.ones((2, 2), np.uint16)}}, "without the dmin and dmax"),
+        ({"data": {"photons": np.ones((2, 2, 3))}}, "tells 1 wavelengths, and has 3 bands"),
+        ({"data": {"photons": -np.ones((2, 2))}}, "holds negative light"),
+    ],
+)
+def test_an_optical_image_that_lacks_something_says_what(tmp_path, changes, message):
+    scipy.io.savemat(tmp_path / "oi.mat", {"oi": optical_image(np.ones((2, 2)), [550.0], **changes)})
+
+    refused(tmp_path / "oi.mat", message)
+
+
+def test_what_is_said_goes_before_what_the_file_tells(tmp_path):
+    scipy.io.savemat(tmp_path / "oi.mat", {"oi": optical_image(np.ones((4, 6)), [550.0])})
+
+    read = read_power_map(
+        tmp_path / "oi.mat", pitch_um=2.0, wavelength_nm=600.0, unit="w_m2_nm", band_width_nm=7.0, origin_um=(1.0, 2.0)
+    )
+
+    assert read.grid == fs.Grid((4, 6), 2.0, (1.0, 2.0))
+    assert read.wavelength_nm.tolist() == [600.0]
+    assert read.data.max() == 7.0
+
+
+# -- numbers and units ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("unit", "expected"),
+    [
+        ("w_m2", (1.0, 1.0)),
+        ("w_m2_nm", (100.0, 100.0)),
+        ("photons_s_m2", (GREEN_J * 550 / 450, GREEN_J)),
+        ("photons_s_m2_nm", (100.0 * GREEN_J * 550 / 450, 100.0 * GREEN_J)),
+    ],
+)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_numbers_become_watts_a_band(tmp_path, unit, expected, dtype):
+    scale = 1.0 if unit.startswith("w") else 1e18
+    path = saved(tmp_path, np.full((2, 3, 4), scale, dtype))
+
+    read = read_power_map(path, pitch_um=1.0, wavelength_nm=[450.0, 550.0], unit=unit)
+
+    assert read.data.dtype == dtype
+    np.testing.assert_allclose(read.data[:, 0, 0], scale * np.array(expected), rtol=2 * np.finfo(dtype).eps)
+
+
+def test_bands_reach_half_way_to_their_neighbours_in_any_order(tmp_path):
+    read = read_power_map(
+        saved(tmp_path, np.ones((3, 1, 1))), pitch_um=1.0, wavelength_nm=[600, 400, 450], unit="w_m2_nm"
+    )
+
+    assert read.data.ravel().tolist() == [150.0, 50.0, 100.0]
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("W/m2", ("w_m2", 1.0)),
+        ("W/m^2", ("w_m2", 1.0)),
+        ("W m-2", ("w_m2", 1.0)),
+        ("W·m⁻²", ("w_m2", 1.0)),
+        ("W/m²", ("w_m2", 1.0)),
+        ("J s**-1 m**-2", ("w_m2", 1.0)),
+        ("uW/cm2", ("w_m2", 0.01)),
+        ("µW/(cm^2)", ("w_m2", 0.01)),
+        ("erg/s/cm2/Angstrom", ("w_m2_nm", 0.01)),
+        ("W m-2 um-1", ("w_m2_nm", 1e-3)),
+        ("W/m^3", ("w_m2_nm", 1e-9)),
+        ("W/(m2 nm)", ("w_m2_nm", 1.0)),
+        ("photons/s/m2", ("photons_s_m2", 1.0)),
+        ("photons/(s m2 nm)", ("photons_s_m2_nm", 1.0)),
+        ("w_m2", ("w_m2", 1.0)),
+        ("photons_s_m2_nm", ("photons_s_m2_nm", 1.0)),
+        ("W/m2 nm", None),
+        ("W m-2 sr-1", None),
+        ("W/m2/nm/sr", None),
+        ("V/m", None),
+        ("1/s", None),
+        ("W/(m2", None),
+        ("W/m2)", None),
+        ("", None),
+        ("a.u.", None),
+        ("W" * 100, None),
+        ("m" + "9" * 60, None),
+        ("W/m100", None),
+    ],
+)
+def test_units_are_read_as_they_are_written(text, unit):
+    assert light_unit(text) == unit
+
+
+@pytest.mark.parametrize(
+    ("text", "size_um"),
+    [("nm", 1e-3), ("micron", 1.0), ("μm", 1.0), ("m", 1e6), ("AA", 1e-4), ("px", None), ("m2", None)],
+)
+def test_lengths_are_read_as_they_are_written(text, size_um):
+    assert length_in_um(text) == size_um
+
+
+@pytest.mark.parametrize("dtype", [">f4", ">f8", "<f2", "u1", ">u2", "<i4", ">i8", "u8"])
+def test_numbers_of_any_type_and_byte_order_are_numbers(tmp_path, dtype):
+    read = read_power_map(saved(tmp_path, np.arange(12).reshape(3, 4).astype(dtype)), **TOLD)
+
+    assert np.array_equal(read.data[0], np.arange(12).reshape(3, 4))
+    assert read.data.dtype in (np.float32, np.float64)
+    assert read.data.dtype.isnative
+
+
+def test_fortran_order_is_the_same_array(tmp_path):
+    array = np.arange(24.0).reshape(2, 3, 4)
+
+    read = read_power_map(
+        saved(tmp_path, np.asfortranarray(array)), pitch_um=1.0, wavelength_nm=[450, 550], unit="w_m2"
+    )
+
+    assert np.array_equal(read.data, array)
+
+
+def test_rounding_below_darkness_is_kept(tmp_path):
+    light = np.array([[1.0, -1e-7]])
+
+    assert np.array_equal(read_power_map(saved(tmp_path, light), **TOLD).data[0], light)
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.array([[1.0, np.nan]]), r"holds nan at \[band, row, column\] = \[0, 0, 1\]"),
+        (np.array([[1.0], [np.inf]]), r"holds inf at \[band, row, column\] = \[0, 1, 0\]"),
+        (np.array([[1.0, -0.5]]), r"holds negative light, -0\.5 W/m² at \[band, row, column\] = \[0, 0, 1\]"),
+        (np.array([[-1e-9, -1e-9]]), r"holds negative light"),
+        (np.ones((2, 2), complex), r"holds complex numbers: a field"),
+        (np.ones((2, 2), bool), r"of the type bool"),
+        (np.array([["a", "b"]]), r"of the type <U1"),
+        (np.ones(3), r"shape \(3,\)"),
+        (np.ones((2, 1, 3, 3)), r"shape \(2, 1, 3, 3\)"),
+        (np.ones((2, 0)), r"shape \(2, 0\)"),
+        (np.float64(1.0), r"shape \(\)"),
+        (np.array([[{}]], dtype=object), r"holds Python objects"),
+        (np.zeros((2, 2), [("a", "f8")]), r"of the type"),
+        (np.ones((5000, 1, 1)), r"holds 5000 bands, more than 4096; bands come first"),
+    ],
+)
+def test_what_light_cannot_be_is_refused(tmp_path, array, message):
+    refused(saved(tmp_path, array), message, **TOLD)
+
+
+@pytest.mark.parametrize(
+    ("told", "message", "error"),
+    [
+        ({"pitch_um": None}, r"does not tell the size of its cells; give pitch_um=\.\.\., their side in µm", FileError),
+        ({"wavelength_nm": None}, r"give wavelength_nm=\.\.\., 1 in nm", FileError),
+        ({"unit": None}, r"does not tell its unit; give unit=\.\.\., one of", FileError),
+        ({"unit": "w_m2_nm"}, r"does not tell how wide its bands are; give band_width_nm=", FileError),
+        ({"pitch_um": -1.0}, r"'pitch_um' must be > 0", ParameterError),
+        ({"pitch_um": 1e-6}, r"'pitch_um' must be >= 0\.0001", ParameterError),
+        ({"wavelength_nm": 0.55}, r"'wavelength_nm' must be from 10", ParameterError),
+        (
+            {"wavelength_nm": [450, 550]},
+            r"'wavelength_nm' must have 1 values, one for each band of the map, got 2",
+            ParameterError,
+        ),
+        (
+            {"unit": "lux"},
+            r"'unit' must be one of 'w_m2', 'w_m2_nm', 'photons_s_m2', 'photons_s_m2_nm', got 'lux'",
+            ParameterError,
+        ),
+        (
+            {"unit": "w_m2_nm", "band_width_nm": [1, 2]},
+            r"'band_width_nm' must be one positive number, or one for each",
+            ParameterError,
+        ),
+        ({"band_width_nm": -1}, r"'band_width_nm' must be > 0", ParameterError),
+        ({"origin_um": (1.0,)}, r"'origin_um' must be two numbers", ParameterError),
+        ({"name": "x"}, r"holds one array without a name; leave name= out", FileError),
+    ],
+)
+def test_what_is_missing_or_said_wrongly_is_told(tmp_path, told, message, error):
+    refused(saved(tmp_path, np.ones((3, 4))), message, error, **{**TOLD, **told})
+
+
+def test_what_is_no_file_of_a_map_is_refused(tmp_path):
+    (tmp_path / "empty").write_bytes(b"")
+    (tmp_path / "packed").write_bytes(b"\x1f\x8b" + bytes(50))
+    (tmp_path / "text").write_text("1 2 3")
+
+    refused(tmp_path / "nowhere", "no such file")
+    refused(tmp_path, "is not a file")
+    refused(tmp_path / "empty", "is empty")
+    refused(tmp_path / "packed", "is compressed with gzip; unpack it first")
+    refused(tmp_path / "text", "is no power map: expected npy, npz, FITS, TIFF, EXR, netCDF, zarr or MAT")
+
+
+# -- files from strangers ---------------------------------------------------------------------------------------------
+
+MAX_S, HANGING_S, MAX_BYTES = 20.0, 60.0, 2 * 2**30
+READ = """
+import json, resource, sys
+from foveasim import maps
+from foveasim.errors import FoveasimError
+from foveasim.maps import read_power_map
+from foveasim.maps._readers import READERS
+
+if "here" in sys.argv:
+    maps.read_apart = lambda path, kind, name: READERS[kind](path, name)
+    resource.setrlimit(resource.RLIMIT_AS, (4 * 2**30, 4 * 2**30))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+answers = open(int(sys.argv[1]), "w")
+
+def busy_s():
+    return sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+
+for path in sys.stdin.read().splitlines():
+    began_s = busy_s()
+    try:
+        answer = ["PowerMap", str(read_power_map(path, pitch_um=1.0, wavelength_nm=550.0, unit="w_m2").data.shape)]
+    except FoveasimError as error:
+        answer = [type(error).__name__, str(error)]
+    except BaseException as error:
+        answer = ["!" + type(error).__name__, str(error)]
+    own = next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmHWM")) * 1024
+    child = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
+    print(json.dumps([*answer, busy_s() - began_s, own + child]), file=answers, flush=True)
+"""
+#: The program that read was ended.
+ENDED = "ended"
+#: What reading may raise.
+ERRORS = {"FileError", "ParameterError"}
+
+
+def read_all(paths, *, apart=True):
+    """
+    What a program of its own makes of files: kind, sentence, seconds of a processor, bytes.
+
+    Not ``apart``: what the readers make of them in that program. One that ends it is a kind of its own.
+    """
+    answers = []
+    while len(answers) < len(paths):
+        rest, (source, sink) = paths[len(answers) :], os.pipe()
+        command = [sys.executable, "-c", READ, str(sink), *(() if apart else ("here",))]
+        with (
+            subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, pass_fds=[sink]
+            ) as program,
+            os.fdopen(source) as told,
+        ):
+            os.close(sink)
+            timer = threading.Timer(HANGING_S + 4 * len(rest), program.kill)
+            timer.start()
+            program.stdin.write("\n".join(map(str, rest)).encode())
+            program.stdin.close()
+            answers += map(json.loads, told)
+            timer.cancel()
+        if len(answers) < len(paths):
+            answers.append([ENDED, f"{program.returncode}", 0.0, 0])
+    return answers
+
+
+def assert_harmless(answers, kinds):
+    for answer in answers:
+        kind, sentence, busy_s, n_bytes = answer
+        assert kind in kinds, answer
+        assert sentence.isprintable(), answer
+        assert len(sentence) < 700
+        assert busy_s < MAX_S, answer
+        assert n_bytes < MAX_BYTES, answer
+
+
+def npy_header(shape, dtype="<f4"):
+    text = repr({"descr": dtype, "fortran_order": False, "shape": shape}).encode()
+    text = text.ljust(-(len(text) + 11) % 64 + len(text)) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
+
+
+def zipped(**members):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(f"{name}.npy", content)
+    return file.getvalue()
+
+
+def fits_header(*cards, body=b""):
+    text = b"".join(f"{key:8}= {value:>20}".encode().ljust(80) for key, value in cards) + b"END".ljust(80)
+    return text.ljust(-(-len(text) // 2880) * 2880) + body
+
+
+def tiff_directory(*entries, after=0, body=b""):
+    """A TIFF of one directory of (tag, type, count, value)."""
+    table = b"".join(struct.pack("<HHII", *entry) for entry in entries)
+    return b"II*\0" + struct.pack("<IH", 8, len(entries)) + table + struct.pack("<I", after) + body
+
+
+def big_tiff():
+    n = 2**20
+    return tiff_directory(
+        *((256, 4, 1, n), (257, 4, 1, n), (258, 3, 1, 32), (259, 3, 1, 8), (262, 3, 1, 1), (339, 3, 1, 3)),
+        *((273, 4, 1, 200), (277, 3, 1, 1), (278, 4, 1, n), (279, 4, 1, 50)),
+        body=bytes(100),
+    )
+
+
+def looping_tiff():
+    return tiff_directory((256, 4, 1, 2), (257, 4, 1, 2), (258, 3, 1, 8), (273, 4, 1, 8), after=8)
+
+
+def mat_element(kind, content):
+    return struct.pack("<II", kind, len(content)) + content + bytes(0 if kind == 15 else -len(content) % 8)
+
+
+def mat(*elements):
+    return b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + b"".join(elements)
+
+
+def mat_array(name, kind, dims, *parts):
+    content = mat_element(6, struct.pack("<II", kind, 0)) + mat_element(5, struct.pack("<ii", *dims))
+    content += mat_element(1, name) + b"".join(parts)
+    return mat_element(14, content)
+
+
+def nested_mat(n):
+    """Cells in cells, deeper than any program looks."""
+    inner = mat_array(b"", 6, (1, 1), mat_element(9, bytes(8)))
+    for _ in range(n):
+        inner = mat_array(b"", 1, (1, 1), inner)
+    return mat(mat_array(b"oi", 1, (1, 1), inner))
+
+
+def hdf5(fill):
+    file = io.BytesIO()
+    with h5py.File(file, "w") as tree:
+        fill(tree)
+    return file.getvalue()
+
+
+def sparse(tree):
+    tree.create_dataset("light", (2**20, 2**20), "f4", chunks=(1024, 1024), compression="gzip")
+
+
+def hdf5_bomb(tree):
+    tree.create_dataset(
+        "light", data=np.zeros((2**13, 2**14), "f4"), chunks=(2**13, 2**14), compression="gzip", shuffle=True
+    )
+
+
+def virtual(tree):
+    layout = h5py.VirtualLayout((2, 2), "u1")
+    layout[:] = h5py.VirtualSource("/etc/passwd", "x", (2, 2))
+    tree.create_virtual_dataset("light", layout)
+
+
+def mat73(fill):
+    content = bytearray(512) + hdf5(fill)
+    content[:128] = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
+    return bytes(content)
+
+
+def huge_oi(tree):
+    tree.create_dataset("oi/data/photons", (3, 2**18, 2**18), "f4", chunks=(1, 1024, 1024), compression="gzip")
+
+
+BOMBS = {
+    "npy of a huge shape": lambda: npy_header((2**20, 2**20)) + bytes(100),
+    "npy of a negative shape": lambda: npy_header((-3, -4)) + bytes(48),
+    "npy of no bytes": lambda: npy_header((2**30, 2**20), "<V0"),
+    "npy of objects": lambda: npy_header((1, 1), "|O") + b"cos\nsystem\n(S'touch /tmp/owned'\ntR.",
+    "npy whose header is code": lambda: (
+        b"\x93NUMPY\x01\x00\x40\x00" + b"__import__('os').system('touch /tmp/owned')".ljust(63) + b"\n"
+    ),
+    "npy with an endless header": lambda: b"\x93NUMPY\x02\x00\xff\xff\xff\x7f" + b"(" * 100_000,
+    "zip bomb": lambda: zipped(data=npy_header((2**14, 2**13)) + bytes(2**29)),
+    "zip of a bomb beside the map": lambda: zipped(
+        data=npy_header((2, 2)) + bytes(16), unit=npy_header((2**22,)) + bytes(2**24)
+    ),
+    "zip of objects": lambda: zipped(data=npy_header((1, 1), "|O") + b"cos\nsystem\n(S'touch /tmp/owned'\ntR."),
+    "fits of a huge shape": lambda: fits_header(
+        ("SIMPLE", "T"), ("BITPIX", -64), ("NAXIS", 2), ("NAXIS1", 2**31), ("NAXIS2", 2**31)
+    ),
+    "fits of a negative shape": lambda: fits_header(
+        ("SIMPLE", "T"), ("BITPIX", -64), ("NAXIS", 2), ("NAXIS1", -5), ("NAXIS2", 5)
+    ),
+    "fits of 999 axes": lambda: fits_header(
+        ("SIMPLE", "T"), ("BITPIX", 8), ("NAXIS", 999), *((f"NAXIS{i}", 1) for i in range(1, 1000))
+    ),
+    "fits without an end": lambda: b"SIMPLE  =                    T".ljust(80) + b"COMMENT".ljust(80) * 100_000,
+    "fits of 2000 parts": lambda: (
+        fits_header(("SIMPLE", "T"), ("BITPIX", 8), ("NAXIS", 0), ("EXTEND", "T"))
+        + fits_header(("XTENSION", "'IMAGE   '"), ("BITPIX", 8), ("NAXIS", 0), ("PCOUNT", 0), ("GCOUNT", 1)) * 2000
+    ),
+    "tiff of a huge shape": big_tiff,
+    "tiff of pages in a circle": looping_tiff,
+    "hdf5 of a huge shape": lambda: hdf5(sparse),
+    "hdf5 bomb": lambda: hdf5(hdf5_bomb),
+    "hdf5 of another file's numbers": lambda: hdf5(
+        lambda t: t.create_dataset("light", (2, 2), "u1", external="/etc/passwd")
+    ),
+    "hdf5 of other files' arrays": lambda: hdf5(virtual),
+    "hdf5 that links elsewhere": lambda: hdf5(
+        lambda t: t.__setitem__("light", h5py.ExternalLink("/tmp/other.h5", "/x"))
+    ),
+    "hdf5 of objects": lambda: hdf5(lambda t: t.create_dataset("light", (2, 2), h5py.string_dtype())),
+    "hdf5 in itself": lambda: hdf5(
+        lambda t: (t.create_group("a"), t["a"].__setitem__("b", t["/"]), t["a"].__setitem__("c", t["a"]))
+    ),
+    "hdf5 of 2000 arrays": lambda: hdf5(lambda t: [t.create_dataset(f"a{i}", data=1.0) for i in range(2000)]),
+    "netCDF 3 of endless dimensions": lambda: b"CDF\x01" + struct.pack(">iii", 0, 10, 2**31 - 1) + bytes(100),
+    "mat bomb": lambda: mat(mat_element(15, zlib.compress(bytes(2**29), 9))),
+    "mat of a huge shape": lambda: mat(mat_array(b"oi", 6, (2**15, 2**16), mat_element(9, bytes(8)))),
+    "mat of a huge cell": lambda: mat(mat_array(b"oi", 1, (2**15, 2**15))),
+    "mat of nested cells": lambda: nested_mat(20_000),
+    "mat of a function": lambda: mat(
+        mat_array(b"oi", 16, (1, 1), mat_array(b"", 4, (1, 6), mat_element(4, "system".encode("utf-16-le"))))
+    ),
+    "mat of an object": lambda: mat(mat_array(b"oi", 17, (1, 1))),
+    "mat 7.3 of a huge shape": lambda: mat73(huge_oi),
+    "mat 7.3 of objects": lambda: mat73(lambda t: t.create_dataset("oi/data/photons", (2, 2), h5py.ref_dtype)),
+    "mat 7.3 of another file's numbers": lambda: mat73(
+        lambda t: t.create_dataset("oi/data/photons", (2, 2), "u1", external="/etc/passwd")
+    ),
+}
+
+
+def test_files_made_to_harm_end_in_one_sentence(tmp_path):
+    paths = [tmp_path / f"{i}" for i in range(len(BOMBS))]
+    for path, make in zip(paths, BOMBS.values(), strict=True):
+        path.write_bytes(make())
+
+    answers = dict(zip(BOMBS, read_all(paths), strict=True))
+
+    for name, answer in answers.items():
+        assert answer[0] in ERRORS, (name, answer)
+        assert not answer[1].isspace(), name
+    assert_harmless(answers.values(), ERRORS)
+
+
+#: What in a zarr folder is changed, and what that would do.
+ZARR_BOMBS = {
+    "unpickled": lambda m: m["codecs"].append({"name": "numcodecs.pickle", "configuration": {}}),
+    "unknown": lambda m: m["codecs"].append({"name": "os.system"}),
+    "nested": lambda m: m["codecs"].insert(
+        0,
+        {
+            "name": "sharding_indexed",
+            "configuration": {"chunk_shape": [1, 1, 1], "codecs": [{"name": "numcodecs.pickle"}]},
+        },
+    ),
+    "objects": lambda m: m.update(data_type="object"),
+    "huge": lambda m: m.update(shape=[1, 2**30, 2**30]),
+    "huge chunks": lambda m: m["chunk_grid"]["configuration"].update(chunk_shape=[1, 2**20, 2**20]),
+    "negative": lambda m: m.update(shape=[1, -5, 4]),
+    "storage": lambda m: m.update(storage_transformers=[{"name": "x"}]),
+}
+
+
+def test_zarr_folders_made_to_harm_end_in_one_sentence(tmp_path):
+    paths = []
+    for name, change in ZARR_BOMBS.items():
+        path = tmp_path / f"{name}.zarr"
+        write_power_map(letter_map(), path)
+        metadata = path / "irradiance" / "zarr.json"
+        about = json.loads(metadata.read_text())
+        change(about)
+        metadata.write_text(json.dumps(about))
+        paths.append(path)
+    (path / "zarr.json").write_text("{" * 5000)
+
+    answers = read_all(paths, apart=False)
+
+    assert_harmless(answers, ERRORS)
+    for name, answer in zip(ZARR_BOMBS, answers, strict=True):
+        assert "known to hold nothing but numbers" in answer[1] or name not in ("unpickled", "unknown", "nested"), (
+            answer
+        )
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A file of each format, its bytes."""
+    folder = tmp_path_factory.mktemp("whole")
+    for ending in ("npz", "fits", "tif", "exr", "nc"):
+        write_power_map(random_map(n_band=1), folder / f"map.{ending}")
+    np.save(folder / "map.npy", random_map().data[0])
+    tree = {"oi": optical_image(np.ones((4, 6)), [550.0])}
+    scipy.io.savemat(folder / "map.mat", tree)
+    save_v73(folder / "map.mat73", tree)
+    files = {path.suffix[1:]: path.read_bytes() for path in folder.iterdir()}
+    files["fits"] = files["fits"].rstrip(b"\0")  # a file cut short in its last block's padding is whole
+    return files
+
+
+#: Formats whose libraries broken files may crash: they are read in a program of their own.
+FRAGILE = ("exr", "nc", "mat", "mat73")
+N_BROKEN = 40
+
+
+@pytest.mark.parametrize("ending", ["npy", "npz", "fits", "tif", *FRAGILE])
+def test_files_that_are_cut_short_changed_or_noise_end_in_a_map_or_in_one_sentence(whole, tmp_path, ending):
+    data, rng = whole[ending], np.random.default_rng(11)
+    files = [data[: len(data) * i // N_BROKEN] for i in range(1, N_BROKEN)]
+    files += [data[:16] + rng.bytes(int(size)) for size in rng.integers(1, 3000, N_BROKEN)]
+    for i in range(N_BROKEN):
+        broken = bytearray(data)
+        for at in rng.integers(0, len(data), 1 + i % 3):
+            broken[at] ^= 1 << rng.integers(8)
+        files.append(bytes(broken))
+    paths = [tmp_path / str(i) for i in range(len(files))]
+    for path, content in zip(paths, files, strict=True):
+        path.write_bytes(content)
+
+    answers = read_all(paths, apart=False)
+
+    crashed = {ENDED} if ending in FRAGILE else set()
+    assert_harmless(answers, ERRORS | {"PowerMap"} | crashed)
+    if ending != "exr":  # it gives what it could not read, and says so on standard output
+        assert_harmless(answers[: 2 * N_BROKEN - 1], ERRORS | crashed)
+
+
+@pytest.mark.usefixtures("apart")
+def test_an_exr_that_is_cut_short_is_refused(whole, tmp_path):
+    (tmp_path / "map.exr").write_bytes(whole["exr"][:-20])
+
+    refused(tmp_path / "map.exr", "is broken or cut short")
+
+
+@pytest.mark.usefixtures("apart")
+@pytest.mark.parametrize(
+    ("limit", "value", "message"),
+    [
+        ("BASE_BYTES", 2**26 - 3 * 2**28, "reading it as MAT crashed|asks for more memory"),
+        ("MAX_CPU_S", 0, "reading it took more than 0 s"),
+    ],
+)
+def test_a_program_that_is_ended_by_what_it_reads_ends_in_one_sentence(
+    whole, tmp_path, monkeypatch, limit, value, message
+):
+    (tmp_path / "map.mat").write_bytes(whole["mat"])
+    monkeypatch.setattr(_apart, limit, value)
+
+    refused(tmp_path / "map.mat", message)
