@@ -40,7 +40,10 @@ def described(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [described(item) for item in value]
     if is_dataclass(value):
-        return {"kind": type(value).__name__, **{f.name: described(getattr(value, f.name)) for f in fields(value) if f.repr}}
+        return {
+            "kind": type(value).__name__,
+            **{f.name: described(getattr(value, f.name)) for f in fields(value) if f.repr},
+        }
     return repr(value)
 
 

@@ -415,7 +415,7 @@ def test_a_camera_sees_lateral_colour_without_resampling():
         y, x = ((np.arange(150) - 74.5)[:, None] * 11.6e-6, (np.arange(150) - 74.5) * 11.6e-6)
         ratio = ((1 + (x**2 + y**2) * size**2 / DISTANCE_M**2) / (1 + (x**2 + y**2) / DISTANCE_M**2)) ** 2
         joules = fs.units.photon_energy_j(scene.wavelength_nm[band])
-        expected += fs.Integrator(layout, grid)(irradiance / size**2 * ratio) * 1e-12 / joules
+        expected += fs.Integrator(layout, grid, order=2)(irradiance / size**2 * ratio) * 1e-12 / joules
 
     assert len(both.optics.image_grids(scene)) == 2
     assert got == pytest.approx(expected, rel=1e-4)

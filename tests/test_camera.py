@@ -69,13 +69,39 @@ def test_a_power_map_of_any_other_program_is_taken_as_it_is():
 def test_a_scene_and_its_power_map_give_the_same_electrons(precision, filters):
     optics = fs.Optics(focal_length_mm=22.0, f_number=4.0, precision=precision)
     sensor = fs.Sensor(rgb_layout(), qe=fs.SiliconQE(depth_um=3.0), filters=filters)
-    camera = fs.Camera(optics=optics, sensor=sensor)
+    camera = fs.Camera(optics=optics, sensor=sensor, order=2)
     scene = picture_scene(n_wavelengths=11)
 
     collapsed = camera.photoelectrons_per_s(scene)
     by_wavelength = camera.photoelectrons_per_s(optics.power_map(scene))
 
     assert collapsed == pytest.approx(by_wavelength, rel=2e-5 if precision == "single" else 1e-7)
+
+
+@pytest.mark.parametrize(("cells_per_lambda_n", "order"), [(8.2, 2), (2.1, 2), (1.9, 1), (0.3, 1)])
+def test_cells_have_a_gradient_where_the_lens_makes_the_light_smooth(cells_per_lambda_n, order):
+    lambda_n_um = 0.55 * OPTICS.working_f_number(0.5)
+    pitch_um = lambda_n_um / cells_per_lambda_n / OPTICS.magnification(0.5)
+    shape = (401, 401)
+    scene = fs.Scene.point_sources(
+        shape=shape, pixels=[(200, 200)], intensity_w_sr_nm=1.0, pitch_um=pitch_um, distance_m=0.5, band_width_nm=1.0
+    )
+    width_um = 401 * lambda_n_um / cells_per_lambda_n
+    layout = fs.Layout.from_rectangles([[0.0, 0.0], [0.0, 0.0]], [lambda_n_um, 0.999 * width_um])
+    optics = replace(OPTICS, padding="periodic")
+    shares = {}
+    for asked in (None, 1, 2):
+        camera = fs.Camera(optics=optics, sensor=fs.Sensor(layout), order=asked)
+        assert camera.order(scene) == (asked or order)
+        assert camera.order(optics.power_map(scene)) == (asked or 1)
+        square, whole = camera.photoelectrons_per_s(scene)
+        shares[asked] = square / whole
+
+    assert shares[None] == shares[order]
+    # A square of side λN about the point; without the thin frame around the largest site.
+    if cells_per_lambda_n == 8.2:
+        assert shares[2] == pytest.approx(0.528891, abs=4e-4)
+        assert abs(shares[1] - 0.528891) > 1e-3
 
 
 def test_each_site_sees_through_its_own_filter():

@@ -157,7 +157,7 @@ def test_a_wrong_setting_is_told_with_its_place(shot_file, change, message):
     [
         ("scene.pitch_um=abc", r'scene\.pitch_um: must be a valid number, got "abc"'),
         ("scene.pitchum=3", r"scene\.pitchum: no such setting"),
-        ("scene.wavelength_nm=550", r"scene\.wavelength_nm: must be a valid array, got 550"),
+        ("scene.wavelength_nm=[550, x]", r'scene\.wavelength_nm\.1: must be a valid number, got "x"'),
         ("scene.encoding=gamma", r"scene\.encoding: must be 'srgb', 'sqrt' or 'linear', got \"gamma\""),
         ("scene.band_width_nm=[1.0, x]", r'scene\.band_width_nm\.1: must be a valid number, got "x"'),
         ("scene.picture=3", r"scene\.picture: must be a valid string, got 3"),
@@ -194,6 +194,28 @@ def test_files_named_in_a_change_are_looked_for_in_the_current_folder(shot_file,
 
     assert shot.camera.sensor.layout.n_sites == 6
     assert shot.rules == fs.DesignRules(min_size_um=6.0)
+
+
+def test_light_of_another_program_is_captured_like_a_scene(shot_file, tmp_path, monkeypatch):
+    light = np.random.default_rng(4).random((2, 120, 130))
+    np.save(tmp_path / "light.npy", light)
+    tells = "pitch_um: 1.0, wavelength_nm: [500, 600], unit: w_m2"
+    monkeypatch.chdir("/")
+
+    shot = read_shot(shot_file, [f"scene={{kind: power_map, path: light.npy, {tells}}}", "integration_order=2"])
+
+    assert np.array_equal(shot.scene.data, light)
+    assert shot.scene.grid == fs.Grid.centred((120, 130), 1.0)
+    assert shot.camera.order(shot.scene) == 2
+    assert shot.camera.capture(shot.scene, exposure_s=0.01, seed=1).settings["integration_order"] == 2
+    for change, message in (
+        ("scene={kind: power_map, path: light.npy}", r"light\.npy: .*pitch_um"),
+        (f"scene={{kind: power_map, path: no.npy, {tells}}}", r"no\.npy: no such file"),
+        (f"scene={{kind: power_map, path: light.npy, {tells}, unit: lux}}", "stands there twice"),
+        ("integration_order=3", "integration_order: must be"),
+    ):
+        with pytest.raises(FileError, match=message):
+            read_shot(shot_file, [change])
 
 
 def test_wavelengths_outside_the_sensors_tables_are_told_before_the_capture(shot_file):

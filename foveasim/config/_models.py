@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from foveasim import layout as layouts
 from foveasim.distortion import BrownConrady, Fisheye, Lens, PolynomialFisheye, Scaramuzza
 from foveasim.layout import DesignRules, Layout
+from foveasim.maps import read_power_map
 from foveasim.optics import Annulus, Blades, LateralColour, Optics, PupilImage, Seidel, Slit, Spider, Zernike
 from foveasim.scene import Scene, charts
 from foveasim.sensor import ConstantCurve, FilterSet, GaussianCurve, PolynomialCurve, Sensor, SiliconQE
@@ -102,14 +103,19 @@ _IN_FILES: dict[str, Any] = {
     "density": Annotated[str | None, Field(description="a picture: bright where sites are to be dense")],
     "importance": Annotated[str, Field(description="a picture: bright where squares are to be small")],
     "outlines_um": list[_Outline] | None,
+    "path": str,
+    "picture": str,
     "region": _Outline | None,
+    "spectrum": list[list[float]] | None,
 }
+_Numbers: Any = float | list[float] | None
 #: Parameters that files do not have: the picture of a density covers the rectangle ``size_um``.
 _NOT_IN_FILES = ("density_grid",)
-_SCENES: dict[str, Callable[..., Scene]] = {
+_SCENES: dict[str, Callable[..., Any]] = {
     "picture": Scene.from_picture,
     "flat": Scene.flat,
     "point_sources": Scene.point_sources,
+    "power_map": read_power_map,
     "bars": charts.bars,
     "checkerboard": charts.checkerboard,
     "colour_chart": charts.colour_chart,
@@ -143,7 +149,7 @@ _CURVES: dict[str, Callable[..., Any]] = {
 
 _LensSection = _one_of("kind", {name: _model(name, lens) for name, lens in _LENSES.items()})
 _PupilSection = _one_of(
-    "kind", {name: _model(name, pupil, skip=("wavefront_um",), picture=str) for name, pupil in _PUPILS.items()}
+    "kind", {name: _model(name, pupil, skip=("wavefront_um",), **_IN_FILES) for name, pupil in _PUPILS.items()}
 )
 _OpticsSection = _model(
     "optics",
@@ -157,7 +163,11 @@ _CurveSection = _one_of("kind", {name: _model(name, curve) for name, curve in _C
 _FilterSection = _model("filter set", FilterSet, curves=list[_CurveSection])  # type: ignore[valid-type]
 _PerSite = float | PerArea | list[float]
 _SceneSection = _one_of(
-    "kind", {k: _model(k, call, picture=str, spectrum=list[list[float]] | None) for k, call in _SCENES.items()}
+    "kind",
+    {
+        k: _model(k, call, **(_IN_FILES | {"wavelength_nm": _Numbers, "band_width_nm": _Numbers}))
+        for k, call in _SCENES.items()
+    },
 )
 _SensorSection = _model(
     "sensor",
@@ -204,7 +214,7 @@ LayoutUnion = _one_of(
 
 
 class ShotSection(_Section):
-    """A whole shot: scene, optics, distortion, layout, sensor, exposure."""
+    """A whole shot: scene or power map, optics, distortion, layout, sensor, exposure."""
 
     scene: _SceneSection  # type: ignore[valid-type]
     optics: _OpticsSection  # type: ignore[valid-type]
@@ -213,3 +223,4 @@ class ShotSection(_Section):
     sensor: _SensorSection = Field(default_factory=_SensorSection)  # type: ignore[valid-type]
     exposure_s: float
     seed: int = 0
+    integration_order: Literal[1, 2] | None = None

@@ -18,7 +18,7 @@ from foveasim.config._models import PICTURES, LayoutUnion, PerArea, RulesSection
 from foveasim.config._problems import validated
 from foveasim.documents import parsed, read_yaml
 from foveasim.errors import ConfigError, FoveasimError, ParameterError
-from foveasim.fields import Grid
+from foveasim.fields import Grid, PowerMap
 from foveasim.layout import PRESETS, DesignRules, Layout, inset, mosaic, read_layout, snap
 from foveasim.optics import Optics
 from foveasim.pictures import read_picture
@@ -44,6 +44,7 @@ YAML_ENDINGS = (".yaml", ".yml")
 #: Settings whose value may be the name of a file.
 FILE_SETTINGS = (
     "scene.picture",
+    "scene.path",
     "optics.pupil.picture",
     "layout",
     "layout.parameters.importance",
@@ -81,7 +82,8 @@ class Shot:
     ----------
     name : str
         The file's name without its ending.
-    scene : Scene
+    scene : Scene or PowerMap
+        What is captured.
     camera : Camera
     rules : DesignRules or None
         Rules that the sensor's layout is meant to keep.
@@ -90,7 +92,7 @@ class Shot:
     """
 
     name: str
-    scene: Scene
+    scene: Scene | PowerMap
     camera: Camera
     rules: DesignRules | None
     exposure_s: float
@@ -140,14 +142,21 @@ def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int |
     distortion = _built(path, "distortion", settings.distortion)
     scene = _built(path, "scene", settings.scene)
     # What would end the capture is told before it begins, with its place in the file.
-    _call(path, "scene", optics.grid, {"scene": scene})
+    if isinstance(scene, Scene):
+        _call(path, "scene", optics.grid, {"scene": scene})
     _call(path, "scene", sensor.responsivity_e_per_j, {"wavelength_nm": scene.wavelength_nm})
     streams = _call(path, "", Streams, {"seed": settings.seed})
     exposure_s = _call(path, "", check_number, {"name": "exposure_s", "value": settings.exposure_s, "at_least": 0.0})
     return Shot(
         name=path.stem,
         scene=scene,
-        camera=Camera(optics=optics, sensor=sensor, distortion=distortion, n_threads=n_threads),
+        camera=Camera(
+            optics=optics,
+            sensor=sensor,
+            distortion=distortion,
+            order=settings.integration_order,
+            n_threads=n_threads,
+        ),
         rules=file.rules,
         exposure_s=exposure_s,
         seed=streams.seed,
@@ -266,7 +275,7 @@ def _values(path: Path, place: str, section: BaseModel) -> dict[str, Any]:
 def _built(path: Path, place: str, value: Any) -> Any:
     if isinstance(value, list):
         return [_built(path, f"{place}[{i}]", item) for i, item in enumerate(value)]
-    if isinstance(value, str) and place.rpartition(".")[2] == "picture":
+    if isinstance(value, str) and place.rpartition(".")[2] in {"path", "picture"}:
         return _picture_path(path, value, place)
     if not isinstance(value, BaseModel) or isinstance(value, PerArea):
         return value
