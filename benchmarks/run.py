@@ -15,6 +15,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -113,6 +114,8 @@ def bench_optics(report: Report, shape: tuple[int, int]) -> None:
     layout = paper_layout(grid)
     sensor = fs.Sensor(layout, qe=0.6, dark_e_per_s=20.0, full_well_e=1e6, read_noise_e=1.0, bits=12)
     camera = fs.Camera(optics=optics, sensor=sensor)
+    # With the same padding.
+    aberrated = replace(optics, pupil=fs.optics.Blades(6), zernike=fs.optics.Zernike(coefficients={7: 0.02}))
     # The padded size: 99 % of a point's light lies within 20.3 λN.
     pad = int(np.ceil(20.3 * 0.55 * optics.working_f_number(0.56) / grid.pitch_um))
     padded = tuple(int(scipy.fft.next_fast_len(n + 2 * pad, real=True)) for n in shape)
@@ -126,6 +129,7 @@ def bench_optics(report: Report, shape: tuple[int, int]) -> None:
         {
             "pair": pair,
             "optics": lambda: list(optics.weighted_maps(mono, np.ones((1, 1)))),
+            "aberrated": lambda: list(aberrated.weighted_maps(mono, np.ones((1, 1)))),
             "capture": lambda: camera.capture(mono, exposure_s=0.02, seed=0),
             "first": lambda: fs.Camera(optics=optics, sensor=sensor).capture(mono, exposure_s=0.02, seed=0),
         },
@@ -134,6 +138,7 @@ def bench_optics(report: Report, shape: tuple[int, int]) -> None:
     report.slower_than(
         "optics, one band", times["optics"], f"rfft2 + irfft2, {padded[0]} x {padded[1]}", times["pair"], 1.3
     )
+    report.slower_than("six blades and coma, one band", times["aberrated"], "rfft2 + irfft2", times["pair"], 1.3)
     report.slower_than("mono capture, all noise", times["capture"], "rfft2 + irfft2", times["pair"], 1.7)
     report.slower_than("the same, layout not yet compiled", times["first"], "rfft2 + irfft2", times["pair"])
 
@@ -170,6 +175,7 @@ def bench_distortion(report: Report, shape: tuple[int, int]) -> None:
     bent = fs.Camera(optics=optics, sensor=sensor, distortion=lens)
     cells = np.random.default_rng(0).random(grid.shape, dtype=np.float32)
     straight, carried = plain.integrator(grid), bent.integrator(grid)
+    squares = fs.layout.grid(n_x=8 * shape[1] // 50, n_y=8 * shape[0] // 50, pitch_um=5.0 * grid.pitch_um)
     # Where each cell of the warped map comes from, in cells.
     x, y = np.meshgrid(grid.x_um, grid.y_um)
     source = lens.undistort(np.stack((x, y), axis=-1), outside="mask")
@@ -182,12 +188,17 @@ def bench_distortion(report: Report, shape: tuple[int, int]) -> None:
             "remap": lambda: straight(cv2.remap(cells, index, None, cv2.INTER_LINEAR)),
             "compile bent": lambda: fs.Integrator(layout, grid, distortion=lens),
             "compile": lambda: fs.Integrator(layout, grid),
+            "squares bent": lambda: fs.Integrator(squares, grid, distortion=lens),
+            "squares": lambda: fs.Integrator(squares, grid),
         },
         6,
     )
     report.slower_than("distorted mono capture", times["bent"], "the same undistorted", times["plain"], 1.1)
     report.faster_than("distorted frame", times["frame"], "cv2.remap + undistorted frame", times["remap"], 3)
     report.slower_than("compiling a distorted layout", times["compile bent"], "undistorted", times["compile"], 2)
+    report.slower_than(
+        f"{squares.n_sites:,} distorted squares", times["squares bent"], "undistorted", times["squares"], 2
+    )
 
 
 MEMORY_PROBE = """

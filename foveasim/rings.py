@@ -84,7 +84,10 @@ def site_area_um2(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floa
     """Area of every site, holes taken off, (n_site,) µm²; negative when its outline is clockwise."""
     if site_offsets.size == 1:
         return np.zeros(0)
-    return np.add.reduceat(ring_moments(xy_um, ring_offsets)[0], site_offsets[:-1])
+    local = xy_um - np.repeat(xy_um[ring_offsets[:-1]], np.diff(ring_offsets), axis=0)
+    after = local[next_vertex(ring_offsets)]
+    cross = local[:, 0] * after[:, 1] - local[:, 1] * after[:, 0]
+    return 0.5 * np.add.reduceat(cross, ring_offsets[site_offsets[:-1]])
 
 
 def site_bounds_um(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floats:

@@ -21,8 +21,8 @@ __all__ = ["BrownConrady"]
 N_DIRECTIONS = 720
 #: Points that a thread takes at once.
 POINTS_A_PIECE = 50_000
-#: A start beyond the fold is moved inwards so often, at most.
-MAX_MOVES = 30
+#: Points of the table where the search for the inverse begins.
+START_POINTS = 4097
 #: The fold is looked for up to this radius in focal lengths: 89.4 degrees from the axis.
 MAX_RADIUS = 100.0
 
@@ -179,38 +179,19 @@ class BrownConrady(Placed):
         return np.where(self._is_inside(xy)[:, np.newaxis], self._map(xy), np.nan)
 
     def _backward(self, xy: Floats) -> Floats:
-        most = float(self._fold.max()) * (1.0 + 1e-3)
-        k = np.array([self.k1, self.k2, self.k3, self.k4, self.k5, self.k6])
         points = np.ascontiguousarray(xy)
-        start = self._start(points)
+        k = np.array([self.k1, self.k2, self.k3, self.k4, self.k5, self.k6])
+        inverse = kernels("distortion").brown_conrady_inverse
+        pieces = [points[i : i + POINTS_A_PIECE] for i in range(0, max(len(points), 1), POINTS_A_PIECE)]
+        found = each(lambda p: inverse(p, k, self.p1, self.p2, self._fold, *self._ideal), pieces, thread_count())
+        return np.concatenate(found) if len(found) > 1 else np.asarray(found[0])
 
-        def inverse(piece: slice) -> Floats:
-            return np.asarray(
-                kernels("distortion").brown_conrady_inverse(
-                    points[piece], start[piece], k, self.p1, self.p2, min(most * most, np.finfo(np.float64).max)
-                )
-            )
-
-        pieces = [slice(i, i + POINTS_A_PIECE) for i in range(0, max(len(points), 1), POINTS_A_PIECE)]
-        found = np.concatenate(each(inverse, pieces, thread_count()))
-        error = np.hypot(*(self._map(found) - points).T)
-        is_solved = (error <= 1e-12 * np.maximum(np.hypot(*xy.T), 1.0)) & self._is_inside(found)
-        return np.where(is_solved[:, np.newaxis], found, np.nan)
-
-    def _start(self, xy: Floats) -> Floats:
-        """The inverse of the radial part, from a table along the radius."""
+    @cached_property
+    def _ideal(self) -> tuple[Floats, float]:
+        """Ideal radii at equal steps of the distorted one, without tangential terms, and the steps over the latter."""
         end = min(self._radial_fold, float(self._fold.max()), MAX_RADIUS)
-        table = end * np.linspace(0.0, 1.0, 2049)
+        table = end * np.linspace(0.0, 1.0, START_POINTS)
         factor, _ = self._radial(table * table)
         reach = np.maximum.accumulate(table * factor)
-        radius = np.hypot(*xy.T)
-        ideal = np.minimum(np.interp(radius, reach, table), 0.98 * end)
-        scale = np.divide(ideal, radius, out=np.ones_like(radius), where=radius > 0.0)
-        start = np.asarray(xy * scale[:, np.newaxis])
-        # Near the fold tangential terms may put the start beyond it.
-        for _ in range(MAX_MOVES):
-            is_beyond = ~self._is_inside(start)
-            if not is_beyond.any():
-                break
-            start[is_beyond] *= 0.8
-        return start
+        ideal = np.interp(reach[-1] * np.linspace(0.0, 1.0, START_POINTS), reach, table)
+        return np.minimum(ideal, 0.98 * end), (START_POINTS - 1) / float(reach[-1])

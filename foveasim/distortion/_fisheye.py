@@ -39,7 +39,12 @@ class _ByAngle(Placed):
     def _limits(self) -> tuple[float, float]:
         most_rad = self._max_theta_rad()
         ideal = math.inf if most_rad >= 0.5 * math.pi - GRAZING else math.tan(most_rad)
-        return ideal, float(self._height(np.array([most_rad]))[0])
+        return ideal, self._highest
+
+    @cached_property
+    def _highest(self) -> float:
+        """Image height of the largest angle."""
+        return float(self._height(np.array([self._max_theta_rad()]))[0])
 
     def _forward(self, xy: Floats) -> Floats:
         radius = np.hypot(xy[:, 0], xy[:, 1])
@@ -50,7 +55,7 @@ class _ByAngle(Placed):
 
     def _backward(self, xy: Floats) -> Floats:
         radius = np.hypot(xy[:, 0], xy[:, 1])
-        is_inside = radius <= self._limits()[1]
+        is_inside = radius <= self._highest
         theta_rad = self._theta_rad(np.where(is_inside, radius, 0.0))
         return _scaled(xy, radius, np.where(is_inside, np.tan(theta_rad), np.nan), 1.0 / float(self._slope()))
 
@@ -286,6 +291,6 @@ class Scaramuzza(_ByAngle):
     def _backward(self, xy: Floats) -> Floats:
         plain = xy @ np.linalg.inv(self._matrix).T
         radius = np.hypot(plain[:, 0], plain[:, 1])
-        is_inside = radius <= super()._limits()[1]
+        is_inside = radius <= self._highest
         theta_rad = self._theta_rad(np.where(is_inside, radius, 0.0))
         return _scaled(plain, radius, np.where(is_inside, np.tan(theta_rad), np.nan), 1.0 / self._slope())

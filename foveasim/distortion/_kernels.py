@@ -12,8 +12,16 @@ _numbers = types.Array(types.float64, 1, "C", readonly=True)
 
 #: Newton's steps, and how often one is halved.
 MAX_STEPS, MAX_HALVINGS = 60, 30
-#: A residual of this share of a point's distance from the centre is rounding.
-RESIDUAL = 4e-16
+#: A start beyond the fold is moved inwards so often, at most.
+MAX_MOVES = 30
+#: A residual of this share of a point's distance from the centre is rounding, and one below this solves.
+RESIDUAL, SOLVED = 1e-15, 1e-12
+#: A point that equals one of so many before it has the same answer.
+LOOK_BACK = 8
+#: A squared residual of so many times that of rounding cannot be made smaller by shorter steps.
+NEARLY = 1e4
+#: Between the directions in which it is known, the fold may be further out by this share.
+FOLD_MARGIN = 1e-3
 
 
 @njit(cache=True, nogil=True)
@@ -32,25 +40,60 @@ def _map(x, y, k, p1, p2):
     return x_d, y_d, xx, xy, yy
 
 
+@njit(cache=True, nogil=True)
+def _is_inside(x, y, determinant, fold, min_fold):
+    """Whether an ideal point lies within the fold, whose radius is given in equal directions."""
+    if not determinant > 0.0:
+        return False
+    radius = np.hypot(x, y)
+    if radius <= min_fold:
+        return True
+    turn = np.arctan2(y, x) / (2.0 * np.pi) * fold.size
+    low = int(np.floor(turn))
+    # Between two directions the fold is a curve: the larger of the two, with the determinant, tells.
+    return radius <= max(fold[low % fold.size], fold[(low + 1) % fold.size]) * (1.0 + FOLD_MARGIN)
+
+
 @njit(
-    types.float64[:, ::1](_points, _points, _numbers, types.float64, types.float64, types.float64),
+    types.float64[:, ::1](_points, _numbers, types.float64, types.float64, _numbers, _numbers, types.float64),
     cache=True,
     nogil=True,
 )
-def brown_conrady_inverse(xy, start, k, p1, p2, max_r2):
+def brown_conrady_inverse(xy, k, p1, p2, fold, ideal, per_step):
     """
-    Ideal points (n, 2) whose distorted positions are ``xy``, or the nearest that Newton's steps come from ``start``.
+    Ideal points (n, 2) within the fold whose distorted positions are ``xy``, NaN where there are none.
 
-    Steps that do not come nearer, leave the circle of ``max_r2``, or reach a point where the determinant is not positive are
-    halved.
+    ``ideal`` is the ideal radius at equal steps of the distorted one, without tangential terms: Newton's steps begin there.
+    Steps that do not come nearer, leave the fold's circle, or reach a point where the determinant is not positive are halved.
     """
-    found = np.empty_like(start)
+    found = np.empty_like(xy)
+    min_fold, max_fold = fold.min(), fold.max() * (1.0 + FOLD_MARGIN)
+    last = ideal.size - 1
     for i in range(xy.shape[0]):
-        x, y = start[i, 0], start[i, 1]
-        x_d, y_d, xx, xy_, yy = _map(x, y, k, p1, p2)
-        ex, ey = x_d - xy[i, 0], y_d - xy[i, 1]
+        u, v = xy[i, 0], xy[i, 1]
+        # Neighbours in a layout share corners.
+        same = -1
+        for j in range(max(i - LOOK_BACK, 0), i):
+            if xy[j, 0] == u and xy[j, 1] == v:
+                same = j
+        if same >= 0:
+            found[i, 0], found[i, 1] = found[same, 0], found[same, 1]
+            continue
+        distance = np.hypot(u, v)
+        place = distance * per_step
+        at = int(min(place, float(last - 1)))
+        radius = ideal[at] + min(place - at, 1.0) * (ideal[at + 1] - ideal[at])
+        scale = radius / distance if distance > 0.0 else 1.0
+        # Near the fold tangential terms may put the start beyond it.
+        for _ in range(MAX_MOVES):
+            x, y = u * scale, v * scale
+            x_d, y_d, xx, xy_, yy = _map(x, y, k, p1, p2)
+            if _is_inside(x, y, xx * yy - xy_ * xy_, fold, min_fold):
+                break
+            scale *= 0.8
+        ex, ey = x_d - u, y_d - v
         error = ex * ex + ey * ey
-        goal = RESIDUAL * max(np.hypot(xy[i, 0], xy[i, 1]), 1e-3)
+        goal = RESIDUAL * max(distance, 1e-3)
         goal *= goal
         for _ in range(MAX_STEPS):
             determinant = xx * yy - xy_ * xy_
@@ -61,14 +104,20 @@ def brown_conrady_inverse(xy, start, k, p1, p2, max_r2):
             for _ in range(MAX_HALVINGS):
                 new_x, new_y = x - length * step_x, y - length * step_y
                 x_d, y_d, a, b, c = _map(new_x, new_y, k, p1, p2)
-                fx, fy = x_d - xy[i, 0], y_d - xy[i, 1]
-                if fx * fx + fy * fy < error and a * c - b * b > 0.0 and new_x * new_x + new_y * new_y <= max_r2:
+                fx, fy = x_d - u, y_d - v
+                if fx * fx + fy * fy < error and a * c - b * b > 0.0 and np.hypot(new_x, new_y) <= max_fold:
                     is_better = True
+                    break
+                if error <= NEARLY * goal:  # rounding: shorter steps come no nearer
                     break
                 length *= 0.5
             if not is_better:
                 break
             x, y, xx, xy_, yy, ex, ey = new_x, new_y, a, b, c, fx, fy
             error = ex * ex + ey * ey
-        found[i, 0], found[i, 1] = x, y
+        is_solved = np.sqrt(error) <= SOLVED * max(distance, 1.0)
+        if is_solved and _is_inside(x, y, xx * yy - xy_ * xy_, fold, min_fold):
+            found[i, 0], found[i, 1] = x, y
+        else:
+            found[i, 0], found[i, 1] = np.nan, np.nan
     return found

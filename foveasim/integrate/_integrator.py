@@ -110,6 +110,16 @@ class Integrator:
         self.grid = grid
         self.order = check_count("order", order, at_most=2, cure="1 takes cells as even, 2 as means with a gradient")
         self.n_threads = thread_count(n_threads)
+        check_choice("conserve", conserve, ("flux", "density"))
+        self._gain: Floats | None = None
+        self._is_lost = np.zeros(layout.site_offsets.size - 1, bool)
+        on_sensor = layout
+        if distortion is not None:
+            if not hasattr(distortion, "undistort"):
+                raise ParameterError("distortion", "must be a lens of foveasim.distortion", distortion)
+            carried = carried_back(layout, distortion, grid.pitch_um, self.n_threads)
+            layout, self._is_lost = carried, carried.is_lost
+        # A lens does not turn outlines over: its image of one that is clockwise is so too.
         self._area_um2 = site_area_um2(layout.xy_um, layout.ring_offsets, layout.site_offsets)
         inside_out = np.flatnonzero(self._area_um2 <= 0.0)
         if inside_out.size:
@@ -117,28 +127,14 @@ class Integrator:
                 f"site {inside_out[0]} has no positive area: its outline must be counter-clockwise, as from_polygons makes it",
                 tuple(int(i) for i in inside_out),
             )
-        check_choice("conserve", conserve, ("flux", "density"))
-        self._gain: Floats | None = None
-        self._is_lost = np.zeros(self._area_um2.size, bool)
-        if distortion is not None:
-            if not hasattr(distortion, "undistort"):
-                raise ParameterError("distortion", "must be a lens of foveasim.distortion", distortion)
-            layout = self._carried(layout, distortion, conserve)
+        if distortion is not None and (conserve == "density" or self._is_lost.any()):
+            self._gain = np.where(self._is_lost, 0.0, 1.0)
+            if conserve == "density":
+                self._gain *= (
+                    site_area_um2(on_sensor.xy_um, on_sensor.ring_offsets, on_sensor.site_offsets) / self._area_um2
+                )
         self._plan: Plan = compile_plan(layout, grid, self.n_threads, self.order)
         self._bounds_um = site_bounds_um(layout.xy_um, layout.ring_offsets, layout.site_offsets)
-
-    def _carried(self, layout: PackedRings, distortion: PointMap, conserve: str) -> PackedRings:
-        """Outlines in the map's plane, their areas there, and the factor of each site's integral."""
-        carried = carried_back(layout, distortion, self.grid.pitch_um)
-        self._is_lost = carried.is_lost
-        area_um2 = site_area_um2(carried.xy_um, carried.ring_offsets, carried.site_offsets)
-        gain = np.where(carried.is_lost, 0.0, 1.0)
-        if conserve == "density":
-            gain *= self._area_um2 / area_um2
-        if conserve == "density" or carried.is_lost.any():
-            self._gain = gain
-        self._area_um2 = area_um2
-        return carried
 
     @property
     def lost_sites(self) -> Ints:

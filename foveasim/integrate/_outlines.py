@@ -8,6 +8,7 @@ import numpy as np
 
 from foveasim.arrays import Bools, Floats, Ints
 from foveasim.fields import PackedRings, PointMap
+from foveasim.parallel import each
 from foveasim.rings import next_vertex, positions_in_runs
 
 __all__ = ["CarriedRings", "carried_back"]
@@ -18,6 +19,8 @@ CHORD_SHARE = 0.002
 BEND_POINTS = 65
 #: An edge is cut into so many pieces at most: those that need more reach the lens's border.
 MAX_PIECES = 256
+#: Sites that are carried as one piece of work, whose points stay in the cache.
+SITES_PER_PIECE = 4096
 
 
 class CarriedRings(NamedTuple):
@@ -29,7 +32,7 @@ class CarriedRings(NamedTuple):
     is_lost: Bools
 
 
-def carried_back(layout: PackedRings, lens: PointMap, pitch_um: float) -> CarriedRings:
+def carried_back(layout: PackedRings, lens: PointMap, pitch_um: float, n_threads: int) -> CarriedRings:
     """
     The outlines that an ideal lens would have to fill.
 
@@ -41,6 +44,7 @@ def carried_back(layout: PackedRings, lens: PointMap, pitch_um: float) -> Carrie
         NaN for points that the lens sends no light to.
     pitch_um : float, µm
         Of the map's cells: edges are cut until their chords are within 0.2 % of it.
+    n_threads : int
 
     Returns
     -------
@@ -51,40 +55,69 @@ def carried_back(layout: PackedRings, lens: PointMap, pitch_um: float) -> Carrie
     -----
     An edge is cut at the same points from both of its sides, so that what tiles the sensor tiles the carried plane.
     """
-    xy_um = layout.xy_um
-    begin, end = xy_um, xy_um[next_vertex(layout.ring_offsets)]
-    # From the smaller end to the larger one: neighbours cut the edge that they share alike.
-    is_turned = (end[:, 0] < begin[:, 0]) | ((end[:, 0] == begin[:, 0]) & (end[:, 1] < begin[:, 1]))
-    low, high = np.where(is_turned[:, np.newaxis], end, begin), np.where(is_turned[:, np.newaxis], begin, end)
-    n_pieces = _pieces(low, high, lens, CHORD_SHARE * pitch_um)
-    edge = np.repeat(np.arange(begin.shape[0]), n_pieces)
-    step = positions_in_runs(n_pieces)
-    share = np.where(is_turned[edge], n_pieces[edge] - step, step) / n_pieces[edge]
-    points = low[edge] + share[:, np.newaxis] * (high - low)[edge]
-    points[step == 0] = begin
+    n_sites = layout.site_offsets.size - 1
+    if n_sites == 0:
+        return CarriedRings(layout.xy_um, layout.ring_offsets, layout.site_offsets, np.zeros(0, bool))
+    bends = _Bends(layout.xy_um, lens, CHORD_SHARE * pitch_um)
+
+    def some_sites(first: int) -> tuple[Floats, Ints, Bools]:
+        site_offsets = layout.site_offsets[first : min(first + SITES_PER_PIECE, n_sites) + 1]
+        ring_offsets = layout.ring_offsets[site_offsets[0] : site_offsets[-1] + 1]
+        xy_um = layout.xy_um[ring_offsets[0] : ring_offsets[-1]]
+        return _carried(xy_um, ring_offsets - ring_offsets[0], site_offsets - site_offsets[0], lens, bends)
+
+    pieces = each(some_sites, range(0, n_sites, SITES_PER_PIECE), n_threads)
+    n_points = np.concatenate([piece[1] for piece in pieces])
+    return CarriedRings(
+        np.concatenate([piece[0] for piece in pieces]),
+        np.concatenate(([0], np.cumsum(n_points))),
+        layout.site_offsets,
+        np.concatenate([piece[2] for piece in pieces]),
+    )
+
+
+def _carried(
+    xy_um: Floats, ring_offsets: Ints, site_offsets: Ints, lens: PointMap, bends: _Bends
+) -> tuple[Floats, Ints, Bools]:
+    """Points of some sites' outlines, how many every ring has, and which sites are lost."""
+    end = xy_um[next_vertex(ring_offsets)]
+    n_pieces = bends.n_pieces(xy_um, end)
+    points = xy_um
+    if n_pieces.max() > 1:
+        # From the smaller end to the larger one: neighbours cut the edge that they share alike.
+        is_turned = (end[:, 0] < xy_um[:, 0]) | ((end[:, 0] == xy_um[:, 0]) & (end[:, 1] < xy_um[:, 1]))
+        low, high = np.where(is_turned[:, np.newaxis], end, xy_um), np.where(is_turned[:, np.newaxis], xy_um, end)
+        edge = np.repeat(np.arange(xy_um.shape[0]), n_pieces)
+        step = positions_in_runs(n_pieces)
+        share = np.where(is_turned[edge], n_pieces[edge] - step, step) / n_pieces[edge]
+        points = low[edge] + share[:, np.newaxis] * (high - low)[edge]
+        points[step == 0] = xy_um
     carried = lens.undistort(points, outside="mask")
-    ring_offsets = np.concatenate(([0], np.cumsum(n_pieces)))[layout.ring_offsets]
-    is_lost = np.zeros(layout.site_offsets.size - 1, bool)
-    if is_lost.size:
-        is_lost = np.logical_or.reduceat(np.isnan(carried).any(axis=1), ring_offsets[layout.site_offsets[:-1]])
-    n_points = np.diff(ring_offsets[layout.site_offsets])
-    carried = np.where(np.repeat(is_lost, n_points)[:, np.newaxis], points, carried)
-    return CarriedRings(carried, ring_offsets, layout.site_offsets, is_lost)
+    new_offsets = np.concatenate(([0], np.cumsum(n_pieces)))[ring_offsets]
+    is_lost = np.logical_or.reduceat(np.isnan(carried[:, 0]), new_offsets[site_offsets[:-1]])
+    if is_lost.any():
+        is_of_lost = np.repeat(is_lost, np.diff(new_offsets[site_offsets]))
+        carried = np.where(is_of_lost[:, np.newaxis], points, carried)
+    return carried, np.diff(new_offsets), is_lost
 
 
-def _pieces(low_um: Floats, high_um: Floats, lens: PointMap, chord_um: float) -> Ints:
-    """How many pieces every edge is cut into: a chord of length L deviates by L² / 8 times the second derivative."""
-    if low_um.shape[0] == 0:
-        return np.ones(0, np.int64)
-    first_um, last_um = low_um.min(axis=0), np.maximum(high_um.max(axis=0), low_um.max(axis=0))
-    first_um = np.minimum(first_um, high_um.min(axis=0))
-    step_um = np.maximum(last_um - first_um, chord_um) / (BEND_POINTS - 1)
-    bend = _bends(first_um, step_um, lens)
-    place = np.rint((0.5 * (low_um + high_um) - first_um) / step_um).astype(np.int64)
-    bend_per_um = bend[np.clip(place[:, 1], 0, BEND_POINTS - 1), np.clip(place[:, 0], 0, BEND_POINTS - 1)]
-    length2_um2 = ((high_um - low_um) ** 2).sum(axis=1)
-    n = np.ceil(np.sqrt(length2_um2 * bend_per_um / (8.0 * chord_um)))
-    return np.clip(n, 1, MAX_PIECES).astype(np.int64)
+class _Bends:
+    """How much a lens bends lines near the points of a coarse grid over a layout."""
+
+    def __init__(self, xy_um: Floats, lens: PointMap, chord_um: float) -> None:
+        self._first_um = np.array([xy_um[:, i].min() for i in (0, 1)])
+        size_um = np.array([xy_um[:, i].max() for i in (0, 1)]) - self._first_um
+        self._step_um = np.maximum(size_um, chord_um) / (BEND_POINTS - 1)
+        # A chord of length L deviates by L² / 8 times the second derivative.
+        self._pieces_per_um = np.sqrt(_bends(self._first_um, self._step_um, lens) / (8.0 * chord_um))
+
+    def n_pieces(self, begin_um: Floats, end_um: Floats) -> Ints:
+        """How many pieces every edge is cut into."""
+        place = ((0.5 * (begin_um + end_um) - self._first_um) / self._step_um + 0.5).astype(np.int64)
+        np.clip(place, 0, BEND_POINTS - 1, out=place)
+        length_um = np.hypot(end_um[:, 0] - begin_um[:, 0], end_um[:, 1] - begin_um[:, 1])
+        n = np.ceil(length_um * self._pieces_per_um[place[:, 1], place[:, 0]])
+        return np.clip(n, 1, MAX_PIECES).astype(np.int64)
 
 
 def _bends(first_um: Floats, step_um: Floats, lens: PointMap) -> Floats:
