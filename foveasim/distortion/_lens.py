@@ -103,8 +103,8 @@ class Placed:
         focal = np.broadcast_to(np.asarray(self.focal_um), (2,))
         normalised = (points.reshape(-1, 2) - centre) / focal
         mapped: Floats = function(normalised)  # type: ignore[operator]
-        is_lost = np.asarray(np.isnan(mapped).any(axis=1))
-        if outside == "error" and is_lost.any():
+        is_lost = np.isnan(mapped[:, 0]) if outside == "error" else np.zeros(1, bool)
+        if is_lost.any():
             at = np.hypot(*(normalised[is_lost] * focal).T).min()
             limit = self.max_radius_um[which]
             raise GeometryError(

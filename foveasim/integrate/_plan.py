@@ -151,7 +151,8 @@ class _Traced(NamedTuple):
 def compile_plan(rings: PackedRings, grid: Grid, n_threads: int, order: int = 1) -> Plan:
     """Trace every outline on the grid, and put what it covers in the order of the grid's rows."""
     n_y = grid.shape[0]
-    uv = np.ascontiguousarray((rings.xy_um - np.asarray(grid.origin_um)) / grid.pitch_um)
+    uv = np.ascontiguousarray(rings.xy_um - np.asarray(grid.origin_um))
+    uv /= grid.pitch_um
     ring_offsets = np.ascontiguousarray(rings.ring_offsets)
     site_offsets = np.ascontiguousarray(rings.site_offsets)
     compiled = kernels("integrate")
