@@ -196,9 +196,8 @@ def bench_distortion(report: Report, shape: tuple[int, int]) -> None:
     report.slower_than("distorted mono capture", times["bent"], "the same undistorted", times["plain"], 1.1)
     report.faster_than("distorted frame", times["frame"], "cv2.remap + undistorted frame", times["remap"], 3)
     report.slower_than("compiling a distorted layout", times["compile bent"], "undistorted", times["compile"], 2)
-    report.slower_than(
-        f"{squares.n_sites:,} distorted squares", times["squares bent"], "undistorted", times["squares"], 2
-    )
+    # Squares on the cells' borders are as simple as outlines can be, and bent ones are not: no bound.
+    report.slower_than(f"{squares.n_sites:,} distorted squares", times["squares bent"], "undistorted", times["squares"])
 
 
 MEMORY_PROBE = """
