@@ -275,3 +275,43 @@ def test_a_lens_that_throws_the_border_far_out_asks_for_a_grid():
 
     with pytest.raises(ParameterError, match=r"'grid' must be given: the whole distorted map has"):
         distort_map(power_map(np.ones((40, 40)), fs.Grid.centred((40, 40), 1.0)), far)
+
+
+def test_a_letter_seen_through_a_calibration_of_opencv_is_opencvs_own_picture():
+    """The whole way, with rows from the top and y down on OpenCV's side, a lens off the middle and tangential terms."""
+    import cv2
+
+    n_y, n_x = 150, 200
+    letter = np.full((n_y, n_x), 0.1, np.float32)
+    letter[40:110, 80:90] = letter[40:50, 80:130] = letter[68:78, 80:112] = 1.0  # the first row on top
+    matrix = np.array([[180.0, 0.0, 107.0], [0.0, 176.0, 66.0], [0.0, 0.0, 1.0]])
+    coefficients = np.array([-0.25, 0.06, 0.06, -0.04])
+    u, v = np.meshgrid(np.arange(n_x, dtype=float), np.arange(n_y, dtype=float))
+    source = cv2.undistortPoints(np.stack((u, v), axis=-1).reshape(-1, 1, 2), matrix, coefficients, P=matrix)
+    # OpenCV's points are right to 5 of its own steps; its picture to a 32nd of a pixel.
+    theirs = cv2.remap(letter, source.reshape(n_y, n_x, 2).astype(np.float32), None, cv2.INTER_LINEAR, borderValue=0.1)
+
+    pixel_um = 2.0
+    lens = fs.distortion.from_opencv(matrix, coefficients, image_size=(n_x, n_y), pixel_um=pixel_um)
+    light = fs.PowerMap.from_array(letter, pitch_um=pixel_um, wavelength_nm=550.0, top_row_first=True)
+    pixels = fs.layout.grid(n_x=n_x, n_y=n_y, pitch_um=pixel_um)
+    sites = fs.Integrator(pixels, light.grid, distortion=lens, conserve="density")(light.data)[0] / pixel_um**2
+    ours = np.zeros((n_y, n_x))
+    column, row = ((pixels.centroid_um / pixel_um + np.array([n_x, n_y]) / 2).astype(int)).T
+    ours[n_y - 1 - row, column] = sites  # back to the first row on top
+    warped = distort_map(light, lens, grid=light.grid, conserve="density").data[0, ::-1]
+
+    middle = slice(15, -15), slice(15, -15)
+
+    def apart(picture):
+        return np.abs(picture - theirs)[middle].mean()
+
+    # Means over bent pixels against linear interpolation differ at the letter's edges.
+    for picture in (ours, warped):
+        assert apart(picture) < 0.01
+        assert np.corrcoef(picture[middle].ravel(), theirs[middle].ravel())[0, 1] > 0.98
+        # A lens with either tangential term, or the middle, the wrong way up or round would be told.
+        for wrong in (picture[::-1], picture[:, ::-1], np.roll(picture, 2, 0), np.roll(picture, 2, 1)):
+            assert apart(wrong) > 2 * apart(picture)
+    flipped = fs.distortion.from_opencv(matrix, coefficients * [1, 1, -1, 1], image_size=(n_x, n_y), pixel_um=pixel_um)
+    assert apart(distort_map(light, flipped, grid=light.grid, conserve="density").data[0, ::-1]) > 2 * apart(warped)
