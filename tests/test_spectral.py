@@ -2,14 +2,34 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 
 import numpy as np
 import pytest
 
-from foveasim.errors import ParameterError
-from foveasim.sensor import ConstantCurve, FilterSet, GaussianCurve, PolynomialCurve, SiliconQE, rgb_filters
+import foveasim as fs
+from foveasim.config import read_shot
+from foveasim.errors import ConfigError, FileError, ParameterError
+from foveasim.sensor import (
+    BandMean,
+    ConstantCurve,
+    FilterSet,
+    GaussianCurve,
+    PassBand,
+    PolynomialCurve,
+    ProductCurve,
+    SiliconQE,
+    SplineCurve,
+    StepCurve,
+    TableCurve,
+    camera_filters,
+    ccd_qe,
+    read_curve,
+    read_filters,
+    rgb_filters,
+)
 
 EPS = np.finfo(float).eps
 
@@ -260,3 +280,564 @@ def test_each_primary_passes_its_own_filter_best(wavelength_nm, winner):
 def test_impossible_filters_are_refused(curves, names, sentence):
     with pytest.raises(ParameterError, match=f"^{sentence}"):
         FilterSet(curves, names)
+
+
+# -- tables ---------------------------------------------------------------------------------------------------------
+
+RAGGED = {"wavelength_nm": [400, 410, 470, 475, 600, 700], "value": [0.0, 1.0, 1.0, 0.2, 0.3, 0.0]}
+
+
+def test_between_two_values_a_table_is_their_weighted_mean():
+    curve = TableCurve(wavelength_nm=[500, 400, 700], value=[0.8, 0.2, 0.0])
+    np.testing.assert_allclose(curve([400, 425, 500, 600, 700]), [0.2, 0.35, 0.8, 0.4, 0.0], rtol=0, atol=2 * EPS)
+
+
+@pytest.mark.parametrize("kind", [TableCurve, SplineCurve])
+def test_a_table_goes_through_its_values(kind):
+    np.testing.assert_allclose(kind(**RAGGED)(RAGGED["wavelength_nm"]), RAGGED["value"], rtol=0, atol=2 * EPS)
+
+
+def test_a_spline_stays_between_neighbouring_values_and_does_not_turn():
+    curve = SplineCurve(**RAGGED)
+    for (low, high), ends in zip(
+        itertools.pairwise(RAGGED["wavelength_nm"]), itertools.pairwise(RAGGED["value"]), strict=True
+    ):
+        between = curve(np.linspace(low, high, 501))
+        assert np.all(between >= min(ends) - EPS)
+        assert np.all(between <= max(ends) + EPS)
+        assert np.all(np.diff(between) * np.sign(ends[1] - ends[0]) >= -EPS)
+
+
+def test_random_tables_give_splines_from_0_to_1():
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        curve = SplineCurve(
+            wavelength_nm=np.cumsum(rng.uniform(0.01, 50, 12)) + 300, value=np.round(rng.uniform(0, 1, 12))
+        )
+        between = curve(np.linspace(curve.wavelength_nm[0], curve.wavelength_nm[-1], 2001))
+        assert between.min() == 0.0
+        assert between.max() == 1.0
+
+
+def test_a_spline_of_a_straight_line_is_the_line():
+    curve = SplineCurve(wavelength_nm=[400, 450, 700], value=[0.1, 0.15, 0.4])
+    waves_nm = np.linspace(400, 700, 31)
+    np.testing.assert_allclose(curve(waves_nm), waves_nm / 1000 - 0.3, rtol=0, atol=4 * EPS)
+
+
+def test_a_smooth_curve_is_met_better_by_a_spline_than_by_lines():
+    table_nm, between_nm = np.arange(400.0, 701.0, 20.0), np.linspace(400, 700, 1201)
+    truth = GaussianCurve(centre_nm=560.0, fwhm_nm=120.0)  # highest at a wavelength of the table
+    worst = [
+        np.abs(kind(wavelength_nm=table_nm, value=truth(table_nm))(between_nm) - truth(between_nm)).max()
+        for kind in (SplineCurve, TableCurve)
+    ]
+    assert 3.0 * worst[0] < worst[1] < 0.02
+
+
+def test_a_step_belongs_to_the_value_that_begins_there():
+    curve = StepCurve(edge_nm=[400, 500, 700], value=[0.2, 0.6])
+    np.testing.assert_array_equal(curve([400, 499.999, 500, 700]), [0.2, 0.2, 0.6, 0.6])
+
+
+@pytest.mark.parametrize(
+    "curve",
+    [
+        TableCurve(wavelength_nm=[400, 700], value=[0.3, 0.5]),
+        SplineCurve(wavelength_nm=[400, 700], value=[0.3, 0.5]),
+        StepCurve(edge_nm=[400, 550, 700], value=[0.3, 0.5]),
+    ],
+    ids=["lines", "spline", "steps"],
+)
+class TestBeyondATable:
+    @pytest.mark.parametrize("outside_nm", [399.9, 700.1, math.inf, math.nan])
+    def test_wavelengths_are_refused_with_the_cure(self, curve, outside_nm):
+        with pytest.raises(
+            ParameterError, match=rf"must lie in the table, 400 to 700 nm, got {outside_nm} nm; beyond="
+        ):
+            curve([500.0, outside_nm])
+
+    def test_the_curve_may_be_0(self, curve):
+        np.testing.assert_array_equal(
+            dataclasses.replace(curve, beyond="zero")([399.9, 400, 700, 701]), [0, 0.3, 0.5, 0]
+        )
+
+    def test_the_curve_may_stay(self, curve):
+        np.testing.assert_array_equal(
+            dataclasses.replace(curve, beyond="hold")([1.0, 400, 700, 9e5]), [0.3, 0.3, 0.5, 0.5]
+        )
+
+    @pytest.mark.parametrize("beyond", ["zero", "hold"])
+    def test_what_is_no_wavelength_is_refused_all_the_same(self, curve, beyond):
+        with pytest.raises(ParameterError, match=r"^'wavelength_nm' must lie in"):
+            dataclasses.replace(curve, beyond=beyond)(math.nan)
+
+    def test_the_shape_is_that_of_the_wavelengths(self, curve):
+        assert curve(550.0).shape == ()
+        assert curve(np.full((2, 3), 550.0)).shape == (2, 3)
+
+    def test_another_choice_is_refused(self, curve):
+        with pytest.raises(ParameterError, match=r"^'beyond' must be one of 'refuse', 'zero', 'hold', got 'guess'$"):
+            dataclasses.replace(curve, beyond="guess")
+
+
+@pytest.mark.parametrize("kind", [TableCurve, SplineCurve, PolynomialCurve])
+def test_wavelengths_in_micrometres_are_told_to_be_none_in_nm(kind):
+    with pytest.raises(
+        ParameterError, match=r"must be from 10 to 1e\+06, got \[0.4, 0.5, 0.6\] nm; wavelengths are in nm"
+    ):
+        kind(wavelength_nm=[0.4, 0.5, 0.6], value=[0.1, 0.2, 0.3], **({"degree": 1} if kind is PolynomialCurve else {}))
+
+
+@pytest.mark.parametrize(
+    ("edge_nm", "value", "sentence"),
+    [
+        ([400, 500], [0.1, 0.2], "'edge_nm' must be one more than the values, of which there are 2, got 2"),
+        ([400], [], "'edge_nm' must be one more than the values"),
+        ([400, 400], [0.1], "'edge_nm' must ascend"),
+        ([500, 400], [0.1], "'edge_nm' must ascend"),
+        ([400, 500], [1.1], "'value' must be <= 1 everywhere, got 1.1"),
+        ([400, 500], [-0.1], "'value' must be >= 0.0 everywhere"),
+        ([400, math.nan], [0.1], "'edge_nm' must be finite everywhere"),
+    ],
+)
+def test_impossible_steps_are_refused(edge_nm, value, sentence):
+    with pytest.raises(ParameterError, match=f"^{sentence}"):
+        StepCurve(edge_nm=edge_nm, value=value)
+
+
+# -- bands ----------------------------------------------------------------------------------------------------------
+
+WAVES_NM = np.linspace(300.0, 1100.0, 801)
+
+
+def test_an_edge_passes_10_50_and_90_percent_where_it_says():
+    curve = PassBand(from_nm=600.0, edge_nm=40.0, peak=0.8)
+    np.testing.assert_allclose(curve([580.0, 600.0, 620.0]), [0.08, 0.4, 0.72], rtol=8 * EPS)
+
+
+@pytest.mark.parametrize("edge_nm", [0.0, 5.0, 80.0])
+def test_a_long_pass_and_a_short_pass_of_the_same_edge_share_the_light(edge_nm):
+    both = PassBand(from_nm=600.0, edge_nm=edge_nm)(WAVES_NM) + PassBand(to_nm=600.0, edge_nm=edge_nm)(WAVES_NM)
+    np.testing.assert_allclose(both, 1.0, rtol=0, atol=2 * EPS)
+
+
+@pytest.mark.parametrize("edge_nm", [0.0, 5.0, 80.0])
+def test_neighbouring_bands_add_up_to_the_band_of_both(edge_nm):
+    first, second, both = (
+        PassBand(from_nm=a, to_nm=b, edge_nm=edge_nm)(WAVES_NM) for a, b in ((450, 520), (520, 700), (450, 700))
+    )
+    np.testing.assert_allclose(first + second, both, rtol=0, atol=4 * EPS)
+
+
+@pytest.mark.parametrize("edge_nm", [5.0, 40.0, 200.0])
+def test_the_area_of_a_band_is_its_width(edge_nm):
+    waves_nm = np.arange(-2000.0, 3500.0)  # the sum over whole nm is the area to rounding for edges this wide
+    assert math.isclose(PassBand(from_nm=500, to_nm=620, edge_nm=edge_nm, peak=0.5)(waves_nm).sum(), 60.0, rel_tol=1e-6)
+
+
+@pytest.mark.parametrize("parameters", [{"to_nm": 650.0}, {"from_nm": 650.0}, {"from_nm": 500.0, "to_nm": 501.0}])
+@pytest.mark.parametrize("edge_nm", [0.0, 1e-9, 3.0, 1e4])
+def test_a_band_stays_from_0_to_1(parameters, edge_nm):
+    passed = PassBand(**parameters, edge_nm=edge_nm)(np.linspace(1.0, 1e6, 100_001))
+    assert passed.min() >= 0.0
+    assert passed.max() <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("parameters", "sentence"),
+    [
+        ({}, "'from_nm' or 'to_nm' must be given"),
+        ({"from_nm": 0.0}, "'from_nm' must be > 0"),
+        ({"from_nm": 500.0, "to_nm": 500.0}, "'to_nm' must be > 500, got 500.0 nm"),
+        ({"to_nm": math.nan}, "'to_nm' must be finite"),
+        ({"to_nm": 500.0, "edge_nm": -1.0}, "'edge_nm' must be >= 0"),
+        ({"to_nm": 500.0, "peak": 1.5}, "'peak' must be <= 1"),
+    ],
+)
+def test_impossible_bands_are_refused(parameters, sentence):
+    with pytest.raises(ParameterError, match=f"^{sentence}"):
+        PassBand(**parameters)
+
+
+# -- products -------------------------------------------------------------------------------------------------------
+
+SILICON, GREEN, CUT = SiliconQE(depth_um=3.0), GaussianCurve(centre_nm=540.0, fwhm_nm=90.0), PassBand(to_nm=650.0)
+
+
+def test_a_product_is_the_product_of_the_values():
+    waves_nm = np.linspace(400.0, 1050.0, 66)
+    np.testing.assert_array_equal((SILICON * GREEN)(waves_nm), SILICON(waves_nm) * GREEN(waves_nm))
+
+
+def test_products_are_taken_apart_and_compare_by_their_curves():
+    assert (SILICON * GREEN) * CUT == SILICON * (GREEN * CUT) == ProductCurve([SILICON, GREEN, CUT])
+    assert (SILICON * 0.5).curves == (SILICON, ConstantCurve(0.5))
+
+
+def test_a_product_does_not_depend_on_the_order():
+    waves_nm = np.linspace(400.0, 1050.0, 66)
+    values = [ProductCurve(order)(waves_nm) for order in itertools.permutations([SILICON, GREEN, CUT, 0.9])]
+    assert all(np.allclose(a, values[0], rtol=8 * EPS, atol=0) for a in values)
+
+
+@pytest.mark.parametrize("number", [0.25, np.float64(0.25), np.array(0.25), 1, 0])
+def test_a_curve_times_a_number_is_a_curve_from_both_sides(number):
+    for curve in (CUT * number, number * CUT):
+        np.testing.assert_allclose(curve([600.0, 650.0]), CUT([600.0, 650.0]) * float(number), rtol=2 * EPS)
+
+
+def test_a_function_is_a_curve_in_a_product():
+    assert ((lambda waves_nm: np.asarray(waves_nm) / 1000.0) * ConstantCurve(0.5))(500.0) == 0.25
+
+
+def test_a_product_is_known_where_all_its_curves_are():
+    with pytest.raises(ParameterError, match=r"must lie in the table of silicon's absorption, 400 to 1050 nm"):
+        (GREEN * SILICON)(390.0)
+
+
+@pytest.mark.parametrize("factor", [1.5, -0.1, math.nan, "0.5", None])
+def test_a_factor_that_is_no_share_is_refused(factor):
+    with pytest.raises(ParameterError, match=r"^'curves' must be"):
+        SILICON * factor
+
+
+@pytest.mark.parametrize("curves", [[], "ab", None, 0.5])
+def test_a_product_of_nothing_is_refused(curves):
+    with pytest.raises(ParameterError, match=r"^'curves' must be one or more curves or numbers"):
+        ProductCurve(curves)
+
+
+def test_filters_times_a_curve_are_each_times_the_curve():
+    waves_nm = np.linspace(400.0, 700.0, 31)
+    cut = rgb_filters() * CUT
+    assert cut.names == ("R", "G", "B")
+    np.testing.assert_array_equal(cut.transmission(waves_nm), rgb_filters().transmission(waves_nm) * CUT(waves_nm))
+
+
+def test_every_channel_may_have_a_quantum_efficiency_of_its_own():
+    filters = rgb_filters() * [SILICON, 0.5, GREEN]
+    factors = np.stack([SILICON([500.0, 600.0]), [0.5, 0.5], GREEN([500.0, 600.0])])
+    waves_nm = np.array([500.0, 600.0])
+    np.testing.assert_array_equal(filters.transmission(waves_nm), rgb_filters().transmission(waves_nm) * factors)
+
+
+@pytest.mark.parametrize("factor", [[0.5, 0.5], [], [0.5] * 4, 1.5, "rgb", None, [0.5, 0.5, 2.0]])
+def test_factors_that_do_not_fit_the_filters_are_refused(factor):
+    with pytest.raises(ParameterError, match=r"^'factor' must be"):
+        rgb_filters() * factor
+
+
+# -- mixing in a sensor -----------------------------------------------------------------------------------------------
+
+
+def bayer():
+    return fs.layout.mosaic(fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0), ("RG", "GB"))
+
+
+def test_filter_and_quantum_efficiency_mix_to_one_curve():
+    waves_nm = np.linspace(400.0, 700.0, 7)
+    apart = fs.Sensor(bayer(), qe=SILICON * CUT, filters="rgb")
+    in_one = fs.Sensor(bayer(), filters=rgb_filters() * SILICON * CUT)
+    np.testing.assert_allclose(
+        apart.responsivity_e_per_j(waves_nm), in_one.responsivity_e_per_j(waves_nm), rtol=8 * EPS
+    )
+
+
+# -- means over bands -------------------------------------------------------------------------------------------------
+
+
+def test_the_mean_of_a_constant_is_the_constant():
+    assert math.isclose(BandMean(curve=ConstantCurve(0.3), band_width_nm=40.0)(550.0), 0.3, rel_tol=8 * EPS)
+
+
+def test_the_mean_of_a_straight_line_is_its_mean_over_photons():
+    line = TableCurve(wavelength_nm=[400, 800], value=[0.4, 0.8])  # the share is wavelength / 1000
+    # mean of x² / 1000 over c ± w/2, divided by c: (c² + w²/12) / (1000 c)
+    mean = BandMean(curve=line, band_width_nm=100.0, n_points=10_000)(600.0)
+    assert math.isclose(mean, (600.0**2 + 100.0**2 / 12) / 600e3, rel_tol=1e-8)
+
+
+def test_a_band_gives_the_photons_of_its_halves():
+    curve = GaussianCurve(centre_nm=551.0, fwhm_nm=7.0)
+    whole = BandMean(curve=curve, band_width_nm=40.0, n_points=64)(560.0) * 560.0
+    halves = BandMean(curve=curve, band_width_nm=20.0, n_points=32)([550.0, 570.0]) * [550.0, 570.0]
+    assert math.isclose(whole, halves.mean(), rel_tol=16 * EPS)
+
+
+@pytest.mark.parametrize(("shift_nm", "share_at_points"), [(0.0, 1.8797), (10.0, 0.2349)])
+def test_a_narrow_filter_between_broad_bands_gives_its_electrons_by_their_means_only(shift_nm, share_at_points):
+    narrow = GaussianCurve(centre_nm=550.0 + shift_nm, fwhm_nm=10.0)
+    waves_nm = np.arange(450.0, 651.0, 20.0)
+    photons = 1.06446701943 * 10.0 * narrow.centre_nm  # area times the mean wavelength of a symmetric band
+    at_points = (narrow(waves_nm) * waves_nm).sum() * 20.0 / photons
+    over_bands = (BandMean(curve=narrow, band_width_nm=20.0)(waves_nm) * waves_nm).sum() * 20.0 / photons
+    assert abs(at_points - share_at_points) < 1e-3
+    assert abs(over_bands - 1.0) < 1e-9
+
+
+def test_broad_filters_need_no_means_every_10_nm():
+    waves_nm = np.arange(400.0, 701.0, 10.0)
+    photons = [
+        (f.transmission(waves_nm) * waves_nm).sum(axis=1) for f in (rgb_filters(), rgb_filters().over_bands(10.0))
+    ]
+    np.testing.assert_allclose(photons[0], photons[1], rtol=1e-3)
+
+
+def test_a_mean_keeps_the_shape_and_the_range():
+    mean = BandMean(curve=PassBand(from_nm=500.0, to_nm=520.0, edge_nm=0.0), band_width_nm=60.0)
+    values = mean(np.linspace(400.0, 700.0, 12).reshape(3, 4))
+    assert values.shape == (3, 4)
+    assert values.min() >= 0.0
+    assert values.max() <= 1.0
+
+
+def test_a_band_that_reaches_beyond_the_curve_is_refused():
+    with pytest.raises(ParameterError, match=r"must lie in the table of silicon's absorption"):
+        BandMean(curve=SILICON, band_width_nm=20.0)([400.0, 500.0])
+
+
+@pytest.mark.parametrize(
+    ("parameters", "name"),
+    [
+        ({"curve": 0.5, "band_width_nm": 10.0}, "curve"),
+        ({"curve": GREEN, "band_width_nm": 0.0}, "band_width_nm"),
+        ({"curve": GREEN, "band_width_nm": 10.0, "n_points": 0}, "n_points"),
+    ],
+)
+def test_impossible_means_are_refused(parameters, name):
+    with pytest.raises(ParameterError, match=f"^'{name}' must be"):
+        BandMean(**parameters)
+
+
+def test_a_band_below_zero_is_refused():
+    with pytest.raises(ParameterError, match=r"^'wavelength_nm' must be > 500, half a band, got 400.0 nm"):
+        BandMean(curve=GREEN, band_width_nm=1000.0)(400.0)
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+def written(folder, text):
+    path = folder / "curves.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "wavelength_nm,qe\n400,0.1\n500,0.6\n700,0.2\n",
+        "400,0.1\n500,0.6\n700,0.2",
+        "# a comment\n\nnm\tqe\n700\t0.2\n400\t.1\n# another\n500\t6e-1\n",
+        "wavelength (nm);qe\r\n400;0.1\r\n500;0.6\r\n700;0.2\r\n",
+        "wavelength  QE\n 400   0.1\n 500   0.6\n 700   0.2\n",
+        "lambda [µm],qe\n0.4,0.1\n0.5,0.6\n0.7,0.2\n",
+        "Wavelength_um,qe\n0.4,0.1\n0.5,0.6\n0.7,0.2\n",
+        "wavelength_nm,QE [%]\n400,10\n500,60\n700,20\n",
+        "wavelength_nm,qe_percent\n400,10\n500,60\n700,20\n",
+        '"wavelength, nm","the qe"\n"400","0.1"\n500,0.6\n700,0.2\n',
+        b"\xef\xbb\xbfwavelength_nm,qe\n400,0.1\n500,0.6\n700,0.2\n",
+    ],
+)
+def test_one_table_may_be_written_in_many_ways(tmp_path, text):
+    expected = TableCurve(wavelength_nm=[400, 500, 700], value=[0.1, 0.6, 0.2])
+    assert read_curve(written(tmp_path, text)) == expected
+
+
+def test_units_are_what_the_caller_says(tmp_path):
+    path = written(tmp_path, "0.4,10\n0.7,60\n")
+    curve = read_curve(path, wavelength_unit="um", value_unit="percent", between="spline", beyond="hold")
+    assert curve == SplineCurve(wavelength_nm=[400, 700], value=[0.1, 0.6], beyond="hold")
+    assert curve.source == "curves.csv, 1"
+
+
+def test_a_column_is_taken_by_name_or_number(tmp_path):
+    path = written(tmp_path, "wavelength_nm,R,G (%)\n400,0.1,50\n500,0.2,60\n")
+    assert read_curve(path, "G") == read_curve(path, 2) == TableCurve(wavelength_nm=[400, 500], value=[0.5, 0.6])
+    assert read_curve(path, "R", value_unit="percent").value == (0.001, 0.002)
+
+
+def test_filters_have_the_names_of_their_columns(tmp_path):
+    filters = read_filters(written(tmp_path, "wavelength_nm,R,G [%],B_percent\n400,0.1,50,7\n500,0.2,60,8\n"))
+    assert filters.names == ("R", "G", "B")
+    np.testing.assert_allclose(filters.transmission(np.array([450.0])), [[0.15], [0.55], [0.075]], rtol=4 * EPS)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "holds no table: no line but comments"),
+        ("# nothing\n\n  \n", "holds no table"),
+        ("wavelength_nm,qe\n", "must have at least 2 lines of numbers, got 0"),
+        ("400,0.5\n", "must have at least 2 lines of numbers, got 1"),
+        ("400\n500\n", "must have 2 to 1000 columns, wavelengths and values, got 1"),
+        (",".join(["400"] * 2000) + "\n" + ",".join(["500"] * 2000), "must have 2 to 1000 columns"),
+        ("400,0.1\n500\n", "line 2 must have 2 columns, as the first has, got 1"),
+        ("nm,qe\n400,0.1\n500,0.2,\n", "line 3 must have 2 columns, as the first has, got 3"),
+        ("400,0.1\n500,high\n", "line 2, column 2: must be a number, got 'high'"),
+        ("400,0.1\n500,\n", "line 2, column 2: must be a number, got ''"),
+        ("400,0.1\n500,nan\n", "line 2, column 2: must be a number, got 'nan'"),
+        ("nan,0.1\n500,0.2\n", "line 1, column 1: must be a number, got 'nan'"),
+        ("400,inf\n500,0.2\n", "line 1, column 2: must be a number, got 'inf'"),
+        ("400,0x1\n500,0.2\n", "line 1, column 2: must be a number"),
+        ("400,1_0\n500,0.2\n", "line 1, column 2: must be a number"),
+        ("400,__import__('os')\n500,0.2\n", "line 1, column 2: must be a number"),
+        ("400;0,1\n500;0,2\n", "line 1, column 2: must be a number, got '0,1'; write decimals with a point"),
+        ('400,"0.1\n500,0.2\n', "line 1 cannot be parted into columns"),
+        ("400,0.1\n500,1.2\n", r"line 2, column '1': 1\.2 must be <= 1; where it is percent, say value_unit='percent'"),
+        ("400,0.1\n500,1e999\n", "line 2, column '1': inf must be <= 1"),
+        ("nm,QE [%]\n400,10\n500,101\n", "line 3, column 'QE': 101 must be <= 100 %"),
+        ("400,0.1\n500,-0.01\n", r"line 2, column '1': -0\.01 must be >= 0; set to 0 what is noise"),
+        (
+            "0.4,0.1\n0.5,0.2\n",
+            r"line 1: the wavelength must be from 10 to 1e\+06 nm, got 0\.4; where .* wavelength_unit='um'",
+        ),
+        ("400,0.1\n-500,0.2\n", "line 2: the wavelength must be from"),
+        ("um,qe\n400,0.1\n5000,0.2\n", r"line 3: the wavelength must be .*, got 5e\+06$"),
+        ("400,0.1\n500,0.2\n400.0,0.1\n", "lines 1 and 3 have the same wavelength, 400 nm"),
+        ("wavelength (Angstrom),qe\n4000,0.1\n5000,0.2\n", "wavelengths must be in nm or µm, got 'wavelength "),
+        ("nm,R,R\n400,0.1,0.2\n500,0.2,0.2\n", "column 3 has the name 'R' again in the first line"),
+        ("nm,R,\n400,0.1,0.2\n500,0.2,0.2\n", "column 3 has no name in the first line"),
+        ("nm,%\n400,0.1\n500,0.2\n", "column 2 has no name in the first line"),
+        ("400,0.1\x00\n500,0.2\n", "line 1, column 2: must be a number"),
+        (b"\xff\xfe4\x000\x000\x00", "is no text in UTF-8"),
+        (b"400,0.1\n" * 600_000, "is larger than 4194304 bytes, and so no table of curves"),
+        (b"4,1\n" * 100_001, "has more than 100000 lines, and so is no table of curves"),
+    ],
+)
+@pytest.mark.parametrize("read", [lambda path: read_curve(path, 1), read_filters], ids=["curve", "filters"])
+def test_a_malformed_file_is_told_in_one_sentence(tmp_path, read, text, sentence):
+    with pytest.raises(FileError, match=rf"curves\.csv: {sentence}[^\n]*$"):
+        read(written(tmp_path, text))
+
+
+@pytest.mark.parametrize("read", [read_curve, read_filters])
+@pytest.mark.parametrize(("name", "sentence"), [("no.csv", "no such file"), ("", "is not a file"), ("\0", "")])
+def test_a_file_that_is_none_is_refused(tmp_path, read, name, sentence):
+    with pytest.raises(FileError, match=f"{sentence}[^\n]*$"):
+        read(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("column", "sentence"),
+    [
+        (None, "has 2 columns of values, say which: R, G"),
+        ("B", "has no column 'B', only R, G, or their numbers from 1 to 2"),
+        (0, "has no column 0"),
+        (3, "has no column 3"),
+        (True, "has no column True"),
+        (1.0, "has no column 1.0"),
+    ],
+)
+def test_a_column_that_is_not_there_is_refused(tmp_path, column, sentence):
+    with pytest.raises(FileError, match=f"{sentence}[^\n]*$"):
+        read_curve(written(tmp_path, "nm,R,G\n400,0.1,0.2\n500,0.2,0.2\n"), column)
+
+
+@pytest.mark.parametrize("name", ["wavelength_unit", "value_unit", "between", "beyond"])
+def test_a_choice_that_is_none_is_refused(tmp_path, name):
+    with pytest.raises(ParameterError, match=f"^'{name}' must be one of .*, got 'guess'$"):
+        read_filters(written(tmp_path, "400,0.1\n500,0.2\n"), **{name: "guess"})
+
+
+# -- measured curves --------------------------------------------------------------------------------------------------
+
+#: Another CCD of the type, from another report of ESO (Grus), and another D5100 (Jiang et al. 2013), each colour to its peak.
+GRUS = {
+    480: 0.790,
+    520: 0.786,
+    560: 0.764,
+    600: 0.754,
+    640: 0.743,
+    700: 0.693,
+    760: 0.591,
+    800: 0.517,
+    860: 0.397,
+    900: 0.293,
+    960: 0.127,
+    1000: 0.047,
+}
+D5100 = {
+    450: (0.048, 0.188, 1.000), 480: (0.056, 0.433, 0.901), 500: (0.059, 0.648, 0.583), 530: (0.141, 1.000, 0.162),
+    560: (0.047, 0.669, 0.029), 590: (1.000, 0.314, 0.009), 620: (0.620, 0.056, 0.003), 650: (0.277, 0.020, 0.005),
+}  # fmt: skip
+
+
+def test_the_ccd_is_as_another_of_its_type():
+    np.testing.assert_allclose(ccd_qe()(list(GRUS)), list(GRUS.values()), rtol=0, atol=0.0451)
+
+
+def test_the_camera_is_as_another_of_its_type():
+    waves_nm = np.array(list(D5100), float)
+    per_energy = camera_filters().transmission(waves_nm) * waves_nm
+    dense_nm = np.arange(400.0, 720.0)
+    per_energy /= (camera_filters().transmission(dense_nm) * dense_nm).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(per_energy.T, list(D5100.values()), rtol=0, atol=0.11)
+
+
+def test_every_colour_of_the_camera_reaches_1():
+    waves_nm = np.arange(380.0, 780.5, 5.0)
+    values = camera_filters().transmission(waves_nm)
+    np.testing.assert_array_equal(values.max(axis=1), 1.0)
+    assert waves_nm[values.argmax(axis=1)].tolist() == [595.0, 530.0, 460.0]
+    assert values.min() >= 0.0
+
+
+# -- settings ---------------------------------------------------------------------------------------------------------
+
+SHOT = """
+scene: {kind: flat, shape: [40, 40], pitch_um: 400, distance_m: 1.0, radiance_w_m2_sr_nm: 0.2, band_width_nm: 100}
+optics: {focal_length_mm: 8, f_number: 2.8}
+layout: {generator: grid, parameters: {n_x: 4, n_y: 4, pitch_um: 8}, mosaic: [RG, GB]}
+exposure_s: 0.01
+"""
+
+
+@pytest.fixture
+def shot_file(tmp_path):
+    (tmp_path / "curves.csv").write_text("wavelength_nm,R,G [%],B\n400,0.1,50,0.7\n700,0.2,60,0.8\n")
+    path = tmp_path / "shot.yaml"
+    path.write_text(SHOT)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("setting", "curve"),
+    [
+        ("{kind: ccd}", ccd_qe()),
+        ("{kind: pass_band, to_nm: 650, edge_nm: 20}", PassBand(to_nm=650.0, edge_nm=20.0)),
+        ("{kind: table, wavelength_nm: [400, 700], value: [0.2, 1]}", TableCurve(wavelength_nm=[400, 700], value=[0.2, 1])),
+        ("{kind: spline, wavelength_nm: [400, 700], value: [0, 1]}", SplineCurve(wavelength_nm=[400, 700], value=[0, 1])),
+        ("{kind: step, edge_nm: [400, 700], value: [0.5], beyond: hold}", StepCurve(edge_nm=[400, 700], value=[0.5], beyond="hold")),
+        ("{kind: product, curves: [0.9, {kind: silicon, depth_um: 3}]}", ProductCurve([0.9, SILICON])),
+        ("{kind: file, path: curves.csv, column: G}", TableCurve(wavelength_nm=[400, 700], value=[0.5, 0.6])),
+        ("{kind: file, path: curves.csv, column: 1, between: spline}", SplineCurve(wavelength_nm=[400, 700], value=[0.1, 0.2])),
+    ],
+)  # fmt: skip
+def test_a_curve_in_a_settings_file_is_that_of_the_call(shot_file, setting, curve):
+    assert read_shot(shot_file, [f"sensor.qe={setting}"]).camera.sensor.qe == curve
+
+
+def test_filters_in_a_settings_file_are_read_beside_it(shot_file, tmp_path, monkeypatch):
+    monkeypatch.chdir("/")
+    sensor = read_shot(shot_file, ["sensor.filters={path: curves.csv}"]).camera.sensor
+    assert sensor.filters == read_filters(tmp_path / "curves.csv")
+    assert sensor.filter_names == ("R", "G", "B")
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ("sensor.qe={kind: file, path: no.csv}", r"sensor\.qe: .*no\.csv: no such file"),
+        ("sensor.qe={kind: file, path: curves.csv}", r"sensor\.qe: .*has 3 columns of values, say which: R, G, B"),
+        ("sensor.qe={kind: product, curves: [{kind: step}]}", r"sensor\.qe\.curves\.0\.edge_nm: is missing"),
+        ("sensor.qe={kind: product, curves: [2]}", r"sensor\.qe\.curves: must be <= 1, got 2"),
+        ("sensor.filters={path: shot.yaml}", r"sensor\.filters: .*shot\.yaml: "),
+        ("sensor.filters={path: curves.csv, names: [a]}", r"sensor\.filters\.names: no such setting"),
+        ("sensor.filters={curves: [{kind: file, path: no.csv}]}", r"sensor\.filters\.curves\[0\]: .*no such file"),
+    ],
+)
+def test_a_wrong_curve_in_a_settings_file_is_told_with_its_place(shot_file, change, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        read_shot(shot_file, [change])

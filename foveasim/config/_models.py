@@ -11,7 +11,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal, Union, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, create_model
 
 from foveasim import layout as layouts
 from foveasim.distortion import BrownConrady, Fisheye, Lens, PolynomialFisheye, Scaramuzza
@@ -19,7 +19,22 @@ from foveasim.layout import DesignRules, Layout
 from foveasim.maps import read_power_map
 from foveasim.optics import Annulus, Blades, LateralColour, Optics, PupilImage, Seidel, Slit, Spider, Zernike
 from foveasim.scene import Scene, charts
-from foveasim.sensor import ConstantCurve, FilterSet, GaussianCurve, PolynomialCurve, Sensor, SiliconQE
+from foveasim.sensor import (
+    ConstantCurve,
+    FilterSet,
+    GaussianCurve,
+    PassBand,
+    PolynomialCurve,
+    ProductCurve,
+    Sensor,
+    SiliconQE,
+    SplineCurve,
+    StepCurve,
+    TableCurve,
+    ccd_qe,
+    read_curve,
+    read_filters,
+)
 
 __all__ = ["PICTURES", "LayoutUnion", "PerArea", "RulesSection", "ShotSection", "call_of"]
 
@@ -141,10 +156,16 @@ _PUPILS: dict[str, Callable[..., Any]] = {
     "spider": Spider,
 }
 _CURVES: dict[str, Callable[..., Any]] = {
+    "ccd": ccd_qe,
     "constant": ConstantCurve,
+    "file": read_curve,
     "gaussian": GaussianCurve,
+    "pass_band": PassBand,
     "polynomial": PolynomialCurve,
     "silicon": SiliconQE,
+    "spline": SplineCurve,
+    "step": StepCurve,
+    "table": TableCurve,
 }
 
 _LensSection = _one_of("kind", {name: _model(name, lens) for name, lens in _LENSES.items()})
@@ -159,8 +180,16 @@ _OpticsSection = _model(
     seidel=_model("seidel", Seidel) | None,
     lateral_colour=_model("lateral colour", LateralColour) | None,
 )
-_CurveSection = _one_of("kind", {name: _model(name, curve) for name, curve in _CURVES.items()})
-_FilterSection = _model("filter set", FilterSet, curves=list[_CurveSection])  # type: ignore[valid-type]
+_curves = {name: _model(name, curve, path=str) for name, curve in _CURVES.items()}
+_Factor = float | _one_of("kind", _curves)
+_product = _model("product", ProductCurve, curves=list[_Factor])  # type: ignore[valid-type]
+_CurveSection = _one_of("kind", _curves | {"product": _product})
+_filter_set = _model("filter set", FilterSet, curves=list[_CurveSection])  # type: ignore[valid-type]
+_filter_file = _model("filter file", read_filters, path=str)
+_FilterSection: Any = Annotated[
+    Annotated[_filter_set, Tag("filter set")] | Annotated[_filter_file, Tag("filter file")],
+    Discriminator(lambda section: "filter file" if isinstance(section, dict) and "path" in section else "filter set"),
+]
 _PerSite = float | PerArea | list[float]
 _SceneSection = _one_of(
     "kind",

@@ -5,26 +5,42 @@ from __future__ import annotations
 from foveasim.sensor._sensor import Sensor
 from foveasim.sensor.crosstalk import Coupling, Diffusion, KernelCrosstalk, Mixing
 from foveasim.sensor.noise import draw_shot_noise
-from foveasim.sensor.spectral import (
+from foveasim.sensor.spectral import FilterSet, rgb_filters
+from foveasim.sensor.spectral_curves import (
+    BandMean,
     ConstantCurve,
-    FilterSet,
+    Curve,
     GaussianCurve,
-    PolynomialCurve,
+    PassBand,
+    ProductCurve,
     SiliconQE,
-    rgb_filters,
 )
+from foveasim.sensor.spectral_files import read_curve, read_filters
+from foveasim.sensor.spectral_measured import camera_filters, ccd_qe
+from foveasim.sensor.spectral_tables import PolynomialCurve, SplineCurve, StepCurve, TableCurve
 
 __all__ = [
+    "BandMean",
     "ConstantCurve",
     "Coupling",
+    "Curve",
     "Diffusion",
     "FilterSet",
     "GaussianCurve",
     "KernelCrosstalk",
     "Mixing",
+    "PassBand",
     "PolynomialCurve",
+    "ProductCurve",
     "Sensor",
     "SiliconQE",
+    "SplineCurve",
+    "StepCurve",
+    "TableCurve",
+    "camera_filters",
+    "ccd_qe",
     "draw_shot_noise",
+    "read_curve",
+    "read_filters",
     "rgb_filters",
 ]
