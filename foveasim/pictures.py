@@ -6,8 +6,10 @@ Arrays here are as one sees the picture: (n_y, n_x) or (n_y, n_x, n_channel), th
 
 from __future__ import annotations
 
+import math
 import struct
 import warnings
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,16 +18,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim.apart import read_apart
 from foveasim.errors import FileError
 from foveasim.files import written_whole
 
 if TYPE_CHECKING:
     from PIL import Image
 
-__all__ = ["read_picture", "write_picture"]
+__all__ = ["pixels_of_page", "read_picture", "write_picture"]
 
 #: Larger pictures are refused: 2**28 pixels are 3 GiB as three float32 channels.
 MAX_PIXELS = 2**28
+#: What a small EXR may unpack to, and for each byte of a larger one: deflate packs no better.
+MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**28, 1032
 #: Formats that Pillow is asked for; its other readers are for files that are no pictures of scenes.
 PILLOW_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "PPM", "JPEG2000", "TGA")
 #: Pillow's modes that hold the numbers of the file as they are, and what others are converted to.
@@ -40,6 +45,10 @@ CONVERTED_MODES = {
     "I;16L": "I",
     "I": "I",
 }
+#: Beginnings of PNG and of what is packed in JPEG 2000, and what ends that, and JPEG.
+PNG_MAGIC, JPEG2000_MAGIC, END_MARKER = b"\x89PNG\r\n\x1a\n", b"\xff\x4f\xff\x51", b"\xff\xd9"
+#: Marker of JPEG behind whose segment the numbers begin, and the length of a marker.
+START_OF_SCAN, MARKER_BYTES = 0xDA, 2
 #: Tag of TIFF and EXIF that tells how the camera was held.
 ORIENTATION_TAG = 274
 
@@ -63,6 +72,11 @@ def read_picture(path: str | Path) -> NDArray[Any]:
     ------
     FileError
         When the file is missing, no picture, cut short, too large, or holds several pictures.
+
+    Notes
+    -----
+    A changed bit is found where the format has checksums: in PNG, and in EXR and TIFF packed with deflate. EXR is read by a
+    program of its own, which a broken file can end.
     """
     path = Path(path)
     try:
@@ -89,7 +103,7 @@ def _reader_of(head: bytes) -> Any:
     """The reader for a file that begins with these bytes."""
     if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return _read_tiff
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:25] == b"\x10":
+    if head[:8] == PNG_MAGIC and head[24:25] == b"\x10":
         return _read_deep_png
     if head[:4] == b"\x76\x2f\x31\x01":
         return _read_exr
@@ -112,6 +126,7 @@ def _read_with_pillow(path: Path) -> NDArray[Any]:
                 n_pictures = getattr(image, "n_frames", 1)
                 if n_pictures > 1 and image.format != "MPO":  # phones put small pictures behind the photograph
                     raise FileError(path, f"holds {n_pictures} pictures; give a file with one")
+                _check_whole(path, str(image.format))
                 orientation = _orientation(image)
                 plain = _plain(image)
                 numbers = np.asarray(plain)
@@ -123,6 +138,43 @@ def _read_with_pillow(path: Path) -> NDArray[Any]:
         is_16_bit = numbers.min() >= 0 and numbers.max() <= np.iinfo(np.uint16).max
         numbers = numbers.astype(np.uint16 if is_16_bit else np.float32)
     return _upright(numbers, orientation)
+
+
+def _check_whole(path: Path, kind: str) -> None:
+    """Refuse what Pillow takes for whole: it passes over the sums of PNG, and does not always miss an end."""
+    if kind not in ("PNG", "JPEG", "MPO", "JPEG2000"):
+        return
+    content = path.read_bytes()
+    if kind == "PNG":
+        is_whole = _has_true_sums(content)
+    else:
+        begin = content.find(JPEG2000_MAGIC) if kind == "JPEG2000" else _first_scan(content)
+        # Packed numbers are so written that they never hold the marker.
+        is_whole = content.find(END_MARKER, max(begin, 0)) >= 0
+    if not is_whole:
+        raise FileError(path, "is broken or cut short")
+
+
+def _has_true_sums(content: bytes) -> bool:
+    """Whether the chunks of a PNG that hold its picture have the checksums that they tell."""
+    place, view = len(PNG_MAGIC), memoryview(content)
+    while place + 12 <= len(content):
+        begin = place + 4
+        end = begin + 4 + int.from_bytes(view[place:begin])
+        told = int.from_bytes(view[end : end + 4])
+        if content.startswith(b"IDAT", begin) and zlib.crc32(view[begin:end]) != told:
+            return False
+        place = end + 4
+    return True
+
+
+def _first_scan(content: bytes) -> int:
+    """Where the numbers of a JPEG begin, behind its notes, which may hold another JPEG."""
+    place = MARKER_BYTES
+    while content[place : place + 1] == b"\xff" and content[place + 1] != START_OF_SCAN:
+        is_filler = content[place + 1] == 0xFF
+        place += 1 if is_filler else MARKER_BYTES + int.from_bytes(content[place + 2 : place + 4])
+    return place
 
 
 def _plain(image: Image.Image) -> Image.Image:
@@ -172,7 +224,7 @@ def _read_tiff(path: Path) -> NDArray[Any]:
             raise FileError(path, f"is a TIFF in {name}; save it as grey or RGB")
         if page.samplesperpixel > 4:
             raise FileError(path, f"must be one picture of 1 to 4 channels, got {page.samplesperpixel}")
-        picture = page.asarray()
+        picture = pixels_of_page(path, page)
         if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and picture.ndim == 3:
             picture = np.moveaxis(picture, 0, -1)
         if page.photometric == PHOTOMETRIC.PALETTE:
@@ -189,6 +241,29 @@ def _read_tiff(path: Path) -> NDArray[Any]:
     if has_dimmed_colours and picture.ndim == 3:
         picture = picture[..., :-1]  # its colours are over black already
     return _upright(picture.astype(np.float32) if picture.dtype.kind == "f" else picture, orientation)
+
+
+def pixels_of_page(path: Path, page: Any) -> NDArray[Any]:
+    """
+    The numbers of a TIFF's page, all of which the file holds.
+
+    Parameters
+    ----------
+    path : Path
+    page : tifffile.TiffPage
+        Of the open file; what it lacks would be 0.
+
+    Raises
+    ------
+    FileError
+        When a strip or tile lies outside the file, or none is told.
+    """
+    n_bytes = path.stat().st_size
+    segments = list(zip(page.dataoffsets, page.databytecounts, strict=False))
+    n_expected = 1 if page.is_contiguous else math.prod(page.chunked)
+    if len(segments) < n_expected or any(at <= 0 or n <= 0 or at + n > n_bytes for at, n in segments):
+        raise FileError(path, "is broken or cut short")
+    return np.asarray(page.asarray())
 
 
 def _read_deep_png(path: Path) -> NDArray[Any]:
@@ -212,6 +287,16 @@ def _read_radiance(path: Path) -> NDArray[Any]:
 
 
 def _read_exr(path: Path) -> NDArray[Any]:
+    # OpenEXR prints what it could not read, and may go on without it.
+    return read_apart(_openexr, path, kind="EXR", max_unpacked=_max_unpacked, is_silent=True)[1]
+
+
+def _max_unpacked(n_bytes: int) -> int:
+    return min(MIN_UNPACKED_BYTES + UNPACKED_PER_BYTE * n_bytes, 16 * MAX_PIXELS)
+
+
+def _openexr(path: Path) -> tuple[dict[str, Any], NDArray[np.float32]]:
+    """The picture of an EXR, as the program of its own reads it."""
     try:
         import OpenEXR
     except ImportError:
@@ -219,13 +304,17 @@ def _read_exr(path: Path) -> NDArray[Any]:
     with OpenEXR.File(str(path), header_only=True) as file:
         if len(file.parts) != 1:
             raise FileError(path, f"holds {len(file.parts)} pictures; give a file with one")
-        low, high = file.header()["dataWindow"]
-        _check_size(path, *(int(n) for n in np.asarray(high) - np.asarray(low) + 1))
+        low, high = (np.asarray(corner, dtype=np.int64) for corner in file.header()["dataWindow"])
+        n_x, n_y = (high - low + 1).tolist()
+        _check_size(path, n_x, n_y)
     with OpenEXR.File(str(path)) as file:
         layers = {name: channel.pixels for name, channel in file.channels().items()}
     if len(layers) != 1:
-        raise FileError(path, f"must have the channels of one picture, got {', '.join(layers)}")
-    return np.asarray(next(iter(layers.values())), dtype=np.float32)
+        raise FileError(path, f"must have the channels of one picture, got {', '.join(map(repr, layers)):.200}")
+    picture = np.asarray(next(iter(layers.values())), dtype=np.float32)
+    if picture.shape[:2] != (n_y, n_x):
+        raise FileError(path, f"must have channels of {n_x} x {n_y} pixels, got an array of the shape {picture.shape}")
+    return {}, picture
 
 
 def _upright(picture: NDArray[Any], orientation: object) -> NDArray[Any]:

@@ -19,11 +19,11 @@ import scipy.io
 import tifffile
 
 import foveasim as fs
+from foveasim import apart as reading_apart
 from foveasim import maps
 from foveasim.errors import FileError, ParameterError
-from foveasim.maps import _apart, _dataset, from_xarray, read_power_map, to_xarray, write_power_map
-from foveasim.maps._apart import read_apart
-from foveasim.maps._readers import READERS
+from foveasim.maps import _dataset, from_xarray, read_power_map, to_xarray, write_power_map
+from foveasim.maps._apart import READERS, read_apart
 from foveasim.maps._units import length_in_um, light_unit
 
 h5py = pytest.importorskip("h5py")
@@ -906,10 +906,11 @@ def test_what_is_no_file_of_a_map_is_refused(tmp_path):
 MAX_S, HANGING_S, MAX_BYTES = 20.0, 60.0, 2 * 2**30
 READ = """
 import json, resource, sys
+from foveasim import apart as reading_apart
 from foveasim import maps
 from foveasim.errors import FoveasimError
 from foveasim.maps import read_power_map
-from foveasim.maps._readers import READERS
+from foveasim.maps._apart import READERS
 
 if "here" in sys.argv:
     maps.read_apart = lambda path, kind, name: READERS[kind](path, name)
@@ -1225,6 +1226,17 @@ def test_files_that_are_cut_short_changed_or_noise_end_in_a_map_or_in_one_senten
         assert_harmless(answers[: 2 * N_BROKEN - 1], ERRORS | crashed)
 
 
+def test_strips_that_a_tiff_lacks_are_not_made_up(tmp_path):
+    path = tmp_path / "map.tif"
+    tifffile.imwrite(path, np.ones((40, 30), np.float32), rowsperstrip=5)
+    with tifffile.TiffFile(path) as file:
+        place = file.pages[0].tags["StripByteCounts"].offset
+    content = path.read_bytes()
+    path.write_bytes(content[:place] + struct.pack("<H", 60_000) + content[place + 2 :])
+
+    refused(path, "is broken or cut short", **TOLD)
+
+
 @pytest.mark.usefixtures("apart")
 def test_an_exr_that_is_cut_short_is_refused(whole, tmp_path):
     (tmp_path / "map.exr").write_bytes(whole["exr"][:-20])
@@ -1236,7 +1248,7 @@ def test_an_exr_that_is_cut_short_is_refused(whole, tmp_path):
 @pytest.mark.parametrize(
     ("limit", "value", "message"),
     [
-        ("BASE_BYTES", 2**26 - 3 * 2**28, "reading it as MAT crashed|asks for more memory"),
+        ("BASE_BYTES", 2**26 - 3 * 2**28, "reading it as MAT crashed|asks for more memory|failed to map"),
         ("MAX_CPU_S", 0, "reading it took more than 0 s"),
     ],
 )
@@ -1244,6 +1256,6 @@ def test_a_program_that_is_ended_by_what_it_reads_ends_in_one_sentence(
     whole, tmp_path, monkeypatch, limit, value, message
 ):
     (tmp_path / "map.mat").write_bytes(whole["mat"])
-    monkeypatch.setattr(_apart, limit, value)
+    monkeypatch.setattr(reading_apart, limit, value)
 
     refused(tmp_path / "map.mat", message)

@@ -8,7 +8,9 @@ import subprocess
 import sys
 import zlib
 
+import imagecodecs
 import numpy as np
+import OpenEXR
 import pytest
 import tifffile
 from PIL import Image
@@ -230,6 +232,33 @@ def test_an_exr_is_read_as_it_was_written(tmp_path):
     np.testing.assert_array_equal(read_bytes(tmp_path, content), colour, strict=True)
 
 
+@pytest.fixture
+def here(monkeypatch):
+    """Reads EXR in this program, which takes no second for each file to start another."""
+    monkeypatch.setattr(pictures, "read_apart", lambda reader, path, **_: reader(path))
+
+
+def saved_exr(path, picture, compression, *, is_tiled=False):
+    kind = OpenEXR.tiledimage if is_tiled else OpenEXR.scanlineimage
+    header = {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"), "type": kind}
+    if is_tiled:
+        header["tiles"] = OpenEXR.TileDescription()
+    with OpenEXR.File(header, {"RGB": picture}) as file:
+        file.write(str(path))
+    return path.read_bytes()
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize("is_tiled", [False, True], ids=["lines", "tiles"])
+@pytest.mark.parametrize("compression", ["NO", "RLE", "ZIPS", "ZIP", "PIZ"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float16])
+def test_a_packed_exr_is_read_as_it_was_written(tmp_path, compression, is_tiled, dtype):
+    picture = np.random.default_rng(3).random((90, 70, 3)).astype(dtype)
+    content = saved_exr(tmp_path / "whole.exr", picture, compression, is_tiled=is_tiled)
+    np.testing.assert_array_equal(read_bytes(tmp_path, content), picture.astype(np.float32), strict=True)
+
+
+@pytest.mark.usefixtures("here")
 def test_a_missing_reader_is_named_with_the_command_that_installs_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     assert_is_refused(tmp_path, exr()[0], r"needs a reader for EXR: pip install 'foveasim\[pictures\]'")
@@ -422,6 +451,10 @@ WHOLE = {
     "bmp": encoded(NOISE, "BMP"),
     "gif": encoded(NOISE, "GIF"),
     "ppm": encoded(NOISE, "PPM"),
+    "tiff of jpeg xr": tiff(NOISE, photometric="rgb", compression="jpegxr", rowsperstrip=8),
+    "jpeg 2000": encoded(NOISE, "JPEG2000"),
+    "radiance hdr": imagecodecs.rgbe_encode(NOISE.astype(np.float32)),
+    "exr": exr()[0],
     "16-bit colour png": png(
         width=5, height=40, depth=16, colour_type=2, rows=b"".join(b"\0" + row[:10].tobytes() for row in NOISE)
     ),
@@ -433,6 +466,76 @@ WHOLE = {
 def test_a_picture_cut_short_is_refused(tmp_path, content, share):
     cut = content[: 1 + int(share * (len(content) - 1))]
     assert_is_refused(tmp_path, cut, "is broken or cut short|is not a picture in a format that can be read")
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize("is_tiled", [False, True], ids=["lines", "tiles"])
+@pytest.mark.parametrize("compression", ["NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "DWAA"])
+def test_an_exr_cut_short_is_refused_or_its_reader_prints(tmp_path, capfd, compression, is_tiled):
+    picture = np.random.default_rng(3).random((90, 70, 3)).astype(np.float16)
+    path = tmp_path / "cut.exr"
+    content = saved_exr(path, picture, compression, is_tiled=is_tiled)
+    for size in {*range(1, len(content), len(content) // 50), *range(len(content) - 9, len(content))}:
+        path.write_bytes(content[:size])
+        try:
+            read_picture(path)
+        except FileError:
+            continue
+        assert capfd.readouterr().out, size
+
+
+def test_a_broken_exr_prints_nothing(tmp_path, capfd):
+    assert_is_refused(tmp_path, exr()[0][:-1], r"is broken or cut short$")
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("side", [2**15, 2**31 - 1])
+def test_an_exr_of_giant_tiles_is_refused_before_it_fills_the_memory(tmp_path, side):
+    content = saved_exr(tmp_path / "tiles.exr", NOISE.astype(np.float32), "ZIP", is_tiled=True)
+    place = content.index(b"tiledesc\0") + 13
+    assert_is_refused(tmp_path, content[:place] + struct.pack("<II", side, side) + content[place + 8 :], "is broken")
+
+
+def test_a_bit_flipped_in_the_picture_of_a_png_is_found(tmp_path):
+    content = encoded(NOISE, "PNG")
+    begin = content.index(b"IDAT")
+    for place in range(begin + 4, len(content) - 16, 97):
+        flipped = bytearray(content)
+        flipped[place] ^= 8
+        assert_is_refused(tmp_path, flipped, "is broken or cut short")
+
+
+@pytest.mark.parametrize("kind", ["png", "jpeg", "progressive jpeg", "jpeg 2000", "radiance hdr"])
+def test_a_picture_whose_end_was_never_written_is_refused(tmp_path, kind):
+    content = WHOLE[kind]
+    for share in (0.3, 0.6, 0.9):
+        n = int(share * len(content))
+        assert_is_refused(tmp_path, content[:n] + bytes(len(content) - n), "is broken or cut short")
+
+
+def test_a_jpeg_2000_cut_behind_its_header_is_refused(tmp_path):
+    content = WHOLE["jpeg 2000"]
+    assert_is_refused(tmp_path, content[: content.index(b"\xff\x90")], "is broken or cut short")
+
+
+def test_a_picture_in_the_notes_of_a_jpeg_is_not_its_end(tmp_path):
+    notes = b"Exif\0\0" + encoded(GREY8, "JPEG")
+    content = encoded(NOISE, "JPEG", exif=notes)
+    assert read_bytes(tmp_path, content + b"behind the end").shape == NOISE.shape
+    assert_is_refused(tmp_path, content[:-400] + bytes(400), "is broken or cut short")
+
+
+def without_strips(content, name):
+    """A TIFF whose page does not tell where its strips lie, or how long they are."""
+    with tifffile.TiffFile(io.BytesIO(content)) as file:
+        place = file.pages[0].tags[name].offset
+    return content[:place] + struct.pack("<H", 60_000) + content[place + 2 :]
+
+
+@pytest.mark.parametrize("name", ["StripOffsets", "StripByteCounts"])
+@pytest.mark.parametrize("kind", ["tiff in strips", "deflated tiff"])
+def test_strips_that_a_tiff_lacks_are_not_made_up(tmp_path, kind, name):
+    assert_is_refused(tmp_path, without_strips(WHOLE[kind], name), "is broken or cut short")
 
 
 def giant_tiff():

@@ -1,27 +1,29 @@
-"""Reading through libraries that a broken file can crash, in a program of its own with limits of memory and time."""
+"""Maps through libraries that a broken file can crash: their readers, and what they find in a program of its own."""
 
 from __future__ import annotations
 
-import json
-import os
-import signal
-import subprocess
-import sys
-import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from foveasim.errors import FileError
-from foveasim.maps._common import Found, Refusal, max_unpacked
+from foveasim import apart
+from foveasim.maps import _dataset, _exr, _isetcam
+from foveasim.maps._common import Found, Refusal, as_images, max_unpacked, one_sentence
 
-__all__ = ["read_apart"]
+__all__ = ["READERS", "read_apart"]
 
-#: Memory of the program and its libraries, and how often the numbers are copied on their way.
-BASE_BYTES, COPIES = 2**31, 3
-MAX_CPU_S, BYTES_PER_S = 10, 2**22
-#: On a busy computer the same takes longer.
-PATIENCE = 5
+#: By the kind of file.
+READERS: dict[str, Callable[[Path, str | None], Found]] = {
+    "EXR": _exr.read,
+    "netCDF": _dataset.read_netcdf,
+    "zarr": _dataset.read_zarr,
+    "MAT": _isetcam.read_mat5,
+    "MAT 7.3": _isetcam.read_mat73,
+}
 
 
 def read_apart(path: Path, kind: str, name: str | None) -> Found:
@@ -37,50 +39,24 @@ def read_apart(path: Path, kind: str, name: str | None) -> Found:
 
     Raises
     ------
-    Refusal
+    FileError
         When it is broken, hostile, too large, or no map.
     """
-    n_bytes = path.stat().st_size if path.is_file() else _folder_bytes(path)
-    max_cpu_s = MAX_CPU_S + n_bytes // BYTES_PER_S
-    with tempfile.TemporaryDirectory(prefix="foveasim-") as folder:
-        out, told = Path(folder) / "map.npy", Path(folder) / "told.txt"
-        task = {
-            "path": str(path.resolve()),
-            "kind": kind,
-            "name": name,
-            "out": str(out),
-            "told": str(told),
-            "sys_path": sys.path,
-            "max_cpu_s": max_cpu_s,
-            "max_bytes": BASE_BYTES + COPIES * max_unpacked(n_bytes),
-        }
+    # OpenEXR prints what it could not read, and may go on without it.
+    told, data = apart.read_apart(
+        _read, path, kind, name, kind=kind, max_unpacked=max_unpacked, is_silent=kind == "EXR"
+    )
+    about: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in told.items()}
+    return Found(data=data, **about)
+
+
+def _read(path: Path, kind: str, name: str | None) -> tuple[dict[str, Any], NDArray[Any]]:
+    """What a reader finds, taken apart for its way between the programs."""
+    with one_sentence(path):
         try:
-            done = subprocess.run(  # noqa: S603 -- our own program
-                [sys.executable, "-P", str(Path(__file__).with_name("_isolated.py"))],
-                input=json.dumps(task).encode(),
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                timeout=PATIENCE * max_cpu_s,
-                check=False,
-                # Each thread of a library reserves memory of its own.
-                env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::"},
-            )
-        except subprocess.TimeoutExpired:
-            raise Refusal(f"is broken or hostile: reading it took more than {max_cpu_s} s") from None
-        if done.returncode == -getattr(signal, "SIGXCPU", 0):
-            raise Refusal(f"is broken or hostile: reading it took more than {max_cpu_s} s")
-        if done.returncode != 0 or not done.stdout:
-            raise Refusal(f"is broken or hostile: reading it as {kind} crashed")
-        answer = json.loads(done.stdout)
-        if kind == "EXR" and told.stat().st_size:  # OpenEXR gives pixels that it could not read, and prints so
-            raise Refusal("is broken or cut short")
-        if "refused" in answer:
-            raise Refusal(answer["refused"])
-        if "broken" in answer:
-            raise FileError(path, f"is broken, or no power map ({answer['broken']:.200})")
-        found = {key: tuple(v) if key in ("pitch_um", "origin_um") and v else v for key, v in answer["found"].items()}
-        return Found(**{**found, "data": np.load(out, allow_pickle=False)})
-
-
-def _folder_bytes(path: Path) -> int:
-    return sum((Path(folder) / file).lstat().st_size for folder, _, files in os.walk(path) for file in files)
+            found = READERS[kind](path, name)
+        except ModuleNotFoundError as error:
+            raise Refusal(f"needs {error.name}; install it with: pip install 'foveasim[maps]'") from None
+        told = asdict(replace(found, data=np.empty(0)))
+        del told["data"]
+        return told, as_images(found.data)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from foveasim.fields import PowerMap, to_file_rows
 from foveasim.maps._common import MAX_BANDS, Found, Refusal, check_size
 from foveasim.maps._text import about_map, found_in_text
+from foveasim.pictures import pixels_of_page
 
 __all__ = ["MAGICS", "read", "write"]
 
@@ -64,7 +65,8 @@ def read(path: Path, name: str | None) -> Found:
         check_size((n_pages, *first.shape), first.dtype.itemsize, n_bytes)
         if n_pages > 1 and first.ndim != 2:
             raise Refusal(f"holds {n_pages} pages of the shape {first.shape}, expected one for each band")
-        data = first.asarray()[np.newaxis] if n_pages == 1 else np.stack([page.asarray() for page in pages])
+        images = [pixels_of_page(path, page) for page in pages]
+        data = images[0][np.newaxis] if n_pages == 1 else np.stack(images)
         if first.ndim == 3:
             data = _samples_first(data[0], first, tifffile)
         orientation = first.tags[ORIENTATION_TAG].value if ORIENTATION_TAG in first.tags else ON_TOP
