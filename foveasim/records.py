@@ -42,7 +42,7 @@ def described(value: Any) -> Any:
     if is_dataclass(value):
         return {
             "kind": type(value).__name__,
-            **{f.name: described(getattr(value, f.name)) for f in fields(value) if f.repr},
+            **{f.name: described(getattr(value, f.name)) for f in fields(value) if not f.name.startswith("_")},
         }
     return repr(value)
 

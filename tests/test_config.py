@@ -141,6 +141,7 @@ def test_a_change_replaces_one_setting(shot_file, change, value):
         ("optics.pupil={kind: image, picture: no.png}", r"no\.png: no such file"),
         ("optics.zernike={coefficients: {0: 0.1}}", r"optics\.zernike\.coefficients: has an index that must be >= 1"),
         ("optics.zernike={coefficients: {coma: 0.1}}", r"optics\.zernike\.coefficients"),
+        ("optics.zernike={coefficients: {4: 500}}", r"optics\.aberrations: throw light of 550 nm"),
         ("optics.focus_distance_m=0.001", r"optics\.focus_distance_m: must be larger than the focal length"),
     ],
 )
@@ -200,7 +201,7 @@ def test_light_of_another_program_is_captured_like_a_scene(shot_file, tmp_path, 
     light = np.random.default_rng(4).random((2, 120, 130))
     np.save(tmp_path / "light.npy", light)
     tells = "pitch_um: 1.0, wavelength_nm: [500, 600], unit: w_m2"
-    monkeypatch.chdir("/")
+    monkeypatch.chdir(tmp_path)
 
     shot = read_shot(shot_file, [f"scene={{kind: power_map, path: light.npy, {tells}}}", "integration_order=2"])
 

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from foveasim import distortion
 from foveasim.distortion import (
     BrownConrady,
     Fisheye,
@@ -19,7 +20,7 @@ from foveasim.distortion import (
     read_calibration,
     to_opencv,
 )
-from foveasim.errors import ConfigError, GeometryError, ParameterError
+from foveasim.errors import ConfigError, FileError, GeometryError, ParameterError
 
 cv2 = pytest.importorskip("cv2")
 
@@ -436,3 +437,48 @@ def test_broken_calibrations_are_refused_in_one_sentence(tmp_path, text, message
 def test_lenses_that_cannot_be_are_refused(call, message):
     with pytest.raises(ParameterError, match=message):
         call()
+
+
+def test_a_scaramuzza_lens_has_one_distance_of_its_ideal_plane():
+    """Its rays are round; axes that differ are a stretch."""
+    with pytest.raises(ParameterError, match=r"'focal_um' must be one number, .*'stretch' tells axes apart"):
+        distortion.Scaramuzza(a=[1500.0, 0.0, 0.0, 0.0], pixel_um=2.0, focal_um=(3000.0, 6000.0))
+
+
+def test_longer_lists_of_opencv_are_read_where_the_rest_is_nothing():
+    matrix, k = [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], [-0.1, 0.01, 0.001, 0.002, 0.0, 0.0, 0.0, 0.0]
+    options = {"image_size": (640, 480), "pixel_um": 2.0}
+
+    for n in (12, 14):
+        lens = distortion.from_opencv(matrix, k + [0.0] * (n - 8), **options)
+        assert lens == distortion.from_opencv(matrix, k, **options)
+        with pytest.raises(ParameterError, match="'coefficients' must be 4, 5, 8 numbers"):
+            distortion.from_opencv(matrix, k + [0.0] * (n - 9) + [0.1], **options)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"K": [1, 2, 3], "RadialDistortion": [0.1, 0.2], "ImageSize": [480, 640]}', "must have a matrix of 3 x 3 numbers, got 3"),
+        ('{"K": [[500,0,1],[0,500,1],[0,0,1]], "RadialDistortion": [0.1, 0.2], "ImageSize": [480.5, 640]}', "must be a whole number"),
+        ('{"MappingCoefficients": [700, 0, 0, 0], "DistortionCenter": [320, 240], "ImageSize": [480, 640], "StretchMatrix": [1, 0, 1]}', "must have a matrix of 2 x 2"),
+        ("#polynomial\ninf 1 0 0 0 0\n1\n1 1\n1 0 0\n480 640\n", "is no calib_results.txt"),
+        ("#polynomial\n5 -1500 0 0 0 0\n1 2\n240 320\n1 0 0\ninf 640\n", "must be finite"),
+    ],
+)  # fmt: skip
+def test_calibrations_with_numbers_too_many_or_too_few_are_told_in_one_sentence(tmp_path, text, message):
+    path = tmp_path / "calibration.txt"
+    path.write_text(text)
+
+    with pytest.raises(FileError, match=message) as caught:
+        distortion.read_calibration(path, pixel_um=2.0, focal_um=1000.0)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("image_size", [(640,), 5, (640.5, 480), ("640", "480")])
+def test_sizes_of_images_that_are_none_are_refused(tmp_path, image_size):
+    path = tmp_path / "calibration.yaml"
+    path.write_text("camera_matrix: [500, 0, 320, 0, 500, 240, 0, 0, 1]\ndistortion_coefficients: [0.1, 0, 0, 0]\n")
+
+    with pytest.raises(FileError, match="'image_size"):
+        distortion.read_calibration(path, pixel_um=2.0, image_size=image_size)

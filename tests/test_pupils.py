@@ -412,3 +412,133 @@ def test_a_pupil_that_lets_nothing_through_or_too_much_is_told_when_used(pupil, 
 def test_a_bad_question_about_a_point_is_refused(call, message):
     with pytest.raises(ParameterError, match=f"^{message}"):
         call(lens())
+
+
+def test_a_single_frequency_has_a_single_answer():
+    for optics in (lens(), lens(pupil=Annulus(0.3))):
+        got = optics.mtf(50.0, WAVELENGTH_NM)
+        assert got.shape == ()
+        assert got == pytest.approx(optics.mtf([[50.0]], WAVELENGTH_NM)[0, 0])
+
+
+@pytest.mark.parametrize("obscuration", [0.0, 0.5, 0.9])
+@pytest.mark.parametrize("side", [99.0, 101.0, 300.0])
+def test_far_out_the_rest_of_the_light_falls_as_the_pupil_has_edge(side, obscuration):
+    """Outside a square of side a a clear circle leaves 8 sqrt(2) / (π³ a), and an annulus as much more as it has edge."""
+    edge = (1.0 + obscuration) / (1.0 - obscuration**2)
+    optics = lens(pupil=Annulus(obscuration)) if obscuration else lens()
+    if obscuration and side > 256.0:
+        with pytest.raises(
+            ParameterError, match=r"'side_um' must be <= 256 λN where the pupil is sampled, got 660.0 µm"
+        ):
+            optics.ensquared_energy(side * LAMBDA_N_UM, WAVELENGTH_NM)
+        return
+
+    rest = 1.0 - optics.ensquared_energy(side * LAMBDA_N_UM, WAVELENGTH_NM)
+
+    assert rest == pytest.approx(edge * 8 * np.sqrt(2) / (np.pi**3 * side), rel=0.08)
+
+
+@pytest.mark.parametrize(
+    ("pupil", "edge"),
+    [
+        (clear, 1.0),
+        (Annulus(0.5), 1.5 / 0.75),
+        (Annulus(0.9), 1.9 / 0.19),
+        (Blades(4, angle_deg=22.5), 4 * np.sqrt(2) / 2 / 2),
+    ],
+)
+def test_padding_grows_with_the_edge_of_the_pupil(pupil, edge):
+    aperture = Aperture([pupil], [], 0.0)
+
+    assert aperture.edge(550.0) == pytest.approx(edge, rel=0.05)
+
+
+def test_a_pattern_is_not_shown_beyond_where_it_repeats():
+    with pytest.raises(ParameterError, match=r"'pitch_um' and n_points reach 4506 µm.* more than 512 λN = 1126 µm"):
+        lens(pupil=Annulus(0.3)).psf(WAVELENGTH_NM, pitch_um=LAMBDA_N_UM, n_points=4097)
+
+
+def test_transparency_of_a_picture_of_a_pupil_is_no_light():
+    picture = np.zeros((4, 4, 4), np.uint8)
+    picture[..., :3] = 255
+    picture[:2, :, 3] = 255  # the upper half is opaque
+    x, y = points(4)
+
+    got = PupilImage(picture)(x, y, 550.0)
+
+    assert got.tolist() == [[0.0] * 4] * 2 + [[1.0] * 4] * 2
+
+
+@pytest.mark.parametrize(
+    "picture", [np.exp(1j * np.ones((3, 3))), [["0.5", "1"], ["1", "1"]], [[1, 0], [0]], np.ones((0, 0))]
+)
+def test_pictures_of_pupils_that_are_no_real_numbers_are_refused(picture):
+    with pytest.raises(ParameterError, match=r"^'picture' must be (an array of real numbers|square)"):
+        PupilImage(picture)
+
+
+def test_the_tables_of_a_scene_serve_the_next_frame(monkeypatch):
+    calls = []
+    transfer = Aperture.transfer
+    monkeypatch.setattr(Aperture, "transfer", lambda self, *a: calls.append(a) or transfer(self, *a))
+    optics = lens(pupil=Blades(5), precision="single")
+    scene = point_scene(optics, n=64, wavelength_nm=np.linspace(400.0, 700.0, 7))
+    weights = np.random.default_rng(0).random((3, 7))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SamplingWarning)
+        first = list(optics.weighted_maps(scene, weights))
+        n_first = len(calls)
+        again = list(optics.weighted_maps(scene, weights))
+
+    assert n_first == 7
+    assert len(calls) == 7
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments", "message"),
+    [
+        ("power_map", ("x.png",), "'scene' must be a Scene, got a str"),
+        ("grid", (None,), "'scene' must be a Scene, got a NoneType"),
+        ("patchwork_error", (np.ones((3, 3)),), "'scene' must be a Scene, got a ndarray"),
+        ("weighted_maps", ("scene", np.ones((2, 2))), r"'weights' must have the shape \(n_output, 1\)"),
+        ("weighted_maps", ("scene", [1.0]), "'weights' must have 2 dimensions"),
+        ("mtf", (np.ones(2), np.ones(3)), "'wavelength_nm' must be one number"),
+    ],
+)
+def test_what_is_no_scene_or_weight_is_refused(method, arguments, message):
+    optics = lens(pupil=Annulus(0.2))
+    scene = point_scene(optics, n=64)
+
+    with pytest.raises(ParameterError, match=f"^{message}"):
+        getattr(optics, method)(*(scene if isinstance(a, str) and a == "scene" else a for a in arguments))
+
+
+@pytest.mark.parametrize("pupil", [Annulus, lambda x: x, [Annulus(0.2), None], print])
+def test_what_cannot_be_called_as_a_pupil_is_refused(pupil):
+    if pupil is print:  # takes anything, and gives nothing
+        with pytest.raises(ParameterError, match="'pupil' must give real or complex amplitudes"):
+            lens(pupil=pupil).mtf(1.0, 550.0)
+        return
+    with pytest.raises(ParameterError, match=r"^'pupil' must be a pupil"):
+        lens(pupil=pupil)
+
+
+def test_a_distance_must_be_one_number_and_padding_of_a_size():
+    optics = lens(padding="zero", padding_cells=200_000)
+
+    with pytest.raises(ParameterError, match="'distance_m' must be one number"):
+        optics.strehl(550.0, distance_m=np.ones(3))
+    with pytest.raises(
+        ParameterError, match="'padding_cells' of 200000 makes a picture of 301 cells 400301 cells wide"
+    ):
+        list(optics.weighted_maps(point_scene(optics), [[1.0]]))
+
+
+def test_a_list_of_pupils_is_kept_from_later_changes():
+    pupils = [Annulus(0.2)]
+    optics = lens(pupil=pupils)
+    pupils.append(Slit(0.1))
+
+    assert optics.pupil == (Annulus(0.2),)

@@ -42,14 +42,7 @@ BUNDLED_PICTURE = "skimage:"
 #: Endings of files that hold settings; a layout in any other file is told by its content.
 YAML_ENDINGS = (".yaml", ".yml")
 #: Settings whose value may be the name of a file.
-FILE_SETTINGS = (
-    "scene.picture",
-    "scene.path",
-    "optics.pupil.picture",
-    "layout",
-    "layout.parameters.importance",
-    "layout.parameters.density",
-)
+FILE_SETTINGS = ("density", "importance", "layout", "path", "picture")
 #: A picture's sides may have this relative difference from those of the rectangle that it covers.
 SHAPE_ROUNDING = 1e-6
 
@@ -144,6 +137,7 @@ def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int |
     # What would end the capture is told before it begins, with its place in the file.
     if isinstance(scene, Scene):
         _call(path, "scene", optics.grid, {"scene": scene})
+        _call(path, "optics", optics.check, {"scene": scene})
     _call(path, "scene", sensor.responsivity_e_per_j, {"wavelength_nm": scene.wavelength_nm})
     streams = _call(path, "", Streams, {"seed": settings.seed})
     exposure_s = _call(path, "", check_number, {"name": "exposure_s", "value": settings.exposure_s, "at_least": 0.0})
@@ -323,7 +317,16 @@ def _replace(path: Path, data: dict[str, Any], change: str) -> None:
         place = place.setdefault(name, {})
         if not isinstance(place, dict):
             raise ConfigError(path, f"'{change}' cannot be set: {'.'.join(names[: i + 1])} is no section but {place!r}")
-    new = parsed(path, value)
-    if key.strip() in FILE_SETTINGS and isinstance(new, str) and not new.startswith(BUNDLED_PICTURE):
-        new = str(Path(new).absolute())
+    new = _from_here(names[-1], parsed(path, value))
     place[names[-1]] = new
+
+
+def _from_here(name: str, value: Any) -> Any:
+    """A change with the files that it names made absolute: they are looked for in the current folder."""
+    if isinstance(value, dict):
+        return {key: _from_here(key, item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_from_here(name, item) for item in value]
+    if name not in FILE_SETTINGS or not isinstance(value, str) or value.startswith(BUNDLED_PICTURE):
+        return value
+    return value if name == "layout" and value in shipped_layouts() else str(Path(value).absolute())

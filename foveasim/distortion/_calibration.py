@@ -31,7 +31,7 @@ MATRIX_KEYS = ("cameramatrix", "k", "intrinsicmatrix")
 COEFFICIENT_KEYS = ("distortioncoefficients", "distcoeffs", "d")
 MODEL_KEYS = ("distortionmodel", "cameramodel", "model")
 WIDTH_KEYS, HEIGHT_KEYS = ("imagewidth", "width"), ("imageheight", "height")
-FISHEYE_MODELS = ("fisheye", "equidistant", "kannalabrandt4", "kannala_brandt")
+FISHEYE_MODELS = ("fisheye", "equidistant", "kannala_brandt4", "kannala_brandt", "opencv_fisheye")
 PINHOLE_MODELS = ("plumb_bob", "rational_polynomial", "pinhole", "radtan", "brown_conrady", "opencv")
 
 
@@ -50,7 +50,7 @@ def from_opencv(
     ----------
     camera_matrix : (3, 3), pixels
         ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``.
-    coefficients : (4,), (5,) or (8,)
+    coefficients : (4,), (5,) or (8,), or (12,) or (14,) where the rest is 0
         ``k1, k2, p1, p2[, k3[, k4, k5, k6]]``; with ``fisheye`` the four of ``cv2.fisheye``.
     image_size : (width, height), pixels
         Of the images that were calibrated.
@@ -72,6 +72,8 @@ def from_opencv(
     if matrix.shape != (3, 3) or matrix[0, 1] or matrix[1, 0] or not (matrix[2] == (0.0, 0.0, 1.0)).all():
         raise ParameterError("camera_matrix", "must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", matrix.tolist())
     k = finite_array("coefficients", coefficients).ravel()
+    if not fisheye and k.size in (12, 14) and not k[8:].any():  # no thin prism, no tilt
+        k = k[:8]
     allowed = (4,) if fisheye else (4, 5, 8)
     if k.size not in allowed:
         raise ParameterError("coefficients", f"must be {', '.join(map(str, allowed))} numbers", k.tolist())
@@ -173,13 +175,14 @@ def _from_keys(path: Path, keys: Mapping[str, Any], pixel_um: float, image_size:
         raise ConfigError(path, f"the camera matrix must have 9 numbers, got {matrix.size}")
     coefficients = _numbers(path, _value(path, keys, COEFFICIENT_KEYS, "distortion coefficients")).reshape(-1)
     model = str(next((keys[key] for key in MODEL_KEYS if key in keys), PINHOLE_MODELS[0])).lower()
+    model = re.sub("kannalabrandt", "kannala_brandt", re.sub("[- ]", "_", model))
     if model not in FISHEYE_MODELS + PINHOLE_MODELS:
         raise ConfigError(path, f"the distortion model must be one of {FISHEYE_MODELS + PINHOLE_MODELS}, got '{model}'")
     size: list[Any] = [next((keys[key] for key in names if key in keys), None) for names in (WIDTH_KEYS, HEIGHT_KEYS)]
     if None in size:
         if image_size is None:
             raise ConfigError(path, "tells no image_width and image_height; give 'image_size'")
-        size = list(image_size)
+        size = list(_size(image_size))
     return from_opencv(
         matrix.reshape(3, 3),
         coefficients,
@@ -191,9 +194,9 @@ def _from_keys(path: Path, keys: Mapping[str, Any], pixel_um: float, image_size:
 
 def _from_matlab(path: Path, keys: Mapping[str, Any], pixel_um: float) -> Lens:
     if "k" in keys:
-        matrix = _numbers(path, keys["k"]).reshape(3, 3)
+        matrix = _square(path, keys["k"], 3)
     else:  # MATLAB's older form is transposed
-        matrix = _numbers(path, _value(path, keys, ("intrinsicmatrix",), "an intrinsic matrix")).reshape(3, 3).T
+        matrix = _square(path, _value(path, keys, ("intrinsicmatrix",), "an intrinsic matrix"), 3).T
     radial = _numbers(path, keys["radialdistortion"]).ravel()
     tangential = _numbers(path, keys.get("tangentialdistortion", [0.0, 0.0])).ravel()
     size = _numbers(path, _value(path, keys, ("imagesize",), "an image size")).ravel()
@@ -201,7 +204,7 @@ def _from_matlab(path: Path, keys: Mapping[str, Any], pixel_um: float) -> Lens:
         raise ConfigError(path, "must have 2 or 3 radial and 2 tangential coefficients, and two image sizes")
     matrix = matrix - np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])  # pixels counted from 1
     coefficients = [*radial[:2], *tangential, *radial[2:]]
-    return from_opencv(matrix, coefficients, image_size=(int(size[1]), int(size[0])), pixel_um=pixel_um)
+    return from_opencv(matrix, coefficients, image_size=(size[1], size[0]), pixel_um=pixel_um)
 
 
 def _from_matlab_fisheye(path: Path, keys: Mapping[str, Any], pixel_um: float, focal_um: float | None) -> Lens:
@@ -211,7 +214,7 @@ def _from_matlab_fisheye(path: Path, keys: Mapping[str, Any], pixel_um: float, f
     a = _numbers(path, _value(path, keys, ("mappingcoefficients",), "mapping coefficients")).ravel()
     centre = _numbers(path, _value(path, keys, ("distortioncenter",), "a distortion centre")).ravel() - 1.0
     size = _numbers(path, _value(path, keys, ("imagesize",), "an image size")).ravel()
-    matrix = _numbers(path, keys.get("stretchmatrix", [[1.0, 0.0], [0.0, 1.0]])).reshape(2, 2)
+    matrix = _square(path, keys.get("stretchmatrix", [[1.0, 0.0], [0.0, 1.0]]), 2)
     if centre.size != 2 or size.size != 2:
         raise ConfigError(path, "must have two numbers of the distortion centre and two of the image size")
     return Scaramuzza(
@@ -219,7 +222,7 @@ def _from_matlab_fisheye(path: Path, keys: Mapping[str, Any], pixel_um: float, f
         pixel_um=pixel_um,
         focal_um=_given(path, focal_um),
         stretch=(matrix * np.array([[1.0, -1.0], [-1.0, 1.0]])).tolist(),
-        centre_um=_centre_um((centre[0], centre[1]), (int(size[1]), int(size[0])), pixel_um),
+        centre_um=_centre_um((centre[0], centre[1]), (size[1], size[0]), pixel_um),
     )
 
 
@@ -230,7 +233,7 @@ def _from_ocamcalib(path: Path, text: str, pixel_um: float, focal_um: float | No
         n = int(rows[0][0])
         direct = rows[0][1:]
         centre, affine, size = rows[2][:2], rows[3][:3], rows[4][:2]
-    except (ValueError, IndexError):
+    except (ValueError, IndexError, OverflowError):
         raise ConfigError(
             path, "is no calib_results.txt: five lines of numbers (polynomial, inverse, centre, affine, size)"
         ) from None
@@ -243,7 +246,7 @@ def _from_ocamcalib(path: Path, text: str, pixel_um: float, focal_um: float | No
         pixel_um=pixel_um,
         focal_um=_given(path, focal_um),
         stretch=[[1.0, -e], [-d, c]],
-        centre_um=_centre_um((centre[1], centre[0]), (int(size[1]), int(size[0])), pixel_um),
+        centre_um=_centre_um((centre[1], centre[0]), (size[1], size[0]), pixel_um),
     )
 
 
@@ -268,12 +271,20 @@ def _numbers(path: Path, value: Any) -> Floats:
         raise ConfigError(path, f"must hold finite numbers, got {str(value)[:60]}") from None
 
 
-def _size(image_size: tuple[int, int]) -> tuple[int, int]:
+def _square(path: Path, value: Any, n: int) -> Floats:
+    """A square matrix."""
+    numbers = _numbers(path, value)
+    if numbers.size != n * n:
+        raise ConfigError(path, f"must have a matrix of {n} x {n} numbers, got {numbers.size}")
+    return numbers.reshape(n, n)
+
+
+def _size(image_size: tuple[Any, Any]) -> tuple[int, int]:
     if np.shape(image_size) != (2,):
         raise ParameterError("image_size", "must be two numbers (width, height)", image_size, "pixels")
     return check_count("image_size[0]", image_size[0]), check_count("image_size[1]", image_size[1])
 
 
-def _centre_um(pixel: tuple[float, float], image_size: tuple[int, int], pixel_um: float) -> tuple[float, float]:
+def _centre_um(pixel: tuple[float, float], image_size: tuple[Any, Any], pixel_um: float) -> tuple[float, float]:
     width, height = _size(image_size)
     return (float(pixel[0]) - 0.5 * (width - 1)) * pixel_um, (0.5 * (height - 1) - float(pixel[1])) * pixel_um

@@ -201,8 +201,8 @@ class Scaramuzza(_ByAngle):
         Coefficients with a negative a0 (an axis into the camera) are turned round.
     pixel_um : float, µm
         Side of the pixels in which the coefficients are.
-    focal_um : float or (x, y), µm
-        Distance of the ideal image plane behind the pupil: that of the power map.
+    focal_um : float, µm
+        Distance of the ideal image plane behind the pupil. With another than the optics' own, the picture is scaled too.
     stretch : (2, 2)
         Matrix S of Eq. 8: distorted positions are S times those above, with x to the right and y up.
     centre_um : (x, y), µm
@@ -220,7 +220,7 @@ class Scaramuzza(_ByAngle):
 
     a: Sequence[float]
     pixel_um: float
-    focal_um: float | tuple[float, float]
+    focal_um: float
     stretch: Sequence[Sequence[float]] = ((1.0, 0.0), (0.0, 1.0))
     centre_um: tuple[float, float] = (0.0, 0.0)
 
@@ -234,6 +234,7 @@ class Scaramuzza(_ByAngle):
         object.__setattr__(self, "a", tuple((a * np.sign(a[0])).tolist()))
         object.__setattr__(self, "stretch", tuple(map(tuple, stretch.tolist())))
         object.__setattr__(self, "pixel_um", check_number("pixel_um", self.pixel_um, above=0.0))
+        object.__setattr__(self, "focal_um", check_number("focal_um", self.focal_um, cure="'stretch' tells axes apart"))
         self._check_place()
 
     @cached_property
@@ -243,7 +244,7 @@ class Scaramuzza(_ByAngle):
     @cached_property
     def _depth(self) -> np.polynomial.Polynomial:
         """Depth of the ray against height, both in focal lengths."""
-        unit = self.pixel_um / float(np.max(self.focal_um))
+        unit = self.pixel_um / self.focal_um
         a0, a2, a3, a4 = self.a
         return np.polynomial.Polynomial([a0 * unit, 0.0, a2 / unit, a3 / unit**2, a4 / unit**3])
 

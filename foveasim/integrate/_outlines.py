@@ -13,7 +13,8 @@ from foveasim.rings import next_vertex, positions_in_runs
 
 __all__ = ["CarriedRings", "carried_back"]
 
-#: A carried edge deviates from its chords by at most this share of a cell.
+#: A carried edge deviates from its chords by at most this share of a cell; one that is longer than a step of the grid below, or
+#: needs more than the most pieces, by a few times that.
 CHORD_SHARE = 0.002
 #: How much the lens bends lines is found at so many points along either side of the layout.
 BEND_POINTS = 65

@@ -29,7 +29,7 @@ __all__ = ["Aperture", "Wavefront"]
 MIN_ACROSS = 192
 #: ... and so many for each λN by which aberrations throw the light aside: at that distance the pattern has 1.3 % too little.
 ACROSS_PER_BLUR = 16
-#: More samples than this are refused: the light would be thrown over 250 λN.
+#: More samples than this are refused: the light would be thrown further than 128 λN.
 MAX_ACROSS = 2048
 #: Points across the aperture at which a pupil's shape is looked up, odd so that edges at simple fractions lie between them.
 FINE = 1535
@@ -48,7 +48,7 @@ class Wavefront(Protocol):
 
 def overlaps(n_to: int, to_step: float, n_from: int, from_step: float) -> Any:
     """Shares of the cells of one centred line of cells in the cells of another, a sparse (n_to, n_from) matrix."""
-    from scipy.sparse import diags_array
+    from scipy.sparse import coo_array, diags_array
 
     to_edges = (np.arange(n_to + 1) - 0.5 * n_to) * to_step
     from_edges = (np.arange(n_from + 1) - 0.5 * n_from) * from_step
@@ -57,8 +57,6 @@ def overlaps(n_to: int, to_step: float, n_from: int, from_step: float) -> Any:
     row = np.searchsorted(to_edges, middles) - 1
     column = np.searchsorted(from_edges, middles) - 1
     is_both = (row >= 0) & (row < n_to) & (column >= 0) & (column < n_from)
-    from scipy.sparse import coo_array
-
     shares = coo_array((lengths[is_both], (row[is_both], column[is_both])), shape=(n_to, n_from))
     return diags_array(np.full(n_to, 1.0 / to_step)) @ shares.tocsr()
 
@@ -124,8 +122,8 @@ class Aperture:
             raise ParameterError(name, f"must give amplitudes of at most 1 at {wavelength_nm:g} nm", highest)
         return values
 
-    def _share_and_slope(self, wavelength_nm: float) -> tuple[float, float]:
-        """Share of the power that the shape passes, and its own phase's slope in waves for the aperture's radius."""
+    def _share_slope_edge(self, wavelength_nm: float) -> tuple[float, float, float]:
+        """Share of the power that the shape passes, its own phase's slope in waves a radius, its edge over that of a circle."""
         key = 0.0 if self.is_grey else wavelength_nm
         if key not in self._kept:
             shape = self._shape(wavelength_nm, FINE)
@@ -138,9 +136,12 @@ class Aperture:
                 turn = np.abs(np.angle(a * np.conj(b)))[(a != 0.0) & (b != 0.0)]
                 # A jump is diffraction, no slope: that is what all but a few points keep below.
                 slope += float(np.quantile(turn, 0.99)) / (2.0 * np.pi) * 0.5 * FINE if turn.size else 0.0
-            self._kept[key] = share, slope
-        share, slope = self._kept[key]
-        return share, slope
+            # Steps along both axes cross a line of any direction 4/π times for its length.
+            steps = sum(float(np.sum(np.abs(np.diff(shape, axis=axis)) ** 2)) for axis in (0, 1))
+            edge = 0.25 * np.pi * steps * (2.0 / FINE) / (share * np.pi)
+            self._kept[key] = share, slope, max(0.5 * edge, 1.0)
+        share, slope, edge = self._kept[key]
+        return share, slope, edge
 
     def transmittance(self, wavelength_nm: float) -> float:
         """
@@ -151,7 +152,11 @@ class Aperture:
         ParameterError
             When it is none.
         """
-        return self._share_and_slope(wavelength_nm)[0] if self.pupils else 1.0
+        return self._share_slope_edge(wavelength_nm)[0] if self.pupils else 1.0
+
+    def edge(self, wavelength_nm: float) -> float:
+        """Length of the shape's edge over its area, over that of a clear circle: at least 1."""
+        return self._share_slope_edge(wavelength_nm)[2] if self.pupils else 1.0
 
     def path_um(self, x: Floats, y: Floats, wavelength_nm: float, field_um: tuple[float, float]) -> Floats:
         """The whole wavefront in µm at points of the aperture."""
@@ -162,7 +167,7 @@ class Aperture:
 
     def blur_lambda_n(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
         """How far geometry throws the light from the image point, in units of λN: twice the wavefront's slope in waves."""
-        slope = self._share_and_slope(wavelength_nm)[1] if self.pupils else 0.0
+        slope = self._share_slope_edge(wavelength_nm)[1] if self.pupils else 0.0
         key = wavelength_nm, field_um
         if (self.wavefronts or self.defocus_um) and key not in self._kept:
             at = np.linspace(-1.0, 1.0, SLOPE_POINTS)
@@ -261,6 +266,12 @@ class Aperture:
     ) -> Floats:
         """Share of a point's light in a µm² at the points (y, x) of a rectangle, (n_y, n_x)."""
         reach = 2.0 * max(np.abs(x_um).max(), np.abs(y_um).max()) / lambda_n_um
+        if reach > 0.5 * MAX_ACROSS:
+            raise ParameterError(
+                "pitch_um",
+                f"and n_points reach {0.5 * reach * lambda_n_um:.4g} µm from the image point, more than {MAX_ACROSS // 4} λN = "
+                f"{0.25 * MAX_ACROSS * lambda_n_um:.4g} µm, from where on a sampled pupil's pattern would repeat",
+            )
         n_across = max(self.n_across(wavelength_nm, field_um), min(MAX_ACROSS, math.ceil(4.0 * reach)))
         amplitude, at, power = self.samples(wavelength_nm, n_across, field_um)
         wave_y, wave_x = (np.exp(-1j * np.pi / lambda_n_um * np.outer(u, at)) for u in (y_um, x_um))

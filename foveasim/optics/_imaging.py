@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 
 from foveasim.arrays import Bools, Floats, Images, Ints
@@ -49,6 +50,10 @@ class Imaging:
         Cells of padding on each side, at least.
     f_max_per_um : float
         Highest frequency that passes.
+    blur_cells : float
+        How far geometry throws the light, at most.
+    guard : int
+        Cells around a patch of the field that its light reaches.
     sinc_power : int
         1 for points, 2 for square source pixels.
     real : float32 or float64
@@ -65,6 +70,8 @@ class Imaging:
     padding: str
     pad: int
     f_max_per_um: float
+    blur_cells: float
+    guard: int
     sinc_power: int
     real: type[np.floating[Any]]
     n_threads: int
@@ -79,14 +86,20 @@ class Imaging:
         """Weights of the wavelengths in all the tables that will be asked for."""
         return [self.weights[c] * self.light_w_m2[b] for c, b in np.argwhere(self.is_needed())]
 
-    def transform(self, shape: tuple[int, int], padding: str, pad: int) -> Transform:
-        """Transforms of pictures of a size."""
+    def sources(self) -> tuple[Ints, Ints]:
+        """Rows and columns of the picture that each row and column of the padded one shows, -1 for darkness."""
+        rows, columns = (source_pixels(n, self.padding, self.pad) for n in self.grid.shape)
+        return rows, columns
+
+    def transform(self, rows: Ints, columns: Ints, shape: tuple[int, int]) -> Transform:
+        """Transforms of pictures of a size, padded."""
         return Transform(
             shape=shape,
-            rows=source_pixels(shape[0], padding, pad),
-            columns=source_pixels(shape[1], padding, pad),
+            rows=rows,
+            columns=columns,
             pitch_um=self.grid.pitch_um,
             f_max_per_um=self.f_max_per_um,
+            blur_cells=self.blur_cells,
             sinc_power=self.sinc_power,
             real=self.real,
             n_threads=self.n_threads,
@@ -94,7 +107,7 @@ class Imaging:
 
     def maps(self, table_of: Tables) -> Iterator[NDArray[Any]]:
         """Maps with the same pattern all over the field, each computed when it is asked for."""
-        transform = self.transform(self.grid.shape, self.padding, self.pad)
+        transform = self.transform(*self.sources(), self.grid.shape)
 
         def spectrum(b: int) -> NDArray[Any]:
             return transform.forward(self.basis[b], self.tangent2_x, self.tangent2_y, self.falloff_power)
@@ -123,51 +136,67 @@ class Imaging:
                     del spectra[b]
             yield np.zeros(transform.shape, self.real) if total is None else transform.inverse(total)
 
-    def patch_maps(self, patch: _Patch, table_of: Tables) -> Iterator[NDArray[Any]]:
-        """What a patch gives to every map, with ``pad`` cells around it."""
-        n_y, n_x = patch.source_rows.size, patch.source_columns.size
-        transform = self.transform((n_y + 2 * self.pad, n_x + 2 * self.pad), "zero", 0)
-        window = np.outer(patch.fade_rows, patch.fade_columns).astype(self.real)
-        x2, y2 = self.tangent2_x[patch.source_columns], self.tangent2_y[patch.source_rows]
-        window *= ((1.0 + x2 + y2[:, np.newaxis]) ** (-0.5 * self.falloff_power)).astype(self.real)
-        picture = np.zeros(transform.shape, self.real)
-        middle = (slice(self.pad, self.pad + n_y), slice(self.pad, self.pad + n_x))
-        on_axis = np.zeros(transform.shape[1]), np.zeros(transform.shape[0])
+    def patch_maps(self, rows: _Piece, columns: _Piece, table_of: Tables) -> Iterator[NDArray[Any]]:
+        """What a patch gives to every map, over the cells that its light reaches."""
+        shape = rows.cells.size, columns.cells.size
+        transform = self.transform(np.arange(shape[0]), np.arange(shape[1]), shape)
+        x2, y2 = self.tangent2_x[columns.sources], self.tangent2_y[rows.sources]
+        window = np.outer(rows.fade, columns.fade) * (1.0 + x2 + y2[:, np.newaxis]) ** (-0.5 * self.falloff_power)
+        picture = np.zeros(shape, self.real)
+        lit = picture[rows.lit, columns.lit]
+        on_axis = np.zeros(shape[1]), np.zeros(shape[0])
 
         def spectrum(b: int) -> NDArray[Any]:
-            picture[middle] = self.basis[b][np.ix_(patch.source_rows, patch.source_columns)] * window
+            lit[:] = self.basis[b][np.ix_(rows.sources, columns.sources)] * window
             return transform.forward(picture, *on_axis, self.falloff_power)
 
         return self._maps(transform, spectrum, table_of)
 
 
 @dataclass(frozen=True)
-class _Patch:
-    """A piece of the padded picture: the pixels that it shows, how it fades, where it begins in the picture, its middle."""
+class _Piece:
+    """
+    A patch along one axis.
 
-    source_rows: Ints
-    source_columns: Ints
-    fade_rows: Floats
-    fade_columns: Floats
-    first_row: int
-    first_column: int
-    middle_um: tuple[float, float]
+    Attributes
+    ----------
+    sources, fade : (n_lit,)
+        The picture's pixels that it shows, and how it fades into its neighbours.
+    lit : slice
+        Where they lie among its cells.
+    cells : (n_cell,)
+        Cells of the picture that its light reaches, in order; below 0 or beyond the picture in the padding.
+    """
+
+    sources: Ints
+    fade: Floats
+    lit: slice
+    cells: Ints
 
 
 def patchwork(
     imaging: Imaging, n_patches: tuple[int, int], tables_at: Callable[[tuple[float, float]], Tables]
 ) -> Iterator[NDArray[Any]]:
-    """Maps with patterns that differ over the field; all maps are in memory together."""
+    """
+    Maps with patterns that differ over the field; all maps are in memory together.
+
+    A patch lies on the same endless repetition of the padded picture as the picture does without patches, so that patterns
+    which are alike give the same maps either way, but for light that a point throws beyond the patch's guard.
+    """
     maps = np.zeros((len(imaging.weights), *imaging.grid.shape), imaging.real)
-    n_y, n_x = imaging.grid.shape
-    for patch in _patches(imaging, n_patches):
-        height, width = (n.size + 2 * imaging.pad for n in (patch.source_rows, patch.source_columns))
-        top, left = patch.first_row - imaging.pad, patch.first_column - imaging.pad
-        to = slice(max(top, 0), min(top + height, n_y)), slice(max(left, 0), min(left + width, n_x))
-        if to[0].start >= to[0].stop or to[1].start >= to[1].stop:
-            continue
-        for c, piece in enumerate(imaging.patch_maps(patch, tables_at(patch.middle_um))):
-            maps[c][to] += piece[to[0].start - top : to[0].stop - top, to[1].start - left : to[1].stop - left]
+    node_y_um, node_x_um = _nodes_um(imaging.grid, n_patches)
+    row_sources, column_sources = imaging.sources()
+    all_rows = _pieces(imaging, row_sources, imaging.grid.shape[0], node_y_um)
+    all_columns = _pieces(imaging, column_sources, imaging.grid.shape[1], node_x_um)
+    for y_um, rows in zip(node_y_um, all_rows, strict=True):
+        for x_um, columns in zip(node_x_um, all_columns, strict=True):
+            seen = [
+                (piece.cells >= 0) & (piece.cells < n)
+                for piece, n in zip((rows, columns), imaging.grid.shape, strict=True)
+            ]
+            to = np.ix_(rows.cells[seen[0]], columns.cells[seen[1]])
+            for c, given in enumerate(imaging.patch_maps(rows, columns, tables_at((float(x_um), float(y_um))))):
+                maps[c][to] += given[np.ix_(*seen)]
     yield from maps
 
 
@@ -206,40 +235,30 @@ def _nodes_um(grid: Grid, n_patches: tuple[int, int]) -> tuple[Floats, Floats]:
     return y, x
 
 
-def _patches(imaging: Imaging, n_patches: tuple[int, int]) -> Iterator[_Patch]:
-    node_y_um, node_x_um = _nodes_um(imaging.grid, n_patches)
-    rows = list(_pieces(imaging, imaging.grid.shape[0], node_y_um))
-    columns = list(_pieces(imaging, imaging.grid.shape[1], node_x_um))
-    for y_um, (source_rows, fade_rows, first_row) in zip(node_y_um, rows, strict=True):
-        for x_um, (source_columns, fade_columns, first_column) in zip(node_x_um, columns, strict=True):
-            yield _Patch(
-                source_rows,
-                source_columns,
-                fade_rows,
-                fade_columns,
-                first_row,
-                first_column,
-                (float(x_um), float(y_um)),
-            )
-
-
-def _pieces(imaging: Imaging, n: int, node_um: Floats) -> Iterator[tuple[Ints, Floats, int]]:
-    """Along one axis, for each node: the picture's pixels that its patch shows, their weights, and where the patch begins."""
-    sources = source_pixels(n, imaging.padding, imaging.pad)
+def _pieces(imaging: Imaging, sources: Ints, n: int, node_um: Floats) -> list[_Piece]:
+    """Along one axis, the patch of each node."""
     first = -((sources.size - n) // 2)
     half_um = 0.5 * n * imaging.grid.pitch_um
     at_um = np.clip((first + np.arange(sources.size) + 0.5) * imaging.grid.pitch_um - half_um, -half_um, half_um)
+    pieces = []
     for k in range(node_um.size):
         fade = np.ones(sources.size)
         if node_um.size > 1:
             fade = np.interp(at_um, node_um, np.arange(node_um.size) == k)
-        fade = np.where(sources >= 0, fade, 0.0)
-        used = np.flatnonzero(fade > 0.0)
+        used = np.flatnonzero((fade > 0.0) & (sources >= 0))
         low, high = (int(used[0]), int(used[-1]) + 1) if used.size else (0, 1)
-        yield np.maximum(sources[low:high], 0), fade[low:high], first + low
+        fade = np.where(sources >= 0, fade, 0.0)[low:high]
+        size = int(scipy.fft.next_fast_len(high - low + 2 * imaging.guard, real=True))
+        if size >= sources.size:  # the whole padded picture, which repeats
+            size, begin = sources.size, 0
+        else:
+            begin = low - (size - (high - low)) // 2
+        cells = (begin + np.arange(size)) % sources.size + first
+        pieces.append(_Piece(np.maximum(sources[low:high], 0), fade, slice(low - begin, high - begin), cells))
+    return pieces
 
 
-def reach_cells(share: float, lambda_n_um: float, blur_lambda_n: float, pitch_um: float) -> int:
+def reach_cells(share: float, lambda_n_um: float, blur_lambda_n: float, edge: float, pitch_um: float) -> int:
     """Cells from a point's image that hold all but a share of its light: what diffraction throws aside, and geometry."""
-    # Of a clear circle 2 / (π² r) of the light lies beyond the radius r in λN.
-    return math.ceil((2.0 / math.pi**2 / share + blur_lambda_n) * lambda_n_um / pitch_um)
+    # Of a clear circle 2 / (π² r) of the light lies beyond the radius r in λN; of others more, as they have more edge.
+    return math.ceil((2.0 / math.pi**2 / share * edge + blur_lambda_n) * lambda_n_um / pitch_um)

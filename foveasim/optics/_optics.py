@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import warnings
 from collections.abc import Iterator, Sequence
@@ -27,9 +28,24 @@ __all__ = ["Optics"]
 
 #: Default padding: the radius that holds all but this share of a point's light.
 LOST_SHARE = 0.01
+#: Share of a point's light that a patch of the field may throw to a wrong place.
+PATCH_LOST_SHARE = 0.002
 #: The paper's Eq. 5 asks for an aperture radius much larger than H λ / (p0 min(M, N)): this many times.
 MUCH_LARGER = 10.0
 PADDINGS = ("reflect", "edge", "zero", "periodic")
+
+
+def _is_pupil(pupil: object) -> bool:
+    """Whether something can be called with x, y and a wavelength."""
+    if not callable(pupil) or isinstance(pupil, type):
+        return False
+    try:
+        inspect.signature(pupil).bind(0.0, 0.0, 0.0)
+    except TypeError:
+        return False
+    except ValueError:  # a builtin that does not tell
+        return True
+    return True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,18 +72,19 @@ class Optics(PointImages):
     seidel : Seidel, optional
         Aberrations that grow with the distance from the axis.
     focus_distance_m : float, optional, m
-        Distance at which the lens is focused; by default that of the scene. Other scenes are blurred by defocus.
+        Distance at which the lens is focused, infinity allowed; by default that of the scene. Others are blurred by defocus.
     lateral_colour : LateralColour, optional
-        Image sizes of different colours.
+        Image sizes of different colours. A smaller image leaves the border of a power map dark.
     field_patches : int
-        Where aberrations differ over the field: so many patterns along each side of the picture, linear in between.
+        Where aberrations differ over the field: so many patterns along each side of the picture, linear in between. What a
+        point throws further than its patch reaches, 0.2 % of its light, may come to a wrong place.
     source_pixel : {"point", "square"}
         Whether a picture's pixel shines from its centre (the paper) or evenly from its square.
     padding : {"reflect", "edge", "zero", "periodic"}
         What lies beyond the picture. ``"periodic"`` adds nothing: light that leaves on one side enters on the other,
         so that none is lost.
     padding_cells : int, optional
-        Width of the padding; by default the radius that holds 99 % of a point's light.
+        Width of the padding; by default about the radius that holds 99 % of a point's light.
     precision : {"single", "double"}
         Of the Fourier transforms and the maps.
 
@@ -146,7 +163,9 @@ class Optics(PointImages):
             part = getattr(self, name)
             if part is not None and not isinstance(part, kind):
                 raise ParameterError(name, f"must be a foveasim.optics.{kind.__name__}, got a {type(part).__name__}")
-        if not all(callable(pupil) for pupil in self._pupils()):
+        if isinstance(self.pupil, Sequence):
+            object.__setattr__(self, "pupil", tuple(self.pupil))
+        if not all(_is_pupil(pupil) for pupil in self._pupils()):
             raise ParameterError(
                 "pupil", "must be a pupil of foveasim.optics, or a callable T(x, y, wavelength_nm)", self.pupil
             )
@@ -161,6 +180,8 @@ class Optics(PointImages):
 
     def _check_distance(self, name: str, distance_m: float) -> float:
         focal_m = float(m_from_mm(self.focal_length_mm))
+        if isinstance(distance_m, float) and distance_m == math.inf:
+            return math.inf
         distance_m = check_number(name, distance_m, above=0.0)
         if distance_m <= focal_m:
             raise ParameterError(
@@ -209,6 +230,8 @@ class Optics(PointImages):
 
     def grid(self, scene: SceneLike) -> Grid:
         """The sensor-plane grid on which a scene's pixels are imaged, upright and centred on the axis."""
+        if not hasattr(scene, "spectrum_w_m2_sr_nm"):
+            raise ParameterError("scene", f"must be a Scene, got a {type(scene).__name__}")
         shape = scene.basis.shape
         return Grid.centred((shape[1], shape[2]), scene.pitch_um * self.magnification(scene.distance_m))
 
@@ -230,6 +253,22 @@ class Optics(PointImages):
         n = self.working_f_number(distance_m)
         gain = math.pi / (1.0 + 4.0 * n * n) if self.emission == "lambertian" else 1.0 / (8.0 * n * n)
         return gain * self.transmission
+
+    def check(self, scene: SceneLike) -> None:
+        """
+        Raise what would end a map of a scene, before it begins.
+
+        Raises
+        ------
+        ParameterError
+            When the scene is no scene or too near, the pupil is empty, or aberrations throw light too far.
+        """
+        grid, aperture = self.grid(scene), self._aperture(scene.distance_m)
+        if not self._is_clear_circle(aperture):
+            for wave_nm in scene.wavelength_nm:
+                aperture.transmittance(float(wave_nm))
+                for place_um in self._places_um(grid):
+                    aperture.n_across(float(wave_nm), place_um)
 
     # -- light ----------------------------------------------------------------------------------------------------
 
@@ -253,11 +292,12 @@ class Optics(PointImages):
         ParameterError, SimulationError
             When the scene is too near, or not finite.
         """
+        grid = self.grid(scene)
         n_bands = scene.wavelength_nm.size
         data = np.empty((n_bands, *scene.basis.shape[1:]), self._real_type())
         for band, cells in enumerate(self.weighted_maps(scene, np.eye(n_bands), n_threads=n_threads)):
             data[band] = cells
-        return PowerMap(data, self.grid(scene), scene.wavelength_nm)
+        return PowerMap(data, grid, scene.wavelength_nm)
 
     def weighted_maps(
         self, scene: SceneLike, weights: Floats, *, grid: Grid | None = None, n_threads: int | None = None
@@ -287,10 +327,16 @@ class Optics(PointImages):
         images, the cost is B forward transforms and one inverse transform an output, for any number of wavelengths.
         Lateral colour costs that for each size of image, and aberrations that differ over the field for each patch.
         """
-        weights = np.asarray(weights, dtype=np.float64)
-        self._warn_if_too_small(self._lambda_n_um(scene), self.grid(scene))
+        common = self.grid(scene)
+        weights = finite_array("weights", weights, ndim=2)
+        if weights.shape[1] != scene.wavelength_nm.size:
+            raise ParameterError(
+                "weights",
+                f"must have the shape (n_output, {scene.wavelength_nm.size}), one for each wavelength, got {weights.shape}",
+            )
+        self._warn_if_too_small(self._lambda_n_um(scene), common)
         if grid is not None or self.lateral_colour is None:
-            return self._maps(scene, weights, grid or self.grid(scene), thread_count(n_threads))
+            return self._maps(scene, weights, grid or common, thread_count(n_threads))
         return self._maps_on_one_grid(scene, weights, thread_count(n_threads))
 
     def _maps_on_one_grid(self, scene: SceneLike, weights: Floats, n_threads: int) -> Iterator[NDArray[Any]]:
@@ -325,7 +371,11 @@ class Optics(PointImages):
             falloff_power=4 if self.emission == "lambertian" else 3,
             grid=grid,
             padding=self.padding,
-            pad=self._pad(scene, grid, aperture, lambda_n_um),
+            pad=self._reach(scene, grid, aperture, lambda_n_um, LOST_SHARE)
+            if self.padding_cells is None
+            else self.padding_cells,
+            guard=self._reach(scene, grid, aperture, lambda_n_um, PATCH_LOST_SHARE),
+            blur_cells=self._blur_um(scene, grid, aperture, lambda_n_um) / grid.pitch_um,
             f_max_per_um=1.0 / float(lambda_n_um.min()),
             sinc_power=1 if self.source_pixel == "point" else 2,
             real=self._real_type(),
@@ -335,12 +385,12 @@ class Optics(PointImages):
             return imaging.maps(RadialTables(1.0 / lambda_n_um, self._real_type()))
 
         def tables_at(field_um: tuple[float, float]) -> Tables:
-            key = scene.wavelength_nm.tobytes(), scene.distance_m, field_um
+            light = scene.wavelength_nm.tobytes(), scene.distance_m
 
             def made() -> PlaneTables:
                 return PlaneTables(aperture, scene.wavelength_nm, lambda_n_um, field_um, self._real_type())
 
-            return self._cache.prepared(key, made, imaging.sums())
+            return self._cache.prepared(light, field_um, made, imaging.sums())
 
         if not self._is_varying():
             return imaging.maps(tables_at((0.0, 0.0)))
@@ -363,11 +413,12 @@ class Optics(PointImages):
         share : float
             The largest over the wavelengths and the neighbouring patches; 0 where the pattern is the same everywhere.
         """
+        grid = self.grid(scene)
         if not self._is_varying():
             return 0.0
         aperture, n = self._aperture(scene.distance_m), self.field_patches
         return max(
-            patchwork_error(aperture, self.grid(scene), (n, n), float(wave_nm), float(near_um))
+            patchwork_error(aperture, grid, (n, n), float(wave_nm), float(near_um))
             for wave_nm, near_um in zip(scene.wavelength_nm, self._lambda_n_um(scene), strict=True)
         )
 
@@ -375,8 +426,7 @@ class Optics(PointImages):
         wave_nm = float(wavelengths_nm("wavelength_nm", check_number("wavelength_nm", wavelength_nm))[0])
         if distance_m is None:
             distance_m = float("inf") if self.focus_distance_m is None else self.focus_distance_m
-        if distance_m != float("inf"):
-            distance_m = self._check_distance("distance_m", distance_m)
+        distance_m = self._check_distance("distance_m", distance_m)
         place = finite_array("field_um", field_um, ndim=1)
         if place.size != 2:
             raise ParameterError("field_um", "must be two numbers (x, y)", field_um, "µm")
@@ -413,18 +463,32 @@ class Optics(PointImages):
     def _lambda_n_um(self, scene: SceneLike) -> Floats:
         return np.asarray(um_from_nm(scene.wavelength_nm) * self.working_f_number(scene.distance_m))
 
-    def _pad(self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats) -> int:
-        if self.padding_cells is not None:
-            return self.padding_cells
+    def _places_um(self, grid: Grid) -> list[tuple[float, float]]:
+        """Points of the field where aberrations are strongest."""
         half_x_um, half_y_um = (0.5 * n * grid.pitch_um for n in grid.shape[::-1])
-        places_um = [
-            (0.0, 0.0),
-            *((sx * half_x_um, sy * half_y_um) for sx in (-1, 1) for sy in (-1, 1) if self._is_varying()),
-        ]
+        corners = [(sx * half_x_um, sy * half_y_um) for sx in (-1, 1) for sy in (-1, 1)]
+        return [(0.0, 0.0), *(corners if self._is_varying() else ())]
+
+    def _blur_um(self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats) -> float:
+        """How far geometry throws the light on the sensor, at most."""
         return max(
-            reach_cells(LOST_SHARE, float(near_um), aperture.blur_lambda_n(float(wave_nm), place_um), grid.pitch_um)
+            aperture.blur_lambda_n(float(wave_nm), place_um) * float(near_um)
             for wave_nm, near_um in zip(scene.wavelength_nm, lambda_n_um, strict=True)
-            for place_um in places_um
+            for place_um in self._places_um(grid)
+        )
+
+    def _reach(self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats, share: float) -> int:
+        """Cells from a point's image that hold all but a share of its light."""
+        return max(
+            reach_cells(
+                share,
+                float(near_um),
+                aperture.blur_lambda_n(float(wave_nm), place_um),
+                aperture.edge(float(wave_nm)),
+                grid.pitch_um,
+            )
+            for wave_nm, near_um in zip(scene.wavelength_nm, lambda_n_um, strict=True)
+            for place_um in self._places_um(grid)
         )
 
     def _real_type(self) -> type[np.floating[Any]]:

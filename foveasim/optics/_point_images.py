@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim.arrays import Floats, check_count, check_number, finite_array
+from foveasim.errors import ParameterError
 from foveasim.fields import Grid
 from foveasim.optics._aperture import Aperture
 from foveasim.optics.otf import circular_otf
@@ -25,6 +26,10 @@ PSF_POINTS, PSF_LAMBDA_N = 257, 0.125
 POINT_ACROSS = 384
 #: Nodes of the radial and angular quadratures of a circle's light in squares, at least, and more for each λN of the side.
 QUADRATURE_NODES, NODES_PER_LAMBDA_N = 64, 8
+#: From this side on (λN) the pattern's mean fall tells the rest, to 1e-5.
+FAR_SIDE = 100.0
+#: Circles and squares that a sampled pupil's light is told of (λN): its pattern repeats at eight times this.
+MAX_EXTENT = 256.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -72,10 +77,10 @@ class Point:
             return circular_otf(np.hypot(s_x, s_y)).astype(np.complex128)
         from scipy.ndimage import map_coordinates
 
-        otf, n = self._plane(0.0)
-        at = [s_y * n + n, s_x * n + n]
+        otf, n = self._plane(0.0, "")
+        at = [np.ravel(s_y) * n + n, np.ravel(s_x) * n + n]
         real, imaginary = (map_coordinates(part, at, order=1, mode="constant") for part in (otf.real, otf.imag))
-        return np.asarray(real + 1j * imaginary)
+        return np.asarray(real + 1j * imaginary).reshape(np.shape(s_x))
 
     def in_circles(self, radius_um: Floats) -> Floats:
         """Share of the light within radii."""
@@ -85,7 +90,7 @@ class Point:
         if self.is_clear_circle:
             v = np.pi * radius
             return np.asarray(1.0 - j0(v) ** 2 - j1(v) ** 2)  # Rayleigh; Born and Wolf, section 8.5.2
-        otf, n = self._plane(float(radius.max(initial=0.0)))
+        otf, n = self._plane(float(radius.max(initial=0.0)), "radius_um")
         s = np.arange(-n, n + 1) / n
         frequency = np.maximum(np.hypot(s[:, np.newaxis], s), 1e-9)
         # A disc's transform is R J1(2π R f) / f.
@@ -97,12 +102,16 @@ class Point:
         side = side_um / self.lambda_n_um
         if self.is_clear_circle:
             return np.array([_airy_in_square(float(a)) for a in side.ravel()]).reshape(side.shape)
-        otf, n = self._plane(float(side.max(initial=0.0)))
+        otf, n = self._plane(float(side.max(initial=0.0)), "side_um")
         boxes = side.reshape(-1, 1) * np.sinc(side.reshape(-1, 1) * np.arange(-n, n + 1) / n)
         return np.einsum("ij,jk,ik->i", boxes, otf.real, boxes, optimize=True).reshape(side.shape) / n**2
 
-    def _plane(self, extent: float) -> tuple[NDArray[np.complexfloating], int]:
+    def _plane(self, extent: float, name: str) -> tuple[NDArray[np.complexfloating], int]:
         """Transfer function on a square of frequencies ``k / n``, k from -n to n, and n."""
+        if extent > MAX_EXTENT:
+            raise ParameterError(
+                name, f"must be <= {MAX_EXTENT:.0f} λN where the pupil is sampled", extent * self.lambda_n_um, "µm"
+            )
         # The step makes the pattern repeat: no copy of it may touch what is looked at, up to ``extent`` in λN.
         n = max(POINT_ACROSS, self.aperture.n_across(self.wavelength_nm, self.field_um), int(8.0 * extent))
         return self.aperture.transfer(self.wavelength_nm, n, n, self.field_um, np.float64), n
@@ -110,6 +119,9 @@ class Point:
 
 def _airy_in_square(side: float) -> float:
     """Share of a clear circle's light in a square: the product of their transfer functions, in polar coordinates."""
+    if side > FAR_SIDE:
+        # Far out the pattern falls as 1 / (π³ r³) on the mean; outside the square lies its integral.
+        return 1.0 - 8.0 * math.sqrt(2.0) / (math.pi**3 * side)
     nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_NODES + int(NODES_PER_LAMBDA_N * side))
     s, ds = 0.5 * (nodes + 1.0), 0.5 * weights
     angle, turn = 0.25 * np.pi * 0.5 * (nodes + 1.0), 0.25 * np.pi * 0.5 * weights  # an eighth of the circle

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from foveasim.arrays import Floats, Images, Ints
 from foveasim.compiled import kernels
-from foveasim.errors import SimulationError
+from foveasim.errors import ParameterError, SimulationError
 from foveasim.optics.otf import MAX_ALIASES
 from foveasim.parallel import each
 
@@ -27,10 +27,15 @@ __all__ = ["Transform", "source_pixels"]
 #: Up to so many aliases to a side are added frequency by frequency ...
 DIRECT_ALIASES = 1
 #: ... and more by a smooth function of the frequency, through this many Chebyshev nodes an axis. The transfer function's bend
-#: at its cut-off leaves an error: at most 3e-7 of the brightest cell of a point's image, over 1.6 to 60 λN a cell.
+#: at its cut-off leaves an error: of a clear circle at most 3e-7 of the brightest cell of a point's image, over 1.6 to 60 λN a
+#: cell, and of others 1e-4.
 ALIAS_NODES = 32
+#: Where geometry throws the light over many cells, a transfer function turns as often within the range: so many nodes more.
+NODES_PER_CELL = 4.0
 #: Products of that function that are smaller than this share of the factor at zero frequency are left out.
 ALIAS_ACCURACY = 1e-9
+#: A wider padded picture is a slip: of a lens far too small for its picture, or of a unit.
+MAX_PADDED = 1 << 17
 #: Rows that one thread works on at a time.
 ROWS_PER_PIECE = 64
 #: How numpy calls our paddings; -1 stands for darkness.
@@ -46,6 +51,10 @@ def source_pixels(n: int, padding: str, pad: int) -> Ints:
     """Along one axis of n cells, the picture's cell that each padded cell shows, or -1; the padded size is a fast one."""
     if padding == "periodic":
         return np.arange(n)
+    if n + 2 * pad > MAX_PADDED:
+        raise ParameterError(
+            "padding_cells", f"of {pad} makes a picture of {n} cells {n + 2 * pad} cells wide, more than {MAX_PADDED}"
+        )
     extra = int(scipy.fft.next_fast_len(n + 2 * pad, real=True)) - n
     return np.pad(np.arange(n), (extra // 2, extra - extra // 2), **NUMPY_PADDING[padding])
 
@@ -66,6 +75,7 @@ class Transform:
         columns: Ints,
         pitch_um: float,
         f_max_per_um: float,
+        blur_cells: float,
         sinc_power: int,
         real: type[np.floating[Any]],
         n_threads: int,
@@ -75,6 +85,7 @@ class Transform:
         self._kernels = kernels("optics")  # once, before there are threads
         self._n_alias = min(MAX_ALIASES, max(0, math.ceil(f_max_per_um * pitch_um - 0.5)))
         self._pitch_um, self._sinc_power = pitch_um, sinc_power
+        self._n_plane_nodes = 2 * ALIAS_NODES + math.ceil(NODES_PER_CELL * blur_cells)
         n_near = self._n_alias if self._n_alias <= DIRECT_ALIASES else 0
         k = np.arange(-n_near, n_near + 1)[:, np.newaxis]
         cycles_y = scipy.fft.fftfreq(rows.size) + k
@@ -96,7 +107,7 @@ class Transform:
         if self._n_alias <= DIRECT_ALIASES:
             return np.zeros((0, self._cycles_x.size), table.dtype), np.zeros((0, self._cycles_y.size), table.dtype)
         is_radial = table.ndim == 1
-        n_nodes = ALIAS_NODES if is_radial else 2 * ALIAS_NODES
+        n_nodes = ALIAS_NODES if is_radial else self._n_plane_nodes
         sums = self._kernels.alias_sum if is_radial else self._kernels.alias_sum_plane
         nodes = np.polynomial.chebyshev.chebpts1(n_nodes)
         at_nodes = sums(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -135,7 +136,7 @@ class Zernike:
     {(3, -1): 0.1375}
     """
 
-    coefficients: Mapping[int, float | Sequence[float]]
+    coefficients: Mapping[int, float | Sequence[float]] = field(hash=False)
     index: Literal["noll", "osa"] = "noll"
     unit: Literal["um", "waves"] = "um"
     wavelength_nm: float | Sequence[float] | None = None
@@ -160,7 +161,13 @@ class Zernike:
                     f"coefficients[{j}]", f"must be one number, or one for each of the {n_waves} wavelengths", value
                 )
             clean[int(j)] = float(numbers) if numbers.ndim == 0 else tuple(numbers.tolist())
-        object.__setattr__(self, "coefficients", clean)
+        object.__setattr__(self, "coefficients", MappingProxyType(clean))
+        if waves_nm is not None:
+            is_one = np.ndim(self.wavelength_nm) == 0  # type: ignore[arg-type]
+            object.__setattr__(self, "wavelength_nm", float(waves_nm[0]) if is_one else tuple(waves_nm.tolist()))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _zernike, (dict(self.coefficients), self.index, self.unit, self.wavelength_nm)
 
     def _orders(self, j: int) -> tuple[int, int]:
         try:
@@ -192,6 +199,10 @@ class Zernike:
             if number_um:
                 total_um += number_um * zernike(n, m, x, y)
         return total_um
+
+
+def _zernike(coefficients: Any, index: Any, unit: Any, wavelength_nm: Any) -> Zernike:
+    return Zernike(coefficients=coefficients, index=index, unit=unit, wavelength_nm=wavelength_nm)
 
 
 @dataclass(frozen=True, kw_only=True)

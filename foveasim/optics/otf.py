@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Sequence
 from functools import cached_property
+from threading import Lock
 from typing import Any, Protocol
 
 import numpy as np
@@ -26,6 +27,8 @@ TABLE_POINTS = {np.float32: 1 << 13, np.float64: 1 << 15}
 KEPT_APERTURES = 4
 #: Numbers that the tables of all wavelengths may hold together, 128 MiB; beyond that their steps grow.
 MAX_TABLE_SIZE = 1 << 24
+#: Complex numbers that a lens keeps for the next frames, 512 MiB in single precision.
+MAX_KEPT_SIZE = 1 << 26
 
 
 def circular_otf(s: ArrayLike) -> Floats:
@@ -130,10 +133,15 @@ class PlaneTables:
 
 
 class TableCache:
-    """What a lens made before, up to a size in memory: the frames of a video need the same. It is never pickled."""
+    """
+    What a lens made before, up to a size in memory: the frames of a video need the same. It is never pickled.
+
+    Tables of other light than the present one give way first; what then still does not fit is made anew each time.
+    """
 
     def __init__(self) -> None:
-        self._made: dict[Hashable, PlaneTables] = {}
+        self._lock = Lock()
+        self._made: dict[tuple[Hashable, tuple[float, float]], PlaneTables] = {}
         self._apertures: dict[float, Aperture] = {}
 
     def __reduce__(self) -> tuple[type[TableCache], tuple[()]]:
@@ -141,16 +149,32 @@ class TableCache:
 
     def aperture(self, distance_m: float, made: Callable[[], Aperture]) -> Aperture:
         """The aperture that a scene at a distance sees; the ones used last are kept."""
-        self._apertures[distance_m] = self._apertures.pop(distance_m) if distance_m in self._apertures else made()
-        while len(self._apertures) > KEPT_APERTURES:
-            del self._apertures[next(iter(self._apertures))]
-        return self._apertures[distance_m]
+        with self._lock:
+            aperture = self._apertures.pop(distance_m) if distance_m in self._apertures else made()
+            self._apertures[distance_m] = aperture
+            while len(self._apertures) > KEPT_APERTURES:
+                del self._apertures[next(iter(self._apertures))]
+            return aperture
 
-    def prepared(self, key: Hashable, made: Callable[[], PlaneTables], weights: Sequence[Floats]) -> PlaneTables:
-        """The tables of a key, with those of some weighted sums; the ones used last are kept."""
-        tables = self._made.pop(key, None) or made()
+    def prepared(
+        self,
+        light: Hashable,
+        field_um: tuple[float, float],
+        made: Callable[[], PlaneTables],
+        weights: Sequence[Floats],
+    ) -> PlaneTables:
+        """The tables of a kind of light and a point of the field, with those of some weighted sums."""
+        with self._lock:
+            tables = self._made.get((light, field_um)) or made()
         tables.prepare(weights)
-        self._made[key] = tables
-        while len(self._made) > 1 and sum(t.size for t in self._made.values()) > 2 * MAX_TABLE_SIZE:
-            del self._made[next(iter(self._made))]
+        with self._lock:
+            self._made[light, field_um] = tables
+            for other in [key for key in self._made if key[0] != light]:
+                if self._size() > MAX_KEPT_SIZE:
+                    del self._made[other]
+            if len(self._made) > 1 and self._size() > MAX_KEPT_SIZE:
+                del self._made[light, field_um]
         return tables
+
+    def _size(self) -> int:
+        return sum(tables.size for tables in self._made.values())

@@ -168,7 +168,7 @@ class PupilImage:
     ----------
     picture : path, or (n, n) array, the first row on top
         Transmission, 0 to 1 (of whole numbers up to the type's maximum), over the square around the aperture's circle. The
-        pixels are squares; a colour picture counts by its mean.
+        pixels are squares; a colour picture counts by its mean, times its alpha.
     values : {"amplitude", "power"}
         Whether a value is the share of the amplitude or of the power (its square) that passes.
     wavefront_um : (n, n) array, the first row on top, optional, µm
@@ -189,14 +189,17 @@ class PupilImage:
     def __post_init__(self) -> None:
         check_choice("values", self.values, ("amplitude", "power"))
         is_file = isinstance(self.picture, str | Path)
-        pixels = read_picture(self.picture) if is_file else np.asarray(self.picture)  # type: ignore[arg-type]
+        pixels = read_picture(self.picture) if is_file else as_numbers("picture", self.picture, keep_type=True)  # type: ignore[arg-type]
         peak = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else 1.0
         amplitude = finite_array("picture", pixels, at_least=0.0) / peak
-        if amplitude.ndim not in (2, 3) or amplitude.shape[0] != amplitude.shape[1]:
+        if amplitude.ndim not in (2, 3) or amplitude.shape[0] != amplitude.shape[1] or amplitude.size == 0:
             raise ParameterError("picture", f"must be square, got the shape {amplitude.shape}")
-        if amplitude.max(initial=0.0) > 1.0:
+        if amplitude.max() > 1.0:
             raise ParameterError("picture", "must be from 0 to 1", float(amplitude.max()))
-        amplitude = from_file_rows(amplitude).mean(axis=0)
+        channels = from_file_rows(amplitude)
+        # What is transparent in a picture is no light, as in a scene.
+        alpha = channels[-1] if channels.shape[0] in (2, 4) else 1.0
+        amplitude = (channels[:-1] if channels.shape[0] in (2, 4) else channels).mean(axis=0) * alpha
         if self.values == "power":
             amplitude = np.sqrt(amplitude)
         object.__setattr__(self, "picture", read_only(np.ascontiguousarray(amplitude[::-1])))
