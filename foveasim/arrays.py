@@ -48,6 +48,7 @@ MIN_WAVELENGTH_NM, MAX_WAVELENGTH_NM = 10.0, 1e6
 
 #: Suffixes of names, longest first, and the unit that each stands for in messages.
 UNIT_SUFFIXES = {
+    "_fraction": "",
     "_w_m2_sr_nm": "W/(m² sr nm)",
     "_w_m2_sr": "W/(m² sr)",
     "_e_per_s": "e-/s",
@@ -201,19 +202,22 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> str:
     return value
 
 
-def as_numbers(name: str, value: ArrayLike) -> Floats:
+def as_numbers(name: str, value: ArrayLike, *, keep_type: bool = False) -> NDArray[Any]:
     """
-    The value as a float64 array, whatever its numbers.
+    The value as an array of real numbers: float64, or as it is.
 
     Raises
     ------
     ParameterError
-        When it is ragged, or not numeric.
+        When it is ragged, or has other than real numbers.
     """
     try:
-        return np.asarray(value, dtype=np.float64)
+        array = np.asarray(value)
+        if array.dtype.kind in "cSUmM":
+            raise TypeError
+        return array if keep_type and array.dtype.kind in "biuf" else np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ParameterError(name, "must be an array of numbers", value) from None
+        raise ParameterError(name, "must be an array of real numbers", value) from None
 
 
 def finite_array(

@@ -193,8 +193,8 @@ class Camera:
         photo_e_per_s = self._photoelectrons_per_s(light, clock)
         with clock.stage("sensor"):
             expected_e = sensor.expected_electrons(photo_e_per_s, exposure_s)
-            electrons = sensor.collect(expected_e, streams=streams)
-            code = sensor.read(electrons, streams=streams)
+            electrons = sensor.collect(expected_e, streams=streams, n_threads=self._n_threads)
+            code = sensor.read(electrons, streams=streams, n_threads=self._n_threads)
         return Capture(
             layout=self._layout,
             code=code,

@@ -9,7 +9,13 @@ import numpy as np
 
 from foveasim.arrays import check_count
 
-__all__ = ["Streams"]
+__all__ = ["Streams", "device_key"]
+
+
+def device_key(seed: int, effect: str) -> tuple[np.uint64, np.uint64]:
+    """Key of a counter-based generator for what is fixed in a device: an effect's numbers, of the device's seed."""
+    words = np.random.SeedSequence(seed, spawn_key=(crc32(effect.encode()),)).generate_state(2, np.uint64)
+    return words[0], words[1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +48,7 @@ class Streams:
         object.__setattr__(self, "seed", check_count("seed", self.seed, at_least=0))
         object.__setattr__(self, "frame", check_count("frame", self.frame, at_least=0))
 
-    def of(self, effect: str) -> np.random.Generator:
-        """A fresh generator of the effect's stream, at its beginning."""
-        key = (self.frame, crc32(effect.encode()))
+    def of(self, effect: str, block: int | None = None) -> np.random.Generator:
+        """A fresh generator of the effect's stream, at its beginning; of one of its blocks, where it has several."""
+        key = (self.frame, crc32(effect.encode())) if block is None else (self.frame, crc32(effect.encode()), block)
         return np.random.Generator(np.random.PCG64DXSM(np.random.SeedSequence(self.seed, spawn_key=key)))

@@ -2,27 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foveasim.arrays import Floats, Ints, check_choice, check_count, check_number, finite_array, read_only
+from foveasim.compiled import kernels
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.fields import PackedRings
-from foveasim.sensor.noise import LARGEST_CHARGE_E, ShotNoise, draw_shot_noise
+from foveasim.sensor.converter import Companding, Converter
+from foveasim.sensor.device import Device
+from foveasim.sensor.noise import LARGEST_CHARGE_E, ShotNoise, draw_shot_noise, in_blocks
 from foveasim.sensor.spectral import ConstantCurve, Curve, FilterSet, rgb_filters
 from foveasim.streams import Streams
-from foveasim.units import electrons_to_volts, photon_energy_j
+from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C, electrons_to_volts, photon_energy_j
 
 __all__ = ["PerSite", "Photosites", "Sensor"]
 
 #: Capacitances outside this range are a slip of units.
 MIN_CAPACITANCE_F, MAX_CAPACITANCE_F = 1e-18, 1e-6
-#: A charge this share of a code below a code's border is on it: the rounding of a division.
-CODE_ROUNDING = 1e-9
+#: Means that are drawn by Poisson's law one electron after the other: more take too long.
+MOST_INVERTED_E = 700.0
+NO_SITES = read_only(np.zeros(0, np.int64))
+#: Per-site values, and whether they must be above 0.
+_PER_SITE = {"dark_e_per_s": None, "full_well_e": 0.0, "read_noise_e": None, "capacitance_f": 0.0}
+#: Shares that lie between 0 and 1, and standard deviations as shares.
+_SHARES = ("hot_fraction", "dead_fraction", "rts_fraction", "nonlinearity_fraction")
+_SPREADS = ("prnu_fraction", "dsnu_fraction", "pixel_fpn_fraction", "line_fpn_fraction", "gain_fpn_fraction")
 
 #: One value for all sites, or an array (n_site,).
 PerSite = float | NDArray[np.float64]
@@ -40,6 +50,10 @@ class Photosites(PackedRings, Protocol):
         """Index of each site's colour filter, (n_site,)."""
 
     @property
+    def readout_line(self) -> Ints:
+        """Line that each site is read through, (n_site,)."""
+
+    @property
     def columns(self) -> Mapping[str, NDArray[Any]]:
         """Data per site by name; ``channel`` is among them where sites differ in colour."""
 
@@ -49,56 +63,104 @@ class Sensor:
     """
     Photosites with their electronics.
 
-    The order of effects: expected photons x quantum efficiency x filter, + dark charge, **one** Poisson draw, full
-    well, + read noise, volts (q/C), clip to 0 .. V_sat, ADC. The defaults are a perfect sensor: every photon an
-    electron, no noise but the shot noise of light.
+    The order of effects: expected photons x quantum efficiency x filter x PRNU, + dark charge, charge diffusion, **one**
+    Poisson draw, full well, + kTC noise, read noise and telegraph noise, volts (q/C) with gain FPN and non-linearity,
+    + offset FPN of pixel and line, clip to 0 .. V_sat, converter with its non-linearities. The defaults are a perfect sensor:
+    every photon an electron, no noise but the shot noise of light.
 
     Parameters
     ----------
     layout : Layout
-        The photosites; their ``channel`` chooses the filter.
+        The photosites; their ``channel`` chooses the filter, and their ``readout_line`` the line of the converter.
     qe : float or curve
         Quantum efficiency, electrons per photon: a number, or a function of the wavelength in nm, such as
         :class:`SiliconQE` or :class:`PolynomialCurve`.
     filters : None, "rgb", or FilterSet
         Colour filters; None for a sensor without, whatever the layout's channels, "rgb" for :func:`rgb_filters`.
+    prnu_fraction : float
+        Photo-response non-uniformity: standard deviation of the sites' response over its mean.
     dark_e_per_s : float or (n_site,), e-/s
-        Dark current.
-    full_well_e : float or (n_site,), optional, e-
-        Charge that a site can hold; None for no limit but V_sat.
-    read_noise_e : float or (n_site,), e-
-        Standard deviation of the Gaussian noise of reading.
-    capacitance_f : float or (n_site,), F
-        Capacitance that the charge is read on: 1e-13 F in the paper's foveal run.
-    v_sat_v : float, V
-        Voltage that gives the highest code; nothing above it is seen.
-    bits : int
-        Of the linear analogue-to-digital converter, 1 to 16.
+        Dark current at ``dark_reference_k``.
+    temperature_k, dark_reference_k, dark_doubling_k : float, K
+        Temperature of the sensor, the one that the dark current is of, and the rise that doubles it.
+    dsnu_fraction : float
+        Dark-signal non-uniformity: standard deviation of the sites' dark current over its mean.
+    hot_fraction, hot_e_per_s : float
+        Share of the sites that have this much more dark current (e-/s, at ``dark_reference_k``).
+    dead_fraction : float
+        Share of the sites that collect no light.
     shot_noise : {"auto", "exact", "off"}
         See :func:`foveasim.sensor.draw_shot_noise`.
     gaussian_above_e : float, e-
         Expectation above which ``"auto"`` takes the Gaussian for the Poisson law.
+    full_well_e : float or (n_site,), optional, e-
+        Charge that a site can hold; None for no limit but V_sat.
+    ktc_noise : bool
+        Whether resetting leaves the noise ``sqrt(k T C)`` on the charge.
+    cds : bool
+        Correlated double sampling: the level after the reset is subtracted, which takes off kTC noise and the pixels' offset
+        FPN. ``read_noise_e`` is what remains.
+    read_noise_e : float or (n_site,), e-
+        Standard deviation of the Gaussian noise of reading.
+    rts_fraction, rts_e : float
+        Random telegraph noise: share of the sites that are in either of two states, so many e- apart, by chance in each frame.
+    capacitance_f : float or (n_site,), F
+        Capacitance that the charge is read on: 1e-13 F in the paper's foveal run.
+    gain_fpn_fraction : float
+        Standard deviation of the sites' volts per charge over its mean.
+    nonlinearity_fraction : float
+        Share of the voltage that the response lacks at V_sat, growing with the square of the voltage.
+    pixel_fpn_fraction, line_fpn_fraction : float
+        Standard deviation of the offsets of pixels, and of readout lines, over V_sat (the paper: 0.02).
+    v_sat_v : float, V
+        Voltage that gives the highest code; nothing above it is seen.
+    bits, companding, log_strength, companding_table, inl_dn, dnl_dn
+        Of the converter: see :class:`foveasim.sensor.Converter`.
+    device_seed : int
+        Which of all devices of this kind it is: seed of everything that is fixed from its making on.
 
     Raises
     ------
     ParameterError
         When a value is out of range, or an array does not have one value a site.
     SimulationError
-        When the layout's channels need more filters than there are.
+        When the layout's channels need more filters than there are, or lines are told apart that the layout has not.
     """
 
     layout: Photosites
     _: KW_ONLY
     qe: float | Curve = 1.0
     filters: FilterSet | Literal["rgb"] | None = None
+    prnu_fraction: float = 0.0
     dark_e_per_s: PerSite = 0.0
-    full_well_e: PerSite | None = None
-    read_noise_e: PerSite = 0.0
-    capacitance_f: PerSite = 1e-13
-    v_sat_v: float = 3.0
-    bits: int = 8
+    temperature_k: float = 300.0
+    dark_reference_k: float = 300.0
+    dark_doubling_k: float = 8.0
+    dsnu_fraction: float = 0.0
+    hot_fraction: float = 0.0
+    hot_e_per_s: float = 0.0
+    dead_fraction: float = 0.0
     shot_noise: ShotNoise = "auto"
     gaussian_above_e: float = 100.0
+    full_well_e: PerSite | None = None
+    ktc_noise: bool = False
+    cds: bool = False
+    read_noise_e: PerSite = 0.0
+    rts_fraction: float = 0.0
+    rts_e: float = 0.0
+    capacitance_f: PerSite = 1e-13
+    gain_fpn_fraction: float = 0.0
+    nonlinearity_fraction: float = 0.0
+    pixel_fpn_fraction: float = 0.0
+    line_fpn_fraction: float = 0.0
+    v_sat_v: float = 3.0
+    bits: int = 8
+    companding: Companding = "linear"
+    log_strength: float = 100.0
+    companding_table: Sequence[float] | None = None
+    inl_dn: Sequence[float] = ()
+    dnl_dn: float = 0.0
+    device_seed: int = 0
 
     def __post_init__(self) -> None:
         if not all(hasattr(self.layout, name) for name in ("n_sites", "channel", "columns")):
@@ -108,12 +170,7 @@ class Sensor:
         is_rgb = isinstance(self.filters, str) and self.filters == "rgb"
         if self.filters is not None and not is_rgb and not isinstance(self.filters, FilterSet):
             raise ParameterError("filters", "must be None, 'rgb' or a FilterSet", self.filters)
-        for name, above in (
-            ("dark_e_per_s", None),
-            ("full_well_e", 0.0),
-            ("read_noise_e", None),
-            ("capacitance_f", 0.0),
-        ):
+        for name, above in _PER_SITE.items():
             value = getattr(self, name)
             if value is not None or name != "full_well_e":
                 object.__setattr__(self, name, self._per_site(name, value, above))
@@ -128,12 +185,32 @@ class Sensor:
                 "F",
                 "capacitances are in farad: 1 fF is 1e-15",
             )
-        object.__setattr__(self, "v_sat_v", check_number("v_sat_v", self.v_sat_v, above=0.0))
-        object.__setattr__(self, "bits", check_count("bits", self.bits, at_least=1, at_most=16))
+        numbers: dict[str, float] = {
+            **{name: check_number(name, getattr(self, name), at_least=0.0, at_most=1.0) for name in _SHARES},
+            **{name: check_number(name, getattr(self, name), at_least=0.0) for name in _SPREADS},
+            **{name: check_number(name, getattr(self, name), at_least=0.0) for name in ("hot_e_per_s", "rts_e")},
+            **{
+                name: check_number(name, getattr(self, name), above=0.0, at_most=1000.0)
+                for name in ("temperature_k", "dark_reference_k", "dark_doubling_k")
+            },
+            "v_sat_v": check_number("v_sat_v", self.v_sat_v, above=0.0),
+            "gaussian_above_e": check_number(
+                "gaussian_above_e", self.gaussian_above_e, at_least=10.0, at_most=MOST_INVERTED_E
+            ),
+            "device_seed": check_count("device_seed", self.device_seed, at_least=0),
+        }
+        for name, number in numbers.items():
+            object.__setattr__(self, name, number)
+        for name in ("ktc_noise", "cds"):
+            if not isinstance(getattr(self, name), bool):
+                raise ParameterError(name, "must be true or false", getattr(self, name))
         check_choice("shot_noise", self.shot_noise, ("auto", "exact", "off"))
-        object.__setattr__(
-            self, "gaussian_above_e", check_number("gaussian_above_e", self.gaussian_above_e, at_least=10.0)
-        )
+        object.__setattr__(self, "bits", self.converter.bits)
+        if (self.line_fpn_fraction or self.dnl_dn) and "readout_line" not in self.layout.columns:
+            raise SimulationError(
+                "lines of readout differ, but the layout does not say which site is on which; give it a column 'readout_line', "
+                "for example with foveasim.layout.readout_by or nearest_bus"
+            )
         if self.filters is None:
             return
         if self.n_filters > 1 and "channel" not in self.layout.columns:
@@ -208,6 +285,81 @@ class Sensor:
             raise ParameterError("qe", "and the filters must give values from 0 to 1 at every wavelength", curves)
         return curves / photon_energy_j(wavelength_nm)
 
+    # -- what differs from site to site ------------------------------------------------------------------------------
+
+    @cached_property
+    def converter(self) -> Converter:
+        """The analogue-to-digital converter."""
+        return Converter(
+            bits=self.bits,
+            companding=self.companding,
+            log_strength=self.log_strength,
+            companding_table=self.companding_table,
+            inl_dn=self.inl_dn,
+            dnl_dn=self.dnl_dn,
+        )
+
+    @cached_property
+    def device(self) -> Device:
+        """What is fixed from the device's making on."""
+        return Device(self.device_seed, self.layout)
+
+    @cached_property
+    def response(self) -> Floats:
+        """Relative response of every site to light, (n_site,) or (1,): PRNU and dead sites."""
+        gain = np.ones(1)
+        if self.prnu_fraction:
+            gain = np.maximum(1.0 + self.prnu_fraction * self.device.normals("prnu"), 0.0)
+        if self.dead_fraction:
+            gain = np.where(self.device.uniforms("dead") < self.dead_fraction, 0.0, gain)
+        return read_only(gain)
+
+    @cached_property
+    def dark_rate_e_per_s(self) -> Floats:
+        """Dark current of every site at the sensor's temperature, (n_site,) or (1,) e-/s: DSNU and hot sites."""
+        rate = np.atleast_1d(np.asarray(self.dark_e_per_s, np.float64)).copy()
+        if self.dsnu_fraction:
+            rate = rate * np.maximum(1.0 + self.dsnu_fraction * self.device.normals("dsnu"), 0.0)
+        if self.hot_fraction:
+            rate = rate + self.hot_e_per_s * (self.device.uniforms("hot") < self.hot_fraction)
+        return read_only(rate * 2.0 ** ((self.temperature_k - self.dark_reference_k) / self.dark_doubling_k))
+
+    @cached_property
+    def ktc_noise_e(self) -> Floats:
+        """Standard deviation of the noise of resetting, ``sqrt(k T C) / q``, (n_site,) or (1,) e-; 0 where it is off."""
+        if not self.ktc_noise or self.cds:
+            return read_only(np.zeros(1))
+        capacitance_f = np.atleast_1d(np.asarray(self.capacitance_f, np.float64))
+        return read_only(np.sqrt(BOLTZMANN_J_PER_K * self.temperature_k * capacitance_f) / ELEMENTARY_CHARGE_C)
+
+    @cached_property
+    def gain(self) -> Floats:
+        """Relative volts per charge of every site, (n_site,) or (1,)."""
+        if not self.gain_fpn_fraction:
+            return read_only(np.ones(1))
+        return read_only(np.maximum(1.0 + self.gain_fpn_fraction * self.device.normals("gain"), 0.0))
+
+    @cached_property
+    def pixel_offset_v(self) -> Floats:
+        """Offset of every site, (n_site,) or (1,) V."""
+        if not self.pixel_fpn_fraction or self.cds:
+            return read_only(np.zeros(1))
+        return read_only(self.v_sat_v * self.pixel_fpn_fraction * self.device.normals("pixel offset"))
+
+    @cached_property
+    def line_offset_v(self) -> Floats:
+        """Offset of every readout line by its number, (n_line,) or (1,) V."""
+        if not self.line_fpn_fraction:
+            return read_only(np.zeros(1))
+        lines = np.arange(int(self.layout.readout_line.max(initial=0)) + 1)
+        offset_v = self.v_sat_v * self.line_fpn_fraction * self.device.line_normals("line offset", lines)
+        return read_only(np.resize(offset_v, max(lines.size, 2)))
+
+    @cached_property
+    def telegraph_sites(self) -> Ints:
+        """Sites with random telegraph noise."""
+        return np.flatnonzero(self.device.uniforms("telegraph") < self.rts_fraction) if self.rts_fraction else NO_SITES
+
     # -- charge and code ------------------------------------------------------------------------------------------
 
     def expected_electrons(self, photo_e_per_s: Floats, exposure_s: float) -> Floats:
@@ -220,26 +372,71 @@ class Sensor:
             When the exposure is negative.
         """
         exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
-        return (photo_e_per_s + self.dark_e_per_s) * exposure_s
+        return (photo_e_per_s * self.response + self.dark_rate_e_per_s) * exposure_s
 
-    def collect(self, expected_e: Floats, *, streams: Streams) -> Ints:
+    def collect(self, expected_e: Floats, *, streams: Streams, n_threads: int | None = None) -> Ints:
         """Charge that a draw gives, (n_site,) int64 e-: shot noise, then the full well."""
-        electrons = draw_shot_noise(expected_e, self.shot_noise, self.gaussian_above_e, streams)
-        if self.full_well_e is None:
-            return electrons
-        return np.minimum(electrons, np.floor(np.minimum(self.full_well_e, LARGEST_CHARGE_E)).astype(np.int64))
+        electrons = draw_shot_noise(expected_e, self.shot_noise, self.gaussian_above_e, streams, n_threads=n_threads)
+        if self.full_well_e is not None:
+            well_e = np.floor(np.minimum(self.full_well_e, LARGEST_CHARGE_E)).astype(np.int64)
+            np.minimum(electrons, well_e, out=electrons)
+        return electrons
 
-    def read(self, electrons: Ints, *, streams: Streams) -> NDArray[Any]:
+    def read(self, electrons: Ints, *, streams: Streams, n_threads: int | None = None) -> NDArray[Any]:
         """
         Digital code of every charge, (n_site,) uint8 or uint16.
 
-        Read noise, volts, the clip at V_sat and the converter: code ``k`` stands for the voltages from
-        ``k * V_sat / 2**bits`` to the next, and both 0 and ``2**bits - 1`` are reached.
+        Noise of resetting and reading, volts, offsets, the clip at V_sat and the converter: without companding and faults
+        code ``k`` stands for the voltages from ``k * V_sat / 2**bits`` to the next.
         """
-        charge_e = electrons.astype(np.float64)
-        if np.any(np.asarray(self.read_noise_e) > 0.0):
-            charge_e += self.read_noise_e * streams.of("read").standard_normal(charge_e.size)
-        voltage_v = np.clip(electrons_to_volts(charge_e, self.capacitance_f), 0.0, self.v_sat_v)
-        n_codes = 2**self.bits
-        code = np.minimum(np.floor(voltage_v * (n_codes / self.v_sat_v) + CODE_ROUNDING), n_codes - 1)
-        return code.astype(np.uint8 if self.bits <= 8 else np.uint16)
+        convert = self.converter
+        code = np.empty(electrons.size, np.uint8 if self.bits <= 8 else np.uint16)
+        noises_e = {"reset": self.ktc_noise_e, "read": np.atleast_1d(np.asarray(self.read_noise_e, np.float64))}
+        noises_e = {effect: sigma_e for effect, sigma_e in noises_e.items() if sigma_e.any()}
+        v_per_e = np.atleast_1d(electrons_to_volts(1.0, self.capacitance_f))
+        line = np.ascontiguousarray(self.layout.readout_line)
+        telegraph_e = self._telegraph_e(streams)
+        read_out = kernels("sensor").read_out
+        dnl_key = self.device.key("dnl")[0] & np.uint64(0xFFFFFFFF)
+
+        def part(values: Floats, sites: slice) -> Floats:
+            return values[sites] if values.size > 1 else values
+
+        def block(number: int, sites: slice) -> None:
+            charge_e = electrons[sites].astype(np.float64)
+            for effect, sigma_e in noises_e.items():
+                noise = streams.of(effect, number).standard_normal(charge_e.size)
+                noise *= part(sigma_e, sites)
+                charge_e += noise
+            if telegraph_e is not None:
+                charge_e += telegraph_e[sites]
+            read_out(
+                charge_e,
+                part(v_per_e, sites),
+                part(self.pixel_offset_v, sites),
+                self.line_offset_v,
+                part(self.gain, sites),
+                line[sites],
+                self.v_sat_v,
+                self.nonlinearity_fraction,
+                convert.way,
+                convert.log_strength,
+                convert.curve,
+                convert.n_codes,
+                convert.inl,
+                convert.dnl_dn,
+                dnl_key,
+                convert.quantiles,
+                code[sites],
+            )
+
+        in_blocks(electrons.size, block, n_threads)
+        return code
+
+    def _telegraph_e(self, streams: Streams) -> Floats | None:
+        sites = self.telegraph_sites
+        if sites.size == 0 or not self.rts_e:
+            return None
+        charge_e = np.zeros(self.layout.n_sites)
+        charge_e[sites] = self.rts_e * (streams.of("telegraph").random(sites.size) - 0.5 > 0.0) - 0.5 * self.rts_e
+        return charge_e

@@ -1,27 +1,42 @@
-"""Shot noise: one Poisson draw on the expected electrons."""
+"""Temporal noise: one Poisson draw on the expected electrons, and Gaussian numbers, in blocks of sites."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
 
 from foveasim.arrays import Floats, Ints
+from foveasim.compiled import kernels
+from foveasim.parallel import each, thread_count
 from foveasim.streams import Streams
 
-__all__ = ["LARGEST_CHARGE_E", "ShotNoise", "draw_shot_noise"]
+__all__ = ["BLOCK_SITES", "ShotNoise", "draw_shot_noise", "in_blocks"]
 
 ShotNoise = Literal["auto", "exact", "off"]
 
-#: Variance that rounding to whole electrons adds; taken off the Gaussian's, so that the sum is Poisson's.
-ROUNDING_VARIANCE = 1.0 / 12.0
+#: Sites that draw from one stream of an effect, one after the other; fixed, so that draws do not depend on the threads.
+BLOCK_SITES = 1 << 16
 #: Expectations beyond this are beyond numpy's Poisson generator; the Gaussian is exact to 1e-9 long before.
 LARGEST_EXACT_E = 1e18
 #: No charge is larger: 2**62 fits int64 with room for sums.
 LARGEST_CHARGE_E = 2.0**62
 
 
-def draw_shot_noise(expected_e: Floats, how: ShotNoise, gaussian_above_e: float, streams: Streams) -> Ints:
+def in_blocks(n_sites: int, work: Callable[[int, slice], None], n_threads: int | None = None) -> None:
+    """Do some work on every block of sites: its number, and where its sites lie."""
+    n_blocks = -(-n_sites // BLOCK_SITES)
+    each(
+        lambda block: work(block, slice(block * BLOCK_SITES, min((block + 1) * BLOCK_SITES, n_sites))),
+        range(n_blocks),
+        thread_count(n_threads),
+    )
+
+
+def draw_shot_noise(
+    expected_e: Floats, how: ShotNoise, gaussian_above_e: float, streams: Streams, *, n_threads: int | None = None
+) -> Ints:
     """
     Electrons that are collected where so many are expected.
 
@@ -29,11 +44,13 @@ def draw_shot_noise(expected_e: Floats, how: ShotNoise, gaussian_above_e: float,
     ----------
     expected_e : (n_site,) float64, e-
     how : {"auto", "exact", "off"}
-        ``"exact"``: Poisson. ``"auto"``: Poisson up to ``gaussian_above_e``, above it a Gaussian of the same mean and
-        variance, rounded. ``"off"``: the expectation, rounded.
+        ``"auto"``: Poisson up to ``gaussian_above_e``, above it a Gaussian of the same mean and variance, rounded; a site's
+        draw does not depend on how bright the others are. ``"exact"``: Poisson everywhere. ``"off"``: the expectation, rounded.
     gaussian_above_e : float, e-
     streams : Streams
-        Uses the streams ``shot`` (Poisson) and ``shot_gaussian``.
+        Uses the stream ``shot``.
+    n_threads : int, optional
+        All cores by default. Draws do not depend on it.
 
     Returns
     -------
@@ -41,17 +58,22 @@ def draw_shot_noise(expected_e: Floats, how: ShotNoise, gaussian_above_e: float,
         Never below 0. Mean and variance are those of Poisson on both sides of the switch.
     """
     if how == "off":
-        return _whole(expected_e)
-    is_gaussian = expected_e > (gaussian_above_e if how == "auto" else LARGEST_EXACT_E)
-    electrons = streams.of("shot").poisson(np.where(is_gaussian, 0.0, expected_e))
-    if is_gaussian.any():
-        # One number a site, used or not: a Gaussian draw does not depend on how bright the other sites are.
-        z = streams.of("shot_gaussian").standard_normal(expected_e.size)[is_gaussian]
-        mean_e = expected_e[is_gaussian]
-        electrons[is_gaussian] = _whole(mean_e + np.sqrt(np.maximum(mean_e - ROUNDING_VARIANCE, 0.0)) * z)
+        return np.rint(np.clip(expected_e, 0.0, LARGEST_CHARGE_E)).astype(np.int64)
+    electrons = np.empty(expected_e.size, np.int64)
+    expected_e = np.ascontiguousarray(expected_e, np.float64)
+    draw = kernels("sensor").poisson_or_gaussian
+
+    def block(number: int, sites: slice) -> None:
+        generator = streams.of("shot", number)
+        if how == "auto":
+            z = generator.standard_normal(sites.stop - sites.start)
+            draw(expected_e[sites], z, gaussian_above_e, electrons[sites])
+            return
+        is_beyond = expected_e[sites] > LARGEST_EXACT_E
+        electrons[sites] = generator.poisson(np.where(is_beyond, 0.0, expected_e[sites]))
+        electrons[sites][is_beyond] = np.rint(np.minimum(expected_e[sites][is_beyond], LARGEST_CHARGE_E)).astype(
+            np.int64
+        )
+
+    in_blocks(expected_e.size, block, n_threads)
     return electrons
-
-
-def _whole(charge_e: Floats) -> Ints:
-    """Whole electrons, from 0 to the largest number that int64 holds with certainty."""
-    return np.rint(np.clip(charge_e, 0.0, LARGEST_CHARGE_E)).astype(np.int64)

@@ -1,0 +1,459 @@
+"""Every effect of the electronic chain: how much it does, where it stands, and that it leaves all others as they were."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import scipy.constants
+import scipy.stats
+
+import foveasim as fs
+from foveasim.errors import ParameterError, SimulationError
+from foveasim.layout import grid
+from foveasim.sensor import Sensor
+from foveasim.sensor.device import Device
+from foveasim.streams import Streams
+
+N_X, N_Y = 500, 400
+N = N_X * N_Y
+MANY = grid(n_x=N_X, n_y=N_Y, pitch_um=2.0).with_columns(readout_line=np.tile(np.arange(N_X), N_Y))
+SIGMAS = 5.0
+#: 16 bits of 1 electron each, up to 3 V.
+FINE = {"bits": 16, "v_sat_v": 3.0, "capacitance_f": 65_536 * scipy.constants.e / 3.0, "shot_noise": "off"}
+V_PER_DN = 3.0 / 65_536
+
+
+def sensor(**parameters):
+    return Sensor(MANY, **{**FINE, **parameters})
+
+
+def expected(photo_e=0.0, exposure_s=1.0, **parameters):
+    return np.broadcast_to(sensor(**parameters).expected_electrons(np.full(N, photo_e), exposure_s), N)
+
+
+def codes(charge_e=30_000, *, seed=0, frame=0, **parameters):
+    charge = np.broadcast_to(np.asarray(charge_e, np.int64), N).copy()
+    return sensor(**parameters).read(charge, streams=Streams(seed, frame)).astype(float)
+
+
+def assert_spread(values, sigma, extra_variance=0.0):
+    """The standard deviation is right to five of its standard errors."""
+    variance = sigma**2 + extra_variance
+    assert values.var() == pytest.approx(variance, rel=SIGMAS * math.sqrt(2.0 / (values.size - 1)))
+
+
+# -- numbers of a device ----------------------------------------------------------------------------------------------
+
+
+def test_numbers_of_a_device_are_those_of_the_published_generator():
+    """numpy's Philox 4x64, whose counter goes up before the first word."""
+    device = Device(seed=7, layout=MANY)
+    key = device.key("prnu")
+    ours = fs.compiled.kernels("sensor").device_uniforms(
+        *key, np.array([5, 2**63], np.uint64), np.array([1, 0], np.uint64)
+    )
+
+    for number, (first, second) in zip(ours, ((5, 1), (2**63, 0)), strict=True):
+        word = np.random.Philox(key=[int(k) for k in key], counter=[first - 1, second, 0, 0]).random_raw()
+        assert number == ((int(word) >> 11) + 0.5) / 2.0**53
+
+
+@pytest.mark.parametrize(
+    ("key", "counter", "words"),
+    [
+        (0, (0, 0), (0xFF1DAE59, 0x6CD10DF2)),
+        (0xFFFFFFFF, (0xFFFFFFFF, 0xFFFFFFFF), (0x2C3F628B, 0xAB4FD7AD)),
+        (0x13198A2E, (0x243F6A88, 0x85A308D3), (0xDD7CE038, 0xF62A4C12)),
+    ],
+)
+def test_the_small_generator_gives_its_authors_known_answers(key, counter, words):
+    """The known-answer tests that Salmon et al. publish with Random123."""
+    got = fs.compiled.kernels("sensor")._philox_2x32(np.uint64(key), *(np.uint64(c) for c in counter))
+
+    assert tuple(int(word) for word in got) == words
+
+
+EFFECTS = ("prnu", "dsnu", "hot", "gain", "pixel offset", "telegraph")
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_a_crop_and_another_order_are_the_same_device(effect):
+    whole = Device(seed=3, layout=MANY).normals(effect)
+    ids = np.random.default_rng(0).permutation(N)[:1000]
+
+    assert np.array_equal(Device(seed=3, layout=MANY[ids]).normals(effect), whole[ids])
+
+
+def test_a_column_may_tell_sites_apart_in_place_of_where_they_are():
+    named = MANY[:100].with_columns(site_id=np.arange(100) + 7)
+
+    there = Device(seed=3, layout=named.translate(5.0, 1.0)).normals("prnu")
+
+    assert np.array_equal(there, Device(seed=3, layout=named).normals("prnu"))
+    assert not np.any(there == Device(seed=3, layout=MANY[:100]).normals("prnu"))
+
+
+def test_devices_effects_and_sites_are_independent():
+    patterns = [Device(seed=seed, layout=MANY).normals(effect) for seed in (0, 1) for effect in EFFECTS]
+
+    correlation = np.corrcoef(patterns)
+    assert np.abs(correlation[~np.eye(len(patterns), dtype=bool)]).max() < SIGMAS / math.sqrt(N)
+    picture = patterns[0].reshape(N_Y, N_X)
+    for neighbour in (picture[1:] * picture[:-1], picture[:, 1:] * picture[:, :-1]):
+        assert abs(neighbour.mean()) < SIGMAS / math.sqrt(neighbour.size)
+    assert scipy.stats.kstest(patterns[0], "norm").pvalue > 1e-6
+
+
+# -- before the draw --------------------------------------------------------------------------------------------------
+
+
+def test_photo_response_differs_by_its_share_and_dark_charge_does_not():
+    light, dark = expected(1000.0, prnu_fraction=0.02), expected(0.0, prnu_fraction=0.02, dark_e_per_s=1000.0)
+
+    assert_spread(light, 20.0)
+    assert light.mean() == pytest.approx(1000.0, abs=SIGMAS * 20.0 / math.sqrt(N))
+    assert np.ptp(dark) == 0.0
+
+
+def test_dark_signal_differs_by_its_share_and_light_does_not():
+    dark, light = expected(0.0, 2.0, dsnu_fraction=0.1, dark_e_per_s=300.0), expected(500.0, dsnu_fraction=0.1)
+
+    assert_spread(dark, 60.0)
+    assert np.ptp(light) == 0.0
+
+
+@pytest.mark.parametrize(("temperature_k", "factor"), [(300.0, 1.0), (308.0, 2.0), (292.0, 0.5), (324.0, 8.0)])
+def test_dark_current_doubles_every_eight_kelvin(temperature_k, factor):
+    assert expected(temperature_k=temperature_k, dark_e_per_s=50.0)[0] == pytest.approx(50.0 * factor)
+    assert expected(100.0, temperature_k=temperature_k)[0] == 100.0
+
+
+def test_hot_sites_are_as_many_as_said_and_so_hot():
+    dark = expected(hot_fraction=0.01, hot_e_per_s=5000.0, dark_e_per_s=10.0)
+
+    is_hot = dark > 100.0
+    assert np.unique(dark).tolist() == [10.0, 5010.0]
+    assert is_hot.sum() == pytest.approx(0.01 * N, abs=SIGMAS * math.sqrt(0.01 * N))
+
+
+def test_dead_sites_collect_no_light_but_dark_charge():
+    charge = expected(1000.0, dead_fraction=0.02, dark_e_per_s=10.0)
+
+    assert np.unique(charge).tolist() == [10.0, 1010.0]
+    assert (charge == 10.0).sum() == pytest.approx(0.02 * N, abs=SIGMAS * math.sqrt(0.02 * N))
+
+
+def test_fixed_patterns_stay_from_frame_to_frame_and_differ_between_devices():
+    one, same, other = (sensor(prnu_fraction=0.05, device_seed=s).response for s in (1, 1, 2))
+
+    assert np.array_equal(one, same)
+    assert abs(np.corrcoef(one, other)[0, 1]) < SIGMAS / math.sqrt(N)
+
+
+# -- the draw -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mean_e", [0.3, 4.0, 60.0, 99.9])
+def test_few_electrons_follow_poissons_law_whatever_the_neighbours_get(mean_e):
+    noisy = sensor(shot_noise="auto")
+    expected_e = np.full(N, mean_e)
+    expected_e[::2] = np.random.default_rng(0).uniform(0.0, 1e4, N // 2)
+
+    alone = noisy.collect(np.full(N, mean_e), streams=Streams(4))
+    among = noisy.collect(expected_e, streams=Streams(4))
+
+    assert np.array_equal(alone[1::2], among[1::2])
+    law = scipy.stats.poisson(mean_e)
+    low, high = int(law.ppf(1e-3)), int(law.ppf(1 - 1e-3))
+    edges = np.concatenate(([-np.inf], np.arange(low, high + 1) + 0.5, [np.inf]))
+    counts = np.histogram(alone, edges)[0]
+    chances = np.diff(np.concatenate(([0.0], law.cdf(np.arange(low, high + 1)), [1.0])))
+    assert scipy.stats.chisquare(counts, chances * N).pvalue > 1e-6
+
+
+def test_draws_and_codes_do_not_depend_on_the_number_of_threads():
+    noisy = sensor(shot_noise="auto", read_noise_e=3.0, ktc_noise=True, dnl_dn=0.5, rts_fraction=0.1, rts_e=20.0)
+    expected_e = np.random.default_rng(0).uniform(0.0, 300.0, N)
+    exact = sensor(shot_noise="exact")
+
+    for n_threads in (2, 3, 7):
+        for one in (noisy, exact):
+            first = one.collect(expected_e, streams=Streams(1), n_threads=1)
+            assert np.array_equal(first, one.collect(expected_e, streams=Streams(1), n_threads=n_threads))
+        code = noisy.read(first, streams=Streams(1), n_threads=1)
+        assert np.array_equal(code, noisy.read(first, streams=Streams(1), n_threads=n_threads))
+
+
+# -- noise of reading --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("capacitance_f", "noise_e"), [(1e-15, 12.70), (1e-13, 127.0), (4.8e-13, 278.3)])
+def test_reset_noise_has_its_published_sizes_at_300_kelvin(capacitance_f, noise_e):
+    assert sensor(ktc_noise=True, capacitance_f=capacitance_f).ktc_noise_e[0] == pytest.approx(noise_e, rel=5e-4)
+
+
+def test_reset_noise_is_in_the_codes_and_double_sampling_takes_it_off():
+    size_e = sensor(ktc_noise=True).ktc_noise_e[0]
+
+    assert_spread(codes(ktc_noise=True), size_e, 1 / 12)
+    assert np.ptp(codes(ktc_noise=True, cds=True)) == 0.0
+    assert sensor(ktc_noise=True, temperature_k=75.0).ktc_noise_e[0] == pytest.approx(size_e / 2)
+
+
+def test_reset_noise_is_of_each_sites_own_capacitance():
+    two = np.where(np.arange(N) % 2, FINE["capacitance_f"], 4.0 * FINE["capacitance_f"])
+
+    noise = sensor(ktc_noise=True, capacitance_f=two).ktc_noise_e
+
+    assert noise[0] == pytest.approx(2.0 * noise[1])
+
+
+def test_noises_of_resetting_and_reading_add_in_squares():
+    size_e = sensor(ktc_noise=True).ktc_noise_e[0]
+
+    assert_spread(codes(ktc_noise=True, read_noise_e=40.0), math.hypot(size_e, 40.0), 1 / 12)
+
+
+def test_telegraph_sites_jump_between_two_states_from_frame_to_frame():
+    frames = np.stack([codes(rts_fraction=0.1, rts_e=40.0, frame=k) for k in range(30)])
+    moves = np.ptp(frames, axis=0)
+
+    assert (moves > 0).sum() == pytest.approx(0.1 * N, abs=SIGMAS * math.sqrt(0.1 * N))
+    assert np.unique(moves).tolist() == [0.0, 40.0]
+    assert frames[:, moves > 0].mean() == pytest.approx(30_000.0, abs=0.1)
+
+
+def test_noise_of_reading_comes_after_the_full_well():
+    full = sensor(full_well_e=7000.0, read_noise_e=50.0, ktc_noise=False)
+    charge = full.collect(np.full(N, 9000.0), streams=Streams(0))
+
+    assert np.unique(charge).tolist() == [7000]
+    assert_spread(full.read(charge, streams=Streams(0)).astype(float), 50.0, 1 / 12)
+
+
+# -- volts ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("charge_e", "spread_dn"), [(30_000, 300.0), (15_000, 150.0)])
+def test_gains_differ_by_their_share_of_the_signal(charge_e, spread_dn):
+    assert_spread(codes(charge_e, gain_fpn_fraction=0.01), spread_dn, 1 / 12)
+
+
+@pytest.mark.parametrize("charge_e", [20_000, 40_000])
+def test_pixels_have_offsets_of_their_share_of_the_range_at_any_signal(charge_e):
+    got = codes(charge_e, pixel_fpn_fraction=0.02)
+
+    assert_spread(got, 0.02 * 65_536, 1 / 12)
+    assert np.array_equal(got, codes(charge_e, pixel_fpn_fraction=0.02, seed=1, frame=5))
+    assert np.ptp(codes(charge_e, pixel_fpn_fraction=0.02, cds=True)) == 0.0
+
+
+def test_lines_have_offsets_that_all_their_sites_share():
+    picture = codes(line_fpn_fraction=0.02).reshape(N_Y, N_X)
+
+    assert np.all(picture == picture[0])
+    assert picture[0].std() == pytest.approx(0.02 * 65_536, rel=SIGMAS / math.sqrt(2 * N_X))
+
+
+def test_offsets_come_before_the_clip_and_gains_do_not_touch_them():
+    dark = codes(0, pixel_fpn_fraction=0.02, gain_fpn_fraction=0.5)
+
+    # Half the offsets are negative and end at 0.
+    assert (dark == 0.0).mean() == pytest.approx(0.5, abs=SIGMAS / math.sqrt(N))
+    assert np.array_equal(dark, codes(0, pixel_fpn_fraction=0.02))
+    assert codes(65_000, pixel_fpn_fraction=0.02).max() == 65_535
+
+
+def test_a_response_that_bends_lacks_its_share_at_full_range():
+    for share in (0.25, 0.5, 1.0):
+        charge = round(share * 65_536)
+        assert codes(charge, nonlinearity_fraction=0.04)[0] == pytest.approx(charge * (1 - 0.04 * share), abs=1.0)
+
+
+# -- codes ------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bits", [4, 8, 12])
+@pytest.mark.parametrize(
+    ("companding", "share_of_codes"),
+    [
+        ({"companding": "linear"}, lambda x: x),
+        ({"companding": "root"}, np.sqrt),
+        ({"companding": "log", "log_strength": 50.0}, lambda x: np.log(1 + 50 * x) / np.log(51)),
+        (
+            {"companding": "table", "companding_table": [0.0, 0.5, 0.8, 1.0]},
+            lambda x: np.interp(x, [0, 1 / 3, 2 / 3, 1], [0, 0.5, 0.8, 1]),
+        ),
+    ],
+)
+def test_a_companding_converter_has_its_curve_and_both_its_ends(bits, companding, share_of_codes):
+    charge = np.linspace(0, 65_536, N).astype(np.int64)
+    got = codes(charge, **{**companding, "bits": bits})
+
+    assert got.min() == 0
+    assert got.max() == 2**bits - 1
+    assert np.all(np.diff(got) >= 0)
+    exact = share_of_codes(charge / 65_536) * 2**bits
+    is_sure = np.abs(exact - np.rint(exact)) > 1e-4  # a hair from the border of a code either may be
+    assert np.array_equal(got[is_sure], np.minimum(np.floor(exact[is_sure]), 2**bits - 1))
+
+
+def test_integral_nonlinearity_is_added_where_its_table_says():
+    charge = np.linspace(0, 65_535, N).astype(np.int64)
+    moved = codes(charge, inl_dn=[0.0, 30.0, 0.0]) - codes(charge)
+
+    middle = np.abs(charge - 32_768) < 100
+    assert np.abs(moved[middle] - 30.0).max() <= 1.0
+    assert np.abs(moved - 30.0 * (1 - np.abs(charge / 32_768 - 1))).max() <= 1.0
+
+
+def test_differential_nonlinearity_is_one_number_a_line_and_code():
+    """Half a code in the middle of code 7 of 16: the number added moves it where it is beyond half a code."""
+    charge = np.full(N, round(65_536 / 16 * 7.5), np.int64)
+    picture = codes(charge, bits=4, dnl_dn=0.5).reshape(N_Y, N_X)
+
+    assert np.all(picture == picture[0])
+    moved = picture[0] - 7.0
+    law = scipy.stats.norm(scale=0.5)
+    for step in (-1, 0, 1):
+        chance = law.cdf(step + 0.5) - law.cdf(step - 0.5)
+        assert (moved == step).mean() == pytest.approx(chance, abs=SIGMAS * math.sqrt(chance * (1 - chance) / N_X))
+    other_code = codes(np.full(N, round(65_536 / 16 * 8.5)), bits=4, dnl_dn=0.5).reshape(N_Y, N_X)[0] - 8.0
+    assert abs(np.corrcoef(moved, other_code)[0, 1]) < SIGMAS / math.sqrt(N_X)
+
+
+def test_differential_nonlinearity_has_its_size_between_the_codes():
+    """Over a ramp within one code the share of the next code shows each line's number."""
+    steps = np.arange(N_Y) / N_Y
+    charge = np.round(65_536 / 16 * (7.0 + steps)).astype(np.int64).repeat(N_X)
+    picture = codes(charge, bits=4, dnl_dn=0.2).reshape(N_Y, N_X)
+
+    added = picture.mean(axis=0) - 7.0  # about the number, where it is between -1 and 1
+    assert added.std() == pytest.approx(0.2, rel=SIGMAS / math.sqrt(2 * N_X))
+
+
+# -- order and independence -------------------------------------------------------------------------------------------
+
+ALL = {
+    "prnu_fraction": 0.02,
+    "dark_e_per_s": 50.0,
+    "dsnu_fraction": 0.1,
+    "hot_fraction": 0.001,
+    "hot_e_per_s": 1e4,
+    "dead_fraction": 0.001,
+    "full_well_e": 40_000.0,
+    "ktc_noise": True,
+    "read_noise_e": 5.0,
+    "rts_fraction": 0.05,
+    "rts_e": 20.0,
+    "gain_fpn_fraction": 0.01,
+    "pixel_fpn_fraction": 0.01,
+    "line_fpn_fraction": 0.01,
+    "dnl_dn": 0.5,
+    "shot_noise": "auto",
+}
+#: Effects, what switches each off, and what it must not change.
+SWITCHES = {
+    "prnu_fraction": 0.0,
+    "dark_e_per_s": 0.0,
+    "dsnu_fraction": 0.0,
+    "hot_fraction": 0.0,
+    "dead_fraction": 0.0,
+    "shot_noise": "off",
+    "full_well_e": None,
+    "ktc_noise": False,
+    "read_noise_e": 0.0,
+    "rts_fraction": 0.0,
+    "gain_fpn_fraction": 0.0,
+    "pixel_fpn_fraction": 0.0,
+    "line_fpn_fraction": 0.0,
+    "dnl_dn": 0.0,
+}
+BEFORE_THE_DRAW = ("prnu_fraction", "dark_e_per_s", "dsnu_fraction", "hot_fraction", "dead_fraction")
+PATTERNS = ("response", "dark_rate_e_per_s", "gain", "pixel_offset_v", "line_offset_v", "telegraph_sites")
+OF_PATTERN = {
+    "prnu_fraction": "response",
+    "dead_fraction": "response",
+    "dark_e_per_s": "dark_rate_e_per_s",
+    "dsnu_fraction": "dark_rate_e_per_s",
+    "hot_fraction": "dark_rate_e_per_s",
+    "gain_fpn_fraction": "gain",
+    "pixel_fpn_fraction": "pixel_offset_v",
+    "line_fpn_fraction": "line_offset_v",
+    "rts_fraction": "telegraph_sites",
+}
+
+
+@pytest.mark.parametrize("effect", SWITCHES)
+def test_an_effect_switched_off_changes_something_and_leaves_all_other_draws(effect):
+    on, off = sensor(**ALL), sensor(**{**ALL, effect: SWITCHES[effect]})
+    streams = Streams(3, 2)
+    light_e = np.linspace(0.0, 50_000.0, N)
+
+    charges = [s.collect(s.expected_electrons(light_e, 1.0), streams=streams) for s in (on, off)]
+    read = [s.read(charge, streams=streams) for s, charge in zip((on, off), charges, strict=True)]
+
+    assert not np.array_equal(*read)
+    for pattern in PATTERNS:
+        if OF_PATTERN.get(effect) != pattern:
+            assert np.array_equal(getattr(on, pattern), getattr(off, pattern))
+    if effect in BEFORE_THE_DRAW or effect in {"shot_noise", "full_well_e"}:
+        # From the same charge on, the same codes.
+        assert np.array_equal(on.read(charges[0], streams=streams), off.read(charges[0], streams=streams))
+    else:
+        assert np.array_equal(*charges)
+
+
+def test_sites_without_an_effect_of_their_own_draw_as_before():
+    on, off = sensor(**ALL), sensor(**{**ALL, "rts_fraction": 0.0})
+    charge = np.full(N, 20_000, np.int64)
+    moved = on.read(charge, streams=Streams(0)) != off.read(charge, streams=Streams(0))
+
+    assert set(np.flatnonzero(moved)) <= set(on.telegraph_sites)
+
+
+# -- limits -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("prnu_fraction", -0.1, "'prnu_fraction' must be >= 0"),
+        ("dead_fraction", 1.5, "'dead_fraction' must be <= 1"),
+        ("hot_fraction", float("nan"), "'hot_fraction' must be finite"),
+        ("temperature_k", 0.0, "'temperature_k' must be > 0"),
+        ("temperature_k", -20.0, "'temperature_k' must be > 0"),
+        ("dark_doubling_k", 0.0, "'dark_doubling_k' must be > 0"),
+        ("ktc_noise", 1, "'ktc_noise' must be true or false"),
+        ("cds", "yes", "'cds' must be true or false"),
+        ("companding", "gamma", "'companding' must be one of 'linear', 'root', 'log', 'table'"),
+        ("companding_table", [0.0, 1.0], "'companding_table' and companding='table' belong together"),
+        ("companding", "table", "'companding_table' and companding='table' belong together"),
+        ("inl_dn", [3.0], "'inl_dn' must be at least two numbers"),
+        ("inl_dn", [0.0, float("inf")], "'inl_dn' must be finite"),
+        ("log_strength", 0.0, "'log_strength' must be > 0"),
+        ("dnl_dn", -1.0, "'dnl_dn' must be >= 0"),
+        ("device_seed", -1, "'device_seed' must be >= 0"),
+        ("device_seed", 1.5, "'device_seed' must be a whole number"),
+        ("gaussian_above_e", 1e5, "'gaussian_above_e' must be <= 700"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_its_name(name, value, message):
+    with pytest.raises(ParameterError, match=f"^{message}"):
+        sensor(**{name: value})
+
+
+@pytest.mark.parametrize("table", [[0.0, 0.6, 0.5, 1.0], [0.1, 1.0], [0.0, 0.9], [1.0]])
+def test_a_companding_table_that_falls_or_does_not_reach_its_ends_is_refused(table):
+    with pytest.raises(
+        ParameterError, match="'companding_table' must be two or more numbers from 0 to 1 that never fall"
+    ):
+        sensor(companding="table", companding_table=table)
+
+
+@pytest.mark.parametrize("parameters", [{"dnl_dn": 0.5}, {"line_fpn_fraction": 0.02}])
+def test_lines_that_differ_need_a_layout_that_says_which_is_which(parameters):
+    with pytest.raises(SimulationError, match="give it a column 'readout_line'"):
+        Sensor(fs.Layout.from_rectangles([[0.0, 0.0], [3.0, 0.0]], 2.0), **parameters)
