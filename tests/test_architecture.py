@@ -45,7 +45,7 @@ DIMENSIONLESS = {
 }  # fmt: skip
 #: Names of parts that no user sees, in cells, pitches or steps as their docstrings say.
 INTERNAL = {
-    "blur_lambda_n", "cycles", "extent", "fade_columns", "fade_rows", "from_step", "function", "height",
+    "blur_cells", "blur_lambda_n", "cycles", "edge", "extent", "fade", "from_step", "function", "height",
     "n_across", "moments", "new_radius", "per_step", "pixel", "r2", "radius", "s_x", "s_y", "share", "side", "shares", "slope", "spread", "tables_at",
     "tangent2_x", "tangent2_y", "to_step", "upper", "x", "x2", "xy", "y", "y2",
 }  # fmt: skip
