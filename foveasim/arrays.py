@@ -217,7 +217,7 @@ def as_numbers(name: str, value: ArrayLike, *, keep_type: bool = False) -> NDArr
             raise TypeError
         return array if keep_type and array.dtype.kind in "biuf" else np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ParameterError(name, "must be an array of real numbers", value) from None
+        raise ParameterError(name, "must be an array of numbers", value) from None
 
 
 def finite_array(

@@ -795,7 +795,8 @@ exposure_s: 0.01
 
 
 @pytest.fixture
-def shot_file(tmp_path):
+def shot_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where the files are that a change names
     (tmp_path / "curves.csv").write_text("wavelength_nm,R,G [%],B\n400,0.1,50,0.7\n700,0.2,60,0.8\n")
     path = tmp_path / "shot.yaml"
     path.write_text(SHOT)
@@ -821,7 +822,8 @@ def test_a_curve_in_a_settings_file_is_that_of_the_call(shot_file, setting, curv
 
 def test_filters_in_a_settings_file_are_read_beside_it(shot_file, tmp_path, monkeypatch):
     monkeypatch.chdir("/")
-    sensor = read_shot(shot_file, ["sensor.filters={path: curves.csv}"]).camera.sensor
+    shot_file.write_text(SHOT + "sensor: {filters: {path: curves.csv}}\n")
+    sensor = read_shot(shot_file).camera.sensor
     assert sensor.filters == read_filters(tmp_path / "curves.csv")
     assert sensor.filter_names == ("R", "G", "B")
 
