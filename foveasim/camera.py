@@ -219,6 +219,28 @@ class Camera:
             stage_s=clock.stage_s,
         )
 
+    def predict(self, light: Scene | PowerMap, *, exposure_s: float) -> tuple[Floats, Floats]:
+        """
+        Mean and variance of every site's code over all noise, without a draw.
+
+        Parameters
+        ----------
+        light : Scene or PowerMap
+        exposure_s : float, s
+
+        Returns
+        -------
+        mean_dn, variance_dn2 : (n_site,) float64, DN and DN²
+            Of this device: its fixed patterns are in the mean.
+
+        Raises
+        ------
+        ParameterError, SimulationError
+            As for :meth:`capture`.
+        """
+        expected_e = self._sensor.expected_electrons(self._photoelectrons_per_s(light, _Clock()), exposure_s)
+        return self._sensor.predict(expected_e, n_threads=self._n_threads)
+
     def _photoelectrons_per_s(self, light: Scene | PowerMap, clock: _Clock) -> Floats:
         """
         One inverse transform and one pass over the map for each colour filter, whatever the number of wavelengths.

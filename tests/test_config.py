@@ -86,6 +86,25 @@ def test_numbers_without_a_point_in_front_of_the_exponent_are_numbers(shot_file)
             lambda s: s.camera.distortion.a == (1570.0, -2.75e-4, 3.76e-8, -3.64e-11),
         ),
         ("layout.mosaic=[RG, GB]", lambda s: s.camera.sensor.layout.channel.max() == 2),
+        (
+            "sensor.crosstalk={kind: diffusion, spread_um: 0.4}",
+            lambda s: s.camera.sensor.crosstalk == fs.sensor.Diffusion(spread_um=0.4),
+        ),
+        (
+            "sensor.crosstalk={kind: kernel, kernel: [[0, 0.02, 0], [0.02, 0.92, 0.02], [0, 0.02, 0]]}",
+            lambda s: s.camera.sensor.crosstalk.kernel[1][1] == 0.92,
+        ),
+        (
+            "sensor.coupling={neighbour_share: 0.01}",
+            lambda s: s.camera.sensor.coupling == fs.sensor.Coupling(neighbour_share=0.01),
+        ),
+        ("sensor.companding=root", lambda s: s.camera.sensor.converter.companding == "root"),
+        ("sensor.inl_dn=[0, 1, 0]", lambda s: s.camera.sensor.converter.inl_dn == (0.0, 1.0, 0.0)),
+        ("sensor.ktc_noise=true", lambda s: s.camera.sensor.ktc_noise_e[0] > 0.0),
+        (
+            "sensor={filters: rgb, qe: [0.3, {kind: constant, value: 0.5}, 0.4]}; layout.mosaic=[RG, GB]",
+            lambda s: s.camera.sensor.qe == (0.3, fs.sensor.ConstantCurve(0.5), 0.4),
+        ),
         ("layout.move_um=[5.0, -3.0]", lambda s: abs(s.camera.sensor.layout.centroid_um.mean(0) - [5, -3]).max() < 1),
         ("layout.mosaic=[RG, GB]; sensor.filters=rgb", lambda s: s.camera.sensor.n_filters == 3),
         (

@@ -21,8 +21,11 @@ from foveasim.optics import Annulus, Blades, LateralColour, Optics, PupilImage, 
 from foveasim.scene import Scene, charts
 from foveasim.sensor import (
     ConstantCurve,
+    Coupling,
+    Diffusion,
     FilterSet,
     GaussianCurve,
+    KernelCrosstalk,
     PassBand,
     PolynomialCurve,
     ProductCurve,
@@ -155,6 +158,7 @@ _PUPILS: dict[str, Callable[..., Any]] = {
     "slit": Slit,
     "spider": Spider,
 }
+_CROSSTALK: dict[str, Callable[..., Any]] = {"diffusion": Diffusion, "kernel": KernelCrosstalk}
 _CURVES: dict[str, Callable[..., Any]] = {
     "ccd": ccd_qe,
     "constant": ConstantCurve,
@@ -202,8 +206,10 @@ _SensorSection = _model(
     "sensor",
     Sensor,
     skip=("layout",),
-    qe=float | _CurveSection,
+    qe=float | _CurveSection | list[float | _CurveSection],  # type: ignore[valid-type]
     filters=Literal["rgb"] | _FilterSection | None,
+    crosstalk=_one_of("kind", {name: _model(name, way) for name, way in _CROSSTALK.items()}) | None,
+    coupling=_model("coupling", Coupling) | None,
     dark_e_per_s=_PerSite,
     full_well_e=_PerSite | None,
     read_noise_e=_PerSite,

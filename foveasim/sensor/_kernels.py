@@ -13,7 +13,16 @@ import math
 import numpy as np
 from numba import njit, types
 
-__all__ = ["ADC_LINEAR", "ADC_LOG", "ADC_ROOT", "ADC_TABLE", "device_uniforms", "poisson_or_gaussian", "read_out"]
+__all__ = [
+    "ADC_LINEAR",
+    "ADC_LOG",
+    "ADC_ROOT",
+    "ADC_TABLE",
+    "device_uniforms",
+    "poisson_or_gaussian",
+    "predict_codes",
+    "read_out",
+]
 
 #: Ways of a converter from a share of the range to a share of the codes.
 ADC_LINEAR, ADC_ROOT, ADC_LOG, ADC_TABLE = range(4)
@@ -25,6 +34,13 @@ ROUNDING_VARIANCE = 1.0 / 12.0
 LARGEST_CHARGE_E = 2.0**62
 #: One draw of a Poisson law is at most so many of its standard deviations, and so many electrons more, above its mean.
 FAR_SIGMAS, FAR_ELECTRONS = 12.0, 40
+#: Charges further from their mean than so many standard deviations weigh nothing.
+REACH_SIGMAS = 9.0
+#: Points of a mixture of charges, at most; chances below the smallest are left out; charges are whole to this.
+MOST_NODES, TINY, WHOLE = 2048, 1e-18, 1e-6
+#: Halvings that find a number to its last bit.
+BISECTIONS = 60
+SQRT_HALF, SQRT_TWO_PI = math.sqrt(0.5), math.sqrt(2.0 * math.pi)
 
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 _ints = types.Array(types.int64, 1, "C", readonly=True)
@@ -136,6 +152,83 @@ def _converted(share, way, strength, table):
     return share
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _value(charge, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl):
+    """Codes, not yet whole, of a charge."""
+    v = charge * per_e
+    v *= 1.0 - bend * min(max(v / v_sat_v, 0.0), 1.0)
+    share = min(max((v + offset) / v_sat_v, 0.0), 1.0)
+    value = _converted(share, way, strength, table) * n_codes
+    if inl.size > 1:
+        place = min(value / n_codes, 1.0) * (inl.size - 1)
+        k = min(int(place), inl.size - 2)
+        value += inl[k] + (place - k) * (inl[k + 1] - inl[k])
+    return value
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _dnl_normal(key, line, code, quantiles):
+    """The number of the Gaussian law that a line adds before a code."""
+    word, _ = _philox_2x32(key, np.uint64(line) & _LOW, np.uint64(code))
+    place = np.float64(word) * (_ONE_IN_2_32 * (quantiles.size - 1))
+    k = int(place)
+    return quantiles[k] + (place - k) * (quantiles[k + 1] - quantiles[k])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _code(value, line, n_codes, dnl, dnl_key, quantiles):
+    """The code of codes not yet whole."""
+    code = min(max(math.floor(value + CODE_ROUNDING), 0.0), n_codes - 1.0)
+    if dnl > 0.0:
+        moved = value + dnl * _dnl_normal(dnl_key, line, code, quantiles)
+        code = min(max(math.floor(moved + CODE_ROUNDING), 0.0), n_codes - 1.0)
+    return code
+
+
+@njit(cache=True, nogil=True)
+def _charge(value, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl):
+    """The charge that has codes not yet whole: :func:`_value` the other way, infinite beyond its ends."""
+    share_of_codes = value / n_codes
+    if inl.size > 1:
+        low, high = 0.0, 1.0
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            place = middle * (inl.size - 1)
+            k = min(int(place), inl.size - 2)
+            if middle * n_codes + inl[k] + (place - k) * (inl[k + 1] - inl[k]) < value:
+                low = middle
+            else:
+                high = middle
+        share_of_codes = high if high < 1.0 else 1.0 + TINY
+        if low == 0.0:
+            share_of_codes = 0.0
+    if share_of_codes <= 0.0:
+        return -np.inf
+    if share_of_codes > 1.0:
+        return np.inf
+    share = share_of_codes
+    if way == ADC_ROOT:
+        share = share_of_codes * share_of_codes
+    elif way == ADC_LOG:
+        share = math.expm1(share_of_codes * math.log1p(strength)) / strength
+    elif way == ADC_TABLE:
+        low, high = 0.0, 1.0
+        for _ in range(BISECTIONS):
+            share = 0.5 * (low + high)
+            if _converted(share, way, strength, table) < share_of_codes:
+                low = share
+            else:
+                high = share
+    v = share * v_sat_v - offset
+    if bend > 0.0 and v > 0.0:
+        v = (
+            0.5 * v_sat_v * (1.0 - math.sqrt(1.0 - 4.0 * bend * v / v_sat_v)) / bend
+            if v < v_sat_v * (1.0 - bend)
+            else v / (1.0 - bend)
+        )
+    return v / per_e
+
+
 @njit(
     [
         types.void(
@@ -189,20 +282,138 @@ def read_out(
     Gaussian by its ``quantiles``.
     """
     for i in range(charge_e.size):
-        v = charge_e[i] * _at(v_per_e, i) * _at(gain, i)
-        v *= 1.0 - bend * min(max(v / v_sat_v, 0.0), 1.0)
-        v += _at(offset_v, i) + (line_offset_v[line[i]] if line_offset_v.size > 1 else line_offset_v[0])
-        share = min(max(v / v_sat_v, 0.0), 1.0)
-        value = _converted(share, way, strength, table) * n_codes
-        if inl.size > 1:
-            place = min(value / n_codes, 1.0) * (inl.size - 1)
-            k = min(int(place), inl.size - 2)
-            value += inl[k] + (place - k) * (inl[k + 1] - inl[k])
-        step = min(max(math.floor(value + CODE_ROUNDING), 0.0), n_codes - 1.0)
-        if dnl > 0.0:
-            word, _ = _philox_2x32(dnl_key, np.uint64(line[i]) & _LOW, np.uint64(step))
-            place = np.float64(word) * (_ONE_IN_2_32 * (quantiles.size - 1))
-            k = int(place)
-            z = quantiles[k] + (place - k) * (quantiles[k + 1] - quantiles[k])
-            step = min(max(math.floor(value + dnl * z + CODE_ROUNDING), 0.0), n_codes - 1.0)
-        code[i] = int(step)
+        offset = _at(offset_v, i) + (line_offset_v[line[i]] if line_offset_v.size > 1 else line_offset_v[0])
+        per_e = _at(v_per_e, i) * _at(gain, i)
+        value = _value(charge_e[i], per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl)
+        code[i] = int(_code(value, line[i], n_codes, dnl, dnl_key, quantiles))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _below(q, nodes, weights, n_nodes, mean, deviation, well_e, sigma, half_step):
+    """
+    Chance that a charge lies below ``q``.
+
+    It is a mixture of points (``n_nodes`` of them) or, without any, a Gaussian of a mean and a deviation that ends at the well;
+    then the Gaussian noise ``sigma``, then one of two states ``half_step`` up or down.
+    """
+    total = 0.0
+    for side in range(2):
+        at = q + half_step if side else q - half_step
+        if n_nodes == 0:
+            if sigma == 0.0:
+                total += 1.0 if at > well_e else 0.5 * math.erfc((mean - at) / deviation * SQRT_HALF)
+            else:
+                total += 0.5 * math.erfc((mean - at) / math.sqrt(deviation**2 + sigma**2) * SQRT_HALF)
+        else:
+            for j in range(n_nodes):
+                if sigma == 0.0:
+                    total += weights[j] if nodes[j] < at - WHOLE else 0.0
+                else:
+                    total += weights[j] * 0.5 * math.erfc((nodes[j] - at) / sigma * SQRT_HALF)
+    return 0.5 * total
+
+
+@njit(cache=True, nogil=True)
+def _mixture(mean, is_poisson, well_e, points, shares, nodes, weights):
+    """Points and chances of a drawn charge that a well cuts off: Poisson's law, or the Gaussian by quadrature."""
+    n = 0
+    rest = 1.0
+    if is_poisson:
+        chance = math.exp(-mean)
+        k = 0
+        last = int(mean + FAR_SIGMAS * math.sqrt(mean)) + FAR_ELECTRONS
+        while k <= last and k < well_e and n < nodes.size - 1:
+            if chance > TINY:
+                nodes[n], weights[n] = k, chance
+                n += 1
+            rest -= chance
+            k += 1
+            chance *= mean / k
+        if k >= well_e:
+            nodes[n], weights[n] = well_e, max(rest, 0.0)
+            n += 1
+        return n
+    deviation = math.sqrt(mean)
+    low, high = mean - REACH_SIGMAS * deviation, min(well_e, mean + REACH_SIGMAS * deviation)
+    if high > low:
+        for j in range(points.size):
+            charge = low + 0.5 * (points[j] + 1.0) * (high - low)
+            z = (charge - mean) / deviation
+            nodes[n] = charge
+            weights[n] = 0.5 * (high - low) * shares[j] * math.exp(-0.5 * z * z) / (deviation * SQRT_TWO_PI)
+            rest -= weights[n]
+            n += 1
+    nodes[n], weights[n] = well_e, max(rest, 0.0)
+    return n + 1
+
+
+@njit(
+    types.void(
+        _floats, _floats, types.float64, types.boolean, _floats, _floats, _floats, _floats, _floats, _floats, _floats, _ints,
+        types.float64, types.float64, types.int64, types.float64, _floats, types.int64, _floats, types.float64, types.uint64,
+        _floats, _floats, _floats, types.float64[::1], types.float64[::1],
+    ),
+    cache=True,
+    nogil=True,
+)  # fmt: skip
+def predict_codes(
+    mean_e, variance_e2, poisson_below_e, is_drawn, well_e, sigma_e, half_step_e, v_per_e, gain, offset_v, line_offset_v, line,
+    v_sat_v, bend, way, strength, table, n_codes, inl, dnl, dnl_key, quantiles, points, shares, mean_dn, variance_dn2,
+):  # fmt: skip
+    """
+    Mean and variance of the codes of sites.
+
+    ``mean_e`` is expected; with ``is_drawn`` the charge is drawn of it (Poisson's law below a mean, the Gaussian above) and cut
+    off by the well, without it is a Gaussian of ``variance_e2``, or that mean itself where this is 0.
+    """
+    nodes, weights = np.empty(MOST_NODES), np.empty(MOST_NODES)
+    for i in range(mean_e.size):
+        mean, well, sigma, half_step = mean_e[i], _at(well_e, i), _at(sigma_e, i), _at(half_step_e, i)
+        n_nodes = 0
+        deviation = math.sqrt(_at(variance_e2, i))
+        if is_drawn:
+            deviation = math.sqrt(mean)
+            if mean <= poisson_below_e:
+                n_nodes = _mixture(mean, True, well, points, shares, nodes, weights)
+            elif well < mean + REACH_SIGMAS * deviation and sigma > 0.0:
+                n_nodes = _mixture(mean, False, well, points, shares, nodes, weights)
+        elif deviation == 0.0:
+            n_nodes = 1
+            nodes[0], weights[0] = min(mean, well), 1.0
+        per_e = _at(v_per_e, i) * _at(gain, i)
+        offset = _at(offset_v, i) + (line_offset_v[line[i]] if line_offset_v.size > 1 else line_offset_v[0])
+        reach = REACH_SIGMAS * math.sqrt(deviation**2 + sigma**2) + half_step + (FAR_ELECTRONS if n_nodes > 1 else 1.0)
+        low, high = min(mean, well) - reach, min(mean, well) + reach
+        first = _value(low, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl)
+        last = _value(high, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl)
+        k_first, k_last = max(math.floor(first) - 1, 0), min(math.floor(last) + 1, n_codes - 1)
+        total, squares = 0.0, 0.0
+        at, reached = low, 0.0
+        for k in range(k_first, k_last + 1):
+            # Within one step of the even converter the line's own number splits it once.
+            jump = 1.0
+            if dnl > 0.0:
+                moved = dnl * _dnl_normal(dnl_key, line[i], k, quantiles)
+                jump = math.ceil(k + moved) - (k + moved)
+            for part in range(2):
+                border = k + jump if part == 0 else k + 1.0
+                if part == 1 and jump == 1.0:
+                    continue
+                end = _charge(border, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl)
+                if k == k_last and (part == 1 or jump == 1.0):
+                    end = np.inf
+                if end <= at:
+                    continue
+                below = (
+                    1.0
+                    if end == np.inf
+                    else _below(end, nodes, weights, n_nodes, mean, deviation, well, sigma, half_step)
+                )
+                middle = 0.5 * (at + end) if end < np.inf else max(at, high) + 1.0
+                value = _value(middle, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl)
+                code = _code(value, line[i], n_codes, dnl, dnl_key, quantiles)
+                total += code * (below - reached)
+                squares += code * code * (below - reached)
+                at, reached = end, below
+        mean_dn[i] = total
+        variance_dn2[i] = max(squares - total * total, 0.0)

@@ -15,6 +15,7 @@ from foveasim.compiled import kernels
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.fields import PackedRings
 from foveasim.sensor.converter import Companding, Converter
+from foveasim.sensor.crosstalk import Coupling, Diffusion, KernelCrosstalk, Mixing, Neighbourhood
 from foveasim.sensor.device import Device
 from foveasim.sensor.noise import LARGEST_CHARGE_E, ShotNoise, draw_shot_noise, in_blocks
 from foveasim.sensor.spectral import ConstantCurve, Curve, FilterSet, rgb_filters
@@ -25,20 +26,22 @@ __all__ = ["PerSite", "Photosites", "Sensor"]
 
 #: Capacitances outside this range are a slip of units.
 MIN_CAPACITANCE_F, MAX_CAPACITANCE_F = 1e-18, 1e-6
+#: Points of the quadrature over a charge that the full well cuts off.
+QUADRATURE_NODES = 96
 #: Means that are drawn by Poisson's law one electron after the other: more take too long.
 MOST_INVERTED_E = 700.0
 NO_SITES = read_only(np.zeros(0, np.int64))
 #: Per-site values, and whether they must be above 0.
 _PER_SITE = {"dark_e_per_s": None, "full_well_e": 0.0, "read_noise_e": None, "capacitance_f": 0.0}
 #: Shares that lie between 0 and 1, and standard deviations as shares.
-_SHARES = ("hot_fraction", "dead_fraction", "rts_fraction", "nonlinearity_fraction")
+_SHARES = {"hot_fraction": 1.0, "dead_fraction": 1.0, "rts_fraction": 1.0, "nonlinearity_fraction": 0.5}
 _SPREADS = ("prnu_fraction", "dsnu_fraction", "pixel_fpn_fraction", "line_fpn_fraction", "gain_fpn_fraction")
 
 #: One value for all sites, or an array (n_site,).
 PerSite = float | NDArray[np.float64]
 
 
-class Photosites(PackedRings, Protocol):
+class Photosites(PackedRings, Neighbourhood, Protocol):
     """Outlines with a colour channel per site, as the sensor needs them; :class:`foveasim.Layout` is one."""
 
     @property
@@ -72,7 +75,7 @@ class Sensor:
     ----------
     layout : Layout
         The photosites; their ``channel`` chooses the filter, and their ``readout_line`` the line of the converter.
-    qe : float or curve
+    qe : float or curve, or one for each filter
         Quantum efficiency, electrons per photon: a number, or a function of the wavelength in nm, such as
         :class:`SiliconQE` or :class:`PolynomialCurve`.
     filters : None, "rgb", or FilterSet
@@ -89,12 +92,16 @@ class Sensor:
         Share of the sites that have this much more dark current (e-/s, at ``dark_reference_k``).
     dead_fraction : float
         Share of the sites that collect no light.
+    crosstalk : Diffusion or KernelCrosstalk, optional
+        Charge that goes to neighbours before it is collected.
     shot_noise : {"auto", "exact", "off"}
         See :func:`foveasim.sensor.draw_shot_noise`.
     gaussian_above_e : float, e-
         Expectation above which ``"auto"`` takes the Gaussian for the Poisson law.
     full_well_e : float or (n_site,), optional, e-
         Charge that a site can hold; None for no limit but V_sat.
+    coupling : Coupling, optional
+        Charge that is read at neighbours, after the draw.
     ktc_noise : bool
         Whether resetting leaves the noise ``sqrt(k T C)`` on the charge.
     cds : bool
@@ -129,7 +136,7 @@ class Sensor:
 
     layout: Photosites
     _: KW_ONLY
-    qe: float | Curve = 1.0
+    qe: float | Curve | Sequence[float | Curve] = 1.0
     filters: FilterSet | Literal["rgb"] | None = None
     prnu_fraction: float = 0.0
     dark_e_per_s: PerSite = 0.0
@@ -140,9 +147,11 @@ class Sensor:
     hot_fraction: float = 0.0
     hot_e_per_s: float = 0.0
     dead_fraction: float = 0.0
+    crosstalk: Diffusion | KernelCrosstalk | None = None
     shot_noise: ShotNoise = "auto"
     gaussian_above_e: float = 100.0
     full_well_e: PerSite | None = None
+    coupling: Coupling | None = None
     ktc_noise: bool = False
     cds: bool = False
     read_noise_e: PerSite = 0.0
@@ -165,7 +174,9 @@ class Sensor:
     def __post_init__(self) -> None:
         if not all(hasattr(self.layout, name) for name in ("n_sites", "channel", "columns")):
             raise ParameterError("layout", f"must be a Layout, got a {type(self.layout).__name__}")
-        if not callable(self.qe):
+        if isinstance(self.qe, list | tuple):
+            object.__setattr__(self, "qe", tuple(self.qe))
+        elif not callable(self.qe):
             object.__setattr__(self, "qe", check_number("qe", self.qe, at_least=0.0, at_most=1.0))
         is_rgb = isinstance(self.filters, str) and self.filters == "rgb"
         if self.filters is not None and not is_rgb and not isinstance(self.filters, FilterSet):
@@ -186,7 +197,7 @@ class Sensor:
                 "capacitances are in farad: 1 fF is 1e-15",
             )
         numbers: dict[str, float] = {
-            **{name: check_number(name, getattr(self, name), at_least=0.0, at_most=1.0) for name in _SHARES},
+            **{name: check_number(name, getattr(self, name), at_least=0.0, at_most=m) for name, m in _SHARES.items()},
             **{name: check_number(name, getattr(self, name), at_least=0.0) for name in _SPREADS},
             **{name: check_number(name, getattr(self, name), at_least=0.0) for name in ("hot_e_per_s", "rts_e")},
             **{
@@ -205,6 +216,11 @@ class Sensor:
             if not isinstance(getattr(self, name), bool):
                 raise ParameterError(name, "must be true or false", getattr(self, name))
         check_choice("shot_noise", self.shot_noise, ("auto", "exact", "off"))
+        for name, kinds in (("crosstalk", (Diffusion, KernelCrosstalk)), ("coupling", (Coupling,))):
+            part = getattr(self, name)
+            if part is not None and not isinstance(part, kinds):
+                raise ParameterError(name, f"must be a {' or a '.join(k.__name__ for k in kinds)}", part)
+        _ = self._filters_and_qe
         object.__setattr__(self, "bits", self.converter.bits)
         if (self.line_fpn_fraction or self.dnl_dn) and "readout_line" not in self.layout.columns:
             raise SimulationError(
@@ -246,6 +262,13 @@ class Sensor:
             return FilterSet((ConstantCurve(1.0),), ("all",))
         return rgb_filters() if isinstance(self.filters, str) else self.filters
 
+    @cached_property
+    def _filters_and_qe(self) -> FilterSet:
+        try:
+            return self._filter_set * self.qe
+        except ParameterError as error:
+            raise ParameterError("qe", str(error).removeprefix(f"'{error.name}' ")) from None
+
     @property
     def n_filters(self) -> int:
         """Number of different colour filters; 1 for a sensor without."""
@@ -279,8 +302,7 @@ class Sensor:
         ParameterError
             When a quantum efficiency or a filter leaves 0 .. 1, or is not known at a wavelength.
         """
-        qe = self.qe(wavelength_nm) if callable(self.qe) else np.full(wavelength_nm.shape, float(self.qe))
-        curves = np.broadcast_to(qe, wavelength_nm.shape) * self._filter_set.transmission(wavelength_nm)
+        curves = self._filters_and_qe.transmission(wavelength_nm)
         if not (np.isfinite(curves).all() and curves.min() >= 0.0 and curves.max() <= 1.0):
             raise ParameterError("qe", "and the filters must give values from 0 to 1 at every wavelength", curves)
         return curves / photon_energy_j(wavelength_nm)
@@ -360,11 +382,22 @@ class Sensor:
         """Sites with random telegraph noise."""
         return np.flatnonzero(self.device.uniforms("telegraph") < self.rts_fraction) if self.rts_fraction else NO_SITES
 
+    @cached_property
+    def _crosstalk(self) -> Mixing | None:
+        return None if self.crosstalk is None else self.crosstalk.mixing(self.layout)
+
+    @cached_property
+    def _coupling(self) -> Mixing | None:
+        if self.coupling is None:
+            return None
+        per_site = None if np.ndim(self.capacitance_f) == 0 else self.capacitance_f
+        return self.coupling.mixing(self.layout, capacitance_f=per_site)
+
     # -- charge and code ------------------------------------------------------------------------------------------
 
     def expected_electrons(self, photo_e_per_s: Floats, exposure_s: float) -> Floats:
         """
-        Expected charge of every site at the end of an exposure, (n_site,) e-: photoelectrons and dark charge.
+        Expected charge of every site at the end of an exposure, (n_site,) e-: photoelectrons and dark charge, diffused.
 
         Raises
         ------
@@ -372,7 +405,8 @@ class Sensor:
             When the exposure is negative.
         """
         exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
-        return (photo_e_per_s * self.response + self.dark_rate_e_per_s) * exposure_s
+        expected_e = (photo_e_per_s * self.response + self.dark_rate_e_per_s) * exposure_s
+        return expected_e if self._crosstalk is None else self._crosstalk.apply(expected_e)
 
     def collect(self, expected_e: Floats, *, streams: Streams, n_threads: int | None = None) -> Ints:
         """Charge that a draw gives, (n_site,) int64 e-: shot noise, then the full well."""
@@ -399,23 +433,22 @@ class Sensor:
         read_out = kernels("sensor").read_out
         dnl_key = self.device.key("dnl")[0] & np.uint64(0xFFFFFFFF)
 
-        def part(values: Floats, sites: slice) -> Floats:
-            return values[sites] if values.size > 1 else values
+        charges: NDArray[Any] = electrons if self._coupling is None else self._coupling.apply(electrons)
 
         def block(number: int, sites: slice) -> None:
-            charge_e = electrons[sites].astype(np.float64)
+            charge_e = charges[sites].astype(np.float64)
             for effect, sigma_e in noises_e.items():
                 noise = streams.of(effect, number).standard_normal(charge_e.size)
-                noise *= part(sigma_e, sites)
+                noise *= _part(sigma_e, sites)
                 charge_e += noise
             if telegraph_e is not None:
                 charge_e += telegraph_e[sites]
             read_out(
                 charge_e,
-                part(v_per_e, sites),
-                part(self.pixel_offset_v, sites),
+                _part(v_per_e, sites),
+                _part(self.pixel_offset_v, sites),
                 self.line_offset_v,
-                part(self.gain, sites),
+                _part(self.gain, sites),
                 line[sites],
                 self.v_sat_v,
                 self.nonlinearity_fraction,
@@ -440,3 +473,86 @@ class Sensor:
         charge_e = np.zeros(self.layout.n_sites)
         charge_e[sites] = self.rts_e * (streams.of("telegraph").random(sites.size) - 0.5 > 0.0) - 0.5 * self.rts_e
         return charge_e
+
+    def predict(self, expected_e: Floats, *, n_threads: int | None = None) -> tuple[Floats, Floats]:
+        """
+        Mean and variance of every site's code over all draws, for this device, without a draw.
+
+        Parameters
+        ----------
+        expected_e : (n_site,) float64, e-
+            As :meth:`expected_electrons` gives it.
+        n_threads : int, optional
+
+        Returns
+        -------
+        mean_dn, variance_dn2 : (n_site,) float64, DN and DN²
+            Of the codes: quantisation, clips and the converter's faults included.
+
+        Notes
+        -----
+        The code is even between borders of the charge, and weighs what the charge's distribution has between: Poisson's law up
+        to ``gaussian_above_e`` (for ``"exact"`` too: above it a Gaussian), cut off by the full well, with the Gaussian noise
+        of resetting and reading and the telegraph's two states. Coupled charges are taken as Gaussian of the coupled variance.
+        """
+        expected_e = np.ascontiguousarray(expected_e, np.float64)
+        convert = self.converter
+        mean_dn, variance_dn2 = np.empty(expected_e.size), np.empty(expected_e.size)
+        well_e = np.array([np.inf]) if self.full_well_e is None else np.floor(np.atleast_1d(self.full_well_e))
+        sigma_e = np.sqrt(self.ktc_noise_e**2 + np.atleast_1d(self.read_noise_e) ** 2)
+        half_step_e = np.zeros(expected_e.size if self.telegraph_sites.size else 1)
+        half_step_e[self.telegraph_sites] = 0.5 * self.rts_e
+        is_drawn = self.shot_noise != "off"
+        drawn_e, drawn_e2 = expected_e, np.zeros(1)
+        if not is_drawn:
+            drawn_e = np.minimum(np.rint(expected_e), well_e)
+        if self._coupling is not None:
+            # Of what the well leaves of a draw, as a Gaussian.
+            cut = np.minimum(drawn_e, well_e)
+            drawn_e2 = self._coupling.variance(
+                np.where(drawn_e < well_e, drawn_e, 0.0) if is_drawn else np.zeros_like(cut)
+            )
+            drawn_e, is_drawn, well_e = self._coupling.apply(cut), False, np.array([np.inf])
+        points, shares = np.polynomial.legendre.leggauss(QUADRATURE_NODES)
+        line = np.ascontiguousarray(self.layout.readout_line)
+        v_per_e = np.atleast_1d(electrons_to_volts(1.0, self.capacitance_f))
+        dnl_key = self.device.key("dnl")[0] & np.uint64(0xFFFFFFFF)
+        predict_codes = kernels("sensor").predict_codes
+
+        def block(_: int, sites: slice) -> None:
+            predict_codes(
+                drawn_e[sites],
+                _part(drawn_e2, sites),
+                self.gaussian_above_e,
+                is_drawn,
+                _part(well_e, sites),
+                _part(sigma_e, sites),
+                _part(half_step_e, sites),
+                _part(v_per_e, sites),
+                _part(self.gain, sites),
+                _part(self.pixel_offset_v, sites),
+                self.line_offset_v,
+                line[sites],
+                self.v_sat_v,
+                self.nonlinearity_fraction,
+                convert.way,
+                convert.log_strength,
+                convert.curve,
+                convert.n_codes,
+                convert.inl,
+                convert.dnl_dn,
+                dnl_key,
+                convert.quantiles,
+                points,
+                shares,
+                mean_dn[sites],
+                variance_dn2[sites],
+            )
+
+        in_blocks(expected_e.size, block, n_threads)
+        return mean_dn, variance_dn2
+
+
+def _part(values: Floats, sites: slice) -> Floats:
+    """Values of some sites, or the one of all."""
+    return values[sites] if values.size > 1 else values
