@@ -297,8 +297,9 @@ def _below(q, nodes, weights, n_nodes, mean, deviation, well_e, sigma, half_step
     then the Gaussian noise ``sigma``, then one of two states ``half_step`` up or down.
     """
     total = 0.0
-    for side in range(2):
-        at = q + half_step if side else q - half_step
+    n_states = 2 if half_step > 0.0 else 1
+    for state in range(n_states):
+        at = q + half_step if state else q - half_step
         if n_nodes == 0:
             if sigma == 0.0:
                 total += 1.0 if at > well_e else 0.5 * math.erfc((mean - at) / deviation * SQRT_HALF)
@@ -310,7 +311,7 @@ def _below(q, nodes, weights, n_nodes, mean, deviation, well_e, sigma, half_step
                     total += weights[j] if nodes[j] < at - WHOLE else 0.0
                 else:
                     total += weights[j] * 0.5 * math.erfc((nodes[j] - at) / sigma * SQRT_HALF)
-    return 0.5 * total
+    return total / n_states
 
 
 @njit(cache=True, nogil=True)
