@@ -58,7 +58,7 @@ def main(out_dir: Path) -> None:
     # %% Read noise: the paper's three.
     noises_e = (0.0, 50.0, 200.0)
     cameras = [camera(read_noise_e=noise_e) for noise_e in noises_e]
-    figure = Figure(figsize=(15, 5.2), layout="constrained")
+    figure = Figure(figsize=(15, 5.7), layout="constrained")
     for axes, one, noise_e in zip(figure.subplots(1, 3), cameras, noises_e, strict=True):
         axes.imshow(codes(one, scene), origin="lower", cmap="gray", vmin=0, vmax=1023 * MOST_PHOTONS / FULL_WELL_E)
         axes.set_title(f"read noise {noise_e:g} e-")
@@ -67,7 +67,7 @@ def main(out_dir: Path) -> None:
 
     # %% Fixed patterns: of lines, and of pixels.
     striped, grainy = camera(line_fpn_fraction=0.02), camera(pixel_fpn_fraction=0.02)
-    figure = Figure(figsize=(10, 5.2), layout="constrained")
+    figure = Figure(figsize=(10, 5.7), layout="constrained")
     for axes, (name, one) in zip(
         figure.subplots(1, 2), {"lines, 2 %": striped, "pixels, 2 %": grainy}.items(), strict=True
     ):
@@ -81,7 +81,7 @@ def main(out_dir: Path) -> None:
     pictures = [codes(one, scene).astype(int) for one in (even, uneven)]
     column = N_SIDE // 2
     expected_e = even.photoelectrons_per_s(scene).reshape(N_SIDE, N_SIDE) * EXPOSURE_S
-    figure = Figure(figsize=(16, 5.2), layout="constrained")
+    figure = Figure(figsize=(16, 5.7), layout="constrained")
     axes = figure.subplots(1, 3, width_ratios=[1, 1, 1.3])
     for place, picture, name in zip(axes, pictures, ("4 bits", "4 bits, DNL of 0.5"), strict=False):
         place.imshow(picture, origin="lower", cmap="gray", vmin=0, vmax=15)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 import foveasim as fs
 from foveasim.errors import FileError, ParameterError
 from foveasim.pictures import read_picture
-from foveasim.view import plot_capture, plot_layout, save_figure
+from foveasim.view import plot_capture, plot_layout, plot_noise_budget, save_figure
 
 FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
 LAYOUT = fs.Layout.from_polygons([FRAME, shapely.box(10, 0, 12, 8)])
@@ -80,3 +80,21 @@ def test_an_unknown_format_is_refused_and_leaves_nothing(tmp_path):
         save_figure(plot_layout(LAYOUT).figure, tmp_path / "plot.xyz")
 
     assert not list(tmp_path.iterdir())
+
+
+def test_a_noise_budget_has_a_bar_for_each_source_and_class():
+    layout = fs.layout.grid(n_x=4, n_y=1, pitch_um=2.0)
+    sensor = fs.Sensor(layout, read_noise_e=[3.0, 3.0, 5.0, 5.0], prnu_fraction=0.01)
+    noise_e = fs.sensor.noise_budget(sensor, np.full(4, 400.0), 1.0)
+
+    together = plot_noise_budget(noise_e)
+    apart = plot_noise_budget(noise_e, classes=[0, 0, 1, 1])
+
+    names = [text.get_text() for text in together.get_yticklabels()]
+    assert names == ["shot of light", "read", "quantisation", "photo response"]
+    widths = [bar.get_width() for bar in together.patches]
+    assert widths[0] == pytest.approx(20.0)
+    assert widths[1] == pytest.approx(np.sqrt(17.0))
+    assert [bar.get_width() for bar in apart.patches][1::4] == pytest.approx([3.0, 5.0])
+    with pytest.raises(ParameterError, match="'classes' must be one for each of the 4 sites"):
+        plot_noise_budget(noise_e, classes=[0, 1])

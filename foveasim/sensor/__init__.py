@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from foveasim.sensor._sensor import Sensor
+from foveasim.sensor.budget import FIXED, TEMPORAL, noise_budget
 from foveasim.sensor.crosstalk import Coupling, Diffusion, KernelCrosstalk, Mixing
 from foveasim.sensor.noise import draw_shot_noise
 from foveasim.sensor.spectral import FilterSet, rgb_filters
@@ -20,6 +21,8 @@ from foveasim.sensor.spectral_measured import camera_filters, ccd_qe
 from foveasim.sensor.spectral_tables import PolynomialCurve, SplineCurve, StepCurve, TableCurve
 
 __all__ = [
+    "FIXED",
+    "TEMPORAL",
     "BandMean",
     "ConstantCurve",
     "Coupling",
@@ -40,6 +43,7 @@ __all__ = [
     "camera_filters",
     "ccd_qe",
     "draw_shot_noise",
+    "noise_budget",
     "read_curve",
     "read_filters",
     "rgb_filters",

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from foveasim.view.plots import plot_capture, plot_layout, save_figure
+from foveasim.view.plots import plot_capture, plot_layout, plot_noise_budget, save_figure
 
-__all__ = ["plot_capture", "plot_layout", "save_figure"]
+__all__ = ["plot_capture", "plot_layout", "plot_noise_budget", "save_figure"]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from foveasim.arrays import Floats, check_choice, finite_array
 from foveasim.capture import Capture
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.collections import Collection
     from matplotlib.figure import Figure
 
-__all__ = ["plot_capture", "plot_layout", "save_figure"]
+__all__ = ["plot_capture", "plot_layout", "plot_noise_budget", "save_figure"]
 
 #: Colours of filters by their names; others take matplotlib's cycle.
 FILTER_COLOURS = {"R": (1.0, 0.25, 0.2), "G": (0.3, 0.9, 0.3), "B": (0.3, 0.45, 1.0), "all": (1.0, 1.0, 1.0)}
@@ -117,6 +119,53 @@ def plot_capture(capture: Capture, *, of: str = "code", ax: Axes | None = None) 
     base = np.array([FILTER_COLOURS.get(name, (1.0, 1.0, 1.0)) for name in capture.filter_names])
     share = (values / max(float(values.max(initial=0.0)), 1.0)) ** DISPLAY_GAMMA
     return plot_layout(capture.layout, colours=base[capture.filter_of_site] * share[:, np.newaxis], ax=ax)
+
+
+def plot_noise_budget(
+    noise_e: Mapping[str, Floats], *, classes: ArrayLike | None = None, ax: Axes | None = None
+) -> Axes:
+    """
+    Draw the noise budget as bars: the root of the mean square of every source, temporal sources above fixed ones.
+
+    Parameters
+    ----------
+    noise_e : mapping of (n_site,) arrays, e-
+        From :func:`foveasim.sensor.noise_budget`.
+    classes : (n_site,) integers, optional
+        Sites of the same number share bars, such as a column of sizes or the channel; by default all do.
+    ax : matplotlib axes, optional
+        New ones by default.
+
+    Returns
+    -------
+    matplotlib axes
+
+    Raises
+    ------
+    ParameterError
+        When there is not one class a site.
+    """
+    from matplotlib.figure import Figure
+
+    if ax is None:
+        ax = Figure(figsize=(7.0, 4.5), layout="constrained").add_subplot()
+    n_sites = next(iter(noise_e.values())).size
+    labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(classes)
+    if labels.shape != (n_sites,):
+        raise ParameterError("classes", f"must be one for each of the {n_sites} sites, got {labels.shape}")
+    shown = {name: values for name, values in noise_e.items() if np.any(values > 0.0)}
+    kinds = np.unique(labels)
+    for k, kind in enumerate(kinds):
+        sizes_e = [float(np.sqrt(np.mean(values[labels == kind] ** 2))) for values in shown.values()]
+        places = np.arange(len(shown)) + (k - 0.5 * (kinds.size - 1)) * 0.8 / kinds.size
+        ax.barh(places, sizes_e, height=0.8 / kinds.size, label=None if kinds.size == 1 else f"class {kind}")
+    ax.set_yticks(range(len(shown)), list(shown))
+    ax.invert_yaxis()
+    ax.set_xscale("log")
+    ax.set_xlabel("noise / e- rms")
+    if kinds.size > 1:
+        ax.legend()
+    return ax
 
 
 def save_figure(figure: Figure, path: str | Path, dpi: float = 150.0) -> None:

@@ -1,0 +1,75 @@
+"""The noise budget: its parts, and their sum against the prediction of the whole chain."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.constants
+
+from foveasim.errors import ParameterError
+from foveasim.layout import grid
+from foveasim.sensor import FIXED, TEMPORAL, Sensor, noise_budget
+
+N = 400
+LINE = grid(n_x=N, n_y=1, pitch_um=2.0).with_columns(readout_line=np.arange(N))
+
+
+def test_the_sources_have_their_textbook_sizes():
+    """kTC of 0.1 pF at 300 K: 127.0 e-; 8 bits of 3 V on it: 7314 e- a step, 2111 e- rms (physics of the paper's run)."""
+    sensor = Sensor(
+        LINE,
+        ktc_noise=True,
+        read_noise_e=4.0,
+        dark_e_per_s=900.0,
+        prnu_fraction=0.01,
+        pixel_fpn_fraction=0.02,
+        capacitance_f=1e-13,
+    )
+
+    noise_e = noise_budget(sensor, np.full(N, 40_000.0), 1.0)
+
+    assert tuple(noise_e) == (*TEMPORAL, *FIXED)
+    expected = {
+        "shot of light": 200.0,
+        "shot of dark charge": 30.0,
+        "reset": 127.0,
+        "read": 4.0,
+        "quantisation": 2111.4,
+        "photo response": 400.0,
+        "offset of pixels": 0.02 * 1.8724e6,
+        "gain": 0.0,
+        "telegraph": 0.0,
+    }
+    for name, size_e in expected.items():
+        assert noise_e[name] == pytest.approx(np.full(N, size_e), rel=5e-4, abs=1e-9)
+
+
+@pytest.mark.parametrize("companding", [{}, {"companding": "root"}, {"companding": "log", "log_strength": 5.0}])
+@pytest.mark.parametrize("bend", [0.0, 0.1])
+def test_temporal_sources_add_up_to_the_variance_of_the_code(companding, bend):
+    full_e = 20_000.0
+    sensor = Sensor(
+        LINE,
+        bits=10,
+        capacitance_f=full_e * scipy.constants.e / 3.0,
+        dark_e_per_s=200.0,
+        read_noise_e=60.0,
+        ktc_noise=True,
+        nonlinearity_fraction=bend,
+        **companding,
+    )
+    photo_e = np.linspace(4000.0, 15_000.0, N)
+    budget = noise_budget(sensor, photo_e, 1.0)
+    mean_dn, variance_dn2 = sensor.predict(sensor.expected_electrons(photo_e, 1.0))
+
+    slope_dn_per_e = np.gradient(mean_dn, photo_e)
+    total_e2 = sum(budget[name] ** 2 for name in TEMPORAL)
+    inner = slice(5, -5)
+    assert np.mean(variance_dn2[inner] / slope_dn_per_e[inner] ** 2 / total_e2[inner]) == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_list_that_is_not_one_a_site_is_refused():
+    with pytest.raises(ParameterError, match="'photo_e_per_s' must be 400 numbers, one a site, got"):
+        noise_budget(Sensor(LINE), np.ones(3), 1.0)
+    with pytest.raises(ParameterError, match="'exposure_s' must be >= 0"):
+        noise_budget(Sensor(LINE), np.ones(N), -1.0)
