@@ -14,6 +14,7 @@ import argparse
 import json
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +27,8 @@ from rich.console import Console
 
 import foveasim as fs
 from foveasim.parallel import thread_count
+from foveasim.sensor.noise import in_blocks
+from foveasim.streams import Streams
 from layouts import bench_layouts
 
 #: The largest picture of the paper.
@@ -200,6 +203,60 @@ def bench_distortion(report: Report, shape: tuple[int, int]) -> None:
     report.slower_than(f"{squares.n_sites:,} distorted squares", times["squares bent"], "undistorted", times["squares"])
 
 
+def bench_sensor(report: Report, n_side: int) -> None:
+    """Measure the whole electronic chain, every noise on, against its bound a site and the random numbers that it draws."""
+    layout = fs.layout.hexagonal(n_columns=n_side, n_rows=n_side, pitch_um=2.0)
+    layout = layout.with_columns(readout_line=np.arange(layout.n_sites) % n_side)
+    sensor = fs.Sensor(
+        layout,
+        prnu_fraction=0.01,
+        dark_e_per_s=20.0,
+        dsnu_fraction=0.1,
+        hot_fraction=1e-4,
+        hot_e_per_s=1e4,
+        dead_fraction=1e-4,
+        crosstalk=fs.sensor.Diffusion(spread_um=0.3),
+        full_well_e=1e5,
+        ktc_noise=True,
+        read_noise_e=3.0,
+        rts_fraction=0.01,
+        rts_e=10.0,
+        gain_fpn_fraction=0.01,
+        nonlinearity_fraction=0.02,
+        pixel_fpn_fraction=0.02,
+        line_fpn_fraction=0.02,
+        bits=12,
+        companding="root",
+        inl_dn=[0.0, 1.0, -1.0, 0.0],
+        dnl_dn=0.5,
+        capacitance_f=2e-15,
+    )
+    light_e_per_s = np.full(layout.n_sites, 5000.0)
+
+    def chain() -> np.ndarray:
+        streams = Streams(1)
+        return sensor.read(
+            sensor.collect(sensor.expected_electrons(light_e_per_s, 1.0), streams=streams), streams=streams
+        )
+
+    def numbers() -> None:
+        # Shot, reset and read noise.
+        for effect in ("shot", "reset", "read"):
+            in_blocks(
+                layout.n_sites, lambda k, sites, e=effect: Streams(1).of(e, k).standard_normal(sites.stop - sites.start)
+            )
+
+    times = best_s({"chain": chain, "numbers": numbers}, 8)
+    ns = 1e9 * times["chain"] / layout.n_sites
+    report.add(f"sensor, every noise, {layout.n_sites:,} sites", f"{ns:.3g} ns", "a site", "", ns, 60)
+    report.slower_than("the same", times["chain"], "its Gaussian numbers alone", times["numbers"])
+    tracemalloc.start()
+    chain()
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    report.add("memory of the same", "", "arrays of float64 a site", "", peak / (8 * layout.n_sites), 4)
+
+
 MEMORY_PROBE = """
 import sys, numpy as np
 sys.path.insert(0, sys.argv[1])
@@ -251,6 +308,8 @@ def main() -> int:
     for bench in (bench_integrator, bench_optics, bench_distortion, bench_wavelengths, bench_memory):
         with console.status(bench.__name__.replace("_", " ")):
             bench(report, shape)
+    with console.status("bench sensor"):
+        bench_sensor(report, 100 if is_quick else 1000)
     with console.status("bench layouts"):
         bench_layouts(report, 10_000 if is_quick else 1_000_000)
     bench_import(report)
