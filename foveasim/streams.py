@@ -41,9 +41,9 @@ class Streams:
     number of threads or processes.
 
     Stability: with the same versions of this package and of numpy a seed gives the same numbers, bit for bit, on any machine;
-    every capture records both versions. Between versions numbers may change (numpy promises the raw words of its generators, not
-    what its distributions make of them); where ours do, the changelog says so. What is fixed in a device comes from published
-    counter-based generators, and stays.
+    every capture records both versions. Between versions numbers may change (numpy promises the raw words of its generators,
+    not what its distributions make of them); where ours do, the changelog says so. What is fixed in a device comes from
+    published counter-based generators, and stays.
     """
 
     seed: int

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -412,6 +414,57 @@ def test_sites_without_an_effect_of_their_own_draw_as_before():
     moved = on.read(charge, streams=Streams(0)) != off.read(charge, streams=Streams(0))
 
     assert set(np.flatnonzero(moved)) <= set(on.telegraph_sites)
+
+
+@pytest.mark.parametrize("effect", ["prnu_fraction", "dsnu_fraction", "gain_fpn_fraction", "pixel_fpn_fraction", "dnl_dn", "line_fpn_fraction", "dead_fraction", "hot_fraction", "rts_fraction"])  # fmt: skip
+def test_a_crop_of_a_sensor_reads_the_same_codes_as_the_whole(effect):
+    """Without temporal noise, whose numbers are those of places in the list of sites."""
+    quiet = {**ALL, "shot_noise": "off", "ktc_noise": False, "read_noise_e": 0.0, "rts_e": 0.0, effect: ALL[effect]}
+    ids = np.random.default_rng(1).permutation(N)[:5000]
+    crop = Sensor(MANY[ids], **{**FINE, **quiet})
+    light_e = np.linspace(100.0, 30_000.0, N)
+
+    whole = sensor(**quiet)
+    codes = [
+        s.read(s.collect(s.expected_electrons(light, 1.0), streams=Streams(0)), streams=Streams(0))
+        for s, light in ((whole, light_e), (crop, light_e[ids]))
+    ]
+
+    assert np.array_equal(codes[1], codes[0][ids])
+    assert set(ids[crop.telegraph_sites]) == set(whole.telegraph_sites) & set(ids)
+
+
+def test_another_process_and_another_order_of_frames_draw_the_same_codes():
+    program = """
+import hashlib, sys
+import numpy as np
+import foveasim as fs
+from foveasim.streams import Streams
+layout = fs.layout.grid(n_x=400, n_y=300, pitch_um=2.0)
+sensor = fs.Sensor(layout, prnu_fraction=0.02, read_noise_e=3.0, ktc_noise=True, dnl_dn=0.5, rts_fraction=0.1, rts_e=9.0, bits=12)
+light = np.linspace(0.0, 500.0, layout.n_sites)
+for frame in map(int, sys.argv[2:]):
+    streams = Streams(9, frame)
+    charge = sensor.collect(sensor.expected_electrons(light, 1.0), streams=streams, n_threads=int(sys.argv[1]))
+    code = sensor.read(charge, streams=streams, n_threads=int(sys.argv[1]))
+    print(frame, hashlib.sha256(code.tobytes()).hexdigest())
+"""
+    runs = [
+        subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=True).stdout
+        for arguments in (("1", "0", "1", "2"), ("3", "2", "0", "1"))
+    ]
+
+    assert len(set(runs[0].splitlines())) == 3
+    assert sorted(runs[0].splitlines()) == sorted(runs[1].splitlines())
+
+
+def test_half_the_sensitivity_is_half_the_light_and_all_of_the_dark_charge():
+    halves = np.where(np.arange(N) % 2, 0.5, 1.0)
+    charge = expected(1000.0, sensitivity=halves, dark_e_per_s=10.0)
+
+    assert np.unique(charge).tolist() == [510.0, 1010.0]
+    with pytest.raises(ParameterError, match=r"'sensitivity' must be <= 1, got 2.0"):
+        sensor(sensitivity=2.0)
 
 
 # -- limits -------------------------------------------------------------------------------------------------------------

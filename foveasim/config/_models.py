@@ -210,6 +210,7 @@ _SensorSection = _model(
     filters=Literal["rgb"] | _FilterSection | None,
     crosstalk=_one_of("kind", {name: _model(name, way) for name, way in _CROSSTALK.items()}) | None,
     coupling=_model("coupling", Coupling) | None,
+    sensitivity=_PerSite,
     dark_e_per_s=_PerSite,
     full_well_e=_PerSite | None,
     read_noise_e=_PerSite,

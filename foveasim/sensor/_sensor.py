@@ -32,7 +32,7 @@ QUADRATURE_NODES = 96
 MOST_INVERTED_E = 700.0
 NO_SITES = read_only(np.zeros(0, np.int64))
 #: Per-site values, and whether they must be above 0.
-_PER_SITE = {"dark_e_per_s": None, "full_well_e": 0.0, "read_noise_e": None, "capacitance_f": 0.0}
+_PER_SITE = {"sensitivity": None, "dark_e_per_s": None, "full_well_e": 0.0, "read_noise_e": None, "capacitance_f": 0.0}
 #: Shares that lie between 0 and 1, and standard deviations as shares.
 _SHARES = {"hot_fraction": 1.0, "dead_fraction": 1.0, "rts_fraction": 1.0, "nonlinearity_fraction": 0.5}
 _SPREADS = ("prnu_fraction", "dsnu_fraction", "pixel_fpn_fraction", "line_fpn_fraction", "gain_fpn_fraction")
@@ -80,6 +80,8 @@ class Sensor:
         :class:`SiliconQE` or :class:`PolynomialCurve`.
     filters : None, "rgb", or FilterSet
         Colour filters; None for a sensor without, whatever the layout's channels, "rgb" for :func:`rgb_filters`.
+    sensitivity : float or (n_site,)
+        Share of the light that a site collects beside its quantum efficiency and filter, as of a smaller lens or opening.
     prnu_fraction : float
         Photo-response non-uniformity: standard deviation of the sites' response over its mean.
     dark_e_per_s : float or (n_site,), e-/s
@@ -138,6 +140,7 @@ class Sensor:
     _: KW_ONLY
     qe: float | Curve | Sequence[float | Curve] = 1.0
     filters: FilterSet | Literal["rgb"] | None = None
+    sensitivity: PerSite = 1.0
     prnu_fraction: float = 0.0
     dark_e_per_s: PerSite = 0.0
     temperature_k: float = 300.0
@@ -185,6 +188,8 @@ class Sensor:
             value = getattr(self, name)
             if value is not None or name != "full_well_e":
                 object.__setattr__(self, name, self._per_site(name, value, above))
+        if np.max(self.sensitivity) > 1.0:
+            raise ParameterError("sensitivity", "must be <= 1", float(np.max(self.sensitivity)))
         if not np.all(
             (np.asarray(self.capacitance_f) >= MIN_CAPACITANCE_F)
             & (np.asarray(self.capacitance_f) <= MAX_CAPACITANCE_F)
@@ -328,13 +333,13 @@ class Sensor:
 
     @cached_property
     def response(self) -> Floats:
-        """Relative response of every site to light, (n_site,) or (1,): PRNU and dead sites."""
-        gain = np.ones(1)
+        """Relative response of every site to light, (n_site,) or (1,): sensitivity, PRNU and dead sites."""
+        gain = np.atleast_1d(np.asarray(self.sensitivity, np.float64))
         if self.prnu_fraction:
-            gain = np.maximum(1.0 + self.prnu_fraction * self.device.normals("prnu"), 0.0)
+            gain = gain * np.maximum(1.0 + self.prnu_fraction * self.device.normals("prnu"), 0.0)
         if self.dead_fraction:
             gain = np.where(self.device.uniforms("dead") < self.dead_fraction, 0.0, gain)
-        return read_only(gain)
+        return read_only(gain.copy())
 
     @cached_property
     def dark_rate_e_per_s(self) -> Floats:

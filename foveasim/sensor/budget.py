@@ -50,7 +50,7 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
     n_sites = sensor.layout.n_sites
     if photo_e_per_s.shape != (n_sites,):
         raise ParameterError("photo_e_per_s", f"must be {n_sites} numbers, one a site, got {photo_e_per_s.shape}")
-    photo_e = photo_e_per_s * exposure_s
+    photo_e = photo_e_per_s * exposure_s * sensor.sensitivity
     # Before DSNU and hot sites.
     heat = 2.0 ** ((sensor.temperature_k - sensor.dark_reference_k) / sensor.dark_doubling_k)
     dark_e = np.broadcast_to(np.asarray(sensor.dark_e_per_s) * heat * exposure_s, (n_sites,))
