@@ -38,15 +38,15 @@ HEAVY = {
 }  # fmt: skip
 #: Names of numbers without a unit, or with the unit of what they are measured with.
 DIMENSIONLESS = {
-    "a", "above", "at_least", "at_most", "blanking", "coefficients", "colours", "companding_table", "contrast", "dpi", "f_number", "factor", "figure_inches", "fill_factor", "k", "k1", "k2", "k3", "k4", "k5", "k6", "kernel",
+    "a", "above", "at_least", "at_most", "blanking", "coefficients", "colours", "companding_table", "contrast", "dpi", "f_number", "factor", "figure_inches", "fill_factor", "gain", "hot_sigmas", "k", "k1", "k2", "k3", "k4", "k5", "k6", "kernel",
     "limit", "log_strength", "magnification", "max_aspect_ratio", "obscuration",
-    "max_density", "max_growth", "max_neighbour_ratio", "max_track_use", "min_density", "min_growth", "neighbour_share", "p1", "p2", "peak", "per_vertex", "qe", "ratio", "rounding",
+    "max_density", "max_growth", "max_neighbour_ratio", "max_track_use", "min_density", "min_growth", "neighbour_share", "noisy_ratio", "p1", "p2", "peak", "per_vertex", "qe", "ratio", "rounding",
     "ring_ratio", "sensitivity", "spectrum", "stretch", "transmission", "value", "values", "weight", "weights", "white", "worst_area_error",
 }  # fmt: skip
 #: Names of parts that no user sees, in cells, pitches or steps as their docstrings say.
 INTERNAL = {
-    "blur_cells", "blur_lambda_n", "cycles", "edge", "extent", "fade", "from_step", "function", "height",
-    "n_across", "moments", "new_radius", "per_step", "pixel", "r2", "radius", "s_x", "s_y", "share", "side", "shares", "slope", "spread", "tables_at",
+    "beside", "blur_cells", "blur_lambda_n", "cycles", "diagonal", "edge", "extent", "fade", "from_step", "function", "height",
+    "n_across", "moments", "new_radius", "per_step", "pixel", "r2", "radius", "right", "s_x", "s_y", "share", "side", "shares", "slope", "spread", "tables_at",
     "tangent2_x", "tangent2_y", "to_step", "upper", "x", "x2", "xy", "y", "y2",
 }  # fmt: skip
 FLOATING = re.compile(r"\b(float|Floats|PerSite)\b")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from foveasim.sensor._sensor import Sensor
 from foveasim.sensor.budget import FIXED, TEMPORAL, noise_budget
+from foveasim.sensor.calibration import Calibration, calibrate, linearised
 from foveasim.sensor.crosstalk import Coupling, Diffusion, KernelCrosstalk, Mixing
+from foveasim.sensor.exposures import Ramp, Rates, fit_ramp, merge_exposures, non_destructive_reads
 from foveasim.sensor.noise import draw_shot_noise
 from foveasim.sensor.spectral import FilterSet, rgb_filters
 from foveasim.sensor.spectral_curves import (
@@ -24,6 +26,7 @@ __all__ = [
     "FIXED",
     "TEMPORAL",
     "BandMean",
+    "Calibration",
     "ConstantCurve",
     "Coupling",
     "Curve",
@@ -35,15 +38,22 @@ __all__ = [
     "PassBand",
     "PolynomialCurve",
     "ProductCurve",
+    "Ramp",
+    "Rates",
     "Sensor",
     "SiliconQE",
     "SplineCurve",
     "StepCurve",
     "TableCurve",
+    "calibrate",
     "camera_filters",
     "ccd_qe",
     "draw_shot_noise",
+    "fit_ramp",
+    "linearised",
+    "merge_exposures",
     "noise_budget",
+    "non_destructive_reads",
     "read_curve",
     "read_filters",
     "rgb_filters",

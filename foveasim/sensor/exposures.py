@@ -1,0 +1,404 @@
+"""
+Several readings of the same sites: exposures merged for a high dynamic range, and reads along one exposure.
+
+Both estimate electrons per second by weights of inverse variance. Shot noise enters the weights by an estimate that all
+readings share, never by a reading's own value, which would favour readings that are low by chance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim.arrays import Floats, Ints, finite_array, read_only
+from foveasim.errors import ParameterError
+from foveasim.sensor._sensor import Sensor
+from foveasim.sensor.calibration import ROUNDING_DN2, Calibration, linearised, nominal_e_per_dn
+from foveasim.sensor.noise import LARGEST_CHARGE_E, draw_shot_noise
+from foveasim.streams import Streams
+
+__all__ = ["Ramp", "Rates", "fit_ramp", "merge_exposures", "non_destructive_reads"]
+
+#: A reading is saturated where it is within so many standard deviations of the noise of reading of the full well.
+MARGIN_SIGMAS = 5.0
+#: Weights fall to 0 over this last share of the range: wide against shot noise, for a charge of more than 400 e-.
+TAPER_SHARE = 0.25
+#: Times that weights are taken from the merged estimate.
+N_PASSES = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Rates:
+    """
+    Estimates of electrons per second.
+
+    Attributes
+    ----------
+    rate_e_per_s : (n_site,) float64, e-/s
+        NaN where no reading could be used.
+    sigma_e_per_s : (n_site,) float64, e-/s
+        Standard deviation that the weights predict: the inverse root of the sum of inverse variances.
+    n_used : (n_site,) int64
+        Number of readings that were used.
+    """
+
+    rate_e_per_s: Floats
+    sigma_e_per_s: Floats
+    n_used: Ints
+
+    def __post_init__(self) -> None:
+        _protect(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Ramp:
+    """
+    Reads along one exposure.
+
+    Attributes
+    ----------
+    times_s : (n_read,) float64, s
+        Of the reads, since the reset.
+    electrons : (n_read, n_site) int64, e-
+        Charge collected so far, without the noise of resetting and reading.
+    code : (n_read, n_site) uint8 or uint16, DN
+    """
+
+    times_s: Floats
+    electrons: Ints
+    code: NDArray[Any]
+
+    def __post_init__(self) -> None:
+        _protect(self)
+
+
+# -- several exposures ------------------------------------------------------------------------------------------------
+
+
+def merge_exposures(
+    code: ArrayLike, exposures_s: ArrayLike, sensor: Sensor, *, calibration: Calibration | None = None
+) -> Rates:
+    """
+    Electrons per second of several exposures of the same light.
+
+    Parameters
+    ----------
+    code : (n_exposure, n_site), DN
+        Codes as the sensor gives them, one row an exposure; not changed.
+    exposures_s : (n_exposure,), s
+        In any order.
+    sensor : Sensor
+        Its converter, capacitances, full well and noises count.
+    calibration : Calibration, optional
+        Takes offsets, dark signal and differences of gain out of the codes. Without one a linear code y is
+        ``y + 1/2`` codes of charge, dark charge is part of the rate, and the sensor's offsets are errors.
+
+    Returns
+    -------
+    Rates
+
+    Raises
+    ------
+    ParameterError
+        When codes, exposures and sensor do not fit together, or a value is out of range.
+    SimulationError
+        When the calibration does not know the dark signal of an exposure.
+
+    Notes
+    -----
+    The charge ``N_j`` of the exposure ``t_j`` has the variance ``v_j = r t_j + dark charge + read² + reset² + step² / 12``, and
+
+    ::
+
+        r = sum_j w_j N_j / t_j / sum_j w_j,    w_j = a_j t_j² / v_j
+
+    with the shot noise of the common r: first ``sum a N / sum a t``, then twice the result. Below saturation ``a = 1``: weights
+    are the inverse variances, and the result's variance is the inverse of their sum (the likeliest r for Gaussian noise; see
+    Granados et al., Optimal HDR reconstruction with linear digital cameras, CVPR 2010).
+
+    Never used are the highest code, and codes within five standard deviations of the full well's. That alone would keep
+    exposures near saturation only when they are low by chance. So ``a`` falls from 1 to 0 over the last quarter of the range,
+    and what is left of this selection is taken off: a weight a(x) that depends on the Gaussian number x itself moves the mean
+    by ``variance * E[a'(x)]`` (C. Stein, Annals of Statistics 9, 1135, 1981). There the predicted variance is that of the
+    result's slopes in all exposures; within two standard deviations of saturation it is too large, by up to a third.
+
+    Codes of 0 are clipped noise: without a pedestal above the read noise, dark sites come out too bright.
+
+    Examples
+    --------
+    A site of 5000 e-/s in two exposures; the second is saturated at 1000 e-:
+
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=1, n_y=1, pitch_um=2.0), bits=10, v_sat_v=1.0, capacitance_f=1.6406288e-16)
+    >>> merge_exposures([[499.5], [1023]], [0.1, 10.0], sensor).rate_e_per_s.round(1).tolist()
+    [5000.0]
+
+    Large and small sites side by side (sub-pixel HDR) are two classes of sites, here of the sensitivities 1 and 0.1:
+
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), bits=10, v_sat_v=1.0, capacitance_f=1.6406288e-16)
+    >>> rates, sensitivity = merge_exposures([[1023, 499.5]], [0.1], sensor), np.array([1.0, 0.1])
+    >>> weight = (sensitivity / rates.sigma_e_per_s) ** 2
+    >>> round(float(np.nansum(weight * rates.rate_e_per_s / sensitivity) / np.nansum(weight)), 1)
+    50000.0
+    """
+    times_s = finite_array("exposures_s", exposures_s, ndim=1, above=0.0)
+    codes, linear_dn, e_per_dn = _readings(code, times_s.size, sensor, "exposure")
+    n_sites = sensor.layout.n_sites
+    dark_e_per_s = np.zeros(1)
+    gain = np.ones(1)
+    offset_dn = np.full((times_s.size, 1), -0.5)
+    if calibration is not None:
+        if not isinstance(calibration, Calibration) or calibration.n_sites != n_sites:
+            raise ParameterError("calibration", f"must be a Calibration of the sensor's {n_sites} sites", calibration)
+        single = calibration.exposure_s is None
+        offset_dn = np.stack([calibration.offset_at(None if single else float(t_s)) for t_s in times_s])
+        gain = np.where(calibration.gain > 0.0, calibration.gain, np.nan)
+        dark_e_per_s = sensor.dark_rate_e_per_s
+
+    charge_e = (linear_dn - offset_dn) / gain * e_per_dn
+    top_dn = _saturation_dn(sensor)
+    top_e = (top_dn - offset_dn) / gain * e_per_dn
+    fixed_e2 = _read_noise_e2(sensor, codes, e_per_dn) + sensor.ktc_noise_e**2
+    shot = 0.0 if sensor.shot_noise == "off" else 1.0
+    is_used = (codes < 2.0**sensor.bits - 1.0) & (linear_dn < top_dn) & np.isfinite(charge_e) & (top_e > 0.0)
+    t_s = times_s[:, None]
+    rates = np.where(is_used, charge_e, 0.0) / t_s
+    width = TAPER_SHARE * np.where(is_used, top_e, 1.0) / t_s
+    taper = np.where(is_used, np.clip((np.where(is_used, top_e, 0.0) / t_s - rates) / width, 0.0, 1.0), 0.0)
+    falling = np.where((taper > 0.0) & (taper < 1.0), -1.0 / width, 0.0)
+    is_known = taper.any(axis=0)
+    whole = np.where(is_known, (taper * t_s).sum(axis=0), 1.0)
+    rate = (taper * rates * t_s).sum(axis=0) / whole
+    share = taper
+    for _ in range(N_PASSES):
+        information = t_s**2 / (shot * (np.maximum(rate, 0.0) + dark_e_per_s) * t_s + fixed_e2)
+        whole = np.where(is_known, (taper * information).sum(axis=0), 1.0)
+        share = taper * information / whole
+        rate = (share * rates).sum(axis=0)
+    slope = share + falling * information / whole * (rates - rate)
+    rate = rate - (falling * (1.0 - share)).sum(axis=0) / whole
+    variance = (slope**2 / information).sum(axis=0)
+    return Rates(
+        rate_e_per_s=np.where(is_known, rate, np.nan),
+        sigma_e_per_s=np.where(is_known, np.sqrt(variance), np.nan),
+        n_used=np.count_nonzero(taper, axis=0).astype(np.int64),
+    )
+
+
+# -- reads along one exposure -----------------------------------------------------------------------------------------
+
+
+def non_destructive_reads(
+    sensor: Sensor, photo_e_per_s: ArrayLike, times_s: ArrayLike, *, streams: Streams, n_threads: int | None = None
+) -> Ramp:
+    """
+    Reads of one charge while it collects.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    photo_e_per_s : number or (n_site,), e-/s
+        As :meth:`foveasim.Camera.photoelectrons_per_s` gives it.
+    times_s : (n_read,), s
+        Of the reads since the reset, rising.
+    streams : Streams
+        Of the frame.
+    n_threads : int, optional
+        All cores by default. Draws do not depend on it.
+
+    Returns
+    -------
+    Ramp
+
+    Raises
+    ------
+    ParameterError
+        When times do not rise, or there is not one rate a site.
+
+    Notes
+    -----
+    What comes between two reads is drawn by itself and added, then the full well cuts off: later charges contain earlier ones,
+    ``cov(N_i, N_j) = E[N_i]`` for ``i <= j``, and increments are uncorrelated. Noise of reading is drawn for each read; that of
+    resetting once, the same in all reads. A telegraph's state is drawn for each read, as if it were fast.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), shot_noise="off", full_well_e=500.0)
+    >>> non_destructive_reads(sensor, [100.0, 300.0], [1.0, 2.0, 3.0], streams=Streams(0)).electrons.tolist()
+    [[100, 300], [200, 500], [300, 500]]
+    """
+    times = _rising("times_s", times_s)
+    if not isinstance(sensor, Sensor):
+        raise ParameterError("sensor", f"must be a foveasim.Sensor, got a {type(sensor).__name__}")
+    n_sites = sensor.layout.n_sites
+    light = finite_array("photo_e_per_s", photo_e_per_s, at_least=0.0)
+    if light.shape not in ((), (n_sites,)):
+        raise ParameterError(
+            "photo_e_per_s", f"must be one number, or one for each of the {n_sites} sites, got the shape {light.shape}"
+        )
+    per_s = sensor.expected_electrons(np.broadcast_to(light, n_sites), 1.0)
+    well_e = LARGEST_CHARGE_E if sensor.full_well_e is None else np.minimum(sensor.full_well_e, LARGEST_CHARGE_E)
+    well_e = np.floor(well_e).astype(np.int64)
+    reset_e = sensor.ktc_noise_e * streams.of("reset").standard_normal(n_sites)
+    # The noise of resetting is in the charge already.
+    reader = replace(sensor, ktc_noise=False) if sensor.ktc_noise_e.any() else sensor
+    electrons = np.empty((times.size, n_sites), np.int64)
+    codes = []
+    collected = np.zeros(n_sites, np.int64)
+    for k, interval_s in enumerate(np.diff(times, prepend=0.0)):
+        own = Streams(int(streams.of("read of a ramp", k).integers(2**63)), streams.frame)
+        if sensor.shot_noise == "off":
+            collected = draw_shot_noise(per_s * times[k], "off", sensor.gaussian_above_e, own)
+        else:
+            collected = collected + draw_shot_noise(
+                per_s * interval_s, sensor.shot_noise, sensor.gaussian_above_e, own, n_threads=n_threads
+            )
+        collected = np.minimum(collected, well_e)
+        electrons[k] = collected
+        charge: Any = collected if reader is sensor else collected + reset_e
+        codes.append(reader.read(charge, streams=own, n_threads=n_threads))
+    return Ramp(times_s=times, electrons=electrons, code=np.stack(codes))
+
+
+def fit_ramp(
+    code: ArrayLike, times_s: ArrayLike, sensor: Sensor, *, weight_rate_e_per_s: ArrayLike | None = None
+) -> Rates:
+    """
+    Slopes of ramps: electrons per second of reads along one exposure.
+
+    Parameters
+    ----------
+    code : (n_read, n_site), DN
+        Codes as the sensor gives them; not changed.
+    times_s : (n_read,), s
+        Rising.
+    sensor : Sensor
+        Its converter, capacitances, full well and noise of reading count.
+    weight_rate_e_per_s : number or (n_site,), optional, e-/s
+        Rate that the weights are of; by default each site's own, from its first and last usable read.
+
+    Returns
+    -------
+    Rates
+        Dark charge is part of the rate. NaN where fewer than two reads could be used.
+
+    Raises
+    ------
+    ParameterError
+        When codes, times and sensor do not fit together, or a value is out of range.
+
+    Notes
+    -----
+    Differences of one read and the next have no offset and no noise of resetting. Their covariance has ``r dt_k + 2 s²`` on the
+    diagonal and ``-s²`` beside it, with the noise s of reading and rounding; the slope is the one of generalised least squares,
+    solved in time proportional to the reads (T. D. Brandt, PASP 136, 045004, 2024; arXiv:2309.08753).
+
+    For given ``weight_rate_e_per_s`` the slope is a fixed sum of the reads, and so unbiased; for weights of the site's own
+    rate it is off by a fraction of an electron a ramp.
+
+    Reads count up to the first that is saturated (the highest code, or within five standard deviations of the full well's).
+    """
+    times = _rising("times_s", times_s)
+    if times.size < 2:
+        raise ParameterError("times_s", "must be at least two times", times_s, "s")
+    codes, linear_dn, e_per_dn = _readings(code, times.size, sensor, "read")
+    n_sites = sensor.layout.n_sites
+    charge_e = linear_dn * e_per_dn
+    noise_e2 = _read_noise_e2(sensor, codes, e_per_dn)
+    is_below = (codes < 2.0**sensor.bits - 1.0) & (linear_dn < _saturation_dn(sensor))
+    is_used = np.logical_and.accumulate(is_below, axis=0)
+    n_used = np.count_nonzero(is_used, axis=0).astype(np.int64)
+    last = np.maximum(n_used - 1, 0)
+    lasted_s = times[last] - times[0]
+    if weight_rate_e_per_s is None:
+        rise_e = charge_e[last, np.arange(n_sites)] - charge_e[0]
+        rate = np.divide(rise_e, lasted_s, out=np.zeros(n_sites), where=lasted_s > 0.0)
+    else:
+        rate = finite_array("weight_rate_e_per_s", weight_rate_e_per_s)
+        if rate.shape not in ((), (n_sites,)):
+            raise ParameterError(
+                "weight_rate_e_per_s", f"must be one number, or one for each of the {n_sites} sites, got {rate.shape}"
+            )
+    if sensor.shot_noise == "off":
+        rate = np.zeros(1)
+    dt_s = np.where(is_used[1:], np.diff(times)[:, None], 0.0)
+    rise_e = np.where(is_used[1:], np.diff(charge_e, axis=0), 0.0)
+    diagonal = np.where(is_used[1:], np.maximum(rate, 0.0) * dt_s + noise_e2[:-1] + noise_e2[1:], 1.0)
+    beside = np.where(is_used[2:], -noise_e2[1:-1], 0.0)
+    weights = _solved(diagonal, beside, dt_s)
+    information = (weights * dt_s).sum(axis=0)
+    is_known = n_used >= 2
+    information = np.where(is_known, information, 1.0)
+    return Rates(
+        rate_e_per_s=np.where(is_known, (weights * rise_e).sum(axis=0) / information, np.nan),
+        sigma_e_per_s=np.where(is_known, 1.0 / np.sqrt(information), np.nan),
+        n_used=n_used,
+    )
+
+
+# -- parts ------------------------------------------------------------------------------------------------------------
+
+
+def _protect(carrier: Any) -> None:
+    for field in fields(carrier):
+        object.__setattr__(carrier, field.name, read_only(np.asarray(getattr(carrier, field.name)).view()))
+
+
+def _rising(name: str, times_s: ArrayLike) -> Floats:
+    times = finite_array(name, times_s, ndim=1, at_least=0.0)
+    if times.size == 0 or np.any(np.diff(times) <= 0.0):
+        raise ParameterError(name, "must be one or more times, each later than the one before", times_s, "s")
+    return times
+
+
+def _readings(code: ArrayLike, n_readings: int, sensor: Sensor, what: str) -> tuple[Floats, Floats, Floats]:
+    """Codes (n_reading, n_site), linear codes, and electrons of one."""
+    linear_dn = linearised(code, sensor)
+    codes = np.asarray(code, np.float64)
+    if codes.shape != (n_readings, sensor.layout.n_sites):
+        raise ParameterError(
+            "code",
+            f"must have a row for each {what} and a column for each site, {(n_readings, sensor.layout.n_sites)}, "
+            f"got the shape {codes.shape}",
+        )
+    return codes, linear_dn, nominal_e_per_dn(sensor)
+
+
+def _read_noise_e2(sensor: Sensor, codes: NDArray[Any], e_per_dn: Floats) -> Floats:
+    """Variance of reading and rounding, (n_reading, n_site) e-²; wider apart codes round more."""
+    table = linearised(np.arange(2**sensor.bits), sensor)
+    step_dn = np.interp(codes, np.arange(table.size), np.gradient(table)) if table.size > 1 else np.ones(codes.shape)
+    # Without shot noise charges are whole electrons by rounding.
+    whole_e2 = ROUNDING_DN2 if sensor.shot_noise == "off" else 0.0
+    return np.asarray((step_dn * e_per_dn) ** 2 * ROUNDING_DN2 + whole_e2 + np.square(sensor.read_noise_e))
+
+
+def _saturation_dn(sensor: Sensor) -> Floats:
+    """Linear code from which a site is taken as saturated: the highest, or its full well's, less the noise of reading."""
+    n_sites = sensor.layout.n_sites
+    top_dn = np.full(n_sites, float(linearised(2**sensor.bits - 1, sensor)))
+    if sensor.full_well_e is None:
+        return top_dn
+    still = replace(sensor, read_noise_e=0.0, ktc_noise=False, rts_e=0.0, coupling=None)
+    well_e = np.floor(np.minimum(np.broadcast_to(sensor.full_well_e, n_sites), LARGEST_CHARGE_E)).astype(np.int64)
+    well_dn = linearised(still.read(well_e, streams=Streams(0)), sensor)
+    noise_dn = np.sqrt(np.square(sensor.read_noise_e) + sensor.ktc_noise_e**2) / nominal_e_per_dn(sensor)
+    return np.minimum(top_dn, well_dn - MARGIN_SIGMAS * noise_dn - 1.0)
+
+
+def _solved(diagonal: Floats, beside: Floats, right: Floats) -> Floats:
+    """Solutions of symmetric tridiagonal systems, one a column: elimination downwards, then upwards."""
+    n = diagonal.shape[0]
+    pivot, solved = diagonal.copy(), right.copy()
+    for k in range(1, n):
+        factor = beside[k - 1] / pivot[k - 1]
+        pivot[k] -= factor * beside[k - 1]
+        solved[k] -= factor * solved[k - 1]
+    solved[-1] /= pivot[-1]
+    for k in range(n - 2, -1, -1):
+        solved[k] = (solved[k] - beside[k] * solved[k + 1]) / pivot[k]
+    return solved

@@ -1,0 +1,383 @@
+"""Merged exposures and ramps against the light that was put in, and against the variances that theory gives."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import scipy.constants
+
+from foveasim.errors import ParameterError, SimulationError
+from foveasim.layout import grid
+from foveasim.sensor import Calibration, Sensor, calibrate, fit_ramp, merge_exposures, non_destructive_reads
+from foveasim.streams import Streams
+
+SIGMAS = 5.0
+N = 20_000
+ROW = grid(n_x=200, n_y=100, pitch_um=2.0)
+E_PER_DN = 2.5
+#: 12 bits of 2.5 electrons each, noise of reading well above a code: rounding is even.
+SENSOR = {"bits": 12, "v_sat_v": 1.0, "capacitance_f": E_PER_DN * 4096 * scipy.constants.e, "read_noise_e": 6.0}
+FULL_E = 4095 * E_PER_DN
+EXPOSURES_S = [1e-3, 0.03, 1.0]
+PEDESTAL_DN = 20.0
+
+
+def pedestal(n_sites=N):
+    """A calibration of a device whose only fault is an offset of 20 codes."""
+    dark = np.full((2, n_sites), PEDESTAL_DN - 0.5)
+    return Calibration.from_frames(dark, dark[:1] + 100.0, highest_dn=4095)
+
+
+def exposed(rate_e_per_s, exposures_s, seed, n_sites=N, full_well_e=math.inf):
+    """Codes of Poisson's charges with Gaussian noise of reading on a pedestal, by numpy alone."""
+    rng = np.random.default_rng(seed)
+    codes = []
+    for t_s in exposures_s:
+        charge_e = np.minimum(rng.poisson(rate_e_per_s * t_s, n_sites), full_well_e) + rng.normal(0.0, 6.0, n_sites)
+        codes.append(np.clip(np.floor(charge_e / E_PER_DN + PEDESTAL_DN), 0, 4095))
+    return np.array(codes)
+
+
+# -- several exposures ------------------------------------------------------------------------------------------------
+
+
+def test_without_noise_and_rounding_the_light_comes_out_exactly():
+    """Codes between whole ones, as a converter without steps would give them; weights that fall correct for rounding."""
+    rate = np.geomspace(2e3, 1e7, 200)
+    code = np.minimum(rate * np.array(EXPOSURES_S)[:, None] / E_PER_DN - 0.5, 4095.0)
+    sensor = Sensor(ROW[:200], **{**SENSOR, "shot_noise": "off", "read_noise_e": 0.0})
+
+    merged = merge_exposures(code, EXPOSURES_S, sensor)
+
+    is_falling = ((code > 3000.0) & (code < 4095.0)).any(axis=0)
+    assert merged.rate_e_per_s[~is_falling] == pytest.approx(rate[~is_falling], rel=1e-12)
+    assert merged.rate_e_per_s == pytest.approx(rate, rel=1e-4)
+    assert set(merged.n_used) == {1, 2, 3}
+
+
+@pytest.mark.parametrize("companding", ["linear", "root", "log"])
+def test_without_noise_the_light_comes_out_to_the_rounding_of_charge_and_code(companding):
+    """Both are off by a half at most: 2.5 of their standard deviations in one exposure, at most 4.3 in three together."""
+    rate = np.geomspace(100.0, 1e7, 200)
+    sensor = Sensor(ROW[:200], **{**SENSOR, "companding": companding, "shot_noise": "off", "read_noise_e": 0.0})
+    charge_e = np.array([np.rint(rate * t_s).astype(np.int64) for t_s in EXPOSURES_S])
+    code = np.array([sensor.read(row, streams=Streams(0)) for row in charge_e])
+
+    merged = merge_exposures(code, EXPOSURES_S, sensor)
+
+    assert merged.n_used.min() >= 1
+    assert np.abs((merged.rate_e_per_s - rate) / merged.sigma_e_per_s).max() < 4.3
+    assert np.abs(merged.rate_e_per_s / rate - 1.0).max() < 0.02
+
+
+@pytest.mark.parametrize("rate_e_per_s", [30.0, 300.0, 3e3, 9.5e3, 1.05e4, 3e4, 3.2e5, 3e6])
+def test_five_decades_of_light_are_unbiased_with_the_variance_of_the_weights(rate_e_per_s):
+    sensor = Sensor(ROW, **SENSOR)
+
+    merged = merge_exposures(exposed(rate_e_per_s, EXPOSURES_S, 1), EXPOSURES_S, sensor, calibration=pedestal())
+
+    rate, sigma = merged.rate_e_per_s, merged.sigma_e_per_s
+    variance = np.mean(sigma**2)
+    assert np.isfinite(rate).all()
+    assert rate.mean() == pytest.approx(rate_e_per_s, abs=SIGMAS * math.sqrt(variance / N))
+    assert rate.var() == pytest.approx(variance, rel=SIGMAS * math.sqrt(2.0 / N))
+
+
+@pytest.mark.parametrize("share", [0.72, 0.76, 0.8, 0.9, 0.97, 0.99, 1.0, 1.01, 1.03])
+def test_exposures_about_saturation_are_unbiased_too(share):
+    """Keeping them whenever they are below, only when they are low by chance, would be off by 13 standard errors."""
+    rate_e_per_s = share * (4095 - PEDESTAL_DN) * E_PER_DN
+
+    merged = merge_exposures(
+        exposed(rate_e_per_s, EXPOSURES_S, 11), EXPOSURES_S, Sensor(ROW, **SENSOR), calibration=pedestal()
+    )
+
+    variance = np.mean(merged.sigma_e_per_s**2)
+    assert merged.rate_e_per_s.mean() == pytest.approx(rate_e_per_s, abs=SIGMAS * math.sqrt(variance / N))
+    assert 0.65 < merged.rate_e_per_s.var() / variance < 1.0 + SIGMAS * math.sqrt(2.0 / N)
+
+
+def test_the_variance_is_that_of_the_best_weights():
+    """Both exposures below saturation: the inverse of the sum of both inverse variances, in closed form."""
+    sensor = Sensor(ROW, **SENSOR)
+    rate, exposures_s = 2000.0, [0.2, 1.0]
+
+    merged = merge_exposures(exposed(rate, exposures_s, 2), exposures_s, sensor, calibration=pedestal())
+
+    fixed_e2 = 36.0 + E_PER_DN**2 / 12
+    information = sum(t_s**2 / (rate * t_s + fixed_e2) for t_s in exposures_s)
+    assert (merged.n_used == 2).all()
+    assert np.mean(merged.sigma_e_per_s**2) == pytest.approx(1 / information, rel=1e-3)
+    assert merged.rate_e_per_s.var() == pytest.approx(1 / information, rel=SIGMAS * math.sqrt(2.0 / N))
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
+def test_saturated_codes_are_never_used(order):
+    """A light that saturates the longer exposures: the result is that of the shortest, whatever the others say."""
+    sensor = Sensor(ROW, **SENSOR)
+    exposures_s = [1e-3, 0.1, 1.0]
+    codes = exposed(2e6, exposures_s, 3)
+    assert (codes[1:] == 4095).all()
+
+    merged = merge_exposures(codes[list(order)], [exposures_s[k] for k in order], sensor, calibration=pedestal())
+    alone = merge_exposures(codes[:1], exposures_s[:1], sensor, calibration=pedestal())
+
+    assert (merged.n_used == 1).all()
+    assert merged.rate_e_per_s == pytest.approx(alone.rate_e_per_s, rel=1e-12)
+
+
+def test_a_full_well_below_the_highest_code_is_saturation_too():
+    sensor = Sensor(ROW, full_well_e=4000.0, **SENSOR)
+    codes = exposed(1e5, [0.01, 0.1], 4, full_well_e=4000.0)
+    assert codes.max() < 4095
+
+    merged = merge_exposures(codes, [0.01, 0.1], sensor)
+
+    assert (merged.n_used == 1).all()
+
+
+def test_where_all_is_saturated_there_is_no_number():
+    merged = merge_exposures(np.full((2, 3), 4095), [0.1, 1.0], Sensor(ROW[:3], **SENSOR))
+
+    assert np.isnan(merged.rate_e_per_s).all()
+    assert np.isnan(merged.sigma_e_per_s).all()
+    assert merged.n_used.tolist() == [0, 0, 0]
+
+
+def test_a_dark_site_keeps_its_long_exposure_though_the_short_one_says_nothing():
+    """Read noise of the shortest exposure, carried to the longest, is ten times the range."""
+    sensor = Sensor(ROW, **SENSOR)
+    exposures_s = [1e-4, 1.0]
+
+    merged = merge_exposures(exposed(50.0, exposures_s, 5), exposures_s, sensor, calibration=pedestal())
+
+    assert (merged.n_used == 2).all()
+    assert merged.rate_e_per_s.mean() == pytest.approx(50.0, abs=SIGMAS * math.sqrt((50.0 + 37.0) / N))
+
+
+def test_a_calibration_takes_the_device_out():
+    """All fixed patterns, in the package's own chain."""
+    sensor = Sensor(
+        ROW,
+        prnu_fraction=0.02,
+        gain_fpn_fraction=0.01,
+        pixel_fpn_fraction=0.002,
+        dark_e_per_s=2000.0,
+        dsnu_fraction=0.1,
+        **SENSOR,
+    )
+    calibration = calibrate(sensor, exposure_s=0.1, flat_e=5000.0, n_frames=200, seed=1, long_exposure_s=0.4)
+    exposures_s, rate = [0.05, 0.2], 2e4
+    codes = []
+    for k, t_s in enumerate(exposures_s):
+        expected_e = sensor.expected_electrons(np.full(N, rate), t_s)
+        streams = Streams(9, k)
+        codes.append(sensor.read(sensor.collect(expected_e, streams=streams), streams=streams))
+    seen = ~calibration.clipped
+
+    merged = merge_exposures(codes, exposures_s, sensor, calibration=calibration)
+
+    off = (merged.rate_e_per_s - rate)[seen]
+    assert seen.mean() > 0.9
+    assert abs(off.mean()) < 2e-3 * rate
+    # The calibration's own errors come on top: a few percent of the variance.
+    assert off.var() == pytest.approx(np.mean(merged.sigma_e_per_s[seen] ** 2), rel=0.1)
+
+
+# -- ramps ------------------------------------------------------------------------------------------------------------
+
+TIMES_S = [0.5, 1.0, 1.5, 2.5, 3.0, 4.0]
+
+
+@pytest.mark.parametrize(("rate_e_per_s", "shot_noise"), [(15.0, "auto"), (15.0, "exact"), (900.0, "auto")])
+def test_reads_contain_the_earlier_ones_and_increments_are_uncorrelated(rate_e_per_s, shot_noise):
+    sensor = Sensor(ROW, shot_noise=shot_noise, **SENSOR)
+    times = np.array(TIMES_S)
+
+    electrons = non_destructive_reads(sensor, rate_e_per_s, times, streams=Streams(1)).electrons.astype(float)
+
+    covariance = np.cov(electrons)
+    expected = rate_e_per_s * np.minimum(times[:, None], times)
+    variance = np.diag(expected)
+    # Of a sample covariance of nearly Gaussian numbers; Poisson's excess adds its mean.
+    error = np.sqrt((np.outer(variance, variance) + expected**2 + expected) / N)
+    assert np.abs((covariance - expected) / error).max() < SIGMAS
+    increments = np.diff(electrons, axis=0, prepend=0.0)
+    correlation = np.corrcoef(increments)
+    assert np.abs(correlation[~np.eye(len(times), dtype=bool)]).max() < SIGMAS / math.sqrt(N)
+    assert increments.min() >= 0.0
+    assert electrons.mean(axis=1) == pytest.approx(
+        rate_e_per_s * times, abs=SIGMAS * math.sqrt(rate_e_per_s * times[-1] / N)
+    )
+
+
+def test_noise_of_reading_is_new_in_each_read_and_that_of_resetting_the_same():
+    sensor = Sensor(
+        ROW,
+        bits=16,
+        v_sat_v=1.0,
+        capacitance_f=65_536 * scipy.constants.e,
+        shot_noise="off",
+        ktc_noise=True,
+        read_noise_e=6.0,
+    )
+    reset_e = float(sensor.ktc_noise_e[0])
+
+    code = non_destructive_reads(sensor, 8000.0, TIMES_S, streams=Streams(2)).code.astype(float)
+
+    covariance = np.cov(code)
+    expected = reset_e**2 + np.eye(len(TIMES_S)) * (36.0 + 1 / 12)
+    assert np.abs(covariance / expected - 1.0).max() < SIGMAS * math.sqrt(2.0 / N)
+    increments = np.diff(code, axis=0)
+    assert np.cov(increments)[0, 0] == pytest.approx(72.0 + 2 / 12, rel=SIGMAS * math.sqrt(2.0 / N))
+    assert np.cov(increments)[0, 1] == pytest.approx(-36.0 - 1 / 12, abs=SIGMAS * 72.0 * math.sqrt(1.25 / N))
+
+
+def test_the_full_well_holds_what_it_holds_and_dark_charge_collects_too():
+    sensor = Sensor(ROW[:3], shot_noise="off", full_well_e=[100.5, 1e4, 1e4], dark_e_per_s=[0.0, 0.0, 50.0])
+
+    ramp = non_destructive_reads(sensor, [60.0, 60.0, 0.3], [1.0, 2.0, 3.0], streams=Streams(0))
+
+    assert ramp.electrons.tolist() == [[60, 60, 50], [100, 120, 101], [100, 180, 151]]
+
+
+def test_a_ramp_is_its_seeds_and_frames_alone():
+    sensor = Sensor(ROW, **SENSOR)
+    code = non_destructive_reads(sensor, 300.0, TIMES_S, streams=Streams(3, 1), n_threads=1).code
+
+    assert np.array_equal(code, non_destructive_reads(sensor, 300.0, TIMES_S, streams=Streams(3, 1)).code)
+    longer = non_destructive_reads(sensor, 300.0, [*TIMES_S, 9.0], streams=Streams(3, 1)).code
+    assert np.array_equal(code, longer[:-1])
+    assert (code != non_destructive_reads(sensor, 300.0, TIMES_S, streams=Streams(3, 2)).code).mean() > 0.5
+
+
+def ramp_codes(rate_e_per_s, times_s, seed):
+    """Codes of ramps by numpy alone, on a pedestal."""
+    rng = np.random.default_rng(seed)
+    steps_s = np.diff(times_s, prepend=0.0)
+    charge_e = rng.poisson(rate_e_per_s * steps_s[:, None], (steps_s.size, N)).cumsum(axis=0)
+    codes = (charge_e + rng.normal(0.0, 6.0, charge_e.shape)) / E_PER_DN + PEDESTAL_DN
+    return np.clip(np.floor(codes), 0, 4095)
+
+
+@pytest.mark.parametrize("rate_e_per_s", [0.0, 3.0, 30.0, 300.0, 2000.0])
+def test_slopes_are_unbiased_with_the_variance_of_least_squares(rate_e_per_s):
+    """The oracle inverts the covariance of the reads themselves, with a free offset."""
+    sensor = Sensor(ROW, **SENSOR)
+    times = np.array(TIMES_S)
+    code = ramp_codes(rate_e_per_s, times, 4)
+
+    fit = fit_ramp(code, times, sensor, weight_rate_e_per_s=rate_e_per_s)
+    own = fit_ramp(code, times, sensor)
+
+    noise_e2 = 36.0 + E_PER_DN**2 / 12
+    covariance = rate_e_per_s * np.minimum(times[:, None], times) + noise_e2 * np.eye(times.size)
+    design = np.stack([np.ones(times.size), times], axis=1)
+    inverse = np.linalg.inv(covariance)
+    normal = np.linalg.inv(design.T @ inverse @ design)
+    oracle = (normal @ design.T @ inverse @ ((code - PEDESTAL_DN + 0.5) * E_PER_DN))[1]
+    sigma = math.sqrt(normal[1, 1])
+    assert fit.sigma_e_per_s == pytest.approx(np.full(N, sigma), rel=1e-9)
+    assert fit.rate_e_per_s == pytest.approx(oracle, rel=1e-9, abs=1e-9)
+    assert fit.rate_e_per_s.mean() == pytest.approx(rate_e_per_s, abs=SIGMAS * sigma / math.sqrt(N))
+    assert fit.rate_e_per_s.var() == pytest.approx(sigma**2, rel=SIGMAS * math.sqrt(2.0 / N))
+    # Own weights: less than half an electron over the ramp.
+    assert own.rate_e_per_s.mean() == pytest.approx(rate_e_per_s, abs=0.5 / times[-1] + SIGMAS * sigma / math.sqrt(N))
+    assert own.rate_e_per_s.var() == pytest.approx(sigma**2, rel=0.08)
+
+
+def test_reads_after_saturation_are_not_used():
+    sensor = Sensor(ROW, **SENSOR)
+    times = np.arange(1.0, 9.0)
+    code = ramp_codes(2000.0, times, 5)
+    n_below = (code < 4095).sum(axis=0)
+
+    fit = fit_ramp(code, times, sensor)
+    first_five = fit_ramp(code[:5], times[:5], sensor)
+    code[6:] = 4095
+    assert n_below.max() < 8
+
+    assert np.array_equal(fit.n_used, n_below)
+    is_five = n_below == 5
+    assert is_five.sum() > 1000
+    assert fit.rate_e_per_s[is_five] == pytest.approx(first_five.rate_e_per_s[is_five], rel=1e-12)
+
+
+def test_a_ramp_whose_last_read_saturates_by_chance_has_an_unbiased_slope():
+    rate_e_per_s, times = 2037.0, np.arange(1.0, 9.0)
+
+    fit = fit_ramp(ramp_codes(rate_e_per_s, times, 7), times, Sensor(ROW, **SENSOR))
+
+    assert np.bincount(fit.n_used)[[4, 5]].min() > 0.4 * N
+    sigma = fit.rate_e_per_s.std()
+    assert fit.rate_e_per_s.mean() == pytest.approx(rate_e_per_s, abs=SIGMAS * sigma / math.sqrt(N))
+
+
+def test_one_usable_read_has_no_slope():
+    code = np.array([[100, 4095], [4095, 4095], [200, 4095]])
+
+    fit = fit_ramp(code, [1.0, 2.0, 3.0], Sensor(ROW[:2], **SENSOR))
+
+    assert np.isnan(fit.rate_e_per_s).all()
+    assert fit.n_used.tolist() == [1, 0]
+
+
+def test_a_ramp_of_the_chain_has_the_slope_of_its_light_and_dark_charge():
+    sensor = Sensor(ROW, dark_e_per_s=100.0, ktc_noise=True, cds=False, **{**SENSOR, "v_sat_v": 4.0, "bits": 14})
+    times = np.linspace(0.2, 4.0, 12)
+
+    fit = fit_ramp(non_destructive_reads(sensor, 900.0, times, streams=Streams(6)).code, times, sensor)
+
+    variance = np.mean(fit.sigma_e_per_s**2)
+    assert fit.rate_e_per_s.mean() == pytest.approx(1000.0, abs=SIGMAS * math.sqrt(variance / N) + 0.1)
+    assert fit.rate_e_per_s.var() == pytest.approx(variance, rel=SIGMAS * math.sqrt(2.0 / N) + 0.01)
+
+
+# -- bad input --------------------------------------------------------------------------------------------------------
+
+FEW = Sensor(ROW[:3], **SENSOR)
+CODE = np.full((2, 3), 100)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: merge_exposures(CODE, [0.1], FEW), r"'code' must have a row for each exposure and a column for each"),
+        (lambda: merge_exposures(CODE, [0.1, 0.0], FEW), "'exposures_s' must be > 0"),
+        (lambda: merge_exposures(CODE + 5000, [0.1, 1.0], FEW), "'code' must be <= 4095 everywhere"),
+        (lambda: merge_exposures(CODE, [0.1, 1.0], None), "'sensor' must be a"),
+        (
+            lambda: merge_exposures(CODE, [0.1, 1.0], FEW, calibration=pedestal(7)),
+            "'calibration' must be a Calibration",
+        ),
+        (
+            lambda: non_destructive_reads(FEW, 1.0, [1.0, 1.0], streams=Streams(0)),
+            "'times_s' must be one or more times, each",
+        ),
+        (
+            lambda: non_destructive_reads(FEW, [1.0, 2.0], [1.0], streams=Streams(0)),
+            "'photo_e_per_s' must be one number, or",
+        ),
+        (lambda: non_destructive_reads(FEW, -1.0, [1.0], streams=Streams(0)), "'photo_e_per_s' must be >= 0"),
+        (lambda: non_destructive_reads(None, 1.0, [1.0], streams=Streams(0)), "'sensor' must be a"),
+        (lambda: fit_ramp(CODE[:1], [1.0], FEW), "'times_s' must be at least two times"),
+        (lambda: fit_ramp(CODE, [1.0, 2.0, 3.0], FEW), "'code' must have a row for each read"),
+        (
+            lambda: fit_ramp(CODE, [1.0, 2.0], FEW, weight_rate_e_per_s=[1.0]),
+            "'weight_rate_e_per_s' must be one number, or",
+        ),
+    ],
+)
+def test_bad_input_gets_one_clear_sentence(call, message):
+    with pytest.raises(ParameterError, match=message) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+def test_exposures_of_unknown_dark_signal_are_refused():
+    calibration = Calibration.from_frames(np.full((2, 3), 9.0), np.full((1, 3), 99.0), exposure_s=0.1)
+
+    with pytest.raises(SimulationError, match="the dark signal of 1 s is not known; calibrate with"):
+        merge_exposures(CODE, [0.1, 1.0], FEW, calibration=calibration)
