@@ -13,7 +13,7 @@ electrons, electrons get noise, volts become codes::
 
 from __future__ import annotations
 
-from foveasim import distortion, errors, layout, maps, optics, reconstruct, scene, sensor, units, view
+from foveasim import distortion, errors, layout, maps, metrics, optics, reconstruct, scene, sensor, units, view
 from foveasim._version import __version__
 from foveasim.camera import Camera
 from foveasim.capture import Capture
@@ -49,6 +49,7 @@ __all__ = [
     "errors",
     "layout",
     "maps",
+    "metrics",
     "optics",
     "read_layout",
     "read_power_map",

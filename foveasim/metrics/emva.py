@@ -1,0 +1,308 @@
+"""
+The parameters of EMVA 1288 from frames: gain, noise, efficiency, saturation, non-uniformity, linearity, dark current.
+
+EMVA Standard 1288, Release 4.0 Linear (https://www.emva.org/standards-technology/emva-1288/), of a sensor whose codes grow in
+proportion to the light. What the standard tells of one sort of pixels is told here of each class of photosites. Its split of
+the spatial variance into rows, columns and pixels asks for a grid and is left out, and so are its pictures and histograms.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim.arrays import Bools, Floats, finite_array, read_only
+from foveasim.errors import FoveasimWarning, ParameterError
+from foveasim.metrics.photon_transfer import (
+    LEAST_DARK_DN2,
+    QUANTISATION_DN2,
+    PhotonTransfer,
+    SiteClasses,
+    above_dark,
+    codes_of,
+    is_linear,
+    photon_transfer,
+    slopes,
+)
+
+__all__ = ["Emva1288", "emva1288"]
+
+#: The linearity error is told between these shares of saturation.
+LINEARITY_FRACTIONS = (0.05, 0.95)
+#: The response's non-uniformity is told at this share of saturation.
+PRNU_FRACTION = 0.5
+#: No more of the dark codes than this may be cut off at 0.
+MOST_UNDERFLOW_FRACTION = 0.005
+#: A dark current is a line's slope over at least so many exposures.
+LEAST_EXPOSURES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Emva1288:
+    """
+    Parameters of EMVA 1288, for each class of sites.
+
+    Attributes
+    ----------
+    classes : (n_class,)
+        Labels of the classes, sorted.
+    gain_dn_per_e : (n_class,) float64, DN/e-
+        System gain K: slope of the temporal variance against the mean, less darkness, up to 70 % of saturation.
+    responsivity_dn_per_ph : (n_class,) float64, DN per photon
+        R: slope of the mean against photons, less darkness, up to 70 % of saturation.
+    qe : (n_class,) float64
+        Quantum efficiency, electrons per photon: R / K.
+    dark_noise_dn : (n_class,) float64, DN
+        Temporal noise of darkness, quantisation included; at exposure 0 where a dark series was given. At least sqrt(0.24).
+    dark_noise_e : (n_class,) float64, e-
+        The same without quantisation: ``sqrt(dark_noise_dn**2 - 1/12) / K``.
+    is_hidden : (n_class,) bool
+        Whether quantisation hides the dark noise (a variance below 0.24 DN²): it is then an upper bound.
+    saturation_ph : (n_class,) float64, photons
+        Light at the level of the highest temporal variance.
+    threshold_ph : (n_class,) float64, photons
+        Absolute sensitivity threshold, where the signal is as large as its noise: ``(dark_noise_dn / K + 1/2) / qe``.
+    linearity_error_min_fraction, linearity_error_max_fraction : (n_class,) float64
+        Largest relative deviations of the mean, down and up, from a line fitted with relative weights from 5 to 95 % of
+        saturation; NaN where there are fewer than three levels.
+    dsnu_e : (n_class,) float64, e-
+        DSNU1288: standard deviation from site to site in the dark, over K; NaN where its variance comes out below 0.
+    prnu_fraction : (n_class,) float64
+        PRNU1288: standard deviation from site to site at the level nearest to half saturation, dark variance taken off,
+        over the mean less darkness; NaN where its variance comes out below 0.
+    dark_current_e_per_s, dark_current_of_variance_e_per_s : (n_class,) float64, e-/s
+        From the growth of the mean and of the variance of darkness with exposure; NaN without a dark series.
+    underflow_fraction : (n_class,) float64
+        Share of dark codes that are 0.
+    transfer, dark : PhotonTransfer
+        What it was told from.
+
+    Notes
+    -----
+    The saturation is one of the levels given: it is no finer than they are. A full well cuts off the fluctuations above it, so
+    the variance is highest some 2 standard deviations of the shot noise below the full well.
+    """
+
+    classes: NDArray[Any]
+    gain_dn_per_e: Floats
+    responsivity_dn_per_ph: Floats
+    qe: Floats
+    dark_noise_dn: Floats
+    dark_noise_e: Floats
+    is_hidden: Bools
+    saturation_ph: Floats
+    threshold_ph: Floats
+    linearity_error_min_fraction: Floats
+    linearity_error_max_fraction: Floats
+    dsnu_e: Floats
+    prnu_fraction: Floats
+    dark_current_e_per_s: Floats
+    dark_current_of_variance_e_per_s: Floats
+    underflow_fraction: Floats
+    transfer: PhotonTransfer
+    dark: PhotonTransfer
+
+    def __repr__(self) -> str:
+        return f"Emva1288({self.transfer.n_frames.size} levels, {self.classes.size} classes)"
+
+    @property
+    def saturation_e(self) -> Floats:
+        """Saturation capacity, (n_class,) e-: ``qe * saturation_ph``."""
+        return self.qe * self.saturation_ph
+
+    @property
+    def threshold_e(self) -> Floats:
+        """Absolute sensitivity threshold, (n_class,) e-: ``qe * threshold_ph``."""
+        return self.qe * self.threshold_ph
+
+    @property
+    def snr_max(self) -> Floats:
+        """Highest signal-to-noise ratio, (n_class,): ``sqrt(saturation_e)``."""
+        return np.sqrt(self.saturation_e)
+
+    @property
+    def snr_max_db(self) -> Floats:
+        """The same in decibels, ``20 log10``, (n_class,)."""
+        return 20.0 * np.log10(self.snr_max)
+
+    @property
+    def dynamic_range(self) -> Floats:
+        """Saturation over threshold, (n_class,)."""
+        return self.saturation_ph / self.threshold_ph
+
+    @property
+    def dynamic_range_db(self) -> Floats:
+        """The same in decibels, ``20 log10``, (n_class,)."""
+        return 20.0 * np.log10(self.dynamic_range)
+
+
+def emva1288(
+    frames: Sequence[Any],
+    dark: Sequence[Any],
+    photons: ArrayLike,
+    *,
+    classes: ArrayLike | None = None,
+    dark_series: Sequence[Any] | None = None,
+    exposure_s: ArrayLike | None = None,
+) -> Emva1288:
+    """
+    Parameters of EMVA 1288 from frames of even light and of darkness.
+
+    Parameters
+    ----------
+    frames : sequence of levels
+        For each level of light, rising, two or more frames: ``(n_frame, n_site)`` DN, or a list of codes or captures. Levels
+        should reach beyond saturation, and be many: the standard asks for 50. Many frames at about half of saturation,
+        and in the dark, make PRNU and DSNU sharper.
+    dark : sequence of levels
+        Frames of darkness in the same form: one level where all exposures were equally long, or one for each level.
+    photons : (n_level,) or (n_level, n_site) float64
+        Expected photons per site at each level: they differ from site to site where sizes do.
+    classes : (n_site,), optional
+        Label of each site's class, such as its size or filter; one class of all by default.
+    dark_series : sequence of levels, optional
+        Frames of darkness at the exposures ``exposure_s``, three or more, for the dark current, and for the dark noise at
+        exposure 0.
+    exposure_s : (n_exposure,) float64, s
+
+    Returns
+    -------
+    Emva1288
+
+    Raises
+    ------
+    ParameterError
+        When shapes do not fit together, a level has fewer than two frames, or there is no light.
+
+    Warns
+    -----
+    FoveasimWarning
+        When more than 0.5 % of the dark codes are 0: noise is cut off there, and dark noise and DSNU come out too small.
+    """
+    frames, dark = list(frames), list(dark)
+    transfer = photon_transfer(frames, classes=classes)
+    darkness = photon_transfer(dark, classes=classes)
+    groups = SiteClasses(classes, int(transfer.n_sites.sum()))
+    mean_dn, variance_dn2 = above_dark(transfer, darkness)
+    level_ph = _photons(photons, groups, len(frames))
+    top, each = transfer.saturation_level, np.arange(transfer.classes.size)
+    saturation_dn = mean_dn[top, each]
+
+    is_used = is_linear(mean_dn, top)
+    gain_dn_per_e = slopes("frames", mean_dn, variance_dn2, is_used)
+    responsivity = slopes("photons", level_ph, mean_dn, is_used)
+    qe = responsivity / gain_dn_per_e
+
+    dark_current, dark_current_of_variance, noise_dn2 = _dark_current(
+        dark_series, exposure_s, classes, gain_dn_per_e, darkness.temporal_variance_dn2[0]
+    )
+    dark_noise_dn = np.sqrt(np.maximum(noise_dn2, LEAST_DARK_DN2))
+
+    half = np.abs(mean_dn - PRNU_FRACTION * saturation_dn).argmin(axis=0)
+    dark_half = np.minimum(half, darkness.n_frames.size - 1)
+    dark_spatial_dn2 = darkness.spatial_variance_dn2[dark_half, each]
+    light_spatial_dn2 = transfer.spatial_variance_dn2[half, each] - dark_spatial_dn2
+    linearity_min, linearity_max = _linearity(level_ph, mean_dn, saturation_dn)
+    parameters: dict[str, NDArray[Any]] = {
+        "classes": transfer.classes,
+        "gain_dn_per_e": gain_dn_per_e,
+        "responsivity_dn_per_ph": responsivity,
+        "qe": qe,
+        "dark_noise_dn": dark_noise_dn,
+        "dark_noise_e": np.sqrt(dark_noise_dn**2 - QUANTISATION_DN2) / gain_dn_per_e,
+        "is_hidden": noise_dn2 < LEAST_DARK_DN2,
+        "saturation_ph": level_ph[top, each],
+        "threshold_ph": (dark_noise_dn / gain_dn_per_e + 0.5) / qe,
+        "linearity_error_min_fraction": linearity_min,
+        "linearity_error_max_fraction": linearity_max,
+        "dsnu_e": _root(dark_spatial_dn2) / gain_dn_per_e,
+        "prnu_fraction": _root(light_spatial_dn2) / mean_dn[half, each],
+        "dark_current_e_per_s": dark_current,
+        "dark_current_of_variance_e_per_s": dark_current_of_variance,
+        "underflow_fraction": _underflow(dark[0], groups),
+    }
+    return Emva1288(
+        **{name: read_only(values) for name, values in parameters.items()}, transfer=transfer, dark=darkness
+    )
+
+
+def _photons(photons: ArrayLike, groups: SiteClasses, n_levels: int) -> Floats:
+    """Photons per site of each level and class, (n_level, n_class)."""
+    values = finite_array("photons", photons, at_least=0.0)
+    n_sites = int(groups.n_sites.sum())
+    if values.shape == (n_levels,):
+        return np.repeat(values[:, None], groups.n_sites.size, axis=1)
+    if values.shape != (n_levels, n_sites):
+        raise ParameterError("photons", f"must have the shape ({n_levels},) or ({n_levels}, {n_sites})", values.shape)
+    return np.stack([groups.mean(level) for level in values])
+
+
+def _dark_current(
+    dark_series: Sequence[Any] | None,
+    exposure_s: ArrayLike | None,
+    classes: ArrayLike | None,
+    gain_dn_per_e: Floats,
+    noise_dn2: Floats,
+) -> tuple[Floats, Floats, Floats]:
+    """Dark current of the mean and of the variance, (n_class,) e-/s, and the variance at exposure 0, DN²."""
+    if dark_series is None and exposure_s is None:
+        return np.full_like(gain_dn_per_e, np.nan), np.full_like(gain_dn_per_e, np.nan), noise_dn2
+    if dark_series is None or exposure_s is None:
+        raise ParameterError("dark_series", "and exposure_s must be given together")
+    series = photon_transfer(dark_series, classes=classes)
+    times_s = finite_array("exposure_s", exposure_s, ndim=1, at_least=0.0)
+    if times_s.size != series.n_frames.size or np.unique(times_s).size < LEAST_EXPOSURES:
+        raise ParameterError(
+            "exposure_s",
+            f"must have one exposure for each of the {series.n_frames.size} levels, and at least {LEAST_EXPOSURES} different",
+            times_s.tolist(),
+            "s",
+        )
+    off_s = times_s - times_s.mean()
+    mean_slope = off_s @ series.mean_dn / (off_s @ off_s)
+    variance_slope = off_s @ series.temporal_variance_dn2 / (off_s @ off_s)
+    at_zero_dn2 = series.temporal_variance_dn2.mean(axis=0) - variance_slope * times_s.mean()
+    return mean_slope / gain_dn_per_e, variance_slope / gain_dn_per_e**2, at_zero_dn2
+
+
+def _linearity(level_ph: Floats, mean_dn: Floats, saturation_dn: Floats) -> tuple[Floats, Floats]:
+    """Smallest and largest relative deviation from a line that is fitted with weights of 1 over the signal squared."""
+    lowest, highest = np.full_like(saturation_dn, np.nan), np.full_like(saturation_dn, np.nan)
+    for c, full_dn in enumerate(saturation_dn):
+        y = mean_dn[:, c]
+        level = np.arange(y.size)
+        # From the first level above to the last level below, as with the gain.
+        is_above, is_below = y >= LINEARITY_FRACTIONS[0] * full_dn, y <= LINEARITY_FRACTIONS[1] * full_dn
+        first = np.where(is_above, level, y.size).min()
+        last = np.where(is_below, level, -1).max()
+        chosen = slice(first, last + 1)
+        x, y = level_ph[chosen, c], y[chosen]
+        if y.size < LEAST_EXPOSURES or y.min() <= 0.0 or np.ptp(x) == 0.0:
+            continue
+        slope, offset = np.linalg.lstsq(np.column_stack((x / y, 1.0 / y)), np.ones(y.size), rcond=None)[0]
+        deviation = y / (slope * x + offset) - 1.0
+        lowest[c], highest[c] = deviation.min(), deviation.max()
+    return lowest, highest
+
+
+def _root(variance_dn2: Floats) -> Floats:
+    """Standard deviation in DN; NaN below 0."""
+    return np.sqrt(np.where(variance_dn2 >= 0.0, variance_dn2, np.nan))
+
+
+def _underflow(dark: Any, groups: SiteClasses) -> Floats:
+    """Share of codes that are 0, with a warning where they are many."""
+    share = groups.mean((codes_of("dark[0]", dark) == 0).mean(axis=0))
+    if share.max() > MOST_UNDERFLOW_FRACTION:
+        warnings.warn(
+            f"{100 * share.max():.1f} % of the dark codes are 0, where noise is cut off: dark noise and DSNU come out too "
+            "small; let some dark charge lift darkness above 0",
+            FoveasimWarning,
+            stacklevel=3,
+        )
+    return share

@@ -1,0 +1,399 @@
+"""
+Photon transfer: mean and variance of codes over levels of even light, for each class of photosites.
+
+The temporal variance is that of EMVA 1288, Release 4.0 Linear (https://www.emva.org/standards-technology/emva-1288/): of two
+frames of one level, half the mean square of their difference, less half the square of the difference of their means, so that
+neither fixed patterns nor a light that flickers as a whole are in it. For more than two frames the same holds of the
+sample variance over frames. The spatial variance is that of the sites' means over frames, less the temporal variance of a
+single frame over the number of frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim.arrays import Floats, Ints, as_numbers, check_count, check_number, finite_array, read_only
+from foveasim.errors import ParameterError
+from foveasim.sensor import Sensor
+from foveasim.streams import Streams
+
+__all__ = [
+    "PhotonTransfer",
+    "SiteClasses",
+    "above_dark",
+    "codes_of",
+    "draw_frames",
+    "is_linear",
+    "photon_transfer",
+    "predicted_photon_transfer",
+    "slopes",
+]
+
+#: The gain is told from levels up to this share of saturation (EMVA 1288).
+LINEAR_FRACTION = 0.7
+#: Variance, in DN², of an even spread over one code.
+QUANTISATION_DN2 = 1.0 / 12.0
+#: A variance below this, in DN², is quantisation's more than the sensor's (EMVA 1288).
+LEAST_DARK_DN2 = 0.24
+
+
+@dataclass(frozen=True, eq=False)
+class PhotonTransfer:
+    """
+    Mean and variance of codes at several levels of light, for each class of sites.
+
+    Attributes
+    ----------
+    classes : (n_class,)
+        Labels of the classes, sorted.
+    n_sites : (n_class,) int64
+        Sites of each class.
+    n_frames : (n_level,) int64
+        Frames that each level was told from; 0 where it was predicted.
+    mean_dn : (n_level, n_class) float64, DN
+        Mean code over sites and frames.
+    temporal_variance_dn2 : (n_level, n_class) float64, DN²
+        Variance from frame to frame, mean over the sites; its mean over many runs is ``1 - 1 / n_sites`` of the sites'.
+    spatial_variance_dn2 : (n_level, n_class) float64, DN²
+        Variance from site to site, without the temporal part; by chance it may come out below 0.
+    """
+
+    classes: NDArray[Any]
+    n_sites: Ints
+    n_frames: Ints
+    mean_dn: Floats
+    temporal_variance_dn2: Floats
+    spatial_variance_dn2: Floats
+
+    def __post_init__(self) -> None:
+        shape = (np.size(self.n_frames), np.size(self.classes))
+        for name in ("mean_dn", "temporal_variance_dn2", "spatial_variance_dn2"):
+            values = finite_array(name, getattr(self, name))
+            if values.shape != shape:
+                raise ParameterError(name, f"must have the shape (n_level, n_class) = {shape}, got {values.shape}")
+            object.__setattr__(self, name, read_only(values.view()))
+
+    def __repr__(self) -> str:
+        return f"PhotonTransfer({self.n_frames.size} levels, {self.classes.size} classes of {self.n_sites.sum()} sites)"
+
+    @property
+    def saturation_level(self) -> Ints:
+        """Index of the level of the highest temporal variance, (n_class,): EMVA 1288's saturation."""
+        return np.asarray(self.temporal_variance_dn2.argmax(axis=0), np.int64)
+
+    def gain_dn_per_e(self, dark: PhotonTransfer | None = None) -> Floats:
+        """
+        System gain: slope of the temporal variance against the mean, both less those of darkness.
+
+        Parameters
+        ----------
+        dark : PhotonTransfer, optional
+            Darkness, as one level or as one for each level; the first level by default.
+
+        Returns
+        -------
+        gain : (n_class,) float64, DN/e-
+            Least squares through the origin, over levels up to 70 % of saturation.
+
+        Raises
+        ------
+        ParameterError
+            When the dark levels do not fit, or there is no light.
+        """
+        mean_dn, variance_dn2 = above_dark(self, dark)
+        return slopes("levels", mean_dn, variance_dn2, is_linear(mean_dn, self.saturation_level))
+
+    def dark_noise_e(self, dark: PhotonTransfer | None = None) -> Floats:
+        """
+        Temporal noise of darkness without that of quantisation.
+
+        Parameters
+        ----------
+        dark : PhotonTransfer, optional
+            Darkness, of which the first level counts; this curve's first level by default.
+
+        Returns
+        -------
+        noise : (n_class,) float64, e-
+            ``sqrt(variance - 1/12) / gain``: read noise, and the noise of what dark charge there is. Where the variance is
+            below 0.24 DN², quantisation hides it, and this is an upper bound, ``0.40 / gain``.
+
+        Raises
+        ------
+        ParameterError
+            As for :meth:`gain_dn_per_e`.
+        """
+        variance_dn2 = (self if dark is None else dark).temporal_variance_dn2[0]
+        return np.sqrt(np.maximum(variance_dn2, LEAST_DARK_DN2) - QUANTISATION_DN2) / self.gain_dn_per_e(dark)
+
+
+class SiteClasses:
+    """Means over the sites of each class."""
+
+    def __init__(self, classes: ArrayLike | None, n_sites: int) -> None:
+        labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(classes)
+        if labels.shape != (n_sites,):
+            raise ParameterError("classes", f"must have one label for each of the {n_sites} sites, got {labels.shape}")
+        self.labels, self._class_of_site = np.unique(labels, return_inverse=True)
+        self.n_sites = np.bincount(self._class_of_site).astype(np.int64)
+        if self.n_sites.min(initial=n_sites) < 2:
+            few = self.labels[self.n_sites < 2].tolist()
+            raise ParameterError("classes", "must have at least two sites each", few)
+
+    def mean(self, values: Floats) -> Floats:
+        """Mean over each class's sites, (n_class,) of (n_site,)."""
+        return np.bincount(self._class_of_site, weights=values) / self.n_sites
+
+    def variance(self, values: Floats) -> Floats:
+        """Sample variance over each class's sites, (n_class,) of (n_site,)."""
+        off = values - self.mean(values)[self._class_of_site]
+        return np.bincount(self._class_of_site, weights=off * off) / (self.n_sites - 1)
+
+
+def draw_frames(
+    sensor: Sensor,
+    expected_e: ArrayLike,
+    *,
+    n_frames: int = 2,
+    seed: int,
+    first_frame: int = 0,
+    n_threads: int | None = None,
+) -> NDArray[Any]:
+    """
+    Several frames of one level of light.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    expected_e : number or (n_site,) float64, e-
+        Expected charge, as :meth:`Sensor.expected_electrons` gives it.
+    n_frames : int
+    seed, first_frame : int
+        Of the noise. The same numbers give the same frames, bit for bit, whatever the number of threads.
+    n_threads : int, optional
+
+    Returns
+    -------
+    codes : (n_frame, n_site) uint8 or uint16, DN
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range, or the charge has not one value a site.
+    """
+    level_e = _level("expected_e", expected_e, sensor.layout.n_sites)
+    first_frame = check_count("first_frame", first_frame, at_least=0)
+    codes = []
+    for k in range(check_count("n_frames", n_frames)):
+        streams = Streams(seed, first_frame + k)
+        codes.append(
+            sensor.read(
+                sensor.collect(level_e, streams=streams, n_threads=n_threads), streams=streams, n_threads=n_threads
+            )
+        )
+    return np.stack(codes)
+
+
+def photon_transfer(
+    source: Sensor | Sequence[Any],
+    expected_e: Sequence[ArrayLike] | Floats | None = None,
+    *,
+    classes: ArrayLike | None = None,
+    n_frames: int = 2,
+    seed: int | None = None,
+    n_threads: int | None = None,
+) -> PhotonTransfer:
+    """
+    Mean, temporal and spatial variance of codes at several levels, for each class of sites.
+
+    Parameters
+    ----------
+    source : Sensor, or sequence of levels
+        A sensor to draw frames of; or frames: for each level two or more, as an array ``(n_frame, n_site)`` in DN, or as a
+        list of codes or of :class:`foveasim.Capture`.
+    expected_e : (n_level,) or (n_level, n_site) float64, or a sequence of either, e-
+        With a sensor: the expected charge at each level, as :meth:`Sensor.expected_electrons` gives it.
+    classes : (n_site,), optional
+        Label of each site's class, such as its size or filter; one class of all by default.
+    n_frames, seed, n_threads
+        With a sensor: frames a level, the seed of their noise, and threads, of which the result does not depend.
+
+    Returns
+    -------
+    PhotonTransfer
+
+    Raises
+    ------
+    ParameterError
+        When there are fewer than two frames in a level or two sites in a class, or shapes differ.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=200, n_y=200, pitch_um=2.0), bits=12, capacitance_f=1e-15, v_sat_v=1.0)
+    >>> curve = fs.metrics.photon_transfer(sensor, np.linspace(0.0, 6000.0, 13), seed=0)
+    >>> bool(np.abs(curve.gain_dn_per_e() * 6241.5 / 4096 - 1.0) < 0.02)
+    True
+    """
+    if isinstance(source, Sensor):
+        if expected_e is None or seed is None:
+            raise ParameterError("expected_e" if expected_e is None else "seed", "must be given with a sensor")
+        sensor, n_frames = source, check_count("n_frames", n_frames, at_least=2)
+        groups = SiteClasses(classes, sensor.layout.n_sites)
+        measured = [
+            _statistics(
+                draw_frames(
+                    sensor, level_e, n_frames=n_frames, seed=seed, first_frame=k * n_frames, n_threads=n_threads
+                ),
+                groups,
+            )
+            for k, level_e in enumerate(_levels(expected_e, sensor.layout.n_sites))
+        ]
+        return _transfer(groups, [n_frames] * len(measured), measured)
+    if expected_e is not None or seed is not None:
+        raise ParameterError("expected_e" if seed is None else "seed", "goes with a sensor, not with frames")
+    measured, counts, n_sites = [], [], None
+    for k, frames in enumerate(source):
+        codes = codes_of(f"frames[{k}]", frames)
+        if n_sites is None:
+            n_sites = codes.shape[1]
+            groups = SiteClasses(classes, n_sites)
+        if codes.shape[1] != n_sites:
+            raise ParameterError(f"frames[{k}]", f"must have the {n_sites} sites of the first level", codes.shape[1])
+        measured.append(_statistics(codes, groups))
+        counts.append(codes.shape[0])
+    if n_sites is None:
+        raise ParameterError("frames", "must have at least one level")
+    return _transfer(groups, counts, measured)
+
+
+def predicted_photon_transfer(
+    sensor: Sensor,
+    expected_e: Sequence[ArrayLike] | Floats,
+    *,
+    classes: ArrayLike | None = None,
+    n_threads: int | None = None,
+) -> PhotonTransfer:
+    """
+    What :func:`photon_transfer` of infinitely many frames would give, by :meth:`Sensor.predict`, without a draw.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    expected_e : (n_level,) or (n_level, n_site) float64, or a sequence of either, e-
+        The expected charge at each level.
+    classes : (n_site,), optional
+        Label of each site's class.
+    n_threads : int, optional
+
+    Returns
+    -------
+    PhotonTransfer
+        With 0 frames a level.
+
+    Raises
+    ------
+    ParameterError
+        As for :func:`photon_transfer`.
+    """
+    groups = SiteClasses(classes, sensor.layout.n_sites)
+    told = []
+    for level_e in _levels(expected_e, sensor.layout.n_sites):
+        mean_dn, variance_dn2 = sensor.predict(level_e, n_threads=n_threads)
+        told.append((groups.mean(mean_dn), groups.mean(variance_dn2), groups.variance(mean_dn)))
+    return _transfer(groups, [0] * len(told), told)
+
+
+def codes_of(name: str, frames: Any) -> NDArray[Any]:
+    """Codes of some frames, (n_frame, n_site), of an array or a list of arrays or captures."""
+    if not isinstance(frames, np.ndarray):
+        try:
+            frames = [getattr(frame, "code", frame) for frame in frames]
+        except TypeError:
+            raise ParameterError(name, "must be a list of frames") from None
+    codes = as_numbers(name, frames, keep_type=True)
+    if codes.ndim != 2 or codes.shape[0] < 2 or codes.shape[1] < 2:
+        raise ParameterError(name, "must have the shape (n_frame, n_site), at least two of both", codes.shape)
+    if codes.dtype.kind == "f" and not np.isfinite(codes).all():
+        raise ParameterError(name, "must be finite everywhere")
+    return codes
+
+
+def _statistics(codes: NDArray[Any], groups: SiteClasses) -> tuple[Floats, Floats, Floats]:
+    """Mean, temporal variance and spatial variance of each class."""
+    n_frames = codes.shape[0]
+    mean_dn = codes.mean(axis=0, dtype=np.float64)
+    off = codes - mean_dn
+    stack_dn2 = groups.mean((off * off).sum(axis=0) / (n_frames - 1))
+    frame_means_dn = np.array([groups.mean(row) for row in off])
+    temporal_dn2 = stack_dn2 - frame_means_dn.var(axis=0, ddof=1)
+    return groups.mean(mean_dn), temporal_dn2, groups.variance(mean_dn) - stack_dn2 / n_frames
+
+
+def _transfer(
+    groups: SiteClasses, n_frames: Sequence[int], levels_dn: Sequence[tuple[Floats, Floats, Floats]]
+) -> PhotonTransfer:
+    if not levels_dn:
+        raise ParameterError("expected_e", "must have at least one level")
+    mean_dn, temporal_dn2, spatial_dn2 = (np.stack(values) for values in zip(*levels_dn, strict=True))
+    return PhotonTransfer(
+        classes=read_only(groups.labels),
+        n_sites=read_only(groups.n_sites),
+        n_frames=read_only(np.array(n_frames, np.int64)),
+        mean_dn=mean_dn,
+        temporal_variance_dn2=temporal_dn2,
+        spatial_variance_dn2=spatial_dn2,
+    )
+
+
+def _level(name: str, expected_e: ArrayLike, n_sites: int) -> Floats:
+    """Charge of one level for every site."""
+    if np.ndim(expected_e) == 0:
+        return np.full(n_sites, check_number(name, expected_e, at_least=0.0))
+    level_e = finite_array(name, expected_e, ndim=1, at_least=0.0)
+    if level_e.size != n_sites:
+        raise ParameterError(name, f"must be one number, or one for each of the {n_sites} sites, got {level_e.size}")
+    return level_e
+
+
+def _levels(expected_e: Sequence[ArrayLike] | Floats, n_sites: int) -> list[Floats]:
+    if np.ndim(expected_e[0] if len(expected_e) else 0) > 1:
+        raise ParameterError("expected_e", "must have the shape (n_level,) or (n_level, n_site)")
+    return [_level(f"expected_e[{k}]", level_e, n_sites) for k, level_e in enumerate(expected_e)]
+
+
+def above_dark(transfer: PhotonTransfer, dark: PhotonTransfer | None) -> tuple[Floats, Floats]:
+    """Mean and temporal variance, less those of darkness, (n_level, n_class)."""
+    n_levels = transfer.n_frames.size
+    if dark is None:
+        return (
+            transfer.mean_dn - transfer.mean_dn[0],
+            transfer.temporal_variance_dn2 - transfer.temporal_variance_dn2[0],
+        )
+    if dark.n_frames.size not in (1, n_levels) or not np.array_equal(dark.classes, transfer.classes):
+        raise ParameterError(
+            "dark", f"must have the same classes, and one level or {n_levels} as the light", dark.n_frames.size
+        )
+    return transfer.mean_dn - dark.mean_dn, transfer.temporal_variance_dn2 - dark.temporal_variance_dn2
+
+
+def is_linear(mean_dn: Floats, saturation_level: Ints) -> NDArray[np.bool_]:
+    """Whether a level counts for the gain: up to the last that is at most 70 % of saturation, (n_level, n_class)."""
+    saturation_dn = np.take_along_axis(mean_dn, saturation_level[None, :], axis=0)
+    is_below = mean_dn <= LINEAR_FRACTION * saturation_dn
+    level = np.arange(mean_dn.shape[0])[:, None]
+    return level <= np.where(is_below, level, -1).max(axis=0)
+
+
+def slopes(name: str, x: Floats, y: Floats, is_used: NDArray[np.bool_]) -> Floats:
+    """Slopes of lines through the origin by least squares, (n_class,) of (n_level, n_class)."""
+    squares = np.where(is_used, x * x, 0.0).sum(axis=0)
+    if not np.all(squares > 0.0):
+        raise ParameterError(name, "must have light below 70 % of saturation for every class", cure="add darker levels")
+    return np.asarray(np.where(is_used, x * y, 0.0).sum(axis=0) / squares)
