@@ -268,6 +268,15 @@ def test_offsets_come_before_the_clip_and_gains_do_not_touch_them():
     assert codes(65_000, pixel_fpn_fraction=0.02).max() == 65_535
 
 
+def test_a_pedestal_lifts_darkness_and_keeps_its_noise_whole():
+    dark = codes(0, pedestal_v=0.3, read_noise_e=100.0)
+
+    assert dark.mean() == pytest.approx(0.1 * 65_536 - 0.5, abs=SIGMAS * 100.0 / math.sqrt(N))
+    assert_spread(dark, 100.0, 1 / 12)
+    assert np.ptp(codes(0, pedestal_v=0.3, cds=True)) == 0.0
+    assert codes(0, pedestal_v=0.3, cds=True)[0] == codes(0, pedestal_v=0.3)[0] == 6553
+
+
 def test_a_response_that_bends_lacks_its_share_at_full_range():
     for share in (0.25, 0.5, 1.0):
         charge = round(share * 65_536)

@@ -119,6 +119,8 @@ class Sensor:
         Standard deviation of the sites' volts per charge over its mean.
     nonlinearity_fraction : float
         Share of the voltage that the response lacks at V_sat, growing with the square of the voltage.
+    pedestal_v : float, V
+        Black level: added to every voltage, so that noise about darkness is not cut off at code 0.
     pixel_fpn_fraction, line_fpn_fraction : float
         Standard deviation of the offsets of pixels, and of readout lines, over V_sat (the paper: 0.02).
     v_sat_v : float, V
@@ -163,6 +165,7 @@ class Sensor:
     capacitance_f: PerSite = 1e-13
     gain_fpn_fraction: float = 0.0
     nonlinearity_fraction: float = 0.0
+    pedestal_v: float = 0.0
     pixel_fpn_fraction: float = 0.0
     line_fpn_fraction: float = 0.0
     v_sat_v: float = 3.0
@@ -204,7 +207,10 @@ class Sensor:
         numbers: dict[str, float] = {
             **{name: check_number(name, getattr(self, name), at_least=0.0, at_most=m) for name, m in _SHARES.items()},
             **{name: check_number(name, getattr(self, name), at_least=0.0) for name in _SPREADS},
-            **{name: check_number(name, getattr(self, name), at_least=0.0) for name in ("hot_e_per_s", "rts_e")},
+            **{
+                name: check_number(name, getattr(self, name), at_least=0.0)
+                for name in ("hot_e_per_s", "rts_e", "pedestal_v")
+            },
             **{
                 name: check_number(name, getattr(self, name), above=0.0, at_most=1000.0)
                 for name in ("temperature_k", "dark_reference_k", "dark_doubling_k")
@@ -368,10 +374,10 @@ class Sensor:
 
     @cached_property
     def pixel_offset_v(self) -> Floats:
-        """Offset of every site, (n_site,) or (1,) V."""
+        """Offset of every site, (n_site,) or (1,) V: the pedestal and, without double sampling, its own."""
         if not self.pixel_fpn_fraction or self.cds:
-            return read_only(np.zeros(1))
-        return read_only(self.v_sat_v * self.pixel_fpn_fraction * self.device.normals("pixel offset"))
+            return read_only(np.full(1, self.pedestal_v))
+        return read_only(self.pedestal_v + self.v_sat_v * self.pixel_fpn_fraction * self.device.normals("pixel offset"))
 
     @cached_property
     def line_offset_v(self) -> Floats:
