@@ -266,6 +266,8 @@ def test_offsets_come_before_the_clip_and_gains_do_not_touch_them():
     assert (dark == 0.0).mean() == pytest.approx(0.5, abs=SIGMAS / math.sqrt(N))
     assert np.array_equal(dark, codes(0, pixel_fpn_fraction=0.02))
     assert codes(65_000, pixel_fpn_fraction=0.02).max() == 65_535
+    # Half as much again as the range: no offset brings that below its end.
+    assert codes(98_000, pixel_fpn_fraction=0.02).min() == 65_535
 
 
 def test_a_pedestal_lifts_darkness_and_keeps_its_noise_whole():
