@@ -26,7 +26,7 @@ from foveasim.optics import Optics
 from foveasim.parallel import thread_count
 from foveasim.records import described, versions
 from foveasim.scene import Scene
-from foveasim.sensor import Sensor
+from foveasim.sensor import Sensor, noise_budget
 from foveasim.streams import Streams
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
@@ -240,6 +240,22 @@ class Camera:
         """
         expected_e = self._sensor.expected_electrons(self._photoelectrons_per_s(light, _Clock()), exposure_s)
         return self._sensor.predict(expected_e, n_threads=self._n_threads)
+
+    def noise_budget(self, light: Scene | PowerMap, *, exposure_s: float) -> dict[str, Floats]:
+        """
+        Noise of every site by source, (n_site,) e- each: :func:`foveasim.sensor.noise_budget` for what the camera sees.
+
+        Parameters
+        ----------
+        light : Scene or PowerMap
+        exposure_s : float, s
+
+        Raises
+        ------
+        ParameterError, SimulationError
+            As for :meth:`capture`.
+        """
+        return noise_budget(self._sensor, self._photoelectrons_per_s(light, _Clock()), exposure_s)
 
     def _photoelectrons_per_s(self, light: Scene | PowerMap, clock: _Clock) -> Floats:
         """

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import scipy.constants
 
+import foveasim as fs
 from foveasim.errors import ParameterError
 from foveasim.layout import grid
-from foveasim.sensor import FIXED, TEMPORAL, Sensor, noise_budget
+from foveasim.sensor import FIXED, PRESETS, TEMPORAL, Sensor, noise_budget
 
 N = 400
 LINE = grid(n_x=N, n_y=1, pitch_um=2.0).with_columns(readout_line=np.arange(N))
@@ -73,3 +74,34 @@ def test_a_list_that_is_not_one_a_site_is_refused():
         noise_budget(Sensor(LINE), np.ones(3), 1.0)
     with pytest.raises(ParameterError, match="'exposure_s' must be >= 0"):
         noise_budget(Sensor(LINE), np.ones(N), -1.0)
+
+
+def test_a_camera_and_a_sensor_give_what_their_functions_give():
+    layout = grid(n_x=20, n_y=20, pitch_um=4.0)
+    sensor = Sensor(layout, prnu_fraction=0.02, **PRESETS["paper_foveal"])
+    camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    scene = fs.Scene.flat(shape=(200, 200), pitch_um=60.0, distance_m=1.0, radiance_w_m2_sr_nm=0.5, band_width_nm=10.0)
+
+    budget = camera.noise_budget(scene, exposure_s=0.03)
+    by_hand = noise_budget(sensor, camera.photoelectrons_per_s(scene), 0.03)
+    calibration = sensor.calibrate(exposure_s=0.03, flat_e=5e5, n_frames=4, seed=1)
+
+    assert all(np.array_equal(budget[name], by_hand[name]) for name in by_hand)
+    # 8 bits of 3 V on 0.1 pF: 7314 e- a step, 2111 e- rms.
+    assert budget["quantisation"] == pytest.approx(np.full(400, 2111.4), rel=1e-4)
+    assert np.corrcoef(calibration.gain, sensor.response)[0, 1] > 0.5
+
+
+@pytest.mark.parametrize(
+    ("name", "facts"),
+    [
+        ("paper_foveal", {"read_noise_e": 1.0, "capacitance_f": 1e-13, "v_sat_v": 3.0, "bits": 8}),
+        ("paper_distortion", {"read_noise_e": 1.0, "capacitance_f": 4.8e-13, "v_sat_v": 3.0, "bits": 8}),
+        ("paper_read_noise", {"read_noise_e": 50.0, "full_well_e": 7000.0}),
+    ],
+)
+def test_presets_are_the_papers_table(name, facts):
+    sensor = Sensor(LINE, **PRESETS[name])
+
+    assert {key: getattr(sensor, key) for key in facts} == facts
+    assert set(PRESETS[name]) == set(facts)

@@ -8,6 +8,7 @@ from foveasim.sensor.calibration import Calibration, calibrate, linearised
 from foveasim.sensor.crosstalk import Coupling, Diffusion, KernelCrosstalk, Mixing
 from foveasim.sensor.exposures import Ramp, Rates, fit_ramp, merge_exposures, non_destructive_reads
 from foveasim.sensor.noise import draw_shot_noise
+from foveasim.sensor.presets import PRESETS
 from foveasim.sensor.spectral import FilterSet, rgb_filters
 from foveasim.sensor.spectral_curves import (
     BandMean,
@@ -24,6 +25,7 @@ from foveasim.sensor.spectral_tables import PolynomialCurve, SplineCurve, StepCu
 
 __all__ = [
     "FIXED",
+    "PRESETS",
     "TEMPORAL",
     "BandMean",
     "Calibration",

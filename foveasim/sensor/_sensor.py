@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim.arrays import Floats, Ints, check_choice, check_count, check_number, finite_array, read_only
 from foveasim.compiled import kernels
@@ -21,6 +21,9 @@ from foveasim.sensor.noise import LARGEST_CHARGE_E, ShotNoise, draw_shot_noise, 
 from foveasim.sensor.spectral import ConstantCurve, Curve, FilterSet, rgb_filters
 from foveasim.streams import Streams
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C, electrons_to_volts, photon_energy_j
+
+if TYPE_CHECKING:
+    from foveasim.sensor.calibration import Calibration
 
 __all__ = ["PerSite", "Photosites", "Sensor"]
 
@@ -484,6 +487,14 @@ class Sensor:
         charge_e = np.zeros(self.layout.n_sites)
         charge_e[sites] = self.rts_e * (streams.of("telegraph").random(sites.size) - 0.5 > 0.0) - 0.5 * self.rts_e
         return charge_e
+
+    def calibrate(
+        self, *, exposure_s: float, flat_e: ArrayLike, n_frames: int, seed: int, **options: Any
+    ) -> Calibration:
+        """Take dark and flat frames, and calibrate: :func:`foveasim.sensor.calibrate`, whose parameters these are."""
+        from foveasim.sensor.calibration import calibrate
+
+        return calibrate(self, exposure_s=exposure_s, flat_e=flat_e, n_frames=n_frames, seed=seed, **options)
 
     def predict(self, expected_e: Floats, *, n_threads: int | None = None) -> tuple[Floats, Floats]:
         """
