@@ -514,3 +514,11 @@ def test_a_character_that_yaml_forbids_is_told_in_one_line(tmp_path, character):
     with pytest.raises(ConfigError, match="special characters are not allowed") as caught:
         read_layout_file(path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", sorted(p.name for p in (REPOSITORY / "gallery").glob("*.yaml")))
+def test_shots_of_the_gallery_are_built(name):
+    shot = read_shot(REPOSITORY / "gallery" / name)
+
+    assert shot.name == name.removesuffix(".yaml")
+    assert shot.camera.sensor.layout.n_sites > 1000

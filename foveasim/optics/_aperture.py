@@ -15,7 +15,6 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
 from foveasim.arrays import Bools, Floats
@@ -246,6 +245,8 @@ class Aperture:
         otf : (2 n_lags + 1, 2 n_lags + 1) complex64 or complex128
             At frequencies ``k / (n_across λN)``, k from -n_lags to n_lags, rows along y.
         """
+        import scipy.fft
+
         amplitude, _, power = self.samples(wavelength_nm, n_across, field_um)
         n = amplitude.shape[0]
         size = scipy.fft.next_fast_len(2 * n)

@@ -16,7 +16,6 @@ from foveasim.arrays import Bools, Floats, check_choice, check_count, check_numb
 from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.fields import Grid, PowerMap, SceneLike
 from foveasim.optics._aperture import Aperture, Wavefront, overlaps
-from foveasim.optics._imaging import Imaging, patchwork, patchwork_error, reach_cells
 from foveasim.optics._point_images import Point, PointImages
 from foveasim.optics.aberrations import LateralColour, Seidel, Zernike
 from foveasim.optics.otf import MAX_ALIASES, PlaneTables, RadialTables, TableCache, Tables
@@ -352,6 +351,8 @@ class Optics(PointImages):
             yield total.astype(self._real_type())
 
     def _maps(self, scene: SceneLike, weights: Floats, grid: Grid, n_threads: int) -> Iterator[NDArray[Any]]:
+        from foveasim.optics._imaging import Imaging, patchwork
+
         lambda_n_um = self._lambda_n_um(scene)
         aperture = self._aperture(scene.distance_m)
         is_clear_circle = self._is_clear_circle(aperture)
@@ -413,6 +414,8 @@ class Optics(PointImages):
         share : float
             The largest over the wavelengths and the neighbouring patches; 0 where the pattern is the same everywhere.
         """
+        from foveasim.optics._imaging import patchwork_error
+
         grid = self.grid(scene)
         if not self._is_varying():
             return 0.0
@@ -479,6 +482,8 @@ class Optics(PointImages):
 
     def _reach(self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats, share: float) -> int:
         """Cells from a point's image that hold all but a share of its light."""
+        from foveasim.optics._imaging import reach_cells
+
         return max(
             reach_cells(
                 share,
