@@ -521,3 +521,21 @@ def test_a_companding_table_that_falls_or_does_not_reach_its_ends_is_refused(tab
 def test_lines_that_differ_need_a_layout_that_says_which_is_which(parameters):
     with pytest.raises(SimulationError, match="give it a column 'readout_line'"):
         Sensor(fs.Layout.from_rectangles([[0.0, 0.0], [3.0, 0.0]], 2.0), **parameters)
+
+
+@pytest.mark.parametrize(
+    ("charge_e", "message"),
+    [
+        (np.ones(3), f"must be one number for each of the {N} sites, got \\(3,\\)"),
+        (np.full(N, -1.0), "must be >= 0 everywhere, got -1.0 e-"),
+        (np.full(N, np.nan), "must be >= 0 everywhere, got nan e-"),
+    ],
+)
+def test_charges_that_are_not_those_of_the_sites_are_refused(charge_e, message):
+    one = sensor(read_noise_e=1.0)
+
+    for step in (lambda: one.collect(charge_e, streams=Streams(0)), lambda: one.predict(charge_e)):
+        with pytest.raises(ParameterError, match=message):
+            step()
+    with pytest.raises(ParameterError, match="'electrons' must be one number for each of the"):
+        one.read(np.ones(3, np.int64), streams=Streams(0))

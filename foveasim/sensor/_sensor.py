@@ -424,6 +424,7 @@ class Sensor:
 
     def collect(self, expected_e: Floats, *, streams: Streams, n_threads: int | None = None) -> Ints:
         """Charge that a draw gives, (n_site,) int64 e-: shot noise, then the full well."""
+        self._check_charges("expected_e", expected_e)
         electrons = draw_shot_noise(expected_e, self.shot_noise, self.gaussian_above_e, streams, n_threads=n_threads)
         if self.full_well_e is not None:
             well_e = np.floor(np.minimum(self.full_well_e, LARGEST_CHARGE_E)).astype(np.int64)
@@ -437,6 +438,7 @@ class Sensor:
         Noise of resetting and reading, volts, offsets, the clip at V_sat and the converter: without companding and faults
         code ``k`` stands for the voltages from ``k * V_sat / 2**bits`` to the next.
         """
+        self._check_charges("electrons", electrons, at_least=-np.inf)
         convert = self.converter
         code = np.empty(electrons.size, np.uint8 if self.bits <= 8 else np.uint16)
         noises_e = {"reset": self.ktc_noise_e, "read": np.atleast_1d(np.asarray(self.read_noise_e, np.float64))}
@@ -480,6 +482,14 @@ class Sensor:
         in_blocks(electrons.size, block, n_threads)
         return code
 
+    def _check_charges(self, name: str, charge_e: NDArray[Any], at_least: float = 0.0) -> None:
+        if np.shape(charge_e) != (self.layout.n_sites,):
+            raise ParameterError(
+                name, f"must be one number for each of the {self.layout.n_sites} sites, got {np.shape(charge_e)}"
+            )
+        if self.layout.n_sites and not np.min(charge_e) >= at_least:
+            raise ParameterError(name, f"must be >= {at_least:g} everywhere", float(np.min(charge_e)), "e-")
+
     def _telegraph_e(self, streams: Streams) -> Floats | None:
         sites = self.telegraph_sites
         if sites.size == 0 or not self.rts_e:
@@ -511,12 +521,18 @@ class Sensor:
         mean_dn, variance_dn2 : (n_site,) float64, DN and DN²
             Of the codes: quantisation, clips and the converter's faults included.
 
+        Raises
+        ------
+        ParameterError
+            When there is not one charge of at least 0 for each site.
+
         Notes
         -----
         The code is even between borders of the charge, and weighs what the charge's distribution has between: Poisson's law up
         to ``gaussian_above_e`` (for ``"exact"`` too: above it a Gaussian), cut off by the full well, with the Gaussian noise
         of resetting and reading and the telegraph's two states. Coupled charges are taken as Gaussian of the coupled variance.
         """
+        self._check_charges("expected_e", expected_e)
         expected_e = np.ascontiguousarray(expected_e, np.float64)
         convert = self.converter
         mean_dn, variance_dn2 = np.empty(expected_e.size), np.empty(expected_e.size)
