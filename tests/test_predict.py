@@ -166,6 +166,23 @@ def test_diffusion_and_coupling_are_in_the_prediction():
     assert_agree(sensor, expected_e)
 
 
+@pytest.mark.parametrize("light_e", [0.0, 60.0, 1500.0, 4990.0, 5100.0, 12_000.0])
+def test_with_crosstalk_too_every_noise_is_predicted_from_dark_to_saturation(light_e):
+    layout = grid(n_x=8, n_y=8, pitch_um=3.0)
+    sensor = Sensor(
+        layout,
+        bits=12,
+        v_sat_v=1.0,
+        capacitance_f=9e-16,
+        crosstalk=Diffusion(spread_um=0.5),
+        coupling=Coupling(neighbour_share=0.01),
+        pedestal_v=0.05,
+        **EVERYTHING,
+    )
+
+    assert_agree(sensor, sensor.expected_electrons(np.linspace(0.7, 1.0, 64) * light_e, 1.0))
+
+
 def test_the_camera_predicts_what_it_captures():
     layout = fs.layout.mosaic(fs.layout.hexagonal(n_columns=8, n_rows=8, pitch_um=4.0), ("RG", "GB"))
     scene = fs.Scene.flat(

@@ -545,12 +545,10 @@ class Sensor:
         if not is_drawn:
             drawn_e = np.minimum(np.rint(expected_e), well_e)
         if self._coupling is not None:
-            # Of what the well leaves of a draw, as a Gaussian.
-            cut = np.minimum(drawn_e, well_e)
-            drawn_e2 = self._coupling.variance(
-                np.where(drawn_e < well_e, drawn_e, 0.0) if is_drawn else np.zeros_like(cut)
-            )
-            drawn_e, is_drawn, well_e = self._coupling.apply(cut), False, np.array([np.inf])
+            # What the well leaves of a draw is mixed, and taken as a Gaussian.
+            mean_e, variance_e2 = _cut_off(drawn_e, drawn_e if is_drawn else np.zeros(1), well_e)
+            drawn_e, drawn_e2 = self._coupling.apply(mean_e), self._coupling.variance(variance_e2)
+            is_drawn, well_e = False, np.array([np.inf])
         points, shares = np.polynomial.legendre.leggauss(QUADRATURE_NODES)
         line = np.ascontiguousarray(self.layout.readout_line)
         v_per_e = np.atleast_1d(electrons_to_volts(1.0, self.capacitance_f))
@@ -594,3 +592,18 @@ class Sensor:
 def _part(values: Floats, sites: slice) -> Floats:
     """Values of some sites, or the one of all."""
     return values[sites] if values.size > 1 else values
+
+
+def _cut_off(mean: Floats, variance: Floats, end: Floats) -> tuple[Floats, Floats]:
+    """Mean and variance of a Gaussian whose values beyond an end are put to it."""
+    from scipy.special import ndtr
+
+    deviation = np.sqrt(np.maximum(variance, 1e-12))
+    z = np.clip((end - mean) / deviation, -40.0, 40.0)
+    below, at = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
+    # How far below the end, and its square; where all lies far below, the Gaussian itself.
+    short = deviation * (z * below + at)
+    short2 = deviation**2 * ((1.0 + z * z) * below + z * at)
+    is_free = z >= 40.0
+    cut = np.where(is_free, mean, np.where(is_free, 0.0, end) - short)
+    return cut, np.where(is_free, variance, np.maximum(short2 - short**2, 0.0))
