@@ -49,6 +49,10 @@ MIN_WAVELENGTH_NM, MAX_WAVELENGTH_NM = 10.0, 1e6
 #: Suffixes of names, longest first, and the unit that each stands for in messages.
 UNIT_SUFFIXES = {
     "_fraction": "",
+    "_dn_per_ph": "DN per photon",
+    "_dn2": "DN²",
+    "_e2": "e-²",
+    "_ph": "photons",
     "_w_m2_sr_nm": "W/(m² sr nm)",
     "_w_m2_sr": "W/(m² sr)",
     "_e_per_s": "e-/s",

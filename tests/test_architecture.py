@@ -41,7 +41,6 @@ DIMENSIONLESS = {
     "a", "above", "at_least", "at_most", "blanking", "coefficients", "colours", "companding_table", "contrast", "dpi", "f_number", "factor", "figure_inches", "fill_factor", "gain", "hot_sigmas", "k", "k1", "k2", "k3", "k4", "k5", "k6", "kernel",
     "limit", "log_strength", "magnification", "max_aspect_ratio", "obscuration",
     "max_density", "max_growth", "max_neighbour_ratio", "max_track_use", "min_density", "min_growth", "neighbour_share", "noisy_ratio", "p1", "p2", "peak", "per_vertex", "qe", "ratio", "rounding",
-    "level_ph", "noise_dn2", "responsivity_dn_per_ph", "saturation_ph", "spatial_variance_dn2", "temporal_variance_dn2", "threshold_ph", "variance_dn2",
     "ring_ratio", "sensitivity", "spectrum", "stretch", "transmission", "value", "values", "weight", "weights", "white", "worst_area_error",
 }  # fmt: skip
 #: Names of parts that no user sees, in cells, pitches or steps as their docstrings say.

@@ -594,16 +594,16 @@ def _part(values: Floats, sites: slice) -> Floats:
     return values[sites] if values.size > 1 else values
 
 
-def _cut_off(mean: Floats, variance: Floats, end: Floats) -> tuple[Floats, Floats]:
+def _cut_off(mean_e: Floats, variance_e2: Floats, end_e: Floats) -> tuple[Floats, Floats]:
     """Mean and variance of a Gaussian whose values beyond an end are put to it."""
     from scipy.special import ndtr
 
-    deviation = np.sqrt(np.maximum(variance, 1e-12))
-    z = np.clip((end - mean) / deviation, -40.0, 40.0)
+    deviation = np.sqrt(np.maximum(variance_e2, 1e-12))
+    z = np.clip((end_e - mean_e) / deviation, -40.0, 40.0)
     below, at = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
     # How far below the end, and its square; where all lies far below, the Gaussian itself.
     short = deviation * (z * below + at)
     short2 = deviation**2 * ((1.0 + z * z) * below + z * at)
     is_free = z >= 40.0
-    cut = np.where(is_free, mean, np.where(is_free, 0.0, end) - short)
-    return cut, np.where(is_free, variance, np.maximum(short2 - short**2, 0.0))
+    cut = np.where(is_free, mean_e, np.where(is_free, 0.0, end_e) - short)
+    return cut, np.where(is_free, variance_e2, np.maximum(short2 - short**2, 0.0))
