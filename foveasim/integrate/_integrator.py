@@ -119,8 +119,11 @@ class Integrator:
                 raise ParameterError("distortion", "must be a lens of foveasim.distortion", distortion)
             carried = carried_back(layout, distortion, grid.pitch_um, self.n_threads)
             layout, self._is_lost = carried, carried.is_lost
+            self._area_um2, self._bounds_um = carried.area_um2, carried.bounds_um
+        else:
+            self._area_um2 = site_area_um2(layout.xy_um, layout.ring_offsets, layout.site_offsets)
+            self._bounds_um = site_bounds_um(layout.xy_um, layout.ring_offsets, layout.site_offsets)
         # A lens does not turn outlines over: its image of one that is clockwise is so too.
-        self._area_um2 = site_area_um2(layout.xy_um, layout.ring_offsets, layout.site_offsets)
         inside_out = np.flatnonzero(self._area_um2 <= 0.0)
         if inside_out.size:
             raise GeometryError(
@@ -133,8 +136,7 @@ class Integrator:
                 self._gain *= (
                     site_area_um2(on_sensor.xy_um, on_sensor.ring_offsets, on_sensor.site_offsets) / self._area_um2
                 )
-        self._plan: Plan = compile_plan(layout, grid, self.n_threads, self.order)
-        self._bounds_um = site_bounds_um(layout.xy_um, layout.ring_offsets, layout.site_offsets)
+        self._plan: Plan = compile_plan(layout, self._bounds_um, grid, self.n_threads, self.order)
 
     @property
     def lost_sites(self) -> Ints:

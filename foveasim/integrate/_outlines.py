@@ -9,7 +9,7 @@ import numpy as np
 from foveasim.arrays import Bools, Floats, Ints
 from foveasim.fields import PackedRings, PointMap
 from foveasim.parallel import each
-from foveasim.rings import next_vertex, positions_in_runs
+from foveasim.rings import next_vertex, positions_in_runs, site_area_um2, site_bounds_um
 
 __all__ = ["CarriedRings", "carried_back"]
 
@@ -25,12 +25,14 @@ SITES_PER_PIECE = 4096
 
 
 class CarriedRings(NamedTuple):
-    """Packed rings in the undistorted plane, and which sites have no place there."""
+    """Packed rings in the undistorted plane, which sites have no place there, and all sites' areas and bounds."""
 
     xy_um: Floats
     ring_offsets: Ints
     site_offsets: Ints
     is_lost: Bools
+    area_um2: Floats
+    bounds_um: Floats
 
 
 def carried_back(layout: PackedRings, lens: PointMap, pitch_um: float, n_threads: int) -> CarriedRings:
@@ -58,29 +60,31 @@ def carried_back(layout: PackedRings, lens: PointMap, pitch_um: float, n_threads
     """
     n_sites = layout.site_offsets.size - 1
     if n_sites == 0:
-        return CarriedRings(layout.xy_um, layout.ring_offsets, layout.site_offsets, np.zeros(0, bool))
+        return CarriedRings(
+            layout.xy_um, layout.ring_offsets, layout.site_offsets, np.zeros(0, bool), np.zeros(0), np.zeros((0, 4))
+        )
     bends = _Bends(layout.xy_um, lens, CHORD_SHARE * pitch_um)
 
-    def some_sites(first: int) -> tuple[Floats, Ints, Bools]:
+    def some_sites(first: int) -> CarriedRings:
         site_offsets = layout.site_offsets[first : min(first + SITES_PER_PIECE, n_sites) + 1]
         ring_offsets = layout.ring_offsets[site_offsets[0] : site_offsets[-1] + 1]
         xy_um = layout.xy_um[ring_offsets[0] : ring_offsets[-1]]
         return _carried(xy_um, ring_offsets - ring_offsets[0], site_offsets - site_offsets[0], lens, bends)
 
     pieces = each(some_sites, range(0, n_sites, SITES_PER_PIECE), n_threads)
-    n_points = np.concatenate([piece[1] for piece in pieces])
+    n_points = np.concatenate([np.diff(piece.ring_offsets) for piece in pieces])
     return CarriedRings(
-        np.concatenate([piece[0] for piece in pieces]),
+        np.concatenate([piece.xy_um for piece in pieces]),
         np.concatenate(([0], np.cumsum(n_points))),
         layout.site_offsets,
-        np.concatenate([piece[2] for piece in pieces]),
+        np.concatenate([piece.is_lost for piece in pieces]),
+        np.concatenate([piece.area_um2 for piece in pieces]),
+        np.concatenate([piece.bounds_um for piece in pieces]),
     )
 
 
-def _carried(
-    xy_um: Floats, ring_offsets: Ints, site_offsets: Ints, lens: PointMap, bends: _Bends
-) -> tuple[Floats, Ints, Bools]:
-    """Points of some sites' outlines, how many every ring has, and which sites are lost."""
+def _carried(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints, lens: PointMap, bends: _Bends) -> CarriedRings:
+    """The outlines of some sites."""
     end = xy_um[next_vertex(ring_offsets)]
     n_pieces = bends.n_pieces(xy_um, end)
     points = xy_um
@@ -99,7 +103,14 @@ def _carried(
     if is_lost.any():
         is_of_lost = np.repeat(is_lost, np.diff(new_offsets[site_offsets]))
         carried = np.where(is_of_lost[:, np.newaxis], points, carried)
-    return carried, np.diff(new_offsets), is_lost
+    return CarriedRings(
+        carried,
+        new_offsets,
+        site_offsets,
+        is_lost,
+        site_area_um2(carried, new_offsets, site_offsets),
+        site_bounds_um(carried, new_offsets, site_offsets),
+    )
 
 
 class _Bends:

@@ -13,7 +13,7 @@ from foveasim.arrays import Floats, Ints
 from foveasim.compiled import kernels
 from foveasim.fields import Grid, PackedRings
 from foveasim.parallel import each
-from foveasim.rings import positions_in_runs, site_bounds_um
+from foveasim.rings import positions_in_runs
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -148,8 +148,8 @@ class _Traced(NamedTuple):
     row_cuts: Ints
 
 
-def compile_plan(rings: PackedRings, grid: Grid, n_threads: int, order: int = 1) -> Plan:
-    """Trace every outline on the grid, and put what it covers in the order of the grid's rows."""
+def compile_plan(rings: PackedRings, bounds_um: Floats, grid: Grid, n_threads: int, order: int = 1) -> Plan:
+    """Trace every outline, within its bounds (n_site, 4), on the grid; put what it covers in the order of the grid's rows."""
     n_y = grid.shape[0]
     uv = np.ascontiguousarray(rings.xy_um - np.asarray(grid.origin_um))
     uv /= grid.pitch_um
@@ -164,9 +164,9 @@ def compile_plan(rings: PackedRings, grid: Grid, n_threads: int, order: int = 1)
     row_cuts, next_cut = _starts([t.row_cuts for t in traced], n_y)
 
     rows_per_band = max(MIN_ROWS_PER_BAND, -(-n_y // MAX_BANDS))
-    bounds = site_bounds_um(uv, ring_offsets, site_offsets)  # in cells
-    first_row = np.floor(np.clip(bounds[:, 1], 0, n_y)).astype(np.int64)
-    last_row = np.ceil(np.clip(bounds[:, 3], 0, n_y)).astype(np.int64)
+    low, high = ((bounds_um[:, k] - grid.origin_um[1]) / grid.pitch_um for k in (1, 3))
+    first_row = np.floor(np.clip(low, 0, n_y)).astype(np.int64)
+    last_row = np.ceil(np.clip(high, 0, n_y)).astype(np.int64)
     n_bands = np.where(last_row > first_row, (last_row - 1) // rows_per_band - first_row // rows_per_band + 1, 0)
     first_slot = np.concatenate(([0], np.cumsum(n_bands)))
 
