@@ -57,6 +57,7 @@ def test_temporal_sources_add_up_to_the_variance_of_the_code(companding, bend):
         read_noise_e=60.0,
         ktc_noise=True,
         nonlinearity_fraction=bend,
+        pedestal_v=0.4 if bend else 0.0,
         **companding,
     )
     photo_e = np.linspace(4000.0, 15_000.0, N)
@@ -66,6 +67,9 @@ def test_temporal_sources_add_up_to_the_variance_of_the_code(companding, bend):
     slope_dn_per_e = np.gradient(mean_dn, photo_e)
     total_e2 = sum(budget[name] ** 2 for name in TEMPORAL)
     inner = slice(5, -5)
+    # A step of the converter is worth what the slope of the whole chain says, at the level that the pedestal lifts it to.
+    steps_e = 1.0 / np.sqrt(12.0) / slope_dn_per_e
+    assert np.mean(budget["quantisation"][inner] / steps_e[inner]) == pytest.approx(1.0, abs=0.01)
     assert np.mean(variance_dn2[inner] / slope_dn_per_e[inner] ** 2 / total_e2[inner]) == pytest.approx(1.0, abs=0.01)
 
 

@@ -58,7 +58,10 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
     charge_e = photo_e + dark_e
     share = np.clip(charge_e * volts_per_e / sensor.v_sat_v, 0.0, 1.0)
     bent_v_per_e = volts_per_e * (1.0 - 2.0 * sensor.nonlinearity_fraction * share)
-    dn_per_e = _slope_dn(sensor, share * (1.0 - sensor.nonlinearity_fraction * share)) / sensor.v_sat_v * bent_v_per_e
+    lifted = np.clip(
+        share * (1.0 - sensor.nonlinearity_fraction * share) + sensor.pedestal_v / sensor.v_sat_v, 0.0, 1.0
+    )
+    dn_per_e = _slope_dn(sensor, lifted) / sensor.v_sat_v * bent_v_per_e
     is_telegraph = np.zeros(n_sites)
     is_telegraph[sensor.telegraph_sites] = 1.0
     is_drawn = sensor.shot_noise != "off"
