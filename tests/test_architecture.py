@@ -57,9 +57,23 @@ def room_of(path):
     return relative.parts[0].removesuffix(".py")
 
 
+#: Methods by which data hand themselves to the room that shows them: these may call upwards, and nothing else may.
+SHOWN_BY = {"plot", "to_pyvista"}
+
+
 def imported_rooms(path):
     rooms = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    tree = ast.parse(path.read_text())
+    handed_up = {
+        node
+        for method in ast.walk(tree)
+        if isinstance(method, ast.FunctionDef) and method.name in SHOWN_BY
+        for node in ast.walk(method)
+        if isinstance(node, ast.ImportFrom) and node.module == "foveasim.view"
+    }
+    for node in ast.walk(tree):
+        if node in handed_up:
+            continue
         names = []
         if isinstance(node, ast.ImportFrom) and node.module:
             names = [node.module, *(f"{node.module}.{a.name}" for a in node.names if node.module == "foveasim")]
