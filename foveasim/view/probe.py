@@ -1,0 +1,156 @@
+"""
+What this machine can render three dimensions with, found without the crash of trying.
+
+Where no OpenGL is, VTK ends the interpreter instead of raising. So libraries are asked first, without VTK; then a program of
+its own draws a few pixels with VTK and is read: what survives that may be used here.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from importlib.util import find_spec
+
+__all__ = ["begin_rendering", "find_renderer", "what_to_install"]
+
+#: Names by which VTK's window classes are chosen, and the variable that chooses.
+VTK_CHOICE = "VTK_DEFAULT_OPENGL_WINDOW"
+X11, EGL, OSMESA = "vtkXOpenGLRenderWindow", "vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow"
+#: Systems whose own windows VTK always has.
+OF_SYSTEM = {"darwin": "vtkCocoaRenderWindow", "win32": "vtkWin32OpenGLRenderWindow"}
+#: From EGL's headers: a display without screen (EGL_MESA_platform_surfaceless).
+EGL_PLATFORM_SURFACELESS_MESA = 0x31DD
+#: A renderer that has drawn nothing after this time hangs.
+TRIAL_S = 60.0
+#: Draws eight by eight pixels of one colour and looks at them.
+TRIAL = """
+import vtkmodules.vtkRenderingOpenGL2
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
+from vtkmodules.vtkRenderingCore import vtkRenderer, vtkRenderWindow
+renderer, window = vtkRenderer(), vtkRenderWindow()
+renderer.SetBackground(1.0, 0.0, 1.0)
+window.SetOffScreenRendering(1)
+window.SetMultiSamples(0)
+window.SetSize(8, 8)
+window.AddRenderer(renderer)
+window.Render()
+pixels = vtkUnsignedCharArray()
+window.GetPixelData(0, 0, 7, 7, 1, pixels, 0)
+raise SystemExit(vtk_to_numpy(pixels).tolist() != [[255, 0, 255]] * 64)
+"""
+
+
+@cache
+def find_renderer() -> str | None:
+    """
+    The window class with which VTK can render on this machine, found once.
+
+    Returns
+    -------
+    str or None
+        The name of the VTK class: on a screen, by EGL or by OSMesa without one; None where there is none, or no VTK.
+
+    Notes
+    -----
+    A ``VTK_DEFAULT_OPENGL_WINDOW`` in the environment is tried first. On the first call a program of its own renders a
+    few pixels, which takes some tenths of a second; a crash ends that program alone.
+    """
+    if find_spec("vtkmodules") is None:
+        return None
+    return next((name for name in dict.fromkeys(_candidates()) if _survives(name)), None)
+
+
+def begin_rendering() -> None:
+    """Tell VTK which window to use; to be called before its first one, where :func:`find_renderer` found one."""
+    found = find_renderer()
+    if found is not None:
+        os.environ[VTK_CHOICE] = found
+
+
+def what_to_install() -> str:
+    """What is missing for pictures by PyVista, as a sentence; empty where nothing is."""
+    if any(find_spec(module) is None for module in ("pyvista", "vtkmodules")):
+        return "PyVista is not installed; install it with pip install 'foveasim[view]'"
+    if find_renderer() is None:
+        return "this machine has no OpenGL; install it, on Debian and Ubuntu with apt install libegl1 libgl1"
+    return ""
+
+
+def _candidates() -> Iterator[str]:
+    """Window classes whose libraries are here and answer, the best first."""
+    if os.environ.get(VTK_CHOICE):
+        yield os.environ[VTK_CHOICE]
+    if sys.platform in OF_SYSTEM:
+        yield OF_SYSTEM[sys.platform]
+        return
+    if os.environ.get("DISPLAY") and _opens_display():
+        yield X11
+    if _initialises_egl():
+        yield EGL
+    if _library("libOSMesa.so.8") is not None:
+        yield OSMESA
+
+
+def _survives(window: str) -> bool:
+    """Whether a program of its own renders with this class of window."""
+    command = [sys.executable, "-P", "-c", TRIAL]
+    try:
+        trial = subprocess.run(  # noqa: S603 -- our own text
+            command, env={**os.environ, VTK_CHOICE: window}, capture_output=True, timeout=TRIAL_S, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return trial.returncode == 0
+
+
+def _library(name: str) -> ctypes.CDLL | None:
+    try:
+        return ctypes.CDLL(name)
+    except OSError:
+        return None
+
+
+def _opens_display() -> bool:
+    """Whether X11 is here and shows something: a name alone in DISPLAY does not."""
+    x11 = _library("libX11.so.6")
+    if x11 is None:
+        return False
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    x11.XOpenDisplay.argtypes = (ctypes.c_char_p,)
+    x11.XCloseDisplay.argtypes = (ctypes.c_void_p,)
+    display = x11.XOpenDisplay(None)
+    if not display:
+        return False
+    x11.XCloseDisplay(display)
+    return True
+
+
+def _initialises_egl() -> bool:
+    """Whether EGL finds a driver for a display without screen: the library alone, without a driver, makes VTK crash."""
+    os.environ.setdefault("EGL_LOG_LEVEL", "fatal")  # Mesa would print where it has looked in vain
+    egl = _library("libEGL.so.1")
+    if egl is None:
+        return False
+    egl.eglGetProcAddress.restype = ctypes.c_void_p
+    egl.eglGetProcAddress.argtypes = (ctypes.c_char_p,)
+    egl.eglGetDisplay.restype = ctypes.c_void_p
+    egl.eglGetDisplay.argtypes = (ctypes.c_void_p,)
+    for function in (egl.eglInitialize, egl.eglTerminate):
+        function.restype = ctypes.c_uint
+    egl.eglInitialize.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
+    egl.eglTerminate.argtypes = (ctypes.c_void_p,)
+    displays = [egl.eglGetDisplay(None)]
+    address = egl.eglGetProcAddress(b"eglGetPlatformDisplayEXT")
+    if address:
+        get = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_uint, ctypes.c_void_p, ctypes.c_void_p)(address)
+        displays.insert(0, get(EGL_PLATFORM_SURFACELESS_MESA, None, None))
+    for display in filter(None, displays):
+        if egl.eglInitialize(display, None, None):
+            egl.eglTerminate(display)
+            return True
+    return False
