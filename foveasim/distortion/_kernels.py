@@ -20,6 +20,8 @@ RESIDUAL, SOLVED = 1e-15, 1e-12
 LOOK_BACK = 8
 #: A squared residual of so many times that of rounding cannot be made smaller by shorter steps.
 NEARLY = 1e4
+#: A step of this share of a point's distance from the centre is the last: what it leaves is of the share's square.
+LAST_STEP = 1e-9
 #: Between the directions in which it is known, the fold may be further out by this share.
 FOLD_MARGIN = 1e-3
 
@@ -45,7 +47,7 @@ def _is_inside(x, y, determinant, fold, min_fold):
     """Whether an ideal point lies within the fold, whose radius is given in equal directions."""
     if not determinant > 0.0:
         return False
-    radius = np.hypot(x, y)
+    radius = np.sqrt(x * x + y * y)
     if radius <= min_fold:
         return True
     turn = np.arctan2(y, x) / (2.0 * np.pi) * fold.size
@@ -79,7 +81,7 @@ def brown_conrady_inverse(xy, k, p1, p2, fold, ideal, per_step):
         if same >= 0:
             found[i, 0], found[i, 1] = found[same, 0], found[same, 1]
             continue
-        distance = np.hypot(u, v)
+        distance = np.sqrt(u * u + v * v)
         place = distance * per_step
         at = int(min(place, float(last - 1)))
         radius = ideal[at] + min(place - at, 1.0) * (ideal[at + 1] - ideal[at])
@@ -93,19 +95,23 @@ def brown_conrady_inverse(xy, k, p1, p2, fold, ideal, per_step):
             scale *= 0.8
         ex, ey = x_d - u, y_d - v
         error = ex * ex + ey * ey
-        goal = RESIDUAL * max(distance, 1e-3)
-        goal *= goal
+        size = max(distance, 1e-3)
+        goal = (RESIDUAL * size) * (RESIDUAL * size)
+        last_step = (LAST_STEP * size) * (LAST_STEP * size)
         for _ in range(MAX_STEPS):
             determinant = xx * yy - xy_ * xy_
             if error <= goal or determinant <= 0.0:
                 break
             step_x, step_y = (yy * ex - xy_ * ey) / determinant, (xx * ey - xy_ * ex) / determinant
+            if step_x * step_x + step_y * step_y <= last_step:
+                x, y, error = x - step_x, y - step_y, 0.0
+                break
             length, is_better = 1.0, False
             for _ in range(MAX_HALVINGS):
                 new_x, new_y = x - length * step_x, y - length * step_y
                 x_d, y_d, a, b, c = _map(new_x, new_y, k, p1, p2)
                 fx, fy = x_d - u, y_d - v
-                if fx * fx + fy * fy < error and a * c - b * b > 0.0 and np.hypot(new_x, new_y) <= max_fold:
+                if fx * fx + fy * fy < error and a * c - b * b > 0.0 and new_x * new_x + new_y * new_y <= max_fold * max_fold:
                     is_better = True
                     break
                 if error <= NEARLY * goal:  # rounding: shorter steps come no nearer

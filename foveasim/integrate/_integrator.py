@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from collections.abc import Callable
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -11,10 +12,10 @@ from numpy.typing import ArrayLike
 from foveasim.arrays import Floats, Ints, check_choice, check_count, finite_array, read_only
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, PackedRings, PointMap
-from foveasim.integrate._outlines import carried_back
+from foveasim.integrate._outlines import CarriedOutlines, Outlines, outlines_of
 from foveasim.integrate._plan import Plan, compile_plan
 from foveasim.parallel import thread_count
-from foveasim.rings import site_area_um2, site_bounds_um
+from foveasim.rings import site_area_um2
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -111,37 +112,31 @@ class Integrator:
         self.order = check_count("order", order, at_most=2, cure="1 takes cells as even, 2 as means with a gradient")
         self.n_threads = thread_count(n_threads)
         check_choice("conserve", conserve, ("flux", "density"))
-        self._gain: Floats | None = None
-        self._is_lost = np.zeros(layout.site_offsets.size - 1, bool)
-        on_sensor = layout
+        outlines: Callable[[int, int], Outlines] = partial(outlines_of, layout)
         if distortion is not None:
             if not hasattr(distortion, "undistort"):
                 raise ParameterError("distortion", "must be a lens of foveasim.distortion", distortion)
-            carried = carried_back(layout, distortion, grid.pitch_um, self.n_threads)
-            layout, self._is_lost = carried, carried.is_lost
-            self._area_um2, self._bounds_um = carried.area_um2, carried.bounds_um
-        else:
-            self._area_um2 = site_area_um2(layout.xy_um, layout.ring_offsets, layout.site_offsets)
-            self._bounds_um = site_bounds_um(layout.xy_um, layout.ring_offsets, layout.site_offsets)
+            outlines = CarriedOutlines(layout, distortion, grid.pitch_um)
+        self._plan: Plan = compile_plan(outlines, layout.site_offsets.size - 1, grid, self.n_threads, self.order)
         # A lens does not turn outlines over: its image of one that is clockwise is so too.
-        inside_out = np.flatnonzero(self._area_um2 <= 0.0)
+        inside_out = np.flatnonzero(self._plan.area_um2 <= 0.0)
         if inside_out.size:
             raise GeometryError(
                 f"site {inside_out[0]} has no positive area: its outline must be counter-clockwise, as from_polygons makes it",
                 tuple(int(i) for i in inside_out),
             )
-        if distortion is not None and (conserve == "density" or self._is_lost.any()):
-            self._gain = np.where(self._is_lost, 0.0, 1.0)
+        self._gain: Floats | None = None
+        if distortion is not None and (conserve == "density" or self._plan.is_lost.any()):
+            self._gain = np.where(self._plan.is_lost, 0.0, 1.0)
             if conserve == "density":
                 self._gain *= (
-                    site_area_um2(on_sensor.xy_um, on_sensor.ring_offsets, on_sensor.site_offsets) / self._area_um2
+                    site_area_um2(layout.xy_um, layout.ring_offsets, layout.site_offsets) / self._plan.area_um2
                 )
-        self._plan: Plan = compile_plan(layout, self._bounds_um, grid, self.n_threads, self.order)
 
     @property
     def lost_sites(self) -> Ints:
         """Sites outside the lens's image circle, which receive nothing."""
-        return np.flatnonzero(self._is_lost)
+        return np.flatnonzero(self._plan.is_lost)
 
     def __repr__(self) -> str:
         return f"Integrator({self.n_sites} sites on {self.grid})"
@@ -154,15 +149,15 @@ class Integrator:
     @cached_property
     def uncovered_um2(self) -> Floats:
         """Area of each site, in the map's plane, that lies off the grid or gets no light through the lens, (n_site,) µm²."""
-        x_min, y_min, x_max, y_max = self.grid.bounds_um
+        plan, (x_min, y_min, x_max, y_max) = self._plan, self.grid.bounds_um
         rounding_um = UNCOVERED_ROUNDING * max(map(abs, self.grid.bounds_um))
-        low_um, high_um = self._bounds_um[:, :2], self._bounds_um[:, 2:]
+        low_um, high_um = plan.bounds_um[:, :2], plan.bounds_um[:, 2:]
         beyond_um = np.maximum(np.array([x_min, y_min]) - low_um, high_um - np.array([x_max, y_max])).max(
             axis=1, initial=-np.inf
         )
-        rest_um2 = np.clip(self._area_um2 - self._plan.covered_um2, 0.0, self._area_um2)
+        rest_um2 = np.clip(plan.area_um2 - plan.covered_um2, 0.0, plan.area_um2)
         rest_um2 = np.where(beyond_um > rounding_um, rest_um2, 0.0)
-        return read_only(np.where(self._is_lost, self._area_um2, rest_um2))
+        return read_only(np.where(plan.is_lost, plan.area_um2, rest_um2))
 
     def __call__(self, power_map: ArrayLike) -> Floats:
         """

@@ -33,6 +33,7 @@ __all__ = [
     "ROW",
     "SITE",
     "gather",
+    "measure_sites",
     "place_cuts",
     "place_spans",
     "scatter",
@@ -323,16 +324,44 @@ def _write_cuts(first_cell, links, moment, climb, n_y, n_x, site, row, cuts, mom
     return n_cuts
 
 
+@njit(types.Tuple((_float_list, _moment_list))(_points, _ints, _ints), cache=True, nogil=True)
+def measure_sites(xy, ring_offsets, site_offsets):
+    """
+    Area (n_site,) of every site, holes taken off, negative when clockwise; and its bounds (n_site, 4): low, then high.
+
+    Rings are measured from their first vertex, so that small ones far from the origin keep their digits.
+    """
+    n_sites = site_offsets.size - 1
+    areas = np.empty(n_sites, np.float64)
+    bounds = np.empty((n_sites, 4), np.float64)
+    for site in range(n_sites):
+        twice = 0.0
+        x_low, y_low, x_high, y_high = np.inf, np.inf, -np.inf, -np.inf
+        for ring in range(site_offsets[site], site_offsets[site + 1]):
+            start, stop = ring_offsets[ring], ring_offsets[ring + 1]
+            x_0, y_0 = xy[start, 0], xy[start, 1]
+            x_a, y_a = xy[stop - 1, 0] - x_0, xy[stop - 1, 1] - y_0
+            for b in range(start, stop):
+                x_low, x_high = min(x_low, xy[b, 0]), max(x_high, xy[b, 0])
+                y_low, y_high = min(y_low, xy[b, 1]), max(y_high, xy[b, 1])
+                x_b, y_b = xy[b, 0] - x_0, xy[b, 1] - y_0
+                twice += x_a * y_b - y_a * x_b
+                x_a, y_a = x_b, y_b
+        areas[site] = 0.5 * twice
+        bounds[site, 0], bounds[site, 1], bounds[site, 2], bounds[site, 3] = x_low, y_low, x_high, y_high
+    return areas, bounds
+
+
 @njit(
     types.Tuple((_span_list, _float_list, _cut_list, _moment_list, _float_list))(
-        _points, _ints, _ints, _count, _count, _count, _count, _count
+        _points, _ints, _ints, _count, _count, _count, _count
     ),
     cache=True,
     nogil=True,
 )
-def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x, order):
+def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
     """
-    Spans of the sites ``first_site .. last_site - 1`` on a grid of ``n_y`` rows and ``n_x`` columns.
+    Spans of some sites, the first of which is number ``first_site``, on a grid of ``n_y`` rows and ``n_x`` columns.
 
     ``F(u)``, the integral of the map along a row from its left end to ``u``, makes the integral over a polygon
     the sum over its edges of (height climbed) x (mean of F). Split at the cell borders, a piece of height
@@ -348,10 +377,10 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x,
     cuts : (n_cut, 3) int32
         At second order, in the order of the spans; empty at first.
     moments : (n_cut, 2) float64
-    covered : (last_site - first_site,) float64, cells
+    covered : (n_site,) float64, cells
         Area of each site that lies on the grid.
     """
-    n_sites = last_site - first_site
+    n_sites = site_offsets.size - 1
     covered = np.zeros(n_sites, np.float64)
     spans = np.empty((4 * n_sites + 64, 5), np.int32)
     weights = np.empty(16 * n_sites + 64, np.float64)
@@ -359,7 +388,7 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x,
     n_cuts = 0
     room = 0  # for all cuts, but for those along horizontal edges
     if has_moments:
-        first_ring, last_ring = site_offsets[first_site], site_offsets[last_site]
+        first_ring, last_ring = site_offsets[0], site_offsets[n_sites]
         room = n_x + _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_y * n_sites)
     cuts = np.empty((room, 3), np.int32)
     moments = np.empty((cuts.shape[0], 2), np.float64)
@@ -372,8 +401,9 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x,
     cover = np.empty((256, 2), np.float64)
     moment = np.empty((256 if has_moments else 0, 3), np.float64)
 
-    for site in range(first_site, last_site):
-        first_ring, last_ring = site_offsets[site], site_offsets[site + 1]
+    for i_site in range(n_sites):
+        site = first_site + i_site
+        first_ring, last_ring = site_offsets[i_site], site_offsets[i_site + 1]
         v_low, v_high = np.inf, -np.inf
         for i in range(ring_offsets[first_ring], ring_offsets[last_ring]):
             v_low = min(v_low, uv[i, 1])
@@ -423,7 +453,7 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, last_site, n_y, n_x,
             n_spans, n_weights, area = _write_row(
                 head[row], links, cover, climb[row], n_x, site, bottom + row, spans, n_spans, weights, n_weights
             )
-            covered[site - first_site] += area
+            covered[i_site] += area
         if has_moments:
             for row in range(n_rows):
                 if n_cuts + n_x > cuts.shape[0]:

@@ -1,4 +1,4 @@
-"""Outlines of photosites carried back through a lens into the plane of the undistorted map."""
+"""Outlines of photosites in the map's plane: as they are, or carried back through a lens, some sites at a time."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import numpy as np
 
 from foveasim.arrays import Bools, Floats, Ints
 from foveasim.fields import PackedRings, PointMap
-from foveasim.parallel import each
-from foveasim.rings import next_vertex, positions_in_runs, site_area_um2, site_bounds_um
+from foveasim.rings import next_vertex, positions_in_runs
 
-__all__ = ["CarriedRings", "carried_back"]
+__all__ = ["CarriedOutlines", "Outlines", "outlines_of"]
 
 #: A carried edge deviates from its chords by at most this share of a cell; one that is longer than a step of the grid below, or
 #: needs more than the most pieces, by a few times that.
@@ -20,22 +19,30 @@ CHORD_SHARE = 0.002
 BEND_POINTS = 65
 #: An edge is cut into so many pieces at most: those that need more reach the lens's border.
 MAX_PIECES = 256
-#: Sites that are carried as one piece of work, whose points stay in the cache.
-SITES_PER_PIECE = 4096
 
 
-class CarriedRings(NamedTuple):
-    """Packed rings in the undistorted plane, which sites have no place there, and all sites' areas and bounds."""
+class Outlines(NamedTuple):
+    """Packed rings of some sites in the map's plane, and which of the sites have no place there."""
 
     xy_um: Floats
     ring_offsets: Ints
     site_offsets: Ints
     is_lost: Bools
-    area_um2: Floats
-    bounds_um: Floats
 
 
-def carried_back(layout: PackedRings, lens: PointMap, pitch_um: float, n_threads: int) -> CarriedRings:
+def outlines_of(layout: PackedRings, first: int, last: int) -> Outlines:
+    """The outlines of the sites from the first to before the last, as they are in the sensor plane."""
+    site_offsets = layout.site_offsets[first : last + 1]
+    ring_offsets = layout.ring_offsets[site_offsets[0] : site_offsets[-1] + 1]
+    return Outlines(
+        np.ascontiguousarray(layout.xy_um[ring_offsets[0] : ring_offsets[-1]]),
+        ring_offsets - ring_offsets[0],
+        site_offsets - site_offsets[0],
+        np.zeros(last - first, bool),
+    )
+
+
+class CarriedOutlines:
     """
     The outlines that an ideal lens would have to fill.
 
@@ -47,44 +54,26 @@ def carried_back(layout: PackedRings, lens: PointMap, pitch_um: float, n_threads
         NaN for points that the lens sends no light to.
     pitch_um : float, µm
         Of the map's cells: edges are cut until their chords are within 0.2 % of it.
-    n_threads : int
-
-    Returns
-    -------
-    CarriedRings
-        Sites with a vertex that gets no light are lost, and have their outlines in the sensor plane.
 
     Notes
     -----
-    An edge is cut at the same points from both of its sides, so that what tiles the sensor tiles the carried plane.
+    Sites with a vertex that gets no light are lost, and keep their outlines in the sensor plane. An edge is cut at the same
+    points from both of its sides, so that what tiles the sensor tiles the carried plane.
     """
-    n_sites = layout.site_offsets.size - 1
-    if n_sites == 0:
-        return CarriedRings(
-            layout.xy_um, layout.ring_offsets, layout.site_offsets, np.zeros(0, bool), np.zeros(0), np.zeros((0, 4))
-        )
-    bends = _Bends(layout.xy_um, lens, CHORD_SHARE * pitch_um)
 
-    def some_sites(first: int) -> CarriedRings:
-        site_offsets = layout.site_offsets[first : min(first + SITES_PER_PIECE, n_sites) + 1]
-        ring_offsets = layout.ring_offsets[site_offsets[0] : site_offsets[-1] + 1]
-        xy_um = layout.xy_um[ring_offsets[0] : ring_offsets[-1]]
-        return _carried(xy_um, ring_offsets - ring_offsets[0], site_offsets - site_offsets[0], lens, bends)
+    def __init__(self, layout: PackedRings, lens: PointMap, pitch_um: float) -> None:
+        self._layout, self._lens = layout, lens
+        self._bends = _Bends(layout.xy_um, lens, CHORD_SHARE * pitch_um) if layout.xy_um.size else None
 
-    pieces = each(some_sites, range(0, n_sites, SITES_PER_PIECE), n_threads)
-    n_points = np.concatenate([np.diff(piece.ring_offsets) for piece in pieces])
-    return CarriedRings(
-        np.concatenate([piece.xy_um for piece in pieces]),
-        np.concatenate(([0], np.cumsum(n_points))),
-        layout.site_offsets,
-        np.concatenate([piece.is_lost for piece in pieces]),
-        np.concatenate([piece.area_um2 for piece in pieces]),
-        np.concatenate([piece.bounds_um for piece in pieces]),
-    )
+    def __call__(self, first: int, last: int) -> Outlines:
+        """Those of the sites from the first to before the last."""
+        outlines = outlines_of(self._layout, first, last)
+        return outlines if self._bends is None else _carried(outlines, self._lens, self._bends)
 
 
-def _carried(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints, lens: PointMap, bends: _Bends) -> CarriedRings:
-    """The outlines of some sites."""
+def _carried(outlines: Outlines, lens: PointMap, bends: _Bends) -> Outlines:
+    """Outlines in the sensor plane, carried back."""
+    xy_um, ring_offsets, site_offsets, _ = outlines
     end = xy_um[next_vertex(ring_offsets)]
     n_pieces = bends.n_pieces(xy_um, end)
     points = xy_um
@@ -97,20 +86,13 @@ def _carried(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints, lens: PointM
         share = np.where(is_turned[edge], n_pieces[edge] - step, step) / n_pieces[edge]
         points = low[edge] + share[:, np.newaxis] * (high - low)[edge]
         points[step == 0] = xy_um
+        ring_offsets = np.concatenate(([0], np.cumsum(n_pieces)))[ring_offsets]
     carried = lens.undistort(points, outside="mask")
-    new_offsets = np.concatenate(([0], np.cumsum(n_pieces)))[ring_offsets]
-    is_lost = np.logical_or.reduceat(np.isnan(carried[:, 0]), new_offsets[site_offsets[:-1]])
+    is_lost = np.logical_or.reduceat(np.isnan(carried[:, 0]), ring_offsets[site_offsets[:-1]])
     if is_lost.any():
-        is_of_lost = np.repeat(is_lost, np.diff(new_offsets[site_offsets]))
+        is_of_lost = np.repeat(is_lost, np.diff(ring_offsets[site_offsets]))
         carried = np.where(is_of_lost[:, np.newaxis], points, carried)
-    return CarriedRings(
-        carried,
-        new_offsets,
-        site_offsets,
-        is_lost,
-        site_area_um2(carried, new_offsets, site_offsets),
-        site_bounds_um(carried, new_offsets, site_offsets),
-    )
+    return Outlines(carried, ring_offsets, site_offsets, is_lost)
 
 
 class _Bends:

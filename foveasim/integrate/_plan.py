@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, Ints
+from foveasim.arrays import Bools, Floats, Ints
 from foveasim.compiled import kernels
-from foveasim.fields import Grid, PackedRings
+from foveasim.fields import Grid
+from foveasim.integrate._outlines import Outlines
 from foveasim.parallel import each
 from foveasim.rings import positions_in_runs
 
@@ -53,8 +54,12 @@ class Plan:
         Height of the bands of rows that are summed apart.
     first_slot : (n_site + 1,) int64
         Site s has the slots ``first_slot[s] : first_slot[s + 1]``, one a band.
-    covered_um2 : (n_site,) float64, µm²
-        Area of each site that lies on the grid.
+    area_um2, covered_um2 : (n_site,) float64, µm²
+        Area of each site's outline, and how much of it lies on the grid.
+    bounds_um : (n_site, 4) float64, µm
+        Of each site's outline: x_min, y_min, x_max, y_max.
+    is_lost : (n_site,) bool
+        Sites whose outline has no place in the map's plane.
     """
 
     grid: Grid
@@ -68,7 +73,10 @@ class Plan:
     moments: Floats
     rows_per_band: int
     first_slot: Ints
+    area_um2: Floats
     covered_um2: Floats
+    bounds_um: Floats
+    is_lost: Bools
 
     def _pass(self, kernel: Callable[..., None], read: NDArray[Any], written: NDArray[Any], n_threads: int) -> None:
         """Run a kernel over all bands of rows: bands write to different places, and none depends on ``n_threads``."""
@@ -142,27 +150,38 @@ class _Traced(NamedTuple):
     weights: Floats
     cuts: NDArray[np.int32]
     moments: Floats
-    covered_um2: Floats
     row_spans: Ints
     row_weights: Ints
     row_cuts: Ints
+    area_um2: Floats
+    covered_um2: Floats
+    bounds_um: Floats
+    is_lost: Bools
 
 
-def compile_plan(rings: PackedRings, bounds_um: Floats, grid: Grid, n_threads: int, order: int = 1) -> Plan:
-    """Trace every outline, within its bounds (n_site, 4), on the grid; put what it covers in the order of the grid's rows."""
+def compile_plan(
+    outlines: Callable[[int, int], Outlines], n_sites: int, grid: Grid, n_threads: int, order: int = 1
+) -> Plan:
+    """
+    Trace every outline on the grid, and put what it covers in the order of the grid's rows.
+
+    ``outlines(first, last)`` gives those of the sites from the first to before the last: they are asked for piece by piece, so
+    that what has just been carried is traced while it is in the cache, and never are all of them in memory.
+    """
     n_y = grid.shape[0]
-    uv = np.ascontiguousarray(rings.xy_um - np.asarray(grid.origin_um))
-    uv /= grid.pitch_um
-    ring_offsets = np.ascontiguousarray(rings.ring_offsets)
-    site_offsets = np.ascontiguousarray(rings.site_offsets)
     compiled = kernels("integrate")
-    traced = _trace(uv, ring_offsets, site_offsets, grid, n_threads, order)
+    traced = each(
+        lambda first: _traced(outlines(first, min(first + SITES_PER_PIECE, n_sites)), first, grid, order),
+        range(0, n_sites, SITES_PER_PIECE),
+        n_threads,
+    )
 
     # Where the next span of (piece, row) goes: behind all lower rows, and the same row of the pieces before.
     row_spans, next_span = _starts([t.row_spans for t in traced], n_y)
     row_weights, next_weight = _starts([t.row_weights for t in traced], n_y)
     row_cuts, next_cut = _starts([t.row_cuts for t in traced], n_y)
 
+    bounds_um = np.concatenate([np.zeros((0, 4)), *(t.bounds_um for t in traced)])
     rows_per_band = max(MIN_ROWS_PER_BAND, -(-n_y // MAX_BANDS))
     low, high = ((bounds_um[:, k] - grid.origin_um[1]) / grid.pitch_um for k in (1, 3))
     first_row = np.floor(np.clip(low, 0, n_y)).astype(np.int64)
@@ -184,7 +203,7 @@ def compile_plan(rings: PackedRings, bounds_um: Floats, grid: Grid, n_threads: i
     each(place, range(len(traced)), n_threads)
     return Plan(
         grid=grid,
-        n_sites=site_offsets.size - 1,
+        n_sites=n_sites,
         row_spans=row_spans,
         row_weights=row_weights,
         spans=out_spans,
@@ -194,34 +213,35 @@ def compile_plan(rings: PackedRings, bounds_um: Floats, grid: Grid, n_threads: i
         moments=out_moments,
         rows_per_band=rows_per_band,
         first_slot=first_slot,
+        area_um2=np.concatenate([np.zeros(0), *(t.area_um2 for t in traced)]),
         covered_um2=np.concatenate([np.zeros(0), *(t.covered_um2 for t in traced)]),
+        bounds_um=bounds_um,
+        is_lost=np.concatenate([np.zeros(0, bool), *(t.is_lost for t in traced)]),
     )
 
 
-def _trace(xy: Floats, ring_offsets: Ints, site_offsets: Ints, grid: Grid, n_threads: int, order: int) -> list[_Traced]:
-    """Trace the sites, piece by piece; ``xy`` are the vertices in cells."""
+def _traced(outlines: Outlines, first_site: int, grid: Grid, order: int) -> _Traced:
+    """Trace some sites, the first of which is number ``first_site``."""
     compiled = kernels("integrate")
     n_y, n_x = grid.shape
-    n_sites = site_offsets.size - 1
-
-    def trace(first_site: int) -> _Traced:
-        last_site = min(first_site + SITES_PER_PIECE, n_sites)
-        spans, weights, cuts, moments, covered = compiled.trace_sites(
-            xy, ring_offsets, site_offsets, first_site, last_site, n_y, n_x, order
-        )
-        n_weights = spans[:, compiled.N_PARTIAL] + (spans[:, compiled.N_RUN] > 0)
-        return _Traced(
-            spans,
-            weights,
-            cuts,
-            moments,
-            covered * grid.cell_area_um2,
-            row_spans=np.bincount(spans[:, compiled.ROW], minlength=n_y),
-            row_weights=np.bincount(spans[:, compiled.ROW], n_weights, minlength=n_y).astype(np.int64),
-            row_cuts=np.bincount(cuts[:, compiled.ROW], minlength=n_y),
-        )
-
-    return each(trace, range(0, n_sites, SITES_PER_PIECE), n_threads)
+    rings = outlines.ring_offsets, outlines.site_offsets
+    area_um2, bounds_um = compiled.measure_sites(outlines.xy_um, *rings)
+    uv = (outlines.xy_um - np.asarray(grid.origin_um)) / grid.pitch_um
+    spans, weights, cuts, moments, covered = compiled.trace_sites(uv, *rings, first_site, n_y, n_x, order)
+    n_weights = spans[:, compiled.N_PARTIAL] + (spans[:, compiled.N_RUN] > 0)
+    return _Traced(
+        spans,
+        weights,
+        cuts,
+        moments,
+        row_spans=np.bincount(spans[:, compiled.ROW], minlength=n_y),
+        row_weights=np.bincount(spans[:, compiled.ROW], n_weights, minlength=n_y).astype(np.int64),
+        row_cuts=np.bincount(cuts[:, compiled.ROW], minlength=n_y),
+        area_um2=area_um2,
+        covered_um2=covered * grid.cell_area_um2,
+        bounds_um=bounds_um,
+        is_lost=outlines.is_lost,
+    )
 
 
 def _starts(counts: list[NDArray[np.int64]], n_y: int) -> tuple[Ints, Ints]:
