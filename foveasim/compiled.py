@@ -17,18 +17,18 @@ _log = logging.getLogger("foveasim")
 _lock = Lock()
 
 
-def kernels(room: str) -> ModuleType:
+def kernels(room: str, module: str = "_kernels") -> ModuleType:
     """
-    The compiled kernels of a room.
+    The compiled kernels of a room, of one module of them.
 
     numba itself takes half a second to load, and compiling some seconds more, once a machine: so neither happens at
     ``import foveasim``. Where no folder can keep the machine code, it is kept in the temporary one.
     """
-    name = f"foveasim.{room}._kernels"
+    name = f"foveasim.{room}.{module}"
     with _lock:
         if name in sys.modules:
             return sys.modules[name]
-        if not _is_cached(room):
+        if not _is_cached(room, module):
             _log.warning("compiling the kernels of foveasim.%s for this machine, once (a few seconds)", room)
         try:
             return importlib.import_module(name)
@@ -41,9 +41,9 @@ def kernels(room: str) -> ModuleType:
             return importlib.import_module(name)
 
 
-def _is_cached(room: str) -> bool:
+def _is_cached(room: str, module: str) -> bool:
     """Whether machine code lies beside the source, or may lie elsewhere because the source's folder cannot be written."""
     folder = Path(__file__).parent / room
     is_elsewhere = bool(os.environ.get("NUMBA_CACHE_DIR")) or not os.access(folder, os.W_OK)
-    pattern = f"_kernels.*py{sys.version_info.major}{sys.version_info.minor}*.nbi"
+    pattern = f"{module}.*py{sys.version_info.major}{sys.version_info.minor}*.nbi"
     return is_elsewhere or any((folder / "__pycache__").glob(pattern))
