@@ -18,6 +18,7 @@ from foveasim.errors import GeometryError, ParameterError
 from foveasim.rings import next_vertex, positions_in_runs, ring_moments, ring_spread_um2, site_bounds_um, site_moments
 
 if TYPE_CHECKING:
+    from pyvista import PolyData  # noqa: TID251 -- a type alone
     from scipy.sparse import csr_array
 
     from foveasim.layout.enforce import Change
@@ -310,8 +311,8 @@ class Layout:
         """(x_min, y_min, x_max, y_max) of the whole layout, µm."""
         if self.n_sites == 0:
             raise GeometryError("the layout has no sites, and so no bounds")
-        low, high = self.xy_um.min(axis=0), self.xy_um.max(axis=0)
-        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+        x_um, y_um = self.xy_um[:, 0], self.xy_um[:, 1]  # one by one: many times as fast as both along axis 0
+        return float(x_um.min()), float(y_um.min()), float(x_um.max()), float(y_um.max())
 
     def polygons(self) -> NDArray[Any]:
         """The sites as shapely polygons, (n_site,) array of objects."""
@@ -432,6 +433,12 @@ class Layout:
         from foveasim.layout.summary import describe
 
         return describe(self, readout)
+
+    def to_pyvista(self) -> PolyData:
+        """The sites as PolyData with every column, for PyVista; see :func:`foveasim.view.polydata`."""
+        from foveasim.view import polydata
+
+        return polydata(self)
 
     # -- neighbours ----------------------------------------------------------------------------------------------
 
