@@ -66,6 +66,8 @@ UNIT_SUFFIXES = {
     "_j_s": "J s",
     "_per_mm": "per mm",
     "_um2": "µm²",
+    "_um3": "µm³",
+    "_px": "pixels",
     "_um": "µm",
     "_mm": "mm",
     "_nm": "nm",

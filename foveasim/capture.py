@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ from foveasim.files import written_whole
 from foveasim.layout import Layout
 from foveasim.reconstruct import Picture, cells, fill_channels, raster_grid
 from foveasim.records import described
+
+if TYPE_CHECKING:
+    from pyvista import PolyData  # noqa: TID251 -- a type alone
 
 __all__ = ["Capture"]
 
@@ -140,6 +143,12 @@ class Capture:
             values = fill_channels(self.layout, values, self.filter_of_site, n_filters)
             values = np.where(np.isnan(values), 0.0, values)
         return cells(self.layout, values, raster_grid(self.layout, max_pixels) if grid is None else grid)
+
+    def to_pyvista(self) -> PolyData:
+        """The sites as PolyData with what they measured, for PyVista; see :func:`foveasim.view.polydata`."""
+        from foveasim.view import polydata
+
+        return polydata(self)
 
     def save(self, path: str | Path) -> None:
         """

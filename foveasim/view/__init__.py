@@ -2,7 +2,22 @@
 
 from __future__ import annotations
 
+from foveasim.view.meshes import Mesh, polydata, prisms
 from foveasim.view.plots import plot_capture, plot_layout, plot_noise_budget, save_figure
 from foveasim.view.probe import find_renderer
+from foveasim.view.stills import Viewpoint, render, show, sites_in_view
 
-__all__ = ["find_renderer", "plot_capture", "plot_layout", "plot_noise_budget", "save_figure"]
+__all__ = [
+    "Mesh",
+    "Viewpoint",
+    "find_renderer",
+    "plot_capture",
+    "plot_layout",
+    "plot_noise_budget",
+    "polydata",
+    "prisms",
+    "render",
+    "save_figure",
+    "show",
+    "sites_in_view",
+]

@@ -15,13 +15,15 @@ from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec
 
-__all__ = ["begin_rendering", "find_renderer", "what_to_install"]
+__all__ = ["ON_SCREEN", "begin_rendering", "find_renderer", "what_to_install"]
 
 #: Names by which VTK's window classes are chosen, and the variable that chooses.
 VTK_CHOICE = "VTK_DEFAULT_OPENGL_WINDOW"
 X11, EGL, OSMESA = "vtkXOpenGLRenderWindow", "vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow"
 #: Systems whose own windows VTK always has.
 OF_SYSTEM = {"darwin": "vtkCocoaRenderWindow", "win32": "vtkWin32OpenGLRenderWindow"}
+#: Those that a person can look at.
+ON_SCREEN = frozenset({X11, *OF_SYSTEM.values()})
 #: From EGL's headers: a display without screen (EGL_MESA_platform_surfaceless).
 EGL_PLATFORM_SURFACELESS_MESA = 0x31DD
 #: A renderer that has drawn nothing after this time hangs.
@@ -75,9 +77,9 @@ def begin_rendering() -> None:
 def what_to_install() -> str:
     """What is missing for pictures by PyVista, as a sentence; empty where nothing is."""
     if any(find_spec(module) is None for module in ("pyvista", "vtkmodules")):
-        return "PyVista is not installed; install it with pip install 'foveasim[view]'"
+        return "PyVista is not installed; install it with: pip install 'foveasim[view]'"
     if find_renderer() is None:
-        return "this machine has no OpenGL; install it, on Debian and Ubuntu with apt install libegl1 libgl1"
+        return "this machine has no OpenGL; install it, on Debian and Ubuntu with: apt install libegl1 libgl1"
     return ""
 
 

@@ -1,0 +1,439 @@
+"""
+Photosites as surfaces in three dimensions: flat polygons for PyVista, triangles, columns as high as what a site measured.
+
+One frame with the sensor's: x to the right, y up, z toward the lens. Triangles are counter-clockwise seen from outside.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim.arrays import Bools, Floats, Ints, check_length_um, finite_array
+from foveasim.capture import Capture
+from foveasim.errors import GeometryError, ParameterError
+from foveasim.layout import Layout
+from foveasim.parallel import each, thread_count
+from foveasim.records import described
+from foveasim.rings import next_vertex, positions_in_runs
+from foveasim.view.palette import colours_of
+
+if TYPE_CHECKING:
+    from pyvista import PolyData
+
+__all__ = ["Caps", "Mesh", "extruded", "polydata", "prisms", "triangulated"]
+
+#: A triangle of less than this share of its site's box is a line to float64.
+FLAT_SHARE = 1e-12
+#: Columns are as high as this share of the layout's width, by default.
+TALLEST_SHARE = 0.15
+#: Sites that one call of the triangulation takes.
+SITES_A_CALL = 20_000
+#: What a capture measured, in its PolyData.
+MEASURED = ("code", "electrons", "expected_e", "filter_of_site")
+
+Indices = NDArray[np.int32]
+RgbArray = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Mesh:
+    """
+    A surface of triangles whose points know their photosite.
+
+    Attributes
+    ----------
+    name : str
+        What it is: ``"wells"``.
+    points_um : (n_point, 3) float64, µm
+    triangles : (n_triangle, 3) int32
+        Points of each triangle, counter-clockwise from outside. All three are of one photosite.
+    photosite : (n_point,) int32
+        Site that a point belongs to; -1 for none.
+    values : (n_point,) float64
+        What is shown of the site, in its unit.
+    colours : (n_point, 3) uint8
+        Red, green, blue, encoded as screens expect.
+    """
+
+    name: str
+    points_um: Floats
+    triangles: Indices
+    photosite: Indices
+    values: Floats
+    colours: RgbArray
+
+    def __repr__(self) -> str:
+        return f"Mesh({self.name!r}, {self.triangles.shape[0]:,} triangles)"
+
+    @property
+    def bounds_um(self) -> tuple[Floats, Floats]:
+        """Lowest and highest corner of its box, (3,) µm each."""
+        if self.points_um.size == 0:
+            raise GeometryError(f"the mesh {self.name!r} is empty, and so has no bounds")
+        return self.points_um.min(axis=0), self.points_um.max(axis=0)
+
+    def to_pyvista(self) -> PolyData:
+        """
+        The surface as PolyData with the cell data ``photosite``, ``value`` and ``rgb``.
+
+        Raises
+        ------
+        ParameterError
+            When PyVista is not installed.
+        """
+        first = self.triangles[:, 0]
+        mesh = _polydata(
+            self.points_um, np.arange(self.triangles.shape[0] + 1, dtype=np.int32) * 3, self.triangles.ravel()
+        )
+        mesh.cell_data["photosite"] = self.photosite[first]
+        mesh.cell_data["value"] = self.values[first]
+        mesh.cell_data["rgb"] = self.colours[first]
+        return mesh
+
+
+class Caps(NamedTuple):
+    """Triangles that cover photosites."""
+
+    triangles: Ints
+    """(n_triangle, 3) vertices of the layout, counter-clockwise."""
+    site: Ints
+    """(n_triangle,) site of each."""
+    weld: Ints
+    """(n_vertex,) the vertex that stands for each: itself, save where a hole touches its outline in a corner."""
+
+
+def triangulated(layout: Layout) -> Caps:
+    """
+    Triangles that cover every photosite exactly, with its own vertices only.
+
+    Parameters
+    ----------
+    layout : Layout
+        Of sites that do not cross themselves.
+
+    Returns
+    -------
+    Caps
+
+    Notes
+    -----
+    A fan from one corner covers the site when no triangle of it is turned over: the signed areas of its triangles add up to
+    one inside the outline and nought outside, everywhere. Other sites, and those with holes, are given to GEOS's
+    constrained Delaunay triangulation.
+    """
+    n_vertices = np.diff(layout.ring_offsets)
+    has_hole = np.diff(layout.site_offsets) > 1
+    fans, is_covered = _fans(layout.xy_um, layout.ring_offsets)
+    is_fan = is_covered[layout.site_offsets[:-1]] & ~has_hole
+    ring_of_fan = np.repeat(np.arange(n_vertices.size), n_vertices - 2)
+    site_of_ring = np.repeat(np.arange(layout.n_sites), np.diff(layout.site_offsets))
+    site = site_of_ring[ring_of_fan]
+    weld = np.arange(layout.xy_um.shape[0])
+    if is_fan.all():
+        return Caps(fans, site, weld)
+    keep = is_fan[site]
+    others = np.flatnonzero(~is_fan)
+    pieces = each(
+        lambda part: _delaunay(layout, part),
+        np.split(others, range(SITES_A_CALL, others.size, SITES_A_CALL)),
+        thread_count(),
+    )
+    for _, _, vertices, stand_ins in pieces:
+        weld[vertices] = stand_ins
+    return Caps(
+        np.concatenate([fans[keep], *(piece[0] for piece in pieces)]),
+        np.concatenate([site[keep], *(piece[1] for piece in pieces)]),
+        weld,
+    )
+
+
+def extruded(
+    layout: Layout, caps: Caps, low_um: ArrayLike, high_um: ArrayLike, *, has_floor: bool = True
+) -> tuple[Floats, Indices, Indices]:
+    """
+    Prisms over photosites.
+
+    Parameters
+    ----------
+    layout : Layout
+    caps : Caps
+        Of the same layout.
+    low_um, high_um : number or (n_site,), µm
+        Heights of floor and roof.
+    has_floor : bool
+        Whether they are closed below.
+
+    Returns
+    -------
+    points_um : (2 n_vertex, 3) float64, µm
+        The layout's vertices on the floor, then on the roof.
+    triangles : (n_triangle, 3) int32
+    photosite : (2 n_vertex,) int32
+    """
+    n = layout.xy_um.shape[0]
+    vertices_of_site = np.diff(layout.ring_offsets[layout.site_offsets])
+    points_um = np.empty((2 * n, 3))
+    points_um[:n, :2] = points_um[n:, :2] = layout.xy_um
+    points_um[:n, 2] = np.repeat(np.broadcast_to(low_um, layout.n_sites), vertices_of_site)
+    points_um[n:, 2] = np.repeat(np.broadcast_to(high_um, layout.n_sites), vertices_of_site)
+    here = caps.weld
+    after = here[next_vertex(layout.ring_offsets)]
+    n_caps = caps.triangles.shape[0]
+    triangles = np.empty((2 * n + n_caps * (1 + has_floor), 3), np.int32)
+    triangles[:n] = np.stack((here, after, after + n), axis=1)
+    triangles[n : 2 * n] = np.stack((here, after + n, here + n), axis=1)
+    triangles[2 * n : 2 * n + n_caps] = caps.triangles + n
+    if has_floor:
+        triangles[2 * n + n_caps :] = caps.triangles[:, ::-1]
+    site = np.repeat(np.arange(layout.n_sites, dtype=np.int32), vertices_of_site)
+    return points_um, triangles, np.concatenate((site, site))
+
+
+def prisms(
+    data: Layout | Capture,
+    height: str | ArrayLike | None = None,
+    *,
+    by: str | ArrayLike | None = None,
+    tallest_um: float | None = None,
+) -> Mesh:
+    """
+    Photosites as columns whose height is what they measured.
+
+    Parameters
+    ----------
+    data : Layout or Capture
+    height : str or (n_site,) array
+        What the height shows: ``"code"``, ``"electrons"``, ``"expected_e"``, ``"area_um2"``, ``"size_um"``, any column of
+        numbers, or one value a site, at least 0. By default the code of a capture, the size of a layout's sites.
+    by : str or array, optional
+        What the colour shows, as in :func:`foveasim.view.colours_of`; by default the same as the height.
+    tallest_um : float, µm
+        Height of the tallest column; 0.15 of the layout's longer side by default.
+
+    Returns
+    -------
+    Mesh
+        Open below. ``values`` are what the height shows.
+
+    Raises
+    ------
+    GeometryError
+        When there are no sites.
+    ParameterError
+        When a name is no column, or there is not one finite value of at least 0 a site.
+
+    Examples
+    --------
+    >>> from foveasim.layout import grid
+    >>> columns = prisms(grid(n_x=2, n_y=1, pitch_um=2.0), [1.0, 3.0], tallest_um=6.0)
+    >>> columns.points_um[:, 2].max(), columns.triangles.shape[0]
+    (np.float64(6.0), 20)
+    """
+    is_capture = isinstance(data, Capture)
+    layout = data.layout if isinstance(data, Capture) else data
+    height = ("code" if is_capture else "size_um") if height is None else height
+    shown = colours_of(data, height)
+    values = finite_array("height", shown.values if shown.values is not None else height, ndim=1, at_least=0.0)
+    colours = (shown if by is None else colours_of(data, by)).rgb
+    x_min, y_min, x_max, y_max = layout.bounds_um
+    tallest_um = (
+        TALLEST_SHARE * max(x_max - x_min, y_max - y_min)
+        if tallest_um is None
+        else check_length_um("tallest_um", tallest_um)
+    )
+    most = float(values.max())
+    heights_um = values * (tallest_um / most if most > 0.0 else 0.0)
+    points_um, triangles, photosite = extruded(layout, triangulated(layout), 0.0, heights_um, has_floor=False)
+    return Mesh(
+        name="columns",
+        points_um=points_um,
+        triangles=triangles,
+        photosite=photosite,
+        values=values[photosite],
+        colours=colours[photosite],
+    )
+
+
+def polydata(data: Layout | Capture) -> PolyData:
+    """
+    Photosites as polygons in the plane z = 0, for PyVista.
+
+    Parameters
+    ----------
+    data : Layout or Capture
+
+    Returns
+    -------
+    pyvista.PolyData
+        One polygon a site, in the sites' order, when none has a hole or an inward corner; such sites are several
+        triangles each. Cell data: ``photosite``, ``area_um2``, ``channel``, ``readout_line``, every column, and of a
+        capture ``code``, ``electrons``, ``expected_e``, ``filter_of_site``. Field data: ``provenance`` and of a capture
+        ``settings``, as JSON.
+
+    Raises
+    ------
+    ParameterError
+        When PyVista is not installed.
+    """
+    layout = data.layout if isinstance(data, Capture) else data
+    columns: dict[str, NDArray[Any]] = {
+        "area_um2": layout.area_um2,
+        "channel": layout.channel,
+        "readout_line": layout.readout_line,
+        **layout.columns,
+    }
+    notes: dict[str, Mapping[str, Any]] = {"provenance": described(dict(layout.provenance))}
+    if isinstance(data, Capture):
+        columns |= {name: getattr(data, name) for name in MEASURED}
+        notes["settings"] = data.settings
+    offsets, corners, photosite = _cells(layout)
+    mesh = _polydata(
+        np.column_stack((layout.xy_um, np.zeros(layout.xy_um.shape[0]))),
+        offsets.astype(np.int32),
+        corners.astype(np.int32),
+    )
+    mesh.cell_data["photosite"] = photosite
+    for name, column in columns.items():
+        mesh.cell_data[name] = (column.astype(np.float32) if column.dtype == np.float16 else column)[photosite]
+    for name, note in notes.items():
+        mesh.field_data[name] = [json.dumps(note)]
+    return mesh
+
+
+# -- parts ---------------------------------------------------------------------------------------------------------------
+
+
+def _cells(layout: Layout) -> tuple[Ints, Ints, Ints]:
+    """Polygons of all sites: offsets, vertices and sites; sites that VTK would fill wrongly as triangles."""
+    counts = np.diff(layout.ring_offsets)
+    is_whole = _is_convex(layout)
+    if is_whole.all():
+        return layout.ring_offsets, np.arange(layout.xy_um.shape[0]), np.arange(layout.n_sites)
+    caps = triangulated(layout)
+    parts = caps.triangles[~is_whole[caps.site]]
+    whole = np.flatnonzero(is_whole)
+    whole_rings = layout.site_offsets[whole]
+    sizes = np.concatenate((counts[whole_rings], np.full(parts.shape[0], 3)))
+    photosite = np.concatenate((whole, caps.site[~is_whole[caps.site]]))
+    vertices = np.repeat(layout.ring_offsets[whole_rings], counts[whole_rings]) + positions_in_runs(counts[whole_rings])
+    # In the order of the sites, so that a cell is found beside its neighbours.
+    order = np.argsort(photosite, kind="stable")
+    starts = np.concatenate(([0], np.cumsum(sizes)))[:-1]
+    flat = np.concatenate((vertices, parts.ravel()))
+    corners = flat[np.repeat(starts[order], sizes[order]) + positions_in_runs(sizes[order])]
+    return np.concatenate(([0], np.cumsum(sizes[order]))), corners, photosite[order]
+
+
+def _is_convex(layout: Layout) -> Bools:
+    """Whether a site has no hole and no inward corner, (n_site,)."""
+    if layout.n_sites == 0:
+        return np.zeros(0, bool)
+    turn = _turns(layout.xy_um, layout.ring_offsets)
+    least = np.minimum.reduceat(turn, layout.ring_offsets[:-1])[layout.site_offsets[:-1]]
+    return (np.diff(layout.site_offsets) == 1) & (least > -FLAT_SHARE)
+
+
+def _turns(xy_um: Floats, ring_offsets: Ints) -> Floats:
+    """Sine of the angle by which the outline turns to the left at each vertex, (n_vertex,)."""
+    after = next_vertex(ring_offsets)
+    out = xy_um[after] - xy_um
+    into = np.empty_like(out)
+    into[after] = out
+    cross = into[:, 0] * out[:, 1] - into[:, 1] * out[:, 0]
+    return np.asarray(cross / np.maximum(np.hypot(*into.T) * np.hypot(*out.T), np.finfo(np.float64).tiny))
+
+
+def _fans(xy_um: Floats, ring_offsets: Ints) -> tuple[Ints, Bools]:
+    """Triangles of every ring from one of its corners (sum of n - 2, 3), and whether none is flat or turned over."""
+    counts = np.diff(ring_offsets)
+    if counts.size == 0:
+        return np.zeros((0, 3), np.int64), np.zeros(0, bool)
+    starts = ring_offsets[:-1]
+    turn = _turns(xy_um, ring_offsets)
+    ring = np.repeat(np.arange(counts.size), counts)
+    is_inward = np.minimum.reduceat(turn, starts) < -FLAT_SHARE
+    after = next_vertex(ring_offsets)
+    before = np.empty_like(after)
+    before[after] = np.arange(after.size)
+    # From the sharpest inward corner; else from where both neighbours are true corners, so that no triangle is flat.
+    merit = np.where(is_inward[ring], -turn, np.minimum(turn[before], turn[after]))
+    best = np.flatnonzero(merit == np.maximum.reduceat(merit, starts)[ring])
+    apex = np.empty(counts.size, np.int64)
+    apex[ring[best][::-1]] = best[::-1]  # the first of equals
+    n_triangles = counts - 2
+    of = np.repeat(np.arange(counts.size), n_triangles)
+    step = positions_in_runs(n_triangles) + 1
+    begin, size, first = starts[of], counts[of], apex[of]
+    second = begin + (first - begin + step) % size
+    third = begin + (first - begin + step + 1) % size
+    a, b, c = xy_um[first], xy_um[second], xy_um[third]
+    double_um2 = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    ends = np.cumsum(n_triangles) - n_triangles
+    box = np.maximum.reduceat(xy_um, starts) - np.minimum.reduceat(xy_um, starts)
+    covered = np.minimum.reduceat(double_um2, ends) > FLAT_SHARE * box[:, 0] * box[:, 1]
+    return np.stack((first, second, third), axis=1), covered
+
+
+def _delaunay(layout: Layout, sites: Ints) -> tuple[Ints, Ints, Ints, Ints]:
+    """Triangles and sites of some photosites by GEOS; the photosites' vertices, and which vertex stands for each."""
+    part = layout[sites]
+    triangles, owner = shapely.get_parts(shapely.constrained_delaunay_triangles(part.polygons()), return_index=True)
+    corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
+    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    is_turned = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] < 0.0
+    corners[is_turned] = corners[is_turned, ::-1]
+    # Each corner is found among the vertices of its site by its coordinates, which are the same numbers.
+    first = layout.ring_offsets[layout.site_offsets[sites]]
+    counts = layout.ring_offsets[layout.site_offsets[sites + 1]] - first
+    vertices = np.repeat(first, counts) + positions_in_runs(counts)
+    points = np.concatenate((part.xy_um, corners.reshape(-1, 2)))
+    site = np.concatenate((np.repeat(np.arange(sites.size), counts), np.repeat(owner, 3)))
+    order = np.lexsort((points[:, 1], points[:, 0], site))
+    is_new = np.ones(order.size, bool)
+    is_new[1:] = (np.diff(site[order]) != 0) | np.any(np.diff(points[order], axis=0) != 0.0, axis=1)
+    group = np.empty(order.size, np.int64)
+    group[order] = np.cumsum(is_new) - 1
+    stand_in = np.full(int(is_new.sum()), -1)
+    stand_in[group[: vertices.size][::-1]] = vertices[::-1]
+    found = stand_in[group]
+    if found.min(initial=0) < 0:
+        bad = sites[site[np.flatnonzero(found < 0)[0]]]
+        raise GeometryError(f"site {bad} cannot be cut into triangles; repair its outline", (int(bad),))
+    return found[vertices.size :].reshape(-1, 3), sites[owner], vertices, found[: vertices.size]
+
+
+def _polydata(points_um: Floats, offsets: Indices, corners: Indices) -> PolyData:
+    """PolyData of polygons with these corners."""
+    pyvista = imported_pyvista()
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkCellArray
+
+    cells = vtkCellArray()
+    cells.SetData(numpy_to_vtk(offsets, deep=True), numpy_to_vtk(np.ascontiguousarray(corners), deep=True))
+    mesh = pyvista.PolyData()
+    mesh.points = points_um
+    mesh.SetPolys(cells)
+    return mesh
+
+
+def imported_pyvista() -> Any:
+    """
+    The package PyVista.
+
+    Raises
+    ------
+    ParameterError
+        When it is not installed.
+    """
+    try:
+        import pyvista
+    except ImportError:
+        raise ParameterError("pyvista", "is missing; install it with: pip install 'foveasim[view]'") from None
+    return pyvista
