@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from foveasim.view.id_map import SitePixels, id_map, site_at
 from foveasim.view.meshes import Mesh, polydata, prisms
+from foveasim.view.palette import SiteColours, colours_of, site_colours
 from foveasim.view.plots import plot_capture, plot_layout, plot_noise_budget, save_figure
 from foveasim.view.probe import find_renderer
 from foveasim.view.stills import Viewpoint, render, show, sites_in_view
+from foveasim.view.web import web_page, write_web_page
 
 __all__ = [
     "Mesh",
+    "SiteColours",
+    "SitePixels",
     "Viewpoint",
+    "colours_of",
     "find_renderer",
+    "id_map",
     "plot_capture",
     "plot_layout",
     "plot_noise_budget",
@@ -19,5 +26,9 @@ __all__ = [
     "render",
     "save_figure",
     "show",
+    "site_at",
+    "site_colours",
     "sites_in_view",
+    "web_page",
+    "write_web_page",
 ]

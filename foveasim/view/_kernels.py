@@ -1,0 +1,130 @@
+"""The view room's numba kernels: which photosite lies under each pixel of a picture, and the colours of the pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, types
+
+__all__ = ["blended", "paint_sites", "rows_of_sites"]
+
+_ints = types.Array(types.int64, 1, "C", readonly=True)
+_floats = types.Array(types.float64, 1, "C", readonly=True)
+_points = types.Array(types.float64, 2, "C", readonly=True)
+_rows = types.Array(types.int32, 2, "C", readonly=True)
+_colours = types.Array(types.uint8, 2, "C", readonly=True)
+
+
+#: Samples over a shorter length than this are at one place.
+SMALLEST = 1e-200
+
+
+@njit(cache=True, nogil=True)
+def _per_length(samples):
+    """How many evenly spaced samples there are in a unit of length; any number where there is but one."""
+    length = samples[-1] - samples[0]
+    return (samples.size - 1) / length if length > SMALLEST else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _first_at(samples, per_length, value):
+    """Index of the first of the evenly spaced, rising samples that is at or beyond a value; exact."""
+    if value <= samples[0]:
+        return 0
+    if value > samples[-1]:
+        return samples.size
+    k = int((value - samples[0]) * per_length) + 1
+    # The guess is off by its rounding at most: the samples themselves decide.
+    while k == samples.size or samples[k - 1] >= value:
+        k -= 1
+    while samples[k] < value:
+        k += 1
+    return k
+
+
+@njit(types.void(_points, _ints, _floats, _floats, types.int64, types.int32[:, ::1]), cache=True, nogil=True)
+def rows_of_sites(xy, starts, x, y, first, rows):
+    """
+    First row and end of the rows of samples that each site reaches: empty when it lies between rows, or beside all columns.
+
+    Site ``first + i`` has the vertices ``starts[first + i] : starts[first + i + 1]``, and its rows come to ``rows[i]``.
+    """
+    per_y = _per_length(y)
+    for i in range(rows.shape[0]):
+        low_x, high_x, low_y, high_y = np.inf, -np.inf, np.inf, -np.inf
+        for k in range(starts[first + i], starts[first + i + 1]):
+            low_x, high_x = min(low_x, xy[k, 0]), max(high_x, xy[k, 0])
+            low_y, high_y = min(low_y, xy[k, 1]), max(high_y, xy[k, 1])
+        rows[i] = 0
+        if low_x <= x[-1] and high_x >= x[0]:
+            rows[i, 0] = _first_at(y, per_y, low_y)
+            rows[i, 1] = _first_at(y, per_y, high_y)
+
+
+@njit(
+    types.void(_points, _ints, _ints, _rows, _floats, _floats, types.int64, types.int32[:, ::1]), cache=True, nogil=True
+)
+def paint_sites(xy, ring_offsets, site_offsets, rows, x, y, first_row, ids):
+    """
+    Write the index of the site over each sample of a band of rows, the highest one where several are; others stay.
+
+    Even-odd: every edge is crossed by the rows from its lower end (included) to its upper end (not), and turns inside to
+    outside for the samples at and beyond the crossing. The crossing is calculated from the lower end whichever way the
+    edge runs: both sites of a shared edge find the same samples.
+    """
+    n_rows, n_columns = ids.shape
+    per_x, per_y = _per_length(x), _per_length(y)
+    crossed = np.zeros((n_rows, n_columns + 1), np.bool_)
+    left = np.full(n_rows, n_columns + 1)
+    right = np.full(n_rows, -1)
+    for site in range(site_offsets.size - 1):
+        bottom, top = max(rows[site, 0] - first_row, 0), min(rows[site, 1] - first_row, n_rows)
+        if bottom >= top:
+            continue
+        for ring in range(site_offsets[site], site_offsets[site + 1]):
+            a = ring_offsets[ring + 1] - 1
+            for b in range(ring_offsets[ring], ring_offsets[ring + 1]):
+                low, high = (a, b) if xy[a, 1] < xy[b, 1] else (b, a)
+                a = b
+                low_y, high_y = xy[low, 1], xy[high, 1]
+                if low_y == high_y or high_y <= y[first_row + bottom] or low_y > y[first_row + top - 1]:
+                    continue
+                run, rise = xy[high, 0] - xy[low, 0], high_y - low_y
+                r = max(_first_at(y, per_y, low_y) - first_row, bottom)
+                while r < top and y[first_row + r] < high_y:
+                    # Multiplied first: exact where the crossing of whole numbers is one.
+                    c = _first_at(x, per_x, xy[low, 0] + (y[first_row + r] - low_y) * run / rise)
+                    crossed[r, c] = not crossed[r, c]
+                    left[r], right[r] = min(left[r], c), max(right[r], c)
+                    r += 1
+        for r in range(bottom, top):
+            is_inside = False
+            for c in range(left[r], right[r] + 1):
+                if crossed[r, c]:
+                    is_inside = not is_inside
+                    crossed[r, c] = False
+                if is_inside:
+                    ids[r, c] = site
+            left[r], right[r] = n_columns + 1, -1
+
+
+@njit(
+    types.void(types.Array(types.int32, 2, "C", readonly=True), _colours, types.int64, types.uint8[:, :, ::1]),
+    cache=True,
+    nogil=True,
+)
+def blended(ids, colours, n_samples, picture):
+    """Mean colour of the ``n_samples`` x ``n_samples`` samples of each pixel; ``colours[i + 1]`` is that of site i."""
+    n_y, n_x = picture.shape[:2]
+    n = n_samples * n_samples
+    for row in range(n_y):
+        for column in range(n_x):
+            red, green, blue = n // 2, n // 2, n // 2
+            for i in range(row * n_samples, (row + 1) * n_samples):
+                for j in range(column * n_samples, (column + 1) * n_samples):
+                    k = ids[i, j] + 1
+                    red += colours[k, 0]
+                    green += colours[k, 1]
+                    blue += colours[k, 2]
+            picture[row, column, 0] = red // n
+            picture[row, column, 1] = green // n
+            picture[row, column, 2] = blue // n

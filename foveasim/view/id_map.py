@@ -1,0 +1,244 @@
+"""Which photosite lies under each pixel of a picture: with it, colours and the mouse are a matter of looking up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim.arrays import Floats, check_count, check_shape, finite_array, read_only
+from foveasim.compiled import kernels
+from foveasim.errors import ParameterError
+from foveasim.fields import PackedRings
+from foveasim.parallel import each, thread_count
+from foveasim.view.palette import BACKGROUND, Rgb
+
+__all__ = ["SitePixels", "id_map", "site_at"]
+
+#: Pictures of more samples than this are refused: 4 GB of indices.
+MAX_SAMPLES = 2**30
+#: Bands of rows for each thread: two, as sites may be crowded; each band looks at all sites, so that more cost time.
+BANDS_PER_THREAD = 2
+#: Sites whose rows are found at a time.
+CHUNK_SITES = 65_536
+
+Bounds = tuple[float, float, float, float]
+
+
+def id_map(
+    layout: PackedRings,
+    shape: tuple[int, int],
+    bounds_um: Sequence[float] | Floats | None = None,
+    *,
+    n_threads: int | None = None,
+) -> NDArray[np.int32]:
+    """
+    The photosite under the centre of each pixel.
+
+    Parameters
+    ----------
+    layout : Layout
+        Convex sites, concave ones, holes.
+    shape : (n_y, n_x)
+        Numbers of pixels.
+    bounds_um : (x_min, y_min, x_max, y_max), optional, µm
+        What the pixels cover; the layout's own bounds by default.
+    n_threads : int, optional
+        All cores by default; the result does not depend on it.
+
+    Returns
+    -------
+    ids : (n_y, n_x) int32
+        Index of the site, -1 where there is none; row 0 is the lowest y.
+
+    Raises
+    ------
+    ParameterError
+        When the shape or the bounds are none, or the layout has no sites and no bounds are given.
+
+    Notes
+    -----
+    A centre on the border of two sites belongs to the one on its +x side, or on its +y side where the border is
+    horizontal: in a tiling every pixel has one site. What lies on a slanted border is told by float64, in the same way
+    for both sites. Where sites overlap, the one with the highest index is seen. The inside of rings is told by the
+    even-odd rule, whatever their winding.
+
+    Examples
+    --------
+    >>> from foveasim.layout import grid
+    >>> id_map(grid(n_x=2, n_y=1, pitch_um=3.0), (1, 4), (-4.0, -1.0, 4.0, 1.0)).tolist()  # centres at -3, -1, 1, 3
+    [[0, 0, 1, -1]]
+    """
+    n_y, n_x = check_shape("shape", shape)
+    if n_y * n_x > MAX_SAMPLES:
+        raise ParameterError("shape", f"must have at most {MAX_SAMPLES:,} pixels", shape)
+    x_min, y_min, x_max, y_max = _checked(layout, bounds_um)
+    columns_um, rows_um = _centres_um(x_min, x_max, n_x), _centres_um(y_min, y_max, n_y)
+    return _sites_at(layout, columns_um, rows_um, thread_count(n_threads))
+
+
+def site_at(layout: PackedRings, x_um: float, y_um: float) -> int:
+    """Index of the site at a point, -1 where there is none; borders and overlaps as for :func:`id_map`."""
+    point = finite_array("x_um, y_um", (x_um, y_um))
+    return int(_sites_at(layout, point[:1], point[1:], 1)[0, 0])
+
+
+@dataclass(frozen=True, eq=False)
+class SitePixels:
+    """
+    A picture's pixels by the sites that they show.
+
+    Attributes
+    ----------
+    ids : (n_y * n_samples, n_x * n_samples) int32
+        The site at each sample, -1 where there is none; row 0 is the lowest y.
+    bounds_um : (x_min, y_min, x_max, y_max), µm
+    n_samples : int
+        Samples along each side of a pixel.
+    """
+
+    ids: NDArray[np.int32]
+    bounds_um: Bounds
+    n_samples: int = 1
+
+    @classmethod
+    def of(
+        cls,
+        layout: PackedRings,
+        shape: tuple[int, int],
+        bounds_um: Sequence[float] | Floats | None = None,
+        *,
+        n_samples: int = 3,
+        n_threads: int | None = None,
+    ) -> SitePixels:
+        """
+        The pixels of a layout.
+
+        Parameters
+        ----------
+        layout : Layout
+        shape : (n_y, n_x)
+            Numbers of pixels.
+        bounds_um : (x_min, y_min, x_max, y_max), optional, µm
+            What the pixels cover; the layout's own bounds by default.
+        n_samples : int
+            Samples along each side of a pixel, for smooth borders.
+        n_threads : int, optional
+            All cores by default.
+
+        Raises
+        ------
+        ParameterError
+            As for :func:`id_map`.
+        """
+        n_y, n_x = check_shape("shape", shape)
+        n = check_count("n_samples", n_samples, at_most=16)
+        bounds = _checked(layout, bounds_um)
+        ids = id_map(layout, (n * n_y, n * n_x), bounds, n_threads=n_threads)
+        return cls(read_only(ids), bounds, n)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Numbers of pixels (n_y, n_x)."""
+        n_y, n_x = self.ids.shape
+        return n_y // self.n_samples, n_x // self.n_samples
+
+    def picture(
+        self, rgb: NDArray[np.uint8], *, background: Rgb = BACKGROUND, n_threads: int | None = None
+    ) -> NDArray[np.uint8]:
+        """
+        The picture in which each site has a colour.
+
+        Parameters
+        ----------
+        rgb : (n_site, 3) uint8
+            From :func:`foveasim.view.site_colours`.
+        background : (r, g, b)
+            Colour of what no site covers.
+        n_threads : int, optional
+            All cores by default.
+
+        Returns
+        -------
+        picture : (n_y, n_x, 3) uint8
+            Row 0 is the lowest y. A pixel is the mean of its samples' numbers as they are: on a grey scale, and nearly so
+            on another, the mean of the values; drawings by outlines are smoothed the same way.
+
+        Raises
+        ------
+        ParameterError
+            When there are fewer colours than sites in the picture, or they are no bytes.
+        """
+        rgb = np.asarray(rgb)
+        highest = int(self.ids.max(initial=-1))
+        if rgb.dtype != np.uint8 or rgb.ndim != 2 or rgb.shape[1] != 3 or rgb.shape[0] <= highest:
+            raise ParameterError(
+                "rgb", f"must be bytes of the shape (n_site, 3), n_site > {highest}, got {rgb.dtype} of {rgb.shape}"
+            )
+        colours = np.concatenate((np.array([background], np.uint8), rgb))
+        picture = np.empty((*self.shape, 3), np.uint8)
+        n, n_threads = self.n_samples, thread_count(n_threads)
+
+        def blend(rows: slice) -> None:
+            kernels("view").blended(
+                self.ids[rows.start * n : rows.stop * n], colours, n, picture[rows.start : rows.stop]
+            )
+
+        each(blend, _bands(self.shape[0], n_threads), n_threads)
+        return picture
+
+    def site_at(self, x_um: ArrayLike, y_um: ArrayLike) -> NDArray[np.int32]:
+        """The site of the sample nearest to each point, (...) int32; -1 where there is none, or beyond the picture."""
+        x, y = np.broadcast_arrays(finite_array("x_um", x_um), finite_array("y_um", y_um))
+        x_min, y_min, x_max, y_max = self.bounds_um
+        n_y, n_x = self.ids.shape
+        column, row = ((x - x_min) * (n_x / (x_max - x_min)), (y - y_min) * (n_y / (y_max - y_min)))
+        is_in = (column >= 0.0) & (column < n_x) & (row >= 0.0) & (row < n_y)
+        at = self.ids[np.where(is_in, row, 0.0).astype(np.int64), np.where(is_in, column, 0.0).astype(np.int64)]
+        return np.where(is_in, at, np.int32(-1))
+
+
+def _checked(layout: PackedRings, bounds_um: Sequence[float] | Floats | None) -> Bounds:
+    if bounds_um is None:
+        if layout.xy_um.size == 0:
+            raise ParameterError("layout", "must have sites, or 'bounds_um' be given")
+        x_um, y_um = layout.xy_um[:, 0], layout.xy_um[:, 1]
+        bounds_um = (x_um.min(), y_um.min(), x_um.max(), y_um.max())
+    bounds = finite_array("bounds_um", bounds_um, ndim=1)
+    if bounds.size != 4 or not (bounds[0] < bounds[2] and bounds[1] < bounds[3]):
+        raise ParameterError("bounds_um", "must be (x_min, y_min, x_max, y_max)", bounds_um, "µm")
+    x_min, y_min, x_max, y_max = bounds.tolist()
+    return x_min, y_min, x_max, y_max
+
+
+def _centres_um(low_um: float, high_um: float, n: int) -> Floats:
+    return np.asarray(low_um + (np.arange(n) + 0.5) * ((high_um - low_um) / n))
+
+
+def _bands(n_rows: int, n_threads: int) -> list[slice]:
+    """The rows in pieces. A row is painted by itself, so that their number cannot be seen in the result."""
+    height = -(-n_rows // (BANDS_PER_THREAD * n_threads)) if n_threads > 1 else n_rows
+    return [slice(start, min(start + height, n_rows)) for start in range(0, n_rows, height)]
+
+
+def _sites_at(layout: PackedRings, x_um: Floats, y_um: Floats, n_threads: int) -> NDArray[np.int32]:
+    """The site at each sample of rising columns and rows, (n_y, n_x) int32."""
+    view = kernels("view")
+    n_sites = layout.site_offsets.size - 1
+    starts = layout.ring_offsets[layout.site_offsets]
+    rows = np.empty((n_sites, 2), np.int32)
+    ids = np.full((y_um.size, x_um.size), -1, np.int32)
+
+    def find(first: int) -> None:
+        view.rows_of_sites(layout.xy_um, starts, x_um, y_um, first, rows[first : first + CHUNK_SITES])
+
+    def paint(band: slice) -> None:
+        view.paint_sites(
+            layout.xy_um, layout.ring_offsets, layout.site_offsets, rows, x_um, y_um, band.start, ids[band]
+        )
+
+    each(find, range(0, n_sites, CHUNK_SITES), n_threads)
+    each(paint, _bands(y_um.size, n_threads), n_threads)
+    return ids
