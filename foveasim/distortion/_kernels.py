@@ -26,14 +26,13 @@ LAST_STEP = 1e-9
 FOLD_MARGIN = 1e-3
 
 
-@njit(cache=True, nogil=True)
-def _map(x, y, k, p1, p2):
+@njit(cache=True, nogil=True, inline="always")
+def _map(x, y, k1, k2, k3, k4, k5, k6, p1, p2):
     """Distorted position of a point, and the Jacobian: x_d, y_d, dx/dx, dx/dy, dy/dy."""
     r2 = x * x + y * y
-    above = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]))
-    below = 1.0 + r2 * (k[3] + r2 * (k[4] + r2 * k[5]))
-    factor = above / below
-    slope = (k[0] + r2 * (2.0 * k[1] + 3.0 * r2 * k[2]) - factor * (k[3] + r2 * (2.0 * k[4] + 3.0 * r2 * k[5]))) / below
+    over_below = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    factor = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) * over_below
+    slope = (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3) - factor * (k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6))) * over_below
     x_d = x * factor + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
     y_d = y * factor + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y)
     xx = factor + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
@@ -42,7 +41,7 @@ def _map(x, y, k, p1, p2):
     return x_d, y_d, xx, xy, yy
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _is_inside(x, y, determinant, fold, min_fold):
     """Whether an ideal point lies within the fold, whose radius is given in equal directions."""
     if not determinant > 0.0:
@@ -70,6 +69,7 @@ def brown_conrady_inverse(xy, k, p1, p2, fold, ideal, per_step):
     """
     found = np.empty_like(xy)
     min_fold, max_fold = fold.min(), fold.max() * (1.0 + FOLD_MARGIN)
+    k1, k2, k3, k4, k5, k6 = k[0], k[1], k[2], k[3], k[4], k[5]
     last = ideal.size - 1
     for i in range(xy.shape[0]):
         u, v = xy[i, 0], xy[i, 1]
@@ -89,7 +89,7 @@ def brown_conrady_inverse(xy, k, p1, p2, fold, ideal, per_step):
         # Near the fold tangential terms may put the start beyond it.
         for _ in range(MAX_MOVES):
             x, y = u * scale, v * scale
-            x_d, y_d, xx, xy_, yy = _map(x, y, k, p1, p2)
+            x_d, y_d, xx, xy_, yy = _map(x, y, k1, k2, k3, k4, k5, k6, p1, p2)
             if _is_inside(x, y, xx * yy - xy_ * xy_, fold, min_fold):
                 break
             scale *= 0.8
@@ -109,9 +109,13 @@ def brown_conrady_inverse(xy, k, p1, p2, fold, ideal, per_step):
             length, is_better = 1.0, False
             for _ in range(MAX_HALVINGS):
                 new_x, new_y = x - length * step_x, y - length * step_y
-                x_d, y_d, a, b, c = _map(new_x, new_y, k, p1, p2)
+                x_d, y_d, a, b, c = _map(new_x, new_y, k1, k2, k3, k4, k5, k6, p1, p2)
                 fx, fy = x_d - u, y_d - v
-                if fx * fx + fy * fy < error and a * c - b * b > 0.0 and new_x * new_x + new_y * new_y <= max_fold * max_fold:
+                if (
+                    fx * fx + fy * fy < error
+                    and a * c - b * b > 0.0
+                    and new_x * new_x + new_y * new_y <= max_fold * max_fold
+                ):
                     is_better = True
                     break
                 if error <= NEARLY * goal:  # rounding: shorter steps come no nearer

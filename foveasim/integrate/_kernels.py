@@ -53,6 +53,8 @@ MIN_RUN = 12
 NO_COVERAGE = 2e-15
 #: End of a linked list.
 END = -1
+#: Sites in a box of so many columns and rows have all its cells at hand; in fewer columns than a run needs there is none.
+BOX_COLUMNS, BOX_ROWS = MIN_RUN + 1, 64
 
 
 def _input(dtype, ndim):
@@ -142,9 +144,14 @@ def _add_moments(moment, ua, ub, va, vb, height):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _trace_edge(ua, va, ub, vb, n_y, n_x, bottom, head, recent, climb, links, cover, moment, n_cells):
+def _trace_edge(
+    ua, va, ub, vb, n_y, n_x, bottom, left_column, box_columns, head, recent, climb, links, cover, moment, n_cells
+):
     """
     Add one edge to the scratch cells; returns their count.
+
+    With ``box_columns`` > 0 the cells are those of a box whose corner is (``bottom``, ``left_column``), row by row; else they
+    are made when an edge touches them.
 
     ``cover[i]`` is (height, area): the signed height of the edge's pieces in the cell, and the area between
     them and the cell's left border. ``climb[row]`` is (height of all pieces in the row without their signs, number of them).
@@ -187,7 +194,10 @@ def _trace_edge(ua, va, ub, vb, n_y, n_x, bottom, head, recent, climb, links, co
                 height = rise if is_last else (u_next - left) * steepness
                 piece = sign * (height - climbed)
                 climb[row - bottom, 1] += 1.0
-                cell, count = _find_cell(head, recent, links, n_cells, row - bottom, column)
+                if box_columns > 0:
+                    cell, count = (row - bottom) * box_columns + column - left_column, n_cells
+                else:
+                    cell, count = _find_cell(head, recent, links, n_cells, row - bottom, column)
                 if count > n_cells:
                     cover[cell, 0] = 0.0
                     cover[cell, 1] = 0.0
@@ -404,15 +414,21 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
     for i_site in range(n_sites):
         site = first_site + i_site
         first_ring, last_ring = site_offsets[i_site], site_offsets[i_site + 1]
-        v_low, v_high = np.inf, -np.inf
+        u_low, v_low, u_high, v_high = np.inf, np.inf, -np.inf, -np.inf
         for i in range(ring_offsets[first_ring], ring_offsets[last_ring]):
-            v_low = min(v_low, uv[i, 1])
-            v_high = max(v_high, uv[i, 1])
+            u_low, u_high = min(u_low, uv[i, 0]), max(u_high, uv[i, 0])
+            v_low, v_high = min(v_low, uv[i, 1]), max(v_high, uv[i, 1])
         if not (v_high > 0.0 and v_low < n_y):
             continue
         bottom = int(np.floor(max(v_low, 0.0)))
         n_rows = int(np.ceil(min(v_high, float(n_y)))) - bottom
-        size = _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_rows)
+        left_column = int(min(max(u_low, 0.0), float(n_x)))
+        box_columns = int(min(max(u_high, 0.0), float(n_x))) - left_column + 1
+        if box_columns <= BOX_COLUMNS and n_rows <= BOX_ROWS:
+            size = n_rows * box_columns
+        else:
+            box_columns = 0
+            size = _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_rows)
         if head.size < n_rows:
             head = np.empty(2 * n_rows, np.int32)
             recent = np.empty(2 * n_rows, np.int32)
@@ -424,7 +440,18 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
         head[:n_rows] = END
         recent[:n_rows] = END
         climb[:n_rows] = 0.0
-        n_cells = 0
+        n_cells = n_rows * box_columns
+        if box_columns > 0:
+            for row in range(n_rows):
+                first = row * box_columns
+                head[row] = first
+                for column in range(box_columns):
+                    links[first + column, 0] = left_column + column
+                    links[first + column, 1] = first + column + 1
+                links[first + box_columns - 1, 1] = END
+        cover[:n_cells] = 0.0
+        if has_moments:
+            moment[:n_cells] = 0.0
         for ring in range(first_ring, last_ring):
             start, stop = ring_offsets[ring], ring_offsets[ring + 1]
             a = stop - 1
@@ -437,6 +464,8 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
                     n_y,
                     n_x,
                     bottom,
+                    left_column,
+                    box_columns,
                     head,
                     recent,
                     climb,
