@@ -160,6 +160,46 @@ def convert(
 
 
 @app.command()
+def view(
+    file: Annotated[
+        Path,
+        typer.Argument(help="A layout's file or name, a capture (.npz), or a report of check (.lyrdb, with --layout)."),
+    ],
+    web: Annotated[Path | None, typer.Option("--web", help="Write the page to this .html file.")] = None,
+    serve: Annotated[bool, typer.Option("--serve", help="Hand the page out on this computer until Ctrl-C.")] = False,
+    port: Annotated[int, typer.Option("--port", help="Port of --serve; 0 for any that is free.")] = 0,
+    layout: Annotated[Path | None, typer.Option("--layout", help="The layout that a report is of.")] = None,
+    rules: Annotated[
+        Path | None, typer.Option("--rules", help="Rules to check the layout against: a YAML file or a preset's name.")
+    ] = None,
+) -> None:
+    """Explore a layout, a capture or a report in a browser, on a page that needs no network."""
+    from foveasim.shots import read_viewable
+    from foveasim.view.web import check_page_path, open_page, serve_page, web_page, write_web_page
+
+    if web is not None and serve:
+        _end("error: --web writes a file and --serve hands the page out: take one of them", BAD_INPUT)
+    if port and not serve:
+        _end("error: --port belongs to --serve", BAD_INPUT)
+    if web is not None:
+        check_page_path(web)
+    with console.status("reading"):
+        seen = read_viewable(file, layout=layout, rules=rules)
+    if web is not None:
+        with console.status("writing the page"):
+            write_web_page(seen.thing, web, report=seen.report, name=seen.name)
+        console.print(f"wrote {web}", soft_wrap=True, highlight=False)
+        return
+    with console.status("making the page"):
+        text = web_page(seen.thing, report=seen.report, name=seen.name)
+    if serve:
+        serve_page(text, port=port, tell=lambda at: _say(f"{file} is at {at} until you press Ctrl-C"))
+        return
+    path, is_opened = open_page(text)
+    _say(f"opened {path}" if is_opened else f"found no browser; open {path} in one")
+
+
+@app.command()
 def schema() -> None:
     """Print the JSON schema of a settings file."""
     from foveasim.config import schema as json_schema
@@ -203,6 +243,12 @@ def main() -> None:
         _end(f"error: {error.strerror or error}", BAD_INPUT)
     finally:
         warnings.showwarning = show_warning
+
+
+def _say(sentence: str) -> None:
+    # Flushed: who waits for an address may read it from a pipe.
+    sys.stdout.write(sentence + "\n")
+    sys.stdout.flush()
 
 
 def _end(sentence: str, code: int) -> NoReturn:

@@ -3,5 +3,15 @@
 from __future__ import annotations
 
 from foveasim.shots._shots import Result, check_folder, demo_settings, results_table, run_shot, write_results
+from foveasim.shots._viewing import Viewable, read_viewable
 
-__all__ = ["Result", "check_folder", "demo_settings", "results_table", "run_shot", "write_results"]
+__all__ = [
+    "Result",
+    "Viewable",
+    "check_folder",
+    "demo_settings",
+    "read_viewable",
+    "results_table",
+    "run_shot",
+    "write_results",
+]

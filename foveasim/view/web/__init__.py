@@ -1,0 +1,8 @@
+"""Pages for a browser: one file each, that needs no network."""
+
+from __future__ import annotations
+
+from foveasim.view.web._page import check_page_path, web_page, write_web_page
+from foveasim.view.web._serve import open_page, serve_page
+
+__all__ = ["check_page_path", "open_page", "serve_page", "web_page", "write_web_page"]

@@ -1,0 +1,339 @@
+"""What a page is told of a layout, a capture and a report: plain data, arrays and a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from foveasim.arrays import UNIT_SUFFIXES, Floats
+from foveasim.capture import Capture
+from foveasim.errors import GeometryError, ParameterError
+from foveasim.layout import Layout, Report
+from foveasim.view.id_map import SitePixels
+from foveasim.view.palette import (
+    BACKGROUND,
+    CATEGORY_COLOURS,
+    DISPLAY_GAMMA,
+    FILTER_COLOURS,
+    NO_DATA,
+    Rgb,
+    site_colours,
+)
+from foveasim.view.web._pack import back_references, smallest
+from foveasim.view.web._shapes import shapes_of
+
+__all__ = ["Content", "content_of", "signal_to_noise"]
+
+#: Longer side of the picture.
+PICTURE_PIXELS = 800
+#: Violations of a rule that a page lists, the worst first.
+MAX_LISTED = 2000
+#: Whole numbers above this are told as text: a page's numbers are float64.
+MAX_EXACT = 2**53
+#: Colours of channels that no sensor has given filters yet.
+CHANNEL_NAMES = "RGBW"
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """
+    What is shown.
+
+    Attributes
+    ----------
+    about : mapping
+        Plain data for JSON: numbers of sites, columns, rules, the picture's place.
+    arrays : mapping of str to array
+        By the names that ``about`` has for them.
+    picture_png : bytes
+        What the sensor saw; of a layout alone, its sites.
+    """
+
+    about: Mapping[str, Any]
+    arrays: Mapping[str, NDArray[Any]]
+    picture_png: bytes
+
+
+def content_of(thing: Layout | Capture, report: Report | None = None, *, name: str = "") -> Content:
+    """
+    What a page is told.
+
+    Parameters
+    ----------
+    thing : Layout or Capture
+    report : Report, optional
+        Of a check of the same layout.
+    name : str
+        Heading; by default what made the layout.
+
+    Raises
+    ------
+    ParameterError
+        When the thing is neither, or the report is of another number of sites.
+    GeometryError
+        When the layout has no sites.
+    """
+    if not isinstance(thing, Layout | Capture):
+        raise ParameterError("thing", f"must be a Layout or a Capture, got a {type(thing).__name__}")
+    capture = thing if isinstance(thing, Capture) else None
+    layout = thing.layout if isinstance(thing, Capture) else thing
+    if layout.n_sites == 0:
+        raise GeometryError("the layout has no sites, and so nothing to show")
+    if report is not None and not isinstance(report, Report):
+        raise ParameterError("report", f"must be a Report of a check, got a {type(report).__name__}")
+    if report is not None and report.n_sites != layout.n_sites:
+        raise ParameterError(
+            "report", f"must be of this layout of {layout.n_sites:,} sites, got one of {report.n_sites:,}"
+        )
+    arrays = _outlines(layout)
+    columns = _columns(layout, capture, arrays)
+    picture, place = _picture(layout, capture)
+    provenance = layout.provenance
+    origin = str(provenance.get("generator", provenance.get("made_by", provenance.get("read_from", "polygons"))))
+    about = {
+        "name": name or origin.replace("_", " "),
+        "kind": "layout" if capture is None else "capture",
+        "notes": _notes(layout, capture, origin),
+        "n_sites": layout.n_sites,
+        "bounds_um": layout.bounds_um,
+        "columns": columns,
+        "filter": next((column["array"] for column in columns if column["key"] == "channel"), None),
+        "picture": place,
+        "rules": [] if report is None else _rules(report, arrays),
+        "palette": {
+            "kinds": [_hex(colour) for colour in CATEGORY_COLOURS],
+            "no_data": _hex(NO_DATA),
+            "ground": _hex(BACKGROUND),
+            "gamma": DISPLAY_GAMMA,
+        },
+    }
+    return Content(about, arrays, picture)
+
+
+def signal_to_noise(capture: Capture) -> Floats | None:
+    """
+    Expected charge of every site over the noise of light and of reading, (n_site,); None where neither is known.
+
+    Parameters
+    ----------
+    capture : Capture
+        Its settings tell the read noise, where it is one number for all sites, and whether shot noise was drawn.
+
+    Notes
+    -----
+    ``expected_e / sqrt(expected_e + read_noise_e²)``. The expectation counts dark charge too, and fixed patterns, the
+    converter's steps and resets are left out: :meth:`foveasim.Camera.predict` and :func:`foveasim.sensor.noise_budget`
+    have them all.
+    """
+    settings = capture.settings.get("sensor")
+    settings = settings if isinstance(settings, Mapping) else {}
+    read_noise_e = settings.get("read_noise_e")
+    if isinstance(read_noise_e, list) and len(read_noise_e) == capture.layout.n_sites:
+        read_noise_e = np.array(read_noise_e, dtype=np.float64)
+    elif isinstance(read_noise_e, bool) or not isinstance(read_noise_e, int | float):
+        return None
+    shot_e2 = 0.0 if settings.get("shot_noise") == "off" else capture.expected_e
+    variance_e2 = np.asarray(shot_e2 + np.square(read_noise_e) + np.zeros(capture.layout.n_sites))
+    if not np.isfinite(variance_e2).all():
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(variance_e2 > 0.0, capture.expected_e / np.sqrt(variance_e2), np.nan))
+
+
+# -- outlines -----------------------------------------------------------------------------------------------------------
+
+
+def _outlines(layout: Layout) -> dict[str, NDArray[Any]]:
+    shapes = shapes_of(layout)
+    arrays = {
+        "xy_um": shapes.xy_um,
+        "place": smallest(back_references(shapes.place)),
+        "ring_sizes": smallest(np.diff(shapes.ring_offsets)),
+        "cut_sites": shapes.cut_sites.astype(np.uint32),
+        "cut_counts": smallest(np.diff(shapes.cut_offsets)),
+        "cuts": shapes.cuts.astype(np.uint32).reshape(-1),
+    }
+    n_rings = np.diff(shapes.site_offsets)
+    if n_rings.max() > 1:
+        arrays["site_rings"] = smallest(n_rings)
+    return arrays
+
+
+# -- columns ------------------------------------------------------------------------------------------------------------
+
+
+def _columns(layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
+    """What can be shown of a site, in the order of a list: how it is called, its unit, and how it becomes colours."""
+    columns: list[dict[str, Any]] = []
+
+    def add(key: str, label: str, unit: str, values: NDArray[Any], kind: str | None = None, **more: Any) -> str:
+        name = f"column-{len(arrays)}"
+        told, numbers = _as_numbers(values)
+        arrays[name] = numbers
+        # A column of sizes may hold few of them: a name for each is for what is no number, and for what is told to be.
+        kind = kind or ("kinds" if "names" in told else "even")
+        columns.append({"key": key, "label": label, "unit": unit, "array": name, "kind": kind, **told, **more})
+        return name
+
+    if capture is not None:
+        colours = [_filter_colour(k, name) for k, name in enumerate(capture.filter_names)]
+        code = add("code", "code", "DN", capture.code, "grey")
+        if len(colours) > 1:
+            lit = {**columns[0], "key": "picture", "label": "colour mosaic", "kind": "lit", "colours": colours}
+            columns.insert(0, {**lit, "array": code, "is_repeat": True})
+        add("electrons", "electrons", "e⁻", capture.electrons)
+        add("expected_e", "expected electrons", "e⁻", capture.expected_e)
+        ratio = signal_to_noise(capture)
+        if ratio is not None:
+            add("snr", "signal to noise", "", ratio, note="expected charge over shot noise and read noise")
+        if len(colours) > 1:
+            names = list(capture.filter_names)
+            add("channel", "filter", "", capture.filter_of_site, "kinds", names=names, colours=colours)
+    elif "channel" in layout.columns and _is_index(layout.columns["channel"]):
+        n_channels = int(layout.channel.max()) + 1
+        letters = list(CHANNEL_NAMES[:n_channels]) if n_channels in (3, 4) else [str(k) for k in range(n_channels)]
+        colours = [_filter_colour(k, name) for k, name in enumerate(letters)]
+        add("channel", "channel", "", layout.channel, "kinds", names=letters, colours=colours)
+    columns.append({"key": "size_um", "label": "pixel size", "unit": "µm", "kind": "even", "of": "size"})
+    columns.append({"key": "area_um2", "label": "area", "unit": "µm²", "kind": "even", "of": "area"})
+    taken = {column["key"] for column in columns}
+    for key in sorted(layout.columns, key=lambda name: name != "readout_line"):
+        if key not in taken:
+            label, unit = _label(key)
+            values = layout.columns[key]
+            add(key, label, unit, values.astype(str) if _are_few(values) and not unit else values)
+    return columns
+
+
+def _is_index(values: NDArray[Any]) -> bool:
+    return values.dtype.kind in "iu" and int(values.min(initial=0)) >= 0 and int(values.max(initial=0)) < 256
+
+
+def _are_few(values: NDArray[Any]) -> bool:
+    """Whether whole numbers are so few that they name kinds, such as zones."""
+    if values.dtype.kind not in "iu":
+        return False
+    # A span first: finding the kinds of a million different numbers takes long.
+    low, high = int(values.min(initial=0)), int(values.max(initial=0))
+    return high - low < 2**16 and np.unique(values).size <= len(CATEGORY_COLOURS)
+
+
+def _as_numbers(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any]]:
+    """A column as numbers that a page has exactly, and what it must know of them."""
+    if values.dtype.kind == "b":
+        return {"names": ["no", "yes"], "whole": True}, values.astype(np.uint8)
+    if values.dtype.kind in "iu" and (values.max(initial=0) <= MAX_EXACT and values.min(initial=0) >= -MAX_EXACT):
+        return {"whole": True}, smallest(values)
+    if values.dtype.kind == "f":
+        return {}, smallest(values)
+    if values.dtype.kind == "c":
+        values = values.astype(str)
+    names, kinds = np.unique(values, return_inverse=True)
+    texts = [name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name) for name in names]
+    return {"names": texts, "whole": True}, smallest(kinds)
+
+
+def _label(key: str) -> tuple[str, str]:
+    """A column's name in words, and the unit that it ends in."""
+    suffix = next((suffix for suffix in UNIT_SUFFIXES if key.lower().endswith(suffix) and len(suffix) < len(key)), "")
+    return key[: len(key) - len(suffix)].replace("_", " ").strip() or key, UNIT_SUFFIXES.get(suffix, "")
+
+
+def _filter_colour(position: int, name: str) -> str:
+    return _hex(FILTER_COLOURS.get(name, CATEGORY_COLOURS[position % len(CATEGORY_COLOURS)]))
+
+
+def _hex(colour: Rgb) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*colour)
+
+
+# -- the picture, the rules, the notes ------------------------------------------------------------------------------------
+
+
+def _picture(layout: Layout, capture: Capture | None) -> tuple[bytes, dict[str, Any]]:
+    """What the sensor saw as a PNG, and where it lies; of a layout, its sites in the colours of their channels or sizes."""
+    from PIL import Image
+
+    if capture is not None:
+        seen = capture.picture(max_pixels=PICTURE_PIXELS)
+        white = capture.white_dn
+        if seen.data.shape[0] not in (1, 3):
+            seen = replace(seen, data=np.mean(seen.data / white.reshape(-1, 1, 1), axis=0, keepdims=True))
+            white = np.ones(1)
+        pixels = seen.to_image(white, encode_srgb=True)
+        bounds_um = seen.grid.bounds_um
+    else:
+        x_min, y_min, x_max, y_max = layout.bounds_um
+        bounds_um = layout.bounds_um
+        pixel_um = max(x_max - x_min, y_max - y_min) / PICTURE_PIXELS
+        shape = (max(1, round((y_max - y_min) / pixel_um)), max(1, round((x_max - x_min) / pixel_um)))
+        by = "channel" if "channel" in layout.columns and _is_index(layout.columns["channel"]) else "size_um"
+        pixels = SitePixels.of(layout, shape, n_samples=2).picture(site_colours(layout, by))[::-1]
+    file = BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(file, "PNG")
+    height, width = pixels.shape[:2]
+    return file.getvalue(), {"bounds_um": bounds_um, "width": width, "height": height}
+
+
+def _rules(report: Report, arrays: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
+    """What was asked and found; the worst violations of each rule as arrays, one rule after the other."""
+    rules = []
+    values: list[float] = []
+    sites: list[tuple[int, ...]] = []
+    markers: list[Any] = []
+    for result in report.results:
+        listed = result.violations[:MAX_LISTED]
+        values += [violation.value for violation in listed]
+        sites += [violation.site_ids for violation in listed]
+        markers += [violation.marker for violation in listed]
+        rules.append({
+            "name": result.rule, "sentence": result.sentence, "limit": _finite(result.limit), "unit": result.unit,
+            "count": len(result), "listed": len(listed), "waiver": result.waiver,
+        })  # fmt: skip
+    parts, owner = shapely.get_parts(np.array(markers, dtype=object), return_index=True)
+    rings, part_of_ring = _outlines_of_parts(parts)
+    points_um, ring_of_point = shapely.get_coordinates(rings, return_index=True)
+    n_parts = np.bincount(owner[part_of_ring], minlength=len(markers)) if len(markers) else np.zeros(0, np.int64)
+    arrays["violation_value"] = np.array(values, dtype=np.float64)
+    arrays["violation_sites"] = np.array([site for ids in sites for site in ids], dtype=np.uint32)
+    arrays["violation_site_counts"] = smallest(np.array([len(ids) for ids in sites], dtype=np.int64))
+    arrays["marker_part_counts"] = smallest(n_parts)
+    arrays["marker_sizes"] = smallest(np.bincount(ring_of_point, minlength=len(rings)))
+    arrays["marker_xy_um"] = points_um
+    return rules
+
+
+def _outlines_of_parts(parts: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    """Lines of markers, and the part that each is of: rings of polygons closed, lines and points as they are."""
+    is_polygon = shapely.get_type_id(parts) == shapely.GeometryType.POLYGON
+    rings, of_polygon = shapely.get_rings(parts[is_polygon], return_index=True)
+    lines = np.concatenate((rings, parts[~is_polygon]))
+    part = np.concatenate((np.flatnonzero(is_polygon)[of_polygon], np.flatnonzero(~is_polygon)))
+    order = np.argsort(part, kind="stable")
+    return lines[order], part[order].astype(np.int64)
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def _notes(layout: Layout, capture: Capture | None, origin: str) -> list[str]:
+    x_min, y_min, x_max, y_max = layout.bounds_um
+    notes = [
+        f"{layout.n_sites:,} photosites",
+        f"{x_max - x_min:.5g} × {y_max - y_min:.5g} µm",
+        origin.replace("_", " "),
+    ]
+    if capture is not None:
+        notes.append(f"{capture.bits} bits")
+        exposure_s = capture.settings.get("exposure_s")
+        if isinstance(exposure_s, int | float):
+            notes.append(f"{1e3 * exposure_s:.4g} ms")
+        notes.append(f"{100 * capture.saturated_share:.3g} % saturated")
+    return notes

@@ -1,0 +1,167 @@
+"""The page: template, style, scripts and data joined to one file that needs no network."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from foveasim.capture import Capture
+from foveasim.errors import FileError
+from foveasim.files import written_whole
+from foveasim.layout import Layout, Report
+from foveasim.view.web._content import content_of
+from foveasim.view.web._pack import packed
+
+__all__ = ["check_page_path", "joined", "web_page", "write_web_page"]
+
+#: Scripts in the order in which they stand on each other.
+SCRIPTS = ("unpack.js", "sites.js", "colours.js", "map.js", "page.js")
+#: Endings of pages.
+ENDINGS = (".html", ".htm")
+#: A page loads nothing: its own scripts and style alone, told by their checksums, and pictures that stand in it.
+POLICY = (
+    "default-src 'none'; script-src '{script}'; style-src '{style}'; img-src data: blob:; base-uri 'none'; "
+    "form-action 'none'"
+)
+
+
+def web_page(thing: Layout | Capture, *, report: Report | None = None, name: str = "") -> str:
+    """
+    A page to explore a layout or a capture in a browser: zoom, values of the site under the mouse, colours, histogram.
+
+    Parameters
+    ----------
+    thing : Layout or Capture
+    report : Report, optional
+        Of a check of this layout: its violations are listed and marked.
+    name : str
+        Heading; by default what made the layout.
+
+    Returns
+    -------
+    text : str
+        HTML with everything in it, for a browser with WebGL2; it loads nothing from anywhere.
+
+    Raises
+    ------
+    ParameterError
+        When the thing is neither, or the report is of another layout.
+    GeometryError
+        When the layout has no sites.
+
+    Examples
+    --------
+    >>> from foveasim.layout import grid
+    >>> page = web_page(grid(n_x=4, n_y=3, pitch_um=2.0), name="a small grid")
+    >>> "<title>a small grid</title>" in page
+    True
+    """
+    content = content_of(thing, report, name=name)
+    arrays = {key: packed(values) for key, values in content.arrays.items()}
+    about = {**content.about, "arrays": {key: told for key, (told, _) in arrays.items()}}
+    return joined(
+        "template.html",
+        ("page.css",),
+        SCRIPTS,
+        about,
+        {key: text for key, (_, text) in arrays.items()},
+        title=str(content.about["name"]),
+        alt="What the sensor saw" if isinstance(thing, Capture) else "The photosites of the layout",
+        picture="data:image/png;base64," + base64.b64encode(content.picture_png).decode(),
+    )
+
+
+def write_web_page(thing: Layout | Capture, path: str | Path, *, report: Report | None = None, name: str = "") -> None:
+    """
+    Write :func:`web_page` to a file, whole or not at all.
+
+    Parameters
+    ----------
+    thing : Layout or Capture
+    path : path
+        Ending in ``.html``.
+    report : Report, optional
+    name : str
+        Heading; by default what made the layout.
+
+    Raises
+    ------
+    FileError
+        When the ending is another, or nothing can be written there.
+    ParameterError, GeometryError
+        As for :func:`web_page`.
+    """
+    target = check_page_path(path)
+    text = web_page(thing, report=report, name=name)
+    with written_whole(target) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def check_page_path(path: str | Path) -> Path:
+    """
+    The path of a page, before anything is computed for it.
+
+    Raises
+    ------
+    FileError
+        When it does not end as pages do, or its folder does not exist.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in ENDINGS:
+        raise FileError(target, "must end in .html")
+    if not target.parent.is_dir():
+        raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
+    return target
+
+
+def joined(
+    template: str,
+    styles: tuple[str, ...],
+    scripts: tuple[str, ...],
+    about: dict[str, Any],
+    data: dict[str, str],
+    **texts: str,
+) -> str:
+    """
+    One HTML text of its parts.
+
+    Parameters
+    ----------
+    template, styles, scripts : str
+        Files beside this one. Scripts share a scope that is closed to others.
+    about : dict
+        Plain data, for the element ``about``.
+    data : dict of str to base64
+        Packed arrays, for elements ``data-NAME``.
+    **texts : str
+        For the template's places, escaped.
+    """
+    style = "".join(map(_part, styles))
+    script = '(() => {\n"use strict";\n' + "\n".join(map(_part, scripts)) + "\n})();\n"
+    # Of what ends a script element nothing may stand in one, whatever a column of a stranger's file is called.
+    plain = json.dumps(about, ensure_ascii=True, allow_nan=False).replace("<", "\\u003c").replace(">", "\\u003e")
+    elements = [f'<script type="application/json" id="about">{plain}</script>']
+    elements += [f'<script type="text/plain" id="data-{key}">{text}</script>' for key, text in data.items()]
+    return Template(_part(template)).substitute(
+        {name: html.escape(text) for name, text in texts.items()},
+        policy=html.escape(POLICY.format(script=_checksum(script), style=_checksum(style)), quote=False),
+        style=style,
+        script=script,
+        data="\n".join(elements),
+    )
+
+
+@cache
+def _part(name: str) -> str:
+    return files("foveasim.view.web").joinpath(name).read_text(encoding="utf-8")
+
+
+def _checksum(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

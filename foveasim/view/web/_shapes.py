@@ -1,0 +1,160 @@
+"""Outlines of photosites as a page draws and picks them: shared vertices, and triangles that keep notches and holes open."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from foveasim.arrays import Bools, Floats, Ints
+from foveasim.layout import Layout
+from foveasim.rings import next_vertex, positions_in_runs
+
+__all__ = ["Shapes", "shapes_of"]
+
+#: A triangle of a fan may be turned over by this share of its site's area: rounding.
+ROUNDING = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """
+    Outlines and triangles.
+
+    Attributes
+    ----------
+    xy_um : (n_place, 2) float64, µm
+        Every place where a vertex is, once, in the order in which rings come to it.
+    place : (n_vertex,) int64
+        Place of each vertex of each ring. Rings of one ring sites may begin at another vertex than the layout's.
+    ring_offsets, site_offsets : int64
+        As of the layout.
+    cut_sites : (n_cut,) int64
+        Sites that no fan from their first vertex fills, in rising order. All others are filled by theirs.
+    cut_offsets : (n_cut + 1,) int64
+        Site ``cut_sites[i]`` has the triangles ``cut_offsets[i] : cut_offsets[i + 1]``.
+    cuts : (n_triangle, 3) int64
+        Vertices of their triangles.
+    """
+
+    xy_um: Floats
+    place: Ints
+    ring_offsets: Ints
+    site_offsets: Ints
+    cut_sites: Ints
+    cut_offsets: Ints
+    cuts: Ints
+
+
+def shapes_of(layout: Layout) -> Shapes:
+    """
+    What a page draws of a layout.
+
+    Parameters
+    ----------
+    layout : Layout
+        Of at least one site.
+
+    Notes
+    -----
+    A fan from a vertex fills a simple ring when none of its triangles is turned over: so convex sites need no triangles
+    of their own, nor do those with a notch that a fan from its deepest vertex looks into.
+    """
+    xy_um, place = _shared(layout.xy_um)
+    n_rings = np.diff(layout.site_offsets)
+    order, is_filled = _fans(layout, n_rings == 1)
+    place = place[order]
+    cut_sites = np.flatnonzero(~is_filled)
+    cut_offsets, cuts = _cut(layout, cut_sites, place, xy_um)
+    return Shapes(xy_um, place, layout.ring_offsets, layout.site_offsets, cut_sites, cut_offsets, cuts)
+
+
+def _shared(xy_um: Floats) -> tuple[Floats, Ints]:
+    """Places in the order of their first vertex, and each vertex's place."""
+    keys = (np.ascontiguousarray(xy_um) + 0.0).view(np.complex128)[:, 0]  # + 0.0: -0 and 0 are one place
+    _, first, place = np.unique(keys, return_index=True, return_inverse=True)
+    rank = np.empty(first.size, np.int64)
+    by_first = np.argsort(first)
+    rank[by_first] = np.arange(first.size)
+    return xy_um[first[by_first]], rank[place]
+
+
+def _fans(layout: Layout, may_fan: Bools) -> tuple[Ints, Bools]:
+    """The vertices in an order in which fans fill as many sites as can be, and whether they fill each."""
+    xy_um, ring_offsets = layout.xy_um, layout.ring_offsets
+    n_vertices = np.diff(ring_offsets)
+    first_ring = layout.site_offsets[:-1]
+    tolerance_um2 = ROUNDING * np.abs(layout.area_um2)
+    order = np.arange(xy_um.shape[0])
+    is_filled = np.zeros(layout.n_sites, bool)
+    is_filled[may_fan] = _is_filled(xy_um, ring_offsets, order, first_ring[may_fan], tolerance_um2[may_fan])
+    left = np.flatnonzero(may_fan & ~is_filled)
+    if left.size:
+        # The deepest vertex: where the outline turns to the right the most.
+        after = next_vertex(ring_offsets)
+        before = np.empty_like(after)
+        before[after] = np.arange(after.size)
+        a, b = xy_um - xy_um[before], xy_um[after] - xy_um
+        turn_um2 = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+        rings = first_ring[left]
+        vertices = np.repeat(ring_offsets[rings], n_vertices[rings]) + positions_in_runs(n_vertices[rings])
+        starts = np.cumsum(n_vertices[rings]) - n_vertices[rings]
+        deepest_um2 = np.minimum.reduceat(turn_um2[vertices], starts)
+        is_deepest = turn_um2[vertices] == np.repeat(deepest_um2, n_vertices[rings])
+        step = np.where(is_deepest, positions_in_runs(n_vertices[rings]), vertices.size)
+        shift = np.repeat(np.minimum.reduceat(step, starts), n_vertices[rings])
+        within = (positions_in_runs(n_vertices[rings]) + shift) % np.repeat(n_vertices[rings], n_vertices[rings])
+        order[vertices] = np.repeat(ring_offsets[rings], n_vertices[rings]) + within
+        is_filled[left] = _is_filled(xy_um, ring_offsets, order, rings, tolerance_um2[left])
+    return order, is_filled
+
+
+def _is_filled(xy_um: Floats, ring_offsets: Ints, order: Ints, rings: Ints, tolerance_um2: Floats) -> Bools:
+    """Whether the fan from the first vertex of each ring, in this order, turns no triangle over."""
+    if rings.size == 0:
+        return np.zeros(0, bool)
+    n_triangles = ring_offsets[rings + 1] - ring_offsets[rings] - 2
+    apex = np.repeat(ring_offsets[rings], n_triangles)
+    second = apex + 1 + positions_in_runs(n_triangles)
+    centre = xy_um[order[apex]]
+    a, b = xy_um[order[second]] - centre, xy_um[order[second + 1]] - centre
+    area_um2 = 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    starts = np.cumsum(n_triangles) - n_triangles
+    return np.asarray(np.minimum.reduceat(area_um2, starts) >= -tolerance_um2)
+
+
+def _cut(layout: Layout, sites: Ints, place: Ints, xy_um: Floats) -> tuple[Ints, Ints]:
+    """Triangles of sites that fans do not fill, as vertices: the constrained Delaunay triangulation of each."""
+    if sites.size == 0:
+        return np.zeros(1, np.int64), np.zeros((0, 3), np.int64)
+    polygons = layout[sites].polygons()
+    # An outline that crosses itself, which only the plain constructor lets in, is drawn as what it encloses.
+    is_valid = shapely.is_valid(polygons)
+    polygons[~is_valid] = shapely.buffer(polygons[~is_valid], 0.0)
+    parts, owner = shapely.get_parts(shapely.constrained_delaunay_triangles(polygons), return_index=True)
+    corners_um = shapely.get_coordinates(parts).reshape(-1, 4, 2)[:, :3]
+    owner = sites[owner]
+    # A corner is the vertex of its site that lies at its place; what has none came from the repair above.
+    sorted_keys, by_key = _keys(xy_um)
+    corner_keys = np.ascontiguousarray(corners_um.reshape(-1, 2) + 0.0).view(np.complex128)[:, 0]
+    found = np.minimum(np.searchsorted(sorted_keys, corner_keys), sorted_keys.size - 1)
+    is_known = sorted_keys[found] == corner_keys
+    site_of_vertex = np.repeat(np.arange(layout.n_sites), np.diff(layout.ring_offsets[layout.site_offsets]))
+    pair = site_of_vertex * xy_um.shape[0] + place
+    by_pair = np.argsort(pair, kind="stable")
+    wanted = np.repeat(owner, 3) * xy_um.shape[0] + by_key[found]
+    at = np.minimum(np.searchsorted(pair[by_pair], wanted), pair.size - 1)
+    vertex = by_pair[at]
+    is_known &= pair[vertex] == wanted
+    is_whole = is_known.reshape(-1, 3).all(axis=1)
+    counts = np.bincount(np.searchsorted(sites, owner[is_whole]), minlength=sites.size)
+    return np.concatenate(([0], np.cumsum(counts))), vertex.reshape(-1, 3)[is_whole]
+
+
+def _keys(xy_um: Floats) -> tuple[NDArray[Any], Ints]:
+    keys = np.ascontiguousarray(xy_um + 0.0).view(np.complex128)[:, 0]
+    by_key = np.argsort(keys)
+    return keys[by_key], by_key

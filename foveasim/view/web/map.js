@@ -1,0 +1,155 @@
+// The map: draws all sites by WebGL2 and keeps what part of the sensor is in view.
+
+const VERTEX_SHADER = `#version 300 es
+in ivec2 place;
+in uint site;
+uniform ivec2 centre;
+uniform vec2 rest;
+uniform vec2 zoom;
+uniform highp sampler2D colours;
+flat out vec4 colour;
+void main() {
+  colour = texelFetch(colours, ivec2(int(site) & 2047, int(site) >> 11), 0);
+  // Whole numbers subtract exactly, so that outlines stay sharp however near one goes.
+  gl_Position = vec4((vec2(place - centre) - rest) * zoom, 0.0, 1.0);
+}`;
+const FRAGMENT_SHADER = `#version 300 es
+precision mediump float;
+flat in vec4 colour;
+out vec4 pixel;
+void main() { pixel = colour; }`;
+const TEXTURE_WIDTH = 2048;
+// Places as whole numbers: the longer side of the layout is so many steps.
+const LATTICE = 2 ** 30;
+// How near one can go: the view may be this many times narrower than the layout.
+const DEEPEST = 1e7;
+
+class SensorMap {
+  constructor(canvas, sites, renderer) {
+    this.canvas = canvas;
+    this.sites = sites;
+    const [x0, y0, x1, y1] = sites.bounds;
+    this.middle = [0.5 * (x0 + x1), 0.5 * (y0 + y1)];
+    this.extent = Math.max(x1 - x0, y1 - y0);
+    this.perUm = LATTICE / this.extent;
+    this.x = this.middle[0];
+    this.y = this.middle[1];
+    this.scale = 1;
+    this.width = this.height = 1;
+    this.colours = new Uint32Array(TEXTURE_WIDTH * Math.max(1, Math.ceil(sites.n / TEXTURE_WIDTH)));
+    const isSmooth = !renderer.isSlow || sites.n < 20000;
+    this.gl = canvas.getContext("webgl2", { antialias: isSmooth, alpha: false, depth: false, powerPreference: "high-performance" });
+    if (this.gl) this._load();
+  }
+
+  _load() {
+    const { gl, sites } = this;
+    const program = gl.createProgram();
+    for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX_SHADER], [gl.FRAGMENT_SHADER, FRAGMENT_SHADER]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, text);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+    }
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
+    gl.useProgram(program);
+    this.at = Object.fromEntries(["centre", "rest", "zoom"].map((name) => [name, gl.getUniformLocation(program, name)]));
+
+    const n = sites.place.length, places = new Int32Array(2 * n), owners = new Uint32Array(n);
+    for (let v = 0; v < n; v++) {
+      const p = 2 * sites.place[v];
+      places[2 * v] = Math.round((sites.xy[p] - this.middle[0]) * this.perUm);
+      places[2 * v + 1] = Math.round((sites.xy[p + 1] - this.middle[1]) * this.perUm);
+    }
+    for (let site = 0; site < sites.n; site++) owners.fill(site, sites.firstVertex(site), sites.firstVertex(site + 1));
+    gl.bindVertexArray(gl.createVertexArray());
+    for (const [name, data, size, type] of [["place", places, 2, gl.INT], ["site", owners, 1, gl.UNSIGNED_INT]]) {
+      const location = gl.getAttribLocation(program, name);
+      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+      gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
+      gl.enableVertexAttribArray(location);
+      gl.vertexAttribIPointer(location, size, type, 0, 0);
+    }
+    const { corners, tiles } = sites.triangles();
+    this.tiles = tiles;
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+  }
+
+  sendColours() {
+    const { gl, colours } = this;
+    const bytes = new Uint8Array(colours.buffer), rows = colours.length / TEXTURE_WIDTH;
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, TEXTURE_WIDTH, rows, 0, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+  }
+
+  // From µm on the sensor to CSS pixels of the map, and back; y points up on the sensor.
+  toX(x) { return 0.5 * this.width + (x - this.x) * this.scale; }
+  toY(y) { return 0.5 * this.height - (y - this.y) * this.scale; }
+  fromX(px) { return this.x + (px - 0.5 * this.width) / this.scale; }
+  fromY(py) { return this.y - (py - 0.5 * this.height) / this.scale; }
+
+  resize(width, height) {
+    this.width = Math.max(1, width);
+    this.height = Math.max(1, height);
+    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    this.canvas.width = Math.round(this.width * ratio);
+    this.canvas.height = Math.round(this.height * ratio);
+  }
+
+  // The scale at which the whole layout is in view.
+  fitScale() {
+    const [x0, y0, x1, y1] = this.sites.bounds;
+    return 0.94 * Math.min(this.width / (x1 - x0), this.height / (y1 - y0));
+  }
+
+  set(x, y, scale) {
+    const [x0, y0, x1, y1] = this.sites.bounds, fit = this.fitScale();
+    this.scale = clamp(scale, 0.5 * fit, DEEPEST * fit);
+    this.x = clamp(x, x0, x1);
+    this.y = clamp(y, y0, y1);
+  }
+
+  // Zooms by a factor, with what is under a pixel staying there.
+  zoom(factor, px, py) {
+    const x = this.fromX(px), y = this.fromY(py), fit = this.fitScale();
+    const scale = clamp(this.scale * factor, 0.5 * fit, DEEPEST * fit);
+    this.set(x - (px - 0.5 * this.width) / scale, y + (py - 0.5 * this.height) / scale, scale);
+  }
+
+  draw(ground) {
+    const { gl, canvas } = this;
+    gl.viewport(0, 0, canvas.width, canvas.height);
+    gl.clearColor(ground[0] / 255, ground[1] / 255, ground[2] / 255, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    const centre = [(this.x - this.middle[0]) * this.perUm, (this.y - this.middle[1]) * this.perUm];
+    const whole = centre.map(Math.round);
+    gl.uniform2i(this.at.centre, whole[0], whole[1]);
+    gl.uniform2f(this.at.rest, centre[0] - whole[0], centre[1] - whole[1]);
+    gl.uniform2f(this.at.zoom, (2 * this.scale) / this.perUm / this.width, (2 * this.scale) / this.perUm / this.height);
+    const x0 = this.fromX(0), x1 = this.fromX(this.width), y0 = this.fromY(this.height), y1 = this.fromY(0);
+    let from = -1, to = -1;
+    const flush = () => { if (to > from) gl.drawElements(gl.TRIANGLES, to - from, gl.UNSIGNED_INT, 4 * from); };
+    for (const tile of this.tiles) {
+      const [a, b, c, d] = tile.reach;
+      if (a > x1 || c < x0 || b > y1 || d < y0) continue;
+      if (tile.from !== to) { flush(); from = tile.from; }
+      to = tile.to;
+    }
+    flush();
+  }
+}
+
+// What draws WebGL2 here: null where nothing does, else whether it is the processor, where smooth edges cost too much.
+function findRenderer() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) return null;
+  const told = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = told ? gl.getParameter(told.UNMASKED_RENDERER_WEBGL) : "";
+  const lose = gl.getExtension("WEBGL_lose_context");
+  if (lose) lose.loseContext();
+  return { isSlow: /swiftshader|llvmpipe|software|basic render/i.test(name) };
+}

@@ -1,0 +1,912 @@
+// The page: controls, the photosite under the mouse, colours, rules, the picture, links.
+
+const about = JSON.parse(document.getElementById("about").textContent);
+const $ = (id) => document.getElementById(id);
+const reducesMotion = matchMedia("(prefers-reduced-motion: reduce)");
+// More outlines than this are not drawn: they would be a grey mush.
+const MOST_OUTLINES = 4000;
+const VIOLATIONS_AT_A_TIME = 200;
+const STEPS = 72;
+
+const state = {
+  sites: null, map: null, columns: [], scale: null, column: null, range: null, wantsLog: undefined,
+  hovered: -1, others: [], pinned: -1, cursor: null, chosen: null, shownViolations: 0, drawn: 0, drawMs: 0, loaded: false,
+};
+const loading = new Map();
+const asks = { map: false, marks: false };
+
+function array(name) {
+  if (!loading.has(name)) loading.set(name, unpack(name, about.arrays[name]));
+  return loading.get(name);
+}
+
+function make(tag, text, className) {
+  const element = document.createElement(tag);
+  if (text !== undefined) element.textContent = text;
+  if (className) element.className = className;
+  return element;
+}
+
+// -- columns ------------------------------------------------------------------------------------------------------------
+
+async function valuesOf(column) {
+  if (!column.values) {
+    if (column.of === "area") column.values = state.sites.area;
+    else if (column.of === "size") column.values = Float64Array.from(state.sites.area, Math.sqrt);
+    else column.values = await array(column.array);
+  }
+  return column.values;
+}
+
+// A site's value as text, with its unit.
+function textOf(column, site) {
+  if (column.of === "area") return shown(state.sites.area[site]) + " µm²";
+  if (column.of === "size") return shown(Math.sqrt(state.sites.area[site])) + " µm";
+  if (!column.values) return "…";
+  const value = column.values[site];
+  if (column.names) return column.names[value];
+  return column.unit ? shown(value) + " " + column.unit : shown(value);
+}
+
+const titleOf = (column) => (column.unit ? column.label + " / " + column.unit : column.label);
+
+async function colourBy(key, range = null) {
+  const column = about.columns.find((c) => c.key === key) || about.columns[0];
+  const values = await valuesOf(column);
+  state.filterOf = about.filter && column.kind === "lit" ? await array(about.filter) : null;
+  if (state.column !== column) state.wantsLog = undefined;
+  state.column = column;
+  state.range = range;
+  state.scale = new Scale(column, values, state.filterOf, about.palette, state.wantsLog);
+  $("colouring").value = column.key;
+  repaint();
+  drawLegend();
+  fillRange();
+  rememberView();
+}
+
+function repaint() {
+  state.scale.paint(state.map.colours, state.range, groundColour());
+  state.map.sendColours();
+  ask("map");
+}
+
+function groundColour() {
+  return bytesOfHex(getComputedStyle(document.documentElement).getPropertyValue("--map").trim());
+}
+
+// -- legend and histogram ---------------------------------------------------------------------------------------------------
+
+function fitted(canvas) {
+  const ratio = Math.min(window.devicePixelRatio || 1, 2), width = canvas.clientWidth, height = canvas.clientHeight;
+  canvas.width = Math.max(1, Math.round(width * ratio));
+  canvas.height = Math.max(1, Math.round(height * ratio));
+  const context = canvas.getContext("2d");
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  return { context, width, height };
+}
+
+const inkOf = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+function drawLegend() {
+  const { scale, column } = state, isKinds = column.kind === "kinds";
+  $("bar").hidden = $("range").hidden = isKinds;
+  $("kinds").hidden = !isKinds;
+  $("log-label").hidden = !scale.canLog;
+  $("log").checked = scale.isLog;
+  const { values } = column;
+  if (isKinds) {
+    const counts = new Map();
+    for (let i = 0; i < values.length; i++) counts.set(values[i], (counts.get(values[i]) || 0) + 1);
+    const kinds = [...counts.keys()].sort((a, b) => a - b), most = 40;
+    $("kinds").replaceChildren(...kinds.slice(0, most).map((kind) => {
+      const item = make("li"), swatch = make("i");
+      swatch.style.background = "rgb(" + scale.kindColour(kind) + ")";
+      item.append(swatch, make("span", (column.names ? column.names[kind] : shown(kind)) + " · " + shown(counts.get(kind))));
+      return item;
+    }));
+    $("summary").textContent = kinds.length > most ? "and " + shown(kinds.length - most) + " more; colours repeat" : "";
+    return;
+  }
+  const histogram = scale.histogram(STEPS);
+  state.histogram = histogram;
+  drawHistogram();
+  const ramp = fitted($("ramp")), rows = scale.tables.length;
+  scale.tables.forEach((shades, row) => {
+    for (let px = 0; px < ramp.width; px++) {
+      ramp.context.fillStyle = "rgb(" + shades[Math.round((255 * px) / Math.max(1, ramp.width - 1))] + ")";
+      ramp.context.fillRect(px, (row * ramp.height) / rows, 1.5, ramp.height / rows);
+    }
+  });
+  const ticks = scale.ticks(4);
+  $("ticks").replaceChildren(...ticks.map((tick) => {
+    const label = make("span", brief(tick)), share = scale.share(tick);
+    label.style.left = 100 * clamp(share, 0, 1) + "%";
+    if (share < 0.04) label.style.transform = "none";
+    if (share > 0.96) label.style.transform = "translateX(-100%)";
+    return label;
+  }));
+  let sum = 0, count = 0;
+  for (let i = 0; i < values.length; i++) if (Number.isFinite(values[i])) { sum += values[i]; count++; }
+  const unit = column.unit ? " " + column.unit : "";
+  $("summary").textContent = count === 0 ? "no values" :
+    shown(scale.lowest) + " to " + shown(scale.highest) + unit + ", mean " + shown(Number((sum / count).toPrecision(5))) + unit +
+    (column.note ? " (" + column.note + ")" : "");
+}
+
+// Heights are roots of counts, so that a few sites among many can be seen.
+function drawHistogram() {
+  const { scale, histogram, column } = state;
+  if (!histogram || column.kind === "kinds") return;
+  const { context, width, height } = fitted($("histogram"));
+  const most = Math.max(...histogram), step = width / histogram.length;
+  const [from, to] = state.range ? state.range.map((v) => scale.share(v) * width) : [-1, width + 1];
+  context.clearRect(0, 0, width, height);
+  histogram.forEach((count, i) => {
+    const x = i * step, tall = count ? Math.max(1.5, Math.sqrt(count / most) * (height - 4)) : 0;
+    const isIn = x + step > from && x < to;
+    context.fillStyle = isIn ? inkOf("--accent") : inkOf("--line");
+    context.fillRect(x, height - tall, Math.max(step - (step > 3 ? 0.75 : 0), 0.5), tall);
+  });
+  const site = state.pinned >= 0 ? state.pinned : state.hovered;
+  if (site >= 0 && Number.isFinite(column.values[site])) {
+    const x = clamp(scale.share(column.values[site]), 0, 1) * width;
+    context.fillStyle = inkOf("--text");
+    context.fillRect(clamp(x - 1, 0, width - 2), 0, 2, height);
+  }
+}
+
+function setRange(from, to) {
+  const isAll = from === null;
+  state.range = isAll ? null : [Math.min(from, to), Math.max(from, to)];
+  fillRange();
+  repaint();
+  drawHistogram();
+  rememberView();
+}
+
+function fillRange() {
+  const { range, scale } = state;
+  $("range-from").value = Number((range ? range[0] : scale.lowest).toPrecision(6));
+  $("range-to").value = Number((range ? range[1] : scale.highest).toPrecision(6));
+  $("range-all").disabled = !range;
+}
+
+function listenToHistogram() {
+  const canvas = $("histogram");
+  let start = null;
+  const valueAt = (event) => {
+    const box = canvas.getBoundingClientRect();
+    const value = state.scale.value(clamp((event.clientX - box.left) / box.width, 0, 1));
+    return state.column.whole && !state.scale.isLog ? Math.round(value) : value;
+  };
+  canvas.addEventListener("pointerdown", (event) => { start = valueAt(event); canvas.setPointerCapture(event.pointerId); });
+  canvas.addEventListener("pointermove", (event) => { if (start !== null && event.buttons) setRange(start, valueAt(event)); });
+  canvas.addEventListener("pointerup", (event) => { if (start !== null && valueAt(event) === start) setRange(null); start = null; });
+  for (const id of ["range-from", "range-to"]) {
+    $(id).addEventListener("change", () => {
+      const from = Number($("range-from").value), to = Number($("range-to").value);
+      if (Number.isFinite(from) && Number.isFinite(to)) setRange(from, to);
+      else fillRange();
+    });
+  }
+  $("range-all").addEventListener("click", () => setRange(null));
+  $("log").addEventListener("change", () => {
+    state.wantsLog = $("log").checked;
+    colourBy(state.column.key, state.range);
+  });
+}
+
+// -- drawing ------------------------------------------------------------------------------------------------------------------
+
+function ask(what) {
+  const isAsked = asks.map || asks.marks;
+  asks[what] = true;
+  if (!isAsked) requestAnimationFrame(drawAsked);
+}
+
+function drawAsked() {
+  const isMap = asks.map;
+  asks.map = asks.marks = false;
+  if (isMap) drawMap();
+  drawMarks();
+}
+
+function drawMap() {
+  const start = performance.now();
+  state.map.draw(groundColour());
+  drawLines();
+  drawScaleBar();
+  state.drawn++;
+  state.drawMs = performance.now() - start;
+}
+
+// Outlines of sites that are large enough to have them, and markers of violations.
+function drawLines() {
+  const { map, sites } = state, { context, width, height } = state.lines;
+  context.clearRect(0, 0, width, height);
+  const view = [map.fromX(0), map.fromY(height), map.fromX(width), map.fromY(0)];
+  const found = sites.within(...view, MOST_OUTLINES);
+  if (found && found.size) {
+    const side = Math.sqrt((width * height) / found.size), ink = clamp((side - 7) / 25, 0, 0.5);
+    if (ink > 0) {
+      context.beginPath();
+      for (const site of found) sites.trace(context, site, map);
+      context.lineWidth = 1;
+      context.strokeStyle = "rgb(15 20 30 / " + ink + ")";
+      context.stroke();
+    }
+  }
+  if (state.violations) drawMarkers(context, view);
+}
+
+function drawMarkers(context, [x0, y0, x1, y1]) {
+  const { violations, map } = state, rule = Number($("rule").value);
+  context.beginPath();
+  let drawn = 0;
+  for (let i = 0; i < violations.n && drawn < MOST_OUTLINES; i++) {
+    const [a, b, c, d] = violations.boxes.subarray(4 * i, 4 * i + 4);
+    if ((rule >= 0 && violations.rule[i] !== rule) || a > x1 || c < x0 || b > y1 || d < y0) continue;
+    drawn++;
+    if ((c - a) * map.scale < 3 && (d - b) * map.scale < 3) {
+      const x = map.toX(0.5 * (a + c)), y = map.toY(0.5 * (b + d));
+      context.moveTo(x + 2.5, y);
+      context.arc(x, y, 2.5, 0, 7);
+    } else violations.trace(context, i, map);
+  }
+  context.lineWidth = 4;
+  context.strokeStyle = "rgb(255 255 255 / 70%)";
+  context.stroke();
+  context.lineWidth = 2;
+  context.strokeStyle = "#d3261b";
+  context.stroke();
+}
+
+function outline(context, trace, widths, inks) {
+  context.beginPath();
+  trace();
+  context.lineJoin = "round";
+  widths.forEach((width, i) => {
+    context.lineWidth = width;
+    context.strokeStyle = inks[i];
+    context.stroke();
+  });
+}
+
+function drawMarks() {
+  const { map, sites, violations, cursor } = state, { context, width, height } = state.marks;
+  context.clearRect(0, 0, width, height);
+  const ring = (site, inks) => {
+    const [a, b, c, d] = sites.box.subarray(4 * site, 4 * site + 4);
+    outline(context, () => sites.trace(context, site, map), [5, 2.5], inks);
+    // A site of a few pixels could be missed: a circle around it.
+    if ((c - a) * map.scale < 10 && (d - b) * map.scale < 10) {
+      outline(context, () => context.arc(map.toX(0.5 * (a + c)), map.toY(0.5 * (b + d)), 9, 0, 7), [4, 2], inks);
+    }
+  };
+  if (state.chosen !== null) {
+    outline(context, () => violations.trace(context, state.chosen, map), [8, 4], ["#ffffff", "#d3261b"]);
+    const [a, b, c, d] = violations.boxes.subarray(4 * state.chosen, 4 * state.chosen + 4);
+    const radius = Math.max(16, 0.75 * map.scale * Math.hypot(c - a, d - b));
+    outline(context, () => context.arc(map.toX(0.5 * (a + c)), map.toY(0.5 * (b + d)), radius, 0, 7), [4, 2], ["#ffffff", "#d3261b"]);
+  }
+  if (state.pinned >= 0) ring(state.pinned, ["#ffffff", "#1f5fbf"]);
+  if (state.hovered >= 0 && state.hovered !== state.pinned) ring(state.hovered, ["#ffffff", "#10151f"]);
+  if (cursor && cursor.from !== "mouse") {
+    const x = map.toX(cursor.x), y = map.toY(cursor.y);
+    const cross = () => { for (const [u, v] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) { context.moveTo(x + 4 * u, y + 4 * v); context.lineTo(x + 13 * u, y + 13 * v); } };
+    outline(context, cross, [4, 2], ["#ffffff", "#10151f"]);
+  }
+  drawPictureMarks();
+}
+
+function drawScaleBar() {
+  const { map } = state, length = roundStep(90 / map.scale / 2), bar = $("scale-bar");
+  bar.querySelector("span").textContent = length >= 1000 ? length / 1000 + " mm" : length >= 0.1 ? Number(length.toPrecision(3)) + " µm" : Number((1000 * length).toPrecision(3)) + " nm";
+  bar.querySelector("i").style.width = length * map.scale + "px";
+  state.scaleBar = { length, width: length * map.scale };
+}
+
+// -- the picture -----------------------------------------------------------------------------------------------------------------
+
+// Where the picture lies in its frame, in CSS pixels, whatever space is left beside it.
+function pictureBox() {
+  const frame = $("picture-frame"), { width, height, bounds_um: bounds } = about.picture;
+  const scale = Math.min(frame.clientWidth / width, frame.clientHeight / height);
+  const left = 0.5 * (frame.clientWidth - scale * width), top = 0.5 * (frame.clientHeight - scale * height);
+  const perUm = (scale * width) / (bounds[2] - bounds[0]);
+  return {
+    toX: (x) => left + (x - bounds[0]) * perUm, toY: (y) => top + scale * height - (y - bounds[1]) * perUm,
+    fromX: (px) => bounds[0] + (px - left) / perUm, fromY: (py) => bounds[1] + (top + scale * height - py) / perUm,
+  };
+}
+
+function drawPictureMarks() {
+  const { context, width, height } = fitted($("picture-marks")), box = pictureBox(), { map, cursor } = state;
+  context.clearRect(0, 0, width, height);
+  const x0 = box.toX(map.fromX(0)), y0 = box.toY(map.fromY(0)), x1 = box.toX(map.fromX(map.width)), y1 = box.toY(map.fromY(map.height));
+  if (x0 > 1 || y0 > 1 || x1 < width - 1 || y1 < height - 1) {
+    const w = Math.max(5, x1 - x0), h = Math.max(5, y1 - y0), x = 0.5 * (x0 + x1 - w), y = 0.5 * (y0 + y1 - h);
+    outline(context, () => context.rect(x, y, w, h), [3.5, 1.75], ["rgb(0 0 0 / 55%)", "#ffffff"]);
+  }
+  if (cursor) {
+    const x = box.toX(cursor.x), y = box.toY(cursor.y);
+    const cross = () => { for (const [u, v] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) { context.moveTo(x + 3 * u, y + 3 * v); context.lineTo(x + 9 * u, y + 9 * v); } };
+    outline(context, cross, [3.5, 1.5], ["rgb(0 0 0 / 65%)", "#ffffff"]);
+  }
+}
+
+function listenToPicture() {
+  const frame = $("picture-frame");
+  const place = (event) => {
+    const area = frame.getBoundingClientRect(), box = pictureBox();
+    return [box.fromX(event.clientX - area.left), box.fromY(event.clientY - area.top)];
+  };
+  const isIn = ([x, y]) => { const [a, b, c, d] = about.picture.bounds_um; return x >= a && x <= c && y >= b && y <= d; };
+  frame.addEventListener("pointermove", (event) => { const at = place(event); isIn(at) ? hover(...at, "picture") : leave(); });
+  frame.addEventListener("pointerleave", leave);
+  frame.addEventListener("click", (event) => {
+    const at = place(event);
+    if (!isIn(at)) return;
+    fly(...at, Math.max(state.map.scale, 4 * state.map.fitScale()));
+  });
+  $("enlarge").addEventListener("click", () => {
+    const main = document.querySelector("main"), isBeside = main.classList.toggle("beside");
+    if (isBeside) main.insertBefore(frame, document.querySelector("aside"));
+    else $("picture-heading").closest("section").append(frame);
+    $("enlarge").setAttribute("aria-pressed", isBeside);
+    resize();
+  });
+}
+
+// -- the photosite ------------------------------------------------------------------------------------------------------------------
+
+function hover(x, y, from) {
+  const all = state.sites.pickAll(x, y);
+  state.cursor = { x, y, from };
+  state.hovered = all.length ? all[all.length - 1] : -1;
+  state.others = all.slice(0, -1);
+  $("cursor").textContent = "x " + lengthText(x) + "  y " + lengthText(y) + " µm";
+  tellSite();
+  ask("marks");
+}
+
+function leave() {
+  state.cursor = null;
+  state.hovered = -1;
+  state.others = [];
+  $("cursor").textContent = "";
+  tellSite();
+  ask("marks");
+}
+
+// As many digits as the view can tell apart.
+function lengthText(value) {
+  return value.toFixed(clamp(Math.ceil(Math.log10(state.map.scale)) + 1, 0, 6));
+}
+
+let toldSite = null, speaking = 0;
+
+function tellSite() {
+  const site = state.hovered >= 0 ? state.hovered : state.pinned;
+  const key = site + "/" + state.pinned + "/" + state.others + "/" + state.loaded;
+  if (key === toldSite) return;
+  toldSite = key;
+  $("site").classList.toggle("empty", site < 0);
+  $("unpin").hidden = state.pinned < 0;
+  $("site-heading").textContent = site < 0 ? "Photosite" : "Photosite " + site.toLocaleString("en-US") + (site === state.pinned ? " (pinned)" : "");
+  const rows = [];
+  for (const column of about.columns) {
+    if (column.is_repeat) continue;
+    rows.push([column.label, site < 0 ? "–" : textOf(column, site), column === state.column || (column.array && column.array === state.column.array)]);
+  }
+  const centre = site < 0 ? null : state.sites.centre(site);
+  rows.push(["centre", centre ? shown(Number(centre[0].toPrecision(7))) + ", " + shown(Number(centre[1].toPrecision(7))) + " µm" : "–"]);
+  if (site >= 0 && site === state.hovered && state.others.length) rows.push(["overlaps", state.others.join(", ")]);
+  const cells = [];
+  for (const [label, text, isShown] of rows) {
+    const value = make("dd", text);
+    if (isShown && site >= 0) {
+      const swatch = make("span", undefined, "swatch");
+      swatch.style.background = "rgb(" + state.scale.colour(site) + ")";
+      value.prepend(swatch);
+    }
+    cells.push(make("dt", label), value);
+  }
+  $("values").replaceChildren(...cells);
+  drawHistogram();
+  clearTimeout(speaking);
+  if (site >= 0) speaking = setTimeout(() => { $("live").textContent = sentence(site); }, 300);
+}
+
+function sentence(site) {
+  const parts = about.columns.filter((column) => !column.is_repeat).map((column) => column.label + " " + textOf(column, site));
+  return "Photosite " + site + ": " + parts.join(", ");
+}
+
+function pin(site) {
+  state.pinned = site === state.pinned ? -1 : site;
+  tellSite();
+  drawHistogram();
+  rememberView();
+  ask("marks");
+}
+
+function goTo(site) {
+  const { sites, map } = state, [a, b, c, d] = sites.box.subarray(4 * site, 4 * site + 4);
+  state.pinned = site;
+  const wanted = 0.12 * Math.min(map.width, map.height) / Math.max(c - a, d - b);
+  fly(0.5 * (a + c), 0.5 * (b + d), wanted);
+  tellSite();
+}
+
+// -- moving -----------------------------------------------------------------------------------------------------------------------------
+
+let flight = 0;
+
+function fly(x, y, scale) {
+  const { map } = state, from = { x: map.x, y: map.y, scale: map.scale };
+  map.set(x, y, scale);
+  const to = { x: map.x, y: map.y, scale: map.scale };
+  cancelAnimationFrame(flight);
+  if (reducesMotion.matches) { moved(); return; }
+  map.set(from.x, from.y, from.scale);
+  const start = performance.now(), ratio = to.scale / from.scale;
+  const step = () => {
+    const t = clamp((performance.now() - start) / 450, 0, 1), eased = t * t * (3 - 2 * t);
+    // The way goes as the width of the view does, so that it looks as if one fell towards the place.
+    const way = Math.abs(ratio - 1) < 1e-3 ? eased : (1 - ratio ** -eased) / (1 - 1 / ratio);
+    map.set(from.x + way * (to.x - from.x), from.y + way * (to.y - from.y), from.scale * ratio ** eased);
+    if (t < 1) { ask("map"); flight = requestAnimationFrame(step); } else { map.set(to.x, to.y, to.scale); moved(); }
+  };
+  step();
+}
+
+function moved() {
+  ask("map");
+  rememberView();
+}
+
+function fit() {
+  const { map } = state;
+  fly(map.middle[0], map.middle[1], map.fitScale());
+}
+
+function resize() {
+  const frame = $("map"), { map } = state, isWhole = Math.abs(map.scale / map.fitScale() - 1) < 1e-6;
+  map.resize(frame.clientWidth, frame.clientHeight);
+  state.lines = fitted($("lines"));
+  state.marks = fitted($("marks"));
+  if (isWhole) map.set(map.middle[0], map.middle[1], map.fitScale());
+  else map.set(map.x, map.y, map.scale);
+  if (state.scale) drawLegend();
+  ask("map");
+}
+
+function listenToMap() {
+  const canvas = $("marks"), pointers = new Map(), { map } = state;
+  let travelled = 0, pinch = 0;
+  const at = (event) => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    cancelAnimationFrame(flight);
+    const lines = event.deltaMode === 1 ? 16 : event.deltaMode === 2 ? 400 : 1;
+    const [px, py] = at(event);
+    map.zoom(Math.exp(-clamp(event.deltaY * lines, -400, 400) * (event.ctrlKey ? 0.01 : 0.002)), px, py);
+    hover(map.fromX(px), map.fromY(py), "mouse");
+    moved();
+  }, { passive: false });
+  canvas.addEventListener("pointerdown", (event) => {
+    cancelAnimationFrame(flight);
+    canvas.setPointerCapture(event.pointerId);
+    pointers.set(event.pointerId, at(event));
+    travelled = 0;
+    pinch = distance();
+  });
+  const distance = () => {
+    const [a, b] = [...pointers.values()];
+    return b ? Math.hypot(a[0] - b[0], a[1] - b[1]) : 0;
+  };
+  canvas.addEventListener("pointermove", (event) => {
+    const [px, py] = at(event), before = pointers.get(event.pointerId);
+    if (before) {
+      const share = 1 / pointers.size, dx = (px - before[0]) * share, dy = (py - before[1]) * share;
+      travelled += Math.abs(dx) + Math.abs(dy);
+      pointers.set(event.pointerId, [px, py]);
+      if (travelled > 4) {
+        canvas.classList.add("held");
+        map.set(map.x - dx / map.scale, map.y + dy / map.scale, map.scale);
+        if (pointers.size === 2) {
+          const [a, b] = [...pointers.values()], apart = distance();
+          if (pinch > 0) map.zoom(apart / pinch, 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]));
+          pinch = apart;
+        }
+        moved();
+      }
+    }
+    hover(map.fromX(px), map.fromY(py), "mouse");
+  });
+  const release = (event) => {
+    pointers.delete(event.pointerId);
+    pinch = distance();
+    if (!pointers.size) canvas.classList.remove("held");
+  };
+  canvas.addEventListener("pointerup", (event) => {
+    if (pointers.has(event.pointerId) && pointers.size === 1 && travelled <= 4) pin(state.hovered);
+    release(event);
+  });
+  canvas.addEventListener("pointercancel", release);
+  canvas.addEventListener("pointerleave", () => { if (!pointers.size) leave(); });
+  canvas.addEventListener("blur", () => { if (state.cursor && state.cursor.from === "keys") leave(); });
+  canvas.addEventListener("keydown", (event) => {
+    const step = 60 / map.scale;
+    const moves = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (moves[event.key]) map.set(map.x + step * moves[event.key][0], map.y + step * moves[event.key][1], map.scale);
+    else if (event.key === "Enter" || event.key === " ") { hover(map.x, map.y, "keys"); pin(state.hovered); } else return;
+    event.preventDefault();
+    cancelAnimationFrame(flight);
+    hover(map.x, map.y, "keys");
+    moved();
+  });
+  document.addEventListener("keydown", (event) => {
+    if (event.target.closest("input, select, dialog") || event.ctrlKey || event.metaKey || event.altKey) return;
+    const nearer = (factor) => { map.zoom(factor, 0.5 * map.width, 0.5 * map.height); moved(); };
+    if (event.key === "+" || event.key === "=") nearer(1.4);
+    else if (event.key === "-" || event.key === "_") nearer(1 / 1.4);
+    else if (event.key === "0") fit();
+    else if (event.key === "/") { $("find-site").focus(); event.preventDefault(); }
+    else if (event.key === "Escape") { state.pinned = -1; choose(null); setRange(null); tellSite(); moved(); }
+    if (document.activeElement === canvas) hover(map.x, map.y, "keys");
+  });
+  $("nearer").addEventListener("click", () => fly(map.x, map.y, 2 * map.scale));
+  $("farther").addEventListener("click", () => fly(map.x, map.y, 0.5 * map.scale));
+  $("fit").addEventListener("click", fit);
+  $("unpin").addEventListener("click", () => { state.pinned = -1; tellSite(); moved(); });
+  new ResizeObserver(resize).observe($("map"));
+}
+
+// -- design rules -----------------------------------------------------------------------------------------------------------------------
+
+class Violations {
+  constructor(arrays) {
+    this.n = arrays.violation_value.length;
+    this.value = arrays.violation_value;
+    this.siteOffsets = offsetsOf(arrays.violation_site_counts);
+    this.sites = arrays.violation_sites;
+    this.partOffsets = offsetsOf(arrays.marker_part_counts);
+    this.pointOffsets = offsetsOf(arrays.marker_sizes);
+    this.xy = arrays.marker_xy_um;
+    this.rule = new Uint16Array(this.n);
+    let at = 0;
+    about.rules.forEach((rule, k) => { this.rule.fill(k, at, at + rule.listed); at += rule.listed; });
+    this.boxes = new Float64Array(4 * this.n);
+    for (let i = 0; i < this.n; i++) {
+      const from = this.pointOffsets[this.partOffsets[i]], to = this.pointOffsets[this.partOffsets[i + 1]];
+      const box = [Infinity, Infinity, -Infinity, -Infinity];
+      for (let p = from; p < to; p++) {
+        box[0] = Math.min(box[0], this.xy[2 * p]);
+        box[1] = Math.min(box[1], this.xy[2 * p + 1]);
+        box[2] = Math.max(box[2], this.xy[2 * p]);
+        box[3] = Math.max(box[3], this.xy[2 * p + 1]);
+      }
+      // A place without a marker is where its sites are.
+      if (from === to) for (const site of this.sitesOf(i)) box.splice(0, 4, ...state.sites.box.subarray(4 * site, 4 * site + 4));
+      this.boxes.set(box, 4 * i);
+    }
+  }
+
+  sitesOf(i) { return this.sites.subarray(this.siteOffsets[i], this.siteOffsets[i + 1]); }
+
+  trace(context, i, view) {
+    for (let part = this.partOffsets[i]; part < this.partOffsets[i + 1]; part++) {
+      const from = this.pointOffsets[part], to = this.pointOffsets[part + 1];
+      for (let p = from; p < to; p++) {
+        const x = view.toX(this.xy[2 * p]), y = view.toY(this.xy[2 * p + 1]);
+        if (to - from === 1) { context.moveTo(x + 4, y); context.arc(x, y, 4, 0, 7); }
+        else if (p === from) context.moveTo(x, y);
+        else context.lineTo(x, y);
+      }
+    }
+  }
+}
+
+async function loadRules() {
+  if (!about.rules.length) return;
+  const names = ["violation_value", "violation_sites", "violation_site_counts", "marker_part_counts", "marker_sizes", "marker_xy_um"];
+  const arrays = Object.fromEntries(await Promise.all(names.map(async (name) => [name, await array(name)])));
+  state.violations = new Violations(arrays);
+  $("rules").hidden = false;
+  const total = about.rules.reduce((sum, rule) => sum + rule.count, 0);
+  const option = (value, text) => { const element = make("option", text); element.value = value; return element; };
+  $("rule").append(option(-1, "all (" + shown(total) + ")"), ...about.rules.map((rule, k) => option(k, rule.name + " (" + shown(rule.count) + ")")));
+  $("rule").addEventListener("change", () => { state.shownViolations = 0; choose(null); listViolations(); ask("map"); });
+  $("more").addEventListener("click", listViolations);
+  $("violations").addEventListener("keydown", (event) => {
+    const step = { ArrowDown: 1, ArrowUp: -1 }[event.key], buttons = [...$("violations").querySelectorAll("button")];
+    const next = buttons[buttons.indexOf(document.activeElement) + step];
+    if (step && next) { next.focus(); event.preventDefault(); }
+  });
+  listViolations();
+}
+
+// The next violations of the chosen rule, behind those that are listed.
+function listViolations() {
+  const rule = Number($("rule").value), { violations } = state, asked = rule < 0 ? about.rules : [about.rules[rule]];
+  const of = [];
+  for (let i = 0; i < violations.n; i++) if (rule < 0 || violations.rule[i] === rule) of.push(i);
+  if (!state.shownViolations) $("violations").replaceChildren();
+  const next = of.slice(state.shownViolations, state.shownViolations + VIOLATIONS_AT_A_TIME);
+  $("violations").append(...next.map(violationItem));
+  state.shownViolations += next.length;
+  $("more").hidden = state.shownViolations >= of.length;
+  const count = asked.reduce((sum, r) => sum + r.count, 0), listed = asked.reduce((sum, r) => sum + r.listed, 0);
+  const rest = listed < count ? " The worst " + shown(listed) + " are listed." : "";
+  if (rule >= 0) {
+    const { sentence: text, limit, unit, waiver } = about.rules[rule];
+    const bound = limit === null ? "" : "; the limit is " + shown(limit) + (unit ? " " + unit : "");
+    $("sentence").textContent = text + bound + "." + (waiver ? " Waived: " + waiver + "." : "") + rest;
+  } else $("sentence").textContent = (count ? "" : "All rules are kept.") + rest;
+  if (!$("sentence").textContent) $("sentence").textContent = shown(about.rules.filter((r) => !r.count).length) + " of " + about.rules.length + " rules are kept.";
+}
+
+function violationItem(i) {
+  const { violations } = state, rule = about.rules[violations.rule[i]], ids = [...violations.sitesOf(i)];
+  const sites = ids.length ? (ids.length > 1 ? "sites " : "site ") + ids.slice(0, 4).join(", ") + (ids.length > 4 ? ", …" : "") : "place";
+  const value = Number.isNaN(violations.value[i]) ? "" : shown(violations.value[i]) + (rule.unit ? " " + rule.unit : "");
+  const item = make("li"), button = make("button");
+  button.type = "button";
+  button.dataset.violation = i;
+  button.append(make("span", Number($("rule").value) < 0 ? rule.name + ": " + sites : sites), make("span", value));
+  button.title = rule.name + ": " + sites;
+  button.addEventListener("click", () => flyToViolation(i));
+  item.append(button);
+  return item;
+}
+
+function choose(i) {
+  state.chosen = i;
+  for (const button of $("violations").querySelectorAll("button")) {
+    if (Number(button.dataset.violation) === i) button.setAttribute("aria-current", "true");
+    else button.removeAttribute("aria-current");
+  }
+}
+
+function flyToViolation(i) {
+  const { violations, map, sites } = state, box = [...violations.boxes.subarray(4 * i, 4 * i + 4)];
+  let width = Math.max(box[2] - box[0], box[3] - box[1]);
+  for (const site of violations.sitesOf(i)) {
+    if (site >= sites.n) continue;
+    const [a, b, c, d] = sites.box.subarray(4 * site, 4 * site + 4);
+    width = Math.max(width, Math.min(Math.max(c - a, d - b), 20 * width || Infinity));
+  }
+  choose(i);
+  if (!Number.isFinite(box[0])) { tell("The report tells no place"); return; }
+  fly(0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]), (0.3 * Math.min(map.width, map.height)) / (width || 1));
+}
+
+// -- links, pictures, light and dark ---------------------------------------------------------------------------------------------------------
+
+let remembering = 0;
+
+function rememberView() {
+  clearTimeout(remembering);
+  remembering = setTimeout(() => history.replaceState(null, "", viewHash()), 150);
+}
+
+function viewHash() {
+  const { map, column, range, pinned } = state, words = new URLSearchParams();
+  const digits = clamp(Math.ceil(Math.log10(map.scale)) + 2, 0, 12);
+  words.set("x", map.x.toFixed(digits));
+  words.set("y", map.y.toFixed(digits));
+  words.set("width", Number((map.width / map.scale).toPrecision(5)));
+  words.set("by", column.key);
+  if (range) words.set("range", range.map((v) => Number(v.toPrecision(7))).join(" "));
+  if (pinned >= 0) words.set("site", pinned);
+  return "#" + words;
+}
+
+// The view that a link asks for, as far as it makes sense.
+function readHash() {
+  const words = new URLSearchParams(location.hash.slice(1)), { map, sites } = state;
+  const [x, y, width] = ["x", "y", "width"].map((name) => (words.has(name) ? Number(words.get(name)) : NaN));
+  if (Number.isFinite(x) && Number.isFinite(y) && width > 0) map.set(x, y, map.width / width);
+  const site = words.has("site") ? Number(words.get("site")) : -1;
+  if (Number.isInteger(site) && site >= 0 && site < sites.n) state.pinned = site;
+  const range = (words.get("range") || "").split(" ").map(Number);
+  return [words.get("by"), range.length === 2 && range.every(Number.isFinite) ? range : null];
+}
+
+let telling = 0;
+
+function tell(text) {
+  $("told").textContent = text;
+  $("told").hidden = false;
+  clearTimeout(telling);
+  telling = setTimeout(() => { $("told").hidden = true; }, 2600);
+}
+
+async function copyLink() {
+  history.replaceState(null, "", viewHash());
+  try {
+    await navigator.clipboard.writeText(location.href);
+    tell("Link to this view copied");
+  } catch {
+    tell("The address above is the link to this view");
+  }
+}
+
+// The map as it is shown, with its scale bar and what its colours mean.
+function viewAsPicture() {
+  const { map, scale, column } = state, cells = $("cells"), ratio = cells.width / map.width;
+  const picture = document.createElement("canvas"), foot = 46;
+  picture.width = cells.width;
+  picture.height = cells.height + Math.round(foot * ratio);
+  const context = picture.getContext("2d");
+  context.fillStyle = inkOf("--raised");
+  context.fillRect(0, 0, picture.width, picture.height);
+  map.draw(groundColour());
+  context.drawImage(cells, 0, 0);
+  for (const id of ["lines", "marks"]) context.drawImage($(id), 0, 0, cells.width, cells.height);
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.translate(14, map.height);
+  context.fillStyle = context.strokeStyle = inkOf("--text");
+  context.font = "13px system-ui, sans-serif";
+  context.fillText($("scale-bar").querySelector("span").textContent, 0, 18);
+  context.fillRect(0, 26, state.scaleBar.width, 3);
+  context.translate(state.scaleBar.width + 40, 0);
+  context.fillText(titleOf(column), 0, 18);
+  if (column.kind !== "kinds") {
+    const width = 220;
+    scale.tables.forEach((shades, row) => {
+      for (let px = 0; px < width; px++) {
+        context.fillStyle = "rgb(" + shades[Math.round((255 * px) / (width - 1))] + ")";
+        context.fillRect(px, 26 + (row * 10) / scale.tables.length, 1.5, 10 / scale.tables.length);
+      }
+    });
+    context.fillStyle = inkOf("--text");
+    const ends = brief(scale.from) + " to " + brief(scale.to) + (scale.isLog ? ", log" : "");
+    context.fillText(ends, width + 10, 36);
+  }
+  return picture;
+}
+
+function savePicture() {
+  viewAsPicture().toBlob((blob) => {
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(blob);
+    link.download = about.name.replace(/[^\p{L}\p{N}_-]+/gu, "_").slice(0, 60) + ".png";
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 5000);
+  });
+}
+
+function setTheme(theme) {
+  document.documentElement.dataset.theme = theme;
+}
+
+function listenToTools() {
+  $("link").addEventListener("click", copyLink);
+  $("save").addEventListener("click", savePicture);
+  $("help").addEventListener("click", () => $("keys").showModal());
+  $("theme").addEventListener("click", () => {
+    const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
+    setTheme(theme);
+    try { localStorage.setItem("foveasim-theme", theme); } catch { /* kept for this page alone */ }
+    repaint();
+    drawLegend();
+  });
+  $("find").addEventListener("submit", (event) => {
+    event.preventDefault();
+    const text = $("find-site").value.replace(/[\s,_]/g, ""), site = text === "" ? NaN : Number(text);
+    const isThere = Number.isInteger(site) && site >= 0 && site < state.sites.n;
+    $("find-site").setAttribute("aria-invalid", !isThere);
+    if (isThere) goTo(site);
+    else tell("Sites have the numbers 0 to " + shown(state.sites.n - 1));
+  });
+  window.addEventListener("hashchange", async () => {
+    const [key, range] = readHash();
+    await colourBy(key || state.column.key, range);
+    tellSite();
+    moved();
+  });
+}
+
+// -- opening --------------------------------------------------------------------------------------------------------------------------------
+
+function startTheme() {
+  let theme = null;
+  try { theme = localStorage.getItem("foveasim-theme"); } catch { /* not kept */ }
+  const system = matchMedia("(prefers-color-scheme: dark)");
+  setTheme(theme === "dark" || theme === "light" ? theme : system.matches ? "dark" : "light");
+  system.addEventListener("change", () => { if (!theme) { setTheme(system.matches ? "dark" : "light"); if (state.scale) { repaint(); drawLegend(); } } });
+}
+
+// Without WebGL2 the picture stands in for the map.
+function showPlain(why) {
+  document.body.classList.add("plain");
+  $("opening").hidden = true;
+  $("map").append($("picture-frame"));
+  $("told").textContent = why;
+  $("told").hidden = false;
+}
+
+async function open() {
+  startTheme();
+  $("notes").textContent = about.notes.join(" · ");
+  const renderer = findRenderer();
+  if (!renderer) {
+    showPlain("This browser has no WebGL2, which the map needs; the picture shows what the page holds.");
+    return;
+  }
+  const names = ["xy_um", "place", "ring_sizes", "cut_sites", "cut_counts", "cuts", ...(about.arrays.site_rings ? ["site_rings"] : [])];
+  const arrays = Object.fromEntries(await Promise.all(names.map(async (name) => [name, await array(name)])));
+  state.sites = new Sites(arrays, about);
+  state.map = new SensorMap($("cells"), state.sites, renderer);
+  if (!state.map.gl) throw new Error("WebGL2 was lost");
+  $("cells").addEventListener("webglcontextlost", () => showPlain("The graphics card gave up; load the page again."));
+  $("colouring").append(...about.columns.map((column) => {
+    const option = make("option", titleOf(column));
+    option.value = column.key;
+    return option;
+  }));
+  $("colouring").addEventListener("change", () => colourBy($("colouring").value));
+  state.map.resize($("map").clientWidth, $("map").clientHeight);
+  state.lines = fitted($("lines"));
+  state.marks = fitted($("marks"));
+  state.map.set(state.map.middle[0], state.map.middle[1], state.map.fitScale());
+  const [key, range] = readHash();
+  await loadRules();
+  await colourBy(key || (about.kind === "layout" && !about.filter ? "size_um" : about.columns[0].key), range);
+  listenToMap();
+  listenToHistogram();
+  listenToPicture();
+  listenToTools();
+  tellSite();
+  drawAsked();
+  $("opening").hidden = true;
+}
+
+// All other columns, when the page can be used already.
+async function openRest() {
+  for (const column of about.columns) await valuesOf(column);
+  state.loaded = true;
+  tellSite();
+}
+
+const handle = {
+  nSites: about.n_sites,
+  ready: null,
+  complete: null,
+  readyMs: NaN,
+  pick: (x, y) => { const all = state.sites.pickAll(x, y); return all.length ? all[all.length - 1] : -1; },
+  pickAll: (x, y) => state.sites.pickAll(x, y),
+  values: (site) => Object.fromEntries(about.columns.map((c) => [c.key, c.names ? c.names[c.values[site]] : c.values[site]])),
+  colour: (site) => state.scale.colour(site),
+  centre: (site) => state.sites.centre(site),
+  get view() { const { x, y, scale, width, height } = state.map; return { x, y, scale, width, height }; },
+  get hovered() { return state.hovered; },
+  get pinned() { return state.pinned; },
+  get chosen() { return state.chosen; },
+  get range() { return state.range; },
+  get drawMs() { return state.drawMs; },
+  get column() { return state.column.key; },
+  // CSS pixels of the window, for a mouse.
+  toWindow: (x, y) => { const box = $("marks").getBoundingClientRect(); return [box.left + state.map.toX(x), box.top + state.map.toY(y)]; },
+  fromWindow: (px, py) => { const box = $("marks").getBoundingClientRect(); return [state.map.fromX(px - box.left), state.map.fromY(py - box.top)]; },
+  // Colours of the map's pixels as they are drawn, (r, g, b, a) at a place on the sensor.
+  pixel: (x, y) => {
+    const { map } = state, { gl } = map, ratio = map.canvas.width / map.width, bytes = new Uint8Array(4);
+    map.draw(groundColour());
+    gl.readPixels(Math.floor(map.toX(x) * ratio), map.canvas.height - 1 - Math.floor(map.toY(y) * ratio), 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    return [...bytes];
+  },
+  picture: () => viewAsPicture().toDataURL("image/png"),
+};
+window.foveasim = handle;
+handle.ready = open().then(() => { handle.readyMs = performance.now(); }).catch((error) => {
+  showPlain("The map cannot be shown (" + error.message + "); the picture shows what the page holds.");
+  throw error;
+});
+handle.complete = handle.ready.then(() => state.sites && openRest());
+handle.complete.catch(() => {});

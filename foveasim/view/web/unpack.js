@@ -1,0 +1,37 @@
+// Arrays out of the page: base64 of gzip of bytes sorted by significance.
+
+const TYPES = {
+  uint8: Uint8Array, int8: Int8Array, uint16: Uint16Array, int16: Int16Array,
+  uint32: Uint32Array, int32: Int32Array, float32: Float32Array, float64: Float64Array,
+};
+
+function bytesOfBase64(text) {
+  if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);
+  const binary = atob(text), bytes = new Uint8Array(binary.length);
+  for (let i = 0; i < bytes.length; i++) bytes[i] = binary.charCodeAt(i);
+  return bytes;
+}
+
+async function unpack(name, about) {
+  const element = document.getElementById("data-" + name);
+  const zipped = bytesOfBase64(element.textContent.trim());
+  element.remove();
+  const stream = new Blob([zipped]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const planes = new Uint8Array(await new Response(stream).arrayBuffer());
+  const Type = TYPES[about.type], n = about.size, width = Type.BYTES_PER_ELEMENT;
+  if (planes.length !== n * width) throw new Error("array " + name + " is cut short");
+  if (width === 1) return new Type(planes.buffer);
+  const bytes = new Uint8Array(n * width);
+  for (let plane = 0; plane < width; plane++) {
+    const from = plane * n;
+    for (let i = 0, to = plane; i < n; i++, to += width) bytes[to] = planes[from + i];
+  }
+  return new Type(bytes.buffer);
+}
+
+// Running sums with a 0 in front: counts to offsets.
+function offsetsOf(counts) {
+  const offsets = new Uint32Array(counts.length + 1);
+  for (let i = 0; i < counts.length; i++) offsets[i + 1] = offsets[i] + counts[i];
+  return offsets;
+}
