@@ -5,15 +5,21 @@ from __future__ import annotations
 from foveasim.view.id_map import SitePixels, id_map, site_at
 from foveasim.view.meshes import Mesh, polydata, prisms
 from foveasim.view.palette import SiteColours, colours_of, site_colours
-from foveasim.view.plots import plot_capture, plot_layout, plot_noise_budget, save_figure
+from foveasim.view.plots import plot_capture, plot_layout, plot_noise_budget, save_drawing, save_figure
 from foveasim.view.probe import find_renderer
+from foveasim.view.rule_plots import plot_report
+from foveasim.view.solids import PartReport, SensorStack, Solids, SolidsReport, solids, stack
 from foveasim.view.stills import Viewpoint, render, show, sites_in_view
 from foveasim.view.web import web_page, write_web_page
 
 __all__ = [
     "Mesh",
+    "PartReport",
+    "SensorStack",
     "SiteColours",
     "SitePixels",
+    "Solids",
+    "SolidsReport",
     "Viewpoint",
     "colours_of",
     "find_renderer",
@@ -21,14 +27,18 @@ __all__ = [
     "plot_capture",
     "plot_layout",
     "plot_noise_budget",
+    "plot_report",
     "polydata",
     "prisms",
     "render",
+    "save_drawing",
     "save_figure",
     "show",
     "site_at",
     "site_colours",
     "sites_in_view",
+    "solids",
+    "stack",
     "web_page",
     "write_web_page",
 ]

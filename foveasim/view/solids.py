@@ -1,0 +1,644 @@
+"""
+The sensor as solids: wells, the trenches between them, colour filters and microlenses, closed and with their thicknesses.
+
+::
+
+        ╭──────╮╭──────╮   lenses: caps over the sites
+        ├──────┤├──────┤   filters: prisms over the sites         z = filter_thickness_um
+        ├┬────┬┤├┬────┬┤                                           z = 0
+        ││    │││││    ││   trenches: each site less its well
+        ││    ││││    ││   wells: the site with its border moved inwards
+        └┴────┴┘└┴────┴┘                                           z = -well_depth_um
+
+Every part is made by numpy, site by site, so that a photosite keeps its number in it; manifold3d checks it and makes true cuts,
+trimesh writes it.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim.arrays import Floats, Ints, check_count, check_length_um, check_number
+from foveasim.capture import Capture
+from foveasim.errors import FileError, GeometryError, ParameterError
+from foveasim.files import written_whole
+from foveasim.layout import Layout, inset
+from foveasim.layout._regions import as_region
+from foveasim.rings import next_vertex, positions_in_runs
+from foveasim.view.meshes import FLAT_SHARE, Mesh, extruded, triangulated
+from foveasim.view.palette import colours_of
+
+__all__ = ["PartReport", "SensorStack", "Solids", "SolidsReport", "solids", "stack"]
+
+#: Kinds of files, by their endings.
+FORMATS = (".glb", ".stl", ".3mf", ".ply", ".obj")
+#: Colours of what has no filter's: silicon, oxide in the trenches, the glass of lenses.
+SILICON, OXIDE, GLASS = (116, 132, 160), (58, 64, 78), (208, 228, 240)
+#: How much of a lens's colour is its filter's, which is seen through it.
+SEEN_THROUGH = 0.35
+#: What is uncovered of the sensor cut open: from this share of its width and up to this share of its height.
+QUARTER = (0.5, 0.5)
+TERRACES = (((0.36, 0.64), ("filters", "lenses")), ((0.2, 0.8), ("lenses",)))
+#: Overlaps below this share of the smaller part are rounding.
+ROUNDING = 1e-9
+#: Thicker than this is no layer on a sensor.
+MAX_THICKNESS_UM = 1000.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorStack:
+    """
+    Thicknesses of what a sensor is made of.
+
+    Parameters
+    ----------
+    well_depth_um : float, µm
+        Depth of the silicon that collects charge, and of the trenches.
+    trench_width_um : float, µm
+        Between two neighbours' wells; each site gives half of it. 0 for none.
+    filter_thickness_um : float, µm
+        0 for no filters.
+    lens_height_um : float, µm
+        Of a lens's middle over its border; over a site too small for it, that of a half ball of the site's area. 0 for none.
+    n_lens_steps : int
+        Steps by which a lens rises.
+    n_lens_corners : int
+        A lens's outline has at least so many corners, and grows rounder toward its middle; 0 for those of the site alone, from
+        border to middle.
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range.
+    """
+
+    well_depth_um: float = 3.0
+    trench_width_um: float = 0.2
+    filter_thickness_um: float = 0.6
+    lens_height_um: float = 0.7
+    n_lens_steps: int = 6
+    n_lens_corners: int = 0
+
+    def __post_init__(self) -> None:
+        check_length_um("well_depth_um", self.well_depth_um, at_most=MAX_THICKNESS_UM)
+        for name in ("trench_width_um", "filter_thickness_um", "lens_height_um"):
+            check_number(name, getattr(self, name), at_least=0.0, at_most=MAX_THICKNESS_UM)
+            if getattr(self, name) > 0.0:
+                check_length_um(name, getattr(self, name))
+        check_count("n_lens_steps", self.n_lens_steps, at_most=64)
+        check_count("n_lens_corners", self.n_lens_corners, at_least=0, at_most=256)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartReport:
+    """
+    What manifold3d says of one part.
+
+    Attributes
+    ----------
+    name : str
+    status : str
+        ``"NoError"`` when the surface is closed and oriented everywhere.
+    n_triangles : int
+    volume_um3 : float, µm³
+    euler_characteristic : int
+        2 for each ball-like piece, 0 for each ring.
+    """
+
+    name: str
+    status: str
+    n_triangles: int
+    volume_um3: float
+    euler_characteristic: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolidsReport:
+    """
+    What manifold3d says of solids.
+
+    Attributes
+    ----------
+    parts : tuple of PartReport
+    overlap_um3 : mapping of (name, name) to float, µm³
+        Volume that two parts share.
+    """
+
+    parts: tuple[PartReport, ...]
+    overlap_um3: Mapping[tuple[str, str], float]
+
+    @property
+    def ok(self) -> bool:
+        """Whether every part is closed and no two share volume."""
+        volumes_um3 = {part.name: part.volume_um3 for part in self.parts}
+        return all(part.status == "NoError" for part in self.parts) and all(
+            shared_um3 <= ROUNDING * min(volumes_um3[a], volumes_um3[b])
+            for (a, b), shared_um3 in self.overlap_um3.items()
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Solids:
+    """
+    The parts of a sensor as closed surfaces; made by :func:`solids`.
+
+    Attributes
+    ----------
+    layout : Layout
+    sensor_stack : SensorStack
+    parts : mapping of str to Mesh
+        ``"wells"``, ``"trenches"``, ``"filters"``, ``"lenses"``: those that the stack has. The surfaces of every photosite are
+        closed by themselves; neighbours touch.
+    """
+
+    layout: Layout
+    sensor_stack: SensorStack
+    parts: Mapping[str, Mesh]
+
+    def __repr__(self) -> str:
+        return f"Solids({', '.join(f'{mesh.triangles.shape[0]:,} triangles of {name}' for name, mesh in self.parts.items())})"
+
+    @property
+    def meshes(self) -> tuple[Mesh, ...]:
+        """The parts, from the bottom up."""
+        return tuple(self.parts.values())
+
+    def volumes_um3(self, part: str) -> Floats:
+        """
+        Volume of a part at every photosite, (n_site,) µm³.
+
+        Raises
+        ------
+        ParameterError
+            When there is no such part.
+        """
+        mesh = self._part(part)
+        site = mesh.photosite[mesh.triangles[:, 0]]
+        # From the middle of each site, so that small sites far from the origin keep their digits.
+        anchor = np.column_stack((self.layout.centroid_um, np.zeros(self.layout.n_sites)))[site]
+        a, b, c = (mesh.points_um[mesh.triangles[:, k]] - anchor for k in range(3))
+        six_um3 = np.einsum("ij,ij->i", a, np.cross(b, c))
+        return np.bincount(site, weights=six_um3 / 6.0, minlength=self.layout.n_sites).astype(np.float64)
+
+    @property
+    def fill_factor(self) -> float:
+        """
+        Volume of the wells as a share of the silicon under the layout's convex hull.
+
+        Without trenches this is the layout's own, as in :func:`foveasim.layout.describe`; with them, that of
+        ``inset(layout, trench_width_um / 2)`` on the same hull.
+        """
+        hull_um2 = float(shapely.MultiPoint(self.layout.xy_um).convex_hull.area)
+        return float(self.volumes_um3("wells").sum()) / (hull_um2 * self.sensor_stack.well_depth_um)
+
+    def check(self) -> SolidsReport:
+        """
+        Whether every part is closed, and how much volume any two of them share.
+
+        Raises
+        ------
+        ParameterError
+            When manifold3d is not installed.
+
+        Notes
+        -----
+        Neighbouring sites of one part are not held against each other: the rule ``max_overlap_um2`` does this on the layout.
+        """
+        made = {name: _manifold(mesh.points_um, mesh.triangles) for name, mesh in self.parts.items()}
+        return SolidsReport(
+            parts=tuple(
+                PartReport(
+                    name=name,
+                    status=one.status().name,
+                    n_triangles=one.num_tri(),
+                    volume_um3=one.volume(),
+                    euler_characteristic=2 - 2 * one.genus(),
+                )
+                for name, one in made.items()
+            ),
+            overlap_um3={
+                (a, b): (made[a] ^ made[b]).volume() if _share_height(self.parts[a], self.parts[b]) else 0.0
+                for a, b in combinations(made, 2)
+            },
+        )
+
+    def cut(self, region: Any = None, *, of: Sequence[str] | None = None, whole: bool = False) -> Solids:
+        """
+        The solids without what stands over a region.
+
+        Parameters
+        ----------
+        region : shapely polygon or (n, 2) vertices, µm
+            By default the quarter of the layout with the largest x and the smallest y, which faces the viewer of
+            :class:`foveasim.view.Viewpoint`'s defaults.
+        of : sequence of str, optional
+            Parts that are cut; all by default.
+        whole : bool
+            Whether sites go or stay as wholes, by their centres of area.
+
+        Returns
+        -------
+        Solids
+            Closed again: sites on the border are cut by manifold3d, others stay as they are or go.
+
+        Raises
+        ------
+        ParameterError
+            When the region is none, a part is unknown, or manifold3d is not installed.
+        """
+        region = _near_quarter(self.layout, QUARTER) if region is None else as_region("region", region)
+        names = tuple(self.parts) if of is None else tuple(of)
+        for name in names:
+            self._part(name)
+        shapely.prepare(region)
+        if whole:
+            is_gone = shapely.contains_xy(region, self.layout.centroid_um)
+            is_crossed = np.zeros_like(is_gone)
+        else:
+            polygons = self.layout.polygons()
+            is_gone = shapely.covers(region, polygons)
+            is_crossed = ~is_gone & shapely.intersects(region, polygons)
+        parts = dict(self.parts)
+        for name in names:
+            if parts[name].triangles.size:
+                parts[name] = _without(parts[name], is_gone, is_crossed, region)
+        return replace(self, parts=MappingProxyType(parts))
+
+    def write(self, path: str | Path) -> None:
+        """
+        Write the solids to a file, whole or not at all.
+
+        Parameters
+        ----------
+        path : path
+            ``.glb`` keeps the parts apart, with their colours and the attributes ``_photosite`` and ``_value`` of every point;
+            ``.3mf`` the parts apart; ``.ply`` and ``.obj`` colours; ``.stl`` the bare triangles. One unit is 1 µm, z is toward
+            the lens.
+
+        Raises
+        ------
+        FileError
+            When the ending is another, or nothing can be written there.
+        ParameterError
+            When trimesh is not installed.
+        """
+        target = Path(path)
+        kind = target.suffix.lower()
+        if kind not in FORMATS:
+            raise FileError(target, f"must end in {', '.join(FORMATS)}")
+        trimesh = _imported("trimesh")
+        bodies = {name: _body(trimesh, mesh) for name, mesh in self.parts.items() if mesh.triangles.size}
+        if not bodies:
+            raise GeometryError("there is nothing left of the solids to write")
+        whole = trimesh.Scene(bodies) if kind in (".glb", ".3mf") else trimesh.util.concatenate(list(bodies.values()))
+        with written_whole(target) as temporary, temporary.open("wb") as file:
+            content = whole.export(file_type=kind[1:])
+            file.write(content.encode() if isinstance(content, str) else content)
+
+    def _part(self, name: str) -> Mesh:
+        if name not in self.parts:
+            raise ParameterError("part", f"must be one of {', '.join(map(repr, self.parts))}", name)
+        return self.parts[name]
+
+
+def solids(
+    data: Layout | Capture, sensor_stack: SensorStack | None = None, *, by: str | ArrayLike | None = None
+) -> Solids:
+    """
+    The sensor's parts as closed surfaces with their thicknesses.
+
+    Parameters
+    ----------
+    data : Layout or Capture
+    sensor_stack : SensorStack, optional
+    by : str or array, optional
+        What the wells' colours and the points' values show, as in :func:`foveasim.view.colours_of`; by default the code of a
+        capture, and bare silicon of a layout. Filters have the colours of their channels.
+
+    Returns
+    -------
+    Solids
+
+    Raises
+    ------
+    GeometryError
+        When a site is too narrow for its trench, or cannot carry a lens: it has a hole, or is not seen whole from any place in
+        it; ``.site_ids`` names them.
+    ParameterError
+        When ``by`` is no column.
+
+    Examples
+    --------
+    >>> from foveasim.layout import grid
+    >>> made = solids(grid(n_x=2, n_y=2, pitch_um=4.0), SensorStack(well_depth_um=3.0, trench_width_um=0.4))
+    >>> round(made.fill_factor, 9)  # (3.6 / 4)²
+    0.81
+    """
+    sensor_stack = sensor_stack or SensorStack()
+    layout = data.layout if isinstance(data, Capture) else data
+    if layout.n_sites == 0:
+        raise GeometryError("the layout has no sites, and so no solids")
+    bare = np.zeros(layout.n_sites)
+    in_silicon = _Colouring(_tinted(layout, SILICON), bare)
+    if by is not None or isinstance(data, Capture):
+        shown = colours_of(data, by)
+        is_number = shown.values is not None and shown.values.dtype.kind in "biuf"
+        in_silicon = _Colouring(shown.rgb, np.asarray(shown.values, np.float64) if is_number else bare)
+    in_oxide = _Colouring(_tinted(layout, OXIDE), in_silicon.values)
+    in_filters = _Colouring(colours_of(data, "channel").rgb, in_silicon.values)
+    in_glass = _Colouring(_mixed(in_filters.rgb, GLASS), in_silicon.values)
+    depth_um, up_um = sensor_stack.well_depth_um, sensor_stack.filter_thickness_um
+    has_trench = sensor_stack.trench_width_um > 0.0
+    footprint = inset(layout, 0.5 * sensor_stack.trench_width_um) if has_trench else layout
+    parts = {"wells": _prisms("wells", footprint, (-depth_um, 0.0), in_silicon)}
+    if has_trench:
+        walls, owner = _walls(layout, footprint)
+        parts["trenches"] = _prisms("trenches", walls, (-depth_um, 0.0), in_oxide, owner)
+    if up_um > 0.0:
+        parts["filters"] = _prisms("filters", layout, (0.0, up_um), in_filters)
+    if sensor_stack.lens_height_um > 0.0:
+        parts["lenses"] = _lenses(layout, up_um, sensor_stack, in_glass)
+    return Solids(layout=layout, sensor_stack=sensor_stack, parts=MappingProxyType(parts))
+
+
+def stack(
+    data: Layout | Capture, sensor_stack: SensorStack | None = None, *, by: str | ArrayLike | None = None
+) -> Solids:
+    """
+    The sensor cut open: the near quarter taken away down to the floor, filters and lenses uncovered in terraces around it.
+
+    Parameters
+    ----------
+    data, sensor_stack, by
+        As for :func:`solids`.
+
+    Returns
+    -------
+    Solids
+        For :func:`foveasim.view.render`.
+
+    Raises
+    ------
+    GeometryError, ParameterError
+        As for :func:`solids`.
+    """
+    made = solids(data, sensor_stack, by=by)
+    for shares, names in TERRACES:
+        made = made.cut(
+            _near_quarter(made.layout, shares), of=[name for name in names if name in made.parts], whole=True
+        )
+    return made.cut(_near_quarter(made.layout, QUARTER))
+
+
+# -- parts ---------------------------------------------------------------------------------------------------------------
+
+
+def _near_quarter(layout: Layout, shares: tuple[float, float]) -> Any:
+    """Rectangle over the corner of largest x and smallest y, its inner sides through the middles of sites."""
+    x_min, y_min, x_max, y_max = layout.bounds_um
+    width, height = x_max - x_min, y_max - y_min
+    x, y = layout.centroid_um.T
+    low_x = x[np.abs(x - (x_min + shares[0] * width)).argmin()]
+    high_y = y[np.abs(y - (y_min + shares[1] * height)).argmin()]
+    return shapely.box(low_x, y_min - 0.1 * height, x_max + 0.1 * width, high_y)
+
+
+class _Colouring(NamedTuple):
+    """Colour (n_site, 3) and value (n_site,) of every photosite."""
+
+    rgb: NDArray[np.uint8]
+    values: Floats
+
+
+def _tinted(layout: Layout, colour: tuple[int, int, int]) -> NDArray[np.uint8]:
+    return np.tile(np.array(colour, np.uint8), (layout.n_sites, 1))
+
+
+def _mixed(rgb: NDArray[np.uint8], glass: tuple[int, int, int]) -> NDArray[np.uint8]:
+    return np.rint((1.0 - SEEN_THROUGH) * np.array(glass) + SEEN_THROUGH * rgb).astype(np.uint8)
+
+
+def _walls(layout: Layout, wells: Layout) -> tuple[Layout, Ints]:
+    """What is left of each site around its well, and the site of each piece."""
+    pieces, owner = shapely.get_parts(shapely.difference(layout.polygons(), wells.polygons()), return_index=True)
+    return Layout.from_polygons(pieces), owner
+
+
+def _prisms(
+    name: str, footprint: Layout, z_um: tuple[float, float], look: _Colouring, owner: Ints | None = None
+) -> Mesh:
+    """Prisms between two heights, one for each polygon of a layout; ``owner`` is the photosite of each."""
+    points_um, triangles, position = extruded(footprint, triangulated(footprint), *z_um)
+    return _coloured(name, points_um, triangles, position if owner is None else owner.astype(np.int32)[position], look)
+
+
+def _coloured(
+    name: str, points_um: Floats, triangles: NDArray[np.int32], photosite: NDArray[np.int32], look: _Colouring
+) -> Mesh:
+    return Mesh(
+        name=name,
+        points_um=points_um,
+        triangles=triangles,
+        photosite=photosite,
+        values=look.values[photosite],
+        colours=look.rgb[photosite],
+    )
+
+
+def _lenses(layout: Layout, floor_um: float, sensor_stack: SensorStack, look: _Colouring) -> Mesh:
+    """Caps of balls, drawn out to the sites' outlines: the outline shrinks toward a middle as it rises."""
+    if sensor_stack.n_lens_corners:
+        layout = _with_corners(layout, sensor_stack.n_lens_corners)
+    caps = triangulated(layout)
+    n, n_sites, n_steps = layout.xy_um.shape[0], layout.n_sites, sensor_stack.n_lens_steps
+    site = np.repeat(np.arange(n_sites), np.diff(layout.ring_offsets[layout.site_offsets]))
+    middle_um = _middles(layout, site)
+    arm_um = layout.xy_um - middle_um[site]
+    # Steps of equal angle from the border (1) to the middle (0), where a last fan closes the cap.
+    share = np.cos(0.5 * np.pi * np.arange(n_steps) / n_steps)[:, np.newaxis]
+    drawn_in = np.broadcast_to(share, (n_steps, n))
+    if sensor_stack.n_lens_corners:
+        # Toward the largest circle around the middle, which lies inside: no step is wider than the one below.
+        round_share = _free_radius_um(layout, arm_um)[site] / np.hypot(*arm_um.T)
+        drawn_in = share * (share**2 + (1.0 - share**2) * round_share)
+    radius_um = np.sqrt(layout.area_um2 / np.pi)
+    points_um = np.empty((n_steps * n + n_sites, 3))
+    steps = points_um[: n_steps * n].reshape(n_steps, n, 3)
+    steps[..., :2] = middle_um[site] + drawn_in[..., np.newaxis] * arm_um
+    steps[..., 2] = floor_um + _cap_height_um(radius_um, sensor_stack.lens_height_um, share)[:, site]
+    points_um[:n, :2] = layout.xy_um  # the very numbers of the filter below
+    points_um[n_steps * n :, :2] = middle_um
+    points_um[n_steps * n :, 2] = floor_um + np.minimum(radius_um, sensor_stack.lens_height_um)
+    here, after = caps.weld, caps.weld[next_vertex(layout.ring_offsets)]
+    low = n * np.arange(n_steps - 1)[:, np.newaxis]
+    sides = (
+        np.stack((here + low, after + low, after + low + n), axis=-1),
+        np.stack((here + low, after + low + n, here + low + n), axis=-1),
+    )
+    top = n * (n_steps - 1)
+    fan = np.stack((here + top, after + top, n_steps * n + site), axis=1)
+    triangles = np.concatenate((caps.triangles[:, ::-1], *(part.reshape(-1, 3) for part in sides), fan))
+    photosite = np.concatenate((np.tile(site, n_steps), np.arange(n_sites)))
+    return _coloured("lenses", points_um, triangles.astype(np.int32), photosite.astype(np.int32), look)
+
+
+def _with_corners(layout: Layout, n_corners: int) -> Layout:
+    """The same sites, long edges divided so that every ring has at least so many vertices."""
+    edge_um = layout.xy_um[next_vertex(layout.ring_offsets)] - layout.xy_um
+    length_um = np.hypot(*edge_um.T)
+    starts = layout.ring_offsets[:-1]
+    around_um = np.repeat(np.add.reduceat(length_um, starts), np.diff(layout.ring_offsets))
+    pieces = np.ceil(n_corners * length_um / around_um).astype(np.int64)
+    step = positions_in_runs(pieces) / np.repeat(pieces, pieces)
+    xy_um = np.repeat(layout.xy_um, pieces, axis=0) + step[:, np.newaxis] * np.repeat(edge_um, pieces, axis=0)
+    offsets = np.concatenate(([0], np.cumsum(pieces)))[layout.ring_offsets]
+    return Layout(xy_um, offsets, layout.site_offsets, layout.columns)
+
+
+def _free_radius_um(layout: Layout, arm_um: Floats) -> Floats:
+    """Radius of the largest circle in every site around its middle, (n_site,); ``arm_um`` leads from there to the vertices."""
+    after = next_vertex(layout.ring_offsets)
+    edge_um = arm_um[after] - arm_um
+    height_um = (arm_um[:, 0] * edge_um[:, 1] - arm_um[:, 1] * edge_um[:, 0]) / np.hypot(*edge_um.T)
+    return np.minimum.reduceat(height_um, layout.ring_offsets[layout.site_offsets[:-1]])
+
+
+def _cap_height_um(radius_um: Floats, height_um: float, share: Floats) -> Floats:
+    """Height over its border of a ball's cap, at a share of its radius from its middle; at most half a ball."""
+    sag_um = np.minimum(height_um, radius_um)
+    ball_um = (radius_um**2 + sag_um**2) / (2.0 * sag_um)
+    rise_um = np.sqrt(np.maximum(ball_um**2 - (radius_um * share) ** 2, 0.0)) - (ball_um - sag_um)
+    return np.where(share < 1.0, rise_um, 0.0)
+
+
+def _middles(layout: Layout, site: Ints) -> Floats:
+    """A place in every site that sees its whole outline, (n_site, 2) µm: the centre of area, or of the largest circle in it."""
+    has_hole = np.diff(layout.site_offsets) > 1
+    middle_um = layout.centroid_um.copy()
+    hidden = np.flatnonzero(~_sees_all(layout, middle_um, site) & ~has_hole)
+    if hidden.size:
+        circles = shapely.maximum_inscribed_circle(layout[hidden].polygons())
+        middle_um[hidden] = shapely.get_coordinates(circles).reshape(-1, 2, 2)[:, 0]
+    bad = np.flatnonzero(~_sees_all(layout, middle_um, site) | has_hole)
+    if bad.size:
+        more = f" (and {bad.size - 1} more)" if bad.size > 1 else ""
+        raise GeometryError(
+            f"site {bad[0]} cannot carry a lens{more}: it has a hole, or is not seen whole from any middle; take "
+            "lens_height_um=0, or other sites",
+            tuple(int(i) for i in bad),
+        )
+    return middle_um
+
+
+def _sees_all(layout: Layout, middle_um: Floats, site: Ints) -> NDArray[np.bool_]:
+    """Whether every edge of a site runs counter-clockwise around its middle, (n_site,)."""
+    arm_um = layout.xy_um - middle_um[site]
+    after_um = arm_um[next_vertex(layout.ring_offsets)]
+    double_um2 = arm_um[:, 0] * after_um[:, 1] - arm_um[:, 1] * after_um[:, 0]
+    least_um2 = np.minimum.reduceat(double_um2, layout.ring_offsets[layout.site_offsets[:-1]])
+    return np.asarray(least_um2 > FLAT_SHARE * layout.area_um2)
+
+
+# -- manifold3d and trimesh -----------------------------------------------------------------------------------------------
+
+
+def _imported(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise ParameterError(name, "is missing; install it with: pip install 'foveasim[view]'") from None
+
+
+def _manifold(points_um: Floats, triangles: NDArray[np.integer[Any]]) -> Any:
+    """The surface as a Manifold; columns of ``points_um`` beyond the third are carried along."""
+    manifold3d = _imported("manifold3d")
+    return manifold3d.Manifold(manifold3d.Mesh64(np.ascontiguousarray(points_um), triangles.astype(np.uint64)))
+
+
+def _share_height(one: Mesh, other: Mesh) -> bool:
+    """Whether two parts are at the same height anywhere; if not, they share nothing, and no boolean is needed to know it."""
+    if not (one.triangles.size and other.triangles.size):
+        return False
+    (low, high), (other_low, other_high) = one.bounds_um, other.bounds_um
+    return bool(low[2] < other_high[2] and other_low[2] < high[2])
+
+
+def _without(mesh: Mesh, is_gone: NDArray[np.bool_], is_crossed: NDArray[np.bool_], region: Any) -> Mesh:
+    """A part without some sites, and with others cut by what stands over a region."""
+    site_of = mesh.photosite[mesh.triangles[:, 0]]
+    is_whole = ~is_gone[site_of] & ~is_crossed[site_of]
+    points_um, photosite, triangles = _compact(mesh.points_um, mesh.photosite, mesh.triangles[is_whole])
+    crossed = _compact(mesh.points_um, mesh.photosite, mesh.triangles[is_crossed[site_of]])
+    if crossed[2].size:
+        # The number of its site goes with every point; those that the cut makes have nought, and the site of their piece.
+        numbered = np.column_stack((crossed[0], crossed[1] + 1.0))
+        left = (_manifold(numbered, crossed[2]) - _over(region, mesh)).to_mesh64()
+        weld = np.arange(left.vert_properties.shape[0])
+        weld[left.merge_from_vert] = left.merge_to_vert
+        cut = weld[left.tri_verts.astype(np.int64)]
+        if cut.size:
+            number = np.rint(left.vert_properties[:, 3]).astype(np.int64)
+            np.maximum.at(number, weld, number.copy())
+            number = _of_pieces(cut, number) - 1
+            cut_um, cut_site, cut = _compact(left.vert_properties[:, :3], number.astype(np.int32), cut)
+            triangles = np.concatenate((triangles, cut + points_um.shape[0])).astype(np.int32)
+            points_um, photosite = np.concatenate((points_um, cut_um)), np.concatenate((photosite, cut_site))
+    look = _Colouring(np.zeros((is_gone.size, 3), np.uint8), np.zeros(is_gone.size))
+    look.rgb[mesh.photosite], look.values[mesh.photosite] = mesh.colours, mesh.values
+    return _coloured(mesh.name, points_um, triangles, photosite, look)
+
+
+def _over(region: Any, mesh: Mesh) -> Any:
+    """What stands over a region, from below a mesh to above it."""
+    outline = Layout.from_polygons(shapely.get_parts([region]))
+    low, high = mesh.bounds_um
+    margin_um = high[2] - low[2]
+    points_um, triangles, _ = extruded(outline, triangulated(outline), low[2] - margin_um, high[2] + margin_um)
+    return _manifold(points_um, triangles)
+
+
+def _of_pieces(triangles: Ints, number: Ints) -> Ints:
+    """The largest number among the points of each connected piece, for every point."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n = number.size
+    a, b, c = triangles.T
+    ones = np.ones(2 * a.size, np.int8)
+    n_pieces, piece = connected_components(coo_array((ones, (np.concatenate((a, b)), np.concatenate((b, c)))), (n, n)))
+    largest = np.zeros(n_pieces, np.int64)
+    np.maximum.at(largest, piece, number)
+    return np.asarray(largest[piece])
+
+
+def _compact(points_um: Floats, photosite: NDArray[np.int32], triangles: Any) -> tuple[Floats, Any, NDArray[np.int32]]:
+    """The points that triangles use, their sites, and the triangles renumbered."""
+    is_used = np.zeros(points_um.shape[0], bool)
+    is_used[triangles] = True
+    renumbered = np.cumsum(is_used) - 1
+    return points_um[is_used], photosite[is_used], renumbered[triangles].astype(np.int32)
+
+
+def _body(trimesh: Any, mesh: Mesh) -> Any:
+    """The part as trimesh knows it; glTF gives own attributes of points an underscore."""
+    body = trimesh.Trimesh(
+        mesh.points_um,
+        mesh.triangles,
+        vertex_colors=np.column_stack((mesh.colours, np.full(mesh.colours.shape[0], 255, np.uint8))),
+        process=False,
+    )
+    body.vertex_attributes = {
+        "_photosite": mesh.photosite.astype(np.float32),
+        "_value": mesh.values.astype(np.float32),
+    }
+    return body
