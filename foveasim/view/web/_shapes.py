@@ -63,10 +63,8 @@ def shapes_of(layout: Layout) -> Shapes:
     A fan from a vertex fills a simple ring when none of its triangles is turned over: so convex sites need no triangles
     of their own, nor do those with a notch that a fan from its deepest vertex looks into.
     """
-    xy_um, place = _shared(layout.xy_um)
-    n_rings = np.diff(layout.site_offsets)
-    order, is_filled = _fans(layout, n_rings == 1)
-    place = place[order]
+    order, is_filled = _fans(layout, np.diff(layout.site_offsets) == 1)
+    xy_um, place = _shared(layout.xy_um[order])
     cut_sites = np.flatnonzero(~is_filled)
     cut_offsets, cuts = _cut(layout, cut_sites, place, xy_um)
     return Shapes(xy_um, place, layout.ring_offsets, layout.site_offsets, cut_sites, cut_offsets, cuts)

@@ -56,10 +56,13 @@ class Scale {
     this.highest = high;
     // Light begins at darkness.
     if (column.kind === "grey" || column.kind === "lit") low = 0;
-    this.from = low;
-    this.to = high > low ? high : low + 1;
+    // Values that differ by rounding alone are one value, in the middle of the scale.
+    const isOne = high - low <= 1e-9 * Math.max(Math.abs(low), Math.abs(high));
+    this.from = isOne && !column.whole && low !== 0 ? low - 0.5 : low;
+    this.to = isOne ? this.from + 1 : high;
     this.canLog = column.kind === "even" && low > 0 && high / low > 4;
-    this.isLog = this.canLog && (wantsLog ?? high / low > 40);
+    // Sizes that differ much are told apart on a scale of ratios.
+    this.isLog = this.canLog && (wantsLog ?? (Boolean(column.of) && high / low > 40));
     // Colours of kinds repeat; a column may name more of them than there are colours.
     this.nKinds = column.colours ? column.colours.length : palette.kinds.length;
     if (column.kind === "even") this.tables = [table(viridis)];
@@ -150,7 +153,7 @@ function roundStep(length, isWhole) {
 function shown(value) {
   if (Number.isNaN(value)) return "no value";
   if (!Number.isFinite(value)) return value > 0 ? "infinite" : "minus infinite";
-  if (Number.isInteger(value) && Math.abs(value) < 1e15) return value.toLocaleString("en-US");
+  if (Number.isSafeInteger(value)) return value.toLocaleString("en-US");
   const size = Math.abs(value);
   return size >= 1e-3 && size < 1e7 ? String(Number(value.toPrecision(6))) : value.toExponential(4);
 }

@@ -1,0 +1,710 @@
+"""The page in a real browser: every site where it is, with its values; and in Python: what is packed into it."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import shapely
+from matplotlib import colormaps
+
+import foveasim as fs
+from foveasim.errors import FileError, GeometryError, ParameterError
+from foveasim.layout.lyrdb import read_lyrdb
+from foveasim.pictures import read_picture
+from foveasim.view import site_at, web_page, write_web_page
+from foveasim.view.palette import FILTER_COLOURS
+from foveasim.view.web._content import signal_to_noise
+from foveasim.view.web._pack import back_references, packed, smallest
+from foveasim.view.web._shapes import shapes_of
+
+CHROMIUM = "/usr/bin/chromium"
+SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+
+#: A frame with an island in it, an L, an arrow that no fan from its first vertex fills, a comb that none fills at all,
+#: two boxes that share a border, and two that overlap.
+FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
+ELL = shapely.Polygon([(10, 0), (16, 0), (16, 2), (12, 2), (12, 8), (10, 8)])
+ARROW = shapely.Polygon([(0, 10), (8, 14), (0, 18), (3, 14)])
+COMB = shapely.Polygon([
+    (10, 10), (20, 10), (20, 18), (18, 18), (18, 12), (16, 12), (16, 18), (14, 18), (14, 12), (12, 12), (12, 18), (10, 18),
+])  # fmt: skip
+SHAPES = [
+    FRAME, shapely.box(3, 3, 5, 5), ELL, ARROW, COMB, shapely.box(22, 0, 25, 4), shapely.box(25, 0, 30, 4),
+    shapely.box(22, 10, 27, 15), shapely.box(25, 12, 30, 18), shapely.Point(26, 7).buffer(1.5),
+]  # fmt: skip
+ZOO = fs.Layout.from_polygons(
+    SHAPES,
+    readout_line=np.arange(10) // 2,
+    gain=np.array([0.1, 1 / 3, 2.5, np.nan, 1e-7, 123456.789, -4.0, 7.0, 8.0, 9.0]),
+    kind=np.array(["frame", "box", "ell", "arrow", "comb", "box", "box", "box", "box", "disc"]),
+    is_dark=np.arange(10) == 3,
+    wide=np.arange(10) * 10**15,
+)
+N_X, N_Y, PITCH_UM = 12, 10, 2.5
+MOSAIC = fs.layout.mosaic(fs.layout.grid(n_x=N_X, n_y=N_Y, pitch_um=PITCH_UM), ("RG", "GB"))
+
+
+def capture_of(layout, filters=("R", "G", "B"), **sensor):
+    rng = np.random.default_rng(3)
+    expected_e = rng.uniform(0.0, 4000.0, layout.n_sites)
+    electrons = rng.poisson(expected_e)
+    return fs.Capture(
+        layout=layout,
+        code=(electrons // 5).astype(np.uint16),
+        electrons=electrons,
+        expected_e=expected_e,
+        filter_of_site=layout.channel,
+        filter_names=filters,
+        bits=10,
+        white_dn=np.full(len(filters), 800.0),
+        settings={"exposure_s": 0.01, "sensor": {"read_noise_e": 3.0, "shot_noise": "auto", **sensor}},
+    )
+
+
+CAPTURE = capture_of(MOSAIC)
+
+
+# -- what is packed ---------------------------------------------------------------------------------------------------------
+
+
+def triangles_of(shapes):
+    """Triangles as the page makes them, with their sites, in plain loops."""
+    cut = dict(zip(shapes.cut_sites.tolist(), range(len(shapes.cut_sites)), strict=True))
+    for site in range(len(shapes.site_offsets) - 1):
+        if site in cut:
+            i = cut[site]
+            yield from ((site, corners) for corners in shapes.cuts[shapes.cut_offsets[i] : shapes.cut_offsets[i + 1]])
+        else:
+            first, last = shapes.ring_offsets[shapes.site_offsets[[site, site + 1]]]
+            yield from ((site, (first, v, v + 1)) for v in range(first + 1, last - 1))
+
+
+@pytest.mark.parametrize(
+    ("layout", "n_cut"),
+    [
+        (ZOO, 2),  # the frame, and the comb
+        (fs.layout.log_polar(n_sectors=24, r_min_um=20.0, r_max_um=60.0, chords_per_arc=3), 0),
+        (fs.layout.penrose(side_um=5.0, size_um=60.0), 0),
+    ],
+    ids=["zoo", "log-polar", "penrose"],
+)
+def test_triangles_fill_each_site_and_nothing_else(layout, n_cut):
+    shapes = shapes_of(layout)
+    filled_um2 = np.zeros(layout.n_sites)
+    polygons = layout.polygons()
+    for site, corners in triangles_of(shapes):
+        triangle = shapely.Polygon(shapes.xy_um[shapes.place[list(corners)]])
+        filled_um2[site] += triangle.area
+        assert triangle.difference(polygons[site]).area < 1e-9
+
+    assert filled_um2 == pytest.approx(layout.area_um2, rel=1e-9)
+    assert shapes.cut_sites.size == n_cut
+
+
+def test_a_place_that_sites_share_is_there_once_and_rings_come_back_from_what_is_told_of_them():
+    for layout in (ZOO, MOSAIC):
+        shapes = shapes_of(layout)
+        place, seen = [], 0
+        for back in back_references(shapes.place).tolist():
+            place.append(seen if back == 0 else seen - back)
+            seen += back == 0
+        assert place == shapes.place.tolist()
+    shapes = shapes_of(fs.layout.grid(n_x=5, n_y=4, pitch_um=1.0))
+
+    assert shapes.xy_um.shape == (6 * 5, 2)
+    assert np.unique(shapes.xy_um, axis=0).shape == (6 * 5, 2)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.array([0, 255]), np.array([-1, 100]), np.array([0, 2**16]), np.array([2**40, -5]), np.array([0.1, np.nan, np.inf, -0.0]),
+        np.array([0.5, 2.0**-30]), np.array([True, False]), np.zeros(0),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_packed_numbers_come_back_to_the_last_bit(values):
+    small = smallest(values)
+    told, text = packed(small)
+    planes = np.frombuffer(gzip.decompress(base64.b64decode(text)), np.uint8)
+    back = (
+        np.ascontiguousarray(planes.reshape(-1, told["size"]).T).view(told["type"]).ravel() if told["size"] else small
+    )
+
+    assert np.array_equal(back.astype(np.float64), values.astype(np.float64), equal_nan=True)
+    assert back.nbytes <= max(values.nbytes, 1)
+
+
+def test_signal_to_noise_is_that_of_light_and_of_reading():
+    expected_e = CAPTURE.expected_e
+
+    assert signal_to_noise(CAPTURE) == pytest.approx(expected_e / np.sqrt(expected_e + 9.0))
+    assert signal_to_noise(capture_of(MOSAIC, shot_noise="off")) == pytest.approx(expected_e / 3.0)
+    # An array of which only the checksum was kept, and settings without a sensor.
+    assert signal_to_noise(capture_of(MOSAIC, read_noise_e={"shape": [120], "sha256": "..."})) is None
+    assert signal_to_noise(replace(CAPTURE, settings={})) is None
+
+
+class Elements(HTMLParser):
+    """What a page is made of."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.found = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+
+
+def test_a_page_asks_for_nothing_outside_of_it():
+    text = web_page(CAPTURE)
+    links = [v for _, attrs in Elements(text).found for k, v in attrs.items() if k in {"src", "href", "action"}]
+
+    assert links
+    assert all(link.startswith("data:") for link in links)
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
+    assert policy.startswith("default-src 'none'; script-src 'sha256-")
+    assert "unsafe" not in policy
+    assert "connect-src" not in policy
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: web_page(3), ParameterError, "'thing' must be a Layout or a Capture, got a int"),
+        (lambda: web_page(ZOO[:0]), GeometryError, "the layout has no sites"),
+        (lambda: web_page(ZOO, report="none"), ParameterError, "'report' must be a Report of a check, got a str"),
+        (
+            lambda: web_page(ZOO, report=MOSAIC.check(fs.DesignRules(min_size_um=1.0))),
+            ParameterError,
+            "'report' must be of this layout of 10 sites, got one of 120",
+        ),
+        (lambda: write_web_page(ZOO, "page.txt"), FileError, r"page.txt: must end in .html"),
+        (lambda: write_web_page(ZOO, "nowhere/page.html"), FileError, "the folder nowhere does not exist"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
+
+
+def test_a_page_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    (tmp_path / "page.html").write_text("before")
+    monkeypatch.setattr("foveasim.view.web._page.web_page", lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        write_web_page(ZOO, tmp_path / "page.html")
+
+    assert [p.name for p in tmp_path.iterdir()] == ["page.html"]
+    assert (tmp_path / "page.html").read_text() == "before"
+
+
+# -- in a browser --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=list(SOFTWARE))
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def visit(browser, tmp_path):
+    """Opens pages, and at the end asks of each that nothing went wrong and nothing was asked of the network."""
+    contexts, problems, asked = [], [], []
+
+    def open_page(text, *, hash_text="", script=None, **options):
+        path = tmp_path / f"page{len(contexts)}.html"
+        path.write_text(text, encoding="utf-8")
+        context = browser.new_context(
+            **{"viewport": {"width": 1200, "height": 800}, "reduced_motion": "reduce", **options}
+        )
+        contexts.append(context)
+        if script:
+            context.add_init_script(script)
+        page = context.new_page()
+        page.on("console", lambda message: problems.append(message.text))
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(path.as_uri() + hash_text)
+        page.evaluate("foveasim.complete")
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert problems == []
+    assert [url for url in asked if not url.startswith(("file:", "data:", "blob:"))] == []
+
+
+def until(page, condition, argument=None):
+    """Wait for a condition, asked from outside: the page's own rules let nothing evaluate text in it."""
+    for _ in range(300):
+        if page.evaluate(condition, argument):
+            return
+        page.evaluate("() => new Promise((done) => setTimeout(done, 20))")
+    pytest.fail(f"{condition} did not come true")
+
+
+def hover(page, x_um, y_um):
+    page.mouse.move(*page.evaluate("([x, y]) => foveasim.toWindow(x, y)", [x_um, y_um]))
+    page.evaluate("() => new Promise(requestAnimationFrame)")
+
+
+def row(page, label):
+    """What the panel says of the site under the mouse."""
+    return page.evaluate(
+        "label => { const dt = [...document.querySelectorAll('#values dt')].find((e) => e.textContent === label);"
+        " return dt && dt.nextElementSibling.textContent; }",
+        label,
+    )
+
+
+@pytest.mark.needs("chromium")
+def test_the_mouse_finds_every_kind_of_site_and_its_values(visit):
+    page = visit(web_page(ZOO))
+    inside = {0: (1, 1), 1: (4, 4), 2: (11, 6), 3: (5, 14), 4: (19, 17), 5: (23, 2), 6: (28, 2), 9: (26, 7)}
+    for site, point in inside.items():
+        hover(page, *point)
+        assert page.evaluate("foveasim.hovered") == site
+        assert page.inner_text("#site-heading") == f"Photosite {site}"
+        assert row(page, "area") == f"{float(f'{ZOO.area_um2[site]:.6g}'):g} µm²"
+        assert row(page, "readout line") == str(site // 2)
+        assert row(page, "kind") == ZOO.columns["kind"][site]
+        assert row(page, "is dark") == ("yes" if site == 3 else "no")
+        assert row(page, "wide") == f"{site * 10**15:,}"
+    assert row(page, "gain") == "9"
+    # The frame's hole beside the island, the arrow's notch, a gap of the comb, and beyond the layout.
+    for point in [(2.5, 4.0), (1.0, 14.0), (17.0, 15.0), (21.0, 9.0)]:
+        hover(page, *point)
+        assert page.evaluate("foveasim.hovered") == -1
+        assert row(page, "area") == "–"
+    hover(page, 26.0, 13.0)
+    assert page.evaluate("foveasim.hovered") == 8
+    assert row(page, "overlaps") == "7"
+    values = page.evaluate("foveasim.nSites && [...Array(10).keys()].map((i) => foveasim.values(i).gain)")
+    assert np.array_equal(np.array(values, dtype=float), ZOO.columns["gain"], equal_nan=True)
+
+
+@pytest.mark.needs("chromium")
+def test_the_page_and_python_agree_on_every_point_borders_too(visit):
+    for layout in (ZOO, fs.layout.hexagonal(n_columns=7, n_rows=6, pitch_um=3.0), MOSAIC.rotate(30.0)):
+        page = visit(web_page(layout))
+        x0, y0, x1, y1 = layout.bounds_um
+        anywhere = np.random.default_rng(0).uniform((x0 - 1, y0 - 1), (x1 + 1, y1 + 1), (1500, 2))
+        closed = np.concatenate((layout.xy_um, layout.xy_um[:1]))
+        points = np.concatenate((anywhere, layout.xy_um, 0.5 * (closed[1:] + closed[:-1])))
+        found = page.evaluate("points => points.map(([x, y]) => foveasim.pick(x, y))", points.tolist())
+
+        assert found == [site_at(layout, x, y) for x, y in points]
+
+
+@pytest.mark.needs("chromium")
+def test_the_wheel_zooms_about_what_is_under_it(visit):
+    page = visit(web_page(CAPTURE))
+    page.mouse.move(320, 510)
+    under = page.evaluate("foveasim.fromWindow(320, 510)")
+    before = page.evaluate("foveasim.view.scale")
+    for step in (-200, -200, -200, 150, -200):
+        page.mouse.wheel(0, step)
+    page.evaluate("() => new Promise((done) => setTimeout(done, 50))")
+    until(page, "before => foveasim.view.scale > 3 * before", before)
+
+    assert page.evaluate("foveasim.view.scale") / before == pytest.approx(np.exp(0.4 * 4 - 0.3), rel=1e-9)
+    assert page.evaluate("foveasim.fromWindow(320, 510)") == pytest.approx(under, abs=1e-9)
+
+
+@pytest.mark.needs("chromium")
+def test_the_mouse_pans_pins_and_the_buttons_zoom(visit):
+    page = visit(web_page(CAPTURE))
+    hover(page, 0.0, 0.0)
+    before = page.evaluate("foveasim.view")
+    x, y = page.evaluate("foveasim.toWindow(0, 0)")
+    page.mouse.down()
+    page.mouse.move(x + 60, y + 40, steps=4)
+    page.mouse.up()
+    after = page.evaluate("foveasim.view")
+
+    assert (after["x"] - before["x"]) * before["scale"] == pytest.approx(-60, abs=1e-6)
+    assert (after["y"] - before["y"]) * before["scale"] == pytest.approx(40, abs=1e-6)
+    assert page.evaluate("foveasim.pinned") == -1
+
+    page.mouse.click(*page.evaluate("foveasim.toWindow(6.0, 6.0)"))
+    assert page.evaluate("foveasim.pinned") == page.evaluate("foveasim.pick(6.0, 6.0)")
+    page.mouse.move(5, 5)
+    assert "(pinned)" in page.inner_text("#site-heading")
+    page.click("#nearer")
+    assert page.evaluate("foveasim.view.scale") == pytest.approx(2 * before["scale"])
+    page.click("#fit")
+    assert page.evaluate("foveasim.view") == pytest.approx(before)
+
+
+@pytest.mark.needs("chromium")
+def test_two_fingers_zoom_by_as_much_as_they_part(visit):
+    page = visit(web_page(CAPTURE), has_touch=True)
+    before = page.evaluate("foveasim.view")
+    fingers = page.context.new_cdp_session(page)
+
+    def touch(kind, half):
+        points = [] if half is None else [{"x": 400 - half, "y": 400, "id": 0}, {"x": 400 + half, "y": 400, "id": 1}]
+        fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    touch("touchStart", 50)
+    for half in range(60, 151, 10):
+        touch("touchMove", half)
+    touch("touchEnd", None)
+
+    assert page.evaluate("foveasim.view.scale") / before["scale"] == pytest.approx(3.0, rel=0.25)
+
+
+@pytest.mark.needs("chromium")
+def test_sites_have_the_colours_of_what_is_chosen(visit):
+    page = visit(web_page(CAPTURE))
+    site = int(np.argmax(CAPTURE.code * (MOSAIC.channel == 1)))
+    x, y = MOSAIC.centroid_um[site]
+    x, y = x + 0.3 * PITCH_UM, y + 0.2 * PITCH_UM
+
+    def drawn():
+        return page.evaluate("([x, y]) => foveasim.pixel(x, y)", [x, y])[:3]
+
+    share = CAPTURE.code[site] / CAPTURE.code.max()
+    assert page.evaluate("foveasim.column") == "picture"
+    assert drawn() == pytest.approx(np.array(FILTER_COLOURS["G"]) * share ** (1 / 2.2), abs=2)
+    page.select_option("#colouring", "channel")
+    until(page, "foveasim.column === 'channel'")
+    assert drawn() == list(FILTER_COLOURS["G"])
+    page.select_option("#colouring", "electrons")
+    until(page, "foveasim.column === 'electrons'")
+    low, high = CAPTURE.electrons.min(), CAPTURE.electrons.max()
+    expected = colormaps["viridis"]((CAPTURE.electrons[site] - low) / (high - low))[:3]
+    assert drawn() == pytest.approx(np.array(expected) * 255, abs=4)
+    page.select_option("#colouring", "code")
+    until(page, "foveasim.column === 'code'")
+    assert drawn() == pytest.approx([255 * share ** (1 / 2.2)] * 3, abs=2)
+    hover(page, x, y)
+    assert row(page, "code") == f"{CAPTURE.code[site]:,} DN"
+    assert row(page, "electrons") == f"{CAPTURE.electrons[site]:,} e⁻"
+    assert row(page, "filter") == "G"
+    assert float(row(page, "signal to noise")) == pytest.approx(signal_to_noise(CAPTURE)[site], rel=1e-5)
+    assert page.evaluate(f"foveasim.values({site}).expected_e") == CAPTURE.expected_e[site]
+
+
+@pytest.mark.needs("chromium")
+def test_holes_and_notches_show_the_ground_and_sites_do_not(visit):
+    page = visit(web_page(ZOO), color_scheme="light")
+    points = [(2.5, 4.0), (1.0, 14.0), (17.0, 15.0), (13.0, 5.0), (1.0, 1.0), (4.0, 4.0), (7.0, 14.0), (19.0, 17.0)]
+    is_ground = [page.evaluate("([x, y]) => foveasim.pixel(x, y)", list(p))[:3] == [185, 196, 214] for p in points]
+
+    assert is_ground == [True] * 4 + [False] * 4
+
+
+@pytest.mark.needs("chromium")
+def test_a_range_of_values_fades_all_others(visit):
+    page = visit(web_page(CAPTURE), hash_text="#by=electrons")
+    low, high = np.argsort(CAPTURE.electrons)[[5, -5]]
+    point = {site: (MOSAIC.centroid_um[site] + 0.6).tolist() for site in (low, high)}
+
+    def drawn(site):
+        return page.evaluate("([x, y]) => foveasim.pixel(x, y)", point[site])[:3]
+
+    before = drawn(low), drawn(high)
+    page.fill("#range-from", str(int(np.median(CAPTURE.electrons))))
+    page.keyboard.press("Enter")
+    after = drawn(low), drawn(high)
+
+    assert after[1] == before[1]
+    assert np.abs(np.array(after[0]) - (185, 196, 214)).max() < 0.13 * 255
+    page.click("#range-all")
+    assert (drawn(low), drawn(high)) == before
+    box = page.locator("#histogram").bounding_box()
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 20)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"], box["y"] + 20, steps=3)
+    page.mouse.up()
+    from_e, to_e = page.evaluate("foveasim.range")
+    span = CAPTURE.electrons.max() - CAPTURE.electrons.min()
+    assert from_e == pytest.approx(CAPTURE.electrons.min() + 0.5 * span, abs=0.02 * span)
+    assert to_e == CAPTURE.electrons.max()
+
+
+@pytest.mark.needs("chromium")
+def test_everything_can_be_reached_and_done_with_the_keyboard(visit):
+    page = visit(web_page(CAPTURE))
+    order = []
+    for _ in range(20):
+        page.keyboard.press("Tab")
+        order.append(page.evaluate("document.activeElement.id"))
+        assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") != "none" or not order[-1]
+    wanted = ["find-site", "link", "save", "theme", "help", "marks", "nearer", "farther", "fit", "colouring", "enlarge"]
+    assert [name for name in order if name in wanted][: len(wanted)] == wanted
+
+    page.focus("#colouring")
+    page.keyboard.press("ArrowDown")
+    until(page, "foveasim.column === 'code'")
+    page.focus("#marks")
+    before = page.evaluate("foveasim.view")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowUp")
+    after = page.evaluate("foveasim.view")
+    assert after["x"] > before["x"]
+    assert after["y"] > before["y"]
+    page.keyboard.press("+")
+    assert page.evaluate("foveasim.view.scale") > after["scale"]
+    page.keyboard.press("Enter")
+    pinned = page.evaluate("foveasim.pinned")
+    assert pinned == page.evaluate("foveasim.pick(foveasim.view.x, foveasim.view.y)") >= 0
+    until(page, "document.getElementById('live').textContent !== ''")
+    assert page.inner_text("#live").startswith(f"Photosite {pinned}: code {CAPTURE.code[pinned]:,} DN")
+    page.keyboard.press("Escape")
+    assert page.evaluate("foveasim.pinned") == -1
+    page.keyboard.press("0")
+    assert page.evaluate("foveasim.view.scale") == pytest.approx(before["scale"])
+
+
+@pytest.mark.needs("chromium")
+def test_a_number_finds_its_site_and_one_that_is_none_is_told(visit):
+    page = visit(web_page(CAPTURE))
+    page.keyboard.press("/")
+    page.keyboard.type("57")
+    page.keyboard.press("Enter")
+    view = page.evaluate("foveasim.view")
+
+    assert page.evaluate("foveasim.pinned") == 57
+    assert (view["x"], view["y"]) == pytest.approx(MOSAIC.centroid_um[57])
+    page.fill("#find-site", "120")
+    page.keyboard.press("Enter")
+    assert page.inner_text("#told") == "Sites have the numbers 0 to 119"
+    assert page.get_attribute("#find-site", "aria-invalid") == "true"
+    assert page.evaluate("foveasim.pinned") == 57
+
+
+@pytest.mark.needs("chromium")
+def test_a_violation_is_flown_to_by_a_click_and_by_enter(visit):
+    rules = fs.DesignRules(max_overlap_um2=0.0, min_size_um=2.5, min_space_um=2.5, max_sites=50)
+    report = ZOO.check(rules)
+    page = visit(web_page(ZOO, report=report))
+    buttons = page.locator("#violations button")
+
+    assert buttons.count() == len(report.violations) > 3
+    assert page.inner_text("#rule option >> nth=0") == f"all ({len(report.violations)})"
+    for i, violation in enumerate(report.violations):
+        if i % 2:
+            buttons.nth(i).click()
+        else:
+            buttons.nth(i).focus()
+            page.keyboard.press("Enter")
+        view = page.evaluate("foveasim.view")
+        x0, y0, x1, y1 = violation.marker.bounds
+        assert page.evaluate("foveasim.chosen") == i
+        assert (view["x"], view["y"]) == pytest.approx((0.5 * (x0 + x1), 0.5 * (y0 + y1)), abs=1e-6)
+        assert view["scale"] * max(x1 - x0, y1 - y0) < view["height"]
+        assert str(violation.site_ids[0]) in buttons.nth(i).inner_text()
+    page.select_option("#rule", label="max_overlap_um2 (1)")
+    assert buttons.count() == 1
+    assert buttons.first.inner_text().split("\n") == ["sites 7, 8", "6 µm²"]
+    assert "the limit is 0 µm²" in page.inner_text("#sentence")
+
+
+@pytest.mark.needs("chromium")
+def test_a_link_opens_the_same_view(visit):
+    page = visit(web_page(CAPTURE), hash_text="#x=2.5&y=-3.25&width=9&by=snr&site=41")
+
+    view = page.evaluate("foveasim.view")
+    assert (view["x"], view["y"], view["width"] / view["scale"]) == pytest.approx((2.5, -3.25, 9.0))
+    assert page.evaluate("[foveasim.column, foveasim.pinned]") == ["snr", 41]
+    page.click("#nearer")
+    until(page, "new URLSearchParams(location.hash.slice(1)).get('width') === '4.5'")
+    assert "by=snr" in page.url
+    for wrong in ("#x=a&width=-1&by=nothing&site=1e9&range=x y", "#%%%", "#site=-1&range=1"):
+        assert visit(web_page(CAPTURE), hash_text=wrong).evaluate("foveasim.pinned") == -1
+
+
+@pytest.mark.needs("chromium")
+def test_the_picture_and_the_map_show_the_same_place(visit):
+    page = visit(web_page(CAPTURE))
+    x_um, y_um = 6.2, 8.4
+    box = page.locator("#picture-frame").bounding_box()
+    x0, y0, x1, y1 = MOSAIC.bounds_um
+
+    def point_on_picture():
+        box = page.locator("#picture").bounding_box()
+        scale = min(box["width"] / (x1 - x0), box["height"] / (y1 - y0))
+        left = box["x"] + 0.5 * (box["width"] - scale * (x1 - x0))
+        top = box["y"] + 0.5 * (box["height"] - scale * (y1 - y0))
+        return left + (x_um - x0) * scale, top + (y1 - y_um) * scale
+
+    page.locator("#picture").scroll_into_view_if_needed()
+    page.mouse.move(*point_on_picture())
+    assert page.evaluate("foveasim.hovered") == site_at(MOSAIC, x_um, y_um)
+    page.click("#enlarge")
+    assert page.locator("#picture-frame").bounding_box()["width"] > 1.2 * box["width"]
+    page.mouse.move(*point_on_picture())
+    assert page.evaluate("foveasim.hovered") == site_at(MOSAIC, x_um, y_um)
+    page.mouse.click(*point_on_picture())
+    view = page.evaluate("foveasim.view")
+    assert (view["x"], view["y"]) == pytest.approx((x_um, y_um), abs=0.1)
+
+
+@pytest.mark.needs("chromium")
+def test_the_view_is_saved_as_a_picture(visit, tmp_path):
+    page = visit(web_page(CAPTURE, name="a/b <c>"))
+    with page.expect_download() as download:
+        page.click("#save")
+    download.value.save_as(tmp_path / "view.png")
+    picture = read_picture(tmp_path / "view.png")
+    view = page.evaluate("foveasim.view")
+
+    assert download.value.suggested_filename == "a_b_c_.png"
+    assert picture.shape[:2] == (view["height"] + 46, view["width"])
+    middle = picture[: int(view["height"])].reshape(-1, picture.shape[2])
+    assert len(np.unique(middle[:, :3], axis=0)) > 50
+
+
+HOSTILE = (
+    "</script><script>window.hacked = 1</script>",
+    "<img src=x onerror='window.hacked = 1'>",
+    "\"'><svg onload=window.hacked=1>",
+    "<!--<script>",
+    "$script ${title} \u2028 &lt;b&gt;",
+)
+
+
+@pytest.mark.needs("chromium")
+def test_names_in_a_strangers_file_stay_text(visit, tmp_path):
+    layout = ZOO.with_columns(**{
+        text: np.array([HOSTILE[(i + k) % len(HOSTILE)] for i in range(ZOO.n_sites)]) for k, text in enumerate(HOSTILE)
+    })  # fmt: skip
+    layout = fs.Layout(
+        layout.xy_um, layout.ring_offsets, layout.site_offsets, layout.columns, {"generator": HOSTILE[0]}
+    )
+    ZOO.check(fs.DesignRules(min_size_um=2.5)).write(tmp_path / "report.lyrdb")
+    told = (tmp_path / "report.lyrdb").read_text()
+    told = told.replace("min_size_um", HOSTILE[1].replace("<", "&lt;")).replace("photosite", "place")
+    (tmp_path / "hostile.lyrdb").write_text(told)
+    report = read_lyrdb(tmp_path / "hostile.lyrdb", layout.n_sites)
+    for name in HOSTILE:
+        page = visit(web_page(layout, report=report, name=name))
+        hover(page, 1.0, 1.0)
+        page.locator("#violations button").first.click()
+        page.select_option("#colouring", HOSTILE[0])
+        until(page, "name => foveasim.column === name", HOSTILE[0])
+        page.evaluate("() => new Promise((done) => setTimeout(done, 50))")
+
+        assert page.evaluate("window.hacked") is None
+        assert page.evaluate("document.querySelector('h1').textContent") == name
+        assert page.evaluate("document.title") == name.strip().replace("\u2028", "\u2028")
+        assert page.evaluate("foveasim.values(0)")[HOSTILE[0]] == HOSTILE[0]
+        assert page.evaluate("document.querySelectorAll('img, svg[onload]').length") == 1
+
+
+@pytest.mark.needs("chromium")
+def test_without_webgl2_the_page_says_so_and_shows_the_picture(visit):
+    without = (
+        "const get = HTMLCanvasElement.prototype.getContext;"
+        "HTMLCanvasElement.prototype.getContext = function (kind, ...rest)"
+        " { return kind === 'webgl2' ? null : get.call(this, kind, ...rest); };"
+    )
+    page = visit(web_page(CAPTURE), script=without)
+
+    assert page.inner_text("#told").startswith("This browser has no WebGL2")
+    box = page.locator("#picture").bounding_box()
+    assert box["width"] > 600
+    assert box["height"] > 400
+    assert not page.is_visible("aside")
+
+
+def luminance(colour):
+    shares = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [s / 12.92 if s <= 0.04045 else ((s + 0.055) / 1.055) ** 2.4 for s in shares]
+    return np.dot(linear, (0.2126, 0.7152, 0.0722))
+
+
+@pytest.mark.needs("chromium")
+def test_text_stands_out_in_light_and_dark_and_the_button_changes_them(visit):
+    page = visit(web_page(CAPTURE), color_scheme="dark")
+    theme = "document.documentElement.dataset.theme"
+    for expected in ("dark", "light"):
+        assert page.evaluate(theme) == expected
+        names = ("--text", "--quiet", "--accent", "--wrong", "--raised")
+        *inks, ground = (
+            page.evaluate("n => getComputedStyle(document.documentElement).getPropertyValue(n).trim()", name)
+            for name in names
+        )
+        for ink in inks:
+            high, low = sorted((luminance(ink), luminance(ground)), reverse=True)
+            assert (high + 0.05) / (low + 0.05) >= 4.5  # WCAG 2.1, level AA
+        shot = page.screenshot()
+        assert len(shot) > 10_000
+        page.click("#theme")
+    assert page.evaluate(theme) == "dark"
+
+
+@pytest.mark.needs("chromium")
+@pytest.mark.parametrize("size", [(1280, 720), (1024, 640), (640, 800)])
+def test_nothing_sticks_out_of_a_small_window(visit, size):
+    page = visit(
+        web_page(CAPTURE, name="a rather long name of a sensor that nobody would think of"),
+        viewport={"width": size[0], "height": size[1]},
+    )
+
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert page.evaluate("document.querySelector('aside').scrollWidth <= document.querySelector('aside').clientWidth")
+    for name in ("#find-site", "#theme", "#nearer", "#colouring"):
+        box = page.locator(name).bounding_box()
+        assert 0 <= box["x"] <= box["x"] + box["width"] <= size[0]
+
+
+@pytest.mark.needs("chromium")
+@pytest.mark.parametrize(("n_x", "n_y"), [(100, 100), (500, 400)])
+def test_many_sites_open_and_are_found(visit, n_x, n_y):
+    layout = fs.layout.grid(n_x=n_x, n_y=n_y, pitch_um=1.5)
+    capture = capture_of(layout, filters=("all",))
+    page = visit(web_page(capture))
+    sites = np.random.default_rng(1).integers(0, layout.n_sites, 200)
+    found = page.evaluate("points => points.map(([x, y]) => foveasim.pick(x, y))", layout.centroid_um[sites].tolist())
+
+    assert found == sites.tolist()
+    for site in sites[:3].tolist():
+        x, y = layout.centroid_um[site]
+        level = 255 * (capture.code[site] / capture.code.max()) ** (1 / 2.2)
+        page.fill("#find-site", str(site))
+        page.press("#find-site", "Enter")
+        assert page.evaluate("([x, y]) => foveasim.pixel(x, y)", [x + 0.3, y + 0.3])[:3] == pytest.approx(
+            [level] * 3, abs=2
+        )
+        assert page.evaluate(f"foveasim.values({site}).electrons") == capture.electrons[site]
+
+
+@pytest.mark.needs("chromium")
+def test_outlines_stay_sharp_however_near_one_goes(visit):
+    """A border a thousandth of a nanometre from the middle of a view two picometres wide, on a sensor of ten millimetres."""
+    border_um = 3.0
+    layout = fs.Layout.from_polygons(
+        [shapely.box(0, 0, border_um, 10), shapely.box(border_um, 0, 6, 10), shapely.box(9_000, 9_000, 10_000, 10_000)],
+        channel=[0, 1, 2],
+    )
+    page = visit(web_page(layout), hash_text=f"#x={border_um}&y=5&width=0.002&by=channel")
+    colours = [page.evaluate("([x, y]) => foveasim.pixel(x, y)", [border_um + d, 5.0])[:3] for d in (-1e-4, 1e-4)]
+
+    assert page.evaluate("foveasim.view.width / foveasim.view.scale") == pytest.approx(0.002)
+    assert colours == [list(FILTER_COLOURS["R"]), list(FILTER_COLOURS["G"])]
+
+
+def test_about_is_plain_json_with_a_name_for_every_array():
+    text = web_page(ZOO, report=ZOO.check(fs.DesignRules(min_size_um=2.5)))
+    about = json.loads(re.search(r'<script type="application/json" id="about">(.*?)</script>', text)[1])
+    ids = {attrs["id"] for tag, attrs in Elements(text).found if tag == "script" and attrs.get("type") == "text/plain"}
+
+    assert {f"data-{name}" for name in about["arrays"]} == ids
+    assert [rule["name"] for rule in about["rules"]] == ["min_size_um"]
