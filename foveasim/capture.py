@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim.arrays import Floats, Ints, check_choice, check_count, read_only
 from foveasim.errors import FileError, ParameterError
@@ -21,6 +21,7 @@ from foveasim.reconstruct import Picture, cells, fill_channels, raster_grid
 from foveasim.records import described
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from pyvista import PolyData  # noqa: TID251 -- a type alone
 
 __all__ = ["Capture"]
@@ -149,6 +150,12 @@ class Capture:
         from foveasim.view import polydata
 
         return polydata(self)
+
+    def plot(self, by: str | ArrayLike = "code", **options: Any) -> Axes:
+        """Draw the photosites on matplotlib axes, coloured by what they measured; see :func:`foveasim.view.plot_capture`."""
+        from foveasim.view import plot_capture
+
+        return plot_capture(self, by, **options)
 
     def save(self, path: str | Path) -> None:
         """

@@ -38,7 +38,7 @@ HEAVY = {
 }  # fmt: skip
 #: Names of numbers without a unit, or with the unit of what they are measured with.
 DIMENSIONLESS = {
-    "a", "above", "at_least", "at_most", "blanking", "coefficients", "colours", "companding_table", "contrast", "dpi", "f_number", "factor", "figure_inches", "fill_factor", "gain", "gamma", "high", "hot_sigmas", "k", "k1", "k2", "k3", "k4", "k5", "k6", "kernel",
+    "a", "above", "at_least", "at_most", "blanking", "coefficients", "companding_table", "contrast", "dpi", "f_number", "factor", "figure_inches", "fill_factor", "gain", "gamma", "high", "hot_sigmas", "k", "k1", "k2", "k3", "k4", "k5", "k6", "kernel",
     "limit", "log_strength", "low", "magnification", "max_aspect_ratio", "obscuration",
     "max_density", "max_growth", "max_neighbour_ratio", "max_track_use", "min_density", "min_growth", "neighbour_share", "noisy_ratio", "p1", "p2", "peak", "per_vertex", "qe", "ratio", "rounding",
     "ring_ratio", "sensitivity", "spectrum", "stretch", "transmission", "value", "values", "weight", "weights", "white", "worst_area_error", "zoom",

@@ -162,6 +162,29 @@ def test_a_pixel_is_the_mean_of_its_samples():
     assert np.array_equal(one.ids, three.ids[1::3, 1::3])
     assert np.abs(three.picture(rgb, background=(10, 20, 30)) - samples).max() <= 0.5
 
+    # Without a background: the mean of the samples that show a site, and their share.
+    is_site = (three.ids >= 0).reshape(30, 3, 40, 3)
+    counts = is_site.sum(axis=(1, 3))
+    alone = (table[three.ids].reshape(30, 3, 40, 3, 3) * is_site[..., None]).sum(axis=(1, 3)) / np.maximum(counts, 1)[
+        ..., None
+    ]
+    clear = three.picture(rgb, background=None)
+    assert np.abs(clear[..., :3] - alone).max() <= 0.5
+    assert np.abs(clear[..., 3] - 255 * counts / 9).max() <= 0.5
+
+
+def test_a_border_is_drawn_where_one_site_ends_and_another_begins():
+    pixels = SitePixels.of(L.grid(n_x=2, n_y=2, pitch_um=2.0), (6, 6), (-3, -3, 3, 3), n_samples=1)
+    drawn = np.all(pixels.picture(np.full((4, 3), 200, np.uint8), border=(1, 2, 3)) == (1, 2, 3), axis=-1)
+
+    # Sites from pixel 1 to 2 and 3 to 4: borders at the first pixel of each, and at the first beyond.
+    within = np.arange(6) > 0
+    at = np.isin(np.arange(6), (1, 3, 5))
+    assert np.array_equal(
+        drawn,
+        (at[:, None] & (within[None] & (np.arange(6) < 5)[None])) | (at[None] & (within & (np.arange(6) < 5))[:, None]),
+    )
+
 
 @pytest.mark.parametrize(
     ("call", "message"),

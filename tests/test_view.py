@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import xml.etree.ElementTree as ET
+
 import numpy as np
 import pytest
 import shapely
@@ -10,25 +13,56 @@ from matplotlib.figure import Figure
 import foveasim as fs
 from foveasim.errors import FileError, ParameterError
 from foveasim.pictures import read_picture
-from foveasim.view import plot_capture, plot_layout, plot_noise_budget, save_figure
+from foveasim.view import (
+    colours_of,
+    plot_layout,
+    plot_noise_budget,
+    plot_report,
+    save_drawing,
+    save_figure,
+    site_colours,
+)
+from foveasim.view._artists import SiteImage, length_text, nice_length_um
+from foveasim.view.palette import BACKGROUND, CATEGORY_COLOURS, FILTER_COLOURS, NO_DATA
+from foveasim.view.plots import MOST_OUTLINES
 
 FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
 LAYOUT = fs.Layout.from_polygons([FRAME, shapely.box(10, 0, 12, 8)])
+#: More sites than are drawn as outlines.
+MANY = fs.layout.grid(n_x=64, n_y=64, pitch_um=2.0)
+CHEQUERED = np.add.outer(np.arange(64), np.arange(64)).ravel() % 2
 
 
-def drawn(axes, tmp_path):
-    """The picture of the axes' inside, which are stretched over the whole figure."""
+def drawn(axes, tmp_path, dpi=100):
+    """The picture of the axes' inside, which are stretched over the whole figure, first row on top."""
     axes.set_position((0, 0, 1, 1))
     axes.axis("off")
     axes.figure.set_layout_engine("none")
-    save_figure(axes.figure, tmp_path / "plot.png", dpi=100)
-    return read_picture(tmp_path / "plot.png")
+    save_figure(axes.figure, tmp_path / "plot.png", dpi=dpi)
+    return read_picture(tmp_path / "plot.png")[..., :3]
+
+
+def bare_axes(width=6, height=4):
+    return Figure(figsize=(width, height), facecolor="white").add_axes((0, 0, 1, 1))
+
+
+@pytest.fixture(scope="module")
+def mosaic_capture():
+    layout = fs.layout.mosaic(fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0), ("RG", "GB"))
+    sensor = fs.Sensor(layout, filters="rgb", capacitance_f=1e-15)
+    scene = fs.Scene.flat(
+        shape=(100, 100), pitch_um=20.0, distance_m=0.5, radiance_w_m2_sr_nm=1.0, wavelength_nm=(450, 540, 610)
+    )
+    camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=sensor)
+    return camera.capture(scene, exposure_s=0.01, seed=0)
+
+
+# -- outlines and images -------------------------------------------------------------------------------------------
 
 
 def test_sites_are_drawn_where_they_are_holes_and_gaps_left_open(tmp_path):
-    axes = Figure(figsize=(6, 4), facecolor="white").add_axes((0, 0, 1, 1))
-    plot_layout(LAYOUT, colours=np.array([[1.0, 0, 0], [0, 0, 1.0]]), ax=axes)
-    picture = drawn(axes, tmp_path)[..., :3]
+    axes = plot_layout(LAYOUT, np.array([[1.0, 0, 0], [0, 0, 1.0]]), scale_bar=False, ax=bare_axes())
+    picture = drawn(axes, tmp_path)
     red, blue = (np.all(picture == colour, axis=-1).mean() for colour in ([255, 0, 0], [0, 0, 255]))
 
     # Of the plot's 12 x 8 µm the frame covers 64 - 16 and the box 16.
@@ -37,42 +71,368 @@ def test_sites_are_drawn_where_they_are_holes_and_gaps_left_open(tmp_path):
     assert not np.all(picture[200, 200] == [255, 0, 0])
 
 
-def test_y_points_up(tmp_path):
-    low_and_high = fs.Layout.from_rectangles([[0, 0], [0, 2]], 2.0)
-    axes = Figure(figsize=(2, 4)).add_axes((0, 0, 1, 1))
-    plot_layout(low_and_high, colours=np.array([[0, 0, 0], [1.0, 1, 1]]), ax=axes)
-    picture = drawn(axes, tmp_path)[..., 0]
+@pytest.mark.parametrize("n", [1, 60], ids=["outlines", "image"])
+def test_y_points_up_and_x_to_the_right(tmp_path, n):
+    layout = fs.layout.grid(n_x=2 * n, n_y=2 * n, pitch_um=2.0)
+    is_high, is_right = (layout.centroid_um[:, i] > 0 for i in (1, 0))
+    assert (layout.n_sites > MOST_OUTLINES) == (n > 1)
+    axes = layout.plot(np.stack((is_high, is_right, is_high), axis=1) * 1.0, scale_bar=False, ax=bare_axes(4, 4))
+    picture = drawn(axes, tmp_path)
 
-    assert picture[50:150].min() == 255
-    assert picture[250:350].max() == 0
+    assert np.all(picture[50:150, 50:150] == [255, 0, 255])
+    assert np.all(picture[250:350, 250:350] == [0, 255, 0])
+    assert np.all(picture[50:150, 250:350] == 255)
 
 
-def test_a_mosaic_is_drawn_in_the_colours_of_its_filters():
-    layout = fs.layout.mosaic(fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0), ("RG", "GB"))
-    sensor = fs.Sensor(layout, filters="rgb", capacitance_f=1e-15)
-    scene = fs.Scene.flat(
-        shape=(100, 100), pitch_um=20.0, distance_m=0.5, radiance_w_m2_sr_nm=1.0, wavelength_nm=(450, 540, 610)
-    )
-    camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=sensor)
-    axes = plot_capture(camera.capture(scene, exposure_s=0.01, seed=0))
+def test_an_image_of_many_sites_shows_each_where_it_is_and_what_none_covers(tmp_path):
+    layout = MANY[(MANY.centroid_um[:, 0] > 0) | (MANY.centroid_um[:, 0] < -32.0)]
+    assert layout.n_sites > MOST_OUTLINES
+    axes = plot_layout(layout, np.zeros((layout.n_sites, 3)), scale_bar=False, ax=bare_axes(4, 4))
+    assert tuple(round(255 * c) for c in axes.get_facecolor()[:3]) == BACKGROUND
+    picture = drawn(axes, tmp_path)
+
+    assert np.all(picture[:, :99] == 0)
+    assert np.all(picture[:, 101:199] == 255)
+    assert np.all(picture[:, 201:] == 0)
+
+
+def test_an_image_is_as_the_outlines_are(tmp_path, monkeypatch):
+    layout = fs.layout.log_polar(n_sectors=60, min_size_um=1.0, r_max_um=20.0)
+    colours = np.random.default_rng(0).integers(0, 256, (layout.n_sites, 3), dtype=np.uint8)
+    pictures = []
+    for most in (0, 10**6):
+        monkeypatch.setattr("foveasim.view.plots.MOST_OUTLINES", most)
+        axes = plot_layout(layout, colours, scale_bar=False, ax=bare_axes(4, 4))
+        assert bool(axes.images) == (most == 0)
+        pictures.append(drawn(axes, tmp_path).astype(float))
+
+    difference = np.abs(pictures[0] - pictures[1])
+    assert np.median(difference) == 0.0
+    assert difference.mean() < 3.0  # of 255: outlines have a rim of 0.3 points
+
+
+def test_an_image_is_sharp_at_any_zoom_and_resolution(tmp_path):
+    axes = plot_layout(MANY, CHEQUERED[:, None] * np.ones(3), scale_bar=False, ax=bare_axes(4, 4))
+    axes.set_xlim(-2.0, 2.0)
+    axes.set_ylim(-2.0, 2.0)
+    for dpi in (50, 200):
+        picture = drawn(axes, tmp_path, dpi=dpi)
+        values, counts = np.unique(picture, return_counts=True)
+
+        # Four squares of one colour each, up to the pixels on their borders.
+        assert counts[np.isin(values, (0, 255))].sum() / picture.size > 1 - 4.5 / (4 * dpi)
+        assert (picture == 255).mean() == pytest.approx(0.5, abs=2.5 / (4 * dpi))
+
+
+def test_many_sites_smaller_than_pixels_give_their_mean(tmp_path):
+    axes = plot_layout(MANY, CHEQUERED[:, None] * np.ones(3), scale_bar=False, ax=bare_axes(0.2, 0.2))
+    picture = drawn(axes, tmp_path)
+
+    assert picture.shape[:2] == (20, 20)
+    assert picture.mean() == pytest.approx(127.5, abs=3.0)
+
+
+def test_axes_turned_over_turn_the_image(tmp_path):
+    colours = np.where(MANY.centroid_um[:, :1] > 0, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
+    axes = plot_layout(MANY, colours, scale_bar=False, ax=bare_axes(4, 4))
+    axes.invert_xaxis()
+    picture = drawn(axes, tmp_path)
+
+    assert np.all(picture[:, :199] == [255, 0, 0])
+    assert np.all(picture[:, 201:] == [0, 0, 255])
+
+
+def test_an_image_is_painted_once_for_the_same_view_and_recoloured_without():
+    axes = plot_layout(MANY, np.zeros((MANY.n_sites, 3)), ax=bare_axes())
+    (image,) = axes.images
+    assert isinstance(image, SiteImage)
+    axes.figure.draw_without_rendering()
+    first = image.pixels
+    image.recolour(colours_of(MANY, CHEQUERED == 0))
+    axes.figure.draw_without_rendering()
+    assert image.pixels is first
+    axes.set_xlim(0, 10)
+    axes.figure.draw_without_rendering()
+
+    assert image.pixels is not first
+
+
+@pytest.mark.parametrize("ending", ["pdf", "svg"])
+def test_an_image_can_stand_in_a_file_of_vectors(tmp_path, ending):
+    save_figure(plot_layout(MANY, "row", figure_inches=3.0).figure, tmp_path / f"plot.{ending}")
+
+    assert (tmp_path / f"plot.{ending}").stat().st_size > 5000
+
+
+# -- what is told beside the sites ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("layout", [LAYOUT, MANY], ids=["outlines", "image"])
+@pytest.mark.parametrize("is_drawn", [False, True])
+def test_the_site_under_the_mouse_is_told_with_its_size_and_value(layout, is_drawn):
+    axes = layout.plot(np.arange(layout.n_sites) * 1.5, label="charge / e-")
+    if is_drawn:
+        axes.figure.draw_without_rendering()
+        assert all(image.pixels is not None for image in axes.images)
+    site = layout.n_sites - 1
+    x, y = layout.centroid_um[site]
+
+    size_um = {2: "4", 4096: "2"}[layout.n_sites]
+    assert axes.format_coord(x, y).endswith(f": site {site}, size {size_um} µm, charge {site * 1.5:g} e-")
+    assert axes.format_coord(x + 1000.0, y) == f"x = {x + 1000.0:.6g} µm, y = {y:.6g} µm"
+
+
+@pytest.mark.parametrize(
+    ("limit_um", "expected_um"),
+    [(0.7, 0.5), (1.0, 1.0), (1.99, 1.0), (2.0, 2.0), (4.9, 2.0), (50.0, 50.0), (999.0, 500.0), (2e4, 2e4)],
+)
+def test_a_scale_bar_is_one_two_or_five(limit_um, expected_um):
+    assert nice_length_um(limit_um) == pytest.approx(expected_um, rel=1e-12)
+
+
+@pytest.mark.parametrize(("length_um", "text"), [(0.2, "200 nm"), (1.0, "1 µm"), (500.0, "500 µm"), (5000.0, "5 mm")])
+def test_a_scale_bar_has_the_unit_that_suits_it(length_um, text):
+    assert length_text(length_um) == text
+
+
+@pytest.mark.parametrize("zoom", [1.0, 0.1, 0.013])
+def test_a_scale_bar_is_as_long_as_it_says(tmp_path, zoom):
+    axes = plot_layout(MANY, np.ones((MANY.n_sites, 3)), ax=bare_axes(6, 6))
+    axes.set_xlim(-64.0 * zoom, 64.0 * zoom)
+    axes.set_ylim(-64.0 * zoom, 64.0 * zoom)
+    picture = drawn(axes, tmp_path)
+    rows = np.all(picture == 0, axis=-1)
+    length_px = rows.sum(axis=1).max()
+
+    assert length_px * 128.0 * zoom / 600 == pytest.approx(nice_length_um(32.0 * zoom), rel=0.02)
+
+
+def test_a_colour_bar_has_the_unit_and_the_range_and_a_legend_the_kinds():
+    layout = fs.layout.mosaic(fs.layout.log_polar(n_sectors=8, min_size_um=1.0, r_max_um=9.0), ("RG", "GB"))
+    sized = layout.plot("area_um2")
+    (bar,) = [axes for axes in sized.figure.axes if axes is not sized]
+    assert bar.get_ylabel() == "area / µm²"
+    assert bar.get_ylim() == pytest.approx((layout.area_um2.min(), layout.area_um2.max()))
+
+    kinds = layout.plot("channel")
+    assert len(kinds.figure.axes) == 1
+    assert kinds.get_legend().get_title().get_text() == "filter"
+    assert [text.get_text() for text in kinds.get_legend().get_texts()] == ["R", "G", "B"]
+
+    lines = layout.with_columns(readout_line=np.arange(layout.n_sites)).plot("readout_line")
+    assert lines.get_title() == f"readout line: {layout.n_sites} in 10 colours"
+
+
+def test_readout_lines_pass_through_the_centres_in_their_order():
+    layout = fs.layout.readout_by(fs.layout.grid(n_x=3, n_y=4, pitch_um=2.0), "column")
+    axes = layout.plot(overlay="readout_lines")
+    lines = axes.collections[1].get_segments()
+
+    assert len(lines) == 3
+    assert [line.tolist() for line in lines] == [[[x, y] for y in (-3, -1, 1, 3)] for x in (-2, 0, 2)]
+    assert axes.collections[2].get_offsets().tolist() == [[x, -3] for x in (-2, 0, 2)]
+
+
+def test_adjacency_is_a_line_for_each_shared_edge():
+    axes = fs.layout.grid(n_x=3, n_y=4, pitch_um=2.0).plot(overlay=["adjacency"])
+    segments = np.array(axes.collections[1].get_segments())
+
+    assert segments.shape == (2 * 4 + 3 * 3, 2, 2)
+    assert np.allclose(np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1), 2.0)
+
+
+# -- colours -------------------------------------------------------------------------------------------------------
+
+
+def test_a_mosaic_is_drawn_in_the_colours_of_its_filters(mosaic_capture):
+    axes = mosaic_capture.plot()
     colours = axes.collections[0].get_facecolor()[:, :3]
 
     # The filter's own colour is the strongest of the three.
-    assert np.array_equal(colours.argmax(axis=1), layout.channel)
+    assert np.array_equal(colours.argmax(axis=1), mosaic_capture.layout.channel)
+    assert np.array_equal(
+        site_colours(mosaic_capture, "channel"), [FILTER_COLOURS["RGB"[c]] for c in mosaic_capture.layout.channel]
+    )
+    (bar,) = [other for other in axes.figure.axes if other is not axes]
+    assert bar.get_ylabel() == "code / DN"
+    assert bar.get_ylim() == (0.0, mosaic_capture.code.max())
+
+
+def test_the_brightest_site_of_a_mosaic_has_its_filters_colour(mosaic_capture):
+    brightest = int(mosaic_capture.electrons.argmax())
+
+    expected = FILTER_COLOURS["RGB"[mosaic_capture.layout.channel[brightest]]]
+    assert tuple(site_colours(mosaic_capture, "electrons")[brightest]) == expected
+
+
+def test_values_rise_through_the_colour_map_and_no_data_is_none_of_it():
+    layout = fs.layout.grid(n_x=256, n_y=1, pitch_um=1.0)
+    values = np.arange(256.0)
+    values[7] = np.nan
+    rgb = site_colours(layout, values).astype(int)
+    luminance = np.delete(rgb @ [2126, 7152, 722], 7)
+
+    assert np.all(np.diff(luminance) >= -7152)  # a byte's step: colours are rounded
+    assert luminance[-1] > luminance[0] + 1_000_000
+    assert tuple(rgb[7]) == NO_DATA
+    assert np.abs(np.delete(rgb, 7, axis=0) - NO_DATA).sum(axis=1).min() > 60
+
+
+def test_equal_values_have_one_colour_and_a_scale_of_some_length():
+    shown = colours_of(MANY, np.full(MANY.n_sites, 3.0))
+
+    assert np.unique(shown.rgb, axis=0).shape == (1, 3)
+    assert (shown.scale.low, shown.scale.high) == (2.5, 3.5)
+    assert np.all(colours_of(MANY, np.full(MANY.n_sites, np.nan)).rgb == NO_DATA)
+
+
+@pytest.mark.parametrize(
+    ("values", "names"),
+    [
+        (np.arange(6) % 2 == 0, ["False", "True"]),
+        (np.array(list("abcabc")), ["a", "b", "c"]),
+        (np.array([3, 3, 5, 5, 3, 3]), ["3", "5"]),
+    ],
+    ids=["truth", "text", "numbers"],
+)
+def test_kinds_have_a_colour_each_which_the_legend_names(values, names):
+    layout = fs.layout.grid(n_x=6, n_y=1, pitch_um=1.0).with_columns(kind=values)
+    shown = colours_of(layout, "kind")
+    legend = dict(shown.legend)
+
+    assert list(legend) == names
+    assert len(set(legend.values())) == len(names)
+    assert [tuple(c) for c in shown.rgb.tolist()] == [legend[str(v)] for v in values]
+    assert shown.scale is None
+
+
+def test_a_readout_line_has_the_colour_of_its_number_in_any_part_of_a_layout():
+    layout = fs.layout.readout_by(fs.layout.grid(n_x=30, n_y=2, pitch_um=1.0), "column")
+
+    rgb = site_colours(layout, "readout_line")
+    assert np.array_equal(site_colours(layout[layout.readout_line > 11], "readout_line"), rgb[layout.readout_line > 11])
+    assert np.array_equal(rgb, np.array(CATEGORY_COLOURS)[layout.readout_line % 10])
+
+
+def test_neighbours_of_a_bare_layout_mostly_differ():
+    rgb = site_colours(fs.layout.grid(n_x=50, n_y=40, pitch_um=1.0)).reshape(40, 50, 3).astype(int)
+
+    # Five shades without any order: 4 of 5 pairs differ.
+    assert np.any(np.diff(rgb, axis=1), axis=-1).mean() > 0.75
+    assert np.any(np.diff(rgb, axis=0), axis=-1).mean() > 0.75
+
+
+# -- design rules --------------------------------------------------------------------------------------------------
+
+
+def test_a_report_is_drawn_with_every_violation_in_its_place():
+    layout = fs.Layout.from_rectangles([[0, 0], [10, 0], [10.5, 6], [20, 0]], [[4, 4], [0.5, 4], [4, 4], [1, 1]])
+    rules = fs.DesignRules(min_width_um=0.8, min_size_um=1.8, max_sites=3, waivers={"min_size_um": "test pixels"})
+    report = layout.check(rules)
+    axes = report.plot(layout)
+    by_label = {c.get_label(): c for c in axes.collections if not c.get_label().startswith("_")}
+
+    assert list(by_label) == [str(result) for result in report.results if len(result)]
+    for result in report.results:
+        if len(result):
+            places = [record for record in report.records() if record["rule"] == result.rule]
+            offsets = np.asarray(by_label[str(result)].get_offsets())
+            assert np.allclose(offsets, [[p["x_um"], p["y_um"]] for p in places])
+    colours = {tuple(c.get_edgecolor()[0]) for c in by_label.values()}
+    assert len(colours) == len(by_label)
+    texts = {text.get_text() for text in axes.texts}
+    assert {"0.5 µm", "1 µm", "1.41 µm"} <= texts
+    assert axes.get_title() == "4 violations on 4 photosites, 0 of 3 rules kept"
+    waived = next(c for label, c in by_label.items() if "waived" in label)
+    assert waived.get_linestyle()[0][1] is not None
+
+
+def test_a_report_without_a_layout_shows_the_places_alone():
+    report = LAYOUT.check(fs.DesignRules(min_width_um=3.0))
+    axes = plot_report(report)
+
+    assert len(report.violations) == 2
+    x, y = np.asarray([[r["x_um"], r["y_um"]] for r in report.records()]).T
+    assert axes.get_xlim()[0] < x.min() <= x.max() < axes.get_xlim()[1]
+    assert axes.get_ylim()[0] < y.min() <= y.max() < axes.get_ylim()[1]
+    with pytest.raises(ParameterError, match="'layout' must be the one that was checked, of 2 sites"):
+        report.plot(MANY)
+
+
+def test_a_report_of_a_sound_layout_says_so(tmp_path):
+    axes = LAYOUT.check(fs.DesignRules(min_size_um=1.0)).plot(LAYOUT)
+
+    assert axes.get_title() == "0 violations on 2 photosites, 1 of 1 rules kept"
+    assert axes.get_legend() is None
+    save_figure(axes.figure, tmp_path / "report.png", dpi=50)
+
+
+def test_of_too_many_violations_the_worst_are_drawn_and_the_legend_says_so(tmp_path):
+    report = MANY.check(fs.DesignRules(min_size_um=3.0))
+    axes = report.plot(MANY)
+
+    circles = axes.collections[-1]
+    assert len(circles.get_offsets()) == 2000 < len(report.violations) == 4096
+    assert circles.get_label().endswith("(the worst 2,000 are drawn)")
+    assert not axes.texts
+    save_figure(axes.figure, tmp_path / "report.png", dpi=50)
+
+
+# -- drawings ------------------------------------------------------------------------------------------------------
+
+
+def test_a_drawing_has_a_path_a_site_in_the_colours_of_the_plot(tmp_path, mosaic_capture):
+    save_drawing(mosaic_capture, tmp_path / "capture.svg", "electrons")
+    paths = list(ET.parse(tmp_path / "capture.svg").iter("{http://www.w3.org/2000/svg}path"))
+
+    assert [path.get("fill") for path in paths] == [
+        "#" + bytes(rgb.tolist()).hex() for rgb in site_colours(mosaic_capture, "electrons")
+    ]
+    x0, y0, *_ = mosaic_capture.layout.xy_um[0]
+    assert re.match(rf"M{x0:.4f} {y0:.4f}L", paths[0].get("d"))
+
+
+def test_a_drawing_of_too_many_sites_is_refused_and_leaves_nothing(tmp_path):
+    with pytest.raises(ParameterError, match="'data' must have at most 20,000 sites for a drawing, got 20,022"):
+        save_drawing(fs.layout.grid(n_x=142, n_y=141, pitch_um=1.0), tmp_path / "layout.svg")
+    with pytest.raises(FileError, match=r"must end in \.svg"):
+        save_drawing(LAYOUT, tmp_path / "layout.png")
+
+    assert not list(tmp_path.iterdir())
+
+
+# -- what is refused -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"values": 3.0}, "'values' must have one row for each of the 2 sites"),
-        ({"values": np.ones(3)}, "'values' must have one row for each of the 2 sites"),
-        ({"colours": np.ones((5, 3))}, "'colours' must have one row for each of the 2 sites"),
-        ({"values": np.array([1.0, np.nan])}, "'values' must be finite everywhere"),
+        ({"by": 3.0}, "'by' must have one row for each of the 2 sites"),
+        ({"by": np.ones(3)}, "'by' must have one row for each of the 2 sites"),
+        ({"by": np.ones((5, 3))}, "'by' must have one row for each of the 2 sites"),
+        ({"by": np.ones((2, 4))}, "'by' must have one row for each of the 2 sites"),
+        ({"by": [[1.0], [1.0, 2.0]]}, "'by' must be one value for each site"),
+        ({"by": [1j, 2.0]}, "'by' must be an array of numbers"),
+        ({"by": np.array([1.0, np.inf])}, "'by' must be finite everywhere, or NaN"),
+        ({"by": np.full((2, 3), np.nan)}, "'by' must be finite everywhere"),
+        ({"by": "code"}, "'by' must be one of area_um2, channel, readout_line, size_um, or an array, got 'code'"),
+        ({"overlay": "lines"}, "'overlay' must be one of 'readout_lines', 'adjacency'"),
+        ({"overlay": "readout_lines"}, "'readout_line' must be a column of the layout"),
     ],
 )
-def test_values_that_do_not_fit_are_refused(arguments, message):
+def test_what_cannot_be_drawn_is_refused(arguments, message):
     with pytest.raises(ParameterError, match=message):
         plot_layout(LAYOUT, **arguments)
+
+
+def test_adjacency_of_too_many_sites_is_refused():
+    with pytest.raises(ParameterError, match="'adjacency' is for at most 50,000 sites, got 50,176"):
+        plot_layout(fs.layout.grid(n_x=224, n_y=224, pitch_um=1.0), overlay="adjacency")
+
+
+def test_only_layouts_and_captures_have_sites_to_colour():
+    with pytest.raises(ParameterError, match="'data' must be a Layout or a Capture, got a dict"):
+        colours_of({})
 
 
 def test_an_unknown_format_is_refused_and_leaves_nothing(tmp_path):

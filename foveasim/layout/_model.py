@@ -18,6 +18,7 @@ from foveasim.errors import GeometryError, ParameterError
 from foveasim.rings import next_vertex, positions_in_runs, ring_moments, ring_spread_um2, site_bounds_um, site_moments
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from pyvista import PolyData  # noqa: TID251 -- a type alone
     from scipy.sparse import csr_array
 
@@ -439,6 +440,12 @@ class Layout:
         from foveasim.view import polydata
 
         return polydata(self)
+
+    def plot(self, by: str | ArrayLike | None = None, **options: Any) -> Axes:
+        """Draw the layout on matplotlib axes, coloured by a column or an array; see :func:`foveasim.view.plot_layout`."""
+        from foveasim.view import plot_layout
+
+        return plot_layout(self, by, **options)
 
     # -- neighbours ----------------------------------------------------------------------------------------------
 

@@ -23,6 +23,7 @@ from foveasim.layout.presets import PRESETS
 from foveasim.layout.routing import Readout, Routing
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from rich.table import Table
 
 __all__ = ["RULES", "DesignRules", "Report", "RuleResult", "Violation", "check", "min_width_um"]
@@ -321,6 +322,12 @@ class Report:
             }
             for violation in self.violations
         ]
+
+    def plot(self, layout: Layout | None = None, **options: Any) -> Axes:
+        """Draw the places where rules are broken, on the layout that was checked; see :func:`foveasim.view.plot_report`."""
+        from foveasim.view import plot_report
+
+        return plot_report(self, layout, **options)
 
     def write(self, path: str | Path) -> None:
         """Write a KLayout report database (``.lyrdb``); see :func:`foveasim.layout.lyrdb.write_lyrdb`."""

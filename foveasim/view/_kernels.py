@@ -10,7 +10,7 @@ __all__ = ["blended", "paint_sites", "rows_of_sites"]
 _ints = types.Array(types.int64, 1, "C", readonly=True)
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 _points = types.Array(types.float64, 2, "C", readonly=True)
-_rows = types.Array(types.int32, 2, "C", readonly=True)
+_ids = types.Array(types.int32, 2, "C", readonly=True)
 _colours = types.Array(types.uint8, 2, "C", readonly=True)
 
 
@@ -61,7 +61,7 @@ def rows_of_sites(xy, starts, x, y, first, rows):
 
 
 @njit(
-    types.void(_points, _ints, _ints, _rows, _floats, _floats, types.int64, types.int32[:, ::1]), cache=True, nogil=True
+    types.void(_points, _ints, _ints, _ids, _floats, _floats, types.int64, types.int32[:, ::1]), cache=True, nogil=True
 )
 def paint_sites(xy, ring_offsets, site_offsets, rows, x, y, first_row, ids):
     """
@@ -108,23 +108,31 @@ def paint_sites(xy, ring_offsets, site_offsets, rows, x, y, first_row, ids):
 
 
 @njit(
-    types.void(types.Array(types.int32, 2, "C", readonly=True), _colours, types.int64, types.uint8[:, :, ::1]),
-    cache=True,
-    nogil=True,
+    types.void(_ids, _colours, types.int64, types.boolean, types.int64, types.uint8[:, :, ::1]), cache=True, nogil=True
 )
-def blended(ids, colours, n_samples, picture):
-    """Mean colour of the ``n_samples`` x ``n_samples`` samples of each pixel; ``colours[i + 1]`` is that of site i."""
-    n_y, n_x = picture.shape[:2]
-    n = n_samples * n_samples
-    for row in range(n_y):
-        for column in range(n_x):
-            red, green, blue = n // 2, n // 2, n // 2
-            for i in range(row * n_samples, (row + 1) * n_samples):
+def blended(ids, colours, n_samples, has_borders, first_row, band):
+    """
+    Mean colour of the ``n_samples`` x ``n_samples`` samples of each pixel of a band of rows: red, green, blue, alpha.
+
+    ``colours[i + 1]`` (red, green, blue, weight) is that of site i, ``colours[0]`` that of no site, and the last one, where
+    asked for, that of samples whose left or lower neighbour shows another site. Weights are 0 or 255: alpha is their mean.
+    """
+    border = colours.shape[0] - 1
+    for row in range(band.shape[0]):
+        for column in range(band.shape[1]):
+            red, green, blue, n = 0, 0, 0, 0
+            for i in range((first_row + row) * n_samples, (first_row + row + 1) * n_samples):
                 for j in range(column * n_samples, (column + 1) * n_samples):
                     k = ids[i, j] + 1
-                    red += colours[k, 0]
-                    green += colours[k, 1]
-                    blue += colours[k, 2]
-            picture[row, column, 0] = red // n
-            picture[row, column, 1] = green // n
-            picture[row, column, 2] = blue // n
+                    if has_borders and (ids[i, max(j - 1, 0)] != k - 1 or ids[max(i - 1, 0), j] != k - 1):
+                        k = border
+                    if colours[k, 3] != 0:
+                        red += colours[k, 0]
+                        green += colours[k, 1]
+                        blue += colours[k, 2]
+                        n += 1
+            half, whole = n // 2, max(n, 1)
+            band[row, column, 0] = (red + half) // whole
+            band[row, column, 1] = (green + half) // whole
+            band[row, column, 2] = (blue + half) // whole
+            band[row, column, 3] = (255 * n + n_samples * n_samples // 2) // (n_samples * n_samples)

@@ -146,7 +146,12 @@ class SitePixels:
         return n_y // self.n_samples, n_x // self.n_samples
 
     def picture(
-        self, rgb: NDArray[np.uint8], *, background: Rgb = BACKGROUND, n_threads: int | None = None
+        self,
+        rgb: NDArray[np.uint8],
+        *,
+        background: Rgb | None = BACKGROUND,
+        border: Rgb | None = None,
+        n_threads: int | None = None,
     ) -> NDArray[np.uint8]:
         """
         The picture in which each site has a colour.
@@ -155,16 +160,19 @@ class SitePixels:
         ----------
         rgb : (n_site, 3) uint8
             From :func:`foveasim.view.site_colours`.
-        background : (r, g, b)
-            Colour of what no site covers.
+        background : (r, g, b) or None
+            Colour of what no site covers; None for none.
+        border : (r, g, b), optional
+            Colour of lines, one sample wide, where one site ends and another begins.
         n_threads : int, optional
             All cores by default.
 
         Returns
         -------
-        picture : (n_y, n_x, 3) uint8
-            Row 0 is the lowest y. A pixel is the mean of its samples' numbers as they are: on a grey scale, and nearly so
-            on another, the mean of the values; drawings by outlines are smoothed the same way.
+        picture : (n_y, n_x, 3) uint8, or (n_y, n_x, 4) without a background
+            Red, green, blue, and the share that sites cover as alpha; row 0 is the lowest y. A pixel is the mean of its
+            samples' numbers as they are: on a grey scale, and nearly so on another, the mean of the values. Drawings by
+            outlines are smoothed the same way.
 
         Raises
         ------
@@ -177,17 +185,18 @@ class SitePixels:
             raise ParameterError(
                 "rgb", f"must be bytes of the shape (n_site, 3), n_site > {highest}, got {rgb.dtype} of {rgb.shape}"
             )
-        colours = np.concatenate((np.array([background], np.uint8), rgb))
-        picture = np.empty((*self.shape, 3), np.uint8)
+        table = np.full((rgb.shape[0] + 2, 4), 255, np.uint8)
+        table[0] = (0, 0, 0, 0) if background is None else (*background, 255)
+        table[1:-1, :3] = rgb
+        table[-1, :3] = border or 0
+        picture = np.empty((*self.shape, 4), np.uint8)
         n, n_threads = self.n_samples, thread_count(n_threads)
 
         def blend(rows: slice) -> None:
-            kernels("view").blended(
-                self.ids[rows.start * n : rows.stop * n], colours, n, picture[rows.start : rows.stop]
-            )
+            kernels("view").blended(self.ids, table, n, border is not None, rows.start, picture[rows])
 
         each(blend, _bands(self.shape[0], n_threads), n_threads)
-        return picture
+        return picture if background is None else picture[..., :3]
 
     def site_at(self, x_um: ArrayLike, y_um: ArrayLike) -> NDArray[np.int32]:
         """The site of the sample nearest to each point, (...) int32; -1 where there is none, or beyond the picture."""

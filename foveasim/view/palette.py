@@ -16,12 +16,14 @@ from foveasim.layout import Layout
 
 __all__ = [
     "BACKGROUND",
+    "BORDER",
     "CATEGORY_COLOURS",
     "FILTER_COLOURS",
     "NO_DATA",
     "ColourScale",
     "SiteColours",
     "colours_of",
+    "shares",
     "site_colours",
 ]
 
@@ -36,7 +38,7 @@ FILTER_COLOURS: Mapping[str, Rgb] = {
 }  # fmt: skip
 #: Names of the channels of a layout that no sensor has given filters yet: the order of :func:`foveasim.layout.mosaic`.
 CHANNEL_NAMES = "RGBW"
-#: Colours of things that differ in kind: easily told apart, also by people who confuse red and green, for the first six.
+#: Colours of things that differ in kind, of middling brightness: lines and text can lie on them.
 CATEGORY_COLOURS: tuple[Rgb, ...] = (
     (86, 140, 200), (236, 160, 60), (70, 165, 130), (205, 95, 80), (150, 120, 190),
     (130, 195, 225), (190, 180, 70), (225, 145, 185), (140, 110, 90), (150, 155, 160),
@@ -45,6 +47,8 @@ CATEGORY_COLOURS: tuple[Rgb, ...] = (
 SHADES: tuple[Rgb, ...] = ((222, 226, 232), (202, 209, 218), (232, 228, 219), (212, 219, 212), (236, 236, 238))
 #: What no photosite covers is neither black nor white.
 BACKGROUND: Rgb = (185, 196, 214)
+#: Lines between sites.
+BORDER: Rgb = (64, 64, 64)
 #: Sites without a value (NaN): a colour of none of the colour maps in use.
 NO_DATA: Rgb = (217, 140, 150)
 #: What was measured is shown as a photograph; what is known of a site in a map of even steps, also to the colour-blind.
@@ -95,6 +99,8 @@ class SiteColours:
         For a colour bar, when values are sizes.
     legend : tuple of (str, (r, g, b))
         Names of colours, when values are kinds; empty when there are too many.
+    has_borders : bool
+        Whether sites are to be set off from each other: not in a photograph, nor where the colours are given.
     """
 
     rgb: RgbArray
@@ -102,6 +108,13 @@ class SiteColours:
     values: NDArray[Any] | None = None
     scale: ColourScale | None = None
     legend: tuple[tuple[str, Rgb], ...] = ()
+    has_borders: bool = True
+
+
+def shares(rgb: Rgb, factor: float = 1.0) -> tuple[float, float, float]:
+    """A colour by numbers from 0 to 1, as matplotlib has them, times a factor that makes it darker."""
+    red, green, blue = (factor * c / 255.0 for c in rgb)
+    return red, green, blue
 
 
 def site_colours(data: Layout | Capture, by: str | ArrayLike | None = None) -> RgbArray:
@@ -194,8 +207,8 @@ def _of_array(by: ArrayLike, n_sites: int, label: str) -> SiteColours:
         raise ParameterError("by", f"must have one row for each of the {n_sites} sites, got {array.shape}")
     if array.ndim == 2:
         is_bytes = array.dtype == np.uint8
-        shares = array / 255.0 if is_bytes else np.clip(finite_array("by", array), 0.0, 1.0)
-        return SiteColours(np.rint(255.0 * shares).astype(np.uint8), label)
+        given = array / 255.0 if is_bytes else np.clip(finite_array("by", array), 0.0, 1.0)
+        return SiteColours(np.rint(255.0 * given).astype(np.uint8), label, has_borders=False)
     if array.dtype.kind == "U" or _is_kind(array):
         return _kinds(array, label)
     return _sizes(as_numbers("by", array), label, EVEN_STEPS)
@@ -209,7 +222,7 @@ def _photograph(capture: Capture, values: Floats, title: str) -> SiteColours:
     high = max(float(values.max(initial=0.0)), 1.0)
     bright = base[capture.filter_of_site] * ((values / high) ** DISPLAY_GAMMA)[:, np.newaxis]
     scale = ColourScale(0.0, high, PHOTOGRAPH, DISPLAY_GAMMA)
-    return SiteColours(np.rint(bright).astype(np.uint8), title, values, scale)
+    return SiteColours(np.rint(bright).astype(np.uint8), title, values, scale, has_borders=False)
 
 
 def _channel_names(layout: Layout) -> tuple[str, ...]:
@@ -266,10 +279,13 @@ def _sizes(values: Floats, title: str, colour_map: str) -> SiteColours:
     table = np.concatenate((table, np.array([NO_DATA], np.uint8)))
     with np.errstate(invalid="ignore"):
         step = np.where(is_known, np.clip((values - low) * (256.0 / (high - low)), 0.0, 255.0), 256.0)
-    return SiteColours(table[step.astype(np.int64)], title, values, ColourScale(low, high, colour_map))
+    scale = ColourScale(low, high, colour_map)
+    return SiteColours(table[step.astype(np.int64)], title, values, scale, has_borders=colour_map != PHOTOGRAPH)
 
 
 def _strewn(n: int, n_kinds: int) -> Ints:
-    """Numbers below ``n_kinds`` for n things in a row, such that any two near each other mostly differ."""
-    golden = 0.6180339887498949
-    return np.asarray((np.arange(n) * golden % 1.0 * n_kinds).astype(np.int64))
+    """Numbers below ``n_kinds`` that look thrown, the same at each call: the last steps of Murmur's hash of the positions."""
+    mixed = np.arange(n, dtype=np.uint64)
+    for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35), (16, 1)):
+        mixed = ((mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)) & np.uint64(0xFFFFFFFF)
+    return (mixed % np.uint64(n_kinds)).astype(np.int64)

@@ -2,38 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, check_choice, finite_array
+from foveasim.arrays import Floats, check_choice
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
 from foveasim.files import written_whole
-from foveasim.layout import Layout
+from foveasim.layout import Layout, readout_order
+from foveasim.view.id_map import site_at
+from foveasim.view.palette import BACKGROUND, BORDER, CATEGORY_COLOURS, SiteColours, colours_of, shares
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.collections import Collection
     from matplotlib.figure import Figure
 
-__all__ = ["plot_capture", "plot_layout", "plot_noise_budget", "save_figure"]
+__all__ = ["plot_capture", "plot_layout", "plot_noise_budget", "save_drawing", "save_figure"]
 
-#: Colours of filters by their names; others take matplotlib's cycle.
-FILTER_COLOURS = {"R": (1.0, 0.25, 0.2), "G": (0.3, 0.9, 0.3), "B": (0.3, 0.45, 1.0), "all": (1.0, 1.0, 1.0)}
-#: Codes are raised to this power before they scale a colour, so that dark sites can be told apart.
-DISPLAY_GAMMA = 1.0 / 2.2
+#: Layouts of more sites are drawn as an image, which takes less time than their outlines.
+MOST_OUTLINES = 3000
+#: Layouts of more sites are not drawn with their adjacency: nobody could see it, and finding it takes long.
+MOST_ADJACENT = 50_000
+#: Drawings of more sites are slow to open everywhere.
+MOST_DRAWN = 20_000
+#: Least share of a figure's shorter side in its longer one: axes, texts and bars need room.
+SLIMMEST = 0.4
+#: Readout lines are as much darker than the colours that their sites may have.
+LINE_BRIGHTNESS = 0.55
 
 
 def plot_layout(
     layout: Layout,
-    values: Floats | None = None,
+    by: str | ArrayLike | None = None,
     *,
     label: str = "",
-    colours: Floats | None = None,
+    overlay: str | Sequence[str] = (),
+    scale_bar: bool = True,
     ax: Axes | None = None,
     figure_inches: float = 8.0,
 ) -> Axes:
@@ -43,82 +53,72 @@ def plot_layout(
     Parameters
     ----------
     layout : Layout
-    values : (n_site,), optional
-        Shown in a colour map with a colour bar.
+    by : str or array, optional
+        ``"channel"``, ``"area_um2"``, ``"size_um"``, ``"readout_line"`` or any other column; one value a site, NaN where
+        there is none; or a colour a site (n_site, 3). The bare shapes by default. See :func:`foveasim.view.colours_of`.
     label : str
-        Of the colour bar, with its unit.
-    colours : (n_site, 3), optional
-        Red, green, blue from 0 to 1, in the place of values.
+        What an array holds, with its unit.
+    overlay : str or sequence of str
+        ``"readout_lines"``: a line through the centres of the sites in the order in which they are read, from a dot.
+        ``"adjacency"``: a line between the centres of any two sites that share an edge.
+    scale_bar : bool
+        Whether a bar tells a length.
     ax : matplotlib axes, optional
         New ones by default.
     figure_inches : float
-        Side of a new figure.
+        Longer side of a new figure.
 
     Returns
     -------
     matplotlib axes
-        In µm, x to the right and y up.
+        In µm, x to the right and y up. In a window, the site under the mouse is told.
 
     Raises
     ------
     ParameterError
-        When the arrays do not have one row a site.
+        When there is no such column, the array has not one row a site, or the layout is no such that could be overlaid.
+
+    Notes
+    -----
+    Up to 3,000 sites are outlines, which stay outlines in a file of vectors. More are an image, painted for the pixels
+    there are: again after each zoom, and at the resolution of the file that is saved. Its borders are smoothed by 3 x 3
+    samples a pixel.
     """
-    from matplotlib.figure import Figure
-
-    if ax is None:
-        ax = Figure(figsize=(figure_inches, figure_inches), layout="constrained").add_subplot()
-    for name, array in (("values", values), ("colours", colours)):
-        if array is not None and np.shape(array)[:1] != (layout.n_sites,):
-            raise ParameterError(
-                name, f"must have one row for each of the {layout.n_sites} sites, got {np.shape(array)}"
-            )
-    sites = _outlines(layout)
-    if colours is not None:
-        sites.set_facecolor([tuple(c) for c in np.clip(finite_array("colours", colours, ndim=2), 0.0, 1.0)])
-    elif values is not None:
-        sites.set_array(finite_array("values", values, ndim=1))
-        sites.set_cmap("gray")
-    else:
-        sites.set_facecolor("none")
-        sites.set_edgecolor("black")
-    ax.add_collection(sites)
-    if values is not None and colours is None:
-        ax.figure.colorbar(sites, ax=ax, label=label, shrink=0.8)
-    x_min, y_min, x_max, y_max = layout.bounds_um
-    ax.set_xlim(x_min, x_max)
-    ax.set_ylim(y_min, y_max)
-    ax.set_aspect("equal")
-    ax.set_facecolor("#b9c4d6")  # what no photosite covers is neither black nor white
-    ax.set_xlabel("x / µm")
-    ax.set_ylabel("y / µm")
-    return ax
+    return _plot(layout, colours_of(layout, by, label=label), overlay, scale_bar, ax, figure_inches)
 
 
-def plot_capture(capture: Capture, *, of: str = "code", ax: Axes | None = None) -> Axes:
+def plot_capture(
+    capture: Capture,
+    by: str | ArrayLike = "code",
+    *,
+    label: str = "",
+    overlay: str | Sequence[str] = (),
+    scale_bar: bool = True,
+    ax: Axes | None = None,
+    figure_inches: float = 8.0,
+) -> Axes:
     """
     Draw the photosites of a capture, coloured by what they measured.
 
     Parameters
     ----------
     capture : Capture
-    of : {"code", "electrons", "expected_e"}
-    ax : matplotlib axes, optional
-        New ones by default.
+    by : str or array
+        ``"code"``, ``"electrons"``, ``"expected_e"``, or what :func:`plot_layout` takes.
+    label, overlay, scale_bar, ax, figure_inches
+        As for :func:`plot_layout`.
 
     Returns
     -------
     matplotlib axes
         On a colour mosaic each site has its filter's colour, as bright as its value.
+
+    Raises
+    ------
+    ParameterError
+        As for :func:`plot_layout`.
     """
-    check_choice("of", of, ("code", "electrons", "expected_e"))
-    values = np.asarray(getattr(capture, of), dtype=np.float64)
-    unit = "DN" if of == "code" else "e-"
-    if len(capture.filter_names) == 1:
-        return plot_layout(capture.layout, values, label=f"{of} / {unit}", ax=ax)
-    base = np.array([FILTER_COLOURS.get(name, (1.0, 1.0, 1.0)) for name in capture.filter_names])
-    share = (values / max(float(values.max(initial=0.0)), 1.0)) ** DISPLAY_GAMMA
-    return plot_layout(capture.layout, colours=base[capture.filter_of_site] * share[:, np.newaxis], ax=ax)
+    return _plot(capture.layout, colours_of(capture, by, label=label), overlay, scale_bar, ax, figure_inches)
 
 
 def plot_noise_budget(
@@ -184,12 +184,130 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = 150.0) -> None:
             raise FileError(path, f"cannot be written in this format: {' '.join(str(error).split())}") from None
 
 
-def _outlines(layout: Layout) -> Collection:
+def save_drawing(data: Layout | Capture, path: str | Path, by: str | ArrayLike | None = None) -> None:
+    """
+    Write a layout or a capture as a drawing in the format SVG: one path a site, in µm, without axes.
+
+    Parameters
+    ----------
+    data : Layout or Capture
+    path : str or Path
+        Ends in ``.svg``.
+    by : str or array, optional
+        What the colours show; see :func:`foveasim.view.colours_of`.
+
+    Raises
+    ------
+    ParameterError
+        When there are more than 20,000 sites.
+    FileError
+        When the path ends in something else, or nothing can be written there.
+    """
+    layout = data.layout if isinstance(data, Capture) else data
+    rgb = colours_of(data, by).rgb
+    if Path(path).suffix.lower() != ".svg":
+        raise FileError(path, "must end in .svg")
+    if layout.n_sites > MOST_DRAWN:
+        raise ParameterError(
+            "data",
+            f"must have at most {MOST_DRAWN:,} sites for a drawing, got {layout.n_sites:,}",
+            cure="save a picture with save_figure, or a part of the layout",
+        )
+    colours, position = np.unique(rgb, axis=0, return_inverse=True)
+    names = {k: "#{:02x}{:02x}{:02x}".format(*colour) for k, colour in enumerate(colours.tolist())}
+    layout.with_columns(channel=position.ravel()).write(path, colours=names)
+
+
+def new_axes(figure_inches: float, ratio: float = 1.0) -> Axes:
+    """Axes of their own for what is ``ratio`` times as high as wide, on a figure whose longer side is given."""
+    from matplotlib.figure import Figure
+
+    width, height = max(SLIMMEST, min(1.0, 1.0 / ratio)), max(SLIMMEST, min(1.0, ratio))
+    return Figure(figsize=(figure_inches * width, figure_inches * height), layout="constrained").add_subplot()
+
+
+def _plot(
+    layout: Layout,
+    colours: SiteColours,
+    overlay: str | Sequence[str],
+    scale_bar: bool,
+    ax: Axes | None,
+    figure_inches: float,
+) -> Axes:
+    from foveasim.view._artists import ScaleBar, SiteImage
+
+    overlays = [overlay] if isinstance(overlay, str) else overlay
+    draw_over = [OVERLAYS[check_choice("overlay", name, OVERLAYS)] for name in overlays]
+    x_min, y_min, x_max, y_max = layout.bounds_um
+    if ax is None:
+        ax = new_axes(figure_inches, (y_max - y_min) / (x_max - x_min))
+    find: Callable[[float, float], int] = partial(site_at, layout)
+    if layout.n_sites <= MOST_OUTLINES:
+        ax.add_collection(_coloured_outlines(layout, colours))
+    else:
+        image = SiteImage(ax, layout, colours)
+        ax.add_image(image)
+        image.set_clip_path(ax.patch)
+        find = image.site_at
+    for draw in draw_over:
+        draw(layout, ax)
+    if scale_bar:
+        ax.add_artist(ScaleBar())
+    ax.set_xlim(x_min, x_max)
+    ax.set_ylim(y_min, y_max)
+    ax.set_aspect("equal")
+    ax.set_facecolor(shares(BACKGROUND))
+    ax.set_xlabel("x / µm")
+    ax.set_ylabel("y / µm")
+    _explain(ax, colours)
+
+    def told(x: float, y: float) -> str:  # matplotlib calls with these names
+        return _told(layout, colours, x, y, find(x, y))
+
+    ax.format_coord = told  # type: ignore[method-assign]
+    return ax
+
+
+def _explain(ax: Axes, colours: SiteColours) -> None:
+    """A colour bar for sizes, a legend for kinds."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import PowerNorm
+    from matplotlib.patches import Patch
+
+    if colours.scale is not None:
+        scale = colours.scale
+        shown = ScalarMappable(PowerNorm(scale.gamma, scale.low, scale.high), scale.colour_map)
+        ax.figure.colorbar(shown, ax=ax, label=colours.title, shrink=0.8)
+    elif colours.legend:
+        patches = [Patch(facecolor=shares(rgb), edgecolor="0.4", label=name) for name, rgb in colours.legend]
+        ax.legend(handles=patches, title=colours.title or None, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    elif colours.values is not None:
+        n_kinds = np.unique(colours.values).size
+        ax.set_title(f"{colours.title or 'kind'}: {n_kinds} in {len(CATEGORY_COLOURS)} colours", fontsize="medium")
+
+
+def _told(layout: Layout, colours: SiteColours, x_um: float, y_um: float, site: int) -> str:
+    """What stands below a window for the point under the mouse."""
+    place = f"x = {x_um:.6g} µm, y = {y_um:.6g} µm"
+    if site < 0:
+        return place
+    size_um = float(np.sqrt(layout[[site]].area_um2[0]))
+    text = f"{place}: site {site}, size {size_um:.4g} µm"
+    if colours.values is None or colours.title == "size / µm":
+        return text
+    value = colours.values[site]
+    name, _, unit = colours.title.partition(" / ")
+    number = f"{value:.6g}" if colours.values.dtype.kind == "f" else str(value)
+    return f"{text}, {name or 'value'} {number}{' ' if unit else ''}{unit}"
+
+
+def _coloured_outlines(layout: Layout, colours: SiteColours) -> Collection:
     """All sites as one collection: polygons where none has a hole, which matplotlib draws faster, else paths."""
     from matplotlib.collections import PathCollection, PolyCollection
     from matplotlib.path import Path as Outline
 
-    style: dict[str, Any] = {"linewidths": 0.3, "edgecolors": "face"}
+    style: dict[str, Any] = {"facecolors": colours.rgb / 255.0, "linewidths": 0.3}
+    style["edgecolors"] = [shares(BORDER)] if colours.has_borders else "face"
     counts = np.diff(layout.ring_offsets)
     if counts.size == layout.n_sites:
         # One array where all have as many vertices: matplotlib's types know sequences only, its code takes both.
@@ -210,3 +328,42 @@ def _outlines(layout: Layout) -> Collection:
 
 def _closed(ring_um: Floats) -> Floats:
     return np.concatenate((ring_um, ring_um[:1]))
+
+
+def _draw_readout_lines(layout: Layout, ax: Axes) -> None:
+    """A line through the centres of the sites of each readout line, and a dot where it begins."""
+    from matplotlib.collections import LineCollection
+
+    line = layout.index_column("readout_line")
+    ordered = layout if "readout_order" in layout.columns else readout_order(layout)
+    order = np.lexsort((ordered.index_column("readout_order"), line))
+    starts = np.flatnonzero(np.diff(line[order], prepend=-1))
+    colours = [shares(CATEGORY_COLOURS[k % len(CATEGORY_COLOURS)], LINE_BRIGHTNESS) for k in line[order][starts]]
+    through_um = layout.centroid_um[order]
+    ax.add_collection(LineCollection(np.split(through_um, starts[1:]), colors=colours, linewidths=1.2))
+    ax.scatter(
+        through_um[starts, 0], through_um[starts, 1], s=20.0, c=colours, edgecolors="white", linewidths=0.6, zorder=3
+    )
+
+
+def _draw_adjacency(layout: Layout, ax: Axes) -> None:
+    """A line between the centres of any two sites that share an edge."""
+    from matplotlib.collections import LineCollection
+
+    if layout.n_sites > MOST_ADJACENT:
+        raise ParameterError(
+            "overlay",
+            f"'adjacency' is for at most {MOST_ADJACENT:,} sites, got {layout.n_sites:,}",
+            cure="draw a part of the layout",
+        )
+    pairs = layout.adjacency().tocoo()
+    is_once = pairs.row < pairs.col
+    ends_um = layout.centroid_um[np.stack((pairs.row[is_once], pairs.col[is_once]), axis=1)]
+    ax.add_collection(LineCollection(list(ends_um), colors="#202020", linewidths=0.9))
+
+
+#: What can be drawn over the sites.
+OVERLAYS: Mapping[str, Callable[[Layout, Axes], None]] = {
+    "readout_lines": _draw_readout_lines,
+    "adjacency": _draw_adjacency,
+}

@@ -1,0 +1,137 @@
+"""What matplotlib has not: an image that is painted anew for the pixels of its axes, and a bar that tells a length."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist, allow_rasterization
+from matplotlib.axes import Axes
+from matplotlib.backend_bases import RendererBase
+from matplotlib.image import AxesImage
+from matplotlib.patches import FancyBboxPatch, Rectangle
+from matplotlib.text import Text
+from matplotlib.transforms import Affine2D, IdentityTransform
+from numpy.typing import NDArray
+
+from foveasim.layout import Layout
+from foveasim.view.id_map import SitePixels, site_at
+from foveasim.view.palette import BORDER, SiteColours
+
+__all__ = ["ScaleBar", "SiteImage", "length_text", "nice_length_um"]
+
+#: Samples along a pixel's side, fewer where a picture would have more of them than 256 MB hold.
+N_SAMPLES, MOST_SAMPLES = 3, 2**26
+#: Borders are drawn where they take at most this share of the samples, told by some of the rows: sites of 7 pixels.
+MOST_BORDERS, SAMPLED_ROWS = 0.05, 16
+#: Longest share of the axes that a scale bar takes.
+BAR_SHARE = 0.25
+
+
+class SiteImage(AxesImage):
+    """
+    Photosites in colours, painted for the very pixels that are drawn: sharp at any zoom and any resolution of a file.
+
+    Parameters
+    ----------
+    ax : matplotlib axes
+        With linear scales.
+    layout : Layout
+    colours : SiteColours
+    """
+
+    def __init__(self, ax: Axes, layout: Layout, colours: SiteColours) -> None:
+        x_min, y_min, x_max, y_max = layout.bounds_um
+        super().__init__(ax, interpolation="nearest", origin="lower", extent=(x_min, x_max, y_min, y_max))
+        self.set_data(np.zeros((1, 1, 4), np.uint8))  # what asks for data before the first picture gets this
+        self._layout, self._colours = layout, colours
+        self.pixels: SitePixels | None = None
+
+    def recolour(self, colours: SiteColours) -> None:
+        """Other colours for the same sites; which site each pixel shows stays known."""
+        self._colours = colours
+        self.stale = True
+
+    def site_at(self, x_um: float, y_um: float) -> int:
+        """The site that is seen at a point, -1 for none."""
+        return site_at(self._layout, x_um, y_um) if self.pixels is None else int(self.pixels.site_at(x_um, y_um))
+
+    def make_image(
+        self, renderer: RendererBase, magnification: float = 1.0, unsampled: bool = False
+    ) -> tuple[NDArray[np.uint8], float, float, Affine2D]:
+        """The picture as bytes with alpha, lowest row first, and where its lower left corner comes to be."""
+        del renderer, unsampled
+        window = self.axes.bbox
+        low, high = np.floor(window.min), np.ceil(window.max)
+        n_x, n_y = (max(1, round(length * magnification)) for length in high - low)
+        (x0, y0), (x1, y1) = self.axes.transData.inverted().transform((low, high))
+        bounds_um = (min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1))
+        if self.pixels is None or (self.pixels.bounds_um, self.pixels.shape) != (bounds_um, (n_y, n_x)):
+            n_samples = max(1, min(N_SAMPLES, math.isqrt(MOST_SAMPLES // (n_x * n_y))))
+            self.pixels = SitePixels.of(self._layout, (n_y, n_x), bounds_um, n_samples=n_samples)
+        changes = self.pixels.ids[::SAMPLED_ROWS, 1:] != self.pixels.ids[::SAMPLED_ROWS, :-1]
+        has_borders = self._colours.has_borders and changes.size > 0 and float(changes.mean()) < MOST_BORDERS
+        picture = self.pixels.picture(self._colours.rgb, background=None, border=BORDER if has_borders else None)
+        alpha = self.get_alpha()
+        if alpha is not None:
+            picture[..., 3] = np.rint(picture[..., 3] * np.float64(alpha))
+        picture = picture[:: 1 if y0 < y1 else -1, :: 1 if x0 < x1 else -1]
+        return np.ascontiguousarray(picture), float(low[0]), float(low[1]), Affine2D()
+
+
+class ScaleBar(Artist):
+    """A bar of 1, 2 or 5 times a power of ten in the lower left corner, as long as fits, at any zoom."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.set_zorder(10)
+        self.set_in_layout(False)
+
+    @allow_rasterization  # type: ignore[untyped-decorator]
+    def draw(self, renderer: RendererBase) -> None:
+        """Draw the bar for the limits that the axes have now."""
+        if not self.get_visible() or self.axes is None:
+            return
+        window, pt = self.axes.bbox, float(renderer.points_to_pixels(1.0))  # type: ignore[arg-type]
+        low_um, high_um = sorted(self.axes.get_xlim())
+        length_um = nice_length_um(BAR_SHARE * (high_um - low_um))
+        length = length_um / (high_um - low_um) * window.width
+        x, y, pad = window.x0 + 9 * pt, window.y0 + 9 * pt, 4 * pt
+        text = Text(x + 0.5 * length, y + 5 * pt, length_text(length_um), fontsize=8, ha="center", va="bottom")
+        text.set_figure(self.axes.figure)
+        width = max(length, text.get_window_extent(renderer).width)
+        x += 0.5 * (width - length)
+        text.set_x(x + 0.5 * length)
+        style: dict[str, Any] = {"transform": IdentityTransform(), "linewidth": 0.0}
+        left = x - 0.5 * (width - length)
+        parts = (
+            FancyBboxPatch((left, y), width, 15 * pt, boxstyle=f"round,pad={pad}", fc="white", alpha=0.8, **style),
+            Rectangle((x, y), length, 3 * pt, facecolor="black", **style),
+            text,
+        )
+        for part in parts:
+            part.set_figure(self.axes.figure)
+            part.draw(renderer)
+        self.stale = False
+
+
+def nice_length_um(limit_um: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is not above a limit."""
+    power = 10.0 ** math.floor(math.log10(limit_um))
+    steps = [step * power for step in (1.0, 2.0, 5.0, 10.0)]
+    return max(step for step in steps if step <= limit_um * (1.0 + 1e-12))
+
+
+def length_text(length_um: float) -> str:
+    """
+    A length in the unit that suits it.
+
+    Examples
+    --------
+    >>> length_text(0.5), length_text(20.0), length_text(2000.0)
+    ('500 nm', '20 µm', '2 mm')
+    """
+    if length_um < 1.0:
+        return f"{1000.0 * length_um:.6g} nm"
+    return f"{length_um:.6g} µm" if length_um < 1000.0 else f"{length_um / 1000.0:.6g} mm"
