@@ -39,6 +39,8 @@ GROUND = (238, 240, 244)
 FILLED_SHARE = 0.94
 #: Points that decide how far off the viewer stands.
 FRAMING_POINTS = 50_000
+#: Bisections that find the scene's middle to a thousandth of a pixel.
+CENTRING_STEPS = 24
 #: Rows that are drawn beyond the border and cut off: the shade of corners has a stray line there.
 SHADE_MARGIN_PX = 16
 #: How far the shade of corners reaches, as a share of the scene's size.
@@ -280,25 +282,39 @@ def _eye(meshes: list[Mesh], viewpoint: Viewpoint, size_px: tuple[int, int]) -> 
     focal_px = 0.5 * size_px[1] / np.tan(0.5 * np.radians(viewpoint.view_deg))
     points = np.concatenate([_framing(mesh) for mesh in meshes])
     low, high = points.min(axis=0), points.max(axis=0)
-    # Largest and smallest tangent at which a point is seen are to be as far from the middle as the border allows.
+    middle_um, size_um = 0.5 * (low + high), float(np.linalg.norm(high - low))
     reach = FILLED_SHARE * 0.5 * np.array(size_px) / focal_px
-    seen = (points - 0.5 * (low + high)) @ axes.T
-    offset = (
-        np.zeros(2) if viewpoint.focus_um is None else (np.array(viewpoint.focus_um) - 0.5 * (low + high)) @ axes[:2].T
-    )
-    distance = np.max(np.abs(seen[:, :2] - offset) / reach + seen[:, 2:])
+    seen = (points - middle_um) @ axes.T
+    across_um, toward_um = seen[:, :2], seen[:, 2:]
+    # A point at s across and z toward the viewer is inside when |s - offset| <= reach (distance - z): two lines in the
+    # offset, whose crossing is the nearest place from which both borders hold.
+    from_right, from_left = (np.max(sign * across_um / reach + toward_um, axis=0) for sign in (1.0, -1.0))
     if viewpoint.focus_um is None:
-        for _ in range(4):  # a shift changes what perspective makes of near and far points: a few steps settle it
-            tangent = (seen[:, :2] - offset) / (distance - seen[:, 2:])
-            offset = offset + 0.5 * (tangent.min(axis=0) + tangent.max(axis=0)) * distance
-            distance = np.max(np.abs(seen[:, :2] - offset) / reach + seen[:, 2:])
-    nearest = float(seen[:, 2].max())
-    size_um = float(np.linalg.norm(high - low))
-    distance = nearest + max(float(distance) - nearest, 1e-3 * size_um)
-    focus_um = 0.5 * (low + high) + offset @ axes[:2]
-    if viewpoint.focus_um is not None:
+        distance = _beyond(float(np.max(0.5 * (from_right + from_left))), toward_um, size_um)
+        offset = _centred(across_um, distance - toward_um)
+        focus_um = middle_um + offset @ axes[:2]
+    else:
         focus_um = np.array(viewpoint.focus_um, dtype=np.float64)
+        offset = (focus_um - middle_um) @ axes.T
+        needed = np.maximum(from_right - offset[:2] / reach, from_left + offset[:2] / reach)
+        distance = _beyond(float(np.max(needed)), toward_um, size_um) - offset[2]
     return _Eye(focus_um + distance * toward, focus_um, axes, focal_px * viewpoint.zoom, viewpoint.view_deg)
+
+
+def _beyond(distance_um: float, toward_um: Floats, size_um: float) -> float:
+    """The distance, or a little before the nearest point where the scene is flat and seen from its edge."""
+    return max(distance_um, float(toward_um.max()) + 1e-3 * size_um)
+
+
+def _centred(across_um: Floats, before_um: Floats) -> Floats:
+    """Where the viewer looks so that the outermost points are equally far from the middle, (2,)."""
+    low, high = across_um.min(axis=0), across_um.max(axis=0)
+    for _ in range(CENTRING_STEPS):
+        middle = 0.5 * (low + high)
+        tangent = (across_um - middle) / before_um
+        is_left = tangent.max(axis=0) + tangent.min(axis=0) > 0.0
+        low, high = np.where(is_left, middle, low), np.where(is_left, high, middle)
+    return np.asarray(0.5 * (low + high))
 
 
 def _framing(mesh: Mesh) -> Floats:

@@ -1,0 +1,510 @@
+"""Three dimensions: what PyVista gets, columns as high as a response, and two renderers that see the same."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import shapely
+
+import foveasim as fs
+from foveasim.errors import FileError, FoveasimWarning, GeometryError, ParameterError, SimulationError
+from foveasim.pictures import read_picture
+from foveasim.view import Mesh, Viewpoint, prisms, probe, render, show, sites_in_view, stills
+from foveasim.view.meshes import triangulated
+
+FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
+HOOK = shapely.Polygon([(20, 0), (28, 0), (28, 2), (22, 2), (22, 8), (20, 8)])
+#: The hole meets the outline in a corner.
+BITTEN = shapely.Polygon([(30, 0), (38, 0), (38, 8), (30, 8)], [[(30, 0), (34, 6), (36, 4)]])
+#: Every edge has vertices in its middle: no fan from a corner is without flat triangles.
+NODED = shapely.Polygon(
+    [(40 + x, y) for x, y in [(0, 0), (3, 0), (6, 0), (9, 0), (9, 3), (9, 6), (9, 9), (5, 9), (0, 9), (0, 5)]]
+)
+ODD = [FRAME, shapely.box(10, 0, 12, 8), HOOK, BITTEN, NODED]
+ODD_LAYOUT = fs.Layout.from_polygons(ODD, channel=[0, 1, 2, 0, 1], name=["a", "b", "c", "d", "e"])
+STRAIGHT_DOWN = Viewpoint(azimuth_deg=-90.0, elevation_deg=90.0)
+
+
+def area_um2(layout, caps):
+    a, b, c = (layout.xy_um[caps.triangles[:, k]] for k in range(3))
+    (ux, uy), (vx, vy) = (b - a).T, (c - a).T
+    return 0.5 * (ux * vy - uy * vx)
+
+
+def capture():
+    layout = fs.layout.mosaic(fs.layout.grid(n_x=6, n_y=5, pitch_um=2.0), ("RG", "GB"))
+    sensor = fs.Sensor(layout, filters="rgb", capacitance_f=1e-15)
+    scene = fs.Scene.flat(
+        shape=(100, 100), pitch_um=20.0, distance_m=0.5, radiance_w_m2_sr_nm=1.0, wavelength_nm=(450, 540, 610)
+    )
+    return fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=sensor).capture(
+        scene, exposure_s=0.01, seed=0
+    )
+
+
+# -- triangles -----------------------------------------------------------------------------------------------------------
+
+
+LAYOUTS = {
+    "odd": lambda: ODD_LAYOUT,
+    "hexagons": lambda: fs.layout.hexagonal(n_columns=20, n_rows=20, pitch_um=2.0),
+    "rings with arcs": lambda: fs.layout.log_polar(n_sectors=48, min_size_um=2.0, r_max_um=60.0, stagger=True, chords_per_arc=4),
+    "T-junctions noded": lambda: fs.layout.node(fs.layout.zones(side_um=(8, 16, 32), pitch_um=(1, 2, 4))),
+    "Penrose": lambda: fs.layout.penrose(side_um=2.0, size_um=30.0),
+    "Voronoi": lambda: fs.layout.voronoi(n_sites=200, size_um=(30.0, 30.0), seed=3),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_triangles_cover_every_site_once_and_none_is_flat_or_turned_over(name):
+    layout = LAYOUTS[name]()
+    caps = triangulated(layout)
+    areas_um2 = area_um2(layout, caps)
+
+    assert np.all(areas_um2 > 0.0)
+    assert np.bincount(caps.site, weights=areas_um2) == pytest.approx(layout.area_um2, rel=1e-12)
+    # Triangles of their own site's vertices, all of them: n - 2 for an outline, 2 more for a hole that does not touch it.
+    n_vertices = np.diff(layout.ring_offsets[layout.site_offsets])
+    n_holes = np.where(np.arange(layout.n_sites) == 3, 0, np.diff(layout.site_offsets) - 1)
+    assert np.array_equal(np.bincount(caps.site), n_vertices - 2 + 2 * n_holes)
+    site_of_vertex = np.repeat(np.arange(layout.n_sites), n_vertices)
+    assert np.array_equal(site_of_vertex[caps.triangles], np.repeat(caps.site[:, np.newaxis], 3, axis=1))
+
+
+def test_no_triangle_lies_outside_its_site():
+    caps = triangulated(ODD_LAYOUT)
+    triangles = shapely.polygons(ODD_LAYOUT.xy_um[caps.triangles])
+    outside = shapely.difference(triangles, np.array(ODD)[caps.site])
+
+    assert shapely.area(outside).max() < 1e-12
+
+
+# -- PyVista's data ------------------------------------------------------------------------------------------------------
+
+
+def test_every_column_goes_with_its_polygon():
+    layout = fs.layout.hexagonal(n_columns=4, n_rows=3, pitch_um=2.0).with_columns(zone=np.arange(12) // 5)
+    mesh = layout.to_pyvista()
+
+    assert mesh.n_cells == 12
+    assert np.array_equal(mesh.cell_data["photosite"], np.arange(12))
+    assert np.array_equal(mesh.cell_data["zone"], np.arange(12) // 5)
+    assert mesh.cell_data["area_um2"] == pytest.approx(layout.area_um2)
+    assert mesh.compute_cell_sizes()["Area"] == pytest.approx(layout.area_um2)
+    assert {"channel", "readout_line", *layout.columns} <= set(mesh.cell_data.keys())
+    assert json.loads(mesh.field_data["provenance"][0])["generator"] == "hexagonal"
+
+
+def test_sites_with_holes_and_inward_corners_keep_their_area_and_their_number():
+    mesh = ODD_LAYOUT.to_pyvista()
+    photosite = np.asarray(mesh.cell_data["photosite"])
+    sizes = np.asarray(mesh.compute_cell_sizes()["Area"])
+
+    assert np.bincount(photosite, weights=sizes) == pytest.approx(ODD_LAYOUT.area_um2)
+    assert np.array_equal(photosite, np.sort(photosite))
+    assert np.count_nonzero(photosite == 1) == 1
+    assert [str(name) for name in mesh.cell_data["name"]] == [list("abcde")[site] for site in photosite]
+
+
+def test_a_capture_gives_what_it_measured_and_how():
+    taken = capture()
+    mesh = taken.to_pyvista()
+
+    for name in ("code", "electrons", "expected_e", "filter_of_site"):
+        assert np.array_equal(mesh.cell_data[name], getattr(taken, name))
+    assert json.loads(mesh.field_data["settings"][0]) == json.loads(json.dumps(taken.settings))
+
+
+def test_an_empty_layout_is_an_empty_mesh():
+    assert ODD_LAYOUT[np.zeros(5, bool)].to_pyvista().n_cells == 0
+
+
+def test_pyvista_that_is_missing_is_named_with_its_command(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyvista", None)
+
+    with pytest.raises(ParameterError, match=r"is missing; install it with: pip install 'foveasim\[view\]'"):
+        ODD_LAYOUT.to_pyvista()
+
+
+# -- columns -------------------------------------------------------------------------------------------------------------
+
+
+def test_columns_are_as_high_as_their_values():
+    values = np.array([1.0, 4.0, 2.0, 0.0, 3.0])
+    columns = prisms(ODD_LAYOUT, values, tallest_um=8.0)
+    top_um = np.zeros(5)
+    np.maximum.at(top_um, columns.photosite, columns.points_um[:, 2])
+
+    assert top_um == pytest.approx(2.0 * values)
+    assert np.array_equal(columns.values, values[columns.photosite])
+
+
+def test_the_surface_of_columns_is_roofs_and_walls():
+    # What a layout of n sites has: the area of the sites, and their outlines times the height.
+    columns = prisms(ODD_LAYOUT, np.ones(5), tallest_um=3.0)
+    a, b, c = (columns.points_um[columns.triangles[:, k]] for k in range(3))
+    surface_um2 = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+
+    assert surface_um2 == pytest.approx(ODD_LAYOUT.area_um2.sum() + 3.0 * shapely.length(np.array(ODD)).sum())
+
+
+def test_columns_of_a_capture_show_its_code_in_the_colours_of_its_filters():
+    taken = capture()
+    columns = prisms(taken)
+
+    assert np.array_equal(columns.values, taken.code[columns.photosite])
+    is_red = taken.filter_of_site[columns.photosite] == taken.filter_names.index("R")
+    assert np.all(columns.colours[is_red].argmax(axis=1) == 0)
+
+
+def test_a_height_by_name_and_a_colour_by_another():
+    layout = ODD_LAYOUT.with_columns(depth_um=np.arange(5.0))
+    columns = prisms(layout, "depth_um", by="channel")
+
+    assert np.array_equal(np.unique(columns.values), np.arange(5.0))
+    assert len(np.unique(columns.colours, axis=0)) == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"height": np.ones(4)}, "must have one row for each of the 5 sites"),
+        ({"height": -np.ones(5)}, "'height' must be >= 0"),
+        ({"height": np.array([1, 2, 3, 4, np.nan])}, "'height' must be finite"),
+        ({"height": "name"}, "'height' must be an array of numbers"),
+        ({"height": "no such column"}, "must be one of"),
+        ({"height": np.ones((5, 3))}, "'height' must have 1 dimension"),
+        ({"tallest_um": 0.0}, "'tallest_um' must be > 0"),
+    ],
+)
+def test_heights_that_are_none_are_refused(arguments, message):
+    with pytest.raises(ParameterError, match=message):
+        prisms(ODD_LAYOUT, **arguments)
+
+
+def test_a_layout_without_sites_has_no_columns():
+    with pytest.raises(GeometryError, match="no sites"):
+        prisms(ODD_LAYOUT[np.zeros(5, bool)])
+
+
+# -- the software's renderer ---------------------------------------------------------------------------------------------
+
+
+def software(scene, **parameters):
+    return render(scene, renderer="software", **{"size_px": (300, 200), "oversampling": 1, **parameters})
+
+
+def test_seen_from_above_every_pixel_shows_the_site_under_it():
+    # All as high as each other: what is seen is the layout, enlarged.
+    flat = prisms(ODD_LAYOUT, np.ones(5), tallest_um=0.01)
+    site = sites_in_view(flat, viewpoint=STRAIGHT_DOWN, size_px=(980, 200))
+    seen = np.argwhere(site >= 0)
+    left, right, top, bottom = seen[:, 1].min(), seen[:, 1].max() + 1, seen[:, 0].min(), seen[:, 0].max() + 1
+    x0, y0, x1, y1 = ODD_LAYOUT.bounds_um
+    x_um = x0 + (np.arange(left, right) + 0.5 - left) / (right - left) * (x1 - x0)
+    y_um = y1 - (np.arange(top, bottom) + 0.5 - top) / (bottom - top) * (y1 - y0)  # first row on top: y up
+    expected = np.full((bottom - top, right - left), -1)
+    for k, polygon in enumerate(ODD):
+        expected[shapely.contains_xy(polygon, *np.meshgrid(x_um, y_um))] = k
+
+    assert np.mean(site[top:bottom, left:right] == expected) > 0.98
+
+
+def test_the_nearer_column_hides_the_farther_one_whatever_their_order():
+    for y_um in ([0.0, 20.0], [20.0, 0.0]):
+        layout = fs.Layout.from_rectangles([[0.0, y_um[0]], [0.0, y_um[1]]], 4.0)
+        site = sites_in_view(
+            prisms(layout, [1.0, 1.0], tallest_um=30.0), viewpoint=Viewpoint(azimuth_deg=-90, elevation_deg=0)
+        )
+        near = int(np.argmin(y_um))  # the viewer stands at small y
+
+        assert set(np.unique(site)) == {-1, near}
+
+
+def test_a_square_twice_as_near_is_seen_twice_as_large():
+    corners = np.array([[-2.0, -2.0], [2.0, -2.0], [2.0, 2.0], [-2.0, 2.0]])
+    squares = Mesh(
+        name="squares",
+        points_um=np.concatenate(
+            [np.column_stack((corners + np.array([x, 0.0]), np.full(4, z))) for x, z in ((-20.0, 0.0), (20.0, 40.0))]
+        ),
+        triangles=np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32),
+        photosite=np.repeat(np.array([0, 1], np.int32), 4),
+        values=np.zeros(8),
+        colours=np.zeros((8, 3), np.uint8),
+    )
+    viewpoint = Viewpoint(azimuth_deg=-90.0, elevation_deg=90.0, focus_um=(0.0, 0.0, 0.0), view_deg=60.0)
+    above_um = stills._eye([squares], viewpoint, (1600, 1000)).position_um[2]
+    n_seen = np.bincount(sites_in_view(squares, viewpoint=viewpoint).ravel() + 1)[1:]
+
+    assert np.sqrt(n_seen[1] / n_seen[0]) == pytest.approx(above_um / (above_um - 40.0), rel=0.02)
+    assert above_um / (above_um - 40.0) > 1.5
+
+
+def test_roofs_have_their_colour_and_walls_are_darker():
+    layout = fs.Layout.from_rectangles([[0.0, 0.0]], 10.0)
+    mesh = prisms(layout, [1.0], tallest_um=10.0, by=np.array([[200, 100, 40]], np.uint8))
+    light = np.array(stills.LIGHT) / np.linalg.norm(stills.LIGHT)
+    picture = software(mesh, viewpoint=Viewpoint(azimuth_deg=-90.0, elevation_deg=40.0))
+    roof = np.array([200, 100, 40]) * (stills.AMBIENT + stills.DIFFUSE * light[2])
+    front = np.array([200, 100, 40]) * (stills.AMBIENT + stills.DIFFUSE * light[1])
+
+    assert set(map(tuple, picture.reshape(-1, 3).tolist())) == {
+        stills.GROUND, tuple(np.rint(roof).astype(int)), tuple(np.rint(front).astype(int))
+    }  # fmt: skip
+
+
+def test_no_colour_is_clipped():
+    picture = software(prisms(ODD_LAYOUT, np.ones(5), by=np.full((5, 3), 255, np.uint8)))
+    seen = picture[np.any(picture != stills.GROUND, axis=-1)]
+
+    assert pytest.approx(1.0) == stills.AMBIENT + stills.DIFFUSE
+    assert seen.max() < 255
+    assert len(np.unique(seen[:, 0])) >= 3
+
+
+def test_oversampling_is_the_mean_of_finer_pixels():
+    columns = prisms(ODD_LAYOUT, np.arange(5.0))
+    fine = software(columns, size_px=(600, 400)).astype(float)
+    mean = fine.reshape(200, 2, 300, 2, 3).mean(axis=(1, 3))
+
+    assert np.abs(software(columns, oversampling=2) - mean).max() <= 0.5
+
+
+@pytest.mark.parametrize("n_threads", [1, 3, 7])
+def test_the_picture_does_not_depend_on_the_number_of_threads(n_threads, monkeypatch):
+    columns = prisms(ODD_LAYOUT, np.arange(5.0))
+    expected = software(columns)
+    monkeypatch.setattr(stills, "thread_count", lambda: n_threads)
+
+    assert np.array_equal(software(columns), expected)
+
+
+def test_a_zoom_of_two_enlarges_twice():
+    columns = prisms(fs.layout.grid(n_x=9, n_y=9, pitch_um=2.0), np.ones(81), tallest_um=0.01)
+    plain, near = (
+        sites_in_view(columns, viewpoint=Viewpoint(azimuth_deg=-90, elevation_deg=90, zoom=zoom)) for zoom in (1.0, 2.0)
+    )
+
+    assert np.count_nonzero(near == 40) == pytest.approx(4 * np.count_nonzero(plain == 40), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "viewpoint", [Viewpoint(azimuth_deg=a, elevation_deg=e) for a in (-120, 10, 200) for e in (-30, 5, 60, 90)]
+)
+def test_the_whole_scene_is_in_the_picture_and_fills_it(viewpoint):
+    columns, size_px = prisms(ODD_LAYOUT, np.arange(5.0)), np.array([400, 300])
+    place = stills._eye([columns], viewpoint, (400, 300)).on_screen(columns.points_um, (400, 300))
+    margins = np.array([place[:, :2].min(axis=0), size_px - place[:, :2].max(axis=0)]) / size_px
+
+    assert np.all(place[:, 2] > 0.0)
+    assert margins.min(axis=0).min() == pytest.approx(0.5 * (1.0 - stills.FILLED_SHARE), abs=0.002)
+    assert margins[0] == pytest.approx(margins[1], abs=0.002)
+    picture = software(columns, viewpoint=viewpoint)
+    assert np.all(picture[[0, -1]] == stills.GROUND)
+    assert np.all(picture[:, [0, -1]] == stills.GROUND)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"oversampling": 0}, "'oversampling' must be >= 1"),
+        ({"size_px": (0, 5)}, r"'size_px\[0\]' must be >= 1"),
+        ({"size_px": (100_000, 5)}, "'size_px' must be <= "),
+        ({"ground": (1, 2)}, "'ground' must be three numbers"),
+        ({"ground": (1, 2, 300)}, "'ground' must be three numbers"),
+        ({"renderer": "best"}, "'renderer' must be one of"),
+    ],
+)
+def test_pictures_that_cannot_be_are_refused(parameters, message):
+    with pytest.raises(ParameterError, match=message):
+        render(prisms(ODD_LAYOUT), **{"renderer": "software", **parameters})
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"elevation_deg": 91.0}, "'elevation_deg' must be <= 90"),
+        ({"zoom": 0.0}, "'zoom' must be > 0"),
+        ({"view_deg": 180.0}, "'view_deg' must be <= 120"),
+        ({"focus_um": (1.0, 2.0)}, "'focus_um' must be three numbers"),
+    ],
+)
+def test_viewpoints_that_cannot_be_are_refused(parameters, message):
+    with pytest.raises(ParameterError, match=message):
+        Viewpoint(**parameters)
+
+
+def test_a_scene_that_is_none_is_refused():
+    with pytest.raises(ParameterError, match="'scene' must be a Mesh"):
+        render(ODD_LAYOUT)
+    with pytest.raises(GeometryError, match="nothing to show"):
+        render([])
+
+
+def test_a_picture_is_written_as_it_is_given_back(tmp_path):
+    picture = render(prisms(ODD_LAYOUT), tmp_path / "still.png", renderer="software", size_px=(60, 40))
+
+    assert np.array_equal(read_picture(tmp_path / "still.png"), picture)
+    with pytest.raises(FileError, match="must end in"):
+        render(prisms(ODD_LAYOUT), tmp_path / "still.xyz", renderer="software", size_px=(60, 40))
+    assert [path.name for path in tmp_path.iterdir()] == ["still.png"]
+
+
+# -- PyVista's renderer --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.needs("renderer")
+@pytest.mark.parametrize("viewpoint", [Viewpoint(), Viewpoint(azimuth_deg=30, elevation_deg=15, zoom=1.7, view_deg=50)])
+def test_both_renderers_make_the_same_picture(viewpoint):
+    layout = fs.layout.giotto(n_rho=20, n_theta=40, n_fovea=6, n_across=80, unit_um=1.0, chords_per_arc=3)
+    response = 2.0 + np.cos(layout.centroid_um[:, 0] / 5.0)
+    columns = prisms(layout, response)
+    ours, theirs = (
+        render(columns, viewpoint=viewpoint, size_px=(400, 260), oversampling=2, renderer=name).astype(int)
+        for name in ("software", "pyvista")
+    )
+    is_ground = [np.all(picture == stills.GROUND, axis=-1) for picture in (ours, theirs)]
+
+    # Borders may fall to either side of a pixel's centre: less than one in a hundred does.
+    assert np.mean(is_ground[0] != is_ground[1]) < 0.005
+    assert np.mean(np.abs(ours - theirs).max(axis=-1) > 3) < 0.01
+
+
+@pytest.mark.needs("renderer")
+def test_pyvista_sees_the_sites_that_the_identities_name():
+    layout = fs.layout.hexagonal(n_columns=12, n_rows=12, pitch_um=2.0)
+    n = layout.n_sites
+    colours = np.stack((np.arange(n) % 16 * 17, np.arange(n) // 16 * 25, np.full(n, 90)), axis=1).astype(np.uint8)
+    columns = prisms(layout, np.random.default_rng(4).random(n), by=colours, tallest_um=0.5)
+    site = sites_in_view(columns, viewpoint=STRAIGHT_DOWN, size_px=(500, 400))
+    picture = render(columns, viewpoint=STRAIGHT_DOWN, size_px=(500, 400), oversampling=1, renderer="pyvista")
+    light = np.array(stills.LIGHT) / np.linalg.norm(stills.LIGHT)
+    roof = np.rint(colours * (stills.AMBIENT + stills.DIFFUSE * light[2]))
+    is_roof = (site >= 0) & np.all(np.abs(picture - roof[site]) <= 2, axis=-1)
+
+    assert np.count_nonzero(is_roof) > 0.93 * np.count_nonzero(site >= 0)
+
+
+@pytest.mark.needs("renderer")
+def test_the_shade_of_corners_darkens_them_and_leaves_no_line_at_the_border():
+    layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0)
+    columns = prisms(layout, np.indices((8, 8)).sum(axis=0).ravel() % 2 + 1.0, by=np.full((64, 3), 200, np.uint8))
+    plain, shaded = (
+        render(columns, size_px=(400, 260), shade_corners=shade, renderer="pyvista").astype(int)
+        for shade in (False, True)
+    )
+
+    is_ground = np.all(plain == stills.GROUND, axis=-1)
+    assert shaded[~is_ground].mean() < plain[~is_ground].mean() - 3
+    assert np.all(shaded[[0, -1]] == stills.GROUND)
+    assert np.all(shaded[:, [0, -1]] == stills.GROUND)
+
+
+@pytest.mark.needs("renderer")
+def test_a_machine_without_a_screen_opens_no_window(monkeypatch):
+    monkeypatch.setattr(stills, "find_renderer", lambda: probe.EGL)
+
+    with pytest.raises(SimulationError, match="no screen to open a window on; write a picture with"):
+        show(prisms(ODD_LAYOUT))
+
+
+# -- machines that lack something ----------------------------------------------------------------------------------------
+
+
+def test_without_a_renderer_the_picture_is_made_and_the_cure_is_named(monkeypatch):
+    monkeypatch.setattr(stills, "what_to_install", lambda: "this machine has no OpenGL; install it")
+    columns = prisms(ODD_LAYOUT)
+
+    with pytest.warns(FoveasimWarning, match="no OpenGL; install it; the picture is made without"):
+        picture = render(columns, size_px=(60, 40), shade_corners=True)
+    assert np.array_equal(picture, render(columns, size_px=(60, 40), renderer="software"))
+    with pytest.raises(SimulationError, match="no OpenGL; install it"):
+        render(columns, renderer="pyvista")
+    with pytest.raises(SimulationError, match="no OpenGL; install it"):
+        show(columns)
+
+
+#: What machines lack, played by the environment: no driver, a library without its drivers, screens that are none.
+MACHINES = {
+    "no EGL driver": {"__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
+    "EGL without OpenGL's drivers": {"LIBGL_DRIVERS_PATH": "/nonexistent", "GBM_BACKENDS_PATH": "/nonexistent"},
+    "a screen that is none": {"DISPLAY": ":77", "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
+    "a window class that is none": {probe.VTK_CHOICE: "vtkNoRenderWindow", "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
+    "a window class without its library": {probe.VTK_CHOICE: probe.OSMESA, "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
+}  # fmt: skip
+STILL = """
+import warnings
+import numpy as np
+import foveasim as fs
+with warnings.catch_warnings(record=True) as told:
+    warnings.simplefilter("always")
+    picture = fs.view.render(fs.view.prisms(fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0)), size_px=(60, 40))
+print(fs.view.find_renderer(), len(np.unique(picture)) > 2, *[w.message for w in told], sep="|")
+"""
+
+
+@pytest.mark.parametrize("machine", MACHINES)
+def test_no_machine_ends_the_interpreter(machine):
+    bare = {k: v for k, v in os.environ.items() if k not in {"DISPLAY", probe.VTK_CHOICE}}
+    run = subprocess.run(
+        [sys.executable, "-c", STILL], env={**bare, **MACHINES[machine]}, capture_output=True, text=True, check=False
+    )
+    renderer, is_drawn, *told = run.stdout.strip().split("|")
+
+    assert (run.returncode, is_drawn) == (0, "True")
+    # Where a library of another kind is here, it is found; otherwise one sentence says what to install.
+    assert [bool(renderer == "None")] == [len(told) == 1]
+    assert all("apt install libegl1 libgl1" in sentence for sentence in told)
+
+
+@pytest.mark.parametrize("outcome", ["crashes", "raises", "hangs"])
+def test_a_trial_that_fails_counts_as_no_renderer(outcome, monkeypatch):
+    trials = {
+        "crashes": "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
+        "raises": "1 / 0",
+        "hangs": "import time; time.sleep(60)",
+    }
+    monkeypatch.setattr(probe, "TRIAL", trials[outcome])
+    monkeypatch.setattr(probe, "TRIAL_S", 0.5 if outcome == "hangs" else 60.0)
+    monkeypatch.setattr(probe, "_candidates", lambda: iter([probe.EGL, probe.OSMESA]))
+
+    assert probe.find_renderer.__wrapped__() is None
+
+
+def test_the_first_window_that_survives_is_taken(monkeypatch):
+    monkeypatch.setattr(probe, "_candidates", lambda: iter([probe.X11, probe.EGL, probe.OSMESA]))
+    monkeypatch.setattr(probe, "_survives", lambda window: window == probe.EGL)
+
+    assert probe.find_renderer.__wrapped__() == probe.EGL
+
+
+def test_libraries_that_are_missing_are_no_candidates(monkeypatch):
+    for variable in ("DISPLAY", probe.VTK_CHOICE):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr(probe, "_library", lambda _: None)
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert list(probe._candidates()) == []
+
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert list(probe._candidates()) == []
+
+    monkeypatch.setattr(probe, "_library", lambda name: object() if name == "libOSMesa.so.8" else None)
+    assert list(probe._candidates()) == [probe.OSMESA]
+
+
+def test_without_pyvista_the_command_is_named(monkeypatch):
+    monkeypatch.setattr(probe, "find_spec", lambda _: None)
+
+    assert probe.what_to_install() == "PyVista is not installed; install it with: pip install 'foveasim[view]'"
+    assert probe.find_renderer.__wrapped__() is None
+
+
+def test_a_mesh_shows_itself():
+    assert repr(prisms(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0))) == "Mesh('columns', 20 triangles)"
+    assert isinstance(prisms(ODD_LAYOUT), Mesh)
