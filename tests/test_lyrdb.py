@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import sys
 
 import pytest
 import shapely
-from klayout import rdb
+from klayout import db, rdb
 
 import foveasim as fs
 from foveasim.errors import FileError
+from foveasim.layout.lyrdb import is_lyrdb, read_lyrdb
 
 LAYOUT = fs.Layout.from_polygons([shapely.box(0, 0, 4, 4), shapely.box(3, 0, 8, 4), shapely.box(8.2, 0, 8.5, 4)])
 RULES = fs.DesignRules(min_width_um=1.0, max_overlap_um2=0.0, min_space_um=0.5, max_sites=10)
@@ -52,3 +54,66 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(tmp_path, 
     with pytest.raises(FileError, match=r"needs the library klayout: pip install 'foveasim\[layout\]'"):
         LAYOUT.check(RULES).write(tmp_path / "report.lyrdb")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_report_that_was_written_is_read_again(tmp_path):
+    report = LAYOUT.check(RULES)
+    report.write(tmp_path / "report.lyrdb")
+    back = read_lyrdb(tmp_path / "report.lyrdb", LAYOUT.n_sites)
+
+    assert is_lyrdb(tmp_path / "report.lyrdb")
+    assert [r.rule for r in back.results] == [r.rule for r in report.results]
+    for was, now in zip(report.results, back.results, strict=True):
+        assert (now.sentence, now.limit, now.unit) == (was.sentence, was.limit, was.unit)
+        assert len(now) == len(was)
+    for was, now in zip(report.violations, back.violations, strict=True):
+        assert (now.rule, now.site_ids) == (was.rule, was.site_ids)
+        assert now.value == pytest.approx(was.value)
+        assert now.marker.equals_exact(was.marker.normalize(), 1e-6) or now.marker.equals(was.marker)
+
+
+def test_findings_of_another_program_are_read_as_places(tmp_path):
+    database = rdb.ReportDatabase("other")
+    cell = database.create_cell("TOP").rdb_id()
+    category = database.create_category("width").rdb_id()
+    below = database.create_category(database.category_by_id(category), "narrow").rdb_id()
+    polygon = db.DPolygon([db.DPoint(0, 0), db.DPoint(0, 9), db.DPoint(9, 9), db.DPoint(9, 0)])
+    polygon.insert_hole([db.DPoint(2, 2), db.DPoint(2, 5), db.DPoint(5, 5), db.DPoint(5, 2)])
+    pair = db.DEdgePair(db.DEdge(0, 0, 1, 0), db.DEdge(0, 2, 1, 2))
+    for kind, shape in ((category, polygon), (below, pair), (category, db.DBox(1, 2, 3, 5))):
+        database.create_item(cell, kind).add_value(shape)
+    database.save(str(tmp_path / "other.lyrdb"))
+    report = read_lyrdb(tmp_path / "other.lyrdb", 3)
+    found = {(v.rule, v.marker.geom_type, v.marker.area, v.marker.bounds) for v in report.violations}
+
+    assert found == {
+        ("width", "Polygon", 81.0 - 9.0, (0.0, 0.0, 9.0, 9.0)),
+        ("width", "Polygon", 6.0, (1.0, 2.0, 3.0, 5.0)),
+        ("width.narrow", "GeometryCollection", 0.0, (0.0, 0.0, 1.0, 2.0)),
+    }
+    assert all(v.site_ids == () and math.isnan(v.value) for v in report.violations)
+    assert not report.ok
+
+
+@pytest.mark.parametrize(
+    ("content", "n_sites", "message"),
+    [
+        (None, 3, "no such file"),
+        ("not xml", 3, "is broken or no report"),
+        ("<html/>", 3, "is no report database"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><report-database>&b;</report-database>', 3, "declares entities"),
+        ("cut", 3, "is broken or no report"),
+        ("whole", 1, "names site 2, and the layout has 1"),
+        ("marker", 3, "has a marker that is none"),
+    ],
+)
+def test_a_broken_or_strange_report_is_refused(tmp_path, content, n_sites, message):
+    path = tmp_path / "report.lyrdb"
+    LAYOUT.check(RULES).write(path)
+    whole = path.read_text()
+    texts = {"cut": whole[: len(whole) // 2], "whole": whole, "marker": whole.replace("polygon: (", "polygon: (x")}
+    path.unlink()
+    if content is not None:
+        path.write_text(texts.get(content, content))
+    with pytest.raises(FileError, match=message):
+        read_lyrdb(path, n_sites)

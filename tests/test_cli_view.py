@@ -1,0 +1,173 @@
+"""The command view as a user meets it: what it writes, what it hands out, and what it refuses in one sentence."""
+
+from __future__ import annotations
+
+import http.client
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+
+import foveasim as fs
+from foveasim import cli
+from foveasim.errors import ParameterError
+from foveasim.view.web import open_page, serve_page
+
+LAYOUT = fs.layout.grid(n_x=6, n_y=5, pitch_um=2.0)
+
+
+@pytest.fixture
+def view(folder, monkeypatch, capsys):
+    """The command, in this process: its exit code, what it says, and what it complains of."""
+
+    def run(*arguments):
+        monkeypatch.chdir(folder)
+        monkeypatch.setattr(sys, "argv", ["foveasim", "view", *arguments])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        return (end.value.code or 0, *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("view")
+    LAYOUT.write(folder / "layout.geojson")
+    LAYOUT.write(folder / "layout.npz")
+    LAYOUT.check(fs.DesignRules(min_size_um=3.0)).write(folder / "report.lyrdb")
+    (folder / "rules.yaml").write_text("{min_size_um: 3.0}")
+    (folder / "text.txt").write_text("nothing to see")
+    capture = fs.Capture(
+        layout=LAYOUT,
+        code=np.arange(30, dtype=np.uint8),
+        electrons=np.arange(30) * 10,
+        expected_e=np.arange(30) * 10.0,
+        filter_of_site=np.zeros(30, np.int64),
+        filter_names=("all",),
+        bits=8,
+        white_dn=np.array([255.0]),
+        settings={},
+    )
+    capture.save(folder / "capture.npz")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["layout.geojson"], ["30 photosites", '"kind": "layout"']),
+        (["layout.npz"], ["30 photosites", '"kind": "layout"']),
+        (["quad_bayer"], ["<title>quad_bayer</title>", "photosites"]),
+        (["capture.npz"], ["30 photosites", '"kind": "capture"', "expected electrons"]),
+        (["layout.npz", "--rules", "rules.yaml"], ["min_size_um", '"count": 30']),
+        (["report.lyrdb", "--layout", "layout.npz"], ["min_size_um", '"count": 30']),
+    ],
+    ids=lambda value: value[0],
+)
+def test_a_page_is_written_of_whatever_can_be_looked_at(view, tmp_path, arguments, words):
+    code, said, complaint = view(*arguments, "--web", str(tmp_path / "out.html"))
+
+    assert (code, complaint) == (0, "")
+    assert said.strip() == f"wrote {tmp_path / 'out.html'}"
+    text = (tmp_path / "out.html").read_text()
+    assert [word for word in words if word not in text] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["nothing.gds"], "nothing.gds: no such file"),
+        (["text.txt"], "text.txt: is no layout file"),
+        (["capture.npz", "--web", "page.txt"], "page.txt: must end in .html"),
+        (["capture.npz", "--web", "nowhere/page.html"], "the folder nowhere does not exist"),
+        (["capture.npz", "--web", "a.html", "--serve"], "take one of them"),
+        (["capture.npz", "--port", "8000"], "--port belongs to --serve"),
+        (["capture.npz", "--serve", "--port", "70000"], "'port' must be <= 65535"),
+        (["report.lyrdb"], "'layout' must be given"),
+        (["report.lyrdb", "--layout", "layout.npz", "--rules", "rules.yaml"], "'rules' cannot be given with a report"),
+        (["layout.npz", "--layout", "layout.npz"], "'layout' belongs to a report"),
+        (["layout.npz", "--rules", "nothing.yaml"], "nothing.yaml: no such file"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_what_cannot_be_shown_ends_in_one_sentence(view, folder, arguments, sentence):
+    before = sorted(folder.iterdir())
+    code, said, complaint = view(*arguments)
+
+    assert (code, said) == (2, "")
+    assert complaint.startswith("error: ")
+    assert complaint.count("\n") == 1
+    assert sentence in complaint
+    assert sorted(folder.iterdir()) == before
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written_is_told(view, tmp_path):
+    tmp_path.chmod(0o500)
+    code, _, complaint = view("layout.npz", "--web", str(tmp_path / "out.html"))
+
+    assert code == 2
+    assert "cannot be written" in complaint
+
+
+def test_a_page_in_the_place_of_a_folder_is_refused(view, tmp_path):
+    (tmp_path / "out.html").mkdir()
+    code, _, complaint = view("layout.npz", "--web", str(tmp_path / "out.html"))
+
+    assert code == 2
+    assert "it is a folder" in complaint
+    assert [p.name for p in tmp_path.iterdir()] == ["out.html"]
+
+
+def test_a_page_is_handed_out_on_this_computer_alone_until_it_is_stopped(view, folder):
+    command = [sys.executable, "-m", "foveasim.cli", "view", "layout.npz", "--serve"]
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
+        try:
+            line = server.stdout.readline()
+            assert re.fullmatch(r"layout.npz is at http://127.0.0.1:\d+/ until you press Ctrl-C\n", line)
+            address = line.split(" ")[3]
+            port = int(address.rsplit(":", 1)[1].strip("/"))
+            with urllib.request.urlopen(address) as answer:
+                assert answer.headers["Content-Type"] == "text/html; charset=utf-8"
+                assert b"30 photosites" in answer.read()
+            with pytest.raises(urllib.error.HTTPError, match="404") as refused:
+                urllib.request.urlopen(address + "layout.npz")
+            refused.value.close()
+            # A stranger's name that leads to this computer.
+            connection = http.client.HTTPConnection("127.0.0.1", port)
+            connection.request("GET", "/", headers={"Host": f"stranger.example:{port}"})
+            assert connection.getresponse().status == 403
+            connection.close()
+            # The same port for a second server.
+            code, _, complaint = view("layout.npz", "--serve", "--port", str(port))
+            assert code == 2
+            assert "'port' cannot be listened on" in complaint
+        finally:
+            server.send_signal(signal.SIGINT)
+            rest, errors = server.communicate(timeout=20)
+
+    assert server.returncode == 0
+    assert (rest, errors) == ("", "")
+
+
+def test_without_a_choice_the_page_goes_to_a_browser_or_is_told_of(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    opened = []
+    for has_browser in (True, False):
+        monkeypatch.setattr("webbrowser.open", lambda address, found=has_browser: opened.append(address) or found)
+        path, is_opened = open_page("<p>µ</p>")
+        assert is_opened == has_browser
+        assert path.read_text(encoding="utf-8") == "<p>µ</p>"
+        assert opened[-1] == path.as_uri()
+
+
+def test_a_port_that_is_none_is_refused():
+    with pytest.raises(ParameterError, match="'port' must be >= 0"):
+        serve_page("", port=-1, tell=print)
