@@ -113,7 +113,7 @@ def main(out_dir: Path) -> None:
     mosaics = sensors(qe * cut)
     for position, (name, sensor) in enumerate(mosaics.items(), start=1):
         capture = fs.Camera(optics=OPTICS, sensor=sensor).capture(together, exposure_s=EXPOSURE_S, seed=1)
-        axes = plot_capture(capture, ax=figure.add_subplot(2, 3, position))
+        axes = plot_capture(capture, legend=False, ax=figure.add_subplot(2, 3, position))
         axes.set_xlim(60, 260)
         axes.set_ylim(200, 400)
         axes.set_title(f"{name}: {sensor.layout.n_sites:,} sites")

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["plot_capture", "plot_layout", "plot_noise_budget", "save_drawing", "save_figure"]
 
 #: Layouts of more sites are drawn as an image, which takes less time than their outlines.
-MOST_OUTLINES = 3000
+MOST_OUTLINES = 4000
 #: Layouts of more sites are not drawn with their adjacency: nobody could see it, and finding it takes long.
 MOST_ADJACENT = 50_000
 #: Drawings of more sites are slow to open everywhere.
@@ -44,6 +44,7 @@ def plot_layout(
     label: str = "",
     overlay: str | Sequence[str] = (),
     scale_bar: bool = True,
+    legend: bool = True,
     ax: Axes | None = None,
     figure_inches: float = 8.0,
 ) -> Axes:
@@ -63,6 +64,8 @@ def plot_layout(
         ``"adjacency"``: a line between the centres of any two sites that share an edge.
     scale_bar : bool
         Whether a bar tells a length.
+    legend : bool
+        Whether a colour bar or a legend tells what the colours mean.
     ax : matplotlib axes, optional
         New ones by default.
     figure_inches : float
@@ -80,11 +83,11 @@ def plot_layout(
 
     Notes
     -----
-    Up to 3,000 sites are outlines, which stay outlines in a file of vectors. More are an image, painted for the pixels
+    Up to 4,000 sites are outlines, which stay outlines in a file of vectors. More are an image, painted for the pixels
     there are: again after each zoom, and at the resolution of the file that is saved. Its borders are smoothed by 3 x 3
     samples a pixel.
     """
-    return _plot(layout, colours_of(layout, by, label=label), overlay, scale_bar, ax, figure_inches)
+    return _plot(layout, colours_of(layout, by, label=label), overlay, scale_bar, legend, ax, figure_inches)
 
 
 def plot_capture(
@@ -94,6 +97,7 @@ def plot_capture(
     label: str = "",
     overlay: str | Sequence[str] = (),
     scale_bar: bool = True,
+    legend: bool = True,
     ax: Axes | None = None,
     figure_inches: float = 8.0,
 ) -> Axes:
@@ -105,7 +109,7 @@ def plot_capture(
     capture : Capture
     by : str or array
         ``"code"``, ``"electrons"``, ``"expected_e"``, or what :func:`plot_layout` takes.
-    label, overlay, scale_bar, ax, figure_inches
+    label, overlay, scale_bar, legend, ax, figure_inches
         As for :func:`plot_layout`.
 
     Returns
@@ -118,7 +122,7 @@ def plot_capture(
     ParameterError
         As for :func:`plot_layout`.
     """
-    return _plot(capture.layout, colours_of(capture, by, label=label), overlay, scale_bar, ax, figure_inches)
+    return _plot(capture.layout, colours_of(capture, by, label=label), overlay, scale_bar, legend, ax, figure_inches)
 
 
 def plot_noise_budget(
@@ -231,6 +235,7 @@ def _plot(
     colours: SiteColours,
     overlay: str | Sequence[str],
     scale_bar: bool,
+    legend: bool,
     ax: Axes | None,
     figure_inches: float,
 ) -> Axes:
@@ -259,7 +264,8 @@ def _plot(
     ax.set_facecolor(shares(BACKGROUND))
     ax.set_xlabel("x / µm")
     ax.set_ylabel("y / µm")
-    _explain(ax, colours)
+    if legend:
+        _explain(ax, colours)
 
     def told(x: float, y: float) -> str:  # matplotlib calls with these names
         return _told(layout, colours, x, y, find(x, y))
@@ -277,7 +283,7 @@ def _explain(ax: Axes, colours: SiteColours) -> None:
     if colours.scale is not None:
         scale = colours.scale
         shown = ScalarMappable(PowerNorm(scale.gamma, scale.low, scale.high), scale.colour_map)
-        ax.figure.colorbar(shown, ax=ax, label=colours.title, shrink=0.8)
+        ax.figure.colorbar(shown, ax=ax, label=colours.title, shrink=0.8, aspect=30.0, pad=0.02)
     elif colours.legend:
         patches = [Patch(facecolor=shares(rgb), edgecolor="0.4", label=name) for name, rgb in colours.legend]
         ax.legend(handles=patches, title=colours.title or None, loc="upper left", bbox_to_anchor=(1.01, 1.0))
