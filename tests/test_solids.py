@@ -1,0 +1,439 @@
+"""The sensor as solids: closed, of the right volumes, without overlap, cut truly, and the same in the files."""
+
+from __future__ import annotations
+
+import sys
+
+import manifold3d
+import numpy as np
+import pytest
+import shapely
+import trimesh
+
+import foveasim as fs
+from foveasim.errors import FileError, GeometryError, ParameterError
+from foveasim.view import SensorStack, render, solids, stack
+
+PARTS = ("wells", "trenches", "filters", "lenses")
+STACK = SensorStack(well_depth_um=3.0, trench_width_um=0.2, filter_thickness_um=0.6, lens_height_um=0.7)
+NO_LENSES = SensorStack(lens_height_um=0.0)
+FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
+HOOK = shapely.Polygon([(20, 0), (28, 0), (28, 2), (22, 2), (22, 8), (20, 8)])
+HORSESHOE = shapely.Polygon([(30, 0), (39, 0), (39, 9), (37, 9), (37, 2), (32, 2), (32, 9), (30, 9)])
+LAYOUTS = {
+    "squares": lambda: fs.layout.mosaic(fs.layout.grid(n_x=12, n_y=9, pitch_um=2.0), ("RG", "GB")),
+    "hexagons": lambda: fs.layout.hexagonal(n_columns=10, n_rows=10, pitch_um=2.5),
+    "rings with arcs": lambda: fs.layout.log_polar(n_sectors=40, min_size_um=2.0, r_max_um=60.0, stagger=True, chords_per_arc=3),
+    "zones": lambda: fs.layout.node(fs.layout.zones(side_um=(8, 16, 32), pitch_um=(1, 2, 4))),
+    "Voronoi, far from the origin": lambda: fs.layout.voronoi(n_sites=150, size_um=(30.0, 30.0), seed=3).translate(4000.0, -9000.0),
+    "gaps": lambda: fs.layout.grid(n_x=5, n_y=5, pitch_um=3.0, trench_um=0.6),
+}  # fmt: skip
+
+
+def as_trimesh(mesh):
+    return trimesh.Trimesh(mesh.points_um, mesh.triangles, process=False)
+
+
+def hull_um2(layout):
+    return shapely.MultiPoint(layout.xy_um).convex_hull.area
+
+
+# -- closed, and of the right volume -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_every_part_is_closed_and_no_two_share_volume(name):
+    made = solids(LAYOUTS[name](), STACK)
+    report = made.check()
+
+    assert tuple(made.parts) == PARTS
+    assert report.ok
+    assert [part.status for part in report.parts] == ["NoError"] * 4
+    for mesh in made.meshes:
+        body = as_trimesh(mesh)
+        assert body.is_watertight
+        assert body.is_winding_consistent
+    # Balls and rings: as many as there are sites.
+    n = made.layout.n_sites
+    assert [part.euler_characteristic for part in report.parts] == [2 * n, 0, 2 * n, 2 * n]
+    assert max(report.overlap_um3.values()) <= 1e-9
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_volumes_are_areas_times_thicknesses(name):
+    layout = LAYOUTS[name]()
+    made = solids(layout, STACK)
+    well_um2 = fs.layout.inset(layout, 0.1).area_um2
+
+    assert made.volumes_um3("wells") == pytest.approx(3.0 * well_um2, rel=1e-9)
+    assert made.volumes_um3("trenches") == pytest.approx(3.0 * (layout.area_um2 - well_um2), rel=1e-9)
+    assert made.volumes_um3("filters") == pytest.approx(0.6 * layout.area_um2, rel=1e-9)
+    for part in made.check().parts:  # manifold3d's own sums, of millions of triangles far from the origin too
+        assert part.volume_um3 == pytest.approx(made.volumes_um3(part.name).sum(), rel=1e-7)
+
+
+def test_the_trench_of_a_square_is_what_a_pencil_says():
+    # 2 µm squares: wells of 1.8 µm, walls of 4 - 3.24 µm².
+    made = solids(fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0), STACK)
+
+    assert made.volumes_um3("wells") == pytest.approx(np.full(9, 3.0 * 3.24), rel=1e-12)
+    assert made.volumes_um3("trenches") == pytest.approx(np.full(9, 3.0 * 0.76), rel=1e-12)
+    low, high = made.parts["wells"].bounds_um
+    assert (low[2], high[2]) == (-3.0, 0.0)
+    low, high = made.parts["lenses"].bounds_um
+    assert (low[2], high[2]) == pytest.approx((0.6, 1.3))
+
+
+@pytest.mark.parametrize("n_steps", [1, 4, 32])
+def test_a_lens_is_a_stack_of_frustums_over_its_site(n_steps):
+    # A frustum between scaled copies of an area A at shares s and t has the volume A h (s² + s t + t²) / 3.
+    layout = fs.layout.hexagonal(n_columns=4, n_rows=4, pitch_um=3.0)
+    made = solids(layout, SensorStack(lens_height_um=0.5, n_lens_steps=n_steps))
+    radius_um = np.sqrt(layout.area_um2[0] / np.pi)
+    ball_um = (radius_um**2 + 0.25) / 1.0
+    share = np.append(np.cos(0.5 * np.pi * np.arange(n_steps) / n_steps), 0.0)
+    height_um = np.sqrt(ball_um**2 - (share * radius_um) ** 2) - (ball_um - 0.5)
+    frustums = np.diff(height_um) * (share[1:] ** 2 + share[1:] * share[:-1] + share[:-1] ** 2) / 3.0
+
+    assert made.volumes_um3("lenses") == pytest.approx(layout.area_um2 * frustums.sum(), rel=1e-9)
+
+
+def test_the_lens_of_a_disc_comes_to_the_cap_of_a_ball():
+    disc = fs.Layout.from_polygons([shapely.Point(5.0, 5.0).buffer(4.0, quad_segs=64)])
+    made = solids(disc, SensorStack(lens_height_um=1.5, n_lens_steps=48))
+    cap_um3 = np.pi * 1.5 * (3.0 * 16.0 + 1.5**2) / 6.0
+
+    assert made.volumes_um3("lenses")[0] == pytest.approx(cap_um3, rel=2e-3)
+
+
+def test_a_lens_is_at_most_half_a_ball_over_a_small_site():
+    made = solids(fs.Layout.from_rectangles([[0, 0], [20, 0]], [1.0, 9.0]), SensorStack(lens_height_um=3.0))
+    mesh = made.parts["lenses"]
+    top_um = [mesh.points_um[mesh.photosite == k, 2].max() for k in (0, 1)]
+
+    assert top_um == pytest.approx([0.6 + 1.0 / np.sqrt(np.pi), 0.6 + 3.0])
+
+
+@pytest.mark.parametrize("name", ["squares", "rings with arcs", "gaps"])
+def test_rounder_lenses_are_closed_and_touch_their_filters_only(name):
+    made = solids(LAYOUTS[name](), SensorStack(n_lens_corners=20, n_lens_steps=5))
+    lenses = made.parts["lenses"]
+    report = made.check()
+
+    assert report.ok
+    assert as_trimesh(lenses).is_watertight
+    assert report.parts[3].euler_characteristic == 2 * made.layout.n_sites
+    # Seen from above no part of a lens hangs over another one: all but the floor faces up.
+    a, b, c = (lenses.points_um[lenses.triangles[:, k]] for k in range(3))
+    upward = np.cross(b - a, c - a)[:, 2]
+    assert np.all((upward > 0.0) | (np.maximum(np.maximum(a, b), c)[:, 2] <= 0.6))
+    roof_um2 = 0.5 * np.bincount(lenses.photosite[lenses.triangles[:, 0]], weights=np.maximum(upward, 0.0))
+    assert roof_um2 == pytest.approx(made.layout.area_um2, rel=1e-9)
+
+
+def test_the_fill_factor_is_the_layouts_own():
+    for make in LAYOUTS.values():
+        layout = make()
+        whole = solids(layout, SensorStack(trench_width_um=0.0))
+        narrowed = solids(layout, STACK)
+
+        assert tuple(whole.parts) == ("wells", "filters", "lenses")
+        assert whole.fill_factor == pytest.approx(layout.describe().fill_factor, rel=1e-9)
+        assert narrowed.fill_factor == pytest.approx(
+            fs.layout.inset(layout, 0.1).area_um2.sum() / hull_um2(layout), rel=1e-9
+        )
+
+
+def test_ten_thousand_sites_are_closed_and_share_nothing():
+    layout = fs.layout.grid(n_x=100, n_y=100, pitch_um=4.0)
+    made = solids(layout, SensorStack(trench_width_um=0.4))
+    report = made.check()
+
+    assert report.ok
+    assert all(as_trimesh(mesh).is_watertight for mesh in made.meshes)
+    assert max(report.overlap_um3.values()) < 1e-9
+    assert made.fill_factor == pytest.approx(0.81, rel=1e-9)
+    assert report.parts[0].volume_um3 == pytest.approx(10_000 * 3.6**2 * 3.0, rel=1e-9)
+    assert report.parts[1].volume_um3 == pytest.approx(10_000 * (16.0 - 3.6**2) * 3.0, rel=1e-9)
+    assert report.parts[2].volume_um3 == pytest.approx(10_000 * 16.0 * 0.6, rel=1e-9)
+
+
+def test_the_check_sees_parts_that_share_volume_and_surfaces_that_are_open():
+    made = solids(fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0), STACK)
+    wells = made.parts["wells"]
+    moved = type(wells)(**{**fields_of(wells), "points_um": wells.points_um + np.array([0.05, 0.0, 0.0])})
+    opened = type(wells)(**{**fields_of(wells), "triangles": wells.triangles[1:]})
+
+    shared = with_wells(made, moved).check()
+    # Every well stands 0.05 µm deep in its own trench's wall, over 1.8 µm by 3 µm.
+    assert shared.overlap_um3["wells", "trenches"] == pytest.approx(9 * 0.05 * 1.8 * 3.0)
+    assert not shared.ok
+    broken = with_wells(made, opened).check()
+    assert broken.parts[0].status == "NotManifold"
+    assert not broken.ok
+
+
+def fields_of(mesh):
+    return {name: getattr(mesh, name) for name in ("name", "points_um", "triangles", "photosite", "values", "colours")}
+
+
+def with_wells(made, wells):
+    return type(made)(layout=made.layout, sensor_stack=made.sensor_stack, parts={**made.parts, "wells": wells})
+
+
+# -- odd sites -----------------------------------------------------------------------------------------------------------
+
+
+def test_holes_and_inward_corners_are_carried():
+    # The frame's well is a frame too; its trench runs along the outline and around the hole.
+    layout = fs.Layout.from_polygons([FRAME, HOOK])
+    made = solids(layout, NO_LENSES)
+    report = made.check()
+    well_um2 = [7.8**2 - 4.2**2, 60 - 4 * 7.0]
+
+    assert report.ok
+    assert all(as_trimesh(mesh).is_watertight for mesh in made.meshes)
+    assert made.volumes_um3("wells")[0] == pytest.approx(3.0 * well_um2[0], rel=1e-9)
+    assert made.volumes_um3("trenches") == pytest.approx(3.0 * layout.area_um2 - made.volumes_um3("wells"), rel=1e-9)
+    assert {part.name: part.euler_characteristic for part in report.parts} == {
+        "wells": 0 + 2,
+        "trenches": 0 + 0 + 0,
+        "filters": 0 + 2,
+    }
+
+
+def test_a_hole_that_meets_the_outline_in_a_corner_is_closed():
+    bitten = shapely.Polygon([(30, 0), (38, 0), (38, 8), (30, 8)], [[(30, 0), (34, 6), (36, 4)]])
+    made = solids(fs.Layout.from_polygons([bitten]), SensorStack(trench_width_um=0.0, lens_height_um=0.0))
+
+    assert made.check().ok
+    assert made.volumes_um3("wells")[0] == pytest.approx(3.0 * bitten.area, rel=1e-9)
+
+
+def test_a_site_that_no_place_sees_whole_carries_no_lens_and_is_named():
+    box = shapely.box(-9, 0, -1, 8)
+    with pytest.raises(
+        GeometryError, match=r"site 1 cannot carry a lens: .* take lens_height_um=0, or other sites"
+    ) as raised:
+        solids(fs.Layout.from_polygons([box, HORSESHOE]), STACK)
+    assert raised.value.site_ids == (1,)
+    with pytest.raises(GeometryError, match=r"site 0 cannot carry a lens \(and 1 more\): it has a hole"):
+        solids(fs.Layout.from_polygons([FRAME, box, HORSESHOE]), STACK)
+    assert solids(fs.Layout.from_polygons([FRAME, box, HORSESHOE]), NO_LENSES).check().ok
+
+
+def test_a_hook_carries_a_lens_from_its_corner():
+    # The centre of area lies outside; that of the largest circle in the corner sees all.
+    hook = shapely.Polygon([(0, 0), (8, 0), (8, 3), (3, 3), (3, 8), (0, 8)])
+    assert not hook.contains(hook.centroid)
+    made = solids(fs.Layout.from_polygons([hook]), SensorStack())
+
+    assert made.check().ok
+    assert made.volumes_um3("lenses")[0] > 0.0
+
+
+def test_a_site_too_narrow_for_its_trench_is_named():
+    layout = fs.Layout.from_rectangles([[0, 0], [5, 0], [10, 0]], [[2, 2], [0.15, 2], [2, 2]])
+
+    with pytest.raises(GeometryError, match="site 1 would vanish or fall into parts") as raised:
+        solids(layout, STACK)
+    assert raised.value.site_ids == (1,)
+
+
+def test_a_layout_without_sites_has_no_solids():
+    with pytest.raises(GeometryError, match="no sites"):
+        solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0)[np.zeros(4, bool)])
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"well_depth_um": 0.0}, "'well_depth_um' must be > 0"),
+        ({"trench_width_um": -0.1}, "'trench_width_um' must be >= 0"),
+        ({"filter_thickness_um": 1e-7}, "'filter_thickness_um' must be >= 0.0001"),
+        ({"lens_height_um": 5000.0}, "'lens_height_um' must be <= 1000"),
+        ({"n_lens_steps": 0}, "'n_lens_steps' must be >= 1"),
+        ({"n_lens_corners": -1}, "'n_lens_corners' must be >= 0"),
+    ],
+)
+def test_thicknesses_that_cannot_be_are_refused(parameters, message):
+    with pytest.raises(ParameterError, match=message):
+        SensorStack(**parameters)
+
+
+# -- cuts ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["squares", "rings with arcs", "zones"])
+@pytest.mark.parametrize("shape", ["quarter", "slanted", "disc", "two pieces"])
+def test_a_cut_leaves_closed_solids_of_the_remaining_area(name, shape):
+    layout = LAYOUTS[name]()
+    x0, y0, x1, y1 = layout.bounds_um
+    x, y, size = 0.5 * (x0 + x1) + 0.123, 0.5 * (y0 + y1) - 0.217, max(x1 - x0, y1 - y0)
+    region = {
+        "quarter": shapely.box(x, y - size, x + size, y),
+        "slanted": shapely.Polygon([(x, y), (x + size, y - 0.37 * size), (x + size, y + 2 * size)]),
+        "disc": shapely.Point(x, y).buffer(0.2 * size),
+        "two pieces": shapely.MultiPolygon(
+            [shapely.box(x, y, x + 1.1, y + 1.3), shapely.box(x - size, y - size, x - 2.0, y - 0.7)]
+        ),
+    }[shape]
+    cut = solids(layout, STACK).cut(region)
+    left_um2 = shapely.area(shapely.difference(layout.polygons(), region))
+    well_left_um2 = shapely.area(shapely.difference(fs.layout.inset(layout, 0.1).polygons(), region))
+
+    assert cut.check().ok
+    assert all(as_trimesh(mesh).is_watertight for mesh in cut.meshes)
+    # Site by site: so every cut face knows whose it is.
+    assert cut.volumes_um3("filters") == pytest.approx(0.6 * left_um2, abs=1e-9 * layout.area_um2.max())
+    assert cut.volumes_um3("wells") == pytest.approx(3.0 * well_left_um2, abs=1e-9 * layout.area_um2.max())
+
+
+def test_a_cut_lens_loses_what_manifold3d_says():
+    made = solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=4.0), STACK)
+    region = shapely.box(-1.0, -5.0, 5.0, 1.2)
+    lenses = made.parts["lenses"]
+    body = manifold3d.Manifold(manifold3d.Mesh64(lenses.points_um, lenses.triangles.astype(np.uint64)))
+    box = manifold3d.Manifold.cube((6.0, 6.2, 20.0)).translate((-1.0, -5.0, -10.0))
+
+    assert made.cut(region).volumes_um3("lenses").sum() == pytest.approx((body - box).volume(), rel=1e-12)
+
+
+def test_pieces_of_a_cut_keep_the_colour_and_the_value_of_their_site():
+    layout = LAYOUTS["squares"]()
+    values = np.arange(layout.n_sites, dtype=float)
+    cut = solids(layout, STACK, by=values).cut(shapely.box(-0.5, -50, 50, 0.4))
+
+    for mesh in cut.meshes:
+        assert np.array_equal(mesh.values, values[mesh.photosite])
+        centre_um = np.stack([mesh.points_um[mesh.triangles[:, k]] for k in range(3)]).mean(axis=0)[:, :2]
+        reach_um = np.abs(centre_um - layout.centroid_um[mesh.photosite[mesh.triangles[:, 0]]]).max()
+        assert reach_um <= 1.0 + 1e-9
+
+
+def test_a_cut_of_some_parts_leaves_the_others():
+    made = solids(LAYOUTS["hexagons"](), STACK)
+    cut = made.cut(of=["lenses", "filters"])
+
+    assert cut.parts["wells"] is made.parts["wells"]
+    assert cut.volumes_um3("filters").sum() < made.volumes_um3("filters").sum()
+    with pytest.raises(ParameterError, match="'part' must be one of 'wells', 'trenches'"):
+        made.cut(of=["glass"])
+
+
+def test_whole_sites_go_by_their_middles():
+    layout = fs.layout.grid(n_x=4, n_y=1, pitch_um=2.0)  # middles at -3, -1, 1, 3
+    cut = solids(layout, STACK).cut(shapely.box(0.9, -5, 9, 5), whole=True)
+
+    assert cut.volumes_um3("filters") == pytest.approx([2.4, 2.4, 0.0, 0.0])
+
+
+def test_a_region_over_everything_leaves_nothing_and_says_so(tmp_path):
+    made = solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0), STACK)
+    nothing = made.cut(shapely.box(-9, -9, 9, 9))
+
+    assert nothing.volumes_um3("wells").sum() == 0.0
+    with pytest.raises(GeometryError, match="nothing to show"):
+        render(nothing, renderer="software")
+    with pytest.raises(GeometryError, match="nothing left of the solids to write"):
+        nothing.write(tmp_path / "none.glb")
+    assert nothing.cut().fill_factor == 0.0
+
+
+def test_the_sensor_cut_open_shows_every_layer():
+    opened = stack(fs.layout.grid(n_x=20, n_y=20, pitch_um=2.0), STACK)
+    volumes = [opened.volumes_um3(part) for part in PARTS]
+
+    assert opened.check().ok
+    # More is taken away the higher the layer.
+    n_whole = [np.count_nonzero(v > 0.99 * v.max()) for v in volumes]
+    assert n_whole[0] == n_whole[1] > n_whole[2] > n_whole[3] > 0
+
+
+def test_a_capture_shows_its_code_in_the_wells():
+    layout = LAYOUTS["squares"]()
+    sensor = fs.Sensor(layout, filters="rgb", capacitance_f=1e-15)
+    scene = fs.Scene.flat(
+        shape=(100, 100), pitch_um=20.0, distance_m=0.5, radiance_w_m2_sr_nm=1.0, wavelength_nm=(450, 540, 610)
+    )
+    taken = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=sensor).capture(
+        scene, exposure_s=0.01, seed=0
+    )
+    wells = solids(taken, STACK).parts["wells"]
+
+    assert np.array_equal(wells.values, taken.code[wells.photosite])
+
+
+# -- files ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def made():
+    return solids(LAYOUTS["hexagons"](), STACK, by=np.arange(100.0))
+
+
+def test_a_glb_holds_the_same_faces_sites_and_values(made, tmp_path):
+    made.write(tmp_path / "sensor.glb")
+    loaded = trimesh.load(tmp_path / "sensor.glb", process=False)
+
+    assert set(loaded.geometry) == set(PARTS)
+    for name, mesh in made.parts.items():
+        body = loaded.geometry[name]
+        assert np.array_equal(body.faces, mesh.triangles)
+        assert np.allclose(body.vertices, mesh.points_um, rtol=1e-6, atol=1e-5)  # glTF's numbers are float32
+        assert np.array_equal(np.ravel(body.vertex_attributes["_photosite"]), mesh.photosite)
+        assert np.array_equal(np.ravel(body.vertex_attributes["_value"]), mesh.values)
+        assert np.array_equal(body.visual.vertex_colors[:, :3], mesh.colours)
+        assert body.is_watertight
+
+
+@pytest.mark.parametrize("ending", [".stl", ".ply", ".obj", ".3mf"])
+def test_other_files_hold_as_many_faces_and_the_same_volume(made, ending, tmp_path):
+    made.write(tmp_path / f"sensor{ending}")
+    loaded = trimesh.load(tmp_path / f"sensor{ending}", process=False)
+    bodies = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
+    n_faces = sum(len(body.faces) for body in bodies)
+    volume_um3 = sum(made.volumes_um3(part).sum() for part in PARTS)
+
+    assert n_faces == sum(mesh.triangles.shape[0] for mesh in made.meshes)
+    assert sum(body.volume for body in bodies) == pytest.approx(volume_um3, rel=1e-5)
+
+
+def test_an_unknown_ending_is_refused_and_leaves_nothing(made, tmp_path):
+    with pytest.raises(FileError, match=r"must end in \.glb, \.stl"):
+        made.write(tmp_path / "sensor.step")
+    with pytest.raises(FileError, match=r"the folder .* does not exist"):
+        made.write(tmp_path / "none" / "sensor.glb")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_export_that_fails_leaves_what_was_there(made, tmp_path, monkeypatch):
+    (tmp_path / "sensor.glb").write_bytes(b"before")
+
+    def broken(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(trimesh.Scene, "export", broken)
+    with pytest.raises(FileError, match="cannot be written: No space left on device"):
+        made.write(tmp_path / "sensor.glb")
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"before"]
+
+
+@pytest.mark.parametrize("library", ["trimesh", "manifold3d"])
+def test_a_library_that_is_missing_is_named_with_its_command(made, library, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
+
+    with pytest.raises(
+        ParameterError, match=rf"'{library}' is missing; install it with: pip install 'foveasim\[view\]'"
+    ):
+        made.write(tmp_path / "a.glb") if library == "trimesh" else made.check()
+    assert not list(tmp_path.iterdir())
+
+
+def test_solids_tell_what_they_are(made):
+    assert (
+        repr(made)
+        == "Solids(2,000 triangles of wells, 4,800 triangles of trenches, 2,000 triangles of filters, 7,000 triangles of lenses)"
+    )
+    with pytest.raises(ParameterError, match="'part' must be one of"):
+        made.volumes_um3("glass")
