@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint bench docs clean
 .NOTPARALLEL:
 
 demo: $(VENV)/.installed
@@ -22,8 +22,12 @@ lint: $(VENV)/.installed-dev
 bench: $(VENV)/.installed-dev
 	$(BIN)/python benchmarks/run.py
 
+docs: $(VENV)/.installed-docs
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet --builder html docs docs/_build/html
+	@echo "the site begins at docs/_build/html/index.html"
+
 clean:
-	rm -rf $(VENV) out .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) out docs/_build docs/gallery docs/reference .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find foveasim tests -name __pycache__ -type d -exec rm -rf {} +
 
 $(VENV)/.made:
@@ -42,3 +46,8 @@ $(VENV)/.installed-dev: $(VENV)/.made pyproject.toml
 	@echo "installing foveasim and its development tools into $(VENV) (a minute or so)"
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-docs: $(VENV)/.made pyproject.toml
+	@echo "installing foveasim and what its documentation is made with into $(VENV) (a minute or so)"
+	$(BIN)/python -m pip install --quiet --editable '.[docs]'
+	touch $@ $(VENV)/.installed-dev $(VENV)/.installed
