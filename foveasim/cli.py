@@ -172,10 +172,15 @@ def view(
     rules: Annotated[
         Path | None, typer.Option("--rules", help="Rules to check the layout against: a YAML file or a preset's name.")
     ] = None,
+    solid: Annotated[
+        bool,
+        typer.Option("--solid", help="In three dimensions: a capture as columns, a layout with its wells and lenses."),
+    ] = False,
 ) -> None:
     """Explore a layout, a capture or a report in a browser, on a page that needs no network."""
+    from foveasim.files import written_whole
     from foveasim.shots import read_viewable
-    from foveasim.view.web import check_page_path, open_page, serve_page, web_page, write_web_page
+    from foveasim.view.web import check_page_path, open_page, serve_page, solid_page, web_page
 
     if web is not None and serve:
         _end("error: --web writes a file and --serve hands the page out: take one of them", BAD_INPUT)
@@ -183,15 +188,18 @@ def view(
         _end("error: --port belongs to --serve", BAD_INPUT)
     if web is not None:
         check_page_path(web)
+    if solid and (rules is not None or layout is not None):
+        _end("error: --solid shows no violations: leave --rules and --layout out", BAD_INPUT)
     with console.status("reading"):
         seen = read_viewable(file, layout=layout, rules=rules)
+    with console.status("making the page"):
+        flat = None if solid else web_page(seen.thing, report=seen.report, name=seen.name)
+        text = solid_page(seen.thing, name=seen.name) if flat is None else flat
     if web is not None:
-        with console.status("writing the page"):
-            write_web_page(seen.thing, web, report=seen.report, name=seen.name)
+        with written_whole(web) as temporary:
+            temporary.write_text(text, encoding="utf-8")
         console.print(f"wrote {web}", soft_wrap=True, highlight=False)
         return
-    with console.status("making the page"):
-        text = web_page(seen.thing, report=seen.report, name=seen.name)
     if serve:
         serve_page(text, port=port, tell=lambda at: _say(f"{file} is at {at} until you press Ctrl-C"))
         return

@@ -68,8 +68,10 @@ def folder(tmp_path_factory):
         (["capture.npz"], ["30 photosites", '"kind": "capture"', "expected electrons"]),
         (["layout.npz", "--rules", "rules.yaml"], ["min_size_um", '"count": 30']),
         (["report.lyrdb", "--layout", "layout.npz"], ["min_size_um", '"count": 30']),
+        (["layout.npz", "--solid"], ["30 photosites", "z is toward the lens"]),
+        (["capture.npz", "--solid"], ["30 photosites", "as high as the codes"]),
     ],
-    ids=lambda value: value[0],
+    ids=lambda value: " ".join(value) if "photosites" not in " ".join(value) else "",
 )
 def test_a_page_is_written_of_whatever_can_be_looked_at(view, tmp_path, arguments, words):
     code, said, complaint = view(*arguments, "--web", str(tmp_path / "out.html"))
@@ -90,6 +92,7 @@ def test_a_page_is_written_of_whatever_can_be_looked_at(view, tmp_path, argument
         (["capture.npz", "--web", "a.html", "--serve"], "take one of them"),
         (["capture.npz", "--port", "8000"], "--port belongs to --serve"),
         (["capture.npz", "--serve", "--port", "70000"], "'port' must be <= 65535"),
+        (["layout.npz", "--solid", "--rules", "rules.yaml"], "--solid shows no violations"),
         (["report.lyrdb"], "'layout' must be given"),
         (["report.lyrdb", "--layout", "layout.npz", "--rules", "rules.yaml"], "'rules' cannot be given with a report"),
         (["layout.npz", "--layout", "layout.npz"], "'layout' belongs to a report"),

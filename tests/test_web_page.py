@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import base64
 import gzip
+import itertools
 import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ import foveasim as fs
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout.lyrdb import read_lyrdb
 from foveasim.pictures import read_picture
-from foveasim.view import site_at, web_page, write_web_page
+from foveasim.view import SensorStack, site_at, solid_page, solids, web_page, write_solid_page, write_web_page
 from foveasim.view.palette import FILTER_COLOURS
 from foveasim.view.web._content import signal_to_noise
 from foveasim.view.web._pack import back_references, packed, smallest
@@ -717,3 +719,101 @@ def test_about_is_plain_json_with_a_name_for_every_array():
 
     assert {f"data-{name}" for name in about["arrays"]} == ids
     assert [rule["name"] for rule in about["rules"]] == ["min_size_um"]
+
+
+# -- three dimensions ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.needs("chromium")
+def test_the_mouse_finds_columns_where_they_stand_and_as_high_as_they_are(visit):
+    page = visit(solid_page(CAPTURE))
+    page.evaluate("foveasim.lookDown()")
+    x0, y0, x1, y1 = MOSAIC.bounds_um
+    tallest_um = 0.15 * max(x1 - x0, y1 - y0)
+    for site in (0, 37, 64, 119, int(CAPTURE.code.argmax())):
+        x, y = MOSAIC.centroid_um[site]
+        z = tallest_um * CAPTURE.code[site] / CAPTURE.code.max()
+        page.mouse.move(*page.evaluate("([x, y, z]) => foveasim.toWindow(x, y, z)", [x, y, z]))
+        until(page, "site => foveasim.hovered === site", site)
+
+        assert page.inner_text("#site-heading") == f"Photosite {site} (columns)"
+        assert row(page, "code") == f"{CAPTURE.code[site]:,} DN"
+        assert row(page, "area") == f"{PITCH_UM**2} µm²"
+        assert row(page, "filter") == "RGB"[MOSAIC.channel[site]]
+    page.mouse.move(3, 3)
+    until(page, "foveasim.hovered === -1")
+    # From the side, the tallest column hides what is right behind its top.
+    page.focus("#solid")
+    page.keyboard.press("0")
+    site = int(CAPTURE.code.argmax())
+    top = [*MOSAIC.centroid_um[site], tallest_um]
+    picked = page.evaluate("(p) => foveasim.pick(...foveasim.toWindow(...p))", top)
+    assert picked == {"site": site, "part": "columns"}
+
+
+@pytest.mark.needs("chromium")
+def test_parts_of_the_stack_can_be_hidden_and_what_is_under_them_is_found(visit):
+    layout = fs.layout.mosaic(fs.layout.grid(n_x=6, n_y=4, pitch_um=3.0), ("RG", "GB"))
+    stack = solids(layout, SensorStack(well_depth_um=4.0, trench_width_um=0.4))
+    page = visit(solid_page(layout, solids=stack))
+    assert page.evaluate("foveasim.parts") == list(stack.parts) == ["wells", "trenches", "filters", "lenses"]
+    page.evaluate("foveasim.lookDown()")
+    place = [*layout.centroid_um[14], 0.0]
+    for part in ("lenses", "filters", "wells"):
+        found = page.evaluate("(p) => foveasim.pick(...foveasim.toWindow(...p))", place)
+        assert found == {"site": 14, "part": part}
+        page.get_by_label(part).uncheck()
+    found = page.evaluate(
+        "(p) => foveasim.pick(...foveasim.toWindow(...p))", [layout.bounds_um[0] + 0.1, layout.centroid_um[6, 1], 0.0]
+    )
+    assert found == {"site": 6, "part": "trenches"}
+
+
+@pytest.mark.needs("chromium")
+def test_keys_turn_the_solids_and_the_hovered_site_is_lit_up(visit, tmp_path):
+    page = visit(solid_page(CAPTURE))
+    shots = [page.screenshot()]
+    page.focus("#solid")
+    for key in ("ArrowLeft", "ArrowUp", "+", "t", "0"):
+        page.keyboard.press(key)
+        page.evaluate("() => new Promise(requestAnimationFrame)")
+        shots.append(page.screenshot())
+    assert all(one != other for one, other in itertools.pairwise(shots))
+    x, y = page.evaluate("(p) => foveasim.toWindow(...p)", [*MOSAIC.centroid_um[60], 1.0])
+    page.mouse.move(x, y)
+    until(page, "foveasim.hovered >= 0")
+    page.evaluate("() => new Promise(requestAnimationFrame)")
+    (tmp_path / "lit.png").write_bytes(page.screenshot(clip={"x": x - 4, "y": y - 4, "width": 8, "height": 8}))
+    red, green, blue = read_picture(tmp_path / "lit.png")[..., :3].reshape(-1, 3).mean(axis=0)
+    assert red > green > 1.3 * blue  # the yellow of what is lit up, over any filter's colour
+
+
+@pytest.mark.needs("chromium")
+def test_names_stay_text_on_the_page_of_solids_too(visit):
+    layout = MOSAIC.with_columns(**{HOSTILE[0]: np.full(MOSAIC.n_sites, HOSTILE[1])})
+    page = visit(solid_page(layout, name=HOSTILE[1]))
+    page.evaluate("foveasim.lookDown()")
+    page.mouse.move(*page.evaluate("(p) => foveasim.toWindow(...p)", [*MOSAIC.centroid_um[40], 0.0]))
+    until(page, "foveasim.hovered === 40")
+
+    assert row(page, HOSTILE[0].replace("_", " ").strip()) == HOSTILE[1]
+    assert page.evaluate("window.hacked") is None
+
+
+def test_a_page_of_solids_asks_for_nothing_outside_of_it_and_needs_a_right_ending(tmp_path):
+    write_solid_page(MOSAIC, tmp_path / "solid.html")
+    text = (tmp_path / "solid.html").read_text()
+
+    assert all(
+        v.startswith("data:") for _, attrs in Elements(text).found for k, v in attrs.items() if k in {"src", "href"}
+    )
+    with pytest.raises(FileError, match=r"must end in .html"):
+        write_solid_page(MOSAIC, tmp_path / "solid.glb")
+
+
+def test_bundled_libraries_come_with_their_licences():
+    folder = files("foveasim.view.web") / "three"
+    told = (folder / "versions.txt").read_text()
+    for library in ("three", "three-mesh-bvh"):
+        assert re.search(rf"^  {library} +\d+\.\d+\.\d+ +MIT, LICENSE\.{library}$", told, re.MULTILINE)
+        assert "MIT" in (folder / f"LICENSE.{library}").read_text()

@@ -10,7 +10,7 @@ from foveasim.view.probe import find_renderer
 from foveasim.view.rule_plots import plot_report
 from foveasim.view.solids import PartReport, SensorStack, Solids, SolidsReport, solids, stack
 from foveasim.view.stills import Viewpoint, render, show, sites_in_view
-from foveasim.view.web import web_page, write_web_page
+from foveasim.view.web import solid_page, web_page, write_solid_page, write_web_page
 
 __all__ = [
     "Mesh",
@@ -37,8 +37,10 @@ __all__ = [
     "site_at",
     "site_colours",
     "sites_in_view",
+    "solid_page",
     "solids",
     "stack",
     "web_page",
+    "write_solid_page",
     "write_web_page",
 ]

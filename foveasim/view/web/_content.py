@@ -17,7 +17,6 @@ from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout import Layout, Report
 from foveasim.view.id_map import SitePixels
 from foveasim.view.palette import (
-    BACKGROUND,
     CATEGORY_COLOURS,
     DISPLAY_GAMMA,
     FILTER_COLOURS,
@@ -28,7 +27,7 @@ from foveasim.view.palette import (
 from foveasim.view.web._pack import back_references, smallest
 from foveasim.view.web._shapes import shapes_of
 
-__all__ = ["Content", "content_of", "signal_to_noise"]
+__all__ = ["Content", "content_of", "described_sites", "signal_to_noise"]
 
 #: Longer side of the picture.
 PICTURE_PIXELS = 800
@@ -79,41 +78,63 @@ def content_of(thing: Layout | Capture, report: Report | None = None, *, name: s
     GeometryError
         When the layout has no sites.
     """
-    if not isinstance(thing, Layout | Capture):
-        raise ParameterError("thing", f"must be a Layout or a Capture, got a {type(thing).__name__}")
-    capture = thing if isinstance(thing, Capture) else None
-    layout = thing.layout if isinstance(thing, Capture) else thing
-    if layout.n_sites == 0:
-        raise GeometryError("the layout has no sites, and so nothing to show")
+    about, arrays, layout = described_sites(thing, name=name)
     if report is not None and not isinstance(report, Report):
         raise ParameterError("report", f"must be a Report of a check, got a {type(report).__name__}")
     if report is not None and report.n_sites != layout.n_sites:
         raise ParameterError(
             "report", f"must be of this layout of {layout.n_sites:,} sites, got one of {report.n_sites:,}"
         )
-    arrays = _outlines(layout)
+    arrays |= _outlines(layout)
+    picture, place = _picture(layout, thing if isinstance(thing, Capture) else None)
+    rules = [] if report is None else _rules(report, arrays)
+    return Content({**about, "picture": place, "rules": rules}, arrays, picture)
+
+
+def described_sites(
+    thing: Layout | Capture, *, name: str = ""
+) -> tuple[dict[str, Any], dict[str, NDArray[Any]], Layout]:
+    """
+    What every kind of page is told of photosites.
+
+    Returns
+    -------
+    about : dict
+        Heading, notes, number of sites, bounds, columns, palette.
+    arrays : dict of str to array
+        Of the columns.
+    layout : Layout
+
+    Raises
+    ------
+    ParameterError, GeometryError
+        As for :func:`content_of`.
+    """
+    if not isinstance(thing, Layout | Capture):
+        raise ParameterError("thing", f"must be a Layout or a Capture, got a {type(thing).__name__}")
+    capture = thing if isinstance(thing, Capture) else None
+    layout = thing.layout if isinstance(thing, Capture) else thing
+    if layout.n_sites == 0:
+        raise GeometryError("the layout has no sites, and so nothing to show")
+    arrays: dict[str, NDArray[Any]] = {}
     columns = _columns(layout, capture, arrays)
-    picture, place = _picture(layout, capture)
     provenance = layout.provenance
-    origin = str(provenance.get("generator", provenance.get("made_by", provenance.get("read_from", "polygons"))))
+    origin = str(provenance.get("generator", provenance.get("made_by", "polygons"))).replace("_", " ")
     about = {
-        "name": name or origin.replace("_", " "),
+        "name": name or origin,
         "kind": "layout" if capture is None else "capture",
         "notes": _notes(layout, capture, origin),
         "n_sites": layout.n_sites,
         "bounds_um": layout.bounds_um,
         "columns": columns,
         "filter": next((column["array"] for column in columns if column["key"] == "channel"), None),
-        "picture": place,
-        "rules": [] if report is None else _rules(report, arrays),
         "palette": {
             "kinds": [_hex(colour) for colour in CATEGORY_COLOURS],
             "no_data": _hex(NO_DATA),
-            "ground": _hex(BACKGROUND),
             "gamma": DISPLAY_GAMMA,
         },
     }
-    return Content(about, arrays, picture)
+    return about, arrays, layout
 
 
 def signal_to_noise(capture: Capture) -> Floats | None:
@@ -191,7 +212,13 @@ def _columns(layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[
         add("expected_e", "expected electrons", "e⁻", capture.expected_e)
         ratio = signal_to_noise(capture)
         if ratio is not None:
-            add("snr", "signal to noise", "", ratio, note="expected charge over shot noise and read noise")
+            add(
+                "snr",
+                "signal to noise",
+                "",
+                ratio.astype(np.float32),
+                note="expected charge over shot noise and read noise",
+            )
         if len(colours) > 1:
             names = list(capture.filter_names)
             add("channel", "filter", "", capture.filter_of_site, "kinds", names=names, colours=colours)
