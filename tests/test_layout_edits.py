@@ -177,3 +177,18 @@ def test_a_union_has_the_sites_of_all_and_the_columns_of_each():
 def test_bad_arguments_are_refused_by_name(call, message):
     with pytest.raises(ParameterError, match=message):
         call()
+
+
+def test_slivers_along_a_cut_join_their_neighbours_on_the_other_side():
+    """Both sides of a cut are computed apart, so their borders agree up to rounding only."""
+    disc = shapely.Point(0.0, 0.0).buffer(50.0)
+    hexagons = fs.layout.hexagonal(n_columns=40, n_rows=40, pitch_um=3.0)
+    zones = fs.layout.zones(pitch_um=(2.0, 4.0, 8.0), side_um=(48.0, 144.0, 288.0))
+    both = fs.layout.union([fs.layout.clip(hexagons, disc), fs.layout.punch(zones, disc)])
+
+    joined = fs.layout.merge_small(both, min_size_um=1.0)
+
+    assert both.area_um2.min() < 0.1
+    assert joined.area_um2.min() >= 1.0
+    assert joined.area_um2.sum() == pytest.approx(both.area_um2.sum(), abs=1e-3)
+    assert joined.n_sites > 0.9 * both.n_sites

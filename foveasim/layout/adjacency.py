@@ -15,7 +15,7 @@ from foveasim.rings import next_vertex
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-__all__ = ["adjacency"]
+__all__ = ["TOUCHING_UM", "adjacency"]
 
 #: Edges that are this close touch: far below any manufacturing grid, far above the rounding of positions.
 TOUCHING_UM = 1e-6

@@ -19,7 +19,7 @@ from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._model import Layout
 from foveasim.layout._noding import points_on_edges
 from foveasim.layout._regions import as_region
-from foveasim.layout.adjacency import adjacency
+from foveasim.layout.adjacency import TOUCHING_UM, adjacency
 from foveasim.rings import next_vertex, positions_in_runs
 
 __all__ = ["clip", "inset", "joining_groups", "merge", "merge_small", "node", "punch", "snap", "split", "union"]
@@ -165,6 +165,9 @@ def merge(layout: Layout, groups: ArrayLike) -> Layout:
     rows = np.full((count.size, int(count.max(initial=1))), None, dtype=object)
     rows[group[order], positions_in_runs(count)] = layout.polygons()[order]
     joined = shapely.union_all(rows, axis=1) if count.size else np.zeros(0, dtype=object)
+    apart = shapely.get_type_id(joined) != shapely.GeometryType.POLYGON
+    # Edges that were cut apart are neighbours' up to rounding: on a fine grid they are one.
+    joined[apart] = shapely.union_all(rows[apart], axis=1, grid_size=TOUCHING_UM)
     apart = shapely.get_type_id(joined) != shapely.GeometryType.POLYGON
     if apart.any():
         bad = np.flatnonzero(apart[group])
