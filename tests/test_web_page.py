@@ -7,6 +7,7 @@ import gzip
 import itertools
 import json
 import re
+import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
 from importlib.resources import files
@@ -26,7 +27,6 @@ from foveasim.view.web._content import signal_to_noise
 from foveasim.view.web._pack import back_references, packed, smallest
 from foveasim.view.web._shapes import shapes_of
 
-CHROMIUM = "/usr/bin/chromium"
 SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 #: A frame with an island in it, an L, an arrow that no fan from its first vertex fills, a comb that none fills at all,
@@ -216,7 +216,7 @@ def browser():
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=list(SOFTWARE))
+        chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=list(SOFTWARE))
         yield chromium
         chromium.close()
 
@@ -447,6 +447,15 @@ def test_a_range_of_values_fades_all_others(visit):
     span = CAPTURE.electrons.max() - CAPTURE.electrons.min()
     assert from_e == pytest.approx(CAPTURE.electrons.min() + 0.5 * span, abs=0.02 * span)
     assert to_e == CAPTURE.electrons.max()
+
+
+@pytest.mark.needs("chromium")
+def test_a_bound_that_is_not_touched_keeps_all_its_digits(visit):
+    page = visit(web_page(CAPTURE), hash_text="#by=expected_e")
+    page.fill("#range-from", "1000")
+    page.keyboard.press("Enter")
+
+    assert page.evaluate("foveasim.range") == [1000.0, CAPTURE.expected_e.max()]
 
 
 @pytest.mark.needs("chromium")

@@ -37,8 +37,7 @@ class SensorMap {
     this.scale = 1;
     this.width = this.height = 1;
     this.colours = new Uint32Array(TEXTURE_WIDTH * Math.max(1, Math.ceil(sites.n / TEXTURE_WIDTH)));
-    const isSmooth = !renderer.isSlow || sites.n < 20000;
-    this.gl = canvas.getContext("webgl2", { antialias: isSmooth, alpha: false, depth: false, powerPreference: "high-performance" });
+    this.gl = canvas.getContext("webgl2", { antialias: !renderer.isSlow, alpha: false, depth: false, powerPreference: "high-performance" });
     if (this.gl) this._load();
   }
 

@@ -141,11 +141,12 @@ function drawHistogram() {
   const { context, width, height } = fitted($("histogram"));
   const most = Math.max(...histogram), step = width / histogram.length;
   const [from, to] = state.range ? state.range.map((v) => scale.share(v) * width) : [-1, width + 1];
+  const inside = inkOf("--accent"), outside = inkOf("--line");
   context.clearRect(0, 0, width, height);
   histogram.forEach((count, i) => {
     const x = i * step, tall = count ? Math.max(1.5, Math.sqrt(count / most) * (height - 4)) : 0;
     const isIn = x + step > from && x < to;
-    context.fillStyle = isIn ? inkOf("--accent") : inkOf("--line");
+    context.fillStyle = isIn ? inside : outside;
     context.fillRect(x, height - tall, Math.max(step - (step > 3 ? 0.75 : 0), 0.5), tall);
   });
   const site = state.pinned >= 0 ? state.pinned : state.hovered;
@@ -167,8 +168,9 @@ function setRange(from, to) {
 
 function fillRange() {
   const { range, scale } = state;
-  $("range-from").value = Number((range ? range[0] : scale.lowest).toPrecision(6));
-  $("range-to").value = Number((range ? range[1] : scale.highest).toPrecision(6));
+  state.rangeTexts = (range || [scale.lowest, scale.highest]).map((bound) => String(Number(bound.toPrecision(5))));
+  $("range-from").value = state.rangeTexts[0];
+  $("range-to").value = state.rangeTexts[1];
   $("range-all").disabled = !range;
 }
 
@@ -185,7 +187,10 @@ function listenToHistogram() {
   canvas.addEventListener("pointerup", (event) => { if (start !== null && valueAt(event) === start) setRange(null); start = null; });
   for (const id of ["range-from", "range-to"]) {
     $(id).addEventListener("change", () => {
-      const from = Number($("range-from").value), to = Number($("range-to").value);
+      // A bound that was not changed keeps the digits that its field does not show.
+      const [low, high] = state.range || [state.scale.lowest, state.scale.highest], [lowText, highText] = state.rangeTexts;
+      const from = $("range-from").value === lowText ? low : Number($("range-from").value);
+      const to = $("range-to").value === highText ? high : Number($("range-to").value);
       if (Number.isFinite(from) && Number.isFinite(to)) setRange(from, to);
       else fillRange();
     });
@@ -233,7 +238,8 @@ function drawLines() {
       context.beginPath();
       for (const site of found) sites.trace(context, site, map);
       context.lineWidth = 1;
-      context.strokeStyle = "rgb(15 20 30 / " + ink + ")";
+      // Between the grey of dark sites and that of bright ones, so that it is seen on both.
+      context.strokeStyle = "rgb(112 120 134 / " + 1.6 * ink + ")";
       context.stroke();
     }
   }
@@ -401,7 +407,7 @@ function tellSite() {
     rows.push([column.label, site < 0 ? "–" : textOf(column, site), column === state.column || (column.array && column.array === state.column.array)]);
   }
   const centre = site < 0 ? null : state.sites.centre(site);
-  rows.push(["centre", centre ? shown(Number(centre[0].toPrecision(7))) + ", " + shown(Number(centre[1].toPrecision(7))) + " µm" : "–"]);
+  rows.push(["centre / µm", centre ? centre.map((v) => String(Number(v.toPrecision(6)))).join(", ") : "–"]);
   if (site >= 0 && site === state.hovered && state.others.length) rows.push(["overlaps", state.others.join(", ")]);
   const cells = [];
   for (const [label, text, isShown] of rows) {
@@ -619,7 +625,7 @@ async function loadRules() {
   $("rules").hidden = false;
   const total = about.rules.reduce((sum, rule) => sum + rule.count, 0);
   const option = (value, text) => { const element = make("option", text); element.value = value; return element; };
-  $("rule").append(option(-1, "all (" + shown(total) + ")"), ...about.rules.map((rule, k) => option(k, rule.name + " (" + shown(rule.count) + ")")));
+  $("rule").append(option(-1, "all (" + shown(total) + ")"), ...about.rules.map((rule, k) => option(k, rule.name + " (" + shown(rule.count) + (rule.waiver ? ", waived)" : ")"))));
   $("rule").addEventListener("change", () => { state.shownViolations = 0; choose(null); listViolations(); ask("map"); });
   $("more").addEventListener("click", listViolations);
   $("violations").addEventListener("keydown", (event) => {
