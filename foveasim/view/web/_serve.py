@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
-import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 
@@ -89,6 +87,9 @@ def open_page(text: str) -> tuple[Path, bool]:
     is_opened : bool
         Whether there was a browser.
     """
+    import tempfile
+    import webbrowser
+
     path = Path(tempfile.mkdtemp(prefix="foveasim-")) / "view.html"
     path.write_text(text, encoding="utf-8")
     return path, webbrowser.open(path.as_uri())
