@@ -48,7 +48,7 @@ SILICON, OXIDE, GLASS = (116, 132, 160), (58, 64, 78), (208, 228, 240)
 SEEN_THROUGH = 0.35
 #: What is uncovered of the sensor cut open: from this share of its width and up to this share of its height.
 QUARTER = (0.5, 0.5)
-TERRACES = (((0.36, 0.64), ("filters", "lenses")), ((0.2, 0.8), ("lenses",)))
+TERRACES = (((0.39, 0.61), ("filters", "lenses")), ((0.27, 0.73), ("lenses",)))
 #: Overlaps below this share of the smaller part are rounding.
 ROUNDING = 1e-9
 #: Thicker than this is no layer on a sensor.
@@ -470,7 +470,7 @@ def _lenses(layout: Layout, floor_um: float, sensor_stack: SensorStack, look: _C
     if sensor_stack.n_lens_corners:
         # Toward the largest circle around the middle, which lies inside: no step is wider than the one below.
         round_share = _free_radius_um(layout, arm_um)[site] / np.hypot(*arm_um.T)
-        drawn_in = share * (share**2 + (1.0 - share**2) * round_share)
+        drawn_in = share * (share**4 + (1.0 - share**4) * round_share)
     radius_um = np.sqrt(layout.area_um2 / np.pi)
     points_um = np.empty((n_steps * n + n_sites, 3))
     steps = points_um[: n_steps * n].reshape(n_steps, n, 3)

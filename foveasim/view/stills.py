@@ -45,6 +45,10 @@ CENTRING_STEPS = 24
 SHADE_MARGIN_PX = 16
 #: How far the shade of corners reaches, as a share of the scene's size.
 SHADE_REACH_SHARE = 0.02
+#: What is nearer than this share of the reach throws no shade: with less the depth buffer's steps show as hatching.
+SHADE_BIAS_SHARE = 0.1
+#: Scenes of more triangles are drawn with one sample a pixel, by default: a picture in seconds.
+SMOOTHED_TRIANGLES = 1_000_000
 #: More pixels than this are a slip.
 MAX_SIDE_PX = 32_768
 
@@ -130,7 +134,7 @@ def render(
     *,
     viewpoint: Viewpoint | None = None,
     size_px: tuple[int, int] = (1600, 1000),
-    oversampling: int = 2,
+    oversampling: int | None = None,
     shade_corners: bool = False,
     ground: tuple[int, int, int] = GROUND,
     renderer: Literal["auto", "pyvista", "software"] = "auto",
@@ -146,8 +150,9 @@ def render(
     viewpoint : Viewpoint, optional
     size_px : (int, int)
         Width and height of the picture.
-    oversampling : int
-        Each pixel is the mean of so many by so many; 1 has jagged edges and is faster.
+    oversampling : int, optional
+        Each pixel is the mean of so many by so many; 1 has jagged edges and is faster. By default 2, and 1 for scenes of more
+        than a million triangles.
     shade_corners : bool
         Whether places that little light reaches are darker (ambient occlusion); by PyVista only.
     ground : (r, g, b)
@@ -174,6 +179,8 @@ def render(
     """
     meshes = _meshes(scene)
     check_choice("renderer", renderer, ("auto", "pyvista", "software"))
+    if oversampling is None:
+        oversampling = 2 if sum(mesh.triangles.shape[0] for mesh in meshes) <= SMOOTHED_TRIANGLES else 1
     oversampling = check_count("oversampling", oversampling, at_most=8)
     n_x, n_y = _size(size_px, oversampling)
     if finite_array("ground", ground).shape != (3,) or not all(0 <= part <= 255 for part in ground):
@@ -406,7 +413,7 @@ def _by_pyvista(
         if shade_corners:
             size_um = float(np.linalg.norm(np.ptp(np.stack([b for m in meshes for b in m.bounds_um]), axis=0)))
             reach_um = SHADE_REACH_SHARE * size_um
-            plotter.enable_ssao(radius=reach_um, bias=0.02 * reach_um, kernel_size=64, blur=True)
+            plotter.enable_ssao(radius=reach_um, bias=SHADE_BIAS_SHARE * reach_um, kernel_size=64, blur=True)
         large = np.asarray(plotter.screenshot(None, return_img=True))
     finally:
         plotter.close()

@@ -1,0 +1,100 @@
+"""
+What does a retina see that looks a cat in the eye?
+
+New here: ``view.prisms`` of a capture, in colours of one's own, ``view.Viewpoint``, ``Integrator`` on other pictures.
+
+Expect: 9,411 sites, 28 % of them in a fovea of 5.1 % of the area; columns whose height is the code, of which the brightest
+stands 60 µm tall and the others in proportion within 1e-12.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import skimage.data
+
+import foveasim as fs
+from foveasim import view
+from foveasim.encodings import decoded, encoded_srgb
+
+WAVELENGTH_NM = 550.0
+EXPOSURE_S = 0.01
+#: Of white, on a square micrometre in an exposure.
+MOST_PHOTONS_PER_UM2 = 1500.0
+CAPACITANCE_F_PER_UM2 = 0.7e-16
+#: Row and column of the cat's eye, which comes to the axis.
+GAZE_PX = (113, 172)
+PITCH_UM = 2.3
+N_FOVEA = 30
+TALLEST_UM = 60.0
+#: Of the colours, since walls in the shade are darker than the photograph.
+BRIGHTENING = 1.5
+
+
+def retina() -> fs.Layout:
+    """Rings of unit height in the middle, then rings that grow: the Giotto rule."""
+    return fs.layout.giotto(n_rho=64, n_theta=200, n_fovea=N_FOVEA, n_across=260, unit_um=2.0)
+
+
+def photograph(radius_um: float) -> np.ndarray:
+    """Relative radiance of red, green and blue around the cat's eye, as far as the retina reaches."""
+    half = int(radius_um / PITCH_UM) + 1
+    row, column = GAZE_PX
+    padded = np.pad(skimage.data.chelsea(), ((half, half), (half, half), (0, 0)), mode="edge")
+    return decoded(padded[row : row + 2 * half, column : column + 2 * half] / 255.0, "srgb")
+
+
+def main(out_dir: Path) -> None:
+    """Write the pictures to a folder."""
+    layout = retina()
+    rgb = photograph(layout.bounds_um[2])
+    joules_um2 = MOST_PHOTONS_PER_UM2 * fs.units.photon_energy_j(WAVELENGTH_NM) * rgb @ np.array([0.3, 0.6, 0.1])
+    light = fs.PowerMap.from_array(
+        joules_um2 / EXPOSURE_S / 1e-12, pitch_um=PITCH_UM, wavelength_nm=WAVELENGTH_NM, top_row_first=True
+    )
+
+    # %% Large sites hold more charge, so that a code is light per area whatever the site's size.
+    sensor = fs.Sensor(layout, capacitance_f=CAPACITANCE_F_PER_UM2 * layout.area_um2, bits=10)
+    camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    capture = camera.capture(light, exposure_s=EXPOSURE_S, seed=1)
+    print(capture)
+
+    # %% Each column in the mean colour of what its site looks at.
+    of_sites = fs.Integrator(layout, light.grid)(np.moveaxis(rgb[::-1], -1, 0)) / layout.area_um2
+    colours = encoded_srgb(BRIGHTENING * of_sites).T
+    columns = view.prisms(capture, by=colours, tallest_um=TALLEST_UM)
+
+    # %% The whole retina, and its fovea; without OpenGL without the shade of corners.
+    renderer = "pyvista" if view.find_renderer() else "software"
+    for name, viewpoint in {
+        "whole": view.Viewpoint(azimuth_deg=-80.0, elevation_deg=52.0),
+        "fovea": view.Viewpoint(azimuth_deg=-80.0, elevation_deg=48.0, zoom=3.4, focus_um=(0.0, 0.0, 10.0)),
+    }.items():
+        view.render(
+            columns,
+            out_dir / f"15_retina_{name}.png",
+            viewpoint=viewpoint,
+            size_px=(1200, 860),
+            shade_corners=renderer == "pyvista",
+            renderer=renderer,
+        )
+
+    # %% The numbers.
+    is_fovea = layout.columns["ring"] < N_FOVEA
+    share, of_area = is_fovea.mean(), layout.area_um2[is_fovea].sum() / layout.area_um2.sum()
+    print(f"the brightest colour is {colours.max():.2f} of white")
+    print(f"{layout.n_sites:,} sites, {share:.0%} of them in a fovea of {of_area:.1%} of the area")
+    top_um = np.zeros(layout.n_sites)
+    np.maximum.at(top_um, columns.photosite, columns.points_um[:, 2])
+    assert layout.n_sites == 9411
+    assert abs(share - 0.28) < 0.005
+    assert abs(of_area - 0.051) < 0.0005
+    assert np.allclose(top_um, TALLEST_UM * capture.code / capture.code.max(), rtol=1e-12, atol=0.0)
+    assert capture.saturated_share == 0.0
+    assert colours.max() < 1.0
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "."))
