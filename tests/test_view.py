@@ -461,3 +461,10 @@ def test_a_noise_budget_has_a_bar_for_each_source_and_class():
     assert [bar.get_width() for bar in apart.patches][1::4] == pytest.approx([3.0, 5.0])
     with pytest.raises(ParameterError, match="'classes' must be one for each of the 4 sites"):
         plot_noise_budget(noise_e, classes=[0, 1])
+
+
+def test_sizes_that_differ_by_rounding_have_one_colour():
+    layout = fs.layout.grid(n_x=20, n_y=20, pitch_um=0.1).rotate(17.0)
+
+    assert np.ptp(layout.area_um2) > 0.0
+    assert np.ptp(site_colours(layout, "area_um2"), axis=0).max() <= 1

@@ -27,6 +27,8 @@ __all__ = [
     "site_colours",
 ]
 
+#: Values that differ by less than this share are equal up to rounding, and get one colour.
+SAME = 1e-9
 #: Colours as red, green and blue from 0 to 255, encoded as screens expect (sRGB).
 Rgb: TypeAlias = tuple[int, int, int]
 RgbArray: TypeAlias = NDArray[np.uint8]
@@ -273,7 +275,7 @@ def _sizes(values: Floats, title: str, colour_map: str) -> SiteColours:
         raise ParameterError("by", "must be finite everywhere, or NaN for no data", values)
     low = float(values.min(where=is_known, initial=np.inf)) if is_known.any() else 0.0
     high = float(values.max(where=is_known, initial=-np.inf)) if is_known.any() else 0.0
-    if low == high:
+    if high - low <= SAME * max(abs(low), abs(high)):
         low, high = low - 0.5, high + 0.5
     table = np.rint(255.0 * colormaps[colour_map](np.arange(256))[:, :3]).astype(np.uint8)
     table = np.concatenate((table, np.array([NO_DATA], np.uint8)))
