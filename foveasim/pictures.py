@@ -51,6 +51,7 @@ PNG_MAGIC, JPEG2000_MAGIC, END_MARKER = b"\x89PNG\r\n\x1a\n", b"\xff\x4f\xff\x51
 START_OF_SCAN, MARKER_BYTES = 0xDA, 2
 #: Tag of TIFF and EXIF that tells how the camera was held.
 ORIENTATION_TAG = 274
+TIFF_ENDINGS = (".tif", ".tiff")
 
 
 def read_picture(path: str | Path) -> NDArray[Any]:
@@ -345,41 +346,90 @@ def _check_size(path: Path, width: int, height: int) -> None:
 # -- writing ---------------------------------------------------------------------------------------------------------
 
 
-def write_picture(path: str | Path, picture: NDArray[np.uint8]) -> None:
+def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
     """
     Write a picture file, whole or not at all.
 
     Parameters
     ----------
     path : path
-        Its ending chooses the format: ``.png`` keeps every number.
-    picture : (n_y, n_x) or (n_y, n_x, n_channel) uint8
+        Its ending chooses the format: ``.png`` and ``.tif`` keep every number of uint8 and uint16, ``.tif`` and, with the extra
+        ``pictures``, ``.exr`` those of float32, NaN included; others hold uint8, more or less.
+    picture : (n_y, n_x) or (n_y, n_x, n_channel) uint8, uint16 or float32
         First row on top; grey, grey and alpha, colour, or colour and alpha.
 
     Raises
     ------
     FileError
-        When the ending names no known format, the array is no such picture, or nothing can be written.
+        When the ending names no known format, the array is no picture that it holds, or nothing can be written.
     """
     from PIL import Image
 
     target = Path(path)
-    if Image.registered_extensions().get(target.suffix.lower()) not in PILLOW_FORMATS:
-        raise FileError(target, "must end in .png, .webp, .jpg, .bmp, .tga, .ppm or .jp2; .png keeps every number")
+    ending = target.suffix.lower()
+    is_pillow = Image.registered_extensions().get(ending) in PILLOW_FORMATS
+    if not is_pillow and ending not in (*TIFF_ENDINGS, ".exr"):
+        raise FileError(
+            target, "must end in .png, .webp, .jpg, .bmp, .tga, .ppm, .jp2, .tif or .exr; .png keeps every number"
+        )
     if picture.ndim == 3 and picture.shape[2] == 1:
         picture = picture[..., 0]
+    held = (
+        ("uint8", "uint16", "float32")
+        if ending in TIFF_ENDINGS
+        else {".exr": ("float32",), ".png": ("uint8", "uint16")}.get(ending, ("uint8",))
+    )
     if (
-        picture.dtype != np.uint8
+        picture.dtype.name not in held
         or picture.ndim not in (2, 3)
         or 0 in picture.shape
         or (picture.shape[2:] or (1,))[0] > 4
     ):
         raise FileError(
             target,
-            f"cannot hold an array of the shape {picture.shape} and type {picture.dtype}, only 1 to 4 channels of uint8",
+            f"cannot hold an array of the shape {picture.shape} and type {picture.dtype}, only 1 to 4 channels of "
+            f"{' or '.join(held)}",
         )
+    picture = np.ascontiguousarray(picture)
     with written_whole(target) as temporary:
         try:
-            Image.fromarray(np.ascontiguousarray(picture)).save(temporary)
-        except (OSError, ValueError) as error:
+            if ending in TIFF_ENDINGS:
+                _write_tiff(temporary, picture)
+            elif ending == ".exr":
+                _write_exr(temporary, picture)
+            elif picture.dtype == np.uint16:
+                import imagecodecs
+
+                temporary.write_bytes(imagecodecs.png_encode(picture))
+            else:
+                Image.fromarray(picture).save(temporary)
+        except ImportError:
+            raise FileError(target, "needs a writer for EXR: pip install 'foveasim[pictures]'") from None
+        except (OSError, ValueError, RuntimeError) as error:
             raise FileError(target, f"cannot be written in this format ({error}); take .png") from None
+
+
+def _write_tiff(path: Path, picture: NDArray[Any]) -> None:
+    import tifffile
+
+    n_channels = (picture.shape[2:] or (1,))[0]
+    tifffile.imwrite(
+        path,
+        picture,
+        photometric="rgb" if n_channels > 2 else "minisblack",
+        planarconfig="contig" if n_channels > 1 else None,
+        extrasamples=["unassalpha"] if n_channels in (2, 4) else None,
+        compression="zlib",
+        metadata=None,
+    )
+
+
+def _write_exr(path: Path, picture: NDArray[Any]) -> None:
+    import OpenEXR
+
+    layers = picture.reshape(*picture.shape[:2], -1)
+    names = ("Y", "YA", "RGB", "RGBA")[layers.shape[2] - 1]
+    channels = {name: np.ascontiguousarray(layers[..., k]) for k, name in enumerate(names)}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))
