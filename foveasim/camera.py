@@ -24,6 +24,7 @@ from foveasim.integrate import Integrator
 from foveasim.layout import Layout
 from foveasim.optics import Optics
 from foveasim.parallel import thread_count
+from foveasim.reconstruct import Picture, reference
 from foveasim.records import described, versions
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor, noise_budget
@@ -240,6 +241,37 @@ class Camera:
         """
         expected_e = self._sensor.expected_electrons(self._photoelectrons_per_s(light, _Clock()), exposure_s)
         return self._sensor.predict(expected_e, n_threads=self._n_threads)
+
+    def reference(self, light: Scene | PowerMap, grid: Grid, *, exposure_s: float) -> Picture:
+        """
+        The picture that a perfect sensor with a raster's pixels would take: what reconstructions are compared with.
+
+        Parameters
+        ----------
+        light : Scene or PowerMap
+        grid : Grid
+            The raster, in the plane of the lens without distortion.
+        exposure_s : float, s
+
+        Returns
+        -------
+        Picture
+            Photoelectrons per µm² behind each of the sensor's filters, of the light behind the lens, without noise and dark
+            charge: exact means over the pixels. NaN off the image.
+
+        Raises
+        ------
+        ParameterError, SimulationError
+            As for :meth:`capture`.
+        """
+        exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
+        if not isinstance(light, Scene | PowerMap):
+            raise ParameterError("light", f"must be a Scene or a PowerMap, got a {type(light).__name__}")
+        power_map = self._optics.power_map(light, n_threads=self._n_threads) if isinstance(light, Scene) else light
+        # Joules on a µm².
+        joules_per_w_m2 = float(w_from_w_m2_um2(exposure_s))
+        weights = self._sensor.responsivity_e_per_j(light.wavelength_nm) * joules_per_w_m2
+        return reference(power_map, grid, weights=weights)
 
     def noise_budget(self, light: Scene | PowerMap, *, exposure_s: float) -> dict[str, Floats]:
         """

@@ -17,8 +17,21 @@ from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid
 from foveasim.files import written_whole
 from foveasim.layout import Layout
-from foveasim.reconstruct import Picture, cells, fill_channels, raster_grid
+from foveasim.reconstruct import (
+    Picture,
+    Readings,
+    cells,
+    charge_readings,
+    code_readings,
+    electrons_per_code,
+    fill_channels,
+    least_squares,
+    linear,
+    natural,
+    raster_grid,
+)
 from foveasim.records import described
+from foveasim.sensor import Sensor
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,6 +44,29 @@ FILE_VERSION = 1
 #: Arrays of a capture file, and how a column of the layout is named among them.
 ARRAYS = ("code", "electrons", "expected_e", "filter_of_site", "xy_um", "ring_offsets", "site_offsets")
 COLUMN_PREFIX = "column_"
+#: What a sensor's codes tell of the light by: these of its parameters, as they are meant. Fixed patterns are not known.
+ELECTRONICS = (
+    *(
+        "sensitivity",
+        "dark_e_per_s",
+        "temperature_k",
+        "dark_reference_k",
+        "dark_doubling_k",
+        "shot_noise",
+        "full_well_e",
+    ),
+    *(
+        "ktc_noise",
+        "cds",
+        "read_noise_e",
+        "rts_fraction",
+        "rts_e",
+        "capacitance_f",
+        "nonlinearity_fraction",
+        "pedestal_v",
+    ),
+    *("v_sat_v", "bits", "companding", "log_strength", "companding_table", "inl_dn"),
+)
 #: A file that would unpack to more than this is refused.
 MAX_UNPACKED_BYTES = 8 * 2**30
 
@@ -105,26 +141,42 @@ class Capture:
 
     def picture(
         self,
-        method: Literal["cells"] = "cells",
+        method: Literal["cells", "linear", "natural", "least_squares"] = "cells",
         *,
         max_pixels: int = 1024,
         grid: Grid | None = None,
-        of: Literal["code", "electrons", "expected_e"] = "code",
+        of: Literal["code", "electrons", "expected_e", "light_e"] = "code",
+        per: Literal["site", "um2"] = "site",
+        sensor: Sensor | None = None,
+        **options: Any,
     ) -> Picture:
         """
         Raster picture of what the sensor saw.
 
         Parameters
         ----------
-        method : {"cells"}
-            ``"cells"``: every pixel takes the value of its photosites, weighted by area. On a colour mosaic a site's
-            other colours come from the nearest sites that see them.
+        method : {"cells", "linear", "natural", "least_squares"}
+            ``"cells"``: every pixel takes the value of its photosites, weighted by area; on a colour mosaic a site's other
+            colours come from the nearest sites that see them. ``"linear"``, ``"natural"``: smooth between the sites' centres,
+            each colour between the sites that see it. ``"least_squares"``: the picture that explains the values, smooth where
+            they leave it open. See the functions of these names in :mod:`foveasim.reconstruct`.
         max_pixels : int
             Length of the longer side, when no grid is given.
         grid : Grid, optional
             The pixels; by default square ones over the whole layout.
-        of : {"code", "electrons", "expected_e"}
-            Which values to show.
+        of : {"code", "electrons", "expected_e", "light_e"}
+            Which values to show. ``"light_e"`` are the photoelectrons that the codes stand for: companding undone, pedestal and
+            dark charge taken off.
+        per : {"site", "um2"}
+            ``"site"``: the values as they are, so that a larger site is brighter where it collects more. ``"um2"``: over what
+            even light gives each site, its area in µm² times its sensitivity (and, for codes, codes per electron over their
+            mean): an even scene is even, whatever the sites' sizes.
+        sensor : Sensor, optional
+            That made the capture: needed where its electronics differ from site to site in a layout of more than 64 sites,
+            since ``settings`` does not keep such.
+        **options
+            Of the method's function. ``"least_squares"`` takes ``mu``, ``blur``, ``tolerance``, ``max_steps``, and the values'
+            ``variance``; all take ``n_threads``.
 
         Returns
         -------
@@ -134,16 +186,85 @@ class Capture:
         Raises
         ------
         ParameterError
-            When a choice is none of the above.
+            When a choice is none of the above, an option none of the method's, or the electronics are not known where they are
+            needed.
+
+        Notes
+        -----
+        Least squares need values linear in light: from codes and charges the pedestal and the dark charge are taken off,
+        companding is undone, and saturated sites are left out. What they find is light per µm²; with ``per="site"`` that is
+        shown as what a site of the mean response would give. The ``variance`` is by default that of shot noise, and for codes
+        that of resetting, reading and rounding too.
         """
-        check_choice("method", method, ("cells",))
-        check_choice("of", of, ("code", "electrons", "expected_e"))
-        values = np.asarray(getattr(self, of), dtype=np.float64)
+        methods = {"cells": cells, "linear": linear, "natural": natural, "least_squares": least_squares}
+        check_choice("method", method, tuple(methods))
+        check_choice("of", of, ("code", "electrons", "expected_e", "light_e"))
+        check_choice("per", per, ("site", "um2"))
+        known = {"n_threads"} | (
+            {"mu", "blur", "tolerance", "max_steps", "variance"} if method == "least_squares" else set()
+        )
+        if set(options) - known:
+            name = min(set(options) - known)
+            raise ParameterError(name, f"is no option of {method!r}, which has {', '.join(sorted(known))}")
+        grid = raster_grid(self.layout, max_pixels) if grid is None else grid
         n_filters = len(self.filter_names)
-        if n_filters > 1:
-            values = fill_channels(self.layout, values, self.filter_of_site, n_filters)
-            values = np.where(np.isnan(values), 0.0, values)
-        return cells(self.layout, values, raster_grid(self.layout, max_pixels) if grid is None else grid)
+        is_own = self.filter_of_site == np.arange(n_filters)[:, np.newaxis]
+        is_fitted = method == "least_squares"
+        is_light = is_fitted or of == "light_e"
+        electronics = self._electronics(sensor) if is_light or per == "um2" else None
+        values = np.asarray(self.code if of == "light_e" else getattr(self, of), dtype=np.float64)
+        response = np.ones(self.layout.n_sites)
+        if electronics is not None:
+            response = self.layout.area_um2 * electronics.sensitivity
+            e_per_dn = electrons_per_code(electronics) if of == "code" else np.ones(values.size)
+            response = response * (np.mean(e_per_dn) / e_per_dn)
+            if is_light:
+                readings = self._readings(electronics, of)
+                values = readings.light_e / e_per_dn
+                if is_fitted:
+                    values[readings.is_full] = np.nan
+                    options = {"variance": readings.variance_e2 / e_per_dn**2, **options}
+        if is_fitted:
+            scale = float(response.mean()) if per == "site" else 1.0
+            is_seen = is_own.any(axis=1)
+            channels = np.where(is_own[is_seen], values, np.nan)
+            found = least_squares(self.layout, channels, grid, response=response / scale, **options)
+            if is_seen.all():
+                return found
+            data = np.zeros((n_filters, *grid.shape), np.float32) * found.data[:1]
+            data[is_seen] = found.data
+            return Picture(data, found.coverage, grid)
+        values = values / (response if per == "um2" else 1.0)
+        if method == "cells":
+            if n_filters > 1:
+                values = fill_channels(self.layout, values, self.filter_of_site, n_filters)
+                values = np.where(np.isnan(values), 0.0, values)
+            return cells(self.layout, values, grid, **options)
+        # A filter that no site has is black, as in cells.
+        channels = np.where(is_own, values, np.where(is_own.any(axis=1, keepdims=True), np.nan, 0.0))
+        return methods[method](self.layout, channels, grid, **options)
+
+    def _electronics(self, sensor: Sensor | None) -> Sensor:
+        """The sensor as it is meant: the one given, or as much of it as the settings tell."""
+        if sensor is not None:
+            if not isinstance(sensor, Sensor) or sensor.layout.n_sites != self.layout.n_sites:
+                raise ParameterError("sensor", f"must be the Sensor of these {self.layout.n_sites} sites", sensor)
+            return sensor
+        told = self.settings.get("sensor", {})
+        for name in ELECTRONICS:
+            if name not in told or isinstance(told[name], Mapping):
+                raise ParameterError(
+                    "sensor",
+                    f"must be given: the capture's settings do not tell its {name!r}"
+                    + (" of every site" if name in told else ""),
+                )
+        return Sensor(self.layout, **{name: told[name] for name in ELECTRONICS})
+
+    def _readings(self, electronics: Sensor, of: str) -> Readings:
+        exposure_s = float(self.settings.get("exposure_s", 0.0))
+        if of in ("code", "light_e"):
+            return code_readings(self.code, electronics, exposure_s)
+        return charge_readings(getattr(self, of), electronics, exposure_s)
 
     def to_pyvista(self) -> PolyData:
         """The sites as PolyData with what they measured, for PyVista; see :func:`foveasim.view.polydata`."""

@@ -38,16 +38,16 @@ HEAVY = {
 }  # fmt: skip
 #: Names of numbers without a unit, or with the unit of what they are measured with.
 DIMENSIONLESS = {
-    "a", "above", "at_least", "at_most", "blanking", "coefficients", "companding_table", "contrast", "dpi", "f_number", "factor", "figure_inches", "fill_factor", "gain", "gamma", "high", "hot_sigmas", "k", "k1", "k2", "k3", "k4", "k5", "k6", "kernel",
-    "limit", "log_strength", "low", "magnification", "max_aspect_ratio", "obscuration",
+    "a", "above", "at_least", "at_most", "blanking", "coefficients", "companding_table", "contrast", "data_range", "dpi", "f_number", "factor", "figure_inches", "fill_factor", "gain", "gamma", "high", "hot_sigmas", "k", "k1", "k2", "k3", "k4", "k5", "k6", "kernel",
+    "limit", "log_strength", "low", "magnification", "min_coverage", "mu", "max_aspect_ratio", "obscuration",
     "max_density", "max_growth", "max_neighbour_ratio", "max_track_use", "min_density", "min_growth", "neighbour_share", "noisy_ratio", "p1", "p2", "peak", "per_vertex", "qe", "ratio", "rounding",
-    "ring_ratio", "sensitivity", "spectrum", "stretch", "transmission", "value", "values", "weight", "weights", "white", "worst_area_error", "zoom",
+    "ring_ratio", "sensitivity", "spectrum", "stretch", "tolerance", "transmission", "value", "values", "weight", "weights", "white", "worst_area_error", "zoom",
 }  # fmt: skip
 #: Names of parts that no user sees, in cells, pitches or steps as their docstrings say.
 INTERNAL = {
-    "axes", "beside", "blur_cells", "blur_lambda_n", "cycles", "diagonal", "edge", "extent", "fade", "from_step", "function", "height",
-    "n_across", "moments", "new_radius", "per_step", "pixel", "r2", "radius", "right", "s_x", "s_y", "screen", "share", "side", "shares", "slope", "spread", "tables_at",
-    "tangent2_x", "tangent2_y", "to_step", "upper", "x", "x2", "xy", "y", "y2",
+    "axes", "beside", "blur_cells", "blur_lambda_n", "bound", "corners", "cycles", "diagonal", "edge", "enough", "extent", "fade", "from_step", "function", "gradient", "height",
+    "n_across", "moments", "new_radius", "per_step", "pixel", "plane", "points", "r2", "radius", "right", "rows", "s_x", "s_y", "screen", "share", "side", "shares", "slope", "spread", "start", "tables_at",
+    "tangent2_x", "tangent2_y", "to_step", "transform", "upper", "x", "x2", "xy", "y", "y2",
 }  # fmt: skip
 FLOATING = re.compile(r"\b(float|Floats|PerSite)\b")
 

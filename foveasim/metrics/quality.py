@@ -1,0 +1,141 @@
+"""How near a picture is to a reference: PSNR and structural similarity, of the pixels that photosites cover."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from foveasim.arrays import Bools, Floats, as_numbers, check_count, check_number
+from foveasim.errors import ParameterError
+from foveasim.reconstruct import Picture
+
+__all__ = ["psnr_db", "ssim"]
+
+#: Pixels that photosites cover by less than this are left out, unless told otherwise.
+COVERED = 0.5
+
+
+def psnr_db(
+    picture: Picture | ArrayLike,
+    reference: Picture | ArrayLike,
+    data_range: float | None = None,
+    *,
+    min_coverage: float = COVERED,
+) -> float:
+    """
+    Peak signal-to-noise ratio.
+
+    Parameters
+    ----------
+    picture, reference : Picture or (..., n_y, n_x)
+        Of the same shape, in the same unit.
+    data_range : float, optional
+        The peak; by default the reference's largest less its smallest value, of the pixels that are compared.
+    min_coverage : float
+        Pixels of a picture count when at least this share of them is covered by photosites, and no channel is NaN.
+
+    Returns
+    -------
+    psnr_db : float, dB
+        ``20 log10(data_range / root mean square of the difference)``; infinite for equal pictures.
+
+    Raises
+    ------
+    ParameterError
+        When shapes differ, no pixel can be compared, or the range is not above 0.
+
+    Examples
+    --------
+    >>> float(round(psnr_db([[1.0, 2.0], [3.0, np.nan]], [[1.1, 2.1], [2.9, 7.0]], data_range=1.0), 6))
+    20.0
+    """
+    one, other, counts = _compared(picture, reference, min_coverage)
+    difference2 = float(np.mean((one - other)[:, counts] ** 2))
+    peak = _range(other[:, counts], data_range)
+    return math.inf if difference2 == 0.0 else 10.0 * math.log10(peak * peak / difference2)
+
+
+def ssim(
+    picture: Picture | ArrayLike,
+    reference: Picture | ArrayLike,
+    data_range: float | None = None,
+    *,
+    min_coverage: float = COVERED,
+    window: int = 7,
+) -> float:
+    """
+    Mean structural similarity (Wang, Bovik, Sheikh, Simoncelli 2004), as scikit-image has it.
+
+    Parameters
+    ----------
+    picture, reference, data_range, min_coverage
+        As for :func:`psnr_db`.
+    window : int, pixels
+        Odd side of the square in which means and variances are taken.
+
+    Returns
+    -------
+    ssim : float
+        Up to 1. The mean over the channels and the pixels whose windows have nothing but pixels that count.
+
+    Raises
+    ------
+    ParameterError
+        As for :func:`psnr_db`; when the window is even, or no window fits.
+    """
+    from scipy.ndimage import minimum_filter
+    from skimage.metrics import structural_similarity
+
+    one, other, counts = _compared(picture, reference, min_coverage)
+    window = check_count("window", window, at_least=3)
+    if window % 2 == 0:
+        raise ParameterError("window", "must be odd", window)
+    fits = minimum_filter(counts, size=window, mode="constant", cval=0)
+    if not fits.any():
+        raise ParameterError("window", "must fit on the pixels that count; no such place", window)
+    peak = _range(other[:, counts], data_range)
+    one, other = (np.where(counts, plane, 0.0) for plane in (one, other))  # what is not looked at must be a number
+    maps = [
+        structural_similarity(a, b, win_size=window, data_range=peak, full=True)[1]
+        for a, b in zip(one, other, strict=True)
+    ]
+    return float(np.mean(np.array(maps)[:, fits]))
+
+
+def _compared(
+    picture: Picture | ArrayLike, reference: Picture | ArrayLike, min_coverage: float
+) -> tuple[Floats, Floats, Bools]:
+    """Both as (n_channel, n_y, n_x), and the pixels that count, (n_y, n_x)."""
+    min_coverage = check_number("min_coverage", min_coverage, at_least=0.0, at_most=1.0)
+    planes, covered = [], []
+    for name, one in (("picture", picture), ("reference", reference)):
+        is_picture = isinstance(one, Picture)
+        values = as_numbers(name, one.data if isinstance(one, Picture) else one)
+        if values.ndim < 2:
+            raise ParameterError(name, f"must have the shape (..., n_y, n_x), got {values.shape}")
+        planes.append(values.reshape(-1, *values.shape[-2:]))
+        # Shares are float32: a whole pixel may be short of 1 by their rounding.
+        covered.append(one.coverage >= min_coverage - 1e-6 if is_picture else True)  # type: ignore[union-attr]
+    if planes[0].shape != planes[1].shape:
+        raise ParameterError("reference", f"must have the picture's shape {planes[0].shape}, got {planes[1].shape}")
+    if (
+        isinstance(picture, Picture)
+        and isinstance(reference, Picture)
+        and not np.allclose(picture.grid.bounds_um, reference.grid.bounds_um, rtol=1e-9, atol=1e-6)
+    ):
+        raise ParameterError("reference", "must lie on the picture's grid", reference.grid.bounds_um)
+    counts = np.isfinite(planes).all(axis=(0, 1)) & covered[0] & covered[1]
+    if not counts.any():
+        raise ParameterError("picture", "and reference must have a pixel that both know")
+    return planes[0], planes[1], np.asarray(counts)
+
+
+def _range(values: Floats, data_range: float | None) -> float:
+    if data_range is not None:
+        return check_number("data_range", data_range, above=0.0)
+    peak = float(np.ptp(values))
+    if peak == 0.0:
+        raise ParameterError("data_range", "must be given where the reference is the same everywhere")
+    return peak

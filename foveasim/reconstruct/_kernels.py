@@ -1,0 +1,184 @@
+"""
+The reconstruction's numba kernels: natural neighbours, and the roughness of a picture.
+
+A **triangulation** is three arrays, one row a triangle: ``corners`` (its sites, counter-clockwise), ``beyond`` (the triangle
+across the edge that faces each corner, -1 where there is none) and ``circles`` (centre and squared radius of the circle through
+the corners). They know arrays only, release the interpreter lock, and are compiled for explicit types when this module is
+imported; the machine code is cached on disk.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, types
+
+__all__ = ["add_roughness", "natural_neighbours"]
+
+#: Natural neighbours of a point, at most: a random point has six, and the middle of a ring of sites as many as the ring.
+MAX_TRIANGLES = 4096
+#: Nearer to an edge than this share of its length there is only the straight line between its ends: circles grow too large.
+THIN = 1e-5
+#: A point this near to a corner, as a share of its triangle's longest edge, is the corner.
+AT_CORNER = 1e-10
+
+
+def _input(dtype, ndim):
+    """Type of an argument that is only read: read-only and writeable arrays, C-contiguous."""
+    return types.Array(dtype, ndim, "C", readonly=True)
+
+
+_points = _input(types.float64, 2)
+_table = _input(types.int64, 2)
+
+
+@njit(cache=True, nogil=True)
+def _cross(ax, ay, bx, by):
+    return ax * by - ay * bx
+
+
+@njit(
+    types.void(
+        _points,
+        _input(types.int64, 1),
+        _points,
+        _points,
+        _table,
+        _table,
+        _points,
+        types.float64[:, ::1],
+    ),
+    cache=True,
+    nogil=True,
+)
+def natural_neighbours(points, start, xy, values, corners, beyond, circles, out):
+    """
+    Sibson's interpolant at points that lie in known triangles.
+
+    ``points`` (n, 2) with the triangle of each in ``start``; sites at ``xy`` (n_site, 2) with ``values`` (n_site, n_channel);
+    results go to ``out`` (n, n_channel).
+
+    The triangles whose circles hold a point are those that it would replace. What its Voronoi cell takes from a site's is a
+    polygon: its corners are the centres of those triangles, and of the circles through the point and each edge of their union.
+    Its area is summed edge by edge about the point, so that the polygons need not be put in order.
+    """
+    n_channels = values.shape[1]
+    triangles = np.empty(MAX_TRIANGLES, np.int64)
+    edge_from = np.empty(MAX_TRIANGLES + 2, np.int64)
+    edge_to = np.empty(MAX_TRIANGLES + 2, np.int64)
+    edge_x = np.empty(MAX_TRIANGLES + 2, np.float64)
+    edge_y = np.empty(MAX_TRIANGLES + 2, np.float64)
+    # What each site gives, kept for all sites and cleared where it was touched.
+    area = np.zeros(xy.shape[0], np.float64)
+    is_inside = np.zeros(corners.shape[0], np.bool_)
+
+    for p in range(points.shape[0]):
+        px, py = points[p, 0], points[p, 1]
+        home = start[p]
+
+        # Straight lines where the triangle, or the point's place in it, is too thin for circles.
+        longest2 = 0.0
+        for k in range(3):
+            a, b = corners[home, k], corners[home, (k + 1) % 3]
+            longest2 = max(longest2, (xy[a, 0] - xy[b, 0]) ** 2 + (xy[a, 1] - xy[b, 1]) ** 2)
+        whole = 0.0
+        is_straight = False
+        share = np.empty(3)
+        for k in range(3):
+            a, b = corners[home, (k + 1) % 3], corners[home, (k + 2) % 3]
+            share[k] = _cross(xy[a, 0] - px, xy[a, 1] - py, xy[b, 0] - px, xy[b, 1] - py)
+            whole += share[k]
+            if beyond[home, k] < 0 and share[k] < THIN * longest2:
+                is_straight = True
+        for k in range(3):
+            a = corners[home, k]
+            if (xy[a, 0] - px) ** 2 + (xy[a, 1] - py) ** 2 <= AT_CORNER**2 * longest2:
+                is_straight = True
+        if whole < 100.0 * THIN * longest2:
+            is_straight = True
+
+        n_triangles, n_edges, has_room = 0, 0, True
+        if not is_straight:
+            triangles[0], n_triangles, done = home, 1, 0
+            is_inside[home] = True
+            while done < n_triangles and has_room:
+                t = triangles[done]
+                done += 1
+                for k in range(3):
+                    other = beyond[t, k]
+                    if other < 0 or is_inside[other]:
+                        continue
+                    distance2 = (circles[other, 0] - px) ** 2 + (circles[other, 1] - py) ** 2
+                    if distance2 < circles[other, 2] * (1.0 - 1e-12):
+                        if n_triangles == MAX_TRIANGLES:
+                            has_room = False
+                            break
+                        triangles[n_triangles] = other
+                        n_triangles += 1
+                        is_inside[other] = True
+
+            for i in range(n_triangles):
+                t = triangles[i]
+                cx, cy = circles[t, 0] - px, circles[t, 1] - py
+                for k in range(3):
+                    a, b = corners[t, (k + 1) % 3], corners[t, (k + 2) % 3]
+                    other = beyond[t, k]
+                    if other >= 0 and is_inside[other]:
+                        # The old border of a and b, from the centre beyond it to this one, with a on its left.
+                        area[a] += _cross(circles[other, 0] - px, circles[other, 1] - py, cx, cy)
+                        continue
+                    ax, ay, bx, by = xy[a, 0] - px, xy[a, 1] - py, xy[b, 0] - px, xy[b, 1] - py
+                    twice = 2.0 * _cross(ax, ay, bx, by)
+                    a2, b2 = ax * ax + ay * ay, bx * bx + by * by
+                    if twice <= 1e-14 * (a2 + b2):  # beside the edge's ends by rounding: on the edge itself
+                        is_straight = True
+                        continue
+                    nx, ny = (a2 * by - b2 * ay) / twice, (b2 * ax - a2 * bx) / twice
+                    area[a] += _cross(nx, ny, cx, cy)
+                    area[b] += _cross(cx, cy, nx, ny)
+                    if n_edges < MAX_TRIANGLES + 2:
+                        edge_from[n_edges], edge_to[n_edges] = a, b
+                        edge_x[n_edges], edge_y[n_edges] = nx, ny
+                        n_edges += 1
+            for i in range(n_edges):
+                for j in range(n_edges):
+                    if edge_to[j] == edge_from[i]:
+                        area[edge_from[i]] += _cross(edge_x[j], edge_y[j], edge_x[i], edge_y[i])
+                        break
+
+        for c in range(n_channels):
+            out[p, c] = 0.0
+        if is_straight or not has_room:
+            for k in range(3):
+                for c in range(n_channels):
+                    out[p, c] += share[k] / whole * values[corners[home, k], c]
+        else:
+            total = 0.0
+            for i in range(n_edges):
+                total += area[edge_from[i]]
+            for i in range(n_edges):
+                for c in range(n_channels):
+                    out[p, c] += area[edge_from[i]] / total * values[edge_from[i], c]
+        for i in range(n_triangles):
+            is_inside[triangles[i]] = False
+            for k in range(3):
+                area[corners[triangles[i], k]] = 0.0
+
+
+@njit(types.void(_points, types.float64, types.float64[:, ::1]), cache=True, nogil=True)
+def add_roughness(picture, weight, out):
+    """
+    Add ``weight`` times the gradient of half the sum of squared differences between neighbouring pixels.
+
+    ``picture`` and ``out`` (n_y, n_x): each pixel gets the sum of its differences from its two to four neighbours.
+    """
+    n_y, n_x = picture.shape
+    for row in range(n_y):
+        for column in range(n_x - 1):
+            difference = weight * (picture[row, column + 1] - picture[row, column])
+            out[row, column] -= difference
+            out[row, column + 1] += difference
+        if row + 1 < n_y:
+            for column in range(n_x):
+                difference = weight * (picture[row + 1, column] - picture[row, column])
+                out[row, column] -= difference
+                out[row + 1, column] += difference

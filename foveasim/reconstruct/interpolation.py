@@ -1,0 +1,229 @@
+"""
+Smooth pictures: values between the centres of photosites, exact at the centres.
+
+The centres are those of gravity. Coverage is that of the sites' outlines, not of the triangles between centres: a blind spot
+stays open.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from foveasim.arrays import Floats, Ints, as_numbers
+from foveasim.compiled import kernels
+from foveasim.errors import ParameterError
+from foveasim.fields import Grid, PackedRings
+from foveasim.integrate import Integrator
+from foveasim.parallel import each, thread_count
+from foveasim.reconstruct.picture import Picture, covered_share
+from foveasim.rings import site_moments
+
+__all__ = ["linear", "natural", "site_values"]
+
+#: Centres nearer to each other than this share of the layout's extent are one, with the mean of their values.
+SAME_PLACE = 1e-9
+#: Pixels that are interpolated as one piece of work; fixed, so that threads change nothing.
+PIXELS_PER_PIECE = 1 << 14
+#: Distances to edges of the hull that are looked at together.
+DISTANCES_AT_ONCE = 1 << 22
+
+
+def linear(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | None = None) -> Picture:
+    """
+    Raster picture that is linear in each triangle of the Delaunay triangulation of the sites' centres.
+
+    Parameters
+    ----------
+    layout : Layout
+    values : (n_site,) or (n_channel, n_site)
+        NaN where a site does not know a channel: it is interpolated between those that do.
+    grid : Grid
+        The picture's pixels; values are those at their centres.
+    n_threads : int, optional
+        All cores by default.
+
+    Returns
+    -------
+    Picture
+        Exact at the centres; a linear field comes back as it is inside their hull. Where sites reach beyond the hull a pixel
+        has the value of the hull's nearest point: nothing is extrapolated. NaN where no site is.
+
+    Raises
+    ------
+    ParameterError
+        When there is not one value a site, one is infinite, or a channel has no value at all.
+    """
+    return _interpolated(layout, values, grid, n_threads, is_smooth=False)
+
+
+def natural(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | None = None) -> Picture:
+    """
+    Raster picture by Sibson's natural neighbours of the sites' centres.
+
+    A pixel's value is the mean of the sites that would lose area to it, were it the centre of a Voronoi cell, each by the
+    area that it would lose (Sibson 1981, A brief description of natural neighbour interpolation).
+
+    Parameters
+    ----------
+    layout, values, grid, n_threads
+        As for :func:`linear`.
+
+    Returns
+    -------
+    Picture
+        As that of :func:`linear`, and without its creases: its gradient is continuous except at the centres.
+
+    Raises
+    ------
+    ParameterError
+        As for :func:`linear`.
+    """
+    return _interpolated(layout, values, grid, n_threads, is_smooth=True)
+
+
+def site_values(values: Floats, n_sites: int) -> Floats:
+    """
+    Values that may be missing, as (n_channel, n_site).
+
+    Raises
+    ------
+    ParameterError
+        When there is not one value a site, one is infinite, or a channel has no value at all.
+    """
+    channels = np.atleast_2d(as_numbers("values", values))
+    if channels.ndim != 2 or channels.shape[1] != n_sites:
+        raise ParameterError("values", f"must have the shape (..., {n_sites}), got {np.shape(values)}")
+    if np.isinf(channels).any():
+        raise ParameterError("values", "must be finite, or NaN where a site knows nothing")
+    empty = np.flatnonzero(np.isnan(channels).all(axis=1))
+    if empty.size:
+        raise ParameterError("values", f"must have a number at one site at least, got none in channel {empty[0]}")
+    return channels
+
+
+def _interpolated(
+    layout: PackedRings, values: Floats, grid: Grid, n_threads: int | None, *, is_smooth: bool
+) -> Picture:
+    integrator = Integrator(layout, grid, n_threads=n_threads)
+    channels = site_values(values, integrator.n_sites)
+    _, centroid_um = site_moments(layout.xy_um, layout.ring_offsets, layout.site_offsets)
+    share = covered_share(integrator)
+    row, column = np.nonzero(share)
+    points_um = np.stack((grid.x_um[column], grid.y_um[row]), axis=1)
+    data = np.full((channels.shape[0], *grid.shape), np.nan)
+    known, kind = np.unique(~np.isnan(channels), axis=0, return_inverse=True)
+    for k, is_known in enumerate(known):
+        of_kind = np.flatnonzero(kind.ravel() == k)
+        mesh = _Mesh.of(centroid_um[is_known], channels[np.ix_(of_kind, np.flatnonzero(is_known))])
+        found = mesh.at(points_um, thread_count(n_threads), is_smooth=is_smooth)
+        data[of_kind[:, np.newaxis], row, column] = found
+    return Picture(data.astype(np.float32), share.astype(np.float32), grid)
+
+
+@dataclass(frozen=True, eq=False)
+class _Mesh:
+    """
+    Places with values, and the triangles between them.
+
+    Coordinates are measured from ``middle_um`` in units of ``extent_um``.
+    """
+
+    xy: Floats
+    values: Floats
+    middle_um: Floats
+    extent_um: float
+
+    @classmethod
+    def of(cls, centroid_um: Floats, values: Floats) -> _Mesh:
+        """Places (n, 2) with values (n_channel, n); equal places are one."""
+        middle_um = 0.5 * (centroid_um.min(axis=0) + centroid_um.max(axis=0))
+        extent_um = float(np.ptp(centroid_um, axis=0).max()) or 1.0
+        xy = (centroid_um - middle_um) / extent_um
+        _, first, place = np.unique(np.rint(xy / SAME_PLACE), axis=0, return_index=True, return_inverse=True)
+        place = place.ravel()
+        count = np.bincount(place)
+        sums = np.array([np.bincount(place, weights=channel) for channel in values])
+        return cls(np.ascontiguousarray(xy[first]), np.ascontiguousarray((sums / count).T), middle_um, extent_um)
+
+    def at(self, points_um: Floats, n_threads: int, *, is_smooth: bool) -> Floats:
+        """Values at points (n, 2), (n_channel, n)."""
+        from scipy.spatial import Delaunay, QhullError
+
+        points = (points_um - self.middle_um) / self.extent_um
+        try:
+            mesh = Delaunay(self.xy)
+        except (QhullError, ValueError):  # fewer than three places, or all on one line
+            return self._along_a_line(points)
+        found = np.empty((points.shape[0], self.values.shape[1]))
+        pieces = [slice(i, i + PIXELS_PER_PIECE) for i in range(0, points.shape[0], PIXELS_PER_PIECE)]
+        triangle = np.asarray(mesh.find_simplex(points), np.int64)
+        corners, beyond = (np.ascontiguousarray(part, np.int64) for part in (mesh.simplices, mesh.neighbors))
+        beyond_hull = np.argwhere(beyond < 0)
+        edges = np.stack([corners[beyond_hull[:, 0], (beyond_hull[:, 1] + k) % 3] for k in (1, 2)], axis=1)
+        circles = _circles(self.xy[corners]) if is_smooth else None
+        room = kernels("reconstruct") if is_smooth else None
+
+        def fill(piece: slice) -> None:
+            inside = np.flatnonzero(triangle[piece] >= 0) + piece.start
+            outside = np.flatnonzero(triangle[piece] < 0) + piece.start
+            if room is not None:
+                out = np.empty((inside.size, self.values.shape[1]))
+                home = triangle[inside]
+                room.natural_neighbours(
+                    np.ascontiguousarray(points[inside]), home, self.xy, self.values, corners, beyond, circles, out
+                )
+                found[inside] = out
+            else:
+                found[inside] = self._linear(
+                    points[inside], mesh.transform[triangle[inside]], corners[triangle[inside]]
+                )
+            if outside.size:
+                found[outside] = self._on_the_hull(points[outside], edges)
+
+        each(fill, pieces, n_threads)
+        return found.T
+
+    def _linear(self, points: Floats, transform: Floats, corners: Ints) -> Floats:
+        first = np.einsum("nij,nj->ni", transform[:, :2], points - transform[:, 2])
+        shares = np.concatenate((first, 1.0 - first.sum(axis=1, keepdims=True)), axis=1)
+        return np.asarray(np.einsum("nk,nkc->nc", shares, self.values[corners]))
+
+    def _on_the_hull(self, points: Floats, edges: Ints) -> Floats:
+        """Values at the hull's nearest points."""
+        start = self.xy[edges[:, 0]]
+        along = self.xy[edges[:, 1]] - start
+        length2 = np.einsum("ij,ij->i", along, along)
+        found = np.empty((points.shape[0], self.values.shape[1]))
+        step = max(1, DISTANCES_AT_ONCE // edges.shape[0])
+        for i in range(0, points.shape[0], step):
+            apart = points[i : i + step, np.newaxis] - start
+            at = np.clip(np.einsum("pej,ej->pe", apart, along) / length2, 0.0, 1.0)
+            distance2 = ((apart - at[..., np.newaxis] * along) ** 2).sum(axis=-1)
+            nearest = distance2.argmin(axis=1)
+            share = np.take_along_axis(at, nearest[:, np.newaxis], axis=1)
+            ends = self.values[edges[nearest]]
+            found[i : i + step] = (1.0 - share) * ends[:, 0] + share * ends[:, 1]
+        return found
+
+    def _along_a_line(self, points: Floats) -> Floats:
+        """Values at the nearest points of the line on which all places lie, clamped at its ends."""
+        order = np.lexsort(self.xy.T)
+        first, last = self.xy[order[0]], self.xy[order[-1]]
+        place, at = ((xy - first) @ (last - first) for xy in (self.xy, points))
+        order = np.argsort(place)
+        return np.array([np.interp(at, place[order], channel[order]) for channel in self.values.T])
+
+
+def _circles(corners: Floats) -> Floats:
+    """Centres and squared radii of the circles through triangles' corners (n, 3, 2), (n, 3)."""
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    twice = 2.0 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    twice = np.where(twice == 0.0, np.finfo(np.float64).tiny, twice)
+    a2, b2 = (a**2).sum(axis=1), (b**2).sum(axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        centre = np.stack((a2 * b[:, 1] - b2 * a[:, 1], b2 * a[:, 0] - a2 * b[:, 0]), axis=1) / twice[:, np.newaxis]
+        circles = np.concatenate((corners[:, 0] + centre, (centre**2).sum(axis=1, keepdims=True)), axis=1)
+    # No circle goes through corners on a line; such a triangle is never looked into.
+    return np.ascontiguousarray(np.where(np.isfinite(circles).all(axis=1, keepdims=True), circles, (0.0, 0.0, -1.0)))

@@ -1,0 +1,388 @@
+"""
+The picture that would have given these values: regularised least squares with the exact overlaps of sites and pixels.
+
+What a site gives is its response times the mean of the picture over its area, so that small and large sites, and those that a
+pixel holds many of, all say what they know about the pixels under them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from foveasim.arrays import Floats, check_choice, check_count, check_number, finite_array
+from foveasim.compiled import kernels
+from foveasim.errors import ParameterError
+from foveasim.fields import Grid, PackedRings
+from foveasim.integrate import Integrator
+from foveasim.parallel import each, thread_count
+from foveasim.reconstruct._bounded import least_nonnegative
+from foveasim.reconstruct.interpolation import site_values
+from foveasim.reconstruct.picture import Picture, covered_share
+
+__all__ = ["least_squares"]
+
+#: A site of which less than this share lies on the raster is left out.
+MIN_ON_RASTER = 1e-6
+#: The strength is right when the misfit is within this share of what the noise makes.
+MISFIT_TOLERANCE = 0.02
+#: Strengths looked at, at most, and how far below the first guess the least may lie.
+MAX_STRENGTHS, FURTHEST = 12, 1e8
+#: The largest strength, times the largest curvature of the data's part: beyond it nothing is left but one even value.
+STRONGEST = 1e6
+#: No picture's roughness is larger than this times its sum of squares; and pixels across the coarsest level, at most.
+ROUGHEST, COARSEST = 8.0, 4
+#: While the strength is looked for, solutions may be this much further from convergence.
+LOOSER = 3.0
+
+
+def least_squares(
+    layout: PackedRings,
+    values: Floats,
+    grid: Grid,
+    *,
+    variance: ArrayLike | None = None,
+    response: ArrayLike | None = None,
+    mu: float | Literal["roughness", "discrepancy"] = "roughness",
+    blur: ArrayLike | None = None,
+    tolerance: float = 1e-4,
+    max_steps: int = 5000,
+    n_threads: int | None = None,
+) -> Picture:
+    """
+    Raster picture x >= 0 that makes ``|C^-1/2 (r W x - y)|² + mu |grad x|²`` smallest.
+
+    Parameters
+    ----------
+    layout : Layout
+    values : (n_site,) or (n_channel, n_site)
+        y: linear in light, 0 without any. NaN where a site does not count: it sees another colour, is saturated, or dead.
+    grid : Grid
+        The picture's pixels.
+    variance : number, (n_site,) or (n_channel, n_site), optional
+        C: variance of the noise of the values. By default all sites count alike, as shares of their response.
+    response : (n_site,), optional
+        r: what each site gives where the picture is 1 everywhere. By default its area in µm²: charges in electrons become a
+        picture in electrons per µm². With ones, values that an even scene makes equal stay what they are.
+    mu : float, "roughness" or "discrepancy"
+        Strength of the smoothness: ``|grad x|²`` is the sum of the squared differences of neighbouring pixels, over the whole
+        raster, and does not depend on how fine it is. Both rules need the variance: see below.
+    blur : (m_y, m_x) or (n_channel, m_y, m_x), optional
+        What the lens makes of one pixel, on the raster's pixels, an odd number along each side, the pixel in the middle
+        (:func:`blur_kernel`): W is then the overlaps after this convolution, and the picture is that in front of the lens.
+        Beyond the raster the picture goes on by as many unknown pixels as the kernel reaches.
+    tolerance : float
+        The solution is found when the root of ``g·M g`` is below this share of ``|C^-1/2 y|``, with the projected gradient g
+        and a preconditioner M: when the sum above is about as far above its smallest as the square of that.
+    max_steps : int
+        Applications of the operator for one solution.
+    n_threads : int, optional
+        All cores by default. Channels are solved side by side.
+
+    Returns
+    -------
+    Picture
+        In the values' unit over that of the response. NaN where no site is, whatever the smoothness makes of it.
+
+    Raises
+    ------
+    ParameterError
+        When an array has another shape, a value is out of range, or the rule for ``mu`` lacks the variance.
+    SimulationError
+        When ``max_steps`` do not suffice.
+
+    Notes
+    -----
+    ``"roughness"``: the number of values over the squared differences of neighbouring pixels of the cell-filled picture. To
+    Bayes, mu says how rough pictures are before one is seen, ``mu |grad x|²`` being about the number of values, and the cells
+    tell how rough this one is. ``"discrepancy"`` (Morozov): so strong that the values are explained no better than their noise
+    asks for, ``|C^-1/2 (r W x - y)|²`` being their number within 2 %. It takes several solutions, and of photographs, whose
+    roughness sits in edges, it makes pictures that are too smooth.
+
+    Of a site that reaches beyond the raster, what lies on it stands for all of it.
+
+    Solved by conjugate gradients with the bound (see ``_bounded``), preconditioned on pixels of all sizes.
+    """
+    integrator = Integrator(layout, grid, n_threads=n_threads)
+    channels = site_values(values, integrator.n_sites)
+    n_channels, n_sites = channels.shape
+    if not isinstance(mu, str):
+        mu = check_number("mu", mu, above=0.0)
+    elif check_choice("mu", mu, ("roughness", "discrepancy")) and variance is None:
+        raise ParameterError("mu", "must be a number where no 'variance' is given: the noise is what it is chosen by")
+    tolerance = check_number("tolerance", tolerance, above=0.0, at_most=0.1)
+    max_steps = check_count("max_steps", max_steps)
+    share = covered_share(integrator)
+    kernel_of = _kernels_of(blur, n_channels)
+    pad = tuple(n // 2 for n in kernel_of[0].shape) if kernel_of else (0, 0)
+    shape = tuple(n + 2 * p for n, p in zip(grid.shape, pad, strict=True))
+    overlaps = _padded(integrator, pad, shape)
+    covered_um2 = np.asarray(overlaps.sum(axis=1)).ravel()
+    whole_um2 = covered_um2 + integrator.uncovered_um2
+    gain = whole_um2 if response is None else finite_array("response", response, ndim=1, at_least=0.0)
+    if gain.shape != (n_sites,):
+        raise ParameterError("response", f"must have the shape ({n_sites},), got {gain.shape}")
+    counts = (covered_um2 > MIN_ON_RASTER * whole_um2) & (gain > 0.0)
+    noise = _noise(variance, gain, channels.shape)
+
+    def solved(channel: int) -> Floats:
+        known = np.flatnonzero(counts & ~np.isnan(channels[channel]))
+        if known.size == 0:
+            raise ParameterError("values", f"must have a number at a site on the raster, got none in channel {channel}")
+        weight = gain[known] / covered_um2[known] / np.sqrt(noise[channel, known])
+        problem = _Problem(
+            overlaps=_scaled_rows(overlaps[known], weight),
+            right=channels[channel, known] / np.sqrt(noise[channel, known]),
+            shape=shape,
+            transfer=_transfer(kernel_of[channel], shape) if kernel_of else None,
+            tolerance=tolerance,
+            max_steps=max_steps,
+        )
+        if mu == "discrepancy":
+            x = problem.as_smooth_as_noise_allows()
+        else:
+            x = problem.solved(problem.natural_strength if isinstance(mu, str) else float(mu))
+        return x.reshape(shape)[pad[0] : pad[0] + grid.shape[0], pad[1] : pad[1] + grid.shape[1]]
+
+    data = np.array(each(solved, range(n_channels), thread_count(n_threads)))
+    data[:, share == 0.0] = np.nan
+    return Picture(data.astype(np.float32), share.astype(np.float32), grid)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """
+    One channel, in units of its noise.
+
+    Attributes
+    ----------
+    overlaps : csr_array (n_value, n_pixel)
+        What each pixel adds to each value, over the value's noise.
+    right : (n_value,)
+        The values over their noise.
+    shape : (n_y, n_x)
+    transfer : (n_y, n_x // 2 + 1) complex, optional
+        Of the blur before it.
+    tolerance : float
+    max_steps : int
+    """
+
+    overlaps: Any
+    right: Floats
+    shape: tuple[int, ...]
+    transfer: Any
+    tolerance: float
+    max_steps: int
+
+    @cached_property
+    def _transposed(self) -> Any:
+        return self.overlaps.T.tocsr()
+
+    def _blurred(self, x: Floats, transfer: Any) -> Floats:
+        if transfer is None:
+            return x
+        from scipy import fft
+
+        plane = fft.rfft2(x.reshape(self.shape))
+        return np.asarray(fft.irfft2(plane * transfer, s=self.shape)).ravel()
+
+    def forward(self, x: Floats) -> Floats:
+        """What a picture gives, over the noise."""
+        return np.asarray(self.overlaps @ self._blurred(x, self.transfer))
+
+    def backward(self, y: Floats) -> Floats:
+        """The transpose of :meth:`forward`."""
+        return self._blurred(np.asarray(self._transposed @ y), None if self.transfer is None else self.transfer.conj())
+
+    @cached_property
+    def _projected(self) -> Floats:
+        return self.backward(self.right)
+
+    @cached_property
+    def _reach(self) -> Floats:
+        """Sum of each row of the data's part of the normal equations, which bounds it."""
+        return np.maximum(self.backward(self.forward(np.ones(self.overlaps.shape[1]))), 0.0)
+
+    def _levels(self, mu: float) -> list[Floats]:
+        """Inverse diagonals of the preconditioner, from the raster to ever coarser pixels."""
+        level, levels = self._reach.reshape(self.shape), []
+        while True:
+            levels.append(1.0 / (level + ROUGHEST * mu))
+            if min(level.shape) <= COARSEST:
+                return levels
+            level = _coarser(level)
+
+    @cached_property
+    def first_guess(self) -> Floats:
+        """The mean, by area, of what the sites alone say."""
+        total = np.asarray(self._transposed @ np.ones(self.right.size))
+        means = self.right / np.asarray(self.overlaps.sum(axis=1)).ravel()
+        weighted = np.asarray(self._transposed @ means)
+        flat = float(np.median(means))
+        return np.maximum(np.where(total > 0.0, weighted / np.where(total > 0.0, total, 1.0), flat), 0.0)
+
+    def solved(self, mu: float, start: Floats | None = None, tolerance: float | None = None) -> Floats:
+        """The picture for one strength."""
+        add_roughness: Callable[..., None] = kernels("reconstruct").add_roughness
+        levels = self._levels(mu)
+
+        def normal(x: Floats) -> Floats:
+            out = self.backward(self.forward(x))
+            add_roughness(x.reshape(self.shape), mu, out.reshape(self.shape))
+            return out
+
+        def precondition(gradient: Floats) -> Floats:
+            planes = [gradient.reshape(self.shape)]
+            for _ in levels[1:]:
+                planes.append(_coarser(planes[-1]))
+            out = planes[-1] * levels[-1]
+            for plane, level in zip(planes[-2::-1], levels[-2::-1], strict=True):
+                out = _finer(out, plane.shape) + plane * level
+            return out.ravel()
+
+        x, self.__dict__["n_steps"] = least_nonnegative(
+            normal,
+            1.0 / levels[0].ravel(),
+            precondition,
+            self._projected,
+            self.first_guess if start is None else start,
+            enough=(tolerance or self.tolerance) * math.sqrt(self.right @ self.right),
+            max_steps=self.max_steps,
+        )
+        return x
+
+    def misfit(self, x: Floats) -> float:
+        """Squared distance from the values, over their number: 1 is what the noise makes."""
+        apart = self.forward(x) - self.right
+        return float(apart @ apart) / self.right.size
+
+    def roughness(self, x: Floats) -> float:
+        """Sum of the squared differences of neighbours."""
+        picture = x.reshape(self.shape)
+        return float((np.diff(picture, axis=0) ** 2).sum() + (np.diff(picture, axis=1) ** 2).sum())
+
+    @cached_property
+    def natural_strength(self) -> float:
+        """Number of values over the roughness of what the sites alone say; for even pictures the largest strength."""
+        return self.right.size / max(
+            self.roughness(self.first_guess), self.right.size / (STRONGEST * float(self._reach.max()))
+        )
+
+    def as_smooth_as_noise_allows(self) -> Floats:
+        """The discrepancy principle: a secant in the logarithms of strength and misfit, between too much and too little."""
+        x, mu = self.first_guess, self.natural_strength
+        low, high = math.log(mu / FURTHEST), math.log(STRONGEST * float(self._reach.max()))
+        before: tuple[float, float] | None = None
+        for _ in range(MAX_STRENGTHS):
+            x = self.solved(mu, x, min(LOOSER * self.tolerance, 0.1))
+            at, value = math.log(mu), math.log(max(self.misfit(x), 1e-300))
+            low, high = (at, high) if value < 0.0 else (low, at)
+            if abs(value) <= MISFIT_TOLERANCE or high - low < 1e-3:
+                break
+            slope = 1.0 if before is None or at == before[0] else (value - before[1]) / (at - before[0])
+            before = at, value
+            # Misfits grow with the strength, and never faster than its square.
+            following = at - value / min(max(slope, 0.1), 2.0)
+            mu = math.exp(following if low < following < high else 0.5 * (low + high))
+        return self.solved(mu, x)
+
+
+# -- levels -----------------------------------------------------------------------------------------------------------
+
+
+def _coarser(plane: Floats) -> Floats:
+    """The transpose of :func:`_finer`."""
+    for axis in (0, 1):
+        plane = np.moveaxis(_halved(np.moveaxis(plane, axis, 0)), 0, axis)
+    return plane
+
+
+def _finer(plane: Floats, shape: tuple[int, ...]) -> Floats:
+    """Pixels of half the size, linear between the middles of the coarse ones."""
+    for axis in (0, 1):
+        plane = np.moveaxis(_doubled(np.moveaxis(plane, axis, 0), shape[axis]), 0, axis)
+    return plane
+
+
+def _doubled(rows: Floats, n: int) -> Floats:
+    before, after = np.concatenate((rows[:1], rows[:-1])), np.concatenate((rows[1:], rows[-1:]))
+    out = np.empty((2 * rows.shape[0], *rows.shape[1:]))
+    out[0::2], out[1::2] = 0.75 * rows + 0.25 * before, 0.75 * rows + 0.25 * after
+    return out[:n]
+
+
+def _halved(rows: Floats) -> Floats:
+    if rows.shape[0] % 2:
+        rows = np.concatenate((rows, np.zeros((1, *rows.shape[1:]))))
+    even, odd = rows[0::2], rows[1::2]
+    out = 0.75 * (even + odd)
+    out[:-1] += 0.25 * even[1:]
+    out[0] += 0.25 * even[0]
+    out[1:] += 0.25 * odd[:-1]
+    out[-1] += 0.25 * odd[-1]
+    return out
+
+
+# -- parts ------------------------------------------------------------------------------------------------------------
+
+
+def _noise(variance: ArrayLike | None, gain: Floats, shape: tuple[int, int]) -> Floats:
+    """Variance of every value, (n_channel, n_site)."""
+    if variance is None:
+        typical = float(np.median(gain[gain > 0.0])) if (gain > 0.0).any() else 1.0
+        return np.broadcast_to(np.where(gain > 0.0, gain / typical, 1.0) ** 2, shape)
+    values = finite_array("variance", variance, above=0.0)
+    try:
+        return np.broadcast_to(values, shape)
+    except ValueError:
+        raise ParameterError(
+            "variance", f"must be one number, or have the shape (..., {shape[1]}), got {values.shape}"
+        ) from None
+
+
+def _scaled_rows(matrix: Any, weight: Floats) -> Any:
+    """A sparse matrix whose rows are multiplied by weights."""
+    scaled = matrix.copy()
+    scaled.data *= np.repeat(weight, np.diff(scaled.indptr))
+    return scaled
+
+
+def _padded(integrator: Integrator, pad: tuple[int, ...], shape: tuple[int, ...]) -> Any:
+    """The overlaps as a sparse matrix on a raster with more pixels around."""
+    from scipy.sparse import csr_array
+
+    matrix = integrator.weights()
+    row, column = np.divmod(matrix.indices, integrator.grid.shape[1])
+    place = (row + pad[0]) * shape[1] + column + pad[1]
+    return csr_array((matrix.data, place, matrix.indptr), shape=(matrix.shape[0], shape[0] * shape[1]))
+
+
+def _kernels_of(blur: ArrayLike | None, n_channels: int) -> list[Floats]:
+    """A kernel for each channel, of the sum that it has; none without a blur."""
+    if blur is None:
+        return []
+    kernel = finite_array("blur", blur, at_least=0.0)
+    if kernel.ndim not in (2, 3) or any(n % 2 == 0 for n in kernel.shape[-2:]) or kernel.sum() <= 0.0:
+        raise ParameterError(
+            "blur", f"must have an odd number of pixels along each side and light in them, got {kernel.shape}"
+        )
+    if kernel.ndim == 3 and kernel.shape[0] not in (1, n_channels):
+        raise ParameterError(
+            "blur", f"must be one kernel, or one for each of the {n_channels} channels, got {kernel.shape[0]}"
+        )
+    return list(np.broadcast_to(kernel, (n_channels, *kernel.shape[-2:])))
+
+
+def _transfer(kernel: Floats, shape: tuple[int, ...]) -> Any:
+    """Transform of a kernel whose middle is a picture's first pixel."""
+    from scipy import fft
+
+    plane = np.zeros(shape)
+    plane[: kernel.shape[0], : kernel.shape[1]] = kernel
+    return fft.rfft2(np.roll(plane, (-(kernel.shape[0] // 2), -(kernel.shape[1] // 2)), axis=(0, 1)))

@@ -1,0 +1,132 @@
+"""What a reconstruction is compared with, and what it may undo: light on a picture's pixels, and a lens's blur on them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from foveasim.arrays import Floats, check_count, finite_array
+from foveasim.errors import ParameterError
+from foveasim.fields import Grid, PowerMap
+from foveasim.optics import Optics
+from foveasim.reconstruct.picture import Picture
+
+__all__ = ["blur_kernel", "reference"]
+
+#: A kernel holds this share of a point's light, unless told otherwise; and its pixels from the middle, at most.
+HELD_SHARE, MAX_RADIUS = 0.98, 128
+#: Distance of samples of the pattern in λN, at most: half of what its frequencies ask for.
+SAMPLE_LAMBDA_N = 0.25
+#: Sum of coverage above which a pixel lies on the map.
+ON_THE_MAP = 1e-9
+
+
+def reference(light: PowerMap, grid: Grid, *, weights: Floats | None = None) -> Picture:
+    """
+    A map of light on the pixels of a picture, exactly: every pixel has the mean of the map over it, by area.
+
+    Parameters
+    ----------
+    light : PowerMap
+    grid : Grid
+        The picture's pixels, of any pitch and place.
+    weights : (n_channel, n_band), optional
+        What 1 W/m² of each band is worth in each channel; by default a channel a band, in W/m².
+
+    Returns
+    -------
+    Picture
+        NaN off the map; its coverage is the share of a pixel on the map.
+
+    Raises
+    ------
+    ParameterError
+        When the weights do not fit the bands.
+    """
+    worth = np.eye(light.wavelength_nm.size) if weights is None else finite_array("weights", weights, ndim=2)
+    if worth.shape[1] != light.wavelength_nm.size:
+        raise ParameterError(
+            "weights", f"must have the shape (n_channel, {light.wavelength_nm.size}), got {worth.shape}"
+        )
+    along_y, along_x = (_overlaps_1d(grid, light.grid, axis) for axis in (0, 1))
+    on_map = np.outer(along_y.sum(axis=1), along_x.sum(axis=1)) / grid.cell_area_um2
+    is_on = on_map > ON_THE_MAP
+    data = np.full((worth.shape[0], *grid.shape), np.nan)
+    for channel, weight in zip(data, worth, strict=True):
+        plane = np.tensordot(weight, light.data, axes=1)
+        sums = (along_x @ (along_y @ plane).T).T / grid.cell_area_um2
+        channel[is_on] = sums[is_on] / on_map[is_on]
+    return Picture(data.astype(np.float32), np.where(is_on, on_map, 0.0).astype(np.float32), grid)
+
+
+def blur_kernel(
+    optics: Optics,
+    grid: Grid,
+    *,
+    wavelength_nm: float,
+    distance_m: float | None = None,
+    radius: int | None = None,
+) -> Floats:
+    """
+    What a lens makes of one even pixel of a picture, on the picture's pixels: the ``blur`` of :func:`least_squares`.
+
+    Parameters
+    ----------
+    optics : Optics
+    grid : Grid
+        The picture's pixels.
+    wavelength_nm : float, nm
+    distance_m : float, optional, m
+        Of the scene; by default the distance of the focus, or infinity.
+    radius : int, optional
+        Pixels from the middle to the side; by default as many as hold 98 % of a point's light, 128 at most.
+
+    Returns
+    -------
+    kernel : (2 radius + 1, 2 radius + 1) float64
+        Of the sum 1: light that falls further off is put back.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range.
+
+    Notes
+    -----
+    On the axis: aberrations that differ over the field are taken as in its middle. The pattern is sampled at λN/4 or finer,
+    and averaged exactly over both pixels, the one that shines and the one that is lit.
+    """
+    if not isinstance(optics, Optics):
+        raise ParameterError("optics", f"must be a foveasim.Optics, got a {type(optics).__name__}")
+    pitch_um = grid.pitch_um
+    if radius is None:
+        reach = np.arange(1, MAX_RADIUS + 1)
+        held = optics.encircled_energy((reach + 0.5) * pitch_um, wavelength_nm, distance_m=distance_m)
+        radius = int(reach[min(int(np.searchsorted(held, HELD_SHARE)), MAX_RADIUS - 1)])
+    radius = check_count("radius", radius, at_least=0, at_most=MAX_RADIUS)
+    finest_um = 8.0 * SAMPLE_LAMBDA_N * optics.psf(wavelength_nm, distance_m=distance_m, n_points=1).grid.pitch_um
+    n_across = int(np.ceil(pitch_um / finest_um)) | 1
+    n_points = (2 * radius + 3) * n_across
+    spread = optics.psf(wavelength_nm, distance_m=distance_m, pitch_um=pitch_um / n_across, n_points=n_points)
+    # From an even pixel to the mean over a pixel, a convolution with two squares: a product of transforms.
+    squares = np.sinc(np.fft.fftfreq(n_points, 1.0 / n_across)) ** 2
+    means = np.fft.ifft2(np.fft.fft2(spread.share_per_um2) * np.outer(squares, squares)).real
+    at = slice(n_across + n_across // 2, n_points - n_across, n_across)
+    kernel = np.maximum(means[at, at], 0.0)
+    return np.asarray(kernel / kernel.sum())
+
+
+def _overlaps_1d(to: Grid, source: Grid, axis: int) -> Any:
+    """Lengths that the cells of two grids share along an axis (0 is y), a sparse (n_to, n_source) matrix, µm."""
+    from scipy.sparse import csr_array
+
+    edges_to, edges_from = (
+        grid.origin_um[1 - axis] + np.arange(grid.shape[axis] + 1) * grid.pitch_um for grid in (to, source)
+    )
+    cuts = np.unique(np.concatenate((edges_to, edges_from)))
+    middle, length_um = 0.5 * (cuts[1:] + cuts[:-1]), np.diff(cuts)
+    row, column = (np.searchsorted(edges, middle, side="right") - 1 for edges in (edges_to, edges_from))
+    is_both = (row >= 0) & (row < to.shape[axis]) & (column >= 0) & (column < source.shape[axis])
+    place = (row[is_both], column[is_both])
+    return csr_array((length_um[is_both], place), shape=(to.shape[axis], source.shape[axis]))

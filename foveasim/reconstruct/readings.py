@@ -1,0 +1,107 @@
+"""What codes and charges tell of the light, by the electronics as they are meant: photoelectrons, and their noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from foveasim.arrays import Bools, Floats, check_number, finite_array
+from foveasim.sensor import Sensor, linearised
+from foveasim.units import volts_to_electrons
+
+__all__ = ["Readings", "charge_readings", "code_readings", "electrons_per_code"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Readings:
+    """
+    Light as sites tell it.
+
+    Attributes
+    ----------
+    light_e : (n_site,) float64, e-
+        Photoelectrons: charge less the dark charge that is expected. Noise may put it below 0.
+    variance_e2 : (n_site,) float64, e-²
+        Of its noise. For shot noise the charge and one more: the mean of the expectations that a charge may come from.
+    is_full : (n_site,) bool
+        Saturated: the light may be any above this.
+    """
+
+    light_e: Floats
+    variance_e2: Floats
+    is_full: Bools
+
+
+def electrons_per_code(sensor: Sensor) -> Floats:
+    """Electrons of one linear code, without the device's faults, (n_site,) e-/DN."""
+    step_e = volts_to_electrons(sensor.v_sat_v / 2.0**sensor.bits, sensor.capacitance_f)
+    return np.broadcast_to(step_e, (sensor.layout.n_sites,))
+
+
+def charge_readings(charge_e: ArrayLike, sensor: Sensor, exposure_s: float) -> Readings:
+    """
+    Readings of charges before they are read out: shot noise only.
+
+    Parameters
+    ----------
+    charge_e : (n_site,), e-
+    sensor : Sensor
+        As it is meant: its fixed patterns are not known to who reads.
+    exposure_s : float, s
+
+    Raises
+    ------
+    ParameterError
+        When a charge is not finite, or the exposure negative.
+    """
+    charge = finite_array("charge_e", charge_e, ndim=1)
+    well_e = np.inf if sensor.full_well_e is None else np.floor(sensor.full_well_e)
+    shot_e2 = np.maximum(charge, 0.0) + 1.0 if sensor.shot_noise != "off" else np.full(charge.size, 1.0 / 12.0)
+    return Readings(
+        light_e=charge - _dark_e(sensor, exposure_s), variance_e2=shot_e2, is_full=np.asarray(charge >= well_e)
+    )
+
+
+def code_readings(code: ArrayLike, sensor: Sensor, exposure_s: float) -> Readings:
+    """
+    Readings of codes: companding and the response's bend undone, pedestal and dark charge taken off.
+
+    Parameters
+    ----------
+    code : (n_site,), DN
+    sensor, exposure_s
+        As for :func:`charge_readings`.
+
+    Raises
+    ------
+    ParameterError
+        When a code is none of the sensor's, or the exposure negative.
+
+    Notes
+    -----
+    Crosstalk, coupling, differential non-linearity and fixed patterns are not undone: for the last,
+    :meth:`foveasim.sensor.Calibration.corrected`.
+    """
+    codes = finite_array("code", code, ndim=1)
+    share = (linearised(codes, sensor) + 0.5) / 2.0**sensor.bits - sensor.pedestal_v / sensor.v_sat_v
+    bend = sensor.nonlinearity_fraction
+    slope = np.ones(codes.size)
+    if bend:
+        slope = np.sqrt(np.maximum(1.0 - 4.0 * bend * share, 1e-6))
+        share = (1.0 - slope) / (2.0 * bend)
+    full_e = electrons_per_code(sensor) * 2.0**sensor.bits
+    charge = share * full_e
+    read_e = charge_readings(charge, sensor, exposure_s)
+    steps_dn = np.gradient(linearised(np.arange(2**sensor.bits), sensor))[codes.astype(np.int64)]
+    rounding_e2 = (steps_dn / slope * full_e / 2.0**sensor.bits) ** 2 / 12.0
+    noise_e2 = sensor.ktc_noise_e**2 + np.square(sensor.read_noise_e) + sensor.rts_fraction * sensor.rts_e**2 / 4.0
+    is_full = read_e.is_full | (codes >= 2**sensor.bits - 1)
+    return Readings(light_e=read_e.light_e, variance_e2=read_e.variance_e2 + noise_e2 + rounding_e2, is_full=is_full)
+
+
+def _dark_e(sensor: Sensor, exposure_s: float) -> Floats:
+    exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
+    heat = 2.0 ** ((sensor.temperature_k - sensor.dark_reference_k) / sensor.dark_doubling_k)
+    return np.asarray(np.asarray(sensor.dark_e_per_s) * heat * exposure_s)

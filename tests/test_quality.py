@@ -1,0 +1,97 @@
+"""How near a picture is to a reference: closed forms, and what is not covered does not count."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+import foveasim as fs
+from foveasim.errors import ParameterError
+from foveasim.metrics import psnr_db, ssim
+from foveasim.reconstruct import Picture
+
+RNG = np.random.default_rng(1)
+TRUTH = RNG.uniform(0.0, 1.0, (40, 50))
+NOISY = TRUTH + RNG.normal(0.0, 0.05, TRUTH.shape)
+
+
+def picture(data, coverage=1.0, pitch_um=1.0):
+    data = np.atleast_3d(np.moveaxis(np.atleast_3d(data), -1, 0))
+    return Picture(data, np.broadcast_to(np.float32(coverage), data.shape[1:]), fs.Grid(data.shape[1:], pitch_um))
+
+
+def test_psnr_of_an_even_difference_is_its_share_of_the_range():
+    assert psnr_db(TRUTH + 0.01, TRUTH, 1.0) == pytest.approx(40.0)
+    assert psnr_db(3.0 * TRUTH + 0.3, 3.0 * TRUTH, 3.0) == pytest.approx(20.0)
+
+
+def test_psnr_is_that_of_scikit_image_where_all_is_covered():
+    assert psnr_db(NOISY, TRUTH, 1.0) == pytest.approx(peak_signal_noise_ratio(TRUTH, NOISY, data_range=1.0))
+    assert psnr_db(NOISY, TRUTH) == pytest.approx(psnr_db(NOISY, TRUTH, float(np.ptp(TRUTH))))
+
+
+def test_equal_pictures_have_no_noise():
+    assert psnr_db(TRUTH, TRUTH) == math.inf
+    assert ssim(TRUTH, TRUTH) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, 1e9])
+def test_what_is_not_covered_does_not_count(wrong):
+    is_hole = np.hypot(*np.meshgrid(np.arange(50) - 25, np.arange(40) - 20)) < 8
+    seen = np.where(is_hole, wrong, NOISY)
+    expected = 10 * np.log10(1.0 / np.mean((NOISY - TRUTH)[~is_hole] ** 2))
+
+    assert psnr_db(picture(seen, ~is_hole), TRUTH[np.newaxis], 1.0) == pytest.approx(expected)
+
+
+def test_ssim_is_that_of_scikit_image_over_windows_that_are_covered():
+    is_hole = np.zeros(TRUTH.shape, bool)
+    is_hole[10:15, 20:30] = True
+    full = structural_similarity(NOISY, TRUTH, win_size=7, data_range=1.0, full=True)[1]
+    counts = np.zeros_like(is_hole)
+    counts[3:-3, 3:-3] = True
+    counts[7:18, 17:33] = False
+
+    assert ssim(np.where(is_hole, np.nan, NOISY), TRUTH, 1.0) == pytest.approx(full[counts].mean(), abs=1e-12)
+
+
+def test_ssim_of_a_whole_picture_is_that_of_scikit_image():
+    expected = structural_similarity(NOISY, TRUTH, win_size=7, data_range=1.0)
+
+    assert ssim(NOISY, TRUTH, 1.0) == pytest.approx(expected, rel=1e-6)
+
+
+def test_pixels_at_the_rim_count_by_choice():
+    coverage = np.full(TRUTH.shape, 0.7)
+    seen = picture(NOISY, coverage)
+
+    assert psnr_db(seen, TRUTH[np.newaxis]) == pytest.approx(psnr_db(NOISY, TRUTH))
+    with pytest.raises(ParameterError, match="'picture' and reference must have a pixel that both know"):
+        psnr_db(seen, TRUTH[np.newaxis], min_coverage=1.0)
+
+
+def test_colours_count_alike():
+    colour = np.stack((TRUTH, TRUTH, TRUTH))
+    seen = colour + np.array([0.1, 0.0, 0.0])[:, None, None]
+
+    assert psnr_db(seen, colour, 1.0) == pytest.approx(20.0 + 10 * np.log10(3.0))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: psnr_db(TRUTH, TRUTH[1:]), "'reference' must have the picture's shape"),
+        (lambda: psnr_db(TRUTH[0], TRUTH[0]), r"'picture' must have the shape \(\.\.\., n_y, n_x\)"),
+        (lambda: psnr_db(NOISY, np.ones_like(TRUTH)), "'data_range' must be given"),
+        (lambda: psnr_db(NOISY, TRUTH, -1.0), "'data_range' must be > 0"),
+        (lambda: psnr_db(picture(TRUTH), picture(TRUTH, pitch_um=2.0)), "'reference' must lie on the picture's grid"),
+        (lambda: ssim(NOISY, TRUTH, window=4), "'window' must be odd"),
+        (lambda: ssim(NOISY, TRUTH, window=51), "'window' must fit on the pixels that count"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused_by_name(call, message):
+    with pytest.raises(ParameterError, match=message):
+        call()
