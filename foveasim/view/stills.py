@@ -434,8 +434,12 @@ def _plotter(
     )
     plotter.add_light(light)
     for mesh in meshes:
+        surface = mesh.to_pyvista()
+        surface.points = surface.points.astype(
+            np.float32
+        )  # what graphics cards take; VTK would convert them one by one
         plotter.add_mesh(
-            mesh.to_pyvista(),
+            surface,
             scalars="rgb",
             rgb=True,
             culling="back",
