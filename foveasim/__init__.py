@@ -13,7 +13,21 @@ electrons, electrons get noise, volts become codes::
 
 from __future__ import annotations
 
-from foveasim import distortion, errors, layout, maps, metrics, optics, reconstruct, scene, sensor, units, view
+from foveasim import (
+    distortion,
+    errors,
+    layout,
+    maps,
+    metrics,
+    modes,
+    optics,
+    reconstruct,
+    scene,
+    sensor,
+    units,
+    video,
+    view,
+)
 from foveasim._version import __version__
 from foveasim.camera import Camera
 from foveasim.capture import Capture
@@ -50,6 +64,7 @@ __all__ = [
     "layout",
     "maps",
     "metrics",
+    "modes",
     "optics",
     "read_layout",
     "read_power_map",
@@ -58,6 +73,7 @@ __all__ = [
     "scene",
     "sensor",
     "units",
+    "video",
     "view",
     "write_power_map",
 ]

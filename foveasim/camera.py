@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Literal
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, check_count, check_number
+from foveasim.arrays import Floats, check_count, check_number, finite_array
 from foveasim.capture import Capture
 from foveasim.compiled import kernels
 from foveasim.distortion import Lens
@@ -22,6 +25,7 @@ from foveasim.errors import CoverageWarning, ParameterError, SimulationError
 from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
+from foveasim.modes import Between, Exposure, Shutter
 from foveasim.optics import Optics
 from foveasim.parallel import thread_count
 from foveasim.reconstruct import Picture, reference
@@ -31,7 +35,12 @@ from foveasim.sensor import Sensor, noise_budget
 from foveasim.streams import Streams
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
-__all__ = ["Camera"]
+__all__ = ["Camera", "Light"]
+
+#: A place in the image, (x, y) in µm.
+Place = tuple[float, float]
+#: A frame of light: a scene or a map, or one with the place in its image where the sensor's middle is put.
+Light = Scene | PowerMap | tuple[Scene | PowerMap, Sequence[float]]
 
 #: A map made by Fourier transforms may fall below darkness by this share of the brightest site: rounding of float32.
 NEGATIVE_ROUNDING = 1e-4
@@ -107,7 +116,7 @@ class Camera:
         self._order = None if order is None else check_count("order", order, at_most=2)
         self._layout = sensor.layout
         self._n_threads = thread_count(n_threads)
-        self._integrators: dict[tuple[Grid, int], Integrator] = {}
+        self._integrators: dict[tuple[Grid, int, Place], Integrator] = {}
 
     def __repr__(self) -> str:
         return f"Camera({self._optics!r}, {self._sensor!r})"
@@ -136,14 +145,24 @@ class Camera:
         narrowest_um = float(um_from_nm(light.wavelength_nm.min())) * self._optics.working_f_number(light.distance_m)
         return 2 if self._optics.grid(light).pitch_um <= SMOOTH_LAMBDA_N * narrowest_um else 1
 
-    def integrator(self, grid: Grid, *, order: Literal[1, 2] = 1, n_grids: int = 1) -> Integrator:
-        """The sensor's layout compiled for a grid; kept for the grids used last, of which ``n_grids`` are used together."""
-        integrator = self._integrators.pop((grid, order), None)
+    def integrator(
+        self,
+        grid: Grid,
+        *,
+        order: Literal[1, 2] = 1,
+        n_grids: int = 1,
+        place_um: Place = (0.0, 0.0),
+    ) -> Integrator:
+        """
+        The sensor's layout compiled for a grid, with its middle at a place in the image, µm.
+
+        Kept for the grids used last, of which ``n_grids`` are used together.
+        """
+        integrator = self._integrators.pop((grid, order, place_um), None)
         if integrator is None:
-            integrator = Integrator(
-                self._layout, grid, distortion=self._distortion, order=order, n_threads=self._n_threads
-            )
-        self._integrators[grid, order] = integrator
+            layout = self._layout.translate(*place_um) if any(place_um) else self._layout
+            integrator = Integrator(layout, grid, distortion=self._distortion, order=order, n_threads=self._n_threads)
+        self._integrators[grid, order, place_um] = integrator
         while len(self._integrators) > KEPT_INTEGRATORS * n_grids:
             del self._integrators[next(iter(self._integrators))]
         return integrator
@@ -189,9 +208,21 @@ class Camera:
         """
         streams = Streams(seed, frame)
         exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
-        sensor = self._sensor
         clock = _Clock()
         photo_e_per_s = self._photoelectrons_per_s(light, clock)
+        return self._exposed(light, photo_e_per_s, exposure_s, streams, clock)
+
+    def _exposed(
+        self,
+        light: Scene | PowerMap,
+        photo_e_per_s: Floats,
+        exposure_s: float,
+        streams: Streams,
+        clock: _Clock,
+        **settings: Any,
+    ) -> Capture:
+        """What the sensor makes of the light on its sites."""
+        sensor = self._sensor
         with clock.stage("sensor"):
             expected_e = sensor.expected_electrons(photo_e_per_s, exposure_s)
             electrons = sensor.collect(expected_e, streams=streams, n_threads=self._n_threads)
@@ -207,18 +238,178 @@ class Camera:
             white_dn=self._white(light),
             settings={
                 "light": _light_described(light),
-                "optics": described(self._optics),
-                "distortion": None if self._distortion is None else described(self._distortion),
+                **self._described,
                 "integration_order": self.order(light),
-                "sensor": {k: v for k, v in described(sensor).items() if k != "layout"},
-                "layout": described(dict(self._layout.provenance)),
                 "exposure_s": exposure_s,
                 "seed": streams.seed,
                 "frame": streams.frame,
                 "versions": versions(),
+                **settings,
             },
             stage_s=clock.stage_s,
         )
+
+    @cached_property
+    def _described(self) -> dict[str, Any]:
+        """What all captures of the camera have in common, as plain data."""
+        return {
+            "optics": described(self._optics),
+            "distortion": None if self._distortion is None else described(self._distortion),
+            "sensor": {k: v for k, v in described(self._sensor).items() if k != "layout"},
+            "layout": described(dict(self._layout.provenance)),
+        }
+
+    def rates(self, frames: Iterable[Light]) -> Iterator[Floats]:
+        """
+        Expected photoelectrons of every site in a second, frame by frame: what the modes of acquisition take.
+
+        Parameters
+        ----------
+        frames : iterable of Scene or PowerMap, or of pairs with a place (x_um, y_um)
+            As for :meth:`video`.
+
+        Yields
+        ------
+        photo_e_per_s : (n_site,) float64, e-/s
+            As :meth:`photoelectrons_per_s` gives it.
+
+        Raises
+        ------
+        ParameterError, SimulationError
+            As for :meth:`capture`, when the frame comes.
+        """
+        return (rate_e_per_s for *_, rate_e_per_s in self._lit(frames, _Clock()))
+
+    def video(
+        self,
+        frames: Iterable[Light],
+        *,
+        exposure_s: float | Sequence[float],
+        seed: int,
+        first_frame: int = 0,
+        frame_s: float | None = None,
+        line_s: float = 0.0,
+        every: int = 1,
+        between: Between = "hold",
+    ) -> Iterator[Capture]:
+        """
+        One capture after the other, each made when it is asked for.
+
+        Parameters
+        ----------
+        frames : iterable of Scene or PowerMap, or of pairs with a place (x_um, y_um)
+            The light, frame by frame. With a place, the sensor's middle is put there in the image behind the lens: a gaze that
+            moves. See :mod:`foveasim.video` for frames from pictures and video files, and for paths of gazes.
+        exposure_s : float, or one after the other, s
+            Of a sequence the captures take one each, over and over: a bracket.
+        seed : int
+            Of the noise; fixed patterns are the device's and stay.
+        first_frame : int
+            Number of the first capture: capture k has the noise of ``capture(..., frame=first_frame + k)``.
+        frame_s : float, optional, s
+            From one frame of light to the next. Without it every frame lights one capture and no other.
+        line_s : float, s
+            Rolling shutter: a site begins ``readout_order * line_s`` after the first. Needs ``frame_s``.
+        every : int
+            Number of frames of light from one capture to the next.
+        between : {"hold", "linear"}
+            What light does between frames: it holds until the next, or goes over into it in a straight line.
+
+        Yields
+        ------
+        Capture
+
+        Raises
+        ------
+        ParameterError, SimulationError
+            At once, when an argument is out of range; as for :meth:`capture`, when the frame comes.
+
+        Notes
+        -----
+        In memory are one frame of light and, while exposures overlap, some numbers a site of each; the layout is compiled once.
+        The same object again is the same light: its image is not computed anew, wherever the gaze goes. A place moves the
+        photosites' outlines, so that shifts of any part of a cell are exact; the layout is compiled for each new place.
+
+        With ``frame_s`` a capture has the light of all frames that its exposure covers, each weighted by its time; the last
+        frame's light stays until the last exposure is over.
+
+        Examples
+        --------
+        >>> import foveasim as fs
+        >>> layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0)
+        >>> camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=fs.Sensor(layout))
+        >>> scene = fs.Scene.flat(
+        ...     shape=(200, 200), pitch_um=10.0, distance_m=0.5, radiance_w_m2_sr_nm=0.1, band_width_nm=10.0
+        ... )
+        >>> [c.settings["frame"] for c in camera.video([scene, scene], exposure_s=0.01, seed=0)]
+        [0, 1]
+        """
+        exposures_s = finite_array("exposure_s", exposure_s, at_least=0.0)
+        if exposures_s.ndim > 1 or exposures_s.size == 0:
+            raise ParameterError("exposure_s", "must be one time, or a sequence of times", exposure_s, "s")
+        exposures_s = np.atleast_1d(exposures_s)
+        if not isinstance(frames, Iterable):
+            raise ParameterError("frames", f"must be an iterable of Scenes or PowerMaps, got a {type(frames).__name__}")
+        if frame_s is None and (line_s or between != "hold" or every != 1):
+            name = "line_s" if line_s else "between" if between != "hold" else "every"
+            raise ParameterError(name, "needs 'frame_s', the time from one frame of light to the next")
+        streams = Streams(seed, first_frame)
+        every = check_count("every", every)
+        if frame_s is None:
+            return self._still(frames, exposures_s, streams)
+        shutter = Shutter(self._layout, frame_s, line_s, between)
+        return self._rolling(frames, exposures_s, streams, shutter, every)
+
+    def _still(self, frames: Iterable[Light], exposures_s: Floats, streams: Streams) -> Iterator[Capture]:
+        """A capture for every frame, which is all that lights it."""
+        clock = _Clock()
+        for k, (light, place_um, rate_e_per_s) in enumerate(self._lit(frames, clock)):
+            number = Streams(streams.seed, streams.frame + k)
+            exposure_s = float(exposures_s[k % exposures_s.size])
+            yield self._exposed(light, rate_e_per_s, exposure_s, number, clock.so_far(), **_told(place_um))
+
+    def _rolling(
+        self, frames: Iterable[Light], exposures_s: Floats, streams: Streams, shutter: Shutter, every: int
+    ) -> Iterator[Capture]:
+        """A capture for every so many frames, lit by all those that its exposure covers."""
+        times = {"frame_s": shutter.frame_s, "line_s": shutter.line_s, "every": every, "between": shutter.between}
+        going_on: deque[tuple[int, Scene | PowerMap, Place, Exposure]] = deque()
+        clock = _Clock()
+
+        def first(last_e_per_s: Floats) -> Capture:
+            k, light, place_um, exposure = going_on.popleft()
+            number = Streams(streams.seed, streams.frame + k)
+            mean_e_per_s, told = exposure.mean_e_per_s(last_e_per_s), times | _told(place_um)
+            return self._exposed(light, mean_e_per_s, exposure.exposure_s, number, clock.so_far(), **told)
+
+        rate_e_per_s = np.zeros(1)
+        for n, (light, place_um, rate_e_per_s) in enumerate(self._lit(frames, clock)):
+            if n % every == 0:
+                k = n // every
+                going_on.append((k, light, place_um, Exposure(shutter, float(exposures_s[k % exposures_s.size]))))
+            with clock.stage("shutter"):
+                for *_, exposure in going_on:
+                    exposure.add(rate_e_per_s)
+            while going_on and going_on[0][-1].is_over:
+                yield first(rate_e_per_s)
+        while going_on:
+            yield first(rate_e_per_s)
+
+    def _lit(self, frames: Iterable[Light], clock: _Clock) -> Iterator[tuple[Scene | PowerMap, Place, Floats]]:
+        """Every frame's light, the sensor's place, and the light on the sites; what frames have in common is computed once."""
+        before: tuple[Scene | PowerMap, Place] | None = None
+        rate_e_per_s = np.zeros(self._layout.n_sites)
+        kept: dict[tuple[Grid, int], NDArray[Any]] = {}
+        for frame in frames:
+            light, place_um = _parts(frame)
+            is_same_light = before is not None and light is before[0]
+            if not is_same_light:
+                kept = {}
+            if not is_same_light or before is None or place_um != before[1]:
+                images = kept if isinstance(frame, tuple) else None
+                rate_e_per_s = self._photoelectrons_per_s(light, clock, place_um, images)
+            before = light, place_um
+            yield light, place_um, rate_e_per_s
 
     def predict(self, light: Scene | PowerMap, *, exposure_s: float) -> tuple[Floats, Floats]:
         """
@@ -289,11 +480,18 @@ class Camera:
         """
         return noise_budget(self._sensor, self._photoelectrons_per_s(light, _Clock()), exposure_s)
 
-    def _photoelectrons_per_s(self, light: Scene | PowerMap, clock: _Clock) -> Floats:
+    def _photoelectrons_per_s(
+        self,
+        light: Scene | PowerMap,
+        clock: _Clock,
+        place_um: Place = (0.0, 0.0),
+        kept: dict[tuple[Grid, int], NDArray[Any]] | None = None,
+    ) -> Floats:
         """
         One inverse transform and one pass over the map for each colour filter, whatever the number of wavelengths.
 
-        Lateral colour makes images of several sizes, each with its own grid, and the same for each of them.
+        Lateral colour makes images of several sizes, each with its own grid, and the same for each of them. The images of a
+        scene are put in ``kept``, and taken from there when they are in it.
         """
         if not isinstance(light, Scene | PowerMap):
             raise ParameterError("light", f"must be a Scene or a PowerMap, got a {type(light).__name__}")
@@ -308,7 +506,9 @@ class Camera:
             grids = self._optics.image_grids(light)
         with clock.stage("compile layout"):
             order = self.order(light)
-            integrators = [self.integrator(grid, order=order, n_grids=len(grids)) for grid, _ in grids]
+            integrators = [
+                self.integrator(grid, order=order, n_grids=len(grids), place_um=place_um) for grid, _ in grids
+            ]
         self._warn_of_uncovered(min(integrators, key=lambda integrator: integrator.grid.pitch_um))
         rate_e_per_s = np.zeros(self._layout.n_sites)
         if isinstance(light, PowerMap):
@@ -322,7 +522,9 @@ class Camera:
                 maps = self._optics.weighted_maps(light, weights[used] * is_on_it, grid=grid, n_threads=self._n_threads)
                 for c in used:
                     with clock.stage("optics"):
-                        cells = next(maps)
+                        cells = next(maps) if kept is None or (grid, c) not in kept else kept[grid, c]
+                        if kept is not None:
+                            kept[grid, c] = cells
                     with clock.stage("integration"):
                         rates = w_from_w_m2_um2(integrator(cells))
                         del cells
@@ -387,6 +589,27 @@ class _Clock:
         start_s = time.perf_counter()
         yield
         self.stage_s[name] = self.stage_s.get(name, 0.0) + time.perf_counter() - start_s
+
+    def so_far(self) -> _Clock:
+        """What was added up since this was last asked."""
+        before = _Clock()
+        before.stage_s, self.stage_s = self.stage_s, {}
+        return before
+
+
+def _told(place_um: Place) -> dict[str, Any]:
+    """What a capture's settings tell of its place."""
+    return {"place_um": list(place_um)} if any(place_um) else {}
+
+
+def _parts(frame: Light) -> tuple[Scene | PowerMap, Place]:
+    """Light, and the place of the sensor's middle in its image."""
+    if not isinstance(frame, tuple):
+        return frame, (0.0, 0.0)
+    place_um = finite_array("frames", frame[1], ndim=1) if len(frame) == 2 else np.zeros(0)
+    if place_um.size != 2:
+        raise ParameterError("frames", "must be Scenes or PowerMaps, or pairs (light, (x_um, y_um))", frame)
+    return frame[0], (float(place_um[0]), float(place_um[1]))
 
 
 def _light_described(light: Scene | PowerMap) -> dict[str, object]:

@@ -24,16 +24,16 @@ FLOORS = [
     {"documents", "encodings", "parallel", "pictures", "records", "rings", "streams", "units"},
     {"fields"},
     {"distortion", "integrate", "layout", "maps", "optics", "scene", "sensor"},
-    {"reconstruct"},
+    {"modes", "reconstruct"},
     {"capture"},
     {"camera"},
-    {"config", "metrics", "view"},
+    {"config", "metrics", "video", "view"},
     {"shots"},
     {"cli"},
 ]
 #: Loaded when they are used, not before.
 HEAVY = {
-    "OpenEXR", "PIL", "astropy", "cv2", "dask", "exactextract", "gdstk", "h5netcdf", "h5py", "imagecodecs", "klayout", "manifold3d", "matplotlib", "pyarrow", "numba", "pydantic", "pyvista", "rich", "skimage", "tifffile",
+    "OpenEXR", "PIL", "astropy", "av", "cv2", "dask", "exactextract", "gdstk", "h5netcdf", "h5py", "imagecodecs", "klayout", "manifold3d", "matplotlib", "pyarrow", "numba", "pydantic", "pyvista", "rich", "skimage", "tifffile",
     "torch", "trimesh", "typer", "vtk", "xarray", "yaml", "zarr",
 }  # fmt: skip
 #: Names of numbers without a unit, or with the unit of what they are measured with.

@@ -1,0 +1,16 @@
+"""
+Videos: frames of light from pictures, files and moving gazes; captures as zarr folders, pictures and video files.
+
+::
+
+    frames = fs.video.Footage("street.mp4", pitch_um=20.0, distance_m=0.8, peak_radiance_w_m2_sr_nm=0.1)
+    fs.video.write_video(camera.video(frames, exposure_s=1 / 100, seed=0), "street.zarr", progress=True)
+"""
+
+from __future__ import annotations
+
+from foveasim.video.footage import Footage
+from foveasim.video.gaze import GazePath, look, look_around, saccades
+from foveasim.video.recording import Recording, read_recording, write_video
+
+__all__ = ["Footage", "GazePath", "Recording", "look", "look_around", "read_recording", "saccades", "write_video"]

@@ -1,0 +1,181 @@
+"""Footage: pictures in a row, from memory, a folder or a video file, as scenes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sized
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim.arrays import check_count, check_number
+from foveasim.errors import FileError, ParameterError
+from foveasim.scene import Scene
+
+__all__ = ["Footage"]
+
+#: Endings of the pictures that a folder is searched for.
+PICTURE_ENDINGS = (".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga", ".tif", ".tiff", ".webp")
+NEEDS_PYAV = "needs a reader for video files: pip install 'foveasim[video]'"
+
+
+class Footage:
+    """
+    Frames of light from pictures; iterating gives a Scene for each, read when it is asked for.
+
+    Parameters
+    ----------
+    source : path, or iterable of paths or arrays
+        A folder of pictures, in the natural order of their names (``frame 2`` before ``frame 10``); a video file, with the
+        extra ``video``; or the pictures themselves, as :meth:`foveasim.Scene.from_picture` takes them.
+    start, stop, step : int
+        Which of the frames: as of a slice.
+    frame_s : float, optional, s
+        From one frame to the next; by default what the video file says.
+    **scene
+        Of :meth:`foveasim.Scene.from_picture`: ``pitch_um``, ``distance_m``, ``peak_radiance_w_m2_sr_nm``, and others.
+
+    Raises
+    ------
+    FileError
+        When there is no such file, a folder holds no pictures, or, as frames are read, one is broken or of another size.
+    ParameterError
+        When a value is out of range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> pictures = [np.full((4, 6), level) for level in (0.25, 0.5)]
+    >>> footage = Footage(
+    ...     pictures, pitch_um=10.0, distance_m=1.0, peak_radiance_w_m2_sr_nm=0.1, band_width_nm=10.0, encoding="linear"
+    ... )
+    >>> [float(scene.basis.max()) for scene in footage]
+    [0.25, 0.5]
+    """
+
+    def __init__(
+        self,
+        source: str | Path | Iterable[str | Path | ArrayLike],
+        *,
+        start: int = 0,
+        stop: int | None = None,
+        step: int = 1,
+        frame_s: float | None = None,
+        **scene: Any,
+    ) -> None:
+        self._start = check_count("start", start, at_least=0)
+        self._stop = None if stop is None else check_count("stop", stop, at_least=0)
+        self._step = check_count("step", step)
+        self._scene = scene
+        self._source: Iterable[Any]
+        self._n_source: int | None = None
+        told_s: float | None = None
+        if isinstance(source, str | Path):
+            path = Path(source)
+            if path.is_dir():
+                self._source = _pictures_in(path)
+                self._n_source = len(self._source)
+            elif path.is_file():
+                self._source = _VideoFile(path)
+                self._n_source, told_s = self._source.n_frames, self._source.frame_s
+            else:
+                raise FileError(path, "no such file or folder")
+        elif isinstance(source, Iterable):
+            self._source = source
+            self._n_source = len(source) if isinstance(source, Sized) else None
+        else:
+            raise ParameterError("source", f"must be a path, or pictures, got a {type(source).__name__}")
+        if frame_s is not None:
+            told_s = check_number("frame_s", frame_s, above=0.0)
+        self._frame_s = None if told_s is None else told_s * (self._step if frame_s is None else 1)
+
+    def __repr__(self) -> str:
+        return f"Footage({self.n_frames or 'any number of'} frames)"
+
+    @property
+    def frame_s(self) -> float | None:
+        """Seconds from one frame to the next; None where nobody said."""
+        return self._frame_s
+
+    @property
+    def n_frames(self) -> int | None:
+        """How many frames there are; None where that is not known before the last."""
+        if self._n_source is None:
+            return None
+        return len(
+            range(self._start, min(self._n_source, self._n_source if self._stop is None else self._stop), self._step)
+        )
+
+    def __iter__(self) -> Iterator[Scene]:
+        """Scenes, one after the other."""
+        shape: tuple[int, ...] | None = None
+        for k, picture in enumerate(islice(iter(self._source), self._start, self._stop, self._step)):
+            scene = Scene.from_picture(picture, **self._scene)
+            if shape is not None and scene.basis.shape != shape:
+                where = picture if isinstance(picture, str | Path) else f"frame {self._start + k * self._step}"
+                raise FileError(
+                    where, f"has the shape {scene.basis.shape}, and the frames before it {shape}: all must be alike"
+                )
+            shape = scene.basis.shape
+            yield scene
+
+
+def _pictures_in(folder: Path) -> list[Path]:
+    """The pictures of a folder, in the natural order of their names."""
+    pictures = [
+        path
+        for path in folder.iterdir()
+        if path.is_file() and path.suffix.lower() in PICTURE_ENDINGS and not path.name.startswith(".")
+    ]
+    if not pictures:
+        raise FileError(folder, f"holds no pictures ({', '.join(PICTURE_ENDINGS)})")
+    return sorted(pictures, key=lambda path: [(int(p), "") if p.isdigit() else (-1, p) for p in _pieces(path)])
+
+
+def _pieces(path: Path) -> list[str]:
+    return [piece for piece in re.split(r"(\d+)", path.name) if piece]
+
+
+class _VideoFile:
+    """Frames of a video file as (n_y, n_x, 3) uint8, first row on top."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with _opened(path) as container:
+            stream = container.streams.video[0]
+            rate = stream.average_rate or stream.base_rate
+            self.frame_s = None if not rate else float(1 / rate)
+            self.n_frames: int | None = int(stream.frames) or None
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        import av
+
+        with _opened(self.path) as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            n_read = 0
+            try:
+                for frame in container.decode(stream):
+                    yield frame.to_ndarray(format="rgb24")
+                    n_read += 1
+            except av.FFmpegError as error:
+                raise FileError(self.path, f"is broken after frame {n_read} ({error})") from None
+            if n_read == 0:
+                raise FileError(self.path, "holds no frames")
+
+
+def _opened(path: Path) -> Any:
+    try:
+        import av
+    except ImportError:
+        raise FileError(path, NEEDS_PYAV) from None
+    try:
+        container = av.open(str(path))
+    except (av.FFmpegError, OSError) as error:
+        raise FileError(path, f"is no video file that can be read ({error})") from None
+    if not container.streams.video:
+        container.close()
+        raise FileError(path, "holds no pictures that move")
+    return container

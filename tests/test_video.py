@@ -1,0 +1,547 @@
+"""Videos: frames after one another are single captures, gazes shift exactly, shutters roll, files come back."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+import foveasim as fs
+from foveasim.errors import FileError, ParameterError, SimulationError
+from foveasim.pictures import write_picture
+from foveasim.sensor import merge_exposures
+from foveasim.video import Footage, GazePath, look, look_around, read_recording, saccades, write_video
+
+PITCH_UM, DISTANCE_M = 10.0, 0.5
+LIGHT = {
+    "pitch_um": PITCH_UM,
+    "distance_m": DISTANCE_M,
+    "peak_radiance_w_m2_sr_nm": 0.1,
+    "band_width_nm": 50.0,
+    "encoding": "linear",
+}
+OPTICS = fs.Optics(focal_length_mm=22.0, f_number=4.0)
+
+
+def pictures(n, shape=(120, 160), seed=0):
+    rng = np.random.default_rng(seed)
+    return [rng.random(shape, dtype=np.float32) for _ in range(n)]
+
+
+def scene_of(picture):
+    return fs.Scene.from_picture(picture, **LIGHT)
+
+
+def rows_layout(n_x=12, n_y=10, pitch_um=3.0):
+    layout = fs.layout.grid(n_x=n_x, n_y=n_y, pitch_um=pitch_um)
+    row = np.rint((layout.centroid_um[:, 1] - layout.centroid_um[:, 1].min()) / pitch_um).astype(np.int64)
+    return layout.with_columns(readout_order=row)
+
+
+def camera_of(layout, **sensor):
+    kinds = {"read_noise_e": 2.0, "prnu_fraction": 0.02, "bits": 12, "capacitance_f": 1e-14} | sensor
+    return fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout, **kinds))
+
+
+def map_camera(layout, **sensor):
+    """A camera for maps of light, one electron a photon, its charges not rounded by noise."""
+    return fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout, shot_noise="off", **sensor))
+
+
+def bar_map(grid, left_um, width_um=3.0):
+    """A bright bar over all rows, exactly where it is told to be."""
+    edges = grid.origin_um[0] + grid.pitch_um * np.arange(grid.shape[1] + 1)
+    share = np.diff(np.clip(edges, left_um, left_um + width_um)) / grid.pitch_um
+    return fs.PowerMap(np.broadcast_to(share, (1, *grid.shape)).copy(), grid, np.array([550.0]))
+
+
+# -- frames after one another ------------------------------------------------------------------------------------------
+
+
+def test_every_frame_of_a_video_is_the_single_capture_of_its_number():
+    scenes = [scene_of(p) for p in pictures(3)]
+    camera = camera_of(rows_layout())
+
+    captures = list(camera.video(scenes, exposure_s=0.01, seed=5, first_frame=7))
+
+    for k, (scene, capture) in enumerate(zip(scenes, captures, strict=True)):
+        alone = camera_of(rows_layout()).capture(scene, exposure_s=0.01, seed=5, frame=7 + k)
+        assert np.array_equal(capture.code, alone.code)
+        assert np.array_equal(capture.electrons, alone.electrons)
+        assert capture.settings == alone.settings
+
+
+def test_a_still_scene_keeps_its_fixed_pattern_and_changes_its_noise():
+    scene = scene_of(pictures(1)[0])
+    first, second = camera_of(rows_layout()).video([scene, scene], exposure_s=0.01, seed=5)
+
+    assert np.array_equal(first.expected_e, second.expected_e)
+    assert np.mean(first.electrons != second.electrons) > 0.9
+
+
+def test_the_image_of_the_same_object_is_computed_once():
+    scene = scene_of(pictures(1)[0])
+    first, second, third = camera_of(rows_layout()).video(
+        [scene, scene, scene_of(pictures(1)[0])], exposure_s=0.01, seed=5
+    )
+
+    assert "optics" in first.stage_s
+    assert "optics" not in second.stage_s
+    assert "optics" in third.stage_s
+    assert np.array_equal(second.expected_e, third.expected_e)
+
+
+def test_the_layout_is_compiled_once_for_all_frames():
+    camera = camera_of(rows_layout())
+    list(camera.video([scene_of(p) for p in pictures(3)], exposure_s=0.01, seed=5))
+
+    assert len(camera._integrators) == 1
+
+
+def test_frames_are_asked_for_one_at_a_time():
+    asked = []
+
+    def frames():
+        for k, picture in enumerate(pictures(3)):
+            asked.append(k)
+            yield scene_of(picture)
+
+    video = camera_of(rows_layout()).video(frames(), exposure_s=0.01, seed=0)
+
+    assert asked == []
+    next(video)
+    assert asked == [0]
+    next(video)
+    assert asked == [0, 1]
+
+
+def test_rates_are_the_photoelectrons_of_each_frame():
+    scenes = [scene_of(p) for p in pictures(2)]
+    camera = camera_of(rows_layout())
+
+    for rate, scene in zip(camera.rates(scenes), scenes, strict=True):
+        assert np.array_equal(rate, camera.photoelectrons_per_s(scene))
+
+
+def test_a_bracket_takes_its_exposures_in_turns_and_merges_to_the_light():
+    layout = rows_layout()
+    camera = camera_of(layout, read_noise_e=0.0, prnu_fraction=0.0)
+    scene = scene_of(pictures(1)[0])
+    exposures_s = [0.002, 0.02]
+    captures = list(camera.video([scene] * 4, exposure_s=exposures_s, seed=1))
+
+    assert [c.settings["exposure_s"] for c in captures] == exposures_s * 2
+    rates = merge_exposures([c.code for c in captures[:2]], exposures_s, camera.sensor)
+    truth = camera.photoelectrons_per_s(scene)
+    seen = np.isfinite(rates.rate_e_per_s)
+    assert seen.all()
+    assert np.abs((rates.rate_e_per_s - truth) / rates.sigma_e_per_s).max() < 5.0
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"exposure_s": -1.0}, "exposure_s"),
+        ({"exposure_s": []}, "exposure_s"),
+        ({"seed": -1}, "seed"),
+        ({"first_frame": -1}, "frame"),
+        ({"line_s": 1e-3}, "frame_s"),
+        ({"every": 2}, "frame_s"),
+        ({"between": "linear"}, "frame_s"),
+        ({"frame_s": 0.0}, "frame_s"),
+        ({"frame_s": 1.0, "every": 0}, "every"),
+        ({"frame_s": 1.0, "line_s": -1.0}, "line_s"),
+        ({"frame_s": 1.0, "between": "cubic"}, "between"),
+    ],
+)
+def test_a_wrong_argument_is_told_before_the_first_frame(change, name):
+    with pytest.raises(ParameterError, match=name):
+        camera_of(rows_layout()).video([], **({"exposure_s": 0.01, "seed": 0} | change))
+
+
+def test_frames_that_are_no_light_are_told():
+    camera = camera_of(rows_layout())
+    with pytest.raises(ParameterError, match="iterable"):
+        camera.video(3, exposure_s=0.01, seed=0)
+    with pytest.raises(ParameterError, match="Scene or a PowerMap"):
+        list(camera.video([np.ones((3, 3))], exposure_s=0.01, seed=0))
+    with pytest.raises(ParameterError, match="pairs"):
+        list(camera.video([(scene_of(pictures(1)[0]), 1.0, 2.0)], exposure_s=0.01, seed=0))
+
+
+def test_no_frames_give_no_captures():
+    camera = camera_of(rows_layout())
+
+    assert list(camera.video([], exposure_s=0.01, seed=0)) == []
+    assert list(camera.video([], exposure_s=0.01, seed=0, frame_s=0.1)) == []
+
+
+# -- gazes ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_gaze_of_whole_cells_is_the_picture_moved_by_whole_pixels():
+    grid = fs.Grid.centred((60, 80), 0.5)
+    data = np.random.default_rng(3).random((1, 60, 80))
+    light = fs.PowerMap(data, grid, np.array([550.0]))
+    camera = map_camera(rows_layout(n_x=5, n_y=4))
+    # The gaze goes to +x and +y: what lay there comes to the middle.
+    moved = fs.PowerMap(np.roll(data, (-4, -7), axis=(1, 2)), grid, np.array([550.0]))
+
+    gazed, plain = camera.rates([(light, (3.5, 2.0)), moved])
+
+    assert np.allclose(gazed, plain, rtol=1e-12)
+
+
+def test_a_gaze_of_any_part_of_a_cell_is_exact_on_a_linear_field():
+    grid = fs.Grid.centred((60, 80), 0.5)
+    x_um, y_um = np.meshgrid(grid.x_um, grid.y_um)
+    light = fs.PowerMap((100.0 + 2.0 * x_um - 3.0 * y_um)[np.newaxis], grid, np.array([550.0]))
+    layout = rows_layout(n_x=5, n_y=4)
+    camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout), order=2)
+
+    still, gazed = camera.rates([light, (light, (0.123, -0.217))])
+    plane = 100.0 + 2.0 * layout.centroid_um[:, 0] - 3.0 * layout.centroid_um[:, 1]
+
+    assert np.allclose(gazed / still, (plane + 2.0 * 0.123 + 3.0 * 0.217) / plane, rtol=1e-12)
+
+
+def test_a_moving_camera_sees_a_part_of_the_picture_where_it_looks():
+    whole = scene_of(pictures(1, (200, 260))[0])
+    cell_um = OPTICS.grid(whole).pitch_um
+    layout = rows_layout(n_x=6, n_y=5)
+    camera = camera_of(layout)
+    path = GazePath(np.array([0.0, 1.0]), cell_um * np.array([[0.0, 0.0], [12.25, -7.5]]))
+    parts = list(look_around(whole, path, OPTICS, shape=(120, 160)))
+
+    (first, place), (second, rest) = parts
+
+    assert place == (0.0, 0.0)
+    assert np.array_equal(first.basis, whole.basis[:, 40:160, 50:210])
+    assert np.array_equal(second.basis[0, 0, :3], whole.basis[0, 32, 62:65])
+    assert rest[0] == pytest.approx(0.25 * cell_um)
+    assert abs(rest[1]) == pytest.approx(0.5 * cell_um)
+    # The sensor moved behind the lens sees the same, up to falloff over these few pixels.
+    around, behind = list(camera.rates(parts))[1], list(camera.rates(look(whole, path)))[1]
+    assert np.allclose(around, behind, rtol=2e-3)
+
+
+def test_parts_of_odd_differences_are_centred_to_half_a_pixel():
+    whole = scene_of(pictures(1, (121, 161))[0])
+    cell_um = OPTICS.grid(whole).pitch_um
+    ((_, rest),) = look_around(whole, GazePath(np.zeros(1), np.zeros((1, 2))), OPTICS, shape=(100, 140))
+
+    assert np.allclose(np.abs(rest), 0.5 * cell_um)
+
+
+def test_a_gaze_beyond_the_picture_is_told_with_its_time():
+    whole = scene_of(pictures(1)[0])
+    path = GazePath(np.array([0.0, 0.5]), np.array([[0.0, 0.0], [1000.0, 0.0]]))
+    with pytest.raises(ParameterError, match=r"leaves the picture at 0\.5 s"):
+        list(look_around(whole, path, OPTICS, shape=(100, 100)))
+
+
+def test_saccades_stay_in_their_field_and_rest_between_jumps():
+    path = saccades(duration_s=20.0, frame_s=1e-3, size_um=(200.0, 80.0), seed=3, saccade_s=0.04)
+    speed = np.linalg.norm(np.diff(path.xy_um, axis=0), axis=1)
+
+    assert path.xy_um.shape == (20_000, 2)
+    assert np.all(np.abs(path.xy_um) <= [100.0, 40.0])
+    # About a rest of 0.3 s and a jump of 0.04 s at a time: 59 jumps, each at most 40 steps.
+    share = np.mean(speed > 0)
+    assert share == pytest.approx(0.04 / 0.34, rel=0.25)
+
+
+def test_drift_spreads_as_the_root_of_time():
+    paths = [
+        saccades(duration_s=0.5, frame_s=1e-3, size_um=(0.0, 0.0), seed=k, fixation_s=100.0, drift_um_per_root_s=10.0)
+        for k in range(400)
+    ]
+    ends_um = np.array([path.xy_um[-1] for path in paths])
+
+    # Variance 100 µm²/s for 0.499 s, from 800 numbers: relative standard error sqrt(2/800) = 0.05.
+    assert ends_um.var() == pytest.approx(49.9, rel=0.25)
+
+
+def test_a_seed_gives_the_same_gaze_and_another_another():
+    one, same, other = (saccades(duration_s=2.0, frame_s=0.01, size_um=(50.0, 50.0), seed=s) for s in (1, 1, 2))
+
+    assert np.array_equal(one.xy_um, same.xy_um)
+    assert not np.array_equal(one.xy_um, other.xy_um)
+
+
+def test_a_path_is_straight_between_its_points():
+    path = GazePath(np.array([0.0, 2.0]), np.array([[0.0, 4.0], [10.0, 0.0]]))
+
+    assert path.at(0.5).tolist() == [2.5, 3.0]
+    assert path.at([-1.0, 5.0]).tolist() == [[0.0, 4.0], [10.0, 0.0]]
+    with pytest.raises(ParameterError, match="t_s"):
+        GazePath(np.zeros(2), np.zeros((2, 2)))
+    with pytest.raises(ParameterError, match="xy_um"):
+        GazePath(np.zeros(1), np.zeros((2, 2)))
+
+
+# -- shutters ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_rolling_shutter_of_no_delay_is_the_global_one_bit_for_bit():
+    scenes = [scene_of(p) for p in pictures(3)]
+    plain = camera_of(rows_layout()).video(scenes, exposure_s=0.01, seed=5)
+    rolled = camera_of(rows_layout()).video(scenes, exposure_s=0.01, seed=5, frame_s=0.01, line_s=0.0)
+
+    for a, b in zip(plain, rolled, strict=True):
+        assert np.array_equal(a.code, b.code)
+        assert np.array_equal(a.expected_e, b.expected_e)
+
+
+def test_a_still_scene_looks_the_same_through_every_shutter():
+    scene = scene_of(pictures(1)[0])
+    camera = camera_of(rows_layout())
+    plain = next(camera.video([scene], exposure_s=0.01, seed=5)).expected_e
+    for between in ("hold", "linear"):
+        rolled = camera.video([scene] * 3, exposure_s=0.01, seed=5, frame_s=0.004, line_s=1.3e-3, between=between)
+        for capture in rolled:
+            assert np.allclose(capture.expected_e, plain, rtol=1e-12)
+
+
+@pytest.mark.parametrize("between", ["hold", "linear"])
+def test_a_moving_bar_leans_by_its_speed_times_the_time_of_a_line(between):
+    layout = rows_layout(n_x=60, n_y=20, pitch_um=1.0)
+    grid = fs.Grid.centred((40, 160), 0.5)
+    speed_um_per_frame, frame_s, line_s = 0.1, 1e-4, 1e-3
+    frames = (bar_map(grid, -20.0 + speed_um_per_frame * k) for k in range(300))
+    (capture,) = map_camera(layout).video(
+        frames, exposure_s=frame_s, seed=0, frame_s=frame_s, line_s=line_s, every=1000, between=between
+    )
+    light = capture.expected_e.reshape(20, 60)
+    middle_um = light @ layout.centroid_um[:60, 0] / light.sum(axis=1)
+
+    # v t_line = 0.1 µm / 1e-4 s * 1e-3 s = 1 µm a line.
+    assert np.allclose(np.diff(middle_um), 1.0, atol=1e-9)
+
+
+def test_motion_during_the_exposure_blurs_over_the_way():
+    layout = rows_layout(n_x=60, n_y=2, pitch_um=1.0)
+    grid = fs.Grid.centred((8, 160), 0.5)
+    frames = (bar_map(grid, -20.0 + 0.5 * k, width_um=1.0) for k in range(40))
+    (capture,) = map_camera(layout).video(frames, exposure_s=0.02, seed=0, frame_s=1e-3, every=100)
+    light = capture.expected_e[:60] / capture.expected_e[:60].sum()
+    x_um = layout.centroid_um[:60, 0]
+    variance = light @ x_um**2 - (light @ x_um) ** 2
+
+    # Twenty places 0.5 µm apart, 0.25 µm² (20² - 1) / 12, and bars that straddle two sites of 1 µm every other time: 1/8 µm².
+    assert variance == pytest.approx(0.25 * 399 / 12 + 0.125, abs=1e-3)
+
+
+def test_a_line_sees_each_frame_for_as_long_as_it_is_exposed_to_it():
+    layout = rows_layout(n_x=1, n_y=3, pitch_um=1.0)
+    grid = fs.Grid.centred((8, 8), 0.5)
+    levels = np.array([1.0, 3.0, 10.0, 40.0])
+    lights = [fs.PowerMap(np.full((1, 8, 8), level), grid, np.array([550.0])) for level in levels]
+    camera = map_camera(layout)
+    per_level = camera.photoelectrons_per_s(lights[0])
+    held = next(camera.video(lights, exposure_s=1.5, seed=0, frame_s=1.0, line_s=0.5, every=9))
+    line = next(camera.video(lights, exposure_s=1.5, seed=0, frame_s=1.0, line_s=0.5, every=9, between="linear"))
+
+    # 1 for 1 s and 3 for 0.5 s; 1 for 0.5 s and 3 for 1 s; 3 for 1 s and 10 for 0.5 s.
+    assert np.allclose(held.expected_e / per_level, [2.5, 3.5, 8.0], rtol=1e-12)
+    # The broken line through 1, 3, 10 and 40 at 0, 1, 2 and 3 s, summed by trapezia.
+    table = np.interp(np.linspace(0, 3, 300_001), np.arange(4), levels)
+    sums = [np.trapezoid(table[round(a * 1e5) : round((a + 1.5) * 1e5) + 1], dx=1e-5) for a in (0.0, 0.5, 1.0)]
+    assert np.allclose(line.expected_e / per_level, sums, rtol=1e-9)
+
+
+def test_the_last_light_stays_until_all_lines_are_done():
+    layout = rows_layout(n_x=1, n_y=3, pitch_um=1.0)
+    grid = fs.Grid.centred((8, 8), 0.5)
+    lights = [fs.PowerMap(np.full((1, 8, 8), level), grid, np.array([550.0])) for level in (1.0, 3.0)]
+    camera = map_camera(layout)
+    per_level = camera.photoelectrons_per_s(lights[0])
+    captures = list(camera.video(lights, exposure_s=1.0, seed=0, frame_s=1.0, line_s=1.0))
+
+    assert [np.round(c.expected_e / per_level, 12).tolist() for c in captures] == [[1.0, 3.0, 3.0], [3.0, 3.0, 3.0]]
+
+
+def test_a_shutter_without_an_order_of_lines_is_told():
+    layout = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0)
+    with pytest.raises(SimulationError, match="readout_order"):
+        camera_of(layout).video([], exposure_s=0.01, seed=0, frame_s=0.1, line_s=1e-3)
+
+
+def test_every_so_many_frames_begin_an_exposure():
+    lights = [scene_of(p) for p in pictures(7)]
+    camera = camera_of(rows_layout())
+    captures = list(camera.video(lights, exposure_s=0.01, seed=0, frame_s=0.01, every=3))
+
+    assert [c.settings["frame"] for c in captures] == [0, 1, 2]
+    for k, capture in enumerate(captures):
+        assert np.array_equal(capture.expected_e, camera.capture(lights[3 * k], exposure_s=0.01, seed=0).expected_e)
+
+
+# -- footage ----------------------------------------------------------------------------------------------------------
+
+
+def test_pictures_of_a_folder_come_in_natural_order(tmp_path):
+    for k in (10, 2, 1):
+        write_picture(tmp_path / f"frame {k}.png", np.full((8, 8), k, np.uint8))
+    (tmp_path / "notes.txt").write_text("no picture")
+    footage = Footage(tmp_path, **LIGHT)
+
+    assert footage.n_frames == 3
+    assert [round(float(scene.basis.max()) * 255) for scene in footage] == [1, 2, 10]
+    assert [round(float(s.basis.max()) * 255) for s in Footage(tmp_path, start=1, step=1, **LIGHT)] == [2, 10]
+
+
+def test_footage_may_be_seen_again():
+    footage = Footage(pictures(3), **LIGHT)
+
+    assert [s.basis.sum() for s in footage] == [s.basis.sum() for s in footage]
+    assert footage.n_frames == 3
+    assert Footage(iter(pictures(2)), **LIGHT).n_frames is None
+    assert Footage(pictures(5), start=1, stop=9, step=2, **LIGHT).n_frames == 2
+
+
+def test_frames_of_another_size_are_told():
+    with pytest.raises(FileError, match="frame 1: has the shape"):
+        list(Footage([np.ones((4, 4)), np.ones((4, 5))], **LIGHT))
+
+
+def test_footage_that_is_not_there_is_told(tmp_path):
+    with pytest.raises(FileError, match="no such file or folder"):
+        Footage(tmp_path / "none.mp4", **LIGHT)
+    with pytest.raises(FileError, match="holds no pictures"):
+        Footage(tmp_path, **LIGHT)
+    with pytest.raises(ParameterError, match="source"):
+        Footage(3, **LIGHT)
+    (tmp_path / "text.mp4").write_text("this is no video")
+    with pytest.raises(FileError, match="no video file that can be read"):
+        Footage(tmp_path / "text.mp4", **LIGHT)
+
+
+def test_a_missing_reader_is_told_in_one_sentence(tmp_path, monkeypatch):
+    (tmp_path / "clip.mp4").write_bytes(b"0")
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(FileError, match=r"pip install 'foveasim\[video\]'"):
+        Footage(tmp_path / "clip.mp4", **LIGHT)
+    camera = camera_of(rows_layout())
+    captures = camera.video([scene_of(pictures(1)[0])], exposure_s=0.01, seed=0)
+    with pytest.raises(FileError, match=r"pip install 'foveasim\[video\]'"):
+        write_video(captures, tmp_path / "out.mp4")
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+def captures_of(n, **sensor):
+    return camera_of(rows_layout(), **sensor).video([scene_of(p) for p in pictures(n)], exposure_s=0.01, seed=5)
+
+
+def test_a_zarr_folder_holds_every_code(tmp_path, monkeypatch):
+    monkeypatch.setattr("foveasim.video.recording.CHUNK_CODES", 250)
+    captures = list(captures_of(5))
+
+    assert write_video(iter(captures), tmp_path / "v.zarr") == 5
+    recording = read_recording(tmp_path / "v.zarr")
+
+    assert recording.n_frames == 5
+    assert recording.code.dtype == np.uint16
+    assert np.array_equal(recording.code[:], [c.code for c in captures])
+    assert recording.frame.tolist() == [0, 1, 2, 3, 4]
+    assert recording.exposure_s.tolist() == [0.01] * 5
+    assert recording.settings == captures[0].settings
+    assert np.array_equal(recording.layout.xy_um, captures[0].layout.xy_um)
+    assert np.array_equal(recording.layout.columns["readout_order"], captures[0].layout.columns["readout_order"])
+    assert recording.bits == 12
+    assert np.array_equal(recording.white_dn, captures[0].white_dn)
+    assert [p.name for p in tmp_path.iterdir()] == ["v.zarr"]
+
+
+def test_what_ends_early_leaves_what_was_there(tmp_path):
+    def failing():
+        yield from captures_of(2)
+        raise RuntimeError("the light went out")
+
+    write_video(captures_of(3), tmp_path / "v.zarr")
+    for name in ("v.zarr", "pictures", "v.gif", "v.mp4"):
+        with pytest.raises(RuntimeError, match="the light went out"):
+            write_video(failing(), tmp_path / name)
+
+    assert [p.name for p in tmp_path.iterdir()] == ["v.zarr"]
+    assert read_recording(tmp_path / "v.zarr").n_frames == 3
+
+
+def test_a_recording_may_be_written_anew_and_nothing_else_is_written_over(tmp_path):
+    write_video(captures_of(3), tmp_path / "v.zarr")
+    write_video(captures_of(2), tmp_path / "v.zarr")
+    assert read_recording(tmp_path / "v.zarr").n_frames == 2
+
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "thesis.txt").write_text("years of work")
+    (tmp_path / "kept.zarr").mkdir()
+    (tmp_path / "kept.zarr" / "thesis.txt").write_text("years of work")
+    for name in ("kept", "kept.zarr"):
+        with pytest.raises(FileError, match="something else is there"):
+            write_video(captures_of(1), tmp_path / name)
+        assert (tmp_path / name / "thesis.txt").read_text() == "years of work"
+
+
+def test_pictures_are_those_of_the_captures(tmp_path):
+    from foveasim.pictures import read_picture
+
+    captures = list(captures_of(2))
+    assert write_video(captures, tmp_path / "pictures", max_pixels=60) == 2
+
+    for k, capture in enumerate(captures):
+        expected = capture.picture(max_pixels=60).to_image(capture.white_dn, encode_srgb=True)
+        assert np.array_equal(read_picture(tmp_path / "pictures" / f"frame_{k:06d}.png"), expected)
+
+
+@pytest.mark.parametrize("ending", ["mp4", "webm", "mkv"])
+def test_a_film_comes_back_through_footage(tmp_path, ending):
+    layout = rows_layout()
+    grid = fs.Grid.centred((80, 90), 0.5)
+    levels = np.linspace(0.1, 0.9, 6)
+    camera = map_camera(layout, bits=8, capacitance_f=1e-13)
+    full = float(camera.photoelectrons_per_s(fs.PowerMap(np.ones((1, 80, 90)), grid, np.array([550.0]))).max())
+    exposure_s = 1.872e6 / full
+    lights = [fs.PowerMap(np.full((1, 80, 90), level), grid, np.array([550.0])) for level in levels]
+    path = tmp_path / f"film.{ending}"
+
+    assert write_video(camera.video(lights, exposure_s=exposure_s, seed=0), path, max_pixels=64, frame_s=0.1) == 6
+    footage = Footage(path, **(LIGHT | {"encoding": "srgb", "wavelength_nm": (550.0,)}))
+
+    assert footage.frame_s == pytest.approx(0.1)
+    seen = [float(np.median(scene.basis)) for scene in footage]
+    assert np.allclose(seen, levels, atol=0.03)
+
+
+def test_a_gif_has_all_its_frames(tmp_path):
+    from PIL import Image
+
+    write_video(captures_of(4), tmp_path / "v.gif", frame_s=0.1, max_pixels=40)
+    with Image.open(tmp_path / "v.gif") as gif:
+        assert gif.n_frames == 4
+        assert gif.info["duration"] == 100
+
+
+def test_other_endings_and_no_captures_are_told(tmp_path):
+    with pytest.raises(FileError, match="must end in"):
+        write_video(captures_of(1), tmp_path / "v.txt")
+    for name in ("v.zarr", "v.gif", "v.mp4", "pictures"):
+        with pytest.raises(ParameterError, match="at least one capture"):
+            write_video([], tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_no_recording_is_told(tmp_path):
+    with pytest.raises(FileError, match="no such folder"):
+        read_recording(tmp_path / "none.zarr")
+    (tmp_path / "empty.zarr").mkdir()
+    with pytest.raises(FileError, match="broken or no video"):
+        read_recording(tmp_path / "empty.zarr")
+
+
+def test_progress_counts_the_frames(tmp_path, capsys):
+    write_video(captures_of(2), tmp_path / "v.zarr", progress=True, n_frames=2)
+
+    assert "frames" in capsys.readouterr().out
