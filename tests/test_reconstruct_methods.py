@@ -7,7 +7,10 @@ import math
 import numpy as np
 import pytest
 import shapely
+import skimage.data
 from reference.neighbours import stolen_shares
+from skimage.color import rgb2gray
+from skimage.transform import resize
 
 import foveasim as fs
 from foveasim.errors import ParameterError, SimulationError
@@ -130,7 +133,7 @@ def test_a_moved_layout_has_a_moved_picture(method):
 def test_smooth_pictures_are_exact_at_the_centres(layout, method):
     values = np.random.default_rng(1).uniform(1.0, 9.0, layout.n_sites)
 
-    for site in range(0, layout.n_sites, max(1, layout.n_sites // 25)):
+    for site in range(0, layout.n_sites, max(1, layout.n_sites // 10)):
         picture = method(layout, values, grid_through(layout.centroid_um[site]))
         assert picture.data[0, 0, 0] == pytest.approx(values[site], rel=1e-6)
 
@@ -399,6 +402,28 @@ def test_a_solution_that_takes_too_long_is_told():
 
     with pytest.raises(SimulationError, match="did not converge in 2 steps; give a larger 'tolerance'"):
         fitted(FOVEAL, values, raster_grid(FOVEAL, 60), mu=1e-3, max_steps=2)
+
+
+@pytest.mark.parametrize("name", ["astronaut", "coffee", "chelsea"])
+@pytest.mark.parametrize(
+    "layout",
+    [
+        fs.layout.log_polar(n_sectors=64, min_size_um=2.0, r_max_um=128.0, stagger=True),
+        fs.layout.hexagonal(n_columns=42, n_rows=48, pitch_um=6.0),
+        fs.layout.zones(side_um=(32, 64, 128, 256), pitch_um=(2, 4, 8, 16)),
+    ],
+    ids=["log-polar", "hexagons", "zones"],
+)
+def test_photographs_of_least_squares_are_nearer_to_the_light_than_those_of_cells(layout, name):
+    grid = fs.Grid.centred((128, 128), 2.0)
+    light = 1.0 + 99.0 * resize(rgb2gray(getattr(skimage.data, name)()), (128, 128), anti_aliasing=True)[::-1] ** 2.2
+    values = np.random.default_rng(1).poisson(Integrator(layout, grid)(light)).astype(float)
+    sharp = least_squares(layout, values, grid, variance=values + 1.0)
+    blocky = cells(layout, values / layout.area_um2, grid)
+
+    assert (
+        psnr_db(sharp, light[np.newaxis], min_coverage=1.0) > psnr_db(blocky, light[np.newaxis], min_coverage=1.0) + 1.0
+    )
 
 
 # -- rasters ----------------------------------------------------------------------------------------------------------

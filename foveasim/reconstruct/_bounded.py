@@ -71,29 +71,29 @@ def least_nonnegative(
         free = np.where(is_free, gradient, 0.0)
         chopped = np.where(is_free, 0.0, np.minimum(gradient, 0.0))
         steep = np.where(is_free, precondition(free), 0.0)
-        free2, chopped2 = free @ steep, chopped @ (chopped / bound)
+        free2, chopped2 = _dot(free, steep), _dot(chopped, chopped / bound)
         if math.sqrt(free2 + chopped2) <= enough:
             return x, n_steps
         if n_steps >= max_steps:
             raise SimulationError(
                 f"the picture did not converge in {max_steps} steps; give a larger 'tolerance' or 'mu', or more 'max_steps'"
             )
-        if chopped2 > np.minimum(x, free / bound) @ free:
+        if chopped2 > _dot(np.minimum(x, free / bound), free):
             down = chopped / bound
             image = matrix(down)
             n_steps += 1
-            length = (gradient @ down) / (down @ image)
+            length = _dot(gradient, down) / _dot(down, image)
             x = np.maximum(x - length * down, 0.0)  # grows where it was 0; the clip is for rounding
             gradient -= length * image
             direction = None
             continue
-        direction = steep if direction is None else steep - ((steep @ image) / curvature) * direction
+        direction = steep if direction is None else steep - (_dot(steep, image) / curvature) * direction
         image = matrix(direction)
         n_steps += 1
-        curvature = float(direction @ image)
+        curvature = _dot(direction, image)
         if curvature <= 0.0:  # A does not see this direction: only rounding is left of the gradient
             return x, n_steps
-        length = (gradient @ direction) / curvature
+        length = _dot(gradient, direction) / curvature
         falls = direction > 0.0
         room = float(np.min(x[falls] / direction[falls], initial=np.inf))
         if length <= room:
@@ -104,7 +104,7 @@ def least_nonnegative(
         tried = np.maximum(x - length * direction, 0.0)
         tried_gradient = matrix(tried) - right
         n_steps += 1
-        if tried @ (tried_gradient - right) < x @ (gradient - right):
+        if _dot(tried, tried_gradient - right) < _dot(x, gradient - right):
             x, gradient = tried, tried_gradient
         else:
             x = np.maximum(x - room * direction, 0.0)
@@ -113,3 +113,8 @@ def least_nonnegative(
             gradient = matrix(x) - right
             n_steps += 1
         direction = None
+
+
+def _dot(x: Floats, y: Floats) -> float:
+    """Scalar product, by one thread: those of a library would wait for each other longer than they work."""
+    return float(np.einsum("i,i->", x, y))

@@ -101,9 +101,9 @@ def least_squares(
     -----
     ``"roughness"``: the number of values over the squared differences of neighbouring pixels of the cell-filled picture. To
     Bayes, mu says how rough pictures are before one is seen, ``mu |grad x|²`` being about the number of values, and the cells
-    tell how rough this one is. ``"discrepancy"`` (Morozov): so strong that the values are explained no better than their noise
-    asks for, ``|C^-1/2 (r W x - y)|²`` being their number within 2 %. It takes several solutions, and of photographs, whose
-    roughness sits in edges, it makes pictures that are too smooth.
+    tell how rough this one is. ``"discrepancy"`` (Morozov): so strong that the values are explained no better than their
+    noise asks for, ``|C^-1/2 (r W x - y)|²`` being their number within 2 %, or the strongest there is. It takes several
+    solutions, and follows the noise alone: of photographs in little light it makes pictures that are too smooth.
 
     Of a site that reaches beyond the raster, what lies on it stands for all of it.
 
@@ -121,7 +121,7 @@ def least_squares(
     share = covered_share(integrator)
     kernel_of = _kernels_of(blur, n_channels)
     pad = tuple(n // 2 for n in kernel_of[0].shape) if kernel_of else (0, 0)
-    shape = tuple(n + 2 * p for n, p in zip(grid.shape, pad, strict=True))
+    shape = tuple(_fast(n + 2 * p) if p else n for n, p in zip(grid.shape, pad, strict=True))
     overlaps = _padded(integrator, pad, shape)
     covered_um2 = np.asarray(overlaps.sum(axis=1)).ravel()
     whole_um2 = covered_um2 + integrator.uncovered_um2
@@ -344,6 +344,13 @@ def _noise(variance: ArrayLike | None, gain: Floats, shape: tuple[int, int]) -> 
         raise ParameterError(
             "variance", f"must be one number, or have the shape (..., {shape[1]}), got {values.shape}"
         ) from None
+
+
+def _fast(n: int) -> int:
+    """The next length of which transforms are fast."""
+    from scipy import fft
+
+    return int(fft.next_fast_len(n, real=True))
 
 
 def _scaled_rows(matrix: Any, weight: Floats) -> Any:
