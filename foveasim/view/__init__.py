@@ -8,7 +8,7 @@ from foveasim.view.palette import SiteColours, colours_of, site_colours
 from foveasim.view.plots import plot_capture, plot_layout, plot_noise_budget, save_drawing, save_figure
 from foveasim.view.probe import find_renderer
 from foveasim.view.rule_plots import plot_report
-from foveasim.view.solids import PartReport, SensorStack, Solids, SolidsReport, solids, stack
+from foveasim.view.solids import PartReport, SensorStack, Solids, SolidsReport, solids, stack, write_meshes
 from foveasim.view.stills import Viewpoint, render, show, sites_in_view
 from foveasim.view.web import solid_page, web_page, write_solid_page, write_web_page
 
@@ -41,6 +41,7 @@ __all__ = [
     "solids",
     "stack",
     "web_page",
+    "write_meshes",
     "write_solid_page",
     "write_web_page",
 ]

@@ -38,7 +38,7 @@ from foveasim.rings import next_vertex, positions_in_runs
 from foveasim.view.meshes import FLAT_SHARE, Mesh, extruded, triangulated
 from foveasim.view.palette import colours_of
 
-__all__ = ["PartReport", "SensorStack", "Solids", "SolidsReport", "solids", "stack"]
+__all__ = ["PartReport", "SensorStack", "Solids", "SolidsReport", "solids", "stack", "write_meshes"]
 
 #: Kinds of files, by their endings.
 FORMATS = (".glb", ".stl", ".3mf", ".ply", ".obj")
@@ -275,35 +275,8 @@ class Solids:
         return replace(self, parts=MappingProxyType(parts))
 
     def write(self, path: str | Path) -> None:
-        """
-        Write the solids to a file, whole or not at all.
-
-        Parameters
-        ----------
-        path : path
-            ``.glb`` keeps the parts apart, with their colours and the attributes ``_photosite`` and ``_value`` of every point;
-            ``.3mf`` the parts apart; ``.ply`` and ``.obj`` colours; ``.stl`` the bare triangles. One unit is 1 µm, z is toward
-            the lens.
-
-        Raises
-        ------
-        FileError
-            When the ending is another, or nothing can be written there.
-        ParameterError
-            When trimesh is not installed.
-        """
-        target = Path(path)
-        kind = target.suffix.lower()
-        if kind not in FORMATS:
-            raise FileError(target, f"must end in {', '.join(FORMATS)}")
-        trimesh = _imported("trimesh")
-        bodies = {name: _body(trimesh, mesh) for name, mesh in self.parts.items() if mesh.triangles.size}
-        if not bodies:
-            raise GeometryError("there is nothing left of the solids to write")
-        whole = trimesh.Scene(bodies) if kind in (".glb", ".3mf") else trimesh.util.concatenate(list(bodies.values()))
-        with written_whole(target) as temporary, temporary.open("wb") as file:
-            content = whole.export(file_type=kind[1:])
-            file.write(content.encode() if isinstance(content, str) else content)
+        """Write the solids to a file; see :func:`foveasim.view.write_meshes`."""
+        write_meshes(self.meshes, path)
 
     def _part(self, name: str) -> Mesh:
         if name not in self.parts:
@@ -401,6 +374,41 @@ def stack(
 
 
 # -- parts ---------------------------------------------------------------------------------------------------------------
+
+
+def write_meshes(meshes: Sequence[Mesh], path: str | Path) -> None:
+    """
+    Write surfaces to a file, whole or not at all.
+
+    Parameters
+    ----------
+    meshes : sequence of Mesh
+    path : path
+        ``.glb`` keeps the parts apart, with their colours and the attributes ``_photosite`` and ``_value`` of every point;
+        ``.3mf`` the parts apart; ``.ply`` and ``.obj`` colours; ``.stl`` the bare triangles. One unit is 1 µm, z is toward
+        the lens.
+
+    Raises
+    ------
+    FileError
+        When the ending is another, or nothing can be written there.
+    GeometryError
+        When there is not a single triangle.
+    ParameterError
+        When trimesh is not installed.
+    """
+    target = Path(path)
+    kind = target.suffix.lower()
+    if kind not in FORMATS:
+        raise FileError(target, f"must end in {', '.join(FORMATS)}")
+    trimesh = _imported("trimesh")
+    bodies = {mesh.name: _body(trimesh, mesh) for mesh in meshes if mesh.triangles.size}
+    if not bodies:
+        raise GeometryError("there is nothing left of the solids to write")
+    whole = trimesh.Scene(bodies) if kind in (".glb", ".3mf") else trimesh.util.concatenate(list(bodies.values()))
+    with written_whole(target) as temporary, temporary.open("wb") as file:
+        content = whole.export(file_type=kind[1:])
+        file.write(content.encode() if isinstance(content, str) else content)
 
 
 def _near_quarter(layout: Layout, shares: tuple[float, float]) -> Any:

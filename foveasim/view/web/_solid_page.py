@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,8 @@ import numpy as np
 from foveasim.capture import Capture
 from foveasim.files import written_whole
 from foveasim.layout import Layout
-from foveasim.view.meshes import prisms
-from foveasim.view.solids import SensorStack, Solids
+from foveasim.view.meshes import Mesh, prisms
+from foveasim.view.solids import Solids, write_meshes
 from foveasim.view.solids import solids as solids_of
 from foveasim.view.web._content import described_sites
 from foveasim.view.web._pack import packed
@@ -50,14 +51,13 @@ def solid_page(thing: Layout | Capture, *, solids: Solids | None = None, name: s
     """
     about, arrays, layout = described_sites(thing, name=name)
     if solids is None and isinstance(thing, Capture):
-        columns = prisms(thing)
-        solids = Solids(layout=layout, sensor_stack=SensorStack(), parts={columns.name: columns})
+        meshes: Sequence[Mesh] = (prisms(thing),)
         shown = "The columns are as high as the codes."
     else:
-        solids = solids_of(thing) if solids is None else solids
+        meshes = (solids_of(thing) if solids is None else solids).meshes
         shown = "z is toward the lens."
     with tempfile.TemporaryDirectory() as folder:
-        solids.write(Path(folder) / "solids.glb")
+        write_meshes(meshes, Path(folder) / "solids.glb")
         arrays["glb"] = np.frombuffer((Path(folder) / "solids.glb").read_bytes(), np.uint8)
     arrays["area_um2"] = layout.area_um2
     told = {key: packed(values) for key, values in arrays.items()}
