@@ -41,6 +41,8 @@ __all__ = ["Camera", "Light"]
 Place = tuple[float, float]
 #: A frame of light: a scene or a map, or one with the place in its image where the sensor's middle is put.
 Light = Scene | PowerMap | tuple[Scene | PowerMap, Sequence[float]]
+#: Maps of light behind each colour filter, on each grid.
+KeptImages = dict[tuple[Grid, int], NDArray[Any]]
 
 #: A map made by Fourier transforms may fall below darkness by this share of the brightest site: rounding of float32.
 NEGATIVE_ROUNDING = 1e-4
@@ -113,7 +115,9 @@ class Camera:
         self._optics = optics
         self._sensor = sensor
         self._distortion = distortion
-        self._order = None if order is None else check_count("order", order, at_most=2)
+        self._order: Literal[1, 2] | None = order
+        if order is not None:
+            self._order = 2 if check_count("order", order, at_most=2) == 2 else 1
         self._layout = sensor.layout
         self._n_threads = thread_count(n_threads)
         self._integrators: dict[tuple[Grid, int, Place], Integrator] = {}
@@ -139,7 +143,7 @@ class Camera:
     def order(self, light: Scene | PowerMap) -> Literal[1, 2]:
         """Order of the integration of a kind of light."""
         if self._order is not None:
-            return 2 if self._order == 2 else 1
+            return self._order
         if isinstance(light, PowerMap):
             return 1
         narrowest_um = float(um_from_nm(light.wavelength_nm.min())) * self._optics.working_f_number(light.distance_m)
@@ -167,7 +171,29 @@ class Camera:
             del self._integrators[next(iter(self._integrators))]
         return integrator
 
-    def photoelectrons_per_s(self, light: Scene | PowerMap) -> Floats:
+    def replace(self, *, optics: Optics | None = None, sensor: Sensor | None = None) -> Camera:
+        """
+        A camera with another lens, another sensor, or both.
+
+        Layouts that were compiled for grids are shared where the new sensor has the same layout: the same object, not its like.
+
+        Raises
+        ------
+        ParameterError
+            When an argument is none of the above.
+        """
+        other = Camera(
+            optics=self._optics if optics is None else optics,
+            sensor=self._sensor if sensor is None else sensor,
+            distortion=self._distortion,
+            order=self._order,
+            n_threads=self._n_threads,
+        )
+        if other._layout is self._layout:
+            other._integrators = self._integrators
+        return other
+
+    def photoelectrons_per_s(self, light: Scene | PowerMap, *, images: KeptImages | None = None) -> Floats:
         """
         Expected photoelectrons of every site in a second, (n_site,) e-/s.
 
@@ -175,6 +201,9 @@ class Camera:
         ----------
         light : Scene or PowerMap
             A scene to be imaged, or a map that any other optics program made.
+        images : dict, optional
+            The scene's images are put in it, and taken from it where they are there: for other layouts with the same lens,
+            scene and colour filters.
 
         Raises
         ------
@@ -183,9 +212,17 @@ class Camera:
         SimulationError
             When the map is not finite under a site.
         """
-        return self._photoelectrons_per_s(light, _Clock())
+        return self._photoelectrons_per_s(light, _Clock(), kept=images)
 
-    def capture(self, light: Scene | PowerMap, *, exposure_s: float, seed: int, frame: int = 0) -> Capture:
+    def capture(
+        self,
+        light: Scene | PowerMap,
+        *,
+        exposure_s: float,
+        seed: int,
+        frame: int = 0,
+        photo_e_per_s: Floats | None = None,
+    ) -> Capture:
         """
         One exposure.
 
@@ -196,6 +233,8 @@ class Camera:
         exposure_s : float, s
         seed, frame : int
             Of the noise. The same numbers give the same capture, bit for bit.
+        photo_e_per_s : (n_site,) float64, optional, e-/s
+            What :meth:`photoelectrons_per_s` gave for this light, where it is known: nothing of it is computed anew.
 
         Returns
         -------
@@ -209,7 +248,14 @@ class Camera:
         streams = Streams(seed, frame)
         exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
         clock = _Clock()
-        photo_e_per_s = self._photoelectrons_per_s(light, clock)
+        if photo_e_per_s is None:
+            photo_e_per_s = self._photoelectrons_per_s(light, clock)
+        else:
+            photo_e_per_s = finite_array("photo_e_per_s", photo_e_per_s, ndim=1, at_least=0.0)
+            if photo_e_per_s.size != self._layout.n_sites:
+                raise ParameterError(
+                    "photo_e_per_s", f"must be {self._layout.n_sites} numbers, one a site, got {photo_e_per_s.size}"
+                )
         return self._exposed(light, photo_e_per_s, exposure_s, streams, clock)
 
     def _exposed(
@@ -399,7 +445,7 @@ class Camera:
         """Every frame's light, the sensor's place, and the light on the sites; what frames have in common is computed once."""
         before: tuple[Scene | PowerMap, Place] | None = None
         rate_e_per_s = np.zeros(self._layout.n_sites)
-        kept: dict[tuple[Grid, int], NDArray[Any]] = {}
+        kept: KeptImages = {}
         for frame in frames:
             light, place_um = _parts(frame)
             is_same_light = before is not None and light is before[0]
@@ -485,7 +531,7 @@ class Camera:
         light: Scene | PowerMap,
         clock: _Clock,
         place_um: Place = (0.0, 0.0),
-        kept: dict[tuple[Grid, int], NDArray[Any]] | None = None,
+        kept: KeptImages | None = None,
     ) -> Floats:
         """
         One inverse transform and one pass over the map for each colour filter, whatever the number of wavelengths.
@@ -519,7 +565,8 @@ class Camera:
         else:
             used = np.unique(filter_of_site)
             for (grid, is_on_it), integrator in zip(grids, integrators, strict=True):
-                maps = self._optics.weighted_maps(light, weights[used] * is_on_it, grid=grid, n_threads=self._n_threads)
+                new = used if kept is None else np.array([c for c in used if (grid, c) not in kept], np.int64)
+                maps = self._optics.weighted_maps(light, weights[new] * is_on_it, grid=grid, n_threads=self._n_threads)
                 for c in used:
                     with clock.stage("optics"):
                         cells = next(maps) if kept is None or (grid, c) not in kept else kept[grid, c]

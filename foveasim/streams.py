@@ -9,13 +9,18 @@ import numpy as np
 
 from foveasim.arrays import check_count
 
-__all__ = ["Streams", "device_key"]
+__all__ = ["Streams", "derived_seed", "device_key"]
 
 
 def device_key(seed: int, effect: str) -> tuple[np.uint64, np.uint64]:
     """Key of a counter-based generator for what is fixed in a device: an effect's numbers, of the device's seed."""
     words = np.random.SeedSequence(seed, spawn_key=(crc32(effect.encode()),)).generate_state(2, np.uint64)
     return words[0], words[1]
+
+
+def derived_seed(seed: int, index: int) -> int:
+    """Seed below 2**63 of one run among many: it depends on the seed of them all and the run's number alone."""
+    return int(np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 @dataclass(frozen=True, slots=True)

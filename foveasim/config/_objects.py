@@ -29,9 +29,14 @@ from foveasim.streams import Streams
 __all__ = [
     "LayoutFile",
     "Shot",
+    "build_shot",
+    "check_settings",
+    "files_from",
+    "put_setting",
     "read_any_layout",
     "read_layout_file",
     "read_rules",
+    "read_settings",
     "read_shot",
     "schema",
     "shipped_layouts",
@@ -114,26 +119,106 @@ def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int |
     FileError
         When a picture that the file names cannot be read.
     """
+    return build_shot(path, read_settings(path, changes), n_threads=n_threads)
+
+
+def read_settings(path: str | Path, changes: Sequence[str] = ()) -> dict[str, Any]:
+    """
+    What a shot's settings file says, as plain data, with changes.
+
+    Parameters
+    ----------
+    path, changes
+        As for :func:`read_shot`.
+
+    Raises
+    ------
+    ConfigError
+        When it is no YAML, or a change is none.
+    """
     path = Path(path)
     data = read_yaml(path)
     for change in changes:
         _replace(path, data, change)
-    settings = validated(path, ShotSection, data)
-    if isinstance(settings.layout, str):
+    return data
+
+
+def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
+    """
+    Names and types of a shot's settings, before anything is built.
+
+    Parameters
+    ----------
+    path : path
+        Of the file that the settings are from, for messages.
+    settings : mapping
+        As :func:`read_settings` gives them.
+
+    Raises
+    ------
+    ConfigError
+        With the file, the place in it, what was expected and got.
+    """
+    validated(Path(path), ShotSection, dict(settings))
+
+
+def _made_anew(_part: str, _settings: Any, make: Callable[[], Any]) -> Any:
+    return make()
+
+
+def build_shot(
+    path: str | Path,
+    data: Mapping[str, Any],
+    *,
+    n_threads: int | None = None,
+    kept: Callable[[str, Any, Callable[[], Any]], Any] = _made_anew,
+) -> Shot:
+    """
+    Build the shot that settings describe.
+
+    Parameters
+    ----------
+    path : path
+        Of the file that they are from: pictures and layouts that they name are looked for beside it.
+    data : mapping
+        As :func:`read_settings` gives them.
+    n_threads : int, optional
+        For the camera.
+    kept : callable, optional
+        ``kept(part, settings, make)`` gives what ``make()`` makes of a part's settings, or what it made of the same before.
+
+    Raises
+    ------
+    ConfigError, FileError
+        As for :func:`read_shot`.
+    """
+    path = Path(path)
+    settings = validated(path, ShotSection, dict(data))
+
+    def layout_file() -> LayoutFile:
+        if not isinstance(settings.layout, str):
+            return _built_layout(path, "layout.", settings.layout)
         beside = path.parent / settings.layout
         name = settings.layout if settings.layout in shipped_layouts() and not beside.exists() else beside
-        file = _call(path, "layout", read_any_layout, {"path": name})
-    else:
-        file = _built_layout(path, "layout.", settings.layout)
+        read: LayoutFile = _call(path, "layout", read_any_layout, {"path": name})
+        return read
+
+    def sensor_of_layout() -> Sensor:
+        values = {
+            name: value.per_um2 * layout.area_um2 if isinstance(value, PerArea) else value
+            for name, value in _values(path, "sensor.", settings.sensor).items()
+        }
+        made: Sensor = _call(path, "sensor", Sensor, {"layout": layout, **values})
+        return made
+
+    file = kept("layout", data["layout"], layout_file)
     layout = file.layout
-    sensor_values = {
-        name: value.per_um2 * layout.area_um2 if isinstance(value, PerArea) else value
-        for name, value in _values(path, "sensor.", settings.sensor).items()
-    }
-    sensor = _call(path, "sensor", Sensor, {"layout": layout, **sensor_values})
-    optics = _call(path, "optics", Optics, _values(path, "optics.", settings.optics))
-    distortion = _built(path, "distortion", settings.distortion)
-    scene = _built(path, "scene", settings.scene)
+    sensor = kept("sensor", [data["layout"], data.get("sensor")], sensor_of_layout)
+    optics = kept(
+        "optics", data["optics"], lambda: _call(path, "optics", Optics, _values(path, "optics.", settings.optics))
+    )
+    distortion = kept("distortion", data.get("distortion"), lambda: _built(path, "distortion", settings.distortion))
+    scene = kept("scene", data["scene"], lambda: _built(path, "scene", settings.scene))
     # What would end the capture is told before it begins, with its place in the file.
     if isinstance(scene, Scene):
         _call(path, "scene", optics.grid, {"scene": scene})
@@ -141,16 +226,17 @@ def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int |
     _call(path, "scene", sensor.responsivity_e_per_j, {"wavelength_nm": scene.wavelength_nm})
     streams = _call(path, "", Streams, {"seed": settings.seed})
     exposure_s = _call(path, "", check_number, {"name": "exposure_s", "value": settings.exposure_s, "at_least": 0.0})
+    order = settings.integration_order
+    camera = kept(
+        "camera",
+        [data["layout"], data.get("distortion"), order],
+        lambda: Camera(optics=optics, sensor=sensor, distortion=distortion, order=order, n_threads=n_threads),
+    )
     return Shot(
         name=path.stem,
         scene=scene,
-        camera=Camera(
-            optics=optics,
-            sensor=sensor,
-            distortion=distortion,
-            order=settings.integration_order,
-            n_threads=n_threads,
-        ),
+        # Another lens, or other electronics, look through the layout that was compiled for the first.
+        camera=camera.replace(optics=optics, sensor=sensor),
         rules=file.rules,
         exposure_s=exposure_s,
         seed=streams.seed,
@@ -309,24 +395,57 @@ def _picture_path(path: Path, picture: str, place: str) -> Path:
 def _replace(path: Path, data: dict[str, Any], change: str) -> None:
     """Replace one setting by a "key=value" of the command line."""
     key, equals, value = change.partition("=")
-    names = key.strip().split(".")
-    if not equals or not all(names):
+    if not equals or not all(key.strip().split(".")):
         raise ConfigError(path, f"a change must be 'key=value', such as sensor.bits=10, got '{change}'")
+    put_setting(path, data, key.strip(), files_from(Path(), parsed(path, value), key.strip()))
+
+
+def put_setting(path: str | Path, data: dict[str, Any], key: str, value: Any) -> None:
+    """
+    Put a value at a setting's place, such as ``"sensor.bits"``, in settings that are changed.
+
+    Raises
+    ------
+    ConfigError
+        When the key is empty in parts, or leads through a value that is no section.
+    """
+    names = key.split(".")
+    if not all(names):
+        raise ConfigError(path, f"'{key}' is no setting's place, such as sensor.bits")
     place: Any = data
     for i, name in enumerate(names[:-1]):
         place = place.setdefault(name, {})
         if not isinstance(place, dict):
-            raise ConfigError(path, f"'{change}' cannot be set: {'.'.join(names[: i + 1])} is no section but {place!r}")
-    new = _from_here(names[-1], parsed(path, value))
-    place[names[-1]] = new
+            raise ConfigError(
+                path, f"'{key}={value}' cannot be set: {'.'.join(names[: i + 1])} is no section but {place!r}"
+            )
+    place[names[-1]] = value
 
 
-def _from_here(name: str, value: Any) -> Any:
-    """A change with the files that it names made absolute: they are looked for in the current folder."""
+def files_from(folder: Path, value: Any, key: str = "", found: list[Path] | None = None) -> Any:
+    """
+    Settings with the files that they name made absolute.
+
+    Parameters
+    ----------
+    folder : Path
+        Where they are looked for.
+    value : plain data
+    key : str
+        Place of the value in the settings.
+    found : list of Path, optional
+        The files are added to it.
+    """
     if isinstance(value, dict):
-        return {key: _from_here(key, item) for key, item in value.items()}
+        return {name: files_from(folder, item, name, found) for name, item in value.items()}
     if isinstance(value, list):
-        return [_from_here(name, item) for item in value]
+        return [files_from(folder, item, key, found) for item in value]
+    name = key.rpartition(".")[2]
     if name not in FILE_SETTINGS or not isinstance(value, str) or value.startswith(BUNDLED_PICTURE):
         return value
-    return value if name == "layout" and value in shipped_layouts() else str(Path(value).absolute())
+    if name == "layout" and value in shipped_layouts():
+        return value
+    file = (folder / value).absolute()
+    if found is not None:
+        found.append(file)
+    return str(file)
