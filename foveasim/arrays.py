@@ -65,6 +65,7 @@ UNIT_SUFFIXES = {
     "_w_sr": "W/sr",
     "_j_s": "J s",
     "_per_mm": "per mm",
+    "_per_s": "per s",
     "_um2": "µm²",
     "_um3": "µm³",
     "_px": "pixels",

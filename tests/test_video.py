@@ -437,7 +437,7 @@ def captures_of(n, **sensor):
 
 
 def test_a_zarr_folder_holds_every_code(tmp_path, monkeypatch):
-    monkeypatch.setattr("foveasim.video.recording.CHUNK_CODES", 250)
+    monkeypatch.setattr(sys.modules[write_video.__module__], "CHUNK_CODES", 250)
     captures = list(captures_of(5))
 
     assert write_video(iter(captures), tmp_path / "v.zarr") == 5

@@ -1,7 +1,17 @@
-"""Ways of acquisition beyond one exposure of all sites at once: rolling shutters, events, spikes."""
+"""
+Ways of acquisition beyond one exposure of all sites at once: rolling shutters, events, spikes.
+
+::
+
+    pixels = fs.modes.EventPixels(camera.sensor, contrast_on=0.2, contrast_off=0.2, refractory_s=1e-4)
+    for events in pixels.stream(camera.rates(frames), frame_s=1 / 1000, seed=0):
+        ...
+"""
 
 from __future__ import annotations
 
+from foveasim.modes.events import Events
+from foveasim.modes.pixels import EventPixels, SpikingPixels
 from foveasim.modes.shutter import Between, Exposure, Shutter
 
-__all__ = ["Between", "Exposure", "Shutter"]
+__all__ = ["Between", "EventPixels", "Events", "Exposure", "Shutter", "SpikingPixels"]

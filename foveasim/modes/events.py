@@ -1,0 +1,213 @@
+"""Events: when, where, and whether brighter or darker, as arrays and files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.arrays import Floats, check_number, read_only
+from foveasim.errors import FileError, ParameterError
+from foveasim.files import written_whole
+from foveasim.layout import Layout
+
+__all__ = ["Events"]
+
+FORMAT, VERSION = "foveasim events", 1
+HDF5_ENDINGS = (".h5", ".hdf5")
+#: Addresses in files for event tools are 16-bit numbers.
+MAX_ADDRESS = 2**16 - 1
+MICROSECONDS_PER_S = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Events:
+    """
+    What photosites told of themselves, in the order of time.
+
+    Attributes
+    ----------
+    t_s : (n_event,) float64, s
+        Rising; events of the same time in the order of their sites.
+    site : (n_event,) int32
+    polarity : (n_event,) int8
+        1 for brighter, -1 for darker; spikes are all 1.
+    layout : Layout
+        The photosites.
+    """
+
+    t_s: Floats
+    site: NDArray[np.int32]
+    polarity: NDArray[np.int8]
+    layout: Layout
+
+    def __post_init__(self) -> None:
+        for name, kind in (("t_s", np.float64), ("site", np.int32), ("polarity", np.int8)):
+            values = np.asarray(getattr(self, name))
+            if (
+                values.shape != np.shape(self.t_s)
+                or values.ndim != 1
+                or not np.can_cast(values.dtype, kind, "same_kind")
+            ):
+                raise ParameterError(
+                    name, f"must be {np.dtype(kind).name}, one for each time, got {values.dtype}{values.shape}"
+                )
+            object.__setattr__(self, name, read_only(values.astype(kind, copy=False).view()))
+
+    def __repr__(self) -> str:
+        return f"Events({self.t_s.size:,} of {self.layout.n_sites:,} sites)"
+
+    def __len__(self) -> int:
+        """Number of events."""
+        return int(self.t_s.size)
+
+    def counts(self, *, polarity: int | None = None) -> NDArray[np.int64]:
+        """How many events each site gave, (n_site,); of one polarity, or of both."""
+        sites = self.site if polarity is None else self.site[self.polarity == polarity]
+        return np.bincount(sites, minlength=self.layout.n_sites).astype(np.int64)
+
+    def between(self, start_s: float, stop_s: float) -> Events:
+        """The events from one time to before another."""
+        start_s, stop_s = check_number("start_s", start_s), check_number("stop_s", stop_s)
+        part = slice(*np.searchsorted(self.t_s, (start_s, stop_s)))
+        return Events(self.t_s[part], self.site[part], self.polarity[part], self.layout)
+
+    @classmethod
+    def joined(cls, parts: Iterable[Events]) -> Events:
+        """Events of batches that follow each other, as one."""
+        batches = list(parts)
+        if not batches:
+            raise ParameterError("parts", "must hold at least one batch of events")
+        arrays = [np.concatenate([getattr(b, name) for b in batches]) for name in ("t_s", "site", "polarity")]
+        return cls(arrays[0], arrays[1], arrays[2], batches[0].layout)
+
+    def addresses(self, pitch_um: float | None = None) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+        """
+        Column and row of every site on a raster, (n_site,) each: where tools that know rows and columns only may put it.
+
+        Parameters
+        ----------
+        pitch_um : float, optional, µm
+            Of the raster; by default the root of the smallest site's area, which gives the sites of a square grid their own
+            columns and rows. Row 0 is on top, as in pictures. Where sites lie closer than the pitch, some share an address.
+        """
+        centroid_um = self.layout.centroid_um
+        if pitch_um is None:
+            pitch_um = float(np.sqrt(self.layout.area_um2.min(initial=np.inf)))
+        pitch_um = check_number("pitch_um", pitch_um, above=0.0)
+        low, high = centroid_um.min(axis=0), centroid_um.max(axis=0)
+        column, row = (
+            np.rint((centroid_um[:, 0] - low[0]) / pitch_um),
+            np.rint((high[1] - centroid_um[:, 1]) / pitch_um),
+        )
+        if max(column.max(), row.max()) > MAX_ADDRESS:
+            raise ParameterError(
+                "pitch_um",
+                f"gives more than {MAX_ADDRESS + 1} columns or rows, which files have no numbers for",
+                pitch_um,
+                "µm",
+            )
+        return column.astype(np.uint16), row.astype(np.uint16)
+
+    def save(self, path: str | Path, *, pitch_um: float | None = None) -> None:
+        """
+        Write the events to a file, whole or not at all.
+
+        Parameters
+        ----------
+        path : path
+            ``.npz``: the arrays and the layout, which :meth:`load` reads. ``.h5`` or ``.hdf5``, with the extra ``video``: see
+            below.
+        pitch_um : float, optional, µm
+            Of the raster of :meth:`addresses` in HDF5.
+
+        Raises
+        ------
+        FileError
+            When the ending is none of these, h5py is missing, or nothing can be written there.
+
+        Notes
+        -----
+        HDF5 as of the data set DSEC (Gehrig et al., IEEE Robotics and Automation Letters 6, 4947, 2021), and of the tools
+        that read it: the group ``events`` with the arrays ``t`` (µs, int64), ``x`` and ``y`` (uint16, row 0 on top) and ``p``
+        (uint8, 0 or 1), and beside it ``ms_to_idx``, the first event of each millisecond, and ``t_offset`` of 0. Moreover
+        ``events/site``, and the sites' ``sites/x_um``, ``sites/y_um``, ``sites/area_um2``, ``sites/x`` and ``sites/y``: since
+        sites may share an address.
+        """
+        target = Path(path)
+        if target.suffix.lower() in HDF5_ENDINGS:
+            self._save_hdf5(target, pitch_um)
+            return
+        if target.suffix.lower() != ".npz":
+            raise FileError(target, "must end in .npz, .h5 or .hdf5")
+        layout = self.layout
+        arrays: dict[str, Any] = {f"column_{name}": values for name, values in layout.columns.items()}
+        arrays |= {name: np.asarray(getattr(layout, name)) for name in ("xy_um", "ring_offsets", "site_offsets")}
+        about = np.array(json.dumps({"format": FORMAT, "version": VERSION}))
+        with written_whole(target) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, about=about, t_s=self.t_s, site=self.site, polarity=self.polarity, **arrays)
+
+    def _save_hdf5(self, target: Path, pitch_um: float | None) -> None:
+        try:
+            import h5py
+        except ImportError:
+            raise FileError(target, "needs h5py: pip install 'foveasim[video]'") from None
+        x, y = self.addresses(pitch_um)
+        t_us = np.floor(self.t_s * MICROSECONDS_PER_S).astype(np.int64)
+        n_ms = int(t_us[-1]) // 1000 + 2 if t_us.size else 1
+        with written_whole(target) as temporary, h5py.File(temporary, "w") as file:
+            events: dict[str, NDArray[Any]] = {
+                "t": t_us,
+                "x": x[self.site],
+                "y": y[self.site],
+                "p": (self.polarity > 0).astype(np.uint8),
+                "site": self.site,
+            }
+            for name, values in events.items():
+                file.create_dataset(f"events/{name}", data=values, compression="gzip", shuffle=True)
+            file["ms_to_idx"] = np.searchsorted(t_us, 1000 * np.arange(n_ms)).astype(np.uint64)
+            file["t_offset"] = np.int64(0)
+            centroid_um = self.layout.centroid_um
+            sites: dict[str, NDArray[Any]] = {
+                "x_um": centroid_um[:, 0],
+                "y_um": centroid_um[:, 1],
+                "area_um2": self.layout.area_um2,
+                "x": x,
+                "y": y,
+            }
+            for name, values in sites.items():
+                file[f"sites/{name}"] = values
+            file.attrs.update({"format": FORMAT, "version": VERSION})
+
+    @classmethod
+    def load(cls, path: str | Path) -> Events:
+        """
+        Read events that :meth:`save` wrote as ``.npz``.
+
+        Raises
+        ------
+        FileError
+            When the file is missing, broken, or holds no events.
+        """
+        source = Path(path)
+        if not source.is_file():
+            raise FileError(source, "is not a file" if source.exists() else "no such file")
+        try:
+            with np.load(source, allow_pickle=False) as data:
+                about = json.loads(str(data["about"]))
+                if about.get("format") != FORMAT:
+                    raise FileError(source, "holds no events")
+                columns = {
+                    name.removeprefix("column_"): data[name] for name in data.files if name.startswith("column_")
+                }
+                layout = Layout(data["xy_um"], data["ring_offsets"], data["site_offsets"], columns)
+                return cls(data["t_s"], data["site"], data["polarity"], layout)
+        except FileError:
+            raise
+        except Exception as error:  # noqa: BLE001 -- a broken file makes its readers trip over anything
+            raise FileError(source, f"is broken or holds no events ({' '.join(str(error).split())})") from None

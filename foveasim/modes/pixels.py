@@ -1,0 +1,427 @@
+"""
+Photosites that speak for themselves: those that tell changes of light, and those that spike when they have collected a charge.
+
+Both are fed the light of frames, as :meth:`foveasim.Camera.rates` gives it, and remember what was before: a video may come in
+batches of any size, and gives the same events.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
+from itertools import islice
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim.arrays import Floats, Ints, check_count, check_number, finite_array, read_only
+from foveasim.compiled import kernels
+from foveasim.errors import ParameterError, SimulationError
+from foveasim.modes.events import Events
+from foveasim.parallel import each, thread_count
+from foveasim.sensor import Sensor
+from foveasim.streams import device_key
+from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
+
+__all__ = ["EventPixels", "SpikingPixels"]
+
+#: Thresholds below this are below the noise of any circuit, and their events beyond any memory.
+MIN_CONTRAST = 1e-3
+#: A site's threshold is at least this share of the mean, whatever its mismatch.
+LEAST_THRESHOLD = 0.1
+#: Sites that one thread works on at a time; fixed, so that results do not depend on the number of threads.
+PIECE_SITES = 2048
+#: More events of one batch than this are a slip: of a threshold, or of the light's unit.
+MAX_EVENTS = 1 << 27
+
+#: A kernel for some sites: of their positions, and where what they remember and their events are.
+Work = Callable[[slice, NDArray[Any], Ints, Floats, NDArray[np.int32], NDArray[np.int8]], int]
+
+
+@dataclass(frozen=True, eq=False)
+class EventPixels:
+    """
+    Photosites of an event camera (dynamic vision sensor): each tells when the logarithm of its light has changed enough.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        Its photosites: areas, sensitivities, PRNU, dark current and crosstalk count, and the device's seed.
+    contrast_on, contrast_off : float
+        Change of the natural logarithm of the photocurrent that gives an event: 0.2 are 22 % brighter, or 18 % darker.
+    mismatch_fraction : float
+        Standard deviation of the sites' thresholds over their mean, fixed in the device.
+    refractory_s : float, s
+        How long a site is held after an event, while its reference follows the light.
+    capacitance_f : float, F
+        Of the photoreceptor's node: 1e-14 F is usual, 0 has no low pass. See the notes.
+    temperature_k : float, K
+    leak_per_s : float, 1/s
+        Events of brightening that a site gives each second in constant light, by leakage.
+    noise_per_s : float, 1/s
+        Events of shot noise, of either polarity alike, that a site gives each second in darkness ...
+    noise_half_e_per_s : float, e-/s
+        ... and half as many at this photocurrent: ``noise_per_s / (1 + I / noise_half)``.
+    floor_e_per_s : float, e-/s
+        Added to every site's photocurrent, so that darkness has a logarithm.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range.
+
+    Notes
+    -----
+    Between frames the logarithm of the photocurrent I is a straight line L(t), and events have the times at which the
+    thresholds are crossed, to the last bits. The photoreceptor follows it as a low pass, ``dV/dt = (L - V) / tau`` with
+    ``tau = C (kT/q) / I``, the corner frequency ``1 / (2 pi tau)`` in proportion to the light, and I the mean of the
+    interval's ends. An event sets the site's reference to its level at the end of the refractory time; leakage lowers the
+    reference.
+
+    Noise is that of a Poisson process with the refractory time as its dead time; a noise event sets the reference like any
+    other.
+
+    Examples
+    --------
+    A site whose light grows from 100 to 1000 e-/s, ln 10 = 2.303, at thresholds of 0.5:
+
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=1, n_y=1, pitch_um=10.0))
+    >>> pixels = EventPixels(sensor, contrast_on=0.5, floor_e_per_s=0.0)
+    >>> pixels.events([[100.0], [1000.0]], frame_s=1.0, seed=0).t_s.round(3).tolist()
+    [0.217, 0.434, 0.651, 0.869]
+    """
+
+    sensor: Sensor
+    _: KW_ONLY
+    contrast_on: float = 0.2
+    contrast_off: float = 0.2
+    mismatch_fraction: float = 0.0
+    refractory_s: float = 0.0
+    capacitance_f: float = 0.0
+    temperature_k: float = 300.0
+    leak_per_s: float = 0.0
+    noise_per_s: float = 0.0
+    noise_half_e_per_s: float = 1e4
+    floor_e_per_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_sensor(self.sensor)
+        for name in ("contrast_on", "contrast_off"):
+            object.__setattr__(self, name, check_number(name, getattr(self, name), at_least=MIN_CONTRAST))
+        for name in ("mismatch_fraction", "refractory_s", "leak_per_s", "noise_per_s", "floor_e_per_s"):
+            object.__setattr__(self, name, check_number(name, getattr(self, name), at_least=0.0))
+        for name in ("temperature_k", "noise_half_e_per_s"):
+            object.__setattr__(self, name, check_number(name, getattr(self, name), above=0.0))
+        capacitance_f = check_number("capacitance_f", self.capacitance_f, at_least=0.0, at_most=1e-9)
+        object.__setattr__(self, "capacitance_f", capacitance_f)
+
+    @cached_property
+    def thresholds(self) -> tuple[Floats, Floats]:
+        """Every site's thresholds for brighter and for darker, (n_site,) or (1,) each."""
+        means = self.contrast_on, self.contrast_off
+        if not self.mismatch_fraction:
+            return read_only(np.full(1, means[0])), read_only(np.full(1, means[1]))
+        on, off = (
+            mean
+            * np.maximum(1.0 + self.mismatch_fraction * self.sensor.device.normals(f"event {which}"), LEAST_THRESHOLD)
+            for mean, which in zip(means, ("on", "off"), strict=True)
+        )
+        return read_only(on), read_only(off)
+
+    def stream(
+        self,
+        rates: Iterable[ArrayLike],
+        *,
+        frame_s: float,
+        seed: int,
+        batch: int = 32,
+        n_threads: int | None = None,
+    ) -> Iterator[Events]:
+        """
+        Events, some frames at a time.
+
+        Parameters
+        ----------
+        rates : iterable of (n_site,), e-/s
+            The frames' photoelectrons, as :meth:`foveasim.Camera.rates` gives them.
+        frame_s : float, s
+            From one frame to the next; the first is at 0 s.
+        seed : int
+            Of the noise.
+        batch : int
+            Frames at a time; the events do not depend on it.
+        n_threads : int, optional
+            All cores by default. Events do not depend on it.
+
+        Yields
+        ------
+        Events
+            Of each batch, all later than those before.
+
+        Raises
+        ------
+        ParameterError
+            At once, when a number is out of range; later, when a frame has not one rate of at least 0 a site.
+        SimulationError
+            When a site has no current at all, or there are more events than fit the memory.
+        """
+        frame_s = check_number("frame_s", frame_s, above=0.0)
+        batch = check_count("batch", batch)
+        key = device_key(check_count("seed", seed, at_least=0), "change events")
+        return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
+
+    def events(self, rates: Iterable[ArrayLike], *, frame_s: float, seed: int, n_threads: int | None = None) -> Events:
+        """All events as one; as :meth:`stream`."""
+        return _all(self.stream(rates, frame_s=frame_s, seed=seed, n_threads=n_threads), self.sensor)
+
+    def _stream(
+        self, rates: Iterable[ArrayLike], frame_s: float, key: tuple[Any, Any], batch: int, n_threads: int
+    ) -> Iterator[Events]:
+        kernel = kernels("modes")
+        tau_e = self.capacitance_f * BOLTZMANN_J_PER_K * self.temperature_k / ELEMENTARY_CHARGE_C**2
+        on, off = self.thresholds
+        memory = np.zeros((self.sensor.layout.n_sites, 4))
+        n_drawn = np.zeros(self.sensor.layout.n_sites, np.int64)
+        n_before = 0
+        before: Floats | None = None
+        for dark_current in _batches(self.sensor, rates, batch):
+            current = dark_current + self.floor_e_per_s
+            if not current.min(initial=np.inf) > 0.0:
+                site = int(np.flatnonzero((current <= 0.0).any(axis=0))[0])
+                raise SimulationError(
+                    f"site {site} has no current, and so no logarithm: give 'floor_e_per_s', or the sensor a dark current"
+                )
+            if before is None:
+                memory[:, kernel.LEVEL] = np.log(current[0])
+                frames, log_light = current, np.log(current)
+            else:
+                frames = np.concatenate((before, current))
+                log_light = np.log(frames)
+            first = max(n_before - 1, 0)
+
+            def work(sites: slice, kept: NDArray[Any], drawn: Ints, *out: NDArray[Any]) -> int:
+                return int(
+                    kernel.change_events(
+                        np.ascontiguousarray(log_light[:, sites]),  # noqa: B023 -- is called at once
+                        np.ascontiguousarray(frames[:, sites]),  # noqa: B023
+                        frame_s,
+                        first,  # noqa: B023
+                        _part(on, sites),
+                        _part(off, sites),
+                        self.refractory_s,
+                        self.leak_per_s,
+                        tau_e,
+                        self.noise_per_s,
+                        self.noise_half_e_per_s,
+                        *key,
+                        sites.start,
+                        kept,
+                        drawn,
+                        *out,
+                    )
+                )
+
+            n_before += current.shape[0]
+            before = current[-1:].copy()
+            yield _gathered(work, memory, n_drawn, self.sensor, n_threads)
+
+
+@dataclass(frozen=True, eq=False)
+class SpikingPixels:
+    """
+    Photosites that integrate and fire: each collects charge, and gives a spike when it has a threshold of it.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        Its photosites: areas, sensitivities, PRNU, dark current and crosstalk count. Without its shot noise charge flows
+        evenly.
+    threshold_e : float or (n_site,), e-
+        Charge of a spike, at least 1.
+    refractory_s : float, s
+        After a spike, while charge is lost.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range, or an array does not have one value a site.
+
+    Notes
+    -----
+    Without noise the rate of spikes is ``1 / (N_th / I + refractory)`` for a current of I electrons a second. With it the time
+    to a threshold of N electrons that come one by one follows the gamma law of the shape N, drawn exactly, so that intervals
+    vary by ``1 / sqrt(N)`` of their mean. A charge that is collected stays from frame to frame. Light stays as it is from each
+    frame to the next: frame k lasts from ``k frame_s`` to ``(k + 1) frame_s``.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> sensor = fs.Sensor(fs.layout.grid(n_x=1, n_y=1, pitch_um=10.0), shot_noise="off")
+    >>> SpikingPixels(sensor, threshold_e=400.0).events([[1000.0], [500.0]], frame_s=1.0, seed=0).t_s.round(9).tolist()
+    [0.4, 0.8, 1.4]
+    """
+
+    sensor: Sensor
+    _: KW_ONLY
+    threshold_e: float | Floats = 1000.0
+    refractory_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_sensor(self.sensor)
+        threshold_e = finite_array("threshold_e", self.threshold_e, at_least=1.0)
+        if threshold_e.shape not in ((), (self.sensor.layout.n_sites,)):
+            raise ParameterError(
+                "threshold_e", f"must be one number, or one for each of the {self.sensor.layout.n_sites} sites"
+            )
+        object.__setattr__(
+            self, "threshold_e", read_only(threshold_e.copy()) if threshold_e.ndim else float(threshold_e)
+        )
+        object.__setattr__(self, "refractory_s", check_number("refractory_s", self.refractory_s, at_least=0.0))
+
+    def stream(
+        self,
+        rates: Iterable[ArrayLike],
+        *,
+        frame_s: float,
+        seed: int,
+        batch: int = 32,
+        n_threads: int | None = None,
+    ) -> Iterator[Events]:
+        """
+        Spikes, some frames at a time.
+
+        Parameters
+        ----------
+        rates : iterable of (n_site,), e-/s
+            The frames' photoelectrons, as :meth:`foveasim.Camera.rates` gives them.
+        frame_s : float, s
+            How long each frame lasts; the first begins at 0 s.
+        seed : int
+            Of the shot noise.
+        batch : int
+            Frames at a time; the spikes do not depend on it.
+        n_threads : int, optional
+            All cores by default. Spikes do not depend on it.
+
+        Yields
+        ------
+        Events
+            Of each batch, all of the polarity 1, all later than those before.
+
+        Raises
+        ------
+        ParameterError
+            At once, when a number is out of range; later, when a frame has not one rate of at least 0 a site.
+        SimulationError
+            When there are more spikes than fit the memory.
+        """
+        frame_s = check_number("frame_s", frame_s, above=0.0)
+        batch = check_count("batch", batch)
+        key = device_key(check_count("seed", seed, at_least=0), "spikes")
+        return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
+
+    def events(self, rates: Iterable[ArrayLike], *, frame_s: float, seed: int, n_threads: int | None = None) -> Events:
+        """All spikes as one; as :meth:`stream`."""
+        return _all(self.stream(rates, frame_s=frame_s, seed=seed, n_threads=n_threads), self.sensor)
+
+    def _stream(
+        self, rates: Iterable[ArrayLike], frame_s: float, key: tuple[Any, Any], batch: int, n_threads: int
+    ) -> Iterator[Events]:
+        kernel = kernels("modes")
+        threshold_e = np.atleast_1d(np.asarray(self.threshold_e, np.float64))
+        memory = np.zeros((self.sensor.layout.n_sites, 4))
+        n_drawn = np.zeros(self.sensor.layout.n_sites, np.int64)
+        first = 0
+        for current in _batches(self.sensor, rates, batch):
+            expected = current / (threshold_e + self.refractory_s * current) * frame_s
+            if expected.sum() > MAX_EVENTS:
+                raise SimulationError(
+                    f"{expected.sum():.3g} spikes of {current.shape[0]} frames do not fit the memory: take fewer frames a "
+                    "batch, a higher threshold_e, or less light"
+                )
+
+            def work(sites: slice, kept: NDArray[Any], drawn: Ints, *out: NDArray[Any]) -> int:
+                t_s, site, polarity = out
+                polarity[:] = 1
+                return int(
+                    kernel.charge_spikes(
+                        np.ascontiguousarray(current[:, sites]),  # noqa: B023 -- is called at once
+                        frame_s,
+                        first,  # noqa: B023
+                        _part(threshold_e, sites),
+                        self.refractory_s,
+                        self.sensor.shot_noise != "off",
+                        *key,
+                        sites.start,
+                        kept,
+                        drawn,
+                        t_s,
+                        site,
+                    )
+                )
+
+            yield _gathered(work, memory, n_drawn, self.sensor, n_threads)
+            first += current.shape[0]
+
+
+# -- parts ------------------------------------------------------------------------------------------------------------
+
+
+def _check_sensor(sensor: object) -> None:
+    if not isinstance(sensor, Sensor):
+        raise ParameterError("sensor", f"must be a foveasim.Sensor, got a {type(sensor).__name__}")
+
+
+def _part(values: Floats, sites: slice) -> Floats:
+    """Values of some sites, or the one of all."""
+    return values[sites] if values.size > 1 else values
+
+
+def _batches(sensor: Sensor, rates: Iterable[ArrayLike], batch: int) -> Iterator[Floats]:
+    """Currents of some frames at a time, (n_frame, n_site) e-/s: photoelectrons and dark charge, with crosstalk."""
+    n_sites = sensor.layout.n_sites
+    remaining = iter(rates)
+    while rows := list(islice(remaining, batch)):
+        current = np.empty((len(rows), n_sites))
+        for k, row in enumerate(rows):
+            rate = finite_array("rates", row, at_least=0.0)
+            if rate.shape != (n_sites,):
+                raise ParameterError("rates", f"must have one number for each of the {n_sites} sites, got {rate.shape}")
+            current[k] = sensor.expected_electrons(rate, 1.0)
+        yield current
+
+
+def _gathered(work: Work, memory: NDArray[Any], n_drawn: Ints, sensor: Sensor, n_threads: int) -> Events:
+    """What a kernel makes of all sites, in the order of time."""
+
+    def piece(first: int) -> tuple[Floats, NDArray[np.int32], NDArray[np.int8]]:
+        sites = slice(first, min(first + PIECE_SITES, memory.shape[0]))
+        capacity = 4 * PIECE_SITES
+        while True:
+            kept, drawn = memory[sites].copy(), n_drawn[sites].copy()
+            out = np.empty(capacity), np.empty(capacity, np.int32), np.empty(capacity, np.int8)
+            n = work(sites, kept, drawn, *out)
+            if n <= capacity:
+                memory[sites], n_drawn[sites] = kept, drawn
+                return out[0][:n], out[1][:n], out[2][:n]
+            if n > MAX_EVENTS:
+                raise SimulationError(
+                    f"{n:,} events of {sites.stop - sites.start} sites do not fit the memory: take fewer frames a "
+                    "batch, higher thresholds, or less noise"
+                )
+            capacity = n
+
+    parts = each(piece, range(0, memory.shape[0], PIECE_SITES), n_threads)
+    if not parts:
+        return Events(np.zeros(0), np.zeros(0, np.int32), np.zeros(0, np.int8), sensor.layout)  # type: ignore[arg-type]
+    t_s, site, polarity = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    order = np.lexsort((site, t_s))
+    return Events(t_s[order], site[order], polarity[order], sensor.layout)  # type: ignore[arg-type]
+
+
+def _all(batches: Iterator[Events], sensor: Sensor) -> Events:
+    nothing = Events(np.zeros(0), np.zeros(0, np.int32), np.zeros(0, np.int8), sensor.layout)  # type: ignore[arg-type]
+    return Events.joined([nothing, *batches])
