@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import scipy.fft
 import shapely
+from looking import bench_looking
 from report import Report, best_s
 from rich.console import Console
 
@@ -30,7 +31,6 @@ from foveasim.parallel import thread_count
 from foveasim.sensor.noise import in_blocks
 from foveasim.streams import Streams
 from layouts import bench_layouts
-from looking import bench_looking
 
 #: The largest picture of the paper.
 FULL_SHAPE = (4640, 8256)
