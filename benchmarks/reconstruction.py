@@ -3,8 +3,8 @@ Pictures by every method of reconstruction against the light on the sensor: PSNR
 
     python benchmarks/reconstruction.py
 
-Three photographs on three layouts, f/4, 10 bits, a read noise of 3 electrons; capacitances as the sites' areas, so that the brightest
-site is at 90 % of the range. Only pixels that photosites cover wholly are compared.
+Three photographs on three layouts, f/4, 10 bits, a read noise of 3 electrons; capacitances as the sites' areas, so that the
+brightest site is at 90 % of the range. Only pixels that photosites cover wholly are compared.
 """
 
 from __future__ import annotations
