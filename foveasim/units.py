@@ -19,6 +19,8 @@ __all__ = [
     "m_from_mm",
     "m_from_nm",
     "m_from_um",
+    "per_mm_from_per_um",
+    "per_um_from_per_mm",
     "photon_energy_j",
     "um_from_m",
     "um_from_nm",
@@ -55,6 +57,16 @@ def um_from_m(length_m: Floats | float) -> Floats:
 def um_from_nm(length_nm: Floats | float) -> Floats:
     """Micrometres from nanometres."""
     return np.asarray(length_nm, dtype=np.float64) * 1e-3
+
+
+def per_um_from_per_mm(frequency_per_mm: Floats | float) -> Floats:
+    """Line pairs per micrometre from line pairs per millimetre."""
+    return np.asarray(frequency_per_mm, dtype=np.float64) * 1e-3
+
+
+def per_mm_from_per_um(frequency_per_um: Floats | float) -> Floats:
+    """Line pairs per millimetre from line pairs per micrometre."""
+    return np.asarray(frequency_per_um, dtype=np.float64) * 1e3
 
 
 def w_from_w_m2_um2(power_w_m2_um2: Floats | float) -> Floats:

@@ -28,6 +28,8 @@ def test_constants_are_those_of_the_si(name, published):
     ("convert", "length", "converted"),
     [
         (units.m_from_nm, 550.0, 5.5e-7),
+        (units.per_um_from_per_mm, 125.0, 0.125),
+        (units.per_mm_from_per_um, 0.125, 125.0),
         (units.m_from_um, 2.2, 2.2e-6),
         (units.m_from_mm, 22.0, 0.022),
         (units.um_from_m, 0.56, 560_000.0),

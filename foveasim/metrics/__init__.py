@@ -1,18 +1,52 @@
-"""What a sensor and its pictures are worth, in numbers: photon transfer, EMVA 1288, PSNR and similarity."""
+"""What a sensor and its pictures are worth, in numbers: photon transfer, EMVA 1288, resolution, aliasing, flow, similarity."""
 
 from __future__ import annotations
 
+from foveasim.metrics.aliasing import AliasingSpectrum, SamplingSpectrum, aliasing_spectrum, sampling_spectrum
 from foveasim.metrics.emva import Emva1288, emva1288
+from foveasim.metrics.flow import FlowBound, FlowEstimate, estimate_flow, flow_bound, site_gradients_e_per_um
 from foveasim.metrics.photon_transfer import PhotonTransfer, draw_frames, photon_transfer, predicted_photon_transfer
+from foveasim.metrics.pixel_mtf import polygon_mtf, polygon_otf, wave_vectors_per_mm
 from foveasim.metrics.quality import psnr_db, ssim
+from foveasim.metrics.sampling import (
+    EccentricityTable,
+    neighbour_spacing_um,
+    nyquist_against_eccentricity,
+    nyquist_per_mm,
+)
+from foveasim.metrics.slanted_edge import EdgeMtf, slanted_edge_mtf
+from foveasim.metrics.snr import SnrTable, light_at_snr_fraction, measured_snr_by_class, size_classes_um, snr_by_class
 
 __all__ = [
+    "AliasingSpectrum",
+    "EccentricityTable",
+    "EdgeMtf",
     "Emva1288",
+    "FlowBound",
+    "FlowEstimate",
     "PhotonTransfer",
+    "SamplingSpectrum",
+    "SnrTable",
+    "aliasing_spectrum",
     "draw_frames",
     "emva1288",
+    "estimate_flow",
+    "flow_bound",
+    "light_at_snr_fraction",
+    "measured_snr_by_class",
+    "neighbour_spacing_um",
+    "nyquist_against_eccentricity",
+    "nyquist_per_mm",
     "photon_transfer",
+    "polygon_mtf",
+    "polygon_otf",
     "predicted_photon_transfer",
     "psnr_db",
+    "sampling_spectrum",
+    "site_gradients_e_per_um",
+    "size_classes_um",
+    "slanted_edge_mtf",
+    "snr_by_class",
     "ssim",
+    "wave_vectors_per_mm",
 ]

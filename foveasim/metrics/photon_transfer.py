@@ -139,20 +139,20 @@ class SiteClasses:
         labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(classes)
         if labels.shape != (n_sites,):
             raise ParameterError("classes", f"must have one label for each of the {n_sites} sites, got {labels.shape}")
-        self.labels, self._class_of_site = np.unique(labels, return_inverse=True)
-        self.n_sites = np.bincount(self._class_of_site).astype(np.int64)
+        self.labels, self.of_site = np.unique(labels, return_inverse=True)
+        self.n_sites = np.bincount(self.of_site).astype(np.int64)
         if self.n_sites.min(initial=n_sites) < 2:
             few = self.labels[self.n_sites < 2].tolist()
             raise ParameterError("classes", "must have at least two sites each", few)
 
     def mean(self, values: Floats) -> Floats:
         """Mean over each class's sites, (n_class,) of (n_site,)."""
-        return np.bincount(self._class_of_site, weights=values) / self.n_sites
+        return np.bincount(self.of_site, weights=values) / self.n_sites
 
     def variance(self, values: Floats) -> Floats:
         """Sample variance over each class's sites, (n_class,) of (n_site,)."""
-        off = values - self.mean(values)[self._class_of_site]
-        return np.bincount(self._class_of_site, weights=off * off) / (self.n_sites - 1)
+        off = values - self.mean(values)[self.of_site]
+        return np.bincount(self.of_site, weights=off * off) / (self.n_sites - 1)
 
 
 def draw_frames(

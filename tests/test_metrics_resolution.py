@@ -1,0 +1,340 @@
+"""Resolution: polygons' transforms in closed form, the slanted edge against lens times pixel, Nyquist frequencies of lattices."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import shapely
+
+import foveasim as fs
+from foveasim.errors import ParameterError, SimulationError
+from foveasim.metrics import (
+    neighbour_spacing_um,
+    nyquist_against_eccentricity,
+    nyquist_per_mm,
+    polygon_mtf,
+    polygon_otf,
+    slanted_edge_mtf,
+    wave_vectors_per_mm,
+)
+from foveasim.optics import circular_otf
+from foveasim.scene import charts
+
+#: From frequencies where float64 could not tell a sine from 1, to 40 periods across a site.
+FREQUENCIES = np.array([0.0, 1e-300, 1e-200, 1e-12, 1e-6, 1e-3, 0.1, 1.0, 10.0, 99.7, 250.0, 333.3, 1000.0, 1e4])
+ANGLES = (0.0, 17.0, 45.0, 90.0, 133.0, 270.0)
+
+# -- polygons ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle_deg", ANGLES)
+def test_a_rectangle_is_a_product_of_sincs(angle_deg):
+    layout = fs.layout.grid(n_x=1, n_y=1, pitch_um=4.0, pitch_y_um=3.0).translate(5000.0, -300.0)
+    waves = wave_vectors_per_mm(FREQUENCIES, angle_deg)
+    expected = np.sinc(4e-3 * waves[:, 0]) * np.sinc(3e-3 * waves[:, 1])
+
+    assert np.abs(polygon_otf(layout, waves)[0] - expected).max() <= 1e-12
+
+
+def test_a_hexagon_has_its_closed_forms_across_sides_and_corners():
+    layout = fs.layout.hexagonal(n_columns=1, n_rows=1, pitch_um=4.0)
+    w, s = 4e-3, 4e-3 / np.sqrt(3.0)
+    f = FREQUENCIES
+
+    sides, corners = polygon_otf(layout, wave_vectors_per_mm(f, 0.0)), polygon_otf(layout, wave_vectors_per_mm(f, 90.0))
+
+    assert np.abs(sides - (2 / 3 * np.sinc(w * f) + 1 / 3 * np.sinc(w * f / 2) ** 2)).max() <= 1e-12
+    assert np.abs(corners - np.sinc(1.5 * s * f) * np.sinc(0.5 * s * f)).max() <= 1e-12
+
+
+def l_shape():
+    whole = shapely.Polygon([(0, 0), (5, 0), (5, 2), (2, 2.5), (1, 6), (0, 6)], [[(0.5, 0.5), (1.2, 0.6), (0.8, 1.5)]])
+    return whole, fs.Layout.from_polygons([whole])
+
+
+def test_pieces_of_a_site_add_up_to_it():
+    whole, layout = l_shape()
+    cut = shapely.Polygon([(-1, -1), (3, -1), (0.3, 7), (-1, 7)])
+    parts = fs.Layout.from_polygons([whole & cut, whole - cut])
+    waves = np.random.default_rng(0).normal(0.0, 200.0, (50, 2))
+
+    def integrals(some):
+        away = np.exp(-2e-3j * np.pi * (some.centroid_um @ np.moveaxis(waves, 0, 1)))
+        return some.area_um2[:, None] * polygon_otf(some, waves) * away
+
+    assert integrals(parts).sum(axis=0) == pytest.approx(integrals(layout)[0], abs=1e-12 * whole.area)
+
+
+def test_a_site_is_its_mean_over_many_points():
+    whole, layout = l_shape()
+    step = 0.01
+    x, y = np.meshgrid(np.arange(0.0, 5.0, step) + step / 2, np.arange(0.0, 6.0, step) + step / 2)
+    inside = shapely.contains_xy(whole, x, y)
+    points = np.stack((x[inside], y[inside]), axis=1) - layout.centroid_um[0]
+    waves = np.array([[30.0, 10.0], [-120.0, 75.0], [0.0, 240.0], [310.0, 0.0]])
+
+    slow = np.exp(-2e-3j * np.pi * (points @ np.moveaxis(waves, 0, 1))).mean(axis=0)
+
+    assert np.abs(polygon_otf(layout, waves)[0] - slow).max() <= 2e-4
+
+
+def test_moving_a_site_changes_nothing_and_turning_it_turns_its_transform():
+    _, layout = l_shape()
+    f = np.array([3.0, 80.0, 300.0])
+
+    still = polygon_mtf(layout, f, angle_deg=20.0)
+
+    assert polygon_mtf(layout.translate(4000.0, 77.0), f, angle_deg=20.0) == pytest.approx(still, abs=1e-12)
+    assert polygon_mtf(layout.rotate(31.0), f, angle_deg=51.0) == pytest.approx(still, abs=1e-12)
+
+
+def test_near_frequency_0_the_second_moment_is_left_with_all_its_digits():
+    layout = fs.layout.grid(n_x=1, n_y=1, pitch_um=4.0)
+    f = np.array([1e-3, 1e-2, 1e-1])
+    otf = polygon_otf(layout, wave_vectors_per_mm(f))[0]
+    tilted = fs.Layout.from_polygons([shapely.Polygon([(0, 0), (3, 0), (0, 3)])])
+    odd = polygon_otf(tilted, wave_vectors_per_mm(f))[0].imag
+
+    assert otf.imag.tolist() == [0.0, 0.0, 0.0]
+    # The third moment of x of this triangle about its centroid, over its area, is 0.2; exp(-ikx) has (i k³ / 6) of it.
+    assert odd == pytest.approx((2e-3 * np.pi * f) ** 3 / 6.0 * 0.2, rel=1e-4)
+
+
+def test_all_sites_give_what_each_gives_alone_on_any_number_of_threads():
+    layout = fs.layout.log_polar(n_sectors=90, min_size_um=2.0, r_max_um=150.0, stagger=True)
+    waves = np.random.default_rng(1).normal(0.0, 150.0, (7, 2))
+    together = polygon_otf(layout, waves, n_threads=1)
+
+    assert layout.n_sites > 2000
+    assert np.array_equal(together, polygon_otf(layout, waves, n_threads=3))
+    some = [0, 1023, 1024, layout.n_sites - 1]
+    assert np.array_equal(together[some], polygon_otf(layout[some], waves))
+
+
+def test_bad_waves_are_told():
+    layout = fs.layout.grid(n_x=1, n_y=1, pitch_um=1.0)
+    with pytest.raises(ParameterError, match=r"'wave_per_mm' must have the shape \(n_wave, 2\)"):
+        polygon_otf(layout, [[1.0, 2.0, 3.0]])
+    with pytest.raises(ParameterError, match="'angle_deg' must be one number, or one for each of the 3 frequencies"):
+        polygon_mtf(layout, [1.0, 2.0, 3.0], angle_deg=[1.0, 2.0])
+
+
+# -- the slanted edge -------------------------------------------------------------------------------------------------
+
+OPTICS = fs.Optics(focal_length_mm=10.0, f_number=4.0)
+CELL_UM, DISTANCE_M = 0.5, 0.5
+SQUARES = fs.layout.grid(n_x=60, n_y=60, pitch_um=4.0)
+HEXAGONS = fs.layout.hexagonal(n_columns=60, n_rows=70, pitch_um=4.0)
+
+
+def edge_capture(layout, angle_deg, n_cells=760):
+    scene = charts.slanted_edge(
+        angle_deg=angle_deg,
+        shape=(n_cells, n_cells),
+        pitch_um=CELL_UM / OPTICS.magnification(DISTANCE_M),
+        distance_m=DISTANCE_M,
+        radiance_w_m2_sr_nm=0.1,
+        wavelength_nm=[550.0],
+        band_width_nm=10.0,
+    )
+    sensor = fs.Sensor(layout, capacitance_f=1e-15 * layout.area_um2)
+    return fs.Camera(optics=OPTICS, sensor=sensor).capture(scene, exposure_s=0.1, seed=1)
+
+
+def lens_times_pixel(layout, frequency_per_mm, angle_deg):
+    """Closed forms of the clear circle, the sites, and the chart's and the map's cells, across an edge."""
+    wave = wave_vectors_per_mm(frequency_per_mm, angle_deg)
+    lens = circular_otf(frequency_per_mm * 0.55e-3 * OPTICS.working_f_number(DISTANCE_M))
+    cells = np.prod(np.sinc(1e-3 * CELL_UM * wave), axis=1) ** 2
+    return lens * cells * polygon_mtf(layout, frequency_per_mm, angle_deg=angle_deg).mean(axis=0)
+
+
+@pytest.mark.parametrize("angle_deg", [5.0, -5.0, 85.0, 175.0, -95.0, 23.0])
+@pytest.mark.parametrize("layout", [SQUARES, HEXAGONS], ids=["squares", "hexagons"])
+def test_the_mtf_by_the_edge_is_that_of_lens_times_pixel_up_to_nyquist(layout, angle_deg):
+    found = slanted_edge_mtf(layout, edge_capture(layout, angle_deg).expected_e)
+    f = found.frequency_per_mm
+    is_in = f <= nyquist_per_mm(layout)[0] * 1.0001
+    expected = lens_times_pixel(layout[[0]], f, angle_deg)
+
+    assert abs(found.angle_deg - angle_deg) < 0.01
+    assert abs(found.offset_um) < 0.002
+    assert np.abs(found.mtf / expected - 1.0)[is_in].max() < 0.02
+    assert np.abs(found.mtf - expected)[is_in].max() < 0.008
+    assert found.mtf50_per_mm == pytest.approx(np.interp(-0.5, -expected, f), rel=0.015)
+
+
+def test_the_edge_need_not_pass_through_the_middle():
+    layout = SQUARES.translate(37.0, 11.0)
+    found = slanted_edge_mtf(layout, edge_capture(layout, 5.0).expected_e)
+    is_in = found.frequency_per_mm <= 125.0
+
+    assert abs(found.offset_um) < 0.01
+    assert np.abs(found.mtf / lens_times_pixel(layout[[0]], found.frequency_per_mm, 5.0) - 1.0)[is_in].max() < 0.02
+
+
+def test_sites_in_few_lines_along_the_edge_tell_it_too():
+    # At 60 degrees hexagons lie in lines 2 µm apart, and bins of 1 µm hold one line or none, or parts of one.
+    found = slanted_edge_mtf(HEXAGONS, edge_capture(HEXAGONS, 60.0).expected_e)
+    is_in = found.frequency_per_mm <= 144.0
+
+    expected = lens_times_pixel(HEXAGONS[[0]], found.frequency_per_mm, 60.0)
+    assert np.abs(found.mtf / expected - 1.0)[is_in].max() < 0.02
+
+
+def test_an_annulus_of_a_foveal_layout_has_the_mtf_of_its_pixels():
+    layout = fs.layout.log_polar(n_sectors=200, min_size_um=2.0, r_max_um=140.0).translate(-70.0, 0.0)
+    r_um = np.hypot(layout.centroid_um[:, 0] + 70.0, layout.centroid_um[:, 1])
+    where = (r_um > 80.0) & (r_um < 120.0) & (layout.centroid_um[:, 0] > -60.0)
+    capture = edge_capture(layout, 5.0, n_cells=900)
+
+    found = slanted_edge_mtf(layout, capture.expected_e / layout.area_um2, where=where)
+
+    is_in = found.frequency_per_mm <= 125.0
+    expected = lens_times_pixel(layout[where], found.frequency_per_mm, 5.0)
+    assert abs(found.angle_deg - 5.0) < 0.02
+    assert np.abs(found.mtf - expected)[is_in].max() < 0.02
+
+
+def test_noise_and_a_dead_block_move_the_mtf_a_little():
+    capture = edge_capture(SQUARES, 5.0)
+    noisy = capture.electrons.astype(float)
+    noisy[np.hypot(*(SQUARES.centroid_um - [60.0, 60.0]).T) < 15.0] = 0.0
+
+    found, clean = (
+        slanted_edge_mtf(SQUARES, noisy, reach_um=40.0),
+        slanted_edge_mtf(SQUARES, capture.expected_e, reach_um=40.0),
+    )
+
+    assert abs(found.angle_deg - 5.0) < 0.05
+    assert found.mtf50_per_mm == pytest.approx(clean.mtf50_per_mm, rel=0.02)
+
+
+def test_an_edge_of_known_blur_has_its_known_mtf():
+    # A Gaussian blur of 3 µm on points without size: its transform, and nothing else.
+    from scipy.special import ndtr
+
+    layout = fs.layout.grid(n_x=150, n_y=150, pitch_um=2.0)
+    across = layout.centroid_um @ [np.cos(np.deg2rad(8.0)), np.sin(np.deg2rad(8.0))]
+    f = np.linspace(0.0, 120.0, 25)
+
+    found = slanted_edge_mtf(layout, 100.0 + 200.0 * ndtr((across - 7.0) / 3.0), frequency_per_mm=f, window="none")
+
+    assert found.offset_um == pytest.approx(7.0, abs=1e-3)
+    assert found.contrast == pytest.approx(0.5, abs=1e-3)
+    assert np.abs(found.mtf - np.exp(-2.0 * (np.pi * 3e-3 * f) ** 2)).max() < 5e-4
+    assert found.profile[0] == pytest.approx(100.0)
+    assert found.profile[-1] == pytest.approx(300.0)
+
+
+def test_windows_and_bins_change_little():
+    values = edge_capture(SQUARES, 5.0).expected_e
+    f = np.linspace(0.0, 125.0, 26)
+    plain = slanted_edge_mtf(SQUARES, values, frequency_per_mm=f, window="none")
+
+    for options in ({"window": "tukey"}, {"window": "hamming"}, {"window": "none", "bin_um": 0.6}):
+        assert np.abs(slanted_edge_mtf(SQUARES, values, frequency_per_mm=f, **options).mtf - plain.mtf).max() < 0.005
+
+
+def test_what_is_no_edge_is_told():
+    rng = np.random.default_rng(0)
+    x, y = SQUARES.centroid_um[:, 0], SQUARES.centroid_um[:, 1]
+    tilted = x + 0.1 * y
+    for values, sentence in (
+        (np.full(x.size, 3.0), "no edge is found: all values are the same"),
+        (rng.normal(100.0, 5.0, x.size), "no edge is found: a straight edge explains .* % of the values' variance"),
+        ((np.floor(x / 20) + np.floor(y / 20)) % 2, "no edge is found: a straight edge explains"),
+        (100.0 + x, "no edge is found: the values rise over .* µm, more than a quarter"),
+        (1000.0 + 10.0 * (tilted > 0), "the edge has too little contrast: black is 1000 and white 1010"),
+        (100.0 * (x > 0.1), "the edge's profile has gaps .* turn the edge by a few degrees from the rows"),
+        (100.0 * (tilted > 122), "the edge is too near to the region's border"),
+    ):
+        with pytest.raises(SimulationError, match=sentence):
+            slanted_edge_mtf(SQUARES, values)
+    with pytest.raises(ParameterError, match="'where' must leave at least 50 sites, got 40"):
+        slanted_edge_mtf(SQUARES, tilted, where=np.arange(3600) < 40)
+    with pytest.raises(ParameterError, match="'where' must be a mask of the 3600 sites"):
+        slanted_edge_mtf(SQUARES, tilted, where=[1, 2, 3])
+    with pytest.raises(ParameterError, match="'values' must be one for each of the 3600 sites"):
+        slanted_edge_mtf(SQUARES, tilted[:5])
+
+
+# -- sampling ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("layout", "expected_per_mm"),
+    [
+        (fs.layout.grid(n_x=9, n_y=7, pitch_um=2.5), 200.0),
+        (fs.layout.grid(n_x=9, n_y=7, pitch_um=2.5, trench_um=0.5).rotate(33.0), 200.0),
+        (fs.layout.grid(n_x=9, n_y=7, pitch_um=2.5, stagger=True), 200.0),
+        (fs.layout.grid(n_x=40, n_y=7, pitch_um=1.0, pitch_y_um=25.0), 20.0),
+        (fs.layout.hexagonal(n_columns=9, n_rows=8, pitch_um=2.0).rotate(11.0), 1000.0 / (np.sqrt(3.0) * 2.0)),
+        (fs.layout.hexagonal(n_columns=9, n_rows=8, pitch_um=2.0, orientation="flat"), 1000.0 / (np.sqrt(3.0) * 2.0)),
+    ],
+)
+def test_nyquist_of_lattices_is_that_of_theory(layout, expected_per_mm):
+    assert nyquist_per_mm(layout) == pytest.approx(np.full(layout.n_sites, expected_per_mm), rel=1e-9)
+
+
+def test_the_two_spacings_of_any_lattice_give_its_cell_and_its_nyquist_frequency():
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        basis = rng.uniform(-3.0, 3.0, (2, 2))
+        if abs(np.linalg.det(basis)) < 1.0:
+            continue
+        i = np.stack(np.meshgrid(np.arange(-25, 26), np.arange(-25, 26)), axis=-1).reshape(-1, 2)
+        layout = fs.Layout.from_rectangles(i @ basis, 0.01)
+        inner = np.hypot(*layout.centroid_um.T) < 4.0
+        nearest_um, row_um = (values[inner] for values in neighbour_spacing_um(layout))
+        # The slow way: half the shortest vector of the reciprocal lattice.
+        reciprocal = np.linalg.norm(np.delete(i, len(i) // 2, axis=0) @ np.linalg.inv(basis).transpose(), axis=1).min()
+
+        assert nearest_um * row_um == pytest.approx(np.full(inner.sum(), abs(np.linalg.det(basis))), rel=1e-6)
+        assert 1e-3 * nyquist_per_mm(layout)[inner] == pytest.approx(np.full(inner.sum(), 0.5 * reciprocal), rel=1e-6)
+
+
+def test_filters_of_a_mosaic_have_nyquist_frequencies_of_their_own():
+    layout = fs.layout.mosaic(fs.layout.grid(n_x=12, n_y=12, pitch_um=2.0), ["RG", "GB"])
+    found = nyquist_per_mm(layout, per_channel=True)
+
+    # Red and blue at twice the pitch; green on a square lattice turned by 45 degrees.
+    for channel, expected in ((0, 125.0), (1, 250.0 / np.sqrt(2.0)), (2, 125.0)):
+        assert found[layout.channel == channel] == pytest.approx(expected)
+    with pytest.raises(ParameterError, match="'per_channel' goes with by='neighbours'"):
+        nyquist_per_mm(layout, by="area", per_channel=True)
+
+
+def test_a_row_and_a_lone_site_have_no_nyquist_frequency_but_an_area():
+    row = fs.layout.grid(n_x=20, n_y=1, pitch_um=2.0)
+
+    assert np.isnan(nyquist_per_mm(row)).all()
+    assert np.isnan(nyquist_per_mm(row[[3]])).all()
+    assert nyquist_per_mm(row, by="area") == pytest.approx(250.0)
+
+
+def test_log_polar_sampling_falls_as_the_inverse_of_eccentricity():
+    layout = fs.layout.log_polar(n_sectors=200, min_size_um=2.0, r_max_um=400.0)
+    table = nyquist_against_eccentricity(layout, n_bins=10)
+    middle_um = 0.5 * (table.edges_um[1:] + table.edges_um[:-1])
+
+    assert table.n_sites.sum() == layout.n_sites
+    assert table.size_at_centre_um == 0.0
+    assert table.nyquist_per_mm * middle_um == pytest.approx(1000.0 * 200 / (4 * np.pi), rel=0.05)
+    assert np.all(
+        (table.nyquist_min_per_mm <= table.nyquist_per_mm) & (table.nyquist_per_mm <= table.nyquist_max_per_mm)
+    )
+    # In squarish sites 2π r is 200 of them.
+    assert table.growth_fraction == pytest.approx(2 * np.pi / 200, rel=0.01)
+    assert "size = 0 µm" in str(table)
+    assert table.records()[0]["n_sites"] == table.n_sites[0]
+
+
+def test_a_uniform_sensor_does_not_fall_and_a_retina_has_its_e2():
+    even = nyquist_against_eccentricity(SQUARES, n_bins=5)
+    retina = nyquist_against_eccentricity(fs.layout.fovi(fov_um=400.0, a_um=20.0, n_rings=50), by="area")
+
+    assert even.nyquist_per_mm == pytest.approx(np.full(5, 125.0))
+    assert (even.e2_um, even.growth_fraction) == (np.inf, 0.0)
+    # Its rings are as thick as (r + a): twice as large at r = a.
+    assert retina.e2_um == pytest.approx(20.0, rel=0.1)
