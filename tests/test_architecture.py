@@ -28,12 +28,12 @@ FLOORS = [
     {"capture"},
     {"camera"},
     {"config", "metrics", "video", "view"},
-    {"shots"},
+    {"explore", "shots"},
     {"cli"},
 ]
 #: Loaded when they are used, not before.
 HEAVY = {
-    "OpenEXR", "PIL", "astropy", "av", "cv2", "dask", "exactextract", "gdstk", "h5netcdf", "h5py", "imagecodecs", "klayout", "manifold3d", "matplotlib", "pyarrow", "numba", "pydantic", "pyvista", "rich", "skimage", "tifffile",
+    "OpenEXR", "PIL", "astropy", "av", "cv2", "dask", "distributed", "exactextract", "gdstk", "h5netcdf", "h5py", "imagecodecs", "klayout", "manifold3d", "matplotlib", "pyarrow", "numba", "optuna", "pydantic", "pyvista", "rich", "skimage", "tifffile",
     "torch", "trimesh", "typer", "vtk", "xarray", "yaml", "zarr",
 }  # fmt: skip
 #: Names of numbers without a unit, or with the unit of what they are measured with.

@@ -21,6 +21,7 @@ from foveasim.config._objects import (
     schema,
     shipped_layouts,
 )
+from foveasim.config._problems import validated
 
 __all__ = [
     "LayoutFile",
@@ -36,4 +37,5 @@ __all__ = [
     "read_shot",
     "schema",
     "shipped_layouts",
+    "validated",
 ]

@@ -1,0 +1,203 @@
+"""A worker's bench: takes the captures of points, and keeps what the next points may have in common with them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+
+from foveasim.capture import Capture
+from foveasim.config import Shot, build_shot
+from foveasim.errors import FoveasimError
+from foveasim.explore._metrics import Metric
+from foveasim.explore._records import Record, values_of
+
+__all__ = ["Bench", "Job", "Task", "run_tasks"]
+
+#: What a worker keeps of earlier points, in memory.
+KEPT_BYTES = 1 << 30
+#: Objects are weighed by the arrays in them, so many containers deep.
+DEPTH = 6
+#: Characters of a message that are kept.
+LONGEST_MESSAGE = 500
+
+
+@dataclass(frozen=True)
+class Job:
+    """What all points of a sweep have in common: the file for messages, metrics, threads (0: the worker's), what varies."""
+
+    source: Path
+    metrics: Mapping[str, Metric]
+    n_threads: int
+    is_geometry_varied: bool
+
+
+@dataclass(frozen=True)
+class Task:
+    """A point: its number, and all its settings."""
+
+    point: int
+    settings: Mapping[str, Any]
+
+
+class Bench:
+    """
+    Parts that were made before, up to a size in memory: layouts, scenes, lenses, compiled layouts, images, light on sites.
+
+    Results never depend on what is kept: a part is a function of its settings, and its warnings are kept with it.
+    """
+
+    def __init__(self, kept_bytes: int = KEPT_BYTES) -> None:
+        self._kept_bytes = kept_bytes
+        self._parts: OrderedDict[tuple[str, str], tuple[Any, list[str]]] = OrderedDict()
+        self._told: list[str] = []
+        self.n_made: dict[str, int] = {}
+
+    def kept(self, part: str, settings: Any, make: Callable[[], Any]) -> Any:
+        """What a part's settings make, or made before."""
+        key = part, json.dumps(settings, sort_keys=True)
+        if key not in self._parts:
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                made = make()
+            self._parts[key] = made, [str(warning.message) for warning in caught]
+            self.n_made[part] = self.n_made.get(part, 0) + 1
+            self._forget()
+        self._parts.move_to_end(key)
+        made, told = self._parts[key]
+        self._told += told
+        return made
+
+    def _forget(self) -> None:
+        """Let go of what was not used for longest, but never of the last of any sort."""
+        last = {part: key for key in self._parts for part in (key[0],)}
+        seen: set[int] = set()
+        sizes = {key: _n_bytes(made, seen) for key, (made, _) in reversed(self._parts.items())}
+        total = sum(sizes.values())
+        for key in list(self._parts):
+            if total <= self._kept_bytes:
+                return
+            if last[key[0]] != key:
+                total -= sizes[key]
+                del self._parts[key]
+
+    def captured(self, job: Job, settings: Mapping[str, Any]) -> tuple[Shot, Capture]:
+        """The shot of a point and its capture."""
+        shot = build_shot(job.source, settings, n_threads=job.n_threads, kept=self.kept)
+        camera, sensor, scene = shot.camera, shot.camera.sensor, shot.scene
+        response = hashlib.sha256(sensor.responsivity_e_per_j(scene.wavelength_nm).tobytes()).hexdigest()
+        light = [settings["scene"], settings["optics"], response]
+        filters = hashlib.sha256(sensor.filter_of_site.tobytes()).hexdigest()
+        sites = [settings["layout"], settings.get("distortion"), settings.get("integration_order"), filters]
+        images = self.kept("images", light, dict) if job.is_geometry_varied else None
+        photo_e_per_s = self.kept(
+            "light on sites", [light, sites], lambda: camera.photoelectrons_per_s(scene, images=images)
+        )
+        capture = camera.capture(scene, exposure_s=shot.exposure_s, seed=shot.seed, photo_e_per_s=photo_e_per_s)
+        return shot, capture
+
+    def record(self, job: Job, task: Task) -> Record:
+        """What a point gave: its metrics, or what went wrong. Nothing that a point raises ends the others."""
+        self._told = []
+        values: dict[str, Any] = {}
+        errors = []
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                shot, capture = self.captured(job, task.settings)
+            except Exception as error:  # noqa: BLE001 -- a point's settings may make anything of ours or of a library's raise
+                errors.append(_told(error))
+            else:
+                for name, metric in job.metrics.items():
+                    try:
+                        values |= values_of(name, metric(shot, shot.camera, capture))
+                    except Exception as error:  # noqa: BLE001 -- metrics are the user's
+                        errors.append(f"{name}: {_told(error)}")
+        told = dict.fromkeys([*self._told, *(str(warning.message) for warning in caught)])
+        return Record(task.point, values, "; ".join(errors), "; ".join(_short(text) for text in told))
+
+
+def _told(error: Exception) -> str:
+    text = str(error) if isinstance(error, FoveasimError) else f"{type(error).__name__}: {error}"
+    return _short(text)
+
+
+def _short(text: str) -> str:
+    text = " ".join(text.split())
+    return text if len(text) <= LONGEST_MESSAGE else text[: LONGEST_MESSAGE - 3] + "..."
+
+
+def _n_bytes(thing: Any, seen: set[int], depth: int = DEPTH) -> int:
+    """Bytes of the arrays in an object that were not seen before."""
+    if id(thing) in seen or depth == 0:
+        return 0
+    if isinstance(thing, np.ndarray):
+        base = thing if thing.base is None or not isinstance(thing.base, np.ndarray) else thing.base
+        n_bytes = 0 if id(base) in seen else int(base.nbytes)
+        seen |= {id(base), id(thing)}
+        return n_bytes
+    if isinstance(thing, str | bytes | int | float | type(None)):
+        return 0
+    seen.add(id(thing))
+    if isinstance(thing, Mapping):
+        inside: list[Any] = list(thing.values())
+    elif isinstance(thing, list | tuple):
+        inside = list(thing)
+    elif type(thing).__module__.startswith("foveasim"):
+        slots = [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ())]
+        inside = [*getattr(thing, "__dict__", {}).values(), *(getattr(thing, name, None) for name in slots)]
+    else:
+        return 0
+    return sum(_n_bytes(item, seen, depth - 1) for item in inside)
+
+
+# -- on a worker ------------------------------------------------------------------------------------------------------
+
+#: One point at a time in a process: a camera uses the process's threads.
+_lock = Lock()
+#: The job that this process works on, and its bench.
+_current: dict[str, tuple[Job, Bench]] = {}
+
+
+def run_tasks(job: bytes, versions: Mapping[str, str], tasks: Sequence[Task]) -> tuple[list[Record], int]:
+    """
+    The records of some points, and the process that made them; called by dask on its workers.
+
+    Raises
+    ------
+    RuntimeError
+        When this worker's versions are others: its results might be, too.
+    """
+    import cloudpickle
+
+    from foveasim.records import versions as own_versions
+
+    if own_versions() != dict(versions):
+        different = [
+            f"{name} {own_versions().get(name)}" for name in versions if own_versions().get(name) != versions[name]
+        ]
+        wanted = [f"{name} {versions[name]}" for name in versions if own_versions().get(name) != versions[name]]
+        raise RuntimeError(f"a worker has {', '.join(different)}, and here is {', '.join(wanted)}")
+    digest = hashlib.sha256(job).hexdigest()
+    with _lock:
+        if digest not in _current:
+            _current.clear()
+            own_job = cloudpickle.loads(job)
+            _current[digest] = replace(own_job, n_threads=own_job.n_threads or _threads_of_worker()), Bench()
+        own_job, bench = _current[digest]
+        return [bench.record(own_job, task) for task in tasks], os.getpid()
+
+
+def _threads_of_worker() -> int:
+    from distributed import get_worker
+
+    return int(get_worker().state.nthreads)

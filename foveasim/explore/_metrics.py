@@ -1,0 +1,159 @@
+"""What a point of a sweep is worth, in numbers: metrics by name, and any function of a shot, its camera and its capture."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from foveasim.camera import Camera
+from foveasim.capture import Capture
+from foveasim.config import Shot
+from foveasim.errors import ParameterError
+from foveasim.layout import Readout
+from foveasim.metrics import psnr_db
+from foveasim.reconstruct import raster_grid
+
+__all__ = ["DEFAULT_METRICS", "METRICS", "Metric", "metric_of", "named_metrics"]
+
+#: A function of a shot, its camera and its capture, which gives a number, a mapping of names to such, or an array with labels.
+Metric = Callable[[Shot, Camera, Capture], Any]
+
+#: Side of the pictures that are compared.
+PSNR_PIXELS = 256
+#: Metrics of a sweep that names none.
+DEFAULT_METRICS = ("mean_code_dn", "saturated_fraction", "snr", "n_sites")
+
+
+def mean_code_dn(shot: Shot, camera: Camera, capture: Capture) -> float:  # noqa: ARG001 -- the signature of metrics
+    """Mean of the codes, DN."""
+    return float(np.mean(capture.code))
+
+
+def saturated_fraction(shot: Shot, camera: Camera, capture: Capture) -> float:  # noqa: ARG001
+    """Share of the sites that gave the highest code."""
+    return capture.saturated_share
+
+
+def snr(shot: Shot, camera: Camera, capture: Capture) -> dict[str, float]:
+    """
+    Signal over temporal noise of the codes, predicted without a draw: mean and median over the sites.
+
+    The signal is the mean code less that of darkness. Sites within half a code of the highest have no noise and are left out;
+    NaN where none is left.
+    """
+    sensor = camera.sensor
+    mean_dn, variance_dn2 = sensor.predict(capture.expected_e)
+    dark_e = sensor.expected_electrons(np.zeros(sensor.layout.n_sites), shot.exposure_s)
+    dark_dn, _ = sensor.predict(dark_e)
+    counts = (variance_dn2 > 0.0) & (mean_dn < 2**sensor.bits - 1.5)
+    if not counts.any():
+        return {"mean": float("nan"), "median": float("nan")}
+    ratio = (mean_dn - dark_dn)[counts] / np.sqrt(variance_dn2[counts])
+    return {"mean": float(ratio.mean()), "median": float(np.median(ratio))}
+
+
+def n_sites(shot: Shot, camera: Camera, capture: Capture) -> int:  # noqa: ARG001
+    """Photosites of the layout."""
+    return capture.layout.n_sites
+
+
+def data_rate_gbit_per_s(shot: Shot, camera: Camera, capture: Capture) -> float:
+    """
+    Data rate of one lane, Gbit/s.
+
+    Of the readout in the layout's design rules; without one, of frames without a pause, one an exposure.
+    """
+    if shot.rules is not None and shot.rules.readout is not None:
+        readout = shot.rules.readout
+    else:
+        readout = Readout(frames_per_s=1.0 / shot.exposure_s, bits=camera.sensor.bits)
+    return readout.gbit_per_s(capture.layout.n_sites)
+
+
+def picture_psnr_db(shot: Shot, camera: Camera, capture: Capture) -> float:
+    """PSNR of the picture of cells, in photoelectrons per µm², against the light behind the lens, dB."""
+    grid = raster_grid(capture.layout, PSNR_PIXELS)
+    picture = capture.picture(of="light_e", per="um2", grid=grid, sensor=camera.sensor)
+    return psnr_db(picture, camera.reference(shot.scene, grid, exposure_s=shot.exposure_s))
+
+
+#: Metrics by their names.
+METRICS: dict[str, Metric] = {
+    "data_rate_gbit_per_s": data_rate_gbit_per_s,
+    "mean_code_dn": mean_code_dn,
+    "n_sites": n_sites,
+    "psnr_db": picture_psnr_db,
+    "saturated_fraction": saturated_fraction,
+    "snr": snr,
+}
+
+
+def metric_of(name: str) -> Metric:
+    """
+    The function that ``"module:function"`` names, for the command line: it imports the module, and so runs it.
+
+    Raises
+    ------
+    ParameterError
+        When there is no such module or function.
+    """
+    module, _, function = name.partition(":")
+    folder = str(Path.cwd())
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    try:
+        found = getattr(importlib.import_module(module), function)
+    except Exception as error:  # noqa: BLE001 -- whatever a module raises while it is imported
+        raise ParameterError(
+            "metric", f"must be module:function of a module that can be imported ({error})", name
+        ) from None
+    if not callable(found):
+        raise ParameterError("metric", "must name a function", name)
+    metric: Metric = found
+    return metric
+
+
+def named_metrics(metrics: Iterable[str | Metric] | Mapping[str, Metric] | None) -> dict[str, Metric]:
+    """
+    Metrics by the names that results get.
+
+    Raises
+    ------
+    ParameterError
+        When a name is none of :data:`METRICS`, stands there twice, or a metric is no function.
+    """
+    if metrics is None:
+        metrics = DEFAULT_METRICS
+    if isinstance(metrics, str) or callable(metrics):
+        metrics = (metrics,)
+    if isinstance(metrics, Mapping):
+        pairs = list(metrics.items())
+    else:
+        pairs = [
+            (metric, METRICS.get(metric)) if isinstance(metric, str) else (getattr(metric, "__name__", ""), metric)
+            for metric in metrics
+        ]
+    found: dict[str, Metric] = {}
+    for name, metric in pairs:
+        if metric is None:
+            raise ParameterError(
+                "metrics",
+                f"must be of {', '.join(sorted(METRICS))}",
+                name,
+                cure="functions of your own are given in Python, or with --metric module:function",
+            )
+        if not callable(metric):
+            raise ParameterError("metrics", "must be names or functions", metric)
+        if not isinstance(name, str) or not name.isidentifier():
+            raise ParameterError("metrics", "must have names that are identifiers: name functions by a mapping", name)
+        if name in found:
+            raise ParameterError("metrics", "must have a name each; there are two of this one", name)
+        found[name] = metric
+    if not found:
+        raise ParameterError("metrics", "must be at least one")
+    return found

@@ -1,0 +1,417 @@
+"""What a sweep does: a shot, the settings that vary, repeats, seed and metrics; and the numbers of its points."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence, Sized
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from foveasim.arrays import Ints, check_choice, check_count
+from foveasim.config import check_settings, files_from, put_setting, read_settings, validated
+from foveasim.documents import read_yaml
+from foveasim.errors import ConfigError, ParameterError
+from foveasim.explore._metrics import Metric, metric_of, named_metrics
+from foveasim.records import versions
+from foveasim.streams import derived_seed
+
+__all__ = ["Plan", "plan_sweep", "read_sweep"]
+
+#: More points than this are a slip: of a millisecond each they would take a quarter of an hour.
+MAX_POINTS = 1_000_000
+#: So many values of each setting are checked before a sweep begins; what is wrong with later ones, their points tell.
+CHECKED_VALUES = 1000
+#: Names of dimensions that are not settings.
+POINT, REPEAT = "point", "repeat"
+#: Settings that change where light falls on photosites, and those that change the light.
+GEOMETRY = ("layout", "distortion", "integration_order")
+LIGHT = ("scene", "optics", "sensor.qe", "sensor.filters")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plan:
+    """
+    A sweep before it runs.
+
+    Attributes
+    ----------
+    source : Path
+        The file that the settings are from, for messages.
+    settings : mapping
+        Of the shot, as plain data; files that they name are absolute.
+    values : mapping of str to list
+        Values of each setting that varies, by its path, such as ``"sensor.bits"``.
+    mode : {"product", "zip"}
+        Every value with every other, or the first with the first, the second with the second.
+    repeats : int
+        Captures of each point, which differ in their seeds.
+    seed : int
+        That every point's seed is derived from.
+    metrics : mapping of str to function
+    files : mapping of str to str
+        SHA-256 of the files that the settings name.
+    """
+
+    source: Path
+    settings: Mapping[str, Any]
+    values: Mapping[str, Sequence[Any]]
+    mode: Literal["product", "zip"]
+    repeats: int
+    seed: int
+    metrics: Mapping[str, Metric]
+    files: Mapping[str, str]
+
+    @cached_property
+    def shape(self) -> tuple[int, ...]:
+        """Numbers of values along the results' dimensions, repeats last where there are several."""
+        counts = [len(values) for values in self.values.values()]
+        own = tuple(counts) if self.mode == "product" else (counts[0],)
+        return own if self.repeats == 1 else (*own, self.repeats)
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Names of the results' dimensions."""
+        own = tuple(self.values) if self.mode == "product" else (POINT,)
+        return own if self.repeats == 1 else (*own, REPEAT)
+
+    @property
+    def n_points(self) -> int:
+        """Captures that the sweep takes."""
+        return math.prod(self.shape)
+
+    @cached_property
+    def choices(self) -> Ints:
+        """Which value of each setting every point has, (n_point, n_setting)."""
+        number = np.arange(self.n_points)
+        if self.mode == "product":
+            return np.stack(np.unravel_index(number, self.shape)[: len(self.values)], axis=1)
+        return np.repeat((number // self.repeats)[:, np.newaxis], len(self.values), axis=1)
+
+    def settings_of(self, point: int) -> dict[str, Any]:
+        """All settings of a point, with its seed."""
+        chosen = {path: values[k] for (path, values), k in zip(self.values.items(), self.choices[point], strict=True)}
+        return self._changed(chosen) | {"seed": self.seed_of(point)}
+
+    def seed_of(self, point: int) -> int:
+        """Seed of a point's noise: of the sweep's seed and the point's number, and of nothing else."""
+        return derived_seed(self.seed, point)
+
+    @property
+    def is_geometry_varied(self) -> bool:
+        """Whether points differ in the photosites, or in where the lens puts them."""
+        return any(_is_of(path, GEOMETRY) for path in self.values)
+
+    def order(self) -> tuple[Ints, Ints]:
+        """
+        Numbers of the points, those with the same layout and light beside each other, and where such groups begin.
+
+        Every other layout has its lights in the other order, so that the light met last is met again.
+        """
+        choices = self.choices if self.mode == "product" else self._first_equal()
+        groups = []
+        for parts in (GEOMETRY, LIGHT):
+            own = [k for k, path in enumerate(self.values) if _is_of(path, parts)]
+            groups.append(np.unique(choices[:, own], axis=0, return_inverse=True)[1].reshape(-1))
+        layout, light = groups
+        light_there_and_back = np.where(layout % 2 == 0, light, -light)
+        order = np.lexsort((np.arange(self.n_points), light_there_and_back, layout))
+        is_new = np.diff(layout[order], prepend=-1) | np.diff(light[order], prepend=-1)
+        return order, np.flatnonzero(is_new)
+
+    def described(self) -> dict[str, Any]:
+        """All that results depend on, as plain data: a store goes on where it equals."""
+        return {
+            "settings": dict(self.settings),
+            "vary": {path: list(values) for path, values in self.values.items()},
+            "mode": self.mode,
+            "repeats": self.repeats,
+            "seed": self.seed,
+            "metrics": {
+                name: f"{getattr(metric, '__module__', '')}:{getattr(metric, '__qualname__', name)}"
+                for name, metric in self.metrics.items()
+            },
+            "files": dict(self.files),
+            "versions": versions(),
+        }
+
+    def _first_equal(self) -> Ints:
+        """As ``choices``, with the number of the first value that is equal in the place of every value's own."""
+        columns = []
+        for values, chosen in zip(self.values.values(), self.choices.T, strict=True):
+            first: dict[str, int] = {}
+            numbers = [first.setdefault(json.dumps(value), k) for k, value in enumerate(values)]
+            columns.append(np.array(numbers)[chosen])
+        return np.stack(columns, axis=1)
+
+    def _changed(self, chosen: Mapping[str, Any]) -> dict[str, Any]:
+        data = _copied(self.settings)
+        for path, value in chosen.items():
+            put_setting(self.source, data, path, value)
+        return data
+
+    def check(self) -> None:
+        """
+        Names and types of all settings that vary, before anything is built.
+
+        Raises
+        ------
+        ConfigError
+            With the setting, what was expected and got.
+        """
+        names = list(self.values)
+        for path in names:
+            if any(other != path and other.startswith(path + ".") for other in names):
+                inside = next(other for other in names if other.startswith(path + "."))
+                raise ConfigError(self.source, f"'{path}' and '{inside}' cannot both vary: one holds the other")
+        if self.mode == "zip":
+            for k in range(min(len(self.values[names[0]]), CHECKED_VALUES)):
+                check_settings(self.source, self._changed({path: values[k] for path, values in self.values.items()}))
+            return
+        first = {path: values[0] for path, values in self.values.items()}
+        for path, values in self.values.items():
+            for value in values[:CHECKED_VALUES]:
+                check_settings(self.source, self._changed(first | {path: value}))
+
+
+class _Range(BaseModel):
+    """Numbers from one to another."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    start: float = Field(alias="from")
+    stop: float = Field(alias="to")
+    n: int = Field(ge=1, le=MAX_POINTS)
+    spacing: Literal["linear", "geometric"] = "linear"
+
+
+class _SweepSection(BaseModel):
+    """A sweep: a shot, what varies in it, repeats, seed, names of metrics."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    shot: str | dict[str, Any]
+    set: dict[str, Any] = {}
+    vary: dict[str, list[Any] | _Range] | None = None
+    points: list[dict[str, Any]] | None = None
+    mode: Literal["product", "zip"] = "product"
+    repeats: int = 1
+    seed: int = 0
+    metrics: list[str] | None = None
+
+
+def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
+    """
+    Read a YAML file of a sweep.
+
+    Parameters
+    ----------
+    path : path
+        With the keys ``shot`` (a file beside it, or the settings themselves), ``vary`` (settings' paths to lists, or to
+        ``{from: 2, to: 16, n: 8, spacing: geometric}``) or ``points`` (a list of settings), ``mode``, ``repeats``, ``seed``,
+        ``metrics``, and ``set`` (settings to be replaced in all points). The file names metrics of :data:`METRICS` only: a file
+        never makes the program import code.
+    metrics : sequence of str
+        More metrics: names, or ``module:function``, which is imported.
+
+    Raises
+    ------
+    ConfigError
+        With the file, the place in it, what was expected and got.
+    ParameterError
+        When there is no such metric.
+    """
+    path = Path(path)
+    section: _SweepSection = validated(path, _SweepSection, read_yaml(path))
+    if (section.vary is None) == (section.points is None):
+        raise ConfigError(path, "must have either 'vary' or 'points'")
+    vary: Any = section.points
+    if section.vary is not None:
+        vary = {
+            name: _numbers(path, name, values) if isinstance(values, _Range) else values
+            for name, values in section.vary.items()
+        }
+    shot: Any = section.shot
+    source = path
+    if isinstance(shot, str):
+        source = path.parent / shot
+        shot = read_settings(source)
+    # The names that the file gives are looked up in METRICS, and never imported.
+    wanted = named_metrics(section.metrics)
+    for name in metrics:
+        for own, metric in named_metrics([metric_of(name) if ":" in name else name]).items():
+            if own in wanted:
+                raise ParameterError("metric", "must have a name of its own; the sweep has one of this name", own)
+            wanted[own] = metric
+    try:
+        return plan_sweep(
+            shot,
+            vary,
+            mode=section.mode,
+            repeats=section.repeats,
+            seed=section.seed,
+            metrics=wanted,
+            changes={name: files_from(path.parent, value, name) for name, value in section.set.items()},
+            source=source,
+            folder=path.parent,
+        )
+    except ParameterError as error:
+        raise ConfigError(path, str(error)) from None
+
+
+def plan_sweep(
+    shot: str | Path | Mapping[str, Any],
+    vary: Mapping[str, Iterable[Any]] | Sequence[Mapping[str, Any]],
+    *,
+    mode: Literal["product", "zip"] = "product",
+    repeats: int = 1,
+    seed: int = 0,
+    metrics: Iterable[str | Metric] | Mapping[str, Metric] | None = None,
+    changes: Mapping[str, Any] | None = None,
+    source: str | Path = "settings",
+    folder: str | Path = ".",
+) -> Plan:
+    """
+    Plan a sweep, and check all that can be checked without building anything.
+
+    Parameters
+    ----------
+    shot : path or mapping
+        A settings file, or settings as it has them.
+    vary : mapping of str to values, or sequence of mappings
+        Values by the settings' paths, such as ``{"sensor.bits": [8, 10]}``; or a list of points, all with the same paths.
+    mode : {"product", "zip"}
+        Every value with every other, or the first with the first, the second with the second.
+    repeats : int
+        Captures of each point, which differ in their seeds.
+    seed : int
+    metrics : names or functions, or mapping of names to functions, optional
+        See :data:`METRICS`. A function takes a shot, its camera and its capture, and gives a number, a text, a mapping of names
+        to such, a numpy array, or an xarray.DataArray.
+    changes : mapping of str to value, optional
+        Settings to be replaced in all points.
+    source : path
+        What messages call settings that are no file.
+    folder : path
+        Where files that ``vary`` names are looked for.
+
+    Raises
+    ------
+    ParameterError, ConfigError
+        When nothing varies, a path or a value is none of the shot's, or there are too many points.
+    """
+    check_choice("mode", mode, ("product", "zip"))
+    if isinstance(shot, Mapping):
+        source, data = Path(source), dict(shot)
+    else:
+        source = Path(shot)
+        data = read_settings(source)
+    values, mode = _by_path(vary, mode)
+    repeats = check_count("repeats", repeats, at_most=MAX_POINTS)
+    counts = [len(each) for each in values.values()]
+    n_points = repeats * (math.prod(counts) if mode == "product" else counts[0])
+    if n_points > MAX_POINTS:
+        raise ParameterError(
+            "vary",
+            f"asks for {n_points:,} points, and a sweep has at most {MAX_POINTS:,}; vary fewer settings together",
+        )
+    found: list[Path] = []
+    settings = files_from(source.parent, data, found=found)
+    for path, value in (changes or {}).items():
+        put_setting(source, settings, path, files_from(Path(folder), value, path, found))
+    settings.pop("seed", None)
+    plan = Plan(
+        source=source.absolute(),
+        settings=settings,
+        values={path: [files_from(Path(folder), v, path, found) for v in each] for path, each in values.items()},
+        mode=mode,
+        repeats=repeats,
+        seed=check_count("seed", seed, at_least=0),
+        metrics=named_metrics(metrics),
+        files={str(file): _digest(file) for file in dict.fromkeys(found)},
+    )
+    plan.check()
+    return plan
+
+
+def _by_path(vary: Any, mode: Literal["product", "zip"]) -> tuple[dict[str, list[Any]], Literal["product", "zip"]]:
+    """Values by path, of a mapping or of a list of points."""
+    if not isinstance(vary, Mapping):
+        points = list(vary) if isinstance(vary, Iterable) and not isinstance(vary, str) else []
+        if not points or not all(isinstance(point, Mapping) and point for point in points):
+            raise ParameterError("vary", "must be values by settings' paths, or a list of points, and not empty", vary)
+        for point in points:
+            if set(point) != set(points[0]):
+                raise ParameterError("points", f"must all have the settings {', '.join(points[0])}", dict(point))
+        vary, mode = {path: [point[path] for point in points] for path in points[0]}, "zip"
+    values: dict[str, list[Any]] = {}
+    for path, each in vary.items():
+        if not isinstance(each, Iterable) or isinstance(each, str | Mapping):
+            raise ParameterError(str(path), "must vary over a list of values", each)
+        if isinstance(each, Sized) and len(each) > MAX_POINTS:
+            raise ParameterError(str(path), f"has {len(each):,} values, and a sweep has at most {MAX_POINTS:,} points")
+        values[str(path)] = [_plain(str(path), value) for value in each]
+    if not values or not all(values.values()):
+        empty = next(iter(values), None)
+        raise ParameterError(empty or "vary", "must have values: nothing varies")
+    if "seed" in values:
+        raise ParameterError("seed", "cannot vary: every point's seed is derived from the sweep's; take 'repeats'")
+    counts = {path: len(each) for path, each in values.items()}
+    if mode == "zip" and len(set(counts.values())) > 1:
+        told = ", ".join(f"{path}: {n}" for path, n in counts.items())
+        raise ParameterError("vary", f"must have as many values of each setting to go side by side ({told})")
+    if mode == "product":
+        for path, each in values.items():
+            texts = [json.dumps(value) for value in each]
+            twice = (
+                next((text for text in texts if texts.count(text) > 1), None) if len(set(texts)) < len(texts) else None
+            )
+            if twice is not None:
+                raise ParameterError(path, f"has the value {twice} twice; take 'repeats' for more captures of a point")
+    return values, mode
+
+
+def _plain(path: str, value: Any) -> Any:
+    """A value as YAML has it."""
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    if isinstance(value, Path):
+        value = str(value)
+    try:
+        return json.loads(json.dumps(value))
+    except (TypeError, ValueError, RecursionError):
+        raise ParameterError(path, "must vary over numbers, texts, lists and sections", value) from None
+
+
+def _numbers(path: Path, name: str, between: _Range) -> list[Any]:
+    if between.spacing == "geometric":
+        if not between.start * between.stop > 0.0:
+            raise ConfigError(path, f"vary.{name}: geometric steps need ends of one sign, and not 0")
+        numbers = np.geomspace(between.start, between.stop, between.n)
+    else:
+        numbers = np.linspace(between.start, between.stop, between.n)
+    if not np.isfinite(numbers).all():
+        raise ConfigError(path, f"vary.{name}: has ends that are not finite")
+    is_whole = bool((numbers == np.rint(numbers)).all())
+    return [int(number) if is_whole else float(number) for number in numbers]
+
+
+def _is_of(path: str, parts: tuple[str, ...]) -> bool:
+    return any(path == part or path.startswith(part + ".") or part.startswith(path + ".") for part in parts)
+
+
+def _copied(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with sections of their own; lists are shared."""
+    return {key: _copied(value) if isinstance(value, dict) else value for key, value in data.items()}
+
+
+def _digest(file: Path) -> str:
+    """SHA-256 of a file; empty where there is none, which the points will tell."""
+    if not file.is_file():
+        return ""
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()

@@ -1,0 +1,276 @@
+"""What points gave, as plain data; and the journal that they are written to, one by one, while a sweep runs."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import os
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.errors import FileError, ParameterError
+
+__all__ = ["Journal", "Record", "Value", "check_same_plan", "journal_of", "values_of"]
+
+FORMAT, VERSION = "foveasim sweep", 1
+#: What a metric may give that is no array.
+Scalar = bool | int | float | str
+
+
+@dataclass(frozen=True, eq=False)
+class Value:
+    """An array of a metric, with names of its dimensions and labels of those that have some."""
+
+    data: NDArray[Any]
+    dims: tuple[str, ...]
+    labels: Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Record:
+    """What a point gave: values by names, what went wrong, and warnings; the texts are empty when all is well."""
+
+    point: int
+    values: Mapping[str, Scalar | Value]
+    error: str = ""
+    warning: str = ""
+
+
+def values_of(name: str, given: Any) -> dict[str, Scalar | Value]:
+    """
+    What a metric gave, by the names of variables.
+
+    Raises
+    ------
+    ParameterError
+        When it is none of a number, a text, a mapping, an array, or an array with labels.
+    """
+    if isinstance(given, Mapping):
+        found: dict[str, Scalar | Value] = {}
+        for key, item in given.items():
+            found |= values_of(f"{name}_{key}", item)
+        return found
+    if isinstance(given, np.generic):
+        given = given.item()
+    if isinstance(given, Scalar):
+        return {name: given}
+    if isinstance(given, np.ndarray):
+        dims = tuple(f"{name}_{k}" for k in range(given.ndim))
+        return {name: Value(_simple(name, given), dims, {})}
+    if all(hasattr(given, part) for part in ("values", "dims", "coords")):
+        dims = tuple(str(dim) for dim in given.dims)
+        labels = {dim: _simple(name, given.coords[dim].values) for dim in dims if dim in given.coords}
+        return {name: Value(_simple(name, given.values), dims, labels)}
+    raise ParameterError(
+        name, f"must give a number, a text, a mapping, an array or an array with labels, got a {type(given).__name__}"
+    )
+
+
+def _simple(name: str, array: Any) -> NDArray[Any]:
+    array = np.asarray(array)
+    if array.dtype.kind in "OT":
+        array = array.astype(str)
+    if array.dtype.kind not in "biufU":
+        raise ParameterError(name, f"must give numbers or texts, got an array of {array.dtype}")
+    return np.ascontiguousarray(array)
+
+
+# -- the journal ------------------------------------------------------------------------------------------------------
+
+
+def journal_of(store: Path) -> Path:
+    """The journal beside a store: there while a sweep runs, and after one that was ended or has points that failed."""
+    return store.with_name(store.name + ".journal")
+
+
+class Journal:
+    """
+    A file of records, a line each, which is whole after any end of the program.
+
+    A line has a checksum, and only whole lines count: what a sudden end cut off is done again. The file is locked while it is
+    open, so that two programs never write it at once.
+    """
+
+    def __init__(self, store: Path, plan: Mapping[str, Any]) -> None:
+        self.path = journal_of(store)
+        self._store = store
+        head = {"format": FORMAT, "version": VERSION, "plan": json.loads(json.dumps(plan))}
+        self.records: dict[int, Record] = {}
+        try:
+            self._file: IO[bytes] = self.path.open("a+b")
+            self._lock()
+            self._file.seek(0)
+            lines = list(_lines(self._file))
+            if not lines and self._file.tell():
+                raise FileError(self.path, "is no sweep's journal")
+            if lines:
+                _check_same(self.path, lines[0][0], head)
+            self._end = sum(length for _, length in lines)
+            self._file.truncate(self._end)
+            if not lines:
+                self._write(head)
+        except OSError as error:
+            raise FileError(self.path, f"cannot be written: {error.strerror or error}") from None
+        for line, _ in lines[1:]:
+            if line is not None:
+                record = _record(line)
+                self.records[record.point] = record
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(OSError):
+            self._file.close()
+
+    def add(self, record: Record) -> None:
+        """
+        Write a record.
+
+        Raises
+        ------
+        FileError
+            When the disk is full, say; what was written before is whole.
+        """
+        try:
+            self._write(_line(record))
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                self._file.truncate(self._end)
+            raise FileError(
+                self.path,
+                f"cannot be written: {error.strerror or error}; {len(self.records):,} points are kept in it, and the same "
+                "sweep goes on from there",
+            ) from None
+        self.records[record.point] = record
+
+    def remove(self) -> None:
+        """Take the file away: its records are in the store."""
+        self.path.unlink(missing_ok=True)
+
+    def _write(self, line: Any) -> None:
+        text = json.dumps(line).encode()
+        whole = b"%08x %s\n" % (zlib.crc32(text), text)
+        # Past Python's buffer: the system has the line, whatever becomes of this process.
+        left = memoryview(whole)
+        while left:
+            left = left[os.write(self._file.fileno(), left) :]
+        self._end += len(whole)
+
+    def _lock(self) -> None:
+        try:
+            import fcntl
+        except ImportError:  # a system without such locks
+            return
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._file.close()
+            raise FileError(self._store, "is being written by another program that runs the same sweep") from None
+
+
+def _lines(file: IO[bytes]) -> Iterator[tuple[Any, int]]:
+    """What the whole lines of a journal say, None where one is broken, and their lengths; nothing of a torn last line."""
+    for line in file:
+        if not line.endswith(b"\n"):
+            return
+        checksum, _, text = line.rstrip(b"\n").partition(b" ")
+        try:
+            said = json.loads(text) if int(checksum, 16) == zlib.crc32(text) else None
+        except ValueError:
+            said = None
+        yield said, len(line)
+
+
+def _check_same(path: Path, found: Any, head: Mapping[str, Any]) -> None:
+    """
+    Whether a journal is of a plan.
+
+    Raises
+    ------
+    FileError
+        When it is of another.
+    """
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise FileError(path, "is no sweep's journal")
+    if found.get("version") != VERSION:
+        raise FileError(path, f"has the format version {found.get('version')}, expected {VERSION}")
+    check_same_plan(path, found["plan"], head["plan"])
+
+
+def check_same_plan(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """
+    Whether results are of a plan.
+
+    Raises
+    ------
+    FileError
+        When they are of another.
+    """
+    wanted = json.loads(json.dumps(wanted))
+    different = _first_difference(found, wanted)
+    if different is not None:
+        raise FileError(
+            path, f"is of another sweep: '{different}' differs; write this one under another name, or remove that one"
+        )
+
+
+def _first_difference(one: Any, other: Any, place: str = "") -> str | None:
+    if isinstance(one, dict) and isinstance(other, dict):
+        for key in dict.fromkeys([*one, *other]):
+            inside = f"{place}.{key}" if place else str(key)
+            if key not in one or key not in other:
+                return inside
+            found = _first_difference(one[key], other[key], inside)
+            if found is not None:
+                return found
+        return None
+    return None if one == other else place or "plan"
+
+
+def _line(record: Record) -> dict[str, Any]:
+    return {
+        "point": record.point,
+        "values": {
+            name: {
+                "data": _packed(value.data),
+                "dims": value.dims,
+                "labels": {dim: _packed(labels) for dim, labels in value.labels.items()},
+            }
+            if isinstance(value, Value)
+            else value
+            for name, value in record.values.items()
+        },
+        "error": record.error,
+        "warning": record.warning,
+    }
+
+
+def _record(line: Mapping[str, Any]) -> Record:
+    values = {
+        name: Value(
+            _unpacked(value["data"]),
+            tuple(value["dims"]),
+            {dim: _unpacked(packed) for dim, packed in value["labels"].items()},
+        )
+        if isinstance(value, dict)
+        else value
+        for name, value in line["values"].items()
+    }
+    return Record(line["point"], values, line["error"], line["warning"])
+
+
+def _packed(array: NDArray[Any]) -> list[Any]:
+    return [array.dtype.str, array.shape, base64.b64encode(array.tobytes()).decode("ascii")]
+
+
+def _unpacked(packed: Any) -> NDArray[Any]:
+    dtype, shape, text = packed
+    return np.frombuffer(base64.b64decode(text), np.dtype(dtype)).reshape(shape)

@@ -1,0 +1,264 @@
+"""Records of points as one labelled data set, and the zarr store that it is kept in."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.arrays import unit_of
+from foveasim.errors import FileError, ParameterError
+from foveasim.explore._plan import POINT, REPEAT, Plan
+from foveasim.explore._records import FORMAT, VERSION, Record, Value
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["check_store", "dataset_of", "open_results", "stored_plan", "write_store"]
+
+#: Variables of every sweep.
+SEED, ERROR, WARNING = "seed", "error", "warning"
+#: Attributes of a store that hold texts of JSON, so that any format can keep them.
+PLAN, SETTINGS, VERSIONS = "plan", "settings", "versions"
+
+
+def dataset_of(plan: Plan, records: Mapping[int, Record]) -> xr.Dataset:
+    """
+    The records as an xarray.Dataset, whatever the order in which they came.
+
+    Parameters
+    ----------
+    plan : Plan
+    records : mapping of int to Record
+        By the points' numbers; points without one have NaN, and the error "not done".
+
+    Returns
+    -------
+    xarray.Dataset
+        Dimensions are the settings that vary, or ``point``, and ``repeat``. Beside the metrics: ``seed``, ``error`` (empty
+        where all is well), ``warning``. Dimensions without labels are as long as the longest, with NaN beyond.
+    """
+    xr = _xarray()
+    shape, dims = plan.shape, plan.dims
+    rows = [records[k] for k in sorted(records)]
+    names = list(dict.fromkeys(name for record in rows for name in record.values))
+    labels = _labels(rows)
+    variables: dict[str, Any] = {}
+    for name in names:
+        given = {record.point: record.values[name] for record in rows if name in record.values}
+        own_dims, flat = _stacked(name, given, plan.n_points, labels)
+        variables[name] = (
+            (*dims, *own_dims),
+            flat.reshape(*shape, *flat.shape[1:]),
+            {"units": unit_of(name)} if unit_of(name) else {},
+        )
+    seeds = np.array([plan.seed_of(k) for k in range(plan.n_points)], np.int64)
+    texts = {
+        ERROR: [records[k].error if k in records else "not done" for k in range(plan.n_points)],
+        WARNING: [records[k].warning if k in records else "" for k in range(plan.n_points)],
+    }
+    variables[SEED] = (dims, seeds.reshape(shape))
+    for name, each in texts.items():
+        variables[name] = (dims, _texts(each).reshape(shape))
+    coords: dict[str, Any] = {
+        path: (
+            (path if plan.mode == "product" else POINT,),
+            coordinate(values),
+            {"units": unit_of(path)} if unit_of(path) else {},
+        )
+        for path, values in plan.values.items()
+    }
+    if plan.mode == "zip":
+        coords[POINT] = np.arange(shape[0])
+    if plan.repeats > 1:
+        coords[REPEAT] = np.arange(plan.repeats)
+    coords |= {dim: (dim, array) for dim, array in labels.items()}
+    described = plan.described()
+    attributes = {
+        "format": FORMAT,
+        "version": VERSION,
+        SETTINGS: json.dumps(described["settings"]),
+        VERSIONS: json.dumps(described["versions"]),
+        PLAN: json.dumps(described),
+    }
+    return xr.Dataset(variables, coords, attributes)
+
+
+def coordinate(values: Iterable[Any]) -> NDArray[Any]:
+    """Values of a setting as labels: numbers, yes and no, or texts; all others as texts of JSON."""
+    values = list(values)
+    for kinds, dtype in (((bool,), np.bool_), ((int,), np.int64), ((int, float), np.float64)):
+        if all(type(value) in kinds for value in values):
+            try:
+                return np.array(values, dtype)
+            except OverflowError:
+                continue
+    if all(isinstance(value, str) for value in values):
+        return _texts(values)
+    return _texts([value if isinstance(value, str) else json.dumps(value) for value in values])
+
+
+def _texts(values: list[str]) -> NDArray[Any]:
+    return np.array(values, np.dtypes.StringDType())
+
+
+def _labels(rows: Iterable[Record]) -> dict[str, NDArray[Any]]:
+    """Labels of each dimension that has some, of all records together: sorted numbers, or texts as they came."""
+    found: dict[str, dict[Any, None]] = {}
+    for record in rows:
+        for value in record.values.values():
+            if isinstance(value, Value):
+                for dim, labels in value.labels.items():
+                    found.setdefault(dim, {}).update(dict.fromkeys(labels.tolist()))
+    return {
+        dim: _texts([str(label) for label in each])
+        if any(isinstance(label, str) for label in each)
+        else np.array(sorted(each))
+        for dim, each in found.items()
+    }
+
+
+def _stacked(
+    name: str, given: Mapping[int, Any], n_points: int, labels: Mapping[str, NDArray[Any]]
+) -> tuple[tuple[str, ...], NDArray[Any]]:
+    """A metric's values of all points, (n_point, ...), with what is not known as NaN or an empty text, and its dimensions."""
+    values = {k: v if isinstance(v, Value) else Value(np.asarray(v), (), {}) for k, v in given.items()}
+    first = next(iter(values.values()))
+    if any(value.dims != first.dims for value in values.values()):
+        told = sorted({str(value.dims) for value in values.values()})
+        raise ParameterError(name, f"must have the same dimensions in all points, got {' and '.join(told)}")
+    # A dimension without labels is this variable's own.
+    dims = tuple(dim if dim in labels else dim if dim.startswith(name) else f"{name}_{dim}" for dim in first.dims)
+    shape = tuple(
+        labels[dim].size if dim in labels else max(value.data.shape[axis] for value in values.values())
+        for axis, dim in enumerate(first.dims)
+    )
+    kinds = {value.data.dtype.kind for value in values.values()}
+    is_text = "U" in kinds
+    is_whole = len(values) == n_points and all(value.data.shape == shape for value in values.values())
+    if is_text:
+        flat: NDArray[Any] = np.full((n_points, *shape), "", np.dtypes.StringDType())
+    else:
+        dtype = np.result_type(*(value.data.dtype for value in values.values()))
+        if dtype.kind not in "biuf":  # whole numbers beyond 64 bits
+            dtype = np.dtype(np.float64)
+        flat = (
+            np.empty((n_points, *shape), dtype)
+            if is_whole
+            else np.full(
+                (n_points, *shape), np.nan, np.promote_types(dtype, np.float64) if dtype.kind != "f" else dtype
+            )
+        )
+    places = {dim: {label: k for k, label in enumerate(labels[dim].tolist())} for dim in first.dims if dim in labels}
+    for k, value in values.items():
+        at: list[Any] = [
+            np.array([places[dim][label] for label in value.labels[dim].tolist()], np.int64)
+            if dim in value.labels
+            else np.arange(value.data.shape[axis])
+            for axis, dim in enumerate(value.dims)
+        ]
+        place: Any = (k, *np.ix_(*at))
+        flat[place] = value.data.astype(flat.dtype) if is_text else value.data
+    return dims, flat
+
+
+# -- the store --------------------------------------------------------------------------------------------------------
+
+
+def check_store(path: Path) -> None:
+    """
+    Whether results can be written there, before anything is computed.
+
+    Raises
+    ------
+    FileError
+        When the folder does not exist, or something else is there.
+    """
+    _xarray()
+    if not path.absolute().parent.is_dir():
+        raise FileError(path, f"cannot be written: the folder {path.absolute().parent} does not exist")
+    if path.exists() and not (path / "zarr.json").is_file():
+        raise FileError(path, "cannot be written: something else than a sweep's results is there")
+
+
+def stored_plan(path: Path) -> dict[str, Any] | None:
+    """
+    The plan of the results in a store; None where there is no store.
+
+    Raises
+    ------
+    FileError
+        When the store is broken, or no sweep's.
+    """
+    if not path.exists():
+        return None
+    try:
+        attributes = json.loads((path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
+        if attributes["format"] == FORMAT:
+            plan: dict[str, Any] = json.loads(attributes[PLAN])
+            return plan
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    raise FileError(path, "holds something else than a sweep's results")
+
+
+def open_results(path: str | Path) -> xr.Dataset:
+    """
+    The results in a store, in memory.
+
+    Raises
+    ------
+    FileError
+        When there is none, or it is broken.
+    """
+    path = Path(path)
+    if stored_plan(path) is None:
+        raise FileError(path, "no such store")
+    try:
+        with _xarray().open_zarr(path, consolidated=False, chunks=None) as dataset:
+            loaded: xr.Dataset = dataset.load()
+            return loaded
+    except Exception as error:  # noqa: BLE001 -- a broken store makes its readers trip over anything
+        raise FileError(path, f"is broken ({' '.join(str(error).split()):.200})") from None
+
+
+def write_store(dataset: xr.Dataset, path: Path) -> None:
+    """
+    Write a zarr folder, whole or not at all, in the place of one that was there.
+
+    Raises
+    ------
+    FileError
+        When nothing can be written there.
+    """
+    token = secrets.token_hex(8)
+    new, old = (path.with_name(f".foveasim-{token}-{which}.zarr") for which in ("new", "old"))
+    try:
+        dataset.to_zarr(new, mode="w-", consolidated=False, zarr_format=3)
+        if path.exists():
+            path.rename(old)
+        new.rename(path)
+    except OSError as error:
+        if old.exists() and not path.exists():
+            old.rename(path)
+        raise FileError(path, f"cannot be written: {error.strerror or error}") from None
+    finally:
+        for folder in (new, old):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _xarray() -> Any:
+    try:
+        import xarray
+        import zarr  # noqa: F401 -- the results' format
+    except ImportError:
+        raise ParameterError(
+            "sweep", "needs xarray and zarr; install them with: pip install 'foveasim[explore]'"
+        ) from None
+    return xarray

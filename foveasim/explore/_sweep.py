@@ -1,0 +1,221 @@
+"""Sweeps: the same shot with other settings, again and again, into one store of results."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import sysconfig
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from foveasim.arrays import Ints, check_count
+from foveasim.errors import SimulationError
+from foveasim.explore._bench import Job, Task
+from foveasim.explore._engine import client_of, records_of
+from foveasim.explore._metrics import Metric
+from foveasim.explore._plan import Plan, plan_sweep
+from foveasim.explore._records import Journal, Record, check_same_plan, journal_of
+from foveasim.explore._results import check_store, dataset_of, open_results, stored_plan, write_store
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["run_sweep", "sweep"]
+
+#: Told how many points are done, of how many.
+Tell = Callable[[int, int], None]
+
+
+def sweep(
+    shot: str | Path | Mapping[str, Any],
+    vary: Mapping[str, Iterable[Any]] | Sequence[Mapping[str, Any]],
+    *,
+    mode: Literal["product", "zip"] = "product",
+    repeats: int = 1,
+    seed: int = 0,
+    metrics: Iterable[str | Metric] | Mapping[str, Metric] | None = None,
+    changes: Mapping[str, Any] | None = None,
+    out: str | Path | None = None,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    retry: bool = False,
+    tell: Tell | None = None,
+) -> xr.Dataset:
+    """
+    Take a shot with many settings, and tabulate metrics over them.
+
+    Parameters
+    ----------
+    shot, vary, mode, repeats, seed, metrics, changes
+        As for :func:`plan_sweep`.
+    out, scheduler, workers, retry, tell
+        As for :func:`run_sweep`.
+
+    Returns
+    -------
+    xarray.Dataset
+        See :func:`run_sweep`.
+
+    Raises
+    ------
+    ParameterError, ConfigError, FileError, SimulationError
+        As for both.
+
+    Notes
+    -----
+    Workers are processes that import the calling program's main file: keep the call under ``if __name__ == "__main__":``.
+
+    Examples
+    --------
+    ::
+
+        results = sweep("shot.yaml", {"sensor.bits": [8, 10, 12], "exposure_s": [0.01, 0.02]}, repeats=10, out="results.zarr")
+        results["snr_mean"].mean("repeat")
+    """
+    plan = plan_sweep(shot, vary, mode=mode, repeats=repeats, seed=seed, metrics=metrics, changes=changes)
+    return run_sweep(plan, out=out, scheduler=scheduler, workers=workers, retry=retry, tell=tell)
+
+
+def run_sweep(
+    plan: Plan,
+    *,
+    out: str | Path | None = None,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    retry: bool = False,
+    tell: Tell | None = None,
+) -> xr.Dataset:
+    """
+    Run a sweep that was planned, or go on with one that was ended.
+
+    Parameters
+    ----------
+    plan : Plan
+    out : path, optional
+        A zarr folder for the results. While the sweep runs, every point that is done is written to a journal beside it, from
+        which the same sweep goes on after any end of the program; the folder is written when all are done. The journal stays
+        where points failed.
+    scheduler : str, optional
+        Address of a dask scheduler, such as ``"tcp://10.0.0.1:8786"``, whose workers have this package and see the files that
+        the settings name under the same names. By default processes on this machine.
+    workers : int, optional
+        Number of those processes; by default one a core.
+    retry : bool
+        Whether points that failed before are tried again.
+    tell : callable, optional
+        Called with the numbers of points that are done and of all.
+
+    Returns
+    -------
+    xarray.Dataset
+        Metrics over the settings that vary; ``seed``, ``error`` and ``warning`` of every point; the plan, all settings and the
+        versions among its attributes. The same, bit for bit, with any number of workers, and after any number of ends.
+
+    Raises
+    ------
+    ParameterError
+        When no scheduler answers, or a package is missing.
+    FileError
+        When the store is another sweep's, or cannot be written.
+    SimulationError
+        When the scheduler or its workers go away. What was done is kept.
+
+    Notes
+    -----
+    A point that raises has NaN and its message among the results, and the others go on. Points with the same layout and light
+    go to the same worker, which keeps layouts, scenes, images, compiled layouts and the light on the sites.
+    """
+    if workers is not None:
+        workers = check_count("workers", workers, at_most=1024)
+    if out is None:
+        records: dict[int, Record] = {}
+        _run(plan, records, lambda record: records.update({record.point: record}), scheduler, workers, tell)
+        return dataset_of(plan, records)
+    store = Path(out)
+    check_store(store)
+    before = stored_plan(store)
+    if before is not None:
+        check_same_plan(store, before, plan.described())
+        if not journal_of(store).exists():
+            if tell is not None:
+                tell(plan.n_points, plan.n_points)
+            return open_results(store)
+    with Journal(store, plan.described()) as journal:
+        if retry:
+            for point in [point for point, record in journal.records.items() if record.error]:
+                del journal.records[point]
+        _run(plan, journal.records, journal.add, scheduler, workers, tell)
+        dataset = dataset_of(plan, journal.records)
+        write_store(dataset, store)
+        if not any(record.error for record in journal.records.values()):
+            journal.remove()
+    return dataset
+
+
+def _run(
+    plan: Plan,
+    known: Mapping[int, Record],
+    add: Callable[[Record], None],
+    scheduler: str | None,
+    workers: int | None,
+    tell: Tell | None,
+) -> None:
+    """Do all points that are not known."""
+    runs = [[int(point) for point in run if int(point) not in known] for run in _runs(plan, workers)]
+    n_left = sum(len(run) for run in runs)
+    n_done = plan.n_points - n_left
+    if tell is not None:
+        tell(n_done, plan.n_points)
+    if n_left == 0:
+        return
+    with client_of(scheduler, workers, n_left) as (client, n_threads):
+        job = _pickled(Job(plan.source, plan.metrics, n_threads, plan.is_geometry_varied))
+        try:
+            for record in records_of(client, job, lambda point: Task(point, plan.settings_of(point)), runs):
+                add(record)
+                n_done += 1
+                if tell is not None:
+                    tell(n_done, plan.n_points)
+        except SimulationError as error:
+            raise SimulationError(f"{error}; {n_done:,} of {plan.n_points:,} points are done") from None
+
+
+def _runs(plan: Plan, workers: int | None) -> list[Ints]:
+    """The points in their order, cut where layout or light changes, so that each worker begins at such a place."""
+    order, begins = plan.order()
+    n_runs = workers or 1
+    wished = np.linspace(0, order.size, n_runs + 1)[1:-1]
+    cuts = {int(begins[np.abs(begins - place).argmin()]) for place in wished} - {0}
+    bounds = [0, *sorted(cuts), order.size]
+    return [order[start:stop] for start, stop in itertools.pairwise(bounds)]
+
+
+def _pickled(job: Job) -> bytes:
+    """The job with the functions of the user's own modules in it: workers need not find those."""
+    import cloudpickle
+
+    own = [sys.modules[name] for metric in job.metrics.values() if (name := _own_module(metric)) is not None]
+    for module in own:
+        cloudpickle.register_pickle_by_value(module)
+    try:
+        return bytes(cloudpickle.dumps(job))
+    except Exception as error:  # noqa: BLE001 -- objects refuse to be pickled in many ways
+        raise SimulationError(f"the metrics cannot be sent to other processes: {error}") from None
+    finally:
+        for module in own:
+            cloudpickle.unregister_pickle_by_value(module)
+
+
+def _own_module(metric: Metric) -> str | None:
+    """Name of a metric's module, where it is a file of the user's and no installed package."""
+    name = getattr(metric, "__module__", None)
+    if name is None or name == "__main__" or name.partition(".")[0] == "foveasim":
+        return None
+    file = getattr(sys.modules.get(name), "__file__", None)
+    if file is None:
+        return None
+    installed = {sysconfig.get_path(kind) for kind in ("purelib", "platlib", "stdlib")}
+    return None if any(Path(file).is_relative_to(folder) for folder in installed) else name
