@@ -10,9 +10,10 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cached_property
-from typing import Any, Literal
+from threading import Lock
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ from foveasim.integrate import Integrator
 from foveasim.layout import Layout
 from foveasim.modes import Between, Exposure, Shutter
 from foveasim.optics import Optics
-from foveasim.parallel import thread_count
+from foveasim.parallel import in_order, thread_count
 from foveasim.reconstruct import Picture, reference
 from foveasim.records import described, versions
 from foveasim.scene import Scene
@@ -162,13 +163,17 @@ class Camera:
 
         Kept for the grids used last, of which ``n_grids`` are used together.
         """
-        integrator = self._integrators.pop((grid, order, place_um), None)
+        key = grid, order, place_um
+        integrator = self._integrators.get(key)
         if integrator is None:
             layout = self._layout.translate(*place_um) if any(place_um) else self._layout
             integrator = Integrator(layout, grid, distortion=self._distortion, order=order, n_threads=self._n_threads)
-        self._integrators[grid, order, place_um] = integrator
+        # One that is in its place already is left there: frames that are computed together find it.
+        if next(reversed(self._integrators), None) != key:
+            self._integrators.pop(key, None)
+            self._integrators[key] = integrator
         while len(self._integrators) > KEPT_INTEGRATORS * n_grids:
-            del self._integrators[next(iter(self._integrators))]
+            self._integrators.pop(next(iter(self._integrators)), None)
         return integrator
 
     def replace(self, *, optics: Optics | None = None, sensor: Sensor | None = None) -> Camera:
@@ -305,13 +310,14 @@ class Camera:
             "layout": described(dict(self._layout.provenance)),
         }
 
-    def rates(self, frames: Iterable[Light]) -> Iterator[Floats]:
+    def rates(self, frames: Iterable[Light], *, ahead: int = 0) -> Iterator[Floats]:
         """
         Expected photoelectrons of every site in a second, frame by frame: what the modes of acquisition take.
 
         Parameters
         ----------
         frames : iterable of Scene or PowerMap, or of pairs with a place (x_um, y_um)
+        ahead : int
             As for :meth:`video`.
 
         Yields
@@ -324,7 +330,8 @@ class Camera:
         ParameterError, SimulationError
             As for :meth:`capture`, when the frame comes.
         """
-        return (rate_e_per_s for *_, rate_e_per_s in self._lit(frames, _Clock()))
+        ahead = check_count("ahead", ahead, at_least=0)
+        return (rate_e_per_s for *_, rate_e_per_s in self._lit(frames, _Clock(), ahead))
 
     def video(
         self,
@@ -337,6 +344,7 @@ class Camera:
         line_s: float = 0.0,
         every: int = 1,
         between: Between = "hold",
+        ahead: int = 0,
     ) -> Iterator[Capture]:
         """
         One capture after the other, each made when it is asked for.
@@ -360,6 +368,9 @@ class Camera:
             Number of frames of light from one capture to the next.
         between : {"hold", "linear"}
             What light does between frames: it holds until the next, or goes over into it in a straight line.
+        ahead : int
+            Frames that are computed before they are asked for, each by one thread, which is faster than all threads on one
+            frame. For frames that do not depend on the captures before.
 
         Yields
         ------
@@ -372,7 +383,8 @@ class Camera:
 
         Notes
         -----
-        In memory are one frame of light and, while exposures overlap, some numbers a site of each; the layout is compiled once.
+        In memory are one frame of light, or ``ahead`` of them, and some numbers a site of every exposure that is going on; the
+        layout is compiled once.
         The same object again is the same light: its image is not computed anew, wherever the gaze goes. A place moves the
         photosites' outlines, so that shifts of any part of a cell are exact; the layout is compiled for each new place.
 
@@ -400,22 +412,22 @@ class Camera:
             name = "line_s" if line_s else "between" if between != "hold" else "every"
             raise ParameterError(name, "needs 'frame_s', the time from one frame of light to the next")
         streams = Streams(seed, first_frame)
-        every = check_count("every", every)
+        every, ahead = check_count("every", every), check_count("ahead", ahead, at_least=0)
         if frame_s is None:
-            return self._still(frames, exposures_s, streams)
+            return self._still(frames, exposures_s, streams, ahead)
         shutter = Shutter(self._layout, frame_s, line_s, between)
-        return self._rolling(frames, exposures_s, streams, shutter, every)
+        return self._rolling(frames, exposures_s, streams, shutter, every, ahead)
 
-    def _still(self, frames: Iterable[Light], exposures_s: Floats, streams: Streams) -> Iterator[Capture]:
+    def _still(self, frames: Iterable[Light], exposures_s: Floats, streams: Streams, ahead: int) -> Iterator[Capture]:
         """A capture for every frame, which is all that lights it."""
         clock = _Clock()
-        for k, (light, place_um, rate_e_per_s) in enumerate(self._lit(frames, clock)):
+        for k, (light, place_um, rate_e_per_s) in enumerate(self._lit(frames, clock, ahead)):
             number = Streams(streams.seed, streams.frame + k)
             exposure_s = float(exposures_s[k % exposures_s.size])
             yield self._exposed(light, rate_e_per_s, exposure_s, number, clock.so_far(), **_told(place_um))
 
     def _rolling(
-        self, frames: Iterable[Light], exposures_s: Floats, streams: Streams, shutter: Shutter, every: int
+        self, frames: Iterable[Light], exposures_s: Floats, streams: Streams, shutter: Shutter, every: int, ahead: int
     ) -> Iterator[Capture]:
         """A capture for every so many frames, lit by all those that its exposure covers."""
         times = {"frame_s": shutter.frame_s, "line_s": shutter.line_s, "every": every, "between": shutter.between}
@@ -429,7 +441,7 @@ class Camera:
             return self._exposed(light, mean_e_per_s, exposure.exposure_s, number, clock.so_far(), **told)
 
         rate_e_per_s = np.zeros(1)
-        for n, (light, place_um, rate_e_per_s) in enumerate(self._lit(frames, clock)):
+        for n, (light, place_um, rate_e_per_s) in enumerate(self._lit(frames, clock, ahead)):
             if n % every == 0:
                 k = n // every
                 going_on.append((k, light, place_um, Exposure(shutter, float(exposures_s[k % exposures_s.size]))))
@@ -441,21 +453,30 @@ class Camera:
         while going_on:
             yield first(rate_e_per_s)
 
-    def _lit(self, frames: Iterable[Light], clock: _Clock) -> Iterator[tuple[Scene | PowerMap, Place, Floats]]:
+    def _lit(
+        self, frames: Iterable[Light], clock: _Clock, ahead: int
+    ) -> Iterator[tuple[Scene | PowerMap, Place, Floats]]:
         """Every frame's light, the sensor's place, and the light on the sites; what frames have in common is computed once."""
-        before: tuple[Scene | PowerMap, Place] | None = None
+        alone = self
+        if ahead:
+            alone = Camera(
+                optics=self._optics, sensor=self._sensor, distortion=self._distortion, order=self._order, n_threads=1
+            )
+        making = Lock()
+
+        def lit(task: _Task) -> tuple[_Task, Floats | None, _Clock]:
+            own = _Clock()
+            if task.is_repeated:
+                return task, None, own
+            # Who comes first makes the images that the next frames of the same light take.
+            with making if task.images == {} else nullcontext():
+                return task, alone._photoelectrons_per_s(task.light, own, task.place_um, task.images), own
+
         rate_e_per_s = np.zeros(self._layout.n_sites)
-        kept: KeptImages = {}
-        for frame in frames:
-            light, place_um = _parts(frame)
-            is_same_light = before is not None and light is before[0]
-            if not is_same_light:
-                kept = {}
-            if not is_same_light or before is None or place_um != before[1]:
-                images = kept if isinstance(frame, tuple) else None
-                rate_e_per_s = self._photoelectrons_per_s(light, clock, place_um, images)
-            before = light, place_um
-            yield light, place_um, rate_e_per_s
+        for task, found, own in in_order(lit, _tasks(frames), self._n_threads, ahead):
+            rate_e_per_s = rate_e_per_s if found is None else found
+            clock.add(own)
+            yield task.light, task.place_um, rate_e_per_s
 
     def predict(self, light: Scene | PowerMap, *, exposure_s: float) -> tuple[Floats, Floats]:
         """
@@ -637,11 +658,40 @@ class _Clock:
         yield
         self.stage_s[name] = self.stage_s.get(name, 0.0) + time.perf_counter() - start_s
 
+    def add(self, other: _Clock) -> None:
+        """Add another's seconds."""
+        for name, s in other.stage_s.items():
+            self.stage_s[name] = self.stage_s.get(name, 0.0) + s
+
     def so_far(self) -> _Clock:
         """What was added up since this was last asked."""
         before = _Clock()
         before.stage_s, self.stage_s = self.stage_s, {}
         return before
+
+
+class _Task(NamedTuple):
+    """One frame of a video: its light, the sensor's place, where its images are kept, and whether nothing changed."""
+
+    light: Scene | PowerMap
+    place_um: Place
+    images: KeptImages | None
+    is_repeated: bool
+
+
+def _tasks(frames: Iterable[Light]) -> Iterator[_Task]:
+    """The frames, with what each has in common with the one before: frames with places share the images of their light."""
+    before: _Task | None = None
+    for frame in frames:
+        light, place_um = _parts(frame)
+        is_same = before is not None and light is before.light
+        images: KeptImages | None = None
+        if isinstance(frame, tuple) and isinstance(light, Scene):
+            is_kept = before is not None and is_same and before.images is not None
+            images = before.images if before is not None and is_kept else {}
+        is_repeated = before is not None and is_same and place_um == before.place_um
+        before = _Task(light, place_um, images, is_repeated)
+        yield before
 
 
 def _told(place_um: Place) -> dict[str, Any]:

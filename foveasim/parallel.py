@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 from foveasim.arrays import check_count
 
-__all__ = ["each", "thread_count"]
+__all__ = ["each", "in_order", "thread_count"]
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -43,3 +44,32 @@ def each(work: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: in
         return [work(item) for item in items]
     with ThreadPoolExecutor(min(n_threads, len(items))) as pool:
         return list(pool.map(work, items))
+
+
+def in_order(
+    work: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: int, n_ahead: int
+) -> Iterator[_Result]:
+    """
+    ``work(item) for item in items``, lazily, with so many items worked on before they are asked for.
+
+    The first one is worked on alone: it may make what the others share. With none ahead no thread is started, and each item is
+    taken when its result is asked for.
+    """
+    remaining = iter(items)
+    if n_ahead == 0:
+        yield from map(work, remaining)
+        return
+    for item in remaining:
+        yield work(item)
+        break
+    pool = ThreadPoolExecutor(min(n_threads, n_ahead))
+    going_on: deque[Future[_Result]] = deque()
+    try:
+        for item in remaining:
+            going_on.append(pool.submit(work, item))
+            if len(going_on) > n_ahead:
+                yield going_on.popleft().result()
+        while going_on:
+            yield going_on.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)

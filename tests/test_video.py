@@ -116,6 +116,57 @@ def test_frames_are_asked_for_one_at_a_time():
     assert asked == [0, 1]
 
 
+@pytest.mark.parametrize("ahead", [1, 2, 5])
+def test_frames_computed_ahead_are_the_same(ahead):
+    scenes = [scene_of(p) for p in pictures(4)]
+    frames = [
+        scenes[0],
+        scenes[0],
+        scenes[1],
+        (scenes[1], (0.3, 0.0)),
+        (scenes[2], (0.3, 0.0)),
+        (scenes[2], (0.5, 0.1)),
+        scenes[3],
+    ]
+    times = {"exposure_s": 0.01, "seed": 3}
+    for how in ({}, {"frame_s": 0.004, "line_s": 1e-3}):
+        plain = list(camera_of(rows_layout()).video(frames, **times, **how))
+        fast = list(camera_of(rows_layout()).video(frames, **times, **how, ahead=ahead))
+        assert len(fast) == 7
+        for a, b in zip(plain, fast, strict=True):
+            assert np.array_equal(a.code, b.code)
+            assert np.array_equal(a.expected_e, b.expected_e)
+            assert a.settings == b.settings
+    rates = camera_of(rows_layout()).rates(frames, ahead=ahead)
+    assert np.array_equal(list(rates), list(camera_of(rows_layout()).rates(frames)))
+
+
+def test_only_so_many_frames_are_taken_ahead_and_none_before_the_first():
+    asked = []
+
+    def frames():
+        for k, picture in enumerate(pictures(6)):
+            asked.append(k)
+            yield scene_of(picture)
+
+    video = camera_of(rows_layout()).video(frames(), exposure_s=0.01, seed=0, ahead=2)
+    next(video)
+    assert asked == [0]
+    next(video)
+    assert asked == [0, 1, 2, 3]
+    video.close()
+    assert asked == [0, 1, 2, 3]
+
+
+def test_an_error_ahead_comes_in_its_turn():
+    good = scene_of(pictures(1)[0])
+    video = camera_of(rows_layout()).video([good, good, "no light"], exposure_s=0.01, seed=0, ahead=2)
+
+    next(video)
+    with pytest.raises(ParameterError, match="Scene or a PowerMap"):
+        list(video)
+
+
 def test_rates_are_the_photoelectrons_of_each_frame():
     scenes = [scene_of(p) for p in pictures(2)]
     camera = camera_of(rows_layout())
@@ -148,6 +199,7 @@ def test_a_bracket_takes_its_exposures_in_turns_and_merges_to_the_light():
         ({"first_frame": -1}, "frame"),
         ({"line_s": 1e-3}, "frame_s"),
         ({"every": 2}, "frame_s"),
+        ({"ahead": -1}, "ahead"),
         ({"between": "linear"}, "frame_s"),
         ({"frame_s": 0.0}, "frame_s"),
         ({"frame_s": 1.0, "every": 0}, "every"),
