@@ -228,7 +228,10 @@ def _grown(array, n_used, n_more):
     if n_used + n_more <= array.shape[0]:
         return array
     larger = np.empty((2 * array.shape[0] + n_more, *array.shape[1:]), array.dtype)
-    larger[:n_used] = array[:n_used]
+    # Number by number: the assignment of a slice takes numba seconds to compile, for the text of an error.
+    to, old = larger.ravel(), array.ravel()
+    for i in range(n_used * (larger.size // larger.shape[0])):
+        to[i] = old[i]
     return larger
 
 
