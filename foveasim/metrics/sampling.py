@@ -39,7 +39,8 @@ def nyquist_per_mm(
         ``"neighbours"``: ``1 / (2 h)``, h the distance of two rows of sites. A site's nearest neighbour gives the direction of
         the row, and the nearest one off that line the next row. Of a lattice this is exactly the frequency below which
         nothing is aliased in any direction: ``1 / (2 p)`` for squares, ``1 / (√3 p)`` for hexagons of pitch p. Gaps between
-        sites do not matter.
+        sites do not matter. Of sites in groups, as one filter's in a quad-Bayer mosaic, it is that within a group: for their
+        repeat see :func:`foveasim.metrics.sampling_spectrum`.
         ``"area"``: ``1 / (2 sqrt(area))`` of the site itself: the same in all directions, and smooth where sites are irregular,
         but right only where sites are without gaps.
     per_channel : bool

@@ -13,7 +13,16 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Bools, Floats, check_choice, check_length_um, check_number, finite_array, read_only
+from foveasim.arrays import (
+    Bools,
+    Floats,
+    as_numbers,
+    check_choice,
+    check_length_um,
+    check_number,
+    finite_array,
+    read_only,
+)
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
 from foveasim.units import per_mm_from_per_um, per_um_from_per_mm
@@ -154,7 +163,7 @@ def slanted_edge_mtf(
     ----------
     ISO 12233:2023, Photography: Electronic still picture imaging: Resolution and spatial frequency responses, annex D (e-SFR).
     """
-    site_values = np.asarray(values, np.float64) if np.ndim(values) == 1 else finite_array("values", values, ndim=1)
+    site_values = np.asarray(as_numbers("values", values), np.float64)
     if site_values.shape != (layout.n_sites,):
         raise ParameterError("values", f"must be one for each of the {layout.n_sites} sites, got {site_values.shape}")
     is_used = np.isfinite(site_values) & _mask(where, layout.n_sites)
