@@ -133,6 +133,6 @@ def polygon_mtf(
     >>> from foveasim.layout import hexagonal
     >>> hexagon = hexagonal(n_columns=1, n_rows=1, pitch_um=4.0)
     >>> np.round(polygon_mtf(hexagon, [0.0, 125.0, 250.0]), 4)
-    array([[1.    , 0.6945, 0.1351]])
+    array([[1.    , 0.6946, 0.1351]])
     """
     return np.abs(polygon_otf(layout, wave_vectors_per_mm(frequency_per_mm, angle_deg), n_threads=n_threads))
