@@ -208,6 +208,36 @@ def view(
 
 
 @app.command()
+def video(
+    settings: Annotated[Path, typer.Argument(help="YAML file of the shot, whose scene's size and light the frames have.")],
+    frames: Annotated[Path, typer.Option("--frames", help="Folder of pictures, or a video file.")],
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="A .zarr folder with every code, a .mp4, .webm or .gif, or a folder of pictures."),
+    ] = Path("video.zarr"),
+    changes: Annotated[list[str] | None, typer.Option("--set", help="Replace a setting: sensor.bits=10.")] = None,
+    frames_per_s: Annotated[float | None, typer.Option("--fps", help="Frames a second of a folder of pictures.")] = None,
+    line_s: Annotated[float, typer.Option("--line-s", help="Rolling shutter: seconds from line to line.")] = 0.0,
+    stop: Annotated[int | None, typer.Option("--stop", help="Frames to take, at most.")] = None,
+    threads: Threads = None,
+) -> None:
+    """Take a video with the camera of a settings file: pictures or a video file in the place of its scene."""
+    from foveasim.config import read_shot
+    from foveasim.shots import run_video
+
+    if frames_per_s is not None and not frames_per_s > 0.0:
+        _end(f"error: --fps must be > 0, got {frames_per_s:g}", BAD_INPUT)
+    with console.status("reading settings"):
+        shot = read_shot(settings, changes or [], n_threads=threads)
+    frame_s = None if frames_per_s is None else 1.0 / frames_per_s
+    try:
+        n = run_video(shot, frames, out, frame_s=frame_s, line_s=line_s, stop=stop, n_threads=threads, progress=True)
+    except KeyboardInterrupt:
+        _end("stopped", STOPPED)
+    console.print(f"wrote {out}: {n:,} frames", soft_wrap=True, highlight=False)
+
+
+@app.command()
 def schema() -> None:
     """Print the JSON schema of a settings file."""
     from foveasim.config import schema as json_schema

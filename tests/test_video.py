@@ -597,3 +597,95 @@ def test_progress_counts_the_frames(tmp_path, capsys):
     write_video(captures_of(2), tmp_path / "v.zarr", progress=True, n_frames=2)
 
     assert "frames" in capsys.readouterr().out
+
+
+# -- the command ------------------------------------------------------------------------------------------------------
+
+SHOT = """
+scene: {kind: picture, picture: photo.png, pitch_um: 100, distance_m: 1.0, peak_radiance_w_m2_sr_nm: 0.2}
+optics: {focal_length_mm: 8, f_number: 2.8}
+layout: {generator: grid, parameters: {n_x: 20, n_y: 20, pitch_um: 3}}
+exposure_s: 0.01
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    rng = np.random.default_rng(0)
+    (tmp_path / "shot.yaml").write_text(SHOT)
+    (tmp_path / "frames").mkdir()
+    for k in range(3):
+        write_picture(tmp_path / "frames" / f"{k}.png", rng.integers(0, 255, (120, 160, 3), np.uint8))
+    write_picture(tmp_path / "photo.png", rng.integers(0, 255, (120, 160, 3), np.uint8))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def command(*arguments):
+    """Exit code of the command video, in this process."""
+    from foveasim.cli import main
+
+    before, sys.argv = sys.argv, ["foveasim", "video", *arguments]
+    try:
+        main()
+    except SystemExit as ended:
+        return ended.code or 0
+    finally:
+        sys.argv = before
+    return 0
+
+
+def test_the_command_takes_a_folder_with_the_camera_of_a_shot(folder, capsys):
+    assert command("shot.yaml", "--frames", "frames", "--out", "v.zarr") == 0
+    recording = read_recording(folder / "v.zarr")
+
+    assert recording.n_frames == 3
+    assert "3 frames" in capsys.readouterr().out
+    from foveasim.config import read_shot
+
+    shot = read_shot("shot.yaml", ["scene.picture=frames/2.png"])
+    alone = shot.camera.capture(shot.scene, exposure_s=0.01, seed=0, frame=2)
+    assert np.array_equal(recording.code[2], alone.code)
+
+
+def test_the_command_stops_after_so_many_frames(folder):
+    assert command("shot.yaml", "--frames", "frames", "--out", "pictures", "--stop", "2") == 0
+
+    assert sorted(p.name for p in (folder / "pictures").iterdir()) == ["frame_000000.png", "frame_000001.png"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("--frames", "none"), "no such file or folder"),
+        (("--frames", "frames", "--fps", "0"), "--fps must be > 0"),
+        (("--frames", "frames", "--line-s", "1e-4"), "frame_s"),
+        (("--frames", "frames", "--line-s", "1e-4", "--fps", "30"), "readout_order"),
+        (("--frames", "frames", "--out", "v.txt"), "must end in"),
+    ],
+)
+@pytest.mark.usefixtures("folder")
+def test_the_command_tells_what_is_wrong_in_one_sentence(capsys, arguments, sentence):
+    assert command("shot.yaml", *arguments) == 2
+    error = capsys.readouterr().err
+
+    assert sentence in error
+    assert "Traceback" not in error
+
+
+def test_frames_like_a_scene_have_its_light():
+    grey, colour = (
+        fs.Scene.from_picture(p, **(LIGHT | {"peak_radiance_w_m2_sr_nm": 0.3, "wavelength_nm": w}))
+        for p, w in ((np.ones((4, 5)), (500.0,)), (np.ones((4, 5, 3)), (600.0, 550.0, 500.0)))
+    )
+    white = np.full((6, 7, 3), 0.5)
+    for like, frame in ((grey, white), (colour, white), (grey, white[..., 0]), (colour, white[..., 0])):
+        (scene,) = Footage([frame], like=like, encoding="linear")
+        assert scene.basis.shape == (like.basis.shape[0], 6, 7)
+        assert np.allclose(scene.basis, 0.5)
+        assert np.array_equal(scene.spectrum_w_m2_sr_nm, like.spectrum_w_m2_sr_nm)
+        assert np.array_equal(scene.wavelength_nm, like.wavelength_nm)
+    with pytest.raises(ParameterError, match="pitch_um"):
+        Footage([], like=grey, pitch_um=3.0)
+    with pytest.raises(ParameterError, match="like"):
+        Footage([], like=3)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sized
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim.arrays import check_count, check_number
@@ -18,6 +20,8 @@ __all__ = ["Footage"]
 
 #: Endings of the pictures that a folder is searched for.
 PICTURE_ENDINGS = (".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga", ".tif", ".tiff", ".webp")
+#: Any wavelengths: they are left off again.
+GREY_NM, COLOUR_NM = (550.0,), (620.0, 550.0, 450.0)
 NEEDS_PYAV = "needs a reader for video files: pip install 'foveasim[video]'"
 
 
@@ -34,8 +38,12 @@ class Footage:
         Which of the frames: as of a slice.
     frame_s : float, optional, s
         From one frame to the next; by default what the video file says.
+    like : Scene, optional
+        A scene whose pitch, distance and spectra the frames have, with the pictures in place of its own: colours are made grey
+        for a scene of one basis image, and grey is made colour for one of three.
     **scene
-        Of :meth:`foveasim.Scene.from_picture`: ``pitch_um``, ``distance_m``, ``peak_radiance_w_m2_sr_nm``, and others.
+        Of :meth:`foveasim.Scene.from_picture`: ``pitch_um``, ``distance_m``, ``peak_radiance_w_m2_sr_nm``, and others; beside
+        ``like`` the ``encoding`` alone.
 
     Raises
     ------
@@ -63,8 +71,18 @@ class Footage:
         stop: int | None = None,
         step: int = 1,
         frame_s: float | None = None,
+        like: Scene | None = None,
         **scene: Any,
     ) -> None:
+        if like is not None and not isinstance(like, Scene):
+            raise ParameterError("like", f"must be a Scene, got a {type(like).__name__}")
+        if like is not None and like.basis.shape[0] not in (1, 3):
+            raise ParameterError("like", f"must have 1 or 3 basis images, as pictures have, got {like.basis.shape[0]}")
+        if like is not None and set(scene) - {"encoding"}:
+            raise ParameterError(
+                min(set(scene) - {"encoding"}), "is that of the scene 'like', and cannot be given beside it"
+            )
+        self._like = like
         self._start = check_count("start", start, at_least=0)
         self._stop = None if stop is None else check_count("stop", stop, at_least=0)
         self._step = check_count("step", step)
@@ -112,7 +130,7 @@ class Footage:
         """Scenes, one after the other."""
         shape: tuple[int, ...] | None = None
         for k, picture in enumerate(islice(iter(self._source), self._start, self._stop, self._step)):
-            scene = Scene.from_picture(picture, **self._scene)
+            scene = Scene.from_picture(picture, **self._scene) if self._like is None else self._made_like(picture)
             if shape is not None and scene.basis.shape != shape:
                 where = picture if isinstance(picture, str | Path) else f"frame {self._start + k * self._step}"
                 raise FileError(
@@ -120,6 +138,23 @@ class Footage:
                 )
             shape = scene.basis.shape
             yield scene
+
+    def _made_like(self, picture: Any) -> Scene:
+        like = self._like
+        assert like is not None
+        n_basis = like.basis.shape[0]
+        read = Scene.from_picture(
+            picture,
+            pitch_um=like.pitch_um,
+            distance_m=like.distance_m,
+            peak_radiance_w_m2_sr_nm=1.0,
+            # One wavelength makes colours grey. The spectra are those of the other scene.
+            wavelength_nm=GREY_NM if n_basis == 1 else COLOUR_NM,
+            band_width_nm=1.0,
+            **self._scene,
+        )
+        basis = np.broadcast_to(read.basis, (n_basis, *read.basis.shape[1:]))
+        return replace(like, basis=basis, source=read.source)
 
 
 def _pictures_in(folder: Path) -> list[Path]:
