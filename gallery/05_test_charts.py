@@ -1,7 +1,7 @@
 """
 Which test charts are there, and what does a sensor of hexagons make of a slanted edge?
 
-New here: ``foveasim.scene.charts``, ``Capture.expected_e``, an MTF by the slanted edge.
+New here: ``foveasim.scene.charts``, ``Capture.expected_e``, ``metrics.slanted_edge_mtf``.
 
 Expect: the edge's angle, 5 degrees, found again within 0.01; the MTF of lens and hexagons, 0.57 at 100 line pairs per mm,
 within 0.006 of its closed form up to 150, since what the lens spreads further than 100 µm is not looked at.
@@ -15,10 +15,9 @@ from pathlib import Path
 import numpy as np
 import shapely
 from matplotlib.figure import Figure
-from scipy.optimize import curve_fit
-from scipy.special import erf
 
 import foveasim as fs
+from foveasim.metrics import slanted_edge_mtf
 from foveasim.scene import charts
 from foveasim.view import plot_capture, save_figure
 
@@ -32,7 +31,6 @@ PITCH_UM = 4.0
 ANGLE_DEG = 5.0
 #: How far from the edge sites are looked at; of the light that a lens spreads, 0.4 % goes further.
 REACH_UM = 100.0
-BIN_UM = 0.25
 PER_MM = np.arange(5.0, 151.0, 5.0)
 
 
@@ -59,23 +57,6 @@ def colours() -> np.ndarray:
     scene = charts.colour_chart(patch_mm=6.0, gap_mm=1.0, illuminant="E", **(SHEET | three))
     rgb = np.tensordot(scene.spectrum_w_m2_sr_nm.T, scene.basis, axes=1) / LIGHT["radiance_w_m2_sr_nm"]
     return np.moveaxis(np.clip(rgb, 0.0, 1.0) ** (1 / 2.2), 0, -1)
-
-
-def edge(x_um: np.ndarray, angle: float, middle: float, width: float, black: float, white: float) -> np.ndarray:
-    """A blurred edge at points (n, 2)."""
-    distance = x_um[:, 0] * np.cos(angle) + x_um[:, 1] * np.sin(angle) - middle
-    return black + (white - black) * (0.5 + 0.5 * erf(distance / width))
-
-
-def mtf_of_an_edge(distance_um: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """MTF at some frequencies, from values at distances from an edge."""
-    borders = np.arange(-REACH_UM, REACH_UM + BIN_UM, BIN_UM)
-    counts, at_um, profile = (np.histogram(distance_um, borders, weights=w)[0] for w in (None, distance_um, values))
-    at_um, profile = at_um / counts, profile / counts
-    spread = np.diff(profile)
-    waves = np.exp(-1j * np.pi * 1e-3 * np.multiply.outer(PER_MM, at_um[:-1] + at_um[1:]))
-    # The mean over bins and the difference of two bins are a sinc each.
-    return np.abs(waves @ spread) / spread.sum() / np.sinc(1e-3 * PER_MM * BIN_UM) ** 2
 
 
 def closed_form(layout: fs.Layout, angle: float) -> np.ndarray:
@@ -115,16 +96,15 @@ def main(out_dir: Path) -> None:
     camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout, capacitance_f=1e-15 * layout.area_um2))
     scene = charts.slanted_edge(angle_deg=ANGLE_DEG, shape=(640, 640), pitch_um=scene_pitch_um, **LIGHT)
     capture = camera.capture(scene, exposure_s=0.1, seed=1)
-    xy_um, electrons = layout.centroid_um, capture.expected_e
-    guess = (np.deg2rad(4.0), 0.0, PITCH_UM, electrons.min(), electrons.max())
-    (angle, middle, *_), _ = curve_fit(edge, xy_um, electrons, guess)
-    distance_um = xy_um[:, 0] * np.cos(angle) + xy_um[:, 1] * np.sin(angle) - middle
-    measured, expected = mtf_of_an_edge(distance_um, electrons), closed_form(layout, angle)
+    found = slanted_edge_mtf(layout, capture.expected_e, reach_um=REACH_UM, frequency_per_mm=PER_MM)
+    angle = np.deg2rad(ANGLE_DEG)
+    measured, expected = found.mtf, closed_form(layout, angle)
+    distance_um = layout.centroid_um @ [np.cos(angle), np.sin(angle)]
 
     figure = Figure(figsize=(14, 4.6), layout="constrained")
     plot_capture(capture, ax=figure.add_subplot(1, 3, 1))
     axes = figure.add_subplot(1, 3, 2)
-    axes.plot(distance_um, electrons, ".", markersize=2)
+    axes.plot(distance_um, capture.expected_e, ".", markersize=2)
     axes.set_xlim(-15, 15)
     axes.set_xlabel("distance of the site from the edge / µm")
     axes.set_ylabel("electrons expected")
@@ -148,9 +128,9 @@ def main(out_dir: Path) -> None:
     at_100 = float(measured[np.searchsorted(PER_MM, 100.0)])
     worst = float(np.abs(measured - expected).max())
     print(
-        f"edge at {np.rad2deg(angle):.4f} degrees; MTF {at_100:.3f} at 100 line pairs per mm, off by {worst:.4f} at most"
+        f"edge at {found.angle_deg:.4f} degrees; MTF {at_100:.3f} at 100 line pairs per mm, off by {worst:.4f} at most"
     )
-    assert abs(np.rad2deg(angle) - ANGLE_DEG) < 0.01
+    assert abs(found.angle_deg - ANGLE_DEG) < 0.01
     assert abs(at_100 - 0.57) < 0.005
     assert worst < 0.006
 
