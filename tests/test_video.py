@@ -92,6 +92,52 @@ def test_the_image_of_the_same_object_is_computed_once():
     assert np.array_equal(second.expected_e, third.expected_e)
 
 
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize(
+    "changes", [{}, {"pupil": fs.optics.Blades(6), "zernike": fs.optics.Zernike(coefficients={7: 0.05})}]
+)
+@pytest.mark.parametrize("pitch_um", [10.0, 60.0])
+def test_what_is_kept_of_the_lens_for_later_frames_changes_no_bit(changes, precision, pitch_um):
+    scenes = [
+        fs.Scene.from_picture(np.stack([p, p.T, 1 - p], axis=-1), **(LIGHT | {"pitch_um": pitch_um}))
+        for p in pictures(4, (130, 130))
+    ]
+    weights = np.random.default_rng(1).random((2, 3))
+
+    def lens():
+        return fs.Optics(focal_length_mm=22.0, f_number=4.0, precision=precision, **changes)
+
+    kept = lens()
+    for scene in scenes:
+        fresh = [cells.tobytes() for cells in lens().weighted_maps(scene, weights)]
+        assert [cells.tobytes() for cells in kept.weighted_maps(scene, weights)] == fresh
+    assert sum(factor is not None for factor in kept._cache._factors.values()) == 6
+
+
+def test_factors_of_a_lens_are_kept_within_their_room(monkeypatch):
+    from foveasim.optics import otf
+
+    small, large = (scene_of(np.ones(shape, np.float32)) for shape in ((120, 160), (240, 320)))
+
+    def kept_sizes(*scenes, optics):
+        for scene in scenes:
+            list(optics.weighted_maps(scene, np.ones((1, 1))))
+        return [factor.size for factor in optics._cache._factors.values() if factor is not None]
+
+    def lens():
+        return fs.Optics(focal_length_mm=22.0, f_number=4.0)
+
+    assert kept_sizes(small, optics=lens()) == []
+    (of_small,) = kept_sizes(small, small, optics=lens())
+    (of_large,) = kept_sizes(large, large, optics=lens())
+    assert len(kept_sizes(small, small, large, large, optics=lens())) == 2
+    # Room for one: the one used before gives way; and room for none.
+    monkeypatch.setattr(otf, "MAX_FACTOR_SIZE", of_small + of_large - 1)
+    assert kept_sizes(small, small, large, large, optics=lens()) == [of_large]
+    monkeypatch.setattr(otf, "MAX_FACTOR_SIZE", of_small - 1)
+    assert kept_sizes(small, small, small, optics=lens()) == []
+
+
 def test_the_layout_is_compiled_once_for_all_frames():
     camera = camera_of(rows_layout())
     list(camera.video([scene_of(p) for p in pictures(3)], exposure_s=0.01, seed=5))

@@ -25,6 +25,8 @@ from foveasim.optics.otf import Tables
 
 __all__ = ["Imaging", "patchwork", "patchwork_error", "reach_cells"]
 
+#: Of a sum's weights, a transform and tables: the factor on a spectrum where one is kept, or None.
+Kept = Callable[[Floats, Transform, Tables], NDArray[Any] | None]
 #: Patterns of neighbouring patches are compared at so many points along either axis, so far beyond what geometry throws aside.
 COMPARED_POINTS, COMPARED_LAMBDA_N = 257, 5.0
 
@@ -58,6 +60,8 @@ class Imaging:
         1 for points, 2 for square source pixels.
     real : float32 or float64
     n_threads : int
+    kept : function
+        Where factors of former maps are found.
     """
 
     basis: Images
@@ -75,6 +79,7 @@ class Imaging:
     sinc_power: int
     real: type[np.floating[Any]]
     n_threads: int
+    kept: Kept
 
     def is_needed(self) -> Bools:
         """Which basis images shine in which output, (n_output, n_basis)."""
@@ -112,10 +117,14 @@ class Imaging:
         def spectrum(b: int) -> NDArray[Any]:
             return transform.forward(self.basis[b], self.tangent2_x, self.tangent2_y, self.falloff_power)
 
-        return self._maps(transform, spectrum, table_of)
+        return self._maps(transform, spectrum, table_of, self.kept)
 
     def _maps(
-        self, transform: Transform, spectrum_of: Callable[[int], NDArray[Any]], table_of: Tables
+        self,
+        transform: Transform,
+        spectrum_of: Callable[[int], NDArray[Any]],
+        table_of: Tables,
+        kept: Kept | None = None,
     ) -> Iterator[NDArray[Any]]:
         is_needed = self.is_needed()
         spectra: dict[int, NDArray[Any]] = {}
@@ -129,9 +138,12 @@ class Imaging:
                 is_first_term = total is None
                 if total is None:
                     total = spectra[b] if is_last_use else np.empty_like(spectra[b])
-                transform.multiply(
-                    spectra[b], *table_of(output * self.light_w_m2[b]), total, is_added=not is_first_term
-                )
+                weight = output * self.light_w_m2[b]
+                factor = kept and kept(weight, transform, table_of)
+                if factor is None:
+                    transform.multiply(spectra[b], *table_of(weight), total, is_added=not is_first_term)
+                else:
+                    transform.multiply_by(spectra[b], factor, total, is_added=not is_first_term)
                 if is_last_use:
                     del spectra[b]
             yield np.zeros(transform.shape, self.real) if total is None else transform.inverse(total)

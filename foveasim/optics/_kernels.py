@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, types
 
-__all__ = ["alias_sum", "alias_sum_plane", "expose", "transfer", "transfer_plane"]
+__all__ = ["alias_sum", "alias_sum_plane", "expose", "multiply", "transfer", "transfer_plane"]
 
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 
@@ -120,6 +120,37 @@ def transfer(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is
         else:
             for ix in range(n_x):
                 out[row, ix] = spectrum[row, ix] * h[ix]
+
+
+@njit(
+    [
+        types.void(
+            types.Array(c, 2, "C", readonly=True),
+            types.Array(h, 2, "C", readonly=True),
+            types.boolean,
+            types.int64,
+            types.int64,
+            c[:, ::1],
+        )
+        for c, h in (
+            (types.complex64, types.float32),
+            (types.complex128, types.float64),
+            (types.complex64, types.complex64),
+            (types.complex128, types.complex128),
+        )
+    ],
+    cache=True,
+    nogil=True,
+)
+def multiply(spectrum, factor, is_added, first_row, last_row, out):
+    """``out = spectrum * factor`` or ``out += spectrum * factor`` over some rows, as :func:`transfer` does with its own."""
+    for row in range(first_row, last_row):
+        if is_added:
+            for ix in range(spectrum.shape[1]):
+                out[row, ix] += spectrum[row, ix] * factor[row, ix]
+        else:
+            for ix in range(spectrum.shape[1]):
+                out[row, ix] = spectrum[row, ix] * factor[row, ix]
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -7,7 +7,7 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,9 @@ from foveasim.optics.otf import MAX_ALIASES, PlaneTables, RadialTables, TableCac
 from foveasim.optics.pupils import Pupil
 from foveasim.parallel import thread_count
 from foveasim.units import m_from_mm, m_from_um, um_from_m, um_from_nm
+
+if TYPE_CHECKING:
+    from foveasim.optics._transform import Transform
 
 __all__ = ["Optics"]
 
@@ -363,6 +366,13 @@ class Optics(PointImages):
             scene.spectrum_w_m2_sr_nm * scene.band_width_nm * share * self.irradiance_per_radiance(scene.distance_m)
         )
         tangent2_x, tangent2_y = self._squared_tangents(scene)
+        # What a factor on a spectrum hangs on, beside the lens and the weights.
+        light = scene.wavelength_nm.tobytes(), scene.distance_m, grid.shape, grid.pitch_um
+
+        def kept(weight: Floats, transform: Transform, table_of: Tables) -> NDArray[Any] | None:
+            n_numbers = math.prod(transform.spectrum_shape) * (1 if is_clear_circle else 2)
+            return self._cache.factor(light, weight, n_numbers, lambda: transform.factor(*table_of(weight)))
+
         imaging = Imaging(
             basis=scene.basis,
             light_w_m2=light_w_m2 * (scene.pitch_um * self.magnification(scene.distance_m) / grid.pitch_um) ** 2,
@@ -381,17 +391,16 @@ class Optics(PointImages):
             sinc_power=1 if self.source_pixel == "point" else 2,
             real=self._real_type(),
             n_threads=n_threads,
+            kept=kept,
         )
         if is_clear_circle:
             return imaging.maps(RadialTables(1.0 / lambda_n_um, self._real_type()))
 
         def tables_at(field_um: tuple[float, float]) -> Tables:
-            light = scene.wavelength_nm.tobytes(), scene.distance_m
-
             def made() -> PlaneTables:
                 return PlaneTables(aperture, scene.wavelength_nm, lambda_n_um, field_um, self._real_type())
 
-            return self._cache.prepared(light, field_um, made, imaging.sums())
+            return self._cache.prepared(light[:2], field_um, made, imaging.sums())
 
         if not self._is_varying():
             return imaging.maps(tables_at((0.0, 0.0)))

@@ -193,6 +193,23 @@ class Transform:
 
         self._each_rows(some_rows, spectrum.shape[0])
 
+    @property
+    def spectrum_shape(self) -> tuple[int, int]:
+        """Rows and columns of a spectrum."""
+        return self._rows.size, self._n_columns
+
+    def factor(self, table: NDArray[Any], per_step: float) -> NDArray[Any]:
+        """What :meth:`multiply` multiplies by, as an array of the spectrum's shape; real for a radial table."""
+        ones = np.ones(self.spectrum_shape, np.result_type(self._real, np.complex64))
+        self.multiply(ones, table, per_step, ones, is_added=False)
+        return np.ascontiguousarray(ones.real) if table.ndim == 1 else ones
+
+    def multiply_by(self, spectrum: NDArray[Any], factor: NDArray[Any], out: NDArray[Any], *, is_added: bool) -> None:
+        """As :meth:`multiply`, bit for bit, with the factor at hand."""
+        self._each_rows(
+            lambda first, last: self._kernels.multiply(spectrum, factor, is_added, first, last, out), spectrum.shape[0]
+        )
+
     def inverse(self, spectrum: NDArray[Any]) -> NDArray[Any]:
         """The picture of a spectrum, without its padding; the spectrum is used up."""
         n_y, n_x = self.shape

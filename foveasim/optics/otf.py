@@ -29,6 +29,10 @@ KEPT_APERTURES = 4
 MAX_TABLE_SIZE = 1 << 24
 #: Complex numbers that a lens keeps for the next frames, 512 MiB in single precision.
 MAX_KEPT_SIZE = 1 << 26
+#: Numbers of the factors on spectra that it keeps, 128 MiB in single precision: those of a colour video of 1080p fit.
+MAX_FACTOR_SIZE = 1 << 25
+#: Sums that it remembers to have been asked for a factor of; the oldest is forgotten first.
+REMEMBERED_SUMS = 64
 
 
 def circular_otf(s: ArrayLike) -> Floats:
@@ -69,8 +73,12 @@ class RadialTables:
         self._real = real
         wanted = TABLE_POINTS[real] * float(f_max_per_um / cutoff_per_um.min())
         n_points = max(TABLE_POINTS[real], int(min(wanted, MAX_TABLE_SIZE / cutoff_per_um.size)))
-        self._otf = circular_otf(np.linspace(0.0, f_max_per_um, n_points) / cutoff_per_um[:, np.newaxis])
+        self._f_per_um, self._cutoff_per_um = np.linspace(0.0, f_max_per_um, n_points), cutoff_per_um
         self._per_step = (n_points - 1) / f_max_per_um
+
+    @cached_property
+    def _otf(self) -> Floats:
+        return circular_otf(self._f_per_um / self._cutoff_per_um[:, np.newaxis])
 
     def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
         """The table, and its steps over frequency (µm)."""
@@ -143,6 +151,7 @@ class TableCache:
         self._lock = Lock()
         self._made: dict[tuple[Hashable, tuple[float, float]], PlaneTables] = {}
         self._apertures: dict[float, Aperture] = {}
+        self._factors: dict[tuple[Hashable, bytes], NDArray[Any] | None] = {}
 
     def __reduce__(self) -> tuple[type[TableCache], tuple[()]]:
         return TableCache, ()
@@ -175,6 +184,36 @@ class TableCache:
             if len(self._made) > 1 and self._size() > MAX_KEPT_SIZE:
                 del self._made[light, field_um]
         return tables
+
+    def factor(
+        self, light: Hashable, weight: Floats, n_numbers: int, made: Callable[[], NDArray[Any]]
+    ) -> NDArray[Any] | None:
+        """
+        What spectra are multiplied by for a weighted sum, from the second time on that it is asked for.
+
+        None the first time, since that of a single picture is not worth its memory, and where there is no room: factors of
+        other light, or of other sizes of pictures, give way.
+        """
+        key = light, weight.tobytes()
+        with self._lock:
+            is_new = key not in self._factors
+            found = self._factors.setdefault(key, None)
+            while len(self._factors) > REMEMBERED_SUMS:
+                del self._factors[next(iter(self._factors))]
+            if is_new or found is not None:
+                return found
+            for other in [other for other in self._factors if other[0] != light]:
+                if self._factor_size() + n_numbers > MAX_FACTOR_SIZE:
+                    del self._factors[other]
+            if self._factor_size() + n_numbers > MAX_FACTOR_SIZE:
+                return None
+        found = made()
+        with self._lock:
+            self._factors[key] = found
+        return found
+
+    def _factor_size(self) -> int:
+        return sum(f.size * (2 if np.iscomplexobj(f) else 1) for f in self._factors.values() if f is not None)
 
     def _size(self) -> int:
         return sum(tables.size for tables in self._made.values())
