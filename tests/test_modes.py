@@ -404,6 +404,13 @@ def test_parts_in_time_are_whole_and_disjoint():
     assert np.array_equal(events.counts(polarity=1) + events.counts(polarity=-1), events.counts())
 
 
+def test_events_that_would_unpack_to_too_much_are_refused(tmp_path, monkeypatch):
+    some_events().save(tmp_path / "e.npz")
+    monkeypatch.setattr(sys.modules[Events.__module__], "MAX_UNPACKED_BYTES", 1000)
+    with pytest.raises(FileError, match="would unpack to more"):
+        Events.load(tmp_path / "e.npz")
+
+
 def test_files_that_hold_no_events_are_told(tmp_path):
     with pytest.raises(FileError, match="must end in"):
         some_events().save(tmp_path / "e.txt")

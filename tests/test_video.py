@@ -639,6 +639,24 @@ def test_a_folder_that_is_no_recording_is_told(tmp_path):
         read_recording(tmp_path / "empty.zarr")
 
 
+def test_a_recording_that_names_other_programs_is_refused(tmp_path):
+    write_video(captures_of(2), tmp_path / "v.zarr")
+    path = tmp_path / "v.zarr" / "code" / "zarr.json"
+    path.write_text(path.read_text().replace('"zstd"', '"numcodecs.pickle"'))
+    with pytest.raises(FileError, match=r"packed with 'numcodecs\.pickle'"):
+        read_recording(tmp_path / "v.zarr")
+
+
+def test_a_recording_of_impossible_size_is_refused(tmp_path):
+    write_video(captures_of(2), tmp_path / "v.zarr")
+    path = tmp_path / "v.zarr" / "xy_um" / "zarr.json"
+    text = path.read_text()
+    path.write_text(text.replace("480", str(10**10), 1))
+    assert path.read_text() != text
+    with pytest.raises(FileError, match="would unpack to more"):
+        read_recording(tmp_path / "v.zarr")
+
+
 def test_progress_counts_the_frames(tmp_path, capsys):
     write_video(captures_of(2), tmp_path / "v.zarr", progress=True, n_frames=2)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,8 @@ HDF5_ENDINGS = (".h5", ".hdf5")
 #: Addresses in files for event tools are 16-bit numbers.
 MAX_ADDRESS = 2**16 - 1
 MICROSECONDS_PER_S = 1e6
+#: A file that would unpack to more than this is refused.
+MAX_UNPACKED_BYTES = 8 * 2**30
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,10 +201,15 @@ class Events:
         if not source.is_file():
             raise FileError(source, "is not a file" if source.exists() else "no such file")
         try:
+            with zipfile.ZipFile(source) as archive:
+                if sum(item.file_size for item in archive.infolist()) > MAX_UNPACKED_BYTES:
+                    raise FileError(source, f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
             with np.load(source, allow_pickle=False) as data:
                 about = json.loads(str(data["about"]))
                 if about.get("format") != FORMAT:
                     raise FileError(source, "holds no events")
+                if about.get("version") != VERSION:
+                    raise FileError(source, f"has the format version {about.get('version')}, expected {VERSION}")
                 columns = {
                     name.removeprefix("column_"): data[name] for name in data.files if name.startswith("column_")
                 }

@@ -34,6 +34,9 @@ ZARR = ".zarr"
 VIDEO_ENDINGS = (".mp4", ".mkv", ".mov", ".webm")
 #: Codes that one chunk of a zarr folder holds, at least one frame of them: what is kept in memory while writing.
 CHUNK_CODES = 1 << 22
+#: What packs the numbers, as zarr does unless told otherwise; and a folder with more numbers beside the codes is refused.
+CODECS = ("bytes", "zstd")
+MAX_UNPACKED_BYTES = 8 * 2**30
 NEEDS = {"zarr": "needs zarr: pip install 'foveasim[video]'", "av": "needs PyAV: pip install 'foveasim[video]'"}
 #: Grey behind what no photosite sees, as a share of white.
 BEHIND = 0.12
@@ -206,12 +209,16 @@ def read_recording(path: str | Path) -> Recording:
     if not source.is_dir():
         raise FileError(source, "is not a folder" if source.exists() else "no such folder")
     try:
+        _check_codecs(source)
         group = zarr.open_group(str(source), mode="r")
         about = dict(group.attrs)
         if about.get("format") != FORMAT:
             raise FileError(source, "is no video of captures")
         if about.get("version") != VERSION:
             raise FileError(source, f"has the format version {about.get('version')}, expected {VERSION}")
+        arrays = [array for name, array in (*group.arrays(), *group["columns"].arrays()) if name != "code"]
+        if sum(array.nbytes for array in arrays) > MAX_UNPACKED_BYTES:
+            raise FileError(source, f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
         columns = {name: values[:] for name, values in group["columns"].arrays()}
         return Recording(
             code=group["code"],
@@ -230,6 +237,17 @@ def read_recording(path: str | Path) -> Recording:
         raise
     except Exception as error:  # noqa: BLE001 -- a broken folder makes its readers trip over anything
         raise FileError(source, f"is broken or no video of captures ({' '.join(str(error).split())})") from None
+
+
+def _check_codecs(source: Path) -> None:
+    """Refuse metadata that name other programs to run on the chunks than those that recordings are packed with."""
+    for path in source.rglob("zarr.json"):
+        metadata = json.loads(path.read_text(encoding="utf-8"))
+        if metadata.get("storage_transformers"):
+            raise FileError(source, "is packed in a way that no video of captures is")
+        for codec in metadata.get("codecs", []):
+            if codec.get("name") not in CODECS:
+                raise FileError(source, f"is packed with {codec.get('name')!r:.40}, as no video of captures is")
 
 
 def _write_zarr(captures: Iterable[Capture], target: Path) -> int:
