@@ -208,6 +208,51 @@ def view(
 
 
 @app.command()
+def sweep(
+    settings: Annotated[Path, typer.Argument(help="YAML file of the sweep: a shot, and what varies in it.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Zarr folder for the results; a sweep that was ended goes on in it.")
+    ] = Path("results.zarr"),
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", help="Address of a dask scheduler; by default processes of this machine."),
+    ] = None,
+    workers: Annotated[int | None, typer.Option("--workers", help="Those processes; one a core by default.")] = None,
+    metrics: Annotated[
+        list[str] | None,
+        typer.Option("--metric", help="One more metric: a name, or module:function, which is imported and run."),
+    ] = None,
+    retry: Annotated[bool, typer.Option("--retry", help="Try points again that failed before.")] = False,
+) -> None:
+    """Take a shot with many settings, and tabulate metrics; the exit code is 1 when a point failed."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+
+    from foveasim.explore import read_sweep, run_sweep
+
+    plan = read_sweep(settings, metrics=metrics or ())
+    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    progress = Progress(*columns, console=console)
+    bar = progress.add_task(settings.stem, total=plan.n_points)
+
+    def tell(n_done: int, n_points: int) -> None:
+        progress.start()  # now that there are workers
+        progress.update(bar, completed=n_done, total=n_points)
+
+    try:
+        results = run_sweep(plan, out=out, scheduler=scheduler, workers=workers, retry=retry, tell=tell)
+    except KeyboardInterrupt:
+        _end(f"stopped; what is done is kept beside {out}, and the same command goes on from there", STOPPED)
+    finally:
+        if progress.live.is_started:
+            progress.stop()
+    sizes = " x ".join(f"{n} {name}" for name, n in zip(plan.dims, plan.shape, strict=True))
+    console.print(f"wrote {out}: {plan.n_points:,} points ({sizes})", soft_wrap=True, highlight=False, markup=False)
+    failed = [text for text in results["error"].to_numpy().ravel().tolist() if text]
+    if failed:
+        _end(f"{len(failed):,} of {plan.n_points:,} points failed; the first: {failed[0]}", BROKEN_RULE)
+
+
+@app.command()
 def video(
     settings: Annotated[Path, typer.Argument(help="YAML file of the shot, whose scene's size and light the frames have.")],
     frames: Annotated[Path, typer.Option("--frames", help="Folder of pictures, or a video file.")],

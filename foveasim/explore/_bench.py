@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import signal
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -166,6 +167,11 @@ def _n_bytes(thing: Any, seen: set[int], depth: int = DEPTH) -> int:
 _lock = Lock()
 #: The job that this process works on, and its bench.
 _current: dict[str, tuple[Job, Bench]] = {}
+
+
+def dask_setup(_worker: Any) -> None:
+    """What a worker that we start does first: Ctrl-C, which the whole terminal gets, is for the program that started it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def run_tasks(job: bytes, versions: Mapping[str, str], tasks: Sequence[Task]) -> tuple[list[Record], int]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import queue
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.explore._bench import Task, run_tasks
 from foveasim.explore._records import Record
-from foveasim.parallel import thread_count
 from foveasim.records import versions
 
 if TYPE_CHECKING:
@@ -30,15 +30,15 @@ BUNDLE_S, LARGEST_BUNDLE = 0.05, 64
 #: Bundles at a worker: one that it works on, and one that waits.
 AT_A_WORKER = 2
 #: A point that ended its worker so often is not tried again.
-MOST_DEATHS = 3
+MOST_DEATHS = 2
 #: How often the workers are counted.
 COUNT_S = 1.0
 
 
 @contextmanager
-def client_of(scheduler: str | None, n_workers: int | None, n_points: int) -> Iterator[tuple[Client, int]]:
+def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
     """
-    A client of a scheduler, or of workers on this machine that end with the block; and the threads for each worker.
+    A client of a scheduler, or of workers on this machine that end with the block.
 
     Raises
     ------
@@ -54,23 +54,14 @@ def client_of(scheduler: str | None, n_workers: int | None, n_points: int) -> It
             "sweep", "needs dask.distributed; install it with: pip install 'foveasim[explore]'"
         ) from None
     if scheduler is not None:
+        _check_answer(scheduler)
+        client = Client(scheduler, timeout=SCHEDULER_S, set_as_default=False)
         try:
-            client = Client(scheduler, timeout=SCHEDULER_S, set_as_default=False)
-        except (OSError, ValueError, TypeError, ImportError) as error:
-            reason = " ".join(str(error).split()).partition(" after")[0] or type(error).__name__
-            raise ParameterError(
-                "scheduler",
-                f"must be the address of a dask scheduler that answers within {SCHEDULER_S:g} s ({reason:.160})",
-                scheduler,
-            ) from None
-        try:
-            yield client, 0
+            yield client
         finally:
             with suppress(Exception):
                 client.close(timeout=2)
         return
-    n_threads = thread_count()
-    n_workers = max(1, min(n_threads if n_workers is None else n_workers, n_points))
     # A worker's end is ours to judge: each point is tried again, alone, and counted.
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 0, "distributed.scheduler.work-stealing": False}),
@@ -79,11 +70,35 @@ def client_of(scheduler: str | None, n_workers: int | None, n_points: int) -> It
             threads_per_worker=1,
             memory_limit=MEMORY_LIMIT // n_workers,
             dashboard_address=None,
+            preload=[run_tasks.__module__],
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
     ):
-        yield client, max(1, n_threads // n_workers)
+        yield client
+
+
+def _check_answer(scheduler: str) -> None:
+    """Ask a scheduler who it is: a client that found none would not let go of the program for a while."""
+    from distributed import rpc
+
+    async def answer() -> Any:
+        async with rpc(scheduler) as asked:
+            return await asyncio.wait_for(asked.identity(), SCHEDULER_S)
+
+    try:
+        # In a thread of its own: a notebook has an event loop in this one.
+        with ThreadPoolExecutor(1) as pool:
+            is_scheduler = pool.submit(lambda: asyncio.run(answer())).result().get("type") == "Scheduler"
+        reason = "it is something else"
+    except Exception as error:  # noqa: BLE001 -- what is no scheduler may answer anything
+        is_scheduler, reason = False, " ".join(str(error).split()) or type(error).__name__
+    if not is_scheduler:
+        raise ParameterError(
+            "scheduler",
+            f"must be the address of a dask scheduler that answers within {SCHEDULER_S:g} s ({reason:.160})",
+            scheduler,
+        )
 
 
 @dataclass(eq=False)

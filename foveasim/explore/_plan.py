@@ -184,8 +184,8 @@ class _Range(BaseModel):
     """Numbers from one to another."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
-    start: float = Field(alias="from")
-    stop: float = Field(alias="to")
+    low: float = Field(alias="from")
+    high: float = Field(alias="to")
     n: int = Field(ge=1, le=MAX_POINTS)
     spacing: Literal["linear", "geometric"] = "linear"
 
@@ -389,11 +389,11 @@ def _plain(path: str, value: Any) -> Any:
 
 def _numbers(path: Path, name: str, between: _Range) -> list[Any]:
     if between.spacing == "geometric":
-        if not between.start * between.stop > 0.0:
+        if not between.low * between.high > 0.0:
             raise ConfigError(path, f"vary.{name}: geometric steps need ends of one sign, and not 0")
-        numbers = np.geomspace(between.start, between.stop, between.n)
+        numbers = np.geomspace(between.low, between.high, between.n)
     else:
-        numbers = np.linspace(between.start, between.stop, between.n)
+        numbers = np.linspace(between.low, between.high, between.n)
     if not np.isfinite(numbers).all():
         raise ConfigError(path, f"vary.{name}: has ends that are not finite")
     is_whole = bool((numbers == np.rint(numbers)).all())

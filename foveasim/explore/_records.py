@@ -105,29 +105,40 @@ class Journal:
         self.records: dict[int, Record] = {}
         try:
             self._file: IO[bytes] = self.path.open("a+b")
-            self._lock()
-            self._file.seek(0)
-            lines = list(_lines(self._file))
-            if not lines and self._file.tell():
-                raise FileError(self.path, "is no sweep's journal")
-            if lines:
-                _check_same(self.path, lines[0][0], head)
-            self._end = sum(length for _, length in lines)
-            self._file.truncate(self._end)
-            if not lines:
-                self._write(head)
         except OSError as error:
             raise FileError(self.path, f"cannot be written: {error.strerror or error}") from None
+        try:
+            lines = self._begin(head)
+        except BaseException as error:
+            self._file.close()
+            if isinstance(error, OSError):
+                raise FileError(self.path, f"cannot be written: {error.strerror or error}") from None
+            raise
         for line, _ in lines[1:]:
             if line is not None:
                 record = _record(line)
                 self.records[record.point] = record
+
+    def _begin(self, head: Mapping[str, Any]) -> list[tuple[Any, int]]:
+        """The whole lines that are there, of the same plan; the head when there are none."""
+        self._lock()
+        self._file.seek(0)
+        lines = list(_lines(self._file))
+        if lines or self._file.tell():
+            _check_same(self.path, lines[0][0] if lines else None, head)
+        self._end = sum(length for _, length in lines)
+        self._file.truncate(self._end)
+        if not lines:
+            self._write(head)
+        return lines
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(OSError):
+            if not self.records:
+                self.remove()
             self._file.close()
 
     def add(self, record: Record) -> None:
@@ -172,7 +183,6 @@ class Journal:
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            self._file.close()
             raise FileError(self._store, "is being written by another program that runs the same sweep") from None
 
 

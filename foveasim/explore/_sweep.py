@@ -19,6 +19,7 @@ from foveasim.explore._metrics import Metric
 from foveasim.explore._plan import Plan, plan_sweep
 from foveasim.explore._records import Journal, Record, check_same_plan, journal_of
 from foveasim.explore._results import check_store, dataset_of, open_results, stored_plan, write_store
+from foveasim.parallel import thread_count
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -140,8 +141,6 @@ def run_sweep(
     if before is not None:
         check_same_plan(store, before, plan.described())
         if not journal_of(store).exists():
-            if tell is not None:
-                tell(plan.n_points, plan.n_points)
             return open_results(store)
     with Journal(store, plan.described()) as journal:
         if retry:
@@ -164,15 +163,18 @@ def _run(
     tell: Tell | None,
 ) -> None:
     """Do all points that are not known."""
-    runs = [[int(point) for point in run if int(point) not in known] for run in _runs(plan, workers)]
-    n_left = sum(len(run) for run in runs)
-    n_done = plan.n_points - n_left
-    if tell is not None:
-        tell(n_done, plan.n_points)
+    n_left = plan.n_points - len(known)
+    n_done = len(known)
     if n_left == 0:
         return
-    with client_of(scheduler, workers, n_left) as (client, n_threads):
-        job = _pickled(Job(plan.source, plan.metrics, n_threads, plan.is_geometry_varied))
+    n_workers = min(thread_count() if workers is None else workers, n_left)
+    runs = [[int(point) for point in run if int(point) not in known] for run in _runs(plan, n_workers)]
+    # A worker of a scheduler knows how many threads it was given.
+    n_threads = max(1, thread_count() // n_workers) if scheduler is None else 0
+    job = _pickled(Job(plan.source, plan.metrics, n_threads, plan.is_geometry_varied))
+    with client_of(scheduler, n_workers) as client:
+        if tell is not None:
+            tell(n_done, plan.n_points)
         try:
             for record in records_of(client, job, lambda point: Task(point, plan.settings_of(point)), runs):
                 add(record)
@@ -183,10 +185,9 @@ def _run(
             raise SimulationError(f"{error}; {n_done:,} of {plan.n_points:,} points are done") from None
 
 
-def _runs(plan: Plan, workers: int | None) -> list[Ints]:
+def _runs(plan: Plan, n_runs: int) -> list[Ints]:
     """The points in their order, cut where layout or light changes, so that each worker begins at such a place."""
     order, begins = plan.order()
-    n_runs = workers or 1
     wished = np.linspace(0, order.size, n_runs + 1)[1:-1]
     cuts = {int(begins[np.abs(begins - place).argmin()]) for place in wished} - {0}
     bounds = [0, *sorted(cuts), order.size]

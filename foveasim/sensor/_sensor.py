@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
@@ -549,7 +549,7 @@ class Sensor:
             mean_e, variance_e2 = _cut_off(drawn_e, drawn_e if is_drawn else np.zeros(1), well_e)
             drawn_e, drawn_e2 = self._coupling.apply(mean_e), self._coupling.variance(variance_e2)
             is_drawn, well_e = False, np.array([np.inf])
-        points, shares = np.polynomial.legendre.leggauss(QUADRATURE_NODES)
+        points, shares = _quadrature()
         line = np.ascontiguousarray(self.layout.readout_line)
         v_per_e = np.atleast_1d(electrons_to_volts(1.0, self.capacitance_f))
         dnl_key = self.device.key("dnl")[0] & np.uint64(0xFFFFFFFF)
@@ -592,6 +592,13 @@ class Sensor:
 def _part(values: Floats, sites: slice) -> Floats:
     """Values of some sites, or the one of all."""
     return values[sites] if values.size > 1 else values
+
+
+@cache
+def _quadrature() -> tuple[Floats, Floats]:
+    """Gauss's points and weights from -1 to 1: an eigenvalue problem, which takes longer than the codes of a small sensor."""
+    points, shares = np.polynomial.legendre.leggauss(QUADRATURE_NODES)
+    return read_only(points), read_only(shares)
 
 
 def _cut_off(mean_e: Floats, variance_e2: Floats, end_e: Floats) -> tuple[Floats, Floats]:

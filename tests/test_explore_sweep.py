@@ -1,0 +1,635 @@
+"""Sweeps: the same numbers on any workers and after any end, every point once, failures told and kept apart."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from foveasim import explore
+from foveasim.config import build_shot
+from foveasim.errors import ConfigError, FileError, ParameterError, SimulationError
+from foveasim.explore._bench import Bench, Job, Task
+from foveasim.explore._records import Journal, Record, journal_of, values_of
+from foveasim.explore._results import dataset_of, write_store
+
+SHOT = {
+    "scene": {
+        "kind": "flat",
+        "shape": [60, 60],
+        "pitch_um": 300.0,
+        "distance_m": 1.0,
+        "radiance_w_m2_sr_nm": 0.1,
+        "band_width_nm": 100.0,
+    },
+    "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    "layout": {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}},
+    "sensor": {"read_noise_e": 2.0, "capacitance_f": 4e-15},
+    "exposure_s": 0.01,
+}
+#: 200 points of every sort: a layout, a lens, electronics, an exposure, repeats.
+VARY_200 = {
+    "layout.parameters.n_x": [8, 12],
+    "optics.f_number": [2.0, 2.8],
+    "sensor.bits": [6, 8, 10, 12, 14],
+    "exposure_s": [0.0005, 0.002],
+}
+REPEATS = 5
+SLOW_S = 0.02
+
+
+def in_process(plan):
+    """The results of a plan without any worker, through one bench."""
+    job, bench = Job(plan.source, plan.metrics, 1, plan.is_geometry_varied), Bench()
+    return dataset_of(plan, {k: bench.record(job, Task(k, plan.settings_of(k))) for k in range(plan.n_points)})
+
+
+def logged(folder, pause_s=0.0):
+    """A metric with a side effect: every execution is a line of a file, with the process that did it."""
+
+    def mean_dn(shot, _, capture):
+        line = f"{shot.seed} {os.getpid()}\n".encode()
+        log = os.open(folder / "log", os.O_CREAT | os.O_APPEND | os.O_WRONLY)
+        os.write(log, line)
+        os.close(log)
+        time.sleep(pause_s)
+        return float(capture.code.mean())
+
+    return {"mean_dn": mean_dn}
+
+
+def executions(folder):
+    """Seeds and processes of all executions."""
+    path = folder / "log"
+    return [tuple(map(int, line.split())) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def wait_for(condition, limit_s=30.0):
+    end_s = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
+def plan_200(metrics=None):
+    return explore.plan_sweep(SHOT, VARY_200, repeats=REPEATS, seed=3, metrics=metrics)
+
+
+@pytest.fixture(scope="module")
+def by_hand():
+    """The 200 points without workers, caches or stores: each shot built anew, and captured."""
+    plan = plan_200()
+    records = {}
+    for point in range(plan.n_points):
+        shot = build_shot("by hand", plan.settings_of(point))
+        capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=plan.seed_of(point))
+        values = {}
+        for name, metric in plan.metrics.items():
+            values |= values_of(name, metric(shot, shot.camera, capture))
+        records[point] = Record(point, values)
+    return dataset_of(plan, records)
+
+
+# -- the same numbers everywhere --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("workers", [1, 2, 4])
+def test_results_are_the_same_with_any_number_of_workers(workers, by_hand, tmp_path):
+    found = explore.run_sweep(plan_200(), out=tmp_path / "r.zarr", workers=workers)
+
+    xr.testing.assert_identical(found, by_hand)
+    xr.testing.assert_identical(explore.open_results(tmp_path / "r.zarr"), by_hand)
+    assert [p.name for p in tmp_path.iterdir()] == ["r.zarr"]
+    # A complete sweep is read: the scheduler, which is none, is not asked.
+    again = explore.run_sweep(plan_200(), out=tmp_path / "r.zarr", scheduler="tcp://127.0.0.1:1")
+    xr.testing.assert_identical(again, by_hand)
+
+
+def free_port():
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+def answers(port):
+    with socket.socket() as one:
+        return one.connect_ex(("127.0.0.1", port)) == 0
+
+
+def test_results_are_the_same_on_a_scheduler_started_separately(by_hand):
+    address = f"tcp://127.0.0.1:{free_port()}"
+    programs = [
+        ("distributed.cli.dask_scheduler", "--host", address, "--no-dashboard"),
+        *[("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard")] * 2,
+    ]
+    running = []
+    try:
+        for module, *arguments in programs:
+            command = [sys.executable, "-m", module, *arguments]
+            running.append(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+            if len(running) == 1:
+                wait_for(lambda: answers(int(address.rpartition(":")[2])))
+
+        found = explore.run_sweep(plan_200(), scheduler=address)
+    finally:
+        for program in reversed(running):
+            program.terminate()
+        for program in running:
+            program.wait(timeout=20)
+
+    xr.testing.assert_identical(found, by_hand)
+
+
+def test_a_points_seed_is_of_the_sweeps_seed_and_its_number_alone():
+    few = explore.plan_sweep(SHOT, {"sensor.bits": [8, 9]}, seed=3)
+    many = plan_200()
+
+    assert [few.seed_of(k) for k in range(2)] == [many.seed_of(k) for k in range(2)]
+    assert len({many.seed_of(k) for k in range(many.n_points)}) == many.n_points
+    assert many.seed_of(0) != explore.plan_sweep(SHOT, VARY_200, seed=4).seed_of(0)
+
+
+# -- ends -------------------------------------------------------------------------------------------------------------
+
+
+def journal_points(store):
+    lines = journal_of(store).read_text().splitlines() if journal_of(store).exists() else []
+    return [json.loads(line.partition(" ")[2])["point"] for line in lines[1:]]
+
+
+def test_a_worker_that_is_killed_costs_nothing_but_what_it_was_doing(by_hand, tmp_path):
+    plan = plan_200(logged(tmp_path, SLOW_S))
+    store = tmp_path / "r.zarr"
+    kept = []
+
+    def kill():
+        wait_for(lambda: len(executions(tmp_path)) > 60)
+        os.kill(executions(tmp_path)[-1][1], signal.SIGKILL)
+        kept.extend(journal_points(store))
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    found = explore.run_sweep(plan, out=store, workers=2)
+    killer.join()
+
+    assert (found["error"] == "").all()
+    np.testing.assert_array_equal(found["mean_dn"], by_hand["mean_code_dn"])
+    seeds = [seed for seed, _ in executions(tmp_path)]
+    assert set(seeds) == set(by_hand["seed"].values.ravel().tolist())
+    assert kept
+    assert all(seeds.count(plan.seed_of(point)) == 1 for point in kept)
+    # Two bundles of 0.05 s may have been at the worker.
+    assert len(seeds) - len(set(seeds)) <= 2 * round(0.05 / SLOW_S)
+
+
+METRIC = """
+import os, time
+from pathlib import Path
+
+def mean_dn(shot, camera, capture):
+    log = os.open(Path(LOG), os.O_CREAT | os.O_APPEND | os.O_WRONLY)
+    os.write(log, f"{shot.seed} {os.getpid()}\\n".encode())
+    os.close(log)
+    time.sleep(0.02)
+    return float(capture.code.mean())
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with a sweep of 60 points, and a metric that logs its executions."""
+    (tmp_path / "shot.yaml").write_text(json.dumps(SHOT))
+    (tmp_path / "own.py").write_text(METRIC.replace("LOG", repr(str(tmp_path / "log"))))
+    vary = {"sensor.bits": [8, 10], "exposure_s": {"from": 0.01, "to": 0.1, "n": 10, "spacing": "geometric"}}
+    (tmp_path / "sweep.yaml").write_text(json.dumps({"shot": "shot.yaml", "vary": vary, "repeats": 3, "seed": 3}))
+    return tmp_path
+
+
+COMMAND = [sys.executable, "-m", "foveasim.cli", "sweep", "sweep.yaml", "--workers", "1", "--metric", "own:mean_dn"]
+
+
+def is_gone(process):
+    stat = Path(f"/proc/{process}/stat")
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return True
+    return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+def ended(end, folder, n_points):
+    """A sweep that is ended when so many points are done: its exit code, its last words, and the points in its journal."""
+    store = folder / "results.zarr"
+    running = subprocess.Popen(
+        COMMAND, cwd=folder, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    wait_for(lambda: len(journal_points(store)) >= n_points)
+    if end == signal.SIGINT:  # as a terminal's Ctrl-C, which all its processes get
+        os.killpg(running.pid, end)
+    else:
+        os.kill(running.pid, end)
+    _, told = running.communicate(timeout=30)
+    wait_for(lambda: all(is_gone(process) for _, process in executions(folder)))
+    return running.returncode, told, journal_points(store)
+
+
+def test_a_sweep_that_was_ended_twice_goes_on_and_no_point_that_was_done_is_done_again(folder):
+    code, told, after_stop = ended(signal.SIGINT, folder, 10)
+    n_stop = len(executions(folder))
+
+    assert code == 130
+    assert told == "stopped; what is done is kept beside results.zarr, and the same command goes on from there\n"
+    assert 10 <= len(after_stop) < 30
+
+    code, _, after_kill = ended(signal.SIGKILL, folder, 30)
+    n_kill = len(executions(folder))
+
+    assert code == -signal.SIGKILL
+    assert after_kill[: len(after_stop)] == after_stop
+    assert 30 <= len(after_kill) < 60
+
+    result = subprocess.run(COMMAND, cwd=folder, capture_output=True, text=True, check=False)
+
+    assert result.returncode == 0, result.stderr
+    assert not journal_of(folder / "results.zarr").exists()
+    found = explore.open_results(folder / "results.zarr")
+    assert (found["error"] == "").all()
+    np.testing.assert_array_equal(found["mean_dn"], found["mean_code_dn"])
+    assert found["mean_dn"].min() > 0
+    plan = explore.read_sweep(folder / "sweep.yaml")
+    seeds = [seed for seed, _ in executions(folder)]
+    assert {plan.seed_of(point) for point in after_stop}.isdisjoint(seeds[n_stop:])
+    assert {plan.seed_of(point) for point in after_kill}.isdisjoint(seeds[n_kill:])
+    assert len(seeds[n_kill:]) == 60 - len(after_kill)
+
+
+def test_points_that_fail_are_in_the_results_with_their_message_and_can_be_tried_again(tmp_path):
+    fatal = tmp_path / "fatal"
+    fatal.touch()
+
+    def moody(shot, *_):
+        if shot.exposure_s == 0.5:
+            raise RuntimeError("no mood")
+        if shot.exposure_s == 1.0 and fatal.exists():
+            os._exit(1)
+        return 7.0
+
+    vary = {"exposure_s": [0.1, -1.0, 0.5, 1.0, 2.0]}
+    plan = explore.plan_sweep(SHOT, vary, metrics={"moody": moody, "n_sites": explore.METRICS["n_sites"]})
+
+    found = explore.run_sweep(plan, out=tmp_path / "r.zarr", workers=1)
+
+    assert found["error"].values.tolist() == [
+        "",
+        "settings: exposure_s: must be >= 0, got -1.0 s".replace("settings", str(plan.source)),
+        "moody: RuntimeError: no mood",
+        "ended its worker 2 times: too little memory, or a crash in a metric",
+        "",
+    ]
+    np.testing.assert_array_equal(found["moody"], [7.0, np.nan, np.nan, np.nan, 7.0])
+    np.testing.assert_array_equal(found["n_sites"], [64, np.nan, 64, np.nan, 64])
+
+    fatal.unlink()
+    found = explore.run_sweep(plan, out=tmp_path / "r.zarr", workers=1, retry=True)
+
+    np.testing.assert_array_equal(found["moody"], [7.0, np.nan, np.nan, 7.0, 7.0])
+    assert journal_of(tmp_path / "r.zarr").exists()
+
+
+# -- the journal and the store ----------------------------------------------------------------------------------------
+
+PLAN = explore.plan_sweep(SHOT, {"sensor.bits": [8, 9, 10]})
+
+
+def test_a_journal_forgets_the_line_that_was_cut_off_and_nothing_else(tmp_path):
+    store = tmp_path / "r.zarr"
+    with Journal(store, PLAN.described()) as journal:
+        for point in range(3):
+            journal.add(Record(point, {"a": 0.1 + point, "curve": values_of("c", np.arange(3.0))["c"]}, "", "µ"))
+    whole = journal_of(store).read_bytes()
+    for n_cut in (1, 20, 60):
+        journal_of(store).write_bytes(whole[:-n_cut])
+        with Journal(store, PLAN.described()) as journal:
+            assert sorted(journal.records) == [0, 1]
+            assert journal.records[1].values["a"] == 1.1
+            np.testing.assert_array_equal(journal.records[1].values["curve"].data, np.arange(3.0))
+    damaged = bytearray(whole)
+    damaged[whole.index(b'"a": 1.1') + 5] ^= 1
+    journal_of(store).write_bytes(damaged)
+    with Journal(store, PLAN.described()) as journal:
+        assert sorted(journal.records) == [0, 2]
+
+
+def test_a_full_disk_is_told_and_leaves_what_was_written_whole(tmp_path, monkeypatch):
+    store = tmp_path / "r.zarr"
+    write = os.write
+
+    def full(file, data):
+        write(file, bytes(data)[:10])
+        raise OSError(28, "No space left on device")
+
+    with Journal(store, PLAN.described()) as journal:
+        journal.add(Record(0, {"a": 1.0}))
+        monkeypatch.setattr(os, "write", full)
+        with pytest.raises(FileError, match=r"No space left on device; 1 points are kept in it"):
+            journal.add(Record(1, {"a": 2.0}))
+    monkeypatch.undo()
+    with Journal(store, PLAN.described()) as journal:
+        assert sorted(journal.records) == [0]
+
+
+def test_two_programs_do_not_write_the_same_store(tmp_path):
+    store = tmp_path / "r.zarr"
+    with Journal(store, PLAN.described()), pytest.raises(FileError, match="being written by another program"):
+        Journal(store, PLAN.described())
+
+
+def test_a_store_of_another_sweep_is_left_alone(tmp_path):
+    store = tmp_path / "r.zarr"
+    write_store(dataset_of(PLAN, {}), store)
+    other = explore.plan_sweep(SHOT, {"sensor.bits": [8, 9, 12]})
+
+    with pytest.raises(FileError, match=r"is of another sweep: 'vary\.sensor\.bits' differs"):
+        explore.run_sweep(other, out=store)
+    assert explore.open_results(store)["sensor.bits"].values.tolist() == [8, 9, 10]
+
+
+@pytest.mark.parametrize("text", ["my notes", "my notes\n", "{}\n{}\n"])
+def test_a_file_that_is_no_journal_is_left_alone(tmp_path, text):
+    journal_of(tmp_path / "r.zarr").write_text(text)
+
+    with pytest.raises(FileError, match="is no sweep's journal"):
+        explore.run_sweep(PLAN, out=tmp_path / "r.zarr")
+    assert journal_of(tmp_path / "r.zarr").read_text() == text
+
+
+# -- what a data set holds --------------------------------------------------------------------------------------------
+
+
+def test_labelled_arrays_are_joined_by_their_labels_and_others_padded():
+    one = xr.DataArray([1.0, 2.0], dims="colour", coords={"colour": ["red", "green"]})
+    two = xr.DataArray([3.0, 4.0], dims="colour", coords={"colour": ["green", "blue"]})
+    records = {
+        k: Record(
+            k, values_of("c", light) | values_of("m", {"n": k, "path": "ab"[k]}) | values_of("v", np.arange(k + 1))
+        )
+        for k, light in enumerate((one, two))
+    }
+
+    found = dataset_of(explore.plan_sweep(SHOT, {"sensor.bits": [8, 9]}), records)
+
+    assert found["colour"].values.tolist() == ["red", "green", "blue"]
+    np.testing.assert_array_equal(found["c"], [[1.0, 2.0, np.nan], [np.nan, 3.0, 4.0]])
+    np.testing.assert_array_equal(found["v"], [[0.0, np.nan], [0.0, 1.0]])
+    assert found["m_n"].values.tolist() == [0, 1]
+    assert found["m_path"].values.tolist() == ["a", "b"]
+
+
+def test_points_side_by_side_are_labelled_with_all_their_settings():
+    points = [
+        {"optics.emission": "isotropic", "layout.parameters.n_x": 8, "sensor.qe": 0.5},
+        {
+            "optics.emission": "lambertian",
+            "layout.parameters.n_x": 9,
+            "sensor.qe": {"kind": "silicon", "depth_um": 3.0},
+        },
+    ]
+    plan = explore.plan_sweep(SHOT, points, repeats=2)
+
+    found = in_process(plan)
+
+    assert found["n_sites"].dims == ("point", "repeat")
+    assert found["n_sites"].values.tolist() == [[64, 64], [72, 72]]
+    assert found["optics.emission"].values.tolist() == ["isotropic", "lambertian"]
+    assert found["sensor.qe"].values.tolist() == ["0.5", '{"kind": "silicon", "depth_um": 3.0}']
+    assert json.loads(found.attrs["settings"])["exposure_s"] == 0.01
+    assert json.loads(found.attrs["versions"])["numpy"] == np.__version__
+
+
+# -- what is shared ---------------------------------------------------------------------------------------------------
+
+
+def test_what_points_have_in_common_is_made_once_and_changes_no_result():
+    plan = plan_200()
+    job = Job(plan.source, plan.metrics, 1, plan.is_geometry_varied)
+    bench = Bench()
+    order, _ = plan.order()
+    shared = {int(point): bench.record(job, Task(point, plan.settings_of(point))) for point in order}
+
+    assert {part: bench.n_made[part] for part in ("scene", "layout", "optics", "images", "light on sites")} == {
+        "scene": 1,
+        "layout": 2,
+        "optics": 2,
+        "images": 2,
+        "light on sites": 4,
+    }
+    small = Bench(kept_bytes=0)
+    for point in (0, 199, 57):
+        assert small.record(job, Task(point, plan.settings_of(point))) == shared[point]
+
+
+def test_points_with_the_same_layout_and_light_are_neighbours_in_any_mode():
+    for plan in (
+        plan_200(),
+        explore.plan_sweep(SHOT, [{"sensor.bits": 6 + k % 3, "optics.f_number": 2.0 + k % 2} for k in range(12)]),
+    ):
+        order, begins = plan.order()
+        assert sorted(order) == list(range(plan.n_points))
+        kinds = [json.dumps([plan.settings_of(k)[part] for part in ("layout", "optics")]) for k in order]
+        assert len(begins) == len(set(kinds))
+        assert all(len(set(kinds[a:b])) == 1 for a, b in zip(begins, [*begins[1:], None], strict=True))
+
+
+def test_a_camera_takes_light_that_is_known_and_shares_its_compiled_layout():
+    shot = build_shot("by hand", SHOT)
+    camera, images = shot.camera, {}
+    known = camera.photoelectrons_per_s(shot.scene, images=images)
+    kept = {place: image.copy() for place, image in images.items()}
+    again = camera.replace(sensor=shot.camera.sensor).photoelectrons_per_s(shot.scene, images=images)
+
+    np.testing.assert_array_equal(known, again)
+    assert kept
+    assert all(np.array_equal(images[place], image) for place, image in kept.items())
+    for anew, taken in zip(
+        *(
+            (c.code, c.electrons, c.expected_e)
+            for c in (
+                camera.capture(shot.scene, exposure_s=0.01, seed=1),
+                camera.capture(shot.scene, exposure_s=0.01, seed=1, photo_e_per_s=known),
+            )
+        ),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(anew, taken)
+    grid = shot.camera.optics.grid(shot.scene)
+    assert camera.replace(optics=shot.camera.optics).integrator(grid) is camera.integrator(grid)
+    with pytest.raises(ParameterError, match="'photo_e_per_s' must be 64 numbers, one a site, got 3"):
+        camera.capture(shot.scene, exposure_s=0.01, seed=1, photo_e_per_s=known[:3])
+
+
+# -- bad sweeps -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("vary", "options", "error", "message"),
+    [
+        ({"sensor.bitz": [8]}, {}, ConfigError, r"sensor\.bitz: no such setting"),
+        ({"sensor.bits": ["ten"]}, {}, ConfigError, r"sensor\.bits: must be a valid integer, got \"ten\""),
+        ({"sensor.bits": [8, "ten"]}, {"mode": "zip"}, ConfigError, r"sensor\.bits: must be a valid integer"),
+        (
+            {"exposure_s.x": [8]},
+            {},
+            ConfigError,
+            r"'exposure_s\.x=8' cannot be set: exposure_s is no section but 0\.01",
+        ),
+        ({"sensor.": [8]}, {}, ConfigError, r"'sensor\.' is no setting's place"),
+        ({}, {}, ParameterError, "'vary' must have values: nothing varies"),
+        ([], {}, ParameterError, "'vary' must be values by settings' paths, or a list of points"),
+        ({"sensor.bits": []}, {}, ParameterError, r"'sensor\.bits' must have values"),
+        ({"sensor.bits": 8}, {}, ParameterError, r"'sensor\.bits' must vary over a list of values, got 8"),
+        ({"sensor.bits": range(10**9)}, {}, ParameterError, r"'sensor\.bits' has 1,000,000,000 values"),
+        (
+            {f"sensor.{n}": range(1000) for n in ("bits", "v_sat_v", "prnu_fraction")},
+            {},
+            ParameterError,
+            "asks for 1,000,000,000 points",
+        ),
+        ({"sensor.bits": [8]}, {"repeats": 10**9}, ParameterError, "'repeats' must be .* 1000000"),
+        ({"sensor.bits": [8, 8]}, {}, ParameterError, "has the value 8 twice"),
+        (
+            {"sensor.bits": [8], "exposure_s": [1, 2]},
+            {"mode": "zip"},
+            ParameterError,
+            r"\(sensor\.bits: 1, exposure_s: 2\)",
+        ),
+        ({"sensor.bits": [8]}, {"mode": "grid"}, ParameterError, "'mode' must be"),
+        ({"sensor.bits": [8]}, {"metrics": ["beauty"]}, ParameterError, "'metrics' must be of .*, got 'beauty'"),
+        ({"sensor.bits": [8]}, {"metrics": []}, ParameterError, "'metrics' must be at least one"),
+        ({"sensor.bits": [8]}, {"metrics": [lambda *_: 1]}, ParameterError, "name functions by a mapping"),
+        ({"sensor.bits": [object()]}, {}, ParameterError, r"'sensor\.bits' must vary over numbers, texts"),
+        ({"seed": [1, 2]}, {}, ParameterError, "'seed' cannot vary"),
+        ({"layout": ["four_zones"], "layout.parameters.n_x": [8]}, {}, ConfigError, "cannot both vary"),
+        (
+            [{"sensor.bits": 8}, {"exposure_s": 1}],
+            {},
+            ParameterError,
+            r"'points' must all have the settings sensor\.bits",
+        ),
+    ],
+)
+def test_a_bad_sweep_ends_before_it_begins_in_one_sentence(vary, options, error, message):
+    with pytest.raises(error, match=message) as caught:
+        explore.plan_sweep(SHOT, vary, **options)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("store", ["nowhere/r.zarr", "file", "folder"])
+def test_a_store_that_cannot_be_written_is_told_before_the_first_point(tmp_path, store):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+
+    with pytest.raises(FileError, match="cannot be written"):
+        explore.run_sweep(PLAN, out=tmp_path / store)
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1", "tcp://", "foo://host:1", "silent"])
+def test_a_scheduler_that_does_not_answer_is_told_and_leaves_nothing(tmp_path, monkeypatch, address):
+    monkeypatch.setattr("foveasim.explore._engine.SCHEDULER_S", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        if address == "silent":  # a port that is open, and says nothing
+            address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(
+            ParameterError, match="'scheduler' must be the address of a dask scheduler that answers within"
+        ):
+            explore.run_sweep(PLAN, out=tmp_path / "r.zarr", scheduler=address)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_metric_that_cannot_be_sent_to_workers_is_told():
+    lock = threading.Lock()
+    plan = explore.plan_sweep(SHOT, {"sensor.bits": [8]}, metrics={"locked": lambda *_: lock.locked()})
+
+    with pytest.raises(SimulationError, match="metrics cannot be sent to other processes"):
+        explore.run_sweep(plan, workers=1)
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_file_says_what_a_call_says(folder):
+    read = explore.read_sweep(folder / "sweep.yaml")
+    called = explore.plan_sweep(
+        folder / "shot.yaml",
+        {"sensor.bits": [8, 10], "exposure_s": np.geomspace(0.01, 0.1, 10)},
+        repeats=3,
+        seed=3,
+    )
+
+    assert read.described() == called.described()
+    assert read.shape == (2, 10, 3)
+    assert read.dims == ("sensor.bits", "exposure_s", "repeat")
+
+
+def test_a_file_never_makes_the_program_import_code(folder):
+    (folder / "trap.py").write_text(f"open({str(folder / 'sprung')!r}, 'w')")
+    sweep = {"shot": "shot.yaml", "vary": {"sensor.bits": [8]}, "metrics": ["trap:metric"]}
+    (folder / "bad.yaml").write_text(json.dumps(sweep))
+    result = subprocess.run([*COMMAND[:4], "bad.yaml"], cwd=folder, capture_output=True, text=True, check=False)
+
+    assert result.returncode == 2
+    assert "'metrics' must be of" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert not (folder / "sprung").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"vary": None}, "must have either 'vary' or 'points'"),
+        ({"points": [{"sensor.bits": 8}]}, "must have either 'vary' or 'points'"),
+        ({"vary": {"sensor.bits": {"from": 1}}}, "vary.sensor.bits"),
+        (
+            {"vary": {"sensor.v_sat_v": {"from": 0, "to": 1, "n": 3, "spacing": "geometric"}}},
+            "geometric steps need ends of one sign",
+        ),
+        ({"shot": "none.yaml"}, "none.yaml: no such file"),
+        ({"repeat": 3}, "repeat: no such setting"),
+        ({"repeats": "three"}, "repeats: must be a valid integer"),
+        ({"set": {"sensor.bitz": 3}}, r"sensor\.bitz: no such setting"),
+    ],
+)
+def test_a_bad_file_is_told_with_its_place(folder, change, message):
+    sweep = json.loads((folder / "sweep.yaml").read_text()) | change
+    (folder / "bad.yaml").write_text(json.dumps({key: value for key, value in sweep.items() if value is not None}))
+
+    with pytest.raises(ConfigError, match=message):
+        explore.read_sweep(folder / "bad.yaml")
+
+
+def test_results_are_of_the_files_as_they_were(folder):
+    (folder / "photo.png").write_bytes(b"one")
+    scene = {
+        "kind": "picture",
+        "picture": "photo.png",
+        "pitch_um": 1.0,
+        "distance_m": 1.0,
+        "peak_radiance_w_m2_sr_nm": 1.0,
+    }
+    (folder / "shot.yaml").write_text(json.dumps(SHOT | {"scene": scene}))
+    plans = [explore.plan_sweep(folder / "shot.yaml", {"sensor.bits": [8]})]
+    (folder / "photo.png").write_bytes(b"two")
+    plans.append(explore.plan_sweep(folder / "shot.yaml", {"sensor.bits": [8]}))
+
+    assert plans[0].settings == plans[1].settings
+    assert plans[0].settings["scene"]["picture"] == str(folder / "photo.png")
+    assert plans[0].described() != plans[1].described()
