@@ -11,7 +11,7 @@ import pytest
 
 import foveasim as fs
 from foveasim.errors import FileError, ParameterError, SimulationError
-from foveasim.modes import EventPixels, Events, SpikingPixels
+from foveasim.modes import EventPixels, Events, SpikingPixels, write_events
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 
 
@@ -394,6 +394,54 @@ def test_hdf5_has_the_arrays_of_event_tools(tmp_path):
     assert np.array_equal(p == 1, events.polarity == 1)
     for ms in (0, 3, 100, len(ms_to_idx) - 1):
         assert ms_to_idx[ms] == np.count_nonzero(t_us < 1000 * ms)
+
+
+def test_batches_make_the_same_hdf5_as_all_events_at_once(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    layout = fs.layout.grid(n_x=6, n_y=4, pitch_um=4.0)
+    pixels = EventPixels(fs.Sensor(layout), noise_per_s=40.0)
+    # In the middle no event for 100 ms.
+    rates = np.concatenate((walk(30, 24), np.repeat(walk(30, 24)[-1:], 10, axis=0), walk(20, 24)))
+    whole = pixels.events(rates, frame_s=0.01, seed=1)
+    whole.save(tmp_path / "whole.h5")
+
+    assert write_events(pixels.stream(rates, frame_s=0.01, seed=1, batch=3), tmp_path / "batches.h5") == len(whole)
+    names = [
+        "events/t",
+        "events/x",
+        "events/y",
+        "events/p",
+        "events/site",
+        "ms_to_idx",
+        "t_offset",
+        "sites/x_um",
+        "sites/area_um2",
+    ]
+    with h5py.File(tmp_path / "whole.h5") as a, h5py.File(tmp_path / "batches.h5") as b:
+        for name in names:
+            assert np.array_equal(a[name][()], b[name][()])
+            assert a[name].dtype == b[name].dtype
+
+
+def test_hdf5_of_no_events_or_of_batches_that_do_not_follow_each_other(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    events = some_events()
+    with pytest.raises(ParameterError, match="follow each other"):
+        write_events([events, events], tmp_path / "e.h5")
+    with pytest.raises(ParameterError, match="at least one batch"):
+        write_events([], tmp_path / "e.h5")
+    with pytest.raises(FileError, match="must end in"):
+        write_events([events], tmp_path / "e.npz")
+    assert list(tmp_path.iterdir()) == []
+    assert write_events([events.between(5.0, 6.0)], tmp_path / "e.h5") == 0
+    with h5py.File(tmp_path / "e.h5") as file:
+        assert file["ms_to_idx"][:].tolist() == [0]
+
+
+def test_a_missing_hdf5_library_is_told(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(FileError, match=r"pip install 'foveasim\[video\]'"):
+        some_events().save(tmp_path / "e.h5")
 
 
 def test_parts_in_time_are_whole_and_disjoint():

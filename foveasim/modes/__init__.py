@@ -10,8 +10,8 @@ Ways of acquisition beyond one exposure of all sites at once: rolling shutters, 
 
 from __future__ import annotations
 
-from foveasim.modes.events import Events
+from foveasim.modes.events import Events, write_events
 from foveasim.modes.pixels import EventPixels, SpikingPixels
 from foveasim.modes.shutter import Between, Exposure, Shutter
 
-__all__ = ["Between", "EventPixels", "Events", "Exposure", "Shutter", "SpikingPixels"]
+__all__ = ["Between", "EventPixels", "Events", "Exposure", "Shutter", "SpikingPixels", "write_events"]

@@ -17,10 +17,12 @@ from foveasim.errors import FileError, ParameterError
 from foveasim.files import written_whole
 from foveasim.layout import Layout
 
-__all__ = ["Events"]
+__all__ = ["Events", "write_events"]
 
 FORMAT, VERSION = "foveasim events", 1
 HDF5_ENDINGS = (".h5", ".hdf5")
+#: Events of one chunk in HDF5.
+CHUNK_EVENTS = 1 << 16
 #: Addresses in files for event tools are 16-bit numbers.
 MAX_ADDRESS = 2**16 - 1
 MICROSECONDS_PER_S = 1e6
@@ -124,8 +126,7 @@ class Events:
         Parameters
         ----------
         path : path
-            ``.npz``: the arrays and the layout, which :meth:`load` reads. ``.h5`` or ``.hdf5``, with the extra ``video``: see
-            below.
+            ``.npz``: the arrays and the layout, which :meth:`load` reads. ``.h5`` or ``.hdf5``: as :func:`write_events`.
         pitch_um : float, optional, µm
             Of the raster of :meth:`addresses` in HDF5.
 
@@ -133,18 +134,10 @@ class Events:
         ------
         FileError
             When the ending is none of these, h5py is missing, or nothing can be written there.
-
-        Notes
-        -----
-        HDF5 as of the data set DSEC (Gehrig et al., IEEE Robotics and Automation Letters 6, 4947, 2021), and of the tools
-        that read it: the group ``events`` with the arrays ``t`` (µs, int64), ``x`` and ``y`` (uint16, row 0 on top) and ``p``
-        (uint8, 0 or 1), and beside it ``ms_to_idx``, the first event of each millisecond, and ``t_offset`` of 0. Moreover
-        ``events/site``, and the sites' ``sites/x_um``, ``sites/y_um``, ``sites/area_um2``, ``sites/x`` and ``sites/y``: since
-        sites may share an address.
         """
         target = Path(path)
         if target.suffix.lower() in HDF5_ENDINGS:
-            self._save_hdf5(target, pitch_um)
+            write_events([self], target, pitch_um=pitch_um)
             return
         if target.suffix.lower() != ".npz":
             raise FileError(target, "must end in .npz, .h5 or .hdf5")
@@ -154,38 +147,6 @@ class Events:
         about = np.array(json.dumps({"format": FORMAT, "version": VERSION}))
         with written_whole(target) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, about=about, t_s=self.t_s, site=self.site, polarity=self.polarity, **arrays)
-
-    def _save_hdf5(self, target: Path, pitch_um: float | None) -> None:
-        try:
-            import h5py
-        except ImportError:
-            raise FileError(target, "needs h5py: pip install 'foveasim[video]'") from None
-        x, y = self.addresses(pitch_um)
-        t_us = np.floor(self.t_s * MICROSECONDS_PER_S).astype(np.int64)
-        n_ms = int(t_us[-1]) // 1000 + 2 if t_us.size else 1
-        with written_whole(target) as temporary, h5py.File(temporary, "w") as file:
-            events: dict[str, NDArray[Any]] = {
-                "t": t_us,
-                "x": x[self.site],
-                "y": y[self.site],
-                "p": (self.polarity > 0).astype(np.uint8),
-                "site": self.site,
-            }
-            for name, values in events.items():
-                file.create_dataset(f"events/{name}", data=values, compression="gzip", shuffle=True)
-            file["ms_to_idx"] = np.searchsorted(t_us, 1000 * np.arange(n_ms)).astype(np.uint64)
-            file["t_offset"] = np.int64(0)
-            centroid_um = self.layout.centroid_um
-            sites: dict[str, NDArray[Any]] = {
-                "x_um": centroid_um[:, 0],
-                "y_um": centroid_um[:, 1],
-                "area_um2": self.layout.area_um2,
-                "x": x,
-                "y": y,
-            }
-            for name, values in sites.items():
-                file[f"sites/{name}"] = values
-            file.attrs.update({"format": FORMAT, "version": VERSION})
 
     @classmethod
     def load(cls, path: str | Path) -> Events:
@@ -219,3 +180,95 @@ class Events:
             raise
         except Exception as error:  # noqa: BLE001 -- a broken file makes its readers trip over anything
             raise FileError(source, f"is broken or holds no events ({' '.join(str(error).split())})") from None
+
+
+def write_events(batches: Iterable[Events], path: str | Path, *, pitch_um: float | None = None) -> int:
+    """
+    Write events to an HDF5 file as they come, whole or not at all.
+
+    Parameters
+    ----------
+    batches : iterable of Events
+        That follow each other, as :meth:`foveasim.modes.EventPixels.stream` gives them.
+    path : path
+        ``.h5`` or ``.hdf5``; needs the extra ``video``.
+    pitch_um : float, optional, µm
+        Of the raster of :meth:`Events.addresses`.
+
+    Returns
+    -------
+    n_events : int
+        How many were written.
+
+    Raises
+    ------
+    FileError
+        When the ending is none of these, h5py is missing, or nothing can be written there.
+    ParameterError
+        When there is no batch, or one begins before the end of the one before it.
+
+    Notes
+    -----
+    HDF5 as of the data set DSEC (Gehrig et al., IEEE Robotics and Automation Letters 6, 4947, 2021), and of the tools that read
+    it: the group ``events`` with the arrays ``t`` (µs, int64), ``x`` and ``y`` (uint16, row 0 on top) and ``p`` (uint8, 0 or
+    1), and beside it ``ms_to_idx``, the first event of each millisecond, and ``t_offset`` of 0. Moreover ``events/site``, and the
+    sites' ``sites/x_um``, ``sites/y_um``, ``sites/area_um2``, ``sites/x`` and ``sites/y``: since sites may share an address.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in HDF5_ENDINGS:
+        raise FileError(target, "must end in .h5 or .hdf5")
+    try:
+        import h5py
+    except ImportError:
+        raise FileError(target, "needs h5py: pip install 'foveasim[video]'") from None
+    n, n_ms, last_us = 0, 0, -1
+    with written_whole(target) as temporary, h5py.File(temporary, "w") as file:
+        for batch in batches:
+            if "sites" not in file:
+                x, y = batch.addresses(pitch_um)
+                _begin(file, batch.layout, x, y)
+            if len(batch) == 0:
+                continue
+            t_us = np.floor(batch.t_s * MICROSECONDS_PER_S).astype(np.int64)
+            if t_us[0] < last_us:
+                raise ParameterError("batches", f"must follow each other, got one that begins at {batch.t_s[0]:g} s")
+            last_us = int(t_us[-1])
+            arrays: dict[str, NDArray[Any]] = {
+                "t": t_us,
+                "x": x[batch.site],
+                "y": y[batch.site],
+                "p": batch.polarity > 0,
+                "site": batch.site,
+            }
+            for name, values in arrays.items():
+                _append(file[f"events/{name}"], values)
+            # Of the milliseconds that begin behind all events before.
+            begins_us = 1000 * np.arange(n_ms, last_us // 1000 + 1)
+            _append(file["ms_to_idx"], n + np.searchsorted(t_us, begins_us))
+            n, n_ms = n + t_us.size, last_us // 1000 + 1
+        if "sites" not in file:
+            raise ParameterError("batches", "must hold at least one batch of events")
+        _append(file["ms_to_idx"], np.array([n]))
+    return n
+
+
+def _begin(file: Any, layout: Layout, x: NDArray[np.uint16], y: NDArray[np.uint16]) -> None:
+    """What an HDF5 file of events has before the first."""
+    kinds = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8, "site": np.int32}
+    for name, kind in kinds.items():
+        file.create_dataset(
+            f"events/{name}", (0,), kind, maxshape=(None,), chunks=(CHUNK_EVENTS,), compression="gzip", shuffle=True
+        )
+    file.create_dataset("ms_to_idx", (0,), np.uint64, maxshape=(None,), chunks=(CHUNK_EVENTS,))
+    file["t_offset"] = np.int64(0)
+    centroid_um = layout.centroid_um
+    sites = {"x_um": centroid_um[:, 0], "y_um": centroid_um[:, 1], "area_um2": layout.area_um2, "x": x, "y": y}
+    for name, values in sites.items():
+        file[f"sites/{name}"] = values
+    file.attrs.update({"format": FORMAT, "version": VERSION})
+
+
+def _append(dataset: Any, values: NDArray[Any]) -> None:
+    n = dataset.shape[0]
+    dataset.resize((n + values.size,))
+    dataset[n:] = values
