@@ -209,10 +209,11 @@ def write_events(batches: Iterable[Events], path: str | Path, *, pitch_um: float
 
     Notes
     -----
-    HDF5 as of the data set DSEC (Gehrig et al., IEEE Robotics and Automation Letters 6, 4947, 2021), and of the tools that read
-    it: the group ``events`` with the arrays ``t`` (µs, int64), ``x`` and ``y`` (uint16, row 0 on top) and ``p`` (uint8, 0 or
-    1), and beside it ``ms_to_idx``, the first event of each millisecond, and ``t_offset`` of 0. Moreover ``events/site``, and the
-    sites' ``sites/x_um``, ``sites/y_um``, ``sites/area_um2``, ``sites/x`` and ``sites/y``: since sites may share an address.
+    HDF5 as of the data set DSEC (Gehrig et al., IEEE Robotics and Automation Letters 6, 4947, 2021), and of the tools that
+    read it: the group ``events`` with the arrays ``t`` (µs, int64), ``x`` and ``y`` (uint16, row 0 on top) and ``p`` (uint8, 0
+    or 1), and beside it ``ms_to_idx``, the first event of each millisecond, and ``t_offset`` of 0. Moreover ``events/site``,
+    and the sites' ``sites/x_um``, ``sites/y_um``, ``sites/area_um2``, ``sites/x`` and ``sites/y``: since sites may share an
+    address.
     """
     target = Path(path)
     if target.suffix.lower() not in HDF5_ENDINGS:
