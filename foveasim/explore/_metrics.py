@@ -25,6 +25,8 @@ Metric = Callable[[Shot, Camera, Capture], Any]
 
 #: Side of the pictures that are compared.
 PSNR_PIXELS = 256
+#: Variance of what rounding to a code takes away, in codes.
+QUANTISATION_DN2 = 1.0 / 12.0
 #: Metrics of a sweep that names none.
 DEFAULT_METRICS = ("mean_code_dn", "saturated_fraction", "snr", "n_sites")
 
@@ -43,17 +45,17 @@ def snr(shot: Shot, camera: Camera, capture: Capture) -> dict[str, float]:
     """
     Signal over temporal noise of the codes, predicted without a draw: mean and median over the sites.
 
-    The signal is the mean code less that of darkness. Sites within half a code of the highest have no noise and are left out;
-    NaN where none is left.
+    The signal is the mean code less that of darkness; the variance is no less than the 1/12 DN² of rounding. Sites within half
+    a code of the highest tell nothing and are left out; NaN where none is left.
     """
     sensor = camera.sensor
     mean_dn, variance_dn2 = sensor.predict(capture.expected_e)
     dark_e = sensor.expected_electrons(np.zeros(sensor.layout.n_sites), shot.exposure_s)
     dark_dn, _ = sensor.predict(dark_e)
-    counts = (variance_dn2 > 0.0) & (mean_dn < 2**sensor.bits - 1.5)
+    counts = mean_dn < 2**sensor.bits - 1.5
     if not counts.any():
         return {"mean": float("nan"), "median": float("nan")}
-    ratio = (mean_dn - dark_dn)[counts] / np.sqrt(variance_dn2[counts])
+    ratio = (mean_dn - dark_dn)[counts] / np.sqrt(np.maximum(variance_dn2[counts], QUANTISATION_DN2))
     return {"mean": float(ratio.mean()), "median": float(np.median(ratio))}
 
 

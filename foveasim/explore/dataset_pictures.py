@@ -1,0 +1,286 @@
+"""Pictures of a data set, one at a time: of a folder, a zip file, an array, or anything that has a length and items."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+import zipfile
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.errors import FileError, ParameterError
+from foveasim.pictures import read_picture
+from foveasim.records import described
+
+__all__ = ["Source", "source_of"]
+
+#: Endings of the files that are taken for pictures.
+ENDINGS = (".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga", ".tif", ".tiff", ".webp")
+#: A packed picture that would unpack to more than this is refused.
+MAX_UNPACKED_BYTES = 2**30
+
+
+class Source(Protocol):
+    """Where pictures come from."""
+
+    def __len__(self) -> int: ...
+
+    def name(self, k: int) -> str:
+        """What messages call a picture."""
+
+    def picture(self, k: int) -> NDArray[Any]:
+        """A picture as :func:`foveasim.pictures.read_picture` gives it, first row on top."""
+
+    def labels(self) -> list[Any] | None:
+        """What the source itself says of every picture's class, or None."""
+
+    def described(self) -> dict[str, Any]:
+        """Plain data that tells the source from others."""
+
+
+def source_of(pictures: Any) -> Source:
+    """
+    Whatever holds pictures, as a source.
+
+    Raises
+    ------
+    FileError
+        When there is no such file, or no picture in it.
+    ParameterError
+        When it is none of what a data set takes.
+    """
+    if isinstance(pictures, str | Path):
+        path = Path(pictures).absolute()
+        if path.is_dir():
+            return _Folder(path)
+        if not path.is_file():
+            raise FileError(path, "no such file or folder")
+        if path.suffix.lower() == ".npy":
+            return _ArrayFile(path)
+        if zipfile.is_zipfile(path):
+            return _Zip(path)
+        raise FileError(path, "must be a folder of pictures, a zip file of them, or an array (.npy)")
+    if isinstance(pictures, np.ndarray):
+        return _Array(pictures)
+    if isinstance(pictures, Mapping) or not (hasattr(pictures, "__len__") and hasattr(pictures, "__getitem__")):
+        kind = type(pictures).__name__
+        raise ParameterError("pictures", f"must be a folder, a zip file, an array, or a sequence, got a {kind}")
+    return _Items(pictures)
+
+
+class _Folder:
+    """Pictures of a folder and the folders in it, in the natural order of their names."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        found = (Path(place) / name for place, _, names in os.walk(folder) for name in names)
+        self._names = _ordered(path.relative_to(folder).as_posix() for path in found)
+        if not self._names:
+            raise FileError(folder, f"holds no pictures ({', '.join(ENDINGS)})")
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def name(self, k: int) -> str:
+        return str(self._folder / self._names[k])
+
+    def picture(self, k: int) -> NDArray[Any]:
+        return read_picture(self._folder / self._names[k])
+
+    def labels(self) -> list[Any] | None:
+        return _folder_labels(self._names)
+
+    def described(self) -> dict[str, Any]:
+        return {"kind": "folder", "names": described(np.array("\n".join(self._names)))}
+
+
+class _Zip:
+    """Pictures of a zip file, which each process opens for itself."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            with zipfile.ZipFile(path) as archive:
+                names = [item.filename for item in archive.infolist() if not item.is_dir()]
+        except (OSError, zipfile.BadZipFile) as error:
+            raise FileError(path, f"is broken ({error})") from None
+        self._names = _ordered(names)
+        if not self._names:
+            raise FileError(path, f"holds no pictures ({', '.join(ENDINGS)})")
+        self._opened: tuple[int, zipfile.ZipFile] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_opened": None}
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def name(self, k: int) -> str:
+        return f"{self._path}!{self._names[k]}"
+
+    def picture(self, k: int) -> NDArray[Any]:
+        # A process that was forked shares its parent's place in the file.
+        if self._opened is None or self._opened[0] != os.getpid():
+            self._opened = os.getpid(), zipfile.ZipFile(self._path)
+        archive, name = self._opened[1], self._names[k]
+        if archive.getinfo(name).file_size > MAX_UNPACKED_BYTES:
+            raise FileError(self.name(k), f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
+        try:
+            content = archive.read(name)
+        except Exception as error:  # noqa: BLE001 -- a broken member makes its reader trip over anything
+            raise FileError(self.name(k), f"is broken ({' '.join(str(error).split())})") from None
+        with tempfile.TemporaryDirectory(prefix="foveasim-") as folder:
+            file = Path(folder) / f"picture{PurePosixPath(name).suffix}"
+            file.write_bytes(content)
+            try:
+                return read_picture(file)
+            except FileError as error:
+                raise FileError(self.name(k), str(error).removeprefix(f"{file}: ")) from None
+
+    def labels(self) -> list[Any] | None:
+        return _folder_labels(self._names)
+
+    def described(self) -> dict[str, Any]:
+        return {"kind": "zip", "names": described(np.array("\n".join(self._names)))}
+
+
+class _Array:
+    """Pictures (n, n_y, n_x) or (n, n_y, n_x, n_channel) in memory."""
+
+    def __init__(self, pictures: NDArray[Any]) -> None:
+        _check_stack("pictures", pictures)
+        self._pictures = pictures
+
+    def __len__(self) -> int:
+        return int(self._pictures.shape[0])
+
+    def name(self, k: int) -> str:
+        return f"picture {k}"
+
+    def picture(self, k: int) -> NDArray[Any]:
+        return self._pictures[k]
+
+    def labels(self) -> list[Any] | None:
+        return None
+
+    def described(self) -> dict[str, Any]:
+        return {"kind": "array", "array": described(self._pictures)}
+
+
+class _ArrayFile:
+    """Pictures in a file of one numpy array, of which each process reads what it needs."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._pictures: NDArray[Any] | None = None
+        self._n = len(self._array())
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_pictures": None}
+
+    def _array(self) -> NDArray[Any]:
+        if self._pictures is None:
+            try:
+                pictures = np.load(self._path, mmap_mode="r", allow_pickle=False)
+            except (OSError, ValueError, EOFError) as error:
+                raise FileError(self._path, f"is no array that can be read ({error})") from None
+            _check_stack(str(self._path), pictures)
+            self._pictures = pictures
+        return self._pictures
+
+    def __len__(self) -> int:
+        return self._n
+
+    def name(self, k: int) -> str:
+        return f"{self._path}[{k}]"
+
+    def picture(self, k: int) -> NDArray[Any]:
+        return np.array(self._array()[k])
+
+    def labels(self) -> list[Any] | None:
+        return None
+
+    def described(self) -> dict[str, Any]:
+        array = self._array()
+        return {"kind": "array file", "name": self._path.name, "shape": list(array.shape), "dtype": str(array.dtype)}
+
+
+class _Items:
+    """Files, arrays or Pillow's images, alone or in pairs with their classes, of anything that has a length and items."""
+
+    def __init__(self, items: Sequence[Any]) -> None:
+        if len(items) == 0:
+            raise ParameterError("pictures", "must hold at least one picture")
+        self._items = items
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def name(self, k: int) -> str:
+        # Items that are no list may be made when they are asked for.
+        item = self._items[k] if isinstance(self._items, list | tuple) else None
+        item = item[0] if isinstance(item, tuple) else item
+        return str(item) if isinstance(item, str | Path) else f"picture {k}"
+
+    def picture(self, k: int) -> NDArray[Any]:
+        item = self._items[k]
+        item = item[0] if isinstance(item, tuple) else item
+        if isinstance(item, str | Path):
+            return read_picture(item)
+        try:
+            return np.asarray(item)
+        except ValueError:
+            raise ParameterError(f"picture {k}", "must be a file or an array of numbers", item) from None
+
+    def labels(self) -> list[Any] | None:
+        if isinstance(self._items, list | tuple):
+            is_pair = [isinstance(item, tuple) for item in self._items]
+            if all(is_pair):
+                return [item[1] for item in self._items]
+            if any(is_pair):
+                raise ParameterError("pictures", "must all be pairs (picture, label), or none of them")
+            return None
+        targets = getattr(self._items, "targets", None)
+        if targets is not None and len(targets) == len(self):
+            return np.asarray(targets).tolist()
+        if isinstance(self._items[0], tuple):
+            return [self._items[k][1] for k in range(len(self))]
+        return None
+
+    def described(self) -> dict[str, Any]:
+        is_list = isinstance(self._items, list | tuple)
+        names = [self.name(k) for k in range(len(self))] if is_list else []
+        return {"kind": "items", "n": len(self), "names": described(np.array("\n".join(names)))}
+
+
+def _check_stack(name: str, pictures: NDArray[Any]) -> None:
+    if pictures.ndim not in (3, 4) or 0 in pictures.shape or (pictures.ndim == 4 and pictures.shape[3] > 4):
+        raise ParameterError(
+            name, f"must have the shape (n, n_y, n_x) or (n, n_y, n_x, 1 to 4 channels), got {pictures.shape}"
+        )
+
+
+def _ordered(names: Iterable[str]) -> list[str]:
+    """Names of pictures in their natural order, ``2.png`` before ``10.png``; hidden files are none."""
+    pictures = (
+        name
+        for name in names
+        if PurePosixPath(name).suffix.lower() in ENDINGS
+        and not any(part.startswith((".", "__MACOSX")) for part in PurePosixPath(name).parts)
+    )
+
+    def pieces(name: str) -> list[tuple[int, str]]:
+        return [(int(p), "") if p.isdigit() else (-1, p) for p in re.split(r"(\d+)", name) if p]
+
+    return sorted(pictures, key=pieces)
+
+
+def _folder_labels(names: Sequence[str]) -> list[Any] | None:
+    """Names of the outermost folders that pictures are in; None when they are in none."""
+    folders = [PurePosixPath(name).parts[0] if "/" in name else None for name in names]
+    return folders if all(folder is not None for folder in folders) else None
