@@ -25,6 +25,7 @@ import shapely
 from looking import bench_looking
 from report import Report, best_s
 from rich.console import Console
+from video import bench_video
 
 import foveasim as fs
 from foveasim.parallel import thread_count
@@ -314,6 +315,8 @@ def main() -> int:
         bench_sensor(report, 100 if is_quick else 1000)
     with console.status("bench layouts"):
         bench_layouts(report, 10_000 if is_quick else 1_000_000)
+    with console.status("bench video"):
+        bench_video(report, 100 if is_quick else 1000)
     with console.status("bench looking"):
         bench_looking(report, 20_000 if is_quick else 1_000_000)
     bench_import(report)

@@ -59,6 +59,8 @@ ROOMS = {
     "foveasim.maps": "Light from other programs, and for them.",
     "foveasim.sensor": "From light to codes: efficiencies, noise, converters.",
     "foveasim.reconstruct": "From codes back to pictures.",
+    "foveasim.video": "Frames in, gazes that move, recordings out.",
+    "foveasim.modes": "Other ways to expose: rolling shutters, events, spikes.",
     "foveasim.metrics": "What a sensor is worth.",
     "foveasim.view": "Plots, solids, and pages for a browser.",
     "foveasim.config": "Settings files: YAML in, objects out.",
