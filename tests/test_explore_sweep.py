@@ -362,7 +362,7 @@ def test_a_store_of_another_sweep_is_left_alone(tmp_path):
     write_store(dataset_of(PLAN, {}), store)
     other = explore.plan_sweep(SHOT, {"sensor.bits": [8, 9, 12]})
 
-    with pytest.raises(FileError, match=r"is of another sweep: 'vary\.sensor\.bits' differs"):
+    with pytest.raises(FileError, match=r"is of another sweep or study: 'vary\.sensor\.bits' differs"):
         explore.run_sweep(other, out=store)
     assert explore.open_results(store)["sensor.bits"].values.tolist() == [8, 9, 10]
 

@@ -1,10 +1,35 @@
-"""Many cameras: sweeps over the settings of a shot, on the cores of this machine or on a dask scheduler."""
+"""Many cameras: sweeps over the settings of a shot, here or on a dask scheduler, and searches for the best settings."""
 
 from __future__ import annotations
 
 from foveasim.explore._metrics import METRICS, Metric, metric_of
 from foveasim.explore._plan import Plan, plan_sweep, read_sweep
 from foveasim.explore._results import open_results
+from foveasim.explore._study import study
 from foveasim.explore._sweep import run_sweep, sweep
+from foveasim.explore.dataset import DataSet
+from foveasim.explore.dataset_draws import draw_of
+from foveasim.explore.dataset_recipes import classification, denoising
+from foveasim.explore.dataset_store import StoredSamples, open_data_set, write_data_set
+from foveasim.explore.dataset_torch import torch_data_set
 
-__all__ = ["METRICS", "Metric", "Plan", "metric_of", "open_results", "plan_sweep", "read_sweep", "run_sweep", "sweep"]
+__all__ = [
+    "METRICS",
+    "DataSet",
+    "Metric",
+    "Plan",
+    "StoredSamples",
+    "classification",
+    "denoising",
+    "draw_of",
+    "metric_of",
+    "open_data_set",
+    "open_results",
+    "plan_sweep",
+    "read_sweep",
+    "run_sweep",
+    "study",
+    "sweep",
+    "torch_data_set",
+    "write_data_set",
+]

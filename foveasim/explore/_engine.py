@@ -116,7 +116,6 @@ class _Bundle:
     points: list[int]
     worker: str
     is_alone: bool
-    sent_s: float
 
 
 @dataclass(eq=False)
@@ -226,7 +225,7 @@ def records_of(
                         workers=[worker],
                         allow_other_workers=True,
                     )
-                    work.sent[future] = _Bundle(points, worker, is_alone, now_s)
+                    work.sent[future] = _Bundle(points, worker, is_alone)
                     future.add_done_callback(done.put)
             try:
                 future = done.get(timeout=COUNT_S)
@@ -246,14 +245,14 @@ def _arrived(work: _Work, future: Future[Any], bundle: _Bundle) -> list[Record]:
     from distributed import KilledWorker
 
     try:
-        records, _ = future.result()
+        records, spent_s = future.result()
     except KilledWorker:
         return list(_again(work, bundle))
     except (CancelledError, TimeoutError, OSError) as error:
         raise SimulationError(f"the scheduler is gone ({error or type(error).__name__})") from None
     except Exception as error:  # noqa: BLE001 -- whatever a worker without the package, or without a metric's module, raises
         raise SimulationError(f"the workers cannot run the points: {' '.join(str(error).split()):.300}") from None
-    took_s = (time.monotonic() - bundle.sent_s) / len(records)
+    took_s = spent_s / len(records)
     work.point_s = took_s if work.point_s is None else 0.5 * (work.point_s + took_s)
     return list(records)
 

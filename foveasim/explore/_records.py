@@ -228,7 +228,8 @@ def check_same_plan(path: Path, found: Mapping[str, Any], wanted: Mapping[str, A
     different = _first_difference(found, wanted)
     if different is not None:
         raise FileError(
-            path, f"is of another sweep: '{different}' differs; write this one under another name, or remove that one"
+            path,
+            f"is of another sweep or study: '{different}' differs; write this one under another name, or remove that one",
         )
 
 
