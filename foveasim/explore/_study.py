@@ -25,6 +25,8 @@ __all__ = ["study"]
 
 #: Where a setting is searched: numbers from one to another, the same with steps or spacing, or a list of choices.
 Search = tuple[float, float] | Mapping[str, Any] | Sequence[Any]
+#: Lowest and highest value of results, either of them None.
+Limits = Mapping[str, tuple[float | None, float | None]]
 #: Keys of a range that is a mapping.
 RANGE_KEYS = {"from", "to", "step", "spacing"}
 #: Attributes of a study and of its trials.
@@ -37,7 +39,7 @@ def study(
     objectives: Mapping[str, Literal["maximize", "minimize"]],
     *,
     n_trials: int,
-    constraints: Mapping[str, tuple[float | None, float | None]] | None = None,
+    constraints: Limits | None = None,
     metrics: Sequence[str | Metric] | Mapping[str, Metric] | None = None,
     changes: Mapping[str, Any] | None = None,
     seed: int = 0,
@@ -134,7 +136,7 @@ def _told(
     trial: optuna.Trial,
     record: Record,
     objectives: Sequence[str],
-    constraints: Mapping[str, tuple[float | None, float | None]],
+    constraints: Limits,
 ) -> None:
     """Tell a study what a trial gave."""
     numbers: dict[str, float] = {}
@@ -165,7 +167,7 @@ def _told(
     found.tell(trial, [numbers[name] for name in objectives])
 
 
-def _check_names(objectives: Mapping[str, str], constraints: Mapping[str, tuple[float | None, float | None]]) -> None:
+def _check_names(objectives: Mapping[str, str], constraints: Limits) -> None:
     if not isinstance(objectives, Mapping) or not objectives:
         raise ParameterError("objectives", 'must be names of results with "maximize" or "minimize"', objectives)
     for name, way in objectives.items():
