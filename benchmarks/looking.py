@@ -72,6 +72,6 @@ def _bench_columns(report: Report, n_sites: int, path: Path) -> None:
     times = best_s(calls, 2)
     if renderer:
         what = f"a picture of {n_sites:,} columns"
-        report.faster_than(what, times["ours"], "PyVista as it comes, of equal height", times["defaults"], 2)
+        report.faster_than(what, times["ours"], "PyVista as it comes, of equal height", times["defaults"])
         report.add("the same", f"{times['ours']:.3g} s", "seconds", "", times["ours"], COLUMNS_S)
         report.slower_than("the same without OpenGL", times["software"], "with it", times["ours"])
