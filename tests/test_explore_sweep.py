@@ -441,6 +441,25 @@ def test_what_points_have_in_common_is_made_once_and_changes_no_result():
         assert small.record(job, Task(point, plan.settings_of(point))) == shared[point]
 
 
+@pytest.mark.parametrize("kept_bytes", [0, 200_000, 2_000_000])
+def test_a_bench_keeps_no_more_than_it_may(kept_bytes):
+    plan = explore.plan_sweep(SHOT, {"layout.parameters.n_x": list(range(8, 40))})
+    job = Job(plan.source, plan.metrics, 1, plan.is_geometry_varied)
+    bench = Bench(kept_bytes)
+    sizes = []
+    for point in range(plan.n_points):
+        before = set(bench._parts)
+        bench.record(job, Task(point, plan.settings_of(point)))
+        new = set(bench._parts) - before
+        assert {part for part, _ in new} >= {"layout", "sensor", "camera", "light on sites"}
+        sizes.append(sum(part.n_bytes for part in bench._parts.values()))
+        least = sum(
+            part.n_bytes for key, part in bench._parts.items() if key in new or key[0] in {"scene", "optics", "images"}
+        )
+        assert sizes[-1] <= max(kept_bytes, least)
+    assert max(sizes) > 0.5 * kept_bytes
+
+
 def test_points_with_the_same_layout_and_light_are_neighbours_in_any_mode():
     for plan in (
         plan_200(),

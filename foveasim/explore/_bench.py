@@ -24,8 +24,10 @@ from foveasim.explore._records import Record, values_of
 
 __all__ = ["Bench", "Job", "Task", "run_tasks"]
 
-#: What a worker keeps of earlier points, in memory.
-KEPT_BYTES = 1 << 30
+#: What a worker keeps of earlier points, in memory and in number. Parts inside others are counted in each.
+KEPT_BYTES, MOST_PARTS = 1 << 30, 1024
+#: Parts that hold more as they are used.
+GROWING = ("camera", "images")
 #: Objects are weighed by the arrays in them, so many containers deep.
 DEPTH = 6
 #: Characters of a message that are kept.
@@ -50,6 +52,15 @@ class Task:
     settings: Mapping[str, Any]
 
 
+@dataclass
+class _Part:
+    """Something that was made, the warnings of its making, and its weight."""
+
+    made: Any
+    told: list[str]
+    n_bytes: int = 0
+
+
 class Bench:
     """
     Parts that were made before, up to a size in memory: layouts, scenes, lenses, compiled layouts, images, light on sites.
@@ -59,7 +70,8 @@ class Bench:
 
     def __init__(self, kept_bytes: int = KEPT_BYTES) -> None:
         self._kept_bytes = kept_bytes
-        self._parts: OrderedDict[tuple[str, str], tuple[Any, list[str]]] = OrderedDict()
+        self._parts: OrderedDict[tuple[str, str], _Part] = OrderedDict()
+        self._used: set[tuple[str, str]] = set()
         self._told: list[str] = []
         self.n_made: dict[str, int] = {}
 
@@ -70,26 +82,26 @@ class Bench:
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
                 made = make()
-            self._parts[key] = made, [str(warning.message) for warning in caught]
+            self._parts[key] = _Part(made, [str(warning.message) for warning in caught])
             self.n_made[part] = self.n_made.get(part, 0) + 1
-            self._forget()
         self._parts.move_to_end(key)
-        made, told = self._parts[key]
-        self._told += told
-        return made
+        self._used.add(key)
+        self._told += self._parts[key].told
+        return self._parts[key].made
 
     def _forget(self) -> None:
-        """Let go of what was not used for longest, but never of the last of any sort."""
-        last = {part: key for key in self._parts for part in (key[0],)}
-        seen: set[int] = set()
-        sizes = {key: _n_bytes(made, seen) for key, (made, _) in reversed(self._parts.items())}
-        total = sum(sizes.values())
+        """Let go of what was not used for longest, but not of what the last point used."""
+        for key in self._used:
+            # Weighed anew: cameras and images grow while they are used.
+            if self._parts[key].n_bytes == 0 or key[0] in GROWING:
+                self._parts[key].n_bytes = _n_bytes(self._parts[key].made, set())
+        total = sum(part.n_bytes for part in self._parts.values())
         for key in list(self._parts):
-            if total <= self._kept_bytes:
-                return
-            if last[key[0]] != key:
-                total -= sizes[key]
-                del self._parts[key]
+            if total <= self._kept_bytes and len(self._parts) <= MOST_PARTS:
+                break
+            if key not in self._used:
+                total -= self._parts.pop(key).n_bytes
+        self._used = set()
 
     def captured(self, job: Job, settings: Mapping[str, Any]) -> tuple[Shot, Capture]:
         """The shot of a point and its capture."""
@@ -123,6 +135,7 @@ class Bench:
                         values |= values_of(name, metric(shot, shot.camera, capture))
                     except Exception as error:  # noqa: BLE001 -- metrics are the user's
                         errors.append(f"{name}: {_told(error)}")
+        self._forget()
         told = dict.fromkeys([*self._told, *(str(warning.message) for warning in caught)])
         return Record(task.point, values, "; ".join(errors), "; ".join(_short(text) for text in told))
 
