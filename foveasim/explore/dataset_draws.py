@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from foveasim.arrays import check_count, check_number, finite_array
@@ -99,9 +100,9 @@ def draw_of(path: str, told: Any) -> Draw:
     path : str
         The setting's, for messages.
     told : mapping
-        ``{"uniform": [low, high]}``, ``{"log_uniform": [low, high]}`` (even in the logarithm), ``{"integers": [low, high]}`` (both
-        included), ``{"normal": [mean, standard deviation, low, high]}`` (cut off at the ends), or ``{"choice": [...]}``, with
-        ``"weights"`` where the chances differ.
+        ``{"uniform": [low, high]}``; ``{"log_uniform": [low, high]}``, even in the logarithm; ``{"integers": [low, high]}``,
+        both included; ``{"normal": [mean, standard deviation, low, high]}``, cut off at the ends; or ``{"choice": [...]}``,
+        with ``"weights"`` where the chances differ.
 
     Raises
     ------
@@ -145,7 +146,7 @@ def draw_of(path: str, told: Any) -> Draw:
     return Draw(path, kind, numbers)
 
 
-def _choice(path: str, values: Sequence[Any], weights: Any) -> Draw:
+def _choice(path: str, values: Sequence[Any] | NDArray[Any], weights: Any) -> Draw:
     try:
         plain = json.loads(json.dumps(list(values), default=lambda value: value.tolist()))
     except (TypeError, ValueError, AttributeError, RecursionError):

@@ -17,7 +17,18 @@ from foveasim.fields import Grid, from_file_rows
 from foveasim.integrate import Integrator
 from foveasim.pictures import read_picture
 
-__all__ = ["NOTHING", "Boxes", "Flow", "boxes_on_sites", "flow_on_sites", "mask_on_sites", "read_flow", "read_mask"]
+__all__ = [
+    "NOTHING",
+    "Boxes",
+    "Flow",
+    "boxes_on_sites",
+    "checked_boxes",
+    "flow_on_sites",
+    "mask_on_sites",
+    "one_a_picture",
+    "read_flow",
+    "read_mask",
+]
 
 #: Label of a site that sees mostly what lies off the picture, and of boxes that only fill up a sample.
 NOTHING = -1
@@ -35,8 +46,8 @@ class Boxes:
     Attributes
     ----------
     box_um : (n_box, 4) float64, µm
-        x_min, y_min, x_max, y_max of each box's image, y up, around all of it where the lens bends it; 0 where the lens throws
-        no light of it on the sensor's plane.
+        x_min, y_min, x_max, y_max of each box's image, y up; where the lens bends it, around the image of its outline, as much
+        of it as the lens images; 0 where it images none.
     covers : (n_box, n_site) bool
         Sites of whose light-collecting area more than half is in the box.
     """
@@ -117,7 +128,7 @@ def mask_on_sites(mask: Ints, integrator: Integrator) -> Ints:
     Returns
     -------
     classes : (n_site,) int64
-        :data:`NOTHING` where what lies off the picture has most. Of classes with the same area the lowest.
+        :data:`NOTHING` where no class has more than what lies off the picture. Of classes with the same area the lowest.
 
     Notes
     -----
@@ -126,10 +137,10 @@ def mask_on_sites(mask: Ints, integrator: Integrator) -> Ints:
     rows = from_file_rows(mask)[0]
     found = np.full(integrator.n_sites, NOTHING, np.int64)
     rounding_um2 = TIE * _seen_um2(integrator)
-    most_um2 = integrator.uncovered_um2 + rounding_um2
+    most_um2 = integrator.uncovered_um2
     for number in np.unique(rows):
         own_um2 = integrator((rows == number).astype(np.float32))
-        is_more = own_um2 > most_um2 + np.where(found == NOTHING, -2.0, 1.0) * rounding_um2
+        is_more = own_um2 > most_um2 + rounding_um2
         found[is_more] = number
         most_um2 = np.where(is_more, own_um2, most_um2)
     return found
@@ -191,7 +202,9 @@ def checked_boxes(name: str, boxes: Any) -> tuple[Floats, Ints]:
     numbers = finite_array(name, boxes, ndim=2)
     if numbers.shape[1] not in (4, 5):
         raise ParameterError(
-            name, f"must have the shape (n, 4) or, with classes, (n, 5), got {numbers.shape}", cure="x0, y0, x1, y1, class"
+            name,
+            f"must have the shape (n, 4) or, with classes, (n, 5), got {numbers.shape}",
+            cure="x0, y0, x1, y1, class",
         )
     is_flat = (numbers[:, 2:4] <= numbers[:, :2]).any(axis=1)
     if is_flat.any():

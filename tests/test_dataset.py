@@ -1,0 +1,805 @@
+"""Data sets: every sample a function of the seed and its number, labels where the light goes, files whole after any end."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import operator
+import os
+import pickle
+import resource
+import subprocess
+import sys
+import tarfile
+import zipfile
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+
+import numpy as np
+import pytest
+import shapely
+from PIL import Image
+from scipy.stats import truncnorm
+
+import foveasim as fs
+from foveasim import explore
+from foveasim.config import build_shot
+from foveasim.errors import ConfigError, CoverageWarning, FileError, FoveasimWarning, ParameterError, SimulationError
+from foveasim.explore.dataset_labels import boxes_on_sites, flow_on_sites, mask_on_sites
+from foveasim.explore.dataset_torch import _kind
+
+SHOT = {
+    "scene": {
+        "kind": "picture",
+        "pitch_um": 300.0,
+        "distance_m": 1.0,
+        "peak_radiance_w_m2_sr_nm": 0.05,
+        "wavelength_nm": [620, 550, 450],
+    },
+    "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    "layout": {"generator": "hexagonal", "parameters": {"n_columns": 9, "n_rows": 8, "pitch_um": 7.0}},
+    "sensor": {"read_noise_e": 2.0, "capacitance_f": 2e-14},
+    "exposure_s": 0.01,
+}
+VARY = {
+    "optics.f_number": {"log_uniform": [1.4, 8.0]},
+    "exposure_s": {"uniform": [0.002, 0.02]},
+    "sensor.read_noise_e": {"choice": [1.0, 4.0]},
+    "sensor.qe": {"choice": [0.5, {"kind": "silicon", "depth_um": 3.0}]},
+}
+N_Y, N_X = 80, 96
+FLAT = {"kind": "flat", "shape": [80, 96], "radiance_w_m2_sr_nm": 0.1}
+BARREL = {"kind": "brown_conrady", "focal_um": 100.0, "k1": -0.3}
+
+
+def pictures(n, seed=0):
+    return np.random.default_rng(seed).integers(0, 256, (n, N_Y, N_X, 3), np.uint8)
+
+
+def labelled(n=5, **more):
+    """A data set with labels of every sort."""
+    rng = np.random.default_rng(1)
+    options = {
+        "cameras": 2,
+        "draws": 2,
+        "seed": 7,
+        "fields": ("code", "electrons", "expected_e", "expected_dn"),
+        "labels": ["dog", "cat", "dog", "bird", "cat"][:n],
+        "boxes": [[[1, 2, 20, 30, 4]], [], [[3, 3, 9, 12, 1], [20, 5, 40, 39, 2]], [], [[0, 0, N_X, N_Y, 9]]][:n],
+        "masks": list(rng.integers(0, 3, (n, N_Y, N_X))),
+        "flows": list(rng.normal(size=(n, N_Y, N_X, 2))),
+    } | more
+    return explore.DataSet(pictures(n), SHOT, VARY, **options)
+
+
+def assert_same(one, other):
+    assert set(one) == set(other)
+    for name, value in one.items():
+        assert type(value) is type(other[name]), name
+        if isinstance(value, np.ndarray):
+            assert value.dtype == other[name].dtype, name
+        np.testing.assert_array_equal(value, other[name], err_msg=name)
+
+
+# -- the same sample always -------------------------------------------------------------------------------------------
+
+
+def test_a_sample_is_the_same_in_any_order_and_alone():
+    data = labelled()
+    forwards = [data[k] for k in range(len(data))]
+
+    for k in np.random.default_rng(0).permutation(len(data)):
+        assert_same(data[k], forwards[k])
+    for k in (0, 7, 19):
+        assert_same(labelled()[k], forwards[k])
+
+
+def test_a_sample_is_the_same_in_other_processes():
+    data = labelled()
+    order = np.random.default_rng(1).permutation(len(data)).tolist()
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+        found = list(pool.map(partial(operator.getitem, data), order))
+
+    for k, sample in zip(order, found, strict=True):
+        assert_same(sample, data[k])
+
+
+def test_a_pickled_data_set_takes_no_kept_parts_along():
+    data = labelled()
+    size = len(pickle.dumps(data))
+    list(data)
+
+    assert len(pickle.dumps(data)) == size
+
+
+def test_a_sample_is_what_the_shot_by_hand_gives():
+    data = explore.DataSet(pictures(3), SHOT, VARY, cameras=4, seed=5)
+    index = 9
+    settings = data.settings_of(index)
+    told = {key: value for key, value in SHOT["scene"].items() if key != "kind"}
+    flat = {key: value for key, value in told.items() if key != "peak_radiance_w_m2_sr_nm"}
+    by_hand = build_shot("by hand", settings | {"scene": FLAT | flat})
+    scene = fs.Scene.from_picture(pictures(3)[2], **told)
+    capture = by_hand.camera.capture(scene, exposure_s=by_hand.exposure_s, seed=5, frame=index)
+
+    np.testing.assert_array_equal(data[index]["code"], capture.code)
+    np.testing.assert_array_equal(data[index]["electrons"], capture.electrons)
+    assert (
+        data.shot(index).camera.optics.f_number
+        == settings["optics"]["f_number"]
+        == data[index]["settings"]["optics.f_number"]
+    )
+
+
+def test_draws_differ_in_noise_alone_and_cameras_in_settings():
+    data = labelled()
+
+    first, again, other = data[0], data[1], data[2]
+
+    assert first["settings"] == again["settings"] != other["settings"]
+    np.testing.assert_array_equal(first["expected_e"], again["expected_e"])
+    np.testing.assert_array_equal(first["expected_dn"], again["expected_dn"])
+    assert (first["electrons"] != again["electrons"]).mean() > 0.5
+    assert first["picture"] == other["picture"] == 0
+
+
+def test_another_seed_draws_other_cameras():
+    found = [explore.DataSet(pictures(1), SHOT, VARY, seed=seed)[0]["settings"]["exposure_s"] for seed in range(20)]
+
+    assert len(set(found)) == 20
+
+
+def test_another_setting_drawn_leaves_the_others_as_they_were():
+    few = explore.DataSet(pictures(6), SHOT, {"exposure_s": VARY["exposure_s"]})
+    more = explore.DataSet(pictures(6), SHOT, VARY)
+
+    assert [s["settings"]["exposure_s"] for s in few] == [s["settings"]["exposure_s"] for s in more]
+
+
+# -- distributions ----------------------------------------------------------------------------------------------------
+
+N_DRAWS = 4000
+
+
+@pytest.mark.parametrize(
+    ("told", "share_below"),
+    [
+        ({"uniform": [2.0, 6.0]}, lambda x: (x - 2.0) / 4.0),
+        ({"log_uniform": [1.0, 100.0]}, lambda x: np.log(x) / np.log(100.0)),
+        ({"normal": [1.0, 2.0, 0.0, 4.0]}, lambda x: truncnorm(-0.5, 1.5, loc=1.0, scale=2.0).cdf(x)),
+    ],
+)
+def test_a_distribution_is_the_one_it_says(told, share_below):
+    draw = explore.draw_of("x", told)
+    shares = np.sort([share_below(draw.at(0, k)[0]) for k in range(N_DRAWS)])
+
+    # Kolmogorov: the largest distance of the two distributions exceeds 2.3 / sqrt(n) once in 25,000.
+    assert np.abs(shares - (np.arange(N_DRAWS) + 0.5) / N_DRAWS).max() < 2.3 / np.sqrt(N_DRAWS)
+
+
+@pytest.mark.parametrize(
+    ("told", "chances"),
+    [
+        ({"integers": [-1, 2]}, {-1: 0.25, 0: 0.25, 1: 0.25, 2: 0.25}),
+        ({"choice": [8, 10]}, {8: 0.5, 10: 0.5}),
+        ({"choice": ["a", "b", "c"], "weights": [1, 0, 3]}, {"a": 0.25, "b": 0.0, "c": 0.75}),
+    ],
+)
+def test_a_choice_has_its_chances(told, chances):
+    draw = explore.draw_of("x", told)
+    found = [draw.at(3, k)[0] for k in range(N_DRAWS)]
+
+    assert set(found) == {value for value, chance in chances.items() if chance}
+    for value, chance in chances.items():
+        assert abs(found.count(value) - chance * N_DRAWS) <= 5.0 * np.sqrt(N_DRAWS * chance * (1.0 - chance))
+
+
+def test_choices_that_are_no_numbers_are_told_by_their_positions():
+    data = explore.DataSet(pictures(20), SHOT, VARY)
+    choices = VARY["sensor.qe"]["choice"]
+
+    for k in range(20):
+        assert data.settings_of(k)["sensor"]["qe"] == choices[data[k]["settings"]["sensor.qe"]]
+
+
+def test_codes_of_all_samples_have_the_type_of_the_most_bits():
+    data = explore.DataSet(pictures(4), SHOT, {"sensor.bits": {"choice": [8, 12]}})
+
+    assert {sample["code"].dtype for sample in data} == {np.dtype(np.uint16)}
+    assert explore.DataSet(pictures(1), SHOT)[0]["code"].dtype == np.uint8
+
+
+# -- labels where the light goes --------------------------------------------------------------------------------------
+
+GRID = fs.Grid.centred((11, 13), 4.0)
+LENS = fs.distortion.BrownConrady(focal_um=60.0, k1=-0.25, p1=0.01, centre_um=(1.5, -2.0))
+#: Sites of many shapes, some of them partly off the picture.
+SITES = fs.layout.voronoi(n_sites=40, size_um=(56.0, 46.0), seed=2)
+
+
+def shared_um2(lens):
+    """Areas that every site shares with every cell, (n_site, n_y, n_x), and all its area, by shapely."""
+    outlines = SITES.polygons()
+    if lens is not None:
+        outlines = shapely.segmentize(outlines, 0.02)
+        outlines = shapely.transform(outlines, lens.undistort)
+    x, y = (GRID.origin_um[axis] + np.arange(GRID.shape[1 - axis] + 1) * GRID.pitch_um for axis in (0, 1))
+    cells = shapely.box(*np.broadcast_arrays(x[:-1], y[:-1, np.newaxis], x[1:], y[1:, np.newaxis]))
+    return shapely.area(shapely.intersection(outlines[:, np.newaxis, np.newaxis], cells)), outlines
+
+
+@pytest.fixture(scope="module", params=[None, LENS], ids=["straight", "distorted"])
+def seen(request):
+    areas_um2, outlines = shared_um2(request.param)
+    return request.param, fs.Integrator(SITES, GRID, distortion=request.param), areas_um2, outlines
+
+
+def test_a_site_has_the_class_of_most_of_its_area(seen):
+    _, integrator, areas_um2, outlines = seen
+    mask = np.random.default_rng(0).integers(0, 4, GRID.shape)
+    found = mask_on_sites(mask[::-1], integrator)
+    of_class = np.stack([(areas_um2 * (mask == k)).sum(axis=(1, 2)) for k in range(4)])
+    off_um2 = shapely.area(outlines) - areas_um2.sum(axis=(1, 2))
+    all_um2 = np.concatenate((off_um2[np.newaxis], of_class))
+    first, second = np.sort(all_um2, axis=0)[[-1, -2]]
+    is_clear = first - second > 1e-4 * first
+
+    assert is_clear.sum() >= 38
+    assert (off_um2 > 0.01).sum() > 5
+    np.testing.assert_array_equal(found[is_clear], all_um2.argmax(axis=0)[is_clear] - 1)
+    assert -1 in found
+
+
+@pytest.mark.parametrize("box_px", [(3, 2, 9, 10), (0, 0, 13, 11), (2.25, 1.5, 7.0, 8.125)])
+def test_a_box_covers_the_sites_that_are_mostly_in_it(seen, box_px):
+    lens, integrator, _, outlines = seen
+    x0, y1 = GRID.origin_um[0], GRID.bounds_um[3]
+    left, top, right, bottom = box_px
+    box = shapely.box(x0 + 4.0 * left, y1 - 4.0 * bottom, x0 + 4.0 * right, y1 - 4.0 * top)
+    share = shapely.area(shapely.intersection(outlines, box)) / shapely.area(outlines)
+
+    found = boxes_on_sites(np.array([box_px], float), integrator, lens)
+
+    # Pixels that a box cuts are spread evenly.
+    is_clear = np.abs(share - 0.5) > (1e-4 if box_px == tuple(map(int, box_px)) else 0.1)
+    assert is_clear.sum() > 30
+    assert 5 < (share > 0.5).sum() <= 40
+    np.testing.assert_array_equal(found.covers[0][is_clear], share[is_clear] > 0.5)
+    border = shapely.get_coordinates(shapely.segmentize(box, 0.01).exterior)
+    real = border if lens is None else lens.distort(border)
+    np.testing.assert_allclose(found.box_um[0], [*real.min(axis=0), *real.max(axis=0)], atol=0.02)
+
+
+def test_flow_of_a_site_is_the_mean_of_its_pixels(seen):
+    lens, integrator, areas_um2, _ = seen
+    rng = np.random.default_rng(4)
+    flow_px = rng.normal(size=(*GRID.shape, 2))
+    flow_px[2:5, 3:6] = np.nan
+    middles = np.stack(np.meshgrid(GRID.x_um, GRID.y_um), axis=-1)
+    moves = flow_px[::-1] * [4.0, -4.0]
+    if lens is not None:
+        with np.errstate(invalid="ignore"):
+            is_known = np.isfinite(moves).all(axis=-1, keepdims=True)
+            moves = np.where(is_known, lens.distort(middles + np.nan_to_num(moves)) - lens.distort(middles), np.nan)
+    known_um2 = areas_um2 * np.isfinite(moves[..., 0])
+    sums = np.einsum("syx,yxk->sk", known_um2, np.nan_to_num(moves))
+
+    found = flow_on_sites(flow_px, integrator, lens)
+
+    area_um2 = known_um2.sum(axis=(1, 2))
+    is_clear = area_um2 > 0.1
+    assert is_clear.sum() > 30
+    assert found.is_known[is_clear].all()
+    np.testing.assert_allclose(found.flow_um[is_clear], sums[is_clear] / area_um2[is_clear, np.newaxis], atol=2e-3)
+    assert not found.is_known[area_um2 == 0.0].any()
+    assert np.isfinite(found.flow_um).all()
+
+
+def test_labels_go_where_the_camera_puts_the_light():
+    """A picture that is bright where its mask, its box and its class are: the sites that see light have the labels."""
+    bright = np.zeros((N_Y, N_X), np.uint8)
+    bright[30:42, 36:70] = 255
+    layout = {"generator": "grid", "parameters": {"n_x": 24, "n_y": 20, "pitch_um": 4.0}}
+    data = explore.DataSet(
+        [bright],
+        SHOT | {"layout": layout, "distortion": BARREL, "exposure_s": 1e-4},
+        masks=[bright // 255],
+        boxes=[[[36, 30, 70, 42]]],
+        flows=[np.full((N_Y, N_X, 2), [0.5, 0.25])],
+        fields=("expected_e",),
+    )
+    sample = data[0]
+    layout = data.layout
+    light = sample["expected_e"] / layout.area_um2 > 0.5 * (sample["expected_e"] / layout.area_um2).max()
+    corners = layout.centroid_um[light]
+    inside = np.all(
+        (layout.centroid_um > sample["box_um"][0, :2]) & (layout.centroid_um < sample["box_um"][0, 2:]), axis=1
+    )
+
+    # Along the edges the lens's blur decides.
+    assert (sample["mask"] == 1).sum() > 50
+    assert np.mean(light == (sample["mask"] == 1)) > 0.97
+    np.testing.assert_array_equal(sample["box_covers"][0], sample["mask"] == 1)
+    assert np.all(inside[sample["mask"] == 1])
+    assert corners[:, 1].mean() > 0.0  # the upper half of the picture
+    assert sample["flow_um"][:, 0].min() > 0.0 > sample["flow_um"][:, 1].max()
+
+
+def test_nothing_in_a_sample_is_nan_where_sites_see_no_picture():
+    narrow = {"kind": "fisheye", "projection": "orthographic", "focal_um": 30.0}
+    shot = SHOT | {"scene": SHOT["scene"] | {"pitch_um": 120.0}, "distortion": narrow}
+    flows = np.full((1, N_Y, N_X, 2), np.nan)
+    with pytest.warns(CoverageWarning, match="sample 0: .*photosites lie"):
+        sample = explore.DataSet(
+            pictures(1), shot, masks=np.zeros((1, N_Y, N_X), int), boxes=[[[0, 0, 5, 5]]], flows=flows
+        )[0]
+
+    assert "photosites lie" in sample["warning"]
+    assert (sample["mask"] == -1).any()
+    assert not sample["flow_known"].any()
+    assert all(np.isfinite(value).all() for value in sample.values() if isinstance(value, np.ndarray))
+
+
+@pytest.mark.parametrize(("fit", "is_covered"), [("cover", True), ("contain", False)])
+def test_pictures_of_any_size_fit_the_layout(fit, is_covered):
+    wide, high = np.full((20, 90, 3), 200, np.uint8), np.full((90, 20, 3), 200, np.uint8)
+    data = explore.DataSet([wide, high], SHOT, masks=[wide[..., 0] // 200, high[..., 0] // 200], fit=fit)
+    if is_covered:
+        assert all((sample["mask"] == 1).all() for sample in data)
+        return
+    with pytest.warns(CoverageWarning):
+        assert all((sample["mask"] == -1).any() for sample in data)
+    for k, n in ((0, 90), (1, 90)):
+        grid = data.shot(k).camera.optics.grid(data.shot(k).scene)
+        x0, y0, x1, y1 = np.abs(data.layout.bounds_um)
+        half_um = (max(x0, x1), max(y0, y1))[k]
+        assert n * grid.pitch_um / 2 == pytest.approx(half_um)
+
+
+# -- where pictures come from -----------------------------------------------------------------------------------------
+
+
+def folder_of_classes(tmp_path):
+    for k, (name, picture) in enumerate(zip(("b/2.png", "a/10.png", "a/9.png", "b/1.png"), pictures(4), strict=True)):
+        path = tmp_path / "pictures" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(picture).save(path)
+        (path.parent / "notes.txt").write_text(str(k))
+    (tmp_path / "pictures" / "a" / ".9.png").write_text("hidden")
+    return tmp_path / "pictures"
+
+
+def test_folders_zips_files_pairs_and_arrays_give_the_same_samples(tmp_path):
+    folder = folder_of_classes(tmp_path)
+    names = ["a/9.png", "a/10.png", "b/1.png", "b/2.png"]
+    archive = tmp_path / "pictures.zip"
+    with zipfile.ZipFile(archive, "w") as file:
+        for name in reversed(names):
+            file.write(folder / name, name)
+    stack = pictures(4)[[2, 1, 3, 0]]
+    np.save(tmp_path / "stack.npy", stack)
+    classes = ["a", "a", "b", "b"]
+    paired = [(Image.open(folder / name), label) for name, label in zip(names, classes, strict=True)]
+    made = {
+        "folder": explore.DataSet(folder, SHOT, VARY),
+        "zip": explore.DataSet(archive, SHOT, VARY),
+        "files": explore.DataSet([folder / name for name in names], SHOT, VARY, labels=classes),
+        "pairs": explore.DataSet(paired, SHOT, VARY),
+        "array": explore.DataSet(stack, SHOT, VARY, labels=classes),
+        "npy": explore.DataSet(tmp_path / "stack.npy", SHOT, VARY, labels=classes),
+    }
+
+    for data in made.values():
+        assert data.class_names == ["a", "b"]
+        again = pickle.loads(pickle.dumps(data)) if data is not made["pairs"] else data
+        for k in range(4):
+            assert_same(again[k], made["folder"][k])
+    assert [sample["label"] for sample in made["zip"]] == [0, 0, 1, 1]
+
+
+def test_a_mask_with_a_palette_has_its_numbers(tmp_path):
+    image = Image.fromarray(np.full((N_Y, N_X), 3, np.uint8), mode=None).convert("P")
+    image.putpalette([200, 10, 10] * 256)
+    image.putdata([3] * (N_Y * N_X))
+    image.save(tmp_path / "mask.png")
+
+    sample = explore.DataSet(pictures(1), SHOT, masks=[tmp_path / "mask.png"])[0]
+
+    assert set(sample["mask"].tolist()) == {3}
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["data.zarr", "data"])
+@pytest.mark.parametrize("workers", [1, 2])
+def test_what_was_written_is_what_is_simulated(name, workers, tmp_path):
+    data = labelled()
+    progress = []
+
+    stored = explore.write_data_set(
+        data, tmp_path / name, per_shard=3, workers=workers, tell=lambda *told: progress.append(told)
+    )
+
+    assert len(stored) == len(data)
+    for k in range(len(data)):
+        assert_same(stored[k], data[k])
+    assert_same(pickle.loads(pickle.dumps(stored))[-1], data[-1])
+    assert progress[0] == (0, 20)
+    assert progress[-1] == (20, 20)
+    assert stored.class_names == ["bird", "cat", "dog"]
+    assert stored.about["plan"]["seed"] == 7
+    assert stored.about["plan"]["settings"]["sensor"]["read_noise_e"] == 2.0
+    assert stored.about["plan"]["versions"]["foveasim"] == fs.__version__
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+def test_tar_files_are_the_same_bytes_with_any_number_of_workers_and_read_by_their_names(tmp_path):
+    for workers in (1, 2):
+        explore.write_data_set(labelled(), tmp_path / f"data{workers}", per_shard=6, workers=workers)
+    shards = sorted(p.name for p in (tmp_path / "data1").glob("*.tar"))
+
+    assert shards == [f"shard-{k:06d}.tar" for k in range(4)]
+    for name in shards:
+        assert (tmp_path / "data1" / name).read_bytes() == (tmp_path / "data2" / name).read_bytes()
+    with tarfile.open(tmp_path / "data1" / shards[1]) as tar:
+        assert tar.getnames()[:3] == ["000000006.npz", "000000006.json", "000000006.cls"]
+        about = json.load(tar.extractfile("000000007.json"))
+        assert about["label"] == int(tar.extractfile("000000007.cls").read()) == labelled()[7]["label"]
+    assert fs.read_layout(tmp_path / "data1" / "layout.npz").n_sites == labelled().layout.n_sites
+
+
+def test_the_photosites_are_beside_the_codes(tmp_path):
+    zarr = pytest.importorskip("zarr")
+    data = explore.DataSet(pictures(2), SHOT, VARY)
+    explore.write_data_set(data, tmp_path / "data.zarr")
+    group = zarr.open_group(str(tmp_path / "data.zarr"), mode="r")
+    layout = fs.Layout(*(group[f"layout/{name}"][:] for name in ("xy_um", "ring_offsets", "site_offsets")))
+
+    np.testing.assert_array_equal(layout.area_um2, data.layout.area_um2)
+    np.testing.assert_array_equal(group["settings/exposure_s"][:], [s["settings"]["exposure_s"] for s in data])
+
+
+def test_tar_files_hold_layouts_that_differ_and_zarr_does_not(tmp_path):
+    vary = {"layout.parameters.pitch_um": {"uniform": [5.0, 7.0]}, "layout.parameters.n_rows": {"integers": [6, 9]}}
+    data = explore.DataSet(pictures(5), SHOT, vary)
+
+    stored = explore.write_data_set(data, tmp_path / "data", per_shard=2)
+
+    assert len({sample["code"].size for sample in stored}) > 1
+    with pytest.raises(ParameterError, match="'layout' must not vary in a zarr folder"):
+        explore.write_data_set(data, tmp_path / "data.zarr")
+    with pytest.raises(ParameterError, match="'layout' differs from sample to sample"):
+        _ = data.layout
+
+
+def broken_folder(tmp_path):
+    """Six pictures, of which the fifth is cut short, and its whole content."""
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for k, picture in enumerate(pictures(6)):
+        Image.fromarray(picture).save(folder / f"{k}.png")
+    whole = (folder / "4.png").read_bytes()
+    (folder / "4.png").write_bytes(whole[: len(whole) // 2])
+    return folder, whole
+
+
+@pytest.mark.parametrize("name", ["data.zarr", "data"])
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_broken_picture_is_named_and_writing_goes_on_from_there(name, workers, tmp_path):
+    folder, whole = broken_folder(tmp_path)
+    target = tmp_path / name
+    done = (
+        (lambda: {p: p.stat().st_mtime_ns for p in target.glob("code/c/*/0")})
+        if name.endswith("zarr")
+        else (lambda: {p: p.stat().st_mtime_ns for p in target.glob("*.tar")})
+    )
+    with pytest.raises(FileError, match=r"4\.png: is broken or cut short"):
+        explore.write_data_set(explore.DataSet(folder, SHOT, VARY), target, per_shard=1, workers=workers)
+    before = done()
+    with pytest.raises(FileError, match=r"has \d of 6 shards; write the same data set there to go on"):
+        explore.open_data_set(target)
+    (folder / "4.png").write_bytes(whole)
+    data = explore.DataSet(folder, SHOT, VARY)
+
+    stored = explore.write_data_set(data, target, workers=workers)
+
+    assert len(before) >= 4 if workers == 1 else len(before) >= 1
+    assert before.items() <= done().items()
+    for k in range(6):
+        assert_same(stored[k], data[k])
+
+
+def test_a_process_that_ends_amid_a_shard_leaves_whole_shards(tmp_path):
+    script = tmp_path / "write.py"
+    script.write_text(
+        "import json, os, sys\n"
+        "import numpy as np\n"
+        "from foveasim import explore\n"
+        "class Pictures:\n"
+        "    def __len__(self):\n"
+        "        return 8\n"
+        "    def __getitem__(self, k):\n"
+        "        if k == 5 and sys.argv[2] == 'end':\n"
+        "            os._exit(9)\n"
+        "        return np.random.default_rng(k).integers(0, 256, (40, 48, 3), np.uint8)\n"
+        "if __name__ == '__main__':\n"
+        "    shot = json.loads(sys.argv[3])\n"
+        "    for path in sys.argv[4:]:\n"
+        "        explore.write_data_set(explore.DataSet(Pictures(), shot), path, per_shard=2, workers=int(sys.argv[1]))\n"
+    )
+    both = [str(tmp_path / "data.zarr"), str(tmp_path / "data")]
+
+    def run(workers, how, *paths):
+        command = [sys.executable, str(script), str(workers), how, json.dumps(SHOT), *paths]
+        return subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
+
+    for path in both:
+        assert run(1, "end", path).returncode == 9
+    lost = run(2, "end", both[1])
+    finished = run(1, "whole", *both)
+
+    assert "SimulationError: a process that writes samples ended" in lost.stderr
+    assert finished.returncode == 0, finished.stderr
+    data = explore.DataSet([np.random.default_rng(k).integers(0, 256, (40, 48, 3), np.uint8) for k in range(8)], SHOT)
+    for path in both:
+        stored = explore.open_data_set(path)
+        for k in range(8):
+            assert_same(stored[k], data[k])
+
+
+@pytest.mark.parametrize("name", ["data.zarr", "data"])
+def test_a_full_disk_is_one_sentence_and_no_broken_shard(name, tmp_path):
+    """The system refuses files beyond a size, as it does where no place is left."""
+    rng = np.random.default_rng(0)
+    layout = {"generator": "grid", "parameters": {"n_x": 90, "n_y": 90, "pitch_um": 1.0}}
+    data = explore.DataSet(
+        rng.integers(0, 256, (4, 100, 100, 3), np.uint8), SHOT | {"layout": layout}, fields=("electrons",), fit="cover"
+    )
+    data[0]
+    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (9_000, usual[1]))
+    try:
+        with pytest.raises(FileError, match="cannot be written: File too large"):
+            explore.write_data_set(data, tmp_path / name, per_shard=1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
+
+    stored = explore.write_data_set(data, tmp_path / name, per_shard=1)
+
+    for k in range(4):
+        assert_same(stored[k], data[k])
+    assert not list(tmp_path.rglob(".foveasim*"))
+
+
+def test_a_store_of_something_else_is_left_alone(tmp_path):
+    data = explore.DataSet(pictures(2), SHOT, VARY)
+    explore.write_data_set(data, tmp_path / "data", per_shard=1)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other.zarr").write_text("text")
+    for other, path, message in (
+        (explore.DataSet(pictures(2), SHOT, VARY, seed=1), "data", "is another data set: its 'seed' differs"),
+        (explore.DataSet(pictures(2, 1), SHOT, VARY), "data", "its 'pictures' differs"),
+        (data, "other", "holds something else than a data set"),
+        (data, "other.zarr", "holds something else than a data set"),
+        (data, "data.hdf", "must end in .zarr, or have no ending"),
+        (data, "missing/data", "cannot be written: the folder .*missing does not exist"),
+        (data, "data/shard-000000.tar/x", "cannot be written: the folder .* does not exist"),
+    ):
+        with pytest.raises(FileError, match=message):
+            explore.write_data_set(other, tmp_path / path)
+    with pytest.raises(FileError, match="its 'per_shard' differs"):
+        explore.write_data_set(data, tmp_path / "data", per_shard=2)
+    (tmp_path / "data" / "shard-000001.tar").write_bytes(b"cut short")
+    with pytest.raises(FileError, match="has a broken sample 1"):
+        explore.open_data_set(tmp_path / "data")[1]
+    with pytest.raises(FileError, match="no such folder"):
+        explore.open_data_set(tmp_path / "nothing")
+
+
+def test_warnings_of_samples_are_told_once_and_kept(tmp_path):
+    shot = SHOT | {"scene": SHOT["scene"] | {"pitch_um": 70.0}}
+    with pytest.warns(FoveasimWarning, match="3 of the samples written have warnings, such as: sample 0: ") as caught:
+        stored = explore.write_data_set(explore.DataSet(pictures(3), shot), tmp_path / "data.zarr")
+
+    assert len(caught) == 1
+    assert all("photosites lie" in sample["warning"] for sample in stored)
+
+
+# -- refusals ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("vary", "error", "message"),
+    [
+        ({"optics.speed": {"uniform": [1, 2]}}, ConfigError, "settings: optics.speed: no such setting"),
+        ({"exposure_s": [1, 2]}, ParameterError, "'exposure_s' must be drawn from one distribution"),
+        ({"exposure_s": {"gamma": [1, 2]}}, ParameterError, "must be drawn from one distribution"),
+        ({"exposure_s": {"uniform": [2, 1]}}, ParameterError, "must go from a lower number to a higher one"),
+        ({"exposure_s": {"uniform": [1]}}, ParameterError, r"uniform needs \[low, high\]"),
+        ({"exposure_s": {"uniform": "ab"}}, ParameterError, r"uniform needs \[low, high\], got 'ab'"),
+        ({"exposure_s": {"log_uniform": [0, 1]}}, ParameterError, "must be > 0"),
+        ({"exposure_s": {"uniform": [0, float("inf")]}}, ParameterError, "must be finite"),
+        ({"exposure_s": {"normal": [5, 1, 0, 1]}}, ParameterError, "its mean between the ends"),
+        ({"exposure_s": {"uniform": [0, 1], "weights": [1]}}, ParameterError, "weights, which only a choice has"),
+        ({"sensor.bits": {"choice": []}}, ParameterError, "at least one value"),
+        ({"sensor.bits": {"choice": [8, 9], "weights": [1]}}, ParameterError, "needs weights for its 2 choices"),
+        ({"sensor.bits": {"uniform": [8, 9.5]}}, ConfigError, "sensor.bits: "),
+        ({"sensor.bits": {"choice": [8, 40]}}, ConfigError, "sensor.bits: must be <= "),
+        (
+            {"optics.f_number": {"uniform": [0.1, 2]}},
+            ConfigError,
+            "settings: optics.f_number: must be >= 0.5, got 0.1",
+        ),
+        ({"seed": {"integers": [0, 9]}}, ParameterError, "'seed' cannot vary"),
+        ({"scene.picture": {"choice": ["a.png"]}}, ParameterError, "'scene.picture' cannot vary"),
+        ({"sensor": {"choice": [{}]}, "sensor.bits": {"choice": [8]}}, ConfigError, "cannot both vary"),
+        (["exposure_s"], ParameterError, "'vary' must be distributions by settings' paths"),
+    ],
+)
+def test_a_bad_distribution_is_refused_before_the_first_sample(vary, error, message):
+    with pytest.raises(error, match=message) as caught:
+        explore.DataSet(pictures(2), SHOT, vary)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"labels": [1]}, ParameterError, "'labels' must have one for each of the 2 pictures, got 1"),
+        ({"labels": [1, "a"]}, ParameterError, "must all be whole numbers, or all be texts"),
+        ({"labels": 3}, ParameterError, "'labels' must be a sequence"),
+        ({"boxes": [[[0, 0, 1, 1]], [[3, 0, 1, 1]]]}, ParameterError, r"'boxes\[1\]' must have x0 < x1"),
+        ({"boxes": [[], [1, 2, 3]]}, ParameterError, r"'boxes\[1\]' must have 2 dimensions"),
+        ({"boxes": [[], [[1, 2, 3]]]}, ParameterError, r"must have the shape \(n, 4\)"),
+        ({"boxes": [[], [[1, 2, 3, 4, 0.5]]]}, ParameterError, "whole numbers as classes"),
+        ({"fields": ["codes"]}, ParameterError, "'fields' must be one of 'code'"),
+        ({"fit": "crop"}, ParameterError, "'fit' must be one of 'cover', 'contain'"),
+        ({"cameras": 0}, ParameterError, "'cameras' must be >= 1"),
+        ({"draws": 1.5}, ParameterError, "'draws' must be a whole number"),
+        ({"seed": -1}, ParameterError, "'seed' must be >= 0"),
+        ({"changes": {"optics.speed": 1}}, ConfigError, "optics.speed: no such setting"),
+        ({"fit": "cover", "vary": {"scene.pitch_um": {"uniform": [1, 2]}}}, ParameterError, "cannot vary beside 'fit'"),
+        ({"shot": SHOT | {"scene": FLAT}}, ConfigError, "scene.kind: must be 'picture'"),
+        ({"shot": 5}, ParameterError, "'shot' must be a settings file, or settings, got a int"),
+        ({"shot": "missing.yaml"}, ConfigError, "missing.yaml: no such file"),
+        (
+            {"pictures": 5},
+            ParameterError,
+            "'pictures' must be a folder, a zip file, an array, or a sequence, got a int",
+        ),
+        ({"pictures": []}, ParameterError, "'pictures' must hold at least one picture"),
+        ({"pictures": np.zeros((3, 4))}, ParameterError, "'pictures' must have the shape"),
+        ({"pictures": np.zeros((0, 4, 4))}, ParameterError, "'pictures' must have the shape"),
+        ({"pictures": "missing"}, FileError, "missing: no such file or folder"),
+        ({"pictures": [np.zeros((4, 4, 3), complex)]}, FileError, "picture 0: is no picture for these settings"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_sentence(options, error, message):
+    arguments = {"pictures": pictures(2), "shot": SHOT} | options
+    with pytest.raises(error, match=message) as caught:
+        explore.DataSet(**arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_folders_and_files_without_pictures_are_refused(tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "notes.txt").write_text("no picture")
+    (tmp_path / "one.png").write_bytes(b"no zip file")
+    (tmp_path / "bad.npy").write_bytes(b"no array")
+    with zipfile.ZipFile(tmp_path / "empty.zip", "w") as file:
+        file.writestr("notes.txt", "no picture")
+    with zipfile.ZipFile(tmp_path / "broken.zip", "w") as file:
+        file.writestr("a.png", b"no picture")
+    for name, message in (
+        ("empty", "empty: holds no pictures"),
+        ("empty.zip", "empty.zip: holds no pictures"),
+        ("one.png", "must be a folder of pictures, a zip file"),
+        ("bad.npy", "bad.npy: is no array that can be read"),
+        ("broken.zip", r"broken.zip!a.png: is not a picture"),
+    ):
+        with pytest.raises(FileError, match=message):
+            explore.DataSet(tmp_path / name, SHOT)
+
+
+def test_labels_that_do_not_fit_a_picture_name_it():
+    bad = {
+        "masks": ([np.zeros((N_Y, N_X), int), np.zeros((3, 3), int)], "mask of picture 1' must be whole numbers"),
+        "flows": ([np.zeros((N_Y, N_X, 2)), np.zeros((N_Y, N_X))], "flow of picture 1' must be numbers of the shape"),
+    }
+    for name, (given, message) in bad.items():
+        data = explore.DataSet(pictures(2), SHOT, **{name: given})
+        data[0]
+        with pytest.raises(SimulationError, match=f"sample 1 .*{message}"):
+            data[1]
+
+
+def test_samples_are_counted_as_of_a_sequence():
+    data = explore.DataSet(pictures(2), SHOT, cameras=2, draws=3)
+
+    assert len(data) == len(list(data)) == 12
+    assert_same(data[-1], data[11])
+    for index in (12, -13):
+        with pytest.raises(IndexError, match="there are 12 samples"):
+            data[index]
+
+
+# -- recipes ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_target_of_denoising_is_the_mean_of_its_draws():
+    n_draws = 400
+    data = explore.denoising(pictures(1), SHOT, draws=n_draws)
+    samples = list(data)
+    codes = np.stack([sample["code"] for sample in samples]).astype(float)
+    shot, target_dn = data.shot(0), samples[0]["expected_dn"]
+    capture = data.capture(0)
+    _, variance_dn2 = shot.camera.sensor.predict(capture.expected_e)
+    off_dn = np.abs(codes.mean(axis=0) - target_dn)
+    is_noisy = variance_dn2 > 0.02
+
+    assert len({sample["settings"]["exposure_s"] for sample in samples}) == 1
+    assert is_noisy.sum() > 20
+    assert (off_dn / np.sqrt(variance_dn2 / n_draws))[is_noisy].max() < 5.0
+    assert off_dn[~is_noisy].max(initial=0.0) < 0.05
+
+
+def test_classification_draws_a_camera_for_every_picture_around_the_shots():
+    data = explore.classification(pictures(30), SHOT, {"sensor.bits": {"choice": [6, 8]}}, labels=[0] * 30)
+    drawn = [sample["settings"] for sample in data]
+    f_numbers = np.array([each["optics.f_number"] for each in drawn])
+
+    assert set(data[0]) == {"index", "picture", "code", "label", "settings", "warning"}
+    assert f_numbers.min() >= 2.8 / 1.5
+    assert f_numbers.max() <= 8.4
+    assert f_numbers.max() / f_numbers.min() > 2.0
+    assert len({each["sensor.device_seed"] for each in drawn}) == 30
+    assert {each["sensor.bits"] for each in drawn} == {6, 8}
+    with pytest.raises(ConfigError, match="exposure_s: is missing"):
+        explore.classification(pictures(1), {key: value for key, value in SHOT.items() if key != "exposure_s"})
+
+
+# -- torch ------------------------------------------------------------------------------------------------------------
+
+
+def test_without_torch_one_sentence_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    _kind.cache_clear()
+    with pytest.raises(ParameterError, match=r"needs torch; install it with: pip install 'foveasim\[torch\]'"):
+        explore.torch_data_set(labelled(1))
+
+
+def test_torch_is_not_needed_and_not_loaded_for_a_data_set():
+    code = "import sys; from foveasim import explore; sys.exit('torch' in sys.modules or 'zarr' in sys.modules)"
+
+    assert subprocess.run([sys.executable, "-c", code], env=os.environ, check=False).returncode == 0
+
+
+def test_a_loader_of_torch_gives_the_same_samples_with_any_number_of_workers(tmp_path):
+    torch = pytest.importorskip("torch")
+    data = explore.DataSet(pictures(50), SHOT, VARY, cameras=20, labels=[k % 7 for k in range(50)])
+    stored = explore.write_data_set(data, tmp_path / "data.zarr")
+    found = {
+        n: list(torch.utils.data.DataLoader(samples, batch_size=40, num_workers=n, shuffle=False))
+        for n, samples in ((0, data), (2, explore.torch_data_set(data)))
+    }
+    found["stored"] = list(torch.utils.data.DataLoader(stored, batch_size=40, num_workers=2))
+
+    assert isinstance(explore.torch_data_set(data), torch.utils.data.Dataset)
+    assert sum(len(batch["label"]) for batch in found[0]) == len(data) == 1000
+    for other in (found[2], found["stored"]):
+        for one, two in zip(found[0], other, strict=True):
+            for name in ("index", "code", "electrons", "label", "picture"):
+                assert torch.equal(one[name], two[name])
+            for path in VARY:
+                assert torch.equal(one["settings"][path], two["settings"][path])
+    np.testing.assert_array_equal(found[0][3]["code"][5].numpy(), data[125]["code"])
+
+
+def test_deep_codes_become_tensors_that_torch_can_reckon_with():
+    torch = pytest.importorskip("torch")
+    data = explore.DataSet(pictures(1), SHOT, changes={"sensor.bits": 12})
+    transformed = explore.torch_data_set(data, partial(operator.itemgetter("code")))
+
+    assert explore.torch_data_set(data)[0]["code"].dtype == torch.int32
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(transformed))[0].numpy(), data[0]["code"])
