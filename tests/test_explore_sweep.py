@@ -129,8 +129,11 @@ def answers(port):
         return one.connect_ex(("127.0.0.1", port)) == 0
 
 
-def test_results_are_the_same_on_a_scheduler_started_separately(by_hand):
-    address = f"tcp://127.0.0.1:{free_port()}"
+@pytest.fixture(scope="module")
+def scheduler():
+    """A scheduler with two workers, in programs of their own: its address, and its program."""
+    port = free_port()
+    address = f"tcp://127.0.0.1:{port}"
     programs = [
         ("distributed.cli.dask_scheduler", "--host", address, "--no-dashboard"),
         *[("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard")] * 2,
@@ -141,16 +144,37 @@ def test_results_are_the_same_on_a_scheduler_started_separately(by_hand):
             command = [sys.executable, "-m", module, *arguments]
             running.append(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
             if len(running) == 1:
-                wait_for(lambda: answers(int(address.rpartition(":")[2])))
-
-        found = explore.run_sweep(plan_200(), scheduler=address)
+                wait_for(lambda: answers(port))
+        yield address, running[0]
     finally:
         for program in reversed(running):
             program.terminate()
         for program in running:
             program.wait(timeout=20)
 
+
+def test_results_are_the_same_on_a_scheduler_started_separately(scheduler, by_hand):
+    found = explore.run_sweep(plan_200(), scheduler=scheduler[0])
+
     xr.testing.assert_identical(found, by_hand)
+
+
+def test_a_scheduler_that_is_killed_is_told_and_what_was_done_is_kept(scheduler, tmp_path):
+    """The last test of that scheduler."""
+    address, program = scheduler
+    store = tmp_path / "r.zarr"
+
+    def kill():
+        wait_for(lambda: len(journal_points(store)) >= 5)
+        program.kill()
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    with pytest.raises(SimulationError, match=r"the scheduler does not answer any more; \d+ of 200 points are done"):
+        explore.run_sweep(plan_200(logged(tmp_path, SLOW_S)), out=store, scheduler=address)
+    killer.join()
+
+    assert len(journal_points(store)) >= 5
 
 
 def test_a_points_seed_is_of_the_sweeps_seed_and_its_number_alone():

@@ -55,12 +55,13 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
         ) from None
     if scheduler is not None:
         _check_answer(scheduler)
-        client = Client(scheduler, timeout=SCHEDULER_S, set_as_default=False)
-        try:
-            yield client
-        finally:
-            with suppress(Exception):
-                client.close(timeout=2)
+        with _silent():
+            client = Client(scheduler, timeout=SCHEDULER_S, set_as_default=False)
+            try:
+                yield client
+            finally:
+                with suppress(Exception):
+                    client.close(timeout=2)
         return
     # A worker's end is ours to judge: each point is tried again, alone, and counted.
     with (
@@ -76,6 +77,20 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
         Client(cluster, set_as_default=False) as client,
     ):
         yield client
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Without what dask logs of a lost connection, which is told in a sentence."""
+    logs = [logging.getLogger(name) for name in ("distributed.client", "distributed.core")]
+    levels = [log.level for log in logs]
+    for log in logs:
+        log.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for log, level in zip(logs, levels, strict=True):
+            log.setLevel(level)
 
 
 def _check_answer(scheduler: str) -> None:
@@ -248,8 +263,8 @@ def _arrived(work: _Work, future: Future[Any], bundle: _Bundle) -> list[Record]:
         records, spent_s = future.result()
     except KilledWorker:
         return list(_again(work, bundle))
-    except (CancelledError, TimeoutError, OSError) as error:
-        raise SimulationError(f"the scheduler is gone ({error or type(error).__name__})") from None
+    except (CancelledError, TimeoutError, OSError):
+        raise SimulationError("the scheduler does not answer any more") from None
     except Exception as error:  # noqa: BLE001 -- whatever a worker without the package, or without a metric's module, raises
         raise SimulationError(f"the workers cannot run the points: {' '.join(str(error).split()):.300}") from None
     took_s = spent_s / len(records)
@@ -269,5 +284,5 @@ def _again(work: _Work, bundle: _Bundle) -> Iterator[Record]:
 def _workers(client: Client) -> set[str]:
     try:
         return set(client.nthreads())
-    except Exception as error:  # noqa: BLE001 -- a connection can break in many ways
-        raise SimulationError(f"the scheduler is gone ({error or type(error).__name__})") from None
+    except Exception:  # noqa: BLE001 -- a connection can break in many ways
+        raise SimulationError("the scheduler does not answer any more") from None

@@ -182,7 +182,9 @@ def _run(
                 if tell is not None:
                     tell(n_done, plan.n_points)
         except SimulationError as error:
-            raise SimulationError(f"{error}; {n_done:,} of {plan.n_points:,} points are done") from None
+            raise SimulationError(
+                f"{error}; {n_done:,} of {plan.n_points:,} points are done, and a sweep with a store goes on from there"
+            ) from None
 
 
 def _runs(plan: Plan, n_runs: int) -> list[Ints]:
