@@ -1,7 +1,7 @@
 """
 How fine a fovea, and how wide a lens: what does a photograph gain from each?
 
-New here: ``foveasim.explore``: a sweep in a YAML file (``foveal_sweep.yaml``), run on worker processes into one labelled store.
+New here: ``foveasim.explore``: a sweep in a YAML file (``sweeps/foveal.yaml``), run on worker processes into one labelled store.
 
 Expect: noise is that of light, so the mean signal to noise of any of the layouts goes as one over the root of 1 + 4 N², N the
 f-number behind the lens, within 1 % from f/2 to f/8. Four times the sectors bring the picture 8 dB nearer to the light, and
@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from foveasim.explore import read_sweep, run_sweep
 from foveasim.view import save_figure
 
-SWEEP = Path(__file__).parent / "foveal_sweep.yaml"
+SWEEP = Path(__file__).parent / "sweeps" / "foveal.yaml"
 #: Image size over scene size: 8 mm of focal length, 1 m away.
 MAGNIFICATION = 8.0 / (1000.0 - 8.0)
 
