@@ -1,7 +1,7 @@
 """
 How fine a fovea, and how wide a lens: what does a photograph gain from each?
 
-New here: ``foveasim.explore``: a sweep in a YAML file (``sweeps/foveal.yaml``), run on worker processes into one labelled store.
+New here: ``foveasim.explore``: a sweep in a YAML file (``sweeps/foveal.yaml``), run on worker processes into a labelled store.
 
 Expect: noise is that of light, so the mean signal to noise of any of the layouts goes as one over the root of 1 + 4 N², N the
 f-number behind the lens, within 1 % from f/2 to f/8. Four times the sectors bring the picture 8 dB nearer to the light, and
