@@ -20,7 +20,7 @@ def test_code_on_a_page_runs(page, tmp_path, monkeypatch):
     mpl.use("agg")
     monkeypatch.chdir(tmp_path)
     Image.fromarray(astronaut()).save("photo.jpg")
-    names = {}
+    names = {"__name__": "__main__"}
     for block in BLOCK.findall(page.read_text()):
         exec(compile(block, str(page), "exec"), names)
 
