@@ -755,6 +755,8 @@ def test_classification_draws_a_camera_for_every_picture_around_the_shots():
     assert f_numbers.max() / f_numbers.min() > 2.0
     assert len({each["sensor.device_seed"] for each in drawn}) == 30
     assert {each["sensor.bits"] for each in drawn} == {6, 8}
+    data = explore.denoising(pictures(1), SHOT, draws=1, cameras=40, changes={"exposure_s": 3.2})
+    assert all(0.1 <= sample["settings"]["exposure_s"] <= 3.2 for sample in data)
     with pytest.raises(ConfigError, match="exposure_s: is missing"):
         explore.classification(pictures(1), {key: value for key, value in SHOT.items() if key != "exposure_s"})
 

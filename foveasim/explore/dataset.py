@@ -8,7 +8,7 @@ import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -116,7 +116,7 @@ class DataSet:
     >>> import numpy as np
     >>> shot = {
     ...     "scene": {
-    ...         "kind": "picture", "picture": "", "pitch_um": 100.0, "distance_m": 1.0,
+    ...         "kind": "picture", "picture": "", "pitch_um": 500.0, "distance_m": 1.0,
     ...         "peak_radiance_w_m2_sr_nm": 0.1, "wavelength_nm": 550, "band_width_nm": 100,
     ...     },
     ...     "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
@@ -375,7 +375,7 @@ class DataSet:
             drawn = self._drawn(index)
             shot, capture = self._captured(index)
             sample: dict[str, Any] = {"index": index, "picture": self._picture_of(index)}
-            sample |= {field: self._field(field, shot, capture) for field in self.fields}
+            sample |= {field: self._field(field, index, shot, capture) for field in self.fields}
             sample |= self._site_labels(index, shot)
         told = [*self._told, *(_warning(each.message) for each in caught)]
         if told and not self._has_warned:
@@ -386,11 +386,13 @@ class DataSet:
         sample["warning"] = "; ".join(dict.fromkeys(str(each) for each in told))
         return sample
 
-    def _field(self, field: str, shot: Shot, capture: Capture) -> NDArray[Any]:
+    def _field(self, field: str, index: int, shot: Shot, capture: Capture) -> NDArray[Any]:
         if field == "code":
             return capture.code.astype(self._code_type)
         if field == "expected_dn":
-            return shot.camera.sensor.predict(capture.expected_e, n_threads=self._n_threads)[0]
+            # The same for all draws of a camera.
+            predict = partial(shot.camera.sensor.predict, capture.expected_e, n_threads=self._n_threads)
+            return np.array(self._keep("prediction", index // self.draws, predict)[0])
         return np.array(getattr(capture, field))
 
     def _site_labels(self, index: int, shot: Shot) -> dict[str, Any]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 from foveasim.arrays import check_number
-from foveasim.config import read_settings
+from foveasim.config import put_setting, read_settings
 from foveasim.errors import ConfigError
 from foveasim.explore.dataset import DataSet
 
@@ -52,7 +53,7 @@ def classification(
     FileError, ParameterError, ConfigError
         As for :class:`DataSet`.
     """
-    f_number, exposure_s = _number(shot, "optics.f_number"), _number(shot, "exposure_s")
+    f_number, exposure_s = _numbers(shot, options, "optics.f_number", "exposure_s")
     usual: dict[str, Any] = {
         "optics.f_number": {"log_uniform": [max(f_number / 1.5, FASTEST), 3.0 * f_number]},
         "exposure_s": {"log_uniform": [exposure_s / 8.0, 4.0 * exposure_s]},
@@ -93,13 +94,14 @@ def denoising(
     DataSet
         With the ``code`` and, as the target, ``expected_dn``: the mean of the code over all draws, computed and not averaged.
         It has the fixed patterns of the device, which no draw differs in; give a shot without them for a target that has none.
+        Where codes are cut off at 0 the mean is above the light's; ``sensor.pedestal_v`` keeps noise about darkness.
 
     Raises
     ------
     FileError, ParameterError, ConfigError
         As for :class:`DataSet`.
     """
-    exposure_s = _number(shot, "exposure_s")
+    (exposure_s,) = _numbers(shot, options, "exposure_s")
     usual: dict[str, Any] = {
         "exposure_s": {"log_uniform": [exposure_s / 32.0, exposure_s]},
         "sensor.read_noise_e": {"log_uniform": [0.5, 20.0]},
@@ -108,12 +110,18 @@ def denoising(
     return DataSet(pictures, shot, usual | dict(vary or {}), draws=draws, seed=seed, **options)
 
 
-def _number(shot: str | Path | Mapping[str, Any], path: str) -> float:
-    """A number among the shot's settings."""
-    value: Any = shot if isinstance(shot, Mapping) else read_settings(shot)
-    file = "settings" if isinstance(shot, Mapping) else shot
-    for name in path.split("."):
-        value = value.get(name) if isinstance(value, Mapping) else None
-    if value is None:
-        raise ConfigError(file, f"{path}: is missing")
-    return check_number(path.rpartition(".")[2], value, above=0.0)
+def _numbers(shot: str | Path | Mapping[str, Any], options: Mapping[str, Any], *paths: str) -> list[float]:
+    """Numbers among the shot's settings, with the changes among a data set's options."""
+    file = Path("settings") if isinstance(shot, Mapping) else Path(shot)
+    data = deepcopy(dict(shot)) if isinstance(shot, Mapping) else read_settings(file)
+    for path, value in (options.get("changes") or {}).items():
+        put_setting(file, data, path, value)
+    found = []
+    for path in paths:
+        place: Any = data
+        for name in path.split("."):
+            place = place.get(name) if isinstance(place, Mapping) else None
+        if place is None:
+            raise ConfigError(file, f"{path}: is missing")
+        found.append(check_number(path.rpartition(".")[2], place, above=0.0))
+    return found

@@ -31,6 +31,10 @@ FORMAT, VERSION = "foveasim data set", 1
 ZARR, ABOUT = ".zarr", "data_set.json"
 #: Bytes of the samples of a shard, about, and how many they are at most: one process has them in memory.
 SHARD_BYTES, LARGEST_SHARD = 1 << 26, 512
+#: Shards of a data set, at least, so that many processes can write it and little is lost with one.
+FEWEST_SHARDS = 32
+#: Shards of a zarr folder that a process keeps when it reads: those met last.
+KEPT_SHARDS = 4
 #: Name of the array that tells which shards are done, and of the group of what was drawn.
 DONE, SETTINGS = "done", "settings"
 NEEDS_ZARR = "needs zarr: pip install 'foveasim[explore]'"
@@ -56,9 +60,10 @@ def write_data_set(
     path : path
         ``.zarr``: a zarr folder with an array for each part of the samples, and a chunk of it for each shard. Without an
         ending: a folder of tar files ``shard-000000.tar`` ..., as WebDataset reads them, with the arrays (``.npz``), the rest
-        (``.json``) and, where there are labels, the class (``.cls``) of each sample.
+        (``.json``) and, where there are labels, the class (``.cls``) of each sample. Arrays of all samples are read faster from
+        zarr, and single samples in any order from tar files, of which only they are read.
     per_shard : int, optional
-        Samples of a shard; by default about 64 MiB of them.
+        Samples of a shard; by default about 64 MiB of them, and a 32nd of all at most.
     workers : int
         Processes. They import the calling program's main file: keep the call under ``if __name__ == "__main__":``.
     tell : callable, optional
@@ -106,7 +111,8 @@ def write_data_set(
             "format": FORMAT,
             "version": VERSION,
             "n_samples": len(data_set),
-            "per_shard": per_shard or max(1, min(SHARD_BYTES // n_bytes, LARGEST_SHARD, len(data_set))),
+            "per_shard": per_shard
+            or max(1, min(SHARD_BYTES // n_bytes, LARGEST_SHARD, len(data_set) // FEWEST_SHARDS)),
             "has_label": "label" in first,
             "class_names": data_set.class_names,
             "plan": plan,
@@ -450,9 +456,10 @@ class _ZarrShards(_Shards):
     def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
         super().__init__(folder, about)
         self._opened: tuple[int, dict[str, Any]] | None = None
+        self._read: dict[int, dict[str, NDArray[Any]]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_opened": None}
+        return self.__dict__ | {"_opened": None, "_read": {}}
 
     @staticmethod
     def begin(target: Path, about: Mapping[str, Any], data_set: DataSet, first: Mapping[str, Any]) -> None:
@@ -506,18 +513,26 @@ class _ZarrShards(_Shards):
         arrays[DONE][k] = 1
 
     def read(self, index: int) -> dict[str, Any]:
+        rows, row = self._rows(index // self.per_shard), index % self.per_shard
         sample: dict[str, Any] = {SETTINGS: {}}
-        for name, array in self._arrays().items():
-            if name == DONE:
-                continue
-            value: Any = array[index]
-            if array.ndim == 1:
-                value = value.item() if isinstance(value, np.ndarray | np.generic) else value
+        for name, values in rows.items():
+            value = np.array(values[row]) if values.ndim > 1 else values[row]
+            value = value.item() if isinstance(value, np.generic) else value
             if name.startswith(f"{SETTINGS}/"):
                 sample[SETTINGS][name.removeprefix(f"{SETTINGS}/")] = value
             else:
-                sample[name] = np.asarray(value) if array.ndim > 1 else value
+                sample[name] = value
         return sample
+
+    def _rows(self, k: int) -> dict[str, NDArray[Any]]:
+        """All of a shard: a chunk is unpacked as a whole, and so is kept for its other samples."""
+        if k not in self._read:
+            place = slice(self.samples(k).start, self.samples(k).stop)
+            rows = {name: np.asarray(array[place]) for name, array in self._arrays().items() if name != DONE}
+            self._read[k] = rows
+            while len(self._read) > KEPT_SHARDS:
+                del self._read[next(iter(self._read))]
+        return self._read[k]
 
 
 def _flat(sample: Mapping[str, Any]) -> dict[str, NDArray[Any] | int | float | str]:
