@@ -1,0 +1,136 @@
+"""
+What do networks learn from that are to mind neither the camera nor its noise?
+
+New here: ``foveasim.explore.classification`` and ``denoising``, ``DataSet``, ``write_data_set``.
+
+Expect: one photograph as 8 cameras drawn at random take it, each sample with its class and the sites of its box; noisy captures
+at three exposures beside the mean code that they are noisy about, whose mean squared distance is the variance that the sensor
+predicts, within 3 %.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import skimage.data
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from foveasim import Capture, explore
+from foveasim.view import save_figure
+
+SHOT = {
+    "scene": {
+        "kind": "picture",
+        "distance_m": 1.0,
+        "peak_radiance_w_m2_sr_nm": 0.004,
+        "wavelength_nm": [620, 550, 450],
+    },
+    "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    "layout": "foveal_blind_spot",
+    "sensor": {"qe": 0.6, "filters": "rgb", "capacitance_f": {"per_um2": 1e-16}, "v_sat_v": 1.0, "bits": 10},
+    "exposure_s": 0.02,
+}
+#: Layouts that samples may have: any that come with the package, or that settings describe.
+LAYOUTS = [
+    "foveal_blind_spot",
+    {
+        "generator": "hexagonal",
+        "parameters": {"n_columns": 110, "n_rows": 127, "pitch_um": 12.0},
+        "mosaic": ["RG", "GB"],
+    },
+    {"generator": "grid", "parameters": {"n_x": 100, "n_y": 100, "pitch_um": 12.5}, "mosaic": ["RG", "GB"]},
+]
+#: Fewer of them for the other data set: means of few electrons take longer to compute than captures.
+HEXAGONS = {
+    "generator": "hexagonal",
+    "parameters": {"n_columns": 76, "n_rows": 88, "pitch_um": 17.3},
+    "mosaic": ["RG", "GB"],
+}
+#: For a denoiser: hundreds of electrons fill the codes.
+DIM = {"exposure_s": 2e-4, "sensor.capacitance_f": {"per_um2": 1e-18}, "layout": HEXAGONS}
+#: The face in the photograph, in its pixels from the upper left corner, and its class.
+FACE_PX, FACE = [170, 50, 280, 200], 1
+N_CAMERAS, N_DRAWS = 8, 4
+#: Of the pictures: their side, and what is where no photosite is.
+PICTURE_PIXELS, GREY = 300, 60.0
+
+
+def shown(capture: Capture, white_dn: float | None = None) -> NDArray[np.uint8]:
+    """A capture's picture over grey, its codes or up to a highest one."""
+    share = 1.0 if white_dn is None else white_dn / capture.white_dn.max()
+    image = capture.picture(max_pixels=PICTURE_PIXELS).to_image(share * capture.white_dn, encode_srgb=True)
+    cover = image[..., -1:] / 255.0
+    return np.rint(image[..., :-1] * cover + GREY * (1.0 - cover)).astype(np.uint8)
+
+
+def main(out_dir: Path) -> None:
+    """Write samples of both data sets to a folder."""
+    photograph = skimage.data.astronaut()
+
+    # %% For a classifier: the same class, whatever the layout, the lens, the exposure and the electronics.
+    data = explore.classification(
+        [photograph],
+        SHOT,
+        {"layout": {"choice": LAYOUTS}, "sensor.bits": {"choice": [6, 8, 10]}},
+        cameras=N_CAMERAS,
+        seed=5,
+        labels=["astronaut"],
+        boxes=[[[*FACE_PX, FACE]]],
+        fit="cover",
+    )
+    figure = Figure(figsize=(14, 7.8), layout="constrained")
+    for k, axes in enumerate(figure.subplots(2, N_CAMERAS // 2).ravel()):
+        sample, capture = data[k], data.capture(k)
+        x0, y0, x1, y1 = capture.layout.bounds_um
+        axes.imshow(shown(capture), extent=(x0, x1, y0, y1))
+        left, low, right, high = sample["box_um"][0]
+        axes.plot([left, right, right, left, left], [low, low, high, high, low], color="yellow", linewidth=0.8)
+        drawn = sample["settings"]
+        axes.set_title(
+            f"f/{drawn['optics.f_number']:.1f}, {1e3 * drawn['exposure_s']:.0f} ms, "
+            f"{drawn['sensor.read_noise_e']:.1f} e- read noise, {drawn['sensor.bits']} bits\n"
+            f"{capture.layout.n_sites:,} sites, {sample['box_covers'][0].sum():,} of the face",
+            fontsize=9,
+        )
+        axes.set_axis_off()
+    save_figure(figure, out_dir / "23_random_cameras.png", dpi=75)
+
+    # %% For a denoiser: draws of the noise, and the mean of all draws, computed.
+    noisy = explore.denoising([photograph], SHOT, cameras=3, draws=N_DRAWS, fit="cover", changes=DIM)
+    figure = Figure(figsize=(11, 7.6), layout="constrained")
+    ratios = []
+    for axes, first in zip(figure.subplots(2, 3).T, range(0, len(noisy), N_DRAWS), strict=True):
+        samples = [noisy[k] for k in range(first, first + N_DRAWS)]
+        capture = noisy.capture(first)
+        _, variance_dn2 = noisy.shot(first).camera.sensor.predict(capture.expected_e)
+        errors_dn = [sample["code"] - sample["expected_dn"] for sample in samples]
+        ratios.append(float(np.mean(np.square(errors_dn)) / variance_dn2.mean()))
+        drawn = samples[0]["settings"]
+        print(f"{1e6 * drawn['exposure_s']:.0f} µs: mean squared distance over the variance {ratios[-1]:.4f}")
+        titles = (
+            f"code: {1e6 * drawn['exposure_s']:.0f} µs, {drawn['sensor.read_noise_e']:.1f} e- read noise",
+            f"its expectation, {np.sqrt(np.mean(np.square(errors_dn))):.1f} DN away",
+        )
+        mean_dn = samples[0]["expected_dn"]
+        target = replace(capture, code=np.rint(mean_dn).astype(capture.code.dtype))
+        for part, one, title in zip(axes, (capture, target), titles, strict=True):
+            part.imshow(shown(one, float(np.percentile(mean_dn, 99.0))))
+            part.set_title(title, fontsize=9)
+            part.set_axis_off()
+    save_figure(figure, out_dir / "23_denoising.png", dpi=75)
+
+    # %% Written shard by shard, and read back.
+    with tempfile.TemporaryDirectory() as folder:
+        stored = explore.write_data_set(noisy, Path(folder) / "noisy")
+        print(stored, "of seed", stored.about["plan"]["seed"])
+        assert np.array_equal(stored[7]["code"], noisy[7]["code"])
+    assert max(abs(ratio - 1.0) for ratio in ratios) < 0.03
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "."))
