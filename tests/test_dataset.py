@@ -270,6 +270,20 @@ def test_a_box_covers_the_sites_that_are_mostly_in_it(seen, box_px):
     np.testing.assert_allclose(found.box_um[0], [*real.min(axis=0), *real.max(axis=0)], atol=0.02)
 
 
+def test_a_box_that_the_lens_does_not_image_is_nowhere():
+    far = fs.Grid.centred((100, 100), 4.0)
+    found = boxes_on_sites(
+        np.array([[0.0, 0.0, 5.0, 5.0], [48.0, 48.0, 52.0, 52.0]]),
+        fs.Integrator(SITES, far, distortion=LENS),
+        LENS,
+    )
+
+    assert not found.box_um[0].any()
+    assert not found.covers[0].any()
+    assert found.box_um[1].any()
+    assert found.covers[1].any()
+
+
 def test_flow_of_a_site_is_the_mean_of_its_pixels(seen):
     lens, integrator, areas_um2, _ = seen
     rng = np.random.default_rng(4)
@@ -661,6 +675,11 @@ def test_a_bad_distribution_is_refused_before_the_first_sample(vary, error, mess
         ({"changes": {"optics.speed": 1}}, ConfigError, "optics.speed: no such setting"),
         ({"fit": "cover", "vary": {"scene.pitch_um": {"uniform": [1, 2]}}}, ParameterError, "cannot vary beside 'fit'"),
         ({"shot": SHOT | {"scene": FLAT}}, ConfigError, "scene.kind: must be 'picture'"),
+        (
+            {"shot": SHOT | {"exposure_s": object()}},
+            ConfigError,
+            "settings: must hold numbers, texts, lists and sections",
+        ),
         ({"shot": 5}, ParameterError, "'shot' must be a settings file, or settings, got a int"),
         ({"shot": "missing.yaml"}, ConfigError, "missing.yaml: no such file"),
         (
@@ -722,6 +741,14 @@ def test_samples_are_counted_as_of_a_sequence():
     for index in (12, -13):
         with pytest.raises(IndexError, match="there are 12 samples"):
             data[index]
+    with pytest.raises(TypeError):
+        data[1.5]
+
+
+def test_settings_in_python_may_hold_numbers_of_numpy():
+    shot = SHOT | {"exposure_s": np.float32(0.5), "sensor": {"bits": np.int64(9)}}
+
+    assert explore.DataSet(pictures(1), shot).settings_of(0)["sensor"]["bits"] == 9
 
 
 # -- recipes ----------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import operator
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -62,7 +63,8 @@ class DataSet:
     ----------
     pictures : path, (n, n_y, n_x) or (n, n_y, n_x, n_channel) array, or sequence
         A folder of pictures and folders of them, a zip file of such, a file of one array (``.npy``); or files, arrays and
-        Pillow's images, alone or in pairs with their classes, of anything that has a length and items.
+        Pillow's images, alone or in pairs with their classes, of anything that has a length and items. Of pairs that are no
+        list all are asked for once, unless the classes are its ``targets`` as well.
     shot : path or mapping
         A settings file, or settings as it has them, of a scene of the kind ``picture``, whose picture these take the place of.
     vary : mapping of str to distribution, optional
@@ -109,7 +111,8 @@ class DataSet:
     number in all samples; with masks ``mask`` (n_site,), -1 off the picture; with flows ``flow_um`` (n_site, 2) and
     ``flow_known`` (n_site,). See :mod:`foveasim.explore.dataset_labels` for what they say.
 
-    Each process keeps the parts that it met last: layouts, compiled layouts, lenses, scenes, the light on the sites.
+    Each process keeps the parts that it met last: layouts, compiled layouts, lenses, scenes, the light on the sites. Arrays in
+    memory may go to each process whole; of files, and of a ``.npy`` file, each reads what it needs.
 
     Examples
     --------
@@ -273,7 +276,7 @@ class DataSet:
 
     def _at(self, index: int, what: Callable[[int], Any]) -> Any:
         """Something of a sample; what goes wrong is told with its number."""
-        place = int(index)
+        place = operator.index(index)
         if not -len(self) <= place < len(self):
             raise IndexError(f"there are {len(self)} samples, and none of the number {place}")
         place %= len(self)
@@ -476,7 +479,19 @@ def _base(shot: str | Path | Mapping[str, Any], changes: Mapping[str, Any], *, i
     for path, value in changes.items():
         put_setting(file, data, path, files_from(Path(), value, path))
     data.pop("seed", None)
-    return file, json.loads(json.dumps(data))
+    try:
+        return file, json.loads(json.dumps(data, default=_plain))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ConfigError(file, f"must hold numbers, texts, lists and sections ({error})") from None
+
+
+def _plain(value: Any) -> Any:
+    """What settings in Python may hold beside plain data."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"got a {type(value).__name__}")
 
 
 def _draws(file: Path, vary: Mapping[str, Any], *, is_fitted: bool) -> dict[str, Draw]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import tempfile
@@ -96,7 +97,7 @@ class _Folder:
         return _folder_labels(self._names)
 
     def described(self) -> dict[str, Any]:
-        return {"kind": "folder", "names": described(np.array("\n".join(self._names)))}
+        return {"kind": "folder", **_told(self._names)}
 
 
 class _Zip:
@@ -146,7 +147,7 @@ class _Zip:
         return _folder_labels(self._names)
 
     def described(self) -> dict[str, Any]:
-        return {"kind": "zip", "names": described(np.array("\n".join(self._names)))}
+        return {"kind": "zip", **_told(self._names)}
 
 
 class _Array:
@@ -254,8 +255,12 @@ class _Items:
 
     def described(self) -> dict[str, Any]:
         is_list = isinstance(self._items, list | tuple)
-        names = [self.name(k) for k in range(len(self))] if is_list else []
-        return {"kind": "items", "n": len(self), "names": described(np.array("\n".join(names)))}
+        return {"kind": "items", "n": len(self)} | (_told([self.name(k) for k in range(len(self))]) if is_list else {})
+
+
+def _told(names: Sequence[str]) -> dict[str, Any]:
+    """How many names there are, and a sum of them."""
+    return {"n": len(names), "sha256": hashlib.sha256("\n".join(names).encode()).hexdigest()}
 
 
 def _check_stack(name: str, pictures: NDArray[Any]) -> None:

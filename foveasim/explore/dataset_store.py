@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import multiprocessing
+import operator
 import os
 import secrets
 import shutil
@@ -269,7 +270,7 @@ class StoredSamples:
         FileError
             When its shard is broken.
         """
-        place = int(index)
+        place = operator.index(index)
         if not -len(self) <= place < len(self):
             raise IndexError(f"there are {len(self)} samples, and none of the number {place}")
         place %= len(self)
