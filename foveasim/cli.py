@@ -254,14 +254,20 @@ def sweep(
 
 @app.command()
 def video(
-    settings: Annotated[Path, typer.Argument(help="YAML file of the shot, whose scene's size and light the frames have.")],
+    settings: Annotated[
+        Path, typer.Argument(help="YAML file of the shot, whose scene's size and light the frames have.")
+    ],
     frames: Annotated[Path, typer.Option("--frames", help="Folder of pictures, or a video file.")],
     out: Annotated[
         Path,
-        typer.Option("--out", "-o", help="A .zarr folder with every code, a .mp4, .webm or .gif, or a folder of pictures."),
+        typer.Option(
+            "--out", "-o", help="A .zarr folder with every code, a .mp4, .webm or .gif, or a folder of pictures."
+        ),
     ] = Path("video.zarr"),
     changes: Annotated[list[str] | None, typer.Option("--set", help="Replace a setting: sensor.bits=10.")] = None,
-    frames_per_s: Annotated[float | None, typer.Option("--fps", help="Frames a second of a folder of pictures.")] = None,
+    frames_per_s: Annotated[
+        float | None, typer.Option("--fps", help="Frames a second of a folder of pictures.")
+    ] = None,
     line_s: Annotated[float, typer.Option("--line-s", help="Rolling shutter: seconds from line to line.")] = 0.0,
     stop: Annotated[int | None, typer.Option("--stop", help="Frames to take, at most.")] = None,
     threads: Threads = None,

@@ -401,7 +401,9 @@ def test_a_file_that_would_unpack_to_too_much_is_refused(capture, tmp_path, monk
 
 def test_a_picture_of_a_mosaic_has_a_channel_for_each_filter(capture):
     assert capture.picture(max_pixels=40).data.shape[0] == 3
-    with pytest.raises(ParameterError, match="'method' must be one of 'cells', 'linear', 'natural', 'least_squares', got 'magic'"):
+    with pytest.raises(
+        ParameterError, match="'method' must be one of 'cells', 'linear', 'natural', 'least_squares', got 'magic'"
+    ):
         capture.picture("magic")
 
 
