@@ -48,7 +48,11 @@ def main(out_dir: Path) -> None:
     size = layout.provenance["parameters"]
     shape = size["n_y"], size["n_x"]
     left, bottom, right, top = layout.bounds_um
-    checkers = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
+    ideal = optics.power_map(shot.scene)
+    ideal_camera = fs.Camera(optics=optics, sensor=shot.camera.sensor)
+    checkers, straight = (
+        camera.capture(ideal, exposure_s=shot.exposure_s, seed=shot.seed) for camera in (shot.camera, ideal_camera)
+    )
 
     # %% Points and a letter through the same lens.
     like = {
@@ -69,32 +73,34 @@ def main(out_dir: Path) -> None:
     is_inside = np.all(np.abs(expected_um) < np.array([right, top]) - (NEAR + 1) * lens.pixel_um, axis=1)
     found_um = middles_um(layout, spots.expected_e, expected_um[is_inside], shape)
 
-    # %% The same light warped as a picture, and integrated.
-    ideal = optics.power_map(shot.scene)
-    warped = fs.distortion.distort_map(ideal, lens)
-    by_warping = fs.Integrator(layout, warped.grid)(warped.data)[0]
-    by_outlines = shot.camera.integrator(ideal.grid, order=2)(ideal.data)[0]
+    # %% The same light warped as a picture, and integrated, on the upper right quarter.
+    quarter = layout[np.all(layout.centroid_um > 0.0, axis=1)]
+    n_y, n_x = (n // 2 for n in ideal.grid.shape)
+    warped = fs.distortion.distort_map(ideal, lens, grid=fs.Grid((n_y, n_x), ideal.grid.pitch_um, (0.0, 0.0)))
+    by_warping = fs.Integrator(quarter, warped.grid)(warped.data)[0]
+    by_outlines = fs.Integrator(quarter, ideal.grid, distortion=lens, order=2)(ideal.data)[0]
     # Even light, to see what each way makes of areas.
     even = fs.Grid.centred((290, 516), 16.0 * ideal.grid.pitch_um)
     by_density, by_flux = (
         fs.Integrator(layout, even, distortion=lens, conserve=kept)(np.ones(even.shape)) for kept in ("density", "flux")
     )
 
-    figure = Figure(figsize=(14, 8.6), layout="constrained")
+    figure = Figure(figsize=(18, 7.4), layout="constrained")
     pictures = {
+        "an ideal lens: code": (straight.code, "gray"),
         "the paper's run: code": (checkers.code, "gray"),
         "a letter: code": (upright.code, "gray"),
         "light of a warped picture over that of the lens": (by_density / by_flux, "viridis"),
     }
     for position, (name, (values, colours)) in enumerate(pictures.items(), start=1):
-        axes = figure.add_subplot(2, 2, position)
+        axes = figure.add_subplot(2, 3, position)
         image = axes.imshow(values.reshape(shape), origin="lower", extent=(left, right, bottom, top), cmap=colours)
         axes.set_title(name)
         axes.set_xlabel("x / µm")
         axes.set_ylabel("y / µm")
         if colours == "viridis":
             figure.colorbar(image, ax=axes)
-    axes = figure.add_subplot(2, 2, 4)
+    axes = figure.add_subplot(2, 3, 5)
     axes.plot(*ideal_um[is_inside].T, "o", markerfacecolor="none", label="without distortion")
     axes.plot(*found_um.T, "x", label="found in the capture")
     axes.set_title("points of light")
