@@ -48,11 +48,13 @@ def main(out_dir: Path) -> None:
     size = layout.provenance["parameters"]
     shape = size["n_y"], size["n_x"]
     left, bottom, right, top = layout.bounds_um
-    ideal = optics.power_map(shot.scene)
-    ideal_camera = fs.Camera(optics=optics, sensor=shot.camera.sensor)
-    checkers, straight = (
-        camera.capture(ideal, exposure_s=shot.exposure_s, seed=shot.seed) for camera in (shot.camera, ideal_camera)
-    )
+    checkers = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
+
+    # %% The same without distortion, on sites four times as wide.
+    fine = shot.camera.sensor
+    large = fs.layout.grid(n_x=shape[1] // 4, n_y=shape[0] // 4, pitch_um=4.0 * size["pitch_um"])
+    coarse = fs.Sensor(large, qe=fine.qe, capacitance_f=16.0 * fine.capacitance_f, v_sat_v=fine.v_sat_v, bits=fine.bits)
+    straight = fs.Camera(optics=optics, sensor=coarse).capture(shot.scene, exposure_s=shot.exposure_s, seed=1)
 
     # %% Points and a letter through the same lens.
     like = {
@@ -73,16 +75,18 @@ def main(out_dir: Path) -> None:
     is_inside = np.all(np.abs(expected_um) < np.array([right, top]) - (NEAR + 1) * lens.pixel_um, axis=1)
     found_um = middles_um(layout, spots.expected_e, expected_um[is_inside], shape)
 
-    # %% The same light warped as a picture, and integrated, on the upper right quarter.
-    quarter = layout[np.all(layout.centroid_um > 0.0, axis=1)]
-    n_y, n_x = (n // 2 for n in ideal.grid.shape)
-    warped = fs.distortion.distort_map(ideal, lens, grid=fs.Grid((n_y, n_x), ideal.grid.pitch_um, (0.0, 0.0)))
-    by_warping = fs.Integrator(quarter, warped.grid)(warped.data)[0]
-    by_outlines = fs.Integrator(quarter, ideal.grid, distortion=lens, order=2)(ideal.data)[0]
-    # Even light, to see what each way makes of areas.
+    # %% The same light warped as a picture, and integrated, in the upper right corner, where it is bent the most.
+    is_in_corner = np.all(layout.centroid_um > 0.5 * np.array([right, top]), axis=1)
+    ideal = optics.power_map(shot.scene)
+    (n_y, n_x), cell_um = ideal.grid.shape, ideal.grid.pitch_um
+    corner = fs.Grid((n_y // 2 - n_y // 5, n_x // 2 - n_x // 5), cell_um, (n_x // 5 * cell_um, n_y // 5 * cell_um))
+    warped = fs.distortion.distort_map(ideal, lens, grid=corner)
+    by_warping = fs.Integrator(layout[is_in_corner], warped.grid)(warped.data)[0]
+    by_outlines = shot.camera.integrator(ideal.grid, order=2)(ideal.data)[0][is_in_corner]
+    # Even light on larger sites, to see what each way makes of areas.
     even = fs.Grid.centred((290, 516), 16.0 * ideal.grid.pitch_um)
     by_density, by_flux = (
-        fs.Integrator(layout, even, distortion=lens, conserve=kept)(np.ones(even.shape)) for kept in ("density", "flux")
+        fs.Integrator(large, even, distortion=lens, conserve=kept)(np.ones(even.shape)) for kept in ("density", "flux")
     )
 
     figure = Figure(figsize=(18, 7.4), layout="constrained")
@@ -94,7 +98,8 @@ def main(out_dir: Path) -> None:
     }
     for position, (name, (values, colours)) in enumerate(pictures.items(), start=1):
         axes = figure.add_subplot(2, 3, position)
-        image = axes.imshow(values.reshape(shape), origin="lower", extent=(left, right, bottom, top), cmap=colours)
+        n_rows = round((values.size * shape[0] / shape[1]) ** 0.5)
+        image = axes.imshow(values.reshape(n_rows, -1), origin="lower", extent=(left, right, bottom, top), cmap=colours)
         axes.set_title(name)
         axes.set_xlabel("x / µm")
         axes.set_ylabel("y / µm")
