@@ -5,12 +5,16 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import cache
 from typing import TypeVar
 
 from foveasim.arrays import check_count
 
 __all__ = ["each", "in_order", "thread_count"]
+
+#: Threads that there may be at least, for who asks for more than there are cores.
+LEAST_THREADS = 8
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -38,12 +42,50 @@ def each(work: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: in
 
     The pieces must not depend on each other, nor their sizes on ``n_threads``: that is what makes results the
     same, bit for bit, for any number of threads.
+
+    The calling thread works too, so that pieces may spread work in their turn: no thread waits for one that is not there.
     """
     items = list(items)
-    if n_threads == 1 or len(items) <= 1:
+    n_helpers = min(n_threads, len(items)) - 1
+    if n_helpers <= 0:
         return [work(item) for item in items]
-    with ThreadPoolExecutor(min(n_threads, len(items))) as pool:
-        return list(pool.map(work, items))
+    waiting = deque(enumerate(items))
+    results: dict[int, _Result] = {}
+    errors: dict[int, BaseException] = {}
+
+    def some() -> None:
+        while waiting:
+            try:
+                number, item = waiting.popleft()
+            except IndexError:  # another thread took the last one
+                return
+            try:
+                results[number] = work(item)
+            except BaseException as error:  # noqa: BLE001 -- raised by the calling thread
+                errors[number] = error
+                waiting.clear()
+
+    helpers = [_pool().submit(some) for _ in range(n_helpers)]
+    try:
+        some()
+    finally:
+        waiting.clear()
+        # One that no thread has begun has nothing left to do.
+        wait([helper for helper in helpers if not helper.cancel()])
+    if errors:
+        raise errors[min(errors)]
+    return [results[number] for number in range(len(items))]
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    """The threads of this process: they stay, as starting them takes as long as a small piece of work."""
+    return ThreadPoolExecutor(max(thread_count(), LEAST_THREADS), thread_name_prefix="foveasim")
+
+
+if hasattr(os, "register_at_fork"):
+    # A child process has none of its parent's threads.
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def in_order(

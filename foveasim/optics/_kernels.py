@@ -18,12 +18,11 @@ _floats = types.Array(types.float64, 1, "C", readonly=True)
 @njit(
     [
         types.void(
-            types.Array(cell, 2, "A", readonly=True),
+            types.Array(cell, 2, "C", readonly=True),
             types.Array(real, 1, "C", readonly=True),
             types.Array(real, 1, "C", readonly=True),
             types.int64,
             types.Array(types.int64, 1, "C", readonly=True),
-            types.int64,
             types.int64,
             real[:, ::1],
         )
@@ -34,21 +33,21 @@ _floats = types.Array(types.float64, 1, "C", readonly=True)
     nogil=True,
     error_model="numpy",
 )
-def expose(image, x2, y2, power, source_column, before, first_row, out):
+def expose(rows, x2, y2, power, source_column, before, out):
     """
-    Write some rows of a picture, from ``first_row`` on, times ``cos(theta) ** power``, padded on both sides.
+    Write some rows of a picture times ``cos(theta) ** power``, padded on both sides.
 
-    ``x2`` and ``y2`` are (x0/H)² and (y0/H)² of the picture's columns and rows, so that ``cos² = 1 / (1 + x2 + y2)``.
+    ``x2`` and ``y2`` are (x0/H)² and (y0/H)² of the picture's columns and of the rows, so that ``cos² = 1 / (1 + x2 + y2)``.
     ``source_column`` names the picture's column of each column of ``out``, -1 for darkness; the picture's own
     column 0 comes to lie at column ``before``.
     """
-    n_x = image.shape[1]
+    n_x = rows.shape[1]
     one = x2.dtype.type(1.0)
     for row in range(out.shape[0]):
-        source = image[first_row + row]
+        source = rows[row]
         line = out[row]
         middle = line[before : before + n_x]
-        base = one + y2[first_row + row]
+        base = one + y2[row]
         if power == 4:
             for ix in range(n_x):
                 cos2 = one / (base + x2[ix])
@@ -57,9 +56,10 @@ def expose(image, x2, y2, power, source_column, before, first_row, out):
             for ix in range(n_x):
                 cos2 = one / (base + x2[ix])
                 middle[ix] = source[ix] * (cos2 * np.sqrt(cos2))
-        for column in range(line.size):
-            if column < before or column >= before + n_x:
-                line[column] = middle[source_column[column]] if source_column[column] >= 0 else 0.0
+        for column in range(before):
+            line[column] = middle[source_column[column]] if source_column[column] >= 0 else 0.0
+        for column in range(before + n_x, line.size):
+            line[column] = middle[source_column[column]] if source_column[column] >= 0 else 0.0
 
 
 @njit(

@@ -151,7 +151,8 @@ class Transform:
 
         def some_rows(first: int, last: int) -> None:
             padded = np.empty((last - first, self._columns.size), self._real)
-            self._kernels.expose(image, x2, y2, falloff_power, self._columns, left, first, padded)
+            rows = np.ascontiguousarray(image[first:last])
+            self._kernels.expose(rows, x2, y2[first:last], falloff_power, self._columns, left, padded)
             spectrum[top + first : top + last] = scipy.fft.rfft(padded, axis=1, overwrite_x=True)[:, : self._n_columns]
 
         self._each_rows(some_rows, n_y)
