@@ -328,7 +328,7 @@ def _light(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Imag
         table = decoded(np.arange(peak + 1) / peak, encoding).astype(np.float32)
         values = np.arange(peak + 1, dtype=np.float32) / np.float32(peak)
         colours = pixels[..., :-1] if has_alpha else pixels
-        light = table[np.ascontiguousarray(from_file_rows(colours))]
+        light = np.take(table, np.ascontiguousarray(from_file_rows(colours)))
         alpha = values[from_file_rows(pixels[..., -1])] if has_alpha else None
     elif pixels.dtype.kind == "f":
         if not np.isfinite(pixels).all() or pixels.min() < 0:
