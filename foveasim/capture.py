@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,11 +10,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim.archives import opened_archive, write_archive
 from foveasim.arrays import Floats, Ints, check_choice, check_count, read_only
-from foveasim.errors import FileError, ParameterError
+from foveasim.errors import ParameterError
 from foveasim.fields import Grid
-from foveasim.files import written_whole
 from foveasim.layout import Layout
+from foveasim.layout.packed import packed_layout, unpacked_layout
 from foveasim.reconstruct import (
     Picture,
     Readings,
@@ -41,9 +40,8 @@ __all__ = ["Capture"]
 
 FILE_FORMAT = "foveasim capture"
 FILE_VERSION = 1
-#: Arrays of a capture file, and how a column of the layout is named among them.
-ARRAYS = ("code", "electrons", "expected_e", "filter_of_site", "xy_um", "ring_offsets", "site_offsets")
-COLUMN_PREFIX = "column_"
+#: Arrays of a capture file, beside the layout's.
+ARRAYS = ("code", "electrons", "expected_e", "filter_of_site")
 #: What a sensor's codes tell of the light by: these of its parameters, as they are meant. Fixed patterns are not known.
 ELECTRONICS = (
     *(
@@ -67,8 +65,6 @@ ELECTRONICS = (
     ),
     *("v_sat_v", "bits", "companding", "log_strength", "companding_table", "inl_dn"),
 )
-#: A file that would unpack to more than this is refused.
-MAX_UNPACKED_BYTES = 8 * 2**30
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,9 +283,6 @@ class Capture:
         FileError
             When the ending is not ``.npz``, or nothing can be written there.
         """
-        target = Path(path)
-        if target.suffix != ".npz":
-            raise FileError(target, "must end in .npz")
         about = {
             "format": FILE_FORMAT,
             "version": FILE_VERSION,
@@ -299,10 +292,8 @@ class Capture:
             "settings": self.settings,
             "provenance": described(dict(self.layout.provenance)),
         }
-        arrays = {name: getattr(self if hasattr(self, name) else self.layout, name) for name in ARRAYS}
-        arrays |= {COLUMN_PREFIX + name: values for name, values in self.layout.columns.items()}
-        with written_whole(target) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)
+        arrays = {name: getattr(self, name) for name in ARRAYS}
+        write_archive(path, about, arrays | packed_layout(self.layout))
 
     @classmethod
     def load(cls, path: str | Path) -> Capture:
@@ -314,30 +305,9 @@ class Capture:
         FileError
             When the file is missing, broken, too large, or no capture.
         """
-        source = Path(path)
-        if not source.is_file():
-            raise FileError(source, "is not a file" if source.exists() else "no such file")
-        try:
-            with zipfile.ZipFile(source) as archive:
-                if sum(item.file_size for item in archive.infolist()) > MAX_UNPACKED_BYTES:
-                    raise FileError(source, f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
-            with np.load(source, allow_pickle=False) as data:
-                about = json.loads(str(data["about"]))
-                if about.get("format") != FILE_FORMAT:
-                    raise FileError(source, "is no foveasim capture")
-                if about.get("version") != FILE_VERSION:
-                    raise FileError(source, f"has the format version {about.get('version')}, expected {FILE_VERSION}")
-                arrays = {name: data[name] for name in ARRAYS}
-                columns = {
-                    name.removeprefix(COLUMN_PREFIX): data[name]
-                    for name in data.files
-                    if name.startswith(COLUMN_PREFIX)
-                }
-            layout = Layout(
-                arrays["xy_um"], arrays["ring_offsets"], arrays["site_offsets"], columns, about["provenance"]
-            )
+        with opened_archive(path, "foveasim capture", FILE_FORMAT, FILE_VERSION) as (about, arrays):
             return cls(
-                layout=layout,
+                layout=unpacked_layout(arrays, about["provenance"]),
                 code=arrays["code"],
                 electrons=arrays["electrons"],
                 expected_e=arrays["expected_e"],
@@ -347,8 +317,3 @@ class Capture:
                 white_dn=np.asarray(about["white_dn"], dtype=np.float64),
                 settings=about["settings"],
             )
-        except FileError:
-            raise
-        except Exception as error:  # noqa: BLE001 -- a broken file makes its readers trip over anything
-            told = " ".join(str(error).split())
-            raise FileError(source, f"is broken or no foveasim capture ({told})") from None

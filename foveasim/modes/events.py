@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim.archives import opened_archive, write_archive
 from foveasim.arrays import Floats, check_number, read_only
 from foveasim.errors import FileError, ParameterError
 from foveasim.files import written_whole
 from foveasim.layout import Layout
+from foveasim.layout.packed import packed_layout, unpacked_layout
+from foveasim.records import described
 
 __all__ = ["Events", "write_events"]
 
@@ -26,8 +27,6 @@ CHUNK_EVENTS = 1 << 16
 #: Addresses in files for event tools are 16-bit numbers.
 MAX_ADDRESS = 2**16 - 1
 MICROSECONDS_PER_S = 1e6
-#: A file that would unpack to more than this is refused.
-MAX_UNPACKED_BYTES = 8 * 2**30
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,12 +140,9 @@ class Events:
             return
         if target.suffix.lower() != ".npz":
             raise FileError(target, "must end in .npz, .h5 or .hdf5")
-        layout = self.layout
-        arrays: dict[str, Any] = {f"column_{name}": values for name, values in layout.columns.items()}
-        arrays |= {name: np.asarray(getattr(layout, name)) for name in ("xy_um", "ring_offsets", "site_offsets")}
-        about = np.array(json.dumps({"format": FORMAT, "version": VERSION}))
-        with written_whole(target) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, about=about, t_s=self.t_s, site=self.site, polarity=self.polarity, **arrays)
+        arrays = {name: np.asarray(getattr(self, name)) for name in ("t_s", "site", "polarity")}
+        about = {"format": FORMAT, "version": VERSION, "provenance": described(dict(self.layout.provenance))}
+        write_archive(target, about, arrays | packed_layout(self.layout))
 
     @classmethod
     def load(cls, path: str | Path) -> Events:
@@ -158,28 +154,9 @@ class Events:
         FileError
             When the file is missing, broken, or holds no events.
         """
-        source = Path(path)
-        if not source.is_file():
-            raise FileError(source, "is not a file" if source.exists() else "no such file")
-        try:
-            with zipfile.ZipFile(source) as archive:
-                if sum(item.file_size for item in archive.infolist()) > MAX_UNPACKED_BYTES:
-                    raise FileError(source, f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
-            with np.load(source, allow_pickle=False) as data:
-                about = json.loads(str(data["about"]))
-                if about.get("format") != FORMAT:
-                    raise FileError(source, "holds no events")
-                if about.get("version") != VERSION:
-                    raise FileError(source, f"has the format version {about.get('version')}, expected {VERSION}")
-                columns = {
-                    name.removeprefix("column_"): data[name] for name in data.files if name.startswith("column_")
-                }
-                layout = Layout(data["xy_um"], data["ring_offsets"], data["site_offsets"], columns)
-                return cls(data["t_s"], data["site"], data["polarity"], layout)
-        except FileError:
-            raise
-        except Exception as error:  # noqa: BLE001 -- a broken file makes its readers trip over anything
-            raise FileError(source, f"is broken or holds no events ({' '.join(str(error).split())})") from None
+        with opened_archive(path, "file of events", FORMAT, VERSION) as (about, arrays):
+            layout = unpacked_layout(arrays, about.get("provenance", {}))
+            return cls(arrays["t_s"], arrays["site"], arrays["polarity"], layout)
 
 
 def write_events(batches: Iterable[Events], path: str | Path, *, pitch_um: float | None = None) -> int:

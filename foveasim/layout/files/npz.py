@@ -2,39 +2,29 @@
 
 from __future__ import annotations
 
-import json
-import math
-import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.lib import format as npy
-from numpy.typing import NDArray
 
-from foveasim.arrays import MAX_SITES
+from foveasim.archives import read_archive, write_archive
 from foveasim.errors import FileError
-from foveasim.files import written_whole
 from foveasim.layout._model import Layout
 from foveasim.layout.files._common import (
     WrittenLayout,
     check_header,
     check_sites_of,
-    check_unpacked,
     header,
     lossless,
+    max_unpacked,
     one_sentence,
 )
+from foveasim.layout.packed import is_of_layout, packed_layout, unpacked_layout
 from foveasim.rings import ring_moments
 
 __all__ = ["MAGICS", "read", "write"]
 
 #: A zip archive, and an empty one.
 MAGICS = (b"PK\x03\x04", b"PK\x05\x06")
-ARRAYS = ("xy_um", "ring_offsets", "site_offsets")
-#: How a column is named among the arrays.
-COLUMN_PREFIX = "column_"
-SUFFIX = ".npy"
 
 
 def write(layout: Layout, path: Path) -> WrittenLayout:
@@ -46,10 +36,7 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     FileError
         When nothing can be written there.
     """
-    arrays: dict[str, Any] = {name: getattr(layout, name) for name in ARRAYS}
-    arrays |= {COLUMN_PREFIX + name: values for name, values in layout.columns.items()}
-    with written_whole(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, about=np.array(json.dumps(header(layout))), **arrays)
+    write_archive(path, header(layout), packed_layout(layout), is_packed=False)
     return lossless(layout, path)
 
 
@@ -62,45 +49,18 @@ def read(path: Path) -> Layout:
     FileError
         When it is broken, too large, or something else.
     """
-    with one_sentence(path, "npz"), zipfile.ZipFile(path) as archive:
-        items = {item.filename.removesuffix(SUFFIX): item for item in archive.infolist()}
-        check_unpacked(path, sum(item.file_size for item in items.values()))
-        if not {item.compress_type for item in items.values()} <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
-            raise FileError(path, "is packed in a way that numpy does not use")
-        if "about" not in items:
+    with one_sentence(path, "npz"):
+        about, arrays = read_archive(path, max_bytes=max_unpacked(path))
+        if about is None:
             raise FileError(path, "is no foveasim layout")
-        provenance = check_header(path, json.loads(str(_array(archive, items["about"]))))
-        unknown = [n for n in items if n not in {"about", *ARRAYS} and not n.startswith(COLUMN_PREFIX)]
+        provenance = check_header(path, about)
+        unknown = [name for name in arrays if not is_of_layout(name)]
         if unknown:
             raise FileError(path, f"is broken: {unknown[0]!r:.40} is no array of a layout")
-        xy_um, ring_offsets, site_offsets = (_array(archive, items[name]) for name in ARRAYS)
-        check_sites_of(path, site_offsets.size - 1)
-        columns = {
-            name.removeprefix(COLUMN_PREFIX): _array(archive, item)
-            for name, item in items.items()
-            if name.startswith(COLUMN_PREFIX)
-        }
-        layout = Layout(xy_um, ring_offsets, site_offsets, columns, provenance)
+        check_sites_of(path, arrays["site_offsets"].size - 1)
+        layout = unpacked_layout(arrays, provenance)
         _check_winding(path, layout)
         return layout
-
-
-def _array(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> NDArray[Any]:
-    """One array, after its header was found to fit what follows it: no array is made larger than the file says."""
-    with archive.open(item) as file:
-        version = npy.read_magic(file)
-        if version not in ((1, 0), (2, 0)):
-            raise ValueError(f"array format {version}")
-        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, is_fortran, dtype = read_header(file)
-        if dtype.hasobject:
-            raise ValueError("an array of objects")
-        # What takes no room may be there any number of times.
-        n = math.prod(shape)
-        if n * dtype.itemsize != item.file_size - file.tell() or not 0 <= n <= max(item.file_size, MAX_SITES):
-            raise ValueError("an array of another size than its header tells")
-        flat = np.frombuffer(file.read(), dtype) if dtype.itemsize else np.zeros(n, dtype)
-    return flat.reshape(shape, order="F" if is_fortran else "C")
 
 
 def _check_winding(path: Path, layout: Layout) -> None:

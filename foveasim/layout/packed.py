@@ -1,0 +1,44 @@
+"""A layout as named arrays, to lie in one file with others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.layout._model import Layout
+
+__all__ = ["is_of_layout", "packed_layout", "unpacked_layout"]
+
+OUTLINES = ("xy_um", "ring_offsets", "site_offsets")
+#: How a column is named among the arrays.
+COLUMN_PREFIX = "column_"
+
+
+def packed_layout(layout: Layout) -> dict[str, NDArray[Any]]:
+    """Outlines and columns by name."""
+    arrays = {name: np.asarray(getattr(layout, name)) for name in OUTLINES}
+    return arrays | {COLUMN_PREFIX + name: values for name, values in layout.columns.items()}
+
+
+def unpacked_layout(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str, Any]) -> Layout:
+    """
+    The layout that lies among arrays, without the checks of outlines from strangers.
+
+    Raises
+    ------
+    KeyError
+        When an array of its outlines is not there.
+    """
+    columns = {
+        name.removeprefix(COLUMN_PREFIX): values for name, values in arrays.items() if name.startswith(COLUMN_PREFIX)
+    }
+    xy_um, ring_offsets, site_offsets = (arrays[name] for name in OUTLINES)
+    return Layout(xy_um, ring_offsets, site_offsets, columns, provenance)
+
+
+def is_of_layout(name: str) -> bool:
+    """Whether an array of this name is a layout's."""
+    return name in OUTLINES or name.startswith(COLUMN_PREFIX)
