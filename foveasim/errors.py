@@ -40,7 +40,13 @@ _UNSAID = object()
 
 
 class FoveasimError(Exception):
-    """Base of all errors of the package."""
+    """Base of all errors of the package; they go from process to process as they are."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        state = dict(self.__dict__)
+        if not isinstance(state.get("value"), str | int | float | None):
+            state["value"] = _shown(state["value"])  # which may be anything
+        return _restored, (type(self), self.args, state)
 
 
 class ParameterError(FoveasimError, ValueError):
@@ -51,7 +57,9 @@ class ParameterError(FoveasimError, ValueError):
         self.value = None if value is _UNSAID else value
         self.unit = unit
         got = f", got {_shown(value)}{' ' + unit if unit else ''}" if value is not _UNSAID else ""
-        super().__init__(f"'{name}' {rule}{got}{'; ' + cure if cure else ''}")
+        #: All of the message but the name.
+        self.told = f"{rule}{got}{'; ' + cure if cure else ''}"
+        super().__init__(f"'{name}' {self.told}")
 
 
 class GeometryError(FoveasimError, ValueError):
@@ -88,6 +96,14 @@ class SamplingWarning(FoveasimWarning):
 
 class CoverageWarning(FoveasimWarning):
     """Photosites lie partly or wholly off the map of light and receive less, or nothing."""
+
+
+def _restored(kind: type[FoveasimError], args: tuple[Any, ...], state: dict[str, Any]) -> FoveasimError:
+    """An error that was pickled: its message is made, and must not be made again."""
+    error = kind.__new__(kind)
+    error.args = args
+    error.__dict__.update(state)
+    return error
 
 
 def _shown(value: Any) -> str:

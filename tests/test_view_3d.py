@@ -173,11 +173,11 @@ def test_a_height_by_name_and_a_colour_by_another():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"height": np.ones(4)}, "must have one row for each of the 5 sites"),
+        ({"height": np.ones(4)}, "'height' must have one row for each of the 5 sites"),
         ({"height": -np.ones(5)}, "'height' must be >= 0"),
         ({"height": np.array([1, 2, 3, 4, np.nan])}, "'height' must be finite"),
         ({"height": "name"}, "'height' must be an array of numbers"),
-        ({"height": "no such column"}, "must be one of"),
+        ({"height": "no such column"}, "'height' must be one of"),
         ({"height": np.ones((5, 3))}, "'height' must have 1 dimension"),
         ({"tallest_um": 0.0}, "'tallest_um' must be > 0"),
     ],

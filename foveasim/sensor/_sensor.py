@@ -281,7 +281,7 @@ class Sensor:
         try:
             return self._filter_set * self.qe
         except ParameterError as error:
-            raise ParameterError("qe", str(error).removeprefix(f"'{error.name}' ")) from None
+            raise ParameterError("qe", error.told) from None
 
     @property
     def n_filters(self) -> int:

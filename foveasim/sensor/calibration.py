@@ -524,7 +524,7 @@ class _Frames:
             try:
                 self.add(frame)
             except ParameterError as error:
-                raise ParameterError(name, str(error).removeprefix(f"'{error.name}' ")) from None
+                raise ParameterError(name, error.told) from None
 
 
 def _calibration(

@@ -239,7 +239,10 @@ def prisms(
     is_capture = isinstance(data, Capture)
     layout = data.layout if isinstance(data, Capture) else data
     height = ("code" if is_capture else "size_um") if height is None else height
-    shown = colours_of(data, height)
+    try:
+        shown = colours_of(data, height)
+    except ParameterError as error:
+        raise ParameterError("height", error.told) from None
     values = finite_array("height", shown.values if shown.values is not None else height, ndim=1, at_least=0.0)
     colours = (shown if by is None else colours_of(data, by)).rgb
     x_min, y_min, x_max, y_max = layout.bounds_um

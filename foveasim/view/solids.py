@@ -332,7 +332,14 @@ def solids(
     in_glass = _Colouring(_mixed(in_filters.rgb, GLASS), in_silicon.values)
     depth_um, up_um = sensor_stack.well_depth_um, sensor_stack.filter_thickness_um
     has_trench = sensor_stack.trench_width_um > 0.0
-    footprint = inset(layout, 0.5 * sensor_stack.trench_width_um) if has_trench else layout
+    try:
+        footprint = inset(layout, 0.5 * sensor_stack.trench_width_um) if has_trench else layout
+    except GeometryError as error:
+        at = f"site {error.site_ids[0]}" + (f" (and {len(error.site_ids) - 1} more)" if len(error.site_ids) > 1 else "")
+        raise GeometryError(
+            f"{at} is too narrow for a trench of {sensor_stack.trench_width_um:g} µm around it: take a smaller trench_width_um",
+            error.site_ids,
+        ) from None
     parts = {"wells": _prisms("wells", footprint, (-depth_um, 0.0), in_silicon)}
     if has_trench:
         walls, owner = _walls(layout, footprint)

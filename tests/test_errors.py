@@ -1,0 +1,51 @@
+"""Errors: what their messages say, and that they reach other processes as they are."""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from foveasim.errors import ConfigError, FileError, GeometryError, ParameterError, SimulationError
+
+ERRORS = [
+    ParameterError("pitch_um", "must be > 0", -1.0, "µm", "take a larger one"),
+    ParameterError("white", "must be something", None),
+    ParameterError("layout", "must be a Layout", lambda: None),
+    GeometryError("site 3 is no photosite", (3,)),
+    FileError("a/file.npz", "is broken"),
+    ConfigError(Path("shot.yaml"), "optics: must be there"),
+    SimulationError("parts do not fit"),
+]
+
+
+def test_a_message_has_name_rule_value_unit_and_cure():
+    assert str(ERRORS[0]) == "'pitch_um' must be > 0, got -1.0 µm; take a larger one"
+    assert str(ParameterError("height", ERRORS[0].told)) == "'height' must be > 0, got -1.0 µm; take a larger one"
+    assert str(ParameterError("white", "must be there")) == "'white' must be there"
+    assert len(str(ParameterError("data", "must be short", np.zeros((500, 500))))) < 120
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+def test_errors_survive_pickling(error):
+    found = pickle.loads(pickle.dumps(error))
+
+    assert type(found) is type(error)
+    assert str(found) == str(error)
+    assert {**vars(found), "value": 0} == {**vars(error), "value": 0}
+    if not callable(vars(error).get("value")):
+        assert vars(found) == vars(error)
+
+
+def _fails(_: int) -> None:
+    raise ParameterError("pitch_um", "must be > 0", -1.0, "µm")
+
+
+def test_errors_reach_the_process_that_waits_for_them():
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        waiting = pool.apply_async(_fails, (1,))
+        with pytest.raises(ParameterError, match=r"'pitch_um' must be > 0, got -1\.0 µm"):
+            waiting.get(timeout=120.0)
