@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -122,6 +123,17 @@ def free_port():
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         return one.getsockname()[1]
+
+
+def test_another_dask_on_this_machine_does_not_matter():
+    # Warnings are errors here: dask's own, of its usual port being taken, would be one.
+    with socket.socket() as usual:
+        with suppress(OSError):  # where another dask has it
+            usual.bind(("127.0.0.1", 8787))
+            usual.listen()
+        found = explore.sweep(SHOT, {"sensor.bits": [8, 10]}, workers=1)
+
+    assert (found["error"] == "").all()
 
 
 def answers(port):

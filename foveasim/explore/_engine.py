@@ -70,7 +70,9 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
             n_workers=n_workers,
             threads_per_worker=1,
             memory_limit=MEMORY_LIMIT // n_workers,
-            dashboard_address=None,
+            # No dashboard: only so does dask not ask for the one port of another's, and warn where that has it.
+            dashboard_address="127.0.0.1:0",
+            scheduler_kwargs={"dashboard": False},
             preload=[run_tasks.__module__],
             silence_logs=logging.CRITICAL,
         ) as cluster,
