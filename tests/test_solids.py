@@ -235,7 +235,7 @@ def test_a_hook_carries_a_lens_from_its_corner():
 def test_a_site_too_narrow_for_its_trench_is_named():
     layout = fs.Layout.from_rectangles([[0, 0], [5, 0], [10, 0]], [[2, 2], [0.15, 2], [2, 2]])
 
-    with pytest.raises(GeometryError, match="site 1 is too narrow for a trench of 0.2 µm around it") as raised:
+    with pytest.raises(GeometryError, match=r"site 1 is too narrow for a trench of 0\.2 µm around it") as raised:
         solids(layout, STACK)
     assert raised.value.site_ids == (1,)
 
