@@ -355,11 +355,12 @@ class Camera:
             The light, frame by frame. With a place, the sensor's middle is put there in the image behind the lens: a gaze that
             moves. See :mod:`foveasim.video` for frames from pictures and video files, and for paths of gazes.
         exposure_s : float, or one after the other, s
-            Of a sequence the captures take one each, over and over: a bracket.
+            Of a sequence the captures take one each, over and over, as their numbers say: a bracket.
         seed : int
             Of the noise; fixed patterns are the device's and stay.
         first_frame : int
-            Number of the first capture: capture k has the noise of ``capture(..., frame=first_frame + k)``.
+            Number of the first capture: capture k has the noise of ``capture(..., frame=first_frame + k)``. A video is gone on
+            with from light number ``first_frame * every`` on.
         frame_s : float, optional, s
             From one frame of light to the next. Without it every frame lights one capture and no other.
         line_s : float, s
@@ -423,7 +424,7 @@ class Camera:
         clock = _Clock()
         for k, (light, place_um, rate_e_per_s) in enumerate(self._lit(frames, clock, ahead)):
             number = Streams(streams.seed, streams.frame + k)
-            exposure_s = float(exposures_s[k % exposures_s.size])
+            exposure_s = float(exposures_s[number.frame % exposures_s.size])
             yield self._exposed(light, rate_e_per_s, exposure_s, number, clock.so_far(), **_told(place_um))
 
     def _rolling(
@@ -444,7 +445,8 @@ class Camera:
         for n, (light, place_um, rate_e_per_s) in enumerate(self._lit(frames, clock, ahead)):
             if n % every == 0:
                 k = n // every
-                going_on.append((k, light, place_um, Exposure(shutter, float(exposures_s[k % exposures_s.size]))))
+                exposure_s = float(exposures_s[(streams.frame + k) % exposures_s.size])
+                going_on.append((k, light, place_um, Exposure(shutter, exposure_s)))
             with clock.stage("shutter"):
                 for *_, exposure in going_on:
                     exposure.add(rate_e_per_s)

@@ -236,6 +236,22 @@ def test_a_bracket_takes_its_exposures_in_turns_and_merges_to_the_light():
     assert np.abs((rates.rate_e_per_s - truth) / rates.sigma_e_per_s).max() < 5.0
 
 
+@pytest.mark.parametrize("first", [1, 2, 3])
+@pytest.mark.parametrize("shutter", [{}, {"frame_s": 0.004, "line_s": 1e-3, "every": 2}])
+def test_a_video_gone_on_with_is_the_rest_of_the_whole_one(first, shutter):
+    lights = [scene_of(p) for p in pictures(9)]
+    how = {"exposure_s": [0.002, 0.009, 0.005], "seed": 1} | shutter
+    whole = list(camera_of(rows_layout()).video(lights, **how))
+    begun = lights[first * shutter.get("every", 1) :]
+    rest = list(camera_of(rows_layout()).video(begun, **how, first_frame=first))
+
+    assert len(rest) == len(whole) - first
+    for one, other in zip(rest, whole[first:], strict=True):
+        assert np.array_equal(one.code, other.code)
+        assert np.array_equal(one.expected_e, other.expected_e)
+        assert one.settings == other.settings
+
+
 @pytest.mark.parametrize(
     ("change", "name"),
     [
@@ -535,7 +551,7 @@ def captures_of(n, **sensor):
 
 
 def test_a_zarr_folder_holds_every_code(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys.modules[write_video.__module__], "CHUNK_CODES", 250)
+    monkeypatch.setattr(sys.modules[read_recording.__module__], "CHUNK_CODES", 250)
     captures = list(captures_of(5))
 
     assert write_video(iter(captures), tmp_path / "v.zarr") == 5
