@@ -1,10 +1,10 @@
-"""What a result was made from, as plain data that can be written to a file: settings and versions."""
+"""What a result was made from, as plain data that can be written to a file and compared: settings and versions."""
 
 from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.metadata import version
@@ -14,7 +14,7 @@ import numpy as np
 
 from foveasim._version import __version__
 
-__all__ = ["described", "versions"]
+__all__ = ["described", "differences", "versions"]
 
 #: Arrays up to this size are written out; of longer ones the shape and a checksum are kept.
 WRITTEN_OUT = 64
@@ -45,6 +45,19 @@ def described(value: Any) -> Any:
             **{f.name: described(getattr(value, f.name)) for f in fields(value) if not f.name.startswith("_")},
         }
     return repr(value)
+
+
+def differences(one: Any, other: Any, place: str = "") -> Iterator[str]:
+    """Dotted names of the places in which plain data differ: ``optics.f_number``."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        for key in dict.fromkeys([*one, *other]):
+            inside = f"{place}.{key}" if place else str(key)
+            if key not in one or key not in other:
+                yield inside
+            else:
+                yield from differences(one[key], other[key], inside)
+    elif one != other:
+        yield place or "plan"
 
 
 @cache

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim.errors import FileError, ParameterError
+from foveasim.files import lock
+from foveasim.records import differences
 
 __all__ = ["Journal", "Record", "Value", "check_same_plan", "journal_of", "values_of"]
 
@@ -121,7 +123,8 @@ class Journal:
 
     def _begin(self, head: Mapping[str, Any]) -> list[tuple[Any, int]]:
         """The whole lines that are there, of the same plan; the head when there are none."""
-        self._lock()
+        if not lock(self._file):
+            raise FileError(self._store, "is being written by another program that runs the same sweep")
         self._file.seek(0)
         lines = list(_lines(self._file))
         if lines or self._file.tell():
@@ -175,16 +178,6 @@ class Journal:
             left = left[os.write(self._file.fileno(), left) :]
         self._end += len(whole)
 
-    def _lock(self) -> None:
-        try:
-            import fcntl
-        except ImportError:  # a system without such locks
-            return
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise FileError(self._store, "is being written by another program that runs the same sweep") from None
-
 
 def _lines(file: IO[bytes]) -> Iterator[tuple[Any, int]]:
     """What the whole lines of a journal say, None where one is broken, and their lengths; nothing of a torn last line."""
@@ -225,25 +218,12 @@ def check_same_plan(path: Path, found: Mapping[str, Any], wanted: Mapping[str, A
         When they are of another.
     """
     wanted = json.loads(json.dumps(wanted))
-    different = _first_difference(found, wanted)
+    different = next(differences(found, wanted), None)
     if different is not None:
         raise FileError(
             path,
             f"is of another sweep or study: '{different}' differs; write this one under another name, or remove that one",
         )
-
-
-def _first_difference(one: Any, other: Any, place: str = "") -> str | None:
-    if isinstance(one, dict) and isinstance(other, dict):
-        for key in dict.fromkeys([*one, *other]):
-            inside = f"{place}.{key}" if place else str(key)
-            if key not in one or key not in other:
-                return inside
-            found = _first_difference(one[key], other[key], inside)
-            if found is not None:
-                return found
-        return None
-    return None if one == other else place or "plan"
 
 
 def _line(record: Record) -> dict[str, Any]:
