@@ -261,7 +261,10 @@ def video(
     out: Annotated[
         Path,
         typer.Option(
-            "--out", "-o", help="A .zarr folder with every code, a .mp4, .webm or .gif, or a folder of pictures."
+            "--out",
+            "-o",
+            help="A .zarr folder with every code, in which a video that was ended goes on; a .mp4, .webm or .gif; or a "
+            "folder of pictures.",
         ),
     ] = Path("video.zarr"),
     changes: Annotated[list[str] | None, typer.Option("--set", help="Replace a setting: sensor.bits=10.")] = None,
@@ -275,17 +278,23 @@ def video(
     """Take a video with the camera of a settings file: pictures or a video file in the place of its scene."""
     from foveasim.config import read_shot
     from foveasim.shots import run_video
+    from foveasim.video import frames_kept, partial_of
 
     if frames_per_s is not None and not frames_per_s > 0.0:
         _end(f"error: --fps must be > 0, got {frames_per_s:g}", BAD_INPUT)
     with console.status("reading settings"):
         shot = read_shot(settings, changes or [], n_threads=threads)
     frame_s = None if frames_per_s is None else 1.0 / frames_per_s
+    is_kept = out.suffix.lower() == ".zarr"
+    was_finished = is_kept and out.exists()
     try:
         n = run_video(shot, frames, out, frame_s=frame_s, line_s=line_s, stop=stop, n_threads=threads, progress=True)
     except KeyboardInterrupt:
-        _end("stopped", STOPPED)
-    console.print(f"wrote {out}: {n:,} frames", soft_wrap=True, highlight=False)
+        n = frames_kept(out) if is_kept and partial_of(out).is_dir() else 0
+        kept = f"; {n:,} frames are kept beside {out}, and the same command goes on from there" if n else ""
+        _end(f"stopped{kept}", STOPPED)
+    told = f"{out} was finished before" if was_finished else f"wrote {out}"
+    console.print(f"{told}: {n:,} frames", soft_wrap=True, highlight=False, markup=False)
 
 
 @app.command()
@@ -325,7 +334,7 @@ def main() -> None:
     try:
         app()
     except FoveasimError as error:
-        _end(f"error: {error}", BAD_INPUT)
+        _end("; ".join([f"error: {error}", *getattr(error, "__notes__", ())]), BAD_INPUT)
     except MemoryError:
         _end("error: there is not enough memory for this; take a smaller picture or fewer photosites", BAD_INPUT)
     except OSError as error:

@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import os
+import signal
+import subprocess
 import sys
+import time
+from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +18,17 @@ import foveasim as fs
 from foveasim.errors import FileError, ParameterError, SimulationError
 from foveasim.pictures import write_picture
 from foveasim.sensor import merge_exposures
-from foveasim.video import Footage, GazePath, look, look_around, read_recording, saccades, write_video
+from foveasim.video import (
+    Footage,
+    GazePath,
+    frames_kept,
+    look,
+    look_around,
+    partial_of,
+    read_recording,
+    saccades,
+    write_video,
+)
 
 PITCH_UM, DISTANCE_M = 10.0, 0.5
 LIGHT = {
@@ -570,6 +587,17 @@ def test_a_zarr_folder_holds_every_code(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["v.zarr"]
 
 
+@pytest.mark.parametrize("resume", [False, True])
+@pytest.mark.parametrize("other", [{"bits": 8}, {"n_x": 11}])
+def test_captures_of_other_sites_or_bits_do_not_come_into_the_same_video(tmp_path, other, resume):
+    sensor = {"bits": other["bits"]} if "bits" in other else {}
+    camera = camera_of(rows_layout(n_x=other.get("n_x", 12)), **sensor)
+    captures = [*captures_of(2), camera.capture(scene_of(pictures(1)[0]), exposure_s=0.01, seed=0, frame=2)]
+    with pytest.raises(ParameterError, match="must be of the same layout and bits"):
+        write_video(captures, tmp_path / "v.zarr", resume=resume)
+    assert frames_kept(tmp_path / "v.zarr") == (2 if resume else 0)
+
+
 def test_what_ends_early_leaves_what_was_there(tmp_path):
     def failing():
         yield from captures_of(2)
@@ -679,6 +707,337 @@ def test_progress_counts_the_frames(tmp_path, capsys):
     assert "frames" in capsys.readouterr().out
 
 
+# -- recordings that were ended ---------------------------------------------------------------------------------------
+
+#: A rolling shutter, a bracket, and two frames of light from capture to capture.
+ROLLING = {"exposure_s": [0.002, 0.009, 0.005], "seed": 5, "frame_s": 0.004, "line_s": 1e-3, "every": 2}
+
+
+class LightsOutError(Exception):
+    """What ends a recording."""
+
+
+def rolling(n_before, n_frames=22, **sensor):
+    """Captures after those that are kept."""
+    footage = Footage(pictures(n_frames), **LIGHT).from_frame(2 * n_before)
+    return camera_of(rows_layout(), **sensor).video(footage, **ROLLING, first_frame=n_before)
+
+
+def cut(captures, n):
+    """So many captures, and an error in the place of the next."""
+    yield from islice(captures, n)
+    raise LightsOutError
+
+
+def files_of(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def small_chunks(monkeypatch):
+    """Four frames of 120 sites a chunk."""
+    monkeypatch.setattr(sys.modules[read_recording.__module__], "CHUNK_CODES", 500)
+
+
+@pytest.mark.usefixtures("small_chunks")
+@pytest.mark.parametrize("ends", [(0, 3), (4, 1, 4), (5, 6), (11,), (1, 0, 1)])
+def test_a_recording_that_was_ended_goes_on_and_is_the_whole_one_to_the_byte(tmp_path, ends):
+    path, n = tmp_path / "v.zarr", 0
+    for more in ends:
+        assert frames_kept(path) == n
+        with pytest.raises(LightsOutError) as ended:
+            write_video(cut(rolling(n), more), path, resume=True)
+        n += more
+        notes = [f"{n} frames are kept in {partial_of(path)}, from which the same recording goes on"] if n else []
+        assert getattr(ended.value, "__notes__", []) == notes
+        assert [p.name for p in tmp_path.iterdir()] == (["v.zarr.partial"] if n else [])
+
+    assert write_video(rolling(n), path, resume=True) == 11
+    write_video(rolling(0), tmp_path / "whole.zarr")
+
+    assert files_of(path) == files_of(tmp_path / "whole.zarr")
+    assert not partial_of(path).exists()
+    assert frames_kept(path) == read_recording(path).n_frames == 11
+    assert write_video(rolling(frames_kept(path)), path, resume=True) == 11
+
+
+@pytest.mark.usefixtures("small_chunks")
+def test_ctrl_c_keeps_every_frame(tmp_path):
+    def interrupted():
+        yield from islice(rolling(0), 6)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_video(interrupted(), tmp_path / "v.zarr", resume=True)
+
+    assert frames_kept(tmp_path / "v.zarr") == 6
+
+
+RECORDER = """
+import sys, time
+from pathlib import Path
+sys.path.insert(0, TESTS)
+from test_video import frames_kept, rolling, write_video
+recording = sys.modules[frames_kept.__module__]
+recording.CHUNK_CODES, recording.WRITE_S = 500, 0.0
+
+def slowly(captures):
+    for capture in captures:
+        time.sleep(60.0 if capture.settings["frame"] == 10 else 0.02)
+        yield capture
+
+write_video(slowly(rolling(frames_kept("v.zarr"))), "v.zarr", resume=True)
+"""
+
+
+def wait_for(condition, limit_s=60.0):
+    end_s = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.005)
+
+
+def test_a_program_that_is_killed_leaves_its_recording_whole(tmp_path, monkeypatch):
+    script, path = tmp_path / "record.py", tmp_path / "v.zarr"
+    script.write_text(f"TESTS = {str(Path(__file__).parent)!r}\n{RECORDER}")
+    kept = 0
+    for more in (2, 3):
+        running = subprocess.Popen([sys.executable, script], cwd=tmp_path)
+        wait_for(lambda enough=kept + more: frames_kept(path) >= enough)
+        running.kill()
+        assert running.wait() == -signal.SIGKILL
+        assert kept + more <= frames_kept(path) < 11
+        kept = frames_kept(path)
+
+    monkeypatch.setattr(sys.modules[read_recording.__module__], "CHUNK_CODES", 500)
+    assert write_video(rolling(kept), path, resume=True) == 11
+    write_video(rolling(0), tmp_path / "whole.zarr")
+    assert files_of(path) == files_of(tmp_path / "whole.zarr")
+
+
+@pytest.mark.usefixtures("small_chunks")
+def test_a_disk_that_is_full_at_any_file_is_told_and_loses_no_whole_frame(tmp_path, monkeypatch):
+    write_video(rolling(0), tmp_path / "whole.zarr")
+    whole, replace, n_full = files_of(tmp_path / "whole.zarr"), Path.replace, 0
+    monkeypatch.setattr(sys.modules[read_recording.__module__], "WRITE_S", 0.0)
+
+    def fill_after(n_files):
+        def full(path, target):
+            nonlocal n_files
+            n_files -= 1
+            if n_files < 0:
+                raise OSError(28, "No space left on device")
+            return replace(path, target)
+
+        monkeypatch.setattr(Path, "replace", full)
+
+    for n_files in range(0, 90, 7):
+        path = tmp_path / f"{n_files}.zarr"
+        fill_after(n_files)
+        try:
+            write_video(rolling(0), path, resume=True)
+        except FileError as error:
+            n_full += 1
+            assert "cannot be written: No space left on device" in str(error)  # noqa: PT017 -- some come through
+        monkeypatch.setattr(Path, "replace", replace)
+        kept = frames_kept(path)
+        if kept:
+            assert np.array_equal(codes_of(path, kept), read_recording(tmp_path / "whole.zarr").code[:kept])
+        assert write_video(rolling(kept), path, resume=True) == 11
+        assert files_of(path) == whole
+    assert n_full > 8
+
+
+def codes_of(path, n):
+    """The first codes of a recording, finished or not."""
+    import zarr
+
+    return zarr.open_array(str(path if path.exists() else partial_of(path)), path="code", mode="r")[:n]
+
+
+def test_frames_are_kept_every_few_seconds_though_no_chunk_is_full(tmp_path, monkeypatch):
+    path, kept = tmp_path / "v.zarr", []
+
+    def watched():
+        for capture in rolling(0):
+            kept.append(frames_kept(path))
+            yield capture
+
+    monkeypatch.setattr(sys.modules[read_recording.__module__], "WRITE_S", 0.0)
+    write_video(watched(), path, resume=True)
+
+    assert kept == list(range(11))
+
+
+@pytest.mark.usefixtures("small_chunks")
+def test_another_recording_is_not_gone_on_with(tmp_path):
+    path = tmp_path / "v.zarr"
+    with pytest.raises(LightsOutError):
+        write_video(cut(rolling(0), 5), path, resume=True, plan={"gaze": {"seed": 1}})
+    before = files_of(partial_of(path))
+
+    def other(how=None, light=None, plan=1, **sensor):
+        layout = sensor.pop("layout", rows_layout())
+        footage = Footage(pictures(22), **(LIGHT | (light or {}))).from_frame(10)
+        captures = camera_of(layout, **sensor).video(footage, **(ROLLING | {"first_frame": 5} | (how or {})))
+        with pytest.raises((FileError, ParameterError)) as refused:
+            write_video(captures, path, resume=True, plan={"gaze": {"seed": plan}})
+        assert files_of(partial_of(path)) == before
+        return str(refused.value)
+
+    columns = rows_layout().with_columns(zone=np.arange(120))
+    moved = rows_layout().translate(0.1, 0.0)
+    for name, changes in {
+        "gaze.seed": {"plan": 2},
+        "bits": {"bits": 8},
+        "sensor.read_noise_e": {"read_noise_e": 3.0},
+        "layout": {"layout": moved},
+        "seed": {"how": {"seed": 6}},
+        "line_s": {"how": {"line_s": 2e-3}},
+        "every": {"how": {"every": 1}},
+        "light.pitch_um": {"light": {"pitch_um": 11.0}},
+        "light.spectrum_w_m2_sr_nm": {"light": {"peak_radiance_w_m2_sr_nm": 0.2}},
+    }.items():
+        assert f"is another recording: '{name}' differs; write this one under another name" in other(**changes)
+    assert "'layout' differs" in other(layout=columns)
+    for first_frame in (0, 4, 6):
+        told = other(how={"first_frame": first_frame})
+        assert "after 5 frames comes the number 5; leave out the light of the first 5" in told
+        assert f"got {first_frame}" in told
+
+
+def test_a_recording_through_other_filters_is_another_one(tmp_path):
+    layout = rows_layout()
+    layout = layout.with_columns(channel=np.arange(layout.n_sites) % 3)
+    for filters, refusal in ((None, None), ("rgb", "'filters' differs")):
+        n = frames_kept(tmp_path / "v.zarr")
+        captures = camera_of(layout, filters=filters).video(
+            [scene_of(p) for p in pictures(3)[n:]], exposure_s=0.01, seed=5, first_frame=n
+        )
+        with pytest.raises(LightsOutError if refusal is None else FileError, match=refusal):
+            write_video(cut(captures, 2), tmp_path / "v.zarr", resume=True)
+
+
+def test_what_differed_between_frames_before_may_differ_after(tmp_path):
+    """A zoom: the distance is another one in every frame."""
+    path = tmp_path / "v.zarr"
+    scenes = [fs.Scene.from_picture(p, **(LIGHT | {"distance_m": 0.5 - 0.02 * k})) for k, p in enumerate(pictures(4))]
+
+    def zoomed(n, **sensor):
+        return camera_of(rows_layout(), **sensor).video(scenes[n:], exposure_s=0.01, seed=1, first_frame=n)
+
+    with pytest.raises(LightsOutError):
+        write_video(cut(zoomed(0), 2), path, resume=True)
+    with pytest.raises(FileError, match=r"sensor\.read_noise_e"):
+        write_video(zoomed(2, read_noise_e=3.0), path, resume=True)
+    assert write_video(zoomed(2), path, resume=True) == 4
+    assert np.array_equal(read_recording(path).code[:], [c.code for c in zoomed(0)])
+
+
+def test_frames_that_are_not_numbered_one_after_the_other_are_told_before_they_are_lost(tmp_path):
+    captures = [next(captures_of(1)) for _ in range(2)]
+    with pytest.raises(ParameterError, match="numbered one after the other"):
+        write_video(captures, tmp_path / "v.zarr", resume=True)
+    assert write_video(captures, tmp_path / "v.zarr") == 2
+
+
+def test_two_programs_do_not_write_the_same_recording(tmp_path):
+    path = tmp_path / "v.zarr"
+
+    def meddled():
+        for k, capture in enumerate(rolling(0)):
+            if k in (0, 3):
+                with pytest.raises(FileError, match="is being written by another program"):
+                    write_video(rolling(0), path, resume=True)
+            yield capture
+
+    assert write_video(meddled(), path, resume=True) == 11
+    assert np.array_equal(read_recording(path).code[:], [c.code for c in rolling(0)])
+
+
+def test_a_finished_recording_is_left_as_it_is(tmp_path):
+    path = tmp_path / "v.zarr"
+    write_video(rolling(0), path, resume=True, plan={"a": 1})
+    before = files_of(path)
+
+    def never():
+        raise AssertionError
+        yield
+
+    assert write_video(never(), path, resume=True, plan={"a": 1}) == 11
+    with pytest.raises(FileError, match="is another recording: 'a' differs"):
+        write_video(never(), path, resume=True, plan={"a": 2})
+    write_video(rolling(0), tmp_path / "w.zarr")
+    with pytest.raises(FileError, match="is finished, with 11 frames, and nothing is put after them"):
+        write_video(rolling(10), tmp_path / "w.zarr", resume=True)
+    assert files_of(path) == before
+
+
+def test_something_else_in_the_place_of_a_recording_is_left_alone(tmp_path):
+    for name, place in (("a", "a.zarr"), ("b", "b.zarr.partial")):
+        (tmp_path / place).mkdir()
+        (tmp_path / place / "thesis.txt").write_text("years of work")
+        with pytest.raises(FileError, match="something else is there"):
+            write_video(rolling(0), tmp_path / f"{name}.zarr", resume=True)
+        assert files_of(tmp_path / place) == {"thesis.txt": b"years of work"}
+    (tmp_path / "c.zarr.partial").write_text("years of work")
+    with pytest.raises(FileError, match="something else is there"):
+        write_video(rolling(0), tmp_path / "c.zarr", resume=True)
+    with pytest.raises(FileError, match="does not exist"):
+        write_video(rolling(0), tmp_path / "none" / "c.zarr", resume=True)
+
+
+def test_only_zarr_folders_are_gone_on_with(tmp_path):
+    for name in ("v.mp4", "v.gif", "pictures"):
+        with pytest.raises(ParameterError, match=r"'resume' is for \.zarr folders"):
+            write_video(rolling(0), tmp_path / name, resume=True)
+        with pytest.raises(FileError, match=r"is no \.zarr folder"):
+            frames_kept(tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("small_chunks")
+def test_progress_goes_on_from_the_frames_that_are_kept(tmp_path, capsys):
+    with pytest.raises(LightsOutError):
+        write_video(cut(rolling(0), 6), tmp_path / "v.zarr", resume=True, progress=True, n_frames=11)
+    assert "55%" in capsys.readouterr().out
+    write_video(rolling(6), tmp_path / "v.zarr", resume=True, progress=True, n_frames=11)
+    assert "100%" in capsys.readouterr().out
+
+
+def test_footage_from_a_frame_on_is_the_rest_of_it(tmp_path):
+    film = tmp_path / "film.mp4"
+    write_video(captures_of(7), film, max_pixels=64, frame_s=0.1)
+    for source in (film, pictures(7)):
+        footage = Footage(source, start=1, step=2, **(LIGHT | {"wavelength_nm": (550.0,)}))
+        whole = [scene.basis for scene in footage]
+        assert len(whole) == 3
+        for n in range(5):
+            rest = footage.from_frame(n)
+            assert rest.n_frames == max(3 - n, 0)
+            assert rest.frame_s == footage.frame_s
+            assert [b.tobytes() for b in whole[n:]] == [scene.basis.tobytes() for scene in rest]
+    with pytest.raises(ParameterError, match="'n'"):
+        footage.from_frame(-1)
+
+
+def test_metadata_that_were_put_together_are_not_what_is_opened(tmp_path):
+    """Zarr may keep all metadata in one place, where those of an array may name another program than in their own."""
+    path = tmp_path / "v.zarr"
+    codes = [c.code for c in captures_of(2)]
+    write_video(captures_of(2), path)
+    about = json.loads((path / "zarr.json").read_text())
+    code = (path / "code" / "zarr.json").read_text().replace('"zstd"', '"numcodecs.pickle"')
+    about["consolidated_metadata"] = {
+        "kind": "inline",
+        "must_understand": False,
+        "metadata": {"code": json.loads(code)},
+    }
+    (path / "zarr.json").write_text(json.dumps(about))
+
+    assert np.array_equal(read_recording(path).code[:], codes)
+
+
 # -- the command ------------------------------------------------------------------------------------------------------
 
 SHOT = """
@@ -732,6 +1091,79 @@ def test_the_command_stops_after_so_many_frames(folder):
     assert command("shot.yaml", "--frames", "frames", "--out", "pictures", "--stop", "2") == 0
 
     assert sorted(p.name for p in (folder / "pictures").iterdir()) == ["frame_000000.png", "frame_000001.png"]
+
+
+def run_command(*arguments, **how):
+    return subprocess.Popen(
+        [sys.executable, "-m", "foveasim.cli", "video", "shot.yaml", "--frames", "frames", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **how,
+    )
+
+
+def test_the_command_goes_on_where_it_was_stopped(folder, capsys):
+    frames, out = folder / "frames", folder / "v.zarr"
+    for k in range(3, 400):
+        os.link(frames / f"{k % 3}.png", frames / f"{k}.png")
+    running = run_command("--out", "v.zarr", cwd=folder)
+    wait_for((partial_of(out) / "frame" / "zarr.json").exists)
+    running.send_signal(signal.SIGINT)
+    _, told = running.communicate(timeout=60)
+    kept = frames_kept(out)
+
+    assert running.returncode == 130
+    assert told == f"stopped; {kept} frames are kept beside v.zarr, and the same command goes on from there\n"
+    assert 0 < kept < 400
+    assert not out.exists()
+
+    asked = ("shot.yaml", "--frames", "frames", "--out", "v.zarr")
+    assert command(*asked, "--set", "sensor.read_noise_e=9") == 2
+    assert "is another recording: 'sensor.read_noise_e' differs" in capsys.readouterr().err
+    assert command(*asked) == 0
+    assert "wrote v.zarr: 400 frames" in capsys.readouterr().out
+    assert command("shot.yaml", "--frames", "frames", "--out", "whole.zarr") == 0
+    assert files_of(out) == files_of(folder / "whole.zarr")
+
+
+def test_a_frame_that_cannot_be_read_costs_none_of_those_that_were_taken(folder, capsys):
+    good = (folder / "frames" / "2.png").read_bytes()
+    (folder / "frames" / "2.png").write_bytes(good[:-100].ljust(len(good), b"\0"))
+    asked = ("shot.yaml", "--frames", "frames", "--out", "v.zarr")
+
+    assert command(*asked) == 2
+    # One may be read, and not yet seen by the sensor, when the next cannot be.
+    assert 1 <= frames_kept("v.zarr") <= 2
+    assert " frames are kept in v.zarr.partial, from which the same recording goes on" in capsys.readouterr().err
+    (folder / "frames" / "2.png").write_bytes(good)
+    assert command(*asked) == 0
+    assert read_recording(folder / "v.zarr").frame.tolist() == [0, 1, 2]
+
+
+def test_the_command_does_a_finished_recording_not_again_and_another_one_not_over_it(folder, capsys):
+    asked = ("shot.yaml", "--frames", "frames", "--out", "v.zarr")
+    assert command(*asked) == 0
+    before = files_of(folder / "v.zarr")
+    capsys.readouterr()
+
+    assert command(*asked) == 0
+    assert "v.zarr was finished before: 3 frames" in capsys.readouterr().out
+    for changes, name in (
+        (("--set", "optics.f_number=4"), "optics.f_number"),
+        (("--stop", "2"), "stop"),
+        (("--set", "layout.parameters.pitch_um=2.9"), "layout.parameters.pitch_um"),
+        (("--set", "exposure_s=0.02"), "exposure_s"),
+    ):
+        assert command(*asked, *changes) == 2
+        assert f"is another recording: '{name}' differs" in capsys.readouterr().err
+    write_picture(folder / "frames" / "3.png", np.zeros((120, 160, 3), np.uint8))
+    assert command(*asked) == 2
+    assert "is another recording: 'frames' differs" in capsys.readouterr().err
+    assert files_of(folder / "v.zarr") == before
+    # Pictures to look at are made anew, as ever.
+    for k in ("2", "3"):
+        assert command("shot.yaml", "--frames", "frames", "--out", "v.gif", "--stop", k) == 0
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,18 @@ from __future__ import annotations
 
 from foveasim.video.footage import Footage
 from foveasim.video.gaze import GazePath, look, look_around, saccades
-from foveasim.video.recording import Recording, read_recording, write_video
+from foveasim.video.recording import Recording, frames_kept, partial_of, read_recording
+from foveasim.video.writing import write_video
 
-__all__ = ["Footage", "GazePath", "Recording", "look", "look_around", "read_recording", "saccades", "write_video"]
+__all__ = [
+    "Footage",
+    "GazePath",
+    "Recording",
+    "frames_kept",
+    "look",
+    "look_around",
+    "partial_of",
+    "read_recording",
+    "saccades",
+    "write_video",
+]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import re
 from collections.abc import Iterable, Iterator, Sized
 from dataclasses import replace
@@ -10,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from foveasim.arrays import check_count, check_number
 from foveasim.errors import FileError, ParameterError
 from foveasim.scene import Scene
 
-__all__ = ["Footage"]
+__all__ = ["Footage", "pictures_in"]
 
 #: Endings of the pictures that a folder is searched for.
 PICTURE_ENDINGS = (".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga", ".tif", ".tiff", ".webp")
@@ -93,7 +94,7 @@ class Footage:
         if isinstance(source, str | Path):
             path = Path(source)
             if path.is_dir():
-                self._source = _pictures_in(path)
+                self._source = pictures_in(path)
                 self._n_source = len(self._source)
             elif path.is_file():
                 self._source = _VideoFile(path)
@@ -126,10 +127,34 @@ class Footage:
             range(self._start, min(self._n_source, self._n_source if self._stop is None else self._stop), self._step)
         )
 
+    def from_frame(self, n: int) -> Footage:
+        """
+        The same frames without the first ``n``, which are passed over and not made into scenes.
+
+        Parameters
+        ----------
+        n : int
+
+        Returns
+        -------
+        Footage
+
+        Raises
+        ------
+        ParameterError
+            When ``n`` is negative or not whole.
+        """
+        rest = copy.copy(self)
+        rest._start += check_count("n", n, at_least=0) * self._step  # noqa: SLF001 -- its own
+        return rest
+
     def __iter__(self) -> Iterator[Scene]:
         """Scenes, one after the other."""
         shape: tuple[int, ...] | None = None
-        for k, picture in enumerate(islice(iter(self._source), self._start, self._stop, self._step)):
+        pictures: Iterator[Any] = islice(iter(self._source), self._start, self._stop, self._step)
+        if isinstance(self._source, _VideoFile):  # frames that are passed over are decoded, and no more
+            pictures = (frame.to_ndarray(format="rgb24") for frame in pictures)
+        for k, picture in enumerate(pictures):
             scene = Scene.from_picture(picture, **self._scene) if self._like is None else self._made_like(picture)
             if shape is not None and scene.basis.shape != shape:
                 where = picture if isinstance(picture, str | Path) else f"frame {self._start + k * self._step}"
@@ -157,7 +182,7 @@ class Footage:
         return replace(like, basis=basis, source=read.source)
 
 
-def _pictures_in(folder: Path) -> list[Path]:
+def pictures_in(folder: Path) -> list[Path]:
     """The pictures of a folder, in the natural order of their names."""
     pictures = [
         path
@@ -174,7 +199,7 @@ def _pieces(path: Path) -> list[str]:
 
 
 class _VideoFile:
-    """Frames of a video file as (n_y, n_x, 3) uint8, first row on top."""
+    """Frames of a video file as the decoder gives them, which become (n_y, n_x, 3) uint8, first row on top."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -184,7 +209,7 @@ class _VideoFile:
             self.frame_s = None if not rate else float(1 / rate)
             self.n_frames: int | None = int(stream.frames) or None
 
-    def __iter__(self) -> Iterator[NDArray[Any]]:
+    def __iter__(self) -> Iterator[Any]:
         import av
 
         with _opened(self.path) as container:
@@ -193,7 +218,7 @@ class _VideoFile:
             n_read = 0
             try:
                 for frame in container.decode(stream):
-                    yield frame.to_ndarray(format="rgb24")
+                    yield frame
                     n_read += 1
             except av.FFmpegError as error:
                 raise FileError(self.path, f"is broken after frame {n_read} ({error})") from None

@@ -1,158 +1,60 @@
-"""Videos of captures as files: zarr folders that hold every code, pictures in a row, and video files to look at."""
+"""Videos of captures as zarr folders that hold every code: written frame by frame, gone on with after any end, and read."""
 
 from __future__ import annotations
 
 import json
-import secrets
+import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, check_count, check_number
+from foveasim.arrays import Floats, check_count
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
-from foveasim.fields import Grid
-from foveasim.files import written_whole
-from foveasim.integrate import Integrator
+from foveasim.files import folder_written_whole, lock
 from foveasim.layout import Layout
-from foveasim.pictures import write_picture
-from foveasim.reconstruct import Picture, fill_channels, raster_grid
-from foveasim.reconstruct.picture import covered_share
-from foveasim.records import described
+from foveasim.records import described, differences
 
-__all__ = ["Recording", "read_recording", "write_video"]
+__all__ = [
+    "ZARR",
+    "Recording",
+    "alike",
+    "frames_kept",
+    "library",
+    "partial_of",
+    "read_recording",
+    "record",
+    "record_on",
+]
 
 FORMAT, VERSION = "foveasim video", 1
 ZARR = ".zarr"
-VIDEO_ENDINGS = (".mp4", ".mkv", ".mov", ".webm")
 #: Codes that one chunk of a zarr folder holds, at least one frame of them: what is kept in memory while writing.
 CHUNK_CODES = 1 << 22
+#: A recording that can be gone on with is written at least so often, whether a chunk is full or not: what a sudden end costs.
+WRITE_S = 10.0
 #: What packs the numbers, as zarr does unless told otherwise; and a folder with more numbers beside the codes is refused.
 CODECS = ("bytes", "zstd")
 MAX_UNPACKED_BYTES = 8 * 2**30
 NEEDS = {"zarr": "needs zarr: pip install 'foveasim[video]'", "av": "needs PyAV: pip install 'foveasim[video]'"}
-#: Grey behind what no photosite sees, as a share of white.
-BEHIND = 0.12
+#: Arrays of the layout, and those that grow frame by frame: the numbers come last, and tell which frames are whole.
+GEOMETRY, GROWING = ("xy_um", "ring_offsets", "site_offsets"), ("code", "exposure_s", "frame")
+#: In the place of a frame's number until the frame is whole.
+NO_FRAME = -1
+#: What may differ between captures of one recording, whatever else does not.
+OWN_SETTINGS = frozenset({"exposure_s", "frame", "light.source", "place_um"})
+#: A file that is locked while a recording grows, and the ending of zarr's files that are not written to their end.
+LOCK, TORN = "lock", ".partial"
 
 
-def write_video(
-    captures: Iterable[Capture],
-    path: str | Path,
-    *,
-    frame_s: float = 1.0 / 25.0,
-    max_pixels: int = 512,
-    n_frames: int | None = None,
-    progress: bool = False,
-) -> int:
-    """
-    Write captures as they come, whole or not at all.
-
-    Parameters
-    ----------
-    captures : iterable of Capture
-        Of the same layout, as :meth:`foveasim.Camera.video` gives them.
-    path : path
-        ``.zarr``: a folder with every code, which :func:`read_recording` reads. ``.mp4``, ``.mkv``, ``.mov``, ``.webm`` (with
-        the extra ``video``) and ``.gif``: pictures to look at. Without an ending: a folder of pictures ``frame_000000.png`` ...
-    frame_s : float, s
-        How long a frame is shown.
-    max_pixels : int
-        Length of the longer side of pictures.
-    n_frames : int, optional
-        How many there will be, for the progress.
-    progress : bool
-        Whether to show how far it is, and how long it will still take.
-
-    Returns
-    -------
-    n_frames : int
-        How many were written.
-
-    Raises
-    ------
-    FileError
-        When the ending names no format, a library is missing, nothing can be written there, or something else is there.
-    ParameterError
-        When there is no capture, or a value is out of range.
-
-    Notes
-    -----
-    In memory are a chunk of codes, or a frame, however long the video is. Until the last frame is written the target is not
-    there, or is what it was before.
-    """
-    target = Path(path)
-    frame_s = check_number("frame_s", frame_s, above=0.0)
-    max_pixels = check_count("max_pixels", max_pixels, at_least=2)
-    ending = target.suffix.lower()
-    if progress:
-        captures = _told(captures, n_frames)
-    if ending == ZARR:
-        return _write_zarr(captures, target)
-    if ending == ".gif":
-        return _write_gif(captures, target, frame_s, max_pixels)
-    if ending in VIDEO_ENDINGS:
-        return _write_film(captures, target, frame_s, max_pixels)
-    if ending:
-        raise FileError(
-            target, f"must end in .zarr, .gif, {', '.join(VIDEO_ENDINGS)}, or have no ending, for a folder of pictures"
-        )
-    return _write_pictures(captures, target, max_pixels)
-
-
-def _told(captures: Iterable[Capture], n_frames: int | None) -> Iterator[Capture]:
-    from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    columns = (SpinnerColumn(), *Progress.get_default_columns()[:-1], TimeRemainingColumn(), TimeElapsedColumn())
-    with Progress(*columns) as bar:
-        yield from bar.track(captures, total=n_frames, description="frames")
-
-
-@contextmanager
-def _folder_written_whole(target: Path, *, is_ours: Callable[[Path], bool]) -> Iterator[Path]:
-    """A temporary folder, renamed to the target when the block ends well, removed otherwise."""
-    if target.exists() and not is_ours(target):
-        raise FileError(target, "cannot be written: something else is there")
-    if not target.parent.is_dir():
-        raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
-    token = secrets.token_hex(8)
-    new, old = (target.with_name(f".foveasim-{token}-{which}{target.suffix}") for which in ("new", "old"))
-    try:
-        new.mkdir()
-        yield new
-        if target.exists():
-            target.rename(old)
-        new.rename(target)
-    except OSError as error:
-        if old.exists() and not target.exists():
-            old.rename(target)
-        raise FileError(target, f"cannot be written: {error.strerror or error}") from None
-    finally:
-        for folder in (new, old):
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-def _checked(captures: Iterable[Capture]) -> Iterator[Capture]:
-    """The captures, of which all must be of one layout, and one at least must come."""
-    layout: Layout | None = None
-    for capture in captures:
-        if not isinstance(capture, Capture):
-            raise ParameterError("captures", f"must be Captures, got a {type(capture).__name__}")
-        if layout is not None and capture.layout is not layout and capture.layout.n_sites != layout.n_sites:
-            raise ParameterError("captures", f"must be of the same layout, got one of {capture.layout!r}")
-        layout = capture.layout
-        yield capture
-    if layout is None:
-        raise ParameterError("captures", "must hold at least one capture")
-
-
-# -- zarr -------------------------------------------------------------------------------------------------------------
+# -- reading ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,20 +107,11 @@ def read_recording(path: str | Path) -> Recording:
         When it is missing, broken, or no video of captures.
     """
     source = Path(path)
-    zarr = _library(source, "zarr")
+    library(source, "zarr")
     if not source.is_dir():
         raise FileError(source, "is not a folder" if source.exists() else "no such folder")
-    try:
-        _check_codecs(source)
-        group = zarr.open_group(str(source), mode="r")
-        about = dict(group.attrs)
-        if about.get("format") != FORMAT:
-            raise FileError(source, "is no video of captures")
-        if about.get("version") != VERSION:
-            raise FileError(source, f"has the format version {about.get('version')}, expected {VERSION}")
-        arrays = [array for name, array in (*group.arrays(), *group["columns"].arrays()) if name != "code"]
-        if sum(array.nbytes for array in arrays) > MAX_UNPACKED_BYTES:
-            raise FileError(source, f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
+    with _trusted(source) as group:
+        about = group.attrs
         columns = {name: values[:] for name, values in group["columns"].arrays()}
         return Recording(
             code=group["code"],
@@ -233,6 +126,61 @@ def read_recording(path: str | Path) -> Recording:
             white_dn=np.asarray(about["white_dn"], np.float64),
             settings=about["settings"],
         )
+
+
+def partial_of(path: str | Path) -> Path:
+    """The folder beside a recording in which it grows: there after an end of the program, until the last frame is in."""
+    target = Path(path)
+    return target.with_name(target.name + ".partial")
+
+
+def frames_kept(path: str | Path) -> int:
+    """
+    How many frames of a recording are there, of one that was ended or one that is finished.
+
+    Parameters
+    ----------
+    path : path
+        Of the recording, as :func:`write_video` was given it with ``resume``.
+
+    Returns
+    -------
+    n_frames : int
+        0 where nothing is there.
+
+    Raises
+    ------
+    FileError
+        When something else is there, or it is broken.
+    """
+    target = Path(path)
+    if target.suffix.lower() != ZARR:
+        raise FileError(target, "is no .zarr folder, and others keep no frames")
+    library(target, "zarr")
+    if target.exists():
+        with _trusted(target) as group:
+            return int(group["code"].shape[0])
+    folder = partial_of(target)
+    return _n_whole(folder) if folder.exists() else 0
+
+
+@contextmanager
+def _trusted(source: Path, mode: str = "r") -> Iterator[Any]:
+    """The group of a recording; what its folder holds may be anything, and whatever that breaks is told in one sentence."""
+    zarr = library(source, "zarr")
+    try:
+        _check_codecs(source)
+        group = zarr.open_group(str(source), mode=mode, use_consolidated=False)  # which is not what was checked
+        if group.attrs.get("format") != FORMAT:
+            raise FileError(source, "is no video of captures")
+        if group.attrs.get("version") != VERSION:
+            raise FileError(source, f"has the format version {group.attrs.get('version')}, expected {VERSION}")
+        names = (*GEOMETRY, "filter_of_site", "exposure_s", "frame")
+        arrays = [group[name] for name in names if name in group]
+        arrays += [array for _, array in group["columns"].arrays()] if "columns" in group else []
+        if sum(array.nbytes for array in arrays) > MAX_UNPACKED_BYTES:
+            raise FileError(source, f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
+        yield group
     except FileError:
         raise
     except Exception as error:  # noqa: BLE001 -- a broken folder makes its readers trip over anything
@@ -241,7 +189,7 @@ def read_recording(path: str | Path) -> Recording:
 
 def _check_codecs(source: Path) -> None:
     """Refuse metadata that name other programs to run on the chunks than those that recordings are packed with."""
-    for path in source.rglob("zarr.json"):
+    for path in (*source.glob("zarr.json"), *source.glob("*/zarr.json"), *source.glob("columns/*/zarr.json")):
         metadata = json.loads(path.read_text(encoding="utf-8"))
         if metadata.get("storage_transformers"):
             raise FileError(source, "is packed in a way that no video of captures is")
@@ -250,72 +198,23 @@ def _check_codecs(source: Path) -> None:
                 raise FileError(source, f"is packed with {codec.get('name')!r:.40}, as no video of captures is")
 
 
-def _write_zarr(captures: Iterable[Capture], target: Path) -> int:
-    zarr = _library(target, "zarr")
-
-    def is_recording(folder: Path) -> bool:
-        try:
-            return zarr.open_group(str(folder), mode="r").attrs.get("format") == FORMAT
-        except Exception:  # noqa: BLE001 -- whatever else it is
-            return False
-
-    with _folder_written_whole(target, is_ours=is_recording) as folder:
-        group = zarr.open_group(str(folder), mode="w")
-        columns: dict[str, list[Any]] = {"code": [], "exposure_s": [], "frame": []}
-        n_written, n_chunk = 0, 1
-
-        def flush() -> None:
-            nonlocal n_written
-            n = len(columns["code"])
-            for name, values in columns.items():
-                array = group[name]
-                array.resize((n_written + n, *array.shape[1:]))
-                array[n_written:] = np.asarray(values, array.dtype)
-                values.clear()
-            n_written += n
-
-        for k, capture in enumerate(_checked(captures)):
-            if k == 0:
-                n_sites = capture.layout.n_sites
-                n_chunk = max(1, CHUNK_CODES // max(n_sites, 1))
-                _write_about(group, capture)
-                group.create_array(
-                    "code", shape=(0, n_sites), chunks=(n_chunk, max(n_sites, 1)), dtype=capture.code.dtype
-                )
-                for name, kind in (("exposure_s", "f8"), ("frame", "i8")):
-                    group.create_array(name, shape=(0,), chunks=(4096,), dtype=kind)
-            columns["code"].append(capture.code)
-            columns["exposure_s"].append(capture.settings.get("exposure_s", np.nan))
-            columns["frame"].append(capture.settings.get("frame", k))
-            if len(columns["code"]) == n_chunk:
-                flush()
-        if columns["code"]:
-            flush()
-    return n_written
+def _is_recording(folder: Path) -> bool:
+    zarr = library(folder, "zarr")
+    try:
+        return zarr.open_group(str(folder), mode="r", use_consolidated=False).attrs.get("format") == FORMAT
+    except Exception:  # noqa: BLE001 -- whatever else it is
+        return False
 
 
-def _write_about(group: Any, capture: Capture) -> None:
-    layout = capture.layout
-    for name in ("xy_um", "ring_offsets", "site_offsets"):
-        group.create_array(name, data=np.asarray(getattr(layout, name)))
-    group.create_array("filter_of_site", data=np.asarray(capture.filter_of_site))
-    group.create_group("columns")
-    for name, values in layout.columns.items():
-        group["columns"].create_array(name, data=np.asarray(values))
-    group.attrs.update(
-        {
-            "format": FORMAT,
-            "version": VERSION,
-            "filter_names": list(capture.filter_names),
-            "bits": capture.bits,
-            "white_dn": capture.white_dn.tolist(),
-            "settings": json.loads(json.dumps(capture.settings)),
-            "provenance": described(dict(layout.provenance)),
-        }
-    )
+def library(path: Path, name: str) -> Any:
+    """
+    A library that files of a kind need.
 
-
-def _library(path: Path, name: str) -> Any:
+    Raises
+    ------
+    FileError
+        When it is missing.
+    """
     from importlib import import_module
 
     try:
@@ -324,102 +223,302 @@ def _library(path: Path, name: str) -> Any:
         raise FileError(path, NEEDS[name]) from None
 
 
-# -- pictures ---------------------------------------------------------------------------------------------------------
+# -- writing ----------------------------------------------------------------------------------------------------------
 
 
-class _Raster:
-    """Pictures of captures of one layout: its overlaps with the pixels are computed once."""
+def alike(captures: Iterable[Capture], *, n_before: int = 0) -> Iterator[Capture]:
+    """
+    The captures, as they come.
 
-    def __init__(self, layout: Layout, max_pixels: int, *, is_even: bool = False) -> None:
-        grid = raster_grid(layout, max_pixels)
-        if is_even:  # video formats halve the colours' pixels
-            grid = Grid(tuple(n + n % 2 for n in grid.shape), grid.pitch_um, grid.origin_um)  # type: ignore[arg-type]
-        self._layout, self._integrator = layout, Integrator(layout, grid)
-        self._share = covered_share(self._integrator)
-        self._covered_um2 = np.where(self._share > 0.0, self._share, np.nan) * grid.cell_area_um2
-
-    def image(self, capture: Capture) -> NDArray[np.uint8]:
-        """Colours as a screen expects them, and coverage, (n_y, n_x, 2 or 4), first row on top."""
-        values = capture.code.astype(np.float64)[np.newaxis]
-        n_filters = len(capture.filter_names)
-        if n_filters > 1:
-            values = fill_channels(self._layout, values[0], capture.filter_of_site, n_filters)
-            values = np.where(np.isnan(values), 0.0, values)
-        data = (self._integrator.spread(values) / self._covered_um2).astype(np.float32)
-        white: Any = capture.white_dn
-        if n_filters not in (1, 3):
-            data, white = data.mean(axis=0, keepdims=True), float(np.mean(white))
-        picture = Picture(data, self._share.astype(np.float32), self._integrator.grid)
-        return np.asarray(picture.to_image(white, encode_srgb=True), np.uint8)
-
-    def flat(self, capture: Capture) -> NDArray[np.uint8]:
-        """Colours over a dark grey, (n_y, n_x, 3)."""
-        image = self.image(capture).astype(np.float64)
-        colours, cover = image[..., :-1], image[..., -1:] / 255.0
-        colours = colours * cover + 255.0 * BEHIND * (1.0 - cover)
-        return np.ascontiguousarray(np.broadcast_to(np.rint(colours), (*colours.shape[:2], 3)).astype(np.uint8))
+    Raises
+    ------
+    ParameterError
+        When they are not all of one layout and as many bits, or none comes where none was before.
+    """
+    first: tuple[int, int] | None = None
+    for capture in captures:
+        if not isinstance(capture, Capture):
+            raise ParameterError("captures", f"must be Captures, got a {type(capture).__name__}")
+        kind = capture.layout.n_sites, capture.bits
+        first = kind if first is None else first
+        if kind != first:
+            raise ParameterError("captures", f"must be of the same layout and bits, got {capture!r}")
+        yield capture
+    if first is None and n_before == 0:
+        raise ParameterError("captures", "must hold at least one capture")
 
 
-def _write_pictures(captures: Iterable[Capture], target: Path, max_pixels: int) -> int:
-    def is_pictures(folder: Path) -> bool:
-        return folder.is_dir() and all(p.name.startswith("frame_") and p.suffix == ".png" for p in folder.iterdir())
-
-    n_frames = 0
-    with _folder_written_whole(target, is_ours=is_pictures) as folder:
-        raster: _Raster | None = None
-        for capture in _checked(captures):
-            raster = raster or _Raster(capture.layout, max_pixels)
-            write_picture(folder / f"frame_{n_frames:06d}.png", raster.image(capture))
-            n_frames += 1
-    return n_frames
+def record(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | None) -> int:
+    """Write captures to a zarr folder, whole or not at all; their number."""
+    library(target, "zarr")
+    with folder_written_whole(target, is_ours=_is_recording) as folder:
+        frames = _Frames(folder, plan)
+        for capture in alike(captures):
+            frames.add(capture)
+        frames.write()
+    return frames.n_whole
 
 
-def _write_gif(captures: Iterable[Capture], target: Path, frame_s: float, max_pixels: int) -> int:
-    from PIL import Image
-
-    n_frames = 0
-
-    def pictures() -> Iterator[Image.Image]:
-        nonlocal n_frames
-        raster: _Raster | None = None
-        for capture in _checked(captures):
-            raster = raster or _Raster(capture.layout, max_pixels)
-            n_frames += 1
-            yield Image.fromarray(raster.flat(capture)).quantize(256)
-
-    with written_whole(target) as temporary:
-        all_pictures = pictures()
-        first = next(all_pictures)
-        first.save(
-            temporary,
-            format="GIF",
-            save_all=True,
-            append_images=all_pictures,
-            duration=max(20, round(1000.0 * frame_s)),
-            loop=0,
-        )
-    return n_frames
-
-
-def _write_film(captures: Iterable[Capture], target: Path, frame_s: float, max_pixels: int) -> int:
-    av = _library(target, "av")
-    codec = "libvpx-vp9" if target.suffix.lower() == ".webm" else "libx264"
-    n_frames = 0
-    with written_whole(target) as temporary:
+def record_on(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | None) -> int:
+    """Write captures to a zarr folder after those that are kept; the number of all."""
+    library(target, "zarr")
+    if target.exists():
+        return _finished(captures, target, plan)
+    with _growing(target) as folder:
+        n_before = _n_whole(folder)
+        if n_before:
+            _check_plan(folder, plan)
+        with _full_disks_told(target):
+            frames = _Frames(folder, plan, n_before)
         try:
-            with av.open(str(temporary), mode="w") as container:
-                raster: _Raster | None = None
-                stream: Any = None
-                for capture in _checked(captures):
-                    raster = raster or _Raster(capture.layout, max_pixels, is_even=True)
-                    pixels = raster.flat(capture)
-                    if stream is None:
-                        stream = container.add_stream(codec, rate=Fraction(1.0 / frame_s).limit_denominator(1001))
-                        stream.height, stream.width = pixels.shape[:2]
-                        stream.pix_fmt = "yuv420p"
-                    container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
-                    n_frames += 1
-                container.mux(stream.encode())
-        except av.FFmpegError as error:
-            raise FileError(target, f"cannot be written as a video file ({error})") from None
-    return n_frames
+            for capture in _following(alike(captures, n_before=n_before), folder, n_before):
+                with _full_disks_told(target):
+                    frames.add(capture)
+                    if time.monotonic() - frames.written_s > WRITE_S:
+                        frames.write()
+            with _full_disks_told(target):
+                frames.write()
+                folder.rename(target)
+                (target / LOCK).unlink(missing_ok=True)
+        except BaseException as error:
+            with suppress(Exception):
+                frames.write()
+            if frames.n_whole:
+                error.add_note(f"{frames.n_whole:,} frames are kept in {folder}, from which the same recording goes on")
+            raise
+    return frames.n_whole
+
+
+def _finished(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | None) -> int:
+    """The number of frames of a finished recording, after which nothing may come."""
+    if not _is_recording(target):
+        raise FileError(target, "cannot be written: something else is there")
+    _check_plan(target, plan)
+    n = frames_kept(target)
+    # Of the same plan nothing more can come; who gives none says so by captures of which none is left.
+    if plan is None and next(iter(captures), None) is not None:
+        raise FileError(
+            target,
+            f"is finished, with {n:,} frames, and nothing is put after them; write this one under another name, or remove "
+            "that one",
+        )
+    return n
+
+
+@contextmanager
+def _growing(target: Path) -> Iterator[Path]:
+    """The folder in which a recording grows, locked; it stays after the block unless no frame is in it."""
+    folder = partial_of(target)
+    if not target.parent.is_dir():
+        raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
+    if folder.exists() and not (folder.is_dir() and _is_ours(folder)):
+        raise FileError(folder, "cannot be written: something else is there")
+    with _full_disks_told(target):
+        folder.mkdir(exist_ok=True)
+        file = (folder / LOCK).open("ab")
+    with file:
+        with _full_disks_told(target):
+            # A folder that another program finished or began meanwhile is not the one that was locked.
+            if not lock(file) or not _is_at(file, folder / LOCK):
+                raise FileError(target, "is being written by another program")
+            for torn in folder.rglob(f"*{TORN}"):
+                torn.unlink()
+        try:
+            yield folder
+        finally:
+            if folder.exists() and not _n_whole(folder):
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _full_disks_told(target: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise FileError(target, f"cannot be written: {error.strerror or error}") from None
+
+
+def _is_ours(folder: Path) -> bool:
+    """Whether a recording grows in a folder, or was about to."""
+    return all(path.name == LOCK or path.suffix == TORN for path in folder.iterdir()) or _is_recording(folder)
+
+
+def _is_at(file: IO[bytes], path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except OSError:
+        return False
+
+
+def _n_whole(folder: Path) -> int:
+    """How many frames of a growing recording are whole."""
+    if not (folder / "frame" / "zarr.json").exists():
+        return 0
+    with _trusted(folder) as group:
+        frame = group["frame"][:]
+    return int(np.argmax(frame == NO_FRAME)) if (frame == NO_FRAME).any() else frame.size
+
+
+def _check_plan(path: Path, plan: Mapping[str, Any] | None) -> None:
+    """Refuse a recording that was made after another plan."""
+    with _trusted(path) as group:
+        found = group.attrs.get("plan")
+    _refuse(path, differences(found, _plain(plan)))
+
+
+def _refuse(path: Path, different: Iterable[str]) -> None:
+    for name in different:
+        raise FileError(
+            path,
+            f"is another recording: '{name}' differs; write this one under another name, or remove that one",
+        )
+
+
+def _following(captures: Iterable[Capture], folder: Path, n_before: int) -> Iterator[Capture]:
+    """
+    The captures, which must be numbered one after the other, and go on with those that the folder holds.
+
+    What differed between captures of the recording before may differ again; anything else that does is another recording.
+    """
+    first: dict[str, Any] | None = None
+    may_differ, next_frame = set(OWN_SETTINGS), None
+    if n_before:
+        with _trusted(folder) as group:
+            first, next_frame = group.attrs["settings"], int(group["frame"][n_before - 1]) + 1
+            may_differ |= set(group.attrs["varied"])
+    for k, capture in enumerate(captures, n_before):
+        settings = _plain(capture.settings)
+        frame = check_count("frame", settings.get("frame", k), at_least=0)
+        if next_frame is not None and frame != next_frame:
+            raise ParameterError(
+                "captures",
+                f"must be numbered one after the other to be gone on with: after {k:,} frames comes the number "
+                f"{next_frame}; leave out the light of the first {k:,}, and number the captures from there on (first_frame)",
+                frame,
+            )
+        first = settings if first is None else first
+        different = [name for name in differences(first, settings) if name not in may_differ]
+        if n_before and k == n_before:
+            _refuse(folder, _other_parts(folder, capture))
+            _refuse(folder, different)
+        elif different:
+            may_differ |= set(different)
+            with _trusted(folder, "r+") as group:
+                pass
+            with _full_disks_told(folder):
+                group.attrs["varied"] = sorted(may_differ - OWN_SETTINGS)
+        next_frame = frame + 1
+        yield capture
+
+
+def _other_parts(folder: Path, capture: Capture) -> Iterator[str]:
+    """Names of what a capture has otherwise than a recording, beside settings."""
+    with _trusted(folder) as group:
+        found = {name: group[name][:] for name in GEOMETRY}
+        found |= {f"column {name}": values[:] for name, values in group["columns"].arrays()}
+        filter_of_site, dtype, about = group["filter_of_site"][:], group["code"].dtype, dict(group.attrs)
+    layout = capture.layout
+    wanted = {name: np.asarray(getattr(layout, name)) for name in GEOMETRY}
+    wanted |= {f"column {name}": np.asarray(values) for name, values in layout.columns.items()}
+    if found.keys() != wanted.keys() or any(not np.array_equal(found[name], wanted[name]) for name in found):
+        yield "layout"
+    if about["bits"] != capture.bits or dtype != capture.code.dtype:
+        yield "bits"
+    if about["filter_names"] != list(capture.filter_names) or not np.array_equal(
+        filter_of_site, capture.filter_of_site
+    ):
+        yield "filters"
+
+
+def _plain(data: Mapping[str, Any] | None) -> Any:
+    """Data as they come back from a file."""
+    return json.loads(json.dumps(None if data is None else dict(data)))
+
+
+class _Frames:
+    """
+    The frames of a recording in a folder, and those of the last chunk, not yet full, in memory.
+
+    A chunk is written anew when frames come to it, and every file of it whole or not at all: what the folder tells that it
+    holds is there after any end of the program.
+    """
+
+    def __init__(self, folder: Path, plan: Mapping[str, Any] | None, n_whole: int = 0) -> None:
+        self._folder, self._plan = folder, plan
+        self._arrays: dict[str, Any] = {}
+        self._n_chunk = 1
+        # How many frames are before the chunk, and its frames: together, so that Ctrl-C never finds one without the other.
+        self._chunk: tuple[int, list[tuple[Any, ...]]] = 0, []
+        self.n_whole, self.written_s = n_whole, time.monotonic()
+        if n_whole:
+            with _trusted(folder, "r+") as group:
+                self._arrays = {name: group[name] for name in GROWING}
+                code = self._arrays["code"]
+                self._n_chunk = code.chunks[0]
+                n_before = n_whole - n_whole % self._n_chunk
+                if (n_whole - n_before) * code.shape[1] * code.dtype.itemsize > MAX_UNPACKED_BYTES:
+                    raise FileError(folder, f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
+                values = (array[n_before:n_whole] for array in self._arrays.values())
+                self._chunk = n_before, list(zip(*values, strict=True))
+            for array in self._arrays.values():
+                array.resize((n_whole, *array.shape[1:]))
+
+    def add(self, capture: Capture) -> None:
+        """Add a frame; a chunk that is full is written."""
+        if not self._arrays:
+            self._begin(capture)
+        n_before, frames = self._chunk
+        told = capture.settings
+        frames.append((capture.code, told.get("exposure_s", np.nan), told.get("frame", n_before + len(frames))))
+        if len(frames) == self._n_chunk:
+            self.write()
+            self._chunk = self.n_whole, []
+
+    def write(self) -> None:
+        """Write the frames that are in memory alone."""
+        n_before, frames = self._chunk
+        n = n_before + len(frames)
+        if n > self.n_whole:
+            for array, values in zip(self._arrays.values(), zip(*frames, strict=True), strict=True):
+                array.resize((n, *array.shape[1:]))
+                array[n_before:] = np.asarray(values, array.dtype)
+            self.n_whole = n
+        self.written_s = time.monotonic()
+
+    def _begin(self, capture: Capture) -> None:
+        layout, n_sites = capture.layout, capture.layout.n_sites
+        arrays = {}
+        for path in self._folder.iterdir():  # of one that was ended before its first frame
+            if path.is_dir():
+                shutil.rmtree(path)
+            elif path.name != LOCK:
+                path.unlink()
+        group = library(self._folder, "zarr").create_group(
+            str(self._folder),
+            attributes={
+                "format": FORMAT,
+                "version": VERSION,
+                "filter_names": list(capture.filter_names),
+                "bits": capture.bits,
+                "white_dn": capture.white_dn.tolist(),
+                "settings": _plain(capture.settings),
+                "varied": [],
+                "provenance": described(dict(layout.provenance)),
+                "plan": _plain(self._plan),
+            },
+        )
+        for name in GEOMETRY:
+            group.create_array(name, data=np.asarray(getattr(layout, name)))
+        group.create_array("filter_of_site", data=np.asarray(capture.filter_of_site))
+        group.create_group("columns")
+        for name, values in layout.columns.items():
+            group["columns"].create_array(name, data=np.asarray(values))
+        self._n_chunk = max(1, CHUNK_CODES // max(n_sites, 1))
+        for name, shape, dtype, n_chunk, fill in (
+            ("code", (0, n_sites), capture.code.dtype, self._n_chunk, 0),
+            ("exposure_s", (0,), np.dtype(np.float64), 4096, 0.0),
+            ("frame", (0,), np.dtype(np.int64), 4096, NO_FRAME),
+        ):
+            chunks = (n_chunk, *(max(n, 1) for n in shape[1:]))
+            arrays[name] = group.create_array(name, shape=shape, chunks=chunks, dtype=dtype, fill_value=fill)
+        self._arrays = arrays

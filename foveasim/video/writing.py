@@ -1,0 +1,232 @@
+"""Videos of captures as files: zarr folders that hold every code, pictures in a row, and video files to look at."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.arrays import check_count, check_number
+from foveasim.capture import Capture
+from foveasim.errors import FileError, ParameterError
+from foveasim.fields import Grid
+from foveasim.files import folder_written_whole, written_whole
+from foveasim.integrate import Integrator
+from foveasim.layout import Layout
+from foveasim.pictures import write_picture
+from foveasim.reconstruct import Picture, fill_channels, raster_grid
+from foveasim.reconstruct.picture import covered_share
+from foveasim.video.recording import ZARR, alike, frames_kept, library, record, record_on
+
+__all__ = ["write_video"]
+
+VIDEO_ENDINGS = (".mp4", ".mkv", ".mov", ".webm")
+#: Grey behind what no photosite sees, as a share of white.
+BEHIND = 0.12
+
+
+def write_video(
+    captures: Iterable[Capture],
+    path: str | Path,
+    *,
+    frame_s: float = 1.0 / 25.0,
+    max_pixels: int = 512,
+    n_frames: int | None = None,
+    progress: bool = False,
+    resume: bool = False,
+    plan: Mapping[str, Any] | None = None,
+) -> int:
+    """
+    Write captures as they come: whole or not at all, or so that an ended recording can be gone on with.
+
+    Parameters
+    ----------
+    captures : iterable of Capture
+        Of the same layout, as :meth:`foveasim.Camera.video` gives them.
+    path : path
+        ``.zarr``: a folder with every code, which :func:`read_recording` reads. ``.mp4``, ``.mkv``, ``.mov``, ``.webm`` (with
+        the extra ``video``) and ``.gif``: pictures to look at. Without an ending: a folder of pictures ``frame_000000.png`` ...
+    frame_s : float, s
+        How long a frame is shown.
+    max_pixels : int
+        Length of the longer side of pictures.
+    n_frames : int, optional
+        How many there will be in all, for the progress.
+    progress : bool
+        Whether to show how far it is, and how long it will still take.
+    resume : bool
+        Whether a ``.zarr`` folder keeps its frames beside the target, in :func:`partial_of` it, until the last one is in, and
+        goes on with those that are there: ``captures`` are the ones after :func:`frames_kept`.
+    plan : mapping, optional
+        Plain data that tell what is recorded, kept in a ``.zarr`` folder: what was begun after another plan is not gone on
+        with, and of a finished recording of the same plan no capture is taken.
+
+    Returns
+    -------
+    n_frames : int
+        How many are written, those that were kept among them.
+
+    Raises
+    ------
+    FileError
+        When the ending names no format, a library is missing, nothing can be written there, or something else is there: with
+        ``resume`` another recording, or one that another program is writing.
+    ParameterError
+        When there is no capture, one that does not follow the frames that are kept, or a value is out of range.
+
+    Notes
+    -----
+    In memory are a chunk of codes, or a frame, however long the video is. Until the last frame is written the target is not
+    there, or is what it was before.
+
+    With ``resume``, Ctrl-C, an error in a frame and a full disk lose no frame, and a sudden end of the program those of the
+    last 10 seconds. What is gone on with is the same recording: its captures are numbered on, and all their settings are those
+    of the first, but for what told captures before apart.
+
+    Examples
+    --------
+    The same lines begin a recording, go on with it after any end, and leave it when it is finished::
+
+        n = frames_kept("long.zarr")
+        captures = camera.video(footage.from_frame(n), exposure_s=0.01, seed=0, first_frame=n)
+        write_video(captures, "long.zarr", resume=True)
+    """
+    target = Path(path)
+    frame_s = check_number("frame_s", frame_s, above=0.0)
+    max_pixels = check_count("max_pixels", max_pixels, at_least=2)
+    ending = target.suffix.lower()
+    if ending != ZARR and (resume or plan is not None):
+        raise ParameterError(
+            "resume" if resume else "plan",
+            f"is for .zarr folders; others, as {target.name}, are written whole or not at all",
+        )
+    if progress:
+        captures = _told(captures, n_frames, frames_kept(target) if resume else 0)
+    if ending == ZARR:
+        return (record_on if resume else record)(captures, target, plan)
+    if ending == ".gif":
+        return _write_gif(captures, target, frame_s, max_pixels)
+    if ending in VIDEO_ENDINGS:
+        return _write_film(captures, target, frame_s, max_pixels)
+    if ending:
+        raise FileError(
+            target, f"must end in .zarr, .gif, {', '.join(VIDEO_ENDINGS)}, or have no ending, for a folder of pictures"
+        )
+    return _write_pictures(captures, target, max_pixels)
+
+
+def _told(captures: Iterable[Capture], n_frames: int | None, n_before: int) -> Iterator[Capture]:
+    from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (SpinnerColumn(), *Progress.get_default_columns()[:-1], TimeRemainingColumn(), TimeElapsedColumn())
+    with Progress(*columns) as bar:
+        # The time left is told by the frames that are made now: those that were kept took none.
+        task = bar.add_task("frames", total=n_frames, completed=n_before)
+        for capture in captures:
+            yield capture
+            bar.advance(task)
+
+
+# -- pictures ---------------------------------------------------------------------------------------------------------
+
+
+class _Raster:
+    """Pictures of captures of one layout: its overlaps with the pixels are computed once."""
+
+    def __init__(self, layout: Layout, max_pixels: int, *, is_even: bool = False) -> None:
+        grid = raster_grid(layout, max_pixels)
+        if is_even:  # video formats halve the colours' pixels
+            grid = Grid(tuple(n + n % 2 for n in grid.shape), grid.pitch_um, grid.origin_um)  # type: ignore[arg-type]
+        self._layout, self._integrator = layout, Integrator(layout, grid)
+        self._share = covered_share(self._integrator)
+        self._covered_um2 = np.where(self._share > 0.0, self._share, np.nan) * grid.cell_area_um2
+
+    def image(self, capture: Capture) -> NDArray[np.uint8]:
+        """Colours as a screen expects them, and coverage, (n_y, n_x, 2 or 4), first row on top."""
+        values = capture.code.astype(np.float64)[np.newaxis]
+        n_filters = len(capture.filter_names)
+        if n_filters > 1:
+            values = fill_channels(self._layout, values[0], capture.filter_of_site, n_filters)
+            values = np.where(np.isnan(values), 0.0, values)
+        data = (self._integrator.spread(values) / self._covered_um2).astype(np.float32)
+        white: Any = capture.white_dn
+        if n_filters not in (1, 3):
+            data, white = data.mean(axis=0, keepdims=True), float(np.mean(white))
+        picture = Picture(data, self._share.astype(np.float32), self._integrator.grid)
+        return np.asarray(picture.to_image(white, encode_srgb=True), np.uint8)
+
+    def flat(self, capture: Capture) -> NDArray[np.uint8]:
+        """Colours over a dark grey, (n_y, n_x, 3)."""
+        image = self.image(capture).astype(np.float64)
+        colours, cover = image[..., :-1], image[..., -1:] / 255.0
+        colours = colours * cover + 255.0 * BEHIND * (1.0 - cover)
+        return np.ascontiguousarray(np.broadcast_to(np.rint(colours), (*colours.shape[:2], 3)).astype(np.uint8))
+
+
+def _write_pictures(captures: Iterable[Capture], target: Path, max_pixels: int) -> int:
+    def is_pictures(folder: Path) -> bool:
+        return folder.is_dir() and all(p.name.startswith("frame_") and p.suffix == ".png" for p in folder.iterdir())
+
+    n_frames = 0
+    with folder_written_whole(target, is_ours=is_pictures) as folder:
+        raster: _Raster | None = None
+        for capture in alike(captures):
+            raster = raster or _Raster(capture.layout, max_pixels)
+            write_picture(folder / f"frame_{n_frames:06d}.png", raster.image(capture))
+            n_frames += 1
+    return n_frames
+
+
+def _write_gif(captures: Iterable[Capture], target: Path, frame_s: float, max_pixels: int) -> int:
+    from PIL import Image
+
+    n_frames = 0
+
+    def pictures() -> Iterator[Image.Image]:
+        nonlocal n_frames
+        raster: _Raster | None = None
+        for capture in alike(captures):
+            raster = raster or _Raster(capture.layout, max_pixels)
+            n_frames += 1
+            yield Image.fromarray(raster.flat(capture)).quantize(256)
+
+    with written_whole(target) as temporary:
+        all_pictures = pictures()
+        first = next(all_pictures)
+        first.save(
+            temporary,
+            format="GIF",
+            save_all=True,
+            append_images=all_pictures,
+            duration=max(20, round(1000.0 * frame_s)),
+            loop=0,
+        )
+    return n_frames
+
+
+def _write_film(captures: Iterable[Capture], target: Path, frame_s: float, max_pixels: int) -> int:
+    av = library(target, "av")
+    codec = "libvpx-vp9" if target.suffix.lower() == ".webm" else "libx264"
+    n_frames = 0
+    with written_whole(target) as temporary:
+        try:
+            with av.open(str(temporary), mode="w") as container:
+                raster: _Raster | None = None
+                stream: Any = None
+                for capture in alike(captures):
+                    raster = raster or _Raster(capture.layout, max_pixels, is_even=True)
+                    pixels = raster.flat(capture)
+                    if stream is None:
+                        stream = container.add_stream(codec, rate=Fraction(1.0 / frame_s).limit_denominator(1001))
+                        stream.height, stream.width = pixels.shape[:2]
+                        stream.pix_fmt = "yuv420p"
+                    container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+                    n_frames += 1
+                container.mux(stream.encode())
+        except av.FFmpegError as error:
+            raise FileError(target, f"cannot be written as a video file ({error})") from None
+    return n_frames
