@@ -20,6 +20,7 @@ from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
 from foveasim.files import folder_written_whole, lock
 from foveasim.layout import Layout
+from foveasim.layout.packed import packed_layout
 from foveasim.records import described, differences
 
 __all__ = [
@@ -413,20 +414,14 @@ def _following(captures: Iterable[Capture], folder: Path, n_before: int) -> Iter
 
 def _other_parts(folder: Path, capture: Capture) -> Iterator[str]:
     """Names of what a capture has otherwise than a recording, beside settings."""
-    with _trusted(folder) as group:
-        found = {name: group[name][:] for name in GEOMETRY}
-        found |= {f"column {name}": values[:] for name, values in group["columns"].arrays()}
-        filter_of_site, dtype, about = group["filter_of_site"][:], group["code"].dtype, dict(group.attrs)
-    layout = capture.layout
-    wanted = {name: np.asarray(getattr(layout, name)) for name in GEOMETRY}
-    wanted |= {f"column {name}": np.asarray(values) for name, values in layout.columns.items()}
-    if found.keys() != wanted.keys() or any(not np.array_equal(found[name], wanted[name]) for name in found):
+    found = read_recording(folder)
+    there, here = packed_layout(found.layout), packed_layout(capture.layout)
+    if there.keys() != here.keys() or any(not np.array_equal(there[name], here[name]) for name in here):
         yield "layout"
-    if about["bits"] != capture.bits or dtype != capture.code.dtype:
+    if found.bits != capture.bits or found.code.dtype != capture.code.dtype:
         yield "bits"
-    if about["filter_names"] != list(capture.filter_names) or not np.array_equal(
-        filter_of_site, capture.filter_of_site
-    ):
+    is_same = np.array_equal(found.filter_of_site, capture.filter_of_site)
+    if found.filter_names != tuple(capture.filter_names) or not is_same:
         yield "filters"
 
 
