@@ -7,11 +7,13 @@ A file names a call of the package and its parameters: the file and the Python c
 from __future__ import annotations
 
 from foveasim.config._objects import (
+    YAML_ENDINGS,
     LayoutFile,
     Shot,
     build_shot,
     check_settings,
     files_from,
+    picture_path,
     put_setting,
     read_any_layout,
     read_layout_file,
@@ -24,11 +26,13 @@ from foveasim.config._objects import (
 from foveasim.config._problems import validated
 
 __all__ = [
+    "YAML_ENDINGS",
     "LayoutFile",
     "Shot",
     "build_shot",
     "check_settings",
     "files_from",
+    "picture_path",
     "put_setting",
     "read_any_layout",
     "read_layout_file",

@@ -27,11 +27,13 @@ from foveasim.sensor import Sensor
 from foveasim.streams import Streams
 
 __all__ = [
+    "YAML_ENDINGS",
     "LayoutFile",
     "Shot",
     "build_shot",
     "check_settings",
     "files_from",
+    "picture_path",
     "put_setting",
     "read_any_layout",
     "read_layout_file",
@@ -296,10 +298,10 @@ def read_rules(path: str | Path) -> DesignRules:
     return rules
 
 
-def schema() -> dict[str, Any]:
-    """JSON schema of a settings file."""
-    described = TypeAdapter(ShotSection).json_schema()
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **described, "title": "foveasim settings"}
+def schema(section: Any = ShotSection, title: str = "foveasim settings") -> dict[str, Any]:
+    """JSON schema of a settings file, or of a file whose model is given."""
+    described = TypeAdapter(section).json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **described, "title": title}
 
 
 def _built_layout(path: Path, place: str, section: Any) -> LayoutFile:
@@ -326,7 +328,7 @@ def _built_layout(path: Path, place: str, section: Any) -> LayoutFile:
 def _picture_values(path: Path, place: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """A picture's values from 0 to 1, colours averaged, in the place of its name; for a density also where its pixels are."""
     name = place.rpartition(".")[2]
-    picture = read_picture(_picture_path(path, values[name], place))
+    picture = read_picture(picture_path(path, values[name], place))
     scale = np.iinfo(picture.dtype).max if picture.dtype.kind == "u" else 1.0
     n_colours = {2: 1, 4: 3}.get(picture.shape[2], picture.shape[2]) if picture.ndim == 3 else 1
     grey = picture.reshape(*picture.shape[:2], -1)[::-1, :, :n_colours].mean(axis=2, dtype=np.float64) / scale
@@ -356,7 +358,7 @@ def _built(path: Path, place: str, value: Any) -> Any:
     if isinstance(value, list):
         return [_built(path, f"{place}[{i}]", item) for i, item in enumerate(value)]
     if isinstance(value, str) and place.rpartition(".")[2] in {"path", "picture"}:
-        return _picture_path(path, value, place)
+        return picture_path(path, value, place)
     if not isinstance(value, BaseModel) or isinstance(value, PerArea):
         return value
     return _call(path, place, _callable(value), _values(path, place + ".", value))
@@ -379,7 +381,24 @@ def _call(path: Path, place: str, function: Callable[..., Any], arguments: Mappi
         raise ConfigError(path, f"{place}: {error}") from None
 
 
-def _picture_path(path: Path, picture: str, place: str) -> Path:
+def picture_path(path: Path, picture: str, place: str) -> Path:
+    """
+    The file of a picture that a settings file names: one beside it, or one that comes with scikit-image.
+
+    Parameters
+    ----------
+    path : Path
+        Of the settings file.
+    picture : str
+        A file, or ``skimage:astronaut`` and its like.
+    place : str
+        Of the name in the settings file, for messages.
+
+    Raises
+    ------
+    ConfigError
+        When scikit-image brings no such picture.
+    """
     if not picture.startswith(BUNDLED_PICTURE):
         return path.parent / picture
     name = picture.removeprefix(BUNDLED_PICTURE)

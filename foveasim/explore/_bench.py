@@ -19,7 +19,7 @@ import numpy as np
 from foveasim.capture import Capture
 from foveasim.config import Shot, build_shot
 from foveasim.errors import FoveasimError
-from foveasim.explore._metrics import Metric
+from foveasim.explore._metrics import REFERENCES, Metric
 from foveasim.explore._records import Record, values_of
 
 __all__ = ["Bench", "Job", "Task", "run_tasks"]
@@ -107,8 +107,7 @@ class Bench:
         """The shot of a point and its capture."""
         shot = build_shot(job.source, settings, n_threads=job.n_threads, kept=self.kept)
         camera, sensor, scene = shot.camera, shot.camera.sensor, shot.scene
-        response = hashlib.sha256(sensor.responsivity_e_per_j(scene.wavelength_nm).tobytes()).hexdigest()
-        light = [settings["scene"], settings["optics"], response]
+        light = _light(shot, settings)
         filters = hashlib.sha256(sensor.filter_of_site.tobytes()).hexdigest()
         sites = [settings["layout"], settings.get("distortion"), settings.get("integration_order"), filters]
         images = self.kept("images", light, dict) if job.is_geometry_varied else None
@@ -117,6 +116,16 @@ class Bench:
         )
         capture = camera.capture(scene, exposure_s=shot.exposure_s, seed=shot.seed, photo_e_per_s=photo_e_per_s)
         return shot, capture
+
+    def _measured(self, metric: Metric, shot: Shot, capture: Capture, settings: Mapping[str, Any]) -> Any:
+        """What a metric gives; what it compares captures with is made once for all that share it."""
+        compared: Callable[..., Any] = metric
+        make = next((make for own, make in REFERENCES.items() if own is metric), None)
+        if make is None:
+            return metric(shot, shot.camera, capture)
+        key = [_light(shot, settings), settings["layout"], shot.exposure_s]
+        reference = self.kept("reference", key, lambda: make(shot, shot.camera))
+        return compared(shot, shot.camera, capture, reference)
 
     def record(self, job: Job, task: Task) -> Record:
         """What a point gave: its metrics, or what went wrong. Nothing that a point raises ends the others."""
@@ -132,12 +141,18 @@ class Bench:
             else:
                 for name, metric in job.metrics.items():
                     try:
-                        values |= values_of(name, metric(shot, shot.camera, capture))
+                        values |= values_of(name, self._measured(metric, shot, capture, task.settings))
                     except Exception as error:  # noqa: BLE001 -- metrics are the user's
                         errors.append(f"{name}: {_told(error)}")
         self._forget()
         told = dict.fromkeys([*self._told, *(str(warning.message) for warning in caught)])
         return Record(task.point, values, "; ".join(errors), "; ".join(_short(text) for text in told))
+
+
+def _light(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
+    """What the light behind the lens depends on, as the sensor's filters see it."""
+    response = shot.camera.sensor.responsivity_e_per_j(shot.scene.wavelength_nm)
+    return [settings["scene"], settings["optics"], hashlib.sha256(response.tobytes()).hexdigest()]
 
 
 def _told(error: Exception) -> str:

@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -44,6 +44,8 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
     ------
     ParameterError
         When dask is missing, or no scheduler answers.
+    SimulationError
+        When workers do not start on this machine.
     """
     try:
         import dask
@@ -66,18 +68,27 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
     # A worker's end is ours to judge: each point is tried again, alone, and counted.
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 0, "distributed.scheduler.work-stealing": False}),
-        LocalCluster(
-            n_workers=n_workers,
-            threads_per_worker=1,
-            memory_limit=MEMORY_LIMIT // n_workers,
-            # No dashboard: only so does dask not ask for the one port of another's, and warn where that has it.
-            dashboard_address="127.0.0.1:0",
-            scheduler_kwargs={"dashboard": False},
-            preload=[run_tasks.__module__],
-            silence_logs=logging.CRITICAL,
-        ) as cluster,
-        Client(cluster, set_as_default=False) as client,
+        ExitStack() as opened,
     ):
+        try:
+            cluster = opened.enter_context(
+                LocalCluster(
+                    n_workers=n_workers,
+                    threads_per_worker=1,
+                    memory_limit=MEMORY_LIMIT // n_workers,
+                    # No dashboard: only so does dask not ask for the one port of another's, and warn where that has it.
+                    dashboard_address="127.0.0.1:0",
+                    scheduler_kwargs={"dashboard": False},
+                    preload=[run_tasks.__module__],
+                    silence_logs=logging.CRITICAL,
+                )
+            )
+            client = opened.enter_context(Client(cluster, set_as_default=False))
+        except Exception as error:  # noqa: BLE001 -- a machine without memory or time for them makes them fail in many ways
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise SimulationError(
+                f"the workers did not start ({reason:.160}); try it again, or with fewer of them"
+            ) from None
         yield client
 
 

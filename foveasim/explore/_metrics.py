@@ -16,9 +16,18 @@ from foveasim.config import Shot
 from foveasim.errors import ParameterError
 from foveasim.layout import Readout
 from foveasim.metrics import psnr_db
-from foveasim.reconstruct import raster_grid
+from foveasim.reconstruct import Picture, raster_grid
 
-__all__ = ["DEFAULT_METRICS", "METRICS", "Metric", "metric_of", "named_metrics"]
+__all__ = [
+    "DEFAULT_METRICS",
+    "METRICS",
+    "REFERENCES",
+    "Metric",
+    "gives",
+    "metric_of",
+    "named_metrics",
+    "with_more_metrics",
+]
 
 #: A function of a shot, its camera and its capture, which gives a number, a mapping of names to such, or an array with labels.
 Metric = Callable[[Shot, Camera, Capture], Any]
@@ -77,11 +86,17 @@ def data_rate_gbit_per_s(shot: Shot, camera: Camera, capture: Capture) -> float:
     return readout.gbit_per_s(capture.layout.n_sites)
 
 
-def picture_psnr_db(shot: Shot, camera: Camera, capture: Capture) -> float:
+def light_behind_lens(shot: Shot, camera: Camera) -> Picture:
+    """What the picture of a perfect sensor would be: of light, layout and exposure alone, and the same for any noise."""
+    grid = raster_grid(camera.sensor.layout, PSNR_PIXELS)
+    return camera.reference(shot.scene, grid, exposure_s=shot.exposure_s)
+
+
+def picture_psnr_db(shot: Shot, camera: Camera, capture: Capture, reference: Picture | None = None) -> float:
     """PSNR of the picture of cells, in photoelectrons per µm², against the light behind the lens, dB."""
-    grid = raster_grid(capture.layout, PSNR_PIXELS)
-    picture = capture.picture(of="light_e", per="um2", grid=grid, sensor=camera.sensor)
-    return psnr_db(picture, camera.reference(shot.scene, grid, exposure_s=shot.exposure_s))
+    reference = light_behind_lens(shot, camera) if reference is None else reference
+    picture = capture.picture(of="light_e", per="um2", grid=reference.grid, sensor=camera.sensor)
+    return psnr_db(picture, reference)
 
 
 #: Metrics by their names.
@@ -93,6 +108,10 @@ METRICS: dict[str, Metric] = {
     "saturated_fraction": saturated_fraction,
     "snr": snr,
 }
+
+
+#: What a metric may be given beside its capture, of light, layout and exposure alone: many captures share it.
+REFERENCES: dict[Callable[..., Any], Callable[[Shot, Camera], Any]] = {picture_psnr_db: light_behind_lens}
 
 
 def metric_of(name: str) -> Metric:
@@ -159,3 +178,32 @@ def named_metrics(metrics: Iterable[str | Metric] | Mapping[str, Metric] | None)
     if not found:
         raise ParameterError("metrics", "must be at least one")
     return found
+
+
+def with_more_metrics(metrics: Mapping[str, Metric], names: Iterable[str]) -> dict[str, Metric]:
+    """
+    Metrics of a file, and those that the command line names beside them.
+
+    Parameters
+    ----------
+    metrics : mapping of str to function
+    names : iterable of str
+        Names of :data:`METRICS`, or ``module:function``, which is imported and so runs.
+
+    Raises
+    ------
+    ParameterError
+        When there is no such metric, or one of the same name.
+    """
+    found = dict(metrics)
+    for name in names:
+        for own, metric in named_metrics([metric_of(name) if ":" in name else name]).items():
+            if own in found:
+                raise ParameterError("metric", "must have a name of its own; there is one of this name already", own)
+            found[own] = metric
+    return found
+
+
+def gives(metric: str, result: str) -> bool:
+    """Whether a metric of a name may give a result of a name: its own, or one of the numbers in a mapping that it gives."""
+    return result == metric or result.startswith(metric + "_")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence, Sized
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,11 +18,12 @@ from foveasim.arrays import Ints, check_choice, check_count
 from foveasim.config import check_settings, files_from, put_setting, read_settings, validated
 from foveasim.documents import read_yaml
 from foveasim.errors import ConfigError, ParameterError
-from foveasim.explore._metrics import Metric, metric_of, named_metrics
+from foveasim.explore._files import digests
+from foveasim.explore._metrics import Metric, named_metrics, with_more_metrics
 from foveasim.records import versions
 from foveasim.streams import derived_seed
 
-__all__ = ["Plan", "plan_sweep", "read_sweep"]
+__all__ = ["MAX_POINTS", "Plan", "SweepSection", "check_apart", "plan_sweep", "read_sweep", "shot_of", "telling"]
 
 #: More points than this are a slip: of a millisecond each they would take a quarter of an hour.
 MAX_POINTS = 1_000_000
@@ -56,7 +57,7 @@ class Plan:
         That every point's seed is derived from.
     metrics : mapping of str to function
     files : mapping of str to str
-        SHA-256 of the files that the settings name.
+        SHA-256 of the files that the settings name, and of those that these name.
     """
 
     source: Path
@@ -166,10 +167,7 @@ class Plan:
             With the setting, what was expected and got.
         """
         names = list(self.values)
-        for path in names:
-            if any(other != path and other.startswith(path + ".") for other in names):
-                inside = next(other for other in names if other.startswith(path + "."))
-                raise ConfigError(self.source, f"'{path}' and '{inside}' cannot both vary: one holds the other")
+        check_apart(self.source, names)
         if self.mode == "zip":
             for k in range(min(len(self.values[names[0]]), CHECKED_VALUES)):
                 check_settings(self.source, self._changed({path: values[k] for path, values in self.values.items()}))
@@ -190,7 +188,7 @@ class _Range(BaseModel):
     spacing: Literal["linear", "geometric"] = "linear"
 
 
-class _SweepSection(BaseModel):
+class SweepSection(BaseModel):
     """A sweep: a shot, what varies in it, repeats, seed, names of metrics."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -226,7 +224,7 @@ def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
         When there is no such metric.
     """
     path = Path(path)
-    section: _SweepSection = validated(path, _SweepSection, read_yaml(path))
+    section: SweepSection = validated(path, SweepSection, read_yaml(path))
     if (section.vary is None) == (section.points is None):
         raise ConfigError(path, "must have either 'vary' or 'points'")
     vary: Any = section.points
@@ -235,19 +233,12 @@ def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
             name: _numbers(path, name, values) if isinstance(values, _Range) else values
             for name, values in section.vary.items()
         }
-    shot: Any = section.shot
-    source = path
-    if isinstance(shot, str):
-        source = path.parent / shot
-        shot = read_settings(source)
-    # The names that the file gives are looked up in METRICS, and never imported.
-    wanted = named_metrics(section.metrics)
-    for name in metrics:
-        for own, metric in named_metrics([metric_of(name) if ":" in name else name]).items():
-            if own in wanted:
-                raise ParameterError("metric", "must have a name of its own; the sweep has one of this name", own)
-            wanted[own] = metric
-    try:
+    source, shot = shot_of(path, section.shot)
+    with telling(path):
+        # The names that the file gives are looked up in METRICS, and never imported.
+        named = named_metrics(section.metrics)
+    wanted = with_more_metrics(named, metrics)
+    with telling(path):
         return plan_sweep(
             shot,
             vary,
@@ -259,8 +250,6 @@ def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
             source=source,
             folder=path.parent,
         )
-    except ParameterError as error:
-        raise ConfigError(path, str(error)) from None
 
 
 def plan_sweep(
@@ -332,10 +321,61 @@ def plan_sweep(
         repeats=repeats,
         seed=check_count("seed", seed, at_least=0),
         metrics=named_metrics(metrics),
-        files={str(file): _digest(file) for file in dict.fromkeys(found)},
+        files=digests(found),
     )
     plan.check()
     return plan
+
+
+def shot_of(path: Path, shot: str | dict[str, Any]) -> tuple[Path, dict[str, Any]]:
+    """
+    The shot that a file names, beside it, or holds: the file that its settings are from, and the settings.
+
+    Raises
+    ------
+    ConfigError
+        When there is no such file, or it is no YAML.
+    """
+    if not isinstance(shot, str):
+        return path, shot
+    source = path.parent / shot
+    return source, read_settings(source)
+
+
+@contextmanager
+def telling(path: Path) -> Iterator[None]:
+    """
+    Errors in what a file says, with the file's name; those of the shot that it names, with both.
+
+    Raises
+    ------
+    ConfigError
+        In the place of any :class:`ParameterError`, and of other files' errors.
+    """
+    try:
+        yield
+    except ParameterError as error:
+        raise ConfigError(path, str(error)) from None
+    except ConfigError as error:
+        if error.path.absolute() == path.absolute():
+            raise
+        raise ConfigError(path, f"with {error.path.name}: {str(error).removeprefix(f'{error.path}: ')}") from None
+
+
+def check_apart(source: Path, paths: Iterable[str], verb: str = "vary") -> None:
+    """
+    Whether no setting is inside another.
+
+    Raises
+    ------
+    ConfigError
+        With both.
+    """
+    names = list(paths)
+    for path in names:
+        inside = next((other for other in names if other.startswith(path + ".")), None)
+        if inside is not None:
+            raise ConfigError(source, f"'{path}' and '{inside}' cannot both {verb}: one holds the other")
 
 
 def _by_path(vary: Any, mode: Literal["product", "zip"]) -> tuple[dict[str, list[Any]], Literal["product", "zip"]]:
@@ -407,11 +447,3 @@ def _is_of(path: str, parts: tuple[str, ...]) -> bool:
 def _copied(data: Mapping[str, Any]) -> dict[str, Any]:
     """Settings with sections of their own; lists are shared."""
     return {key: _copied(value) if isinstance(value, dict) else value for key, value in data.items()}
-
-
-def _digest(file: Path) -> str:
-    """SHA-256 of a file; empty where there is none, which the points will tell."""
-    if not file.is_file():
-        return ""
-    with file.open("rb") as opened:
-        return hashlib.file_digest(opened, "sha256").hexdigest()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import secrets
 import shutil
 from collections.abc import Iterable, Mapping
@@ -241,6 +242,10 @@ def write_store(dataset: xr.Dataset, path: Path) -> None:
     new, old = (path.with_name(f".foveasim-{token}-{which}.zarr") for which in ("new", "old"))
     try:
         dataset.to_zarr(new, mode="w-", consolidated=False, zarr_format=3)
+        # On the disk before the journal is removed: a power cut leaves one of them whole.
+        for file in (path for path in new.rglob("*") if path.is_file()):
+            with file.open("r+b") as opened:
+                os.fsync(opened.fileno())
         if path.exists():
             path.rename(old)
         new.rename(path)

@@ -1,0 +1,54 @@
+"""Files that results depend on, by their checksums: those that settings name, and those that these name in turn."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+
+from foveasim.config import YAML_ENDINGS, files_from
+from foveasim.documents import read_yaml
+from foveasim.errors import ConfigError
+
+__all__ = ["digests"]
+
+
+def digests(files: Iterable[Path]) -> dict[str, str]:
+    """
+    SHA-256 of files, and of those that are named in them: the picture of a density in a layout's file, say.
+
+    Parameters
+    ----------
+    files : iterable of Path
+
+    Returns
+    -------
+    digests : dict of str to str
+        By the files' names; empty where there is none, which whoever reads it will tell.
+    """
+    found: dict[str, str] = {}
+    left = list(files)
+    while left:
+        file = left.pop(0)
+        if str(file) in found:
+            continue
+        found[str(file)] = _digest(file)
+        if file.suffix.lower() in YAML_ENDINGS and file.is_file():
+            left += _named_in(file)
+    return found
+
+
+def _named_in(file: Path) -> list[Path]:
+    named: list[Path] = []
+    try:
+        files_from(file.parent, read_yaml(file), found=named)
+    except ConfigError:  # whoever builds what it describes tells what is wrong
+        return []
+    return named
+
+
+def _digest(file: Path) -> str:
+    if not file.is_file():
+        return ""
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
