@@ -5,7 +5,8 @@ from __future__ import annotations
 from foveasim.explore._metrics import METRICS, Metric, metric_of
 from foveasim.explore._plan import Plan, plan_sweep, read_sweep
 from foveasim.explore._results import open_results
-from foveasim.explore._study import study
+from foveasim.explore._study import best_table, finished_trials, run_study, study
+from foveasim.explore._study_plan import StudyPlan, plan_study, read_study
 from foveasim.explore._sweep import run_sweep, sweep
 from foveasim.explore.dataset import DataSet
 from foveasim.explore.dataset_draws import draw_of
@@ -19,14 +20,20 @@ __all__ = [
     "Metric",
     "Plan",
     "StoredSamples",
+    "StudyPlan",
+    "best_table",
     "classification",
     "denoising",
     "draw_of",
+    "finished_trials",
     "metric_of",
     "open_data_set",
     "open_results",
+    "plan_study",
     "plan_sweep",
+    "read_study",
     "read_sweep",
+    "run_study",
     "run_sweep",
     "study",
     "sweep",

@@ -4,31 +4,27 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from foveasim.arrays import check_count
-from foveasim.config import files_from, put_setting
-from foveasim.errors import FileError, ParameterError
+from foveasim.errors import FileError, FoveasimError, ParameterError
 from foveasim.explore._bench import Bench, Job, Task
-from foveasim.explore._metrics import METRICS, Metric
-from foveasim.explore._plan import Plan, plan_sweep
+from foveasim.explore._metrics import Metric
 from foveasim.explore._records import Record, check_same_plan
+from foveasim.explore._study_plan import Limits, Search, StudyPlan, plan_study
 from foveasim.parallel import thread_count
 from foveasim.streams import derived_seed
 
 if TYPE_CHECKING:
     import optuna
+    from rich.table import Table
 
-__all__ = ["study"]
+__all__ = ["best_table", "finished_trials", "run_study", "study"]
 
-#: Where a setting is searched: numbers from one to another, the same with steps or spacing, or a list of choices.
-Search = tuple[float, float] | Mapping[str, Any] | Sequence[Any]
-#: Lowest and highest value of results, either of them None.
-Limits = Mapping[str, tuple[float | None, float | None]]
-#: Keys of a range that is a mapping.
-RANGE_KEYS = {"from", "to", "step", "spacing"}
+#: Rows of the table of the best trials, and characters of a choice in it.
+MOST_ROWS, LONGEST_CHOICE = 20, 40
 #: Attributes of a study and of its trials.
 PLAN, ERROR, IS_CUT = "plan", "error", "ended with the program"
 
@@ -92,42 +88,126 @@ def study(
     The sampler (tree-structured Parzen estimators) is seeded anew for every trial from the seed and the trial's number: a study
     that was ended and goes on finds the same as one that was not. One program at a time may write a study.
     """
+    plan = plan_study(
+        shot,
+        search,
+        objectives,
+        n_trials=n_trials,
+        constraints=constraints,
+        metrics=metrics,
+        changes=changes,
+        seed=seed,
+        name=name,
+    )
+    return run_study(plan, storage=storage, tell=tell)
+
+
+def run_study(
+    plan: StudyPlan,
+    *,
+    storage: str | Path | None = None,
+    tell: Callable[[int, int], None] | None = None,
+) -> optuna.Study:
+    """
+    Run a study that was planned, or go on with one that was ended.
+
+    Parameters
+    ----------
+    plan : StudyPlan
+    storage, tell
+        As for :func:`study`.
+
+    Returns
+    -------
+    optuna.Study
+        See :func:`study`.
+
+    Raises
+    ------
+    ParameterError
+        When Optuna is missing.
+    FileError
+        When the storage cannot be used, or holds another study of this name.
+    """
     optuna = _optuna()
-    n_trials = check_count("n_trials", n_trials)
-    seed = check_count("seed", seed, at_least=0)
-    constraints = dict(constraints or {})
-    _check_names(objectives, constraints)
-    plan = _planned(shot, search, [*objectives, *constraints], metrics, changes, seed)
-    found = _opened(optuna, storage, name, list(objectives.values()))
-    described = {
-        **{key: value for key, value in plan.described().items() if key not in {"vary", "mode", "repeats"}},
-        "search": {path: _plain(where) for path, where in search.items()},
-        "objectives": dict(objectives),
-        "constraints": {key: list(limits) for key, limits in constraints.items()},
-    }
-    before = found.user_attrs.get(PLAN)
-    if before is None:
-        found.set_user_attr(PLAN, json.loads(json.dumps(described)))
-    else:
-        check_same_plan(Path(str(storage)), before, described)
-    for trial in found.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,)):
-        # A program was ended in the middle of it: it counts for nothing, and its place is taken by the next.
-        optuna.trial.Trial(found, trial._trial_id).set_user_attr(IS_CUT, True)  # noqa: SLF001 -- Optuna has no other way
-        found.tell(trial.number, state=optuna.trial.TrialState.FAIL)
-    job = Job(plan.source, plan.metrics, thread_count(), True)
+    url = _url(storage)
+    with _silent(optuna), _using(storage):
+        found = _opened(optuna, storage, url, plan)
+        _begin(optuna, storage, found, plan.described())
+    job = Job(plan.base.source, plan.base.metrics, thread_count(), True)
     bench = Bench()
-    while (n_done := sum(not trial.user_attrs.get(IS_CUT) for trial in found.get_trials(deepcopy=False))) < n_trials:
+    n_done = len(finished_trials(found))
+    while n_done < plan.n_trials:
         if tell is not None:
-            tell(n_done, n_trials)
-        found.sampler = optuna.samplers.TPESampler(seed=derived_seed(seed, n_done) % 2**32)
-        trial = found.ask()
-        settings = json.loads(json.dumps(dict(plan.settings))) | {"seed": seed}
-        for path, where in search.items():
-            put_setting(plan.source, settings, path, files_from(Path(), _suggested(trial, path, where), path))
-        _told(optuna, found, trial, bench.record(job, Task(n_done, settings)), list(objectives), constraints)
+            tell(n_done, plan.n_trials)
+        found.sampler = optuna.samplers.TPESampler(seed=derived_seed(plan.base.seed, n_done) % 2**32)
+        with _using(storage, n_done):
+            trial = found.ask()
+            settings = plan.settings_of(trial)
+        record = bench.record(job, Task(n_done, settings))
+        with _using(storage, n_done):
+            _told(optuna, found, trial, record, list(plan.objectives), plan.constraints)
+        n_done += 1
     if tell is not None:
-        tell(n_trials, n_trials)
+        tell(plan.n_trials, plan.n_trials)
     return found
+
+
+def finished_trials(found: optuna.Study) -> list[optuna.trial.FrozenTrial]:
+    """
+    Trials of a study, without those that ended with the program that they were in.
+
+    Those that failed have their message in ``user_attrs["error"]``.
+    """
+    return [trial for trial in found.get_trials(deepcopy=False) if not trial.user_attrs.get(IS_CUT)]
+
+
+def best_table(plan: StudyPlan, found: optuna.Study) -> Table:
+    """Table of the best trials: objectives, the results that have limits, settings; the best in the first objective on top."""
+    from rich.table import Table
+
+    limited = [name for name in plan.constraints if name not in plan.objectives]
+    table = Table(box=None)
+    table.add_column("trial", justify="right")
+    for name, way in plan.objectives.items():
+        table.add_column(f"{name}\n{way}d", justify="right", overflow="fold")
+    for heading in (*limited, *_short(plan.search)):
+        table.add_column(heading, justify="right", overflow="fold")
+    sign = -1.0 if next(iter(plan.objectives.values())) == "maximize" else 1.0
+    best = sorted(found.best_trials, key=lambda trial: sign * trial.values[0])
+    rows: dict[tuple[str, ...], int] = {}
+    for trial in best:
+        results = [*trial.values, *(trial.user_attrs[name] for name in limited)]
+        chosen = [_shown(trial.params[path], where) for path, where in plan.search.items()]
+        # The same settings may have been tried twice, and gave the same.
+        rows.setdefault((*(f"{value:.6g}" for value in results), *chosen), trial.number)
+    for cells, number in list(rows.items())[:MOST_ROWS]:
+        table.add_row(f"{number}", *cells)
+    if len(rows) > MOST_ROWS:
+        table.caption = f"and {len(rows) - MOST_ROWS:,} more that are as good"
+    return table
+
+
+def _short(paths: Iterable[str]) -> list[str]:
+    """The last parts of settings' paths, as many as tell them apart."""
+    split = [path.split(".") for path in paths]
+    return [
+        next(
+            ".".join(parts[-n:])
+            for n in range(1, len(parts) + 1)
+            if n == len(parts) or sum(other[-n:] == parts[-n:] for other in split) == 1
+        )
+        for parts in split
+    ]
+
+
+def _shown(value: Any, where: Search) -> str:
+    """A trial's value of a setting, for a table; of choices the text of JSON is what Optuna keeps."""
+    chosen = json.loads(value) if isinstance(where, list) else value
+    if isinstance(chosen, float):
+        return f"{chosen:.6g}"
+    text = chosen if isinstance(chosen, str) else json.dumps(chosen)
+    return text if len(text) <= LONGEST_CHOICE else text[: LONGEST_CHOICE - 3] + "..."
 
 
 def _told(
@@ -167,109 +247,65 @@ def _told(
     found.tell(trial, [numbers[name] for name in objectives])
 
 
-def _check_names(objectives: Mapping[str, str], constraints: Limits) -> None:
-    if not isinstance(objectives, Mapping) or not objectives:
-        raise ParameterError("objectives", 'must be names of results with "maximize" or "minimize"', objectives)
-    for name, way in objectives.items():
-        if way not in ("maximize", "minimize"):
-            raise ParameterError(str(name), 'must be "maximize" or "minimize"', way)
-    for name, limits in constraints.items():
-        is_pair = isinstance(limits, tuple | list) and len(limits) == 2
-        if (
-            not is_pair
-            or all(limit is None for limit in limits)
-            or not all(limit is None or (isinstance(limit, int | float) and math.isfinite(limit)) for limit in limits)
-        ):
-            raise ParameterError(str(name), "must have limits (low, high), one of which may be None", limits)
+def _opened(optuna: Any, storage: str | Path | None, url: str | None, plan: StudyPlan) -> optuna.Study:
+    """The study in its storage, or a new one."""
+    directions = list(plan.objectives.values())
+    if url is None or plan.name not in optuna.get_all_study_names(storage=url):
+        return optuna.create_study(storage=url, study_name=plan.name, directions=directions)
+    found = optuna.load_study(storage=url, study_name=plan.name)
+    if [direction.name.lower() for direction in found.directions] != directions:
+        raise FileError(str(storage), f"holds a study '{plan.name}' with other objectives; take another name")
+    return found
 
 
-def _planned(
-    shot: str | Path | Mapping[str, Any],
-    search: Mapping[str, Search],
-    names: Sequence[str],
-    metrics: Sequence[str | Metric] | Mapping[str, Metric] | None,
-    changes: Mapping[str, Any] | None,
-    seed: int,
-) -> Plan:
-    """The settings and metrics, all ranges checked at their ends."""
-    if not isinstance(search, Mapping) or not search:
-        raise ParameterError("search", "must be ranges by settings' paths: nothing is searched", search)
-    wanted: Any = metrics
-    if wanted is None:
-        wanted = [own for own in METRICS if any(name == own or name.startswith(own + "_") for name in names)]
-        unknown = [name for name in names if not any(name == own or name.startswith(own + "_") for own in METRICS)]
-        if unknown:
-            raise ParameterError(
-                "objectives",
-                f"must be results of metrics ({', '.join(METRICS)}), or of 'metrics' that are given",
-                unknown[0],
-            )
-    plans = [
-        plan_sweep(shot, {path: _ends(path, where)}, mode="zip", metrics=wanted, changes=changes, seed=seed)
-        for path, where in search.items()
-    ]
-    return plans[0]
-
-
-def _ends(path: str, where: Search) -> list[Any]:
-    """Values at the ends of a range, or all choices."""
-    if isinstance(where, Mapping):
-        if set(where) - RANGE_KEYS or not {"from", "to"} <= set(where) or {"step", "spacing"} <= set(where):
-            raise ParameterError(path, "must have 'from' and 'to', and may have 'step' or 'spacing'", dict(where))
-        if where.get("spacing", "linear") not in ("linear", "geometric"):
-            raise ParameterError(path, "must have a spacing that is linear or geometric", where["spacing"])
-        if "step" in where and not (isinstance(where["step"], int | float) and where["step"] > 0):
-            raise ParameterError(path, "must have a step > 0", where["step"])
-        ends = [where["from"], where["to"]]
-    elif isinstance(where, tuple):
-        ends = list(where)
-    elif isinstance(where, list) and where:
-        return where
+def _begin(optuna: Any, storage: str | Path | None, found: optuna.Study, described: Mapping[str, Any]) -> None:
+    """Check that a study is this one, and give up the trial that it was ended in."""
+    before = found.user_attrs.get(PLAN)
+    if before is not None:
+        check_same_plan(Path(str(storage)), before, described)
+    elif found.get_trials(deepcopy=False):
+        raise FileError(str(storage), f"holds a study '{found.study_name}' of another program; take another name")
     else:
-        raise ParameterError(path, "must be searched in (low, high), in a range, or in a list of choices", where)
-    is_pair = len(ends) == 2 and all(isinstance(end, int | float) and math.isfinite(end) for end in ends)
-    if not is_pair or not ends[0] < ends[1]:
-        raise ParameterError(path, "must have two ends, the first the smaller", where)
-    if isinstance(where, Mapping) and where.get("spacing") == "geometric" and ends[0] <= 0:
-        raise ParameterError(path, "must be above 0 for geometric spacing", where["from"])
-    return ends
+        found.set_user_attr(PLAN, json.loads(json.dumps(described)))
+    for trial in found.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,)):
+        # It counts for nothing, and its place is taken by the next.
+        optuna.trial.Trial(found, trial._trial_id).set_user_attr(IS_CUT, True)  # noqa: SLF001 -- Optuna has no other way
+        found.tell(trial.number, state=optuna.trial.TrialState.FAIL)
 
 
-def _suggested(trial: optuna.Trial, path: str, where: Search) -> Any:
-    """A trial's value of a setting."""
-    if isinstance(where, list):
-        texts = [json.dumps(choice) for choice in where]
-        return json.loads(trial.suggest_categorical(path, texts))
-    low, high = _ends(path, where)
-    step = where.get("step") if isinstance(where, Mapping) else None
-    is_log = isinstance(where, Mapping) and where.get("spacing") == "geometric"
-    if all(isinstance(number, int) for number in (low, high, step or 1)):
-        return trial.suggest_int(path, low, high, step=step or 1, log=is_log)
-    return trial.suggest_float(path, low, high, step=step, log=is_log)
+def _url(storage: str | Path | None) -> str | None:
+    """The URL of a storage; None of memory."""
+    if storage is None or "://" in str(storage):
+        return storage if storage is None else str(storage)
+    path = Path(storage).absolute()
+    if not path.parent.is_dir():
+        raise FileError(str(storage), "cannot be written: its folder does not exist")
+    return f"sqlite:///{path}"
 
 
-def _plain(where: Search) -> Any:
-    return dict(where) if isinstance(where, Mapping) else list(where)
+@contextmanager
+def _using(storage: str | Path | None, n_done: int | None = None) -> Iterator[None]:
+    """What goes wrong with a storage, in one sentence; with what is kept in it, once there is something."""
+    try:
+        yield
+    except FoveasimError:
+        raise
+    except Exception as error:  # noqa: BLE001 -- databases fail in many ways
+        cause: BaseException = error
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
+        reason = str(cause).partition("\n")[0]
+        kept = "" if n_done is None else f"; {n_done:,} trials are kept in it, and the same study goes on from there"
+        raise FileError(str(storage), f"cannot be used as a study's storage ({reason:.200}){kept}") from None
 
 
-def _opened(optuna: Any, storage: str | Path | None, name: str, directions: list[str]) -> optuna.Study:
-    url = storage if storage is None or "://" in str(storage) else f"sqlite:///{Path(storage).absolute()}"
+@contextmanager
+def _silent(optuna: Any) -> Iterator[None]:
+    """Without what Optuna logs of a study that it makes."""
     verbosity = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
-        if url is not None and url != storage and not Path(str(storage)).absolute().parent.is_dir():
-            raise FileError(str(storage), "cannot be written: its folder does not exist")
-        if url is not None and name in optuna.get_all_study_names(storage=url):
-            found = optuna.load_study(storage=url, study_name=name)
-            if [direction.name.lower() for direction in found.directions] != directions:
-                raise FileError(str(storage), f"holds a study '{name}' with other objectives; take another name")
-            return found
-        return optuna.create_study(storage=url, study_name=name, directions=directions)
-    except FileError:
-        raise
-    except Exception as error:  # noqa: BLE001 -- databases fail in many ways
-        reason = str(error).partition("\n")[0]
-        raise FileError(str(storage), f"cannot be used as a study's storage ({reason:.200})") from None
+        yield
     finally:
         optuna.logging.set_verbosity(verbosity)
 
