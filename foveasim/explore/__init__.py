@@ -5,11 +5,13 @@ from __future__ import annotations
 from foveasim.explore._metrics import METRICS, Metric, metric_of
 from foveasim.explore._plan import Plan, plan_sweep, read_sweep
 from foveasim.explore._results import open_results
+from foveasim.explore._schemas import schema_of
 from foveasim.explore._study import best_table, finished_trials, run_study, study
 from foveasim.explore._study_plan import StudyPlan, plan_study, read_study
 from foveasim.explore._sweep import run_sweep, sweep
 from foveasim.explore.dataset import DataSet
 from foveasim.explore.dataset_draws import draw_of
+from foveasim.explore.dataset_file import DataSetFile, read_data_set
 from foveasim.explore.dataset_recipes import classification, denoising
 from foveasim.explore.dataset_store import StoredSamples, open_data_set, write_data_set
 from foveasim.explore.dataset_torch import torch_data_set
@@ -17,6 +19,7 @@ from foveasim.explore.dataset_torch import torch_data_set
 __all__ = [
     "METRICS",
     "DataSet",
+    "DataSetFile",
     "Metric",
     "Plan",
     "StoredSamples",
@@ -31,10 +34,12 @@ __all__ = [
     "open_results",
     "plan_study",
     "plan_sweep",
+    "read_data_set",
     "read_study",
     "read_sweep",
     "run_study",
     "run_sweep",
+    "schema_of",
     "study",
     "sweep",
     "torch_data_set",

@@ -20,6 +20,8 @@ from foveasim.arrays import check_choice, check_count
 from foveasim.capture import Capture
 from foveasim.config import Shot, build_shot, check_settings, files_from, put_setting, read_settings
 from foveasim.errors import ConfigError, FileError, FoveasimError, FoveasimWarning, ParameterError, SimulationError
+from foveasim.explore._files import digests
+from foveasim.explore._plan import check_apart
 from foveasim.explore.dataset_draws import Draw, draw_of
 from foveasim.explore.dataset_labels import (
     NOTHING,
@@ -93,6 +95,8 @@ class DataSet:
         lens. By default the pitch is the shot's.
     changes : mapping of str to value, optional
         Settings to be replaced in all samples.
+    source : path
+        What messages call settings that are no file.
     n_threads : int
         That a sample is computed with.
 
@@ -148,6 +152,7 @@ class DataSet:
         flows: Sequence[Any] | None = None,
         fit: Literal["cover", "contain"] | None = None,
         changes: Mapping[str, Any] | None = None,
+        source: str | Path = "settings",
         n_threads: int = 1,
     ) -> None:
         self.cameras = check_count("cameras", cameras)
@@ -169,8 +174,9 @@ class DataSet:
         if fit is not None:
             check_choice("fit", fit, ("cover", "contain"))
         self._fit = fit
-        self._file, self._settings = _base(shot, changes or {}, is_fitted=fit is not None)
-        self._draws = _draws(self._file, vary or {}, is_fitted=fit is not None)
+        self._files: list[Path] = []
+        self._file, self._settings = _base(shot, Path(source), changes or {}, self._files, is_fitted=fit is not None)
+        self._draws = _draws(self._file, vary or {}, self._files, is_fitted=fit is not None)
         self._begin()
         self._fit_um = (0.0, 0.0, 1.0)
         self._code_type: Any = np.uint8
@@ -269,6 +275,7 @@ class DataSet:
             "fit": self._fit,
             "class_names": self.class_names,
             "labels": hashlib.sha256(json.dumps(labels).encode()).hexdigest(),
+            "files": digests(self._files),
             "versions": versions(),
         }
 
@@ -460,10 +467,17 @@ class DataSet:
         return self._built(0, settings).camera.sensor.bits
 
 
-def _base(shot: str | Path | Mapping[str, Any], changes: Mapping[str, Any], *, is_fitted: bool) -> tuple[Path, Any]:
-    """The file that settings are from, for messages, and the settings with absolute files."""
+def _base(
+    shot: str | Path | Mapping[str, Any],
+    source: Path,
+    changes: Mapping[str, Any],
+    found: list[Path],
+    *,
+    is_fitted: bool,
+) -> tuple[Path, Any]:
+    """The file that settings are from, for messages, and the settings with absolute files, which are added to those found."""
     if isinstance(shot, Mapping):
-        file, data = Path("settings"), _copied(shot)
+        file, data = source, _copied(shot)
     elif isinstance(shot, str | Path):
         file = Path(shot)
         data = read_settings(file)
@@ -472,12 +486,14 @@ def _base(shot: str | Path | Mapping[str, Any], changes: Mapping[str, Any], *, i
     scene = data.get("scene")
     if not isinstance(scene, Mapping) or scene.get("kind") != "picture":
         raise ConfigError(file, "scene.kind: must be 'picture' for a data set, whose pictures take its place")
-    data = files_from(file.parent, {**data, "scene": {key: scene[key] for key in scene if key != "picture"}})
+    data = files_from(
+        file.parent, {**data, "scene": {key: scene[key] for key in scene if key != "picture"}}, found=found
+    )
     data["scene"]["picture"] = ""
     if is_fitted:
         data["scene"]["pitch_um"] = 1.0
     for path, value in changes.items():
-        put_setting(file, data, path, files_from(Path(), value, path))
+        put_setting(file, data, path, files_from(Path(), value, path, found))
     data.pop("seed", None)
     try:
         return file, json.loads(json.dumps(data, default=_plain))
@@ -494,16 +510,14 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"got a {type(value).__name__}")
 
 
-def _draws(file: Path, vary: Mapping[str, Any], *, is_fitted: bool) -> dict[str, Draw]:
+def _draws(file: Path, vary: Mapping[str, Any], found: list[Path], *, is_fitted: bool) -> dict[str, Draw]:
     if not isinstance(vary, Mapping):
         raise ParameterError("vary", "must be distributions by settings' paths", vary)
     draws = {str(path): draw_of(str(path), told) for path, told in vary.items()}
+    check_apart(file, draws)
     for path, draw in draws.items():
         if draw.kind == "choice":
-            draws[path] = replace(draw, values=tuple(files_from(Path(), value, path) for value in draw.values))
-        inside = next((other for other in draws if other.startswith(path + ".")), None)
-        if inside is not None:
-            raise ConfigError(file, f"'{path}' and '{inside}' cannot both vary: one holds the other")
+            draws[path] = replace(draw, values=tuple(files_from(Path(), value, path, found) for value in draw.values))
         if path in ("seed", "scene", "scene.kind", "scene.picture"):
             raise ParameterError(path, "cannot vary: the data set has its own seed and its own pictures")
         if is_fitted and path == "scene.pitch_um":

@@ -9,7 +9,7 @@ import tempfile
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ ENDINGS = (".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tg
 MAX_UNPACKED_BYTES = 2**30
 
 
+@runtime_checkable
 class Source(Protocol):
     """Where pictures come from."""
 
@@ -33,6 +34,9 @@ class Source(Protocol):
 
     def name(self, k: int) -> str:
         """What messages call a picture."""
+
+    def key(self, k: int) -> str:
+        """What files of labels call a picture: its name in the folder or the zip file, or its number."""
 
     def picture(self, k: int) -> NDArray[Any]:
         """A picture as :func:`foveasim.pictures.read_picture` gives it, first row on top."""
@@ -46,7 +50,7 @@ class Source(Protocol):
 
 def source_of(pictures: Any) -> Source:
     """
-    Whatever holds pictures, as a source.
+    Whatever holds pictures, as a source; a source as it is.
 
     Raises
     ------
@@ -55,6 +59,8 @@ def source_of(pictures: Any) -> Source:
     ParameterError
         When it is none of what a data set takes.
     """
+    if isinstance(pictures, Source):
+        return pictures
     if isinstance(pictures, str | Path):
         path = Path(pictures).absolute()
         if path.is_dir():
@@ -90,6 +96,9 @@ class _Folder:
     def name(self, k: int) -> str:
         return str(self._folder / self._names[k])
 
+    def key(self, k: int) -> str:
+        return self._names[k]
+
     def picture(self, k: int) -> NDArray[Any]:
         return read_picture(self._folder / self._names[k])
 
@@ -123,6 +132,9 @@ class _Zip:
 
     def name(self, k: int) -> str:
         return f"{self._path}!{self._names[k]}"
+
+    def key(self, k: int) -> str:
+        return self._names[k]
 
     def picture(self, k: int) -> NDArray[Any]:
         # A process that was forked shares its parent's place in the file.
@@ -163,6 +175,9 @@ class _Array:
     def name(self, k: int) -> str:
         return f"picture {k}"
 
+    def key(self, k: int) -> str:
+        return str(k)
+
     def picture(self, k: int) -> NDArray[Any]:
         return self._pictures[k]
 
@@ -200,6 +215,9 @@ class _ArrayFile:
     def name(self, k: int) -> str:
         return f"{self._path}[{k}]"
 
+    def key(self, k: int) -> str:
+        return str(k)
+
     def picture(self, k: int) -> NDArray[Any]:
         return np.array(self._array()[k])
 
@@ -227,6 +245,11 @@ class _Items:
         item = self._items[k] if isinstance(self._items, list | tuple) else None
         item = item[0] if isinstance(item, tuple) else item
         return str(item) if isinstance(item, str | Path) else f"picture {k}"
+
+    def key(self, k: int) -> str:
+        item = self._items[k] if isinstance(self._items, list | tuple) else None
+        item = item[0] if isinstance(item, tuple) else item
+        return Path(item).name if isinstance(item, str | Path) else str(k)
 
     def picture(self, k: int) -> NDArray[Any]:
         item = self._items[k]

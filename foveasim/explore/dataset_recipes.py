@@ -112,7 +112,7 @@ def denoising(
 
 def _numbers(shot: str | Path | Mapping[str, Any], options: Mapping[str, Any], *paths: str) -> list[float]:
     """Numbers among the shot's settings, with the changes among a data set's options."""
-    file = Path("settings") if isinstance(shot, Mapping) else Path(shot)
+    file = Path(options.get("source", "settings")) if isinstance(shot, Mapping) else Path(shot)
     data = deepcopy(dict(shot)) if isinstance(shot, Mapping) else read_settings(file)
     for path, value in (options.get("changes") or {}).items():
         put_setting(file, data, path, value)

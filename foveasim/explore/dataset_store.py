@@ -12,9 +12,11 @@ import shutil
 import signal
 import tarfile
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
+from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -142,11 +144,12 @@ def _write_shards(data_set: DataSet, shards: _Shards, workers: int, tell: Tell |
     told: list[str] = []
     if tell is not None:
         tell(n_done, n)
-    for k, own in _written(data_set, shards, left, workers):
-        told += own
-        n_done += len(shards.samples(k))
-        if tell is not None:
-            tell(n_done, n)
+    with closing(_written(data_set, shards, left, workers)) as written:
+        for k, own in written:
+            told += own
+            n_done += len(shards.samples(k))
+            if tell is not None:
+                tell(n_done, n)
     if told:
         warnings.warn(
             f"{len(told):,} of the samples written have warnings, such as: {min(told)}",
@@ -155,31 +158,33 @@ def _write_shards(data_set: DataSet, shards: _Shards, workers: int, tell: Tell |
         )
 
 
-def _written(data_set: DataSet, shards: _Shards, left: Sequence[int], workers: int) -> Iterator[tuple[int, list[str]]]:
+def _written(
+    data_set: DataSet, shards: _Shards, left: Sequence[int], workers: int
+) -> Generator[tuple[int, list[str]], None, None]:
     """Shards as they are written, with the warnings of their samples."""
     if workers == 1 or len(left) <= 1:
         for k in left:
             yield k, _write_shard(data_set, shards, k)
         return
     context = multiprocessing.get_context("spawn")
+    stop = context.Event()
+    pool = ProcessPoolExecutor(min(workers, len(left)), context, _begin, (data_set, shards, stop))
     try:
-        pool = ProcessPoolExecutor(min(workers, len(left)), context, _begin, (data_set, shards))
-        with pool:
-            going_on = {pool.submit(_write_own, k): k for k in left}
-            try:
-                for future in as_completed(going_on):
-                    told, failure = future.result()
-                    if failure is not None:
-                        raise _raised(failure)
-                    yield going_on[future], told
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
+        going_on = {pool.submit(_write_own, k): k for k in left}
+        for future in as_completed(going_on):
+            told, failure = future.result()
+            if failure is not None:
+                raise _raised(failure)
+            yield going_on[future], told
     except BrokenProcessPool:
         raise SimulationError(
             "a process that writes samples ended: too little memory, or a crash; done shards stay, and the same "
             "call goes on from there"
         ) from None
+    finally:
+        # Once all is done there is nothing to stop; before that, shards that are begun are given up at their next sample.
+        stop.set()
+        pool.shutdown(cancel_futures=True)
 
 
 class _Failure(NamedTuple):
@@ -197,27 +202,33 @@ def _raised(failure: _Failure) -> FoveasimError:
 _own: list[Any] = []
 
 
-def _begin(data_set: DataSet, shards: _Shards) -> None:
+def _begin(data_set: DataSet, shards: _Shards, stop: Event) -> None:
     """What a process does first: Ctrl-C, which the whole terminal gets, is for the program that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _own[:] = [data_set, shards]
+    _own[:] = [data_set, shards, stop]
 
 
 def _write_own(k: int) -> tuple[list[str], _Failure | None]:
     try:
-        data_set, shards = _own
-        return _write_shard(data_set, shards, k), None
+        data_set, shards, stop = _own
+        return _write_shard(data_set, shards, k, stop.is_set), None
     except FileError as error:
         return [], _Failure(str(error.path), str(error).removeprefix(f"{error.path}: "))
     except FoveasimError as error:
         return [], _Failure(None, str(error))
 
 
-def _write_shard(data_set: DataSet, shards: _Shards, k: int) -> list[str]:
-    """Simulate the samples of a shard and write it; their warnings."""
+def _write_shard(
+    data_set: DataSet, shards: _Shards, k: int, is_stopped: Callable[[], bool] = lambda: False
+) -> list[str]:
+    """Simulate the samples of a shard and write it, unless it is stopped before; their warnings."""
+    samples = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they are told at the end, together
-        samples = [data_set[index] for index in shards.samples(k)]
+        for index in shards.samples(k):
+            if is_stopped():
+                return []
+            samples.append(data_set[index])
     try:
         shards.write(k, samples)
     except OSError as error:
