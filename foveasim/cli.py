@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, NoReturn, TextIO
 
@@ -34,6 +35,11 @@ console_of_errors = Console(stderr=True)
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; made when it does not exist.")]
 Threads = Annotated[int | None, typer.Option("--threads", help="Threads to use; all cores by default.")]
+
+Metrics = Annotated[
+    list[str] | None,
+    typer.Option("--metric", help="One more metric: a name, or module:function, which is imported and run."),
+]
 
 
 @app.callback(invoke_without_command=True)
@@ -218,38 +224,87 @@ def sweep(
         typer.Option("--scheduler", help="Address of a dask scheduler; by default processes of this machine."),
     ] = None,
     workers: Annotated[int | None, typer.Option("--workers", help="Those processes; one a core by default.")] = None,
-    metrics: Annotated[
-        list[str] | None,
-        typer.Option("--metric", help="One more metric: a name, or module:function, which is imported and run."),
-    ] = None,
+    metrics: Metrics = None,
     retry: Annotated[bool, typer.Option("--retry", help="Try points again that failed before.")] = False,
 ) -> None:
     """Take a shot with many settings, and tabulate metrics; the exit code is 1 when a point failed."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
-
     from foveasim.explore import read_sweep, run_sweep
 
     plan = read_sweep(settings, metrics=metrics or ())
-    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    progress = Progress(*columns, console=console)
-    bar = progress.add_task(settings.stem, total=plan.n_points)
-
-    def tell(n_done: int, n_points: int) -> None:
-        progress.start()  # now that there are workers
-        progress.update(bar, completed=n_done, total=n_points)
-
-    try:
+    with _progress(settings.stem, f"what is done is kept beside {out}") as tell:
         results = run_sweep(plan, out=out, scheduler=scheduler, workers=workers, retry=retry, tell=tell)
-    except KeyboardInterrupt:
-        _end(f"stopped; what is done is kept beside {out}, and the same command goes on from there", STOPPED)
-    finally:
-        if progress.live.is_started:
-            progress.stop()
     sizes = " x ".join(f"{n} {name}" for name, n in zip(plan.dims, plan.shape, strict=True))
     console.print(f"wrote {out}: {plan.n_points:,} points ({sizes})", soft_wrap=True, highlight=False, markup=False)
     failed = [text for text in results["error"].to_numpy().ravel().tolist() if text]
     if failed:
         _end(f"{len(failed):,} of {plan.n_points:,} points failed; the first: {failed[0]}", BROKEN_RULE)
+
+
+@app.command()
+def study(
+    settings: Annotated[
+        Path, typer.Argument(help="YAML file of the study: a shot, where its settings are searched, and what is best.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="SQLite file for the trials, study.db by default; a study that was ended goes on in it."
+        ),
+    ] = None,
+    storage: Annotated[
+        str | None, typer.Option("--storage", help="URL of a data base that Optuna takes, in the place of --out.")
+    ] = None,
+    trials: Annotated[
+        int | None, typer.Option("--trials", help="Trials that the study has at its end; by default the file's.")
+    ] = None,
+    metrics: Metrics = None,
+) -> None:
+    """Search the settings that make a shot best; the exit code is 1 when no trial is good, failed or beyond the limits."""
+    from foveasim.explore import best_table, finished_trials, read_study, run_study
+
+    if out is not None and storage is not None:
+        _end("error: --out writes a file and --storage names a data base: take one of them", BAD_INPUT)
+    if storage is not None and "://" not in storage:
+        _end(f"error: --storage must be a URL, such as sqlite:///study.db, got '{storage}'", BAD_INPUT)
+    plan = read_study(settings, metrics=metrics or (), n_trials=trials)
+    place = storage or str(out or "study.db")
+    with _progress(settings.stem, f"the trials that are done are kept in {place}") as tell:
+        found = run_study(plan, storage=place, tell=tell)
+    done = finished_trials(found)
+    failed = [trial.user_attrs["error"] for trial in done if "error" in trial.user_attrs]
+    if failed:
+        _tell(f"{len(failed):,} of {len(done):,} trials failed; the first: {failed[0]}")
+    if not found.best_trials:
+        why = "all failed" if len(failed) == len(done) else "those that did not fail are beyond the limits"
+        _end(f"no trial in {place} is good: {why}", BROKEN_RULE)
+    console.print(best_table(plan, found))
+    console.print(f"wrote {place}: {len(done):,} trials", soft_wrap=True, highlight=False, markup=False)
+
+
+@app.command()
+def dataset(
+    settings: Annotated[
+        Path, typer.Argument(help="YAML file of the data set: pictures, a shot, and what is drawn of its settings.")
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", "-o", help="A folder of tar files, or a .zarr folder; a data set that was ended goes on in it."
+        ),
+    ] = Path("data_set"),
+    workers: Annotated[int | None, typer.Option("--workers", help="Processes; one a core by default.")] = None,
+) -> None:
+    """Take pictures with cameras drawn at random, and write them as samples to learn from."""
+    from foveasim.explore import read_data_set, write_data_set
+    from foveasim.parallel import thread_count
+
+    n_cores = thread_count()
+    n_workers = n_cores if workers is None else workers
+    with console.status("reading pictures and settings"):
+        file = read_data_set(settings, n_threads=max(1, n_cores // max(1, n_workers)))
+    with _progress(settings.stem, f"the shards that are done are kept in {out}") as tell:
+        write_data_set(file.data_set, out, per_shard=file.per_shard, workers=n_workers, tell=tell)
+    console.print(f"wrote {out}: {len(file.data_set):,} samples", soft_wrap=True, highlight=False, markup=False)
 
 
 @app.command()
@@ -298,11 +353,13 @@ def video(
 
 
 @app.command()
-def schema() -> None:
-    """Print the JSON schema of a settings file."""
-    from foveasim.config import schema as json_schema
+def schema(
+    kind: Annotated[str, typer.Argument(help="What the file describes: shot, sweep, study or dataset.")] = "shot",
+) -> None:
+    """Print the JSON schema of a settings file: of a shot, or of many."""
+    from foveasim.explore import schema_of
 
-    sys.stdout.write(json.dumps(json_schema(), indent=2) + "\n")
+    sys.stdout.write(json.dumps(schema_of(kind), indent=2) + "\n")
 
 
 def _run(settings: Sequence[Path], changes: Sequence[str], out: Path, threads: int | None) -> None:
@@ -343,14 +400,40 @@ def main() -> None:
         warnings.showwarning = show_warning
 
 
+@contextmanager
+def _progress(name: str, kept: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar with the time left, from the first count on; Ctrl-C ends with what is kept, and how to go on."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    progress = Progress(*columns, console=console)
+    bar = progress.add_task(name, total=None)
+
+    def tell(n_done: int, n: int) -> None:
+        progress.start()  # now that there are workers
+        progress.update(bar, completed=n_done, total=n)
+
+    try:
+        yield tell
+    except KeyboardInterrupt:
+        _end(f"stopped; {kept}, and the same command goes on from there", STOPPED)
+    finally:
+        if progress.live.is_started:
+            progress.stop()
+
+
 def _say(sentence: str) -> None:
     # Flushed: who waits for an address may read it from a pipe.
     sys.stdout.write(sentence + "\n")
     sys.stdout.flush()
 
 
-def _end(sentence: str, code: int) -> NoReturn:
+def _tell(sentence: str) -> None:
     console_of_errors.print(sentence, soft_wrap=True, highlight=False, markup=False)
+
+
+def _end(sentence: str, code: int) -> NoReturn:
+    _tell(sentence)
     sys.exit(code)
 
 

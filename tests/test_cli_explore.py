@@ -1,0 +1,816 @@
+"""Studies and data sets on the command line: the same as the calls, after any end, and bad files in one sentence."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+import zipfile
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import optuna
+import pytest
+import yaml
+from PIL import Image
+
+from foveasim import cli, explore
+from foveasim.config import build_shot
+from foveasim.errors import ConfigError, FileError
+from foveasim.explore import _records
+from foveasim.explore._bench import Bench, Job, Task
+from foveasim.explore._records import Journal, Record
+from foveasim.explore._study_plan import _suggested
+from foveasim.explore.dataset_label_files import files_of_pictures, read_boxes, read_labels
+
+GALLERY = Path(__file__).parents[1] / "gallery" / "sweeps"
+SHOT = {
+    "scene": {
+        "kind": "flat",
+        "shape": [60, 60],
+        "pitch_um": 300.0,
+        "distance_m": 1.0,
+        "radiance_w_m2_sr_nm": 0.1,
+        "band_width_nm": 100.0,
+    },
+    "optics": {"focal_length_mm": 8.0, "f_number": 2.8},
+    "layout": {"generator": "grid", "parameters": {"n_x": 8, "n_y": 8, "pitch_um": 3.0}},
+    "sensor": {"read_noise_e": 2.0, "capacitance_f": 4e-15, "dark_e_per_s": 0.0},
+    "exposure_s": 0.0001,
+}
+STUDY = {
+    "shot": "shot.yaml",
+    "search": {
+        "layout.parameters.n_x": {"from": 4, "to": 13, "step": 2},
+        "optics.f_number": {"from": 1.4, "to": 8, "spacing": "geometric"},
+        "sensor.bits": [8, 10, 12],
+    },
+    "objectives": {"snr_mean": "maximize", "n_sites": "minimize"},
+    "constraints": {"n_sites": [33, None]},
+    "trials": 14,
+    "seed": 3,
+}
+PHOTOGRAPHED = SHOT | {
+    "scene": {
+        "kind": "picture",
+        "pitch_um": 300.0,
+        "distance_m": 1.0,
+        "peak_radiance_w_m2_sr_nm": 0.05,
+        "wavelength_nm": [620, 550, 450],
+    },
+    "exposure_s": 0.01,
+}
+VARY = {
+    "optics.f_number": {"log_uniform": [1.4, 8.0]},
+    "sensor.read_noise_e": {"choice": [1.0, 4.0]},
+    "layout.parameters.n_x": {"integers": [8, 9]},
+}
+DATA_SET = {
+    "pictures": "photos",
+    "shot": "photographed.yaml",
+    "vary": {path: VARY[path] for path in ("optics.f_number", "sensor.read_noise_e")},
+    "cameras": 2,
+    "draws": 2,
+    "seed": 7,
+}
+#: Pictures of two classes, the second before the first in the alphabet.
+NAMES = ("dogs/2.png", "dogs/10.png", "cats/1.png")
+N_Y, N_X = 40, 48
+#: A metric that takes its time, so that a program can be ended amid trials.
+METRICS = """
+import time
+from pathlib import Path
+
+def patient(shot, camera, capture):
+    time.sleep(0.1)
+    return float(capture.code.mean())
+
+def harsh(shot, camera, capture):
+    if camera.sensor.bits > 8:
+        raise RuntimeError("no mood")
+    return 1.0
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with a shot, a study, a data set and metrics, in which the program runs."""
+    (tmp_path / "shot.yaml").write_text(json.dumps(SHOT))
+    (tmp_path / "photographed.yaml").write_text(json.dumps(PHOTOGRAPHED))
+    (tmp_path / "study.yaml").write_text(json.dumps(STUDY))
+    (tmp_path / "data.yaml").write_text(json.dumps(DATA_SET))
+    (tmp_path / "own.py").write_text(METRICS)
+    rng = np.random.default_rng(0)
+    for name in NAMES:
+        (tmp_path / "photos" / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(rng.integers(0, 256, (N_Y, N_X, 3), np.uint8)).save(tmp_path / "photos" / name)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def foveasim(folder, monkeypatch, capsys):  # noqa: ARG001 -- it runs there
+    """The program in this process: exit code, what it says, and what it says is wrong."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["foveasim", *map(str, arguments)])
+        monkeypatch.setattr(sys, "path", list(sys.path))
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        said = capsys.readouterr()
+        return ended.value.code or 0, said.out, said.err
+
+    return run
+
+
+def told(study):
+    """What counts of a study's trials."""
+    return [(t.params, t.values, t.user_attrs.get("error")) for t in explore.finished_trials(study)]
+
+
+def stored(path, name="study"):
+    return optuna.load_study(study_name=name, storage=f"sqlite:///{path}")
+
+
+def assert_same(one, other):
+    assert set(one) == set(other)
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, other[name], err_msg=name)
+
+
+def called_study(**options):
+    """The study of the file, as a call in Python says it."""
+    return explore.study(
+        SHOT,
+        STUDY["search"],
+        STUDY["objectives"],
+        **{"n_trials": 14, "constraints": {"n_sites": (33, None)}, "seed": 3} | options,
+    )
+
+
+# -- studies ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_study_on_the_command_line_finds_what_the_call_finds_and_shows_the_best(foveasim, folder):
+    called = called_study()
+
+    code, said, wrong = foveasim("study", "study.yaml")
+
+    assert (code, wrong) == (0, "")
+    assert told(stored(folder / "study.db")) == told(called)
+    assert "wrote study.db: 14 trials" in said
+    shown = [line.split() for line in said.splitlines() if len(line.split()) == 6 and line.split()[0].isdigit()]
+    best = {trial.number: trial for trial in called.best_trials}
+    assert {int(number) for number, *_ in shown} <= set(best)
+    assert {(row[1], row[2]) for row in shown} == {(f"{t.values[0]:.6g}", f"{t.values[1]:.6g}") for t in best.values()}
+    assert [float(row[1]) for row in shown] == sorted((float(row[1]) for row in shown), reverse=True)
+    for number, snr, n_sites, n_x, f_number, bits in shown:
+        assert int(n_sites) == 8 * int(n_x) > 32
+        trial = best[int(number)]
+        assert float(snr) == pytest.approx(trial.values[0], rel=1e-5)
+        assert float(f_number) == pytest.approx(trial.params["optics.f_number"], rel=1e-5)
+        assert bits == trial.params["sensor.bits"]
+
+
+def test_a_study_goes_on_to_more_trials_as_if_it_had_them_from_the_start(foveasim, folder):
+    for n_trials in (4, 9, 14):
+        code, said, _ = foveasim("study", "study.yaml", "--trials", n_trials, "-o", "few.db")
+        assert code == 0
+        assert f"wrote few.db: {n_trials} trials" in said
+    # Fewer than there are: nothing is to be done, and nothing is lost.
+    assert "14 trials" in foveasim("study", "study.yaml", "--trials", 2, "--storage", "sqlite:///few.db")[1]
+
+    assert told(stored(folder / "few.db")) == told(called_study())
+
+
+def n_begun(path):
+    """Trials in a study's file, which is looked at and not touched."""
+    try:
+        with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as base:
+            return base.execute("SELECT count(*) FROM trials").fetchone()[0]
+    except sqlite3.OperationalError:  # not yet
+        return 0
+
+
+def ended(end, folder, n_trials):
+    """A study that is ended when so many trials are begun: its exit code and its last words."""
+    command = [sys.executable, "-m", "foveasim.cli", "study", "slow.yaml", "--metric", "own:patient"]
+    running = subprocess.Popen(
+        command, cwd=folder, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    limit_s = time.monotonic() + 60.0
+    while n_begun(folder / "study.db") < n_trials and running.poll() is None:
+        assert time.monotonic() < limit_s
+        time.sleep(0.02)
+    if end is not None:
+        os.killpg(running.pid, end)
+    _, said = running.communicate(timeout=60)
+    return running.returncode, said
+
+
+def test_a_study_that_was_ended_twice_goes_on_as_if_it_was_not(folder):
+    (folder / "slow.yaml").write_text(json.dumps(STUDY | {"trials": 40}))
+
+    code, said = ended(signal.SIGINT, folder, 4)
+    n_stop = n_begun(folder / "study.db")
+
+    assert code == 130
+    assert said == "stopped; the trials that are done are kept in study.db, and the same command goes on from there\n"
+    assert 3 < n_stop < 30
+
+    code, _ = ended(signal.SIGKILL, folder, n_stop + 4)
+
+    assert code == -signal.SIGKILL
+    assert n_stop < n_begun(folder / "study.db") < 40
+
+    assert ended(None, folder, 0) == (0, "")
+    found = stored(folder / "study.db")
+    assert told(found) == told(called_study(n_trials=40))
+    assert {trial.user_attrs["patient"] > 0.0 for trial in explore.finished_trials(found)} == {True}
+
+
+def test_a_study_without_a_good_trial_says_so_with_its_exit_code(foveasim, folder):
+    failing = STUDY | {"search": {"exposure_s": [-1.0, -2.0]}, "trials": 3}
+    beyond = STUDY | {"constraints": {"n_sites": [None, 5]}, "trials": 2}
+    (folder / "failing.yaml").write_text(json.dumps(failing))
+    (folder / "beyond.yaml").write_text(json.dumps(beyond))
+
+    code, _, wrong = foveasim("study", "failing.yaml", "-o", "a.db")
+
+    assert code == 1
+    assert "3 of 3 trials failed; the first: " in wrong
+    assert "exposure_s: must be >= 0, got -" in wrong
+    assert wrong.splitlines()[-1] == "no trial in a.db is good: all failed"
+
+    code, _, wrong = foveasim("study", "beyond.yaml", "-o", "b.db")
+
+    assert (code, wrong) == (1, "no trial in b.db is good: those that did not fail are beyond the limits\n")
+
+
+def test_trials_that_fail_are_told_and_the_best_of_the_others_shown(foveasim, folder):
+    (folder / "some.yaml").write_text(json.dumps(STUDY | {"objectives": {"harsh": "maximize"}, "trials": 8}))
+
+    code, said, wrong = foveasim("study", "some.yaml", "--metric", "own:harsh")
+    failed = [t for t in stored(folder / "study.db").trials if t.params["sensor.bits"] != "8"]
+
+    assert code == 0
+    assert 0 < len(failed) < 8
+    assert wrong == f"{len(failed)} of 8 trials failed; the first: harsh: RuntimeError: no mood\n"
+    assert "wrote study.db: 8 trials" in said
+
+
+def test_a_file_says_what_a_call_says(folder):
+    read = explore.read_study(folder / "study.yaml")
+    called = explore.plan_study(
+        folder / "shot.yaml",
+        STUDY["search"],
+        STUDY["objectives"],
+        n_trials=14,
+        constraints={"n_sites": (33, None)},
+        seed=3,
+    )
+
+    assert read.described() == called.described()
+    assert (read.n_trials, read.name) == (14, "study")
+    assert set(read.base.metrics) == {"snr", "n_sites"}
+    assert read.described()["files"] == {}
+
+
+@pytest.mark.parametrize(
+    ("where", "possible"),
+    [
+        ({"from": 4, "to": 13, "step": 2}, {4, 6, 8, 10, 12}),
+        ({"from": 0.1, "to": 0.75, "step": 0.2}, {0.1, 0.3, 0.5, 0.7}),
+        ({"from": 0, "to": 1, "step": 0.3}, {0.0, 0.3, 0.6, 0.9}),
+        ({"from": 1, "to": 3}, {1, 2, 3}),
+        ((5, 7), {5, 6, 7}),
+        ([[1, 2], "a", None], {"[1, 2]", '"a"', "null"}),
+    ],
+)
+def test_a_range_gives_its_steps_and_no_others(where, possible):
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    found = [_suggested(study.ask(), "x", where) for _ in range(60)]
+
+    if isinstance(where, list):
+        assert {json.dumps(value) for value in found} == possible
+        return
+    assert {round(value, 12) for value in found} == possible
+    assert {type(value) for value in found} == {type(next(iter(possible)))}
+
+
+def test_files_of_all_choices_are_beside_the_study_and_among_what_it_depends_on(folder):
+    (folder / "deep").mkdir()
+    for k in (1, 2):
+        grid = {"generator": "grid", "parameters": {"n_x": k, "n_y": k, "pitch_um": 3.0}}
+        (folder / "deep" / f"{k}.yaml").write_text(json.dumps(grid))
+    search = {"sensor.bits": [8, 10], "layout": ["1.yaml", "2.yaml"]}
+    (folder / "deep" / "study.yaml").write_text(json.dumps(STUDY | {"shot": "../shot.yaml", "search": search}))
+
+    plan = explore.read_study(folder / "deep" / "study.yaml")
+    found = explore.run_study(plan)
+
+    assert [Path(file).name for file in plan.files] == ["1.yaml", "2.yaml"]
+    by_file = {(json.loads(t.params["layout"]), t.user_attrs["n_sites"]) for t in found.trials}
+    assert by_file == {("1.yaml", 1), ("2.yaml", 4)}
+    (folder / "deep" / "2.yaml").write_text("changed")
+    assert explore.read_study(folder / "deep" / "study.yaml").described() != plan.described()
+
+
+def test_the_trials_of_another_program_are_left_alone(foveasim, folder):
+    study = optuna.create_study(study_name="study", storage="sqlite:///own.db", directions=["maximize", "minimize"])
+    study.tell(study.ask(), [1.0, 2.0])
+
+    code, _, wrong = foveasim("study", "study.yaml", "-o", "own.db")
+
+    assert code == 2
+    assert wrong == "error: own.db: holds a study 'study' of another program; take another name\n"
+    assert len(stored(folder / "own.db").trials) == 1
+
+
+def test_a_storage_that_breaks_amid_a_study_is_one_sentence_and_keeps_what_is_done(folder):
+    plan = explore.read_study(folder / "study.yaml")
+
+    def spoil(n_done, _):
+        if n_done == 3:  # as another program would that runs the same study
+            running = stored(folder / "study.db").ask()
+            plan.base.metrics["snr"] = lambda *_: stored(folder / "study.db").tell(
+                running.number + 1, state=optuna.trial.TrialState.FAIL
+            )
+
+    with pytest.raises(FileError, match=r"study\.db: cannot be used .*already finished.*; 3 trials are kept") as caught:
+        explore.run_study(plan, storage=folder / "study.db", tell=spoil)
+    assert "\n" not in str(caught.value)
+
+
+BAD_STUDIES = [
+    ({"repeats": 3}, "bad.yaml: repeats: no such setting"),
+    ({"search": {"sensor.bitz": [8]}}, "bad.yaml: with shot.yaml: sensor.bitz: no such setting"),
+    ({"search": {}}, "bad.yaml: 'search' must be ranges by settings' paths: nothing is searched"),
+    ({"search": {"sensor.bits": []}}, "bad.yaml: 'sensor.bits' must be searched in"),
+    ({"search": {"sensor.bits": {"from": 8}}}, "bad.yaml: search.sensor.bits.to: is missing"),
+    ({"search": {"sensor.bits": {"from": 12, "to": 8}}}, "'sensor.bits' must have two ends, the first the smaller"),
+    ({"search": {"sensor.bits": {"from": 8, "to": 10, "step": 3}}}, "a step > 0, and no larger than the range"),
+    ({"search": {"sensor.bits": {"from": 8.5, "to": 10}}}, "sensor.bits: must be a valid integer, got 8.5"),
+    ({"search": {"seed": [1, 2]}}, "'seed' cannot be searched"),
+    ({"search": {"layout": ["x.yaml"], "layout.parameters.n_x": [3]}}, "cannot both be searched"),
+    ({"objectives": {"snr_mean": "up"}}, "bad.yaml: objectives.snr_mean: must be 'maximize' or 'minimize', got \"up\""),
+    ({"objectives": {}}, "bad.yaml: 'objectives' must be names of results"),
+    ({"objectives": {"beauty": "maximize"}}, "bad.yaml: 'objectives' must be results of metrics ("),
+    ({"constraints": {"beauty": [0, 1]}}, "bad.yaml: 'constraints' must be results of metrics ("),
+    ({"constraints": {"n_sites": [None, None]}}, "'n_sites' must have limits"),
+    ({"constraints": {"n_sites": [2, 1]}}, "the first no larger than the second"),
+    ({"metrics": ["snr"]}, "'objectives' must be results of metrics (snr)"),
+    ({"metrics": ["own:harsh"]}, "bad.yaml: 'metrics' must be of data_rate_gbit_per_s"),
+    ({"trials": 0}, "bad.yaml: trials: must be greater than or equal to 1, got 0"),
+    ({"trials": "many"}, 'bad.yaml: trials: must be a valid integer, got "many"'),
+    ({"name": ""}, "bad.yaml: name: must have at least 1 character"),
+    ({"shot": "none.yaml"}, "none.yaml: no such file"),
+    ({"set": {"sensor.bitz": 3}}, "sensor.bitz: no such setting"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BAD_STUDIES)
+def test_a_bad_study_is_one_sentence_and_nothing_is_written(foveasim, folder, change, message):
+    (folder / "bad.yaml").write_text(json.dumps(STUDY | change))
+    before = sorted(folder.rglob("*"))
+
+    code, said, wrong = foveasim("study", "bad.yaml")
+
+    assert (code, said) == (2, "")
+    assert wrong.startswith("error: ")
+    assert message in wrong
+    assert wrong.count("\n") == 1
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--trials", "0"], "'trials' must be >= 1, got 0"),
+        (["--out", "no/where.db"], "no/where.db: cannot be written: its folder does not exist"),
+        (["--out", "."], ".: cannot be used as a study's storage (unable to open database file)"),
+        (["--out", "a.db", "--storage", "sqlite:///b.db"], "take one of them"),
+        (["--storage", "b.db"], "--storage must be a URL"),
+        (["--storage", "nosuch://base"], "cannot be used as a study's storage"),
+        (["--metric", "none:such"], "'metric' must be module:function of a module that can be imported"),
+        (["--metric", "beauty"], "'metrics' must be of"),
+        (["--metric", "snr"], "'metric' must have a name of its own"),
+    ],
+)
+def test_a_bad_option_of_a_study_is_one_sentence_and_nothing_is_written(foveasim, folder, options, message):
+    before = sorted(folder.rglob("*"))
+
+    code, said, wrong = foveasim("study", "study.yaml", *options)
+
+    assert (code, said) == (2, "")
+    assert message in wrong
+    assert wrong.count("\n") == 1
+    assert sorted(folder.rglob("*")) == before
+
+
+# -- data sets --------------------------------------------------------------------------------------------------------
+
+
+def labels_of_all_sorts(folder):
+    """Files of labels of the three pictures, and what they say."""
+    rng = np.random.default_rng(1)
+    masks, flows, boxes = {}, {}, {"dogs/2.png": [[1.0, 2.0, 20.5, 30.0, 4.0]], "dogs/10.png": [], "cats/1.png": []}
+    boxes["cats/1.png"] = [[0.0, 0.0, 9.0, 12.0, 1.0], [20.0, 5.0, 40.0, 39.0, 2.0]]
+    for name in NAMES:
+        masks[name], flows[name] = rng.integers(0, 3, (N_Y, N_X), np.uint8), rng.normal(size=(N_Y, N_X, 2))
+        for kind in ("masks", "flows"):
+            (folder / kind / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(masks[name]).save((folder / "masks" / name).with_suffix(".bmp"))
+        np.save((folder / "flows" / name).with_suffix(".npy"), flows[name])
+    lines = [
+        "label,note,picture",
+        "seal,,dogs/10.png",
+        '"lion, old","a\n b",dogs/2.png',
+        "seal,,cats/1.png",
+        "x,,no.png",
+    ]
+    (folder / "labels.csv").write_text("\n".join(lines) + "\n", encoding="utf-8-sig")
+    images = [{"id": k, "file_name": name, "width": N_X} for k, name in enumerate(("no.png", *NAMES[::-1]))]
+    annotations = [
+        {"image_id": image["id"], "category_id": int(c), "bbox": [x0, y0, x1 - x0, y1 - y0], "segmentation": []}
+        for image in images
+        for x0, y0, x1, y1, c in boxes.get(image["file_name"], [])
+    ]
+    crowd = {"image_id": 1, "category_id": 9, "bbox": [0, 0, 5, 5], "iscrowd": 1}
+    other = {"image_id": 0, "category_id": 9, "bbox": [0, 0, 0, 0]}
+    (folder / "coco.json").write_text(json.dumps({"images": images, "annotations": [crowd, *annotations, other]}))
+    # Pictures come in the natural order of their names.
+    order = sorted(NAMES, key=lambda name: (name.split("/")[0], int(Path(name).stem)))
+    said = {"cats/1.png": "seal", "dogs/2.png": "lion, old", "dogs/10.png": "seal"}
+    return {
+        "labels": [said[name] for name in order],
+        "boxes": [boxes[name] for name in order],
+        "masks": [masks[name] for name in order],
+        "flows": [flows[name] for name in order],
+    }
+
+
+@pytest.mark.parametrize("out", ["data_set", "d.zarr"])
+def test_a_data_set_on_the_command_line_is_what_the_call_gives(foveasim, folder, out):
+    labels = labels_of_all_sorts(folder)
+    named = {"labels": "labels.csv", "boxes": "coco.json", "masks": "masks", "flows": "flows", "per_shard": 5}
+    (folder / "all.yaml").write_text(json.dumps(DATA_SET | named))
+    data = explore.DataSet("photos", "photographed.yaml", DATA_SET["vary"], cameras=2, draws=2, seed=7, **labels)
+
+    code, said, wrong = foveasim("dataset", "all.yaml", "--out", out, "--workers", 1)
+    found = explore.open_data_set(folder / out)
+
+    assert (code, wrong) == (0, "")
+    assert f"wrote {out}: 12 samples" in said
+    assert len(found) == len(data) == 12
+    assert found.class_names == ["lion, old", "seal"]
+    assert found.about["per_shard"] == 5
+    for k in range(12):
+        assert_same(found[k], data[k])
+    assert {"label", "box_um", "mask", "flow_um"} < set(found[0])
+
+
+@pytest.mark.parametrize("recipe", ["classification", "denoising"])
+def test_a_recipe_in_a_file_is_the_call_of_its_name(folder, recipe):
+    (folder / "own.yaml").write_text(json.dumps({"pictures": "photos", "shot": PHOTOGRAPHED, "recipe": recipe}))
+
+    read = explore.read_data_set(folder / "own.yaml").data_set
+    called = getattr(explore, recipe)(folder / "photos", PHOTOGRAPHED)
+
+    assert read.described() == called.described()
+    assert_same(read[5 % len(read)], called[5 % len(read)])
+
+
+def test_pictures_may_be_a_zip_file_an_array_or_a_list_of_files(folder):
+    pictures = {name: np.asarray(Image.open(folder / "photos" / name)) for name in sorted(NAMES)}
+    with zipfile.ZipFile(folder / "photos.zip", "w") as archive:
+        for name in NAMES:
+            archive.write(folder / "photos" / name, name)
+    np.save(folder / "photos.npy", np.stack(list(pictures.values())))
+    (folder / "numbers.csv").write_text("picture,label\n2,-1\n1,30\n0,7\n")
+    (folder / "names.csv").write_text("picture,label\n1.png,-1\n10.png,30\n2.png,7\n")
+
+    def read(**keys):
+        (folder / "own.yaml").write_text(json.dumps(DATA_SET | keys))
+        return explore.read_data_set(folder / "own.yaml").data_set
+
+    zipped = read(pictures="photos.zip")
+    array = read(pictures="photos.npy", labels="numbers.csv")
+    files = read(pictures=[f"photos/{name}" for name in sorted(NAMES)], labels="names.csv")
+
+    assert zipped.class_names == ["cats", "dogs"]
+    assert [array[4 * k]["label"] for k in range(3)] == [7, 30, -1]
+    assert [files[4 * k]["label"] for k in range(3)] == [-1, 30, 7]
+    for k, name in enumerate(sorted(NAMES)):
+        np.testing.assert_array_equal(array[4 * k]["electrons"], files[4 * k]["electrons"], err_msg=name)
+
+
+def test_a_data_set_that_was_ended_goes_on_and_gives_the_same_samples(folder):
+    (folder / "long.yaml").write_text(json.dumps(DATA_SET | {"cameras": 150, "per_shard": 10}))
+    command = [sys.executable, "-m", "foveasim.cli", "dataset", "long.yaml", "--workers", "2"]
+    shards = lambda: {p.name: p.stat().st_mtime_ns for p in (folder / "data_set").glob("*.tar")}  # noqa: E731
+    running = subprocess.Popen(
+        command, cwd=folder, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    limit_s = time.monotonic() + 120.0
+    while len(shards()) < 2:
+        assert time.monotonic() < limit_s
+        time.sleep(0.01)
+    os.killpg(running.pid, signal.SIGINT)
+    _, wrong = running.communicate(timeout=120)
+    before = shards()
+
+    assert running.returncode == 130
+    assert wrong == "stopped; the shards that are done are kept in data_set, and the same command goes on from there\n"
+    # Shards that waited for a process were not begun.
+    assert 2 <= len(before) < 90
+    assert not list((folder / "data_set").glob(".*"))
+
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    found, data = explore.open_data_set(folder / "data_set"), explore.read_data_set("long.yaml").data_set
+
+    assert result.returncode == 0, result.stderr
+    assert before.items() <= shards().items()
+    assert len(found) == len(data) == 900
+    for k in (0, 19, 450, 899):
+        assert_same(found[k], data[k])
+
+
+def test_warnings_of_samples_are_told_once(folder):
+    layout = SHOT["layout"] | {"parameters": {"n_x": 12, "n_y": 12, "pitch_um": 30.0}}  # beyond the pictures
+    (folder / "far.yaml").write_text(json.dumps(DATA_SET | {"set": {"layout": layout}}))
+    command = [sys.executable, "-m", "foveasim.cli", "dataset", "far.yaml", "--workers", "1"]
+
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+    assert result.returncode == 0
+    assert result.stderr.startswith("warning: 12 of the samples written have warnings, such as: sample 0: ")
+    assert result.stderr.count("\n") == 1
+
+
+BAD_DATA_SETS = [
+    ({"repeats": 3}, "bad.yaml: repeats: no such setting"),
+    ({"pictures": None}, "bad.yaml: pictures: is missing"),
+    ({"pictures": "nowhere"}, "nowhere: no such file or folder"),
+    ({"pictures": "empty"}, "empty: holds no pictures"),
+    ({"pictures": []}, "bad.yaml: 'pictures' must hold at least one picture"),
+    ({"pictures": ["skimage:nobody"]}, "bad.yaml: pictures.0: scikit-image brings no picture 'nobody'"),
+    ({"pictures": ["photos/none.png"]}, "none.png: no such file"),
+    ({"shot": "none.yaml"}, "none.yaml: no such file"),
+    ({"shot": SHOT}, "bad.yaml: scene.kind: must be 'picture' for a data set"),
+    ({"vary": {"sensor.bitz": {"choice": [8]}}}, "bad.yaml: with photographed.yaml: sensor.bitz: no such setting"),
+    ({"vary": {"sensor.bits": {"chance": [8]}}}, "bad.yaml: vary.sensor.bits.chance: no such setting"),
+    ({"vary": {"sensor.bits": {"integers": [8, 40]}}}, "sensor.bits: must be <= 16, got 40"),
+    ({"vary": {"sensor.bits": {"choice": []}}}, "'sensor.bits' must be chosen from at least one value"),
+    ({"vary": {"exposure_s": {"uniform": [1]}}}, "bad.yaml: 'exposure_s' uniform needs [low, high]"),
+    ({"cameras": 0}, "bad.yaml: 'cameras' must be >= 1, got 0"),
+    ({"draws": "many"}, 'bad.yaml: draws: must be a valid integer, got "many"'),
+    ({"recipe": "magic"}, "bad.yaml: recipe: must be 'classification' or 'denoising'"),
+    ({"fields": ["volts"]}, "bad.yaml: fields.0: must be 'code'"),
+    ({"per_shard": 0}, "bad.yaml: per_shard: must be greater than or equal to 1"),
+    ({"set": {"sensor.bitz": 3}}, "sensor.bitz: no such setting"),
+    ({"labels": "none.csv"}, "none.csv: no such file"),
+    ({"labels": [1]}, "bad.yaml: 'labels' must have one for each of the 3 pictures, got 1"),
+    ({"boxes": "own.py"}, "own.py: holds no boxes as COCO has them (Invalid JSON"),
+    ({"masks": "flows"}, "flows: no such folder"),
+    ({"masks": "empty"}, "empty: has nothing for 3 of the 3 pictures, first 'cats/1'; it has none (.png, "),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BAD_DATA_SETS)
+def test_a_bad_data_set_is_one_sentence_and_nothing_is_written(foveasim, folder, change, message):
+    keys = {key: value for key, value in (DATA_SET | change).items() if value is not None}
+    (folder / "bad.yaml").write_text(json.dumps(keys))
+    (folder / "empty").mkdir()
+    before = sorted(folder.rglob("*"))
+
+    code, said, wrong = foveasim("dataset", "bad.yaml", "--workers", 1)
+
+    assert (code, said) == (2, "")
+    assert wrong.startswith("error: ")
+    assert message in wrong
+    assert wrong.count("\n") == 1
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--workers", "0"], "'workers' must be >= 1, got 0"),
+        (["--out", "no/where"], "cannot be written: the folder"),
+        (["--out", "photos"], "photos: holds something else than a data set"),
+        (["--out", "x.txt"], "must end in .zarr, or have no ending"),
+    ],
+)
+def test_a_bad_option_of_a_data_set_is_one_sentence_and_nothing_is_written(foveasim, folder, options, message):
+    before = sorted(folder.rglob("*"))
+
+    code, _, wrong = foveasim("dataset", "data.yaml", *options)
+
+    assert code == 2
+    assert message in wrong
+    assert wrong.count("\n") == 1
+    assert sorted(folder.rglob("*")) == before
+
+
+# -- files of labels --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "must have the columns 'picture' and 'label' in its first line"),
+        ("id,label\na,1\n", r"must have the columns 'picture' and 'label' in its first line, got \['id', 'label'\]"),
+        ("picture,label\na,1\n", "has nothing for 1 of the 2 pictures, first 'b'; it has 'a'"),
+        ("picture,label\na,1\nb,1\na,2\n", "has the picture 'a' twice, in line 4 again"),
+        ("picture,label\na,1\nb\n", "has 1 values in line 3, and 2 columns"),
+        ('picture,label\na,"1\n', "is no CSV file"),
+    ],
+)
+def test_a_bad_file_of_classes_is_told_with_its_place(tmp_path, text, message):
+    (tmp_path / "labels.csv").write_text(text)
+
+    with pytest.raises(FileError, match=message) as caught:
+        read_labels(tmp_path / "labels.csv", ["a", "b"])
+    assert "\n" not in str(caught.value)
+
+
+def test_classes_may_be_an_array_and_no_objects_are_read(tmp_path):
+    np.save(tmp_path / "numbers.npy", np.array([3, 1], np.uint8))
+    np.save(tmp_path / "texts.npy", np.array(["b", "a"]))
+    np.save(tmp_path / "objects.npy", np.array([{}, 1], object), allow_pickle=True)
+    np.save(tmp_path / "reals.npy", np.array([0.5, 1.0]))
+
+    assert read_labels(tmp_path / "numbers.npy", ["x", "y"]) == [3, 1]
+    assert read_labels(tmp_path / "texts.npy", ["x", "y"]) == ["b", "a"]
+    with pytest.raises(FileError, match="is no array that can be read"):
+        read_labels(tmp_path / "objects.npy", ["x", "y"])
+    with pytest.raises(FileError, match="of whole numbers or of texts"):
+        read_labels(tmp_path / "reals.npy", ["x", "y"])
+    with pytest.raises(FileError, match=r"must be a \.csv file"):
+        read_labels(Path(__file__), ["x", "y"])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"images": [{"id": 1, "file_name": "b"}]}, "has nothing for 1 of the 1 pictures, first 'a'; it has 'b'"),
+        ({"images": [{"id": 1, "file_name": "a"}] * 2}, "names the picture 'a' twice"),
+        ({"images": None}, "holds no boxes as COCO has them"),
+        ({"annotations": [{"image_id": 1, "category_id": 2}]}, r"annotations\.0\.bbox"),
+        (
+            {"annotations": [{"image_id": 1, "category_id": 2, "bbox": [1, 2, 0, 3]}]},
+            r"annotations\.0: has a box without an area: \[1\.0, 2\.0, 0\.0, 3\.0\]",
+        ),
+    ],
+)
+def test_a_bad_file_of_boxes_is_told_with_its_place(tmp_path, change, message):
+    coco = {"images": [{"id": 1, "file_name": "a"}], "annotations": []} | change
+    (tmp_path / "coco.json").write_text(json.dumps(coco))
+
+    with pytest.raises(FileError, match=message) as caught:
+        read_boxes(tmp_path / "coco.json", ["a"])
+    assert "\n" not in str(caught.value)
+
+
+def test_a_picture_has_exactly_one_file_of_its_name(tmp_path):
+    (tmp_path / "a.png").touch()
+    (tmp_path / "b.jpg").touch()
+
+    assert files_of_pictures(tmp_path, ["a.jpeg"], (".png",)) == [tmp_path / "a.png"]
+    with pytest.raises(FileError, match="cannot tell two pictures apart that are called 'a'"):
+        files_of_pictures(tmp_path, ["a.jpeg", "a.png"], (".png",))
+    with pytest.raises(FileError, match=r"first 'b'; it has 'a' \(\.png\)"):
+        files_of_pictures(tmp_path, ["a.jpeg", "b.jpeg"], (".png",))
+    (tmp_path / "a.bmp").touch()
+    with pytest.raises(FileError, match=r"has two files of the picture 'a': a\.bmp and a\.png"):
+        files_of_pictures(tmp_path, ["a.jpeg"], (".png", ".bmp"))
+
+
+# -- what they share --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "examples", "needed"),
+    [
+        ("sweep", ["foveal.yaml"], {"shot"}),
+        ("study", ["best_fovea.yaml"], {"shot", "search", "objectives", "trials"}),
+        ("dataset", ["random_cameras.yaml"], {"pictures", "shot"}),
+        ("shot", [], {"scene", "optics", "layout", "exposure_s"}),
+    ],
+)
+def test_the_schema_of_a_kind_has_the_keys_of_its_examples(foveasim, kind, examples, needed):
+    code, said, _ = foveasim("schema", kind)
+    schema = json.loads(said)
+
+    assert code == 0
+    assert set(schema["required"]) == needed
+    assert schema["additionalProperties"] is False
+    for example in examples:
+        assert set(yaml.safe_load((GALLERY / example).read_text())) <= set(schema["properties"])
+
+
+def test_the_schema_is_of_a_shot_unless_another_is_asked_for(foveasim):
+    assert foveasim("schema") == foveasim("schema", "shot")
+    assert foveasim("schema", "film") == (
+        2,
+        "",
+        "error: 'kind' must be one of 'shot', 'sweep', 'study', 'dataset', got 'film'\n",
+    )
+
+
+def test_the_examples_are_what_they_say():
+    study = explore.read_study(GALLERY / "best_fovea.yaml")
+    file = explore.read_data_set(GALLERY / "random_cameras.yaml")
+
+    assert study.n_trials == 40
+    assert set(study.base.metrics) == {"psnr_db", "n_sites", "saturated_fraction"}
+    assert len(file.data_set) == 24
+    assert file.data_set.class_names == ["cat", "cup", "person"]
+
+
+def test_files_that_a_layouts_own_file_names_are_among_what_results_depend_on(folder):
+    density = {"n_sites": 30, "size_um": [40.0, 40.0], "density": "density.png"}
+    (folder / "deep").mkdir()
+    (folder / "deep" / "layout.yaml").write_text(json.dumps({"generator": "voronoi", "parameters": density}))
+    (folder / "shot.yaml").write_text(json.dumps(SHOT | {"layout": "deep/layout.yaml"}))
+    (folder / "photographed.yaml").write_text(json.dumps(PHOTOGRAPHED | {"layout": "deep/layout.yaml"}))
+    told = []
+    for level in (100, 200):
+        Image.fromarray(np.full((8, 8), level, np.uint8)).save(folder / "deep" / "density.png")
+        told.append(
+            [
+                explore.plan_sweep(folder / "shot.yaml", {"sensor.bits": [8]}).described(),
+                explore.DataSet(folder / "photos", folder / "photographed.yaml").described(),
+            ]
+        )
+
+    for one, other in zip(*told, strict=True):
+        assert [Path(file).name for file in one["files"]] == ["layout.yaml", "density.png"]
+        assert {key for key in one if one[key] != other[key]} == {"files"}
+
+
+def test_a_journals_lines_are_on_the_disk_every_second(tmp_path, monkeypatch):
+    now_s, synced = [100.0], []
+    monkeypatch.setattr(_records.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(_records.os, "fsync", lambda _: synced.append(now_s[0]))
+    with Journal(tmp_path / "r.zarr", {}) as journal:
+        for later_s in (100.3, 100.9, 101.1, 101.2, 105.0):
+            now_s[0] = later_s
+            journal.add(Record(len(journal.records), {"x": 1.0}))
+        now_s[0] = 105.5
+
+    assert synced == [100.0, 101.1, 105.0, 105.5]
+
+
+def test_what_a_picture_is_compared_with_is_made_once_and_changes_no_result():
+    vary = {"optics.f_number": [2.0, 4.0], "sensor.bits": [8, 12], "exposure_s": [1e-4, 2e-4]}
+    scene = PHOTOGRAPHED["scene"] | {"picture": "skimage:astronaut", "pitch_um": 30.0}
+    plan = explore.plan_sweep(SHOT | {"scene": scene}, vary, repeats=2, metrics=["psnr_db"])
+    job, bench = Job(plan.source, plan.metrics, 1, plan.is_geometry_varied), Bench()
+    found = [bench.record(job, Task(k, plan.settings_of(k))) for k in range(plan.n_points)]
+
+    assert bench.n_made["reference"] == 4
+    for k in (0, 5, 10, 15):
+        shot = build_shot("by hand", plan.settings_of(k))
+        capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
+        assert found[k].error == ""
+        assert found[k].values["psnr_db"] == explore.METRICS["psnr_db"](shot, shot.camera, capture)
+
+
+def test_a_file_never_makes_the_program_import_code(foveasim, folder):
+    (folder / "trap.py").write_text(f"open({str(folder / 'sprung')!r}, 'w')")
+    for key in ("metrics", "objectives"):
+        given = ["trap:metric"] if key == "metrics" else {"trap:metric": "maximize"}
+        (folder / "bad.yaml").write_text(json.dumps(STUDY | {key: given}))
+        assert foveasim("study", "bad.yaml")[0] == 2
+    assert not (folder / "sprung").exists()
+
+
+def test_a_shots_file_that_is_wrong_is_named_beside_the_file_that_names_it(folder):
+    (folder / "shot.yaml").write_text(json.dumps(SHOT | {"exposure": 1.0}))
+    (folder / "sweep.yaml").write_text(json.dumps({"shot": "shot.yaml", "vary": {"sensor.bits": [8]}}))
+
+    for read, name in ((explore.read_study, "study.yaml"), (explore.read_sweep, "sweep.yaml")):
+        with pytest.raises(ConfigError, match=rf"{name}: with shot\.yaml: exposure: no such setting"):
+            read(folder / name)
+
+
+def test_workers_that_do_not_start_are_told_in_one_sentence(foveasim, folder, monkeypatch):
+    def none_start(**_):
+        raise RuntimeError("Nanny failed\nto start.")
+
+    monkeypatch.setattr("distributed.LocalCluster", none_start)
+    (folder / "sweep.yaml").write_text(json.dumps({"shot": "shot.yaml", "vary": {"sensor.bits": [8, 9]}}))
+
+    code, _, wrong = foveasim("sweep", "sweep.yaml", "--workers", 2)
+
+    assert code == 2
+    assert wrong == "error: the workers did not start (Nanny failed to start.); try it again, or with fewer of them\n"
+    assert not (folder / "results.zarr").exists()
