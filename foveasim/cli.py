@@ -260,16 +260,17 @@ def study(
     metrics: Metrics = None,
 ) -> None:
     """Search the settings that make a shot best; the exit code is 1 when no trial is good, failed or beyond the limits."""
-    from foveasim.explore import best_table, finished_trials, read_study, run_study
+    from foveasim.explore import best_table, finished_trials, read_study, run_study, storage_name
 
     if out is not None and storage is not None:
         _end("error: --out writes a file and --storage names a data base: take one of them", BAD_INPUT)
     if storage is not None and "://" not in storage:
         _end(f"error: --storage must be a URL, such as sqlite:///study.db, got '{storage}'", BAD_INPUT)
     plan = read_study(settings, metrics=metrics or (), n_trials=trials)
-    place = storage or str(out or "study.db")
+    base = storage or str(out or "study.db")
+    place = storage_name(base)
     with _progress(settings.stem, f"the trials that are done are kept in {place}") as tell:
-        found = run_study(plan, storage=place, tell=tell)
+        found = run_study(plan, storage=base, tell=tell)
     done = finished_trials(found)
     failed = [trial.user_attrs["error"] for trial in done if "error" in trial.user_attrs]
     if failed:

@@ -6,7 +6,7 @@ from foveasim.explore._metrics import METRICS, Metric, metric_of
 from foveasim.explore._plan import Plan, plan_sweep, read_sweep
 from foveasim.explore._results import open_results
 from foveasim.explore._schemas import schema_of
-from foveasim.explore._study import best_table, finished_trials, run_study, study
+from foveasim.explore._study import best_table, finished_trials, run_study, storage_name, study
 from foveasim.explore._study_plan import StudyPlan, plan_study, read_study
 from foveasim.explore._sweep import run_sweep, sweep
 from foveasim.explore.dataset import DataSet
@@ -40,6 +40,7 @@ __all__ = [
     "run_study",
     "run_sweep",
     "schema_of",
+    "storage_name",
     "study",
     "sweep",
     "torch_data_set",

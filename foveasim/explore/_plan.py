@@ -192,14 +192,14 @@ class SweepSection(BaseModel):
     """A sweep: a shot, what varies in it, repeats, seed, names of metrics."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
-    shot: str | dict[str, Any]
-    set: dict[str, Any] = {}
-    vary: dict[str, list[Any] | _Range] | None = None
-    points: list[dict[str, Any]] | None = None
-    mode: Literal["product", "zip"] = "product"
-    repeats: int = 1
+    shot: str | dict[str, Any] = Field(description="a file beside this one, or the settings themselves")
+    set: dict[str, Any] = Field({}, description="settings to be replaced in all points, by their paths")
+    vary: dict[str, list[Any] | _Range] | None = Field(None, description="values or ranges, by settings' paths")
+    points: list[dict[str, Any]] | None = Field(None, description="in the place of vary: settings of each point")
+    mode: Literal["product", "zip"] = Field("product", description="every value with every other, or side by side")
+    repeats: int = Field(1, description="captures of each point, which differ in their seeds")
     seed: int = 0
-    metrics: list[str] | None = None
+    metrics: list[str] | None = Field(None, description="names of metrics; usual ones by default")
 
 
 def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     import optuna
     from rich.table import Table
 
-__all__ = ["best_table", "finished_trials", "run_study", "study"]
+__all__ = ["best_table", "finished_trials", "run_study", "storage_name", "study"]
 
 #: Rows of the table of the best trials, and characters of a choice in it.
 MOST_ROWS, LONGEST_CHOICE = 20, 40
@@ -52,7 +53,7 @@ def study(
         As for :func:`plan_sweep`.
     search : mapping of str to range
         By the settings' paths: ``(low, high)``, whole numbers where both are; ``{"from": 1, "to": 64, "spacing": "geometric"}``
-        or ``{"from": 0, "to": 64, "step": 8}``; or a list of choices.
+        or ``{"from": 0, "to": 64, "step": 8}``, whole numbers where all are; or a list of choices.
     objectives : mapping of str to {"maximize", "minimize"}
         By the names that results of metrics have, such as ``"snr_mean"``. Of several, the study finds the Pareto front.
     n_trials : int
@@ -162,6 +163,11 @@ def finished_trials(found: optuna.Study) -> list[optuna.trial.FrozenTrial]:
     return [trial for trial in found.get_trials(deepcopy=False) if not trial.user_attrs.get(IS_CUT)]
 
 
+def storage_name(storage: str | Path | None) -> str:
+    """What messages call a storage: its URL without the user's name and password."""
+    return re.sub(r"://[^/@]*@", "://", str(storage))
+
+
 def best_table(plan: StudyPlan, found: optuna.Study) -> Table:
     """Table of the best trials: objectives, the results that have limits, settings; the best in the first objective on top."""
     from rich.table import Table
@@ -254,7 +260,7 @@ def _opened(optuna: Any, storage: str | Path | None, url: str | None, plan: Stud
         return optuna.create_study(storage=url, study_name=plan.name, directions=directions)
     found = optuna.load_study(storage=url, study_name=plan.name)
     if [direction.name.lower() for direction in found.directions] != directions:
-        raise FileError(str(storage), f"holds a study '{plan.name}' with other objectives; take another name")
+        raise FileError(storage_name(storage), f"holds a study '{plan.name}' with other objectives; take another name")
     return found
 
 
@@ -262,9 +268,11 @@ def _begin(optuna: Any, storage: str | Path | None, found: optuna.Study, describ
     """Check that a study is this one, and give up the trial that it was ended in."""
     before = found.user_attrs.get(PLAN)
     if before is not None:
-        check_same_plan(Path(str(storage)), before, described)
+        check_same_plan(Path(storage_name(storage)), before, described)
     elif found.get_trials(deepcopy=False):
-        raise FileError(str(storage), f"holds a study '{found.study_name}' of another program; take another name")
+        raise FileError(
+            storage_name(storage), f"holds a study '{found.study_name}' of another program; take another name"
+        )
     else:
         found.set_user_attr(PLAN, json.loads(json.dumps(described)))
     for trial in found.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,)):
@@ -279,7 +287,7 @@ def _url(storage: str | Path | None) -> str | None:
         return storage if storage is None else str(storage)
     path = Path(storage).absolute()
     if not path.parent.is_dir():
-        raise FileError(str(storage), "cannot be written: its folder does not exist")
+        raise FileError(storage_name(storage), "cannot be written: its folder does not exist")
     return f"sqlite:///{path}"
 
 
@@ -296,7 +304,7 @@ def _using(storage: str | Path | None, n_done: int | None = None) -> Iterator[No
             cause = cause.__cause__
         reason = str(cause).partition("\n")[0]
         kept = "" if n_done is None else f"; {n_done:,} trials are kept in it, and the same study goes on from there"
-        raise FileError(str(storage), f"cannot be used as a study's storage ({reason:.200}){kept}") from None
+        raise FileError(storage_name(storage), f"cannot be used as a study's storage ({reason:.200}){kept}") from None
 
 
 @contextmanager
