@@ -92,6 +92,28 @@ def test_a_study_of_two_objectives_gives_the_front_within_the_constraints():
         assert bits in (8, 10, 12)
 
 
+def test_a_setting_is_searched_in_the_numbers_that_it_takes_however_the_ends_are_written():
+    found = explore.study(
+        SHOT,
+        {
+            "optics.f_number": (2, 16),
+            "sensor.read_noise_e": {"from": 1, "to": 9, "spacing": "geometric"},
+            "sensor.bits": (6, 14),
+            "layout.parameters.n_x": {"from": 2, "to": 20},
+        },
+        {"snr_mean": "maximize"},
+        n_trials=12,
+    )
+    f_number, read_noise_e, bits, n_x = (
+        np.array([t.params[path] for t in found.trials]) for path in found.trials[0].params
+    )
+
+    assert (f_number % 1.0 != 0.0).all()
+    assert (read_noise_e % 1.0 != 0.0).all()
+    assert bits.dtype.kind == n_x.dtype.kind == "i"
+    assert not any(t.user_attrs.get("error") for t in found.trials)
+
+
 SEARCH = {"exposure_s": (1e-5, 1e-3), "optics.emission": ["lambertian", "isotropic"]}
 
 

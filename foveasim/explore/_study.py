@@ -52,8 +52,8 @@ def study(
     shot, changes
         As for :func:`plan_sweep`.
     search : mapping of str to range
-        By the settings' paths: ``(low, high)``, whole numbers where both are; ``{"from": 1, "to": 64, "spacing": "geometric"}``
-        or ``{"from": 0, "to": 64, "step": 8}``, whole numbers where all are; or a list of choices.
+        By the settings' paths: ``(low, high)``, ``{"from": 1, "to": 64, "spacing": "geometric"}`` or
+        ``{"from": 0, "to": 64, "step": 8}``, in whole numbers where the setting takes no others; or a list of choices.
     objectives : mapping of str to {"maximize", "minimize"}
         By the names that results of metrics have, such as ``"snr_mean"``. Of several, the study finds the Pareto front.
     n_trials : int

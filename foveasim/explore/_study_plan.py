@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from foveasim.arrays import check_count
-from foveasim.config import files_from, put_setting, validated
+from foveasim.config import check_settings, files_from, put_setting, validated
 from foveasim.documents import read_yaml
-from foveasim.errors import ParameterError
+from foveasim.errors import ConfigError, ParameterError
 from foveasim.explore._metrics import METRICS, Metric, gives, named_metrics, with_more_metrics
 from foveasim.explore._plan import MAX_POINTS, Plan, check_apart, plan_sweep, shot_of, telling
 
@@ -91,7 +91,7 @@ class StudyPlan:
 
 
 class _SearchRange(BaseModel):
-    """From a number to another: whole numbers where all that are given are whole, such as 2 and not 2.0."""
+    """From a number to another: whole numbers where the setting takes no others."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     low: _Number = Field(alias="from")
@@ -123,8 +123,8 @@ def read_study(path: str | Path, *, metrics: Sequence[str] = (), n_trials: int |
     ----------
     path : path
         With the keys ``shot`` (a file beside it, or the settings themselves), ``search`` (settings' paths to
-        ``{from: 2, to: 16, step: 2}``, to ``{from: 0.5, to: 4.0, spacing: geometric}``, or to a list of choices; between
-        numbers that are all written as whole ones only whole ones are tried), ``objectives`` (results' names to ``maximize`` or
+        ``{from: 2, to: 16, step: 2}``, to ``{from: 0.5, to: 4, spacing: geometric}``, or to a list of choices; of settings that
+        are whole numbers only such are tried), ``objectives`` (results' names to ``maximize`` or
         ``minimize``), ``trials``, ``constraints`` (results' names to ``[low, high]``, either of them ``null``), ``seed``,
         ``metrics``, ``name``, and ``set`` (settings to be replaced in all trials). The file names metrics of :data:`METRICS`
         only: a file never makes the program import code.
@@ -227,7 +227,7 @@ def plan_study(
     check_apart(plans[0].source, search, "be searched")
     return StudyPlan(
         base=plans[0],
-        search=dict(search),
+        search={path: _as_taken(plan, path, search[path]) for path, plan in zip(search, plans, strict=True)},
         objectives=dict(objectives),
         constraints=constraints,
         n_trials=n_trials,
@@ -296,6 +296,22 @@ def _ends(path: str, where: Search) -> list[Any]:
         if "step" in where and not (_is_number(where["step"]) and 0 < where["step"] <= ends[1] - ends[0]):
             raise ParameterError(path, "must have a step > 0, and no larger than the range", where["step"])
     return ends
+
+
+def _as_taken(plan: Plan, path: str, where: Search) -> Search:
+    """A range in whole numbers where the setting takes no others, and otherwise in any, however its ends are written."""
+    low, *others = _ends(path, where)
+    if isinstance(where, list) or not all(isinstance(end, int) for end in (low, *others)):
+        return where
+    settings = json.loads(json.dumps(dict(plan.settings)))
+    put_setting(plan.source, settings, path, low + 0.5)
+    try:
+        check_settings(plan.source, settings)
+    except ConfigError:
+        return where
+    if isinstance(where, Mapping):
+        return {key: float(value) if key in {"from", "to"} else value for key, value in where.items()}
+    return float(low), float(others[0])
 
 
 def _is_number(value: Any) -> bool:
