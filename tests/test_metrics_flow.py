@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import foveasim as fs
-from foveasim.errors import ParameterError
+from foveasim.errors import CoverageWarning, ParameterError
 from foveasim.metrics import estimate_flow, flow_bound, site_gradients_e_per_um
 
 GRID = fs.Grid.centred((160, 160), 0.5)
@@ -16,11 +16,11 @@ FOVEAL = fs.layout.log_polar(
 READ_E2 = 9.0
 
 
-def picture(u=0.0, v=0.0, level=60.0):
+def picture(u=0.0, v=0.0, level=60.0, grid=GRID):
     """Exact cell means of some waves that moved by (u, v), e-/µm²; at least 25 anywhere at the given level."""
     rng = np.random.default_rng(5)
-    x, y = np.meshgrid(GRID.x_um - u, GRID.y_um - v)
-    values = np.full(GRID.shape, level)
+    x, y = np.meshgrid(grid.x_um - u, grid.y_um - v)
+    values = np.full(grid.shape, level)
     for _ in range(12):
         wave = rng.normal(size=2)
         wave *= rng.uniform(0.02, 0.12) / np.hypot(*wave)
@@ -119,6 +119,60 @@ def test_regions_move_by_themselves():
 
     assert found.flow_um == pytest.approx(np.array([[0.5, 0.2], [-0.4, 0.6]]), abs=1e-4)
     assert found.bound.n_sites.sum() == FOVEAL.n_sites
+
+
+#: 24 x 24 squares of 4 µm, of which the map has 19 x 19 wholly, others partly, and others not at all.
+WIDE = fs.layout.grid(n_x=24, n_y=24, pitch_um=4.0).translate(1.3, 0.7)
+IS_WHOLE = (np.abs(WIDE.centroid_um) <= 38.0).all(axis=1)
+IS_AWAY = (np.abs(WIDE.centroid_um) >= 42.0).any(axis=1)
+
+
+def test_sites_off_the_map_bias_nothing():
+    around = fs.Grid.centred((240, 240), 0.5)
+    values = fs.Integrator(WIDE, around, order=2)(picture(0.7, -0.4, grid=around))
+    left = (WIDE.centroid_um[:, 0] > 0.0).astype(int)
+
+    found = estimate_flow(WIDE, values, picture(), GRID, variance_e2=values, regions=left)
+
+    assert np.any(~IS_WHOLE & ~IS_AWAY)
+    assert found.flow_um == pytest.approx(np.array([[0.7, -0.4], [0.7, -0.4]]), abs=1e-3)
+    # By where they are when carried back by the shift.
+    lost = (np.abs(WIDE.centroid_um - [0.7, -0.4]) > 38.0).any(axis=1)
+    assert found.bound.n_sites.tolist() == [np.sum(~lost & (left == k)) for k in (0, 1)]
+    assert np.all(found.misfit < 1e-4)
+
+
+def test_the_misfit_counts_the_sites_on_the_map():
+    around = fs.Grid.centred((240, 240), 0.5)
+    mean = fs.Integrator(WIDE, around, order=2)(picture(0.3, 0.2, grid=around))
+    values = mean + np.random.default_rng(3).normal(size=mean.size) * np.sqrt(mean)
+
+    found = estimate_flow(WIDE, values, picture(), GRID, variance_e2=mean)
+
+    # A mean of squares of n normal numbers, two of which the flow has taken.
+    n_on = found.bound.n_sites[0]
+    assert n_on == 19 * 19
+    assert found.misfit[0] == pytest.approx(1.0 - 2.0 / n_on, abs=4.0 * np.sqrt(2.0 / n_on))
+
+
+def test_a_region_off_the_map_is_not_known():
+    labels = IS_AWAY.astype(int)
+    values = np.full(WIDE.n_sites, 900.0)
+
+    found = estimate_flow(WIDE, values, picture(), GRID, variance_e2=values, regions=labels)
+
+    assert found.bound.n_sites[1] == 0
+    assert np.isnan(found.flow_um[1]).all()
+    assert np.isnan(found.misfit[1])
+    assert np.isinf(found.bound.sigma_um[1]).all()
+
+
+def test_gradients_of_sites_off_the_map_are_nothing_and_it_is_told():
+    with pytest.warns(CoverageWarning, match=f"{np.sum(~IS_WHOLE)} of 576 photosites lie partly or wholly off the map"):
+        gradient = site_gradients_e_per_um(WIDE, picture(), GRID)
+
+    assert np.all(gradient[~IS_WHOLE] == 0.0)
+    assert np.array_equal(gradient[IS_WHOLE], site_gradients_e_per_um(WIDE[IS_WHOLE], picture(), GRID))
 
 
 def test_along_an_edge_nothing_is_known():

@@ -7,13 +7,14 @@ integral of the picture's gradient over the site. That is all that a site can te
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Ints, as_numbers, check_count, check_number, finite_array, read_only
-from foveasim.errors import ParameterError
+from foveasim.arrays import Bools, Floats, Ints, as_numbers, check_count, check_number, finite_array, read_only
+from foveasim.errors import CoverageWarning, ParameterError
 from foveasim.fields import Grid
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
@@ -22,6 +23,8 @@ __all__ = ["FlowBound", "FlowEstimate", "estimate_flow", "flow_bound", "site_gra
 
 #: A direction about which there is less than this share of the other's information has none.
 LEAST_INFORMATION = 1e-12
+#: A site of which more than this share lies off the map tells nothing: what was there is not known.
+OFF_SHARE = 1e-9
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -34,6 +37,7 @@ class FlowBound:
     regions : (n_region,) int64
         Their labels, sorted.
     n_sites : (n_region,) int64
+        That tell of it: of an estimate, those that lie wholly on the map.
     information_per_um2 : (n_region, 2, 2) float64, 1/µm²
         Fisher information of (u, v): ``Σ g gᵀ / var``.
     """
@@ -69,7 +73,8 @@ class FlowEstimate:
     bound : FlowBound
         At the estimate.
     misfit : (n_region,) float64
-        Mean of the squared residuals over their variances: about 1 where the model holds.
+        Mean of the squared residuals over their variances, of the sites on the map: about 1 where the model holds. NaN where
+        there are none.
     """
 
     regions: Ints
@@ -96,15 +101,30 @@ def site_gradients_e_per_um(
     Returns
     -------
     gradient : (n_site, 2) float64, e-/µm
-        Along x and y.
+        Along x and y; 0 for sites that lie partly or wholly off the map, which tell nothing.
 
     Raises
     ------
     ParameterError
         When the map does not fit the grid, or has fewer than 5 rows or columns.
+
+    Warns
+    -----
+    CoverageWarning
+        When sites lie partly or wholly off the map.
     """
     cells = _checked_map(map_e_per_um2, grid)
-    return np.moveaxis(Integrator(layout, grid, order=2, n_threads=n_threads)(_gradients(cells, grid.pitch_um)), 0, -1)
+    integrator = Integrator(layout, grid, order=2, n_threads=n_threads)
+    is_on = _is_on_map(integrator, layout)
+    if not is_on.all():
+        warnings.warn(
+            f"{np.count_nonzero(~is_on):,} of {layout.n_sites:,} photosites lie partly or wholly off the map, and are taken to "
+            "tell nothing: take a larger map, or fewer sites",
+            CoverageWarning,
+            stacklevel=2,
+        )
+    gradient = np.moveaxis(integrator(_gradients(cells, grid.pitch_um)), 0, -1)
+    return np.where(is_on[:, np.newaxis], gradient, 0.0)
 
 
 def flow_bound(gradient_e_per_um: ArrayLike, variance_e2: ArrayLike, *, regions: ArrayLike | None = None) -> FlowBound:
@@ -138,7 +158,7 @@ def flow_bound(gradient_e_per_um: ArrayLike, variance_e2: ArrayLike, *, regions:
     if gradient.shape[1] != 2:
         raise ParameterError("gradient_e_per_um", f"must have the shape (n_site, 2), got {gradient.shape}")
     variance = _per_site("variance_e2", finite_array("variance_e2", variance_e2, above=0.0), len(gradient))
-    return _bound(gradient, variance, _Regions(regions, len(gradient)))
+    return _bound(gradient, variance, _Regions(regions, len(gradient)), np.ones(len(gradient), bool))
 
 
 def estimate_flow(
@@ -188,7 +208,8 @@ def estimate_flow(
     Notes
     -----
     For Gaussian noise it is the estimate of maximum likelihood, and reaches the bound where noise is small against the
-    picture. Steps converge to the nearest minimum: for large shifts begin with a blurred picture.
+    picture. Steps converge to the nearest minimum: for large shifts begin with a blurred picture. Sites whose outlines,
+    carried back, lie partly or wholly off the map are left out: what they should see is not known.
     """
     cells = _checked_map(map_e_per_um2, grid)
     maps = np.concatenate((cells[np.newaxis], _gradients(cells, grid.pitch_um)))
@@ -203,9 +224,12 @@ def estimate_flow(
         # The picture moved by u, seen by a site, is the picture seen by the site moved by -u.
         moved_um = np.repeat(groups.of_sites(flow_um), vertices_of_site, axis=0)
         carried = Layout(layout.xy_um - moved_um, layout.ring_offsets, layout.site_offsets)
-        expected, *gradient = Integrator(carried, grid, order=2, n_threads=n_threads)(maps)
-        slope, residual = np.stack(gradient, axis=1), values - expected
-        bound = _bound(slope, variance, groups)
+        integrator = Integrator(carried, grid, order=2, n_threads=n_threads)
+        is_on = _is_on_map(integrator, carried)
+        expected, *gradient = integrator(maps)
+        slope = np.where(is_on[:, np.newaxis], np.stack(gradient, axis=1), 0.0)
+        residual = np.where(is_on, values - expected, 0.0)
+        bound = _bound(slope, variance, groups, is_on)
         if step == n_steps:
             break
         score = -groups.sums(slope * (residual / variance)[:, np.newaxis])
@@ -216,11 +240,12 @@ def estimate_flow(
         if n_steps > 1 and np.abs(change_um).max(initial=0.0) <= tolerance_um:
             break
     flow_um[~np.isfinite(bound.covariance_um2).all(axis=(1, 2))] = np.nan
+    misfit = groups.sums((residual**2 / variance)[:, np.newaxis])[:, 0] / np.maximum(bound.n_sites, 1)
     return FlowEstimate(
         regions=bound.regions,
         flow_um=read_only(flow_um),
         bound=bound,
-        misfit=read_only(groups.sums((residual**2 / variance)[:, np.newaxis])[:, 0] / groups.n_sites),
+        misfit=read_only(np.where(bound.n_sites > 0, misfit, np.nan)),
     )
 
 
@@ -236,7 +261,10 @@ class _Regions:
         self._n_all = n_sites
         self._used = np.flatnonzero(labels >= 0)
         self.labels, self._position = np.unique(labels[self._used].astype(np.int64), return_inverse=True)
-        self.n_sites = np.bincount(self._position, minlength=self.labels.size).astype(np.int64)
+
+    def counts(self, is_counted: Bools) -> Ints:
+        """Sites of each region that count, (n_region,)."""
+        return np.bincount(self._position[is_counted[self._used]], minlength=self.labels.size).astype(np.int64)
 
     def sums(self, values: Floats) -> Floats:
         """(n_region, k) of (n_site, k)."""
@@ -270,14 +298,21 @@ def _gradients(values: Floats, pitch_um: float) -> Floats:
     return slopes
 
 
-def _bound(gradient: Floats, variance_e2: Floats, groups: _Regions) -> FlowBound:
+def _is_on_map(integrator: Integrator, layout: Layout) -> Bools:
+    """Sites that lie wholly on the map, (n_site,)."""
+    return np.asarray(integrator.uncovered_um2 <= OFF_SHARE * layout.area_um2)
+
+
+def _bound(gradient: Floats, variance_e2: Floats, groups: _Regions, is_counted: Bools) -> FlowBound:
     gx, gy = np.moveaxis(gradient, 1, 0)
     xx, xy, yy = np.moveaxis(
         groups.sums(np.stack((gx * gx, gx * gy, gy * gy), axis=1) / variance_e2[:, np.newaxis]), 1, 0
     )
     information = np.stack((np.stack((xx, xy), axis=1), np.stack((xy, yy), axis=1)), axis=1)
     return FlowBound(
-        regions=read_only(groups.labels), n_sites=read_only(groups.n_sites), information_per_um2=read_only(information)
+        regions=read_only(groups.labels),
+        n_sites=read_only(groups.counts(is_counted)),
+        information_per_um2=read_only(information),
     )
 
 
