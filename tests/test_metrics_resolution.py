@@ -236,6 +236,154 @@ def test_windows_and_bins_change_little():
         assert np.abs(slanted_edge_mtf(SQUARES, values, frequency_per_mm=f, **options).mtf - plain.mtf).max() < 0.005
 
 
+GRID = fs.layout.grid(n_x=100, n_y=100, pitch_um=3.0)
+
+
+def squares_at_an_edge(angle_deg=5.0, sigma_um=1.0):
+    """Means over the sites of GRID of an edge from 0 to 1 with a Gaussian blur, by quadrature, and the closed form of the MTF."""
+    from scipy.special import ndtr
+
+    across = np.array([np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))])
+    nodes, shares = np.polynomial.legendre.leggauss(8)
+    values = np.zeros(GRID.n_sites)
+    for i, j in np.ndindex(8, 8):
+        place = (GRID.centroid_um + 1.5 * np.array([nodes[i], nodes[j]])) @ across
+        values += 0.25 * shares[i] * shares[j] * ndtr(place / sigma_um)
+
+    def mtf(frequency_per_mm):
+        box = np.prod(np.sinc(3e-3 * np.multiply.outer(frequency_per_mm, across)), axis=1)
+        return np.abs(box) * np.exp(-2.0 * (np.pi * 1e-3 * sigma_um * frequency_per_mm) ** 2)
+
+    return values, mtf
+
+
+def plain_standard(picture, pitch_um, frequency_per_mm):
+    """ISO 12233's e-SFR on rows of a grid: lines' centroids, four bins a pixel, differences, a bell, and a Fourier sum."""
+    n_y, n_x = picture.shape
+    x, y = np.arange(n_x), np.arange(n_y)
+    rise = np.gradient(picture, axis=1)
+    middle = np.full(n_y, 0.5 * (n_x - 1))
+    for _ in range(2):
+        bell = 0.54 + 0.46 * np.cos(2.0 * np.pi * (x - middle[:, None]) / n_x)
+        line = np.polyfit(y, (rise * bell * x).sum(axis=1) / (rise * bell).sum(axis=1), 1)
+        middle = np.polyval(line, y)
+    k = np.floor(4.0 * (x - middle[:, None])).astype(int)
+    first = k.min()
+    count = np.bincount((k - first).ravel())
+    profile = np.bincount((k - first).ravel(), weights=picture.ravel()) / np.maximum(count, 1)
+    profile = np.interp(np.arange(count.size), np.flatnonzero(count), profile[count > 0])
+    at = np.arange(count.size - 1) + first + 1.0
+    spread = np.diff(profile) * (0.54 + 0.46 * np.cos(np.pi * at / np.abs(at).max()))
+    # Distances are along x; across the edge they are shorter.
+    share = 1e-3 * frequency_per_mm * pitch_um * np.cos(np.arctan(line[0]))
+    found = np.abs(np.exp(-0.5j * np.pi * np.multiply.outer(share, at)) @ spread) / spread.sum()
+    return found / np.sinc(share / 4.0)
+
+
+def test_under_noise_the_error_is_less_than_the_plain_standards_by_a_third():
+    values, mtf = squares_at_an_edge()
+    f = np.linspace(0.0, 500.0 / 3.0, 51)
+    rng = np.random.default_rng(4)
+    ours, plain = [], []
+    for _ in range(40):
+        noisy = values + rng.normal(0.0, 1.0 / 50.0, values.size)
+        ours.append(slanted_edge_mtf(GRID, noisy, frequency_per_mm=f).mtf - mtf(f))
+        plain.append(plain_standard(noisy.reshape(100, 100), 3.0, f) - mtf(f))
+
+    # The plain one is right but for its noise.
+    assert np.abs(plain_standard(values.reshape(100, 100), 3.0, f) - mtf(f)).max() < 0.02
+    assert np.sqrt(np.mean(np.square(ours))) < 2.0 / 3.0 * np.sqrt(np.mean(np.square(plain)))
+    assert np.abs(slanted_edge_mtf(GRID, values, frequency_per_mm=f).mtf - mtf(f)).max() < 0.002
+
+
+def test_the_mtf_scatters_by_what_it_says():
+    values, mtf = squares_at_an_edge()
+    f = np.array([0.0, 20.0, 60.0, 100.0, 140.0, 166.0])
+    rng, n_runs = np.random.default_rng(9), 200
+    # Noisier in white, as of photons.
+    noise = 0.02 * np.sqrt(0.3 + values)
+    draws = [
+        slanted_edge_mtf(GRID, values + noise * rng.normal(size=values.size), frequency_per_mm=f) for _ in range(n_runs)
+    ]
+    found, told = np.array([one.mtf for one in draws]), np.array([one.mtf_sigma for one in draws])
+    scatter, mean = found.std(axis=0, ddof=1), np.sqrt(np.square(told).mean(axis=0))
+
+    assert mtf(f)[-1] > 10.0 * mean[-1]
+    assert (scatter[0], mean[0]) == pytest.approx((0.0, 0.0), abs=1e-12)
+    # A standard deviation of n numbers is known to 1 / sqrt(2 n).
+    assert scatter[1:] == pytest.approx(mean[1:], rel=5.0 / np.sqrt(2.0 * n_runs))
+    assert np.all(np.abs(found.mean(axis=0) - mtf(f))[1:] < 5.0 * mean[1:] / np.sqrt(n_runs) + 5e-4)
+    assert slanted_edge_mtf(GRID, values).mtf_sigma.max() < 0.002
+
+
+@pytest.mark.parametrize("kind", ["box of 2 pitches", "box of 20 pitches", "two-sided exponential", "core and halo"])
+def test_wide_bins_far_out_lose_nothing_of_wide_edges(kind):
+    from scipy.special import ndtr
+
+    layout = fs.layout.grid(n_x=150, n_y=150, pitch_um=2.0)
+    d = layout.centroid_um @ [np.cos(np.deg2rad(5.0)), np.sin(np.deg2rad(5.0))]
+
+    def gauss(f, sigma_um):
+        return np.exp(-2.0 * (np.pi * 1e-3 * sigma_um * f) ** 2)
+
+    values, expected = {
+        "box of 2 pitches": (np.clip(d / 4.0 + 0.5, 0.0, 1.0), lambda f: np.abs(np.sinc(4e-3 * f))),
+        "box of 20 pitches": (np.clip(d / 40.0 + 0.5, 0.0, 1.0), lambda f: np.abs(np.sinc(40e-3 * f))),
+        "two-sided exponential": (
+            0.5 + 0.5 * np.sign(d) * (1.0 - np.exp(-np.abs(d) / 6.0)),
+            lambda f: 1.0 / (1.0 + (2e-3 * np.pi * 6.0 * f) ** 2),
+        ),
+        "core and halo": (0.8 * ndtr(d) + 0.2 * ndtr(d / 12.0), lambda f: 0.8 * gauss(f, 1.0) + 0.2 * gauss(f, 12.0)),
+    }[kind]
+
+    found = slanted_edge_mtf(layout, 100.0 + 100.0 * values)
+
+    assert np.abs(found.mtf - expected(found.frequency_per_mm)).max() < 0.01
+
+
+@pytest.mark.parametrize("bin_um", [0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0])
+def test_what_bins_of_any_width_tell_is_right(bin_um):
+    values, mtf = squares_at_an_edge()
+
+    found = slanted_edge_mtf(GRID, values, bin_um=bin_um)
+
+    highest = min(1000.0 / 3.0, 250.0 / bin_um)
+    assert found.frequency_per_mm[-1] == pytest.approx(highest)
+    assert np.abs(found.mtf - mtf(found.frequency_per_mm)).max() < 0.012
+    with pytest.raises(
+        ParameterError, match=f"'frequency_per_mm' must be <= {250.0 / bin_um:.4g} with bins of {bin_um:g} µm"
+    ):
+        slanted_edge_mtf(GRID, values, bin_um=bin_um, frequency_per_mm=[0.0, 251.0 / bin_um])
+
+
+def test_what_an_edge_cannot_tell_is_refused():
+    values, _ = squares_at_an_edge()
+    blurred, _ = squares_at_an_edge(sigma_um=9.0)
+    for options, sentence in (
+        (
+            {"frequency_per_mm": [0.0, 1e5]},
+            "'frequency_per_mm' must be <= 333.3 with bins of 0.75 µm, got 100000.* narrower",
+        ),
+        ({"frequency_per_mm": [[0.0, 1.0], [2.0, 3.0]]}, "'frequency_per_mm' must be rising numbers"),
+        ({"frequency_per_mm": [0.0, 20.0, 10.0]}, "'frequency_per_mm' must be rising numbers"),
+        ({"frequency_per_mm": []}, "'frequency_per_mm' must be rising numbers"),
+        ({"bin_um": 3.1}, "'bin_um' must be <= 3, got 3.1 µm; one pitch is the most"),
+        ({"reach_um": 2.0}, "'reach_um' must be >= 15, got 2.0 µm; five pitches of 3 µm"),
+    ):
+        with pytest.raises(ParameterError, match=sentence):
+            slanted_edge_mtf(GRID, values, **options)
+    with pytest.raises(ParameterError, match=r"'reach_um' must be >= 25\.6.* twice the edge's width of 12\.8"):
+        slanted_edge_mtf(GRID, blurred, reach_um=20.0)
+
+
+def test_values_about_0_have_an_mtf_and_no_contrast():
+    values, _ = squares_at_an_edge()
+    plain, about_0 = slanted_edge_mtf(GRID, values), slanted_edge_mtf(GRID, 100.0 * values - 50.0)
+
+    assert about_0.contrast == np.inf
+    assert about_0.mtf == pytest.approx(plain.mtf, abs=1e-4)
+
+
 def test_what_is_no_edge_is_told():
     rng = np.random.default_rng(0)
     x, y = SQUARES.centroid_um[:, 0], SQUARES.centroid_um[:, 1]
@@ -303,6 +451,33 @@ def test_filters_of_a_mosaic_have_nyquist_frequencies_of_their_own():
         assert found[layout.channel == channel] == pytest.approx(expected)
     with pytest.raises(ParameterError, match="'per_channel' goes with by='neighbours'"):
         nyquist_per_mm(layout, by="area", per_channel=True)
+
+
+def test_sites_at_one_place_have_no_nyquist_frequency():
+    one = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0)
+    twice = fs.Layout.from_rectangles(np.concatenate((one.centroid_um, one.centroid_um[:1])), 1.0)
+    found = nyquist_per_mm(twice)
+
+    assert np.flatnonzero(np.isnan(found)).tolist() == [0, 16]
+    assert found[5] == pytest.approx(250.0)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        nyquist_per_mm,
+        neighbour_spacing_um,
+        nyquist_against_eccentricity,
+        lambda layout: nyquist_per_mm(layout, by="area"),
+        lambda layout: polygon_mtf(layout, [100.0]),
+        lambda layout: slanted_edge_mtf(layout, [1.0]),
+        fs.metrics.sampling_spectrum,
+        fs.metrics.size_classes_um,
+    ],
+)
+def test_what_is_no_layout_is_told(call):
+    with pytest.raises(ParameterError, match=r"'layout' must be a foveasim\.Layout, got a NoneType"):
+        call(None)
 
 
 def test_a_row_and_a_lone_site_have_no_nyquist_frequency_but_an_area():

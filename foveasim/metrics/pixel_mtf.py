@@ -9,6 +9,7 @@ from foveasim.arrays import Floats, finite_array
 from foveasim.compiled import kernels
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
+from foveasim.metrics.sampling import require_layout
 from foveasim.parallel import each, thread_count
 from foveasim.units import per_um_from_per_mm
 
@@ -79,6 +80,7 @@ def polygon_otf(layout: Layout, wave_per_mm: ArrayLike, *, n_threads: int | None
     >>> np.round(otf.real, 4)
     array([[1.    , 0.6366, 0.4053]])
     """
+    require_layout(layout)
     waves = finite_array("wave_per_mm", wave_per_mm, ndim=2)
     if waves.shape[1] != 2:
         raise ParameterError("wave_per_mm", f"must have the shape (n_wave, 2), got {waves.shape}")

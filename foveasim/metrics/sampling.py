@@ -13,7 +13,13 @@ from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 from foveasim.units import per_mm_from_per_um
 
-__all__ = ["EccentricityTable", "neighbour_spacing_um", "nyquist_against_eccentricity", "nyquist_per_mm"]
+__all__ = [
+    "EccentricityTable",
+    "neighbour_spacing_um",
+    "nyquist_against_eccentricity",
+    "nyquist_per_mm",
+    "require_layout",
+]
 
 #: The second neighbour is at least 30 degrees off the line through the first: in a lattice's reduced basis it is 60 or more.
 LEAST_SINE = 0.5
@@ -49,7 +55,7 @@ def nyquist_per_mm(
     Returns
     -------
     nyquist : (n_site,) float64, 1/mm
-        Line pairs per mm. NaN where there are no such neighbours, as in a single row.
+        Line pairs per mm. NaN where there are no such neighbours, as in a single row, or where one is at the same place.
 
     Raises
     ------
@@ -64,6 +70,7 @@ def nyquist_per_mm(
     >>> np.unique(nyquist_per_mm(hexagonal(n_columns=4, n_rows=4, pitch_um=2.0)).round(3))
     array([288.675])
     """
+    require_layout(layout)
     if check_choice("by", by, ("neighbours", "area")) == "area":
         if per_channel:
             raise ParameterError("per_channel", "goes with by='neighbours': an area does not tell how far its like is")
@@ -84,8 +91,10 @@ def neighbour_spacing_um(layout: Layout, *, per_channel: bool = False) -> tuple[
     Returns
     -------
     nearest_um, row_um : (n_site,) float64, µm
-        Between centroids; their product is the area of a lattice's cell. NaN where there is no such neighbour.
+        Between centroids; their product is the area of a lattice's cell. NaN where there is no such neighbour; sites with
+        another one at the same place have a distance of 0 and no row.
     """
+    require_layout(layout)
     nearest_um, row_um = np.full(layout.n_sites, np.nan), np.full(layout.n_sites, np.nan)
     channel = layout.channel if per_channel else np.zeros(layout.n_sites, np.int64)
     for c in np.unique(channel):
@@ -113,7 +122,8 @@ def _spacing_um(xy_um: Floats) -> tuple[Floats, Floats]:
             step_um = xy_um[ids] - xy_um[sites, np.newaxis]
             along = step_um[:, 0] / np.maximum(distance_um[:, :1], np.finfo(float).tiny)
             off_um = np.abs(along[:, :1] * step_um[..., 1] - along[:, 1:] * step_um[..., 0])
-            is_beside = off_um >= LEAST_SINE * distance_um
+            # One at the same place gives no direction.
+            is_beside = (off_um >= LEAST_SINE * distance_um) & (distance_um[:, :1] > 0.0)
             first = is_beside.argmax(axis=1)
             nearest_um[sites] = distance_um[:, 0]
             found = np.arange(sites.size)
@@ -214,6 +224,7 @@ def nyquist_against_eccentricity(
     ParameterError
         When an argument is out of range, or the layout has no sites.
     """
+    require_layout(layout)
     centre = finite_array("centre_um", centre_um, ndim=1)
     if centre.size != 2:
         raise ParameterError("centre_um", "must be two numbers (x, y)", centre_um, "µm")
@@ -244,6 +255,19 @@ def nyquist_against_eccentricity(
         size_at_centre_um=at_centre_um,
         growth_fraction=slope,
     )
+
+
+def require_layout(layout: object) -> None:
+    """
+    Pass a layout.
+
+    Raises
+    ------
+    ParameterError
+        When it is something else.
+    """
+    if not isinstance(layout, Layout):
+        raise ParameterError("layout", f"must be a foveasim.Layout, got a {type(layout).__name__}")
 
 
 def _low_middle_high(values: Floats, position: NDArray[np.intp], n_bins: int) -> tuple[Floats, Floats, Floats]:

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim.arrays import (
     Bools,
     Floats,
+    Ints,
     as_numbers,
     check_choice,
     check_length_um,
@@ -25,6 +26,7 @@ from foveasim.arrays import (
 )
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
+from foveasim.metrics.sampling import require_layout
 from foveasim.units import per_mm_from_per_um, per_um_from_per_mm
 
 __all__ = ["EdgeMtf", "slanted_edge_mtf"]
@@ -35,14 +37,23 @@ BINS_PER_PITCH = 4
 LEAST_SITES, LEAST_REACH_PITCHES = 50, 5.0
 #: (white - black) / (white + black) below which black and white are the same.
 LEAST_CONTRAST = 0.02
+#: A sum of black and white below this share of their difference is rounding.
+NO_SUM = 1e-9
 #: Share of the values' variance that one straight edge must explain.
 LEAST_EXPLAINED = 0.3
+#: Bins that narrow reach so far, in pitches and in widths of the edge; from there on each widens by this share of the distance.
+#: What lies so far out is smooth, and its noise at high frequencies would drown the rest.
+NARROW_PITCHES, NARROW_WIDTHS, WIDENING = 3.0, 2.0, 0.5
+#: A profile that reaches less far than so many widths of the edge, the error function's, ends on its slope.
+LEAST_REACH_WIDTHS = 2.0
+#: Bins on either side whose sites tell together how much values scatter.
+SCATTER_BINS = 4
+#: Below so many bins to a period the bins' aliases are as large as what is asked for.
+BINS_PER_PERIOD = 4
 #: An edge blurred over more than this share of the region is a ramp.
 WIDEST_SHARE = 0.25
 #: Residuals beyond this share of the step count less and less: a defect, or another edge at the border.
 SOFT_SHARE = 0.1
-#: Corrections of the differences and bins beyond this are left at it, as the standard does.
-MOST_CORRECTION = 10.0
 #: Frequencies of a result that asks for none, up to one a pitch, twice the Nyquist frequency of a square grid.
 N_FREQUENCIES = 101
 #: Levels of the histogram that tells black from white.
@@ -60,14 +71,17 @@ class EdgeMtf:
         Line pairs per mm on the sensor, across the edge.
     mtf : (n_frequency,) float64
         1 at frequency 0.
+    mtf_sigma : (n_frequency,) float64
+        Its standard deviation, as far as it comes of noise that differs from site to site; told from the scatter of the sites
+        about the profile. Where the MTF itself is no larger, its mean is too high.
     angle_deg : float, degrees
         Of the edge from the vertical, counter-clockwise, from -180 to 180: 0 has white to the right of it, 90 above it.
     offset_um : float, µm
         Distance of the edge from the origin, towards white.
     contrast : float
-        (white - black) / (white + black).
+        (white - black) / (white + black); infinite where black is as far below 0 as white is above.
     bin_um, pitch_um : float, µm
-        Width of a bin, and the reference pitch: the median distance of a site from its nearest neighbour.
+        Width of a bin near the edge, and the reference pitch: the median distance of a site from its nearest neighbour.
     distance_um : (n_bin,) float64, µm
         Mean distance of each bin's sites from the edge, black first.
     profile : (n_bin,) float64
@@ -78,6 +92,7 @@ class EdgeMtf:
 
     frequency_per_mm: Floats
     mtf: Floats
+    mtf_sigma: Floats
     angle_deg: float
     offset_um: float
     contrast: float
@@ -127,15 +142,17 @@ def slanted_edge_mtf(
         Sites to take: a region where one edge is all there is, one filter of a mosaic, or an annulus of a foveal layout, whose
         sites are of about one size. All by default.
     bin_um : float, optional, µm
-        Width of the bins of the edge spread function; a quarter of the reference pitch by default.
+        Width of the bins of the edge spread function near the edge; a quarter of the reference pitch by default, one
+        pitch at most.
     reach_um : float, optional, µm
-        How far from the edge sites are looked at; by default as far as there are sites in every bin on both sides.
+        How far from the edge sites are looked at; by default as far as there are sites in every bin on both sides. Light that
+        falls off over the region is taken for a part of the edge: give a shorter reach then, five pitches at least.
     frequency_per_mm : (n,), optional, 1/mm
-        By default from 0 to one line pair a pitch in 100 steps.
+        Rising, up to one line pair in four bins. By default from 0 to there, or to one line pair a pitch, in 100 steps.
     window : {"tukey", "hamming", "none"}
-        By which the line spread function is multiplied, to quieten noise far from the edge: flat over the middle half of the
-        reach with cosine ends; the bell of the standard's first editions; or none. The narrower the window, the more of the
-        light that a lens spreads far is left out, and the higher the MTF comes out.
+        By which the line spread function is multiplied: flat over the middle half of the reach with cosine ends; the bell of
+        the standard's first editions; or none. The narrower the window, the more of the light that a lens spreads far is left
+        out, and the higher the MTF comes out.
 
     Returns
     -------
@@ -156,6 +173,12 @@ def slanted_edge_mtf(
     the bin's own ``sinc(f b)``, and right for any others. The line spread function is the difference of neighbouring bins, at
     places d apart; that multiplies its spectrum by ``sinc(f d)``, which is divided out, as the standard does.
 
+    Bins are narrow up to three pitches or twice the edge's width from it, and from there on half as wide as the way beyond. So
+    far out the line spread function is smooth, as that of a lens is: all of its light is counted, and of its noise little. Its
+    differences are spread over their steps, which multiplies their spectrum by ``sinc(f d)`` once more. Of 100
+    by 100 squares with an edge of 50 and of 20 times the noise, the MTF up to the Nyquist frequency is off by 0.008 and 0.021
+    (root mean square), four tenths of what narrow bins as far as the region reaches have.
+
     The MTF is that across the edge, of the sites near it. It contains the sites' own shape (:func:`polygon_mtf`), the lens,
     diffusion between sites, and the chart's own pixels.
 
@@ -163,6 +186,7 @@ def slanted_edge_mtf(
     ----------
     ISO 12233:2023, Photography: Electronic still picture imaging: Resolution and spatial frequency responses, annex D (e-SFR).
     """
+    require_layout(layout)
     site_values = np.asarray(as_numbers("values", values), np.float64)
     if site_values.shape != (layout.n_sites,):
         raise ParameterError("values", f"must be one for each of the {layout.n_sites} sites, got {site_values.shape}")
@@ -173,27 +197,19 @@ def slanted_edge_mtf(
         raise ParameterError("where", f"must leave at least {LEAST_SITES} sites", n_used)
     xy_um, light, area_um2 = layout.centroid_um[is_used], site_values[is_used], layout.area_um2[is_used]
     pitch_um = _pitch_um(xy_um)
-    bin_um = pitch_um / BINS_PER_PITCH if bin_um is None else check_length_um("bin_um", bin_um)
+    if bin_um is None:
+        bin_um = pitch_um / BINS_PER_PITCH
+    else:
+        bin_um = check_length_um("bin_um", bin_um, at_most=pitch_um, cure="one pitch is the most")
+    frequency = _frequencies_per_mm(frequency_per_mm, bin_um, pitch_um)
     edge = _find_edge(xy_um, light, pitch_um)
     across = np.array([np.cos(edge.angle_rad), np.sin(edge.angle_rad)])
-    bins = _binned(xy_um @ across - edge.offset_um, light, area_um2, bin_um, reach_um, pitch_um)
-
-    line_spread = np.diff(bins.profile)
-    at_um = 0.5 * (bins.distance_um[1:] + bins.distance_um[:-1])
-    line_spread *= _window(window, at_um / max(-bins.distance_um[0], bins.distance_um[-1]))
-    if frequency_per_mm is None:
-        frequency = per_mm_from_per_um(np.linspace(0.0, 1.0 / pitch_um, N_FREQUENCIES))
-    else:
-        frequency = np.atleast_1d(finite_array("frequency_per_mm", frequency_per_mm, at_least=0.0)).copy()
-    cycles = per_um_from_per_mm(frequency)
-    spectrum = np.exp(-2j * np.pi * np.multiply.outer(cycles, at_um)) @ line_spread
-    # What a difference over a step leaves of each frequency, mean over the differences by their sizes.
-    size = np.abs(line_spread) / np.abs(line_spread).sum()
-    left = np.sinc(np.multiply.outer(cycles, np.diff(bins.distance_um))) @ size
-    correction = 1.0 / np.maximum(left, 1.0 / MOST_CORRECTION)
+    bins = _binned(xy_um @ across - edge.offset_um, light, area_um2, bin_um, reach_um, pitch_um, edge.width_um)
+    mtf, sigma = _mtf(bins, window, per_um_from_per_mm(frequency))
     return EdgeMtf(
         frequency_per_mm=read_only(frequency),
-        mtf=read_only(np.abs(spectrum) / line_spread.sum() * correction),
+        mtf=read_only(mtf),
+        mtf_sigma=read_only(sigma),
         angle_deg=float(np.rad2deg(edge.angle_rad)),
         offset_um=edge.offset_um,
         contrast=edge.contrast,
@@ -216,20 +232,62 @@ def _mask(where: ArrayLike | None, n_sites: int) -> Bools:
     return mask
 
 
+def _frequencies_per_mm(frequency_per_mm: ArrayLike | None, bin_um: float, pitch_um: float) -> Floats:
+    """Those asked for, checked, or the default ones."""
+    highest = float(per_mm_from_per_um(1.0 / (BINS_PER_PERIOD * bin_um)))
+    if frequency_per_mm is None:
+        return np.linspace(0.0, min(highest, float(per_mm_from_per_um(1.0 / pitch_um))), N_FREQUENCIES)
+    frequency = np.atleast_1d(finite_array("frequency_per_mm", frequency_per_mm, at_least=0.0)).copy()
+    if frequency.ndim != 1 or frequency.size == 0 or np.any(np.diff(frequency) <= 0.0):
+        raise ParameterError("frequency_per_mm", "must be rising numbers, (n,)", frequency_per_mm, "1/mm")
+    if frequency[-1] > highest * (1.0 + 1e-9):
+        raise ParameterError(
+            "frequency_per_mm",
+            f"must be <= {highest:.4g} with bins of {bin_um:.4g} µm",
+            float(frequency[-1]),
+            "1/mm",
+            "take narrower bins (bin_um)",
+        )
+    return frequency
+
+
 def _pitch_um(xy_um: Floats) -> float:
     from scipy.spatial import cKDTree
 
     return float(np.median(cKDTree(xy_um).query(xy_um, k=[2])[0]))
 
 
+def _mtf(bins: _Bins, window: str, cycles_per_um: Floats) -> tuple[Floats, Floats]:
+    """The MTF and its standard deviation, (n_frequency,)."""
+    rise, step_um = np.diff(bins.profile), np.diff(bins.distance_um)
+    at_um = 0.5 * (bins.distance_um[1:] + bins.distance_um[:-1])
+    weight = _window(window, at_um / max(-bins.distance_um[0], bins.distance_um[-1]))
+    # What a difference over a step leaves of each frequency, for the narrow ones in the mean by their sizes.
+    left = np.sinc(np.multiply.outer(cycles_per_um, step_um))
+    is_narrow = bins.is_narrow[1:] & bins.is_narrow[:-1]
+    size = np.abs(rise * weight) * is_narrow
+    mean_left = (left @ (size / size.sum()))[:, np.newaxis]
+    wave = np.exp(-2j * np.pi * np.multiply.outer(cycles_per_um, at_um))
+    kernel = weight * wave * np.where(is_narrow, 1.0 / mean_left, left)
+    spectrum, total = kernel @ rise, float(weight @ rise)
+    modulus = np.abs(spectrum)
+    mtf = modulus / total
+    # To first order in the noise of the profile: a bin is the end of one rise and the beginning of the next.
+    phase = spectrum.conj() / np.maximum(modulus, np.finfo(float).tiny)
+    of_rise = ((phase[:, np.newaxis] * kernel).real - np.multiply.outer(mtf, weight)) / total
+    of_bin = -np.diff(of_rise, axis=1, prepend=0.0, append=0.0)
+    return mtf, np.sqrt(np.square(of_bin) @ bins.variance)
+
+
 # -- the edge ------------------------------------------------------------------------------------------------------
 
 
 class _Edge(NamedTuple):
-    """Direction towards white (rad), the edge's distance from the origin in that direction, and its contrast."""
+    """Direction towards white (rad), the edge's distance from the origin in that direction, its width, and its contrast."""
 
     angle_rad: float
     offset_um: float
+    width_um: float
     contrast: float
 
 
@@ -276,7 +334,9 @@ def _find_edge(xy_um: Floats, values: Floats, pitch_um: float) -> _Edge:
             f"no edge is found: the values rise over {width * extent_um:.4g} µm, more than a quarter of the region"
         )
     low, high = black + (white - black) * low, black + (white - black) * high
-    contrast = (high - low) / max(abs(high + low), np.finfo(float).tiny)
+    # Of values around 0 a contrast has no meaning.
+    contrast = (high - low) / (high + low) if abs(high + low) > NO_SUM * (high - low) else np.inf
+    contrast = abs(contrast)
     if contrast < LEAST_CONTRAST:
         raise SimulationError(
             f"the edge has too little contrast: black is {low:.4g} and white {high:.4g}, a contrast of {contrast:.2g}, less "
@@ -284,7 +344,7 @@ def _find_edge(xy_um: Floats, values: Floats, pitch_um: float) -> _Edge:
         )
     angle = float((angle + np.pi) % (2.0 * np.pi) - np.pi)
     direction = np.array([np.cos(angle), np.sin(angle)])
-    return _Edge(angle, float(offset * extent_um + middle_um @ direction), contrast)
+    return _Edge(angle, float(offset * extent_um + middle_um @ direction), float(width * extent_um), contrast)
 
 
 def _level_between(values: Floats) -> float:
@@ -307,15 +367,23 @@ def _level_between(values: Floats) -> float:
 
 
 class _Bins(NamedTuple):
-    """Mean distances of the bins' sites, the profile there, and how many sites there are."""
+    """Mean distances of the bins' sites, the profile there and its variance, which are narrow, and how many sites there are."""
 
     distance_um: Floats
     profile: Floats
+    variance: Floats
+    is_narrow: Bools
     n_sites: int
 
 
 def _binned(
-    distance_um: Floats, values: Floats, area_um2: Floats, bin_um: float, reach_um: float | None, pitch_um: float
+    distance_um: Floats,
+    values: Floats,
+    area_um2: Floats,
+    bin_um: float,
+    reach_um: float | None,
+    pitch_um: float,
+    width_um: float,
 ) -> _Bins:
     """Edge spread function: means over bins of the distance from the edge, weighted by area."""
     # Bin 0 begins at the edge.
@@ -327,12 +395,12 @@ def _binned(
     low = int(empty[empty < 0].max(initial=first - 1)) + 1
     high = int(empty[empty >= 0].min(initial=int(k.max()) + 1)) - 1
     n_sides = min(-low, high + 1)
-    if reach_um is None:
-        least_um = LEAST_REACH_PITCHES * pitch_um
-    else:
-        least_um = check_number("reach_um", reach_um, at_least=2.0 * bin_um)
+    least_um = max(LEAST_REACH_PITCHES * pitch_um, LEAST_REACH_WIDTHS * width_um)
+    if reach_um is not None:
+        cure = f"five pitches of {pitch_um:.3g} µm, and twice the edge's width of {width_um:.3g} µm, are the least"
+        least_um = check_number("reach_um", reach_um, at_least=float(f"{least_um:.3g}"), cure=cure)
         n_sides = min(n_sides, int(np.ceil(least_um / bin_um)))
-    if n_sides * bin_um < min(least_um, reach_um or np.inf) * (1.0 - 1e-9):
+    if n_sides * bin_um < least_um * (1.0 - 1e-9):
         far_um = min(-distance_um.min(), distance_um.max())
         raise SimulationError(
             f"the edge's profile has gaps or ends {max(n_sides, 0) * bin_um:.4g} µm from it, before {least_um:.4g} µm: "
@@ -343,14 +411,44 @@ def _binned(
             )
         )
     is_in = (k >= -n_sides) & (k < n_sides)
-    position, weights = k[is_in] + n_sides, area_um2[is_in]
+    n_narrow = int(np.ceil(max(NARROW_PITCHES * pitch_um, NARROW_WIDTHS * width_um) / bin_um))
+    borders = _widening_borders(n_narrow, n_sides)
+    position = np.searchsorted(borders, k[is_in], side="right") - 1
+    weights, value = area_um2[is_in], values[is_in]
     total = np.bincount(position, weights=weights)
     mean_um = np.bincount(position, weights=weights * distance_um[is_in]) / total
-    variance_um2 = np.bincount(position, weights=weights * np.square(distance_um[is_in] - mean_um[position])) / total
-    profile = np.bincount(position, weights=weights * values[is_in]) / total
+    off_um = distance_um[is_in] - mean_um[position]
+    variance_um2 = np.bincount(position, weights=weights * np.square(off_um)) / total
+    profile = np.bincount(position, weights=weights * value) / total
     # The mean over places that vary about a middle is off from the value there by half the variance times the curvature.
     profile -= 0.5 * variance_um2 * _curvature(mean_um, profile)
-    return _Bins(mean_um, profile, int(np.count_nonzero(is_in)))
+    # What values are off from the profile's parabola at their own places is noise.
+    slope, bend = np.gradient(profile, mean_um), 0.5 * _curvature(mean_um, profile)
+    noise = value - (profile[position] + (slope[position] + bend[position] * off_um) * off_um)
+    return _Bins(
+        mean_um,
+        profile,
+        _scatter(noise, position) * np.bincount(position, weights=np.square(weights)) / np.square(total),
+        np.maximum(-borders[:-1], borders[1:]) <= n_narrow,
+        int(np.count_nonzero(is_in)),
+    )
+
+
+def _widening_borders(n_narrow: int, n_sides: int) -> Ints:
+    """Borders of the bins, in narrow ones, from -n_sides to n_sides."""
+    side = list(range(min(n_narrow, n_sides) + 1))
+    while side[-1] < n_sides:
+        step, rest = round(1.0 + max(0.0, WIDENING * (side[-1] - n_narrow))), n_sides - side[-1]
+        side.append(side[-1] + (step if rest >= 2 * step else rest))
+    return np.concatenate((-np.array(side[:0:-1], np.int64), np.array(side, np.int64)))
+
+
+def _scatter(values: Floats, position: NDArray[np.intp]) -> Floats:
+    """Variance of values about 0 in each bin, told from its neighbours too; NaN where all hold one site alone."""
+    around = np.ones(2 * SCATTER_BINS + 1)
+    squares = np.convolve(np.pad(np.bincount(position, weights=np.square(values)), SCATTER_BINS), around, "valid")
+    freedom = np.convolve(np.pad(np.bincount(position) - 1.0, SCATTER_BINS), around, "valid")
+    return np.asarray(squares / np.where(freedom > 0.5, freedom, np.nan))
 
 
 def _curvature(distance_um: Floats, profile: Floats) -> Floats:
