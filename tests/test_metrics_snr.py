@@ -86,6 +86,115 @@ def test_large_sites_saturate_first_and_a_ratio_beyond_the_well_is_never_reached
     assert np.all(np.diff(dim) < 0.0)
 
 
+EVEN = fs.layout.grid(n_x=30, n_y=30, pitch_um=3.0)
+
+
+def lit(charge_e, layout=EVEN, **options):
+    """A camera, and the light that gives each of its smallest sites a charge in EXPOSURE_S."""
+    sensor = fs.Sensor(layout, **({"capacitance_f": 2e-15, "v_sat_v": 1.0, "bits": 12, "read_noise_e": 5.0} | options))
+    shown = fs.Camera(optics=OPTICS, sensor=sensor)
+    even = fs.PowerMap.from_array(np.ones((100, 100)), pitch_um=4.0, wavelength_nm=550.0)
+    rate_e_per_s = shown.photoelectrons_per_s(even).min()
+    return shown, fs.PowerMap.from_array(
+        np.full((100, 100), charge_e / EXPOSURE_S / rate_e_per_s), pitch_um=4.0, wavelength_nm=550.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("charge_e", "share"), [(8000.0, 0.0), (9750.0, 0.0), (9850.0, 1.0), (10_000.0, 1.0), (10_300.0, 1.0), (2e5, 1.0)]
+)
+@pytest.mark.parametrize("bits", [10, 12])
+def test_a_full_well_is_saturation_where_it_cuts_off_the_noise(charge_e, share, bits):
+    # Of 10,000 e- twice the shot noise is 200.
+    shown, light = lit(charge_e, full_well_e=1e4, bits=bits)
+
+    table = snr_by_class(shown, light, exposure_s=EXPOSURE_S)
+
+    assert table.saturated_fraction.tolist() == [share]
+    # Where a site is not, it does not beat the square root of its charge by more than the little that is cut off there.
+    assert share or table.snr[0] < 1.01 * np.sqrt(charge_e)
+
+
+@pytest.mark.parametrize(("below_e", "share"), [(150.0, 1.0), (350.0, 0.0)])
+def test_the_highest_code_is_saturation_where_it_cuts_off_the_noise(below_e, share):
+    # 12,483 e- at 1 V on 2 fF, and a shot noise of 112 e-.
+    shown, light = lit(volts_to_electrons(1.0, 2e-15) - below_e)
+
+    assert snr_by_class(shown, light, exposure_s=EXPOSURE_S).saturated_fraction.tolist() == [share]
+
+
+def test_captures_tell_full_wells_by_their_electrons():
+    for charge_e, share in ((9000.0, 0.0), (10_100.0, 1.0)):
+        shown, light = lit(charge_e, full_well_e=1e4)
+        frames, dark = (
+            [shown.capture(some, exposure_s=EXPOSURE_S, seed=k, frame=k) for k in range(4)]
+            for some in (light, fs.PowerMap(0.0 * light.data, light.grid, light.wavelength_nm))
+        )
+        codes, dark_codes = (np.stack([one.code for one in some]) for some in (frames, dark))
+
+        assert measured_snr_by_class(EVEN, frames, dark).saturated_fraction.tolist() == [share]
+        given = measured_snr_by_class(EVEN, frames, dark, full_well_e=np.where(np.arange(900) < 450, 8000.0, 2e4))
+        assert given.saturated_fraction.tolist() == [0.5]
+        # Codes alone do not tell.
+        assert measured_snr_by_class(EVEN, codes, dark_codes, bits=12).saturated_fraction.tolist() == [0.0]
+        with pytest.raises(ParameterError, match="'full_well_e' goes with captures"):
+            measured_snr_by_class(EVEN, codes, dark_codes, bits=12, full_well_e=1e4)
+
+
+def test_wells_that_settings_do_not_tell_must_be_given():
+    shown, light = lit(5000.0, full_well_e=np.linspace(9e3, 1e4, 900))
+    frames = [shown.capture(light, exposure_s=EXPOSURE_S, seed=k, frame=k) for k in range(2)]
+
+    with pytest.raises(ParameterError, match="'full_well_e' must be given: the captures' settings do not tell it"):
+        measured_snr_by_class(EVEN, frames, frames)
+    table = measured_snr_by_class(EVEN, frames, frames, full_well_e=shown.sensor.full_well_e)
+    assert table.saturated_fraction.tolist() == [0.0]
+
+
+@pytest.mark.parametrize("bits", [10, 12])
+def test_the_least_light_is_found_where_rings_of_a_class_saturate(bits):
+    # Rings of a class differ by a quarter in area and more: the large ones fill up before the small ones reach the ratio.
+    layout = fs.layout.log_polar(n_sectors=6, n_rings=10, r_min_um=5.0, r_max_um=60.0)
+    shown, light = lit(2000.0, layout, full_well_e=1e4, bits=bits)
+    sensor, labels = shown.sensor, size_classes_um(layout, 3)
+    full_e = sensor.expected_electrons(shown.photoelectrons_per_s(light), EXPOSURE_S)
+    dark_dn, _ = sensor.predict(np.zeros(layout.n_sites))
+    shares = np.geomspace(1e-2, 20.0, 700)
+    told = [sensor.predict(full_e * share) for share in shares]
+
+    found_some = False
+    for snr in (50.0, 80.0, 88.0, 92.0):
+        found = light_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S, snr=snr, classes=labels)
+        for k, label in enumerate(np.unique(labels)):
+            of = labels == label
+            # By looking at all shares: the first that does. Half of the sites within 200 e- of the well do not count.
+            ratio = [(mean - dark_dn)[of].mean() / np.sqrt(variance[of].mean() + 1e-30) for mean, variance in told]
+            first = shares[np.flatnonzero(np.array(ratio) >= snr)[0]]
+            full = np.mean(first * full_e[of] > 9800.0)
+            found_some |= 0.0 < full < 0.5
+            assert found[k] == pytest.approx(np.nan if full >= 0.5 else first, rel=0.012, nan_ok=True)
+    assert found_some
+
+
+def test_a_ratio_beyond_the_well_is_never_reached():
+    shown, light = lit(2000.0, fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0), full_well_e=1e4)
+
+    assert np.isfinite(light_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S, snr=98.0)).all()
+    for snr in (103.0, 150.0, 1e4, 1e9):
+        assert np.isnan(light_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S, snr=snr)).all()
+    nothing = fs.PowerMap(0.0 * light.data, light.grid, light.wavelength_nm)
+    assert np.isnan(light_at_snr_fraction(shown, nothing, exposure_s=EXPOSURE_S)).all()
+
+
+def test_without_noise_the_least_light_is_that_of_the_first_code():
+    shown, light = lit(2000.0, read_noise_e=0.0, shot_noise="off")
+
+    found = light_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S)
+
+    # Charges are whole: the first that is a code or more.
+    assert found[0] * 2000.0 == pytest.approx(np.ceil(volts_to_electrons(1.0 / 4096, 2e-15)) - 0.5, rel=1e-3)
+
+
 def test_sizes_fall_into_classes_of_equal_ratios():
     layout = fs.layout.log_polar(n_sectors=60, min_size_um=2.0, r_max_um=380.0)
     size_um = np.sqrt(layout.area_um2)
@@ -114,5 +223,11 @@ def test_bad_input_is_told():
         measured_snr_by_class(ZONES, frames, frames[:, :7], bits=12)
     with pytest.raises(ParameterError, match="'classes' must have one label for each"):
         snr_by_class(camera(), flat(), exposure_s=EXPOSURE_S, classes=[1, 2])
+    with pytest.raises(ParameterError, match=r"'camera' must be a foveasim\.Camera, got a NoneType"):
+        snr_by_class(None, None, exposure_s=1.0)
+    with pytest.raises(ParameterError, match=r"'camera' must be a foveasim\.Camera, got a Sensor"):
+        light_at_snr_fraction(camera().sensor, flat(), exposure_s=1.0)
+    with pytest.raises(ParameterError, match=r"'layout' must be a foveasim\.Layout, got a NoneType"):
+        measured_snr_by_class(None, frames, frames, bits=12)
     with pytest.raises(ParameterError, match="'snr' must be > 0"):
         light_at_snr_fraction(camera(), flat(), exposure_s=EXPOSURE_S, snr=0.0)

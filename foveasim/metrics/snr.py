@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Ints, check_count, check_number, read_only
+from foveasim.arrays import Bools, Floats, Ints, check_count, check_number, finite_array, read_only
 from foveasim.camera import Camera
+from foveasim.capture import Capture
 from foveasim.errors import ParameterError
 from foveasim.fields import PowerMap
 from foveasim.layout import Layout
 from foveasim.metrics.photon_transfer import SiteClasses, codes_of
+from foveasim.metrics.sampling import require_layout
 from foveasim.scene import Scene
+from foveasim.sensor import Sensor
 
 __all__ = ["SnrTable", "light_at_snr_fraction", "measured_snr_by_class", "size_classes_um", "snr_by_class"]
 
 #: Sizes that differ by less than this share are one class.
 SIZE_ROUNDING = 1e-6
-#: The light at a ratio is found to this share, in at most so many steps.
-SHARE_ROUNDING, MOST_STEPS = 1e-6, 60
+#: The light at a ratio is looked for between these shares of what is given, and found to this share of it.
+LEAST_SHARE, MOST_SHARE, SHARE_ROUNDING = 1e-12, 1e12, 1e-6
+#: In at most so many steps, each so many of them a half, for clips that bend the ratio; of secants between these slopes.
+MOST_STEPS, HALVED_EVERY, SLOPES = 200, 4, (0.25, 4.0)
+#: Where the full well or the highest code is within so many standard deviations of the mean, noise is cut off: its variance
+#: falls from there on, which is EMVA 1288's saturation.
+CUT_OFF_SIGMAS = 2.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -42,7 +50,8 @@ class SnrTable:
     noise_dn : (n_class,) float64, DN
         Root of the mean temporal variance.
     saturated_fraction : (n_class,) float64
-        Share of the sites whose code is the highest, on average over frames to within half a code.
+        Share of the sites whose noise is cut off, so that their ratio is too high: the mean charge is within two standard
+        deviations of its shot noise of the full well, or the mean code within two of its own of the highest, to half a code.
     """
 
     classes: NDArray[Any]
@@ -110,6 +119,7 @@ def size_classes_um(layout: Layout, n_classes: int = 6) -> Floats:
     ParameterError
         When the number is below 1, or the layout has no sites.
     """
+    require_layout(layout)
     n_classes = check_count("n_classes", n_classes)
     if layout.n_sites == 0:
         raise ParameterError("layout", "must have sites")
@@ -146,13 +156,13 @@ def snr_by_class(
         As for :meth:`Camera.predict`, or when a class has fewer than two sites.
     """
     exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
-    sensor, layout = camera.sensor, camera.sensor.layout
-    assert isinstance(layout, Layout)  # a camera takes no other
+    sensor, layout = _sensor_and_layout(camera)
     groups = SiteClasses(size_classes_um(layout) if classes is None else classes, layout.n_sites)
-    mean_dn, variance_dn2 = camera.predict(light, exposure_s=exposure_s)
+    expected_e = sensor.expected_electrons(camera.photoelectrons_per_s(light), exposure_s)
+    mean_dn, variance_dn2 = sensor.predict(expected_e)
     dark_dn, _ = sensor.predict(sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s))
-    highest = 2**sensor.bits - 1
-    return _table(groups, layout.area_um2, mean_dn, variance_dn2, dark_dn, mean_dn > highest - 0.5)
+    is_full = _is_well_full(sensor, expected_e) | _is_code_full(mean_dn, variance_dn2, sensor.bits)
+    return _table(groups, layout.area_um2, mean_dn, variance_dn2, dark_dn, is_full)
 
 
 def light_at_snr_fraction(
@@ -174,8 +184,8 @@ def light_at_snr_fraction(
     Returns
     -------
     share : (n_class,) float64
-        In the order of the sorted labels; more than 1 where the light given does not do. NaN where no light does: sites
-        saturate before, or see nothing.
+        In the order of the sorted labels; more than 1 where the light given does not do. NaN where no light does: half of the
+        sites saturate before (:attr:`SnrTable.saturated_fraction`), or they see nothing.
 
     Raises
     ------
@@ -184,31 +194,73 @@ def light_at_snr_fraction(
 
     Notes
     -----
-    Found by predicting the codes at other shares until they fit, clips at darkness and quantisation included: without a
-    pedestal the converter cuts off half the noise of darkness, and no formula tells the rest.
+    Found by predicting the codes at other shares, clips at darkness and quantisation included: without a pedestal the
+    converter cuts off half the noise of darkness, and no formula tells the rest.
     """
     exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
     snr = check_number("snr", snr, above=0.0)
-    sensor, layout = camera.sensor, camera.sensor.layout
-    assert isinstance(layout, Layout)  # a camera takes no other
+    sensor, layout = _sensor_and_layout(camera)
     groups = SiteClasses(size_classes_um(layout) if classes is None else classes, layout.n_sites)
     full_e = sensor.expected_electrons(camera.photoelectrons_per_s(light), exposure_s)
     dark_e = sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s)
     dark_dn, _ = sensor.predict(dark_e)
-    share = np.ones(groups.n_sites.size)
+    search = _Search(groups.n_sites.size)
+    is_full = np.zeros(groups.n_sites.size, bool)
     for _ in range(MOST_STEPS):
-        mean_dn, variance_dn2 = sensor.predict(dark_e + share[groups.of_site] * (full_e - dark_e))
-        signal_dn, noise_dn = groups.mean(mean_dn - dark_dn), np.sqrt(groups.mean(variance_dn2))
-        # The ratio grows as the light or as its root, so that each step at least halves what is off, as a power.
-        off = np.clip(signal_dn / np.maximum(snr * noise_dn, np.finfo(float).tiny), 1e-3, 1e3)
-        if np.abs(off - 1.0).max() < SHARE_ROUNDING:
+        if search.is_done.all():
             break
-        share = np.clip(share / off, 1e-12, 1e12)
-    return np.where(np.abs(off - 1.0) < SHARE_ROUNDING, share, np.nan)
+        # Those that are found are left in the dark, which is quick to predict.
+        share = np.where(search.is_done, 0.0, np.exp(search.at))
+        expected_e = dark_e + share[groups.of_site] * (full_e - dark_e)
+        mean_dn, variance_dn2 = sensor.predict(expected_e)
+        signal_dn, noise_dn = groups.mean(mean_dn - dark_dn), np.sqrt(groups.mean(variance_dn2))
+        is_cut = _is_well_full(sensor, expected_e) | _is_code_full(mean_dn, variance_dn2, sensor.bits)
+        does = ~search.is_done & (signal_dn > 0.0) & (signal_dn >= snr * noise_dn * (1.0 - SHARE_ROUNDING))
+        is_full = np.where(does, groups.mean(is_cut.astype(np.float64)) >= 0.5, is_full)
+        too_little = np.maximum(snr * noise_dn, np.finfo(float).tiny)
+        search.step(np.log(np.clip(signal_dn, 1e-3 * too_little, 1e3 * too_little) / too_little))
+    return np.where(search.is_found & ~is_full, np.exp(search.high), np.nan)
+
+
+class _Search:
+    """Roots of rising functions of a logarithm, each of its own: secants, and halves where these leave what is left."""
+
+    def __init__(self, n: int) -> None:
+        self.at = np.zeros(n)
+        self.low, self.high = np.full(n, np.log(LEAST_SHARE)), np.full(n, np.log(MOST_SHARE))
+        self.is_found, self.is_done = np.zeros(n, bool), np.zeros(n, bool)
+        self._last: tuple[Floats, Floats] | None = None
+        self._n_steps = 0
+
+    def step(self, value: Floats) -> None:
+        """Take the functions' values at ``at``, and go on to the next places; those that are done stay."""
+        at, goes = self.at, ~self.is_done
+        is_above = value >= -SHARE_ROUNDING
+        self.is_found |= goes & is_above
+        self.high = np.where(goes & is_above, at, self.high)
+        self.low = np.where(goes & ~is_above, at, self.low)
+        is_root = np.abs(value) <= SHARE_ROUNDING
+        self.is_done |= is_root | (self.high - self.low <= SHARE_ROUNDING)
+        # Signals grow as the light and ratios as it or its root, where no clip bends them.
+        slope = np.ones(at.size)
+        if self._last is not None:
+            moved = at - self._last[0]
+            slope = np.where(moved == 0.0, 1.0, (value - self._last[1]) / np.where(moved == 0.0, 1.0, moved))
+        self._last = at, value
+        self._n_steps += 1
+        guess = at - value / np.clip(slope, *SLOPES)
+        is_in = (guess > self.low) & (guess < self.high) & (self._n_steps % HALVED_EVERY != 0)
+        self.at = np.where(self.is_done, at, np.where(is_in, guess, 0.5 * (self.low + self.high)))
 
 
 def measured_snr_by_class(
-    layout: Layout, frames: Any, dark: Any, *, bits: int | None = None, classes: ArrayLike | None = None
+    layout: Layout,
+    frames: Any,
+    dark: Any,
+    *,
+    bits: int | None = None,
+    full_well_e: ArrayLike | None = None,
+    classes: ArrayLike | None = None,
 ) -> SnrTable:
     """
     The same from frames of one scene and of darkness.
@@ -220,6 +272,9 @@ def measured_snr_by_class(
         Two frames or more.
     bits : int, optional
         Of the codes, to tell saturation; taken from captures by default.
+    full_well_e : float or (n_site,), optional, e-
+        Full wells, to tell saturation by captures' electrons; taken from their settings by default. Codes alone do not tell
+        that a well is full: without captures only saturation of the codes is told.
     classes : (n_site,), optional
         As for :func:`snr_by_class`.
 
@@ -230,28 +285,71 @@ def measured_snr_by_class(
     Raises
     ------
     ParameterError
-        When shapes do not fit together, there are fewer than two frames, or the bits are not known.
+        When shapes do not fit together, there are fewer than two frames, the bits are not known, or captures' settings do
+        not tell the full well of every site.
     """
+    require_layout(layout)
+    captures = frames if isinstance(frames, Sequence) and all(isinstance(frame, Capture) for frame in frames) else ()
     if bits is None:
         first = frames[0] if isinstance(frames, Sequence) and len(frames) else None
         bits = getattr(first, "bits", None)
         if bits is None:
             raise ParameterError("bits", "must be given where frames are no captures")
-    highest = 2 ** check_count("bits", bits, at_most=16) - 1
+    bits = check_count("bits", bits, at_most=16)
     codes, dark_codes = codes_of("frames", frames), codes_of("dark", dark)
     for name, some in (("frames", codes), ("dark", dark_codes)):
         if some.shape[1] != layout.n_sites:
             raise ParameterError(name, f"must have the layout's {layout.n_sites} sites", some.shape[1])
     groups = SiteClasses(size_classes_um(layout) if classes is None else classes, layout.n_sites)
-    mean_dn = codes.mean(axis=0)
-    return _table(
-        groups,
-        layout.area_um2,
-        mean_dn,
-        codes.var(axis=0, ddof=1),
-        dark_codes.mean(axis=0),
-        mean_dn > highest - 0.5,
-    )
+    mean_dn, variance_dn2 = codes.mean(axis=0), codes.var(axis=0, ddof=1)
+    is_full = _is_code_full(mean_dn, variance_dn2, bits)
+    well_e = _full_well_e(captures, full_well_e, layout.n_sites)
+    if well_e is not None:
+        mean_e = np.mean([capture.electrons for capture in captures], axis=0)
+        is_full |= _is_near(mean_e, mean_e, well_e)
+    return _table(groups, layout.area_um2, mean_dn, variance_dn2, dark_codes.mean(axis=0), is_full)
+
+
+def _sensor_and_layout(camera: Camera) -> tuple[Sensor, Layout]:
+    if not isinstance(camera, Camera):
+        raise ParameterError("camera", f"must be a foveasim.Camera, got a {type(camera).__name__}")
+    assert isinstance(camera.sensor.layout, Layout)  # a camera takes no other
+    return camera.sensor, camera.sensor.layout
+
+
+def _full_well_e(captures: Sequence[Capture], full_well_e: ArrayLike | None, n_sites: int) -> Floats | None:
+    """Wells of the captures' sites, one or (n_site,); None where there are none, or no captures."""
+    if full_well_e is None:
+        if not captures:
+            return None
+        full_well_e = captures[0].settings.get("sensor", {}).get("full_well_e")
+        if isinstance(full_well_e, Mapping):
+            raise ParameterError("full_well_e", "must be given: the captures' settings do not tell it of every site")
+        if full_well_e is None:
+            return None
+    elif not captures:
+        raise ParameterError("full_well_e", "goes with captures: codes alone do not tell the charge")
+    well_e = finite_array("full_well_e", full_well_e, above=0.0)
+    if well_e.shape not in ((), (n_sites,)):
+        raise ParameterError("full_well_e", f"must be one number, or one for each of the {n_sites} sites", well_e.shape)
+    return well_e
+
+
+def _is_well_full(sensor: Sensor, expected_e: Floats) -> Bools:
+    """Whether a well's edge cuts off the shot noise, (n_site,)."""
+    if sensor.full_well_e is None:
+        return np.zeros(expected_e.shape, bool)
+    return _is_near(expected_e, np.zeros(1) if sensor.shot_noise == "off" else expected_e, sensor.full_well_e)
+
+
+def _is_code_full(mean_dn: Floats, variance_dn2: Floats, bits: int) -> Bools:
+    """Whether the highest code cuts off the noise, (n_site,)."""
+    return _is_near(mean_dn, variance_dn2, 2**bits - 1.5)
+
+
+def _is_near(mean: Floats, variance: Floats, limit: Floats | float) -> Bools:
+    """Whether a limit is within some standard deviations of a mean, or below."""
+    return np.asarray(mean + CUT_OFF_SIGMAS * np.sqrt(variance) >= limit)
 
 
 def _table(
