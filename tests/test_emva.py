@@ -281,6 +281,49 @@ def test_a_bent_response_has_the_error_of_its_line():
     assert deviation.max() > 0.005
 
 
+#: Frames of a sensor of 0.2 DN an electron, whose noise ends at 9000 e-, and the photons of their levels.
+LEVELS_PH = np.arange(100.0, 11_000.0, 200.0)
+
+
+def of_five_electrons_a_code(photons, n_sites=4000):
+    rng = np.random.default_rng(1)
+    return [0.2 * np.minimum(rng.poisson(p, (2, n_sites)), 9000) + rng.normal(50.0, 1.0, (2, n_sites)) for p in photons]
+
+
+def test_levels_must_rise():
+    frames, dark = of_five_electrons_a_code(LEVELS_PH), of_five_electrons_a_code([0.0])
+    per_site = np.repeat(LEVELS_PH[:, None], 4000, axis=1)
+
+    assert emva1288(frames, dark, LEVELS_PH).gain_dn_per_e[0] == pytest.approx(0.2, rel=0.02)
+    for photons in (LEVELS_PH[::-1], np.r_[LEVELS_PH[1], LEVELS_PH[0], LEVELS_PH[2:]], np.minimum(LEVELS_PH, 9000.0)):
+        with pytest.raises(ParameterError, match="'photons' must rise from level to level"):
+            emva1288(frames[::-1], dark, photons)
+    with pytest.raises(ParameterError, match="'photons' must rise from level to level"):
+        emva1288(frames[::-1], dark, per_site[::-1])
+
+
+def test_the_gain_does_not_hang_on_the_order_of_levels():
+    frames = [*of_five_electrons_a_code([0.0]), *of_five_electrons_a_code(LEVELS_PH)]
+    dark = photon_transfer(frames[:1])
+
+    rising, falling = photon_transfer(frames), photon_transfer(frames[::-1])
+
+    assert rising.gain_dn_per_e()[0] == pytest.approx(0.2, rel=0.02)
+    assert falling.gain_dn_per_e(dark)[0] == pytest.approx(rising.gain_dn_per_e(dark)[0], rel=1e-12)
+    with pytest.raises(ParameterError, match="'levels' must begin with darkness"):
+        falling.gain_dn_per_e()
+
+
+def test_levels_that_never_saturate_are_told():
+    faint = LEVELS_PH < 2500.0
+    frames, dark = of_five_electrons_a_code(LEVELS_PH[faint]), of_five_electrons_a_code([0.0])
+
+    with pytest.warns(
+        FoveasimWarning, match="highest at the last level for 1 of 1 classes: their saturation is not reached"
+    ):
+        emva1288(frames, dark, LEVELS_PH[faint])
+
+
 def test_nothing_hangs_on_the_number_of_threads():
     one, two = (measured(n_threads=n, levels=slice(0, 52, 8)) for n in (1, 2))
 
@@ -481,6 +524,9 @@ def test_captures_are_frames():
         (lambda: photon_transfer([np.zeros((2, 5))], classes=[0, 1]), "one label for each"),
         (lambda: photon_transfer([np.zeros((2, 5))], seed=1), "goes with a sensor"),
         (lambda: photon_transfer([3, 4]), "list of frames"),
+        (lambda: photon_transfer(5), "'source' must be a foveasim.Sensor or a list of levels, got a int"),
+        (lambda: photon_transfer(Sensor(GRID), 5.0, seed=1), "'expected_e' must be a list of levels, got 5.0 e-"),
+        (lambda: predicted_photon_transfer(Sensor(GRID), np.array(5.0)), "'expected_e' must be a list of levels"),
         (lambda: photon_transfer(Sensor(GRID), [1.0]), "'seed'"),
         (lambda: photon_transfer(Sensor(GRID), seed=1), "'expected_e'"),
         (lambda: photon_transfer(Sensor(GRID), [-1.0], seed=1), ">= 0"),

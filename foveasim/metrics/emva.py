@@ -177,12 +177,13 @@ def emva1288(
     Raises
     ------
     ParameterError
-        When shapes do not fit together, a level has fewer than two frames, or there is no light.
+        When shapes do not fit together, a level has fewer than two frames, there is no light, or levels do not rise.
 
     Warns
     -----
     FoveasimWarning
         When more than 0.5 % of the dark codes are 0: noise is cut off there, and dark noise and DSNU come out too small.
+        When the variance is highest at the last level: saturation is beyond it, and what is told from it, too.
     """
     frames, dark = list(frames), list(dark)
     transfer = photon_transfer(frames, classes=classes)
@@ -191,6 +192,13 @@ def emva1288(
     mean_dn, variance_dn2 = above_dark(transfer, darkness)
     level_ph = _photons(photons, groups, len(frames))
     top, each = transfer.saturation_level, np.arange(transfer.classes.size)
+    if np.any(top == len(frames) - 1):
+        warnings.warn(
+            f"the variance is highest at the last level for {np.count_nonzero(top == len(frames) - 1)} of {top.size} classes: "
+            "their saturation is not reached, and comes out too low; add brighter levels",
+            FoveasimWarning,
+            stacklevel=2,
+        )
     saturation_dn = mean_dn[top, each]
 
     is_used = is_linear(mean_dn, top)
@@ -236,10 +244,14 @@ def _photons(photons: ArrayLike, groups: SiteClasses, n_levels: int) -> Floats:
     values = finite_array("photons", photons, at_least=0.0)
     n_sites = int(groups.n_sites.sum())
     if values.shape == (n_levels,):
-        return np.repeat(values[:, None], groups.n_sites.size, axis=1)
-    if values.shape != (n_levels, n_sites):
+        level_ph = np.repeat(values[:, None], groups.n_sites.size, axis=1)
+    elif values.shape == (n_levels, n_sites):
+        level_ph = np.stack([groups.mean(level) for level in values])
+    else:
         raise ParameterError("photons", f"must have the shape ({n_levels},) or ({n_levels}, {n_sites})", values.shape)
-    return np.stack([groups.mean(level) for level in values])
+    if np.any(np.diff(level_ph, axis=0) <= 0.0):
+        raise ParameterError("photons", "must rise from level to level in every class", cure="sort the levels")
+    return level_ph
 
 
 def _dark_current(

@@ -10,7 +10,7 @@ single frame over the number of frames.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -103,7 +103,7 @@ class PhotonTransfer:
         Raises
         ------
         ParameterError
-            When the dark levels do not fit, or there is no light.
+            When the dark levels do not fit, there is no light, or none are given and the first level is not the darkest.
         """
         mean_dn, variance_dn2 = above_dark(self, dark)
         return slopes("levels", mean_dn, variance_dn2, is_linear(mean_dn, self.saturation_level))
@@ -259,6 +259,8 @@ def photon_transfer(
     if expected_e is not None or seed is not None:
         raise ParameterError("expected_e" if seed is None else "seed", "goes with a sensor, not with frames")
     measured, counts, n_sites = [], [], None
+    if not isinstance(source, Iterable):
+        raise ParameterError("source", f"must be a foveasim.Sensor or a list of levels, got a {type(source).__name__}")
     for k, frames in enumerate(source):
         codes = codes_of(f"frames[{k}]", frames)
         if n_sites is None:
@@ -363,7 +365,11 @@ def _level(name: str, expected_e: ArrayLike, n_sites: int) -> Floats:
 
 
 def _levels(expected_e: Sequence[ArrayLike] | Floats, n_sites: int) -> list[Floats]:
-    if np.ndim(expected_e[0] if len(expected_e) else 0) > 1:
+    try:
+        n_levels = len(expected_e)
+    except TypeError:
+        raise ParameterError("expected_e", "must be a list of levels", expected_e, "e-") from None
+    if np.ndim(expected_e[0] if n_levels else 0) > 1:
         raise ParameterError("expected_e", "must have the shape (n_level,) or (n_level, n_site)")
     return [_level(f"expected_e[{k}]", level_e, n_sites) for k, level_e in enumerate(expected_e)]
 
@@ -372,6 +378,10 @@ def above_dark(transfer: PhotonTransfer, dark: PhotonTransfer | None) -> tuple[F
     """Mean and temporal variance, less those of darkness, (n_level, n_class)."""
     n_levels = transfer.n_frames.size
     if dark is None:
+        if np.any(transfer.mean_dn[0] > transfer.mean_dn[-1]):
+            raise ParameterError(
+                "levels", "must begin with darkness", cure="give them rising, or dark frames of their own"
+            )
         return (
             transfer.mean_dn - transfer.mean_dn[0],
             transfer.temporal_variance_dn2 - transfer.temporal_variance_dn2[0],
@@ -384,11 +394,8 @@ def above_dark(transfer: PhotonTransfer, dark: PhotonTransfer | None) -> tuple[F
 
 
 def is_linear(mean_dn: Floats, saturation_level: Ints) -> NDArray[np.bool_]:
-    """Whether a level counts for the gain: up to the last that is at most 70 % of saturation, (n_level, n_class)."""
-    saturation_dn = np.take_along_axis(mean_dn, saturation_level[None, :], axis=0)
-    is_below = mean_dn <= LINEAR_FRACTION * saturation_dn
-    level = np.arange(mean_dn.shape[0])[:, None]
-    return level <= np.where(is_below, level, -1).max(axis=0)
+    """Whether a level counts for the gain: at most 70 % of saturation, (n_level, n_class)."""
+    return np.asarray(mean_dn <= LINEAR_FRACTION * np.take_along_axis(mean_dn, saturation_level[None, :], axis=0))
 
 
 def slopes(name: str, x: Floats, y: Floats, is_used: NDArray[np.bool_]) -> Floats:
