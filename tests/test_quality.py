@@ -80,6 +80,27 @@ def test_colours_count_alike():
     assert psnr_db(seen, colour, 1.0) == pytest.approx(20.0 + 10 * np.log10(3.0))
 
 
+@pytest.mark.parametrize("wrong", [np.inf, -np.inf])
+def test_an_infinite_pixel_is_no_unknown_one(wrong):
+    """A reconstruction that diverged has no score: it is not left out like what photosites do not cover."""
+    diverged = TRUTH.copy()
+    diverged[3, 4:7] = wrong
+    is_seen = np.isfinite(diverged)
+
+    for score in (psnr_db, ssim):
+        with pytest.raises(
+            ParameterError, match="'picture' must be finite where it is compared, and 3 of 2,000 pixels"
+        ):
+            score(diverged, TRUTH, 1.0)
+        with pytest.raises(
+            ParameterError, match="'reference' must be finite where it is compared, and 3 of 2,000 pixels"
+        ):
+            score(TRUTH, diverged, 1.0)
+    assert psnr_db(picture(np.where(is_seen, TRUTH + 0.1, wrong), is_seen), TRUTH[np.newaxis], 1.0) == pytest.approx(
+        20.0
+    )
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

@@ -44,7 +44,7 @@ def psnr_db(
     Raises
     ------
     ParameterError
-        When shapes differ, no pixel can be compared, or the range is not above 0.
+        When shapes differ, no pixel can be compared, one that counts is infinite, or the range is not above 0.
 
     Examples
     --------
@@ -126,9 +126,17 @@ def _compared(
         and not np.allclose(picture.grid.bounds_um, reference.grid.bounds_um, rtol=1e-9, atol=1e-6)
     ):
         raise ParameterError("reference", "must lie on the picture's grid", reference.grid.bounds_um)
-    counts = np.isfinite(planes).all(axis=(0, 1)) & covered[0] & covered[1]
+    counts = ~np.isnan(planes).any(axis=(0, 1)) & covered[0] & covered[1]
     if not counts.any():
         raise ParameterError("picture", "and reference must have a pixel that both know")
+    for name, plane in zip(("picture", "reference"), planes, strict=True):
+        n_infinite = int(np.count_nonzero(np.isinf(plane).any(axis=0) & counts))
+        if n_infinite:
+            raise ParameterError(
+                name,
+                f"must be finite where it is compared, and {n_infinite:,} of {np.count_nonzero(counts):,} pixels are not",
+                cure="pixels that are not known must be NaN",
+            )
     return planes[0], planes[1], np.asarray(counts)
 
 
