@@ -150,3 +150,21 @@ def test_bad_regions_are_told():
         aliasing_spectrum(SQUARES, (1.0, 2.0, 3.0))
     with pytest.raises(ParameterError, match="'weights' must be one of 'sites', 'area'"):
         sampling_spectrum(SQUARES, weights="none")
+
+
+def test_a_lattices_peaks_are_as_high_as_the_windows_sums():
+    """In closed form over the disc: the mean of cos² is (1/2 - 2/π²), that of its square (3/8 - 2/π²)."""
+    spectrum = sampling_spectrum(SQUARES)
+    middle = spectrum.frequency_per_mm.size // 2
+    window, square = 0.5 - 2.0 / np.pi**2, 3.0 / 8.0 - 2.0 / np.pi**2
+
+    peaks = spectrum.power[middle, middle], spectrum.power[middle, np.abs(spectrum.frequency_per_mm - 250.0).argmin()]
+
+    assert peaks[0] == pytest.approx(spectrum.n_sites * window**2 / square, rel=0.01)
+    assert peaks[0] == pytest.approx(0.51 * spectrum.n_sites, rel=0.02)
+
+
+@pytest.mark.parametrize("n_bins", [0, -1, 2.5, 10_000, None])
+def test_rings_are_a_whole_number(n_bins):
+    with pytest.raises(ParameterError, match="'n_bins' must be"):
+        sampling_spectrum(SQUARES).radial(n_bins)

@@ -14,11 +14,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, check_choice, check_length_um, check_number, finite_array, read_only
+from foveasim.arrays import Floats, check_choice, check_count, check_length_um, check_number, finite_array, read_only
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 from foveasim.metrics.pixel_mtf import polygon_otf
-from foveasim.metrics.sampling import nyquist_per_mm
+from foveasim.metrics.sampling import nyquist_per_mm, require_layout
 from foveasim.units import per_mm_from_per_um, per_um_from_per_mm
 
 __all__ = ["AliasingSpectrum", "SamplingSpectrum", "aliasing_spectrum", "sampling_spectrum"]
@@ -61,8 +61,9 @@ class SamplingSpectrum:
     frequency_per_mm : (n,) float64, 1/mm
         Of rows and columns, line pairs per mm, 0 in the middle.
     power : (n, n) float64
-        ``|Σ w exp(-2πi f·x)|² / Σ w²`` at [fy, fx], w the window: 1 on average for points by chance (Poisson), the number of
-        sites at the peaks of a lattice. The peak at 0 is a disc of the radius ``peak_per_mm``.
+        ``|Σ w exp(-2πi f·x)|² / Σ w²`` at [fy, fx], w the window: 1 on average for points by chance (Poisson), and
+        ``(Σ w)² / Σ w²`` at the peaks of a lattice, which is about half the number of sites: those at the border weigh
+        little. The peak at 0 is a disc of the radius ``peak_per_mm``.
     nyquist_per_mm : float, 1/mm
         Median of the region's sites.
     peak_per_mm : float, 1/mm
@@ -90,7 +91,13 @@ class SamplingSpectrum:
             Middles of rings from 0 to the highest frequency; the first ones hold the peak at 0.
         power, anisotropy : (n_bins,) float64
             Mean, and variance over the mean squared: about 1 for points without order, more for lattices. NaN in empty rings.
+
+        Raises
+        ------
+        ParameterError
+            When the number is no whole number from 1 to 4096.
         """
+        n_bins = check_count("n_bins", n_bins, at_most=MOST_FREQUENCIES)
         f = self.frequency_per_mm
         r = np.hypot(f, f[:, np.newaxis]).ravel()
         edges = np.linspace(0.0, f[-1], n_bins + 1)
@@ -270,6 +277,7 @@ def aliasing_spectrum(
 
 
 def _region(layout: Layout, centre_um: tuple[float, float] | None, radius_um: float | None) -> _Region:
+    require_layout(layout)
     if layout.n_sites == 0:
         raise ParameterError("layout", "must have sites")
     x_min, y_min, x_max, y_max = layout.bounds_um
