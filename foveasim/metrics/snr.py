@@ -347,9 +347,9 @@ def _is_code_full(mean_dn: Floats, variance_dn2: Floats, bits: int) -> Bools:
     return _is_near(mean_dn, variance_dn2, 2**bits - 1.5)
 
 
-def _is_near(mean: Floats, variance: Floats, limit: Floats | float) -> Bools:
-    """Whether a limit is within some standard deviations of a mean, or below."""
-    return np.asarray(mean + CUT_OFF_SIGMAS * np.sqrt(variance) >= limit)
+def _is_near(value: Floats, variance: Floats, limit: Floats | float) -> Bools:
+    """Whether a limit is within some standard deviations of a value, or below it."""
+    return np.asarray(value + CUT_OFF_SIGMAS * np.sqrt(variance) >= limit)
 
 
 def _table(
