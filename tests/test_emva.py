@@ -524,6 +524,8 @@ def test_captures_are_frames():
         (lambda: photon_transfer([np.zeros((2, 5))], classes=[0, 1]), "one label for each"),
         (lambda: photon_transfer([np.zeros((2, 5))], seed=1), "goes with a sensor"),
         (lambda: photon_transfer([3, 4]), "list of frames"),
+        (lambda: emva1288(5, [np.ones((2, 4))], [1.0]), "'frames' must be a list of levels, got a int"),
+        (lambda: emva1288([np.ones((2, 4))], None, [1.0]), "'dark' must be a list of levels, got a NoneType"),
         (lambda: photon_transfer(5), "'source' must be a foveasim.Sensor or a list of levels, got a int"),
         (lambda: photon_transfer(Sensor(GRID), 5.0, seed=1), "'expected_e' must be a list of levels, got 5.0 e-"),
         (lambda: predicted_photon_transfer(Sensor(GRID), np.array(5.0)), "'expected_e' must be a list of levels"),

@@ -199,6 +199,10 @@ def test_bad_input_is_told():
         flow_bound(np.ones((3, 3)), 1.0)
     with pytest.raises(ParameterError, match="'regions' must be 3 whole numbers"):
         flow_bound(np.ones((3, 2)), 1.0, regions=[0.5, 1.0, 2.0])
+    with pytest.raises(ParameterError, match=r"'layout' must be a foveasim\.Layout, got a NoneType"):
+        estimate_flow(None, values, map_e, GRID, variance_e2=1.0)
+    with pytest.raises(ParameterError, match=r"'layout' must be a foveasim\.Layout, got a list"):
+        site_gradients_e_per_um([FOVEAL], map_e, GRID)
     with pytest.raises(ParameterError, match="'values_e' must be one for each of the"):
         estimate_flow(FOVEAL, values[:5], map_e, GRID, variance_e2=1.0)
     with pytest.raises(ParameterError, match="'map_e_per_um2' must have the grid's shape"):

@@ -9,7 +9,7 @@ the spatial variance into rows, columns and pixels asks for a grid and is left o
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -185,6 +185,9 @@ def emva1288(
         When more than 0.5 % of the dark codes are 0: noise is cut off there, and dark noise and DSNU come out too small.
         When the variance is highest at the last level: saturation is beyond it, and what is told from it, too.
     """
+    for name, levels in (("frames", frames), ("dark", dark)):
+        if not isinstance(levels, Iterable):
+            raise ParameterError(name, f"must be a list of levels, got a {type(levels).__name__}")
     frames, dark = list(frames), list(dark)
     transfer = photon_transfer(frames, classes=classes)
     darkness = photon_transfer(dark, classes=classes)

@@ -18,6 +18,7 @@ from foveasim.errors import CoverageWarning, ParameterError
 from foveasim.fields import Grid
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
+from foveasim.metrics.sampling import require_layout
 
 __all__ = ["FlowBound", "FlowEstimate", "estimate_flow", "flow_bound", "site_gradients_e_per_um"]
 
@@ -113,6 +114,7 @@ def site_gradients_e_per_um(
     CoverageWarning
         When sites lie partly or wholly off the map.
     """
+    require_layout(layout)
     cells = _checked_map(map_e_per_um2, grid)
     integrator = Integrator(layout, grid, order=2, n_threads=n_threads)
     is_on = _is_on_map(integrator, layout)
@@ -211,6 +213,7 @@ def estimate_flow(
     picture. Steps converge to the nearest minimum: for large shifts begin with a blurred picture. Sites whose outlines,
     carried back, lie partly or wholly off the map are left out: what they should see is not known.
     """
+    require_layout(layout)
     cells = _checked_map(map_e_per_um2, grid)
     maps = np.concatenate((cells[np.newaxis], _gradients(cells, grid.pitch_um)))
     values = _per_site("values_e", finite_array("values_e", values_e), layout.n_sites)
