@@ -48,7 +48,7 @@ NARROW_PITCHES, NARROW_WIDTHS, WIDENING = 3.0, 2.0, 0.5
 LEAST_REACH_WIDTHS = 2.0
 #: Bins on either side whose sites tell together how much values scatter.
 SCATTER_BINS = 4
-#: Below so many bins to a period the bins' aliases are as large as what is asked for.
+#: With fewer bins to a period their aliases are no longer small: with so many they are below 1 %, with two 18 %.
 BINS_PER_PERIOD = 4
 #: An edge blurred over more than this share of the region is a ramp.
 WIDEST_SHARE = 0.25
