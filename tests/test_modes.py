@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import foveasim as fs
-from foveasim.errors import FileError, ParameterError, SimulationError
+from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
+from foveasim.layout import Layout
 from foveasim.modes import EventPixels, Events, SpikingPixels, write_events
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 
@@ -103,29 +104,32 @@ def test_a_change_much_faster_than_the_low_pass_is_not_seen():
     assert len(pixels.events([[1e5], [1e6], [1e5]], frame_s=1e-9, seed=0)) == 0
 
 
-def test_the_low_pass_agrees_with_small_steps_of_its_equation():
+@pytest.mark.parametrize(("step", "seed", "n_least"), [(0.5, 5, 25), (2.0, 6, 1000)])
+def test_the_low_pass_agrees_with_small_steps_of_its_equation(step, seed, n_least):
     capacitance_f, frame_s, contrast = 3e-14, 2e-3, 0.06
-    rates = walk(40, 1, seed=5, step=0.5)[:, 0]
+    rates = walk(40, 1, seed=seed, step=step)[:, 0]
     events = pixels_of(contrast_on=contrast, contrast_off=contrast, capacitance_f=capacitance_f).events(
         rates[:, None], frame_s=frame_s, seed=0
     )
 
-    n, log_light = 20_000, np.log(rates)
+    n, log_light = 4000, np.log(rates)
     level = reference = log_light[0]
     expected = []
     for k in range(39):
-        tau_s = capacitance_f * BOLTZMANN_J_PER_K * 300.0 / (ELEMENTARY_CHARGE_C**2 * 0.5 * (rates[k] + rates[k + 1]))
-        decay, dt_s = math.exp(-frame_s / n / tau_s), frame_s / n
+        dt_s = frame_s / n
         for j in range(n):
             light = log_light[k] + (log_light[k + 1] - log_light[k]) * (j + 0.5) / n
-            level = light + (level - light) * decay
+            # Of the light at this very moment.
+            tau_s = capacitance_f * BOLTZMANN_J_PER_K * 300.0 / (ELEMENTARY_CHARGE_C**2 * math.exp(light))
+            level = light + (level - light) * math.exp(-dt_s / tau_s)
             if abs(level - reference) >= contrast:
                 expected.append((k * frame_s + (j + 1) * dt_s, np.sign(level - reference)))
                 reference += math.copysign(contrast, level - reference)
 
-    assert len(expected) > 30
+    assert len(expected) > n_least
     assert events.polarity.tolist() == [p for _, p in expected]
-    assert np.allclose(events.t_s, [t_s for t_s, _ in expected], atol=2e-6)
+    # Parts of a frame have one time constant each, and where the level hardly moves, times tell small differences of it.
+    assert np.allclose(events.t_s, [t_s for t_s, _ in expected], rtol=0.0, atol=0.15 * frame_s)
 
 
 @pytest.mark.parametrize("noise_per_s", [0.0, 1e4])
@@ -154,11 +158,46 @@ def test_after_an_event_the_reference_follows_until_the_refractory_time_is_over(
 
 
 def test_leakage_gives_its_rate_of_brightening_in_constant_light():
-    events = pixels_of(2, leak_per_s=5.0).events([[1e3, 1e4]] * 22, frame_s=0.1, seed=0)
+    events = pixels_of(2, leak_per_s=5.0).events([[1e3, 1e4]] * 21, frame_s=0.1, seed=0)
 
     assert events.counts(polarity=-1).tolist() == [0, 0]
     for site in (0, 1):
-        assert np.allclose(events.t_s[events.site == site], 0.2 * np.arange(1, 11), rtol=1e-12)
+        times_s = events.t_s[events.site == site]
+        assert times_s.size == 10
+        assert times_s[0] <= 0.2
+        assert np.allclose(np.diff(times_s), 0.2, rtol=1e-12)
+
+
+def test_leaking_sites_do_not_tell_in_chorus():
+    n_sites, leak_per_s = 10_000, 0.1
+    pixels = pixels_of(sensor=fs.Sensor(fs.layout.grid(n_x=100, n_y=100, pitch_um=4.0)), leak_per_s=leak_per_s)
+    one, other = (pixels.events(np.full((11, n_sites), 1e4), frame_s=1.0, seed=s) for s in (0, 1))
+
+    # In one period each site tells once, at any time alike: the distance of Kolmogorov's test at 5 sigma.
+    assert np.array_equal(np.sort(one.site), np.arange(n_sites))
+    assert np.abs(one.t_s * leak_per_s - np.arange(n_sites) / n_sites).max() < 2.7 / math.sqrt(n_sites)
+    assert abs(np.corrcoef(one.t_s[np.argsort(one.site)], other.t_s[np.argsort(other.site)])[0, 1]) < 0.05
+
+
+def test_the_spread_of_leaks_is_fixed_in_the_device_and_keeps_their_mean():
+    n_sites, spread = 40_000, 0.5
+    layout = fs.layout.grid(n_x=200, n_y=200, pitch_um=4.0)
+    one, other = (
+        EventPixels(fs.Sensor(layout, device_seed=s), leak_per_s=2.0, leak_spread_fraction=spread) for s in (1, 2)
+    )
+    leaks = one.leaks_per_s
+
+    assert leaks.min() > 0.0
+    assert abs(leaks.mean() - 2.0) < 5.0 * 2.0 * spread / math.sqrt(n_sites)
+    # The kurtosis of a log-normal law: for w = 1 + 0.5², w⁴ + 2w³ + 3w² - 3.
+    w = 1.0 + spread**2
+    kurtosis = w**4 + 2.0 * w**3 + 3.0 * w**2 - 3.0
+    assert abs(leaks.var() / (2.0 * spread) ** 2 - 1.0) < 5.0 * math.sqrt((kurtosis - 1.0) / n_sites)
+    assert abs(np.corrcoef(leaks, other.leaks_per_s)[0, 1]) < 5.0 / math.sqrt(n_sites)
+    part = EventPixels(fs.Sensor(layout[:50], device_seed=1), leak_per_s=2.0, leak_spread_fraction=spread)
+    events = part.events(np.full((101, 50), 1e4), frame_s=1.0, seed=0)
+    for site in (0, 17, 49):
+        assert np.allclose(np.diff(events.t_s[events.site == site]), 1.0 / leaks[site], rtol=1e-9)
 
 
 def test_noise_events_are_a_poisson_process_that_light_halves():
@@ -201,15 +240,61 @@ NOISY = {
 }
 
 
+def doubling(n_frames, n_sites):
+    """Light whose events of ln 2 fall on the borders of frames."""
+    return np.repeat(100.0 * 2.0 ** np.arange(n_frames)[:, None], n_sites, axis=1)
+
+
 @pytest.mark.parametrize("batch", [1, 2, 7, 100])
-@pytest.mark.parametrize("changes", [{}, NOISY])
-def test_batches_of_any_size_give_the_same_events(batch, changes):
+@pytest.mark.parametrize(
+    ("changes", "light"),
+    [
+        ({}, walk),
+        (NOISY, walk),
+        # Steps of leakage that take as long as a frame, and of light: at the borders, but for rounding.
+        ({"leak_per_s": 10.0, "mismatch_fraction": 0.1}, lambda n, m: np.full((3 * n, m), 1e4)),
+        ({"contrast_on": math.log(2.0), "refractory_s": 1e-9}, doubling),
+    ],
+)
+def test_batches_of_any_size_give_the_same_events(batch, changes, light):
     pixels = pixels_of(30, **changes)
-    rates = walk(25, 30)
-    whole = pixels.events(rates, frame_s=0.01, seed=4)
+    rates = light(25, 30)
+    frame_s = 0.1 if light is not walk else 0.01
+    whole = pixels.events(rates, frame_s=frame_s, seed=4)
 
     assert len(whole) > 500
-    assert same(Events.joined(pixels.stream(rates, frame_s=0.01, seed=4, batch=batch)), whole)
+    assert same(Events.joined(pixels.stream(rates, frame_s=frame_s, seed=4, batch=batch)), whole)
+
+
+def test_events_of_a_frame_are_of_the_batch_that_it_ends():
+    pixels = pixels_of(30, contrast_on=math.log(2.0))
+    for k, events in enumerate(pixels.stream(doubling(25, 30), frame_s=0.1, seed=0, batch=1)):
+        assert np.all((events.t_s > (k - 1) * 0.1) & (events.t_s <= k * 0.1))
+
+
+@pytest.mark.parametrize("batch", [1, 2, 7])
+def test_spikes_at_the_borders_of_frames_are_in_the_same_order_in_all_batches(batch):
+    sensor = sensor_of(40, shot_noise="off")
+    threshold_e = 100.0 * (1.0 + 0.037 * np.arange(40))
+    # Three spikes a frame, the last of them at its end, but for rounding.
+    pixels = SpikingPixels(sensor, threshold_e=threshold_e)
+    rates = [30.0 * threshold_e] * 41
+    whole = pixels.events(rates, frame_s=0.1, seed=4)
+
+    assert len(whole) >= 3 * 40 * 40
+    assert same(Events.joined(pixels.stream(rates, frame_s=0.1, seed=4, batch=batch)), whole)
+
+
+def test_events_of_the_same_time_are_in_the_order_of_their_sites():
+    # All sites cross at the same times, the odd ones twice as often.
+    pixels = pixels_of(500)
+    rates = np.full((3, 500), 100.0)
+    rates[1:] *= np.where(np.arange(500) % 2, math.exp(1.6), math.exp(0.8))
+    events = pixels.events(rates, frame_s=1.0, seed=0)
+    order = np.lexsort((events.site, events.t_s))
+
+    assert np.unique(events.t_s).size < 20 < len(events)
+    assert np.array_equal(order, np.arange(len(events)))
 
 
 def test_threads_and_pieces_change_nothing(monkeypatch):
@@ -316,6 +401,20 @@ def test_each_site_may_have_its_own_threshold():
     assert spikes.counts().tolist() == [40, 20, 10]
 
 
+def test_events_beyond_the_most_are_not_counted_on(monkeypatch):
+    """A site that would count for hours, and pieces that hold too many only together."""
+    monkeypatch.setattr(sys.modules[EventPixels.__module__], "MAX_EVENTS", 1000)
+    endless = pixels_of(1, noise_per_s=1e15)
+    with pytest.raises(SimulationError, match=r"more than 1,000 events of 1 frames do not fit the memory"):
+        endless.events([[1e-3]] * 2, frame_s=1.0, seed=0)
+    monkeypatch.setattr(sys.modules[EventPixels.__module__], "PIECE_SITES", 10)
+    pixels = pixels_of(50, noise_per_s=30.0)
+    assert 100 < len(pixels.events([[1e-3] * 50] * 2, frame_s=0.1, seed=0)) < 1000
+    for n_threads in (1, 2):
+        with pytest.raises(SimulationError, match=r"more than 1,000 events"):
+            pixels.events([[1e-3] * 50] * 2, frame_s=1.0, seed=0, n_threads=n_threads)
+
+
 def test_more_spikes_than_memory_are_told():
     with pytest.raises(SimulationError, match="do not fit the memory"):
         SpikingPixels(sensor_of(1), threshold_e=1.0).events([[1e12]], frame_s=1.0, seed=0)
@@ -331,6 +430,8 @@ def test_more_spikes_than_memory_are_told():
         (EventPixels, {"contrast_off": 1e-9}),
         (EventPixels, {"refractory_s": -1.0}),
         (EventPixels, {"leak_per_s": math.nan}),
+        (EventPixels, {"leak_spread_fraction": -0.1}),
+        (EventPixels, {"mismatch_fraction": 5.0}),
         (EventPixels, {"capacitance_f": 1.0}),
         (EventPixels, {"temperature_k": 0.0}),
         (SpikingPixels, {"threshold_e": 0.5}),
@@ -354,6 +455,9 @@ def test_wrong_calls_are_told_at_once_and_wrong_frames_when_they_come(kind):
     for frame in ([1.0, 2.0], [1.0, 2.0, -1.0], [1.0, 2.0, math.nan]):
         with pytest.raises(ParameterError, match="rates"):
             pixels.events([frame], frame_s=0.1, seed=0)
+    for rates in (None, 3.0):
+        with pytest.raises(ParameterError, match=r"'rates' must be frames of one rate a site each"):
+            pixels.stream(rates, frame_s=0.1, seed=0)
     assert len(pixels.events([], frame_s=0.1, seed=0)) == 0
 
 
@@ -438,6 +542,278 @@ def test_hdf5_of_no_events_or_of_batches_that_do_not_follow_each_other(tmp_path)
         assert file["ms_to_idx"][:].tolist() == [0]
 
 
+def test_hdf5_comes_back_to_the_microsecond(tmp_path):
+    pytest.importorskip("h5py")
+    events = some_events()
+    events = Events(
+        events.t_s,
+        events.site,
+        events.polarity,
+        events.layout.with_columns(name=[f"sité {k}" for k in range(24)], is_on=np.arange(24) % 2 == 0),
+    )
+    events.save(tmp_path / "e.h5")
+    read = Events.load(tmp_path / "e.h5")
+
+    assert np.array_equal(read.site, events.site)
+    assert np.array_equal(read.polarity, events.polarity)
+    assert np.all((events.t_s - read.t_s >= 0.0) & (events.t_s - read.t_s < 1e-6))
+    assert np.array_equal(read.layout.xy_um, events.layout.xy_um)
+    assert read.layout.provenance["generator"] == "grid"
+    for name in ("readout_order", "name", "is_on", "row"):
+        assert np.array_equal(read.layout.columns[name], events.layout.columns[name])
+        assert read.layout.columns[name].dtype == events.layout.columns[name].dtype
+    read.save(tmp_path / "again.h5")
+    assert same(Events.load(tmp_path / "again.h5"), read)
+
+
+def broken_hdf5(path, how):
+    h5py = pytest.importorskip("h5py")
+    some_events().save(path)
+    if how == "cut":
+        path.write_bytes(path.read_bytes()[:3000])
+        return
+    with h5py.File(path, "a") as file:
+        if how == "stranger":
+            del file.attrs["format"]
+        elif how == "version":
+            file.attrs["version"] = 7
+        elif how == "link":
+            del file["events/t"]
+            file["events/t"] = h5py.ExternalLink("other.h5", "/t")
+        elif how == "external":
+            del file["events/t"]
+            file.create_dataset("events/t", (8,), "i8", external=[("/etc/passwd", 0, 64)])
+        elif how == "text":
+            del file["events/t"]
+            file["events/t"] = "now"
+        elif how == "order":
+            file["events/t"][0] = 10**9
+        elif how == "site":
+            file["events/site"][3] = 24
+        elif how == "group":
+            del file["layout"]
+        elif how == "large":
+            del file["events/p"]
+            file.create_dataset("events/p", (10**11,), "u1", chunks=(10**6,), compression="gzip")
+
+
+@pytest.mark.parametrize(
+    ("how", "told"),
+    [
+        ("cut", "is broken"),
+        ("stranger", "holds no events of foveasim; make them with Events.from_addresses"),
+        ("version", "has the format version 7, expected 2"),
+        ("link", "has no numbers 'events/t' of its own"),
+        ("external", "has no numbers 'events/t' of its own"),
+        ("text", "has no numbers 'events/t' of its own"),
+        ("order", "is broken or no file of events .'t_s' must be finite, at least 0, and rising"),
+        ("site", "is broken or no file of events .'site' must be from 0 to 23"),
+        ("group", "has no group 'layout' of its own"),
+        ("large", "would unpack to more than a file of its size holds"),
+    ],
+)
+def test_hdf5_of_strangers_is_told_in_one_sentence(tmp_path, how, told):
+    broken_hdf5(tmp_path / "e.h5", how)
+    with pytest.raises(FileError, match=told):
+        Events.load(tmp_path / "e.h5")
+
+
+def test_hdf5_has_no_table_of_a_clock_that_began_long_ago(tmp_path):
+    pytest.importorskip("h5py")
+    layout = fs.layout.grid(n_x=2, n_y=1, pitch_um=4.0)
+    with pytest.raises(ParameterError, match=r"must end before 100,000 s.*take off what the clock showed"):
+        Events([1e9], [0], [1], layout).save(tmp_path / "e.h5")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("join", [Events.joined, lambda parts: write_events(parts, "nowhere/e.h5")])
+def test_batches_of_several_layouts_or_no_batches_are_told(join, tmp_path, monkeypatch):
+    pytest.importorskip("h5py")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "nowhere").mkdir()
+    layout, other = (fs.layout.grid(n_x=2, n_y=1, pitch_um=pitch) for pitch in (4.0, 5.0))
+    one = Events([1.0], [0], [1], layout)
+    for parts, told in (
+        ([one, Events([2.0], [0], [1], other)], "must be of one layout"),
+        ([one, Events([0.5], [0], [1], layout)], "must follow each other"),
+        (one, "got a Events; put it into a list"),
+        (None, "got a NoneType"),
+        ([one, 3], "must be Events, got a int"),
+        ([], "at least one batch"),
+    ):
+        with pytest.raises(ParameterError, match=told):
+            join(parts)
+    assert list((tmp_path / "nowhere").iterdir()) == []
+    # A layout that came from a file is the same one.
+    again = fs.layout.grid(n_x=2, n_y=1, pitch_um=4.0)
+    join([one, Events([1.0], [1], [1], again)])
+
+
+def test_arrays_for_event_tools(tmp_path):
+    events = some_events()
+    x, y = events.addresses()
+    found = events.structured()
+
+    assert found.dtype == np.dtype([("x", np.int16), ("y", np.int16), ("t", np.int64), ("p", bool)])
+    assert np.array_equal(found["x"], x[events.site])
+    assert np.array_equal(found["y"], y[events.site])
+    assert np.array_equal(found["t"], np.floor(events.t_s * 1e6))
+    assert np.array_equal(found["p"], events.polarity == 1)
+    events.save(tmp_path / "e.npy")
+    assert np.array_equal(np.load(tmp_path / "e.npy", allow_pickle=False), found)
+    events.save(tmp_path / "e.txt")
+    t_s, *addresses, p = np.loadtxt(tmp_path / "e.txt").T
+    assert np.abs(t_s - events.t_s).max() < 1e-9
+    assert np.array_equal(addresses, [found["x"], found["y"]])
+    assert np.array_equal(p, found["p"])
+
+
+def test_arrays_for_event_tools_without_numbers_for_it_are_told():
+    layout = fs.layout.grid(n_x=40_000, n_y=1, pitch_um=1.0)
+    with pytest.raises(ParameterError, match="more than 32768 columns or rows"):
+        Events([1.0], [0], [1], layout).structured()
+    with pytest.raises(ParameterError, match="'t_s' must be at most"):
+        Events([1e12], [0], [1], fs.layout.grid(n_x=2, n_y=1, pitch_um=1.0)).structured()
+
+
+def test_recordings_with_addresses_are_events_of_a_layout():
+    events = some_events()
+    found = events.structured()
+    read = Events.from_addresses(events.t_s, found["x"], found["y"], 2 * found["p"] - 1, events.layout)
+
+    assert same(read, events)
+    # Row 0 is on top.
+    layout = fs.layout.grid(n_x=3, n_y=2, pitch_um=4.0)
+    (site,) = Events.from_addresses([0.1], [2], [0], [1], layout).site
+    assert layout.centroid_um[site].tolist() == [4.0, 2.0]
+    for x, y, told in (
+        ([3], [0], "got 0 at"),
+        ([0.5], [0], "'x' must be one whole"),
+        ([0], [-1], "'y' must be from 0"),
+    ):
+        with pytest.raises(ParameterError, match=told):
+            Events.from_addresses([0.1], x, y, [1], layout)
+
+
+LATTICES = {
+    "square": lambda: fs.layout.grid(n_x=10, n_y=8, pitch_um=4.0),
+    "trenches": lambda: fs.layout.grid(n_x=10, n_y=8, pitch_um=4.0, trench_um=0.4),
+    "fill factor": lambda: fs.layout.grid(n_x=10, n_y=8, pitch_um=4.0, fill_factor=0.5),
+    "oblong": lambda: fs.layout.grid(n_x=10, n_y=8, pitch_um=4.0, pitch_y_um=8.0),
+    "staggered": lambda: fs.layout.grid(n_x=10, n_y=8, pitch_um=4.0, stagger=True),
+    "hexagonal": lambda: fs.layout.hexagonal(n_columns=10, n_rows=8, pitch_um=4.0),
+}
+
+
+@pytest.mark.parametrize("name", LATTICES)
+def test_sites_of_a_lattice_are_addressed_by_their_columns_and_rows(name):
+    layout = LATTICES[name]()
+    order = np.random.default_rng(0).permutation(80)
+    for sites, upwards in ((np.arange(80), 1.0), (order, 1.0), (order[:40], 1.0), (np.arange(80), -1.0)):
+        part = layout[sites]
+        if upwards < 0:  # upside down: the lowest row is on top
+            part = Layout(part.xy_um * [1.0, -1.0], part.ring_offsets, part.site_offsets, part.columns)
+        x, y = Events([], [], [], part).addresses()
+        row = sites // 10
+        assert np.array_equal(x, sites % 10 - (sites % 10).min())
+        assert np.array_equal(y, row.max() - row if upwards > 0 else row - row.min())
+
+
+@pytest.mark.parametrize("name", LATTICES)
+def test_without_columns_no_two_sites_share_an_address(name):
+    layout = LATTICES[name]()
+    layout = Layout(layout.xy_um, layout.ring_offsets, layout.site_offsets)
+    x, y = Events([], [], [], layout).addresses()
+
+    assert len(set(zip(x.tolist(), y.tolist(), strict=True))) == 80
+    if name in {"square", "trenches", "fill factor"}:
+        assert (x.max(), y.max()) == (9, 7)
+
+
+def test_every_site_of_rings_has_its_own_address_and_picture_order():
+    layout = fs.layout.log_polar(n_sectors=64, min_size_um=4.0, r_max_um=150.0)
+    x, y = Events([], [], [], layout).addresses()
+
+    assert len(set(zip(x.tolist(), y.tolist(), strict=True))) == layout.n_sites
+    assert np.corrcoef(x, layout.centroid_um[:, 0])[0, 1] > 0.999
+    assert np.corrcoef(y, layout.centroid_um[:, 1])[0, 1] < -0.999
+
+
+def test_shared_addresses_are_told():
+    layout = fs.layout.grid(n_x=10, n_y=8, pitch_um=4.0)
+    events = Events([], [], [], layout)
+    with pytest.warns(FoveasimWarning, match="80 sites have 1 addresses on the raster, so that some share theirs"):
+        events.addresses(100.0)
+    assert [a.size for a in Events([], [], [], layout[:0]).addresses()] == [0, 0]
+
+
+def test_counts_in_spans_of_time_are_those_of_the_spans(monkeypatch):
+    events = some_events()
+    monkeypatch.setattr(sys.modules[Events.__module__], "MAX_COUNTS", 100 * 24)
+    edges_s = np.array([0.01, 0.02, 0.05, 0.25, 9.0])
+    for polarity in (None, 1, -1):
+        found = events.histogram(edges_s, polarity=polarity)
+        assert found.shape == (4, 24)
+        for k, (begin_s, end_s) in enumerate(itertools.pairwise(edges_s)):
+            assert np.array_equal(found[k], events.between(begin_s, end_s).counts(polarity=polarity))
+    assert events.histogram(edges_s).sum() == len(events.between(0.01, 9.0))
+    for wrong in ([0.0], [1.0, 0.5], [[0.0, 1.0]], np.linspace(0.0, 1.0, 102)):
+        with pytest.raises(ParameterError, match="edges_s"):
+            events.histogram(wrong)
+    for call in (events.counts, lambda polarity: events.histogram([0.0, 1.0], polarity=polarity)):
+        for polarity in ("on", 0):
+            with pytest.raises(ParameterError, match="'polarity' must be 1 or -1"):
+                call(polarity=polarity)
+
+
+@pytest.mark.parametrize(
+    ("t_s", "site", "polarity", "told"),
+    [
+        ([math.nan], [0], [1], "t_s"),
+        ([math.inf], [0], [1], "t_s"),
+        ([1.0, math.nan, 2.0], [0, 0, 0], [1, 1, 1], "t_s"),
+        ([-1.0], [0], [1], "'t_s' must be finite, at least 0, and rising"),
+        ([2.0, 1.0], [0, 0], [1, 1], "sort events by time"),
+        ([1.0], [7], [1], "'site' must be from 0 to 2, the sites of the layout, got 7"),
+        ([1.0], [-1], [1], "site"),
+        ([1.0], [2**33], [1], "got 8589934592"),
+        ([1.0], [0.0], [1], "'site' must be whole numbers"),
+        ([1.0], [0], [0], "'polarity' must be 1 or -1, got 0; of 0 and 1 make 2"),
+        ([1.0], [0], [257], "polarity"),
+        ([1.0], [0, 1], [1], "'site' must be one number for each of 1 times"),
+        ([[1.0]], [0], [1], "t_s"),
+    ],
+)
+def test_events_that_cannot_be_are_told(t_s, site, polarity, told, tmp_path):
+    layout = fs.layout.grid(n_x=3, n_y=1, pitch_um=4.0)
+    with pytest.raises(ParameterError, match=told):
+        Events(t_s, site, polarity, layout)
+    with pytest.raises(ParameterError, match="layout"):
+        Events([1.0], [0], [1], None)
+    # Nor from a file.
+    Events([1.0], [0], [1], layout).save(tmp_path / "e.npz")
+    with np.load(tmp_path / "e.npz") as file:
+        arrays = dict(file) | {"t_s": np.array(t_s), "site": np.array(site), "polarity": np.array(polarity)}
+    np.savez(tmp_path / "e.npz", **arrays)
+    with pytest.raises(FileError, match="is broken or no file of events"):
+        Events.load(tmp_path / "e.npz")
+
+
+def test_events_are_theirs_alone():
+    t_s, site, polarity = np.array([1.0, 2.0]), np.array([0, 1], np.int32), np.array([1, -1], np.int8)
+    window = t_s[:]
+    window.flags.writeable = False
+    layout = fs.layout.grid(n_x=3, n_y=1, pitch_um=4.0)
+    one, other = Events(t_s, site, polarity, layout), Events(window, site, polarity, layout)
+    t_s[0] = 99.0
+
+    assert one.t_s.tolist() == other.t_s.tolist() == [1.0, 2.0]
+    assert not one.t_s.flags.writeable
+    assert t_s.flags.writeable
+    # What nobody can write to is not copied.
+    assert np.shares_memory(one.between(0.0, 1.5).t_s, one.t_s)
+
+
 def test_a_missing_hdf5_library_is_told(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(FileError, match=r"pip install 'foveasim\[video\]'"):
@@ -461,7 +837,7 @@ def test_events_that_would_unpack_to_too_much_are_refused(tmp_path, monkeypatch)
 
 def test_files_that_hold_no_events_are_told(tmp_path):
     with pytest.raises(FileError, match="must end in"):
-        some_events().save(tmp_path / "e.txt")
+        some_events().save(tmp_path / "e.mat")
     with pytest.raises(FileError, match="no such file"):
         Events.load(tmp_path / "none.npz")
     (tmp_path / "bad.npz").write_bytes(b"no zip")

@@ -3,7 +3,11 @@ Numba kernels of asynchronous photosites: events of changes of log light, and sp
 
 They know arrays only, release the interpreter lock, and are compiled for explicit types when this module is imported. Each
 takes some sites through some frames, one frame after the other, and changes what it remembers of every site. Events go to
-arrays in that order; where these are full, events are only counted, so that the caller can begin anew with longer ones.
+arrays in that order, site by site in each frame; ``ends`` tells behind which the frames end. Where the arrays are full, events
+are only counted, so that the caller can begin anew with longer ones; behind ``n_most`` there is no counting on.
+
+An event that times, as floating-point numbers, would put into another frame than its own has the nearest time of its own:
+changes belong to ``(begin, end]`` of a frame, spikes to ``[begin, end)``. So frames follow each other, however they are taken.
 
 Random numbers hang on the key, the site and how many the site drew before: not on how frames come in batches.
 """
@@ -24,10 +28,14 @@ __all__ = ["DIFFERENCE", "HAZARD", "HELD", "LEVEL", "MISSING", "change_events", 
 LEVEL, DIFFERENCE, HELD, HAZARD = range(4)
 #: Of a site that collects charge: what is missing to the next spike, and HELD.
 MISSING = 0
+#: Behind a low pass, light is taken in parts whose logarithms change by at most this: each part has one time constant.
+PART_CHANGE = 0.25
+#: Where logarithms change by less than this, the mean of the ends is the mean of the light to 1e-9.
+LEAST_CHANGE = 1e-4
 #: Steps that find a crossing to its last bits, where Newton's are kept within brackets.
 STEPS = 80
 
-_bytes, _sites = types.int8[::1], types.int32[::1]
+_bytes, _sites, _counts = types.int8[::1], types.int32[::1], types.int64[::1]
 _row = types.Array(types.float64, 1, "C", readonly=True)
 _rows = types.Array(types.float64, 2, "C", readonly=True)
 
@@ -49,6 +57,11 @@ def _risen(slope, swing, tau, begin, end):
 @njit(cache=True, nogil=True)
 def _crossing(slope, swing, tau, begin, difference, on, off, end):
     """First time from ``begin`` to ``end`` at which the difference reaches ``on`` or ``-off``, and which; beyond it if none."""
+    # What rounding left behind the last frame.
+    if difference >= on:
+        return begin, 1
+    if difference <= -off:
+        return begin, -1
     if tau == 0.0:
         if slope > 0.0:
             return begin + (on - difference) / slope, 1
@@ -87,16 +100,16 @@ def _crossing(slope, swing, tau, begin, difference, on, off, end):
 
 @njit(
     types.int64(
-        _rows, _rows, types.float64, types.int64, _row, _row, types.float64, types.float64, types.float64,
-        types.float64, types.float64, types.uint64, types.uint64, types.int64,
-        types.float64[:, ::1], types.int64[::1], types.float64[::1], _sites, _bytes,
+        _rows, _rows, types.float64, types.int64, _row, _row, _row, types.float64, types.float64,
+        types.float64, types.float64, types.uint64, types.uint64, types.int64, types.int64,
+        types.float64[:, ::1], _counts, _counts, types.float64[::1], _sites, _bytes,
     ),
     cache=True,
     nogil=True,
 )  # fmt: skip
 def change_events(
-    log_light, current, frame_s, first_frame, on, off, refractory_s, leak_per_s, tau_e, noise_per_s, noise_half,
-    key_0, key_1, first_site, memory, n_drawn, t_s, site, polarity,
+    log_light, current, frame_s, first_frame, on, off, leak_per_s, refractory_s, tau_e, noise_per_s, noise_half,
+    key_0, key_1, first_site, n_most, memory, n_drawn, ends, t_s, site, polarity,
 ):  # fmt: skip
     """
     Events of some sites from the first to the last of some frames; how many, written or not.
@@ -106,43 +119,63 @@ def change_events(
     """
     n = 0
     for k in range(log_light.shape[0] - 1):
-        begin_s = (first_frame + k) * frame_s
+        begin_s, end_s = (first_frame + k) * frame_s, (first_frame + k + 1) * frame_s
+        after_s = np.nextafter(begin_s, math.inf)
         for i in range(log_light.shape[1]):
-            mean = 0.5 * (current[k, i] + current[k + 1, i])
-            slope = (log_light[k + 1, i] - log_light[k, i]) / frame_s
-            tau = tau_e / mean
-            swing = 0.0
-            if tau > 0.0:
-                swing = memory[i, LEVEL] - log_light[k, i] + slope * tau
             up, down = on[i if on.size > 1 else 0], off[i if off.size > 1 else 0]
-            total = slope + leak_per_s * up
-            noise = noise_per_s / (1.0 + mean / noise_half)
-            u = min(max(memory[i, HELD] - begin_s, 0.0), frame_s)
-            if noise > 0.0 and n_drawn[i] == 0:
+            leak = leak_per_s[i if leak_per_s.size > 1 else 0] * up
+            if n_drawn[i] == 0:
                 n_drawn[i] = 1
-                memory[i, HAZARD] = -math.log(_uniform(_words(key_0, key_1, first_site + i, 0)[0]))
-            while u < frame_s:
-                at, sign = _crossing(total, swing, tau, u, memory[i, DIFFERENCE], up, down, frame_s)
-                noise_at = u + memory[i, HAZARD] / noise if noise > 0.0 else math.inf
-                if at > frame_s and noise_at > frame_s:
-                    memory[i, DIFFERENCE] += _risen(total, swing, tau, u, frame_s)
-                    memory[i, HAZARD] -= noise * (frame_s - u)
-                    break
-                if noise_at < at:
-                    word_0, word_1, _, _ = _words(key_0, key_1, first_site + i, n_drawn[i])
-                    n_drawn[i] += 1
-                    memory[i, HAZARD] = -math.log(_uniform(word_0))
-                    at, sign = noise_at, 1 if word_1 & np.uint64(1) else -1
-                else:
-                    memory[i, HAZARD] -= noise * (at - u)
-                if n < t_s.size:
-                    t_s[n], site[n], polarity[n] = begin_s + at, first_site + i, sign
-                n += 1
-                memory[i, DIFFERENCE] = 0.0
-                memory[i, HELD] = begin_s + at + refractory_s
-                u = at + refractory_s
-            if tau > 0.0:
-                memory[i, LEVEL] = log_light[k + 1, i] - slope * tau + swing * math.exp(-frame_s / tau)
+                word_0, word_1, _, _ = _words(key_0, key_1, first_site + i, 0)
+                memory[i, HAZARD] = -math.log(_uniform(word_0))
+                # A leaking site is anywhere between two events when the light begins.
+                memory[i, DIFFERENCE] = _uniform(word_1) * up if leak > 0.0 else 0.0
+            change = log_light[k + 1, i] - log_light[k, i]
+            slope = change / frame_s
+            total = slope + leak
+            n_parts = max(1, math.ceil(abs(change) / PART_CHANGE)) if tau_e > 0.0 else 1
+            part_s, part_change = frame_s / n_parts, change / n_parts
+            end_current = current[k, i]
+            for part in range(n_parts):
+                part_begin_s = part * part_s
+                light = log_light[k, i] + part * part_change
+                begin_current, end_current = end_current, current[k + 1, i]
+                if part < n_parts - 1:
+                    end_current = current[k, i] * math.exp((part + 1) * part_change)
+                # The mean of light whose logarithm is a straight line: with it the low pass decays as it should.
+                mean = 0.5 * (begin_current + end_current)
+                if abs(part_change) > LEAST_CHANGE:
+                    mean = (end_current - begin_current) / part_change
+                tau = tau_e / mean
+                swing = memory[i, LEVEL] - light + slope * tau if tau > 0.0 else 0.0
+                noise = noise_per_s / (1.0 + mean / noise_half)
+                u = min(max(memory[i, HELD] - begin_s - part_begin_s, 0.0), part_s)
+                while u < part_s:
+                    at, sign = _crossing(total, swing, tau, u, memory[i, DIFFERENCE], up, down, part_s)
+                    noise_at = u + memory[i, HAZARD] / noise if noise > 0.0 else math.inf
+                    if at > part_s and noise_at > part_s:
+                        memory[i, DIFFERENCE] += _risen(total, swing, tau, u, part_s)
+                        memory[i, HAZARD] -= noise * (part_s - u)
+                        break
+                    if noise_at < at:
+                        word_0, word_1, _, _ = _words(key_0, key_1, first_site + i, n_drawn[i])
+                        n_drawn[i] += 1
+                        memory[i, HAZARD] = -math.log(_uniform(word_0))
+                        at, sign = noise_at, 1 if word_1 & np.uint64(1) else -1
+                    else:
+                        memory[i, HAZARD] -= noise * (at - u)
+                    at_s = begin_s + (part_begin_s + at)
+                    if n < t_s.size:
+                        t_s[n], site[n], polarity[n] = min(max(at_s, after_s), end_s), first_site + i, sign
+                    n += 1
+                    if n > n_most:
+                        return n
+                    memory[i, DIFFERENCE] = 0.0
+                    memory[i, HELD] = at_s + refractory_s
+                    u = at + refractory_s
+                if tau > 0.0:
+                    memory[i, LEVEL] = light + part_change - slope * tau + swing * math.exp(-part_s / tau)
+        ends[k] = n
     return n
 
 
@@ -167,26 +200,15 @@ def _gamma(shape, key_0, key_1, site, number):
 @njit(
     types.int64(
         _rows, types.float64, types.int64, _row, types.float64, types.boolean, types.uint64, types.uint64, types.int64,
-        types.float64[:, ::1], types.int64[::1], types.float64[::1], _sites,
+        types.int64, types.float64[:, ::1], _counts, _counts, types.float64[::1], _sites, _bytes,
     ),
     cache=True,
     nogil=True,
 )  # fmt: skip
 def charge_spikes(
-    current,
-    frame_s,
-    first_frame,
-    threshold_e,
-    refractory_s,
-    is_noisy,
-    key_0,
-    key_1,
-    first_site,
-    memory,
-    n_drawn,
-    t_s,
-    site,
-):
+    current, frame_s, first_frame, threshold_e, refractory_s, is_noisy, key_0, key_1, first_site,
+    n_most, memory, n_drawn, ends, t_s, site, polarity,
+):  # fmt: skip
     """
     Spikes of some sites during some frames; how many, written or not.
 
@@ -196,6 +218,7 @@ def charge_spikes(
     n = 0
     for k in range(current.shape[0]):
         begin_s = (first_frame + k) * frame_s
+        last_s = np.nextafter((first_frame + k + 1) * frame_s, -math.inf)
         for i in range(current.shape[1]):
             rate, threshold = current[k, i], threshold_e[i if threshold_e.size > 1 else 0]
             u = min(max(memory[i, HELD] - begin_s, 0.0), frame_s)
@@ -205,16 +228,20 @@ def charge_spikes(
                     memory[i, MISSING] = threshold
                     if is_noisy:
                         memory[i, MISSING], n_drawn[i] = _gamma(threshold, key_0, key_1, first_site + i, n_drawn[i])
-                at = u + memory[i, MISSING] / rate if rate > 0.0 else math.inf
+                # A charge that is missing by less than nothing was complete when the frame before ended.
+                at = u + max(memory[i, MISSING], 0.0) / rate if rate > 0.0 else math.inf
                 if at >= frame_s:
                     memory[i, MISSING] -= rate * (frame_s - u)
                     break
                 if n < t_s.size:
-                    t_s[n], site[n] = begin_s + at, first_site + i
+                    t_s[n], site[n], polarity[n] = min(begin_s + at, last_s), first_site + i, 1
                 n += 1
+                if n > n_most:
+                    return n
                 memory[i, MISSING] = threshold
                 if is_noisy:
                     memory[i, MISSING], n_drawn[i] = _gamma(threshold, key_0, key_1, first_site + i, n_drawn[i])
                 memory[i, HELD] = begin_s + at + refractory_s
                 u = at + refractory_s
+        ends[k] = n
     return n

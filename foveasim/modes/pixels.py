@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from itertools import islice
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim.arrays import Floats, Ints, check_count, check_number, finite_array, read_only
 from foveasim.compiled import kernels
 from foveasim.errors import ParameterError, SimulationError
+from foveasim.layout import Layout
 from foveasim.modes.events import Events
 from foveasim.parallel import each, thread_count
 from foveasim.sensor import Sensor
@@ -31,13 +33,17 @@ __all__ = ["EventPixels", "SpikingPixels"]
 MIN_CONTRAST = 1e-3
 #: A site's threshold is at least this share of the mean, whatever its mismatch.
 LEAST_THRESHOLD = 0.1
+#: A wider spread of thresholds would have more than one in a thousand sites below the least, and no longer be what it says.
+MAX_MISMATCH = 0.3
 #: Sites that one thread works on at a time; fixed, so that results do not depend on the number of threads.
 PIECE_SITES = 2048
 #: More events of one batch than this are a slip: of a threshold, or of the light's unit.
 MAX_EVENTS = 1 << 27
 
-#: A kernel for some sites: of their positions, and where what they remember and their events are.
-Work = Callable[[slice, NDArray[Any], Ints, Floats, NDArray[np.int32], NDArray[np.int8]], int]
+#: A kernel for some sites: of their positions and the most events, and where what they remember and their events are.
+Work = Callable[[slice, int, NDArray[Any], Ints, Ints, Floats, NDArray[np.int32], NDArray[np.int8]], int]
+#: Events of some sites, frame by frame: behind which each frame ends, and their times, sites and polarities.
+Piece = tuple[Ints, Floats, NDArray[np.int32], NDArray[np.int8]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +58,7 @@ class EventPixels:
     contrast_on, contrast_off : float
         Change of the natural logarithm of the photocurrent that gives an event: 0.2 are 22 % brighter, or 18 % darker.
     mismatch_fraction : float
-        Standard deviation of the sites' thresholds over their mean, fixed in the device.
+        Standard deviation of the sites' thresholds over their mean, fixed in the device; at most 0.3.
     refractory_s : float, s
         How long a site is held after an event, while its reference follows the light.
     capacitance_f : float, F
@@ -60,6 +66,8 @@ class EventPixels:
     temperature_k : float, K
     leak_per_s : float, 1/s
         Events of brightening that a site gives each second in constant light, by leakage.
+    leak_spread_fraction : float
+        Standard deviation of the sites' leaks over their mean, a log-normal law, fixed in the device.
     noise_per_s : float, 1/s
         Events of shot noise, of either polarity alike, that a site gives each second in darkness ...
     noise_half_e_per_s : float, e-/s
@@ -76,9 +84,13 @@ class EventPixels:
     -----
     Between frames the logarithm of the photocurrent I is a straight line L(t), and events have the times at which the
     thresholds are crossed, to the last bits. The photoreceptor follows it as a low pass, ``dV/dt = (L - V) / tau`` with
-    ``tau = C (kT/q) / I``, the corner frequency ``1 / (2 pi tau)`` in proportion to the light, and I the mean of the
-    interval's ends. An event sets the site's reference to its level at the end of the refractory time; leakage lowers the
-    reference.
+    ``tau = C (kT/q) / I``, the corner frequency ``1 / (2 pi tau)`` in proportion to the light; I is the mean current of each
+    part of a frame in which L changes by at most a quarter. An event sets the site's reference to its level at the end of the
+    refractory time; leakage lowers the reference. Frames should follow each other so fast that L changes little between them:
+    what the light did meanwhile nobody told.
+
+    A leaking site is anywhere between two events of its leak when the light begins, at a place drawn with the noise: sites do
+    not tell in chorus. An event at the border of two frames is of the first.
 
     Noise is that of a Poisson process with the refractory time as its dead time; a noise event sets the reference like any
     other.
@@ -103,6 +115,7 @@ class EventPixels:
     capacitance_f: float = 0.0
     temperature_k: float = 300.0
     leak_per_s: float = 0.0
+    leak_spread_fraction: float = 0.0
     noise_per_s: float = 0.0
     noise_half_e_per_s: float = 1e4
     floor_e_per_s: float = 1.0
@@ -111,8 +124,12 @@ class EventPixels:
         _check_sensor(self.sensor)
         for name in ("contrast_on", "contrast_off"):
             object.__setattr__(self, name, check_number(name, getattr(self, name), at_least=MIN_CONTRAST))
-        for name in ("mismatch_fraction", "refractory_s", "leak_per_s", "noise_per_s", "floor_e_per_s"):
+        for name in ("refractory_s", "leak_per_s", "leak_spread_fraction", "noise_per_s", "floor_e_per_s"):
             object.__setattr__(self, name, check_number(name, getattr(self, name), at_least=0.0))
+        mismatch_fraction = check_number(
+            "mismatch_fraction", self.mismatch_fraction, at_least=0.0, at_most=MAX_MISMATCH, cure="0.03 are 3 %"
+        )
+        object.__setattr__(self, "mismatch_fraction", mismatch_fraction)
         for name in ("temperature_k", "noise_half_e_per_s"):
             object.__setattr__(self, name, check_number(name, getattr(self, name), above=0.0))
         capacitance_f = check_number("capacitance_f", self.capacitance_f, at_least=0.0, at_most=1e-9)
@@ -130,6 +147,16 @@ class EventPixels:
             for mean, which in zip(means, ("on", "off"), strict=True)
         )
         return read_only(on), read_only(off)
+
+    @cached_property
+    def leaks_per_s(self) -> Floats:
+        """Events that every site's leakage gives each second, (n_site,) or (1,)."""
+        if not self.leak_spread_fraction:
+            return read_only(np.full(1, self.leak_per_s))
+        # Of the logarithm: so the law has the mean 1 and the standard deviation that was asked for.
+        sigma = np.sqrt(np.log1p(self.leak_spread_fraction**2))
+        factors = np.exp(sigma * self.sensor.device.normals("event leak") - 0.5 * sigma**2)
+        return read_only(np.asarray(self.leak_per_s * factors))
 
     def stream(
         self,
@@ -168,6 +195,7 @@ class EventPixels:
         SimulationError
             When a site has no current at all, or there are more events than fit the memory.
         """
+        _check_rates(rates)
         frame_s = check_number("frame_s", frame_s, above=0.0)
         batch = check_count("batch", batch)
         key = device_key(check_count("seed", seed, at_least=0), "change events")
@@ -182,7 +210,7 @@ class EventPixels:
     ) -> Iterator[Events]:
         kernel = kernels("modes")
         tau_e = self.capacitance_f * BOLTZMANN_J_PER_K * self.temperature_k / ELEMENTARY_CHARGE_C**2
-        on, off = self.thresholds
+        (on, off), leaks_per_s = self.thresholds, self.leaks_per_s
         memory = np.zeros((self.sensor.layout.n_sites, 4))
         n_drawn = np.zeros(self.sensor.layout.n_sites, np.int64)
         n_before = 0
@@ -202,7 +230,7 @@ class EventPixels:
                 log_light = np.log(frames)
             first = max(n_before - 1, 0)
 
-            def work(sites: slice, kept: NDArray[Any], drawn: Ints, *out: NDArray[Any]) -> int:
+            def work(sites: slice, n_most: int, *out: NDArray[Any]) -> int:
                 return int(
                     kernel.change_events(
                         np.ascontiguousarray(log_light[:, sites]),  # noqa: B023 -- is called at once
@@ -211,22 +239,21 @@ class EventPixels:
                         first,  # noqa: B023
                         _part(on, sites),
                         _part(off, sites),
+                        _part(leaks_per_s, sites),
                         self.refractory_s,
-                        self.leak_per_s,
                         tau_e,
                         self.noise_per_s,
                         self.noise_half_e_per_s,
                         *key,
                         sites.start,
-                        kept,
-                        drawn,
+                        n_most,
                         *out,
                     )
                 )
 
             n_before += current.shape[0]
             before = current[-1:].copy()
-            yield _gathered(work, memory, n_drawn, self.sensor, n_threads)
+            yield _gathered(work, frames.shape[0] - 1, memory, n_drawn, self.sensor, n_threads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,6 +345,7 @@ class SpikingPixels:
         SimulationError
             When there are more spikes than fit the memory.
         """
+        _check_rates(rates)
         frame_s = check_number("frame_s", frame_s, above=0.0)
         batch = check_count("batch", batch)
         key = device_key(check_count("seed", seed, at_least=0), "spikes")
@@ -343,9 +371,7 @@ class SpikingPixels:
                     "batch, a higher threshold_e, or less light"
                 )
 
-            def work(sites: slice, kept: NDArray[Any], drawn: Ints, *out: NDArray[Any]) -> int:
-                t_s, site, polarity = out
-                polarity[:] = 1
+            def work(sites: slice, n_most: int, *out: NDArray[Any]) -> int:
                 return int(
                     kernel.charge_spikes(
                         np.ascontiguousarray(current[:, sites]),  # noqa: B023 -- is called at once
@@ -356,14 +382,12 @@ class SpikingPixels:
                         self.sensor.shot_noise != "off",
                         *key,
                         sites.start,
-                        kept,
-                        drawn,
-                        t_s,
-                        site,
+                        n_most,
+                        *out,
                     )
                 )
 
-            yield _gathered(work, memory, n_drawn, self.sensor, n_threads)
+            yield _gathered(work, current.shape[0], memory, n_drawn, self.sensor, n_threads)
             first += current.shape[0]
 
 
@@ -373,6 +397,17 @@ class SpikingPixels:
 def _check_sensor(sensor: object) -> None:
     if not isinstance(sensor, Sensor):
         raise ParameterError("sensor", f"must be a foveasim.Sensor, got a {type(sensor).__name__}")
+    if not isinstance(sensor.layout, Layout):
+        raise ParameterError("sensor", f"must have a foveasim.Layout, got a {type(sensor.layout).__name__}")
+
+
+def _check_rates(rates: object) -> None:
+    if not isinstance(rates, Iterable):
+        raise ParameterError(
+            "rates",
+            f"must be frames of one rate a site each, got a {type(rates).__name__}",
+            cure="foveasim.Camera.rates makes them of light",
+        )
 
 
 def _part(values: Floats, sites: slice) -> Floats:
@@ -394,34 +429,75 @@ def _batches(sensor: Sensor, rates: Iterable[ArrayLike], batch: int) -> Iterator
         yield current
 
 
-def _gathered(work: Work, memory: NDArray[Any], n_drawn: Ints, sensor: Sensor, n_threads: int) -> Events:
+def _gathered(work: Work, n_frames: int, memory: NDArray[Any], n_drawn: Ints, sensor: Sensor, n_threads: int) -> Events:
     """What a kernel makes of all sites, in the order of time."""
+    n_found = 0
+    adding = Lock()
 
-    def piece(first: int) -> tuple[Floats, NDArray[np.int32], NDArray[np.int8]]:
+    def piece(first: int) -> Piece:
+        nonlocal n_found
         sites = slice(first, min(first + PIECE_SITES, memory.shape[0]))
         capacity = 4 * PIECE_SITES
         while True:
-            kept, drawn = memory[sites].copy(), n_drawn[sites].copy()
+            kept, drawn, ends = memory[sites].copy(), n_drawn[sites].copy(), np.zeros(n_frames, np.int64)
             out = np.empty(capacity), np.empty(capacity, np.int32), np.empty(capacity, np.int8)
-            n = work(sites, kept, drawn, *out)
+            n_most = MAX_EVENTS - n_found
+            n = work(sites, n_most, kept, drawn, ends, *out)
+            if n > n_most:
+                raise _too_many(n_frames)
             if n <= capacity:
-                memory[sites], n_drawn[sites] = kept, drawn
-                return out[0][:n], out[1][:n], out[2][:n]
-            if n > MAX_EVENTS:
-                raise SimulationError(
-                    f"{n:,} events of {sites.stop - sites.start} sites do not fit the memory: take fewer frames a "
-                    "batch, higher thresholds, or less noise"
-                )
+                break
             capacity = n
+        memory[sites], n_drawn[sites] = kept, drawn
+        with adding:
+            n_found += n
+        if n_found > MAX_EVENTS:
+            raise _too_many(n_frames)
+        return ends, out[0][:n], out[1][:n], out[2][:n]
 
-    parts = each(piece, range(0, memory.shape[0], PIECE_SITES), n_threads)
-    if not parts:
-        return Events(np.zeros(0), np.zeros(0, np.int32), np.zeros(0, np.int8), sensor.layout)  # type: ignore[arg-type]
-    t_s, site, polarity = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    order = np.lexsort((site, t_s))
-    return Events(t_s[order], site[order], polarity[order], sensor.layout)  # type: ignore[arg-type]
+    pieces = each(piece, range(0, memory.shape[0], PIECE_SITES), n_threads)
+    t_s, site, polarity = np.empty(n_found), np.empty(n_found, np.int32), np.empty(n_found, np.int8)
+    begins = np.concatenate(([0], sum((ends for ends, *_ in pieces), np.zeros(n_frames, np.int64))))
+
+    def frame(k: int) -> None:
+        # The events of a frame: later than those of the frame before, site by site, and of each site in the order of time.
+        parts = [[array[ends[k - 1] if k else 0 : ends[k]] for array in (s, i, p)] for ends, s, i, p in pieces]
+        found_s, sites, signs = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        order = _rising(found_s)
+        where = slice(begins[k], begins[k + 1])
+        for all_of, of_frame in ((t_s, found_s), (site, sites), (polarity, signs)):
+            all_of[where] = of_frame[order]
+
+    if pieces:
+        each(frame, range(n_frames), n_threads)
+    return Events(read_only(t_s), read_only(site), read_only(polarity), _layout(sensor))
+
+
+def _too_many(n_frames: int) -> SimulationError:
+    return SimulationError(
+        f"more than {MAX_EVENTS:,} events of {n_frames} frames do not fit the memory: take fewer frames a batch, higher "
+        "thresholds, less light or less noise"
+    )
+
+
+def _rising(values: Floats) -> Ints:
+    """Places of values in rising order, equal ones as they come: four times as fast as a stable sort."""
+    order = np.argsort(values)
+    in_order = values[order]
+    is_tied = np.zeros(values.size, bool)
+    np.equal(in_order[1:], in_order[:-1], out=is_tied[1:])
+    is_tied[:-1] |= is_tied[1:]
+    tied = order[is_tied]
+    order[is_tied] = tied[np.lexsort((tied, values[tied]))]
+    return order
 
 
 def _all(batches: Iterator[Events], sensor: Sensor) -> Events:
-    nothing = Events(np.zeros(0), np.zeros(0, np.int32), np.zeros(0, np.int8), sensor.layout)  # type: ignore[arg-type]
+    nothing = Events(np.zeros(0), np.zeros(0, np.int32), np.zeros(0, np.int8), _layout(sensor))
     return Events.joined([nothing, *batches])
+
+
+def _layout(sensor: Sensor) -> Layout:
+    layout = sensor.layout
+    assert isinstance(layout, Layout)  # was checked
+    return layout

@@ -12,8 +12,8 @@ from typing import Literal
 
 import numpy as np
 
-from foveasim.arrays import Floats, check_choice, check_number
-from foveasim.errors import SimulationError
+from foveasim.arrays import Floats, check_choice, check_count, check_number, finite_array
+from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
 
 __all__ = ["Between", "Exposure", "Shutter"]
@@ -42,7 +42,7 @@ class Shutter:
     Raises
     ------
     ParameterError
-        When a time is out of range.
+        When a time is out of range, or the layout is none.
     SimulationError
         When lines differ in time, and the layout does not say which site is on which.
 
@@ -63,6 +63,8 @@ class Shutter:
     between: Between = "hold"
 
     def __post_init__(self) -> None:
+        if not isinstance(self.layout, Layout):
+            raise ParameterError("layout", f"must be a foveasim.Layout, got a {type(self.layout).__name__}")
         object.__setattr__(self, "frame_s", check_number("frame_s", self.frame_s, above=0.0))
         object.__setattr__(self, "line_s", check_number("line_s", self.line_s, at_least=0.0))
         check_choice("between", self.between, ("hold", "linear"))
@@ -82,6 +84,8 @@ class Shutter:
 
     def share(self, frame: int, exposure_s: float) -> Floats:
         """Share of each site's exposure that a frame lights, (n_site,) or (1,); frame 0 begins with the first line."""
+        frame = check_count("frame", frame, at_least=0)
+        exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
         delay_s = self.delay_s
         if not exposure_s:  # a moment
             return np.where((delay_s >= frame * self.frame_s) & (delay_s < (frame + 1) * self.frame_s), 1.0, 0.0)
@@ -93,6 +97,7 @@ class Shutter:
 
     def last_frame(self, exposure_s: float) -> int:
         """The last frame that lights any site's exposure."""
+        exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
         end = (float(self.delay_s.max(initial=0.0)) + exposure_s) / self.frame_s
         frames = int(np.ceil(end - TIME_ROUNDING))
         return max(frames - 1, 0) if self.between == "hold" else frames
@@ -106,9 +111,18 @@ class Exposure:
     ----------
     shutter : Shutter
     exposure_s : float, s
+        0 for a moment.
+
+    Raises
+    ------
+    ParameterError
+        When the time is out of range, or light is not one finite number of at least 0 a site.
     """
 
     def __init__(self, shutter: Shutter, exposure_s: float) -> None:
+        if not isinstance(shutter, Shutter):
+            raise ParameterError("shutter", f"must be a foveasim.modes.Shutter, got a {type(shutter).__name__}")
+        exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
         self._shutter, self.exposure_s = shutter, exposure_s
         self._last = shutter.last_frame(exposure_s)
         self._n_seen = 0
@@ -122,6 +136,7 @@ class Exposure:
 
     def add(self, rate_e_per_s: Floats) -> None:
         """Add the next frame's light, (n_site,) e-/s."""
+        rate_e_per_s = self._light("rate_e_per_s", rate_e_per_s)
         if not self.is_over:
             share = self._shutter.share(self._n_seen, self.exposure_s)
             self._rate_e_per_s = self._rate_e_per_s + share * rate_e_per_s
@@ -130,9 +145,16 @@ class Exposure:
 
     def mean_e_per_s(self, last_e_per_s: Floats) -> Floats:
         """Mean light over every site's exposure, (n_site,) e-/s; the last frame's light stays until all are over."""
+        last_e_per_s = self._light("last_e_per_s", last_e_per_s)
         if self.is_over:
             return self._rate_e_per_s
         return self._rate_e_per_s + (1.0 - self._share) * last_e_per_s
+
+    def _light(self, name: str, rate_e_per_s: Floats) -> Floats:
+        light, n_sites = finite_array(name, rate_e_per_s, at_least=0.0), self._shutter.layout.n_sites
+        if light.shape != (n_sites,):
+            raise ParameterError(name, f"must have one number for each of the {n_sites} sites, got {light.shape}")
+        return light
 
 
 def _hat_integral(x: Floats) -> Floats:

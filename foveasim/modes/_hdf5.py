@@ -1,0 +1,176 @@
+"""Events in HDF5: the arrays that event tools read, and beside them the sites that tools do not know."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.apart import read_apart
+from foveasim.arrays import Floats, Ints
+from foveasim.errors import FileError, ParameterError
+from foveasim.layout import Layout
+from foveasim.layout.packed import packed_layout, unpacked_layout
+from foveasim.records import described
+
+__all__ = ["EventFile", "read_events"]
+
+FORMAT, VERSION = "foveasim events", 2
+#: Events, and milliseconds, of one chunk.
+CHUNK = 1 << 16
+#: The table of milliseconds holds one number for each: those of more than a day are a slip, of a clock that began long ago.
+MAX_MS = 100_000_000
+#: Bytes in memory that one byte in a file may become: what deflate can do at most; and how many any file may.
+UNPACKED_PER_BYTE, MAX_UNPACKED_BYTES = 1032, 8 * 2**30
+#: Kinds of columns that HDF5 has numbers for; text is kept as its bytes.
+NUMBERS, TEXT = "biuf", "US"
+KINDS = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8, "site": np.int32}
+
+
+class EventFile:
+    """
+    A file that events are added to, of an open HDF5 group.
+
+    Parameters
+    ----------
+    file : h5py.File
+    layout : Layout
+    x, y : (n_site,) uint16
+        Each site's address.
+    """
+
+    def __init__(self, file: Any, layout: Layout, x: NDArray[np.uint16], y: NDArray[np.uint16]) -> None:
+        self._file, self._x, self._y = file, x, y
+        self.n_events, self._n_ms = 0, 0
+        for name, kind in KINDS.items():
+            file.create_dataset(
+                f"events/{name}", (0,), kind, maxshape=(None,), chunks=(CHUNK,), compression="gzip", shuffle=True
+            )
+        file.create_dataset("ms_to_idx", (0,), np.uint64, maxshape=(None,), chunks=(CHUNK,))
+        file["t_offset"] = np.int64(0)
+        centroid_um = layout.centroid_um
+        sites = {"x_um": centroid_um[:, 0], "y_um": centroid_um[:, 1], "area_um2": layout.area_um2, "x": x, "y": y}
+        for name, values in sites.items():
+            file[f"sites/{name}"] = values
+        for name, values in packed_layout(layout).items():
+            if values.dtype.kind not in NUMBERS + TEXT:
+                raise ParameterError("batches", f"have a layout whose {name} is of {values.dtype}, which HDF5 has not")
+            file[f"layout/{name}"] = np.char.encode(values, "utf-8") if values.dtype.kind == "U" else values
+        provenance = json.dumps(described(dict(layout.provenance)))
+        file["layout/provenance"] = np.frombuffer(provenance.encode(), np.uint8)
+        file.attrs.update({"format": FORMAT, "version": VERSION})
+
+    def add(self, t_us: Ints, site: NDArray[np.int32], polarity: NDArray[np.int8]) -> None:
+        """Add events, all later than those before."""
+        if t_us.size == 0:
+            return
+        n_ms = int(t_us[-1]) // 1000 + 1
+        if n_ms > MAX_MS:
+            raise ParameterError(
+                "batches",
+                f"must end before {MAX_MS // 1000:,} s, as HDF5 has a table of the milliseconds",
+                float(t_us[-1]) * 1e-6,
+                "s",
+                "take off what the clock showed when the recording began",
+            )
+        values: dict[str, NDArray[Any]] = {
+            "t": t_us,
+            "x": self._x[site],
+            "y": self._y[site],
+            "p": polarity > 0,
+            "site": site,
+        }
+        for name in KINDS:
+            _append(self._file[f"events/{name}"], values[name])
+        # Of the milliseconds that begin behind all events before.
+        for begin in range(self._n_ms, n_ms, CHUNK):
+            begins_us = 1000 * np.arange(begin, min(begin + CHUNK, n_ms))
+            _append(self._file["ms_to_idx"], self.n_events + np.searchsorted(t_us, begins_us))
+        self.n_events, self._n_ms = self.n_events + t_us.size, n_ms
+
+    def end(self) -> None:
+        """Write what comes behind the last event."""
+        _append(self._file["ms_to_idx"], np.array([self.n_events]))
+
+
+def read_events(path: Path) -> tuple[Floats, NDArray[np.int32], NDArray[np.int8], Layout]:
+    """
+    Times to the microsecond below, sites, polarities and layout of a file that :class:`EventFile` wrote.
+
+    Raises
+    ------
+    FileError
+        When the file is broken, hostile, or holds something else.
+    """
+    told, numbers = read_apart(_read, path, kind="HDF5", max_unpacked=_max_unpacked)
+    arrays: dict[str, NDArray[Any]] = {}
+    begin = 0
+    for name, kind, shape in told["arrays"]:
+        n_bytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(kind).itemsize
+        arrays[name] = numbers[begin : begin + n_bytes].view(kind).reshape(shape)
+        begin += n_bytes
+    outlines = {
+        name.removeprefix("layout/"): np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values
+        for name, values in arrays.items()
+        if name.startswith("layout/") and name != "layout/provenance"
+    }
+    layout = unpacked_layout(outlines, json.loads(arrays["layout/provenance"].tobytes()))
+    # In one step from the whole number: 0.3 s is 300,000 µs, and comes back as 0.3.
+    t_s = arrays["events/t"] / 1e6
+    return t_s, arrays["events/site"], (2 * arrays["events/p"].astype(np.int8) - 1).astype(np.int8), layout
+
+
+def _append(dataset: Any, values: NDArray[Any]) -> None:
+    n = dataset.shape[0]
+    dataset.resize((n + values.size,))
+    dataset[n:] = values
+
+
+# -- the other program ------------------------------------------------------------------------------------------------
+
+
+def _max_unpacked(n_bytes: int) -> int:
+    return min(UNPACKED_PER_BYTE * n_bytes, MAX_UNPACKED_BYTES)
+
+
+def _read(path: Path) -> tuple[dict[str, Any], NDArray[np.uint8]]:
+    """The arrays of a file one behind the other as bytes, and what each is."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        if file.attrs.get("format") != FORMAT:
+            raise FileError(path, "holds no events of foveasim; make them with Events.from_addresses")
+        if file.attrs.get("version") != VERSION:
+            raise FileError(path, f"has the format version {file.attrs.get('version')!s:.40}, expected {VERSION}")
+        found = {f"events/{name}": _dataset(path, file, "events", name) for name in ("t", "site", "p")}
+        for name in _group(path, file, "layout"):
+            found[f"layout/{name}"] = _dataset(path, file, "layout", name)
+        if sum(part.size * part.dtype.itemsize for part in found.values()) > _max_unpacked(path.stat().st_size):
+            raise FileError(path, "would unpack to more than a file of its size holds")
+        arrays = {name: np.ascontiguousarray(part[()]) for name, part in found.items()}
+    kinds = [(name, values.dtype.str, values.shape) for name, values in arrays.items()]
+    return {"arrays": kinds}, np.concatenate([values.ravel().view(np.uint8) for values in arrays.values()])
+
+
+def _group(path: Path, file: Any, name: str) -> Mapping[str, Any]:
+    import h5py
+
+    if not isinstance(file.get(name, getlink=True), h5py.HardLink) or not isinstance(file[name], h5py.Group):
+        raise FileError(path, f"has no group {name!r} of its own")
+    group: Mapping[str, Any] = file[name]
+    return group
+
+
+def _dataset(path: Path, file: Any, group: str, name: str) -> Any:
+    """A dataset of numbers or text that lies in this file."""
+    import h5py
+
+    parts: Any = _group(path, file, group)
+    part = parts[name] if isinstance(parts.get(name, getlink=True), h5py.HardLink) else None
+    if not isinstance(part, h5py.Dataset) or part.external or part.is_virtual or part.dtype.kind not in NUMBERS + "S":
+        raise FileError(path, f"has no numbers '{group}/{name}' of its own")
+    return part
