@@ -18,11 +18,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, check_count, check_number, finite_array
+from foveasim.arrays import Floats, check_count, check_number, finite_array, read_only
 from foveasim.capture import Capture
 from foveasim.compiled import kernels
 from foveasim.distortion import Lens
-from foveasim.errors import CoverageWarning, ParameterError, SimulationError
+from foveasim.errors import CoverageWarning, FoveasimWarning, ParameterError, SimulationError
 from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
@@ -49,6 +49,8 @@ KeptImages = dict[tuple[Grid, int], NDArray[Any]]
 NEGATIVE_ROUNDING = 1e-4
 #: A filter that passes less than this share of the strongest one's light cannot be balanced against it.
 DIMMEST_WHITE = 0.01
+#: Exposures that outlast the time between them by this share do so by rounding.
+TIME_ROUNDING = 1e-9
 #: Compiled layouts that a camera keeps, one for each grid it met: those of this many kinds of light.
 KEPT_INTEGRATORS = 4
 #: Where cells are at most this many λN wide the light is smooth over them, and integration of second order is up to 70 times
@@ -323,13 +325,14 @@ class Camera:
         Yields
         ------
         photo_e_per_s : (n_site,) float64, e-/s
-            As :meth:`photoelectrons_per_s` gives it.
+            As :meth:`photoelectrons_per_s` gives it; read-only, since a frame that comes again gives the same array again.
 
         Raises
         ------
         ParameterError, SimulationError
-            As for :meth:`capture`, when the frame comes.
+            At once, when an argument is out of range; as for :meth:`capture`, when the frame comes.
         """
+        _check_frames(frames)
         ahead = check_count("ahead", ahead, at_least=0)
         return (rate_e_per_s for *_, rate_e_per_s in self._lit(frames, _Clock(), ahead))
 
@@ -382,6 +385,11 @@ class Camera:
         ParameterError, SimulationError
             At once, when an argument is out of range; as for :meth:`capture`, when the frame comes.
 
+        Warns
+        -----
+        FoveasimWarning
+            When an exposure outlasts the time to the begin of the next one: no photosite can be in both.
+
         Notes
         -----
         In memory are one frame of light, or ``ahead`` of them, and some numbers a site of every exposure that is going on; the
@@ -407,8 +415,7 @@ class Camera:
         if exposures_s.ndim > 1 or exposures_s.size == 0:
             raise ParameterError("exposure_s", "must be one time, or a sequence of times", exposure_s, "s")
         exposures_s = np.atleast_1d(exposures_s)
-        if not isinstance(frames, Iterable):
-            raise ParameterError("frames", f"must be an iterable of Scenes or PowerMaps, got a {type(frames).__name__}")
+        _check_frames(frames)
         if frame_s is None and (line_s or between != "hold" or every != 1):
             name = "line_s" if line_s else "between" if between != "hold" else "every"
             raise ParameterError(name, "needs 'frame_s', the time from one frame of light to the next")
@@ -417,6 +424,13 @@ class Camera:
         if frame_s is None:
             return self._still(frames, exposures_s, streams, ahead)
         shutter = Shutter(self._layout, frame_s, line_s, between)
+        if exposures_s.max() > (1.0 + TIME_ROUNDING) * every * shutter.frame_s:
+            warnings.warn(
+                f"an exposure of {exposures_s.max():g} s outlasts the {every * shutter.frame_s:g} s to the next one's begin, "
+                "and no photosite can collect the same light for both: take a shorter 'exposure_s', or a larger 'every'",
+                FoveasimWarning,
+                stacklevel=2,
+            )
         return self._rolling(frames, exposures_s, streams, shutter, every, ahead)
 
     def _still(self, frames: Iterable[Light], exposures_s: Floats, streams: Streams, ahead: int) -> Iterator[Capture]:
@@ -476,7 +490,8 @@ class Camera:
 
         rate_e_per_s = np.zeros(self._layout.n_sites)
         for task, found, own in in_order(lit, _tasks(frames), self._n_threads, ahead):
-            rate_e_per_s = rate_e_per_s if found is None else found
+            # Who gets it twice must find it as it was.
+            rate_e_per_s = rate_e_per_s if found is None else read_only(found)
             clock.add(own)
             yield task.light, task.place_um, rate_e_per_s
 
@@ -694,6 +709,14 @@ def _tasks(frames: Iterable[Light]) -> Iterator[_Task]:
         is_repeated = before is not None and is_same and place_um == before.place_um
         before = _Task(light, place_um, images, is_repeated)
         yield before
+
+
+def _check_frames(frames: object) -> None:
+    if not isinstance(frames, Iterable):
+        cure = "put one into a list" if isinstance(frames, Scene | PowerMap) else ""
+        raise ParameterError(
+            "frames", f"must be an iterable of Scenes or PowerMaps, got a {type(frames).__name__}", cure=cure
+        )
 
 
 def _told(place_um: Place) -> dict[str, Any]:

@@ -15,9 +15,11 @@ import numpy as np
 import pytest
 
 import foveasim as fs
-from foveasim.errors import FileError, ParameterError, SimulationError
+from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
+from foveasim.modes import Exposure, Shutter
 from foveasim.pictures import write_picture
 from foveasim.sensor import merge_exposures
+from foveasim.streams import Streams
 from foveasim.video import (
     Footage,
     GazePath,
@@ -29,6 +31,7 @@ from foveasim.video import (
     saccades,
     write_video,
 )
+from foveasim.video.footage import pictures_in
 
 PITCH_UM, DISTANCE_M = 10.0, 0.5
 LIGHT = {
@@ -192,7 +195,7 @@ def test_frames_computed_ahead_are_the_same(ahead):
         scenes[3],
     ]
     times = {"exposure_s": 0.01, "seed": 3}
-    for how in ({}, {"frame_s": 0.004, "line_s": 1e-3}):
+    for how in ({}, {"frame_s": 0.011, "line_s": 1e-3}):
         plain = list(camera_of(rows_layout()).video(frames, **times, **how))
         fast = list(camera_of(rows_layout()).video(frames, **times, **how, ahead=ahead))
         assert len(fast) == 7
@@ -238,6 +241,15 @@ def test_rates_are_the_photoelectrons_of_each_frame():
         assert np.array_equal(rate, camera.photoelectrons_per_s(scene))
 
 
+def test_rates_of_equal_frames_cannot_be_changed_through_each_other():
+    camera, scene = camera_of(rows_layout()), scene_of(pictures(1)[0])
+    truth = camera.photoelectrons_per_s(scene)
+    for rate in camera.rates([scene] * 3):
+        assert np.array_equal(rate, truth)
+        with pytest.raises(ValueError, match="read-only"):
+            np.multiply(rate, 2.0, out=rate)
+
+
 def test_a_bracket_takes_its_exposures_in_turns_and_merges_to_the_light():
     layout = rows_layout()
     camera = camera_of(layout, read_noise_e=0.0, prnu_fraction=0.0)
@@ -257,7 +269,7 @@ def test_a_bracket_takes_its_exposures_in_turns_and_merges_to_the_light():
 @pytest.mark.parametrize("shutter", [{}, {"frame_s": 0.004, "line_s": 1e-3, "every": 2}])
 def test_a_video_gone_on_with_is_the_rest_of_the_whole_one(first, shutter):
     lights = [scene_of(p) for p in pictures(9)]
-    how = {"exposure_s": [0.002, 0.009, 0.005], "seed": 1} | shutter
+    how = {"exposure_s": [0.002, 0.008, 0.005], "seed": 1} | shutter
     whole = list(camera_of(rows_layout()).video(lights, **how))
     begun = lights[first * shutter.get("every", 1) :]
     rest = list(camera_of(rows_layout()).video(begun, **how, first_frame=first))
@@ -299,6 +311,10 @@ def test_frames_that_are_no_light_are_told():
         list(camera.video([np.ones((3, 3))], exposure_s=0.01, seed=0))
     with pytest.raises(ParameterError, match="pairs"):
         list(camera.video([(scene_of(pictures(1)[0]), 1.0, 2.0)], exposure_s=0.01, seed=0))
+    with pytest.raises(ParameterError, match="'frames' must be an iterable of Scenes or PowerMaps, got a int"):
+        camera.rates(5)
+    with pytest.raises(ParameterError, match="got a Scene; put one into a list"):
+        camera.rates(scene_of(pictures(1)[0]))
 
 
 def test_no_frames_give_no_captures():
@@ -401,6 +417,49 @@ def test_a_seed_gives_the_same_gaze_and_another_another():
     assert not np.array_equal(one.xy_um, other.xy_um)
 
 
+def test_a_gaze_rests_and_jumps_at_the_times_that_its_numbers_tell():
+    """A slow twin, which asks every point of the path."""
+    frame_s, n, seed = 0.01, 400, 5
+    path = saccades(duration_s=n * frame_s, frame_s=frame_s, size_um=(60.0, 20.0), seed=seed, drift_um_per_root_s=3.0)
+    rests, targets, walk = (Streams(seed).of(f"gaze {what}") for what in ("rests", "targets", "drift"))
+    steps_um = 3.0 * np.sqrt(frame_s) * walk.standard_normal((n, 2))
+    place_um, leave_s, is_first = np.zeros(2), 0.3 * max(rests.gamma(4.0) / 4.0, 0.2), True
+    n_rests = 1
+    for k, found_um in enumerate(path.xy_um):
+        while frame_s * k >= leave_s + 0.05:
+            place_um, is_first = np.array([30.0, 10.0]) * (2.0 * targets.random(2) - 1.0), True
+            leave_s += 0.05 + 0.3 * max(rests.gamma(4.0) / 4.0, 0.2)
+            n_rests += 1
+        if frame_s * k < leave_s:
+            place_um = place_um if is_first else place_um + steps_um[k]
+            assert np.allclose(found_um, place_um, rtol=0.0, atol=1e-9)
+            is_first = False
+    assert n_rests > 8
+
+
+def test_gazes_that_cannot_be_are_told():
+    with pytest.raises(ParameterError, match=r"'duration_s' must be 1 to 100,000,000 frames of 0.01 s, got 0.001 s"):
+        saccades(duration_s=0.001, frame_s=0.01, size_um=(1.0, 1.0), seed=0)
+    with pytest.raises(ParameterError, match="duration_s"):
+        saccades(duration_s=1e300, frame_s=1e-300, size_um=(1.0, 1.0), seed=0)
+    scene, path = scene_of(pictures(1)[0]), GazePath(np.zeros(1), np.zeros((1, 2)))
+    for light, gaze, told in (
+        (None, path, "'light' must be of the class Scene or PowerMap"),
+        (scene, None, "'path' must be of the class Gaze"),
+    ):
+        with pytest.raises(ParameterError, match=told):
+            look(light, gaze)
+    for change, told in (
+        ({"scene": None}, "'scene' must be of the class Scene"),
+        ({"path": 3}, "'path' must be of the class GazePath"),
+        ({"optics": None}, "'optics' must be of the class Optics"),
+        ({"shape": 5}, "'shape' must be two whole numbers"),
+        ({"shape": (121, 160)}, r"'shape' must be within the picture's \(120, 160\)"),
+    ):
+        with pytest.raises(ParameterError, match=told):
+            look_around(**({"scene": scene, "path": path, "optics": OPTICS, "shape": (10, 10)} | change))
+
+
 def test_a_path_is_straight_between_its_points():
     path = GazePath(np.array([0.0, 2.0]), np.array([[0.0, 4.0], [10.0, 0.0]]))
 
@@ -430,7 +489,9 @@ def test_a_still_scene_looks_the_same_through_every_shutter():
     camera = camera_of(rows_layout())
     plain = next(camera.video([scene], exposure_s=0.01, seed=5)).expected_e
     for between in ("hold", "linear"):
-        rolled = camera.video([scene] * 3, exposure_s=0.01, seed=5, frame_s=0.004, line_s=1.3e-3, between=between)
+        times = {"frame_s": 0.004, "line_s": 1.3e-3, "every": 3, "between": between}
+        rolled = list(camera.video([scene] * 7, exposure_s=0.01, seed=5, **times))
+        assert len(rolled) == 3
         for capture in rolled:
             assert np.allclose(capture.expected_e, plain, rtol=1e-12)
 
@@ -509,6 +570,35 @@ def test_every_so_many_frames_begin_an_exposure():
         assert np.array_equal(capture.expected_e, camera.capture(lights[3 * k], exposure_s=0.01, seed=0).expected_e)
 
 
+def test_exposures_that_no_photosite_can_make_are_told():
+    camera, lights = camera_of(rows_layout()), [scene_of(pictures(1)[0])] * 4
+    with pytest.warns(FoveasimWarning, match=r"an exposure of 1 s outlasts the 0.1 s to the next one's begin"):
+        camera.video(lights, exposure_s=[0.05, 1.0], seed=0, frame_s=0.1)
+    # One behind the other, though times are rounded.
+    assert len(list(camera.video(lights, exposure_s=0.1 + 0.2, seed=0, frame_s=0.1, every=3))) == 2
+
+
+def test_exposures_in_the_making_refuse_what_is_no_time_or_no_light():
+    shutter = Shutter(rows_layout(), frame_s=0.1, line_s=0.01)
+    for call, name in (
+        (lambda: Shutter(None, 1.0), "layout"),
+        (lambda: shutter.share(0, -1.0), "exposure_s"),
+        (lambda: shutter.share(0, np.nan), "exposure_s"),
+        (lambda: shutter.share(-1, 1.0), "frame"),
+        (lambda: shutter.last_frame(np.nan), "exposure_s"),
+        (lambda: Exposure(shutter, np.nan), "exposure_s"),
+        (lambda: Exposure(None, 1.0), "shutter"),
+        (
+            lambda: Exposure(shutter, 1.0).add(np.ones(3)),
+            "rate_e_per_s' must have one number for each of the 120 sites",
+        ),
+        (lambda: Exposure(shutter, 1.0).add(np.full(120, np.nan)), "rate_e_per_s"),
+        (lambda: Exposure(shutter, 1.0).mean_e_per_s(-np.ones(120)), "last_e_per_s"),
+    ):
+        with pytest.raises(ParameterError, match=name):
+            call()
+
+
 # -- footage ----------------------------------------------------------------------------------------------------------
 
 
@@ -530,6 +620,46 @@ def test_footage_may_be_seen_again():
     assert footage.n_frames == 3
     assert Footage(iter(pictures(2)), **LIGHT).n_frames is None
     assert Footage(pictures(5), start=1, stop=9, step=2, **LIGHT).n_frames == 2
+
+
+def test_names_with_digits_that_are_no_numbers_are_ordered_too(tmp_path):
+    for name in ("2²3.png", "2.png", "٣.png", "10.png"):
+        write_picture(tmp_path / name, np.zeros((8, 8), np.uint8))
+    assert [path.name for path in pictures_in(tmp_path)] == ["2.png", "2²3.png", "٣.png", "10.png"]
+
+
+def test_pictures_of_an_iterator_are_given_once():
+    footage = Footage(iter(pictures(3)), **LIGHT)
+    assert len(list(footage)) == 3
+    for again in (footage, footage.from_frame(1)):
+        with pytest.raises(ParameterError, match=r"'source' was an iterator, whose pictures are gone.*give a list"):
+            list(again)
+    assert len(list(Footage(iter(pictures(3)), **LIGHT).from_frame(1))) == 2
+
+
+def test_footage_without_any_frame_is_told():
+    for source, how in (([], {}), (pictures(3), {"start": 3}), (pictures(3), {"start": 1, "stop": 1})):
+        with pytest.raises(ParameterError, match="'source' has no frame from"):
+            Footage(source, **how, **LIGHT)
+    for source, how in (((), {}), (pictures(3), {"start": 3})):
+        footage = Footage(iter(source), **how, **LIGHT)
+        with pytest.raises(ParameterError, match=r"'source' has no frame from .*, of any number of pictures"):
+            list(footage)
+    # Of a video that is gone on with nothing may be left.
+    assert list(Footage(pictures(3), **LIGHT).from_frame(3)) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"pich_um": 3.0}, "'pich_um' is no setting of a scene from a picture; there are pitch_um, distance_m"),
+        ({"pitch_um": None}, "'pitch_um' is missing"),
+    ],
+)
+def test_settings_of_scenes_are_checked_before_a_picture_is_read(changes, told):
+    settings = {name: value for name, value in (LIGHT | changes).items() if value is not None}
+    with pytest.raises(ParameterError, match=told):
+        Footage(["nowhere.png"], **settings)
 
 
 def test_frames_of_another_size_are_told():
@@ -710,7 +840,7 @@ def test_progress_counts_the_frames(tmp_path, capsys):
 # -- recordings that were ended ---------------------------------------------------------------------------------------
 
 #: A rolling shutter, a bracket, and two frames of light from capture to capture.
-ROLLING = {"exposure_s": [0.002, 0.009, 0.005], "seed": 5, "frame_s": 0.004, "line_s": 1e-3, "every": 2}
+ROLLING = {"exposure_s": [0.002, 0.008, 0.005], "seed": 5, "frame_s": 0.004, "line_s": 1e-3, "every": 2}
 
 
 class LightsOutError(Exception):
@@ -894,7 +1024,7 @@ def test_another_recording_is_not_gone_on_with(tmp_path):
         "layout": {"layout": moved},
         "seed": {"how": {"seed": 6}},
         "line_s": {"how": {"line_s": 2e-3}},
-        "every": {"how": {"every": 1}},
+        "every": {"how": {"every": 3}},
         "light.pitch_um": {"light": {"pitch_um": 11.0}},
         "light.spectrum_w_m2_sr_nm": {"light": {"peak_radiance_w_m2_sr_nm": 0.2}},
     }.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import re
 from collections.abc import Iterable, Iterator, Sized
 from dataclasses import replace
@@ -34,7 +35,8 @@ class Footage:
     ----------
     source : path, or iterable of paths or arrays
         A folder of pictures, in the natural order of their names (``frame 2`` before ``frame 10``); a video file, with the
-        extra ``video``; or the pictures themselves, as :meth:`foveasim.Scene.from_picture` takes them.
+        extra ``video``; or the pictures themselves, as :meth:`foveasim.Scene.from_picture` takes them. An iterator gives
+        them once, and the footage can be iterated once then.
     start, stop, step : int
         Which of the frames: as of a slice.
     frame_s : float, optional, s
@@ -51,7 +53,7 @@ class Footage:
     FileError
         When there is no such file, a folder holds no pictures, or, as frames are read, one is broken or of another size.
     ParameterError
-        When a value is out of range.
+        When a value is out of range, a setting of the scene is missing or unknown, or there is no frame at all.
 
     Examples
     --------
@@ -83,6 +85,8 @@ class Footage:
             raise ParameterError(
                 min(set(scene) - {"encoding"}), "is that of the scene 'like', and cannot be given beside it"
             )
+        if like is None:
+            _check_settings(scene)
         self._like = like
         self._start = check_count("start", start, at_least=0)
         self._stop = None if stop is None else check_count("stop", stop, at_least=0)
@@ -102,13 +106,16 @@ class Footage:
             else:
                 raise FileError(path, "no such file or folder")
         elif isinstance(source, Iterable):
-            self._source = source
+            self._source = _Once(source) if isinstance(source, Iterator) else source
             self._n_source = len(source) if isinstance(source, Sized) else None
         else:
             raise ParameterError("source", f"must be a path, or pictures, got a {type(source).__name__}")
         if frame_s is not None:
             told_s = check_number("frame_s", frame_s, above=0.0)
         self._frame_s = None if told_s is None else told_s * (self._step if frame_s is None else 1)
+        self._may_be_empty = False
+        if self._n_source is not None and not isinstance(self._source, _VideoFile):  # whose number is an estimate
+            self._check_some(self.n_frames)
 
     def __repr__(self) -> str:
         return f"Footage({self.n_frames or 'any number of'} frames)"
@@ -146,7 +153,14 @@ class Footage:
         """
         rest = copy.copy(self)
         rest._start += check_count("n", n, at_least=0) * self._step  # noqa: SLF001 -- its own
+        rest._may_be_empty = True  # noqa: SLF001
         return rest
+
+    def _check_some(self, n_frames: int | None) -> None:
+        if n_frames == 0 and not self._may_be_empty:
+            told = "any number of" if self._n_source is None else f"{self._n_source:,}"
+            until = "" if self._stop is None else f" to before {self._stop}"
+            raise ParameterError("source", f"has no frame from {self._start}{until}, of {told} pictures")
 
     def __iter__(self) -> Iterator[Scene]:
         """Scenes, one after the other."""
@@ -163,6 +177,7 @@ class Footage:
                 )
             shape = scene.basis.shape
             yield scene
+        self._check_some(0 if shape is None else None)
 
     def _made_like(self, picture: Any) -> Scene:
         like = self._like
@@ -191,11 +206,40 @@ def pictures_in(folder: Path) -> list[Path]:
     ]
     if not pictures:
         raise FileError(folder, f"holds no pictures ({', '.join(PICTURE_ENDINGS)})")
-    return sorted(pictures, key=lambda path: [(int(p), "") if p.isdigit() else (-1, p) for p in _pieces(path)])
+    return sorted(pictures, key=lambda path: [(int(p), "") if p.isdecimal() else (-1, p) for p in _pieces(path)])
 
 
 def _pieces(path: Path) -> list[str]:
     return [piece for piece in re.split(r"(\d+)", path.name) if piece]
+
+
+def _check_settings(scene: dict[str, Any]) -> None:
+    """Refuse settings that Scene.from_picture does not take, and lack those that it needs, before the first picture is read."""
+    parameters = list(inspect.signature(Scene.from_picture).parameters.values())[1:]
+    names = [p.name for p in parameters]
+    for name in scene:
+        if name not in names:
+            raise ParameterError(name, f"is no setting of a scene from a picture; there are {', '.join(names)}")
+    for parameter in parameters:
+        if parameter.default is parameter.empty and parameter.name not in scene:
+            raise ParameterError(
+                parameter.name, "is missing: a scene from a picture needs it, or give a scene as 'like'"
+            )
+
+
+class _Once:
+    """What an iterator gives, for who begins first."""
+
+    def __init__(self, pictures: Iterator[Any]) -> None:
+        self._pictures: Iterator[Any] | None = pictures
+
+    def __iter__(self) -> Iterator[Any]:
+        if self._pictures is None:
+            raise ParameterError(
+                "source", "was an iterator, whose pictures are gone after the first time", cure="give a list of them"
+            )
+        pictures, self._pictures = self._pictures, None
+        return pictures
 
 
 class _VideoFile:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, check_count, check_number, finite_array, read_only
+from foveasim.arrays import Floats, check_number, check_shape, finite_array, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import PowerMap
 from foveasim.optics import Optics
@@ -22,6 +22,8 @@ __all__ = ["GazePath", "look", "look_around", "saccades"]
 FIXATION_SHAPE = 4.0
 #: A shortest fixation, as a share of the mean.
 SHORTEST_FIXATION = 0.2
+#: Longer paths are a slip of units.
+MAX_POINTS = 10**8
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +107,10 @@ def saccades(
     ((100, 2), [0.0, 0.0])
     """
     frame_s = check_number("frame_s", frame_s, above=0.0)
-    n = check_count("duration_s", round(check_number("duration_s", duration_s, above=0.0) / frame_s), at_most=10**8)
+    duration_s = check_number("duration_s", duration_s, above=0.0)
+    n = round(min(duration_s / frame_s, 2.0 * MAX_POINTS))
+    if not 1 <= n <= MAX_POINTS:
+        raise ParameterError("duration_s", f"must be 1 to {MAX_POINTS:,} frames of {frame_s:g} s", duration_s, "s")
     half_um = 0.5 * finite_array("size_um", size_um, ndim=1, at_least=0.0)
     if half_um.size != 2:
         raise ParameterError("size_um", "must be two numbers (width, height)", size_um, "µm")
@@ -121,13 +126,13 @@ def saccades(
     while begin_s < t_s[-1] or begin_s == 0.0:
         rest_s = fixation_s * max(rests.gamma(FIXATION_SHAPE) / FIXATION_SHAPE, SHORTEST_FIXATION)
         leave_s = begin_s + rest_s
-        resting = np.flatnonzero((t_s >= begin_s) & (t_s < leave_s))
-        walked_um = np.cumsum(steps_um[resting], axis=0) - steps_um[resting[:1]]
+        resting = slice(*np.searchsorted(t_s, (begin_s, leave_s)))
+        walked_um = np.cumsum(steps_um[resting], axis=0) - steps_um[resting][:1]
         xy_um[resting] = place_um + walked_um
-        left_um = xy_um[resting[-1]] if resting.size else place_um
+        left_um = xy_um[resting][-1] if resting.start < resting.stop else place_um
         place_um = half_um * (2.0 * targets.random(2) - 1.0)
         begin_s = leave_s + saccade_s
-        jumping = np.flatnonzero((t_s >= leave_s) & (t_s < begin_s))
+        jumping = slice(*np.searchsorted(t_s, (leave_s, begin_s)))
         u = ((t_s[jumping] - leave_s) / max(saccade_s, frame_s))[:, np.newaxis]
         xy_um[jumping] = left_um + (place_um - left_um) * u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
     return GazePath(np.asarray(t_s), xy_um)
@@ -148,9 +153,14 @@ def look(light: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Scene | Powe
     Yields
     ------
     light, (x_um, y_um)
+
+    Raises
+    ------
+    ParameterError
+        When an argument is none of these.
     """
-    for x_um, y_um in path.xy_um:
-        yield light, (float(x_um), float(y_um))
+    _check_kinds(("light", light, (Scene, PowerMap)), ("path", path, (GazePath,)))
+    return ((light, (float(x_um), float(y_um))) for x_um, y_um in path.xy_um)
 
 
 def look_around(
@@ -179,10 +189,19 @@ def look_around(
     Raises
     ------
     ParameterError
-        When a part would reach beyond the picture.
+        At once, when an argument is none of these, or the part larger than the picture; later, when it would reach beyond.
     """
-    cell_um = optics.grid(scene).pitch_um
-    n_y, n_x = (check_count(f"shape[{i}]", n) for i, n in enumerate(shape))
+    _check_kinds(("scene", scene, (Scene,)), ("path", path, (GazePath,)), ("optics", optics, (Optics,)))
+    n_y, n_x = check_shape("shape", shape)
+    if n_y > scene.basis.shape[1] or n_x > scene.basis.shape[2]:
+        raise ParameterError("shape", f"must be within the picture's {scene.basis.shape[1:]}", (n_y, n_x))
+    return _parts(scene, path, optics.grid(scene).pitch_um, n_y, n_x)
+
+
+def _parts(
+    scene: Scene, path: GazePath, cell_um: float, n_y: int, n_x: int
+) -> Iterator[tuple[Scene, tuple[float, float]]]:
+    """The parts of a picture along a path."""
     free_y, free_x = scene.basis.shape[1] - n_y, scene.basis.shape[2] - n_x
     before: tuple[int, int] | None = None
     part = scene
@@ -207,3 +226,10 @@ def look_around(
             for at_um, at, free in zip(place_um, (left, bottom), (free_x, free_y), strict=True)
         ]
         yield part, (rest_um[0], rest_um[1])
+
+
+def _check_kinds(*arguments: tuple[str, object, tuple[type, ...]]) -> None:
+    for name, value, kinds in arguments:
+        if not isinstance(value, kinds):
+            told = " or ".join(kind.__name__ for kind in kinds)
+            raise ParameterError(name, f"must be of the class {told}, got a {type(value).__name__}")
