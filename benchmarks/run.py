@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import scipy.fft
 import shapely
+from learning import bench_learning
 from looking import bench_looking
 from report import Report, best_s
 from rich.console import Console
@@ -317,6 +318,8 @@ def main() -> int:
         bench_layouts(report, 10_000 if is_quick else 1_000_000)
     with console.status("bench video"):
         bench_video(report, 100 if is_quick else 1000)
+    with console.status("bench learning"):
+        bench_learning(report, 100 if is_quick else 1000)
     with console.status("bench looking"):
         bench_looking(report, 20_000 if is_quick else 1_000_000)
     bench_import(report)

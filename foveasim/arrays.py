@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -87,6 +88,7 @@ UNIT_SUFFIXES = {
 }
 
 
+@lru_cache(maxsize=1024)
 def unit_of(name: str) -> str:
     """Unit that a name carries, ``""`` for a dimensionless one."""
     return next((unit for suffix, unit in UNIT_SUFFIXES.items() if name.lower().endswith(suffix)), "")
