@@ -457,7 +457,7 @@ def test_tar_files_are_the_same_bytes_with_any_number_of_workers_and_read_by_the
     for name in shards:
         assert (tmp_path / "data1" / name).read_bytes() == (tmp_path / "data2" / name).read_bytes()
     with tarfile.open(tmp_path / "data1" / shards[1]) as tar:
-        assert tar.getnames()[:3] == ["000000006.npz", "000000006.json", "000000006.cls"]
+        assert tar.getnames()[:4] == ["__made_of__", "000000006.npz", "000000006.json", "000000006.cls"]
         about = json.load(tar.extractfile("000000007.json"))
         assert about["label"] == int(tar.extractfile("000000007.cls").read()) == labelled()[7]["label"]
     assert fs.read_layout(tmp_path / "data1" / "layout.npz").n_sites == labelled().layout.n_sites
@@ -593,7 +593,7 @@ def test_a_store_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "other.zarr").write_text("text")
     for other, path, message in (
         (explore.DataSet(pictures(2), SHOT, VARY, seed=1), "data", "is another data set: its 'seed' differs"),
-        (explore.DataSet(pictures(2, 1), SHOT, VARY), "data", "its 'pictures' differs"),
+        (explore.DataSet(pictures(3), SHOT, VARY), "data", "its 'pictures' differs"),
         (data, "other", "holds something else than a data set"),
         (data, "other.zarr", "holds something else than a data set"),
         (data, "data.hdf", "must end in .zarr, or have no ending"),
@@ -609,6 +609,100 @@ def test_a_store_of_something_else_is_left_alone(tmp_path):
         explore.open_data_set(tmp_path / "data")[1]
     with pytest.raises(FileError, match="no such folder"):
         explore.open_data_set(tmp_path / "nothing")
+
+
+class Made:
+    """Pictures that are made when they are asked for."""
+
+    def __init__(self, items):
+        self.items = items
+
+    def __len__(self):
+        return len(self.items)
+
+    def __getitem__(self, k):
+        return self.items[k]
+
+
+def zipped(path, each):
+    with zipfile.ZipFile(path, "w") as archive:
+        for k, picture in enumerate(each):
+            Image.fromarray(picture).save(path.with_suffix(".png"))
+            archive.write(path.with_suffix(".png"), f"{k}.png")
+    return path
+
+
+def saved(path, each):
+    np.save(path, each)
+    return path
+
+
+def folder_of(path, each):
+    path.mkdir(exist_ok=True)
+    for k, picture in enumerate(each):
+        Image.fromarray(picture).save(path / f"{k}.png")
+    return path
+
+
+def files_of(path, each):
+    folder_of(path, each)
+    return [path / f"{k}.png" for k in range(len(each))]
+
+
+#: How contents become a data set, by what holds them.
+HOLDERS = {
+    "array": lambda _, each: explore.DataSet(each, SHOT),
+    "list": lambda _, each: explore.DataSet(list(each), SHOT),
+    "Pillow": lambda _, each: explore.DataSet([Image.fromarray(picture) for picture in each], SHOT),
+    "pairs": lambda _, each: explore.DataSet([(picture, 3) for picture in each], SHOT),
+    "made": lambda _, each: explore.DataSet(Made(each), SHOT),
+    "array file": lambda path, each: explore.DataSet(saved(path / "x.npy", each), SHOT),
+    "folder": lambda path, each: explore.DataSet(folder_of(path / "x", each), SHOT),
+    "files": lambda path, each: explore.DataSet(files_of(path / "x", each), SHOT),
+    "zip": lambda path, each: explore.DataSet(zipped(path / "x.zip", each), SHOT),
+    "masks": lambda _, each: explore.DataSet(pictures(4), SHOT, masks=each[..., 0]),
+    "mask files": lambda path, each: explore.DataSet(pictures(4), SHOT, masks=files_of(path / "x", each[..., 0])),
+    "made masks": lambda _, each: explore.DataSet(pictures(4), SHOT, masks=Made(each[..., 0])),
+    "flows": lambda _, each: explore.DataSet(pictures(4), SHOT, flows=list(each[..., :2])),
+}
+
+
+@pytest.mark.parametrize("holder", HOLDERS)
+def test_samples_of_other_contents_are_never_taken_for_those_asked_for(holder, tmp_path):
+    """Under the same names: what is there stays, and what was not done yet is of the contents of now."""
+    make = partial(HOLDERS[holder], tmp_path)
+    each = pictures(4)
+    changed = np.array(each)
+    changed[3] ^= 1
+    target = tmp_path / "data"
+    explore.write_data_set(make(each), target, per_shard=2)
+    before = (target / "shard-000001.tar").read_bytes()
+    other = make(changed)
+
+    with pytest.raises(FileError, match="is of other pictures, masks or flows: those of its samples 2 to 3 hold"):
+        explore.write_data_set(other, target)
+    assert (target / "shard-000001.tar").read_bytes() == before
+    (target / "shard-000001.tar").unlink()
+    stored = explore.write_data_set(other, target)
+
+    for k in range(4):
+        assert_same(stored[k], other[k])
+    explore.write_data_set(other, target)
+
+
+def test_samples_of_other_contents_are_refused_in_zarr_too(tmp_path):
+    explore.write_data_set(explore.DataSet(list(pictures(4)), SHOT), tmp_path / "data.zarr", per_shard=2)
+
+    with pytest.raises(FileError, match="those of its samples 0 to 1 hold something else now"):
+        explore.write_data_set(explore.DataSet(list(pictures(4, 1)), SHOT), tmp_path / "data.zarr")
+
+
+def test_a_shard_that_was_broken_is_written_anew(tmp_path):
+    data = explore.DataSet(pictures(2), SHOT)
+    explore.write_data_set(data, tmp_path / "data", per_shard=1)
+    (tmp_path / "data" / "shard-000001.tar").write_bytes(b"cut short")
+
+    assert_same(explore.write_data_set(data, tmp_path / "data")[1], data[1])
 
 
 def test_warnings_of_samples_are_told_once_and_kept(tmp_path):

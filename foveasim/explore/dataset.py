@@ -33,7 +33,7 @@ from foveasim.explore.dataset_labels import (
     read_flow,
     read_mask,
 )
-from foveasim.explore.dataset_pictures import source_of
+from foveasim.explore.dataset_pictures import digest_of, is_lazy, source_of
 from foveasim.layout import Layout
 from foveasim.records import versions
 from foveasim.scene import Scene
@@ -257,7 +257,7 @@ class DataSet:
         return any(path == LAYOUT or path.startswith(LAYOUT + ".") for path in self._draws)
 
     def described(self) -> dict[str, Any]:
-        """All that samples depend on, as plain data; pictures by their names, or the sum of their numbers."""
+        """All that samples depend on, as plain data; of pictures, masks and flows not what they hold: see :meth:`digest`."""
         labels = {
             "labels": self._labels,
             "boxes": None if self._boxes is None else [[*map(np.ndarray.tolist, each)] for each in self._boxes],
@@ -278,6 +278,26 @@ class DataSet:
             "files": digests(self._files),
             "versions": versions(),
         }
+
+    def digest(self, samples: range) -> str:
+        """
+        SHA-256 of what the pictures, masks and flows of some samples hold.
+
+        Of those that are made when they are asked for, by what is no list, array or file, only the first's and the last's.
+        """
+        numbers = range(self._picture_of(samples[0]), self._picture_of(samples[-1]) + 1)
+        of_pictures = self._pixels_digest if self._pictures.is_lazy else self._pictures.digest
+        found = [of_pictures(k) for k in (_ends(numbers) if self._pictures.is_lazy else numbers)]
+        for each in (self._masks, self._flows):
+            if each is not None:
+                found += [digest_of(each[k]) for k in (_ends(numbers) if is_lazy(each) else numbers)]
+        return hashlib.sha256("\n".join(found).encode()).hexdigest()
+
+    def _pixels_digest(self, picture: int) -> str:
+        try:
+            return digest_of(self._pixels(picture))
+        except FoveasimError:  # its sample tells what is wrong
+            return ""
 
     # -- a sample -----------------------------------------------------------------------------------------------------
 
@@ -538,6 +558,11 @@ def _numbered(labels: Any, n: int) -> tuple[list[int] | None, list[str] | None]:
         numbers = {name: k for k, name in enumerate(names)}
         return [numbers[value] for value in values], names
     raise ParameterError("labels", "must all be whole numbers, or all be texts", values)
+
+
+def _ends(numbers: range) -> list[int]:
+    """The first and the last number."""
+    return [*dict.fromkeys((numbers[0], numbers[-1]))]
 
 
 def _filled(array: NDArray[Any], n: int, value: Any) -> NDArray[Any]:

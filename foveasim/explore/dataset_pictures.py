@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim.errors import FileError, ParameterError
+from foveasim.explore._files import digests
 from foveasim.pictures import read_picture
-from foveasim.records import described
 
-__all__ = ["Source", "source_of"]
+__all__ = ["Source", "digest_of", "is_lazy", "source_of"]
 
 #: Endings of the files that are taken for pictures.
 ENDINGS = (".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga", ".tif", ".tiff", ".webp")
@@ -45,7 +45,14 @@ class Source(Protocol):
         """What the source itself says of every picture's class, or None."""
 
     def described(self) -> dict[str, Any]:
-        """Plain data that tells the source from others."""
+        """Plain data that tells the source from others, but what its pictures hold."""
+
+    @property
+    def is_lazy(self) -> bool:
+        """Whether pictures are made when they are asked for, by whatever holds them."""
+
+    def digest(self, k: int) -> str:
+        """What tells the content of a picture from others, without unpacking it."""
 
 
 def source_of(pictures: Any) -> Source:
@@ -80,8 +87,32 @@ def source_of(pictures: Any) -> Source:
     return _Items(pictures)
 
 
+def is_lazy(items: Sequence[Any]) -> bool:
+    """Whether items may be made when they are asked for."""
+    return not isinstance(items, list | tuple | np.ndarray)
+
+
+def digest_of(item: Any) -> str:
+    """
+    SHA-256 of a file, or of an array, its type and its shape.
+
+    Empty where there is none, which whoever reads it will tell.
+    """
+    if isinstance(item, str | Path):
+        return digests([Path(item)])[str(Path(item))]
+    try:
+        array = np.ascontiguousarray(item)
+        digest = hashlib.sha256(f"{array.dtype.str} {np.shape(item)}".encode())
+        digest.update(array.data)
+    except (TypeError, ValueError):
+        return ""
+    return digest.hexdigest()
+
+
 class _Folder:
     """Pictures of a folder and the folders in it, in the natural order of their names."""
+
+    is_lazy = False
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -108,9 +139,14 @@ class _Folder:
     def described(self) -> dict[str, Any]:
         return {"kind": "folder", **_told(self._names)}
 
+    def digest(self, k: int) -> str:
+        return digest_of(self._folder / self._names[k])
+
 
 class _Zip:
     """Pictures of a zip file, which each process opens for itself."""
+
+    is_lazy = False
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -137,10 +173,7 @@ class _Zip:
         return self._names[k]
 
     def picture(self, k: int) -> NDArray[Any]:
-        # A process that was forked shares its parent's place in the file.
-        if self._opened is None or self._opened[0] != os.getpid():
-            self._opened = os.getpid(), zipfile.ZipFile(self._path)
-        archive, name = self._opened[1], self._names[k]
+        archive, name = self._archive(), self._names[k]
         if archive.getinfo(name).file_size > MAX_UNPACKED_BYTES:
             raise FileError(self.name(k), f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
         try:
@@ -158,12 +191,25 @@ class _Zip:
     def labels(self) -> list[Any] | None:
         return _folder_labels(self._names)
 
+    def _archive(self) -> zipfile.ZipFile:
+        # A process that was forked shares its parent's place in the file.
+        if self._opened is None or self._opened[0] != os.getpid():
+            self._opened = os.getpid(), zipfile.ZipFile(self._path)
+        return self._opened[1]
+
     def described(self) -> dict[str, Any]:
         return {"kind": "zip", **_told(self._names)}
+
+    def digest(self, k: int) -> str:
+        # What is unpacked is checked against this sum.
+        item = self._archive().getinfo(self._names[k])
+        return f"{item.file_size} bytes, {item.CRC:08x}"
 
 
 class _Array:
     """Pictures (n, n_y, n_x) or (n, n_y, n_x, n_channel) in memory."""
+
+    is_lazy = False
 
     def __init__(self, pictures: NDArray[Any]) -> None:
         _check_stack("pictures", pictures)
@@ -185,11 +231,16 @@ class _Array:
         return None
 
     def described(self) -> dict[str, Any]:
-        return {"kind": "array", "array": described(self._pictures)}
+        return {"kind": "array", "shape": list(self._pictures.shape), "dtype": str(self._pictures.dtype)}
+
+    def digest(self, k: int) -> str:
+        return digest_of(self._pictures[k])
 
 
 class _ArrayFile:
     """Pictures in a file of one numpy array, of which each process reads what it needs."""
+
+    is_lazy = False
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -228,6 +279,9 @@ class _ArrayFile:
         array = self._array()
         return {"kind": "array file", "name": self._path.name, "shape": list(array.shape), "dtype": str(array.dtype)}
 
+    def digest(self, k: int) -> str:
+        return digest_of(self._array()[k])
+
 
 class _Items:
     """Files, arrays or Pillow's images, alone or in pairs with their classes, of anything that has a length and items."""
@@ -241,19 +295,23 @@ class _Items:
         return len(self._items)
 
     def name(self, k: int) -> str:
-        # Items that are no list may be made when they are asked for.
-        item = self._items[k] if isinstance(self._items, list | tuple) else None
-        item = item[0] if isinstance(item, tuple) else item
+        item = self._listed(k)
         return str(item) if isinstance(item, str | Path) else f"picture {k}"
 
     def key(self, k: int) -> str:
-        item = self._items[k] if isinstance(self._items, list | tuple) else None
-        item = item[0] if isinstance(item, tuple) else item
+        item = self._listed(k)
         return Path(item).name if isinstance(item, str | Path) else str(k)
 
-    def picture(self, k: int) -> NDArray[Any]:
+    def _item(self, k: int) -> Any:
         item = self._items[k]
-        item = item[0] if isinstance(item, tuple) else item
+        return item[0] if isinstance(item, tuple) else item
+
+    def _listed(self, k: int) -> Any:
+        """The item of a list; None where it may be made when it is asked for."""
+        return None if self.is_lazy else self._item(k)
+
+    def picture(self, k: int) -> NDArray[Any]:
+        item = self._item(k)
         if isinstance(item, str | Path):
             return read_picture(item)
         try:
@@ -277,8 +335,16 @@ class _Items:
         return None
 
     def described(self) -> dict[str, Any]:
-        is_list = isinstance(self._items, list | tuple)
-        return {"kind": "items", "n": len(self)} | (_told([self.name(k) for k in range(len(self))]) if is_list else {})
+        names = {} if self.is_lazy else _told([self.name(k) for k in range(len(self))])
+        return {"kind": "items", "n": len(self)} | names
+
+    @property
+    def is_lazy(self) -> bool:
+        return is_lazy(self._items)
+
+    def digest(self, k: int) -> str:
+        item = self._item(k)
+        return digest_of(item if isinstance(item, str | Path) else self.picture(k))
 
 
 def _told(names: Sequence[str]) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from foveasim.files import written_whole
 
 __all__ = ["StoredSamples", "open_data_set", "write_data_set"]
 
-FORMAT, VERSION = "foveasim data set", 1
+FORMAT, VERSION = "foveasim data set", 2
 ZARR, ABOUT = ".zarr", "data_set.json"
 #: Bytes of the samples of a shard, about, and how many they are at most: one process has them in memory.
 SHARD_BYTES, LARGEST_SHARD = 1 << 26, 512
@@ -38,8 +38,12 @@ SHARD_BYTES, LARGEST_SHARD = 1 << 26, 512
 FEWEST_SHARDS = 32
 #: Shards of a zarr folder that a process keeps when it reads: those met last.
 KEPT_SHARDS = 4
-#: Name of the array that tells which shards are done, and of the group of what was drawn.
+#: Name of the array that tells which shards are done and of what they were made, and of the group of what was drawn.
 DONE, SETTINGS = "done", "settings"
+#: First member of a tar file, which tells of what it was made; WebDataset passes over such names.
+MADE_OF = "__made_of__"
+#: Bytes of a SHA-256.
+DIGEST_BYTES = 32
 NEEDS_ZARR = "needs zarr: pip install 'foveasim[explore]'"
 
 #: Told how many samples are written, of how many.
@@ -81,7 +85,8 @@ def write_data_set(
     ------
     FileError
         When the ending is none of these, something else is there, a picture cannot be read, or nothing can be written: the disk
-        is full, say. Shards that are done stay, and the same call goes on from there.
+        is full, say. Shards that are done stay, and the same call goes on from there, unless the pictures, masks or flows that
+        they were made of hold something else now.
     ParameterError
         When the photosites differ from sample to sample, which only tar files can hold.
     SimulationError
@@ -138,8 +143,19 @@ def _check_same(target: Path, about: Mapping[str, Any], plan: Mapping[str, Any],
 
 
 def _write_shards(data_set: DataSet, shards: _Shards, workers: int, tell: Tell | None) -> None:
-    """Write all shards that are not done."""
-    left = [k for k in range(shards.n_shards) if not shards.is_done(k)]
+    """Write all shards that are not done, when those that are done are of the same pictures."""
+    left = []
+    for k in range(shards.n_shards):
+        made_of = shards.made_of(k)
+        if not made_of:
+            left.append(k)
+        elif made_of != data_set.digest(shards.samples(k)):
+            samples = shards.samples(k)
+            raise FileError(
+                shards.folder,
+                f"is of other pictures, masks or flows: those of its samples {samples[0]} to {samples[-1]} hold something "
+                "else now; write this data set elsewhere, or remove that one",
+            )
     n, n_done = shards.n_samples, shards.n_samples - sum(len(shards.samples(k)) for k in left)
     told: list[str] = []
     if tell is not None:
@@ -223,6 +239,7 @@ def _write_shard(
 ) -> list[str]:
     """Simulate the samples of a shard and write it, unless it is stopped before; their warnings."""
     samples = []
+    made_of = data_set.digest(shards.samples(k))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they are told at the end, together
         for index in shards.samples(k):
@@ -230,7 +247,7 @@ def _write_shard(
                 return []
             samples.append(data_set[index])
     try:
-        shards.write(k, samples)
+        shards.write(k, samples, made_of)
     except OSError as error:
         raise FileError(
             shards.folder,
@@ -389,10 +406,14 @@ class _Shards:
         return range(k * self.per_shard, min((k + 1) * self.per_shard, self.n_samples))
 
     def is_done(self, k: int) -> bool:
-        """Whether a shard is whole."""
+        """Whether a shard is there."""
+        return self.made_of(k) != ""
+
+    def made_of(self, k: int) -> str:
+        """The digest that a shard was written with; empty when it is not there, or broken."""
         raise NotImplementedError
 
-    def write(self, k: int, samples: Sequence[Mapping[str, Any]]) -> None:
+    def write(self, k: int, samples: Sequence[Mapping[str, Any]], made_of: str) -> None:
         """Write a shard."""
         raise NotImplementedError
 
@@ -426,11 +447,21 @@ class _TarShards(_Shards):
     def is_done(self, k: int) -> bool:
         return self._file(k).is_file()
 
-    def write(self, k: int, samples: Sequence[Mapping[str, Any]]) -> None:
+    def made_of(self, k: int) -> str:
+        try:
+            with tarfile.open(self._file(k), "r:") as tar:
+                first = tar.next()
+                told = None if first is None or first.name != MADE_OF else tar.extractfile(first)
+                return "" if told is None else told.read().decode()
+        except (OSError, tarfile.TarError, UnicodeDecodeError):
+            return ""
+
+    def write(self, k: int, samples: Sequence[Mapping[str, Any]], made_of: str) -> None:
         with (
             written_whole(self._file(k)) as temporary,
             tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar,
         ):
+            _add(tar, MADE_OF, made_of.encode())
             for sample in samples:
                 arrays: dict[str, Any] = {n: value for n, value in sample.items() if isinstance(value, np.ndarray)}
                 rest = {name: value for name, value in sample.items() if name not in arrays}
@@ -440,9 +471,7 @@ class _TarShards(_Shards):
                 if "label" in sample:
                     parts["cls"] = str(sample["label"]).encode()
                 for ending, content in parts.items():
-                    item = tarfile.TarInfo(f"{sample['index']:09d}.{ending}")
-                    item.size = len(content)
-                    tar.addfile(item, io.BytesIO(content))
+                    _add(tar, f"{sample['index']:09d}.{ending}", content)
 
     def read(self, index: int) -> dict[str, Any]:
         k = index // self.per_shard
@@ -460,6 +489,12 @@ class _TarShards(_Shards):
             rest = json.loads(content("json"))
             with np.load(io.BytesIO(content("npz")), allow_pickle=False) as arrays:
                 return rest | {name: arrays[name] for name in arrays.files}
+
+
+def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
+    item = tarfile.TarInfo(name)
+    item.size = len(content)
+    tar.addfile(item, io.BytesIO(content))
 
 
 class _ZarrShards(_Shards):
@@ -490,7 +525,14 @@ class _ZarrShards(_Shards):
                 group.create_array(
                     name, shape=(n, *array.shape), chunks=(per_shard, *lengths), dtype=array.dtype, fill_value=0
                 )
-            group.create_array(DONE, shape=(n_shards,), chunks=(1,), dtype="u1", fill_value=0, compressors=None)
+            group.create_array(
+                DONE,
+                shape=(n_shards, DIGEST_BYTES),
+                chunks=(1, DIGEST_BYTES),
+                dtype="u1",
+                fill_value=0,
+                compressors=None,
+            )
             layout = data_set.layout
             for name in ("xy_um", "ring_offsets", "site_offsets"):
                 group.create_array(f"layout/{name}", data=np.asarray(getattr(layout, name)))
@@ -509,20 +551,21 @@ class _ZarrShards(_Shards):
             self._opened = os.getpid(), arrays
         return self._opened[1]
 
-    def is_done(self, k: int) -> bool:
+    def made_of(self, k: int) -> str:
         try:
-            return bool(self._arrays()[DONE][k] == 1)
+            mark = np.asarray(self._arrays()[DONE][k], np.uint8)
         except Exception:  # noqa: BLE001 -- a mark that was cut off is none
-            return False
+            return ""
+        return mark.tobytes().hex() if mark.any() else ""
 
-    def write(self, k: int, samples: Sequence[Mapping[str, Any]]) -> None:
+    def write(self, k: int, samples: Sequence[Mapping[str, Any]], made_of: str) -> None:
         arrays, place = self._arrays(), slice(self.samples(k).start, self.samples(k).stop)
         each = [_flat(sample) for sample in samples]
         for name in each[0]:
             values: list[Any] = [sample[name] for sample in each]
             kind = np.dtypes.StringDType() if isinstance(values[0], str) else arrays[name].dtype
             arrays[name][place] = np.array(values, kind)
-        arrays[DONE][k] = 1
+        arrays[DONE][k] = np.frombuffer(bytes.fromhex(made_of), np.uint8)
 
     def read(self, index: int) -> dict[str, Any]:
         rows, row = self._rows(index // self.per_shard), index % self.per_shard
