@@ -209,6 +209,31 @@ def test_codes_of_all_samples_have_the_type_of_the_most_bits():
     assert explore.DataSet(pictures(1), SHOT)[0]["code"].dtype == np.uint8
 
 
+@pytest.mark.parametrize("name", ["data.zarr", "data"])
+@pytest.mark.parametrize(
+    "vary",
+    [
+        {"optics.f_number": {"choice": [2, 2.8, 4]}},
+        {"sensor.read_noise_e": {"choice": [3, 0.5]}, "sensor.device_seed": {"choice": [2**63 - 1, 0, 7]}},
+    ],
+)
+def test_stored_numbers_are_those_that_samples_were_made_with(name, vary, tmp_path):
+    """Whichever comes first, a whole number or another: all have the one type, and none is cut off."""
+    is_whole_first = set()
+    for seed in (0, 4, 5):
+        data = explore.DataSet(pictures(12), SHOT, vary, seed=seed, fields=())
+        stored = explore.write_data_set(data, tmp_path / f"{seed}{name}")
+        for k in range(12):
+            assert_same(stored[k], data[k])
+            for path, number in data[k]["settings"].items():
+                section, _, key = path.partition(".")
+                assert number == data.settings_of(k)[section][key]
+                assert type(number) is type(data[0]["settings"][path])
+        section, _, key = next(iter(vary)).partition(".")
+        is_whole_first.add(data.settings_of(0)[section][key] in (2, 3, 4))
+    assert is_whole_first == {True, False}
+
+
 # -- labels where the light goes --------------------------------------------------------------------------------------
 
 GRID = fs.Grid.centred((11, 13), 4.0)
@@ -732,6 +757,25 @@ def test_warnings_of_samples_are_told_once_and_kept(tmp_path):
         ({"exposure_s": {"uniform": [0, 1], "weights": [1]}}, ParameterError, "weights, which only a choice has"),
         ({"sensor.bits": {"choice": []}}, ParameterError, "at least one value"),
         ({"sensor.bits": {"choice": [8, 9], "weights": [1]}}, ParameterError, "needs weights for its 2 choices"),
+        ({"sensor.bits": {"choice": [8, 9], "weights": [1e308, 1e308]}}, ParameterError, "of a sum above 0"),
+        ({"sensor.bits": {"choice": [8, 9], "weights": [-1, 2]}}, ParameterError, "must be >= 0"),
+        ({"sensor.bits": {"choice": [8, 9], "weights": "ab"}}, ParameterError, "must be an array of numbers"),
+        ({"sensor.bits": {"choice": 8}}, ParameterError, "choice needs a list of values, got 8"),
+        (
+            {"sensor.device_seed": {"choice": [2**70, 1]}},
+            ParameterError,
+            "of at most 64 bits, got 1180591620717411303424",
+        ),
+        ({"exposure_s": {"choice": [0.1, float("nan")]}}, ParameterError, "'exposure_s' must be finite, got nan"),
+        ({"exposure_s": {"uniform": [-1e308, 1e308]}}, ParameterError, "ends whose distance is a number"),
+        ({"exposure_s": {"uniform": [None, 1]}}, ParameterError, "must be one number, got None"),
+        ({"exposure_s": {"uniform": [True, 2]}}, ParameterError, "must be one number, got True"),
+        ({"exposure_s": {"uniform": [[1, 2], [3, 4]]}}, ParameterError, r"must be one number, got \[1, 2\]"),
+        ({"exposure_s": {"uniform": {1, 2}}}, ParameterError, r"uniform needs \[low, high\]"),
+        ({"exposure_s": {"uniform": [1, 2], "integers": [1, 2]}}, ParameterError, "drawn from one distribution"),
+        ({"exposure_s": {"normal": [1, 0, 0, 2]}}, ParameterError, "a standard deviation above 0"),
+        ({"exposure_s": {"integers": [1, 2.5]}}, ParameterError, "must be a whole number, got 2.5"),
+        ({"": {"uniform": [1, 2]}}, ConfigError, "'' is no setting's place"),
         ({"sensor.bits": {"uniform": [8, 9.5]}}, ConfigError, "sensor.bits: "),
         ({"sensor.bits": {"choice": [8, 40]}}, ConfigError, "sensor.bits: must be <= "),
         (
@@ -756,11 +800,19 @@ def test_a_bad_distribution_is_refused_before_the_first_sample(vary, error, mess
     [
         ({"labels": [1]}, ParameterError, "'labels' must have one for each of the 2 pictures, got 1"),
         ({"labels": [1, "a"]}, ParameterError, "must all be whole numbers, or all be texts"),
+        ({"labels": [1, 2.0]}, ParameterError, "must all be whole numbers, or all be texts"),
+        ({"labels": [None, None]}, ParameterError, "must all be whole numbers, or all be texts"),
+        ({"labels": np.zeros((2, 2), int)}, ParameterError, "must all be whole numbers, or all be texts"),
+        ({"labels": [2**70, 1]}, ParameterError, "'labels' must be <= 9223372036854775807"),
+        ({"boxes": [[], [[1, 2, 3, 4, 1e300]]]}, ParameterError, "whole numbers up to 9007199254740992 as classes"),
+        ({"boxes": [[], [[1, 2, float("nan"), 4]]]}, ParameterError, "must be finite everywhere"),
+        ({"boxes": [[], [[1, 2, 1, 4]]]}, ParameterError, "must have x0 < x1 and y0 < y1"),
+        ({"boxes": [[], "ab"]}, ParameterError, "must be an array of numbers"),
         ({"labels": 3}, ParameterError, "'labels' must be a sequence"),
         ({"boxes": [[[0, 0, 1, 1]], [[3, 0, 1, 1]]]}, ParameterError, r"'boxes\[1\]' must have x0 < x1"),
         ({"boxes": [[], [1, 2, 3]]}, ParameterError, r"'boxes\[1\]' must have 2 dimensions"),
         ({"boxes": [[], [[1, 2, 3]]]}, ParameterError, r"must have the shape \(n, 4\)"),
-        ({"boxes": [[], [[1, 2, 3, 4, 0.5]]]}, ParameterError, "whole numbers as classes"),
+        ({"boxes": [[], [[1, 2, 3, 4, 0.5]]]}, ParameterError, "must have whole numbers up to"),
         ({"fields": ["codes"]}, ParameterError, "'fields' must be one of 'code'"),
         ({"fit": "crop"}, ParameterError, "'fit' must be one of 'cover', 'contain'"),
         ({"cameras": 0}, ParameterError, "'cameras' must be >= 1"),
@@ -820,6 +872,9 @@ def test_labels_that_do_not_fit_a_picture_name_it():
         "masks": ([np.zeros((N_Y, N_X), int), np.zeros((3, 3), int)], "mask of picture 1' must be whole numbers"),
         "flows": ([np.zeros((N_Y, N_X, 2)), np.zeros((N_Y, N_X))], "flow of picture 1' must be numbers of the shape"),
     }
+    huge = [np.zeros((N_Y, N_X), int), np.full((N_Y, N_X), 2**64 - 1, np.uint64)]
+    with pytest.raises(SimulationError, match=r"sample 1 .*mask of picture 1' must be whole numbers of 64 bits"):
+        explore.DataSet(pictures(2), SHOT, masks=huge)[1]
     for name, (given, message) in bad.items():
         data = explore.DataSet(pictures(2), SHOT, **{name: given})
         data[0]

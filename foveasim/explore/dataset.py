@@ -22,7 +22,7 @@ from foveasim.config import Shot, build_shot, check_settings, files_from, put_se
 from foveasim.errors import ConfigError, FileError, FoveasimError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore._files import digests
 from foveasim.explore._plan import check_apart
-from foveasim.explore.dataset_draws import Draw, draw_of
+from foveasim.explore.dataset_draws import LEAST, MOST, Draw, draw_of
 from foveasim.explore.dataset_labels import (
     NOTHING,
     boxes_on_sites,
@@ -552,6 +552,8 @@ def _numbered(labels: Any, n: int) -> tuple[list[int] | None, list[str] | None]:
     each = one_a_picture("labels", labels, n)
     values = [value.item() if isinstance(value, np.generic) else value for value in (each[k] for k in range(n))]
     if all(isinstance(value, int) for value in values):
+        for value in values:
+            check_count("labels", value, at_least=LEAST, at_most=MOST)
         return [int(value) for value in values], None
     if all(isinstance(value, str) for value in values):
         names = sorted(set(values))

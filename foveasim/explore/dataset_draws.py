@@ -26,6 +26,8 @@ FORMS = {
     "normal": "[mean, standard deviation, low, high]",
     "choice": "a list of values",
 }
+#: Whole numbers of choices: those of 64 bits, as arrays of samples hold them.
+LEAST, MOST = -(2**63), 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,13 @@ class Draw:
         )
 
     @property
+    def number_type(self) -> type[int | float]:
+        """Of the numbers that tell the values, the same for all of them."""
+        if self.kind == "choice":
+            return float if self.is_numeric and any(isinstance(value, float) for value in self.values) else int
+        return int if self.kind == "integers" else float
+
+    @property
     def ends(self) -> tuple[Any, ...]:
         """The values that must be possible for all to be: both ends, or every choice."""
         return self.values if self.kind == "choice" else self.values[-2:]
@@ -71,7 +80,7 @@ class Draw:
         if self.kind == "choice":
             edges = np.cumsum(np.ones(len(self.values)) if self.weights is None else self.weights)
             place = int(np.searchsorted(edges, share * edges[-1], side="right"))
-            return self.values[place], self.values[place] if self.is_numeric else place
+            return self.values[place], self.number_type(self.values[place] if self.is_numeric else place)
         low, high = self.values[-2:]
         if self.kind == "integers":
             number: int | float = low + int(share * (high - low + 1))
@@ -136,6 +145,8 @@ def draw_of(path: str, told: Any) -> Draw:
     else:
         numbers = tuple(check_number(path, value, above=0.0 if kind == "log_uniform" else None) for value in values)
         low, high = numbers[-2:]
+    if not math.isfinite(high - low):
+        raise ParameterError(path, f"{kind} needs ends whose distance is a number", list(values))
     if low > high:
         raise ParameterError(path, f"{kind} must go from a lower number to a higher one", list(values))
     if kind == "normal":
@@ -153,9 +164,14 @@ def _choice(path: str, values: Sequence[Any] | NDArray[Any], weights: Any) -> Dr
         raise ParameterError(path, "must be chosen from numbers, texts, lists and sections", values) from None
     if not plain:
         raise ParameterError(path, "must be chosen from at least one value")
+    for value in plain:
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            check_number(path, value)
+        if isinstance(value, int) and not LEAST <= value <= MOST:
+            raise ParameterError(path, "must be chosen from numbers of at most 64 bits", value)
     if weights is not None:
         shares = finite_array(f"weights of {path}", weights, ndim=1, at_least=0.0)
-        if shares.size != len(plain) or not shares.sum() > 0.0:
-            raise ParameterError(path, f"needs weights for its {len(plain)} choices, not all of them 0", weights)
+        if shares.size != len(plain) or not 0.0 < sum(shares.tolist()) < math.inf:
+            raise ParameterError(path, f"needs weights for its {len(plain)} choices, of a sum above 0", weights)
         return Draw(path, "choice", tuple(plain), tuple(shares.tolist()))
     return Draw(path, "choice", tuple(plain))

@@ -32,6 +32,8 @@ __all__ = [
 
 #: Label of a site that sees mostly what lies off the picture, and of boxes that only fill up a sample.
 NOTHING = -1
+#: Largest class of a box: beyond it not every whole number is a float, as which boxes are given.
+MOST_CLASS = 2**53
 #: Points along each side of a box, whose image may be bent.
 POINTS_A_SIDE = 65
 #: Areas that differ by less than this share of a site are the same up to rounding: the lower class has it.
@@ -210,8 +212,8 @@ def checked_boxes(name: str, boxes: Any) -> tuple[Floats, Ints]:
     if is_flat.any():
         raise ParameterError(name, "must have x0 < x1 and y0 < y1", numbers[is_flat][0, :4].tolist(), "pixels")
     classes = numbers[:, 4] if numbers.shape[1] == 5 else np.full(len(numbers), float(NOTHING))
-    if (classes != np.rint(classes)).any():
-        raise ParameterError(name, "must have whole numbers as classes", classes.tolist())
+    if (classes != np.rint(classes)).any() or (np.abs(classes) > MOST_CLASS).any():
+        raise ParameterError(name, f"must have whole numbers up to {MOST_CLASS} as classes", classes.tolist())
     return numbers[:, :4], classes.astype(np.int64)
 
 
@@ -244,6 +246,8 @@ def read_mask(mask: Any, name: str, shape: tuple[int, int]) -> Ints:
             raise ParameterError(name, "must be an array of whole numbers", mask) from None
     if classes.dtype == np.bool_:
         classes = classes.astype(np.uint8)
+    if classes.shape == shape and classes.dtype == np.uint64 and classes.max() > np.iinfo(np.int64).max:
+        raise ParameterError(name, "must be whole numbers of 64 bits with a sign", int(classes.max()))
     if classes.shape != shape or classes.dtype.kind not in "iu":
         raise ParameterError(
             name, f"must be whole numbers of the picture's shape {shape}, got {classes.dtype} of {classes.shape}"

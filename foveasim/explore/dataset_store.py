@@ -563,8 +563,10 @@ class _ZarrShards(_Shards):
         each = [_flat(sample) for sample in samples]
         for name in each[0]:
             values: list[Any] = [sample[name] for sample in each]
-            kind = np.dtypes.StringDType() if isinstance(values[0], str) else arrays[name].dtype
-            arrays[name][place] = np.array(values, kind)
+            if isinstance(values[0], str):
+                arrays[name][place] = np.array(values, np.dtypes.StringDType())
+            else:
+                arrays[name][place] = np.array(values).astype(arrays[name].dtype, casting="safe", copy=False)
         arrays[DONE][k] = np.frombuffer(bytes.fromhex(made_of), np.uint8)
 
     def read(self, index: int) -> dict[str, Any]:
