@@ -293,18 +293,19 @@ def dataset(
             "--out", "-o", help="A folder of tar files, or a .zarr folder; a data set that was ended goes on in it."
         ),
     ] = Path("data_set"),
-    workers: Annotated[int | None, typer.Option("--workers", help="Processes; one a core by default.")] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", help="Processes; by default one a core, where there is enough to do.")
+    ] = None,
 ) -> None:
     """Take pictures with cameras drawn at random, and write them as samples to learn from."""
     from foveasim.explore import read_data_set, write_data_set
     from foveasim.parallel import thread_count
 
-    n_cores = thread_count()
-    n_workers = n_cores if workers is None else workers
+    n_threads = 1 if workers is None else max(1, thread_count() // max(1, workers))
     with console.status("reading pictures and settings"):
-        file = read_data_set(settings, n_threads=max(1, n_cores // max(1, n_workers)))
+        file = read_data_set(settings, n_threads=n_threads)
     with _progress(settings.stem, f"the shards that are done are kept in {out}") as tell:
-        write_data_set(file.data_set, out, per_shard=file.per_shard, workers=n_workers, tell=tell)
+        write_data_set(file.data_set, out, per_shard=file.per_shard, workers=workers, tell=tell)
     console.print(f"wrote {out}: {len(file.data_set):,} samples", soft_wrap=True, highlight=False, markup=False)
 
 

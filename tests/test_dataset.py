@@ -25,6 +25,7 @@ import foveasim as fs
 from foveasim import explore
 from foveasim.config import build_shot
 from foveasim.errors import ConfigError, CoverageWarning, FileError, FoveasimWarning, ParameterError, SimulationError
+from foveasim.explore import dataset_store
 from foveasim.explore.dataset_labels import boxes_on_sites, flow_on_sites, mask_on_sites
 from foveasim.explore.dataset_torch import _kind
 
@@ -447,6 +448,19 @@ def test_a_mask_with_a_palette_has_its_numbers(tmp_path):
     assert set(sample["mask"].tolist()) == {3}
 
 
+class Made:
+    """Pictures that are made when they are asked for."""
+
+    def __init__(self, items):
+        self.items = items
+
+    def __len__(self):
+        return len(self.items)
+
+    def __getitem__(self, k):
+        return self.items[k]
+
+
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
@@ -587,6 +601,101 @@ def test_a_process_that_ends_amid_a_shard_leaves_whole_shards(tmp_path):
             assert_same(stored[k], data[k])
 
 
+def test_a_program_that_its_writers_cannot_import_is_told_so_and_ends(tmp_path):
+    """The writers end while they start; what they are to be told is more than a pipe takes at once."""
+    script = tmp_path / "write.py"
+    script.write_text(
+        "import json, sys\n"
+        "import numpy as np\n"
+        "from foveasim import explore\n"
+        "data = explore.DataSet(np.zeros((64, 64, 64), np.uint8), json.loads(sys.argv[1]))\n"
+        "explore.write_data_set(data, sys.argv[2], workers=2)\n"
+    )
+    command = [sys.executable, str(script), json.dumps(SHOT), str(tmp_path / "data")]
+
+    result = subprocess.run(command, check=False, capture_output=True, text=True, timeout=240)
+
+    assert result.returncode == 1
+    assert "SimulationError: a process that writes samples ended" in result.stderr
+    assert 'the call is not under `if __name__ == "__main__":`' in result.stderr
+
+
+def test_writers_end_with_the_program_that_started_them_and_leave_nothing(tmp_path):
+    script = tmp_path / "write.py"
+    script.write_text(
+        "import json, multiprocessing, sys, time\n"
+        "import numpy as np\n"
+        "from foveasim import explore\n"
+        "class Pictures:\n"
+        "    def __len__(self):\n"
+        "        return 8\n"
+        "    def __getitem__(self, k):\n"
+        "        if multiprocessing.parent_process() is not None:\n"
+        "            print('begun', flush=True)\n"
+        "            time.sleep(400)\n"
+        "        return np.zeros((40, 48, 3), np.uint8)\n"
+        "if __name__ == '__main__':\n"
+        "    explore.write_data_set(explore.DataSet(Pictures(), json.loads(sys.argv[1])), sys.argv[2], workers=2)\n"
+    )
+    (tmp_path / "temporary").mkdir()
+    running = subprocess.Popen(
+        [sys.executable, str(script), json.dumps(SHOT), str(tmp_path / "data")],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"TMPDIR": str(tmp_path / "temporary")},
+    )
+    assert running.stdout.readline() == "begun\n"
+    assert list((tmp_path / "temporary").iterdir())
+    running.kill()
+
+    # The output ends when all that can write to it have.
+    running.communicate(timeout=240)
+
+    assert list((tmp_path / "temporary").iterdir()) == []
+
+
+class Homebound(Made):
+    """Pictures that another process cannot take over."""
+
+    def __setstate__(self, state):
+        raise ValueError("the pictures stay")
+
+
+def test_pictures_that_cannot_go_to_other_processes_are_told_in_one_sentence(tmp_path):
+    local = Made(pictures(4))
+    local.key = lambda: None
+    for made, error, message in (
+        (local, ParameterError, "'workers' must be 1 for pictures or labels that cannot go to other processes"),
+        (
+            Homebound(pictures(4)),
+            SimulationError,
+            r"could not go to other processes \(the pictures stay\); take workers=1",
+        ),
+    ):
+        data = explore.DataSet(made, SHOT)
+        with pytest.raises(error, match=message) as caught:
+            explore.write_data_set(data, tmp_path / "data", workers=2)
+        assert "\n" not in str(caught.value)
+    assert_same(explore.write_data_set(data, tmp_path / "data")[3], data[3])
+
+
+def test_processes_are_started_where_there_is_enough_to_do(tmp_path, monkeypatch):
+    started = []
+
+    def others(data_set, shards, left, workers):
+        started.append((len(left), workers))
+        return dataset_store._written(data_set, shards, left, 1)
+
+    monkeypatch.setattr(dataset_store, "_written_by_others", others)
+    monkeypatch.setattr(dataset_store, "thread_count", lambda: 5)
+    data = explore.DataSet(pictures(6), SHOT)
+    for name, alone_s, found in (("short", 1e6, []), ("long", 0.0, [(5, 5)])):
+        monkeypatch.setattr(dataset_store, "ALONE_S", alone_s)
+        stored = explore.write_data_set(data, tmp_path / name, workers=None)
+        assert started == found
+        assert_same(stored[5], data[5])
+
+
 @pytest.mark.parametrize("name", ["data.zarr", "data"])
 def test_a_full_disk_is_one_sentence_and_no_broken_shard(name, tmp_path):
     """The system refuses files beyond a size, as it does where no place is left."""
@@ -634,19 +743,6 @@ def test_a_store_of_something_else_is_left_alone(tmp_path):
         explore.open_data_set(tmp_path / "data")[1]
     with pytest.raises(FileError, match="no such folder"):
         explore.open_data_set(tmp_path / "nothing")
-
-
-class Made:
-    """Pictures that are made when they are asked for."""
-
-    def __init__(self, items):
-        self.items = items
-
-    def __len__(self):
-        return len(self.items)
-
-    def __getitem__(self, k):
-        return self.items[k]
 
 
 def zipped(path, each):

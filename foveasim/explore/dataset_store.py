@@ -7,18 +7,22 @@ import json
 import multiprocessing
 import operator
 import os
+import pickle
 import secrets
 import shutil
 import signal
 import tarfile
+import tempfile
+import threading
+import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
-from multiprocessing.synchronize import Event
+from contextlib import closing, suppress
+from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +31,7 @@ from foveasim.arrays import check_count
 from foveasim.errors import FileError, FoveasimError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore.dataset import DataSet
 from foveasim.files import written_whole
+from foveasim.parallel import thread_count
 
 __all__ = ["StoredSamples", "open_data_set", "write_data_set"]
 
@@ -44,6 +49,10 @@ DONE, SETTINGS = "done", "settings"
 MADE_OF = "__made_of__"
 #: Bytes of a SHA-256.
 DIGEST_BYTES = 32
+#: Files of the folder that processes share: what they work on, and what tells them to stop.
+WORK, STOP = "work", "stop"
+#: What takes longer than this in one process is worth others, which take seconds to start.
+ALONE_S = 10.0
 NEEDS_ZARR = "needs zarr: pip install 'foveasim[explore]'"
 
 #: Told how many samples are written, of how many.
@@ -55,7 +64,7 @@ def write_data_set(
     path: str | Path,
     *,
     per_shard: int | None = None,
-    workers: int = 1,
+    workers: int | None = 1,
     tell: Tell | None = None,
 ) -> StoredSamples:
     """
@@ -71,8 +80,9 @@ def write_data_set(
         zarr, and single samples in any order from tar files, of which only they are read.
     per_shard : int, optional
         Samples of a shard; by default about 64 MiB of them, and a 32nd of all at most.
-    workers : int
-        Processes. They import the calling program's main file: keep the call under ``if __name__ == "__main__":``.
+    workers : int, optional
+        Processes. They import the calling program's main file: keep the call under ``if __name__ == "__main__":``. None: one a
+        core, as soon as what is left would take this process alone more than some seconds.
     tell : callable, optional
         Called with the numbers of samples that are written and of all.
 
@@ -90,7 +100,7 @@ def write_data_set(
     ParameterError
         When the photosites differ from sample to sample, which only tar files can hold.
     SimulationError
-        When a sample's camera cannot be made, or a process ends.
+        When a sample's camera cannot be made, a process ends, or cannot take over pictures of a class of the caller's own.
 
     Warns
     -----
@@ -98,7 +108,7 @@ def write_data_set(
         Once, when samples had warnings: ``warning`` tells each.
     """
     target = Path(path).absolute()
-    workers = check_count("workers", workers, at_most=1024)
+    workers = None if workers is None else check_count("workers", workers, at_most=1024)
     if per_shard is not None:
         per_shard = check_count("per_shard", per_shard)
     kind = _kind_of(target)
@@ -142,7 +152,7 @@ def _check_same(target: Path, about: Mapping[str, Any], plan: Mapping[str, Any],
         )
 
 
-def _write_shards(data_set: DataSet, shards: _Shards, workers: int, tell: Tell | None) -> None:
+def _write_shards(data_set: DataSet, shards: _Shards, workers: int | None, tell: Tell | None) -> None:
     """Write all shards that are not done, when those that are done are of the same pictures."""
     left = []
     for k in range(shards.n_shards):
@@ -175,63 +185,97 @@ def _write_shards(data_set: DataSet, shards: _Shards, workers: int, tell: Tell |
 
 
 def _written(
-    data_set: DataSet, shards: _Shards, left: Sequence[int], workers: int
+    data_set: DataSet, shards: _Shards, left: Sequence[int], workers: int | None
 ) -> Generator[tuple[int, list[str]], None, None]:
     """Shards as they are written, with the warnings of their samples."""
-    if workers == 1 or len(left) <= 1:
-        for k in left:
-            yield k, _write_shard(data_set, shards, k)
-        return
-    context = multiprocessing.get_context("spawn")
-    stop = context.Event()
-    pool = ProcessPoolExecutor(min(workers, len(left)), context, _begin, (data_set, shards, stop))
+    begun_s = time.monotonic()
+    for n_done, k in enumerate(left):
+        n_left = len(left) - n_done
+        left_s = n_left * (time.monotonic() - begun_s) / n_done if n_done else 0.0
+        if n_left > 1 and (left_s > ALONE_S if workers is None else workers > 1):
+            yield from _written_by_others(data_set, shards, left[n_done:], workers or thread_count())
+            return
+        yield k, _write_shard(data_set, shards, k)
+
+
+def _written_by_others(
+    data_set: DataSet, shards: _Shards, left: Sequence[int], workers: int
+) -> Generator[tuple[int, list[str]], None, None]:
+    """
+    Shards as other processes write them.
+
+    They take the data set from a file: one that ended while it is told through a pipe would never be noticed.
+    """
+    with tempfile.TemporaryDirectory(prefix="foveasim-", ignore_cleanup_errors=True) as name:
+        folder = Path(name)
+        _hand_over(folder, data_set, shards)
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(min(workers, len(left)), context, _begin, (folder,))
+        try:
+            going_on = {pool.submit(_write_own, folder, k): k for k in left}
+            for future in as_completed(going_on):
+                yield going_on[future], future.result()
+        except BrokenProcessPool:
+            raise SimulationError(
+                "a process that writes samples ended: too little memory, a crash, or the call is not under `if __name__ == "
+                '"__main__":`; done shards stay, and the same call goes on from there'
+            ) from None
+        except FoveasimError as error:
+            raise error from None  # without the other process's traceback
+        finally:
+            # Once all is done there is nothing to stop; before that, shards that are begun are given up at their next sample.
+            with suppress(OSError):
+                (folder / STOP).touch()
+            pool.shutdown(cancel_futures=True)
+
+
+def _hand_over(folder: Path, data_set: DataSet, shards: _Shards) -> None:
+    """Write what other processes work on."""
     try:
-        going_on = {pool.submit(_write_own, k): k for k in left}
-        for future in as_completed(going_on):
-            told, failure = future.result()
-            if failure is not None:
-                raise _raised(failure)
-            yield going_on[future], told
-    except BrokenProcessPool:
-        raise SimulationError(
-            "a process that writes samples ended: too little memory, or a crash; done shards stay, and the same "
-            "call goes on from there"
+        with (folder / WORK).open("wb") as file:
+            pickle.dump((data_set, shards), file, pickle.HIGHEST_PROTOCOL)
+    except OSError as error:
+        raise FileError(folder, f"cannot be written: {error.strerror or error}") from None
+    except Exception as error:  # noqa: BLE001 -- whatever pictures of the caller's own raise
+        raise ParameterError(
+            "workers", f"must be 1 for pictures or labels that cannot go to other processes ({_line(error)})"
         ) from None
-    finally:
-        # Once all is done there is nothing to stop; before that, shards that are begun are given up at their next sample.
-        stop.set()
-        pool.shutdown(cancel_futures=True)
 
 
-class _Failure(NamedTuple):
-    """An error of another process: exceptions of several arguments do not come through whole."""
-
-    path: str | None
-    message: str
-
-
-def _raised(failure: _Failure) -> FoveasimError:
-    return SimulationError(failure.message) if failure.path is None else FileError(failure.path, failure.message)
-
-
-#: What a process of the pool works on.
-_own: list[Any] = []
+@cache
+def _handed_over(folder: Path) -> tuple[DataSet, _Shards]:
+    """What a process works on."""
+    try:
+        with (folder / WORK).open("rb") as file:
+            data_set, shards = pickle.load(file)  # noqa: S301 -- of the process that started this one
+    except Exception as error:  # noqa: BLE001 -- whatever pictures of the caller's own raise
+        raise SimulationError(
+            f"the data set could not go to other processes ({_line(error)}); take workers=1"
+        ) from None
+    return data_set, shards
 
 
-def _begin(data_set: DataSet, shards: _Shards, stop: Event) -> None:
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _begin(folder: Path) -> None:
     """What a process does first: Ctrl-C, which the whole terminal gets, is for the program that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _own[:] = [data_set, shards, stop]
+    threading.Thread(target=_end_with_parent, args=(folder,), daemon=True).start()
 
 
-def _write_own(k: int) -> tuple[list[str], _Failure | None]:
-    try:
-        data_set, shards, stop = _own
-        return _write_shard(data_set, shards, k, stop.is_set), None
-    except FileError as error:
-        return [], _Failure(str(error.path), str(error).removeprefix(f"{error.path}: "))
-    except FoveasimError as error:
-        return [], _Failure(None, str(error))
+def _end_with_parent(folder: Path) -> None:
+    """End at once when the program that started this process has ended, by whatever, and remove what it left."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    shutil.rmtree(folder, ignore_errors=True)
+    os._exit(1)
+
+
+def _write_own(folder: Path, k: int) -> list[str]:
+    return _write_shard(*_handed_over(folder), k, (folder / STOP).exists)
 
 
 def _write_shard(
