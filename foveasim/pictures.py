@@ -25,7 +25,7 @@ from foveasim.files import written_whole
 if TYPE_CHECKING:
     from PIL import Image
 
-__all__ = ["pixels_of_page", "read_picture", "write_picture"]
+__all__ = ["pixels_of_image", "pixels_of_page", "read_picture", "write_picture"]
 
 #: Larger pictures are refused: 2**28 pixels are 3 GiB as three float32 channels.
 MAX_PIXELS = 2**28
@@ -128,13 +128,26 @@ def _read_with_pillow(path: Path) -> NDArray[Any]:
                 if n_pictures > 1 and image.format != "MPO":  # phones put small pictures behind the photograph
                     raise FileError(path, f"holds {n_pictures} pictures; give a file with one")
                 _check_whole(path, str(image.format))
-                orientation = _orientation(image)
-                plain = _plain(image)
-                numbers = np.asarray(plain)
+                return pixels_of_image(image)
     except UnidentifiedImageError:
         raise FileError(path, "is not a picture in a format that can be read") from None
     except Image.DecompressionBombError:
         raise FileError(path, f"has more than {MAX_PIXELS} pixels") from None
+
+
+def pixels_of_image(image: Image.Image) -> NDArray[Any]:
+    """
+    The numbers of one of Pillow's images, as :func:`read_picture` gives them.
+
+    Raises
+    ------
+    Exception
+        Whatever a broken file, or a mode that has no colours, makes Pillow trip over.
+    """
+    image.load()  # Pillow turns TIFF by itself, and then takes the note away
+    orientation = _orientation(image)
+    plain = _plain(image)
+    numbers = np.asarray(plain)
     if plain.mode == "I":
         is_16_bit = numbers.min() >= 0 and numbers.max() <= np.iinfo(np.uint16).max
         numbers = numbers.astype(np.uint16 if is_16_bit else np.float32)

@@ -11,6 +11,7 @@ import resource
 import subprocess
 import sys
 import tarfile
+import warnings
 import zipfile
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -399,6 +400,19 @@ def test_pictures_of_any_size_fit_the_layout(fit, is_covered):
 # -- where pictures come from -----------------------------------------------------------------------------------------
 
 
+class Made:
+    """Pictures that are made when they are asked for."""
+
+    def __init__(self, items):
+        self.items = items
+
+    def __len__(self):
+        return len(self.items)
+
+    def __getitem__(self, k):
+        return self.items[k]
+
+
 def folder_of_classes(tmp_path):
     for k, (name, picture) in enumerate(zip(("b/2.png", "a/10.png", "a/9.png", "b/1.png"), pictures(4), strict=True)):
         path = tmp_path / "pictures" / name
@@ -437,6 +451,58 @@ def test_folders_zips_files_pairs_and_arrays_give_the_same_samples(tmp_path):
     assert [sample["label"] for sample in made["zip"]] == [0, 0, 1, 1]
 
 
+TURNED = Image.Exif()
+TURNED[274] = 6  # the camera was held on its side
+
+
+@pytest.mark.parametrize(
+    ("ending", "convert", "note"),
+    [
+        ("png", lambda image: image.quantize(16), None),
+        ("png", lambda image: image.convert("1"), None),
+        ("png", lambda image: image.convert("LA"), None),
+        ("png", lambda image: Image.fromarray(np.asarray(image.convert("L")).astype(np.uint16) * 255), None),
+        ("png", lambda image: image, TURNED),
+        ("jpg", lambda image: image, TURNED),
+        ("jpg", lambda image: image.convert("CMYK"), None),
+        ("tif", lambda image: image, TURNED),
+    ],
+    ids=["palette", "1", "LA", "16 bits", "turned PNG", "turned JPEG", "CMYK", "turned TIFF"],
+)
+def test_an_image_of_pillow_is_seen_as_its_file_is(ending, convert, note, tmp_path):
+    image, file = convert(Image.fromarray(pictures(1)[0])), tmp_path / f"a.{ending}"
+    image.save(file, **({} if note is None else {"exif": note}))
+    opened = Image.open(file)
+    opened.load()
+    of_file = explore.DataSet([file], SHOT)[0]
+
+    assert_same(explore.DataSet([Image.open(file)], SHOT)[0], of_file)
+    assert_same(explore.DataSet([opened], SHOT)[0], of_file)
+    assert_same(pickle.loads(pickle.dumps(explore.DataSet([opened], SHOT)))[0], of_file)
+    assert_same(explore.DataSet(Made([Image.open(file)]), SHOT)[0], of_file)
+
+
+@pytest.mark.parametrize("mode", ["HSV", "YCbCr", "CMYK", "RGBX"])
+def test_colours_of_an_image_of_pillow_are_seen_in_any_of_its_modes(mode):
+    """Of black and white, which all of them hold as they are."""
+    grey = np.repeat(pictures(1)[0][..., :1] // 128 * 255, 3, axis=2).astype(np.uint8)
+
+    assert_same(explore.DataSet([Image.fromarray(grey).convert(mode)], SHOT)[0], explore.DataSet([grey], SHOT)[0])
+
+
+def test_a_broken_image_of_pillow_is_told_in_one_sentence(tmp_path):
+    Image.fromarray(pictures(1)[0]).save(tmp_path / "a.png")
+    whole = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "a.png").write_bytes(whole[: len(whole) // 2])
+
+    with (
+        Image.open(tmp_path / "a.png") as image,
+        pytest.raises(FileError, match="picture 0: is no image that can be read") as caught,
+    ):
+        explore.DataSet([image], SHOT)
+    assert "\n" not in str(caught.value)
+
+
 def test_a_mask_with_a_palette_has_its_numbers(tmp_path):
     image = Image.fromarray(np.full((N_Y, N_X), 3, np.uint8), mode=None).convert("P")
     image.putpalette([200, 10, 10] * 256)
@@ -446,19 +512,6 @@ def test_a_mask_with_a_palette_has_its_numbers(tmp_path):
     sample = explore.DataSet(pictures(1), SHOT, masks=[tmp_path / "mask.png"])[0]
 
     assert set(sample["mask"].tolist()) == {3}
-
-
-class Made:
-    """Pictures that are made when they are asked for."""
-
-    def __init__(self, items):
-        self.items = items
-
-    def __len__(self):
-        return len(self.items)
-
-    def __getitem__(self, k):
-        return self.items[k]
 
 
 # -- files ------------------------------------------------------------------------------------------------------------
@@ -824,6 +877,21 @@ def test_a_shard_that_was_broken_is_written_anew(tmp_path):
     (tmp_path / "data" / "shard-000001.tar").write_bytes(b"cut short")
 
     assert_same(explore.write_data_set(data, tmp_path / "data")[1], data[1])
+
+
+class Litter(Made):
+    """Pictures that leave open files behind, which Python tells of whenever it finds them."""
+
+    def __getitem__(self, k):
+        warnings.warn("unclosed file", ResourceWarning, stacklevel=2)
+        return super().__getitem__(k)
+
+
+def test_what_python_tells_of_files_left_open_is_no_warning_of_a_sample():
+    with pytest.warns(ResourceWarning):
+        data = explore.DataSet(Litter(pictures(3)), SHOT)
+
+    assert {sample["warning"] for sample in data} == {""}
 
 
 def test_warnings_of_samples_are_told_once_and_kept(tmp_path):

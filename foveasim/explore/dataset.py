@@ -8,6 +8,7 @@ import operator
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -349,8 +350,7 @@ class DataSet:
         parts = self._kept.setdefault(part, OrderedDict())
         key = json.dumps(settings, sort_keys=True)
         if key not in parts:
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")
+            with _told_warnings() as caught:
                 made = make()
             parts[key] = made, [_warning(each.message) for each in caught]
             if len(parts) > KEPT:
@@ -400,8 +400,7 @@ class DataSet:
 
     def _sample(self, index: int) -> dict[str, Any]:
         self._told = []
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with _told_warnings() as caught:
             drawn = self._drawn(index)
             shot, capture = self._captured(index)
             sample: dict[str, Any] = {"index": index, "picture": self._picture_of(index)}
@@ -571,6 +570,15 @@ def _filled(array: NDArray[Any], n: int, value: Any) -> NDArray[Any]:
     """An array with more rows, of one value."""
     rest = np.full((n - len(array), *array.shape[1:]), value, array.dtype)
     return np.concatenate((array, rest))
+
+
+@contextmanager
+def _told_warnings() -> Iterator[list[warnings.WarningMessage]]:
+    """All warnings, but those that Python gives whenever it finds a file left open."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        warnings.simplefilter("ignore", ResourceWarning)
+        yield caught
 
 
 def _warning(message: Warning | str) -> Warning:

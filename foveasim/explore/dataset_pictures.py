@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import sys
 import tempfile
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from foveasim.errors import FileError, ParameterError
 from foveasim.explore._files import digests
-from foveasim.pictures import read_picture
+from foveasim.pictures import pixels_of_image, read_picture
 
 __all__ = ["Source", "digest_of", "is_lazy", "source_of"]
 
@@ -314,6 +315,13 @@ class _Items:
         item = self._item(k)
         if isinstance(item, str | Path):
             return read_picture(item)
+        if _is_image(item):
+            try:
+                return pixels_of_image(item)
+            except Exception as error:  # noqa: BLE001 -- a broken image makes its reader trip over anything
+                raise FileError(
+                    self.name(k), f"is no image that can be read ({' '.join(str(error).split())})"
+                ) from None
         try:
             return np.asarray(item)
         except ValueError:
@@ -345,6 +353,12 @@ class _Items:
     def digest(self, k: int) -> str:
         item = self._item(k)
         return digest_of(item if isinstance(item, str | Path) else self.picture(k))
+
+
+def _is_image(item: Any) -> bool:
+    """Whether an item is one of Pillow's images; who has one has loaded Pillow."""
+    pillow = sys.modules.get("PIL.Image")
+    return pillow is not None and isinstance(item, pillow.Image)
 
 
 def _told(names: Sequence[str]) -> dict[str, Any]:
