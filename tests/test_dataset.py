@@ -28,6 +28,7 @@ from foveasim.config import build_shot
 from foveasim.errors import ConfigError, CoverageWarning, FileError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore import dataset_store
 from foveasim.explore.dataset_labels import boxes_on_sites, flow_on_sites, mask_on_sites
+from foveasim.explore.dataset_pictures import source_of
 from foveasim.explore.dataset_torch import _kind
 
 SHOT = {
@@ -449,6 +450,38 @@ def test_folders_zips_files_pairs_and_arrays_give_the_same_samples(tmp_path):
         for k in range(4):
             assert_same(again[k], made["folder"][k])
     assert [sample["label"] for sample in made["zip"]] == [0, 0, 1, 1]
+
+
+def test_pictures_come_in_the_natural_order_of_their_names_however_they_are_found(tmp_path):
+    names = ["a1.png", "a.png", "001.png", "01.png", "1.png", "1a.png", "2.png", "10.png"]
+    names += [f"{'9' * 5000}.png", f"1{'0' * 5000}.png", "²3.png", "٣.png"]
+    order = sorted(names, key=lambda name: (name[0] in "0123456789", names.index(name)))
+    Image.fromarray(pictures(1)[0]).save(tmp_path / "a.png")
+    for seed in range(5):
+        archive = tmp_path / f"{seed}.zip"
+        with zipfile.ZipFile(archive, "w") as file:
+            for k in np.random.default_rng(seed).permutation(len(names)):
+                file.write(tmp_path / "a.png", names[k])
+        source = source_of(archive)
+        assert [source.key(k) for k in range(len(source))] == order
+    (tmp_path / "folder").mkdir()
+    short = [name for name in order if len(name) < 99]
+    for name in reversed(short):
+        Image.fromarray(pictures(1)[0]).save(tmp_path / "folder" / name)
+    source = source_of(tmp_path / "folder")
+    assert [source.key(k) for k in range(len(source))] == short
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_a_name_that_a_zip_file_has_twice_is_one_picture(tmp_path):
+    with zipfile.ZipFile(tmp_path / "x.zip", "w") as archive:
+        for picture in pictures(2):
+            Image.fromarray(picture).save(tmp_path / "a.png")
+            archive.write(tmp_path / "a.png", "a.png")
+    data = explore.DataSet(tmp_path / "x.zip", SHOT)
+
+    assert len(data) == 1
+    np.testing.assert_array_equal(data[0]["code"], explore.DataSet(pictures(2)[1:], SHOT)[0]["code"])
 
 
 TURNED = Image.Exif()

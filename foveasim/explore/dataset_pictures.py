@@ -382,10 +382,12 @@ def _ordered(names: Iterable[str]) -> list[str]:
         and not any(part.startswith((".", "__MACOSX")) for part in PurePosixPath(name).parts)
     )
 
-    def pieces(name: str) -> list[tuple[int, str]]:
-        return [(int(p), "") if p.isdigit() else (-1, p) for p in re.split(r"(\d+)", name) if p]
+    def key(name: str) -> tuple[list[tuple[int, str]], str]:
+        # Of whole numbers without the zeros before them the longer is the larger; where all are equal, the names decide.
+        pieces = enumerate(re.split(r"([0-9]+)", name))
+        return [(len(n := p.lstrip("0")), n) if k % 2 else (-1, p) for k, p in pieces if p], name
 
-    return sorted(pictures, key=pieces)
+    return sorted(set(pictures), key=key)
 
 
 def _folder_labels(names: Sequence[str]) -> list[Any] | None:
