@@ -30,6 +30,7 @@ from foveasim.explore import dataset_store
 from foveasim.explore.dataset_labels import boxes_on_sites, flow_on_sites, mask_on_sites
 from foveasim.explore.dataset_pictures import source_of
 from foveasim.explore.dataset_torch import _kind
+from foveasim.pictures import write_picture
 
 SHOT = {
     "scene": {
@@ -195,6 +196,55 @@ def test_a_choice_has_its_chances(told, chances):
     assert set(found) == {value for value, chance in chances.items() if chance}
     for value, chance in chances.items():
         assert abs(found.count(value) - chance * N_DRAWS) <= 5.0 * np.sqrt(N_DRAWS * chance * (1.0 - chance))
+
+
+@pytest.mark.parametrize("sigma", [1e-320, 1e-9, 0.1, 1e6])
+def test_a_normal_distribution_of_any_width_is_between_its_ends(sigma):
+    """Nearly even far inside a wide one, and its mean where it is narrow."""
+    draw = explore.draw_of("x", {"normal": [1.0, sigma, 0.0, 2.0]})
+    found = np.array([draw.at(0, k)[0] for k in range(N_DRAWS)])
+    sigma_cut = min(sigma, np.sqrt(1.0 / 3.0))
+
+    assert 0.0 <= found.min() <= found.max() <= 2.0
+    assert abs(found.mean() - 1.0) <= 5.0 * sigma_cut / np.sqrt(N_DRAWS)
+    # The variance of an even and of a normal distribution, to 5 sigma of the wider spread of the normal's.
+    assert found.std() == pytest.approx(sigma_cut, rel=5.0 / np.sqrt(2.0 * N_DRAWS))
+
+
+def test_labels_may_be_true_and_false():
+    data = explore.DataSet(pictures(2), SHOT, labels=[True, False])
+
+    assert [sample["label"] for sample in data] == [1, 0]
+
+
+def test_pictures_of_all_depths_hold_the_same_light(tmp_path):
+    """One picture in 8 bits, 16 bits and floating-point numbers, in a folder, a zip file and memory."""
+    picture = pictures(1)[0]
+    deep, exact = picture.astype(np.uint16) * 257, (picture / 255.0).astype(np.float32)
+    folder = tmp_path / "all"
+    folder.mkdir()
+    for name, numbers in (("1.png", picture), ("2.png", deep), ("3.tif", deep), ("4.tif", exact), ("5.exr", exact)):
+        write_picture(folder / name, numbers)
+    with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
+        for file in folder.iterdir():
+            archive.write(file, file.name)
+
+    for source in (folder, tmp_path / "all.zip", [picture, deep, deep, exact, exact]):
+        found = [sample["expected_e"] for sample in explore.DataSet(source, SHOT, fields=("expected_e",))]
+        assert len(found) == 5
+        for each in found[1:]:
+            np.testing.assert_allclose(each, found[0], rtol=1e-6)
+
+
+def test_a_box_beyond_the_picture_covers_what_of_it_is_on_it():
+    boxes = [[-5, -5, N_X / 2, N_Y], [N_X + 10, 5, N_X + 20, 9], [-1e300, -1e300, 1e300, 1e300]]
+    sample = explore.DataSet(pictures(1), SHOT, boxes=[boxes], fit="cover")[0]
+    left = explore.DataSet(pictures(1), SHOT, boxes=[[[0, 0, N_X / 2, N_Y]]], fit="cover")[0]
+
+    np.testing.assert_array_equal(sample["box_covers"][0], left["box_covers"][0])
+    assert 0 < left["box_covers"].sum() < left["box_covers"].size
+    assert not sample["box_covers"][1].any()
+    assert sample["box_covers"][2].all()
 
 
 def test_choices_that_are_no_numbers_are_told_by_their_positions():
@@ -971,6 +1021,8 @@ def test_warnings_of_samples_are_told_once_and_kept(tmp_path):
         ({"exposure_s": {"uniform": {1, 2}}}, ParameterError, r"uniform needs \[low, high\]"),
         ({"exposure_s": {"uniform": [1, 2], "integers": [1, 2]}}, ParameterError, "drawn from one distribution"),
         ({"exposure_s": {"normal": [1, 0, 0, 2]}}, ParameterError, "a standard deviation above 0"),
+        ({"exposure_s": {"normal": [1, 1e300, 0, 2]}}, ParameterError, "a standard deviation up to 1e\\+06 times"),
+        ({"exposure_s": {"uniform": b"ab"}}, ParameterError, r"uniform needs \[low, high\]"),
         ({"exposure_s": {"integers": [1, 2.5]}}, ParameterError, "must be a whole number, got 2.5"),
         ({"": {"uniform": [1, 2]}}, ConfigError, "'' is no setting's place"),
         ({"sensor.bits": {"uniform": [8, 9.5]}}, ConfigError, "sensor.bits: "),
@@ -1031,6 +1083,9 @@ def test_a_bad_distribution_is_refused_before_the_first_sample(vary, error, mess
             "'pictures' must be a folder, a zip file, an array, or a sequence, got a int",
         ),
         ({"pictures": []}, ParameterError, "'pictures' must hold at least one picture"),
+        ({"pictures": [(pictures(1)[0], 1), ()]}, ParameterError, "must all be pairs"),
+        ({"pictures": [(pictures(1)[0],)]}, ParameterError, "must all be pairs"),
+        ({"pictures": [(pictures(1)[0], None)]}, ParameterError, "must all be whole numbers, or all be texts"),
         ({"pictures": np.zeros((3, 4))}, ParameterError, "'pictures' must have the shape"),
         ({"pictures": np.zeros((0, 4, 4))}, ParameterError, "'pictures' must have the shape"),
         ({"pictures": "missing"}, FileError, "missing: no such file or folder"),

@@ -552,7 +552,7 @@ def _numbered(labels: Any, n: int) -> tuple[list[int] | None, list[str] | None]:
     values = [value.item() if isinstance(value, np.generic) else value for value in (each[k] for k in range(n))]
     if all(isinstance(value, int) for value in values):
         for value in values:
-            check_count("labels", value, at_least=LEAST, at_most=MOST)
+            check_count("labels", int(value), at_least=LEAST, at_most=MOST)
         return [int(value) for value in values], None
     if all(isinstance(value, str) for value in values):
         names = sorted(set(values))

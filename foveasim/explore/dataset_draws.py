@@ -26,6 +26,8 @@ FORMS = {
     "normal": "[mean, standard deviation, low, high]",
     "choice": "a list of values",
 }
+#: Standard deviation over the distance of the ends: beyond it rounding leaves few numbers between them.
+WIDEST = 1e6
 #: Whole numbers of choices: those of 64 bits, as arrays of samples hold them.
 LEAST, MOST = -(2**63), 2**63 - 1
 
@@ -90,7 +92,8 @@ class Draw:
             number = math.exp(math.log(low) + share * (math.log(high) - math.log(low)))
         else:
             mean, sigma = self.values[:2]
-            below, above = ndtr((np.array([low, high]) - mean) / sigma)
+            with np.errstate(over="ignore"):  # ends that are far out
+                below, above = ndtr((np.array([low, high]) - mean) / sigma)
             number = mean + sigma * float(ndtri(below + share * (above - below)))
         number = min(max(number, low), high)  # rounding
         return number, number
@@ -131,7 +134,7 @@ def draw_of(path: str, told: Any) -> Draw:
         raise ParameterError(path, f"must be drawn from one distribution ({known})", told)
     (kind,) = kinds
     values = told[kind]
-    if not isinstance(values, Sequence | np.ndarray) or isinstance(values, str):
+    if not isinstance(values, Sequence | np.ndarray) or isinstance(values, str | bytes):
         raise ParameterError(path, f"{kind} needs {FORMS[kind]}", values)
     if kind == "choice":
         return _choice(path, values, told.get("weights"))
@@ -154,6 +157,10 @@ def draw_of(path: str, told: Any) -> Draw:
         # Further out the numbers between the ends are no longer told apart.
         if not (sigma > 0.0 and low <= mean <= high):
             raise ParameterError(path, "normal needs a standard deviation above 0, and its mean between the ends", told)
+        if (high - low) * WIDEST < sigma:
+            raise ParameterError(
+                path, f"normal needs a standard deviation up to {WIDEST:g} times its ends' distance", told
+            )
     return Draw(path, kind, numbers)
 
 

@@ -329,10 +329,10 @@ class _Items:
 
     def labels(self) -> list[Any] | None:
         if isinstance(self._items, list | tuple):
-            is_pair = [isinstance(item, tuple) for item in self._items]
+            is_pair = [isinstance(item, tuple) and len(item) > 1 for item in self._items]
             if all(is_pair):
                 return [item[1] for item in self._items]
-            if any(is_pair):
+            if any(isinstance(item, tuple) for item in self._items):
                 raise ParameterError("pictures", "must all be pairs (picture, label), or none of them")
             return None
         targets = getattr(self._items, "targets", None)
