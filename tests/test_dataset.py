@@ -11,10 +11,12 @@ import resource
 import subprocess
 import sys
 import tarfile
+import tempfile
 import warnings
 import zipfile
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -854,6 +856,48 @@ def test_a_full_disk_is_one_sentence_and_no_broken_shard(name, tmp_path):
     for k in range(4):
         assert_same(stored[k], data[k])
     assert not list(tmp_path.rglob(".foveasim*"))
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="a system without such rights")
+def test_what_must_not_be_read_or_written_is_one_sentence():
+    """As somebody without rights of his own, whom root becomes for it."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)  # that others may enter, as pytest's they may not
+        folder.chmod(0o777)
+        data = explore.DataSet(pictures(2), SHOT)
+        for kind in ("a", "a.zarr"):
+            explore.write_data_set(data, folder / kind, per_shard=1)
+        (folder / "a" / "shard-000001.tar").unlink()
+        pytest.importorskip("zarr").open_group(str(folder / "a.zarr"), mode="r+")["done"][1] = 0
+        (folder / "pictures" / "closed").mkdir(parents=True)
+        Image.fromarray(pictures(1)[0]).save(folder / "pictures" / "1.png")
+        closed = [
+            folder / "pictures" / "closed",
+            *(p for p in (folder / "a.zarr").rglob("*") if p.is_dir()),
+            folder / "a",
+        ]
+        for place in closed:
+            place.chmod(0o000 if place.name == "closed" else 0o555)
+        try:
+            os.seteuid(os.getuid() or 65534)
+            for call, message in (
+                (lambda: explore.write_data_set(data, folder / "a"), "tar: cannot be written: Permission denied"),
+                (lambda: explore.write_data_set(data, folder / "a.zarr"), "zarr: cannot be written: Permission denied"),
+                (
+                    lambda: explore.write_data_set(data, closed[0] / "a"),
+                    "closed/a: cannot be written: Permission denied",
+                ),
+                (lambda: explore.open_data_set(closed[0] / "a"), "closed/a: cannot be read: Permission denied"),
+                (lambda: explore.DataSet(folder / "pictures", SHOT), "closed: cannot be read: Permission denied"),
+                (lambda: explore.DataSet(closed[0] / "a", SHOT), "closed/a: cannot be read: Permission denied"),
+            ):
+                with pytest.raises(FileError, match=message) as caught:
+                    call()
+                assert "\n" not in str(caught.value)
+        finally:
+            os.seteuid(os.getuid())
+            for place in closed:
+                place.chmod(0o755)
 
 
 def test_a_store_of_something_else_is_left_alone(tmp_path):

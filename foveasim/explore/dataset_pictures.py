@@ -71,10 +71,13 @@ def source_of(pictures: Any) -> Source:
         return pictures
     if isinstance(pictures, str | Path):
         path = Path(pictures).absolute()
-        if path.is_dir():
-            return _Folder(path)
-        if not path.is_file():
-            raise FileError(path, "no such file or folder")
+        try:
+            if path.is_dir():
+                return _Folder(path)
+            if not path.is_file():
+                raise FileError(path, "no such file or folder")
+        except OSError as error:
+            raise _unreadable(error, path) from None
         if path.suffix.lower() == ".npy":
             return _ArrayFile(path)
         if zipfile.is_zipfile(path):
@@ -97,15 +100,15 @@ def digest_of(item: Any) -> str:
     """
     SHA-256 of a file, or of an array, its type and its shape.
 
-    Empty where there is none, which whoever reads it will tell.
+    Empty where there is none, or none that can be read, which whoever reads it will tell.
     """
-    if isinstance(item, str | Path):
-        return digests([Path(item)])[str(Path(item))]
     try:
+        if isinstance(item, str | Path):
+            return digests([Path(item)])[str(Path(item))]
         array = np.ascontiguousarray(item)
         digest = hashlib.sha256(f"{array.dtype.str} {np.shape(item)}".encode())
         digest.update(array.data)
-    except (TypeError, ValueError):
+    except (OSError, TypeError, ValueError):
         return ""
     return digest.hexdigest()
 
@@ -117,7 +120,7 @@ class _Folder:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        found = (Path(place) / name for place, _, names in os.walk(folder) for name in names)
+        found = (Path(place) / name for place, _, names in os.walk(folder, onerror=_stop) for name in names)
         self._names = _ordered(path.relative_to(folder).as_posix() for path in found)
         if not self._names:
             raise FileError(folder, f"holds no pictures ({', '.join(ENDINGS)})")
@@ -364,6 +367,15 @@ def _is_image(item: Any) -> bool:
 def _told(names: Sequence[str]) -> dict[str, Any]:
     """How many names there are, and a sum of them."""
     return {"n": len(names), "sha256": hashlib.sha256("\n".join(names).encode()).hexdigest()}
+
+
+def _unreadable(error: OSError, path: Path) -> FileError:
+    return FileError(error.filename or path, f"cannot be read: {error.strerror or error}")
+
+
+def _stop(error: OSError) -> None:
+    """What a folder in a folder of pictures holds must not be missing unseen."""
+    raise _unreadable(error, Path())
 
 
 def _check_stack(name: str, pictures: NDArray[Any]) -> None:

@@ -119,7 +119,7 @@ def write_data_set(
             )
         _zarr(target)
     plan = json.loads(json.dumps(data_set.described()))
-    about = _about_of(target) if target.exists() else None
+    about = _about_of(target) if os.path.exists(target) else None  # noqa: PTH110 -- also where it must not be looked for
     if about is None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the shard of the first sample tells them
@@ -368,8 +368,11 @@ def open_data_set(path: str | Path) -> StoredSamples:
         When there is none, it is broken, or not all shards are done.
     """
     source = Path(path).absolute()
-    if not source.is_dir():
-        raise FileError(source, "is not a folder" if source.exists() else "no such folder")
+    try:
+        if not source.is_dir():
+            raise FileError(source, "is not a folder" if source.exists() else "no such folder")
+    except OSError as error:
+        raise FileError(source, f"cannot be read: {error.strerror or error}") from None
     if source.suffix.lower() == ZARR:
         _zarr(source)
     stored = StoredSamples(source, _about_of(source))
@@ -415,10 +418,10 @@ def _zarr(path: Path) -> Any:
 
 def _begun(target: Path, make: Callable[[Path], None]) -> None:
     """Make a folder whole or not at all."""
-    if not target.parent.is_dir():
-        raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
     new = target.with_name(f".foveasim-{secrets.token_hex(8)}{target.suffix}")
     try:
+        if not target.parent.is_dir():
+            raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
         new.mkdir()
         make(new)
         new.rename(target)
