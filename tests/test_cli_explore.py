@@ -475,6 +475,9 @@ def test_a_data_set_on_the_command_line_is_what_the_call_gives(foveasim, folder,
     for k in range(12):
         assert_same(found[k], data[k])
     assert {"label", "box_um", "mask", "flow_um"} < set(found[0])
+    code, _, wrong = foveasim("dataset", "all.yaml", "--out", f"again_{out}")
+    assert (code, wrong) == (0, "")
+    assert_same(explore.open_data_set(folder / f"again_{out}")[11], data[11])
 
 
 @pytest.mark.parametrize("recipe", ["classification", "denoising"])
