@@ -108,5 +108,8 @@ def _restored(kind: type[FoveasimError], args: tuple[Any, ...], state: dict[str,
 
 def _shown(value: Any) -> str:
     """Short text of a value for a message."""
-    text = " ".join(repr(value).split())
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:  # noqa: BLE001 -- any object may fail to tell what it is, and Python refuses very long numbers
+        return f"one of type {type(value).__name__}"
     return text if len(text) <= 80 else text[:77] + "..."

@@ -28,6 +28,8 @@ def test_a_message_has_name_rule_value_unit_and_cure():
     assert str(ParameterError("white", "must be there")) == "'white' must be there"
     assert len(str(ParameterError("data", "must be short", np.zeros((500, 500))))) < 120
 
+    assert str(ParameterError("n", "must be less", 10**5000)) == "'n' must be less, got one of type int"
+
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
 def test_errors_survive_pickling(error):
