@@ -10,7 +10,8 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import suppress
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,8 @@ VARY_200 = {
 }
 REPEATS = 5
 SLOW_S = 0.02
+#: What does not end within this, on however slow a machine, never ends.
+LIMIT_S = 150.0
 
 
 def in_process(plan):
@@ -75,11 +78,25 @@ def executions(folder):
     return [tuple(map(int, line.split())) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def wait_for(condition, limit_s=30.0):
+def wait_for(condition, limit_s=LIMIT_S):
     end_s = time.monotonic() + limit_s
     while not condition():
         assert time.monotonic() < end_s
         time.sleep(0.01)
+
+
+def ends(call):
+    """What a call gives, which may hang: then this fails."""
+    given = Future()
+
+    def run():
+        try:
+            given.set_result(call())
+        except BaseException as error:  # noqa: BLE001 -- it is raised where it is waited for
+            given.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    return given.result(LIMIT_S)
 
 
 def plan_200(metrics=None):
@@ -141,14 +158,14 @@ def answers(port):
         return one.connect_ex(("127.0.0.1", port)) == 0
 
 
-@pytest.fixture(scope="module")
-def scheduler():
-    """A scheduler with two workers, in programs of their own: its address, and its program."""
+@contextmanager
+def programs(n_workers):
+    """A scheduler with workers, in programs of their own: its address, and its program."""
     port = free_port()
     address = f"tcp://127.0.0.1:{port}"
     programs = [
         ("distributed.cli.dask_scheduler", "--host", address, "--no-dashboard"),
-        *[("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard")] * 2,
+        *[("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard")] * n_workers,
     ]
     running = []
     try:
@@ -162,13 +179,84 @@ def scheduler():
         for program in reversed(running):
             program.terminate()
         for program in running:
-            program.wait(timeout=20)
+            program.wait(timeout=LIMIT_S)
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    with programs(2) as started:
+        yield started
 
 
 def test_results_are_the_same_on_a_scheduler_started_separately(scheduler, by_hand):
     found = explore.run_sweep(plan_200(), scheduler=scheduler[0])
 
     xr.testing.assert_identical(found, by_hand)
+
+
+@pytest.fixture(params=["1 process", "2 processes", "1 worker of a scheduler", "2 workers of a scheduler"])
+def where(request):
+    """Where a sweep runs."""
+    n_workers = int(request.param[0])
+    if "process" in request.param:
+        yield {"workers": n_workers}
+    elif n_workers == 1:
+        with programs(1) as (address, _):
+            yield {"scheduler": address}
+    else:
+        yield {"scheduler": request.getfixturevalue("scheduler")[0]}
+
+
+def test_a_metric_that_ends_its_process_costs_its_point_alone_and_two_tries(where, tmp_path):
+    (log,) = logged(tmp_path).values()
+
+    def deadly(shot, camera, capture):
+        log(shot, camera, capture)
+        if camera.sensor.bits == 9:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return 7.0
+
+    plan = explore.plan_sweep(SHOT, {"sensor.bits": [6, 7, 8, 9, 10, 11]}, metrics=[deadly])
+    found = ends(lambda: explore.run_sweep(plan, **where))
+
+    is_fatal = found["sensor.bits"].values == 9
+    assert found["error"].values[is_fatal].item().startswith("ended its worker 2 times")
+    assert (found["error"].values[~is_fatal] == "").all()
+    assert (found["deadly"].values[~is_fatal] == 7.0).all()
+    seeds = [seed for seed, _ in executions(tmp_path)]
+    assert set(seeds) == set(found["seed"].values.tolist())
+    assert seeds.count(found["seed"].values[is_fatal].item()) == 2
+    assert max(seeds.count(seed) for seed in seeds) == 2
+
+
+def test_a_worker_that_is_killed_from_outside_costs_no_point(where, tmp_path):
+    plan = explore.plan_sweep(SHOT, {"exposure_s": np.linspace(0.01, 0.02, 40)}, metrics=logged(tmp_path, SLOW_S))
+    killed = []
+
+    def kill():
+        wait_for(lambda: len(executions(tmp_path)) > 15)
+        killed.append(executions(tmp_path)[-1][1])
+        os.kill(killed[0], signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    found = ends(lambda: explore.run_sweep(plan, **where))
+    killer.join()
+
+    assert (found["error"] == "").all()
+    assert found["mean_dn"].notnull().all()
+    seeds = [seed for seed, _ in executions(tmp_path)]
+    assert max(seeds.count(seed) for seed in seeds) <= 2
+
+
+def test_a_metric_may_raise_anything():
+    def rude(_, camera, __):
+        raise {8: SystemExit, 9: KeyboardInterrupt, 10: GeneratorExit, 11: RuntimeError}[camera.sensor.bits]("why")
+
+    found = ends(lambda: explore.sweep(SHOT, {"sensor.bits": [8, 9, 10, 11]}, metrics=[rude], workers=1))
+
+    kinds = ("SystemExit", "KeyboardInterrupt", "GeneratorExit", "RuntimeError")
+    assert found["error"].values.tolist() == [f"rude: {kind}: why" for kind in kinds]
 
 
 def test_a_scheduler_that_is_killed_is_told_and_what_was_done_is_kept(scheduler, tmp_path):
@@ -602,7 +690,7 @@ def test_a_store_that_cannot_be_written_is_told_before_the_first_point(tmp_path,
 
 @pytest.mark.parametrize("address", ["127.0.0.1", "tcp://", "foo://host:1", "silent"])
 def test_a_scheduler_that_does_not_answer_is_told_and_leaves_nothing(tmp_path, monkeypatch, address):
-    monkeypatch.setattr("foveasim.explore._engine.SCHEDULER_S", 0.5)
+    monkeypatch.setattr("foveasim.explore._cluster.SCHEDULER_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         if address == "silent":  # a port that is open, and says nothing
             address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"

@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import signal
+import sys
 import time
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Lock
+from threading import Lock, current_thread, main_thread
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ __all__ = ["Bench", "Job", "Task", "run_tasks"]
 
 #: What a worker keeps of earlier points, in memory and in number. Parts inside others are counted in each.
 KEPT_BYTES, MOST_PARTS = 1 << 30, 1024
+#: And no more than this part of a worker's memory: captures need most of it.
+SHARE_OF_MEMORY = 4
 #: Parts that hold more as they are used.
 GROWING = ("camera", "images")
 #: Objects are weighed by the arrays in them, so many containers deep.
@@ -136,13 +139,15 @@ class Bench:
             warnings.simplefilter("always")
             try:
                 shot, capture = self.captured(job, task.settings)
-            except Exception as error:  # noqa: BLE001 -- a point's settings may make anything of ours or of a library's raise
+            except BaseException as error:  # noqa: BLE001 -- a point's settings may make anything of ours or of a library's raise
+                _raise_ctrl_c(error)
                 errors.append(_told(error))
             else:
                 for name, metric in job.metrics.items():
                     try:
                         values |= values_of(name, self._measured(metric, shot, capture, task.settings))
-                    except Exception as error:  # noqa: BLE001 -- metrics are the user's
+                    except BaseException as error:  # noqa: BLE001 -- metrics are the user's, and may end with sys.exit()
+                        _raise_ctrl_c(error)
                         errors.append(f"{name}: {_told(error)}")
         self._forget()
         told = dict.fromkeys([*self._told, *(str(warning.message) for warning in caught)])
@@ -155,9 +160,16 @@ def _light(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
     return [settings["scene"], settings["optics"], hashlib.sha256(response.tobytes()).hexdigest()]
 
 
-def _told(error: Exception) -> str:
-    text = str(error) if isinstance(error, FoveasimError) else f"{type(error).__name__}: {error}"
-    return _short(text)
+def _raise_ctrl_c(error: BaseException) -> None:
+    """Let Ctrl-C through, which comes to the main thread; elsewhere, as in a worker's tasks, a metric raised it."""
+    if isinstance(error, KeyboardInterrupt) and current_thread() is main_thread():
+        raise error
+
+
+def _told(error: BaseException) -> str:
+    return _short(
+        str(error) if isinstance(error, FoveasimError) else f"{type(error).__name__}: {error}".removesuffix(": ")
+    )
 
 
 def _short(text: str) -> str:
@@ -202,9 +214,13 @@ def dask_setup(_worker: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def run_tasks(job: bytes, versions: Mapping[str, str], tasks: Sequence[Task]) -> tuple[list[Record], float]:
+def run_tasks(
+    job: bytes, versions: Mapping[str, str], folder: str, tasks: Sequence[Task]
+) -> tuple[list[Record], float] | None:
     """
     The records of some points, and the seconds that they took; called by dask on its workers.
+
+    None when this is another worker than that with the folder: dask itself tries again what ended with one.
 
     Raises
     ------
@@ -212,9 +228,13 @@ def run_tasks(job: bytes, versions: Mapping[str, str], tasks: Sequence[Task]) ->
         When this worker's versions are others: its results might be, too.
     """
     import cloudpickle
+    from distributed import get_worker
 
     from foveasim.records import versions as own_versions
 
+    worker = get_worker()
+    if worker.local_directory != folder:
+        return None
     if own_versions() != dict(versions):
         different = [
             f"{name} {own_versions().get(name)}" for name in versions if own_versions().get(name) != versions[name]
@@ -226,13 +246,9 @@ def run_tasks(job: bytes, versions: Mapping[str, str], tasks: Sequence[Task]) ->
         if digest not in _current:
             _current.clear()
             own_job = cloudpickle.loads(job)
-            _current[digest] = replace(own_job, n_threads=own_job.n_threads or _threads_of_worker()), Bench()
+            n_threads = own_job.n_threads or int(worker.state.nthreads)
+            kept_bytes = min(KEPT_BYTES, (worker.memory_manager.memory_limit or sys.maxsize) // SHARE_OF_MEMORY)
+            _current[digest] = replace(own_job, n_threads=n_threads), Bench(kept_bytes)
         own_job, bench = _current[digest]
         start_s = time.perf_counter()
         return [bench.record(own_job, task) for task in tasks], time.perf_counter() - start_s
-
-
-def _threads_of_worker() -> int:
-    from distributed import get_worker
-
-    return int(get_worker().state.nthreads)

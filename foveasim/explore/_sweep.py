@@ -14,7 +14,8 @@ import numpy as np
 from foveasim.arrays import Ints, check_count
 from foveasim.errors import SimulationError
 from foveasim.explore._bench import Job, Task
-from foveasim.explore._engine import client_of, records_of
+from foveasim.explore._cluster import client_of
+from foveasim.explore._engine import records_of
 from foveasim.explore._metrics import Metric
 from foveasim.explore._plan import Plan, plan_sweep
 from foveasim.explore._records import Journal, Record, check_same_plan, journal_of
