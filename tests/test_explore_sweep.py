@@ -522,6 +522,111 @@ def test_labelled_arrays_are_joined_by_their_labels_and_others_padded():
     assert found["m_path"].values.tolist() == ["a", "b"]
 
 
+ODD = {
+    "a 0-d array": lambda _: np.array(3.0),
+    "a 0-d DataArray": lambda k: xr.DataArray(np.arange(k + 2.0)).mean(),
+    "a Dataset": lambda k: xr.Dataset({"a": 3.0, "b": ("x", np.arange(k + 2.0))}),
+    "long doubles": lambda _: np.arange(3, dtype=np.longdouble),
+    "a long double": lambda _: np.longdouble(3.0),
+    "another byte order": lambda _: np.arange(3, dtype=">i4"),
+    "a large number": lambda _: 2**70,
+    "large numbers": lambda _: np.array([2**63 + 5], np.uint64),
+    "nothing": lambda _: np.array([]),
+    "objects that are texts": lambda _: np.array(["a", "bc"], object),
+    "numbers and texts": lambda k: "seven" if k else 7,
+    "labels of two sorts": lambda k: xr.DataArray([1.0, 2.0], dims="x", coords={"x": ["1", "b"] if k else [1, 2]}),
+    "labels of large numbers": lambda k: xr.DataArray(
+        [1.0], dims="x", coords={"x": np.array([2**63], np.uint64) if k else [-1]}
+    ),
+    "a dimension of the sweep's": lambda _: xr.DataArray([1.0, 2.0], dims="repeat", coords={"repeat": [5, 6]}),
+    "a dimension of its own name": lambda _: xr.DataArray([1.0, 2.0], dims="odd", coords={"odd": [5, 6]}),
+    "a dimension that is a setting": lambda _: xr.DataArray(
+        [1.0, 2.0], dims="exposure_s", coords={"exposure_s": [5, 6]}
+    ),
+    "a dimension named as a result": lambda _: {"0": 1.0, "a": xr.DataArray([1.0, 2.0], dims="odd_0")},
+    "labels here and none there": lambda _: {
+        "a": xr.DataArray([1.0], dims="x", coords={"x": [5]}),
+        "b": xr.DataArray([1.0, 2.0], dims="x"),
+    },
+}
+
+
+@pytest.mark.parametrize("odd", ODD)
+def test_whatever_a_metric_gives_is_kept_and_can_be_read(odd, tmp_path):
+    plan = explore.plan_sweep(SHOT, {"exposure_s": [0.01, 0.02]}, repeats=2)
+    records = {k: Record(k, values_of("odd", ODD[odd](k % 2))) for k in range(plan.n_points)}
+    with Journal(tmp_path / "r.zarr", plan.described()) as journal:
+        for record in records.values():
+            journal.add(record)
+    with Journal(tmp_path / "r.zarr", plan.described()) as journal:
+        found = dataset_of(plan, journal.records)
+    write_store(found, tmp_path / "r.zarr")
+
+    xr.testing.assert_identical(explore.open_results(tmp_path / "r.zarr"), found)
+    xr.testing.assert_identical(dataset_of(plan, records), found)
+    assert (found["error"] == "").all()
+    mine = [name for name in found.data_vars if name.startswith("odd")]
+    assert mine
+    for name in mine:
+        given = values_of("odd", ODD[odd](1))[name]
+        data = np.asarray(getattr(given, "data", given))
+        kept = found[name].values[0, 1]
+        if data.dtype.kind == "U":
+            assert {str(one) for one in np.ravel(kept)} >= {str(one) for one in np.ravel(data)}
+        else:
+            assert set(kept.ravel().tolist()) >= set(data.astype(kept.dtype).ravel().tolist())
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (np.array([1j]), "must give numbers or texts, got an array of complex128"),
+        (np.array([None, "a"]), "must give numbers or texts, got an array of object"),
+        (np.array(["2020-01-01"], "datetime64[D]"), "must give numbers or texts"),
+        ("\ud800", "must give texts of Unicode characters"),
+        (np.array(["a", "\ud800"]), "must give texts of Unicode characters"),
+        (xr.DataArray([1.0, 2.0], dims="x", coords={"x": [1.0, np.nan]}), "a different label for each value along 'x'"),
+        (
+            xr.DataArray([1.0, 2.0, 3.0], dims="x", coords={"x": [0.5, 0.5, 1]}),
+            "a different label for each value along 'x'",
+        ),
+        ({"a/b": 1}, "'m_a/b' cannot be the name of a result: it must be a short text without '/'"),
+        ({"a" * 300: 1}, "cannot be the name of a result"),
+        ({"\ud800": 1}, "cannot be the name of a result"),
+        (xr.DataArray([1.0], dims="a/b", coords={"a/b": [1]}), "cannot be the name of a result"),
+        ({"a": {"b": 1}, "a_b": 99}, "'m_a_b' must be the name of one result; there are two of it"),
+        (None, "must give a number, a text, a mapping, an array or an array with labels, got a NoneType"),
+    ],
+)
+def test_what_no_store_can_keep_is_told_by_its_point(given, message):
+    with pytest.raises(ParameterError, match=message):
+        values_of("m", given)
+
+
+def test_points_that_differ_from_most_are_told_and_the_others_kept():
+    plan = explore.plan_sweep(SHOT, {"sensor.bits": [8, 9, 10, 11]})
+    given = [3.0, np.arange(2.0), 4.0, xr.DataArray([1.0], dims="x", coords={"x": [1]})]
+    records = {k: Record(k, values_of("m", one), "woe" if k == 3 else "") for k, one in enumerate(given)}
+
+    found = dataset_of(plan, records)
+
+    np.testing.assert_array_equal(found["m"], [3.0, np.nan, 4.0, np.nan])
+    told = "m: has other dimensions or labels than in most points, with none"
+    assert found["error"].values.tolist() == ["", told, "", f"woe; {told}"]
+    many = dataset_of(plan, {k: Record(k, values_of("m", given[1] if k else 3.0)) for k in range(4)})
+    assert many["m"].shape == (4, 2)
+    assert np.isnan(many["m"][0]).all()
+
+
+def test_results_of_two_metrics_with_one_name_are_told():
+    plan = explore.plan_sweep(SHOT, {"sensor.bits": [8]}, metrics={"a": lambda *_: {"b": 1}, "a_b": lambda *_: 2})
+
+    found = in_process(plan)
+
+    assert found["a_b"].item() == 1
+    assert found["error"].item() == "a_b: 'a_b' must be the name of one result; there are two of it"
+
+
 def test_points_side_by_side_are_labelled_with_all_their_settings():
     points = [
         {"optics.emission": "isotropic", "layout.parameters.n_x": 8, "sensor.qe": 0.5},

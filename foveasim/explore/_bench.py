@@ -21,7 +21,7 @@ from foveasim.capture import Capture
 from foveasim.config import Shot, build_shot
 from foveasim.errors import FoveasimError
 from foveasim.explore._metrics import REFERENCES, Metric
-from foveasim.explore._records import Record, values_of
+from foveasim.explore._records import Record, check_new, values_of
 
 __all__ = ["Bench", "Job", "Task", "run_tasks"]
 
@@ -145,7 +145,9 @@ class Bench:
             else:
                 for name, metric in job.metrics.items():
                     try:
-                        values |= values_of(name, self._measured(metric, shot, capture, task.settings))
+                        more = values_of(name, self._measured(metric, shot, capture, task.settings))
+                        check_new(values, more)
+                        values |= more
                     except BaseException as error:  # noqa: BLE001 -- metrics are the user's, and may end with sys.exit()
                         _raise_ctrl_c(error)
                         errors.append(f"{name}: {_told(error)}")

@@ -8,7 +8,7 @@ import json
 import os
 import time
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Self
@@ -20,7 +20,7 @@ from foveasim.errors import FileError, ParameterError
 from foveasim.files import lock
 from foveasim.records import differences
 
-__all__ = ["Journal", "Record", "Value", "check_same_plan", "journal_of", "values_of"]
+__all__ = ["Journal", "Record", "Value", "check_new", "check_same_plan", "journal_of", "values_of"]
 
 FORMAT, VERSION = "foveasim sweep", 1
 #: So long a journal's lines may wait for the disk.
@@ -55,36 +55,93 @@ def values_of(name: str, given: Any) -> dict[str, Scalar | Value]:
     Raises
     ------
     ParameterError
-        When it is none of a number, a text, a mapping, an array, or an array with labels.
+        When it is none of a number, a text, a mapping, an array, or an array with labels, or cannot be kept in a store.
     """
     if isinstance(given, Mapping):
         found: dict[str, Scalar | Value] = {}
         for key, item in given.items():
-            found |= values_of(f"{name}_{key}", item)
+            more = values_of(_name(f"{name}_{key}"), item)
+            check_new(found, more)
+            found |= more
         return found
-    if isinstance(given, np.generic):
-        given = given.item()
+    if isinstance(given, np.generic | np.ndarray):
+        return {name: _value(name, given, tuple(f"{name}_{k}" for k in range(given.ndim)), {})}
     if isinstance(given, Scalar):
-        return {name: given}
-    if isinstance(given, np.ndarray):
-        dims = tuple(f"{name}_{k}" for k in range(given.ndim))
-        return {name: Value(_simple(name, given), dims, {})}
+        return {name: _scalar(name, given)}
     if all(hasattr(given, part) for part in ("values", "dims", "coords")):
-        dims = tuple(str(dim) for dim in given.dims)
-        labels = {dim: _simple(name, given.coords[dim].values) for dim in dims if dim in given.coords}
-        return {name: Value(_simple(name, given.values), dims, labels)}
+        dims = tuple(_name(str(dim)) for dim in given.dims)
+        labels = {str(dim): given.coords[dim].values for dim in given.dims if dim in given.coords}
+        return {name: _value(name, given.values, dims, labels)}
     raise ParameterError(
         name, f"must give a number, a text, a mapping, an array or an array with labels, got a {type(given).__name__}"
     )
 
 
+def check_new(found: Collection[str], more: Iterable[str]) -> None:
+    """
+    Whether variables have other names than those before.
+
+    Raises
+    ------
+    ParameterError
+        With the name.
+    """
+    twice = next((name for name in more if name in found), None)
+    if twice is not None:
+        raise ParameterError(twice, "must be the name of one result; there are two of it")
+
+
+def _name(name: str) -> str:
+    """The name of a variable or a dimension, which is a folder in the store."""
+    if (
+        not name.isprintable()
+        or not name.strip(". ")
+        or name == "zarr.json"
+        or set(name) & {"/", "\\"}
+        or len(name) > 100
+    ):
+        raise ParameterError(name[:100], "cannot be the name of a result: it must be a short text without '/'")
+    return name
+
+
+def _value(name: str, data: Any, dims: tuple[str, ...], labels: Mapping[str, Any]) -> Scalar | Value:
+    """An array with its labels; a number or text where it has no dimensions."""
+    array = _simple(name, data)
+    if not dims:
+        return _scalar(name, array.item())
+    if len(set(dims)) < len(dims):
+        raise ParameterError(name, f"must have dimensions of different names, got {', '.join(dims)}")
+    simple = {dim: _simple(name, each) for dim, each in labels.items()}
+    for dim, each in simple.items():
+        if len(set(each.tolist())) < each.size or (each.dtype.kind == "f" and np.isnan(each).any()):
+            raise ParameterError(name, f"must have a different label for each value along '{dim}', and no NaN")
+    return Value(array, dims, simple)
+
+
 def _simple(name: str, array: Any) -> NDArray[Any]:
+    """An array of numbers or texts that any store takes."""
     array = np.asarray(array)
-    if array.dtype.kind in "OT":
+    if array.dtype.kind == "T" or (array.dtype.kind == "O" and all(isinstance(item, str) for item in array.flat)):
         array = array.astype(str)
     if array.dtype.kind not in "biufU":
         raise ParameterError(name, f"must give numbers or texts, got an array of {array.dtype}")
-    return np.ascontiguousarray(array)
+    if array.dtype.kind == "f" and array.dtype.itemsize > np.dtype(np.float64).itemsize:
+        array = array.astype(np.float64)
+    if array.dtype.kind == "U":
+        _scalar(name, "".join(array.flat))
+    return np.array(array, array.dtype.newbyteorder("="), order="C")
+
+
+def _scalar(name: str, given: Scalar) -> Scalar:
+    """A number or text that any store takes."""
+    if isinstance(given, str):
+        try:
+            given.encode()
+        except UnicodeEncodeError:
+            raise ParameterError(name, "must give texts of Unicode characters, got a lone half of one", given) from None
+    elif isinstance(given, int) and given.bit_length() > 63:
+        return float(given)
+    return given
 
 
 # -- the journal ------------------------------------------------------------------------------------------------------

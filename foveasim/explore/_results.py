@@ -6,6 +6,7 @@ import json
 import os
 import secrets
 import shutil
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,21 +48,21 @@ def dataset_of(plan: Plan, records: Mapping[int, Record]) -> xr.Dataset:
     """
     xr = _xarray()
     shape, dims = plan.shape, plan.dims
-    rows = [records[k] for k in sorted(records)]
-    names = list(dict.fromkeys(name for record in rows for name in record.values))
-    labels = _labels(rows)
+    errors = {k: records[k].error if k in records else "not done" for k in range(plan.n_points)}
+    taken = {*plan.values, POINT, REPEAT, SEED, ERROR, WARNING}
+    given = _apart(_alike(_by_name([records[k] for k in sorted(records)]), taken, errors), taken)
+    labels = _labels(given)
     variables: dict[str, Any] = {}
-    for name in names:
-        given = {record.point: record.values[name] for record in rows if name in record.values}
-        own_dims, flat = _stacked(name, given, plan.n_points, labels)
+    for name, values in given.items():
+        flat = _stacked(values, plan.n_points, labels)
         variables[name] = (
-            (*dims, *own_dims),
+            (*dims, *next(iter(values.values())).dims),
             flat.reshape(*shape, *flat.shape[1:]),
             {"units": unit_of(name)} if unit_of(name) else {},
         )
     seeds = np.array([plan.seed_of(k) for k in range(plan.n_points)], np.int64)
     texts = {
-        ERROR: [records[k].error if k in records else "not done" for k in range(plan.n_points)],
+        ERROR: list(errors.values()),
         WARNING: [records[k].warning if k in records else "" for k in range(plan.n_points)],
     }
     variables[SEED] = (dims, seeds.reshape(shape))
@@ -79,7 +80,7 @@ def dataset_of(plan: Plan, records: Mapping[int, Record]) -> xr.Dataset:
         coords[POINT] = np.arange(shape[0])
     if plan.repeats > 1:
         coords[REPEAT] = np.arange(plan.repeats)
-    coords |= {dim: (dim, array) for dim, array in labels.items()}
+    coords |= {dim: (dim, array) for dim, (array, _) in labels.items()}
     described = plan.described()
     attributes = {
         "format": FORMAT,
@@ -109,35 +110,89 @@ def _texts(values: list[str]) -> NDArray[Any]:
     return np.array(values, np.dtypes.StringDType())
 
 
-def _labels(rows: Iterable[Record]) -> dict[str, NDArray[Any]]:
-    """Labels of each dimension that has some, of all records together: sorted numbers, or texts as they came."""
-    found: dict[str, dict[Any, None]] = {}
+def _by_name(rows: Iterable[Record]) -> dict[str, dict[int, Value]]:
+    """Values of each name, by points; numbers and texts as arrays without dimensions."""
+    given: dict[str, dict[int, Value]] = {}
     for record in rows:
-        for value in record.values.values():
-            if isinstance(value, Value):
-                for dim, labels in value.labels.items():
-                    found.setdefault(dim, {}).update(dict.fromkeys(labels.tolist()))
-    return {
-        dim: _texts([str(label) for label in each])
-        if any(isinstance(label, str) for label in each)
-        else np.array(sorted(each))
-        for dim, each in found.items()
-    }
+        for name, value in record.values.items():
+            array = value if isinstance(value, Value) else Value(np.asarray(value), (), {})
+            given.setdefault(name, {})[record.point] = array
+    return given
+
+
+def _alike(
+    given: Mapping[str, dict[int, Value]], taken: set[str], errors: dict[int, str]
+) -> dict[str, dict[int, Value]]:
+    """
+    Values that have the same dimensions in all points.
+
+    What differs from most, or has the name of a setting that varies, is left out, and told in ``errors``.
+    """
+    kept: dict[str, dict[int, Value]] = {}
+    for name, values in given.items():
+        kinds = Counter((value.dims, tuple(value.labels)) for value in values.values())
+        most = kinds.most_common(1)[0][0]
+        alike = {k: value for k, value in values.items() if (value.dims, tuple(value.labels)) == most}
+        why = f"{name}: has other dimensions or labels than in most points, with {', '.join(most[0]) or 'none'}"
+        if name in taken:
+            alike, why = {}, f"{name}: has the name of a setting or of a dimension"
+        for k in sorted(values.keys() - alike.keys()):
+            errors[k] = "; ".join(filter(None, (errors[k], why)))
+        if alike:
+            kept[name] = alike
+    return kept
+
+
+def _apart(given: Mapping[str, Mapping[int, Value]], taken: set[str]) -> dict[str, dict[int, Value]]:
+    """
+    Values with names of dimensions that nothing else has.
+
+    Dimensions with labels are shared by all variables that name them so; others are a variable's own.
+    """
+    labelled = {dim for values in given.values() for dim in next(iter(values.values())).labels}
+    apart: dict[str, dict[int, Value]] = {}
+    for name, values in given.items():
+        first = next(iter(values.values()))
+        own: dict[str, str] = {}
+        for dim in first.dims:
+            free = dim if dim in first.labels or dim.startswith(name) else f"{name}_{dim}"
+            others = {*taken, *given, *own.values(), *(() if free in first.labels else labelled)}
+            if free in others:
+                free = f"{name}_{dim}"
+            while free in others:
+                free += "_"
+            own[dim] = free
+        for k, value in values.items():
+            labels = {own[dim]: each for dim, each in value.labels.items()}
+            apart.setdefault(name, {})[k] = Value(value.data, tuple(own[dim] for dim in value.dims), labels)
+    return apart
+
+
+def _labels(given: Mapping[str, Mapping[int, Value]]) -> dict[str, tuple[NDArray[Any], dict[Any, int]]]:
+    """Labels of each dimension that has some, and their places: sorted numbers, or texts as they came."""
+    found: dict[str, dict[Any, None]] = {}
+    for values in given.values():
+        for value in values.values():
+            for dim, labels in value.labels.items():
+                found.setdefault(dim, {}).update(dict.fromkeys(labels.tolist()))
+    joined: dict[str, tuple[NDArray[Any], dict[Any, int]]] = {}
+    for dim, each in found.items():
+        if any(isinstance(label, str) for label in each):
+            places = {text: k for k, text in enumerate(dict.fromkeys(map(str, each)))}
+            joined[dim] = _texts(list(places)), {label: places[str(label)] for label in each}
+        else:
+            numbers = sorted(each)
+            joined[dim] = np.array(numbers), {label: k for k, label in enumerate(numbers)}
+    return joined
 
 
 def _stacked(
-    name: str, given: Mapping[int, Any], n_points: int, labels: Mapping[str, NDArray[Any]]
-) -> tuple[tuple[str, ...], NDArray[Any]]:
-    """A metric's values of all points, (n_point, ...), with what is not known as NaN or an empty text, and its dimensions."""
-    values = {k: v if isinstance(v, Value) else Value(np.asarray(v), (), {}) for k, v in given.items()}
+    values: Mapping[int, Value], n_points: int, labels: Mapping[str, tuple[NDArray[Any], Mapping[Any, int]]]
+) -> NDArray[Any]:
+    """A metric's values of all points, (n_point, ...), with what is not known as NaN or an empty text."""
     first = next(iter(values.values()))
-    if any(value.dims != first.dims for value in values.values()):
-        told = sorted({str(value.dims) for value in values.values()})
-        raise ParameterError(name, f"must have the same dimensions in all points, got {' and '.join(told)}")
-    # A dimension without labels is this variable's own.
-    dims = tuple(dim if dim in labels else dim if dim.startswith(name) else f"{name}_{dim}" for dim in first.dims)
     shape = tuple(
-        labels[dim].size if dim in labels else max(value.data.shape[axis] for value in values.values())
+        labels[dim][0].size if dim in first.labels else max(value.data.shape[axis] for value in values.values())
         for axis, dim in enumerate(first.dims)
     )
     kinds = {value.data.dtype.kind for value in values.values()}
@@ -147,26 +202,19 @@ def _stacked(
         flat: NDArray[Any] = np.full((n_points, *shape), "", np.dtypes.StringDType())
     else:
         dtype = np.result_type(*(value.data.dtype for value in values.values()))
-        if dtype.kind not in "biuf":  # whole numbers beyond 64 bits
-            dtype = np.dtype(np.float64)
-        flat = (
-            np.empty((n_points, *shape), dtype)
-            if is_whole
-            else np.full(
-                (n_points, *shape), np.nan, np.promote_types(dtype, np.float64) if dtype.kind != "f" else dtype
-            )
-        )
-    places = {dim: {label: k for k, label in enumerate(labels[dim].tolist())} for dim in first.dims if dim in labels}
+        if not is_whole and dtype.kind != "f":
+            dtype = np.promote_types(dtype, np.float64)
+        flat = np.empty((n_points, *shape), dtype) if is_whole else np.full((n_points, *shape), np.nan, dtype)
     for k, value in values.items():
         at: list[Any] = [
-            np.array([places[dim][label] for label in value.labels[dim].tolist()], np.int64)
+            np.array([labels[dim][1][label] for label in value.labels[dim].tolist()], np.int64)
             if dim in value.labels
             else np.arange(value.data.shape[axis])
             for axis, dim in enumerate(value.dims)
         ]
         place: Any = (k, *np.ix_(*at))
         flat[place] = value.data.astype(flat.dtype) if is_text else value.data
-    return dims, flat
+    return flat
 
 
 # -- the store --------------------------------------------------------------------------------------------------------

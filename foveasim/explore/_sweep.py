@@ -150,7 +150,7 @@ def run_sweep(
         _run(plan, journal.records, journal.add, scheduler, workers, tell)
         dataset = dataset_of(plan, journal.records)
         write_store(dataset, store)
-        if not any(record.error for record in journal.records.values()):
+        if not (dataset["error"] != "").any():
             journal.remove()
     return dataset
 
