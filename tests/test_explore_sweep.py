@@ -433,6 +433,37 @@ def test_points_that_fail_are_in_the_results_with_their_message_and_can_be_tried
     assert journal_of(tmp_path / "r.zarr").exists()
 
 
+def test_trying_again_what_failed_never_makes_failures_permanent(tmp_path):
+    bad = tmp_path / "bad"
+    bad.touch()
+
+    def moody(*_):
+        if bad.exists():
+            raise RuntimeError("no mood")
+        return 7.0
+
+    plan = explore.plan_sweep(SHOT, {"sensor.bits": [8, 9]}, metrics=[moody])
+    store = tmp_path / "r.zarr"
+    explore.run_sweep(plan, out=store, workers=1)
+    before = journal_of(store).read_bytes()
+    with pytest.raises(ParameterError, match="scheduler"):
+        explore.run_sweep(plan, out=store, scheduler="tcp://127.0.0.1:1", retry=True)
+
+    assert journal_of(store).read_bytes() == before
+
+    bad.unlink()
+    journal_of(store).unlink()
+    assert (
+        explore.run_sweep(plan, out=store, workers=1)["error"].values.tolist() == ["moody: RuntimeError: no mood"] * 2
+    )
+
+    found = explore.run_sweep(plan, out=store, workers=1, retry=True)
+
+    assert found["error"].values.tolist() == ["", ""]
+    assert found["moody"].values.tolist() == [7.0, 7.0]
+    assert not journal_of(store).exists()
+
+
 # -- the journal and the store ----------------------------------------------------------------------------------------
 
 PLAN = explore.plan_sweep(SHOT, {"sensor.bits": [8, 9, 10]})
@@ -455,6 +486,20 @@ def test_a_journal_forgets_the_line_that_was_cut_off_and_nothing_else(tmp_path):
     journal_of(store).write_bytes(damaged)
     with Journal(store, PLAN.described()) as journal:
         assert sorted(journal.records) == [0, 2]
+
+
+def test_a_journal_that_was_cut_off_in_its_first_line_is_begun_anew(tmp_path):
+    store = tmp_path / "r.zarr"
+    with Journal(store, PLAN.described()) as journal:
+        head = journal_of(store).read_bytes()
+    for torn in (head[:40], head[:-1], b"\0" * 100, b""):
+        journal_of(store).write_bytes(torn)
+        with Journal(store, PLAN.described()) as journal:
+            assert journal.records == {}
+            journal.add(Record(0, {"a": 1.0}))
+        with Journal(store, PLAN.described()) as journal:
+            assert sorted(journal.records) == [0]
+        journal_of(store).unlink()
 
 
 def test_a_full_disk_is_told_and_leaves_what_was_written_whole(tmp_path, monkeypatch):
@@ -491,7 +536,7 @@ def test_a_store_of_another_sweep_is_left_alone(tmp_path):
     assert explore.open_results(store)["sensor.bits"].values.tolist() == [8, 9, 10]
 
 
-@pytest.mark.parametrize("text", ["my notes", "my notes\n", "{}\n{}\n"])
+@pytest.mark.parametrize("text", ["my notes", "my notes\n", "{}\n{}\n", "cafe", '{"format": "foveasim'])
 def test_a_file_that_is_no_journal_is_left_alone(tmp_path, text):
     journal_of(tmp_path / "r.zarr").write_text(text)
 

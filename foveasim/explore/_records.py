@@ -6,6 +6,7 @@ import base64
 import contextlib
 import json
 import os
+import re
 import time
 import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -23,6 +24,8 @@ from foveasim.records import differences
 __all__ = ["Journal", "Record", "Value", "check_new", "check_same_plan", "journal_of", "values_of"]
 
 FORMAT, VERSION = "foveasim sweep", 1
+#: How a journal begins: a checksum, and what it is.
+TORN_HEAD = rb'[0-9a-f]{1,8} \{"format": "foveasim'
 #: So long a journal's lines may wait for the disk.
 SYNC_S = 1.0
 #: What a metric may give that is no array.
@@ -189,11 +192,13 @@ class Journal:
             raise FileError(self._store, "is being written by another program that runs the same sweep")
         self._file.seek(0)
         lines = list(_lines(self._file))
-        if lines or self._file.tell():
+        self._file.seek(0)
+        if lines or not _is_torn_head(self._file.read()):
             _check_same(self.path, lines[0][0] if lines else None, head)
         self._end = sum(length for _, length in lines)
         self._file.truncate(self._end)
-        if not lines:
+        self._is_new = not lines
+        if self._is_new:
             self._write(head)
         return lines
 
@@ -202,7 +207,7 @@ class Journal:
 
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(OSError):
-            if not self.records:
+            if self._is_new and not self.records:
                 self.remove()
             elif self.path.exists():
                 self._sync()
@@ -264,6 +269,11 @@ def _lines(file: IO[bytes]) -> Iterator[tuple[Any, int]]:
         yield said, len(line)
 
 
+def _is_torn_head(text: bytes) -> bool:
+    """Whether a file without a whole line is empty, or what a sudden end left of a journal that was just begun."""
+    return not text.strip(b"\0") or re.match(TORN_HEAD, text) is not None
+
+
 def _check_same(path: Path, found: Any, head: Mapping[str, Any]) -> None:
     """
     Whether a journal is of a plan.
@@ -277,7 +287,7 @@ def _check_same(path: Path, found: Any, head: Mapping[str, Any]) -> None:
         raise FileError(path, "is no sweep's journal")
     if found.get("version") != VERSION:
         raise FileError(path, f"has the format version {found.get('version')}, expected {VERSION}")
-    check_same_plan(path, found["plan"], head["plan"])
+    check_same_plan(path, found.get("plan", {}), head["plan"])
 
 
 def check_same_plan(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:

@@ -106,7 +106,7 @@ def run_sweep(
     workers : int, optional
         Number of those processes; by default one a core.
     retry : bool
-        Whether points that failed before are tried again.
+        Whether points that failed before are tried again; all of them, where there is a store without its journal.
     tell : callable, optional
         Called with the numbers of points that are done and of all.
 
@@ -142,7 +142,10 @@ def run_sweep(
     if before is not None:
         check_same_plan(store, before, plan.described())
         if not journal_of(store).exists():
-            return open_results(store)
+            complete = open_results(store)
+            # What points gave cannot be had from a store again as it was: without the journal, all are tried.
+            if not (retry and (complete["error"] != "").any()):
+                return complete
     with Journal(store, plan.described()) as journal:
         if retry:
             for point in [point for point, record in journal.records.items() if record.error]:
