@@ -259,6 +259,39 @@ def test_a_metric_may_raise_anything():
     assert found["error"].values.tolist() == [f"rude: {kind}: why" for kind in kinds]
 
 
+def paused(when):
+    """A metric that pauses its worker, as dask does when its memory is full, for good, from some point on."""
+
+    def pausing(_, camera, __):
+        from distributed import Status, get_worker
+
+        if when(camera.sensor.bits):
+            get_worker().memory_manager.memory_pause_fraction = False  # dask must not take it back
+            get_worker().status = Status.paused
+        time.sleep(SLOW_S)
+        return os.getpid()
+
+    return explore.plan_sweep(SHOT, {"sensor.bits": list(range(4, 16))}, metrics=[pausing])
+
+
+def test_what_waits_at_a_paused_worker_is_done_by_another(monkeypatch):
+    monkeypatch.setattr("foveasim.explore._cluster.PAUSED_S", 1.0)
+    found = ends(lambda: explore.run_sweep(paused(lambda bits: bits == 4), workers=2))
+
+    assert (found["error"] == "").all()
+    one = found["pausing"].sel({"sensor.bits": 4})
+    assert (found["pausing"] == one).sum() < 6
+
+
+def test_workers_that_are_all_paused_are_told(monkeypatch):
+    monkeypatch.setattr("foveasim.explore._cluster.PAUSED_S", 1.0)
+    monkeypatch.setattr("foveasim.explore._engine.WORKERS_S", 1.0)
+    with pytest.raises(
+        SimulationError, match=r"have taken no points for 1 s: they are paused.*; \d+ of 12 points are done"
+    ):
+        ends(lambda: explore.run_sweep(paused(lambda _: True), workers=2))
+
+
 def test_a_scheduler_that_is_killed_is_told_and_what_was_done_is_kept(scheduler, tmp_path):
     """The last test of that scheduler."""
     address, program = scheduler
