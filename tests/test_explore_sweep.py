@@ -569,6 +569,18 @@ def test_a_store_of_another_sweep_is_left_alone(tmp_path):
     assert explore.open_results(store)["sensor.bits"].values.tolist() == [8, 9, 10]
 
 
+def test_results_of_another_function_of_the_same_name_are_not_taken_for_this_ones(tmp_path):
+    def brighter(than):
+        return lambda _, __, capture: float((capture.code > than).mean())
+
+    plans = [explore.plan_sweep(SHOT, {"sensor.bits": [8]}, metrics={"share": brighter(than)}) for than in (0, 255)]
+    found = explore.run_sweep(plans[0], out=tmp_path / "r.zarr", workers=1)
+
+    assert found["share"].item() == 1.0
+    with pytest.raises(FileError, match=r"'metrics\.share' differs"):
+        explore.run_sweep(plans[1], out=tmp_path / "r.zarr", workers=1)
+
+
 @pytest.mark.parametrize("text", ["my notes", "my notes\n", "{}\n{}\n", "cafe", '{"format": "foveasim'])
 def test_a_file_that_is_no_journal_is_left_alone(tmp_path, text):
     journal_of(tmp_path / "r.zarr").write_text(text)
@@ -835,6 +847,10 @@ def test_a_camera_takes_light_that_is_known_and_shares_its_compiled_layout():
         ),
         ({"sensor.bits": [8]}, {"repeats": 10**9}, ParameterError, "'repeats' must be .* 1000000"),
         ({"sensor.bits": [8, 8]}, {}, ParameterError, "has the value 8 twice"),
+        ({"exposure_s": [2, 2.0]}, {}, ParameterError, r"has the value 2\.0 twice"),
+        ({"sensor.device_seed": [2**64, 2**64 + 1]}, {}, ParameterError, r"has the value .* twice"),
+        ({"exposure_s": [0.1, float("nan")]}, {}, ParameterError, r"'exposure_s' must vary over numbers.*, got nan"),
+        ({"sensor.bits": {8, 10}}, {}, ParameterError, "'sensor.bits' must vary over a list of values"),
         (
             {"sensor.bits": [8], "exposure_s": [1, 2]},
             {"mode": "zip"},
@@ -845,6 +861,13 @@ def test_a_camera_takes_light_that_is_known_and_shares_its_compiled_layout():
         ({"sensor.bits": [8]}, {"metrics": ["beauty"]}, ParameterError, "'metrics' must be of .*, got 'beauty'"),
         ({"sensor.bits": [8]}, {"metrics": []}, ParameterError, "'metrics' must be at least one"),
         ({"sensor.bits": [8]}, {"metrics": [lambda *_: 1]}, ParameterError, "name functions by a mapping"),
+        ({"sensor.bits": [8]}, {"metrics": {"seed": len}}, ParameterError, "'metrics' must have names .* not 'seed'"),
+        (
+            {"exposure_s": [8]},
+            {"metrics": {"exposure_s": len}},
+            ParameterError,
+            "'metrics' must have other names than .*",
+        ),
         ({"sensor.bits": [object()]}, {}, ParameterError, r"'sensor\.bits' must vary over numbers, texts"),
         ({"seed": [1, 2]}, {}, ParameterError, "'seed' cannot vary"),
         ({"layout": ["four_zones"], "layout.parameters.n_x": [8]}, {}, ConfigError, "cannot both vary"),

@@ -36,6 +36,8 @@ Metric = Callable[[Shot, Camera, Capture], Any]
 PSNR_PIXELS = 256
 #: Variance of what rounding to a code takes away, in codes.
 QUANTISATION_DN2 = 1.0 / 12.0
+#: Names that results have beside metrics.
+RESERVED = ("seed", "error", "warning", "point", "repeat")
 #: Metrics of a sweep that names none.
 DEFAULT_METRICS = ("mean_code_dn", "saturated_fraction", "snr", "n_sites")
 
@@ -172,6 +174,8 @@ def named_metrics(metrics: Iterable[str | Metric] | Mapping[str, Metric] | None)
             raise ParameterError("metrics", "must be names or functions", metric)
         if not isinstance(name, str) or not name.isidentifier():
             raise ParameterError("metrics", "must have names that are identifiers: name functions by a mapping", name)
+        if name in RESERVED:
+            raise ParameterError("metrics", f"must have names that results do not have already, not '{name}'")
         if name in found:
             raise ParameterError("metrics", "must have a name each; there are two of this one", name)
         found[name] = metric

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from foveasim.arrays import Ints, check_choice, check_count
@@ -19,11 +21,22 @@ from foveasim.config import check_settings, files_from, put_setting, read_settin
 from foveasim.documents import read_yaml
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.explore._files import digests
+from foveasim.explore._functions import described
 from foveasim.explore._metrics import Metric, named_metrics, with_more_metrics
 from foveasim.records import versions
 from foveasim.streams import derived_seed
 
-__all__ = ["MAX_POINTS", "Plan", "SweepSection", "check_apart", "plan_sweep", "read_sweep", "shot_of", "telling"]
+__all__ = [
+    "MAX_POINTS",
+    "Plan",
+    "SweepSection",
+    "check_apart",
+    "coordinate",
+    "plan_sweep",
+    "read_sweep",
+    "shot_of",
+    "telling",
+]
 
 #: More points than this are a slip: of a millisecond each they would take a quarter of an hour.
 MAX_POINTS = 1_000_000
@@ -134,13 +147,15 @@ class Plan:
             "mode": self.mode,
             "repeats": self.repeats,
             "seed": self.seed,
-            "metrics": {
-                name: f"{getattr(metric, '__module__', '')}:{getattr(metric, '__qualname__', name)}"
-                for name, metric in self.metrics.items()
-            },
+            "metrics": dict(self._metrics_described),
             "files": dict(self.files),
             "versions": versions(),
         }
+
+    @cached_property
+    def _metrics_described(self) -> dict[str, str]:
+        # Once: what a function takes along may change while it works.
+        return {name: described(metric) for name, metric in self.metrics.items()}
 
     def _first_equal(self) -> Ints:
         """As ``choices``, with the number of the first value that is equal in the place of every value's own."""
@@ -323,6 +338,9 @@ def plan_sweep(
         metrics=named_metrics(metrics),
         files=digests(found),
     )
+    clash = next((name for name in plan.metrics if name in plan.values), None)
+    if clash is not None:
+        raise ParameterError("metrics", f"must have other names than the settings that vary, not '{clash}'")
     plan.check()
     return plan
 
@@ -340,6 +358,19 @@ def shot_of(path: Path, shot: str | dict[str, Any]) -> tuple[Path, dict[str, Any
         return path, shot
     source = path.parent / shot
     return source, read_settings(source)
+
+
+def coordinate(values: Iterable[Any]) -> NDArray[Any]:
+    """Values of a setting as labels: numbers, yes and no, or texts; all others as texts of JSON."""
+    values = list(values)
+    for kinds, dtype in (((bool,), np.bool_), ((int,), np.int64), ((int, float), np.float64)):
+        if all(type(value) in kinds for value in values):
+            try:
+                return np.array(values, dtype)
+            except OverflowError:
+                continue
+    texts = [value if isinstance(value, str) else json.dumps(value) for value in values]
+    return np.array(texts, np.dtypes.StringDType())
 
 
 @contextmanager
@@ -390,7 +421,8 @@ def _by_path(vary: Any, mode: Literal["product", "zip"]) -> tuple[dict[str, list
         vary, mode = {path: [point[path] for point in points] for path in points[0]}, "zip"
     values: dict[str, list[Any]] = {}
     for path, each in vary.items():
-        if not isinstance(each, Iterable) or isinstance(each, str | Mapping):
+        # A set has another order in every run, and with it the points other numbers.
+        if not isinstance(each, Iterable) or isinstance(each, str | Mapping | set | frozenset):
             raise ParameterError(str(path), "must vary over a list of values", each)
         if isinstance(each, Sized) and len(each) > MAX_POINTS:
             raise ParameterError(str(path), f"has {len(each):,} values, and a sweep has at most {MAX_POINTS:,} points")
@@ -406,11 +438,8 @@ def _by_path(vary: Any, mode: Literal["product", "zip"]) -> tuple[dict[str, list
         raise ParameterError("vary", f"must have as many values of each setting to go side by side ({told})")
     if mode == "product":
         for path, each in values.items():
-            texts = [json.dumps(value) for value in each]
-            twice = (
-                next((text for text in texts if texts.count(text) > 1), None) if len(set(texts)) < len(texts) else None
-            )
-            if twice is not None:
+            twice, n = Counter(coordinate(each).tolist()).most_common(1)[0]
+            if n > 1:
                 raise ParameterError(path, f"has the value {twice} twice; take 'repeats' for more captures of a point")
     return values, mode
 
@@ -422,9 +451,16 @@ def _plain(path: str, value: Any) -> Any:
     if isinstance(value, Path):
         value = str(value)
     try:
-        return json.loads(json.dumps(value))
+        return json.loads(json.dumps(value), parse_constant=_constant)
     except (TypeError, ValueError, RecursionError):
         raise ParameterError(path, "must vary over numbers, texts, lists and sections", value) from None
+
+
+def _constant(text: str) -> float:
+    """Infinity, which a distance may be; no setting is NaN."""
+    if text == "NaN":
+        raise ValueError(text)
+    return float(text)
 
 
 def _numbers(path: Path, name: str, between: _Range) -> list[Any]:

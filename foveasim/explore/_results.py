@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from foveasim.arrays import unit_of
 from foveasim.errors import FileError, ParameterError
-from foveasim.explore._plan import POINT, REPEAT, Plan
+from foveasim.explore._plan import POINT, REPEAT, Plan, coordinate
 from foveasim.explore._records import FORMAT, VERSION, Record, Value
 
 if TYPE_CHECKING:
@@ -90,20 +90,6 @@ def dataset_of(plan: Plan, records: Mapping[int, Record]) -> xr.Dataset:
         PLAN: json.dumps(described),
     }
     return xr.Dataset(variables, coords, attributes)
-
-
-def coordinate(values: Iterable[Any]) -> NDArray[Any]:
-    """Values of a setting as labels: numbers, yes and no, or texts; all others as texts of JSON."""
-    values = list(values)
-    for kinds, dtype in (((bool,), np.bool_), ((int,), np.int64), ((int, float), np.float64)):
-        if all(type(value) in kinds for value in values):
-            try:
-                return np.array(values, dtype)
-            except OverflowError:
-                continue
-    if all(isinstance(value, str) for value in values):
-        return _texts(values)
-    return _texts([value if isinstance(value, str) else json.dumps(value) for value in values])
 
 
 def _texts(values: list[str]) -> NDArray[Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import sys
-import sysconfig
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,6 +15,7 @@ from foveasim.errors import SimulationError
 from foveasim.explore._bench import Job, Task
 from foveasim.explore._cluster import client_of
 from foveasim.explore._engine import records_of
+from foveasim.explore._functions import own_module
 from foveasim.explore._metrics import Metric
 from foveasim.explore._plan import Plan, plan_sweep
 from foveasim.explore._records import Journal, Record, check_same_plan, journal_of
@@ -204,7 +204,8 @@ def _pickled(job: Job) -> bytes:
     """The job with the functions of the user's own modules in it: workers need not find those."""
     import cloudpickle
 
-    own = [sys.modules[name] for metric in job.metrics.values() if (name := _own_module(metric)) is not None]
+    names = {own_module(metric) for metric in job.metrics.values()} - {None, "__main__"}
+    own = [sys.modules[name] for name in names if name is not None]
     for module in own:
         cloudpickle.register_pickle_by_value(module)
     try:
@@ -214,15 +215,3 @@ def _pickled(job: Job) -> bytes:
     finally:
         for module in own:
             cloudpickle.unregister_pickle_by_value(module)
-
-
-def _own_module(metric: Metric) -> str | None:
-    """Name of a metric's module, where it is a file of the user's and no installed package."""
-    name = getattr(metric, "__module__", None)
-    if name is None or name == "__main__" or name.partition(".")[0] == "foveasim":
-        return None
-    file = getattr(sys.modules.get(name), "__file__", None)
-    if file is None:
-        return None
-    installed = {sysconfig.get_path(kind) for kind in ("purelib", "platlib", "stdlib")}
-    return None if any(Path(file).is_relative_to(folder) for folder in installed) else name
