@@ -140,6 +140,69 @@ def test_a_study_that_was_ended_goes_on_as_if_it_was_not(tmp_path):
     assert told(explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=20, seed=6)) != told(whole)
 
 
+def test_two_programs_do_not_write_the_same_study(tmp_path):
+    def run(file, metric):
+        explore.study(SHOT, SEARCH, {"m": "maximize"}, n_trials=3, metrics={"m": metric}, storage=file)
+
+    def meddle(*_):
+        with pytest.raises(FileError, match="is being written by another program that runs a study"):
+            run(f"sqlite:///{tmp_path}/s.db", len)
+        return 1.0
+
+    run(tmp_path / "s.db", meddle)
+
+    assert [path.name for path in tmp_path.iterdir()] == ["s.db"]
+    found = optuna.load_study(study_name="study", storage=f"sqlite:///{tmp_path}/s.db")
+    assert [trial.value for trial in found.trials] == [1.0] * 3
+
+
+def test_a_program_ends_when_another_machine_goes_on_with_its_study(tmp_path):
+    """As there: the same study is signed by another program, while a trial runs."""
+    calls = []
+
+    def overtaken(*_):
+        calls.append(1)
+        if len(calls) == 3:
+            optuna.load_study(study_name="study", storage=f"sqlite:///{tmp_path}/s.db").set_user_attr("writer", "other")
+        return 1.0
+
+    with pytest.raises(FileError, match="is being written by another program, which has begun to run the same study"):
+        explore.study(SHOT, SEARCH, {"m": "maximize"}, n_trials=9, metrics={"m": overtaken}, storage=tmp_path / "s.db")
+
+    found = optuna.load_study(study_name="study", storage=f"sqlite:///{tmp_path}/s.db")
+    assert [trial.value for trial in explore.finished_trials(found)] == [1.0] * 2
+    assert len(found.trials) == 3
+    assert all(trial.state.is_finished() for trial in found.trials)
+
+
+def test_a_study_of_another_function_of_the_same_name_is_another(tmp_path):
+    for level in (1.0, 2.0):
+        given = {"n_trials": 1, "metrics": {"m": lambda *_, level=level: level}, "storage": tmp_path / "s.db"}
+        if level == 1.0:
+            explore.study(SHOT, SEARCH, {"m": "maximize"}, **given)
+        else:
+            with pytest.raises(FileError, match=r"'metrics\.m' differs"):
+                explore.study(SHOT, SEARCH, {"m": "maximize"}, **given)
+
+
+def test_a_study_ends_with_ctrl_c_and_not_with_what_else_a_metric_raises():
+    def run(kind):
+        def rude(*_):
+            raise kind("why")
+
+        return explore.study(SHOT, SEARCH, {"m": "maximize"}, n_trials=1, metrics={"m": rude})
+
+    assert run(SystemExit).trials[0].user_attrs["error"] == "m: SystemExit: why"
+    with pytest.raises(KeyboardInterrupt):
+        run(KeyboardInterrupt)
+
+
+def test_an_array_is_told_to_be_no_objective():
+    found = explore.study(SHOT, SEARCH, {"m": "maximize"}, n_trials=1, metrics={"m": lambda *_: np.zeros(3)})
+
+    assert found.trials[0].user_attrs["error"] == "'m' is an array, no finite number"
+
+
 def test_trials_that_fail_are_told_and_the_others_go_on():
     found = explore.study(
         SHOT,

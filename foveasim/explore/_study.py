@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
+import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from foveasim.errors import FileError, FoveasimError, ParameterError
 from foveasim.explore._bench import Bench, Job, Task
 from foveasim.explore._metrics import Metric
-from foveasim.explore._records import Record, check_same_plan
+from foveasim.explore._records import Record, Value, check_same_plan
 from foveasim.explore._study_plan import Limits, Search, StudyPlan, plan_study
+from foveasim.files import lock
 from foveasim.parallel import thread_count
 from foveasim.streams import derived_seed
 
@@ -27,7 +31,7 @@ __all__ = ["best_table", "finished_trials", "run_study", "storage_name", "study"
 #: Rows of the table of the best trials, and characters of a choice in it.
 MOST_ROWS, LONGEST_CHOICE = 20, 40
 #: Attributes of a study and of its trials.
-PLAN, ERROR, IS_CUT = "plan", "error", "ended with the program"
+PLAN, WRITER, ERROR, IS_CUT = "plan", "writer", "error", "ended with the program"
 
 
 def study(
@@ -132,23 +136,27 @@ def run_study(
     """
     optuna = _optuna()
     url = _url(storage)
-    with _silent(optuna), _using(storage):
-        found = _opened(optuna, storage, url, plan)
-        _begin(optuna, storage, found, plan.described())
-    job = Job(plan.base.source, plan.base.metrics, thread_count(), True)
-    bench = Bench()
-    n_done = len(finished_trials(found))
-    while n_done < plan.n_trials:
-        if tell is not None:
-            tell(n_done, plan.n_trials)
-        found.sampler = optuna.samplers.TPESampler(seed=derived_seed(plan.base.seed, n_done) % 2**32)
-        with _using(storage, n_done):
-            trial = found.ask()
-            settings = plan.settings_of(trial)
-        record = bench.record(job, Task(n_done, settings))
-        with _using(storage, n_done):
-            _told(optuna, found, trial, record, list(plan.objectives), plan.constraints)
-        n_done += 1
+    with _alone(storage, url):
+        token = secrets.token_hex(8)
+        with _silent(optuna), _using(storage):
+            found = _opened(optuna, storage, url, plan)
+            _begin(optuna, storage, found, plan.described(), token)
+        job = Job(plan.base.source, plan.base.metrics, thread_count(), True)
+        bench = Bench()
+        n_done = len(finished_trials(found))
+        while n_done < plan.n_trials:
+            if tell is not None:
+                tell(n_done, plan.n_trials)
+            found.sampler = optuna.samplers.TPESampler(seed=derived_seed(plan.base.seed, n_done) % 2**32)
+            with _using(storage, n_done):
+                trial = found.ask()
+                _check_writer(optuna, storage, trial, token)
+                settings = plan.settings_of(trial)
+            record = bench.record(job, Task(n_done, settings))
+            with _using(storage, n_done):
+                _check_writer(optuna, storage, trial, token)
+                _told(optuna, found, trial, record, list(plan.objectives), plan.constraints)
+            n_done += 1
     if tell is not None:
         tell(plan.n_trials, plan.n_trials)
     return found
@@ -232,7 +240,7 @@ def _told(
         if not isinstance(value, int | float) or not math.isfinite(value):
             given = ", ".join(record.values) or "nothing"
             error = error or (
-                f"'{name}' is {value!r:.40}, no finite number"
+                f"'{name}' is {'an array' if isinstance(value, Value) else repr(value):.40}, no finite number"
                 if name in record.values
                 else f"no '{name}' among {given}"
             )
@@ -264,8 +272,10 @@ def _opened(optuna: Any, storage: str | Path | None, url: str | None, plan: Stud
     return found
 
 
-def _begin(optuna: Any, storage: str | Path | None, found: optuna.Study, described: Mapping[str, Any]) -> None:
-    """Check that a study is this one, and give up the trial that it was ended in."""
+def _begin(
+    optuna: Any, storage: str | Path | None, found: optuna.Study, described: Mapping[str, Any], token: str
+) -> None:
+    """Check that a study is this one, sign as its writer, and give up the trial that it was ended in."""
     before = found.user_attrs.get(PLAN)
     if before is not None:
         check_same_plan(Path(storage_name(storage)), before, described)
@@ -275,10 +285,74 @@ def _begin(optuna: Any, storage: str | Path | None, found: optuna.Study, describ
         )
     else:
         found.set_user_attr(PLAN, json.loads(json.dumps(described)))
+    found.set_user_attr(WRITER, token)
     for trial in found.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,)):
         # It counts for nothing, and its place is taken by the next.
-        optuna.trial.Trial(found, trial._trial_id).set_user_attr(IS_CUT, True)  # noqa: SLF001 -- Optuna has no other way
-        found.tell(trial.number, state=optuna.trial.TrialState.FAIL)
+        _give_up(optuna, optuna.trial.Trial(found, trial._trial_id))  # noqa: SLF001 -- Optuna has no other way
+
+
+def _give_up(optuna: Any, trial: optuna.Trial) -> None:
+    trial.set_user_attr(IS_CUT, True)
+    trial.study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
+
+
+def _check_writer(optuna: Any, storage: str | Path | None, trial: optuna.Trial, token: str) -> None:
+    """
+    Whether no other program has begun to write the study.
+
+    Raises
+    ------
+    FileError
+        When one has: the trial, which the other does not know, is given up, if it was not already by the other.
+    """
+    if trial.study.user_attrs.get(WRITER) == token:
+        return
+    with suppress(Exception):
+        _give_up(optuna, trial)
+    raise FileError(storage_name(storage), "is being written by another program, which has begun to run the same study")
+
+
+@contextmanager
+def _alone(storage: str | Path | None, url: str | None) -> Iterator[None]:
+    """
+    While no other program on this machine writes the file of a study, which no data base on another machine has.
+
+    Raises
+    ------
+    FileError
+        When one does.
+    """
+    file = None if url is None else _file_of(url)
+    if file is None:
+        yield
+        return
+    # Not the file itself: to close it here would end SQLite's own locks on it.
+    beside = file.with_name(file.name + ".lock")
+    with ExitStack() as opened:
+        is_ours = False
+        while not is_ours:
+            with _using(storage):
+                held = opened.enter_context(beside.open("ab"))
+                if not lock(held):
+                    raise FileError(storage_name(storage), "is being written by another program that runs a study")
+                # A program that ends takes the file away, perhaps after we opened it.
+                is_ours = beside.exists() and os.path.samestat(beside.stat(), os.fstat(held.fileno()))
+        opened.callback(partial(beside.unlink, missing_ok=True))
+        yield
+
+
+def _file_of(url: str) -> Path | None:
+    """The file of an SQLite data base; None of another."""
+    from sqlalchemy.engine import make_url
+    from sqlalchemy.exc import ArgumentError
+
+    try:
+        parts = make_url(url)
+    except ArgumentError:
+        return None  # Optuna tells
+    if not parts.drivername.startswith("sqlite") or parts.database in {None, "", ":memory:"}:
+        return None
+    return Path(str(parts.database))
 
 
 def _url(storage: str | Path | None) -> str | None:
