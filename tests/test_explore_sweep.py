@@ -593,6 +593,15 @@ def test_a_file_that_is_no_journal_is_left_alone(tmp_path, text):
 # -- what a data set holds --------------------------------------------------------------------------------------------
 
 
+def test_xarray_opens_a_store_without_a_word(tmp_path):
+    records = {k: Record(k, {"a": 1.0, "path": "ab"[k]}) for k in range(2)}
+    found = dataset_of(explore.plan_sweep(SHOT, {"sensor.bits": [8, 9]}), records)
+    write_store(found, tmp_path / "r.zarr")  # here, too, any warning is an error
+
+    with xr.open_zarr(tmp_path / "r.zarr") as opened:
+        xr.testing.assert_identical(opened.load(), found)
+
+
 def test_labelled_arrays_are_joined_by_their_labels_and_others_padded():
     one = xr.DataArray([1.0, 2.0], dims="colour", coords={"colour": ["red", "green"]})
     two = xr.DataArray([3.0, 4.0], dims="colour", coords={"colour": ["green", "blue"]})

@@ -6,6 +6,7 @@ import json
 import os
 import secrets
 import shutil
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -275,7 +276,10 @@ def write_store(dataset: xr.Dataset, path: Path) -> None:
     token = secrets.token_hex(8)
     new, old = (path.with_name(f".foveasim-{token}-{which}.zarr") for which in ("new", "old"))
     try:
-        dataset.to_zarr(new, mode="w-", consolidated=False, zarr_format=3)
+        with warnings.catch_warnings():
+            # Zarr has it for all who open the store with xarray, and warns that others may not read it so; they need not.
+            warnings.filterwarnings("ignore", "Consolidated metadata is currently not part")
+            dataset.to_zarr(new, mode="w-", consolidated=True, zarr_format=3)
         # On the disk before the journal is removed: a power cut leaves one of them whole.
         for file in (path for path in new.rglob("*") if path.is_file()):
             with file.open("r+b") as opened:
