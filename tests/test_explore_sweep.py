@@ -723,7 +723,7 @@ def test_results_of_two_metrics_with_one_name_are_told():
     found = in_process(plan)
 
     assert found["a_b"].item() == 1
-    assert found["error"].item() == "a_b: 'a_b' must be the name of one result; there are two of it"
+    assert found["error"].item() == "'a_b' must be the name of one result; there are two of it"
 
 
 def test_points_side_by_side_are_labelled_with_all_their_settings():
@@ -914,6 +914,30 @@ def test_a_scheduler_that_does_not_answer_is_told_and_leaves_nothing(tmp_path, m
         ):
             explore.run_sweep(PLAN, out=tmp_path / "r.zarr", scheduler=address)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_answers_and_is_no_scheduler_is_told_without_what_dask_makes_of_it():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer():
+            with server.accept()[0] as one:
+                one.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+
+        threading.Thread(target=answer, daemon=True).start()
+        with pytest.raises(ParameterError, match=r"within 10 s \(it is something else\)"):
+            explore.run_sweep(PLAN, scheduler=f"tcp://127.0.0.1:{server.getsockname()[1]}")
+
+
+def test_a_program_without_the_guard_is_told_of_it_and_its_workers_are_silent(tmp_path):
+    (tmp_path / "own.py").write_text(
+        f"from foveasim import explore\nexplore.sweep({SHOT!r}, {{'sensor.bits': [8]}}, workers=1)\n"
+    )
+    command = [sys.executable, "own.py"]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=LIMIT_S)
+
+    assert result.returncode == 1
+    assert result.stderr.count("Traceback") == 1
+    assert 'under if __name__ == "__main__": alone' in result.stderr.splitlines()[-1]
 
 
 def test_a_metric_that_cannot_be_sent_to_workers_is_told():

@@ -150,7 +150,9 @@ class Bench:
                         values |= more
                     except BaseException as error:  # noqa: BLE001 -- metrics are the user's, and may end with sys.exit()
                         _raise_ctrl_c(error)
-                        errors.append(f"{name}: {_told(error)}")
+                        text = _told(error)
+                        # What we say of a result begins with its name.
+                        errors.append(text if text.startswith(f"'{name}") else f"{name}: {text}")
         self._forget()
         told = dict.fromkeys([*self._told, *(str(warning.message) for warning in caught)])
         return Record(task.point, values, "; ".join(errors), "; ".join(_short(text) for text in told))

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
+from multiprocessing import current_process
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from foveasim.errors import ParameterError, SimulationError
@@ -62,6 +63,9 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
                 with suppress(Exception):
                     client.close(timeout=2)
         return
+    if getattr(current_process(), "_inheriting", False):
+        # A worker that imports the main program came here: what began the worker tells that it did not start.
+        raise SystemExit(1)
     # A worker's end is ours to judge: each point is tried again, alone, and counted.
     with (
         dask.config.set(
@@ -86,7 +90,8 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
         except Exception as error:  # noqa: BLE001 -- a machine without memory or time for them makes them fail in many ways
             reason = " ".join(str(error).split()) or type(error).__name__
             raise SimulationError(
-                f"the workers did not start ({reason:.160}); try it again, or with fewer of them"
+                f"the workers did not start ({reason:.160}); try it again, or with fewer of them; a program of your own calls "
+                'it under if __name__ == "__main__": alone, for workers import that program'
             ) from None
         yield client
 
@@ -113,13 +118,15 @@ def _check_answer(scheduler: str) -> None:
         async with rpc(scheduler) as asked:
             return await asyncio.wait_for(asked.identity(), SCHEDULER_S)
 
+    reason = "it is something else"
     try:
         # In a thread of its own: a notebook has an event loop in this one.
         with ThreadPoolExecutor(1) as pool:
             is_scheduler = pool.submit(lambda: asyncio.run(answer())).result().get("type") == "Scheduler"
-        reason = "it is something else"
-    except Exception as error:  # noqa: BLE001 -- what is no scheduler may answer anything
+    except (OSError, ValueError) as error:
         is_scheduler, reason = False, " ".join(str(error).split()) or type(error).__name__
+    except Exception:  # noqa: BLE001 -- what is no scheduler may answer anything, and dask takes it for lengths and pickles
+        is_scheduler = False
     if not is_scheduler:
         raise ParameterError(
             "scheduler",
