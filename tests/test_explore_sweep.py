@@ -165,7 +165,8 @@ def programs(n_workers):
     address = f"tcp://127.0.0.1:{port}"
     programs = [
         ("distributed.cli.dask_scheduler", "--host", address, "--no-dashboard"),
-        *[("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard")] * n_workers,
+        *[("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard", "--memory-limit", "2 GB")]
+        * n_workers,
     ]
     running = []
     try:
@@ -247,6 +248,18 @@ def test_a_worker_that_is_killed_from_outside_costs_no_point(where, tmp_path):
     assert found["mean_dn"].notnull().all()
     seeds = [seed for seed, _ in executions(tmp_path)]
     assert max(seeds.count(seed) for seed in seeds) <= 2
+
+
+def test_a_worker_keeps_parts_in_a_quarter_of_its_memory(scheduler):
+    def kept_bytes(*_):
+        from foveasim.explore import _bench
+
+        ((_, bench),) = _bench._current.values()
+        return bench._kept_bytes
+
+    found = explore.sweep(SHOT, {"sensor.bits": [8]}, metrics=[kept_bytes], scheduler=scheduler[0])
+
+    assert found["kept_bytes"].item() == 500_000_000
 
 
 def test_a_metric_may_raise_anything():
