@@ -176,7 +176,7 @@ class Workers:
             if self._client.cluster is not None:
                 # Dask begins a worker that ended anew, but gives it up when it ends again before it is there.
                 self._client.cluster.scale(len(self._client.cluster.worker_spec))
-            told = self._client.scheduler_info()["workers"]
+            told = self._client.scheduler_info(n_workers=-1)["workers"]  # all: some versions tell of five
         except Exception:  # noqa: BLE001 -- a connection can break in many ways
             raise SimulationError("the scheduler does not answer any more") from None
         found = {Worker(address, one["local_directory"]): one for address, one in told.items()}
