@@ -1,9 +1,11 @@
-"""What some tests need of the machine: ``@pytest.mark.needs("renderer")``, ``"chromium"``."""
+"""What some tests need of the machine: ``@pytest.mark.needs("renderer")``, ``"chromium"``; and kernels for all processes."""
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -19,6 +21,14 @@ def chromium_is_missing():
 
 
 MISSING = {"renderer": renderer_is_missing, "chromium": chromium_is_missing}
+
+
+def pytest_configure(config):
+    """Compile all kernels once, before there are several processes that would each compile them."""
+    if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
+        root = Path(__file__).parents[1]
+        for path in (root / "foveasim").rglob("_kernels.py"):
+            importlib.import_module(".".join(path.relative_to(root).with_suffix("").parts))
 
 
 def pytest_runtest_setup(item):
