@@ -372,4 +372,5 @@ def main(out_dir: Path, *, is_large: bool = False) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "."), is_large="--large" in sys.argv)
+    folders = [word for word in sys.argv[1:] if word != "--large"]
+    main(Path(folders[0] if folders else "."), is_large="--large" in sys.argv)
