@@ -7,12 +7,13 @@ Arrays here are as one sees the picture: (n_y, n_x) or (n_y, n_x, n_channel), th
 from __future__ import annotations
 
 import math
+import re
 import struct
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from foveasim.files import written_whole
 if TYPE_CHECKING:
     from PIL import Image
 
-__all__ = ["pixels_of_image", "pixels_of_page", "read_picture", "write_picture"]
+__all__ = ["PICTURE_ENDINGS", "picture_names", "pixels_of_image", "pixels_of_page", "read_picture", "write_picture"]
 
 #: Larger pictures are refused: 2**28 pixels are 3 GiB as three float32 channels.
 MAX_PIXELS = 2**28
@@ -52,6 +53,25 @@ START_OF_SCAN, MARKER_BYTES = 0xDA, 2
 #: Tag of TIFF and EXIF that tells how the camera was held.
 ORIENTATION_TAG = 274
 TIFF_ENDINGS = (".tif", ".tiff")
+#: Endings of the pictures that a folder is searched for.
+PICTURE_ENDINGS = (".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga", *TIFF_ENDINGS, ".webp")
+
+
+def picture_names(names: Iterable[str]) -> list[str]:
+    """Those that are pictures', in their natural order, ``2.png`` before ``10.png``; hidden files are none."""
+    pictures = (
+        name
+        for name in names
+        if PurePosixPath(name).suffix.lower() in PICTURE_ENDINGS
+        and not any(part.startswith((".", "__MACOSX")) for part in PurePosixPath(name).parts)
+    )
+
+    def key(name: str) -> tuple[list[tuple[int, str]], str]:
+        # Of whole numbers without the zeros before them the longer is the larger; where all are equal, the names decide.
+        pieces = enumerate(re.split(r"([0-9]+)", name))
+        return [(len(n := p.lstrip("0")), n) if k % 2 else (-1, p) for k, p in pieces if p], name
+
+    return sorted(set(pictures), key=key)
 
 
 def read_picture(path: str | Path) -> NDArray[Any]:

@@ -51,9 +51,6 @@ TRIED_VALUES = 64
 #: Settings that change which photosites there are.
 LAYOUT = "layout"
 
-#: Keeps what was made of some settings.
-_Keep = Callable[[str, Any, Callable[[], Any]], Any]
-
 
 class DataSet:
     """

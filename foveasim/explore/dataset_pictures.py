@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol, runtime_checkable
 
@@ -17,12 +16,10 @@ from numpy.typing import NDArray
 
 from foveasim.errors import FileError, ParameterError
 from foveasim.explore._files import digests
-from foveasim.pictures import pixels_of_image, read_picture
+from foveasim.pictures import PICTURE_ENDINGS, picture_names, pixels_of_image, read_picture
 
 __all__ = ["Source", "digest_of", "is_lazy", "source_of"]
 
-#: Endings of the files that are taken for pictures.
-ENDINGS = (".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga", ".tif", ".tiff", ".webp")
 #: A packed picture that would unpack to more than this is refused.
 MAX_UNPACKED_BYTES = 2**30
 
@@ -121,9 +118,9 @@ class _Folder:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         found = (Path(place) / name for place, _, names in os.walk(folder, onerror=_stop) for name in names)
-        self._names = _ordered(path.relative_to(folder).as_posix() for path in found)
+        self._names = picture_names(path.relative_to(folder).as_posix() for path in found)
         if not self._names:
-            raise FileError(folder, f"holds no pictures ({', '.join(ENDINGS)})")
+            raise FileError(folder, f"holds no pictures ({', '.join(PICTURE_ENDINGS)})")
 
     def __len__(self) -> int:
         return len(self._names)
@@ -159,9 +156,9 @@ class _Zip:
                 names = [item.filename for item in archive.infolist() if not item.is_dir()]
         except (OSError, zipfile.BadZipFile) as error:
             raise FileError(path, f"is broken ({error})") from None
-        self._names = _ordered(names)
+        self._names = picture_names(names)
         if not self._names:
-            raise FileError(path, f"holds no pictures ({', '.join(ENDINGS)})")
+            raise FileError(path, f"holds no pictures ({', '.join(PICTURE_ENDINGS)})")
         self._opened: tuple[int, zipfile.ZipFile] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -383,23 +380,6 @@ def _check_stack(name: str, pictures: NDArray[Any]) -> None:
         raise ParameterError(
             name, f"must have the shape (n, n_y, n_x) or (n, n_y, n_x, 1 to 4 channels), got {pictures.shape}"
         )
-
-
-def _ordered(names: Iterable[str]) -> list[str]:
-    """Names of pictures in their natural order, ``2.png`` before ``10.png``; hidden files are none."""
-    pictures = (
-        name
-        for name in names
-        if PurePosixPath(name).suffix.lower() in ENDINGS
-        and not any(part.startswith((".", "__MACOSX")) for part in PurePosixPath(name).parts)
-    )
-
-    def key(name: str) -> tuple[list[tuple[int, str]], str]:
-        # Of whole numbers without the zeros before them the longer is the larger; where all are equal, the names decide.
-        pieces = enumerate(re.split(r"([0-9]+)", name))
-        return [(len(n := p.lstrip("0")), n) if k % 2 else (-1, p) for k, p in pieces if p], name
-
-    return sorted(set(pictures), key=key)
 
 
 def _folder_labels(names: Sequence[str]) -> list[Any] | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import inspect
-import re
 from collections.abc import Iterable, Iterator, Sized
 from dataclasses import replace
 from itertools import islice
@@ -16,12 +15,11 @@ from numpy.typing import ArrayLike
 
 from foveasim.arrays import check_count, check_number
 from foveasim.errors import FileError, ParameterError
+from foveasim.pictures import PICTURE_ENDINGS, picture_names
 from foveasim.scene import Scene
 
 __all__ = ["Footage", "pictures_in"]
 
-#: Endings of the pictures that a folder is searched for.
-PICTURE_ENDINGS = (".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga", ".tif", ".tiff", ".webp")
 #: Any wavelengths: they are left off again.
 GREY_NM, COLOUR_NM = (550.0,), (620.0, 550.0, 450.0)
 NEEDS_PYAV = "needs a reader for video files: pip install 'foveasim[video]'"
@@ -199,18 +197,10 @@ class Footage:
 
 def pictures_in(folder: Path) -> list[Path]:
     """The pictures of a folder, in the natural order of their names."""
-    pictures = [
-        path
-        for path in folder.iterdir()
-        if path.is_file() and path.suffix.lower() in PICTURE_ENDINGS and not path.name.startswith(".")
-    ]
-    if not pictures:
+    names = picture_names(path.name for path in folder.iterdir() if path.is_file())
+    if not names:
         raise FileError(folder, f"holds no pictures ({', '.join(PICTURE_ENDINGS)})")
-    return sorted(pictures, key=lambda path: [(int(p), "") if p.isdecimal() else (-1, p) for p in _pieces(path)])
-
-
-def _pieces(path: Path) -> list[str]:
-    return [piece for piece in re.split(r"(\d+)", path.name) if piece]
+    return [folder / name for name in names]
 
 
 def _check_settings(scene: dict[str, Any]) -> None:
