@@ -237,6 +237,34 @@ def test_isotropic_points_give_the_irradiance_of_equation_3():
     assert power_map.data.sum() * power_map.grid.cell_area_um2 * 1e-12 == pytest.approx(flux_w, rel=1e-12)
 
 
+@pytest.mark.parametrize("f_number", [1.4, 2.8, 4.0])
+@pytest.mark.parametrize("distance_m", [0.5, 1e4])
+def test_aplanatic_irradiance_conserves_entrance_pupil_flux(f_number, distance_m):
+    """Radiance times the projected solid angle of the entrance pupil, summed over its rings, spread over the geometric image."""
+    optics = lens(f_number=f_number, lens="aplanatic")
+    a_m = 0.5 * 22e-3 / f_number
+    r_m = a_m * (np.arange(2000) + 0.5) / 2000
+    cos2 = distance_m**2 / (distance_m**2 + r_m**2)
+    projected_sr = (2.0 * np.pi * r_m * cos2**2 / distance_m**2).sum() * a_m / 2000
+    per_radiance_sr = projected_sr / optics.magnification(distance_m) ** 2
+
+    # Small pupil against the distance of the scene: off by (a/H)², at most 2.5e-4 here.
+    assert optics.irradiance_per_radiance(distance_m) == pytest.approx(per_radiance_sr, rel=(a_m / distance_m) ** 2 + 1e-6)
+    isotropic = lens(f_number=f_number, lens="aplanatic", emission="isotropic")
+    # A hemisphere of even radiance emits π L per area, isotropic points L in 2π sr: a factor of 2π on the axis.
+    assert optics.irradiance_per_radiance(distance_m) == pytest.approx(
+        2.0 * np.pi * isotropic.irradiance_per_radiance(distance_m), rel=1e-14
+    )
+
+
+@pytest.mark.parametrize(("f_number", "percent"), [(4.0, 1.56), (2.8, 3.19), (1.4, 12.76)])
+def test_thin_and_aplanatic_irradiance_differ(f_number, percent):
+    thin, aplanatic = (lens(f_number=f_number, lens=kind).irradiance_per_radiance(np.inf) for kind in ("thin", "aplanatic"))
+
+    assert 100.0 * (aplanatic / thin - 1.0) == pytest.approx(percent, abs=0.01)
+    assert lens(f_number=f_number).irradiance_per_radiance(np.inf) == thin
+
+
 def test_transmission_scales_the_light():
     full, _ = airy_map(3, 101)
     half, _ = airy_map(3, 101, lens(transmission=0.5))
