@@ -24,6 +24,7 @@ __all__ = [
     "check_count",
     "check_length_um",
     "check_number",
+    "check_pitch_um",
     "check_shape",
     "check_sites",
     "finite_array",
@@ -183,6 +184,24 @@ def check_length_um(name: str, value: object, *, at_most: float | None = None, c
     return check_number(
         name, length_um, at_least=MIN_LENGTH_UM, at_most=MAX_LENGTH_UM, cure=cure or "lengths on a sensor are in µm"
     )
+
+
+def check_pitch_um(name: str, value: object) -> tuple[float, float]:
+    """
+    The value as the distances of cells along x and along y, in µm.
+
+    Raises
+    ------
+    ParameterError
+        When it is neither one length nor a pair of lengths (along x, along y).
+    """
+    if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or getattr(value, "ndim", 1) == 0:
+        pitch_um = check_length_um(name, value)
+        return pitch_um, pitch_um
+    if len(value) != 2:
+        raise ParameterError(name, "must be one number, or two numbers (along x, along y)", value, "µm")
+    along_x_um, along_y_um = (check_length_um(name, length_um) for length_um in value)
+    return along_x_um, along_y_um
 
 
 def check_sites(n_sites: int) -> int:

@@ -150,7 +150,7 @@ class Camera:
         if isinstance(light, PowerMap):
             return 1
         narrowest_um = float(um_from_nm(light.wavelength_nm.min())) * self._optics.working_f_number(light.distance_m)
-        return 2 if self._optics.grid(light).pitch_um <= SMOOTH_LAMBDA_N * narrowest_um else 1
+        return 2 if self._optics.grid(light).pitch_x_um <= SMOOTH_LAMBDA_N * narrowest_um else 1
 
     def integrator(
         self,
@@ -593,7 +593,7 @@ class Camera:
             integrators = [
                 self.integrator(grid, order=order, n_grids=len(grids), place_um=place_um) for grid, _ in grids
             ]
-        self._warn_of_uncovered(min(integrators, key=lambda integrator: integrator.grid.pitch_um))
+        self._warn_of_uncovered(min(integrators, key=lambda integrator: integrator.grid.cell_area_um2))
         rate_e_per_s = np.zeros(self._layout.n_sites)
         if isinstance(light, PowerMap):
             integrator = integrators[0]

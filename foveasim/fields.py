@@ -9,7 +9,7 @@ places where rows are turned over.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,15 +19,28 @@ from foveasim.arrays import (
     Images,
     Ints,
     as_numbers,
-    check_length_um,
     check_number,
+    check_pitch_um,
     check_shape,
     read_only,
     wavelengths_nm,
 )
 from foveasim.errors import ParameterError
 
-__all__ = ["Grid", "PackedRings", "PointMap", "PowerMap", "SceneLike", "from_file_rows", "rising", "to_file_rows"]
+__all__ = [
+    "Grid",
+    "PackedRings",
+    "Pitch",
+    "PointMap",
+    "PowerMap",
+    "SceneLike",
+    "from_file_rows",
+    "rising",
+    "to_file_rows",
+]
+
+#: Sides of a cell: one length of a square, or (along x, along y).
+Pitch: TypeAlias = float | tuple[float, float]
 
 
 class PackedRings(Protocol):
@@ -89,14 +102,15 @@ class SceneLike(Protocol):
 @dataclass(frozen=True)
 class Grid:
     """
-    A grid of square cells in the sensor plane.
+    A grid of equal rectangular cells in the sensor plane.
 
     Parameters
     ----------
     shape : (n_y, n_x)
         Numbers of rows and columns.
-    pitch_um : float, µm
-        Side of a cell.
+    pitch_um : float, or (pitch_x, pitch_y), µm
+        Side of a square cell, or width and height of a rectangular one. Two equal numbers become one: ``pitch_um`` is a float
+        for square cells and a tuple for others; ``pitch_x_um`` and ``pitch_y_um`` are floats for both.
     origin_um : (x0, y0), µm
         Lower left corner of cell [0, 0].
 
@@ -110,10 +124,12 @@ class Grid:
     >>> grid = Grid(shape=(2, 4), pitch_um=0.5, origin_um=(-1.0, -0.5))
     >>> grid.bounds_um
     (-1.0, -0.5, 1.0, 0.5)
+    >>> Grid(shape=(2, 4), pitch_um=(0.5, 2.0)).bounds_um
+    (0.0, 0.0, 2.0, 4.0)
     """
 
     shape: tuple[int, int]
-    pitch_um: float
+    pitch_um: Pitch
     origin_um: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -122,35 +138,56 @@ class Grid:
         x0, y0 = (check_number(f"origin_um[{i}]", x) for i, x in enumerate(self.origin_um))
         object.__setattr__(self, "shape", check_shape("shape", self.shape))
         object.__setattr__(self, "origin_um", (x0, y0))
-        object.__setattr__(self, "pitch_um", check_length_um("pitch_um", self.pitch_um))
+        pitch_x_um, pitch_y_um = check_pitch_um("pitch_um", self.pitch_um)
+        object.__setattr__(self, "pitch_um", pitch_x_um if pitch_x_um == pitch_y_um else (pitch_x_um, pitch_y_um))
 
     @classmethod
-    def centred(cls, shape: tuple[int, int], pitch_um: float) -> Grid:
-        """Grid whose middle lies on the optical axis."""
-        check_shape("shape", shape)
-        check_length_um("pitch_um", pitch_um)
-        return cls(shape, pitch_um, (-0.5 * shape[1] * pitch_um, -0.5 * shape[0] * pitch_um))
+    def centred(cls, shape: tuple[int, int], pitch_um: Pitch) -> Grid:
+        """Grid whose middle lies on the optical axis; arguments as for the class."""
+        n_y, n_x = check_shape("shape", shape)
+        pitch_x_um, pitch_y_um = check_pitch_um("pitch_um", pitch_um)
+        return cls(shape, pitch_um, (-0.5 * n_x * pitch_x_um, -0.5 * n_y * pitch_y_um))
+
+    @property
+    def pitch_x_um(self) -> float:
+        """Width of a cell in µm."""
+        return self.pitch_um[0] if isinstance(self.pitch_um, tuple) else self.pitch_um
+
+    @property
+    def pitch_y_um(self) -> float:
+        """Height of a cell in µm."""
+        return self.pitch_um[1] if isinstance(self.pitch_um, tuple) else self.pitch_um
+
+    @property
+    def pitch_xy_um(self) -> Floats:
+        """Width and height of a cell, (2,) µm."""
+        return np.array([self.pitch_x_um, self.pitch_y_um])
+
+    @property
+    def is_square(self) -> bool:
+        """Whether cells are as wide as they are high."""
+        return not isinstance(self.pitch_um, tuple)
 
     @property
     def cell_area_um2(self) -> float:
         """Area of a cell in µm²."""
-        return self.pitch_um**2
+        return self.pitch_x_um * self.pitch_y_um
 
     @property
     def bounds_um(self) -> tuple[float, float, float, float]:
         """The grid's (x_min, y_min, x_max, y_max) in µm."""
         x0, y0 = self.origin_um
-        return x0, y0, x0 + self.shape[1] * self.pitch_um, y0 + self.shape[0] * self.pitch_um
+        return x0, y0, x0 + self.shape[1] * self.pitch_x_um, y0 + self.shape[0] * self.pitch_y_um
 
     @property
     def x_um(self) -> Floats:
         """Cell centres along x, (n_x,), µm."""
-        return np.asarray(self.origin_um[0] + (np.arange(self.shape[1]) + 0.5) * self.pitch_um)
+        return np.asarray(self.origin_um[0] + (np.arange(self.shape[1]) + 0.5) * self.pitch_x_um)
 
     @property
     def y_um(self) -> Floats:
         """Cell centres along y, (n_y,), µm, the lowest first."""
-        return np.asarray(self.origin_um[1] + (np.arange(self.shape[0]) + 0.5) * self.pitch_um)
+        return np.asarray(self.origin_um[1] + (np.arange(self.shape[0]) + 0.5) * self.pitch_y_um)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +238,7 @@ class PowerMap:
         cls,
         data: ArrayLike,
         *,
-        pitch_um: float,
+        pitch_um: Pitch,
         wavelength_nm: ArrayLike,
         origin_um: tuple[float, float] | None = None,
         top_row_first: bool = False,
@@ -213,8 +250,8 @@ class PowerMap:
         ----------
         data : (n_y, n_x) or (n_band, n_y, n_x), W/m² per band
             Mean irradiance of each cell; two dimensions are one band.
-        pitch_um : float, µm
-            Side of a cell.
+        pitch_um : float, or (pitch_x, pitch_y), µm
+            Side of a square cell, or width and height of a rectangular one.
         wavelength_nm : number or (n_band,), nm
             The bands' wavelengths.
         origin_um : (x0, y0), optional, µm

@@ -123,14 +123,14 @@ def _bounding_grid(grid: Grid, lens: Any) -> Grid:
     low, high = corners.min(axis=0), corners.max(axis=0)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise ParameterError("grid", "must be given: the lens throws the map's border to infinity")
-    first = np.floor((low - (x0, y0)) / grid.pitch_um + ON_EDGE)
-    last = np.ceil((high - (x0, y0)) / grid.pitch_um - ON_EDGE)
+    first = np.floor((low - (x0, y0)) / grid.pitch_xy_um + ON_EDGE)
+    last = np.ceil((high - (x0, y0)) / grid.pitch_xy_um - ON_EDGE)
     n_x, n_y = (int(n) for n in np.maximum(last - first, 1))
     if n_x * n_y > MAX_CELLS:
         raise ParameterError(
             "grid", f"must be given: the whole distorted map has {n_y} x {n_x} cells, more than {MAX_CELLS}"
         )
-    origin = np.array([x0, y0]) + first * grid.pitch_um
+    origin = np.array([x0, y0]) + first * grid.pitch_xy_um
     return Grid((n_y, n_x), grid.pitch_um, (float(origin[0]), float(origin[1])))
 
 
@@ -161,7 +161,8 @@ def _carried_back(
     """Of some rows of cells: where they look, in rows and columns of the source's cells, and what their light is times."""
     middles = np.stack(np.meshgrid(grid.x_um, grid.y_um[rows]), axis=-1)
     ideal = lens.undistort(middles, outside="mask")
-    pixel = np.stack([(ideal[..., axis] - source.origin_um[axis]) / source.pitch_um - 0.5 for axis in (1, 0)])
+    cell = (ideal - source.origin_um) / source.pitch_xy_um - 0.5
+    pixel = np.stack([cell[..., 1], cell[..., 0]])
     if conserve == "density":
         return pixel, 1.0
     corners = lens.undistort(_corners(grid, rows), outside="mask")
@@ -170,24 +171,24 @@ def _carried_back(
     area_um2 = 0.5 * np.abs(rising[..., 0] * falling[..., 1] - rising[..., 1] * falling[..., 0])
     gain = area_um2 / grid.cell_area_um2
     is_rim = np.isnan(gain) & ~np.isnan(ideal).any(axis=-1)
-    gain[is_rim] = _determinant(lens, middles[is_rim], ideal[is_rim], STEP * grid.pitch_um)
+    gain[is_rim] = _determinant(lens, middles[is_rim], ideal[is_rim], STEP * grid.pitch_xy_um)
     return pixel, np.nan_to_num(gain, nan=0.0)
 
 
 def _corners(grid: Grid, rows: slice) -> Floats:
     """Corners of some rows of cells, (n_row + 1, n_x + 1, 2), µm."""
-    x_um = grid.origin_um[0] + np.arange(grid.shape[1] + 1) * grid.pitch_um
-    y_um = grid.origin_um[1] + np.arange(rows.start, rows.stop + 1) * grid.pitch_um
+    x_um = grid.origin_um[0] + np.arange(grid.shape[1] + 1) * grid.pitch_x_um
+    y_um = grid.origin_um[1] + np.arange(rows.start, rows.stop + 1) * grid.pitch_y_um
     return np.stack(np.meshgrid(x_um, y_um), axis=-1)
 
 
-def _determinant(lens: PointMap, points_um: Floats, ideal_um: Floats, step_um: float) -> Floats:
+def _determinant(lens: PointMap, points_um: Floats, ideal_um: Floats, step_um: Floats) -> Floats:
     """Determinant of d x_u / d x_d at points whose cells reach out of the image circle, looking towards its middle."""
     columns = []
     for axis in (0, 1):
         step = np.zeros(2)
-        step[axis] = step_um
+        step[axis] = step_um[axis]
         up, down = (lens.undistort(points_um + sign * step, outside="mask") for sign in (1.0, -1.0))
-        columns.append(np.where(np.isnan(up), ideal_um - down, up - ideal_um) / step_um)
+        columns.append(np.where(np.isnan(up), ideal_um - down, up - ideal_um) / step_um[axis])
     across, along = columns
     return np.asarray(np.abs(across[..., 0] * along[..., 1] - across[..., 1] * along[..., 0]))

@@ -160,7 +160,7 @@ def flow_on_sites(flow_px: Floats, integrator: Integrator, lens: Lens | None) ->
         As for :func:`boxes_on_sites`.
     """
     grid = integrator.grid
-    moves = np.moveaxis(from_file_rows(np.asarray(flow_px, np.float64)), 0, -1) * [grid.pitch_um, -grid.pitch_um]
+    moves = np.moveaxis(from_file_rows(np.asarray(flow_px, np.float64)), 0, -1) * [grid.pitch_x_um, -grid.pitch_y_um]
     is_known = np.isfinite(moves).all(axis=-1)
     moves = np.where(is_known[..., np.newaxis], moves, 0.0)
     if lens is not None:
@@ -187,7 +187,7 @@ def _seen_um2(integrator: Integrator) -> Floats:
 def _on_sensor(points_px: Floats, grid: Grid) -> Floats:
     """Points (n, 2) of a picture, from its upper left corner and y down, in the sensor's plane."""
     x0, _, _, y1 = grid.bounds_um
-    return np.array([x0, y1]) + points_px * [grid.pitch_um, -grid.pitch_um]
+    return np.array([x0, y1]) + points_px * [grid.pitch_x_um, -grid.pitch_y_um]
 
 
 def checked_boxes(name: str, boxes: Any) -> tuple[Floats, Ints]:

@@ -116,7 +116,7 @@ class Integrator:
         if distortion is not None:
             if not hasattr(distortion, "undistort"):
                 raise ParameterError("distortion", "must be a lens of foveasim.distortion", distortion)
-            outlines = CarriedOutlines(layout, distortion, grid.pitch_um)
+            outlines = CarriedOutlines(layout, distortion, min(grid.pitch_x_um, grid.pitch_y_um))
         self._plan: Plan = compile_plan(outlines, layout.site_offsets.size - 1, grid, self.n_threads, self.order)
         # A lens does not turn outlines over: its image of one that is clockwise is so too.
         inside_out = np.flatnonzero(self._plan.area_um2 <= 0.0)

@@ -1,7 +1,7 @@
 """
 The integrator's numba kernels: outlines to spans of cells, spans in the order of the map, a map through them.
 
-Coordinates are in *cells* of the grid, ``u = (x - x0) / pitch`` to the right and ``v = (y - y0) / pitch`` up, so
+Coordinates are in *cells* of the grid, ``u = (x - x0) / pitch_x`` to the right and ``v = (y - y0) / pitch_y`` up, so
 that cell ``[iy, ix]`` is the unit square from ``(ix, iy)`` to ``(ix + 1, iy + 1)``.
 
 By Green's theorem the overlap of a site with a cell is a sum over the site's edges (:func:`trace_sites`). What

@@ -53,7 +53,7 @@ class CarriedOutlines:
     lens : object with ``undistort(xy_um, outside="mask")``
         NaN for points that the lens sends no light to.
     pitch_um : float, µm
-        Of the map's cells: edges are cut until their chords are within 0.2 % of it.
+        Shorter side of the map's cells: edges are cut until their chords are within 0.2 % of it.
 
     Notes
     -----

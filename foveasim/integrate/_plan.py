@@ -183,7 +183,7 @@ def compile_plan(
 
     bounds_um = np.concatenate([np.zeros((0, 4)), *(t.bounds_um for t in traced)])
     rows_per_band = max(MIN_ROWS_PER_BAND, -(-n_y // MAX_BANDS))
-    low, high = ((bounds_um[:, k] - grid.origin_um[1]) / grid.pitch_um for k in (1, 3))
+    low, high = ((bounds_um[:, k] - grid.origin_um[1]) / grid.pitch_y_um for k in (1, 3))
     first_row = np.floor(np.clip(low, 0, n_y)).astype(np.int64)
     last_row = np.ceil(np.clip(high, 0, n_y)).astype(np.int64)
     n_bands = np.where(last_row > first_row, (last_row - 1) // rows_per_band - first_row // rows_per_band + 1, 0)
@@ -226,7 +226,7 @@ def _traced(outlines: Outlines, first_site: int, grid: Grid, order: int) -> _Tra
     n_y, n_x = grid.shape
     rings = outlines.ring_offsets, outlines.site_offsets
     area_um2, bounds_um = compiled.measure_sites(outlines.xy_um, *rings)
-    uv = (outlines.xy_um - np.asarray(grid.origin_um)) / grid.pitch_um
+    uv = (outlines.xy_um - np.asarray(grid.origin_um)) / grid.pitch_xy_um
     spans, weights, cuts, moments, covered = compiled.trace_sites(uv, *rings, first_site, n_y, n_x, order)
     n_weights = spans[:, compiled.N_PARTIAL] + (spans[:, compiled.N_RUN] > 0)
     return _Traced(

@@ -251,9 +251,9 @@ def _covering(values: Floats, grid: Grid, outline: shapely.Polygon) -> Floats:
     rounding_um = 1e-9 * max(x1 - x0, y1 - y0)
     if min(low_x - x0, low_y - y0, x1 - high_x, y1 - high_y) < -rounding_um:
         raise ParameterError("density_grid", "must cover the whole region", grid.bounds_um, "µm")
-    half_um = 0.5 * grid.pitch_um
-    is_near_x = (grid.x_um + half_um > low_x) & (grid.x_um - half_um < high_x)
-    is_near_y = (grid.y_um + half_um > low_y) & (grid.y_um - half_um < high_y)
+    half_x_um, half_y_um = 0.5 * grid.pitch_x_um, 0.5 * grid.pitch_y_um
+    is_near_x = (grid.x_um + half_x_um > low_x) & (grid.x_um - half_x_um < high_x)
+    is_near_y = (grid.y_um + half_y_um > low_y) & (grid.y_um - half_y_um < high_y)
     return np.where(is_near_y[:, np.newaxis] & is_near_x, values, 0.0)
 
 
@@ -292,7 +292,7 @@ def _first_centres(n_sites: int, weight: Floats, grid: Grid, outline: shapely.Po
         cell = np.clip(np.searchsorted(total, target, side="right") - 1, column * n_y, column * n_y + n_y - 1)
         cell_mass = total[cell + 1] - total[cell]
         y = cell - column * n_y + (target - total[cell]) / np.where(cell_mass > 0.0, cell_mass, 1.0)
-        points_um = np.stack((x, y), axis=1) * grid.pitch_um + np.array(grid.origin_um)
+        points_um = np.stack((x, y), axis=1) * grid.pitch_xy_um + np.array(grid.origin_um)
         points_um = points_um[shapely.contains_xy(outline, points_um)]
         if points_um.shape[0] >= n_sites:
             return np.asarray(points_um[:n_sites])
@@ -599,17 +599,18 @@ class _PictureField:
             of_edge = np.bincount(edge, line * dy, minlength=once.size)
             around = np.concatenate((of_edge[:twins], -of_edge[:twins], of_edge[twins:]))
             total[i] = np.bincount(edges.cell, around, minlength=n)
-        mass, pitch_um = total[0] * self.grid.pitch_um**2, self.grid.pitch_um
-        return mass, total[1:].T * pitch_um**3 + mass[:, np.newaxis] * np.array(self.grid.origin_um)
+        cell_um2 = self.grid.cell_area_um2
+        mass = total[0] * cell_um2
+        return mass, total[1:].T * (cell_um2 * self.grid.pitch_xy_um) + mass[:, np.newaxis] * np.array(self.grid.origin_um)
 
     def along(self, start_um: Floats, stop_um: Floats) -> Any:
         edge, start, stop, at = self._pieces(start_um, stop_um)
-        length_um = np.hypot(*(stop - start)) * self.grid.pitch_um
+        length_um = np.hypot(*((stop - start) * self.grid.pitch_xy_um[:, np.newaxis]))
         return np.bincount(edge, self.values[at] * length_um, minlength=start_um.shape[0])
 
     def _pieces(self, start_um: Floats, stop_um: Floats) -> tuple[Ints, Any, Any, tuple[Ints, Ints]]:
         """Lines cut where they leave a cell of the picture: line, ends (2, n) in cells from the corner, row and column."""
-        start, stop = ((xy_um - np.array(self.grid.origin_um)) / self.grid.pitch_um for xy_um in (start_um, stop_um))
+        start, stop = ((xy_um - np.array(self.grid.origin_um)) / self.grid.pitch_xy_um for xy_um in (start_um, stop_um))
         line, start, stop = _cut(start, stop, axis=1)
         piece, start, stop = _cut(start, stop, axis=0)
         middle = np.floor(0.5 * (start + stop)).astype(np.int64)

@@ -26,7 +26,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from foveasim.errors import FileError, ParameterError
-from foveasim.fields import PowerMap
+from foveasim.fields import Pitch, PowerMap
 from foveasim.files import written_whole
 from foveasim.maps import _dataset, _exr, _fits, _isetcam, _npy, _tiff
 from foveasim.maps._apart import read_apart
@@ -63,7 +63,7 @@ _READERS: dict[tuple[bytes, ...], Any] = {
 def read_power_map(
     path: str | Path,
     *,
-    pitch_um: float | None = None,
+    pitch_um: Pitch | None = None,
     wavelength_nm: ArrayLike | None = None,
     band_width_nm: ArrayLike | None = None,
     unit: Unit | None = None,
@@ -78,8 +78,8 @@ def read_power_map(
     ----------
     path : path
         A file of one of the formats above, told by its content, or a zarr folder.
-    pitch_um : float, optional, µm
-        Side of a cell, where the file does not tell it.
+    pitch_um : float, or (pitch_x, pitch_y), optional, µm
+        Side of a square cell, or width and height of a rectangular one, where the file does not contain them.
     wavelength_nm : number or sequence, optional, nm
         The bands' wavelengths, where the file does not tell them.
     band_width_nm : number or sequence, optional, nm

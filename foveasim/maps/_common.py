@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Images, check_choice, check_length_um, finite_array, wavelengths_nm
+from foveasim.arrays import Floats, Images, check_choice, check_pitch_um, finite_array, wavelengths_nm
 from foveasim.errors import FileError, FoveasimError, ParameterError
-from foveasim.fields import Grid, PowerMap, rising
+from foveasim.fields import Grid, Pitch, PowerMap, rising
 from foveasim.maps._units import PER_NM, UNITS, Unit, light_unit, per_band_w_m2
 
 __all__ = [
@@ -38,8 +38,10 @@ MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**28, 256
 MAX_BANDS = 4096
 #: Enough to tell the formats apart.
 HEAD_BYTES = 1024
-#: Cells are square, and steps even, when they differ by less than this share: coordinates may be float32.
+#: Steps are even when they differ by less than this share: coordinates may be float32.
 UNEVEN = 1e-4
+#: Cells are square when their sides differ by less than this fraction: what float32 coordinates leave of one pitch.
+SQUARE = 1e-6
 #: Fourier transforms in float32 leave so much of the brightest light below 0.
 DARKEST = 1e-5
 MAX_TOLD = 300
@@ -81,7 +83,7 @@ class Found:
 class Given:
     """What the caller says of a map, which goes before what the file tells; None where nothing is said."""
 
-    pitch_um: float | None = None
+    pitch_um: Pitch | None = None
     wavelength_nm: ArrayLike | None = None
     band_width_nm: ArrayLike | None = None
     unit: Unit | None = None
@@ -90,7 +92,7 @@ class Given:
 
     def __post_init__(self) -> None:
         if self.pitch_um is not None:
-            check_length_um("pitch_um", self.pitch_um)
+            check_pitch_um("pitch_um", self.pitch_um)
         if self.wavelength_nm is not None:
             wavelengths_nm("wavelength_nm", self.wavelength_nm)
         if self.band_width_nm is not None:
@@ -193,7 +195,7 @@ def pitch_of_axes(x: Floats, y: Floats) -> tuple[float | None, float | None]:
         # Coordinates that are rounded to float32 far from 0 have uneven steps too.
         rounding = 4.0 * float(np.spacing(np.float32(np.abs(along).max())))
         if step == 0.0 or np.abs(np.diff(along) - step).max() > UNEVEN * abs(step) + rounding:
-            raise Refusal(f"has uneven steps along {name}; cells must be square, so resample it first")
+            raise Refusal(f"has uneven steps along {name}; cells must be equal, so resample it first")
         steps.append(step)
     return steps[0], steps[1]
 
@@ -250,15 +252,16 @@ def as_images(data: NDArray[Any]) -> Images:
     return images.astype(np.float32 if is_small else np.float64, copy=False)
 
 
-def _pitch_um(found: Found, given: Given) -> float:
+def _pitch_um(found: Found, given: Given) -> Pitch:
     if given.pitch_um is not None:
         return given.pitch_um
     if found.pitch_um is None:
-        raise Refusal("does not tell the size of its cells; give pitch_um=..., their side in µm")
-    along_x, along_y = found.pitch_um
-    if abs(along_x - along_y) > UNEVEN * max(abs(along_x), abs(along_y)):
-        raise Refusal(f"has cells of {along_x:.6g} µm by {along_y:.6g} µm; they must be square, so resample it first")
-    return along_x
+        raise Refusal("does not tell the size of its cells; give pitch_um=..., their side or (width, height) in µm")
+    try:
+        along_x, along_y = check_pitch_um("pitch_um", found.pitch_um)
+    except ParameterError as error:
+        raise Refusal(f"has cells of a size outside the allowed range ({error})") from None
+    return along_x if abs(along_x - along_y) <= SQUARE * max(along_x, along_y) else (along_x, along_y)
 
 
 def _wavelengths_nm(images: Images, found: Found, given: Given) -> Floats:

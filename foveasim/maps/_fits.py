@@ -40,12 +40,12 @@ def write(power_map: PowerMap, path: Path) -> None:
     hdu = fits.PrimaryHDU(power_map.data.astype(power_map.data.dtype.newbyteorder(">")))
     header = hdu.header
     header["BUNIT"] = "W m-2"
-    for axis, start in ((1, grid.origin_um[0]), (2, grid.origin_um[1])):
+    for axis, start, step in ((1, grid.origin_um[0], grid.pitch_x_um), (2, grid.origin_um[1], grid.pitch_y_um)):
         header[f"CTYPE{axis}"] = "LINEAR"
         header[f"CUNIT{axis}"] = "um"
         header[f"CRPIX{axis}"] = 0.5
         header[f"CRVAL{axis}"] = start
-        header[f"CDELT{axis}"] = grid.pitch_um
+        header[f"CDELT{axis}"] = step
     step_nm = np.diff(waves_nm)
     if step_nm.size == 0 or np.ptp(step_nm) <= UNEVEN * abs(step_nm[0]):
         header["CTYPE3"], header["CUNIT3"], header["CRPIX3"] = "WAVE", "nm", 1.0

@@ -3,6 +3,7 @@ Maps as numpy arrays: one array (npy), or named arrays in an archive (npz). Noth
 
 Names in an archive are ``data``, ``pitch_um``, ``origin_um``, ``wavelength_nm``, ``band_width_nm`` and ``unit``, as
 ``np.savez(path, data=..., pitch_um=0.5, wavelength_nm=[450, 550], unit="w_m2")`` writes them; the lowest row is first.
+``pitch_um`` is one number, or the two of (x, y).
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from foveasim.fields import PowerMap
@@ -45,7 +46,7 @@ def found_in_text(text: str, data: NDArray[Any], *, is_y_falling: bool) -> Found
     if about.get("version") != FILE_VERSION:
         raise Refusal(f"has the format version {about.get('version')!r:.40}, expected {FILE_VERSION}")
     try:
-        pitch_um = float(about["pitch_um"])
+        pitch_x_um, pitch_y_um = map(float, np.broadcast_to(about["pitch_um"], (2,)))
         x0, y0 = map(float, about["origin_um"])
         waves = [float(w) for w in about["wavelength_nm"]]
     except (KeyError, TypeError, ValueError):
@@ -53,7 +54,7 @@ def found_in_text(text: str, data: NDArray[Any], *, is_y_falling: bool) -> Found
     return Found(
         data=data,
         is_y_falling=is_y_falling,
-        pitch_um=(pitch_um, pitch_um),
+        pitch_um=(pitch_x_um, pitch_y_um),
         origin_um=(x0, y0),
         wavelength_nm=waves,
         unit=str(about.get("unit")),

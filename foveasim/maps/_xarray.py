@@ -9,7 +9,7 @@ import numpy as np
 
 from foveasim.arrays import Floats
 from foveasim.errors import ParameterError
-from foveasim.fields import Grid, PowerMap
+from foveasim.fields import Grid, Pitch, PowerMap
 from foveasim.maps._common import Found, Given, Refusal, finished, pitch_of_axes
 from foveasim.maps._units import Unit, length_in_um
 
@@ -66,7 +66,7 @@ def to_xarray(power_map: PowerMap) -> xr.DataArray:
         attrs={
             "units": "W m-2",
             "long_name": "irradiance per band",
-            "pitch_um": grid.pitch_um,
+            "pitch_um": np.asarray(grid.pitch_um).tolist(),
             "origin_um": list(grid.origin_um),
         },
     )
@@ -75,7 +75,7 @@ def to_xarray(power_map: PowerMap) -> xr.DataArray:
 def from_xarray(
     data_array: xr.DataArray,
     *,
-    pitch_um: float | None = None,
+    pitch_um: Pitch | None = None,
     wavelength_nm: ArrayLike | None = None,
     band_width_nm: ArrayLike | None = None,
     unit: Unit | None = None,
@@ -171,7 +171,7 @@ def _place(array: xr.DataArray, x: Floats, y: Floats, names: tuple[Hashable, Has
     per_x, per_y = (p for p in per if p is not None)
     exact = _exact(array, x * per_x, y * per_y)
     if exact is not None:
-        return {**told, "pitch_um": (exact.pitch_um, exact.pitch_um), "origin_um": exact.origin_um}
+        return {**told, "pitch_um": (exact.pitch_x_um, exact.pitch_y_um), "origin_um": exact.origin_um}
     if step_x is None and step_y is None:
         return told
     pitch_x = abs(step_x) * per_x if step_x is not None else None
@@ -193,11 +193,12 @@ def _exact(array: xr.DataArray, x_um: Floats, y_um: Floats) -> Grid | None:
         return None
     try:
         x0, y0 = np.asarray(origin, dtype=np.float64).tolist()
-        grid = Grid((y_um.size, x_um.size), float(pitch), (x0, y0))
+        grid = Grid((y_um.size, x_um.size), np.asarray(pitch, dtype=np.float64).tolist(), (x0, y0))
     except (TypeError, ValueError):
         return None
-    far = max(np.abs(np.sort(x_um) - grid.x_um).max(), np.abs(np.sort(y_um) - grid.y_um).max())
-    return grid if far <= ROUNDING * grid.pitch_um else None
+    far_x = np.abs(np.sort(x_um) - grid.x_um).max() / grid.pitch_x_um
+    far_y = np.abs(np.sort(y_um) - grid.y_um).max() / grid.pitch_y_um
+    return grid if max(far_x, far_y) <= ROUNDING else None
 
 
 def _wavelengths_nm(array: xr.DataArray, dimension: Hashable | None) -> list[float] | None:

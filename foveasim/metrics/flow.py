@@ -125,7 +125,7 @@ def site_gradients_e_per_um(
             CoverageWarning,
             stacklevel=2,
         )
-    gradient = np.moveaxis(integrator(_gradients(cells, grid.pitch_um)), 0, -1)
+    gradient = np.moveaxis(integrator(_gradients(cells, grid)), 0, -1)
     return np.where(is_on[:, np.newaxis], gradient, 0.0)
 
 
@@ -215,7 +215,7 @@ def estimate_flow(
     """
     require_layout(layout)
     cells = _checked_map(map_e_per_um2, grid)
-    maps = np.concatenate((cells[np.newaxis], _gradients(cells, grid.pitch_um)))
+    maps = np.concatenate((cells[np.newaxis], _gradients(cells, grid)))
     values = _per_site("values_e", finite_array("values_e", values_e), layout.n_sites)
     variance = _per_site("variance_e2", finite_array("variance_e2", variance_e2, above=0.0), layout.n_sites)
     n_steps = check_count("n_steps", n_steps)
@@ -292,10 +292,14 @@ def _checked_map(map_e_per_um2: ArrayLike, grid: Grid) -> Floats:
     return cells
 
 
-def _gradients(values: Floats, pitch_um: float) -> Floats:
+def _gradients(values: Floats, grid: Grid) -> Floats:
     """Slopes of a map along x and y, (2, n_y, n_x) per µm: differences of fourth order, of second at the borders."""
-    slopes = np.stack((np.gradient(values, pitch_um, axis=1), np.gradient(values, pitch_um, axis=0)))
-    for along, out in ((values, slopes[0]), (np.moveaxis(values, 0, 1), np.moveaxis(slopes[1], 0, 1))):
+    pitch_x_um, pitch_y_um = grid.pitch_x_um, grid.pitch_y_um
+    slopes = np.stack((np.gradient(values, pitch_x_um, axis=1), np.gradient(values, pitch_y_um, axis=0)))
+    for along, out, pitch_um in (
+        (values, slopes[0], pitch_x_um),
+        (np.moveaxis(values, 0, 1), np.moveaxis(slopes[1], 0, 1), pitch_y_um),
+    ):
         near, far = along[:, 3:-1] - along[:, 1:-3], along[:, 4:] - along[:, :-4]
         out[:, 2:-2] = (8.0 * near - far) / (12.0 * pitch_um)
     return slopes

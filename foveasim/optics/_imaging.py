@@ -102,7 +102,7 @@ class Imaging:
             shape=shape,
             rows=rows,
             columns=columns,
-            pitch_um=self.grid.pitch_um,
+            pitch_um=self.grid.pitch_x_um,
             f_max_per_um=self.f_max_per_um,
             blur_cells=self.blur_cells,
             sinc_power=self.sinc_power,
@@ -218,7 +218,7 @@ def patchwork_error(
     """Largest share of a point's light astray half-way between patches, or of one patch at the corners of the picture."""
     node_y_um, node_x_um = _nodes_um(grid, n_patches)
     if n_patches == (1, 1):
-        half_y_um, half_x_um = (0.5 * n * grid.pitch_um for n in grid.shape)
+        half_y_um, half_x_um = (0.5 * n * grid.pitch_x_um for n in grid.shape)
         wrong_um = [(sx * half_x_um, sy * half_y_um) for sx in (-1, 1) for sy in (-1, 1)]
         known_um = [[(0.0, 0.0)]] * 4
     else:
@@ -241,7 +241,7 @@ def patchwork_error(
 def _nodes_um(grid: Grid, n_patches: tuple[int, int]) -> tuple[Floats, Floats]:
     """Middles of the patches along y and x: from border to border, or on the axis when there is one."""
     y, x = (
-        np.linspace(-0.5, 0.5, n) * size * grid.pitch_um if n > 1 else np.zeros(1)
+        np.linspace(-0.5, 0.5, n) * size * grid.pitch_x_um if n > 1 else np.zeros(1)
         for n, size in zip(n_patches, grid.shape, strict=True)
     )
     return y, x
@@ -250,8 +250,8 @@ def _nodes_um(grid: Grid, n_patches: tuple[int, int]) -> tuple[Floats, Floats]:
 def _pieces(imaging: Imaging, sources: Ints, n: int, node_um: Floats) -> list[_Piece]:
     """Along one axis, the patch of each node."""
     first = -((sources.size - n) // 2)
-    half_um = 0.5 * n * imaging.grid.pitch_um
-    at_um = np.clip((first + np.arange(sources.size) + 0.5) * imaging.grid.pitch_um - half_um, -half_um, half_um)
+    half_um = 0.5 * n * imaging.grid.pitch_x_um
+    at_um = np.clip((first + np.arange(sources.size) + 0.5) * imaging.grid.pitch_x_um - half_um, -half_um, half_um)
     pieces = []
     for k in range(node_um.size):
         fade = np.ones(sources.size)

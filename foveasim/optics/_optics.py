@@ -259,7 +259,7 @@ class Optics(PointImages):
         if self.lateral_colour is None:
             return [(grid, np.ones(scene.wavelength_nm.size, bool))]
         sizes = self.lateral_colour.at(scene.wavelength_nm)
-        return [(Grid.centred(grid.shape, grid.pitch_um * float(size)), sizes == size) for size in np.unique(sizes)]
+        return [(Grid.centred(grid.shape, grid.pitch_x_um * float(size)), sizes == size) for size in np.unique(sizes)]
 
     def irradiance_per_radiance(self, distance_m: float) -> float:
         """Irradiance on the axis over the scene's radiance (sr), transmission included."""
@@ -347,6 +347,8 @@ class Optics(PointImages):
                 "weights",
                 f"must have the shape (n_output, {scene.wavelength_nm.size}), one for each wavelength, got {weights.shape}",
             )
+        if grid is not None and not grid.is_square:
+            raise ParameterError("grid", "must have square cells, as a scene's pixels are", grid.pitch_um, "µm")
         self._warn_if_too_small(self._lambda_n_um(scene), common)
         if grid is not None or self.lateral_colour is None:
             return self._maps(scene, weights, grid or common, thread_count(n_threads))
@@ -355,7 +357,7 @@ class Optics(PointImages):
     def _maps_on_one_grid(self, scene: SceneLike, weights: Floats, n_threads: int) -> Iterator[NDArray[Any]]:
         to = self.grid(scene)
         groups = self.image_grids(scene)
-        onto = [[overlaps(n, to.pitch_um, n, grid.pitch_um) for n in to.shape] for grid, _ in groups]
+        onto = [[overlaps(n, to.pitch_x_um, n, grid.pitch_x_um) for n in to.shape] for grid, _ in groups]
         for output in weights:
             total = np.zeros(to.shape)
             for (grid, is_of_it), (along_y, along_x) in zip(groups, onto, strict=True):
@@ -371,14 +373,14 @@ class Optics(PointImages):
         aperture = self._aperture(scene.distance_m)
         is_clear_circle = self._is_clear_circle(aperture)
         if is_clear_circle:
-            lambda_n_um = np.maximum(lambda_n_um, grid.pitch_um / MAX_ALIASES)
+            lambda_n_um = np.maximum(lambda_n_um, grid.pitch_x_um / MAX_ALIASES)
         share = np.array([aperture.transmittance(float(w)) for w in scene.wavelength_nm])
         light_w_m2 = (
             scene.spectrum_w_m2_sr_nm * scene.band_width_nm * share * self.irradiance_per_radiance(scene.distance_m)
         )
         tangent2_x, tangent2_y = self._squared_tangents(scene)
         # What a factor on a spectrum hangs on, beside the lens and the weights.
-        light = scene.wavelength_nm.tobytes(), scene.distance_m, grid.shape, grid.pitch_um
+        light = scene.wavelength_nm.tobytes(), scene.distance_m, grid.shape, grid.pitch_x_um
 
         def kept(weight: Floats, transform: Transform, table_of: Tables) -> NDArray[Any] | None:
             n_numbers = math.prod(transform.spectrum_shape) * (1 if is_clear_circle else 2)
@@ -386,7 +388,7 @@ class Optics(PointImages):
 
         imaging = Imaging(
             basis=scene.basis,
-            light_w_m2=light_w_m2 * (scene.pitch_um * self.magnification(scene.distance_m) / grid.pitch_um) ** 2,
+            light_w_m2=light_w_m2 * (scene.pitch_um * self.magnification(scene.distance_m) / grid.pitch_x_um) ** 2,
             weights=weights,
             tangent2_x=tangent2_x,
             tangent2_y=tangent2_y,
@@ -397,7 +399,7 @@ class Optics(PointImages):
             if self.padding_cells is None
             else self.padding_cells,
             guard=self._reach(scene, grid, aperture, lambda_n_um, PATCH_LOST_SHARE),
-            blur_cells=self._blur_um(scene, grid, aperture, lambda_n_um) / grid.pitch_um,
+            blur_cells=self._blur_um(scene, grid, aperture, lambda_n_um) / grid.pitch_x_um,
             f_max_per_um=1.0 / float(lambda_n_um.min()),
             sinc_power=1 if self.source_pixel == "point" else 2,
             real=self._real_type(),
@@ -488,7 +490,7 @@ class Optics(PointImages):
 
     def _places_um(self, grid: Grid) -> list[tuple[float, float]]:
         """Points of the field where aberrations are strongest."""
-        half_x_um, half_y_um = (0.5 * n * grid.pitch_um for n in grid.shape[::-1])
+        half_x_um, half_y_um = (0.5 * n * grid.pitch_x_um for n in grid.shape[::-1])
         corners = [(sx * half_x_um, sy * half_y_um) for sx in (-1, 1) for sy in (-1, 1)]
         return [(0.0, 0.0), *(corners if self._is_varying() else ())]
 
@@ -510,7 +512,7 @@ class Optics(PointImages):
                 float(near_um),
                 aperture.blur_lambda_n(float(wave_nm), place_um),
                 aperture.edge(float(wave_nm)),
-                grid.pitch_um,
+                grid.pitch_x_um,
             )
             for wave_nm, near_um in zip(scene.wavelength_nm, lambda_n_um, strict=True)
             for place_um in self._places_um(grid)
@@ -522,10 +524,10 @@ class Optics(PointImages):
     def _warn_if_too_small(self, lambda_n_um: Floats, grid: Grid) -> None:
         """Warn where the paper's Eq. 5, a >> H λ / (p0 min(M, N)), does not hold."""
         # On the sensor side the ratio of its two sides is min(M, N) p / (2 λ N).
-        widest_um = float(max(lambda_n_um.max(), grid.pitch_um / MAX_ALIASES))
-        ratio = 0.5 * min(grid.shape) * grid.pitch_um / widest_um
+        widest_um = float(max(lambda_n_um.max(), grid.pitch_x_um / MAX_ALIASES))
+        ratio = 0.5 * min(grid.shape) * grid.pitch_x_um / widest_um
         if ratio < MUCH_LARGER:
-            height, width = (n * grid.pitch_um for n in grid.shape)
+            height, width = (n * grid.pitch_x_um for n in grid.shape)
             warnings.warn(
                 f"the image of the scene is only {width:.4g} x {height:.4g} µm, and the lens spreads a point over "
                 f"{2.44 * widest_um:.3g} µm: the paper's Eq. 5 wants the aperture's radius to be much "

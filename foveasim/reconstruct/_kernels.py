@@ -164,21 +164,22 @@ def natural_neighbours(points, start, xy, values, corners, beyond, circles, out)
                 area[corners[triangles[i], k]] = 0.0
 
 
-@njit(types.void(_points, types.float64, types.float64[:, ::1]), cache=True, nogil=True)
-def add_roughness(picture, weight, out):
+@njit(types.void(_points, types.float64, types.float64, types.float64[:, ::1]), cache=True, nogil=True)
+def add_roughness(picture, weight_x, weight_y, out):
     """
-    Add ``weight`` times the gradient of half the sum of squared differences between neighbouring pixels.
+    Add the gradient of half the weighted sum of squared differences between neighbouring pixels.
 
-    ``picture`` and ``out`` (n_y, n_x): each pixel gets the sum of its differences from its two to four neighbours.
+    ``picture`` and ``out`` (n_y, n_x): each pixel gets the sum of its differences from its two to four neighbours, those in its
+    row times ``weight_x``, those in its column times ``weight_y``.
     """
     n_y, n_x = picture.shape
     for row in range(n_y):
         for column in range(n_x - 1):
-            difference = weight * (picture[row, column + 1] - picture[row, column])
+            difference = weight_x * (picture[row, column + 1] - picture[row, column])
             out[row, column] -= difference
             out[row, column + 1] += difference
         if row + 1 < n_y:
             for column in range(n_x):
-                difference = weight * (picture[row + 1, column] - picture[row, column])
+                difference = weight_y * (picture[row + 1, column] - picture[row, column])
                 out[row, column] -= difference
                 out[row + 1, column] += difference

@@ -36,8 +36,9 @@ MISFIT_TOLERANCE = 0.02
 MAX_STRENGTHS, FURTHEST = 12, 1e8
 #: The largest strength, times the largest curvature of the data's part: beyond it nothing is left but one even value.
 STRONGEST = 1e6
-#: No picture's roughness is larger than this times its sum of squares; and pixels across the coarsest level, at most.
-ROUGHEST, COARSEST = 8.0, 4
+#: No picture's roughness along one axis is larger than this times its sum of squares; and pixels across the coarsest level, at
+#: most.
+ROUGHEST, COARSEST = 4.0, 4
 #: While the strength is looked for, solutions may be this much further from convergence.
 LOOSER = 3.0
 
@@ -72,7 +73,8 @@ def least_squares(
         picture in electrons per µm². With ones, values that an even scene makes equal stay what they are.
     mu : float, "roughness" or "discrepancy"
         Strength of the smoothness: ``|grad x|²`` is the sum of the squared differences of neighbouring pixels, over the whole
-        raster, and does not depend on how fine it is. Both rules need the variance: see below.
+        raster, and does not depend on how fine it is; along x it is times height over width of a pixel, along y the inverse, so
+        that it stands for the integral of the squared gradient for pixels of any form. Both rules need the variance: see below.
     blur : (m_y, m_x) or (n_channel, m_y, m_x), optional
         What the lens makes of one pixel, on the raster's pixels, an odd number along each side, the pixel in the middle
         (:func:`blur_kernel`): W is then the overlaps after this convolution, and the picture is that in front of the lens.
@@ -140,6 +142,7 @@ def least_squares(
             overlaps=_scaled_rows(overlaps[known], weight),
             right=channels[channel, known] / np.sqrt(noise[channel, known]),
             shape=shape,
+            smoothing=(grid.pitch_y_um / grid.pitch_x_um, grid.pitch_x_um / grid.pitch_y_um),
             transfer=_transfer(kernel_of[channel], shape) if kernel_of else None,
             tolerance=tolerance,
             max_steps=max_steps,
@@ -167,6 +170,8 @@ class _Problem:
     right : (n_value,)
         The values over their noise.
     shape : (n_y, n_x)
+    smoothing : (along x, along y)
+        Weights of the squared differences of neighbours: 1 for square pixels.
     transfer : (n_y, n_x // 2 + 1) complex, optional
         Of the blur before it.
     tolerance : float
@@ -176,6 +181,7 @@ class _Problem:
     overlaps: Any
     right: Floats
     shape: tuple[int, ...]
+    smoothing: tuple[float, float]
     transfer: Any
     tolerance: float
     max_steps: int
@@ -213,7 +219,7 @@ class _Problem:
         """Inverse diagonals of the preconditioner, from the raster to ever coarser pixels."""
         level, levels = self._reach.reshape(self.shape), []
         while True:
-            levels.append(1.0 / (level + ROUGHEST * mu))
+            levels.append(1.0 / (level + ROUGHEST * sum(self.smoothing) * mu))
             if min(level.shape) <= COARSEST:
                 return levels
             level = _coarser(level)
@@ -231,10 +237,11 @@ class _Problem:
         """The picture for one strength."""
         add_roughness: Callable[..., None] = kernels("reconstruct").add_roughness
         levels = self._levels(mu)
+        mu_x, mu_y = (mu * weight for weight in self.smoothing)
 
         def normal(x: Floats) -> Floats:
             out = self.backward(self.forward(x))
-            add_roughness(x.reshape(self.shape), mu, out.reshape(self.shape))
+            add_roughness(x.reshape(self.shape), mu_x, mu_y, out.reshape(self.shape))
             return out
 
         def precondition(gradient: Floats) -> Floats:
@@ -263,9 +270,10 @@ class _Problem:
         return float(apart @ apart) / self.right.size
 
     def roughness(self, x: Floats) -> float:
-        """Sum of the squared differences of neighbours."""
-        picture = x.reshape(self.shape)
-        return float((np.diff(picture, axis=0) ** 2).sum() + (np.diff(picture, axis=1) ** 2).sum())
+        """Weighted sum of the squared differences of neighbours."""
+        picture, (weight_x, weight_y) = x.reshape(self.shape), self.smoothing
+        across, along = (np.diff(picture, axis=1) ** 2).sum(), (np.diff(picture, axis=0) ** 2).sum()
+        return float(weight_y * along + weight_x * across)
 
     @cached_property
     def natural_strength(self) -> float:

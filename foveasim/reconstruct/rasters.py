@@ -18,6 +18,8 @@ __all__ = ["blur_kernel", "reference"]
 HELD_SHARE, MAX_RADIUS = 0.98, 128
 #: Distance of samples of the pattern in λN, at most: half of what its frequencies ask for.
 SAMPLE_LAMBDA_N = 0.25
+#: The pattern is sampled at this many points along an axis, at most.
+MAX_SAMPLES = 8192
 #: Sum of coverage above which a pixel lies on the map.
 ON_THE_MAP = 1e-9
 
@@ -80,7 +82,8 @@ def blur_kernel(
     distance_m : float, optional, m
         Of the scene; by default the distance of the focus, or infinity.
     radius : int, optional
-        Pixels from the middle to the side; by default as many as hold 98 % of a point's light, 128 at most.
+        Pixels from the middle to either side; by default as many as hold 98 % of a point's light along the shorter side of a
+        pixel, 128 at most.
 
     Returns
     -------
@@ -99,21 +102,32 @@ def blur_kernel(
     """
     if not isinstance(optics, Optics):
         raise ParameterError("optics", f"must be a foveasim.Optics, got a {type(optics).__name__}")
-    pitch_um = grid.pitch_um
+    shorter_um = min(grid.pitch_x_um, grid.pitch_y_um)
     if radius is None:
         reach = np.arange(1, MAX_RADIUS + 1)
-        held = optics.encircled_energy((reach + 0.5) * pitch_um, wavelength_nm, distance_m=distance_m)
+        held = optics.encircled_energy((reach + 0.5) * shorter_um, wavelength_nm, distance_m=distance_m)
         radius = int(reach[min(int(np.searchsorted(held, HELD_SHARE)), MAX_RADIUS - 1)])
     radius = check_count("radius", radius, at_least=0, at_most=MAX_RADIUS)
-    finest_um = 8.0 * SAMPLE_LAMBDA_N * optics.psf(wavelength_nm, distance_m=distance_m, n_points=1).grid.pitch_um
-    n_across = int(np.ceil(pitch_um / finest_um)) | 1
-    n_points = (2 * radius + 3) * n_across
-    spread = optics.psf(wavelength_nm, distance_m=distance_m, pitch_um=pitch_um / n_across, n_points=n_points)
-    # From an even pixel to the mean over a pixel, a convolution with two squares: a product of transforms.
-    squares = np.sinc(np.fft.fftfreq(n_points, 1.0 / n_across)) ** 2
-    means = np.fft.ifft2(np.fft.fft2(spread.share_per_um2) * np.outer(squares, squares)).real
-    at = slice(n_across + n_across // 2, n_points - n_across, n_across)
-    kernel = np.maximum(means[at, at], 0.0)
+    finest_um = 8.0 * SAMPLE_LAMBDA_N * optics.psf(wavelength_nm, distance_m=distance_m, n_points=1).grid.pitch_x_um
+    step_um = shorter_um / (int(np.ceil(shorter_um / finest_um)) | 1)
+    n_points = int(np.ceil((2 * radius + 3) * max(grid.pitch_x_um, grid.pitch_y_um) / step_um - 1e-9)) | 1
+    if n_points > MAX_SAMPLES:
+        raise ParameterError(
+            "grid",
+            f"must have pixels whose blur takes at most {MAX_SAMPLES} samples across, got {n_points}",
+            cure="take pixels nearer to square, or a smaller 'radius'",
+        )
+    spread = optics.psf(wavelength_nm, distance_m=distance_m, pitch_um=step_um, n_points=n_points)
+    # From an even pixel to the mean over a pixel, a convolution with two boxes: a product of transforms, taken back at the
+    # pixels' centres alone.
+    cycles_per_um = np.fft.fftfreq(n_points, step_um)
+    centre_um, offset = 0.5 * (n_points - 1) * step_um, np.arange(-radius, radius + 1)
+    along_y, along_x = (
+        np.exp(2j * np.pi * np.outer(centre_um + offset * pitch_um, cycles_per_um)) * np.sinc(pitch_um * cycles_per_um) ** 2
+        for pitch_um in (grid.pitch_y_um, grid.pitch_x_um)
+    )
+    means = (along_y @ np.fft.fft2(spread.share_per_um2) @ along_x.T).real
+    kernel = np.maximum(means, 0.0)
     return np.asarray(kernel / kernel.sum())
 
 
@@ -122,7 +136,7 @@ def _overlaps_1d(to: Grid, source: Grid, axis: int) -> Any:
     from scipy.sparse import csr_array
 
     edges_to, edges_from = (
-        grid.origin_um[1 - axis] + np.arange(grid.shape[axis] + 1) * grid.pitch_um for grid in (to, source)
+        grid.origin_um[1 - axis] + np.arange(grid.shape[axis] + 1) * grid.pitch_xy_um[1 - axis] for grid in (to, source)
     )
     cuts = np.unique(np.concatenate((edges_to, edges_from)))
     middle, length_um = 0.5 * (cuts[1:] + cuts[:-1]), np.diff(cuts)

@@ -33,6 +33,8 @@ RGB_NM = (620.0, 550.0, 450.0)
 GREY_NM = (550.0,)
 #: Encoded floating-point numbers above this are no picture from 0 to 1, but one from 0 to 255.
 MAX_ENCODED = 16.0
+#: Pixels and distances larger than these are a slip of units: an astronomical scene is 1e9 m away, and as wide.
+MAX_PITCH_UM, MAX_DISTANCE_M = 1e15, 1e9
 #: Weights of red, green and blue in the brightness of a colour (Rec. ITU-R BT.709).
 BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
@@ -105,8 +107,9 @@ class Scene:
         object.__setattr__(self, "spectrum_w_m2_sr_nm", read_only(spectrum.copy()))
         object.__setattr__(self, "wavelength_nm", wavelength_nm)
         object.__setattr__(self, "band_width_nm", read_only(width_nm.copy()))
-        object.__setattr__(self, "pitch_um", check_number("pitch_um", self.pitch_um, above=0.0, at_most=1e9))
-        object.__setattr__(self, "distance_m", check_number("distance_m", self.distance_m, above=0.0, at_most=1e9))
+        object.__setattr__(self, "pitch_um", check_number("pitch_um", self.pitch_um, above=0.0, at_most=MAX_PITCH_UM))
+        distance_m = check_number("distance_m", self.distance_m, above=0.0, at_most=MAX_DISTANCE_M)
+        object.__setattr__(self, "distance_m", distance_m)
 
     def __repr__(self) -> str:
         n_basis, n_y, n_x = self.basis.shape

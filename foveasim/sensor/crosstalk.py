@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, Ints, as_numbers, check_choice, check_length_um, check_number, finite_array
+from foveasim.arrays import Floats, Ints, as_numbers, check_choice, check_length_um, check_number, check_pitch_um, finite_array
 from foveasim.errors import ParameterError, SimulationError
 
 if TYPE_CHECKING:
@@ -342,11 +342,7 @@ class KernelCrosstalk:
         object.__setattr__(self, "kernel", tuple(tuple(float(share) for share in row) for row in kernel))
         check_choice("border", self.border, ("kept", "lost"))
         if self.pitch_um is not None:
-            given = as_numbers("pitch_um", self.pitch_um)
-            if given.shape not in ((), (2,)):
-                raise ParameterError("pitch_um", "must be one number, or two numbers (pitch_x, pitch_y)", self.pitch_um)
-            pitches = tuple(check_length_um("pitch_um", float(p_um)) for p_um in np.broadcast_to(given, 2))
-            object.__setattr__(self, "pitch_um", pitches)
+            object.__setattr__(self, "pitch_um", check_pitch_um("pitch_um", self.pitch_um))
 
     def mixing(self, layout: Neighbourhood) -> Mixing:
         """

@@ -195,7 +195,7 @@ def look_around(
     n_y, n_x = check_shape("shape", shape)
     if n_y > scene.basis.shape[1] or n_x > scene.basis.shape[2]:
         raise ParameterError("shape", f"must be within the picture's {scene.basis.shape[1:]}", (n_y, n_x))
-    return _parts(scene, path, optics.grid(scene).pitch_um, n_y, n_x)
+    return _parts(scene, path, optics.grid(scene).pitch_x_um, n_y, n_x)
 
 
 def _parts(

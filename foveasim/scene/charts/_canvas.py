@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from foveasim.arrays import Bools, Floats, check_choice, check_number, check_shape, finite_array, wavelengths_nm
 from foveasim.errors import ParameterError, SamplingWarning
-from foveasim.scene._scene import Scene, band_widths_nm
+from foveasim.scene._scene import MAX_DISTANCE_M, MAX_PITCH_UM, Scene, band_widths_nm
 from foveasim.units import m_from_um
 
 __all__ = [
@@ -77,8 +77,8 @@ class Canvas:
             )
         for name, value in {
             "shape": check_shape("shape", self.shape),
-            "pitch_um": check_number("pitch_um", self.pitch_um, above=0.0, at_most=1e9),
-            "distance_m": check_number("distance_m", self.distance_m, above=0.0, at_most=1e9),
+            "pitch_um": check_number("pitch_um", self.pitch_um, above=0.0, at_most=MAX_PITCH_UM),
+            "distance_m": check_number("distance_m", self.distance_m, above=0.0, at_most=MAX_DISTANCE_M),
             "radiance_w_m2_sr_nm": np.broadcast_to(radiance, waves_nm.shape),
             "wavelength_nm": waves_nm,
             "band_width_nm": band_widths_nm(waves_nm, self.band_width_nm),
