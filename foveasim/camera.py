@@ -6,6 +6,7 @@ The only place that knows the order of the stages, and that makes random streams
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections import deque
@@ -18,11 +19,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, check_count, check_number, finite_array, read_only
+from foveasim.arrays import Bools, Floats, check_count, check_number, finite_array, read_only
 from foveasim.capture import Capture
 from foveasim.compiled import kernels
 from foveasim.distortion import Lens
-from foveasim.errors import CoverageWarning, FoveasimWarning, ParameterError, SimulationError
+from foveasim.errors import CoverageWarning, FoveasimWarning, ParameterError, SamplingWarning, SimulationError
 from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
@@ -67,8 +68,10 @@ class Camera:
     optics : Optics
     sensor : Sensor
     distortion : lens model of foveasim.distortion, optional
-        Where the lens puts light that an ideal one would put elsewhere: photosites' outlines are carried back, once, and no
-        picture is resampled.
+        Displaces the image points of the ideal lens. The outlines of the photosites are undistorted once, and no picture is
+        resampled. The optical axis meets the sensor at its ``centre_um``: the ideal image, relative illumination and field
+        positions of a scene are all centred there, as in OpenCV's ``projectPoints``. Where its ``focal_um`` differs between x
+        and y, the ideal image is scaled alike, keeping its area.
     order : {1, 2}, optional
         Whether a map's cells are taken as even, or as means with a gradient (see :class:`foveasim.Integrator`). By default 2
         for scenes whose image has cells of at most λN/2 at all wavelengths, and 1 for coarser ones and for power maps.
@@ -84,6 +87,8 @@ class Camera:
     -----
     CoverageWarning
         On a capture, when photosites lie off the image, or where the lens sends no light.
+    SamplingWarning
+        On a capture, when second-order integration of a sharp image on coarse cells makes photosites negative.
 
     Examples
     --------
@@ -143,6 +148,10 @@ class Camera:
         """Where the lens puts light that an ideal one would put elsewhere, or None. For another one make another camera."""
         return self._distortion
 
+    def oversample(self, light: Scene | PowerMap) -> int:
+        """Cells of the power map along a side of a source pixel: as :class:`Optics` specifies or chooses; 1 for power maps."""
+        return 1 if isinstance(light, PowerMap) else int(self._optics.resolved(light).oversample)
+
     def order(self, light: Scene | PowerMap) -> Literal[1, 2]:
         """Order of the integration of a kind of light."""
         if self._order is not None:
@@ -150,7 +159,61 @@ class Camera:
         if isinstance(light, PowerMap):
             return 1
         narrowest_um = float(um_from_nm(light.wavelength_nm.min())) * self._optics.working_f_number(light.distance_m)
-        return 2 if self._optics.grid(light).pitch_x_um <= SMOOTH_LAMBDA_N * narrowest_um else 1
+        cell_um = self._optics.grid(light).pitch_x_um / self.oversample(light)
+        return 2 if cell_um <= SMOOTH_LAMBDA_N * narrowest_um else 1
+
+    def image_grid(self, scene: Scene) -> Grid:
+        """
+        Return the grid on which the pixels of a scene are imaged without distortion, in the sensor frame.
+
+        Parameters
+        ----------
+        scene : Scene
+
+        Returns
+        -------
+        Grid
+            :meth:`Optics.grid`, centred on the principal point of the distortion model.
+
+        Raises
+        ------
+        ParameterError
+            When the scene is not a Scene, or nearer than the focal length.
+        """
+        return self._placed(self._optics.grid(scene))
+
+    def power_map(self, scene: Scene) -> PowerMap:
+        """
+        Compute the irradiance of a scene on the sensor plane without distortion, in the sensor frame.
+
+        Parameters
+        ----------
+        scene : Scene
+
+        Returns
+        -------
+        PowerMap
+            (n_wavelength, n_y, n_x): :meth:`Optics.power_map` with :meth:`oversample` cells along a source pixel, centred on the
+            principal point of the distortion model. Capturing it gives the capture of the scene at the same ``order``.
+
+        Raises
+        ------
+        ParameterError, SimulationError
+            When the scene is too near, or not finite.
+        """
+        power_map = self._optics.resolved(scene).power_map(scene, n_threads=self._n_threads)
+        return PowerMap(power_map.data, self._placed(power_map.grid), power_map.wavelength_nm)
+
+    def _placed(self, grid: Grid) -> Grid:
+        """Move a grid from the frame of the lens, centred on the axis, to the frame of the sensor."""
+        if self._distortion is None:
+            return grid
+        centre_um = np.array(self._distortion.centre_um)
+        focal_um = np.broadcast_to(np.asarray(self._distortion.focal_um), (2,))
+        scale = focal_um / math.sqrt(focal_um[0] * focal_um[1])
+        pitch_x_um, pitch_y_um = grid.pitch_xy_um * scale
+        x0_um, y0_um = centre_um + grid.origin_um * scale
+        return Grid(grid.shape, (float(pitch_x_um), float(pitch_y_um)), (float(x0_um), float(y0_um)))
 
     def integrator(
         self,
@@ -292,6 +355,7 @@ class Camera:
             settings={
                 "light": _light_described(light),
                 **self._described,
+                "oversample": self.oversample(light),
                 "integration_order": self.order(light),
                 "exposure_s": exposure_s,
                 "seed": streams.seed,
@@ -542,7 +606,7 @@ class Camera:
         exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
         if not isinstance(light, Scene | PowerMap):
             raise ParameterError("light", f"must be a Scene or a PowerMap, got a {type(light).__name__}")
-        power_map = self._optics.power_map(light, n_threads=self._n_threads) if isinstance(light, Scene) else light
+        power_map = self.power_map(light) if isinstance(light, Scene) else light
         # Joules on a µm².
         joules_per_w_m2 = float(w_from_w_m2_um2(exposure_s))
         weights = self._sensor.responsivity_e_per_j(light.wavelength_nm) * joules_per_w_m2
@@ -585,14 +649,14 @@ class Camera:
             for room in ("integrate",) if isinstance(light, PowerMap) else ("integrate", "optics"):
                 kernels(room)
         if isinstance(light, PowerMap):
-            grids = [(light.grid, np.ones(light.wavelength_nm.size, bool))]
+            optics, grids = self._optics, [(light.grid, np.ones(light.wavelength_nm.size, bool))]
         else:
-            grids = self._optics.image_grids(light)
+            optics = self._optics.resolved(light)
+            grids = optics.image_grids(light)
         with clock.stage("compile layout"):
             order = self.order(light)
-            integrators = [
-                self.integrator(grid, order=order, n_grids=len(grids), place_um=place_um) for grid, _ in grids
-            ]
+            placed = [grid if isinstance(light, PowerMap) else self._placed(grid) for grid, _ in grids]
+            integrators = [self.integrator(grid, order=order, n_grids=len(grids), place_um=place_um) for grid in placed]
         self._warn_of_uncovered(min(integrators, key=lambda integrator: integrator.grid.cell_area_um2))
         rate_e_per_s = np.zeros(self._layout.n_sites)
         if isinstance(light, PowerMap):
@@ -604,7 +668,7 @@ class Camera:
             used = np.unique(filter_of_site)
             for (grid, is_on_it), integrator in zip(grids, integrators, strict=True):
                 new = used if kept is None else np.array([c for c in used if (grid, c) not in kept], np.int64)
-                maps = self._optics.weighted_maps(light, weights[new] * is_on_it, grid=grid, n_threads=self._n_threads)
+                maps = optics.weighted_maps(light, weights[new] * is_on_it, grid=grid, n_threads=self._n_threads)
                 for c in used:
                     with clock.stage("optics"):
                         cells = next(maps) if kept is None or (grid, c) not in kept else kept[grid, c]
@@ -619,16 +683,25 @@ class Camera:
             raise SimulationError(
                 f"the light on site {bad} is not finite: the power map has a NaN or an infinity there"
             )
-        # What falls below darkness by rounding, or by a cell's gradient, is darkness; a map from elsewhere may be negative.
-        rounding_e_per_s = NEGATIVE_ROUNDING * float(rate_e_per_s.max(initial=0.0))
-        if (
-            isinstance(light, PowerMap)
-            and rate_e_per_s.min(initial=0.0) < -rounding_e_per_s
-            and (order == 1 or np.nanmin(light.data) < 0.0)
-        ):
-            bad = int(rate_e_per_s.argmin())
-            raise SimulationError(f"the light on site {bad} is negative: the power map is below 0 there")
+        # Transforms leave rates below 0 by rounding, second order where cells are coarse; a map from elsewhere may be negative.
+        is_negative = rate_e_per_s < -NEGATIVE_ROUNDING * float(rate_e_per_s.max(initial=0.0))
+        if is_negative.any():
+            if isinstance(light, PowerMap) and (order == 1 or np.nanmin(light.data) < 0.0):
+                bad = int(rate_e_per_s.argmin())
+                raise SimulationError(f"the light on site {bad} is negative: the power map is below 0 there")
+            self._warn_of_negative(rate_e_per_s, is_negative)
         return np.maximum(rate_e_per_s, 0.0)
+
+    def _warn_of_negative(self, rate_e_per_s: Floats, is_negative: Bools) -> None:
+        """Warn where gradients of coarse cells make photosites negative."""
+        fraction = -float(rate_e_per_s[is_negative].sum()) / float(rate_e_per_s[rate_e_per_s > 0.0].sum())
+        warnings.warn(
+            f"second-order integration makes the photoelectrons of {int(is_negative.sum()):,} of {rate_e_per_s.size:,} "
+            f"photosites negative, {100.0 * fraction:.2g} % of all, and they are set to 0: the image is too sharp for cells of "
+            "this size; take order=1, or finer cells (Optics(oversample=...))",
+            SamplingWarning,
+            stacklevel=4,
+        )
 
     def _warn_of_uncovered(self, integrator: Integrator) -> None:
         """Tell of sites that the map of light does not reach: their darkness is no property of the scene."""

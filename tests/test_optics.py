@@ -249,7 +249,9 @@ def test_aplanatic_irradiance_conserves_entrance_pupil_flux(f_number, distance_m
     per_radiance_sr = projected_sr / optics.magnification(distance_m) ** 2
 
     # Small pupil against the distance of the scene: off by (a/H)², at most 2.5e-4 here.
-    assert optics.irradiance_per_radiance(distance_m) == pytest.approx(per_radiance_sr, rel=(a_m / distance_m) ** 2 + 1e-6)
+    assert optics.irradiance_per_radiance(distance_m) == pytest.approx(
+        per_radiance_sr, rel=(a_m / distance_m) ** 2 + 1e-6
+    )
     isotropic = lens(f_number=f_number, lens="aplanatic", emission="isotropic")
     # A hemisphere of even radiance emits π L per area, isotropic points L in 2π sr: a factor of 2π on the axis.
     assert optics.irradiance_per_radiance(distance_m) == pytest.approx(
@@ -259,7 +261,9 @@ def test_aplanatic_irradiance_conserves_entrance_pupil_flux(f_number, distance_m
 
 @pytest.mark.parametrize(("f_number", "percent"), [(4.0, 1.56), (2.8, 3.19), (1.4, 12.76)])
 def test_thin_and_aplanatic_irradiance_differ(f_number, percent):
-    thin, aplanatic = (lens(f_number=f_number, lens=kind).irradiance_per_radiance(np.inf) for kind in ("thin", "aplanatic"))
+    thin, aplanatic = (
+        lens(f_number=f_number, lens=kind).irradiance_per_radiance(np.inf) for kind in ("thin", "aplanatic")
+    )
 
     assert 100.0 * (aplanatic / thin - 1.0) == pytest.approx(percent, abs=0.01)
     assert lens(f_number=f_number).irradiance_per_radiance(np.inf) == thin

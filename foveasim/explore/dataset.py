@@ -428,7 +428,7 @@ class DataSet:
             return found
         camera, scene = shot.camera, shot.scene
         assert isinstance(scene, Scene)
-        grid = camera.optics.grid(scene)
+        grid = camera.image_grid(scene)
         lens = camera.distortion
         n_grids = len(camera.optics.image_grids(scene))
         integrator = camera.integrator(grid, order=1, n_grids=n_grids)
@@ -460,8 +460,10 @@ class DataSet:
                 assert isinstance(scene, Scene)
                 if layout.n_sites == 0:
                     raise ParameterError("fit", "needs a layout with sites")
-                x0, y0, x1, y1 = (abs(end_um) for end_um in layout.bounds_um)
-                self._fit_um = (max(x0, x1), max(y0, y1), base.camera.optics.magnification(scene.distance_m))
+                x_um, y_um = (0.0, 0.0) if base.camera.distortion is None else base.camera.distortion.centre_um
+                x0, y0, x1, y1 = layout.bounds_um
+                half_um = max(x1 - x_um, x_um - x0), max(y1 - y_um, y_um - y0)
+                self._fit_um = (*half_um, base.camera.optics.magnification(scene.distance_m))
             first = {path: draw.ends[0] for path, draw in self._draws.items()}
             most_bits = self._tried(first)
             for path, draw in self._draws.items():

@@ -601,7 +601,9 @@ class _PictureField:
             total[i] = np.bincount(edges.cell, around, minlength=n)
         cell_um2 = self.grid.cell_area_um2
         mass = total[0] * cell_um2
-        return mass, total[1:].T * (cell_um2 * self.grid.pitch_xy_um) + mass[:, np.newaxis] * np.array(self.grid.origin_um)
+        return mass, total[1:].T * (cell_um2 * self.grid.pitch_xy_um) + mass[:, np.newaxis] * np.array(
+            self.grid.origin_um
+        )
 
     def along(self, start_um: Floats, stop_um: Floats) -> Any:
         edge, start, stop, at = self._pieces(start_um, stop_um)

@@ -47,6 +47,7 @@ class Imaging:
     falloff_power : int
         Of the cosine.
     grid : Grid
+        Of the images of the source pixels.
     padding : str
     pad : int
         Cells of padding on each side, at least.
@@ -56,8 +57,10 @@ class Imaging:
         How far geometry throws the light, at most.
     guard : int
         Cells around a patch of the field that its light reaches.
-    sinc_power : int
-        1 for points, 2 for square source pixels.
+    is_square_source : bool
+        Whether source pixels emit uniformly from their squares, instead of from their centres.
+    oversample : int
+        Cells of a map along a side of a source pixel.
     real : float32 or float64
     n_threads : int
     kept : function
@@ -76,7 +79,8 @@ class Imaging:
     f_max_per_um: float
     blur_cells: float
     guard: int
-    sinc_power: int
+    is_square_source: bool
+    oversample: int
     real: type[np.floating[Any]]
     n_threads: int
     kept: Kept
@@ -105,7 +109,8 @@ class Imaging:
             pitch_um=self.grid.pitch_x_um,
             f_max_per_um=self.f_max_per_um,
             blur_cells=self.blur_cells,
-            sinc_power=self.sinc_power,
+            is_square_source=self.is_square_source,
+            oversample=self.oversample,
             real=self.real,
             n_threads=self.n_threads,
         )
@@ -133,20 +138,23 @@ class Imaging:
             for b in (int(b) for b in np.flatnonzero(is_needed[c])):
                 if b not in spectra:
                     spectra[b] = spectrum_of(b)
-                # The last use of a spectrum may overwrite it.
                 is_last_use = not is_needed[c + 1 :, b].any()
                 is_first_term = total is None
+                spectrum = transform.refine(spectra[b])
+                # A copy, and the last use of a spectrum, may be overwritten.
+                is_free = is_last_use or spectrum is not spectra[b]
+                if is_last_use:
+                    del spectra[b]
                 if total is None:
-                    total = spectra[b] if is_last_use else np.empty_like(spectra[b])
+                    total = spectrum if is_free else np.empty_like(spectrum)
                 weight = output * self.light_w_m2[b]
                 factor = kept and kept(weight, transform, table_of)
                 if factor is None:
-                    transform.multiply(spectra[b], *table_of(weight), total, is_added=not is_first_term)
+                    transform.multiply(spectrum, *table_of(weight), total, is_added=not is_first_term)
                 else:
-                    transform.multiply_by(spectra[b], factor, total, is_added=not is_first_term)
-                if is_last_use:
-                    del spectra[b]
-            yield np.zeros(transform.shape, self.real) if total is None else transform.inverse(total)
+                    transform.multiply_by(spectrum, factor, total, is_added=not is_first_term)
+                del spectrum
+            yield np.zeros(transform.map_shape, self.real) if total is None else transform.inverse(total)
 
     def patch_maps(self, rows: _Piece, columns: _Piece, table_of: Tables) -> Iterator[NDArray[Any]]:
         """What a patch gives to every map, over the cells that its light reaches."""
@@ -195,18 +203,18 @@ def patchwork(
     A patch lies on the same endless repetition of the padded picture as the picture does without patches, so that patterns
     which are alike give the same maps either way, but for light that a point throws beyond the patch's guard.
     """
-    maps = np.zeros((len(imaging.weights), *imaging.grid.shape), imaging.real)
+    k = imaging.oversample
+    n_y, n_x = imaging.grid.shape
+    maps = np.zeros((len(imaging.weights), k * n_y, k * n_x), imaging.real)
     node_y_um, node_x_um = _nodes_um(imaging.grid, n_patches)
     row_sources, column_sources = imaging.sources()
     all_rows = _pieces(imaging, row_sources, imaging.grid.shape[0], node_y_um)
     all_columns = _pieces(imaging, column_sources, imaging.grid.shape[1], node_x_um)
     for y_um, rows in zip(node_y_um, all_rows, strict=True):
         for x_um, columns in zip(node_x_um, all_columns, strict=True):
-            seen = [
-                (piece.cells >= 0) & (piece.cells < n)
-                for piece, n in zip((rows, columns), imaging.grid.shape, strict=True)
-            ]
-            to = np.ix_(rows.cells[seen[0]], columns.cells[seen[1]])
+            fine = [(k * piece.cells[:, np.newaxis] + np.arange(k)).ravel() for piece in (rows, columns)]
+            seen = [(cells >= 0) & (cells < n) for cells, n in zip(fine, maps.shape[1:], strict=True)]
+            to = np.ix_(fine[0][seen[0]], fine[1][seen[1]])
             for c, given in enumerate(imaging.patch_maps(rows, columns, tables_at((float(x_um), float(y_um))))):
                 maps[c][to] += given[np.ix_(*seen)]
     yield from maps

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, types
 
-__all__ = ["alias_sum", "alias_sum_plane", "expose", "multiply", "transfer", "transfer_plane"]
+__all__ = ["alias_sum", "alias_sum_plane", "expose", "multiply", "replicate", "transfer", "transfer_plane"]
 
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 
@@ -60,6 +60,40 @@ def expose(rows, x2, y2, power, source_column, before, out):
             line[column] = middle[source_column[column]] if source_column[column] >= 0 else 0.0
         for column in range(before + n_x, line.size):
             line[column] = middle[source_column[column]] if source_column[column] >= 0 else 0.0
+
+
+@njit(
+    [
+        types.void(
+            types.Array(c, 2, "C", readonly=True),
+            types.int64,
+            types.Array(c, 1, "C", readonly=True),
+            types.Array(c, 1, "C", readonly=True),
+            types.int64,
+            types.int64,
+            c[:, ::1],
+        )
+        for c in (types.complex64, types.complex128)
+    ],
+    cache=True,
+    nogil=True,
+)
+def replicate(spectrum, n_columns, phase_x, phase_y, first_row, last_row, out):
+    """
+    Write some rows of a spectrum repeated over a larger range of frequencies, times ``phase_y[row] * phase_x[column]``.
+
+    ``spectrum`` is that of ``n_columns`` real samples along x: its columns run from zero frequency to at most half a cycle per
+    sample, and the others are the conjugates of the rows mirrored.
+    """
+    n_rows = spectrum.shape[0]
+    half = n_columns // 2
+    for row in range(first_row, last_row):
+        source = spectrum[row % n_rows]
+        mirrored = spectrum[(n_rows - row % n_rows) % n_rows]
+        for column in range(out.shape[1]):
+            at = column % n_columns
+            value = source[at] if at <= half else np.conj(mirrored[n_columns - at])
+            out[row, column] = value * (phase_y[row] * phase_x[column])
 
 
 @njit(
@@ -222,21 +256,39 @@ def transfer_plane(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far
                 out[row, ix] = spectrum[row, ix] * h[ix]
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _alias_gain(cycles, k, source_cells, is_alternating):
+    """
+    Factors ``sinc(f) * sinc(source_cells * f)`` of the aliases ``f = cycles + k``, (n_alias, n).
+
+    ``source_cells`` is the side of the source pixels in cells, 0 for points. With ``is_alternating`` odd aliases are negative.
+    """
+    gain = np.empty((k.size, cycles.size))
+    for a in range(k.size):
+        sign = -1.0 if is_alternating and k[a] % 2 else 1.0
+        for i in range(cycles.size):
+            f = cycles[i] + k[a]
+            gain[a, i] = sign * np.sinc(f) * np.sinc(source_cells * f)
+    return gain
+
+
 @njit(
     types.complex128[:, ::1](
-        types.Array(types.complex128, 2, "C", readonly=True), types.float64, _floats, types.int64, types.int64
+        types.Array(types.complex128, 2, "C", readonly=True),
+        types.float64,
+        _floats,
+        types.int64,
+        types.float64,
+        types.boolean,
     ),
     cache=True,
     nogil=True,
 )
-def alias_sum_plane(table, per_step, cycles, n_alias, sinc_power):
+def alias_sum_plane(table, per_step, cycles, n_alias, source_cells, is_alternating):
     """As :func:`alias_sum`, for a transfer function of any form: a square of complex numbers over f_y and f_x."""
     n = cycles.size
     k = np.arange(-n_alias, n_alias + 1)
-    gain = np.empty((k.size, n))
-    for a in range(k.size):
-        for i in range(n):
-            gain[a, i] = np.sinc(cycles[i] + k[a]) ** sinc_power
+    gain = _alias_gain(cycles, k, source_cells, is_alternating)
     total = np.zeros((n, n), np.complex128)
     for a in range(k.size):
         for b in range(k.size):
@@ -251,24 +303,26 @@ def alias_sum_plane(table, per_step, cycles, n_alias, sinc_power):
 
 @njit(
     types.float64[:, ::1](
-        types.Array(types.float64, 1, "C", readonly=True), types.float64, _floats, types.int64, types.int64
+        types.Array(types.float64, 1, "C", readonly=True),
+        types.float64,
+        _floats,
+        types.int64,
+        types.float64,
+        types.boolean,
     ),
     cache=True,
     nogil=True,
 )
-def alias_sum(table, per_step, cycles, n_alias, sinc_power):
+def alias_sum(table, per_step, cycles, n_alias, source_cells, is_alternating):
     """
-    Sum of ``table(|f + k|) * (sinc(f_x + k_x) * sinc(f_y + k_y)) ** sinc_power`` over all aliases but ``k = 0``.
+    Sum of ``table(|f + k|) * gain(f_x + k_x) * gain(f_y + k_y)`` over all aliases but ``k = 0``.
 
-    At the frequencies ``cycles`` x ``cycles``, in cycles per cell; ``per_step`` is steps of the table over them.
+    The factors are those of :func:`_alias_gain`. At the frequencies ``cycles`` x ``cycles``, in cycles per cell; ``per_step`` is steps of the table over them.
     """
     n = cycles.size
     last = table.size - 1
     k = np.arange(-n_alias, n_alias + 1)
-    gain = np.empty((k.size, n))
-    for a in range(k.size):
-        for i in range(n):
-            gain[a, i] = np.sinc(cycles[i] + k[a]) ** sinc_power
+    gain = _alias_gain(cycles, k, source_cells, is_alternating)
     total = np.zeros((n, n))
     for a in range(k.size):
         for b in range(k.size):

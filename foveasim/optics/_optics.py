@@ -6,7 +6,7 @@ import inspect
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -34,6 +34,15 @@ LOST_SHARE = 0.01
 PATCH_LOST_SHARE = 0.002
 #: The paper's Eq. 5 asks for an aperture radius much larger than H λ / (p0 min(M, N)): this many times.
 MUCH_LARGER = 10.0
+#: Finer cells than this along a source pixel are a mistake.
+MAX_OVERSAMPLE = 16
+#: Cells per λN from which on a photosite of side λN collects the light of a point to within 1e-3 of it, wherever its edges are,
+#: at second order: the largest error found over 600 positions is 1.3e-3 at 5 and 6e-4 at 6 (gallery/03_edges_and_cells.py).
+FINE_CELLS_PER_LAMBDA_N = 5.5
+#: A larger map does not fit into memory: 16 GiB in single precision.
+MAX_CELLS = 1 << 32
+#: Cells of a map that oversampling chosen automatically stays below: 512 MiB in single precision.
+MAX_AUTO_CELLS = 1 << 27
 PADDINGS = ("reflect", "edge", "zero", "periodic")
 
 
@@ -86,6 +95,11 @@ class Optics(PointImages):
         point throws further than its patch reaches, 0.2 % of its light, may come to a wrong place.
     source_pixel : {"point", "square"}
         Whether a picture's pixel shines from its centre (the paper) or evenly from its square.
+    oversample : int or "auto"
+        Cells of a map along a side of a source pixel, k: maps have k x k times the cells, each with its exact mean. ``"auto"``
+        is 1, but in a :class:`foveasim.Camera`, which chooses k by :meth:`auto_oversample` for each scene. Finer cells resolve
+        the irradiance under photosites whose edges cut cells. They also resolve the lattice of the emitters where source
+        pixels emit from their centres and are wider than λN; take ``source_pixel="square"`` there.
     padding : {"reflect", "edge", "zero", "periodic"}
         What lies beyond the picture. ``"periodic"`` adds nothing: light that leaves on one side enters on the other,
         so that none is lost.
@@ -135,6 +149,7 @@ class Optics(PointImages):
     lateral_colour: LateralColour | None = None
     field_patches: int = 5
     source_pixel: Literal["point", "square"] = "point"
+    oversample: int | Literal["auto"] = "auto"
     padding: Literal["reflect", "edge", "zero", "periodic"] = "reflect"
     padding_cells: int | None = None
     precision: Literal["single", "double"] = "single"
@@ -162,6 +177,8 @@ class Optics(PointImages):
         }
         if self.focus_distance_m is not None:
             numbers["focus_distance_m"] = self._check_distance("focus_distance_m", self.focus_distance_m)
+        if self.oversample != "auto":
+            numbers["oversample"] = check_count("oversample", self.oversample, at_most=MAX_OVERSAMPLE)
         numbers["field_patches"] = check_count("field_patches", self.field_patches, at_most=64)
         if self.padding_cells is not None:
             numbers["padding_cells"] = check_count("padding_cells", self.padding_cells, at_least=0, at_most=2**20)
@@ -250,16 +267,60 @@ class Optics(PointImages):
 
     def image_grids(self, scene: SceneLike) -> list[tuple[Grid, Bools]]:
         """
-        Grids on which the pixels are imaged, each with the wavelengths that it is of, (n_wavelength,) bool.
+        Grids of the cells of maps, each with the wavelengths that it is of, (n_wavelength,) bool.
 
-        One, unless lateral colour makes images of different sizes: the pixels of a larger image are larger, and no picture is
+        One, ``oversample`` times finer than :meth:`grid`, unless lateral colour makes images of different sizes: the pixels of a larger image are larger, and no picture is
         resampled.
         """
         grid = self.grid(scene)
         if self.lateral_colour is None:
-            return [(grid, np.ones(scene.wavelength_nm.size, bool))]
+            return [(self._refined(grid), np.ones(scene.wavelength_nm.size, bool))]
         sizes = self.lateral_colour.at(scene.wavelength_nm)
-        return [(Grid.centred(grid.shape, grid.pitch_x_um * float(size)), sizes == size) for size in np.unique(sizes)]
+        return [
+            (self._refined(Grid.centred(grid.shape, grid.pitch_x_um * float(size))), sizes == size)
+            for size in np.unique(sizes)
+        ]
+
+    @property
+    def _n_fine(self) -> int:
+        """Cells along a side of a source pixel."""
+        return 1 if self.oversample == "auto" else self.oversample
+
+    def _refined(self, grid: Grid) -> Grid:
+        """The cells of a map on a grid of source pixels."""
+        n_y, n_x = grid.shape
+        return Grid((self._n_fine * n_y, self._n_fine * n_x), grid.pitch_x_um / self._n_fine, grid.origin_um)
+
+    def resolved(self, scene: SceneLike) -> Optics:
+        """Return the lens with ``oversample`` as a number, chosen for a scene where it is "auto"; both share their tables."""
+        if self.oversample != "auto":
+            return self
+        lens = replace(self, oversample=self.auto_oversample(scene))
+        object.__setattr__(lens, "_cache", self._cache)
+        return lens
+
+    def auto_oversample(self, scene: SceneLike) -> int:
+        """
+        Choose how many times finer than source pixels the cells of a map should be.
+
+        Parameters
+        ----------
+        scene : Scene
+
+        Returns
+        -------
+        k : int
+            The smallest with at least 5.5 cells per λN at the shortest wavelength, so that the fraction of a point's light that a
+            photosite of side λN collects is within 1e-3 at second order. Less where the map would have more than 2^27 cells,
+            and 1 where a source pixel is wider than λN: there a picture is no sampled image of its scene, and its emitters
+            would be resolved one by one.
+        """
+        per_lambda_n = float(self._lambda_n_um(scene).min()) / self.grid(scene).pitch_x_um
+        if per_lambda_n < 1.0:
+            return 1
+        wanted = math.ceil(FINE_CELLS_PER_LAMBDA_N / per_lambda_n * (1.0 - 1e-9))
+        affordable = math.isqrt(MAX_AUTO_CELLS // math.prod(scene.basis.shape[1:])) if scene.basis.size else 1
+        return max(1, min(wanted, affordable))
 
     def irradiance_per_radiance(self, distance_m: float) -> float:
         """Irradiance on the axis over the scene's radiance (sr), transmission included."""
@@ -298,16 +359,17 @@ class Optics(PointImages):
         Returns
         -------
         PowerMap
-            (n_wavelength, n_y, n_x), float32 or float64 as ``precision`` says, W/m² within each wavelength's band.
+            (n_wavelength, k n_y, k n_x) with k = ``oversample``, float32 or float64 as ``precision`` says, W/m² within each
+            wavelength's band.
 
         Raises
         ------
         ParameterError, SimulationError
             When the scene is too near, or not finite.
         """
-        grid = self.grid(scene)
+        grid = self._refined(self.grid(scene))
         n_bands = scene.wavelength_nm.size
-        data = np.empty((n_bands, *scene.basis.shape[1:]), self._real_type())
+        data = np.empty((n_bands, *grid.shape), self._real_type())
         for band, cells in enumerate(self.weighted_maps(scene, np.eye(n_bands), n_threads=n_threads)):
             data[band] = cells
         return PowerMap(data, grid, scene.wavelength_nm)
@@ -324,14 +386,14 @@ class Optics(PointImages):
         weights : (n_output, n_wavelength) float64
             Output c is ``sum_k weights[c, k] * power_map[k]``.
         grid : Grid, optional
-            One of :meth:`image_grids`, whose wavelengths alone have weights. By default :meth:`grid`: images of other sizes are
-            put on it by the areas that their pixels share with its cells.
+            One of :meth:`image_grids`, whose wavelengths alone have weights. By default the one without lateral colour: images
+            of other sizes are put on it by the areas that their cells share with its own.
         n_threads : int, optional
             All cores by default.
 
         Returns
         -------
-        maps : iterator of (n_y, n_x) float32 or float64
+        maps : iterator of (k n_y, k n_x) float32 or float64
             Each is computed when it is asked for.
 
         Notes
@@ -340,7 +402,7 @@ class Optics(PointImages):
         images, the cost is B forward transforms and one inverse transform an output, for any number of wavelengths.
         Lateral colour costs that for each size of image, and aberrations that differ over the field for each patch.
         """
-        common = self.grid(scene)
+        common = self._refined(self.grid(scene))
         weights = finite_array("weights", weights, ndim=2)
         if weights.shape[1] != scene.wavelength_nm.size:
             raise ParameterError(
@@ -350,12 +412,16 @@ class Optics(PointImages):
         if grid is not None and not grid.is_square:
             raise ParameterError("grid", "must have square cells, as a scene's pixels are", grid.pitch_um, "µm")
         self._warn_if_too_small(self._lambda_n_um(scene), common)
+        if math.prod(common.shape) > MAX_CELLS:
+            raise ParameterError(
+                "oversample", f"must give a map of at most {MAX_CELLS:,} cells, got {common.shape}", self.oversample
+            )
         if grid is not None or self.lateral_colour is None:
             return self._maps(scene, weights, grid or common, thread_count(n_threads))
         return self._maps_on_one_grid(scene, weights, thread_count(n_threads))
 
     def _maps_on_one_grid(self, scene: SceneLike, weights: Floats, n_threads: int) -> Iterator[NDArray[Any]]:
-        to = self.grid(scene)
+        to = self._refined(self.grid(scene))
         groups = self.image_grids(scene)
         onto = [[overlaps(n, to.pitch_x_um, n, grid.pitch_x_um) for n in to.shape] for grid, _ in groups]
         for output in weights:
@@ -372,6 +438,7 @@ class Optics(PointImages):
         lambda_n_um = self._lambda_n_um(scene)
         aperture = self._aperture(scene.distance_m)
         is_clear_circle = self._is_clear_circle(aperture)
+        pixels = Grid.centred((scene.basis.shape[1], scene.basis.shape[2]), grid.pitch_x_um * self._n_fine)
         if is_clear_circle:
             lambda_n_um = np.maximum(lambda_n_um, grid.pitch_x_um / MAX_ALIASES)
         share = np.array([aperture.transmittance(float(w)) for w in scene.wavelength_nm])
@@ -380,7 +447,7 @@ class Optics(PointImages):
         )
         tangent2_x, tangent2_y = self._squared_tangents(scene)
         # What a factor on a spectrum hangs on, beside the lens and the weights.
-        light = scene.wavelength_nm.tobytes(), scene.distance_m, grid.shape, grid.pitch_x_um
+        light = scene.wavelength_nm.tobytes(), scene.distance_m, grid.shape, grid.pitch_x_um, self._n_fine
 
         def kept(weight: Floats, transform: Transform, table_of: Tables) -> NDArray[Any] | None:
             n_numbers = math.prod(transform.spectrum_shape) * (1 if is_clear_circle else 2)
@@ -388,20 +455,21 @@ class Optics(PointImages):
 
         imaging = Imaging(
             basis=scene.basis,
-            light_w_m2=light_w_m2 * (scene.pitch_um * self.magnification(scene.distance_m) / grid.pitch_x_um) ** 2,
+            light_w_m2=light_w_m2 * (scene.pitch_um * self.magnification(scene.distance_m) / pixels.pitch_x_um) ** 2,
             weights=weights,
             tangent2_x=tangent2_x,
             tangent2_y=tangent2_y,
             falloff_power=4 if self.emission == "lambertian" else 3,
-            grid=grid,
+            grid=pixels,
             padding=self.padding,
-            pad=self._reach(scene, grid, aperture, lambda_n_um, LOST_SHARE)
+            pad=self._reach(scene, pixels, aperture, lambda_n_um, LOST_SHARE)
             if self.padding_cells is None
             else self.padding_cells,
-            guard=self._reach(scene, grid, aperture, lambda_n_um, PATCH_LOST_SHARE),
-            blur_cells=self._blur_um(scene, grid, aperture, lambda_n_um) / grid.pitch_x_um,
+            guard=self._reach(scene, pixels, aperture, lambda_n_um, PATCH_LOST_SHARE),
+            blur_cells=self._blur_um(scene, pixels, aperture, lambda_n_um) / pixels.pitch_x_um,
             f_max_per_um=1.0 / float(lambda_n_um.min()),
-            sinc_power=1 if self.source_pixel == "point" else 2,
+            is_square_source=self.source_pixel == "square",
+            oversample=self._n_fine,
             real=self._real_type(),
             n_threads=n_threads,
             kept=kept,

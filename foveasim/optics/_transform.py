@@ -4,6 +4,11 @@ Fourier transforms of pictures of one size, and what is done to their spectra.
 Cells are means of the irradiance: points at cell centres have a spectrum that repeats with 1/p, and the mean over a cell
 multiplies frequency f by sinc(f p), a square source pixel once more. Every alias f + k/p passes with the pupil's factor at
 f + k/p, so that a cell's mean is exact whether it is smaller than the diffraction pattern or larger.
+
+Cells may be k times finer than the source pixels. The spectrum of points at the centres of source pixels is known at all
+frequencies, since it repeats: it is written k x k times side by side, multiplied by the factors of the fine cells, and
+transformed back at k times the size. The centre of the first fine cell lies (p - p/k) / 2 before that of the first source pixel,
+which is a phase.
 """
 
 from __future__ import annotations
@@ -76,26 +81,48 @@ class Transform:
         pitch_um: float,
         f_max_per_um: float,
         blur_cells: float,
-        sinc_power: int,
+        is_square_source: bool,
+        oversample: int,
         real: type[np.floating[Any]],
         n_threads: int,
     ) -> None:
-        self.shape, self._rows, self._columns = shape, rows, columns
-        self._real, self._n_threads = real, n_threads
+        self._picture_shape, self._rows, self._columns = shape, rows, columns
+        self._real, self._n_threads, self._oversample = real, n_threads, oversample
         self._kernels = kernels("optics")  # once, before there are threads
-        self._n_alias = min(MAX_ALIASES, max(0, math.ceil(f_max_per_um * pitch_um - 0.5)))
-        self._pitch_um, self._sinc_power = pitch_um, sinc_power
-        self._n_plane_nodes = 2 * ALIAS_NODES + math.ceil(NODES_PER_CELL * blur_cells)
+        self._n_rows = oversample * rows.size
+        self._pitch_um = pitch_um / oversample
+        f_max = f_max_per_um * self._pitch_um
+        self._n_alias = min(MAX_ALIASES, max(0, math.ceil(f_max - 0.5)))
+        self._source_cells = float(oversample) if is_square_source else 0.0
+        # The phase of an alias differs from that of its frequency by the factor -1 where the cells divide a pixel evenly.
+        self._is_alternating = oversample % 2 == 0
+        self._n_plane_nodes = 2 * ALIAS_NODES + math.ceil(NODES_PER_CELL * blur_cells * oversample)
         n_near = self._n_alias if self._n_alias <= DIRECT_ALIASES else 0
         k = np.arange(-n_near, n_near + 1)[:, np.newaxis]
-        cycles_y = scipy.fft.fftfreq(rows.size) + k
-        cycles_x = scipy.fft.rfftfreq(columns.size) + k
+        cycles_y = scipy.fft.fftfreq(self._n_rows) + k
+        cycles_x = scipy.fft.rfftfreq(oversample * columns.size) + k
         if self._n_alias == 0:
-            cycles_x = cycles_x[:, : int(np.searchsorted(cycles_x[0], f_max_per_um * pitch_um)) + 1]
+            cycles_x = cycles_x[:, : int(np.searchsorted(cycles_x[0], f_max)) + 1]
         self._n_columns = cycles_x.shape[1]
-        self._fx_per_um, self._fy_per_um = (cycles_x / pitch_um).astype(real), (cycles_y / pitch_um).astype(real)
-        self._gain_x, self._gain_y = ((np.sinc(c) ** sinc_power).astype(real) for c in (cycles_x, cycles_y))
+        self._fx_per_um, self._fy_per_um = ((cycles / self._pitch_um).astype(real) for cycles in (cycles_x, cycles_y))
+        sign = np.where(self._is_alternating & (k % 2 == 1), -1.0, 1.0)
+        self._gain_x, self._gain_y = (
+            (sign * np.sinc(cycles) * np.sinc(self._source_cells * cycles)).astype(real)
+            for cycles in (cycles_x, cycles_y)
+        )
         self._cycles_x, self._cycles_y = cycles_x[n_near], cycles_y[n_near]
+
+    @property
+    def map_shape(self) -> tuple[int, int]:
+        """Rows and columns of a map's cells."""
+        n_y, n_x = self._picture_shape
+        return self._oversample * n_y, self._oversample * n_x
+
+    @property
+    def _before(self) -> tuple[int, int]:
+        """Rows and columns of padding before the picture."""
+        n_y, n_x = self._picture_shape
+        return (self._rows.size - n_y) // 2, (self._columns.size - n_x) // 2
 
     def _far_aliases(self, table: NDArray[Any], per_step: float) -> tuple[NDArray[Any], NDArray[Any]]:
         """
@@ -115,7 +142,8 @@ class Transform:
             per_step / self._pitch_um,
             0.25 * (nodes + 1.0) if is_radial else 0.5 * nodes,
             self._n_alias,
-            self._sinc_power,
+            self._source_cells,
+            self._is_alternating,
         )
         y_modes, sizes, x_modes = np.linalg.svd(at_nodes)
         zero = table[0] if is_radial else table[table.shape[0] // 2, table.shape[0] // 2]
@@ -144,16 +172,16 @@ class Transform:
 
     def forward(self, image: Images, x2: Floats, y2: Floats, falloff_power: int) -> NDArray[Any]:
         """Spectrum of a picture with falloff and padding."""
-        n_y, n_x = self.shape
-        top, left = (self._rows.size - n_y) // 2, (self._columns.size - n_x) // 2
-        spectrum = np.empty((self._rows.size, self._n_columns), np.result_type(self._real, np.complex64))
+        (n_y, _), (top, left) = self._picture_shape, self._before
+        n_columns = min(self._n_columns, self._columns.size // 2 + 1)
+        spectrum = np.empty((self._rows.size, n_columns), np.result_type(self._real, np.complex64))
         x2, y2 = x2.astype(self._real), y2.astype(self._real)
 
         def some_rows(first: int, last: int) -> None:
             padded = np.empty((last - first, self._columns.size), self._real)
             rows = np.ascontiguousarray(image[first:last])
             self._kernels.expose(rows, x2, y2[first:last], falloff_power, self._columns, left, padded)
-            spectrum[top + first : top + last] = scipy.fft.rfft(padded, axis=1, overwrite_x=True)[:, : self._n_columns]
+            spectrum[top + first : top + last] = scipy.fft.rfft(padded, axis=1, overwrite_x=True)[:, :n_columns]
 
         self._each_rows(some_rows, n_y)
         for row in (*range(top), *range(top + n_y, self._rows.size)):
@@ -162,6 +190,24 @@ class Transform:
         if not np.isfinite(spectrum[0, 0]):
             raise SimulationError("the scene has values that are not finite")
         return spectrum
+
+    def refine(self, spectrum: NDArray[Any]) -> NDArray[Any]:
+        """Spectrum of the points over the frequencies of the map's cells; the same array where cells are source pixels."""
+        if self._oversample == 1:
+            return spectrum
+        # k² as many cells share the sum of the points. The phases move the origin to the first fine cell.
+        phase_x, phase_y = (
+            (self._oversample * np.exp(-1j * np.pi * (self._oversample - 1) * cycles)).astype(spectrum.dtype)
+            for cycles in (self._cycles_x, self._cycles_y)
+        )
+        out = np.empty(self.spectrum_shape, spectrum.dtype)
+        self._each_rows(
+            lambda first, last: self._kernels.replicate(
+                spectrum, self._columns.size, phase_x, phase_y, first, last, out
+            ),
+            self._n_rows,
+        )
+        return out
 
     def multiply(
         self, spectrum: NDArray[Any], table: NDArray[Any], per_step: float, out: NDArray[Any], *, is_added: bool
@@ -197,7 +243,7 @@ class Transform:
     @property
     def spectrum_shape(self) -> tuple[int, int]:
         """Rows and columns of a spectrum."""
-        return self._rows.size, self._n_columns
+        return self._n_rows, self._n_columns
 
     def factor(self, table: NDArray[Any], per_step: float) -> NDArray[Any]:
         """What :meth:`multiply` multiplies by, as an array of the spectrum's shape; real for a radial table."""
@@ -213,13 +259,13 @@ class Transform:
 
     def inverse(self, spectrum: NDArray[Any]) -> NDArray[Any]:
         """The picture of a spectrum, without its padding; the spectrum is used up."""
-        n_y, n_x = self.shape
-        top, left = (self._rows.size - n_y) // 2, (self._columns.size - n_x) // 2
+        n_y, n_x = self.map_shape
+        top, left = (self._oversample * before for before in self._before)
         lines = scipy.fft.ifft(spectrum, axis=0, overwrite_x=True, workers=self._n_threads)
-        image = np.empty(self.shape, self._real)
+        image = np.empty(self.map_shape, self._real)
 
         def some_rows(first: int, last: int) -> None:
-            padded = scipy.fft.irfft(lines[top + first : top + last], n=self._columns.size, axis=1)
+            padded = scipy.fft.irfft(lines[top + first : top + last], n=self._oversample * self._columns.size, axis=1)
             image[first:last] = padded[:, left : left + n_x]
 
         self._each_rows(some_rows, n_y)

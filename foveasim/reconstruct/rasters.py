@@ -123,7 +123,8 @@ def blur_kernel(
     cycles_per_um = np.fft.fftfreq(n_points, step_um)
     centre_um, offset = 0.5 * (n_points - 1) * step_um, np.arange(-radius, radius + 1)
     along_y, along_x = (
-        np.exp(2j * np.pi * np.outer(centre_um + offset * pitch_um, cycles_per_um)) * np.sinc(pitch_um * cycles_per_um) ** 2
+        np.exp(2j * np.pi * np.outer(centre_um + offset * pitch_um, cycles_per_um))
+        * np.sinc(pitch_um * cycles_per_um) ** 2
         for pitch_um in (grid.pitch_y_um, grid.pitch_x_um)
     )
     means = (along_y @ np.fft.fft2(spread.share_per_um2) @ along_x.T).real

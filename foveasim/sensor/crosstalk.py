@@ -16,7 +16,16 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, Ints, as_numbers, check_choice, check_length_um, check_number, check_pitch_um, finite_array
+from foveasim.arrays import (
+    Floats,
+    Ints,
+    as_numbers,
+    check_choice,
+    check_length_um,
+    check_number,
+    check_pitch_um,
+    finite_array,
+)
 from foveasim.errors import ParameterError, SimulationError
 
 if TYPE_CHECKING:

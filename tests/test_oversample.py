@@ -1,0 +1,207 @@
+"""Cells of power maps finer than the source pixels: exact means, and photosites as small as the PSF."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import j1
+
+import foveasim as fs
+from foveasim.errors import SamplingWarning
+
+DISTANCE_M = 1.0
+WAVELENGTH_NM = 500.0
+OPTICS = fs.Optics(focal_length_mm=10.0, f_number=4.0, precision="double", padding="periodic")
+LAMBDA_N_UM = 1e-3 * WAVELENGTH_NM * OPTICS.working_f_number(DISTANCE_M)
+
+
+def pitch_of(cells_per_lambda_n):
+    """Pixel pitch of a scene whose image has a number of pixels per λN."""
+    return LAMBDA_N_UM / cells_per_lambda_n / OPTICS.magnification(DISTANCE_M)
+
+
+def points_of(cells_per_lambda_n, shape, pixels):
+    return fs.Scene.point_sources(
+        shape=shape,
+        pixels=pixels,
+        intensity_w_sr_nm=1.0,
+        pitch_um=pitch_of(cells_per_lambda_n),
+        distance_m=DISTANCE_M,
+        wavelength_nm=WAVELENGTH_NM,
+        band_width_nm=1.0,
+    )
+
+
+def block_means(cells, k):
+    n_y, n_x = cells.shape
+    return cells.reshape(n_y // k, k, n_x // k, k).mean(axis=(1, 3))
+
+
+def airy_energy(centre, sides):
+    """Energy of the Airy pattern in rectangles around points, all in λN: Gauss quadrature of (2 J1(πr) / πr)² π/4."""
+    node, weight = np.polynomial.legendre.leggauss(24)
+    found = []
+    for (x, y), (width, height) in zip(centre, sides, strict=True):
+        r = np.pi * np.hypot(*np.meshgrid(x + 0.5 * width * node, y + 0.5 * height * node)) + 1e-12
+        found.append(0.25 * width * height * np.pi / 4 * ((2.0 * j1(r) / r) ** 2 * np.outer(weight, weight)).sum())
+    return np.array(found)
+
+
+@pytest.mark.parametrize("k", [2, 3, 4, 5])
+@pytest.mark.parametrize("cells_per_lambda_n", [0.3, 0.7, 1.2, 3.0])
+@pytest.mark.parametrize("source_pixel", ["point", "square"])
+@pytest.mark.parametrize("pupil", ["circle", "coma"])
+def test_fine_cells_average_to_source_cells(k, cells_per_lambda_n, source_pixel, pupil):
+    optics = replace(OPTICS, source_pixel=source_pixel)
+    if pupil == "coma":
+        optics = replace(optics, pupil=fs.optics.Blades(5), zernike=fs.optics.Zernike(coefficients={7: 0.1, 5: 0.05}))
+    scene = points_of(cells_per_lambda_n, (66, 70), [(10, 50), (45, 3)])
+    coarse = optics.power_map(scene)
+    fine = replace(optics, oversample=k).power_map(scene)
+
+    assert fine.grid.bounds_um == pytest.approx(coarse.grid.bounds_um, rel=1e-12)
+    assert fine.grid.shape == (66 * k, 70 * k)
+    # Many aliases are summed through a fit: 3e-7 of the peak for a circle, 1e-4 for other pupils.
+    tolerance = {"circle": 1e-6, "coma": 1e-4}[pupil] if cells_per_lambda_n < 0.7 else 1e-12
+    np.testing.assert_allclose(block_means(fine.data[0], k), coarse.data[0], atol=tolerance * coarse.data.max())
+
+
+@pytest.mark.parametrize(("cells_per_lambda_n", "k"), [(0.5, 2), (0.7, 3), (1.2, 2), (2.0, 2), (1.0, 5)])
+def test_fine_cells_hold_the_airy_energy(cells_per_lambda_n, k):
+    n = 160
+    scene = points_of(cells_per_lambda_n, (n, n), [(n // 2, n // 2)])
+    fine = replace(OPTICS, oversample=k).power_map(scene)
+    at_um = -0.5 * n * LAMBDA_N_UM / cells_per_lambda_n + (n // 2 + 0.5) * LAMBDA_N_UM / cells_per_lambda_n
+    near = slice(k * n // 2 - 2 * k, k * n // 2 + 3 * k)
+    x, y = np.meshgrid(fine.grid.x_um[near] - at_um, fine.grid.y_um[near] - at_um)
+    centre = np.stack((x.ravel(), y.ravel()), axis=1) / LAMBDA_N_UM
+    sides = np.full(centre.shape, fine.grid.pitch_x_um / LAMBDA_N_UM)
+    got = fine.data[0, near, near].ravel() / fine.data.sum()
+
+    # A periodic picture of 80 λN or more returns the 0.25 % of the energy beyond it to all cells alike.
+    np.testing.assert_allclose(got, airy_energy(centre, sides), atol=2e-3 * sides[0, 0] ** 2)
+
+
+@pytest.mark.parametrize("padding", ["reflect", "zero", "periodic"])
+@pytest.mark.parametrize("source_pixel", ["point", "square"])
+def test_flat_scene_stays_flat_on_fine_cells(padding, source_pixel):
+    optics = replace(OPTICS, padding=padding, source_pixel=source_pixel, oversample=3)
+    scene = fs.Scene.flat(
+        shape=(80, 90),
+        pitch_um=pitch_of(1.3),
+        distance_m=DISTANCE_M,
+        radiance_w_m2_sr_nm=1.0,
+        wavelength_nm=WAVELENGTH_NM,
+        band_width_nm=1.0,
+    )
+    data = optics.power_map(scene).data[0]
+    middle = data[90:150, 90:180]
+
+    # Off the axis by at most 0.03 mm at 10 mm. Zeros beyond the picture take the wings of the PSF.
+    assert np.ptp(middle) / middle.mean() < (0.02 if padding == "zero" else 5e-5)
+
+
+@pytest.mark.parametrize("cells_per_lambda_n", [1.0, 1.2, 1.5, 2.0, 3.0, 4.5])
+def test_auto_oversample_bounds_pixel_error(cells_per_lambda_n):
+    """The fraction of a point's energy in pixels of side λN anywhere around it, against quadrature of the Airy pattern."""
+    n = int(80 * cells_per_lambda_n) // 2 * 2
+    scene = points_of(cells_per_lambda_n, (n, n), [(n // 2, n // 2)])
+    point_um = 0.5 * LAMBDA_N_UM / cells_per_lambda_n
+    offset = np.random.default_rng(5).uniform(-1.5, 1.5, (400, 2))
+    everything = [[0.0, 0.0, 0.999 * n * LAMBDA_N_UM / cells_per_lambda_n]]
+    squares = np.concatenate(
+        (np.column_stack((point_um + offset * LAMBDA_N_UM, np.full(400, LAMBDA_N_UM))), everything)
+    )
+    layout = fs.Layout.from_rectangles(squares[:, :2], squares[:, 2:] * [1.0, 1.0])
+    truth = airy_energy(offset, np.ones((400, 2)))
+    errors = {}
+    for oversample in ("auto", 1):
+        camera = fs.Camera(optics=replace(OPTICS, oversample=oversample), sensor=fs.Sensor(layout))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", SamplingWarning)
+            rate = camera.photoelectrons_per_s(scene)
+        errors[oversample] = np.abs(rate[:-1] / rate[-1] - truth).max()
+
+    assert errors["auto"] < 1e-3
+    assert errors[1] > 1.3e-3
+
+
+def test_capture_settings_contain_oversample():
+    sensor = fs.Sensor(fs.layout.grid(n_x=10, n_y=10, pitch_um=2.0))
+    camera = fs.Camera(optics=replace(OPTICS, padding="reflect"), sensor=sensor)
+    capture = camera.capture(points_of(1.5, (100, 100), [(50, 50)]), exposure_s=1e-3, seed=0)
+
+    assert capture.settings["oversample"] == 4  # 5.5 / 1.5, rounded up
+    assert capture.settings["integration_order"] == 2
+    assert camera.power_map(points_of(1.5, (100, 100), [(50, 50)])).grid.shape == (400, 400)
+
+
+def test_wide_source_pixels_are_not_oversampled():
+    """Pixels wider than λN: finer cells would show each emitter by itself."""
+    scene = points_of(0.9, (120, 120), [(60, 60)])
+    sensor = fs.Sensor(fs.layout.grid(n_x=10, n_y=10, pitch_um=2.0))
+    auto, plain = (fs.Camera(optics=replace(OPTICS, oversample=k), sensor=sensor) for k in ("auto", 1))
+
+    assert auto.oversample(scene) == 1
+    assert (auto.photoelectrons_per_s(scene) == plain.photoelectrons_per_s(scene)).all()
+
+
+def test_auto_oversample_stays_within_memory():
+    """Maps of at most 2^27 cells: the pixels of a large scene are divided less, or not at all."""
+    for shape, expected in (((1000, 1000), 4), ((5000, 4000), 2), ((6000, 6000), 1)):
+        scene = fs.Scene.flat(
+            shape=shape,
+            pitch_um=pitch_of(1.4),
+            distance_m=DISTANCE_M,
+            radiance_w_m2_sr_nm=1.0,
+            wavelength_nm=WAVELENGTH_NM,
+            band_width_nm=1.0,
+        )
+        assert OPTICS.auto_oversample(scene) == expected
+
+
+def test_field_patches_and_lateral_colour_oversample():
+    """Each band on the grid of its own image size, with aberrations that grow from the axis."""
+    optics = replace(
+        OPTICS,
+        padding="reflect",
+        seidel=fs.optics.Seidel(coma_um=0.3, field_radius_um=60.0),
+        lateral_colour=fs.optics.LateralColour(wavelength_nm=(450.0, 650.0), magnification=(0.99, 1.01)),
+    )
+    scene = fs.Scene.point_sources(
+        shape=(60, 64),
+        pixels=[(30, 32), (12, 50)],
+        intensity_w_sr_nm=1.0,
+        pitch_um=pitch_of(1.3),
+        distance_m=DISTANCE_M,
+        wavelength_nm=[450.0, 650.0],
+        band_width_nm=1.0,
+    )
+    for which in (0, 1):
+        maps = {}
+        for k in (1, 3):
+            lens = replace(optics, oversample=k)
+            grid, is_on_it = lens.image_grids(scene)[which]
+            maps[k] = next(lens.weighted_maps(scene, is_on_it[np.newaxis].astype(float), grid=grid))
+            assert grid.shape == (60 * k, 64 * k)
+
+        np.testing.assert_allclose(block_means(maps[3], 3), maps[1], atol=1e-5 * maps[1].max())
+
+
+@pytest.mark.parametrize("oversample", [0, 17, 1.5, "fine"])
+def test_bad_oversample_raises_by_name(oversample):
+    with pytest.raises(fs.errors.ParameterError, match="oversample"):
+        replace(OPTICS, oversample=oversample)
+
+
+def test_negative_sites_of_coarse_cells_warn():
+    """Order 2 asked for on cells wider than the PSF: gradients at a point overshoot below 0."""
+    scene = points_of(0.8, (60, 60), [(30, 30)])
+    cell_um = LAMBDA_N_UM / 0.8
+    layout = fs.layout.grid(n_x=40, n_y=40, pitch_um=0.25 * cell_um).translate(0.5 * cell_um, 0.5 * cell_um)
+    camera = fs.Camera(optics=replace(OPTICS, padding="reflect"), sensor=fs.Sensor(layout), order=2)
+    with pytest.warns(SamplingWarning, match=r"negative, [\d.]+ % of all, .* take order=1, or finer cells"):
+        rate = camera.photoelectrons_per_s(scene)
+
+    assert rate.min() == 0.0
