@@ -193,8 +193,8 @@ class Camera:
         Returns
         -------
         PowerMap
-            (n_wavelength, n_y, n_x): :meth:`Optics.power_map` with :meth:`oversample` cells along a source pixel, centred on the
-            principal point of the distortion model. Capturing it gives the capture of the scene at the same ``order``.
+            (n_wavelength, n_y, n_x): :meth:`Optics.power_map` with :meth:`oversample` cells along a source pixel, centred on
+            the principal point of the distortion model. Capturing it gives the capture of the scene at the same ``order``.
 
         Raises
         ------

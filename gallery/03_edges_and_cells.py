@@ -1,11 +1,11 @@
 """
 How wrong is the light in a pixel whose edges cut the map's cells?
 
-New here: the limit of a map that is constant on its cells, and how it shrinks; Optics(oversample=k), cells finer than the pixels
-of the scene, and what they cost.
+New here: the limit of a map that is constant on its cells, and how it shrinks; Optics(oversample=k), cells finer than the
+pixels of the scene, and what they cost.
 
-Expect: an error that falls as the power -2 of the number of cells (within 0.25), and none where edges lie on cell borders; with the
-oversampling that a camera chooses, at most 1e-3 of a point's energy in a pixel of side wavelength x f-number, anywhere.
+Expect: an error that falls as the power -2 of the number of cells (within 0.25), and none where edges lie on cell borders;
+with the oversampling that a camera chooses, at most 1e-3 of a point's energy in any pixel of side wavelength x f-number.
 """
 
 from __future__ import annotations

@@ -317,7 +317,8 @@ def alias_sum(table, per_step, cycles, n_alias, source_cells, is_alternating):
     """
     Sum of ``table(|f + k|) * gain(f_x + k_x) * gain(f_y + k_y)`` over all aliases but ``k = 0``.
 
-    The factors are those of :func:`_alias_gain`. At the frequencies ``cycles`` x ``cycles``, in cycles per cell; ``per_step`` is steps of the table over them.
+    The factors are those of :func:`_alias_gain`. At the frequencies ``cycles`` x ``cycles``, in cycles per cell; ``per_step``
+    is steps of the table over them.
     """
     n = cycles.size
     last = table.size - 1

@@ -269,8 +269,8 @@ class Optics(PointImages):
         """
         Grids of the cells of maps, each with the wavelengths that it is of, (n_wavelength,) bool.
 
-        One, ``oversample`` times finer than :meth:`grid`, unless lateral colour makes images of different sizes: the pixels of a larger image are larger, and no picture is
-        resampled.
+        One, ``oversample`` times finer than :meth:`grid`, unless lateral colour makes images of different sizes: the pixels of
+        a larger image are larger, and no picture is resampled.
         """
         grid = self.grid(scene)
         if self.lateral_colour is None:
@@ -310,10 +310,9 @@ class Optics(PointImages):
         Returns
         -------
         k : int
-            The smallest with at least 5.5 cells per λN at the shortest wavelength, so that the fraction of a point's light that a
-            photosite of side λN collects is within 1e-3 at second order. Less where the map would have more than 2^27 cells,
-            and 1 where a source pixel is wider than λN: there a picture is no sampled image of its scene, and its emitters
-            would be resolved one by one.
+            The smallest with at least 5.5 cells per λN at the shortest wavelength, so that the fraction of a point's energy
+            that a photosite of side λN collects is within 1e-3 at second order. Less where the map would have more than 2^27
+            cells, and 1 where source pixels are wider than λN: finer cells would resolve their emitters one by one.
         """
         per_lambda_n = float(self._lambda_n_um(scene).min()) / self.grid(scene).pitch_x_um
         if per_lambda_n < 1.0:

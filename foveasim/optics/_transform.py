@@ -7,8 +7,8 @@ f + k/p, so that a cell's mean is exact whether it is smaller than the diffracti
 
 Cells may be k times finer than the source pixels. The spectrum of points at the centres of source pixels is known at all
 frequencies, since it repeats: it is written k x k times side by side, multiplied by the factors of the fine cells, and
-transformed back at k times the size. The centre of the first fine cell lies (p - p/k) / 2 before that of the first source pixel,
-which is a phase.
+transformed back at k times the size. The centre of the first fine cell lies (p - p/k) / 2 before that of the first source
+pixel, which is a phase.
 """
 
 from __future__ import annotations
