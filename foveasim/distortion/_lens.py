@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from foveasim.arrays import Floats, check_choice, check_length_um, finite_array
 from foveasim.errors import GeometryError, ParameterError
+from foveasim.rings import from_frame, to_frame
 
 __all__ = ["Outside", "Placed"]
 
@@ -101,7 +102,7 @@ class Placed:
             raise ParameterError("xy_um", f"must have the shape (..., 2), got {points.shape}")
         centre = np.asarray(self.centre_um)
         focal = np.broadcast_to(np.asarray(self.focal_um), (2,))
-        normalised = (points.reshape(-1, 2) - centre) / focal
+        normalised = to_frame(points.reshape(-1, 2), centre, focal)
         mapped: Floats = function(normalised)  # type: ignore[operator]
         is_lost = np.isnan(mapped[:, 0]) if outside == "error" else np.zeros(1, bool)
         if is_lost.any():
@@ -111,4 +112,4 @@ class Placed:
                 f"{int(is_lost.sum())} points cannot be {('distorted', 'undistorted')[which]}: the nearest lies {at:.6g} µm "
                 f"from the lens's centre, and the model is right up to {limit:.6g} µm; keep to that, or take outside='mask'"
             )
-        return np.asarray((mapped * focal + centre).reshape(points.shape))
+        return from_frame(mapped, centre, focal).reshape(points.shape)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from foveasim.arrays import Bools, Floats, Ints
+from foveasim.compiled import kernels
 from foveasim.fields import PackedRings, PointMap
 from foveasim.rings import next_vertex, positions_in_runs
 
@@ -74,10 +76,10 @@ class CarriedOutlines:
 def _carried(outlines: Outlines, lens: PointMap, bends: _Bends) -> Outlines:
     """Outlines in the sensor plane, carried back."""
     xy_um, ring_offsets, site_offsets, _ = outlines
-    end = xy_um[next_vertex(ring_offsets)]
-    n_pieces = bends.n_pieces(xy_um, end)
+    n_pieces = bends.n_pieces(xy_um, ring_offsets)
     points = xy_um
     if n_pieces.max() > 1:
+        end = xy_um[next_vertex(ring_offsets)]
         # From the smaller end to the larger one: neighbours cut the edge that they share alike.
         is_turned = (end[:, 0] < xy_um[:, 0]) | ((end[:, 0] == xy_um[:, 0]) & (end[:, 1] < xy_um[:, 1]))
         low, high = np.where(is_turned[:, np.newaxis], end, xy_um), np.where(is_turned[:, np.newaxis], xy_um, end)
@@ -105,13 +107,10 @@ class _Bends:
         # A chord of length L deviates by L² / 8 times the second derivative.
         self._pieces_per_um = np.sqrt(_bends(self._first_um, self._step_um, lens) / (8.0 * chord_um))
 
-    def n_pieces(self, begin_um: Floats, end_um: Floats) -> Ints:
-        """How many pieces every edge is cut into."""
-        place = ((0.5 * (begin_um + end_um) - self._first_um) / self._step_um + 0.5).astype(np.int64)
-        np.clip(place, 0, BEND_POINTS - 1, out=place)
-        length_um = np.hypot(end_um[:, 0] - begin_um[:, 0], end_um[:, 1] - begin_um[:, 1])
-        n = np.ceil(length_um * self._pieces_per_um[place[:, 1], place[:, 0]])
-        return np.clip(n, 1, MAX_PIECES).astype(np.int64)
+    def n_pieces(self, xy_um: Floats, ring_offsets: Ints) -> Ints:
+        """Return the number of pieces of every edge, in the order of their first vertices."""
+        count: Callable[..., Ints] = kernels("integrate").count_pieces
+        return count(xy_um, ring_offsets, self._first_um, self._step_um, self._pieces_per_um, MAX_PIECES)
 
 
 def _bends(first_um: Floats, step_um: Floats, lens: PointMap) -> Floats:

@@ -14,7 +14,7 @@ from foveasim.compiled import kernels
 from foveasim.fields import Grid
 from foveasim.integrate._outlines import Outlines
 from foveasim.parallel import each
-from foveasim.rings import positions_in_runs
+from foveasim.rings import positions_in_runs, to_frame
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -226,7 +226,7 @@ def _traced(outlines: Outlines, first_site: int, grid: Grid, order: int) -> _Tra
     n_y, n_x = grid.shape
     rings = outlines.ring_offsets, outlines.site_offsets
     area_um2, bounds_um = compiled.measure_sites(outlines.xy_um, *rings)
-    uv = (outlines.xy_um - np.asarray(grid.origin_um)) / grid.pitch_xy_um
+    uv = to_frame(outlines.xy_um, grid.origin_um, grid.pitch_xy_um)
     spans, weights, cuts, moments, covered = compiled.trace_sites(uv, *rings, first_site, n_y, n_x, order)
     n_weights = spans[:, compiled.N_PARTIAL] + (spans[:, compiled.N_RUN] > 0)
     return _Traced(
