@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Bools, Floats, check_count, check_number, finite_array, read_only
+from foveasim.arrays import Bools, Floats, check_count, finite_array, read_only
 from foveasim.capture import Capture
 from foveasim.compiled import kernels
 from foveasim.distortion import Lens
@@ -34,6 +34,7 @@ from foveasim.reconstruct import Picture, reference
 from foveasim.records import described, versions
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor, noise_budget
+from foveasim.sensor.limits import check_plausible, check_plausible_array
 from foveasim.streams import Streams
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
@@ -316,7 +317,7 @@ class Camera:
             When a value is out of range, or parts do not fit together.
         """
         streams = Streams(seed, frame)
-        exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
+        exposure_s = check_plausible("exposure_s", exposure_s)
         clock = _Clock()
         if photo_e_per_s is None:
             photo_e_per_s = self._photoelectrons_per_s(light, clock)
@@ -475,7 +476,7 @@ class Camera:
         >>> [c.settings["frame"] for c in camera.video([scene, scene], exposure_s=0.01, seed=0)]
         [0, 1]
         """
-        exposures_s = finite_array("exposure_s", exposure_s, at_least=0.0)
+        exposures_s = check_plausible_array("exposure_s", exposure_s)
         if exposures_s.ndim > 1 or exposures_s.size == 0:
             raise ParameterError("exposure_s", "must be one time, or a sequence of times", exposure_s, "s")
         exposures_s = np.atleast_1d(exposures_s)
@@ -603,7 +604,7 @@ class Camera:
         ParameterError, SimulationError
             As for :meth:`capture`.
         """
-        exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
+        exposure_s = check_plausible("exposure_s", exposure_s)
         if not isinstance(light, Scene | PowerMap):
             raise ParameterError("light", f"must be a Scene or a PowerMap, got a {type(light).__name__}")
         power_map = self.power_map(light) if isinstance(light, Scene) else light

@@ -335,6 +335,49 @@ def test_a_ramp_of_the_chain_has_the_slope_of_its_light_and_dark_charge():
     assert fit.rate_e_per_s.var() == pytest.approx(variance, rel=SIGMAS * math.sqrt(2.0 / N) + 0.01)
 
 
+# -- random telegraph noise -------------------------------------------------------------------------------------------
+
+#: Charges of 1,000 to 4,000 e-, far from both ends of the codes.
+RTS_RATE_E_PER_S, RTS_TIMES_S = 2e4, [0.05, 0.1, 0.2]
+
+
+def assert_drawn_as_predicted(found, n_sites=N):
+    """The spread over sites is the predicted one, to five standard errors of the spread."""
+    sigma = np.broadcast_to(found.sigma_e_per_s, n_sites)
+    spread = (found.rate_e_per_s - RTS_RATE_E_PER_S) / sigma
+    assert spread.std() == pytest.approx(1.0, abs=SIGMAS / math.sqrt(2.0 * n_sites) + 1e-3)
+
+
+def exposed_in_turn(sensor):
+    """Codes of several exposures of one rate, as the sensor draws them."""
+    rows = []
+    for frame, t_s in enumerate(RTS_TIMES_S):
+        streams = Streams(11, frame)
+        electrons = sensor.collect(np.full(N, RTS_RATE_E_PER_S * t_s), streams=streams)
+        rows.append(sensor.read(electrons, streams=streams))
+    return np.stack(rows)
+
+
+@pytest.mark.parametrize("shot_noise", ["auto", "off"])
+@pytest.mark.parametrize("rts_fraction", [1.0, 0.5])
+def test_merged_exposures_predict_rts_spread(rts_fraction, shot_noise):
+    sensor = Sensor(ROW, **SENSOR, rts_fraction=rts_fraction, rts_e=200.0, shot_noise=shot_noise)
+    merged = merge_exposures(exposed_in_turn(sensor), RTS_TIMES_S, sensor)
+
+    is_rts = np.isin(np.arange(N), sensor.telegraph_sites)
+    assert_drawn_as_predicted(merged)
+    assert merged.sigma_e_per_s[is_rts].min() > 2.0 * merged.sigma_e_per_s[~is_rts].max(initial=0.0)
+
+
+@pytest.mark.parametrize("rts_fraction", [1.0, 0.5])
+def test_ramps_predict_rts_spread(rts_fraction):
+    sensor = Sensor(ROW, **SENSOR, rts_fraction=rts_fraction, rts_e=200.0)
+    times = np.linspace(0.05, 0.25, 6)
+    ramp = non_destructive_reads(sensor, RTS_RATE_E_PER_S, times, streams=Streams(12))
+
+    assert_drawn_as_predicted(fit_ramp(ramp.code, times, sensor, weight_rate_e_per_s=RTS_RATE_E_PER_S))
+
+
 # -- bad input --------------------------------------------------------------------------------------------------------
 
 FEW = Sensor(ROW[:3], **SENSOR)
@@ -348,6 +391,12 @@ CODE = np.full((2, 3), 100)
         (lambda: merge_exposures(CODE, [0.1, 0.0], FEW), "'exposures_s' must be > 0"),
         (lambda: merge_exposures(CODE + 5000, [0.1, 1.0], FEW), "'code' must be <= 4095 everywhere"),
         (lambda: merge_exposures(CODE, [0.1, 1.0], None), "'sensor' must be a"),
+        (lambda: merge_exposures(CODE, [0.1, 1e300], FEW), "'exposures_s' must be from .* got 1e\\+300 s at"),
+        (lambda: fit_ramp(CODE, [1.0, 1e300], FEW), "'times_s' must be 0, or from .* got 1e\\+300 s at"),
+        (
+            lambda: fit_ramp(CODE, [1.0, 2.0], FEW, weight_rate_e_per_s=1e300),
+            r"'weight_rate_e_per_s' must be from .* to 1e\+15, got 1e\+300 e-/s",
+        ),
         (
             lambda: merge_exposures(CODE, [0.1, 1.0], FEW, calibration=pedestal(7)),
             "'calibration' must be a Calibration",

@@ -404,7 +404,7 @@ def test_each_site_may_have_its_own_threshold():
 def test_events_beyond_the_most_are_not_counted_on(monkeypatch):
     """A site that would count for hours, and pieces that hold too many only together."""
     monkeypatch.setattr(sys.modules[EventPixels.__module__], "MAX_EVENTS", 1000)
-    endless = pixels_of(1, noise_per_s=1e15)
+    endless = pixels_of(1, noise_per_s=1e9)
     with pytest.raises(SimulationError, match=r"more than 1,000 events of 1 frames do not fit the memory"):
         endless.events([[1e-3]] * 2, frame_s=1.0, seed=0)
     monkeypatch.setattr(sys.modules[EventPixels.__module__], "PIECE_SITES", 10)
@@ -437,6 +437,18 @@ def test_more_spikes_than_memory_are_told():
         (SpikingPixels, {"threshold_e": 0.5}),
         (SpikingPixels, {"threshold_e": [1.0, 2.0]}),
         (SpikingPixels, {"refractory_s": -1.0}),
+        (EventPixels, {"contrast_on": 1e300}),
+        (EventPixels, {"contrast_off": 1e300}),
+        (EventPixels, {"refractory_s": 1e300}),
+        (EventPixels, {"leak_per_s": 1e300}),
+        (EventPixels, {"leak_spread_fraction": 1e9}),
+        (EventPixels, {"noise_per_s": 1e300}),
+        (EventPixels, {"noise_half_e_per_s": 1e300}),
+        (EventPixels, {"floor_e_per_s": 1e300}),
+        (EventPixels, {"temperature_k": 1e300}),
+        (EventPixels, {"capacitance_f": 1e-30}),
+        (SpikingPixels, {"threshold_e": 1e300}),
+        (SpikingPixels, {"refractory_s": 1e300}),
     ],
 )
 def test_parameters_out_of_range_are_told(kind, change):

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import scipy.constants
 import scipy.stats
+import shapely
 
 import foveasim as fs
 from foveasim.errors import ParameterError, SimulationError
@@ -97,6 +99,81 @@ def test_a_column_may_tell_sites_apart_in_place_of_where_they_are():
     assert not np.any(there == Device(seed=3, layout=MANY[:100]).normals("prnu"))
 
 
+def concentric_rings():
+    """Four circular rings of one centroid, around a disc."""
+    centre = shapely.Point(3.0, -2.0)
+    discs = [centre.buffer(radius_um, quad_segs=16) for radius_um in (2.0, 4.0, 6.0, 8.0, 10.0)]
+    return fs.Layout.from_polygons([discs[0], *(outer.difference(inner) for inner, outer in pairwise(discs))])
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_sites_of_one_centroid_have_distinct_devices(effect):
+    rings = concentric_rings()
+    whole = Device(seed=3, layout=rings).normals(effect)
+
+    assert np.ptp(rings.centroid_um, axis=0).max() < 1e-9
+    assert np.unique(whole).size == 5
+    for site in range(5):
+        assert Device(seed=3, layout=rings[[site]]).normals(effect) == whole[site]
+    # The disc contains its centroid, and has the draw of any site there.
+    square = fs.Layout.from_rectangles([[3.0, -2.0]], 1.0)
+    assert Device(seed=3, layout=square).normals(effect) == whole[0]
+
+
+def test_crescent_around_a_site_has_its_own_device():
+    """Neither has a hole: a bracket, and a square at the bracket's centroid, in its opening."""
+    bracket = shapely.box(0.0, 0.0, 6.0, 6.0).difference(shapely.box(1.0, 1.0, 7.0, 5.0))
+    x, y = bracket.centroid.coords[0]
+    assert not bracket.contains(bracket.centroid)
+    layout = fs.Layout.from_polygons([bracket, shapely.box(x - 0.5, y - 0.5, x + 0.5, y + 0.5)])
+
+    assert np.ptp(layout.centroid_um, axis=0).max() < 1e-9
+    assert np.unique(Device(seed=3, layout=layout).normals("prnu")).size == 2
+
+
+@pytest.mark.parametrize("n_sectors", [3, 4, 5, 8])
+def test_arcs_keep_device_of_centroid(n_sectors):
+    """Thin arcs do not contain their centroids; squares there do, and have the same numbers."""
+    arcs = fs.layout.log_polar(n_sectors=n_sectors, n_rings=60, r_min_um=5.0, r_max_um=60.0, chords_per_arc=8)
+    squares = fs.Layout.from_rectangles(arcs.centroid_um, 0.1)
+    contained = shapely.contains_xy(arcs.polygons(), *arcs.centroid_um.T)
+
+    assert not contained.any()
+    assert np.array_equal(Device(seed=3, layout=arcs).normals("prnu"), Device(seed=3, layout=squares).normals("prnu"))
+
+
+def test_arc_around_a_site_has_its_own_device():
+    arc = fs.layout.log_polar(n_sectors=3, n_rings=60, r_min_um=5.0, r_max_um=60.0, chords_per_arc=8)[[170]]
+    x, y = arc.centroid_um[0]
+    pair = fs.Layout.from_polygons([arc.polygons()[0], shapely.box(x - 0.5, y - 0.5, x + 0.5, y + 0.5)])
+
+    assert not shapely.intersects(*pair.polygons())
+    assert np.unique(Device(seed=3, layout=pair).normals("prnu")).size == 2
+
+
+def test_ring_device_ignores_order_of_vertices():
+    rings = concentric_rings()
+    turned = fs.Layout.from_polygons(
+        [
+            shapely.Polygon(
+                np.roll(ring.exterior.coords[:-1], 5, axis=0),
+                [np.roll(h.coords[:-1], 3, axis=0) for h in ring.interiors],
+            )
+            for ring in rings.polygons()
+        ]
+    )
+
+    assert np.array_equal(
+        Device(seed=3, layout=turned).normals("prnu")[1:], Device(seed=3, layout=rings).normals("prnu")[1:]
+    )
+
+
+def test_equal_polygons_share_one_device():
+    twice = fs.Layout.from_polygons([concentric_rings().polygons()[2]] * 2)
+
+    assert np.ptp(Device(seed=3, layout=twice).normals("prnu")) == 0.0
+
+
 def test_devices_effects_and_sites_are_independent():
     patterns = [Device(seed=seed, layout=MANY).normals(effect) for seed in (0, 1) for effect in EFFECTS]
 
@@ -124,6 +201,19 @@ def test_dark_signal_differs_by_its_share_and_light_does_not():
 
     assert_spread(dark, 60.0)
     assert np.ptp(light) == 0.0
+
+
+@pytest.mark.parametrize("fraction", [0.1, 0.5, 1.0, 2.0])
+def test_dark_signal_has_stated_mean_and_spread(fraction):
+    """Fourth moment of the log-normal distribution: kurtosis w^4 + 2 w^3 + 3 w^2 - 3, w = 1 + fraction^2."""
+    dark = expected(0.0, dsnu_fraction=fraction, dark_e_per_s=300.0)
+
+    w = 1.0 + fraction**2
+    kurtosis = w**4 + 2.0 * w**3 + 3.0 * w**2 - 3.0
+    assert dark.min() > 0.0
+    assert dark.mean() == pytest.approx(300.0, abs=SIGMAS * 300.0 * fraction / math.sqrt(N))
+    assert dark.std() == pytest.approx(300.0 * fraction, rel=SIGMAS * 0.5 * math.sqrt((kurtosis - 1.0) / N))
+    assert scipy.stats.kstest(np.log(dark), "norm", (np.log(300.0 / math.sqrt(w)), math.sqrt(np.log(w)))).pvalue > 1e-6
 
 
 @pytest.mark.parametrize(("temperature_k", "factor"), [(300.0, 1.0), (308.0, 2.0), (292.0, 0.5), (324.0, 8.0)])
@@ -260,7 +350,7 @@ def test_lines_have_offsets_that_all_their_sites_share():
 
 
 def test_offsets_come_before_the_clip_and_gains_do_not_touch_them():
-    dark = codes(0, pixel_fpn_fraction=0.02, gain_fpn_fraction=0.5)
+    dark = codes(0, pixel_fpn_fraction=0.02, gain_fpn_fraction=0.3)
 
     # Half the offsets are negative and end at 0.
     assert (dark == 0.0).mean() == pytest.approx(0.5, abs=SIGMAS / math.sqrt(N))
@@ -502,11 +592,46 @@ def test_half_the_sensitivity_is_half_the_light_and_all_of_the_dark_charge():
         ("device_seed", -1, "'device_seed' must be >= 0"),
         ("device_seed", 1.5, "'device_seed' must be a whole number"),
         ("gaussian_above_e", 1e5, "'gaussian_above_e' must be <= 700"),
+        ("read_noise_e", 1e300, r"'read_noise_e' must be <= 1e\+07, got 1e\+300 e-; charges are in electrons"),
+        (
+            "read_noise_e",
+            np.where(np.arange(N) == 7, 1e300, 1.0),
+            r"'read_noise_e' must be <= .* got 1e\+300 e- at \[7\]",
+        ),
+        ("rts_e", 1e300, r"'rts_e' must be <= 1e\+07, got 1e\+300 e-"),
+        ("prnu_fraction", 1e9, "'prnu_fraction' must be <= 0.3, got 1000000000.0; 0.03 is 3 %"),
+        ("gain_fpn_fraction", 0.5, "'gain_fpn_fraction' must be <= 0.3"),
+        ("dsnu_fraction", 1e9, "'dsnu_fraction' must be <= 10"),
+        ("pixel_fpn_fraction", 2.0, "'pixel_fpn_fraction' must be <= 1"),
+        ("line_fpn_fraction", 2.0, "'line_fpn_fraction' must be <= 1"),
+        ("dark_e_per_s", 1e300, r"'dark_e_per_s' must be <= 1e\+15, got 1e\+300 e-/s"),
+        ("hot_e_per_s", 1e300, r"'hot_e_per_s' must be <= 1e\+15, got 1e\+300 e-/s"),
+        ("full_well_e", 1e300, r"'full_well_e' must be <= 1e\+15, got 1e\+300 e-"),
+        ("v_sat_v", 1e300, r"'v_sat_v' must be from 1e-06 to 1000, got 1e\+300 V; voltages are in volts"),
+        ("v_sat_v", 1e-9, r"'v_sat_v' must be from 1e-06 to 1000, got 1e-09 V"),
+        ("pedestal_v", 30.0, r"'pedestal_v' must be < v_sat_v = 3 V, got 30.0 V"),
+        ("dark_doubling_k", 1e-6, r"'dark_doubling_k' must be from 0.1 to 1000, got 1e-06 K"),
+        ("dnl_dn", 1e300, "'dnl_dn' must be <= 65536, got .* DN"),
+        ("inl_dn", [0.0, 1e300], "'inl_dn' must be from -65536 to 65536 everywhere, got .* DN"),
+        ("capacitance_f", 1.0, "'capacitance_f' must be from 1e-18 to 1e-06, got 1.0 F; capacitances are in farad"),
     ],
 )
 def test_what_cannot_be_is_refused_by_its_name(name, value, message):
     with pytest.raises(ParameterError, match=f"^{message}"):
         sensor(**{name: value})
+
+
+def test_implausible_heat_is_rejected():
+    with pytest.raises(ParameterError, match=r"'dark_e_per_s' must be <= 1e\+15 at temperature_k = 900 K, got .* e-/s"):
+        sensor(dark_e_per_s=1.0, temperature_k=900.0, dark_reference_k=300.0, dark_doubling_k=5.0)
+
+
+@pytest.mark.parametrize("exposure_s", [1e300, 1e-30])
+def test_implausible_exposure_is_rejected(exposure_s):
+    with pytest.raises(
+        ParameterError, match=r"'exposure_s' must be 0, or from 1e-12 to 1e\+07, got .* s; times are in sec"
+    ):
+        sensor().expected_electrons(np.ones(N), exposure_s)
 
 
 @pytest.mark.parametrize("table", [[0.0, 0.6, 0.5, 1.0], [0.1, 1.0], [0.0, 0.9], [1.0]])

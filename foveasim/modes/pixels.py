@@ -17,24 +17,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Ints, check_count, check_number, finite_array, read_only
+from foveasim.arrays import Floats, Ints, check_count, finite_array, read_only
 from foveasim.compiled import kernels
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
 from foveasim.modes.events import Events
 from foveasim.parallel import each, thread_count
 from foveasim.sensor import Sensor
+from foveasim.sensor.limits import check_plausible, check_plausible_array
 from foveasim.streams import device_key
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 
 __all__ = ["EventPixels", "SpikingPixels"]
 
-#: Thresholds below this are below the noise of any circuit, and their events beyond any memory.
-MIN_CONTRAST = 1e-3
 #: A site's threshold is at least this share of the mean, whatever its mismatch.
 LEAST_THRESHOLD = 0.1
-#: A wider spread of thresholds would have more than one in a thousand sites below the least, and no longer be what it says.
-MAX_MISMATCH = 0.3
 #: Sites that one thread works on at a time; fixed, so that results do not depend on the number of threads.
 PIECE_SITES = 2048
 #: More events of one batch than this are a slip: of a threshold, or of the light's unit.
@@ -122,17 +119,12 @@ class EventPixels:
 
     def __post_init__(self) -> None:
         _check_sensor(self.sensor)
-        for name in ("contrast_on", "contrast_off"):
-            object.__setattr__(self, name, check_number(name, getattr(self, name), at_least=MIN_CONTRAST))
-        for name in ("refractory_s", "leak_per_s", "leak_spread_fraction", "noise_per_s", "floor_e_per_s"):
-            object.__setattr__(self, name, check_number(name, getattr(self, name), at_least=0.0))
-        mismatch_fraction = check_number(
-            "mismatch_fraction", self.mismatch_fraction, at_least=0.0, at_most=MAX_MISMATCH, cure="0.03 are 3 %"
-        )
-        object.__setattr__(self, "mismatch_fraction", mismatch_fraction)
-        for name in ("temperature_k", "noise_half_e_per_s"):
-            object.__setattr__(self, name, check_number(name, getattr(self, name), above=0.0))
-        capacitance_f = check_number("capacitance_f", self.capacitance_f, at_least=0.0, at_most=1e-9)
+        for name in (
+            *("contrast_on", "contrast_off", "mismatch_fraction", "refractory_s", "temperature_k", "leak_per_s"),
+            *("leak_spread_fraction", "noise_per_s", "noise_half_e_per_s", "floor_e_per_s"),
+        ):
+            object.__setattr__(self, name, check_plausible(name, getattr(self, name)))
+        capacitance_f = check_plausible("capacitance_f", self.capacitance_f, of="EventPixels")
         object.__setattr__(self, "capacitance_f", capacitance_f)
 
     @cached_property
@@ -153,10 +145,7 @@ class EventPixels:
         """Events that every site's leakage gives each second, (n_site,) or (1,)."""
         if not self.leak_spread_fraction:
             return read_only(np.full(1, self.leak_per_s))
-        # Of the logarithm: so the law has the mean 1 and the standard deviation that was asked for.
-        sigma = np.sqrt(np.log1p(self.leak_spread_fraction**2))
-        factors = np.exp(sigma * self.sensor.device.normals("event leak") - 0.5 * sigma**2)
-        return read_only(np.asarray(self.leak_per_s * factors))
+        return read_only(self.leak_per_s * self.sensor.device.log_normals("event leak", self.leak_spread_fraction))
 
     def stream(
         self,
@@ -196,7 +185,7 @@ class EventPixels:
             When a site has no current at all, or there are more events than fit the memory.
         """
         _check_rates(rates)
-        frame_s = check_number("frame_s", frame_s, above=0.0)
+        frame_s = check_plausible("frame_s", frame_s)
         batch = check_count("batch", batch)
         key = device_key(check_count("seed", seed, at_least=0), "change events")
         return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
@@ -298,7 +287,7 @@ class SpikingPixels:
 
     def __post_init__(self) -> None:
         _check_sensor(self.sensor)
-        threshold_e = finite_array("threshold_e", self.threshold_e, at_least=1.0)
+        threshold_e = check_plausible_array("threshold_e", finite_array("threshold_e", self.threshold_e, at_least=1.0))
         if threshold_e.shape not in ((), (self.sensor.layout.n_sites,)):
             raise ParameterError(
                 "threshold_e", f"must be one number, or one for each of the {self.sensor.layout.n_sites} sites"
@@ -306,7 +295,7 @@ class SpikingPixels:
         object.__setattr__(
             self, "threshold_e", read_only(threshold_e.copy()) if threshold_e.ndim else float(threshold_e)
         )
-        object.__setattr__(self, "refractory_s", check_number("refractory_s", self.refractory_s, at_least=0.0))
+        object.__setattr__(self, "refractory_s", check_plausible("refractory_s", self.refractory_s))
 
     def stream(
         self,
@@ -346,7 +335,7 @@ class SpikingPixels:
             When there are more spikes than fit the memory.
         """
         _check_rates(rates)
-        frame_s = check_number("frame_s", frame_s, above=0.0)
+        frame_s = check_plausible("frame_s", frame_s)
         batch = check_count("batch", batch)
         key = device_key(check_count("seed", seed, at_least=0), "spikes")
         return self._stream(rates, frame_s, key, batch, thread_count(n_threads))

@@ -12,9 +12,10 @@ from typing import Literal
 
 import numpy as np
 
-from foveasim.arrays import Floats, check_choice, check_count, check_number, finite_array
+from foveasim.arrays import Floats, check_choice, check_count, finite_array
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
+from foveasim.sensor.limits import check_plausible
 
 __all__ = ["Between", "Exposure", "Shutter"]
 
@@ -65,8 +66,8 @@ class Shutter:
     def __post_init__(self) -> None:
         if not isinstance(self.layout, Layout):
             raise ParameterError("layout", f"must be a foveasim.Layout, got a {type(self.layout).__name__}")
-        object.__setattr__(self, "frame_s", check_number("frame_s", self.frame_s, above=0.0))
-        object.__setattr__(self, "line_s", check_number("line_s", self.line_s, at_least=0.0))
+        object.__setattr__(self, "frame_s", check_plausible("frame_s", self.frame_s))
+        object.__setattr__(self, "line_s", check_plausible("line_s", self.line_s))
         check_choice("between", self.between, ("hold", "linear"))
         if self.line_s and "readout_order" not in self.layout.columns:
             raise SimulationError(
@@ -85,7 +86,7 @@ class Shutter:
     def share(self, frame: int, exposure_s: float) -> Floats:
         """Share of each site's exposure that a frame lights, (n_site,) or (1,); frame 0 begins with the first line."""
         frame = check_count("frame", frame, at_least=0)
-        exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
+        exposure_s = check_plausible("exposure_s", exposure_s)
         delay_s = self.delay_s
         if not exposure_s:  # a moment
             return np.where((delay_s >= frame * self.frame_s) & (delay_s < (frame + 1) * self.frame_s), 1.0, 0.0)
@@ -97,7 +98,7 @@ class Shutter:
 
     def last_frame(self, exposure_s: float) -> int:
         """The last frame that lights any site's exposure."""
-        exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
+        exposure_s = check_plausible("exposure_s", exposure_s)
         end = (float(self.delay_s.max(initial=0.0)) + exposure_s) / self.frame_s
         frames = int(np.ceil(end - TIME_ROUNDING))
         return max(frames - 1, 0) if self.between == "hold" else frames
@@ -122,7 +123,7 @@ class Exposure:
     def __init__(self, shutter: Shutter, exposure_s: float) -> None:
         if not isinstance(shutter, Shutter):
             raise ParameterError("shutter", f"must be a foveasim.modes.Shutter, got a {type(shutter).__name__}")
-        exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
+        exposure_s = check_plausible("exposure_s", exposure_s)
         self._shutter, self.exposure_s = shutter, exposure_s
         self._last = shutter.last_frame(exposure_s)
         self._n_seen = 0

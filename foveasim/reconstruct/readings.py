@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Bools, Floats, check_number, finite_array
+from foveasim.arrays import Bools, Floats, finite_array
 from foveasim.sensor import Sensor, linearised
+from foveasim.sensor.limits import check_plausible
 from foveasim.units import volts_to_electrons
 
 __all__ = ["Readings", "charge_readings", "code_readings", "electrons_per_code"]
@@ -94,14 +95,12 @@ def code_readings(code: ArrayLike, sensor: Sensor, exposure_s: float) -> Reading
     full_e = electrons_per_code(sensor) * 2.0**sensor.bits
     charge = share * full_e
     read_e = charge_readings(charge, sensor, exposure_s)
-    steps_dn = np.gradient(linearised(np.arange(2**sensor.bits), sensor))[codes.astype(np.int64)]
-    rounding_e2 = (steps_dn / slope * full_e / 2.0**sensor.bits) ** 2 / 12.0
-    noise_e2 = sensor.ktc_noise_e**2 + np.square(sensor.read_noise_e) + sensor.rts_fraction * sensor.rts_e**2 / 4.0
+    step_e = sensor.converter.width_of_code_dn(codes) / slope * electrons_per_code(sensor)
+    noise_e2 = sensor.readout_noise_e2(is_device_known=False) + step_e**2 * sensor.converter.noise_dn2
     is_full = read_e.is_full | (codes >= 2**sensor.bits - 1)
-    return Readings(light_e=read_e.light_e, variance_e2=read_e.variance_e2 + noise_e2 + rounding_e2, is_full=is_full)
+    return Readings(light_e=read_e.light_e, variance_e2=read_e.variance_e2 + noise_e2, is_full=is_full)
 
 
 def _dark_e(sensor: Sensor, exposure_s: float) -> Floats:
-    exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
-    heat = 2.0 ** ((sensor.temperature_k - sensor.dark_reference_k) / sensor.dark_doubling_k)
-    return np.asarray(np.asarray(sensor.dark_e_per_s) * heat * exposure_s)
+    exposure_s = check_plausible("exposure_s", exposure_s)
+    return np.asarray(np.asarray(sensor.dark_e_per_s) * sensor.heat * exposure_s)

@@ -7,8 +7,10 @@ from foveasim.sensor.budget import FIXED, TEMPORAL, noise_budget
 from foveasim.sensor.calibration import Calibration, calibrate, linearised
 from foveasim.sensor.crosstalk import Coupling, Diffusion, KernelCrosstalk, Mixing
 from foveasim.sensor.exposures import Ramp, Rates, fit_ramp, merge_exposures, non_destructive_reads
+from foveasim.sensor.limits import LIMITS, Limits
 from foveasim.sensor.noise import draw_shot_noise
 from foveasim.sensor.presets import PRESETS
+from foveasim.sensor.signal_to_noise import SiteSignals, signal_to_noise
 from foveasim.sensor.spectral import FilterSet, rgb_filters
 from foveasim.sensor.spectral_curves import (
     BandMean,
@@ -25,6 +27,7 @@ from foveasim.sensor.spectral_tables import PolynomialCurve, SplineCurve, StepCu
 
 __all__ = [
     "FIXED",
+    "LIMITS",
     "PRESETS",
     "TEMPORAL",
     "BandMean",
@@ -36,6 +39,7 @@ __all__ = [
     "FilterSet",
     "GaussianCurve",
     "KernelCrosstalk",
+    "Limits",
     "Mixing",
     "PassBand",
     "PolynomialCurve",
@@ -44,6 +48,7 @@ __all__ = [
     "Rates",
     "Sensor",
     "SiliconQE",
+    "SiteSignals",
     "SplineCurve",
     "StepCurve",
     "TableCurve",
@@ -59,4 +64,5 @@ __all__ = [
     "read_curve",
     "read_filters",
     "rgb_filters",
+    "signal_to_noise",
 ]

@@ -21,6 +21,7 @@ __all__ = [
     "device_uniforms",
     "poisson_or_gaussian",
     "predict_codes",
+    "rays_met",
     "read_out",
 ]
 
@@ -45,6 +46,7 @@ SQRT_HALF, SQRT_TWO_PI = math.sqrt(0.5), math.sqrt(2.0 * math.pi)
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 _ints = types.Array(types.int64, 1, "C", readonly=True)
 _words = types.Array(types.uint64, 1, "C", readonly=True)
+_points = types.Array(types.float64, 2, "C", readonly=True)
 
 #: Philox 4x64: multipliers and Weyl steps.
 _M0, _M1 = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
@@ -104,6 +106,34 @@ def device_uniforms(key_0, key_1, first, second):
         word, _, _, _ = _philox(key_0, key_1, first[i], second[i], np.uint64(0), np.uint64(0))
         out[i] = _uniform(word)
     return out
+
+
+@njit(types.int64[::1](_points, _ints, _ints, _points, _points), cache=True, nogil=True)
+def rays_met(xy, ring_offsets, site_offsets, centroid, directions):
+    """
+    Number of rays from every site's centroid that meet its outline; 0 for a site that contains its centroid.
+
+    Contained by the even-odd rule along the first ray; ``directions`` are unit vectors.
+    """
+    met = np.zeros(site_offsets.size - 1, np.int64)
+    for i in range(met.size):
+        for d in range(directions.shape[0]):
+            cos, sin = directions[d, 0], directions[d, 1]
+            n_crossed = 0
+            for r in range(site_offsets[i], site_offsets[i + 1]):
+                last = ring_offsets[r + 1] - 1
+                x, y = xy[last, 0] - centroid[i, 0], xy[last, 1] - centroid[i, 1]
+                u, v = cos * x + sin * y, cos * y - sin * x
+                for k in range(ring_offsets[r], ring_offsets[r + 1]):
+                    x, y = xy[k, 0] - centroid[i, 0], xy[k, 1] - centroid[i, 1]
+                    next_u, next_v = cos * x + sin * y, cos * y - sin * x
+                    if (v > 0.0) != (next_v > 0.0) and u - v * (next_u - u) / (next_v - v) > 0.0:
+                        n_crossed += 1
+                    u, v = next_u, next_v
+            if d == 0 and n_crossed % 2 == 1:
+                break
+            met[i] += n_crossed > 0
+    return met
 
 
 @njit(cache=True, nogil=True, inline="always")

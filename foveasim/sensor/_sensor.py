@@ -10,15 +10,17 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Ints, check_choice, check_count, check_number, finite_array, read_only
+from foveasim.arrays import Floats, Ints, check_choice, check_count, check_number, read_only
 from foveasim.compiled import kernels
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.fields import PackedRings
 from foveasim.sensor.converter import Companding, Converter
 from foveasim.sensor.crosstalk import Coupling, Diffusion, KernelCrosstalk, Mixing, Neighbourhood
 from foveasim.sensor.device import Device
+from foveasim.sensor.limits import LIMITS, check_plausible, check_plausible_array
 from foveasim.sensor.noise import LARGEST_CHARGE_E, ShotNoise, draw_shot_noise, in_blocks
 from foveasim.sensor.spectral import ConstantCurve, Curve, FilterSet, rgb_filters
+from foveasim.sensor.spectral_curves import CurveError
 from foveasim.streams import Streams
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C, electrons_to_volts, photon_energy_j
 
@@ -27,18 +29,18 @@ if TYPE_CHECKING:
 
 __all__ = ["PerSite", "Photosites", "Sensor"]
 
-#: Capacitances outside this range are a slip of units.
-MIN_CAPACITANCE_F, MAX_CAPACITANCE_F = 1e-18, 1e-6
 #: Points of the quadrature over a charge that the full well cuts off.
 QUADRATURE_NODES = 96
 #: Means that are drawn by Poisson's law one electron after the other: more take too long.
 MOST_INVERTED_E = 700.0
 NO_SITES = read_only(np.zeros(0, np.int64))
-#: Per-site values, and whether they must be above 0.
-_PER_SITE = {"sensitivity": None, "dark_e_per_s": None, "full_well_e": 0.0, "read_noise_e": None, "capacitance_f": 0.0}
-#: Shares that lie between 0 and 1, and standard deviations as shares.
-_SHARES = {"hot_fraction": 1.0, "dead_fraction": 1.0, "rts_fraction": 1.0, "nonlinearity_fraction": 0.5}
-_SPREADS = ("prnu_fraction", "dsnu_fraction", "pixel_fpn_fraction", "line_fpn_fraction", "gain_fpn_fraction")
+#: Parameters with one value for all sites or one per site, and those with one value.
+_PER_SITE = ("sensitivity", "dark_e_per_s", "full_well_e", "read_noise_e", "capacitance_f")
+_NUMBERS = (
+    *("prnu_fraction", "dsnu_fraction", "pixel_fpn_fraction", "line_fpn_fraction", "gain_fpn_fraction"),
+    *("hot_fraction", "dead_fraction", "rts_fraction", "nonlinearity_fraction", "hot_e_per_s", "rts_e"),
+    *("temperature_k", "dark_reference_k", "dark_doubling_k", "v_sat_v", "pedestal_v"),
+)
 
 #: One value for all sites, or an array (n_site,).
 PerSite = float | NDArray[np.float64]
@@ -86,13 +88,15 @@ class Sensor:
     sensitivity : float or (n_site,)
         Share of the light that a site collects beside its quantum efficiency and filter, as of a smaller lens or opening.
     prnu_fraction : float
-        Photo-response non-uniformity: standard deviation of the sites' response over its mean.
+        Photo-response non-uniformity: standard deviation of the sites' response over its mean, a Gaussian distribution; at
+        most 0.3.
     dark_e_per_s : float or (n_site,), e-/s
         Dark current at ``dark_reference_k``.
     temperature_k, dark_reference_k, dark_doubling_k : float, K
         Temperature of the sensor, the one that the dark current is of, and the rise that doubles it.
     dsnu_fraction : float
-        Dark-signal non-uniformity: standard deviation of the sites' dark current over its mean.
+        Dark-signal non-uniformity: standard deviation of the sites' dark current over its mean, ``dark_e_per_s``, a log-normal
+        distribution: no site is below 0, however wide it is.
     hot_fraction, hot_e_per_s : float
         Share of the sites that have this much more dark current (e-/s, at ``dark_reference_k``).
     dead_fraction : float
@@ -119,11 +123,11 @@ class Sensor:
     capacitance_f : float or (n_site,), F
         Capacitance that the charge is read on: 1e-13 F in the paper's foveal run.
     gain_fpn_fraction : float
-        Standard deviation of the sites' volts per charge over its mean.
+        Standard deviation of the sites' volts per charge over its mean, a Gaussian distribution; at most 0.3.
     nonlinearity_fraction : float
         Share of the voltage that the response lacks at V_sat, growing with the square of the voltage.
     pedestal_v : float, V
-        Black level: added to every voltage, so that noise about darkness is not cut off at code 0.
+        Black level: added to every voltage, so that noise of dark frames is not cut off at code 0. Less than ``v_sat_v``.
     pixel_fpn_fraction, line_fpn_fraction : float
         Standard deviation of the offsets of pixels, and of readout lines, over V_sat (the paper: 0.02).
     v_sat_v : float, V
@@ -136,7 +140,8 @@ class Sensor:
     Raises
     ------
     ParameterError
-        When a value is out of range, or an array does not have one value a site.
+        When a value is out of range or implausible (:data:`foveasim.sensor.LIMITS`), or an array does not have one value a
+        site.
     SimulationError
         When the layout's channels need more filters than there are, or lines are told apart that the layout has not.
     """
@@ -190,42 +195,36 @@ class Sensor:
         is_rgb = isinstance(self.filters, str) and self.filters == "rgb"
         if self.filters is not None and not is_rgb and not isinstance(self.filters, FilterSet):
             raise ParameterError("filters", "must be None, 'rgb' or a FilterSet", self.filters)
-        for name, above in _PER_SITE.items():
+        for name in _PER_SITE:
             value = getattr(self, name)
             if value is not None or name != "full_well_e":
-                object.__setattr__(self, name, self._per_site(name, value, above))
-        if np.max(self.sensitivity) > 1.0:
-            raise ParameterError("sensitivity", "must be <= 1", float(np.max(self.sensitivity)))
-        if not np.all(
-            (np.asarray(self.capacitance_f) >= MIN_CAPACITANCE_F)
-            & (np.asarray(self.capacitance_f) <= MAX_CAPACITANCE_F)
-        ):
-            raise ParameterError(
-                "capacitance_f",
-                f"must be from {MIN_CAPACITANCE_F:g} to {MAX_CAPACITANCE_F:g}",
-                self.capacitance_f,
-                "F",
-                "capacitances are in farad: 1 fF is 1e-15",
-            )
+                object.__setattr__(self, name, self._per_site(name, value))
         numbers: dict[str, float] = {
-            **{name: check_number(name, getattr(self, name), at_least=0.0, at_most=m) for name, m in _SHARES.items()},
-            **{name: check_number(name, getattr(self, name), at_least=0.0) for name in _SPREADS},
-            **{
-                name: check_number(name, getattr(self, name), at_least=0.0)
-                for name in ("hot_e_per_s", "rts_e", "pedestal_v")
-            },
-            **{
-                name: check_number(name, getattr(self, name), above=0.0, at_most=1000.0)
-                for name in ("temperature_k", "dark_reference_k", "dark_doubling_k")
-            },
-            "v_sat_v": check_number("v_sat_v", self.v_sat_v, above=0.0),
+            **{name: check_plausible(name, getattr(self, name)) for name in _NUMBERS},
             "gaussian_above_e": check_number(
                 "gaussian_above_e", self.gaussian_above_e, at_least=10.0, at_most=MOST_INVERTED_E
             ),
             "device_seed": check_count("device_seed", self.device_seed, at_least=0),
         }
+        if numbers["pedestal_v"] >= numbers["v_sat_v"]:
+            raise ParameterError(
+                "pedestal_v",
+                f"must be < v_sat_v = {numbers['v_sat_v']:g} V",
+                numbers["pedestal_v"],
+                "V",
+                "a pedestal above the range gives every site the highest code",
+            )
         for name, number in numbers.items():
             object.__setattr__(self, name, number)
+        hottest_e_per_s = self.heat * float(np.max(self.dark_e_per_s, initial=0.0) + self.hot_e_per_s)
+        if hottest_e_per_s > LIMITS["dark_e_per_s"].high:
+            raise ParameterError(
+                "dark_e_per_s",
+                f"{LIMITS['dark_e_per_s'].rule} at temperature_k = {self.temperature_k:g} K",
+                hottest_e_per_s,
+                "e-/s",
+                "check dark_reference_k and dark_doubling_k",
+            )
         for name in ("ktc_noise", "cds"):
             if not isinstance(getattr(self, name), bool):
                 raise ParameterError(name, "must be true or false", getattr(self, name))
@@ -258,10 +257,10 @@ class Sensor:
     def __repr__(self) -> str:
         return f"Sensor({self.layout!r}, filters {', '.join(self.filter_names)}, {self.bits} bits)"
 
-    def _per_site(self, name: str, value: PerSite, above: float | None) -> PerSite:
+    def _per_site(self, name: str, value: PerSite) -> PerSite:
         if np.ndim(value) == 0:
-            return check_number(name, value, above=above, at_least=0.0)
-        array = finite_array(name, value, ndim=1, above=above, at_least=0.0)
+            return check_plausible(name, value)
+        array = check_plausible_array(name, value, ndim=1)
         if array.size != self.layout.n_sites:
             raise ParameterError(
                 name, f"must be one number, or one for each of the {self.layout.n_sites} sites, got {array.size}"
@@ -298,6 +297,18 @@ class Sensor:
         """Index of each site's filter, (n_site,)."""
         return np.zeros(self.layout.n_sites, np.int64) if self.filters is None else self.layout.channel
 
+    def _transmission(self, wavelength_nm: Floats) -> Floats:
+        """Filter times efficiency, (n_filter, n_wavelength); a function that fails is named by its parameter."""
+        try:
+            return self._filters_and_qe.transmission(wavelength_nm)
+        except CurveError as error:
+            name = "qe"
+            try:
+                self._filter_set.transmission(wavelength_nm)
+            except CurveError:
+                name = "filters"
+            raise ParameterError(name, error.told) from error.__cause__
+
     def responsivity_e_per_j(self, wavelength_nm: Floats) -> Floats:
         """
         Electrons per joule of light that falls on a site.
@@ -314,9 +325,10 @@ class Sensor:
         Raises
         ------
         ParameterError
-            When a quantum efficiency or a filter leaves 0 .. 1, or is not known at a wavelength.
+            When a quantum efficiency or a filter leaves 0 .. 1, or is not known at a wavelength; when a function given for one
+            fails, or returns other than one number per wavelength: the message names it, and its error is the cause.
         """
-        curves = self._filters_and_qe.transmission(wavelength_nm)
+        curves = self._transmission(wavelength_nm)
         if not (np.isfinite(curves).all() and curves.min() >= 0.0 and curves.max() <= 1.0):
             raise ParameterError("qe", "and the filters must give values from 0 to 1 at every wavelength", curves)
         return curves / photon_energy_j(wavelength_nm)
@@ -355,10 +367,18 @@ class Sensor:
         """Dark current of every site at the sensor's temperature, (n_site,) or (1,) e-/s: DSNU and hot sites."""
         rate = np.atleast_1d(np.asarray(self.dark_e_per_s, np.float64)).copy()
         if self.dsnu_fraction:
-            rate = rate * np.maximum(1.0 + self.dsnu_fraction * self.device.normals("dsnu"), 0.0)
+            rate = rate * self.device.log_normals("dsnu", self.dsnu_fraction)
         if self.hot_fraction:
             rate = rate + self.hot_e_per_s * (self.device.uniforms("hot") < self.hot_fraction)
-        return read_only(rate * 2.0 ** ((self.temperature_k - self.dark_reference_k) / self.dark_doubling_k))
+        return read_only(rate * self.heat)
+
+    @property
+    def heat(self) -> float:
+        """Dark current at the sensor's temperature over that at ``dark_reference_k``."""
+        try:
+            return float(2.0 ** ((self.temperature_k - self.dark_reference_k) / self.dark_doubling_k))
+        except OverflowError:
+            return float("inf")
 
     @cached_property
     def ktc_noise_e(self) -> Floats:
@@ -367,6 +387,35 @@ class Sensor:
             return read_only(np.zeros(1))
         capacitance_f = np.atleast_1d(np.asarray(self.capacitance_f, np.float64))
         return read_only(np.sqrt(BOLTZMANN_J_PER_K * self.temperature_k * capacitance_f) / ELEMENTARY_CHARGE_C)
+
+    @cached_property
+    def rts_noise_e(self) -> Floats:
+        """Standard deviation of every site's RTS noise, (n_site,) or (1,) e-: half the distance of its two states."""
+        if not self.telegraph_sites.size:
+            return read_only(np.zeros(1))
+        noise_e = np.zeros(self.layout.n_sites)
+        noise_e[self.telegraph_sites] = 0.5 * self.rts_e
+        return read_only(noise_e)
+
+    def readout_noise_e2(self, *, is_reset: bool = True, is_device_known: bool = True) -> Floats:
+        """
+        Variance of every site's charge by its readout: reset (kTC), read and RTS noise.
+
+        Parameters
+        ----------
+        is_reset : bool
+            Whether reset noise counts: it does not in differences of reads of one charge.
+        is_device_known : bool
+            Whether the device's RTS sites are known; otherwise every site has the mean RTS variance of all.
+
+        Returns
+        -------
+        variance_e2 : (n_site,) or (1,) float64, e-²
+            Before quantisation. RTS noise of two equally probable states ``rts_e`` apart has the variance ``rts_e² / 4``.
+        """
+        rts_e2 = np.square(self.rts_noise_e) if is_device_known else np.full(1, self.rts_fraction * self.rts_e**2 / 4.0)
+        reset_e2 = np.square(self.ktc_noise_e) if is_reset else np.zeros(1)
+        return np.asarray(np.atleast_1d(np.square(self.read_noise_e)) + reset_e2 + rts_e2)
 
     @cached_property
     def gain(self) -> Floats:
@@ -416,9 +465,9 @@ class Sensor:
         Raises
         ------
         ParameterError
-            When the exposure is negative.
+            When the exposure is negative, or implausible.
         """
-        exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
+        exposure_s = check_plausible("exposure_s", exposure_s)
         expected_e = (photo_e_per_s * self.response + self.dark_rate_e_per_s) * exposure_s
         return expected_e if self._crosstalk is None else self._crosstalk.apply(expected_e)
 
@@ -490,6 +539,25 @@ class Sensor:
         if self.layout.n_sites and not np.min(charge_e) >= at_least:
             raise ParameterError(name, f"must be >= {at_least:g} everywhere", float(np.min(charge_e)), "e-")
 
+    def checked_charges(self, name: str, charge_e: ArrayLike) -> Floats:
+        """
+        Charges of all sites as an array, (n_site,) float64 e-.
+
+        Raises
+        ------
+        ParameterError
+            When there is not one charge of at least 0 for each site.
+        """
+        charges = np.ascontiguousarray(charge_e, np.float64)
+        self._check_charges(name, charges)
+        return charges
+
+    def coupled(self, mean_e: Floats, variance_e2: Floats) -> tuple[Floats, Floats]:
+        """Mean and variance of independent charges after inter-pixel coupling, (n_site,) e- and e-² each."""
+        if self._coupling is None:
+            return mean_e, variance_e2
+        return self._coupling.apply(mean_e), self._coupling.variance(variance_e2)
+
     def _telegraph_e(self, streams: Streams) -> Floats | None:
         sites = self.telegraph_sites
         if sites.size == 0 or not self.rts_e:
@@ -532,14 +600,11 @@ class Sensor:
         to ``gaussian_above_e`` (for ``"exact"`` too: above it a Gaussian), cut off by the full well, with the Gaussian noise
         of resetting and reading and the telegraph's two states. Coupled charges are taken as Gaussian of the coupled variance.
         """
-        self._check_charges("expected_e", expected_e)
-        expected_e = np.ascontiguousarray(expected_e, np.float64)
+        expected_e = self.checked_charges("expected_e", expected_e)
         convert = self.converter
         mean_dn, variance_dn2 = np.empty(expected_e.size), np.empty(expected_e.size)
         well_e = np.array([np.inf]) if self.full_well_e is None else np.floor(np.atleast_1d(self.full_well_e))
         sigma_e = np.sqrt(self.ktc_noise_e**2 + np.atleast_1d(self.read_noise_e) ** 2)
-        half_step_e = np.zeros(expected_e.size if self.telegraph_sites.size else 1)
-        half_step_e[self.telegraph_sites] = 0.5 * self.rts_e
         is_drawn = self.shot_noise != "off"
         drawn_e, drawn_e2 = expected_e, np.zeros(1)
         if not is_drawn:
@@ -547,7 +612,7 @@ class Sensor:
         if self._coupling is not None:
             # What the well leaves of a draw is mixed, and taken as a Gaussian.
             mean_e, variance_e2 = _cut_off(drawn_e, drawn_e if is_drawn else np.zeros(1), well_e)
-            drawn_e, drawn_e2 = self._coupling.apply(mean_e), self._coupling.variance(variance_e2)
+            drawn_e, drawn_e2 = self.coupled(mean_e, variance_e2)
             is_drawn, well_e = False, np.array([np.inf])
         points, shares = _quadrature()
         line = np.ascontiguousarray(self.layout.readout_line)
@@ -563,7 +628,7 @@ class Sensor:
                 is_drawn,
                 _part(well_e, sites),
                 _part(sigma_e, sites),
-                _part(half_step_e, sites),
+                _part(self.rts_noise_e, sites),
                 _part(v_per_e, sites),
                 _part(self.gain, sites),
                 _part(self.pixel_offset_v, sites),

@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim.arrays import Bools, Floats, as_numbers, check_count, check_number, finite_array, read_only
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor._sensor import Sensor
-from foveasim.sensor.converter import Converter
+from foveasim.sensor.converter import QUANTISATION_DN2
 from foveasim.sensor.crosstalk import Neighbourhood
+from foveasim.sensor.limits import check_plausible, check_plausible_array
 from foveasim.streams import Streams
 from foveasim.units import volts_to_electrons
 
@@ -29,8 +30,6 @@ __all__ = ["Calibration", "calibrate", "linearised", "nominal_e_per_dn"]
 
 #: Standard deviation of a Gaussian law over its median absolute deviation.
 SIGMA_PER_MAD = 1.482602218505602
-#: Variance of rounding to whole codes; no spread of codes is taken for less than its root.
-ROUNDING_DN2 = 1.0 / 12.0
 #: Chance that a site of typical noise is taken for a noisy one, in frames as few as there are.
 FALSE_ALARM = 1e-6
 #: A defective site's value comes from neighbours at most so many steps away.
@@ -74,40 +73,12 @@ def linearised(code: ArrayLike, sensor: Sensor) -> Floats:
     [-0.5, 64.0, 254.5]
     """
     _require_sensor(sensor)
-    return _looked_up(code, _linear_table(sensor.converter), 2.0**sensor.bits - 1.0)
+    return _looked_up(code, sensor.converter.linear_dn, 2.0**sensor.bits - 1.0)
 
 
 def nominal_e_per_dn(sensor: Sensor) -> Floats:
     """Electrons of one linear code as the electronics are meant, without the device's faults, (n_site,) or (1,) e-/DN."""
     return np.atleast_1d(volts_to_electrons(sensor.v_sat_v / 2.0**sensor.bits, np.asarray(sensor.capacitance_f)))
-
-
-def _linear_table(converter: Converter) -> Floats:
-    """Linear code of every code: the middle of the shares of the range that give it, (n_codes,)."""
-    n_codes = converter.n_codes
-    border = np.arange(n_codes + 1) / n_codes
-    if converter.inl.size > 1:
-        nodes = np.linspace(0.0, 1.0, converter.inl.size)
-        border = _first_at(nodes + converter.inl / n_codes, nodes, border)
-    if converter.companding == "root":
-        border = border**2
-    elif converter.companding == "log":
-        border = np.expm1(border * np.log1p(converter.log_strength)) / converter.log_strength
-    elif converter.companding == "table":
-        border = _first_at(converter.curve, np.linspace(0.0, 1.0, converter.curve.size), border)
-    border[-1] = 1.0  # the highest code takes the rest of the range
-    return read_only(0.5 * (border[:-1] + border[1:]) * n_codes - 0.5)
-
-
-def _first_at(values: Floats, at_fraction: Floats, wanted_fraction: Floats) -> Floats:
-    """Place where straight lines through values first reach what is wanted; the last place where they never do."""
-    rising = np.maximum.accumulate(values)
-    after = np.searchsorted(rising, wanted_fraction, side="left")
-    inside = np.clip(after, 1, values.size - 1)
-    low, high = rising[inside - 1], rising[inside]
-    step = np.where(high > low, (wanted_fraction - low) / np.where(high > low, high - low, 1.0), 0.0)
-    place = at_fraction[inside - 1] + np.clip(step, 0.0, 1.0) * (at_fraction[inside] - at_fraction[inside - 1])
-    return np.where(after == 0, at_fraction[0], np.where(after >= values.size, at_fraction[-1], place))
 
 
 def _looked_up(code: ArrayLike, linear_dn: Floats, highest_dn: float) -> Floats:
@@ -288,7 +259,7 @@ class Calibration:
         """
         if exposure_s is None:
             return self.offset_dn
-        exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
+        exposure_s = check_plausible("exposure_s", exposure_s)
         if exposure_s == self.exposure_s:
             return self.offset_dn
         if self.dark_rate_dn_per_s is None or self.exposure_s is None:
@@ -449,21 +420,22 @@ def calibrate(
     True
     """
     _require_sensor(sensor)
-    exposure_s = check_number("exposure_s", exposure_s, above=0.0)
+    exposure_s = check_plausible("exposure_s", check_number("exposure_s", exposure_s, above=0.0))
     n_frames = check_count("n_frames", n_frames, at_least=2)
     n_sites = sensor.layout.n_sites
-    flat = np.ascontiguousarray(_one_or_per_site("flat_e", flat_e, n_sites, above=0.0))
+    flat = np.ascontiguousarray(_one_or_per_site("flat_e", check_plausible_array("flat_e", flat_e), n_sites, above=0.0))
     meant = replace(sensor, prnu_fraction=0.0, dsnu_fraction=0.0, hot_fraction=0.0, dead_fraction=0.0)
     darkness = np.zeros(n_sites)
     dark_e = meant.expected_electrons(darkness, exposure_s)
     signal_e = meant.expected_electrons(flat / exposure_s, exposure_s) - dark_e
-    noise_e2 = dark_e * (sensor.shot_noise != "off") + np.square(sensor.read_noise_e) + sensor.ktc_noise_e**2
+    # RTS noise is a defect, which makes a site noisy: not part of what is meant.
+    noise_e2 = dark_e * (sensor.shot_noise != "off") + replace(meant, rts_fraction=0.0).readout_noise_e2()
     if sensor.coupling is not None:
         capacitance_f = None if np.ndim(sensor.capacitance_f) == 0 else sensor.capacitance_f
         coupling = sensor.coupling.mixing(sensor.layout, capacitance_f=capacitance_f)
         signal_e, dark_e = coupling.apply(signal_e), coupling.apply(dark_e)
     e_per_dn = nominal_e_per_dn(sensor)
-    table = None if sensor.companding == "linear" and not sensor.inl_dn else _linear_table(sensor.converter)
+    table = None if sensor.companding == "linear" and not sensor.inl_dn else sensor.converter.linear_dn
 
     def frames(light_e: Floats, exposure_s: float, kind: int) -> _Frames:
         stack = _Frames(2.0**sensor.bits - 1.0, table)
@@ -475,6 +447,7 @@ def calibrate(
         return stack
 
     if long_exposure_s is not None:
+        check_plausible("long_exposure_s", long_exposure_s)
         long_exposure_s = check_number("long_exposure_s", long_exposure_s, above=exposure_s)
     return _calibration(
         frames(darkness, exposure_s, 0),
@@ -484,7 +457,7 @@ def calibrate(
         long_exposure_s=long_exposure_s,
         expected_dn=signal_e / e_per_dn,
         expected_dark_dn_per_s=dark_e / e_per_dn / exposure_s,
-        expected_noise_dn=np.sqrt(noise_e2 / e_per_dn**2 + ROUNDING_DN2),
+        expected_noise_dn=np.sqrt(noise_e2 / e_per_dn**2 + QUANTISATION_DN2),
         hot_sigmas=hot_sigmas,
         dead_fraction=dead_fraction,
         noisy_ratio=noisy_ratio,
@@ -546,15 +519,15 @@ def _calibration(
     for name, stack in (("flat", flat), ("dark_long", dark_long)):
         if stack is not None and stack.mean_dn.size != n_sites:
             raise ParameterError(name, f"must have the {n_sites} sites of the dark frames, got {stack.mean_dn.size}")
-    hot_sigmas = check_number("hot_sigmas", hot_sigmas, above=0.0)
+    hot_sigmas = check_plausible("hot_sigmas", hot_sigmas)
     dead_fraction = check_number("dead_fraction", dead_fraction, at_least=0.0, at_most=1.0)
-    noisy_ratio = check_number("noisy_ratio", noisy_ratio, at_least=1.0)
+    noisy_ratio = check_plausible("noisy_ratio", check_number("noisy_ratio", noisy_ratio, at_least=1.0))
     most_clipped = check_number("max_clipped_fraction", max_clipped_fraction, at_least=0.0, at_most=1.0)
     expected = _one_or_per_site("expected_dn", expected_dn, n_sites, above=0.0)
     meant_rate = _one_or_per_site("expected_dark_dn_per_s", expected_dark_dn_per_s, n_sites, above=None)
     meant_noise = _one_or_per_site("expected_noise_dn", expected_noise_dn, n_sites, above=0.0)
     if exposure_s is not None:
-        exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
+        exposure_s = check_plausible("exposure_s", exposure_s)
     elif dark_long is not None or meant_rate.any():
         raise ParameterError("exposure_s", "must be given with a second exposure or an expected dark signal", None)
     if (dark_long is None) != (long_exposure_s is None):
@@ -571,12 +544,12 @@ def _calibration(
     if not typical > 0.0:
         raise SimulationError("the flat is no brighter than the dark, so the response is not known; take more light")
 
-    is_hot = _outliers(dark.mean_dn - meant_rate * (exposure_s or 0.0), hot_sigmas, np.sqrt(ROUNDING_DN2))
+    is_hot = _outliers(dark.mean_dn - meant_rate * (exposure_s or 0.0), hot_sigmas, np.sqrt(QUANTISATION_DN2))
     rate: Floats | None = None
     if dark_long is not None and exposure_s is not None:
         longer_s = check_number("long_exposure_s", long_exposure_s, above=exposure_s) - exposure_s
         rate = (dark_long.mean_dn - dark.mean_dn) / longer_s
-        is_hot |= _outliers(rate - meant_rate, hot_sigmas, np.sqrt(ROUNDING_DN2) / longer_s)
+        is_hot |= _outliers(rate - meant_rate, hot_sigmas, np.sqrt(QUANTISATION_DN2) / longer_s)
     is_dead = (response < dead_fraction * typical) & ~is_saturated
     noise_dn = np.sqrt(dark.squares_dn2 / (dark.n_frames - 1))
     is_noisy = _noisy(noise_dn, meant_noise, _rounding_dn(dark), dark.n_frames, noisy_ratio)
@@ -623,8 +596,8 @@ def _rounding_dn(frames: _Frames) -> Floats:
     """Standard deviation of rounding where the sites' mean codes lie: wider apart codes round more."""
     table = frames.linear_dn
     if table is None or table.size < 2:
-        return np.sqrt([ROUNDING_DN2])
-    return np.interp(frames.mean_dn, table, np.gradient(table)) * np.sqrt(ROUNDING_DN2)
+        return np.sqrt([QUANTISATION_DN2])
+    return np.interp(frames.mean_dn, table, np.gradient(table)) * np.sqrt(QUANTISATION_DN2)
 
 
 def _stack(name: str, frames: ArrayLike, at_least: int) -> Floats:

@@ -4,6 +4,16 @@ What makes one device differ from the next of its kind: patterns that are fixed 
 Every number hangs on the seed of the device, the name of the effect, and the place of the site (or the number of its line)
 alone, by a counter-based generator: so a crop of a layout, its sites in another order, another frame or another number of
 workers see the same device.
+
+The place of a site is its centroid. Of sites that do not overlap, at most one contains the centroid that they share, as a disc
+does among concentric rings. A site that surrounds its centroid without containing it (a ring, a C) therefore has its outline
+as its place: the positions of all its vertices, in any order. So rings of one centroid are different sites, and each is the
+same device with or without the others.
+
+An arc of up to 180 degrees, as of a log-polar layout of few sectors, does not contain its centroid either, but another site's
+centroid is there by a rare coincidence only. Its place is its centroid, unless the layout has that other site: of such a pair
+alone, the arc is another device where it is cropped out. Two sites with equal outlines are one site that is listed twice, and
+have the same numbers, unless a column ``site_id`` distinguishes them.
 """
 
 from __future__ import annotations
@@ -15,18 +25,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, Ints
+from foveasim.arrays import Floats, Ints, read_only
 from foveasim.compiled import kernels
 from foveasim.fields import PackedRings
-from foveasim.rings import site_moments
+from foveasim.rings import positions_in_runs, site_moments
 from foveasim.streams import device_key
 
 __all__ = ["SITE_ID", "Device"]
 
 #: A column of this name, of whole numbers, tells sites apart in place of where they are.
 SITE_ID = "site_id"
-#: Sites are told apart by where their centroids lie, in units of this.
+#: Sites are distinguished by where their centroids lie, in units of this; vertices of outlines, too.
 PLACE_UM = 1e-4
+#: Unit vectors of eight rays, off the axes: an opening is often on one.
+_ANGLES_RAD = 2.0 * np.pi * np.arange(8) / 8.0 + 0.3
+RAYS = read_only(np.stack((np.cos(_ANGLES_RAD), np.sin(_ANGLES_RAD)), axis=1))
+#: A site that meets as many of them as this from its centroid surrounds it: a thin arc of 180 degrees covers 245 of 360.
+FEWEST_RAYS_AROUND = 6
 
 Words = NDArray[np.uint64]
 
@@ -49,15 +64,23 @@ class Device:
 
     @cached_property
     def _sites(self) -> tuple[Words, Words]:
-        """Two words for every site, that no other site of the layout has."""
+        """Two words for every site, that no site of another outline has."""
         columns: Any = getattr(self.layout, "columns", {})
         if SITE_ID in columns:
             ids = np.ascontiguousarray(columns[SITE_ID], np.int64)
             return ids.view(np.uint64), np.full(ids.size, 1 << 63, np.uint64)
-        _, centroid_um = site_moments(self.layout.xy_um, self.layout.ring_offsets, self.layout.site_offsets)
+        rings = self.layout.xy_um, self.layout.ring_offsets, self.layout.site_offsets
+        _, centroid_um = site_moments(*rings)
         place = np.rint(centroid_um / PLACE_UM).astype(np.int64).T
-        x, y = np.ascontiguousarray(place)
-        return x.view(np.uint64), y.view(np.uint64)
+        x, y = (words.view(np.uint64) for words in np.ascontiguousarray(place))
+        n_met = kernels("sensor").rays_met(*rings, np.ascontiguousarray(centroid_um), RAYS)
+        is_around = n_met >= FEWEST_RAYS_AROUND
+        if np.any((n_met > 0) & ~is_around):
+            _, which, n_here = np.unique(place, axis=1, return_inverse=True, return_counts=True)
+            is_around |= (n_met > 0) & (n_here[which.ravel()] > 1)
+        around = np.flatnonzero(is_around)
+        x[around], y[around] = _outline_words(*rings, around)
+        return x, y
 
     def key(self, effect: str) -> tuple[np.uint64, np.uint64]:
         """Key of an effect's numbers."""
@@ -74,9 +97,46 @@ class Device:
 
         return np.asarray(ndtri(self.uniforms(effect)))
 
+    def log_normals(self, effect: str, spread_fraction: float) -> Floats:
+        """
+        A number of the log-normal distribution for every site, (n_site,).
+
+        The mean is 1 and the standard deviation ``spread_fraction``: the logarithm is a Gaussian of the variance
+        ``s² = ln(1 + spread_fraction²)`` and the mean ``-s² / 2``.
+        """
+        sigma = np.sqrt(np.log1p(spread_fraction**2))
+        return np.asarray(np.exp(sigma * self.normals(effect) - 0.5 * sigma**2))
+
     def line_normals(self, effect: str, lines: Ints) -> Floats:
         """A number of the standard Gaussian law for each of some lines."""
         from scipy.special import ndtri
 
         words = np.ascontiguousarray(lines, np.int64).view(np.uint64)
         return np.asarray(ndtri(kernels("sensor").device_uniforms(*self.key(effect), words, np.zeros_like(words))))
+
+
+#: Odd factors of the two words of an outline, and of its coordinates (fractions of 2**64 of the golden ratio and others).
+_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+
+
+def _outline_words(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints, sites: Ints) -> tuple[Words, Words]:
+    """Two words for the outlines of some sites: sums over vertices of a hash of each, whatever vertex is the first."""
+    begins, ends = ring_offsets[site_offsets[sites]], ring_offsets[site_offsets[sites + 1]]
+    lengths = ends - begins
+    if not sites.size:
+        return np.zeros(0, np.uint64), np.zeros(0, np.uint64)
+    vertices = np.repeat(begins, lengths) + positions_in_runs(lengths)
+    place = np.rint(xy_um[vertices] / PLACE_UM).astype(np.int64).view(np.uint64)
+    firsts = np.concatenate(([0], np.cumsum(lengths)[:-1]))
+    one, other = (
+        np.add.reduceat(_mixed(_mixed(place[:, 0] * factor) + place[:, 1] * _FACTORS[2]), firsts)
+        for factor in _FACTORS[:2]
+    )
+    return one, other
+
+
+def _mixed(words: Words) -> Words:
+    """Words whose bits all hang on all bits: the last steps of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014)."""
+    words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return words ^ (words >> np.uint64(31))

@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Ints, finite_array, read_only
+from foveasim.arrays import Floats, Ints, read_only
 from foveasim.errors import ParameterError
 from foveasim.sensor._sensor import Sensor
-from foveasim.sensor.calibration import ROUNDING_DN2, Calibration, linearised, nominal_e_per_dn
+from foveasim.sensor.calibration import Calibration, linearised, nominal_e_per_dn
+from foveasim.sensor.converter import QUANTISATION_DN2
+from foveasim.sensor.limits import check_plausible_array
 from foveasim.sensor.noise import LARGEST_CHARGE_E, draw_shot_noise
 from foveasim.streams import Streams
 
@@ -109,7 +111,13 @@ def merge_exposures(
 
     Notes
     -----
-    The charge ``N_j`` of the exposure ``t_j`` has the variance ``v_j = r t_j + dark charge + read² + reset² + step² / 12``, and
+    The charge ``N_j`` of the exposure ``t_j`` has the variance
+
+    ::
+
+        v_j = r t_j + dark charge + read² + reset² + rts² / 4 + step² (1/12 + dnl²)
+
+    with ``rts`` on the device's RTS sites and ``step`` the width of the code, and
 
     ::
 
@@ -144,7 +152,7 @@ def merge_exposures(
     >>> round(float(np.nansum(weight * rates.rate_e_per_s / sensitivity) / np.nansum(weight)), 1)
     50000.0
     """
-    times_s = finite_array("exposures_s", exposures_s, ndim=1, above=0.0)
+    times_s = check_plausible_array("exposures_s", exposures_s, ndim=1)
     codes, linear_dn, e_per_dn = _readings(code, times_s.size, sensor, "exposure")
     n_sites = sensor.layout.n_sites
     dark_e_per_s = np.zeros(1)
@@ -161,7 +169,7 @@ def merge_exposures(
     charge_e = (linear_dn - offset_dn) / gain * e_per_dn
     top_dn = _saturation_dn(sensor)
     top_e = (top_dn - offset_dn) / gain * e_per_dn
-    fixed_e2 = _read_noise_e2(sensor, codes, e_per_dn) + sensor.ktc_noise_e**2
+    fixed_e2 = _conversion_noise_e2(sensor, codes, e_per_dn) + sensor.readout_noise_e2()
     shot = 0.0 if sensor.shot_noise == "off" else 1.0
     is_used = (codes < 2.0**sensor.bits - 1.0) & (linear_dn < top_dn) & np.isfinite(charge_e) & (top_e > 0.0)
     t_s = times_s[:, None]
@@ -235,7 +243,7 @@ def non_destructive_reads(
     if not isinstance(sensor, Sensor):
         raise ParameterError("sensor", f"must be a foveasim.Sensor, got a {type(sensor).__name__}")
     n_sites = sensor.layout.n_sites
-    light = finite_array("photo_e_per_s", photo_e_per_s, at_least=0.0)
+    light = check_plausible_array("photo_e_per_s", photo_e_per_s)
     if light.shape not in ((), (n_sites,)):
         raise ParameterError(
             "photo_e_per_s", f"must be one number, or one for each of the {n_sites} sites, got the shape {light.shape}"
@@ -277,7 +285,7 @@ def fit_ramp(
     times_s : (n_read,), s
         Rising.
     sensor : Sensor
-        Its converter, capacitances, full well and noise of reading count.
+        Its converter, capacitances, full well, read noise and RTS sites count.
     weight_rate_e_per_s : number or (n_site,), optional, e-/s
         Rate that the weights are of; by default each site's own, from its first and last usable read.
 
@@ -294,8 +302,9 @@ def fit_ramp(
     Notes
     -----
     Differences of one read and the next have no offset and no noise of resetting. Their covariance has ``r dt_k + 2 s²`` on the
-    diagonal and ``-s²`` beside it, with the noise s of reading and rounding; the slope is the one of generalised least squares,
-    solved in time proportional to the reads (T. D. Brandt, PASP 136, 045004, 2024; arXiv:2309.08753).
+    diagonal and ``-s²`` off it, with the noise s of reading, of RTS sites and of conversion; the slope is the one of
+    generalised least squares, solved in time proportional to the reads (T. D. Brandt, PASP 136, 045004, 2024;
+    arXiv:2309.08753).
 
     For given ``weight_rate_e_per_s`` the slope is a fixed sum of the reads, and so unbiased; for weights of the site's own
     rate it is off by a fraction of an electron a ramp.
@@ -308,7 +317,7 @@ def fit_ramp(
     codes, linear_dn, e_per_dn = _readings(code, times.size, sensor, "read")
     n_sites = sensor.layout.n_sites
     charge_e = linear_dn * e_per_dn
-    noise_e2 = _read_noise_e2(sensor, codes, e_per_dn)
+    noise_e2 = _conversion_noise_e2(sensor, codes, e_per_dn) + sensor.readout_noise_e2(is_reset=False)
     is_below = (codes < 2.0**sensor.bits - 1.0) & (linear_dn < _saturation_dn(sensor))
     is_used = np.logical_and.accumulate(is_below, axis=0)
     n_used = np.count_nonzero(is_used, axis=0).astype(np.int64)
@@ -318,7 +327,7 @@ def fit_ramp(
         rise_e = charge_e[last, np.arange(n_sites)] - charge_e[0]
         rate = np.divide(rise_e, lasted_s, out=np.zeros(n_sites), where=lasted_s > 0.0)
     else:
-        rate = finite_array("weight_rate_e_per_s", weight_rate_e_per_s)
+        rate = check_plausible_array("weight_rate_e_per_s", weight_rate_e_per_s)
         if rate.shape not in ((), (n_sites,)):
             raise ParameterError(
                 "weight_rate_e_per_s", f"must be one number, or one for each of the {n_sites} sites, got {rate.shape}"
@@ -349,7 +358,7 @@ def _protect(carrier: Any) -> None:
 
 
 def _rising(name: str, times_s: ArrayLike) -> Floats:
-    times = finite_array(name, times_s, ndim=1, at_least=0.0)
+    times = check_plausible_array(name, times_s, ndim=1)
     if times.size == 0 or np.any(np.diff(times) <= 0.0):
         raise ParameterError(name, "must be one or more times, each later than the one before", times_s, "s")
     return times
@@ -368,17 +377,16 @@ def _readings(code: ArrayLike, n_readings: int, sensor: Sensor, what: str) -> tu
     return codes, linear_dn, nominal_e_per_dn(sensor)
 
 
-def _read_noise_e2(sensor: Sensor, codes: NDArray[Any], e_per_dn: Floats) -> Floats:
-    """Variance of reading and rounding, (n_reading, n_site) e-²; wider apart codes round more."""
-    table = linearised(np.arange(2**sensor.bits), sensor)
-    step_dn = np.interp(codes, np.arange(table.size), np.gradient(table)) if table.size > 1 else np.ones(codes.shape)
-    # Without shot noise charges are whole electrons by rounding.
-    whole_e2 = ROUNDING_DN2 if sensor.shot_noise == "off" else 0.0
-    return np.asarray((step_dn * e_per_dn) ** 2 * ROUNDING_DN2 + whole_e2 + np.square(sensor.read_noise_e))
+def _conversion_noise_e2(sensor: Sensor, codes: NDArray[Any], e_per_dn: Floats) -> Floats:
+    """Variance of conversion to codes, (n_reading, n_site) e-²: wider codes err more."""
+    step_e = sensor.converter.width_of_code_dn(codes) * e_per_dn
+    # Without shot noise charges are integers by rounding.
+    whole_e2 = QUANTISATION_DN2 if sensor.shot_noise == "off" else 0.0
+    return np.asarray(step_e**2 * sensor.converter.noise_dn2 + whole_e2)
 
 
 def _saturation_dn(sensor: Sensor) -> Floats:
-    """Linear code from which a site is taken as saturated: the highest, or its full well's, less the noise of reading."""
+    """Linear code from which a site is taken as saturated: the highest, or its full well's, less the noise of its readout."""
     n_sites = sensor.layout.n_sites
     top_dn = np.full(n_sites, float(linearised(2**sensor.bits - 1, sensor)))
     if sensor.full_well_e is None:
@@ -386,7 +394,7 @@ def _saturation_dn(sensor: Sensor) -> Floats:
     still = replace(sensor, read_noise_e=0.0, ktc_noise=False, rts_e=0.0, coupling=None)
     well_e = np.floor(np.minimum(np.broadcast_to(sensor.full_well_e, n_sites), LARGEST_CHARGE_E)).astype(np.int64)
     well_dn = linearised(still.read(well_e, streams=Streams(0)), sensor)
-    noise_dn = np.sqrt(np.square(sensor.read_noise_e) + sensor.ktc_noise_e**2) / nominal_e_per_dn(sensor)
+    noise_dn = np.sqrt(sensor.readout_noise_e2()) / nominal_e_per_dn(sensor)
     return np.minimum(top_dn, well_dn - MARGIN_SIGMAS * noise_dn - 1.0)
 
 

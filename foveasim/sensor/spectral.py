@@ -17,6 +17,7 @@ from foveasim.sensor.spectral_curves import (
     GaussianCurve,
     ProductCurve,
     as_curve,
+    curve_values,
 )
 
 __all__ = ["ConstantCurve", "Curve", "FilterSet", "rgb_filters"]
@@ -89,8 +90,15 @@ class FilterSet:
         return FilterSet([BandMean(curve=curve, band_width_nm=band_width_nm) for curve in self.curves], self.names)
 
     def transmission(self, wavelength_nm: Floats) -> Floats:
-        """Transmission of every filter, (n_filter, n_wavelength)."""
-        return np.stack([curve(wavelength_nm) for curve in self.curves])
+        """
+        Transmission of every filter, (n_filter, n_wavelength).
+
+        Raises
+        ------
+        ParameterError
+            When a curve fails, or returns other than one number per wavelength; its own error is the cause.
+        """
+        return np.stack([curve_values(curve, wavelength_nm) for curve in self.curves])
 
 
 def rgb_filters() -> FilterSet:

@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim.arrays import Floats, check_count, check_number
-from foveasim.errors import ParameterError
+from foveasim.errors import FoveasimError, ParameterError
 
 __all__ = [
     "BandMean",
     "ConstantCurve",
     "Curve",
+    "CurveError",
     "Factor",
     "GaussianCurve",
     "Multiplied",
@@ -31,7 +32,12 @@ __all__ = [
     "SiliconQE",
     "as_curve",
     "check_within",
+    "curve_values",
 ]
+
+
+class CurveError(ParameterError):
+    """A function given for a curve that fails, or returns other than one number per wavelength."""
 
 
 class Curve(Protocol):
@@ -260,7 +266,9 @@ class ProductCurve(Multiplied):
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Values at the wavelengths, of the same shape."""
-        return np.asarray(reduce(np.multiply, (as_curve("curves", c)(wavelength_nm) for c in self.curves)))
+        return np.asarray(
+            reduce(np.multiply, (curve_values(as_curve("curves", c), wavelength_nm) for c in self.curves))
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -311,7 +319,7 @@ class BandMean(Multiplied):
             )
         middles = (np.arange(self.n_points) + 0.5) / self.n_points - 0.5
         points_nm = centre_nm + self.band_width_nm * middles
-        return np.asarray((self.curve(points_nm) * points_nm / centre_nm).mean(axis=-1))
+        return np.asarray((curve_values(self.curve, points_nm) * points_nm / centre_nm).mean(axis=-1))
 
 
 def as_curve(name: str, value: object) -> Curve:
@@ -326,6 +334,42 @@ def as_curve(name: str, value: object) -> Curve:
     if callable(value):
         return value
     return ConstantCurve(check_number(name, value, at_least=0.0, at_most=1.0))
+
+
+def curve_values(curve: Curve, wavelength_nm: ArrayLike) -> Floats:
+    """
+    Return a curve's values at wavelengths, of the same shape; one number stands for all of them.
+
+    Raises
+    ------
+    CurveError
+        When the function fails, which is the cause, or returns other than one real number per wavelength.
+    ParameterError
+        As the curves of this package raise it.
+    """
+    called = getattr(curve, "__qualname__", None) or type(curve).__qualname__
+    try:
+        given = curve(wavelength_nm)
+    except FoveasimError:
+        raise
+    except Exception as error:
+        problem = " ".join(f"{type(error).__name__}: {error}".split())
+        raise CurveError(
+            "curve", f"must be a function of wavelength that returns numbers, but {called} raised {problem}"
+        ) from error
+    try:
+        values = np.asarray(given)
+        if values.dtype.kind not in "biuf":
+            raise TypeError
+    except (TypeError, ValueError):
+        raise CurveError("curve", "must return one number per wavelength", given, cure=f"correct {called}") from None
+    if values.shape not in ((), np.shape(wavelength_nm)):
+        raise CurveError(
+            "curve",
+            f"must return one number per wavelength, got the shape {values.shape} for {np.shape(wavelength_nm)}",
+            cure=f"correct {called}",
+        )
+    return np.broadcast_to(values.astype(np.float64, copy=False), np.shape(wavelength_nm))
 
 
 def check_within(wavelength_nm: ArrayLike, low_nm: float, high_nm: float, what: str, cure: str = "") -> None:

@@ -1,0 +1,196 @@
+"""
+Plausible ranges of the parameters of sensors and of their exposures: one table for all.
+
+A value outside its range is a slip of units or of digits. The ranges are wide: no sensor in use reaches their ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim.arrays import check_number, finite_array, unit_of
+from foveasim.errors import ParameterError
+
+__all__ = ["LIMITS", "MAX_SPREAD", "Limits", "check_plausible", "check_plausible_array"]
+
+#: A wider Gaussian spread about 1 has more than one in 2,300 values below 0, where it is cut off.
+MAX_SPREAD = 0.3
+_GAUSSIAN = "0.03 is 3 %; a Gaussian spread above 0.3 would be cut off at 0"
+_ELECTRONS = "charges are in electrons: 1 fC is 6242 e-"
+_RATES = "rates are in electrons per second: 1 fA is 6242 e-/s"
+_SECONDS = "times are in seconds: 1 ms is 1e-3"
+_VOLTS = "voltages are in volts: 1 mV is 1e-3"
+_KELVIN = "temperatures are in kelvin: 0 °C is 273.15 K"
+_PER_SECOND = "rates are per second and photosite"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """
+    A plausible range.
+
+    Parameters
+    ----------
+    high : float
+        Largest plausible value, in the parameter's unit.
+    low : float
+        Smallest plausible value; below 0 only where values of both signs are.
+    is_positive : bool
+        Whether 0 is outside; otherwise it is inside, whatever ``low`` is.
+    hint : str
+        Reminder of the unit, for the message.
+    """
+
+    high: float
+    low: float = 0.0
+    is_positive: bool = False
+    hint: str = ""
+
+    @property
+    def rule(self) -> str:
+        """The range as a message states it."""
+        if self.low == 0.0:
+            return f"must be <= {self.high:g}"
+        is_apart = self.low > 0.0 and not self.is_positive
+        return f"must be {'0, or ' if is_apart else ''}from {self.low:g} to {self.high:g}"
+
+
+_FRACTION = Limits(high=1.0, hint="fractions are from 0 to 1")
+_SPREAD = Limits(high=MAX_SPREAD, hint=_GAUSSIAN)
+#: Of log-normal distributions.
+_WIDE_SPREAD = Limits(high=10.0, hint="a standard deviation over the mean: 0.1 is 10 %")
+_RATE_E = Limits(high=1e15, hint=_RATES)
+_CHARGE_E = Limits(high=1e15, hint=_ELECTRONS)
+#: A microfarad at room temperature has a reset noise of 4e5 e-.
+_NOISE_E = Limits(high=1e7, hint=_ELECTRONS)
+_TIME_S = Limits(low=1e-12, high=1e7, hint=_SECONDS)
+_DURATION_S = Limits(low=1e-12, high=1e7, is_positive=True, hint=_SECONDS)
+_EVENTS = Limits(high=1e9, hint=_PER_SECOND)
+#: Thresholds below 1e-3 are below the noise of any circuit, and their events beyond any memory.
+_CONTRAST = Limits(low=1e-3, high=20.0, is_positive=True, hint="contrasts are of natural logarithms: 0.2 is 22 %")
+_OFFSET = Limits(high=1.0, hint="offsets are fractions of v_sat_v: 0.02 is 2 %")
+
+#: By the names of keywords; where two classes have one name for different things, the class comes first.
+LIMITS: Mapping[str, Limits] = MappingProxyType(
+    {
+        # Sensor
+        "sensitivity": _FRACTION,
+        "hot_fraction": _FRACTION,
+        "dead_fraction": _FRACTION,
+        "rts_fraction": _FRACTION,
+        "nonlinearity_fraction": Limits(high=0.5, hint="above 0.5 the voltage would fall with charge"),
+        "prnu_fraction": _SPREAD,
+        "gain_fpn_fraction": _SPREAD,
+        "dsnu_fraction": _WIDE_SPREAD,
+        "pixel_fpn_fraction": _OFFSET,
+        "line_fpn_fraction": _OFFSET,
+        "dark_e_per_s": _RATE_E,
+        "hot_e_per_s": _RATE_E,
+        "temperature_k": Limits(low=0.01, high=1000.0, is_positive=True, hint=_KELVIN),
+        "dark_reference_k": Limits(low=0.01, high=1000.0, is_positive=True, hint=_KELVIN),
+        "dark_doubling_k": Limits(low=0.1, high=1000.0, is_positive=True, hint="dark current doubles every 5 to 10 K"),
+        "full_well_e": Limits(low=0.0, high=1e15, is_positive=True, hint=_ELECTRONS),
+        "read_noise_e": _NOISE_E,
+        "rts_e": _NOISE_E,
+        "capacitance_f": Limits(
+            low=1e-18, high=1e-6, is_positive=True, hint="capacitances are in farad: 1 fF is 1e-15"
+        ),
+        "pedestal_v": Limits(high=1e3, hint=_VOLTS),
+        "v_sat_v": Limits(low=1e-6, high=1e3, is_positive=True, hint=_VOLTS),
+        # Converter
+        "log_strength": Limits(high=1e9, is_positive=True),
+        "dnl_dn": Limits(high=2.0**16, hint="deviations are in codes"),
+        "inl_dn": Limits(low=-(2.0**16), high=2.0**16, hint="deviations are in codes"),
+        # Exposures, ramps and calibrations
+        "exposure_s": _TIME_S,
+        "exposures_s": _DURATION_S,
+        "long_exposure_s": _DURATION_S,
+        "times_s": _TIME_S,
+        "photo_e_per_s": _RATE_E,
+        "weight_rate_e_per_s": Limits(low=-1e15, high=1e15, hint=_RATES),
+        "flat_e": Limits(high=1e15, is_positive=True, hint=_ELECTRONS),
+        "charge_e": _CHARGE_E,
+        "hot_sigmas": Limits(high=1e6, is_positive=True, hint="a number of standard deviations"),
+        "noisy_ratio": Limits(high=1e6, is_positive=True, hint="a ratio of standard deviations"),
+        # Event and spiking photosites
+        "contrast_on": _CONTRAST,
+        "contrast_off": _CONTRAST,
+        "mismatch_fraction": _SPREAD,
+        "refractory_s": _TIME_S,
+        "frame_s": _DURATION_S,
+        "line_s": _TIME_S,
+        "EventPixels.capacitance_f": Limits(low=1e-18, high=1e-9, hint="capacitances are in farad: 1 fF is 1e-15"),
+        "leak_per_s": _EVENTS,
+        "leak_spread_fraction": _WIDE_SPREAD,
+        "noise_per_s": _EVENTS,
+        "noise_half_e_per_s": Limits(high=1e15, is_positive=True, hint=_RATES),
+        "floor_e_per_s": _RATE_E,
+        "threshold_e": Limits(low=1.0, high=1e15, is_positive=True, hint=_ELECTRONS),
+    }
+)
+
+
+def check_plausible(name: str, value: object, *, of: str = "") -> float:
+    """
+    Return the value as a float within its plausible range.
+
+    Parameters
+    ----------
+    name : str
+        The keyword, a key of :data:`LIMITS`.
+    value : object
+    of : str
+        Class of the keyword, where the table has one of its own for it.
+
+    Raises
+    ------
+    ParameterError
+        When it is not one finite number, negative, or outside the range; the message names range and unit.
+    """
+    limits = LIMITS[f"{of}.{name}" if of else name]
+    number = check_number(name, value, above=0.0 if limits.is_positive else None, at_least=0.0, cure=limits.hint)
+    _check_range(name, np.asarray(number), limits)
+    return number
+
+
+def check_plausible_array(name: str, value: ArrayLike, *, ndim: int | None = None) -> NDArray[np.float64]:
+    """
+    Return the values as a float64 array within their plausible range.
+
+    Parameters
+    ----------
+    name : str
+        The keyword, a key of :data:`LIMITS`.
+    value : array_like
+    ndim : int, optional
+        Number of dimensions; any by default.
+
+    Raises
+    ------
+    ParameterError
+        When a value is not finite, negative, or outside the range; the message names the first one's index.
+    """
+    limits = LIMITS[name]
+    least = 0.0 if limits.low >= 0.0 else None
+    array = finite_array(name, value, ndim=ndim, at_least=least, above=0.0 if limits.is_positive else None)
+    _check_range(name, array, limits)
+    return array
+
+
+def _check_range(name: str, values: NDArray[np.float64], limits: Limits) -> None:
+    is_outside = (values > limits.high) | (values < limits.low)
+    if not limits.is_positive:
+        is_outside &= values != 0.0
+    if not np.any(is_outside):
+        return
+    where = tuple(int(i) for i in np.argwhere(is_outside)[0])
+    place = f" at [{', '.join(map(str, where))}]" if where else ""
+    everywhere = " everywhere" if values.ndim else ""
+    raise ParameterError(
+        name, limits.rule + everywhere, float(values[where]), (unit_of(name) + place).strip(), limits.hint
+    )
