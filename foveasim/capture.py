@@ -30,7 +30,7 @@ from foveasim.reconstruct import (
     raster_grid,
 )
 from foveasim.records import described
-from foveasim.sensor import Sensor
+from foveasim.sensor import Sensor, signal_to_noise
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,7 +63,12 @@ ELECTRONICS = (
         "nonlinearity_fraction",
         "pedestal_v",
     ),
-    *("v_sat_v", "bits", "companding", "log_strength", "companding_table", "inl_dn"),
+    *("v_sat_v", "bits", "companding", "log_strength", "companding_table", "inl_dn", "dnl_dn"),
+)
+#: Further parameters that signal-to-noise ratios depend on: those of the device.
+DEVICE = (
+    *("device_seed", "dsnu_fraction", "hot_fraction", "hot_e_per_s", "gain_fpn_fraction", "pixel_fpn_fraction"),
+    "line_fpn_fraction",
 )
 
 
@@ -190,7 +195,7 @@ class Capture:
         Least squares need values linear in light: from codes and charges the pedestal and the dark charge are taken off,
         companding is undone, and saturated sites are left out. What they find is light per µm²; with ``per="site"`` that is
         shown as what a site of the mean response would give. The ``variance`` is by default that of shot noise, and for codes
-        that of resetting, reading and rounding too.
+        that of resetting, reading, RTS sites and rounding too.
         """
         methods = {"cells": cells, "linear": linear, "natural": natural, "least_squares": least_squares}
         check_choice("method", method, tuple(methods))
@@ -240,7 +245,26 @@ class Capture:
         channels = np.where(is_own, values, np.where(is_own.any(axis=1, keepdims=True), np.nan, 0.0))
         return methods[method](self.layout, channels, grid, **options)
 
-    def _electronics(self, sensor: Sensor | None) -> Sensor:
+    def signal_to_noise(self, *, sensor: Sensor | None = None) -> Floats:
+        """
+        Signal-to-noise ratio of every site, (n_site,), without a draw: :func:`foveasim.sensor.signal_to_noise`.
+
+        Parameters
+        ----------
+        sensor : Sensor, optional
+            That made the capture: needed where its electronics differ from site to site in a layout of more than 64 sites,
+            since ``settings`` does not keep such. Without it crosstalk and coupling of dark charge are not counted.
+
+        Raises
+        ------
+        ParameterError
+            When the electronics are not known, or the sensor is of another number of sites.
+        """
+        known = self._electronics(sensor, DEVICE)
+        dark_e = known.expected_electrons(np.zeros(self.layout.n_sites), float(self.settings.get("exposure_s", 0.0)))
+        return signal_to_noise(known, self.expected_e, np.broadcast_to(dark_e, self.expected_e.shape)).ratio
+
+    def _electronics(self, sensor: Sensor | None, further: tuple[str, ...] = ()) -> Sensor:
         """The sensor as it is meant: the one given, or as much of it as the settings tell."""
         if sensor is not None:
             if not isinstance(sensor, Sensor) or sensor.layout.n_sites != self.layout.n_sites:
@@ -254,7 +278,8 @@ class Capture:
                     f"must be given: the capture's settings do not tell its {name!r}"
                     + (" of every site" if name in told else ""),
                 )
-        return Sensor(self.layout, **{name: told[name] for name in ELECTRONICS})
+        more = [name for name in further if name in told]
+        return Sensor(self.layout, **{name: told[name] for name in (*ELECTRONICS, *more)})
 
     def _readings(self, electronics: Sensor, of: str) -> Readings:
         exposure_s = float(self.settings.get("exposure_s", 0.0))

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import re
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import foveasim as fs
 from foveasim.errors import ParameterError
-from foveasim.metrics import light_at_snr_fraction, measured_snr_by_class, size_classes_um, snr_by_class
+from foveasim.explore import METRICS
+from foveasim.metrics import SnrTable, light_at_snr_fraction, measured_snr_by_class, size_classes_um, snr_by_class
+from foveasim.sensor import linearised, signal_to_noise
+from foveasim.streams import Streams
 from foveasim.units import volts_to_electrons
+from foveasim.view import plot_capture
+from foveasim.view.web._content import content_of
 
 ZONES = fs.layout.zones(side_um=(40, 80, 160), pitch_um=(1, 2, 4))
 EXPOSURE_S = 0.01
@@ -158,18 +166,19 @@ def test_the_least_light_is_found_where_rings_of_a_class_saturate(bits):
     shown, light = lit(2000.0, layout, full_well_e=1e4, bits=bits)
     sensor, labels = shown.sensor, size_classes_um(layout, 3)
     full_e = sensor.expected_electrons(shown.photoelectrons_per_s(light), EXPOSURE_S)
-    dark_dn, _ = sensor.predict(np.zeros(layout.n_sites))
     shares = np.geomspace(1e-2, 20.0, 700)
-    told = [sensor.predict(full_e * share) for share in shares]
+    step_e = volts_to_electrons(1.0 / 2**bits, 2e-15)
 
     found_some = False
     for snr in (50.0, 80.0, 88.0, 92.0):
         found = light_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S, snr=snr, classes=labels)
         for k, label in enumerate(np.unique(labels)):
             of = labels == label
-            # By looking at all shares: the first that does. Half of the sites within 200 e- of the well do not count.
-            ratio = [(mean - dark_dn)[of].mean() / np.sqrt(variance[of].mean() + 1e-30) for mean, variance in told]
-            first = shares[np.flatnonzero(np.array(ratio) >= snr)[0]]
+            # By looking at all fractions: the first that does. Half of the sites within 200 e- of the well do not count.
+            charge_e = np.minimum(shares[:, np.newaxis] * full_e[of], 1e4).mean(axis=1)
+            ratio = charge_e / np.sqrt(charge_e + 25.0 + step_e**2 / 12.0)
+            reached = np.flatnonzero(ratio >= snr)
+            first = shares[reached[0]] if reached.size else np.nan
             full = np.mean(first * full_e[of] > 9800.0)
             found_some |= 0.0 < full < 0.5
             assert found[k] == pytest.approx(np.nan if full >= 0.5 else first, rel=0.012, nan_ok=True)
@@ -186,13 +195,14 @@ def test_a_ratio_beyond_the_well_is_never_reached():
     assert np.isnan(light_at_snr_fraction(shown, nothing, exposure_s=EXPOSURE_S)).all()
 
 
-def test_without_noise_the_least_light_is_that_of_the_first_code():
+def test_without_noise_quantisation_sets_threshold():
     shown, light = lit(2000.0, read_noise_e=0.0, shot_noise="off")
 
     found = light_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S)
 
-    # Charges are whole: the first that is a code or more.
-    assert found[0] * 2000.0 == pytest.approx(np.ceil(volts_to_electrons(1.0 / 4096, 2e-15)) - 0.5, rel=1e-3)
+    # Rounding to codes, and of charges to integers.
+    step_e = volts_to_electrons(1.0 / 4096, 2e-15)
+    assert found[0] * 2000.0 == pytest.approx(np.sqrt((step_e**2 + 1.0) / 12.0), rel=1e-5)
 
 
 def test_sizes_fall_into_classes_of_equal_ratios():
@@ -213,6 +223,162 @@ def test_classes_may_be_any_labels_and_print_as_a_table():
     assert table.classes.tolist() == ["left", "right"]
     assert [row["class"] for row in table.records()] == ["left", "right"]
     assert "left" in str(table)
+
+
+# -- one definition -----------------------------------------------------------------------------------------------------
+
+LARGE = fs.layout.grid(n_x=10, n_y=10, pitch_um=8.0).with_columns(readout_line=np.tile(np.arange(10), 10))
+COMPANDINGS = [{}, {"companding": "root"}, {"companding": "log", "log_strength": 300.0}]
+
+
+def signals(charges_e, **options):
+    """Signals of one site for each of several charges, without dark charge."""
+    layout = fs.layout.grid(n_x=len(charges_e), n_y=1, pitch_um=8.0)
+    return signal_to_noise(fs.Sensor(layout, **options), charges_e, np.zeros(len(charges_e)))
+
+
+def test_snr_table_stays_below_shot_limit():
+    """10 bits of 1,828 e- each: 2,031 e- lie inside one code, and the variance of the codes vanishes."""
+    ratios = []
+    for charge_e in (2031.0, 1e4, 1e5, 1e6):
+        shown, light = lit(charge_e, LARGE, bits=10, read_noise_e=2.0, capacitance_f=1e-13, v_sat_v=3.0)
+        table = snr_by_class(shown, light, exposure_s=EXPOSURE_S)
+        ratios.append(table.snr[0])
+        assert table.snr[0] <= np.sqrt(charge_e)
+    # Of 2,031 e-: 2,031 / sqrt(2,031 + 4 + 1,828² / 12).
+    assert ratios[0] == pytest.approx(3.83, abs=0.01)
+    assert np.all(np.diff(ratios) > 0.0)
+
+
+@pytest.mark.parametrize("bits", [1, 3, 10, 14])
+@pytest.mark.parametrize("companding", COMPANDINGS)
+@pytest.mark.parametrize(
+    "more",
+    [
+        {},
+        {"full_well_e": 9000.0},
+        {"pedestal_v": 0.1, "read_noise_e": 0.0},
+        {"ktc_noise": True, "rts_fraction": 1.0, "rts_e": 50.0},
+    ],
+)
+def test_snr_rises_below_shot_limit(bits, companding, more):
+    charges_e = np.geomspace(1e-2, 1e6, 4001)
+    found = signals(
+        charges_e, bits=bits, v_sat_v=1.0, capacitance_f=2e-15, **{"read_noise_e": 3.0, **companding, **more}
+    )
+
+    assert np.all(found.ratio <= np.sqrt(found.signal_e) * (1.0 + 1e-12))
+    assert np.all(np.diff(found.ratio) >= -1e-9 * found.ratio[1:])
+    assert found.is_saturated[-1]
+    assert bits == 1 or not found.is_saturated[0]
+
+
+@pytest.mark.parametrize("sigma_dn", [0.05, 0.3, 1.0, 8.0])
+@pytest.mark.parametrize("dnl_dn", [0.0, 0.4])
+@pytest.mark.parametrize(("companding", "charge_e"), list(zip(COMPANDINGS, (20_000, 20_000, 6000), strict=True)))
+def test_noise_matches_squared_error_of_codes(companding, charge_e, dnl_dn, sigma_dn):
+    """Offsets spread over a code and more: variance and squared error of the codes together, for any noise."""
+    n = 40_000
+    layout = fs.layout.grid(n_x=200, n_y=200, pitch_um=2.0).with_columns(readout_line=np.arange(n))
+    full_e = 40_000.0
+    known = {"bits": 8, "v_sat_v": 1.0, "capacitance_f": full_e * 1.602176634e-19, "shot_noise": "off", **companding}
+    ideal = fs.Sensor(layout, **known)
+    step_e = signal_to_noise(ideal, np.full(n, float(charge_e)), np.zeros(n)).noise_e[0] * np.sqrt(12.0)
+    # The noise is relative to the code there.
+    sensor = fs.Sensor(
+        layout,
+        **known,
+        dnl_dn=dnl_dn,
+        read_noise_e=sigma_dn * step_e,
+        pixel_fpn_fraction=2.0 * step_e / full_e,
+    )
+    code = sensor.read(np.full(n, charge_e), streams=Streams(5))
+    found_e = (linearised(code, sensor) + 0.5) * full_e / 256.0 - sensor.pixel_offset_v * full_e
+
+    told = signal_to_noise(sensor, np.full(n, float(charge_e)), np.zeros(n))
+
+    squares = np.square(found_e - charge_e)
+    error = squares.std() / np.sqrt(n)
+    # Wider codes on one side of a curve than on the other: to 2 %.
+    assert squares.mean() == pytest.approx(np.square(told.noise_e).mean(), abs=5.0 * error + 0.02 * squares.mean())
+
+
+def test_snr_is_one_everywhere():
+    layout = fs.layout.grid(n_x=6, n_y=6, pitch_um=8.0).with_columns(readout_line=np.repeat(np.arange(6), 6))
+    shown, light = lit(
+        5000.0,
+        layout,
+        bits=10,
+        companding="root",
+        dark_e_per_s=2e4,
+        dsnu_fraction=0.3,
+        hot_fraction=0.1,
+        hot_e_per_s=3e4,
+        ktc_noise=True,
+        rts_fraction=0.4,
+        rts_e=80.0,
+        dnl_dn=0.3,
+        gain_fpn_fraction=0.02,
+        pixel_fpn_fraction=0.01,
+        line_fpn_fraction=0.01,
+        prnu_fraction=0.02,
+        pedestal_v=0.05,
+        device_seed=4,
+    )
+    sensor = shown.sensor
+    capture = shown.capture(light, exposure_s=EXPOSURE_S, seed=1)
+    dark_e = sensor.expected_electrons(np.zeros(36), EXPOSURE_S)
+    ratio = signal_to_noise(sensor, capture.expected_e, dark_e).ratio
+    page = content_of(capture)
+    column = next(column for column in page.about["columns"] if column["key"] == "snr")
+    # A class of one site each twice over, since a class has two: the same site in two layouts.
+    by_site = snr_by_class(shown, light, exposure_s=EXPOSURE_S, classes=np.zeros(36, np.int64))
+
+    assert np.ptp(ratio) > 5.0
+    assert capture.signal_to_noise() == pytest.approx(ratio)
+    assert capture.signal_to_noise(sensor=sensor) == pytest.approx(ratio)
+    assert page.arrays[column["array"]] == pytest.approx(ratio, rel=1e-6)
+    assert ratio.min() < by_site.snr[0] < ratio.max()
+    shot = SimpleNamespace(exposure_s=EXPOSURE_S)
+    assert METRICS["snr"](shot, shown, capture)["mean"] == pytest.approx(ratio.mean())
+    assert plot_capture(capture, "snr").collections[0].get_facecolor().shape == (36, 4)
+
+
+def test_measured_snr_undoes_companding():
+    shown, light = lit(6000.0, companding="root", bits=10)
+    nothing = fs.PowerMap(0.0 * light.data, light.grid, light.wavelength_nm)
+    frames, dark = (
+        [shown.capture(some, exposure_s=EXPOSURE_S, seed=k, frame=k) for k in range(12)] for some in (light, nothing)
+    )
+
+    told, found = snr_by_class(shown, light, exposure_s=EXPOSURE_S), measured_snr_by_class(EVEN, frames, dark)
+
+    # Variances of 900 sites and 12 frames are known to sqrt(2 / (900 * 11)); in the dark half the noise is clipped.
+    assert found.snr[0] == pytest.approx(told.snr[0], rel=5 * 0.5 * np.sqrt(2 / (900 * 11)) + 1e-3)
+    assert found.snr[0] < 1.1 * np.sqrt(6000.0)  # in companded codes it would be twice as high
+
+
+def test_measured_snr_inside_one_code_is_bounded():
+    codes, dark = np.full((4, 900), 7), np.zeros((4, 900))
+
+    assert measured_snr_by_class(EVEN, codes, dark, bits=12).snr == pytest.approx([7.0 * np.sqrt(12.0)])
+
+
+def test_table_columns_stay_apart_at_any_magnitude():
+    numbers = np.array([1.961e-06, 5.098e05, 1e-300, 1.2345e300])
+    table = SnrTable(
+        classes=np.array(["a", "a very long label", "b", "c"]),
+        n_sites=np.array([2, 123_456_789, 2, 2]),
+        size_um=numbers,
+        signal_dn=numbers[::-1].copy(),
+        noise_dn=numbers,
+        saturated_fraction=np.array([0.0, 1.0, 1e-9, 0.123456]),
+    )
+    lines = str(table).splitlines()
+
+    for line in lines:
+        assert len(re.split(" {2,}", line.strip())) == 8
+    assert len({len(line) for line in lines}) == 1
 
 
 def test_bad_input_is_told():

@@ -21,9 +21,10 @@ import foveasim as fs
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout.lyrdb import read_lyrdb
 from foveasim.pictures import read_picture
+from foveasim.records import described
 from foveasim.view import SensorStack, site_at, solid_page, solids, web_page, write_solid_page, write_web_page
 from foveasim.view.palette import FILTER_COLOURS
-from foveasim.view.web._content import signal_to_noise
+from foveasim.view.web._content import content_of
 from foveasim.view.web._pack import back_references, packed, smallest
 from foveasim.view.web._shapes import shapes_of
 
@@ -53,6 +54,10 @@ N_X, N_Y, PITCH_UM = 12, 10, 2.5
 MOSAIC = fs.layout.mosaic(fs.layout.grid(n_x=N_X, n_y=N_Y, pitch_um=PITCH_UM), ("RG", "GB"))
 
 
+#: A code of 5 e-, as :func:`capture_of` makes them.
+ELECTRONICS = {"bits": 10, "v_sat_v": 1.0, "capacitance_f": 5 * 1024 * 1.602176634e-19, "read_noise_e": 3.0}
+
+
 def capture_of(layout, filters=("R", "G", "B"), **sensor):
     rng = np.random.default_rng(3)
     expected_e = rng.uniform(0.0, 4000.0, layout.n_sites)
@@ -66,7 +71,7 @@ def capture_of(layout, filters=("R", "G", "B"), **sensor):
         filter_names=filters,
         bits=10,
         white_dn=np.full(len(filters), 800.0),
-        settings={"exposure_s": 0.01, "sensor": {"read_noise_e": 3.0, "shot_noise": "auto", **sensor}},
+        settings={"exposure_s": 0.01, "sensor": {**described(fs.Sensor(layout, **ELECTRONICS)), **sensor}},
     )
 
 
@@ -144,14 +149,22 @@ def test_packed_numbers_come_back_to_the_last_bit(values):
     assert back.nbytes <= max(values.nbytes, 1)
 
 
-def test_signal_to_noise_is_that_of_light_and_of_reading():
+def snr_column(capture):
+    """Signal-to-noise ratios that a page of a capture has; None where it has none."""
+    page = content_of(capture)
+    names = [column["array"] for column in page.about["columns"] if column["key"] == "snr"]
+    return page.arrays[names[0]] if names else None
+
+
+def test_page_snr_includes_quantisation():
     expected_e = CAPTURE.expected_e
 
-    assert signal_to_noise(CAPTURE) == pytest.approx(expected_e / np.sqrt(expected_e + 9.0))
-    assert signal_to_noise(capture_of(MOSAIC, shot_noise="off")) == pytest.approx(expected_e / 3.0)
+    assert snr_column(CAPTURE) == pytest.approx(expected_e / np.sqrt(expected_e + 9.0 + 25.0 / 12.0), rel=1e-6)
+    quiet = snr_column(capture_of(MOSAIC, shot_noise="off"))
+    assert quiet == pytest.approx(expected_e / np.sqrt(9.0 + 26.0 / 12.0), rel=1e-6)
     # An array of which only the checksum was kept, and settings without a sensor.
-    assert signal_to_noise(capture_of(MOSAIC, read_noise_e={"shape": [120], "sha256": "..."})) is None
-    assert signal_to_noise(replace(CAPTURE, settings={})) is None
+    assert snr_column(capture_of(MOSAIC, read_noise_e={"shape": [120], "sha256": "..."})) is None
+    assert snr_column(replace(CAPTURE, settings={})) is None
 
 
 class Elements(HTMLParser):
@@ -407,7 +420,7 @@ def test_sites_have_the_colours_of_what_is_chosen(visit):
     assert row(page, "code") == f"{CAPTURE.code[site]:,} DN"
     assert row(page, "electrons") == f"{CAPTURE.electrons[site]:,} e⁻"
     assert row(page, "filter") == "G"
-    assert float(row(page, "signal to noise")) == pytest.approx(signal_to_noise(CAPTURE)[site], rel=1e-5)
+    assert float(row(page, "signal to noise")) == pytest.approx(CAPTURE.signal_to_noise()[site], rel=1e-5)
     assert page.evaluate(f"foveasim.values({site}).expected_e") == CAPTURE.expected_e[site]
 
 

@@ -17,6 +17,7 @@ from foveasim.errors import ParameterError
 from foveasim.layout import Readout
 from foveasim.metrics import psnr_db
 from foveasim.reconstruct import Picture, raster_grid
+from foveasim.sensor import signal_to_noise
 
 __all__ = [
     "DEFAULT_METRICS",
@@ -34,8 +35,6 @@ Metric = Callable[[Shot, Camera, Capture], Any]
 
 #: Side of the pictures that are compared.
 PSNR_PIXELS = 256
-#: Variance of what rounding to a code takes away, in codes.
-QUANTISATION_DN2 = 1.0 / 12.0
 #: Names that results have beside metrics.
 RESERVED = ("seed", "error", "warning", "point", "repeat")
 #: Metrics of a sweep that names none.
@@ -54,19 +53,16 @@ def saturated_fraction(shot: Shot, camera: Camera, capture: Capture) -> float:  
 
 def snr(shot: Shot, camera: Camera, capture: Capture) -> dict[str, float]:
     """
-    Signal over temporal noise of the codes, predicted without a draw: mean and median over the sites.
+    Signal over temporal noise, predicted without a draw: mean and median over the sites.
 
-    The signal is the mean code less that of darkness; the variance is no less than the 1/12 DN² of rounding. Sites within half
-    a code of the highest tell nothing and are left out; NaN where none is left.
+    The ratio of :func:`foveasim.sensor.signal_to_noise`. Saturated sites are left out; NaN where all are.
     """
     sensor = camera.sensor
-    mean_dn, variance_dn2 = sensor.predict(capture.expected_e)
     dark_e = sensor.expected_electrons(np.zeros(sensor.layout.n_sites), shot.exposure_s)
-    dark_dn, _ = sensor.predict(dark_e)
-    counts = mean_dn < 2**sensor.bits - 1.5
-    if not counts.any():
+    found = signal_to_noise(sensor, capture.expected_e, dark_e)
+    ratio = found.ratio[~found.is_saturated]
+    if not ratio.size:
         return {"mean": float("nan"), "median": float("nan")}
-    ratio = (mean_dn - dark_dn)[counts] / np.sqrt(np.maximum(variance_dn2[counts], QUANTISATION_DN2))
     return {"mean": float(ratio.mean()), "median": float(np.median(ratio))}
 
 

@@ -20,7 +20,6 @@ from foveasim.arrays import Bools, Floats, finite_array, read_only
 from foveasim.errors import FoveasimWarning, ParameterError
 from foveasim.metrics.photon_transfer import (
     LEAST_DARK_DN2,
-    QUANTISATION_DN2,
     PhotonTransfer,
     SiteClasses,
     above_dark,
@@ -29,6 +28,7 @@ from foveasim.metrics.photon_transfer import (
     photon_transfer,
     slopes,
 )
+from foveasim.sensor.converter import QUANTISATION_DN2
 
 __all__ = ["Emva1288", "emva1288"]
 
@@ -122,7 +122,7 @@ class Emva1288:
 
     @property
     def snr_max(self) -> Floats:
-        """Highest signal-to-noise ratio, (n_class,): ``sqrt(saturation_e)``."""
+        """Highest signal-to-noise ratio, (n_class,): ``sqrt(saturation_e)``, of shot noise alone as the standard defines it."""
         return np.sqrt(self.saturation_e)
 
     @property

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim.arrays import Floats, Ints, as_numbers, check_count, check_number, finite_array, read_only
 from foveasim.errors import ParameterError
 from foveasim.sensor import Sensor
+from foveasim.sensor.converter import QUANTISATION_DN2
 from foveasim.streams import Streams
 
 __all__ = [
@@ -36,8 +37,6 @@ __all__ = [
 
 #: The gain is told from levels up to this share of saturation (EMVA 1288).
 LINEAR_FRACTION = 0.7
-#: Variance, in DN², of an even spread over one code.
-QUANTISATION_DN2 = 1.0 / 12.0
 #: A variance below this, in DN², is quantisation's more than the sensor's (EMVA 1288).
 LEAST_DARK_DN2 = 0.24
 

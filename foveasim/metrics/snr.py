@@ -1,4 +1,8 @@
-"""Signal and noise of the sites of each size or class: predicted, without a draw, and measured from captures."""
+"""
+Signal and noise of the sites of each size or class: predicted, without a draw, and measured from captures.
+
+Predictions are those of :func:`foveasim.sensor.signal_to_noise`, the package's one definition of the ratio.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,10 @@ from foveasim.layout import Layout
 from foveasim.metrics.photon_transfer import SiteClasses, codes_of
 from foveasim.metrics.sampling import require_layout
 from foveasim.scene import Scene
-from foveasim.sensor import Sensor
+from foveasim.sensor import Sensor, SiteSignals, signal_to_noise
+from foveasim.sensor.converter import QUANTISATION_DN2, Converter
+from foveasim.sensor.limits import check_plausible
+from foveasim.sensor.signal_to_noise import CUT_OFF_SIGMAS
 
 __all__ = ["SnrTable", "light_at_snr_fraction", "measured_snr_by_class", "size_classes_um", "snr_by_class"]
 
@@ -28,15 +35,14 @@ SIZE_ROUNDING = 1e-6
 LEAST_SHARE, MOST_SHARE, SHARE_ROUNDING = 1e-12, 1e12, 1e-6
 #: In at most so many steps, each so many of them a half, for clips that bend the ratio; of secants between these slopes.
 MOST_STEPS, HALVED_EVERY, SLOPES = 200, 4, (0.25, 4.0)
-#: Where the full well or the highest code is within so many standard deviations of the mean, noise is cut off: its variance
-#: falls from there on, which is EMVA 1288's saturation.
-CUT_OFF_SIGMAS = 2.0
+#: Between two columns of a printed table.
+GAP = "  "
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SnrTable:
     """
-    Signal and temporal noise of each class of sites.
+    Signal and temporal noise of each class of sites, in linear codes.
 
     Attributes
     ----------
@@ -46,12 +52,13 @@ class SnrTable:
     size_um : (n_class,) float64, µm
         Mean square root of the sites' areas.
     signal_dn : (n_class,) float64, DN
-        Mean code less that of darkness.
+        Mean code less that of dark frames.
     noise_dn : (n_class,) float64, DN
-        Root of the mean temporal variance.
+        Root of the mean temporal variance, quantisation included.
     saturated_fraction : (n_class,) float64
-        Share of the sites whose noise is cut off, so that their ratio is too high: the mean charge is within two standard
-        deviations of its shot noise of the full well, or the mean code within two of its own of the highest, to half a code.
+        Fraction of the sites whose noise is cut off: the mean charge is within two standard deviations of its shot noise of
+        the full well, or the mean code within two of its own of the highest. A prediction has the ratio of saturation there;
+        a measured ratio is too high.
     """
 
     classes: NDArray[Any]
@@ -63,14 +70,13 @@ class SnrTable:
 
     @property
     def snr(self) -> Floats:
-        """Signal over noise, (n_class,); infinite without noise, NaN where there is neither."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return self.signal_dn / self.noise_dn
+        """Signal over noise, (n_class,): at most the root of the signal's electrons, unless measured ones are saturated."""
+        return np.divide(self.signal_dn, self.noise_dn, out=np.zeros_like(self.signal_dn), where=self.noise_dn > 0.0)
 
     @property
     def snr_db(self) -> Floats:
-        """The same in decibels, ``20 log10``, (n_class,)."""
-        with np.errstate(divide="ignore", invalid="ignore"):
+        """The same in decibels, ``20 log10``, (n_class,); -inf without signal."""
+        with np.errstate(divide="ignore"):
             return 20.0 * np.log10(np.maximum(self.snr, 0.0))
 
     def records(self) -> list[dict[str, Any]]:
@@ -89,14 +95,25 @@ class SnrTable:
         return [dict(zip(columns, row, strict=True)) for row in rows]
 
     def __str__(self) -> str:
-        lines = ["    class    sites  size / µm  signal / DN  noise / DN     SNR  SNR / dB  saturated"]
-        for row in self.records():
-            label = f"{row['class']:.5g}" if isinstance(row["class"], float) else str(row["class"])
-            lines.append(
-                f"{label:>9}{row['n_sites']:9,}{row['size_um']:11.4g}{row['signal_dn']:13.5g}{row['noise_dn']:12.4g}"
-                f"{row['snr']:8.4g}{row['snr_db']:10.4g}{100.0 * row['saturated_fraction']:9.3g} %"
+        heads = ("class", "sites", "size / µm", "signal / DN", "noise / DN", "SNR", "SNR / dB", "saturated")
+        rows = [
+            (
+                f"{row['class']:.5g}" if isinstance(row["class"], float) else str(row["class"]),
+                f"{row['n_sites']:,}",
+                f"{row['size_um']:.4g}",
+                f"{row['signal_dn']:.5g}",
+                f"{row['noise_dn']:.4g}",
+                f"{row['snr']:.4g}",
+                f"{row['snr_db']:.4g}",
+                f"{100.0 * row['saturated_fraction']:.3g} %",
             )
-        return "\n".join(lines)
+            for row in self.records()
+        ]
+        # As wide as their widest cell: numbers of any magnitude stay apart.
+        widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
+        return "\n".join(
+            GAP.join(cell.rjust(width) for cell, width in zip(cells, widths, strict=True)) for cells in (heads, *rows)
+        )
 
 
 def size_classes_um(layout: Layout, n_classes: int = 6) -> Floats:
@@ -136,7 +153,7 @@ def snr_by_class(
     camera: Camera, light: Scene | PowerMap, *, exposure_s: float, classes: ArrayLike | None = None
 ) -> SnrTable:
     """
-    Predicted signal and noise of each class of sites, by :meth:`Camera.predict`: without a draw.
+    Predict signal and noise of each class of sites, without a draw.
 
     Parameters
     ----------
@@ -154,15 +171,18 @@ def snr_by_class(
     ------
     ParameterError, SimulationError
         As for :meth:`Camera.predict`, or when a class has fewer than two sites.
+
+    Notes
+    -----
+    Signal and noise are those of :func:`foveasim.sensor.signal_to_noise`, in linear codes: quantisation is in the noise once,
+    companding and the response's bend are referred to the charge.
     """
-    exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
+    exposure_s = check_plausible("exposure_s", exposure_s)
     sensor, layout = _sensor_and_layout(camera)
     groups = SiteClasses(size_classes_um(layout) if classes is None else classes, layout.n_sites)
     expected_e = sensor.expected_electrons(camera.photoelectrons_per_s(light), exposure_s)
-    mean_dn, variance_dn2 = sensor.predict(expected_e)
-    dark_dn, _ = sensor.predict(sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s))
-    is_full = _is_well_full(sensor, expected_e) | _is_code_full(mean_dn, variance_dn2, sensor.bits)
-    return _table(groups, layout.area_um2, mean_dn, variance_dn2, dark_dn, is_full)
+    dark_e = sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s)
+    return _table(groups, layout.area_um2, *_linear_codes(signal_to_noise(sensor, expected_e, dark_e)))
 
 
 def light_at_snr_fraction(
@@ -194,27 +214,23 @@ def light_at_snr_fraction(
 
     Notes
     -----
-    Found by predicting the codes at other shares, clips at darkness and quantisation included: without a pedestal the
-    converter cuts off half the noise of darkness, and no formula tells the rest.
+    Found by predicting the ratio of :func:`snr_by_class` at other fractions.
     """
-    exposure_s = check_number("exposure_s", exposure_s, at_least=0.0)
+    exposure_s = check_plausible("exposure_s", exposure_s)
     snr = check_number("snr", snr, above=0.0)
     sensor, layout = _sensor_and_layout(camera)
     groups = SiteClasses(size_classes_um(layout) if classes is None else classes, layout.n_sites)
     full_e = sensor.expected_electrons(camera.photoelectrons_per_s(light), exposure_s)
     dark_e = sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s)
-    dark_dn, _ = sensor.predict(dark_e)
     search = _Search(groups.n_sites.size)
     is_full = np.zeros(groups.n_sites.size, bool)
     for _ in range(MOST_STEPS):
         if search.is_done.all():
             break
-        # Those that are found are left in the dark, which is quick to predict.
-        share = np.where(search.is_done, 0.0, np.exp(search.at))
-        expected_e = dark_e + share[groups.of_site] * (full_e - dark_e)
-        mean_dn, variance_dn2 = sensor.predict(expected_e)
-        signal_dn, noise_dn = groups.mean(mean_dn - dark_dn), np.sqrt(groups.mean(variance_dn2))
-        is_cut = _is_well_full(sensor, expected_e) | _is_code_full(mean_dn, variance_dn2, sensor.bits)
+        fraction = np.exp(search.at)
+        expected_e = dark_e + fraction[groups.of_site] * (full_e - dark_e)
+        signal_dn, noise_dn2, is_cut = _linear_codes(signal_to_noise(sensor, expected_e, dark_e))
+        signal_dn, noise_dn = groups.mean(signal_dn), np.sqrt(groups.mean(noise_dn2))
         does = ~search.is_done & (signal_dn > 0.0) & (signal_dn >= snr * noise_dn * (1.0 - SHARE_ROUNDING))
         is_full = np.where(does, groups.mean(is_cut.astype(np.float64)) >= 0.5, is_full)
         too_little = np.maximum(snr * noise_dn, np.finfo(float).tiny)
@@ -263,13 +279,14 @@ def measured_snr_by_class(
     classes: ArrayLike | None = None,
 ) -> SnrTable:
     """
-    The same from frames of one scene and of darkness.
+    Measure signal and noise of each class of sites from frames of one scene and dark frames.
 
     Parameters
     ----------
     layout : Layout
     frames, dark : (n_frame, n_site) DN, or lists of codes or captures
-        Two frames or more.
+        Two frames or more. Codes of captures are made linear, as their settings say; others must be:
+        :func:`foveasim.sensor.linearised`.
     bits : int, optional
         Of the codes, to tell saturation; taken from captures by default.
     full_well_e : float or (n_site,), optional, e-
@@ -287,6 +304,12 @@ def measured_snr_by_class(
     ParameterError
         When shapes do not fit together, there are fewer than two frames, the bits are not known, or captures' settings do
         not tell the full well of every site.
+
+    Notes
+    -----
+    The variance is that of the codes, and no less than the 1/12 DN² of quantisation (times the square of the code's width where
+    codes are companded). Where noise spans more than one code it is that of :func:`snr_by_class`; inside one code, frames do
+    not show what there is of noise, and the ratio is an upper bound. A bent response is not made straight.
     """
     require_layout(layout)
     captures = frames if isinstance(frames, Sequence) and all(isinstance(frame, Capture) for frame in frames) else ()
@@ -301,13 +324,23 @@ def measured_snr_by_class(
         if some.shape[1] != layout.n_sites:
             raise ParameterError(name, f"must have the layout's {layout.n_sites} sites", some.shape[1])
     groups = SiteClasses(size_classes_um(layout) if classes is None else classes, layout.n_sites)
-    mean_dn, variance_dn2 = codes.mean(axis=0), codes.var(axis=0, ddof=1)
-    is_full = _is_code_full(mean_dn, variance_dn2, bits)
+    is_full = _is_near(codes.mean(axis=0), codes.var(axis=0, ddof=1), 2**bits - 1.5)
     well_e = _full_well_e(captures, full_well_e, layout.n_sites)
     if well_e is not None:
         mean_e = np.mean([capture.electrons for capture in captures], axis=0)
         is_full |= _is_near(mean_e, mean_e, well_e)
-    return _table(groups, layout.area_um2, mean_dn, variance_dn2, dark_codes.mean(axis=0), is_full)
+    converter = _converter(captures, bits)
+    linear_dn, dark_dn = (np.interp(some, np.arange(2.0**bits), converter.linear_dn) for some in (codes, dark_codes))
+    floor_dn2 = QUANTISATION_DN2 * np.square(converter.width_of_code_dn(codes.mean(axis=0)))
+    noise_dn2 = np.maximum(linear_dn.var(axis=0, ddof=1), floor_dn2)
+    return _table(groups, layout.area_um2, linear_dn.mean(axis=0) - dark_dn.mean(axis=0), noise_dn2, is_full)
+
+
+def _converter(captures: Sequence[Capture], bits: int) -> Converter:
+    """Converter that made the codes, as captures' settings specify it; a linear one where they do not."""
+    settings = captures[0].settings.get("sensor", {}) if captures else {}
+    names = ("companding", "log_strength", "companding_table", "inl_dn")
+    return Converter(bits=bits, **{name: settings[name] for name in names if name in settings})
 
 
 def _sensor_and_layout(camera: Camera) -> tuple[Sensor, Layout]:
@@ -335,36 +368,23 @@ def _full_well_e(captures: Sequence[Capture], full_well_e: ArrayLike | None, n_s
     return well_e
 
 
-def _is_well_full(sensor: Sensor, expected_e: Floats) -> Bools:
-    """Whether a well's edge cuts off the shot noise, (n_site,)."""
-    if sensor.full_well_e is None:
-        return np.zeros(expected_e.shape, bool)
-    return _is_near(expected_e, np.zeros(1) if sensor.shot_noise == "off" else expected_e, sensor.full_well_e)
-
-
-def _is_code_full(mean_dn: Floats, variance_dn2: Floats, bits: int) -> Bools:
-    """Whether the highest code cuts off the noise, (n_site,)."""
-    return _is_near(mean_dn, variance_dn2, 2**bits - 1.5)
-
-
 def _is_near(value: Floats, variance: Floats, limit: Floats | float) -> Bools:
     """Whether a limit is within some standard deviations of a value, or below it."""
     return np.asarray(value + CUT_OFF_SIGMAS * np.sqrt(variance) >= limit)
 
 
-def _table(
-    groups: SiteClasses,
-    area_um2: Floats,
-    mean_dn: Floats,
-    variance_dn2: Floats,
-    dark_dn: Floats,
-    is_full: NDArray[np.bool_],
-) -> SnrTable:
+def _linear_codes(found: SiteSignals) -> tuple[Floats, Floats, Bools]:
+    """Signal in linear codes, its variance, and whether sites are saturated, (n_site,) each."""
+    gain = found.gain_dn_per_e
+    return gain * found.signal_e, np.square(gain * found.noise_e), found.is_saturated
+
+
+def _table(groups: SiteClasses, area_um2: Floats, signal_dn: Floats, noise_dn2: Floats, is_full: Bools) -> SnrTable:
     return SnrTable(
         classes=read_only(groups.labels),
         n_sites=read_only(groups.n_sites),
         size_um=read_only(groups.mean(np.sqrt(area_um2))),
-        signal_dn=read_only(groups.mean(mean_dn - dark_dn)),
-        noise_dn=read_only(np.sqrt(groups.mean(variance_dn2))),
+        signal_dn=read_only(groups.mean(signal_dn)),
+        noise_dn=read_only(np.sqrt(groups.mean(noise_dn2))),
         saturated_fraction=read_only(groups.mean(is_full.astype(np.float64))),
     )

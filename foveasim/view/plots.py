@@ -108,7 +108,8 @@ def plot_capture(
     ----------
     capture : Capture
     by : str or array
-        ``"code"``, ``"electrons"``, ``"expected_e"``, or what :func:`plot_layout` takes.
+        ``"code"``, ``"electrons"``, ``"expected_e"``, ``"snr"`` (:meth:`Capture.signal_to_noise`), or what :func:`plot_layout`
+        takes.
     label, overlay, scale_bar, legend, ax, figure_inches
         As for :func:`plot_layout`.
 
@@ -120,8 +121,10 @@ def plot_capture(
     Raises
     ------
     ParameterError
-        As for :func:`plot_layout`.
+        As for :func:`plot_layout`, or as for :meth:`Capture.signal_to_noise`.
     """
+    if isinstance(by, str) and by == "snr" and by not in capture.layout.columns:
+        by, label = capture.signal_to_noise(), label or "signal-to-noise ratio"
     return _plot(capture.layout, colours_of(capture, by, label=label), overlay, scale_bar, legend, ax, figure_inches)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from foveasim.arrays import UNIT_SUFFIXES, Floats
 from foveasim.capture import Capture
-from foveasim.errors import GeometryError, ParameterError
+from foveasim.errors import GeometryError, ParameterError, SimulationError
 from foveasim.layout import Layout, Report
 from foveasim.view.id_map import SitePixels
 from foveasim.view.palette import (
@@ -27,7 +27,7 @@ from foveasim.view.palette import (
 from foveasim.view.web._pack import back_references, smallest
 from foveasim.view.web._shapes import shapes_of
 
-__all__ = ["Content", "content_of", "described_sites", "signal_to_noise"]
+__all__ = ["Content", "content_of", "described_sites"]
 
 #: Longer side of the picture.
 PICTURE_PIXELS = 800
@@ -137,36 +137,6 @@ def described_sites(
     return about, arrays, layout
 
 
-def signal_to_noise(capture: Capture) -> Floats | None:
-    """
-    Expected charge of every site over the noise of light and of reading, (n_site,); None where neither is known.
-
-    Parameters
-    ----------
-    capture : Capture
-        Its settings tell the read noise, where it is one number for all sites, and whether shot noise was drawn.
-
-    Notes
-    -----
-    ``expected_e / sqrt(expected_e + read_noise_e²)``. The expectation counts dark charge too, and fixed patterns, the
-    converter's steps and resets are left out: :meth:`foveasim.Camera.predict` and :func:`foveasim.sensor.noise_budget`
-    have them all.
-    """
-    settings = capture.settings.get("sensor")
-    settings = settings if isinstance(settings, Mapping) else {}
-    read_noise_e = settings.get("read_noise_e")
-    if isinstance(read_noise_e, list) and len(read_noise_e) == capture.layout.n_sites:
-        read_noise_e = np.array(read_noise_e, dtype=np.float64)
-    elif isinstance(read_noise_e, bool) or not isinstance(read_noise_e, int | float):
-        return None
-    shot_e2 = 0.0 if settings.get("shot_noise") == "off" else capture.expected_e
-    variance_e2 = np.asarray(shot_e2 + np.square(read_noise_e) + np.zeros(capture.layout.n_sites))
-    if not np.isfinite(variance_e2).all():
-        return None
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.where(variance_e2 > 0.0, capture.expected_e / np.sqrt(variance_e2), np.nan))
-
-
 # -- outlines -----------------------------------------------------------------------------------------------------------
 
 
@@ -210,14 +180,14 @@ def _columns(layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[
             columns.insert(0, {**lit, "array": code, "is_repeat": True})
         add("electrons", "electrons", "e⁻", capture.electrons)
         add("expected_e", "expected electrons", "e⁻", capture.expected_e)
-        ratio = signal_to_noise(capture)
+        ratio = _signal_to_noise(capture)
         if ratio is not None:
             add(
                 "snr",
                 "signal to noise",
                 "",
                 ratio.astype(np.float32),
-                note="expected charge over shot noise and read noise",
+                note="expected photoelectrons over temporal noise, quantisation included",
             )
         if len(colours) > 1:
             names = list(capture.filter_names)
@@ -236,6 +206,14 @@ def _columns(layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[
             values = layout.columns[key]
             add(key, label, unit, values.astype(str) if _are_few(values) and not unit else values)
     return columns
+
+
+def _signal_to_noise(capture: Capture) -> Floats | None:
+    """Ratio of every site, (n_site,); None where the capture's settings do not specify the electronics."""
+    try:
+        return capture.signal_to_noise()
+    except (ParameterError, SimulationError):
+        return None
 
 
 def _is_index(values: NDArray[Any]) -> bool:
