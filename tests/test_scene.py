@@ -11,6 +11,7 @@ import skimage.color
 import tifffile
 from PIL import Image
 
+import foveasim as fs
 from foveasim.encodings import decoded
 from foveasim.errors import FileError, ParameterError
 from foveasim.scene import Scene
@@ -435,3 +436,25 @@ def test_a_scene_cannot_be_written_into(name):
     array = getattr(scene_of(F * np.uint8(255)), name)
     with pytest.raises(ValueError, match=r"read-only"):
         array[...] = 0.0
+
+
+def test_far_scene_takes_pixels_of_kilometres():
+    """As ISETCam's scenes at 1e6 m: pixels of 9 km, imaged on cells of 36 µm by a lens of 4 mm."""
+    far = fs.Scene.flat(shape=(12, 16), pitch_um=9e9, distance_m=1e6, radiance_w_m2_sr_nm=0.5, band_width_nm=10.0)
+    optics = fs.Optics(focal_length_mm=4.0, f_number=4.0)
+    near = fs.Scene.flat(shape=(12, 16), pitch_um=9e6, distance_m=1e3, radiance_w_m2_sr_nm=0.5, band_width_nm=10.0)
+
+    assert optics.grid(far).pitch_um == pytest.approx(36.0, rel=1e-6)
+    np.testing.assert_allclose(optics.power_map(far).data, optics.power_map(near).data, rtol=1e-4)
+    edge = fs.scene.charts.slanted_edge(
+        shape=(12, 16), pitch_um=9e9, distance_m=1e6, radiance_w_m2_sr_nm=0.5, band_width_nm=10.0, wavelength_nm=[550.0]
+    )
+    assert edge.pitch_um == 9e9
+
+
+@pytest.mark.parametrize("name", ["pitch_um", "distance_m"])
+def test_scene_rejects_sizes_of_other_units(name):
+    values = {"pitch_um": 10.0, "distance_m": 1.0, name: 1.1e15}
+
+    with pytest.raises(ParameterError, match=rf"'{name}' must be <= 1e\+"):
+        fs.Scene.flat(shape=(4, 4), radiance_w_m2_sr_nm=1.0, band_width_nm=1.0, **values)
