@@ -1,8 +1,17 @@
-"""Array types, and the shared checks that every value passes once, where it enters the package."""
+"""
+Array types, and the shared checks that every value passes once, where it enters the package.
+
+Masked arrays (:mod:`numpy.ma`) lose their mask in ``np.asarray``, and with it what they say about missing data. Every array
+from outside therefore goes through :func:`unmasked`, as :func:`as_numbers` and :func:`finite_array` do: a mask that hides
+nothing is taken off; masked values are rejected, or become NaN where NaN stands for no data.
+
+Arrays that an object of the package holds go through :func:`own`: later edits of the caller's array do not reach it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import mmap
+from collections.abc import Callable, Collection, Sequence
 from functools import lru_cache
 from typing import Any, TypeVar
 
@@ -28,8 +37,11 @@ __all__ = [
     "check_shape",
     "check_sites",
     "finite_array",
+    "handed_over",
+    "own",
     "read_only",
     "unit_of",
+    "unmasked",
     "wavelengths_nm",
 ]
 
@@ -112,6 +124,7 @@ def check_number(
     ParameterError
         When it is no number, not finite, or out of bounds.
     """
+    value = unmasked(name, value)
     try:
         if value is None or isinstance(value, bool | str | bytes) or np.ndim(value) != 0:  # type: ignore[arg-type]
             raise TypeError
@@ -195,6 +208,7 @@ def check_pitch_um(name: str, value: object) -> tuple[float, float]:
     ParameterError
         When it is neither one length nor a pair of lengths (along x, along y).
     """
+    value = unmasked(name, value)
     if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or getattr(value, "ndim", 1) == 0:
         pitch_um = check_length_um(name, value)
         return pitch_um, pitch_um
@@ -230,15 +244,66 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> str:
     return value
 
 
-def as_numbers(name: str, value: ArrayLike, *, keep_type: bool = False) -> NDArray[Any]:
+def unmasked(name: str, value: Any, *, missing_is_nan: bool = False) -> Any:
+    """
+    Return the value without numpy's masks, which ``np.asarray`` would drop in silence.
+
+    Parameters
+    ----------
+    name : str
+        Of the parameter, for the message.
+    value : any
+        Masked arrays, also in lists, are looked for; anything else is returned as it is.
+    missing_is_nan : bool
+        Whether masked values become NaN (float64 unless the array is floating-point already); by default they are rejected.
+
+    Raises
+    ------
+    ParameterError
+        When values are masked and NaN does not stand for missing data.
+    """
+    if not _has_mask(value):
+        return value
+    try:
+        data, mask = np.asarray(_parts(value, np.ma.getdata)), np.asarray(_parts(value, np.ma.getmaskarray))
+    except ValueError:
+        return value  # ragged: whoever makes an array of it says so
+    n_masked = int(np.count_nonzero(mask))
+    if n_masked == 0:
+        return data
+    if missing_is_nan and data.dtype.kind in "biuf":
+        return np.where(mask, data.dtype.type(np.nan) if data.dtype.kind == "f" else np.nan, data)
+    raise ParameterError(
+        name,
+        f"must have no masked values, got {n_masked} of {mask.size} masked",
+        cure="fill them first, for example with .filled(0)",
+    )
+
+
+def _parts(value: Any, part_of: Callable[[Any], Any]) -> Any:
+    """The data or the masks of masked arrays in lists."""
+    return [_parts(item, part_of) for item in value] if isinstance(value, list | tuple) else part_of(value)
+
+
+def _has_mask(value: object) -> bool:
+    if isinstance(value, np.ma.MaskedArray):
+        return True
+    if not isinstance(value, list | tuple):
+        return False
+    kinds = set(map(type, value))
+    return any(issubclass(kind, np.ma.MaskedArray | list | tuple) for kind in kinds) and any(map(_has_mask, value))
+
+
+def as_numbers(name: str, value: ArrayLike, *, keep_type: bool = False, missing_is_nan: bool = False) -> NDArray[Any]:
     """
     The value as an array of real numbers: float64, or as it is.
 
     Raises
     ------
     ParameterError
-        When it is ragged, or has other than real numbers.
+        When it is ragged, or has other than real numbers, or masked values and ``missing_is_nan`` is not set.
     """
+    value = unmasked(name, value, missing_is_nan=missing_is_nan)
     try:
         array = np.asarray(value)
         if array.dtype.kind in "cSUmM":
@@ -301,3 +366,25 @@ def read_only(array: _Array) -> _Array:
     """The same array, no longer writeable."""
     array.flags.writeable = False
     return array
+
+
+def handed_over(array: _Array) -> _Array:
+    """The same array, with all that it is a view of no longer writeable: for memory that nobody outside the package knows."""
+    base: Any = array
+    while isinstance(base, np.ndarray):
+        base.flags.writeable = False
+        base = base.base
+    return array
+
+
+def own(array: _Array) -> _Array:
+    """
+    Return the values as a read-only array that later edits of the caller's array do not change.
+
+    An array that is read-only already, with all that it is a view of, is returned as it is, so that objects of the package
+    share memory and large maps are not doubled; any other is copied.
+    """
+    base: Any = array
+    while isinstance(base, np.ndarray) and not base.flags.writeable:
+        base = base.base
+    return array if base is None or isinstance(base, bytes | mmap.mmap) else read_only(array.copy())

@@ -346,10 +346,10 @@ class Camera:
             code = sensor.read(electrons, streams=streams, n_threads=self._n_threads)
         return Capture(
             layout=self._layout,
-            code=code,
-            electrons=electrons,
-            expected_e=expected_e,
-            filter_of_site=sensor.filter_of_site,
+            code=read_only(code),
+            electrons=read_only(electrons),
+            expected_e=read_only(expected_e),
+            filter_of_site=read_only(sensor.filter_of_site),
             filter_names=sensor.filter_names,
             bits=sensor.bits,
             white_dn=self._white(light),

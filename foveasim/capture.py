@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim.archives import opened_archive, write_archive
-from foveasim.arrays import Floats, Ints, check_choice, check_count, read_only
+from foveasim.arrays import Floats, Ints, check_choice, check_count, own, read_only, unmasked
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid
 from foveasim.layout import Layout
@@ -29,7 +29,7 @@ from foveasim.reconstruct import (
     natural,
     raster_grid,
 )
-from foveasim.records import described
+from foveasim.records import copied, described
 from foveasim.sensor import Sensor, signal_to_noise
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ class Capture:
             ("filter_of_site", (self.layout.n_sites,), "i", n_filters - 1),
             ("white_dn", (n_filters,), "f", None),
         ):
-            values = np.asarray(getattr(self, name))
+            values = np.asarray(unmasked(name, getattr(self, name)))
             if values.shape != shape or values.dtype.kind not in kinds:
                 raise ParameterError(
                     name, f"must be numbers of the shape {shape}, got {values.dtype} of {values.shape}"
@@ -130,7 +130,10 @@ class Capture:
                 raise ParameterError(name, "must be finite and >= 0 everywhere")
             if limit is not None and values.size and values.max() > limit:
                 raise ParameterError(name, f"must be <= {limit} everywhere", int(values.max()))
-            object.__setattr__(self, name, read_only(values.view()))
+            object.__setattr__(self, name, own(values))
+        # Captures of one camera have most of their settings in common, and each may be edited.
+        object.__setattr__(self, "settings", copied(self.settings))
+        object.__setattr__(self, "stage_s", dict(self.stage_s))
 
     def __repr__(self) -> str:
         return f"Capture({self.layout.n_sites} sites, {self.bits} bits, {100 * self.saturated_share:.1f} % saturated)"
@@ -234,7 +237,7 @@ class Capture:
                 return found
             data = np.zeros((n_filters, *grid.shape), np.float32) * found.data[:1]
             data[is_seen] = found.data
-            return Picture(data, found.coverage, grid)
+            return Picture(read_only(data), found.coverage, grid)
         values = values / (response if per == "um2" else 1.0)
         if method == "cells":
             if n_filters > 1:

@@ -22,7 +22,9 @@ from foveasim.arrays import (
     check_number,
     check_pitch_um,
     check_shape,
+    own,
     read_only,
+    unmasked,
     wavelengths_nm,
 )
 from foveasim.errors import ParameterError
@@ -198,7 +200,8 @@ class PowerMap:
     Parameters
     ----------
     data : (n_band, n_y, n_x) float32 or float64, W/m² per band
-        Mean irradiance of each cell, within the band of each wavelength. Used as it is, without a copy.
+        Mean irradiance of each cell, within the band of each wavelength. Copied, so that later edits of the array do not
+        change the map; an array that is read-only already, with all that it is a view of, is shared.
     grid : Grid
         Where the cells are.
     wavelength_nm : (n_band,) float64, nm
@@ -207,7 +210,7 @@ class PowerMap:
     Raises
     ------
     ParameterError
-        When the shapes do not fit together, or a wavelength is not positive.
+        When the shapes do not fit together, cells are masked, or a wavelength is not positive.
     """
 
     data: Images
@@ -215,11 +218,11 @@ class PowerMap:
     wavelength_nm: Floats
 
     def __post_init__(self) -> None:
-        data = np.asarray(self.data)
+        data = np.asarray(unmasked("data", self.data))
         if not np.can_cast(data.dtype, np.float64):
             raise ParameterError("data", f"must have real numbers, got the type {data.dtype}")
         if data.dtype not in (np.float32, np.float64):
-            data = data.astype(np.float64)
+            data = read_only(data.astype(np.float64))
         if not isinstance(self.grid, Grid):
             raise ParameterError("grid", f"must be a Grid, got a {type(self.grid).__name__}")
         wavelength_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)
@@ -229,8 +232,7 @@ class PowerMap:
                 f"must have the shape (n_band, n_y, n_x) = {(wavelength_nm.size, *self.grid.shape)} of the "
                 f"wavelengths and the grid, got {data.shape}",
             )
-        data = data.view()
-        object.__setattr__(self, "data", read_only(data))
+        object.__setattr__(self, "data", own(data))
         object.__setattr__(self, "wavelength_nm", wavelength_nm)
 
     @classmethod
@@ -274,6 +276,7 @@ class PowerMap:
         >>> spot.data[0, 1].tolist(), spot.grid.origin_um
         ([0.0, 1.0], (-2.0, -2.0))
         """
+        data = unmasked("data", data)
         try:
             images = np.asarray(data)
         except ValueError:
@@ -297,11 +300,16 @@ def from_file_rows(picture: NDArray[Any]) -> NDArray[Any]:
 
 def to_file_rows(picture: ArrayLike) -> NDArray[Any]:
     """(n_y, n_x) or (n_channel, n_y, n_x), first row lowest, to (n_y, n_x[, n_channel]), first row on top (a view)."""
-    picture = np.asarray(picture)
+    picture = np.asarray(unmasked("picture", picture))
     return picture[::-1] if picture.ndim == 2 else np.moveaxis(picture, 0, -1)[::-1]
 
 
 def rising(images: NDArray[Any], *, is_x_falling: bool = False, is_y_falling: bool = False) -> NDArray[Any]:
-    """(..., n_y, n_x) along axes that fall or rise, to axes that rise: lowest row first, leftmost column first."""
+    """
+    (..., n_y, n_x) along axes that fall or rise, to axes that rise: lowest row first, leftmost column first.
+
+    Contiguous; read-only where that takes a copy.
+    """
     turned = images[..., :: -1 if is_y_falling else 1, :: -1 if is_x_falling else 1]
-    return np.ascontiguousarray(turned)
+    contiguous = np.ascontiguousarray(turned)
+    return contiguous if contiguous is turned else read_only(contiguous)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim.apart import read_apart
+from foveasim.arrays import unmasked
 from foveasim.errors import FileError
 from foveasim.files import written_whole
 
@@ -423,7 +424,7 @@ def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
             f"cannot hold an array of the shape {picture.shape} and type {picture.dtype}, only 1 to 4 channels of "
             f"{' or '.join(held)}",
         )
-    picture = np.ascontiguousarray(picture)
+    picture = np.ascontiguousarray(unmasked("picture", picture))
     with written_whole(target) as temporary:
         try:
             if ending in TIFF_ENDINGS:

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from foveasim._version import __version__
+from foveasim.arrays import own
 
-__all__ = ["described", "differences", "versions"]
+__all__ = ["copied", "described", "differences", "versions"]
 
 #: Arrays up to this size are written out; of longer ones the shape and a checksum are kept.
 WRITTEN_OUT = 64
@@ -45,6 +46,17 @@ def described(value: Any) -> Any:
             **{f.name: described(getattr(value, f.name)) for f in fields(value) if not f.name.startswith("_")},
         }
     return repr(value)
+
+
+def copied(value: Any) -> Any:
+    """Plain data as new dicts and lists all the way down: editing the copy leaves the original as it was."""
+    if isinstance(value, Mapping):
+        return {key: copied(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [copied(item) for item in value]
+    if isinstance(value, tuple) and type(value) is tuple:
+        return tuple(copied(item) for item in value)
+    return own(value) if isinstance(value, np.ndarray) else value
 
 
 def differences(one: Any, other: Any, place: str = "") -> Iterator[str]:

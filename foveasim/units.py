@@ -6,9 +6,7 @@ Constants are the exact values of the 2019 SI (CODATA 2018).
 
 from __future__ import annotations
 
-import numpy as np
-
-from foveasim.arrays import Floats
+from foveasim.arrays import Floats, as_numbers
 
 __all__ = [
     "BOLTZMANN_J_PER_K",
@@ -36,42 +34,42 @@ BOLTZMANN_J_PER_K = 1.380649e-23
 
 def m_from_um(length_um: Floats | float) -> Floats:
     """Metres from micrometres."""
-    return np.asarray(length_um, dtype=np.float64) * 1e-6
+    return as_numbers("length_um", length_um) * 1e-6
 
 
 def m_from_mm(length_mm: Floats | float) -> Floats:
     """Metres from millimetres."""
-    return np.asarray(length_mm, dtype=np.float64) * 1e-3
+    return as_numbers("length_mm", length_mm) * 1e-3
 
 
 def m_from_nm(length_nm: Floats | float) -> Floats:
     """Metres from nanometres."""
-    return np.asarray(length_nm, dtype=np.float64) * 1e-9
+    return as_numbers("length_nm", length_nm) * 1e-9
 
 
 def um_from_m(length_m: Floats | float) -> Floats:
     """Micrometres from metres."""
-    return np.asarray(length_m, dtype=np.float64) * 1e6
+    return as_numbers("length_m", length_m) * 1e6
 
 
 def um_from_nm(length_nm: Floats | float) -> Floats:
     """Micrometres from nanometres."""
-    return np.asarray(length_nm, dtype=np.float64) * 1e-3
+    return as_numbers("length_nm", length_nm) * 1e-3
 
 
 def per_um_from_per_mm(frequency_per_mm: Floats | float) -> Floats:
     """Line pairs per micrometre from line pairs per millimetre."""
-    return np.asarray(frequency_per_mm, dtype=np.float64) * 1e-3
+    return as_numbers("frequency_per_mm", frequency_per_mm) * 1e-3
 
 
 def per_mm_from_per_um(frequency_per_um: Floats | float) -> Floats:
     """Line pairs per millimetre from line pairs per micrometre."""
-    return np.asarray(frequency_per_um, dtype=np.float64) * 1e3
+    return as_numbers("frequency_per_um", frequency_per_um) * 1e3
 
 
 def w_from_w_m2_um2(power_w_m2_um2: Floats | float) -> Floats:
     """Watts from (W/m²)·µm², the unit of a map in W/m² integrated over an area in µm²."""
-    return np.asarray(power_w_m2_um2, dtype=np.float64) * 1e-12
+    return as_numbers("power_w_m2_um2", power_w_m2_um2) * 1e-12
 
 
 def photon_energy_j(wavelength_nm: Floats | float) -> Floats:
@@ -90,9 +88,9 @@ def photon_energy_j(wavelength_nm: Floats | float) -> Floats:
 
 def electrons_to_volts(charge_e: Floats | float, capacitance_f: Floats | float) -> Floats:
     """Voltage of a charge on a capacitance, ``q n / C``."""
-    return ELEMENTARY_CHARGE_C * np.asarray(charge_e, dtype=np.float64) / np.asarray(capacitance_f, dtype=np.float64)
+    return ELEMENTARY_CHARGE_C * as_numbers("charge_e", charge_e) / as_numbers("capacitance_f", capacitance_f)
 
 
 def volts_to_electrons(voltage_v: Floats | float, capacitance_f: Floats | float) -> Floats:
     """Charge that makes a voltage on a capacitance, ``C U / q``, in electrons."""
-    return np.asarray(voltage_v, dtype=np.float64) * np.asarray(capacitance_f, dtype=np.float64) / ELEMENTARY_CHARGE_C
+    return as_numbers("voltage_v", voltage_v) * as_numbers("capacitance_f", capacitance_f) / ELEMENTARY_CHARGE_C

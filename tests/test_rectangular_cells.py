@@ -270,9 +270,7 @@ def test_camera_takes_maps_of_rectangular_cells():
     coarse = fs.PowerMap.from_array(MAP, pitch_um=(0.9, 0.3), wavelength_nm=550.0)
     fine = fs.PowerMap.from_array(np.repeat(MAP, 3, axis=1), pitch_um=0.3, wavelength_nm=550.0)
 
-    np.testing.assert_allclose(
-        camera.photoelectrons_per_s(coarse), camera.photoelectrons_per_s(fine), rtol=1e-11
-    )
+    np.testing.assert_allclose(camera.photoelectrons_per_s(coarse), camera.photoelectrons_per_s(fine), rtol=1e-11)
     capture = camera.capture(coarse, exposure_s=1e-3, seed=0)
     assert capture.settings["light"]["grid"]["pitch_um"] == [0.9, 0.3]
 

@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, Images, check_choice, check_count
+from foveasim.arrays import Floats, Images, check_choice, check_count, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PointMap, PowerMap
 
@@ -102,7 +102,7 @@ def distort_map(
         pixel, gain = _carried_back(grid, rows, power_map.grid, lens, conserve)
         for band, image in enumerate(coefficients):
             data[band, rows] = _looked_up(image, pixel, order) * gain
-    return PowerMap(data, grid, power_map.wavelength_nm)
+    return PowerMap(read_only(data), grid, power_map.wavelength_nm)
 
 
 def _bounding_grid(grid: Grid, lens: Any) -> Grid:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, Ints, check_choice, check_count, finite_array, read_only
+from foveasim.arrays import Floats, Ints, check_choice, check_count, finite_array, read_only, unmasked
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, PackedRings, PointMap
 from foveasim.integrate._outlines import CarriedOutlines, Outlines, outlines_of
@@ -166,12 +166,14 @@ class Integrator:
         Parameters
         ----------
         power_map : (..., n_y, n_x) float32 or float64
-            Cell means, row 0 lowest. Other types are converted to float64.
+            Cell means, row 0 lowest. Other types are converted to float64. A site that reads a NaN gets NaN; masked cells are
+            rejected, since a mask does not say what they contain.
 
         Returns
         -------
         power : (..., n_site) float64, the map's unit times µm²
         """
+        power_map = unmasked("power_map", power_map)
         try:
             cells = np.asarray(power_map)
         except ValueError:

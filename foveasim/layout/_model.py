@@ -13,8 +13,19 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import MAX_LENGTH_UM, Bools, Floats, Ints, as_numbers, check_number, finite_array, read_only
+from foveasim.arrays import (
+    MAX_LENGTH_UM,
+    Bools,
+    Floats,
+    Ints,
+    as_numbers,
+    check_number,
+    finite_array,
+    read_only,
+    unmasked,
+)
 from foveasim.errors import GeometryError, ParameterError
+from foveasim.records import copied
 from foveasim.rings import next_vertex, positions_in_runs, ring_moments, ring_spread_um2, site_bounds_um, site_moments
 
 if TYPE_CHECKING:
@@ -101,7 +112,7 @@ class Layout:
         object.__setattr__(self, "ring_offsets", read_only(ring_offsets))
         object.__setattr__(self, "site_offsets", read_only(site_offsets))
         object.__setattr__(self, "columns", MappingProxyType(columns))
-        object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
+        object.__setattr__(self, "provenance", MappingProxyType(copied(self.provenance)))
 
     # -- making -----------------------------------------------------------------------------------------------
 
@@ -330,7 +341,8 @@ class Layout:
 
     def __getitem__(self, selection: Any) -> Layout:
         """Layout of the selected sites: a mask, a slice, site numbers, or a function of the layout that gives one of these."""
-        ids = np.atleast_1d(np.arange(self.n_sites)[selection(self) if callable(selection) else selection])
+        chosen = unmasked("selection", selection(self) if callable(selection) else selection)
+        ids = np.atleast_1d(np.arange(self.n_sites)[chosen])
         if ids.ndim != 1:
             raise ParameterError("selection", f"must be a mask, a slice or a list of sites, got {ids.ndim} dimensions")
         rings = _ranges(self.site_offsets[ids], self.site_offsets[ids + 1])
@@ -371,7 +383,7 @@ class Layout:
                 raise ParameterError(
                     "keys", f"must be values or columns of the layout, which has {sorted(self.columns)}", key
                 )
-            value = self.columns[key] if isinstance(key, str) else np.asarray(key)
+            value = self.columns[key] if isinstance(key, str) else np.asarray(unmasked("keys", key))
             if value.shape != (self.n_sites,):
                 raise ParameterError(
                     "keys", f"must have one value for each of the {self.n_sites} sites, got {value.shape}"
@@ -477,7 +489,7 @@ class Layout:
 
 def _offsets(name: str, offsets: ArrayLike, at_least: int, total: int, of_what: str) -> Ints:
     """Offsets as int64, when they begin at 0, end at the total, and every step is large enough."""
-    array = np.array(offsets)
+    array = np.array(unmasked(name, offsets))
     if array.ndim != 1 or array.size < 1 or array.dtype.kind not in "iu":
         raise ParameterError(name, "must be a list of whole numbers", offsets)
     array = array.astype(np.int64)
@@ -493,6 +505,7 @@ def _offsets(name: str, offsets: ArrayLike, at_least: int, total: int, of_what: 
 
 def _column(name: str, values: ArrayLike) -> NDArray[Any]:
     """A column of data as an array of numbers or text."""
+    values = unmasked(name, values)
     try:
         column = np.array(values)
     except ValueError:

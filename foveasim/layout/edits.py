@@ -14,7 +14,16 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import MAX_LENGTH_UM, Ints, check_choice, check_count, check_length_um, check_sites, finite_array
+from foveasim.arrays import (
+    MAX_LENGTH_UM,
+    Ints,
+    check_choice,
+    check_count,
+    check_length_um,
+    check_sites,
+    finite_array,
+    unmasked,
+)
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._model import Layout
 from foveasim.layout._noding import points_on_edges
@@ -156,7 +165,7 @@ def merge(layout: Layout, groups: ArrayLike) -> Layout:
     ParameterError
         When there is not one group a site.
     """
-    labels = np.asarray(groups)
+    labels = np.asarray(unmasked("groups", groups))
     if labels.shape != (layout.n_sites,) or labels.dtype.kind not in "iu" or labels.min(initial=0) < 0:
         raise ParameterError("groups", f"must be {layout.n_sites} whole numbers from 0, one a site", groups)
     _, first, group, count = np.unique(labels, return_index=True, return_inverse=True, return_counts=True)

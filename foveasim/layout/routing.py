@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from foveasim.arrays import Floats, Ints, check_choice, check_count, check_length_um, check_number
+from foveasim.arrays import Floats, Ints, as_numbers, check_choice, check_count, check_length_um, check_number
 from foveasim.layout._model import Layout
 
 __all__ = ["Crossings", "Readout", "Routing", "crossings"]
@@ -95,7 +95,7 @@ class Routing:
     def n_tracks(self, strip_um: Floats) -> Ints:
         """Lines that can cross strips of these widths: ``layers · floor(strip / (width + space))``."""
         # A strip of exactly so many tracks, up to rounding, holds them.
-        tracks = np.floor(np.asarray(strip_um) / (self.width_um + self.space_um) * (1.0 + 1e-12))
+        tracks = np.floor(as_numbers("strip_um", strip_um) / (self.width_um + self.space_um) * (1.0 + 1e-12))
         return (self.n_layers * tracks).astype(np.int64)
 
 

@@ -25,6 +25,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from foveasim.arrays import handed_over
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Pitch, PowerMap
 from foveasim.files import written_whole
@@ -130,7 +131,9 @@ def read_power_map(
         top_row_first=top_row_first,
     )
     with one_sentence(path):
-        return finished(_found(path, name), given)
+        found = _found(path, name)
+        handed_over(found.data)
+        return finished(found, given)
 
 
 def _found(path: Path, name: str | None) -> Found:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Images, check_choice, check_pitch_um, finite_array, wavelengths_nm
+from foveasim.arrays import Floats, Images, check_choice, check_pitch_um, finite_array, read_only, wavelengths_nm
 from foveasim.errors import FileError, FoveasimError, ParameterError
 from foveasim.fields import Grid, Pitch, PowerMap, rising
 from foveasim.maps._units import PER_NM, UNITS, Unit, light_unit, per_band_w_m2
@@ -249,7 +249,8 @@ def as_images(data: NDArray[Any]) -> Images:
         raise Refusal(f"holds {data.shape[0]} bands, more than {MAX_BANDS}; bands come first: (n_band, n_y, n_x)")
     images = data.reshape(-1, *data.shape[-2:])
     is_small = images.dtype.itemsize <= (4 if images.dtype.kind == "f" else 2)
-    return images.astype(np.float32 if is_small else np.float64, copy=False)
+    converted = images.astype(np.float32 if is_small else np.float64, copy=False)
+    return converted if converted is images else read_only(converted)
 
 
 def _pitch_um(found: Found, given: Given) -> Pitch:
@@ -294,7 +295,7 @@ def _in_w_m2(images: Images, waves_nm: Floats, found: Found, given: Given) -> Im
     data = np.empty_like(images)
     for band, scale in enumerate(factor):
         np.multiply(images[band], scale, out=data[band], dtype=np.float64, casting="same_kind")
-    return data
+    return read_only(data)
 
 
 def _told_unit(text: str | None) -> tuple[Unit, float]:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Ints, as_numbers, check_count, check_number, finite_array, read_only
+from foveasim.arrays import Floats, Ints, as_numbers, check_count, check_number, finite_array, own, read_only, unmasked
 from foveasim.errors import ParameterError
 from foveasim.sensor import Sensor
 from foveasim.sensor.converter import QUANTISATION_DN2
@@ -75,7 +75,9 @@ class PhotonTransfer:
             values = finite_array(name, getattr(self, name))
             if values.shape != shape:
                 raise ParameterError(name, f"must have the shape (n_level, n_class) = {shape}, got {values.shape}")
-            object.__setattr__(self, name, read_only(values.view()))
+            object.__setattr__(self, name, own(values))
+        for name in ("classes", "n_sites", "n_frames"):
+            object.__setattr__(self, name, own(np.asarray(unmasked(name, getattr(self, name)))))
 
     def __repr__(self) -> str:
         return f"PhotonTransfer({self.n_frames.size} levels, {self.classes.size} classes of {self.n_sites.sum()} sites)"
@@ -135,7 +137,7 @@ class SiteClasses:
     """Means over the sites of each class."""
 
     def __init__(self, classes: ArrayLike | None, n_sites: int) -> None:
-        labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(classes)
+        labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(unmasked("classes", classes))
         if labels.shape != (n_sites,):
             raise ParameterError("classes", f"must have one label for each of the {n_sites} sites, got {labels.shape}")
         self.labels, self.of_site = np.unique(labels, return_inverse=True)

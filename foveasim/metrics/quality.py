@@ -112,7 +112,7 @@ def _compared(
     planes, covered = [], []
     for name, one in (("picture", picture), ("reference", reference)):
         is_picture = isinstance(one, Picture)
-        values = as_numbers(name, one.data if isinstance(one, Picture) else one)
+        values = as_numbers(name, one.data if isinstance(one, Picture) else one, missing_is_nan=True)
         if values.ndim < 2:
             raise ParameterError(name, f"must have the shape (..., n_y, n_x), got {values.shape}")
         planes.append(values.reshape(-1, *values.shape[-2:]))

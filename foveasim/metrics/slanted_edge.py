@@ -23,6 +23,7 @@ from foveasim.arrays import (
     check_number,
     finite_array,
     read_only,
+    unmasked,
 )
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
@@ -187,7 +188,7 @@ def slanted_edge_mtf(
     ISO 12233:2023, Photography: Electronic still picture imaging: Resolution and spatial frequency responses, annex D (e-SFR).
     """
     require_layout(layout)
-    site_values = np.asarray(as_numbers("values", values), np.float64)
+    site_values = as_numbers("values", values, missing_is_nan=True)
     if site_values.shape != (layout.n_sites,):
         raise ParameterError("values", f"must be one for each of the {layout.n_sites} sites, got {site_values.shape}")
     is_used = np.isfinite(site_values) & _mask(where, layout.n_sites)
@@ -224,7 +225,7 @@ def slanted_edge_mtf(
 def _mask(where: ArrayLike | None, n_sites: int) -> Bools:
     if where is None:
         return np.ones(n_sites, bool)
-    mask = np.asarray(where)
+    mask = np.asarray(unmasked("where", where))
     if mask.dtype != bool or mask.shape != (n_sites,):
         raise ParameterError(
             "where", f"must be a mask of the {n_sites} sites, got {mask.dtype} of the shape {mask.shape}"

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim.archives import opened_archive, write_archive
-from foveasim.arrays import Floats, Ints, as_numbers, check_number, finite_array, read_only
+from foveasim.arrays import Floats, Ints, as_numbers, check_number, finite_array, own, read_only
 from foveasim.errors import FileError, FoveasimWarning, ParameterError
 from foveasim.files import written_whole
 from foveasim.layout import Layout
@@ -89,7 +89,7 @@ class Events:
                 bad = polarity[np.abs(polarity) != 1]
                 raise ParameterError("polarity", "must be 1 or -1", int(bad[0]), cure="of 0 and 1 make 2 * p - 1")
         for name, values, kept in zip(ARRAYS, (t_s, site, polarity), (np.float64, np.int32, np.int8), strict=True):
-            object.__setattr__(self, name, _own(values.astype(kept, copy=False)))
+            object.__setattr__(self, name, own(values.astype(kept, copy=False)))
 
     def __repr__(self) -> str:
         return f"Events({self.t_s.size:,} of {self.layout.n_sites:,} sites)"
@@ -205,7 +205,7 @@ class Events:
             n = int(behind[bad] - first[bad])
             address = int(places[0][bad]), int(places[1][bad])
             raise ParameterError("layout", f"must have one site at each address (x, y), got {n} at {address}")
-        return cls(np.asarray(t_s), order[first].astype(np.int32), np.asarray(polarity), layout)
+        return cls(t_s, order[first].astype(np.int32), polarity, layout)  # type: ignore[arg-type]
 
     def addresses(self, pitch_um: float | None = None) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
         """
@@ -382,13 +382,6 @@ def write_events(batches: Iterable[Events], path: str | Path, *, pitch_um: float
 
 
 # -- parts ------------------------------------------------------------------------------------------------------------
-
-
-def _own(values: NDArray[Any]) -> NDArray[Any]:
-    """The values, that nobody can write to: a copy, unless nobody can already."""
-    owner = values if values.base is None else values.base
-    is_fixed = isinstance(owner, np.ndarray) and not owner.flags.writeable
-    return values if is_fixed else read_only(values.copy())
 
 
 def _following(name: str, batches: Iterable[Events]) -> Iterator[Events]:

@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Bools, Floats, check_choice, check_count, check_number, finite_array, wavelengths_nm
+from foveasim.arrays import (
+    Bools,
+    Floats,
+    check_choice,
+    check_count,
+    check_number,
+    finite_array,
+    read_only,
+    wavelengths_nm,
+)
 from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.fields import Grid, PowerMap, SceneLike
 from foveasim.optics._aperture import Aperture, Wavefront, overlaps
@@ -371,7 +380,7 @@ class Optics(PointImages):
         data = np.empty((n_bands, *grid.shape), self._real_type())
         for band, cells in enumerate(self.weighted_maps(scene, np.eye(n_bands), n_threads=n_threads)):
             data[band] = cells
-        return PowerMap(data, grid, scene.wavelength_nm)
+        return PowerMap(read_only(data), grid, scene.wavelength_nm)
 
     def weighted_maps(
         self, scene: SceneLike, weights: Floats, *, grid: Grid | None = None, n_threads: int | None = None

@@ -17,7 +17,15 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, check_choice, check_count, check_number, finite_array, wavelengths_nm
+from foveasim.arrays import (
+    Floats,
+    as_numbers,
+    check_choice,
+    check_count,
+    check_number,
+    finite_array,
+    wavelengths_nm,
+)
 from foveasim.errors import ParameterError
 from foveasim.units import um_from_nm
 
@@ -95,7 +103,7 @@ def zernike(n: int, m: int, x: ArrayLike, y: ArrayLike) -> Floats:
 
     if n < abs(m) or (n - m) % 2:
         raise ParameterError("m", f"must be from -n to n = {n} in steps of two", m)
-    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+    x, y = as_numbers("x", x), as_numbers("y", y)
     r2 = x * x + y * y
     k = (n - abs(m)) // 2
     radial = (-1) ** k * eval_jacobi(k, abs(m), 0, 1.0 - 2.0 * r2)

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats
+from foveasim.arrays import Floats, as_numbers
 from foveasim.optics._aperture import Aperture
 
 __all__ = ["MAX_ALIASES", "PlaneTables", "RadialTables", "Tables", "circular_otf"]
@@ -54,7 +54,7 @@ def circular_otf(s: ArrayLike) -> Floats:
     -----
     Goodman, Introduction to Fourier Optics, section on the OTF of a diffraction-limited system.
     """
-    s = np.minimum(np.abs(np.asarray(s, dtype=np.float64)), 1.0)
+    s = np.minimum(np.abs(as_numbers("s", s)), 1.0)
     return np.asarray((2.0 / np.pi) * (np.arccos(s) - s * np.sqrt(1.0 - s * s)))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from foveasim.arrays import Floats, Ints, finite_array
+from foveasim.arrays import Floats, Ints, finite_array, read_only
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
 from foveasim.reconstruct.picture import Picture, covered_share
@@ -39,7 +39,7 @@ def cells(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | N
     share = covered_share(integrator)
     covered_um2 = np.where(share > 0.0, share, np.nan) * grid.cell_area_um2
     data = integrator.spread(channels) / covered_um2
-    return Picture(data.astype(np.float32), share.astype(np.float32), grid)
+    return Picture(read_only(data.astype(np.float32)), read_only(share.astype(np.float32)), grid)
 
 
 def fill_channels(layout: PackedRings, values: Floats, channel: Ints, n_channels: int) -> Floats:

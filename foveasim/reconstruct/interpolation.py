@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from foveasim.arrays import Floats, Ints, as_numbers
+from foveasim.arrays import Floats, Ints, as_numbers, read_only
 from foveasim.compiled import kernels
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PackedRings
@@ -92,7 +92,7 @@ def site_values(values: Floats, n_sites: int) -> Floats:
     ParameterError
         When there is not one value a site, one is infinite, or a channel has no value at all.
     """
-    channels = np.atleast_2d(as_numbers("values", values))
+    channels = np.atleast_2d(as_numbers("values", values, missing_is_nan=True))
     if channels.ndim != 2 or channels.shape[1] != n_sites:
         raise ParameterError("values", f"must have the shape (..., {n_sites}), got {np.shape(values)}")
     if np.isinf(channels).any():
@@ -119,7 +119,7 @@ def _interpolated(
         mesh = _Mesh.of(centroid_um[is_known], channels[np.ix_(of_kind, np.flatnonzero(is_known))])
         found = mesh.at(points_um, thread_count(n_threads), is_smooth=is_smooth)
         data[of_kind[:, np.newaxis], row, column] = found
-    return Picture(data.astype(np.float32), share.astype(np.float32), grid)
+    return Picture(read_only(data.astype(np.float32)), read_only(share.astype(np.float32)), grid)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, check_choice, check_count, check_number, finite_array
+from foveasim.arrays import Floats, check_choice, check_count, check_number, finite_array, read_only
 from foveasim.compiled import kernels
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PackedRings
@@ -155,7 +155,7 @@ def least_squares(
 
     data = np.array(each(solved, range(n_channels), thread_count(n_threads)))
     data[:, share == 0.0] = np.nan
-    return Picture(data.astype(np.float32), share.astype(np.float32), grid)
+    return Picture(read_only(data.astype(np.float32)), read_only(share.astype(np.float32)), grid)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, Images, check_count, finite_array
+from foveasim.arrays import Floats, Images, check_count, finite_array, own, unmasked
 from foveasim.encodings import encoded_srgb
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, PackedRings, to_file_rows
@@ -30,6 +30,8 @@ class Picture:
     """
     A raster picture of per-site values.
 
+    Arrays are read-only; later edits of arrays that it was made of do not change it.
+
     Attributes
     ----------
     data : (n_channel, n_y, n_x) float32
@@ -43,6 +45,11 @@ class Picture:
     data: Images
     coverage: Images
     grid: Grid
+
+    def __post_init__(self) -> None:
+        for name, missing_is_nan in (("data", True), ("coverage", False)):
+            values = unmasked(name, getattr(self, name), missing_is_nan=missing_is_nan)
+            object.__setattr__(self, name, own(np.asarray(values)))
 
     def to_image(
         self, white: float | Floats | None = None, *, encode_srgb: bool = False, bits: int = 8

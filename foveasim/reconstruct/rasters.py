@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from foveasim.arrays import Floats, check_count, finite_array
+from foveasim.arrays import Floats, check_count, finite_array, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PowerMap
 from foveasim.optics import Optics
@@ -59,7 +59,8 @@ def reference(light: PowerMap, grid: Grid, *, weights: Floats | None = None) -> 
         plane = np.tensordot(weight, light.data, axes=1)
         sums = (along_x @ (along_y @ plane).T).T / grid.cell_area_um2
         channel[is_on] = sums[is_on] / on_map[is_on]
-    return Picture(data.astype(np.float32), np.where(is_on, on_map, 0.0).astype(np.float32), grid)
+    coverage = np.where(is_on, on_map, 0.0).astype(np.float32)
+    return Picture(read_only(data.astype(np.float32)), read_only(coverage), grid)
 
 
 def blur_kernel(

@@ -17,7 +17,10 @@ from foveasim.arrays import (
     check_number,
     check_shape,
     finite_array,
+    handed_over,
+    own,
     read_only,
+    unmasked,
     wavelengths_nm,
 )
 from foveasim.encodings import Encoding, decoded
@@ -49,7 +52,8 @@ class Scene:
     Parameters
     ----------
     basis : (n_basis, n_y, n_x) float32 or float64
-        Images, row 0 lowest, values of at least 0.
+        Images, row 0 lowest, values of at least 0. Copied, so that later edits of the array do not change the scene; an array
+        that is read-only already, with all that it is a view of, is shared.
     spectrum_w_m2_sr_nm : (n_basis, n_wavelength) float64, W/(m² sr nm)
         The spectral radiance that the value 1 of each image stands for.
     wavelength_nm : (n_wavelength,) float64, nm
@@ -67,8 +71,6 @@ class Scene:
 
     Notes
     -----
-    The arrays are used as they are, without a copy.
-
     Spectral radiance of pixel [iy, ix] at wavelength k: ``sum_b basis[b, iy, ix] * spectrum[b, k]``.
     """
 
@@ -81,9 +83,9 @@ class Scene:
     source: str = field(default="arrays", kw_only=True)
 
     def __post_init__(self) -> None:
-        basis = np.asarray(self.basis)
+        basis = np.asarray(unmasked("basis", self.basis))
         if basis.dtype not in (np.float32, np.float64):
-            basis = basis.astype(np.float64)
+            basis = read_only(basis.astype(np.float64))
         if basis.ndim != 3 or 0 in basis.shape:
             raise ParameterError("basis", f"must have the shape (n_basis, n_y, n_x), got {basis.shape}")
         lowest, highest = float(basis.min()), float(basis.max())
@@ -103,7 +105,7 @@ class Scene:
                 "spectrum_w_m2_sr_nm",
                 f"must have the shape (n_basis, n_wavelength) = {(basis.shape[0], wavelength_nm.size)}, got {spectrum.shape}",
             )
-        object.__setattr__(self, "basis", read_only(basis.view()))
+        object.__setattr__(self, "basis", own(basis))
         object.__setattr__(self, "spectrum_w_m2_sr_nm", read_only(spectrum.copy()))
         object.__setattr__(self, "wavelength_nm", wavelength_nm)
         object.__setattr__(self, "band_width_nm", read_only(width_nm.copy()))
@@ -208,7 +210,7 @@ class Scene:
                 "or give 'spectrum', the spectrum of each channel",
             )
         return cls(
-            channels,
+            handed_over(channels),
             peak * relative,
             waves_nm,
             band_widths_nm(waves_nm, band_width_nm),
@@ -285,6 +287,7 @@ class Scene:
         """
         pitch_um = check_number("pitch_um", pitch_um, above=0.0)
         n_y, n_x = check_shape("shape", shape)
+        pixels = unmasked("pixels", pixels)
         try:
             points = np.asarray(pixels)
         except ValueError:
@@ -304,7 +307,7 @@ class Scene:
         # A pixel of the pitch p0 with the radiance I / p0² has the intensity I.
         per_area = np.full((1, waves_nm.size), 1.0 / float(m_from_um(pitch_um)) ** 2)
         return cls(
-            image,
+            read_only(image),
             per_area,
             waves_nm,
             band_widths_nm(waves_nm, band_width_nm),
@@ -315,6 +318,7 @@ class Scene:
 
 
 def _picture_array(picture: ArrayLike) -> NDArray[Any]:
+    picture = unmasked("picture", picture)
     try:
         return np.asarray(picture)
     except ValueError:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Ints, check_choice, check_count, check_number, read_only
+from foveasim.arrays import Floats, Ints, check_choice, check_count, check_number, read_only, unmasked
 from foveasim.compiled import kernels
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.fields import PackedRings
@@ -234,7 +234,8 @@ class Sensor:
             if part is not None and not isinstance(part, kinds):
                 raise ParameterError(name, f"must be a {' or a '.join(k.__name__ for k in kinds)}", part)
         _ = self._filters_and_qe
-        object.__setattr__(self, "bits", self.converter.bits)
+        for name in ("bits", "companding_table", "inl_dn"):
+            object.__setattr__(self, name, getattr(self.converter, name))
         if (self.line_fpn_fraction or self.dnl_dn) and "readout_line" not in self.layout.columns:
             raise SimulationError(
                 "lines of readout differ, but the layout does not say which site is on which; give it a column 'readout_line', "
@@ -468,12 +469,13 @@ class Sensor:
             When the exposure is negative, or implausible.
         """
         exposure_s = check_plausible("exposure_s", exposure_s)
+        photo_e_per_s = unmasked("photo_e_per_s", photo_e_per_s)
         expected_e = (photo_e_per_s * self.response + self.dark_rate_e_per_s) * exposure_s
         return expected_e if self._crosstalk is None else self._crosstalk.apply(expected_e)
 
     def collect(self, expected_e: Floats, *, streams: Streams, n_threads: int | None = None) -> Ints:
         """Charge that a draw gives, (n_site,) int64 e-: shot noise, then the full well."""
-        self._check_charges("expected_e", expected_e)
+        expected_e = self._checked_charges("expected_e", expected_e)
         electrons = draw_shot_noise(expected_e, self.shot_noise, self.gaussian_above_e, streams, n_threads=n_threads)
         if self.full_well_e is not None:
             well_e = np.floor(np.minimum(self.full_well_e, LARGEST_CHARGE_E)).astype(np.int64)
@@ -487,7 +489,7 @@ class Sensor:
         Noise of resetting and reading, volts, offsets, the clip at V_sat and the converter: without companding and faults
         code ``k`` stands for the voltages from ``k * V_sat / 2**bits`` to the next.
         """
-        self._check_charges("electrons", electrons, at_least=-np.inf)
+        electrons = self._checked_charges("electrons", electrons, at_least=-np.inf)
         convert = self.converter
         code = np.empty(electrons.size, np.uint8 if self.bits <= 8 else np.uint16)
         noises_e = {"reset": self.ktc_noise_e, "read": np.atleast_1d(np.asarray(self.read_noise_e, np.float64))}
@@ -531,13 +533,15 @@ class Sensor:
         in_blocks(electrons.size, block, n_threads)
         return code
 
-    def _check_charges(self, name: str, charge_e: NDArray[Any], at_least: float = 0.0) -> None:
+    def _checked_charges(self, name: str, charge_e: ArrayLike, at_least: float = 0.0) -> NDArray[Any]:
+        charge_e = unmasked(name, charge_e)
         if np.shape(charge_e) != (self.layout.n_sites,):
             raise ParameterError(
                 name, f"must be one number for each of the {self.layout.n_sites} sites, got {np.shape(charge_e)}"
             )
         if self.layout.n_sites and not np.min(charge_e) >= at_least:
             raise ParameterError(name, f"must be >= {at_least:g} everywhere", float(np.min(charge_e)), "e-")
+        return charge_e
 
     def checked_charges(self, name: str, charge_e: ArrayLike) -> Floats:
         """
@@ -548,9 +552,7 @@ class Sensor:
         ParameterError
             When there is not one charge of at least 0 for each site.
         """
-        charges = np.ascontiguousarray(charge_e, np.float64)
-        self._check_charges(name, charges)
-        return charges
+        return np.ascontiguousarray(self._checked_charges(name, charge_e), np.float64)
 
     def coupled(self, mean_e: Floats, variance_e2: Floats) -> tuple[Floats, Floats]:
         """Mean and variance of independent charges after inter-pixel coupling, (n_site,) e- and e-² each."""

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from foveasim.arrays import Floats
+from foveasim.arrays import Floats, as_numbers
 from foveasim.errors import ParameterError
 from foveasim.sensor._sensor import Sensor
 from foveasim.sensor.limits import check_plausible
@@ -49,7 +49,7 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
     Charge diffusion and coupling, which mix sites, are left out.
     """
     exposure_s = check_plausible("exposure_s", exposure_s)
-    photo_e_per_s = np.asarray(photo_e_per_s, np.float64)
+    photo_e_per_s = as_numbers("photo_e_per_s", photo_e_per_s)
     n_sites = sensor.layout.n_sites
     if photo_e_per_s.shape != (n_sites,):
         raise ParameterError("photo_e_per_s", f"must be {n_sites} numbers, one a site, got {photo_e_per_s.shape}")

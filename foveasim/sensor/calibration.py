@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Bools, Floats, as_numbers, check_count, check_number, finite_array, read_only
+from foveasim.arrays import Bools, Floats, as_numbers, check_count, check_number, finite_array, own, unmasked
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor._sensor import Sensor
 from foveasim.sensor.converter import QUANTISATION_DN2
@@ -141,7 +141,7 @@ class Calibration:
         for field in fields(self):
             values = getattr(self, field.name)
             if isinstance(values, np.ndarray):
-                object.__setattr__(self, field.name, read_only(values.view()))
+                object.__setattr__(self, field.name, own(np.asarray(unmasked(field.name, values))))
 
     def __repr__(self) -> str:
         return f"Calibration({self.n_sites} sites, {int(self.defective.sum())} defective, {int(self.clipped.sum())} clipped)"

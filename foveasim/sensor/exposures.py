@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Ints, read_only
+from foveasim.arrays import Floats, Ints, as_numbers, own, unmasked
 from foveasim.errors import ParameterError
 from foveasim.sensor._sensor import Sensor
 from foveasim.sensor.calibration import Calibration, linearised, nominal_e_per_dn
@@ -354,7 +354,8 @@ def fit_ramp(
 
 def _protect(carrier: Any) -> None:
     for field in fields(carrier):
-        object.__setattr__(carrier, field.name, read_only(np.asarray(getattr(carrier, field.name)).view()))
+        values = unmasked(field.name, getattr(carrier, field.name))
+        object.__setattr__(carrier, field.name, own(np.asarray(values)))
 
 
 def _rising(name: str, times_s: ArrayLike) -> Floats:
@@ -367,7 +368,7 @@ def _rising(name: str, times_s: ArrayLike) -> Floats:
 def _readings(code: ArrayLike, n_readings: int, sensor: Sensor, what: str) -> tuple[Floats, Floats, Floats]:
     """Codes (n_reading, n_site), linear codes, and electrons of one."""
     linear_dn = linearised(code, sensor)
-    codes = np.asarray(code, np.float64)
+    codes = as_numbers("code", code)
     if codes.shape != (n_readings, sensor.layout.n_sites):
         raise ParameterError(
             "code",

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from foveasim.arrays import Floats, Ints
+from foveasim.arrays import Floats, Ints, unmasked
 from foveasim.compiled import kernels
 from foveasim.parallel import each, thread_count
 from foveasim.streams import Streams
@@ -57,6 +57,7 @@ def draw_shot_noise(
     electrons : (n_site,) int64, e-
         Never below 0. Mean and variance are those of Poisson on both sides of the switch.
     """
+    expected_e = unmasked("expected_e", expected_e)
     if how == "off":
         return np.rint(np.clip(expected_e, 0.0, LARGEST_CHARGE_E)).astype(np.int64)
     electrons = np.empty(expected_e.size, np.int64)

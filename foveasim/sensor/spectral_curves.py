@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, check_count, check_number
+from foveasim.arrays import Floats, as_numbers, check_count, check_number
 from foveasim.errors import FoveasimError, ParameterError
 
 __all__ = [
@@ -125,7 +125,7 @@ class GaussianCurve(Multiplied):
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Values at the wavelengths, of the same shape."""
-        offset = (np.asarray(wavelength_nm, dtype=np.float64) - self.centre_nm) / self.fwhm_nm
+        offset = (as_numbers("wavelength_nm", wavelength_nm) - self.centre_nm) / self.fwhm_nm
         return np.asarray(self.peak * np.exp(-4.0 * np.log(2.0) * offset**2))
 
 
@@ -178,7 +178,7 @@ class PassBand(Multiplied):
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Values at the wavelengths, of the same shape."""
-        waves_nm = np.asarray(wavelength_nm, dtype=np.float64)
+        waves_nm = as_numbers("wavelength_nm", wavelength_nm)
         begun = 1.0 if self.from_nm is None else self._step(waves_nm - self.from_nm)
         ended = 0.0 if self.to_nm is None else self._step(waves_nm - self.to_nm)
         return np.asarray(self.peak * np.maximum(begun - ended, 0.0))
@@ -230,7 +230,7 @@ class SiliconQE(Multiplied):
         """Values at the wavelengths, of the same shape."""
         check_within(wavelength_nm, SILICON_NM[0], SILICON_NM[-1], "the table of silicon's absorption")
         length_um = np.exp(
-            np.interp(np.asarray(wavelength_nm, dtype=np.float64), SILICON_NM, np.log(SILICON_ABSORPTION_UM))
+            np.interp(as_numbers("wavelength_nm", wavelength_nm), SILICON_NM, np.log(SILICON_ABSORPTION_UM))
         )
         return np.asarray(self.transmission * -np.expm1(-self.depth_um / length_um))
 
@@ -309,7 +309,7 @@ class BandMean(Multiplied):
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Values at the wavelengths, of the same shape."""
-        centre_nm = np.asarray(wavelength_nm, dtype=np.float64)[..., np.newaxis]
+        centre_nm = as_numbers("wavelength_nm", wavelength_nm)[..., np.newaxis]
         if np.any(centre_nm <= 0.5 * self.band_width_nm):
             raise ParameterError(
                 "wavelength_nm",
@@ -381,7 +381,7 @@ def check_within(wavelength_nm: ArrayLike, low_nm: float, high_nm: float, what: 
     ParameterError
         With the first such wavelength.
     """
-    waves_nm = np.asarray(wavelength_nm, dtype=np.float64)
+    waves_nm = as_numbers("wavelength_nm", wavelength_nm)
     outside = waves_nm[~((waves_nm >= low_nm) & (waves_nm <= high_nm))]
     if outside.size:
         raise ParameterError(

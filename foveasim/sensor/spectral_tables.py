@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, check_choice, check_count, finite_array, wavelengths_nm
+from foveasim.arrays import Floats, as_numbers, check_choice, check_count, finite_array, wavelengths_nm
 from foveasim.errors import ParameterError
 from foveasim.sensor.spectral_curves import Multiplied, check_within
 
@@ -58,7 +58,7 @@ class PolynomialCurve(Multiplied):
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Values at the wavelengths, of the same shape."""
         check_within(wavelength_nm, self.wavelength_nm[0], self.wavelength_nm[-1], "the table of the fit")
-        return np.clip(self._fit(np.asarray(wavelength_nm, dtype=np.float64)), 0.0, 1.0)
+        return np.clip(self._fit(as_numbers("wavelength_nm", wavelength_nm)), 0.0, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,7 +215,7 @@ def _set_table(curve: PolynomialCurve | TableCurve | SplineCurve) -> None:
 def _inside(wavelength_nm: ArrayLike, table_nm: Sequence[float], beyond: Beyond) -> tuple[Floats, Any]:
     """Wavelengths moved to the ends of a table that they lie beyond, and where the curve has a value, or is 0."""
     low_nm, high_nm = table_nm[0], table_nm[-1]
-    waves_nm = np.asarray(wavelength_nm, dtype=np.float64)
+    waves_nm = as_numbers("wavelength_nm", wavelength_nm)
     if beyond == "refuse":
         check_within(waves_nm, low_nm, high_nm, "the table", BEYOND_CURE)
     check_within(waves_nm, 0.0, np.finfo(np.float64).max, "the spectrum")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, check_count, check_shape, finite_array, read_only
+from foveasim.arrays import Floats, check_count, check_shape, finite_array, read_only, unmasked
 from foveasim.compiled import kernels
 from foveasim.errors import ParameterError
 from foveasim.fields import PackedRings
@@ -179,7 +179,7 @@ class SitePixels:
         ParameterError
             When there are fewer colours than sites in the picture, or they are no bytes.
         """
-        rgb = np.asarray(rgb)
+        rgb = np.asarray(unmasked("rgb", rgb))
         highest = int(self.ids.max(initial=-1))
         if rgb.dtype != np.uint8 or rgb.ndim != 2 or rgb.shape[1] != 3 or rgb.shape[0] <= highest:
             raise ParameterError(

@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Bools, Floats, Ints, check_length_um, finite_array
+from foveasim.arrays import Bools, Floats, Ints, as_numbers, check_length_um, finite_array, unmasked
 from foveasim.capture import Capture
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout import Layout
@@ -181,8 +181,8 @@ def extruded(
     vertices_of_site = np.diff(layout.ring_offsets[layout.site_offsets])
     points_um = np.empty((2 * n, 3))
     points_um[:n, :2] = points_um[n:, :2] = layout.xy_um
-    points_um[:n, 2] = np.repeat(np.broadcast_to(low_um, layout.n_sites), vertices_of_site)
-    points_um[n:, 2] = np.repeat(np.broadcast_to(high_um, layout.n_sites), vertices_of_site)
+    points_um[:n, 2] = np.repeat(np.broadcast_to(as_numbers("low_um", low_um), layout.n_sites), vertices_of_site)
+    points_um[n:, 2] = np.repeat(np.broadcast_to(as_numbers("high_um", high_um), layout.n_sites), vertices_of_site)
     here = caps.weld
     after = here[next_vertex(layout.ring_offsets)]
     n_caps = caps.triangles.shape[0]
@@ -238,7 +238,7 @@ def prisms(
     """
     is_capture = isinstance(data, Capture)
     layout = data.layout if isinstance(data, Capture) else data
-    height = ("code" if is_capture else "size_um") if height is None else height
+    height = ("code" if is_capture else "size_um") if height is None else unmasked("height", height)
     try:
         shown = colours_of(data, height)
     except ParameterError as error:

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import UNIT_SUFFIXES, Floats, Ints, as_numbers, finite_array
+from foveasim.arrays import UNIT_SUFFIXES, Floats, Ints, as_numbers, finite_array, own, unmasked
 from foveasim.capture import Capture
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
@@ -201,8 +201,9 @@ def _title(name: str) -> str:
 
 def _of_array(by: ArrayLike, n_sites: int, label: str) -> SiteColours:
     """Colours of values, or given ones as they are."""
+    by = unmasked("by", by, missing_is_nan=True)
     try:
-        array = np.asarray(by)
+        array = own(np.asarray(by))
     except ValueError:
         raise ParameterError("by", "must be one value for each site", by) from None
     if array.ndim == 0 or array.shape[0] != n_sites or array.shape[1:] not in ((), (3,)):

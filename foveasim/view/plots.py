@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, check_choice
+from foveasim.arrays import Floats, check_choice, unmasked
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
 from foveasim.files import written_whole
@@ -157,7 +157,7 @@ def plot_noise_budget(
     if ax is None:
         ax = Figure(figsize=(7.0, 4.5), layout="constrained").add_subplot()
     n_sites = next(iter(noise_e.values())).size
-    labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(classes)
+    labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(unmasked("classes", classes))
     if labels.shape != (n_sites,):
         raise ParameterError("classes", f"must be one for each of the {n_sites} sites, got {labels.shape}")
     shown = {name: values for name, values in noise_e.items() if np.any(values > 0.0)}

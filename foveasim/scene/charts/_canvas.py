@@ -9,7 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Bools, Floats, check_choice, check_number, check_shape, finite_array, wavelengths_nm
+from foveasim.arrays import (
+    Bools,
+    Floats,
+    check_choice,
+    check_number,
+    check_shape,
+    finite_array,
+    handed_over,
+    wavelengths_nm,
+)
 from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.scene._scene import MAX_DISTANCE_M, MAX_PITCH_UM, Scene, band_widths_nm
 from foveasim.units import m_from_um
@@ -189,9 +198,9 @@ class Canvas:
         return self.scene_of(shares[np.newaxis], np.asarray(self.radiance_w_m2_sr_nm)[np.newaxis], source)
 
     def scene_of(self, basis: Shares, spectrum_w_m2_sr_nm: Floats, source: str) -> Scene:
-        """Scene of basis images (n_basis, n_y, n_x) and their spectra (n_basis, n_wavelength)."""
+        """Scene of basis images (n_basis, n_y, n_x), which it keeps, and their spectra (n_basis, n_wavelength)."""
         return Scene(
-            basis,
+            handed_over(basis),
             spectrum_w_m2_sr_nm,
             np.asarray(self.wavelength_nm),
             np.asarray(self.band_width_nm),
