@@ -19,6 +19,7 @@ __all__ = ["copied", "described", "differences", "versions"]
 
 #: Arrays up to this size are written out; of longer ones the shape and a checksum are kept.
 WRITTEN_OUT = 64
+_ATOMS = frozenset({str, int, float, bool, type(None)})
 
 
 def described(value: Any) -> Any:
@@ -50,11 +51,14 @@ def described(value: Any) -> Any:
 
 def copied(value: Any) -> Any:
     """Plain data as new dicts and lists all the way down: editing the copy leaves the original as it was."""
-    if isinstance(value, Mapping):
+    # Plain classes first: the general ones take several times as long, and every frame of a video has such data.
+    if type(value) in _ATOMS:
+        return value
+    if isinstance(value, dict | Mapping):
         return {key: copied(item) for key, item in value.items()}
     if isinstance(value, list):
         return [copied(item) for item in value]
-    if isinstance(value, tuple) and type(value) is tuple:
+    if type(value) is tuple:
         return tuple(copied(item) for item in value)
     return own(value) if isinstance(value, np.ndarray) else value
 
