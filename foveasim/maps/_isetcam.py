@@ -2,9 +2,9 @@
 Optical images of ISETCam and ISETBio, as MATLAB saves them: the struct ``oi``, or its fields.
 
 ``data.photons`` (row, column, wave) are photons/(s m² nm), the first row on top; ``spectrum.wave`` is in nm. The middle of
-the image lies on the axis, and its width is ``2 f tan(wAngular / 2)``, f the focal length (``oiGet(oi, 'width')`` since
-November 2021; before, the distance of the image). A single wavelength stands for 1 nm, as ISETCam's ``bin width`` does.
-Whole numbers, of before 2017, are unpacked between ``dmin`` and ``dmax``.
+the image lies on the axis, its samples are square, and its width is ``2 f tan(wAngular / 2)``, f the focal length
+(``oiGet(oi, 'width')`` since November 2021; before, the distance of the image). A single wavelength stands for 1 nm, as
+ISETCam's ``bin width`` does. Whole numbers, of before 2017, are unpacked between ``dmin`` and ``dmax``.
 """
 
 from __future__ import annotations
