@@ -101,8 +101,9 @@ def test_a_plain_array_is_a_band_in_the_middle():
     assert np.array_equal(letter_map().data[0], UPRIGHT)
 
 
-def test_a_plain_array_of_bands_is_used_without_a_copy():
+def test_read_only_bands_are_shared_with_map():
     data = np.ones((2, 3, 4), np.float32)
+    data.flags.writeable = False
 
     bands = fs.PowerMap.from_array(data, pitch_um=1.0, wavelength_nm=[450.0, 550.0], origin_um=(1.0, 2.0))
 

@@ -249,8 +249,10 @@ def as_images(data: NDArray[Any]) -> Images:
         raise Refusal(f"holds {data.shape[0]} bands, more than {MAX_BANDS}; bands come first: (n_band, n_y, n_x)")
     images = data.reshape(-1, *data.shape[-2:])
     is_small = images.dtype.itemsize <= (4 if images.dtype.kind == "f" else 2)
-    converted = images.astype(np.float32 if is_small else np.float64, copy=False)
-    return converted if converted is images else read_only(converted)
+    converted: Images = images.astype(np.float32 if is_small else np.float64, copy=False)
+    if converted is not images:
+        read_only(converted)
+    return converted
 
 
 def _pitch_um(found: Found, given: Given) -> Pitch:

@@ -54,8 +54,8 @@ def circular_otf(s: ArrayLike) -> Floats:
     -----
     Goodman, Introduction to Fourier Optics, section on the OTF of a diffraction-limited system.
     """
-    s = np.minimum(np.abs(as_numbers("s", s)), 1.0)
-    return np.asarray((2.0 / np.pi) * (np.arccos(s) - s * np.sqrt(1.0 - s * s)))
+    ratio: Floats = np.minimum(np.abs(as_numbers("s", s)), 1.0)
+    return np.asarray((2.0 / np.pi) * (np.arccos(ratio) - ratio * np.sqrt(1.0 - ratio * ratio)))
 
 
 class Tables(Protocol):
