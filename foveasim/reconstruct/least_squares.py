@@ -142,7 +142,7 @@ def least_squares(
             overlaps=_scaled_rows(overlaps[known], weight),
             right=channels[channel, known] / np.sqrt(noise[channel, known]),
             shape=shape,
-            smoothing=(grid.pitch_y_um / grid.pitch_x_um, grid.pitch_x_um / grid.pitch_y_um),
+            weights=(grid.pitch_y_um / grid.pitch_x_um, grid.pitch_x_um / grid.pitch_y_um),
             transfer=_transfer(kernel_of[channel], shape) if kernel_of else None,
             tolerance=tolerance,
             max_steps=max_steps,
@@ -170,7 +170,7 @@ class _Problem:
     right : (n_value,)
         The values over their noise.
     shape : (n_y, n_x)
-    smoothing : (along x, along y)
+    weights : (along x, along y)
         Weights of the squared differences of neighbours: 1 for square pixels.
     transfer : (n_y, n_x // 2 + 1) complex, optional
         Of the blur before it.
@@ -181,7 +181,7 @@ class _Problem:
     overlaps: Any
     right: Floats
     shape: tuple[int, ...]
-    smoothing: tuple[float, float]
+    weights: tuple[float, float]
     transfer: Any
     tolerance: float
     max_steps: int
@@ -219,7 +219,7 @@ class _Problem:
         """Inverse diagonals of the preconditioner, from the raster to ever coarser pixels."""
         level, levels = self._reach.reshape(self.shape), []
         while True:
-            levels.append(1.0 / (level + ROUGHEST * sum(self.smoothing) * mu))
+            levels.append(1.0 / (level + ROUGHEST * sum(self.weights) * mu))
             if min(level.shape) <= COARSEST:
                 return levels
             level = _coarser(level)
@@ -237,7 +237,7 @@ class _Problem:
         """The picture for one strength."""
         add_roughness: Callable[..., None] = kernels("reconstruct").add_roughness
         levels = self._levels(mu)
-        mu_x, mu_y = (mu * weight for weight in self.smoothing)
+        mu_x, mu_y = (mu * weight for weight in self.weights)
 
         def normal(x: Floats) -> Floats:
             out = self.backward(self.forward(x))
@@ -271,7 +271,7 @@ class _Problem:
 
     def roughness(self, x: Floats) -> float:
         """Weighted sum of the squared differences of neighbours."""
-        picture, (weight_x, weight_y) = x.reshape(self.shape), self.smoothing
+        picture, (weight_x, weight_y) = x.reshape(self.shape), self.weights
         across, along = (np.diff(picture, axis=1) ** 2).sum(), (np.diff(picture, axis=0) ** 2).sum()
         return float(weight_y * along + weight_x * across)
 
