@@ -6,6 +6,7 @@ import base64
 import hashlib
 import html
 import json
+import re
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -19,10 +20,8 @@ from foveasim.layout import Layout, Report
 from foveasim.view.web._content import content_of
 from foveasim.view.web._pack import packed
 
-__all__ = ["check_page_path", "joined", "web_page", "write_web_page"]
+__all__ = ["bundled", "check_page_path", "joined", "web_page", "write_web_page"]
 
-#: Scripts in the order in which they stand on each other.
-SCRIPTS = ("unpack.js", "sites.js", "colours.js", "map.js", "page.js")
 #: Endings of pages.
 ENDINGS = (".html", ".htm")
 #: A page loads nothing: its own scripts and style alone, told by their checksums, and pictures that stand in it.
@@ -30,6 +29,9 @@ POLICY = (
     "default-src 'none'; script-src '{script}'; style-src '{style}'; img-src data: blob:; base-uri 'none'; "
     "form-action 'none'"
 )
+#: What modules take from each other, and what they give: lines of their own, without other names for the same.
+IMPORT = re.compile(r'^import \{[\w$, ]+\} from "\./(\w+\.js)";\n', re.MULTILINE)
+EXPORT = re.compile(r"^export (?=(?:async )?function |class |const )", re.MULTILINE)
 
 
 def web_page(thing: Layout | Capture, *, report: Report | None = None, name: str = "") -> str:
@@ -69,7 +71,7 @@ def web_page(thing: Layout | Capture, *, report: Report | None = None, name: str
     return joined(
         "template.html",
         ("page.css",),
-        SCRIPTS,
+        "page.js",
         about,
         {key: text for key, (_, text) in arrays.items()},
         title=str(content.about["name"]),
@@ -124,7 +126,7 @@ def check_page_path(path: str | Path) -> Path:
 def joined(
     template: str,
     styles: tuple[str, ...],
-    scripts: tuple[str, ...],
+    script: str,
     about: dict[str, Any],
     data: dict[str, str],
     **texts: str,
@@ -134,8 +136,8 @@ def joined(
 
     Parameters
     ----------
-    template, styles, scripts : str
-        Files beside this one. Scripts share a scope that is closed to others.
+    template, styles, script : str
+        Files in this package. The script is the module that imports all others, as :func:`bundled` joins them.
     about : dict
         Plain data, for the element ``about``.
     data : dict of str to base64
@@ -144,7 +146,7 @@ def joined(
         For the template's places, escaped.
     """
     style = "".join(map(_part, styles))
-    script = '(() => {\n"use strict";\n' + "\n".join(map(_part, scripts)) + "\n})();\n"
+    script = bundled(script)
     # Of what ends a script element nothing may stand in one, whatever a column of a stranger's file is called.
     plain = json.dumps(about, ensure_ascii=True, allow_nan=False).replace("<", "\\u003c").replace(">", "\\u003e")
     elements = [f'<script type="application/json" id="about">{plain}</script>']
@@ -156,6 +158,35 @@ def joined(
         script=script,
         data="\n".join(elements),
     )
+
+
+@cache
+def bundled(name: str) -> str:
+    """
+    Return a module and all that it imports as one script, which a page from a file may run where it may not import.
+
+    Parameters
+    ----------
+    name : str
+        A module in this package, such as ``"page.js"``. Modules import names from each other as they are, at their top, and
+        no two have the same names.
+
+    Returns
+    -------
+    text : str
+        Every module once, behind those that it imports, in a scope that is closed to others.
+    """
+    modules: dict[str, str] = {}
+
+    def add(module: str) -> None:
+        if module not in modules:
+            text = _part(module)
+            for imported in IMPORT.findall(text):
+                add(imported)
+            modules[module] = EXPORT.sub("", IMPORT.sub("", text))
+
+    add(name)
+    return '(() => {\n"use strict";\n' + "\n".join(modules.values()) + "\n})();\n"
 
 
 @cache

@@ -19,11 +19,11 @@ const VIRIDIS = [
   "addc30b0dd2fb2dd2db5de2bb8de29bade28bddf26c0df25c2df23c5e021c8e020cae11fcde11dd0e11cd2e21bd5e21a",
   "d8e219dae319dde318dfe318e2e418e5e419e7e419eae51aece51befe51cf1e51df4e61ef6e620f8e621fbe723fde725",
 ].join("");
-const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
+export const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
 const packedColour = ([r, g, b]) => (255 << 24 | b << 16 | g << 8 | r) >>> 0;
 const table = (colourOf) => Array.from({ length: 256 }, (_, i) => colourOf(i / 255));
 
-function bytesOfHex(hex) {
+export function bytesOfHex(hex) {
   return [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));
 }
 
@@ -42,7 +42,7 @@ function lit(share, colour, palette) {
 //   even   numbers, in steps even to the eye        grey  numbers as light
 //   lit    numbers as light through each site's filter
 //   kinds  whole numbers that name things
-class Scale {
+export class Scale {
   constructor(column, values, filterOf, palette, wantsLog) {
     Object.assign(this, { column, values, filterOf, palette });
     let low = Infinity, high = -Infinity;
@@ -142,7 +142,7 @@ class Scale {
 }
 
 // The next of 1, 2, 5, 10, ... above a length.
-function roundStep(length, isWhole) {
+export function roundStep(length, isWhole) {
   if (!(length > 0)) return 1;
   const power = 10 ** Math.floor(Math.log10(length)), lead = length / power;
   const step = power * (lead <= 1 ? 1 : lead <= 2 ? 2 : lead <= 5 ? 5 : 10);
@@ -150,7 +150,7 @@ function roundStep(length, isWhole) {
 }
 
 // Whole numbers whole, others to six figures.
-function shown(value) {
+export function shown(value) {
   if (Number.isNaN(value)) return "no value";
   if (!Number.isFinite(value)) return value > 0 ? "infinite" : "minus infinite";
   if (Number.isSafeInteger(value)) return value.toLocaleString("en-US");
@@ -158,8 +158,17 @@ function shown(value) {
   return size >= 1e-3 && size < 1e7 ? String(Number(value.toPrecision(6))) : value.toExponential(4);
 }
 
+// A site's value of a column with its unit, by the sites' areas in µm²; "…" while the column is not there yet.
+export function textOf(column, site, areas) {
+  if (column.of) return shown(column.of === "size" ? Math.sqrt(areas[site]) : areas[site]) + " " + column.unit;
+  if (!column.values) return "…";
+  const value = column.values[site];
+  if (column.names) return column.names[value];
+  return column.unit ? shown(value) + " " + column.unit : shown(value);
+}
+
 // Short ones for axes.
-function brief(value) {
+export function brief(value) {
   const size = Math.abs(value);
   if (size >= 1e6 || (size < 1e-3 && size > 0)) return value.toExponential(0).replace("e+", "e");
   return size >= 1e4 ? (value / 1e3).toLocaleString("en-US") + "k" : String(Number(value.toPrecision(3)));

@@ -1,5 +1,8 @@
 // The map: draws all sites by WebGL2 and keeps what part of the sensor is in view.
 
+import { clamp } from "./colours.js";
+import { TEXTURE_WIDTH, bindIntegers, buildProgram, createLookup, fitCanvas, sendLookup, textureSize } from "./gl.js";
+
 const VERTEX_SHADER = `#version 300 es
 in ivec2 place;
 in uint site;
@@ -9,7 +12,7 @@ uniform vec2 zoom;
 uniform highp sampler2D colours;
 flat out vec4 colour;
 void main() {
-  colour = texelFetch(colours, ivec2(int(site) & 2047, int(site) >> 11), 0);
+  colour = texelFetch(colours, ivec2(int(site) % ${TEXTURE_WIDTH}, int(site) / ${TEXTURE_WIDTH}), 0);
   // Whole numbers subtract exactly, so that outlines stay sharp however near one goes.
   gl_Position = vec4((vec2(place - centre) - rest) * zoom, 0.0, 1.0);
 }`;
@@ -18,13 +21,12 @@ precision mediump float;
 flat in vec4 colour;
 out vec4 pixel;
 void main() { pixel = colour; }`;
-const TEXTURE_WIDTH = 2048;
 // Places as whole numbers: the longer side of the layout is so many steps.
 const LATTICE = 2 ** 30;
 // How near one can go: the view may be this many times narrower than the layout.
 const DEEPEST = 1e7;
 
-class SensorMap {
+export class SensorMap {
   constructor(canvas, sites, renderer) {
     this.canvas = canvas;
     this.sites = sites;
@@ -36,24 +38,16 @@ class SensorMap {
     this.y = this.middle[1];
     this.scale = 1;
     this.width = this.height = 1;
-    this.colours = new Uint32Array(TEXTURE_WIDTH * Math.max(1, Math.ceil(sites.n / TEXTURE_WIDTH)));
+    this.colours = new Uint32Array(textureSize(sites.n));
     this.gl = canvas.getContext("webgl2", { antialias: !renderer.isSlow, alpha: false, depth: false, powerPreference: "high-performance" });
     if (this.gl) this._load();
   }
 
   _load() {
     const { gl, sites } = this;
-    const program = gl.createProgram();
-    for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX_SHADER], [gl.FRAGMENT_SHADER, FRAGMENT_SHADER]]) {
-      const shader = gl.createShader(kind);
-      gl.shaderSource(shader, text);
-      gl.compileShader(shader);
-      gl.attachShader(program, shader);
-    }
-    gl.linkProgram(program);
-    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
+    const { program, at } = buildProgram(gl, VERTEX_SHADER, FRAGMENT_SHADER, ["place", "site"]);
     gl.useProgram(program);
-    this.at = Object.fromEntries(["centre", "rest", "zoom"].map((name) => [name, gl.getUniformLocation(program, name)]));
+    this.at = at;
 
     const n = sites.place.length, places = new Int32Array(2 * n), owners = new Uint32Array(n);
     for (let v = 0; v < n; v++) {
@@ -63,26 +57,21 @@ class SensorMap {
     }
     for (let site = 0; site < sites.n; site++) owners.fill(site, sites.firstVertex(site), sites.firstVertex(site + 1));
     gl.bindVertexArray(gl.createVertexArray());
-    for (const [name, data, size, type] of [["place", places, 2, gl.INT], ["site", owners, 1, gl.UNSIGNED_INT]]) {
-      const location = gl.getAttribLocation(program, name);
-      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-      gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
-      gl.enableVertexAttribArray(location);
-      gl.vertexAttribIPointer(location, size, type, 0, 0);
-    }
+    bindIntegers(gl, 0, places, 2, gl.INT);
+    bindIntegers(gl, 1, owners, 1, gl.UNSIGNED_INT);
     const { corners, tiles } = sites.triangles();
     this.tiles = tiles;
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
-    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    createLookup(gl);
   }
 
-  sendColours() {
-    const { gl, colours } = this;
-    const bytes = new Uint8Array(colours.buffer), rows = colours.length / TEXTURE_WIDTH;
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, TEXTURE_WIDTH, rows, 0, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+  sendColours() { sendLookup(this.gl, new Uint8Array(this.colours.buffer)); }
+
+  // Everything again, after the graphics card lost its memory.
+  restore() {
+    this._load();
+    this.sendColours();
   }
 
   // From µm on the sensor to CSS pixels of the map, and back; y points up on the sensor.
@@ -94,9 +83,7 @@ class SensorMap {
   resize(width, height) {
     this.width = Math.max(1, width);
     this.height = Math.max(1, height);
-    const ratio = Math.min(window.devicePixelRatio || 1, 2);
-    this.canvas.width = Math.round(this.width * ratio);
-    this.canvas.height = Math.round(this.height * ratio);
+    fitCanvas(this.canvas, this.width, this.height);
   }
 
   // The scale at which the whole layout is in view.
@@ -140,15 +127,4 @@ class SensorMap {
     }
     flush();
   }
-}
-
-// What draws WebGL2 here: null where nothing does, else whether it is the processor, where smooth edges cost too much.
-function findRenderer() {
-  const gl = document.createElement("canvas").getContext("webgl2");
-  if (!gl) return null;
-  const told = gl.getExtension("WEBGL_debug_renderer_info");
-  const name = told ? gl.getParameter(told.UNMASKED_RENDERER_WEBGL) : "";
-  const lose = gl.getExtension("WEBGL_lose_context");
-  if (lose) lose.loseContext();
-  return { isSlow: /swiftshader|llvmpipe|software|basic render/i.test(name) };
 }

@@ -1,7 +1,14 @@
 // The page: controls, the photosite under the mouse, colours, rules, the picture, links.
 
-const about = JSON.parse(document.getElementById("about").textContent);
-const $ = (id) => document.getElementById(id);
+import { Scale, brief, bytesOfHex, clamp, roundStep, shown, textOf } from "./colours.js";
+import { listenToPointers } from "./gestures.js";
+import { findRenderer, fitCanvas, pixelRatio, watchSize } from "./gl.js";
+import { SensorMap } from "./map.js";
+import { $, downloadPicture, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme, stayingNotice } from "./page_parts.js";
+import { Sites } from "./sites.js";
+import { offsetsOf, unpack } from "./unpack.js";
+
+const about = JSON.parse($("about").textContent);
 const reducesMotion = matchMedia("(prefers-reduced-motion: reduce)");
 // More outlines than this are not drawn: they would be a grey mush.
 const MOST_OUTLINES = 4000;
@@ -20,13 +27,6 @@ function array(name) {
   return loading.get(name);
 }
 
-function make(tag, text, className) {
-  const element = document.createElement(tag);
-  if (text !== undefined) element.textContent = text;
-  if (className) element.className = className;
-  return element;
-}
-
 // -- columns ------------------------------------------------------------------------------------------------------------
 
 async function valuesOf(column) {
@@ -36,16 +36,6 @@ async function valuesOf(column) {
     else column.values = await array(column.array);
   }
   return column.values;
-}
-
-// A site's value as text, with its unit.
-function textOf(column, site) {
-  if (column.of === "area") return shown(state.sites.area[site]) + " µm²";
-  if (column.of === "size") return shown(Math.sqrt(state.sites.area[site])) + " µm";
-  if (!column.values) return "…";
-  const value = column.values[site];
-  if (column.names) return column.names[value];
-  return column.unit ? shown(value) + " " + column.unit : shown(value);
 }
 
 const titleOf = (column) => (column.unit ? column.label + " / " + column.unit : column.label);
@@ -78,16 +68,13 @@ function groundColour() {
 // -- legend and histogram ---------------------------------------------------------------------------------------------------
 
 function fitted(canvas) {
-  const ratio = Math.min(window.devicePixelRatio || 1, 2), width = canvas.clientWidth, height = canvas.clientHeight;
-  canvas.width = Math.max(1, Math.round(width * ratio));
-  canvas.height = Math.max(1, Math.round(height * ratio));
+  const ratio = pixelRatio(), width = canvas.clientWidth, height = canvas.clientHeight;
+  fitCanvas(canvas, width, height);
   // Where the processor draws, it does so twenty times faster without the way through WebGL.
   const context = canvas.getContext("2d", { willReadFrequently: state.isSlow });
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   return { context, width, height };
 }
-
-const inkOf = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
 function drawLegend() {
   const { scale, column } = state, isKinds = column.kind === "kinds";
@@ -397,7 +384,7 @@ function lengthText(value) {
   return value.toFixed(clamp(Math.ceil(Math.log10(state.map.scale)) + 1, 0, 6));
 }
 
-let toldSite = null, speaking = 0;
+let toldSite = null;
 
 function tellSite() {
   const site = state.hovered >= 0 ? state.hovered : state.pinned;
@@ -410,7 +397,7 @@ function tellSite() {
   const rows = [];
   for (const column of about.columns) {
     if (column.is_repeat) continue;
-    rows.push([column.label, site < 0 ? "–" : textOf(column, site), column === state.column || (column.array && column.array === state.column.array)]);
+    rows.push([column.label, site < 0 ? "–" : textOf(column, site, state.sites.area), column === state.column || (column.array && column.array === state.column.array)]);
   }
   const centre = site < 0 ? null : state.sites.centre(site);
   rows.push(["centre / µm", centre ? centre.map((v) => String(Number(v.toPrecision(6)))).join(", ") : "–"]);
@@ -427,12 +414,11 @@ function tellSite() {
   }
   $("values").replaceChildren(...cells);
   drawHistogram();
-  clearTimeout(speaking);
-  if (site >= 0) speaking = setTimeout(() => { $("live").textContent = sentence(site); }, 300);
+  speak(site < 0 ? null : () => sentence(site));
 }
 
 function sentence(site) {
-  const parts = about.columns.filter((column) => !column.is_repeat).map((column) => column.label + " " + textOf(column, site));
+  const parts = about.columns.filter((column) => !column.is_repeat).map((column) => column.label + " " + textOf(column, site, state.sites.area));
   return "Photosite " + site + ": " + parts.join(", ");
 }
 
@@ -496,59 +482,21 @@ function resize() {
 }
 
 function listenToMap() {
-  const canvas = $("marks"), pointers = new Map(), { map } = state;
-  let travelled = 0, pinch = 0;
-  const at = (event) => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
-  canvas.addEventListener("wheel", (event) => {
-    event.preventDefault();
-    cancelAnimationFrame(flight);
-    const lines = event.deltaMode === 1 ? 16 : event.deltaMode === 2 ? 400 : 1;
-    const [px, py] = at(event);
-    map.zoom(Math.exp(-clamp(event.deltaY * lines, -400, 400) * (event.ctrlKey ? 0.01 : 0.002)), px, py);
-    hover(map.fromX(px), map.fromY(py), "mouse");
-    moved();
-  }, { passive: false });
-  canvas.addEventListener("pointerdown", (event) => {
-    cancelAnimationFrame(flight);
-    canvas.setPointerCapture(event.pointerId);
-    pointers.set(event.pointerId, at(event));
-    travelled = 0;
-    pinch = distance();
+  const canvas = $("marks"), { map } = state;
+  listenToPointers(canvas, {
+    press: () => cancelAnimationFrame(flight),
+    drag: (dx, dy) => { map.set(map.x - dx / map.scale, map.y + dy / map.scale, map.scale); moved(); },
+    pinch: (factor, px, py) => { map.zoom(factor, px, py); moved(); },
+    wheel: (factor, px, py) => {
+      cancelAnimationFrame(flight);
+      map.zoom(factor, px, py);
+      hover(map.fromX(px), map.fromY(py), "mouse");
+      moved();
+    },
+    click: () => pin(state.hovered),
+    move: (px, py) => hover(map.fromX(px), map.fromY(py), "mouse"),
+    leave,
   });
-  const distance = () => {
-    const [a, b] = [...pointers.values()];
-    return b ? Math.hypot(a[0] - b[0], a[1] - b[1]) : 0;
-  };
-  canvas.addEventListener("pointermove", (event) => {
-    const [px, py] = at(event), before = pointers.get(event.pointerId);
-    if (before) {
-      const share = 1 / pointers.size, dx = (px - before[0]) * share, dy = (py - before[1]) * share;
-      travelled += Math.abs(dx) + Math.abs(dy);
-      pointers.set(event.pointerId, [px, py]);
-      if (travelled > 4) {
-        canvas.classList.add("held");
-        map.set(map.x - dx / map.scale, map.y + dy / map.scale, map.scale);
-        if (pointers.size === 2) {
-          const [a, b] = [...pointers.values()], apart = distance();
-          if (pinch > 0) map.zoom(apart / pinch, 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]));
-          pinch = apart;
-        }
-        moved();
-      }
-    }
-    hover(map.fromX(px), map.fromY(py), "mouse");
-  });
-  const release = (event) => {
-    pointers.delete(event.pointerId);
-    pinch = distance();
-    if (!pointers.size) canvas.classList.remove("held");
-  };
-  canvas.addEventListener("pointerup", (event) => {
-    if (pointers.has(event.pointerId) && pointers.size === 1 && travelled <= 4) pin(state.hovered);
-    release(event);
-  });
-  canvas.addEventListener("pointercancel", release);
-  canvas.addEventListener("pointerleave", () => { if (!pointers.size) leave(); });
   canvas.addEventListener("blur", () => { if (state.cursor && state.cursor.from === "keys") leave(); });
   canvas.addEventListener("keydown", (event) => {
     const step = 60 / map.scale;
@@ -562,7 +510,7 @@ function listenToMap() {
     moved();
   });
   document.addEventListener("keydown", (event) => {
-    if (event.target.closest("input, select, dialog") || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (!isForPage(event)) return;
     const nearer = (factor) => { map.zoom(factor, 0.5 * map.width, 0.5 * map.height); moved(); };
     if (event.key === "+" || event.key === "=") nearer(1.4);
     else if (event.key === "-" || event.key === "_") nearer(1 / 1.4);
@@ -575,7 +523,7 @@ function listenToMap() {
   $("farther").addEventListener("click", () => fly(map.x, map.y, 0.5 * map.scale));
   $("fit").addEventListener("click", fit);
   $("unpin").addEventListener("click", () => { state.pinned = -1; tellSite(); moved(); });
-  new ResizeObserver(resize).observe($("map"));
+  watchSize($("map"), resize);
 }
 
 // -- design rules -----------------------------------------------------------------------------------------------------------------------
@@ -693,7 +641,7 @@ function flyToViolation(i) {
     width = Math.max(width, Math.min(Math.max(c - a, d - b), 20 * width || Infinity));
   }
   choose(i);
-  if (!Number.isFinite(box[0])) { tell("The report tells no place"); return; }
+  if (!Number.isFinite(box[0])) { notice("The report tells no place"); return; }
   fly(0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]), (0.3 * Math.min(map.width, map.height)) / (width || 1));
 }
 
@@ -729,22 +677,13 @@ function readHash() {
   return [words.get("by"), range.length === 2 && range.every(Number.isFinite) ? range : null];
 }
 
-let telling = 0;
-
-function tell(text) {
-  $("told").textContent = text;
-  $("told").hidden = false;
-  clearTimeout(telling);
-  telling = setTimeout(() => { $("told").hidden = true; }, 2600);
-}
-
 async function copyLink() {
   history.replaceState(null, "", viewHash());
   try {
     await navigator.clipboard.writeText(location.href);
-    tell("Link to this view copied");
+    notice("Link to this view copied");
   } catch {
-    tell("The address above is the link to this view");
+    notice("The address above is the link to this view");
   }
 }
 
@@ -783,38 +722,16 @@ function viewAsPicture() {
   return picture;
 }
 
-function savePicture() {
-  viewAsPicture().toBlob((blob) => {
-    const link = document.createElement("a");
-    link.href = URL.createObjectURL(blob);
-    link.download = about.name.replace(/[^\p{L}\p{N}_-]+/gu, "_").slice(0, 60) + ".png";
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 5000);
-  });
-}
-
-function setTheme(theme) {
-  document.documentElement.dataset.theme = theme;
-}
-
 function listenToTools() {
   $("link").addEventListener("click", copyLink);
-  $("save").addEventListener("click", savePicture);
-  $("help").addEventListener("click", () => $("keys").showModal());
-  $("theme").addEventListener("click", () => {
-    const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
-    setTheme(theme);
-    try { localStorage.setItem("foveasim-theme", theme); } catch { /* kept for this page alone */ }
-    repaint();
-    drawLegend();
-  });
+  $("save").addEventListener("click", () => downloadPicture(viewAsPicture(), about.name));
   $("find").addEventListener("submit", (event) => {
     event.preventDefault();
     const text = $("find-site").value.replace(/[\s,_]/g, ""), site = text === "" ? NaN : Number(text);
     const isThere = Number.isInteger(site) && site >= 0 && site < state.sites.n;
     $("find-site").setAttribute("aria-invalid", !isThere);
     if (isThere) goTo(site);
-    else tell("Sites have the numbers 0 to " + shown(state.sites.n - 1));
+    else notice("Sites have the numbers 0 to " + shown(state.sites.n - 1));
   });
   window.addEventListener("hashchange", async () => {
     const [key, range] = readHash();
@@ -826,12 +743,23 @@ function listenToTools() {
 
 // -- opening --------------------------------------------------------------------------------------------------------------------------------
 
-function startTheme() {
-  let theme = null;
-  try { theme = localStorage.getItem("foveasim-theme"); } catch { /* not kept */ }
-  const system = matchMedia("(prefers-color-scheme: dark)");
-  setTheme(theme === "dark" || theme === "light" ? theme : system.matches ? "dark" : "light");
-  system.addEventListener("change", () => { if (!theme) { setTheme(system.matches ? "dark" : "light"); if (state.scale) { repaint(); drawLegend(); } } });
+function showTheme() {
+  if (!state.scale) return;
+  repaint();
+  drawLegend();
+}
+
+// What the graphics card forgot is sent to it again as soon as it is back.
+function listenToLosses() {
+  $("cells").addEventListener("webglcontextlost", (event) => {
+    event.preventDefault();
+    stayingNotice("The graphics card has lost the map; it comes back when the card does.");
+  });
+  $("cells").addEventListener("webglcontextrestored", () => {
+    state.map.restore();
+    stayingNotice(null);
+    ask("map");
+  });
 }
 
 // Without WebGL2 the picture stands in for the map.
@@ -844,7 +772,8 @@ function showPlain(why) {
 }
 
 async function open() {
-  startTheme();
+  startTheme(showTheme);
+  listenToHelp();
   $("notes").textContent = about.notes.join(" · ");
   const renderer = findRenderer();
   if (!renderer) {
@@ -857,7 +786,7 @@ async function open() {
   state.sites = new Sites(arrays, about);
   state.map = new SensorMap($("cells"), state.sites, renderer);
   if (!state.map.gl) throw new Error("WebGL2 was lost");
-  $("cells").addEventListener("webglcontextlost", () => showPlain("The graphics card gave up; load the page again."));
+  listenToLosses();
   $("colouring").append(...about.columns.map((column) => {
     const option = make("option", titleOf(column));
     option.value = column.key;

@@ -1,6 +1,8 @@
 // Photosites: exact outlines, what lies under a point, and triangles to draw.
 
-class Sites {
+import { offsetsOf, placesOf } from "./unpack.js";
+
+export class Sites {
   constructor(arrays, about) {
     this.n = about.n_sites;
     this.bounds = about.bounds_um;
@@ -208,10 +210,4 @@ class Sites {
       context.closePath();
     }
   }
-}
-
-function placesOf(references) {
-  const place = new Uint32Array(references.length);
-  for (let v = 0, seen = 0; v < place.length; v++) place[v] = references[v] === 0 ? seen++ : seen - references[v];
-  return place;
 }

@@ -1,246 +1,224 @@
 // The page of solids: parts in three dimensions, and the photosite under the mouse.
 
-const about = JSON.parse(document.getElementById("about").textContent);
-const $ = (id) => document.getElementById(id);
-const state = { hovered: -1, parts: [], pointer: null, isAsked: false, loaded: false };
-// Which site is lit up, for the shaders of all parts.
-const hovered = { value: -1 };
+import { Bodies } from "./bodies.js";
+import { bytesOfHex, shown, textOf } from "./colours.js";
+import { listenToPointers } from "./gestures.js";
+import { findRenderer, watchSize } from "./gl.js";
+import { Orbit } from "./orbit.js";
+import { $, downloadPicture, inkOf, isForPage, listenToHelp, make, notice, speak, startTheme, stayingNotice } from "./page_parts.js";
+import { SolidView } from "./solid_view.js";
+import { unpack } from "./unpack.js";
 
-function make(tag, text, className) {
-  const element = document.createElement(tag);
-  if (text !== undefined) element.textContent = text;
-  if (className) element.className = className;
-  return element;
-}
+const about = JSON.parse($("about").textContent);
+const ARRAYS = ["place_x", "place_y", "places", "z", "corners", "run_sites", "run_points", "run_triangles", "run_colours", "tile_runs"];
+const state = { view: null, area: null, pinned: -1, part: -1, pinnedPart: -1, pointer: null, anchor: null, isAsked: false };
+const ASIDE = [Math.atan2(-0.9, 0.35), Math.atan2(0.75, Math.hypot(0.35, 0.9))], ABOVE = [-0.5 * Math.PI, 0.5 * Math.PI];
 
-const inkOf = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+// -- the photosite --------------------------------------------------------------------------------------------------------
 
-// -- the photosite ------------------------------------------------------------------------------------------------------------
-
-function textOf(column, site) {
-  if (column.of) return shown(column.of === "size" ? Math.sqrt(state.area[site]) : state.area[site]) + " " + column.unit;
-  if (!column.values) return "…";
-  const value = column.values[site];
-  if (column.names) return column.names[value];
-  return column.unit ? shown(value) + " " + column.unit : shown(value);
-}
-
-let speaking = 0;
-
-function tellSite() {
-  const site = state.hovered, columns = about.columns.filter((column) => !column.is_repeat);
+function showSite() {
+  const { view, pinned } = state, hovered = view.hovered, site = hovered >= 0 ? hovered : pinned;
+  const part = hovered >= 0 ? state.part : pinned >= 0 ? state.pinnedPart : -1, isPinned = site >= 0 && site === pinned;
+  const columns = about.columns.filter((column) => !column.is_repeat);
+  const notes = [part >= 0 ? view.parts[part].name : "", isPinned ? "pinned" : ""].filter(Boolean).join(", ");
   $("site").classList.toggle("empty", site < 0);
-  $("site-heading").textContent = site < 0 ? "Photosite" : "Photosite " + site.toLocaleString("en-US") + (state.part ? " (" + state.part + ")" : "");
-  $("values").replaceChildren(...columns.flatMap((column) => [make("dt", column.label), make("dd", site < 0 ? "–" : textOf(column, site))]));
-  clearTimeout(speaking);
-  if (site >= 0) {
-    speaking = setTimeout(() => {
-      $("live").textContent = "Photosite " + site + ": " + columns.map((column) => column.label + " " + textOf(column, site)).join(", ");
-    }, 300);
-  }
+  $("unpin").hidden = pinned < 0;
+  $("site-heading").textContent = site < 0 ? "Photosite" : "Photosite " + site.toLocaleString("en-US") + (notes ? " (" + notes + ")" : "");
+  $("values").replaceChildren(...columns.flatMap((column) => [make("dt", column.label), make("dd", site < 0 ? "–" : textOf(column, site, state.area))]));
+  speak(site < 0 ? null : () => "Photosite " + site + ": " + columns.map((column) => column.label + " " + textOf(column, site, state.area)).join(", "));
 }
 
-// The site of the nearest surface under a place of the window, and its part.
-function pick(px, py) {
-  const box = $("solid").getBoundingClientRect(), caster = new THREE.Raycaster();
-  caster.firstHitOnly = true;
-  const place = new THREE.Vector2((2 * (px - box.left)) / box.width - 1, 1 - (2 * (py - box.top)) / box.height);
-  state.camera.updateMatrixWorld();
-  caster.setFromCamera(place, state.camera);
-  const [hit] = caster.intersectObjects(state.parts.filter((part) => part.visible), false);
-  if (!hit) return { site: -1, part: null };
-  return { site: Math.round(hit.object.geometry.getAttribute("_photosite").getX(hit.face.a)), part: hit.object.name };
-}
-
+// The site of the nearest surface under the pointer, and its part; the surface stays under it while one zooms.
 function hover() {
-  const found = state.pointer ? pick(...state.pointer) : { site: -1, part: null };
-  if (found.site === state.hovered && found.part === state.part) return;
-  state.hovered = found.site;
-  state.part = found.part;
-  hovered.value = found.site;
-  tellSite();
+  const { view, pointer } = state, found = pointer ? view.pick(pointer[0], pointer[1]) : null;
+  const site = found ? found.site : -1, part = found ? found.part : -1;
+  if (pointer && !state.anchor) state.anchor = view.orbit.pointAt(pointer[0], pointer[1], found.depth, new Float64Array(3));
+  if (site === view.hovered && part === state.part) return;
+  view.hovered = site;
+  state.part = part;
+  showSite();
 }
 
-// -- drawing ---------------------------------------------------------------------------------------------------------------------
+function pin(site, part) {
+  const isOff = site < 0 || site === state.pinned;
+  state.pinned = isOff ? -1 : site;
+  state.pinnedPart = isOff ? -1 : part;
+  state.view.setPinned(state.pinned);
+  showSite();
+  ask();
+}
+
+// -- drawing --------------------------------------------------------------------------------------------------------------
 
 function ask() {
   if (state.isAsked) return;
   state.isAsked = true;
-  requestAnimationFrame(() => {
-    state.isAsked = false;
-    hover();
-    draw();
-  });
+  requestAnimationFrame(drawFrame);
 }
 
-function draw() {
-  state.scene.background.set(inkOf("--map"));
-  state.renderer.render(state.scene, state.camera);
+// Ids are drawn a frame after the view came to rest: while it moves, only the image is.
+function drawFrame() {
+  const { view } = state, wasMoving = view.isImageStale && view.areIdsStale;
+  state.isAsked = false;
+  if (!wasMoving) hover();
+  view.draw();
+  if (wasMoving) ask();
+}
+
+// The view has changed, by more than a zoom about what is under the pointer.
+function moved() {
+  state.anchor = null;
+  changed();
+}
+
+function changed() {
+  state.view.change();
+  ask();
+}
+
+function look(direction) {
+  state.view.orbit.look(...direction);
+  moved();
+}
+
+function turn(aside, up) {
+  state.view.orbit.turn(aside, up);
+  moved();
+}
+
+function approach(factor) {
+  state.view.orbit.zoom(1 / factor);
+  moved();
+}
+
+function showTheme() {
+  state.view.setGround(bytesOfHex(inkOf("--map")));
+  ask();
 }
 
 function resize() {
   const { clientWidth: width, clientHeight: height } = $("map");
-  state.renderer.setSize(width, height, false);
-  state.camera.aspect = width / Math.max(1, height);
-  state.camera.updateProjectionMatrix();
-  ask();
+  state.view.resize(width, height);
+  moved();
 }
 
-// Looks at all of it from a direction.
-function look(direction) {
-  const { camera, controls, extent, middle } = state;
-  const width = Math.max(extent.x, extent.y), distance = (0.52 * width) / Math.tan((camera.fov * Math.PI) / 360) / Math.min(1, camera.aspect);
-  camera.position.copy(middle).addScaledVector(direction.normalize(), distance);
-  camera.near = distance / 1000;
-  camera.far = distance * 50;
-  camera.updateProjectionMatrix();
-  controls.target.copy(middle);
-  controls.update();
-  ask();
-}
+// -- mouse, fingers and keys ----------------------------------------------------------------------------------------------
 
-const lookAside = () => look(new THREE.Vector3(0.35, -0.9, 0.75));
-const lookDown = () => look(new THREE.Vector3(0, -0.001, 1));
-
-function approach(factor) {
-  const { camera, controls } = state;
-  camera.position.sub(controls.target).multiplyScalar(factor).add(controls.target);
-  controls.update();
-  ask();
-}
-
-function turn(aside, up) {
-  const { camera, controls } = state, offset = camera.position.clone().sub(controls.target);
-  const azimuth = Math.atan2(offset.y, offset.x) + aside, flat = Math.hypot(offset.x, offset.y);
-  const rise = clamp(Math.atan2(offset.z, flat) + up, -1.5, 1.57), far = offset.length();
-  offset.set(Math.cos(azimuth) * Math.cos(rise), Math.sin(azimuth) * Math.cos(rise), Math.sin(rise)).multiplyScalar(far);
-  camera.position.copy(controls.target).add(offset);
-  controls.update();
-  ask();
-}
-
-// -- opening ------------------------------------------------------------------------------------------------------------------------
-
-// A part as it is shown: its bytes of colour are encoded for screens, which glTF takes for light; the hovered site is lit up.
-function prepared(part) {
-  const { geometry } = part, told = geometry.getAttribute("color"), light = new Float32Array(3 * told.count), colour = new THREE.Color();
-  for (let i = 0; i < told.count; i++) {
-    colour.setRGB(told.getX(i), told.getY(i), told.getZ(i), THREE.SRGBColorSpace).toArray(light, 3 * i);
-  }
-  geometry.setAttribute("color", new THREE.BufferAttribute(light, 3));
-  // Parts of equal corners share them in the file, and the tree puts them into an order of its own.
-  geometry.setIndex(geometry.index.clone());
-  geometry.boundsTree = new THREE.MeshBVH(geometry);
-  part.raycast = THREE.acceleratedRaycast;
-  part.material = new THREE.MeshLambertMaterial({ vertexColors: true, flatShading: true, side: 2 });
-  part.material.onBeforeCompile = (shader) => {
-    shader.uniforms.hovered = hovered;
-    shader.vertexShader = "attribute float _photosite;\nvarying float vSite;\n" + shader.vertexShader.replace("#include <begin_vertex>", "#include <begin_vertex>\nvSite = _photosite;");
-    shader.fragmentShader = "uniform float hovered;\nvarying float vSite;\n" + shader.fragmentShader.replace("#include <color_fragment>", "#include <color_fragment>\nif (abs(vSite - hovered) < 0.5) diffuseColor.rgb = mix(diffuseColor.rgb, vec3(1.0, 0.85, 0.2), 0.7);");
+function listenToCanvas() {
+  const canvas = $("solid"), { orbit } = state.view, point = new Float64Array(3);
+  // Where the pointer is on a surface, known since it came there; else in front of the target.
+  const under = (px, py) => state.anchor || orbit.pointAt(px, py, 1, point);
+  const depthOf = (place) => {
+    let depth = 1;
+    for (let i = 0; i < 3; i++) depth -= (orbit.toEye[i] * (place[i] - orbit.target[i])) / orbit.distance;
+    return Math.max(depth, 0.05);
   };
-  return part;
+  let held = 1;
+  listenToPointers(canvas, {
+    takesRightButton: true,
+    press: () => { held = state.anchor ? depthOf(state.anchor) : 1; },
+    drag: (dx, dy, { isSecond, isMiddle }) => {
+      if (isMiddle) orbit.zoom(Math.exp(0.005 * dy));
+      else if (isSecond) orbit.pan(dx, dy, held);
+      else orbit.turn((-2 * Math.PI * dx) / orbit.tall, (2 * Math.PI * dy) / orbit.tall);
+      moved();
+    },
+    pinch: (factor, px, py) => { orbit.zoom(1 / factor, orbit.pointAt(px, py, 1, point)); moved(); },
+    wheel: (factor, px, py) => { orbit.zoom(1 / factor, under(px, py)); changed(); },
+    click: (px, py) => { const found = state.view.pick(px, py); pin(found.site, found.part); },
+    move: (px, py, isHeld) => { state.pointer = isHeld ? null : [px, py]; state.anchor = null; ask(); },
+    leave: () => { state.pointer = null; state.anchor = null; ask(); },
+  });
+  canvas.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+    if (way && event.shiftKey) { orbit.pan(-60 * way[0], 60 * way[1]); moved(); }
+    else if (way) turn(0.12 * way[0], 0.1 * way[1]);
+    else if (event.key === "Enter" || event.key === " ") {
+      const found = state.view.pick(0.5 * orbit.width, 0.5 * orbit.tall);
+      if (found.site < 0) notice("No photosite in the middle of the view");
+      pin(found.site, found.part);
+    } else return;
+    event.preventDefault();
+  });
+  document.addEventListener("keydown", (event) => {
+    if (!isForPage(event)) return;
+    if (event.key === "+" || event.key === "=") approach(1.3);
+    else if (event.key === "-" || event.key === "_") approach(1 / 1.3);
+    else if (event.key === "0") look(ASIDE);
+    else if (event.key === "t" || event.key === "T") look(ABOVE);
+    else if (event.key === "Escape") pin(-1, -1);
+  });
+}
+
+function listenToTools() {
+  $("nearer").addEventListener("click", () => approach(1.5));
+  $("farther").addEventListener("click", () => approach(1 / 1.5));
+  $("fit").addEventListener("click", () => look(ASIDE));
+  $("above").addEventListener("click", () => look(ABOVE));
+  $("unpin").addEventListener("click", () => pin(-1, -1));
+  $("height").addEventListener("input", () => {
+    const factor = 2 ** Number($("height").value);
+    $("height-told").textContent = "× " + Number(factor.toPrecision(2));
+    state.view.setHeight(factor);
+    moved();
+  });
+  $("save").addEventListener("click", () => {
+    state.view.draw();
+    downloadPicture($("solid"), about.name);
+  });
 }
 
 function partItem(part) {
   const item = make("li"), label = make("label"), box = make("input");
   box.type = "checkbox";
   box.checked = true;
-  box.addEventListener("change", () => { part.visible = box.checked; ask(); });
-  label.append(box, make("span", part.name + " · " + shown(part.geometry.index.count / 3) + " triangles"));
+  box.addEventListener("change", () => { state.view.setVisible(part, box.checked); moved(); });
+  label.append(box, make("span", part.name + " · " + shown(part.nTriangles) + " triangles"));
   item.append(label);
   return item;
 }
 
-function listen() {
+// -- opening --------------------------------------------------------------------------------------------------------------
+
+// What the graphics card forgot is sent to it again as soon as it is back.
+function listenToLosses() {
   const canvas = $("solid");
-  canvas.addEventListener("pointermove", (event) => { state.pointer = event.buttons ? null : [event.clientX, event.clientY]; ask(); });
-  canvas.addEventListener("pointerleave", () => { state.pointer = null; ask(); });
-  canvas.addEventListener("keydown", (event) => {
-    const turns = { ArrowLeft: [-0.12, 0], ArrowRight: [0.12, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
-    if (!turns) return;
-    turn(...turns);
+  canvas.addEventListener("webglcontextlost", (event) => {
     event.preventDefault();
+    stayingNotice("The graphics card has lost this view; it comes back when the card does.");
   });
-  document.addEventListener("keydown", (event) => {
-    if (event.target.closest("input") || event.ctrlKey || event.metaKey || event.altKey) return;
-    if (event.key === "+" || event.key === "=") approach(1 / 1.3);
-    else if (event.key === "-" || event.key === "_") approach(1.3);
-    else if (event.key === "0") lookAside();
-    else if (event.key === "t" || event.key === "T") lookDown();
+  canvas.addEventListener("webglcontextrestored", () => {
+    state.view.load();
+    stayingNotice(null);
+    moved();
   });
-  $("nearer").addEventListener("click", () => approach(1 / 1.5));
-  $("farther").addEventListener("click", () => approach(1.5));
-  $("fit").addEventListener("click", lookAside);
-  $("above").addEventListener("click", lookDown);
-  $("height").addEventListener("input", () => {
-    const factor = 2 ** Number($("height").value);
-    $("height-told").textContent = "× " + Number(factor.toPrecision(2));
-    state.whole.scale.z = factor;
-    state.whole.updateMatrixWorld(true);
-    ask();
-  });
-  $("theme").addEventListener("click", () => {
-    const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
-    document.documentElement.dataset.theme = theme;
-    try { localStorage.setItem("foveasim-theme", theme); } catch { /* kept for this page alone */ }
-    ask();
-  });
-  $("save").addEventListener("click", () => {
-    draw();
-    $("solid").toBlob((blob) => {
-      const link = document.createElement("a");
-      link.href = URL.createObjectURL(blob);
-      link.download = about.name.replace(/[^\p{L}\p{N}_-]+/gu, "_").slice(0, 60) + ".png";
-      link.click();
-      setTimeout(() => URL.revokeObjectURL(link.href), 5000);
-    });
-  });
-  state.controls.addEventListener("change", ask);
-  new ResizeObserver(resize).observe($("map"));
 }
 
 async function open() {
-  let theme = null;
-  try { theme = localStorage.getItem("foveasim-theme"); } catch { /* not kept */ }
-  document.documentElement.dataset.theme = theme || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+  startTheme(() => { if (state.view) showTheme(); });
+  listenToHelp();
   $("notes").textContent = about.notes.join(" · ");
   const renderer = findRenderer();
   if (!renderer) {
-    $("opening").textContent = "This browser has no WebGL2, which three dimensions need.";
+    $("opening").textContent = "This browser has no WebGL2, which three dimensions need. Another browser, or graphics acceleration in the settings of this one, shows them.";
     return;
   }
-  const file = await unpack("glb", about.arrays.glb);
-  const { scene: parts } = await new THREE.GLTFLoader().parseAsync(file.buffer, "");
-  state.area = await unpack("area_um2", about.arrays.area_um2);
-  state.renderer = new THREE.WebGLRenderer({ canvas: $("solid"), antialias: !renderer.isSlow, powerPreference: "high-performance" });
-  state.renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
-  state.scene = new THREE.Scene();
-  state.scene.background = new THREE.Color();
-  state.whole = new THREE.Group();
-  state.scene.add(state.whole);
-  parts.updateMatrixWorld(true);
-  parts.traverse((part) => { if (part.isMesh) state.parts.push(prepared(part)); });
-  state.whole.add(...state.parts);
-  state.camera = new THREE.PerspectiveCamera(35, 1, 1, 1000);
-  state.camera.up.set(0, 0, 1);
-  const sun = new THREE.DirectionalLight(0xffffff, 1.9);
-  sun.position.set(-0.5, -0.6, 1);
-  state.scene.add(new THREE.HemisphereLight(0xffffff, 0x9aa4b4, 1.7), sun);
-  const low = new THREE.Vector3(Infinity, Infinity, Infinity), high = low.clone().negate();
-  for (const { geometry } of state.parts) {
-    geometry.computeBoundingBox();
-    low.min(geometry.boundingBox.min);
-    high.max(geometry.boundingBox.max);
-  }
-  state.extent = high.clone().sub(low);
-  state.middle = low.clone().add(high).multiplyScalar(0.5);
-  state.controls = new THREE.OrbitControls(state.camera, $("solid"));
-  $("parts").append(...state.parts.map(partItem));
-  resize();
-  lookAside();
-  listen();
-  tellSite();
-  draw();
+  const arrays = Object.fromEntries(await Promise.all([...ARRAYS, "area_um2"].map(async (name) => [name, await unpack(name, about.arrays[name])])));
+  const bodies = new Bodies(about.bodies, arrays), smallest = Math.sqrt(arrays.area_um2.reduce((a, b) => Math.min(a, b)));
+  state.area = arrays.area_um2;
+  const orbit = new Orbit(bodies.low, bodies.high, Math.max(4096 * bodies.lattice, 0.1 * smallest));
+  state.view = new SolidView($("solid"), bodies, orbit, about.n_sites, renderer);
+  $("parts").append(...state.view.parts.map(partItem));
+  state.view.resize($("map").clientWidth, $("map").clientHeight);
+  orbit.look(...ASIDE);
+  showTheme();
+  listenToCanvas();
+  listenToTools();
+  listenToLosses();
+  watchSize($("map"), resize);
+  showSite();
+  state.view.draw();
   $("opening").hidden = true;
 }
 
@@ -248,8 +226,7 @@ async function openRest() {
   for (const column of about.columns) {
     if (column.array && !column.is_repeat) column.values = await unpack(column.array, about.arrays[column.array]);
   }
-  state.loaded = true;
-  tellSite();
+  showSite();
 }
 
 window.foveasim = {
@@ -257,19 +234,29 @@ window.foveasim = {
   ready: null,
   complete: null,
   readyMs: NaN,
-  pick,
-  lookDown,
-  draw,
-  get hovered() { return state.hovered; },
-  get parts() { return state.parts.map((part) => part.name); },
+  // What is seen at a place of the window, in CSS pixels.
+  pick: (px, py) => {
+    const box = $("solid").getBoundingClientRect(), { site, part } = state.view.pick(px - box.left, py - box.top);
+    return { site, part: part < 0 ? null : state.view.parts[part].name };
+  },
+  lookDown: () => look(ABOVE),
+  draw: () => state.view.draw(),
+  get hovered() { return state.view.hovered; },
+  get pinned() { return state.pinned; },
+  get parts() { return state.view.parts.map((part) => part.name); },
+  get counts() { return { ...state.view.counts }; },
+  // The eye, the point that it looks at and the length of what is seen of a vertical line there, in µm with heights scaled.
+  get camera() {
+    const { orbit } = state.view;
+    return { eye: [...orbit.eye([0, 0, 0])], target: [...orbit.target], distance: orbit.distance, height: orbit.height, near: orbit.near, far: orbit.far };
+  },
   // CSS pixels of the window where a place on the sensor, in µm, is seen.
   toWindow: (x, y, z) => {
-    state.camera.updateMatrixWorld();
-    const place = new THREE.Vector3(x, y, z * state.whole.scale.z).project(state.camera), box = $("solid").getBoundingClientRect();
-    return [box.left + 0.5 * (place.x + 1) * box.width, box.top + 0.5 * (1 - place.y) * box.height];
+    const box = $("solid").getBoundingClientRect(), [px, py] = state.view.orbit.project(x, y, z, [0, 0]);
+    return [box.left + px, box.top + py];
   },
 };
 window.foveasim.ready = open().then(() => { window.foveasim.readyMs = performance.now(); });
-window.foveasim.complete = window.foveasim.ready.then(() => state.renderer && openRest());
+window.foveasim.complete = window.foveasim.ready.then(() => state.view && openRest());
 window.foveasim.ready.catch((error) => { $("opening").textContent = "The solids cannot be shown (" + error.message + ")."; });
 window.foveasim.complete.catch(() => {});

@@ -12,7 +12,7 @@ function bytesOfBase64(text) {
   return bytes;
 }
 
-async function unpack(name, about) {
+export async function unpack(name, about) {
   const element = document.getElementById("data-" + name);
   const zipped = bytesOfBase64(element.textContent.trim());
   element.remove();
@@ -30,8 +30,15 @@ async function unpack(name, about) {
 }
 
 // Running sums with a 0 in front: counts to offsets.
-function offsetsOf(counts) {
+export function offsetsOf(counts) {
   const offsets = new Uint32Array(counts.length + 1);
   for (let i = 0; i < counts.length; i++) offsets[i + 1] = offsets[i] + counts[i];
   return offsets;
+}
+
+// Places that rings come to, from references back: 0 for the next new one, else how many came since.
+export function placesOf(references) {
+  const place = new Uint32Array(references.length);
+  for (let v = 0, seen = 0; v < place.length; v++) place[v] = references[v] === 0 ? seen++ : seen - references[v];
+  return place;
 }

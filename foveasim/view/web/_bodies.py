@@ -1,0 +1,178 @@
+"""
+Surfaces as a page of solids draws them: vertices on a lattice of integers, photosite by photosite.
+
+Photosites of equal shape have equal triangles, counted from their own first point, and a point is mostly above or next to the
+one before it: so do the arrays compress to a fraction of glTF's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.arrays import Ints
+from foveasim.errors import GeometryError, ParameterError
+from foveasim.layout import Layout
+from foveasim.rings import positions_in_runs
+from foveasim.view.meshes import Mesh
+from foveasim.view.web._pack import back_references, smallest
+
+__all__ = ["bodies_of"]
+
+#: Steps of the lattice along the longest side of all surfaces, at most: their differences are exact as int32.
+MAX_STEPS = 2**30
+#: ... and at least, as many as float32 has.
+MIN_STEPS = 2**24
+#: Steps across the smallest photosite or part, where MAX_STEPS allows it.
+STEPS_PER_FEATURE = 2**12
+#: Photosites of a tile, which is drawn when any of it is in view.
+SITES_PER_TILE = 1500
+
+
+def bodies_of(
+    meshes: Sequence[Mesh], layout: Layout, *, are_closed: bool
+) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """
+    Return surfaces as plain data and arrays for ``bodies.js``.
+
+    Parameters
+    ----------
+    meshes : sequence of Mesh
+        Of photosites of the layout; -1 for none.
+    layout : Layout
+    are_closed : bool
+        Whether the surfaces are closed, so that no back of a triangle is seen from outside.
+
+    Returns
+    -------
+    about : dict
+        ``lattice_um``, ``origin_um``, ``low_um`` and ``high_um`` of their box, and ``list`` of the surfaces.
+    arrays : dict of str to array
+        ``place_x``, ``place_y``: steps on the lattice from one place to the next; ``places``: place of each point, as
+        references back; ``z`` of each point on the lattice; ``run_sites``: site + 1 of each run of points, with
+        ``run_points``, ``run_triangles``, ``run_colours`` of each; ``corners`` of triangles, counted from the first point of
+        their run; ``tile_runs``: runs of each tile.
+
+    Raises
+    ------
+    GeometryError
+        When there is not a single triangle.
+    ParameterError
+        When a triangle spans several photosites, a photosite is not of the layout, or a part has a photosite in several
+        colours.
+    """
+    meshes = [mesh for mesh in meshes if mesh.triangles.size]
+    if not meshes:
+        raise GeometryError("the solids must have at least one triangle, got none")
+    for mesh in meshes:
+        _check(mesh, layout.n_sites)
+    low_um = np.min([mesh.bounds_um[0] for mesh in meshes], axis=0)
+    high_um = np.max([mesh.bounds_um[1] for mesh in meshes], axis=0)
+    lattice_um = _lattice_um(meshes, layout, float((high_um - low_um).max()))
+    origin_um = 0.5 * (low_um + high_um)
+    points = np.rint((np.concatenate([mesh.points_um for mesh in meshes]) - origin_um) / lattice_um).astype(np.int64)
+    _, place = np.unique((points[:, 0] << 32) + points[:, 1], return_inverse=True)
+    tile_of_site = _tiles(layout)
+    pieces = []
+    start = 0
+    for mesh in meshes:
+        stop = start + mesh.points_um.shape[0]
+        pieces.append(_runs(mesh, place[start:stop], tile_of_site, start))
+        start = stop
+    order = np.concatenate([piece.pop("order") for piece in pieces])
+    place, first = _by_first_occurrence(place[order])
+    arrays = {key: np.concatenate([piece[key] for piece in pieces]) for key in pieces[0]}
+    corner_places = points[order][first]
+    arrays |= {
+        "place_x": np.diff(corner_places[:, 0], prepend=0),
+        "place_y": np.diff(corner_places[:, 1], prepend=0),
+        "places": back_references(place),
+        "z": points[order, 2],
+    }
+    about = {
+        "lattice_um": lattice_um,
+        "origin_um": origin_um.tolist(),
+        "low_um": low_um.tolist(),
+        "high_um": high_um.tolist(),
+        "list": [
+            {
+                "name": mesh.name,
+                "n_runs": int(piece["run_sites"].size),
+                "n_tiles": int(piece["tile_runs"].size),
+                "is_closed": are_closed,
+            }
+            for mesh, piece in zip(meshes, pieces, strict=True)
+        ],
+    }
+    return about, {key: smallest(values) for key, values in arrays.items()}
+
+
+def _check(mesh: Mesh, n_sites: int) -> None:
+    site = mesh.photosite[mesh.triangles]
+    if (site != site[:, :1]).any():
+        raise ParameterError("solids", f"must have triangles of one photosite each, got others in {mesh.name!r}")
+    if mesh.photosite.min() < -1 or mesh.photosite.max() >= n_sites:
+        raise ParameterError("solids", f"must be of photosites 0 to {n_sites - 1:,}, got others in {mesh.name!r}")
+    colour_of_site = np.zeros((n_sites + 1, 3), np.uint8)
+    colour_of_site[mesh.photosite] = mesh.colours
+    if not np.array_equal(colour_of_site[mesh.photosite], mesh.colours):
+        raise ParameterError("solids", f"must have one colour per photosite and part, got several in {mesh.name!r}")
+
+
+def _lattice_um(meshes: Sequence[Mesh], layout: Layout, extent_um: float) -> float:
+    """Step of the lattice: fine for the smallest photosite and the thinnest part, as far as integers reach."""
+    thickness_um = np.array([high[2] - low[2] for low, high in (mesh.bounds_um for mesh in meshes)])
+    feature_um = min(float(np.sqrt(layout.area_um2.min())), float(thickness_um[thickness_um > 0.0].min(initial=np.inf)))
+    return max(extent_um / MAX_STEPS, min(extent_um / MIN_STEPS, feature_um / STEPS_PER_FEATURE))
+
+
+def _tiles(layout: Layout) -> Ints:
+    """Tile of each photosite, (n_site,), in rows over the layout's bounds."""
+    n = max(1, round(np.sqrt(layout.n_sites / SITES_PER_TILE)))
+    x_min, y_min, x_max, y_max = layout.bounds_um
+    share = (layout.centroid_um - (x_min, y_min)) / np.maximum((x_max - x_min, y_max - y_min), np.finfo(float).tiny)
+    column, row = np.clip((n * share).astype(np.int64), 0, n - 1).T
+    return row * n + column
+
+
+def _runs(mesh: Mesh, place: Ints, tile_of_site: Ints, offset: int) -> dict[str, NDArray[Any]]:
+    """Points and triangles of a surface sorted by tiles and photosites; points of one place in a photosite follow each other."""
+    site = mesh.photosite.astype(np.int64)
+    tile = np.append(tile_of_site, 0)[site]  # the last one: of no photosite
+    rank_of_site = np.empty(tile_of_site.size + 1, np.int64)
+    by_tile = np.lexsort((np.arange(tile_of_site.size + 1), np.append(tile_of_site, 0)))
+    rank_of_site[by_tile] = np.arange(by_tile.size)
+    rank = rank_of_site[site]
+    _, first, same = np.unique(rank * (int(place.max()) + 1) + place, return_index=True, return_inverse=True)
+    order = np.lexsort((first[same], rank))
+    starts = np.flatnonzero(np.diff(rank[order], prepend=-1))
+    counts = np.diff(starts, append=order.size)
+    within = np.empty(order.size, np.int64)
+    within[order] = positions_in_runs(counts)
+    rank_of_triangle = rank[mesh.triangles[:, 0]]
+    triangles = mesh.triangles[np.argsort(rank_of_triangle, kind="stable")]
+    run_of_rank = np.searchsorted(rank[order][starts], rank_of_triangle)
+    head = order[starts]
+    return {
+        "order": order + offset,
+        "run_sites": site[head] + 1,
+        "run_points": counts,
+        "run_triangles": np.bincount(run_of_rank, minlength=starts.size),
+        "run_colours": mesh.colours[head].ravel(),
+        "corners": within[triangles].ravel(),
+        "tile_runs": np.diff(np.flatnonzero(np.diff(tile[head], prepend=-1)), append=starts.size),
+    }
+
+
+def _by_first_occurrence(place: Ints) -> tuple[Ints, Ints]:
+    """Places numbered in the order in which they occur, and where each does first."""
+    n = int(place.max()) + 1
+    first = np.empty(n, np.int64)
+    first[place[::-1]] = np.arange(place.size)[::-1]  # the last one written is the first one met
+    by_first = np.argsort(first)
+    rank = np.empty(n, np.int64)
+    rank[by_first] = np.arange(n)
+    return rank[place], first[by_first]

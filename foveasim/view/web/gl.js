@@ -1,0 +1,85 @@
+// WebGL 2: what draws it here, programs from their sources, and the size of a canvas in pixels.
+
+// More pixels than this for one of CSS cost time that nobody can see.
+const MAX_PIXEL_RATIO = 2;
+
+// What draws WebGL2 here: null where nothing does, else whether it is the processor, where smooth edges cost too much.
+export function findRenderer() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) return null;
+  const details = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = details ? gl.getParameter(details.UNMASKED_RENDERER_WEBGL) : "";
+  const lose = gl.getExtension("WEBGL_lose_context");
+  if (lose) lose.loseContext();
+  return { isSlow: /swiftshader|llvmpipe|software|basic render/i.test(name) };
+}
+
+export const pixelRatio = () => Math.min(window.devicePixelRatio || 1, MAX_PIXEL_RATIO);
+
+// Gives a canvas the pixels of a size in CSS pixels; whether that changed anything.
+export function fitCanvas(canvas, width, height) {
+  const ratio = pixelRatio(), w = Math.max(1, Math.round(width * ratio)), h = Math.max(1, Math.round(height * ratio));
+  if (canvas.width === w && canvas.height === h) return false;
+  canvas.width = w;
+  canvas.height = h;
+  return true;
+}
+
+// Calls back when an element has another size, or its window another number of pixels for one of CSS.
+export function watchSize(element, onChange) {
+  new ResizeObserver(onChange).observe(element);
+  const watchRatio = () => {
+    matchMedia(`(resolution: ${window.devicePixelRatio}dppx)`).addEventListener("change", () => { watchRatio(); onChange(); }, { once: true });
+  };
+  watchRatio();
+}
+
+// A linked program and the locations of its uniforms by their names; its attributes are numbered in this order.
+export function buildProgram(gl, vertexSource, fragmentSource, attributes = []) {
+  const program = gl.createProgram();
+  attributes.forEach((name, i) => gl.bindAttribLocation(program, i, name));
+  for (const [kind, source] of [[gl.VERTEX_SHADER, vertexSource], [gl.FRAGMENT_SHADER, fragmentSource]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    gl.attachShader(program, shader);
+    gl.deleteShader(shader);
+  }
+  gl.linkProgram(program);
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
+    const logs = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader));
+    throw new Error([gl.getProgramInfoLog(program), ...logs].filter(Boolean).join(" "));
+  }
+  const at = {}, n = gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS) || 0;
+  for (let i = 0; i < n; i++) {
+    const { name } = gl.getActiveUniform(program, i);
+    at[name] = gl.getUniformLocation(program, name);
+  }
+  return { program, at };
+}
+
+// An attribute of integers by its number, for the vertex array that is bound.
+export function bindIntegers(gl, location, data, size, type) {
+  gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+  gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
+  gl.enableVertexAttribArray(location);
+  gl.vertexAttribIPointer(location, size, type, 0, 0);
+}
+
+// One colour per site, in rows of a texture that shaders read with texelFetch.
+export const TEXTURE_WIDTH = 2048;
+
+export const textureSize = (n) => TEXTURE_WIDTH * Math.max(1, Math.ceil(n / TEXTURE_WIDTH));
+
+export function createLookup(gl) {
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+  return texture;
+}
+
+// Colours as bytes r, g, b, a, for the texture that is bound.
+export function sendLookup(gl, bytes) {
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, TEXTURE_WIDTH, bytes.length / 4 / TEXTURE_WIDTH, 0, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+}

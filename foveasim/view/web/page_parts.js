@@ -1,0 +1,92 @@
+// What every page has: elements by their names, light and dark, short notices, downloads, the list of keys.
+
+export const $ = (id) => document.getElementById(id);
+
+export function make(tag, text, className) {
+  const element = document.createElement(tag);
+  if (text !== undefined) element.textContent = text;
+  if (className) element.className = className;
+  return element;
+}
+
+export const inkOf = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+// -- light and dark -------------------------------------------------------------------------------------------------------
+
+// As was chosen on some page before, else as the system; onChange is called when that changes and by the button.
+export function startTheme(onChange) {
+  const root = document.documentElement, system = matchMedia("(prefers-color-scheme: dark)");
+  let chosen = null;
+  try { chosen = localStorage.getItem("foveasim-theme"); } catch { /* not kept */ }
+  if (chosen !== "dark" && chosen !== "light") chosen = null;
+  const show = () => { root.dataset.theme = chosen || (system.matches ? "dark" : "light"); };
+  show();
+  system.addEventListener("change", () => { if (!chosen) { show(); onChange(); } });
+  $("theme").addEventListener("click", () => {
+    chosen = root.dataset.theme === "dark" ? "light" : "dark";
+    try { localStorage.setItem("foveasim-theme", chosen); } catch { /* kept for this page alone */ }
+    show();
+    onChange();
+  });
+}
+
+// -- notices, for eyes and for screen readers ---------------------------------------------------------------------------------
+
+let noticing = 0, speaking = 0;
+
+export function notice(text) {
+  $("told").textContent = text;
+  $("told").hidden = false;
+  clearTimeout(noticing);
+  noticing = setTimeout(() => { $("told").hidden = true; }, 2600);
+}
+
+// A notice that stays until it is null.
+export function stayingNotice(text) {
+  clearTimeout(noticing);
+  $("told").hidden = text === null;
+  if (text !== null) $("told").textContent = text;
+}
+
+// What a screen reader says once it has been true for a moment; null for nothing.
+export function speak(textOrNull) {
+  clearTimeout(speaking);
+  if (textOrNull) speaking = setTimeout(() => { $("live").textContent = textOrNull(); }, 300);
+}
+
+// -- files ------------------------------------------------------------------------------------------------------------------
+
+export function downloadPicture(canvas, name) {
+  canvas.toBlob((blob) => {
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(blob);
+    link.download = name.replace(/[^\p{L}\p{N}_-]+/gu, "_").slice(0, 60) + ".png";
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 5000);
+  });
+}
+
+// -- keys -------------------------------------------------------------------------------------------------------------------
+
+// Whether a key is one for the page: no text is typed, nothing is chosen, no dialog is open, no modifier is held.
+export function isForPage(event) {
+  if (event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return false;
+  return !event.target.closest("input[type='text'], select");
+}
+
+// The list of keys opens by its button and by "?", and closes by "?", Escape and a click on its outside.
+export function listenToHelp() {
+  const keys = $("keys");
+  $("help").addEventListener("click", () => keys.showModal());
+  document.addEventListener("keydown", (event) => {
+    if (event.key !== "?" || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (keys.open) keys.close();
+    else if (isForPage(event)) keys.showModal();
+    else return;
+    event.preventDefault();
+  });
+  keys.addEventListener("click", (event) => {
+    const box = keys.getBoundingClientRect(), { clientX: x, clientY: y } = event;
+    if (event.target === keys && (x < box.left || x > box.right || y < box.top || y > box.bottom)) keys.close();
+  });
+}

@@ -1,0 +1,320 @@
+// Surfaces in three dimensions by WebGL2: an image that is drawn when the view changes, ids of what is seen for picking.
+
+import { TEXTURE_WIDTH, bindIntegers, buildProgram, createLookup, fitCanvas, sendLookup, textureSize } from "./gl.js";
+
+const ATTRIBUTES = ["place", "site"];
+const VERTEX_SHADER = `#version 300 es
+precision highp float;
+in ivec3 place;
+in uint site;
+uniform ivec3 centre;
+uniform vec3 rest;
+uniform vec3 unit;
+uniform mat4 toClip;
+uniform highp sampler2D colours;
+out vec3 at;
+flat out vec3 colour;
+flat out uint owner;
+void main() {
+  // Integers subtract exactly, so that surfaces stay sharp however near one goes.
+  at = (vec3(place - centre) - rest) * unit;
+  gl_Position = toClip * vec4(at, 1.0);
+  colour = texelFetch(colours, ivec2(int(site) % ${TEXTURE_WIDTH}, int(site) / ${TEXTURE_WIDTH}), 0).rgb;
+  owner = site;
+}`;
+const SRGB = `
+vec3 toLinear(vec3 c) { return mix(c / 12.92, pow((c + 0.055) / 1.055, vec3(2.4)), step(0.04045, c)); }
+vec3 toScreen(vec3 c) { return mix(c * 12.92, 1.055 * pow(c, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c)); }`;
+// A surface seen from the front is as bright as its colour; light comes from the sky all around and from a sun.
+const IMAGE_SHADER = `#version 300 es
+precision highp float;
+in vec3 at;
+flat in vec3 colour;
+flat in uint owner;
+uniform uint pinned;
+out vec4 pixel;
+const vec3 SUN = vec3(-0.394, -0.473, 0.788);
+const vec3 FLOOR = vec3(0.32, 0.37, 0.46);
+const vec3 MARK = vec3(0.02, 0.25, 1.0);
+${SRGB}
+void main() {
+  // The plane of a triangle from its neighbours on the screen: it faces the eye, whichever way it is wound.
+  vec3 normal = normalize(cross(dFdx(at), dFdy(at)));
+  vec3 light = 0.45 * mix(FLOOR, vec3(1.0), 0.5 * normal.z + 0.5) + 0.698 * max(dot(normal, SUN), 0.0);
+  vec3 own = toLinear(colour);
+  if (pinned != 0u && owner == pinned) own = mix(own, MARK, 0.7);
+  pixel = vec4(toScreen(own * min(light, 1.0)), min(light.g, 1.0));
+}`;
+// Site plus 1 and 0 for none; part plus 1, and the depth above it.
+const ID_SHADER = `#version 300 es
+precision highp float;
+precision highp int;
+flat in uint owner;
+uniform uint part;
+out uvec2 id;
+void main() { id = uvec2(owner, part | (uint(gl_FragCoord.z * 16777215.0) << 8)); }`;
+const SCREEN_SHADER = `#version 300 es
+void main() { gl_Position = vec4(vec2(gl_VertexID == 1, gl_VertexID == 2) * 4.0 - 1.0, 0.0, 1.0); }`;
+// The image, with the hovered site lit up where the ids have it.
+const COMPOSE_SHADER = `#version 300 es
+precision highp float;
+precision highp int;
+uniform highp sampler2D image;
+uniform highp usampler2D ids;
+uniform uint hovered;
+out vec4 pixel;
+const vec3 MARK = vec3(1.0, 0.69, 0.03);
+${SRGB}
+void main() {
+  ivec2 place = ivec2(gl_FragCoord.xy);
+  vec4 seen = texelFetch(image, place, 0);
+  if (hovered != 0u && texelFetch(ids, place, 0).r == hovered) seen.rgb = toScreen(mix(toLinear(seen.rgb), MARK * seen.a, 0.7));
+  pixel = vec4(seen.rgb, 1.0);
+}`;
+// Samples of a pixel, where the graphics card is fast.
+const SAMPLES = 4;
+const MAX_PARTS = 254;
+
+export class SolidView {
+  // The canvas, Bodies, an Orbit around them, the number of sites, and findRenderer().
+  constructor(canvas, bodies, orbit, nSites, renderer) {
+    if (bodies.list.length > MAX_PARTS) throw new Error("more than " + MAX_PARTS + " parts");
+    this.canvas = canvas;
+    this.bodies = bodies;
+    this.orbit = orbit;
+    this.nSites = nSites;
+    this.wantedSamples = renderer.isSlow ? 0 : SAMPLES;
+    this.parts = bodies.list.map((body) => ({ name: body.name, nTriangles: body.nTriangles, isClosed: body.isClosed, isVisible: true, body }));
+    this.ground = [0, 0, 0];
+    this.hovered = -1;
+    this.pinned = -1;
+    // How often each was drawn.
+    this.counts = { image: 0, ids: 0, screen: 0 };
+    this.found = { site: -1, part: -1, depth: 1 };
+    this.planes = new Float64Array(24);
+    this.word = new Uint32Array(4);
+    this.gl = canvas.getContext("webgl2", { antialias: false, alpha: false, depth: false, powerPreference: "high-performance" });
+    if (!this.gl) throw new Error("WebGL2 was lost");
+    this.load();
+  }
+
+  // Everything that the graphics card holds; again after it lost its memory.
+  load() {
+    const { gl, bodies, nSites } = this;
+    // The same numbers of attributes: one vertex array serves both programs.
+    this.image = buildProgram(gl, VERTEX_SHADER, IMAGE_SHADER, ATTRIBUTES);
+    this.id = buildProgram(gl, VERTEX_SHADER, ID_SHADER, ATTRIBUTES);
+    this.screen = buildProgram(gl, SCREEN_SHADER, COMPOSE_SHADER);
+    gl.activeTexture(gl.TEXTURE0);
+    for (const part of this.parts) {
+      const { places, sites, indices, tiles } = bodies.build(part.body);
+      part.tiles = tiles;
+      part.vertices = gl.createVertexArray();
+      gl.bindVertexArray(part.vertices);
+      bindIntegers(gl, 0, places, 3, gl.INT);
+      bindIntegers(gl, 1, sites, 1, gl.UNSIGNED_INT);
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
+      part.colours = createLookup(gl);
+      const bytes = new Uint8Array(4 * textureSize(nSites + 1));
+      bodies.paint(part.body, bytes);
+      sendLookup(gl, bytes);
+    }
+    this.nothing = gl.createVertexArray();
+    gl.bindVertexArray(null);
+    this.targets = null;
+    this.isImageStale = this.areIdsStale = true;
+  }
+
+  // Buffers of the canvas's size: samples and depths, the image, ids and their depths.
+  _resizeTargets() {
+    const { gl, canvas: { width, height } } = this;
+    if (this.targets) {
+      for (const one of this.targets.buffers) gl.deleteRenderbuffer(one);
+      for (const one of this.targets.textures) gl.deleteTexture(one);
+      for (const one of this.targets.frames) gl.deleteFramebuffer(one);
+    }
+    const kinds = gl.getInternalformatParameter(gl.RENDERBUFFER, gl.RGBA8, gl.SAMPLES) || [];
+    const samples = Math.min(this.wantedSamples, kinds.length ? kinds[0] : 0);
+    const buffer = (format, n) => {
+      const made = gl.createRenderbuffer();
+      gl.bindRenderbuffer(gl.RENDERBUFFER, made);
+      gl.renderbufferStorageMultisample(gl.RENDERBUFFER, n, format, width, height);
+      return made;
+    };
+    const texture = (format) => {
+      const made = gl.createTexture();
+      gl.bindTexture(gl.TEXTURE_2D, made);
+      gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+      return made;
+    };
+    const buffers = [buffer(gl.RGBA8, samples), buffer(gl.DEPTH_COMPONENT24, samples), buffer(gl.DEPTH_COMPONENT24, 0)];
+    const textures = [texture(gl.RGBA8), texture(gl.RG32UI)];
+    const frame = (attach) => {
+      const made = gl.createFramebuffer();
+      gl.bindFramebuffer(gl.FRAMEBUFFER, made);
+      attach();
+      return made;
+    };
+    const attachBuffer = (at, one) => gl.framebufferRenderbuffer(gl.FRAMEBUFFER, at, gl.RENDERBUFFER, one);
+    const attachTexture = (one) => gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, one, 0);
+    const frames = [
+      frame(() => { attachBuffer(gl.COLOR_ATTACHMENT0, buffers[0]); attachBuffer(gl.DEPTH_ATTACHMENT, buffers[1]); }),
+      frame(() => attachTexture(textures[0])),
+      frame(() => { attachTexture(textures[1]); attachBuffer(gl.DEPTH_ATTACHMENT, buffers[2]); }),
+    ];
+    this.targets = { width, height, buffers, textures, frames };
+  }
+
+  // The view has changed: its image is drawn with the next frame, ids when something is picked.
+  change() {
+    this.isImageStale = this.areIdsStale = true;
+  }
+
+  // Only colours have changed: nothing is seen elsewhere.
+  changeColours() { this.isImageStale = true; }
+
+  resize(width, height) {
+    const isNew = fitCanvas(this.canvas, width, height);
+    this.orbit.setSize(width, height);
+    this.change();
+    return isNew;
+  }
+
+  setGround(ground) { this.ground = ground; this.changeColours(); }
+  setPinned(site) { this.pinned = site; this.changeColours(); }
+  setVisible(part, isVisible) { part.isVisible = isVisible; this.change(); }
+  setHeight(factor) { this.orbit.setHeight(factor); this.change(); }
+
+  // Draws what is out of date, and the screen.
+  draw() {
+    const { gl } = this;
+    if (gl.isContextLost()) return;
+    if (!this.targets || this.targets.width !== this.canvas.width || this.targets.height !== this.canvas.height) this._resizeTargets();
+    if (this.isImageStale) this._drawImage();
+    this.counts.screen++;
+    const { program, at } = this.screen;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.disable(gl.DEPTH_TEST);
+    gl.disable(gl.CULL_FACE);
+    gl.useProgram(program);
+    gl.activeTexture(gl.TEXTURE1);
+    gl.bindTexture(gl.TEXTURE_2D, this.targets.textures[1]);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.targets.textures[0]);
+    gl.uniform1i(at.image, 0);
+    gl.uniform1i(at.ids, 1);
+    gl.uniform1ui(at.hovered, this.areIdsStale ? 0 : this.hovered + 1);
+    gl.bindVertexArray(this.nothing);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.bindVertexArray(null);
+  }
+
+  _drawImage() {
+    const { gl, ground, targets: { frames, width, height } } = this;
+    this.isImageStale = false;
+    this.counts.image++;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frames[0]);
+    gl.clearColor(ground[0] / 255, ground[1] / 255, ground[2] / 255, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.useProgram(this.image.program);
+    gl.uniform1ui(this.image.at.pinned, this.pinned + 1);
+    this._drawParts(this.image);
+    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, frames[0]);
+    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, frames[1]);
+    gl.blitFramebuffer(0, 0, width, height, 0, 0, width, height, gl.COLOR_BUFFER_BIT, gl.NEAREST);
+  }
+
+  _drawIds() {
+    const { gl, word } = this;
+    this.areIdsStale = false;
+    this.counts.ids++;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.targets.frames[2]);
+    gl.clearBufferuiv(gl.COLOR, 0, word.fill(0));
+    gl.clear(gl.DEPTH_BUFFER_BIT);
+    gl.useProgram(this.id.program);
+    this._drawParts(this.id);
+  }
+
+  // All visible parts by a program that is in use: no tile that is out of view, no face that is turned away.
+  _drawParts({ at }) {
+    const { gl, orbit, bodies: { lattice, origin }, targets: { width, height } } = this, { target, distance } = orbit;
+    const cx = (target[0] - origin[0]) / lattice, cy = (target[1] - origin[1]) / lattice, cz = (target[2] / orbit.height - origin[2]) / lattice;
+    const wx = Math.round(cx), wy = Math.round(cy), wz = Math.round(cz), unit = lattice / distance;
+    gl.viewport(0, 0, width, height);
+    gl.enable(gl.DEPTH_TEST);
+    gl.cullFace(gl.BACK);
+    gl.uniform3i(at.centre, wx, wy, wz);
+    gl.uniform3f(at.rest, cx - wx, cy - wy, cz - wz);
+    gl.uniform3f(at.unit, unit, unit, unit * orbit.height);
+    gl.uniformMatrix4fv(at.toClip, false, orbit.toClip);
+    this._findPlanes(cx, cy, cz, unit);
+    // What is open below shows its inside to an eye below, and only there.
+    const isAbove = target[2] + distance * orbit.toEye[2] >= orbit.low(2);
+    gl.activeTexture(gl.TEXTURE0);
+    for (let k = 0; k < this.parts.length; k++) {
+      const part = this.parts[k], { tiles } = part;
+      if (!part.isVisible) continue;
+      if (part.isClosed || isAbove) gl.enable(gl.CULL_FACE);
+      else gl.disable(gl.CULL_FACE);
+      if (at.part !== undefined) gl.uniform1ui(at.part, k + 1);
+      gl.bindTexture(gl.TEXTURE_2D, part.colours);
+      gl.bindVertexArray(part.vertices);
+      let from = -1, to = -1;
+      for (let i = 0; i < tiles.length; i++) {
+        const tile = tiles[i];
+        if (!this._isInView(tile.box)) continue;
+        if (tile.from !== to) {
+          if (to > from) gl.drawElements(gl.TRIANGLES, to - from, gl.UNSIGNED_INT, 4 * from);
+          from = tile.from;
+        }
+        to = tile.to;
+      }
+      if (to > from) gl.drawElements(gl.TRIANGLES, to - from, gl.UNSIGNED_INT, 4 * from);
+    }
+    gl.bindVertexArray(null);
+  }
+
+  // The six planes of the view, for boxes on the lattice: a x + b y + c z + d is at least 0 within each.
+  _findPlanes(cx, cy, cz, unit) {
+    const { planes, orbit: { toClip: m, height } } = this;
+    for (let k = 0; k < 6; k++) {
+      const row = k >> 1, sign = k & 1 ? -1 : 1, at = 4 * k;
+      planes[at] = (m[3] + sign * m[row]) * unit;
+      planes[at + 1] = (m[7] + sign * m[4 + row]) * unit;
+      planes[at + 2] = (m[11] + sign * m[8 + row]) * unit * height;
+      planes[at + 3] = m[15] + sign * m[12 + row] - planes[at] * cx - planes[at + 1] * cy - planes[at + 2] * cz;
+    }
+  }
+
+  _isInView(box) {
+    const { planes } = this;
+    for (let at = 0; at < 24; at += 4) {
+      const a = planes[at], b = planes[at + 1], c = planes[at + 2];
+      if (a * box[a > 0 ? 3 : 0] + b * box[b > 0 ? 4 : 1] + c * box[c > 0 ? 5 : 2] + planes[at + 3] < 0) return false;
+    }
+    return true;
+  }
+
+  // What is seen at a pixel of the view: the site and the part, -1 for none, and the depth for Orbit.pointAt.
+  pick(px, py) {
+    const { gl, found, word, canvas, orbit } = this;
+    found.site = found.part = -1;
+    found.depth = 1;
+    if (gl.isContextLost() || !(px >= 0 && py >= 0 && px < orbit.width && py < orbit.tall)) return found;
+    if (!this.targets || this.targets.width !== canvas.width || this.targets.height !== canvas.height) this._resizeTargets();
+    if (this.areIdsStale) this._drawIds();
+    const x = Math.floor((px * canvas.width) / orbit.width), y = canvas.height - 1 - Math.floor((py * canvas.height) / orbit.tall);
+    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, this.targets.frames[2]);
+    gl.readPixels(x, y, 1, 1, gl.RGBA_INTEGER, gl.UNSIGNED_INT, word);
+    const part = (word[1] & 255) - 1;
+    if (part < 0) return found;
+    found.site = word[0] - 1;
+    found.part = part;
+    found.depth = orbit.depthOf((word[1] >>> 8) / 16777215);
+    return found;
+  }
+}
