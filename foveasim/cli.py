@@ -172,7 +172,7 @@ def view(
         typer.Argument(help="A layout's file or name, a capture (.npz), or a report of check (.lyrdb, with --layout)."),
     ],
     web: Annotated[Path | None, typer.Option("--web", help="Write the page to this .html file.")] = None,
-    serve: Annotated[bool, typer.Option("--serve", help="Hand the page out on this computer until Ctrl-C.")] = False,
+    serve: Annotated[bool, typer.Option("--serve", help="Serve the page on localhost until Ctrl-C.")] = False,
     port: Annotated[int, typer.Option("--port", help="Port of --serve; 0 for any that is free.")] = 0,
     layout: Annotated[Path | None, typer.Option("--layout", help="The layout that a report is of.")] = None,
     rules: Annotated[
@@ -189,7 +189,7 @@ def view(
     from foveasim.view.web import check_page_path, open_page, serve_page, solid_page, web_page
 
     if web is not None and serve:
-        _end("error: --web writes a file and --serve hands the page out: take one of them", BAD_INPUT)
+        _end("error: --web writes a file and --serve serves the page: take one of them", BAD_INPUT)
     if port and not serve:
         _end("error: --port belongs to --serve", BAD_INPUT)
     if web is not None:

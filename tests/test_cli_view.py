@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import os
 import re
 import signal
+import socket
+import struct
 import subprocess
 import sys
+import time
 import urllib.error
 import urllib.request
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -174,3 +179,148 @@ def test_without_a_choice_the_page_goes_to_a_browser_or_is_told_of(tmp_path, mon
 def test_a_port_that_is_none_is_refused():
     with pytest.raises(ParameterError, match="'port' must be >= 0"):
         serve_page("", port=-1, tell=print)
+
+
+# -- connections as they come ---------------------------------------------------------------------------------------------------
+
+#: More than the buffers of both ends hold.
+BIG_BYTES = 20_000_000
+SERVER = f"""
+from foveasim.view.web import _serve
+_serve.PATIENCE_S = {{patience_s}}
+_serve.serve_page("x" * {BIG_BYTES}, tell=lambda address: print(address, flush=True))
+"""
+
+
+@pytest.fixture
+def serve():
+    """Start servers in processes of their own; in the end each stops by Ctrl-C with exit code 0 and has printed nothing."""
+    servers = []
+
+    def start(patience_s=60.0):
+        code = SERVER.format(patience_s=patience_s)
+        server = subprocess.Popen(
+            [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        servers.append(server)
+        return int(server.stdout.readline().rsplit(":", 1)[1].strip().strip("/")), server
+
+    yield start
+    endings = []
+    for server in servers:
+        server.send_signal(signal.SIGINT)
+        try:
+            endings.append((*server.communicate(timeout=30), server.returncode))
+        finally:
+            server.kill()
+    assert endings == [("", "", 0)] * len(servers)
+
+
+def connect(port, text="", host="127.0.0.1"):
+    connection = socket.create_connection((host, port), timeout=30)
+    connection.sendall(text.encode())
+    return connection
+
+
+def ask(port, host=None, first="GET / HTTP/1.1", more=""):
+    """All that a server answers to one request."""
+    with connect(port, f"{first}\r\nHost: {host or f'127.0.0.1:{port}'}\r\n{more}\r\n") as connection:
+        return b"".join(iter(lambda: connection.recv(1 << 16), b""))
+
+
+def test_served_page_survives_clients_that_reset(serve):
+    port, _ = serve()
+    for n_bytes in (0, 1, 100_000):
+        for _ in range(5):
+            connection = connect(port, f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n")
+            if n_bytes:
+                connection.recv(n_bytes)
+            # Close with a reset instead of an orderly end.
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            connection.close()
+    head, _, body = ask(port).partition(b"\r\n\r\n")
+
+    assert head.startswith(b"HTTP/1.1 200 OK\r\n")
+    assert len(body) == BIG_BYTES
+
+
+def test_half_sent_requests_are_dropped_after_a_while(serve):
+    port, _ = serve(patience_s=0.3)
+    with contextlib.ExitStack() as stack:
+        halves = [stack.enter_context(connect(port, text)) for text in ("", "GET / HTTP", "GET / HTTP/1.1\r\nHost: x\r\n")]
+        for half in halves:
+            with contextlib.suppress(ConnectionResetError):
+                assert half.recv(1) == b""
+        # A client that takes nothing is dropped too, before all of the page is sent.
+        idle = stack.enter_context(connect(port, f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n"))
+        wait_until(lambda: n_connections(port) == 0)
+        got = 0
+        with contextlib.suppress(ConnectionResetError):
+            while piece := idle.recv(1 << 20):
+                got += len(piece)
+        assert got < BIG_BYTES
+
+
+def n_connections(port):
+    """Connections of a server, as the system counts them."""
+    lines = Path("/proc/net/tcp").read_text(encoding="ascii").splitlines()[1:]
+    return sum(line.split()[1] == f"0100007F:{port:04X}" and line.split()[3] == "01" for line in lines)
+
+
+def wait_until(condition):
+    for _ in range(600):
+        if condition():
+            return
+        time.sleep(0.05)
+    pytest.fail("waited in vain")
+
+
+def test_idle_connections_leave_the_page_served(serve):
+    port, server = serve()
+    with contextlib.ExitStack() as stack:
+        idle = [stack.enter_context(connect(port, "GET /" * (i % 2))) for i in range(100)]
+        assert ask(port).startswith(b"HTTP/1.1 200 OK\r\n")
+        assert len(list(Path(f"/proc/{server.pid}/task").iterdir())) < 20
+        idle += [stack.enter_context(connect(port)) for _ in range(40)]
+        assert ask(port).startswith(b"HTTP/1.1 503 Service Unavailable\r\n")
+        for connection in idle[:60]:
+            connection.close()
+        wait_until(lambda: ask(port).startswith(b"HTTP/1.1 200 OK\r\n"))
+
+
+REQUESTS = [
+    ({"host": "stranger.example"}, b"403"),
+    ({"host": "127.0.0.1"}, b"403"),
+    ({"host": "127.0.0.1:1"}, b"403"),
+    ({"more": "Host: stranger.example\r\n"}, b"400"),
+    ({"first": "GET / HTTP/1.1\r\nhost: stranger.example"}, b"400"),
+    ({"first": "nonsense"}, b"400"),
+    ({"first": "GET /layout.npz HTTP/1.1"}, b"404"),
+    ({"first": "POST / HTTP/1.1"}, b"405"),
+    ({"more": f"X: {'x' * 20_000}\r\n"}, b"431"),
+    ({"first": "HEAD / HTTP/1.1"}, b"200"),
+]
+
+
+def test_served_page_answers_one_request_alone(serve):
+    port, _ = serve()
+    for request, status in REQUESTS:
+        answer = ask(port, **request)
+        assert answer.split(b" ", 2)[1] == status, request
+        assert len(answer) < 1000
+    assert ask(port, f"LOCALHOST:{port}").startswith(b"HTTP/1.1 200")
+
+
+def test_served_page_listens_on_one_address(serve):
+    port, _ = serve()
+    # All of 127.0.0.0/8 leads to this computer; a server of all addresses would answer.
+    with pytest.raises(ConnectionRefusedError):
+        connect(port, host="127.0.0.2")
+
+
+def test_ctrl_c_ends_a_server_with_open_connections(serve):
+    port, server = serve()
+    with connect(port), connect(port, f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n") as reading:
+        reading.recv(10)
+        server.send_signal(signal.SIGINT)
+        assert server.wait(timeout=30) == 0

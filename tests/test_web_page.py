@@ -8,6 +8,7 @@ import itertools
 import json
 import re
 import shutil
+import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from importlib.resources import files
@@ -15,15 +16,18 @@ from importlib.resources import files
 import numpy as np
 import pytest
 import shapely
+import shapely.affinity
 from matplotlib import colormaps
+from reference.ray_casting import first_hits, rays_of
 
 import foveasim as fs
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout.lyrdb import read_lyrdb
 from foveasim.pictures import read_picture
 from foveasim.records import described
-from foveasim.view import SensorStack, site_at, solid_page, solids, web_page, write_solid_page, write_web_page
+from foveasim.view import SensorStack, prisms, site_at, solid_page, solids, web_page, write_solid_page, write_web_page
 from foveasim.view.palette import FILTER_COLOURS
+from foveasim.view.web._bodies import bodies_of
 from foveasim.view.web._content import content_of
 from foveasim.view.web._pack import back_references, packed, smallest
 from foveasim.view.web._shapes import shapes_of
@@ -833,9 +837,593 @@ def test_a_page_of_solids_asks_for_nothing_outside_of_it_and_needs_a_right_endin
         write_solid_page(MOSAIC, tmp_path / "solid.glb")
 
 
-def test_bundled_libraries_come_with_their_licences():
-    folder = files("foveasim.view.web") / "three"
-    told = (folder / "versions.txt").read_text()
-    for library in ("three", "three-mesh-bvh"):
-        assert re.search(rf"^  {library} +\d+\.\d+\.\d+ +MIT, LICENSE\.{library}$", told, re.MULTILINE)
-        assert "MIT" in (folder / f"LICENSE.{library}").read_text()
+# -- three dimensions: what is packed ------------------------------------------------------------------------------------------
+
+
+def surfaces_of(about, arrays):
+    """Surfaces as the page makes them, in plain loops: name, corners (n, 3, 3) in µm, sites and colours of triangles."""
+    x, y = np.cumsum(arrays["place_x"], dtype=np.int64), np.cumsum(arrays["place_y"], dtype=np.int64)
+    place, seen = [], 0
+    for back in arrays["places"].tolist():
+        place.append(seen if back == 0 else seen - back)
+        seen += back == 0
+    points_um = np.array(about["origin_um"]) + about["lattice_um"] * np.column_stack((x[place], y[place], arrays["z"]))
+    runs = list(zip(*(arrays[f"run_{key}"].tolist() for key in ("sites", "points", "triangles")), strict=True))
+    colours = arrays["run_colours"].reshape(-1, 3)
+    tiles = arrays["tile_runs"].tolist()
+    run = first = corner = tile = 0
+    for body in about["list"]:
+        assert sum(tiles[tile : tile + body["n_tiles"]]) == body["n_runs"]
+        tile += body["n_tiles"]
+        triangles, sites, rgb = [], [], []
+        for _ in range(body["n_runs"]):
+            site, n_points, n_triangles = runs[run]
+            local = arrays["corners"][corner : corner + 3 * n_triangles].reshape(-1, 3).astype(int)
+            triangles.append(points_um[first + local])
+            sites += [site - 1] * n_triangles
+            rgb += [colours[run]] * n_triangles
+            run, first, corner = run + 1, first + n_points, corner + 3 * n_triangles
+        yield body["name"], np.concatenate(triangles), np.array(sites), np.array(rgb)
+
+
+def in_one_order(triangles_um, sites, *more):
+    """Triangles from their lowest corner on, sorted by sites and places: equal for equal surfaces."""
+    rounded = np.round(triangles_um, 3)
+    start = [min(range(3), key=lambda k: tuple(corners[k])) for corners in rounded]
+    turned = np.array([np.roll(corners, -k, axis=0) for corners, k in zip(triangles_um, start, strict=True)])
+    order = np.lexsort((*np.round(turned, 3).reshape(-1, 9).T, sites))
+    return turned[order], *(values[order] for values in (sites, *more))
+
+
+BIG = fs.layout.mosaic(fs.layout.grid(n_x=90, n_y=70, pitch_um=2.0), ("RG", "GB"))
+
+
+@pytest.mark.parametrize(
+    ("layout", "meshes", "n_tiles"),
+    [
+        (ZOO, (prisms(ZOO, np.arange(10.0)),), 1),
+        (MOSAIC, solids(MOSAIC, SensorStack(trench_width_um=0.3)).meshes, 1),
+        (MOSAIC, solids(MOSAIC, SensorStack(trench_width_um=0.3, n_lens_corners=12)).cut().meshes, 1),
+        (BIG, (prisms(BIG, np.arange(6300.0)),), 4),
+    ],
+    ids=["notches and holes", "stack", "stack cut open", "tiles"],
+)
+def test_packed_surfaces_return_every_triangle(layout, meshes, n_tiles):
+    about, arrays = bodies_of(meshes, layout, are_closed=True)
+    for mesh, (name, triangles_um, sites, rgb) in zip(meshes, surfaces_of(about, arrays), strict=True):
+        corners = mesh.triangles
+        expected = in_one_order(mesh.points_um[corners], mesh.photosite[corners[:, 0]], mesh.colours[corners[:, 0]])
+        found = in_one_order(triangles_um, sites, rgb)
+
+        assert name == mesh.name
+        assert np.abs(found[0] - expected[0]).max() <= 0.51 * about["lattice_um"]
+        assert np.array_equal(found[1], expected[1])
+        assert np.array_equal(found[2], expected[2])
+    assert {body["n_tiles"] for body in about["list"]} == {n_tiles}
+    assert about["lattice_um"] <= 0.001
+
+
+def test_surfaces_that_no_page_can_show_are_named():
+    (mesh,) = solids(MOSAIC, SensorStack(trench_width_um=0.0, filter_thickness_um=0.0, lens_height_um=0.0)).meshes
+    spotted, crossing = mesh.colours.copy(), mesh.triangles.copy()
+    spotted[5] = 1, 2, 3
+    crossing[0, 2] = mesh.points_um.shape[0] - 1
+    for changed, message in (
+        (replace(mesh, colours=spotted), "must have one colour per photosite and part, got several in 'wells'"),
+        (replace(mesh, triangles=crossing), "must have triangles of one photosite each, got others in 'wells'"),
+        (replace(mesh, photosite=mesh.photosite + 1), "must be of photosites 0 to 119, got others in 'wells'"),
+    ):
+        with pytest.raises(ParameterError, match=message):
+            bodies_of([changed], MOSAIC, are_closed=True)
+    with pytest.raises(GeometryError, match="must have at least one triangle"):
+        bodies_of([replace(mesh, triangles=mesh.triangles[:0])], MOSAIC, are_closed=True)
+
+
+def test_solid_page_needs_no_trimesh(monkeypatch):
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    monkeypatch.setitem(sys.modules, "manifold3d", None)
+
+    assert len(solid_page(MOSAIC)) < 150_000
+    assert len(solid_page(CAPTURE)) < 150_000
+
+
+def test_scripts_are_source_text_of_this_package():
+    """Nothing minified, nothing of other people's: modules that are read, and written, line by line."""
+    web = files("foveasim.view.web")
+    names = sorted(path.name for path in web.iterdir() if not path.name.startswith("__"))
+    scripts = [name for name in names if name.endswith(".js")]
+
+    assert {name.rsplit(".")[-1] for name in names} == {"py", "js", "css", "html"}
+    for name in scripts:
+        text = (web / name).read_text(encoding="utf-8")
+        assert len(text) < 50_000
+        assert max(map(len, text.splitlines())) < 250
+        assert not re.search(r"licen[sc]e|copyright|@preserve", text, re.IGNORECASE)
+
+
+# -- three dimensions in a browser ------------------------------------------------------------------------------------------------
+
+HEXAGONS = fs.layout.hexagonal(n_columns=7, n_rows=6, pitch_um=3.0)
+#: Every other hexagon with a hole, a slot or a notch.
+ODD = fs.Layout.from_polygons([
+    polygon.difference(
+        (
+            polygon.centroid.buffer(0.7, quad_segs=4),
+            shapely.affinity.translate(shapely.box(-0.3, -3.0, 0.3, 0.2), polygon.centroid.x, polygon.centroid.y),
+            shapely.affinity.translate(
+                shapely.Polygon([(-3, -0.8), (0, 0), (-3, 0.8)]), polygon.centroid.x, polygon.centroid.y
+            ),
+            shapely.Polygon(),
+        )[i % 4]
+    )
+    for i, polygon in enumerate(HEXAGONS.polygons())
+])  # fmt: skip
+RINGS = fs.layout.log_polar(n_sectors=24, r_min_um=20.0, r_max_um=60.0, stagger=True)
+STACK = solids(MOSAIC, SensorStack(well_depth_um=4.0, trench_width_um=0.5, filter_thickness_um=1.5, lens_height_um=0.0))
+
+
+def columns_of(layout):
+    """A page of columns of many heights, and the same as prisms for rays: name, polygons, sites, floors, roofs."""
+    capture = capture_of(layout, filters=("all",) * (int(layout.channel.max()) + 1))
+    x0, y0, x1, y1 = layout.bounds_um
+    roofs_um = 0.15 * max(x1 - x0, y1 - y0) * capture.code / capture.code.max()
+    return solid_page(capture), [("columns", layout.polygons(), np.zeros(layout.n_sites), roofs_um)], False
+
+
+def stack_prisms():
+    wells = fs.layout.inset(MOSAIC, 0.25).polygons()
+    ground = MOSAIC.polygons()
+    n = MOSAIC.n_sites
+    return solid_page(MOSAIC, solids=STACK), [
+        ("wells", wells, np.full(n, -4.0), np.zeros(n)),
+        ("trenches", shapely.difference(ground, wells), np.full(n, -4.0), np.zeros(n)),
+        ("filters", ground, np.zeros(n), np.full(n, 1.5)),
+    ], True
+
+
+def rest(page):
+    """Wait until nothing is drawn any more."""
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => requestAnimationFrame(done))))")  # fmt: skip
+
+
+def press(page, *keys):
+    page.focus("#solid")
+    for key in keys:
+        page.keyboard.press(key)
+
+
+def drag(page, dx, dy, button="left"):
+    page.mouse.move(420, 430)
+    page.mouse.down(button=button)
+    page.mouse.move(420 + dx, 430 + dy, steps=4)
+    page.mouse.up(button=button)
+
+
+VIEWS = {
+    "aside": lambda _: None,
+    "above": lambda page: press(page, "t"),
+    "turned, near, moved": lambda page: (drag(page, 190, -60), press(page, "+", "+", "+", "Shift+ArrowLeft")),
+    "low, twice as high": lambda page: (press(page, *["ArrowDown"] * 5), page.fill("#height", "1")),
+    "below": lambda page: press(page, *["ArrowDown"] * 14),
+    "inside": lambda page: press(page, *["+"] * 9),
+}
+
+
+@pytest.mark.needs("chromium")
+@pytest.mark.parametrize(
+    "made",
+    [lambda: columns_of(ZOO), lambda: columns_of(ODD), lambda: columns_of(RINGS), stack_prisms],
+    ids=["notches and holes", "hexagons", "log-polar", "stack"],
+)
+def test_picks_equal_rays_through_prisms(visit, made):
+    text, parts, has_floor = made()
+    page = visit(text)
+    box = page.locator("#solid").bounding_box()
+    rng = np.random.default_rng(5)
+    for name, go in VIEWS.items():
+        page.focus("#solid")
+        page.keyboard.press("0")
+        page.fill("#height", "0")
+        go(page)
+        camera = page.evaluate("foveasim.camera")
+        pixels = np.floor(rng.uniform((0, 0), (int(box["width"]), int(box["height"])), (250, 2))) + 0.5
+        found = page.evaluate(
+            "points => points.map(([x, y]) => foveasim.pick(x, y))", (pixels + (box["x"], box["y"])).tolist()
+        )
+        # Where all of a pixel shows one site, and no other is as near; rounding decides on the borders of all others.
+        around = [pixels + offset for offset in ((0, 0), (0.6, 0.6), (-0.6, 0.6), (0.6, -0.6), (-0.6, -0.6))]
+        rays = rays_of(camera, box["width"], box["height"], np.concatenate(around))
+        hits = np.concatenate([
+            first_hits(polygons, floors * camera["height"], roofs * camera["height"], camera["eye"], rays, has_floor=has_floor)
+            for _, polygons, floors, roofs in parts
+        ], axis=1)  # fmt: skip
+        hits[hits < 0.01 * camera["distance"]] = np.inf  # nearer than what is drawn
+        order = np.argsort(hits, axis=1)
+        first, second = np.take_along_axis(hits, order[:, :2], axis=1).T
+        which = np.where(np.isfinite(first), order[:, 0], -1).reshape(5, -1)
+        with np.errstate(invalid="ignore"):
+            is_clear = (np.where(np.isfinite(first), second - first, 1.0) > 1e-4 * camera["distance"]).reshape(5, -1).all(axis=0)
+        is_clear &= (which == which[0]).all(axis=0)
+        n_sites = len(parts[0][1])
+        expected = [
+            {"site": int(k) % n_sites, "part": parts[int(k) // n_sites][0]} if k >= 0 else {"site": -1, "part": None}
+            for k in which[0]
+        ]
+        wrong = [
+            (name, tuple(pixels[i]), found[i], expected[i])
+            for i in np.flatnonzero(is_clear)
+            if found[i] != expected[i]
+        ]
+
+        assert wrong == []
+        assert is_clear.sum() > 100
+        assert (which[0][is_clear] >= 0).sum() > 25
+
+
+@pytest.mark.needs("chromium")
+def test_gestures_change_the_view_and_nothing_else(visit):
+    page = visit(solid_page(CAPTURE))
+    page.mouse.click(440, 470)
+    pinned = page.evaluate("foveasim.pinned")
+    assert pinned >= 0
+    state = (
+        "() => [foveasim.pinned, foveasim.parts, foveasim.camera.height, document.getElementById('height').value,"
+        " [...document.querySelectorAll('#parts input')].map((box) => box.checked), document.documentElement.dataset.theme,"
+        " document.getElementById('values').textContent]"
+    )
+    page.mouse.move(600, 300)
+    rest(page)
+    page.mouse.move(3, 3)
+    rest(page)
+    before = page.evaluate(state)
+
+    def view():
+        camera = page.evaluate("foveasim.camera")
+        arm = np.array(camera["eye"]) - camera["target"]
+        return np.array(camera["target"]), arm / np.linalg.norm(arm), np.linalg.norm(arm)
+
+    turns = {
+        "drag": lambda: drag(page, 80, 30), "left": lambda: press(page, "ArrowLeft"), "up": lambda: press(page, "ArrowUp"),
+    }  # fmt: skip
+    moves = {
+        "right button": lambda: drag(page, 40, 25, "right"),
+        "shift": lambda: (page.keyboard.down("Shift"), drag(page, -30, 20), page.keyboard.up("Shift")),
+        "keys": lambda: press(page, "Shift+ArrowRight", "Shift+ArrowUp"),
+    }
+    zooms = {
+        "wheel": lambda: (page.mouse.move(300, 460), page.mouse.wheel(0, -240)),
+        "plus": lambda: press(page, "+"),
+        "minus": lambda: press(page, "-"),
+        "middle button": lambda: drag(page, 0, 60, "middle"),
+        "buttons": lambda: page.click("#nearer"),
+    }
+    for kind, gestures in (("turn", turns), ("move", moves), ("zoom", zooms)):
+        for name, gesture in gestures.items():
+            target, direction, distance = view()
+            gesture()
+            rest(page)
+            new_target, new_direction, new_distance = view()
+
+            assert (np.abs(new_direction - direction).max() > 0.01) == (kind == "turn"), name
+            assert (abs(new_distance / distance - 1) > 0.01) == (kind == "zoom"), name
+            if kind != "zoom":
+                assert (np.abs(new_target - target).max() > 0.1) == (kind == "move"), name
+            page.mouse.move(3, 3)
+            rest(page)
+            assert page.evaluate(state) == before, name
+    press(page, "0")
+    assert page.evaluate(state) == before
+
+
+@pytest.mark.needs("chromium")
+def test_two_fingers_zoom_and_one_turns_the_solids(visit):
+    page = visit(solid_page(CAPTURE), has_touch=True)
+    fingers = page.context.new_cdp_session(page)
+
+    def touch(kind, *places):
+        points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(places)]
+        fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    before = page.evaluate("foveasim.camera")
+    touch("touchStart", (390, 400), (450, 400))
+    for half in range(40, 101, 10):
+        touch("touchMove", (420 - half, 400), (420 + half, 400))
+    touch("touchEnd")
+    after = page.evaluate("foveasim.camera")
+    assert before["distance"] / after["distance"] == pytest.approx(100 / 30, rel=0.25)
+    touch("touchStart", (400, 400))
+    for x in range(410, 500, 10):
+        touch("touchMove", (x, 400))
+    touch("touchEnd")
+    turned = page.evaluate("foveasim.camera")
+    assert turned["target"] == after["target"]
+    assert turned["distance"] == pytest.approx(after["distance"])
+    assert turned["eye"] != after["eye"]
+
+
+@pytest.mark.needs("chromium")
+def test_ids_are_drawn_once_per_view(visit):
+    page = visit(solid_page(CAPTURE))
+    page.mouse.move(300, 400)
+    rest(page)
+    before = page.evaluate("foveasim.counts")
+    for x in range(300, 560, 13):
+        page.mouse.move(x, 420)
+        rest(page)
+    after = page.evaluate("foveasim.counts")
+    assert after["screen"] > before["screen"] + 5
+    assert (after["ids"], after["image"]) == (before["ids"], before["image"])
+
+    page.click("#theme")
+    page.mouse.move(420, 420)
+    rest(page)
+    dark = page.evaluate("foveasim.counts")
+    assert (dark["ids"], dark["image"]) == (after["ids"], after["image"] + 1)
+    for step in range(5):
+        page.mouse.wheel(0, -40)
+        rest(page)
+        now = page.evaluate("foveasim.counts")
+        assert now["image"] == dark["image"] + step + 1
+        assert now["ids"] <= dark["ids"] + step + 1
+    page.mouse.move(3, 3)
+    rest(page)
+    before = page.evaluate("foveasim.counts")
+    drag(page, 50, 50)
+    page.mouse.move(3, 3)
+    rest(page)
+    # Nothing is drawn while nothing happens.
+    quiet = page.evaluate("foveasim.counts")
+    assert quiet["image"] > before["image"]
+    assert quiet["ids"] <= before["ids"] + 2
+    rest(page)
+    assert page.evaluate("foveasim.counts") == quiet
+
+
+@pytest.mark.needs("chromium")
+def test_wheel_approaches_the_surface_under_the_mouse(visit):
+    page = visit(solid_page(CAPTURE))
+    site = int(CAPTURE.code.argmax())
+    x0, y0, x1, y1 = MOSAIC.bounds_um
+    top = [*MOSAIC.centroid_um[site], 0.15 * max(x1 - x0, y1 - y0)]
+    place = page.evaluate("(p) => foveasim.toWindow(...p)", top)
+    page.mouse.move(*place)
+    until(page, "site => foveasim.hovered === site", site)
+    before = page.evaluate("foveasim.camera.distance")
+    for _ in range(6):
+        page.mouse.wheel(0, -200)
+    until(page, "before => foveasim.camera.distance < 0.12 * before", before)
+
+    assert page.evaluate("(p) => foveasim.toWindow(...p)", top) == pytest.approx(place, abs=1.0)
+    assert page.evaluate("(p) => foveasim.pick(...p)", place)["site"] == site
+
+
+@pytest.mark.needs("chromium")
+def test_solids_stay_sharp_however_near_one_goes(visit):
+    """Two sites of micrometres on a sensor of ten millimetres, from as near as one can go."""
+    layout = fs.Layout.from_polygons(
+        [shapely.box(0, 0, 3, 10), shapely.box(3, 0, 6, 10), shapely.box(9_000, 9_000, 10_000, 10_000)],
+        channel=[0, 1, 2],
+    )
+    flat = SensorStack(trench_width_um=0.0, filter_thickness_um=0.0, lens_height_um=0.0)
+    page = visit(solid_page(layout, solids=solids(layout, flat)))
+    press(page, "t")
+    for _ in range(60):
+        page.mouse.move(*page.evaluate("foveasim.toWindow(3, 5, 0)"))
+        page.mouse.wheel(0, -400)
+        rest(page)
+    x, y = page.evaluate("foveasim.toWindow(3, 5, 0)")
+    scale = page.evaluate("foveasim.toWindow(4, 5, 0)")[0] - x
+
+    assert scale > 200  # pixels per µm
+    for side, site in ((-3, 0), (3, 1)):
+        assert page.evaluate("(p) => foveasim.pick(...p)", [x + side, y]) == {"site": site, "part": "wells"}
+
+
+@pytest.mark.needs("chromium")
+def test_click_and_enter_pin_a_site_of_the_solids(visit):
+    page = visit(solid_page(CAPTURE))
+    press(page, "t")
+    rest(page)
+    page.mouse.click(*page.evaluate("(p) => foveasim.toWindow(...p)", [*MOSAIC.centroid_um[41], 0.0]))
+    assert page.evaluate("foveasim.pinned") == 41
+    page.mouse.move(3, 3)
+    until(page, "foveasim.hovered === -1")
+    assert page.inner_text("#site-heading") == "Photosite 41 (columns, pinned)"
+    assert row(page, "code") == f"{CAPTURE.code[41]:,} DN"
+    press(page, "Escape")
+    assert page.evaluate("foveasim.pinned") == -1
+    press(page, "Enter")
+    pinned = page.evaluate("foveasim.pinned")
+    assert page.evaluate("foveasim.camera.target")[:2] == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert shapely.distance(MOSAIC.polygons()[pinned], shapely.Point(0.0, 0.0)) < 0.1
+    until(page, "document.getElementById('live').textContent !== ''")
+    assert page.inner_text("#live").startswith(f"Photosite {pinned}: code {CAPTURE.code[pinned]:,} DN")
+    page.click("#unpin")
+    assert page.evaluate("foveasim.pinned") == -1
+
+
+@pytest.mark.needs("chromium")
+@pytest.mark.parametrize("make", [web_page, solid_page])
+def test_question_mark_lists_the_keys(visit, make):
+    page = visit(make(CAPTURE))
+    canvas = "#marks" if make is web_page else "#solid"
+    is_open = "document.getElementById('keys').open"
+    for close in ("Escape", "?"):
+        page.focus(canvas)
+        assert not page.evaluate(is_open)
+        page.keyboard.press("?")
+        assert page.evaluate(is_open)
+        assert page.locator("#keys").get_by_text("?", exact=True).is_visible()
+        # Keys of the page rest meanwhile.
+        before = page.screenshot()
+        for key in ("+", "t", "0", "-"):
+            page.keyboard.press(key)
+        assert page.screenshot() == before
+        page.keyboard.press(close)
+        assert not page.evaluate(is_open)
+    if make is web_page:
+        page.focus("#find-site")
+        page.keyboard.type("?")
+        assert page.input_value("#find-site") == "?"
+        assert not page.evaluate(is_open)
+    page.click("#help")
+    assert page.evaluate(is_open)
+    page.mouse.click(5, 5)
+    assert not page.evaluate(is_open)
+
+
+@pytest.mark.needs("chromium")
+@pytest.mark.parametrize("make", [web_page, solid_page])
+def test_lost_graphics_come_back(visit, make):
+    page = visit(make(CAPTURE))
+    page.evaluate("foveasim.draw && foveasim.draw()")
+    rest(page)
+    before = page.screenshot()
+    canvas = "#cells" if make is web_page else "#solid"
+    page.evaluate(
+        "name => { window.losing = document.querySelector(name).getContext('webgl2').getExtension('WEBGL_lose_context');"
+        " losing.loseContext(); }",
+        canvas,
+    )
+    until(page, "!document.getElementById('told').hidden")
+    assert "has lost" in page.inner_text("#told")
+    page.mouse.move(300, 300)
+    page.mouse.wheel(0, -100)
+    page.mouse.wheel(0, 100)
+    page.mouse.move(3, 3)
+    page.evaluate("losing.restoreContext()")
+    until(page, "document.getElementById('told').hidden")
+    rest(page)
+    if make is solid_page:
+        press(page, "0")
+        rest(page)
+        page.evaluate("document.activeElement.blur()")
+        site = page.evaluate("(p) => foveasim.pick(...foveasim.toWindow(...p))", [*MOSAIC.centroid_um[0], 0.1])["site"]
+        assert site >= 0
+    else:
+        page.click("#fit")
+        page.evaluate("document.activeElement.blur()")
+        page.mouse.move(3, 3)
+        rest(page)
+    rest(page)
+    assert_alike(page.screenshot(), before)
+
+
+def assert_alike(one, other):
+    """Two screenshots differ in few pixels: where a cursor blinks, or a hovered button fades."""
+    from io import BytesIO
+
+    from PIL import Image
+
+    a, b = (np.asarray(Image.open(BytesIO(shot)).convert("RGB"), float) for shot in (one, other))
+    assert (np.abs(a - b).max(axis=2) > 8).mean() < 0.002
+
+
+@pytest.mark.needs("chromium")
+def test_solid_page_names_what_is_missing_without_webgl2(visit):
+    without = (
+        "const get = HTMLCanvasElement.prototype.getContext;"
+        "HTMLCanvasElement.prototype.getContext = function (kind, ...rest)"
+        " { return kind === 'webgl2' ? null : get.call(this, kind, ...rest); };"
+    )
+    page = visit(solid_page(CAPTURE), script=without)
+
+    assert page.inner_text("#opening").startswith("This browser has no WebGL2, which three dimensions need.")
+    page.keyboard.press("?")
+    assert page.evaluate("document.getElementById('keys').open")
+
+
+@pytest.mark.needs("chromium")
+def test_solids_fill_every_pixel_of_a_fine_screen(visit):
+    page = visit(solid_page(CAPTURE), device_scale_factor=2)
+    size = "[document.getElementById('solid').width, document.getElementById('solid').height]"
+    for width, height in ((1200, 800), (900, 620), (640, 760)):
+        page.set_viewport_size({"width": width, "height": height})
+        rest(page)
+        box = page.locator("#map").bounding_box()
+        assert page.evaluate(size) == [round(2 * box["width"]), round(2 * box["height"])]
+        press(page, "t")
+        top = [*MOSAIC.centroid_um[64], 0.0]
+        assert page.evaluate("(p) => foveasim.pick(...foveasim.toWindow(...p))", top)["site"] == 64
+        corners = [page.evaluate("(p) => foveasim.toWindow(...p)", [x, y, 0.0]) for x, y in ((-15, -12.5), (15, 12.5))]
+        assert all(box["x"] <= x <= box["x"] + box["width"] for x, _ in corners)
+        assert all(box["y"] <= y <= box["y"] + box["height"] for _, y in corners)
+        assert corners[0][0] < corners[1][0]  # x to the right
+        assert corners[0][1] > corners[1][1]  # y up
+
+
+@pytest.mark.needs("chromium")
+@pytest.mark.parametrize(("theme", "ground"), [("light", (185, 196, 214)), ("dark", (43, 51, 64))])
+def test_solids_show_their_colours_on_the_ground(visit, tmp_path, theme, ground):
+    layout = fs.layout.mosaic(fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0), ("RG", "GB"))
+    page = visit(solid_page(layout, solids=solids(layout, SensorStack(lens_height_um=0.0))), color_scheme=theme)
+    press(page, "t")
+    rest(page)
+    (tmp_path / "above.png").write_bytes(page.screenshot())
+    picture = read_picture(tmp_path / "above.png")
+
+    def drawn(x, y):
+        px, py = page.evaluate("(p) => foveasim.toWindow(...p)", [x, y, 0.6])
+        return picture[int(py), int(px), :3].astype(int).tolist()
+
+    # Light comes from where one looks from above: colours are as they are told.
+    for site in (0, 1, 4):
+        assert drawn(*layout.centroid_um[site]) == pytest.approx(FILTER_COLOURS["RGB"[layout.channel[site]]], abs=2)
+    assert drawn(layout.bounds_um[0] - 0.8, 0.0) == list(ground)
+
+
+@pytest.mark.needs("chromium")
+@pytest.mark.parametrize(("n_x", "n_y"), [(100, 100), (500, 400)])
+def test_many_solids_open_and_are_found(visit, n_x, n_y):
+    layout = fs.layout.grid(n_x=n_x, n_y=n_y, pitch_um=1.5)
+    wells = solids(layout, SensorStack(trench_width_um=0.0, filter_thickness_um=0.0, lens_height_um=0.0))
+    page = visit(solid_page(layout, solids=wells))
+    page.evaluate("foveasim.lookDown()")
+    sites = np.random.default_rng(1).integers(0, layout.n_sites, 100)
+    places = np.column_stack((layout.centroid_um[sites], np.zeros(sites.size))).tolist()
+    found = page.evaluate("places => places.map((p) => foveasim.pick(...foveasim.toWindow(...p)).site)", places)
+
+    if n_x == 100:
+        assert found == sites.tolist()
+    else:
+        # A site is one or two pixels.
+        step = np.abs(layout.centroid_um[found] - layout.centroid_um[sites]).max(axis=1)
+        assert step.max() <= 1.5 * 1.001
+    assert page.inner_text("#parts") == f"wells · {12 * layout.n_sites:,} triangles"
+    # Near, most tiles are out of view, and what is in view is all there.
+    place = page.evaluate("(p) => foveasim.toWindow(...p)", places[0])
+    page.mouse.move(*place)
+    rest(page)
+    for _ in range(8):
+        page.mouse.wheel(0, -400)
+    rest(page)
+    box = page.locator("#solid").bounding_box()
+    corners = [(box["x"] + u * box["width"], box["y"] + v * box["height"]) for u in (0.03, 0.97) for v in (0.03, 0.97)]
+    assert all(site >= 0 for site in page.evaluate("ps => ps.map((p) => foveasim.pick(...p).site)", corners)) or n_x == 100
+
+
+@pytest.mark.needs("chromium")
+def test_scripts_are_modules_that_browsers_import(browser):
+    """Each as it is, with nothing around it: so that other pages and notebooks may take them."""
+    web = files("foveasim.view.web")
+    context = browser.new_context()
+    page = context.new_page()
+    page.route(
+        "https://modules.invalid/*",
+        lambda route: route.fulfill(
+            content_type="text/javascript" if route.request.url.endswith(".js") else "text/html",
+            body=(web / route.request.url.rsplit("/", 1)[1]).read_text(encoding="utf-8")
+            if route.request.url.endswith(".js")
+            else "<p>",
+        ),
+    )
+    page.goto("https://modules.invalid/")
+    names = ["bodies", "colours", "gestures", "gl", "map", "orbit", "page_parts", "sites", "solid_view", "unpack"]
+    exports = {
+        name: page.evaluate(f"import('./{name}.js').then((module) => Object.keys(module))") for name in names
+    }
+    context.close()
+
+    assert all(exports.values())
+    assert {"Orbit"} == set(exports["orbit"])
+    assert "SolidView" in exports["solid_view"]

@@ -1,8 +1,12 @@
-"""A page handed out on this computer, to its own browser and to nobody else."""
+"""A page served on this computer, to its own browser and to nobody else."""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import socket
 from collections.abc import Callable
+from http import HTTPStatus
 from pathlib import Path
 
 from foveasim.arrays import check_count
@@ -12,11 +16,21 @@ __all__ = ["open_page", "serve_page"]
 
 #: The only address that is listened on: no other computer reaches it.
 HOST = "127.0.0.1"
+#: A connection has this long to send its request, and after that as long for each piece of the page that it takes.
+PATIENCE_S = 10.0
+#: ... and this long to close it.
+LINGER_S = 1.0
+#: Connections at a time; those beyond are answered that the server is busy. A browser opens six.
+MAX_CONNECTIONS = 128
+#: A request of a browser has a few hundred bytes.
+MAX_REQUEST_BYTES = 16_384
+#: The page is sent in pieces, so that slow connections cost no memory.
+PIECE_BYTES = 65_536
 
 
 def serve_page(text: str, *, port: int = 0, tell: Callable[[str], None]) -> None:
     """
-    Hand out one page until the user stops it with Ctrl-C.
+    Serve one page on localhost until the user stops it with Ctrl-C.
 
     Parameters
     ----------
@@ -30,50 +44,107 @@ def serve_page(text: str, *, port: int = 0, tell: Callable[[str], None]) -> None
     Raises
     ------
     ParameterError
-        When the port is none, or taken.
+        When the port is out of range, or taken.
+
+    Notes
+    -----
+    Answers GET and HEAD of ``/``, one request per connection, all in one thread. A request must name this computer as its
+    ``Host``: a page of another site whose name leads here (DNS rebinding) gets nothing.
     """
-    from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-
     port = check_count("port", port, at_least=0, at_most=2**16 - 1)
-    content = text.encode()
-
-    class Handler(BaseHTTPRequestHandler):
-        """Answers with the page, and to nothing else."""
-
-        def do_GET(self) -> None:
-            self._answer(with_content=True)
-
-        def do_HEAD(self) -> None:
-            self._answer(with_content=False)
-
-        def _answer(self, *, with_content: bool) -> None:
-            # A name that a stranger's site gave this address is refused, so that no other site can read the page.
-            is_ours = self.headers.get("Host") in {f"{name}:{self.server.server_port}" for name in (HOST, "localhost")}  # type: ignore[attr-defined]
-            if not is_ours or self.path.partition("?")[0] != "/":
-                self.send_error(404 if is_ours else 403)
-                return
-            self.send_response(200)
-            self.send_header("Content-Type", "text/html; charset=utf-8")
-            self.send_header("Content-Length", str(len(content)))
-            self.send_header("Cache-Control", "no-store")
-            self.send_header("X-Content-Type-Options", "nosniff")
-            self.end_headers()
-            if with_content:
-                self.wfile.write(content)
-
-        def log_message(self, format: str, *args: object) -> None:  # noqa: A002 -- the name is the library's
-            """Say nothing: the user asked for a page, not for a log."""
-
     try:
-        server = ThreadingHTTPServer((HOST, port), Handler)
+        listener = socket.create_server((HOST, port), backlog=MAX_CONNECTIONS)
     except OSError as error:
         raise ParameterError("port", f"cannot be listened on ({error.strerror or error})", port) from None
-    with server:
-        tell(f"http://{HOST}:{server.server_port}/")
+    with listener, contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(_serve(listener, text.encode(), tell))
+
+
+async def _serve(listener: socket.socket, content: bytes, tell: Callable[[str], None]) -> None:
+    port = listener.getsockname()[1]
+    names = {f"{name}:{port}" for name in (HOST, "localhost")} | ({HOST, "localhost"} if port == 80 else set())
+    n_open = 0
+
+    async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        nonlocal n_open
+        n_open += 1
         try:
-            server.serve_forever()
-        except KeyboardInterrupt:
-            return
+            if n_open <= MAX_CONNECTIONS:
+                await _answer(reader, writer, names, content)
+            elif n_open <= 2 * MAX_CONNECTIONS:
+                await _send(writer, HTTPStatus.SERVICE_UNAVAILABLE)
+            await _end(reader, writer)
+        except (OSError, asyncio.IncompleteReadError, asyncio.CancelledError):
+            # Gone, silent for too long (TimeoutError is an OSError), or the server stops: nothing to say to anybody.
+            writer.transport.abort()
+        finally:
+            n_open -= 1
+
+    await asyncio.start_server(connected, sock=listener, limit=MAX_REQUEST_BYTES)
+    tell(f"http://{HOST}:{port}/")
+    await asyncio.Event().wait()
+
+
+async def _answer(
+    reader: asyncio.StreamReader, writer: asyncio.StreamWriter, names: set[str], content: bytes
+) -> None:
+    """Read one request and answer it."""
+    try:
+        async with asyncio.timeout(PATIENCE_S):
+            head = await reader.readuntil(b"\r\n\r\n")
+    except asyncio.LimitOverrunError:
+        await _send(writer, HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE)
+        return
+    first, *lines = head.decode("latin-1").split("\r\n")[:-2]
+    words = first.split(" ")
+    fields = [line.partition(":") for line in lines]
+    hosts = [value.strip().lower() for name, _, value in fields if name.lower() == "host"]
+    if len(words) != 3 or not words[2].startswith("HTTP/1.") or len(hosts) != 1:
+        await _send(writer, HTTPStatus.BAD_REQUEST)
+    elif hosts[0] not in names:
+        await _send(writer, HTTPStatus.FORBIDDEN)
+    elif words[0] not in ("GET", "HEAD"):
+        await _send(writer, HTTPStatus.METHOD_NOT_ALLOWED)
+    elif words[1].partition("?")[0] != "/":
+        await _send(writer, HTTPStatus.NOT_FOUND)
+    else:
+        await _send(writer, HTTPStatus.OK, content, with_content=words[0] == "GET")
+
+
+async def _send(
+    writer: asyncio.StreamWriter, status: HTTPStatus, content: bytes | None = None, *, with_content: bool = True
+) -> None:
+    """Send an answer; one without a page of its own says in plain text what it is."""
+    is_page = content is not None
+    body = f"{status.value} {status.phrase}\n".encode() if content is None else content
+    head = [
+        f"HTTP/1.1 {status.value} {status.phrase}",
+        f"Content-Type: text/{'html' if is_page else 'plain'}; charset=utf-8",
+        f"Content-Length: {len(body)}",
+        "Cache-Control: no-store",
+        "Connection: close",
+        # No page of another site frames this one, embeds it, or guesses at its kind.
+        "Content-Security-Policy: frame-ancestors 'none'",
+        "Cross-Origin-Resource-Policy: same-origin",
+        "X-Content-Type-Options: nosniff",
+        *(["Allow: GET, HEAD"] if status is HTTPStatus.METHOD_NOT_ALLOWED else []),
+    ]
+    writer.write("\r\n".join((*head, "", "")).encode("latin-1"))
+    pieces = range(0, len(body), PIECE_BYTES) if with_content else ()
+    for start in pieces:
+        writer.write(body[start : start + PIECE_BYTES])
+        async with asyncio.timeout(PATIENCE_S):
+            await writer.drain()
+
+
+async def _end(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """Close once the client has read the answer: with a request half read, it would lose the answer to a reset."""
+    writer.write_eof()
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(min(LINGER_S, PATIENCE_S)):
+            while await reader.read(PIECE_BYTES):
+                pass
+    writer.close()
 
 
 def open_page(text: str) -> tuple[Path, bool]:

@@ -64,10 +64,7 @@ export class Orbit {
   // Goes so many times farther from a point, which stays where it is in the view.
   zoom(factor, point = this.target) {
     const distance = clamp(this.distance * factor, this.nearest, 4 * this.fitDistance()), ratio = distance / this.distance;
-    const [x, y, z] = point;
-    this.target[0] = x + (this.target[0] - x) * ratio;
-    this.target[1] = y + (this.target[1] - y) * ratio;
-    this.target[2] = z + (this.target[2] - z) * ratio;
+    for (let i = 0; i < 3; i++) this.target[i] = point[i] + (this.target[i] - point[i]) * ratio;
     this.distance = distance;
     this._update();
   }

@@ -767,8 +767,7 @@ function showPlain(why) {
   document.body.classList.add("plain");
   $("opening").hidden = true;
   $("map").append($("picture-frame"));
-  $("told").textContent = why;
-  $("told").hidden = false;
+  stayingNotice(why);
 }
 
 async function open() {

@@ -97,7 +97,7 @@ function showTheme() {
 }
 
 function resize() {
-  const { clientWidth: width, clientHeight: height } = $("map");
+  const { width, height } = $("map").getBoundingClientRect();
   state.view.resize(width, height);
   moved();
 }
@@ -210,7 +210,7 @@ async function open() {
   const orbit = new Orbit(bodies.low, bodies.high, Math.max(4096 * bodies.lattice, 0.1 * smallest));
   state.view = new SolidView($("solid"), bodies, orbit, about.n_sites, renderer);
   $("parts").append(...state.view.parts.map(partItem));
-  state.view.resize($("map").clientWidth, $("map").clientHeight);
+  resize();
   orbit.look(...ASIDE);
   showTheme();
   listenToCanvas();

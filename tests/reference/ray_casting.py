@@ -1,0 +1,55 @@
+"""Rays of a pinhole camera through prisms over polygons, by plain geometry: what a pixel of a 3D view shows."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+
+#: Vertical field of view of the page.
+FIELD_DEG = 35.0
+
+
+def rays_of(camera, width, height, pixels):
+    """Directions (n, 3) of the rays through places of a window ``width`` by ``height``, from its top left corner."""
+    eye, target = np.array(camera["eye"]), np.array(camera["target"])
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    # Straight from above x stays to the right.
+    right = np.array((1.0, 0.0, 0.0)) if np.linalg.norm(right) < 1e-9 else right / np.linalg.norm(right)
+    up = np.cross(right, forward)
+    half = np.tan(np.radians(FIELD_DEG / 2))
+    x, y = np.asarray(pixels, float).T
+    aside = (2 * x / width - 1) * half * width / height
+    above = (1 - 2 * y / height) * half
+    return forward + aside[:, np.newaxis] * right + above[:, np.newaxis] * up
+
+
+def first_hits(polygons, floors, roofs, eye, directions, *, has_floor):
+    """
+    Distances (n, n_prism) along rays to the first surface of every prism, inf where a ray misses it.
+
+    Prisms stand over polygons between two heights each; without a floor one sees into them from below.
+    """
+    eye = np.asarray(eye, float)
+    hits = np.full((len(directions), len(polygons)), np.inf)
+    for k, (polygon, floor, roof) in enumerate(zip(polygons, floors, roofs, strict=True)):
+        for z in (roof, floor) if has_floor else (roof,):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                t = (z - eye[2]) / directions[:, 2]
+                x, y = (eye[i] + t * directions[:, i] for i in range(2))
+            seen = (t > 0) & np.isfinite(t)
+            seen[seen] = shapely.contains_xy(polygon, x[seen], y[seen])
+            hits[seen, k] = np.minimum(hits[seen, k], t[seen])
+        for ring in (polygon.exterior, *polygon.interiors):
+            corners = np.array(ring.coords)
+            for a, b in zip(corners[:-1], corners[1:], strict=True):
+                edge = b - a
+                # eye + t direction = a + s edge, in the plane.
+                cross = directions[:, 0] * edge[1] - directions[:, 1] * edge[0]
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    t = ((a[0] - eye[0]) * edge[1] - (a[1] - eye[1]) * edge[0]) / cross
+                    s = ((a[0] - eye[0]) * directions[:, 1] - (a[1] - eye[1]) * directions[:, 0]) / cross
+                    z = eye[2] + t * directions[:, 2]
+                    seen = (t > 0) & (s >= 0) & (s <= 1) & (z >= floor) & (z <= roof)
+                hits[seen, k] = np.minimum(hits[seen, k], t[seen])
+    return hits
