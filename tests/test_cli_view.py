@@ -247,7 +247,9 @@ def test_served_page_survives_clients_that_reset(serve):
 def test_half_sent_requests_are_dropped_after_a_while(serve):
     port, _ = serve(patience_s=0.3)
     with contextlib.ExitStack() as stack:
-        halves = [stack.enter_context(connect(port, text)) for text in ("", "GET / HTTP", "GET / HTTP/1.1\r\nHost: x\r\n")]
+        halves = [
+            stack.enter_context(connect(port, text)) for text in ("", "GET / HTTP", "GET / HTTP/1.1\r\nHost: x\r\n")
+        ]
         for half in halves:
             with contextlib.suppress(ConnectionResetError):
                 assert half.recv(1) == b""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import shapely
 
@@ -42,7 +44,7 @@ def first_hits(polygons, floors, roofs, eye, directions, *, has_floor):
             hits[seen, k] = np.minimum(hits[seen, k], t[seen])
         for ring in (polygon.exterior, *polygon.interiors):
             corners = np.array(ring.coords)
-            for a, b in zip(corners[:-1], corners[1:], strict=True):
+            for a, b in itertools.pairwise(corners):
                 edge = b - a
                 # eye + t direction = a + s edge, in the plane.
                 cross = directions[:, 0] * edge[1] - directions[:, 1] * edge[0]

@@ -139,7 +139,7 @@ def _tiles(layout: Layout) -> Ints:
 
 
 def _runs(mesh: Mesh, place: Ints, tile_of_site: Ints, offset: int) -> dict[str, NDArray[Any]]:
-    """Points and triangles of a surface sorted by tiles and photosites; points of one place in a photosite follow each other."""
+    """Points and triangles of a surface sorted by tiles and photosites, points of a photosite at one place together."""
     site = mesh.photosite.astype(np.int64)
     tile = np.append(tile_of_site, 0)[site]  # the last one: of no photosite
     rank_of_site = np.empty(tile_of_site.size + 1, np.int64)

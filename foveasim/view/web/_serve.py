@@ -85,9 +85,7 @@ async def _serve(listener: socket.socket, content: bytes, tell: Callable[[str], 
     await asyncio.Event().wait()
 
 
-async def _answer(
-    reader: asyncio.StreamReader, writer: asyncio.StreamWriter, names: set[str], content: bytes
-) -> None:
+async def _answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, names: set[str], content: bytes) -> None:
     """Read one request and answer it."""
     try:
         async with asyncio.timeout(PATIENCE_S):

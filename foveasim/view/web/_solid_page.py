@@ -18,6 +18,7 @@ from foveasim.view.web._page import check_page_path, joined
 
 __all__ = ["solid_page", "write_solid_page"]
 
+
 def solid_page(thing: Layout | Capture, *, solids: Solids | None = None, name: str = "") -> str:
     """
     A page to turn a sensor round in a browser.

@@ -60,6 +60,7 @@ function ask() {
 function drawFrame() {
   const { view } = state, wasMoving = view.isImageStale && view.areIdsStale;
   state.isAsked = false;
+  if (view.gl.isContextLost()) return;
   if (!wasMoving) hover();
   view.draw();
   if (wasMoving) ask();

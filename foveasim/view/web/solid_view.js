@@ -25,7 +25,7 @@ void main() {
 const SRGB = `
 vec3 toLinear(vec3 c) { return mix(c / 12.92, pow((c + 0.055) / 1.055, vec3(2.4)), step(0.04045, c)); }
 vec3 toScreen(vec3 c) { return mix(c * 12.92, 1.055 * pow(c, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c)); }`;
-// A surface seen from the front is as bright as its colour; light comes from the sky all around and from a sun.
+// Light from the sky all around and from a sun: what faces the sun is as bright as its colour, nothing is brighter.
 const IMAGE_SHADER = `#version 300 es
 precision highp float;
 in vec3 at;
@@ -33,14 +33,14 @@ flat in vec3 colour;
 flat in uint owner;
 uniform uint pinned;
 out vec4 pixel;
-const vec3 SUN = vec3(-0.394, -0.473, 0.788);
+const vec3 SUN = vec3(-0.331, -0.397, 0.856);
 const vec3 FLOOR = vec3(0.32, 0.37, 0.46);
 const vec3 MARK = vec3(0.02, 0.25, 1.0);
 ${SRGB}
 void main() {
   // The plane of a triangle from its neighbours on the screen: it faces the eye, whichever way it is wound.
   vec3 normal = normalize(cross(dFdx(at), dFdy(at)));
-  vec3 light = 0.45 * mix(FLOOR, vec3(1.0), 0.5 * normal.z + 0.5) + 0.698 * max(dot(normal, SUN), 0.0);
+  vec3 light = 0.42 * mix(FLOOR, vec3(1.0), 0.5 * normal.z + 0.5) + 0.60 * max(dot(normal, SUN), 0.0);
   vec3 own = toLinear(colour);
   if (pinned != 0u && owner == pinned) own = mix(own, MARK, 0.7);
   pixel = vec4(toScreen(own * min(light, 1.0)), min(light.g, 1.0));
