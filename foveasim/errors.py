@@ -12,7 +12,8 @@ Every error and warning that foveasim raises on purpose.
 
     FoveasimWarning (UserWarning)
     ├── SamplingWarning                  the discretisation is coarser than the physics asks for
-    └── CoverageWarning                  photosites lie off the picture
+    ├── CoverageWarning                  photosites lie off the picture
+    └── LayoutWarning                    a layout covers less of its field than its parameters ask for
 
 Each message says what is wrong, where, what was got, what was expected, and the cure.
 """
@@ -29,6 +30,7 @@ __all__ = [
     "FoveasimError",
     "FoveasimWarning",
     "GeometryError",
+    "LayoutWarning",
     "ParameterError",
     "SamplingWarning",
     "SimulationError",
@@ -96,6 +98,10 @@ class SamplingWarning(FoveasimWarning):
 
 class CoverageWarning(FoveasimWarning):
     """Photosites lie partly or wholly off the map of light and receive less, or nothing."""
+
+
+class LayoutWarning(FoveasimWarning):
+    """A generated layout covers less of its field than its parameters ask for."""
 
 
 def _restored(kind: type[FoveasimError], args: tuple[Any, ...], state: dict[str, Any]) -> FoveasimError:

@@ -14,9 +14,9 @@ from foveasim.errors import ParameterError
 TILINGS = {
     "grid": fs.layout.grid(n_x=7, n_y=5, pitch_um=1.7),
     "hexagonal": fs.layout.hexagonal(n_columns=7, n_rows=6, pitch_um=2.3),
-    "log_polar": fs.layout.log_polar(n_sectors=16, r_min_um=3.0, r_max_um=30.0),
+    "log_polar": fs.layout.log_polar(n_sectors=16, r_min_um=3.0, r_max_um=22.0),
     "log_polar staggered": fs.layout.log_polar(
-        n_sectors=14, r_min_um=3.0, r_max_um=30.0, stagger=True, chords_per_arc=3
+        n_sectors=14, r_min_um=3.0, r_max_um=18.4, stagger=True, chords_per_arc=3
     ),
     "zones": fs.layout.zones(side_um=(4, 12, 28), pitch_um=(1, 2, 4)),
 }

@@ -33,7 +33,7 @@ def picture_scene(n_wavelengths=3, shape=(200, 240), **changes):
 
 
 def rgb_layout():
-    layout = fs.layout.log_polar(n_sectors=36, min_size_um=3.0, r_max_um=75.0, stagger=True)
+    layout = fs.layout.log_polar(n_sectors=36, min_size_um=3.0, r_max_um=64.0, stagger=True)
     return fs.layout.mosaic(layout, ("RG", "GB"))
 
 

@@ -12,7 +12,7 @@ from foveasim.layout import MOSAICS, colouring, mosaic, nearest_bus, random_chan
 
 GRID = fs.layout.grid(n_x=12, n_y=12, pitch_um=1.0)
 HEXAGONS = fs.layout.hexagonal(n_columns=20, n_rows=18, pitch_um=2.0)
-RINGS = fs.layout.log_polar(n_sectors=30, r_min_um=4.0, r_max_um=60.0, stagger=True)
+RINGS = fs.layout.log_polar(n_sectors=30, r_min_um=4.0, r_max_um=50.0, stagger=True)
 
 
 @pytest.mark.parametrize(

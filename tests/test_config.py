@@ -475,11 +475,11 @@ def test_a_shipped_shot_can_be_built(path):
 def test_a_layout_file_builds_what_the_call_builds(tmp_path):
     path = tmp_path / "rings.yaml"
     path.write_text(
-        "generator: log_polar\nparameters: {n_sectors: 32, min_size_um: 2, r_max_um: 50, stagger: true}\n"
+        "generator: log_polar\nparameters: {n_sectors: 32, min_size_um: 2, r_max_um: 45, stagger: true}\n"
         "mosaic: [RG, GB]\nmove_um: [1.0, 2.0]\nrules: {min_width_um: 1.5}\nsource: made up for this test\n"
     )
     file = read_layout_file(path)
-    expected = fs.layout.log_polar(n_sectors=32, min_size_um=2.0, r_max_um=50.0, stagger=True).translate(1.0, 2.0)
+    expected = fs.layout.log_polar(n_sectors=32, min_size_um=2.0, r_max_um=45.0, stagger=True).translate(1.0, 2.0)
 
     assert np.array_equal(file.layout.xy_um, expected.xy_um)
     assert file.rules == fs.DesignRules(min_width_um=1.5)

@@ -29,7 +29,7 @@ LAYOUTS = {
     "rectangles": grid(n_x=7, n_y=5, pitch_um=3.0, pitch_y_um=5.0),
     "hexagons": HEXAGONS,
     "hexagons with gaps": HEXAGONS[STAYS],
-    "rings": fs.layout.log_polar(n_sectors=16, r_min_um=6.0, r_max_um=60.0),
+    "rings": fs.layout.log_polar(n_sectors=16, r_min_um=6.0, r_max_um=44.0),
     "zones": fs.layout.zones(side_um=(8, 24, 56), pitch_um=(2, 4, 8)),
     "voronoi": fs.layout.voronoi(n_sites=200, size_um=(60.0, 40.0), seed=3),
     "a site in a hole": FRAME,

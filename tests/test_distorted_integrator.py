@@ -16,7 +16,7 @@ BARREL = BrownConrady(focal_um=200.0, k1=-0.12, k2=0.02, p1=0.03, p2=-0.02)
 GRID = fs.Grid.centred((240, 240), 0.5)
 LAYOUTS = {
     "hexagons": fs.layout.tiling(pitch_um=9.0, radius_um=50.0),
-    "rings": fs.layout.log_polar(n_sectors=16, r_min_um=6.0, r_max_um=50.0, fovea="rings", chords_per_arc=3),
+    "rings": fs.layout.log_polar(n_sectors=16, r_min_um=6.0, r_max_um=44.0, fovea="rings", chords_per_arc=3),
     "quads": fs.layout.quadtree(np.eye(16), pitch_um=6.0, limit=0.5, n_levels=3),
 }
 

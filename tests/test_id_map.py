@@ -23,7 +23,7 @@ TILINGS = {
     "octagons": L.octagonal(n_x=6, n_y=6, pitch_um=2.0),
     "zones": L.zones(side_um=(8, 16), pitch_um=(1, 2)),
     "quadtree": L.quadtree(np.add.outer(np.arange(16.0), np.arange(16.0)), pitch_um=1.0, limit=20.0, n_levels=3),
-    "log-polar": L.log_polar(n_sectors=24, min_size_um=1.0, r_max_um=12.0),
+    "log-polar": L.log_polar(n_sectors=24, min_size_um=1.0, r_max_um=10.0),
     "Voronoi": L.voronoi(n_sites=60, size_um=(12.0, 12.0)),
     "Penrose": L.penrose(side_um=2.0, size_um=14.0),
 }

@@ -24,7 +24,7 @@ TILINGS = {
     "grid": fs.layout.grid(n_x=13, n_y=11, pitch_um=0.77),
     "hexagonal": fs.layout.hexagonal(n_columns=12, n_rows=13, pitch_um=0.9),
     "hexagonal flat": fs.layout.hexagonal(n_columns=11, n_rows=12, pitch_um=1.1, orientation="flat"),
-    "log_polar": fs.layout.log_polar(n_sectors=24, r_min_um=0.2, r_max_um=5.5),
+    "log_polar": fs.layout.log_polar(n_sectors=24, r_min_um=0.2, r_max_um=4.7),
     "log_polar staggered, odd chords": fs.layout.log_polar(
         n_sectors=20, r_min_um=0.4, r_max_um=5.5, stagger=True, chords_per_arc=3
     ),

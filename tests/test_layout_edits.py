@@ -13,7 +13,7 @@ from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout.edits import clip, inset, merge, node, punch, snap, split, union
 
 GRID = fs.layout.grid(n_x=10, n_y=8, pitch_um=2.0)
-RINGS = fs.layout.log_polar(n_sectors=24, r_min_um=4.0, r_max_um=40.0, stagger=True, chords_per_arc=2)
+RINGS = fs.layout.log_polar(n_sectors=24, r_min_um=4.0, r_max_um=33.0, stagger=True, chords_per_arc=2)
 ZONES = fs.layout.zones(side_um=(4, 12, 28), pitch_um=(1, 2, 4))
 TILINGS = {"grid": GRID, "rings": RINGS, "zones": ZONES}
 DISC = shapely.Point(1.3, 0.7).buffer(6.1)

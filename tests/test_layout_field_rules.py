@@ -86,6 +86,7 @@ def test_the_data_rate_of_a_layout_is_limited():
 # -- room for lines --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # coarse ratios end inside r_max_um
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(n_sectors=st.integers(20, 400), pitch_um=st.floats(0.2, 2.0), n_layers=st.integers(1, 4))
 def test_spokes_of_a_log_polar_layout_share_the_first_ring(n_sectors, pitch_um, n_layers):
@@ -130,7 +131,7 @@ def test_one_site_or_line_too_many_among_a_hundred_thousand_sites_is_told():
 
 
 def test_lines_without_any_track_are_told():
-    layout = log_polar(n_sectors=12, r_min_um=1.0, r_max_um=30.0)
+    layout = log_polar(n_sectors=12, r_min_um=1.0, r_max_um=24.5)
     routing = Routing(width_um=20.0, space_um=20.0)
 
     assert layout.check(DesignRules(max_track_use=1.0, routing=routing)).results[0].worst == math.inf

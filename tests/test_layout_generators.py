@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from inspect import signature
 from itertools import pairwise
@@ -14,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from foveasim.errors import ParameterError
+from foveasim.errors import LayoutWarning, ParameterError
 from foveasim.layout import Layout, grid, hexagonal, log_polar, mosaic, square_ring_ratio, tiling, zones
 
 relaxed = settings(deadline=None, derandomize=True, max_examples=30)
@@ -315,6 +316,7 @@ def test_square_ring_ratio_refuses_what_is_no_ring(n_sectors):
         square_ring_ratio(n_sectors)
 
 
+@pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # coarse ratios end inside r_max_um
 @pytest.mark.parametrize("n_sectors", [8, 64, 128, 252])
 def test_sites_are_as_high_as_they_are_wide_on_their_centre_line(n_sectors):
     layout = log_polar(n_sectors=n_sectors, r_max_um=1000.0, min_size_um=2.2)
@@ -327,32 +329,77 @@ def test_sites_are_as_high_as_they_are_wide_on_their_centre_line(n_sectors):
     np.testing.assert_allclose(outer - inner, width_um, rtol=1e-9)
 
 
-@pytest.mark.parametrize(("n_sectors", "min_size_um"), [(64, 2.2), (128, 2.2), (64, 5.0), (252, 0.56), (16, 30.0)])
-def test_the_blind_spot_is_the_minimum_size_times_the_sectors_over_a_turn(n_sectors, min_size_um):
-    layout = log_polar(n_sectors=n_sectors, r_max_um=1000.0, min_size_um=min_size_um)
+@pytest.mark.parametrize(("n_sectors", "min_size_um"), [(64, 2.2), (128, 2.2), (64, 5.0), (252, 0.56), (40, 30.0)])
+@pytest.mark.parametrize("chords_per_arc", [2, 3, 16])
+def test_blind_spot_of_squarish_sites_in_closed_form(n_sectors, min_size_um, chords_per_arc):
+    layout = log_polar(n_sectors=n_sectors, r_max_um=1000.0, min_size_um=min_size_um, chords_per_arc=chords_per_arc)
     inner, outer = radii_um(layout)
-    centre_line_um = 0.5 * (inner[0] + outer[0])
+    s = math.sin(math.pi / n_sectors)
 
-    assert centre_line_um == pytest.approx(min_size_um * n_sectors / (2 * math.pi), rel=1e-12)
+    # A squarish ring is 2 s times its centre line high, and as high as the minimum size.
+    assert 0.5 * (inner[0] + outer[0]) == pytest.approx(min_size_um / (2.0 * s), rel=1e-11)
+    assert inner[0] == pytest.approx(min_size_um * (1.0 - s) / (2.0 * s), rel=1e-11)
     assert layout.provenance["blind_radius_um"] == pytest.approx(inner[0], rel=1e-12)
 
 
+@pytest.mark.parametrize("n_sectors", [64, 128, 252])
+def test_blind_spot_with_one_chord_in_closed_form(n_sectors):
+    layout = log_polar(n_sectors=n_sectors, r_max_um=1000.0, min_size_um=2.2)
+    inner, outer = radii_um(layout)
+    # A trapezium of area sin(2π/n) (R² - r²) / 2 = 2 s sin(2π/n) c² on the centre line c.
+    area_per_square = 2.0 * math.sin(math.pi / n_sectors) * math.sin(2.0 * math.pi / n_sectors)
+
+    assert 0.5 * (inner[0] + outer[0]) == pytest.approx(2.2 / math.sqrt(area_per_square), rel=1e-11)
+
+
+def test_blind_spot_tends_to_size_times_sectors_over_a_turn():
+    n_sectors = np.array([64, 256, 1024])
+    rings = [log_polar(n_sectors=int(n), r_max_um=1000.0, min_size_um=2.0, chords_per_arc=8) for n in n_sectors]
+    centre_um = np.array([0.5 * (layout.provenance["blind_radius_um"] + radii_um(layout)[1][0]) for layout in rings])
+    limit_um = 2.0 * n_sectors / (2.0 * math.pi)
+
+    # x / sin(x) = 1 + x²/6 + ...
+    np.testing.assert_allclose(centre_um / limit_um - 1.0, (math.pi / n_sectors) ** 2 / 6.0, rtol=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # coarse ratios end inside r_max_um
 @given(st.integers(3, 100), st.floats(0.1, 10.0), st.floats(1.01, 3.0), st.floats(0.1, 10.0))
 @relaxed
-def test_of_given_rings_those_whose_arcs_or_heights_are_too_small_are_left_out(
-    n_sectors, min_size_um, ring_ratio, r_min_um
-):
+def test_given_rings_below_the_minimum_size_are_left_out(n_sectors, min_size_um, ring_ratio, r_min_um):
     everything = log_polar(n_sectors=n_sectors, r_min_um=r_min_um, r_max_um=2000.0, ring_ratio=ring_ratio)
     kept = log_polar(
         n_sectors=n_sectors, r_min_um=r_min_um, r_max_um=2000.0, ring_ratio=ring_ratio, min_size_um=min_size_um
     )
     inner, outer = radii_um(everything)
     arc_um = math.pi / n_sectors * (inner + outer)
-    # Where a site is as high as its chord is long, it counts as squarish: its size is then its arc.
-    height_um = (outer - inner) * (math.pi / n_sectors) / math.sin(math.pi / n_sectors)
-    is_large = np.minimum(arc_um, height_um) >= min_size_um * (1 - 1e-9)
+    chord_um2 = 0.5 * math.sin(2.0 * math.pi / n_sectors) * (outer**2 - inner**2)
+    is_large = np.min((arc_um, outer - inner, np.sqrt(chord_um2)), axis=0) >= min_size_um * (1 + 1e-9)
 
     np.testing.assert_allclose(radii_um(kept)[0], inner[is_large], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "end_um"),
+    [
+        ({"n_sectors": 8, "min_size_um": 1.0, "r_max_um": 9.0}, 4.2098),
+        ({"n_sectors": 64, "r_min_um": 10.0, "r_max_um": 100.0, "ring_ratio": 2.0}, 80.0),
+    ],
+)
+def test_log_polar_warns_when_rings_end_early(parameters, end_um):
+    with pytest.warns(
+        LayoutWarning, match=f"'r_max_um' is {parameters['r_max_um']:g} µm, and the rings end at"
+    ) as told:
+        layout = log_polar(**parameters)
+    (r_min_um, _), (_, last_um) = (radii_um(layout)[0][[0, -1]], radii_um(layout)[1][[0, -1]])
+    (next_um,) = re.findall(r"take 'r_max_um' = ([\d.]+) µm, or", str(told[0].message))
+
+    assert last_um == pytest.approx(end_um, rel=1e-4)
+    # What the message advises ends where it is asked to, without a warning.
+    assert radii_um(log_polar(**{**parameters, "r_max_um": float(next_um)}))[1].max() == pytest.approx(
+        float(next_um), rel=1e-4
+    )
+    exact = log_polar(n_sectors=parameters["n_sectors"], r_min_um=r_min_um, r_max_um=parameters["r_max_um"], n_rings=3)
+    assert radii_um(exact)[1].max() == pytest.approx(parameters["r_max_um"], rel=1e-12)
 
 
 def test_rings_fill_the_field_and_no_ring_reaches_out_of_it():
@@ -546,7 +593,7 @@ def test_grids_refuse_what_cannot_be(make, parameters, message):
             log_polar,
             {
                 "n_sectors": 12,
-                "r_max_um": 100.0,
+                "r_max_um": 75.0,
                 "min_size_um": 2.2,
                 "r_min_um": 7.0,
                 "n_rings": None,
@@ -555,8 +602,8 @@ def test_grids_refuse_what_cannot_be(make, parameters, message):
                 "chords_per_arc": 3,
             },
         ),
-        (log_polar, {"n_sectors": 24, "r_max_um": 60.0, "min_size_um": 2.2, "fovea": "linear"}),
-        (log_polar, {"n_sectors": 24, "r_max_um": 60.0, "min_size_um": 2.2, "fovea": "hexagons"}),
+        (log_polar, {"n_sectors": 24, "r_max_um": 61.0, "min_size_um": 2.2, "fovea": "linear"}),
+        (log_polar, {"n_sectors": 24, "r_max_um": 61.0, "min_size_um": 2.2, "fovea": "hexagons"}),
         (grid, {"n_x": 3, "n_y": 2, "pitch_um": 2.0, "pitch_y_um": 3.0, "trench_um": 0.25, "stagger": True}),
         (zones, {"side_um": [4.0, 8.0], "pitch_um": [1.0, 2.0]}),
         (zones, {"side_um": [4.0, 9.5], "pitch_um": [1.0, 2.0], "cells": "hexagons"}),

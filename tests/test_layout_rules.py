@@ -221,6 +221,7 @@ def test_widths_turn_and_grow_with_their_shapes(shape, angle_deg, factor, shift_
     assert min_width_um(moved)[0] == pytest.approx(factor * min_width_um(layout)[0], rel=1e-6)
 
 
+@pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # coarse ratios end inside r_max_um
 @given(st.integers(3, 16), st.floats(1.05, 2.0), st.integers(1, 4), st.booleans())
 @example(n_sectors=8, ring_ratio=2.0, chords_per_arc=1, stagger=False)
 @relaxed

@@ -147,7 +147,7 @@ def test_small_sites_are_those_of_klayouts_area(layout, limit_um2):
 FAMILIES = {
     "grid": fs.layout.grid(n_x=9, n_y=8, pitch_um=1.23456),
     "hexagonal": fs.layout.hexagonal(n_columns=9, n_rows=8, pitch_um=1.7, width_um=1.5),
-    "log_polar": fs.layout.log_polar(n_sectors=31, r_min_um=3.0, r_max_um=60.0),
+    "log_polar": fs.layout.log_polar(n_sectors=31, r_min_um=3.0, r_max_um=52.0),
     "voronoi": fs.layout.voronoi(n_sites=200, size_um=(50.0, 40.0), n_iterations=3),
     "zones": fs.layout.zones(side_um=(4, 12, 28), pitch_um=(1, 2, 4)).rotate(10.0),
 }

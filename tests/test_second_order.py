@@ -27,7 +27,7 @@ BARREL = BrownConrady(focal_um=200.0, k1=-0.12, k2=0.02, p1=0.03, p2=-0.02)
 TILINGS = {
     "hexagonal": fs.layout.hexagonal(n_columns=12, n_rows=13, pitch_um=0.9),
     "grid": fs.layout.grid(n_x=13, n_y=11, pitch_um=0.77),
-    "log_polar": fs.layout.log_polar(n_sectors=24, r_min_um=0.2, r_max_um=5.5, fovea="rings"),
+    "log_polar": fs.layout.log_polar(n_sectors=24, r_min_um=0.2, r_max_um=4.7, fovea="rings"),
     "voronoi": fs.layout.voronoi(n_sites=200, size_um=(9.0, 9.0), n_iterations=3).translate(0.1, 0.1),
     "penrose": fs.layout.penrose(side_um=0.9, size_um=10.0),
 }

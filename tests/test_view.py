@@ -209,7 +209,7 @@ def test_a_scale_bar_is_as_long_as_it_says(tmp_path, zoom):
 
 
 def test_a_colour_bar_has_the_unit_and_the_range_and_a_legend_the_kinds():
-    layout = fs.layout.mosaic(fs.layout.log_polar(n_sectors=8, min_size_um=1.0, r_max_um=9.0), ("RG", "GB"))
+    layout = fs.layout.mosaic(fs.layout.log_polar(n_sectors=8, min_size_um=1.0, r_max_um=4.3), ("RG", "GB"))
     sized = layout.plot("area_um2")
     (bar,) = [axes for axes in sized.figure.axes if axes is not sized]
     assert bar.get_ylabel() == "area / µm²"

@@ -53,7 +53,7 @@ def capture():
 LAYOUTS = {
     "odd": lambda: ODD_LAYOUT,
     "hexagons": lambda: fs.layout.hexagonal(n_columns=20, n_rows=20, pitch_um=2.0),
-    "rings with arcs": lambda: fs.layout.log_polar(n_sectors=48, min_size_um=2.0, r_max_um=60.0, stagger=True, chords_per_arc=4),
+    "rings with arcs": lambda: fs.layout.log_polar(n_sectors=48, min_size_um=2.0, r_max_um=54.0, stagger=True, chords_per_arc=4),
     "T-junctions noded": lambda: fs.layout.node(fs.layout.zones(side_um=(8, 16, 32), pitch_um=(1, 2, 4))),
     "Penrose": lambda: fs.layout.penrose(side_um=2.0, size_um=30.0),
     "Voronoi": lambda: fs.layout.voronoi(n_sites=200, size_um=(30.0, 30.0), seed=3),

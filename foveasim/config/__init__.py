@@ -6,6 +6,7 @@ A file names a call of the package and its parameters: the file and the Python c
 
 from __future__ import annotations
 
+from foveasim.config._models import GENERATORS
 from foveasim.config._objects import (
     YAML_ENDINGS,
     LayoutFile,
@@ -26,6 +27,7 @@ from foveasim.config._objects import (
 from foveasim.config._problems import validated
 
 __all__ = [
+    "GENERATORS",
     "YAML_ENDINGS",
     "LayoutFile",
     "Shot",

@@ -39,7 +39,7 @@ from foveasim.sensor import (
     read_filters,
 )
 
-__all__ = ["PICTURES", "LayoutUnion", "PerArea", "RulesSection", "ShotSection", "call_of"]
+__all__ = ["GENERATORS", "PICTURES", "LayoutUnion", "PerArea", "RulesSection", "ShotSection", "call_of"]
 
 #: What a section is a call of.
 _CALLS: dict[type[BaseModel], Callable[..., Any]] = {}
@@ -100,7 +100,8 @@ class PerArea(_Section):
     per_um2: float
 
 
-_GENERATORS: dict[str, Callable[..., Layout]] = {
+#: Every layout family by its name in settings files, which is that of its function.
+GENERATORS: dict[str, Callable[..., Layout]] = {
     "foveal_cartesian": layouts.foveal_cartesian,
     "fovi": layouts.fovi,
     "giotto": layouts.giotto,
@@ -244,7 +245,7 @@ LayoutUnion = _one_of(
             __base__=_LayoutSection,
             parameters=(_model(f"{name} parameters", call, _NOT_IN_FILES, **_IN_FILES), ...),
         )
-        for name, call in _GENERATORS.items()
+        for name, call in GENERATORS.items()
     },
 )
 

@@ -24,7 +24,7 @@ from foveasim.rings import next_vertex, positions_in_runs, ring_moments
 if TYPE_CHECKING:
     from foveasim.layout.rules import DesignRules
 
-__all__ = ["RULES", "Case", "Measured", "Rule", "min_width_um"]
+__all__ = ["RULES", "Case", "Measured", "Rule", "is_below_size", "min_width_um"]
 
 #: Lengths are compared with this tolerance, a thousandth of the finest manufacturing grid (1 nm).
 LENGTH_ROUNDING_UM = 1e-6
@@ -194,6 +194,10 @@ class Rule:
     is_upper: bool = False
     is_deviation: bool = False
     rounding: float = LENGTH_ROUNDING_UM
+
+    def excess(self, values: Floats, limit: float) -> Floats:
+        """Distance of values beyond a limit; negative for those within it. Those above ``rounding`` are violations."""
+        return values - limit if self.is_upper else limit - values
 
 
 def _sizes(case: Case) -> Measured:
@@ -518,6 +522,12 @@ RULES: Mapping[str, Rule] = {
     ),
     "max_track_use": Rule("readout lines have tracks to get out", "", _track_uses, is_upper=True, rounding=0.0),
 }
+
+
+def is_below_size(area_um2: Floats, min_size_um: float) -> Bools:
+    """Whether the rule ``min_size_um`` rejects a site of an area: what makes or joins sites compares sizes as it does."""
+    rule = RULES["min_size_um"]
+    return np.asarray(rule.excess(np.sqrt(area_um2), min_size_um) > rule.rounding)
 
 
 def min_width_um(layout: Layout) -> Floats:

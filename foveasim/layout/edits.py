@@ -25,6 +25,7 @@ from foveasim.arrays import (
     unmasked,
 )
 from foveasim.errors import GeometryError, ParameterError
+from foveasim.layout._measures import is_below_size
 from foveasim.layout._model import Layout
 from foveasim.layout._noding import points_on_edges
 from foveasim.layout._regions import as_region
@@ -194,7 +195,8 @@ def merge_small(layout: Layout, *, min_size_um: float) -> Layout:
     ----------
     layout : Layout
     min_size_um : float, µm
-        Smallest size, the square root of a site's area.
+        Smallest size, the square root of a site's area. Sites that the design rule ``min_size_um`` accepts stay as they
+        are.
 
     Returns
     -------
@@ -208,7 +210,7 @@ def merge_small(layout: Layout, *, min_size_um: float) -> Layout:
     """
     min_size_um = check_length_um("min_size_um", min_size_um)
     while True:
-        small = np.flatnonzero(layout.area_um2 < min_size_um**2)
+        small = np.flatnonzero(is_below_size(layout.area_um2, min_size_um))
         groups = joining_groups(layout, small[np.argsort(layout.area_um2[small], kind="stable")])
         if np.array_equal(groups, np.arange(layout.n_sites)):
             return layout

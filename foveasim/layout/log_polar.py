@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Any, Literal, get_args
 
 import numpy as np
+import shapely
 
 from foveasim.arrays import (
     MAX_SITES,
@@ -17,8 +19,9 @@ from foveasim.arrays import (
     check_number,
     check_sites,
 )
-from foveasim.errors import ParameterError
+from foveasim.errors import LayoutWarning, ParameterError
 from foveasim.layout._annuli import MIN_SITES_PER_RHO, Annuli, Fovea, Ring, annuli, fovea_rings
+from foveasim.layout._measures import is_below_size
 from foveasim.layout._model import Layout
 from foveasim.layout.tiling import with_hexagons
 from foveasim.rings import ring_moments
@@ -29,6 +32,10 @@ __all__ = ["log_polar", "square_ring_ratio"]
 SITES_PER_RHO = 6
 #: Rings thinner than this share of their radius are rounding.
 RATIO_ROUNDING = 1e-12
+#: A coordinate at the radius r is rounded by up to this times r (angle, cosine and product), and a side by twice that.
+COORDINATE_ROUNDING = 4.0 * np.finfo(np.float64).eps
+#: Rings that end inside this fraction of ``r_max_um`` leave a fifth of the field's area open, which needs a warning.
+MIN_REACH = 0.9
 
 
 def square_ring_ratio(n_sectors: int) -> float:
@@ -75,12 +82,15 @@ def log_polar(
     n_sectors : int
         Sites a ring, at least 3.
     r_max_um : float, µm
-        No ring reaches further out.
+        No ring reaches further out. Rings grow by their ratio and end where one more would cross this radius: with
+        ``n_rings`` exactly here, otherwise inside.
     min_size_um : float, optional, µm
-        Smallest pixel that can be made, measured as the arc on a ring's centre line (and less where rings are thinner
-        than squarish ones). Rings whose sites would be smaller are left out: that is the **blind spot**, of the radius
-        ``min_size * n_sectors / 2π`` on the first ring's centre line where the sites are squarish. A design rule measures
-        a site by its area or its narrowest place instead, which are a little less than the arc.
+        Smallest pixel that can be made. No site is smaller as the design rule ``min_size_um`` measures it, by the square
+        root of its area between chords; and no ring is thinner, and no arc on a ring's centre line shorter. Rings whose
+        sites would be smaller are left out: that is the **blind spot**. Where sites are squarish, its radius on the first
+        ring's centre line is ``min_size / (2 sin(π / n_sectors))`` with two chords an arc or more, and tends to
+        ``min_size * n_sectors / 2π`` for many sectors. A site is narrower than its size at its inner arc, which the rule
+        ``min_width_um`` measures.
     r_min_um : float, optional, µm
         Inner radius of the first ring; by default the smallest that ``min_size_um`` allows.
     n_rings : int, optional
@@ -109,7 +119,12 @@ def log_polar(
     Raises
     ------
     ParameterError
-        When a number is out of range, or no ring fits.
+        When a number is out of range, no ring fits, or a fovea inside a given ``r_min_um`` has no site of the minimum size.
+
+    Warns
+    -----
+    LayoutWarning
+        When the rings end inside nine tenths of ``r_max_um``, as those of a coarse ratio may.
     """
     n_sectors = check_count("n_sectors", n_sectors, at_least=3, at_most=MAX_SITES)
     check_choice("fovea", fovea, get_args(Fovea))
@@ -132,8 +147,11 @@ def log_polar(
     else:
         ratio = square_ring_ratio(n_sectors)
 
-    radii_um = _ring_radii_um(n_sectors, ratio, r_min_um, r_max_um, min_size_um, n_rings)
     n_chords = chords_per_arc * (2 if stagger and chords_per_arc % 2 else 1)
+    smallest_um = 0.0
+    if min_size_um is not None:
+        smallest_um = min_size_um * _radius_per_size(n_sectors, ratio, n_chords, fovea, is_given=r_min_um is not None)
+    radii_um = _ring_radii_um(n_sectors, ratio, r_min_um, r_max_um, smallest_um, n_rings)
     rings = [Ring(n_sectors, int(stagger and i % 2 == 1), n_chords) for i in range(radii_um.size - 1)]
     if fovea in {"rings", "linear"}:
         sites, n_sites = _with_fovea(
@@ -178,23 +196,55 @@ def _with_fovea(
     min_size_um: float,
     n_chords: int,
 ) -> tuple[Annuli, Ints]:
-    """Rings with a fovea of so many rings that none of its sites is below the minimum size, and the sites of each ring."""
+    """Rings with a fovea of as many rings as leave no site below the minimum size, and the number of sites of each ring."""
     n_sectors = rings[0].n_sites
     n_rings = max(1, min(round(ratio / (ratio - 1.0) + 0.5), n_sectors // MIN_SITES_PER_RHO))
-    while True:
+    for n in range(n_rings, 0, -1):
         heights, inside = fovea_rings(
-            filling, n_rings=n_rings, n_sectors=n_sectors, n_per_ring=SITES_PER_RHO, n_chords=n_chords
+            filling, n_rings=n, n_sectors=n_sectors, n_per_ring=SITES_PER_RHO, n_chords=n_chords
         )
         inside_um = heights * (radii_um[0] / heights[-1])
-        # The ring around the fovea gives corners to its border.
-        sites = annuli(np.concatenate((inside_um, radii_um[1:2])), [*inside, rings[0]])
-        area_um2, _ = ring_moments(sites.xy_um, sites.ring_offsets)
-        if n_rings == 1 or math.sqrt(area_um2[sites.ring < n_rings].min()) >= min_size_um:
+        # The fovea gives corners to the ring around it, which take some of its area, or all where chords are coarse.
+        if _are_sites(annuli(np.concatenate((inside_um, radii_um[1:2])), [*inside, rings[0]]), min_size_um):
             all_rings = [*inside, *rings]
             n_sites = np.array([ring.n_sites for ring in all_rings])
             check_sites(int(n_sites.sum()))
             return annuli(np.concatenate((inside_um, radii_um[1:])), all_rings), n_sites
-        n_rings -= 1
+    raise ParameterError(
+        "fovea", f"leaves no room for a site of {min_size_um:g} µm inside the first ring", filling,
+        cure="enlarge 'r_min_um', or leave it out",
+    )  # fmt: skip
+
+
+def _are_sites(sites: Annuli, min_size_um: float) -> bool:
+    """Whether all outlines are simple and none is below the minimum size."""
+    area_um2, _ = ring_moments(sites.xy_um, sites.ring_offsets)
+    if area_um2.min() <= 0.0 or is_below_size(area_um2, min_size_um).any():
+        return False
+    layout = Layout(sites.xy_um, sites.ring_offsets, np.arange(sites.ring_offsets.size))
+    return bool(shapely.is_valid(layout.polygons()).all())
+
+
+def _radius_per_size(n_sectors: int, ratio: float, n_chords: int, fovea: Fovea, *, is_given: bool) -> float:
+    """
+    Smallest inner radius of a ring whose sites are not below a minimum size, over that size.
+
+    With the inner radius 1, a ring is ``ratio - 1`` high, its arc on the centre line ``π (1 + ratio) / n_sectors`` long, and
+    the triangles between the axis and the chords of a sector have the areas ``triangles`` and ``ratio² triangles``.
+    """
+    sector_rad = 2.0 * math.pi / n_sectors
+    triangles = 0.5 * n_chords * math.sin(sector_rad / n_chords)
+    area = triangles * (ratio**2 - 1.0)
+    if fovea == "rings":
+        # The fovea's corners on the inner circle may take what lies between its chords and its arc. Where that is most
+        # of the site, the fovea must have fewer corners instead.
+        least = triangles * ratio**2 - 0.5 * sector_rad
+        area = least if least > 0.5 * area else area
+    needs = [1.0 / math.sqrt(area), 1.0 / (ratio - 1.0), 2.0 / (sector_rad * (1.0 + ratio))]
+    if fovea != "none" and not is_given:
+        needs.append(1.0 / math.sqrt(n_sectors * triangles))  # the disc is one site at least
+    # A site is the larger by this that the rounding of its corners takes from its sides.
+    return max(needs) * (1.0 + COORDINATE_ROUNDING * (n_sectors + ratio / (ratio - 1.0)))
 
 
 def _ring_radii_um(
@@ -202,14 +252,10 @@ def _ring_radii_um(
     ratio: float,
     r_min_um: float | None,
     r_max_um: float,
-    min_size_um: float | None,
+    smallest_um: float,
     n_rings: int | None,
 ) -> Floats:
-    """Radii of the circles between the rings that are kept, (n_ring + 1,)."""
-    # Size of a site over its centre-line radius: its arc, less where rings are thinner than squarish ones.
-    half_height = (ratio - 1.0) / (ratio + 1.0)
-    size_per_radius = (2.0 * math.pi / n_sectors) * min(1.0, half_height / math.sin(math.pi / n_sectors))
-    smallest_um = 0.0 if min_size_um is None else min_size_um / size_per_radius * 2.0 / (1.0 + ratio)
+    """Radii of the circles between the rings that are kept, (n_ring + 1,), none of which begins inside ``smallest_um``."""
     first_um = smallest_um if r_min_um is None else r_min_um
     rounding = 1.0 + 1e-12
     n = math.log(r_max_um * rounding / first_um) / math.log(ratio) if first_um < r_max_um else 0.0
@@ -218,7 +264,7 @@ def _ring_radii_um(
             "ring_ratio", f"gives more than {MAX_SITES} sites", ratio, cure="take a larger ratio or r_min_um"
         )
     radii_um = first_um * np.power(ratio, np.arange((int(n) if n_rings is None else n_rings) + 1))
-    radii_um = radii_um[radii_um * rounding >= smallest_um]
+    radii_um = radii_um[radii_um >= smallest_um]
     if radii_um.size < 2:
         raise ParameterError(
             "r_max_um",
@@ -227,5 +273,14 @@ def _ring_radii_um(
             r_max_um,
             "µm",
             "enlarge it, or take fewer sectors or a smaller minimum size",
+        )
+    if radii_um[-1] < MIN_REACH * r_max_um:
+        last_um, next_um = float(radii_um[-1]), float(radii_um[-1]) * ratio
+        warnings.warn(
+            f"'r_max_um' is {r_max_um:g} µm, and the rings end at {last_um:.6g} µm: the next one, {ratio:.6g} times as large, "
+            f"would reach {next_um:.6g} µm; take 'r_max_um' = {next_um * (1.0 + 1e-5):.6g} µm, or 'n_rings' with 'r_min_um' = "
+            f"{radii_um[0]:.6g} µm, which end at 'r_max_um'",
+            LayoutWarning,
+            stacklevel=3,
         )
     return radii_um

@@ -387,7 +387,7 @@ def check(layout: Layout, rules: DesignRules) -> Report:
 
 def _broken(rule: Rule, found: Measured, limit: float, case: Case) -> tuple[Floats, Callable[[], tuple[Any, Any]]]:
     """The values that break the limit, the worst first, and what gives their sites and markers."""
-    beyond = found.values - limit if rule.is_upper else limit - found.values
+    beyond = rule.excess(found.values, limit)
     bad = np.flatnonzero(beyond > rule.rounding)
     bad = bad[np.argsort(-beyond[bad], kind="stable")]
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 import shapely
 
 from foveasim.arrays import Floats, check_choice, check_length_um, check_sites, finite_array
-from foveasim.errors import GeometryError, ParameterError
+from foveasim.errors import GeometryError, LayoutWarning, ParameterError
+from foveasim.layout._measures import is_below_size
 from foveasim.layout._model import Layout
 from foveasim.layout._regions import as_region, one_region, told_region
 from foveasim.layout.edits import clip, merge_small, union
@@ -26,6 +28,8 @@ CORNERS = {
 }
 #: Pieces of less than this share of a cell are joined to a neighbour, unless the user says otherwise.
 SMALL_SHARE = 0.5
+#: Open areas below this fraction of the region are rounding.
+AREA_ROUNDING = 1e-9
 
 
 def tiling(
@@ -67,7 +71,8 @@ def tiling(
         What becomes of cells that the border cuts: pieces below ``min_size_um`` are joined to the neighbour with which
         they share most edge; pieces stay as they are; or only whole cells are kept.
     min_size_um : float, optional, µm
-        Smallest size, the square root of the area, of a site where pieces are joined; half a cell's area by default.
+        Smallest size, the square root of the area, of a site, as the design rule ``min_size_um`` measures it; half a cell's
+        area by default. It does not go with ``border="cut"``, nor with ``"drop"`` where whole cells are smaller.
     origin_um : (x, y), µm
         Where a cell has its centre.
 
@@ -80,9 +85,14 @@ def tiling(
     Raises
     ------
     ParameterError
-        When a number is out of range, or the region is not told once.
+        When a number is out of range, the region is not told once, or the border leaves sites below ``min_size_um``.
     GeometryError
         When no site is left: the region is smaller than one.
+
+    Warns
+    -----
+    LayoutWarning
+        When parts of the region that are smaller than a site stay open, where pieces are joined.
 
     Examples
     --------
@@ -99,11 +109,36 @@ def tiling(
         raise ParameterError("origin_um", "must be two numbers (x, y)", origin_um, "µm")
     if min_size_um is not None:
         min_size_um = check_length_um("min_size_um", min_size_um)
+        if border == "cut":
+            raise ParameterError(
+                "min_size_um",
+                "must be left out with border='cut', which keeps every piece",
+                min_size_um,
+                "µm",
+                "take border='merge'",
+            )
     lattice = _lattice(outline.bounds, pitch_um, cells, origin)
+    if border == "drop" and min_size_um is not None and is_below_size(lattice.area_um2, min_size_um).any():
+        raise ParameterError(
+            "min_size_um",
+            f"must be <= {math.sqrt(lattice.area_um2[0]):.6g}, the size of a whole cell",
+            min_size_um,
+            "µm",
+            "take a larger pitch, or border='merge'",
+        )
     layout = clip(lattice, outline, cut="drop" if border == "drop" else "pieces")
     if border == "merge":
         smallest_um = math.sqrt(SMALL_SHARE * lattice.area_um2[0]) if min_size_um is None else min_size_um
+        pieces_um2 = float(layout.area_um2.sum())
         layout = _merged(layout, smallest_um)
+        open_um2 = pieces_um2 - float(layout.area_um2.sum())
+        if layout.n_sites and open_um2 > AREA_ROUNDING * pieces_um2:
+            warnings.warn(
+                f"{open_um2:.6g} µm² of the region stay open, in parts that are smaller than a site of {smallest_um:.6g} µm; "
+                "leave them out of the region, or take a smaller 'min_size_um'",
+                LayoutWarning,
+                stacklevel=2,
+            )
     if layout.n_sites == 0:
         raise GeometryError("the region holds no site: it is smaller than one; enlarge it, or take a smaller pitch")
     row, column = (layout.columns[name] - layout.columns[name].min() for name in ("row", "column"))
@@ -194,7 +229,7 @@ def _hexagons(region: Any, size_um: float) -> Layout:
 def _merged(pieces: Layout, min_size_um: float) -> Layout:
     """Small pieces joined to their neighbours; those that have none are left out."""
     layout = merge_small(pieces, min_size_um=min_size_um)
-    return layout[layout.area_um2 >= min_size_um**2]
+    return layout[~is_below_size(layout.area_um2, min_size_um)]
 
 
 def _lattice(bounds_um: tuple[float, float, float, float], pitch_um: float, cells: str, origin_um: Floats) -> Layout:

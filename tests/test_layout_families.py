@@ -1,0 +1,342 @@
+"""
+What every layout family promises, for all generators of the package.
+
+The list of generators is that of settings files, ``foveasim.config.GENERATORS``. A generator without an example here fails
+the first test; one that takes ``min_size_um`` is found by its signature.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import math
+import types
+from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import HealthCheck, assume, example, given, settings
+from hypothesis import strategies as st
+
+import foveasim as fs
+from foveasim.config import GENERATORS, schema
+from foveasim.errors import FoveasimError
+
+#: Generators draw what is not possible together: most of it is rejected by them, with an error of the package.
+drawn = settings(
+    deadline=None,
+    derandomize=True,
+    max_examples=60,
+    suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
+)
+quiet = pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")
+
+
+class Family(NamedTuple):
+    """Parameters of a generator, the area that its sites tile in closed form (None: they do not tile), and open holes."""
+
+    generator: str
+    parameters: dict[str, Any]
+    area_um2: float | None
+    n_holes: int = 0
+
+
+def polygon_um2(n_corners, radius_um):
+    return 0.5 * n_corners * math.sin(2.0 * math.pi / n_corners) * radius_um**2
+
+
+def rhombs_um2(layout, side_um):
+    n_thick = int(layout.columns["is_thick"].sum())
+    return side_um**2 * (
+        n_thick * math.sin(math.radians(72.0)) + (layout.n_sites - n_thick) * math.sin(math.radians(36.0))
+    )
+
+
+IMPORTANCE = np.zeros((16, 8))
+IMPORTANCE[3, 5] = 1.0
+PENROSE = {"side_um": 3.0, "size_um": 40.0}
+GIOTTO = {"n_rho": 12, "n_theta": 40, "n_fovea": 5, "n_across": 40, "unit_um": 2.0}
+RINGS = {"n_sectors": 24, "r_max_um": 60.2, "min_size_um": 2.0}
+EXACT = {"n_sectors": 24, "r_min_um": 10.0, "r_max_um": 60.0, "n_rings": 7, "stagger": True}
+NOTCHED = [[0.0, 0.0], [20.0, 0.0], [20.0, 15.0], [8.0, 9.0], [0.0, 15.0]]
+FAMILIES = [
+    Family("foveal_cartesian", {"n_rings": 6, "ring_ratio": 1.4, "pitch_um": 2.0}, (2.0 * 1.4**5) ** 2),
+    Family("fovi", {"fov_um": 100.0, "a_um": 10.0, "n_rings": 6, "n_chords": 99}, math.nan),
+    Family("giotto", GIOTTO, polygon_um2(80, 40.0)),
+    Family("giotto", {**GIOTTO, "fovea": "hexagons", "stagger": False}, polygon_um2(40, 40.0)),
+    Family("giotto", {**GIOTTO, "fovea": "none"}, polygon_um2(80, 40.0) - polygon_um2(80, 9.0), n_holes=1),
+    Family("grid", {"n_x": 5, "n_y": 3, "pitch_um": 2.2, "pitch_y_um": 3.0}, 15 * 2.2 * 3.0),
+    Family("grid", {"n_x": 5, "n_y": 3, "pitch_um": 2.2, "trench_um": 0.2}, None),
+    Family("hexagonal", {"n_columns": 5, "n_rows": 4, "pitch_um": 2.0}, 20 * math.sqrt(3.0) / 2.0 * 4.0),
+    Family("log_polar", EXACT, polygon_um2(48, 60.0) - polygon_um2(48, 10.0), n_holes=1),
+    Family("log_polar", {**EXACT, "fovea": "rings"}, polygon_um2(48, 60.0)),
+    Family("log_polar", {**EXACT, "fovea": "linear", "chords_per_arc": 3}, polygon_um2(144, 60.0)),
+    Family("log_polar", {**EXACT, "fovea": "hexagons", "min_size_um": 2.0}, polygon_um2(48, 60.0)),
+    Family("octagonal", {"n_x": 4, "n_y": 3, "pitch_um": 5.0, "border": "cut"}, 12 * 25.0),
+    Family("penrose", PENROSE, rhombs_um2(fs.layout.penrose(**PENROSE), 3.0)),
+    Family("quadtree", {"importance": IMPORTANCE, "pitch_um": 1.5, "limit": 0.5, "n_levels": 3}, 128 * 1.5**2),
+    Family("sunflower", {"n_sites": 90, "spacing_um": 2.0, "n_chords": 64}, math.nan),
+    Family("tiling", {"pitch_um": 2.0, "region": NOTCHED}, 300.0 - 0.5 * 20.0 * 6.0),
+    Family("tiling", {"pitch_um": 2.0, "size_um": [21.0, 9.0], "cells": "squares", "border": "cut"}, 189.0),
+    Family("voronoi", {"n_sites": 60, "size_um": (20.0, 30.0), "n_iterations": 3}, 600.0),
+    Family("zones", {"side_um": [8.0, 16.0, 48.0], "pitch_um": [1.0, 2.0, 4.0]}, 48.0**2),
+    Family("zones", {"side_um": [8.0, 17.0], "pitch_um": [1.0, 2.0], "cells": "hexagons"}, 17.0**2),
+]
+names = [f"{family.generator} {i}" for i, family in enumerate(FAMILIES)]
+every_family = pytest.mark.parametrize("family", FAMILIES, ids=names)
+
+
+def made(family):
+    return GENERATORS[family.generator](**family.parameters)
+
+
+def test_every_public_generator_is_listed_and_has_an_example():
+    # A family is a function that is called like its module and makes a layout from nothing but numbers and shapes.
+    public = {
+        name
+        for name in fs.layout.__all__
+        if getattr(getattr(fs.layout, name), "__module__", "") == f"foveasim.layout.{name}"
+        and inspect.signature(getattr(fs.layout, name)).return_annotation == "Layout"
+        and "layout" not in inspect.signature(getattr(fs.layout, name)).parameters
+    }
+
+    assert set(GENERATORS) == public
+    assert all(getattr(fs.layout, name) is generator for name, generator in GENERATORS.items())
+    assert {family.generator for family in FAMILIES} == set(GENERATORS)
+
+
+@every_family
+def test_sites_are_simple_polygons_with_area(family):
+    layout = made(family)
+    rebuilt = fs.Layout.from_polygons((layout.xy_um, layout.ring_offsets, layout.site_offsets))
+
+    assert layout.n_sites > 1
+    assert shapely.is_valid(layout.polygons()).all()
+    assert layout.area_um2.min() > 0.0
+    # Nothing had to be wound round or left out.
+    assert np.array_equal(rebuilt.xy_um, layout.xy_um)
+    assert all(column.shape == (layout.n_sites,) for column in layout.columns.values())
+
+
+@every_family
+def test_sites_tile_without_gap_or_overlap(family):
+    layout = made(family)
+    polygons = layout.polygons()
+    first, second = shapely.STRtree(polygons).query(polygons, predicate="intersects")
+    common_um2 = shapely.area(shapely.intersection(polygons[first], polygons[second])[first < second])
+
+    assert common_um2.max(initial=0.0) <= 1e-9 * layout.area_um2.min()
+    assert layout.check(fs.DesignRules(max_overlap_um2=0.0)).ok
+    if family.area_um2 is None:
+        return
+    covered = shapely.union_all(polygons)
+    expected_um2 = family.area_um2
+    if math.isnan(expected_um2):  # a regular polygon whose size the family chooses
+        expected_um2 = polygon_um2(family.parameters["n_chords"], layout.provenance["radius_um"])
+    assert covered.geom_type == "Polygon"
+    assert sum(shapely.Polygon(ring).area > 1e-9 for ring in covered.interiors) == family.n_holes
+    assert layout.area_um2.sum() == pytest.approx(expected_um2, rel=1e-9)
+    assert len(layout.check(fs.DesignRules(max_gap_um2=0.0)).violations) == family.n_holes
+
+
+@every_family
+def test_npz_keeps_every_family_bit_for_bit(family, tmp_path):
+    layout = made(family)
+    layout.write(tmp_path / "layout.npz")
+    read = fs.read_layout(tmp_path / "layout.npz")
+
+    for name in ("xy_um", "ring_offsets", "site_offsets"):
+        assert np.array_equal(getattr(read, name), getattr(layout, name))
+    assert read.columns.keys() == layout.columns.keys()
+    for name, column in layout.columns.items():
+        assert read.columns[name].dtype == column.dtype
+        assert np.array_equal(read.columns[name], column)
+    assert read.provenance["generator"] == family.generator
+
+
+@every_family
+def test_provenance_repeats_every_family(family):
+    layout = made(family)
+    told = layout.provenance["parameters"]
+
+    assert layout.provenance["generator"] == family.generator
+    assert set(told) == set(inspect.signature(GENERATORS[family.generator]).parameters)
+    if family.generator != "quadtree":  # whose picture is not kept
+        assert np.array_equal(GENERATORS[family.generator](**told).xy_um, layout.xy_um)
+
+
+@pytest.mark.parametrize("name", GENERATORS)
+def test_settings_files_take_every_generator(name):
+    sections = schema()["$defs"]
+    keys = next(s for s in sections.values() if s["title"] == f"{name} parameters")["properties"]
+    not_in_files = {"density_grid"}
+
+    assert set(keys) == set(inspect.signature(GENERATORS[name]).parameters) - not_in_files
+    assert f'"const": "{name}"' in json.dumps(sections)
+
+
+# -- the minimum size ------------------------------------------------------------------------------------------------
+
+WITH_MIN_SIZE = [name for name, call in GENERATORS.items() if "min_size_um" in inspect.signature(call).parameters]
+
+
+def values_of(name, hint):
+    """Values of a parameter by its type, and for numbers by the unit in its name; None where the type does not help."""
+    if get_origin(hint) is Literal:
+        return st.sampled_from(get_args(hint))
+    if get_origin(hint) in (Union, types.UnionType):
+        parts = [values_of(name, part) for part in get_args(hint) if part is not type(None)]
+        return st.one_of(*parts) if all(part is not None for part in parts) else None
+    if get_origin(hint) is tuple:
+        parts = [values_of(name, part) for part in get_args(hint)]
+        return st.tuples(*parts) if all(part is not None for part in parts) else None
+    if hint is float:
+        return st.floats(1.01, 4.0) if "ratio" in name else st.floats(0.5, 30.0)
+    return {bool: st.booleans(), int: st.integers(1, 40)}.get(hint)
+
+
+@st.composite
+def parameters_of(draw, call):
+    """Parameters of a generator: those with a default are often left out."""
+    hints = get_type_hints(call)
+    found = {}
+    for name, parameter in inspect.signature(call).parameters.items():
+        values = values_of(name, hints[name])
+        is_needed = parameter.default is inspect.Parameter.empty or name == "min_size_um"
+        if values is None:
+            assert not is_needed, f"no values for '{name}' of {call.__name__}: extend values_of"
+        elif is_needed or draw(st.booleans()):
+            found[name] = draw(values)
+    return found
+
+
+def assert_no_site_is_rejected(layout, min_size_um):
+    report = layout.check(fs.DesignRules(min_size_um=min_size_um))
+
+    assert report.ok, str(report)
+
+
+def test_some_generators_take_a_minimum_size():
+    assert {"log_polar", "tiling"} <= set(WITH_MIN_SIZE)
+
+
+@quiet
+@pytest.mark.parametrize("name", WITH_MIN_SIZE)
+def test_no_generator_makes_a_site_below_its_minimum_size(name):
+    n_made = 0
+
+    @drawn
+    @given(parameters=parameters_of(GENERATORS[name]))
+    def check(parameters):
+        nonlocal n_made
+        try:
+            layout = GENERATORS[name](**parameters)
+        except FoveasimError:
+            assume(False)
+        n_made += 1
+        assert_no_site_is_rejected(layout, parameters["min_size_um"])
+
+    check()
+    assert n_made >= 30
+
+
+@st.composite
+def log_polar_parameters(draw):
+    n_sectors = draw(st.integers(3, 600))
+    min_size_um = draw(st.floats(0.01, 100.0))
+    blind_um = min_size_um * n_sectors / (2.0 * math.pi)
+    r_min_um = draw(st.none() | st.floats(0.02, 3.0).map(lambda x: x * blind_um))
+    ratio = draw(st.none() | st.floats(1.0 + 4.0 / n_sectors, 3.0))
+    return {
+        "n_sectors": n_sectors,
+        "min_size_um": min_size_um,
+        "r_min_um": r_min_um,
+        "r_max_um": max(blind_um, r_min_um or 0.0) * draw(st.floats(1.5, 8.0)),
+        "ring_ratio": ratio,
+        "fovea": draw(st.sampled_from(["none", "rings", "linear"])),
+        "stagger": draw(st.booleans()),
+        "chords_per_arc": draw(st.sampled_from([1, 2, 3, 4, 7])),
+    }
+
+
+@quiet
+@drawn
+@given(parameters=log_polar_parameters())
+@example(parameters={"n_sectors": 192, "min_size_um": 2.0, "r_max_um": 690.0, "stagger": True, "chords_per_arc": 2})
+@example(parameters={"n_sectors": 192, "min_size_um": 2.0, "r_max_um": 300.0, "fovea": "rings"})
+@example(parameters={"n_sectors": 6, "min_size_um": 2.0, "r_max_um": 100.0, "ring_ratio": 9.0, "fovea": "linear"})
+def test_log_polar_sites_reach_the_minimum_size_without_rounding(parameters):
+    try:
+        layout = fs.layout.log_polar(**parameters)
+    except FoveasimError:
+        assume(False)
+
+    assert np.sqrt(layout.area_um2).min() >= parameters["min_size_um"]
+    assert_no_site_is_rejected(layout, parameters["min_size_um"])
+
+
+@quiet
+@drawn
+@given(
+    n_sectors=st.integers(3, 40),
+    ring_ratio=st.floats(1.005, 1.2),
+    fovea=st.sampled_from(["rings", "linear", "hexagons"]),
+    chords_per_arc=st.integers(1, 3),
+    stagger=st.booleans(),
+)
+def test_foveas_inside_coarse_chords_do_not_cross_them(n_sectors, ring_ratio, fovea, chords_per_arc, stagger):
+    layout = fs.layout.log_polar(
+        n_sectors=n_sectors,
+        r_min_um=10.0,
+        r_max_um=20.0,
+        ring_ratio=ring_ratio,
+        fovea=fovea,
+        chords_per_arc=chords_per_arc,
+        stagger=stagger,
+    )
+    n_corners = n_sectors * chords_per_arc * (2 if stagger and chords_per_arc % 2 else 1)
+    outer_um = np.hypot(*layout.xy_um.T).max()
+
+    assert shapely.is_valid(layout.polygons()).all()
+    assert layout.area_um2.sum() == pytest.approx(polygon_um2(n_corners, outer_um), rel=1e-9)
+
+
+@pytest.mark.parametrize("cells", ["squares", "hexagons"])
+@pytest.mark.parametrize("pitch_um", [0.7, 2.2, 3.9])
+def test_whole_cells_of_exactly_the_minimum_size_stay(cells, pitch_um):
+    area_um2 = pitch_um**2 * (1.0 if cells == "squares" else math.sqrt(3.0) / 2.0)
+    parameters = {"pitch_um": pitch_um, "cells": cells, "size_um": (61 * pitch_um, 53 * pitch_um)}
+    layout = fs.layout.tiling(**parameters, min_size_um=math.sqrt(area_um2))
+    whole = fs.layout.tiling(**parameters, border="drop", min_size_um=math.sqrt(area_um2))
+    is_whole = np.isclose(layout.area_um2, area_um2, rtol=1e-9)
+
+    assert_no_site_is_rejected(layout, math.sqrt(area_um2))
+    # Squares fit the rectangle; hexagons at its border are joined to some of the whole ones.
+    assert is_whole.sum() == whole.n_sites if cells == "squares" else is_whole.sum() > 0.9 * whole.n_sites
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"border": "cut"}, "'min_size_um' must be left out with border='cut'"),
+        ({"border": "drop"}, "'min_size_um' must be <= 1.86121, the size of a whole cell, got 2.0 µm"),
+    ],
+)
+def test_tiling_rejects_a_minimum_size_it_cannot_keep(parameters, message):
+    with pytest.raises(fs.errors.ParameterError, match=message):
+        fs.layout.tiling(pitch_um=2.0, radius_um=20.0, min_size_um=2.0, **parameters)
+
+
+def test_tiling_warns_of_parts_too_small_for_a_site():
+    region = shapely.MultiPolygon([shapely.box(0, 0, 20, 20), shapely.box(30, 0, 31, 1)])
+
+    with pytest.warns(fs.errors.LayoutWarning, match="1 µm² of the region stay open, in parts that are smaller than a"):
+        layout = fs.layout.tiling(pitch_um=3.0, region=region)
+    assert layout.area_um2.sum() == pytest.approx(400.0)
+
+
+@pytest.mark.parametrize("fovea", ["rings", "linear", "hexagons"])
+def test_fovea_of_a_given_radius_too_small_for_a_site_is_rejected(fovea):
+    with pytest.raises(fs.errors.ParameterError, match="'fovea' leaves no room for a .* of 5 µm inside the first ring"):
+        fs.layout.log_polar(n_sectors=4, r_min_um=2.0, r_max_um=19.0, min_size_um=5.0, ring_ratio=9.0, fovea=fovea)
