@@ -34,9 +34,10 @@ from foveasim.capture import Capture
 from foveasim.errors import FoveasimError
 from foveasim.fields import Grid, PowerMap
 from foveasim.integrate import Integrator
-from foveasim.layout import DesignRules, Layout, read_layout
+from foveasim.layout import DesignRules, Layout
 from foveasim.maps import read_power_map, write_power_map
 from foveasim.optics import Optics
+from foveasim.reading import read_layout
 from foveasim.reconstruct import Picture
 from foveasim.scene import Scene
 from foveasim.sensor import FilterSet, GaussianCurve, PolynomialCurve, Sensor, SiliconQE, rgb_filters

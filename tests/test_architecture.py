@@ -28,7 +28,7 @@ FLOORS = [
     {"capture"},
     {"camera"},
     {"config", "metrics", "video", "view"},
-    {"explore", "shots"},
+    {"explore", "reading", "shots"},
     {"cli"},
 ]
 #: Loaded when they are used, not before.

@@ -155,7 +155,7 @@ def test_a_folder_that_cannot_be_made_is_told(folder):
 
 LAYOUT = """
 generator: log_polar
-parameters: {n_sectors: 16, r_min_um: 2.0, r_max_um: 20.0}
+parameters: {n_sectors: 16, r_min_um: 2.0, r_max_um: 14.5}
 rules: {min_size_um: 1.0, max_overlap_um2: 0.0}
 source: made for this test
 """
@@ -213,7 +213,7 @@ def test_bad_layout_files_end_with_one_sentence(tmp_path, arguments, words):
     ("layout", "radius"),
     [
         (
-            "{generator: log_polar, parameters: {n_sectors: 32, r_min_um: 10, r_max_um: 100}, move_um: [5.0, 3.0]}",
+            "{generator: log_polar, parameters: {n_sectors: 32, r_min_um: 10, r_max_um: 90}, move_um: [5.0, 3.0]}",
             "10.00",
         ),
         ("{generator: giotto, parameters: {n_rho: 12, n_theta: 40, n_fovea: 5, n_across: 40, unit_um: 4}}", "none"),

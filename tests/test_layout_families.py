@@ -338,5 +338,7 @@ def test_tiling_warns_of_parts_too_small_for_a_site():
 
 @pytest.mark.parametrize("fovea", ["rings", "linear", "hexagons"])
 def test_fovea_of_a_given_radius_too_small_for_a_site_is_rejected(fovea):
-    with pytest.raises(fs.errors.ParameterError, match="'fovea' leaves no room for a .* of 5 µm inside the first ring"):
+    with pytest.raises(
+        fs.errors.ParameterError, match=r"'fovea' leaves no room for a .* of 5 µm inside the first ring"
+    ):
         fs.layout.log_polar(n_sectors=4, r_min_um=2.0, r_max_um=19.0, min_size_um=5.0, ring_ratio=9.0, fovea=fovea)

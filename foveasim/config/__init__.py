@@ -22,9 +22,9 @@ from foveasim.config._objects import (
     read_settings,
     read_shot,
     schema,
-    shipped_layouts,
 )
 from foveasim.config._problems import validated
+from foveasim.layout import shipped_layouts
 
 __all__ = [
     "GENERATORS",

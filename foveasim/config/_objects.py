@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, TypeAdapter
 
-import foveasim
 from foveasim.arrays import check_number
 from foveasim.camera import Camera
 from foveasim.config._models import PICTURES, LayoutUnion, PerArea, RulesSection, ShotSection, call_of
@@ -19,7 +18,8 @@ from foveasim.config._problems import validated
 from foveasim.documents import parsed, read_yaml
 from foveasim.errors import ConfigError, FoveasimError, ParameterError
 from foveasim.fields import Grid, PowerMap
-from foveasim.layout import PRESETS, DesignRules, Layout, inset, mosaic, read_layout, snap
+from foveasim.layout import PRESETS, DesignRules, Layout, inset, mosaic, read_layout, shipped_layouts, snap
+from foveasim.layout.files import check_chip_options, layout_path
 from foveasim.optics import Optics
 from foveasim.pictures import read_picture
 from foveasim.scene import Scene
@@ -41,7 +41,6 @@ __all__ = [
     "read_settings",
     "read_shot",
     "schema",
-    "shipped_layouts",
 ]
 
 #: Pictures that come with scikit-image are named with this in front.
@@ -200,9 +199,7 @@ def build_shot(
     def layout_file() -> LayoutFile:
         if not isinstance(settings.layout, str):
             return _built_layout(path, "layout.", settings.layout)
-        beside = path.parent / settings.layout
-        name = settings.layout if settings.layout in shipped_layouts() and not beside.exists() else beside
-        read: LayoutFile = _call(path, "layout", read_any_layout, {"path": name})
+        read: LayoutFile = _call(path, "layout", read_any_layout, {"path": settings.layout, "folder": path.parent})
         return read
 
     def sensor_of_layout() -> Sensor:
@@ -258,28 +255,33 @@ def read_layout_file(path: str | Path) -> LayoutFile:
     return _built_layout(path, "", validated(path, LayoutUnion, read_yaml(path)))
 
 
-def read_any_layout(path: str | Path) -> LayoutFile:
+def read_any_layout(
+    path: str | Path, *, folder: str | Path = ".", layer: int | None = None, cell: str | None = None
+) -> LayoutFile:
     """
     Read a layout from a YAML file, from a file of any other format, or by the name of a layout that comes with the package.
+
+    Parameters
+    ----------
+    path : path or str
+        A file in the folder comes before a bundled layout of the same name.
+    folder : path
+        Where the path begins; the working directory by default.
+    layer, cell : optional
+        Of GDSII and OASIS, as for :func:`foveasim.layout.read_layout`.
 
     Raises
     ------
     FileError
-        When it cannot be read.
+        When there is neither such a file nor such a name, or it cannot be read.
+    ParameterError
+        When an option does not belong to the file's format.
     """
-    path = shipped_layouts().get(str(path), path) if not Path(path).exists() else path
-    path = Path(path)
+    path = layout_path(path, folder)
     if path.suffix.lower() in YAML_ENDINGS:
+        check_chip_options(layer=layer, cell=cell)
         return read_layout_file(path)
-    return LayoutFile(layout=read_layout(path), rules=None, source=str(path))
-
-
-def shipped_layouts() -> dict[str, Path]:
-    """Files of the layouts that come with the package, by their names: real sensors and those of the paper."""
-    package = Path(foveasim.__file__).parent
-    # An installed package has them inside; a checkout beside it.
-    folder = next(place / "layouts" for place in (package, package.parent) if (place / "layouts").is_dir())
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    return LayoutFile(layout=read_layout(path, layer=layer, cell=cell), rules=None, source=str(path))
 
 
 def read_rules(path: str | Path) -> DesignRules:

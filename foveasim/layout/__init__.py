@@ -7,7 +7,7 @@ from foveasim.layout.adjacency import adjacency
 from foveasim.layout.channels import MOSAICS, colouring, mosaic, random_channels
 from foveasim.layout.edits import clip, inset, merge, merge_small, node, punch, snap, split, union
 from foveasim.layout.enforce import Change, enforce
-from foveasim.layout.files import WrittenLayout, read_layout, write_layout
+from foveasim.layout.files import WrittenLayout, read_layout, shipped_layouts, write_layout
 from foveasim.layout.foveal_cartesian import foveal_cartesian
 from foveasim.layout.fovi import fovi
 from foveasim.layout.giotto import giotto, giotto_ratio
@@ -70,6 +70,7 @@ __all__ = [
     "read_layout",
     "readout_by",
     "readout_order",
+    "shipped_layouts",
     "snap",
     "split",
     "square_ring_ratio",

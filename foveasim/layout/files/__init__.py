@@ -25,6 +25,7 @@ from typing import Any
 
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout._model import Layout
+from foveasim.layout.files._bundled import layout_path, shipped_layouts
 from foveasim.layout.files._common import WrittenLayout, head_of
 from foveasim.layout.files.gds import GDS_MAGIC, OASIS_MAGIC
 from foveasim.layout.files.gds import read as read_gds
@@ -39,7 +40,7 @@ from foveasim.layout.files.npz import read as read_npz
 from foveasim.layout.files.npz import write as write_npz
 from foveasim.layout.files.svg import write as write_svg
 
-__all__ = ["WrittenLayout", "read_layout", "write_layout"]
+__all__ = ["WrittenLayout", "check_chip_options", "layout_path", "read_layout", "shipped_layouts", "write_layout"]
 
 _WRITERS: dict[str, Any] = {
     ".gds": write_gds,
@@ -64,6 +65,8 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
     """
     Read the photosites of a layout file.
 
+    Names of bundled layouts and YAML files are read by :func:`foveasim.read_layout`, which reads all other files by this.
+
     Parameters
     ----------
     path : path
@@ -87,12 +90,12 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
         When an option does not belong to the file's format.
     """
     path = Path(path)
+    if str(path) in shipped_layouts() and not path.exists():
+        raise FileError(path, "no such file; foveasim.read_layout reads the bundled layout of this name")
     head = head_of(path)
     if head.startswith((GDS_MAGIC, OASIS_MAGIC)):
         return read_gds(path, layer=layer, cell=cell)
-    for name, value in (("layer", layer), ("cell", cell)):
-        if value is not None:
-            raise ParameterError(name, "belongs to GDSII and OASIS files", value, cure="leave it out")
+    check_chip_options(layer=layer, cell=cell)
     if head.startswith(NPZ_MAGICS):
         return read_npz(path)
     if head.startswith(PARQUET_MAGIC):
@@ -104,6 +107,20 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
         if text.startswith(magic):
             raise FileError(path, cure)
     raise FileError(path, "is no layout file: expected GDSII, OASIS, npz, GeoJSON or GeoParquet")
+
+
+def check_chip_options(**options: object) -> None:
+    """
+    Reject options of chip files for a file of another format.
+
+    Raises
+    ------
+    ParameterError
+        When one is given.
+    """
+    for name, value in options.items():
+        if value is not None:
+            raise ParameterError(name, "belongs to GDSII and OASIS files", value, cure="leave it out")
 
 
 def write_layout(

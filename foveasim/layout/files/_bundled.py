@@ -1,0 +1,51 @@
+"""Layouts that come with the package: their names, and the file that a name stands for."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from pathlib import Path
+
+from foveasim.errors import FileError
+
+__all__ = ["layout_path", "shipped_layouts"]
+
+
+def shipped_layouts() -> dict[str, Path]:
+    """Files of the layouts that come with the package, by their names: real sensors and those of the paper."""
+    package = Path(__file__).parents[2]
+    # An installed package has them inside; in a checkout they lie next to it.
+    folder = next(place / "layouts" for place in (package, package.parent) if (place / "layouts").is_dir())
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def layout_path(name: str | Path, folder: str | Path = ".") -> Path:
+    """
+    Return the file of a layout, from its path or from the name of a bundled layout.
+
+    Parameters
+    ----------
+    name : path or str
+        A file in the folder comes before a bundled layout of the same name.
+    folder : path
+        Where the path begins; the working directory by default.
+
+    Raises
+    ------
+    FileError
+        When a name without extension is neither; with the closest name and all of them.
+    """
+    file = Path(folder) / name
+    bundled = shipped_layouts()
+    if file.is_file() or Path(name).name != str(name):
+        return file
+    if str(name) in bundled:
+        return bundled[str(name)]
+    closest = get_close_matches(Path(name).stem, bundled, n=1)
+    if Path(name).suffix or file.exists():
+        if closest and not file.exists():
+            raise FileError(file, f"no such file; '{closest[0]}' is a bundled layout")
+        return file
+    meant = f"did you mean '{closest[0]}'? " if closest else ""
+    raise FileError(
+        file, f"no such file, and not the name of a bundled layout; {meant}the names are {', '.join(bundled)}"
+    )
