@@ -36,6 +36,7 @@ __all__ = [
     "check_pitch_um",
     "check_shape",
     "check_sites",
+    "exact_integers",
     "finite_array",
     "handed_over",
     "own",
@@ -338,6 +339,18 @@ def finite_array(
             place = f" at [{', '.join(map(str, where))}]" if where else ""
             raise ParameterError(name, f"{rule} everywhere", float(array[where]), (unit_of(name) + place).strip())
     return array
+
+
+def exact_integers(values: Sequence[int]) -> NDArray[Any] | None:
+    """
+    Return integers as an int64 array, or as uint64 where that is needed; None where neither contains them all.
+
+    numpy makes floating-point numbers, which differ, of a list with integers of more than 63 bits.
+    """
+    low, high = min(values), max(values)
+    if low >= -(2**63) and high < 2**63:
+        return np.array(values, np.int64)
+    return np.array(values, np.uint64) if low >= 0 and high < 2**64 else None
 
 
 def wavelengths_nm(name: str, value: ArrayLike) -> Floats:

@@ -30,6 +30,7 @@ from foveasim.reconstruct import (
     raster_grid,
 )
 from foveasim.records import copied, described
+from foveasim.rings import same_rings
 from foveasim.sensor import Sensor, signal_to_noise
 
 if TYPE_CHECKING:
@@ -176,8 +177,8 @@ class Capture:
             even light gives each site, its area in µm² times its sensitivity (and, for codes, codes per electron over their
             mean): an even scene is even, whatever the sites' sizes.
         sensor : Sensor, optional
-            That made the capture: needed where its electronics differ from site to site in a layout of more than 64 sites,
-            since ``settings`` does not keep such.
+            That made the capture, with the same sites in the same order: needed where its electronics differ from site to
+            site in a layout of more than 64 sites, since ``settings`` does not keep such.
         **options
             Of the method's function. ``"least_squares"`` takes ``mu``, ``blur``, ``tolerance``, ``max_steps``, and the values'
             ``variance``; all take ``n_threads``.
@@ -190,8 +191,8 @@ class Capture:
         Raises
         ------
         ParameterError
-            When a choice is none of the above, an option none of the method's, or the electronics are not known where they are
-            needed.
+            When a choice is none of the above, an option none of the method's, the electronics are not known where they are
+            needed, or the sensor is of another layout.
 
         Notes
         -----
@@ -210,6 +211,7 @@ class Capture:
         if set(options) - known:
             name = min(set(options) - known)
             raise ParameterError(name, f"is no option of {method!r}, which has {', '.join(sorted(known))}")
+        self._check_sensor(sensor)
         grid = raster_grid(self.layout, max_pixels) if grid is None else grid
         n_filters = len(self.filter_names)
         is_own = self.filter_of_site == np.arange(n_filters)[:, np.newaxis]
@@ -261,17 +263,23 @@ class Capture:
         Raises
         ------
         ParameterError
-            When the electronics are not known, or the sensor is of another number of sites.
+            When the electronics are not known, or the sensor is of another layout.
         """
+        self._check_sensor(sensor)
         known = self._electronics(sensor, DEVICE)
         dark_e = known.expected_electrons(np.zeros(self.layout.n_sites), float(self.settings.get("exposure_s", 0.0)))
         return signal_to_noise(known, self.expected_e, np.broadcast_to(dark_e, self.expected_e.shape)).ratio
 
+    def _check_sensor(self, sensor: Sensor | None) -> None:
+        """Raise where a sensor is not of the capture's layout."""
+        if sensor is not None and (not isinstance(sensor, Sensor) or not same_rings(sensor.layout, self.layout)):
+            raise ParameterError(
+                "sensor", "must be the Sensor of the capture's layout, with the same sites in the same order", sensor
+            )
+
     def _electronics(self, sensor: Sensor | None, further: tuple[str, ...] = ()) -> Sensor:
         """The sensor as it is meant: the one given, or as much of it as the settings tell."""
         if sensor is not None:
-            if not isinstance(sensor, Sensor) or sensor.layout.n_sites != self.layout.n_sites:
-                raise ParameterError("sensor", f"must be the Sensor of these {self.layout.n_sites} sites", sensor)
             return sensor
         told = self.settings.get("sensor", {})
         for name in ELECTRONICS:

@@ -8,6 +8,8 @@ Outer rings are counter-clockwise and holes clockwise, so that signed areas simp
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -19,6 +21,7 @@ __all__ = [
     "positions_in_runs",
     "ring_moments",
     "ring_spread_um2",
+    "same_rings",
     "site_area_um2",
     "site_bounds_um",
     "site_moments",
@@ -99,6 +102,14 @@ def ring_spread_um2(xy_um: Floats, ring_offsets: Ints) -> Floats:
     local = xy_um - np.repeat(xy_um[ring_offsets[:-1]], np.diff(ring_offsets), axis=0)
     after = local[next_vertex(ring_offsets)]
     return 0.5 * np.add.reduceat(np.abs(local[:, 0] * after[:, 1] - local[:, 1] * after[:, 0]), ring_offsets[:-1])
+
+
+def same_rings(one: Any, other: Any) -> bool:
+    """Return whether two objects with packed rings have the same outlines in the same order, bit for bit."""
+    if one is other:
+        return True
+    pairs = [(getattr(one, name), getattr(other, name)) for name in ("site_offsets", "ring_offsets", "xy_um")]
+    return all(a is b or np.array_equal(a, b) for a, b in pairs)
 
 
 def site_moments(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> tuple[Floats, Floats]:

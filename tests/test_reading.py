@@ -84,7 +84,9 @@ def test_settings_files_look_in_their_folder_first(tmp_path, monkeypatch, two_si
 
 def test_the_reader_of_files_points_to_names(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(FileError, match="giotto_2: no such file; foveasim.read_layout reads the bundled layout of this"):
+    with pytest.raises(
+        FileError, match=r"giotto_2: no such file; foveasim.read_layout reads the bundled layout of this"
+    ):
         fs.layout.read_layout("giotto_2")
 
 

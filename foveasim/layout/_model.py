@@ -15,11 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim.arrays import (
     MAX_LENGTH_UM,
+    MAX_SITES,
     Bools,
     Floats,
     Ints,
     as_numbers,
     check_number,
+    exact_integers,
     finite_array,
     read_only,
     unmasked,
@@ -45,6 +47,15 @@ __all__ = ["Layout"]
 MIN_LAYOUT_UM = 1e-3
 #: A ring whose area is below this share of its bounding box is a line to float64.
 ZERO_AREA_SHARE = 1e-14
+#: Columns whose values are indices, of filters and of lines: more than MAX_SITES of either are an overflow.
+INDEX_COLUMNS = ("channel", "readout_line")
+#: What a column of integers may contain.
+INTEGER_RANGES = "integers from -2**63 to 2**63 - 1, or from 0 to 2**64 - 1"
+#: What GEOS says of holes, and what we say.
+HOLE_REASONS = {
+    "Hole lies outside shell": "has a hole outside its outline",
+    "Holes are nested": "has a hole inside another hole",
+}
 #: How many bad sites a message names.
 SHOWN_SITES = 5
 
@@ -55,8 +66,8 @@ class Layout:
     Photosites of a sensor: polygons in the sensor plane.
 
     Made by a generator (:func:`foveasim.layout.log_polar` and its neighbours), by :meth:`from_rectangles`, or by
-    :meth:`from_polygons`; the plain constructor takes packed rings that are right already and checks only their
-    structure.
+    :meth:`from_polygons`; the plain constructor takes packed rings that are right already and checks their structure and
+    the sites with holes.
 
     Parameters
     ----------
@@ -74,8 +85,12 @@ class Layout:
 
     Raises
     ------
-    GeometryError, ParameterError
-        When the arrays do not fit together or hold numbers that are not finite.
+    GeometryError
+        When a coordinate is too large, or holes overlap, are wound counter-clockwise, or do not lie inside their outline;
+        ``.site_ids`` and the message name the sites.
+    ParameterError
+        When the arrays do not fit together or contain numbers that are not finite, or a column has integers beyond 64 bits
+        or, for ``channel`` and ``readout_line``, integers that are not indices.
 
     Notes
     -----
@@ -90,6 +105,21 @@ class Layout:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        self._store()
+        _require_sound_holes(self)
+
+    @classmethod
+    def _derived(cls, *fields: Any) -> Layout:
+        """Layout whose holes were checked before: moved by a map that keeps them, or selected."""
+        layout = object.__new__(cls)
+        names = ("xy_um", "ring_offsets", "site_offsets", "columns", "provenance")
+        for name, value in zip(names, fields, strict=True):
+            object.__setattr__(layout, name, value)
+        layout._store()
+        return layout
+
+    def _store(self) -> None:
+        """Check the structure of the fields, and keep read-only copies."""
         xy_um = finite_array("xy_um", self.xy_um, ndim=2)
         if xy_um.shape[1:] != (2,):
             raise ParameterError("xy_um", f"must have the shape (n_vertex, 2), got {xy_um.shape}")
@@ -107,6 +137,8 @@ class Layout:
                     name,
                     f"must have one value for each of the {site_offsets.size - 1} sites, got the shape {column.shape}",
                 )
+            if name in INDEX_COLUMNS:
+                _require_indices(name, column)
             columns[name] = read_only(column)
         object.__setattr__(self, "xy_um", read_only(np.array(xy_um, order="C")))
         object.__setattr__(self, "ring_offsets", read_only(ring_offsets))
@@ -242,7 +274,7 @@ class Layout:
         for name, values in (("channel", channel), ("readout_line", readout_line)):
             if values is not None:
                 columns = {name: values, **columns}
-        return cls(
+        return cls._derived(
             xy_um,
             ring_offsets,
             site_offsets,
@@ -263,7 +295,7 @@ class Layout:
     def __reduce__(self) -> tuple[Any, ...]:
         # Read-only mappings cannot be pickled as they are.
         fields = (self.xy_um, self.ring_offsets, self.site_offsets, dict(self.columns), dict(self.provenance))
-        return Layout, fields
+        return Layout._derived, fields
 
     def __repr__(self) -> str:
         origin = self.provenance.get("generator", self.provenance.get("made_by", "packed rings"))
@@ -294,8 +326,9 @@ class Layout:
         if name not in self.columns:
             raise ParameterError(name, f"must be a column of the layout, which has {sorted(self.columns)}")
         column = self.columns[name]
-        if column.dtype.kind not in "iu" or (column.size and column.min() < 0):
-            raise ParameterError(name, "must hold whole numbers of at least 0", column)
+        if column.dtype.kind not in "iu":
+            raise ParameterError(name, f"must contain integers from 0 to {MAX_SITES}", column)
+        _require_indices(name, column)
         return column.astype(np.int64)
 
     @cached_property
@@ -347,7 +380,7 @@ class Layout:
             raise ParameterError("selection", f"must be a mask, a slice or a list of sites, got {ids.ndim} dimensions")
         rings = _ranges(self.site_offsets[ids], self.site_offsets[ids + 1])
         vertices = _ranges(self.ring_offsets[rings], self.ring_offsets[rings + 1])
-        return Layout(
+        return Layout._derived(
             self.xy_um[vertices],
             np.concatenate(([0], np.cumsum(np.diff(self.ring_offsets)[rings]))),
             np.concatenate(([0], np.cumsum(np.diff(self.site_offsets)[ids]))),
@@ -395,7 +428,7 @@ class Layout:
             raise ParameterError("keys", "must be one or more columns or arrays")
         names = ", ".join(key if isinstance(key, str) else "values" for key in keys)
         ordered = self[np.lexsort(values[::-1])]
-        return Layout(
+        return Layout._derived(
             ordered.xy_um, ordered.ring_offsets, ordered.site_offsets, ordered.columns, self._then(f"sorted by {names}")
         )
 
@@ -405,7 +438,7 @@ class Layout:
 
     def _with_columns(self, columns: Mapping[str, ArrayLike], step: str) -> Layout:
         merged = {**self.columns, **{name: _column(name, values) for name, values in columns.items()}}
-        return Layout(self.xy_um, self.ring_offsets, self.site_offsets, merged, self._then(step))
+        return Layout._derived(self.xy_um, self.ring_offsets, self.site_offsets, merged, self._then(step))
 
     def translate(self, dx_um: float, dy_um: float) -> Layout:
         """Layout moved by (dx, dy) in µm."""
@@ -430,7 +463,7 @@ class Layout:
         return self._moved((self.xy_um - centre) * factor + centre, f"scaled by {factor:g}")
 
     def _moved(self, xy_um: Floats, step: str) -> Layout:
-        return Layout(xy_um, self.ring_offsets, self.site_offsets, self.columns, self._then(step))
+        return Layout._derived(xy_um, self.ring_offsets, self.site_offsets, self.columns, self._then(step))
 
     def _then(self, step: str) -> dict[str, Any]:
         return {**self.provenance, "steps": [*self.provenance.get("steps", []), step]}
@@ -510,9 +543,25 @@ def _column(name: str, values: ArrayLike) -> NDArray[Any]:
         column = np.array(values)
     except ValueError:
         raise ParameterError(name, "must have one value for each site", values) from None
+    is_as_given = isinstance(values, np.ndarray) and values.dtype.kind == "f"
+    if column.ndim == 1 and column.dtype.kind in "fO" and not is_as_given:
+        items = list(values)  # type: ignore[call-overload]
+        if items and all(isinstance(item, int | np.integer) for item in items):
+            integers = exact_integers([int(item) for item in items])
+            if integers is None:
+                raise ParameterError(name, f"must contain {INTEGER_RANGES}", values)
+            return integers
     if column.dtype.hasobject:
         raise ParameterError(name, "must be an array of numbers or text", values)
     return column
+
+
+def _require_indices(name: str, column: NDArray[Any]) -> None:
+    """Reject integers that no filter or line can have as its index."""
+    if column.dtype.kind in "iu" and column.size:
+        worst = int(column.min()) if column.min() < 0 else int(column.max())
+        if not 0 <= worst <= MAX_SITES:
+            raise ParameterError(name, f"must contain integers from 0 to {MAX_SITES}", worst)
 
 
 def _point(name: str, value: ArrayLike) -> Floats:
@@ -573,11 +622,34 @@ def _require_simple(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> No
     """Sites must be valid in the sense of OGC: no ring crosses itself or another, holes lie inside."""
     if site_offsets.size == 1:
         return
-    polygons = Layout(xy_um, ring_offsets, site_offsets).polygons()
+    _require_valid(Layout._derived(xy_um, ring_offsets, site_offsets, {}, {}).polygons())  # noqa: SLF001
+
+
+def _require_sound_holes(layout: Layout) -> None:
+    """Sites with holes must be valid, and their holes wound clockwise; where there are none, this costs nothing."""
+    if layout.ring_offsets.size == layout.site_offsets.size:
+        return
+    has_holes = np.diff(layout.site_offsets) > 1
+    area_um2, _ = ring_moments(layout.xy_um, layout.ring_offsets)
+    area_um2[layout.site_offsets[:-1]] *= -1.0  # so that all rings count alike
+    _require(
+        has_holes & np.logical_or.reduceat(area_um2 >= 0.0, layout.site_offsets[:-1]),
+        "has a hole that is wound the wrong way, or has no area",
+    )
+    sites = np.flatnonzero(has_holes)
+    _require_valid(layout[sites].polygons(), sites, layout.n_sites)
+
+
+def _require_valid(polygons: NDArray[Any], sites: Ints | None = None, n_sites: int = 0) -> None:
+    """Sites must be valid polygons in the sense of OGC; those given are all, or have these numbers among more."""
     is_bad = ~shapely.is_valid(polygons)
-    if is_bad.any():
-        reason = str(shapely.is_valid_reason(polygons[np.flatnonzero(is_bad)[0]]))
-        _require(is_bad, f"crosses or touches itself ({reason}); repair its outline")
+    if not is_bad.any():
+        return
+    reason = str(shapely.is_valid_reason(polygons[np.flatnonzero(is_bad)[0]]))
+    if sites is not None:
+        is_bad = np.isin(np.arange(n_sites), sites[is_bad])
+    what = HOLE_REASONS.get(reason.partition("[")[0], f"crosses or touches itself ({reason})")
+    _require(is_bad, f"{what}; repair its outline")
 
 
 def _without_repeats(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Ints]:

@@ -26,7 +26,7 @@ from foveasim.arrays import (
 )
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout._measures import is_below_size
-from foveasim.layout._model import Layout
+from foveasim.layout._model import INTEGER_RANGES, Layout
 from foveasim.layout._noding import points_on_edges
 from foveasim.layout._regions import as_region
 from foveasim.layout.adjacency import TOUCHING_UM, adjacency
@@ -54,18 +54,18 @@ def union(layouts: Sequence[Layout]) -> Layout:
     Raises
     ------
     ParameterError
-        When there is none, or one is no layout.
+        When there is none, one is no layout, or no type contains all integers of a column.
     """
     layouts = list(layouts)
     if not layouts or not all(isinstance(layout, Layout) for layout in layouts):
         raise ParameterError("layouts", "must be one or more layouts", layouts)
     check_sites(sum(layout.n_sites for layout in layouts) or 1)
     names = set.intersection(*(set(layout.columns) for layout in layouts))
-    return Layout(
+    return Layout._derived(  # noqa: SLF001 -- of the same room
         np.concatenate([layout.xy_um for layout in layouts]),
         _joined([layout.ring_offsets for layout in layouts]),
         _joined([layout.site_offsets for layout in layouts]),
-        {name: np.concatenate([layout.columns[name] for layout in layouts]) for name in sorted(names)},
+        {name: _joined_columns(name, [layout.columns[name] for layout in layouts]) for name in sorted(names)},
         {"made_by": "union", "parts": [dict(layout.provenance) for layout in layouts]},
     )
 
@@ -297,7 +297,7 @@ def node(layout: Layout) -> Layout:
     owner = np.concatenate((np.arange(begin.shape[0]), edge))
     order = np.lexsort((np.concatenate((np.zeros(begin.shape[0]), t)), owner))
     n_new = np.bincount(edge, minlength=begin.shape[0])
-    return Layout(
+    return Layout._derived(  # noqa: SLF001 -- of the same room
         np.concatenate((begin, points[point]))[order],
         np.concatenate(([0], np.cumsum(n_new + 1)))[layout.ring_offsets],
         layout.site_offsets,
@@ -350,6 +350,17 @@ def _joined(offsets: Sequence[Ints]) -> Ints:
     return np.concatenate(([0], np.cumsum(steps)))
 
 
+def _joined_columns(name: str, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Parts of a column one after the other; signed and unsigned integers exactly, of which numpy makes floats."""
+    if {part.dtype.kind for part in parts} == {"i", "u"} and np.result_type(*parts).kind == "f":
+        used = [part for part in parts if part.size]
+        low, high = (min(int(p.min()) for p in used), max(int(p.max()) for p in used)) if used else (0, 0)
+        if low < 0 and high >= 2**63:
+            raise ParameterError(name, f"must contain {INTEGER_RANGES}", high)
+        parts = [part.astype(np.int64 if high < 2**63 else np.uint64) for part in parts]
+    return np.concatenate(parts)
+
+
 def _kept(layout: Layout, region: Any, operation: Any, keeps_whole: Any, cut: str, step: str) -> Layout:
     check_choice("cut", cut, ("pieces", "drop"))
     shapely.prepare(region)
@@ -370,7 +381,7 @@ def _pieces(layout: Layout, shapes: NDArray[Any], parent: Ints, step: str, **col
     )
     own = {name: values[shape[is_real]] for name, values in columns.items()}
     rebuilt = _rebuilt(layout, parts[is_real], parent[shape[is_real]], step)
-    return Layout(
+    return Layout._derived(  # noqa: SLF001
         rebuilt.xy_um, rebuilt.ring_offsets, rebuilt.site_offsets, {**rebuilt.columns, **own}, rebuilt.provenance
     )
 
@@ -379,4 +390,4 @@ def _rebuilt(layout: Layout, polygons: NDArray[Any], parent: Ints, step: str) ->
     """Layout of these polygons, each with the columns of its parent site."""
     rings = Layout.from_polygons(polygons)
     columns = {name: values[parent] for name, values in layout.columns.items()}
-    return Layout(rings.xy_um, rings.ring_offsets, rings.site_offsets, columns, layout._then(step))  # noqa: SLF001
+    return Layout._derived(rings.xy_um, rings.ring_offsets, rings.site_offsets, columns, layout._then(step))  # noqa: SLF001

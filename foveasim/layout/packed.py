@@ -25,17 +25,24 @@ def packed_layout(layout: Layout) -> dict[str, NDArray[Any]]:
 
 def unpacked_layout(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str, Any]) -> Layout:
     """
-    The layout that lies among arrays, without the checks of outlines from strangers.
+    The layout among arrays; of untrusted outlines, only structure and holes are checked.
 
     Raises
     ------
     KeyError
         When an array of its outlines is not there.
+    GeometryError, ParameterError
+        When the arrays do not fit together, holes do not lie in their outlines, or a column is malformed.
     """
+    from foveasim.layout.files._common import check_sizes
+
     columns = {
         name.removeprefix(COLUMN_PREFIX): values for name, values in arrays.items() if name.startswith(COLUMN_PREFIX)
     }
     xy_um, ring_offsets, site_offsets = (arrays[name] for name in OUTLINES)
+    has_holes = np.diff(site_offsets) > 1
+    if has_holes.any():
+        check_sizes(np.diff(site_offsets)[has_holes], np.diff(ring_offsets[site_offsets])[has_holes])
     return Layout(xy_um, ring_offsets, site_offsets, columns, provenance)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim.arrays import Bools, Floats, finite_array
+from foveasim.errors import ParameterError
 from foveasim.sensor import Sensor, linearised
 from foveasim.sensor.limits import check_plausible
 from foveasim.units import volts_to_electrons
@@ -55,9 +56,9 @@ def charge_readings(charge_e: ArrayLike, sensor: Sensor, exposure_s: float) -> R
     Raises
     ------
     ParameterError
-        When a charge is not finite, or the exposure negative.
+        When a charge is not finite, there is not one for each of the sensor's sites, or the exposure is negative.
     """
-    charge = finite_array("charge_e", charge_e, ndim=1)
+    charge = _per_site("charge_e", charge_e, sensor)
     well_e = np.inf if sensor.full_well_e is None else np.floor(sensor.full_well_e)
     shot_e2 = np.maximum(charge, 0.0) + 1.0 if sensor.shot_noise != "off" else np.full(charge.size, 1.0 / 12.0)
     return Readings(
@@ -78,14 +79,14 @@ def code_readings(code: ArrayLike, sensor: Sensor, exposure_s: float) -> Reading
     Raises
     ------
     ParameterError
-        When a code is none of the sensor's, or the exposure negative.
+        When a code is none of the sensor's, there is not one for each of its sites, or the exposure is negative.
 
     Notes
     -----
     Crosstalk, coupling, differential non-linearity and fixed patterns are not undone: for the last,
     :meth:`foveasim.sensor.Calibration.corrected`.
     """
-    codes = finite_array("code", code, ndim=1)
+    codes = _per_site("code", code, sensor)
     share = (linearised(codes, sensor) + 0.5) / 2.0**sensor.bits - sensor.pedestal_v / sensor.v_sat_v
     bend = sensor.nonlinearity_fraction
     slope = np.ones(codes.size)
@@ -99,6 +100,15 @@ def code_readings(code: ArrayLike, sensor: Sensor, exposure_s: float) -> Reading
     noise_e2 = sensor.readout_noise_e2(is_device_known=False) + step_e**2 * sensor.converter.noise_dn2
     is_full = read_e.is_full | (codes >= 2**sensor.bits - 1)
     return Readings(light_e=read_e.light_e, variance_e2=read_e.variance_e2 + noise_e2, is_full=is_full)
+
+
+def _per_site(name: str, values: ArrayLike, sensor: Sensor) -> Floats:
+    found = finite_array(name, values, ndim=1)
+    if found.size != sensor.layout.n_sites:
+        raise ParameterError(
+            name, f"must have one value for each of the {sensor.layout.n_sites} sites, got {found.size}"
+        )
+    return found
 
 
 def _dark_e(sensor: Sensor, exposure_s: float) -> Floats:

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Bools
+from foveasim.arrays import Bools, exact_integers
 from foveasim.layout._model import Layout
-from foveasim.layout.files._common import whole_numbers
 
 __all__ = ["CHANNEL", "MAX_COLUMN_BYTES", "columns_of", "kept_columns", "texts_of"]
 
@@ -199,7 +198,7 @@ def _column(values: Sequence[bytes]) -> NDArray[Any] | None:
 
 def _numbers(values: Sequence[bytes]) -> NDArray[Any] | None:
     try:
-        return whole_numbers(list(map(int, values)))
+        return exact_integers(list(map(int, values)))
     except ValueError:
         return np.array(list(map(float, values)))
 

@@ -33,7 +33,6 @@ __all__ = [
     "restored_column",
     "rounding",
     "texts",
-    "whole_numbers",
 ]
 
 #: Written in every file that keeps columns and origin.
@@ -219,7 +218,7 @@ def checked_layout(
     else:
         check_sizes(shapely.get_num_interior_rings(polygons) + 1, shapely.get_num_coordinates(polygons))
     bare = Layout.from_polygons(polygons)
-    return Layout(bare.xy_um, bare.ring_offsets, bare.site_offsets, columns, provenance)
+    return Layout._derived(bare.xy_um, bare.ring_offsets, bare.site_offsets, columns, provenance)  # noqa: SLF001
 
 
 # -- origin and types of columns, as text in the file -----------------------------------------------------------------
@@ -283,18 +282,13 @@ def restored_column(values: NDArray[Any], dtype: object) -> NDArray[Any]:
             return values
         with np.errstate(all="ignore"):
             restored = values.astype(np.dtype(dtype))
+            again = restored.astype(values.dtype)
     except (TypeError, ValueError, OverflowError):
         return values
-    is_floating = values.dtype.kind == restored.dtype.kind == "f"
-    return restored if np.array_equal(restored, values, equal_nan=is_floating) else values
-
-
-def whole_numbers(values: Sequence[int]) -> NDArray[Any] | None:
-    """A column of whole numbers, exactly; nothing where 64 bits do not hold them."""
-    low, high = min(values), max(values)
-    if low >= -(2**63) and high < 2**63:
-        return np.array(values, np.int64)
-    return np.array(values, np.uint64) if low >= 0 and high < 2**64 else None
+    is_floating = values.dtype.kind == "f"
+    is_same = np.array_equal(restored, values, equal_nan=is_floating and restored.dtype.kind == "f")
+    # An integer equals its neighbours where both are compared as floating-point numbers: so there and back again.
+    return restored if is_same and np.array_equal(again, values, equal_nan=is_floating) else values
 
 
 def texts(values: Sequence[str]) -> NDArray[Any] | None:

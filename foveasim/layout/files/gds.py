@@ -196,7 +196,8 @@ def _snapped(layout: Layout, dbu_um: float) -> Layout:
         raise ParameterError(
             "dbu_um", f"must be >= {np.abs(layout.xy_um).max() / MAX_DBU:.3g} for this layout", dbu_um, "µm"
         )
-    snapped = Layout(_in_um(xy_dbu, dbu_um), layout.ring_offsets, layout.site_offsets)
+    # Its holes are checked below.
+    snapped = Layout._derived(_in_um(xy_dbu, dbu_um), layout.ring_offsets, layout.site_offsets, {}, {})  # noqa: SLF001
     if layout.n_sites:
         area_um2 = ring_moments(snapped.xy_um, snapped.ring_offsets)[0]
         is_hole = np.ones(area_um2.size, bool)

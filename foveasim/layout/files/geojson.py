@@ -20,7 +20,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, Ints
+from foveasim.arrays import Floats, Ints, exact_integers
 from foveasim.errors import FileError
 from foveasim.files import written_whole
 from foveasim.layout._model import Layout
@@ -36,7 +36,6 @@ from foveasim.layout.files._common import (
     plain_columns,
     restored_column,
     texts,
-    whole_numbers,
 )
 
 __all__ = ["read", "write"]
@@ -46,6 +45,8 @@ CHUNK = 10_000
 #: JSON has no infinity, but numbers beyond float64, which are read as such.
 INFINITY = "1e999"
 NUMBERS = {int, float}
+#: All integers up to this are floating-point numbers, and none beyond the other is.
+MAX_EXACT, MAX_FLOAT = 2**53, 2**1023
 #: Among more names of properties, only those of all features are columns: other names could be new for every feature.
 MAX_NAMES = 256
 _BLANK = re.compile(r"[ \t\r\n]*")
@@ -224,6 +225,11 @@ def _members(text: str, add: Callable[[Any], None]) -> Iterator[tuple[str, Any]]
         raise ValueError(f"something follows the end at character {at}")
 
 
+def _is_exact(value: Any) -> bool:
+    """Whether a float64 contains a value, where it is an integer."""
+    return type(value) is not int or abs(value) <= MAX_EXACT or (abs(value) < MAX_FLOAT and int(float(value)) == value)
+
+
 def _column(values: list[Any], dtype: Any) -> NDArray[Any] | None:
     kinds = {type(v) for v in values}
     plain = kinds - {type(None)}
@@ -235,8 +241,10 @@ def _column(values: list[Any], dtype: Any) -> NDArray[Any] | None:
     if kinds == {bool}:
         return restored_column(np.array(values), dtype)
     if kinds == {int}:
-        column = whole_numbers(values)
+        column = exact_integers(values)
         return None if column is None else restored_column(column, dtype)
+    if not all(_is_exact(v) for v in values):
+        return None
     if (plain and plain <= {int, float}) or (not plain and str(dtype)[1:2] == "f"):
         return restored_column(np.array([np.nan if v is None else v for v in values], dtype=np.float64), dtype)
     return None
