@@ -8,13 +8,16 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, NoReturn, TextIO
+from typing import TYPE_CHECKING, Annotated, NoReturn, TextIO
 
 import typer
-from rich.console import Console
 
 from foveasim import __version__
-from foveasim.errors import FoveasimError, FoveasimWarning
+from foveasim.errors import FoveasimError, FoveasimWarning, printable
+from foveasim.terminal import PlainConsole, plain_streams, spinner_of, text_of
+
+if TYPE_CHECKING:
+    from rich.status import Status
 
 __all__ = ["main"]
 
@@ -30,8 +33,8 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-console = Console()
-console_of_errors = Console(stderr=True)
+console = PlainConsole()
+console_of_errors = PlainConsole(stderr=True)
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; made when it does not exist.")]
 Threads = Annotated[int | None, typer.Option("--threads", help="Threads to use; all cores by default.")]
@@ -98,7 +101,7 @@ def check(
     console.print(report)
     if lyrdb is not None:
         report.write(lyrdb)
-        console.print(f"wrote {lyrdb}", soft_wrap=True, highlight=False)
+        _report(f"wrote {lyrdb}")
     if not report.ok:
         raise typer.Exit(BROKEN_RULE)
 
@@ -113,7 +116,7 @@ def layouts() -> None:
     table = Table(box=None)
     for heading in ("name", "photosites", "field / µm", "pixel size / µm", "generator"):
         table.add_column(heading, justify="left" if heading in {"name", "generator"} else "right")
-    with console.status("reading layouts"):
+    with _status("reading layouts"):
         for name, path in shipped_layouts().items():
             found = read_layout_file(path).layout.describe()
             x0, y0, x1, y1 = found.bounds_um
@@ -137,7 +140,7 @@ def describe(
     readout = None
     if frames_per_s is not None:
         readout = Readout(frames_per_s=frames_per_s, bits=bits, blanking=blanking, n_lanes=lanes)
-    console.print(read_any_layout(layout).layout.describe(readout), highlight=False)
+    console.print(read_any_layout(layout).layout.describe(readout))
 
 
 @app.command()
@@ -157,11 +160,9 @@ def convert(
 
     written = write_layout(read_any_layout(source).layout, target, layer=layer, dbu_um=dbu_um)
     lost = f"; the format holds no {', '.join(written.lost_columns)}" if written.lost_columns else ""
-    console.print(
+    _report(
         f"wrote {written.path}: {written.n_sites:,} photosites, vertices moved by at most {written.worst_move_um:.3g} µm, "
-        f"areas changed by at most {100 * written.worst_area_error:.3g} %{lost}",
-        soft_wrap=True,
-        highlight=False,
+        f"areas changed by at most {100 * written.worst_area_error:.3g} %{lost}"
     )
 
 
@@ -196,15 +197,15 @@ def view(
         check_page_path(web)
     if solid and (rules is not None or layout is not None):
         _end("error: --solid shows no violations: leave --rules and --layout out", BAD_INPUT)
-    with console.status("reading"):
+    with _status("reading"):
         seen = read_viewable(file, layout=layout, rules=rules)
-    with console.status("making the page"):
+    with _status("making the page"):
         flat = None if solid else web_page(seen.thing, report=seen.report, name=seen.name)
         text = solid_page(seen.thing, name=seen.name) if flat is None else flat
     if web is not None:
         with written_whole(web) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-        console.print(f"wrote {web}", soft_wrap=True, highlight=False)
+            temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+        _report(f"wrote {web}")
         return
     if serve:
         serve_page(text, port=port, tell=lambda at: _say(f"{file} is at {at} until you press Ctrl-C"))
@@ -234,7 +235,7 @@ def sweep(
     with _progress(settings.stem, f"what is done is kept beside {out}") as tell:
         results = run_sweep(plan, out=out, scheduler=scheduler, workers=workers, retry=retry, tell=tell)
     sizes = " x ".join(f"{n} {name}" for name, n in zip(plan.dims, plan.shape, strict=True))
-    console.print(f"wrote {out}: {plan.n_points:,} points ({sizes})", soft_wrap=True, highlight=False, markup=False)
+    _report(f"wrote {out}: {plan.n_points:,} points ({sizes})")
     failed = [text for text in results["error"].to_numpy().ravel().tolist() if text]
     if failed:
         _end(f"{len(failed):,} of {plan.n_points:,} points failed; the first: {failed[0]}", BROKEN_RULE)
@@ -279,7 +280,7 @@ def study(
         why = "all failed" if len(failed) == len(done) else "those that did not fail are beyond the limits"
         _end(f"no trial in {place} is good: {why}", BROKEN_RULE)
     console.print(best_table(plan, found))
-    console.print(f"wrote {place}: {len(done):,} trials", soft_wrap=True, highlight=False, markup=False)
+    _report(f"wrote {place}: {len(done):,} trials")
 
 
 @app.command()
@@ -302,11 +303,11 @@ def dataset(
     from foveasim.parallel import thread_count
 
     n_threads = 1 if workers is None else max(1, thread_count() // max(1, workers))
-    with console.status("reading pictures and settings"):
+    with _status("reading pictures and settings"):
         file = read_data_set(settings, n_threads=n_threads)
     with _progress(settings.stem, f"the shards that are done are kept in {out}") as tell:
         write_data_set(file.data_set, out, per_shard=file.per_shard, workers=workers, tell=tell)
-    console.print(f"wrote {out}: {len(file.data_set):,} samples", soft_wrap=True, highlight=False, markup=False)
+    _report(f"wrote {out}: {len(file.data_set):,} samples")
 
 
 @app.command()
@@ -339,7 +340,7 @@ def video(
 
     if frames_per_s is not None and not frames_per_s > 0.0:
         _end(f"error: --fps must be > 0, got {frames_per_s:g}", BAD_INPUT)
-    with console.status("reading settings"):
+    with _status("reading settings"):
         shot = read_shot(settings, changes or [], n_threads=threads)
     frame_s = None if frames_per_s is None else 1.0 / frames_per_s
     is_kept = out.suffix.lower() == ".zarr"
@@ -351,7 +352,7 @@ def video(
         kept = f"; {n:,} frames are kept beside {out}, and the same command goes on from there" if n else ""
         _end(f"stopped{kept}", STOPPED)
     told = f"{out} was finished before" if was_finished else f"wrote {out}"
-    console.print(f"{told}: {n:,} frames", soft_wrap=True, highlight=False, markup=False)
+    _report(f"{told}: {n:,} frames")
 
 
 @app.command()
@@ -372,10 +373,10 @@ def _run(settings: Sequence[Path], changes: Sequence[str], out: Path, threads: i
     results = []
     written = []
     try:
-        with console.status("reading settings") as status:
+        with _status("reading settings") as status:
             shots = [read_shot(path, changes, n_threads=threads) for path in settings]
             for shot in shots:
-                status.update(f"{shot.name}: capturing with {shot.camera.sensor.layout.n_sites:,} photosites")
+                status.update(text_of(f"{shot.name}: capturing with {shot.camera.sensor.layout.n_sites:,} photosites"))
                 result, paths = run_shot(shot, out)
                 results.append(result)
                 written += paths
@@ -383,11 +384,16 @@ def _run(settings: Sequence[Path], changes: Sequence[str], out: Path, threads: i
         _end("stopped", STOPPED)
     console.print(results_table(results))
     for path in written:
-        console.print(f"wrote {path}", soft_wrap=True, highlight=False)
+        _report(f"wrote {path}")
 
 
 def main() -> None:
-    """Run the command line; bad input ends with one sentence and the exit code 2."""
+    """Run the command line; bad input ends with one line on standard error and the exit code 2."""
+    with plain_streams():
+        _main()
+
+
+def _main() -> None:
     show_warning = warnings.showwarning
     warnings.showwarning = _show_warning
     try:
@@ -397,7 +403,8 @@ def main() -> None:
     except MemoryError:
         _end("error: there is not enough memory for this; take a smaller picture or fewer photosites", BAD_INPUT)
     except OSError as error:
-        _end(f"error: {error.strerror or error}", BAD_INPUT)
+        where = f"{error.filename}: " if isinstance(error.filename, str) else ""
+        _end(f"error: {where}{error.strerror or error}", BAD_INPUT)
     finally:
         warnings.showwarning = show_warning
 
@@ -405,11 +412,19 @@ def main() -> None:
 @contextmanager
 def _progress(name: str, kept: str) -> Iterator[Callable[[int, int], None]]:
     """A bar with the time left, from the first count on; Ctrl-C ends with what is kept, and how to go on."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
-    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    description = TextColumn("{task.description}", markup=False)
+    columns = (description, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     progress = Progress(*columns, console=console)
-    bar = progress.add_task(name, total=None)
+    bar = progress.add_task(printable(name), total=None)
 
     def tell(n_done: int, n: int) -> None:
         progress.start()  # now that there are workers
@@ -424,14 +439,23 @@ def _progress(name: str, kept: str) -> Iterator[Callable[[int, int], None]]:
             progress.stop()
 
 
+def _status(text: str) -> Status:
+    """A line with a spinner, on terminals only."""
+    return console.status(text_of(text), spinner=spinner_of(console))
+
+
 def _say(sentence: str) -> None:
     # Flushed: who waits for an address may read it from a pipe.
-    sys.stdout.write(sentence + "\n")
+    sys.stdout.write(printable(sentence) + "\n")
     sys.stdout.flush()
 
 
+def _report(sentence: str) -> None:
+    console.print(printable(sentence), soft_wrap=True)
+
+
 def _tell(sentence: str) -> None:
-    console_of_errors.print(sentence, soft_wrap=True, highlight=False, markup=False)
+    console_of_errors.print(printable(sentence), soft_wrap=True)
 
 
 def _end(sentence: str, code: int) -> NoReturn:
@@ -449,7 +473,7 @@ def _show_warning(
 ) -> None:
     is_ours = issubclass(category, FoveasimWarning)
     text = f"warning: {message}" if is_ours else warnings.formatwarning(message, category, filename, lineno, line)
-    console_of_errors.print(text, soft_wrap=True, highlight=False, markup=False)
+    console_of_errors.print(printable(text) if is_ours else text, soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,9 @@ Each message says what is wrong, where, what was got, what was expected, and the
 
 from __future__ import annotations
 
+import errno
+import re
+import reprlib
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +37,9 @@ __all__ = [
     "ParameterError",
     "SamplingWarning",
     "SimulationError",
+    "disk_problem",
+    "printable",
+    "shown",
 ]
 
 
@@ -44,10 +50,13 @@ _UNSAID = object()
 class FoveasimError(Exception):
     """Base of all errors of the package; they go from process to process as they are."""
 
+    def __init__(self, message: str = "", *, prefix: str = "") -> None:
+        super().__init__(prefix + _shortened(message))
+
     def __reduce__(self) -> tuple[Any, ...]:
         state = dict(self.__dict__)
         if not isinstance(state.get("value"), str | int | float | None):
-            state["value"] = _shown(state["value"])  # which may be anything
+            state["value"] = shown(state["value"])  # which may be anything
         return _restored, (type(self), self.args, state)
 
 
@@ -58,7 +67,7 @@ class ParameterError(FoveasimError, ValueError):
         self.name = name
         self.value = None if value is _UNSAID else value
         self.unit = unit
-        got = f", got {_shown(value)}{' ' + unit if unit else ''}" if value is not _UNSAID else ""
+        got = f", got {shown(value)}{' ' + unit if unit else ''}" if value is not _UNSAID else ""
         #: All of the message but the name.
         self.told = f"{rule}{got}{'; ' + cure if cure else ''}"
         super().__init__(f"'{name}' {self.told}")
@@ -77,7 +86,7 @@ class FileError(FoveasimError, ValueError):
 
     def __init__(self, path: str | Path, message: str) -> None:
         self.path = Path(path)
-        super().__init__(f"{path}: {message}")
+        super().__init__(message, prefix=f"{printable(path)}: ")
 
 
 class ConfigError(FileError):
@@ -112,10 +121,91 @@ def _restored(kind: type[FoveasimError], args: tuple[Any, ...], state: dict[str,
     return error
 
 
-def _shown(value: Any) -> str:
-    """Short text of a value for a message."""
+#: Characters of a value in a message, of a word in one, and of a message.
+LONGEST_VALUE, LONGEST_WORD, LONGEST_MESSAGE = 80, 240, 2000
+#: Containers are written out to this depth, with this many elements each: no message costs more than its length.
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxlong = 3, 2 * LONGEST_VALUE
+_SHORT.maxstring = _SHORT.maxother = LONGEST_VALUE
+for _kind in ("tuple", "list", "array", "dict", "set", "frozenset", "deque"):
+    setattr(_SHORT, f"max{_kind}", 8)
+#: Errors of the system that mean that the disk, and not the data, ended the writing.
+DISK_ERRNOS = frozenset(
+    getattr(errno, name) for name in ("ENOSPC", "EDQUOT", "EFBIG", "EROFS", "EIO") if hasattr(errno, name)
+)
+
+
+def shown(value: Any, *, at_most: int = LONGEST_VALUE) -> str:
+    """
+    Return a value as one short line for a message.
+
+    Parameters
+    ----------
+    value : object
+        Of any size and depth.
+    at_most : int
+        Number of characters.
+
+    Returns
+    -------
+    text : str
+        Printable characters only; what exceeds the limit is replaced by ``...``.
+    """
     try:
-        text = " ".join(repr(value).split())
-    except Exception:  # noqa: BLE001 -- any object may fail to tell what it is, and Python refuses very long numbers
+        text = printable(" ".join(_SHORT.repr(value).split()))
+    except Exception:  # noqa: BLE001 -- the repr of any object may raise, and Python rejects very long integers
         return f"one of type {type(value).__name__}"
-    return text if len(text) <= 80 else text[:77] + "..."
+    return text if len(text) <= at_most else text[: at_most - 3] + "..."
+
+
+def _shortened(message: str) -> str:
+    """Return a message without the middle of what is too long in it, whichever value that came from."""
+    words = re.sub(rf"\S{{{LONGEST_WORD + 1},}}", lambda word: _without_middle(word[0], LONGEST_VALUE), message)
+    return _without_middle(words, LONGEST_MESSAGE)
+
+
+def _without_middle(text: str, at_most: int) -> str:
+    half = (at_most - 3) // 2
+    return text if len(text) <= at_most else f"{text[:half]}...{text[-half:]}"
+
+
+def printable(text: object, *, keep: str = "") -> str:
+    r"""
+    Return a text with every character that a terminal does not print as an escape, such as ``\n`` and ``\x1b``.
+
+    Parameters
+    ----------
+    text : object
+        A string or a path, from wherever.
+    keep : str
+        Characters that stay as they are.
+
+    Returns
+    -------
+    text : str
+
+    Examples
+    --------
+    >>> printable("a\nb") == "a" + chr(92) + "nb"
+    True
+    """
+    string = str(text)
+    if string.isprintable():
+        return string
+    return "".join(c if c.isprintable() or c in keep else c.encode("unicode_escape").decode("ascii") for c in string)
+
+
+def disk_problem(error: BaseException) -> str:
+    """
+    Return the system's reason when the disk ended the writing: full, over a limit, read-only, failed; else ``""``.
+
+    Libraries wrap the system's error in their own, so causes and contexts are inspected too.
+    """
+    seen: set[int] = set()
+    found: BaseException | None = error
+    while found is not None and id(found) not in seen:
+        seen.add(id(found))
+        if isinstance(found, OSError) and found.errno in DISK_ERRNOS:
+            return found.strerror or str(found)
+        found = found.__cause__ or found.__context__
+    return ""

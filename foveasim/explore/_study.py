@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from foveasim.errors import FileError, FoveasimError, ParameterError
+from foveasim.errors import FileError, FoveasimError, ParameterError, printable
 from foveasim.explore._bench import Bench, Job, Task
 from foveasim.explore._metrics import Metric
 from foveasim.explore._records import Record, Value, check_same_plan
@@ -179,14 +179,17 @@ def storage_name(storage: str | Path | None) -> str:
 def best_table(plan: StudyPlan, found: optuna.Study) -> Table:
     """Table of the best trials: objectives, the results that have limits, settings; the best in the first objective on top."""
     from rich.table import Table
+    from rich.text import Text
+
+    from foveasim.terminal import text_of
 
     limited = [name for name in plan.constraints if name not in plan.objectives]
     table = Table(box=None)
     table.add_column("trial", justify="right")
     for name, way in plan.objectives.items():
-        table.add_column(f"{name}\n{way}d", justify="right", overflow="fold")
+        table.add_column(Text(f"{printable(name)}\n{way}d"), justify="right", overflow="fold")
     for heading in (*limited, *_short(plan.search)):
-        table.add_column(heading, justify="right", overflow="fold")
+        table.add_column(text_of(heading), justify="right", overflow="fold")
     sign = -1.0 if next(iter(plan.objectives.values())) == "maximize" else 1.0
     best = sorted(found.best_trials, key=lambda trial: sign * trial.values[0])
     rows: dict[tuple[str, ...], int] = {}
@@ -196,7 +199,7 @@ def best_table(plan: StudyPlan, found: optuna.Study) -> Table:
         # The same settings may have been tried twice, and gave the same.
         rows.setdefault((*(f"{value:.6g}" for value in results), *chosen), trial.number)
     for cells, number in list(rows.items())[:MOST_ROWS]:
-        table.add_row(f"{number}", *cells)
+        table.add_row(f"{number}", *map(text_of, cells))
     if len(rows) > MOST_ROWS:
         table.caption = f"and {len(rows) - MOST_ROWS:,} more that are as good"
     return table

@@ -340,6 +340,7 @@ class Report:
 
     def __rich__(self) -> Table:
         from rich.table import Table
+        from rich.text import Text
 
         table = Table(title=f"Design rules on {self.n_sites} photosites")
         for heading in ("rule", "verdict", "count", "worst", "limit", "unit"):
@@ -347,11 +348,11 @@ class Report:
         for r in self.results:
             worst = "" if r.worst is None else f"{r.worst:.6g}"
             verdict = (
-                "[green]pass[/green]"
+                Text("pass", "green")
                 if r.values.size == 0
-                else "[red]fail[/red]"
+                else Text("fail", "red")
                 if not r.ok
-                else "[yellow]waived[/yellow]"
+                else Text("waived", "yellow")
             )
             table.add_row(r.rule, verdict, f"{r.values.size}", worst, f"{r.limit:g}", r.unit)
         return table

@@ -15,8 +15,9 @@ from rich.table import Table
 
 from foveasim.capture import Capture
 from foveasim.config import Shot
-from foveasim.errors import FileError
+from foveasim.errors import FileError, printable
 from foveasim.layout import Layout, Report
+from foveasim.terminal import text_of
 from foveasim.view import plot_capture, save_figure
 
 __all__ = ["Result", "check_folder", "demo_settings", "results_table", "run_shot", "write_results"]
@@ -81,7 +82,7 @@ def write_results(shot: Shot, capture: Capture, folder: str | Path) -> tuple[lis
     picture, layout, saved = (folder / f"{shot.name}_{what}" for what in ("picture.png", "layout.png", "capture.npz"))
     capture.picture(max_pixels=PICTURE_PIXELS).save(picture, capture.white_dn, encode_srgb=True)
     axes = plot_capture(capture)
-    axes.set_title(f"{shot.name}: {capture.layout.n_sites} photosites")
+    axes.set_title(f"{printable(shot.name)}: {capture.layout.n_sites} photosites", parse_math=False)
     save_figure(axes.figure, layout)  # type: ignore[arg-type]
     capture.save(saved)
     return [picture, layout, saved], time.perf_counter() - start_s
@@ -123,7 +124,7 @@ def results_table(results: Sequence[Result]) -> Table:
     table = Table(title="What the sensors saw")
     table.add_column("")
     for result in results:
-        table.add_column(result.shot.name, justify="right")
+        table.add_column(text_of(result.shot.name), justify="right")
     captures = [result.capture for result in results]
     rows = {
         "photosites": [f"{c.layout.n_sites:,}" for c in captures],

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from foveasim.capture import Capture
 from foveasim.config import read_any_layout, read_rules
-from foveasim.errors import FileError, ParameterError
+from foveasim.errors import FileError, ParameterError, printable
 from foveasim.layout import Layout, Report
 from foveasim.layout.lyrdb import is_lyrdb, read_lyrdb
 
@@ -54,15 +54,15 @@ def read_viewable(path: str | Path, *, layout: str | Path | None = None, rules: 
         if rules is not None:
             raise ParameterError("rules", "cannot be given with a report, which is of a check already made", str(rules))
         checked = read_any_layout(layout).layout
-        return Viewable(checked, read_lyrdb(path, checked.n_sites), path.stem)
+        return Viewable(checked, read_lyrdb(path, checked.n_sites), printable(path.stem))
     if layout is not None:
         raise ParameterError("layout", f"belongs to a report (.lyrdb), and {path} is none", str(layout))
     limits = None if rules is None else read_rules(rules)
     if _is_capture(path):
         capture = Capture.load(path)
-        return Viewable(capture, None if limits is None else capture.layout.check(limits), path.stem)
+        return Viewable(capture, None if limits is None else capture.layout.check(limits), printable(path.stem))
     found = read_any_layout(path).layout
-    return Viewable(found, None if limits is None else found.check(limits), path.stem)
+    return Viewable(found, None if limits is None else found.check(limits), printable(path.stem))
 
 
 def _is_capture(path: Path) -> bool:

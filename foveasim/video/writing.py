@@ -122,8 +122,12 @@ def write_video(
 def _told(captures: Iterable[Capture], n_frames: int | None, n_before: int) -> Iterator[Capture]:
     from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    columns = (SpinnerColumn(), *Progress.get_default_columns()[:-1], TimeRemainingColumn(), TimeElapsedColumn())
-    with Progress(*columns) as bar:
+    from foveasim.terminal import PlainConsole, spinner_of
+
+    console = PlainConsole()
+    spinner = SpinnerColumn(spinner_of(console))
+    columns = (spinner, *Progress.get_default_columns()[:-1], TimeRemainingColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as bar:
         # The time left is told by the frames that are made now: those that were kept took none.
         task = bar.add_task("frames", total=n_frames, completed=n_before)
         for capture in captures:
