@@ -13,6 +13,8 @@ electrons, electrons get noise, volts become codes::
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 from foveasim import (
     distortion,
     errors,
@@ -42,6 +44,9 @@ from foveasim.reconstruct import Picture
 from foveasim.scene import Scene
 from foveasim.sensor import FilterSet, GaussianCurve, PolynomialCurve, Sensor, SiliconQE, rgb_filters
 
+if TYPE_CHECKING:
+    from foveasim import explore
+
 __all__ = [
     "Camera",
     "Capture",
@@ -62,6 +67,7 @@ __all__ = [
     "__version__",
     "distortion",
     "errors",
+    "explore",
     "layout",
     "maps",
     "metrics",
@@ -78,3 +84,16 @@ __all__ = [
     "view",
     "write_power_map",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import :mod:`foveasim.explore` when it is used: it loads the checks of settings, which nothing else here needs."""
+    if name == "explore":
+        from importlib import import_module
+
+        return import_module("foveasim.explore")
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim.archives import opened_archive, write_archive
-from foveasim.arrays import Floats, Ints, check_choice, check_count, own, read_only, unmasked
-from foveasim.errors import ParameterError
+from foveasim.arrays import Floats, Ints, check_choice, check_count, own, read_only, unit_of, unmasked
+from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid
+from foveasim.files import folder_written_whole
 from foveasim.layout import Layout
 from foveasim.layout.packed import packed_layout, unpacked_layout
 from foveasim.reconstruct import (
@@ -32,8 +34,11 @@ from foveasim.reconstruct import (
 from foveasim.records import copied, described
 from foveasim.rings import same_rings
 from foveasim.sensor import Sensor, signal_to_noise
+from foveasim.stores import ZARR, Variable, free_name, library, opened_store, store_format, write_variables
 
 if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
     from matplotlib.axes import Axes
     from pyvista import PolyData  # noqa: TID251 -- a type alone
 
@@ -43,6 +48,13 @@ FILE_FORMAT = "foveasim capture"
 FILE_VERSION = 1
 #: Arrays of a capture file, beside the layout's.
 ARRAYS = ("code", "electrons", "expected_e", "filter_of_site")
+#: Units of variables whose names do not carry one.
+UNITS = {"code": "DN", "electrons": "e-"}
+#: Names of variables that are derived from the layout, and of the dimensions' coordinates.
+DERIVED = ("x_um", "y_um", "area_um2", "filter_name")
+SITE, FILTER = "site", "filter"
+#: Group of a store with the outlines.
+LAYOUT_GROUP = "layout"
 #: What a sensor's codes tell of the light by: these of its parameters, as they are meant. Fixed patterns are not known.
 ELECTRONICS = (
     *(
@@ -310,15 +322,137 @@ class Capture:
 
         return plot_capture(self, by, **options)
 
+    def to_xarray(self) -> xr.Dataset:
+        """
+        Return the capture as a labelled data set, which netCDF and zarr files can store.
+
+        Returns
+        -------
+        xarray.Dataset
+            Dimensions ``site`` (n_site) and ``filter`` (n_filter). Variables ``code``, ``electrons``, ``expected_e``,
+            ``filter_of_site`` over sites, ``white_dn`` over filters. Coordinates: numbers of the sites, their centroids
+            ``x_um`` and ``y_um``, ``area_um2``, names of the filters, and all columns of the layout. Every variable has
+            its ``units``, ``"1"`` where it has no dimension. Attributes: ``bits``, ``seed``, ``exposure_s``, and
+            ``settings``, ``versions``, ``provenance`` as strings of JSON.
+
+        Raises
+        ------
+        ParameterError
+            When xarray is missing.
+
+        Notes
+        -----
+        A column of the layout is renamed where its name is taken or contains other characters than letters, digits and
+        ``_``; its attribute ``long_name`` is the one that it had. Outlines of the sites are not part of it:
+        ``layout.write`` and :meth:`save` write them.
+        """
+        try:
+            import xarray as xr
+        except ImportError:
+            raise ParameterError("to_xarray", "needs xarray; install it with: pip install 'foveasim[maps]'") from None
+        variables, coordinates, _ = self._variables()
+
+        def parts(chosen: Mapping[str, Variable]) -> dict[str, Any]:
+            return {name: (part.dims, part.data, dict(part.attributes)) for name, part in chosen.items()}
+
+        return xr.Dataset(parts(variables), parts(coordinates), self._attributes())
+
+    def to_pandas(self) -> pd.DataFrame:
+        """
+        Return the capture as a table with one row per site.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Index ``site``. Columns ``x_um``, ``y_um``, ``area_um2``, ``filter_name``, ``filter_of_site``, ``code``,
+            ``electrons``, ``expected_e``, and the columns of the layout, named as in :meth:`to_xarray`. ``attrs`` has the
+            attributes of :meth:`to_xarray`.
+
+        Raises
+        ------
+        ParameterError
+            When pandas is missing.
+
+        Examples
+        --------
+        The mean code of the sites of each filter::
+
+            capture.to_pandas().groupby("filter_name")["code"].mean()
+        """
+        try:
+            import pandas as pd
+        except ImportError:
+            raise ParameterError("to_pandas", "needs pandas; install it with: pip install 'foveasim[maps]'") from None
+        variables, coordinates, _ = self._variables()
+        columns = {
+            **{name: coordinates[name] for name in ("x_um", "y_um", "area_um2")},
+            "filter_name": Variable((SITE,), np.array(self.filter_names)[self.filter_of_site], {}),
+            **{name: variables[name] for name in ("filter_of_site", "code", "electrons", "expected_e")},
+            **{name: part for name, part in coordinates.items() if part.dims == (SITE,) and name != SITE},
+        }
+        # Pandas writes into what it is given.
+        table = pd.DataFrame(
+            {name: part.data.copy() for name, part in columns.items()},
+            index=pd.Index(coordinates[SITE].data, name=SITE),
+        )
+        table.attrs = self._attributes()
+        return table
+
+    def _variables(self) -> tuple[dict[str, Variable], dict[str, Variable], dict[str, str]]:
+        """All arrays of sites and filters, the coordinates apart, and the names by which the layout's columns are in them."""
+        layout, centroid_um = self.layout, self.layout.centroid_um
+        variables = {name: _variable(name, (SITE,), np.asarray(getattr(self, name))) for name in ARRAYS}
+        variables["white_dn"] = _variable("white_dn", (FILTER,), np.asarray(self.white_dn))
+        coordinates = {
+            SITE: _variable(SITE, (SITE,), np.arange(layout.n_sites)),
+            "x_um": _variable("x_um", (SITE,), centroid_um[:, 0]),
+            "y_um": _variable("y_um", (SITE,), centroid_um[:, 1]),
+            "area_um2": _variable("area_um2", (SITE,), layout.area_um2),
+            FILTER: _variable(FILTER, (FILTER,), np.array(self.filter_names)),
+        }
+        names: dict[str, str] = {}
+        for name, values in layout.columns.items():
+            names[name] = free_name(name, {*variables, *coordinates, *DERIVED})
+            coordinates[names[name]] = _variable(name, (SITE,), values, is_renamed=names[name] != name)
+        return variables, coordinates, names
+
+    def _attributes(self) -> dict[str, Any]:
+        """What applies to all sites: numbers and strings, which any format can store."""
+        settings = self.settings
+        seed = settings.get("seed")
+        found: dict[str, Any] = {"bits": self.bits}
+        if isinstance(seed, int):
+            found["seed"] = seed if abs(seed) < 2**63 else str(seed)
+        if isinstance(settings.get("exposure_s"), int | float):
+            found["exposure_s"] = float(settings["exposure_s"])
+        return found | {
+            "settings": json.dumps(settings),
+            "versions": json.dumps(settings.get("versions", {})),
+            "provenance": json.dumps(described(dict(self.layout.provenance))),
+        }
+
     def save(self, path: str | Path) -> None:
         """
-        Write the capture to a ``.npz`` file, whole or not at all.
+        Write the capture to a ``.npz`` file or a ``.zarr`` directory, atomically.
+
+        Parameters
+        ----------
+        path : path
+            ``.npz``: one compressed file. ``.zarr``, with the extra ``video``: a store that xarray opens as what
+            :meth:`to_xarray` returns; outlines are in its group ``layout``. A capture that is there is replaced.
 
         Raises
         ------
         FileError
-            When the ending is not ``.npz``, or nothing can be written there.
+            When the extension is another, zarr is missing, something else than a capture is there, or nothing can be
+            written.
         """
+        target = Path(path)
+        if target.suffix.lower() == ZARR:
+            self._save_store(target)
+            return
+        if target.suffix.lower() != ".npz":
+            raise FileError(target, "must end in .npz or .zarr")
         about = {
             "format": FILE_FORMAT,
             "version": FILE_VERSION,
@@ -331,17 +465,47 @@ class Capture:
         arrays = {name: getattr(self, name) for name in ARRAYS}
         write_archive(path, about, arrays | packed_layout(self.layout))
 
+    def _save_store(self, target: Path) -> None:
+        zarr = library(target, "zarr")
+        variables, coordinates, names = self._variables()
+        outlines = {
+            "xy_um": _variable("xy_um", ("vertex", "axis"), self.layout.xy_um),
+            "ring_offsets": _variable("ring_offsets", ("ring_end",), self.layout.ring_offsets),
+            "site_offsets": _variable("site_offsets", ("site_end",), self.layout.site_offsets),
+        }
+        attributes = {
+            "format": FILE_FORMAT,
+            "version": FILE_VERSION,
+            **self._attributes(),
+            "filter_names": list(self.filter_names),
+            "columns": names,
+            # As xarray reads them: names of coordinates that are not dimensions.
+            "coordinates": " ".join(name for name in coordinates if name not in (SITE, FILTER)),
+        }
+        with folder_written_whole(target, is_ours=lambda folder: store_format(folder) == FILE_FORMAT) as folder:
+            group = zarr.create_group(str(folder), zarr_format=3, attributes=attributes)
+            write_variables(group, variables | coordinates)
+            write_variables(group.create_group(LAYOUT_GROUP), outlines)
+
     @classmethod
     def load(cls, path: str | Path) -> Capture:
         """
         Read a capture that :meth:`save` wrote.
 
+        Parameters
+        ----------
+        path : path
+            A ``.npz`` file or a ``.zarr`` directory.
+
         Raises
         ------
         FileError
-            When the file is missing, broken, too large, or no capture.
+            When it is missing, corrupt, incomplete, too large, or not a capture.
         """
-        with opened_archive(path, "foveasim capture", FILE_FORMAT, FILE_VERSION) as (about, arrays):
+        source = Path(path)
+        if source.is_dir() or (source.suffix.lower() == ZARR and not source.exists()):
+            return cls._load_store(source)
+        with opened_archive(source, "foveasim capture", FILE_FORMAT, FILE_VERSION) as (about, arrays):
             return cls(
                 layout=unpacked_layout(arrays, about["provenance"]),
                 code=arrays["code"],
@@ -353,3 +517,22 @@ class Capture:
                 white_dn=np.asarray(about["white_dn"], dtype=np.float64),
                 settings=about["settings"],
             )
+
+    @classmethod
+    def _load_store(cls, source: Path) -> Capture:
+        with opened_store(source, "foveasim capture", FILE_FORMAT, FILE_VERSION) as (about, arrays):
+            outlines = (arrays[f"{LAYOUT_GROUP}/{name}"][...] for name in ("xy_um", "ring_offsets", "site_offsets"))
+            columns = {str(name): arrays[place][...] for name, place in about["columns"].items()}
+            return cls(
+                layout=Layout(*outlines, columns, json.loads(about["provenance"])),
+                **{name: arrays[name][...] for name in (*ARRAYS, "white_dn")},
+                filter_names=tuple(map(str, about["filter_names"])),
+                bits=about["bits"],
+                settings=json.loads(about["settings"]),
+            )
+
+
+def _variable(name: str, dims: tuple[str, ...], values: NDArray[Any], *, is_renamed: bool = False) -> Variable:
+    """An array with its unit, by its name; times have one already, which xarray writes itself."""
+    units = {} if values.dtype.kind in "mM" else {"units": UNITS.get(name) or unit_of(name) or "1"}
+    return Variable(dims, values, units | ({"long_name": name} if is_renamed else {}))

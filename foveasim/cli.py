@@ -170,7 +170,9 @@ def convert(
 def view(
     file: Annotated[
         Path,
-        typer.Argument(help="A layout's file or name, a capture (.npz), or a report of check (.lyrdb, with --layout)."),
+        typer.Argument(
+            help="A layout's file or name, a capture (.npz, .zarr), or a report of check (.lyrdb, with --layout)."
+        ),
     ],
     web: Annotated[Path | None, typer.Option("--web", help="Write the page to this .html file.")] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Serve the page on localhost until Ctrl-C.")] = False,

@@ -21,7 +21,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 FLOORS = [
     {"errors", "_version"},
     {"apart", "arrays", "compiled", "files", "terminal"},
-    {"archives", "documents", "encodings", "parallel", "pictures", "records", "rings", "streams", "units"},
+    {"archives", "documents", "encodings", "parallel", "pictures", "records", "rings", "stores", "streams", "units"},
     {"fields"},
     {"distortion", "integrate", "layout", "maps", "optics", "scene", "sensor"},
     {"modes", "reconstruct"},

@@ -11,6 +11,7 @@ from foveasim.config import read_any_layout, read_rules
 from foveasim.errors import FileError, ParameterError, printable
 from foveasim.layout import Layout, Report
 from foveasim.layout.lyrdb import is_lyrdb, read_lyrdb
+from foveasim.stores import store_format
 
 __all__ = ["Viewable", "read_viewable"]
 
@@ -34,7 +35,7 @@ def read_viewable(path: str | Path, *, layout: str | Path | None = None, rules: 
     Parameters
     ----------
     path : path
-        A layout in any format, or the name of a shipped one; a capture (``.npz``); or a report (``.lyrdb``).
+        A layout in any format, or the name of a shipped one; a capture (``.npz``, ``.zarr``); or a report (``.lyrdb``).
     layout : path, optional
         The layout that a report is of.
     rules : path or name of a preset, optional
@@ -66,7 +67,9 @@ def read_viewable(path: str | Path, *, layout: str | Path | None = None, rules: 
 
 
 def _is_capture(path: Path) -> bool:
-    """Whether a file is numpy arrays of a capture, rather than of a layout."""
+    """Whether a file or a zarr store is a capture, rather than a layout."""
+    if path.is_dir():
+        return store_format(path) is not None
     if not path.is_file() or not zipfile.is_zipfile(path):
         return False
     try:

@@ -22,13 +22,12 @@ from foveasim.files import folder_written_whole, lock
 from foveasim.layout import Layout
 from foveasim.layout.packed import packed_layout
 from foveasim.records import described, differences
+from foveasim.stores import ZARR, check_codecs, library
 
 __all__ = [
-    "ZARR",
     "Recording",
     "alike",
     "frames_kept",
-    "library",
     "partial_of",
     "read_recording",
     "record",
@@ -36,7 +35,6 @@ __all__ = [
 ]
 
 FORMAT, VERSION = "foveasim video", 1
-ZARR = ".zarr"
 #: Codes that one chunk of a zarr folder holds, at least one frame of them: what is kept in memory while writing.
 CHUNK_CODES = 1 << 22
 #: A recording that can be gone on with is written at least so often, whether a chunk is full or not: what a sudden end costs.
@@ -44,7 +42,6 @@ WRITE_S = 10.0
 #: What packs the numbers, as zarr does unless told otherwise; and a folder with more numbers beside the codes is refused.
 CODECS = ("bytes", "zstd")
 MAX_UNPACKED_BYTES = 8 * 2**30
-NEEDS = {"zarr": "needs zarr: pip install 'foveasim[video]'", "av": "needs PyAV: pip install 'foveasim[video]'"}
 #: Arrays of the layout, and those that grow frame by frame: the numbers come last, and tell which frames are whole.
 GEOMETRY, GROWING = ("xy_um", "ring_offsets", "site_offsets"), ("code", "exposure_s", "frame")
 #: In the place of a frame's number until the frame is whole.
@@ -170,7 +167,7 @@ def _trusted(source: Path, mode: str = "r") -> Iterator[Any]:
     """The group of a recording; what its folder holds may be anything, and whatever that breaks is told in one sentence."""
     zarr = library(source, "zarr")
     try:
-        _check_codecs(source)
+        check_codecs(source, CODECS, "video of captures")
         group = zarr.open_group(str(source), mode=mode, use_consolidated=False)  # which is not what was checked
         if group.attrs.get("format") != FORMAT:
             raise FileError(source, "is no video of captures")
@@ -188,40 +185,12 @@ def _trusted(source: Path, mode: str = "r") -> Iterator[Any]:
         raise FileError(source, f"is broken or no video of captures ({' '.join(str(error).split())})") from None
 
 
-def _check_codecs(source: Path) -> None:
-    """Refuse metadata that name other programs to run on the chunks than those that recordings are packed with."""
-    for path in (*source.glob("zarr.json"), *source.glob("*/zarr.json"), *source.glob("columns/*/zarr.json")):
-        metadata = json.loads(path.read_text(encoding="utf-8"))
-        if metadata.get("storage_transformers"):
-            raise FileError(source, "is packed in a way that no video of captures is")
-        for codec in metadata.get("codecs", []):
-            if codec.get("name") not in CODECS:
-                raise FileError(source, f"is packed with {codec.get('name')!r:.40}, as no video of captures is")
-
-
 def _is_recording(folder: Path) -> bool:
     zarr = library(folder, "zarr")
     try:
         return zarr.open_group(str(folder), mode="r", use_consolidated=False).attrs.get("format") == FORMAT
     except Exception:  # noqa: BLE001 -- whatever else it is
         return False
-
-
-def library(path: Path, name: str) -> Any:
-    """
-    A library that files of a kind need.
-
-    Raises
-    ------
-    FileError
-        When it is missing.
-    """
-    from importlib import import_module
-
-    try:
-        return import_module(name)
-    except ImportError:
-        raise FileError(path, NEEDS[name]) from None
 
 
 # -- writing ----------------------------------------------------------------------------------------------------------

@@ -20,7 +20,8 @@ from foveasim.layout import Layout
 from foveasim.pictures import write_picture
 from foveasim.reconstruct import Picture, fill_channels, raster_grid
 from foveasim.reconstruct.picture import covered_share
-from foveasim.video.recording import ZARR, alike, frames_kept, library, record, record_on
+from foveasim.stores import ZARR, library
+from foveasim.video.recording import alike, frames_kept, record, record_on
 
 __all__ = ["write_video"]
 

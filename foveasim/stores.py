@@ -1,0 +1,221 @@
+"""
+Zarr stores from anywhere: opened without running what they name, and read only where every number is there.
+
+Metadata of a zarr array name the codecs that decompress its chunks, a chunk that is missing reads as a fill value, and a
+few bytes of metadata can claim any size. What reads a store of ours therefore checks the metadata first.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import warnings
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim.errors import FileError, shown
+
+__all__ = [
+    "ZARR",
+    "Variable",
+    "check_codecs",
+    "free_name",
+    "library",
+    "opened_store",
+    "store_format",
+    "write_variables",
+]
+
+ZARR = ".zarr"
+#: Metadata of a group or an array are text; a longer file is something else.
+MAX_METADATA_BYTES = 2**26
+#: Longest name of an array: names of files have 255 bytes.
+LONGEST_NAME = 60
+NEEDS = {"zarr": "needs zarr: pip install 'foveasim[video]'", "av": "needs PyAV: pip install 'foveasim[video]'"}
+
+
+@dataclass(frozen=True)
+class Variable:
+    """An array with the names of its dimensions and its attributes, its unit among them."""
+
+    dims: tuple[str, ...]
+    data: NDArray[Any]
+    attributes: Mapping[str, Any]
+
+
+def library(path: Path, name: str) -> Any:
+    """
+    Import a library that files of a kind need.
+
+    Raises
+    ------
+    FileError
+        When it is missing.
+    """
+    try:
+        return import_module(name)
+    except ImportError:
+        raise FileError(path, NEEDS[name]) from None
+
+
+def free_name(name: str, taken: Collection[str]) -> str:
+    """
+    Return a name for an array that zarr, netCDF and xarray take: letters, digits and ``_``, and not yet taken.
+
+    Examples
+    --------
+    >>> free_name("a/b", {"a_b"})
+    'a_b_'
+    """
+    safe = re.sub(r"\W", "_", name, flags=re.ASCII)[:LONGEST_NAME]
+    safe = safe if re.match(r"[A-Za-z]", safe) else f"column_{safe.lstrip('_')}"
+    while safe in taken:
+        safe += "_"
+    return safe
+
+
+def write_variables(group: Any, variables: Mapping[str, Variable]) -> None:
+    """
+    Write arrays into an open group, each uncompressed in one chunk, with the names of its dimensions.
+
+    Raises
+    ------
+    FileError
+        When this version of zarr has no array of that type.
+    """
+    with warnings.catch_warnings():
+        # Zarr has text of a fixed length for all who open the store with xarray, and warns that others may not read it.
+        warnings.simplefilter("ignore")
+        for name, variable in variables.items():
+            values = np.asarray(variable.data, order="C")
+            values = values.astype(values.dtype.newbyteorder("="), copy=False)
+            array = group.create_array(
+                name,
+                shape=values.shape,
+                chunks=tuple(max(n, 1) for n in values.shape),
+                dtype=values.dtype,
+                filters=None,
+                compressors=None,
+                dimension_names=variable.dims,
+                attributes=dict(variable.attributes),
+                config={"write_empty_chunks": True},
+            )
+            if array.dtype != values.dtype:
+                raise FileError(
+                    Path(str(group.store_path)), f"cannot hold '{name}' of the type {values.dtype}; update zarr"
+                )
+            if values.size:
+                array[...] = values
+
+
+def store_format(path: Path) -> str | None:
+    """Return what the root of a zarr store specifies as its format, None where there is no store of zarr 3."""
+    try:
+        return str(_metadata(path / "zarr.json")["attributes"]["format"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+
+
+def check_codecs(source: Path, allowed: Collection[str], what: str) -> None:
+    """
+    Check that metadata name no other codecs for the chunks than the allowed ones.
+
+    Raises
+    ------
+    FileError
+        When they do.
+    ValueError, KeyError, AttributeError, OSError
+        When the metadata are corrupt.
+    """
+    for path in (*source.glob("zarr.json"), *source.glob("*/zarr.json"), *source.glob("*/*/zarr.json")):
+        metadata = _metadata(path)
+        if metadata.get("storage_transformers"):
+            raise FileError(source, f"is packed in a way that no {what} is")
+        for codec in metadata.get("codecs", []):
+            if codec.get("name") not in allowed:
+                raise FileError(source, f"is packed with {shown(codec.get('name'), at_most=40)}, as no {what} is")
+
+
+@contextmanager
+def opened_store(
+    path: Path, what: str, file_format: str, version: int
+) -> Iterator[tuple[Mapping[str, Any], Mapping[str, Any]]]:
+    """
+    Open a store that :func:`write_variables` wrote; any error in the block that its contents cause is a FileError.
+
+    Parameters
+    ----------
+    path : Path
+        A directory.
+    what : str
+        What the store should hold, for messages: ``"foveasim capture"``.
+    file_format, version
+        What its attributes must specify.
+
+    Yields
+    ------
+    attributes : mapping
+        Of the root.
+    arrays : mapping of str to zarr array
+        By path, such as ``"code"`` and ``"layout/xy_um"``; every one has all its numbers.
+
+    Raises
+    ------
+    FileError
+        When zarr is missing, or the store is missing, corrupt, incomplete or of another format.
+    """
+    zarr = library(path, "zarr")
+    if not path.is_dir():
+        raise FileError(path, "is not a zarr store" if path.exists() else "no such zarr store")
+    try:
+        _check_plain_files(path)
+        check_codecs(path, ("bytes",), what)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            group = zarr.open_group(str(path), mode="r", use_consolidated=False)
+            attributes = dict(group.attrs)
+            if attributes.get("format") != file_format:
+                raise FileError(path, f"is not a {what}")
+            if attributes.get("version") != version:
+                raise FileError(path, f"has the format version {shown(attributes.get('version'))}, expected {version}")
+            arrays: dict[str, Any] = dict(group.arrays())
+            for name, inner in group.groups():
+                arrays |= {f"{name}/{key}": array for key, array in inner.arrays()}
+            for name, array in arrays.items():
+                if array.nbytes != _bytes_of_chunks(path / name):
+                    raise FileError(path, f"is corrupt: '{name}' is incomplete")
+        yield attributes, arrays
+    except FileError:
+        raise
+    except Exception as error:  # noqa: BLE001 -- corrupt contents make their readers raise anything
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise FileError(path, f"is corrupt or not a {what} ({reason:.200})") from None
+
+
+def _metadata(path: Path) -> Any:
+    if path.stat().st_size > MAX_METADATA_BYTES:
+        raise ValueError(f"{path.name} has more than {MAX_METADATA_BYTES} bytes")
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _check_plain_files(path: Path) -> None:
+    """Check that nothing in a store leads out of it."""
+    for folder, folders, files in os.walk(path, followlinks=False):
+        for name in (*folders, *files):
+            found = Path(folder) / name
+            if found.is_symlink() or not (found.is_file() or found.is_dir()):
+                raise FileError(path, f"holds {shown(name)}, which is neither a file nor a directory of its own")
+
+
+def _bytes_of_chunks(folder: Path) -> int:
+    return sum(file.stat().st_size for file in (folder / "c").rglob("*") if file.is_file()) + (
+        (folder / "c").stat().st_size if (folder / "c").is_file() else 0
+    )
