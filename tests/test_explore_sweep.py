@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
@@ -1031,3 +1032,70 @@ def test_results_are_of_the_files_as_they_were(folder):
     assert plans[0].settings == plans[1].settings
     assert plans[0].settings["scene"]["picture"] == str(folder / "photo.png")
     assert plans[0].described() != plans[1].described()
+
+
+# -- who may talk to a sweep's own scheduler ------------------------------------------------------------------------
+
+
+def attempt(address, arguments, function):
+    """Try to run a function at an address of dask: as a client of a scheduler, and as a peer of a worker."""
+    from distributed import Client, rpc
+    from distributed.protocol.pickle import dumps
+
+    async def ask():
+        async with rpc(address, **arguments) as peer:
+            await asyncio.wait_for(peer.run(function=dumps(function)), 2.0)
+
+    with (
+        suppress(Exception),
+        Client(address, timeout=2.0, set_as_default=False, **arguments.get("client", {})) as client,
+    ):
+        client.submit(function).result(timeout=5.0)
+        client.run_on_scheduler(function)
+    arguments.pop("client", None)
+    with suppress(Exception):
+        asyncio.run(ask())
+
+
+@pytest.mark.parametrize("certificate", ["none", "another"])
+def test_only_owner_runs_code_on_local_workers(certificate, tmp_path):
+    from distributed import Security
+
+    from foveasim.explore._cluster import client_of
+
+    mark = tmp_path / "mark"
+    with client_of(None, 1) as client:
+        info = client.scheduler_info(n_workers=-1)["workers"]
+        addresses = {client.scheduler.address, *info, *(one["nanny"] for one in info.values())}
+        assert len(addresses) == 3
+        for address in addresses:
+            plain = address.rpartition("://")[2]
+            if certificate == "none":
+                attempt(f"tcp://{plain}", {}, mark.touch)
+            else:
+                other = Security.temporary()
+                arguments = {"connection_args": other.get_connection_args("client"), "client": {"security": other}}
+                attempt(f"tls://{plain}", arguments, mark.touch)
+        is_run_by_others = mark.exists()
+        client.submit(mark.touch).result(timeout=LIMIT_S)
+
+    assert not is_run_by_others
+    assert mark.exists()
+
+
+def test_local_cluster_answers_nothing_over_http():
+    from foveasim.explore._cluster import client_of
+
+    with client_of(None, 1) as client:
+        cluster = client.cluster
+        ports = [cluster.scheduler.http_server.port] if getattr(cluster.scheduler, "http_server", None) else []
+        for worker in client.scheduler_info(n_workers=-1)["workers"].values():
+            ports += [port for port in worker["services"].values() if isinstance(port, int)]
+        answers = []
+        for port in ports:
+            for page in ("info/main/workers.html", "json/counts.json", "metrics", "health", "proxy/22/127.0.0.1/"):
+                with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=5.0) as peer:
+                    peer.sendall(f"GET /{page} HTTP/1.0\r\n\r\n".encode())
+                    answers.append(peer.recv(100).split(b"\r\n")[0])
+
+    assert not [answer for answer in answers if b"404" not in answer]

@@ -15,7 +15,7 @@ from foveasim.errors import ParameterError, SimulationError
 from foveasim.explore._bench import run_tasks
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Security
 
 __all__ = ["Worker", "Workers", "client_of"]
 
@@ -31,6 +31,8 @@ MEMORY = {
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": 0.95,
 }
+#: Nothing of a local cluster answers over HTTP, which asks nobody for a certificate.
+NO_HTTP = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 
 
 @contextmanager
@@ -41,22 +43,30 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
     Raises
     ------
     ParameterError
-        When dask is missing, or no scheduler answers.
+        When dask or cryptography is missing, or no scheduler answers.
     SimulationError
         When workers do not start on this machine.
+
+    Notes
+    -----
+    Whoever can talk to a scheduler or a worker of dask can run code with the rights of its owner. Those on this machine
+    talk TLS with a key of this run alone, which never leaves the memory of its processes, and accept nobody without it.
+    A scheduler that somebody started is met as dask's configuration says (``distributed.comm.tls``).
     """
     try:
         import dask
-        from distributed import Client, LocalCluster
+        from distributed import Client, LocalCluster, Security
         from distributed.system import MEMORY_LIMIT
+
+        security = Security() if scheduler is not None else Security.temporary()
     except ImportError:
         raise ParameterError(
-            "sweep", "needs dask.distributed; install it with: pip install 'foveasim[explore]'"
+            "sweep", "needs dask.distributed and cryptography; install them with: pip install 'foveasim[explore]'"
         ) from None
     if scheduler is not None:
-        _check_answer(scheduler)
+        _check_answer(scheduler, security)
         with _silent():
-            client = Client(scheduler, timeout=SCHEDULER_S, set_as_default=False)
+            client = Client(scheduler, timeout=SCHEDULER_S, security=security, set_as_default=False)
             try:
                 yield client
             finally:
@@ -69,7 +79,9 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
     # A worker's end is ours to judge: each point is tried again, alone, and counted.
     with (
         dask.config.set(
-            {"distributed.scheduler.allowed-failures": 0, "distributed.scheduler.work-stealing": False} | MEMORY
+            {"distributed.scheduler.allowed-failures": 0, "distributed.scheduler.work-stealing": False}
+            | MEMORY
+            | NO_HTTP
         ),
         ExitStack() as opened,
     ):
@@ -77,6 +89,7 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
             cluster = opened.enter_context(
                 LocalCluster(
                     n_workers=n_workers,
+                    security=security,
                     threads_per_worker=1,
                     memory_limit=MEMORY_LIMIT // n_workers,
                     # No dashboard: only so does dask not ask for the one port of another's, and warn where that has it.
@@ -110,12 +123,12 @@ def _silent() -> Iterator[None]:
             log.setLevel(level)
 
 
-def _check_answer(scheduler: str) -> None:
+def _check_answer(scheduler: str, security: Security) -> None:
     """Ask a scheduler who it is: a client that found none would not let go of the program for a while."""
     from distributed import rpc
 
     async def answer() -> Any:
-        async with rpc(scheduler) as asked:
+        async with rpc(scheduler, connection_args=security.get_connection_args("client")) as asked:
             return await asyncio.wait_for(asked.identity(), SCHEDULER_S)
 
     reason = "it is something else"
