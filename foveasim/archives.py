@@ -23,6 +23,8 @@ __all__ = ["opened_archive", "read_archive", "write_archive"]
 #: Name of the text beside the arrays.
 ABOUT = "about"
 SUFFIX = ".npy"
+#: numpy before 2.2 stores the argument of this name as one more array; readers ignore it.
+STRAY = "allow_pickle"
 #: A file that would unpack to more than this is refused.
 MAX_UNPACKED_BYTES = 8 * 2**30
 
@@ -46,15 +48,18 @@ def write_archive(
     Raises
     ------
     FileError
-        When the ending is another, or nothing can be written there.
+        When the ending is another, an array contains Python objects, or nothing can be written there.
     """
     target = Path(path)
     if target.suffix.lower() != ".npz":
         raise FileError(target, "must end in .npz")
+    pickled = [name for name, array in arrays.items() if array.dtype.hasobject]
+    if pickled:  # allow_pickle=False would raise it, but only from numpy 2.2 on
+        raise FileError(target, f"{pickled[0]!r:.40} must contain numbers or strings, got Python objects")
     text = np.array(json.dumps(about))
     with written_whole(target) as temporary, temporary.open("wb") as file:
         write = np.savez_compressed if is_packed else np.savez
-        write(file, allow_pickle=False, **{ABOUT: text, **arrays})
+        write(file, **{ABOUT: text, **arrays})
 
 
 def read_archive(path: Path, *, max_bytes: int | None = None) -> tuple[Any, dict[str, NDArray[Any]]]:
@@ -71,6 +76,7 @@ def read_archive(path: Path, *, max_bytes: int | None = None) -> tuple[Any, dict
     limit = MAX_UNPACKED_BYTES if max_bytes is None else max_bytes
     with zipfile.ZipFile(path) as archive:
         items = {item.filename.removesuffix(SUFFIX): item for item in archive.infolist()}
+        items.pop(STRAY, None)
         if sum(item.file_size for item in archive.infolist()) > limit:
             raise FileError(path, f"would unpack to more than {limit} bytes")
         if not {item.compress_type for item in items.values()} <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
