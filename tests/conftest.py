@@ -1,10 +1,11 @@
-"""What some tests need of the machine: ``@pytest.mark.needs("renderer")``, ``"chromium"``; and kernels for all processes."""
+"""What some tests need of the machine: ``@pytest.mark.needs("renderer")``, ``"chromium"``, ``"torch"``; and kernels for all processes."""
 
 from __future__ import annotations
 
-import importlib
 import os
+import re
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -20,15 +21,29 @@ def chromium_is_missing():
     return None if shutil.which("chromium") else "no chromium on the path"
 
 
-MISSING = {"renderer": renderer_is_missing, "chromium": chromium_is_missing}
+def torch_is_missing():
+    return None if find_spec("torch") else "no torch: make test-torch runs this test"
+
+
+MISSING = {"renderer": renderer_is_missing, "chromium": chromium_is_missing, "torch": torch_is_missing}
+PACKAGE = Path(__file__).parents[1] / "foveasim"
+NUMBA = re.compile(r"^(from|import) numba\b", re.MULTILINE)
+
+
+def kernel_modules():
+    """Room and name of each module that loads numba when it is imported."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        if NUMBA.search(path.read_text()):
+            yield ".".join(path.relative_to(PACKAGE).parent.parts), path.stem
 
 
 def pytest_configure(config):
     """Compile all kernels once, before there are several processes that would each compile them."""
     if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
-        root = Path(__file__).parents[1]
-        for path in (root / "foveasim").rglob("_kernels.py"):
-            importlib.import_module(".".join(path.relative_to(root).with_suffix("").parts))
+        from foveasim.compiled import kernels
+
+        for room, module in kernel_modules():
+            kernels(room, module)
 
 
 def pytest_runtest_setup(item):

@@ -37,6 +37,7 @@ import shapely
 from numpy.typing import NDArray
 
 from foveasim.arrays import MAX_SITES, Floats, Ints, check_count, check_number
+from foveasim.compiled import kernels
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.files import written_whole
 from foveasim.layout._model import Layout
@@ -354,12 +355,10 @@ def read(path: Path, *, layer: int | None = None, cell: str | None = None) -> La
 
 def _check_records(path: Path, data: bytes) -> None:
     """Records of GDSII must have lengths that lead to the end of the library, and types that are known."""
-    from foveasim.layout.files._kernels import walk_records
-
     is_known = np.zeros(2**16, bool)
     for kind, records in RECORDS_OF_TYPE.items():
         is_known[[record << 8 | kind for record in records]] = True
-    at, record = walk_records(np.frombuffer(data, np.uint8), is_known, END_OF_LIBRARY)
+    at, record = kernels("layout.files").walk_records(np.frombuffer(data, np.uint8), is_known, END_OF_LIBRARY)
     if record == -1:
         raise FileError(path, f"is broken: byte {at} begins no GDSII record")
     if record != END_OF_LIBRARY or at > len(data):
