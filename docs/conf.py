@@ -71,16 +71,38 @@ ROOMS = {
 REFERENCE = Path(__file__).parent / "reference"
 
 
-def write_reference(_app: Sphinx, _config: Config) -> None:
-    """Write a page for every room, which lists what the room says is public."""
-    REFERENCE.mkdir(exist_ok=True)
+def public_names() -> dict[str, list[str]]:
+    """List the public names of every room, which have a page each."""
     rooms = {name: importlib.import_module(name) for name in ROOMS}
     # What the package lends from its rooms is listed with the rooms.
     lent = {"__version__"}.union(*(room.__all__ for name, room in rooms.items() if name != "foveasim"))
+    public = {}
+    for name, room in rooms.items():
+        hidden = lent if name == "foveasim" else set()
+        public[name] = [n for n in room.__all__ if n not in hidden and not inspect.ismodule(getattr(room, n))]
+    return public
+
+
+def gallery_scripts(repository: Path) -> list[Path]:
+    """List the scripts of the gallery, which have a page each."""
+    return sorted((repository / "gallery").glob("[0-9]*.py"))
+
+
+def generated_pages(repository: Path) -> set[Path]:
+    """List the pages that the build writes, relative to the directory of the documentation."""
+    rooms = {f"{name}.md" for name in ROOMS}
+    made = {f"made/{room}.{name}.rst" for room, names in public_names().items() for name in names}
+    scripts = {f"{script.stem}.md" for script in gallery_scripts(repository)}
+    reference = {Path("reference", page) for page in {"index.md"} | rooms | made}
+    return reference | {Path("gallery", page) for page in {"index.md"} | scripts}
+
+
+def write_reference(_app: Sphinx, _config: Config) -> None:
+    """Write a page for every room, which lists what the room says is public."""
+    REFERENCE.mkdir(exist_ok=True)
+    public = public_names()
     for name, about in ROOMS.items():
-        room, hidden = rooms[name], lent if name == "foveasim" else set()
-        public = [n for n in room.__all__ if n not in hidden and not inspect.ismodule(getattr(room, n))]
-        names = "\n".join(f"   {n}" for n in public)
+        names = "\n".join(f"   {n}" for n in public[name])
         table = f".. currentmodule:: {name}\n\n.. autosummary::\n   :toctree: made\n   :nosignatures:\n\n{names}\n"
         (REFERENCE / f"{name}.md").write_text(f"# {name}\n\n{about}\n\n```{{eval-rst}}\n{table}```\n")
     contents = "\n".join(ROOMS)
@@ -91,7 +113,7 @@ def write_reference(_app: Sphinx, _config: Config) -> None:
 def write_gallery(_app: Sphinx, _config: Config) -> None:
     """Run every script of the gallery, and write a page for each: what it asks and expects, its pictures, its source."""
     entries, stems = [], []
-    for script in sorted((REPOSITORY / "gallery").glob("[0-9]*.py")):
+    for script in gallery_scripts(REPOSITORY):
         folder = GALLERY / script.stem
         done = folder / "done"
         if not done.exists() or done.stat().st_mtime < script.stat().st_mtime:
