@@ -521,10 +521,12 @@ class Capture:
     @classmethod
     def _load_store(cls, source: Path) -> Capture:
         with opened_store(source, "foveasim capture", FILE_FORMAT, FILE_VERSION) as (about, arrays):
-            outlines = (arrays[f"{LAYOUT_GROUP}/{name}"][...] for name in ("xy_um", "ring_offsets", "site_offsets"))
+            xy_um, ring_offsets, site_offsets = (
+                arrays[f"{LAYOUT_GROUP}/{name}"][...] for name in ("xy_um", "ring_offsets", "site_offsets")
+            )
             columns = {str(name): arrays[place][...] for name, place in about["columns"].items()}
             return cls(
-                layout=Layout(*outlines, columns, json.loads(about["provenance"])),
+                layout=Layout(xy_um, ring_offsets, site_offsets, columns, json.loads(about["provenance"])),
                 **{name: arrays[name][...] for name in (*ARRAYS, "white_dn")},
                 filter_names=tuple(map(str, about["filter_names"])),
                 bits=about["bits"],

@@ -534,14 +534,14 @@ class Sensor:
         return code
 
     def _checked_charges(self, name: str, charge_e: ArrayLike, at_least: float = 0.0) -> NDArray[Any]:
-        charge_e = unmasked(name, charge_e)
-        if np.shape(charge_e) != (self.layout.n_sites,):
+        charges = np.asarray(unmasked(name, charge_e))
+        if charges.shape != (self.layout.n_sites,):
             raise ParameterError(
-                name, f"must be one number for each of the {self.layout.n_sites} sites, got {np.shape(charge_e)}"
+                name, f"must be one number for each of the {self.layout.n_sites} sites, got {charges.shape}"
             )
-        if self.layout.n_sites and not np.min(charge_e) >= at_least:
-            raise ParameterError(name, f"must be >= {at_least:g} everywhere", float(np.min(charge_e)), "e-")
-        return charge_e
+        if charges.size and not np.min(charges) >= at_least:
+            raise ParameterError(name, f"must be >= {at_least:g} everywhere", float(np.min(charges)), "e-")
+        return charges
 
     def checked_charges(self, name: str, charge_e: ArrayLike) -> Floats:
         """
