@@ -1398,7 +1398,7 @@ def test_fast_graphics_smooth_edges_of_solids(visit, tmp_path):
         press(page, "t")
         rest(page)
         page.evaluate("document.activeElement.blur()")
-        # The two upper corners of the view are under nothing else.
+        # Without the buttons over the view.
         (tmp_path / "edge.png").write_bytes(page.screenshot(clip={"x": 4, "y": 70, "width": 800, "height": 700}))
         picture = read_picture(tmp_path / "edge.png")[..., :3]
         n_colours[name] = len(np.unique(picture.reshape(-1, 3), axis=0))
