@@ -613,7 +613,7 @@ def test_a_loaded_capture_gives_the_same_picture(tmp_path):
             lambda c, _: c.picture("least_squares"),
             "'sensor' must be given: the capture's settings do not tell its 'capacitance_f' of every site",
         ),
-        (lambda c, _: c.picture(per="um2", sensor="magic"), "'sensor' must be the Sensor of these 108 sites"),
+        (lambda c, _: c.picture(per="um2", sensor="magic"), "'sensor' must be the Sensor of the capture's layout"),
         (
             lambda _, k: k.reference("magic", fs.Grid((2, 2), 1.0), exposure_s=1.0),
             "'light' must be a Scene or a PowerMap",

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import shapely
@@ -545,7 +545,7 @@ def _column(name: str, values: ArrayLike) -> NDArray[Any]:
         raise ParameterError(name, "must have one value for each site", values) from None
     is_as_given = isinstance(values, np.ndarray) and values.dtype.kind == "f"
     if column.ndim == 1 and column.dtype.kind in "fO" and not is_as_given:
-        items = list(values)  # type: ignore[call-overload]
+        items: list[Any] = list(cast(Any, values))
         if items and all(isinstance(item, int | np.integer) for item in items):
             integers = exact_integers([int(item) for item in items])
             if integers is None:
