@@ -54,7 +54,7 @@ def write_archive(
     if target.suffix.lower() != ".npz":
         raise FileError(target, "must end in .npz")
     pickled = [name for name, array in arrays.items() if array.dtype.hasobject]
-    if pickled:  # allow_pickle=False would raise it, but only from numpy 2.2 on
+    if pickled:  # not by allow_pickle=False, which is an array's name to numpy before 2.2
         raise FileError(target, f"{pickled[0]!r:.40} must contain numbers or strings, got Python objects")
     text = np.array(json.dumps(about))
     with written_whole(target) as temporary, temporary.open("wb") as file:

@@ -1248,33 +1248,3 @@ def test_torch_is_not_needed_and_not_loaded_for_a_data_set():
     code = "import sys; from foveasim import explore; sys.exit('torch' in sys.modules or 'zarr' in sys.modules)"
 
     assert subprocess.run([sys.executable, "-c", code], env=os.environ, check=False).returncode == 0
-
-
-def test_a_loader_of_torch_gives_the_same_samples_with_any_number_of_workers(tmp_path):
-    torch = pytest.importorskip("torch")
-    data = explore.DataSet(pictures(50), SHOT, VARY, cameras=20, labels=[k % 7 for k in range(50)])
-    stored = explore.write_data_set(data, tmp_path / "data.zarr")
-    found = {
-        n: list(torch.utils.data.DataLoader(samples, batch_size=40, num_workers=n, shuffle=False))
-        for n, samples in ((0, data), (2, explore.torch_data_set(data)))
-    }
-    found["stored"] = list(torch.utils.data.DataLoader(stored, batch_size=40, num_workers=2))
-
-    assert isinstance(explore.torch_data_set(data), torch.utils.data.Dataset)
-    assert sum(len(batch["label"]) for batch in found[0]) == len(data) == 1000
-    for other in (found[2], found["stored"]):
-        for one, two in zip(found[0], other, strict=True):
-            for name in ("index", "code", "electrons", "label", "picture"):
-                assert torch.equal(one[name], two[name])
-            for path in VARY:
-                assert torch.equal(one["settings"][path], two["settings"][path])
-    np.testing.assert_array_equal(found[0][3]["code"][5].numpy(), data[125]["code"])
-
-
-def test_deep_codes_become_tensors_that_torch_can_reckon_with():
-    torch = pytest.importorskip("torch")
-    data = explore.DataSet(pictures(1), SHOT, changes={"sensor.bits": 12})
-    transformed = explore.torch_data_set(data, partial(operator.itemgetter("code")))
-
-    assert explore.torch_data_set(data)[0]["code"].dtype == torch.int32
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(transformed))[0].numpy(), data[0]["code"])

@@ -28,7 +28,9 @@ EXTRAS = {
     "view": {"view"},
 }
 #: Extras of what is not part of the package.
-FOLDERS = {"tests": {"dev", "torch"}, "benchmarks": {"dev", "torch"}, "gallery": {"dev"}, "docs": {"docs"}}
+FOLDERS = {"tests": {"dev"}, "benchmarks": {"dev", "torch"}, "gallery": {"dev"}, "docs": {"docs"}}
+#: What may name PyTorch: the only tests that run where it is installed, and the check whether it is.
+TORCH_TESTS = {ROOT / "tests" / "test_dataset_torch.py", ROOT / "tests" / "conftest.py"}
 #: Distributions that no line imports.
 INDIRECT = {
     "h5netcdf": "xarray's engine for NetCDF files",
@@ -113,7 +115,8 @@ def test_imports_of_package_are_declared(path):
 
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_imports_of_folders_are_declared(folder):
-    found = {path: undeclared_imports(path, FOLDERS[folder]) for path in sorted((ROOT / folder).rglob("*.py"))}
+    paths = sorted(set((ROOT / folder).rglob("*.py")) - TORCH_TESTS)
+    found = {path: undeclared_imports(path, FOLDERS[folder]) for path in paths}
 
     assert found
     assert {str(path.relative_to(ROOT)): names for path, names in found.items() if names} == {}
@@ -148,3 +151,15 @@ def test_install_hints_name_an_extra():
 
     assert hints
     assert {part for hint in hints for part in hint.split(",")} <= set(PROJECT["optional-dependencies"])
+
+
+def test_bounds_of_a_distribution_agree():
+    bounds = {}
+    for requirements in (PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()):
+        for requirement in requirements:
+            name, bound = re.match(r"([\w.-]+(?:\[[^\]]*\])?)(.*)", requirement).groups()
+            bounds.setdefault(name, set()).add(bound)
+
+    assert {
+        name: found for name, found in bounds.items() if len(found) > 1 or ("" in found and PROJECT["name"] not in name)
+    } == {}

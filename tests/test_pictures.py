@@ -510,7 +510,9 @@ def test_a_picture_whose_end_was_never_written_is_refused(tmp_path, kind):
     content = WHOLE[kind]
     for share in (0.3, 0.6, 0.9):
         n = int(share * len(content))
-        assert_is_refused(tmp_path, content[:n] + bytes(len(content) - n), "is broken or cut short")
+        # pillow before 13 does not recognise a JPEG picture without its tables.
+        is_refused = "is broken or cut short|is not a picture in a format that can be read"
+        assert_is_refused(tmp_path, content[:n] + bytes(len(content) - n), is_refused)
 
 
 def test_a_jpeg_2000_cut_behind_its_header_is_refused(tmp_path):
