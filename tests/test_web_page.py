@@ -903,7 +903,7 @@ def test_packed_surfaces_return_every_triangle(layout, meshes, n_tiles):
     assert about["lattice_um"] <= 0.001
 
 
-def test_surfaces_that_no_page_can_show_are_named():
+def test_unshowable_surfaces_raise_by_name():
     (mesh,) = solids(MOSAIC, SensorStack(trench_width_um=0.0, filter_thickness_um=0.0, lens_height_um=0.0)).meshes
     spotted, crossing = mesh.colours.copy(), mesh.triangles.copy()
     spotted[5] = 1, 2, 3
@@ -1121,7 +1121,7 @@ def test_gestures_change_the_view_and_nothing_else(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_two_fingers_zoom_and_one_turns_the_solids(visit):
+def test_two_fingers_zoom_one_turns_solids(visit):
     page = visit(solid_page(CAPTURE), has_touch=True)
     fingers = page.context.new_cdp_session(page)
 
@@ -1225,7 +1225,7 @@ def test_solids_stay_sharp_however_near_one_goes(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_click_and_enter_pin_a_site_of_the_solids(visit):
+def test_click_and_enter_pin_a_site(visit):
     page = visit(solid_page(CAPTURE))
     press(page, "t")
     rest(page)
@@ -1325,7 +1325,7 @@ def assert_alike(one, other):
 
 
 @pytest.mark.needs("chromium")
-def test_solid_page_names_what_is_missing_without_webgl2(visit):
+def test_solid_page_reports_missing_webgl2(visit):
     without = (
         "const get = HTMLCanvasElement.prototype.getContext;"
         "HTMLCanvasElement.prototype.getContext = function (kind, ...rest)"
@@ -1339,7 +1339,7 @@ def test_solid_page_names_what_is_missing_without_webgl2(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_solids_fill_every_pixel_of_a_fine_screen(visit):
+def test_solids_fill_fine_screens(visit):
     page = visit(solid_page(CAPTURE), device_scale_factor=2)
     size = "[document.getElementById('solid').width, document.getElementById('solid').height]"
     for width, height in ((1200, 800), (900, 620), (640, 760)):
