@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -58,7 +58,7 @@ def write_archive(
         raise FileError(target, f"{pickled[0]!r:.40} must contain numbers or strings, got Python objects")
     text = np.array(json.dumps(about))
     with written_whole(target) as temporary, temporary.open("wb") as file:
-        write = np.savez_compressed if is_packed else np.savez
+        write: Callable[..., None] = np.savez_compressed if is_packed else np.savez
         write(file, **{ABOUT: text, **arrays})
 
 

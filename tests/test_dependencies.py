@@ -19,11 +19,13 @@ ROOT = PACKAGE.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 #: Extras of each part of the package, beyond what is always installed.
 EXTRAS = {
+    "capture": {"maps"},
     "explore": {"explore", "torch"},
     "layout": {"layout"},
     "maps": {"maps"},
     "modes": {"video"},
     "pictures": {"pictures"},
+    "stores": {"maps"},
     "video": {"video"},
     "view": {"view"},
 }
@@ -33,6 +35,7 @@ FOLDERS = {"tests": {"dev"}, "benchmarks": {"dev", "torch"}, "gallery": {"dev"},
 TORCH_TESTS = {ROOT / "tests" / "test_dataset_torch.py", ROOT / "tests" / "conftest.py"}
 #: Distributions that no line imports.
 INDIRECT = {
+    "cryptography": "distributed makes the keys of a sweep's own scheduler with it",
     "h5netcdf": "xarray's engine for NetCDF files",
     "lxml": "trimesh writes 3MF with it",
     "networkx": "trimesh writes 3MF with it",

@@ -32,7 +32,7 @@ MEMORY = {
     "distributed.worker.memory.terminate": 0.95,
 }
 #: Nothing of a local cluster answers over HTTP, which asks nobody for a certificate.
-NO_HTTP = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
+NO_HTTP: dict[str, list[str]] = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 
 
 @contextmanager
