@@ -70,14 +70,14 @@ $(VENV)/.installed-docs: $(VENV)/.made pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[docs]'
 	touch $@ $(VENV)/.installed-dev $(VENV)/.installed
 
-# The build backend is not isolated, as it would be its newest version there.
+# The oldest build backend too, which uv chooses of its own accord the newest.
 $(LOWEST)/.installed: $(LOWEST)/uv/.made pyproject.toml
 	@echo "installing the oldest versions that foveasim admits into $(LOWEST) (a minute or so)"
 	$(LOWEST)/uv/bin/python -m pip install --quiet uv
 	$(UV) venv --quiet --clear --python $(LOWEST_PYTHON) $(LOWEST)/env
-	$(LOWEST)/uv/bin/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")' > $(LOWEST)/build.txt
-	$(UV) pip install --quiet --python $(LOWEST)/env/bin/python --resolution lowest-direct --requirements $(LOWEST)/build.txt
-	$(UV) pip install --quiet --python $(LOWEST)/env/bin/python --resolution lowest-direct --no-build-isolation \
+	$(LOWEST)/uv/bin/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")' | \
+		$(UV) pip compile --quiet --python $(LOWEST)/env/bin/python --resolution lowest-direct --output-file $(LOWEST)/build.txt -
+	$(UV) pip install --quiet --python $(LOWEST)/env/bin/python --resolution lowest-direct --build-constraints $(LOWEST)/build.txt \
 		--editable '.[dev,docs]'
 	touch $@
 

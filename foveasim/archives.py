@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -56,10 +56,10 @@ def write_archive(
     pickled = [name for name, array in arrays.items() if array.dtype.hasobject]
     if pickled:  # not by allow_pickle=False, which is an array's name to numpy before 2.2
         raise FileError(target, f"{pickled[0]!r:.40} must contain numbers or strings, got Python objects")
-    text = np.array(json.dumps(about))
+    members: dict[str, Any] = {ABOUT: np.array(json.dumps(about)), **arrays}
     with written_whole(target) as temporary, temporary.open("wb") as file:
-        write: Callable[..., None] = np.savez_compressed if is_packed else np.savez
-        write(file, **{ABOUT: text, **arrays})
+        write = np.savez_compressed if is_packed else np.savez
+        write(file, **members)
 
 
 def read_archive(path: Path, *, max_bytes: int | None = None) -> tuple[Any, dict[str, NDArray[Any]]]:
