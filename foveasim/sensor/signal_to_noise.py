@@ -104,7 +104,7 @@ def signal_to_noise(sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike) ->
     - Without shot noise charges are rounded to integers, of the variance 1/12 e-².
     - Inter-pixel coupling mixes drawn charges, so that a site's variance is below its charge and ratios may pass its root.
 
-    Fixed patterns of the device count where they change gain or dark charge, and are no noise here: the ratio is temporal.
+    Fixed patterns of the device count where they change gain or dark charge, but not as noise: the ratio is temporal.
 
     Examples
     --------
