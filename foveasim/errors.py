@@ -21,6 +21,7 @@ Each message says what is wrong, where, what was got, what was expected, and the
 from __future__ import annotations
 
 import errno
+import os
 import re
 import reprlib
 from pathlib import Path
@@ -205,7 +206,10 @@ def disk_problem(error: BaseException) -> str:
     found: BaseException | None = error
     while found is not None and id(found) not in seen:
         seen.add(id(found))
-        if isinstance(found, OSError) and found.errno in DISK_ERRNOS:
-            return found.strerror or str(found)
+        # KLayout, Arrow and HDF5 have the number in their messages.
+        number = re.search(r"errno ?=? ?(\d+)", str(found))
+        for code in (getattr(found, "errno", None), number and int(number[1])):
+            if code in DISK_ERRNOS:
+                return os.strerror(code)
         found = found.__cause__ or found.__context__
     return ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import shutil
@@ -10,9 +11,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from foveasim.errors import FileError
+from foveasim.errors import FileError, disk_problem
 
-__all__ = ["folder_written_whole", "lock", "written_whole"]
+__all__ = ["check_room", "folder_written_whole", "lock", "written_whole"]
+
+#: A disk with less space than a block is full.
+FULL_DISK_BYTES = 4096
 
 
 @contextmanager
@@ -25,7 +29,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     Raises
     ------
     FileError
-        When the folder does not exist, or writing fails: the disk is full, say.
+        When the folder does not exist, or writing fails: the disk is full, say, whatever a library makes of that.
     """
     target = Path(path)
     temporary = target.with_name(f".foveasim-{secrets.token_hex(8)}{target.suffix}")
@@ -36,9 +40,12 @@ def written_whole(path: str | Path) -> Iterator[Path]:
             raise FileError(target, "cannot be written: it is a folder")
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
+        if reason := _full(temporary):  # some libraries do not notice, and leave half a file
+            raise FileError(target, f"cannot be written: {reason}")
         temporary.replace(target)
-    except OSError as error:
-        raise FileError(target, f"cannot be written: {error.strerror or error}") from None
+    except Exception as error:
+        _raise_reason(error, target, temporary)
+        raise
     finally:
         with suppress(OSError):  # a name too long for the system was never made
             temporary.unlink(missing_ok=True)
@@ -66,13 +73,73 @@ def folder_written_whole(target: Path, *, is_ours: Callable[[Path], bool]) -> It
         if target.exists():
             target.rename(old)
         new.rename(target)
-    except OSError as error:
+    except Exception as error:
         if old.exists() and not target.exists():
             old.rename(target)
-        raise FileError(target, f"cannot be written: {error.strerror or error}") from None
+        _raise_reason(error, target, new)
+        raise
     finally:
         for folder in (new, old):
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def check_room(path: Path, n_bytes: int) -> None:
+    """
+    Check that a file may grow to a size, before a library that does not survive a full disk writes it.
+
+    Parameters
+    ----------
+    path : Path
+        The file, which exists.
+    n_bytes : int
+        Its size when it is written.
+
+    Raises
+    ------
+    OSError
+        When the disk has not as much space left, or the process may not write files of that size.
+    """
+    if n_bytes > _file_size_limit():
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+    if n_bytes - path.stat().st_size > _free_bytes(path.parent):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _raise_reason(error: Exception, target: Path, temporary: Path) -> None:
+    """Raise the system's reason for an error in writing, where there is one."""
+    reason = disk_problem(error) or _full(temporary)
+    if not reason and isinstance(error, OSError):
+        reason = error.strerror or str(error)
+    if reason:
+        raise FileError(target, f"cannot be written: {reason}") from None
+
+
+def _full(temporary: Path) -> str:
+    """Reason of the system why a file did not grow: some libraries do not pass it on."""
+    with suppress(OSError):
+        if temporary.is_file() and temporary.stat().st_size >= _file_size_limit():
+            return os.strerror(errno.EFBIG)
+        if _free_bytes(temporary.parent) < FULL_DISK_BYTES:
+            return os.strerror(errno.ENOSPC)
+    return ""
+
+
+def _free_bytes(folder: Path) -> int:
+    """Space that this process may use on a disk: some is kept for the superuser."""
+    if hasattr(os, "statvfs") and os.geteuid() == 0:
+        disk = os.statvfs(folder)
+        return disk.f_bfree * disk.f_frsize
+    return shutil.disk_usage(folder).free
+
+
+def _file_size_limit() -> float:
+    """Size in bytes that a file of this process may have."""
+    try:
+        import resource
+    except ImportError:  # a system without such limits
+        return float("inf")
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    return float("inf") if limit == resource.RLIM_INFINITY else limit
 
 
 def lock(file: IO[bytes]) -> bool:

@@ -6,6 +6,7 @@ Arrays here are as one sees the picture: (n_y, n_x) or (n_y, n_x, n_channel), th
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import struct
@@ -21,13 +22,21 @@ from numpy.typing import NDArray
 
 from foveasim.apart import read_apart
 from foveasim.arrays import unmasked
-from foveasim.errors import FileError
+from foveasim.errors import FileError, disk_problem
 from foveasim.files import written_whole
 
 if TYPE_CHECKING:
     from PIL import Image
 
-__all__ = ["PICTURE_ENDINGS", "picture_names", "pixels_of_image", "pixels_of_page", "read_picture", "write_picture"]
+__all__ = [
+    "PICTURE_ENDINGS",
+    "check_picture_size",
+    "picture_names",
+    "pixels_of_image",
+    "pixels_of_page",
+    "read_picture",
+    "write_picture",
+]
 
 #: Larger pictures are refused: 2**28 pixels are 3 GiB as three float32 channels.
 MAX_PIXELS = 2**28
@@ -144,7 +153,7 @@ def _read_with_pillow(path: Path) -> NDArray[Any]:
         with _pillow_limit(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about notes beside the picture
             with Image.open(path, formats=PILLOW_FORMATS) as image:
-                _check_size(path, image.width, image.height)
+                check_picture_size(path, image.width, image.height)
                 n_pictures = getattr(image, "n_frames", 1)
                 if n_pictures > 1 and image.format != "MPO":  # phones put small pictures behind the photograph
                     raise FileError(path, f"holds {n_pictures} pictures; give a file with one")
@@ -248,7 +257,7 @@ def _read_tiff(path: Path) -> NDArray[Any]:
         if len(file.pages) != 1:
             raise FileError(path, f"holds {len(file.pages)} pictures; give a file with one")
         page = file.pages[0]
-        _check_size(path, page.imagewidth, page.imagelength)
+        check_picture_size(path, page.imagewidth, page.imagelength)
         if page.photometric not in (
             PHOTOMETRIC.MINISWHITE,
             PHOTOMETRIC.MINISBLACK,
@@ -306,7 +315,7 @@ def _read_deep_png(path: Path) -> NDArray[Any]:
     import imagecodecs
 
     content = path.read_bytes()
-    _check_size(path, *struct.unpack(">II", content[16:24]))
+    check_picture_size(path, *struct.unpack(">II", content[16:24]))
     return np.asarray(imagecodecs.png_decode(content))
 
 
@@ -317,7 +326,7 @@ def _read_radiance(path: Path) -> NDArray[Any]:
     size = next((line.split() for line in content[:4096].split(b"\n") if line[:2] in (b"-Y", b"+Y")), [])
     if len(size) != 4:
         raise FileError(path, "is broken or cut short (no size)")
-    _check_size(path, int(size[3]), int(size[1]))
+    check_picture_size(path, int(size[3]), int(size[1]))
     return np.asarray(imagecodecs.rgbe_decode(content))
 
 
@@ -341,7 +350,7 @@ def _openexr(path: Path) -> tuple[dict[str, Any], NDArray[np.float32]]:
             raise FileError(path, f"holds {len(file.parts)} pictures; give a file with one")
         low, high = (np.asarray(corner, dtype=np.int64) for corner in file.header()["dataWindow"])
         n_x, n_y = (high - low + 1).tolist()
-        _check_size(path, n_x, n_y)
+        check_picture_size(path, n_x, n_y)
     with OpenEXR.File(str(path)) as file:
         layers = {name: channel.pixels for name, channel in file.channels().items()}
     if len(layers) != 1:
@@ -372,7 +381,15 @@ def _upright(picture: NDArray[Any], orientation: object) -> NDArray[Any]:
     return picture
 
 
-def _check_size(path: Path, width: int, height: int) -> None:
+def check_picture_size(path: Path, width: int, height: int) -> None:
+    """
+    Check the size that a file claims for its picture, before memory is taken for it.
+
+    Raises
+    ------
+    FileError
+        When it has more pixels than any picture of a scene.
+    """
     if width * height > MAX_PIXELS:
         raise FileError(path, f"has {width} x {height} pixels, more than the limit of {MAX_PIXELS}")
 
@@ -436,10 +453,15 @@ def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
 
                 temporary.write_bytes(imagecodecs.png_encode(picture))
             else:
-                Image.fromarray(picture).save(temporary)
+                # In memory: on a full disk Pillow's encoders leave half a file, or never end.
+                encoded = io.BytesIO()
+                Image.fromarray(picture).save(encoded, Image.registered_extensions()[ending])
+                temporary.write_bytes(encoded.getbuffer())
         except ImportError:
             raise FileError(target, "needs a writer for EXR: pip install 'foveasim[pictures]'") from None
         except (OSError, ValueError, RuntimeError) as error:
+            if disk_problem(error):
+                raise
             raise FileError(target, f"cannot be written in this format ({error}); take .png") from None
 
 

@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import zlib
+from pathlib import Path
 
 import imagecodecs
 import numpy as np
@@ -731,13 +732,15 @@ def test_a_write_that_breaks_off_leaves_the_folder_as_it_was(tmp_path, monkeypat
     if is_older:
         target.write_bytes(b"older")
 
-    def break_off(_, path, **__):
-        path.write_bytes(b"half a pic")
+    def break_off(path, _):
+        with path.open("wb") as file:
+            file.write(b"half a pic")
         raise failure
 
-    monkeypatch.setattr(Image.Image, "save", break_off)
-    with pytest.raises(FileError if isinstance(failure, OSError) else type(failure), match=r"No space left|^$"):
-        write_picture(target, GREY8)
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "write_bytes", break_off)
+        with pytest.raises(FileError if isinstance(failure, OSError) else type(failure), match=r"No space left|^$"):
+            write_picture(target, GREY8)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == ({"f.png": b"older"} if is_older else {})
 
 

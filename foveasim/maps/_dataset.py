@@ -21,6 +21,7 @@ import numpy as np
 
 from foveasim.errors import FileError
 from foveasim.fields import PowerMap
+from foveasim.files import check_room
 from foveasim.maps._common import Found, Refusal, check_size
 from foveasim.maps._xarray import NAME, X, Y, found_in_array, to_xarray
 
@@ -55,6 +56,8 @@ ZARR_CODECS = frozenset(
 #: More groups, arrays and links than this are no map.
 MAX_OBJECTS = 1000
 MAX_METADATA_BYTES = 2**22
+#: At most as much of a netCDF file of ours is not numbers of the map: coordinates are counted apart.
+NETCDF_BYTES = 2**16
 
 
 # -- writing ----------------------------------------------------------------------------------------------------------
@@ -63,6 +66,8 @@ MAX_METADATA_BYTES = 2**22
 def write_netcdf(power_map: PowerMap, path: Path) -> None:
     """Write netCDF 4, unpacked."""
     _needs(path, "h5netcdf")
+    # HDF5 crashes on a full disk.
+    check_room(path, power_map.data.nbytes + 8 * sum(power_map.data.shape) + NETCDF_BYTES)
     to_xarray(power_map).to_dataset().to_netcdf(path, engine="h5netcdf", encoding={NAME: {"_FillValue": None}})
 
 

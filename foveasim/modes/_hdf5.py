@@ -17,11 +17,13 @@ from foveasim.layout import Layout
 from foveasim.layout.packed import packed_layout, unpacked_layout
 from foveasim.records import described
 
-__all__ = ["EventFile", "read_events"]
+__all__ = ["EventFile", "most_bytes", "read_events"]
 
 FORMAT, VERSION = "foveasim events", 2
 #: Events, and milliseconds, of one chunk.
 CHUNK = 1 << 16
+#: At most as much of a file is neither events nor the layout.
+METADATA_BYTES = 1 << 16
 #: The table of milliseconds holds one number for each: those of more than a day are a slip, of a clock that began long ago.
 MAX_MS = 100_000_000
 #: Bytes in memory that one byte in a file may become: what deflate can do at most; and how many any file may.
@@ -29,6 +31,25 @@ UNPACKED_PER_BYTE, MAX_UNPACKED_BYTES = 1032, 8 * 2**30
 #: Kinds of columns that HDF5 has numbers for; text is kept as its bytes.
 NUMBERS, TEXT = "biuf", "US"
 KINDS = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8, "site": np.int32}
+
+
+def most_bytes(layout: Layout, n_before: int, t_us: Ints) -> int:
+    """
+    Upper bound of a file's size once events are added: that of its numbers, not compressed.
+
+    Parameters
+    ----------
+    layout : Layout
+    n_before : int
+        Number of events in the file.
+    t_us : (n,) int64, µs
+        Times of those to add.
+    """
+    per_event = sum(np.dtype(kind).itemsize for kind in KINDS.values())
+    n_chunks = min(int(t_us[-1]) // 1000 + 1, MAX_MS) // CHUNK + 1 if t_us.size else 1
+    of_layout = sum(values.nbytes for values in packed_layout(layout).values()) + 32 * layout.n_sites
+    about = len(json.dumps(described(dict(layout.provenance))))
+    return per_event * (n_before + t_us.size) + 8 * CHUNK * n_chunks + of_layout + about + METADATA_BYTES
 
 
 class EventFile:

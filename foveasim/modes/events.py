@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim.archives import opened_archive, write_archive
 from foveasim.arrays import Floats, Ints, as_numbers, check_number, finite_array, own, read_only
 from foveasim.errors import FileError, FoveasimWarning, ParameterError
-from foveasim.files import written_whole
+from foveasim.files import check_room, written_whole
 from foveasim.layout import Layout
 from foveasim.layout.packed import OUTLINES, packed_layout, unpacked_layout
 from foveasim.modes import _hdf5
@@ -370,11 +371,16 @@ def write_events(batches: Iterable[Events], path: str | Path, *, pitch_um: float
     import h5py
 
     file: _hdf5.EventFile | None = None
-    with written_whole(target) as temporary, h5py.File(temporary, "w") as hdf5:
+    with written_whole(target) as temporary, ExitStack() as opened:
         for batch in _following("batches", batches):
+            t_us = _whole_us(batch.t_s)
+            # HDF5 crashes on a full disk.
+            n_bytes = _hdf5.most_bytes(batch.layout, 0 if file is None else file.n_events, t_us)
+            check_room(temporary, n_bytes)
             if file is None:
+                hdf5 = opened.enter_context(h5py.File(temporary, "w"))
                 file = _hdf5.EventFile(hdf5, batch.layout, *batch.addresses(pitch_um))
-            file.add(_whole_us(batch.t_s), batch.site, batch.polarity)
+            file.add(t_us, batch.site, batch.polarity)
         if file is None:
             raise ParameterError("batches", "must hold at least one batch of events")
         file.end()

@@ -5,17 +5,18 @@ from __future__ import annotations
 import copy
 import inspect
 from collections.abc import Iterable, Iterator, Sized
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from foveasim.arrays import check_count, check_number
-from foveasim.errors import FileError, ParameterError
-from foveasim.pictures import PICTURE_ENDINGS, picture_names
+from foveasim.errors import FileError, ParameterError, printable
+from foveasim.pictures import PICTURE_ENDINGS, check_picture_size, picture_names
 from foveasim.scene import Scene
 
 __all__ = ["Footage", "pictures_in"]
@@ -165,7 +166,7 @@ class Footage:
         shape: tuple[int, ...] | None = None
         pictures: Iterator[Any] = islice(iter(self._source), self._start, self._stop, self._step)
         if isinstance(self._source, _VideoFile):  # frames that are passed over are decoded, and no more
-            pictures = (frame.to_ndarray(format="rgb24") for frame in pictures)
+            pictures = _pixels(self._source.path, pictures)
         for k, picture in enumerate(pictures):
             scene = Scene.from_picture(picture, **self._scene) if self._like is None else self._made_like(picture)
             if shape is not None and scene.basis.shape != shape:
@@ -237,27 +238,37 @@ class _VideoFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with _opened(path) as container:
+        with _opened(path) as container, _readable(path, "is corrupt"):
             stream = container.streams.video[0]
             rate = stream.average_rate or stream.base_rate
-            self.frame_s = None if not rate else float(1 / rate)
-            self.n_frames: int | None = int(stream.frames) or None
+            self.frame_s = float(1 / rate) if rate and rate > 0 else None
+            self.n_frames: int | None = int(stream.frames) if stream.frames > 0 else None
 
     def __iter__(self) -> Iterator[Any]:
-        import av
-
         with _opened(self.path) as container:
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
             n_read = 0
-            try:
-                for frame in container.decode(stream):
-                    yield frame
-                    n_read += 1
-            except av.FFmpegError as error:
-                raise FileError(self.path, f"is broken after frame {n_read} ({error})") from None
+            with _readable(self.path, "is corrupt"):
+                stream = container.streams.video[0]
+                stream.thread_type = "AUTO"
+                frames = iter(container.decode(stream))
+            while True:
+                with _readable(self.path, f"is corrupt after frame {n_read}"):
+                    frame = next(frames, None)
+                if frame is None:
+                    break
+                yield frame
+                n_read += 1
             if n_read == 0:
                 raise FileError(self.path, "holds no frames")
+
+
+def _pixels(path: Path, frames: Iterator[Any]) -> Iterator[NDArray[np.uint8]]:
+    """Decode frames to pixels; a size that a corrupt file claims is checked before memory is taken for it."""
+    for frame in frames:
+        check_picture_size(path, frame.width, frame.height)
+        with _readable(path, "is corrupt"):
+            pixels = frame.to_ndarray(format="rgb24")
+        yield pixels
 
 
 def _opened(path: Path) -> Any:
@@ -265,11 +276,22 @@ def _opened(path: Path) -> Any:
         import av
     except ImportError:
         raise FileError(path, NEEDS_PYAV) from None
-    try:
-        container = av.open(str(path))
-    except (av.FFmpegError, OSError) as error:
-        raise FileError(path, f"is no video file that can be read ({error})") from None
+    with _readable(path, "is no video file that can be read"):
+        # Titles and the like are not used: one that is corrupt does not matter.
+        container = av.open(str(path), metadata_errors="replace")
     if not container.streams.video:
         container.close()
         raise FileError(path, "holds no pictures that move")
     return container
+
+
+@contextmanager
+def _readable(path: Path, problem: str) -> Iterator[None]:
+    """What the video library raises in the block, as a FileError: a corrupt file makes it raise anything."""
+    try:
+        yield
+    except FileError:
+        raise
+    except Exception as error:  # noqa: BLE001
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+        raise FileError(path, f"{problem} ({printable(reason):.160})") from None

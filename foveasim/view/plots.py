@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -186,11 +187,14 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = 150.0) -> None:
     """
     # As small as the usual level 6, in two thirds of its time.
     options: dict[str, Any] = {"pil_kwargs": {"compress_level": 3}} if Path(path).suffix.lower() == ".png" else {}
+    # In memory: on a full disk some encoders leave half a file.
+    encoded = io.BytesIO()
     with written_whole(path) as temporary:
         try:
-            figure.savefig(temporary, dpi=dpi, **options)
+            figure.savefig(encoded, format=Path(path).suffix[1:].lower() or None, dpi=dpi, **options)
         except ValueError as error:
             raise FileError(path, f"cannot be written in this format: {' '.join(str(error).split())}") from None
+        temporary.write_bytes(encoded.getbuffer())
 
 
 def save_drawing(data: Layout | Capture, path: str | Path, by: str | ArrayLike | None = None) -> None:
