@@ -1,5 +1,5 @@
 """
-What every layout family promises, for all generators of the package.
+Promises of the layout families, for all generators of the package.
 
 The list of generators is that of settings files, ``foveasim.config.GENERATORS``. A generator without an example here fails
 the first test; one that takes ``min_size_um`` is found by its signature.
@@ -158,12 +158,12 @@ def test_npz_keeps_every_family_bit_for_bit(family, tmp_path):
 @every_family
 def test_provenance_repeats_every_family(family):
     layout = made(family)
-    told = layout.provenance["parameters"]
+    parameters = layout.provenance["parameters"]
 
     assert layout.provenance["generator"] == family.generator
-    assert set(told) == set(inspect.signature(GENERATORS[family.generator]).parameters)
+    assert set(parameters) == set(inspect.signature(GENERATORS[family.generator]).parameters)
     if family.generator != "quadtree":  # whose picture is not kept
-        assert np.array_equal(GENERATORS[family.generator](**told).xy_um, layout.xy_um)
+        assert np.array_equal(GENERATORS[family.generator](**parameters).xy_um, layout.xy_um)
 
 
 @pytest.mark.parametrize("name", GENERATORS)

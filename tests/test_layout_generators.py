@@ -388,10 +388,10 @@ def test_given_rings_below_the_minimum_size_are_left_out(n_sectors, min_size_um,
 def test_log_polar_warns_when_rings_end_early(parameters, end_um):
     with pytest.warns(
         LayoutWarning, match=f"'r_max_um' is {parameters['r_max_um']:g} µm, and the rings end at"
-    ) as told:
+    ) as caught:
         layout = log_polar(**parameters)
     (r_min_um, _), (_, last_um) = (radii_um(layout)[0][[0, -1]], radii_um(layout)[1][[0, -1]])
-    (next_um,) = re.findall(r"take 'r_max_um' = ([\d.]+) µm, or", str(told[0].message))
+    (next_um,) = re.findall(r"take 'r_max_um' = ([\d.]+) µm, or", str(caught[0].message))
 
     assert last_um == pytest.approx(end_um, rel=1e-4)
     # What the message advises ends where it is asked to, without a warning.
@@ -714,7 +714,7 @@ def test_a_mosaic_needs_sites_that_are_numbered_in_two_directions():
 def test_a_mosaic_refuses_rows_that_are_no_numbers_of_rows(row):
     layout = Layout.from_rectangles([[0, 0], [1, 0]], 1.0, row=row, column=[0, 1])
 
-    with pytest.raises(ParameterError, match="'row' must hold whole numbers"):
+    with pytest.raises(ParameterError, match="'row' must contain integers from 0 to"):
         mosaic(layout, ("RG", "GB"))
 
 

@@ -1,4 +1,4 @@
-"""What a layout, its readers and its captures must reject: numbers beyond 64 bits, holes that are not holes, another sensor."""
+"""Input that layouts, readers and captures reject: integers beyond 64 bits, misplaced holes, sensors of other layouts."""
 
 from __future__ import annotations
 

@@ -48,10 +48,10 @@ MIN_LAYOUT_UM = 1e-3
 #: A ring whose area is below this share of its bounding box is a line to float64.
 ZERO_AREA_SHARE = 1e-14
 #: Columns whose values are indices, of filters and of lines: more than MAX_SITES of either are an overflow.
-INDEX_COLUMNS = ("channel", "readout_line")
-#: What a column of integers may contain.
+INDEX_NAMES = ("channel", "readout_line")
+#: Values of a column of integers.
 INTEGER_RANGES = "integers from -2**63 to 2**63 - 1, or from 0 to 2**64 - 1"
-#: What GEOS says of holes, and what we say.
+#: Reasons of GEOS for invalid holes, and their messages here.
 HOLE_REASONS = {
     "Hole lies outside shell": "has a hole outside its outline",
     "Holes are nested": "has a hole inside another hole",
@@ -137,7 +137,7 @@ class Layout:
                     name,
                     f"must have one value for each of the {site_offsets.size - 1} sites, got the shape {column.shape}",
                 )
-            if name in INDEX_COLUMNS:
+            if name in INDEX_NAMES:
                 _require_indices(name, column)
             columns[name] = read_only(column)
         object.__setattr__(self, "xy_um", read_only(np.array(xy_um, order="C")))

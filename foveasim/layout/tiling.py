@@ -85,7 +85,7 @@ def tiling(
     Raises
     ------
     ParameterError
-        When a number is out of range, the region is not told once, or the border leaves sites below ``min_size_um``.
+        When a number is out of range, not exactly one region is given, or the border leaves sites below ``min_size_um``.
     GeometryError
         When no site is left: the region is smaller than one.
 
