@@ -27,7 +27,7 @@ test: $(VENV)/.installed-dev
 # Deprecations that old versions find in new ones of what they use are theirs.
 test-lowest: $(LOWEST)/.installed
 	NUMBA_CACHE_DIR="$(CURDIR)/$(LOWEST)/numba" $(LOWEST)/env/bin/python -m pytest $(PARALLEL) \
-		-W default::DeprecationWarning -W default::PendingDeprecationWarning -W default::FutureWarning $(PYTEST_ARGS)
+		-W default::DeprecationWarning -W default::PendingDeprecationWarning -W error::pytest.PytestWarning $(PYTEST_ARGS)
 
 test-torch: $(TORCH_VENV)/.installed
 	FOVEASIM_TESTS_NEED=torch $(TORCH_VENV)/bin/python -m pytest tests/test_dataset_torch.py $(PYTEST_ARGS)
