@@ -11,8 +11,11 @@ Arrays that an object of the package holds go through :func:`own`: later edits o
 from __future__ import annotations
 
 import mmap
+import os
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -32,6 +35,7 @@ __all__ = [
     "check_choice",
     "check_count",
     "check_length_um",
+    "check_memory",
     "check_number",
     "check_pitch_um",
     "check_shape",
@@ -39,6 +43,7 @@ __all__ = [
     "exact_integers",
     "finite_array",
     "handed_over",
+    "memory_bytes",
     "own",
     "read_only",
     "unit_of",
@@ -58,6 +63,11 @@ _Array = TypeVar("_Array", bound=NDArray[Any])
 MIN_LENGTH_UM, MAX_LENGTH_UM = 1e-4, 1e7
 #: More photosites than this are a slip in a generator's parameters.
 MAX_SITES = 50_000_000
+#: Arrays of a picture's size that an image of it takes.
+ARRAYS_IN_FLIGHT = 3
+#: Memory where the system does not specify it: more than machines have. And where containers have theirs.
+UNKNOWN_MEMORY_BYTES = 2**42
+CONTAINER_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 #: Wavelengths outside this range are, too: from hard ultraviolet to a millimetre.
 MIN_WAVELENGTH_NM, MAX_WAVELENGTH_NM = 10.0, 1e6
 
@@ -172,17 +182,59 @@ def check_count(name: str, value: object, *, at_least: int = 1, at_most: int | N
 
 def check_shape(name: str, value: object) -> tuple[int, int]:
     """
-    The value as the shape (n_y, n_x) of a picture or a grid.
+    The value as the shape (n_y, n_x) of a picture or a grid, one array of which fits in this machine's memory.
 
     Raises
     ------
     ParameterError
-        When it is not two whole numbers of at least 1.
+        When it is not two integers of at least 1, or an array of float32 of that shape needs more memory than there is.
     """
     if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or len(value) != 2:
         raise ParameterError(name, "must be two whole numbers (n_y, n_x)", value)
     n_y, n_x = (check_count(f"{name}[{i}]", n, at_most=2**30) for i, n in enumerate(value))
+    check_memory(name, 4 * n_y * n_x, (n_y, n_x))
     return n_y, n_x
+
+
+def check_memory(name: str, n_bytes: int, value: object, cure: str = "") -> None:
+    """
+    Check that an array and what is made of it fit in memory, before the system ends the program for want of it.
+
+    Parameters
+    ----------
+    name : str
+        Of the parameter that asks for it.
+    n_bytes : int
+        Of one array; nothing is made of it with fewer than three of its size.
+    value : object
+        Of that parameter, for the message.
+
+    Raises
+    ------
+    ParameterError
+        When three such arrays are larger than this machine's memory.
+    """
+    memory = memory_bytes()
+    if ARRAYS_IN_FLIGHT * n_bytes > memory:
+        raise ParameterError(
+            name,
+            f"must give {ARRAYS_IN_FLIGHT} arrays of {n_bytes / 2**30:,.4g} GiB that fit in the memory of "
+            f"{memory / 2**30:.3g} GiB",
+            value,
+            cure=cure or "take fewer pixels",
+        )
+
+
+@lru_cache(maxsize=1)
+def memory_bytes() -> int:
+    """Memory of this machine, or of the container that the program runs in."""
+    limits = [UNKNOWN_MEMORY_BYTES]
+    with suppress(AttributeError, ValueError, OSError):
+        limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    for file in CONTAINER_LIMITS:
+        with suppress(OSError, ValueError):
+            limits.append(int(Path(file).read_text(encoding="ascii")))
+    return min(limit for limit in limits if limit > 0)
 
 
 def check_length_um(name: str, value: object, *, at_most: float | None = None, cure: str = "") -> float:
