@@ -209,7 +209,7 @@ def disk_problem(error: BaseException) -> str:
         # KLayout, Arrow and HDF5 have the number in their messages.
         number = re.search(r"errno ?=? ?(\d+)", str(found))
         for code in (getattr(found, "errno", None), number and int(number[1])):
-            if code in DISK_ERRNOS:
+            if code is not None and code in DISK_ERRNOS:
                 return os.strerror(code)
         found = found.__cause__ or found.__context__
     return ""
