@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn, TextIO
 import typer
 
 from foveasim import __version__
-from foveasim.errors import FoveasimError, FoveasimWarning, printable
+from foveasim.errors import FileError, FoveasimError, FoveasimWarning, printable
 from foveasim.terminal import PlainConsole, plain_streams, spinner_of, text_of
 
 if TYPE_CHECKING:
@@ -405,8 +405,9 @@ def _main() -> None:
     except MemoryError:
         _end("error: there is not enough memory for this; take a smaller picture or fewer photosites", BAD_INPUT)
     except OSError as error:
-        where = f"{error.filename}: " if isinstance(error.filename, str) else ""
-        _end(f"error: {where}{error.strerror or error}", BAD_INPUT)
+        reason = error.strerror or str(error)
+        named = FileError(error.filename, reason) if isinstance(error.filename, str) else reason
+        _end(f"error: {named}", BAD_INPUT)
     finally:
         warnings.showwarning = show_warning
 

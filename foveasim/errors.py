@@ -87,7 +87,7 @@ class FileError(FoveasimError, ValueError):
 
     def __init__(self, path: str | Path, message: str) -> None:
         self.path = Path(path)
-        super().__init__(message, prefix=f"{printable(path)}: ")
+        super().__init__(message, prefix=f"{_without_middle(printable(path), LONGEST_PATH)}: ")
 
 
 class ConfigError(FileError):
@@ -122,8 +122,8 @@ def _restored(kind: type[FoveasimError], args: tuple[Any, ...], state: dict[str,
     return error
 
 
-#: Characters of a value in a message, of a word in one, and of a message.
-LONGEST_VALUE, LONGEST_WORD, LONGEST_MESSAGE = 80, 240, 2000
+#: Characters of a value in a message, of a word in one, of a message, and of a file's path before it.
+LONGEST_VALUE, LONGEST_WORD, LONGEST_MESSAGE, LONGEST_PATH = 80, 240, 2000, 1000
 #: Containers are written out to this depth, with this many elements each: no message costs more than its length.
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlong = 3, 2 * LONGEST_VALUE

@@ -15,6 +15,8 @@ __all__ = ["each", "in_order", "thread_count"]
 
 #: Threads that there may be at least, for who asks for more than there are cores.
 LEAST_THREADS = 8
+#: More than machines have cores.
+MAX_THREADS = 4096
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -27,10 +29,10 @@ def thread_count(n_threads: int | None = None) -> int:
     Raises
     ------
     ParameterError
-        When it is not a whole number of at least 1.
+        When it is not an integer from 1 to 4096.
     """
     if n_threads is not None:
-        return check_count("n_threads", n_threads)
+        return check_count("n_threads", n_threads, at_most=MAX_THREADS)
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -221,3 +221,34 @@ def test_settings_in_messages_are_short(tmp_path):
 
     assert result.returncode == 2
     assert len(result.stderr) < 1000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "printed"),
+    [
+        (("run", "shot.yaml", "--threads", "9" * 30), b"error: 'n_threads' must be <= 4096"),
+        (("video", "picture.yaml", "--frames", "frames", "--stop", "9" * 30), b"error: 'stop' must be <= "),
+        (("dataset", "dataset.yaml"), b"error: dataset.yaml: 'cameras' must be <= 1000000000"),
+        (("study", "study.yaml"), b"error: study.yaml: "),
+        (("check", "x" * 5000), b"File name too long"),
+    ],
+    ids=lambda value: " ".join(value)[:30] if isinstance(value, tuple) else None,
+)
+def test_absurd_numbers_end_in_one_line(tmp_path, arguments, printed):
+    scene = {"kind": "picture", "pitch_um": 300.0, "distance_m": 1.0, "peak_radiance_w_m2_sr_nm": 0.1}
+    scene["wavelength_nm"] = [620, 550, 450]
+    taken = {**SHOT, "scene": {**scene, "picture": "frames/0.png"}}
+    drawn = {"pictures": "frames", "shot": "picture.yaml", "cameras": 10**400}
+    search = {"sensor.bits": {"from": 1, "to": 10**400}}
+    studied = {"shot": "shot.yaml", "search": search, "objectives": {"n_sites": "maximize"}, "trials": 1}
+    files = {"shot": SHOT, "picture": taken, "dataset": drawn, "study": studied}
+    for name, data in files.items():
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(data))
+    (tmp_path / "frames").mkdir()
+    Image.new("RGB", (60, 60)).save(tmp_path / "frames" / "0.png")
+    result = foveasim(*arguments, cwd=tmp_path)
+
+    assert result.returncode == 2
+    assert printed in result.stderr
+    assert result.stderr.count(b"\n") == 1
+    assert len(result.stderr) < 1500

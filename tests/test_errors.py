@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foveasim.errors import ConfigError, FileError, GeometryError, ParameterError, SimulationError
+from foveasim.errors import ConfigError, FileError, GeometryError, ParameterError, SimulationError, printable, shown
 
 ERRORS = [
     ParameterError("pitch_um", "must be > 0", -1.0, "µm", "take a larger one"),
@@ -51,3 +51,50 @@ def test_errors_reach_the_process_that_waits_for_them():
         waiting = pool.apply_async(_fails, (1,))
         with pytest.raises(ParameterError, match=r"'pitch_um' must be > 0, got -1\.0 µm"):
             waiting.get(timeout=120.0)
+
+
+def deep_list():
+    inner = []
+    for _ in range(100_000):
+        inner = [inner]
+    return inner
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        deep_list(),
+        [1.0] * 10**6,
+        "x y " * 10**6,
+        b"z" * 10**6,
+        np.zeros((500, 500)),
+        10**5000,
+        {"k": "v" * 10**6},
+        {k: k for k in range(10**5)},
+    ],
+    ids=["deep", "list", "string", "bytes", "array", "integer", "value", "dict"],
+)
+def test_long_values_are_short_in_messages(value):
+    assert len(shown(value)) <= 80
+    assert len(str(ParameterError("name", "must be short", value))) < 120
+    for error in (FileError, ConfigError):
+        try:
+            text = f"{value}"
+        except (RecursionError, ValueError):
+            continue
+        assert len(str(error("a.yaml", f"is wrong, got {text}"))) <= 2010
+
+
+def test_paths_stay_whole_in_messages():
+    path = "/".join(["a long directory"] * 20)
+
+    assert str(FileError(path, "no such file")) == f"{path}: no such file"
+    assert len(str(FileError("x" * 5000, "no such file"))) < 1020
+
+
+def test_unprintable_characters_become_escapes():
+    assert printable("plain µ × é") == "plain µ × é"
+    assert printable("a\nb\x1b[31m\u202e\udce9") == r"a\nb\x1b[31m\u202e\udce9"
+    assert printable("a\nb\x1b", keep="\n") == "a\nb" + r"\x1b"
+    assert str(FileError("a\nb", "is wrong")) == r"a\nb: is wrong"
+    assert FileError("a\nb", "is wrong").path == Path("a\nb")

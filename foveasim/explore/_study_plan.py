@@ -266,7 +266,7 @@ def _check_names(objectives: Mapping[str, str], constraints: Limits) -> None:
         if (
             not is_pair
             or all(limit is None for limit in limits)
-            or not all(limit is None or (isinstance(limit, int | float) and math.isfinite(limit)) for limit in limits)
+            or not all(limit is None or _is_number(limit) for limit in limits)
         ):
             raise ParameterError(str(name), "must have limits (low, high), one of which may be None", limits)
         low, high = limits
@@ -315,7 +315,9 @@ def _as_taken(plan: Plan, path: str, where: Search) -> Search:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if isinstance(value, int) and not isinstance(value, bool):
+        return abs(value) < 2**63  # Optuna stores no larger ones
+    return isinstance(value, float) and math.isfinite(value)
 
 
 def _suggested(trial: optuna.Trial, path: str, where: Search) -> Any:

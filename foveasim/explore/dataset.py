@@ -48,6 +48,8 @@ FIELDS = ("code", "electrons", "expected_e", "expected_dn")
 KEPT = 4
 #: Values of each setting that are tried before the first sample.
 TRIED_VALUES = 64
+#: More cameras or draws per picture than anyone can compute.
+MAX_REPEATS = 10**9
 #: Settings that change which photosites there are.
 LAYOUT = "layout"
 
@@ -153,8 +155,8 @@ class DataSet:
         source: str | Path = "settings",
         n_threads: int = 1,
     ) -> None:
-        self.cameras = check_count("cameras", cameras)
-        self.draws = check_count("draws", draws)
+        self.cameras = check_count("cameras", cameras, at_most=MAX_REPEATS)
+        self.draws = check_count("draws", draws, at_most=MAX_REPEATS)
         self.seed = Streams(seed).seed
         self.fields = tuple(fields)
         for field in self.fields:

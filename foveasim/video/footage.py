@@ -23,6 +23,8 @@ __all__ = ["Footage", "pictures_in"]
 
 #: Any wavelengths: they are left off again.
 GREY_NM, COLOUR_NM = (550.0,), (620.0, 550.0, 450.0)
+#: More frames than anyone has.
+MAX_FRAMES = 2**31
 NEEDS_PYAV = "needs a reader for video files: pip install 'foveasim[video]'"
 
 
@@ -87,9 +89,9 @@ class Footage:
         if like is None:
             _check_settings(scene)
         self._like = like
-        self._start = check_count("start", start, at_least=0)
-        self._stop = None if stop is None else check_count("stop", stop, at_least=0)
-        self._step = check_count("step", step)
+        self._start = check_count("start", start, at_least=0, at_most=MAX_FRAMES)
+        self._stop = None if stop is None else check_count("stop", stop, at_least=0, at_most=MAX_FRAMES)
+        self._step = check_count("step", step, at_most=MAX_FRAMES)
         self._scene = scene
         self._source: Iterable[Any]
         self._n_source: int | None = None
@@ -151,7 +153,7 @@ class Footage:
             When ``n`` is negative or not whole.
         """
         rest = copy.copy(self)
-        rest._start += check_count("n", n, at_least=0) * self._step  # noqa: SLF001 -- its own
+        rest._start += check_count("n", n, at_least=0, at_most=MAX_FRAMES) * self._step  # noqa: SLF001 -- its own
         rest._may_be_empty = True  # noqa: SLF001
         return rest
 
