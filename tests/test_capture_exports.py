@@ -23,7 +23,7 @@ ODD_NAMES = ("code", "site", "x_um", "a/b", "..", "zarr.json", "__x", "with spac
 
 
 def taken(**columns):
-    layout = fs.layout.mosaic(fs.layout.log_polar(n_sectors=12, r_min_um=4.0, r_max_um=30.0), ("RG", "GB"))
+    layout = fs.layout.mosaic(fs.layout.log_polar(n_sectors=12, r_min_um=4.0, r_max_um=20.0), ("RG", "GB"))
     layout = fs.Layout(
         layout.xy_um,
         layout.ring_offsets,
