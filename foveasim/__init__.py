@@ -86,13 +86,15 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    """Import :mod:`foveasim.explore` when it is used: it loads the checks of settings, which nothing else here needs."""
-    if name == "explore":
-        from importlib import import_module
+if not TYPE_CHECKING:  # type checkers would take any name for an attribute
 
-        return import_module("foveasim.explore")
-    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    def __getattr__(name: str) -> Any:
+        """Import :mod:`foveasim.explore` when it is used: it loads the checks of settings, which nothing else here needs."""
+        if name == "explore":
+            from importlib import import_module
+
+            return import_module("foveasim.explore")
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
 
 
 def __dir__() -> list[str]:
