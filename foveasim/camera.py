@@ -690,15 +690,16 @@ class Camera:
             if isinstance(light, PowerMap) and (order == 1 or np.nanmin(light.data) < 0.0):
                 bad = int(rate_e_per_s.argmin())
                 raise SimulationError(f"the light on site {bad} is negative: the power map is below 0 there")
-            self._warn_of_negative(rate_e_per_s, is_negative)
+            if order == 2:
+                self._warn_of_negative(rate_e_per_s, is_negative)
         return np.maximum(rate_e_per_s, 0.0)
 
     def _warn_of_negative(self, rate_e_per_s: Floats, is_negative: Bools) -> None:
         """Warn where gradients of coarse cells make photosites negative."""
-        fraction = -float(rate_e_per_s[is_negative].sum()) / float(rate_e_per_s[rate_e_per_s > 0.0].sum())
+        fraction = -float(rate_e_per_s[is_negative].sum()) / float(np.abs(rate_e_per_s).sum())
         warnings.warn(
             f"second-order integration makes the photoelectrons of {int(is_negative.sum()):,} of {rate_e_per_s.size:,} "
-            f"photosites negative, {100.0 * fraction:.2g} % of all, and they are set to 0: the image is too sharp for cells of "
+            f"photosites negative, {100.0 * fraction:.3g} % of all, and they are set to 0: the image is too sharp for cells of "
             "this size; take order=1, or finer cells (Optics(oversample=...))",
             SamplingWarning,
             stacklevel=4,

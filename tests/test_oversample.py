@@ -205,3 +205,11 @@ def test_negative_sites_of_coarse_cells_warn():
         rate = camera.photoelectrons_per_s(scene)
 
     assert rate.min() == 0.0
+
+    # The photosites that are negative by themselves: none is left to compare with.
+    every = np.array(
+        [camera.integrator(camera.power_map(scene).grid, order=2)(camera.power_map(scene).data[0])]
+    ).ravel()
+    alone = fs.Camera(optics=camera.optics, sensor=fs.Sensor(layout[every < 0.0]), order=2)
+    with pytest.warns(SamplingWarning, match="100 % of all"):
+        assert (alone.photoelectrons_per_s(scene) == 0.0).all()
