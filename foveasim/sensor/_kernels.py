@@ -39,6 +39,8 @@ FAR_SIGMAS, FAR_ELECTRONS = 12.0, 40
 REACH_SIGMAS = 9.0
 #: Points of a mixture of charges, at most; chances below the smallest are left out; charges are whole to this.
 MOST_NODES, TINY, WHOLE = 2048, 1e-18, 1e-6
+#: Sites that a kernel takes through all steps before the next ones.
+PIECE = 1024
 #: Halvings that find a number to its last bit.
 BISECTIONS = 60
 SQRT_HALF, SQRT_TWO_PI = math.sqrt(0.5), math.sqrt(2.0 * math.pi)
@@ -183,35 +185,60 @@ def _converted(share, way, strength, table):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _value(charge, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl):
-    """Codes, not yet whole, of a charge."""
+def _share(charge, per_e, offset, v_sat_v, bend):
+    """Share of the range that a charge reaches: bent volts and an offset, clipped."""
     v = charge * per_e
     v *= 1.0 - bend * min(max(v / v_sat_v, 0.0), 1.0)
-    share = min(max((v + offset) / v_sat_v, 0.0), 1.0)
-    value = _converted(share, way, strength, table) * n_codes
-    if inl.size > 1:
-        place = min(value / n_codes, 1.0) * (inl.size - 1)
-        k = min(int(place), inl.size - 2)
-        value += inl[k] + (place - k) * (inl[k + 1] - inl[k])
-    return value
+    return min(max((v + offset) / v_sat_v, 0.0), 1.0)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _with_inl(value, n_codes, inl):
+    """Codes, not yet whole, with the integral non-linearity there."""
+    place = min(value / n_codes, 1.0) * (inl.size - 1)
+    k = np.uint32(min(int(place), inl.size - 2))  # unsigned: an index that is known to be none from the end
+    return value + (inl[k] + (place - k) * (inl[k + 1] - inl[k]))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _value(charge, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl):
+    """Codes, not yet whole, of a charge."""
+    value = _converted(_share(charge, per_e, offset, v_sat_v, bend), way, strength, table) * n_codes
+    return _with_inl(value, n_codes, inl) if inl.size > 1 else value
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _dnl_place(key, line, code, n_quantiles):
+    """Where among the quantiles of the Gaussian law the number lies that a line adds before a code."""
+    word, _ = _philox_2x32(key, np.uint64(line) & _LOW, np.uint64(code))
+    return np.float64(word) * (_ONE_IN_2_32 * (n_quantiles - 1))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _between(quantiles, place):
+    """Value at a place among quantiles, linear in between."""
+    k = np.uint32(place)
+    return quantiles[k] + (place - k) * (quantiles[k + 1] - quantiles[k])
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _dnl_normal(key, line, code, quantiles):
     """The number of the Gaussian law that a line adds before a code."""
-    word, _ = _philox_2x32(key, np.uint64(line) & _LOW, np.uint64(code))
-    place = np.float64(word) * (_ONE_IN_2_32 * (quantiles.size - 1))
-    k = int(place)
-    return quantiles[k] + (place - k) * (quantiles[k + 1] - quantiles[k])
+    return _between(quantiles, _dnl_place(key, line, code, quantiles.size))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _whole(value, n_codes):
+    """Code, a whole float64, of codes not yet whole."""
+    return np.float64(int(min(max(value + CODE_ROUNDING, 0.0), n_codes - 1.0)))
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _code(value, line, n_codes, dnl, dnl_key, quantiles):
     """The code of codes not yet whole."""
-    code = min(max(math.floor(value + CODE_ROUNDING), 0.0), n_codes - 1.0)
+    code = _whole(value, n_codes)
     if dnl > 0.0:
-        moved = value + dnl * _dnl_normal(dnl_key, line, code, quantiles)
-        code = min(max(math.floor(moved + CODE_ROUNDING), 0.0), n_codes - 1.0)
+        code = _whole(value + dnl * _dnl_normal(dnl_key, line, code, quantiles), n_codes)
     return code
 
 
@@ -257,6 +284,15 @@ def _charge(value, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, 
             else v / (1.0 - bend)
         )
     return v / per_e
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _copy(values, sites, out):
+    """Values of some sites, or the one of all, to the front of an array."""
+    if values.size > 1:
+        out[: sites.stop - sites.start] = values[sites]
+    else:
+        out[:] = values[0]
 
 
 @njit(
@@ -311,11 +347,38 @@ def read_out(
     codes (size 1: none); ``dnl`` is the standard deviation, in codes, of a number that each line adds before each code, a
     Gaussian by its ``quantiles``.
     """
-    for i in range(charge_e.size):
-        offset = _at(offset_v, i) + (line_offset_v[line[i]] if line_offset_v.size > 1 else line_offset_v[0])
-        per_e = _at(v_per_e, i) * _at(gain, i)
-        value = _value(charge_e[i], per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl)
-        code[i] = int(_code(value, line[i], n_codes, dnl, dnl_key, quantiles))
+    # Step by step over a piece of the sites that stays in the cache: each of the short loops runs on vectors.
+    value, per_e, offsets_v, place = np.empty(PIECE), np.empty(PIECE), np.empty(PIECE), np.empty(PIECE)
+    for first in range(0, charge_e.size, PIECE):
+        n = min(PIECE, charge_e.size - first)
+        sites = slice(first, first + n)
+        charges, lines, codes = charge_e[sites], line[sites], code[sites]
+        _copy(offset_v, sites, offsets_v)
+        _copy(v_per_e, sites, per_e)
+        _copy(gain, sites, place)
+        if line_offset_v.size > 1:
+            for j in range(n):
+                offsets_v[j] += line_offset_v[np.uint64(lines[j])]
+        else:
+            for j in range(n):
+                offsets_v[j] += line_offset_v[0]
+        for j in range(n):
+            value[j] = _share(charges[j], per_e[j] * place[j], offsets_v[j], v_sat_v, bend)
+        if way != ADC_LINEAR:
+            for j in range(n):
+                value[j] = _converted(value[j], way, strength, table)
+        for j in range(n):
+            value[j] *= n_codes
+        if inl.size > 1:
+            for j in range(n):
+                value[j] = _with_inl(value[j], n_codes, inl)
+        for j in range(n):
+            codes[j] = int(_whole(value[j], n_codes))
+        if dnl > 0.0:
+            for j in range(n):
+                place[j] = _dnl_place(dnl_key, lines[j], codes[j], quantiles.size)
+            for j in range(n):
+                codes[j] = int(_whole(value[j] + dnl * _between(quantiles, place[j]), n_codes))
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -18,7 +18,7 @@ from foveasim.sensor.converter import Companding, Converter
 from foveasim.sensor.crosstalk import Coupling, Diffusion, KernelCrosstalk, Mixing, Neighbourhood
 from foveasim.sensor.device import Device
 from foveasim.sensor.limits import LIMITS, check_plausible, check_plausible_array
-from foveasim.sensor.noise import LARGEST_CHARGE_E, ShotNoise, draw_shot_noise, in_blocks
+from foveasim.sensor.noise import LARGEST_CHARGE_E, ShotNoise, draw_shot_noise, in_blocks, pieces
 from foveasim.sensor.spectral import ConstantCurve, Curve, FilterSet, rgb_filters
 from foveasim.sensor.spectral_curves import CurveError
 from foveasim.streams import Streams
@@ -502,33 +502,36 @@ class Sensor:
 
         charges: NDArray[Any] = electrons if self._coupling is None else self._coupling.apply(electrons)
 
-        def block(number: int, sites: slice) -> None:
-            charge_e = charges[sites].astype(np.float64)
-            for effect, sigma_e in noises_e.items():
-                noise = streams.of(effect, number).standard_normal(charge_e.size)
-                noise *= _part(sigma_e, sites)
-                charge_e += noise
-            if telegraph_e is not None:
-                charge_e += telegraph_e[sites]
-            read_out(
-                charge_e,
-                _part(v_per_e, sites),
-                _part(self.pixel_offset_v, sites),
-                self.line_offset_v,
-                _part(self.gain, sites),
-                line[sites],
-                self.v_sat_v,
-                self.nonlinearity_fraction,
-                convert.way,
-                convert.log_strength,
-                convert.curve,
-                convert.n_codes,
-                convert.inl,
-                convert.dnl_dn,
-                dnl_key,
-                convert.quantiles,
-                code[sites],
-            )
+        def block(number: int, whole: slice) -> None:
+            generators = {effect: streams.of(effect, number) for effect in noises_e}
+            # A block's numbers come from one stream, piece by piece: what is worked on stays in the processor's cache.
+            for sites in pieces(whole):
+                charge_e = charges[sites].astype(np.float64)
+                for effect, sigma_e in noises_e.items():
+                    noise = generators[effect].standard_normal(charge_e.size)
+                    noise *= _part(sigma_e, sites)
+                    charge_e += noise
+                if telegraph_e is not None:
+                    charge_e += telegraph_e[sites]
+                read_out(
+                    charge_e,
+                    _part(v_per_e, sites),
+                    _part(self.pixel_offset_v, sites),
+                    self.line_offset_v,
+                    _part(self.gain, sites),
+                    line[sites],
+                    self.v_sat_v,
+                    self.nonlinearity_fraction,
+                    convert.way,
+                    convert.log_strength,
+                    convert.curve,
+                    convert.n_codes,
+                    convert.inl,
+                    convert.dnl_dn,
+                    dnl_key,
+                    convert.quantiles,
+                    code[sites],
+                )
 
         in_blocks(electrons.size, block, n_threads)
         return code

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Literal
 
 import numpy as np
@@ -12,12 +12,14 @@ from foveasim.compiled import kernels
 from foveasim.parallel import each, thread_count
 from foveasim.streams import Streams
 
-__all__ = ["BLOCK_SITES", "ShotNoise", "draw_shot_noise", "in_blocks"]
+__all__ = ["BLOCK_SITES", "ShotNoise", "draw_shot_noise", "in_blocks", "pieces"]
 
 ShotNoise = Literal["auto", "exact", "off"]
 
 #: Sites that draw from one stream of an effect, one after the other; fixed, so that draws do not depend on the threads.
 BLOCK_SITES = 1 << 16
+#: Sites of a block that are worked on at a time: their arrays fit a core's cache.
+PIECE_SITES = 1 << 13
 #: Expectations beyond this are beyond numpy's Poisson generator; the Gaussian is exact to 1e-9 long before.
 LARGEST_EXACT_E = 1e18
 #: No charge is larger: 2**62 fits int64 with room for sums.
@@ -32,6 +34,12 @@ def in_blocks(n_sites: int, work: Callable[[int, slice], None], n_threads: int |
         range(n_blocks),
         thread_count(n_threads),
     )
+
+
+def pieces(block: slice) -> Iterator[slice]:
+    """Pieces of a block of sites, one after the other."""
+    for first in range(block.start, block.stop, PIECE_SITES):
+        yield slice(first, min(first + PIECE_SITES, block.stop))
 
 
 def draw_shot_noise(
@@ -67,8 +75,9 @@ def draw_shot_noise(
     def block(number: int, sites: slice) -> None:
         generator = streams.of("shot", number)
         if how == "auto":
-            z = generator.standard_normal(sites.stop - sites.start)
-            draw(expected_e[sites], z, gaussian_above_e, electrons[sites])
+            for some in pieces(sites):
+                z = generator.standard_normal(some.stop - some.start)
+                draw(expected_e[some], z, gaussian_above_e, electrons[some])
             return
         is_beyond = expected_e[sites] > LARGEST_EXACT_E
         electrons[sites] = generator.poisson(np.where(is_beyond, 0.0, expected_e[sites]))
