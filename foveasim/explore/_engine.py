@@ -181,16 +181,18 @@ def records_of(
                 continue  # it was taken back
             bundle = work.sent.pop(future)
             records = _arrived(work, future, bundle)
+            # Count anew when a worker may have gone.
+            if records is None or future.status != "finished":
+                counted_s = float("-inf")
             if records is None:
                 # They may have gone with their worker; if not, they take long to come.
                 bundle.patience_s *= 2.0
                 work.sent[future] = bundle
                 done.put(future)
-            else:
-                yield from records
-            # Count anew when a worker may have gone.
-            if records is None or future.status != "finished":
-                counted_s = float("-inf")
+                continue
+            # Let go of it: dask would run it again if its worker ended now.
+            del future
+            yield from records
     finally:
         with suppress(Exception):
             client.cancel(list(work.sent))
