@@ -266,6 +266,7 @@ def log_polar_parameters(draw):
 @example(parameters={"n_sectors": 192, "min_size_um": 2.0, "r_max_um": 690.0, "stagger": True, "chords_per_arc": 2})
 @example(parameters={"n_sectors": 192, "min_size_um": 2.0, "r_max_um": 300.0, "fovea": "rings"})
 @example(parameters={"n_sectors": 6, "min_size_um": 2.0, "r_max_um": 100.0, "ring_ratio": 9.0, "fovea": "linear"})
+@example(parameters={"n_sectors": 471, "min_size_um": 0.01171875, "r_max_um": 1.756921363975376, "fovea": "rings"})
 def test_log_polar_sites_reach_the_minimum_size_without_rounding(parameters):
     try:
         layout = fs.layout.log_polar(**parameters)
