@@ -284,6 +284,11 @@ def _opened(path: Path) -> Any:
     if not container.streams.video:
         container.close()
         raise FileError(path, "holds no pictures that move")
+    if (
+        container.streams.video[0].codec_context is None
+    ):  # some versions of PyAV crash where they are asked to decode it
+        container.close()
+        raise FileError(path, "holds pictures in a coding that is unknown here")
     return container
 
 
