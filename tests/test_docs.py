@@ -43,7 +43,11 @@ def broken_links(root):
 PAGES = [page for page in pages_of(ROOT) if BLOCK.search(page.read_text())]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
+#: Pages whose code needs more than the package.
+NEEDS = {"viewing": [pytest.mark.needs("renderer")]}
+
+
+@pytest.mark.parametrize("page", [pytest.param(page, marks=NEEDS.get(page.stem, []), id=page.stem) for page in PAGES])
 def test_code_on_a_page_runs(page, tmp_path, monkeypatch):
     mpl.use("agg")
     monkeypatch.chdir(tmp_path)
