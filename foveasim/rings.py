@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, Ints
+from foveasim.arrays import Bools, Floats, Ints
 
 __all__ = [
+    "are_convex",
     "from_frame",
     "next_vertex",
     "positions_in_runs",
@@ -27,6 +28,9 @@ __all__ = [
     "site_moments",
     "to_frame",
 ]
+
+#: Smaller turns (rad) may be roundings.
+SMALLEST_TURN = 1e-12
 
 
 def next_vertex(ring_offsets: Ints) -> Ints:
@@ -68,6 +72,13 @@ def positions_in_runs(lengths: Ints) -> Ints:
     return np.arange(int(lengths.sum())) - np.repeat(np.cumsum(lengths) - lengths, lengths)
 
 
+def _local_edges(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats, Floats, Floats]:
+    """Both ends of every edge, x, y, x_after, y_after, from its ring's first vertex: column by column, as :func:`to_frame`."""
+    after, lengths = next_vertex(ring_offsets), np.diff(ring_offsets)
+    x, y = (xy_um[:, axis] - np.repeat(xy_um[ring_offsets[:-1], axis], lengths) for axis in (0, 1))
+    return x, y, x[after], y[after]
+
+
 def ring_moments(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats]:
     """
     Signed area and first moments of every ring.
@@ -87,11 +98,13 @@ def ring_moments(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats]:
         return np.zeros(0), np.zeros((0, 2))
     starts = ring_offsets[:-1]
     anchor = xy_um[starts]
-    local = xy_um - np.repeat(anchor, np.diff(ring_offsets), axis=0)
-    after = local[next_vertex(ring_offsets)]
-    cross = local[:, 0] * after[:, 1] - local[:, 1] * after[:, 0]
+    x, y, x_after, y_after = _local_edges(xy_um, ring_offsets)
+    cross = x * y_after - y * x_after
     area_um2 = 0.5 * np.add.reduceat(cross, starts)
-    local_moment = np.add.reduceat((local + after) * cross[:, np.newaxis], starts, axis=0) / 6.0
+    moments = np.empty(xy_um.shape)
+    np.multiply(x + x_after, cross, out=moments[:, 0])
+    np.multiply(y + y_after, cross, out=moments[:, 1])
+    local_moment = np.add.reduceat(moments, starts, axis=0) / 6.0
     return area_um2, local_moment + anchor * area_um2[:, np.newaxis]
 
 
@@ -99,9 +112,31 @@ def ring_spread_um2(xy_um: Floats, ring_offsets: Ints) -> Floats:
     """Sum of the areas of each ring's triangles with its first vertex, all counted positive, (n_ring,): 0 for a line."""
     if ring_offsets.size == 1:
         return np.zeros(0)
-    local = xy_um - np.repeat(xy_um[ring_offsets[:-1]], np.diff(ring_offsets), axis=0)
-    after = local[next_vertex(ring_offsets)]
-    return 0.5 * np.add.reduceat(np.abs(local[:, 0] * after[:, 1] - local[:, 1] * after[:, 0]), ring_offsets[:-1])
+    x, y, x_after, y_after = _local_edges(xy_um, ring_offsets)
+    return 0.5 * np.add.reduceat(np.abs(x * y_after - y * x_after), ring_offsets[:-1])
+
+
+def are_convex(xy_um: Floats, ring_offsets: Ints) -> Bools:
+    """
+    Whether each ring certainly is a convex polygon, of either winding, (n_ring,) bool.
+
+    Notes
+    -----
+    A closed line that turns to the same side at every vertex, and once around in all, is convex, and so meets itself nowhere.
+    Turns that rounding may have made, of less than 1e-12 rad, count as none: such a ring is not certain.
+    """
+    if ring_offsets.size == 1:
+        return np.zeros(0, bool)
+    starts, after = ring_offsets[:-1], next_vertex(ring_offsets)
+    dx, dy = ((column[after] - column) for column in (xy_um[:, 0], xy_um[:, 1]))
+    turn = dx * dy[after]
+    turn -= dy * dx[after]
+    length = np.hypot(dx, dy)
+    smallest = SMALLEST_TURN * length * length[after]
+    is_left, is_right = (np.logical_and.reduceat(side, starts) for side in (turn > smallest, turn < -smallest))
+    is_upwards = (dy > 0.0) | ((dy == 0.0) & (dx > 0.0))
+    n_rounds = np.add.reduceat((~is_upwards & is_upwards[after]).astype(np.int64), starts)
+    return np.asarray((is_left | is_right) & (n_rounds == 1))
 
 
 def same_rings(one: Any, other: Any) -> bool:
@@ -125,10 +160,8 @@ def site_area_um2(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floa
     """Area of every site, holes taken off, (n_site,) µm²; negative when its outline is clockwise."""
     if site_offsets.size == 1:
         return np.zeros(0)
-    local = xy_um - np.repeat(xy_um[ring_offsets[:-1]], np.diff(ring_offsets), axis=0)
-    after = local[next_vertex(ring_offsets)]
-    cross = local[:, 0] * after[:, 1] - local[:, 1] * after[:, 0]
-    return 0.5 * np.add.reduceat(cross, ring_offsets[site_offsets[:-1]])
+    x, y, x_after, y_after = _local_edges(xy_um, ring_offsets)
+    return 0.5 * np.add.reduceat(x * y_after - y * x_after, ring_offsets[site_offsets[:-1]])
 
 
 def site_bounds_um(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floats:

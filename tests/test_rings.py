@@ -7,10 +7,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from foveasim.rings import next_vertex, positions_in_runs, ring_moments, site_bounds_um, site_moments
+from foveasim.rings import are_convex, next_vertex, positions_in_runs, ring_moments, site_bounds_um, site_moments
 
 relaxed = settings(deadline=None, derandomize=True, max_examples=60)
 
@@ -173,3 +174,41 @@ def test_measures_accept_read_only_arrays_and_leave_them_unchanged():
 
 def test_positions_in_runs_count_from_0_in_each_run():
     assert positions_in_runs(np.array([3, 0, 1, 2])).tolist() == [0, 1, 2, 0, 0, 1]
+
+
+# -- convexity --------------------------------------------------------------------------------------------------------
+
+small = st.tuples(st.integers(-4, 4), st.integers(-4, 4))
+
+
+@given(st.lists(st.lists(small, min_size=3, max_size=7), min_size=1, max_size=6))
+@settings(deadline=None, derandomize=True, max_examples=400)
+def test_convex_rings_are_hulls_of_their_vertices(all_rings):
+    all_rings = [ring for ring in all_rings if all(a != b for a, b in pairwise([*ring, ring[0]]))]
+    if not all_rings:
+        return
+    xy_um, ring_offsets, _ = packed([[ring] for ring in all_rings])
+    polygons = [shapely.Polygon(ring) for ring in all_rings]
+    # Each vertex is a corner of the hull, and none stands twice.
+    expected = [
+        p.is_valid and p.convex_hull.geom_type == "Polygon" and len(p.convex_hull.exterior.coords) == len(ring) + 1
+        for p, ring in zip(polygons, all_rings, strict=True)
+    ]
+
+    assert are_convex(xy_um, ring_offsets).tolist() == expected
+
+
+@pytest.mark.parametrize("far_um", [0.0, 1e6])
+@pytest.mark.parametrize("n", [3, 4, 6, 50])
+def test_regular_polygons_of_either_winding_are_convex(n, far_um):
+    angle = 2.0 * np.pi * np.arange(n) / n
+    ring = np.stack((np.cos(angle), np.sin(angle)), axis=1) + far_um
+
+    assert are_convex(ring, np.array([0, n])).all()
+    assert are_convex(ring[::-1], np.array([0, n])).all()
+
+
+def test_a_pentagram_is_not_convex():
+    angle = 2.0 * np.pi * 2.0 * np.arange(5) / 5
+
+    assert not are_convex(np.stack((np.cos(angle), np.sin(angle)), axis=1), np.array([0, 5])).any()

@@ -28,7 +28,15 @@ from foveasim.arrays import (
 )
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.records import copied
-from foveasim.rings import next_vertex, positions_in_runs, ring_moments, ring_spread_um2, site_bounds_um, site_moments
+from foveasim.rings import (
+    are_convex,
+    next_vertex,
+    positions_in_runs,
+    ring_moments,
+    ring_spread_um2,
+    site_bounds_um,
+    site_moments,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -266,7 +274,7 @@ class Layout:
         rounding_um2 = ZERO_AREA_SHARE * np.maximum(box_um2, np.finfo(np.float64).tiny)
         is_line = ring_spread_um2(xy_um, ring_offsets) <= rounding_um2
         _require(np.logical_or.reduceat(is_line, site_offsets[:-1]), "has a ring without area")
-        _require_simple(xy_um, ring_offsets, site_offsets)
+        _require_valid(Layout._derived(xy_um, ring_offsets, site_offsets, {}, {}))
         area_um2, _ = ring_moments(xy_um, ring_offsets)
         is_outline = np.zeros(area_um2.size, bool)
         is_outline[site_offsets[:-1]] = True
@@ -618,13 +626,6 @@ def _require(is_bad_site: Bools, what: str) -> None:
         raise GeometryError(f"site {bad[0]} {what}{others if bad.size > 1 else ''}", tuple(int(i) for i in bad))
 
 
-def _require_simple(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> None:
-    """Sites must be valid in the sense of OGC: no ring crosses itself or another, holes lie inside."""
-    if site_offsets.size == 1:
-        return
-    _require_valid(Layout._derived(xy_um, ring_offsets, site_offsets, {}, {}).polygons())  # noqa: SLF001
-
-
 def _require_sound_holes(layout: Layout) -> None:
     """Sites with holes must be valid, and their holes wound clockwise; where there are none, this costs nothing."""
     if layout.ring_offsets.size == layout.site_offsets.size:
@@ -637,19 +638,33 @@ def _require_sound_holes(layout: Layout) -> None:
         "has a hole that is wound the wrong way, or has no area",
     )
     sites = np.flatnonzero(has_holes)
-    _require_valid(layout[sites].polygons(), sites, layout.n_sites)
+    _require_valid(layout[sites], sites, layout.n_sites)
 
 
-def _require_valid(polygons: NDArray[Any], sites: Ints | None = None, n_sites: int = 0) -> None:
+def _require_valid(layout: Layout, sites: Ints | None = None, n_sites: int = 0) -> None:
     """Sites must be valid polygons in the sense of OGC; those given are all, or have these numbers among more."""
-    is_bad = ~shapely.is_valid(polygons)
+    is_bad = ~valid_sites(layout)
     if not is_bad.any():
         return
-    reason = str(shapely.is_valid_reason(polygons[np.flatnonzero(is_bad)[0]]))
+    reason = str(shapely.is_valid_reason(layout[is_bad].polygons()[0]))
     if sites is not None:
         is_bad = np.isin(np.arange(n_sites), sites[is_bad])
     what = HOLE_REASONS.get(reason.partition("[")[0], f"crosses or touches itself ({reason})")
     _require(is_bad, f"{what}; repair its outline")
+
+
+def valid_sites(layout: Layout) -> Bools:
+    """
+    Whether each site is a valid polygon in the sense of OGC, (n_site,) bool.
+
+    No ring crosses itself or another, and holes lie inside. Convex outlines are told at a tenth of the cost of others.
+    """
+    outlines, n_rings = layout.site_offsets[:-1], np.diff(layout.site_offsets)
+    is_valid = (n_rings == 1) & are_convex(layout.xy_um, layout.ring_offsets)[outlines]
+    others = np.flatnonzero(~is_valid)
+    if others.size:
+        is_valid[others] = shapely.is_valid(layout[others].polygons())
+    return is_valid
 
 
 def _without_repeats(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Ints]:

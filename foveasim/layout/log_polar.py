@@ -7,7 +7,6 @@ import warnings
 from typing import Any, Literal, get_args
 
 import numpy as np
-import shapely
 
 from foveasim.arrays import (
     MAX_SITES,
@@ -21,7 +20,7 @@ from foveasim.arrays import (
 )
 from foveasim.errors import LayoutWarning, ParameterError
 from foveasim.layout._annuli import MIN_SITES_PER_RHO, Annuli, Fovea, Ring, annuli, fovea_rings
-from foveasim.layout._model import Layout
+from foveasim.layout._model import Layout, valid_sites
 from foveasim.layout.tiling import with_hexagons
 from foveasim.rings import ring_moments
 
@@ -221,7 +220,7 @@ def _are_sites(sites: Annuli, min_size_um: float) -> bool:
     if area_um2.min() <= 0.0 or math.sqrt(area_um2.min()) < min_size_um:
         return False
     layout = Layout(sites.xy_um, sites.ring_offsets, np.arange(sites.ring_offsets.size))
-    return bool(shapely.is_valid(layout.polygons()).all())
+    return bool(valid_sites(layout).all())
 
 
 def _radius_per_size(n_sectors: int, ratio: float, n_chords: int, fovea: Fovea, *, is_given: bool) -> float:

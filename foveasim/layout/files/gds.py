@@ -40,7 +40,7 @@ from foveasim.arrays import MAX_SITES, Floats, Ints, check_count, check_number
 from foveasim.compiled import kernels
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.files import written_whole
-from foveasim.layout._model import Layout
+from foveasim.layout._model import Layout, valid_sites
 from foveasim.layout.files._columns import MAX_COLUMN_BYTES, columns_of, kept_columns, texts_of
 from foveasim.layout.files._common import (
     WrittenLayout,
@@ -204,7 +204,7 @@ def _snapped(layout: Layout, dbu_um: float) -> Layout:
         is_hole = np.ones(area_um2.size, bool)
         is_hole[layout.site_offsets[:-1]] = False
         is_flat = np.where(is_hole, area_um2 >= 0.0, area_um2 <= 0.0)
-        is_bad = np.logical_or.reduceat(is_flat, layout.site_offsets[:-1]) | ~shapely.is_valid(snapped.polygons())
+        is_bad = np.logical_or.reduceat(is_flat, layout.site_offsets[:-1]) | ~valid_sites(snapped)
         if is_bad.any():
             bad = np.flatnonzero(is_bad)
             raise GeometryError(
