@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import scipy.fft
@@ -36,20 +37,37 @@ console = Console(width=130)
 
 
 def bench_video(report: Report, n_frames: int) -> None:
-    """Stream so many frames onto a log-polar sensor; time it, and take its parts' shares."""
-    camera, pictures = _camera(), _pictures()
-    scenes = [next(iter(_footage([picture]))) for picture in pictures]
-    grid = camera.optics.grid(scenes[0])
-    pad = int(np.ceil(20.3 * 0.55 * camera.optics.working_f_number(DISTANCE_M) / grid.pitch_um))
+    """Stream so many frames onto a log-polar sensor, through cells of source pixels and finer ones; time it, take shares."""
+    _bench_camera(report, _camera(oversample=1))
+    _bench_camera(report, _camera(oversample="auto"))
+    _memory(report, n_frames)
+
+
+def _limit(camera: fs.Camera, scene: fs.Scene) -> tuple[str, Callable[[], None]]:
+    """What no frame can do without: a transform of the padded picture, one back to the map's cells, and the integration."""
+    pixels, k = camera.optics.grid(scene), camera.oversample(scene)
+    pad = int(np.ceil(20.3 * 0.55 * camera.optics.working_f_number(DISTANCE_M) / pixels.pitch_um))
     padded = tuple(int(scipy.fft.next_fast_len(n + 2 * pad, real=True)) for n in SHAPE)
-    cells, picture = (np.random.default_rng(0).random(s, dtype=np.float32) for s in (SHAPE, padded))
-    integrator = camera.integrator(grid, order=camera.order(scenes[0]))
+    fine = tuple(k * n for n in padded)
+    ((grid, _),) = camera.optics.resolved(scene).image_grids(scene)
+    cells, picture = (np.random.default_rng(0).random(s, dtype=np.float32) for s in (grid.shape, padded))
+    integrator = camera.integrator(grid, order=camera.order(scene))
 
     def limit() -> None:
         for _ in range(N_PICTURES):
             spectrum = scipy.fft.rfft2(picture, workers=thread_count())
-            scipy.fft.irfft2(spectrum, s=padded, workers=thread_count(), overwrite_x=True)
+            scipy.fft.irfft2(spectrum, s=fine, workers=thread_count(), overwrite_x=True)
             integrator(cells)
+
+    name = f"rfft2 {padded[0]} x {padded[1]}, irfft2{'' if k == 1 else f' {fine[0]} x {fine[1]}'}, integral"
+    return name, limit
+
+
+def _bench_camera(report: Report, camera: fs.Camera) -> None:
+    pictures = _pictures()
+    scenes = [next(iter(_footage([picture]))) for picture in pictures]
+    k = camera.oversample(scenes[0])
+    against, limit = _limit(camera, scenes[0])
 
     def still() -> None:
         for _ in camera.video(scenes, exposure_s=EXPOSURE_S, seed=0):
@@ -87,12 +105,12 @@ def bench_video(report: Report, n_frames: int) -> None:
         "gaze": (gaze, N_PICTURES),
     }
     times, cpu = _best({"limit": (limit, N_PICTURES)} | calls, 10)
-    against = f"rfft2, irfft2, {padded[0]} x {padded[1]}, integral"
     console.print(
-        f"{SHAPE[0]} x {SHAPE[1]}, {camera.sensor.layout.n_sites:,} log-polar sites, {thread_count()} threads"
+        f"{SHAPE[0]} x {SHAPE[1]}, {k} x {k} cells a pixel, {camera.sensor.layout.n_sites:,} log-polar sites, "
+        f"{thread_count()} threads"
     )
     for name, title, bound in (
-        ("still", "frame of a video, all noise", 1.0 / 0.6),
+        ("still", f"frame of a video, all noise, oversample={k}", 1.0 / 0.6),
         ("ahead", "the same, frames ahead on each thread", 1.0 / 0.6),
         ("pictures", "the same from sRGB pictures", 1.0 / 0.6),
         ("rolling", "frame through a rolling shutter", None),
@@ -101,9 +119,8 @@ def bench_video(report: Report, n_frames: int) -> None:
     ):
         report.slower_than(title, times[name], against, times["limit"], bound)
     for name, title in (("still", "frame of a video"), ("pictures", "the same from sRGB pictures")):
-        report.slower_than(f"{title}: processor time", cpu[name], against, cpu["limit"], 1.0 / 0.6)
+        report.slower_than(f"{title}, oversample={k}: processor time", cpu[name], against, cpu["limit"], 1.0 / 0.6)
     _shares(camera, pictures)
-    _memory(report, n_frames)
 
 
 def _best(calls: dict[str, tuple[Callable[[], None], int]], repeats: int) -> tuple[dict[str, float], dict[str, float]]:
@@ -118,7 +135,7 @@ def _best(calls: dict[str, tuple[Callable[[], None], int]], repeats: int) -> tup
     return wall, cpu
 
 
-def _camera() -> fs.Camera:
+def _camera(oversample: int | Literal["auto"] = "auto") -> fs.Camera:
     half_um = 0.5 * SHAPE[0] * PITCH_UM * FOCAL_LENGTH_MM / (1e3 * DISTANCE_M - FOCAL_LENGTH_MM)
     r_max_um = 0.96 * half_um
     layout = fs.layout.log_polar(n_sectors=N_SECTORS, n_rings=N_RINGS, r_min_um=0.026 * r_max_um, r_max_um=r_max_um)
@@ -134,7 +151,8 @@ def _camera() -> fs.Camera:
         prnu_fraction=0.01,
         pixel_fpn_fraction=0.01,
     )
-    return fs.Camera(optics=fs.Optics(focal_length_mm=FOCAL_LENGTH_MM, f_number=F_NUMBER), sensor=sensor)
+    optics = fs.Optics(focal_length_mm=FOCAL_LENGTH_MM, f_number=F_NUMBER, oversample=oversample)
+    return fs.Camera(optics=optics, sensor=sensor)
 
 
 def _pictures() -> list[np.ndarray]:
