@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from foveasim.arrays import Floats, Ints, read_only
 from foveasim.compiled import kernels
+from foveasim.errors import ParameterError
 from foveasim.fields import PackedRings
 from foveasim.rings import positions_in_runs, site_moments
 from foveasim.streams import device_key
@@ -67,7 +68,10 @@ class Device:
         """Two words for every site, that no site of another outline has."""
         columns: Any = getattr(self.layout, "columns", {})
         if SITE_ID in columns:
-            ids = np.ascontiguousarray(columns[SITE_ID], np.int64)
+            given = columns[SITE_ID]
+            if given.dtype.kind not in "iu":
+                raise ParameterError(SITE_ID, f"is a column of the layout, and must hold integers, got {given.dtype}")
+            ids = np.ascontiguousarray(given).astype(np.int64)
             return ids.view(np.uint64), np.full(ids.size, 1 << 63, np.uint64)
         rings = self.layout.xy_um, self.layout.ring_offsets, self.layout.site_offsets
         _, centroid_um = site_moments(*rings)
