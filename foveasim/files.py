@@ -6,6 +6,7 @@ import errno
 import os
 import secrets
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,10 +14,12 @@ from typing import IO
 
 from foveasim.errors import FileError, disk_problem
 
-__all__ = ["check_room", "folder_written_whole", "lock", "written_whole"]
+__all__ = ["check_room", "folder_written_whole", "lock", "remove_folder", "written_whole"]
 
 #: A disk with less space than a block is full.
 FULL_DISK_BYTES = 4096
+#: A folder is removed once more after each of these times.
+STRAGGLERS_S = (0.0, 0.05, 0.25)
 
 
 @contextmanager
@@ -80,6 +83,18 @@ def folder_written_whole(target: Path, *, is_ours: Callable[[Path], bool]) -> It
         raise
     finally:
         for folder in (new, old):
+            remove_folder(folder)
+
+
+def remove_folder(folder: Path) -> None:
+    """
+    Remove a folder with all that it holds, or nothing where there is none; what cannot be removed stays.
+
+    Libraries that write in threads of their own, as zarr does, may write on for a moment after an error, into a new folder.
+    """
+    if folder.exists():
+        for wait_s in STRAGGLERS_S:
+            time.sleep(wait_s)
             shutil.rmtree(folder, ignore_errors=True)
 
 

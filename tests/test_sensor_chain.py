@@ -102,7 +102,9 @@ def test_a_column_may_tell_sites_apart_in_place_of_where_they_are():
 def test_site_ids_must_be_integers():
     halves = MANY[:4].with_columns(site_id=[0.0, 0.5, 1.0, 1.5])
 
-    with pytest.raises(ParameterError, match="'site_id' is a column of the layout, and must hold integers, got float64"):
+    with pytest.raises(
+        ParameterError, match="'site_id' is a column of the layout, and must hold integers, got float64"
+    ):
         Device(seed=3, layout=halves).normals("prnu")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import secrets
-import shutil
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -19,6 +18,7 @@ from foveasim.arrays import unit_of
 from foveasim.errors import FileError, ParameterError
 from foveasim.explore._plan import POINT, REPEAT, Plan, coordinate
 from foveasim.explore._records import FORMAT, VERSION, Record, Value
+from foveasim.files import remove_folder
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -293,7 +293,7 @@ def write_store(dataset: xr.Dataset, path: Path) -> None:
         raise FileError(path, f"cannot be written: {error.strerror or error}") from None
     finally:
         for folder in (new, old):
-            shutil.rmtree(folder, ignore_errors=True)
+            remove_folder(folder)
 
 
 def _xarray() -> Any:

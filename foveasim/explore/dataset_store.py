@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from foveasim.arrays import check_count
 from foveasim.errors import FileError, FoveasimError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore.dataset import DataSet
-from foveasim.files import written_whole
+from foveasim.files import remove_folder, written_whole
 from foveasim.parallel import thread_count
 
 __all__ = ["StoredSamples", "open_data_set", "write_data_set"]
@@ -428,7 +428,7 @@ def _begun(target: Path, make: Callable[[Path], None]) -> None:
     except OSError as error:
         raise FileError(target, f"cannot be written: {error.strerror or error}") from None
     finally:
-        shutil.rmtree(new, ignore_errors=True)
+        remove_folder(new)
 
 
 # -- shards -----------------------------------------------------------------------------------------------------------

@@ -12,7 +12,6 @@ import json
 import math
 import os
 import secrets
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +20,7 @@ import numpy as np
 
 from foveasim.errors import FileError
 from foveasim.fields import PowerMap
-from foveasim.files import check_room
+from foveasim.files import check_room, remove_folder
 from foveasim.maps._common import Found, Refusal, check_size
 from foveasim.maps._xarray import NAME, X, Y, found_in_array, to_xarray
 
@@ -100,7 +99,7 @@ def write_zarr(power_map: PowerMap, path: Path) -> None:
         raise FileError(path, f"cannot be written: {error.strerror or error}") from None
     finally:
         for folder in (new, old):
-            shutil.rmtree(folder, ignore_errors=True)
+            remove_folder(folder)
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
