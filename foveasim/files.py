@@ -92,10 +92,13 @@ def remove_folder(folder: Path) -> None:
 
     Libraries that write in threads of their own, as zarr does, may write on for a moment after an error, into a new folder.
     """
-    if folder.exists():
-        for wait_s in STRAGGLERS_S:
-            time.sleep(wait_s)
-            shutil.rmtree(folder, ignore_errors=True)
+    try:
+        is_there = folder.exists()
+    except OSError:  # its place may not even be looked at
+        is_there = False
+    for wait_s in STRAGGLERS_S if is_there else ():
+        time.sleep(wait_s)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def check_room(path: Path, n_bytes: int) -> None:
