@@ -37,14 +37,14 @@ console = Console(width=130)
 
 
 def bench_video(report: Report, n_frames: int) -> None:
-    """Stream so many frames onto a log-polar sensor, through cells of source pixels and finer ones; time it, take shares."""
+    """Benchmark frames of a video with cells of source pixels and with finer ones, and the memory of ``n_frames``."""
     _bench_camera(report, _camera(oversample=1))
     _bench_camera(report, _camera(oversample="auto"))
     _memory(report, n_frames)
 
 
 def _limit(camera: fs.Camera, scene: fs.Scene) -> tuple[str, Callable[[], None]]:
-    """What no frame can do without: a transform of the padded picture, one back to the map's cells, and the integration."""
+    """Return the minimum work per frame: FFT of the padded picture, inverse FFT to the cells of the map, integration."""
     pixels, k = camera.optics.grid(scene), camera.oversample(scene)
     pad = int(np.ceil(20.3 * 0.55 * camera.optics.working_f_number(DISTANCE_M) / pixels.pitch_um))
     padded = tuple(int(scipy.fft.next_fast_len(n + 2 * pad, real=True)) for n in SHAPE)

@@ -19,7 +19,7 @@ __all__ = ["check_room", "folder_written_whole", "lock", "remove_folder", "writt
 #: A disk with less space than a block is full.
 FULL_DISK_BYTES = 4096
 #: A folder is removed once more after each of these times.
-STRAGGLERS_S = (0.0, 0.05, 0.25)
+RETRY_S = (0.0, 0.05, 0.25)
 
 
 @contextmanager
@@ -88,15 +88,15 @@ def folder_written_whole(target: Path, *, is_ours: Callable[[Path], bool]) -> It
 
 def remove_folder(folder: Path) -> None:
     """
-    Remove a folder with all that it holds, or nothing where there is none; what cannot be removed stays.
+    Remove a folder with its contents, if it exists; ignore what the system does not let us remove.
 
-    Libraries that write in threads of their own, as zarr does, may write on for a moment after an error, into a new folder.
+    The threads of zarr may still write for a moment after an error, and create the folder again.
     """
     try:
         is_there = folder.exists()
-    except OSError:  # its place may not even be looked at
+    except OSError:  # no permission for the parent
         is_there = False
-    for wait_s in STRAGGLERS_S if is_there else ():
+    for wait_s in RETRY_S if is_there else ():
         time.sleep(wait_s)
         shutil.rmtree(folder, ignore_errors=True)
 

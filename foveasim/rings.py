@@ -29,7 +29,7 @@ __all__ = [
     "to_frame",
 ]
 
-#: Smaller turns (rad) may be roundings.
+#: Turns (rad) below this may be rounding errors.
 SMALLEST_TURN = 1e-12
 
 
@@ -118,12 +118,12 @@ def ring_spread_um2(xy_um: Floats, ring_offsets: Ints) -> Floats:
 
 def are_convex(xy_um: Floats, ring_offsets: Ints) -> Bools:
     """
-    Whether each ring certainly is a convex polygon, of either winding, (n_ring,) bool.
+    Whether each ring is a strictly convex polygon, of either winding, (n_ring,) bool.
 
     Notes
     -----
     A closed line that turns to the same side at every vertex, and once around in all, is convex, and so meets itself nowhere.
-    Turns that rounding may have made, of less than 1e-12 rad, count as none: such a ring is not certain.
+    Turns below 1e-12 rad may be rounding errors: rings with such a vertex count as not convex.
     """
     if ring_offsets.size == 1:
         return np.zeros(0, bool)

@@ -1,4 +1,4 @@
-"""Files and folders written whole or not at all."""
+"""Atomic writes of folders."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from foveasim.errors import FileError
 from foveasim.files import folder_written_whole, remove_folder
 
 
-def test_removal_waits_for_stragglers(tmp_path):
+def test_removal_outlasts_late_writers(tmp_path):
     folder = tmp_path / "store.zarr"
     has_begun = threading.Event()
 
@@ -24,22 +24,22 @@ def test_removal_waits_for_stragglers(tmp_path):
             has_begun.set()
             time.sleep(0.002)
 
-    straggler = threading.Thread(target=write_on)
-    straggler.start()
+    late_writer = threading.Thread(target=write_on)
+    late_writer.start()
     has_begun.wait()
     remove_folder(folder)
-    straggler.join()
+    late_writer.join()
 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_removing_nothing_is_no_error(tmp_path):
+def test_removing_absent_folder_does_nothing(tmp_path):
     remove_folder(tmp_path / "absent")
 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_failed_folders_leave_nothing_behind(tmp_path):
+def test_failed_folder_write_leaves_nothing(tmp_path):
     def write():
         with folder_written_whole(tmp_path / "a", is_ours=bool) as new:
             (new / "b").write_bytes(b"half")

@@ -183,7 +183,7 @@ small = st.tuples(st.integers(-4, 4), st.integers(-4, 4))
 
 @given(st.lists(st.lists(small, min_size=3, max_size=7), min_size=1, max_size=6))
 @settings(deadline=None, derandomize=True, max_examples=400)
-def test_convex_rings_are_hulls_of_their_vertices(all_rings):
+def test_convex_rings_equal_their_hulls(all_rings):
     all_rings = [ring for ring in all_rings if all(a != b for a, b in pairwise([*ring, ring[0]]))]
     if not all_rings:
         return
@@ -200,7 +200,7 @@ def test_convex_rings_are_hulls_of_their_vertices(all_rings):
 
 @pytest.mark.parametrize("far_um", [0.0, 1e6])
 @pytest.mark.parametrize("n", [3, 4, 6, 50])
-def test_regular_polygons_of_either_winding_are_convex(n, far_um):
+def test_regular_polygons_are_convex(n, far_um):
     angle = 2.0 * np.pi * np.arange(n) / n
     ring = np.stack((np.cos(angle), np.sin(angle)), axis=1) + far_um
 
@@ -208,7 +208,7 @@ def test_regular_polygons_of_either_winding_are_convex(n, far_um):
     assert are_convex(ring[::-1], np.array([0, n])).all()
 
 
-def test_a_pentagram_is_not_convex():
+def test_pentagram_is_not_convex():
     angle = 2.0 * np.pi * 2.0 * np.arange(5) / 5
 
     assert not are_convex(np.stack((np.cos(angle), np.sin(angle)), axis=1), np.array([0, 5])).any()

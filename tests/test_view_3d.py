@@ -459,10 +459,10 @@ import warnings
 import numpy as np
 import foveasim as fs
 from foveasim.errors import FoveasimWarning
-with warnings.catch_warnings(record=True) as told:
+with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     picture = fs.view.render(fs.view.prisms(fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0)), size_px=(60, 40))
-print(fs.view.find_renderer(), len(np.unique(picture)) > 2, *[w.message for w in told if w.category is FoveasimWarning], sep="|")
+print(fs.view.find_renderer(), len(np.unique(picture)) > 2, *[w.message for w in caught if w.category is FoveasimWarning], sep="|")
 """
 
 

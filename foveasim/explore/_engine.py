@@ -181,7 +181,7 @@ def records_of(
                 continue  # it was taken back
             bundle = work.sent.pop(future)
             records = _arrived(work, future, bundle)
-            # Count anew when a worker may have gone.
+            # Count the workers again when one may have ended.
             if records is None or future.status != "finished":
                 counted_s = float("-inf")
             if records is None:
@@ -190,7 +190,7 @@ def records_of(
                 work.sent[future] = bundle
                 done.put(future)
                 continue
-            # Let go of it: dask would run it again if its worker ended now.
+            # Release the future: dask would compute it again if its worker ended now.
             del future
             yield from records
     finally:

@@ -657,7 +657,7 @@ def valid_sites(layout: Layout) -> Bools:
     """
     Whether each site is a valid polygon in the sense of OGC, (n_site,) bool.
 
-    No ring crosses itself or another, and holes lie inside. Convex outlines are told at a tenth of the cost of others.
+    No ring crosses itself or another, and holes lie inside. Only outlines that are not convex are passed to shapely.
     """
     outlines, n_rings = layout.site_offsets[:-1], np.diff(layout.site_offsets)
     is_valid = (n_rings == 1) & are_convex(layout.xy_um, layout.ring_offsets)[outlines]

@@ -39,7 +39,7 @@ FAR_SIGMAS, FAR_ELECTRONS = 12.0, 40
 REACH_SIGMAS = 9.0
 #: Points of a mixture of charges, at most; chances below the smallest are left out; charges are whole to this.
 MOST_NODES, TINY, WHOLE = 2048, 1e-18, 1e-6
-#: Sites that a kernel takes through all steps before the next ones.
+#: Sites per pass through all steps of the readout: their buffers fit the L1 cache.
 PIECE = 1024
 #: Halvings that find a number to its last bit.
 BISECTIONS = 60
@@ -186,7 +186,7 @@ def _converted(share, way, strength, table):
 
 @njit(cache=True, nogil=True, inline="always")
 def _share(charge, per_e, offset, v_sat_v, bend):
-    """Share of the range that a charge reaches: bent volts and an offset, clipped."""
+    """Fraction of the voltage range for a charge: nonlinearity, offset and clip."""
     v = charge * per_e
     v *= 1.0 - bend * min(max(v / v_sat_v, 0.0), 1.0)
     return min(max((v + offset) / v_sat_v, 0.0), 1.0)
@@ -194,48 +194,48 @@ def _share(charge, per_e, offset, v_sat_v, bend):
 
 @njit(cache=True, nogil=True, inline="always")
 def _with_inl(value, n_codes, inl):
-    """Codes, not yet whole, with the integral non-linearity there."""
+    """Add the integral non-linearity to a code before quantisation."""
     place = min(value / n_codes, 1.0) * (inl.size - 1)
-    k = np.uint32(min(int(place), inl.size - 2))  # unsigned: an index that is known to be none from the end
+    k = np.uint32(min(int(place), inl.size - 2))  # unsigned: indices from the end need no check
     return value + (inl[k] + (place - k) * (inl[k + 1] - inl[k]))
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _value(charge, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl):
-    """Codes, not yet whole, of a charge."""
+    """Code of a charge before quantisation."""
     value = _converted(_share(charge, per_e, offset, v_sat_v, bend), way, strength, table) * n_codes
     return _with_inl(value, n_codes, inl) if inl.size > 1 else value
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _dnl_place(key, line, code, n_quantiles):
-    """Where among the quantiles of the Gaussian law the number lies that a line adds before a code."""
+    """Position among the Gaussian quantiles of the DNL of a readout line and a code."""
     word, _ = _philox_2x32(key, np.uint64(line) & _LOW, np.uint64(code))
     return np.float64(word) * (_ONE_IN_2_32 * (n_quantiles - 1))
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _between(quantiles, place):
-    """Value at a place among quantiles, linear in between."""
+    """Interpolate quantiles linearly."""
     k = np.uint32(place)
     return quantiles[k] + (place - k) * (quantiles[k + 1] - quantiles[k])
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _dnl_normal(key, line, code, quantiles):
-    """The number of the Gaussian law that a line adds before a code."""
+    """DNL of a readout line and a code: a standard Gaussian number."""
     return _between(quantiles, _dnl_place(key, line, code, quantiles.size))
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _whole(value, n_codes):
-    """Code, a whole float64, of codes not yet whole."""
+    """Quantise to a code, as float64."""
     return np.float64(int(min(max(value + CODE_ROUNDING, 0.0), n_codes - 1.0)))
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _code(value, line, n_codes, dnl, dnl_key, quantiles):
-    """The code of codes not yet whole."""
+    """Quantise to a code, with differential non-linearity."""
     code = _whole(value, n_codes)
     if dnl > 0.0:
         code = _whole(value + dnl * _dnl_normal(dnl_key, line, code, quantiles), n_codes)
@@ -288,7 +288,7 @@ def _charge(value, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, 
 
 @njit(cache=True, nogil=True, inline="always")
 def _copy(values, sites, out):
-    """Values of some sites, or the one of all, to the front of an array."""
+    """Copy values of a slice of sites, or the value of all, to the start of an array."""
     if values.size > 1:
         out[: sites.stop - sites.start] = values[sites]
     else:
@@ -347,7 +347,7 @@ def read_out(
     codes (size 1: none); ``dnl`` is the standard deviation, in codes, of a number that each line adds before each code, a
     Gaussian by its ``quantiles``.
     """
-    # Step by step over a piece of the sites that stays in the cache: each of the short loops runs on vectors.
+    # One short loop per step, which the compiler vectorises, over buffers that stay in the cache.
     value, per_e, offsets_v, place = np.empty(PIECE), np.empty(PIECE), np.empty(PIECE), np.empty(PIECE)
     for first in range(0, charge_e.size, PIECE):
         n = min(PIECE, charge_e.size - first)

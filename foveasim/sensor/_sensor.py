@@ -490,7 +490,6 @@ class Sensor:
         code ``k`` stands for the voltages from ``k * V_sat / 2**bits`` to the next.
         """
         electrons = self._checked_charges("electrons", electrons, at_least=-np.inf)
-        convert = self.converter
         code = np.empty(electrons.size, np.uint8 if self.bits <= 8 else np.uint16)
         noises_e = {"reset": self.ktc_noise_e, "read": np.atleast_1d(np.asarray(self.read_noise_e, np.float64))}
         noises_e = {effect: sigma_e for effect, sigma_e in noises_e.items() if sigma_e.any()}
@@ -498,13 +497,13 @@ class Sensor:
         line = np.ascontiguousarray(self.layout.readout_line)
         telegraph_e = self._telegraph_e(streams)
         read_out = kernels("sensor").read_out
-        dnl_key = self.device.key("dnl")[0] & np.uint64(0xFFFFFFFF)
+        conversion = self._conversion
 
         charges: NDArray[Any] = electrons if self._coupling is None else self._coupling.apply(electrons)
 
         def block(number: int, whole: slice) -> None:
             generators = {effect: streams.of(effect, number) for effect in noises_e}
-            # A block's numbers come from one stream, piece by piece: what is worked on stays in the processor's cache.
+            # Each block has one random stream per effect; pieces of a block fit the processor's cache.
             for sites in pieces(whole):
                 charge_e = charges[sites].astype(np.float64)
                 for effect, sigma_e in noises_e.items():
@@ -520,21 +519,29 @@ class Sensor:
                     self.line_offset_v,
                     _part(self.gain, sites),
                     line[sites],
-                    self.v_sat_v,
-                    self.nonlinearity_fraction,
-                    convert.way,
-                    convert.log_strength,
-                    convert.curve,
-                    convert.n_codes,
-                    convert.inl,
-                    convert.dnl_dn,
-                    dnl_key,
-                    convert.quantiles,
+                    *conversion,
                     code[sites],
                 )
 
         in_blocks(electrons.size, block, n_threads)
         return code
+
+    @property
+    def _conversion(self) -> tuple[Any, ...]:
+        """Arguments of the kernels from volts to codes: range, nonlinearity and ADC."""
+        adc = self.converter
+        return (
+            self.v_sat_v,
+            self.nonlinearity_fraction,
+            adc.way,
+            adc.log_strength,
+            adc.curve,
+            adc.n_codes,
+            adc.inl,
+            adc.dnl_dn,
+            self.device.key("dnl")[0] & np.uint64(0xFFFFFFFF),
+            adc.quantiles,
+        )
 
     def _checked_charges(self, name: str, charge_e: ArrayLike, at_least: float = 0.0) -> NDArray[Any]:
         charges = np.asarray(unmasked(name, charge_e))
@@ -606,7 +613,6 @@ class Sensor:
         of resetting and reading and the telegraph's two states. Coupled charges are taken as Gaussian of the coupled variance.
         """
         expected_e = self.checked_charges("expected_e", expected_e)
-        convert = self.converter
         mean_dn, variance_dn2 = np.empty(expected_e.size), np.empty(expected_e.size)
         well_e = np.array([np.inf]) if self.full_well_e is None else np.floor(np.atleast_1d(self.full_well_e))
         sigma_e = np.sqrt(self.ktc_noise_e**2 + np.atleast_1d(self.read_noise_e) ** 2)
@@ -622,7 +628,7 @@ class Sensor:
         points, shares = _quadrature()
         line = np.ascontiguousarray(self.layout.readout_line)
         v_per_e = np.atleast_1d(electrons_to_volts(1.0, self.capacitance_f))
-        dnl_key = self.device.key("dnl")[0] & np.uint64(0xFFFFFFFF)
+        conversion = self._conversion
         predict_codes = kernels("sensor").predict_codes
 
         def block(_: int, sites: slice) -> None:
@@ -639,16 +645,7 @@ class Sensor:
                 _part(self.pixel_offset_v, sites),
                 self.line_offset_v,
                 line[sites],
-                self.v_sat_v,
-                self.nonlinearity_fraction,
-                convert.way,
-                convert.log_strength,
-                convert.curve,
-                convert.n_codes,
-                convert.inl,
-                convert.dnl_dn,
-                dnl_key,
-                convert.quantiles,
+                *conversion,
                 points,
                 shares,
                 mean_dn[sites],

@@ -37,7 +37,7 @@ def in_blocks(n_sites: int, work: Callable[[int, slice], None], n_threads: int |
 
 
 def pieces(block: slice) -> Iterator[slice]:
-    """Pieces of a block of sites, one after the other."""
+    """Split a block of sites into slices of at most ``PIECE_SITES``."""
     for first in range(block.start, block.stop, PIECE_SITES):
         yield slice(first, min(first + PIECE_SITES, block.stop))
 
