@@ -29,9 +29,9 @@ from rich.console import Console
 from video import bench_video
 
 import foveasim as fs
-from foveasim.parallel import thread_count
+from foveasim._core.random_streams import Streams
+from foveasim._core.threads import thread_count
 from foveasim.sensor.noise import in_blocks
-from foveasim.streams import Streams
 from layouts import bench_layouts
 
 #: The largest picture of the paper.

@@ -23,8 +23,8 @@ from report import Report
 from rich.console import Console
 
 import foveasim as fs
+from foveasim._core.threads import thread_count
 from foveasim.modes import EventPixels
-from foveasim.parallel import thread_count
 
 SHAPE = (1080, 1920)
 PITCH_UM, DISTANCE_M, FOCAL_LENGTH_MM, F_NUMBER = 20.0, 0.82, 40.0, 4.0

@@ -39,13 +39,13 @@ from foveasim.integrate import Integrator
 from foveasim.layout import DesignRules, Layout
 from foveasim.maps import read_power_map, write_power_map
 from foveasim.optics import Optics
-from foveasim.reading import read_layout
 from foveasim.reconstruct import Picture
 from foveasim.scene import Scene
 from foveasim.sensor import FilterSet, GaussianCurve, PolynomialCurve, Sensor, SiliconQE, rgb_filters
 
 if TYPE_CHECKING:
     from foveasim import explore
+    from foveasim.config import read_layout
 
 __all__ = [
     "Camera",
@@ -86,16 +86,20 @@ __all__ = [
 ]
 
 
+#: Names that are imported when they are used, and the modules that have them: both load the models of settings.
+_LAZY = {"explore": "foveasim.explore", "read_layout": "foveasim.config"}
+
 if not TYPE_CHECKING:  # type checkers would take any name for an attribute
 
     def __getattr__(name: str) -> Any:
-        """Import :mod:`foveasim.explore` when it is used: it loads the checks of settings, which nothing else here needs."""
-        if name == "explore":
-            from importlib import import_module
+        """Import the names of ``_LAZY``."""
+        if name not in _LAZY:
+            raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+        from importlib import import_module
 
-            return import_module("foveasim.explore")
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+        module = import_module(_LAZY[name])
+        return module if module.__name__ == f"{__name__}.{name}" else getattr(module, name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return list(__all__)

@@ -19,9 +19,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Bools, Floats, check_count, finite_array, read_only
+from foveasim._core.provenance import described, versions
+from foveasim._core.random_streams import Streams
+from foveasim._core.threads import in_order, thread_count
+from foveasim._core.validation import Bools, Floats, check_count, finite_array, read_only
 from foveasim.capture import Capture
-from foveasim.compiled import kernels
 from foveasim.distortion import Lens
 from foveasim.errors import CoverageWarning, FoveasimWarning, ParameterError, SamplingWarning, SimulationError
 from foveasim.fields import Grid, PowerMap
@@ -29,13 +31,10 @@ from foveasim.integrate import Integrator
 from foveasim.layout import Layout
 from foveasim.modes import Between, Exposure, Shutter
 from foveasim.optics import Optics
-from foveasim.parallel import in_order, thread_count
 from foveasim.reconstruct import Picture, reference
-from foveasim.records import described, versions
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor, noise_budget
 from foveasim.sensor.limits import check_plausible, check_plausible_array
-from foveasim.streams import Streams
 from foveasim.units import um_from_nm, w_from_w_m2_um2
 
 __all__ = ["Camera", "Light"]
@@ -647,8 +646,7 @@ class Camera:
         filter_of_site = self._sensor.filter_of_site
         weights = self._sensor.responsivity_e_per_j(light.wavelength_nm)
         with clock.stage("load kernels"):
-            for room in ("integrate",) if isinstance(light, PowerMap) else ("integrate", "optics"):
-                kernels(room)
+            _load_kernels(light)
         if isinstance(light, PowerMap):
             optics, grids = self._optics, [(light.grid, np.ones(light.wavelength_nm.size, bool))]
         else:
@@ -822,3 +820,11 @@ def _light_described(light: Scene | PowerMap) -> dict[str, object]:
         "band_width_nm": light.band_width_nm.tolist(),
         "spectrum_w_m2_sr_nm": described(light.spectrum_w_m2_sr_nm),
     }
+
+
+def _load_kernels(light: Scene | PowerMap) -> None:
+    """Import the kernels that images of this light need, so that their compilation is not timed with other work."""
+    import foveasim.integrate._kernels
+
+    if isinstance(light, Scene):
+        import foveasim.optics._kernels  # noqa: F401

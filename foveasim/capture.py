@@ -11,11 +11,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.archives import opened_archive, write_archive
-from foveasim.arrays import Floats, Ints, check_choice, check_count, own, read_only, unit_of, unmasked
+from foveasim._core.provenance import copied, described
+from foveasim._core.rings import same_rings
+from foveasim._core.validation import Floats, Ints, check_choice, check_count, own, read_only, unit_of, unmasked
+from foveasim._io.atomic import folder_written_whole
+from foveasim._io.npz import opened_archive, write_archive
+from foveasim._io.zarr_stores import ZARR, Variable, free_name, library, opened_store, store_format, write_variables
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid
-from foveasim.files import folder_written_whole
 from foveasim.layout import Layout
 from foveasim.layout.packed import packed_layout, unpacked_layout
 from foveasim.reconstruct import (
@@ -31,10 +34,7 @@ from foveasim.reconstruct import (
     natural,
     raster_grid,
 )
-from foveasim.records import copied, described
-from foveasim.rings import same_rings
 from foveasim.sensor import Sensor, signal_to_noise
-from foveasim.stores import ZARR, Variable, free_name, library, opened_store, store_format, write_variables
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, NoReturn, TextIO
 import typer
 
 from foveasim import __version__
+from foveasim._io.terminal import PlainConsole, plain_streams, spinner_of, text_of
 from foveasim.errors import FileError, FoveasimError, FoveasimWarning, printable
-from foveasim.terminal import PlainConsole, plain_streams, spinner_of, text_of
 
 if TYPE_CHECKING:
     from rich.status import Status
@@ -60,7 +60,7 @@ def options(
 @app.command()
 def demo(out: Out = Path("out"), threads: Threads = None) -> None:
     """Show a photograph to a foveal colour sensor and to a four-zone sensor."""
-    from foveasim.shots import demo_settings
+    from foveasim.config import demo_settings
 
     _run(demo_settings(), [], out, threads)
 
@@ -187,8 +187,8 @@ def view(
     ] = False,
 ) -> None:
     """Explore a layout, a capture or a report in a browser, on a page that needs no network."""
-    from foveasim.files import written_whole
-    from foveasim.shots import read_viewable
+    from foveasim._io.atomic import written_whole
+    from foveasim.config import read_viewable
     from foveasim.view.web import check_page_path, open_page, serve_page, solid_page, web_page
 
     if web is not None and serve:
@@ -301,8 +301,8 @@ def dataset(
     ] = None,
 ) -> None:
     """Take pictures with cameras drawn at random, and write them as samples to learn from."""
+    from foveasim._core.threads import thread_count
     from foveasim.explore import read_data_set, write_data_set
-    from foveasim.parallel import thread_count
 
     n_threads = 1 if workers is None else max(1, thread_count() // max(1, workers))
     with _status("reading pictures and settings"):
@@ -336,8 +336,7 @@ def video(
     threads: Threads = None,
 ) -> None:
     """Take a video with the camera of a settings file: pictures or a video file in the place of its scene."""
-    from foveasim.config import read_shot
-    from foveasim.shots import run_video
+    from foveasim.config import read_shot, run_video
     from foveasim.video import frames_kept, partial_of
 
     if frames_per_s is not None and not frames_per_s > 0.0:
@@ -368,8 +367,7 @@ def schema(
 
 
 def _run(settings: Sequence[Path], changes: Sequence[str], out: Path, threads: int | None) -> None:
-    from foveasim.config import read_shot
-    from foveasim.shots import check_folder, results_table, run_shot
+    from foveasim.config import check_folder, read_shot, results_table, run_shot
 
     check_folder(out)
     results = []

@@ -14,7 +14,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import (
+from foveasim._core.validation import (
     Floats,
     Images,
     Ints,

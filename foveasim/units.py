@@ -6,7 +6,7 @@ Constants are the exact values of the 2019 SI (CODATA 2018).
 
 from __future__ import annotations
 
-from foveasim.arrays import Floats, as_numbers
+from foveasim._core.validation import Floats, as_numbers
 
 __all__ = [
     "BOLTZMANN_J_PER_K",

@@ -18,7 +18,7 @@ import skimage.data
 from matplotlib.figure import Figure
 
 import foveasim as fs
-from foveasim.encodings import encoded_srgb
+from foveasim._io.encodings import encoded_srgb
 from foveasim.metrics import psnr_db, ssim
 from foveasim.view import save_figure
 

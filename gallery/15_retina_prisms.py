@@ -17,7 +17,7 @@ import skimage.data
 
 import foveasim as fs
 from foveasim import view
-from foveasim.encodings import decoded, encoded_srgb
+from foveasim._io.encodings import decoded, encoded_srgb
 
 WAVELENGTH_NM = 550.0
 EXPOSURE_S = 0.01

@@ -26,7 +26,7 @@ from matplotlib.patches import Circle
 from scipy.ndimage import distance_transform_edt
 
 import foveasim as fs
-from foveasim.encodings import encoded_srgb
+from foveasim._io.encodings import encoded_srgb
 from foveasim.metrics import estimate_flow, flow_bound, site_gradients_e_per_um
 from foveasim.reconstruct import Readings, cells, code_readings, least_squares
 from foveasim.view import save_figure

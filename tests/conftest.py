@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -27,23 +28,21 @@ def torch_is_missing():
 
 MISSING = {"renderer": renderer_is_missing, "chromium": chromium_is_missing, "torch": torch_is_missing}
 PACKAGE = Path(__file__).parents[1] / "foveasim"
-NUMBA = re.compile(r"^(from|import) numba\b", re.MULTILINE)
+KERNELS = re.compile(r"^from foveasim\._core\.jit import njit$", re.MULTILINE)
 
 
 def kernel_modules():
-    """Room and name of each module that loads numba when it is imported."""
+    """Name of each module whose import compiles kernels."""
     for path in sorted(PACKAGE.rglob("*.py")):
-        if NUMBA.search(path.read_text()):
-            yield ".".join(path.relative_to(PACKAGE).parent.parts), path.stem
+        if KERNELS.search(path.read_text()):
+            yield ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
 
 
 def pytest_configure(config):
     """Compile all kernels once, before there are several processes that would each compile them."""
     if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
-        from foveasim.compiled import kernels
-
-        for room, module in kernel_modules():
-            kernels(room, module)
+        for name in kernel_modules():
+            import_module(name)
 
 
 def pytest_runtest_setup(item):

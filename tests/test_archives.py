@@ -7,7 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from foveasim.archives import read_archive, write_archive
+from foveasim._io.npz import read_archive, write_archive
 from foveasim.errors import FileError
 from foveasim.layout import hexagonal, read_layout, write_layout
 

@@ -9,10 +9,10 @@ import pytest
 import scipy.constants
 
 import foveasim as fs
+from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
 from foveasim.sensor import Calibration, Coupling, Diffusion, Sensor, calibrate, linearised
-from foveasim.streams import Streams
 
 SIGMAS = 5.0
 N_X, N_Y = 200, 100

@@ -393,7 +393,7 @@ def test_a_file_that_would_unpack_to_too_much_is_refused(capture, tmp_path, monk
     capture.save(tmp_path / "c.npz")
     with zipfile.ZipFile(tmp_path / "c.npz") as archive:
         size = sum(item.file_size for item in archive.infolist())
-    monkeypatch.setattr("foveasim.archives.MAX_UNPACKED_BYTES", size - 1)
+    monkeypatch.setattr("foveasim._io.npz.MAX_UNPACKED_BYTES", size - 1)
 
     with pytest.raises(FileError, match="would unpack to more than"):
         fs.Capture.load(tmp_path / "c.npz")

@@ -285,7 +285,7 @@ def test_missing_zarr_gives_pip_command(capture, tmp_path, monkeypatch):
 
 
 def test_view_shows_store_like_archive(capture, tmp_path):
-    from foveasim.shots import read_viewable
+    from foveasim.config import read_viewable
 
     capture.save(tmp_path / "x.zarr")
     assert_same(read_viewable(tmp_path / "x.zarr").thing, capture)

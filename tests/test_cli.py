@@ -14,8 +14,8 @@ import pytest
 from PIL import Image
 
 import foveasim as fs
+from foveasim._io.images import read_picture
 from foveasim.config import shipped_layouts
-from foveasim.pictures import read_picture
 
 SHOT = """
 scene: {kind: picture, picture: photo.png, pitch_um: 100, distance_m: 1.0, peak_radiance_w_m2_sr_nm: 0.2}

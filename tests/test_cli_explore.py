@@ -23,10 +23,10 @@ from foveasim import cli, explore
 from foveasim.config import build_shot
 from foveasim.errors import ConfigError, FileError
 from foveasim.explore import _records
-from foveasim.explore._bench import Bench, Job, Task
 from foveasim.explore._records import Journal, Record
-from foveasim.explore._study_plan import _suggested
-from foveasim.explore.dataset_label_files import files_of_pictures, read_boxes, read_labels
+from foveasim.explore.datasets.label_files import files_of_pictures, read_boxes, read_labels
+from foveasim.explore.studies.plan import _suggested
+from foveasim.explore.worker_cache import Bench, Job, Task
 
 GALLERY = Path(__file__).parents[1] / "gallery" / "sweeps"
 SHOT = {

@@ -205,7 +205,7 @@ def test_ascii_terminals_get_plain_characters(tmp_path, arguments, code, printed
 def test_spinner_is_plain_on_ascii_terminals():
     import io
 
-    from foveasim.terminal import PlainConsole, spinner_of
+    from foveasim._io.terminal import PlainConsole, spinner_of
 
     ascii_file = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     utf8_file = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")

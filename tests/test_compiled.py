@@ -2,34 +2,34 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import shutil
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
+import numba
 import pytest
 from conftest import kernel_modules
 
 import foveasim
-from foveasim.compiled import kernels
-from foveasim.errors import FileError
+from foveasim._core.jit import njit
 
 PACKAGE = Path(foveasim.__file__).parent
 #: Load the smallest kernels, and walk the GDSII records HEADER and ENDLIB, 6 and 4 bytes.
 PROGRAM = """
 import sys
 import numpy as np
-from foveasim.compiled import kernels
-from foveasim.compiled import kernels
 from foveasim.errors import FoveasimError
 try:
-    walk = kernels("layout.files").walk_records
+    from foveasim.layout.files._kernels import walk_records
 except FoveasimError as error:
     sys.exit(str(error))
 records = bytes([0, 6, 0, 2, 2, 88, 0, 4, 4, 0])
-print(walk(np.frombuffer(records, np.uint8), np.ones(2**16, bool), 0x0400))
+print(walk_records(np.frombuffer(records, np.uint8), np.ones(2**16, bool), 0x0400))
 """
 
 
@@ -85,26 +85,34 @@ def test_irreplaceable_machine_code_is_named(filled_cache, tmp_path):
     assert re.fullmatch(r"/.*: contains compiled kernels that can be neither read nor replaced .*; delete .*", message)
 
 
-def test_other_errors_of_kernels_pass(monkeypatch):
-    def fail(name):
-        raise ValueError(name)
+def test_other_compilation_errors_pass_through():
+    def kernel(x):
+        return x + 1
 
-    monkeypatch.setattr("foveasim.compiled.importlib.import_module", fail)
-    with pytest.raises(ValueError, match=r"^foveasim\.optics\._absent$") as caught:
-        kernels("optics", "_absent")
-    assert not isinstance(caught.value, FileError)
+    with pytest.raises(numba.TypingError):
+        njit(numba.int64(numba.types.unicode_type))(kernel)
 
 
 def test_kernel_modules_are_found_by_content():
-    found = set(kernel_modules())
-    written = {path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if "@njit" in path.read_text()}
+    compiling = {
+        path
+        for path in PACKAGE.rglob("*.py")
+        if re.search(r"^\s*@(numba\.)?(n?jit|vectorize)\b", path.read_text(), re.MULTILINE)
+    }
 
-    assert {PACKAGE.joinpath(*room.split("."), f"{name}.py").relative_to(PACKAGE) for room, name in found} == written
-    assert ("view", "_zbuffer_kernels") in found
+    assert {Path(find_spec(name).origin) for name in kernel_modules()} == compiling
+    assert "foveasim.view._zbuffer_kernels" in set(kernel_modules())
 
 
-def test_kernels_are_loaded_by_one_function():
-    importing = re.compile(r"^\s*(from|import) .*_kernels\b", re.MULTILINE)
-    others = [path for path in PACKAGE.rglob("*.py") if not path.stem.endswith("_kernels")]
+@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_kernels_are_imported_inside_functions(path):
+    if path.stem.endswith("_kernels"):
+        return
+    imported = [
+        name
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for name in (getattr(node, "module", None) or "", *(alias.name for alias in node.names))
+    ]
 
-    assert [str(path) for path in others if importing.search(path.read_text())] == []
+    assert [name for name in imported if name.endswith("_kernels")] == []

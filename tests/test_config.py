@@ -10,10 +10,9 @@ import pytest
 import yaml
 
 import foveasim as fs
-from foveasim.config import read_any_layout, read_layout_file, read_shot, schema, shipped_layouts
+from foveasim._io.images import read_picture, write_picture
+from foveasim.config import demo_settings, read_any_layout, read_layout_file, read_shot, schema, shipped_layouts
 from foveasim.errors import ConfigError, FileError
-from foveasim.pictures import read_picture, write_picture
-from foveasim.shots import demo_settings
 from foveasim.view import plot_layout, save_figure
 
 REPOSITORY = Path(fs.__file__).parents[1]

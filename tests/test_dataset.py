@@ -26,13 +26,13 @@ from scipy.stats import truncnorm
 
 import foveasim as fs
 from foveasim import explore
+from foveasim._io.images import write_picture
 from foveasim.config import build_shot
 from foveasim.errors import ConfigError, CoverageWarning, FileError, FoveasimWarning, ParameterError, SimulationError
-from foveasim.explore import dataset_store
-from foveasim.explore.dataset_labels import boxes_on_sites, flow_on_sites, mask_on_sites
-from foveasim.explore.dataset_pictures import source_of
-from foveasim.explore.dataset_torch import _kind
-from foveasim.pictures import write_picture
+from foveasim.explore.datasets import store
+from foveasim.explore.datasets.labels import boxes_on_sites, flow_on_sites, mask_on_sites
+from foveasim.explore.datasets.pictures import source_of
+from foveasim.explore.datasets.pytorch import _kind
 
 SHOT = {
     "scene": {
@@ -823,13 +823,13 @@ def test_processes_are_started_where_there_is_enough_to_do(tmp_path, monkeypatch
 
     def others(data_set, shards, left, workers):
         started.append((len(left), workers))
-        return dataset_store._written(data_set, shards, left, 1)
+        return store._written(data_set, shards, left, 1)
 
-    monkeypatch.setattr(dataset_store, "_written_by_others", others)
-    monkeypatch.setattr(dataset_store, "thread_count", lambda: 5)
+    monkeypatch.setattr(store, "_written_by_others", others)
+    monkeypatch.setattr(store, "thread_count", lambda: 5)
     data = explore.DataSet(pictures(6), SHOT)
     for name, alone_s, found in (("short", 1e6, []), ("long", 0.0, [(5, 5)])):
-        monkeypatch.setattr(dataset_store, "ALONE_S", alone_s)
+        monkeypatch.setattr(store, "ALONE_S", alone_s)
         stored = explore.write_data_set(data, tmp_path / name, workers=None)
         assert started == found
         assert_same(stored[5], data[5])

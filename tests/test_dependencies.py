@@ -19,13 +19,12 @@ ROOT = PACKAGE.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 #: Extras of each part of the package, beyond what is always installed.
 EXTRAS = {
+    "_io": {"maps", "pictures"},
     "capture": {"maps"},
     "explore": {"explore", "torch"},
     "layout": {"layout"},
     "maps": {"maps"},
     "modes": {"video"},
-    "pictures": {"pictures"},
-    "stores": {"maps"},
     "video": {"video"},
     "view": {"view"},
 }

@@ -22,9 +22,9 @@ import xarray as xr
 from foveasim import explore
 from foveasim.config import build_shot
 from foveasim.errors import ConfigError, FileError, ParameterError, SimulationError
-from foveasim.explore._bench import Bench, Job, Task
 from foveasim.explore._records import Journal, Record, journal_of, values_of
-from foveasim.explore._results import dataset_of, write_store
+from foveasim.explore.sweeps.results import dataset_of, write_store
+from foveasim.explore.worker_cache import Bench, Job, Task
 
 SHOT = {
     "scene": {
@@ -271,9 +271,9 @@ def test_a_worker_that_is_killed_from_outside_costs_no_point(where, tmp_path):
 
 def test_a_worker_keeps_parts_in_a_quarter_of_its_memory(scheduler):
     def kept_bytes(*_):
-        from foveasim.explore import _bench
+        from foveasim.explore import worker_cache
 
-        ((_, bench),) = _bench._current.values()
+        ((_, bench),) = worker_cache._current.values()
         return bench._kept_bytes
 
     found = explore.sweep(SHOT, {"sensor.bits": [8]}, metrics=[kept_bytes], scheduler=scheduler[0])
@@ -307,7 +307,7 @@ def paused(when):
 
 
 def test_what_waits_at_a_paused_worker_is_done_by_another(monkeypatch):
-    monkeypatch.setattr("foveasim.explore._cluster.PAUSED_S", 1.0)
+    monkeypatch.setattr("foveasim.explore.cluster.PAUSED_S", 1.0)
     found = ends(lambda: explore.run_sweep(paused(lambda bits: bits == 4), workers=2))
 
     assert (found["error"] == "").all()
@@ -316,8 +316,8 @@ def test_what_waits_at_a_paused_worker_is_done_by_another(monkeypatch):
 
 
 def test_workers_that_are_all_paused_are_told(monkeypatch):
-    monkeypatch.setattr("foveasim.explore._cluster.PAUSED_S", 1.0)
-    monkeypatch.setattr("foveasim.explore._engine.WORKERS_S", 1.0)
+    monkeypatch.setattr("foveasim.explore.cluster.PAUSED_S", 1.0)
+    monkeypatch.setattr("foveasim.explore.executor.WORKERS_S", 1.0)
     with pytest.raises(
         SimulationError, match=r"have taken no points for 1 s: they are paused.*; \d+ of 12 points are done"
     ):
@@ -939,7 +939,7 @@ def test_a_store_that_cannot_be_written_is_told_before_the_first_point(tmp_path,
 
 @pytest.mark.parametrize("address", ["127.0.0.1", "tcp://", "foo://host:1", "silent"])
 def test_a_scheduler_that_does_not_answer_is_told_and_leaves_nothing(tmp_path, monkeypatch, address):
-    monkeypatch.setattr("foveasim.explore._cluster.SCHEDULER_S", 0.5)
+    monkeypatch.setattr("foveasim.explore.cluster.SCHEDULER_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         if address == "silent":  # a port that is open, and says nothing
             address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
@@ -1081,7 +1081,7 @@ def attempt(address, arguments, function):
 def test_only_owner_runs_code_on_local_workers(certificate, tmp_path):
     from distributed import Security
 
-    from foveasim.explore._cluster import client_of
+    from foveasim.explore.cluster import client_of
 
     mark = tmp_path / "mark"
     with client_of(None, 1) as client:
@@ -1104,7 +1104,7 @@ def test_only_owner_runs_code_on_local_workers(certificate, tmp_path):
 
 
 def test_local_cluster_answers_nothing_over_http():
-    from foveasim.explore._cluster import client_of
+    from foveasim.explore.cluster import client_of
 
     with client_of(None, 1) as client:
         cluster = client.cluster

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import scipy.constants
 
+from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
 from foveasim.sensor import Calibration, Sensor, calibrate, fit_ramp, merge_exposures, non_destructive_reads
-from foveasim.streams import Streams
 
 SIGMAS = 5.0
 N = 20_000

@@ -8,8 +8,8 @@ from contextlib import suppress
 
 import pytest
 
+from foveasim._io.atomic import folder_written_whole, remove_folder
 from foveasim.errors import FileError
-from foveasim.files import folder_written_whole, remove_folder
 
 
 def test_removal_outlasts_late_writers(tmp_path):

@@ -9,8 +9,8 @@ import sys
 
 import pytest
 
+from foveasim._io.atomic import check_room, written_whole
 from foveasim.errors import FileError, disk_problem
-from foveasim.files import check_room, written_whole
 
 #: Every writer of the package, in a process that may write files of 1000 bytes.
 PROGRAM = """
@@ -20,7 +20,7 @@ import numpy as np
 import foveasim as fs
 from foveasim import modes, view
 from foveasim.errors import FileError
-from foveasim.pictures import write_picture
+from foveasim._io.images import write_picture
 from foveasim.video import write_video
 from foveasim.view.web import write_web_page
 

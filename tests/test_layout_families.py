@@ -96,7 +96,7 @@ def test_every_public_generator_is_listed_and_has_an_example():
     public = {
         name
         for name in fs.layout.__all__
-        if getattr(getattr(fs.layout, name), "__module__", "") == f"foveasim.layout.{name}"
+        if getattr(getattr(fs.layout, name), "__module__", "") == f"foveasim.layout.generators.{name}"
         and inspect.signature(getattr(fs.layout, name)).return_annotation == "Layout"
         and "layout" not in inspect.signature(getattr(fs.layout, name)).parameters
     }

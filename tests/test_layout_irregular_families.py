@@ -16,11 +16,11 @@ from foveasim.fields import Grid
 from foveasim.layout import Layout
 from foveasim.layout._regions import disc
 from foveasim.layout._voronoi import MovingCells, cells_of, edges_of_rings
-from foveasim.layout.fovi import fovi
-from foveasim.layout.penrose import penrose
-from foveasim.layout.quadtree import quadtree
-from foveasim.layout.sunflower import sunflower
-from foveasim.layout.voronoi import _capacities, _density, _first_centres, _follow_equal, _slopes, voronoi
+from foveasim.layout.generators.fovi import fovi
+from foveasim.layout.generators.penrose import penrose
+from foveasim.layout.generators.quadtree import quadtree
+from foveasim.layout.generators.sunflower import sunflower
+from foveasim.layout.generators.voronoi import _capacities, _density, _first_centres, _follow_equal, _slopes, voronoi
 
 relaxed = settings(deadline=None, derandomize=True, max_examples=30)
 GOLDEN_RATIO = (1 + math.sqrt(5)) / 2

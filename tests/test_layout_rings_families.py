@@ -14,10 +14,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from foveasim.errors import ParameterError
-from foveasim.layout.foveal_cartesian import foveal_cartesian
-from foveasim.layout.giotto import giotto, giotto_ratio
-from foveasim.layout.grid import grid
-from foveasim.layout.octagonal import octagonal
+from foveasim.layout.generators.foveal_cartesian import foveal_cartesian
+from foveasim.layout.generators.giotto import giotto, giotto_ratio
+from foveasim.layout.generators.grid import grid
+from foveasim.layout.generators.octagonal import octagonal
 
 relaxed = settings(deadline=None, derandomize=True, max_examples=40)
 

@@ -14,7 +14,7 @@ from shapely.affinity import rotate
 
 import foveasim as fs
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.layout.rules import RULES
+from foveasim.layout.drc.rules import RULES
 
 SQUARES = fs.layout.grid(n_x=20, n_y=20, pitch_um=3.0, width_um=2.0)
 

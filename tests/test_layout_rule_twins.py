@@ -14,7 +14,7 @@ from reference.rules import TWINS, layouts
 from shapely.affinity import rotate
 
 import foveasim as fs
-from foveasim.layout.rules import RULES
+from foveasim.layout.drc.rules import RULES
 
 relaxed = settings(deadline=None, derandomize=True, max_examples=60)
 

@@ -17,7 +17,7 @@ from shapely import affinity
 
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout import DesignRules, Layout, grid, hexagonal, log_polar, zones
-from foveasim.layout.rules import min_width_um
+from foveasim.layout.drc.rules import min_width_um
 
 relaxed = settings(deadline=None, derandomize=True, max_examples=40)
 

@@ -11,7 +11,7 @@ from klayout import db, rdb
 
 import foveasim as fs
 from foveasim.errors import FileError
-from foveasim.layout.lyrdb import is_lyrdb, read_lyrdb
+from foveasim.layout.drc.report import is_lyrdb, read_lyrdb
 
 LAYOUT = fs.Layout.from_polygons([shapely.box(0, 0, 4, 4), shapely.box(3, 0, 8, 4), shapely.box(8.2, 0, 8.5, 4)])
 RULES = fs.DesignRules(min_width_um=1.0, max_overlap_um2=0.0, min_space_um=0.5, max_sites=10)

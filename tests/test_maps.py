@@ -19,8 +19,8 @@ import scipy.io
 import tifffile
 
 import foveasim as fs
-from foveasim import apart as reading_apart
 from foveasim import maps
+from foveasim._io import sandbox as reading_apart
 from foveasim.errors import FileError, ParameterError
 from foveasim.maps import _dataset, from_xarray, read_power_map, to_xarray, write_power_map
 from foveasim.maps._apart import READERS, read_apart
@@ -903,7 +903,7 @@ def test_what_is_no_file_of_a_map_is_refused(tmp_path):
 MAX_S, HANGING_S, MAX_BYTES = 20.0, 60.0, 2 * 2**30
 READ = """
 import json, resource, sys
-from foveasim import apart as reading_apart
+from foveasim._io import sandbox as reading_apart
 from foveasim import maps
 from foveasim.errors import FoveasimError
 from foveasim.maps import read_power_map

@@ -10,15 +10,16 @@ import shapely
 
 import foveasim as fs
 from foveasim import distortion, metrics, modes, optics, units, video, view
-from foveasim.arrays import unmasked
+from foveasim._core.random_streams import Streams
+from foveasim._core.validation import unmasked
+from foveasim._io.images import write_picture
 from foveasim.errors import ParameterError
 from foveasim.metrics import flow
 from foveasim.metrics.photon_transfer import PhotonTransfer, SiteClasses, codes_of
-from foveasim.pictures import write_picture
 from foveasim.reconstruct import Picture, charge_readings, code_readings, least_squares, linear, natural
 from foveasim.reconstruct import cells as fill_cells
-from foveasim.sensor import calibration, exposures, noise_budget, spectral_tables
-from foveasim.streams import Streams
+from foveasim.sensor import calibration, exposures, noise_budget
+from foveasim.sensor.spectral import tables
 
 LAYOUT = fs.layout.grid(n_x=6, n_y=5, pitch_um=2.0)
 N = LAYOUT.n_sites
@@ -168,10 +169,10 @@ REJECTED = {
         SITES,
     ),
     "TableCurve": (
-        lambda a: spectral_tables.TableCurve(wavelength_nm=[400.0, 500.0], value=a).value,
+        lambda a: tables.TableCurve(wavelength_nm=[400.0, 500.0], value=a).value,
         np.array([0.1, 0.2]),
     ),
-    "TableCurve call": (spectral_tables.TableCurve(wavelength_nm=[400.0, 700.0], value=[0.1, 0.2]), WAVES),
+    "TableCurve call": (tables.TableCurve(wavelength_nm=[400.0, 700.0], value=[0.1, 0.2]), WAVES),
     "GaussianCurve call": (fs.sensor.GaussianCurve(centre_nm=550.0, fwhm_nm=50.0), WAVES),
     "KernelCrosstalk": (lambda a: fs.sensor.KernelCrosstalk(kernel=a).kernel, np.array([[0.1, 0.8, 0.1]])),
     "crosstalk": (lambda a: fs.sensor.Diffusion(spread_um=0.1).mixing(LAYOUT).apply(a), SITES),

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import foveasim as fs
-from foveasim import arrays
+from foveasim._core import validation
 from foveasim.errors import ParameterError
 from foveasim.scene import charts
 
@@ -56,5 +56,5 @@ def test_memory_is_that_of_the_machine():
         pytest.skip("/proc/meminfo is Linux's")
     (total_kib,) = re.findall(r"MemTotal: +(\d+) kB", meminfo.read_text())
 
-    assert 2**28 <= arrays.memory_bytes() <= 1024 * int(total_kib)
+    assert 2**28 <= validation.memory_bytes() <= 1024 * int(total_kib)
     assert fs.Grid((20_000, 10_000), 1.0).shape == (20_000, 10_000)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import foveasim as fs
+from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError
 from foveasim.explore import METRICS
 from foveasim.metrics import SnrTable, light_at_snr_fraction, measured_snr_by_class, size_classes_um, snr_by_class
 from foveasim.sensor import linearised, signal_to_noise
-from foveasim.streams import Streams
 from foveasim.units import volts_to_electrons
 from foveasim.view import plot_capture
 from foveasim.view.web._content import content_of

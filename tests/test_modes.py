@@ -842,7 +842,7 @@ def test_parts_in_time_are_whole_and_disjoint():
 
 def test_events_that_would_unpack_to_too_much_are_refused(tmp_path, monkeypatch):
     some_events().save(tmp_path / "e.npz")
-    monkeypatch.setattr("foveasim.archives.MAX_UNPACKED_BYTES", 1000)
+    monkeypatch.setattr("foveasim._io.npz.MAX_UNPACKED_BYTES", 1000)
     with pytest.raises(FileError, match="would unpack to more"):
         Events.load(tmp_path / "e.npz")
 

@@ -9,7 +9,7 @@ import warnings
 
 import pytest
 
-from foveasim.parallel import each, in_order
+from foveasim._core.threads import each, in_order
 
 
 @pytest.mark.parametrize("n_threads", [1, 2, 3, 50])

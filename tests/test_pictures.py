@@ -17,9 +17,9 @@ import tifffile
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from foveasim import pictures
+from foveasim._io import images
+from foveasim._io.images import read_picture, write_picture
 from foveasim.errors import FileError
-from foveasim.pictures import read_picture, write_picture
 
 #: A letter without any symmetry, the first row on top, as in a file.
 F = np.array(
@@ -236,7 +236,7 @@ def test_an_exr_is_read_as_it_was_written(tmp_path):
 @pytest.fixture
 def here(monkeypatch):
     """Reads EXR in this program, which takes no second for each file to start another."""
-    monkeypatch.setattr(pictures, "read_apart", lambda reader, path, **_: reader(path))
+    monkeypatch.setattr(images, "read_apart", lambda reader, path, **_: reader(path))
 
 
 def saved_exr(path, picture, compression, *, is_tiled=False):
@@ -581,7 +581,7 @@ def test_a_picture_below_the_limit_is_not_called_too_large(tmp_path):
 
 @pytest.mark.parametrize("planes", ["contig", "separate"])
 def test_the_planes_of_a_tiff_do_not_hide_its_size(tmp_path, monkeypatch, planes):
-    monkeypatch.setattr(pictures, "MAX_PIXELS", 1000)
+    monkeypatch.setattr(images, "MAX_PIXELS", 1000)
     picture = NOISE if planes == "contig" else np.moveaxis(NOISE, -1, 0)
     assert_is_refused(tmp_path, tiff(picture, photometric="rgb", planarconfig=planes), "more than the limit of 1000$")
 
@@ -598,7 +598,7 @@ def test_a_tiff_whose_pages_form_a_ring_is_read_or_refused(tmp_path):
     path = tmp_path / "ring.tif"
     path.write_bytes(content)
     program = (
-        "import sys; from foveasim.errors import FileError; from foveasim.pictures import read_picture\n"
+        "import sys; from foveasim.errors import FileError; from foveasim._io.images import read_picture\n"
         "try: read_picture(sys.argv[1])\n"
         "except FileError: pass\n"
     )

@@ -10,9 +10,9 @@ import scipy.constants
 import scipy.stats
 
 import foveasim as fs
+from foveasim._core.random_streams import Streams
 from foveasim.layout import grid
 from foveasim.sensor import Coupling, Diffusion, Sensor
-from foveasim.streams import Streams
 
 SIGMAS = 5.0
 N_DRAWS = 2000

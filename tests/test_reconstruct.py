@@ -7,8 +7,8 @@ import pytest
 import shapely
 
 import foveasim as fs
+from foveasim._io.images import read_picture
 from foveasim.errors import ParameterError
-from foveasim.pictures import read_picture
 from foveasim.reconstruct import cells, fill_channels, raster_grid
 
 FOVEAL = fs.layout.log_polar(n_sectors=40, min_size_um=2.0, r_max_um=80.0, stagger=True)

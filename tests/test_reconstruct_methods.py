@@ -13,10 +13,10 @@ from skimage.color import rgb2gray
 from skimage.transform import resize
 
 import foveasim as fs
+from foveasim._io.images import read_picture
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.integrate import Integrator
 from foveasim.metrics import psnr_db
-from foveasim.pictures import read_picture
 from foveasim.reconstruct import (
     Picture,
     blur_kernel,
@@ -532,7 +532,7 @@ def test_codes_tell_the_light_that_made_them(parameters):
         layout, bits=12, capacitance_f=1e-15, v_sat_v=2.0, read_noise_e=5.0, dark_e_per_s=1e4, **parameters
     )
     light_e = np.linspace(200.0, 6000.0, layout.n_sites)
-    streams = fs.streams.Streams(1, 0)
+    streams = fs._core.random_streams.Streams(1, 0)
     code = sensor.read(sensor.collect(light_e + 100.0, streams=streams), streams=streams)
     readings = code_readings(code, sensor, 0.01)
     z = (readings.light_e - light_e) / np.sqrt(readings.variance_e2)

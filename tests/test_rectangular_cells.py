@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from reference.polygons import ZOO
 
 import foveasim as fs
+from foveasim._core.provenance import described
 from foveasim.config import read_shot, schema
 from foveasim.distortion import BrownConrady
 from foveasim.errors import FileError, ParameterError
 from foveasim.maps import from_xarray, read_power_map, to_xarray, write_power_map
 from foveasim.metrics import flow_bound, site_gradients_e_per_um
 from foveasim.reconstruct import blur_kernel, cells, least_squares, linear, reference
-from foveasim.records import described
 
 SHAPE = (24, 17)
 PITCH = (0.9, 0.35)

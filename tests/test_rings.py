@@ -11,7 +11,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from foveasim.rings import are_convex, next_vertex, positions_in_runs, ring_moments, site_bounds_um, site_moments
+from foveasim._core.rings import are_convex, next_vertex, positions_in_runs, ring_moments, site_bounds_um, site_moments
 
 relaxed = settings(deadline=None, derandomize=True, max_examples=60)
 

@@ -12,7 +12,7 @@ import tifffile
 from PIL import Image
 
 import foveasim as fs
-from foveasim.encodings import decoded
+from foveasim._io.encodings import decoded
 from foveasim.errors import FileError, ParameterError
 from foveasim.scene import Scene
 

@@ -10,10 +10,10 @@ import scipy.constants
 import scipy.stats
 
 import foveasim as fs
+from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
 from foveasim.sensor import ConstantCurve, FilterSet, Sensor, SiliconQE, draw_shot_noise
-from foveasim.streams import Streams
 
 #: Enough sites for statistics to 0.3 %.
 N = 200_000

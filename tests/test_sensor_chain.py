@@ -14,11 +14,11 @@ import scipy.stats
 import shapely
 
 import foveasim as fs
+from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
-from foveasim.sensor import Sensor
+from foveasim.sensor import Sensor, _kernels
 from foveasim.sensor.device import Device
-from foveasim.streams import Streams
 
 N_X, N_Y = 500, 400
 N = N_X * N_Y
@@ -55,9 +55,7 @@ def test_numbers_of_a_device_are_those_of_the_published_generator():
     """numpy's Philox 4x64, whose counter goes up before the first word."""
     device = Device(seed=7, layout=MANY)
     key = device.key("prnu")
-    ours = fs.compiled.kernels("sensor").device_uniforms(
-        *key, np.array([5, 2**63], np.uint64), np.array([1, 0], np.uint64)
-    )
+    ours = _kernels.device_uniforms(*key, np.array([5, 2**63], np.uint64), np.array([1, 0], np.uint64))
 
     for number, (first, second) in zip(ours, ((5, 1), (2**63, 0)), strict=True):
         word = np.random.Philox(key=[int(k) for k in key], counter=[first - 1, second, 0, 0]).random_raw()
@@ -74,7 +72,7 @@ def test_numbers_of_a_device_are_those_of_the_published_generator():
 )
 def test_the_small_generator_gives_its_authors_known_answers(key, counter, words):
     """The known-answer tests that Salmon et al. publish with Random123."""
-    got = fs.compiled.kernels("sensor")._philox_2x32(np.uint64(key), *(np.uint64(c) for c in counter))
+    got = _kernels._philox_2x32(np.uint64(key), *(np.uint64(c) for c in counter))
 
     assert tuple(int(word) for word in got) == words
 
@@ -549,7 +547,7 @@ def test_another_process_and_another_order_of_frames_draw_the_same_codes():
 import hashlib, sys
 import numpy as np
 import foveasim as fs
-from foveasim.streams import Streams
+from foveasim._core.random_streams import Streams
 layout = fs.layout.grid(n_x=400, n_y=300, pitch_um=2.0)
 sensor = fs.Sensor(layout, prnu_fraction=0.02, read_noise_e=3.0, ktc_noise=True, dnl_dn=0.5, rts_fraction=0.1, rts_e=9.0, bits=12)
 light = np.linspace(0.0, 500.0, layout.n_sites)

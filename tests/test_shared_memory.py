@@ -10,11 +10,12 @@ import pytest
 
 import foveasim as fs
 from foveasim import distortion, modes, optics, video, view
-from foveasim.arrays import handed_over, own, read_only
+from foveasim._core.validation import handed_over, own, read_only
 from foveasim.maps import from_xarray, read_power_map, to_xarray, write_power_map
 from foveasim.metrics.photon_transfer import PhotonTransfer
 from foveasim.reconstruct import Picture
-from foveasim.sensor import Calibration, FilterSet, KernelCrosstalk, exposures, spectral_tables
+from foveasim.sensor import Calibration, FilterSet, KernelCrosstalk, exposures
+from foveasim.sensor.spectral import tables
 
 LAYOUT = fs.layout.grid(n_x=3, n_y=2, pitch_um=2.0)
 SENSOR = fs.Sensor(LAYOUT, bits=10)
@@ -114,7 +115,7 @@ CARRIERS = {
     ),
     "KernelCrosstalk": (lambda kernel: KernelCrosstalk(kernel=kernel), {"kernel": np.array([[0.1, 0.8, 0.1]])}),
     "TableCurve": (
-        spectral_tables.TableCurve,
+        tables.TableCurve,
         {"wavelength_nm": np.array([400.0, 700.0]), "value": np.array([0.1, 0.2])},
     ),
     "PolynomialFisheye": (

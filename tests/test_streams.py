@@ -11,8 +11,8 @@ import sys
 import numpy as np
 import pytest
 
+from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError
-from foveasim.streams import Streams
 
 N_DRAWS = 100_000
 KEYS = [(seed, frame, effect) for seed in (0, 1, 2**40) for frame in (0, 1, 2) for effect in ("shot", "read")]
@@ -54,7 +54,7 @@ def test_a_stream_begins_anew_whatever_was_drawn_before():
 
 
 def test_another_process_draws_the_same_numbers():
-    program = "from foveasim.streams import Streams; print(Streams(5, 2).of('shot').integers(2**63))"
+    program = "from foveasim._core.random_streams import Streams; print(Streams(5, 2).of('shot').integers(2**63))"
     here = int(Streams(5, 2).of("shot").integers(2**63))
     for hash_seed in ("1", "2"):
         environment = {**os.environ, "PYTHONHASHSEED": hash_seed}

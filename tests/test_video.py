@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 import foveasim as fs
+from foveasim._core.random_streams import Streams
+from foveasim._io.images import write_picture
 from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.modes import Exposure, Shutter
-from foveasim.pictures import write_picture
 from foveasim.sensor import merge_exposures
-from foveasim.streams import Streams
 from foveasim.video import (
     Footage,
     GazePath,
@@ -31,7 +31,7 @@ from foveasim.video import (
     saccades,
     write_video,
 )
-from foveasim.video.footage import pictures_in
+from foveasim.video.frame_source import pictures_in
 
 PITCH_UM, DISTANCE_M = 10.0, 0.5
 LIGHT = {
@@ -759,7 +759,7 @@ def test_a_recording_may_be_written_anew_and_nothing_else_is_written_over(tmp_pa
 
 
 def test_pictures_are_those_of_the_captures(tmp_path):
-    from foveasim.pictures import read_picture
+    from foveasim._io.images import read_picture
 
     captures = list(captures_of(2))
     assert write_video(captures, tmp_path / "pictures", max_pixels=60) == 2

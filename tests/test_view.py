@@ -11,8 +11,8 @@ import shapely
 from matplotlib.figure import Figure
 
 import foveasim as fs
+from foveasim._io.images import read_picture
 from foveasim.errors import FileError, ParameterError
-from foveasim.pictures import read_picture
 from foveasim.view import (
     colours_of,
     plot_layout,
@@ -23,8 +23,8 @@ from foveasim.view import (
     site_colours,
 )
 from foveasim.view._artists import SiteImage, length_text, nice_length_um
-from foveasim.view.palette import BACKGROUND, CATEGORY_COLOURS, FILTER_COLOURS, NO_DATA
 from foveasim.view.plots import MOST_OUTLINES
+from foveasim.view.site_colours import BACKGROUND, CATEGORY_COLOURS, FILTER_COLOURS, NO_DATA
 
 FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
 LAYOUT = fs.Layout.from_polygons([FRAME, shapely.box(10, 0, 12, 8)])

@@ -12,9 +12,9 @@ import pytest
 import shapely
 
 import foveasim as fs
+from foveasim._io.images import read_picture
 from foveasim.errors import FileError, FoveasimWarning, GeometryError, ParameterError, SimulationError
-from foveasim.pictures import read_picture
-from foveasim.view import Mesh, Viewpoint, prisms, probe, render, show, sites_in_view, stills
+from foveasim.view import Mesh, Viewpoint, prisms, render, render3d, renderer, show, sites_in_view
 from foveasim.view.meshes import triangulated
 
 FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
@@ -239,7 +239,7 @@ def test_a_square_twice_as_near_is_seen_twice_as_large():
         colours=np.zeros((8, 3), np.uint8),
     )
     viewpoint = Viewpoint(azimuth_deg=-90.0, elevation_deg=90.0, focus_um=(0.0, 0.0, 0.0), view_deg=60.0)
-    above_um = stills._eye([squares], viewpoint, (1600, 1000)).position_um[2]
+    above_um = render3d._eye([squares], viewpoint, (1600, 1000)).position_um[2]
     n_seen = np.bincount(sites_in_view(squares, viewpoint=viewpoint).ravel() + 1)[1:]
 
     assert np.sqrt(n_seen[1] / n_seen[0]) == pytest.approx(above_um / (above_um - 40.0), rel=0.02)
@@ -249,21 +249,21 @@ def test_a_square_twice_as_near_is_seen_twice_as_large():
 def test_roofs_have_their_colour_and_walls_are_darker():
     layout = fs.Layout.from_rectangles([[0.0, 0.0]], 10.0)
     mesh = prisms(layout, [1.0], tallest_um=10.0, by=np.array([[200, 100, 40]], np.uint8))
-    light = np.array(stills.LIGHT) / np.linalg.norm(stills.LIGHT)
+    light = np.array(render3d.LIGHT) / np.linalg.norm(render3d.LIGHT)
     picture = software(mesh, viewpoint=Viewpoint(azimuth_deg=-90.0, elevation_deg=40.0))
-    roof = np.array([200, 100, 40]) * (stills.AMBIENT + stills.DIFFUSE * light[2])
-    front = np.array([200, 100, 40]) * (stills.AMBIENT + stills.DIFFUSE * light[1])
+    roof = np.array([200, 100, 40]) * (render3d.AMBIENT + render3d.DIFFUSE * light[2])
+    front = np.array([200, 100, 40]) * (render3d.AMBIENT + render3d.DIFFUSE * light[1])
 
     assert set(map(tuple, picture.reshape(-1, 3).tolist())) == {
-        stills.GROUND, tuple(np.rint(roof).astype(int)), tuple(np.rint(front).astype(int))
+        render3d.GROUND, tuple(np.rint(roof).astype(int)), tuple(np.rint(front).astype(int))
     }  # fmt: skip
 
 
 def test_no_colour_is_clipped():
     picture = software(prisms(ODD_LAYOUT, np.ones(5), by=np.full((5, 3), 255, np.uint8)))
-    seen = picture[np.any(picture != stills.GROUND, axis=-1)]
+    seen = picture[np.any(picture != render3d.GROUND, axis=-1)]
 
-    assert pytest.approx(1.0) == stills.AMBIENT + stills.DIFFUSE
+    assert pytest.approx(1.0) == render3d.AMBIENT + render3d.DIFFUSE
     assert seen.max() < 255
     assert len(np.unique(seen[:, 0])) >= 3
 
@@ -280,7 +280,7 @@ def test_oversampling_is_the_mean_of_finer_pixels():
 def test_the_picture_does_not_depend_on_the_number_of_threads(n_threads, monkeypatch):
     columns = prisms(ODD_LAYOUT, np.arange(5.0))
     expected = software(columns)
-    monkeypatch.setattr(stills, "thread_count", lambda: n_threads)
+    monkeypatch.setattr(render3d, "thread_count", lambda: n_threads)
 
     assert np.array_equal(software(columns), expected)
 
@@ -299,15 +299,15 @@ def test_a_zoom_of_two_enlarges_twice():
 )
 def test_the_whole_scene_is_in_the_picture_and_fills_it(viewpoint):
     columns, size_px = prisms(ODD_LAYOUT, np.arange(5.0)), np.array([400, 300])
-    place = stills._eye([columns], viewpoint, (400, 300)).on_screen(columns.points_um, (400, 300))
+    place = render3d._eye([columns], viewpoint, (400, 300)).on_screen(columns.points_um, (400, 300))
     margins = np.array([place[:, :2].min(axis=0), size_px - place[:, :2].max(axis=0)]) / size_px
 
     assert np.all(place[:, 2] > 0.0)
-    assert margins.min(axis=0).min() == pytest.approx(0.5 * (1.0 - stills.FILLED_SHARE), abs=0.002)
+    assert margins.min(axis=0).min() == pytest.approx(0.5 * (1.0 - render3d.FILLED_SHARE), abs=0.002)
     assert margins[0] == pytest.approx(margins[1], abs=0.002)
     picture = software(columns, viewpoint=viewpoint)
-    assert np.all(picture[[0, -1]] == stills.GROUND)
-    assert np.all(picture[:, [0, -1]] == stills.GROUND)
+    assert np.all(picture[[0, -1]] == render3d.GROUND)
+    assert np.all(picture[:, [0, -1]] == render3d.GROUND)
 
 
 @pytest.mark.parametrize(
@@ -369,7 +369,7 @@ def test_both_renderers_make_the_same_picture(viewpoint):
         render(columns, viewpoint=viewpoint, size_px=(400, 260), oversampling=2, renderer=name).astype(int)
         for name in ("software", "pyvista")
     )
-    is_ground = [np.all(picture == stills.GROUND, axis=-1) for picture in (ours, theirs)]
+    is_ground = [np.all(picture == render3d.GROUND, axis=-1) for picture in (ours, theirs)]
 
     # Borders may fall to either side of a pixel's centre: less than one in a hundred does.
     assert np.mean(is_ground[0] != is_ground[1]) < 0.005
@@ -384,8 +384,8 @@ def test_pyvista_sees_the_sites_that_the_identities_name():
     columns = prisms(layout, np.random.default_rng(4).random(n), by=colours, tallest_um=0.5)
     site = sites_in_view(columns, viewpoint=STRAIGHT_DOWN, size_px=(500, 400))
     picture = render(columns, viewpoint=STRAIGHT_DOWN, size_px=(500, 400), oversampling=1, renderer="pyvista")
-    light = np.array(stills.LIGHT) / np.linalg.norm(stills.LIGHT)
-    roof = np.rint(colours * (stills.AMBIENT + stills.DIFFUSE * light[2]))
+    light = np.array(render3d.LIGHT) / np.linalg.norm(render3d.LIGHT)
+    roof = np.rint(colours * (render3d.AMBIENT + render3d.DIFFUSE * light[2]))
     is_roof = (site >= 0) & np.all(np.abs(picture - roof[site]) <= 2, axis=-1)
 
     assert np.count_nonzero(is_roof) > 0.93 * np.count_nonzero(site >= 0)
@@ -400,10 +400,10 @@ def test_the_shade_of_corners_darkens_them_and_leaves_no_line_at_the_border():
         for shade in (False, True)
     )
 
-    is_ground = np.all(plain == stills.GROUND, axis=-1)
+    is_ground = np.all(plain == render3d.GROUND, axis=-1)
     assert shaded[~is_ground].mean() < plain[~is_ground].mean() - 1
-    assert np.all(shaded[[0, -1]] == stills.GROUND)
-    assert np.all(shaded[:, [0, -1]] == stills.GROUND)
+    assert np.all(shaded[[0, -1]] == render3d.GROUND)
+    assert np.all(shaded[:, [0, -1]] == render3d.GROUND)
 
 
 @pytest.mark.needs("renderer")
@@ -424,7 +424,7 @@ def test_the_shade_of_corners_leaves_a_plain_as_it_is():
 
 @pytest.mark.needs("renderer")
 def test_a_machine_without_a_screen_opens_no_window(monkeypatch):
-    monkeypatch.setattr(stills, "find_renderer", lambda: probe.EGL)
+    monkeypatch.setattr(render3d, "find_renderer", lambda: renderer.EGL)
 
     with pytest.raises(SimulationError, match="no screen to open a window on; write a picture with"):
         show(prisms(ODD_LAYOUT))
@@ -434,7 +434,7 @@ def test_a_machine_without_a_screen_opens_no_window(monkeypatch):
 
 
 def test_without_a_renderer_the_picture_is_made_and_the_cure_is_named(monkeypatch):
-    monkeypatch.setattr(stills, "what_to_install", lambda: "this machine has no OpenGL; install it")
+    monkeypatch.setattr(render3d, "what_to_install", lambda: "this machine has no OpenGL; install it")
     columns = prisms(ODD_LAYOUT)
 
     with pytest.warns(FoveasimWarning, match="no OpenGL; install it; the picture is made without"):
@@ -451,8 +451,8 @@ MACHINES = {
     "no EGL driver": {"__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
     "EGL without OpenGL's drivers": {"LIBGL_DRIVERS_PATH": "/nonexistent", "GBM_BACKENDS_PATH": "/nonexistent"},
     "a screen that is none": {"DISPLAY": ":77", "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
-    "a window class that is none": {probe.VTK_CHOICE: "vtkNoRenderWindow", "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
-    "a window class without its library": {probe.VTK_CHOICE: probe.OSMESA, "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
+    "a window class that is none": {renderer.VTK_CHOICE: "vtkNoRenderWindow", "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
+    "a window class without its library": {renderer.VTK_CHOICE: renderer.OSMESA, "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
 }  # fmt: skip
 STILL = """
 import warnings
@@ -468,15 +468,15 @@ print(fs.view.find_renderer(), len(np.unique(picture)) > 2, *[w.message for w in
 
 @pytest.mark.parametrize("machine", MACHINES)
 def test_no_machine_ends_the_interpreter(machine):
-    bare = {k: v for k, v in os.environ.items() if k not in {"DISPLAY", probe.VTK_CHOICE}}
+    bare = {k: v for k, v in os.environ.items() if k not in {"DISPLAY", renderer.VTK_CHOICE}}
     run = subprocess.run(
         [sys.executable, "-c", STILL], env={**bare, **MACHINES[machine]}, capture_output=True, text=True, check=False
     )
-    renderer, is_drawn, *told = run.stdout.strip().split("|")
+    found, is_drawn, *told = run.stdout.strip().split("|")
 
     assert (run.returncode, is_drawn) == (0, "True")
     # Where a library of another kind is here, it is found; otherwise one sentence says what to install.
-    assert [bool(renderer == "None")] == [len(told) == 1]
+    assert [bool(found == "None")] == [len(told) == 1]
     assert all("apt install libegl1 libgl1" in sentence for sentence in told)
 
 
@@ -487,39 +487,39 @@ def test_a_trial_that_fails_counts_as_no_renderer(outcome, monkeypatch):
         "raises": "1 / 0",
         "hangs": "import time; time.sleep(60)",
     }
-    monkeypatch.setattr(probe, "TRIAL", trials[outcome])
-    monkeypatch.setattr(probe, "TRIAL_S", 0.5 if outcome == "hangs" else 60.0)
-    monkeypatch.setattr(probe, "_candidates", lambda: iter([probe.EGL, probe.OSMESA]))
+    monkeypatch.setattr(renderer, "TRIAL", trials[outcome])
+    monkeypatch.setattr(renderer, "TRIAL_S", 0.5 if outcome == "hangs" else 60.0)
+    monkeypatch.setattr(renderer, "_candidates", lambda: iter([renderer.EGL, renderer.OSMESA]))
 
-    assert probe.find_renderer.__wrapped__() is None
+    assert renderer.find_renderer.__wrapped__() is None
 
 
 def test_the_first_window_that_survives_is_taken(monkeypatch):
-    monkeypatch.setattr(probe, "_candidates", lambda: iter([probe.X11, probe.EGL, probe.OSMESA]))
-    monkeypatch.setattr(probe, "_survives", lambda window: window == probe.EGL)
+    monkeypatch.setattr(renderer, "_candidates", lambda: iter([renderer.X11, renderer.EGL, renderer.OSMESA]))
+    monkeypatch.setattr(renderer, "_survives", lambda window: window == renderer.EGL)
 
-    assert probe.find_renderer.__wrapped__() == probe.EGL
+    assert renderer.find_renderer.__wrapped__() == renderer.EGL
 
 
 def test_libraries_that_are_missing_are_no_candidates(monkeypatch):
-    for variable in ("DISPLAY", probe.VTK_CHOICE):
+    for variable in ("DISPLAY", renderer.VTK_CHOICE):
         monkeypatch.delenv(variable, raising=False)
-    monkeypatch.setattr(probe, "_library", lambda _: None)
+    monkeypatch.setattr(renderer, "_library", lambda _: None)
     monkeypatch.setattr(sys, "platform", "linux")
-    assert list(probe._candidates()) == []
+    assert list(renderer._candidates()) == []
 
     monkeypatch.setenv("DISPLAY", ":0")
-    assert list(probe._candidates()) == []
+    assert list(renderer._candidates()) == []
 
-    monkeypatch.setattr(probe, "_library", lambda name: object() if name == "libOSMesa.so.8" else None)
-    assert list(probe._candidates()) == [probe.OSMESA]
+    monkeypatch.setattr(renderer, "_library", lambda name: object() if name == "libOSMesa.so.8" else None)
+    assert list(renderer._candidates()) == [renderer.OSMESA]
 
 
 def test_without_pyvista_the_command_is_named(monkeypatch):
-    monkeypatch.setattr(probe, "find_spec", lambda _: None)
+    monkeypatch.setattr(renderer, "find_spec", lambda _: None)
 
-    assert probe.what_to_install() == "PyVista is not installed; install it with: pip install 'foveasim[view]'"
-    assert probe.find_renderer.__wrapped__() is None
+    assert renderer.what_to_install() == "PyVista is not installed; install it with: pip install 'foveasim[view]'"
+    assert renderer.find_renderer.__wrapped__() is None
 
 
 def test_a_mesh_shows_itself():

@@ -21,12 +21,12 @@ from matplotlib import colormaps
 from reference.ray_casting import first_hits, rays_of
 
 import foveasim as fs
+from foveasim._core.provenance import described
+from foveasim._io.images import read_picture
 from foveasim.errors import FileError, GeometryError, ParameterError
-from foveasim.layout.lyrdb import read_lyrdb
-from foveasim.pictures import read_picture
-from foveasim.records import described
+from foveasim.layout.drc.report import read_lyrdb
 from foveasim.view import SensorStack, prisms, site_at, solid_page, solids, web_page, write_solid_page, write_web_page
-from foveasim.view.palette import FILTER_COLOURS
+from foveasim.view.site_colours import FILTER_COLOURS
 from foveasim.view.web._bodies import bodies_of
 from foveasim.view.web._content import content_of
 from foveasim.view.web._pack import back_references, packed, smallest

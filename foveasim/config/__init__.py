@@ -1,7 +1,8 @@
 """
-Settings files: YAML to the package's objects, and the JSON schema of what may stand in them.
+Settings files: YAML to objects of the package and whole shots, and the JSON schema of the settings.
 
 A file names a call of the package and its parameters: the file and the Python call have the same names, defaults and limits.
+A shot runs from its settings file to the files that a user inspects.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from foveasim.config._objects import (
     picture_path,
     put_setting,
     read_any_layout,
+    read_layout,
     read_layout_file,
     read_rules,
     read_settings,
@@ -24,24 +26,37 @@ from foveasim.config._objects import (
     schema,
 )
 from foveasim.config._problems import validated
+from foveasim.config._shots import Result, check_folder, demo_settings, results_table, run_shot, write_results
+from foveasim.config._video import run_video
+from foveasim.config._viewing import Viewable, read_viewable
 from foveasim.layout import shipped_layouts
 
 __all__ = [
     "GENERATORS",
     "YAML_ENDINGS",
     "LayoutFile",
+    "Result",
     "Shot",
+    "Viewable",
     "build_shot",
+    "check_folder",
     "check_settings",
+    "demo_settings",
     "files_from",
     "picture_path",
     "put_setting",
     "read_any_layout",
+    "read_layout",
     "read_layout_file",
     "read_rules",
     "read_settings",
     "read_shot",
+    "read_viewable",
+    "results_table",
+    "run_shot",
+    "run_video",
     "schema",
     "shipped_layouts",
     "validated",
+    "write_results",
 ]

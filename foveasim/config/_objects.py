@@ -11,20 +11,21 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, TypeAdapter
 
-from foveasim.arrays import check_number
+from foveasim._core.random_streams import Streams
+from foveasim._core.validation import check_number
+from foveasim._io.images import read_picture
+from foveasim._io.yaml_files import parsed, read_yaml
 from foveasim.camera import Camera
 from foveasim.config._models import PICTURES, LayoutUnion, PerArea, RulesSection, ShotSection, call_of
 from foveasim.config._problems import validated
-from foveasim.documents import parsed, read_yaml
 from foveasim.errors import ConfigError, FoveasimError, ParameterError
 from foveasim.fields import Grid, PowerMap
-from foveasim.layout import PRESETS, DesignRules, Layout, inset, mosaic, read_layout, shipped_layouts, snap
+from foveasim.layout import PRESETS, DesignRules, Layout, inset, mosaic, shipped_layouts, snap
 from foveasim.layout.files import check_chip_options, layout_path
+from foveasim.layout.files import read_layout as read_sites
 from foveasim.optics import Optics
-from foveasim.pictures import read_picture
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor
-from foveasim.streams import Streams
 
 __all__ = [
     "YAML_ENDINGS",
@@ -36,6 +37,7 @@ __all__ = [
     "picture_path",
     "put_setting",
     "read_any_layout",
+    "read_layout",
     "read_layout_file",
     "read_rules",
     "read_settings",
@@ -255,6 +257,43 @@ def read_layout_file(path: str | Path) -> LayoutFile:
     return _built_layout(path, "", validated(path, LayoutUnion, read_yaml(path)))
 
 
+def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None = None) -> Layout:
+    """
+    Read a layout from a file of any format, or by the name of a layout that comes with the package.
+
+    Parameters
+    ----------
+    path : path or str
+        A GDSII, OASIS, GeoJSON, GeoParquet or npz file, recognised by its content; a YAML file of a generator and its
+        parameters; or a name, such as ``"giotto_2"``. A file of that name in the working directory comes first, as on
+        the command line.
+    layer : int, optional
+        Of GDSII and OASIS: the layer that contains the photosites; needed where shapes lie on several.
+    cell : str, optional
+        Of GDSII and OASIS: the cell to read, with all cells below it; needed where there are several top cells.
+
+    Returns
+    -------
+    Layout
+        Without the design rules and the source that a YAML file may state: :func:`foveasim.config.read_any_layout`
+        returns these too.
+
+    Raises
+    ------
+    FileError
+        When there is neither such a file nor such a name, or the file is corrupt, truncated, too large, or not a layout.
+    ParameterError
+        When an option does not belong to the file's format.
+
+    Examples
+    --------
+    >>> import foveasim as fs
+    >>> fs.read_layout("prima_100").n_sites
+    378
+    """
+    return read_any_layout(path, layer=layer, cell=cell).layout
+
+
 def read_any_layout(
     path: str | Path, *, folder: str | Path = ".", layer: int | None = None, cell: str | None = None
 ) -> LayoutFile:
@@ -281,7 +320,7 @@ def read_any_layout(
     if path.suffix.lower() in YAML_ENDINGS:
         check_chip_options(layer=layer, cell=cell)
         return read_layout_file(path)
-    return LayoutFile(layout=read_layout(path, layer=layer, cell=cell), rules=None, source=str(path))
+    return LayoutFile(layout=read_sites(path, layer=layer, cell=cell), rules=None, source=str(path))
 
 
 def read_rules(path: str | Path) -> DesignRules:

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from foveasim.arrays import Bools, Floats, check_number
-from foveasim.compiled import kernels
+from foveasim._core.threads import each, thread_count
+from foveasim._core.validation import Bools, Floats, check_number
 from foveasim.distortion._lens import Placed
 from foveasim.distortion._solve import smallest_roots
-from foveasim.parallel import each, thread_count
 
 __all__ = ["BrownConrady"]
 
@@ -179,9 +178,11 @@ class BrownConrady(Placed):
         return np.where(self._is_inside(xy)[:, np.newaxis], self._map(xy), np.nan)
 
     def _backward(self, xy: Floats) -> Floats:
+        from foveasim.distortion import _kernels
+
         points = np.ascontiguousarray(xy)
         k = np.array([self.k1, self.k2, self.k3, self.k4, self.k5, self.k6])
-        inverse = kernels("distortion").brown_conrady_inverse
+        inverse = _kernels.brown_conrady_inverse
         pieces = [points[i : i + POINTS_A_PIECE] for i in range(0, max(len(points), 1), POINTS_A_PIECE)]
         found = each(lambda p: inverse(p, k, self.p1, self.p2, self._fold, *self._ideal), pieces, thread_count())
         return np.concatenate(found) if len(found) > 1 else np.asarray(found[0])

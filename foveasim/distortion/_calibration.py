@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, check_count, check_number, finite_array
+from foveasim._core.validation import Floats, check_count, check_number, finite_array
 from foveasim.distortion._brown_conrady import BrownConrady
 from foveasim.distortion._fisheye import Fisheye, PolynomialFisheye, Scaramuzza
 from foveasim.errors import ConfigError, ParameterError
@@ -143,7 +143,7 @@ def read_calibration(
     ConfigError
         When the file is none of these, or lacks what a lens needs.
     """
-    from foveasim.documents import parsed, read_text
+    from foveasim._io.yaml_files import parsed, read_text
 
     path = Path(path)
     text = read_text(path)

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from foveasim.arrays import Floats, check_choice, check_number, finite_array
+from foveasim._core.validation import Floats, check_choice, check_number, finite_array
 from foveasim.distortion._lens import Placed
 from foveasim.distortion._solve import growing_inverse, smallest_roots
 from foveasim.errors import ParameterError

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
+from numba import types
+
+from foveasim._core.jit import njit
 
 __all__ = ["brown_conrady_inverse"]
 
@@ -26,7 +28,7 @@ LAST_STEP = 1e-9
 FOLD_MARGIN = 1e-3
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _map(x, y, k1, k2, k3, k4, k5, k6, p1, p2):
     """Distorted position of a point, and the Jacobian: x_d, y_d, dx/dx, dx/dy, dy/dy."""
     r2 = x * x + y * y
@@ -41,7 +43,7 @@ def _map(x, y, k1, k2, k3, k4, k5, k6, p1, p2):
     return x_d, y_d, xx, xy, yy
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _is_inside(x, y, determinant, fold, min_fold):
     """Whether an ideal point lies within the fold, whose radius is given in equal directions."""
     if not determinant > 0.0:
@@ -57,8 +59,6 @@ def _is_inside(x, y, determinant, fold, min_fold):
 
 @njit(
     types.float64[:, ::1](_points, _numbers, types.float64, types.float64, _numbers, _numbers, types.float64),
-    cache=True,
-    nogil=True,
 )
 def brown_conrady_inverse(xy, k, p1, p2, fold, ideal, per_step):
     """

@@ -7,9 +7,9 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, check_choice, check_length_um, finite_array
+from foveasim._core.rings import from_frame, to_frame
+from foveasim._core.validation import Floats, check_choice, check_length_um, finite_array
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.rings import from_frame, to_frame
 
 __all__ = ["Outside", "Placed"]
 

@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, Images, check_choice, check_count, read_only
+from foveasim._core.validation import Floats, Images, check_choice, check_count, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PointMap, PowerMap
 

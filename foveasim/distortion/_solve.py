@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from foveasim.arrays import Floats
+from foveasim._core.validation import Floats
 
 __all__ = ["growing_inverse", "smallest_roots"]
 

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from foveasim.explore._metrics import METRICS, Metric, metric_of
-from foveasim.explore._plan import Plan, plan_sweep, read_sweep
-from foveasim.explore._results import open_results
 from foveasim.explore._schemas import schema_of
-from foveasim.explore._study import best_table, finished_trials, run_study, storage_name, study
-from foveasim.explore._study_plan import StudyPlan, plan_study, read_study
-from foveasim.explore._sweep import run_sweep, sweep
-from foveasim.explore.dataset import DataSet
-from foveasim.explore.dataset_draws import draw_of
-from foveasim.explore.dataset_file import DataSetFile, read_data_set
-from foveasim.explore.dataset_recipes import classification, denoising
-from foveasim.explore.dataset_store import StoredSamples, open_data_set, write_data_set
-from foveasim.explore.dataset_torch import torch_data_set
+from foveasim.explore.datasets.dataset import DataSet
+from foveasim.explore.datasets.distributions import draw_of
+from foveasim.explore.datasets.plan import DataSetFile, read_data_set
+from foveasim.explore.datasets.pytorch import torch_data_set
+from foveasim.explore.datasets.recipes import classification, denoising
+from foveasim.explore.datasets.store import StoredSamples, open_data_set, write_data_set
+from foveasim.explore.studies.plan import StudyPlan, plan_study, read_study
+from foveasim.explore.studies.study import best_table, finished_trials, run_study, storage_name, study
+from foveasim.explore.sweeps.plan import Plan, plan_sweep, read_sweep
+from foveasim.explore.sweeps.results import open_results
+from foveasim.explore.sweeps.sweep import run_sweep, sweep
 
 __all__ = [
     "METRICS",

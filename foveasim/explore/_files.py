@@ -6,8 +6,8 @@ import hashlib
 from collections.abc import Iterable
 from pathlib import Path
 
+from foveasim._io.yaml_files import read_yaml
 from foveasim.config import YAML_ENDINGS, files_from
-from foveasim.documents import read_yaml
 from foveasim.errors import ConfigError
 
 __all__ = ["digests"]

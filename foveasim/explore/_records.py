@@ -17,9 +17,9 @@ from typing import IO, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.provenance import differences
+from foveasim._io.atomic import lock
 from foveasim.errors import FileError, ParameterError
-from foveasim.files import lock
-from foveasim.records import differences
 
 __all__ = ["Journal", "Record", "Value", "check_new", "check_same_plan", "journal_of", "values_of"]
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from foveasim.arrays import check_choice
+from foveasim._core.validation import check_choice
 from foveasim.config import schema
-from foveasim.explore._plan import SweepSection
-from foveasim.explore._study_plan import StudySection
-from foveasim.explore.dataset_file import DataSetSection
+from foveasim.explore.datasets.plan import DataSetSection
+from foveasim.explore.studies.plan import StudySection
+from foveasim.explore.sweeps.plan import SweepSection
 
 __all__ = ["schema_of"]
 

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, Ints, check_choice, check_count, finite_array, read_only, unmasked
+from foveasim._core.rings import site_area_um2
+from foveasim._core.threads import thread_count
+from foveasim._core.validation import Floats, Ints, check_choice, check_count, finite_array, read_only, unmasked
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, PackedRings, PointMap
 from foveasim.integrate._outlines import CarriedOutlines, Outlines, outlines_of
 from foveasim.integrate._plan import Plan, compile_plan
-from foveasim.parallel import thread_count
-from foveasim.rings import site_area_um2
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

@@ -24,7 +24,9 @@ is imported; the machine code is cached on disk.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
+from numba import types
+
+from foveasim._core.jit import njit
 
 __all__ = [
     "COLUMN",
@@ -76,7 +78,7 @@ _moment_list = types.float64[:, ::1]
 _int_list = types.int64[::1]
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_rows):
     """Upper bound of the number of cells on the grid that the rings' edges touch."""
     bound = 0
@@ -91,7 +93,7 @@ def _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_rows):
     return min(bound, n_rows * (n_x + 1))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _find_cell(head, recent, links, n_cells, row, column):
     """
     Scratch cell (row, column): its index, and the count of cells, one higher when it had to be made.
@@ -129,7 +131,7 @@ def _find_cell(head, recent, links, n_cells, row, column):
     return here, n_cells
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _add_moments(moment, ua, ub, va, vb, height):
     """
     Add the moments of a piece from (ua, va) to (ub, vb), relative to its cell's centre, that climbs ``height``.
@@ -144,7 +146,7 @@ def _add_moments(moment, ua, ub, va, vb, height):
     moment[2] += height * (v_mean * (u_mean + 0.5) + (vb - va) * spread)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _trace_edge(
     ua, va, ub, vb, n_y, n_x, bottom, left_column, box_columns, head, recent, climb, links, cover, moment, n_cells
 ):
@@ -223,7 +225,7 @@ def _trace_edge(
     return n_cells
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _grown(array, n_used, n_more):
     """The array itself, or a longer copy when ``n_more`` further rows would not fit."""
     if n_used + n_more <= array.shape[0]:
@@ -236,13 +238,13 @@ def _grown(array, n_used, n_more):
     return larger
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _rounding(climb):
     """Largest weight or moment in a row that is nothing but rounding."""
     return NO_COVERAGE * climb[0] * max(climb[1] / 8.0, 1.0)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _write_row(first_cell, links, cover, climb, n_x, site, row, spans, n_spans, weights, n_weights):
     """Append the spans of one row of one site; returns the new counts, and the area covered."""
     winding = 0.0  # weight of the cells before the next touched one: the sum of the heights from there on
@@ -296,7 +298,7 @@ def _write_row(first_cell, links, cover, climb, n_x, site, row, spans, n_spans, 
     return n_spans, n_weights, covered
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _gradient_share(index, n):
     """One over the distance of the neighbours that the gradient at a cell is taken from; 0 along a single cell."""
     if n == 1:
@@ -304,7 +306,7 @@ def _gradient_share(index, n):
     return 0.5 if 0 < index < n - 1 else 1.0
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _write_cuts(first_cell, links, moment, climb, n_y, n_x, site, row, cuts, moments, n_cuts):
     """Append the cuts of one row of one site; returns their new count."""
     tilt = 0.0  # moment along v of the cells before the next touched one
@@ -338,7 +340,7 @@ def _write_cuts(first_cell, links, moment, climb, n_y, n_x, site, row, cuts, mom
     return n_cuts
 
 
-@njit(types.Tuple((_float_list, _moment_list))(_points, _ints, _ints), cache=True, nogil=True)
+@njit(types.Tuple((_float_list, _moment_list))(_points, _ints, _ints))
 def measure_sites(xy, ring_offsets, site_offsets):
     """
     Area (n_site,) of every site, holes taken off, negative when clockwise; and its bounds (n_site, 4): low, then high.
@@ -368,8 +370,6 @@ def measure_sites(xy, ring_offsets, site_offsets):
 
 @njit(
     types.int64[::1](_points, _ints, _floats, _floats, _points, _count),
-    cache=True,
-    nogil=True,
 )
 def count_pieces(xy, ring_offsets, first, step, pieces_per_length, most):
     """
@@ -395,8 +395,6 @@ def count_pieces(xy, ring_offsets, first, step, pieces_per_length, most):
     types.Tuple((_span_list, _float_list, _cut_list, _moment_list, _float_list))(
         _points, _ints, _ints, _count, _count, _count, _count
     ),
-    cache=True,
-    nogil=True,
 )
 def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
     """
@@ -525,8 +523,6 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
 
 @njit(
     types.void(_spans, _floats, _int_list, _int_list, _ints, _count, _span_list, _float_list),
-    cache=True,
-    nogil=True,
 )
 def place_spans(spans, weights, next_span, next_weight, first_slot, rows_per_band, out_spans, out_weights):
     """
@@ -556,8 +552,6 @@ def place_spans(spans, weights, next_span, next_weight, first_slot, rows_per_ban
 
 @njit(
     types.void(_cuts, _points, _int_list, _ints, _count, _cut_list, _moment_list),
-    cache=True,
-    nogil=True,
 )
 def place_cuts(cuts, moments, next_cut, first_slot, rows_per_band, out_cuts, out_moments):
     """Copy cuts and their moments into the order of rows, as :func:`place_spans` does with spans and weights."""
@@ -577,7 +571,7 @@ def place_cuts(cuts, moments, next_cut, first_slot, rows_per_band, out_cuts, out
         next_cut[row] = to
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _add_gradients(cells, row, row_cuts, cuts, moments, slots):
     """Add moment x gradient over the cuts of a row into the slots."""
     n_y, n_x = cells.shape
@@ -594,8 +588,6 @@ def _add_gradients(cells, row, row_cuts, cuts, moments, slots):
         types.void(_input(cell, 2), _count, _count, _ints, _ints, _spans, _floats, _ints, _cuts, _points, _float_list)
         for cell in (types.float32, types.float64)
     ],
-    cache=True,
-    nogil=True,
 )
 def gather(cells, first_row, last_row, row_spans, row_weights, spans, weights, row_cuts, cuts, moments, slots):
     """
@@ -649,8 +641,6 @@ def gather(cells, first_row, last_row, row_spans, row_weights, spans, weights, r
 
 @njit(
     types.void(_floats, _count, _count, _ints, _ints, _spans, _floats, _ints, _cuts, _points, _moment_list),
-    cache=True,
-    nogil=True,
 )
 def scatter(values, first_row, last_row, row_spans, row_weights, spans, weights, row_cuts, cuts, moments, cells):
     """

@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foveasim.arrays import Bools, Floats, Ints
-from foveasim.compiled import kernels
+from foveasim._core.rings import next_vertex, positions_in_runs
+from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.fields import PackedRings, PointMap
-from foveasim.rings import next_vertex, positions_in_runs
 
 __all__ = ["CarriedOutlines", "Outlines", "outlines_of"]
 
@@ -109,7 +108,9 @@ class _Bends:
 
     def n_pieces(self, xy_um: Floats, ring_offsets: Ints) -> Ints:
         """Return the number of pieces of every edge, in the order of their first vertices."""
-        count: Callable[..., Ints] = kernels("integrate").count_pieces
+        from foveasim.integrate import _kernels
+
+        count: Callable[..., Ints] = _kernels.count_pieces
         return count(xy_um, ring_offsets, self._first_um, self._step_um, self._pieces_per_um, MAX_PIECES)
 
 

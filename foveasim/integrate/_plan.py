@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Bools, Floats, Ints
-from foveasim.compiled import kernels
+from foveasim._core.rings import positions_in_runs, to_frame
+from foveasim._core.threads import each
+from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.fields import Grid
 from foveasim.integrate._outlines import Outlines
-from foveasim.parallel import each
-from foveasim.rings import positions_in_runs, to_frame
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -91,8 +90,10 @@ class Plan:
 
     def gather(self, cells: NDArray[Any], n_threads: int) -> Floats:
         """Sum of weight x cell for every site, (n_site,), of one map (n_y, n_x) float32 or float64, C-contiguous."""
+        from foveasim.integrate import _kernels
+
         slots = np.zeros(int(self.first_slot[-1]))
-        self._pass(kernels("integrate").gather, cells, slots, n_threads)
+        self._pass(_kernels.gather, cells, slots, n_threads)
         sums = np.zeros(self.n_sites)
         is_on_grid = np.diff(self.first_slot) > 0
         if is_on_grid.any():
@@ -101,17 +102,20 @@ class Plan:
 
     def scatter(self, values: Floats, n_threads: int) -> Floats:
         """Sum of weight x value of the site for every cell, (n_y, n_x): the transpose of :meth:`gather`."""
+        from foveasim.integrate import _kernels
+
         cells = np.zeros(self.grid.shape)
         slots = np.repeat(values, np.diff(self.first_slot))
-        self._pass(kernels("integrate").scatter, slots, cells, n_threads)
+        self._pass(_kernels.scatter, slots, cells, n_threads)
         return cells
 
     def matrix(self) -> csr_array[Any]:
         """The plan as a sparse matrix (n_site, n_y * n_x), of overlaps in cells at first order; runs are written out."""
         from scipy.sparse import coo_array
 
-        column_of = kernels("integrate")
-        n_partial, n_run = (self.spans[:, column].astype(np.int64) for column in (column_of.N_PARTIAL, column_of.N_RUN))
+        from foveasim.integrate import _kernels
+
+        n_partial, n_run = (self.spans[:, column].astype(np.int64) for column in (_kernels.N_PARTIAL, _kernels.N_RUN))
         n_cells = n_partial + n_run
         # A span's k-th cell has its k-th weight, and every cell of the run the one after the partial ones.
         n_weights = n_partial + (n_run > 0)
@@ -119,10 +123,10 @@ class Plan:
         k = positions_in_runs(n_cells)
         at = np.repeat(first_weight, n_cells) + np.minimum(k, np.repeat(n_partial, n_cells))
         n_y, n_x = self.grid.shape
-        start = self.spans[:, column_of.ROW].astype(np.int64) * n_x + self.spans[:, column_of.COLUMN]
+        start = self.spans[:, _kernels.ROW].astype(np.int64) * n_x + self.spans[:, _kernels.COLUMN]
         cell = np.repeat(start, n_cells) + k
         slot_site = np.repeat(np.arange(self.n_sites), np.diff(self.first_slot))
-        site = np.repeat(slot_site[self.spans[:, column_of.SITE]], n_cells)
+        site = np.repeat(slot_site[self.spans[:, _kernels.SITE]], n_cells)
         parts = zip((self.weights[at], site, cell), self._gradients(slot_site), strict=True)
         weight, site, cell = (np.concatenate(part) for part in parts)
         matrix = coo_array((weight, (site, cell)), shape=(self.n_sites, n_y * n_x)).tocsr()
@@ -168,8 +172,9 @@ def compile_plan(
     ``outlines(first, last)`` gives those of the sites from the first to before the last: they are asked for piece by piece, so
     that what has just been carried is traced while it is in the cache, and never are all of them in memory.
     """
+    from foveasim.integrate import _kernels
+
     n_y = grid.shape[0]
-    compiled = kernels("integrate")
     traced = each(
         lambda first: _traced(outlines(first, min(first + SITES_PER_PIECE, n_sites)), first, grid, order),
         range(0, n_sites, SITES_PER_PIECE),
@@ -197,8 +202,8 @@ def compile_plan(
 
     def place(i: int) -> None:
         t, slots = traced[i], (slot_of_band_0, rows_per_band)
-        compiled.place_spans(t.spans, t.weights, next_span[i], next_weight[i], *slots, out_spans, out_weights)
-        compiled.place_cuts(t.cuts, t.moments, next_cut[i], *slots, out_cuts, out_moments)
+        _kernels.place_spans(t.spans, t.weights, next_span[i], next_weight[i], *slots, out_spans, out_weights)
+        _kernels.place_cuts(t.cuts, t.moments, next_cut[i], *slots, out_cuts, out_moments)
 
     each(place, range(len(traced)), n_threads)
     return Plan(
@@ -222,21 +227,22 @@ def compile_plan(
 
 def _traced(outlines: Outlines, first_site: int, grid: Grid, order: int) -> _Traced:
     """Trace some sites, the first of which is number ``first_site``."""
-    compiled = kernels("integrate")
+    from foveasim.integrate import _kernels
+
     n_y, n_x = grid.shape
     rings = outlines.ring_offsets, outlines.site_offsets
-    area_um2, bounds_um = compiled.measure_sites(outlines.xy_um, *rings)
+    area_um2, bounds_um = _kernels.measure_sites(outlines.xy_um, *rings)
     uv = to_frame(outlines.xy_um, grid.origin_um, grid.pitch_xy_um)
-    spans, weights, cuts, moments, covered = compiled.trace_sites(uv, *rings, first_site, n_y, n_x, order)
-    n_weights = spans[:, compiled.N_PARTIAL] + (spans[:, compiled.N_RUN] > 0)
+    spans, weights, cuts, moments, covered = _kernels.trace_sites(uv, *rings, first_site, n_y, n_x, order)
+    n_weights = spans[:, _kernels.N_PARTIAL] + (spans[:, _kernels.N_RUN] > 0)
     return _Traced(
         spans,
         weights,
         cuts,
         moments,
-        row_spans=np.bincount(spans[:, compiled.ROW], minlength=n_y),
-        row_weights=np.bincount(spans[:, compiled.ROW], n_weights, minlength=n_y).astype(np.int64),
-        row_cuts=np.bincount(cuts[:, compiled.ROW], minlength=n_y),
+        row_spans=np.bincount(spans[:, _kernels.ROW], minlength=n_y),
+        row_weights=np.bincount(spans[:, _kernels.ROW], n_weights, minlength=n_y).astype(np.int64),
+        row_cuts=np.bincount(cuts[:, _kernels.ROW], minlength=n_y),
         area_um2=area_um2,
         covered_um2=covered * grid.cell_area_um2,
         bounds_um=bounds_um,

@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-from foveasim.layout._model import Layout
 from foveasim.layout.adjacency import adjacency
 from foveasim.layout.channels import MOSAICS, colouring, mosaic, random_channels
+from foveasim.layout.drc.presets import PRESETS, Preset
+from foveasim.layout.drc.repair import Change, enforce
+from foveasim.layout.drc.routing import Readout, Routing, crossings
+from foveasim.layout.drc.rules import DesignRules, Report, RuleResult, Violation, min_width_um
 from foveasim.layout.edits import clip, inset, merge, merge_small, node, punch, snap, split, union
-from foveasim.layout.enforce import Change, enforce
 from foveasim.layout.files import WrittenLayout, read_layout, shipped_layouts, write_layout
-from foveasim.layout.foveal_cartesian import foveal_cartesian
-from foveasim.layout.fovi import fovi
-from foveasim.layout.giotto import giotto, giotto_ratio
-from foveasim.layout.grid import grid
-from foveasim.layout.hexagonal import hexagonal
-from foveasim.layout.log_polar import log_polar, square_ring_ratio
-from foveasim.layout.octagonal import octagonal
-from foveasim.layout.penrose import penrose
-from foveasim.layout.presets import PRESETS, Preset
-from foveasim.layout.quadtree import quadtree
+from foveasim.layout.generators.foveal_cartesian import foveal_cartesian
+from foveasim.layout.generators.fovi import fovi
+from foveasim.layout.generators.giotto import giotto, giotto_ratio
+from foveasim.layout.generators.grid import grid
+from foveasim.layout.generators.hexagonal import hexagonal
+from foveasim.layout.generators.log_polar import log_polar, square_ring_ratio
+from foveasim.layout.generators.octagonal import octagonal
+from foveasim.layout.generators.penrose import penrose
+from foveasim.layout.generators.quadtree import quadtree
+from foveasim.layout.generators.sunflower import sunflower
+from foveasim.layout.generators.tiling import fill, tiling
+from foveasim.layout.generators.voronoi import voronoi
+from foveasim.layout.generators.zones import zones
+from foveasim.layout.model import Layout
 from foveasim.layout.readout import nearest_bus, readout_by, readout_order
-from foveasim.layout.routing import Readout, Routing, crossings
-from foveasim.layout.rules import DesignRules, Report, RuleResult, Violation, min_width_um
 from foveasim.layout.summary import Summary, describe
-from foveasim.layout.sunflower import sunflower
-from foveasim.layout.tiling import fill, tiling
-from foveasim.layout.voronoi import voronoi
-from foveasim.layout.zones import zones
 
 __all__ = [
     "MOSAICS",

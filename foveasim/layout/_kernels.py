@@ -5,7 +5,9 @@ from __future__ import annotations
 from heapq import heappop, heappush
 
 import numpy as np
-from numba import njit, types
+from numba import types
+
+from foveasim._core.jit import njit
 
 __all__ = ["aspect_ratios", "colour_greedily", "contacts", "meeting_boxes", "min_widths", "overhangs", "shared_lengths"]
 
@@ -20,7 +22,7 @@ _flags = types.Array(types.boolean, 1, "C")
 MIN_OPPOSITION = 0.9
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _point_to_edge(px, py, ax, ay, bx, by):
     """Distance of a point from a segment."""
     dx, dy = bx - ax, by - ay
@@ -29,7 +31,7 @@ def _point_to_edge(px, py, ax, ay, bx, by):
     return np.hypot(px - ax - t * dx, py - ay - t * dy)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _across_from_inward_corner(xy, a, b, after, first, last):
     """Distance from an inward corner b, straight across the site, to the nearest edge; infinite for an outward one."""
     bx, by = xy[b, 0], xy[b, 1]
@@ -53,7 +55,7 @@ def _across_from_inward_corner(xy, a, b, after, first, last):
     return nearest
 
 
-@njit(types.float64[::1](_points, _ints, _ints, _ints, _ints), cache=True, nogil=True)
+@njit(types.float64[::1](_points, _ints, _ints, _ints, _ints))
 def min_widths(xy, after, before, ring_offsets, site_offsets):
     """
     Smallest width of every site: between edges that face each other, from inward corners across, of a strip that holds it.
@@ -104,7 +106,7 @@ def min_widths(xy, after, before, ring_offsets, site_offsets):
 EQUAL_AREAS = 1e-9
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _next_hull_corner(xy, corner, first, last):
     """The vertex that no other one lies on the right of, seen from a corner of the hull; of several the furthest."""
     best = -1
@@ -121,7 +123,7 @@ def _next_hull_corner(xy, corner, first, last):
     return best
 
 
-@njit(types.float64[::1](_points, _ints, _ints), cache=True, nogil=True)
+@njit(types.float64[::1](_points, _ints, _ints))
 def aspect_ratios(xy, ring_offsets, site_offsets):
     """
     Longer over shorter side of the smallest rectangle around every site; of equally small ones the least elongated.
@@ -159,7 +161,7 @@ def aspect_ratios(xy, ring_offsets, site_offsets):
     return ratios
 
 
-@njit(types.int64[::1](_points, _ints), cache=True, nogil=True)
+@njit(types.int64[::1](_points, _ints))
 def meeting_boxes(box, order):
     """
     Pairs (i, j), i < j, of boxes (x_min, y_min, x_max, y_max) that meet, as i n + j; ``order`` is that of x_min.
@@ -206,7 +208,7 @@ def meeting_boxes(box, order):
     return pairs
 
 
-@njit(types.float64[::1](_points, _ints, _ints), cache=True, nogil=True)
+@njit(types.float64[::1](_points, _ints, _ints))
 def overhangs(xy, after, first_vertex):
     """How far every edge's site reaches out beyond the edge's line, to its right; 0 all around a convex site."""
     reach = np.zeros(xy.shape[0])
@@ -222,13 +224,13 @@ def overhangs(xy, after, first_vertex):
     return reach
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _is_same(xy, a, c):
     """Whether two vertices coincide, bit for bit."""
     return xy[a, 0] == xy[c, 0] and xy[a, 1] == xy[c, 1]
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _edge_to_edge(xy, a, b, c, d):
     """Distance of the segments from a to b and from c to d; 0 where they cross."""
     ax, ay, bx, by = xy[a, 0], xy[a, 1], xy[b, 0], xy[b, 1]
@@ -249,7 +251,7 @@ def _edge_to_edge(xy, a, b, c, d):
     return min(near, _point_to_edge(dx, dy, ax, ay, bx, by))
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _edges_meeting(xy, a, b, c, d):
     """Distance of the edges from a to b and from c to d, and how near they come besides one common end."""
     is_ac, is_ad, is_bc, is_bd = _is_same(xy, a, c), _is_same(xy, a, d), _is_same(xy, b, c), _is_same(xy, b, d)
@@ -264,7 +266,7 @@ def _edges_meeting(xy, a, b, c, d):
     return 0.0, min(near, _point_to_edge(xy[q, 0], xy[q, 1], xy[a, 0], xy[a, 1], xy[b, 0], xy[b, 1]))
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _is_inside(xy, after, first, last, x, y):
     """Whether a point lies in a site."""
     is_inside = False
@@ -275,13 +277,13 @@ def _is_inside(xy, after, first, last, x, y):
     return is_inside
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _is_in_box(x, y, box, site):
     """Whether a point lies in a site's box."""
     return box[site, 0] <= x <= box[site, 2] and box[site, 1] <= y <= box[site, 3]
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _has_edge_inside(xy, after, box, i_first, i_last, j, j_first, j_last):
     """Whether the middle of an edge of one site, that is no edge of the other, lies in the other."""
     for a in range(i_first, i_last):
@@ -297,7 +299,7 @@ def _has_edge_inside(xy, after, box, i_first, i_last, j, j_first, j_last):
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _is_parted(xy, after, overhang, depth, i_first, i_last, j_first, j_last):
     """Whether two sites lie on the two sides of an edge of the first, but for a strip of some depth."""
     for a in range(i_first, i_last):
@@ -312,7 +314,7 @@ def _is_parted(xy, after, overhang, depth, i_first, i_last, j_first, j_last):
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _common_edges(xy, after, box, overhang, depth, i_first, i_last, j, j_first, j_last, is_shared):
     """Whether two sites have a common vertex, and whether a common edge parts them; such edges are flagged."""
     is_met, is_parted = False, False
@@ -328,7 +330,7 @@ def _common_edges(xy, after, box, overhang, depth, i_first, i_last, j, j_first, 
     return is_met, is_parted
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _nearest_edges(xy, after, box, i_first, i_last, j, j_first, j_last, nearest, reach, touching):
     """Distance of two outlines, up to what is known and a reach; how near they come besides common vertices and edges."""
     besides = np.inf
@@ -355,8 +357,6 @@ def _nearest_edges(xy, after, box, i_first, i_last, j, j_first, j_last, nearest,
     types.Tuple((types.float64[::1], types.boolean[::1]))(
         _points, _ints, _ints, _points, _floats, _floats, _ints, _ints, types.float64, types.float64, _flags
     ),
-    cache=True,
-    nogil=True,
 )
 def contacts(xy, after, first_vertex, box, overhang, depth, first, second, reach, touching, is_shared):
     """
@@ -406,7 +406,7 @@ def contacts(xy, after, first_vertex, box, overhang, depth, first, second, reach
 CORNER_UM = 1e-6
 
 
-@njit(types.float64[::1](_points, _ints, _ints, _ints, _ints, types.float64), cache=True, nogil=True)
+@njit(types.float64[::1](_points, _ints, _ints, _ints, _ints, types.float64))
 def shared_lengths(xy, after, first_vertex, first, second, max_gap):
     """
     Length over which the outlines of two sites run along each other, for every pair (first[i], second[i]).
@@ -437,7 +437,7 @@ def shared_lengths(xy, after, first_vertex, first, second, max_gap):
     return lengths
 
 
-@njit(types.int64[::1](_ints, _ints, _floats, types.int64), cache=True, nogil=True)
+@njit(types.int64[::1](_ints, _ints, _floats, types.int64))
 def colour_greedily(first, neighbour, shared, n_colours):
     """
     A colour for every site: the one with the least shared edge to coloured neighbours, and of those the rarest so far.

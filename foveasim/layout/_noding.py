@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import shapely
 
-from foveasim.arrays import Floats, Ints
+from foveasim._core.validation import Floats, Ints
 
 __all__ = ["ON_EDGE_UM", "noded_edges", "points_on_edges"]
 

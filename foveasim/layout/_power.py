@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Bools, Floats, Ints
+from foveasim._core.validation import Bools, Floats, Ints
 
 __all__ = ["N_FAR", "PowerDiagram", "far_points_um"]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from foveasim.arrays import MAX_LENGTH_UM, as_numbers, check_length_um, finite_array
+from foveasim._core.validation import MAX_LENGTH_UM, as_numbers, check_length_um, finite_array
 from foveasim.errors import ParameterError
 
 __all__ = ["as_region", "disc", "one_region", "told_region"]

@@ -10,11 +10,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from foveasim.arrays import Bools, Floats, Ints
+from foveasim._core.rings import next_vertex, ring_moments
+from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.layout._model import Layout
 from foveasim.layout._power import N_FAR, PowerDiagram, far_points_um
-from foveasim.rings import next_vertex, ring_moments
+from foveasim.layout.model import Layout
 
 __all__ = ["CellEdges", "MovingCells", "cells_of", "edges_of_rings"]
 

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from foveasim.arrays import check_number
-from foveasim.compiled import kernels
-from foveasim.layout._model import Layout
-from foveasim.rings import next_vertex
+from foveasim._core.rings import next_vertex
+from foveasim._core.validation import check_number
+from foveasim.layout.model import Layout
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -57,6 +56,8 @@ def adjacency(layout: Layout, *, max_gap_um: float = TOUCHING_UM) -> csr_array[A
     """
     from scipy.sparse import coo_array
 
+    from foveasim.layout import _kernels
+
     max_gap_um = check_number("max_gap_um", max_gap_um, at_least=0.0)
     box = layout.site_bounds_um
     reach = box + max(max_gap_um, TOUCHING_UM) * np.array([-0.5, -0.5, 0.5, 0.5])
@@ -64,7 +65,7 @@ def adjacency(layout: Layout, *, max_gap_um: float = TOUCHING_UM) -> csr_array[A
     a, b = shapely.STRtree(boxes).query(boxes)
     is_first = a < b
     a, b = a[is_first], b[is_first]
-    length_um = kernels("layout").shared_lengths(
+    length_um = _kernels.shared_lengths(
         layout.xy_um,
         next_vertex(layout.ring_offsets),
         layout.ring_offsets[layout.site_offsets],

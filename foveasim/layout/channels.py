@@ -7,12 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import check_count, finite_array
-from foveasim.compiled import kernels
+from foveasim._core.random_streams import Streams
+from foveasim._core.validation import check_count, finite_array
 from foveasim.errors import ParameterError
-from foveasim.layout._model import Layout
 from foveasim.layout.adjacency import adjacency
-from foveasim.streams import Streams
+from foveasim.layout.model import Layout
 
 __all__ = ["MOSAICS", "colouring", "mosaic", "random_channels"]
 
@@ -128,9 +127,11 @@ def colouring(layout: Layout, n_channels: int, *, max_gap_um: float | None = Non
     ParameterError
         When ``n_channels`` is not from 1 to 64.
     """
+    from foveasim.layout import _kernels
+
     n_channels = check_count("n_channels", n_channels, at_most=64)
     shared_um = adjacency(layout) if max_gap_um is None else adjacency(layout, max_gap_um=max_gap_um)
-    channel = kernels("layout").colour_greedily(
+    channel = _kernels.colour_greedily(
         shared_um.indptr.astype(np.int64), shared_um.indices.astype(np.int64), shared_um.data, n_channels
     )
     return layout.with_columns(channel=channel)

@@ -14,7 +14,8 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import (
+from foveasim._core.rings import next_vertex, positions_in_runs
+from foveasim._core.validation import (
     MAX_LENGTH_UM,
     Ints,
     check_choice,
@@ -25,12 +26,11 @@ from foveasim.arrays import (
     unmasked,
 )
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.layout._measures import is_below_size
-from foveasim.layout._model import INTEGER_RANGES, Layout
 from foveasim.layout._noding import points_on_edges
 from foveasim.layout._regions import as_region
 from foveasim.layout.adjacency import TOUCHING_UM, adjacency
-from foveasim.rings import next_vertex, positions_in_runs
+from foveasim.layout.drc.measurements import is_below_size
+from foveasim.layout.model import INTEGER_RANGES, Layout
 
 __all__ = ["clip", "inset", "joining_groups", "merge", "merge_small", "node", "punch", "snap", "split", "union"]
 

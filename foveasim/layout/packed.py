@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.layout._model import Layout
+from foveasim.layout.model import Layout
 
 __all__ = ["is_of_layout", "packed_layout", "unpacked_layout"]
 

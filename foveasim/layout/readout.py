@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import shapely
 
+from foveasim._core.rings import positions_in_runs
 from foveasim.errors import ParameterError
-from foveasim.layout._model import Layout
-from foveasim.rings import positions_in_runs
+from foveasim.layout.model import Layout
 
 __all__ = ["nearest_bus", "readout_by", "readout_order"]
 

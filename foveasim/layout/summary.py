@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from foveasim.arrays import Floats, Ints
+from foveasim._core.validation import Floats, Ints
 from foveasim.errors import ParameterError
-from foveasim.layout._model import Layout
-from foveasim.layout.routing import Readout
+from foveasim.layout.drc.routing import Readout
+from foveasim.layout.model import Layout
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -105,7 +105,7 @@ class Summary:
         from rich.console import Group
         from rich.table import Table
 
-        from foveasim.terminal import text_of
+        from foveasim._io.terminal import text_of
 
         facts = Table(show_header=False, box=None)
         for name, value in self.rows():

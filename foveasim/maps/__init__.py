@@ -25,10 +25,10 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import handed_over
+from foveasim._core.validation import handed_over
+from foveasim._io.atomic import written_whole
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Pitch, PowerMap
-from foveasim.files import written_whole
 from foveasim.maps import _dataset, _exr, _fits, _isetcam, _npy, _tiff
 from foveasim.maps._apart import read_apart
 from foveasim.maps._common import Found, Given, finished, head_of, one_sentence

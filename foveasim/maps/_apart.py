@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim import apart
+from foveasim._io import sandbox
 from foveasim.maps import _dataset, _exr, _isetcam
 from foveasim.maps._common import Found, Refusal, as_images, max_unpacked, one_sentence
 
@@ -43,7 +43,7 @@ def read_apart(path: Path, kind: str, name: str | None) -> Found:
         When it is broken, hostile, too large, or no map.
     """
     # OpenEXR prints what it could not read, and may go on without it.
-    told, data = apart.read_apart(
+    told, data = sandbox.read_apart(
         _read, path, kind, name, kind=kind, max_unpacked=max_unpacked, is_silent=kind == "EXR"
     )
     about: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in told.items()}

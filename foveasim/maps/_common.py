@@ -11,7 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Images, check_choice, check_pitch_um, finite_array, read_only, wavelengths_nm
+from foveasim._core.validation import (
+    Floats,
+    Images,
+    check_choice,
+    check_pitch_um,
+    finite_array,
+    read_only,
+    wavelengths_nm,
+)
 from foveasim.errors import FileError, FoveasimError, ParameterError
 from foveasim.fields import Grid, Pitch, PowerMap, rising
 from foveasim.maps._units import PER_NM, UNITS, Unit, light_unit, per_band_w_m2

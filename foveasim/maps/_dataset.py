@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foveasim._io.atomic import check_room, remove_folder
 from foveasim.errors import FileError
 from foveasim.fields import PowerMap
-from foveasim.files import check_room, remove_folder
 from foveasim.maps._common import Found, Refusal, check_size
 from foveasim.maps._xarray import NAME, X, Y, found_in_array, to_xarray
 

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._io.images import pixels_of_page
 from foveasim.fields import PowerMap, to_file_rows
 from foveasim.maps._common import MAX_BANDS, Found, Refusal, check_size
 from foveasim.maps._text import about_map, found_in_text
-from foveasim.pictures import pixels_of_page
 
 __all__ = ["MAGICS", "read", "write"]
 

@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from foveasim.arrays import Floats
+from foveasim._core.validation import Floats
 from foveasim.units import photon_energy_j
 
 __all__ = ["PER_NM", "UNITS", "Unit", "length_in_um", "light_unit", "per_band_w_m2"]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from foveasim.arrays import Floats
+from foveasim._core.validation import Floats
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, Pitch, PowerMap
 from foveasim.maps._common import Found, Given, Refusal, finished, pitch_of_axes

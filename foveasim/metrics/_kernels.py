@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
+from numba import types
+
+from foveasim._core.jit import njit
 
 __all__ = ["polygon_transforms"]
 
@@ -17,7 +19,7 @@ SERIES_BELOW = 1e-2
 STILL = 1e-140
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _sinc_less_one(v):
     """sin(v) / v - 1 without loss of digits."""
     if abs(v) < SERIES_BELOW:
@@ -26,7 +28,7 @@ def _sinc_less_one(v):
     return np.sin(v) / v - 1.0
 
 
-@njit(types.complex128[:, ::1](_points, _ints, _ints, _points, _floats, _points), cache=True, nogil=True)
+@njit(types.complex128[:, ::1](_points, _ints, _ints, _points, _floats, _points))
 def polygon_transforms(xy, ring_offsets, site_offsets, centre, area, wave):
     """
     Integral of exp(-i k·(x - centre)) over each site, over its area, (n_site, n_wave).

@@ -14,7 +14,15 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, check_choice, check_count, check_length_um, check_number, finite_array, read_only
+from foveasim._core.validation import (
+    Floats,
+    check_choice,
+    check_count,
+    check_length_um,
+    check_number,
+    finite_array,
+    read_only,
+)
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 from foveasim.metrics.pixel_mtf import polygon_otf

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Bools, Floats, finite_array, read_only
+from foveasim._core.validation import Bools, Floats, finite_array, read_only
 from foveasim.errors import FoveasimWarning, ParameterError
 from foveasim.metrics.photon_transfer import (
     LEAST_DARK_DN2,
@@ -28,7 +28,7 @@ from foveasim.metrics.photon_transfer import (
     photon_transfer,
     slopes,
 )
-from foveasim.sensor.converter import QUANTISATION_DN2
+from foveasim.sensor.adc import QUANTISATION_DN2
 
 __all__ = ["Emva1288", "emva1288"]
 

@@ -13,7 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Bools, Floats, Ints, as_numbers, check_count, check_number, finite_array, read_only
+from foveasim._core.validation import (
+    Bools,
+    Floats,
+    Ints,
+    as_numbers,
+    check_count,
+    check_number,
+    finite_array,
+    read_only,
+)
 from foveasim.errors import CoverageWarning, ParameterError
 from foveasim.fields import Grid
 from foveasim.integrate import Integrator

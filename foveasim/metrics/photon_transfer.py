@@ -17,11 +17,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Ints, as_numbers, check_count, check_number, finite_array, own, read_only, unmasked
+from foveasim._core.random_streams import Streams
+from foveasim._core.validation import (
+    Floats,
+    Ints,
+    as_numbers,
+    check_count,
+    check_number,
+    finite_array,
+    own,
+    read_only,
+    unmasked,
+)
 from foveasim.errors import ParameterError
 from foveasim.sensor import Sensor
-from foveasim.sensor.converter import QUANTISATION_DN2
-from foveasim.streams import Streams
+from foveasim.sensor.adc import QUANTISATION_DN2
 
 __all__ = [
     "PhotonTransfer",

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, finite_array
-from foveasim.compiled import kernels
+from foveasim._core.threads import each, thread_count
+from foveasim._core.validation import Floats, finite_array
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 from foveasim.metrics.sampling import require_layout
-from foveasim.parallel import each, thread_count
 from foveasim.units import per_um_from_per_mm
 
 __all__ = ["polygon_mtf", "polygon_otf", "wave_vectors_per_mm"]
@@ -80,12 +79,14 @@ def polygon_otf(layout: Layout, wave_per_mm: ArrayLike, *, n_threads: int | None
     >>> np.round(otf.real, 4)
     array([[1.    , 0.6366, 0.4053]])
     """
+    from foveasim.metrics import _kernels
+
     require_layout(layout)
     waves = finite_array("wave_per_mm", wave_per_mm, ndim=2)
     if waves.shape[1] != 2:
         raise ParameterError("wave_per_mm", f"must have the shape (n_wave, 2), got {waves.shape}")
     rad_per_um = np.ascontiguousarray(2.0 * np.pi * per_um_from_per_mm(waves))
-    transforms = kernels("metrics").polygon_transforms
+    transforms = _kernels.polygon_transforms
     otf = np.empty((layout.n_sites, waves.shape[0]), np.complex128)
 
     def block(start: int) -> None:

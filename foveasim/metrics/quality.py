@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Bools, Floats, as_numbers, check_count, check_number
+from foveasim._core.validation import Bools, Floats, as_numbers, check_count, check_number
 from foveasim.errors import ParameterError
 from foveasim.reconstruct import Picture
 

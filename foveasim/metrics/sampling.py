@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, Ints, check_choice, check_count, finite_array, read_only
+from foveasim._core.validation import Floats, Ints, check_choice, check_count, finite_array, read_only
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
 from foveasim.units import per_mm_from_per_um

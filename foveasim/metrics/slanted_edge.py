@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import (
+from foveasim._core.validation import (
     Bools,
     Floats,
     Ints,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Bools, Floats, Ints, check_count, check_number, finite_array, read_only
+from foveasim._core.validation import Bools, Floats, Ints, check_count, check_number, finite_array, read_only
 from foveasim.camera import Camera
 from foveasim.capture import Capture
 from foveasim.errors import ParameterError
@@ -23,7 +23,7 @@ from foveasim.metrics.photon_transfer import SiteClasses, codes_of
 from foveasim.metrics.sampling import require_layout
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor, SiteSignals, signal_to_noise
-from foveasim.sensor.converter import QUANTISATION_DN2, Converter
+from foveasim.sensor.adc import QUANTISATION_DN2, Converter
 from foveasim.sensor.limits import check_plausible
 from foveasim.sensor.signal_to_noise import CUT_OFF_SIGMAS
 

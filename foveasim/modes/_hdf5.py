@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.apart import read_apart
-from foveasim.arrays import Floats, Ints
+from foveasim._core.provenance import described
+from foveasim._core.validation import Floats, Ints
+from foveasim._io.sandbox import read_apart
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout import Layout
 from foveasim.layout.packed import packed_layout, unpacked_layout
-from foveasim.records import described
 
 __all__ = ["EventFile", "most_bytes", "read_events"]
 

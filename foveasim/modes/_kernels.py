@@ -17,8 +17,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
+from foveasim._core.jit import njit
 from foveasim.sensor._kernels import _philox, _uniform
 
 __all__ = ["DIFFERENCE", "HAZARD", "HELD", "LEVEL", "MISSING", "change_events", "charge_spikes"]
@@ -40,12 +41,12 @@ _row = types.Array(types.float64, 1, "C", readonly=True)
 _rows = types.Array(types.float64, 2, "C", readonly=True)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _words(key_0, key_1, site, number):
     return _philox(key_0, key_1, np.uint64(site), np.uint64(number), np.uint64(0), np.uint64(0))
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _risen(slope, swing, tau, begin, end):
     """Rise of ``slope * u + swing * exp(-u / tau)`` from one time to another; without swing where tau is 0."""
     rise = slope * (end - begin)
@@ -54,7 +55,7 @@ def _risen(slope, swing, tau, begin, end):
     return rise
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _crossing(slope, swing, tau, begin, difference, on, off, end):
     """First time from ``begin`` to ``end`` at which the difference reaches ``on`` or ``-off``, and which; beyond it if none."""
     # What rounding left behind the last frame.
@@ -104,8 +105,6 @@ def _crossing(slope, swing, tau, begin, difference, on, off, end):
         types.float64, types.float64, types.uint64, types.uint64, types.int64, types.int64,
         types.float64[:, ::1], _counts, _counts, types.float64[::1], _sites, _bytes,
     ),
-    cache=True,
-    nogil=True,
 )  # fmt: skip
 def change_events(
     log_light, current, frame_s, first_frame, on, off, leak_per_s, refractory_s, tau_e, noise_per_s, noise_half,
@@ -179,7 +178,7 @@ def change_events(
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _gamma(shape, key_0, key_1, site, number):
     """
     Draw of the gamma law of a shape of at least 1, and how many numbers were drawn then.
@@ -202,8 +201,6 @@ def _gamma(shape, key_0, key_1, site, number):
         _rows, types.float64, types.int64, _row, types.float64, types.boolean, types.uint64, types.uint64, types.int64,
         types.int64, types.float64[:, ::1], _counts, _counts, types.float64[::1], _sites, _bytes,
     ),
-    cache=True,
-    nogil=True,
 )  # fmt: skip
 def charge_spikes(
     current, frame_s, first_frame, threshold_e, refractory_s, is_noisy, key_0, key_1, first_site,

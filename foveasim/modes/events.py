@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.archives import opened_archive, write_archive
-from foveasim.arrays import Floats, Ints, as_numbers, check_number, finite_array, own, read_only
+from foveasim._core.provenance import described
+from foveasim._core.validation import Floats, Ints, as_numbers, check_number, finite_array, own, read_only
+from foveasim._io.atomic import check_room, written_whole
+from foveasim._io.npz import opened_archive, write_archive
 from foveasim.errors import FileError, FoveasimWarning, ParameterError
-from foveasim.files import check_room, written_whole
 from foveasim.layout import Layout
 from foveasim.layout.packed import OUTLINES, packed_layout, unpacked_layout
 from foveasim.modes import _hdf5
-from foveasim.records import described
 
 __all__ = ["Events", "write_events"]
 

@@ -17,15 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Ints, check_count, finite_array, read_only
-from foveasim.compiled import kernels
+from foveasim._core.random_streams import device_key
+from foveasim._core.threads import each, thread_count
+from foveasim._core.validation import Floats, Ints, check_count, finite_array, read_only
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
 from foveasim.modes.events import Events
-from foveasim.parallel import each, thread_count
 from foveasim.sensor import Sensor
 from foveasim.sensor.limits import check_plausible, check_plausible_array
-from foveasim.streams import device_key
 from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 
 __all__ = ["EventPixels", "SpikingPixels"]
@@ -197,7 +196,8 @@ class EventPixels:
     def _stream(
         self, rates: Iterable[ArrayLike], frame_s: float, key: tuple[Any, Any], batch: int, n_threads: int
     ) -> Iterator[Events]:
-        kernel = kernels("modes")
+        from foveasim.modes import _kernels
+
         tau_e = self.capacitance_f * BOLTZMANN_J_PER_K * self.temperature_k / ELEMENTARY_CHARGE_C**2
         (on, off), leaks_per_s = self.thresholds, self.leaks_per_s
         memory = np.zeros((self.sensor.layout.n_sites, 4))
@@ -212,7 +212,7 @@ class EventPixels:
                     f"site {site} has no current, and so no logarithm: give 'floor_e_per_s', or the sensor a dark current"
                 )
             if before is None:
-                memory[:, kernel.LEVEL] = np.log(current[0])
+                memory[:, _kernels.LEVEL] = np.log(current[0])
                 frames, log_light = current, np.log(current)
             else:
                 frames = np.concatenate((before, current))
@@ -221,7 +221,7 @@ class EventPixels:
 
             def work(sites: slice, n_most: int, *out: NDArray[Any]) -> int:
                 return int(
-                    kernel.change_events(
+                    _kernels.change_events(
                         np.ascontiguousarray(log_light[:, sites]),  # noqa: B023 -- is called at once
                         np.ascontiguousarray(frames[:, sites]),  # noqa: B023
                         frame_s,
@@ -347,7 +347,8 @@ class SpikingPixels:
     def _stream(
         self, rates: Iterable[ArrayLike], frame_s: float, key: tuple[Any, Any], batch: int, n_threads: int
     ) -> Iterator[Events]:
-        kernel = kernels("modes")
+        from foveasim.modes import _kernels
+
         threshold_e = np.atleast_1d(np.asarray(self.threshold_e, np.float64))
         memory = np.zeros((self.sensor.layout.n_sites, 4))
         n_drawn = np.zeros(self.sensor.layout.n_sites, np.int64)
@@ -362,7 +363,7 @@ class SpikingPixels:
 
             def work(sites: slice, n_most: int, *out: NDArray[Any]) -> int:
                 return int(
-                    kernel.charge_spikes(
+                    _kernels.charge_spikes(
                         np.ascontiguousarray(current[:, sites]),  # noqa: B023 -- is called at once
                         frame_s,
                         first,  # noqa: B023

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from foveasim.arrays import Floats, check_choice, check_count, finite_array
+from foveasim._core.validation import Floats, check_choice, check_count, finite_array
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
 from foveasim.sensor.limits import check_plausible

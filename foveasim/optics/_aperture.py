@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Bools, Floats
+from foveasim._core.validation import Bools, Floats
 from foveasim.errors import ParameterError
 from foveasim.optics.pupils import Annulus, Blades, Pupil, PupilImage, Slit, Spider
 from foveasim.units import um_from_nm

@@ -17,7 +17,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from foveasim.arrays import Bools, Floats, Images, Ints
+from foveasim._core.validation import Bools, Floats, Images, Ints
 from foveasim.fields import Grid
 from foveasim.optics._aperture import Aperture
 from foveasim.optics._transform import Transform, source_pixels

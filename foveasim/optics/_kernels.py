@@ -8,7 +8,9 @@ imported; the machine code is cached on disk.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
+from numba import types
+
+from foveasim._core.jit import njit
 
 __all__ = ["alias_sum", "alias_sum_plane", "expose", "multiply", "replicate", "transfer", "transfer_plane"]
 
@@ -29,8 +31,6 @@ _floats = types.Array(types.float64, 1, "C", readonly=True)
         for cell in (types.float32, types.float64)
         for real in (types.float32, types.float64)
     ],
-    cache=True,
-    nogil=True,
     error_model="numpy",
 )
 def expose(rows, x2, y2, power, source_column, before, out):
@@ -75,8 +75,6 @@ def expose(rows, x2, y2, power, source_column, before, out):
         )
         for c in (types.complex64, types.complex128)
     ],
-    cache=True,
-    nogil=True,
 )
 def replicate(spectrum, n_columns, phase_x, phase_y, first_row, last_row, out):
     """
@@ -115,8 +113,6 @@ def replicate(spectrum, n_columns, phase_x, phase_y, first_row, last_row, out):
         )
         for c, r in ((types.complex64, types.float32), (types.complex128, types.float64))
     ],
-    cache=True,
-    nogil=True,
 )
 def transfer(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is_added, first_row, last_row, out):
     """
@@ -173,8 +169,6 @@ def transfer(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is
             (types.complex128, types.complex128),
         )
     ],
-    cache=True,
-    nogil=True,
 )
 def multiply(spectrum, factor, is_added, first_row, last_row, out):
     """``out = spectrum * factor`` or ``out += spectrum * factor`` over some rows, as :func:`transfer` does with its own."""
@@ -187,7 +181,7 @@ def multiply(spectrum, factor, is_added, first_row, last_row, out):
                 out[row, ix] = spectrum[row, ix] * factor[row, ix]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _in_plane(table, u, v):
     """
     Value between the points of a plane of frequencies, linear in both; 0 beyond its border.
@@ -228,8 +222,6 @@ def _in_plane(table, u, v):
         )
         for c, r in ((types.complex64, types.float32), (types.complex128, types.float64))
     ],
-    cache=True,
-    nogil=True,
 )
 def transfer_plane(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is_added, first_row, last_row, out):
     """As :func:`transfer`, for a transfer function of any form: a square of complex numbers over f_y and f_x."""
@@ -256,7 +248,7 @@ def transfer_plane(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far
                 out[row, ix] = spectrum[row, ix] * h[ix]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _alias_gain(cycles, k, source_cells, is_alternating):
     """
     Factors ``sinc(f) * sinc(source_cells * f)`` of the aliases ``f = cycles + k``, (n_alias, n).
@@ -281,8 +273,6 @@ def _alias_gain(cycles, k, source_cells, is_alternating):
         types.float64,
         types.boolean,
     ),
-    cache=True,
-    nogil=True,
 )
 def alias_sum_plane(table, per_step, cycles, n_alias, source_cells, is_alternating):
     """As :func:`alias_sum`, for a transfer function of any form: a square of complex numbers over f_y and f_x."""
@@ -310,8 +300,6 @@ def alias_sum_plane(table, per_step, cycles, n_alias, source_cells, is_alternati
         types.float64,
         types.boolean,
     ),
-    cache=True,
-    nogil=True,
 )
 def alias_sum(table, per_step, cycles, n_alias, source_cells, is_alternating):
     """

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import (
+from foveasim._core.threads import thread_count
+from foveasim._core.validation import (
     Bools,
     Floats,
     check_choice,
@@ -29,7 +30,6 @@ from foveasim.optics._point_images import Point, PointImages
 from foveasim.optics.aberrations import LateralColour, Seidel, Zernike
 from foveasim.optics.otf import MAX_ALIASES, PlaneTables, RadialTables, TableCache, Tables
 from foveasim.optics.pupils import Pupil
-from foveasim.parallel import thread_count
 from foveasim.units import m_from_mm, m_from_um, um_from_m, um_from_nm
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, check_count, check_number, finite_array
+from foveasim._core.validation import Floats, check_count, check_number, finite_array
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid
 from foveasim.optics._aperture import Aperture

@@ -21,11 +21,10 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, Images, Ints
-from foveasim.compiled import kernels
+from foveasim._core.threads import each
+from foveasim._core.validation import Floats, Images, Ints
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.optics.otf import MAX_ALIASES
-from foveasim.parallel import each
 
 __all__ = ["Transform", "source_pixels"]
 
@@ -86,9 +85,11 @@ class Transform:
         real: type[np.floating[Any]],
         n_threads: int,
     ) -> None:
+        from foveasim.optics import _kernels
+
         self._picture_shape, self._rows, self._columns = shape, rows, columns
         self._real, self._n_threads, self._oversample = real, n_threads, oversample
-        self._kernels = kernels("optics")  # once, before there are threads
+        self._kernels = _kernels  # once, before there are threads
         self._n_rows = oversample * rows.size
         self._pitch_um = pitch_um / oversample
         f_max = f_max_per_um * self._pitch_um

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import (
+from foveasim._core.validation import (
     Floats,
     as_numbers,
     check_choice,

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, as_numbers
+from foveasim._core.validation import Floats, as_numbers
 from foveasim.optics._aperture import Aperture
 
 __all__ = ["MAX_ALIASES", "PlaneTables", "RadialTables", "Tables", "circular_otf"]

@@ -16,10 +16,19 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Bools, Floats, as_numbers, check_choice, check_count, check_number, finite_array, read_only
+from foveasim._core.validation import (
+    Bools,
+    Floats,
+    as_numbers,
+    check_choice,
+    check_count,
+    check_number,
+    finite_array,
+    read_only,
+)
+from foveasim._io.images import read_picture
 from foveasim.errors import ParameterError
 from foveasim.fields import from_file_rows
-from foveasim.pictures import read_picture
 
 __all__ = ["Annulus", "Blades", "Pupil", "PupilImage", "Slit", "Spider"]
 

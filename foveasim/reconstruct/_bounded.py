@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from foveasim.arrays import Floats
+from foveasim._core.validation import Floats
 from foveasim.errors import SimulationError
 
 __all__ = ["least_nonnegative"]

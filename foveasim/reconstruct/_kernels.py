@@ -10,7 +10,9 @@ imported; the machine code is cached on disk.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
+from numba import types
+
+from foveasim._core.jit import njit
 
 __all__ = ["add_roughness", "natural_neighbours"]
 
@@ -31,7 +33,7 @@ _points = _input(types.float64, 2)
 _table = _input(types.int64, 2)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _cross(ax, ay, bx, by):
     return ax * by - ay * bx
 
@@ -47,8 +49,6 @@ def _cross(ax, ay, bx, by):
         _points,
         types.float64[:, ::1],
     ),
-    cache=True,
-    nogil=True,
 )
 def natural_neighbours(points, start, xy, values, corners, beyond, circles, out):
     """
@@ -164,7 +164,7 @@ def natural_neighbours(points, start, xy, values, corners, beyond, circles, out)
                 area[corners[triangles[i], k]] = 0.0
 
 
-@njit(types.void(_points, types.float64, types.float64, types.float64[:, ::1]), cache=True, nogil=True)
+@njit(types.void(_points, types.float64, types.float64, types.float64[:, ::1]))
 def add_roughness(picture, weight_x, weight_y, out):
     """
     Add the gradient of half the weighted sum of squared differences between neighbouring pixels.

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from foveasim.arrays import Floats, Ints, finite_array, read_only
+from foveasim._core.rings import site_moments
+from foveasim._core.validation import Floats, Ints, finite_array, read_only
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
 from foveasim.reconstruct.picture import Picture, covered_share
-from foveasim.rings import site_moments
 
 __all__ = ["cells", "fill_channels"]
 

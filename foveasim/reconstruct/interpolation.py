@@ -11,14 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from foveasim.arrays import Floats, Ints, as_numbers, read_only
-from foveasim.compiled import kernels
+from foveasim._core.rings import site_moments
+from foveasim._core.threads import each, thread_count
+from foveasim._core.validation import Floats, Ints, as_numbers, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
-from foveasim.parallel import each, thread_count
 from foveasim.reconstruct.picture import Picture, covered_share
-from foveasim.rings import site_moments
 
 __all__ = ["linear", "natural", "site_values"]
 
@@ -151,6 +150,8 @@ class _Mesh:
         """Values at points (n, 2), (n_channel, n)."""
         from scipy.spatial import Delaunay, QhullError
 
+        from foveasim.reconstruct import _kernels
+
         points = (points_um - self.middle_um) / self.extent_um
         try:
             mesh = Delaunay(self.xy)
@@ -163,15 +164,14 @@ class _Mesh:
         beyond_hull = np.argwhere(beyond < 0)
         edges = np.stack([corners[beyond_hull[:, 0], (beyond_hull[:, 1] + k) % 3] for k in (1, 2)], axis=1)
         circles = _circles(self.xy[corners]) if is_smooth else None
-        room = kernels("reconstruct") if is_smooth else None
 
         def fill(piece: slice) -> None:
             inside = np.flatnonzero(triangle[piece] >= 0) + piece.start
             outside = np.flatnonzero(triangle[piece] < 0) + piece.start
-            if room is not None:
+            if is_smooth:
                 out = np.empty((inside.size, self.values.shape[1]))
                 home = triangle[inside]
-                room.natural_neighbours(
+                _kernels.natural_neighbours(
                     np.ascontiguousarray(points[inside]), home, self.xy, self.values, corners, beyond, circles, out
                 )
                 found[inside] = out

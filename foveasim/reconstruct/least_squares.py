@@ -16,12 +16,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, check_choice, check_count, check_number, finite_array, read_only
-from foveasim.compiled import kernels
+from foveasim._core.threads import each, thread_count
+from foveasim._core.validation import Floats, check_choice, check_count, check_number, finite_array, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
-from foveasim.parallel import each, thread_count
 from foveasim.reconstruct._bounded import least_nonnegative
 from foveasim.reconstruct.interpolation import site_values
 from foveasim.reconstruct.picture import Picture, covered_share
@@ -235,7 +234,9 @@ class _Problem:
 
     def solved(self, mu: float, start: Floats | None = None, tolerance: float | None = None) -> Floats:
         """The picture for one strength."""
-        add_roughness: Callable[..., None] = kernels("reconstruct").add_roughness
+        from foveasim.reconstruct import _kernels
+
+        add_roughness: Callable[..., None] = _kernels.add_roughness
         levels = self._levels(mu)
         mu_x, mu_y = (mu * weight for weight in self.weights)
 

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, Images, check_count, finite_array, own, unmasked
-from foveasim.encodings import encoded_srgb
+from foveasim._core.validation import Floats, Images, check_count, finite_array, own, unmasked
+from foveasim._io.encodings import encoded_srgb
+from foveasim._io.images import write_picture
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, PackedRings, to_file_rows
 from foveasim.integrate import Integrator
-from foveasim.pictures import write_picture
 
 __all__ = ["Picture", "covered_share", "raster_grid"]
 

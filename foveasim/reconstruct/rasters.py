@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from foveasim.arrays import Floats, check_count, finite_array, read_only
+from foveasim._core.validation import Floats, check_count, finite_array, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PowerMap
 from foveasim.optics import Optics

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Bools, Floats, finite_array
+from foveasim._core.validation import Bools, Floats, finite_array
 from foveasim.errors import ParameterError
 from foveasim.sensor import Sensor, linearised
 from foveasim.sensor.limits import check_plausible

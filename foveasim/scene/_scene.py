@@ -10,7 +10,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import (
+from foveasim._core.validation import (
     Floats,
     Images,
     check_choice,
@@ -23,10 +23,10 @@ from foveasim.arrays import (
     unmasked,
     wavelengths_nm,
 )
-from foveasim.encodings import Encoding, decoded
+from foveasim._io.encodings import Encoding, decoded
+from foveasim._io.images import read_picture
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import from_file_rows
-from foveasim.pictures import read_picture
 from foveasim.units import m_from_um
 
 __all__ = ["Scene"]

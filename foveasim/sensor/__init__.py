@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from foveasim.sensor._sensor import Sensor
 from foveasim.sensor.budget import FIXED, TEMPORAL, noise_budget
 from foveasim.sensor.calibration import Calibration, calibrate, linearised
 from foveasim.sensor.crosstalk import Coupling, Diffusion, KernelCrosstalk, Mixing
@@ -10,20 +9,27 @@ from foveasim.sensor.exposures import Ramp, Rates, fit_ramp, merge_exposures, no
 from foveasim.sensor.limits import LIMITS, Limits
 from foveasim.sensor.noise import draw_shot_noise
 from foveasim.sensor.presets import PRESETS
+from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import SiteSignals, signal_to_noise
-from foveasim.sensor.spectral import FilterSet, rgb_filters
-from foveasim.sensor.spectral_curves import (
+from foveasim.sensor.spectral import (
     BandMean,
     ConstantCurve,
     Curve,
+    FilterSet,
     GaussianCurve,
     PassBand,
+    PolynomialCurve,
     ProductCurve,
     SiliconQE,
+    SplineCurve,
+    StepCurve,
+    TableCurve,
+    camera_filters,
+    ccd_qe,
+    read_curve,
+    read_filters,
+    rgb_filters,
 )
-from foveasim.sensor.spectral_files import read_curve, read_filters
-from foveasim.sensor.spectral_measured import camera_filters, ccd_qe
-from foveasim.sensor.spectral_tables import PolynomialCurve, SplineCurve, StepCurve, TableCurve
 
 __all__ = [
     "FIXED",

@@ -11,7 +11,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
+from numba import types
+
+from foveasim._core.jit import njit
 
 __all__ = [
     "ADC_LINEAR",
@@ -59,7 +61,7 @@ _11 = np.uint64(11)
 _ONE_IN_2_53, _ONE_IN_2_32 = 2.0**-53, 2.0**-32
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _high_word(a, b):
     """Upper half of the product of two 64-bit numbers."""
     a_low, a_high, b_low, b_high = a & _LOW, a >> _32, b & _LOW, b >> _32
@@ -68,7 +70,7 @@ def _high_word(a, b):
     return a_high * b_high + (middle >> _32) + (low >> _32)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _philox(key_0, key_1, c0, c1, c2, c3):
     """
     Four random words of a counter and a key: Philox 4x64 with ten rounds.
@@ -84,7 +86,7 @@ def _philox(key_0, key_1, c0, c1, c2, c3):
     return c0, c1, c2, c3
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _philox_2x32(key, c0, c1):
     """Two random words of 32 bits, in 64-bit numbers: Philox 2x32 with ten rounds (as above), at a fifth of the cost."""
     for _ in range(10):
@@ -94,13 +96,13 @@ def _philox_2x32(key, c0, c1):
     return c0, c1
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _uniform(word):
     """Number between 0 and 1, neither of them."""
     return (np.float64(word >> _11) + 0.5) * _ONE_IN_2_53
 
 
-@njit(types.float64[::1](types.uint64, types.uint64, _words, _words), cache=True, nogil=True)
+@njit(types.float64[::1](types.uint64, types.uint64, _words, _words))
 def device_uniforms(key_0, key_1, first, second):
     """A number between 0 and 1 for every pair of words: always the same for the same key and pair."""
     out = np.empty(first.size, np.float64)
@@ -110,7 +112,7 @@ def device_uniforms(key_0, key_1, first, second):
     return out
 
 
-@njit(types.int64[::1](_points, _ints, _ints, _points, _points), cache=True, nogil=True)
+@njit(types.int64[::1](_points, _ints, _ints, _points, _points))
 def rays_met(xy, ring_offsets, site_offsets, centroid, directions):
     """
     Number of rays from every site's centroid that meet its outline; 0 for a site that contains its centroid.
@@ -138,7 +140,7 @@ def rays_met(xy, ring_offsets, site_offsets, centroid, directions):
     return met
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _poisson(mean, z):
     """Poisson's law at the probability of a Gaussian number: the same number gives more where more is expected."""
     share = 0.5 * math.erfc(-z * math.sqrt(0.5))
@@ -153,7 +155,7 @@ def _poisson(mean, z):
     return n
 
 
-@njit(types.void(_floats, _floats, types.float64, types.int64[::1]), cache=True, nogil=True)
+@njit(types.void(_floats, _floats, types.float64, types.int64[::1]))
 def poisson_or_gaussian(expected_e, z, gaussian_above_e, electrons):
     """Draws of Poisson's law up to a mean, and above it of the Gaussian of its mean and variance, rounded."""
     for i in range(expected_e.size):
@@ -165,12 +167,12 @@ def poisson_or_gaussian(expected_e, z, gaussian_above_e, electrons):
             electrons[i] = int(np.rint(min(max(charge, 0.0), LARGEST_CHARGE_E)))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _at(values, i):
     return values[i] if values.size > 1 else values[0]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _converted(share, way, strength, table):
     """Share of the codes for a share of the range."""
     if way == ADC_ROOT:
@@ -184,7 +186,7 @@ def _converted(share, way, strength, table):
     return share
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _share(charge, per_e, offset, v_sat_v, bend):
     """Fraction of the voltage range for a charge: nonlinearity, offset and clip."""
     v = charge * per_e
@@ -192,7 +194,7 @@ def _share(charge, per_e, offset, v_sat_v, bend):
     return min(max((v + offset) / v_sat_v, 0.0), 1.0)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _with_inl(value, n_codes, inl):
     """Add the integral non-linearity to a code before quantisation."""
     place = min(value / n_codes, 1.0) * (inl.size - 1)
@@ -200,40 +202,40 @@ def _with_inl(value, n_codes, inl):
     return value + (inl[k] + (place - k) * (inl[k + 1] - inl[k]))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _value(charge, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl):
     """Code of a charge before quantisation."""
     value = _converted(_share(charge, per_e, offset, v_sat_v, bend), way, strength, table) * n_codes
     return _with_inl(value, n_codes, inl) if inl.size > 1 else value
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _dnl_place(key, line, code, n_quantiles):
     """Position among the Gaussian quantiles of the DNL of a readout line and a code."""
     word, _ = _philox_2x32(key, np.uint64(line) & _LOW, np.uint64(code))
     return np.float64(word) * (_ONE_IN_2_32 * (n_quantiles - 1))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _between(quantiles, place):
     """Interpolate quantiles linearly."""
     k = np.uint32(place)
     return quantiles[k] + (place - k) * (quantiles[k + 1] - quantiles[k])
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _dnl_normal(key, line, code, quantiles):
     """DNL of a readout line and a code: a standard Gaussian number."""
     return _between(quantiles, _dnl_place(key, line, code, quantiles.size))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _whole(value, n_codes):
     """Quantise to a code, as float64."""
     return np.float64(int(min(max(value + CODE_ROUNDING, 0.0), n_codes - 1.0)))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _code(value, line, n_codes, dnl, dnl_key, quantiles):
     """Quantise to a code, with differential non-linearity."""
     code = _whole(value, n_codes)
@@ -242,7 +244,7 @@ def _code(value, line, n_codes, dnl, dnl_key, quantiles):
     return code
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _charge(value, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl):
     """The charge that has codes not yet whole: :func:`_value` the other way, infinite beyond its ends."""
     share_of_codes = value / n_codes
@@ -286,7 +288,7 @@ def _charge(value, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, 
     return v / per_e
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _copy(values, sites, out):
     """Copy values of a slice of sites, or the value of all, to the start of an array."""
     if values.size > 1:
@@ -318,8 +320,6 @@ def _copy(values, sites, out):
         )
         for code in (types.uint8, types.uint16)
     ],
-    cache=True,
-    nogil=True,
 )
 def read_out(
     charge_e,
@@ -381,7 +381,7 @@ def read_out(
                 codes[j] = int(_whole(value[j] + dnl * _between(quantiles, place[j]), n_codes))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _below(q, nodes, weights, n_nodes, mean, deviation, well_e, sigma, half_step):
     """
     Chance that a charge lies below ``q``.
@@ -407,7 +407,7 @@ def _below(q, nodes, weights, n_nodes, mean, deviation, well_e, sigma, half_step
     return total / n_states
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _mixture(mean, is_poisson, well_e, points, shares, nodes, weights):
     """Points and chances of a drawn charge that a well cuts off: Poisson's law, or the Gaussian by quadrature."""
     n = 0
@@ -447,8 +447,6 @@ def _mixture(mean, is_poisson, well_e, points, shares, nodes, weights):
         types.float64, types.float64, types.int64, types.float64, _floats, types.int64, _floats, types.float64, types.uint64,
         _floats, _floats, _floats, types.float64[::1], types.float64[::1],
     ),
-    cache=True,
-    nogil=True,
 )  # fmt: skip
 def predict_codes(
     mean_e, variance_e2, poisson_below_e, is_drawn, well_e, sigma_e, half_step_e, v_per_e, gain, offset_v, line_offset_v, line,

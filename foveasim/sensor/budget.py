@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from foveasim.arrays import Floats, as_numbers
+from foveasim._core.validation import Floats, as_numbers
 from foveasim.errors import ParameterError
-from foveasim.sensor._sensor import Sensor
 from foveasim.sensor.limits import check_plausible
+from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import local_step_e
 from foveasim.units import electrons_to_volts
 

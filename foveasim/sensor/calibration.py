@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Bools, Floats, as_numbers, check_count, check_number, finite_array, own, unmasked
+from foveasim._core.random_streams import Streams
+from foveasim._core.validation import Bools, Floats, as_numbers, check_count, check_number, finite_array, own, unmasked
 from foveasim.errors import ParameterError, SimulationError
-from foveasim.sensor._sensor import Sensor
-from foveasim.sensor.converter import QUANTISATION_DN2
+from foveasim.sensor.adc import QUANTISATION_DN2
 from foveasim.sensor.crosstalk import Neighbourhood
 from foveasim.sensor.limits import check_plausible, check_plausible_array
-from foveasim.streams import Streams
+from foveasim.sensor.sensor import Sensor
 from foveasim.units import volts_to_electrons
 
 if TYPE_CHECKING:

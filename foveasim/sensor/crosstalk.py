@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import (
+from foveasim._core.validation import (
     Floats,
     Ints,
     as_numbers,

@@ -25,12 +25,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, Ints, read_only
-from foveasim.compiled import kernels
+from foveasim._core.random_streams import device_key
+from foveasim._core.rings import positions_in_runs, site_moments
+from foveasim._core.validation import Floats, Ints, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import PackedRings
-from foveasim.rings import positions_in_runs, site_moments
-from foveasim.streams import device_key
 
 __all__ = ["SITE_ID", "Device"]
 
@@ -66,6 +65,8 @@ class Device:
     @cached_property
     def _sites(self) -> tuple[Words, Words]:
         """Two words for every site, that no site of another outline has."""
+        from foveasim.sensor import _kernels
+
         columns: Any = getattr(self.layout, "columns", {})
         if SITE_ID in columns:
             given = columns[SITE_ID]
@@ -77,7 +78,7 @@ class Device:
         _, centroid_um = site_moments(*rings)
         place = np.rint(centroid_um / PLACE_UM).astype(np.int64).T
         x, y = (words.view(np.uint64) for words in np.ascontiguousarray(place))
-        n_met = kernels("sensor").rays_met(*rings, np.ascontiguousarray(centroid_um), RAYS)
+        n_met = _kernels.rays_met(*rings, np.ascontiguousarray(centroid_um), RAYS)
         is_around = n_met >= FEWEST_RAYS_AROUND
         if np.any((n_met > 0) & ~is_around):
             _, which, n_here = np.unique(place, axis=1, return_inverse=True, return_counts=True)
@@ -92,7 +93,9 @@ class Device:
 
     def uniforms(self, effect: str) -> Floats:
         """A number between 0 and 1 for every site, (n_site,)."""
-        out: Floats = kernels("sensor").device_uniforms(*self.key(effect), *self._sites)
+        from foveasim.sensor import _kernels
+
+        out: Floats = _kernels.device_uniforms(*self.key(effect), *self._sites)
         return out
 
     def normals(self, effect: str) -> Floats:
@@ -115,8 +118,10 @@ class Device:
         """A number of the standard Gaussian law for each of some lines."""
         from scipy.special import ndtri
 
+        from foveasim.sensor import _kernels
+
         words = np.ascontiguousarray(lines, np.int64).view(np.uint64)
-        return np.asarray(ndtri(kernels("sensor").device_uniforms(*self.key(effect), words, np.zeros_like(words))))
+        return np.asarray(ndtri(_kernels.device_uniforms(*self.key(effect), words, np.zeros_like(words))))
 
 
 #: Odd factors of the two words of an outline, and of its coordinates (fractions of 2**64 of the golden ratio and others).

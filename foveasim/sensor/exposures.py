@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Ints, as_numbers, own, unmasked
+from foveasim._core.random_streams import Streams
+from foveasim._core.validation import Floats, Ints, as_numbers, own, unmasked
 from foveasim.errors import ParameterError
-from foveasim.sensor._sensor import Sensor
+from foveasim.sensor.adc import QUANTISATION_DN2
 from foveasim.sensor.calibration import Calibration, linearised, nominal_e_per_dn
-from foveasim.sensor.converter import QUANTISATION_DN2
 from foveasim.sensor.limits import check_plausible_array
 from foveasim.sensor.noise import LARGEST_CHARGE_E, draw_shot_noise
-from foveasim.streams import Streams
+from foveasim.sensor.sensor import Sensor
 
 __all__ = ["Ramp", "Rates", "fit_ramp", "merge_exposures", "non_destructive_reads"]
 

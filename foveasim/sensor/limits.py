@@ -13,7 +13,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import check_number, finite_array, unit_of
+from foveasim._core.validation import check_number, finite_array, unit_of
 from foveasim.errors import ParameterError
 
 __all__ = ["LIMITS", "MAX_SPREAD", "Limits", "check_plausible", "check_plausible_array"]

@@ -7,10 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from foveasim.arrays import Floats, Ints, unmasked
-from foveasim.compiled import kernels
-from foveasim.parallel import each, thread_count
-from foveasim.streams import Streams
+from foveasim._core.random_streams import Streams
+from foveasim._core.threads import each, thread_count
+from foveasim._core.validation import Floats, Ints, unmasked
 
 __all__ = ["BLOCK_SITES", "ShotNoise", "draw_shot_noise", "in_blocks", "pieces"]
 
@@ -65,12 +64,14 @@ def draw_shot_noise(
     electrons : (n_site,) int64, e-
         Never below 0. Mean and variance are those of Poisson on both sides of the switch.
     """
+    from foveasim.sensor import _kernels
+
     expected_e = unmasked("expected_e", expected_e)
     if how == "off":
         return np.rint(np.clip(expected_e, 0.0, LARGEST_CHARGE_E)).astype(np.int64)
     electrons = np.empty(expected_e.size, np.int64)
     expected_e = np.ascontiguousarray(expected_e, np.float64)
-    draw = kernels("sensor").poisson_or_gaussian
+    draw = _kernels.poisson_or_gaussian
 
     def block(number: int, sites: slice) -> None:
         generator = streams.of("shot", number)

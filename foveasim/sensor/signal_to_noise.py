@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Bools, Floats
-from foveasim.sensor._sensor import Sensor
-from foveasim.sensor.converter import QUANTISATION_DN2
+from foveasim._core.validation import Bools, Floats
+from foveasim.sensor.adc import QUANTISATION_DN2
+from foveasim.sensor.sensor import Sensor
 from foveasim.units import electrons_to_volts
 
 __all__ = ["SiteSignals", "local_step_e", "signal_to_noise"]

@@ -9,7 +9,7 @@ Videos: frames of light from pictures, files and moving gazes; captures as zarr 
 
 from __future__ import annotations
 
-from foveasim.video.footage import Footage
+from foveasim.video.frame_source import Footage
 from foveasim.video.gaze import GazePath, look, look_around, saccades
 from foveasim.video.recording import Recording, frames_kept, partial_of, read_recording
 from foveasim.video.writing import write_video

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, check_number, check_shape, finite_array, read_only
+from foveasim._core.random_streams import Streams
+from foveasim._core.validation import Floats, check_number, check_shape, finite_array, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import PowerMap
 from foveasim.optics import Optics
 from foveasim.scene import Scene
-from foveasim.streams import Streams
 
 __all__ = ["GazePath", "look", "look_around", "saccades"]
 

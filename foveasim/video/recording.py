@@ -15,14 +15,14 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, check_count
+from foveasim._core.provenance import described, differences
+from foveasim._core.validation import Floats, check_count
+from foveasim._io.atomic import folder_written_whole, lock
+from foveasim._io.zarr_stores import ZARR, check_codecs, library
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
-from foveasim.files import folder_written_whole, lock
 from foveasim.layout import Layout
 from foveasim.layout.packed import packed_layout
-from foveasim.records import described, differences
-from foveasim.stores import ZARR, check_codecs, library
 
 __all__ = [
     "Recording",

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import check_count, check_number
+from foveasim._core.validation import check_count, check_number
+from foveasim._io.atomic import folder_written_whole, written_whole
+from foveasim._io.images import write_picture
+from foveasim._io.zarr_stores import ZARR, library
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid
-from foveasim.files import folder_written_whole, written_whole
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
-from foveasim.pictures import write_picture
 from foveasim.reconstruct import Picture, fill_channels, raster_grid
 from foveasim.reconstruct.picture import covered_share
-from foveasim.stores import ZARR, library
 from foveasim.video.recording import alike, frames_kept, record, record_on
 
 __all__ = ["write_video"]
@@ -123,7 +123,7 @@ def write_video(
 def _told(captures: Iterable[Capture], n_frames: int | None, n_before: int) -> Iterator[Capture]:
     from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    from foveasim.terminal import PlainConsole, spinner_of
+    from foveasim._io.terminal import PlainConsole, spinner_of
 
     console = PlainConsole()
     spinner = SpinnerColumn(spinner_of(console))

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from foveasim.view.id_map import SitePixels, id_map, site_at
 from foveasim.view.meshes import Mesh, polydata, prisms
-from foveasim.view.palette import SiteColours, colours_of, site_colours
 from foveasim.view.plots import plot_capture, plot_layout, plot_noise_budget, save_drawing, save_figure
-from foveasim.view.probe import find_renderer
+from foveasim.view.render3d import Viewpoint, render, show, sites_in_view
+from foveasim.view.renderer import find_renderer
 from foveasim.view.rule_plots import plot_report
+from foveasim.view.site_colours import SiteColours, colours_of, site_colours
 from foveasim.view.solids import PartReport, SensorStack, Solids, SolidsReport, solids, stack, write_meshes
-from foveasim.view.stills import Viewpoint, render, show, sites_in_view
 from foveasim.view.web import solid_page, web_page, write_solid_page, write_web_page
 
 __all__ = [

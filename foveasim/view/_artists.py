@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from foveasim.layout import Layout
 from foveasim.view.id_map import SitePixels, site_at
-from foveasim.view.palette import BORDER, SiteColours
+from foveasim.view.site_colours import BORDER, SiteColours
 
 __all__ = ["ScaleBar", "SiteImage", "length_text", "nice_length_um"]
 

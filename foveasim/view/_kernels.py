@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
+from numba import types
+
+from foveasim._core.jit import njit
 
 __all__ = ["blended", "paint_sites", "rows_of_sites"]
 
@@ -18,14 +20,14 @@ _colours = types.Array(types.uint8, 2, "C", readonly=True)
 SMALLEST = 1e-200
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _per_length(samples):
     """How many evenly spaced samples there are in a unit of length; any number where there is but one."""
     length = samples[-1] - samples[0]
     return (samples.size - 1) / length if length > SMALLEST else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _first_at(samples, per_length, value):
     """Index of the first of the evenly spaced, rising samples that is at or beyond a value; exact."""
     if value <= samples[0]:
@@ -41,7 +43,7 @@ def _first_at(samples, per_length, value):
     return k
 
 
-@njit(types.void(_points, _ints, _floats, _floats, types.int64, types.int32[:, ::1]), cache=True, nogil=True)
+@njit(types.void(_points, _ints, _floats, _floats, types.int64, types.int32[:, ::1]))
 def rows_of_sites(xy, starts, x, y, first, rows):
     """
     First row and end of the rows of samples that each site reaches: empty when it lies between rows, or beside all columns.
@@ -60,9 +62,7 @@ def rows_of_sites(xy, starts, x, y, first, rows):
             rows[i, 1] = _first_at(y, per_y, high_y)
 
 
-@njit(
-    types.void(_points, _ints, _ints, _ids, _floats, _floats, types.int64, types.int32[:, ::1]), cache=True, nogil=True
-)
+@njit(types.void(_points, _ints, _ints, _ids, _floats, _floats, types.int64, types.int32[:, ::1]))
 def paint_sites(xy, ring_offsets, site_offsets, rows, x, y, first_row, ids):
     """
     Write the index of the site over each sample of a band of rows, the highest one where several are; others stay.
@@ -107,9 +107,7 @@ def paint_sites(xy, ring_offsets, site_offsets, rows, x, y, first_row, ids):
             left[r], right[r] = n_columns + 1, -1
 
 
-@njit(
-    types.void(_ids, _colours, types.int64, types.boolean, types.int64, types.uint8[:, :, ::1]), cache=True, nogil=True
-)
+@njit(types.void(_ids, _colours, types.int64, types.boolean, types.int64, types.uint8[:, :, ::1]))
 def blended(ids, colours, n_samples, has_borders, first_row, band):
     """
     Mean colour of the ``n_samples`` x ``n_samples`` samples of each pixel of a band of rows: red, green, blue, alpha.

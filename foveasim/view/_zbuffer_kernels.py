@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
+from numba import types
+
+from foveasim._core.jit import njit
 
 __all__ = ["draw_triangles"]
 
@@ -16,8 +18,6 @@ ON_EDGE = 1e-9
 
 @njit(
     types.void(_points, _triangles, types.int32, types.int64, types.int64, types.float64[:, ::1], types.int32[:, ::1]),
-    cache=True,
-    nogil=True,
 )
 def draw_triangles(screen, triangles, first_id, first_row, end_row, nearness, ids):
     """

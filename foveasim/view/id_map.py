@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, check_count, check_shape, finite_array, read_only, unmasked
-from foveasim.compiled import kernels
+from foveasim._core.threads import each, thread_count
+from foveasim._core.validation import Floats, check_count, check_shape, finite_array, read_only, unmasked
 from foveasim.errors import ParameterError
 from foveasim.fields import PackedRings
-from foveasim.parallel import each, thread_count
-from foveasim.view.palette import BACKGROUND, Rgb
+from foveasim.view.site_colours import BACKGROUND, Rgb
 
 __all__ = ["SitePixels", "id_map", "site_at"]
 
@@ -179,6 +178,8 @@ class SitePixels:
         ParameterError
             When there are fewer colours than sites in the picture, or they are no bytes.
         """
+        from foveasim.view import _kernels
+
         rgb = np.asarray(unmasked("rgb", rgb))
         highest = int(self.ids.max(initial=-1))
         if rgb.dtype != np.uint8 or rgb.ndim != 2 or rgb.shape[1] != 3 or rgb.shape[0] <= highest:
@@ -193,7 +194,7 @@ class SitePixels:
         n, n_threads = self.n_samples, thread_count(n_threads)
 
         def blend(rows: slice) -> None:
-            kernels("view").blended(self.ids, table, n, border is not None, rows.start, picture[rows])
+            _kernels.blended(self.ids, table, n, border is not None, rows.start, picture[rows])
 
         each(blend, _bands(self.shape[0], n_threads), n_threads)
         return picture if background is None else picture[..., :3]
@@ -234,17 +235,18 @@ def _bands(n_rows: int, n_threads: int) -> list[slice]:
 
 def _sites_at(layout: PackedRings, x_um: Floats, y_um: Floats, n_threads: int) -> NDArray[np.int32]:
     """The site at each sample of rising columns and rows, (n_y, n_x) int32."""
-    view = kernels("view")
+    from foveasim.view import _kernels
+
     n_sites = layout.site_offsets.size - 1
     starts = layout.ring_offsets[layout.site_offsets]
     rows = np.empty((n_sites, 2), np.int32)
     ids = np.full((y_um.size, x_um.size), -1, np.int32)
 
     def find(first: int) -> None:
-        view.rows_of_sites(layout.xy_um, starts, x_um, y_um, first, rows[first : first + CHUNK_SITES])
+        _kernels.rows_of_sites(layout.xy_um, starts, x_um, y_um, first, rows[first : first + CHUNK_SITES])
 
     def paint(band: slice) -> None:
-        view.paint_sites(
+        _kernels.paint_sites(
             layout.xy_um, layout.ring_offsets, layout.site_offsets, rows, x_um, y_um, band.start, ids[band]
         )
 

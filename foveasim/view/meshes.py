@@ -15,14 +15,14 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Bools, Floats, Ints, as_numbers, check_length_um, finite_array, unmasked
+from foveasim._core.provenance import described
+from foveasim._core.rings import next_vertex, positions_in_runs
+from foveasim._core.threads import each, thread_count
+from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_length_um, finite_array, unmasked
 from foveasim.capture import Capture
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout import Layout
-from foveasim.parallel import each, thread_count
-from foveasim.records import described
-from foveasim.rings import next_vertex, positions_in_runs
-from foveasim.view.palette import colours_of
+from foveasim.view.site_colours import colours_of
 
 if TYPE_CHECKING:
     from pyvista import PolyData

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, check_choice, unmasked
+from foveasim._core.validation import Floats, check_choice, unmasked
+from foveasim._io.atomic import written_whole
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
-from foveasim.files import written_whole
 from foveasim.layout import Layout, readout_order
 from foveasim.view.id_map import site_at
-from foveasim.view.palette import BACKGROUND, BORDER, CATEGORY_COLOURS, SiteColours, colours_of, shares
+from foveasim.view.site_colours import BACKGROUND, BORDER, CATEGORY_COLOURS, SiteColours, colours_of, shares
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

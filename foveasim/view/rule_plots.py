@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from foveasim.errors import ParameterError
 from foveasim.layout import Layout
-from foveasim.layout.rules import Report, RuleResult
+from foveasim.layout.drc.rules import Report, RuleResult
 from foveasim.view.plots import new_axes, plot_layout
 
 if TYPE_CHECKING:

@@ -28,15 +28,15 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim.arrays import Floats, Ints, check_count, check_length_um, check_number
+from foveasim._core.rings import next_vertex, positions_in_runs
+from foveasim._core.validation import Floats, Ints, check_count, check_length_um, check_number
+from foveasim._io.atomic import written_whole
 from foveasim.capture import Capture
 from foveasim.errors import FileError, GeometryError, ParameterError
-from foveasim.files import written_whole
 from foveasim.layout import Layout, inset
 from foveasim.layout._regions import as_region
-from foveasim.rings import next_vertex, positions_in_runs
 from foveasim.view.meshes import FLAT_SHARE, Mesh, extruded, triangulated
-from foveasim.view.palette import colours_of
+from foveasim.view.site_colours import colours_of
 
 __all__ = ["PartReport", "SensorStack", "Solids", "SolidsReport", "solids", "stack", "write_meshes"]
 

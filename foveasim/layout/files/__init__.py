@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 from foveasim.errors import FileError, ParameterError
-from foveasim.layout._model import Layout
 from foveasim.layout.files._bundled import layout_path, shipped_layouts
 from foveasim.layout.files._common import WrittenLayout, head_of
 from foveasim.layout.files.gds import GDS_MAGIC, OASIS_MAGIC
@@ -39,6 +38,7 @@ from foveasim.layout.files.npz import MAGICS as NPZ_MAGICS
 from foveasim.layout.files.npz import read as read_npz
 from foveasim.layout.files.npz import write as write_npz
 from foveasim.layout.files.svg import write as write_svg
+from foveasim.layout.model import Layout
 
 __all__ = ["WrittenLayout", "check_chip_options", "layout_path", "read_layout", "shipped_layouts", "write_layout"]
 

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Bools, exact_integers
-from foveasim.layout._model import Layout
+from foveasim._core.validation import Bools, exact_integers
+from foveasim.layout.model import Layout
 
 __all__ = ["CHANNEL", "MAX_COLUMN_BYTES", "columns_of", "kept_columns", "texts_of"]
 

@@ -12,11 +12,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from foveasim.arrays import MAX_SITES, Floats
+from foveasim._core.provenance import described
+from foveasim._core.rings import site_area_um2
+from foveasim._core.validation import MAX_SITES, Floats
 from foveasim.errors import FileError, FoveasimError, GeometryError, ParameterError
-from foveasim.layout._model import Layout
-from foveasim.records import described
-from foveasim.rings import site_area_um2
+from foveasim.layout.model import Layout
 
 __all__ = [
     "WrittenLayout",

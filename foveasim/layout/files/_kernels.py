@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
+from numba import types
+
+from foveasim._core.jit import njit
 
 __all__ = ["walk_records"]
 
@@ -11,7 +13,7 @@ _bytes = types.Array(types.uint8, 1, "C", readonly=True)
 _flags = types.Array(types.boolean, 1, "C", readonly=True)
 
 
-@njit(types.UniTuple(types.int64, 2)(_bytes, _flags, types.int64), cache=True, nogil=True)
+@njit(types.UniTuple(types.int64, 2)(_bytes, _flags, types.int64))
 def walk_records(data, is_known, last):
     """
     Walk to the end of the record that has the number ``last``, to a record that is none, or to the end of the data.

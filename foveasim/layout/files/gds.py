@@ -36,11 +36,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from foveasim.arrays import MAX_SITES, Floats, Ints, check_count, check_number
-from foveasim.compiled import kernels
+from foveasim._core.rings import positions_in_runs, ring_moments
+from foveasim._core.validation import MAX_SITES, Floats, Ints, check_count, check_number
+from foveasim._io.atomic import written_whole
 from foveasim.errors import FileError, GeometryError, ParameterError
-from foveasim.files import written_whole
-from foveasim.layout._model import Layout, valid_sites
 from foveasim.layout.files._columns import MAX_COLUMN_BYTES, columns_of, kept_columns, texts_of
 from foveasim.layout.files._common import (
     WrittenLayout,
@@ -50,7 +49,7 @@ from foveasim.layout.files._common import (
     one_sentence,
     rounding,
 )
-from foveasim.rings import positions_in_runs, ring_moments
+from foveasim.layout.model import Layout, valid_sites
 
 __all__ = ["GDS_MAGIC", "OASIS_MAGIC", "read", "write"]
 
@@ -355,10 +354,12 @@ def read(path: Path, *, layer: int | None = None, cell: str | None = None) -> La
 
 def _check_records(path: Path, data: bytes) -> None:
     """Records of GDSII must have lengths that lead to the end of the library, and types that are known."""
+    from foveasim.layout.files import _kernels
+
     is_known = np.zeros(2**16, bool)
     for kind, records in RECORDS_OF_TYPE.items():
         is_known[[record << 8 | kind for record in records]] = True
-    at, record = kernels("layout.files").walk_records(np.frombuffer(data, np.uint8), is_known, END_OF_LIBRARY)
+    at, record = _kernels.walk_records(np.frombuffer(data, np.uint8), is_known, END_OF_LIBRARY)
     if record == -1:
         raise FileError(path, f"is broken: byte {at} begins no GDSII record")
     if record != END_OF_LIBRARY or at > len(data):

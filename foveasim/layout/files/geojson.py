@@ -20,10 +20,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from foveasim.arrays import Floats, Ints, exact_integers
+from foveasim._core.validation import Floats, Ints, exact_integers
+from foveasim._io.atomic import written_whole
 from foveasim.errors import FileError
-from foveasim.files import written_whole
-from foveasim.layout._model import Layout
 from foveasim.layout.files._common import (
     WrittenLayout,
     check_header,
@@ -37,6 +36,7 @@ from foveasim.layout.files._common import (
     restored_column,
     texts,
 )
+from foveasim.layout.model import Layout
 
 __all__ = ["read", "write"]
 

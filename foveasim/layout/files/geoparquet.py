@@ -15,9 +15,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from foveasim._io.atomic import written_whole
 from foveasim.errors import FileError, ParameterError
-from foveasim.files import written_whole
-from foveasim.layout._model import Layout
 from foveasim.layout.files._common import (
     WrittenLayout,
     check_header,
@@ -33,6 +32,7 @@ from foveasim.layout.files._common import (
     restored_column,
     texts,
 )
+from foveasim.layout.model import Layout
 
 __all__ = ["MAGIC", "read", "write"]
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from foveasim.archives import read_archive, write_archive
+from foveasim._core.rings import ring_moments
+from foveasim._io.npz import read_archive, write_archive
 from foveasim.errors import FileError
-from foveasim.layout._model import Layout
 from foveasim.layout.files._common import (
     WrittenLayout,
     check_header,
@@ -18,8 +18,8 @@ from foveasim.layout.files._common import (
     max_unpacked,
     one_sentence,
 )
+from foveasim.layout.model import Layout
 from foveasim.layout.packed import is_of_layout, packed_layout, unpacked_layout
-from foveasim.rings import ring_moments
 
 __all__ = ["MAGICS", "read", "write"]
 

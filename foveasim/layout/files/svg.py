@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from foveasim.arrays import check_count
+from foveasim._core.validation import check_count
+from foveasim._io.atomic import written_whole
 from foveasim.errors import ParameterError
-from foveasim.files import written_whole
-from foveasim.layout._model import Layout
 from foveasim.layout.files._common import WrittenLayout, rounding
+from foveasim.layout.model import Layout
 
 __all__ = ["write"]
 

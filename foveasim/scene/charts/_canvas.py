@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import (
+from foveasim._core.validation import (
     Bools,
     Floats,
     check_choice,

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from foveasim.arrays import Floats, check_choice, read_only, wavelengths_nm
+from foveasim._core.validation import Floats, check_choice, read_only, wavelengths_nm
 from foveasim.errors import ParameterError
 
 __all__ = ["PATCH_NAMES", "Illuminant", "illuminant", "light_of", "nonnegative_factors", "patch_reflectance"]

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from foveasim.arrays import Floats, check_count, check_number, check_shape
+from foveasim._core.validation import Floats, check_count, check_number, check_shape
 from foveasim.errors import ParameterError
 from foveasim.scene._scene import GREY_NM, Scene
 from foveasim.scene.charts._canvas import (

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from foveasim.arrays import Floats, check_count, check_number
+from foveasim._core.validation import Floats, check_count, check_number
 from foveasim.scene._scene import GREY_NM, Scene
 from foveasim.scene.charts._canvas import Canvas, OneOrMore, Shares, add_rectangle
 from foveasim.scene.charts._colours import (

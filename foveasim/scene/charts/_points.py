@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from foveasim.arrays import check_number, check_shape
+from foveasim._core.validation import check_number, check_shape
 from foveasim.errors import ParameterError
 from foveasim.scene._scene import GREY_NM, Scene
 from foveasim.scene.charts._canvas import Canvas, OneOrMore

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from foveasim.arrays import Floats, check_choice, check_count, check_number
+from foveasim._core.validation import Floats, check_choice, check_count, check_number
 from foveasim.scene._scene import GREY_NM, Scene
 from foveasim.scene.charts._canvas import Canvas, OneOrMore, checked_contrast, half_plane, sampled
 

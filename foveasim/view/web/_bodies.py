@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Ints
+from foveasim._core.rings import positions_in_runs
+from foveasim._core.validation import Ints
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.layout import Layout
-from foveasim.rings import positions_in_runs
 from foveasim.view.meshes import Mesh
 from foveasim.view.web._pack import back_references, smallest
 

@@ -11,12 +11,12 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from foveasim.arrays import UNIT_SUFFIXES, Floats
+from foveasim._core.validation import UNIT_SUFFIXES, Floats
 from foveasim.capture import Capture
 from foveasim.errors import GeometryError, ParameterError, SimulationError
 from foveasim.layout import Layout, Report
 from foveasim.view.id_map import SitePixels
-from foveasim.view.palette import (
+from foveasim.view.site_colours import (
     CATEGORY_COLOURS,
     DISPLAY_GAMMA,
     FILTER_COLOURS,

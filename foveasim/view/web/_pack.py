@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim.arrays import Ints
+from foveasim._core.validation import Ints
 
 __all__ = ["back_references", "packed", "smallest"]
 

@@ -13,9 +13,9 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from foveasim._io.atomic import written_whole
 from foveasim.capture import Capture
 from foveasim.errors import FileError
-from foveasim.files import written_whole
 from foveasim.layout import Layout, Report
 from foveasim.view.web._content import content_of
 from foveasim.view.web._pack import packed

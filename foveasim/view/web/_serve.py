@@ -9,7 +9,7 @@ from collections.abc import Callable
 from http import HTTPStatus
 from pathlib import Path
 
-from foveasim.arrays import check_count
+from foveasim._core.validation import check_count
 from foveasim.errors import ParameterError
 
 __all__ = ["open_page", "serve_page"]

@@ -9,9 +9,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from foveasim.arrays import Bools, Floats, Ints
+from foveasim._core.rings import next_vertex, positions_in_runs
+from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.layout import Layout
-from foveasim.rings import next_vertex, positions_in_runs
 
 __all__ = ["Shapes", "shapes_of"]
 

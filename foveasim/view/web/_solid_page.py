@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from foveasim._io.atomic import written_whole
 from foveasim.capture import Capture
-from foveasim.files import written_whole
 from foveasim.layout import Layout
 from foveasim.view.meshes import Mesh, prisms
 from foveasim.view.solids import Solids

@@ -1,0 +1,1 @@
+"""What every part uses: checks of arguments, packed rings, random streams, threads, compiled kernels, provenance."""

@@ -1,0 +1,87 @@
+"""What a result was made from, as plain data that can be written to a file and compared: settings and versions."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from foveasim._core.validation import own
+from foveasim._version import __version__
+
+__all__ = ["copied", "described", "differences", "versions"]
+
+#: Arrays up to this size are written out; of longer ones the shape and a checksum are kept.
+WRITTEN_OUT = 64
+_ATOMS = frozenset({str, int, float, bool, type(None)})
+
+
+def described(value: Any) -> Any:
+    """
+    Plain data (numbers, text, lists, dicts) that tells what an object is.
+
+    A dataclass becomes a dict of its fields and its class; a long array its shape, type and SHA-256.
+    """
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        if value.size <= WRITTEN_OUT:
+            return value.tolist()
+        digest = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+        return {"shape": list(value.shape), "dtype": str(value.dtype), "sha256": digest}
+    if isinstance(value, Mapping):
+        return {str(key): described(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [described(item) for item in value]
+    if is_dataclass(value):
+        return {
+            "kind": type(value).__name__,
+            **{f.name: described(getattr(value, f.name)) for f in fields(value) if not f.name.startswith("_")},
+        }
+    return repr(value)
+
+
+def copied(value: Any) -> Any:
+    """Plain data as new dicts and lists all the way down: editing the copy leaves the original as it was."""
+    # Plain classes first: the general ones take several times as long, and every frame of a video has such data.
+    if type(value) in _ATOMS:
+        return value
+    if isinstance(value, dict | Mapping):
+        return {key: copied(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [copied(item) for item in value]
+    if type(value) is tuple:
+        return tuple(copied(item) for item in value)
+    return own(value) if isinstance(value, np.ndarray) else value
+
+
+def differences(one: Any, other: Any, place: str = "") -> Iterator[str]:
+    """Dotted names of the places in which plain data differ: ``optics.f_number``."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        for key in dict.fromkeys([*one, *other]):
+            inside = f"{place}.{key}" if place else str(key)
+            if key not in one or key not in other:
+                yield inside
+            else:
+                yield from differences(one[key], other[key], inside)
+    elif one != other:
+        yield place or "plan"
+
+
+@cache
+def _versions() -> dict[str, str]:
+    libraries = {name: version(name) for name in ("numpy", "scipy", "numba", "shapely")}
+    return {"foveasim": __version__, "python": platform.python_version(), **libraries}
+
+
+def versions() -> dict[str, str]:
+    """Versions of the package, of Python, and of the libraries that results depend on."""
+    return dict(_versions())

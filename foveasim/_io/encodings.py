@@ -1,0 +1,28 @@
+"""What the numbers of a picture stand for: light from encoded values, and encoded values from light."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from foveasim._core.validation import Floats
+
+__all__ = ["Encoding", "decoded", "encoded_srgb"]
+
+#: sRGB (photographs), the square root of the radiance (the paper), the radiance itself.
+Encoding = Literal["srgb", "sqrt", "linear"]
+
+
+def decoded(values: Floats, encoding: Encoding) -> Floats:
+    """Relative radiance of encoded values from 0; sRGB as in IEC 61966-2-1, continued above 1."""
+    if encoding == "sqrt":
+        return values * values
+    if encoding == "srgb":
+        return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    return values
+
+
+def encoded_srgb(values: Floats) -> Floats:
+    """Values of relative radiance from 0 as a screen expects them, IEC 61966-2-1."""
+    return np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1.0 / 2.4) - 0.055)

@@ -1,0 +1,491 @@
+"""
+Picture files, in and out: what a photograph's file holds as an array, and arrays as files.
+
+Arrays here are as one sees the picture: (n_y, n_x) or (n_y, n_x, n_channel), the first row on top.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import struct
+import warnings
+import zlib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._core.validation import unmasked
+from foveasim._io.atomic import written_whole
+from foveasim._io.sandbox import read_apart
+from foveasim.errors import FileError, disk_problem
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+__all__ = [
+    "PICTURE_ENDINGS",
+    "check_picture_size",
+    "picture_names",
+    "pixels_of_image",
+    "pixels_of_page",
+    "read_picture",
+    "write_picture",
+]
+
+#: Larger pictures are refused: 2**28 pixels are 3 GiB as three float32 channels.
+MAX_PIXELS = 2**28
+#: What a small EXR may unpack to, and for each byte of a larger one: deflate packs no better.
+MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**28, 1032
+#: Formats that Pillow is asked for; its other readers are for files that are no pictures of scenes.
+PILLOW_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "PPM", "JPEG2000", "TGA")
+#: Pillow's modes that hold the numbers of the file as they are, and what others are converted to.
+PLAIN_MODES = ("L", "LA", "RGB", "RGBA", "F")
+CONVERTED_MODES = {
+    "1": "L",
+    "PA": "RGBA",
+    "La": "LA",
+    "RGBa": "RGBA",
+    "I;16": "I",
+    "I;16B": "I",
+    "I;16L": "I",
+    "I": "I",
+}
+#: Beginnings of PNG and of what is packed in JPEG 2000, and what ends that, and JPEG.
+PNG_MAGIC, JPEG2000_MAGIC, END_MARKER = b"\x89PNG\r\n\x1a\n", b"\xff\x4f\xff\x51", b"\xff\xd9"
+#: Marker of JPEG behind whose segment the numbers begin, and the length of a marker.
+START_OF_SCAN, MARKER_BYTES = 0xDA, 2
+#: Tag of TIFF and EXIF that tells how the camera was held.
+ORIENTATION_TAG = 274
+TIFF_ENDINGS = (".tif", ".tiff")
+#: Endings of the pictures that a folder is searched for.
+PICTURE_ENDINGS = (".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga", *TIFF_ENDINGS, ".webp")
+
+
+def picture_names(names: Iterable[str]) -> list[str]:
+    """Those that are pictures', in their natural order, ``2.png`` before ``10.png``; hidden files are none."""
+    pictures = (
+        name
+        for name in names
+        if PurePosixPath(name).suffix.lower() in PICTURE_ENDINGS
+        and not any(part.startswith((".", "__MACOSX")) for part in PurePosixPath(name).parts)
+    )
+
+    def key(name: str) -> tuple[list[tuple[int, str]], str]:
+        # Of whole numbers without the zeros before them the longer is the larger; where all are equal, the names decide.
+        pieces = enumerate(re.split(r"([0-9]+)", name))
+        return [(len(n := p.lstrip("0")), n) if k % 2 else (-1, p) for k, p in pieces if p], name
+
+    return sorted(set(pictures), key=key)
+
+
+def read_picture(path: str | Path) -> NDArray[Any]:
+    """
+    The numbers in a picture file.
+
+    Parameters
+    ----------
+    path : path
+        PNG, JPEG, TIFF, WebP, BMP, GIF, PPM, JPEG 2000, Radiance HDR; with the extra ``pictures`` also EXR.
+
+    Returns
+    -------
+    picture : (n_y, n_x) or (n_y, n_x, n_channel), uint8, uint16 or float32
+        First row on top; 1 to 4 channels: grey, grey and alpha, colour, colour and alpha. Palettes are resolved, and a
+        camera's note of how it was held is followed.
+
+    Raises
+    ------
+    FileError
+        When the file is missing, no picture, cut short, too large, or holds several pictures.
+
+    Notes
+    -----
+    A changed bit is found where the format has checksums: in PNG, and in EXR and TIFF packed with deflate. EXR is read by a
+    program of its own, which a broken file can end.
+    """
+    path = Path(path)
+    try:
+        if not path.is_file():
+            raise FileError(path, "is not a file" if path.exists() else "no such file")
+        with path.open("rb") as file:
+            head = file.read(32)
+    except OSError as error:
+        raise FileError(path, f"cannot be opened: {error.strerror or error}") from None
+    try:
+        picture = _reader_of(head)(path)
+    except FileError:
+        raise
+    except Exception as error:  # noqa: BLE001 -- readers raise whatever a broken file made them trip over
+        raise FileError(
+            path, f"is broken or cut short ({' '.join(str(error).split()) or type(error).__name__})"
+        ) from None
+    if picture.ndim not in (2, 3) or 0 in picture.shape or (picture.ndim == 3 and picture.shape[2] > 4):
+        raise FileError(path, f"must be one picture of 1 to 4 channels, got an array of the shape {picture.shape}")
+    return picture
+
+
+def _reader_of(head: bytes) -> Any:
+    """The reader for a file that begins with these bytes."""
+    if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        return _read_tiff
+    if head[:8] == PNG_MAGIC and head[24:25] == b"\x10":
+        return _read_deep_png
+    if head[:4] == b"\x76\x2f\x31\x01":
+        return _read_exr
+    if head[:2] == b"#?":
+        return _read_radiance
+    return _read_with_pillow
+
+
+# -- readers: each gives the numbers of the file, upright, or raises anything ----------------------------------------
+
+
+def _read_with_pillow(path: Path) -> NDArray[Any]:
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with _pillow_limit(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about notes beside the picture
+            with Image.open(path, formats=PILLOW_FORMATS) as image:
+                check_picture_size(path, image.width, image.height)
+                n_pictures = getattr(image, "n_frames", 1)
+                if n_pictures > 1 and image.format != "MPO":  # phones put small pictures behind the photograph
+                    raise FileError(path, f"holds {n_pictures} pictures; give a file with one")
+                _check_whole(path, str(image.format))
+                return pixels_of_image(image)
+    except UnidentifiedImageError:
+        raise FileError(path, "is not a picture in a format that can be read") from None
+    except Image.DecompressionBombError:
+        raise FileError(path, f"has more than {MAX_PIXELS} pixels") from None
+
+
+def pixels_of_image(image: Image.Image) -> NDArray[Any]:
+    """
+    The numbers of one of Pillow's images, as :func:`read_picture` gives them.
+
+    Raises
+    ------
+    Exception
+        Whatever a broken file, or a mode that has no colours, makes Pillow trip over.
+    """
+    image.load()  # Pillow turns TIFF by itself, and then takes the note away
+    orientation = _orientation(image)
+    plain = _plain(image)
+    numbers = np.asarray(plain)
+    if plain.mode == "I":
+        is_16_bit = numbers.min() >= 0 and numbers.max() <= np.iinfo(np.uint16).max
+        numbers = numbers.astype(np.uint16 if is_16_bit else np.float32)
+    return _upright(numbers, orientation)
+
+
+def _check_whole(path: Path, kind: str) -> None:
+    """Refuse what Pillow takes for whole: it passes over the sums of PNG, and does not always miss an end."""
+    if kind not in ("PNG", "JPEG", "MPO", "JPEG2000"):
+        return
+    content = path.read_bytes()
+    if kind == "PNG":
+        is_whole = _has_true_sums(content)
+    else:
+        begin = content.find(JPEG2000_MAGIC) if kind == "JPEG2000" else _first_scan(content)
+        # Packed numbers are so written that they never hold the marker.
+        is_whole = content.find(END_MARKER, max(begin, 0)) >= 0
+    if not is_whole:
+        raise FileError(path, "is broken or cut short")
+
+
+def _has_true_sums(content: bytes) -> bool:
+    """Whether the chunks of a PNG that hold its picture have the checksums that they tell."""
+    place, view = len(PNG_MAGIC), memoryview(content)
+    while place + 12 <= len(content):
+        begin = place + 4
+        end = begin + 4 + int.from_bytes(view[place:begin])
+        told = int.from_bytes(view[end : end + 4])
+        if content.startswith(b"IDAT", begin) and zlib.crc32(view[begin:end]) != told:
+            return False
+        place = end + 4
+    return True
+
+
+def _first_scan(content: bytes) -> int:
+    """Where the numbers of a JPEG begin, behind its notes, which may hold another JPEG."""
+    place = MARKER_BYTES
+    while content[place : place + 1] == b"\xff" and content[place + 1] != START_OF_SCAN:
+        is_filler = content[place + 1] == 0xFF
+        place += 1 if is_filler else MARKER_BYTES + int.from_bytes(content[place + 2 : place + 4])
+    return place
+
+
+def _plain(image: Image.Image) -> Image.Image:
+    """The image in a mode whose numbers are those of the file, with transparency as a channel."""
+    if "transparency" in image.info and image.mode in ("1", "L", "RGB", "P"):
+        return image.convert("LA" if image.mode in ("1", "L") else "RGBA")
+    return image if image.mode in PLAIN_MODES else image.convert(CONVERTED_MODES.get(image.mode, "RGB"))
+
+
+def _orientation(image: Image.Image) -> Any:
+    """The camera's note of how it was held; 1, upright, where the note is broken."""
+    try:
+        return image.getexif().get(ORIENTATION_TAG, 1)
+    except Exception:  # noqa: BLE001 -- a broken note does not make a broken picture
+        return 1
+
+
+@contextmanager
+def _pillow_limit() -> Iterator[None]:
+    """Pillow's own limit of pixels set to ours."""
+    from PIL import Image
+
+    before = Image.MAX_IMAGE_PIXELS
+    Image.MAX_IMAGE_PIXELS = MAX_PIXELS
+    try:
+        yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = before
+
+
+def _read_tiff(path: Path) -> NDArray[Any]:
+    import tifffile
+    from tifffile import PHOTOMETRIC
+
+    with tifffile.TiffFile(path) as file:
+        if len(file.pages) != 1:
+            raise FileError(path, f"holds {len(file.pages)} pictures; give a file with one")
+        page = file.pages[0]
+        check_picture_size(path, page.imagewidth, page.imagelength)
+        if page.photometric not in (
+            PHOTOMETRIC.MINISWHITE,
+            PHOTOMETRIC.MINISBLACK,
+            PHOTOMETRIC.RGB,
+            PHOTOMETRIC.PALETTE,
+        ):
+            name = getattr(page.photometric, "name", page.photometric)
+            raise FileError(path, f"is a TIFF in {name}; save it as grey or RGB")
+        if page.samplesperpixel > 4:
+            raise FileError(path, f"must be one picture of 1 to 4 channels, got {page.samplesperpixel}")
+        picture = pixels_of_page(path, page)
+        if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and picture.ndim == 3:
+            picture = np.moveaxis(picture, 0, -1)
+        if page.photometric == PHOTOMETRIC.PALETTE:
+            picture = np.moveaxis(np.asarray(page.colormap)[:, picture], 0, -1)
+        orientation = page.tags[ORIENTATION_TAG].value if ORIENTATION_TAG in page.tags else 1
+        is_inverted = page.photometric == PHOTOMETRIC.MINISWHITE
+        has_dimmed_colours = tifffile.EXTRASAMPLE.ASSOCALPHA in (page.extrasamples or ())
+    if picture.dtype == np.bool_:
+        picture = picture.astype(np.uint8) * np.uint8(255)
+    if picture.dtype not in (np.uint8, np.uint16) and picture.dtype.kind != "f":
+        raise FileError(path, f"must hold 8-bit, 16-bit or floating-point numbers, got {picture.dtype}")
+    if is_inverted:
+        picture = (1 if picture.dtype.kind == "f" else np.iinfo(picture.dtype).max) - picture
+    if has_dimmed_colours and picture.ndim == 3:
+        picture = picture[..., :-1]  # its colours are over black already
+    return _upright(picture.astype(np.float32) if picture.dtype.kind == "f" else picture, orientation)
+
+
+def pixels_of_page(path: Path, page: Any) -> NDArray[Any]:
+    """
+    The numbers of a TIFF's page, all of which the file holds.
+
+    Parameters
+    ----------
+    path : Path
+    page : tifffile.TiffPage
+        Of the open file; what it lacks would be 0.
+
+    Raises
+    ------
+    FileError
+        When a strip or tile lies outside the file, or none is told.
+    """
+    n_bytes = path.stat().st_size
+    segments = list(zip(page.dataoffsets, page.databytecounts, strict=False))
+    n_expected = 1 if page.is_contiguous else math.prod(page.chunked)
+    if len(segments) < n_expected or any(at <= 0 or n <= 0 or at + n > n_bytes for at, n in segments):
+        raise FileError(path, "is broken or cut short")
+    return np.asarray(page.asarray())
+
+
+def _read_deep_png(path: Path) -> NDArray[Any]:
+    """PNG of 16 bits, which Pillow would cut to 8 in colour."""
+    import imagecodecs
+
+    content = path.read_bytes()
+    check_picture_size(path, *struct.unpack(">II", content[16:24]))
+    return np.asarray(imagecodecs.png_decode(content))
+
+
+def _read_radiance(path: Path) -> NDArray[Any]:
+    import imagecodecs
+
+    content = path.read_bytes()
+    size = next((line.split() for line in content[:4096].split(b"\n") if line[:2] in (b"-Y", b"+Y")), [])
+    if len(size) != 4:
+        raise FileError(path, "is broken or cut short (no size)")
+    check_picture_size(path, int(size[3]), int(size[1]))
+    return np.asarray(imagecodecs.rgbe_decode(content))
+
+
+def _read_exr(path: Path) -> NDArray[Any]:
+    # OpenEXR prints what it could not read, and may go on without it.
+    return read_apart(_openexr, path, kind="EXR", max_unpacked=_max_unpacked, is_silent=True)[1]
+
+
+def _max_unpacked(n_bytes: int) -> int:
+    return min(MIN_UNPACKED_BYTES + UNPACKED_PER_BYTE * n_bytes, 16 * MAX_PIXELS)
+
+
+def _openexr(path: Path) -> tuple[dict[str, Any], NDArray[np.float32]]:
+    """The picture of an EXR, as the program of its own reads it."""
+    try:
+        import OpenEXR
+    except ImportError:
+        raise FileError(path, "needs a reader for EXR: pip install 'foveasim[pictures]'") from None
+    with OpenEXR.File(str(path), header_only=True) as file:
+        if len(file.parts) != 1:
+            raise FileError(path, f"holds {len(file.parts)} pictures; give a file with one")
+        low, high = (np.asarray(corner, dtype=np.int64) for corner in file.header()["dataWindow"])
+        n_x, n_y = (high - low + 1).tolist()
+        check_picture_size(path, n_x, n_y)
+    with OpenEXR.File(str(path)) as file:
+        layers = {name: channel.pixels for name, channel in file.channels().items()}
+    if len(layers) != 1:
+        raise FileError(path, f"must have the channels of one picture, got {', '.join(map(repr, layers)):.200}")
+    picture = np.asarray(next(iter(layers.values())), dtype=np.float32)
+    if picture.shape[:2] != (n_y, n_x):
+        raise FileError(path, f"must have channels of {n_x} x {n_y} pixels, got an array of the shape {picture.shape}")
+    return {}, picture
+
+
+def _upright(picture: NDArray[Any], orientation: object) -> NDArray[Any]:
+    """A picture turned as its note says (EXIF and TIFF, tag 274); other values than 2 to 8 mean upright."""
+    match orientation:
+        case 2:
+            return picture[:, ::-1]
+        case 3:
+            return picture[::-1, ::-1]
+        case 4:
+            return picture[::-1]
+        case 5:
+            return picture.swapaxes(0, 1)
+        case 6:
+            return np.rot90(picture, -1)
+        case 7:
+            return picture[::-1, ::-1].swapaxes(0, 1)
+        case 8:
+            return np.rot90(picture)
+    return picture
+
+
+def check_picture_size(path: Path, width: int, height: int) -> None:
+    """
+    Check the size that a file claims for its picture, before memory is taken for it.
+
+    Raises
+    ------
+    FileError
+        When it has more pixels than any picture of a scene.
+    """
+    if width * height > MAX_PIXELS:
+        raise FileError(path, f"has {width} x {height} pixels, more than the limit of {MAX_PIXELS}")
+
+
+# -- writing ---------------------------------------------------------------------------------------------------------
+
+
+def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
+    """
+    Write a picture file, whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        Its ending chooses the format: ``.png`` and ``.tif`` keep every number of uint8 and uint16, ``.tif`` and, with the extra
+        ``pictures``, ``.exr`` those of float32, NaN included; others hold uint8, more or less.
+    picture : (n_y, n_x) or (n_y, n_x, n_channel) uint8, uint16 or float32
+        First row on top; grey, grey and alpha, colour, or colour and alpha.
+
+    Raises
+    ------
+    FileError
+        When the ending names no known format, the array is no picture that it holds, or nothing can be written.
+    """
+    from PIL import Image
+
+    target = Path(path)
+    ending = target.suffix.lower()
+    is_pillow = Image.registered_extensions().get(ending) in PILLOW_FORMATS
+    if not is_pillow and ending not in (*TIFF_ENDINGS, ".exr"):
+        raise FileError(
+            target, "must end in .png, .webp, .jpg, .bmp, .tga, .ppm, .jp2, .tif or .exr; .png keeps every number"
+        )
+    if picture.ndim == 3 and picture.shape[2] == 1:
+        picture = picture[..., 0]
+    held = (
+        ("uint8", "uint16", "float32")
+        if ending in TIFF_ENDINGS
+        else {".exr": ("float32",), ".png": ("uint8", "uint16")}.get(ending, ("uint8",))
+    )
+    if (
+        picture.dtype.name not in held
+        or picture.ndim not in (2, 3)
+        or 0 in picture.shape
+        or (picture.shape[2:] or (1,))[0] > 4
+    ):
+        raise FileError(
+            target,
+            f"cannot hold an array of the shape {picture.shape} and type {picture.dtype}, only 1 to 4 channels of "
+            f"{' or '.join(held)}",
+        )
+    picture = np.ascontiguousarray(unmasked("picture", picture))
+    with written_whole(target) as temporary:
+        try:
+            if ending in TIFF_ENDINGS:
+                _write_tiff(temporary, picture)
+            elif ending == ".exr":
+                _write_exr(temporary, picture)
+            elif picture.dtype == np.uint16:
+                import imagecodecs
+
+                temporary.write_bytes(imagecodecs.png_encode(picture))
+            else:
+                # In memory: on a full disk Pillow's encoders leave half a file, or never end.
+                encoded = io.BytesIO()
+                Image.fromarray(picture).save(encoded, Image.registered_extensions()[ending])
+                temporary.write_bytes(encoded.getbuffer())
+        except ImportError:
+            raise FileError(target, "needs a writer for EXR: pip install 'foveasim[pictures]'") from None
+        except (OSError, ValueError, RuntimeError) as error:
+            if disk_problem(error):
+                raise
+            raise FileError(target, f"cannot be written in this format ({error}); take .png") from None
+
+
+def _write_tiff(path: Path, picture: NDArray[Any]) -> None:
+    import tifffile
+
+    n_channels = (picture.shape[2:] or (1,))[0]
+    tifffile.imwrite(
+        path,
+        picture,
+        photometric="rgb" if n_channels > 2 else "minisblack",
+        planarconfig="contig" if n_channels > 1 else None,
+        extrasamples=["unassalpha"] if n_channels in (2, 4) else None,
+        compression="zlib",
+        metadata=None,
+    )
+
+
+def _write_exr(path: Path, picture: NDArray[Any]) -> None:
+    import OpenEXR
+
+    layers = picture.reshape(*picture.shape[:2], -1)
+    names = ("Y", "YA", "RGB", "RGBA")[layers.shape[2] - 1]
+    channels = {name: np.ascontiguousarray(layers[..., k]) for k, name in enumerate(names)}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))

@@ -1,0 +1,140 @@
+"""Arrays and words about them in one ``.npz`` file: written whole, read within limits, and never unpickled."""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from foveasim._core.validation import MAX_SITES
+from foveasim._io.atomic import written_whole
+from foveasim.errors import FileError
+
+__all__ = ["opened_archive", "read_archive", "write_archive"]
+
+#: Name of the text beside the arrays.
+ABOUT = "about"
+SUFFIX = ".npy"
+#: numpy before 2.2 stores the argument of this name as one more array; readers ignore it.
+STRAY = "allow_pickle"
+#: A file that would unpack to more than this is refused.
+MAX_UNPACKED_BYTES = 8 * 2**30
+
+
+def write_archive(
+    path: str | Path, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], *, is_packed: bool = True
+) -> None:
+    """
+    Write arrays, and what is to be known about them, whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        ``.npz``.
+    about : mapping
+        Plain data, as JSON holds them.
+    arrays : mapping of str to array
+    is_packed : bool
+        Whether to write fewer bytes in more time.
+
+    Raises
+    ------
+    FileError
+        When the ending is another, an array contains Python objects, or nothing can be written there.
+    """
+    target = Path(path)
+    if target.suffix.lower() != ".npz":
+        raise FileError(target, "must end in .npz")
+    pickled = [name for name, array in arrays.items() if array.dtype.hasobject]
+    if pickled:  # not by allow_pickle=False, which is an array's name to numpy before 2.2
+        raise FileError(target, f"{pickled[0]!r:.40} must contain numbers or strings, got Python objects")
+    members: dict[str, Any] = {ABOUT: np.array(json.dumps(about)), **arrays}
+    with written_whole(target) as temporary, temporary.open("wb") as file:
+        write = np.savez_compressed if is_packed else np.savez
+        write(file, **members)
+
+
+def read_archive(path: Path, *, max_bytes: int | None = None) -> tuple[Any, dict[str, NDArray[Any]]]:
+    """
+    What :func:`write_archive` wrote: the words, or None where there are none, and the arrays.
+
+    Raises
+    ------
+    FileError
+        When it would unpack to too much, or is packed as numpy never packs.
+    Exception
+        Of any kind, when it is broken; :func:`opened_archive` tells it in one sentence.
+    """
+    limit = MAX_UNPACKED_BYTES if max_bytes is None else max_bytes
+    with zipfile.ZipFile(path) as archive:
+        items = {item.filename.removesuffix(SUFFIX): item for item in archive.infolist()}
+        items.pop(STRAY, None)
+        if sum(item.file_size for item in archive.infolist()) > limit:
+            raise FileError(path, f"would unpack to more than {limit} bytes")
+        if not {item.compress_type for item in items.values()} <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+            raise FileError(path, "is packed in a way that numpy does not use")
+        arrays = {name: _array(archive, item) for name, item in items.items()}
+    return json.loads(str(arrays.pop(ABOUT))) if ABOUT in arrays else None, arrays
+
+
+@contextmanager
+def opened_archive(
+    path: str | Path, what: str, file_format: str, version: int
+) -> Iterator[tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
+    """
+    What a file says, and its arrays; whatever the block trips over in them is told in one sentence.
+
+    Parameters
+    ----------
+    path : path
+    what : str
+        What the file should hold, for messages: ``"foveasim capture"``.
+    file_format, version
+        What it must say under ``format`` and ``version``.
+
+    Raises
+    ------
+    FileError
+        When the file is missing, too large, broken, or of another format.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise FileError(source, "is not a file" if source.exists() else "no such file")
+    try:
+        about, arrays = read_archive(source)
+        if not isinstance(about, dict) or about.get("format") != file_format:
+            raise FileError(source, f"is no {what}")
+        if about.get("version") != version:
+            raise FileError(source, f"has the format version {about.get('version')!r:.40}, expected {version}")
+        yield about, arrays
+    except FileError:
+        raise
+    except Exception as error:  # noqa: BLE001 -- a broken file makes its readers trip over anything
+        told = " ".join(str(error).split()) or type(error).__name__
+        raise FileError(source, f"is broken or no {what} ({told:.200})") from None
+
+
+def _array(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> NDArray[Any]:
+    """One array, after its header was found to fit what follows it: no array is made larger than the file says."""
+    with archive.open(item) as file:
+        version = npy.read_magic(file)
+        if version not in ((1, 0), (2, 0)):
+            raise ValueError(f"array format {version}")
+        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, is_fortran, dtype = read_header(file)
+        if dtype.hasobject:
+            raise ValueError("an array of objects")
+        # What takes no room may be there any number of times.
+        n = math.prod(shape)
+        if n * dtype.itemsize != item.file_size - file.tell() or not 0 <= n <= max(item.file_size, MAX_SITES):
+            raise ValueError("an array of another size than its header tells")
+        flat = np.frombuffer(file.read(), dtype) if dtype.itemsize else np.zeros(n, dtype)
+    return flat.reshape(shape, order="F" if is_fortran else "C")

@@ -1,0 +1,163 @@
+"""Taking a shot, writing its results, and telling of them."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import shapely
+from rich.table import Table
+
+from foveasim._io.terminal import text_of
+from foveasim.capture import Capture
+from foveasim.config import Shot
+from foveasim.errors import FileError, printable
+from foveasim.layout import Layout, Report
+from foveasim.view import plot_capture, save_figure
+
+__all__ = ["Result", "check_folder", "demo_settings", "results_table", "run_shot", "write_results"]
+
+#: The demo's shots, in the order shown.
+DEMO_SHOTS = ("foveal", "four_zones")
+#: Side of the pictures that a shot writes.
+PICTURE_PIXELS = 1024
+
+
+def demo_settings() -> list[Path]:
+    """The settings files of the demo's shots, which come with the package."""
+    return [Path(str(files("foveasim.config") / f"{name}.yaml")) for name in DEMO_SHOTS]
+
+
+def check_folder(folder: str | Path) -> Path:
+    """
+    The folder for results, before anything is computed for it.
+
+    Raises
+    ------
+    FileError
+        When there is a file of its name, or it could not be made.
+    """
+    folder = Path(folder)
+    present = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not present.is_dir():
+        raise FileError(folder, f"cannot hold results: {present} is a file, and must be a folder")
+    if not os.access(present, os.W_OK | os.X_OK):
+        raise FileError(folder, f"cannot hold results: nothing may be written in {present}")
+    return folder
+
+
+def write_results(shot: Shot, capture: Capture, folder: str | Path) -> tuple[list[Path], float]:
+    """
+    Write a capture's files: ``NAME_picture.png``, ``NAME_layout.png``, ``NAME_capture.npz``.
+
+    Parameters
+    ----------
+    shot : Shot
+    capture : Capture
+    folder : path
+        Made when it does not exist. Each file is put in it when it is complete.
+
+    Returns
+    -------
+    paths : list of path
+    seconds : float, s
+        Time that it took.
+
+    Raises
+    ------
+    FileError
+        When the folder cannot be made or written.
+    """
+    start_s = time.perf_counter()
+    folder = check_folder(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(folder, f"cannot be made: {error.strerror or error}") from None
+    picture, layout, saved = (folder / f"{shot.name}_{what}" for what in ("picture.png", "layout.png", "capture.npz"))
+    capture.picture(max_pixels=PICTURE_PIXELS).save(picture, capture.white_dn, encode_srgb=True)
+    axes = plot_capture(capture)
+    axes.set_title(f"{printable(shot.name)}: {capture.layout.n_sites} photosites", parse_math=False)
+    save_figure(axes.figure, layout)  # type: ignore[arg-type]
+    capture.save(saved)
+    return [picture, layout, saved], time.perf_counter() - start_s
+
+
+@dataclass(frozen=True)
+class Result:
+    """A shot with its capture, the report of its design rules, and the seconds that writing its files took."""
+
+    shot: Shot
+    capture: Capture
+    report: Report | None
+    writing_s: float
+
+
+def run_shot(shot: Shot, folder: str | Path) -> tuple[Result, list[Path]]:
+    """
+    Take a shot, check its layout against its rules, and write its files.
+
+    Returns
+    -------
+    result : Result
+    paths : list of path
+        The files written.
+
+    Raises
+    ------
+    FoveasimError
+        When parts do not fit together, or files cannot be written.
+    """
+    capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
+    report = None if shot.rules is None else capture.layout.check(shot.rules)
+    paths, writing_s = write_results(shot, capture, folder)
+    return Result(shot, capture, report, writing_s), paths
+
+
+def results_table(results: Sequence[Result]) -> Table:
+    """Table of what the shots' sensors saw, a column a shot."""
+    table = Table(title="What the sensors saw")
+    table.add_column("")
+    for result in results:
+        table.add_column(text_of(result.shot.name), justify="right")
+    captures = [result.capture for result in results]
+    rows = {
+        "photosites": [f"{c.layout.n_sites:,}" for c in captures],
+        "design rules": [_verdict(result.report) for result in results],
+        "smallest pixel / µm": [f"{np.sqrt(c.layout.area_um2.min()):.2f}" for c in captures],
+        "largest pixel / µm": [f"{np.sqrt(c.layout.area_um2.max()):.2f}" for c in captures],
+        "blind-spot radius / µm": [_blind_spot(c.layout) for c in captures],
+        "median electrons": [f"{np.median(c.electrons):,.0f}" for c in captures],
+        "most electrons": [f"{c.electrons.max():,}" for c in captures],
+        "median code / DN": [f"{np.median(c.code):,.0f} of {2**c.bits - 1:,}" for c in captures],
+        "sites at code 0 / %": [f"{100 * np.mean(c.code == 0):.2f}" for c in captures],
+        "saturated sites / %": [f"{100 * c.saturated_share:.2f}" for c in captures],
+    }
+    for stage in dict.fromkeys(stage for c in captures for stage in c.stage_s):
+        rows[f"{stage} / s"] = [f"{c.stage_s.get(stage, 0.0):.3f}" for c in captures]
+    rows["pictures and files / s"] = [f"{result.writing_s:.3f}" for result in results]
+    for title, values in rows.items():
+        table.add_row(title, *values)
+    return table
+
+
+def _verdict(report: Report | None) -> str:
+    if report is None:
+        return "none given"
+    return "kept" if report.ok else f"{sum(len(result) for result in report.results):,} violations"
+
+
+def _blind_spot(layout: Layout) -> str:
+    """Radius of the hole in the middle of the innermost ring, when there is one."""
+    if "ring" not in layout.columns:
+        return "none"
+    innermost = layout[layout.columns["ring"] == layout.columns["ring"].min()]
+    middle_um = innermost.centroid_um.mean(axis=0)
+    if shapely.intersects_xy(innermost.polygons(), *middle_um).any():
+        return "none"
+    return f"{np.linalg.norm(innermost.xy_um - middle_um, axis=1).min():.2f}"

@@ -1,0 +1,1 @@
+"""Datasets: many captures with labels, for learning."""

@@ -1,0 +1,388 @@
+"""Pictures of a data set, one at a time: of a folder, a zip file, an array, or anything that has a length and items."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import tempfile
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._io.images import PICTURE_ENDINGS, picture_names, pixels_of_image, read_picture
+from foveasim.errors import FileError, ParameterError
+from foveasim.explore._files import digests
+
+__all__ = ["Source", "digest_of", "is_lazy", "source_of"]
+
+#: A packed picture that would unpack to more than this is refused.
+MAX_UNPACKED_BYTES = 2**30
+
+
+@runtime_checkable
+class Source(Protocol):
+    """Where pictures come from."""
+
+    def __len__(self) -> int: ...
+
+    def name(self, k: int) -> str:
+        """What messages call a picture."""
+
+    def key(self, k: int) -> str:
+        """What files of labels call a picture: its name in the folder or the zip file, or its number."""
+
+    def picture(self, k: int) -> NDArray[Any]:
+        """A picture as :func:`foveasim._io.images.read_picture` gives it, first row on top."""
+
+    def labels(self) -> list[Any] | None:
+        """What the source itself says of every picture's class, or None."""
+
+    def described(self) -> dict[str, Any]:
+        """Plain data that tells the source from others, but what its pictures hold."""
+
+    @property
+    def is_lazy(self) -> bool:
+        """Whether pictures are made when they are asked for, by whatever holds them."""
+
+    def digest(self, k: int) -> str:
+        """What tells the content of a picture from others, without unpacking it."""
+
+
+def source_of(pictures: Any) -> Source:
+    """
+    Whatever holds pictures, as a source; a source as it is.
+
+    Raises
+    ------
+    FileError
+        When there is no such file, or no picture in it.
+    ParameterError
+        When it is none of what a data set takes.
+    """
+    if isinstance(pictures, Source):
+        return pictures
+    if isinstance(pictures, str | Path):
+        path = Path(pictures).absolute()
+        try:
+            if path.is_dir():
+                return _Folder(path)
+            if not path.is_file():
+                raise FileError(path, "no such file or folder")
+        except OSError as error:
+            raise _unreadable(error, path) from None
+        if path.suffix.lower() == ".npy":
+            return _ArrayFile(path)
+        if zipfile.is_zipfile(path):
+            return _Zip(path)
+        raise FileError(path, "must be a folder of pictures, a zip file of them, or an array (.npy)")
+    if isinstance(pictures, np.ndarray):
+        return _Array(pictures)
+    if isinstance(pictures, Mapping) or not (hasattr(pictures, "__len__") and hasattr(pictures, "__getitem__")):
+        kind = type(pictures).__name__
+        raise ParameterError("pictures", f"must be a folder, a zip file, an array, or a sequence, got a {kind}")
+    return _Items(pictures)
+
+
+def is_lazy(items: Sequence[Any]) -> bool:
+    """Whether items may be made when they are asked for."""
+    return not isinstance(items, list | tuple | np.ndarray)
+
+
+def digest_of(item: Any) -> str:
+    """
+    SHA-256 of a file, or of an array, its type and its shape.
+
+    Empty where there is none, or none that can be read, which whoever reads it will tell.
+    """
+    try:
+        if isinstance(item, str | Path):
+            return digests([Path(item)])[str(Path(item))]
+        array = np.ascontiguousarray(item)
+        digest = hashlib.sha256(f"{array.dtype.str} {np.shape(item)}".encode())
+        digest.update(array.data)
+    except (OSError, TypeError, ValueError):
+        return ""
+    return digest.hexdigest()
+
+
+class _Folder:
+    """Pictures of a folder and the folders in it, in the natural order of their names."""
+
+    is_lazy = False
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        found = (Path(place) / name for place, _, names in os.walk(folder, onerror=_stop) for name in names)
+        self._names = picture_names(path.relative_to(folder).as_posix() for path in found)
+        if not self._names:
+            raise FileError(folder, f"holds no pictures ({', '.join(PICTURE_ENDINGS)})")
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def name(self, k: int) -> str:
+        return str(self._folder / self._names[k])
+
+    def key(self, k: int) -> str:
+        return self._names[k]
+
+    def picture(self, k: int) -> NDArray[Any]:
+        return read_picture(self._folder / self._names[k])
+
+    def labels(self) -> list[Any] | None:
+        return _folder_labels(self._names)
+
+    def described(self) -> dict[str, Any]:
+        return {"kind": "folder", **_told(self._names)}
+
+    def digest(self, k: int) -> str:
+        return digest_of(self._folder / self._names[k])
+
+
+class _Zip:
+    """Pictures of a zip file, which each process opens for itself."""
+
+    is_lazy = False
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            with zipfile.ZipFile(path) as archive:
+                names = [item.filename for item in archive.infolist() if not item.is_dir()]
+        except (OSError, zipfile.BadZipFile) as error:
+            raise FileError(path, f"is broken ({error})") from None
+        self._names = picture_names(names)
+        if not self._names:
+            raise FileError(path, f"holds no pictures ({', '.join(PICTURE_ENDINGS)})")
+        self._opened: tuple[int, zipfile.ZipFile] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_opened": None}
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def name(self, k: int) -> str:
+        return f"{self._path}!{self._names[k]}"
+
+    def key(self, k: int) -> str:
+        return self._names[k]
+
+    def picture(self, k: int) -> NDArray[Any]:
+        archive, name = self._archive(), self._names[k]
+        if archive.getinfo(name).file_size > MAX_UNPACKED_BYTES:
+            raise FileError(self.name(k), f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
+        try:
+            content = archive.read(name)
+        except Exception as error:  # noqa: BLE001 -- a broken member makes its reader trip over anything
+            raise FileError(self.name(k), f"is broken ({' '.join(str(error).split())})") from None
+        with tempfile.TemporaryDirectory(prefix="foveasim-") as folder:
+            file = Path(folder) / f"picture{PurePosixPath(name).suffix}"
+            file.write_bytes(content)
+            try:
+                return read_picture(file)
+            except FileError as error:
+                raise FileError(self.name(k), str(error).removeprefix(f"{file}: ")) from None
+
+    def labels(self) -> list[Any] | None:
+        return _folder_labels(self._names)
+
+    def _archive(self) -> zipfile.ZipFile:
+        # A process that was forked shares its parent's place in the file.
+        if self._opened is None or self._opened[0] != os.getpid():
+            self._opened = os.getpid(), zipfile.ZipFile(self._path)
+        return self._opened[1]
+
+    def described(self) -> dict[str, Any]:
+        return {"kind": "zip", **_told(self._names)}
+
+    def digest(self, k: int) -> str:
+        # What is unpacked is checked against this sum.
+        item = self._archive().getinfo(self._names[k])
+        return f"{item.file_size} bytes, {item.CRC:08x}"
+
+
+class _Array:
+    """Pictures (n, n_y, n_x) or (n, n_y, n_x, n_channel) in memory."""
+
+    is_lazy = False
+
+    def __init__(self, pictures: NDArray[Any]) -> None:
+        _check_stack("pictures", pictures)
+        self._pictures = pictures
+
+    def __len__(self) -> int:
+        return int(self._pictures.shape[0])
+
+    def name(self, k: int) -> str:
+        return f"picture {k}"
+
+    def key(self, k: int) -> str:
+        return str(k)
+
+    def picture(self, k: int) -> NDArray[Any]:
+        return self._pictures[k]
+
+    def labels(self) -> list[Any] | None:
+        return None
+
+    def described(self) -> dict[str, Any]:
+        return {"kind": "array", "shape": list(self._pictures.shape), "dtype": str(self._pictures.dtype)}
+
+    def digest(self, k: int) -> str:
+        return digest_of(self._pictures[k])
+
+
+class _ArrayFile:
+    """Pictures in a file of one numpy array, of which each process reads what it needs."""
+
+    is_lazy = False
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._pictures: NDArray[Any] | None = None
+        self._n = len(self._array())
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_pictures": None}
+
+    def _array(self) -> NDArray[Any]:
+        if self._pictures is None:
+            try:
+                pictures = np.load(self._path, mmap_mode="r", allow_pickle=False)
+            except (OSError, ValueError, EOFError) as error:
+                raise FileError(self._path, f"is no array that can be read ({error})") from None
+            _check_stack(str(self._path), pictures)
+            self._pictures = pictures
+        return self._pictures
+
+    def __len__(self) -> int:
+        return self._n
+
+    def name(self, k: int) -> str:
+        return f"{self._path}[{k}]"
+
+    def key(self, k: int) -> str:
+        return str(k)
+
+    def picture(self, k: int) -> NDArray[Any]:
+        return np.array(self._array()[k])
+
+    def labels(self) -> list[Any] | None:
+        return None
+
+    def described(self) -> dict[str, Any]:
+        array = self._array()
+        return {"kind": "array file", "name": self._path.name, "shape": list(array.shape), "dtype": str(array.dtype)}
+
+    def digest(self, k: int) -> str:
+        return digest_of(self._array()[k])
+
+
+class _Items:
+    """Files, arrays or Pillow's images, alone or in pairs with their classes, of anything that has a length and items."""
+
+    def __init__(self, items: Sequence[Any]) -> None:
+        if len(items) == 0:
+            raise ParameterError("pictures", "must hold at least one picture")
+        self._items = items
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def name(self, k: int) -> str:
+        item = self._listed(k)
+        return str(item) if isinstance(item, str | Path) else f"picture {k}"
+
+    def key(self, k: int) -> str:
+        item = self._listed(k)
+        return Path(item).name if isinstance(item, str | Path) else str(k)
+
+    def _item(self, k: int) -> Any:
+        item = self._items[k]
+        return item[0] if isinstance(item, tuple) else item
+
+    def _listed(self, k: int) -> Any:
+        """The item of a list; None where it may be made when it is asked for."""
+        return None if self.is_lazy else self._item(k)
+
+    def picture(self, k: int) -> NDArray[Any]:
+        item = self._item(k)
+        if isinstance(item, str | Path):
+            return read_picture(item)
+        if _is_image(item):
+            try:
+                return pixels_of_image(item)
+            except Exception as error:  # noqa: BLE001 -- a broken image makes its reader trip over anything
+                raise FileError(
+                    self.name(k), f"is no image that can be read ({' '.join(str(error).split())})"
+                ) from None
+        try:
+            return np.asarray(item)
+        except ValueError:
+            raise ParameterError(f"picture {k}", "must be a file or an array of numbers", item) from None
+
+    def labels(self) -> list[Any] | None:
+        if isinstance(self._items, list | tuple):
+            is_pair = [isinstance(item, tuple) and len(item) > 1 for item in self._items]
+            if all(is_pair):
+                return [item[1] for item in self._items]
+            if any(isinstance(item, tuple) for item in self._items):
+                raise ParameterError("pictures", "must all be pairs (picture, label), or none of them")
+            return None
+        targets = getattr(self._items, "targets", None)
+        if targets is not None and len(targets) == len(self):
+            return np.asarray(targets).tolist()
+        if isinstance(self._items[0], tuple):
+            return [self._items[k][1] for k in range(len(self))]
+        return None
+
+    def described(self) -> dict[str, Any]:
+        names = {} if self.is_lazy else _told([self.name(k) for k in range(len(self))])
+        return {"kind": "items", "n": len(self)} | names
+
+    @property
+    def is_lazy(self) -> bool:
+        return is_lazy(self._items)
+
+    def digest(self, k: int) -> str:
+        item = self._item(k)
+        return digest_of(item if isinstance(item, str | Path) else self.picture(k))
+
+
+def _is_image(item: Any) -> bool:
+    """Whether an item is one of Pillow's images; who has one has loaded Pillow."""
+    pillow = sys.modules.get("PIL.Image")
+    return pillow is not None and isinstance(item, pillow.Image)
+
+
+def _told(names: Sequence[str]) -> dict[str, Any]:
+    """How many names there are, and a sum of them."""
+    return {"n": len(names), "sha256": hashlib.sha256("\n".join(names).encode()).hexdigest()}
+
+
+def _unreadable(error: OSError, path: Path) -> FileError:
+    return FileError(error.filename or path, f"cannot be read: {error.strerror or error}")
+
+
+def _stop(error: OSError) -> None:
+    """What a folder in a folder of pictures holds must not be missing unseen."""
+    raise _unreadable(error, Path())
+
+
+def _check_stack(name: str, pictures: NDArray[Any]) -> None:
+    if pictures.ndim not in (3, 4) or 0 in pictures.shape or (pictures.ndim == 4 and pictures.shape[3] > 4):
+        raise ParameterError(
+            name, f"must have the shape (n, n_y, n_x) or (n, n_y, n_x, 1 to 4 channels), got {pictures.shape}"
+        )
+
+
+def _folder_labels(names: Sequence[str]) -> list[Any] | None:
+    """Names of the outermost folders that pictures are in; None when they are in none."""
+    folders = [PurePosixPath(name).parts[0] if "/" in name else None for name in names]
+    return folders if all(folder is not None for folder in folders) else None

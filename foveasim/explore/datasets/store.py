@@ -1,0 +1,645 @@
+"""Data sets as files: shard by shard, each written whole, by as many processes as one likes, and gone on with after any end."""
+
+from __future__ import annotations
+
+import io
+import json
+import multiprocessing
+import operator
+import os
+import pickle
+import secrets
+import shutil
+import signal
+import tarfile
+import tempfile
+import threading
+import time
+import warnings
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._core.threads import thread_count
+from foveasim._core.validation import check_count
+from foveasim._io.atomic import remove_folder, written_whole
+from foveasim.errors import FileError, FoveasimError, FoveasimWarning, ParameterError, SimulationError
+from foveasim.explore.datasets.dataset import DataSet
+
+__all__ = ["StoredSamples", "open_data_set", "write_data_set"]
+
+FORMAT, VERSION = "foveasim data set", 2
+ZARR, ABOUT = ".zarr", "data_set.json"
+#: Bytes of the samples of a shard, about, and how many they are at most: one process has them in memory.
+SHARD_BYTES, LARGEST_SHARD = 1 << 26, 512
+#: Shards of a data set, at least, so that many processes can write it and little is lost with one.
+FEWEST_SHARDS = 32
+#: Shards of a zarr folder that a process keeps when it reads: those met last.
+KEPT_SHARDS = 4
+#: Name of the array that tells which shards are done and of what they were made, and of the group of what was drawn.
+DONE, SETTINGS = "done", "settings"
+#: First member of a tar file, which tells of what it was made; WebDataset passes over such names.
+MADE_OF = "__made_of__"
+#: Bytes of a SHA-256.
+DIGEST_BYTES = 32
+#: Files of the folder that processes share: what they work on, and what tells them to stop.
+WORK, STOP = "work", "stop"
+#: What takes longer than this in one process is worth others, which take seconds to start.
+ALONE_S = 10.0
+NEEDS_ZARR = "needs zarr: pip install 'foveasim[explore]'"
+
+#: Told how many samples are written, of how many.
+Tell = Callable[[int, int], None]
+
+
+def write_data_set(
+    data_set: DataSet,
+    path: str | Path,
+    *,
+    per_shard: int | None = None,
+    workers: int | None = 1,
+    tell: Tell | None = None,
+) -> StoredSamples:
+    """
+    Simulate all samples and write them, or go on where this was ended.
+
+    Parameters
+    ----------
+    data_set : DataSet
+    path : path
+        ``.zarr``: a zarr folder with an array for each part of the samples, and a chunk of it for each shard. Without an
+        ending: a folder of tar files ``shard-000000.tar`` ..., as WebDataset reads them, with the arrays (``.npz``), the rest
+        (``.json``) and, where there are labels, the class (``.cls``) of each sample. Arrays of all samples are read faster from
+        zarr, and single samples in any order from tar files, of which only they are read.
+    per_shard : int, optional
+        Samples of a shard; by default about 64 MiB of them, and a 32nd of all at most.
+    workers : int, optional
+        Processes. They import the calling program's main file: keep the call under ``if __name__ == "__main__":``. None: one a
+        core, as soon as what is left would take this process alone more than some seconds.
+    tell : callable, optional
+        Called with the numbers of samples that are written and of all.
+
+    Returns
+    -------
+    StoredSamples
+        The same, bit for bit, with any number of workers and after any number of ends.
+
+    Raises
+    ------
+    FileError
+        When the ending is none of these, something else is there, a picture cannot be read, or nothing can be written: the disk
+        is full, say. Shards that are done stay, and the same call goes on from there, unless the pictures, masks or flows that
+        they were made of hold something else now.
+    ParameterError
+        When the photosites differ from sample to sample, which only tar files can hold.
+    SimulationError
+        When a sample's camera cannot be made, a process ends, or cannot take over pictures of a class of the caller's own.
+
+    Warns
+    -----
+    FoveasimWarning
+        Once, when samples had warnings: ``warning`` tells each.
+    """
+    target = Path(path).absolute()
+    workers = None if workers is None else check_count("workers", workers, at_most=1024)
+    if per_shard is not None:
+        per_shard = check_count("per_shard", per_shard)
+    kind = _kind_of(target)
+    if kind is _ZarrShards:
+        if data_set.is_layout_varied:
+            raise ParameterError(
+                "layout", "must not vary in a zarr folder, whose arrays have one length; take a folder of tar files"
+            )
+        _zarr(target)
+    plan = json.loads(json.dumps(data_set.described()))
+    about = _about_of(target) if os.path.exists(target) else None  # noqa: PTH110 -- also where it must not be looked for
+    if about is None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the shard of the first sample tells them
+            first = data_set[0]
+        n_bytes = max(1, sum(value.nbytes for value in first.values() if isinstance(value, np.ndarray)))
+        about = {
+            "format": FORMAT,
+            "version": VERSION,
+            "n_samples": len(data_set),
+            "per_shard": per_shard
+            or max(1, min(SHARD_BYTES // n_bytes, LARGEST_SHARD, len(data_set) // FEWEST_SHARDS)),
+            "has_label": "label" in first,
+            "class_names": data_set.class_names,
+            "plan": plan,
+        }
+        kind.begin(target, about, data_set, first)
+    else:
+        _check_same(target, about, plan, per_shard)
+    _write_shards(data_set, kind(target, about), workers, tell)
+    return open_data_set(target)
+
+
+def _check_same(target: Path, about: Mapping[str, Any], plan: Mapping[str, Any], per_shard: int | None) -> None:
+    different = next((key for key in plan if about["plan"].get(key) != plan[key]), None)
+    if different is None and per_shard not in (None, about["per_shard"]):
+        different = "per_shard"
+    if different is not None:
+        raise FileError(
+            target, f"is another data set: its {different!r} differs; write this one elsewhere, or remove that one"
+        )
+
+
+def _write_shards(data_set: DataSet, shards: _Shards, workers: int | None, tell: Tell | None) -> None:
+    """Write all shards that are not done, when those that are done are of the same pictures."""
+    left = []
+    for k in range(shards.n_shards):
+        made_of = shards.made_of(k)
+        if not made_of:
+            left.append(k)
+        elif made_of != data_set.digest(shards.samples(k)):
+            samples = shards.samples(k)
+            raise FileError(
+                shards.folder,
+                f"is of other pictures, masks or flows: those of its samples {samples[0]} to {samples[-1]} hold something "
+                "else now; write this data set elsewhere, or remove that one",
+            )
+    n, n_done = shards.n_samples, shards.n_samples - sum(len(shards.samples(k)) for k in left)
+    told: list[str] = []
+    if tell is not None:
+        tell(n_done, n)
+    with closing(_written(data_set, shards, left, workers)) as written:
+        for k, own in written:
+            told += own
+            n_done += len(shards.samples(k))
+            if tell is not None:
+                tell(n_done, n)
+    if told:
+        warnings.warn(
+            f"{len(told):,} of the samples written have warnings, such as: {min(told)}",
+            FoveasimWarning,
+            stacklevel=3,
+        )
+
+
+def _written(
+    data_set: DataSet, shards: _Shards, left: Sequence[int], workers: int | None
+) -> Generator[tuple[int, list[str]], None, None]:
+    """Shards as they are written, with the warnings of their samples."""
+    begun_s = time.monotonic()
+    for n_done, k in enumerate(left):
+        n_left = len(left) - n_done
+        left_s = n_left * (time.monotonic() - begun_s) / n_done if n_done else 0.0
+        if n_left > 1 and (left_s > ALONE_S if workers is None else workers > 1):
+            yield from _written_by_others(data_set, shards, left[n_done:], workers or thread_count())
+            return
+        yield k, _write_shard(data_set, shards, k)
+
+
+def _written_by_others(
+    data_set: DataSet, shards: _Shards, left: Sequence[int], workers: int
+) -> Generator[tuple[int, list[str]], None, None]:
+    """
+    Shards as other processes write them.
+
+    They take the data set from a file: one that ended while it is told through a pipe would never be noticed.
+    """
+    with tempfile.TemporaryDirectory(prefix="foveasim-", ignore_cleanup_errors=True) as name:
+        folder = Path(name)
+        _hand_over(folder, data_set, shards)
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(min(workers, len(left)), context, _begin, (folder,))
+        try:
+            going_on = {pool.submit(_write_own, folder, k): k for k in left}
+            for future in as_completed(going_on):
+                yield going_on[future], future.result()
+        except BrokenProcessPool:
+            raise SimulationError(
+                "a process that writes samples ended: too little memory, a crash, or the call is not under `if __name__ == "
+                '"__main__":`; done shards stay, and the same call goes on from there'
+            ) from None
+        except FoveasimError as error:
+            raise error from None  # without the other process's traceback
+        finally:
+            # Once all is done there is nothing to stop; before that, shards that are begun are given up at their next sample.
+            with suppress(OSError):
+                (folder / STOP).touch()
+            pool.shutdown(cancel_futures=True)
+
+
+def _hand_over(folder: Path, data_set: DataSet, shards: _Shards) -> None:
+    """Write what other processes work on."""
+    try:
+        with (folder / WORK).open("wb") as file:
+            pickle.dump((data_set, shards), file, pickle.HIGHEST_PROTOCOL)
+    except OSError as error:
+        raise FileError(folder, f"cannot be written: {error.strerror or error}") from None
+    except Exception as error:  # noqa: BLE001 -- whatever pictures of the caller's own raise
+        raise ParameterError(
+            "workers", f"must be 1 for pictures or labels that cannot go to other processes ({_line(error)})"
+        ) from None
+
+
+@cache
+def _handed_over(folder: Path) -> tuple[DataSet, _Shards]:
+    """What a process works on."""
+    try:
+        with (folder / WORK).open("rb") as file:
+            data_set, shards = pickle.load(file)  # noqa: S301 -- of the process that started this one
+    except Exception as error:  # noqa: BLE001 -- whatever pictures of the caller's own raise
+        raise SimulationError(
+            f"the data set could not go to other processes ({_line(error)}); take workers=1"
+        ) from None
+    return data_set, shards
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _begin(folder: Path) -> None:
+    """What a process does first: Ctrl-C, which the whole terminal gets, is for the program that started it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, args=(folder,), daemon=True).start()
+
+
+def _end_with_parent(folder: Path) -> None:
+    """End at once when the program that started this process has ended, by whatever, and remove what it left."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    shutil.rmtree(folder, ignore_errors=True)
+    os._exit(1)
+
+
+def _write_own(folder: Path, k: int) -> list[str]:
+    return _write_shard(*_handed_over(folder), k, (folder / STOP).exists)
+
+
+def _write_shard(
+    data_set: DataSet, shards: _Shards, k: int, is_stopped: Callable[[], bool] = lambda: False
+) -> list[str]:
+    """Simulate the samples of a shard and write it, unless it is stopped before; their warnings."""
+    samples = []
+    made_of = data_set.digest(shards.samples(k))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # they are told at the end, together
+        for index in shards.samples(k):
+            if is_stopped():
+                return []
+            samples.append(data_set[index])
+    try:
+        shards.write(k, samples, made_of)
+    except OSError as error:
+        raise FileError(
+            shards.folder,
+            f"cannot be written: {error.strerror or error}; done shards stay, and the same call goes on from there",
+        ) from None
+    return [f"sample {sample['index']}: {sample['warning']}" for sample in samples if sample["warning"]]
+
+
+# -- reading ----------------------------------------------------------------------------------------------------------
+
+
+class StoredSamples:
+    """
+    Samples in files: the same mappings, bit for bit, as those of the :class:`DataSet` that was written.
+
+    Has a length and items, and so is a map-style data set too.
+
+    Attributes
+    ----------
+    path : Path
+    about : mapping
+        Settings, distributions, seed, names of the classes, versions.
+    """
+
+    def __init__(self, path: Path, about: Mapping[str, Any]) -> None:
+        self.path, self.about = path, about
+        self._shards = _kind_of(path)(path, about)
+
+    def __repr__(self) -> str:
+        return f"StoredSamples({len(self)} in {self.path})"
+
+    def __len__(self) -> int:
+        """Number of samples."""
+        return self._shards.n_samples
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """Samples, one after the other."""
+        return (self[index] for index in range(len(self)))
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        """
+        A sample.
+
+        Raises
+        ------
+        IndexError
+            When there is none of this number.
+        FileError
+            When its shard is broken.
+        """
+        place = operator.index(index)
+        if not -len(self) <= place < len(self):
+            raise IndexError(f"there are {len(self)} samples, and none of the number {place}")
+        place %= len(self)
+        try:
+            return self._shards.read(place)
+        except Exception as error:  # noqa: BLE001 -- a broken shard makes its readers trip over anything
+            raise FileError(self.path, f"has a broken sample {place} ({' '.join(str(error).split())})") from None
+
+    @property
+    def class_names(self) -> list[str] | None:
+        """Names of the classes that labels number, where they have some."""
+        names: list[str] | None = self.about["class_names"]
+        return names
+
+
+def open_data_set(path: str | Path) -> StoredSamples:
+    """
+    Open what :func:`write_data_set` wrote; samples are read as they are asked for.
+
+    Raises
+    ------
+    FileError
+        When there is none, it is broken, or not all shards are done.
+    """
+    source = Path(path).absolute()
+    try:
+        if not source.is_dir():
+            raise FileError(source, "is not a folder" if source.exists() else "no such folder")
+    except OSError as error:
+        raise FileError(source, f"cannot be read: {error.strerror or error}") from None
+    if source.suffix.lower() == ZARR:
+        _zarr(source)
+    stored = StoredSamples(source, _about_of(source))
+    shards = stored._shards  # noqa: SLF001 -- its own
+    n_done = sum(shards.is_done(k) for k in range(shards.n_shards))
+    if n_done < shards.n_shards:
+        raise FileError(source, f"has {n_done} of {shards.n_shards} shards; write the same data set there to go on")
+    return stored
+
+
+def _about_of(target: Path) -> dict[str, Any]:
+    """What a folder says of its data set."""
+    is_zarr = target.suffix.lower() == ZARR
+    file = target / ("zarr.json" if is_zarr else ABOUT)
+    about: Any = None
+    try:
+        read = json.loads(file.read_text(encoding="utf-8"))
+        about = read["attributes"] if is_zarr else read
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    if not isinstance(about, dict) or about.get("format") != FORMAT:
+        raise FileError(target, "holds something else than a data set")
+    if about.get("version") != VERSION:
+        raise FileError(target, f"has the format version {about.get('version')}, expected {VERSION}")
+    return about
+
+
+def _kind_of(target: Path) -> type[_Shards]:
+    if target.suffix.lower() == ZARR:
+        return _ZarrShards
+    if target.suffix:
+        raise FileError(target, "must end in .zarr, or have no ending, for a folder of tar files")
+    return _TarShards
+
+
+def _zarr(path: Path) -> Any:
+    try:
+        import zarr
+    except ImportError:
+        raise FileError(path, NEEDS_ZARR) from None
+    return zarr
+
+
+def _begun(target: Path, make: Callable[[Path], None]) -> None:
+    """Make a folder whole or not at all."""
+    new = target.with_name(f".foveasim-{secrets.token_hex(8)}{target.suffix}")
+    try:
+        if not target.parent.is_dir():
+            raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
+        new.mkdir()
+        make(new)
+        new.rename(target)
+    except OSError as error:
+        raise FileError(target, f"cannot be written: {error.strerror or error}") from None
+    finally:
+        remove_folder(new)
+
+
+# -- shards -----------------------------------------------------------------------------------------------------------
+
+
+class _Shards:
+    """Samples in a folder, so many in each shard."""
+
+    def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
+        self.folder = folder
+        self.n_samples, self.per_shard = int(about["n_samples"]), int(about["per_shard"])
+        self.n_shards = -(-self.n_samples // self.per_shard)
+        self.has_label = bool(about["has_label"])
+
+    @staticmethod
+    def begin(target: Path, about: Mapping[str, Any], data_set: DataSet, first: Mapping[str, Any]) -> None:
+        """Make the folder for samples like the first."""
+        raise NotImplementedError
+
+    def samples(self, k: int) -> range:
+        """Numbers of a shard's samples."""
+        return range(k * self.per_shard, min((k + 1) * self.per_shard, self.n_samples))
+
+    def is_done(self, k: int) -> bool:
+        """Whether a shard is there."""
+        return self.made_of(k) != ""
+
+    def made_of(self, k: int) -> str:
+        """The digest that a shard was written with; empty when it is not there, or broken."""
+        raise NotImplementedError
+
+    def write(self, k: int, samples: Sequence[Mapping[str, Any]], made_of: str) -> None:
+        """Write a shard."""
+        raise NotImplementedError
+
+    def read(self, index: int) -> dict[str, Any]:
+        """A sample."""
+        raise NotImplementedError
+
+
+class _TarShards(_Shards):
+    """A tar file a shard: it is there when it is whole."""
+
+    def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
+        super().__init__(folder, about)
+        self._places: dict[int, dict[str, tuple[int, int]]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_places": {}}
+
+    @staticmethod
+    def begin(target: Path, about: Mapping[str, Any], data_set: DataSet, first: Mapping[str, Any]) -> None:  # noqa: ARG004 -- for all kinds alike
+        def make(new: Path) -> None:
+            (new / ABOUT).write_text(json.dumps(about, indent=1), encoding="utf-8")
+            if not data_set.is_layout_varied:
+                data_set.layout.write(new / "layout.npz")
+
+        _begun(target, make)
+
+    def _file(self, k: int) -> Path:
+        return self.folder / f"shard-{k:06d}.tar"
+
+    def is_done(self, k: int) -> bool:
+        return self._file(k).is_file()
+
+    def made_of(self, k: int) -> str:
+        try:
+            with tarfile.open(self._file(k), "r:") as tar:
+                first = tar.next()
+                told = None if first is None or first.name != MADE_OF else tar.extractfile(first)
+                return "" if told is None else told.read().decode()
+        except (OSError, tarfile.TarError, UnicodeDecodeError):
+            return ""
+
+    def write(self, k: int, samples: Sequence[Mapping[str, Any]], made_of: str) -> None:
+        with (
+            written_whole(self._file(k)) as temporary,
+            tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar,
+        ):
+            _add(tar, MADE_OF, made_of.encode())
+            for sample in samples:
+                arrays: dict[str, Any] = {n: value for n, value in sample.items() if isinstance(value, np.ndarray)}
+                rest = {name: value for name, value in sample.items() if name not in arrays}
+                packed = io.BytesIO()
+                np.savez_compressed(packed, **arrays)
+                parts = {"npz": packed.getvalue(), "json": json.dumps(rest).encode()}
+                if "label" in sample:
+                    parts["cls"] = str(sample["label"]).encode()
+                for ending, content in parts.items():
+                    _add(tar, f"{sample['index']:09d}.{ending}", content)
+
+    def read(self, index: int) -> dict[str, Any]:
+        k = index // self.per_shard
+        if k not in self._places:
+            with tarfile.open(self._file(k), "r:") as tar:
+                self._places[k] = {item.name: (item.offset_data, item.size) for item in tar}
+        places = self._places[k]
+        with self._file(k).open("rb") as file:
+
+            def content(ending: str) -> bytes:
+                offset, size = places[f"{index:09d}.{ending}"]
+                file.seek(offset)
+                return file.read(size)
+
+            rest = json.loads(content("json"))
+            with np.load(io.BytesIO(content("npz")), allow_pickle=False) as arrays:
+                return rest | {name: arrays[name] for name in arrays.files}
+
+
+def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
+    item = tarfile.TarInfo(name)
+    item.size = len(content)
+    tar.addfile(item, io.BytesIO(content))
+
+
+class _ZarrShards(_Shards):
+    """A chunk of each array a shard, and a mark behind them all when they are written."""
+
+    def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
+        super().__init__(folder, about)
+        self._opened: tuple[int, dict[str, Any]] | None = None
+        self._read: dict[int, dict[str, NDArray[Any]]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_opened": None, "_read": {}}
+
+    @staticmethod
+    def begin(target: Path, about: Mapping[str, Any], data_set: DataSet, first: Mapping[str, Any]) -> None:
+        zarr = _zarr(target)
+        n, per_shard = about["n_samples"], about["per_shard"]
+        n_shards = -(-n // per_shard)
+
+        def make(new: Path) -> None:
+            group = zarr.open_group(str(new), mode="w", zarr_format=3)
+            for name, value in _flat(first).items():
+                if isinstance(value, str):
+                    group.create_array(name, shape=(n,), chunks=(per_shard,), dtype=str)
+                    continue
+                array = np.asarray(value)
+                lengths = tuple(max(length, 1) for length in array.shape)
+                group.create_array(
+                    name, shape=(n, *array.shape), chunks=(per_shard, *lengths), dtype=array.dtype, fill_value=0
+                )
+            group.create_array(
+                DONE,
+                shape=(n_shards, DIGEST_BYTES),
+                chunks=(1, DIGEST_BYTES),
+                dtype="u1",
+                fill_value=0,
+                compressors=None,
+            )
+            layout = data_set.layout
+            for name in ("xy_um", "ring_offsets", "site_offsets"):
+                group.create_array(f"layout/{name}", data=np.asarray(getattr(layout, name)))
+            group.create_array("layout/filter_of_site", data=np.asarray(data_set.shot(0).camera.sensor.filter_of_site))
+            # With this the folder is a data set.
+            group.attrs.update(about)
+
+        _begun(target, make)
+
+    def _arrays(self) -> dict[str, Any]:
+        if self._opened is None or self._opened[0] != os.getpid():
+            group = _zarr(self.folder).open_group(str(self.folder), mode="r+")
+            arrays = {name: array for name, array in group.arrays()}  # noqa: C416 -- a generator of pairs
+            if SETTINGS in group:
+                arrays |= {f"{SETTINGS}/{name}": array for name, array in group[SETTINGS].arrays()}
+            self._opened = os.getpid(), arrays
+        return self._opened[1]
+
+    def made_of(self, k: int) -> str:
+        try:
+            mark = np.asarray(self._arrays()[DONE][k], np.uint8)
+        except Exception:  # noqa: BLE001 -- a mark that was cut off is none
+            return ""
+        return mark.tobytes().hex() if mark.any() else ""
+
+    def write(self, k: int, samples: Sequence[Mapping[str, Any]], made_of: str) -> None:
+        arrays, place = self._arrays(), slice(self.samples(k).start, self.samples(k).stop)
+        each = [_flat(sample) for sample in samples]
+        for name in each[0]:
+            values: list[Any] = [sample[name] for sample in each]
+            if isinstance(values[0], str):
+                arrays[name][place] = np.array(values, np.dtypes.StringDType())
+            else:
+                arrays[name][place] = np.array(values).astype(arrays[name].dtype, casting="safe", copy=False)
+        arrays[DONE][k] = np.frombuffer(bytes.fromhex(made_of), np.uint8)
+
+    def read(self, index: int) -> dict[str, Any]:
+        rows, row = self._rows(index // self.per_shard), index % self.per_shard
+        sample: dict[str, Any] = {SETTINGS: {}}
+        for name, values in rows.items():
+            value = np.array(values[row]) if values.ndim > 1 else values[row]
+            value = value.item() if isinstance(value, np.generic) else value
+            if name.startswith(f"{SETTINGS}/"):
+                sample[SETTINGS][name.removeprefix(f"{SETTINGS}/")] = value
+            else:
+                sample[name] = value
+        return sample
+
+    def _rows(self, k: int) -> dict[str, NDArray[Any]]:
+        """All of a shard: a chunk is unpacked as a whole, and so is kept for its other samples."""
+        if k not in self._read:
+            place = slice(self.samples(k).start, self.samples(k).stop)
+            rows = {name: np.asarray(array[place]) for name, array in self._arrays().items() if name != DONE}
+            self._read[k] = rows
+            while len(self._read) > KEPT_SHARDS:
+                del self._read[next(iter(self._read))]
+        return self._read[k]
+
+
+def _flat(sample: Mapping[str, Any]) -> dict[str, NDArray[Any] | int | float | str]:
+    """A sample with what was drawn as parts of their own."""
+    own = {f"{SETTINGS}/{path}": value for path, value in sample[SETTINGS].items()}
+    return {name: value for name, value in sample.items() if name != SETTINGS} | own

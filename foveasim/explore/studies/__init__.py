@@ -1,0 +1,1 @@
+"""Studies: search for the best settings."""

@@ -1,0 +1,343 @@
+"""What a study does: a shot, where its settings are searched, what is best, within which limits; and each trial's settings."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from foveasim._core.validation import check_count
+from foveasim._io.yaml_files import read_yaml
+from foveasim.config import check_settings, files_from, put_setting, validated
+from foveasim.errors import ConfigError, ParameterError
+from foveasim.explore._metrics import METRICS, Metric, gives, named_metrics, with_more_metrics
+from foveasim.explore.sweeps.plan import MAX_POINTS, Plan, check_apart, plan_sweep, shot_of, telling
+
+if TYPE_CHECKING:
+    import optuna
+
+__all__ = ["Limits", "Search", "StudyPlan", "StudySection", "plan_study", "read_study"]
+
+#: Where a setting is searched: numbers from one to another, the same with steps or spacing, or a list of choices.
+Search = tuple[float, float] | Mapping[str, Any] | Sequence[Any]
+#: Lowest and highest value of results, either of them None.
+Limits = Mapping[str, tuple[float | None, float | None]]
+#: A value of any setting or result, in its unit; and what a file has as limits.
+_Number = int | float
+_Limit = tuple[float | None, float | None]
+#: Keys of a range that is a mapping.
+RANGE_KEYS = {"from", "to", "step", "spacing"}
+#: Parts of a sweep's plan that a study does not have.
+NOT_OF_STUDIES = {"vary", "mode", "repeats"}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StudyPlan:
+    """
+    A study before it runs.
+
+    Attributes
+    ----------
+    base : Plan
+        Settings, seed, metrics and files, as a sweep has them.
+    search : mapping of str to range
+        By the settings' paths.
+    objectives : mapping of str to {"maximize", "minimize"}
+        By the names of results.
+    constraints : mapping of str to (low, high)
+        Limits of results, either of them None.
+    n_trials : int
+        Trials that the study has at its end.
+    name : str
+        Of the study in its storage.
+    folder : Path
+        Where files that choices name are looked for.
+    files : mapping of str to str
+        SHA-256 of the files that settings and choices name.
+    """
+
+    base: Plan
+    search: Mapping[str, Search]
+    objectives: Mapping[str, Literal["maximize", "minimize"]]
+    constraints: Limits
+    n_trials: int
+    name: str
+    folder: Path
+    files: Mapping[str, str]
+
+    def settings_of(self, trial: optuna.Trial) -> dict[str, Any]:
+        """All settings of a trial, with the study's seed: what differs between trials is settings, and not noise."""
+        settings = json.loads(json.dumps(dict(self.base.settings))) | {"seed": self.base.seed}
+        for path, where in self.search.items():
+            value = files_from(self.folder, _suggested(trial, path, where), path)
+            put_setting(self.base.source, settings, path, value)
+        return dict(settings)
+
+    def described(self) -> dict[str, Any]:
+        """All that trials depend on, as plain data: a study goes on where it equals."""
+        base = {key: value for key, value in self.base.described().items() if key not in NOT_OF_STUDIES}
+        return base | {
+            "files": dict(self.files),
+            "search": {path: _plain(where) for path, where in self.search.items()},
+            "objectives": dict(self.objectives),
+            "constraints": {key: list(limits) for key, limits in self.constraints.items()},
+        }
+
+
+class _SearchRange(BaseModel):
+    """From a number to another: whole numbers where the setting takes no others."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    low: _Number = Field(alias="from")
+    high: _Number = Field(alias="to")
+    step: _Number | None = Field(None, description="of the numbers; any between by default")
+    spacing: Literal["linear", "geometric"] | None = Field(None, description="linear by default; not beside a step")
+
+
+class StudySection(BaseModel):
+    """A study: a shot, where its settings are searched, objectives, constraints, number of trials, seed, names of metrics."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    shot: str | dict[str, Any] = Field(description="a file beside this one, or the settings themselves")
+    set: dict[str, Any] = Field({}, description="settings to be replaced in all trials, by their paths")
+    search: dict[str, _SearchRange | list[Any]] = Field(description="ranges or lists of choices, by settings' paths")
+    objectives: dict[str, Literal["maximize", "minimize"]] = Field(description="by the names of results")
+    constraints: dict[str, _Limit] = Field({}, description="[low, high] by the names of results, either of them null")
+    trials: int = Field(ge=1, le=MAX_POINTS, description="that the study has at its end")
+    seed: int = 0
+    metrics: list[str] | None = Field(None, description="by default those that give the objectives and constraints")
+    name: str = Field("study", min_length=1, description="of the study in its storage")
+
+
+def read_study(path: str | Path, *, metrics: Sequence[str] = (), n_trials: int | None = None) -> StudyPlan:
+    """
+    Read a YAML file of a study.
+
+    Parameters
+    ----------
+    path : path
+        With the keys ``shot`` (a file beside it, or the settings themselves), ``search`` (settings' paths to
+        ``{from: 2, to: 16, step: 2}``, to ``{from: 0.5, to: 4, spacing: geometric}``, or to a list of choices; of settings that
+        are whole numbers only such are tried), ``objectives`` (results' names to ``maximize`` or
+        ``minimize``), ``trials``, ``constraints`` (results' names to ``[low, high]``, either of them ``null``), ``seed``,
+        ``metrics``, ``name``, and ``set`` (settings to be replaced in all trials). The file names metrics of :data:`METRICS`
+        only: a file never makes the program import code.
+    metrics : sequence of str
+        More metrics: names, or ``module:function``, which is imported.
+    n_trials : int, optional
+        In the place of the file's.
+
+    Raises
+    ------
+    ConfigError
+        With the file, the place in it, what was expected and got.
+    ParameterError
+        When there is no such metric.
+    """
+    path = Path(path)
+    section: StudySection = validated(path, StudySection, read_yaml(path))
+    source, shot = shot_of(path, section.shot)
+    with telling(path):
+        # The names that the file gives are looked up in METRICS, and never imported.
+        named = _wanted([*section.objectives, *section.constraints], section.metrics)
+    wanted = with_more_metrics(named, metrics)
+    if n_trials is not None:
+        n_trials = check_count("trials", n_trials, at_most=MAX_POINTS)
+    with telling(path):
+        return plan_study(
+            shot,
+            {
+                name: where if isinstance(where, list) else where.model_dump(by_alias=True, exclude_none=True)
+                for name, where in section.search.items()
+            },
+            section.objectives,
+            n_trials=section.trials if n_trials is None else n_trials,
+            constraints=section.constraints,
+            metrics=None if section.metrics is None and not metrics else wanted,
+            changes={name: files_from(path.parent, value, name) for name, value in section.set.items()},
+            seed=section.seed,
+            name=section.name,
+            source=source,
+            folder=path.parent,
+        )
+
+
+def plan_study(
+    shot: str | Path | Mapping[str, Any],
+    search: Mapping[str, Search],
+    objectives: Mapping[str, Literal["maximize", "minimize"]],
+    *,
+    n_trials: int,
+    constraints: Limits | None = None,
+    metrics: Sequence[str | Metric] | Mapping[str, Metric] | None = None,
+    changes: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    name: str = "study",
+    source: str | Path = "settings",
+    folder: str | Path = ".",
+) -> StudyPlan:
+    """
+    Plan a study, and check all that can be checked without building anything.
+
+    Parameters
+    ----------
+    shot, changes, source
+        As for :func:`plan_sweep`.
+    search, objectives, n_trials, constraints, metrics, seed, name
+        As for :func:`study`.
+    folder : path
+        Where files that choices name are looked for.
+
+    Raises
+    ------
+    ParameterError, ConfigError
+        When a path, a range or a name is none.
+    """
+    n_trials = check_count("n_trials", n_trials, at_most=MAX_POINTS)
+    if not isinstance(name, str) or not name:
+        raise ParameterError("name", "must be a text, and not empty", name)
+    constraints = dict(constraints or {})
+    _check_names(objectives, constraints)
+    wanted = _wanted([*objectives, *constraints], metrics)
+    for place, names in (("objectives", objectives), ("constraints", constraints)):
+        _check_given(place, names, METRICS if metrics is None else wanted)
+    if not isinstance(search, Mapping) or not search:
+        raise ParameterError("search", "must be ranges by settings' paths: nothing is searched", search)
+    if "seed" in search:
+        raise ParameterError("seed", "cannot be searched: the noise of all trials is the same")
+    plans = [
+        plan_sweep(
+            shot,
+            {path: _ends(path, where)},
+            mode="zip",
+            metrics=wanted,
+            changes=changes,
+            seed=seed,
+            source=source,
+            folder=folder,
+        )
+        for path, where in search.items()
+    ]
+    check_apart(plans[0].source, search, "be searched")
+    return StudyPlan(
+        base=plans[0],
+        search={path: _as_taken(plan, path, search[path]) for path, plan in zip(search, plans, strict=True)},
+        objectives=dict(objectives),
+        constraints=constraints,
+        n_trials=n_trials,
+        name=name,
+        folder=Path(folder).absolute(),
+        files={file: digest for plan in plans for file, digest in plan.files.items()},
+    )
+
+
+def _wanted(names: Sequence[str], metrics: Any) -> dict[str, Metric]:
+    """The metrics that are given; where none are, those that give the results, by their names."""
+    if metrics is not None:
+        return named_metrics(metrics)
+    return {own: METRICS[own] for own in METRICS if any(gives(own, name) for name in names)}
+
+
+def _check_given(place: str, names: Iterable[str], metrics: Iterable[str]) -> None:
+    for name in names:
+        if not any(gives(own, name) for own in metrics):
+            raise ParameterError(
+                place,
+                f"must be results of metrics ({', '.join(metrics)}), or of 'metrics' that are given",
+                name,
+                cure="functions of your own are given in Python, or with --metric module:function",
+            )
+
+
+def _check_names(objectives: Mapping[str, str], constraints: Limits) -> None:
+    if not isinstance(objectives, Mapping) or not objectives:
+        raise ParameterError("objectives", 'must be names of results with "maximize" or "minimize"', objectives)
+    for name, way in objectives.items():
+        if way not in ("maximize", "minimize"):
+            raise ParameterError(str(name), 'must be "maximize" or "minimize"', way)
+    for name, limits in constraints.items():
+        is_pair = isinstance(limits, tuple | list) and len(limits) == 2
+        if (
+            not is_pair
+            or all(limit is None for limit in limits)
+            or not all(limit is None or _is_number(limit) for limit in limits)
+        ):
+            raise ParameterError(str(name), "must have limits (low, high), one of which may be None", limits)
+        low, high = limits
+        if low is not None and high is not None and low > high:
+            raise ParameterError(str(name), "must have limits (low, high), the first no larger than the second", limits)
+
+
+def _ends(path: str, where: Search) -> list[Any]:
+    """Values at the ends of a range, or all choices."""
+    if isinstance(where, Mapping):
+        if set(where) - RANGE_KEYS or not {"from", "to"} <= set(where) or {"step", "spacing"} <= set(where):
+            raise ParameterError(path, "must have 'from' and 'to', and may have 'step' or 'spacing'", dict(where))
+        if where.get("spacing", "linear") not in ("linear", "geometric"):
+            raise ParameterError(path, "must have a spacing that is linear or geometric", where["spacing"])
+        ends = [where["from"], where["to"]]
+    elif isinstance(where, tuple):
+        ends = list(where)
+    elif isinstance(where, list) and where:
+        return where
+    else:
+        raise ParameterError(path, "must be searched in (low, high), in a range, or in a list of choices", where)
+    if len(ends) != 2 or not all(map(_is_number, ends)) or not ends[0] < ends[1]:
+        raise ParameterError(path, "must have two ends, the first the smaller", where)
+    if isinstance(where, Mapping):
+        if where.get("spacing") == "geometric" and ends[0] <= 0:
+            raise ParameterError(path, "must be above 0 for geometric spacing", where["from"])
+        if "step" in where and not (_is_number(where["step"]) and 0 < where["step"] <= ends[1] - ends[0]):
+            raise ParameterError(path, "must have a step > 0, and no larger than the range", where["step"])
+    return ends
+
+
+def _as_taken(plan: Plan, path: str, where: Search) -> Search:
+    """A range in whole numbers where the setting takes no others, and otherwise in any, however its ends are written."""
+    low, *others = _ends(path, where)
+    if isinstance(where, list) or not all(isinstance(end, int) for end in (low, *others)):
+        return where
+    settings = json.loads(json.dumps(dict(plan.settings)))
+    put_setting(plan.source, settings, path, low + 0.5)
+    try:
+        check_settings(plan.source, settings)
+    except ConfigError:
+        return where
+    if isinstance(where, Mapping):
+        return {key: float(value) if key in {"from", "to"} else value for key, value in where.items()}
+    return float(low), float(others[0])
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, int) and not isinstance(value, bool):
+        return abs(value) < 2**63  # Optuna stores no larger ones
+    return isinstance(value, float) and math.isfinite(value)
+
+
+def _suggested(trial: optuna.Trial, path: str, where: Search) -> Any:
+    """A trial's value of a setting."""
+    if isinstance(where, list):
+        texts = [json.dumps(choice) for choice in where]
+        return json.loads(trial.suggest_categorical(path, texts))
+    low, high = _ends(path, where)
+    step = where.get("step") if isinstance(where, Mapping) else None
+    is_log = isinstance(where, Mapping) and where.get("spacing") == "geometric"
+    is_whole = all(isinstance(number, int) for number in (low, high, step or 1))
+    if step is not None:
+        # Optuna wants the end to be a step, and reckons in decimals.
+        first, each = Decimal(str(low)), Decimal(str(step))
+        last = first + (Decimal(str(high)) - first) // each * each
+        high = int(last) if is_whole else float(last)
+    if is_whole:
+        return trial.suggest_int(path, low, high, step=step or 1, log=is_log)
+    return trial.suggest_float(path, low, high, step=step, log=is_log)
+
+
+def _plain(where: Search) -> Any:
+    return dict(where) if isinstance(where, Mapping) else list(where)

@@ -1,0 +1,1 @@
+"""Sweeps: one shot at many settings."""

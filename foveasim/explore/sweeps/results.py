@@ -1,0 +1,307 @@
+"""Records of points as one labelled data set, and the zarr store that it is kept in."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._core.validation import unit_of
+from foveasim._io.atomic import remove_folder
+from foveasim.errors import FileError, ParameterError
+from foveasim.explore._records import FORMAT, VERSION, Record, Value
+from foveasim.explore.sweeps.plan import POINT, REPEAT, Plan, coordinate
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["check_store", "dataset_of", "open_results", "stored_plan", "write_store"]
+
+#: Variables of every sweep.
+SEED, ERROR, WARNING = "seed", "error", "warning"
+#: Attributes of a store that hold texts of JSON, so that any format can keep them.
+PLAN, SETTINGS, VERSIONS = "plan", "settings", "versions"
+
+
+def dataset_of(plan: Plan, records: Mapping[int, Record]) -> xr.Dataset:
+    """
+    The records as an xarray.Dataset, whatever the order in which they came.
+
+    Parameters
+    ----------
+    plan : Plan
+    records : mapping of int to Record
+        By the points' numbers; points without one have NaN, and the error "not done".
+
+    Returns
+    -------
+    xarray.Dataset
+        Dimensions are the settings that vary, or ``point``, and ``repeat``. Beside the metrics: ``seed``, ``error`` (empty
+        where all is well), ``warning``. Dimensions without labels are as long as the longest, with NaN beyond.
+    """
+    xr = _xarray()
+    shape, dims = plan.shape, plan.dims
+    errors = {k: records[k].error if k in records else "not done" for k in range(plan.n_points)}
+    taken = {*plan.values, POINT, REPEAT, SEED, ERROR, WARNING}
+    given = _apart(_alike(_by_name([records[k] for k in sorted(records)]), taken, errors), taken)
+    labels = _labels(given)
+    variables: dict[str, Any] = {}
+    for name, values in given.items():
+        flat = _stacked(values, plan.n_points, labels)
+        variables[name] = (
+            (*dims, *next(iter(values.values())).dims),
+            flat.reshape(*shape, *flat.shape[1:]),
+            {"units": unit_of(name)} if unit_of(name) else {},
+        )
+    seeds = np.array([plan.seed_of(k) for k in range(plan.n_points)], np.int64)
+    texts = {
+        ERROR: list(errors.values()),
+        WARNING: [records[k].warning if k in records else "" for k in range(plan.n_points)],
+    }
+    variables[SEED] = (dims, seeds.reshape(shape))
+    for name, each in texts.items():
+        variables[name] = (dims, _texts(each).reshape(shape))
+    coords: dict[str, Any] = {
+        path: (
+            (path if plan.mode == "product" else POINT,),
+            coordinate(values),
+            {"units": unit_of(path)} if unit_of(path) else {},
+        )
+        for path, values in plan.values.items()
+    }
+    if plan.mode == "zip":
+        coords[POINT] = np.arange(shape[0])
+    if plan.repeats > 1:
+        coords[REPEAT] = np.arange(plan.repeats)
+    coords |= {dim: (dim, array) for dim, (array, _) in labels.items()}
+    described = plan.described()
+    attributes = {
+        "format": FORMAT,
+        "version": VERSION,
+        SETTINGS: json.dumps(described["settings"]),
+        VERSIONS: json.dumps(described["versions"]),
+        PLAN: json.dumps(described),
+    }
+    return xr.Dataset(variables, coords, attributes)
+
+
+def _texts(values: list[str]) -> NDArray[Any]:
+    return np.array(values, np.dtypes.StringDType())
+
+
+def _by_name(rows: Iterable[Record]) -> dict[str, dict[int, Value]]:
+    """Values of each name, by points; numbers and texts as arrays without dimensions."""
+    given: dict[str, dict[int, Value]] = {}
+    for record in rows:
+        for name, value in record.values.items():
+            array = value if isinstance(value, Value) else Value(np.asarray(value), (), {})
+            given.setdefault(name, {})[record.point] = array
+    return given
+
+
+def _alike(
+    given: Mapping[str, dict[int, Value]], taken: set[str], errors: dict[int, str]
+) -> dict[str, dict[int, Value]]:
+    """
+    Values that have the same dimensions in all points.
+
+    What differs from most, or has the name of a setting that varies, is left out, and told in ``errors``.
+    """
+    kept: dict[str, dict[int, Value]] = {}
+    for name, values in given.items():
+        kinds = Counter((value.dims, tuple(value.labels)) for value in values.values())
+        most = kinds.most_common(1)[0][0]
+        alike = {k: value for k, value in values.items() if (value.dims, tuple(value.labels)) == most}
+        why = f"{name}: has other dimensions or labels than in most points, with {', '.join(most[0]) or 'none'}"
+        if name in taken:
+            alike, why = {}, f"{name}: has the name of a setting or of a dimension"
+        for k in sorted(values.keys() - alike.keys()):
+            errors[k] = "; ".join(filter(None, (errors[k], why)))
+        if alike:
+            kept[name] = alike
+    return kept
+
+
+def _apart(given: Mapping[str, Mapping[int, Value]], taken: set[str]) -> dict[str, dict[int, Value]]:
+    """
+    Values with names of dimensions that nothing else has.
+
+    Dimensions with labels are shared by all variables that name them so; others are a variable's own.
+    """
+    labelled = {dim for values in given.values() for dim in next(iter(values.values())).labels}
+    apart: dict[str, dict[int, Value]] = {}
+    for name, values in given.items():
+        first = next(iter(values.values()))
+        own: dict[str, str] = {}
+        for dim in first.dims:
+            free = dim if dim in first.labels or dim.startswith(name) else f"{name}_{dim}"
+            others = {*taken, *given, *own.values(), *(() if free in first.labels else labelled)}
+            if free in others:
+                free = f"{name}_{dim}"
+            while free in others:
+                free += "_"
+            own[dim] = free
+        for k, value in values.items():
+            labels = {own[dim]: each for dim, each in value.labels.items()}
+            apart.setdefault(name, {})[k] = Value(value.data, tuple(own[dim] for dim in value.dims), labels)
+    return apart
+
+
+def _labels(given: Mapping[str, Mapping[int, Value]]) -> dict[str, tuple[NDArray[Any], dict[Any, int]]]:
+    """Labels of each dimension that has some, and their places: sorted numbers, or texts as they came."""
+    found: dict[str, dict[Any, None]] = {}
+    for values in given.values():
+        for value in values.values():
+            for dim, labels in value.labels.items():
+                found.setdefault(dim, {}).update(dict.fromkeys(labels.tolist()))
+    joined: dict[str, tuple[NDArray[Any], dict[Any, int]]] = {}
+    for dim, each in found.items():
+        if any(isinstance(label, str) for label in each):
+            places = {text: k for k, text in enumerate(dict.fromkeys(map(str, each)))}
+            joined[dim] = _texts(list(places)), {label: places[str(label)] for label in each}
+        else:
+            numbers = sorted(each)
+            joined[dim] = np.array(numbers), {label: k for k, label in enumerate(numbers)}
+    return joined
+
+
+def _stacked(
+    values: Mapping[int, Value], n_points: int, labels: Mapping[str, tuple[NDArray[Any], Mapping[Any, int]]]
+) -> NDArray[Any]:
+    """A metric's values of all points, (n_point, ...), with what is not known as NaN or an empty text."""
+    first = next(iter(values.values()))
+    shape = tuple(
+        labels[dim][0].size if dim in first.labels else max(value.data.shape[axis] for value in values.values())
+        for axis, dim in enumerate(first.dims)
+    )
+    kinds = {value.data.dtype.kind for value in values.values()}
+    is_text = "U" in kinds
+    is_whole = len(values) == n_points and all(value.data.shape == shape for value in values.values())
+    if is_text:
+        flat: NDArray[Any] = np.full((n_points, *shape), "", np.dtypes.StringDType())
+    else:
+        dtype = np.result_type(*(value.data.dtype for value in values.values()))
+        if not is_whole and dtype.kind != "f":
+            dtype = np.promote_types(dtype, np.float64)
+        flat = np.empty((n_points, *shape), dtype) if is_whole else np.full((n_points, *shape), np.nan, dtype)
+    for k, value in values.items():
+        at: list[Any] = [
+            np.array([labels[dim][1][label] for label in value.labels[dim].tolist()], np.int64)
+            if dim in value.labels
+            else np.arange(value.data.shape[axis])
+            for axis, dim in enumerate(value.dims)
+        ]
+        place: Any = (k, *np.ix_(*at))
+        flat[place] = value.data.astype(flat.dtype) if is_text else value.data
+    return flat
+
+
+# -- the store --------------------------------------------------------------------------------------------------------
+
+
+def check_store(path: Path) -> None:
+    """
+    Whether results can be written there, before anything is computed.
+
+    Raises
+    ------
+    FileError
+        When the folder does not exist, or something else is there.
+    """
+    _xarray()
+    if not path.absolute().parent.is_dir():
+        raise FileError(path, f"cannot be written: the folder {path.absolute().parent} does not exist")
+    if path.exists() and not (path / "zarr.json").is_file():
+        raise FileError(path, "cannot be written: something else than a sweep's results is there")
+
+
+def stored_plan(path: Path) -> dict[str, Any] | None:
+    """
+    The plan of the results in a store; None where there is no store.
+
+    Raises
+    ------
+    FileError
+        When the store is broken, or no sweep's.
+    """
+    if not path.exists():
+        return None
+    try:
+        attributes = json.loads((path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
+        if attributes["format"] == FORMAT:
+            plan: dict[str, Any] = json.loads(attributes[PLAN])
+            return plan
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    raise FileError(path, "holds something else than a sweep's results")
+
+
+def open_results(path: str | Path) -> xr.Dataset:
+    """
+    The results in a store, in memory.
+
+    Raises
+    ------
+    FileError
+        When there is none, or it is broken.
+    """
+    path = Path(path)
+    if stored_plan(path) is None:
+        raise FileError(path, "no such store")
+    try:
+        with _xarray().open_zarr(path, consolidated=False, chunks=None) as dataset:
+            loaded: xr.Dataset = dataset.load()
+            return loaded
+    except Exception as error:  # noqa: BLE001 -- a broken store makes its readers trip over anything
+        raise FileError(path, f"is broken ({' '.join(str(error).split()):.200})") from None
+
+
+def write_store(dataset: xr.Dataset, path: Path) -> None:
+    """
+    Write a zarr folder, whole or not at all, in the place of one that was there.
+
+    Raises
+    ------
+    FileError
+        When nothing can be written there.
+    """
+    token = secrets.token_hex(8)
+    new, old = (path.with_name(f".foveasim-{token}-{which}.zarr") for which in ("new", "old"))
+    try:
+        with warnings.catch_warnings():
+            # Zarr has it for all who open the store with xarray, and warns that others may not read it so; they need not.
+            warnings.filterwarnings("ignore", "Consolidated metadata is currently not part")
+            dataset.to_zarr(new, mode="w-", consolidated=True, zarr_format=3)
+        # On the disk before the journal is removed: a power cut leaves one of them whole.
+        for file in (path for path in new.rglob("*") if path.is_file()):
+            with file.open("r+b") as opened:
+                os.fsync(opened.fileno())
+        if path.exists():
+            path.rename(old)
+        new.rename(path)
+    except OSError as error:
+        if old.exists() and not path.exists():
+            old.rename(path)
+        raise FileError(path, f"cannot be written: {error.strerror or error}") from None
+    finally:
+        for folder in (new, old):
+            remove_folder(folder)
+
+
+def _xarray() -> Any:
+    try:
+        import xarray
+        import zarr  # noqa: F401 -- the results' format
+    except ImportError:
+        raise ParameterError(
+            "sweep", "needs xarray and zarr; install them with: pip install 'foveasim[explore]'"
+        ) from None
+    return xarray

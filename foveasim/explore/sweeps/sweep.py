@@ -1,0 +1,217 @@
+"""Sweeps: the same shot with other settings, again and again, into one store of results."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from foveasim._core.threads import thread_count
+from foveasim._core.validation import Ints, check_count
+from foveasim.errors import SimulationError
+from foveasim.explore._functions import own_module
+from foveasim.explore._metrics import Metric
+from foveasim.explore._records import Journal, Record, check_same_plan, journal_of
+from foveasim.explore.cluster import client_of
+from foveasim.explore.executor import records_of
+from foveasim.explore.sweeps.plan import Plan, plan_sweep
+from foveasim.explore.sweeps.results import check_store, dataset_of, open_results, stored_plan, write_store
+from foveasim.explore.worker_cache import Job, Task
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["run_sweep", "sweep"]
+
+#: Told how many points are done, of how many.
+Tell = Callable[[int, int], None]
+
+
+def sweep(
+    shot: str | Path | Mapping[str, Any],
+    vary: Mapping[str, Iterable[Any]] | Sequence[Mapping[str, Any]],
+    *,
+    mode: Literal["product", "zip"] = "product",
+    repeats: int = 1,
+    seed: int = 0,
+    metrics: Iterable[str | Metric] | Mapping[str, Metric] | None = None,
+    changes: Mapping[str, Any] | None = None,
+    out: str | Path | None = None,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    retry: bool = False,
+    tell: Tell | None = None,
+) -> xr.Dataset:
+    """
+    Take a shot with many settings, and tabulate metrics over them.
+
+    Parameters
+    ----------
+    shot, vary, mode, repeats, seed, metrics, changes
+        As for :func:`plan_sweep`.
+    out, scheduler, workers, retry, tell
+        As for :func:`run_sweep`.
+
+    Returns
+    -------
+    xarray.Dataset
+        See :func:`run_sweep`.
+
+    Raises
+    ------
+    ParameterError, ConfigError, FileError, SimulationError
+        As for both.
+
+    Notes
+    -----
+    Workers are processes that import the calling program's main file: keep the call under ``if __name__ == "__main__":``.
+
+    Examples
+    --------
+    ::
+
+        results = sweep("shot.yaml", {"sensor.bits": [8, 10, 12], "exposure_s": [0.01, 0.02]}, repeats=10, out="results.zarr")
+        results["snr_mean"].mean("repeat")
+    """
+    plan = plan_sweep(shot, vary, mode=mode, repeats=repeats, seed=seed, metrics=metrics, changes=changes)
+    return run_sweep(plan, out=out, scheduler=scheduler, workers=workers, retry=retry, tell=tell)
+
+
+def run_sweep(
+    plan: Plan,
+    *,
+    out: str | Path | None = None,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    retry: bool = False,
+    tell: Tell | None = None,
+) -> xr.Dataset:
+    """
+    Run a sweep that was planned, or go on with one that was ended.
+
+    Parameters
+    ----------
+    plan : Plan
+    out : path, optional
+        A zarr folder for the results. While the sweep runs, every point that is done is written to a journal beside it, from
+        which the same sweep goes on after any end of the program; the folder is written when all are done. The journal stays
+        where points failed.
+    scheduler : str, optional
+        Address of a dask scheduler, such as ``"tcp://10.0.0.1:8786"``, whose workers have this package and see the files that
+        the settings name under the same names. By default processes on this machine.
+    workers : int, optional
+        Number of those processes; by default one a core.
+    retry : bool
+        Whether points that failed before are tried again; all of them, where there is a store without its journal.
+    tell : callable, optional
+        Called with the numbers of points that are done and of all.
+
+    Returns
+    -------
+    xarray.Dataset
+        Metrics over the settings that vary; ``seed``, ``error`` and ``warning`` of every point; the plan, all settings and the
+        versions among its attributes. The same, bit for bit, with any number of workers, and after any number of ends.
+
+    Raises
+    ------
+    ParameterError
+        When no scheduler answers, or a package is missing.
+    FileError
+        When the store is another sweep's, or cannot be written.
+    SimulationError
+        When the scheduler or its workers go away. What was done is kept.
+
+    Notes
+    -----
+    A point that raises has NaN and its message among the results, and the others go on. Points with the same layout and light
+    go to the same worker, which keeps layouts, scenes, images, compiled layouts and the light on the sites.
+    """
+    if workers is not None:
+        workers = check_count("workers", workers, at_most=1024)
+    if out is None:
+        records: dict[int, Record] = {}
+        _run(plan, records, lambda record: records.update({record.point: record}), scheduler, workers, tell)
+        return dataset_of(plan, records)
+    store = Path(out)
+    check_store(store)
+    before = stored_plan(store)
+    if before is not None:
+        check_same_plan(store, before, plan.described())
+        if not journal_of(store).exists():
+            complete = open_results(store)
+            # What points gave cannot be had from a store again as it was: without the journal, all are tried.
+            if not (retry and (complete["error"] != "").any()):
+                return complete
+    with Journal(store, plan.described()) as journal:
+        if retry:
+            for point in [point for point, record in journal.records.items() if record.error]:
+                del journal.records[point]
+        _run(plan, journal.records, journal.add, scheduler, workers, tell)
+        dataset = dataset_of(plan, journal.records)
+        write_store(dataset, store)
+        if not (dataset["error"] != "").any():
+            journal.remove()
+    return dataset
+
+
+def _run(
+    plan: Plan,
+    known: Mapping[int, Record],
+    add: Callable[[Record], None],
+    scheduler: str | None,
+    workers: int | None,
+    tell: Tell | None,
+) -> None:
+    """Do all points that are not known."""
+    n_left = plan.n_points - len(known)
+    n_done = len(known)
+    if n_left == 0:
+        return
+    n_workers = min(thread_count() if workers is None else workers, n_left)
+    runs = [[int(point) for point in run if int(point) not in known] for run in _runs(plan, n_workers)]
+    # A worker of a scheduler knows how many threads it was given.
+    n_threads = max(1, thread_count() // n_workers) if scheduler is None else 0
+    job = _pickled(Job(plan.source, plan.metrics, n_threads, plan.is_geometry_varied))
+    with client_of(scheduler, n_workers) as client:
+        if tell is not None:
+            tell(n_done, plan.n_points)
+        try:
+            for record in records_of(client, job, lambda point: Task(point, plan.settings_of(point)), runs):
+                add(record)
+                n_done += 1
+                if tell is not None:
+                    tell(n_done, plan.n_points)
+        except SimulationError as error:
+            raise SimulationError(
+                f"{error}; {n_done:,} of {plan.n_points:,} points are done, and a sweep with a store goes on from there"
+            ) from None
+
+
+def _runs(plan: Plan, n_runs: int) -> list[Ints]:
+    """The points in their order, cut where layout or light changes, so that each worker begins at such a place."""
+    order, begins = plan.order()
+    wished = np.linspace(0, order.size, n_runs + 1)[1:-1]
+    cuts = {int(begins[np.abs(begins - place).argmin()]) for place in wished} - {0}
+    bounds = [0, *sorted(cuts), order.size]
+    return [order[start:stop] for start, stop in itertools.pairwise(bounds)]
+
+
+def _pickled(job: Job) -> bytes:
+    """The job with the functions of the user's own modules in it: workers need not find those."""
+    import cloudpickle
+
+    names = {own_module(metric) for metric in job.metrics.values()} - {None, "__main__"}
+    own = [sys.modules[name] for name in names if name is not None]
+    for module in own:
+        cloudpickle.register_pickle_by_value(module)
+    try:
+        return bytes(cloudpickle.dumps(job))
+    except Exception as error:  # noqa: BLE001 -- objects refuse to be pickled in many ways
+        raise SimulationError(f"the metrics cannot be sent to other processes: {error}") from None
+    finally:
+        for module in own:
+            cloudpickle.unregister_pickle_by_value(module)

@@ -1,0 +1,1 @@
+"""Design rules: limits, measurements, repair, routing and reports."""

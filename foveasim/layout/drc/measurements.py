@@ -1,0 +1,551 @@
+"""What each design rule measures, and the table of all rules."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from foveasim._core.rings import next_vertex, positions_in_runs, ring_moments
+from foveasim._core.threads import each, thread_count
+from foveasim._core.validation import Bools, Floats, Ints
+from foveasim.layout._noding import noded_edges
+from foveasim.layout.adjacency import TOUCHING_UM
+from foveasim.layout.drc.routing import crossings
+from foveasim.layout.model import Layout
+
+if TYPE_CHECKING:
+    from foveasim.layout.drc.rules import DesignRules
+
+__all__ = ["RULES", "Case", "Measured", "Rule", "is_below_size", "min_width_um"]
+
+#: Lengths are compared with this tolerance, a thousandth of the finest manufacturing grid (1 nm).
+LENGTH_ROUNDING_UM = 1e-6
+#: Overlaps and gaps below this share of a site's area are the rounding of its vertices.
+AREA_ROUNDING = 1e-9
+#: Sites that are fewer than one in so many are made into polygons by themselves, rather than all at once.
+FEW = 10
+#: Pairs that a thread takes at once.
+PAIRS_A_PIECE = 100_000
+
+
+@dataclass(frozen=True, slots=True)
+class Contacts:
+    """
+    How sites that are near to each other lie: arrays of pairs, ordered by the first site, then the second.
+
+    Attributes
+    ----------
+    first, second : (n_pair,) int64
+        The sites, first < second.
+    distance_um : (n_pair,) float64, µm
+        0 for sites that overlap, infinite beyond what was asked for.
+    is_apart : (n_pair,) bool
+        Whether the two surely do not overlap but for rounding.
+    is_shared : (n_vertex,) bool
+        Whether the edge that begins at a vertex is another site's edge too, bit for bit.
+    """
+
+    first: Ints
+    second: Ints
+    distance_um: Floats
+    is_apart: Bools
+    is_shared: Bools
+
+    def of(self, pairs: Any) -> Ints:
+        """Sites of some pairs, (n, 2)."""
+        return np.stack((self.first[pairs], self.second[pairs]), axis=1)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A layout and its rules, with what several measures need, computed once."""
+
+    layout: Layout
+    rules: DesignRules
+
+    @cached_property
+    def polygons(self) -> NDArray[Any]:
+        """The sites as shapely polygons."""
+        return self.layout.polygons()
+
+    def shapes(self, sites: Ints) -> NDArray[Any]:
+        """Some sites as shapely polygons."""
+        return self.layout[sites].polygons() if FEW * sites.size < self.layout.n_sites else self.polygons[sites]
+
+    def sites_near(self, box_um: Floats, reach_um: float = 0.0) -> tuple[Ints, Ints]:
+        """Pairs of some boxes, (n, 4), and sites whose boxes are at most so far apart, ordered by the sites."""
+        n = self.layout.n_sites
+        site, box = _near_pairs(np.concatenate((self.layout.site_bounds_um, box_um)), reach_um)
+        is_mixed = (site < n) & (box >= n)
+        return box[is_mixed] - n, site[is_mixed]
+
+    def sites_at(self, geometries: NDArray[Any], among: Bools, reach_um: float = 0.0) -> tuple[Ints, Ints]:
+        """Pairs of some geometries and sites, of those flagged, that are at most so far apart, ordered by the sites."""
+        geometry, site = self.sites_near(shapely.bounds(geometries), reach_um)
+        geometry, site = geometry[among[site]], site[among[site]]
+        shapely.prepare(geometries)
+        is_met = shapely.dwithin(geometries[geometry], self.shapes(site), reach_um)
+        return geometry[is_met], site[is_met]
+
+    @cached_property
+    def after(self) -> Ints:
+        """The vertex that follows each one in its ring."""
+        return next_vertex(self.layout.ring_offsets)
+
+    @cached_property
+    def first_vertex(self) -> Ints:
+        """Where each site's vertices begin, (n_site + 1,)."""
+        return self.layout.ring_offsets[self.layout.site_offsets]
+
+    @cached_property
+    def contacts(self) -> Contacts:
+        """All pairs of sites that may touch, or break the rule for spaces."""
+        from foveasim.layout import _kernels
+
+        layout = self.layout
+        reach_um = max(float(self.rules.min_space_um or 0.0), 2.0 * TOUCHING_UM)
+        first, second = _near_pairs(layout.site_bounds_um, reach_um)
+        box = layout.site_bounds_um
+        depth_um = AREA_ROUNDING * layout.area_um2 / np.hypot(box[:, 2] - box[:, 0], box[:, 3] - box[:, 1])
+        overhang_um = _kernels.overhangs(layout.xy_um, self.after, self.first_vertex)
+        is_shared = np.zeros(layout.xy_um.shape[0], bool)
+
+        def meet(piece: slice) -> tuple[Floats, Bools]:
+            return _kernels.contacts(
+                layout.xy_um, self.after, self.first_vertex, box, overhang_um, depth_um, first[piece], second[piece],
+                reach_um, LENGTH_ROUNDING_UM, is_shared,
+            )  # fmt: skip
+
+        found = each(meet, _pieces(first.size), thread_count())
+        distance_um, is_apart = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return Contacts(first, second, distance_um, is_apart, is_shared)
+
+    @cached_property
+    def windows(self) -> tuple[Floats, Floats, Floats]:
+        """Windows of the density rule, lower left and upper right corners (n, 2) µm, and the area that sites fill in each."""
+        layout, window_um = self.layout, float(self.rules.density_window_um or 0.0)
+        field = np.asarray(self.rules.die_um or (layout.bounds_um if layout.n_sites else (0.0, 0.0, 0.0, 0.0)))
+        sides_um = np.minimum(window_um, field[2:] - field[:2])
+        if sides_um.min() <= 0.0:
+            return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
+        starts, lines = [], []
+        for i in (0, 1):
+            # The last window of a row ends at the die's border.
+            room_um = field[i + 2] - field[i] - sides_um[i]
+            n = math.ceil(room_um / (0.5 * sides_um[i]) - LENGTH_ROUNDING_UM) + 1
+            starts.append(np.minimum(field[i] + 0.5 * sides_um[i] * np.arange(n), field[i + 2] - sides_um[i]))
+            lines.append(np.unique(np.concatenate((starts[i], starts[i] + sides_um[i]))))
+        total_um2 = np.zeros((lines[1].size, lines[0].size))
+        total_um2[1:, 1:] = _filled_um2(layout, *lines).cumsum(axis=0).cumsum(axis=1)
+        x, y = (index.ravel() for index in np.meshgrid(*starts))
+        x0, x1 = np.searchsorted(lines[0], x), np.searchsorted(lines[0], x + sides_um[0])
+        y0, y1 = np.searchsorted(lines[1], y), np.searchsorted(lines[1], y + sides_um[1])
+        filled_um2 = total_um2[y1, x1] - total_um2[y0, x1] - total_um2[y1, x0] + total_um2[y0, x0]
+        low = np.stack((x, y), axis=1)
+        return low, low + sides_um, np.maximum(filled_um2, 0.0)
+
+
+def _pieces(n: int) -> list[slice]:
+    """Runs of pairs, for several threads."""
+    return [slice(start, start + PAIRS_A_PIECE) for start in range(0, max(n, 1), PAIRS_A_PIECE)]
+
+
+def _near_pairs(box_um: Floats, reach_um: float) -> tuple[Ints, Ints]:
+    """Pairs of boxes that are at most so far apart, ordered by the first, then the second."""
+    from foveasim.layout import _kernels
+
+    grown_um = box_um + 0.5 * reach_um * np.array([-1.0, -1.0, 1.0, 1.0])
+    pairs = _kernels.meeting_boxes(grown_um, np.argsort(grown_um[:, 0]))
+    first, second = np.divmod(np.sort(pairs), max(box_um.shape[0], 1))
+    return first, second
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """
+    Values, with functions of positions among them.
+
+    ``sites(positions)`` are the sites that each is about (site i by default), ``markers(positions)`` the places (those sites
+    by default). Both are asked for the values that break the rule only.
+    """
+
+    values: Floats
+    sites: Callable[[Ints], Any] | None = None
+    markers: Callable[[Ints], Any] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """
+    How a rule is checked.
+
+    ``measure`` gives values; those above the limit (``is_upper``) or below it by more than ``rounding`` (in the unit of the
+    value) are violations. A deviation is compared with 0, the limit being a step or a field.
+    """
+
+    sentence: str
+    unit: str
+    measure: Callable[[Case], Measured]
+    is_upper: bool = False
+    is_deviation: bool = False
+    rounding: float = LENGTH_ROUNDING_UM
+
+    def excess(self, values: Floats, limit: float) -> Floats:
+        """Distance of values beyond a limit; negative for those within it. Those above ``rounding`` are violations."""
+        return values - limit if self.is_upper else limit - values
+
+
+def _sizes(case: Case) -> Measured:
+    return Measured(np.sqrt(case.layout.area_um2))
+
+
+def _areas(case: Case) -> Measured:
+    return Measured(case.layout.area_um2)
+
+
+def _widths(case: Case) -> Measured:
+    return Measured(min_width_um(case.layout))
+
+
+def _holes(case: Case) -> Measured:
+    if case.layout.ring_offsets.size == case.layout.site_offsets.size:
+        return Measured(np.zeros(0))
+    area_um2, _moments = ring_moments(case.layout.xy_um, case.layout.ring_offsets)
+    holes = np.flatnonzero(area_um2 < 0.0)
+    site = np.searchsorted(case.layout.site_offsets, holes, side="right") - 1
+
+    def markers(positions: Ints) -> list[Any]:
+        starts, stops = case.layout.ring_offsets[holes[positions]], case.layout.ring_offsets[holes[positions] + 1]
+        return [shapely.Polygon(case.layout.xy_um[a:b]) for a, b in zip(starts, stops, strict=True)]
+
+    return Measured(-area_um2[holes], site[:, np.newaxis].__getitem__, markers)
+
+
+def _spaces(case: Case) -> Measured:
+    found = case.contacts
+    # Sites that abut share their border; with a manufacturing grid, to within one step of it.
+    is_apart = found.distance_um > max(LENGTH_ROUNDING_UM, case.rules.grid_um or 0.0)
+    near = np.flatnonzero(is_apart & (found.distance_um <= float(case.rules.min_space_um or 0.0)))
+    return Measured(
+        found.distance_um[near],
+        lambda k: found.of(near[k]),
+        lambda k: shapely.shortest_line(case.shapes(found.first[near[k]]), case.shapes(found.second[near[k]])),
+    )
+
+
+def _aspect_ratios(case: Case) -> Measured:
+    from foveasim.layout import _kernels
+
+    layout = case.layout
+    return Measured(_kernels.aspect_ratios(layout.xy_um, layout.ring_offsets, layout.site_offsets))
+
+
+def _corner_angles(case: Case) -> Measured:
+    out = case.layout.xy_um[case.after] - case.layout.xy_um
+    into = np.empty_like(out)
+    into[case.after] = out
+    turn_rad = np.arctan2(into[:, 0] * out[:, 1] - into[:, 1] * out[:, 0], np.einsum("ij,ij->i", into, out))
+    return Measured(_per_site(np.minimum, 180.0 - np.degrees(turn_rad), case.layout))
+
+
+def _edge_angles(case: Case) -> Measured:
+    step_deg = float(case.rules.edge_angle_step_deg or 90.0)
+    along = case.layout.xy_um[case.after] - case.layout.xy_um
+    # An edge has no direction: 180 degrees are 0.
+    angle_deg = np.degrees(np.arctan2(along[:, 1], along[:, 0])) % 180.0
+    off_deg = np.minimum(np.abs(angle_deg - step_deg * np.round(angle_deg / step_deg)), 180.0 - angle_deg)
+    return Measured(_per_site(np.maximum, off_deg, case.layout))
+
+
+def _grid_deviations(case: Case) -> Measured:
+    step_um = float(case.rules.grid_um or 1.0)
+    off_um = np.abs(case.layout.xy_um - step_um * np.round(case.layout.xy_um / step_um)).max(axis=1)
+    return Measured(_per_site(np.maximum, off_um, case.layout))
+
+
+def _per_site(reduction: np.ufunc, per_vertex: Floats, layout: Layout) -> Floats:
+    """A value a site from one a vertex."""
+    if layout.n_sites == 0:
+        return np.zeros(0)
+    return np.asarray(reduction.reduceat(per_vertex, layout.ring_offsets[layout.site_offsets[:-1]]))
+
+
+def _overlaps(case: Case) -> Measured:
+    found, area_um2 = case.contacts, case.layout.area_um2
+    pairs = found.of(~found.is_apart)
+    common = shapely.intersection(case.shapes(pairs[:, 0]), case.shapes(pairs[:, 1]))
+    common_um2 = shapely.area(common)
+    is_real = common_um2 > AREA_ROUNDING * area_um2[pairs].min(axis=1, initial=np.inf)
+    return Measured(common_um2[is_real], pairs[is_real].__getitem__, common[is_real].take)
+
+
+def _gaps(case: Case) -> Measured:
+    """
+    What no site covers, of the die or of what sites surround.
+
+    Sites that touch nothing are taken out last. The edges of the others that no two of them share bound faces, each covered
+    or not all over.
+    """
+    layout = case.layout
+    area_um2 = layout.area_um2
+    least_um2 = AREA_ROUNDING * float(area_um2.min()) if layout.n_sites else 0.0
+    if _open_um2(case) <= max(least_um2, float(case.rules.max_gap_um2 or 0.0)):
+        return Measured(np.zeros(0))
+    is_alone = _is_alone(case)
+    border = np.flatnonzero(~case.contacts.is_shared & ~np.repeat(is_alone, np.diff(case.first_vertex)))
+    border_um = np.stack((layout.xy_um[border], layout.xy_um[case.after[border]]), axis=1)
+    # A corner on the middle of a turned edge misses it by rounding: without noding the slit would join what it divides.
+    lines = shapely.linestrings(np.stack(noded_edges(border_um[:, 0], border_um[:, 1]), axis=1))
+    if case.rules.die_um is not None:
+        lines = np.append(lines, shapely.box(*case.rules.die_um).exterior)
+    faces = shapely.get_parts(shapely.polygonize([shapely.union_all(lines)]))
+    faces = _open_faces(faces[shapely.area(faces) > least_um2], is_alone, case)
+
+    face, site = _contents(faces, is_alone, case)
+    open_um2 = shapely.area(faces) - np.bincount(face, area_um2[site], faces.size)
+    gaps = np.flatnonzero(open_um2 > least_um2)
+
+    def sites(positions: Ints) -> list[Ints]:
+        is_rim = is_alone.copy()
+        rim_um = np.concatenate((border_um.min(axis=1), border_um.max(axis=1)), axis=1)
+        is_rim[case.sites_near(rim_um, LENGTH_ROUNDING_UM)[1]] = True
+        gap, around = case.sites_at(faces[gaps[positions]], is_rim, LENGTH_ROUNDING_UM)
+        return _grouped(gap, around, positions.size)
+
+    def markers(positions: Ints) -> list[Any]:
+        contents = _grouped(face, site, faces.size)
+        return [_punched(faces[k], contents[k], case) for k in gaps[positions]]
+
+    return Measured(open_um2[gaps], sites, markers)
+
+
+def _open_um2(case: Case) -> float:
+    """The most that all gaps have together: what sites leave of the die, or of the rectangle around them."""
+    layout = case.layout
+    if not case.contacts.is_apart.all():
+        return np.inf
+    if case.rules.die_um is None:
+        field = np.asarray(layout.bounds_um if layout.n_sites else np.zeros(4))
+    else:
+        field = np.asarray(case.rules.die_um)
+        if _reach_beyond_die(case).values.max(initial=0.0) > 0.0:
+            return np.inf
+    return float((field[2:] - field[:2]).prod() - layout.area_um2.sum())
+
+
+def _is_alone(case: Case) -> Bools:
+    """Sites without holes that touch no other site, nor the border of the die."""
+    found, box = case.contacts, case.layout.site_bounds_um
+    touching = found.of(found.distance_um <= LENGTH_ROUNDING_UM)
+    is_alone = np.diff(case.layout.site_offsets) == 1
+    is_alone[touching.ravel()] = False
+    if case.rules.die_um is not None:
+        die = np.asarray(case.rules.die_um)
+        is_within = _reach_beyond_die(case).values < -LENGTH_ROUNDING_UM
+        is_outside = np.maximum(die[:2] - box[:, 2:], box[:, :2] - die[2:]).max(axis=1) > LENGTH_ROUNDING_UM
+        is_alone &= is_within | is_outside
+    return is_alone
+
+
+def _open_faces(faces: NDArray[Any], is_alone: Bools, case: Case) -> NDArray[Any]:
+    """Faces in the die that no site covers, but for those that are alone."""
+    inner = _inner_points(faces)
+    is_open = np.ones(faces.size, bool)
+    if case.rules.die_um is not None:
+        is_open = np.asarray(shapely.contains(shapely.box(*case.rules.die_um), inner))
+    is_open[case.sites_at(inner, ~is_alone)[0]] = False
+    return faces[is_open]
+
+
+def _inner_points(faces: NDArray[Any]) -> NDArray[Any]:
+    """A point in every polygon, not in one of the cracks that rounding opens at the border of another."""
+    inner = np.asarray(shapely.point_on_surface(faces))
+    thin = np.flatnonzero(shapely.distance(inner, shapely.boundary(faces)) < LENGTH_ROUNDING_UM)
+    inner[thin] = shapely.get_point(shapely.maximum_inscribed_circle(faces[thin]), 0)
+    return inner
+
+
+def _contents(faces: NDArray[Any], is_alone: Bools, case: Case) -> tuple[Ints, Ints]:
+    """Pairs of faces and sites that are alone in them."""
+    face, site = case.sites_near(shapely.bounds(faces))
+    face, site = face[is_alone[site]], site[is_alone[site]]
+    shapely.prepare(faces)
+    is_inside = shapely.contains_xy(faces[face], case.layout.xy_um[case.first_vertex[site]])
+    return face[is_inside], site[is_inside]
+
+
+def _grouped(key: Ints, values: Ints, n_keys: int) -> list[Ints]:
+    """The values of each key, in their order."""
+    stops = np.cumsum(np.bincount(key, minlength=n_keys))[:-1]
+    return np.split(values[np.argsort(key, kind="stable")], stops) if n_keys else []
+
+
+def _punched(face: Any, sites: Ints, case: Case) -> Any:
+    """A polygon without some sites that are alone in it."""
+    if sites.size == 0:
+        return face
+    return shapely.Polygon(face.exterior, [*face.interiors, *shapely.get_exterior_ring(case.shapes(sites))])
+
+
+def _reach_beyond_die(case: Case) -> Measured:
+    die = np.asarray(case.rules.die_um)
+    box = case.layout.site_bounds_um
+    return Measured(np.maximum(die[:2] - box[:, :2], box[:, 2:] - die[2:]).max(axis=1, initial=-np.inf))
+
+
+def _growths(case: Case) -> Measured:
+    """Of the rings in their order, the mean pixel size over that of the ring before; marked at the outer one's first site."""
+    rings, first, ring = np.unique(case.layout.index_column("ring"), return_index=True, return_inverse=True)
+    size_um = np.bincount(ring, np.sqrt(case.layout.area_um2)) / np.bincount(ring) if rings.size else np.zeros(0)
+    order = np.argsort(ring, kind="stable")
+    members = np.split(order, np.cumsum(np.bincount(ring))[:-1])[1:] if rings.size else []
+    return Measured(size_um[1:] / size_um[:-1], lambda k: [members[i] for i in k], lambda k: case.shapes(first[1:][k]))
+
+
+def _neighbour_ratios(case: Case) -> Measured:
+    from foveasim.layout import _kernels
+
+    found, layout = case.contacts, case.layout
+    touching = np.flatnonzero(found.distance_um <= 2.0 * TOUCHING_UM)
+    a, b = found.first[touching], found.second[touching]
+
+    def shared_um(piece: slice) -> Floats:
+        return _kernels.shared_lengths(layout.xy_um, case.after, case.first_vertex, a[piece], b[piece], TOUCHING_UM)
+
+    pairs = touching[np.concatenate(each(shared_um, _pieces(a.size), thread_count())) > 0.0]
+    size_um = np.sqrt(layout.area_um2)
+    ratio = size_um[found.first[pairs]] / size_um[found.second[pairs]]
+    return Measured(
+        np.maximum(ratio, 1.0 / ratio),
+        lambda k: found.of(pairs[k]),
+        lambda k: shapely.linestrings(layout.centroid_um[found.of(pairs[k])]),
+    )
+
+
+def _counts(case: Case) -> Measured:
+    return Measured(np.array([float(case.layout.n_sites)]), lambda _k: [()], lambda _k: [_everything(case)])
+
+
+def _everything(case: Case) -> Any:
+    """The rectangle around all sites."""
+    return shapely.box(*(case.layout.bounds_um if case.layout.n_sites else (0.0, 0.0, 0.0, 0.0)))
+
+
+def _densities(case: Case) -> Measured:
+    """Of windows that move over the die by half their side, the share that sites fill."""
+    low, high, filled_um2 = case.windows
+    share = filled_um2 / np.maximum((high - low).prod(axis=1), np.finfo(np.float64).tiny)
+    return Measured(share, lambda k: [()] * k.size, lambda k: shapely.box(low[k, 0], low[k, 1], high[k, 0], high[k, 1]))
+
+
+def _filled_um2(layout: Layout, x_um: Floats, y_um: Floats) -> Floats:
+    """Area that sites fill in every cell between some lines, (n_y - 1, n_x - 1) µm²."""
+    box = layout.site_bounds_um
+    columns, rows = x_um.size - 1, y_um.size - 1
+    first_x, last_x = (np.clip(np.searchsorted(x_um, box[:, i], "right") - 1, 0, columns - 1) for i in (0, 2))
+    first_y, last_y = (np.clip(np.searchsorted(y_um, box[:, i], "right") - 1, 0, rows - 1) for i in (1, 3))
+    inside = (box[:, 0] >= x_um[0]) & (box[:, 2] <= x_um[-1]) & (box[:, 1] >= y_um[0]) & (box[:, 3] <= y_um[-1])
+    is_whole = inside & (first_x == last_x) & (first_y == last_y)
+    cell, area_um2 = (first_y * columns + first_x)[is_whole], layout.area_um2[is_whole]
+    # The others are cut along the lines: all cells that their boxes reach.
+    cut = np.flatnonzero(~is_whole)
+    wide, high = (last_x - first_x + 1)[cut], (last_y - first_y + 1)[cut]
+    place = positions_in_runs(wide * high)
+    owner = np.repeat(np.arange(cut.size), wide * high)
+    ix, iy = first_x[cut][owner] + place % wide[owner], first_y[cut][owner] + place // wide[owner]
+    pieces = shapely.intersection(
+        layout[cut].polygons()[owner], shapely.box(x_um[ix], y_um[iy], x_um[ix + 1], y_um[iy + 1])
+    )
+    cells = np.concatenate((cell, iy * columns + ix))
+    filled = np.bincount(cells, np.concatenate((area_um2, shapely.area(pieces))), rows * columns)
+    return np.asarray(filled.reshape(rows, columns), dtype=np.float64)
+
+
+def _data_rates(case: Case) -> Measured:
+    assert case.rules.readout is not None
+    return Measured(
+        np.array([case.rules.readout.gbit_per_s(case.layout.n_sites)]), lambda _k: [()], lambda _k: [_everything(case)]
+    )
+
+
+def _track_uses(case: Case) -> Measured:
+    """Wherever lines begin, the lines that must cross over the tracks that they have."""
+    assert case.rules.routing is not None
+    found = crossings(case.layout, case.rules.routing)
+    use = np.divide(found.n_nets, found.n_tracks, out=np.full(found.n_nets.size, np.inf), where=found.n_tracks > 0)
+
+    def markers(positions: Ints) -> list[Any]:
+        if case.rules.routing is not None and case.rules.routing.direction == "upwards":
+            x0, _, x1, _ = case.layout.bounds_um
+            return [shapely.LineString([(x0, y), (x1, y)]) for y in found.place_um[positions]]
+        return [shapely.Point(0.0, 0.0).buffer(r).exterior for r in found.place_um[positions]]
+
+    return Measured(use, lambda k: [found.first_sites[found.strip == i] for i in k], markers)
+
+
+#: Every rule in the order of reports.
+RULES: Mapping[str, Rule] = {
+    "min_size_um": Rule("a site's size, the square root of its area, is at least the limit", "µm", _sizes),
+    "max_size_um": Rule(
+        "a site's size, the square root of its area, is at most the limit", "µm", _sizes, is_upper=True
+    ),
+    "min_area_um2": Rule("a site's area is at least the limit", "µm²", _areas),
+    "min_hole_um2": Rule("a hole in a site has at least the limit's area", "µm²", _holes),
+    "min_width_um": Rule("a site is nowhere narrower than the limit", "µm", _widths),
+    "min_space_um": Rule("sites that do not touch are at least the limit apart", "µm", _spaces),
+    "max_aspect_ratio": Rule("a site is at most so many times as long as wide", "", _aspect_ratios, is_upper=True),
+    "min_angle_deg": Rule("no corner is sharper than the limit", "degrees", _corner_angles),
+    "edge_angle_step_deg": Rule(
+        "edges run at multiples of the angle", "degrees", _edge_angles, is_upper=True, is_deviation=True, rounding=1e-4
+    ),
+    "grid_um": Rule("vertices lie on the manufacturing grid", "µm", _grid_deviations, is_upper=True, is_deviation=True),
+    "max_overlap_um2": Rule(
+        "no two sites cover more than the limit twice", "µm²", _overlaps, is_upper=True, rounding=0.0
+    ),
+    "max_gap_um2": Rule("no gap is larger than the limit", "µm²", _gaps, is_upper=True, rounding=0.0),
+    "die_um": Rule("no site reaches out of the die", "µm", _reach_beyond_die, is_upper=True, is_deviation=True),
+    "min_growth": Rule("pixels grow at least by the limit from ring to ring", "", _growths),
+    "max_growth": Rule("pixels grow at most by the limit from ring to ring", "", _growths, is_upper=True),
+    "max_neighbour_ratio": Rule(
+        "neighbours' sizes differ at most by the limit", "", _neighbour_ratios, is_upper=True, rounding=1e-9
+    ),
+    "max_sites": Rule("there are at most so many sites", "", _counts, is_upper=True, rounding=0.0),
+    "min_density": Rule("sites fill at least the limit of every window", "", _densities, rounding=AREA_ROUNDING),
+    "max_density": Rule(
+        "sites fill at most the limit of every window", "", _densities, is_upper=True, rounding=AREA_ROUNDING
+    ),
+    "max_data_rate_gbit_per_s": Rule(
+        "a lane carries at most the limit", "Gbit/s", _data_rates, is_upper=True, rounding=0.0
+    ),
+    "max_track_use": Rule("readout lines have tracks to get out", "", _track_uses, is_upper=True, rounding=0.0),
+}
+
+
+def is_below_size(area_um2: Floats, min_size_um: float) -> Bools:
+    """Whether the rule ``min_size_um`` rejects a site of an area: what makes or joins sites compares sizes as it does."""
+    rule = RULES["min_size_um"]
+    return np.asarray(rule.excess(np.sqrt(area_um2), min_size_um) > rule.rounding)
+
+
+def min_width_um(layout: Layout) -> Floats:
+    """
+    Smallest width of every site, (n_site,) µm.
+
+    The smallest of: the distance between two edges, not neighbours, that face each other across the site (opposite
+    within 26 degrees); the distance from an inward corner straight across the site to an edge; the width of the
+    narrowest strip along one of its edges that holds the site.
+    """
+    from foveasim.layout import _kernels
+
+    after = next_vertex(layout.ring_offsets)
+    before = np.empty_like(after)
+    before[after] = np.arange(after.size)
+    widths: Floats = _kernels.min_widths(layout.xy_um, after, before, layout.ring_offsets, layout.site_offsets)
+    return widths

@@ -1,0 +1,191 @@
+"""Repairing a layout until it keeps its rules, and telling what was changed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+import shapely
+
+from foveasim._core.validation import Bools, Ints, check_choice
+from foveasim.errors import GeometryError
+from foveasim.layout.drc.rules import RULES, DesignRules, Report, RuleResult
+from foveasim.layout.edits import joining_groups, merge, union
+from foveasim.layout.generators.tiling import fill
+from foveasim.layout.model import Layout
+
+__all__ = ["Change", "enforce"]
+
+Repair: TypeAlias = Literal["drop", "merge", "refill"]
+
+#: Rules that a site breaks by itself, so that taking it away mends them.
+SITE_RULES = (
+    "min_size_um", "max_size_um", "min_area_um2", "min_hole_um2", "min_width_um", "max_aspect_ratio", "min_angle_deg",
+    "edge_angle_step_deg", "grid_um", "die_um",
+)  # fmt: skip
+#: Rules that a pair of sites breaks: the smaller of the two is taken away.
+PAIR_RULES = ("max_overlap_um2", "min_space_um")
+#: Rules that a site breaks by being too small, so that joining it to a neighbour mends them.
+SMALLNESS_RULES = ("min_size_um", "min_area_um2", "min_width_um")
+#: Rounds of merging: a merged site may still be too small.
+MAX_ROUNDS = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """
+    What was done to some sites, and for which rule.
+
+    Attributes
+    ----------
+    rule : str
+    action : {"dropped", "merged", "replaced"}
+    site_ids : tuple of int
+        Numbers of the sites in the layout that was given; merged sites with the ones they were joined to.
+    """
+
+    rule: str
+    action: Literal["dropped", "merged", "replaced"]
+    site_ids: tuple[int, ...]
+
+
+def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> tuple[Layout, tuple[Change, ...]]:
+    """
+    A layout that keeps the rules, made from one that may not.
+
+    Parameters
+    ----------
+    layout : Layout
+    rules : DesignRules
+        Waived rules are left broken.
+    repair : {"drop", "merge", "refill"}
+        ``"drop"`` takes away the sites that break a rule (of two that overlap or are too near, the smaller one): a minimum
+        size leaves the blind spot of a foveal layout. ``"merge"`` first joins sites that are too small to the neighbour with
+        which they share most edge, as often as it takes, and drops what is left. ``"refill"`` drops, and fills the room of
+        sites that were too small, with what they surround, with hexagons of the smallest size; a new site has the columns of
+        the nearest one that was there.
+
+    Returns
+    -------
+    layout : Layout
+    changes : tuple of Change
+
+    Raises
+    ------
+    GeometryError
+        When a rule is broken that no taking away of sites mends: gaps, growth, neighbours' ratio, the number of sites.
+
+    Examples
+    --------
+    >>> from foveasim.layout import log_polar
+    >>> rings = log_polar(n_sectors=32, r_min_um=2.0, r_max_um=50.0)
+    >>> legal, changes = enforce(rings, DesignRules(min_size_um=1.0))
+    >>> rings.n_sites, legal.n_sites, changes[0].action
+    (512, 352, 'dropped')
+    """
+    check_choice("repair", repair, get_args(Repair))
+    waivers = rules.waivers or {}
+    mendable = (*SITE_RULES, *PAIR_RULES)
+    active = replace(rules, **{name: None for name in RULES if name in waivers or name not in mendable})
+    now = np.arange(layout.n_sites)  # where each given site is now; -1 for one that was dropped
+    changes: list[Change] = []
+    given = layout
+    if repair == "merge":
+        layout, now = _merged(layout, active, now, changes)
+    layout, now = _without_guilty(layout, active, now, changes)
+    if repair == "refill":
+        layout = _refilled(layout, given, active, changes)
+    rest = layout.check(replace(rules, **dict.fromkeys(mendable)))
+    if not rest.ok:
+        raise GeometryError(f"taking away sites does not mend every rule: {_broken(rest)}")
+    return layout, tuple(changes)
+
+
+def _without_guilty(layout: Layout, rules: DesignRules, now: Ints, changes: list[Change]) -> tuple[Layout, Ints]:
+    """Sites that break a rule taken away, round after round."""
+    report = layout.check(rules)
+    while not report.ok:
+        gone = np.zeros(layout.n_sites, bool)
+        for result in report.results:
+            new = _guilty(layout, result, gone)
+            gone[new] = True
+            ids = np.flatnonzero(np.isin(now, new))
+            if ids.size:
+                changes.append(Change(result.rule, "dropped", tuple(int(i) for i in ids)))
+        now = np.where((now >= 0) & ~gone[now], (np.cumsum(~gone) - 1)[now], -1)
+        layout = layout[~gone]
+        report = layout.check(rules)
+    return layout, now
+
+
+def _refilled(layout: Layout, given: Layout, rules: DesignRules, changes: list[Change]) -> Layout:
+    """The room of sites that were too small in hexagons that are not."""
+    is_small = [change.action == "dropped" and change.rule in SMALLNESS_RULES for change in changes]
+    gone = np.array([i for change, small in zip(changes, is_small, strict=True) if small for i in change.site_ids], int)
+    if gone.size == 0:
+        return layout
+    dropped = given[np.sort(gone)]
+    room = shapely.get_parts(shapely.union_all(dropped.polygons()))
+    room = shapely.union_all(shapely.polygons(shapely.get_exterior_ring(room)))
+    n_kept = layout.n_sites
+    filled = fill(layout, room, size_um=_smallest_size_um(rules), columns_of=dropped)
+    # Sites at the border may be narrower than a hexagon, or break rules of another kind.
+    new, _ = _merged(filled[n_kept:], rules, np.arange(filled.n_sites - n_kept), [])
+    layout, _ = _without_guilty(union([layout, new]), rules, np.zeros(0, np.int64), [])
+    for k, (change, small) in enumerate(zip(changes, is_small, strict=True)):
+        if small:
+            changes[k] = replace(change, action="replaced")
+    return Layout(
+        layout.xy_um,
+        layout.ring_offsets,
+        layout.site_offsets,
+        layout.columns,
+        given._then("refilled by rules"),  # noqa: SLF001
+    )
+
+
+def _smallest_size_um(rules: DesignRules) -> float:
+    """Size of a hexagon that no limit of smallness forbids."""
+    across_um = (rules.min_width_um or 0.0) * math.sqrt(0.5 * math.sqrt(3.0))
+    return max(rules.min_size_um or 0.0, math.sqrt(rules.min_area_um2 or 0.0), across_um)
+
+
+def _guilty(layout: Layout, result: RuleResult, gone: Bools) -> Ints:
+    """Sites that a rule takes away beyond those that go already: of a pair the smaller one, unless one of them goes."""
+    going = set(np.flatnonzero(gone).tolist())
+    new = set()
+    for violation in result.violations:
+        site = min(violation.site_ids, key=lambda i: float(layout.area_um2[i]))
+        if not going & set(violation.site_ids):
+            new.add(site)
+            going.add(site)
+    return np.array(sorted(new), dtype=np.int64)
+
+
+def _merged(layout: Layout, rules: DesignRules, now: Ints, changes: list[Change]) -> tuple[Layout, Ints]:
+    """Sites that are too small joined to their neighbours, round after round."""
+    smallness = replace(rules, **{name: None for name in RULES if name not in SMALLNESS_RULES})
+    for _ in range(MAX_ROUNDS):
+        report = layout.check(smallness)
+        if report.ok:
+            break
+        rule_of = {v.site_ids[0]: result.rule for result in reversed(report.results) for v in result.violations}
+        group = joining_groups(layout, np.array(list(rule_of), dtype=np.int64))
+        if np.array_equal(group, np.arange(layout.n_sites)):
+            break
+        kept, label = np.unique(group, return_inverse=True)
+        layout, now = merge(layout, label), label[now]
+        order = np.argsort(now, kind="stable")
+        borders = np.searchsorted(now[order], np.arange(kept.size + 1))
+        is_joined = np.bincount(label) > 1
+        rule_of_group = {int(label[site]): rule for site, rule in rule_of.items()}
+        for k in np.flatnonzero(is_joined).tolist():
+            ids = order[borders[k] : borders[k + 1]]
+            changes.append(Change(rule_of_group[k], "merged", tuple(sorted(int(i) for i in ids))))
+    return layout, now
+
+
+def _broken(report: Report) -> str:
+    return "; ".join(str(result) for result in report.results if not result.ok)

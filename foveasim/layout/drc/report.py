@@ -1,0 +1,221 @@
+"""Reports of design rules as KLayout's report database, to be opened over the chip layout."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+import shapely
+
+from foveasim._io.atomic import written_whole
+from foveasim.errors import FileError
+
+if TYPE_CHECKING:
+    from foveasim.layout.drc.rules import Report
+
+__all__ = ["is_lyrdb", "read_lyrdb", "write_lyrdb"]
+
+#: Cell that the photosites of a chip file lie in.
+CELL_NAME = "SENSOR"
+#: Larger files are refused.
+MAX_BYTES = 2**29
+#: How many bytes of a file's beginning tell what it is.
+HEAD_BYTES = 512
+#: What write_lyrdb puts into a category's description, and into an item's text.
+LIMIT = re.compile(r"^(?P<sentence>.*) \(limit (?P<limit>\S+) ?(?P<unit>[^)]*)\)$", re.DOTALL)
+FOUND = re.compile(r"photosite (?P<sites>\d+(?:, \d+)*): (?P<value>\S+) ?(?P<unit>[^']*)")
+#: Points of one ring, edge or box of a marker.
+POINTS = re.compile(r"\(([^()]*)\)")
+
+#: A rule's sentence, limit and unit; a place's sites, value and marker.
+_Told: TypeAlias = tuple[str, float, str]
+_Found: TypeAlias = tuple[tuple[int, ...], float, Any]
+
+
+def write_lyrdb(report: Report, path: str | Path) -> None:
+    """
+    Write a report for KLayout's marker browser, whole or not at all.
+
+    Parameters
+    ----------
+    report : Report
+    path : path
+        Ending in ``.lyrdb``. A category a rule, an item a violation, with the sites' numbers, the measured value, and the
+        marker in µm.
+
+    Raises
+    ------
+    FileError
+        When the ending is another, the library ``klayout`` is missing, or nothing can be written there.
+    """
+    target = Path(path)
+    if target.suffix != ".lyrdb":
+        raise FileError(target, "must end in .lyrdb")
+    try:
+        from klayout import db, rdb
+    except ImportError:
+        raise FileError(target, "needs the library klayout: pip install 'foveasim[layout]'") from None
+    database = rdb.ReportDatabase("foveasim design rules")
+    database.generator = "foveasim"
+    database.top_cell_name = CELL_NAME
+    cell = database.create_cell(CELL_NAME).rdb_id()
+    for result in report.results:
+        category = database.create_category(result.rule)
+        category.description = f"{result.sentence} (limit {result.limit:g} {result.unit})"
+        for violation in result.violations:
+            item = database.create_item(cell, category.rdb_id())
+            sites = ", ".join(map(str, violation.site_ids))
+            item.add_value(f"photosite {sites}: {violation.value:.9g} {violation.unit}".strip())
+            for shape in _shapes(db, violation.marker):
+                item.add_value(shape)
+    with written_whole(target) as temporary:
+        database.save(str(temporary))
+
+
+def _shapes(db: Any, marker: Any) -> list[Any]:
+    """A marker as KLayout's shapes in µm."""
+
+    def points(ring: Any) -> list[Any]:
+        return [db.DPoint(float(x), float(y)) for x, y in shapely.get_coordinates(ring)]
+
+    shapes: list[Any] = []
+    for part in shapely.get_parts(marker):
+        if part.is_empty:
+            continue
+        if isinstance(part, shapely.Polygon):
+            polygon = db.DPolygon(points(part.exterior)[:-1])
+            for hole in part.interiors:
+                polygon.insert_hole(points(hole)[:-1])
+            shapes.append(polygon)
+        else:
+            corners = points(part)
+            shapes += [db.DEdge(a, b) for a, b in zip(corners, corners[1:] or corners, strict=False)]
+    return shapes
+
+
+def is_lyrdb(path: str | Path) -> bool:
+    """Whether a file begins as KLayout's report databases do."""
+    path = Path(path)
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return b"<report-database>" in file.read(HEAD_BYTES)
+
+
+def read_lyrdb(path: str | Path, n_sites: int) -> Report:
+    """
+    Read a report: one that :func:`write_lyrdb` wrote, or the findings of another program as far as they are alike.
+
+    Parameters
+    ----------
+    path : path
+    n_sites : int
+        Of the layout that was checked, which the file does not tell.
+
+    Returns
+    -------
+    Report
+        Of another program's findings, sites, values and limits are not known: none, NaN and NaN. Waivers are not in the
+        file.
+
+    Raises
+    ------
+    FileError
+        When the file is missing, too large, broken, no report, or names a site that the layout does not have.
+    """
+    from foveasim.layout.drc.rules import Report
+
+    source = Path(path)
+    if not source.is_file():
+        raise FileError(source, "is not a file" if source.exists() else "no such file")
+    if source.stat().st_size > MAX_BYTES:
+        raise FileError(source, f"is larger than {MAX_BYTES} bytes")
+    content = source.read_bytes()
+    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+        raise FileError(source, "declares entities, which a report has no use for")
+    try:
+        root = ET.fromstring(content)  # noqa: S314 -- entities, which could grow without end, are refused above
+    except ET.ParseError as error:
+        raise FileError(source, f"is broken or no report ({error})") from None
+    if root.tag != "report-database":
+        raise FileError(source, "is no report database of KLayout")
+    found: dict[str, list[_Found]] = {}
+    about: dict[str, _Told] = {}
+    for name, category in _categories(root):
+        told = LIMIT.match(category.findtext("description") or "")
+        about[name] = (told["sentence"], _number(told["limit"]), told["unit"]) if told else (name, np.nan, "")
+        found[name] = []
+    for item in root.iterfind("items/item"):
+        name = (item.findtext("category") or "").strip().strip("'")
+        sites, value, marker = _item(source, item)
+        if any(site >= n_sites for site in sites):
+            raise FileError(source, f"names site {max(sites)}, and the layout has {n_sites}: it is of another layout")
+        found.setdefault(name, []).append((sites, value, marker))
+    return Report(
+        n_sites, tuple(_result(name, about.get(name, (name, np.nan, "")), items) for name, items in found.items())
+    )
+
+
+def _result(name: str, about: _Told, items: list[_Found]) -> Any:
+    from foveasim.layout.drc.rules import RuleResult
+
+    sentence, limit, unit = about
+    values = np.array([value for _, value, _ in items], dtype=np.float64)
+    places = ([sites for sites, _, _ in items], [marker for _, _, marker in items])
+    return RuleResult(name, sentence, limit, unit, values, None, lambda: places)
+
+
+def _categories(root: Any, parent: str = "") -> list[tuple[str, Any]]:
+    """Categories and those below them, by the names that items have for them."""
+    found = []
+    for category in root.iterfind("categories/category"):
+        name = parent + (category.findtext("name") or "").strip()
+        found += [(name, category), *_categories(category, name + ".")]
+    return found
+
+
+def _item(source: Path, item: Any) -> _Found:
+    """Sites, value and marker of an item."""
+    sites: tuple[int, ...] = ()
+    value = np.nan
+    shapes = []
+    for element in item.iterfind("values/value"):
+        # A tag in brackets may stand in front: "[#name] polygon: (...)".
+        kind, colon, text = (element.text or "").strip().removeprefix("[").partition(":")
+        told = FOUND.search(text)
+        if kind.endswith("text") and told:
+            sites, value = tuple(map(int, told["sites"].split(", "))), _number(told["value"])
+        elif colon and kind.split(" ")[-1] in {"polygon", "edge", "edge-pair", "box", "path"}:
+            try:
+                shapes += _geometries(kind.split(" ")[-1], text)
+            except ValueError:
+                raise FileError(source, f"has a marker that is none: {text.strip()[:60]}") from None
+    return sites, value, shapely.GeometryCollection(shapes) if len(shapes) != 1 else shapes[0]
+
+
+def _geometries(kind: str, text: str) -> list[Any]:
+    """KLayout's text of a shape as shapely's geometries."""
+    rings = []
+    for points in POINTS.findall(text):
+        for part in points.split("/"):
+            corners = [tuple(map(float, point.split(","))) for point in part.split(";")]
+            if any(len(corner) != 2 or not np.isfinite(corner).all() for corner in corners):
+                raise ValueError(text)
+            rings.append(corners)
+    if not rings:
+        raise ValueError(text)
+    if kind == "box":
+        return [shapely.box(*rings[0][0], *rings[0][-1])]
+    if kind == "polygon":
+        return [shapely.Polygon(rings[0], rings[1:])] if len(rings[0]) > 2 else [shapely.MultiPoint(rings[0])]
+    return [shapely.LineString(ring) if len(ring) > 1 else shapely.Point(ring[0]) for ring in rings]
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return np.nan

@@ -1,0 +1,156 @@
+"""Whether the readout lines get out of a layout, and at what rate the data does."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+from foveasim._core.validation import Floats, Ints, as_numbers, check_choice, check_count, check_length_um, check_number
+from foveasim.layout.model import Layout
+
+__all__ = ["Crossings", "Readout", "Routing", "crossings"]
+
+#: Lines whose first sites end within this distance of each other start together.
+TOGETHER_UM = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Readout:
+    """
+    How often and how finely the sites are read.
+
+    Parameters
+    ----------
+    frames_per_s : float, 1/s
+    bits : int
+        Of a site's value.
+    blanking : float
+        Time without data as a share of the time with data, such as 0.2.
+    n_lanes : int
+        Outputs that share the data evenly.
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range.
+    """
+
+    frames_per_s: float
+    bits: int
+    blanking: float = 0.0
+    n_lanes: int = 1
+
+    def __post_init__(self) -> None:
+        check_number("frames_per_s", self.frames_per_s, above=0.0)
+        check_count("bits", self.bits, at_most=64)
+        check_number("blanking", self.blanking, at_least=0.0)
+        check_count("n_lanes", self.n_lanes)
+
+    def gbit_per_s(self, n_sites: int) -> float:
+        """
+        Data rate of one lane, Gbit/s: ``sites · frames/s · bits · (1 + blanking) / lanes``.
+
+        Examples
+        --------
+        >>> round(Readout(frames_per_s=30.0, bits=10, blanking=0.2).gbit_per_s(2592 * 1944), 3)
+        1.814
+        """
+        return 1e-9 * n_sites * self.frames_per_s * self.bits * (1.0 + self.blanking) / self.n_lanes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Routing:
+    """
+    Metal for the readout lines.
+
+    Parameters
+    ----------
+    width_um, space_um : float, µm
+        Smallest width of a track and smallest space between two.
+    n_layers : int
+        Metal layers that the lines may use side by side.
+    direction : {"outwards", "upwards"}
+        Whether lines run away from the optical axis, as spokes do, or along y, as columns do.
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range.
+    """
+
+    width_um: float
+    space_um: float
+    n_layers: int = 1
+    direction: Literal["outwards", "upwards"] = "outwards"
+
+    def __post_init__(self) -> None:
+        check_length_um("width_um", self.width_um)
+        check_length_um("space_um", self.space_um)
+        check_count("n_layers", self.n_layers, at_most=1000)
+        check_choice("direction", self.direction, get_args(Literal["outwards", "upwards"]))
+
+    def n_tracks(self, strip_um: Floats) -> Ints:
+        """Lines that can cross strips of these widths: ``layers · floor(strip / (width + space))``."""
+        # A strip of exactly so many tracks, up to rounding, holds them.
+        tracks = np.floor(as_numbers("strip_um", strip_um) / (self.width_um + self.space_um) * (1.0 + 1e-12))
+        return (self.n_layers * tracks).astype(np.int64)
+
+
+class Crossings(NamedTuple):
+    """
+    The strips that lines must cross, one for each place where lines begin, from the inside out or upwards.
+
+    Attributes
+    ----------
+    place_um : (n_strip,) float64, µm
+        Radius of the circle, or height of the line.
+    n_nets, n_tracks : (n_strip,) int64
+        Lines that cross it, and those that have room.
+    first_sites : (n_line,) int64
+        The first site of each line, and in ``strip`` (n_line,) where it ends.
+    """
+
+    place_um: Floats
+    n_nets: Ints
+    n_tracks: Ints
+    first_sites: Ints
+    strip: Ints
+
+
+def crossings(layout: Layout, routing: Routing) -> Crossings:
+    """
+    Lines and tracks wherever lines begin.
+
+    A line begins at the outer end of its innermost (lowest) site and crosses every strip from there on: the circle of
+    ``2πr`` around the axis at that radius, or the whole width of the layout at that height. In a log-polar layout all spokes
+    meet at the first ring: that is the narrowest place.
+
+    Parameters
+    ----------
+    layout : Layout
+        With the column ``readout_line``.
+    routing : Routing
+
+    Raises
+    ------
+    ParameterError
+        When the layout has no such column.
+    """
+    line = layout.index_column("readout_line")
+    if line.size == 0:
+        nothing = np.zeros(0, np.int64)
+        return Crossings(np.zeros(0), nothing, nothing, nothing, nothing)
+    reach_um = np.hypot(*layout.xy_um.T) if routing.direction == "outwards" else layout.xy_um[:, 1]
+    end_um = np.maximum.reduceat(reach_um, layout.ring_offsets[layout.site_offsets[:-1]])
+    order = np.lexsort((end_um, line))
+    first_sites = order[np.unique(line[order], return_index=True)[1]]
+    start_um = np.sort(end_um[first_sites])
+    place_um = start_um[np.append(np.diff(start_um) > TOGETHER_UM, True)]
+    strip = np.searchsorted(place_um, end_um[first_sites] - TOGETHER_UM)
+    n_nets = np.cumsum(np.bincount(strip, minlength=place_um.size))
+    x_min, _, x_max, _ = layout.bounds_um
+    strips_um = 2.0 * math.pi * place_um if routing.direction == "outwards" else np.full(place_um.size, x_max - x_min)
+    return Crossings(place_um, n_nets, routing.n_tracks(strips_um), first_sites, strip)

@@ -1,0 +1,1 @@
+"""Generators of layouts, one module per family."""

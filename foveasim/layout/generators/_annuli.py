@@ -1,0 +1,173 @@
+"""Rings of sites around the optical axis, neighbours sharing every point of their arcs: what the log-polar families share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, TypeAlias
+
+import numpy as np
+
+from foveasim._core.validation import Floats, Ints
+
+__all__ = ["MIN_SITES_PER_RHO", "Annuli", "Fovea", "Ring", "annuli", "fovea_rings", "ring_outlines"]
+
+#: A ring of the fovea has at least so many sites for each unit of its radius.
+MIN_SITES_PER_RHO = 3
+#: What fills the middle: nothing, rings of as many sites as their radius asks, rings cut by the same spokes, hexagons.
+Fovea: TypeAlias = Literal["none", "rings", "linear", "hexagons"]
+
+
+class Ring(NamedTuple):
+    """A ring's sites, the half sectors that it is turned by, and the chords that each of its arcs is cut into."""
+
+    n_sites: int
+    turn: int
+    n_chords: int
+
+
+class Annuli(NamedTuple):
+    """Outlines of all sites, ring by ring from the inside: packed rings, and each site's ring and place in it."""
+
+    xy_um: Floats
+    ring_offsets: Ints
+    ring: Ints
+    sector: Ints
+
+
+class _Circle(NamedTuple):
+    """Points of a circle, counter-clockwise, and where they lie on it in ``n_steps`` steps of a whole turn."""
+
+    xy_um: Floats
+    step: Ints
+    n_steps: int
+
+
+def annuli(radii_um: Floats, rings: Sequence[Ring]) -> Annuli:
+    """
+    Sites of concentric rings.
+
+    Parameters
+    ----------
+    radii_um : (n_ring + 1,) float64, µm
+        Circles between which the rings lie, growing; the first may be 0 for one site or for sectors in the middle.
+    rings : sequence of Ring
+        Only the innermost may have one site alone.
+
+    Returns
+    -------
+    Annuli
+        An arc has the corners of the sites on both of its sides, so that nothing is left open or covered twice.
+    """
+    outlines, n_vertices = [], []
+    has_disc = rings[0].n_sites == 1
+    inner = _circle(float(radii_um[0]), rings[:1])
+    for i, ring in enumerate(rings):
+        outer = _circle(float(radii_um[i + 1]), rings[i : i + 2])
+        if i == 0 and has_disc:
+            outlines.append(outer.xy_um)
+            n_vertices.append(np.array([len(outer.xy_um)]))
+        else:
+            xy_um, counts = ring_outlines(outer.xy_um, *_ends(outer, ring), inner.xy_um, *_ends(inner, ring))
+            outlines.append(xy_um)
+            n_vertices.append(counts)
+        inner = outer
+    n_sites = np.array([ring.n_sites for ring in rings])
+    ring_of = np.repeat(np.arange(len(rings)), n_sites)
+    sector = np.arange(ring_of.size) - (np.cumsum(n_sites) - n_sites)[ring_of]
+    offsets = np.concatenate(([0], np.cumsum(np.concatenate(n_vertices))))
+    return Annuli(np.concatenate(outlines), offsets, ring_of, sector)
+
+
+def fovea_rings(
+    filling: Literal["rings", "linear"], *, n_rings: int, n_sectors: int, n_per_ring: int, n_chords: int
+) -> tuple[Floats, list[Ring]]:
+    """
+    Circles and rings that fill a disc: ring 0 one site of half a unit's radius, each other ring one unit high.
+
+    Parameters
+    ----------
+    filling : {"rings", "linear"}
+        ``"rings"``: ring ρ holds ``n_per_ring · ρ`` sites. ``"linear"``: linear-polar, cut by the spokes of the rings
+        outside, of which ring ρ has as many as leave its sites one unit of arc on their centre line.
+    n_rings, n_sectors, n_per_ring, n_chords : int
+        Rings in the fovea, sites of a ring outside it, sites that a ring has more than the one inside it, chords an arc.
+
+    Returns
+    -------
+    radii : (n_rings + 1,) float64
+        0, 1/2, 3/2, ... in units: the rings' height.
+    rings : list of Ring
+    """
+    radii = np.concatenate(([0.0], np.arange(n_rings) + 0.5))
+    if filling == "rings":
+        counts = n_per_ring * np.arange(n_rings)
+    else:
+        divisors = np.array([d for d in range(1, n_sectors + 1) if n_sectors % d == 0])
+        rho = np.arange(n_rings)
+        place = np.searchsorted(divisors, 2.0 * math.pi * rho, side="right") - 1
+        # Fewer than 3ρ corners, and a ring's inner circle would cross its outer one.
+        place = np.where(divisors[place] < MIN_SITES_PER_RHO * rho, place + 1, place)
+        counts = divisors[np.minimum(place, divisors.size - 1)]
+    counts[0] = 1
+    return radii, [Ring(int(n), 0, n_chords) for n in counts]
+
+
+def ring_outlines(
+    outer_um: Floats, outer_first: Ints, outer_last: Ints, inner_um: Floats, inner_first: Ints, inner_last: Ints
+) -> tuple[Floats, Ints]:
+    """
+    Outlines of the sites of a ring between two closed loops of points, each loop counter-clockwise and shared.
+
+    Parameters
+    ----------
+    outer_um, inner_um : (n_point, 2) float64, µm
+        The loops.
+    outer_first, outer_last, inner_first, inner_last : (n_site,) int64
+        Each site's corners on them, as positions that run on beyond a loop's end; a site has the points between its
+        corners as well, and so its neighbours' corners.
+
+    Returns
+    -------
+    xy_um : (n_vertex, 2) float64, µm
+        Site after site: its part of the outer loop, then its part of the inner loop backwards.
+    n_vertices : (n_site,) int64
+        How many vertices each has.
+    """
+    n_outer = outer_last - outer_first + 1
+    n_vertices = n_outer + inner_last - inner_first + 1
+    site = np.repeat(np.arange(n_vertices.size), n_vertices)
+    place = np.arange(site.size) - (np.cumsum(n_vertices) - n_vertices)[site]
+    is_inner = place >= n_outer[site]
+    point = np.where(
+        is_inner,
+        len(outer_um) + (inner_last[site] - place + n_outer[site]) % len(inner_um),
+        (outer_first[site] + place) % len(outer_um),
+    )
+    return np.concatenate((outer_um, inner_um))[point], n_vertices
+
+
+def _circle(radius_um: float, rings: Sequence[Ring]) -> _Circle:
+    """Circle with the corners and chords of the rings on both of its sides; those that coincide are one point."""
+    meeting = [ring for ring in rings if ring.n_sites > 1]
+    if radius_um <= 0.0 or not meeting:
+        return _Circle(np.zeros((1, 2)), np.zeros(1, np.int64), 1)
+    n_steps = math.lcm(*(2 * ring.n_sites * ring.n_chords for ring in meeting))
+    steps = []
+    for n_sites, turn, n_chords in meeting:
+        half_chords = 2 * np.arange(n_sites * n_chords) + turn * n_chords
+        steps.append(half_chords * (n_steps // (2 * n_sites * n_chords)) % n_steps)
+    step = np.unique(np.concatenate(steps))
+    angle_rad = (2.0 * math.pi) * (step / n_steps)
+    return _Circle(radius_um * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1), step, n_steps)
+
+
+def _ends(circle: _Circle, ring: Ring) -> tuple[Ints, Ints]:
+    """Positions of the first and last corner of each site of a ring on a circle."""
+    if circle.n_steps == 1:  # the axis
+        nowhere = np.zeros(ring.n_sites, np.int64)
+        return nowhere, nowhere
+    half_sectors = 2 * np.arange(ring.n_sites + 1) + ring.turn
+    turns, corner = np.divmod(half_sectors * (circle.n_steps // (2 * ring.n_sites)), circle.n_steps)
+    position = np.searchsorted(circle.step, corner) + turns * circle.step.size
+    return position[:-1], position[1:]

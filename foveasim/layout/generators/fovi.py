@@ -1,0 +1,116 @@
+"""The isotropic foveal layout: rings around a central site, as far apart as their sites are from each other."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from foveasim._core.rings import positions_in_runs
+from foveasim._core.validation import Floats, Ints, check_count, check_length_um, check_sites
+from foveasim.errors import ParameterError
+from foveasim.layout._regions import disc
+from foveasim.layout._voronoi import cells_of
+from foveasim.layout.model import Layout
+
+__all__ = ["fovi"]
+
+#: Rings around the centre, at most; MAX_SITES is met before.
+MAX_RINGS = 10_000
+#: Chords of the outline for each site of the outermost ring.
+CHORDS_PER_SITE = 4
+
+
+def fovi(*, fov_um: float, a_um: float, n_rings: int, n_chords: int | None = None) -> Layout:
+    """
+    A central site and rings around it whose spacing grows with the radius, no site wider than it is high.
+
+    ::
+
+               ╱ ─ · ─ ╲              · centre of a site; its outline is its Voronoi cell
+             ·  ╱ ─·─ ╲  ·
+            │  ·   ·   ·  │           ring i: r_i = e^w_i - a,  w even on [ln a, ln(fov/2 + a)]
+             ·  ╲ ─·─ ╱  ·            it has ceil(2π r_i / dr_i) sites,  dr_i = (r_(i+1) - r_(i-1)) / 2
+               ╲ ─ · ─ ╱
+            ├─────────────┤
+                 fov_um, from centre to centre of the outermost ring
+
+    Parameters
+    ----------
+    fov_um : float, µm
+        Diameter of the outermost ring's centres. Half a step of the rule beyond it the layout ends.
+    a_um : float, µm
+        Radius of the fovea: spacing is even far inside it, and grows in proportion to the radius far outside.
+    n_rings : int
+        Rings around the central site.
+    n_chords : int, optional
+        Sides of the regular polygon that stands for the outline of the layout; by default 4 for each site of the outermost
+        ring.
+
+    Returns
+    -------
+    Layout
+        Ring by ring from the central site, with the columns ``ring``, ``sector`` (from angle 0 on), ``readout_line`` (the
+        ring). ``provenance`` tells ``radius_um``, that of the outline's corners.
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range, there would be too many sites, or chords would cut through centres.
+    GeometryError
+        When the central sites are too small beside the field for float64.
+
+    Notes
+    -----
+    There is no blind spot for any ``a_um > 0``. The radii are those of the rule one step further for the spacing at the
+    outermost ring.
+
+    Examples
+    --------
+    >>> layout = fovi(fov_um=1000.0, a_um=20.0, n_rings=20)
+    >>> layout.n_sites, layout.columns["ring"][:4].tolist()
+    (568, [0, 1, 1, 1])
+    """
+    fov_um, a_um = check_length_um("fov_um", fov_um), check_length_um("a_um", a_um)
+    n_rings = check_count("n_rings", n_rings, at_most=MAX_RINGS)
+    step = math.log1p(0.5 * fov_um / a_um) / n_rings
+    # e^w - a with w = ln a + i step, without the loss of digits
+    r_um = a_um * np.expm1(step * np.arange(n_rings + 2))
+    r_um[n_rings] = 0.5 * fov_um
+    counts = _counts(r_um)
+    check_sites(int(counts.sum()))
+    ring = np.repeat(np.arange(n_rings + 1), counts)
+    sector = positions_in_runs(counts)
+    angle_rad = 2.0 * math.pi * sector / counts[ring]
+    centres_um = r_um[ring][:, np.newaxis] * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1)
+
+    radius_um = a_um * math.expm1(step * (n_rings + 0.5))
+    if n_chords is None:
+        n_sides = max(CHORDS_PER_SITE * int(counts[-1]), _fewest_chords(0.5 * fov_um, radius_um))
+    else:
+        n_sides = check_count("n_chords", n_chords, at_least=_fewest_chords(0.5 * fov_um, radius_um), at_most=10**6)
+    xy_um, offsets = cells_of(centres_um, disc(radius_um, n_sides))
+    return Layout(
+        xy_um,
+        offsets,
+        np.arange(offsets.size),
+        {"ring": ring, "sector": sector, "readout_line": ring},
+        {
+            "generator": "fovi",
+            "parameters": {"fov_um": fov_um, "a_um": a_um, "n_rings": n_rings, "n_chords": n_chords},
+            "radius_um": radius_um,
+        },
+    )
+
+
+def _counts(r_um: Floats) -> Ints:
+    """Sites on each ring but the last radius, which only tells the spacing of the one inside it."""
+    spacing_um = 0.5 * (r_um[2:] - r_um[:-2])
+    if not (np.diff(r_um) > 0.0).all():
+        raise ParameterError("n_rings", "must leave the rings some width", r_um.size - 2, cure="take fewer rings")
+    return np.concatenate(([1], np.ceil(2.0 * math.pi * r_um[1:-1] / spacing_um).astype(np.int64)))
+
+
+def _fewest_chords(inner_um: float, outer_um: float) -> int:
+    """Chords of the outer circle that leave the inner circle whole."""
+    return max(3, math.floor(math.pi / math.acos(inner_um / outer_um)) + 1)

@@ -1,0 +1,213 @@
+"""
+The log-polar layout by the Giotto rule: a fovea of rings of unit height, and around it rings that grow.
+
+The rule fixes how much a ring is larger than the one inside it by the whole diameter: with ``E = n_rho - n_fovea`` rings
+outside the fovea and R smallest pixels across, ``λ (λ^E - 1) / (λ - 1) = R / 2 - n_fovea + 0.5``, since the rings' heights
+are ``λ, λ², ... λ^E`` and the fovea's edge lies at ``n_fovea - 0.5``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import get_args
+
+import numpy as np
+
+from foveasim._core.validation import MAX_LENGTH_UM, MAX_SITES, check_choice, check_count, check_length_um, check_sites
+from foveasim.errors import ParameterError
+from foveasim.layout.generators._annuli import MIN_SITES_PER_RHO, Fovea, Ring, annuli, fovea_rings
+from foveasim.layout.generators.tiling import with_hexagons
+from foveasim.layout.model import Layout
+
+__all__ = ["giotto", "giotto_ratio"]
+
+#: log λ is solved to this; the ratio itself then has fifteen digits.
+LOG_RATIO_ROUNDING = 1e-16
+
+
+def giotto_ratio(*, n_rho: int, n_fovea: int, n_across: int) -> float:
+    """
+    Ratio λ of the heights of neighbouring rings outside the fovea.
+
+    Parameters
+    ----------
+    n_rho, n_fovea, n_across : int
+        As for :func:`giotto`.
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range, or so few pixels across that rings would shrink outwards.
+
+    Examples
+    --------
+    >>> round(giotto_ratio(n_rho=152, n_fovea=42, n_across=1090), 11)
+    1.02314422609
+    """
+    return math.exp(_log_ratio(n_rho, n_fovea, n_across))
+
+
+def giotto(
+    *,
+    n_rho: int,
+    n_theta: int,
+    n_fovea: int,
+    n_across: int,
+    unit_um: float,
+    fovea: Fovea = "rings",
+    stagger: bool = True,
+    chords_per_arc: int = 1,
+) -> Layout:
+    """
+    Rings around the optical axis: ``n_fovea`` of one unit's height, then rings each λ times as high as the one inside.
+
+    ::
+
+              ╭─────────┬─────────╮       ring n_rho - 1: n_theta sites, λ^(n_rho - n_fovea) units high
+            ╱   ╭───┬───┴───┬───╮   ╲     ...
+           │  ╱   ╭─┴─┬───┬─┴─╮   ╲  │    ring n_fovea: n_theta sites, λ units high
+           │ │   │ ╭──┴─┬─┴──╮ │   │ │    ring ρ of the fovea: (n_theta // n_fovea) · ρ sites, one unit high
+           ├─┼───┼─┤    o    ├─┼───┼─┤    ring 0: one site, of half a unit's radius
+           │ │   │ ╰──┬─┴─┬──╯ │   │ │
+           │  ╲   ╰─┬─┴───┴─┬─╯   ╱  │
+            ╲   ╰───┴───┬───┴───╯   ╱
+              ╰─────────┴─────────╯
+           ├──────── n_across ───────┤    units of unit_um, the smallest pixel
+
+    Parameters
+    ----------
+    n_rho : int
+        All rings, ring 0 included.
+    n_theta : int
+        Sites of a ring outside the fovea; at least 3 for each of the fovea's rings.
+    n_fovea : int
+        Rings of the fovea, which reaches to the radius ``n_fovea - 0.5``.
+    n_across : int
+        Diameter of the whole in smallest pixels, more than ``2 n_rho - 1``.
+    unit_um : float, µm
+        The smallest pixel: the height of the fovea's rings.
+    fovea : {"rings", "linear", "hexagons", "none"}
+        What fills the fovea: rings of (n_theta // n_fovea) · ρ sites; rings cut by some of the spokes outside, with sites at
+        least a unit wide where n_theta has the divisors; hexagons of a unit's area, those at the border larger; nothing, which
+        is the blind spot.
+    stagger : bool
+        Turn every second ring outside the fovea by half a sector, π / n_theta.
+    chords_per_arc : int
+        Straight edges that stand for an arc. Where ``stagger`` would set odd numbers of chords against each other, arcs
+        outside the fovea get twice as many. In the fovea an arc has also the corners of the neighbours across it, so
+        that nothing is left open or covered twice.
+
+    Returns
+    -------
+    Layout
+        Ring by ring from the inside, with the columns ``ring`` (ρ, which begins at ``n_fovea`` without a fovea),
+        ``sector`` and ``readout_line`` (the one of ``n_theta`` spokes in which the site begins; of a hexagon, its middle).
+        Hexagons are the ring ``n_fovea - 1``. ``provenance`` tells ``ring_ratio``, λ, and without a fovea
+        ``blind_radius_um``.
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range, or the rule has no rings that grow.
+
+    Notes
+    -----
+    A site of the fovea is ``2π / (n_theta // n_fovea)`` units wide on its centre line: 1.05 units when there are six for
+    each ring. The edge of ring ρ outside the fovea lies at ``A + B λ^(ρ - n_fovea)`` with ``B = λ / (λ - 1)`` and
+    ``A = n_fovea - B - 0.5``.
+
+    Examples
+    --------
+    Giotto 2, 5,167 sites in the fovea and 27,720 around it:
+
+    >>> layout = giotto(n_rho=152, n_theta=252, n_fovea=42, n_across=1090, unit_um=6.45)
+    >>> layout.n_sites, int((layout.columns["ring"] < 42).sum())
+    (32887, 5167)
+    """
+    log_ratio = _log_ratio(n_rho, n_fovea, n_across)
+    n_rho, n_fovea, n_across = int(n_rho), int(n_fovea), int(n_across)
+    n_theta = check_count("n_theta", n_theta, at_least=3, at_most=MAX_SITES)
+    unit_um = check_length_um("unit_um", unit_um, at_most=2.0 * MAX_LENGTH_UM / n_across)
+    check_choice("fovea", fovea, get_args(Fovea))
+    chords_per_arc = check_count("chords_per_arc", chords_per_arc, at_most=1000)
+    has_rings = fovea in {"rings", "linear"}
+    if has_rings and n_theta < MIN_SITES_PER_RHO * n_fovea:
+        raise ParameterError(
+            "n_theta",
+            f"must be >= {MIN_SITES_PER_RHO * n_fovea}, three times 'n_fovea'",
+            n_theta,
+            cure="or take fovea='none'",
+        )
+    n_rings = n_rho - n_fovea
+    n_per_rho = n_theta // n_fovea
+    check_sites(n_rings * n_theta + (n_per_rho * n_fovea * (n_fovea - 1) // 2 + 1 if has_rings else 0))
+
+    n_chords = chords_per_arc * (2 if stagger and chords_per_arc % 2 else 1)
+    rings = [Ring(n_theta, int(stagger and i % 2 == 1), n_chords) for i in range(n_rings)]
+    growth = math.exp(log_ratio) / math.expm1(log_ratio)
+    radii = n_fovea - 0.5 + growth * np.expm1(log_ratio * np.arange(n_rings + 1))
+    if has_rings:
+        inner, fillers = fovea_rings(
+            "rings" if fovea == "rings" else "linear",
+            n_rings=n_fovea,
+            n_sectors=n_theta,
+            n_per_ring=n_per_rho,
+            n_chords=chords_per_arc,
+        )
+        radii, rings = np.concatenate((inner[:-1], radii)), fillers + rings
+    first = n_rho - len(rings)
+
+    xy_um, offsets, ring, sector = annuli(radii * unit_um, rings)
+    n_sites = np.array([r.n_sites for r in rings])
+    provenance = {
+        "generator": "giotto",
+        "parameters": {
+            "n_rho": n_rho,
+            "n_theta": n_theta,
+            "n_fovea": n_fovea,
+            "n_across": n_across,
+            "unit_um": unit_um,
+            "fovea": fovea,
+            "stagger": stagger,
+            "chords_per_arc": chords_per_arc,
+        },
+        "ring_ratio": math.exp(log_ratio),
+    }
+    if not has_rings:
+        provenance["blind_radius_um"] = float(radii[0] * unit_um)
+    layout = Layout(
+        xy_um,
+        offsets,
+        np.arange(offsets.size),
+        {"ring": first + ring, "sector": sector, "readout_line": sector * n_theta // n_sites[ring]},
+        provenance,
+    )
+    return with_hexagons(layout, unit_um, n_theta) if fovea == "hexagons" else layout
+
+
+def _log_ratio(n_rho: int, n_fovea: int, n_across: int) -> float:
+    from scipy.optimize import brentq
+
+    n_rho = check_count("n_rho", n_rho, at_least=2, at_most=MAX_SITES)
+    n_fovea = check_count(
+        "n_fovea", n_fovea, at_most=n_rho - 1, cure="'n_rho' counts the fovea's rings and at least one around them"
+    )
+    n_across = check_count("n_across", n_across, at_most=2**53)
+    if n_across < 2 * n_rho:
+        raise ParameterError(
+            "n_across",
+            f"must be > {2 * n_rho - 1}, the diameter of {n_rho} rings that do not grow",
+            n_across,
+            cure="take more, or fewer rings",
+        )
+    n_rings = n_rho - n_fovea
+    width = 0.5 * n_across - n_fovea + 0.5
+
+    def excess(x: float) -> float:
+        """Summed heights of the rings, less the width that they have, at the logarithm x of the ratio."""
+        heights = math.exp(x) * math.expm1(n_rings * x) / math.expm1(x) if x > 0.0 else float(n_rings)
+        return heights - width
+
+    # The last ring alone is no higher than all of them together.
+    largest = math.log(width) / n_rings * (1.0 + 1e-9)
+    return float(brentq(excess, 0.0, largest, xtol=LOG_RATIO_ROUNDING, rtol=4 * np.finfo(np.float64).eps))

@@ -1,0 +1,143 @@
+"""The rectangular grid."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from foveasim._core.validation import Floats, check_count, check_length_um, check_number, check_sites
+from foveasim.errors import ParameterError
+from foveasim.layout.model import Layout
+
+__all__ = ["grid"]
+
+
+def grid(
+    *,
+    n_x: int,
+    n_y: int,
+    pitch_um: float,
+    pitch_y_um: float | None = None,
+    width_um: float | None = None,
+    trench_um: float | None = None,
+    fill_factor: float | None = None,
+    stagger: bool = False,
+) -> Layout:
+    """
+    Square or rectangular photosites in rows and columns, the middle of the grid on the optical axis.
+
+    ::
+
+        ┌────┐ ┌────┐ ┌────┐  ─┬─             stagger: every second row moved by half a pitch
+        │    │ │    │ │    │   │ width_um          ┌────┐ ┌────┐ ┌────┐
+        └────┘ └────┘ └────┘  ─┴─                  └────┘ └────┘ └────┘
+        ├──────┤    ├─┤                       ┌────┐ ┌────┐ ┌────┐
+         pitch_um   trench_um                 └────┘ └────┘ └────┘
+
+    Parameters
+    ----------
+    n_x, n_y : int
+        Numbers of columns and rows.
+    pitch_um : float, µm
+        Distance of two centres in a row.
+    pitch_y_um : float, optional, µm
+        Distance of two rows; ``pitch_um`` by default.
+    width_um : float, optional, µm
+        Side of the light-sensitive square; sites tile the plane by default. With two pitches use ``trench_um``.
+    trench_um : float, optional, µm
+        In the place of the width: what is left open between two sites.
+    fill_factor : float, optional
+        In the place of the width: share of a cell that is sensitive to light, ``(1 - trench / pitch)²`` for squares; cells
+        of two pitches keep their shape.
+    stagger : bool
+        Move every second row, from the second on, by half a pitch to the right.
+
+    Returns
+    -------
+    Layout
+        Row by row from the lowest y, with the columns ``row``, ``column``, ``readout_line`` (the column).
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range, the width larger than the pitch, or the width told twice.
+    """
+    n_x, n_y = check_count("n_x", n_x), check_count("n_y", n_y)
+    pitch_um = check_length_um("pitch_um", pitch_um)
+    if pitch_y_um is not None:
+        pitch_y_um = check_length_um("pitch_y_um", pitch_y_um)
+        if width_um is not None:
+            raise ParameterError("width_um", "is the side of squares; with 'pitch_y_um' give 'trench_um'", width_um)
+    shares = [
+        light_share(p_um, width_um, trench_um, fill_factor)
+        for p_um in (pitch_um, pitch_um if pitch_y_um is None else pitch_y_um)
+    ]
+    check_sites(n_x * n_y)
+    row, column = (index.ravel() for index in np.divmod(np.arange(n_y * n_x), n_x))
+    shift = 0.5 * (row % 2) - 0.25 * (n_y > 1) if stagger else 0.0
+    corners = square_corners_um(column - 0.5 * n_x + shift, row - 0.5 * n_y, pitch_um, pitch_y_um, shares)
+    return Layout.from_equal_rings(
+        corners,
+        {"row": row, "column": column, "readout_line": column},
+        {
+            "generator": "grid",
+            "parameters": {
+                "n_x": n_x,
+                "n_y": n_y,
+                "pitch_um": pitch_um,
+                "pitch_y_um": pitch_y_um,
+                "width_um": width_um,
+                "trench_um": trench_um,
+                "fill_factor": fill_factor,
+                "stagger": stagger,
+            },
+        },
+    )
+
+
+def light_share(
+    pitch_um: float, width_um: float | None, trench_um: float | None, fill_factor: float | None
+) -> float | None:
+    """
+    Share of a cell's width that is sensitive to light, from the one way in which it is told; None where cells tile.
+
+    Raises
+    ------
+    ParameterError
+        When it is told twice, or is out of range.
+    """
+    if sum(x is not None for x in (width_um, trench_um, fill_factor)) > 1:
+        raise ParameterError("width_um", "'trench_um' and 'fill_factor' say the same; give one of them")
+    if width_um is not None:
+        return (
+            check_length_um("width_um", width_um, at_most=pitch_um, cure="it is no larger than 'pitch_um'") / pitch_um
+        )
+    if trench_um is not None:
+        trench_um = check_number("trench_um", trench_um, at_least=0.0)
+        if not trench_um < pitch_um:
+            raise ParameterError("trench_um", f"must be < {pitch_um:g}, the pitch", trench_um, "µm")
+        return 1.0 - trench_um / pitch_um if trench_um > 0.0 else None
+    if fill_factor is not None:
+        fill_factor = check_number("fill_factor", fill_factor, above=0.0, at_most=1.0)
+        return math.sqrt(fill_factor) if fill_factor < 1.0 else None
+    return None
+
+
+def square_corners_um(
+    x: Floats,
+    y: Floats,
+    pitch_um: float,
+    pitch_y_um: float | None = None,
+    shares: Sequence[float | None] = (None, None),
+) -> Floats:
+    """
+    Corners (n, 4, 2) µm of a grid's cells with their lower left corners at (x, y), in pitches, or of a share of each.
+
+    Neighbours' corners are the same numbers, bit for bit, when they tile.
+    """
+    margins = [0.0 if share is None else 0.5 * (1.0 - share) for share in shares]
+    (x0, y0), (x1, y1) = margins, [1.0 - margin for margin in margins]
+    steps = np.stack([np.stack((x + dx, y + dy), axis=-1) for dx, dy in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], 1)
+    return np.asarray(steps * np.array([pitch_um, pitch_um if pitch_y_um is None else pitch_y_um]))

@@ -1,0 +1,93 @@
+"""The hexagonal grid."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+
+from foveasim._core.validation import check_choice, check_count, check_length_um, check_sites
+from foveasim.layout.generators.grid import light_share
+from foveasim.layout.model import Layout
+
+__all__ = ["hexagonal"]
+
+
+def hexagonal(
+    *,
+    n_columns: int,
+    n_rows: int,
+    pitch_um: float,
+    width_um: float | None = None,
+    trench_um: float | None = None,
+    fill_factor: float | None = None,
+    orientation: Literal["pointy", "flat"] = "pointy",
+) -> Layout:
+    """
+    Regular hexagons in close packing, the middle of their centres on the optical axis.
+
+    ::
+
+        pointy:   ╱╲  ╱╲  ╱╲        pitch_um = centre to centre
+                 │  ││  ││  │                = flat side to flat side of a full cell
+                  ╲╱╲╱╲╱╲╱╲
+                   │  ││  │  ...    every second row is moved by half a pitch
+
+        flat: the same, turned by 90 degrees (columns in the place of rows)
+
+    Parameters
+    ----------
+    n_columns, n_rows : int
+        Sites along a row, and rows; for ``"flat"`` a row runs upwards.
+    pitch_um : float, µm
+        Distance of two neighbours' centres.
+    width_um : float, optional, µm
+        Distance of two opposite flat sides of the light-sensitive hexagon; the pitch by default.
+    trench_um : float, optional, µm
+        In the place of the width: what is left open between two sites.
+    fill_factor : float, optional
+        In the place of the width: share of a cell that is sensitive to light, ``(width / pitch)²``.
+    orientation : {"pointy", "flat"}
+        Whether a corner or a flat side is on top.
+
+    Returns
+    -------
+    Layout
+        Row by row, with the columns ``row``, ``column``, ``readout_line`` (the column).
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range, the width larger than the pitch, or the width told twice.
+    """
+    n_columns, n_rows = check_count("n_columns", n_columns), check_count("n_rows", n_rows)
+    pitch_um = check_length_um("pitch_um", pitch_um)
+    share = light_share(pitch_um, width_um, trench_um, fill_factor)
+    check_choice("orientation", orientation, ("pointy", "flat"))
+    check_sites(n_columns * n_rows)
+    row, column = (index.ravel() for index in np.divmod(np.arange(n_rows * n_columns), n_columns))
+    # Every corner of the packing lies on a lattice of half pitches and half sides: neighbours' corners are equal.
+    half_um = np.array([0.5 * pitch_um, 0.5 * pitch_um / math.sqrt(3.0)])
+    centre = np.stack((2 * column + row % 2, 3 * row), axis=1)
+    middle = np.array([n_columns - 1 + 0.5 * (n_rows > 1), 1.5 * (n_rows - 1)])
+    corners = np.array([(1, -1), (1, 1), (0, 2), (-1, 1), (-1, -1), (0, -2)])
+    rings_um = ((centre - middle)[:, np.newaxis] + (1.0 if share is None else share) * corners) * half_um
+    if orientation == "flat":
+        rings_um = np.stack((-rings_um[..., 1], rings_um[..., 0]), axis=-1)
+    return Layout.from_equal_rings(
+        rings_um,
+        {"row": row, "column": column, "readout_line": column},
+        {
+            "generator": "hexagonal",
+            "parameters": {
+                "n_columns": n_columns,
+                "n_rows": n_rows,
+                "pitch_um": pitch_um,
+                "width_um": width_um,
+                "trench_um": trench_um,
+                "fill_factor": fill_factor,
+                "orientation": orientation,
+            },
+        },
+    )

@@ -1,0 +1,143 @@
+"""The layout of two sizes: large octagons, and small squares between them that stand on a corner."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+
+from foveasim._core.validation import Bools, Ints, check_choice, check_count, check_length_um, check_sites
+from foveasim.layout.model import Layout
+
+__all__ = ["octagonal"]
+
+#: Side of the diamonds between regular octagons, in pitches.
+REGULAR_SIDE = math.sqrt(2.0) - 1.0
+#: Corners as (x, y) in lines of the lattice: three for each border between cells, half a diamond apart.
+OCTAGON = np.array([(2, 1), (3, 1), (4, 2), (4, 3), (3, 4), (2, 4), (1, 3), (1, 2)])
+DIAMOND = np.array([(1, 0), (2, 1), (1, 2), (0, 1)])
+#: The diamonds stay this share below the size at which they would touch.
+TOUCHING_ROUNDING = 1e-9
+
+
+def octagonal(
+    *,
+    n_x: int,
+    n_y: int,
+    pitch_um: float,
+    diamond_um: float | None = None,
+    border: Literal["whole", "cut"] = "whole",
+) -> Layout:
+    """
+    Octagons on a square grid, its middle on the optical axis, and a diamond where four of them meet.
+
+    ::
+
+          ╱────╲    ╱────╲
+         ╱      ╲  ╱      ╲
+        │        ││        │       pitch_um = centre to centre of two octagons
+         ╲      ╱  ╲      ╱                 = centre to centre of two diamonds
+          ╲────╱ ╱╲ ╲────╱
+          ╱────╲ ╲╱ ╱────╲         diamond_um = side of a diamond
+         ╱      ╲  ╱      ╲                   = slanted side of an octagon
+        │        ││        │
+         ╲      ╱  ╲      ╱
+          ╲────╱    ╲────╱
+
+    Parameters
+    ----------
+    n_x, n_y : int
+        Numbers of columns and rows of octagons.
+    pitch_um : float, µm
+        Distance of two octagons' centres.
+    diamond_um : float, optional, µm
+        Side of the diamonds, less than ``pitch_um / √2``; by default ``(√2 - 1) pitch_um``, which makes the octagons
+        regular.
+    border : {"whole", "cut"}
+        Whether there are diamonds only where four octagons meet, or also halves and quarters of them along the border,
+        which make the sites tile the rectangle of ``n_x`` by ``n_y`` pitches.
+
+    Returns
+    -------
+    Layout
+        The octagons, then the diamonds, row by row from the lowest y, with the columns ``kind`` (0 octagon, 1 diamond),
+        ``row``, ``column`` (in the grid of its kind) and ``readout_line`` (the columns of both kinds, numbered through).
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range, or the diamonds so large that they would touch.
+
+    Notes
+    -----
+    A diamond's area is ``diamond_um²``, an octagon's ``pitch_um² - diamond_um²``: together they are a cell of the grid.
+
+    Examples
+    --------
+    >>> octagonal(n_x=4, n_y=3, pitch_um=5.0, diamond_um=3.0).area_um2[[0, -1]].round(9).tolist()
+    [16.0, 9.0]
+    """
+    n_x, n_y = check_count("n_x", n_x), check_count("n_y", n_y)
+    pitch_um = check_length_um("pitch_um", pitch_um)
+    if diamond_um is not None:
+        diamond_um = check_length_um(
+            "diamond_um",
+            diamond_um,
+            at_most=(1.0 - TOUCHING_ROUNDING) * pitch_um / math.sqrt(2.0),
+            cure="diamonds of the side pitch_um / √2 would touch",
+        )
+    check_choice("border", border, ("whole", "cut"))
+    check_sites(n_x * n_y + (n_x + 1) * (n_y + 1))
+    half_um = (REGULAR_SIDE * pitch_um if diamond_um is None else diamond_um) / math.sqrt(2.0)
+    # Every corner lies on a cell's border, or half a diamond beside it: neighbours' corners are the same numbers.
+    x_um, y_um = (
+        (pitch_um * (np.arange(n + 1) - 0.5 * n)[:, np.newaxis] + (-half_um, 0.0, half_um)).ravel() for n in (n_x, n_y)
+    )
+    row, column = _places(n_y, n_x)
+    octagon = 3 * np.stack((column, row), axis=1)[:, np.newaxis] + OCTAGON
+    first = 0 if border == "cut" else 1
+    diamond_row, diamond_column = _places(n_y + 1 - 2 * first, n_x + 1 - 2 * first)
+    diamond = 3 * (np.stack((diamond_column, diamond_row), axis=1)[:, np.newaxis] + first) + DIAMOND
+    diamond, is_corner = _cut(diamond, n_x, n_y)
+    corner = np.concatenate((octagon.reshape(-1, 2), diamond[is_corner]))
+    n_vertices = np.concatenate((np.full(row.size, len(OCTAGON)), np.count_nonzero(is_corner, axis=1)))
+    return Layout(
+        np.stack((x_um[corner[:, 0]], y_um[corner[:, 1]]), axis=1),
+        np.concatenate(([0], np.cumsum(n_vertices))),
+        np.arange(n_vertices.size + 1),
+        {
+            "kind": np.repeat([0, 1], [row.size, diamond_row.size]),
+            "row": np.concatenate((row, diamond_row)),
+            "column": np.concatenate((column, diamond_column)),
+            "readout_line": np.concatenate((column, n_x + diamond_column)),
+        },
+        {
+            "generator": "octagonal",
+            "parameters": {
+                "n_x": n_x,
+                "n_y": n_y,
+                "pitch_um": pitch_um,
+                "diamond_um": diamond_um,
+                "border": border,
+            },
+        },
+    )
+
+
+def _places(n_rows: int, n_columns: int) -> tuple[Ints, Ints]:
+    """Row and column of each site of a grid, row by row."""
+    row, column = np.divmod(np.arange(n_rows * n_columns), max(1, n_columns))
+    return row, column
+
+
+def _cut(diamond: Ints, n_x: int, n_y: int) -> tuple[Ints, Bools]:
+    """
+    Diamonds (n, 4, 2) without what lies outside the octagons' cells, and which of their corners (n, 4) are left.
+
+    The corners outside move to the diamond's centre. In a half that is no corner, in a quarter it is one.
+    """
+    inside = np.clip(diamond, 1, (3 * n_x + 1, 3 * n_y + 1))
+    is_moved = (inside != diamond).any(axis=2)
+    n_moved = np.cumsum(is_moved, axis=1)
+    return inside, ~is_moved | ((n_moved == 1) & (n_moved[:, -1:] == 2))

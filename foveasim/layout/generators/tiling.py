@@ -1,0 +1,272 @@
+"""Squares or hexagons of one size in any region, and the filling of open places with them."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import Any, Literal, TypeAlias, get_args
+
+import numpy as np
+import shapely
+
+from foveasim._core.validation import Floats, check_choice, check_length_um, check_sites, finite_array
+from foveasim.errors import GeometryError, LayoutWarning, ParameterError
+from foveasim.layout._regions import as_region, one_region, told_region
+from foveasim.layout.drc.measurements import is_below_size
+from foveasim.layout.edits import clip, merge_small, union
+from foveasim.layout.model import Layout
+
+__all__ = ["Cells", "fill", "tiling", "with_hexagons"]
+
+Cells: TypeAlias = Literal["hexagons", "squares"]
+Border: TypeAlias = Literal["merge", "cut", "drop"]
+
+#: Corners of a cell around its centre, counter-clockwise, in the lattice's steps.
+CORNERS = {
+    "squares": np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]),
+    "hexagons": np.array([(1, -1), (1, 1), (0, 2), (-1, 1), (-1, -1), (0, -2)]),
+}
+#: Pieces of less than this share of a cell are joined to a neighbour, unless the user says otherwise.
+SMALL_SHARE = 0.5
+#: Open areas below this fraction of the region are rounding.
+AREA_ROUNDING = 1e-9
+
+
+def tiling(
+    *,
+    pitch_um: float,
+    cells: Cells = "hexagons",
+    size_um: tuple[float, float] | None = None,
+    radius_um: float | None = None,
+    region: Any = None,
+    border: Border = "merge",
+    min_size_um: float | None = None,
+    origin_um: tuple[float, float] = (0.0, 0.0),
+) -> Layout:
+    """
+    Equal squares or hexagons that fill a region to its border.
+
+    ::
+
+          ╭──┬───┬──╮
+         ╱ ╲ │ ╱╲│╱ ╲          whole cells: pitch_um from centre to centre
+        │   ╳   ╳   │
+        │  │ │ · │ ││          · origin_um, the centre of a cell
+         ╲ ╱ ╲ ╱ ╲ ╱
+          ╰───┴───┴─╯          border: small pieces belong to the cell beside them
+
+    Parameters
+    ----------
+    pitch_um : float, µm
+        Distance of neighbouring cells' centres.
+    cells : {"hexagons", "squares"}
+        Hexagons stand on a corner.
+    size_um : (width, height), optional, µm
+        Rectangle around the optical axis that is filled.
+    radius_um : float, optional, µm
+        Disc around the optical axis that is filled, a polygon of 960 sides.
+    region : shapely Polygon or MultiPolygon, or (n, 2) vertices, optional, µm
+        Any other region, with holes or without, in one part or several.
+    border : {"merge", "cut", "drop"}
+        What becomes of cells that the border cuts: pieces below ``min_size_um`` are joined to the neighbour with which
+        they share most edge; pieces stay as they are; or only whole cells are kept.
+    min_size_um : float, optional, µm
+        Smallest size, the square root of the area, of a site, as the design rule ``min_size_um`` measures it; half a cell's
+        area by default. It does not go with ``border="cut"``, nor with ``"drop"`` where whole cells are smaller.
+    origin_um : (x, y), µm
+        Where a cell has its centre.
+
+    Returns
+    -------
+    Layout
+        Row by row, with the columns ``row``, ``column`` (of the lattice, from 0; a joined site has those of one of its
+        parts) and ``readout_line`` (the column).
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range, not exactly one region is given, or the border leaves sites below ``min_size_um``.
+    GeometryError
+        When no site is left: the region is smaller than one.
+
+    Warns
+    -----
+    LayoutWarning
+        When parts of the region that are smaller than a site stay open, where pieces are joined.
+
+    Examples
+    --------
+    >>> layout = tiling(pitch_um=4.0, radius_um=50.0)
+    >>> layout.n_sites, round(float(layout.area_um2.sum()), 1), round(float(layout.area_um2.min()), 1)
+    (571, 7853.9, 7.0)
+    """
+    outline = one_region(size_um=size_um, radius_um=radius_um, region=region)
+    pitch_um = check_length_um("pitch_um", pitch_um)
+    check_choice("cells", cells, get_args(Cells))
+    check_choice("border", border, get_args(Border))
+    origin = finite_array("origin_um", origin_um, ndim=1)
+    if origin.shape != (2,):
+        raise ParameterError("origin_um", "must be two numbers (x, y)", origin_um, "µm")
+    if min_size_um is not None:
+        min_size_um = check_length_um("min_size_um", min_size_um)
+        if border == "cut":
+            raise ParameterError(
+                "min_size_um",
+                "must be left out with border='cut', which keeps every piece",
+                min_size_um,
+                "µm",
+                "take border='merge'",
+            )
+    lattice = _lattice(outline.bounds, pitch_um, cells, origin)
+    if border == "drop" and min_size_um is not None and is_below_size(lattice.area_um2, min_size_um).any():
+        raise ParameterError(
+            "min_size_um",
+            f"must be <= {math.sqrt(lattice.area_um2[0]):.6g}, the size of a whole cell",
+            min_size_um,
+            "µm",
+            "take a larger pitch, or border='merge'",
+        )
+    layout = clip(lattice, outline, cut="drop" if border == "drop" else "pieces")
+    if border == "merge":
+        smallest_um = math.sqrt(SMALL_SHARE * lattice.area_um2[0]) if min_size_um is None else min_size_um
+        pieces_um2 = float(layout.area_um2.sum())
+        layout = _merged(layout, smallest_um)
+        open_um2 = pieces_um2 - float(layout.area_um2.sum())
+        if layout.n_sites and open_um2 > AREA_ROUNDING * pieces_um2:
+            warnings.warn(
+                f"{open_um2:.6g} µm² of the region stay open, in parts that are smaller than a site of {smallest_um:.6g} µm; "
+                "leave them out of the region, or take a smaller 'min_size_um'",
+                LayoutWarning,
+                stacklevel=2,
+            )
+    if layout.n_sites == 0:
+        raise GeometryError("the region holds no site: it is smaller than one; enlarge it, or take a smaller pitch")
+    row, column = (layout.columns[name] - layout.columns[name].min() for name in ("row", "column"))
+    return Layout(
+        layout.xy_um,
+        layout.ring_offsets,
+        layout.site_offsets,
+        {"row": row, "column": column, "readout_line": column},
+        {
+            "generator": "tiling",
+            "parameters": {
+                "pitch_um": pitch_um,
+                "cells": cells,
+                "size_um": None if size_um is None else [float(x) for x in size_um],
+                "radius_um": radius_um,
+                "region": None if region is None else told_region(region),
+                "border": border,
+                "min_size_um": min_size_um,
+                "origin_um": origin.tolist(),
+            },
+        },
+    )
+
+
+def fill(layout: Layout, region: Any, *, size_um: float, columns_of: Layout | None = None) -> Layout:
+    """
+    A layout with a region of it filled with hexagons of one size: a blind spot, the room of sites that were taken away.
+
+    Parameters
+    ----------
+    layout : Layout
+    region : shapely Polygon or MultiPolygon, or (n, 2) vertices, µm
+        What is filled; what sites there cover already stays theirs.
+    size_um : float, µm
+        Size, the square root of the area, of the hexagons. Pieces at the border that are smaller are joined to a
+        neighbour, so that no new site is below it.
+    columns_of : Layout, optional
+        New sites have the columns of the nearest site of this layout, which has all of ``layout``'s; of ``layout`` itself
+        by default.
+
+    Returns
+    -------
+    Layout
+        The layout's sites, then the new ones. A part of the region too small for any site is left open.
+
+    Raises
+    ------
+    ParameterError
+        When the region is none, or the size out of range.
+    """
+    size_um = check_length_um("size_um", size_um)
+    open_region = _open_part(layout, as_region("region", region))
+    if open_region.is_empty:
+        return layout
+    return _joined(layout, _hexagons(open_region, size_um), layout if columns_of is None else columns_of, size_um)
+
+
+def with_hexagons(layout: Layout, size_um: float, n_lines: int) -> Layout:
+    """A layout of rings, its middle filled with hexagons: the ring inside the innermost one, read by the nearest spoke."""
+    ring = layout.columns["ring"]
+    first = int(ring.min())
+    around = shapely.coverage_union_all(layout[ring == first].polygons())
+    middle = _hexagons(shapely.Polygon(around.interiors[0]), size_um)
+    if middle.n_sites == 0:
+        raise ParameterError(
+            "fovea", f"leaves no room for a hexagon of {size_um:g} µm inside the first ring", "hexagons"
+        )
+    angle_rad = np.arctan2(middle.centroid_um[:, 1], middle.centroid_um[:, 0]) % (2.0 * math.pi)
+    line = np.floor(angle_rad * n_lines / (2.0 * math.pi)).astype(np.int64) % n_lines
+    shift = 1 if first == 0 else 0
+    inside = Layout(
+        middle.xy_um,
+        middle.ring_offsets,
+        middle.site_offsets,
+        {"ring": np.full(middle.n_sites, first - 1 + shift), "sector": np.arange(middle.n_sites), "readout_line": line},
+    )
+    both = union([inside, layout.with_columns(ring=ring + shift)])
+    return Layout(both.xy_um, both.ring_offsets, both.site_offsets, both.columns, layout.provenance)
+
+
+def _hexagons(region: Any, size_um: float) -> Layout:
+    """A region in hexagons of the area of a square of this side, and larger sites at the border."""
+    # A hair more, for the rounding of areas.
+    pitch_um = size_um * math.sqrt(2.0 / math.sqrt(3.0)) * (1.0 + 1e-9)
+    return _merged(clip(_lattice(region.bounds, pitch_um, "hexagons", np.zeros(2)), region), size_um)
+
+
+def _merged(pieces: Layout, min_size_um: float) -> Layout:
+    """Small pieces joined to their neighbours; those that have none are left out."""
+    layout = merge_small(pieces, min_size_um=min_size_um)
+    return layout[~is_below_size(layout.area_um2, min_size_um)]
+
+
+def _lattice(bounds_um: tuple[float, float, float, float], pitch_um: float, cells: str, origin_um: Floats) -> Layout:
+    """All cells of the lattice that reach into some bounds."""
+    # Corners lie on a lattice of half pitches (and half sides): neighbours' corners are equal bit for bit.
+    step_um = 0.5 * pitch_um * np.array([1.0, 1.0 if cells == "squares" else 1.0 / math.sqrt(3.0)])
+    row_steps = 2 if cells == "squares" else 3
+    low, high = ((np.asarray(bounds_um[i : i + 2]) - origin_um) / step_um for i in (0, 2))
+    first, last = np.floor((low - 2.0) / (2, row_steps)) - 1, np.ceil((high + 2.0) / (2, row_steps)) + 1
+    n_columns, n_rows = (last - first + 1).tolist()
+    check_sites(max(1, int(min(n_columns * n_rows, 1e18))))
+    row, column = (index.ravel() for index in np.indices((int(n_rows), int(n_columns))))
+    row, column = row + int(first[1]), column + int(first[0])
+    centre = np.stack((2 * column + (row % 2 if cells == "hexagons" else 0), row_steps * row), axis=1)
+    rings_um = (centre[:, np.newaxis] + CORNERS[cells]) * step_um + origin_um
+    box_um = np.concatenate((rings_um.min(axis=1), rings_um.max(axis=1)), axis=1)
+    x0, y0, x1, y1 = bounds_um
+    reaches = (box_um[:, 2] > x0) & (box_um[:, 0] < x1) & (box_um[:, 3] > y0) & (box_um[:, 1] < y1)
+    return Layout.from_equal_rings(
+        rings_um[reaches], {"row": row[reaches] - int(first[1]), "column": column[reaches] - int(first[0])}
+    )
+
+
+def _open_part(layout: Layout, region: Any) -> Any:
+    """What sites leave open of a region."""
+    polygons = layout.polygons()
+    near = polygons[shapely.STRtree(polygons).query(region)]
+    return shapely.difference(region, shapely.union_all(near)) if near.size else region
+
+
+def _joined(layout: Layout, new: Layout, source: Layout, size_um: float) -> Layout:
+    from scipy.spatial import cKDTree
+
+    if new.n_sites and source.n_sites:
+        nearest = np.asarray(cKDTree(source.centroid_um).query(new.centroid_um)[1], dtype=np.int64)
+        columns = {name: source.columns[name][nearest] for name in layout.columns}
+        new = Layout(new.xy_um, new.ring_offsets, new.site_offsets, columns)
+    both = union([layout, new])
+    step = f"filled with {new.n_sites} sites of at least {size_um:g} µm"
+    return Layout(both.xy_um, both.ring_offsets, both.site_offsets, both.columns, layout._then(step))  # noqa: SLF001 -- of the same room

@@ -1,0 +1,658 @@
+"""The density-driven layout: sites as dense as any picture or function asks, evened out by Lloyd's steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike
+
+from foveasim._core.random_streams import Streams
+from foveasim._core.rings import positions_in_runs
+from foveasim._core.validation import (
+    Floats,
+    Ints,
+    as_numbers,
+    check_choice,
+    check_count,
+    check_sites,
+    finite_array,
+)
+from foveasim.errors import GeometryError, ParameterError
+from foveasim.fields import Grid
+from foveasim.layout._regions import one_region
+from foveasim.layout._voronoi import CellEdges, MovingCells, edges_of_rings
+from foveasim.layout.model import Layout
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
+__all__ = ["voronoi"]
+
+#: A picture (n_y, n_x), or a function of points (n, 2) µm that gives (n,) numbers.
+Density: TypeAlias = ArrayLike | Callable[[Any], ArrayLike]
+
+#: Cells along the longer side of the region in which a function is tabulated for the first centres.
+TABLE_CELLS = 1024
+#: The first centres are looked for among at most 2**10 times as many points, or 2**27 in all.
+TRIES_LOG2, MAX_TRIES_LOG2 = 10, 27
+#: Points of a triangle as shares of its second and third corner, their weights, and those of a coarser rule. The one of 3
+#: points is exact for squares of x and y, the one of 7 points for fifth powers and its coarser one for squares (Radon 1948).
+THREE_POINTS = ((1 / 6, 1 / 6, 1 / 3, 1 / 3), (4 / 6, 1 / 6, 1 / 3, 1 / 3), (1 / 6, 4 / 6, 1 / 3, 1 / 3))
+SEVEN_POINTS = (
+    (0.333333333333333333, 0.333333333333333333, 0.225, 0.484071797961957087),
+    (0.101286507323456339, 0.101286507323456339, 0.125939180544827153, 0.171976067346014304),
+    (0.797426985353087322, 0.101286507323456339, 0.125939180544827153, 0.171976067346014304),
+    (0.101286507323456339, 0.797426985353087322, 0.125939180544827153, 0.171976067346014304),
+    (0.470142064105115090, 0.470142064105115090, 0.132394152788506181, 0.0),
+    (0.059715871789769820, 0.470142064105115090, 0.132394152788506181, 0.0),
+    (0.470142064105115090, 0.059715871789769820, 0.132394152788506181, 0.0),
+)
+#: A function's integral over a triangle may be wrong by this share of the mean cell's: triangles are quartered for that.
+TRIANGLE_ERROR, MAX_QUARTERINGS = 1e-8, 9
+#: Points of a line as shares of its length, of equal weight: exact for cubics (Gauss).
+LINE_POINTS = (0.211324865405187118, 0.788675134594812882)
+#: Few triangles and few lines are large ones, and are taken apart as far as it costs nothing.
+LEAST_TRIANGLES, LEAST_LINE_POINTS = 2048, 1024
+#: A cell with less than this share of the mean mass holds no more than rounding.
+EMPTY_SHARE = 1e-9
+#: Equal capacities differ from their mean by this share of it at most; Newton's steps go on to a tenth of that.
+CAPACITY_ERROR = 1e-6
+#: So many of Lloyd's steps are those of cells of equal capacity; and so many more are made where there are none.
+EQUAL_STEPS, MORE_STEPS = 2, 20
+#: Newton's steps, at most; and the smallest part of one that is tried.
+MAX_NEWTON_STEPS, SMALLEST_PART = 30, 0.01
+#: Where they fail, an even density is added at first: its mean, and then this part of it, so many times.
+FADING, N_FADINGS = 0.25, 16
+
+
+def voronoi(
+    *,
+    n_sites: int,
+    density: Density | None = None,
+    density_grid: Grid | None = None,
+    size_um: tuple[float, float] | None = None,
+    region: Any = None,
+    n_iterations: int = 20,
+    capacity: Literal["free", "equal"] = "free",
+    seed: int = 0,
+) -> Layout:
+    """
+    Voronoi cells of seeded centres, as many per area as a density asks.
+
+    ::
+
+        ┌──────┬───────┬──────┐  ─┬─
+        │      ╱╲__╱╲__╱╲     │   │
+        ├─────┤ │·│·│·│· ├────┤   │           · centre: the centre of mass of its cell
+        │  ·   ╲╱·╲╱·╲╱·╱  ·  │   │ size_um[1]
+        ├───────┬┴──┴┬──┴─────┤   │           sites per area in proportion to density
+        │   ·   │ ·  │   ·    │   │
+        └───────┴────┴────────┘  ─┴─
+        ├─────────────────────┤
+               size_um[0]
+
+    Parameters
+    ----------
+    n_sites : int
+        Number of sites.
+    density : (n_y, n_x) array or callable, optional
+        Sites per area, on any scale, at least 0 and somewhere above: a picture on ``density_grid``, or a function of
+        points (n, 2) in µm that gives (n,) values. The same everywhere by default.
+    density_grid : Grid, optional
+        Where the picture's cells are; it must cover the region.
+    size_um : (width, height), µm, optional
+        Rectangle around the optical axis that the sites tile.
+    region : shapely Polygon or (n, 2) vertices, µm, optional
+        Any other outline, convex or not. Without it and ``size_um`` the sites tile ``density_grid``.
+    n_iterations : int
+        Lloyd's steps: each moves all centres to the centres of mass of their cells.
+    capacity : "free" or "equal"
+        The density's integral over a site: about the same for all, as it comes, or the same to 1e-6. Equal sites are the
+        cells of a power diagram.
+    seed : int
+        Of the first centres; the same seed gives the same layout.
+
+    Returns
+    -------
+    Layout
+        In no order that means anything, with the column ``share`` (the site's part of the whole density, in mean sites:
+        1 where sites follow the density; exact for a picture, to about 1e-7 for a function that is smooth within sites).
+
+    Raises
+    ------
+    ParameterError
+        When a number is out of range, a density negative or nowhere above 0, or the region is not told once.
+    GeometryError
+        When a cell would be no simple outline within the region, centres are too close together for float64, or no cells
+        of equal capacity were found.
+
+    Notes
+    -----
+    First centres: a scrambled Sobol sequence through the density's inverse distribution, points outside the region left
+    out; evenly spread without a pattern. Centres of mass are weighted with the square of the density, because cells at
+    rest are as dense as the square root of their weight (Gersho 1979).
+
+    Equal capacity: a point x belongs to the centre c of the least power ``|x - c|² - w`` (Aurenhammer, Hoffmann and Aronov
+    1998), and damped Newton's steps find the weights w (Kitagawa, Mérigot and Thibert 2019). The last 2 of Lloyd's steps
+    take the centres of mass of these cells, weighted with the density itself (de Goes, Breeden, Ostromoukhov and Desbrun
+    2012). A function that jumps within sites has no integrals to 1e-6: give it as a picture, whose integrals are exact.
+
+    Examples
+    --------
+    >>> layout = voronoi(n_sites=200, size_um=(60.0, 40.0), density=lambda xy_um: 1.0 / (1.0 + (xy_um**2).sum(axis=1)))
+    >>> layout.n_sites, round(float(layout.area_um2.sum()), 6)
+    (200, 2400.0)
+    """
+    n_sites = check_sites(check_count("n_sites", n_sites))
+    n_iterations = check_count("n_iterations", n_iterations, at_least=0, at_most=10_000)
+    outline = _region(size_um, region, density_grid)
+    is_equal = check_choice("capacity", capacity, ("free", "equal")) == "equal"
+    field, table, grid = _density(density, density_grid, outline)
+    centres_um = _first_centres(n_sites, table, grid, outline, seed)
+    cells = MovingCells(outline, (lambda edges, n: _moments(edges, n, field)[0]) if is_equal else None)
+    n_equal = min(EQUAL_STEPS, n_iterations) if is_equal else 0
+    squared = field.squared()
+    for _ in range(n_iterations - n_equal):
+        mass, moment = squared.moments(_edges(cells, centres_um), centres_um, is_rough=True)
+        centres_um = _moved(centres_um, mass, moment, outline)
+    if is_equal:
+        _follow_equal(cells, centres_um, field, n_equal)
+    else:
+        _edges(cells, centres_um)
+    xy_um, offsets = cells.rings()
+    mass, _ = _moments(edges_of_rings(xy_um, offsets), n_sites, field)
+    share = mass * (n_sites / mass.sum())
+    if is_equal:
+        _require_equal(float(np.abs(share - 1.0).max()))
+    return Layout(
+        xy_um,
+        offsets,
+        np.arange(offsets.size),
+        {"share": share},
+        {
+            "generator": "voronoi",
+            "parameters": {
+                "n_sites": n_sites,
+                "density": _described(density),
+                "size_um": None if size_um is None else [float(x) for x in size_um],
+                "density_grid": None if density_grid is None else asdict(density_grid),
+                "region": None if region is None else _rings_um(outline),
+                "n_iterations": n_iterations,
+                "capacity": capacity,
+                "seed": int(seed),
+            },
+        },
+    )
+
+
+def _described(density: Density | None) -> str | None:
+    if density is None:
+        return None
+    return getattr(density, "__name__", "function") if callable(density) else f"picture of {np.shape(density)} cells"
+
+
+def _rings_um(outline: shapely.Polygon) -> list[Any]:
+    """Vertices of the outline, and a list of such lists when it has holes."""
+    rings = [shapely.get_coordinates(ring)[:-1].tolist() for ring in (outline.exterior, *outline.interiors)]
+    return rings[0] if len(rings) == 1 else rings
+
+
+def _region(size_um: tuple[float, float] | None, region: Any, density_grid: Grid | None) -> shapely.Polygon:
+    if size_um is not None and region is not None:
+        raise ParameterError("region", "and 'size_um' exclude each other; give one of them")
+    if size_um is None and region is None:
+        if density_grid is None:
+            raise ParameterError("size_um", "or 'region' or 'density_grid' must tell what the sites tile")
+        return shapely.box(*density_grid.bounds_um)
+    outline = one_region(size_um=size_um, region=region)
+    if not isinstance(outline, shapely.Polygon):
+        raise ParameterError("region", "must be one polygon, got several")
+    return outline
+
+
+def _density(
+    density: Density | None, density_grid: Grid | None, outline: shapely.Polygon
+) -> tuple[_Field, Floats, Grid]:
+    """The density, and a table of it on a grid over the region."""
+    if density is not None and not callable(density):
+        if not isinstance(density_grid, Grid):
+            raise ParameterError("density_grid", "must be the Grid of the density's picture", density_grid)
+        picture = finite_array("density", density, ndim=2, at_least=0.0)
+        if picture.shape != density_grid.shape:
+            raise ParameterError("density", f"must have the grid's shape {density_grid.shape}, got {picture.shape}")
+        table = _positive(_covering(picture, density_grid, outline))
+        return _PictureField(picture, density_grid), table, density_grid
+    x0, y0, x1, y1 = outline.bounds
+    pitch_um = max(x1 - x0, y1 - y0) / TABLE_CELLS
+    shape = (max(1, math.ceil((y1 - y0) / pitch_um)), max(1, math.ceil((x1 - x0) / pitch_um)))
+    grid = Grid(shape=shape, pitch_um=max(pitch_um, 1e-4), origin_um=(x0, y0))
+    if density is None:
+        return _EvenField(), np.ones(shape), grid
+    field = _FunctionField(_checked(density))
+    x_um, y_um = np.meshgrid(grid.x_um, grid.y_um)
+    return field, _positive(field.at(np.stack((x_um.ravel(), y_um.ravel()), axis=1)).reshape(shape)), grid
+
+
+def _positive(values: Floats) -> Floats:
+    if not values.any():
+        raise ParameterError("density", "must be above 0 somewhere in the region")
+    return values
+
+
+def _covering(values: Floats, grid: Grid, outline: shapely.Polygon) -> Floats:
+    """The picture, 0 in cells off the region, when its grid covers the region up to rounding."""
+    x0, y0, x1, y1 = grid.bounds_um
+    low_x, low_y, high_x, high_y = outline.bounds
+    rounding_um = 1e-9 * max(x1 - x0, y1 - y0)
+    if min(low_x - x0, low_y - y0, x1 - high_x, y1 - high_y) < -rounding_um:
+        raise ParameterError("density_grid", "must cover the whole region", grid.bounds_um, "µm")
+    half_x_um, half_y_um = 0.5 * grid.pitch_x_um, 0.5 * grid.pitch_y_um
+    is_near_x = (grid.x_um + half_x_um > low_x) & (grid.x_um - half_x_um < high_x)
+    is_near_y = (grid.y_um + half_y_um > low_y) & (grid.y_um - half_y_um < high_y)
+    return np.where(is_near_y[:, np.newaxis] & is_near_x, values, 0.0)
+
+
+def _checked(density: Callable[[Any], ArrayLike]) -> Callable[[Any], Any]:
+    """The function, its values checked each time."""
+
+    def at_points(xy_um: Any) -> Any:
+        values = as_numbers("density", density(xy_um))
+        if values.shape != xy_um.shape[:1]:
+            raise ParameterError(
+                "density", f"must give one value for each of {xy_um.shape[0]} points, got the shape {values.shape}"
+            )
+        return finite_array("density", values, at_least=0.0)
+
+    return at_points
+
+
+def _first_centres(n_sites: int, weight: Floats, grid: Grid, outline: shapely.Polygon, seed: int) -> Floats:
+    """Points (n_sites, 2) µm in the region, in proportion to the weight of the grid's cells and evenly spread."""
+    from scipy.stats import qmc
+
+    # One run through all cells, column by column: a point's first number finds the column, its second the row.
+    n_y, n_x = weight.shape
+    total = np.concatenate(([0.0], np.cumsum(weight.ravel(order="F"))))
+    columns = total[::n_y]
+    shapely.prepare(outline)
+    engine = qmc.Sobol(2, scramble=True, seed=Streams(seed).of("layout voronoi centres"))
+    first = max(4, math.ceil(math.log2(n_sites)))
+    for m in range(first, min(first + TRIES_LOG2, MAX_TRIES_LOG2) + 1):
+        u, v = np.moveaxis(engine.reset().random_base2(m), -1, 0)
+        target = u * total[-1]
+        column = np.clip(np.searchsorted(columns, target, side="right") - 1, 0, n_x - 1)
+        column_mass = columns[column + 1] - columns[column]
+        x = column + (target - columns[column]) / np.where(column_mass > 0.0, column_mass, 1.0)
+        target = columns[column] + v * column_mass
+        cell = np.clip(np.searchsorted(total, target, side="right") - 1, column * n_y, column * n_y + n_y - 1)
+        cell_mass = total[cell + 1] - total[cell]
+        y = cell - column * n_y + (target - total[cell]) / np.where(cell_mass > 0.0, cell_mass, 1.0)
+        points_um = np.stack((x, y), axis=1) * grid.pitch_xy_um + np.array(grid.origin_um)
+        points_um = points_um[shapely.contains_xy(outline, points_um)]
+        if points_um.shape[0] >= n_sites:
+            return np.asarray(points_um[:n_sites])
+    raise ParameterError("density", "must be above 0 in more of the region: too few points of it lie inside")
+
+
+# -- Lloyd's steps ---------------------------------------------------------------------------------------------------
+
+
+def _edges(cells: MovingCells, centres_um: Floats, weights_um2: Floats | None = None) -> CellEdges:
+    edges = cells.follow(centres_um, weights_um2)
+    if edges is None:
+        raise GeometryError("the centres lie too close together for float64")
+    return edges
+
+
+def _moved(centres_um: Floats, mass: Any, moment: Any, outline: shapely.Polygon) -> Floats:
+    """Centres of mass of the cells; a centre stays where its cell is empty, or its centre of mass lies outside."""
+    has_mass = mass > EMPTY_SHARE * mass.mean()
+    moved_um = np.where(has_mass[:, np.newaxis], moment / np.where(has_mass, mass, 1.0)[:, np.newaxis], centres_um)
+    is_inside = shapely.contains_xy(outline, moved_um)
+    return np.where(is_inside[:, np.newaxis], moved_um, centres_um)
+
+
+def _moments(edges: CellEdges, n_cells: int, field: _Integrals) -> tuple[Any, Any]:
+    """Integrals over each cell of the density, (n,), and of that times x and y, (n, 2), by triangles from its middle."""
+    corners_um = np.zeros((n_cells, 2))
+    corners_um[edges.cell] = edges.start_um
+    area_um2, moment_um3 = _EvenField().moments(edges, corners_um)
+    return field.moments(edges, moment_um3 / area_um2[:, np.newaxis])
+
+
+# -- equal capacity --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Capacities:
+    """Cells of some weights (n,), and the masses (n,) and first moments (n, 2) of the density in them."""
+
+    weights_um2: Floats
+    edges: CellEdges
+    mass: Any
+    moment: Any
+
+    @property
+    def share(self) -> Any:
+        """Masses (n,), in mean ones."""
+        return self.mass * (self.mass.size / self.mass.sum())
+
+    @property
+    def worst(self) -> float:
+        """Largest difference of a share from 1."""
+        return float(np.abs(self.share - 1.0).max())
+
+
+def _follow_equal(cells: MovingCells, centres_um: Floats, field: _Integrals, n_moves: int) -> None:
+    """
+    Let cells be those of equal capacity, of the centres after some moves to the centres of mass of such cells.
+
+    The weights that make cells equal always exist when cells keep the parts that a notch of the region cuts off. Where
+    neighbours get them, capacities jump when a part is cut off, and there may be no such weights: until centres have moved.
+    """
+    worst = np.inf
+    for move in range(n_moves + MORE_STEPS + 1):
+        own = _with_own_parts(cells, centres_um, field)
+        found = given = _capacities(own.edges, own.weights_um2, field, is_own=False)
+        if given.worst > CAPACITY_ERROR:
+            found = _newton(cells, centres_um, field, given, is_own=False)
+        worst = min(worst, found.worst)
+        if found.worst > CAPACITY_ERROR:
+            found = given
+        elif move >= n_moves:
+            cells.follow(centres_um, found.weights_um2)
+            return
+        centres_um = _moved(centres_um, found.mass, found.moment, cells.region)
+    _require_equal(worst)
+
+
+def _require_equal(worst: Any) -> None:
+    if not worst <= CAPACITY_ERROR:
+        raise GeometryError(
+            f"found no cells of equal capacity: the best ones differ from the mean by {worst:.1g} of it; take capacity "
+            "'free', more sites, or, for a density that jumps, a picture of it"
+        )
+
+
+def _with_own_parts(cells: MovingCells, centres_um: Floats, field: _Integrals) -> _Capacities:
+    """Cells of equal capacity when each keeps the parts that the region cuts off it."""
+    weights_um2 = np.zeros(centres_um.shape[0])
+    start = _capacities(_edges(cells, centres_um, weights_um2), weights_um2, field, is_own=True)
+    found = _newton(cells, centres_um, field, start, is_own=True)
+    if found.worst <= CAPACITY_ERROR:
+        return found
+    # Where the density is 0, or about, masses do not tell which way to go: come from an even density.
+    mean = start.mass.sum() / cells.region.area
+    for even in (*(mean * FADING**i for i in range(N_FADINGS)), 0.0):
+        faded = _FadedField(field, even)
+        start = _capacities(_edges(cells, centres_um, weights_um2), weights_um2, faded, is_own=True)
+        found = _newton(cells, centres_um, faded, start, is_own=True)
+        _require_equal(found.worst)
+        weights_um2 = found.weights_um2
+    return found
+
+
+def _capacities(edges: CellEdges, weights_um2: Floats, field: _Integrals, *, is_own: bool) -> _Capacities:
+    """Masses of the cells of these edges, with their own parts or with those given to them."""
+    whole = replace(edges, cell=edges.owner) if is_own else edges
+    return _Capacities(weights_um2, edges, *_moments(whole, weights_um2.size, field))
+
+
+def _newton(
+    cells: MovingCells, centres_um: Floats, field: _Integrals, found: _Capacities, *, is_own: bool
+) -> _Capacities:
+    """The cells that damped Newton's steps lead to, equal or not."""
+    for _ in range(MAX_NEWTON_STEPS):
+        if found.worst <= 0.1 * CAPACITY_ERROR:
+            break
+        step_um2 = _newton_step_um2(centres_um, field, found, is_own=is_own)
+        better = None if step_um2 is None else _damped(cells, centres_um, field, found, step_um2, is_own=is_own)
+        if better is None:
+            break
+        found = better
+    return found
+
+
+def _damped(
+    cells: MovingCells, centres_um: Floats, field: _Integrals, found: _Capacities, step_um2: Floats, *, is_own: bool
+) -> _Capacities | None:
+    """The cells after the largest part of a step that leaves all cells some mass and makes them more equal; or None."""
+    least, before = 0.5 * min(found.share.min(), 1.0), np.linalg.norm(found.share - 1.0)
+    part = 1.0
+    while part >= SMALLEST_PART:
+        weights_um2 = found.weights_um2 + part * step_um2
+        edges = cells.follow(centres_um, weights_um2)
+        if edges is not None:
+            new = _capacities(edges, weights_um2, field, is_own=is_own)
+            if new.share.min() >= least and np.linalg.norm(new.share - 1.0) <= (1.0 - 0.5 * part) * before:
+                return new
+        part *= 0.5
+    return None
+
+
+def _newton_step_um2(centres_um: Floats, field: _Integrals, found: _Capacities, *, is_own: bool) -> Floats | None:
+    """
+    Change of the weights (n,) that would make masses equal if they were linear in them; None when they do not tell.
+
+    Only differences of weights count, so that the last one stays.
+    """
+    from scipy.sparse.linalg import splu
+
+    if found.mass.size == 1:
+        return np.zeros(1)
+    slopes = _slopes(centres_um, field, found.edges, is_own=is_own)
+    try:
+        step_um2 = splu(slopes[:-1, :-1]).solve((found.mass.mean() - found.mass)[:-1])
+    except RuntimeError:  # singular: some cells have no edge where there is density
+        return None
+    return np.append(step_um2, 0.0) if np.isfinite(step_um2).all() else None
+
+
+def _slopes(centres_um: Floats, field: _Integrals, edges: CellEdges, *, is_own: bool) -> csc_array[Any]:
+    """
+    Derivatives of the masses with the weights, csc_array (n, n).
+
+    A weight larger by dw moves the edge between two centres at the distance d by ``dw / 2d``; the mass that it sweeps over
+    changes sides, from the cell of the part on the one side to that on the other.
+    """
+    from scipy.sparse import coo_array
+
+    one, other = edges.twins()
+    p, q = edges.owner[one], edges.owner[other]
+    to, of = (p, q) if is_own else (edges.cell[one], edges.cell[other])
+    distance_um = np.hypot(*(centres_um[p] - centres_um[q]).T)
+    swept = field.along(edges.start_um[one], edges.stop_um[one]) / (2.0 * distance_um)
+    rows, columns = np.concatenate((to, to, of, of)), np.concatenate((p, q, p, q))
+    n = centres_um.shape[0]
+    return coo_array((np.concatenate((swept, -swept, -swept, swept)), (rows, columns)), shape=(n, n)).tocsc()
+
+
+# -- the density's integrals -----------------------------------------------------------------------------------------
+
+
+class _Integrals(Protocol):
+    """Integrals of a density."""
+
+    def moments(self, edges: CellEdges, anchors_um: Floats, *, is_rough: bool = False) -> tuple[Any, Any]:
+        """
+        Integrals over each cell of the density, (n,), and of that times x and y, (n, 2).
+
+        Cells are taken apart into triangles of their edges and their anchors (n, 2), wherever these lie; ``is_rough``
+        allows an error that does not matter for a centre of mass.
+        """
+
+    def along(self, start_um: Floats, stop_um: Floats) -> Any:
+        """Integral of the density along each of some lines, (n,)."""
+
+
+class _Field(_Integrals, Protocol):
+    """A density over the region."""
+
+    def squared(self) -> _Field:
+        """The density's square."""
+
+
+class _EvenField:
+    """The density 1 everywhere: exact."""
+
+    def squared(self) -> _Field:
+        return self
+
+    def moments(self, edges: CellEdges, anchors_um: Floats, *, is_rough: bool = False) -> tuple[Any, Any]:
+        del is_rough
+        n, anchor = anchors_um.shape[0], anchors_um.take(edges.cell, 0)
+        a, b = edges.start_um - anchor, edges.stop_um - anchor
+        area_um2 = _area_um2(a, b)
+        mass = np.bincount(edges.cell, area_um2, minlength=n)
+        third = [np.bincount(edges.cell, (a[:, i] + b[:, i]) * (area_um2 / 3.0), minlength=n) for i in (0, 1)]
+        return mass, np.stack(third, axis=1) + mass[:, np.newaxis] * anchors_um
+
+    def along(self, start_um: Floats, stop_um: Floats) -> Any:
+        return np.hypot(*(stop_um - start_um).T)
+
+
+class _FunctionField:
+    """A function of points: triangles are quartered where it bends."""
+
+    def __init__(self, at: Callable[[Any], Any]) -> None:
+        self.at = at
+
+    def squared(self) -> _Field:
+        return _FunctionField(lambda xy_um: self.at(xy_um) ** 2)
+
+    def moments(self, edges: CellEdges, anchors_um: Floats, *, is_rough: bool = False) -> tuple[Any, Any]:
+        n, cell, origin = anchors_um.shape[0], edges.cell, anchors_um.take(edges.cell, 0)
+        # Corners as seen from the anchor of their cell, which is the first one.
+        corners: Any = np.zeros_like(origin), edges.start_um - origin, edges.stop_um - origin
+        total, limit = np.zeros((3, n)), 0.0
+        for depth in range(MAX_QUARTERINGS + 1):
+            sums, coarse = self._sums(origin, corners, THREE_POINTS if is_rough else SEVEN_POINTS)
+            limit = limit or TRIANGLE_ERROR * abs(float(sums[0].sum())) / n
+            # Of a rule of twice the order the error is about the square of that of the coarse one, in shares.
+            is_bent = (sums[0] - coarse) ** 2 > limit * np.abs(sums[0])
+            is_bent |= cell.size < LEAST_TRIANGLES
+            is_bent &= depth < MAX_QUARTERINGS and not is_rough
+            total += [np.bincount(cell[~is_bent], x[~is_bent], minlength=n) for x in sums]
+            if not is_bent.any():
+                break
+            a, b, c = (x[is_bent] for x in corners)
+            ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+            corners = [np.concatenate(x) for x in ((a, ab, ca, ab), (ab, b, bc, bc), (ca, bc, c, ca))]
+            cell, origin = np.tile(cell[is_bent], 4), np.tile(origin[is_bent], (4, 1))
+        return total[0], total[1:].T + total[0][:, np.newaxis] * anchors_um
+
+    def _sums(self, origin: Any, corners: Any, rule: Any) -> tuple[Any, Any]:
+        """Integrals (3, n) over triangles, of the function and of it times x and y from the origin; coarse ones (n,)."""
+        a, ab, ac = corners[0], corners[1] - corners[0], corners[2] - corners[0]
+        area_um2 = _area_um2(ab, ac)
+        sums, coarse = np.zeros((3, area_um2.size)), np.zeros(area_um2.size)
+        for of_ab, of_ac, weight, coarse_weight in rule:
+            offset = a + of_ab * ab + of_ac * ac
+            mass = self.at(origin + offset) * area_um2
+            coarse += coarse_weight * mass
+            mass *= weight
+            for i, x in enumerate((mass, mass * offset[:, 0], mass * offset[:, 1])):
+                sums[i] += x
+        return sums, coarse
+
+    def along(self, start_um: Floats, stop_um: Floats) -> Any:
+        n_parts = 1 + LEAST_LINE_POINTS // max(1, start_um.shape[0])
+        way = ((np.arange(n_parts)[:, np.newaxis] + LINE_POINTS) / n_parts).reshape(-1, 1, 1)
+        points_um = start_um + way * (stop_um - start_um)
+        values = self.at(points_um.reshape(-1, 2)).reshape(way.size, -1)
+        return values.mean(axis=0) * np.hypot(*(stop_um - start_um).T)
+
+
+class _PictureField:
+    """
+    A picture, at each point the value of the cell it lies in: exact.
+
+    By Green's theorem the integral over a site is one along its outline, of ``F dy``, where F is the picture's integral
+    along its row from the left: linear in x on any piece of the outline that lies in one cell of the picture.
+    """
+
+    def __init__(self, values: Floats, grid: Grid) -> None:
+        self.values, self.grid = values, grid
+        times_x = values * (np.arange(values.shape[1]) + 0.5)
+        self._left, self._left_x = np.cumsum(values, axis=1) - values, np.cumsum(times_x, axis=1) - times_x
+
+    def squared(self) -> _Field:
+        return _PictureField(self.values**2, self.grid)
+
+    def moments(self, edges: CellEdges, anchors_um: Floats, *, is_rough: bool = False) -> tuple[Any, Any]:
+        del is_rough
+        n, twins = anchors_um.shape[0], edges.n_twins
+        once = np.r_[0:twins, 2 * twins : edges.cell.size]
+        edge, (x0, y0), (x1, y1), at = self._pieces(edges.start_um[once], edges.stop_um[once])
+        value, column, dy = self.values[at], at[1], y1 - y0
+        left, x, y = self._left[at] - value * column, 0.5 * (x0 + x1), 0.5 * (y0 + y1)
+        # Means along a piece: of x², and of x y.
+        xx, xy = (x0 * x0 + x0 * x1 + x1 * x1) / 3.0, x * y + (x1 - x0) * dy / 12.0
+        lines = (left + value * x, self._left_x[at] + 0.5 * value * (xx - column**2), left * y + value * xy)
+        total = np.zeros((3, n))
+        for i, line in enumerate(lines):
+            of_edge = np.bincount(edge, line * dy, minlength=once.size)
+            around = np.concatenate((of_edge[:twins], -of_edge[:twins], of_edge[twins:]))
+            total[i] = np.bincount(edges.cell, around, minlength=n)
+        cell_um2 = self.grid.cell_area_um2
+        mass = total[0] * cell_um2
+        return mass, total[1:].T * (cell_um2 * self.grid.pitch_xy_um) + mass[:, np.newaxis] * np.array(
+            self.grid.origin_um
+        )
+
+    def along(self, start_um: Floats, stop_um: Floats) -> Any:
+        edge, start, stop, at = self._pieces(start_um, stop_um)
+        length_um = np.hypot(*((stop - start) * self.grid.pitch_xy_um[:, np.newaxis]))
+        return np.bincount(edge, self.values[at] * length_um, minlength=start_um.shape[0])
+
+    def _pieces(self, start_um: Floats, stop_um: Floats) -> tuple[Ints, Any, Any, tuple[Ints, Ints]]:
+        """Lines cut where they leave a cell of the picture: line, ends (2, n) in cells from the corner, row and column."""
+        start, stop = ((xy_um - np.array(self.grid.origin_um)) / self.grid.pitch_xy_um for xy_um in (start_um, stop_um))
+        line, start, stop = _cut(start, stop, axis=1)
+        piece, start, stop = _cut(start, stop, axis=0)
+        middle = np.floor(0.5 * (start + stop)).astype(np.int64)
+        column, row = (np.clip(middle[:, i], 0, self.values.shape[1 - i] - 1) for i in (0, 1))
+        return line[piece], start.T, stop.T, (row, column)
+
+
+class _FadedField:
+    """A density and an even one."""
+
+    def __init__(self, field: _Integrals, even: Any) -> None:
+        self.field, self.even = field, even
+
+    def moments(self, edges: CellEdges, anchors_um: Floats, *, is_rough: bool = False) -> tuple[Any, Any]:
+        mass, moment = self.field.moments(edges, anchors_um, is_rough=is_rough)
+        even_mass, even_moment = _EvenField().moments(edges, anchors_um)
+        return mass + self.even * even_mass, moment + self.even * even_moment
+
+    def along(self, start_um: Floats, stop_um: Floats) -> Any:
+        return self.field.along(start_um, stop_um) + self.even * _EvenField().along(start_um, stop_um)
+
+
+def _area_um2(a_um: Floats, b_um: Floats) -> Any:
+    """Signed areas (n,) of triangles with these two sides from one corner."""
+    return 0.5 * (a_um[:, 0] * b_um[:, 1] - a_um[:, 1] * b_um[:, 0])
+
+
+def _cut(start: Any, stop: Any, axis: int) -> tuple[Ints, Any, Any]:
+    """Lines (n, 2) cut where a coordinate is a whole number: line, and ends of the pieces, in the lines' order."""
+    a, b = start[:, axis], stop[:, axis]
+    first = np.floor(np.minimum(a, b)) + 1.0
+    n_cuts = np.maximum(np.ceil(np.maximum(a, b)) - first, 0.0).astype(np.int64)
+    line, position = np.repeat(np.arange(a.size), n_cuts + 1), positions_in_runs(n_cuts + 1)
+    is_cut = position < n_cuts[line]
+    of, k = line[is_cut], position[is_cut]
+    whole = first[of] + np.where(a[of] < b[of], k, n_cuts[of] - 1 - k)
+    way = (whole - a[of]) / (b[of] - a[of])
+    stops = stop[line]
+    stops[is_cut, axis] = whole
+    stops[is_cut, 1 - axis] = start[of, 1 - axis] + way * (stop[of, 1 - axis] - start[of, 1 - axis])
+    starts = np.roll(stops, 1, axis=0)
+    starts[position == 0] = start
+    return line, starts, stops

@@ -1,0 +1,185 @@
+"""Nested zones of any outline, each with pixels of its own size around the zone inside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, get_args
+
+import numpy as np
+import shapely
+
+from foveasim._core.validation import MAX_LENGTH_UM, Floats, Ints, check_choice, finite_array
+from foveasim.errors import ParameterError
+from foveasim.layout._regions import as_region, told_region
+from foveasim.layout.edits import union
+from foveasim.layout.generators.grid import square_corners_um
+from foveasim.layout.generators.tiling import Cells, tiling
+from foveasim.layout.model import Layout
+
+__all__ = ["zones"]
+
+#: Pixels along the side of a zone, at most.
+MAX_PIXELS = 2**14
+#: Ratios of lengths may be this far from whole numbers.
+WHOLE_NUMBER_ROUNDING = 1e-9
+
+
+def zones(
+    *,
+    pitch_um: Sequence[float],
+    side_um: Sequence[float] | None = None,
+    outlines_um: Sequence[Any] | None = None,
+    cells: Cells | Sequence[Cells] = "squares",
+) -> Layout:
+    """
+    Zones around each other, each filled with its own grid where the zone inside leaves room.
+
+    ::
+
+        ┌───┬───┬───┬───┐  ─┬─
+        │   │   │   │   │   │
+        ├───┼─┬─┼─┬─┼───┤   │           zone 0: fovea of side side_um[0], pitch pitch_um[0]
+        │   ├─┼─┼─┼─┤   │   │ side_um[1]
+        ├───┼─┼─┼─┼─┼───┤   │           zone 1: around it, to side_um[1], pitch pitch_um[1]
+        │   ├─┼─┼─┼─┤   │   │
+        ├───┼─┴─┼─┴─┼───┤   │           ...
+        │   │   │   │   │   │
+        └───┴───┴───┴───┘  ─┴─
+
+    Parameters
+    ----------
+    pitch_um : sequence of float, µm
+        Pixel pitch in each zone, from the innermost.
+    side_um : sequence of float, optional, µm
+        Sides of square zones around the optical axis, growing. In zones of squares, a zone's side and the side of the zone
+        inside it must fit whole pixels.
+    outlines_um : sequence of shapely Polygons or (n, 2) vertices, optional, µm
+        In the place of the sides, any outlines, each around the one before. Pieces of pixels at a border that are below half
+        a pixel's area belong to the pixel beside them.
+    cells : {"squares", "hexagons"} or a sequence of them
+        Shape of the pixels, in all zones or in each. Hexagons are cut at borders as under any outline.
+
+    Returns
+    -------
+    Layout
+        Zone by zone, with the columns ``zone``, ``row``, ``column`` (in the zone's own grid) and ``readout_line``
+        (the columns of all zones, numbered through).
+
+    Raises
+    ------
+    ParameterError
+        When the lists differ in length, zones do not lie in each other, or pixels do not fit.
+    GeometryError
+        When a zone is smaller than one of its pixels.
+
+    Examples
+    --------
+    The same field that takes 262,144 sites of the fovea's size:
+
+    >>> zones(side_um=(64, 128, 256, 512), pitch_um=(1, 2, 4, 8)).n_sites
+    13312
+    """
+    if (side_um is None) == (outlines_um is None):
+        raise ParameterError("side_um", "or 'outlines_um' must be given: one of them")
+    pitches_um = finite_array("pitch_um", pitch_um, ndim=1, above=0.0)
+    shapes = [cells] * pitches_um.size if isinstance(cells, str) else list(cells)
+    for i, shape in enumerate(shapes):
+        check_choice("cells" if isinstance(cells, str) else f"cells[{i}]", shape, get_args(Cells))
+    if len(shapes) != pitches_um.size:
+        raise ParameterError("cells", f"must be one or one for each of the {pitches_um.size} zones, got {len(shapes)}")
+    outlines = None if outlines_um is None else _outlines(outlines_um, pitches_um.size)
+    sides_um = None if side_um is None else _sides(side_um, pitches_um)
+    if sides_um is not None and all(shape == "squares" for shape in shapes):
+        corners, columns = _squares(sides_um, pitches_um)
+        layout = Layout.from_equal_rings(corners, columns)
+    else:
+        if outlines is None:
+            outlines = [
+                shapely.box(-0.5 * s, -0.5 * s, 0.5 * s, 0.5 * s) for s in (() if sides_um is None else sides_um)
+            ]
+        layout = _tiled(outlines, pitches_um, shapes)
+    parameters = {
+        "pitch_um": pitches_um.tolist(),
+        "side_um": None if sides_um is None else sides_um.tolist(),
+        "outlines_um": None if outlines_um is None else [told_region(outline) for outline in outlines_um],
+        "cells": cells if isinstance(cells, str) else shapes,
+    }
+    provenance = {"generator": "zones", "parameters": parameters}
+    return Layout(layout.xy_um, layout.ring_offsets, layout.site_offsets, layout.columns, provenance)
+
+
+def _sides(side_um: Sequence[float], pitches_um: Floats) -> Floats:
+    sides_um = finite_array("side_um", side_um, ndim=1, above=0.0)
+    if sides_um.size == 0 or sides_um.size != pitches_um.size:
+        raise ParameterError(
+            "side_um",
+            f"and 'pitch_um' must have the same length of at least 1, got {sides_um.size} and {pitches_um.size}",
+        )
+    if sides_um.max() > MAX_LENGTH_UM:
+        raise ParameterError("side_um", f"must be <= {MAX_LENGTH_UM:g}", float(sides_um.max()), "µm")
+    if np.any(np.diff(sides_um) <= 0):
+        raise ParameterError("side_um", "must grow from zone to zone", sides_um.tolist(), "µm")
+    return sides_um
+
+
+def _outlines(outlines_um: Sequence[Any], n_zones: int) -> list[Any]:
+    outlines = [as_region(f"outlines_um[{i}]", outline) for i, outline in enumerate(outlines_um)]
+    if not outlines or len(outlines) != n_zones:
+        raise ParameterError(
+            "outlines_um", f"and 'pitch_um' must have the same length of at least 1, got {len(outlines)} and {n_zones}"
+        )
+    for i, (inner, outer) in enumerate(pairwise(outlines)):
+        if not shapely.covers(outer, inner) or not outer.area > inner.area:
+            raise ParameterError(f"outlines_um[{i + 1}]", f"must lie around 'outlines_um[{i}]' and be larger")
+    return outlines
+
+
+def _squares(sides_um: Floats, pitches_um: Floats) -> tuple[Floats, dict[str, Ints]]:
+    """Corners and columns of whole squares in square zones."""
+    corners, columns = [], []
+    n_lines = 0
+    inner_um = 0.0
+    for zone, (outer_um, p_um) in enumerate(zip(sides_um, pitches_um, strict=True)):
+        n = _whole(f"side_um[{zone}]", outer_um, p_um, outer_um / p_um)
+        border = 0
+        if zone > 0:
+            border = _whole(f"pitch_um[{zone}]", p_um, outer_um - inner_um, 0.5 * (outer_um - inner_um) / p_um)
+        row, column = (index.ravel() for index in np.divmod(np.arange(n * n), n))
+        is_inside = (np.minimum(row, column) >= border) & (np.maximum(row, column) < n - border)
+        if inner_um > 0.0:
+            row, column = row[~is_inside], column[~is_inside]
+        corners.append(square_corners_um(column - 0.5 * n, row - 0.5 * n, float(p_um)))
+        columns.append(np.stack((np.full(row.size, zone), row, column, n_lines + column)))
+        n_lines += n
+        inner_um = outer_um
+    names = ("zone", "row", "column", "readout_line")
+    return np.concatenate(corners), dict(zip(names, np.concatenate(columns, axis=1), strict=True))
+
+
+def _tiled(outlines: Sequence[Any], pitches_um: Floats, shapes: Sequence[Cells]) -> Layout:
+    """Zones of any outlines, cut from their lattices."""
+    parts = []
+    n_lines = 0
+    for zone, (outer, p_um, shape) in enumerate(zip(outlines, pitches_um, shapes, strict=True)):
+        region = shapely.difference(outer, outlines[zone - 1]) if zone > 0 else outer
+        # Whole squares from the lower left corner: all of a rectangle's that fit are whole.
+        x_um, y_um = (float(x + 0.5 * p_um) for x in outer.bounds[:2])
+        part = tiling(region=region, pitch_um=float(p_um), cells=shape, origin_um=(x_um, y_um))
+        line = n_lines + part.readout_line
+        parts.append(part.with_columns(zone=np.full(part.n_sites, zone), readout_line=line))
+        n_lines = int(line.max()) + 1
+    return union(parts)
+
+
+def _whole(name: str, value: float, of_um: float, ratio: float) -> int:
+    if ratio > MAX_PIXELS:
+        raise ParameterError(name, f"asks for {ratio:g} pixels in a row, more than {MAX_PIXELS}")
+    if round(ratio) < 1 or abs(ratio - round(ratio)) > WHOLE_NUMBER_ROUNDING * max(ratio, 1.0):
+        raise ParameterError(
+            name,
+            f"must fit whole pixels between the zones' borders ({of_um:g} µm gives {ratio:g} pixels)",
+            float(value),
+            "µm",
+        )
+    return round(ratio)

@@ -1,0 +1,690 @@
+"""The layout: any number of polygon photosites as packed rings, with columns of data per site and their origin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim._core.provenance import copied
+from foveasim._core.rings import (
+    are_convex,
+    next_vertex,
+    positions_in_runs,
+    ring_moments,
+    ring_spread_um2,
+    site_bounds_um,
+    site_moments,
+)
+from foveasim._core.validation import (
+    MAX_LENGTH_UM,
+    MAX_SITES,
+    Bools,
+    Floats,
+    Ints,
+    as_numbers,
+    check_number,
+    exact_integers,
+    finite_array,
+    read_only,
+    unmasked,
+)
+from foveasim.errors import GeometryError, ParameterError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from pyvista import PolyData  # noqa: TID251 -- a type alone
+    from scipy.sparse import csr_array
+
+    from foveasim.layout.drc.repair import Change
+    from foveasim.layout.drc.routing import Readout
+    from foveasim.layout.drc.rules import DesignRules, Report
+    from foveasim.layout.files import WrittenLayout
+    from foveasim.layout.summary import Summary
+
+__all__ = ["Layout"]
+
+#: A layout that is smaller as a whole was given in other units.
+MIN_LAYOUT_UM = 1e-3
+#: A ring whose area is below this share of its bounding box is a line to float64.
+ZERO_AREA_SHARE = 1e-14
+#: Columns whose values are indices, of filters and of lines: more than MAX_SITES of either are an overflow.
+INDEX_NAMES = ("channel", "readout_line")
+#: Values of a column of integers.
+INTEGER_RANGES = "integers from -2**63 to 2**63 - 1, or from 0 to 2**64 - 1"
+#: Reasons of GEOS for invalid holes, and their messages here.
+HOLE_REASONS = {
+    "Hole lies outside shell": "has a hole outside its outline",
+    "Holes are nested": "has a hole inside another hole",
+}
+#: How many bad sites a message names.
+SHOWN_SITES = 5
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Layout:
+    """
+    Photosites of a sensor: polygons in the sensor plane.
+
+    Made by a generator (:func:`foveasim.layout.log_polar` and its neighbours), by :meth:`from_rectangles`, or by
+    :meth:`from_polygons`; the plain constructor takes packed rings that are right already and checks their structure and
+    the sites with holes.
+
+    Parameters
+    ----------
+    xy_um : (n_vertex, 2) float64, µm
+        Vertices as ``[x, y]``, ring after ring, the first vertex of a ring not repeated.
+    ring_offsets : (n_ring + 1,) int64
+        Ring r has the vertices ``ring_offsets[r] : ring_offsets[r + 1]``.
+    site_offsets : (n_site + 1,) int64
+        Site s has the rings ``site_offsets[s] : site_offsets[s + 1]``: its outline, counter-clockwise, then its
+        holes, clockwise.
+    columns : mapping of str to (n_site,) array
+        Data per site: ``channel`` (index of the colour filter), ``readout_line``, and anything else.
+    provenance : mapping
+        Where the layout comes from: generator and parameters, and what followed.
+
+    Raises
+    ------
+    GeometryError
+        When a coordinate is too large, or holes overlap, are wound counter-clockwise, or do not lie inside their outline;
+        ``.site_ids`` and the message name the sites.
+    ParameterError
+        When the arrays do not fit together or contain numbers that are not finite, or a column has integers beyond 64 bits
+        or, for ``channel`` and ``readout_line``, integers that are not indices.
+
+    Notes
+    -----
+    All arrays are read-only; every change gives a new layout. Indexing with a mask, a slice or site numbers
+    selects: ``layout[layout.area_um2 > 4.0]``.
+    """
+
+    xy_um: Floats
+    ring_offsets: Ints
+    site_offsets: Ints
+    columns: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._store()
+        _require_sound_holes(self)
+
+    @classmethod
+    def _derived(cls, *fields: Any) -> Layout:
+        """Layout whose holes were checked before: moved by a map that keeps them, or selected."""
+        layout = object.__new__(cls)
+        names = ("xy_um", "ring_offsets", "site_offsets", "columns", "provenance")
+        for name, value in zip(names, fields, strict=True):
+            object.__setattr__(layout, name, value)
+        layout._store()
+        return layout
+
+    def _store(self) -> None:
+        """Check the structure of the fields, and keep read-only copies."""
+        xy_um = finite_array("xy_um", self.xy_um, ndim=2)
+        if xy_um.shape[1:] != (2,):
+            raise ParameterError("xy_um", f"must have the shape (n_vertex, 2), got {xy_um.shape}")
+        ring_offsets = _offsets("ring_offsets", self.ring_offsets, 3, xy_um.shape[0], "vertices")
+        site_offsets = _offsets("site_offsets", self.site_offsets, 1, ring_offsets.size - 1, "rings")
+        if xy_um.size and np.abs(xy_um).max() > MAX_LENGTH_UM:
+            raise GeometryError(
+                f"the layout lies further than {MAX_LENGTH_UM:g} µm from the origin; coordinates are in µm"
+            )
+        columns = {}
+        for name, values in self.columns.items():
+            column = _column(name, values)
+            if column.shape != (site_offsets.size - 1,):
+                raise ParameterError(
+                    name,
+                    f"must have one value for each of the {site_offsets.size - 1} sites, got the shape {column.shape}",
+                )
+            if name in INDEX_NAMES:
+                _require_indices(name, column)
+            columns[name] = read_only(column)
+        object.__setattr__(self, "xy_um", read_only(np.array(xy_um, order="C")))
+        object.__setattr__(self, "ring_offsets", read_only(ring_offsets))
+        object.__setattr__(self, "site_offsets", read_only(site_offsets))
+        object.__setattr__(self, "columns", MappingProxyType(columns))
+        object.__setattr__(self, "provenance", MappingProxyType(copied(self.provenance)))
+
+    # -- making -----------------------------------------------------------------------------------------------
+
+    @classmethod
+    def from_rectangles(cls, centre_um: ArrayLike, size_um: ArrayLike, **columns: ArrayLike) -> Layout:
+        """
+        Layout from a list of photosites, each with its position and size.
+
+        Parameters
+        ----------
+        centre_um : (n_site, 2), µm
+            Centres as ``[x, y]``.
+        size_um : number, (n_site,) or (n_site, 2), µm
+            Side of the squares, or width and height of the rectangles.
+        **columns : (n_site,) arrays
+            Data per site, such as ``channel`` and ``readout_line``.
+
+        Raises
+        ------
+        ParameterError
+            When a number is not finite, or a size not positive.
+        """
+        centre_um = finite_array("centre_um", centre_um, ndim=2)
+        if centre_um.shape[1] != 2:
+            raise ParameterError("centre_um", f"must have the shape (n_site, 2), got {centre_um.shape}")
+        size_um = finite_array("size_um", size_um, above=0.0)
+        n_sites = centre_um.shape[0]
+        if size_um.ndim > 2 or (size_um.ndim >= 1 and size_um.shape not in ((n_sites,), (n_sites, 2))):
+            raise ParameterError(
+                "size_um", f"must be one number, or have the shape ({n_sites},) or ({n_sites}, 2), got {size_um.shape}"
+            )
+        half_um = 0.5 * np.broadcast_to(size_um[:, np.newaxis] if size_um.ndim == 1 else size_um, (n_sites, 2))
+        low, high = centre_um - half_um, centre_um + half_um
+        corners = np.stack((low, np.stack((high[:, 0], low[:, 1]), 1), high, np.stack((low[:, 0], high[:, 1]), 1)), 1)
+        return cls.from_equal_rings(corners, columns, {"made_by": "from_rectangles"})
+
+    @classmethod
+    def from_equal_rings(
+        cls,
+        rings_um: Floats,
+        columns: Mapping[str, ArrayLike] | None = None,
+        provenance: Mapping[str, Any] | None = None,
+    ) -> Layout:
+        """
+        Layout of sites with the same number of vertices each.
+
+        Parameters
+        ----------
+        rings_um : (n_site, n_vertex, 2), µm
+            Outlines, counter-clockwise and simple: neither is checked.
+        columns, provenance : mappings
+            As for the class.
+        """
+        n_sites, n_vertices = rings_um.shape[:2]
+        return cls(
+            rings_um.reshape(-1, 2),
+            np.arange(n_sites + 1) * n_vertices,
+            np.arange(n_sites + 1),
+            {name: _column(name, values) for name, values in (columns or {}).items()},
+            provenance or {},
+        )
+
+    @classmethod
+    def from_polygons(
+        cls,
+        polygons: Sequence[Any] | NDArray[Any] | tuple[ArrayLike, ArrayLike, ArrayLike],
+        *,
+        channel: ArrayLike | None = None,
+        readout_line: ArrayLike | None = None,
+        provenance: Mapping[str, Any] | None = None,
+        **columns: ArrayLike,
+    ) -> Layout:
+        """
+        Layout from any simple polygons, with holes or without, in any winding.
+
+        Parameters
+        ----------
+        polygons : sequence of shapely Polygon, or the tuple (xy_um, ring_offsets, site_offsets)
+            Coordinates in µm. Packed rings are as for the class, except that rings may be wound either way and may
+            repeat their first vertex at the end.
+        channel, readout_line, **columns : (n_site,) arrays, optional
+            Data per site.
+        provenance : mapping, optional
+            Where the polygons come from.
+
+        Raises
+        ------
+        GeometryError
+            When a polygon is empty, has a coordinate that is not finite, no area, or crosses itself, or when a
+            geometry is no polygon; ``.site_ids`` and the message name the sites.
+
+        Examples
+        --------
+        >>> import shapely
+        >>> layout = Layout.from_polygons([shapely.box(0, 0, 2, 2), shapely.Point(5, 0).buffer(1)], channel=[0, 1])
+        >>> layout.n_sites, float(layout.area_um2[0])
+        (2, 4.0)
+        """
+        if isinstance(polygons, tuple) and len(polygons) == 3 and not isinstance(polygons[0], shapely.Geometry):
+            xy_um, ring_offsets, site_offsets = _packed(*polygons)
+        else:
+            xy_um, ring_offsets, site_offsets = _unpacked(polygons)
+        _require(_per_site(~np.isfinite(xy_um), ring_offsets, site_offsets), "has a coordinate that is not finite")
+        _require(
+            _per_site(np.abs(xy_um) > MAX_LENGTH_UM, ring_offsets, site_offsets),
+            f"lies further than {MAX_LENGTH_UM:g} µm from the origin; coordinates are in µm",
+        )
+        if xy_um.size and np.ptp(xy_um, axis=0).max() < MIN_LAYOUT_UM:
+            raise GeometryError(
+                f"the whole layout is only {np.ptp(xy_um, axis=0).max():g} µm wide; coordinates are in µm"
+            )
+        xy_um, ring_offsets = _without_repeats(xy_um, ring_offsets)
+        _require(
+            np.logical_or.reduceat(np.diff(ring_offsets) < 3, site_offsets[:-1]),
+            "has a ring of fewer than 3 different vertices",
+        )
+        box = site_bounds_um(xy_um, ring_offsets, np.arange(ring_offsets.size))
+        box_um2 = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])
+        rounding_um2 = ZERO_AREA_SHARE * np.maximum(box_um2, np.finfo(np.float64).tiny)
+        is_line = ring_spread_um2(xy_um, ring_offsets) <= rounding_um2
+        _require(np.logical_or.reduceat(is_line, site_offsets[:-1]), "has a ring without area")
+        _require_valid(Layout._derived(xy_um, ring_offsets, site_offsets, {}, {}))
+        area_um2, _ = ring_moments(xy_um, ring_offsets)
+        is_outline = np.zeros(area_um2.size, bool)
+        is_outline[site_offsets[:-1]] = True
+        xy_um = _wound(xy_um, ring_offsets, (area_um2 > 0) != is_outline)
+        for name, values in (("channel", channel), ("readout_line", readout_line)):
+            if values is not None:
+                columns = {name: values, **columns}
+        return cls._derived(
+            xy_um,
+            ring_offsets,
+            site_offsets,
+            {name: _column(name, values) for name, values in columns.items()},
+            provenance or {"made_by": "from_polygons"},
+        )
+
+    # -- reading ----------------------------------------------------------------------------------------------
+
+    @property
+    def n_sites(self) -> int:
+        """Number of photosites."""
+        return self.site_offsets.size - 1
+
+    def __len__(self) -> int:
+        return self.n_sites
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Read-only mappings cannot be pickled as they are.
+        fields = (self.xy_um, self.ring_offsets, self.site_offsets, dict(self.columns), dict(self.provenance))
+        return Layout._derived, fields
+
+    def __repr__(self) -> str:
+        origin = self.provenance.get("generator", self.provenance.get("made_by", "packed rings"))
+        return f"Layout({self.n_sites} sites from {origin}, columns {sorted(self.columns)})"
+
+    @property
+    def channel(self) -> Ints:
+        """Index of each site's colour filter, (n_site,); 0 where the layout has no column ``channel``."""
+        return self._index_column("channel")
+
+    @property
+    def readout_line(self) -> Ints:
+        """Line that each site is read through, (n_site,); 0 where the layout has no column ``readout_line``."""
+        return self._index_column("readout_line")
+
+    def _index_column(self, name: str) -> Ints:
+        return self.index_column(name) if name in self.columns else np.zeros(self.n_sites, np.int64)
+
+    def index_column(self, name: str) -> Ints:
+        """
+        A column of whole numbers from 0, (n_site,) int64.
+
+        Raises
+        ------
+        ParameterError
+            When the layout has no such column, or it holds something else.
+        """
+        if name not in self.columns:
+            raise ParameterError(name, f"must be a column of the layout, which has {sorted(self.columns)}")
+        column = self.columns[name]
+        if column.dtype.kind not in "iu":
+            raise ParameterError(name, f"must contain integers from 0 to {MAX_SITES}", column)
+        _require_indices(name, column)
+        return column.astype(np.int64)
+
+    @cached_property
+    def _moments(self) -> tuple[Floats, Floats]:
+        area_um2, centroid_um = site_moments(self.xy_um, self.ring_offsets, self.site_offsets)
+        return read_only(area_um2), read_only(centroid_um)
+
+    @property
+    def area_um2(self) -> Floats:
+        """Area of each site without its holes, (n_site,) µm²."""
+        return self._moments[0]
+
+    @property
+    def centroid_um(self) -> Floats:
+        """Centre of area of each site, (n_site, 2) µm."""
+        return self._moments[1]
+
+    @cached_property
+    def site_bounds_um(self) -> Floats:
+        """(x_min, y_min, x_max, y_max) of each site, (n_site, 4) µm."""
+        return read_only(site_bounds_um(self.xy_um, self.ring_offsets, self.site_offsets))
+
+    @property
+    def bounds_um(self) -> tuple[float, float, float, float]:
+        """(x_min, y_min, x_max, y_max) of the whole layout, µm."""
+        if self.n_sites == 0:
+            raise GeometryError("the layout has no sites, and so no bounds")
+        x_um, y_um = self.xy_um[:, 0], self.xy_um[:, 1]  # one by one: many times as fast as both along axis 0
+        return float(x_um.min()), float(y_um.min()), float(x_um.max()), float(y_um.max())
+
+    def polygons(self) -> NDArray[Any]:
+        """The sites as shapely polygons, (n_site,) array of objects."""
+        n_vertices = np.diff(self.ring_offsets)
+        # A closed ring has its first vertex once more at its end.
+        ring_of = np.repeat(np.arange(n_vertices.size), n_vertices + 1)
+        closed = self.xy_um[self.ring_offsets[:-1][ring_of] + positions_in_runs(n_vertices + 1) % n_vertices[ring_of]]
+        rings = shapely.linearrings(closed, indices=ring_of)
+        return np.asarray(
+            shapely.polygons(rings, indices=np.repeat(np.arange(self.n_sites), np.diff(self.site_offsets)))
+        )
+
+    # -- changing: every verb gives a new layout ----------------------------------------------------------------
+
+    def __getitem__(self, selection: Any) -> Layout:
+        """Layout of the selected sites: a mask, a slice, site numbers, or a function of the layout that gives one of these."""
+        chosen = unmasked("selection", selection(self) if callable(selection) else selection)
+        ids = np.atleast_1d(np.arange(self.n_sites)[chosen])
+        if ids.ndim != 1:
+            raise ParameterError("selection", f"must be a mask, a slice or a list of sites, got {ids.ndim} dimensions")
+        rings = _ranges(self.site_offsets[ids], self.site_offsets[ids + 1])
+        vertices = _ranges(self.ring_offsets[rings], self.ring_offsets[rings + 1])
+        return Layout._derived(
+            self.xy_um[vertices],
+            np.concatenate(([0], np.cumsum(np.diff(self.ring_offsets)[rings]))),
+            np.concatenate(([0], np.cumsum(np.diff(self.site_offsets)[ids]))),
+            {name: column[ids] for name, column in self.columns.items()},
+            self._then(f"selected {ids.size} of {self.n_sites} sites"),
+        )
+
+    def sort_by(self, *keys: str | ArrayLike, descending: bool = False) -> Layout:
+        """
+        Layout with its sites in the order of one or more keys, the first the most important; equal sites keep their order.
+
+        Parameters
+        ----------
+        *keys : str or (n_site,) array
+            Names of columns, or values.
+        descending : bool
+            The largest first.
+
+        Raises
+        ------
+        ParameterError
+            When there is no key, or one is no column or has not one value a site.
+
+        Examples
+        --------
+        >>> layout = Layout.from_rectangles([[0, 0], [5, 0]], [3.0, 1.0])
+        >>> layout.sort_by(layout.area_um2).area_um2.tolist()
+        [1.0, 9.0]
+        """
+        values = []
+        for key in keys:
+            if isinstance(key, str) and key not in self.columns:
+                raise ParameterError(
+                    "keys", f"must be values or columns of the layout, which has {sorted(self.columns)}", key
+                )
+            value = self.columns[key] if isinstance(key, str) else np.asarray(unmasked("keys", key))
+            if value.shape != (self.n_sites,):
+                raise ParameterError(
+                    "keys", f"must have one value for each of the {self.n_sites} sites, got {value.shape}"
+                )
+            # Ranks, so that texts can be turned round as numbers can.
+            rank = np.unique(value, return_inverse=True)[1]
+            values.append(-rank if descending else rank)
+        if not values:
+            raise ParameterError("keys", "must be one or more columns or arrays")
+        names = ", ".join(key if isinstance(key, str) else "values" for key in keys)
+        ordered = self[np.lexsort(values[::-1])]
+        return Layout._derived(
+            ordered.xy_um, ordered.ring_offsets, ordered.site_offsets, ordered.columns, self._then(f"sorted by {names}")
+        )
+
+    def with_columns(self, **columns: ArrayLike) -> Layout:
+        """Layout with these columns added or replaced."""
+        return self._with_columns(columns, f"columns {', '.join(columns)} set")
+
+    def _with_columns(self, columns: Mapping[str, ArrayLike], step: str) -> Layout:
+        merged = {**self.columns, **{name: _column(name, values) for name, values in columns.items()}}
+        return Layout._derived(self.xy_um, self.ring_offsets, self.site_offsets, merged, self._then(step))
+
+    def translate(self, dx_um: float, dy_um: float) -> Layout:
+        """Layout moved by (dx, dy) in µm."""
+        step = np.array([check_number("dx_um", dx_um), check_number("dy_um", dy_um)])
+        return self._moved(self.xy_um + step, f"moved by ({dx_um:g}, {dy_um:g}) µm")
+
+    def rotate(self, angle_deg: float, origin_um: tuple[float, float] = (0.0, 0.0)) -> Layout:
+        """Layout turned counter-clockwise about a point; quarter turns about the origin are exact."""
+        angle_deg = check_number("angle_deg", angle_deg)
+        quarters, rest = divmod(angle_deg, 90.0)
+        exact = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
+        c, s = exact if rest == 0.0 else (np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg)))
+        centre = _point("origin_um", origin_um)
+        # (A @ xy) row by row: x' = c x - s y, y' = s x + c y
+        turned = (self.xy_um - centre) @ np.array([[c, s], [-s, c]]) + centre
+        return self._moved(turned, f"turned by {angle_deg:g} degrees")
+
+    def scale(self, factor: float, origin_um: tuple[float, float] = (0.0, 0.0)) -> Layout:
+        """Layout enlarged about a point."""
+        factor = check_number("factor", factor, above=0.0)
+        centre = _point("origin_um", origin_um)
+        return self._moved((self.xy_um - centre) * factor + centre, f"scaled by {factor:g}")
+
+    def _moved(self, xy_um: Floats, step: str) -> Layout:
+        return Layout._derived(xy_um, self.ring_offsets, self.site_offsets, self.columns, self._then(step))
+
+    def _then(self, step: str) -> dict[str, Any]:
+        return {**self.provenance, "steps": [*self.provenance.get("steps", []), step]}
+
+    def write(self, path: str | Path, **options: Any) -> WrittenLayout:
+        """Write to a file whose ending tells the format; see :func:`foveasim.layout.write_layout`."""
+        from foveasim.layout.files import write_layout
+
+        return write_layout(self, path, **options)
+
+    def describe(self, readout: Readout | None = None) -> Summary:
+        """Counts, sizes, areas, channels and lines, for a table; see :func:`foveasim.layout.describe`."""
+        from foveasim.layout.summary import describe
+
+        return describe(self, readout)
+
+    def to_pyvista(self) -> PolyData:
+        """The sites as PolyData with every column, for PyVista; see :func:`foveasim.view.polydata`."""
+        from foveasim.view import polydata
+
+        return polydata(self)
+
+    def plot(self, by: str | ArrayLike | None = None, **options: Any) -> Axes:
+        """Draw the layout on matplotlib axes, coloured by a column or an array; see :func:`foveasim.view.plot_layout`."""
+        from foveasim.view import plot_layout
+
+        return plot_layout(self, by, **options)
+
+    # -- neighbours ----------------------------------------------------------------------------------------------
+
+    def adjacency(self, *, max_gap_um: float | None = None) -> csr_array[Any]:
+        """Lengths of the edges that sites share, csr_array (n_site, n_site) µm; see :func:`foveasim.layout.adjacency`."""
+        from foveasim.layout.adjacency import adjacency
+
+        return adjacency(self) if max_gap_um is None else adjacency(self, max_gap_um=max_gap_um)
+
+    # -- rules --------------------------------------------------------------------------------------------------
+
+    def check(self, rules: DesignRules) -> Report:
+        """Report of the sites that break a rule; never raises for a broken rule."""
+        from foveasim.layout.drc.rules import check
+
+        return check(self, rules)
+
+    def enforce(
+        self, rules: DesignRules, *, repair: Literal["drop", "merge"] = "drop"
+    ) -> tuple[Layout, tuple[Change, ...]]:
+        """Layout that keeps the rules, and what was changed for it; see :func:`foveasim.layout.enforce`."""
+        from foveasim.layout.drc.repair import enforce
+
+        return enforce(self, rules, repair=repair)
+
+
+# -- checks of polygons from outside --------------------------------------------------------------------------------
+
+
+def _offsets(name: str, offsets: ArrayLike, at_least: int, total: int, of_what: str) -> Ints:
+    """Offsets as int64, when they begin at 0, end at the total, and every step is large enough."""
+    array = np.array(unmasked(name, offsets))
+    if array.ndim != 1 or array.size < 1 or array.dtype.kind not in "iu":
+        raise ParameterError(name, "must be a list of whole numbers", offsets)
+    array = array.astype(np.int64)
+    if array[0] != 0 or array[-1] != total:
+        raise ParameterError(name, f"must begin at 0 and end at {total}, the number of {of_what}", array)
+    small = np.flatnonzero(np.diff(array) < at_least)
+    if small.size:
+        raise ParameterError(
+            name, f"must give every item at least {at_least} {of_what}; item {small[0]} has fewer", array
+        )
+    return array
+
+
+def _column(name: str, values: ArrayLike) -> NDArray[Any]:
+    """A column of data as an array of numbers or text."""
+    values = unmasked(name, values)
+    try:
+        column = np.array(values)
+    except ValueError:
+        raise ParameterError(name, "must have one value for each site", values) from None
+    is_as_given = isinstance(values, np.ndarray) and values.dtype.kind == "f"
+    if column.ndim == 1 and column.dtype.kind in "fO" and not is_as_given:
+        items: list[Any] = list(cast(Any, values))
+        if items and all(isinstance(item, int | np.integer) for item in items):
+            integers = exact_integers([int(item) for item in items])
+            if integers is None:
+                raise ParameterError(name, f"must contain {INTEGER_RANGES}", values)
+            return integers
+    if column.dtype.hasobject:
+        raise ParameterError(name, "must be an array of numbers or text", values)
+    return column
+
+
+def _require_indices(name: str, column: NDArray[Any]) -> None:
+    """Reject integers that no filter or line can have as its index."""
+    if column.dtype.kind in "iu" and column.size:
+        worst = int(column.min()) if column.min() < 0 else int(column.max())
+        if not 0 <= worst <= MAX_SITES:
+            raise ParameterError(name, f"must contain integers from 0 to {MAX_SITES}", worst)
+
+
+def _point(name: str, value: ArrayLike) -> Floats:
+    point = finite_array(name, value, ndim=1)
+    if point.size != 2:
+        raise ParameterError(name, "must be two numbers (x, y)", value, "µm")
+    return point
+
+
+def _packed(xy_um: ArrayLike, ring_offsets: ArrayLike, site_offsets: ArrayLike) -> tuple[Floats, Ints, Ints]:
+    xy = as_numbers("xy_um", xy_um)
+    if xy.ndim != 2 or xy.shape[1] != 2:
+        raise ParameterError("xy_um", f"must have the shape (n_vertex, 2), got {xy.shape}")
+    rings = _offsets("ring_offsets", ring_offsets, 1, xy.shape[0], "vertices")
+    return xy, rings, _offsets("site_offsets", site_offsets, 1, rings.size - 1, "rings")
+
+
+def _unpacked(polygons: Any) -> tuple[Floats, Ints, Ints]:
+    """Packed rings of shapely polygons, closing vertex included."""
+    items = polygons.geoms if hasattr(polygons, "geoms") else polygons
+    if isinstance(items, str | bytes | shapely.Geometry) or not isinstance(items, Iterable):
+        raise ParameterError("polygons", "must be a sequence of shapely polygons, or packed rings", items)
+    geometries = np.fromiter(items, dtype=object)
+    is_polygon = np.array([isinstance(g, shapely.Polygon) for g in geometries], bool)
+    if not is_polygon.all():
+        bad = int(np.flatnonzero(~is_polygon)[0])
+        kind = type(geometries[bad]).__name__
+        is_geometry = isinstance(geometries[bad], shapely.Geometry)
+        cure = "give each part of it as a site of its own" if is_geometry else "make one with shapely.Polygon(vertices)"
+        raise GeometryError(
+            f"site {bad} must be a shapely Polygon, got a {kind}; {cure}",
+            (bad,),
+        )
+    _require(shapely.is_empty(geometries), "is empty")
+    if geometries.size == 0:
+        return np.zeros((0, 2)), np.zeros(1, np.int64), np.zeros(1, np.int64)
+    _, coordinates, (ring_offsets, site_offsets) = shapely.to_ragged_array(geometries, include_z=False)
+    return coordinates, ring_offsets.astype(np.int64), site_offsets.astype(np.int64)
+
+
+def _per_site(is_bad: Bools, ring_offsets: Ints, site_offsets: Ints) -> Bools:
+    """Whether any coordinate (n_vertex, 2) of a site is bad, (n_site,)."""
+    if site_offsets.size == 1:
+        return np.zeros(0, bool)
+    return np.asarray(np.logical_or.reduceat(np.any(is_bad, axis=1), ring_offsets[site_offsets[:-1]]))
+
+
+def _require(is_bad_site: Bools, what: str) -> None:
+    bad = np.flatnonzero(is_bad_site)
+    if bad.size:
+        others = (
+            f" (and {bad.size - 1} more: {', '.join(map(str, bad[1:SHOWN_SITES]))}{', ...' * (bad.size > SHOWN_SITES)})"
+        )
+        raise GeometryError(f"site {bad[0]} {what}{others if bad.size > 1 else ''}", tuple(int(i) for i in bad))
+
+
+def _require_sound_holes(layout: Layout) -> None:
+    """Sites with holes must be valid, and their holes wound clockwise; where there are none, this costs nothing."""
+    if layout.ring_offsets.size == layout.site_offsets.size:
+        return
+    has_holes = np.diff(layout.site_offsets) > 1
+    area_um2, _ = ring_moments(layout.xy_um, layout.ring_offsets)
+    area_um2[layout.site_offsets[:-1]] *= -1.0  # so that all rings count alike
+    _require(
+        has_holes & np.logical_or.reduceat(area_um2 >= 0.0, layout.site_offsets[:-1]),
+        "has a hole that is wound the wrong way, or has no area",
+    )
+    sites = np.flatnonzero(has_holes)
+    _require_valid(layout[sites], sites, layout.n_sites)
+
+
+def _require_valid(layout: Layout, sites: Ints | None = None, n_sites: int = 0) -> None:
+    """Sites must be valid polygons in the sense of OGC; those given are all, or have these numbers among more."""
+    is_bad = ~valid_sites(layout)
+    if not is_bad.any():
+        return
+    reason = str(shapely.is_valid_reason(layout[is_bad].polygons()[0]))
+    if sites is not None:
+        is_bad = np.isin(np.arange(n_sites), sites[is_bad])
+    what = HOLE_REASONS.get(reason.partition("[")[0], f"crosses or touches itself ({reason})")
+    _require(is_bad, f"{what}; repair its outline")
+
+
+def valid_sites(layout: Layout) -> Bools:
+    """
+    Whether each site is a valid polygon in the sense of OGC, (n_site,) bool.
+
+    No ring crosses itself or another, and holes lie inside. Only outlines that are not convex are passed to shapely.
+    """
+    outlines, n_rings = layout.site_offsets[:-1], np.diff(layout.site_offsets)
+    is_valid = (n_rings == 1) & are_convex(layout.xy_um, layout.ring_offsets)[outlines]
+    others = np.flatnonzero(~is_valid)
+    if others.size:
+        is_valid[others] = shapely.is_valid(layout[others].polygons())
+    return is_valid
+
+
+def _without_repeats(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Ints]:
+    """Rings without vertices that equal the one after; so also without a closing vertex."""
+    if ring_offsets.size == 1:
+        return xy_um, ring_offsets
+    is_new = (xy_um != xy_um[next_vertex(ring_offsets)]).any(axis=1)
+    n_left = np.add.reduceat(is_new.astype(np.int64), ring_offsets[:-1])
+    return xy_um[is_new], np.concatenate(([0], np.cumsum(n_left)))
+
+
+def _wound(xy_um: Floats, ring_offsets: Ints, is_reversed: Bools) -> Floats:
+    """Vertices with some rings turned round, their first vertex staying first."""
+    n_vertices = np.diff(ring_offsets)
+    ring_of = np.repeat(np.arange(n_vertices.size), n_vertices)
+    position = positions_in_runs(n_vertices)
+    turned = np.where(is_reversed[ring_of], -position % n_vertices[ring_of], position)
+    return xy_um[ring_offsets[:-1][ring_of] + turned]
+
+
+def _ranges(starts: Ints, stops: Ints) -> Ints:
+    """The numbers of all half-open ranges, one range after the other."""
+    return np.repeat(starts, stops - starts) + positions_in_runs(stops - starts)

@@ -1,0 +1,37 @@
+"""Quantum efficiency and colour filters: curves over wavelength, and the filters of a sensor."""
+
+from __future__ import annotations
+
+from foveasim.sensor.spectral.curves import (
+    BandMean,
+    ConstantCurve,
+    Curve,
+    GaussianCurve,
+    PassBand,
+    ProductCurve,
+    SiliconQE,
+)
+from foveasim.sensor.spectral.files import read_curve, read_filters
+from foveasim.sensor.spectral.measured import camera_filters, ccd_qe
+from foveasim.sensor.spectral.response import FilterSet, rgb_filters
+from foveasim.sensor.spectral.tables import PolynomialCurve, SplineCurve, StepCurve, TableCurve
+
+__all__ = [
+    "BandMean",
+    "ConstantCurve",
+    "Curve",
+    "FilterSet",
+    "GaussianCurve",
+    "PassBand",
+    "PolynomialCurve",
+    "ProductCurve",
+    "SiliconQE",
+    "SplineCurve",
+    "StepCurve",
+    "TableCurve",
+    "camera_filters",
+    "ccd_qe",
+    "read_curve",
+    "read_filters",
+    "rgb_filters",
+]

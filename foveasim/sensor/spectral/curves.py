@@ -1,0 +1,389 @@
+"""
+Curves over wavelength in closed form, and what is made of other curves: products and means over bands.
+
+A curve is a function of the wavelength in nm with values from 0 to 1: a quantum efficiency, the transmission of a filter, or
+both in one, since they mix by their product.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from foveasim._core.validation import Floats, as_numbers, check_count, check_number
+from foveasim.errors import FoveasimError, ParameterError
+
+__all__ = [
+    "BandMean",
+    "ConstantCurve",
+    "Curve",
+    "CurveError",
+    "Factor",
+    "GaussianCurve",
+    "Multiplied",
+    "PassBand",
+    "ProductCurve",
+    "SiliconQE",
+    "as_curve",
+    "check_within",
+    "curve_values",
+]
+
+
+class CurveError(ParameterError):
+    """A function given for a curve that fails, or returns other than one number per wavelength."""
+
+
+class Curve(Protocol):
+    """A function of wavelength with values from 0 to 1."""
+
+    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
+        """Values at the wavelengths, of the same shape."""
+
+
+#: What a curve may be multiplied with: a curve, or a number from 0 to 1, the same at every wavelength.
+Factor = Curve | float
+
+
+class Multiplied(ABC):
+    """What all curves of this package share: ``curve * curve`` and ``0.9 * curve`` are curves."""
+
+    #: numpy's numbers leave the product to the curve.
+    __array_ufunc__ = None
+
+    @abstractmethod
+    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
+        """Values at the wavelengths, of the same shape."""
+
+    def __mul__(self, other: Factor) -> ProductCurve:
+        """Product with another curve, or with a number from 0 to 1."""
+        return ProductCurve((self, other))
+
+    def __rmul__(self, other: Factor) -> ProductCurve:
+        """Product of another curve, or of a number from 0 to 1, with this one."""
+        return ProductCurve((other, self))
+
+
+@dataclass(frozen=True)
+class ConstantCurve(Multiplied):
+    """
+    The same value at every wavelength.
+
+    Parameters
+    ----------
+    value : float
+        From 0 to 1.
+
+    Raises
+    ------
+    ParameterError
+        When it is not.
+    """
+
+    value: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_number("value", self.value, at_least=0.0, at_most=1.0)
+
+    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
+        """Values at the wavelengths, of the same shape."""
+        return np.full(np.shape(wavelength_nm), float(self.value))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussianCurve(Multiplied):
+    """
+    A smooth band: a Gaussian over wavelength.
+
+    Parameters
+    ----------
+    centre_nm, fwhm_nm : float, nm
+        Where it is highest, and its full width at half maximum.
+    peak : float
+        Its value there.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range.
+    """
+
+    centre_nm: float
+    fwhm_nm: float
+    peak: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_number("centre_nm", self.centre_nm, above=0.0)
+        check_number("fwhm_nm", self.fwhm_nm, above=0.0)
+        check_number("peak", self.peak, above=0.0, at_most=1.0)
+
+    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
+        """Values at the wavelengths, of the same shape."""
+        offset = (as_numbers("wavelength_nm", wavelength_nm) - self.centre_nm) / self.fwhm_nm
+        return np.asarray(self.peak * np.exp(-4.0 * np.log(2.0) * offset**2))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PassBand(Multiplied):
+    """
+    A filter that passes a band, all above a wavelength (long-pass), or all below one (short-pass: an infrared cut).
+
+    Parameters
+    ----------
+    from_nm, to_nm : float, optional, nm
+        Where the band begins and ends: half of the peak. Without the first it is a short-pass, without the second a
+        long-pass.
+    edge_nm : float, nm
+        Width of the edges, from 10 % to 90 %; 0 for sharp ones.
+    peak : float
+        What it passes inside.
+
+    Raises
+    ------
+    ParameterError
+        When there is neither beginning nor end, or a value is out of range.
+
+    Notes
+    -----
+    Edges are logistic functions, and a band is the difference of two of them: neighbouring bands add up to the band of
+    both, the area is ``peak * (to_nm - from_nm)``, and a band narrower than its edges does not reach its peak.
+
+    Examples
+    --------
+    >>> infrared_cut = PassBand(to_nm=650.0, edge_nm=20.0)
+    >>> infrared_cut([640.0, 650.0, 660.0]).round(3)
+    array([0.9, 0.5, 0.1])
+    """
+
+    from_nm: float | None = None
+    to_nm: float | None = None
+    edge_nm: float = 10.0
+    peak: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.from_nm is None and self.to_nm is None:
+            raise ParameterError("from_nm", "or 'to_nm' must be given; without both, ConstantCurve passes all alike")
+        if self.from_nm is not None:
+            check_number("from_nm", self.from_nm, above=0.0)
+        if self.to_nm is not None:
+            check_number("to_nm", self.to_nm, above=0.0 if self.from_nm is None else self.from_nm)
+        check_number("edge_nm", self.edge_nm, at_least=0.0)
+        check_number("peak", self.peak, above=0.0, at_most=1.0)
+
+    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
+        """Values at the wavelengths, of the same shape."""
+        waves_nm = as_numbers("wavelength_nm", wavelength_nm)
+        begun = 1.0 if self.from_nm is None else self._step(waves_nm - self.from_nm)
+        ended = 0.0 if self.to_nm is None else self._step(waves_nm - self.to_nm)
+        return np.asarray(self.peak * np.maximum(begun - ended, 0.0))
+
+    def _step(self, offset_nm: Floats) -> Floats:
+        """From 0 far below to 1 far above."""
+        if self.edge_nm == 0.0:
+            return np.heaviside(offset_nm, 0.5)
+        return 0.5 + 0.5 * np.tanh(np.log(9.0) * offset_nm / self.edge_nm)
+
+
+#: Absorption lengths of crystalline silicon at room temperature, nm to µm; interpolated in the logarithm.
+SILICON_NM = (400, 450, 500, 550, 600, 650, 700, 750, 800, 850, 900, 950, 1000, 1050)
+SILICON_ABSORPTION_UM = (
+    0.0971, 0.3755, 0.8195, 1.561, 2.578, 3.580, 5.243, 7.838, 12.09, 19.55, 33.96, 66.35, 162.3, 640.7,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class SiliconQE(Multiplied):
+    """
+    Quantum efficiency of a silicon layer: the share of the light that it absorbs.
+
+    Parameters
+    ----------
+    depth_um : float, µm
+        Thickness from which all charge is collected.
+    transmission : float
+        Share of the light that enters the silicon.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range; on a call, for a wavelength outside 400 to 1050 nm, where no absorption is known here.
+
+    Notes
+    -----
+    ``transmission * (1 - exp(-depth / l))`` with the absorption length ``l(wavelength)`` (Beer and Lambert).
+    """
+
+    depth_um: float
+    transmission: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_number("depth_um", self.depth_um, above=0.0, at_most=1e5)
+        check_number("transmission", self.transmission, above=0.0, at_most=1.0)
+
+    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
+        """Values at the wavelengths, of the same shape."""
+        check_within(wavelength_nm, SILICON_NM[0], SILICON_NM[-1], "the table of silicon's absorption")
+        length_um = np.exp(
+            np.interp(as_numbers("wavelength_nm", wavelength_nm), SILICON_NM, np.log(SILICON_ABSORPTION_UM))
+        )
+        return np.asarray(self.transmission * -np.expm1(-self.depth_um / length_um))
+
+
+@dataclass(frozen=True)
+class ProductCurve(Multiplied):
+    """
+    The product of curves: light goes through one filter after the other, and what is left becomes electrons.
+
+    Also written as ``curve * curve``.
+
+    Parameters
+    ----------
+    curves : sequence of curves or numbers
+        Numbers from 0 to 1 stand for the same at every wavelength. Products among them are taken apart.
+
+    Raises
+    ------
+    ParameterError
+        When there is no curve, or a number is out of range; on a call, for a wavelength that one of the curves refuses.
+    """
+
+    curves: Sequence[Factor]
+
+    def __post_init__(self) -> None:
+        given = tuple(self.curves) if isinstance(self.curves, list | tuple) else ()
+        if not given:
+            raise ParameterError("curves", "must be one or more curves or numbers", self.curves)
+        flat: list[Curve] = []
+        for curve in (as_curve("curves", c) for c in given):
+            flat += [as_curve("curves", c) for c in curve.curves] if isinstance(curve, ProductCurve) else [curve]
+        object.__setattr__(self, "curves", tuple(flat))
+
+    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
+        """Values at the wavelengths, of the same shape."""
+        return np.asarray(
+            reduce(np.multiply, (curve_values(as_curve("curves", c), wavelength_nm) for c in self.curves))
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BandMean(Multiplied):
+    """
+    The mean of a curve over a band around each wavelength, where few wavelengths stand for broad bands of light.
+
+    Parameters
+    ----------
+    curve : Curve
+    band_width_nm : float, nm
+        Width of the bands, such as the scene's.
+    n_points : int
+        Wavelengths in a band at which the curve is taken.
+
+    Raises
+    ------
+    ParameterError
+        When a value is out of range; on a call, when a band reaches where the curve is not known, or below 0 nm.
+
+    Notes
+    -----
+    Every wavelength is taken by its number of photons per energy: light of the same radiance all over the band gives the
+    electrons that it gives wavelength by wavelength. A band's mean is that of its halves, each by its photons. A filter
+    narrower than the distance of the scene's wavelengths is not to be taken at these wavelengths alone: one of 10 nm gives
+    between 0.2 and 1.9 of its electrons where they are 20 nm apart, and all of them by this mean.
+    """
+
+    curve: Curve
+    band_width_nm: float
+    n_points: int = 64
+
+    def __post_init__(self) -> None:
+        if not callable(self.curve):
+            raise ParameterError("curve", "must be a function of wavelength", self.curve)
+        check_number("band_width_nm", self.band_width_nm, above=0.0)
+        object.__setattr__(self, "n_points", check_count("n_points", self.n_points, at_most=100_000))
+
+    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
+        """Values at the wavelengths, of the same shape."""
+        centre_nm = as_numbers("wavelength_nm", wavelength_nm)[..., np.newaxis]
+        if np.any(centre_nm <= 0.5 * self.band_width_nm):
+            raise ParameterError(
+                "wavelength_nm",
+                f"must be > {0.5 * self.band_width_nm:g}, half a band",
+                float(np.min(centre_nm)),
+                "nm",
+            )
+        middles = (np.arange(self.n_points) + 0.5) / self.n_points - 0.5
+        points_nm = centre_nm + self.band_width_nm * middles
+        return np.asarray((curve_values(self.curve, points_nm) * points_nm / centre_nm).mean(axis=-1))
+
+
+def as_curve(name: str, value: object) -> Curve:
+    """
+    The value as a curve: itself, or a number as the same at every wavelength.
+
+    Raises
+    ------
+    ParameterError
+        When it is neither a function nor a number from 0 to 1; ``name`` is what the message calls it.
+    """
+    if callable(value):
+        return value
+    return ConstantCurve(check_number(name, value, at_least=0.0, at_most=1.0))
+
+
+def curve_values(curve: Curve, wavelength_nm: ArrayLike) -> Floats:
+    """
+    Return a curve's values at wavelengths, of the same shape; one number stands for all of them.
+
+    Raises
+    ------
+    CurveError
+        When the function fails, which is the cause, or returns other than one real number per wavelength.
+    ParameterError
+        As the curves of this package raise it.
+    """
+    called = getattr(curve, "__qualname__", None) or type(curve).__qualname__
+    try:
+        given = curve(wavelength_nm)
+    except FoveasimError:
+        raise
+    except Exception as error:
+        problem = " ".join(f"{type(error).__name__}: {error}".split())
+        raise CurveError(
+            "curve", f"must be a function of wavelength that returns numbers, but {called} raised {problem}"
+        ) from error
+    try:
+        values = np.asarray(given)
+        if values.dtype.kind not in "biuf":
+            raise TypeError
+    except (TypeError, ValueError):
+        raise CurveError("curve", "must return one number per wavelength", given, cure=f"correct {called}") from None
+    if values.shape not in ((), np.shape(wavelength_nm)):
+        raise CurveError(
+            "curve",
+            f"must return one number per wavelength, got the shape {values.shape} for {np.shape(wavelength_nm)}",
+            cure=f"correct {called}",
+        )
+    return np.broadcast_to(values.astype(np.float64, copy=False), np.shape(wavelength_nm))
+
+
+def check_within(wavelength_nm: ArrayLike, low_nm: float, high_nm: float, what: str, cure: str = "") -> None:
+    """
+    Refuse wavelengths outside a range, and those that are no numbers.
+
+    Raises
+    ------
+    ParameterError
+        With the first such wavelength.
+    """
+    waves_nm = as_numbers("wavelength_nm", wavelength_nm)
+    outside = waves_nm[~((waves_nm >= low_nm) & (waves_nm <= high_nm))]
+    if outside.size:
+        raise ParameterError(
+            "wavelength_nm", f"must lie in {what}, {low_nm:g} to {high_nm:g} nm", float(outside[0]), "nm", cure
+        )

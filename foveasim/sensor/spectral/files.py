@@ -1,0 +1,286 @@
+"""
+Curves over wavelength from text files: one column of wavelengths, and one or more of values.
+
+Columns are parted by commas, semicolons, tabs or blanks; lines that begin with ``#`` and empty lines are left out; a first
+line that does not begin with a number names the columns. Nothing is guessed: wavelengths are in nm and values from 0 to 1,
+unless the caller or the first line says otherwise (``wavelength_um``, ``QE [%]``).
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from foveasim._core.validation import MAX_WAVELENGTH_NM, MIN_WAVELENGTH_NM, Floats, check_choice
+from foveasim.errors import FileError
+from foveasim.sensor.spectral.response import FilterSet
+from foveasim.sensor.spectral.tables import Beyond, SplineCurve, TableCurve
+
+__all__ = ["read_curve", "read_filters"]
+
+WavelengthUnit = Literal["nm", "um"]
+ValueUnit = Literal["fraction", "percent"]
+Between = Literal["lines", "spline"]
+
+#: A table of curves is written by hand or by an instrument; a longer one is something else.
+MAX_FILE_BYTES = 4 << 20
+MAX_ROWS, MAX_COLUMNS = 100_000, 1000
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+#: Numbers to programs, and no names of columns.
+NO_NAME = re.compile(r"[-+]?(nan|inf|infinity)", re.IGNORECASE)
+#: Words in the first line that say a unit: how many nm it is.
+UNITS_NM = {
+    **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), 1.0),
+    **dict.fromkeys(
+        ("um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"), 1e3
+    ),
+}
+#: Words that say a unit that is not read.
+OTHER_UNITS = {"angstrom", "angstroms", "ångström", "å", "mm", "m", "cm", "ev", "hz", "thz"}
+#: What is cut from a column's name, for it says the unit and no name.
+PERCENT = re.compile(r"[\s_]*[\[(]?\s*(%|\bpercent\b|\bpct\b|(?<=_)percent|(?<=_)pct)\s*[\])]?", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Columns of a file, wavelengths taken apart and in nm, values from 0 to 1."""
+
+    names: tuple[str, ...]
+    wavelength_nm: Floats
+    values: Floats
+
+
+def read_curve(
+    path: str | Path,
+    column: str | int | None = None,
+    *,
+    wavelength_unit: WavelengthUnit | None = None,
+    value_unit: ValueUnit | None = None,
+    between: Between = "lines",
+    beyond: Beyond = "refuse",
+) -> TableCurve | SplineCurve:
+    """
+    Read one curve from a text file.
+
+    Parameters
+    ----------
+    path : path
+        Text in UTF-8 with a column of wavelengths first.
+    column : str or int, optional
+        Name of the values' column, or its number: 1 is the first beside the wavelengths. Needed where there are several.
+    wavelength_unit : {"nm", "um"}, optional
+        Of the wavelengths; otherwise what the first line says (``wavelength_um``, ``lambda [µm]``), or else nm.
+    value_unit : {"fraction", "percent"}, optional
+        Of the values; otherwise percent where the column's name says so (``QE [%]``, ``qe_percent``), or else from 0 to 1.
+    between : {"lines", "spline"}
+        What is between the values: :class:`TableCurve` or :class:`SplineCurve`.
+    beyond : {"refuse", "zero", "hold"}
+        What to do with wavelengths outside the table: refuse them, take 0, or take the value at the end.
+
+    Returns
+    -------
+    TableCurve or SplineCurve
+        Its ``source`` is the file and the column.
+
+    Raises
+    ------
+    FileError
+        With the line and what was expected and got, when the file is missing, too large, no such table, or a value is out
+        of range.
+    ParameterError
+        When a choice is none of the above.
+    """
+    path = Path(path)
+    table = _read(path, wavelength_unit, value_unit)
+    if column is None and len(table.names) > 1:
+        raise FileError(path, f"has {len(table.names)} columns of values, say which: {', '.join(table.names)}")
+    k = _position(path, table, 1 if column is None else column)
+    return _curve(table, k, f"{path.name}, {table.names[k]}", between, beyond)
+
+
+def read_filters(
+    path: str | Path,
+    *,
+    wavelength_unit: WavelengthUnit | None = None,
+    value_unit: ValueUnit | None = None,
+    between: Between = "lines",
+    beyond: Beyond = "refuse",
+) -> FilterSet:
+    """
+    Read a set of colour filters from a text file: every column beside the wavelengths is one.
+
+    Parameters
+    ----------
+    path : path
+        Text in UTF-8 with a column of wavelengths first; its first line names the filters.
+    wavelength_unit, value_unit, between, beyond
+        As for :func:`read_curve`.
+
+    Returns
+    -------
+    FilterSet
+        In the order of the columns, which is the order of a layout's channels.
+
+    Raises
+    ------
+    FileError
+        With the line and what was expected and got, when the file is missing, too large, no such table, or a value is out
+        of range.
+    ParameterError
+        When a choice is none of the above.
+    """
+    path = Path(path)
+    table = _read(path, wavelength_unit, value_unit)
+    curves = [_curve(table, k, f"{path.name}, {name}", between, beyond) for k, name in enumerate(table.names)]
+    return FilterSet(curves, table.names)
+
+
+def _curve(table: _Table, k: int, source: str, between: Between, beyond: Beyond) -> TableCurve | SplineCurve:
+    check_choice("between", between, get_args(Between))
+    kind = TableCurve if between == "lines" else SplineCurve
+    values, waves_nm = table.values[:, k].tolist(), table.wavelength_nm.tolist()
+    return kind(wavelength_nm=waves_nm, value=values, beyond=beyond, source=source)
+
+
+def _position(path: Path, table: _Table, column: str | int) -> int:
+    """Position of a column among the values."""
+    if isinstance(column, str) and column in table.names:
+        return table.names.index(column)
+    if isinstance(column, int) and not isinstance(column, bool) and 1 <= column <= len(table.names):
+        return column - 1
+    raise FileError(
+        path, f"has no column {column!r}, only {', '.join(table.names)}, or their numbers from 1 to {len(table.names)}"
+    )
+
+
+def _read(path: Path, wavelength_unit: WavelengthUnit | None, value_unit: ValueUnit | None) -> _Table:
+    if wavelength_unit is not None:
+        check_choice("wavelength_unit", wavelength_unit, get_args(WavelengthUnit))
+    if value_unit is not None:
+        check_choice("value_unit", value_unit, get_args(ValueUnit))
+    rows = list(_rows(path, _text(path)))
+    if not rows:
+        raise FileError(path, "holds no table: no line but comments")
+    first = rows[0][1][0]
+    header = None if NUMBER.fullmatch(first) or NO_NAME.fullmatch(first) else rows.pop(0)[1]
+    if len(rows) < 2:
+        raise FileError(path, f"must have at least 2 lines of numbers, got {len(rows)}")
+    n_columns = len(rows[0][1]) if header is None else len(header)
+    if not 2 <= n_columns <= MAX_COLUMNS:
+        raise FileError(
+            path, f"must have 2 to {MAX_COLUMNS} columns, wavelengths and values, got {n_columns} in its first line"
+        )
+    numbers = np.array([_numbers(path, line, cells, n_columns) for line, cells in rows])
+    scale_nm, is_percent, names = _said(path, header, n_columns - 1)
+    if wavelength_unit is not None:
+        scale_nm = UNITS_NM[wavelength_unit]
+    if value_unit is not None:
+        is_percent[:] = value_unit == "percent"
+    lines = [line for line, _ in rows]
+    waves_nm = _checked_wavelengths_nm(path, lines, numbers[:, 0] * scale_nm, scale_nm)
+    return _Table(names, waves_nm, _checked_values(path, lines, names, numbers[:, 1:], is_percent))
+
+
+def _text(path: Path) -> str:
+    try:
+        if not path.is_file():
+            raise FileError(path, "is not a file" if path.exists() else "no such file")
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise FileError(path, f"is larger than {MAX_FILE_BYTES} bytes, and so no table of curves")
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise FileError(path, "is no text in UTF-8") from None
+    except (OSError, ValueError) as error:
+        if isinstance(error, FileError):
+            raise
+        raise FileError(path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
+def _rows(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
+    """Numbers of the lines that hold something, and their cells."""
+    numbered = [
+        (k, line)
+        for k, line in enumerate(text.splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if len(numbered) > MAX_ROWS:
+        raise FileError(path, f"has more than {MAX_ROWS} lines, and so is no table of curves")
+    first = numbered[0][1] if numbered else ""
+    separator = next((mark for mark in ";\t," if mark in first), " ")
+    for k, line in numbered:
+        try:
+            cells = line.split() if separator == " " else next(csv.reader([line], delimiter=separator, strict=True))
+        except csv.Error as error:
+            raise FileError(path, f"line {k} cannot be parted into columns: {error}") from None
+        yield k, [cell.strip() for cell in cells]
+
+
+def _numbers(path: Path, line: int, cells: list[str], n_columns: int) -> list[float]:
+    if len(cells) != n_columns:
+        raise FileError(path, f"line {line} must have {n_columns} columns, as the first has, got {len(cells)}")
+    for k, cell in enumerate(cells, start=1):
+        if not NUMBER.fullmatch(cell):
+            cure = "; write decimals with a point" if re.fullmatch(r"[-+]?\d+,\d+", cell) else ""
+            raise FileError(path, f"line {line}, column {k}: must be a number, got {cell[:40]!r}{cure}")
+    return [float(cell) for cell in cells]
+
+
+def _said(path: Path, header: list[str] | None, n_values: int) -> tuple[float, np.ndarray, tuple[str, ...]]:
+    """What the first line says: nm per unit of the wavelengths, which columns are percent, and the columns' names."""
+    is_percent = np.zeros(n_values, np.bool_)
+    if header is None:
+        return 1.0, is_percent, tuple(str(k + 1) for k in range(n_values))
+    words = [word for word in re.split(r"[\W_\d]+", header[0].lower()) if word]
+    scales = [UNITS_NM[word] for word in words if word in UNITS_NM]
+    other = [word for word in words[1:] if word in OTHER_UNITS]
+    if other and not scales:
+        raise FileError(path, f"wavelengths must be in nm or µm, got {header[0][:40]!r}")
+    names = tuple(PERCENT.sub("", cell).strip() for cell in header[1:])
+    for k, (cell, name) in enumerate(zip(header[1:], names, strict=True)):
+        is_percent[k] = PERCENT.search(cell) is not None
+        if not name or name in names[:k]:
+            problem = "has no name" if not name else f"has the name {name!r} again"
+            raise FileError(path, f"column {k + 2} {problem} in the first line")
+    return (scales or [1.0])[0], is_percent, names
+
+
+def _checked_wavelengths_nm(path: Path, lines: list[int], waves_nm: Floats, scale_nm: float) -> Floats:
+    is_odd = ~((waves_nm >= MIN_WAVELENGTH_NM) & (waves_nm <= MAX_WAVELENGTH_NM))
+    if is_odd.any():
+        k = int(np.argmax(is_odd))
+        cure = (
+            "; where they are in µm, say wavelength_unit='um'"
+            if scale_nm == 1.0 and waves_nm[k] < MIN_WAVELENGTH_NM
+            else ""
+        )
+        raise FileError(
+            path,
+            f"line {lines[k]}: the wavelength must be from {MIN_WAVELENGTH_NM:g} to {MAX_WAVELENGTH_NM:g} nm, "
+            f"got {waves_nm[k]:g}{cure}",
+        )
+    order = np.argsort(waves_nm, kind="stable")
+    repeated = np.flatnonzero(np.diff(waves_nm[order]) == 0.0)
+    if repeated.size:
+        a, b = (lines[order[repeated[0] + i]] for i in (0, 1))
+        raise FileError(path, f"lines {a} and {b} have the same wavelength, {waves_nm[order[repeated[0]]]:g} nm")
+    return waves_nm
+
+
+def _checked_values(
+    path: Path, lines: list[int], names: tuple[str, ...], values: Floats, is_percent: np.ndarray
+) -> Floats:
+    for is_bad, rule in (
+        (values < 0.0, "must be >= 0; set to 0 what is noise"),
+        (is_percent & (values > 100.0), "must be <= 100 %"),
+        (~is_percent & (values > 1.0), "must be <= 1; where it is percent, say value_unit='percent'"),
+    ):
+        if is_bad.any():
+            row, column = (int(i) for i in np.argwhere(is_bad)[0])
+            raise FileError(path, f"line {lines[row]}, column {names[column]!r}: {values[row, column]:g} {rule}")
+    return np.where(is_percent, values / 100.0, values)

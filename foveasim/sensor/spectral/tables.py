@@ -1,0 +1,223 @@
+"""Curves over wavelength from tables: fitted by a polynomial, interpolated by lines or a spline, or in steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from foveasim._core.validation import Floats, as_numbers, check_choice, check_count, finite_array, wavelengths_nm
+from foveasim.errors import ParameterError
+from foveasim.sensor.spectral.curves import Multiplied, check_within
+
+__all__ = ["Beyond", "PolynomialCurve", "SplineCurve", "StepCurve", "TableCurve"]
+
+#: What a table says of wavelengths beyond its ends: nothing, that the curve is 0 there, or that it stays as at the end.
+Beyond = Literal["refuse", "zero", "hold"]
+BEYOND_CURE = "beyond='zero' or beyond='hold' says what the curve is there"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolynomialCurve(Multiplied):
+    """
+    A polynomial fitted to a table by least squares: the paper's quantum efficiency (Fig. 5).
+
+    Parameters
+    ----------
+    wavelength_nm, value : sequences of the same length
+        The table, in any order. Values from 0 to 1.
+    degree : int
+        Degree of the polynomial, below the number of values.
+
+    Raises
+    ------
+    ParameterError
+        When the table is out of range; on a call, for a wavelength outside the table, where a polynomial means nothing.
+
+    Notes
+    -----
+    What the polynomial makes of a table near 0 or 1 is limited to that range.
+    """
+
+    wavelength_nm: Sequence[float]
+    value: Sequence[float]
+    degree: int = 5
+
+    def __post_init__(self) -> None:
+        _set_table(self)
+        object.__setattr__(self, "degree", check_count("degree", self.degree, at_least=0, at_most=len(self.value) - 1))
+
+    @cached_property
+    def _fit(self) -> np.polynomial.Polynomial:
+        return np.polynomial.Polynomial.fit(self.wavelength_nm, self.value, self.degree)
+
+    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
+        """Values at the wavelengths, of the same shape."""
+        check_within(wavelength_nm, self.wavelength_nm[0], self.wavelength_nm[-1], "the table of the fit")
+        return np.clip(self._fit(as_numbers("wavelength_nm", wavelength_nm)), 0.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableCurve(Multiplied):
+    """
+    A table with straight lines between its values.
+
+    Parameters
+    ----------
+    wavelength_nm, value : sequences of the same length
+        The table, in any order. Values from 0 to 1.
+    beyond : {"refuse", "zero", "hold"}
+        What to do with wavelengths outside the table: refuse them, take 0, or take the value at the end.
+    source : str
+        Where the figures come from; kept with the results.
+
+    Raises
+    ------
+    ParameterError
+        When the table is out of range; on a call, for a wavelength outside it, unless ``beyond`` says what is there.
+    """
+
+    wavelength_nm: Sequence[float]
+    value: Sequence[float]
+    beyond: Beyond = "refuse"
+    source: str = field(default="", compare=False)
+
+    def __post_init__(self) -> None:
+        _set_table(self)
+        check_choice("beyond", self.beyond, get_args(Beyond))
+
+    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
+        """Values at the wavelengths, of the same shape."""
+        waves_nm, is_known = _inside(wavelength_nm, self.wavelength_nm, self.beyond)
+        return np.where(is_known, np.interp(waves_nm, self.wavelength_nm, self.value), 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplineCurve(Multiplied):
+    """
+    A table with a smooth curve through its values that keeps their shape: no dip or hump that the table has not.
+
+    Parameters
+    ----------
+    wavelength_nm, value : sequences of the same length
+        The table, in any order. Values from 0 to 1.
+    beyond : {"refuse", "zero", "hold"}
+        What to do with wavelengths outside the table: refuse them, take 0, or take the value at the end.
+    source : str
+        Where the figures come from; kept with the results.
+
+    Raises
+    ------
+    ParameterError
+        When the table is out of range; on a call, for a wavelength outside it, unless ``beyond`` says what is there.
+
+    Notes
+    -----
+    Cubic pieces with the slopes of Fritsch and Butland (SIAM J. Sci. Stat. Comput. 5, 1984): between two values the curve
+    goes from one to the other without turning, and so stays from 0 to 1. A peak between two values is cut off, as by lines.
+    """
+
+    wavelength_nm: Sequence[float]
+    value: Sequence[float]
+    beyond: Beyond = "refuse"
+    source: str = field(default="", compare=False)
+
+    def __post_init__(self) -> None:
+        _set_table(self)
+        check_choice("beyond", self.beyond, get_args(Beyond))
+
+    @cached_property
+    def _pieces(self) -> Any:
+        from scipy.interpolate import PchipInterpolator
+
+        return PchipInterpolator(self.wavelength_nm, self.value)
+
+    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
+        """Values at the wavelengths, of the same shape."""
+        waves_nm, is_known = _inside(wavelength_nm, self.wavelength_nm, self.beyond)
+        return np.where(is_known, np.clip(self._pieces(waves_nm), 0.0, 1.0), 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepCurve(Multiplied):
+    """
+    Constant between edges: the simplest stand-in for a quantum efficiency.
+
+    Parameters
+    ----------
+    edge_nm : sequence of n + 1 floats, nm
+        Ascending.
+    value : sequence of n floats
+        From 0 to 1, each from its edge up to the next, which belongs to the next value; the last edge belongs to the last.
+    beyond : {"refuse", "zero", "hold"}
+        What to do with wavelengths outside the edges: refuse them, take 0, or take the value at the end.
+    source : str
+        Where the figures come from; kept with the results.
+
+    Raises
+    ------
+    ParameterError
+        When the edges do not ascend or a value is out of range; on a call, for a wavelength outside the edges, unless
+        ``beyond`` says what is there.
+    """
+
+    edge_nm: Sequence[float]
+    value: Sequence[float]
+    beyond: Beyond = "refuse"
+    source: str = field(default="", compare=False)
+
+    def __post_init__(self) -> None:
+        values = _shares(self.value)
+        edges_nm = wavelengths_nm("edge_nm", self.edge_nm)
+        if values.size < 1 or edges_nm.size != values.size + 1:
+            raise ParameterError(
+                "edge_nm", f"must be one more than the values, of which there are {values.size}", edges_nm.size
+            )
+        if np.any(np.diff(edges_nm) <= 0.0):
+            raise ParameterError("edge_nm", "must ascend", self.edge_nm, "nm")
+        check_choice("beyond", self.beyond, get_args(Beyond))
+        object.__setattr__(self, "edge_nm", tuple(edges_nm.tolist()))
+        object.__setattr__(self, "value", tuple(values.tolist()))
+
+    def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
+        """Values at the wavelengths, of the same shape."""
+        waves_nm, is_known = _inside(wavelength_nm, self.edge_nm, self.beyond)
+        step = np.minimum(np.searchsorted(self.edge_nm, waves_nm, side="right") - 1, len(self.value) - 1)
+        return np.where(is_known, np.asarray(self.value)[step], 0.0)
+
+
+def _shares(value: ArrayLike) -> Floats:
+    """Values (n,) from 0 to 1."""
+    values = finite_array("value", value, ndim=1, at_least=0.0)
+    if values.size and values.max() > 1.0:
+        raise ParameterError("value", "must be <= 1 everywhere", float(values.max()), cure="percent are hundredths")
+    return values
+
+
+def _set_table(curve: PolynomialCurve | TableCurve | SplineCurve) -> None:
+    """Check a curve's table, and keep it by ascending wavelength as tuples."""
+    waves_nm = finite_array("wavelength_nm", curve.wavelength_nm, ndim=1, above=0.0)
+    values = _shares(curve.value)
+    if values.size != waves_nm.size or values.size < 2:
+        raise ParameterError("value", f"must have as many values as 'wavelength_nm', at least 2, got {values.size}")
+    waves_nm = wavelengths_nm("wavelength_nm", waves_nm)
+    order = np.argsort(waves_nm)
+    if np.any(np.diff(waves_nm[order]) == 0.0):
+        raise ParameterError("wavelength_nm", "must not repeat a wavelength", curve.wavelength_nm, "nm")
+    object.__setattr__(curve, "wavelength_nm", tuple(waves_nm[order].tolist()))
+    object.__setattr__(curve, "value", tuple(values[order].tolist()))
+
+
+def _inside(wavelength_nm: ArrayLike, table_nm: Sequence[float], beyond: Beyond) -> tuple[Floats, Any]:
+    """Wavelengths moved to the ends of a table that they lie beyond, and where the curve has a value, or is 0."""
+    low_nm, high_nm = table_nm[0], table_nm[-1]
+    waves_nm = as_numbers("wavelength_nm", wavelength_nm)
+    if beyond == "refuse":
+        check_within(waves_nm, low_nm, high_nm, "the table", BEYOND_CURE)
+    check_within(waves_nm, 0.0, np.finfo(np.float64).max, "the spectrum")
+    inside_nm = np.clip(waves_nm, low_nm, high_nm)
+    return inside_nm, (inside_nm == waves_nm) | (beyond != "zero")

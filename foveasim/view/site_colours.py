@@ -1,0 +1,294 @@
+"""One colour for each photosite, for every kind of picture: of what it measured, its filter, its size, any column."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim._core.validation import UNIT_SUFFIXES, Floats, Ints, as_numbers, finite_array, own, unmasked
+from foveasim.capture import Capture
+from foveasim.errors import ParameterError
+from foveasim.layout import Layout
+
+__all__ = [
+    "BACKGROUND",
+    "BORDER",
+    "CATEGORY_COLOURS",
+    "FILTER_COLOURS",
+    "NO_DATA",
+    "ColourScale",
+    "SiteColours",
+    "colours_of",
+    "shares",
+    "site_colours",
+]
+
+#: Values that differ by less than this share are equal up to rounding, and get one colour.
+SAME = 1e-9
+#: Colours as red, green and blue from 0 to 255, encoded as screens expect (sRGB).
+Rgb: TypeAlias = tuple[int, int, int]
+RgbArray: TypeAlias = NDArray[np.uint8]
+
+#: Colours of filters by their names.
+FILTER_COLOURS: Mapping[str, Rgb] = {
+    "R": (255, 64, 51), "G": (77, 230, 77), "B": (77, 115, 255), "W": (255, 255, 255), "C": (64, 220, 230),
+    "M": (235, 80, 220), "Y": (245, 225, 60), "IR": (150, 60, 90), "NIR": (150, 60, 90), "all": (255, 255, 255),
+}  # fmt: skip
+#: Names of the channels of a layout that no sensor has given filters yet: the order of :func:`foveasim.layout.mosaic`.
+CHANNEL_NAMES = "RGBW"
+#: Colours of things that differ in kind, of middling brightness: lines and text can lie on them.
+CATEGORY_COLOURS: tuple[Rgb, ...] = (
+    (86, 140, 200), (236, 160, 60), (70, 165, 130), (205, 95, 80), (150, 120, 190),
+    (130, 195, 225), (190, 180, 70), (225, 145, 185), (140, 110, 90), (150, 155, 160),
+)  # fmt: skip
+#: Pale shades of sites that are shown for their shapes alone, neighbours mostly different.
+SHADES: tuple[Rgb, ...] = ((222, 226, 232), (202, 209, 218), (232, 228, 219), (212, 219, 212), (236, 236, 238))
+#: What no photosite covers is neither black nor white.
+BACKGROUND: Rgb = (185, 196, 214)
+#: Lines between sites.
+BORDER: Rgb = (64, 64, 64)
+#: Sites without a value (NaN): a colour of none of the colour maps in use.
+NO_DATA: Rgb = (217, 140, 150)
+#: What was measured is shown as a photograph; what is known of a site in a map of even steps, also to the colour-blind.
+PHOTOGRAPH, EVEN_STEPS = "gray", "viridis"
+#: On a colour mosaic values are raised to this power before they scale a colour, so that dark sites can be told apart.
+DISPLAY_GAMMA = 1.0 / 2.2
+#: Whole numbers of more kinds than this are shown as sizes, and texts without a legend.
+MOST_CATEGORIES = 10
+#: What a capture measured, and how it is called.
+MEASURED = {"code": "code / DN", "electrons": "electrons / e-", "expected_e": "expected charge / e-"}
+
+
+@dataclass(frozen=True, slots=True)
+class ColourScale:
+    """
+    What a colour bar shows.
+
+    Attributes
+    ----------
+    low, high : float
+        Values at the ends of the map, ``low < high``.
+    colour_map : str
+        One of matplotlib's.
+    gamma : float
+        Power that a value's share of the scale is raised to.
+    """
+
+    low: float
+    high: float
+    colour_map: str
+    gamma: float = 1.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SiteColours:
+    """
+    Colours of photosites, and what they mean.
+
+    Attributes
+    ----------
+    rgb : (n_site, 3) uint8
+        Red, green, blue, encoded as screens expect.
+    title : str
+        What is shown, with its unit: ``"area / µm²"``; empty for bare shapes.
+    values : (n_site,) array or None
+        What is shown, of each site: numbers or texts.
+    scale : ColourScale or None
+        For a colour bar, when values are sizes.
+    legend : tuple of (str, (r, g, b))
+        Names of colours, when values are kinds; empty when there are too many.
+    has_borders : bool
+        Whether sites are to be set off from each other: not in a photograph, nor where the colours are given.
+    """
+
+    rgb: RgbArray
+    title: str = ""
+    values: NDArray[Any] | None = None
+    scale: ColourScale | None = None
+    legend: tuple[tuple[str, Rgb], ...] = ()
+    has_borders: bool = True
+
+
+def shares(rgb: Rgb, factor: float = 1.0) -> tuple[float, float, float]:
+    """A colour by numbers from 0 to 1, as matplotlib has them, times a factor that makes it darker."""
+    red, green, blue = (factor * c / 255.0 for c in rgb)
+    return red, green, blue
+
+
+def site_colours(data: Layout | Capture, by: str | ArrayLike | None = None) -> RgbArray:
+    """The colours alone, (n_site, 3) uint8; see :func:`colours_of`."""
+    return colours_of(data, by).rgb
+
+
+def colours_of(data: Layout | Capture, by: str | ArrayLike | None = None, *, label: str = "") -> SiteColours:
+    """
+    A colour for each photosite.
+
+    Parameters
+    ----------
+    data : Layout or Capture
+    by : str or array, optional
+        ``"code"``, ``"electrons"``, ``"expected_e"`` of a capture: as a photograph, on a colour mosaic in the filters'
+        colours. ``"channel"``: the colour of the filter; a layout alone has R, G, B and W in this order. ``"area_um2"``,
+        ``"size_um"`` (the square root of the area), ``"readout_line"`` or any other column. An array: one value a site, or
+        a colour a site (n_site, 3), uint8 or from 0 to 1. By default the code of a capture, the bare shapes of a layout.
+    label : str
+        What an array holds, with its unit; in the place of what a name says, too.
+
+    Returns
+    -------
+    SiteColours
+
+    Raises
+    ------
+    ParameterError
+        When there is no such column, or not one value a site, or one is infinite.
+
+    Notes
+    -----
+    Text, truth values and whole numbers of at most ten kinds are kinds, with a legend; readout lines are kinds in any
+    number, whose colours repeat. Other numbers are sizes, on a scale from their smallest to their largest. NaN is no data.
+
+    Examples
+    --------
+    >>> from foveasim.layout import grid
+    >>> colours_of(grid(n_x=2, n_y=1, pitch_um=3.0), [0.0, 1.0]).rgb.tolist()
+    [[68, 1, 84], [253, 231, 37]]
+    """
+    capture = data if isinstance(data, Capture) else None
+    layout = data if capture is None else capture.layout
+    if not isinstance(layout, Layout):
+        raise ParameterError("data", f"must be a Layout or a Capture, got a {type(data).__name__}")
+    if by is None and capture is None:
+        return SiteColours(np.array(SHADES, np.uint8)[_strewn(layout.n_sites, len(SHADES))])
+    by = "code" if by is None else by
+    if not isinstance(by, str):
+        return _of_array(by, layout.n_sites, label)
+    if capture is not None and by in MEASURED:
+        return _photograph(capture, np.asarray(getattr(capture, by), np.float64), label or MEASURED[by])
+    if by == "channel":
+        names = _channel_names(layout) if capture is None else capture.filter_names
+        return _filters(layout.channel if capture is None else capture.filter_of_site, names, label or "filter")
+    values = _column(layout, by, capture is not None)
+    title = label or _title(by)
+    is_kind = by == "readout_line" or _is_kind(values)
+    return _kinds(values, title) if is_kind else _sizes(values.astype(np.float64), title, EVEN_STEPS)
+
+
+def _column(layout: Layout, by: str, is_capture: bool) -> NDArray[Any]:
+    if by in layout.columns:
+        return layout.columns[by]
+    if by == "area_um2":
+        return layout.area_um2
+    if by == "size_um":
+        return np.asarray(np.sqrt(layout.area_um2))
+    if by == "readout_line":
+        return layout.readout_line
+    known = [*(MEASURED if is_capture else ()), "channel", "area_um2", "size_um", "readout_line", *layout.columns]
+    raise ParameterError("by", f"must be one of {', '.join(sorted(set(known)))}, or an array", by)
+
+
+def _title(name: str) -> str:
+    """What a column's name says, and its unit."""
+    suffix = next((suffix for suffix in UNIT_SUFFIXES if name.lower().endswith(suffix)), "")
+    bare, unit = name[: len(name) - len(suffix)].replace("_", " "), UNIT_SUFFIXES.get(suffix, "")
+    return f"{bare} / {unit}" if bare and unit else bare or unit
+
+
+def _of_array(by: ArrayLike, n_sites: int, label: str) -> SiteColours:
+    """Colours of values, or given ones as they are."""
+    by = unmasked("by", by, missing_is_nan=True)
+    try:
+        array = own(np.asarray(by))
+    except ValueError:
+        raise ParameterError("by", "must be one value for each site", by) from None
+    if array.ndim == 0 or array.shape[0] != n_sites or array.shape[1:] not in ((), (3,)):
+        raise ParameterError("by", f"must have one row for each of the {n_sites} sites, got {array.shape}")
+    if array.ndim == 2:
+        is_bytes = array.dtype == np.uint8
+        given = array / 255.0 if is_bytes else np.clip(finite_array("by", array), 0.0, 1.0)
+        return SiteColours(np.rint(255.0 * given).astype(np.uint8), label, has_borders=False)
+    if array.dtype.kind == "U" or _is_kind(array):
+        return _kinds(array, label)
+    return _sizes(as_numbers("by", array), label, EVEN_STEPS)
+
+
+def _photograph(capture: Capture, values: Floats, title: str) -> SiteColours:
+    """What was measured in shades of grey, or of each site's filter."""
+    if len(capture.filter_names) == 1:
+        return _sizes(values, title, PHOTOGRAPH)
+    base = np.array([_filter_colour(k, name) for k, name in enumerate(capture.filter_names)], np.float64)
+    high = max(float(values.max(initial=0.0)), 1.0)
+    bright = base[capture.filter_of_site] * ((values / high) ** DISPLAY_GAMMA)[:, np.newaxis]
+    scale = ColourScale(0.0, high, PHOTOGRAPH, DISPLAY_GAMMA)
+    return SiteColours(np.rint(bright).astype(np.uint8), title, values, scale, has_borders=False)
+
+
+def _channel_names(layout: Layout) -> tuple[str, ...]:
+    n_channels = int(layout.channel.max(initial=0)) + 1
+    if n_channels == 1:
+        return ("all",)
+    return tuple(CHANNEL_NAMES[:n_channels]) if n_channels in (3, 4) else tuple(map(str, range(n_channels)))
+
+
+def _filter_colour(position: int, name: str) -> Rgb:
+    return FILTER_COLOURS.get(name, CATEGORY_COLOURS[position % len(CATEGORY_COLOURS)])
+
+
+def _filters(channel: Ints, names: tuple[str, ...], title: str) -> SiteColours:
+    colours = [_filter_colour(k, name) for k, name in enumerate(names)]
+    legend = tuple(zip(names, colours, strict=True)) if len(names) <= MOST_CATEGORIES else ()
+    return SiteColours(np.array(colours, np.uint8)[channel], title, np.array(names)[channel], None, legend)
+
+
+def _is_kind(values: NDArray[Any]) -> bool:
+    if values.dtype.kind not in "iu":
+        return values.dtype.kind in "bU"
+    # A span first: finding the kinds of a million different numbers takes long.
+    span = int(values.max(initial=0)) - int(values.min(initial=0))
+    return span < 2**16 and np.unique(values).size <= MOST_CATEGORIES
+
+
+def _kinds(values: NDArray[Any], title: str) -> SiteColours:
+    names, kind = np.unique(values, return_inverse=True)
+    # Lines keep the colours of their numbers, whichever of them a layout has.
+    if names.dtype.kind in "iu":
+        kind = values.astype(np.int64)
+    kind = kind % len(CATEGORY_COLOURS)
+    colours = np.array(CATEGORY_COLOURS, np.uint8)
+    legend = []
+    if names.size <= MOST_CATEGORIES:
+        first = [int(np.flatnonzero(values == name)[0]) for name in names]
+        legend = [(str(name), CATEGORY_COLOURS[kind[i]]) for name, i in zip(names, first, strict=True)]
+    return SiteColours(colours[kind], title, values, None, tuple(legend))
+
+
+def _sizes(values: Floats, title: str, colour_map: str) -> SiteColours:
+    """Colours of a map from the smallest value to the largest; one in the middle where all are equal."""
+    from matplotlib import colormaps
+
+    is_known = ~np.isnan(values)
+    if np.isinf(values).any():
+        raise ParameterError("by", "must be finite everywhere, or NaN for no data", values)
+    low = float(values.min(where=is_known, initial=np.inf)) if is_known.any() else 0.0
+    high = float(values.max(where=is_known, initial=-np.inf)) if is_known.any() else 0.0
+    if high - low <= SAME * max(abs(low), abs(high)):
+        low, high = low - 0.5, high + 0.5
+    table = np.rint(255.0 * colormaps[colour_map](np.arange(256))[:, :3]).astype(np.uint8)
+    table = np.concatenate((table, np.array([NO_DATA], np.uint8)))
+    with np.errstate(invalid="ignore"):
+        step = np.where(is_known, np.clip((values - low) * (256.0 / (high - low)), 0.0, 255.0), 256.0)
+    scale = ColourScale(low, high, colour_map)
+    return SiteColours(table[step.astype(np.int64)], title, values, scale, has_borders=colour_map != PHOTOGRAPH)
+
+
+def _strewn(n: int, n_kinds: int) -> Ints:
+    """Numbers below ``n_kinds`` that look thrown, the same at each call: the last steps of Murmur's hash of the positions."""
+    mixed = np.arange(n, dtype=np.uint64)
+    for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35), (16, 1)):
+        mixed = ((mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)) & np.uint64(0xFFFFFFFF)
+    return (mixed % np.uint64(n_kinds)).astype(np.int64)
