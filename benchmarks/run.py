@@ -31,7 +31,7 @@ from video import bench_video
 import foveasim as fs
 from foveasim._core.random_streams import Streams
 from foveasim._core.threads import thread_count
-from foveasim.sensor.noise import in_blocks
+from foveasim.sensor.blocks import in_blocks
 from layouts import bench_layouts
 
 #: The largest picture of the paper.

@@ -55,34 +55,6 @@ DERIVED = ("x_um", "y_um", "area_um2", "filter_name")
 SITE, FILTER = "site", "filter"
 #: Group of a store with the outlines.
 LAYOUT_GROUP = "layout"
-#: What a sensor's codes tell of the light by: these of its parameters, as they are meant. Fixed patterns are not known.
-ELECTRONICS = (
-    *(
-        "sensitivity",
-        "dark_e_per_s",
-        "temperature_k",
-        "dark_reference_k",
-        "dark_doubling_k",
-        "shot_noise",
-        "full_well_e",
-    ),
-    *(
-        "ktc_noise",
-        "cds",
-        "read_noise_e",
-        "rts_fraction",
-        "rts_e",
-        "capacitance_f",
-        "nonlinearity_fraction",
-        "pedestal_v",
-    ),
-    *("v_sat_v", "bits", "companding", "log_strength", "companding_table", "inl_dn", "dnl_dn"),
-)
-#: Further parameters that signal-to-noise ratios depend on: those of the device.
-DEVICE = (
-    *("device_seed", "dsnu_fraction", "hot_fraction", "hot_e_per_s", "gain_fpn_fraction", "pixel_fpn_fraction"),
-    "line_fpn_fraction",
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +242,7 @@ class Capture:
         ----------
         sensor : Sensor, optional
             That made the capture: needed where its electronics differ from site to site in a layout of more than 64 sites,
-            since ``settings`` does not keep such. Without it crosstalk and coupling of dark charge are not counted.
+            since ``settings`` does not store such, and where it has effects that are not registered.
 
         Raises
         ------
@@ -278,7 +250,7 @@ class Capture:
             When the electronics are not known, or the sensor is of another layout.
         """
         self._check_sensor(sensor)
-        known = self._electronics(sensor, DEVICE)
+        known = self._electronics(sensor)
         dark_e = known.expected_electrons(np.zeros(self.layout.n_sites), float(self.settings.get("exposure_s", 0.0)))
         return signal_to_noise(known, self.expected_e, np.broadcast_to(dark_e, self.expected_e.shape)).ratio
 
@@ -289,20 +261,9 @@ class Capture:
                 "sensor", "must be the Sensor of the capture's layout, with the same sites in the same order", sensor
             )
 
-    def _electronics(self, sensor: Sensor | None, further: tuple[str, ...] = ()) -> Sensor:
-        """The sensor as it is meant: the one given, or as much of it as the settings tell."""
-        if sensor is not None:
-            return sensor
-        told = self.settings.get("sensor", {})
-        for name in ELECTRONICS:
-            if name not in told or isinstance(told[name], Mapping):
-                raise ParameterError(
-                    "sensor",
-                    f"must be given: the capture's settings do not tell its {name!r}"
-                    + (" of every site" if name in told else ""),
-                )
-        more = [name for name in further if name in told]
-        return Sensor(self.layout, **{name: told[name] for name in (*ELECTRONICS, *more)})
+    def _electronics(self, sensor: Sensor | None) -> Sensor:
+        """Return the sensor that is given, or the one that the settings describe."""
+        return Sensor.from_settings(self.layout, self.settings.get("sensor", {})) if sensor is None else sensor
 
     def _readings(self, electronics: Sensor, of: str) -> Readings:
         exposure_s = float(self.settings.get("exposure_s", 0.0))

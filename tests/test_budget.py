@@ -31,15 +31,15 @@ def test_the_sources_have_their_textbook_sizes():
 
     assert tuple(noise_e) == (*TEMPORAL, *FIXED)
     expected = {
-        "shot of light": 200.0,
-        "shot of dark charge": 30.0,
+        "photon_shot": 200.0,
+        "dark_shot": 30.0,
         "reset": 127.0,
         "read": 4.0,
         "quantisation": 2111.4,
-        "photo response": 400.0,
-        "offset of pixels": 0.02 * 1.8724e6,
-        "gain": 0.0,
-        "telegraph": 0.0,
+        "prnu": 400.0,
+        "pixel_fpn": 0.02 * 1.8724e6,
+        "gain_fpn": 0.0,
+        "rts": 0.0,
     }
     for name, size_e in expected.items():
         assert noise_e[name] == pytest.approx(np.full(N, size_e), rel=5e-4, abs=1e-9)

@@ -99,7 +99,7 @@ def test_numbers_without_a_point_in_front_of_the_exponent_are_numbers(shot_file)
         ),
         ("sensor.companding=root", lambda s: s.camera.sensor.converter.companding == "root"),
         ("sensor.inl_dn=[0, 1, 0]", lambda s: s.camera.sensor.converter.inl_dn == (0.0, 1.0, 0.0)),
-        ("sensor.ktc_noise=true", lambda s: s.camera.sensor.ktc_noise_e[0] > 0.0),
+        ("sensor.ktc_noise=true", lambda s: "reset" in [effect.name for effect in s.camera.sensor.chain]),
         (
             "sensor={filters: rgb, qe: [0.3, {kind: constant, value: 0.5}, 0.4]}; layout.mosaic=[RG, GB]",
             lambda s: s.camera.sensor.qe == (0.3, fs.sensor.ConstantCurve(0.5), 0.4),

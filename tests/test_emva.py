@@ -11,7 +11,7 @@ import scipy.constants
 import foveasim as fs
 from foveasim.errors import FoveasimWarning, ParameterError
 from foveasim.metrics import PhotonTransfer, draw_frames, emva1288, photon_transfer, predicted_photon_transfer
-from foveasim.sensor import Sensor
+from foveasim.sensor import Sensor, noise_budget
 from foveasim.units import photon_energy_j
 
 SIGMAS = 5.0
@@ -443,7 +443,7 @@ def test_the_noise_of_resetting_is_that_of_the_capacitance(capacitance_f, noise_
     curve = photon_transfer(sensor, [level_e], seed=7)
 
     got_e = np.sqrt(curve.temporal_variance_dn2[0, 0] - 1 / 12) / gain
-    assert sensor.ktc_noise_e[0] == pytest.approx(noise_e, rel=5e-4)
+    assert noise_budget(sensor, np.zeros(GRID.n_sites), 0.0)["reset"][0] == pytest.approx(noise_e, rel=5e-4)
     assert got_e == pytest.approx(noise_e, rel=SIGMAS * math.sqrt(0.5 / GRID.n_sites) + 5e-4)
 
 

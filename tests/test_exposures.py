@@ -11,7 +11,15 @@ import scipy.constants
 from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
-from foveasim.sensor import Calibration, Sensor, calibrate, fit_ramp, merge_exposures, non_destructive_reads
+from foveasim.sensor import (
+    Calibration,
+    Sensor,
+    calibrate,
+    fit_ramp,
+    merge_exposures,
+    noise_budget,
+    non_destructive_reads,
+)
 
 SIGMAS = 5.0
 N = 20_000
@@ -223,7 +231,7 @@ def test_noise_of_reading_is_new_in_each_read_and_that_of_resetting_the_same():
         ktc_noise=True,
         read_noise_e=6.0,
     )
-    reset_e = float(sensor.ktc_noise_e[0])
+    reset_e = float(noise_budget(sensor, np.zeros(N), 0.0)["reset"][0])
 
     code = non_destructive_reads(sensor, 8000.0, TIMES_S, streams=Streams(2)).code.astype(float)
 
@@ -364,7 +372,7 @@ def test_merged_exposures_predict_rts_spread(rts_fraction, shot_noise):
     sensor = Sensor(ROW, **SENSOR, rts_fraction=rts_fraction, rts_e=200.0, shot_noise=shot_noise)
     merged = merge_exposures(exposed_in_turn(sensor), RTS_TIMES_S, sensor)
 
-    is_rts = np.isin(np.arange(N), sensor.telegraph_sites)
+    is_rts = sensor.pattern("rts") > 0.0
     assert_drawn_as_predicted(merged)
     assert merged.sigma_e_per_s[is_rts].min() > 2.0 * merged.sigma_e_per_s[~is_rts].max(initial=0.0)
 

@@ -293,7 +293,7 @@ def test_noise_matches_squared_error_of_codes(companding, charge_e, dnl_dn, sigm
         pixel_fpn_fraction=2.0 * step_e / full_e,
     )
     code = sensor.read(np.full(n, charge_e), streams=Streams(5))
-    found_e = (linearised(code, sensor) + 0.5) * full_e / 256.0 - sensor.pixel_offset_v * full_e
+    found_e = (linearised(code, sensor) + 0.5) * full_e / 256.0 - sensor.pattern("pixel_fpn") * full_e
 
     told = signal_to_noise(sensor, np.full(n, float(charge_e)), np.zeros(n))
 

@@ -17,7 +17,7 @@ import foveasim as fs
 from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
-from foveasim.sensor import Sensor, _kernels
+from foveasim.sensor import Sensor, _kernels, noise_budget
 from foveasim.sensor.device import Device
 
 N_X, N_Y = 500, 400
@@ -77,7 +77,7 @@ def test_the_small_generator_gives_its_authors_known_answers(key, counter, words
     assert tuple(int(word) for word in got) == words
 
 
-EFFECTS = ("prnu", "dsnu", "hot", "gain", "pixel offset", "telegraph")
+EFFECTS = ("prnu", "dsnu", "hot", "gain_fpn", "pixel_fpn", "rts")
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
@@ -285,32 +285,36 @@ def test_draws_and_codes_do_not_depend_on_the_number_of_threads():
         assert np.array_equal(code, noisy.read(first, streams=Streams(1), n_threads=n_threads))
 
 
+def reset_noise_e(some):
+    return noise_budget(some, np.zeros(N), 0.0)["reset"]
+
+
 # -- noise of reading --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("capacitance_f", "noise_e"), [(1e-15, 12.70), (1e-13, 127.0), (4.8e-13, 278.3)])
 def test_reset_noise_has_its_published_sizes_at_300_kelvin(capacitance_f, noise_e):
-    assert sensor(ktc_noise=True, capacitance_f=capacitance_f).ktc_noise_e[0] == pytest.approx(noise_e, rel=5e-4)
+    assert reset_noise_e(sensor(ktc_noise=True, capacitance_f=capacitance_f))[0] == pytest.approx(noise_e, rel=5e-4)
 
 
 def test_reset_noise_is_in_the_codes_and_double_sampling_takes_it_off():
-    size_e = sensor(ktc_noise=True).ktc_noise_e[0]
+    size_e = reset_noise_e(sensor(ktc_noise=True))[0]
 
     assert_spread(codes(ktc_noise=True), size_e, 1 / 12)
     assert np.ptp(codes(ktc_noise=True, cds=True)) == 0.0
-    assert sensor(ktc_noise=True, temperature_k=75.0).ktc_noise_e[0] == pytest.approx(size_e / 2)
+    assert reset_noise_e(sensor(ktc_noise=True, temperature_k=75.0))[0] == pytest.approx(size_e / 2)
 
 
 def test_reset_noise_is_of_each_sites_own_capacitance():
     two = np.where(np.arange(N) % 2, FINE["capacitance_f"], 4.0 * FINE["capacitance_f"])
 
-    noise = sensor(ktc_noise=True, capacitance_f=two).ktc_noise_e
+    noise = reset_noise_e(sensor(ktc_noise=True, capacitance_f=two))
 
     assert noise[0] == pytest.approx(2.0 * noise[1])
 
 
 def test_noises_of_resetting_and_reading_add_in_squares():
-    size_e = sensor(ktc_noise=True).ktc_noise_e[0]
+    size_e = reset_noise_e(sensor(ktc_noise=True))[0]
 
     assert_spread(codes(ktc_noise=True, read_noise_e=40.0), math.hypot(size_e, 40.0), 1 / 12)
 
@@ -482,17 +486,21 @@ SWITCHES = {
     "dnl_dn": 0.0,
 }
 BEFORE_THE_DRAW = ("prnu_fraction", "dark_e_per_s", "dsnu_fraction", "hot_fraction", "dead_fraction")
-PATTERNS = ("response", "dark_rate_e_per_s", "gain", "pixel_offset_v", "line_offset_v", "telegraph_sites")
+PATTERNS = {
+    "response": lambda s: s.response,
+    "dark_rate_e_per_s": lambda s: s.dark_rate_e_per_s,
+    **{name: lambda s, name=name: s.pattern(name) for name in ("gain_fpn", "pixel_fpn", "column_fpn", "rts")},
+}
 OF_PATTERN = {
     "prnu_fraction": "response",
     "dead_fraction": "response",
     "dark_e_per_s": "dark_rate_e_per_s",
     "dsnu_fraction": "dark_rate_e_per_s",
     "hot_fraction": "dark_rate_e_per_s",
-    "gain_fpn_fraction": "gain",
-    "pixel_fpn_fraction": "pixel_offset_v",
-    "line_fpn_fraction": "line_offset_v",
-    "rts_fraction": "telegraph_sites",
+    "gain_fpn_fraction": "gain_fpn",
+    "pixel_fpn_fraction": "pixel_fpn",
+    "line_fpn_fraction": "column_fpn",
+    "rts_fraction": "rts",
 }
 
 
@@ -506,9 +514,9 @@ def test_an_effect_switched_off_changes_something_and_leaves_all_other_draws(eff
     read = [s.read(charge, streams=streams) for s, charge in zip((on, off), charges, strict=True)]
 
     assert not np.array_equal(*read)
-    for pattern in PATTERNS:
+    for pattern, of in PATTERNS.items():
         if OF_PATTERN.get(effect) != pattern:
-            assert np.array_equal(getattr(on, pattern), getattr(off, pattern))
+            assert np.array_equal(of(on), of(off))
     if effect in BEFORE_THE_DRAW or effect in {"shot_noise", "full_well_e"}:
         # From the same charge on, the same codes.
         assert np.array_equal(on.read(charges[0], streams=streams), off.read(charges[0], streams=streams))
@@ -521,7 +529,7 @@ def test_sites_without_an_effect_of_their_own_draw_as_before():
     charge = np.full(N, 20_000, np.int64)
     moved = on.read(charge, streams=Streams(0)) != off.read(charge, streams=Streams(0))
 
-    assert set(np.flatnonzero(moved)) <= set(on.telegraph_sites)
+    assert set(np.flatnonzero(moved)) <= set(np.flatnonzero(on.pattern("rts")))
 
 
 @pytest.mark.parametrize("effect", ["prnu_fraction", "dsnu_fraction", "gain_fpn_fraction", "pixel_fpn_fraction", "dnl_dn", "line_fpn_fraction", "dead_fraction", "hot_fraction", "rts_fraction"])  # fmt: skip
@@ -539,7 +547,10 @@ def test_a_crop_of_a_sensor_reads_the_same_codes_as_the_whole(effect):
     ]
 
     assert np.array_equal(codes[1], codes[0][ids])
-    assert set(ids[crop.telegraph_sites]) == set(whole.telegraph_sites) & set(ids)
+    if effect != "rts_fraction":
+        return
+    crop, whole = (Sensor(layout, **{**FINE, **quiet, "rts_e": 9.0}).pattern("rts") for layout in (MANY[ids], MANY))
+    assert np.array_equal(crop, whole[ids])
 
 
 def test_another_process_and_another_order_of_frames_draw_the_same_codes():

@@ -454,7 +454,7 @@ def test_a_noise_budget_has_a_bar_for_each_source_and_class():
     apart = plot_noise_budget(noise_e, classes=[0, 0, 1, 1])
 
     names = [text.get_text() for text in together.get_yticklabels()]
-    assert names == ["shot of light", "read", "quantisation", "photo response"]
+    assert names == ["photon_shot", "read", "quantisation", "prnu"]
     widths = [bar.get_width() for bar in together.patches]
     assert widths[0] == pytest.approx(20.0)
     assert widths[1] == pytest.approx(np.sqrt(17.0))

@@ -38,6 +38,7 @@ from foveasim.sensor import (
     read_curve,
     read_filters,
 )
+from foveasim.sensor.effects import EFFECTS
 
 __all__ = ["GENERATORS", "PICTURES", "LayoutUnion", "PerArea", "RulesSection", "ShotSection", "call_of"]
 
@@ -203,6 +204,9 @@ _SceneSection = _one_of(
         for k, call in _SCENES.items()
     },
 )
+_EffectSection: Any = Any
+if EFFECTS:
+    _EffectSection = _one_of("kind", {name: _model(name, effect) for name, effect in EFFECTS.items()})
 _SensorSection = _model(
     "sensor",
     Sensor,
@@ -216,6 +220,7 @@ _SensorSection = _model(
     full_well_e=_PerSite | None,
     read_noise_e=_PerSite,
     capacitance_f=_PerSite,
+    effects=list[_EffectSection],
 )
 RulesSection = _model(
     "design rules",

@@ -59,10 +59,13 @@ def charge_readings(charge_e: ArrayLike, sensor: Sensor, exposure_s: float) -> R
         When a charge is not finite, there is not one for each of the sensor's sites, or the exposure is negative.
     """
     charge = _per_site("charge_e", charge_e, sensor)
-    well_e = np.inf if sensor.full_well_e is None else np.floor(sensor.full_well_e)
-    shot_e2 = np.maximum(charge, 0.0) + 1.0 if sensor.shot_noise != "off" else np.full(charge.size, 1.0 / 12.0)
+    exposure_s = check_plausible("exposure_s", exposure_s)
+    shot = sensor.shot
+    _, variance_e2 = shot.moments(np.maximum(charge, 0.0), np.full(charge.size, float(shot.is_drawn)))
     return Readings(
-        light_e=charge - _dark_e(sensor, exposure_s), variance_e2=shot_e2, is_full=np.asarray(charge >= well_e)
+        light_e=charge - sensor.nominal_dark_e_per_s * exposure_s,
+        variance_e2=variance_e2,
+        is_full=np.asarray(charge >= sensor.well_e),
     )
 
 
@@ -97,7 +100,8 @@ def code_readings(code: ArrayLike, sensor: Sensor, exposure_s: float) -> Reading
     charge = share * full_e
     read_e = charge_readings(charge, sensor, exposure_s)
     step_e = sensor.converter.width_of_code_dn(codes) / slope * electrons_per_code(sensor)
-    noise_e2 = sensor.readout_noise_e2(is_device_known=False) + step_e**2 * sensor.converter.noise_dn2
+    readout = sensor.readout_model(np.maximum(charge, 0.0), is_device_known=False)
+    noise_e2 = readout.noise_e2 + step_e**2 * sensor.converter.noise_dn2
     is_full = read_e.is_full | (codes >= 2**sensor.bits - 1)
     return Readings(light_e=read_e.light_e, variance_e2=read_e.variance_e2 + noise_e2, is_full=is_full)
 
@@ -109,8 +113,3 @@ def _per_site(name: str, values: ArrayLike, sensor: Sensor) -> Floats:
             name, f"must have one value for each of the {sensor.layout.n_sites} sites, got {found.size}"
         )
     return found
-
-
-def _dark_e(sensor: Sensor, exposure_s: float) -> Floats:
-    exposure_s = check_plausible("exposure_s", exposure_s)
-    return np.asarray(np.asarray(sensor.dark_e_per_s) * sensor.heat * exposure_s)

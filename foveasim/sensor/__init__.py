@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from foveasim.sensor.budget import FIXED, TEMPORAL, noise_budget
 from foveasim.sensor.calibration import Calibration, calibrate, linearised
-from foveasim.sensor.crosstalk import Coupling, Diffusion, KernelCrosstalk, Mixing
+from foveasim.sensor.effects.crosstalk import Coupling, Diffusion, KernelCrosstalk, Mixing
+from foveasim.sensor.effects.shot import draw_shot_noise
 from foveasim.sensor.exposures import Ramp, Rates, fit_ramp, merge_exposures, non_destructive_reads
 from foveasim.sensor.limits import LIMITS, Limits
-from foveasim.sensor.noise import draw_shot_noise
 from foveasim.sensor.presets import PRESETS
 from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import SiteSignals, signal_to_noise

@@ -1,9 +1,8 @@
 """
 The sensor's numba kernels: numbers of a device by place, shot noise, and the way from charge to code.
 
-They know arrays only, release the interpreter lock, and are compiled for explicit types when this module is
-imported; the machine code is cached on disk. What is one number for all sites, or one a site, is an array of the size 1
-or n.
+They take arrays, and named tuples of arrays and numbers, and are compiled for explicit types when this module is
+imported. An array that may hold one value for all sites has the size 1 or n.
 """
 
 from __future__ import annotations
@@ -14,25 +13,30 @@ import numpy as np
 from numba import types
 
 from foveasim._core.jit import njit
+from foveasim.sensor.adc import ConversionTables
+from foveasim.sensor.prediction import ChargeDistributions, Quadrature, Transfer
 
 __all__ = [
     "ADC_LINEAR",
     "ADC_LOG",
     "ADC_ROOT",
     "ADC_TABLE",
+    "bend_voltages",
+    "convert",
     "device_uniforms",
-    "poisson_or_gaussian",
+    "draw_poisson",
     "predict_codes",
     "rays_met",
-    "read_out",
 ]
 
-#: Ways of a converter from a share of the range to a share of the codes.
+#: Compandings of the ADC, by the numbers of ``ConversionTables.way``.
 ADC_LINEAR, ADC_ROOT, ADC_LOG, ADC_TABLE = range(4)
 #: A charge this share of a code below a code's border is on it: the rounding of a division.
 CODE_ROUNDING = 1e-9
-#: Variance that rounding to whole electrons adds; taken off the Gaussian's, so that the sum is Poisson's.
+#: Variance that rounding to integers adds.
 ROUNDING_VARIANCE = 1.0 / 12.0
+#: Coefficients of the quadratic term of a draw, and of its correction: see foveasim.sensor.effects.ShotNoise.
+QUADRATIC, QUADRATIC_CORRECTION = 1.0 / 6.0, 11.0 / 648.0
 #: No charge is larger: 2**62 fits int64 with room for sums.
 LARGEST_CHARGE_E = 2.0**62
 #: One draw of a Poisson law is at most so many of its standard deviations, and so many electrons more, above its mean.
@@ -51,6 +55,13 @@ _floats = types.Array(types.float64, 1, "C", readonly=True)
 _ints = types.Array(types.int64, 1, "C", readonly=True)
 _words = types.Array(types.uint64, 1, "C", readonly=True)
 _points = types.Array(types.float64, 2, "C", readonly=True)
+_number, _count = types.float64, types.int64
+_adc = types.NamedTuple(
+    (_number, _count, _number, _floats, _count, _floats, _number, types.uint64, _floats), ConversionTables
+)
+_charges = types.NamedTuple((_floats, _floats, _floats, _floats, _floats, _number, types.boolean), ChargeDistributions)
+_transfer = types.NamedTuple((_floats, _floats, _floats, _floats, _number, _number), Transfer)
+_quadrature = types.NamedUniTuple(_floats, 2, Quadrature)
 
 #: Philox 4x64: multipliers and Weyl steps.
 _M0, _M1 = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
@@ -155,16 +166,22 @@ def _poisson(mean, z):
     return n
 
 
-@njit(types.void(_floats, _floats, types.float64, types.int64[::1]))
-def poisson_or_gaussian(expected_e, z, gaussian_above_e, electrons):
-    """Draws of Poisson's law up to a mean, and above it of the Gaussian of its mean and variance, rounded."""
-    for i in range(expected_e.size):
-        mean = expected_e[i]
-        if mean <= gaussian_above_e:
-            electrons[i] = _poisson(mean, z[i])
-        else:
-            charge = mean + math.sqrt(mean - ROUNDING_VARIANCE) * z[i]
-            electrons[i] = int(np.rint(min(max(charge, 0.0), LARGEST_CHARGE_E)))
+@njit(types.void(_floats, _floats, types.float64, types.int64[::1]), error_model="numpy")
+def draw_poisson(expected_e, z, gaussian_above_e, electrons):
+    """Poisson draws from Gaussian numbers: exact up to an expectation, above it correct to the third moment."""
+    # The first loop has no branches, so that the compiler vectorises it.
+    charge = np.empty(PIECE)
+    for first in range(0, expected_e.size, PIECE):
+        sites = slice(first, min(first + PIECE, expected_e.size))
+        means, normals, out = expected_e[sites], z[sites], electrons[sites]
+        for j in range(means.size):
+            mean = max(means[j], gaussian_above_e)
+            c = QUADRATIC + QUADRATIC_CORRECTION / mean
+            deviation = math.sqrt(mean - ROUNDING_VARIANCE - 2.0 * c * c)
+            drawn = mean + deviation * normals[j] + c * (normals[j] * normals[j] - 1.0)
+            charge[j] = np.rint(min(max(drawn, 0.0), LARGEST_CHARGE_E))
+        for j in range(means.size):
+            out[j] = _poisson(means[j], normals[j]) if means[j] <= gaussian_above_e else int(charge[j])
 
 
 @njit(inline="always")
@@ -173,40 +190,53 @@ def _at(values, i):
 
 
 @njit(inline="always")
-def _converted(share, way, strength, table):
-    """Share of the codes for a share of the range."""
-    if way == ADC_ROOT:
+def _companded(share, adc):
+    """Fraction of the codes for a fraction of the voltage range."""
+    if adc.way == ADC_ROOT:
         return math.sqrt(share)
-    if way == ADC_LOG:
-        return math.log1p(strength * share) / math.log1p(strength)
-    if way == ADC_TABLE:
-        place = share * (table.size - 1)
-        k = min(int(place), table.size - 2)
-        return table[k] + (place - k) * (table[k + 1] - table[k])
+    if adc.way == ADC_LOG:
+        return math.log1p(adc.log_strength * share) / math.log1p(adc.log_strength)
+    if adc.way == ADC_TABLE:
+        place = share * (adc.curve.size - 1)
+        k = min(int(place), adc.curve.size - 2)
+        return adc.curve[k] + (place - k) * (adc.curve[k + 1] - adc.curve[k])
     return share
 
 
 @njit(inline="always")
-def _share(charge, per_e, offset, v_sat_v, bend):
-    """Fraction of the voltage range for a charge: nonlinearity, offset and clip."""
-    v = charge * per_e
-    v *= 1.0 - bend * min(max(v / v_sat_v, 0.0), 1.0)
-    return min(max((v + offset) / v_sat_v, 0.0), 1.0)
+def _bent(v, bend, v_sat_v):
+    """Voltage after the nonlinearity."""
+    return v * (1.0 - bend * min(max(v / v_sat_v, 0.0), 1.0))
+
+
+@njit(types.void(types.float64[::1], types.float64, types.float64), error_model="numpy")
+def bend_voltages(voltage_v, bend, v_sat_v):
+    """Apply the nonlinearity in place; ``bend`` is the fraction that the response lacks at full range."""
+    for i in range(voltage_v.size):
+        voltage_v[i] = _bent(voltage_v[i], bend, v_sat_v)
+
+
+@njit(inline="always")
+def _share(v, v_sat_v):
+    """Fraction of the voltage range, clipped."""
+    return min(max(v / v_sat_v, 0.0), 1.0)
 
 
 @njit(inline="always")
 def _with_inl(value, n_codes, inl):
-    """Add the integral non-linearity to a code before quantisation."""
+    """Add the integral nonlinearity to a code before quantisation."""
     place = min(value / n_codes, 1.0) * (inl.size - 1)
     k = np.uint32(min(int(place), inl.size - 2))  # unsigned: indices from the end need no check
     return value + (inl[k] + (place - k) * (inl[k + 1] - inl[k]))
 
 
 @njit(inline="always")
-def _value(charge, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl):
-    """Code of a charge before quantisation."""
-    value = _converted(_share(charge, per_e, offset, v_sat_v, bend), way, strength, table) * n_codes
-    return _with_inl(value, n_codes, inl) if inl.size > 1 else value
+def _value(charge, site, adc):
+    """Code of a charge before quantisation; ``site`` is (v_per_e, sense_v, scale, output_v, bend)."""
+    per_e, sense_v, scale, output_v, bend = site
+    v = _bent(charge * per_e + sense_v, bend, adc.v_sat_v) * scale + output_v
+    value = _companded(_share(v, adc.v_sat_v), adc) * adc.n_codes
+    return _with_inl(value, adc.n_codes, adc.inl) if adc.inl.size > 1 else value
 
 
 @njit(inline="always")
@@ -236,25 +266,27 @@ def _whole(value, n_codes):
 
 
 @njit(inline="always")
-def _code(value, line, n_codes, dnl, dnl_key, quantiles):
-    """Quantise to a code, with differential non-linearity."""
-    code = _whole(value, n_codes)
-    if dnl > 0.0:
-        code = _whole(value + dnl * _dnl_normal(dnl_key, line, code, quantiles), n_codes)
+def _code(value, line, adc):
+    """Quantise to a code, with differential nonlinearity."""
+    code = _whole(value, adc.n_codes)
+    if adc.dnl_dn > 0.0:
+        code = _whole(value + adc.dnl_dn * _dnl_normal(adc.dnl_key, line, code, adc.quantiles), adc.n_codes)
     return code
 
 
 @njit()
-def _charge(value, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl):
-    """The charge that has codes not yet whole: :func:`_value` the other way, infinite beyond its ends."""
-    share_of_codes = value / n_codes
+def _charge(value, site, adc):
+    """Invert :func:`_value`: the charge that gives a code before quantisation, infinite beyond the ends."""
+    per_e, sense_v, scale, output_v, bend = site
+    v_sat_v, inl = adc.v_sat_v, adc.inl
+    share_of_codes = value / adc.n_codes
     if inl.size > 1:
         low, high = 0.0, 1.0
         for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)
             place = middle * (inl.size - 1)
             k = min(int(place), inl.size - 2)
-            if middle * n_codes + inl[k] + (place - k) * (inl[k + 1] - inl[k]) < value:
+            if middle * adc.n_codes + inl[k] + (place - k) * (inl[k + 1] - inl[k]) < value:
                 low = middle
             else:
                 high = middle
@@ -266,107 +298,49 @@ def _charge(value, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, 
     if share_of_codes > 1.0:
         return np.inf
     share = share_of_codes
-    if way == ADC_ROOT:
+    if adc.way == ADC_ROOT:
         share = share_of_codes * share_of_codes
-    elif way == ADC_LOG:
-        share = math.expm1(share_of_codes * math.log1p(strength)) / strength
-    elif way == ADC_TABLE:
+    elif adc.way == ADC_LOG:
+        share = math.expm1(share_of_codes * math.log1p(adc.log_strength)) / adc.log_strength
+    elif adc.way == ADC_TABLE:
         low, high = 0.0, 1.0
         for _ in range(BISECTIONS):
             share = 0.5 * (low + high)
-            if _converted(share, way, strength, table) < share_of_codes:
+            if _companded(share, adc) < share_of_codes:
                 low = share
             else:
                 high = share
-    v = share * v_sat_v - offset
+    v = (share * v_sat_v - output_v) / scale
     if bend > 0.0 and v > 0.0:
         v = (
             0.5 * v_sat_v * (1.0 - math.sqrt(1.0 - 4.0 * bend * v / v_sat_v)) / bend
             if v < v_sat_v * (1.0 - bend)
             else v / (1.0 - bend)
         )
-    return v / per_e
+    return (v - sense_v) / per_e
 
 
-@njit(inline="always")
-def _copy(values, sites, out):
-    """Copy values of a slice of sites, or the value of all, to the start of an array."""
-    if values.size > 1:
-        out[: sites.stop - sites.start] = values[sites]
-    else:
-        out[:] = values[0]
-
-
-@njit(
-    [
-        types.void(
-            _floats,
-            _floats,
-            _floats,
-            _floats,
-            _floats,
-            _ints,
-            types.float64,
-            types.float64,
-            types.int64,
-            types.float64,
-            _floats,
-            types.int64,
-            _floats,
-            types.float64,
-            types.uint64,
-            _floats,
-            code[::1],
-        )
-        for code in (types.uint8, types.uint16)
-    ],
-)
-def read_out(
-    charge_e,
-    v_per_e,
-    offset_v,
-    line_offset_v,
-    gain,
-    line,
-    v_sat_v,
-    bend,
-    way,
-    strength,
-    table,
-    n_codes,
-    inl,
-    dnl,
-    dnl_key,
-    quantiles,
-    code,
-):
+@njit([types.void(_floats, _ints, _adc, code[::1]) for code in (types.uint8, types.uint16)], error_model="numpy")
+def convert(voltage_v, line, adc, code):
     """
-    Codes of charges: volts, bend, offsets of site and line, clip, conversion with its faults.
+    Codes of voltages: clip, companding, integral and differential nonlinearity, quantisation.
 
-    ``bend`` is the share that the response lacks at full range. ``inl`` holds deviations in codes at equal steps of the
-    codes (size 1: none); ``dnl`` is the standard deviation, in codes, of a number that each line adds before each code, a
-    Gaussian by its ``quantiles``.
+    ``adc.dnl_dn`` is the standard deviation, in codes, of a number that each line adds before each code, a Gaussian by its
+    quantiles.
     """
-    # One short loop per step, which the compiler vectorises, over buffers that stay in the cache.
-    value, per_e, offsets_v, place = np.empty(PIECE), np.empty(PIECE), np.empty(PIECE), np.empty(PIECE)
-    for first in range(0, charge_e.size, PIECE):
-        n = min(PIECE, charge_e.size - first)
+    # One short loop per step, over buffers that stay in the cache. The compiler vectorises them, as numpy's error model does
+    # not check divisions.
+    value, place = np.empty(PIECE), np.empty(PIECE)
+    n_codes, inl, dnl, quantiles = adc.n_codes, adc.inl, adc.dnl_dn, adc.quantiles
+    for first in range(0, voltage_v.size, PIECE):
+        n = min(PIECE, voltage_v.size - first)
         sites = slice(first, first + n)
-        charges, lines, codes = charge_e[sites], line[sites], code[sites]
-        _copy(offset_v, sites, offsets_v)
-        _copy(v_per_e, sites, per_e)
-        _copy(gain, sites, place)
-        if line_offset_v.size > 1:
-            for j in range(n):
-                offsets_v[j] += line_offset_v[np.uint64(lines[j])]
-        else:
-            for j in range(n):
-                offsets_v[j] += line_offset_v[0]
+        volts, lines, codes = voltage_v[sites], line[sites], code[sites]
         for j in range(n):
-            value[j] = _share(charges[j], per_e[j] * place[j], offsets_v[j], v_sat_v, bend)
-        if way != ADC_LINEAR:
+            value[j] = _share(volts[j], adc.v_sat_v)
+        if adc.way != ADC_LINEAR:
             for j in range(n):
-                value[j] = _converted(value[j], way, strength, table)
+                value[j] = _companded(value[j], adc)
         for j in range(n):
             value[j] *= n_codes
         if inl.size > 1:
@@ -376,28 +350,38 @@ def read_out(
             codes[j] = int(_whole(value[j], n_codes))
         if dnl > 0.0:
             for j in range(n):
-                place[j] = _dnl_place(dnl_key, lines[j], codes[j], quantiles.size)
+                place[j] = _dnl_place(adc.dnl_key, lines[j], codes[j], quantiles.size)
             for j in range(n):
                 codes[j] = int(_whole(value[j] + dnl * _between(quantiles, place[j]), n_codes))
 
 
 @njit(inline="always")
-def _below(q, nodes, weights, n_nodes, mean, deviation, well_e, sigma, half_step):
-    """
-    Chance that a charge lies below ``q``.
+def _normal_below(x, skewness):
+    """Distribution function of a standardised variable: the Gaussian, and Edgeworth's term of its skewness."""
+    gaussian = 0.5 * math.erfc(-x * SQRT_HALF)
+    if skewness == 0.0:
+        return gaussian
+    return gaussian - skewness / 6.0 * (x * x - 1.0) * math.exp(-0.5 * x * x) / SQRT_TWO_PI
 
-    It is a mixture of points (``n_nodes`` of them) or, without any, a Gaussian of a mean and a deviation that ends at the well;
-    then the Gaussian noise ``sigma``, then one of two states ``half_step`` up or down.
+
+@njit(inline="always")
+def _below(q, nodes, weights, n_nodes, mean, deviation, third, well_e, sigma, half_step):
+    """
+    Probability that a charge lies below ``q``.
+
+    It is a mixture of points (``n_nodes`` of them) or, without any, near a Gaussian of a mean, a deviation and a third central
+    moment that ends at the well; then the Gaussian noise ``sigma``, then one of two states ``half_step`` up or down.
     """
     total = 0.0
     n_states = 2 if half_step > 0.0 else 1
     for state in range(n_states):
         at = q + half_step if state else q - half_step
         if n_nodes == 0:
-            if sigma == 0.0:
-                total += 1.0 if at > well_e else 0.5 * math.erfc((mean - at) / deviation * SQRT_HALF)
+            if sigma == 0.0 and at > well_e:
+                total += 1.0
             else:
-                total += 0.5 * math.erfc((mean - at) / math.sqrt(deviation**2 + sigma**2) * SQRT_HALF)
+                spread = math.sqrt(deviation**2 + sigma**2)
+                total += _normal_below((at - mean) / spread, third / spread**3)
         else:
             for j in range(n_nodes):
                 if sigma == 0.0:
@@ -408,8 +392,9 @@ def _below(q, nodes, weights, n_nodes, mean, deviation, well_e, sigma, half_step
 
 
 @njit()
-def _mixture(mean, is_poisson, well_e, points, shares, nodes, weights):
-    """Points and chances of a drawn charge that a well cuts off: Poisson's law, or the Gaussian by quadrature."""
+def _mixture(mean, is_poisson, well_e, quadrature, nodes, weights):
+    """Points and probabilities of a Poisson charge that a well cuts off: integers, or Edgeworth's series by quadrature."""
+    points, shares = quadrature
     n = 0
     rest = 1.0
     if is_poisson:
@@ -434,57 +419,56 @@ def _mixture(mean, is_poisson, well_e, points, shares, nodes, weights):
             charge = low + 0.5 * (points[j] + 1.0) * (high - low)
             z = (charge - mean) / deviation
             nodes[n] = charge
-            weights[n] = 0.5 * (high - low) * shares[j] * math.exp(-0.5 * z * z) / (deviation * SQRT_TWO_PI)
+            edgeworth = 1.0 + (z * z - 3.0) * z / (6.0 * deviation)
+            weights[n] = 0.5 * (high - low) * shares[j] * edgeworth * math.exp(-0.5 * z * z) / (deviation * SQRT_TWO_PI)
             rest -= weights[n]
             n += 1
     nodes[n], weights[n] = well_e, max(rest, 0.0)
     return n + 1
 
 
-@njit(
-    types.void(
-        _floats, _floats, types.float64, types.boolean, _floats, _floats, _floats, _floats, _floats, _floats, _floats, _ints,
-        types.float64, types.float64, types.int64, types.float64, _floats, types.int64, _floats, types.float64, types.uint64,
-        _floats, _floats, _floats, types.float64[::1], types.float64[::1],
-    ),
-)  # fmt: skip
-def predict_codes(
-    mean_e, variance_e2, poisson_below_e, is_drawn, well_e, sigma_e, half_step_e, v_per_e, gain, offset_v, line_offset_v, line,
-    v_sat_v, bend, way, strength, table, n_codes, inl, dnl, dnl_key, quantiles, points, shares, mean_dn, variance_dn2,
-):  # fmt: skip
+@njit(types.void(_charges, _transfer, _ints, _adc, _quadrature, types.float64[::1], types.float64[::1]))
+def predict_codes(charges, transfer, line, adc, quadrature, mean_dn, variance_dn2):
     """
     Mean and variance of the codes of sites.
 
-    ``mean_e`` is expected; with ``is_drawn`` the charge is drawn of it (Poisson's law below a mean, the Gaussian above) and cut
-    off by the well, without it is a Gaussian of ``variance_e2``, or that mean itself where this is 0.
+    With ``charges.is_drawn`` a charge is drawn of its mean (Poisson) and cut off by the well; without, it is a Gaussian of
+    ``variance_e2``, or that mean itself where this is 0.
     """
     nodes, weights = np.empty(MOST_NODES), np.empty(MOST_NODES)
-    for i in range(mean_e.size):
-        mean, well, sigma, half_step = mean_e[i], _at(well_e, i), _at(sigma_e, i), _at(half_step_e, i)
+    n_codes, bend = adc.n_codes, transfer.bend
+    for i in range(charges.mean_e.size):
+        mean, well = charges.mean_e[i], _at(charges.well_e, i)
+        sigma, half_step = _at(charges.sigma_e, i), _at(charges.half_step_e, i)
+        third = 0.0
         n_nodes = 0
-        deviation = math.sqrt(_at(variance_e2, i))
-        if is_drawn:
-            deviation = math.sqrt(mean)
-            if mean <= poisson_below_e:
-                n_nodes = _mixture(mean, True, well, points, shares, nodes, weights)
+        deviation = math.sqrt(_at(charges.variance_e2, i))
+        if charges.is_drawn:
+            deviation, third = math.sqrt(mean), mean
+            if mean <= charges.poisson_below_e:
+                n_nodes = _mixture(mean, True, well, quadrature, nodes, weights)
             elif well < mean + REACH_SIGMAS * deviation and sigma > 0.0:
-                n_nodes = _mixture(mean, False, well, points, shares, nodes, weights)
+                n_nodes = _mixture(mean, False, well, quadrature, nodes, weights)
         elif deviation == 0.0:
             n_nodes = 1
             nodes[0], weights[0] = min(mean, well), 1.0
-        per_e = _at(v_per_e, i) * _at(gain, i)
-        offset = _at(offset_v, i) + (line_offset_v[line[i]] if line_offset_v.size > 1 else line_offset_v[0])
+        site = (
+            _at(transfer.v_per_e, i), _at(transfer.sense_v, i), _at(transfer.scale, i), _at(transfer.output_v, i), bend,
+        )  # fmt: skip
+        if site[0] * site[2] == 0.0:
+            mean_dn[i], variance_dn2[i] = _code(_value(0.0, site, adc), line[i], adc), 0.0
+            continue
         reach = REACH_SIGMAS * math.sqrt(deviation**2 + sigma**2) + half_step + (FAR_ELECTRONS if n_nodes > 1 else 1.0)
         low, high = min(mean, well) - reach, min(mean, well) + reach
-        first = _value(low, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl)
-        last = _value(high, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl)
+        first, last = _value(low, site, adc), _value(high, site, adc)
         # Spread over more than a code of an even converter, and nowhere near its ends: a floor takes half a code off, and
         # spreads by a twelfth, to 1e-8.
-        smooth_dn = per_e / v_sat_v * n_codes * (sigma if n_nodes > 0 else math.sqrt(deviation**2 + sigma**2))
-        is_even = way == ADC_LINEAR and inl.size == 1 and dnl == 0.0 and bend == 0.0
+        dn_per_e = site[0] * site[2] / adc.v_sat_v * n_codes
+        smooth_dn = dn_per_e * (sigma if n_nodes > 0 else math.sqrt(deviation**2 + sigma**2))
+        is_even = adc.way == ADC_LINEAR and adc.inl.size == 1 and adc.dnl_dn == 0.0 and bend == 0.0
         if is_even and smooth_dn >= 1.0 and first > 0.0 and last < n_codes and mean + reach < well:
-            dn_per_e = per_e / v_sat_v * n_codes
-            mean_dn[i] = (mean + offset / per_e) * dn_per_e - 0.5
+            offset_v = site[1] * site[2] + site[3]
+            mean_dn[i] = mean * dn_per_e + offset_v / adc.v_sat_v * n_codes - 0.5
             variance_dn2[i] = (deviation**2 + sigma**2 + half_step**2) * dn_per_e**2 + 1.0 / 12.0
             continue
         k_first, k_last = max(math.floor(first) - 1, 0), min(math.floor(last) + 1, n_codes - 1)
@@ -493,14 +477,14 @@ def predict_codes(
         for k in range(k_first, k_last + 1):
             # Within one step of the even converter the line's own number splits it once.
             jump = 1.0
-            if dnl > 0.0:
-                moved = dnl * _dnl_normal(dnl_key, line[i], k, quantiles)
+            if adc.dnl_dn > 0.0:
+                moved = adc.dnl_dn * _dnl_normal(adc.dnl_key, line[i], k, adc.quantiles)
                 jump = math.ceil(k + moved) - (k + moved)
             for part in range(2):
                 border = k + jump if part == 0 else k + 1.0
                 if part == 1 and jump == 1.0:
                     continue
-                end = _charge(border, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl)
+                end = _charge(border, site, adc)
                 if k == k_last and (part == 1 or jump == 1.0):
                     end = np.inf
                 if end <= at:
@@ -508,11 +492,10 @@ def predict_codes(
                 below = (
                     1.0
                     if end == np.inf
-                    else _below(end, nodes, weights, n_nodes, mean, deviation, well, sigma, half_step)
+                    else _below(end, nodes, weights, n_nodes, mean, deviation, third, well, sigma, half_step)
                 )
                 middle = 0.5 * (at + end) if end < np.inf else max(at, high) + 1.0
-                value = _value(middle, per_e, offset, v_sat_v, bend, way, strength, table, n_codes, inl)
-                code = _code(value, line[i], n_codes, dnl, dnl_key, quantiles)
+                code = _code(_value(middle, site, adc), line[i], adc)
                 total += code * (below - reached)
                 squares += code * code * (below - reached)
                 at, reached = end, below

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +14,7 @@ from foveasim._core.validation import Floats, check_choice, check_count, finite_
 from foveasim.errors import ParameterError
 from foveasim.sensor.limits import check_plausible, check_plausible_array
 
-__all__ = ["QUANTISATION_DN2", "Companding", "Converter"]
+__all__ = ["QUANTISATION_DN2", "Companding", "ConversionTables", "Converter"]
 
 #: Ways from a share of the voltage range to a share of the codes.
 Companding = Literal["linear", "root", "log", "table"]
@@ -23,6 +23,20 @@ COMPANDINGS: tuple[Companding, ...] = ("linear", "root", "log", "table")
 N_QUANTILES = 4096
 #: Variance of rounding to a code, in squares of its width: a uniform distribution over one code.
 QUANTISATION_DN2 = 1.0 / 12.0
+
+
+class ConversionTables(NamedTuple):
+    """An ADC as the kernels take it: numbers, and read-only arrays of float64."""
+
+    v_sat_v: float
+    way: int
+    log_strength: float
+    curve: Floats
+    n_codes: int
+    inl: Floats
+    dnl_dn: float
+    dnl_key: np.uint64
+    quantiles: Floats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,6 +166,20 @@ class Converter:
         Release 4.0 Linear, equation 6), and each line adds a number of its own before each code.
         """
         return QUANTISATION_DN2 + self.dnl_dn**2
+
+    def tables(self, v_sat_v: float, dnl_key: np.uint64) -> ConversionTables:
+        """Return the arguments of the kernels, with the full range in V and the key of a device's DNL numbers."""
+        return ConversionTables(
+            v_sat_v=v_sat_v,
+            way=self.way,
+            log_strength=self.log_strength,
+            curve=self.curve,
+            n_codes=self.n_codes,
+            inl=self.inl,
+            dnl_dn=self.dnl_dn,
+            dnl_key=dnl_key & np.uint64(0xFFFFFFFF),
+            quantiles=self.quantiles,
+        )
 
     @cached_property
     def quantiles(self) -> Floats:

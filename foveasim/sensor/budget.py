@@ -1,4 +1,4 @@
-"""The noise budget: how much each source of noise adds, in electrons, to tell which one to fight."""
+"""The noise budget: how much each effect contributes, in electrons, to tell which one to reduce."""
 
 from __future__ import annotations
 
@@ -8,21 +8,27 @@ import numpy as np
 
 from foveasim._core.validation import Floats, as_numbers
 from foveasim.errors import ParameterError
+from foveasim.sensor.effects import STANDARD
 from foveasim.sensor.limits import check_plausible
+from foveasim.sensor.prediction import LEAST_SLOPE
 from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import local_step_e
-from foveasim.units import electrons_to_volts
 
 __all__ = ["FIXED", "TEMPORAL", "noise_budget"]
 
-#: Sources that change from frame to frame, and those that stay.
-TEMPORAL = ("shot of light", "shot of dark charge", "reset", "read", "telegraph", "quantisation")
-FIXED = ("photo response", "dark signal", "gain", "offset of pixels", "offset of lines")
+#: Standard lines of the budget: noise that changes from frame to frame, and fixed patterns.
+TEMPORAL = (
+    "photon_shot",
+    "dark_shot",
+    *(effect.name for effect in STANDARD if effect.is_temporal),
+    "quantisation",
+)
+FIXED = tuple(effect.name for effect in STANDARD if not effect.is_temporal)
 
 
 def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> dict[str, Floats]:
     """
-    Standard deviation that each source of noise alone gives to a site's charge.
+    Return the standard deviation that each effect alone gives to a site's charge.
 
     Parameters
     ----------
@@ -34,10 +40,10 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
     Returns
     -------
     noise_e : dict of (n_site,) float64, e-
-        By source, in the order of :data:`TEMPORAL` and :data:`FIXED`. What comes after the charge is converted back by the
-        slope of the whole chain at the site's mean: offsets, and the noise of conversion, a step over the root of 12 and
-        differential non-linearity. Squares add up, as
-        long as nothing is clipped: the temporal ones to the variance of a site, the fixed ones to that between like sites.
+        By name: :data:`TEMPORAL`, further temporal effects of the sensor, :data:`FIXED`, further fixed ones; 0 for effects that
+        the sensor does not have. Effects on the signal are referred to the charge by the slope of the whole chain at the
+        site's mean, and so is the noise of conversion: a step over the root of 12, and differential nonlinearity. As long as
+        nothing is clipped, squares add up: temporal ones to the variance of a site, fixed ones to that between like sites.
 
     Raises
     ------
@@ -46,33 +52,45 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
 
     Notes
     -----
-    Charge diffusion and coupling, which mix sites, are left out.
+    An effect's line is the root mean square of what it adds to the nominal values: ``sqrt(variance + (mean - nominal)²)`` of
+    its :meth:`~foveasim.sensor.effects.Effect.moments`, of fixed patterns over all devices. Crosstalk and inter-pixel
+    capacitance, which mix sites, are left out.
     """
     exposure_s = check_plausible("exposure_s", exposure_s)
     photo_e_per_s = as_numbers("photo_e_per_s", photo_e_per_s)
     n_sites = sensor.layout.n_sites
     if photo_e_per_s.shape != (n_sites,):
         raise ParameterError("photo_e_per_s", f"must be {n_sites} numbers, one a site, got {photo_e_per_s.shape}")
-    photo_e = photo_e_per_s * exposure_s * sensor.sensitivity
-    # Before DSNU and hot sites.
-    dark_e = np.broadcast_to(np.asarray(sensor.dark_e_per_s) * sensor.heat * exposure_s, (n_sites,))
-    volts_per_e = np.broadcast_to(electrons_to_volts(1.0, sensor.capacitance_f), (n_sites,))
-    charge_e = photo_e + dark_e
-    share = np.clip(charge_e * volts_per_e / sensor.v_sat_v, 0.0, 1.0)
-    bent_v_per_e = volts_per_e * (1.0 - 2.0 * sensor.nonlinearity_fraction * share)
-    step_e = local_step_e(sensor, charge_e, volts_per_e, np.full(1, sensor.pedestal_v))
-    is_drawn = sensor.shot_noise != "off"
-    noise_e = {
-        "shot of light": np.sqrt(photo_e) * is_drawn,
-        "shot of dark charge": np.sqrt(dark_e) * is_drawn,
-        "reset": sensor.ktc_noise_e,
-        "read": np.asarray(sensor.read_noise_e, np.float64),
-        "telegraph": sensor.rts_noise_e,
-        "quantisation": math.sqrt(sensor.converter.noise_dn2) * step_e,
-        "photo response": sensor.prnu_fraction * photo_e,
-        "dark signal": sensor.dsnu_fraction * dark_e,
-        "gain": sensor.gain_fpn_fraction * charge_e,
-        "offset of pixels": 0.0 if sensor.cds else sensor.pixel_fpn_fraction * sensor.v_sat_v / bent_v_per_e,
-        "offset of lines": sensor.line_fpn_fraction * sensor.v_sat_v / bent_v_per_e,
+    photo = photo_e_per_s * sensor.sensitivity
+    dark = np.broadcast_to(sensor.nominal_dark_e_per_s, n_sites)
+    charge_e = (photo + dark) * exposure_s
+    volts = charge_e * sensor.v_per_e
+    fraction = np.clip(volts / sensor.v_sat_v, 0.0, 1.0)
+    bend = sensor.nonlinearity_fraction
+    slope = np.maximum(1.0 - 2.0 * bend * fraction, LEAST_SLOPE)
+    # Nominal values at each stage, and electrons of one of their unit.
+    nominal = {
+        "photo": (photo, exposure_s),
+        "dark": (dark, exposure_s),
+        "expected": (charge_e, 1.0),
+        "charge": (charge_e, 1.0),
+        "sense_node": (volts, 1.0 / sensor.v_per_e),
+        "output": (volts * (1.0 - bend * fraction) + sensor.pedestal_v, 1.0 / (sensor.v_per_e * slope)),
     }
-    return {name: np.broadcast_to(noise_e[name], (n_sites,)).copy() for name in (*TEMPORAL, *FIXED)}
+    step_e = local_step_e(sensor, charge_e, sensor.v_per_e, np.full(1, sensor.pedestal_v))
+    temporal = dict.fromkeys(TEMPORAL, np.zeros(1))
+    fixed = dict.fromkeys(FIXED, np.zeros(1))
+    temporal["quantisation"] = math.sqrt(sensor.converter.noise_dn2) * step_e
+    any_device = sensor.sites.of_any_device()
+    for effect in sensor.chain:
+        if effect.stage == "collection":
+            if sensor.shot.is_drawn:
+                for name, values in (("photon_shot", photo), ("dark_shot", dark)):
+                    temporal[name] = np.sqrt(effect.moments(values * exposure_s, np.zeros(1), sites=any_device)[1])
+        elif effect.is_temporal or effect.is_local:
+            values, e_per_unit = nominal[effect.stage]
+            sites = sensor.sites if effect.is_temporal else any_device
+            mean, variance = effect.moments(values, np.zeros(1), sites=sites)
+            lines = temporal if effect.is_temporal else fixed
+            lines[effect.name] = np.sqrt(variance + (mean - values) ** 2) * e_per_unit
+    return {name: np.broadcast_to(line, n_sites).copy() for name, line in (temporal | fixed).items()}

@@ -8,7 +8,7 @@ temporal dark noise, defect pixels. Codes are linear: what a companding converte
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Bools, Floats, as_numbers, check_count, check_number, finite_array, own, unmasked
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.adc import QUANTISATION_DN2
-from foveasim.sensor.crosstalk import Neighbourhood
+from foveasim.sensor.effects.crosstalk import Neighbourhood
 from foveasim.sensor.limits import check_plausible, check_plausible_array
 from foveasim.sensor.sensor import Sensor
 from foveasim.units import volts_to_electrons
@@ -424,16 +424,15 @@ def calibrate(
     n_frames = check_count("n_frames", n_frames, at_least=2)
     n_sites = sensor.layout.n_sites
     flat = np.ascontiguousarray(_one_or_per_site("flat_e", check_plausible_array("flat_e", flat_e), n_sites, above=0.0))
-    meant = replace(sensor, prnu_fraction=0.0, dsnu_fraction=0.0, hot_fraction=0.0, dead_fraction=0.0)
+    meant = sensor.nominal()
     darkness = np.zeros(n_sites)
     dark_e = meant.expected_electrons(darkness, exposure_s)
     signal_e = meant.expected_electrons(flat / exposure_s, exposure_s) - dark_e
     # RTS noise is a defect, which makes a site noisy: not part of what is meant.
-    noise_e2 = dark_e * (sensor.shot_noise != "off") + replace(meant, rts_fraction=0.0).readout_noise_e2()
-    if sensor.coupling is not None:
-        capacitance_f = None if np.ndim(sensor.capacitance_f) == 0 else sensor.capacitance_f
-        coupling = sensor.coupling.mixing(sensor.layout, capacitance_f=capacitance_f)
-        signal_e, dark_e = coupling.apply(signal_e), coupling.apply(dark_e)
+    quiet = meant.without(*(effect.name for effect in meant.chain if effect.half_step(meant.sites) is not None))
+    dark_e2 = dark_e if sensor.shot.is_drawn else np.zeros(1)
+    noise_e2 = dark_e2 + quiet.readout_model(dark_e).noise_e2
+    signal_e, dark_e = (meant.readout_model(part).mean_e for part in (signal_e, dark_e))
     e_per_dn = nominal_e_per_dn(sensor)
     table = None if sensor.companding == "linear" and not sensor.inl_dn else sensor.converter.linear_dn
 

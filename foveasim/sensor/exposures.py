@@ -7,7 +7,7 @@ readings share, never by a reading's own value, which would favour readings that
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Floats, Ints, as_numbers, own, unmasked
 from foveasim.errors import ParameterError
-from foveasim.sensor.adc import QUANTISATION_DN2
 from foveasim.sensor.calibration import Calibration, linearised, nominal_e_per_dn
+from foveasim.sensor.chain import run
+from foveasim.sensor.effects.shot import LARGEST_CHARGE_E, ROUNDING_E2, draw_shot_noise
 from foveasim.sensor.limits import check_plausible_array
-from foveasim.sensor.noise import LARGEST_CHARGE_E, draw_shot_noise
 from foveasim.sensor.sensor import Sensor
 
 __all__ = ["Ramp", "Rates", "fit_ramp", "merge_exposures", "non_destructive_reads"]
@@ -169,8 +169,7 @@ def merge_exposures(
     charge_e = (linear_dn - offset_dn) / gain * e_per_dn
     top_dn = _saturation_dn(sensor)
     top_e = (top_dn - offset_dn) / gain * e_per_dn
-    fixed_e2 = _conversion_noise_e2(sensor, codes, e_per_dn) + sensor.readout_noise_e2()
-    shot = 0.0 if sensor.shot_noise == "off" else 1.0
+    conversion_e2 = _conversion_noise_e2(sensor, codes, e_per_dn)
     is_used = (codes < 2.0**sensor.bits - 1.0) & (linear_dn < top_dn) & np.isfinite(charge_e) & (top_e > 0.0)
     t_s = times_s[:, None]
     rates = np.where(is_used, charge_e, 0.0) / t_s
@@ -182,7 +181,8 @@ def merge_exposures(
     rate = (taper * rates * t_s).sum(axis=0) / whole
     share = taper
     for _ in range(N_PASSES):
-        information = t_s**2 / (shot * (np.maximum(rate, 0.0) + dark_e_per_s) * t_s + fixed_e2)
+        readings = sensor.readout_model(*sensor.shot.moments((np.maximum(rate, 0.0) + dark_e_per_s) * t_s, np.zeros(1)))
+        information = t_s**2 / (readings.variance_e2 + readings.noise_e2 + conversion_e2)
         whole = np.where(is_known, (taper * information).sum(axis=0), 1.0)
         share = taper * information / whole
         rate = (share * rates).sum(axis=0)
@@ -249,21 +249,21 @@ def non_destructive_reads(
             "photo_e_per_s", f"must be one number, or one for each of the {n_sites} sites, got the shape {light.shape}"
         )
     per_s = sensor.expected_electrons(np.broadcast_to(light, n_sites), 1.0)
-    well_e = LARGEST_CHARGE_E if sensor.full_well_e is None else np.minimum(sensor.full_well_e, LARGEST_CHARGE_E)
-    well_e = np.floor(well_e).astype(np.int64)
-    reset_e = sensor.ktc_noise_e * streams.of("reset").standard_normal(n_sites)
-    # The noise of resetting is in the charge already.
-    reader = replace(sensor, ktc_noise=False) if sensor.ktc_noise_e.any() else sensor
+    well_e = np.minimum(sensor.well_e, LARGEST_CHARGE_E).astype(np.int64)
+    at_reset = [effect for effect in sensor.chain if effect.is_drawn_at_reset]
+    reset_e = run(at_reset, np.zeros(n_sites), sites=sensor.sites, streams=streams, n_threads=n_threads)
+    # What is drawn at the reset is in the charge already.
+    reader = sensor.without(*(effect.name for effect in at_reset)) if at_reset else sensor
     electrons = np.empty((times.size, n_sites), np.int64)
     codes = []
     collected = np.zeros(n_sites, np.int64)
     for k, interval_s in enumerate(np.diff(times, prepend=0.0)):
         own = Streams(int(streams.of("read of a ramp", k).integers(2**63)), streams.frame)
-        if sensor.shot_noise == "off":
+        if not sensor.shot.is_drawn:
             collected = draw_shot_noise(per_s * times[k], "off", sensor.gaussian_above_e, own)
         else:
             collected = collected + draw_shot_noise(
-                per_s * interval_s, sensor.shot_noise, sensor.gaussian_above_e, own, n_threads=n_threads
+                per_s * interval_s, sensor.shot.how, sensor.gaussian_above_e, own, n_threads=n_threads
             )
         collected = np.minimum(collected, well_e)
         electrons[k] = collected
@@ -317,7 +317,9 @@ def fit_ramp(
     codes, linear_dn, e_per_dn = _readings(code, times.size, sensor, "read")
     n_sites = sensor.layout.n_sites
     charge_e = linear_dn * e_per_dn
-    noise_e2 = _conversion_noise_e2(sensor, codes, e_per_dn) + sensor.readout_noise_e2(is_reset=False)
+    noise_e2 = _conversion_noise_e2(sensor, codes, e_per_dn) + sensor.readout_model(charge_e, is_reset=False).noise_e2
+    if not sensor.shot.is_drawn:
+        noise_e2 += ROUNDING_E2
     is_below = (codes < 2.0**sensor.bits - 1.0) & (linear_dn < _saturation_dn(sensor))
     is_used = np.logical_and.accumulate(is_below, axis=0)
     n_used = np.count_nonzero(is_used, axis=0).astype(np.int64)
@@ -332,7 +334,7 @@ def fit_ramp(
             raise ParameterError(
                 "weight_rate_e_per_s", f"must be one number, or one for each of the {n_sites} sites, got {rate.shape}"
             )
-    if sensor.shot_noise == "off":
+    if not sensor.shot.is_drawn:
         rate = np.zeros(1)
     dt_s = np.where(is_used[1:], np.diff(times)[:, None], 0.0)
     rise_e = np.where(is_used[1:], np.diff(charge_e, axis=0), 0.0)
@@ -381,9 +383,7 @@ def _readings(code: ArrayLike, n_readings: int, sensor: Sensor, what: str) -> tu
 def _conversion_noise_e2(sensor: Sensor, codes: NDArray[Any], e_per_dn: Floats) -> Floats:
     """Variance of conversion to codes, (n_reading, n_site) e-²: wider codes err more."""
     step_e = sensor.converter.width_of_code_dn(codes) * e_per_dn
-    # Without shot noise charges are integers by rounding.
-    whole_e2 = QUANTISATION_DN2 if sensor.shot_noise == "off" else 0.0
-    return np.asarray(step_e**2 * sensor.converter.noise_dn2 + whole_e2)
+    return np.asarray(step_e**2 * sensor.converter.noise_dn2)
 
 
 def _saturation_dn(sensor: Sensor) -> Floats:
@@ -392,10 +392,10 @@ def _saturation_dn(sensor: Sensor) -> Floats:
     top_dn = np.full(n_sites, float(linearised(2**sensor.bits - 1, sensor)))
     if sensor.full_well_e is None:
         return top_dn
-    still = replace(sensor, read_noise_e=0.0, ktc_noise=False, rts_e=0.0, coupling=None)
-    well_e = np.floor(np.minimum(np.broadcast_to(sensor.full_well_e, n_sites), LARGEST_CHARGE_E)).astype(np.int64)
+    still = sensor.without(*(e.name for e in sensor.chain if e.is_temporal or (e.stage == "charge" and not e.is_local)))
+    well_e = np.broadcast_to(np.minimum(sensor.well_e, LARGEST_CHARGE_E), n_sites).astype(np.int64)
     well_dn = linearised(still.read(well_e, streams=Streams(0)), sensor)
-    noise_dn = np.sqrt(sensor.readout_noise_e2()) / nominal_e_per_dn(sensor)
+    noise_dn = np.sqrt(sensor.readout_model(sensor.well_e).noise_e2) / nominal_e_per_dn(sensor)
     return np.minimum(top_dn, well_dn - MARGIN_SIGMAS * noise_dn - 1.0)
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
-from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from dataclasses import KW_ONLY, dataclass, fields, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,26 +13,27 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, check_number, read_only, unmasked
 from foveasim.errors import ParameterError, SimulationError
-from foveasim.fields import PackedRings
-from foveasim.sensor.adc import Companding, Converter
-from foveasim.sensor.crosstalk import Coupling, Diffusion, KernelCrosstalk, Mixing, Neighbourhood
+from foveasim.sensor.adc import Companding, ConversionTables, Converter
+from foveasim.sensor.blocks import in_blocks
+from foveasim.sensor.chain import Factor, Nonlinearity, Offset, Step, check_effects, check_names, merged, ordered, run
 from foveasim.sensor.device import Device
+from foveasim.sensor.effects import EFFECTS, STANDARD, Effect, Photosites, Sites, dark_current_factor
+from foveasim.sensor.effects.contract import FixedFactor, FixedOffset
+from foveasim.sensor.effects.crosstalk import Coupling, Diffusion, KernelCrosstalk
+from foveasim.sensor.effects.shot import LARGEST_CHARGE_E, ShotChoice, ShotNoise
 from foveasim.sensor.limits import LIMITS, check_plausible, check_plausible_array
-from foveasim.sensor.noise import LARGEST_CHARGE_E, ShotNoise, draw_shot_noise, in_blocks, pieces
+from foveasim.sensor.prediction import ChargeDistributions, ReadoutModel, cut_off, quadrature, readout_model
 from foveasim.sensor.spectral.curves import CurveError
 from foveasim.sensor.spectral.response import ConstantCurve, Curve, FilterSet, rgb_filters
-from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C, electrons_to_volts, photon_energy_j
+from foveasim.units import electrons_to_volts, photon_energy_j
 
 if TYPE_CHECKING:
     from foveasim.sensor.calibration import Calibration
 
 __all__ = ["PerSite", "Photosites", "Sensor"]
 
-#: Points of the quadrature over a charge that the full well cuts off.
-QUADRATURE_NODES = 96
 #: Means that are drawn by Poisson's law one electron after the other: more take too long.
 MOST_INVERTED_E = 700.0
-NO_SITES = read_only(np.zeros(0, np.int64))
 #: Parameters with one value for all sites or one per site, and those with one value.
 _PER_SITE = ("sensitivity", "dark_e_per_s", "full_well_e", "read_noise_e", "capacitance_f")
 _NUMBERS = (
@@ -43,26 +44,6 @@ _NUMBERS = (
 
 #: One value for all sites, or an array (n_site,).
 PerSite = float | NDArray[np.float64]
-
-
-class Photosites(PackedRings, Neighbourhood, Protocol):
-    """Outlines with a colour channel per site, as the sensor needs them; :class:`foveasim.Layout` is one."""
-
-    @property
-    def n_sites(self) -> int:
-        """Number of sites."""
-
-    @property
-    def channel(self) -> Ints:
-        """Index of each site's colour filter, (n_site,)."""
-
-    @property
-    def readout_line(self) -> Ints:
-        """Line that each site is read through, (n_site,)."""
-
-    @property
-    def columns(self) -> Mapping[str, NDArray[Any]]:
-        """Data per site by name; ``channel`` is among them where sites differ in colour."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -135,6 +116,11 @@ class Sensor:
         Of the converter: see :class:`foveasim.sensor.Converter`.
     device_seed : int
         Which of all devices of this kind it is: seed of everything that is fixed from its making on.
+    effects : sequence of Effect
+        Further noise sources and fixed patterns: :mod:`foveasim.sensor.effects`. They take part in captures, predictions, the
+        noise budget and all weights that depend on noise.
+    disabled : sequence of str
+        Names of effects that are switched off, those of keywords too; the draws of all others stay as they are.
 
     Raises
     ------
@@ -160,7 +146,7 @@ class Sensor:
     hot_e_per_s: float = 0.0
     dead_fraction: float = 0.0
     crosstalk: Diffusion | KernelCrosstalk | None = None
-    shot_noise: ShotNoise = "auto"
+    shot_noise: ShotChoice = "auto"
     gaussian_above_e: float = 100.0
     full_well_e: PerSite | None = None
     coupling: Coupling | None = None
@@ -183,6 +169,8 @@ class Sensor:
     inl_dn: Sequence[float] = ()
     dnl_dn: float = 0.0
     device_seed: int = 0
+    effects: Sequence[Effect] = ()
+    disabled: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         if not all(hasattr(self.layout, name) for name in ("n_sites", "channel", "columns")):
@@ -232,6 +220,8 @@ class Sensor:
             part = getattr(self, name)
             if part is not None and not isinstance(part, kinds):
                 raise ParameterError(name, f"must be a {' or a '.join(k.__name__ for k in kinds)}", part)
+        object.__setattr__(self, "effects", check_effects(self.effects))
+        object.__setattr__(self, "disabled", check_names(self.disabled, self.effects))
         _ = self._filters_and_qe
         for name in ("bits", "companding_table", "inl_dn"):
             object.__setattr__(self, name, getattr(self.converter, name))
@@ -253,6 +243,43 @@ class Sensor:
                 f"the layout has sites of channel {highest}, but the sensor only the filters 0 to {self.n_filters - 1} "
                 f"({', '.join(self.filter_names)})"
             )
+
+    @classmethod
+    def from_settings(cls, layout: Photosites, settings: Mapping[str, Any]) -> Sensor:
+        """
+        Return the sensor that the settings of a capture describe, without its filters and quantum efficiency.
+
+        Parameters
+        ----------
+        layout : Layout
+            That of the capture.
+        settings : mapping
+            ``capture.settings["sensor"]``. Effects are looked up by class among those of the package and
+            :data:`foveasim.sensor.effects.EFFECTS`.
+
+        Raises
+        ------
+        ParameterError
+            When a parameter that has no default of 0 or none is missing, arrays of the sites were too long to be stored, or an
+            effect is not known.
+        """
+        kinds: tuple[Any, ...] = (Diffusion, KernelCrosstalk, Coupling, *EFFECTS.values())
+        classes = {kind.__name__: kind for kind in kinds}
+        values: dict[str, Any] = {}
+        for parameter in fields(cls):
+            name = parameter.name
+            if name in ("layout", "qe", "filters"):
+                continue
+            value = settings.get(name)
+            is_array = isinstance(value, Mapping) and "sha256" in value
+            if is_array or (name not in settings and parameter.default):
+                of_sites = " of every site" if is_array else ""
+                raise ParameterError(
+                    "sensor", f"must be given: the capture's settings do not tell its {name!r}{of_sites}"
+                )
+            if name in settings:
+                values[name] = _object(classes, value)
+        return cls(layout, **values)
 
     def __repr__(self) -> str:
         return f"Sensor({self.layout!r}, filters {', '.join(self.filter_names)}, {self.bits} bits)"
@@ -352,113 +379,141 @@ class Sensor:
         """What is fixed from the device's making on."""
         return Device(self.device_seed, self.layout)
 
+    # -- effects ------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def chain(self) -> tuple[Effect, ...]:
+        """All effects of the sensor that are not disabled, in the order in which they act."""
+        standard = [
+            *(effect for cls in STANDARD if (effect := cls.from_sensor(self)) is not None),
+            *(effect for effect in (self.crosstalk, self.coupling) if effect is not None),
+            ShotNoise("off" if ShotNoise.name in self.disabled else self.shot_noise, self.gaussian_above_e),
+        ]
+        # Inter-pixel capacitance comes before the noise of the readout.
+        standard.sort(key=lambda effect: effect.is_local)
+        chain = ordered((*standard, *self.effects))
+        return tuple(effect for effect in chain if effect.name not in self.disabled or effect.stage == "collection")
+
+    def without(self, *names: str) -> Sensor:
+        """
+        Return the sensor with some effects switched off; the draws of all others stay as they are.
+
+        Parameters
+        ----------
+        *names : str
+            Names of effects, as in :attr:`chain`: ``sensor.without("read", "prnu")``.
+
+        Raises
+        ------
+        ParameterError
+            When a name is not that of an effect.
+        """
+        return replace(self, disabled=tuple(dict.fromkeys((*self.disabled, *names))))
+
+    def nominal(self) -> Sensor:
+        """Return the sensor without the fixed patterns of its device."""
+        return self.without(*(e.name for e in self.chain if e.is_local and not e.is_temporal))
+
+    @property
+    def shot(self) -> ShotNoise:
+        """The draw from expected to collected charge."""
+        (shot,) = (effect for effect in self.chain if isinstance(effect, ShotNoise))
+        return shot
+
+    @cached_property
+    def sites(self) -> Sites:
+        """The photosites as effects take them: with the device and the capacitances of the sense nodes."""
+        capacitance_f = read_only(np.atleast_1d(np.asarray(self.capacitance_f, np.float64)).copy())
+        return Sites(self.layout, self.device, capacitance_f)
+
+    def _at(self, *stages: str) -> list[Effect]:
+        return [effect for effect in self.chain if effect.stage in stages]
+
+    def pattern(self, name: str) -> Floats:
+        """
+        Return the fixed pattern of an effect on this device.
+
+        Parameters
+        ----------
+        name : str
+            Name of an effect that is a fixed factor or offset, such as "prnu", or "rts".
+
+        Returns
+        -------
+        pattern : (n_site,) or (1,) float64
+            Factors, or offsets in the unit of the effect's stage; for "rts" half the distance of the two states, e-.
+
+        Raises
+        ------
+        ParameterError
+            When the sensor has no such effect.
+        """
+        patterns: dict[str, Floats] = {}
+        for effect in self.chain:
+            if isinstance(effect, FixedFactor | FixedOffset):
+                patterns[effect.name] = self.sites.pattern(effect, effect.pattern)
+            elif (half_step := effect.half_step(self.sites)) is not None:
+                patterns[effect.name] = half_step
+        if name not in patterns:
+            names = ", ".join(patterns) or "none"
+            raise ParameterError("name", f"must be one of the sensor's fixed patterns ({names})", name)
+        return patterns[name]
+
     @cached_property
     def response(self) -> Floats:
-        """Relative response of every site to light, (n_site,) or (1,): sensitivity, PRNU and dead sites."""
-        gain = np.atleast_1d(np.asarray(self.sensitivity, np.float64))
-        if self.prnu_fraction:
-            gain = gain * np.maximum(1.0 + self.prnu_fraction * self.device.normals("prnu"), 0.0)
-        if self.dead_fraction:
-            gain = np.where(self.device.uniforms("dead") < self.dead_fraction, 0.0, gain)
-        return read_only(gain.copy())
+        """Relative response of every site to light, (n_site,) or (1,): sensitivity, PRNU, dead sites and further effects."""
+        return self._fixed(self.sensitivity, "photo")
 
     @cached_property
     def dark_rate_e_per_s(self) -> Floats:
-        """Dark current of every site at the sensor's temperature, (n_site,) or (1,) e-/s: DSNU and hot sites."""
-        rate = np.atleast_1d(np.asarray(self.dark_e_per_s, np.float64)).copy()
-        if self.dsnu_fraction:
-            rate = rate * self.device.log_normals("dsnu", self.dsnu_fraction)
-        if self.hot_fraction:
-            rate = rate + self.hot_e_per_s * (self.device.uniforms("hot") < self.hot_fraction)
-        return read_only(rate * self.heat)
+        """Dark current of every site at the sensor's temperature, (n_site,) or (1,) e-/s: DSNU, hot sites, further effects."""
+        return self._fixed(self.nominal_dark_e_per_s, "dark")
+
+    @property
+    def nominal_dark_e_per_s(self) -> Floats:
+        """Dark current at the sensor's temperature without fixed patterns, (n_site,) or (1,) e-/s."""
+        return np.atleast_1d(np.asarray(self.dark_e_per_s, np.float64)) * self.heat
+
+    def _fixed(self, values: PerSite | Floats, stage: str) -> Floats:
+        """Values of all sites after the effects of a stage."""
+        effects, values = self._at(stage), np.atleast_1d(np.asarray(values, np.float64))
+        if not effects:
+            return read_only(values.copy())
+        return read_only(run(effects, np.broadcast_to(values, self.layout.n_sites), sites=self.sites))
 
     @property
     def heat(self) -> float:
         """Dark current at the sensor's temperature over that at ``dark_reference_k``."""
-        try:
-            return float(2.0 ** ((self.temperature_k - self.dark_reference_k) / self.dark_doubling_k))
-        except OverflowError:
-            return float("inf")
+        return dark_current_factor(self.temperature_k, self.dark_reference_k, self.dark_doubling_k)
 
     @cached_property
-    def ktc_noise_e(self) -> Floats:
-        """Standard deviation of the noise of resetting, ``sqrt(k T C) / q``, (n_site,) or (1,) e-; 0 where it is off."""
-        if not self.ktc_noise or self.cds:
-            return read_only(np.zeros(1))
-        capacitance_f = np.atleast_1d(np.asarray(self.capacitance_f, np.float64))
-        return read_only(np.sqrt(BOLTZMANN_J_PER_K * self.temperature_k * capacitance_f) / ELEMENTARY_CHARGE_C)
+    def v_per_e(self) -> Floats:
+        """Nominal conversion gain at zero signal, (n_site,) or (1,) V/e-."""
+        return read_only(np.atleast_1d(electrons_to_volts(1.0, self.capacitance_f)))
 
     @cached_property
-    def rts_noise_e(self) -> Floats:
-        """Standard deviation of every site's RTS noise, (n_site,) or (1,) e-: half the distance of its two states."""
-        if not self.telegraph_sites.size:
-            return read_only(np.zeros(1))
-        noise_e = np.zeros(self.layout.n_sites)
-        noise_e[self.telegraph_sites] = 0.5 * self.rts_e
-        return read_only(noise_e)
-
-    def readout_noise_e2(self, *, is_reset: bool = True, is_device_known: bool = True) -> Floats:
-        """
-        Variance of every site's charge by its readout: reset (kTC), read and RTS noise.
-
-        Parameters
-        ----------
-        is_reset : bool
-            Whether reset noise counts: it does not in differences of reads of one charge.
-        is_device_known : bool
-            Whether the device's RTS sites are known; otherwise every site has the mean RTS variance of all.
-
-        Returns
-        -------
-        variance_e2 : (n_site,) or (1,) float64, e-²
-            Before quantisation. RTS noise of two equally probable states ``rts_e`` apart has the variance ``rts_e² / 4``.
-        """
-        rts_e2 = np.square(self.rts_noise_e) if is_device_known else np.full(1, self.rts_fraction * self.rts_e**2 / 4.0)
-        reset_e2 = np.square(self.ktc_noise_e) if is_reset else np.zeros(1)
-        return np.asarray(np.atleast_1d(np.square(self.read_noise_e)) + reset_e2 + rts_e2)
-
-    @cached_property
-    def gain(self) -> Floats:
-        """Relative volts per charge of every site, (n_site,) or (1,)."""
-        if not self.gain_fpn_fraction:
-            return read_only(np.ones(1))
-        return read_only(np.maximum(1.0 + self.gain_fpn_fraction * self.device.normals("gain"), 0.0))
-
-    @cached_property
-    def pixel_offset_v(self) -> Floats:
-        """Offset of every site, (n_site,) or (1,) V: the pedestal and, without double sampling, its own."""
-        if not self.pixel_fpn_fraction or self.cds:
-            return read_only(np.full(1, self.pedestal_v))
-        return read_only(self.pedestal_v + self.v_sat_v * self.pixel_fpn_fraction * self.device.normals("pixel offset"))
-
-    @cached_property
-    def line_offset_v(self) -> Floats:
-        """Offset of every readout line by its number, (n_line,) or (1,) V."""
-        if not self.line_fpn_fraction:
-            return read_only(np.zeros(1))
-        lines = np.arange(int(self.layout.readout_line.max(initial=0)) + 1)
-        offset_v = self.v_sat_v * self.line_fpn_fraction * self.device.line_normals("line offset", lines)
-        return read_only(np.resize(offset_v, max(lines.size, 2)))
-
-    @cached_property
-    def telegraph_sites(self) -> Ints:
-        """Sites with random telegraph noise."""
-        return np.flatnonzero(self.device.uniforms("telegraph") < self.rts_fraction) if self.rts_fraction else NO_SITES
-
-    @cached_property
-    def _crosstalk(self) -> Mixing | None:
-        return None if self.crosstalk is None else self.crosstalk.mixing(self.layout)
-
-    @cached_property
-    def _coupling(self) -> Mixing | None:
-        if self.coupling is None:
-            return None
-        per_site = None if np.ndim(self.capacitance_f) == 0 else self.capacitance_f
-        return self.coupling.mixing(self.layout, capacitance_f=per_site)
+    def well_e(self) -> Floats:
+        """Full well capacity in whole electrons, (n_site,) or (1,) e-; infinite where there is no limit."""
+        if self.full_well_e is None:
+            return read_only(np.full(1, np.inf))
+        return read_only(np.floor(np.atleast_1d(np.asarray(self.full_well_e, np.float64))))
 
     # -- charge and code ------------------------------------------------------------------------------------------
 
-    def expected_electrons(self, photo_e_per_s: Floats, exposure_s: float) -> Floats:
+    @cached_property
+    def _before_exposure(self) -> tuple[Step, ...]:
+        return merged((Factor(self.sensitivity), *self._at("photo"), Offset(self.dark_rate_e_per_s)), self.sites)
+
+    @cached_property
+    def _after_collection(self) -> tuple[Step, ...]:
+        steps: list[Step] = [*self._at("charge"), Factor(self.v_per_e), *self._at("sense_node")]
+        if self.nonlinearity_fraction:
+            steps.append(Nonlinearity(self.nonlinearity_fraction, self.v_sat_v))
+        if self.pedestal_v:
+            steps.append(Offset(self.pedestal_v))
+        return merged((*steps, *self._at("output")), self.sites)
+
+    def expected_electrons(self, photo_e_per_s: Floats, exposure_s: float, *, n_threads: int | None = None) -> Floats:
         """
         Expected charge of every site at the end of an exposure, (n_site,) e-: photoelectrons and dark charge, diffused.
 
@@ -468,81 +523,53 @@ class Sensor:
             When the exposure is negative, or implausible.
         """
         exposure_s = check_plausible("exposure_s", exposure_s)
-        photo_e_per_s = unmasked("photo_e_per_s", photo_e_per_s)
-        expected_e = (photo_e_per_s * self.response + self.dark_rate_e_per_s) * exposure_s
-        return expected_e if self._crosstalk is None else self._crosstalk.apply(expected_e)
+        photo = np.broadcast_to(np.asarray(unmasked("photo_e_per_s", photo_e_per_s)), self.layout.n_sites)
+        steps = (*self._before_exposure, Factor(exposure_s), *self._at("expected"))
+        return run(steps, photo, sites=self.sites, n_threads=n_threads)
 
     def collect(self, expected_e: Floats, *, streams: Streams, n_threads: int | None = None) -> Ints:
         """Charge that a draw gives, (n_site,) int64 e-: shot noise, then the full well."""
         expected_e = self._checked_charges("expected_e", expected_e)
-        electrons = draw_shot_noise(expected_e, self.shot_noise, self.gaussian_above_e, streams, n_threads=n_threads)
-        if self.full_well_e is not None:
-            well_e = np.floor(np.minimum(self.full_well_e, LARGEST_CHARGE_E)).astype(np.int64)
-            np.minimum(electrons, well_e, out=electrons)
-        return electrons
+        well_e = np.minimum(self.well_e, LARGEST_CHARGE_E).astype(np.int64)
+
+        def cut_off_by_well(electrons: Ints, sites: Sites, out: Ints) -> None:
+            np.minimum(electrons, sites.of(well_e), out=out)
+
+        electrons = np.empty(expected_e.size, np.int64)
+        steps = [self.shot]
+        return run(
+            steps,
+            expected_e,
+            sites=self.sites,
+            streams=streams,
+            n_threads=n_threads,
+            out=electrons,
+            last=cut_off_by_well,
+        )
 
     def read(self, electrons: Ints, *, streams: Streams, n_threads: int | None = None) -> NDArray[Any]:
         """
         Digital code of every charge, (n_site,) uint8 or uint16.
 
-        Noise of resetting and reading, volts, offsets, the clip at V_sat and the converter: without companding and faults
-        code ``k`` stands for the voltages from ``k * V_sat / 2**bits`` to the next.
+        Effects on the charge, volts, nonlinearity, effects on the signal, the clip at V_sat and the converter: without
+        companding and faults code ``k`` stands for the voltages from ``k * V_sat / 2**bits`` to the next.
         """
         from foveasim.sensor import _kernels
 
         electrons = self._checked_charges("electrons", electrons, at_least=-np.inf)
-        code = np.empty(electrons.size, np.uint8 if self.bits <= 8 else np.uint16)
-        noises_e = {"reset": self.ktc_noise_e, "read": np.atleast_1d(np.asarray(self.read_noise_e, np.float64))}
-        noises_e = {effect: sigma_e for effect, sigma_e in noises_e.items() if sigma_e.any()}
-        v_per_e = np.atleast_1d(electrons_to_volts(1.0, self.capacitance_f))
         line = np.ascontiguousarray(self.layout.readout_line)
-        telegraph_e = self._telegraph_e(streams)
-        read_out = _kernels.read_out
-        conversion = self._conversion
+        tables = self._tables
 
-        charges: NDArray[Any] = electrons if self._coupling is None else self._coupling.apply(electrons)
+        def convert(voltage_v: Floats, sites: Sites, code: NDArray[Any]) -> None:
+            _kernels.convert(voltage_v, sites.of(line), tables, code)
 
-        def block(number: int, whole: slice) -> None:
-            generators = {effect: streams.of(effect, number) for effect in noises_e}
-            # Each block has one random stream per effect; pieces of a block fit the processor's cache.
-            for sites in pieces(whole):
-                charge_e = charges[sites].astype(np.float64)
-                for effect, sigma_e in noises_e.items():
-                    noise = generators[effect].standard_normal(charge_e.size)
-                    noise *= _part(sigma_e, sites)
-                    charge_e += noise
-                if telegraph_e is not None:
-                    charge_e += telegraph_e[sites]
-                read_out(
-                    charge_e,
-                    _part(v_per_e, sites),
-                    _part(self.pixel_offset_v, sites),
-                    self.line_offset_v,
-                    _part(self.gain, sites),
-                    line[sites],
-                    *conversion,
-                    code[sites],
-                )
+        code = np.empty(electrons.size, np.uint8 if self.bits <= 8 else np.uint16)
+        steps = self._after_collection
+        return run(steps, electrons, sites=self.sites, streams=streams, n_threads=n_threads, out=code, last=convert)
 
-        in_blocks(electrons.size, block, n_threads)
-        return code
-
-    @property
-    def _conversion(self) -> tuple[Any, ...]:
-        """Arguments of the kernels from volts to codes: range, nonlinearity and ADC."""
-        adc = self.converter
-        return (
-            self.v_sat_v,
-            self.nonlinearity_fraction,
-            adc.way,
-            adc.log_strength,
-            adc.curve,
-            adc.n_codes,
-            adc.inl,
-            adc.dnl_dn,
-            self.device.key("dnl")[0] & np.uint64(0xFFFFFFFF),
-            adc.quantiles,
-        )
+    @cached_property
+    def _tables(self) -> ConversionTables:
+        return self.converter.tables(self.v_sat_v, self.device.key("dnl")[0])
 
     def _checked_charges(self, name: str, charge_e: ArrayLike, at_least: float = 0.0) -> NDArray[Any]:
         charges = np.asarray(unmasked(name, charge_e))
@@ -565,20 +592,6 @@ class Sensor:
         """
         return np.ascontiguousarray(self._checked_charges(name, charge_e), np.float64)
 
-    def coupled(self, mean_e: Floats, variance_e2: Floats) -> tuple[Floats, Floats]:
-        """Mean and variance of independent charges after inter-pixel coupling, (n_site,) e- and e-² each."""
-        if self._coupling is None:
-            return mean_e, variance_e2
-        return self._coupling.apply(mean_e), self._coupling.variance(variance_e2)
-
-    def _telegraph_e(self, streams: Streams) -> Floats | None:
-        sites = self.telegraph_sites
-        if sites.size == 0 or not self.rts_e:
-            return None
-        charge_e = np.zeros(self.layout.n_sites)
-        charge_e[sites] = self.rts_e * (streams.of("telegraph").random(sites.size) - 0.5 > 0.0) - 0.5 * self.rts_e
-        return charge_e
-
     def calibrate(
         self, *, exposure_s: float, flat_e: ArrayLike, n_frames: int, seed: int, **options: Any
     ) -> Calibration:
@@ -586,6 +599,40 @@ class Sensor:
         from foveasim.sensor.calibration import calibrate
 
         return calibrate(self, exposure_s=exposure_s, flat_e=flat_e, n_frames=n_frames, seed=seed, **options)
+
+    def readout_model(
+        self,
+        mean_e: ArrayLike,
+        variance_e2: ArrayLike = 0.0,
+        *,
+        is_reset: bool = True,
+        is_device_known: bool = True,
+    ) -> ReadoutModel:
+        """
+        Return how collected charges become voltages, to first order at their means, and the noise that is added.
+
+        Parameters
+        ----------
+        mean_e, variance_e2 : (..., n_site) or number, e- and e-²
+            Moments of the collected charges, such as those of :attr:`shot`.
+        is_reset : bool
+            Whether noise that is drawn at the reset counts: it does not in differences of reads of one charge.
+        is_device_known : bool
+            Whether the fixed patterns of the device are known; otherwise means over all devices take their place.
+        """
+        mean_e, variance_e2 = (np.atleast_1d(np.asarray(part, np.float64)) for part in (mean_e, variance_e2))
+        return readout_model(
+            [effect for effect in self._at("charge") if is_reset or not effect.is_drawn_at_reset],
+            self._at("sense_node"),
+            self._at("output"),
+            mean_e=mean_e,
+            variance_e2=variance_e2,
+            sites=self.sites if is_device_known else self.sites.of_any_device(),
+            v_per_e=self.v_per_e,
+            bend=self.nonlinearity_fraction,
+            v_sat_v=self.v_sat_v,
+            pedestal_v=self.pedestal_v,
+        )
 
     def predict(self, expected_e: Floats, *, n_threads: int | None = None) -> tuple[Floats, Floats]:
         """
@@ -609,48 +656,51 @@ class Sensor:
 
         Notes
         -----
-        The code is even between borders of the charge, and weighs what the charge's distribution has between: Poisson's law up
-        to ``gaussian_above_e`` (for ``"exact"`` too: above it a Gaussian), cut off by the full well, with the Gaussian noise
-        of resetting and reading and the telegraph's two states. Coupled charges are taken as Gaussian of the coupled variance.
+        The code is constant between borders of the charge, and weighs the probability that the charge's distribution has
+        between: Poisson up to ``gaussian_above_e`` (for ``"exact"`` too), above it a Gaussian with Edgeworth's term of the
+        skewness, cut off by the full well. Effects of the readout act by their moments: to first order at the mean, and
+        temporal noise as Gaussian, but RTS noise by its two states. Charges that are mixed after the draw, as by
+        inter-pixel capacitance, are taken as Gaussian.
         """
         from foveasim.sensor import _kernels
 
         expected_e = self.checked_charges("expected_e", expected_e)
         mean_dn, variance_dn2 = np.empty(expected_e.size), np.empty(expected_e.size)
-        well_e = np.array([np.inf]) if self.full_well_e is None else np.floor(np.atleast_1d(self.full_well_e))
-        sigma_e = np.sqrt(self.ktc_noise_e**2 + np.atleast_1d(self.read_noise_e) ** 2)
-        is_drawn = self.shot_noise != "off"
+        well_e, is_drawn = self.well_e, self.shot.is_drawn
         drawn_e, drawn_e2 = expected_e, np.zeros(1)
         if not is_drawn:
             drawn_e = np.minimum(np.rint(expected_e), well_e)
-        if self._coupling is not None:
+        model = self.readout_model(*cut_off(drawn_e, drawn_e if is_drawn else np.zeros(1), well_e))
+        if model.is_mixed:
             # What the well leaves of a draw is mixed, and taken as a Gaussian.
-            mean_e, variance_e2 = _cut_off(drawn_e, drawn_e if is_drawn else np.zeros(1), well_e)
-            drawn_e, drawn_e2 = self.coupled(mean_e, variance_e2)
+            drawn_e, drawn_e2 = model.mean_e, model.variance_e2
             is_drawn, well_e = False, np.array([np.inf])
-        points, shares = _quadrature()
+        sigma_e, way = np.sqrt(model.gaussian_e2), model.transfer
         line = np.ascontiguousarray(self.layout.readout_line)
-        v_per_e = np.atleast_1d(electrons_to_volts(1.0, self.capacitance_f))
-        conversion = self._conversion
-        predict_codes = _kernels.predict_codes
 
         def block(_: int, sites: slice) -> None:
-            predict_codes(
-                drawn_e[sites],
-                _part(drawn_e2, sites),
-                self.gaussian_above_e,
-                is_drawn,
-                _part(well_e, sites),
-                _part(sigma_e, sites),
-                _part(self.rts_noise_e, sites),
-                _part(v_per_e, sites),
-                _part(self.gain, sites),
-                _part(self.pixel_offset_v, sites),
-                self.line_offset_v,
+            def part(values: Floats) -> Floats:
+                return read_only(self.sites.block(sites).of(values).view())
+
+            _kernels.predict_codes(
+                ChargeDistributions(
+                    mean_e=part(drawn_e),
+                    variance_e2=part(drawn_e2),
+                    well_e=part(well_e),
+                    sigma_e=part(sigma_e),
+                    half_step_e=part(model.half_step_e),
+                    poisson_below_e=self.gaussian_above_e,
+                    is_drawn=is_drawn,
+                ),
+                way._replace(
+                    v_per_e=part(way.v_per_e),
+                    sense_v=part(way.sense_v),
+                    scale=part(way.scale),
+                    output_v=part(way.output_v),
+                ),
                 line[sites],
-                *conversion,
-                points,
-                shares,
+                self._tables,
+                quadrature(),
                 mean_dn[sites],
                 variance_dn2[sites],
             )
@@ -659,28 +709,13 @@ class Sensor:
         return mean_dn, variance_dn2
 
 
-def _part(values: Floats, sites: slice) -> Floats:
-    """Values of some sites, or the one of all."""
-    return values[sites] if values.size > 1 else values
-
-
-@cache
-def _quadrature() -> tuple[Floats, Floats]:
-    """Gauss's points and weights from -1 to 1: an eigenvalue problem, which takes longer than the codes of a small sensor."""
-    points, shares = np.polynomial.legendre.leggauss(QUADRATURE_NODES)
-    return read_only(points), read_only(shares)
-
-
-def _cut_off(mean_e: Floats, variance_e2: Floats, end_e: Floats) -> tuple[Floats, Floats]:
-    """Mean and variance of a Gaussian whose values beyond an end are put to it."""
-    from scipy.special import ndtr
-
-    deviation = np.sqrt(np.maximum(variance_e2, 1e-12))
-    z = np.clip((end_e - mean_e) / deviation, -40.0, 40.0)
-    below, at = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
-    # How far below the end, and its square; where all lies far below, the Gaussian itself.
-    short = deviation * (z * below + at)
-    short2 = deviation**2 * ((1.0 + z * z) * below + z * at)
-    is_free = z >= 40.0
-    cut = np.where(is_free, mean_e, np.where(is_free, 0.0, end_e) - short)
-    return cut, np.where(is_free, variance_e2, np.maximum(short2 - short**2, 0.0))
+def _object(classes: Mapping[str, Any], data: Any) -> Any:
+    """The object of one of some classes that plain data describe; other data as they are."""
+    if isinstance(data, list):
+        return [_object(classes, item) for item in data]
+    if not isinstance(data, Mapping):
+        return data
+    kind = data.get("kind")
+    if str(kind) not in classes:
+        raise ParameterError("sensor", f"must be given: its effect {kind!r} is not registered")
+    return classes[str(kind)](**{name: value for name, value in data.items() if name != "kind"})

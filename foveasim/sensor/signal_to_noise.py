@@ -13,17 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.validation import Bools, Floats
-from foveasim.sensor.adc import QUANTISATION_DN2
+from foveasim.sensor.prediction import LEAST_SLOPE, ReadoutModel
 from foveasim.sensor.sensor import Sensor
-from foveasim.units import electrons_to_volts
 
 __all__ = ["SiteSignals", "local_step_e", "signal_to_noise"]
 
 #: Within this many standard deviations of the full well or of the highest code, noise is cut off: its variance falls from there
 #: on, which is EMVA 1288's saturation.
 CUT_OFF_SIGMAS = 2.0
-#: Least slope of a bent response at its end, relative to that at 0.
-LEAST_SLOPE = 1e-6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -120,32 +117,30 @@ def signal_to_noise(sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike) ->
     charge_e, dark = (
         sensor.checked_charges(name, values) for name, values in (("expected_e", expected_e), ("dark_e", dark_e))
     )
-    is_drawn = sensor.shot_noise != "off"
-    well_e = np.full(1, np.inf) if sensor.full_well_e is None else np.floor(np.atleast_1d(sensor.full_well_e))
-    is_saturated = charge_e + CUT_OFF_SIGMAS * np.sqrt(charge_e * is_drawn) >= well_e
+    shot, well_e = sensor.shot, sensor.well_e
+    is_saturated = charge_e + CUT_OFF_SIGMAS * np.sqrt(charge_e * shot.is_drawn) >= well_e
     charge_e, dark = np.minimum(charge_e, well_e), np.minimum(dark, well_e)
-    shot_e2 = charge_e if is_drawn else np.full(n_sites, QUANTISATION_DN2)
-    charge_e, shot_e2 = sensor.coupled(charge_e, shot_e2)
-    dark, _ = sensor.coupled(dark, np.zeros(n_sites))
+    model = sensor.readout_model(*shot.moments(charge_e, np.zeros(n_sites)))
+    charge_e, shot_e2 = (np.broadcast_to(part, n_sites) for part in (model.mean_e, model.variance_e2))
+    dark = sensor.readout_model(dark).mean_e
 
-    per_e = electrons_to_volts(1.0, sensor.capacitance_f) * sensor.gain
-    line = sensor.line_offset_v
-    offset_v = sensor.pixel_offset_v + (line[sensor.layout.readout_line] if line.size > 1 else line)
-    readout_e2 = sensor.readout_noise_e2()
-    top_e = _top_e(sensor, per_e, offset_v)
-    step_e = local_step_e(sensor, charge_e, per_e, offset_v)
-    noise_e = np.sqrt(shot_e2 + readout_e2 + step_e**2 * sensor.converter.noise_dn2)
+    top_e = _top_e(sensor, model)
+    step_e = _step_e(sensor, charge_e, model)
+    noise_e = np.sqrt(shot_e2 + model.noise_e2 + step_e**2 * sensor.converter.noise_dn2)
     is_saturated |= charge_e + CUT_OFF_SIGMAS * noise_e >= top_e
     is_over = charge_e > top_e
     # A site beyond its range has the ratio of its end.
     part = np.divide(top_e, charge_e, out=np.ones(n_sites), where=is_over)
     charge_e, dark = np.minimum(charge_e, top_e), np.minimum(dark, top_e)
-    step_e = np.where(is_over, local_step_e(sensor, charge_e, per_e, offset_v), step_e)
-    noise_e = np.sqrt(shot_e2 * (part if is_drawn else 1.0) + readout_e2 + step_e**2 * sensor.converter.noise_dn2)
+    step_e = np.where(is_over, _step_e(sensor, charge_e, model), step_e)
+    noise_e = np.sqrt(
+        shot_e2 * (part if shot.is_drawn else 1.0) + model.noise_e2 + step_e**2 * sensor.converter.noise_dn2
+    )
+    gain_v_per_e = model.transfer.v_per_e * model.transfer.scale
     return SiteSignals(
         signal_e=np.maximum(charge_e - dark, 0.0),
         noise_e=np.broadcast_to(noise_e, (n_sites,)),
-        gain_dn_per_e=np.asarray(per_e / sensor.v_sat_v * 2.0**sensor.bits),
+        gain_dn_per_e=np.asarray(gain_v_per_e / sensor.v_sat_v * 2.0**sensor.bits),
         is_saturated=np.asarray(is_saturated),
     )
 
@@ -163,22 +158,37 @@ def local_step_e(sensor: Sensor, charge_e: Floats, volts_per_e: Floats, offset_v
     volts_per_e, offset_v : (n_site,) or (1,) float64, V
         As they are in the device, or as they are meant.
     """
+    offset = np.asarray(offset_v, np.float64)
+    return _local_step_e(sensor, charge_e, volts_per_e, np.zeros(1), np.ones(1), offset)
+
+
+def _step_e(sensor: Sensor, charge_e: Floats, model: ReadoutModel) -> Floats:
+    """Width of a code at given charges on this device, e-."""
+    way = model.transfer
+    return _local_step_e(sensor, charge_e, way.v_per_e, way.sense_v, way.scale, way.output_v)
+
+
+def _local_step_e(
+    sensor: Sensor, charge_e: Floats, v_per_e: Floats, sense_v: Floats, scale: Floats, output_v: Floats
+) -> Floats:
     with np.errstate(divide="ignore"):
-        fraction = np.clip(charge_e * volts_per_e / sensor.v_sat_v, 0.0, 1.0)
+        fraction = np.clip((charge_e * v_per_e + sense_v) / sensor.v_sat_v, 0.0, 1.0)
         bend = sensor.nonlinearity_fraction
-        lifted = np.clip(fraction * (1.0 - bend * fraction) + offset_v / sensor.v_sat_v, 0.0, 1.0)
-        slope_v_per_e = volts_per_e * np.maximum(1.0 - 2.0 * bend * fraction, LEAST_SLOPE)
+        lifted = np.clip(fraction * (1.0 - bend * fraction) * scale + output_v / sensor.v_sat_v, 0.0, 1.0)
+        slope_v_per_e = v_per_e * scale * np.maximum(1.0 - 2.0 * bend * fraction, LEAST_SLOPE)
         step_v = sensor.converter.width_at_dn(lifted) * sensor.v_sat_v / 2.0**sensor.bits
         return np.asarray(step_v / slope_v_per_e)
 
 
-def _top_e(sensor: Sensor, volts_per_e: Floats, offset_v: Floats) -> Floats:
+def _top_e(sensor: Sensor, model: ReadoutModel) -> Floats:
     """Charge at which the highest code begins, at least 0, infinite where no charge gives it."""
-    fraction = np.maximum(sensor.converter.borders[-2] - offset_v / sensor.v_sat_v, 0.0)
-    bend = sensor.nonlinearity_fraction
-    if bend:
-        is_within = fraction < 1.0 - bend
-        bent = 0.5 * (1.0 - np.sqrt(np.maximum(1.0 - 4.0 * bend * fraction, 0.0))) / bend
-        fraction = np.where(is_within, bent, fraction / (1.0 - bend))
+    way = model.transfer
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(volts_per_e > 0.0, fraction * sensor.v_sat_v / volts_per_e, np.inf)
+        fraction = np.maximum((sensor.converter.borders[-2] - way.output_v / sensor.v_sat_v) / way.scale, 0.0)
+        bend = sensor.nonlinearity_fraction
+        if bend:
+            is_within = fraction < 1.0 - bend
+            bent = 0.5 * (1.0 - np.sqrt(np.maximum(1.0 - 4.0 * bend * fraction, 0.0))) / bend
+            fraction = np.where(is_within, bent, fraction / (1.0 - bend))
+        top_v = np.maximum(fraction * sensor.v_sat_v - way.sense_v, 0.0)
+        return np.where(way.v_per_e > 0.0, top_v / way.v_per_e, np.inf)

@@ -11,11 +11,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.threads import each, thread_count
 from foveasim._core.validation import (
     Floats,
     Ints,
@@ -27,6 +28,8 @@ from foveasim._core.validation import (
     finite_array,
 )
 from foveasim.errors import ParameterError, SimulationError
+from foveasim.sensor.blocks import BLOCK_SITES
+from foveasim.sensor.effects.contract import Effect, Sites, Stage
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -93,7 +96,7 @@ class Mixing:
     def __repr__(self) -> str:
         return f"Mixing({self.matrix.shape[0]} sites, {self.matrix.nnz} shares, {self.n_exchanges} exchanges)"
 
-    def apply(self, charge_e: ArrayLike) -> Floats:
+    def apply(self, charge_e: ArrayLike, *, n_threads: int | None = None) -> Floats:
         """
         Charges after crosstalk.
 
@@ -101,6 +104,8 @@ class Mixing:
         ----------
         charge_e : (..., n_site), e-
             Expected charges or drawn ones, or anything that mixes as they do. Not changed.
+        n_threads : int, optional
+            All cores by default.
 
         Returns
         -------
@@ -119,8 +124,26 @@ class Mixing:
         columns = np.moveaxis(self._per_site("charge_e", charge_e), -1, 0)
         mixed = columns.reshape(columns.shape[0], -1) if columns.ndim > 1 else columns
         for _ in range(self.n_exchanges):
-            mixed = self.matrix @ mixed
+            mixed = self._product(mixed, n_threads)
         return np.ascontiguousarray(np.moveaxis(mixed.reshape(columns.shape), 0, -1))
+
+    def _product(self, columns: Floats, n_threads: int | None) -> Floats:
+        """The matrix times columns, in blocks of rows."""
+        if len(self._row_blocks) < 2:
+            return np.asarray(self.matrix @ columns)
+        out = np.empty_like(columns)
+
+        def multiply(block: tuple[slice, csr_array[Any]]) -> None:
+            rows, matrix = block
+            out[rows] = matrix @ columns
+
+        each(multiply, self._row_blocks, thread_count(n_threads))
+        return out
+
+    @cached_property
+    def _row_blocks(self) -> list[tuple[slice, csr_array[Any]]]:
+        starts = range(0, self.matrix.shape[0], BLOCK_SITES)
+        return [(rows := slice(start, start + BLOCK_SITES), self.matrix[rows]) for start in starts]
 
     def variance(self, variance: ArrayLike) -> Floats:
         """
@@ -128,12 +151,12 @@ class Mixing:
 
         Parameters
         ----------
-        variance : (n_site,)
+        variance : (..., n_site)
             Before it, in the square of any unit.
 
         Returns
         -------
-        variance : (n_site,) float64
+        variance : (..., n_site) float64
             ``sum_i matrix[j, i]**2 * variance[i]``, in the same unit.
 
         Raises
@@ -148,7 +171,9 @@ class Mixing:
                 f"variances pass one exchange only, and this mixing has {self.n_exchanges}; diffusion comes before the draw"
             )
         values = self._per_site("variance", variance)
-        return np.asarray(self._squared @ values)
+        columns = np.moveaxis(values, -1, 0)
+        mixed = self._squared @ columns.reshape(columns.shape[0], -1)
+        return np.ascontiguousarray(np.moveaxis(mixed.reshape(columns.shape), 0, -1))
 
     @cached_property
     def _squared(self) -> csr_array[Any]:
@@ -162,11 +187,35 @@ class Mixing:
         return array
 
 
+class _Crosstalk(Effect):
+    """Crosstalk in the chain: compiled for the sites at the first use."""
+
+    is_temporal: ClassVar[bool] = False
+    is_local: ClassVar[bool] = False
+
+    def compiled_for(self, sites: Sites) -> Mixing:
+        """Return the operator for all sites of the layout."""
+        raise NotImplementedError
+
+    def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
+        """Return charges after crosstalk, (n_site,)."""
+        _ = rng
+        return sites.once(self, self.compiled_for).apply(values, n_threads=sites.n_threads)
+
+    def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
+        """Return moments of independent charges after crosstalk, (..., n_site)."""
+        mixing = sites.once(self, self.compiled_for)
+        mean, variance = (
+            np.broadcast_to(part, np.broadcast_shapes(np.shape(part), (sites.n_sites,))) for part in (mean, variance)
+        )
+        return mixing.apply(mean), mixing.variance(variance) if np.any(variance) else np.zeros(1)
+
+
 # -- before the draw --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
-class Diffusion:
+class Diffusion(_Crosstalk):
     """
     Charge that wanders sideways while it drifts to its photosite: an exchange between neighbours of any shape.
 
@@ -214,8 +263,15 @@ class Diffusion:
     [950.0, 50.0]
     """
 
+    name: ClassVar[str] = "crosstalk"
+    stage: ClassVar[Stage] = "expected"
+
     spread_um: float
     max_gap_um: float | None = None
+
+    def compiled_for(self, sites: Sites) -> Mixing:
+        """Return the operator for all sites of the layout."""
+        return self.mixing(sites.layout)
 
     def __post_init__(self) -> None:
         spread_um = check_number("spread_um", self.spread_um, at_least=0.0, at_most=LARGEST_SPREAD_UM)
@@ -301,7 +357,7 @@ class Diffusion:
 
 
 @dataclass(frozen=True, kw_only=True)
-class KernelCrosstalk:
+class KernelCrosstalk(_Crosstalk):
     """
     The same few shares around every site of a rectangular grid: a convolution, as in the paper.
 
@@ -336,9 +392,16 @@ class KernelCrosstalk:
     [75.0, 25.0, 8.0]
     """
 
+    name: ClassVar[str] = "crosstalk"
+    stage: ClassVar[Stage] = "expected"
+
     kernel: Sequence[Sequence[float]]
     border: Literal["kept", "lost"] = "kept"
     pitch_um: float | tuple[float, float] | None = None
+
+    def compiled_for(self, sites: Sites) -> Mixing:
+        """Return the operator for all sites of the layout."""
+        return self.mixing(sites.layout)
 
     def __post_init__(self) -> None:
         kernel = finite_array("kernel", self.kernel, ndim=2, at_least=0.0)
@@ -410,7 +473,7 @@ class KernelCrosstalk:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Coupling:
+class Coupling(_Crosstalk):
     """
     Capacitances between neighbouring readout nodes: a part of each charge is read at its neighbours.
 
@@ -453,9 +516,16 @@ class Coupling:
     [50.0, 4900.0, 50.0]
     """
 
+    name: ClassVar[str] = "ipc"
+    stage: ClassVar[Stage] = "charge"
+
     neighbour_share: float
     edge_um: float | None = None
     max_gap_um: float | None = None
+
+    def compiled_for(self, sites: Sites) -> Mixing:
+        """Return the operator for all sites of the layout, with the capacitances of their sense nodes."""
+        return self.mixing(sites.layout, capacitance_f=sites.capacitance_f if sites.capacitance_f.size > 1 else None)
 
     def __post_init__(self) -> None:
         share = check_number("neighbour_share", self.neighbour_share, at_least=0.0, at_most=LARGEST_SHARE)

@@ -1,0 +1,105 @@
+"""Registries: what the package offers by name, with what users and installed packages add."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from difflib import get_close_matches
+from importlib.metadata import entry_points
+from typing import Any, Generic, TypeVar, overload
+
+from foveasim.errors import ParameterError
+
+__all__ = ["Registry"]
+
+T = TypeVar("T")
+F = TypeVar("F")
+_log = logging.getLogger("foveasim")
+
+
+class Registry(Mapping[str, T], Generic[T]):
+    """
+    Objects of one kind by name: our own, those that a program registers, and entry points of installed packages.
+
+    Parameters
+    ----------
+    kind : str
+        What the objects are, for messages: "layout family".
+    group : str
+        Group of entry points, such as "foveasim.layouts"; the name of an entry point is that of its object. They are loaded
+        when the registry is first read. One that fails to load is reported as a warning and left out.
+    """
+
+    def __init__(self, kind: str, group: str) -> None:
+        self.kind, self.group = kind, group
+        self._objects: dict[str, T] = {}
+        self._is_complete = False
+
+    @overload
+    def register(self, name: str, item: T) -> T: ...
+
+    @overload
+    def register(self, name: str) -> Callable[[F], F]: ...
+
+    def register(self, name: str, item: Any = None) -> Any:
+        """
+        Add an object, or decorate one.
+
+        Parameters
+        ----------
+        name : str
+        item : object, optional
+            Without it, a decorator is returned.
+
+        Raises
+        ------
+        ParameterError
+            When the name is taken by another object.
+        """
+        if item is None:
+            return lambda decorated: self.register(name, decorated)
+        taken = self._objects.get(name)
+        if taken is not None and (getattr(taken, "__module__", 0), getattr(taken, "__qualname__", 0)) != (
+            getattr(item, "__module__", 1),
+            getattr(item, "__qualname__", 1),
+        ):
+            raise ParameterError("name", f"must be new: there is another {self.kind} of this name", name)
+        self._objects[name] = item
+        return item
+
+    def _all(self) -> dict[str, T]:
+        if not self._is_complete:
+            self._is_complete = True
+            for point in entry_points(group=self.group):
+                try:
+                    self.register(point.name, point.load())
+                except Exception as error:  # noqa: BLE001 -- code of another package may raise anything
+                    package = point.dist.name if point.dist is not None else point.value
+                    reason = " ".join(str(error).split()) or type(error).__name__
+                    _log.warning("%s '%s' of %s cannot be loaded (%s)", self.kind, point.name, package, reason)
+        return self._objects
+
+    def __getitem__(self, name: str) -> T:
+        return self._all()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(sorted(self._all()))
+
+    def __len__(self) -> int:
+        return len(self._all())
+
+    def find(self, parameter: str, name: object) -> T:
+        """
+        Return the object of a name that a user gives.
+
+        Raises
+        ------
+        ParameterError
+            When there is none; with the closest name.
+        """
+        objects = self._all()
+        if isinstance(name, str) and name in objects:
+            return objects[name]
+        closest = get_close_matches(str(name), objects, n=1)
+        hint = f"did you mean '{closest[0]}'?" if closest else f"there are {', '.join(self) or 'none'}"
+        raise ParameterError(parameter, f"must be the name of a {self.kind}", name, cure=hint)

@@ -1,0 +1,77 @@
+"""
+Effects: noise sources, fixed patterns and crosstalk, one frozen class each.
+
+``STANDARD`` lists, in the order of the chain, the classes that the keywords of :class:`foveasim.Sensor` build. Others derive
+from :class:`Effect`, or from :class:`AdditiveNoise`, :class:`FixedFactor` or :class:`FixedOffset`, and are given to a sensor
+as ``effects=[...]``, in settings files by their names in :data:`EFFECTS`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from foveasim._core.registry import Registry
+from foveasim.sensor.effects.contract import (
+    STAGES,
+    AdditiveNoise,
+    Effect,
+    FixedFactor,
+    FixedOffset,
+    Photosites,
+    Sites,
+    Stage,
+)
+from foveasim.sensor.effects.crosstalk import Coupling, Diffusion, KernelCrosstalk, Mixing
+from foveasim.sensor.effects.dark import DarkSignal, HotSites, dark_current_factor
+from foveasim.sensor.effects.fixed_pattern import ColumnOffset, PixelGain, PixelOffset
+from foveasim.sensor.effects.readout import ReadNoise, ResetNoise, TelegraphNoise
+from foveasim.sensor.effects.response import DeadSites, PhotoResponse
+from foveasim.sensor.effects.shot import ShotNoise, draw_shot_noise
+
+__all__ = [
+    "EFFECTS",
+    "STAGES",
+    "STANDARD",
+    "AdditiveNoise",
+    "ColumnOffset",
+    "Coupling",
+    "DarkSignal",
+    "DeadSites",
+    "Diffusion",
+    "Effect",
+    "FixedFactor",
+    "FixedOffset",
+    "HotSites",
+    "KernelCrosstalk",
+    "Mixing",
+    "PhotoResponse",
+    "Photosites",
+    "PixelGain",
+    "PixelOffset",
+    "ReadNoise",
+    "ResetNoise",
+    "ShotNoise",
+    "Sites",
+    "Stage",
+    "TelegraphNoise",
+    "dark_current_factor",
+    "draw_shot_noise",
+]
+
+#: Further effects by their names in settings files: register a class with ``@EFFECTS.register("name")``, or in an installed
+#: package with an entry point of the group ``foveasim.effects``.
+EFFECTS: Registry[type[Effect]] = Registry("effect", "foveasim.effects")
+
+#: Classes that a sensor's keywords build, in the order of the chain; ``from_sensor`` gives None for an effect that is off.
+STANDARD: tuple[Any, ...] = (
+    PhotoResponse,
+    DeadSites,
+    DarkSignal,
+    HotSites,
+    ResetNoise,
+    ReadNoise,
+    TelegraphNoise,
+    PixelGain,
+    PixelOffset,
+    ColumnOffset,
+)

@@ -1,0 +1,290 @@
+"""
+The contract of effects: noise sources, fixed patterns and crosstalk.
+
+The sensor chain is an ordered tuple of effects. All that a sensor computes (draws, predictions, the noise budget, the weights
+of reconstruction and of merged exposures) goes through :meth:`Effect.apply` and :meth:`Effect.moments`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from threading import RLock
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foveasim._core.validation import Floats, Ints, read_only
+from foveasim.errors import SimulationError
+from foveasim.fields import PackedRings
+from foveasim.sensor.device import Device
+
+__all__ = ["STAGES", "AdditiveNoise", "Effect", "FixedFactor", "FixedOffset", "Photosites", "Sites", "Stage"]
+
+T = TypeVar("T")
+#: Where an effect acts.
+Stage = Literal["photo", "dark", "expected", "collection", "charge", "sense_node", "output"]
+#: Unit of the values at each stage, in the order of the chain.
+STAGES: Mapping[Stage, str] = MappingProxyType(
+    {
+        "photo": "e-/s",  # photocurrent
+        "dark": "e-/s",  # dark current
+        "expected": "e-",  # expected charge
+        "collection": "e-",  # the shot-noise draw, of which there is one
+        "charge": "e-",  # collected charge
+        "sense_node": "V",  # charge over capacitance
+        "output": "V",  # after the nonlinearity, before clipping and conversion
+    }
+)
+
+
+class Photosites(PackedRings, Protocol):
+    """Outlines with columns per site, as the sensor needs them; :class:`foveasim.Layout` is one."""
+
+    @property
+    def n_sites(self) -> int:
+        """Number of sites."""
+
+    @property
+    def area_um2(self) -> Floats:
+        """Area of each site, (n_site,) µm²."""
+
+    @property
+    def centroid_um(self) -> Floats:
+        """Centroid of each site, (n_site, 2) µm."""
+
+    @property
+    def channel(self) -> Ints:
+        """Index of each site's colour filter, (n_site,)."""
+
+    @property
+    def readout_line(self) -> Ints:
+        """Readout line of each site, (n_site,)."""
+
+    @property
+    def columns(self) -> Mapping[str, NDArray[Any]]:
+        """Data per site by name; ``channel`` is among them where sites differ in colour."""
+
+    def adjacency(self, *, max_gap_um: float | None = None) -> Any:
+        """Lengths of the edges that sites share, (n_site, n_site) sparse, µm."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sites:
+    """
+    Photosites that an effect acts on: all of a layout, or a block of them.
+
+    Attributes
+    ----------
+    layout : Layout
+        All photosites.
+    known_device : Device or None
+        None stands for any device of the kind: moments are then those over all devices.
+    capacitance_f : (n_site,) or (1,) float64, F
+        Capacitance of the sense nodes.
+    index : slice
+        Which sites of the layout these are.
+    n_threads : int or None
+        Threads that an effect on all sites may use; None for all cores.
+    """
+
+    layout: Photosites
+    known_device: Device | None
+    capacitance_f: Floats
+    index: slice = field(default_factory=lambda: slice(None))
+    n_threads: int | None = None
+    _known: dict[Any, Any] = field(default_factory=dict, repr=False)
+    _lock: Any = field(default_factory=RLock, repr=False)
+
+    @property
+    def n_sites(self) -> int:
+        """Number of these sites."""
+        return len(range(*self.index.indices(self.layout.n_sites)))
+
+    def block(self, index: slice, *, n_threads: int | None = 1) -> Sites:
+        """Return a block of the layout's sites."""
+        return replace(self, index=index, n_threads=n_threads)
+
+    def of_any_device(self) -> Sites:
+        """Return the same sites without a device: moments are then those over all devices of the kind."""
+        return replace(self, known_device=None)
+
+    @property
+    def device(self) -> Device:
+        """
+        Source of the numbers that fabrication fixes, :meth:`Device.normals` among them.
+
+        Raises
+        ------
+        SimulationError
+            When the device is not known.
+        """
+        if self.known_device is None:
+            raise SimulationError(
+                "a fixed pattern that differs between devices must define pattern_moments(), its mean and variance over devices"
+            )
+        return self.known_device
+
+    def of(self, values: ArrayLike) -> Any:
+        """Return the part of an array (n_site, ...) of the layout that belongs to these sites; one value for all as it is."""
+        array = np.asarray(values)
+        return array[self.index] if array.ndim and array.shape[0] > 1 else array
+
+    def once(self, key: Any, compute: Callable[[Sites], T]) -> T:
+        """
+        Return what a function of all sites gives, computed at the first call.
+
+        Parameters
+        ----------
+        key : object
+            The effect that asks, or a tuple of it and a name.
+        compute : callable
+            Called with all sites of the layout.
+        """
+        key = tuple(map(id, key)) if isinstance(key, tuple) else id(key)
+        if key not in self._known:
+            with self._lock:
+                if key not in self._known:
+                    self._known[key] = compute(replace(self, index=slice(None)))
+        return self._known[key]
+
+    def pattern(self, effect: Any, compute: Callable[[Sites], ArrayLike]) -> Floats:
+        """Return the part for these sites of an array (n_site,) or number, computed for all sites at the first call."""
+
+        def computed(sites: Sites) -> Floats:
+            return read_only(np.atleast_1d(np.asarray(compute(sites), np.float64)).copy())
+
+        return self.of(self.once(effect, computed))
+
+
+class Effect(ABC):
+    """
+    One noise source, fixed pattern or crosstalk. Subclasses are frozen dataclasses.
+
+    Attributes
+    ----------
+    name : str
+        Key of the noise budget and of the random stream; unique in a sensor.
+    stage : Stage
+        Where the effect acts, which also sets the unit of its values: :data:`STAGES`.
+    is_temporal : bool
+        Whether it is drawn again for each frame; otherwise it is fixed for a device, or deterministic. Before collection
+        effects are fixed.
+    is_local : bool
+        Whether a site's result depends on that site alone. Otherwise :meth:`apply` gets all sites at once.
+    is_drawn_at_reset : bool
+        Whether all reads between two resets share one draw.
+    """
+
+    name: ClassVar[str]
+    stage: ClassVar[Stage]
+    is_temporal: ClassVar[bool]
+    is_local: ClassVar[bool] = True
+    is_drawn_at_reset: ClassVar[bool] = False
+
+    @abstractmethod
+    def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
+        """
+        Return values after the effect.
+
+        Parameters
+        ----------
+        values : (n,) float64, unit of the stage
+            May be overwritten and returned.
+        sites : Sites
+            The ``n`` sites that the values belong to.
+        rng : numpy.random.Generator
+            Stream of this effect, frame and block of sites. Fixed effects get None: they take numbers from ``sites.device``.
+        """
+
+    @abstractmethod
+    def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
+        """
+        Return mean and variance after the effect, without drawing.
+
+        Parameters
+        ----------
+        mean, variance : (n,) or (1,) float64, unit of the stage and its square
+        sites : Sites
+            With a device, fixed patterns are its known numbers; without one, moments are over all devices.
+        """
+
+    def half_step(self, sites: Sites) -> Floats | None:
+        """Return half the distance of two equally probable states, (n,) or (1,); None for effects of other distributions."""
+        _ = sites
+        return None
+
+
+class _FixedPattern(Effect):
+    is_temporal: ClassVar[bool] = False
+
+    @abstractmethod
+    def pattern(self, sites: Sites) -> ArrayLike:
+        """Return the pattern of ``sites.device``, (n,) or one number for all sites."""
+
+    def pattern_moments(self, sites: Sites) -> tuple[ArrayLike, ArrayLike]:
+        """
+        Return mean and variance of the pattern over devices, (n,) or one number each.
+
+        By default those of a pattern that all devices share: the pattern itself, and 0.
+        """
+        return self.pattern(sites), 0.0
+
+
+class FixedFactor(_FixedPattern):
+    """A fixed pattern that multiplies the values; a subclass gives :meth:`pattern`."""
+
+    def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
+        """Return values times the pattern."""
+        _ = rng
+        values *= sites.pattern(self, self.pattern)
+        return values
+
+    def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
+        """Return the moments of a product of independent factors."""
+        if sites.known_device is not None:
+            factor = sites.pattern(self, self.pattern)
+            return mean * factor, variance * factor**2
+        centre, spread2 = (sites.of(part) for part in self.pattern_moments(replace(sites, index=slice(None))))
+        return mean * centre, variance * (centre**2 + spread2) + mean**2 * spread2
+
+
+class FixedOffset(_FixedPattern):
+    """A fixed pattern that is added to the values; a subclass gives :meth:`pattern`, in the unit of the stage."""
+
+    def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
+        """Return values plus the pattern."""
+        _ = rng
+        values += sites.pattern(self, self.pattern)
+        return values
+
+    def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
+        """Return the moments of a sum of independent terms."""
+        if sites.known_device is not None:
+            return mean + sites.pattern(self, self.pattern), variance
+        centre, spread2 = (sites.of(part) for part in self.pattern_moments(replace(sites, index=slice(None))))
+        return mean + centre, variance + spread2
+
+
+class AdditiveNoise(Effect):
+    """Gaussian temporal noise of mean 0 that is added to the values; a subclass gives :meth:`deviation`."""
+
+    is_temporal: ClassVar[bool] = True
+
+    @abstractmethod
+    def deviation(self, sites: Sites) -> ArrayLike:
+        """Return the standard deviation, (n,) or one number for all sites, in the unit of the stage."""
+
+    def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
+        """Return values plus a draw."""
+        noise = rng.standard_normal(values.size)
+        noise *= sites.pattern(self, self.deviation)
+        values += noise
+        return values
+
+    def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
+        """Return the mean and the sum of the variances."""
+        return mean, variance + sites.pattern(self, self.deviation) ** 2

@@ -1,0 +1,108 @@
+"""Fixed-pattern noise (FPN) of the readout: gains and offsets of pixels, offsets of columns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from foveasim._core.validation import Floats
+from foveasim.sensor.effects.contract import FixedFactor, FixedOffset, Sites, Stage
+
+__all__ = ["ColumnOffset", "PixelGain", "PixelOffset"]
+
+
+@dataclass(frozen=True)
+class PixelGain(FixedFactor):
+    """
+    Gain FPN: factors of mean 1 on the conversion gain, Gaussian, cut off at 0.
+
+    Parameters
+    ----------
+    gain_fpn_fraction : float
+        Standard deviation.
+    """
+
+    name: ClassVar[str] = "gain_fpn"
+    stage: ClassVar[Stage] = "sense_node"
+
+    gain_fpn_fraction: float
+
+    @classmethod
+    def from_sensor(cls, sensor: Any) -> Self | None:
+        """Return the effect that a sensor's keywords specify, or None."""
+        return cls(sensor.gain_fpn_fraction) if sensor.gain_fpn_fraction else None
+
+    def pattern(self, sites: Sites) -> Floats:
+        """Return the factors, (n,)."""
+        return np.maximum(1.0 + self.gain_fpn_fraction * sites.device.normals(self.name), 0.0)
+
+    def pattern_moments(self, sites: Sites) -> tuple[float, float]:
+        """Return 1 and the square of ``gain_fpn_fraction``."""
+        _ = sites
+        return 1.0, self.gain_fpn_fraction**2
+
+
+@dataclass(frozen=True)
+class PixelOffset(FixedOffset):
+    """
+    Offset FPN of pixels, Gaussian; correlated double sampling removes it.
+
+    Parameters
+    ----------
+    offset_v : float, V
+        Standard deviation.
+    """
+
+    name: ClassVar[str] = "pixel_fpn"
+    stage: ClassVar[Stage] = "output"
+
+    offset_v: float
+
+    @classmethod
+    def from_sensor(cls, sensor: Any) -> Self | None:
+        """Return the effect that a sensor's keywords specify, or None."""
+        is_on = sensor.pixel_fpn_fraction and not sensor.cds
+        return cls(sensor.v_sat_v * sensor.pixel_fpn_fraction) if is_on else None
+
+    def pattern(self, sites: Sites) -> Floats:
+        """Return the offsets, (n,) V."""
+        return self.offset_v * sites.device.normals(self.name)
+
+    def pattern_moments(self, sites: Sites) -> tuple[float, float]:
+        """Return 0 and the square of ``offset_v``."""
+        _ = sites
+        return 0.0, self.offset_v**2
+
+
+@dataclass(frozen=True)
+class ColumnOffset(FixedOffset):
+    """
+    Offset FPN of readout lines (columns), Gaussian: the same for all sites of a line.
+
+    Parameters
+    ----------
+    offset_v : float, V
+        Standard deviation.
+    """
+
+    name: ClassVar[str] = "column_fpn"
+    stage: ClassVar[Stage] = "output"
+
+    offset_v: float
+
+    @classmethod
+    def from_sensor(cls, sensor: Any) -> Self | None:
+        """Return the effect that a sensor's keywords specify, or None."""
+        return cls(sensor.v_sat_v * sensor.line_fpn_fraction) if sensor.line_fpn_fraction else None
+
+    def pattern(self, sites: Sites) -> Floats:
+        """Return the offset of every site's line, (n,) V."""
+        lines, line_of_site = np.unique(sites.layout.readout_line, return_inverse=True)
+        return (self.offset_v * sites.device.line_normals(self.name, lines))[line_of_site]
+
+    def pattern_moments(self, sites: Sites) -> tuple[float, float]:
+        """Return 0 and the square of ``offset_v``."""
+        _ = sites
+        return 0.0, self.offset_v**2

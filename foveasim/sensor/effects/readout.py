@@ -1,0 +1,118 @@
+"""Temporal noise of the readout: reset, read and random telegraph noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from foveasim._core.validation import Floats
+from foveasim.sensor.effects.contract import AdditiveNoise, Effect, Sites, Stage
+from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
+
+__all__ = ["ReadNoise", "ResetNoise", "TelegraphNoise"]
+
+
+@dataclass(frozen=True)
+class ResetNoise(AdditiveNoise):
+    """
+    Reset (kTC) noise: thermal noise of the reset switch, stored on the sense node.
+
+    Parameters
+    ----------
+    temperature_k : float, K
+    """
+
+    name: ClassVar[str] = "reset"
+    stage: ClassVar[Stage] = "charge"
+    is_drawn_at_reset: ClassVar[bool] = True
+
+    temperature_k: float
+
+    @classmethod
+    def from_sensor(cls, sensor: Any) -> Self | None:
+        """Return the effect that a sensor's keywords specify, or None; correlated double sampling removes it."""
+        return cls(sensor.temperature_k) if sensor.ktc_noise and not sensor.cds else None
+
+    def deviation(self, sites: Sites) -> Floats:
+        """Return ``sqrt(k T C) / q``, (n,) or (1,) e-."""
+        return np.asarray(np.sqrt(BOLTZMANN_J_PER_K * self.temperature_k * sites.capacitance_f) / ELEMENTARY_CHARGE_C)
+
+
+@dataclass(frozen=True, eq=False)
+class ReadNoise(AdditiveNoise):
+    """
+    Gaussian noise of reading.
+
+    Parameters
+    ----------
+    read_noise_e : float or (n_site,), e-
+        Standard deviation, referred to the charge.
+    """
+
+    name: ClassVar[str] = "read"
+    stage: ClassVar[Stage] = "charge"
+
+    read_noise_e: float | Floats
+
+    @classmethod
+    def from_sensor(cls, sensor: Any) -> Self | None:
+        """Return the effect that a sensor's keywords specify, or None."""
+        return cls(sensor.read_noise_e) if np.any(sensor.read_noise_e) else None
+
+    def deviation(self, sites: Sites) -> float | Floats:
+        """Return the standard deviation, (n,) or one number, e-."""
+        _ = sites
+        return self.read_noise_e
+
+
+@dataclass(frozen=True)
+class TelegraphNoise(Effect):
+    """
+    Random telegraph signals (RTS): some sites are in one of two equally probable states in each frame.
+
+    Parameters
+    ----------
+    rts_fraction : float
+        Probability of a site to have this noise.
+    rts_e : float, e-
+        Distance of the two states.
+
+    Notes
+    -----
+    The variance is ``rts_e² / 4`` on RTS sites; over all devices a site has ``rts_fraction`` of it.
+    """
+
+    name: ClassVar[str] = "rts"
+    stage: ClassVar[Stage] = "charge"
+    is_temporal: ClassVar[bool] = True
+
+    rts_fraction: float
+    rts_e: float
+
+    @classmethod
+    def from_sensor(cls, sensor: Any) -> Self | None:
+        """Return the effect that a sensor's keywords specify, or None."""
+        return cls(sensor.rts_fraction, sensor.rts_e) if sensor.rts_fraction and sensor.rts_e else None
+
+    def half_step(self, sites: Sites) -> Floats:
+        """Return half the distance of the states, 0 on other sites, (n,) e-."""
+        return sites.pattern(
+            self,
+            lambda every: np.where(every.device.uniforms(self.name) < self.rts_fraction, 0.5 * self.rts_e, 0.0),
+        )
+
+    def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
+        """Return values with one of the two states, half a step above or below, on RTS sites."""
+        every = sites.once((self, "sites"), lambda whole: np.flatnonzero(self.half_step(whole)))
+        first, end, _ = sites.index.indices(sites.layout.n_sites)
+        where = every[slice(*np.searchsorted(every, (first, end)))] - first
+        values[where] += np.copysign(0.5 * self.rts_e, rng.random(where.size) - 0.5)
+        return values
+
+    def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
+        """Return the mean and the sum of the variances."""
+        if sites.known_device is None:
+            return mean, variance + self.rts_fraction * self.rts_e**2 / 4.0
+        return mean, variance + self.half_step(sites) ** 2

@@ -1,0 +1,75 @@
+"""Fixed patterns of the response to light: photo-response non-uniformity and dead sites."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from foveasim._core.validation import Floats
+from foveasim.sensor.effects.contract import FixedFactor, Sites, Stage
+
+__all__ = ["DeadSites", "PhotoResponse"]
+
+
+@dataclass(frozen=True)
+class PhotoResponse(FixedFactor):
+    """
+    Photo-response non-uniformity (PRNU): factors of mean 1, Gaussian, cut off at 0.
+
+    Parameters
+    ----------
+    prnu_fraction : float
+        Standard deviation.
+    """
+
+    name: ClassVar[str] = "prnu"
+    stage: ClassVar[Stage] = "photo"
+
+    prnu_fraction: float
+
+    @classmethod
+    def from_sensor(cls, sensor: Any) -> Self | None:
+        """Return the effect that a sensor's keywords specify, or None."""
+        return cls(sensor.prnu_fraction) if sensor.prnu_fraction else None
+
+    def pattern(self, sites: Sites) -> Floats:
+        """Return the factors, (n,)."""
+        return np.maximum(1.0 + self.prnu_fraction * sites.device.normals(self.name), 0.0)
+
+    def pattern_moments(self, sites: Sites) -> tuple[float, float]:
+        """Return 1 and the square of ``prnu_fraction``."""
+        _ = sites
+        return 1.0, self.prnu_fraction**2
+
+
+@dataclass(frozen=True)
+class DeadSites(FixedFactor):
+    """
+    Sites that collect no light.
+
+    Parameters
+    ----------
+    dead_fraction : float
+        Probability of a site to be one.
+    """
+
+    name: ClassVar[str] = "dead"
+    stage: ClassVar[Stage] = "photo"
+
+    dead_fraction: float
+
+    @classmethod
+    def from_sensor(cls, sensor: Any) -> Self | None:
+        """Return the effect that a sensor's keywords specify, or None."""
+        return cls(sensor.dead_fraction) if sensor.dead_fraction else None
+
+    def pattern(self, sites: Sites) -> Floats:
+        """Return 0 for dead sites and 1 for others, (n,)."""
+        return np.where(sites.device.uniforms(self.name) < self.dead_fraction, 0.0, 1.0)
+
+    def pattern_moments(self, sites: Sites) -> tuple[float, float]:
+        """Return the moments of a Bernoulli distribution."""
+        _ = sites
+        return 1.0 - self.dead_fraction, self.dead_fraction * (1.0 - self.dead_fraction)

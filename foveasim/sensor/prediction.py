@@ -1,0 +1,197 @@
+"""The chain without draws: moments of charges and voltages, and how charges become voltages to first order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from foveasim._core.validation import Floats, read_only
+from foveasim.sensor.effects.contract import Effect, Sites
+
+__all__ = ["ChargeDistributions", "Quadrature", "ReadoutModel", "Transfer", "cut_off", "quadrature", "readout_model"]
+
+#: Points of the quadrature over a charge that the full well cuts off.
+QUADRATURE_NODES = 96
+#: Least slope of a bent response at its end, relative to that at 0.
+LEAST_SLOPE = 1e-6
+
+
+class ChargeDistributions(NamedTuple):
+    """Distributions of charges as the kernels take them: read-only arrays (n,) or (1,)."""
+
+    mean_e: Floats
+    variance_e2: Floats
+    well_e: Floats
+    sigma_e: Floats
+    half_step_e: Floats
+    poisson_below_e: float
+    is_drawn: bool
+
+
+class Transfer(NamedTuple):
+    """
+    Way from a charge to the voltage at the ADC, as the kernels take it: read-only arrays (n,) or (1,).
+
+    ``v = bent(charge * v_per_e + sense_v) * scale + output_v``.
+    """
+
+    v_per_e: Floats
+    sense_v: Floats
+    scale: Floats
+    output_v: Floats
+    bend: float
+    v_sat_v: float
+
+
+class Quadrature(NamedTuple):
+    """Gauss-Legendre points and weights from -1 to 1."""
+
+    points: Floats
+    weights: Floats
+
+
+class ReadoutModel(NamedTuple):
+    """
+    How collected charges become voltages, to first order at their means.
+
+    Attributes
+    ----------
+    mean_e, variance_e2 : (..., n_site), e- and e-²
+        Moments of the charges after effects that mix sites, such as inter-pixel capacitance.
+    is_mixed : bool
+        Whether such an effect acted, so that charges are no longer Poisson distributed.
+    transfer : Transfer
+        Of these charges; effects of the signal chain are in it.
+    gaussian_e2 : (..., n_site) or (1,), e-²
+        Variance of the Gaussian temporal noise of the readout, referred to the charge.
+    half_step_e : (..., n_site) or (1,), e-
+        Half the distance of two equally probable states, referred to the charge.
+    """
+
+    mean_e: Floats
+    variance_e2: Floats
+    is_mixed: bool
+    transfer: Transfer
+    gaussian_e2: Floats
+    half_step_e: Floats
+
+    @property
+    def noise_e2(self) -> Floats:
+        """Variance of all temporal noise of the readout, referred to the charge, e-²."""
+        return np.asarray(self.gaussian_e2 + self.half_step_e**2)
+
+
+class _Linear:
+    """The effects of one stage to first order: ``factor * value + offset``, noise, and a step of two states."""
+
+    def __init__(self, effects: Iterable[Effect], mean: Floats, variance: Floats, sites: Sites) -> None:
+        self.factor, self.offset = np.ones(1), np.zeros(1)
+        self.noise, self.half_step2 = np.zeros(1), np.zeros(1)
+        self.mean, self.variance = mean, variance
+        for effect in effects:
+            mean, variance = effect.moments(self.mean, self.variance, sites=sites)
+            factor = effect.moments(self.mean + 1.0, self.variance, sites=sites)[0] - mean
+            added = np.zeros(1)
+            if effect.is_temporal:
+                added = np.maximum(variance - factor**2 * self.variance, 0.0)
+            half_step = effect.half_step(sites) if sites.known_device is not None else None
+            self.half_step2 = factor**2 * self.half_step2
+            if half_step is not None:
+                self.half_step2 = self.half_step2 + half_step**2
+                added = np.maximum(added - half_step**2, 0.0)
+            self.offset = mean - factor * (self.mean - self.offset)
+            self.factor = factor * self.factor
+            self.noise = factor**2 * self.noise + added
+            # Without a device, fixed patterns are unknown; they are no temporal noise.
+            self.mean, self.variance = mean, factor**2 * self.variance + added
+
+
+def readout_model(
+    charge: Iterable[Effect],
+    sense_node: Iterable[Effect],
+    output: Iterable[Effect],
+    *,
+    mean_e: Floats,
+    variance_e2: Floats,
+    sites: Sites,
+    v_per_e: Floats,
+    bend: float,
+    v_sat_v: float,
+    pedestal_v: float,
+) -> ReadoutModel:
+    """
+    Return the readout to first order at the means of collected charges.
+
+    Parameters
+    ----------
+    charge, sense_node, output : iterables of Effect
+        Effects of these stages, in order.
+    mean_e, variance_e2 : (..., n_site) or (1,), e- and e-²
+        Moments of collected charges.
+    sites : Sites
+        All sites, with a device or without.
+    v_per_e : (n_site,) or (1,), V/e-
+        Nominal conversion gain.
+    bend : float
+        Fraction that the response lacks at full range.
+    v_sat_v, pedestal_v : float, V
+    """
+    is_mixed = False
+    local: list[Effect] = []
+    for effect in charge:
+        if effect.is_local or effect.is_temporal:
+            local.append(effect)
+            continue
+        before = _Linear(local, mean_e, variance_e2, sites)
+        mean_e, variance_e2 = effect.moments(before.mean, before.variance + before.half_step2, sites=sites)
+        is_mixed, local = True, []
+    charges = _Linear(local, mean_e, variance_e2, sites)
+    sense = _Linear(sense_node, charges.mean * v_per_e, (charges.variance + charges.half_step2) * v_per_e**2, sites)
+    fraction = np.clip(sense.mean / v_sat_v, 0.0, 1.0)
+    slope = np.maximum(1.0 - 2.0 * bend * fraction, LEAST_SLOPE)
+    last = _Linear(output, sense.mean * (1.0 - bend * fraction) + pedestal_v, sense.variance * slope**2, sites)
+    total_v_per_e = charges.factor * v_per_e * sense.factor
+    per_v2 = np.divide(1.0, total_v_per_e**2, out=np.zeros(np.shape(total_v_per_e)), where=total_v_per_e != 0.0)
+    noise_v2 = charges.noise * (v_per_e * sense.factor) ** 2 + sense.noise
+    half_step_v2 = charges.half_step2 * (v_per_e * sense.factor) ** 2 + sense.half_step2
+    output_slope2 = (slope * last.factor) ** 2
+    per_output2 = np.divide(1.0, output_slope2, out=np.zeros(np.shape(output_slope2)), where=output_slope2 != 0.0)
+    return ReadoutModel(
+        mean_e=mean_e,
+        variance_e2=variance_e2,
+        is_mixed=is_mixed,
+        transfer=Transfer(
+            v_per_e=total_v_per_e,
+            sense_v=charges.offset * v_per_e * sense.factor + sense.offset,
+            scale=last.factor,
+            output_v=pedestal_v * last.factor + last.offset,
+            bend=bend,
+            v_sat_v=v_sat_v,
+        ),
+        gaussian_e2=(noise_v2 + last.noise * per_output2) * per_v2,
+        half_step_e=np.sqrt((half_step_v2 + last.half_step2 * per_output2) * per_v2),
+    )
+
+
+@cache
+def quadrature() -> Quadrature:
+    """Return Gauss-Legendre points and weights: an eigenvalue problem, which takes longer than the codes of a small sensor."""
+    return Quadrature(*(read_only(part) for part in np.polynomial.legendre.leggauss(QUADRATURE_NODES)))
+
+
+def cut_off(mean_e: Floats, variance_e2: Floats, end_e: Floats) -> tuple[Floats, Floats]:
+    """Return mean and variance of a Gaussian whose values beyond an end are set to it."""
+    from scipy.special import ndtr
+
+    deviation = np.sqrt(np.maximum(variance_e2, 1e-12))
+    z = np.clip((end_e - mean_e) / deviation, -40.0, 40.0)
+    below, at = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
+    # How far below the end, and its square; where all lies far below, the Gaussian itself.
+    short = deviation * (z * below + at)
+    short2 = deviation**2 * ((1.0 + z * z) * below + z * at)
+    is_free = z >= 40.0
+    cut = np.where(is_free, mean_e, np.where(is_free, 0.0, end_e) - short)
+    return cut, np.where(is_free, variance_e2, np.maximum(short2 - short**2, 0.0))

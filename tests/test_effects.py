@@ -1,0 +1,317 @@
+"""The contract of effects: draws, moments and the noise budget agree, and effects are independent of each other."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import scipy.constants
+import scipy.stats
+
+import foveasim as fs
+from foveasim._core.random_streams import Streams
+from foveasim.errors import ParameterError, SimulationError
+from foveasim.layout import grid
+from foveasim.sensor import Sensor, effects, noise_budget, signal_to_noise
+from foveasim.sensor.effects import AdditiveNoise, Effect, FixedFactor, FixedOffset, ShotNoise, Sites
+
+SIGMAS = 5.0
+N = 40_000
+ROW = grid(n_x=N, n_y=1, pitch_um=2.0).with_columns(readout_line=np.arange(N))
+PHOTO_E, EXPOSURE_S = 5000.0, 0.5
+#: 16 bits of 1 e- each, far from both ends, and a pedestal.
+FINE = {"bits": 16, "v_sat_v": 3.0, "capacitance_f": 65_536 * scipy.constants.e / 3.0, "pedestal_v": 0.5}
+
+
+@dataclass(frozen=True)
+class LampFlicker(AdditiveNoise):
+    """Noise of the test: Gaussian, of the output voltage, larger at sites further to the right."""
+
+    name: ClassVar[str] = "flicker"
+    stage: ClassVar[str] = "output"
+
+    sigma_v: float = 4e-4
+
+    def deviation(self, sites):
+        return self.sigma_v * np.linspace(0.5, 1.5, sites.n_sites)
+
+
+@dataclass(frozen=True)
+class LensShading(FixedFactor):
+    """A fixed pattern of the test: mean response 0.9, and a random part."""
+
+    name: ClassVar[str] = "shading"
+    stage: ClassVar[str] = "photo"
+
+    def pattern(self, sites):
+        return 0.9 + 0.05 * sites.device.normals(self.name)
+
+    def pattern_moments(self, sites):
+        return 0.9, 0.05**2
+
+
+@dataclass(frozen=True)
+class Hum(Effect):
+    """Noise of the test from the bare contract: a factor of all sites of a frame on the charge."""
+
+    name: ClassVar[str] = "hum"
+    stage: ClassVar[str] = "charge"
+    is_temporal: ClassVar[bool] = True
+    is_local: ClassVar[bool] = False
+
+    sigma: float = 0.02
+
+    def apply(self, values, *, sites, rng):
+        return values * (1.0 + self.sigma * rng.standard_normal(values.size))
+
+    def moments(self, mean, variance, *, sites):
+        return mean, variance * (1.0 + self.sigma**2) + (mean * self.sigma) ** 2
+
+
+#: Keywords that switch on one effect each, by its name.
+CASES = {
+    "shot": {},
+    "prnu": {"prnu_fraction": 0.02},
+    "dead": {"dead_fraction": 0.1},
+    "dsnu": {"dark_e_per_s": 4000.0, "dsnu_fraction": 0.3},
+    "hot": {"hot_fraction": 0.05, "hot_e_per_s": 3000.0},
+    "reset": {"ktc_noise": True},
+    "read": {"read_noise_e": np.linspace(5.0, 20.0, N)},
+    "rts": {"rts_fraction": 0.3, "rts_e": 60.0},
+    "gain_fpn": {"gain_fpn_fraction": 0.02},
+    "pixel_fpn": {"pixel_fpn_fraction": 1e-3},
+    "column_fpn": {"line_fpn_fraction": 1e-3},
+    "flicker": {"effects": [LampFlicker()]},
+    "shading": {"effects": [LensShading()]},
+    "hum": {"effects": [Hum()]},
+}
+every_effect = pytest.mark.parametrize("name", CASES)
+
+
+def made(name="", *, shot_noise="off", **more):
+    keywords = CASES.get(name, {})
+    return Sensor(ROW, **FINE, **{"shot_noise": "auto" if name == "shot" else shot_noise, **keywords, **more})
+
+
+def codes(sensor, frame=0, seed=1):
+    streams = Streams(seed, frame)
+    expected_e = sensor.expected_electrons(np.full(N, PHOTO_E / EXPOSURE_S), EXPOSURE_S)
+    return sensor.read(sensor.collect(expected_e, streams=streams), streams=streams).astype(float)
+
+
+def assert_moments(draws, mean, variance):
+    """Over sites, the scatter about the means has the variance: to five standard errors, and the rounding of charges to codes."""
+    z = (draws - mean) / np.sqrt(variance)
+    rounding = 0.25 / np.min(variance)
+    assert abs(z.mean()) < SIGMAS * z.std() / np.sqrt(z.size) + 0.1 * np.sqrt(rounding)
+    assert abs(np.mean(z**2) - 1.0) < SIGMAS * np.std(z**2) / np.sqrt(z.size) + rounding
+
+
+def test_every_standard_effect_is_tested():
+    assert {effect.name for effect in effects.STANDARD} <= set(CASES)
+
+
+@every_effect
+def test_draws_moments_and_budget_agree(name):
+    quiet, noisy = made(), made(name)
+    (effect,) = (e for e in noisy.chain if e.name == name)
+    dark_e = float(np.mean(noisy.nominal_dark_e_per_s)) * EXPOSURE_S
+    sites = noisy.sites if effect.is_temporal else noisy.sites.of_any_device()
+    e_per_unit = {"photo": EXPOSURE_S, "dark": EXPOSURE_S, "sense_node": 65_536 / 3.0, "output": 65_536 / 3.0}
+    unit = 1.0 / e_per_unit.get(effect.stage, 1.0)
+    nominal = {"photo": PHOTO_E, "dark": dark_e}.get(effect.stage, PHOTO_E + dark_e)
+    nominal_unit = nominal * unit + (FINE["pedestal_v"] if effect.stage == "output" else 0.0)
+    mean, variance = effect.moments(np.full(N, nominal_unit), np.zeros(N), sites=sites)
+    shift_e, variance_e2 = (mean - nominal_unit) / unit, variance / unit**2
+    drawn_e = codes(noisy) - np.mean(codes(quiet)) - dark_e
+
+    budget = noise_budget(noisy, np.full(N, PHOTO_E / EXPOSURE_S), EXPOSURE_S)
+    lines = ("photon_shot", "dark_shot") if name == "shot" else (name,)
+    line_e = np.sqrt(sum(budget[line] ** 2 for line in lines))
+
+    np.testing.assert_allclose(line_e, np.hypot(np.sqrt(variance_e2), shift_e), rtol=1e-6)
+    shift_e, variance_e2 = (np.broadcast_to(part, N) for part in (shift_e, variance_e2))
+    some = variance_e2 > 0.0
+    assert_moments(drawn_e[some], shift_e[some], variance_e2[some])
+    assert np.ptp(drawn_e[~some]) <= 1.0 if (~some).any() else name != "rts"
+
+
+@every_effect
+def test_prediction_agrees_with_draws(name):
+    sensor = made(name, shot_noise="auto")
+    expected_e = sensor.expected_electrons(np.full(N, PHOTO_E / EXPOSURE_S), EXPOSURE_S)
+
+    mean_dn, variance_dn2 = sensor.predict(expected_e)
+
+    some = variance_dn2 > 0.0
+    assert_moments(codes(sensor)[some], mean_dn[some], variance_dn2[some])
+    assert np.array_equal(codes(sensor)[~some], mean_dn[~some])
+
+
+@every_effect
+def test_disabled_effect_leaves_other_draws(name):
+    everything = {key: value for case in CASES.values() for key, value in case.items()}
+    everything["effects"] = [LampFlicker(), LensShading(), Hum()]
+    sensor = made(shot_noise="auto", **everything)
+    without = sensor.without(name)
+
+    assert [e.name for e in without.chain if e.name != "shot"] == [
+        e.name for e in sensor.chain if e.name not in {name, "shot"}
+    ]
+    for effect in without.chain:
+        values = np.linspace(0.1, 2000.0, N)
+        drawn = [
+            e.apply(values.copy(), sites=s.sites, rng=Streams(3).of(e.name, 0))
+            for s in (sensor, without)
+            for e in s.chain
+            if e.name == effect.name and e.name != name
+        ]
+        assert all(np.array_equal(drawn[0], other) for other in drawn)
+    alone = made(shot_noise="off", **CASES[name]) if name != "shot" else made("shot")
+    assert not np.array_equal(codes(alone), codes(alone.without(name)))
+
+
+def test_charge_and_codes_depend_on_own_effects():
+    """The chain of two sensors, one of which has one effect more, differs at the sites of that effect alone."""
+    few = made(shot_noise="auto", read_noise_e=3.0, ktc_noise=True)
+    more = made(shot_noise="auto", read_noise_e=3.0, ktc_noise=True, rts_fraction=0.1, rts_e=100.0)
+
+    moved = codes(few) != codes(more)
+
+    assert np.array_equal(moved, more.pattern("rts") > 0.0)
+
+
+@pytest.mark.parametrize("mean_e", [30.0, 99.9, 100.1, 150.0, 1000.0, 1e5])
+def test_shot_noise_has_poisson_moments(mean_e):
+    """Third central moment too: a Gaussian's would be 0 in place of the mean."""
+    n = 2_000_000
+    rng = np.random.default_rng(5)
+
+    drawn = ShotNoise().apply(np.full(n, mean_e), sites=None, rng=rng) - mean_e
+
+    for power, expected in ((1, 0.0), (2, mean_e), (3, mean_e)):
+        values = drawn.astype(float) ** power
+        assert abs(values.mean() - expected) < SIGMAS * values.std() / np.sqrt(n)
+
+
+def test_shot_noise_tails_are_poisson():
+    n, mean_e = 2_000_000, 120.0
+    drawn = ShotNoise().apply(np.full(n, mean_e), sites=None, rng=np.random.default_rng(6))
+
+    for limit in (80, 90, 150, 165):
+        probability = scipy.stats.poisson.cdf(limit, mean_e)
+        error = np.sqrt(probability * (1.0 - probability) / n)
+        assert abs(np.mean(drawn <= limit) - probability) < SIGMAS * error + 0.04 * min(probability, 1.0 - probability)
+
+
+def test_added_effects_enter_all_estimates():
+    plain, noisy = made(shot_noise="auto"), made("flicker", shot_noise="auto")
+    expected_e, dark_e = np.full(N, PHOTO_E), np.zeros(N)
+    added_e2 = np.square(LampFlicker().deviation(noisy.sites) / 3.0 * 65_536)
+    ratios = [signal_to_noise(sensor, expected_e, dark_e).ratio for sensor in (plain, noisy)]
+
+    np.testing.assert_allclose(np.square(PHOTO_E / ratios[1]) - np.square(PHOTO_E / ratios[0]), added_e2, rtol=1e-6)
+    merged = [fs.sensor.merge_exposures([np.full(N, 20_000)], [0.5], sensor).sigma_e_per_s for sensor in (plain, noisy)]
+    np.testing.assert_allclose(np.square(0.5 * merged[1]) - np.square(0.5 * merged[0]), added_e2, rtol=1e-5)
+
+
+def test_moments_without_device_need_declaring():
+    @dataclass(frozen=True)
+    class Undeclared(FixedOffset):
+        name: ClassVar[str] = "undeclared"
+        stage: ClassVar[str] = "output"
+
+        def pattern(self, sites):
+            return 1e-3 * sites.device.normals(self.name)
+
+    with pytest.raises(SimulationError, match=r"must define pattern_moments\(\), its mean and variance over devices"):
+        noise_budget(made(effects=[Undeclared()]), np.full(N, 100.0), 1.0)
+
+
+class Nameless(LampFlicker):
+    name = None
+
+
+class Early(LampFlicker):
+    name, stage = "early", "photo"
+
+
+class Elsewhere(LampFlicker):
+    name, stage = "elsewhere", "lens"
+
+
+class Twin(LampFlicker):
+    name = "read"
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"effects": [3.0]}, "'effects' must be foveasim.sensor.effects.Effect objects, got 3.0"),
+        ({"effects": LampFlicker()}, "'effects' must be a list of effects, got"),
+        ({"effects": [Nameless()]}, "'effects' must have a class attribute 'name' of type str"),
+        ({"effects": [Early()]}, "'early' at the stage 'photo' is temporal; give it the stage 'charge'"),
+        ({"effects": [Elsewhere()]}, "'effects' must have a stage of photo, dark, .*; 'elsewhere' has 'lens'"),
+        ({"effects": [Twin()]}, "'effects' must have names that no other effect has, got two 'read'"),
+        ({"effects": [LampFlicker(), LampFlicker()]}, "got two 'flicker'"),
+        ({"disabled": ["raed"]}, "'disabled' must be names of effects, got 'raed'; did you mean 'read'"),
+        ({"disabled": 3}, "'disabled' must be names of effects, got 3"),
+    ],
+)
+def test_invalid_effects_are_rejected(keywords, message):
+    with pytest.raises(ParameterError, match=message):
+        Sensor(ROW[:4], **keywords)
+
+
+def test_unknown_pattern_lists_patterns():
+    with pytest.raises(
+        ParameterError, match=r"'name' must be one of the sensor's fixed patterns \(prnu, rts\), got 'gain'"
+    ):
+        made("prnu", **CASES["rts"]).pattern("gain")
+
+
+def test_sites_of_block_are_parts():
+    sites = made("prnu").sites
+    block = sites.block(slice(10, 20))
+
+    assert block.n_sites == 10
+    assert np.array_equal(block.of(np.arange(N)), np.arange(10, 20))
+    assert block.of(3.0) == 3.0
+
+
+def test_settings_describe_registered_effects():
+    layout = ROW[:10]
+    sensor = Sensor(
+        layout, **FINE, read_noise_e=2.0, coupling=fs.sensor.Coupling(neighbour_share=0.01), effects=[Registered(2.5)]
+    )
+    from foveasim._core.provenance import described
+
+    settings = described(sensor)
+    again = Sensor.from_settings(layout, settings)
+
+    assert again.chain[-1] == Registered(2.5)
+    assert again.coupling == sensor.coupling
+    with pytest.raises(ParameterError, match="'sensor' must be given: its effect 'LampFlicker' is not registered"):
+        Sensor.from_settings(layout, described(Sensor(layout, effects=[LampFlicker()])))
+
+
+@effects.EFFECTS.register("registered of test_effects")
+@dataclass(frozen=True)
+class Registered(AdditiveNoise):
+    name: ClassVar[str] = "registered"
+    stage: ClassVar[str] = "charge"
+
+    sigma_e: float
+
+    def deviation(self, sites):
+        return self.sigma_e
+
+
+def test_public_effects_have_no_long_signatures():
+    for name in effects.__all__:
+        parts = getattr(effects, name)
+        if inspect.isclass(parts) and issubclass(parts, Effect | Sites):
+            assert len(inspect.signature(parts).parameters) <= 7
