@@ -1,7 +1,7 @@
 """
 Promises of the layout families, for all generators of the package.
 
-The list of generators is that of settings files, ``foveasim.config.GENERATORS``. A generator without an example here fails
+The list of generators is that of settings files, ``foveasim.layout.LAYOUTS``. A generator without an example here fails
 the first test; one that takes ``min_size_um`` is found by its signature.
 """
 
@@ -20,8 +20,9 @@ from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
 import foveasim as fs
-from foveasim.config import GENERATORS, schema
+from foveasim.config import schema
 from foveasim.errors import FoveasimError
+from foveasim.layout import LAYOUTS
 
 #: Generators draw what is not possible together: most of it is rejected by them, with an error of the package.
 drawn = settings(
@@ -88,7 +89,7 @@ every_family = pytest.mark.parametrize("family", FAMILIES, ids=names)
 
 
 def made(family):
-    return GENERATORS[family.generator](**family.parameters)
+    return LAYOUTS[family.generator](**family.parameters)
 
 
 def test_every_public_generator_is_listed_and_has_an_example():
@@ -101,9 +102,9 @@ def test_every_public_generator_is_listed_and_has_an_example():
         and "layout" not in inspect.signature(getattr(fs.layout, name)).parameters
     }
 
-    assert set(GENERATORS) == public
-    assert all(getattr(fs.layout, name) is generator for name, generator in GENERATORS.items())
-    assert {family.generator for family in FAMILIES} == set(GENERATORS)
+    assert set(LAYOUTS) == public
+    assert all(getattr(fs.layout, name) is generator for name, generator in LAYOUTS.items())
+    assert {family.generator for family in FAMILIES} == set(LAYOUTS)
 
 
 @every_family
@@ -161,24 +162,24 @@ def test_provenance_repeats_every_family(family):
     parameters = layout.provenance["parameters"]
 
     assert layout.provenance["generator"] == family.generator
-    assert set(parameters) == set(inspect.signature(GENERATORS[family.generator]).parameters)
+    assert set(parameters) == set(inspect.signature(LAYOUTS[family.generator]).parameters)
     if family.generator != "quadtree":  # whose picture is not kept
-        assert np.array_equal(GENERATORS[family.generator](**parameters).xy_um, layout.xy_um)
+        assert np.array_equal(LAYOUTS[family.generator](**parameters).xy_um, layout.xy_um)
 
 
-@pytest.mark.parametrize("name", GENERATORS)
+@pytest.mark.parametrize("name", LAYOUTS)
 def test_settings_files_take_every_generator(name):
     sections = schema()["$defs"]
     keys = next(s for s in sections.values() if s["title"] == f"{name} parameters")["properties"]
     not_in_files = {"density_grid"}
 
-    assert set(keys) == set(inspect.signature(GENERATORS[name]).parameters) - not_in_files
+    assert set(keys) == set(inspect.signature(LAYOUTS[name]).parameters) - not_in_files
     assert f'"const": "{name}"' in json.dumps(sections)
 
 
 # -- the minimum size ------------------------------------------------------------------------------------------------
 
-WITH_MIN_SIZE = [name for name, call in GENERATORS.items() if "min_size_um" in inspect.signature(call).parameters]
+WITH_MIN_SIZE = [name for name, call in LAYOUTS.items() if "min_size_um" in inspect.signature(call).parameters]
 
 
 def values_of(name, hint):
@@ -227,11 +228,11 @@ def test_no_generator_makes_a_site_below_its_minimum_size(name):
     n_made = 0
 
     @drawn
-    @given(parameters=parameters_of(GENERATORS[name]))
+    @given(parameters=parameters_of(LAYOUTS[name]))
     def check(parameters):
         nonlocal n_made
         try:
-            layout = GENERATORS[name](**parameters)
+            layout = LAYOUTS[name](**parameters)
         except FoveasimError:
             assume(False)
         n_made += 1

@@ -677,7 +677,9 @@ def test_several_layers_or_top_cells_must_be_chosen_from(tmp_path):
     [({"layer": 1}, "npz"), ({"dbu_um": 1e-3}, "geojson"), ({"colours": {}}, "gds"), ({"layer": 2}, "svg")],
 )
 def test_options_of_other_formats_are_refused(zoo, tmp_path, options, ending):
-    with pytest.raises(ParameterError, match=f"does not belong to .{ending} files"):
+    (name,) = options
+    belongs = "SVG" if name == "colours" else "GDSII and OASIS"
+    with pytest.raises(ParameterError, match=f"'{name}' belongs to {belongs} files, got .*; leave it out"):
         write_layout(zoo, tmp_path / f"a.{ending}", **options)
 
 
@@ -954,7 +956,7 @@ def test_parquet_that_repeats_a_long_value_without_end_is_refused(small, tmp_pat
 
 def test_too_large_files_are_refused(small, tmp_path, monkeypatch):
     write_layout(small, tmp_path / "a.npz")
-    monkeypatch.setattr("foveasim.layout.files._common.MAX_FILE_BYTES", 100)
+    monkeypatch.setattr("foveasim._io.formats.MAX_FILE_BYTES", 100)
     with pytest.raises(FileError, match="more than the 100 that are read"):
         read_layout(tmp_path / "a.npz")
 

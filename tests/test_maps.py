@@ -23,7 +23,7 @@ from foveasim import maps
 from foveasim._io import sandbox as reading_apart
 from foveasim.errors import FileError, ParameterError
 from foveasim.maps import _dataset, from_xarray, read_power_map, to_xarray, write_power_map
-from foveasim.maps._apart import READERS, read_apart
+from foveasim.maps._formats import MAP_FORMATS, read_found
 from foveasim.maps._units import length_in_um, light_unit
 
 h5py = pytest.importorskip("h5py")
@@ -50,19 +50,19 @@ def random_map(dtype=np.float32, n_band=3):
 
 
 def read_here(path, kind, name):
-    return READERS[kind](path, name)
+    return MAP_FORMATS[kind].read(path, name)
 
 
 @pytest.fixture(autouse=True)
 def here(monkeypatch):
     """Reads all formats in this program, which takes no second for each file to start another."""
-    monkeypatch.setattr(maps, "read_apart", read_here)
+    monkeypatch.setattr(maps, "read_found", read_here)
 
 
 @pytest.fixture
 def apart(monkeypatch):
     """Reads as users do."""
-    monkeypatch.setattr(maps, "read_apart", read_apart)
+    monkeypatch.setattr(maps, "read_found", read_found)
 
 
 def letter_map():
@@ -895,7 +895,7 @@ def test_what_is_no_file_of_a_map_is_refused(tmp_path):
     refused(tmp_path, "is not a file")
     refused(tmp_path / "empty", "is empty")
     refused(tmp_path / "packed", "is compressed with gzip; unpack it first")
-    refused(tmp_path / "text", "is no power map: expected npy, npz, FITS, TIFF, EXR, netCDF, zarr or MAT")
+    refused(tmp_path / "text", "is no power map: expected EXR, FITS, MAT, netCDF, npy, npz, TIFF or zarr")
 
 
 # -- files from strangers ---------------------------------------------------------------------------------------------
@@ -907,10 +907,10 @@ from foveasim._io import sandbox as reading_apart
 from foveasim import maps
 from foveasim.errors import FoveasimError
 from foveasim.maps import read_power_map
-from foveasim.maps._apart import READERS
+from foveasim.maps._formats import MAP_FORMATS
 
 if "here" in sys.argv:
-    maps.read_apart = lambda path, kind, name: READERS[kind](path, name)
+    maps.read_found = lambda path, kind, name: MAP_FORMATS[kind].read(path, name)
     resource.setrlimit(resource.RLIMIT_AS, (4 * 2**30, 4 * 2**30))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 answers = open(int(sys.argv[1]), "w")

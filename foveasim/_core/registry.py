@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from difflib import get_close_matches
+from importlib import import_module
 from importlib.metadata import entry_points
+from pkgutil import iter_modules
 from typing import Any, Generic, TypeVar, overload
 
 from foveasim.errors import ParameterError
 
-__all__ = ["Registry"]
+__all__ = ["Registry", "import_all"]
+
+
+def import_all(package: str, path: Iterable[str]) -> None:
+    """Import the public modules of a package, so that what they contain is registered."""
+    for module in iter_modules(path):
+        if not module.name.startswith("_"):
+            import_module(f"{package}.{module.name}")
+
 
 T = TypeVar("T")
 F = TypeVar("F")
@@ -34,6 +44,8 @@ class Registry(Mapping[str, T], Generic[T]):
         self.kind, self.group = kind, group
         self._objects: dict[str, T] = {}
         self._is_complete = False
+        #: Number of registrations so far: what is derived from a registry is made anew when it changes.
+        self.version = 0
 
     @overload
     def register(self, name: str, item: T) -> T: ...
@@ -65,6 +77,7 @@ class Registry(Mapping[str, T], Generic[T]):
         ):
             raise ParameterError("name", f"must be new: there is another {self.kind} of this name", name)
         self._objects[name] = item
+        self.version += 1
         return item
 
     def _all(self) -> dict[str, T]:
@@ -83,10 +96,20 @@ class Registry(Mapping[str, T], Generic[T]):
         return self._all()[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(sorted(self._all()))
+        return iter(self._all())
 
     def __len__(self) -> int:
         return len(self._all())
+
+    def attributes_of(self, module: str) -> Callable[[str], T]:
+        """Return a module's ``__getattr__``, which gives registered objects by their names."""
+
+        def attribute(name: str) -> T:
+            if not name.startswith("_") and name in self:
+                return self[name]
+            raise AttributeError(f"module '{module}' has no attribute '{name}'")
+
+        return attribute
 
     def find(self, parameter: str, name: object) -> T:
         """

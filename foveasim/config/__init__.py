@@ -7,7 +7,6 @@ A shot runs from its settings file to the files that a user inspects.
 
 from __future__ import annotations
 
-from foveasim.config._models import GENERATORS
 from foveasim.config._objects import (
     YAML_ENDINGS,
     LayoutFile,
@@ -32,7 +31,6 @@ from foveasim.config._viewing import Viewable, read_viewable
 from foveasim.layout import shipped_layouts
 
 __all__ = [
-    "GENERATORS",
     "YAML_ENDINGS",
     "LayoutFile",
     "Result",

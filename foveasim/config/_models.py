@@ -8,44 +8,31 @@ Python call have the same names, defaults and limits. pydantic reads the types o
 from __future__ import annotations
 
 import inspect
+import logging
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, Literal, Union, get_type_hints
+from functools import lru_cache
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, create_model
 
-from foveasim import layout as layouts
-from foveasim.distortion import BrownConrady, Fisheye, Lens, PolynomialFisheye, Scaramuzza
-from foveasim.layout import DesignRules, Layout
+from foveasim._core.registry import Registry
+from foveasim.distortion import LENSES
+from foveasim.layout import LAYOUTS, DesignRules, Readout, Routing
 from foveasim.maps import read_power_map
-from foveasim.optics import Annulus, Blades, LateralColour, Optics, PupilImage, Seidel, Slit, Spider, Zernike
-from foveasim.scene import Scene, charts
-from foveasim.sensor import (
-    ConstantCurve,
-    Coupling,
-    Diffusion,
-    FilterSet,
-    GaussianCurve,
-    KernelCrosstalk,
-    PassBand,
-    PolynomialCurve,
-    ProductCurve,
-    Sensor,
-    SiliconQE,
-    SplineCurve,
-    StepCurve,
-    TableCurve,
-    ccd_qe,
-    read_curve,
-    read_filters,
-)
+from foveasim.optics import PUPILS, LateralColour, Optics, Seidel, Zernike
+from foveasim.scene import SCENES
+from foveasim.sensor import Coupling, Diffusion, FilterSet, KernelCrosstalk, ProductCurve, Sensor, read_filters
 from foveasim.sensor.effects import EFFECTS
+from foveasim.sensor.spectral import CURVES
 
-__all__ = ["GENERATORS", "PICTURES", "LayoutUnion", "PerArea", "RulesSection", "ShotSection", "call_of"]
+__all__ = ["Models", "PerArea", "call_of", "models"]
 
 #: What a section is a call of.
 _CALLS: dict[type[BaseModel], Callable[..., Any]] = {}
-#: Parameters of generators that a file gives as the name of a picture.
-PICTURES = {"quadtree": "importance", "voronoi": "density"}
+#: What sections may be of besides the package's own: when one of these changes, models are made anew.
+_REGISTRIES: tuple[Registry[Any], ...] = (LAYOUTS, SCENES, LENSES, PUPILS, CURVES, EFFECTS)
+
+_log = logging.getLogger("foveasim")
 
 
 class _Section(BaseModel):
@@ -101,22 +88,6 @@ class PerArea(_Section):
     per_um2: float
 
 
-#: Every layout family by its name in settings files, which is that of its function.
-GENERATORS: dict[str, Callable[..., Layout]] = {
-    "foveal_cartesian": layouts.foveal_cartesian,
-    "fovi": layouts.fovi,
-    "giotto": layouts.giotto,
-    "grid": layouts.grid,
-    "hexagonal": layouts.hexagonal,
-    "log_polar": layouts.log_polar,
-    "octagonal": layouts.octagonal,
-    "penrose": layouts.penrose,
-    "quadtree": layouts.quadtree,
-    "sunflower": layouts.sunflower,
-    "tiling": layouts.tiling,
-    "voronoi": layouts.voronoi,
-    "zones": layouts.zones,
-}
 _Outline = Annotated[list[list[float]] | str, Field(description="vertices [x, y] in µm, or well-known text")]
 #: Parameters that files write in another way than Python does.
 _IN_FILES: dict[str, Any] = {
@@ -129,140 +100,128 @@ _IN_FILES: dict[str, Any] = {
     "spectrum": list[list[float]] | None,
 }
 _Numbers: Any = float | list[float] | None
+#: Bands of scenes: one wavelength or several.
+_WAVELENGTHS: dict[str, Any] = {"wavelength_nm": _Numbers, "band_width_nm": _Numbers}
 #: Parameters that files do not have: the picture of a density covers the rectangle ``size_um``.
 _NOT_IN_FILES = ("density_grid",)
-_SCENES: dict[str, Callable[..., Any]] = {
-    "picture": Scene.from_picture,
-    "flat": Scene.flat,
-    "point_sources": Scene.point_sources,
-    "power_map": read_power_map,
-    "bars": charts.bars,
-    "checkerboard": charts.checkerboard,
-    "colour_chart": charts.colour_chart,
-    "grey_scale": charts.grey_scale,
-    "letter_f": charts.letter_f,
-    "point_grid": charts.point_grid,
-    "siemens_star": charts.siemens_star,
-    "sine": charts.sine,
-    "slanted_edge": charts.slanted_edge,
-    "zone_plate": charts.zone_plate,
-}
-_LENSES: dict[str, Callable[..., Lens]] = {
-    "brown_conrady": BrownConrady,
-    "fisheye": Fisheye,
-    "polynomial_fisheye": PolynomialFisheye,
-    "scaramuzza": Scaramuzza,
-}
-_PUPILS: dict[str, Callable[..., Any]] = {
-    "annulus": Annulus,
-    "blades": Blades,
-    "image": PupilImage,
-    "slit": Slit,
-    "spider": Spider,
-}
 _CROSSTALK: dict[str, Callable[..., Any]] = {"diffusion": Diffusion, "kernel": KernelCrosstalk}
-_CURVES: dict[str, Callable[..., Any]] = {
-    "ccd": ccd_qe,
-    "constant": ConstantCurve,
-    "file": read_curve,
-    "gaussian": GaussianCurve,
-    "pass_band": PassBand,
-    "polynomial": PolynomialCurve,
-    "silicon": SiliconQE,
-    "spline": SplineCurve,
-    "step": StepCurve,
-    "table": TableCurve,
-}
-
-_LensSection = _one_of("kind", {name: _model(name, lens) for name, lens in _LENSES.items()})
-_PupilSection = _one_of(
-    "kind", {name: _model(name, pupil, skip=("wavefront_um",), **_IN_FILES) for name, pupil in _PUPILS.items()}
-)
-_OpticsSection = _model(
-    "optics",
-    Optics,
-    pupil=_PupilSection | list[_PupilSection] | None,  # type: ignore[valid-type]
-    zernike=_model("zernike", Zernike) | None,
-    seidel=_model("seidel", Seidel) | None,
-    lateral_colour=_model("lateral colour", LateralColour) | None,
-)
-_curves = {name: _model(name, curve, path=str) for name, curve in _CURVES.items()}
-_Factor = float | _one_of("kind", _curves)
-_product = _model("product", ProductCurve, curves=list[_Factor])  # type: ignore[valid-type]
-_CurveSection = _one_of("kind", _curves | {"product": _product})
-_filter_set = _model("filter set", FilterSet, curves=list[_CurveSection])  # type: ignore[valid-type]
-_filter_file = _model("filter file", read_filters, path=str)
-_FilterSection: Any = Annotated[
-    Annotated[_filter_set, Tag("filter set")] | Annotated[_filter_file, Tag("filter file")],
-    Discriminator(lambda section: "filter file" if isinstance(section, dict) and "path" in section else "filter set"),
-]
 _PerSite = float | PerArea | list[float]
-_SceneSection = _one_of(
-    "kind",
-    {
-        k: _model(k, call, **(_IN_FILES | {"wavelength_nm": _Numbers, "band_width_nm": _Numbers}))
-        for k, call in _SCENES.items()
-    },
-)
-_EffectSection: Any = Any
-if EFFECTS:
-    _EffectSection = _one_of("kind", {name: _model(name, effect) for name, effect in EFFECTS.items()})
-_SensorSection = _model(
-    "sensor",
-    Sensor,
-    skip=("layout",),
-    qe=float | _CurveSection | list[float | _CurveSection],  # type: ignore[valid-type]
-    filters=Literal["rgb"] | _FilterSection | None,
-    crosstalk=_one_of("kind", {name: _model(name, way) for name, way in _CROSSTALK.items()}) | None,
-    coupling=_model("coupling", Coupling) | None,
-    sensitivity=_PerSite,
-    dark_e_per_s=_PerSite,
-    full_well_e=_PerSite | None,
-    read_noise_e=_PerSite,
-    capacitance_f=_PerSite,
-    effects=list[_EffectSection],
-)
-RulesSection = _model(
-    "design rules",
-    DesignRules,
-    preset=str | None,
-    readout=_model("readout", layouts.Readout) | None,
-    routing=_model("routing", layouts.Routing) | None,
-)
 
 
-class _LayoutSection(_Section):
-    """A layout: a generator and its parameters, colour filters, edits in the order of the keys, design rules, its source."""
+class Models(NamedTuple):
+    """Models of settings files: of a whole shot, of a layout, of design rules."""
 
-    mosaic: str | list[str] | None = None
-    move_um: tuple[float, float] = (0.0, 0.0)
-    inset_um: float = 0.0
-    snap_um: float | None = None
-    rules: RulesSection | None = None  # type: ignore[valid-type]
-    source: str = ""
+    shot: type[BaseModel]
+    layout: Any
+    rules: type[BaseModel]
 
 
-LayoutUnion = _one_of(
-    "generator",
-    {
-        name: create_model(
-            name,
-            __base__=_LayoutSection,
-            parameters=(_model(f"{name} parameters", call, _NOT_IN_FILES, **_IN_FILES), ...),
-        )
-        for name, call in GENERATORS.items()
-    },
-)
+def models() -> Models:
+    """Return the models of settings files, with all that is registered."""
+    for registry in _REGISTRIES:
+        len(registry)  # loads entry points
+    return _models(tuple(registry.version for registry in _REGISTRIES))
 
 
-class ShotSection(_Section):
-    """A whole shot: scene or power map, optics, distortion, layout, sensor, exposure."""
+def _registered(
+    registry: Registry[Any], skip: Sequence[str] = (), title: str = "{}", **types: Any
+) -> dict[str, type[_Section]]:
+    """Sections of all that is registered; what has parameters of types that files cannot have is left out, with a warning."""
+    sections = {}
+    for name, call in registry.items():
+        try:
+            sections[name] = _model(title.format(name), call, skip=skip, **types)
+        except Exception as error:  # noqa: BLE001 -- the signature is that of another package
+            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            _log.warning("settings files cannot have the %s '%s' (%s)", registry.kind, name, reason)
+    return sections
 
-    scene: _SceneSection  # type: ignore[valid-type]
-    optics: _OpticsSection  # type: ignore[valid-type]
-    distortion: _LensSection | None = None  # type: ignore[valid-type]
-    layout: str | LayoutUnion  # type: ignore[valid-type]
-    sensor: _SensorSection = Field(default_factory=_SensorSection)  # type: ignore[valid-type]
-    exposure_s: float
-    seed: int = 0
-    integration_order: Literal[1, 2] | None = None
+
+@lru_cache(maxsize=1)
+def _models(_versions: tuple[int, ...]) -> Models:
+    lens = _one_of("kind", _registered(LENSES))
+    pupil = _one_of("kind", _registered(PUPILS, skip=("wavefront_um",), **_IN_FILES))
+    optics = _model(
+        "optics",
+        Optics,
+        pupil=pupil | list[pupil] | None,  # type: ignore[valid-type]
+        zernike=_model("zernike", Zernike) | None,
+        seidel=_model("seidel", Seidel) | None,
+        lateral_colour=_model("lateral colour", LateralColour) | None,
+    )
+    sensor = _sensor()
+    rules = _model(
+        "design rules",
+        DesignRules,
+        preset=str | None,
+        readout=_model("readout", Readout) | None,
+        routing=_model("routing", Routing) | None,
+    )
+    layout = _layout(rules)
+    power_map = _model("power_map", read_power_map, **(_IN_FILES | _WAVELENGTHS))
+    scene = _one_of("kind", {**_registered(SCENES, **(_IN_FILES | _WAVELENGTHS)), "power_map": power_map})
+    fields: dict[str, Any] = {
+        "scene": (scene, ...),
+        "optics": (optics, ...),
+        "distortion": (lens | None, None),
+        "layout": (str | layout, ...),
+        "sensor": (sensor, Field(default_factory=sensor)),
+        "exposure_s": (float, ...),
+        "seed": (int, 0),
+        "integration_order": (Literal[1, 2] | None, None),
+    }
+    summary = "A whole shot: scene or power map, optics, distortion, layout, sensor, exposure."
+    return Models(create_model("ShotSection", __base__=_Section, __doc__=summary, **fields), layout, rules)
+
+
+def _sensor() -> type[_Section]:
+    curves = _registered(CURVES, path=str)
+    factor = float | _one_of("kind", curves)
+    product = _model("product", ProductCurve, curves=list[factor])  # type: ignore[valid-type]
+    curve = _one_of("kind", curves | {"product": product})
+    filter_set = _model("filter set", FilterSet, curves=list[curve])  # type: ignore[valid-type]
+    filter_file = _model("filter file", read_filters, path=str)
+    filters: Any = Annotated[
+        Annotated[filter_set, Tag("filter set")] | Annotated[filter_file, Tag("filter file")],
+        Discriminator(
+            lambda section: "filter file" if isinstance(section, dict) and "path" in section else "filter set"
+        ),
+    ]
+    effects = _registered(EFFECTS)
+    return _model(
+        "sensor",
+        Sensor,
+        skip=("layout",) if effects else ("layout", "effects"),
+        qe=float | curve | list[float | curve],  # type: ignore[valid-type]
+        filters=Literal["rgb"] | filters | None,
+        crosstalk=_one_of("kind", {name: _model(name, way) for name, way in _CROSSTALK.items()}) | None,
+        coupling=_model("coupling", Coupling) | None,
+        sensitivity=_PerSite,
+        dark_e_per_s=_PerSite,
+        full_well_e=_PerSite | None,
+        read_noise_e=_PerSite,
+        capacitance_f=_PerSite,
+        effects=list[_one_of("kind", effects)] if effects else list[Any],  # type: ignore[misc]
+        disabled=list[str],
+    )
+
+
+def _layout(rules: type[_Section]) -> Any:
+    """Union of the sections of all layout families."""
+    fields: dict[str, Any] = {
+        "mosaic": (str | list[str] | None, None),
+        "move_um": (tuple[float, float], (0.0, 0.0)),
+        "inset_um": (float, 0.0),
+        "snap_um": (float | None, None),
+        "rules": (rules | None, None),
+        "source": (str, ""),
+    }
+    base = create_model("_LayoutSection", __base__=_Section, **fields)
+    base.__doc__ = (
+        "A layout: a generator and its parameters, colour filters, edits in the order of the keys, design rules."
+    )
+    parameters = _registered(LAYOUTS, _NOT_IN_FILES, "{} parameters", **_IN_FILES)
+    return _one_of(
+        "generator",
+        {name: create_model(name, __base__=base, parameters=(part, ...)) for name, part in parameters.items()},
+    )

@@ -16,12 +16,12 @@ from foveasim._core.validation import check_number
 from foveasim._io.images import read_picture
 from foveasim._io.yaml_files import parsed, read_yaml
 from foveasim.camera import Camera
-from foveasim.config._models import PICTURES, LayoutUnion, PerArea, RulesSection, ShotSection, call_of
+from foveasim.config._models import PerArea, call_of, models
 from foveasim.config._problems import validated
 from foveasim.errors import ConfigError, FoveasimError, ParameterError
 from foveasim.fields import Grid, PowerMap
-from foveasim.layout import PRESETS, DesignRules, Layout, inset, mosaic, shipped_layouts, snap
-from foveasim.layout.files import check_chip_options, layout_path
+from foveasim.layout import LAYOUTS, PRESETS, DesignRules, Layout, inset, mosaic, shipped_layouts, snap
+from foveasim.layout.files import check_no_options, layout_path
 from foveasim.layout.files import read_layout as read_sites
 from foveasim.optics import Optics
 from foveasim.scene import Scene
@@ -162,7 +162,7 @@ def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
     ConfigError
         With the file, the place in it, what was expected and got.
     """
-    validated(Path(path), ShotSection, dict(settings))
+    validated(Path(path), models().shot, dict(settings))
 
 
 def _made_anew(_part: str, _settings: Any, make: Callable[[], Any]) -> Any:
@@ -196,7 +196,7 @@ def build_shot(
         As for :func:`read_shot`.
     """
     path = Path(path)
-    settings = validated(path, ShotSection, dict(data))
+    settings = validated(path, models().shot, dict(data))
 
     def layout_file() -> LayoutFile:
         if not isinstance(settings.layout, str):
@@ -254,7 +254,7 @@ def read_layout_file(path: str | Path) -> LayoutFile:
         With the file, the place in it, what was expected and got.
     """
     path = Path(path)
-    return _built_layout(path, "", validated(path, LayoutUnion, read_yaml(path)))
+    return _built_layout(path, "", validated(path, models().layout, read_yaml(path)))
 
 
 def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None = None) -> Layout:
@@ -318,7 +318,7 @@ def read_any_layout(
     """
     path = layout_path(path, folder)
     if path.suffix.lower() in YAML_ENDINGS:
-        check_chip_options(layer=layer, cell=cell)
+        check_no_options(layer=layer, cell=cell)
         return read_layout_file(path)
     return LayoutFile(layout=read_sites(path, layer=layer, cell=cell), rules=None, source=str(path))
 
@@ -335,20 +335,20 @@ def read_rules(path: str | Path) -> DesignRules:
     path = Path(path)
     if str(path) in PRESETS and not path.exists():
         return DesignRules(preset=str(path))
-    rules: DesignRules = _built(path, "", validated(path, RulesSection, read_yaml(path)))
+    rules: DesignRules = _built(path, "", validated(path, models().rules, read_yaml(path)))
     return rules
 
 
-def schema(section: Any = ShotSection, title: str = "foveasim settings") -> dict[str, Any]:
+def schema(section: Any = None, title: str = "foveasim settings") -> dict[str, Any]:
     """JSON schema of a settings file, or of a file whose model is given."""
-    described = TypeAdapter(section).json_schema()
+    described = TypeAdapter(models().shot if section is None else section).json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **described, "title": title}
 
 
 def _built_layout(path: Path, place: str, section: Any) -> LayoutFile:
     parameters = place + "parameters"
     values = _values(path, parameters + ".", section.parameters)
-    picture = PICTURES.get(section.generator)
+    picture = getattr(LAYOUTS[section.generator], "picture", None)
     if picture is not None and values[picture] is not None:
         values |= _picture_values(path, f"{parameters}.{picture}", values)
     layout = _call(path, parameters, _callable(section.parameters), values)

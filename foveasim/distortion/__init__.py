@@ -8,12 +8,15 @@ at a distorted map, there is :func:`distort_map`.
 
 from __future__ import annotations
 
+from foveasim._core.registry import import_all
 from foveasim.distortion._brown_conrady import BrownConrady
 from foveasim.distortion._calibration import Lens, from_opencv, read_calibration, to_opencv
 from foveasim.distortion._fisheye import Fisheye, PolynomialFisheye, Scaramuzza
 from foveasim.distortion._map import distort_map
+from foveasim.distortion._registry import LENSES
 
 __all__ = [
+    "LENSES",
     "BrownConrady",
     "Fisheye",
     "Lens",
@@ -24,3 +27,5 @@ __all__ = [
     "read_calibration",
     "to_opencv",
 ]
+
+import_all(__name__, __path__)

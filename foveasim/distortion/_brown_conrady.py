@@ -12,6 +12,7 @@ import numpy as np
 from foveasim._core.threads import each, thread_count
 from foveasim._core.validation import Bools, Floats, check_number
 from foveasim.distortion._lens import Placed
+from foveasim.distortion._registry import LENSES
 from foveasim.distortion._solve import smallest_roots
 
 __all__ = ["BrownConrady"]
@@ -26,6 +27,7 @@ START_POINTS = 4097
 MAX_RADIUS = 100.0
 
 
+@LENSES.register("brown_conrady")
 @dataclass(frozen=True, kw_only=True)
 class BrownConrady(Placed):
     """

@@ -12,6 +12,7 @@ import numpy as np
 
 from foveasim._core.validation import Floats, check_choice, check_number, finite_array
 from foveasim.distortion._lens import Placed
+from foveasim.distortion._registry import LENSES
 from foveasim.distortion._solve import growing_inverse, smallest_roots
 from foveasim.errors import ParameterError
 
@@ -71,6 +72,7 @@ def _scaled(xy: Floats, radius: Floats, new_radius: Floats, slope: float) -> Flo
     return np.asarray(xy * scale[:, np.newaxis])
 
 
+@LENSES.register("fisheye")
 @dataclass(frozen=True, kw_only=True)
 class Fisheye(_ByAngle):
     """
@@ -135,6 +137,7 @@ class Fisheye(_ByAngle):
         return 0.5 * math.pi - GRAZING
 
 
+@LENSES.register("polynomial_fisheye")
 @dataclass(frozen=True, kw_only=True)
 class PolynomialFisheye(_ByAngle):
     """
@@ -189,6 +192,7 @@ class PolynomialFisheye(_ByAngle):
         return growing_inverse(self._series, self._series.deriv(), height, self._most_rad)
 
 
+@LENSES.register("scaramuzza")
 @dataclass(frozen=True, kw_only=True)
 class Scaramuzza(_ByAngle):
     """

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from foveasim._core.registry import Registry
 from foveasim.camera import Camera
 from foveasim.capture import Capture
 from foveasim.config import Shot
@@ -33,6 +34,8 @@ __all__ = [
 #: A function of a shot, its camera and its capture, which gives a number, a mapping of names to such, or an array with labels.
 Metric = Callable[[Shot, Camera, Capture], Any]
 
+#: Metrics by their names. Installed packages add theirs as entry points of the group ``foveasim.metrics``.
+METRICS: Registry[Metric] = Registry("metric", "foveasim.metrics")
 #: Side of the pictures that are compared.
 PSNR_PIXELS = 256
 #: Names that results have beside metrics.
@@ -41,16 +44,19 @@ RESERVED = ("seed", "error", "warning", "point", "repeat")
 DEFAULT_METRICS = ("mean_code_dn", "saturated_fraction", "snr", "n_sites")
 
 
+@METRICS.register("mean_code_dn")
 def mean_code_dn(shot: Shot, camera: Camera, capture: Capture) -> float:  # noqa: ARG001 -- the signature of metrics
     """Mean of the codes, DN."""
     return float(np.mean(capture.code))
 
 
+@METRICS.register("saturated_fraction")
 def saturated_fraction(shot: Shot, camera: Camera, capture: Capture) -> float:  # noqa: ARG001
     """Share of the sites that gave the highest code."""
     return capture.saturated_share
 
 
+@METRICS.register("snr")
 def snr(shot: Shot, camera: Camera, capture: Capture) -> dict[str, float]:
     """
     Signal over temporal noise, predicted without a draw: mean and median over the sites.
@@ -66,11 +72,13 @@ def snr(shot: Shot, camera: Camera, capture: Capture) -> dict[str, float]:
     return {"mean": float(ratio.mean()), "median": float(np.median(ratio))}
 
 
+@METRICS.register("n_sites")
 def n_sites(shot: Shot, camera: Camera, capture: Capture) -> int:  # noqa: ARG001
     """Photosites of the layout."""
     return capture.layout.n_sites
 
 
+@METRICS.register("data_rate_gbit_per_s")
 def data_rate_gbit_per_s(shot: Shot, camera: Camera, capture: Capture) -> float:
     """
     Data rate of one lane, Gbit/s.
@@ -90,22 +98,12 @@ def light_behind_lens(shot: Shot, camera: Camera) -> Picture:
     return camera.reference(shot.scene, grid, exposure_s=shot.exposure_s)
 
 
+@METRICS.register("psnr_db")
 def picture_psnr_db(shot: Shot, camera: Camera, capture: Capture, reference: Picture | None = None) -> float:
     """PSNR of the picture of cells, in photoelectrons per µm², against the light behind the lens, dB."""
     reference = light_behind_lens(shot, camera) if reference is None else reference
     picture = capture.picture(of="light_e", per="um2", grid=reference.grid, sensor=camera.sensor)
     return psnr_db(picture, reference)
-
-
-#: Metrics by their names.
-METRICS: dict[str, Metric] = {
-    "data_rate_gbit_per_s": data_rate_gbit_per_s,
-    "mean_code_dn": mean_code_dn,
-    "n_sites": n_sites,
-    "psnr_db": picture_psnr_db,
-    "saturated_fraction": saturated_fraction,
-    "snr": snr,
-}
 
 
 #: What a metric may be given beside its capture, of light, layout and exposure alone: many captures share it.

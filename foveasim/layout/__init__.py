@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from foveasim.layout.adjacency import adjacency
 from foveasim.layout.channels import MOSAICS, colouring, mosaic, random_channels
 from foveasim.layout.drc.presets import PRESETS, Preset
@@ -9,6 +11,7 @@ from foveasim.layout.drc.repair import Change, enforce
 from foveasim.layout.drc.routing import Readout, Routing, crossings
 from foveasim.layout.drc.rules import DesignRules, Report, RuleResult, Violation, min_width_um
 from foveasim.layout.edits import clip, inset, merge, merge_small, node, punch, snap, split, union
+from foveasim.layout.families import LAYOUTS, layout_family
 from foveasim.layout.files import WrittenLayout, read_layout, shipped_layouts, write_layout
 from foveasim.layout.generators.foveal_cartesian import foveal_cartesian
 from foveasim.layout.generators.fovi import fovi
@@ -28,6 +31,7 @@ from foveasim.layout.readout import nearest_bus, readout_by, readout_order
 from foveasim.layout.summary import Summary, describe
 
 __all__ = [
+    "LAYOUTS",
     "MOSAICS",
     "PRESETS",
     "Change",
@@ -55,6 +59,7 @@ __all__ = [
     "grid",
     "hexagonal",
     "inset",
+    "layout_family",
     "log_polar",
     "merge",
     "merge_small",
@@ -81,3 +86,6 @@ __all__ = [
     "write_layout",
     "zones",
 ]
+
+if not TYPE_CHECKING:  # families of other packages, and new ones of this
+    __getattr__ = LAYOUTS.attributes_of(__name__)

@@ -126,6 +126,14 @@ class Layout:
         layout._store()
         return layout
 
+    def with_provenance(self, provenance: Mapping[str, Any]) -> Layout:
+        """Return the same layout with another record of what it was made from: plain data."""
+        layout = object.__new__(type(self))
+        for name in ("xy_um", "ring_offsets", "site_offsets", "columns"):
+            object.__setattr__(layout, name, getattr(self, name))
+        object.__setattr__(layout, "provenance", MappingProxyType(copied(dict(provenance))))
+        return layout
+
     def _store(self) -> None:
         """Check the structure of the fields, and keep read-only copies."""
         xy_um = finite_array("xy_um", self.xy_um, ndim=2)

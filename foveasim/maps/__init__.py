@@ -21,44 +21,21 @@ it tells. A file that is broken, cut short or hostile ends in one :class:`~fovea
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from numpy.typing import ArrayLike
 
 from foveasim._core.validation import handed_over
 from foveasim._io.atomic import written_whole
+from foveasim._io.formats import format_of, writing_format
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Pitch, PowerMap
-from foveasim.maps import _dataset, _exr, _fits, _isetcam, _npy, _tiff
-from foveasim.maps._apart import read_apart
-from foveasim.maps._common import Found, Given, finished, head_of, one_sentence
+from foveasim.maps import _dataset, _exr, _fits, _isetcam, _npy, _tiff  # noqa: F401 -- they register their formats
+from foveasim.maps._common import Found, Given, finished, one_sentence
+from foveasim.maps._formats import MAP_FORMATS, read_found
 from foveasim.maps._units import Unit
 from foveasim.maps._xarray import from_xarray, to_xarray
 
-__all__ = ["Unit", "from_xarray", "read_power_map", "to_xarray", "write_power_map"]
-
-_WRITERS: dict[str, Any] = {
-    ".npz": _npy.write_npz,
-    ".fits": _fits.write,
-    ".fit": _fits.write,
-    ".tif": _tiff.write,
-    ".tiff": _tiff.write,
-    ".exr": _exr.write,
-    ".nc": _dataset.write_netcdf,
-    ".nc4": _dataset.write_netcdf,
-}
-ZARR = ".zarr"
-#: Beginnings of files, and their readers in this program, or their kind for one of its own.
-_READERS: dict[tuple[bytes, ...], Any] = {
-    (_npy.NPY_MAGIC,): _npy.read_npy,
-    _npy.ZIP_MAGICS: _npy.read_npz,
-    (_fits.MAGIC,): _fits.read,
-    _tiff.MAGICS: _tiff.read,
-    (_exr.MAGIC,): "EXR",
-    (_isetcam.MAT73_MAGIC,): "MAT 7.3",
-    (_isetcam.MAT5_MAGIC,): "MAT",
-    (_dataset.HDF5_MAGIC, *_dataset.NETCDF3_MAGICS): "netCDF",
-}
+__all__ = ["MAP_FORMATS", "Found", "Unit", "from_xarray", "read_power_map", "to_xarray", "write_power_map"]
 
 
 def read_power_map(
@@ -131,22 +108,10 @@ def read_power_map(
         top_row_first=top_row_first,
     )
     with one_sentence(path):
-        found = _found(path, name)
+        kind, _ = format_of(path, MAP_FORMATS, "power map")
+        found = read_found(path, kind, name)
         handed_over(found.data)
         return finished(found, given)
-
-
-def _found(path: Path, name: str | None) -> Found:
-    if _dataset.is_zarr(path):
-        return read_apart(path, "zarr", name)
-    head = head_of(path)
-    for magics, reader in _READERS.items():
-        if head.startswith(magics):
-            found: Found = read_apart(path, reader, name) if isinstance(reader, str) else reader(path, name)
-            return found
-    if head.startswith(b"\x1f\x8b"):
-        raise FileError(path, "is compressed with gzip; unpack it first")
-    raise FileError(path, "is no power map: expected npy, npz, FITS, TIFF, EXR, netCDF, zarr or MAT")
 
 
 def write_power_map(power_map: PowerMap, path: str | Path) -> None:
@@ -173,14 +138,13 @@ def write_power_map(power_map: PowerMap, path: str | Path) -> None:
     if not isinstance(power_map, PowerMap):
         raise ParameterError("power_map", f"must be a PowerMap, got a {type(power_map).__name__}")
     path = Path(path)
-    if path.suffix.lower() == ZARR:
-        _dataset.write_zarr(power_map, path)
+    form = writing_format(path, MAP_FORMATS)
+    assert form.write is not None
+    if form.is_directory:
+        form.write(power_map, path)
         return
-    writer = _WRITERS.get(path.suffix.lower())
-    if writer is None:
-        raise FileError(path, f"must end in one of {', '.join(sorted([*_WRITERS, ZARR]))}")
     with written_whole(path) as temporary:
         try:
-            writer(power_map, temporary)
+            form.write(power_map, temporary)
         except FileError as error:
             raise FileError(path, str(error).removeprefix(f"{temporary}: ")) from None

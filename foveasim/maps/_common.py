@@ -32,20 +32,15 @@ __all__ = [
     "check_numbers",
     "check_size",
     "finished",
-    "head_of",
     "max_unpacked",
     "one_sentence",
     "pitch_of_axes",
 ]
 
-#: Larger files are refused, and so are maps of more bytes.
-MAX_FILE_BYTES = 8 * 2**30
 MAX_UNPACKED_BYTES = 8 * 2**30
 #: What a small file may unpack to, and for each byte of a larger one.
 MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**28, 256
 MAX_BANDS = 4096
-#: Enough to tell the formats apart.
-HEAD_BYTES = 1024
 #: Steps are even when they differ by less than this share: coordinates may be float32.
 UNEVEN = 1e-4
 #: Cells are square when their sides differ by less than this fraction: what float32 coordinates leave of one pitch.
@@ -109,32 +104,6 @@ class Given:
             check_choice("unit", self.unit, UNITS)
         if self.origin_um is not None:
             Grid((1, 1), 1.0, self.origin_um)
-
-
-def head_of(path: Path) -> bytes:
-    """
-    The first bytes of a file.
-
-    Raises
-    ------
-    FileError
-        When it is missing, unreadable, empty or too large.
-    """
-    try:
-        if not path.is_file():
-            raise FileError(path, "is not a file" if path.exists() else "no such file")
-        n_bytes = path.stat().st_size
-        if n_bytes > MAX_FILE_BYTES:
-            raise FileError(path, f"has {n_bytes} bytes, more than the {MAX_FILE_BYTES} that are read")
-        with path.open("rb") as file:
-            head = file.read(HEAD_BYTES)
-    except FileError:
-        raise
-    except (OSError, ValueError) as error:
-        raise FileError(path, f"cannot be opened: {getattr(error, 'strerror', None) or error}") from None
-    if not head:
-        raise FileError(path, "is empty")
-    return head
 
 
 def max_unpacked(n_bytes: int) -> int:

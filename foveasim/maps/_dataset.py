@@ -19,9 +19,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foveasim._io.atomic import check_room, remove_folder
+from foveasim._io.formats import FileFormat
 from foveasim.errors import FileError
 from foveasim.fields import PowerMap
 from foveasim.maps._common import Found, Refusal, check_size
+from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._xarray import NAME, X, Y, found_in_array, to_xarray
 
 if TYPE_CHECKING:
@@ -256,3 +258,28 @@ def _needs(path: Path, engine: str) -> None:
         __import__("xarray")
     except ImportError:
         raise FileError(path, f"needs {engine} and xarray; install them with: pip install 'foveasim[maps]'") from None
+
+
+MAP_FORMATS.register(
+    "netcdf",
+    FileFormat(
+        title="netCDF",
+        suffixes=(".nc", ".nc4"),
+        signatures=(HDF5_MAGIC, *NETCDF3_MAGICS),
+        read=read_netcdf,
+        write=write_netcdf,
+        is_sandboxed=True,
+    ),
+)
+MAP_FORMATS.register(
+    "zarr",
+    FileFormat(
+        title="zarr",
+        suffixes=(".zarr",),
+        matches=lambda path, _head: is_zarr(path),
+        read=read_zarr,
+        write=write_zarr,
+        is_sandboxed=True,
+        is_directory=True,
+    ),
+)

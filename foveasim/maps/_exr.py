@@ -16,9 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from foveasim._io.formats import FileFormat
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import PowerMap, to_file_rows
 from foveasim.maps._common import MAX_BANDS, Found, Refusal, check_size
+from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._text import about_map, found_in_text
 
 __all__ = ["MAGIC", "read", "write"]
@@ -122,3 +124,9 @@ def _openexr(path: Path) -> Any:
     except ImportError:
         raise FileError(path, "needs OpenEXR; install it with: pip install 'foveasim[maps]'") from None
     return OpenEXR
+
+
+MAP_FORMATS.register(
+    "exr",
+    FileFormat(title="EXR", suffixes=(".exr",), signatures=(MAGIC,), read=read, write=write, is_sandboxed=True),
+)

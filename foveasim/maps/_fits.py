@@ -17,9 +17,11 @@ from typing import Any
 
 import numpy as np
 
+from foveasim._io.formats import FileFormat
 from foveasim.errors import FileError
 from foveasim.fields import PowerMap
 from foveasim.maps._common import UNEVEN, Found, Refusal, check_size
+from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._text import about_map, found_in_text
 from foveasim.maps._units import length_in_um
 
@@ -160,3 +162,8 @@ def _astropy(path: Path) -> Any:
     except ImportError:
         raise FileError(path, "needs astropy; install it with: pip install 'foveasim[maps]'") from None
     return fits
+
+
+MAP_FORMATS.register(
+    "fits", FileFormat(title="FITS", suffixes=(".fits", ".fit"), signatures=(MAGIC,), read=read, write=write)
+)

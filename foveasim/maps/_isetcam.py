@@ -19,8 +19,10 @@ from typing import IO, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._io.formats import FileFormat
 from foveasim.fields import from_file_rows
 from foveasim.maps._common import Found, Refusal, check_size, max_unpacked
+from foveasim.maps._formats import MAP_FORMATS
 
 __all__ = ["MAT5_MAGIC", "MAT73_MAGIC", "read_mat5", "read_mat73"]
 
@@ -181,3 +183,9 @@ def _inflated(file: IO[bytes], length: int, most: int) -> bytes:
             size += len(parts[-1])
             packed = inflater.unconsumed_tail
     return b"".join(parts)
+
+
+for _name, _magic, _read in (("mat73", MAT73_MAGIC, read_mat73), ("mat", MAT5_MAGIC, read_mat5)):
+    MAP_FORMATS.register(
+        _name, FileFormat(title="MAT", suffixes=(".mat",), signatures=(_magic,), read=_read, is_sandboxed=True)
+    )

@@ -18,8 +18,10 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from foveasim._io.formats import FileFormat
 from foveasim.fields import PowerMap
 from foveasim.maps._common import Found, Refusal, check_size
+from foveasim.maps._formats import MAP_FORMATS
 
 __all__ = ["NPY_MAGIC", "ZIP_MAGICS", "read_npy", "read_npz", "write_npz"]
 
@@ -140,3 +142,9 @@ def _read_into(file: IO[bytes], data: NDArray[np.uint8]) -> int:
         data[done : done + len(piece)] = np.frombuffer(piece, np.uint8)
         done += len(piece)
     return done
+
+
+MAP_FORMATS.register("npy", FileFormat(title="npy", suffixes=(".npy",), signatures=(NPY_MAGIC,), read=read_npy))
+MAP_FORMATS.register(
+    "npz", FileFormat(title="npz", suffixes=(".npz",), signatures=ZIP_MAGICS, read=read_npz, write=write_npz)
+)

@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._io.formats import FileFormat
 from foveasim._io.images import pixels_of_page
 from foveasim.fields import PowerMap, to_file_rows
 from foveasim.maps._common import MAX_BANDS, Found, Refusal, check_size
+from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._text import about_map, found_in_text
 
 __all__ = ["MAGICS", "read", "write"]
@@ -78,3 +80,8 @@ def read(path: Path, name: str | None) -> Found:
 
 def _samples_first(data: NDArray[Any], page: Any, tifffile: Any) -> NDArray[Any]:
     return data if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE else np.moveaxis(data, -1, 0)
+
+
+MAP_FORMATS.register(
+    "tiff", FileFormat(title="TIFF", suffixes=(".tif", ".tiff"), signatures=MAGICS, read=read, write=write)
+)

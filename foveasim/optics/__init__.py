@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from foveasim._core.registry import import_all
 from foveasim.optics._optics import Optics
 from foveasim.optics._point_images import PointSpread
 from foveasim.optics.aberrations import LateralColour, Seidel, Zernike, noll_to_nm, osa_to_nm, zernike
 from foveasim.optics.otf import circular_otf
-from foveasim.optics.pupils import Annulus, Blades, Pupil, PupilImage, Slit, Spider
+from foveasim.optics.pupils import PUPILS, Annulus, Blades, Pupil, PupilImage, Slit, Spider
 
 __all__ = [
+    "PUPILS",
     "Annulus",
     "Blades",
     "LateralColour",
@@ -25,3 +27,5 @@ __all__ = [
     "osa_to_nm",
     "zernike",
 ]
+
+import_all(__name__, __path__)

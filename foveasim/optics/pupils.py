@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.registry import Registry
 from foveasim._core.validation import (
     Bools,
     Floats,
@@ -35,7 +36,12 @@ __all__ = ["Annulus", "Blades", "Pupil", "PupilImage", "Slit", "Spider"]
 #: Amplitudes (real or complex) at points x, y in aperture radii, for a wavelength in nm.
 Pupil = Callable[[Floats, Floats, float], NDArray[Any]]
 
+#: Pupils by their names in settings files: what a call gives is a function of pupil coordinates and wavelength. Installed
+#: packages add theirs as entry points of the group ``foveasim.pupils``.
+PUPILS: Registry[Callable[..., Any]] = Registry("pupil", "foveasim.pupils")
 
+
+@PUPILS.register("annulus")
 @dataclass(frozen=True, slots=True)
 class Annulus:
     """
@@ -64,6 +70,7 @@ class Annulus:
         return np.asarray(x * x + y * y >= self.obscuration**2)
 
 
+@PUPILS.register("spider")
 @dataclass(frozen=True, slots=True)
 class Spider:
     """
@@ -102,6 +109,7 @@ class Spider:
         return is_open
 
 
+@PUPILS.register("blades")
 @dataclass(frozen=True, slots=True)
 class Blades:
     """
@@ -136,6 +144,7 @@ class Blades:
         return is_open
 
 
+@PUPILS.register("slit")
 @dataclass(frozen=True, slots=True)
 class Slit:
     """
@@ -168,6 +177,7 @@ class Slit:
         return np.asarray(np.abs(y * np.cos(angle) - x * np.sin(angle)) <= self.width_fraction)
 
 
+@PUPILS.register("image")
 @dataclass(frozen=True, eq=False)
 class PupilImage:
     """

@@ -4,5 +4,6 @@ from __future__ import annotations
 
 from foveasim.scene import charts
 from foveasim.scene._scene import Scene
+from foveasim.scene.registry import SCENES
 
-__all__ = ["Scene", "charts"]
+__all__ = ["SCENES", "Scene", "charts"]

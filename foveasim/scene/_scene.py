@@ -27,6 +27,7 @@ from foveasim._io.encodings import Encoding, decoded
 from foveasim._io.images import read_picture
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import from_file_rows
+from foveasim.scene.registry import SCENES
 from foveasim.units import m_from_um
 
 __all__ = ["Scene"]
@@ -379,3 +380,7 @@ def band_widths_nm(wavelength_nm: Floats, band_width_nm: float | Sequence[float]
     widths = np.empty(wavelength_nm.size)
     widths[order] = 0.5 * (np.concatenate((steps[:1], steps)) + np.concatenate((steps, steps[-1:])))
     return widths
+
+
+for _name, _scene in (("picture", Scene.from_picture), ("flat", Scene.flat), ("point_sources", Scene.point_sources)):
+    SCENES.register(_name, _scene)

@@ -23,45 +23,28 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from foveasim.errors import FileError, ParameterError
+from foveasim._core.registry import import_all
+from foveasim._io.formats import chosen_options, format_of, writing_format
+from foveasim.errors import FileError
 from foveasim.layout.files._bundled import layout_path, shipped_layouts
-from foveasim.layout.files._common import WrittenLayout, head_of
-from foveasim.layout.files.gds import GDS_MAGIC, OASIS_MAGIC
-from foveasim.layout.files.gds import read as read_gds
-from foveasim.layout.files.gds import write as write_gds
-from foveasim.layout.files.geojson import read as read_geojson
-from foveasim.layout.files.geojson import write as write_geojson
-from foveasim.layout.files.geoparquet import MAGIC as PARQUET_MAGIC
-from foveasim.layout.files.geoparquet import read as read_geoparquet
-from foveasim.layout.files.geoparquet import write as write_geoparquet
-from foveasim.layout.files.npz import MAGICS as NPZ_MAGICS
-from foveasim.layout.files.npz import read as read_npz
-from foveasim.layout.files.npz import write as write_npz
-from foveasim.layout.files.svg import write as write_svg
+from foveasim.layout.files._common import WrittenLayout
+from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout
 
-__all__ = ["WrittenLayout", "check_chip_options", "layout_path", "read_layout", "shipped_layouts", "write_layout"]
+__all__ = [
+    "FORMATS",
+    "WrittenLayout",
+    "check_no_options",
+    "layout_path",
+    "read_layout",
+    "shipped_layouts",
+    "write_layout",
+]
 
-_WRITERS: dict[str, Any] = {
-    ".gds": write_gds,
-    ".gdsii": write_gds,
-    ".oas": write_gds,
-    ".oasis": write_gds,
-    ".npz": write_npz,
-    ".geojson": write_geojson,
-    ".json": write_geojson,
-    ".svg": write_svg,
-    ".parquet": write_geoparquet,
-    ".geoparquet": write_geoparquet,
-}
-#: Beginnings of formats that are told from others, and what to do with them.
-_CURES = {
-    b"\x1f\x8b": "is compressed with gzip; unpack it first",
-    b"<": "is markup; an SVG drawing is written and not read",
-}
+import_all(__name__, __path__)
 
 
-def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None = None) -> Layout:
+def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None = None, **options: Any) -> Layout:
     """
     Read the photosites of a layout file.
 
@@ -75,6 +58,8 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
         Of GDSII and OASIS: the layer that holds the photosites; needed where shapes lie on several.
     cell : str, optional
         Of GDSII and OASIS: the cell to read, with all cells below it; needed where several are on top.
+    **options
+        Of other formats in :data:`foveasim.layout.files.FORMATS`.
 
     Returns
     -------
@@ -92,35 +77,23 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
     path = Path(path)
     if str(path) in shipped_layouts() and not path.exists():
         raise FileError(path, "no such file; foveasim.read_layout reads the bundled layout of this name")
-    head = head_of(path)
-    if head.startswith((GDS_MAGIC, OASIS_MAGIC)):
-        return read_gds(path, layer=layer, cell=cell)
-    check_chip_options(layer=layer, cell=cell)
-    if head.startswith(NPZ_MAGICS):
-        return read_npz(path)
-    if head.startswith(PARQUET_MAGIC):
-        return read_geoparquet(path)
-    text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
-    if text.startswith(b"{"):
-        return read_geojson(path)
-    for magic, cure in _CURES.items():
-        if text.startswith(magic):
-            raise FileError(path, cure)
-    raise FileError(path, "is no layout file: expected GDSII, OASIS, npz, GeoJSON or GeoParquet")
+    _, found = format_of(path, FORMATS, "layout file")
+    assert found.read is not None
+    chosen = chosen_options({"layer": layer, "cell": cell, **options}, found.read_options, FORMATS, "read_options")
+    layout: Layout = found.read(path, **chosen)
+    return layout
 
 
-def check_chip_options(**options: object) -> None:
+def check_no_options(**options: object) -> None:
     """
-    Reject options of chip files for a file of another format.
+    Reject options of formats for a file that has none.
 
     Raises
     ------
     ParameterError
         When one is given.
     """
-    for name, value in options.items():
-        if value is not None:
-            raise ParameterError(name, "belongs to GDSII and OASIS files", value, cure="leave it out")
+    chosen_options(options, (), FORMATS, "read_options")
 
 
 def write_layout(
@@ -130,6 +103,7 @@ def write_layout(
     layer: int | None = None,
     dbu_um: float | None = None,
     colours: Mapping[int, str] | None = None,
+    **options: Any,
 ) -> WrittenLayout:
     """
     Write a layout to a file, whole or not at all.
@@ -146,6 +120,8 @@ def write_layout(
         of a nanometre, with which coordinates reach 214 mm.
     colours : mapping of int to str, optional
         Of SVG: the colour of each channel, as ``{0: "#c23b22", 1: "green"}``; channels not named are grey.
+    **options
+        Of other formats in :data:`foveasim.layout.files.FORMATS`.
 
     Returns
     -------
@@ -169,12 +145,10 @@ def write_layout(
     0.0
     """
     path = Path(path)
-    writer = _WRITERS.get(path.suffix.lower())
-    if writer is None:
-        raise FileError(path, f"must end in one of {', '.join(sorted(_WRITERS))}")
-    chosen = {name: v for name, v in (("layer", layer), ("dbu_um", dbu_um), ("colours", colours)) if v is not None}
-    known = {write_gds: {"layer", "dbu_um"}, write_svg: {"colours"}}.get(writer, set())
-    for name, value in chosen.items():
-        if name not in known:
-            raise ParameterError(name, f"does not belong to {path.suffix} files", value, cure="leave it out")
-    return writer(layout, path, **chosen)
+    found = writing_format(path, FORMATS)
+    assert found.write is not None
+    given = {"layer": layer, "dbu_um": dbu_um, "colours": colours, **options}
+    written: WrittenLayout = found.write(
+        layout, path, **chosen_options(given, found.write_options, FORMATS, "write_options")
+    )
+    return written

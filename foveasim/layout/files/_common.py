@@ -25,7 +25,6 @@ __all__ = [
     "check_sizes",
     "check_unpacked",
     "checked_layout",
-    "head_of",
     "header",
     "lossless",
     "max_unpacked",
@@ -38,8 +37,6 @@ __all__ = [
 #: Written in every file that keeps columns and origin.
 FILE_FORMAT = "foveasim layout"
 FILE_VERSION = 1
-#: Larger files are refused, and so are those that would unpack to more: 50 million hexagons take 5 GiB.
-MAX_FILE_BYTES = 8 * 2**30
 MAX_UNPACKED_BYTES = 8 * 2**30
 #: What a small file may unpack to, and for each byte of a larger one: regular grids, packed, unpack to 30 bytes a byte.
 MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**26, 128
@@ -48,8 +45,6 @@ MIN_TEXT_BYTES, TEXT_BYTES_PER_LETTER = 2**28, 64
 #: Rings and edges of a site are looked at in pairs where they may meet: pairs of either in all sites, and for each there is.
 MAX_RING_PAIRS, PAIRS_PER_RING = 2_000_000, 100
 MAX_VERTEX_PAIRS, PAIRS_PER_VERTEX = 1_000_000_000, 1000
-#: Enough to tell the formats apart, white space and a byte order mark before the first brace included.
-HEAD_BYTES = 256
 #: Longer messages are cut: of other libraries, and of our own.
 MAX_TOLD = 200
 MAX_SENTENCE = 500
@@ -104,32 +99,6 @@ def rounding(layout: Layout, rounded_um: Floats, path: Path, lost_columns: tuple
         worst_area_error=float(np.abs(error).max()),
         lost_columns=lost_columns,
     )
-
-
-def head_of(path: Path) -> bytes:
-    """
-    The first bytes of a file.
-
-    Raises
-    ------
-    FileError
-        When it is missing, unreadable, empty or too large.
-    """
-    try:
-        if not path.is_file():
-            raise FileError(path, "is not a file" if path.exists() else "no such file")
-        n_bytes = path.stat().st_size
-        if n_bytes > MAX_FILE_BYTES:
-            raise FileError(path, f"has {n_bytes} bytes, more than the {MAX_FILE_BYTES} that are read")
-        with path.open("rb") as file:
-            head = file.read(HEAD_BYTES)
-    except (OSError, ValueError) as error:
-        if isinstance(error, FileError):
-            raise
-        raise FileError(path, f"cannot be opened: {getattr(error, 'strerror', None) or error}") from None
-    if not head:
-        raise FileError(path, "is empty")
-    return head
 
 
 def max_unpacked(path: Path) -> int:

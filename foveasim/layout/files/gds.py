@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 from foveasim._core.rings import positions_in_runs, ring_moments
 from foveasim._core.validation import MAX_SITES, Floats, Ints, check_count, check_number
 from foveasim._io.atomic import written_whole
+from foveasim._io.formats import FileFormat
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout.files._columns import MAX_COLUMN_BYTES, columns_of, kept_columns, texts_of
 from foveasim.layout.files._common import (
@@ -49,6 +50,7 @@ from foveasim.layout.files._common import (
     one_sentence,
     rounding,
 )
+from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout, valid_sites
 
 __all__ = ["GDS_MAGIC", "OASIS_MAGIC", "read", "write"]
@@ -557,3 +559,21 @@ def _of_loops(loops: list[list[Point]]) -> Any:
     if np.count_nonzero(is_hole) != len(loops) - 1:
         return None
     return shapely.Polygon(loops[outline], [loop for loop, is_in in zip(loops, is_hole, strict=True) if is_in])
+
+
+for _name, _title, _suffixes, _magic in (
+    ("gds", "GDSII", (".gds", ".gdsii"), GDS_MAGIC),
+    ("oasis", "OASIS", (".oas", ".oasis"), OASIS_MAGIC),
+):
+    FORMATS.register(
+        _name,
+        FileFormat(
+            title=_title,
+            suffixes=_suffixes,
+            signatures=(_magic,),
+            read=read,
+            write=write,
+            read_options=("layer", "cell"),
+            write_options=("layer", "dbu_um"),
+        ),
+    )

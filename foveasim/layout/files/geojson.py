@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.validation import Floats, Ints, exact_integers
 from foveasim._io.atomic import written_whole
+from foveasim._io.formats import FileFormat
 from foveasim.errors import FileError
 from foveasim.layout.files._common import (
     WrittenLayout,
@@ -36,6 +37,7 @@ from foveasim.layout.files._common import (
     restored_column,
     texts,
 )
+from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout
 
 __all__ = ["read", "write"]
@@ -248,3 +250,12 @@ def _column(values: list[Any], dtype: Any) -> NDArray[Any] | None:
     if (plain and plain <= {int, float}) or (not plain and str(dtype)[1:2] == "f"):
         return restored_column(np.array([np.nan if v is None else v for v in values], dtype=np.float64), dtype)
     return None
+
+
+def _is_json(_path: Path, head: bytes) -> bool:
+    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{")
+
+
+FORMATS.register(
+    "geojson", FileFormat(title="GeoJSON", suffixes=(".geojson", ".json"), matches=_is_json, read=read, write=write)
+)

@@ -16,6 +16,7 @@ import shapely
 from numpy.typing import NDArray
 
 from foveasim._io.atomic import written_whole
+from foveasim._io.formats import FileFormat
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout.files._common import (
     WrittenLayout,
@@ -32,6 +33,7 @@ from foveasim.layout.files._common import (
     restored_column,
     texts,
 )
+from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout
 
 __all__ = ["MAGIC", "read", "write"]
@@ -196,3 +198,9 @@ def _is_multipolygon_of_one(wkb: bytes | None) -> bool:
     at = 9 if number & WITH_SRID else 5
     n_parts = int.from_bytes(wkb[at : at + 4], "little" if wkb[0] else "big")
     return n_parts == 1 and wkb[at + 4 : at + 9] in HEADS[POLYGON]
+
+
+FORMATS.register(
+    "geoparquet",
+    FileFormat(title="GeoParquet", suffixes=(".parquet", ".geoparquet"), signatures=(MAGIC,), read=read, write=write),
+)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from foveasim._core.rings import ring_moments
+from foveasim._io.formats import FileFormat
 from foveasim._io.npz import read_archive, write_archive
 from foveasim.errors import FileError
 from foveasim.layout.files._common import (
@@ -18,6 +19,7 @@ from foveasim.layout.files._common import (
     max_unpacked,
     one_sentence,
 )
+from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout
 from foveasim.layout.packed import is_of_layout, packed_layout, unpacked_layout
 
@@ -74,3 +76,6 @@ def _check_winding(path: Path, layout: Layout) -> None:
         ring = int(np.flatnonzero(~is_right)[0])
         site = int(np.searchsorted(layout.site_offsets, ring, side="right")) - 1
         raise FileError(path, f"holds no photosites: a ring of site {site} is wound the wrong way, or has no area")
+
+
+FORMATS.register("npz", FileFormat(title="npz", suffixes=(".npz",), signatures=MAGICS, read=read, write=write))

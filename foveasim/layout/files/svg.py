@@ -10,8 +10,10 @@ import numpy as np
 
 from foveasim._core.validation import check_count
 from foveasim._io.atomic import written_whole
+from foveasim._io.formats import FileFormat
 from foveasim.errors import ParameterError
 from foveasim.layout.files._common import WrittenLayout, rounding
+from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout
 
 __all__ = ["write"]
@@ -80,3 +82,6 @@ def _outlines(layout: Layout) -> list[str]:
     # Adding 0 turns -0 into 0.
     numbers = np.round(layout.xy_um, DIGITS) + 0.0
     return ("".join(parts) % tuple(numbers.ravel().tolist())).splitlines()
+
+
+FORMATS.register("svg", FileFormat(title="SVG", suffixes=(".svg",), write=write, write_options=("colours",)))

@@ -1,1 +1,7 @@
-"""Generators of layouts, one module per family."""
+"""Generators of layouts, one module per family; each registers itself in :data:`foveasim.layout.LAYOUTS`."""
+
+from __future__ import annotations
+
+from foveasim._core.registry import import_all
+
+import_all(__name__, __path__)

@@ -17,6 +17,7 @@ from foveasim._core.validation import (
     check_sites,
 )
 from foveasim.errors import ParameterError
+from foveasim.layout.families import layout_family
 from foveasim.layout.generators._annuli import ring_outlines
 from foveasim.layout.model import Layout
 
@@ -28,6 +29,7 @@ RATIO_ROUNDING = 1e-9
 CORNER_ROUNDING = 1e-12
 
 
+@layout_family(example={"n_rings": 12, "pitch_um": 1.0, "n_fovea": 4, "ring_ratio": 1.2})
 def foveal_cartesian(*, n_rings: int, ring_ratio: float, pitch_um: float, n_fovea: int = 1) -> Layout:
     """
     Square rings around the optical axis: ring r has 8r rectangles, and is ``ring_ratio`` times as large as the one inside.
@@ -105,10 +107,6 @@ def foveal_cartesian(*, n_rings: int, ring_ratio: float, pitch_um: float, n_fove
         np.concatenate(([0], np.cumsum(n_vertices))),
         np.arange(n_vertices.size + 1),
         {"ring": ring, "sector": sector, "row": row, "column": column, "readout_line": column},
-        {
-            "generator": "foveal_cartesian",
-            "parameters": {"n_rings": n_rings, "ring_ratio": ring_ratio, "pitch_um": pitch_um, "n_fovea": n_fovea},
-        },
     )
 
 

@@ -11,6 +11,7 @@ from foveasim._core.validation import Floats, Ints, check_count, check_length_um
 from foveasim.errors import ParameterError
 from foveasim.layout._regions import disc
 from foveasim.layout._voronoi import cells_of
+from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
 
 __all__ = ["fovi"]
@@ -21,6 +22,7 @@ MAX_RINGS = 10_000
 CHORDS_PER_SITE = 4
 
 
+@layout_family(example={"fov_um": 36.0, "a_um": 3.0, "n_rings": 12})
 def fovi(*, fov_um: float, a_um: float, n_rings: int, n_chords: int | None = None) -> Layout:
     """
     A central site and rings around it whose spacing grows with the radius, no site wider than it is high.
@@ -96,8 +98,6 @@ def fovi(*, fov_um: float, a_um: float, n_rings: int, n_chords: int | None = Non
         np.arange(offsets.size),
         {"ring": ring, "sector": sector, "readout_line": ring},
         {
-            "generator": "fovi",
-            "parameters": {"fov_um": fov_um, "a_um": a_um, "n_rings": n_rings, "n_chords": n_chords},
             "radius_um": radius_um,
         },
     )

@@ -15,6 +15,7 @@ import numpy as np
 
 from foveasim._core.validation import MAX_LENGTH_UM, MAX_SITES, check_choice, check_count, check_length_um, check_sites
 from foveasim.errors import ParameterError
+from foveasim.layout.families import layout_family
 from foveasim.layout.generators._annuli import MIN_SITES_PER_RHO, Fovea, Ring, annuli, fovea_rings
 from foveasim.layout.generators.tiling import with_hexagons
 from foveasim.layout.model import Layout
@@ -47,6 +48,7 @@ def giotto_ratio(*, n_rho: int, n_fovea: int, n_across: int) -> float:
     return math.exp(_log_ratio(n_rho, n_fovea, n_across))
 
 
+@layout_family(example={"n_rho": 16, "n_theta": 36, "n_fovea": 6, "n_across": 60, "unit_um": 0.6})
 def giotto(
     *,
     n_rho: int,
@@ -160,17 +162,6 @@ def giotto(
     xy_um, offsets, ring, sector = annuli(radii * unit_um, rings)
     n_sites = np.array([r.n_sites for r in rings])
     provenance = {
-        "generator": "giotto",
-        "parameters": {
-            "n_rho": n_rho,
-            "n_theta": n_theta,
-            "n_fovea": n_fovea,
-            "n_across": n_across,
-            "unit_um": unit_um,
-            "fovea": fovea,
-            "stagger": stagger,
-            "chords_per_arc": chords_per_arc,
-        },
         "ring_ratio": math.exp(log_ratio),
     }
     if not has_rings:

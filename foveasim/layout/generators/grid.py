@@ -9,11 +9,13 @@ import numpy as np
 
 from foveasim._core.validation import Floats, check_count, check_length_um, check_number, check_sites
 from foveasim.errors import ParameterError
+from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
 
 __all__ = ["grid"]
 
 
+@layout_family(example={"n_x": 14, "n_y": 14, "pitch_um": 2.0, "trench_um": 0.3, "stagger": True})
 def grid(
     *,
     n_x: int,
@@ -81,19 +83,6 @@ def grid(
     return Layout.from_equal_rings(
         corners,
         {"row": row, "column": column, "readout_line": column},
-        {
-            "generator": "grid",
-            "parameters": {
-                "n_x": n_x,
-                "n_y": n_y,
-                "pitch_um": pitch_um,
-                "pitch_y_um": pitch_y_um,
-                "width_um": width_um,
-                "trench_um": trench_um,
-                "fill_factor": fill_factor,
-                "stagger": stagger,
-            },
-        },
     )
 
 

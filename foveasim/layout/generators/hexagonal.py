@@ -8,12 +8,14 @@ from typing import Literal
 import numpy as np
 
 from foveasim._core.validation import check_choice, check_count, check_length_um, check_sites
+from foveasim.layout.families import layout_family
 from foveasim.layout.generators.grid import light_share
 from foveasim.layout.model import Layout
 
 __all__ = ["hexagonal"]
 
 
+@layout_family(example={"n_columns": 14, "n_rows": 16, "pitch_um": 2.0})
 def hexagonal(
     *,
     n_columns: int,
@@ -78,16 +80,4 @@ def hexagonal(
     return Layout.from_equal_rings(
         rings_um,
         {"row": row, "column": column, "readout_line": column},
-        {
-            "generator": "hexagonal",
-            "parameters": {
-                "n_columns": n_columns,
-                "n_rows": n_rows,
-                "pitch_um": pitch_um,
-                "width_um": width_um,
-                "trench_um": trench_um,
-                "fill_factor": fill_factor,
-                "orientation": orientation,
-            },
-        },
     )

@@ -20,6 +20,7 @@ from foveasim._core.validation import (
     check_sites,
 )
 from foveasim.errors import LayoutWarning, ParameterError
+from foveasim.layout.families import layout_family
 from foveasim.layout.generators._annuli import MIN_SITES_PER_RHO, Annuli, Fovea, Ring, annuli, fovea_rings
 from foveasim.layout.generators.tiling import with_hexagons
 from foveasim.layout.model import Layout, valid_sites
@@ -49,6 +50,7 @@ def square_ring_ratio(n_sectors: int) -> float:
     return (1.0 + s) / (1.0 - s)
 
 
+@layout_family(example={"n_sectors": 36, "min_size_um": 1.0, "r_max_um": 18.0, "fovea": "hexagons"})
 def log_polar(
     *,
     n_sectors: int,
@@ -157,20 +159,7 @@ def log_polar(
         )
     else:
         sites, n_sites = annuli(radii_um, rings), np.full(len(rings), n_sectors)
-    provenance: dict[str, Any] = {
-        "generator": "log_polar",
-        "parameters": {
-            "n_sectors": n_sectors,
-            "r_max_um": r_max_um,
-            "min_size_um": min_size_um,
-            "r_min_um": r_min_um,
-            "n_rings": n_rings,
-            "ring_ratio": ring_ratio,
-            "fovea": fovea,
-            "stagger": stagger,
-            "chords_per_arc": chords_per_arc,
-        },
-    }
+    provenance: dict[str, Any] = {}
     if fovea == "none":
         provenance["blind_radius_um"] = float(radii_um[0])
     layout = Layout(

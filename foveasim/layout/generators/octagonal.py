@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from foveasim._core.validation import Bools, Ints, check_choice, check_count, check_length_um, check_sites
+from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
 
 __all__ = ["octagonal"]
@@ -21,6 +22,7 @@ DIAMOND = np.array([(1, 0), (2, 1), (1, 2), (0, 1)])
 TOUCHING_ROUNDING = 1e-9
 
 
+@layout_family(example={"n_x": 12, "n_y": 12, "pitch_um": 2.0})
 def octagonal(
     *,
     n_x: int,
@@ -111,16 +113,6 @@ def octagonal(
             "row": np.concatenate((row, diamond_row)),
             "column": np.concatenate((column, diamond_column)),
             "readout_line": np.concatenate((column, n_x + diamond_column)),
-        },
-        {
-            "generator": "octagonal",
-            "parameters": {
-                "n_x": n_x,
-                "n_y": n_y,
-                "pitch_um": pitch_um,
-                "diamond_um": diamond_um,
-                "border": border,
-            },
         },
     )
 

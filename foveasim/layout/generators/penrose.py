@@ -9,6 +9,7 @@ import numpy as np
 
 from foveasim._core.validation import MAX_SITES, Bools, Floats, Ints, check_choice, check_length_um
 from foveasim.errors import ParameterError
+from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
 
 __all__ = ["penrose"]
@@ -30,6 +31,7 @@ KEY = 2 ** np.array((48, 32, 16, 0), np.int64)
 DECAGON_INSIDE = math.cos(math.pi / 10.0)
 
 
+@layout_family(example={"side_um": 2.0, "size_um": 30.0})
 def penrose(*, side_um: float, size_um: float, shape: Literal["disc", "square"] = "disc") -> Layout:
     """
     Thick and thin rhombs with one side, the same after every fifth of a turn around the optical axis.
@@ -86,7 +88,6 @@ def penrose(*, side_um: float, size_um: float, shape: Literal["disc", "square"] 
     return Layout.from_equal_rings(
         rings_um,
         {"is_thick": is_thick.astype(np.int64)},
-        {"generator": "penrose", "parameters": {"side_um": side_um, "size_um": size_um, "shape": shape}},
     )
 
 

@@ -18,6 +18,7 @@ from foveasim._core.validation import (
     finite_array,
 )
 from foveasim.errors import ParameterError
+from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
 
 __all__ = ["quadtree"]
@@ -26,6 +27,15 @@ __all__ = ["quadtree"]
 MAX_LEVELS = 15
 
 
+@layout_family(
+    example={
+        "importance": np.exp(-np.hypot(*np.mgrid[-32:32, -32:32]) / 6.0),
+        "pitch_um": 0.5,
+        "limit": 1.0,
+        "n_levels": 4,
+    },
+    picture="importance",
+)
 def quadtree(
     importance: ArrayLike,
     *,
@@ -117,14 +127,7 @@ def quadtree(
         np.arange(level.size + 1),
         {"level": level, "row": row, "column": column, "readout_line": column},
         {
-            "generator": "quadtree",
-            "parameters": {
-                "importance": f"picture of {picture.shape} pixels",
-                "pitch_um": pitch_um,
-                "limit": limit,
-                "n_levels": n_levels,
-                "measure": measure,
-            },
+            "parameters": {"importance": f"picture of {picture.shape} pixels"},
         },
     )
 

@@ -9,6 +9,7 @@ import numpy as np
 from foveasim._core.validation import Floats, Ints, check_count, check_length_um, check_sites
 from foveasim.layout._regions import disc
 from foveasim.layout._voronoi import cells_of
+from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
 
 __all__ = ["sunflower"]
@@ -21,6 +22,7 @@ C = 1.0 / math.sqrt(5.0 - 4.0 * math.cos(3.0 * GOLDEN_ANGLE_RAD))
 MIN_CHORDS = 64
 
 
+@layout_family(example={"n_sites": 300, "spacing_um": 1.6})
 def sunflower(*, n_sites: int, spacing_um: float, n_chords: int | None = None) -> Layout:
     """
     Sites on a golden spiral, each taking the same share of the disc, their outlines the Voronoi cells.
@@ -80,8 +82,6 @@ def sunflower(*, n_sites: int, spacing_um: float, n_chords: int | None = None) -
         np.arange(offsets.size),
         {"turn": np.floor(k * (GOLDEN_ANGLE_RAD / (2.0 * math.pi))).astype(np.int64)},
         {
-            "generator": "sunflower",
-            "parameters": {"n_sites": n_sites, "spacing_um": spacing_um, "n_chords": n_chords},
             "radius_um": radius_um,
         },
     )

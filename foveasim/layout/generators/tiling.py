@@ -14,6 +14,7 @@ from foveasim.errors import GeometryError, LayoutWarning, ParameterError
 from foveasim.layout._regions import as_region, one_region, told_region
 from foveasim.layout.drc.measurements import is_below_size
 from foveasim.layout.edits import clip, merge_small, union
+from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
 
 __all__ = ["Cells", "fill", "tiling", "with_hexagons"]
@@ -32,6 +33,7 @@ SMALL_SHARE = 0.5
 AREA_ROUNDING = 1e-9
 
 
+@layout_family(example={"pitch_um": 2.0, "radius_um": 14.0})
 def tiling(
     *,
     pitch_um: float,
@@ -148,17 +150,7 @@ def tiling(
         layout.site_offsets,
         {"row": row, "column": column, "readout_line": column},
         {
-            "generator": "tiling",
-            "parameters": {
-                "pitch_um": pitch_um,
-                "cells": cells,
-                "size_um": None if size_um is None else [float(x) for x in size_um],
-                "radius_um": radius_um,
-                "region": None if region is None else told_region(region),
-                "border": border,
-                "min_size_um": min_size_um,
-                "origin_um": origin.tolist(),
-            },
+            "parameters": {"region": None if region is None else told_region(region), "origin_um": origin.tolist()},
         },
     )
 

@@ -26,6 +26,7 @@ from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid
 from foveasim.layout._regions import one_region
 from foveasim.layout._voronoi import CellEdges, MovingCells, edges_of_rings
+from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
 
 if TYPE_CHECKING:
@@ -70,6 +71,7 @@ MAX_NEWTON_STEPS, SMALLEST_PART = 30, 0.01
 FADING, N_FADINGS = 0.25, 16
 
 
+@layout_family(example={"n_sites": 200, "size_um": (32.0, 32.0), "n_iterations": 20}, picture="density")
 def voronoi(
     *,
     n_sites: int,
@@ -175,16 +177,10 @@ def voronoi(
         np.arange(offsets.size),
         {"share": share},
         {
-            "generator": "voronoi",
             "parameters": {
-                "n_sites": n_sites,
                 "density": _described(density),
-                "size_um": None if size_um is None else [float(x) for x in size_um],
                 "density_grid": None if density_grid is None else asdict(density_grid),
                 "region": None if region is None else _rings_um(outline),
-                "n_iterations": n_iterations,
-                "capacity": capacity,
-                "seed": int(seed),
             },
         },
     )

@@ -13,6 +13,7 @@ from foveasim._core.validation import MAX_LENGTH_UM, Floats, Ints, check_choice,
 from foveasim.errors import ParameterError
 from foveasim.layout._regions import as_region, told_region
 from foveasim.layout.edits import union
+from foveasim.layout.families import layout_family
 from foveasim.layout.generators.grid import square_corners_um
 from foveasim.layout.generators.tiling import Cells, tiling
 from foveasim.layout.model import Layout
@@ -25,6 +26,7 @@ MAX_PIXELS = 2**14
 WHOLE_NUMBER_ROUNDING = 1e-9
 
 
+@layout_family(example={"side_um": (8.0, 16.0, 32.0), "pitch_um": (1.0, 2.0, 4.0)})
 def zones(
     *,
     pitch_um: Sequence[float],
@@ -99,14 +101,9 @@ def zones(
                 shapely.box(-0.5 * s, -0.5 * s, 0.5 * s, 0.5 * s) for s in (() if sides_um is None else sides_um)
             ]
         layout = _tiled(outlines, pitches_um, shapes)
-    parameters = {
-        "pitch_um": pitches_um.tolist(),
-        "side_um": None if sides_um is None else sides_um.tolist(),
-        "outlines_um": None if outlines_um is None else [told_region(outline) for outline in outlines_um],
-        "cells": cells if isinstance(cells, str) else shapes,
-    }
-    provenance = {"generator": "zones", "parameters": parameters}
-    return Layout(layout.xy_um, layout.ring_offsets, layout.site_offsets, layout.columns, provenance)
+    if outlines_um is None:
+        return layout
+    return layout.with_provenance({"parameters": {"outlines_um": [told_region(outline) for outline in outlines_um]}})
 
 
 def _sides(side_um: Sequence[float], pitches_um: Floats) -> Floats:

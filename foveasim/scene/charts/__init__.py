@@ -13,11 +13,15 @@ away, as on any print; then there is a :class:`foveasim.errors.SamplingWarning`.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+from foveasim._core.registry import import_all
 from foveasim.scene.charts._colours import PATCH_NAMES, illuminant, patch_reflectance
 from foveasim.scene.charts._edges import BarElement, bar_elements, bars, checkerboard, letter_f, slanted_edge
 from foveasim.scene.charts._patches import colour_chart, grey_scale
 from foveasim.scene.charts._points import point_grid
 from foveasim.scene.charts._waves import siemens_star, sine, zone_plate
+from foveasim.scene.registry import SCENES
 
 __all__ = [
     "PATCH_NAMES",
@@ -36,3 +40,7 @@ __all__ = [
     "slanted_edge",
     "zone_plate",
 ]
+
+import_all(__name__, __path__)
+if not TYPE_CHECKING:  # charts of other packages, and new ones of this
+    __getattr__ = SCENES.attributes_of(__name__)

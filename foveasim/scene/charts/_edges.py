@@ -20,6 +20,7 @@ from foveasim.scene.charts._canvas import (
     inked,
     interval,
 )
+from foveasim.scene.registry import SCENES
 
 __all__ = ["BarElement", "bar_elements", "bars", "checkerboard", "letter_f", "slanted_edge"]
 
@@ -65,6 +66,7 @@ class BarElement:
     side_mm: float
 
 
+@SCENES.register("checkerboard")
 def checkerboard(
     *,
     square_mm: float,
@@ -141,6 +143,7 @@ def checkerboard(
     return canvas.scene(shares, contrast, "a checkerboard")
 
 
+@SCENES.register("slanted_edge")
 def slanted_edge(
     *,
     angle_deg: float = 5.0,
@@ -194,6 +197,7 @@ def slanted_edge(
     return canvas.scene(shares, contrast, "a slanted edge")
 
 
+@SCENES.register("bars")
 def bars(
     *,
     groups: Sequence[int],
@@ -333,6 +337,7 @@ def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
     )
 
 
+@SCENES.register("letter_f")
 def letter_f(
     *,
     height_mm: float,

@@ -16,6 +16,7 @@ from foveasim.scene.charts._colours import (
     nonnegative_factors,
     patch_reflectance,
 )
+from foveasim.scene.registry import SCENES
 
 __all__ = ["colour_chart", "grey_scale"]
 
@@ -27,6 +28,7 @@ N_ROWS, N_COLUMNS = 4, 6
 MAX_STEPS = 1000
 
 
+@SCENES.register("grey_scale")
 def grey_scale(
     *,
     n_steps: int = 12,
@@ -92,6 +94,7 @@ def grey_scale(
     return canvas.scene(shares, 1.0, "a grey scale")
 
 
+@SCENES.register("colour_chart")
 def colour_chart(
     *,
     patch_mm: float,

@@ -10,6 +10,7 @@ from foveasim._core.validation import check_number, check_shape
 from foveasim.errors import ParameterError
 from foveasim.scene._scene import GREY_NM, Scene
 from foveasim.scene.charts._canvas import Canvas, OneOrMore
+from foveasim.scene.registry import SCENES
 
 __all__ = ["point_grid"]
 
@@ -17,6 +18,7 @@ __all__ = ["point_grid"]
 ROUNDING_PIXELS = 1e-6
 
 
+@SCENES.register("point_grid")
 def point_grid(
     *,
     spacing_mm: float,

@@ -10,6 +10,7 @@ import numpy as np
 from foveasim._core.validation import Floats, check_choice, check_count, check_number
 from foveasim.scene._scene import GREY_NM, Scene
 from foveasim.scene.charts._canvas import Canvas, OneOrMore, checked_contrast, half_plane, sampled
+from foveasim.scene.registry import SCENES
 
 __all__ = ["siemens_star", "sine", "zone_plate"]
 
@@ -25,6 +26,7 @@ STEEP = 1e9
 GAUSS = ((-0.5 * np.sqrt(0.6), 5.0 / 18.0), (0.0, 8.0 / 18.0), (0.5 * np.sqrt(0.6), 5.0 / 18.0))
 
 
+@SCENES.register("sine")
 def sine(
     *,
     line_pairs_per_mm: float,
@@ -96,6 +98,7 @@ def sine(
     return canvas.scene(shares, contrast, "a sine wave")
 
 
+@SCENES.register("zone_plate")
 def zone_plate(
     *,
     line_pairs_per_mm: float,
@@ -177,6 +180,7 @@ def zone_plate(
     return canvas.scene(canvas.filled(block), contrast, "a zone plate")
 
 
+@SCENES.register("siemens_star")
 def siemens_star(
     *,
     n_spokes: int = 36,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from foveasim._core.registry import Registry
+from foveasim._core.registry import Registry, import_all
 from foveasim.sensor.effects.contract import (
     STAGES,
     AdditiveNoise,
@@ -75,3 +75,5 @@ STANDARD: tuple[Any, ...] = (
     PixelOffset,
     ColumnOffset,
 )
+
+import_all(__name__, __path__)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from foveasim._core.registry import import_all
 from foveasim.sensor.spectral.curves import (
+    CURVES,
     BandMean,
     ConstantCurve,
     Curve,
@@ -17,6 +19,7 @@ from foveasim.sensor.spectral.response import FilterSet, rgb_filters
 from foveasim.sensor.spectral.tables import PolynomialCurve, SplineCurve, StepCurve, TableCurve
 
 __all__ = [
+    "CURVES",
     "BandMean",
     "ConstantCurve",
     "Curve",
@@ -35,3 +38,5 @@ __all__ = [
     "read_filters",
     "rgb_filters",
 ]
+
+import_all(__name__, __path__)

@@ -8,14 +8,15 @@ both in one, since they mix by their product.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from foveasim._core.registry import Registry
 from foveasim._core.validation import Floats, as_numbers, check_count, check_number
 from foveasim.errors import FoveasimError, ParameterError
 
@@ -70,6 +71,12 @@ class Multiplied(ABC):
         return ProductCurve((other, self))
 
 
+#: Curves over wavelength by their names in settings files. Installed packages add theirs as entry points of the group
+#: ``foveasim.curves``.
+CURVES: Registry[Callable[..., Any]] = Registry("curve", "foveasim.curves")
+
+
+@CURVES.register("constant")
 @dataclass(frozen=True)
 class ConstantCurve(Multiplied):
     """
@@ -96,6 +103,7 @@ class ConstantCurve(Multiplied):
         return np.full(np.shape(wavelength_nm), float(self.value))
 
 
+@CURVES.register("gaussian")
 @dataclass(frozen=True, kw_only=True)
 class GaussianCurve(Multiplied):
     """
@@ -129,6 +137,7 @@ class GaussianCurve(Multiplied):
         return np.asarray(self.peak * np.exp(-4.0 * np.log(2.0) * offset**2))
 
 
+@CURVES.register("pass_band")
 @dataclass(frozen=True, kw_only=True)
 class PassBand(Multiplied):
     """
@@ -197,6 +206,7 @@ SILICON_ABSORPTION_UM = (
 )  # fmt: skip
 
 
+@CURVES.register("silicon")
 @dataclass(frozen=True, kw_only=True)
 class SiliconQE(Multiplied):
     """

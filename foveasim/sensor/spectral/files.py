@@ -19,6 +19,7 @@ import numpy as np
 
 from foveasim._core.validation import MAX_WAVELENGTH_NM, MIN_WAVELENGTH_NM, Floats, check_choice
 from foveasim.errors import FileError
+from foveasim.sensor.spectral.curves import CURVES
 from foveasim.sensor.spectral.response import FilterSet
 from foveasim.sensor.spectral.tables import Beyond, SplineCurve, TableCurve
 
@@ -56,6 +57,7 @@ class _Table:
     values: Floats
 
 
+@CURVES.register("file")
 def read_curve(
     path: str | Path,
     column: str | int | None = None,

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from foveasim.sensor.spectral.curves import CURVES
 from foveasim.sensor.spectral.files import read_curve, read_filters
 from foveasim.sensor.spectral.response import FilterSet
 from foveasim.sensor.spectral.tables import SplineCurve, TableCurve
@@ -14,6 +15,7 @@ from foveasim.sensor.spectral.tables import SplineCurve, TableCurve
 __all__ = ["camera_filters", "ccd_qe"]
 
 
+@CURVES.register("ccd")
 def ccd_qe() -> TableCurve | SplineCurve:
     """
     Quantum efficiency of a back-illuminated silicon CCD, as measured: a table for the paper's Fig. 5.

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.validation import Floats, as_numbers, check_choice, check_count, finite_array, wavelengths_nm
 from foveasim.errors import ParameterError
-from foveasim.sensor.spectral.curves import Multiplied, check_within
+from foveasim.sensor.spectral.curves import CURVES, Multiplied, check_within
 
 __all__ = ["Beyond", "PolynomialCurve", "SplineCurve", "StepCurve", "TableCurve"]
 
@@ -21,6 +21,7 @@ Beyond = Literal["refuse", "zero", "hold"]
 BEYOND_CURE = "beyond='zero' or beyond='hold' says what the curve is there"
 
 
+@CURVES.register("polynomial")
 @dataclass(frozen=True, kw_only=True)
 class PolynomialCurve(Multiplied):
     """
@@ -61,6 +62,7 @@ class PolynomialCurve(Multiplied):
         return np.clip(self._fit(as_numbers("wavelength_nm", wavelength_nm)), 0.0, 1.0)
 
 
+@CURVES.register("table")
 @dataclass(frozen=True, kw_only=True)
 class TableCurve(Multiplied):
     """
@@ -96,6 +98,7 @@ class TableCurve(Multiplied):
         return np.where(is_known, np.interp(waves_nm, self.wavelength_nm, self.value), 0.0)
 
 
+@CURVES.register("spline")
 @dataclass(frozen=True, kw_only=True)
 class SplineCurve(Multiplied):
     """
@@ -142,6 +145,7 @@ class SplineCurve(Multiplied):
         return np.where(is_known, np.clip(self._pieces(waves_nm), 0.0, 1.0), 0.0)
 
 
+@CURVES.register("step")
 @dataclass(frozen=True, kw_only=True)
 class StepCurve(Multiplied):
     """

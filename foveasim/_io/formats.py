@@ -1,0 +1,157 @@
+"""File formats: how a format is recognised, read and written, and which options it has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from foveasim.errors import FileError, ParameterError
+
+__all__ = ["FileFormat", "chosen_options", "format_of", "head_of", "writing_format"]
+
+#: A file of more bytes is not read.
+MAX_FILE_BYTES = 8 * 2**30
+HEAD_BYTES = 1024
+#: Beginnings of files that are recognised without being a format, and what to do with them.
+_HINTS = {
+    b"\x1f\x8b": "is compressed with gzip; unpack it first",
+    b"<": "is markup; an SVG drawing is written and not read",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileFormat:
+    """
+    One format: a line of a table of formats.
+
+    Parameters
+    ----------
+    title : str
+        Name in messages.
+    suffixes : tuple of str
+        File extensions with the dot, in lower case; the first is the usual one.
+    signatures : tuple of bytes
+        First bytes of files of the format.
+    matches : callable, optional
+        Called with the path and the first bytes, whether a file is of the format: where signatures do not tell.
+    read, write : callable, optional
+        None for formats that are only written, or only read.
+    read_options, write_options : tuple of str
+        Keywords of ``read`` and ``write`` that users may give.
+    is_sandboxed : bool
+        Whether files are read in the sandbox process: those of libraries that a malformed file can crash.
+    is_directory : bool
+        Whether the format is a directory, which ``write`` writes atomically itself.
+    """
+
+    title: str
+    suffixes: tuple[str, ...]
+    signatures: tuple[bytes, ...] = ()
+    matches: Callable[[Path, bytes], bool] | None = None
+    read: Callable[..., Any] | None = None
+    write: Callable[..., Any] | None = None
+    read_options: tuple[str, ...] = ()
+    write_options: tuple[str, ...] = ()
+    is_sandboxed: bool = False
+    is_directory: bool = False
+
+    def is_of(self, path: Path, head: bytes) -> bool:
+        """Whether a file with these first bytes is of the format."""
+        if self.matches is not None:
+            return self.matches(path, head)
+        return bool(self.signatures) and head.startswith(self.signatures)
+
+
+def head_of(path: Path) -> bytes:
+    """
+    Return the first bytes of a file.
+
+    Raises
+    ------
+    FileError
+        When it is missing, unreadable, empty or too large.
+    """
+    try:
+        if not path.is_file():
+            raise FileError(path, "is not a file" if path.exists() else "no such file")
+        n_bytes = path.stat().st_size
+        if n_bytes > MAX_FILE_BYTES:
+            raise FileError(path, f"has {n_bytes} bytes, more than the {MAX_FILE_BYTES} that are read")
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+    except FileError:
+        raise
+    except (OSError, ValueError) as error:
+        raise FileError(path, f"cannot be opened: {getattr(error, 'strerror', None) or error}") from None
+    if not head:
+        raise FileError(path, "is empty")
+    return head
+
+
+def format_of(path: Path, formats: Mapping[str, FileFormat], what: str) -> tuple[str, FileFormat]:
+    """
+    Return the format of a file by its content, and its name in a table.
+
+    Raises
+    ------
+    FileError
+        When it cannot be read, or is of no format of the table that is read.
+    """
+    head = b"" if path.is_dir() else head_of(path)
+    for name, found in formats.items():
+        if found.read is not None and found.is_of(path, head):
+            return name, found
+    head = head or head_of(path)
+    text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    for beginning, hint in _HINTS.items():
+        if text.startswith(beginning):
+            raise FileError(path, hint)
+    titles = sorted({found.title for found in formats.values() if found.read is not None}, key=str.lower)
+    raise FileError(path, f"is no {what}: expected {', '.join(titles[:-1])} or {titles[-1]}")
+
+
+def writing_format(path: Path, formats: Mapping[str, FileFormat]) -> FileFormat:
+    """
+    Return the format that a file's extension names.
+
+    Raises
+    ------
+    FileError
+        When no format of the table that is written has it.
+    """
+    by_suffix = {suffix: found for found in formats.values() if found.write is not None for suffix in found.suffixes}
+    try:
+        return by_suffix[path.suffix.lower()]
+    except KeyError:
+        raise FileError(path, f"must end in one of {', '.join(sorted(by_suffix))}") from None
+
+
+def chosen_options(
+    options: Mapping[str, Any], known: tuple[str, ...], formats: Mapping[str, FileFormat], of: str
+) -> dict[str, Any]:
+    """
+    Return the options that are given, without those that are None.
+
+    Parameters
+    ----------
+    options : mapping
+    known : tuple of str
+        Options of the file's format.
+    formats : mapping
+        Table of all formats, for messages.
+    of : {"read_options", "write_options"}
+
+    Raises
+    ------
+    ParameterError
+        When one does not belong to the format.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    for name, value in given.items():
+        if name not in known:
+            titles = sorted({found.title for found in formats.values() if name in getattr(found, of)})
+            belongs = f"belongs to {' and '.join(titles)} files" if titles else "is not an option of any format"
+            raise ParameterError(name, belongs, value, cure="leave it out")
+    return given

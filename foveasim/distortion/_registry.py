@@ -1,0 +1,14 @@
+"""Registry of lens models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from foveasim._core.registry import Registry
+
+__all__ = ["LENSES"]
+
+#: Lens models by their names in settings files: what a call gives maps points with ``distort`` and ``undistort``. Installed
+#: packages add theirs as entry points of the group ``foveasim.lenses``.
+LENSES: Registry[Callable[..., Any]] = Registry("lens model", "foveasim.lenses")

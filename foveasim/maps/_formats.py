@@ -1,0 +1,65 @@
+"""Table of formats of power maps, and reading them in the sandbox process."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foveasim._core.registry import Registry
+from foveasim._io import sandbox
+from foveasim._io.formats import FileFormat
+from foveasim.maps._common import Found, Refusal, as_images, max_unpacked, one_sentence
+
+__all__ = ["MAP_FORMATS", "read_found"]
+
+#: Formats of power maps. ``read(path, name)`` gives a :class:`foveasim.maps.Found`, ``write(power_map, path)`` nothing.
+#: Installed packages add theirs as entry points of the group ``foveasim.map_formats``.
+MAP_FORMATS: Registry[FileFormat] = Registry("power map format", "foveasim.map_formats")
+
+
+def read_found(path: Path, kind: str, name: str | None) -> Found:
+    """
+    Return what a file contains, in the sandbox process where its format asks for it.
+
+    Parameters
+    ----------
+    path : Path
+    kind : str
+        Name in :data:`MAP_FORMATS`.
+    name : str, optional
+        Of the array, where there are several.
+
+    Raises
+    ------
+    FileError
+        When it is corrupt, malformed, too large, or no map.
+    """
+    form = MAP_FORMATS[kind]
+    assert form.read is not None
+    if not form.is_sandboxed:
+        found: Found = form.read(path, name)
+        return found
+    # OpenEXR prints what it could not read, and may go on without it.
+    told, data = sandbox.read_apart(
+        _read, path, kind, name, kind=form.title, max_unpacked=max_unpacked, is_silent=kind == "exr"
+    )
+    about: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in told.items()}
+    return Found(data=data, **about)
+
+
+def _read(path: Path, kind: str, name: str | None) -> tuple[dict[str, Any], NDArray[Any]]:
+    """What a reader finds, taken apart for its way between the processes."""
+    form = MAP_FORMATS[kind]
+    assert form.read is not None
+    with one_sentence(path):
+        try:
+            found: Found = form.read(path, name)
+        except ModuleNotFoundError as error:
+            raise Refusal(f"needs {error.name}; install it with: pip install 'foveasim[maps]'") from None
+        told = asdict(replace(found, data=np.empty(0)))
+        del told["data"]
+        return told, as_images(found.data)
