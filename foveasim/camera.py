@@ -118,7 +118,8 @@ class Camera:
             raise ParameterError("sensor", f"must have a foveasim.Layout, got a {type(sensor.layout).__name__}")
         if distortion is not None and not isinstance(distortion, Lens):
             raise ParameterError(
-                "distortion", f"must be a lens of foveasim.distortion, got a {type(distortion).__name__}"
+                "distortion",
+                f"must be a lens model with distort, undistort, focal_um and centre_um, got a {type(distortion).__name__}",
             )
         self._optics = optics
         self._sensor = sensor

@@ -1,7 +1,7 @@
 """
 Which layouts can be made, and what does the middle of a foveal one look like?
 
-New here: every generator of ``foveasim.layout``, the fillings of a fovea, ``colouring``, ``plot_layout``.
+New here: every family of ``layout.LAYOUTS``, the fillings of a fovea, ``colouring``, ``plot_layout``.
 
 Expect: fifteen layouts, none with two sites over each other; four foveas that differ in the middle alone: 1,740 sites around a
 blind spot, and 169, 144 and 235 sites in it, none below the minimum size of 2 µm.
@@ -22,31 +22,13 @@ MIN_SIZE_UM = 2.0
 FOVEA = {"n_sectors": 60, "min_size_um": MIN_SIZE_UM, "r_max_um": 380.0, "stagger": True, "chords_per_arc": 2}
 
 
-def foveal_density(xy_um: np.ndarray) -> np.ndarray:
-    """Sites per area that fall off from the axis."""
-    return 1.0 / (1.0 + (xy_um**2).sum(axis=1) / 100.0)
-
-
 def families() -> dict[str, fs.Layout]:
-    """One small layout of each family."""
+    """The example of each registered family, and what may be made of two of them."""
     make = fs.layout
-    r, c = np.mgrid[-32:32, -32:32] + 0.5
     return {
-        "grid, staggered": make.grid(n_x=14, n_y=14, pitch_um=2.0, trench_um=0.3, stagger=True),
-        "hexagonal": make.hexagonal(n_columns=14, n_rows=16, pitch_um=2.0),
-        "octagonal": make.octagonal(n_x=12, n_y=12, pitch_um=2.0),
-        "tiling of a disc": make.tiling(pitch_um=2.0, radius_um=14.0),
-        "zones": make.zones(side_um=(8, 16, 32), pitch_um=(1, 2, 4)),
+        **{name.replace("_", " "): generator(**generator.example) for name, generator in make.LAYOUTS.items()},
         "zones of hexagons": make.zones(side_um=(9, 19, 36), pitch_um=(1, 2, 4), cells="hexagons"),
-        "foveal Cartesian": make.foveal_cartesian(n_rings=12, pitch_um=1.0, n_fovea=4, ring_ratio=1.2),
-        "quadtree": make.quadtree(np.exp(-np.hypot(r, c) / 6), pitch_um=0.5, limit=1.0, n_levels=4),
-        "log-polar": make.log_polar(n_sectors=36, min_size_um=1.0, r_max_um=18.0, fovea="hexagons"),
-        "Giotto": make.giotto(n_rho=16, n_theta=36, n_fovea=6, n_across=60, unit_um=0.6),
-        "FOVI": make.fovi(fov_um=36.0, a_um=3.0, n_rings=12),
-        "sunflower": make.sunflower(n_sites=300, spacing_um=1.6),
-        "Voronoi, foveal density": make.voronoi(n_sites=300, size_um=(32.0, 32.0), density=foveal_density),
         "dual pixels": make.split(make.grid(n_x=10, n_y=10, pitch_um=3.0)),
-        "Penrose": make.penrose(side_um=2.0, size_um=30.0),
     }
 
 

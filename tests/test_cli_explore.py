@@ -114,7 +114,7 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def foveasim(folder, monkeypatch, capsys):  # noqa: ARG001 -- it runs there
+def foveasim(folder, monkeypatch, capsys):
     """The program in this process: exit code, what it says, and what it says is wrong."""
 
     def run(*arguments):

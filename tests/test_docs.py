@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import re
 import runpy
 from pathlib import Path
@@ -10,6 +11,8 @@ import matplotlib as mpl
 import pytest
 from PIL import Image
 from skimage.data import astronaut
+
+from foveasim._core.registry import Registry
 
 ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -47,6 +50,18 @@ PAGES = [page for page in pages_of(ROOT) if BLOCK.search(page.read_text())]
 NEEDS = {"viewing": [pytest.mark.needs("renderer")]}
 
 
+@pytest.fixture
+def _registries_stay():
+    """What a page registers is gone after it."""
+    registries = [thing for thing in gc.get_objects() if isinstance(thing, Registry)]
+    before = [dict(registry) for registry in registries]
+    yield
+    for registry, objects in zip(registries, before, strict=True):
+        registry._objects = objects
+        registry.version += 1
+
+
+@pytest.mark.usefixtures("_registries_stay")
 @pytest.mark.parametrize("page", [pytest.param(page, marks=NEEDS.get(page.stem, []), id=page.stem) for page in PAGES])
 def test_code_on_a_page_runs(page, tmp_path, monkeypatch):
     mpl.use("agg")
@@ -55,6 +70,13 @@ def test_code_on_a_page_runs(page, tmp_path, monkeypatch):
     names = {"__name__": "__main__"}
     for block in BLOCK.findall(page.read_text()):
         exec(compile(block, str(page), "exec"), names)
+
+
+def test_each_extension_takes_30_lines():
+    blocks = BLOCK.findall((ROOT / "docs" / "extending.md").read_text())
+
+    assert len(blocks) >= 6
+    assert max(block.count("\n") for block in blocks) <= 30
 
 
 def test_links_lead_to_pages():

@@ -24,7 +24,7 @@ def lens(**changes):
     return fs.Optics(**{**values, **changes})
 
 
-def clear(x, y, wavelength_nm):  # noqa: ARG001
+def clear(x, y, wavelength_nm):
     """A clear circle that the package cannot know to be one."""
     return np.ones(np.broadcast_shapes(x.shape, y.shape))
 

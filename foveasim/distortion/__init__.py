@@ -10,8 +10,9 @@ from __future__ import annotations
 
 from foveasim._core.registry import import_all
 from foveasim.distortion._brown_conrady import BrownConrady
-from foveasim.distortion._calibration import Lens, from_opencv, read_calibration, to_opencv
+from foveasim.distortion._calibration import from_opencv, read_calibration, to_opencv
 from foveasim.distortion._fisheye import Fisheye, PolynomialFisheye, Scaramuzza
+from foveasim.distortion._lens import Lens
 from foveasim.distortion._map import distort_map
 from foveasim.distortion._registry import LENSES
 

@@ -10,19 +10,18 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.validation import Floats, check_count, check_number, finite_array
 from foveasim.distortion._brown_conrady import BrownConrady
-from foveasim.distortion._fisheye import Fisheye, PolynomialFisheye, Scaramuzza
+from foveasim.distortion._fisheye import PolynomialFisheye, Scaramuzza
+from foveasim.distortion._lens import Lens
 from foveasim.errors import ConfigError, ParameterError
 
-__all__ = ["Lens", "from_opencv", "read_calibration", "to_opencv"]
-
-Lens: TypeAlias = BrownConrady | Fisheye | PolynomialFisheye | Scaramuzza
+__all__ = ["from_opencv", "read_calibration", "to_opencv"]
 
 #: OpenCV's order of coefficients; it takes the first 4, 5 or 8 of them.
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")

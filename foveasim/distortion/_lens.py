@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, Protocol, TypeAlias, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,10 +11,29 @@ from foveasim._core.rings import from_frame, to_frame
 from foveasim._core.validation import Floats, check_choice, check_length_um, finite_array
 from foveasim.errors import GeometryError, ParameterError
 
-__all__ = ["Outside", "Placed"]
+__all__ = ["Lens", "Outside", "Placed"]
 
 #: What becomes of points that a lens cannot map: an error that names the radius, or NaN.
 Outside: TypeAlias = Literal["error", "mask"]
+
+
+@runtime_checkable
+class Lens(Protocol):
+    """A lens model as cameras take it; those of this package and any other class with these members."""
+
+    @property
+    def focal_um(self) -> float | tuple[float, float]:
+        """Focal length in µm; two of them, along x and y, where the image is stretched."""
+
+    @property
+    def centre_um(self) -> tuple[float, float]:
+        """Where the optical axis meets the sensor, µm."""
+
+    def distort(self, xy_um: ArrayLike, *, outside: Outside = "error") -> Floats:
+        """Return real positions, (..., 2) µm, of ideal ones."""
+
+    def undistort(self, xy_um: ArrayLike, *, outside: Outside = "error") -> Floats:
+        """Return ideal positions, (..., 2) µm, of real ones."""
 
 
 class Placed:

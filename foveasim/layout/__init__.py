@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING
 
 from foveasim.layout.adjacency import adjacency
 from foveasim.layout.channels import MOSAICS, colouring, mosaic, random_channels
+from foveasim.layout.drc.measurements import RULES, Rule
 from foveasim.layout.drc.presets import PRESETS, Preset
 from foveasim.layout.drc.repair import Change, enforce
 from foveasim.layout.drc.routing import Readout, Routing, crossings
 from foveasim.layout.drc.rules import DesignRules, Report, RuleResult, Violation, min_width_um
 from foveasim.layout.edits import clip, inset, merge, merge_small, node, punch, snap, split, union
 from foveasim.layout.families import LAYOUTS, layout_family
-from foveasim.layout.files import WrittenLayout, read_layout, shipped_layouts, write_layout
+from foveasim.layout.files import FORMATS, FileFormat, WrittenLayout, read_layout, shipped_layouts, write_layout
 from foveasim.layout.generators.foveal_cartesian import foveal_cartesian
 from foveasim.layout.generators.fovi import fovi
 from foveasim.layout.generators.giotto import giotto, giotto_ratio
@@ -31,16 +32,20 @@ from foveasim.layout.readout import nearest_bus, readout_by, readout_order
 from foveasim.layout.summary import Summary, describe
 
 __all__ = [
+    "FORMATS",
     "LAYOUTS",
     "MOSAICS",
     "PRESETS",
+    "RULES",
     "Change",
     "DesignRules",
+    "FileFormat",
     "Layout",
     "Preset",
     "Readout",
     "Report",
     "Routing",
+    "Rule",
     "RuleResult",
     "Summary",
     "Violation",

@@ -1,1 +1,29 @@
 """Design rules: limits, measurements, repair, routing and reports."""
+
+from __future__ import annotations
+
+from foveasim.layout.drc.measurements import RULES, Case, Measured, Rule
+from foveasim.layout.drc.presets import PRESETS, Preset
+from foveasim.layout.drc.repair import Change, enforce
+from foveasim.layout.drc.routing import Readout, Routing, crossings
+from foveasim.layout.drc.rules import DesignRules, Report, RuleResult, Violation, check, min_width_um
+
+__all__ = [
+    "PRESETS",
+    "RULES",
+    "Case",
+    "Change",
+    "DesignRules",
+    "Measured",
+    "Preset",
+    "Readout",
+    "Report",
+    "Routing",
+    "Rule",
+    "RuleResult",
+    "Violation",
+    "check",
+    "crossings",
+    "enforce",
+    "min_width_um",
+]

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from foveasim._core.registry import Registry
 from foveasim._core.rings import next_vertex, positions_in_runs, ring_moments
 from foveasim._core.threads import each, thread_count
 from foveasim._core.validation import Bools, Floats, Ints
@@ -186,16 +187,32 @@ class Rule:
     """
     How a rule is checked.
 
-    ``measure`` gives values; those above the limit (``is_upper``) or below it by more than ``rounding`` (in the unit of the
-    value) are violations. A deviation is compared with 0, the limit being a step or a field.
+    Parameters
+    ----------
+    sentence : str
+        What a layout satisfies, for reports.
+    unit : str
+        Of values and limit.
+    measure : callable
+        From a :class:`Case` to one value per site, (n_site,), or to :class:`Measured`.
+    is_upper : bool
+        Whether values above the limit are violations; otherwise those below it.
+    is_deviation : bool
+        Whether values are compared with 0, the limit being a step or a field.
+    rounding : float
+        Values beyond the limit by no more than this satisfy the rule.
+    mended_by : {"drop", "merge", None}
+        What mends a violation: dropping its site, or the smaller one of a pair; merging the site with a neighbour, or
+        dropping it; neither.
     """
 
     sentence: str
     unit: str
-    measure: Callable[[Case], Measured]
+    measure: Callable[[Case], Measured | Floats]
     is_upper: bool = False
     is_deviation: bool = False
     rounding: float = LENGTH_ROUNDING_UM
+    mended_by: Literal["drop", "merge"] | None = "drop"
 
     def excess(self, values: Floats, limit: float) -> Floats:
         """Distance of values beyond a limit; negative for those within it. Those above ``rounding`` are violations."""
@@ -490,15 +507,19 @@ def _track_uses(case: Case) -> Measured:
     return Measured(use, lambda k: [found.first_sites[found.strip == i] for i in k], markers)
 
 
-#: Every rule in the order of reports.
-RULES: Mapping[str, Rule] = {
-    "min_size_um": Rule("a site's size, the square root of its area, is at least the limit", "µm", _sizes),
+#: Rules by name. Those of the package are fields of :class:`foveasim.layout.DesignRules`; others, which programs register and
+#: installed packages have as entry points of the group ``foveasim.rules``, get their limits in its ``custom``.
+RULES: Registry[Rule] = Registry("design rule", "foveasim.rules")
+for _name, _rule in {
+    "min_size_um": Rule(
+        "a site's size, the square root of its area, is at least the limit", "µm", _sizes, mended_by="merge"
+    ),
     "max_size_um": Rule(
         "a site's size, the square root of its area, is at most the limit", "µm", _sizes, is_upper=True
     ),
-    "min_area_um2": Rule("a site's area is at least the limit", "µm²", _areas),
+    "min_area_um2": Rule("a site's area is at least the limit", "µm²", _areas, mended_by="merge"),
     "min_hole_um2": Rule("a hole in a site has at least the limit's area", "µm²", _holes),
-    "min_width_um": Rule("a site is nowhere narrower than the limit", "µm", _widths),
+    "min_width_um": Rule("a site is nowhere narrower than the limit", "µm", _widths, mended_by="merge"),
     "min_space_um": Rule("sites that do not touch are at least the limit apart", "µm", _spaces),
     "max_aspect_ratio": Rule("a site is at most so many times as long as wide", "", _aspect_ratios, is_upper=True),
     "min_angle_deg": Rule("no corner is sharper than the limit", "degrees", _corner_angles),
@@ -509,23 +530,40 @@ RULES: Mapping[str, Rule] = {
     "max_overlap_um2": Rule(
         "no two sites cover more than the limit twice", "µm²", _overlaps, is_upper=True, rounding=0.0
     ),
-    "max_gap_um2": Rule("no gap is larger than the limit", "µm²", _gaps, is_upper=True, rounding=0.0),
+    "max_gap_um2": Rule("no gap is larger than the limit", "µm²", _gaps, is_upper=True, rounding=0.0, mended_by=None),
     "die_um": Rule("no site reaches out of the die", "µm", _reach_beyond_die, is_upper=True, is_deviation=True),
-    "min_growth": Rule("pixels grow at least by the limit from ring to ring", "", _growths),
-    "max_growth": Rule("pixels grow at most by the limit from ring to ring", "", _growths, is_upper=True),
-    "max_neighbour_ratio": Rule(
-        "neighbours' sizes differ at most by the limit", "", _neighbour_ratios, is_upper=True, rounding=1e-9
+    "min_growth": Rule("pixels grow at least by the limit from ring to ring", "", _growths, mended_by=None),
+    "max_growth": Rule(
+        "pixels grow at most by the limit from ring to ring", "", _growths, is_upper=True, mended_by=None
     ),
-    "max_sites": Rule("there are at most so many sites", "", _counts, is_upper=True, rounding=0.0),
-    "min_density": Rule("sites fill at least the limit of every window", "", _densities, rounding=AREA_ROUNDING),
+    "max_neighbour_ratio": Rule(
+        "neighbours' sizes differ at most by the limit",
+        "",
+        _neighbour_ratios,
+        is_upper=True,
+        rounding=1e-9,
+        mended_by=None,
+    ),
+    "max_sites": Rule("there are at most so many sites", "", _counts, is_upper=True, rounding=0.0, mended_by=None),
+    "min_density": Rule(
+        "sites fill at least the limit of every window", "", _densities, rounding=AREA_ROUNDING, mended_by=None
+    ),
     "max_density": Rule(
-        "sites fill at most the limit of every window", "", _densities, is_upper=True, rounding=AREA_ROUNDING
+        "sites fill at most the limit of every window",
+        "",
+        _densities,
+        is_upper=True,
+        rounding=AREA_ROUNDING,
+        mended_by=None,
     ),
     "max_data_rate_gbit_per_s": Rule(
-        "a lane carries at most the limit", "Gbit/s", _data_rates, is_upper=True, rounding=0.0
+        "a lane carries at most the limit", "Gbit/s", _data_rates, is_upper=True, rounding=0.0, mended_by=None
     ),
-    "max_track_use": Rule("readout lines have tracks to get out", "", _track_uses, is_upper=True, rounding=0.0),
-}
+    "max_track_use": Rule(
+        "readout lines have tracks to get out", "", _track_uses, is_upper=True, rounding=0.0, mended_by=None
+    ),
+}.items():
+    RULES.register(_name, _rule)
 
 
 def is_below_size(area_um2: Floats, min_size_um: float) -> Bools:

@@ -20,15 +20,6 @@ __all__ = ["Change", "enforce"]
 
 Repair: TypeAlias = Literal["drop", "merge", "refill"]
 
-#: Rules that a site breaks by itself, so that taking it away mends them.
-SITE_RULES = (
-    "min_size_um", "max_size_um", "min_area_um2", "min_hole_um2", "min_width_um", "max_aspect_ratio", "min_angle_deg",
-    "edge_angle_step_deg", "grid_um", "die_um",
-)  # fmt: skip
-#: Rules that a pair of sites breaks: the smaller of the two is taken away.
-PAIR_RULES = ("max_overlap_um2", "min_space_um")
-#: Rules that a site breaks by being too small, so that joining it to a neighbour mends them.
-SMALLNESS_RULES = ("min_size_um", "min_area_um2", "min_width_um")
 #: Rounds of merging: a merged site may still be too small.
 MAX_ROUNDS = 100
 
@@ -87,8 +78,7 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> t
     """
     check_choice("repair", repair, get_args(Repair))
     waivers = rules.waivers or {}
-    mendable = (*SITE_RULES, *PAIR_RULES)
-    active = replace(rules, **{name: None for name in RULES if name in waivers or name not in mendable})
+    active = rules.only(lambda name: RULES[name].mended_by is not None and name not in waivers)
     now = np.arange(layout.n_sites)  # where each given site is now; -1 for one that was dropped
     changes: list[Change] = []
     given = layout
@@ -97,7 +87,7 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> t
     layout, now = _without_guilty(layout, active, now, changes)
     if repair == "refill":
         layout = _refilled(layout, given, active, changes)
-    rest = layout.check(replace(rules, **dict.fromkeys(mendable)))
+    rest = layout.check(rules.only(lambda name: RULES[name].mended_by is None))
     if not rest.ok:
         raise GeometryError(f"taking away sites does not mend every rule: {_broken(rest)}")
     return layout, tuple(changes)
@@ -122,7 +112,7 @@ def _without_guilty(layout: Layout, rules: DesignRules, now: Ints, changes: list
 
 def _refilled(layout: Layout, given: Layout, rules: DesignRules, changes: list[Change]) -> Layout:
     """The room of sites that were too small in hexagons that are not."""
-    is_small = [change.action == "dropped" and change.rule in SMALLNESS_RULES for change in changes]
+    is_small = [change.action == "dropped" and _is_of_smallness(change.rule) for change in changes]
     gone = np.array([i for change, small in zip(changes, is_small, strict=True) if small for i in change.site_ids], int)
     if gone.size == 0:
         return layout
@@ -166,7 +156,7 @@ def _guilty(layout: Layout, result: RuleResult, gone: Bools) -> Ints:
 
 def _merged(layout: Layout, rules: DesignRules, now: Ints, changes: list[Change]) -> tuple[Layout, Ints]:
     """Sites that are too small joined to their neighbours, round after round."""
-    smallness = replace(rules, **{name: None for name in RULES if name not in SMALLNESS_RULES})
+    smallness = rules.only(_is_of_smallness)
     for _ in range(MAX_ROUNDS):
         report = layout.check(smallness)
         if report.ok:
@@ -189,3 +179,8 @@ def _merged(layout: Layout, rules: DesignRules, now: Ints, changes: list[Change]
 
 def _broken(report: Report) -> str:
     return "; ".join(str(result) for result in report.results if not result.ok)
+
+
+def _is_of_smallness(name: str) -> bool:
+    """Whether a site violates the rule by being too small, so that merging it with a neighbour mends it."""
+    return RULES[name].mended_by == "merge"

@@ -8,7 +8,7 @@ beyond the limit is a violation, one a photosite (or pair, or gap, or ring), and
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import InitVar, dataclass, fields
+from dataclasses import InitVar, dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,7 +30,7 @@ __all__ = ["RULES", "DesignRules", "Report", "RuleResult", "Violation", "check",
 
 
 #: Parameters that hold something else than a number.
-NOT_NUMBERS = {"die_um", "readout", "routing", "waivers"}
+NOT_NUMBERS = {"custom", "die_um", "readout", "routing", "waivers"}
 #: Limits that have an end, and those that cannot be 0.
 MOST = {"min_angle_deg": 180.0, "edge_angle_step_deg": 180.0, "min_density": 1.0, "max_density": 1.0}
 ABOVE_ZERO = ("min_angle_deg", "edge_angle_step_deg", "grid_um", "density_window_um")
@@ -98,6 +98,8 @@ class DesignRules:
         Tracks, layers and direction of the lines.
     waivers : mapping of str to str, optional
         Rules that may be broken, each with the reason. They are checked and reported all the same.
+    custom : mapping of str to float, optional
+        Limits of further rules, by the names under which they are registered in :data:`foveasim.layout.drc.RULES`.
     preset : str, optional
         Name of one of :data:`foveasim.layout.PRESETS`, whose limits stand where none is given here.
 
@@ -137,6 +139,7 @@ class DesignRules:
     max_track_use: float | None = None
     routing: Routing | None = None
     waivers: Mapping[str, str] | None = None
+    custom: Mapping[str, float] | None = None
     preset: InitVar[str | None] = None
 
     def __post_init__(self, preset: str | None) -> None:
@@ -165,6 +168,13 @@ class DesignRules:
             if die.size != 4 or not (die[0] < die[2] and die[1] < die[3]):
                 raise ParameterError("die_um", "must be (x_min, y_min, x_max, y_max)", self.die_um, "µm")
             object.__setattr__(self, "die_um", tuple(float(x) for x in die))
+        custom = {}
+        for name, limit in dict(self.custom or {}).items():
+            RULES.find("custom", name)
+            if name in {rule.name for rule in fields(self)}:
+                raise ParameterError("custom", f"must name further rules; '{name}' is a parameter of its own")
+            custom[name] = check_number(f"custom[{name}]", limit)
+        object.__setattr__(self, "custom", custom)
         waivers = dict(self.waivers or {})
         for name, reason in waivers.items():
             if name not in RULES:
@@ -172,6 +182,21 @@ class DesignRules:
             if not isinstance(reason, str) or not reason.strip():
                 raise ParameterError("waivers", f"must give a reason for '{name}'", reason)
         object.__setattr__(self, "waivers", waivers)
+
+    def only(self, keep: Callable[[str], bool]) -> DesignRules:
+        """Return the same limits for the rules whose names are kept, and none for others."""
+        own = {rule.name for rule in fields(self)}
+        return replace(
+            self,
+            custom={name: limit for name, limit in (self.custom or {}).items() if keep(name)},
+            **{name: None for name in RULES if name in own and not keep(name)},
+        )
+
+    def limits(self) -> dict[str, Any]:
+        """Return the limits that are set, by the names of their rules, in the order of the rules."""
+        custom = self.custom or {}
+        found = {name: custom.get(name, getattr(self, name, None)) for name in RULES}
+        return {name: limit for name, limit in found.items() if limit is not None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -376,14 +401,27 @@ def check(layout: Layout, rules: DesignRules) -> Report:
         raise ParameterError("rules", f"must be DesignRules, got a {type(rules).__name__}")
     case = Case(layout, rules)
     results = []
-    for name, rule in RULES.items():
-        limit = getattr(rules, name)
-        if limit is not None:
-            bound = 0.0 if rule.is_deviation else float(limit)
-            values, places = _broken(rule, rule.measure(case), bound, case)
-            waiver = (rules.waivers or {}).get(name)
-            results.append(RuleResult(name, rule.sentence, bound, rule.unit, values, waiver, places))
+    for name, limit in rules.limits().items():
+        rule = RULES[name]
+        bound = 0.0 if rule.is_deviation else float(limit)
+        values, places = _broken(rule, _measured(name, rule, case), bound, case)
+        waiver = (rules.waivers or {}).get(name)
+        results.append(RuleResult(name, rule.sentence, bound, rule.unit, values, waiver, places))
     return Report(layout.n_sites, tuple(results))
+
+
+def _measured(name: str, rule: Rule, case: Case) -> Measured:
+    """What a rule measures; an array has one value per site."""
+    found = rule.measure(case)
+    if isinstance(found, Measured):
+        return found
+    values = finite_array(name, found)
+    if values.shape != (case.layout.n_sites,):
+        n_sites = case.layout.n_sites
+        raise ParameterError(
+            "custom", f"rule '{name}' must measure one value for each of the {n_sites} sites", values.shape
+        )
+    return Measured(values)
 
 
 def _broken(rule: Rule, found: Measured, limit: float, case: Case) -> tuple[Floats, Callable[[], tuple[Any, Any]]]:

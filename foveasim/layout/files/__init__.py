@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from foveasim._core.registry import import_all
-from foveasim._io.formats import chosen_options, format_of, writing_format
+from foveasim._io.formats import FileFormat, chosen_options, format_of, writing_format
 from foveasim.errors import FileError
 from foveasim.layout.files._bundled import layout_path, shipped_layouts
 from foveasim.layout.files._common import WrittenLayout
@@ -33,6 +33,7 @@ from foveasim.layout.model import Layout
 
 __all__ = [
     "FORMATS",
+    "FileFormat",
     "WrittenLayout",
     "check_no_options",
     "layout_path",

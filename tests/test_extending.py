@@ -1,0 +1,122 @@
+"""Extensions: an installed package adds one of each kind, and every registry reports what it cannot load."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import foveasim
+from foveasim._core.registry import Registry
+from foveasim.errors import ParameterError
+
+EXAMPLE = Path(__file__).parent / "example_package"
+SHOT = """
+scene: {kind: half_plane, shape: [40, 40], pitch_um: 200.0, distance_m: 1.0}
+optics: {focal_length_mm: 8.0, f_number: 4.0, pupil: {kind: half_moon, tilt: 0.1}}
+distortion: {kind: magnifier, factor: 1.05}
+layout:
+  generator: daisy
+  parameters: {n_petals: 12, petal_um: 3.0}
+  rules: {custom: {min_roundness: 0.9}}
+sensor: {read_noise_e: 2.0, effects: [{kind: supply_ripple, sigma_v: 0.002}]}
+exposure_s: 0.01
+"""
+PROGRAM = """
+import json, sys
+import numpy as np
+import foveasim as fs
+from foveasim.config import read_shot, schema
+from foveasim.explore import METRICS
+
+shot = read_shot("shot.yaml")
+capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
+budget = shot.camera.noise_budget(shot.scene, exposure_s=shot.exposure_s)
+daisy = fs.layout.daisy(n_petals=12, petal_um=3.0)
+written = daisy.write("daisy.boxes", digits=2)
+square = fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0)
+capture.save("capture.npz")
+again = fs.Capture.load("capture.npz")
+print(json.dumps({
+    "generator": capture.layout.provenance["generator"],
+    "effects": [effect.name for effect in shot.camera.sensor.chain],
+    "ripple": bool(budget["supply_ripple"].min() > 0),
+    "rules": str(capture.layout.check(shot.rules)),
+    "square": square.check(shot.rules).ok,
+    "boxes": fs.read_layout("daisy.boxes").n_sites,
+    "metric": METRICS["darkest_code_dn"](shot, shot.camera, capture) == int(capture.code.min()),
+    "chart": type(fs.scene.charts.half_plane(shape=(4, 4), pitch_um=1.0, distance_m=1.0)).__name__,
+    "schema": all(name in json.dumps(schema()) for name in ("daisy", "supply_ripple", "half_moon", "magnifier", "half_plane")),
+    "snr": bool(np.allclose(again.signal_to_noise(), capture.signal_to_noise(sensor=shot.camera.sensor), rtol=1e-9)),
+}))
+"""
+
+
+@pytest.fixture(scope="module")
+def extended(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("extended")
+    (folder / "shot.yaml").write_text(SHOT)
+    return subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": f"{EXAMPLE}{os.pathsep}{Path(foveasim.__file__).parents[1]}"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_installed_package_extends_every_kind(extended):
+    assert extended.returncode == 0, extended.stderr
+    assert json.loads(extended.stdout) == {
+        "generator": "daisy",
+        "effects": ["shot", "read", "supply_ripple"],
+        "ripple": True,
+        "rules": "design rules on 13 photosites\nmin_roundness: kept",
+        "square": False,
+        "boxes": 13,
+        "metric": True,
+        "chart": "Scene",
+        "schema": True,
+        "snr": True,
+    }
+
+
+def test_broken_entry_point_is_reported(extended):
+    assert "scene 'broken' of foveasim-example cannot be loaded (" in extended.stderr
+    assert extended.stderr.count("cannot be loaded") == 1
+
+
+def test_name_is_registered_once():
+    registry = Registry("thing", "foveasim.tests")
+    registry.register("one", int)
+
+    assert registry.register("one", int) is int
+    with pytest.raises(ParameterError, match="'name' must be new: there is another thing of this name, got 'one'"):
+        registry.register("one", float)
+
+
+def test_unknown_name_gives_closest():
+    registry = Registry("thing", "foveasim.tests")
+    registry.register("hexagonal")(int)
+
+    assert registry.find("kind", "hexagonal") is int
+    with pytest.raises(
+        ParameterError, match="'kind' must be the name of a thing, got 'hexagnal'; did you mean 'hexagonal'"
+    ):
+        registry.find("kind", "hexagnal")
+    with pytest.raises(AttributeError, match="module 'm' has no attribute 'grid'"):
+        registry.attributes_of("m")("grid")
+
+
+def test_registration_changes_version():
+    registry = Registry("thing", "foveasim.tests")
+    before = registry.version
+    registry.register("one", int)
+
+    assert registry.version > before
+    assert dict(registry) == {"one": int}
