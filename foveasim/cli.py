@@ -108,10 +108,11 @@ def check(
 
 @app.command()
 def layouts() -> None:
-    """List the layouts that come with the package; their names stand for their files in every command."""
+    """List the bundled layouts, whose names stand for their files in every command, and the layout families."""
     from rich.table import Table
 
     from foveasim.config import read_layout_file, shipped_layouts
+    from foveasim.layout import LAYOUTS
 
     table = Table(box=None)
     for heading in ("name", "photosites", "field / µm", "pixel size / µm", "generator"):
@@ -123,6 +124,14 @@ def layouts() -> None:
             sizes = f"{found.size_um[0]:.3g} to {found.size_um[-1]:.3g}"
             table.add_row(name, f"{found.n_sites:,}", f"{x1 - x0:.5g} x {y1 - y0:.5g}", sizes, found.origin)
     console.print(table)
+    families = Table(box=None)
+    families.add_column("family")
+    families.add_column("makes")
+    for name, generator in sorted(LAYOUTS.items()):
+        summary = (generator.__doc__ or "").strip().split("\n\n")[0].split(". ")[0]
+        families.add_row(name, " ".join(summary.replace("``", "").split()).rstrip("."))
+    console.print()
+    console.print(families)
 
 
 @app.command()
