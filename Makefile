@@ -57,7 +57,7 @@ $(VENV)/.made $(LOWEST)/uv/.made $(TORCH_VENV)/.made:
 
 $(VENV)/.installed: $(VENV)/.made pyproject.toml
 	@echo "installing foveasim and what it needs into $(VENV) (a minute or so)"
-	$(BIN)/python -m pip install --quiet --editable .
+	$(BIN)/python -m pip install --quiet --editable '.[view]'
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.made pyproject.toml
@@ -83,5 +83,5 @@ $(LOWEST)/.installed: $(LOWEST)/uv/.made pyproject.toml
 
 $(TORCH_VENV)/.installed: $(TORCH_VENV)/.made pyproject.toml
 	@echo "installing foveasim and PyTorch into $(TORCH_VENV) (minutes, where PyTorch brings CUDA)"
-	$(TORCH_VENV)/bin/python -m pip install --quiet --editable '.[explore,torch]' pytest
+	$(TORCH_VENV)/bin/python -m pip install --quiet --editable '.[explore,learn]' pytest
 	touch $@

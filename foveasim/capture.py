@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.extras import library, needs
 from foveasim._core.provenance import copied, described
 from foveasim._core.rings import same_rings
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, own, read_only, unit_of, unmasked
 from foveasim._io.atomic import folder_written_whole
 from foveasim._io.npz import opened_archive, write_archive
-from foveasim._io.zarr_stores import ZARR, Variable, free_name, library, opened_store, store_format, write_variables
+from foveasim._io.zarr_stores import ZARR, Variable, free_name, opened_store, store_format, write_variables
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid
 from foveasim.layout import Layout
@@ -310,7 +311,7 @@ class Capture:
         try:
             import xarray as xr
         except ImportError:
-            raise ParameterError("to_xarray", "needs xarray; install it with: pip install 'foveasim[maps]'") from None
+            raise ParameterError("to_xarray", needs("xarray", "maps")) from None
         variables, coordinates, _ = self._variables()
 
         def parts(chosen: Mapping[str, Variable]) -> dict[str, Any]:
@@ -343,7 +344,7 @@ class Capture:
         try:
             import pandas as pd
         except ImportError:
-            raise ParameterError("to_pandas", "needs pandas; install it with: pip install 'foveasim[maps]'") from None
+            raise ParameterError("to_pandas", needs("pandas")) from None
         variables, coordinates, _ = self._variables()
         columns = {
             **{name: coordinates[name] for name in ("x_um", "y_um", "area_um2")},

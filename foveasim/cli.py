@@ -19,6 +19,8 @@ from foveasim.errors import FileError, FoveasimError, FoveasimWarning, printable
 if TYPE_CHECKING:
     from rich.status import Status
 
+    from foveasim.config import Result
+
 __all__ = ["main"]
 
 #: Exit code of a run that failed for what it was given.
@@ -60,9 +62,13 @@ def options(
 @app.command()
 def demo(out: Out = Path("out"), threads: Threads = None) -> None:
     """Show a photograph to a foveal colour sensor and to a four-zone sensor."""
-    from foveasim.config import demo_settings
+    from foveasim.config import demo_settings, write_3d_picture
 
-    _run(demo_settings(), [], out, threads)
+    foveal, *_ = _run(demo_settings(), [], out, threads)
+    with _status("drawing in three dimensions"):
+        path = write_3d_picture(foveal, out)
+    if path is not None:
+        _report(f"wrote {path}")
 
 
 @app.command()
@@ -375,7 +381,7 @@ def schema(
     sys.stdout.write(json.dumps(schema_of(kind), indent=2) + "\n")
 
 
-def _run(settings: Sequence[Path], changes: Sequence[str], out: Path, threads: int | None) -> None:
+def _run(settings: Sequence[Path], changes: Sequence[str], out: Path, threads: int | None) -> list[Result]:
     from foveasim.config import check_folder, read_shot, results_table, run_shot
 
     check_folder(out)
@@ -394,6 +400,7 @@ def _run(settings: Sequence[Path], changes: Sequence[str], out: Path, threads: i
     console.print(results_table(results))
     for path in written:
         _report(f"wrote {path}")
+    return results
 
 
 def main() -> None:

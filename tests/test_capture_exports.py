@@ -279,7 +279,7 @@ def test_missing_zarr_gives_pip_command(capture, tmp_path, monkeypatch):
     capture.save(tmp_path / "x.zarr")
     monkeypatch.setitem(sys.modules, "zarr", None)
     for call in (lambda: capture.save(tmp_path / "y.zarr"), lambda: fs.Capture.load(tmp_path / "x.zarr")):
-        with pytest.raises(FileError, match=r"needs zarr: pip install 'foveasim\[video\]'"):
+        with pytest.raises(FileError, match=r"needs zarr; install it with: pip install 'foveasim\[video\]'"):
             call()
     assert not (tmp_path / "y.zarr").exists()
 

@@ -16,6 +16,7 @@ from PIL import Image
 import foveasim as fs
 from foveasim._io.images import read_picture
 from foveasim.config import shipped_layouts
+from foveasim.view import find_renderer
 
 SHOT = """
 scene: {kind: picture, picture: photo.png, pitch_um: 100, distance_m: 1.0, peak_radiance_w_m2_sr_nm: 0.2}
@@ -54,9 +55,12 @@ def test_the_demo_ends_well_and_writes_its_files(demo):
     out, result = demo
 
     assert result.returncode == 0, result.stderr
-    assert sorted(p.name for p in out.iterdir()) == [
+    names = [
         f"{shot}_{what}" for shot in ("four_zones", "foveal") for what in ("capture.npz", "layout.png", "picture.png")
     ]
+    if find_renderer() is not None:
+        names.append("foveal_3d.png")
+    assert sorted(p.name for p in out.iterdir()) == sorted(names)
     for word in ("14,208", "13,312", "blind-spot radius", "60.12", "saturated", "optics / s"):
         assert word in result.stdout
 

@@ -1240,7 +1240,7 @@ def test_classification_draws_a_camera_for_every_picture_around_the_shots():
 def test_without_torch_one_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     _kind.cache_clear()
-    with pytest.raises(ParameterError, match=r"needs torch; install it with: pip install 'foveasim\[torch\]'"):
+    with pytest.raises(ParameterError, match=r"needs torch; install it with: pip install 'foveasim\[learn\]'"):
         explore.torch_data_set(labelled(1))
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import foveasim
+from foveasim._core.extras import EXTRA_OF
 
 PACKAGE = Path(foveasim.__file__).parent
 ROOT = PACKAGE.parent
@@ -21,15 +22,15 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = {
     "_io": {"maps", "pictures"},
     "capture": {"maps"},
-    "explore": {"explore", "torch"},
-    "layout": {"layout"},
+    "explore": {"explore", "learn"},
+    "layout": {"klayout", "layout", "parquet"},
     "maps": {"maps"},
     "modes": {"video"},
     "video": {"video"},
     "view": {"view"},
 }
 #: Extras of what is not part of the package.
-FOLDERS = {"tests": {"dev"}, "benchmarks": {"dev", "torch"}, "gallery": {"dev"}, "docs": {"docs"}}
+FOLDERS = {"tests": {"dev"}, "benchmarks": {"dev", "learn"}, "gallery": {"dev"}, "docs": {"docs"}}
 #: What may name PyTorch: the only tests that run where it is installed, and the check whether it is.
 TORCH_TESTS = {ROOT / "tests" / "test_dataset_torch.py", ROOT / "tests" / "conftest.py"}
 #: Distributions that no line imports.
@@ -129,6 +130,13 @@ def test_declared_distributions_are_used():
     extras = set().union(*EXTRAS.values())
 
     assert allowed(extras) - used == set(INDIRECT)
+
+
+def test_extras_of_messages_bring_their_modules():
+    for module, extra in EXTRA_OF.items():
+        found = distributions().get(module, ["vtk" if module == "vtkmodules" else module])
+        brought = set(declared(PROJECT["optional-dependencies"][extra]))
+        assert {normalised(name) for name in found} & brought, (module, extra)
 
 
 def test_undeclared_imports_are_reported(tmp_path):

@@ -1002,13 +1002,16 @@ def test_a_disk_that_is_full_is_noticed_though_gdstk_says_nothing(small, tmp_pat
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("ending", "module"), [("gds", "gdstk"), ("oas", "gdstk"), ("parquet", "pyarrow")])
-def test_a_missing_extra_is_one_sentence_with_its_cure(small, tmp_path, monkeypatch, ending, module):
+@pytest.mark.parametrize(
+    ("ending", "module", "extra"),
+    [("gds", "gdstk", "layout"), ("oas", "gdstk", "layout"), ("parquet", "pyarrow", "parquet")],
+)
+def test_a_missing_extra_is_one_sentence_with_its_cure(small, tmp_path, monkeypatch, ending, module, extra):
     path = tmp_path / f"a.{ending}"
     write_layout(small, path)
     monkeypatch.setitem(sys.modules, module, None)
     for call in (lambda: write_layout(small, path), lambda: read_layout(path)):
-        with pytest.raises(FileError, match=rf"needs {module}; install it with: pip install 'foveasim\[layout\]'"):
+        with pytest.raises(FileError, match=rf"needs {module}; install it with: pip install 'foveasim\[{extra}\]'"):
             call()
 
 

@@ -51,7 +51,7 @@ def test_another_ending_is_refused(tmp_path):
 
 def test_a_missing_library_is_named_with_the_command_that_installs_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "klayout", None)
-    with pytest.raises(FileError, match=r"needs the library klayout: pip install 'foveasim\[layout\]'"):
+    with pytest.raises(FileError, match=r"needs klayout; install it with: pip install 'foveasim\[klayout\]'"):
         LAYOUT.check(RULES).write(tmp_path / "report.lyrdb")
     assert not list(tmp_path.iterdir())
 

@@ -262,7 +262,7 @@ def test_a_packed_exr_is_read_as_it_was_written(tmp_path, compression, is_tiled,
 @pytest.mark.usefixtures("here")
 def test_a_missing_reader_is_named_with_the_command_that_installs_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    assert_is_refused(tmp_path, exr()[0], r"needs a reader for EXR: pip install 'foveasim\[pictures\]'")
+    assert_is_refused(tmp_path, exr()[0], r"needs OpenEXR; install it with: pip install 'foveasim\[pictures\]'")
 
 
 @pytest.mark.parametrize(

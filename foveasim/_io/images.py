@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.extras import library, needs
 from foveasim._core.validation import unmasked
 from foveasim._io.atomic import written_whole
 from foveasim._io.sandbox import read_apart
@@ -307,21 +308,24 @@ def pixels_of_page(path: Path, page: Any) -> NDArray[Any]:
     n_expected = 1 if page.is_contiguous else math.prod(page.chunked)
     if len(segments) < n_expected or any(at <= 0 or n <= 0 or at + n > n_bytes for at, n in segments):
         raise FileError(path, "is broken or cut short")
-    return np.asarray(page.asarray())
+    try:
+        return np.asarray(page.asarray())
+    except ValueError as error:
+        if "imagecodecs" in str(error):
+            raise FileError(path, f"has a compression that {needs('imagecodecs')}") from None
+        raise
 
 
 def _read_deep_png(path: Path) -> NDArray[Any]:
     """PNG of 16 bits, which Pillow would cut to 8 in colour."""
-    import imagecodecs
-
+    imagecodecs = library(path, "imagecodecs")
     content = path.read_bytes()
     check_picture_size(path, *struct.unpack(">II", content[16:24]))
     return np.asarray(imagecodecs.png_decode(content))
 
 
 def _read_radiance(path: Path) -> NDArray[Any]:
-    import imagecodecs
-
+    imagecodecs = library(path, "imagecodecs")
     content = path.read_bytes()
     size = next((line.split() for line in content[:4096].split(b"\n") if line[:2] in (b"-Y", b"+Y")), [])
     if len(size) != 4:
@@ -344,7 +348,7 @@ def _openexr(path: Path) -> tuple[dict[str, Any], NDArray[np.float32]]:
     try:
         import OpenEXR
     except ImportError:
-        raise FileError(path, "needs a reader for EXR: pip install 'foveasim[pictures]'") from None
+        raise FileError(path, needs("OpenEXR")) from None
     with OpenEXR.File(str(path), header_only=True) as file:
         if len(file.parts) != 1:
             raise FileError(path, f"holds {len(file.parts)} pictures; give a file with one")
@@ -449,16 +453,15 @@ def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
             elif ending == ".exr":
                 _write_exr(temporary, picture)
             elif picture.dtype == np.uint16:
-                import imagecodecs
-
+                imagecodecs = library(target, "imagecodecs")
                 temporary.write_bytes(imagecodecs.png_encode(picture))
             else:
                 # In memory: on a full disk Pillow's encoders leave half a file, or never end.
                 encoded = io.BytesIO()
                 Image.fromarray(picture).save(encoded, Image.registered_extensions()[ending])
                 temporary.write_bytes(encoded.getbuffer())
-        except ImportError:
-            raise FileError(target, "needs a writer for EXR: pip install 'foveasim[pictures]'") from None
+        except ImportError as error:
+            raise FileError(target, needs(error.name or "OpenEXR", "pictures")) from None
         except (OSError, ValueError, RuntimeError) as error:
             if disk_problem(error):
                 raise

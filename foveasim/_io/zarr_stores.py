@@ -14,13 +14,13 @@ import warnings
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.extras import library
 from foveasim.errors import FileError, shown
 
 __all__ = [
@@ -28,7 +28,6 @@ __all__ = [
     "Variable",
     "check_codecs",
     "free_name",
-    "library",
     "opened_store",
     "store_format",
     "write_variables",
@@ -39,7 +38,6 @@ ZARR = ".zarr"
 MAX_METADATA_BYTES = 2**26
 #: Longest name of an array: names of files have 255 bytes.
 LONGEST_NAME = 60
-NEEDS = {"zarr": "needs zarr: pip install 'foveasim[video]'", "av": "needs PyAV: pip install 'foveasim[video]'"}
 
 
 @dataclass(frozen=True)
@@ -49,21 +47,6 @@ class Variable:
     dims: tuple[str, ...]
     data: NDArray[Any]
     attributes: Mapping[str, Any]
-
-
-def library(path: Path, name: str) -> Any:
-    """
-    Import a library that files of a kind need.
-
-    Raises
-    ------
-    FileError
-        When it is missing.
-    """
-    try:
-        return import_module(name)
-    except ImportError:
-        raise FileError(path, NEEDS[name]) from None
 
 
 def free_name(name: str, taken: Collection[str]) -> str:

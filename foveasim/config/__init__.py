@@ -25,7 +25,15 @@ from foveasim.config._objects import (
     schema,
 )
 from foveasim.config._problems import validated
-from foveasim.config._shots import Result, check_folder, demo_settings, results_table, run_shot, write_results
+from foveasim.config._shots import (
+    Result,
+    check_folder,
+    demo_settings,
+    results_table,
+    run_shot,
+    write_3d_picture,
+    write_results,
+)
 from foveasim.config._video import run_video
 from foveasim.config._viewing import Viewable, read_viewable
 from foveasim.layout import shipped_layouts
@@ -56,5 +64,6 @@ __all__ = [
     "schema",
     "shipped_layouts",
     "validated",
+    "write_3d_picture",
     "write_results",
 ]

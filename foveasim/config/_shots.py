@@ -18,7 +18,8 @@ from foveasim.capture import Capture
 from foveasim.config import Shot
 from foveasim.errors import FileError, printable
 from foveasim.layout import Layout, Report
-from foveasim.view import plot_capture, save_figure
+from foveasim.view import plot_capture, prisms, render, save_figure
+from foveasim.view.renderer import what_to_install
 
 __all__ = ["Result", "check_folder", "demo_settings", "results_table", "run_shot", "write_results"]
 
@@ -117,6 +118,27 @@ def run_shot(shot: Shot, folder: str | Path) -> tuple[Result, list[Path]]:
     report = None if shot.rules is None else capture.layout.check(shot.rules)
     paths, writing_s = write_results(shot, capture, folder)
     return Result(shot, capture, report, writing_s), paths
+
+
+def write_3d_picture(result: Result, folder: str | Path) -> Path | None:
+    """
+    Write ``NAME_3d.png``: photosites as columns as high as their codes, by PyVista.
+
+    Returns
+    -------
+    path : Path or None
+        None where PyVista or OpenGL is missing.
+
+    Raises
+    ------
+    FileError
+        When the folder cannot be written.
+    """
+    if what_to_install():
+        return None
+    path = check_folder(folder) / f"{result.shot.name}_3d.png"
+    render(prisms(result.capture, "code"), path, renderer="pyvista")
+    return path
 
 
 def results_table(results: Sequence[Result]) -> Table:

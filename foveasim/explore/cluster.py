@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import current_process
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from foveasim._core.extras import needs
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.explore.worker_cache import run_tasks
 
@@ -60,9 +61,7 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
 
         security = Security() if scheduler is not None else Security.temporary()
     except ImportError:
-        raise ParameterError(
-            "sweep", "needs dask.distributed and cryptography; install them with: pip install 'foveasim[explore]'"
-        ) from None
+        raise ParameterError("sweep", needs("distributed")) from None
     if scheduler is not None:
         _check_answer(scheduler, security)
         with _silent():

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foveasim._core.extras import needs
 from foveasim._io.atomic import check_room, remove_folder
 from foveasim._io.formats import FileFormat
 from foveasim.errors import FileError
@@ -257,7 +258,7 @@ def _needs(path: Path, engine: str) -> None:
         __import__(engine)
         __import__("xarray")
     except ImportError:
-        raise FileError(path, f"needs {engine} and xarray; install them with: pip install 'foveasim[maps]'") from None
+        raise FileError(path, needs(engine, "maps")) from None
 
 
 MAP_FORMATS.register(

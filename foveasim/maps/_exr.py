@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from foveasim._core.extras import needs
 from foveasim._io.formats import FileFormat
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import PowerMap, to_file_rows
@@ -122,7 +123,7 @@ def _openexr(path: Path) -> Any:
     try:
         import OpenEXR
     except ImportError:
-        raise FileError(path, "needs OpenEXR; install it with: pip install 'foveasim[maps]'") from None
+        raise FileError(path, needs("OpenEXR", "maps")) from None
     return OpenEXR
 
 

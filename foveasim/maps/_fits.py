@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from foveasim._core.extras import needs
 from foveasim._io.formats import FileFormat
 from foveasim.errors import FileError
 from foveasim.fields import PowerMap
@@ -160,7 +161,7 @@ def _astropy(path: Path) -> Any:
     try:
         from astropy.io import fits
     except ImportError:
-        raise FileError(path, "needs astropy; install it with: pip install 'foveasim[maps]'") from None
+        raise FileError(path, needs("astropy")) from None
     return fits
 
 

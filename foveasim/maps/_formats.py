@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.extras import needs
 from foveasim._core.registry import Registry
 from foveasim._io import sandbox
 from foveasim._io.formats import FileFormat
@@ -59,7 +60,7 @@ def _read(path: Path, kind: str, name: str | None) -> tuple[dict[str, Any], NDAr
         try:
             found: Found = form.read(path, name)
         except ModuleNotFoundError as error:
-            raise Refusal(f"needs {error.name}; install it with: pip install 'foveasim[maps]'") from None
+            raise Refusal(needs(error.name or "a library", "maps")) from None
         told = asdict(replace(found, data=np.empty(0)))
         del told["data"]
         return told, as_images(found.data)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foveasim._core.extras import install_hint
 from foveasim._core.validation import Floats
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, Pitch, PowerMap
@@ -227,5 +228,5 @@ def _xarray() -> Any:
     try:
         import xarray as xr
     except ImportError:
-        raise ParameterError("xarray", "is missing; install it with: pip install 'foveasim[maps]'") from None
+        raise ParameterError("xarray", f"is missing; {install_hint('xarray', 'maps')}") from None
     return xr

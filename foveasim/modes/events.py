@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.extras import needs
 from foveasim._core.provenance import described
 from foveasim._core.validation import Floats, Ints, as_numbers, check_number, finite_array, own, read_only
 from foveasim._io.atomic import check_room, written_whole
@@ -479,4 +480,4 @@ def _needs_h5py(path: Path) -> None:
     try:
         import h5py  # noqa: F401
     except ImportError:
-        raise FileError(path, "needs h5py: pip install 'foveasim[video]'") from None
+        raise FileError(path, needs("h5py")) from None

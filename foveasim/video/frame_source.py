@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.extras import needs
 from foveasim._core.validation import check_count, check_number
 from foveasim._io.images import PICTURE_ENDINGS, check_picture_size, picture_names
 from foveasim.errors import FileError, ParameterError, printable
@@ -25,7 +26,7 @@ __all__ = ["Footage", "pictures_in"]
 GREY_NM, COLOUR_NM = (550.0,), (620.0, 550.0, 450.0)
 #: More frames than anyone has.
 MAX_FRAMES = 2**31
-NEEDS_PYAV = "needs a reader for video files: pip install 'foveasim[video]'"
+NEEDS_PYAV = needs("av")
 
 
 class Footage:

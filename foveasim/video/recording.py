@@ -15,10 +15,11 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.extras import library
 from foveasim._core.provenance import described, differences
 from foveasim._core.validation import Floats, check_count
 from foveasim._io.atomic import folder_written_whole, lock
-from foveasim._io.zarr_stores import ZARR, check_codecs, library
+from foveasim._io.zarr_stores import ZARR, check_codecs
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout import Layout

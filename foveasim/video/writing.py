@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.extras import library
 from foveasim._core.validation import check_count, check_number
 from foveasim._io.atomic import folder_written_whole, written_whole
 from foveasim._io.images import write_picture
-from foveasim._io.zarr_stores import ZARR, library
+from foveasim._io.zarr_stores import ZARR
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid

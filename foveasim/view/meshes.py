@@ -15,6 +15,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.extras import install_hint
 from foveasim._core.provenance import described
 from foveasim._core.rings import next_vertex, positions_in_runs
 from foveasim._core.threads import each, thread_count
@@ -438,5 +439,5 @@ def imported_pyvista() -> Any:
     try:
         import pyvista
     except ImportError:
-        raise ParameterError("pyvista", "is missing; install it with: pip install 'foveasim[view]'") from None
+        raise ParameterError("pyvista", f"is missing; {install_hint('pyvista')}") from None
     return pyvista

@@ -15,6 +15,8 @@ from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec
 
+from foveasim._core.extras import install_hint
+
 __all__ = ["ON_SCREEN", "begin_rendering", "find_renderer", "what_to_install"]
 
 #: Names by which VTK's window classes are chosen, and the variable that chooses.
@@ -77,7 +79,7 @@ def begin_rendering() -> None:
 def what_to_install() -> str:
     """What is missing for pictures by PyVista, as a sentence; empty where nothing is."""
     if any(find_spec(module) is None for module in ("pyvista", "vtkmodules")):
-        return "PyVista is not installed; install it with: pip install 'foveasim[view]'"
+        return f"PyVista is not installed; {install_hint('pyvista')}"
     if find_renderer() is None:
         return "this machine has no OpenGL; install it, on Debian and Ubuntu with: apt install libegl1 libgl1"
     return ""

@@ -16,7 +16,6 @@ trimesh writes it.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -28,6 +27,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.extras import library
 from foveasim._core.rings import next_vertex, positions_in_runs
 from foveasim._core.validation import Floats, Ints, check_count, check_length_um, check_number
 from foveasim._io.atomic import written_whole
@@ -208,7 +208,6 @@ class Solids:
         Raises
         ------
         ParameterError
-            When manifold3d is not installed.
 
         Notes
         -----
@@ -254,7 +253,7 @@ class Solids:
         Raises
         ------
         ParameterError
-            When the region is none, a part is unknown, or manifold3d is not installed.
+            When the region is none, or a part is unknown.
         """
         region = _near_quarter(self.layout, QUARTER) if region is None else as_region("region", region)
         names = tuple(self.parts) if of is None else tuple(of)
@@ -398,17 +397,19 @@ def write_meshes(meshes: Sequence[Mesh], path: str | Path) -> None:
     Raises
     ------
     FileError
-        When the ending is another, or nothing can be written there.
+        When the ending is another, nothing can be written there, or a library for ``.3mf`` is not installed.
     GeometryError
         When there is not a single triangle.
-    ParameterError
-        When trimesh is not installed.
     """
+    import trimesh
+
     target = Path(path)
     kind = target.suffix.lower()
     if kind not in FORMATS:
         raise FileError(target, f"must end in {', '.join(FORMATS)}")
-    trimesh = _imported("trimesh")
+    if kind == ".3mf":
+        for module in ("lxml", "networkx"):
+            library(target, module)
     bodies = {mesh.name: _body(trimesh, mesh) for mesh in meshes if mesh.triangles.size}
     if not bodies:
         raise GeometryError("there is nothing left of the solids to write")
@@ -567,16 +568,10 @@ def _sees_all(layout: Layout, middle_um: Floats, site: Ints) -> NDArray[np.bool_
 # -- manifold3d and trimesh -----------------------------------------------------------------------------------------------
 
 
-def _imported(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise ParameterError(name, "is missing; install it with: pip install 'foveasim[view]'") from None
-
-
 def _manifold(points_um: Floats, triangles: NDArray[np.integer[Any]]) -> Any:
     """The surface as a Manifold; columns of ``points_um`` beyond the third are carried along."""
-    manifold3d = _imported("manifold3d")
+    import manifold3d
+
     return manifold3d.Manifold(manifold3d.Mesh64(np.ascontiguousarray(points_um), triangles.astype(np.uint64)))
 
 

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from foveasim._core.extras import needs
 from foveasim.errors import ParameterError
 
 __all__ = ["torch_data_set"]
@@ -57,7 +58,7 @@ def _kind() -> Any:
     try:
         import torch  # type: ignore[import-not-found,unused-ignore]
     except ImportError:
-        raise ParameterError("torch_data_set", "needs torch; install it with: pip install 'foveasim[torch]'") from None
+        raise ParameterError("torch_data_set", needs("torch")) from None
 
     def tensor(value: Any) -> Any:
         if not isinstance(value, np.ndarray):

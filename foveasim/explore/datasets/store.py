@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.extras import needs
 from foveasim._core.threads import thread_count
 from foveasim._core.validation import check_count
 from foveasim._io.atomic import remove_folder, written_whole
@@ -53,7 +54,7 @@ DIGEST_BYTES = 32
 WORK, STOP = "work", "stop"
 #: What takes longer than this in one process is worth others, which take seconds to start.
 ALONE_S = 10.0
-NEEDS_ZARR = "needs zarr: pip install 'foveasim[explore]'"
+NEEDS_ZARR = needs("zarr", "explore")
 
 #: Told how many samples are written, of how many.
 Tell = Callable[[int, int], None]

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from foveasim._core.extras import needs
 from foveasim._core.random_streams import derived_seed
 from foveasim._core.threads import thread_count
 from foveasim._io.atomic import lock
@@ -399,5 +400,5 @@ def _optuna() -> Any:
     try:
         import optuna
     except ImportError:
-        raise ParameterError("study", "needs optuna; install it with: pip install 'foveasim[explore]'") from None
+        raise ParameterError("study", needs("optuna")) from None
     return optuna

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._core.extras import needs
 from foveasim._core.validation import unit_of
 from foveasim._io.atomic import remove_folder
 from foveasim.errors import FileError, ParameterError
@@ -301,7 +302,5 @@ def _xarray() -> Any:
         import xarray
         import zarr  # noqa: F401 -- the results' format
     except ImportError:
-        raise ParameterError(
-            "sweep", "needs xarray and zarr; install them with: pip install 'foveasim[explore]'"
-        ) from None
+        raise ParameterError("sweep", needs("xarray")) from None
     return xarray

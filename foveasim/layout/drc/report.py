@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import shapely
 
+from foveasim._core.extras import needs
 from foveasim._io.atomic import written_whole
 from foveasim.errors import FileError
 
@@ -57,7 +58,7 @@ def write_lyrdb(report: Report, path: str | Path) -> None:
     try:
         from klayout import db, rdb
     except ImportError:
-        raise FileError(target, "needs the library klayout: pip install 'foveasim[layout]'") from None
+        raise FileError(target, needs("klayout")) from None
     database = rdb.ReportDatabase("foveasim design rules")
     database.generator = "foveasim"
     database.top_cell_name = CELL_NAME

@@ -36,6 +36,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from foveasim._core.extras import needs
 from foveasim._core.rings import positions_in_runs, ring_moments
 from foveasim._core.validation import MAX_SITES, Floats, Ints, check_count, check_number
 from foveasim._io.atomic import written_whole
@@ -180,7 +181,7 @@ def _gdstk(path: Path) -> Any:
     try:
         import gdstk
     except ImportError:
-        raise FileError(path, "needs gdstk; install it with: pip install 'foveasim[layout]'") from None
+        raise FileError(path, needs("gdstk")) from None
     return gdstk
 
 

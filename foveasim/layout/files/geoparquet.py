@@ -15,6 +15,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from foveasim._core.extras import needs
 from foveasim._io.atomic import written_whole
 from foveasim._io.formats import FileFormat
 from foveasim.errors import FileError, ParameterError
@@ -155,7 +156,7 @@ def _pyarrow(path: Path) -> tuple[Any, Any]:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError:
-        raise FileError(path, "needs pyarrow; install it with: pip install 'foveasim[layout]'") from None
+        raise FileError(path, needs("pyarrow")) from None
     return pa, parquet
 
 

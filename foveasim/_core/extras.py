@@ -1,0 +1,60 @@
+"""Optional libraries: which extra of the package brings each, and the message where one is missing."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from foveasim.errors import FileError
+
+__all__ = ["EXTRA_OF", "install_hint", "library", "needs"]
+
+#: Extra of each optional module, the smallest that brings it.
+EXTRA_OF = {
+    "OpenEXR": "pictures",
+    "astropy": "maps",
+    "av": "video",
+    "cryptography": "explore",
+    "distributed": "explore",
+    "gdstk": "layout",
+    "h5netcdf": "maps",
+    "h5py": "video",
+    "imagecodecs": "pictures",
+    "klayout": "klayout",
+    "lxml": "view",
+    "networkx": "view",
+    "optuna": "explore",
+    "pandas": "maps",
+    "pyarrow": "parquet",
+    "pyvista": "view",
+    "torch": "learn",
+    "vtkmodules": "view",
+    "xarray": "explore",
+    "zarr": "video",
+}
+
+
+def install_hint(module: str, extra: str | None = None) -> str:
+    """Return the command that installs a module, with the extra that brings it or another that does."""
+    return f"install it with: pip install 'foveasim[{extra or EXTRA_OF[module]}]'"
+
+
+def needs(module: str, extra: str | None = None) -> str:
+    """Return the message for a missing module."""
+    return f"needs {module}; {install_hint(module, extra)}"
+
+
+def library(path: Path, module: str) -> Any:
+    """
+    Import a module that files of a kind need.
+
+    Raises
+    ------
+    FileError
+        When it is not installed, with the path of the file.
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        raise FileError(path, needs(module)) from None
