@@ -236,7 +236,7 @@ def test_an_exr_is_read_as_it_was_written(tmp_path):
 @pytest.fixture
 def here(monkeypatch):
     """Reads EXR in this program, which takes no second for each file to start another."""
-    monkeypatch.setattr(images, "read_apart", lambda reader, path, **_: reader(path))
+    monkeypatch.setattr(images, "read_in_sandbox", lambda reader, path, **_: reader(str(path)))
 
 
 def saved_exr(path, picture, compression, *, is_tiled=False):

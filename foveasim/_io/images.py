@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from foveasim._core.extras import library, needs
 from foveasim._core.validation import unmasked
 from foveasim._io.atomic import written_whole
-from foveasim._io.sandbox import read_apart
+from foveasim._io.sandbox import read_in_sandbox
 from foveasim.errors import FileError, disk_problem
 
 if TYPE_CHECKING:
@@ -336,19 +336,17 @@ def _read_radiance(path: Path) -> NDArray[Any]:
 
 def _read_exr(path: Path) -> NDArray[Any]:
     # OpenEXR prints what it could not read, and may go on without it.
-    return read_apart(_openexr, path, kind="EXR", max_unpacked=_max_unpacked, is_silent=True)[1]
+    return read_in_sandbox(_openexr, path, kind="EXR", max_unpacked=_max_unpacked, is_silent=True)[1][0]
 
 
 def _max_unpacked(n_bytes: int) -> int:
     return min(MIN_UNPACKED_BYTES + UNPACKED_PER_BYTE * n_bytes, 16 * MAX_PIXELS)
 
 
-def _openexr(path: Path) -> tuple[dict[str, Any], NDArray[np.float32]]:
-    """The picture of an EXR, as the program of its own reads it."""
-    try:
-        import OpenEXR
-    except ImportError:
-        raise FileError(path, needs("OpenEXR")) from None
+def _openexr(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """The picture of an EXR, as the sandbox process reads it."""
+    path = Path(name)
+    OpenEXR = library(path, "OpenEXR")
     with OpenEXR.File(str(path), header_only=True) as file:
         if len(file.parts) != 1:
             raise FileError(path, f"holds {len(file.parts)} pictures; give a file with one")
@@ -362,7 +360,7 @@ def _openexr(path: Path) -> tuple[dict[str, Any], NDArray[np.float32]]:
     picture = np.asarray(next(iter(layers.values())), dtype=np.float32)
     if picture.shape[:2] != (n_y, n_x):
         raise FileError(path, f"must have channels of {n_x} x {n_y} pixels, got an array of the shape {picture.shape}")
-    return {}, picture
+    return {}, [picture]
 
 
 def _upright(picture: NDArray[Any], orientation: object) -> NDArray[Any]:

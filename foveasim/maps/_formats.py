@@ -45,22 +45,22 @@ def read_found(path: Path, kind: str, name: str | None) -> Found:
         found: Found = form.read(path, name)
         return found
     # OpenEXR prints what it could not read, and may go on without it.
-    told, data = sandbox.read_apart(
-        _read, path, kind, name, kind=form.title, max_unpacked=max_unpacked, is_silent=kind == "exr"
+    told, (data,) = sandbox.read_in_sandbox(
+        _read, path, kind=form.title, max_unpacked=max_unpacked, is_silent=kind == "exr", format_name=kind, name=name
     )
     about: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in told.items()}
     return Found(data=data, **about)
 
 
-def _read(path: Path, kind: str, name: str | None) -> tuple[dict[str, Any], NDArray[Any]]:
+def _read(path: str, format_name: str, name: str | None) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     """What a reader finds, taken apart for its way between the processes."""
-    form = MAP_FORMATS[kind]
+    form = MAP_FORMATS[format_name]
     assert form.read is not None
-    with one_sentence(path):
+    with one_sentence(Path(path)):
         try:
-            found: Found = form.read(path, name)
+            found: Found = form.read(Path(path), name)
         except ModuleNotFoundError as error:
             raise Refusal(needs(error.name or "a library", "maps")) from None
         told = asdict(replace(found, data=np.empty(0)))
         del told["data"]
-        return told, as_images(found.data)
+        return told, [as_images(found.data)]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.provenance import described
 from foveasim._core.validation import Floats, Ints
-from foveasim._io.sandbox import read_apart
+from foveasim._io.sandbox import read_in_sandbox
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout import Layout
 from foveasim.layout.packed import packed_layout, unpacked_layout
@@ -127,13 +127,8 @@ def read_events(path: Path) -> tuple[Floats, NDArray[np.int32], NDArray[np.int8]
     FileError
         When the file is broken, hostile, or holds something else.
     """
-    told, numbers = read_apart(_read, path, kind="HDF5", max_unpacked=_max_unpacked)
-    arrays: dict[str, NDArray[Any]] = {}
-    begin = 0
-    for name, kind, shape in told["arrays"]:
-        n_bytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(kind).itemsize
-        arrays[name] = numbers[begin : begin + n_bytes].view(kind).reshape(shape)
-        begin += n_bytes
+    told, found = read_in_sandbox(_read, path, kind="HDF5", max_unpacked=_max_unpacked)
+    arrays = dict(zip(told["names"], found, strict=True))
     outlines = {
         name.removeprefix("layout/"): np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values
         for name, values in arrays.items()
@@ -158,10 +153,11 @@ def _max_unpacked(n_bytes: int) -> int:
     return min(UNPACKED_PER_BYTE * n_bytes, MAX_UNPACKED_BYTES)
 
 
-def _read(path: Path) -> tuple[dict[str, Any], NDArray[np.uint8]]:
-    """The arrays of a file one behind the other as bytes, and what each is."""
+def _read(file_name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """The arrays of a file, and their names."""
     import h5py
 
+    path = Path(file_name)
     with h5py.File(path, "r") as file:
         if file.attrs.get("format") != FORMAT:
             raise FileError(path, "holds no events of foveasim; make them with Events.from_addresses")
@@ -172,9 +168,8 @@ def _read(path: Path) -> tuple[dict[str, Any], NDArray[np.uint8]]:
             found[f"layout/{name}"] = _dataset(path, file, "layout", name)
         if sum(part.size * part.dtype.itemsize for part in found.values()) > _max_unpacked(path.stat().st_size):
             raise FileError(path, "would unpack to more than a file of its size holds")
-        arrays = {name: np.ascontiguousarray(part[()]) for name, part in found.items()}
-    kinds = [(name, values.dtype.str, values.shape) for name, values in arrays.items()]
-    return {"arrays": kinds}, np.concatenate([values.ravel().view(np.uint8) for values in arrays.values()])
+        arrays = [np.ascontiguousarray(part[()]) for part in found.values()]
+    return {"names": list(found)}, arrays
 
 
 def _group(path: Path, file: Any, name: str) -> Mapping[str, Any]:

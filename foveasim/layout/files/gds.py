@@ -18,11 +18,6 @@ References: Calma, GDSII Stream Format Manual 6.0 (1987); SEMI P39, OASIS.
 
 from __future__ import annotations
 
-import json
-import signal
-import subprocess
-import sys
-import tempfile
 import zlib
 from bisect import bisect_left, bisect_right
 from collections import Counter
@@ -41,6 +36,7 @@ from foveasim._core.rings import positions_in_runs, ring_moments
 from foveasim._core.validation import MAX_SITES, Floats, Ints, check_count, check_number
 from foveasim._io.atomic import written_whole
 from foveasim._io.formats import FileFormat
+from foveasim._io.sandbox import PATIENCE, run_in_sandbox
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout.files._columns import MAX_COLUMN_BYTES, columns_of, kept_columns, texts_of
 from foveasim.layout.files._common import (
@@ -83,8 +79,6 @@ MIN_READING_BYTES, READING_PER_BYTE = 2**30, 256
 MIN_MEMORY_BYTES, MEMORY_PER_BYTE, MAX_MEMORY_BYTES = 2**31, 256, 2**35
 MIN_TEXT_BYTES, TEXT_PER_BYTE = 2**27, 32
 MAX_CPU_S, BYTES_PER_S = 5, 2**20
-#: On a busy computer the same takes longer; and flattening, once it is known how much that is, may.
-PATIENCE = 5
 #: GDSII records by the data type that they have: none, bits, 16-bit, 32-bit, 64-bit floating, text.
 RECORDS_OF_TYPE = {
     0: b"\x04\x07\x08\x09\x0a\x0b\x0c\x11\x15\x2d\x38",
@@ -384,49 +378,29 @@ def _isolated(
     path: Path, is_oasis: bool, layer: int | None, cell: str | None, n_bytes: int
 ) -> tuple[dict[str, Any], Floats, Ints, Ints, bytes]:
     """What gdstk finds in the file, read by a program of its own, which a hostile file may crash."""
-    with tempfile.TemporaryDirectory(prefix="foveasim-") as folder:
-        out = Path(folder) / "shapes"
-        max_cpu_s = MAX_CPU_S + n_bytes // BYTES_PER_S
-        max_memory_bytes = min(MIN_MEMORY_BYTES + MEMORY_PER_BYTE * n_bytes, MAX_MEMORY_BYTES)
-        task = {
-            "path": str(path.resolve()),
-            "out": str(out),
-            "is_oasis": is_oasis,
-            "layer": layer,
-            "cell": cell,
-            "sys_path": sys.path,
-            "max_sites": MAX_SITES,
-            "max_reading_bytes": min(MIN_READING_BYTES + READING_PER_BYTE * n_bytes, max_memory_bytes),
-            "max_memory_bytes": max_memory_bytes,
-            "max_text_bytes": max(MIN_TEXT_BYTES, TEXT_PER_BYTE * n_bytes),
-            "max_cpu_s": max_cpu_s,
-            "max_s": PATIENCE * max_cpu_s,
-        }
-        try:
-            # gdstk may say the same of a broken file a million times.
-            done = subprocess.run(  # noqa: S603 -- our own program
-                [sys.executable, "-P", str(Path(__file__).with_name("_isolated.py"))],
-                input=json.dumps(task).encode(),
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                timeout=PATIENCE * max_cpu_s,
-                check=False,
-            )
-            is_late = done.returncode == -getattr(signal, "SIGXCPU", 0)
-        except subprocess.TimeoutExpired:
-            is_late = True
-        if is_late:
-            raise FileError(path, f"is broken or hostile: reading it took more than {max_cpu_s} s")
-        if done.returncode != 0 or not done.stdout:
-            raise FileError(path, "is broken or hostile: gdstk crashed on it")
-        answer = json.loads(done.stdout)
-        if "refused" in answer:
-            raise FileError(path, answer["refused"])
-        if "broken" in answer:
-            raise FileError(path, f"is broken ({answer['broken']:.160})")
-        with out.open("rb") as file:
-            xy_dbu, counts, tags, texts = (np.load(file, allow_pickle=False) for _ in range(4))
-        return answer, xy_dbu, counts, tags, texts.tobytes()
+    from foveasim.layout.files import _gdstk
+
+    max_cpu_s = MAX_CPU_S + n_bytes // BYTES_PER_S
+    max_memory_bytes = min(MIN_MEMORY_BYTES + MEMORY_PER_BYTE * n_bytes, MAX_MEMORY_BYTES)
+    args = {
+        "is_oasis": is_oasis,
+        "layer": layer,
+        "cell": cell,
+        "max_sites": MAX_SITES,
+        "max_memory_bytes": max_memory_bytes,
+        "max_text_bytes": max(MIN_TEXT_BYTES, TEXT_PER_BYTE * n_bytes),
+        "max_cpu_s": PATIENCE * max_cpu_s,
+    }
+    told, (xy_dbu, counts, tags, texts) = run_in_sandbox(
+        _gdstk.read,
+        path,
+        args,
+        kind="OASIS" if is_oasis else "GDSII",
+        max_cpu_s=max_cpu_s,
+        max_bytes=min(MIN_READING_BYTES + READING_PER_BYTE * n_bytes, max_memory_bytes),
+        is_standalone=True,
+    )
+    return told, xy_dbu, counts, tags, texts.tobytes()
 
 
 def _sites(path: Path, xy_um: Floats, counts: Ints, tags: Ints) -> tuple[Layout, Ints, Ints]:

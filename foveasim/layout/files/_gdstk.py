@@ -1,25 +1,22 @@
 """
-A program of its own that reads GDSII and OASIS through gdstk, flattened: a broken or hostile file can only end *it*.
+Flattened polygons of GDSII and OASIS files, read by gdstk in the sandbox process.
 
-Started by ``gds.py`` with a task as JSON on standard input; answers with JSON on standard output, and leaves the
-polygons as arrays in the file that the task names. It loads nothing of the package, so that it starts quickly.
+The module imports nothing of the package, so that the process starts quickly.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import re
-import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__: list[str] = []
+__all__ = ["Refusal", "read"]
 
 #: Cells that KLayout adds for its own use begin with this.
 KLAYOUT_NOTES = "$$$CONTEXT_INFO$$$"
@@ -75,55 +72,62 @@ class Shapes:
         return Shapes(xy, np.tile(self.counts, k), tags, k * self.n_placements)
 
 
-def main() -> None:
-    """Do the task."""
-    task = json.load(sys.stdin)
-    _limit("RLIMIT_CORE", 0)
-    _limit("RLIMIT_CPU", task["max_cpu_s"])
-    _limit("RLIMIT_AS", task["max_reading_bytes"])
-    sys.path[:] = task["sys_path"]
-    try:
-        answer = _read(task)
-    except Refusal as refusal:
-        answer = {"refused": str(refusal)}
-    except MemoryError:
-        answer = {"refused": "asks for more memory than any layout needs"}
-    except Exception as error:  # noqa: BLE001 -- whatever a broken file makes its reader trip over
-        answer = {"broken": " ".join(str(error).split()) or type(error).__name__}
-    sys.stdout.write(json.dumps(answer))
+def read(
+    path: str,
+    *,
+    limit: Callable[[str, int], None],
+    is_oasis: bool,
+    layer: int | None,
+    cell: str | None,
+    max_sites: int,
+    max_memory_bytes: int,
+    max_text_bytes: int,
+    max_cpu_s: int,
+) -> tuple[dict[str, Any], list[Any]]:
+    """
+    Read a cell with all cells below it.
 
+    Parameters
+    ----------
+    path : str
+    limit : callable
+        Sets limits of memory and processor time: tighter ones are in force while gdstk reads.
+    is_oasis : bool
+    layer, cell : optional
+        As users give them.
+    max_sites, max_memory_bytes, max_text_bytes, max_cpu_s : int
+        Of what is made of the file.
 
-def _limit(kind: str, most: int) -> None:
-    """A bound of memory or time, where the system has them."""
-    try:
-        import resource
-    except ImportError:
-        return
-    number = getattr(resource, kind)
-    hard = resource.getrlimit(number)[1]
-    resource.setrlimit(number, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+    Returns
+    -------
+    told : dict
+        ``dbu_um`` and ``cell``.
+    arrays : list
+        ``xy`` in database units, ``counts``, ``tags`` (see :class:`Shapes`), and the text of the columns.
 
-
-def _read(task: dict[str, Any]) -> dict[str, Any]:
+    Raises
+    ------
+    Refusal
+        When the file is rejected.
+    """
     import gdstk
-    import numpy as np
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        library = (gdstk.read_oas if task["is_oasis"] else gdstk.read_gds)(task["path"])
-    if task["is_oasis"] and caught:
+        library = (gdstk.read_oas if is_oasis else gdstk.read_gds)(path)
+    if is_oasis and caught:
         # Where it meets what it does not know, it leaves out what follows; GDSII tells how much to skip.
         raise Refusal(f"is broken, or holds what gdstk does not read ({caught[0].message})")
     dbu_um = library.precision * 1e6
     if not (math.isfinite(dbu_um) and 1e-9 <= dbu_um <= 1e3 and 1e-12 <= library.unit <= 1.0):
         raise Refusal(f"has the impossible database unit {dbu_um:g} µm")
     cells = {cell.name: cell for cell in library.cells}
-    top = _top(cells, task["cell"])
+    top = _top(cells, cell)
     order = _from_the_bottom(cells, top)
-    _check_numbers(cells, order, task)
+    _check_numbers(cells, order, max_sites, max_memory_bytes)
     # What follows is known to be bounded.
-    _limit("RLIMIT_AS", task["max_memory_bytes"])
-    _limit("RLIMIT_CPU", task["max_s"])
+    limit("RLIMIT_AS", max_memory_bytes)
+    limit("RLIMIT_CPU", max_cpu_s)
     flat: dict[str, Shapes] = {}
     lines: list[str] = []
     last_use = {child: name for name in order for child in _held(cells, name)}
@@ -132,12 +136,9 @@ def _read(task: dict[str, Any]) -> dict[str, Any]:
         for child in _held(cells, name):
             if last_use[child] == name:
                 del flat[child]
-    shapes = _on_one_layer(flat[top], task["layer"])
-    text = _text_of_columns(shapes, lines, task["max_text_bytes"])
-    with open(task["out"], "wb") as file:  # noqa: PTH123 -- a plain name from the task
-        for array in (shapes.xy, shapes.counts, shapes.tags, text):
-            np.save(file, array, allow_pickle=False)
-    return {"dbu_um": dbu_um, "cell": top}
+    shapes = _on_one_layer(flat[top], layer)
+    text = _text_of_columns(shapes, lines, max_text_bytes)
+    return {"dbu_um": dbu_um, "cell": top}, [shapes.xy, shapes.counts, shapes.tags, text]
 
 
 # -- cells ------------------------------------------------------------------------------------------------------------
@@ -187,11 +188,11 @@ def _held(cells: dict[str, Any], name: str) -> Iterator[str]:
         yield child
 
 
-def _check_numbers(cells: dict[str, Any], order: list[str], task: dict[str, Any]) -> None:
+def _check_numbers(cells: dict[str, Any], order: list[str], max_sites: int, max_memory_bytes: int) -> None:
     """Refuse what would flatten to more than any sensor has, or take too much memory or time, before it is done."""
     n_polygons: dict[str, int] = {}
     n_vertices: dict[str, int] = {}
-    max_sites, max_vertices = task["max_sites"], task["max_memory_bytes"] // VERTEX_BYTES
+    max_vertices = max_memory_bytes // VERTEX_BYTES
     n_copied = 0
     for name in order:
         cell = cells[name]
@@ -203,7 +204,7 @@ def _check_numbers(cells: dict[str, Any], order: list[str], task: dict[str, Any]
         if max(n_polygons[name], sum(k for _, k in references)) > max_sites or n_copied > COPIES * max_sites:
             raise Refusal(f"has more than the {max_sites} sites that are read")
         n_vertices[name] = _own_vertices(cell, max_vertices) + sum(k * n_vertices[c] for c, k in references)
-        if VERTEX_BYTES * n_vertices[name] + POLYGON_BYTES * n_polygons[name] > task["max_memory_bytes"]:
+        if VERTEX_BYTES * n_vertices[name] + POLYGON_BYTES * n_polygons[name] > max_memory_bytes:
             raise Refusal("would unpack to more sites and vertices than are read from a file of its size")
 
 
@@ -354,7 +355,3 @@ def _on_one_layer(shapes: Shapes, wanted: int | None) -> Shapes:
     is_wanted = shapes.tags[:, 0] == wanted
     is_kept_vertex = np.repeat(is_wanted, shapes.counts)
     return Shapes(shapes.xy[is_kept_vertex], shapes.counts[is_wanted], shapes.tags[is_wanted], shapes.n_placements)
-
-
-if __name__ == "__main__":
-    main()
