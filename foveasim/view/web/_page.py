@@ -7,6 +7,7 @@ import hashlib
 import html
 import json
 import re
+from collections.abc import Callable
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -100,8 +101,20 @@ def write_web_page(thing: Layout | Capture, path: str | Path, *, report: Report 
     ParameterError, GeometryError
         As for :func:`web_page`.
     """
+    write_page(path, lambda: web_page(thing, report=report, name=name))
+
+
+def write_page(path: str | Path, page: Callable[[], str]) -> None:
+    """
+    Write a page atomically; it is made after its path was checked.
+
+    Raises
+    ------
+    FileError
+        When the path does not end as pages do, its directory does not exist, or nothing can be written there.
+    """
     target = check_page_path(path)
-    text = web_page(thing, report=report, name=name)
+    text = page()
     with written_whole(target) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

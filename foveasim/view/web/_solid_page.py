@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from foveasim._io.atomic import written_whole
 from foveasim.capture import Capture
 from foveasim.layout import Layout
 from foveasim.view.meshes import Mesh, prisms
@@ -14,7 +13,7 @@ from foveasim.view.solids import solids as solids_of
 from foveasim.view.web._bodies import bodies_of
 from foveasim.view.web._content import described_sites
 from foveasim.view.web._pack import packed
-from foveasim.view.web._page import check_page_path, joined
+from foveasim.view.web._page import joined, write_page
 
 __all__ = ["solid_page", "write_solid_page"]
 
@@ -89,7 +88,4 @@ def write_solid_page(
     ParameterError, GeometryError
         As for :func:`solid_page`.
     """
-    target = check_page_path(path)
-    text = solid_page(thing, solids=solids, name=name)
-    with written_whole(target) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_page(path, lambda: solid_page(thing, solids=solids, name=name))
