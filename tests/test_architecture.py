@@ -58,6 +58,15 @@ def room_of(path):
     return relative.parts[0].removesuffix(".py")
 
 
+@pytest.mark.parametrize("folder", sorted({path.parent for path in MODULES}), ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_packages_have_at_most_15_modules(folder):
+    assert len(list(folder.glob("*.py"))) <= 15
+
+
+def test_package_lists_public_names_only():
+    assert set(dir(foveasim)) == set(foveasim.__all__)
+
+
 #: Methods by which data hand themselves to the room that shows them: these may call upwards, and nothing else may.
 SHOWN_BY = {"plot", "to_pyvista"}
 

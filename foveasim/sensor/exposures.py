@@ -230,7 +230,7 @@ def non_destructive_reads(
     -----
     What comes between two reads is drawn by itself and added, then the full well cuts off: later charges contain earlier ones,
     ``cov(N_i, N_j) = E[N_i]`` for ``i <= j``, and increments are uncorrelated. Noise of reading is drawn for each read; that of
-    resetting once, the same in all reads. A telegraph's state is drawn for each read, as if it were fast.
+    resetting once, the same in all reads. The state of RTS sites is drawn for each read, as if it were fast.
 
     Examples
     --------

@@ -52,9 +52,9 @@ class Sensor:
     Photosites with their electronics.
 
     The order of effects: expected photons x quantum efficiency x filter x PRNU, + dark charge, charge diffusion, **one**
-    Poisson draw, full well, + kTC noise, read noise and telegraph noise, volts (q/C) with gain FPN and non-linearity,
-    + offset FPN of pixel and line, clip to 0 .. V_sat, converter with its non-linearities. The defaults are a perfect sensor:
-    every photon an electron, no noise but the shot noise of light.
+    Poisson draw, full well, inter-pixel capacitance, + reset (kTC), read and RTS noise, volts (q/C) with gain FPN and
+    nonlinearity, + offset FPN of pixels and columns, clip to 0 .. V_sat, ADC with its nonlinearities. The defaults are a
+    perfect sensor: every photon an electron, no noise but photon shot noise.
 
     Parameters
     ----------
@@ -84,9 +84,9 @@ class Sensor:
     crosstalk : Diffusion or KernelCrosstalk, optional
         Charge that goes to neighbours before it is collected.
     shot_noise : {"auto", "exact", "off"}
-        See :func:`foveasim.sensor.draw_shot_noise`.
+        See :class:`foveasim.sensor.effects.ShotNoise`.
     gaussian_above_e : float, e-
-        Expectation above which ``"auto"`` takes the Gaussian for the Poisson law.
+        Expectation above which ``"auto"`` draws numbers of the Poisson distribution's first three moments.
     full_well_e : float or (n_site,), optional, e-
         Charge that a site can hold; None for no limit but V_sat.
     coupling : Coupling, optional
