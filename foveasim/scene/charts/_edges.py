@@ -20,7 +20,7 @@ from foveasim.scene.charts._canvas import (
     inked,
     interval,
 )
-from foveasim.scene.registry import SCENES
+from foveasim.scene.registry import chart
 
 __all__ = ["BarElement", "bar_elements", "bars", "checkerboard", "letter_f", "slanted_edge"]
 
@@ -66,7 +66,7 @@ class BarElement:
     side_mm: float
 
 
-@SCENES.register("checkerboard")
+@chart("checkerboard")
 def checkerboard(
     *,
     square_mm: float,
@@ -91,18 +91,7 @@ def checkerboard(
         picture, four of them meet in its middle, and the one right of and above it is black.
     contrast : float
         (white - black) / (white + black).
-    shape : (n_y, n_x)
-        Numbers of pixels.
-    pitch_um : float, µm
-        Distance of two pixels in the scene.
-    distance_m : float, m
-        Distance of the scene from the lens.
-    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
-        Spectral radiance of white.
-    wavelength_nm : sequence, nm
-        Wavelengths.
-    band_width_nm : number or sequence, optional, nm
-        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+    {picture}
 
     Returns
     -------
@@ -143,7 +132,7 @@ def checkerboard(
     return canvas.scene(shares, contrast, "a checkerboard")
 
 
-@SCENES.register("slanted_edge")
+@chart("slanted_edge")
 def slanted_edge(
     *,
     angle_deg: float = 5.0,
@@ -164,18 +153,7 @@ def slanted_edge(
         Of the edge from the vertical, counter-clockwise; 90 is a horizontal edge with white above it.
     contrast : float
         (white - black) / (white + black); 0.6 by default, where white is four times black, as ISO 12233 has it.
-    shape : (n_y, n_x)
-        Numbers of pixels.
-    pitch_um : float, µm
-        Distance of two pixels in the scene.
-    distance_m : float, m
-        Distance of the scene from the lens.
-    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
-        Spectral radiance of white.
-    wavelength_nm : sequence, nm
-        Wavelengths.
-    band_width_nm : number or sequence, optional, nm
-        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+    {picture}
 
     Returns
     -------
@@ -197,7 +175,7 @@ def slanted_edge(
     return canvas.scene(shares, contrast, "a slanted edge")
 
 
-@SCENES.register("bars")
+@chart("bars")
 def bars(
     *,
     groups: Sequence[int],
@@ -221,18 +199,7 @@ def bars(
         Black bars on white, or white ones on black.
     contrast : float
         (white - black) / (white + black).
-    shape : (n_y, n_x)
-        Numbers of pixels.
-    pitch_um : float, µm
-        Distance of two pixels in the scene.
-    distance_m : float, m
-        Distance of the scene from the lens.
-    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
-        Spectral radiance of white.
-    wavelength_nm : sequence, nm
-        Wavelengths.
-    band_width_nm : number or sequence, optional, nm
-        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+    {picture}
 
     Returns
     -------
@@ -337,7 +304,7 @@ def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
     )
 
 
-@SCENES.register("letter_f")
+@chart("letter_f")
 def letter_f(
     *,
     height_mm: float,
@@ -361,18 +328,7 @@ def letter_f(
         A black letter on white, or a white one on black.
     contrast : float
         (white - black) / (white + black).
-    shape : (n_y, n_x)
-        Numbers of pixels.
-    pitch_um : float, µm
-        Distance of two pixels in the scene.
-    distance_m : float, m
-        Distance of the scene from the lens.
-    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
-        Spectral radiance of white.
-    wavelength_nm : sequence, nm
-        Wavelengths.
-    band_width_nm : number or sequence, optional, nm
-        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+    {picture}
 
     Returns
     -------

@@ -16,7 +16,7 @@ from foveasim.scene.charts._colours import (
     nonnegative_factors,
     patch_reflectance,
 )
-from foveasim.scene.registry import SCENES
+from foveasim.scene.registry import SCENES, chart
 
 __all__ = ["colour_chart", "grey_scale"]
 
@@ -28,7 +28,7 @@ N_ROWS, N_COLUMNS = 4, 6
 MAX_STEPS = 1000
 
 
-@SCENES.register("grey_scale")
+@chart("grey_scale")
 def grey_scale(
     *,
     n_steps: int = 12,
@@ -52,18 +52,7 @@ def grey_scale(
         Radiance of a patch over that of the next one: 2 is a stop, ``10**0.15`` a step of 0.15 in density.
     patch_mm : float, mm
         Side of a patch.
-    shape : (n_y, n_x)
-        Numbers of pixels.
-    pitch_um : float, µm
-        Distance of two pixels in the scene.
-    distance_m : float, m
-        Distance of the scene from the lens.
-    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
-        Spectral radiance of white.
-    wavelength_nm : sequence, nm
-        Wavelengths.
-    band_width_nm : number or sequence, optional, nm
-        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+    {picture}
 
     Returns
     -------

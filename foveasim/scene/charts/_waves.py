@@ -10,7 +10,7 @@ import numpy as np
 from foveasim._core.validation import Floats, check_choice, check_count, check_number
 from foveasim.scene._scene import GREY_NM, Scene
 from foveasim.scene.charts._canvas import Canvas, OneOrMore, checked_contrast, half_plane, sampled
-from foveasim.scene.registry import SCENES
+from foveasim.scene.registry import chart
 
 __all__ = ["siemens_star", "sine", "zone_plate"]
 
@@ -26,7 +26,7 @@ STEEP = 1e9
 GAUSS = ((-0.5 * np.sqrt(0.6), 5.0 / 18.0), (0.0, 8.0 / 18.0), (0.5 * np.sqrt(0.6), 5.0 / 18.0))
 
 
-@SCENES.register("sine")
+@chart("sine")
 def sine(
     *,
     line_pairs_per_mm: float,
@@ -53,18 +53,7 @@ def sine(
         By which the white line through the middle is moved on; 90 is a quarter of a period.
     contrast : float
         (white - black) / (white + black), of the ideal wave; the means over pixels have a little less.
-    shape : (n_y, n_x)
-        Numbers of pixels.
-    pitch_um : float, µm
-        Distance of two pixels in the scene.
-    distance_m : float, m
-        Distance of the scene from the lens.
-    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
-        Spectral radiance of white, the wave's highest.
-    wavelength_nm : sequence, nm
-        Wavelengths.
-    band_width_nm : number or sequence, optional, nm
-        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+    {picture}
 
     Returns
     -------
@@ -98,7 +87,7 @@ def sine(
     return canvas.scene(shares, contrast, "a sine wave")
 
 
-@SCENES.register("zone_plate")
+@chart("zone_plate")
 def zone_plate(
     *,
     line_pairs_per_mm: float,
@@ -122,18 +111,7 @@ def zone_plate(
         Of the rim; by default the largest that the picture holds.
     contrast : float
         (white - black) / (white + black).
-    shape : (n_y, n_x)
-        Numbers of pixels.
-    pitch_um : float, µm
-        Distance of two pixels in the scene.
-    distance_m : float, m
-        Distance of the scene from the lens.
-    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
-        Spectral radiance of white, that of the middle.
-    wavelength_nm : sequence, nm
-        Wavelengths.
-    band_width_nm : number or sequence, optional, nm
-        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+    {picture}
 
     Returns
     -------
@@ -180,7 +158,7 @@ def zone_plate(
     return canvas.scene(canvas.filled(block), contrast, "a zone plate")
 
 
-@SCENES.register("siemens_star")
+@chart("siemens_star")
 def siemens_star(
     *,
     n_spokes: int = 36,
@@ -208,18 +186,7 @@ def siemens_star(
         Across the spokes: black and white, or a wave (the star of ISO 12233:2014, which has 144 spokes).
     contrast : float
         (white - black) / (white + black).
-    shape : (n_y, n_x)
-        Numbers of pixels.
-    pitch_um : float, µm
-        Distance of two pixels in the scene.
-    distance_m : float, m
-        Distance of the scene from the lens.
-    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
-        Spectral radiance of white.
-    wavelength_nm : sequence, nm
-        Wavelengths.
-    band_width_nm : number or sequence, optional, nm
-        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+    {picture}
 
     Returns
     -------
