@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from foveasim._core.registry import import_all
 from foveasim.explore._metrics import METRICS, Metric, metric_of
 from foveasim.explore._schemas import schema_of
 from foveasim.explore.datasets.dataset import DataSet
@@ -46,3 +47,5 @@ __all__ = [
     "torch_data_set",
     "write_data_set",
 ]
+
+import_all(__name__, __path__)

@@ -24,6 +24,7 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 
+from foveasim._core.registry import import_all
 from foveasim._core.validation import handed_over
 from foveasim._io.atomic import written_whole
 from foveasim._io.formats import format_of, writing_format
@@ -148,3 +149,6 @@ def write_power_map(power_map: PowerMap, path: str | Path) -> None:
             form.write(power_map, temporary)
         except FileError as error:
             raise FileError(path, str(error).removeprefix(f"{temporary}: ")) from None
+
+
+import_all(__name__, __path__)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from foveasim._core.registry import import_all
 from foveasim.layout.drc.measurements import RULES, Case, Measured, Rule
 from foveasim.layout.drc.presets import PRESETS, Preset
 from foveasim.layout.drc.repair import Change, enforce
@@ -27,3 +28,5 @@ __all__ = [
     "enforce",
     "min_width_um",
 ]
+
+import_all(__name__, __path__)
