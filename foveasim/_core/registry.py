@@ -101,6 +101,14 @@ class Registry(Mapping[str, T], Generic[T]):
     def __len__(self) -> int:
         return len(self._all())
 
+    def within(self, package: str) -> dict[str, T]:
+        """Return the objects that modules of a package registered; entry points are not loaded."""
+        return {
+            name: item
+            for name, item in self._objects.items()
+            if str(getattr(item, "__module__", "")).startswith(f"{package}.")
+        }
+
     def attributes_of(self, module: str) -> Callable[[str], T]:
         """Return a module's ``__getattr__``, which gives registered objects by their names."""
 

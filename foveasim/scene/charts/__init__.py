@@ -42,5 +42,7 @@ __all__ = [
 ]
 
 import_all(__name__, __path__)
+# A chart comes before a module of its name.
+globals().update(SCENES.within(__name__))
 if not TYPE_CHECKING:  # charts of other packages, and new ones of this
     __getattr__ = SCENES.attributes_of(__name__)
