@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ def test_a_script_runs_and_writes_its_pictures(path, tmp_path, monkeypatch):
     (tmp_path / "out").mkdir()
     spec = importlib.util.spec_from_file_location(f"gallery_{path.stem}", path)
     module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)  # dataclasses look their modules up
     spec.loader.exec_module(module)
 
     module.main(tmp_path / "out")
