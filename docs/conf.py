@@ -6,6 +6,7 @@ import ast
 import importlib
 import inspect
 import runpy
+import shutil
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -58,6 +59,7 @@ ROOMS = {
     "foveasim.distortion": "Lens models, which move the outlines of photosites.",
     "foveasim.maps": "Light from other programs, and for them.",
     "foveasim.sensor": "From light to codes: efficiencies, noise, converters.",
+    "foveasim.sensor.effects": "Noise sources, fixed patterns and crosstalk, and the contract for one's own.",
     "foveasim.reconstruct": "From codes back to pictures.",
     "foveasim.video": "Frames in, gazes that move, recordings out.",
     "foveasim.modes": "Other ways to expose: rolling shutters, events, spikes.",
@@ -74,11 +76,10 @@ REFERENCE = Path(__file__).parent / "reference"
 def public_names() -> dict[str, list[str]]:
     """List the public names of every room, which have a page each."""
     rooms = {name: importlib.import_module(name) for name in ROOMS}
-    # What the package lends from its rooms is listed with the rooms.
-    lent = {"__version__"}.union(*(room.__all__ for name, room in rooms.items() if name != "foveasim"))
     public = {}
     for name, room in rooms.items():
-        hidden = lent if name == "foveasim" else set()
+        # What a package re-exports from its subpackages is listed with these.
+        hidden = {"__version__"}.union(*(other.__all__ for at, other in rooms.items() if at.startswith(f"{name}.")))
         public[name] = [n for n in room.__all__ if n not in hidden and not inspect.ismodule(getattr(room, n))]
     return public
 
@@ -99,7 +100,8 @@ def generated_pages(repository: Path) -> set[Path]:
 
 def write_reference(_app: Sphinx, _config: Config) -> None:
     """Write a page for every room, which lists what the room says is public."""
-    REFERENCE.mkdir(exist_ok=True)
+    shutil.rmtree(REFERENCE, ignore_errors=True)  # pages of names that are no more
+    REFERENCE.mkdir()
     public = public_names()
     for name, about in ROOMS.items():
         names = "\n".join(f"   {n}" for n in public[name])
