@@ -231,6 +231,18 @@ def test_moments_without_device_need_declaring():
         noise_budget(made(effects=[Undeclared()]), np.full(N, 100.0), 1.0)
 
 
+@pytest.mark.parametrize("returned", [None, np.zeros(3)])
+def test_wrong_result_of_effect_is_rejected(returned):
+    class Wrong(Hum):
+        is_local = True
+
+        def apply(self, values, *, sites, rng):
+            return returned
+
+    with pytest.raises(SimulationError, match=r"the effect 'hum' must return an array of the shape .*; check its apply"):
+        codes(made(effects=[Wrong()]))
+
+
 class Nameless(LampFlicker):
     name = None
 

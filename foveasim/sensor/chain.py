@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Floats
-from foveasim.errors import ParameterError
+from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.blocks import in_blocks, pieces
 from foveasim.sensor.effects import STAGES, STANDARD, Effect, FixedFactor, FixedOffset, Sites
 
@@ -213,10 +213,21 @@ def run(
         rng: Any = streams.of(step.name) if step.is_temporal and streams is not None else None
         whole = sites.block(slice(None), n_threads=n_threads)
         mine = values if is_ours else np.array(values, np.float64)
-        values, local, is_ours = step.apply(mine, sites=whole, rng=rng), [], True
+        values, local, is_ours = _applied(step, mine, whole, rng), [], True
     if not local and out is None:
         return np.asarray(values)
     return _pass(local, values, np.empty(sites.n_sites) if out is None else out, last, sites, streams, n_threads)
+
+
+def _applied(step: Step, values: Any, sites: Sites, rng: Any) -> Any:
+    """Values after a step, one for each site."""
+    found = step.apply(values, sites=sites, rng=rng)
+    if getattr(found, "shape", None) != values.shape:
+        raise SimulationError(
+            f"the effect '{step.name}' must return an array of the shape {values.shape}, got "
+            f"{getattr(found, 'shape', type(found).__name__)}; check its apply()"
+        )
+    return found
 
 
 def _pass(
@@ -237,7 +248,7 @@ def _pass(
         for index in pieces(whole):
             part, some = values[index].astype(np.float64), sites.block(index)
             for step, rng in zip(steps, rngs, strict=True):
-                part = step.apply(part, sites=some, rng=rng)
+                part = _applied(step, part, some, rng)
             if last is None:
                 out[index] = part
             else:
