@@ -239,7 +239,9 @@ def test_wrong_result_of_effect_is_rejected(returned):
         def apply(self, values, *, sites, rng):
             return returned
 
-    with pytest.raises(SimulationError, match=r"the effect 'hum' must return an array of the shape .*; check its apply"):
+    with pytest.raises(
+        SimulationError, match=r"the effect 'hum' must return an array of the shape .*; check its apply"
+    ):
         codes(made(effects=[Wrong()]))
 
 
