@@ -245,6 +245,28 @@ def test_wrong_result_of_effect_is_rejected(returned):
         codes(made(effects=[Wrong()]))
 
 
+@pytest.mark.parametrize("deviation", [np.ones(3), np.nan])
+def test_wrong_deviation_is_rejected(deviation):
+    class Wrong(LampFlicker):
+        def deviation(self, sites):
+            return deviation
+
+    with pytest.raises(
+        SimulationError, match="the effect 'flicker' must give one finite number, or one for each of the"
+    ):
+        codes(made(effects=[Wrong()]))
+
+
+@pytest.mark.parametrize("returned", [None, 3.0, (np.ones(3), np.ones(3))])
+def test_wrong_moments_are_rejected(returned):
+    class Wrong(Hum):
+        def moments(self, mean, variance, *, sites):
+            return returned
+
+    with pytest.raises(SimulationError, match="the effect 'hum' must return a mean and a variance of the shape"):
+        made(effects=[Wrong()]).predict(np.full(N, 100.0))
+
+
 class Nameless(LampFlicker):
     name = None
 

@@ -120,3 +120,10 @@ def test_registration_changes_version():
 
     assert registry.version > before
     assert dict(registry) == {"one": int}
+
+
+def test_wrong_extensions_give_messages():
+    with pytest.raises(ParameterError, match="'custom' must be limits by the names of rules, got 3"):
+        foveasim.DesignRules(custom=3)
+    with pytest.raises(ParameterError, match="'digits' is not an option of any format, got 3; leave it out"):
+        foveasim.read_layout("prima_100", digits=3)

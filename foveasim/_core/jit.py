@@ -77,7 +77,7 @@ def njit(signature: Any = None, **options: Any) -> Callable[[Callable[..., Any]]
 
 
 def _is_cached(function: Callable[..., Any]) -> bool:
-    """Whether machine code lies beside the source, or may lie elsewhere because the source's directory cannot be written."""
+    """Whether machine code is next to the source, or may be elsewhere because the source's directory cannot be written."""
     source = Path(inspect.getfile(function))
     is_elsewhere = bool(os.environ.get("NUMBA_CACHE_DIR")) or not os.access(source.parent, os.W_OK)
     pattern = f"{source.stem}.*py{sys.version_info.major}{sys.version_info.minor}*.nbi"

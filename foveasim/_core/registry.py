@@ -44,7 +44,7 @@ class Registry(Mapping[str, T], Generic[T]):
         self.kind, self.group = kind, group
         self._objects: dict[str, T] = {}
         self._is_complete = False
-        #: Number of registrations so far: what is derived from a registry is made anew when it changes.
+        #: Number of registrations so far: what is derived from a registry is rebuilt when it changes.
         self.version = 0
 
     @overload

@@ -257,7 +257,7 @@ def read_layout_file(path: str | Path) -> LayoutFile:
     return _built_layout(path, "", validated(path, models().layout, read_yaml(path)))
 
 
-def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None = None) -> Layout:
+def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None = None, **options: Any) -> Layout:
     """
     Read a layout from a file of any format, or by the name of a layout that comes with the package.
 
@@ -271,6 +271,8 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
         Of GDSII and OASIS: the layer that contains the photosites; needed where shapes lie on several.
     cell : str, optional
         Of GDSII and OASIS: the cell to read, with all cells below it; needed where there are several top cells.
+    **options
+        Of other formats in :data:`foveasim.layout.FORMATS`.
 
     Returns
     -------
@@ -291,11 +293,11 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
     >>> fs.read_layout("prima_100").n_sites
     378
     """
-    return read_any_layout(path, layer=layer, cell=cell).layout
+    return read_any_layout(path, layer=layer, cell=cell, **options).layout
 
 
 def read_any_layout(
-    path: str | Path, *, folder: str | Path = ".", layer: int | None = None, cell: str | None = None
+    path: str | Path, *, folder: str | Path = ".", layer: int | None = None, cell: str | None = None, **options: Any
 ) -> LayoutFile:
     """
     Read a layout from a YAML file, from a file of any other format, or by the name of a layout that comes with the package.
@@ -318,9 +320,9 @@ def read_any_layout(
     """
     path = layout_path(path, folder)
     if path.suffix.lower() in YAML_ENDINGS:
-        check_no_options(layer=layer, cell=cell)
+        check_no_options(layer=layer, cell=cell, **options)
         return read_layout_file(path)
-    return LayoutFile(layout=read_sites(path, layer=layer, cell=cell), rules=None, source=str(path))
+    return LayoutFile(layout=read_sites(path, layer=layer, cell=cell, **options), rules=None, source=str(path))
 
 
 def read_rules(path: str | Path) -> DesignRules:

@@ -12,6 +12,7 @@ import shapely
 
 from foveasim._core.provenance import described
 from foveasim._core.registry import Registry
+from foveasim.errors import SimulationError
 from foveasim.layout.model import Layout
 
 __all__ = ["LAYOUTS", "layout_family"]
@@ -57,6 +58,8 @@ def layout_family(
         @functools.wraps(generator)
         def family(*args: P.args, **kwargs: P.kwargs) -> Layout:
             layout = generator(*args, **kwargs)
+            if not isinstance(layout, Layout):
+                raise SimulationError(f"the layout family '{name}' must return a Layout, got a {type(layout).__name__}")
             given = signature.bind(*args, **kwargs)
             given.apply_defaults()
             own = dict(layout.provenance)

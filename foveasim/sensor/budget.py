@@ -90,7 +90,7 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
         elif effect.is_temporal or effect.is_local:
             values, e_per_unit = nominal[effect.stage]
             sites = sensor.sites if effect.is_temporal else any_device
-            mean, variance = effect.moments(values, np.zeros(1), sites=sites)
+            mean, variance = effect.checked_moments(values, np.zeros(1), sites)
             lines = temporal if effect.is_temporal else fixed
             lines[effect.name] = np.sqrt(variance + (mean - values) ** 2) * e_per_unit
     return {name: np.broadcast_to(line, n_sites).copy() for name, line in (temporal | fixed).items()}

@@ -168,6 +168,8 @@ class DesignRules:
             if die.size != 4 or not (die[0] < die[2] and die[1] < die[3]):
                 raise ParameterError("die_um", "must be (x_min, y_min, x_max, y_max)", self.die_um, "µm")
             object.__setattr__(self, "die_um", tuple(float(x) for x in die))
+        if self.custom is not None and not isinstance(self.custom, Mapping):
+            raise ParameterError("custom", "must be limits by the names of rules", self.custom)
         custom = {}
         for name, limit in dict(self.custom or {}).items():
             RULES.find("custom", name)

@@ -152,10 +152,24 @@ class Sites:
         return self._known[key]
 
     def pattern(self, effect: Any, compute: Callable[[Sites], ArrayLike]) -> Floats:
-        """Return the part for these sites of an array (n_site,) or number, computed for all sites at the first call."""
+        """
+        Return the part for these sites of an array (n_site,) or number, computed for all sites at the first call.
+
+        Raises
+        ------
+        SimulationError
+            When it has another shape, or a number is not finite.
+        """
 
         def computed(sites: Sites) -> Floats:
-            return read_only(np.atleast_1d(np.asarray(compute(sites), np.float64)).copy())
+            found = np.atleast_1d(np.asarray(compute(sites), np.float64))
+            if found.shape not in ((1,), (sites.n_sites,)) or not np.isfinite(found).all():
+                name = getattr(effect, "name", type(effect).__name__)
+                raise SimulationError(
+                    f"the effect '{name}' must give one finite number, or one for each of the {sites.n_sites} sites, "
+                    f"got an array of the shape {found.shape}"
+                )
+            return read_only(found.copy())
 
         return self.of(self.once(effect, computed))
 
@@ -211,6 +225,27 @@ class Effect(ABC):
         sites : Sites
             With a device, fixed patterns are its known numbers; without one, moments are over all devices.
         """
+
+    def checked_moments(self, mean: Floats, variance: Floats, sites: Sites) -> tuple[Floats, Floats]:
+        """
+        Return what :meth:`moments` gives.
+
+        Raises
+        ------
+        SimulationError
+            When that is not a mean and a variance of the shape of the values.
+        """
+        found = self.moments(mean, variance, sites=sites)
+        shape = np.broadcast_shapes(np.shape(mean), np.shape(variance), (sites.n_sites,))
+        try:
+            after, spread2 = (np.asarray(part, np.float64) for part in found)
+            if np.broadcast_shapes(after.shape, spread2.shape, shape) != shape:
+                raise ValueError
+        except (TypeError, ValueError):
+            raise SimulationError(
+                f"the effect '{self.name}' must return a mean and a variance of the shape {shape}; check its moments()"
+            ) from None
+        return after, spread2
 
     def half_step(self, sites: Sites) -> Floats | None:
         """Return half the distance of two equally probable states, (n,) or (1,); None for effects of other distributions."""
