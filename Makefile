@@ -15,7 +15,7 @@ UV := $(LOWEST)/uv/bin/uv
 # PyTorch has an environment of its own, as its wheel may bring gigabytes of CUDA libraries.
 TORCH_VENV ?= .venv-torch
 
-.PHONY: demo test test-lowest test-torch lint bench docs clean
+.PHONY: demo test test-lowest test-torch soak lint bench docs clean
 .NOTPARALLEL:
 
 demo: $(VENV)/.installed
@@ -31,6 +31,10 @@ test-lowest: $(LOWEST)/.installed
 
 test-torch: $(TORCH_VENV)/.installed
 	FOVEASIM_TESTS_NEED=torch $(TORCH_VENV)/bin/python -m pytest tests/test_dataset_torch.py $(PYTEST_ARGS)
+
+# Kills workers at random for some minutes: every item must be computed, and none more than twice.
+soak: $(VENV)/.installed-dev
+	FOVEASIM_SOAK_ROUNDS=20 $(BIN)/python -m pytest tests/test_executor.py -k lost --verbose $(PYTEST_ARGS)
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

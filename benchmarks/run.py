@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import scipy.fft
 import shapely
+from exploring import bench_exploring
 from learning import bench_learning
 from looking import bench_looking
 from report import Report, best_s
@@ -326,6 +327,8 @@ def main() -> int:
         bench_video(report, 100 if is_quick else 1000)
     with console.status("bench learning"):
         bench_learning(report, 100 if is_quick else 1000)
+    with console.status("bench exploring"):
+        bench_exploring(report, 10 if is_quick else 40)
     with console.status("bench looking"):
         bench_looking(report, 20_000 if is_quick else 1_000_000)
     bench_import(report)

@@ -275,6 +275,10 @@ def study(
     trials: Annotated[
         int | None, typer.Option("--trials", help="Trials that the study has at its end; by default the file's.")
     ] = None,
+    scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a dask scheduler.")] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", help="Processes for the trials of a batch; none but this by default.")
+    ] = None,
     metrics: Metrics = None,
 ) -> None:
     """Search the settings that make a shot best; the exit code is 1 when no trial is good, failed or beyond the limits."""
@@ -288,7 +292,7 @@ def study(
     base = storage or str(out or "study.db")
     place = storage_name(base)
     with _progress(settings.stem, f"the trials that are done are kept in {place}") as tell:
-        found = run_study(plan, storage=base, tell=tell)
+        found = run_study(plan, storage=base, scheduler=scheduler, workers=workers, tell=tell)
     done = finished_trials(found)
     failed = [trial.user_attrs["error"] for trial in done if "error" in trial.user_attrs]
     if failed:
@@ -314,6 +318,10 @@ def dataset(
     workers: Annotated[
         int | None, typer.Option("--workers", help="Processes; by default one a core, where there is enough to do.")
     ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", help="Address of a dask scheduler; by default processes of this machine."),
+    ] = None,
 ) -> None:
     """Take pictures with cameras drawn at random, and write them as samples to learn from."""
     from foveasim._core.threads import thread_count
@@ -323,7 +331,7 @@ def dataset(
     with _status("reading pictures and settings"):
         file = read_data_set(settings, n_threads=n_threads)
     with _progress(settings.stem, f"the shards that are done are kept in {out}") as tell:
-        write_data_set(file.data_set, out, per_shard=file.per_shard, workers=workers, tell=tell)
+        write_data_set(file.data_set, out, per_shard=file.per_shard, workers=workers, scheduler=scheduler, tell=tell)
     _report(f"wrote {out}: {len(file.data_set):,} samples")
 
 

@@ -26,7 +26,7 @@ from foveasim.explore import _records
 from foveasim.explore._records import Journal, Record
 from foveasim.explore.datasets.label_files import files_of_pictures, read_boxes, read_labels
 from foveasim.explore.studies.plan import _suggested
-from foveasim.explore.worker_cache import Bench, Job, Task
+from foveasim.explore.worker_cache import ShotRunner
 
 GALLERY = Path(__file__).parents[1] / "gallery" / "sweeps"
 SHOT = {
@@ -777,10 +777,10 @@ def test_what_a_picture_is_compared_with_is_made_once_and_changes_no_result():
     vary = {"optics.f_number": [2.0, 4.0], "sensor.bits": [8, 12], "exposure_s": [1e-4, 2e-4]}
     scene = PHOTOGRAPHED["scene"] | {"picture": "skimage:astronaut", "pitch_um": 30.0}
     plan = explore.plan_sweep(SHOT | {"scene": scene}, vary, repeats=2, metrics=["psnr_db"])
-    job, bench = Job(plan.source, plan.metrics, 1, plan.is_geometry_varied), Bench()
-    found = [bench.record(job, Task(k, plan.settings_of(k))) for k in range(plan.n_points)]
+    runner = ShotRunner(plan.source, plan.metrics, is_geometry_varied=False, n_threads=1)
+    found = [runner.record(k, plan.settings_of(k)) for k in range(plan.n_points)]
 
-    assert bench.n_made["reference"] == 4
+    assert runner.cache.n_made["reference"] == 4
     for k in (0, 5, 10, 15):
         shot = build_shot("by hand", plan.settings_of(k))
         capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from foveasim import explore
-from foveasim.explore._functions import described
+from foveasim.explore._functions import identity_of
 
 OWN = """
 import functools
@@ -67,8 +67,8 @@ METRICS = {
 """
 COMMAND = """
 import json, own
-from foveasim.explore._functions import described
-print(json.dumps({name: described(metric) for name, metric in own.METRICS.items()}))
+from foveasim.explore._functions import identity_of
+print(json.dumps({name: identity_of(metric) for name, metric in own.METRICS.items()}))
 """
 
 
@@ -113,14 +113,14 @@ def test_a_checksum_does_not_change_as_a_function_is_used():
     def often(n):
         return sum(n + k for k in range(10)) + table[0]
 
-    before = described(often)
+    before = identity_of(often)
     for k in range(200):
         often(k)
-    assert described(often) == before
+    assert identity_of(often) == before
 
 
 def test_the_packages_own_metrics_are_told_by_the_packages_version():
-    assert described(explore.METRICS["snr"]) == "foveasim.explore._metrics:snr"
+    assert identity_of(explore.METRICS["snr"]) == "foveasim.explore._metrics:snr"
 
 
 @pytest.mark.parametrize(
@@ -133,5 +133,5 @@ def test_the_packages_own_metrics_are_told_by_the_packages_version():
     ],
 )
 def test_functions_that_take_other_things_along_are_others(pair):
-    assert described(pair[0]) == described(pair[0])
-    assert described(pair[0]) != described(pair[1])
+    assert identity_of(pair[0]) == identity_of(pair[0])
+    assert identity_of(pair[0]) != identity_of(pair[1])

@@ -11,6 +11,7 @@ import pytest
 from foveasim import explore
 from foveasim.config import build_shot
 from foveasim.errors import ConfigError, FileError, ParameterError
+from foveasim.explore.studies import study
 
 SHOT = {
     "scene": {
@@ -138,6 +139,51 @@ def test_a_study_that_was_ended_goes_on_as_if_it_was_not(tmp_path):
     assert len(again.trials) == 21
     assert told(run(20, storage=f"sqlite:///{tmp_path}/study.db")) == told(whole)
     assert told(explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=20, seed=6)) != told(whole)
+
+
+@pytest.mark.parametrize("n_workers", [1, 2])
+def test_batches_do_not_depend_on_workers(n_workers):
+    def run(**options):
+        return explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=24, seed=5, batch=6, **options)
+
+    assert told(run(workers=n_workers)) == told(run())
+
+
+def test_batch_larger_than_one_changes_the_search():
+    one, many = (
+        explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=24, seed=5, batch=batch) for batch in (1, 12)
+    )
+
+    # The first trials are random in any case.
+    assert told(one)[:10] == told(many)[:10]
+    assert told(one) != told(many)
+
+
+@pytest.mark.parametrize("stopped_at", [13, 17, 18])
+def test_interrupted_batch_resumes_bit_identically(stopped_at, tmp_path, monkeypatch):
+    def run(**options):
+        return explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=24, seed=5, batch=6, **options)
+
+    whole = run()
+    store_result, n_stored = study._told, []
+
+    def interrupted(*args):
+        if len(n_stored) == stopped_at:
+            raise KeyboardInterrupt
+        n_stored.append(None)
+        store_result(*args)
+
+    monkeypatch.setattr(study, "_told", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(storage=tmp_path / "study.db")
+    monkeypatch.undo()
+
+    assert told(run(storage=tmp_path / "study.db")) == told(whole)
+
+
+def test_trials_are_a_multiple_of_batch():
+    with pytest.raises(ParameterError, match="'n_trials' must be a multiple of the batch of 4, got 6"):
+        explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=6, batch=4)
 
 
 def test_two_programs_do_not_write_the_same_study(tmp_path):

@@ -21,13 +21,15 @@ from foveasim._core.provenance import differences
 from foveasim._io.atomic import lock
 from foveasim.errors import FileError, ParameterError
 
-__all__ = ["Journal", "Record", "Value", "check_new", "check_same_plan", "journal_of", "values_of"]
+__all__ = ["ENDED_ITS_WORKER", "Journal", "Record", "Value", "check_new", "check_same_plan", "journal_of", "values_of"]
 
 FORMAT, VERSION = "foveasim sweep", 1
 #: How a journal begins: a checksum, and what it is.
 TORN_HEAD = rb'[0-9a-f]{1,8} \{"format": "foveasim'
 #: So long a journal's lines may wait for the disk.
 SYNC_S = 1.0
+#: Error of a point that ended its worker each time it was tried.
+ENDED_ITS_WORKER = "ended its worker each time: too little memory, or a crash in a metric"
 #: What a metric may give that is no array.
 Scalar = bool | int | float | str
 

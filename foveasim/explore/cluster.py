@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import signal
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import current_process
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from foveasim._core.extras import needs
 from foveasim.errors import ParameterError, SimulationError
-from foveasim.explore.worker_cache import run_tasks
 
 if TYPE_CHECKING:
     from distributed import Client, Security
 
-__all__ = ["Worker", "Workers", "client_of"]
+__all__ = ["WorkerStates", "client_of", "dask_setup"]
 
 #: Time that a scheduler has to answer.
 SCHEDULER_S = 10.0
-#: A worker that is paused so long and works on nothing will not soon go on: its reports come every second or so.
+#: Seconds after which a task that waits at a paused worker is sent elsewhere; workers report every second or so.
 PAUSED_S = 10.0
 #: What our own workers do about memory. A worker that dask pauses may wait for ever for memory that a metric keeps; one that
 #: is ended is begun anew without it.
@@ -75,10 +75,10 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
     if getattr(current_process(), "_inheriting", False):
         # A worker that imports the main program came here: what began the worker tells that it did not start.
         raise SystemExit(1)
-    # A worker's end is ours to judge: each point is tried again, alone, and counted.
+    # Every item of a worker that ended is tried again, alone: not with the others of its task.
     with (
         dask.config.set(
-            {"distributed.scheduler.allowed-failures": 0, "distributed.scheduler.work-stealing": False}
+            {"distributed.scheduler.allowed-failures": 0, "distributed.admin.large-graph-warning-threshold": "1 TB"}
             | MEMORY
             | NO_HTTP
         ),
@@ -94,7 +94,7 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
                     # No dashboard: only so does dask not ask for the one port of another's, and warn where that has it.
                     dashboard_address="127.0.0.1:0",
                     scheduler_kwargs={"dashboard": False},
-                    preload=[run_tasks.__module__],
+                    preload=[__name__],
                     silence_logs=logging.CRITICAL,
                 )
             )
@@ -147,35 +147,36 @@ def _check_answer(scheduler: str, security: Security) -> None:
         )
 
 
-class Worker(NamedTuple):
-    """A worker's process; one that was begun anew may have the address of the one before, but never its folder."""
-
-    address: str
-    folder: str
+def dask_setup(_worker: Any) -> None:
+    """Prepare a worker of this machine: Ctrl-C, which all processes of a terminal get, is for the program that started it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-class Workers:
+class WorkerStates:
     """
-    The workers of a scheduler, as they were when they were last counted.
+    States of a scheduler's workers at the last update.
 
     Attributes
     ----------
-    here : set of Worker
-        All that have not ended.
-    able : set of Worker
-        Those that begin what they are sent.
-    stuck : set of Worker
-        Those that are paused for their memory, and work on nothing.
+    alive : set of str
+        Addresses of all workers.
+    running : set of str
+        Those that start the tasks they are sent.
+    stuck : set of str
+        Those that have been paused for some time because their memory is full, and compute nothing.
+    n_executing : int
+        Tasks that all workers compute.
     """
 
     def __init__(self, client: Client) -> None:
         self._client = client
-        self._paused_since_s: dict[Worker, float] = {}
-        self.here: set[Worker] = set()
-        self.able: set[Worker] = set()
-        self.stuck: set[Worker] = set()
+        self._paused_since_s: dict[str, float] = {}
+        self.alive: set[str] = set()
+        self.running: set[str] = set()
+        self.stuck: set[str] = set()
+        self.n_executing = 0
 
-    def count(self) -> None:
+    def update(self) -> None:
         """
         Ask the scheduler.
 
@@ -186,19 +187,17 @@ class Workers:
         """
         try:
             if self._client.cluster is not None:
-                # Dask begins a worker that ended anew, but gives it up when it ends again before it is there.
+                # Dask restarts a worker that ended, but not one that ends again before it has started.
                 self._client.cluster.scale(len(self._client.cluster.worker_spec))
-            told = self._client.scheduler_info(n_workers=-1)["workers"]  # all: some versions tell of five
-        except Exception:  # noqa: BLE001 -- a connection can break in many ways
+            found = self._client.scheduler_info(n_workers=-1)["workers"]
+        except Exception:  # noqa: BLE001 -- connections break in many ways
             raise SimulationError("the scheduler does not answer any more") from None
-        found = {Worker(address, one["local_directory"]): one for address, one in told.items()}
-        self.here = set(found)
-        self.able = {worker for worker, one in found.items() if one["status"] == "running"}
         now_s = time.monotonic()
-        idle = {
-            worker
-            for worker, one in found.items()
-            if one["status"] == "paused" and not one["metrics"].get("task_counts", {}).get("executing")
+        executing = {
+            address: one["metrics"].get("task_counts", {}).get("executing", 0) for address, one in found.items()
         }
-        self._paused_since_s = {worker: self._paused_since_s.get(worker, now_s) for worker in idle}
-        self.stuck = {worker for worker, since_s in self._paused_since_s.items() if now_s - since_s > PAUSED_S}
+        self.alive, self.n_executing = set(found), sum(executing.values())
+        self.running = {address for address, one in found.items() if one["status"] == "running"}
+        paused = {address for address, one in found.items() if one["status"] == "paused" and not executing[address]}
+        self._paused_since_s = {address: self._paused_since_s.get(address, now_s) for address in paused}
+        self.stuck = {address for address, since_s in self._paused_since_s.items() if now_s - since_s > PAUSED_S}

@@ -1,256 +1,439 @@
-"""Points to the workers of dask, and their records back: neighbours to the same worker, and none lost with a worker."""
+"""One function for many items, on the workers of dask or in this process: for sweeps, studies and datasets alike."""
 
 from __future__ import annotations
 
+import heapq
+import itertools
 import queue
+import sys
 import time
+from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
-from contextlib import suppress
-from dataclasses import dataclass, field
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from threading import Lock
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from foveasim._core.provenance import versions
-from foveasim.errors import SimulationError
-from foveasim.explore._records import Record
-from foveasim.explore.cluster import Worker, Workers
-from foveasim.explore.worker_cache import Task, run_tasks
+from foveasim.errors import FoveasimError, SimulationError
+from foveasim.explore._functions import own_module
+from foveasim.explore.cluster import WorkerStates, client_of
 
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-__all__ = ["records_of"]
+__all__ = ["KILLED", "MAX_DEATHS", "Run", "executor"]
 
-#: Time that all workers may be away.
-WORKERS_S = 60.0
-#: Points that take less are sent together, so many seconds' worth, and no more than this many.
-BUNDLE_S, LARGEST_BUNDLE = 0.05, 64
-#: Bundles at a worker: one that it works on, and one that waits.
-AT_A_WORKER = 2
-#: A point that ended its worker so often is not tried again.
-MOST_DEATHS = 2
-#: How often the workers are counted.
-COUNT_S = 1.0
+#: Result of an item that ended its worker each time it was tried.
+KILLED: Any = object()
+#: Seconds that a worker computes before it returns results: what the end of a worker or of the program can cost.
+CHUNK_S = 0.5
+#: Chunks per second that one scheduler manages: with more workers, chunks take longer.
+CHUNKS_PER_S = 1000.0
+#: Items of a chunk, at most.
+MAX_ITEMS = 1024
+#: Ends of workers after which an item is not tried again.
+MAX_DEATHS = 3
+#: Seconds that all workers may be absent.
+ABSENT_S = 60.0
+#: Seconds between two updates of the list of workers.
+POLL_S = 1.0
 
-
-@dataclass(eq=False)
-class _Run:
-    """Consecutive points, which the worker that works on them likely has the parts for."""
-
-    points: deque[int]
-    worker: Worker | None = None
-
-
-@dataclass(eq=False)
-class _Bundle:
-    """Points that were sent to a worker together."""
-
-    points: list[int]
-    worker: Worker
-    is_alone: bool
-    #: So long its records may take to come from the worker, before we look whether that is still there.
-    patience_s: float = COUNT_S
+#: Computes items, and yields each with its result, or with KILLED, as they are done. The second argument has the positions, in
+#: ascending order, at which costly shared parts of the items change.
+Run = Callable[[Sequence[Any], Sequence[int]], Iterator[tuple[Any, Any]]]
 
 
-@dataclass(eq=False)
-class _Work:
-    """What is still to be sent, and what is at the workers."""
-
-    runs: list[_Run]
-    alone: deque[int] = field(default_factory=deque)
-    deaths: dict[int, int] = field(default_factory=dict)
-    sent: dict[Any, _Bundle] = field(default_factory=dict)
-    #: Seconds that a point took, lately.
-    point_s: float | None = None
-
-    def bundles_at(self, worker: Worker) -> list[_Bundle]:
-        return [bundle for bundle in self.sent.values() if bundle.worker == worker]
-
-    def next_for(self, worker: Worker, n_workers: int) -> tuple[list[int], bool] | None:
-        """The next points for a worker; alone with it, when they ended one before."""
-        here = self.bundles_at(worker)
-        if any(bundle.is_alone for bundle in here) or len(here) >= AT_A_WORKER:
-            return None
-        if self.alone:
-            return None if here else ([self.alone.popleft()], True)
-        run = self._run_of(worker)
-        if run is None:
-            return None
-        n = 1 if self.point_s is None else int(BUNDLE_S / max(self.point_s, 1e-6))
-        n = max(1, min(n, LARGEST_BUNDLE, -(-len(run.points) // (2 * max(n_workers, 1)))))
-        points = [run.points.popleft() for _ in range(min(n, len(run.points)))]
-        if not run.points:
-            self.runs.remove(run)
-        return points, False
-
-    def _run_of(self, worker: Worker) -> _Run | None:
-        """The worker's own run, one that nobody has, or the second half of the longest."""
-        if not self.runs:
-            return None
-        own = next((run for run in self.runs if run.worker == worker), None)
-        if own is None:
-            own = next((run for run in self.runs if run.worker is None), None)
-        if own is None:
-            longest = max(self.runs, key=lambda run: len(run.points))
-            half = len(longest.points) // 2
-            if half == 0:
-                own = longest
-            else:
-                own = _Run(deque(longest.points.pop() for _ in range(half)))
-                own.points.reverse()
-                self.runs.append(own)
-        own.worker = worker
-        return own
-
-    def lost(self, workers: set[Worker]) -> None:
-        """Runs of all but these workers are anyone's."""
-        for run in self.runs:
-            if run.worker not in workers:
-                run.worker = None
-
-    def put_back(self, bundle: _Bundle) -> None:
-        """Points that were not begun."""
-        if bundle.is_alone:
-            self.alone.extend(bundle.points)
-        else:
-            self.runs.append(_Run(deque(bundle.points)))
-
-
-def records_of(
-    client: Client,
-    job: bytes,
-    task_of: Callable[[int], Task],
-    runs: Sequence[Sequence[int]],
-) -> Iterator[Record]:
+@contextmanager
+def executor(
+    function: Callable[[Any], Any],
+    *,
+    what: str,
+    users: Iterable[Callable[..., Any]] = (),
+    scheduler: str | None = None,
+    workers: int | None = None,
+) -> Iterator[Run]:
     """
-    The records of points, as they are done.
+    Start workers that compute one function.
 
     Parameters
     ----------
-    client : distributed.Client
-    job : bytes
-        What all points have in common, pickled.
-    task_of : callable
-        The task of a point's number.
-    runs : sequence of sequences of int
-        Points that have costly parts in common, one run for a worker to begin with.
+    function : callable
+        Takes an item, and returns its result. Each worker process has one copy of it, which may keep what items share.
+    what : str
+        What a user would change when the function cannot be pickled, for that message.
+    users : iterable of callables, optional
+        Functions in it that may be of users' own modules, which workers need not find.
+    scheduler : str, optional
+        Address of a dask scheduler. By default processes of this machine.
+    workers : int, optional
+        Number of those processes; None computes in this process, without dask.
+
+    Yields
+    ------
+    run : callable
+        See :data:`Run`. A ``FoveasimError`` of the function ends the run.
 
     Raises
     ------
+    ParameterError
+        When dask is missing, or no scheduler answers.
     SimulationError
-        When the scheduler or all workers are gone, or workers cannot run points at all.
+        When workers do not start, or the function cannot be pickled; from ``run`` when the scheduler or all workers are gone,
+        or workers cannot compute the function at all.
+
+    Notes
+    -----
+    Dask restarts workers of this machine, detects which are alive and whose tasks were lost, and copies the function to
+    each. It does not know that neighbouring items share compiled layouts and optical images: its queue would deal
+    them to all workers in turn, and each would make the same parts. So each worker gets a range of neighbours, in tasks of
+    about 0.5 s, and a worker without a range gets half of the longest: O(log n_worker) for each task. Items of a task that
+    ended its worker are tried again one by one, so that an item that crashes costs no other.
     """
-    work = _Work([_Run(deque(run)) for run in runs if len(run)])
-    done: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
-    workers = Workers(client)
-    counted_s, seen_s = float("-inf"), time.monotonic()
+    if scheduler is None and workers is None:
+        yield lambda items, _cuts: ((item, function(item)) for item in items)
+        return
+    payload = _pickled(function, what, users)
+    with client_of(scheduler, workers or 1) as client:
+        shared = client.submit(_Shared, payload, versions(), pure=False)
+        yield lambda items, cuts: _Dispatch(client, shared, items, cuts).run()
+
+
+def _pickled(function: Callable[[Any], Any], what: str, users: Iterable[Callable[..., Any]]) -> bytes:
+    import cloudpickle
+
+    names = {own_module(user) for user in users} - {None, "__main__"}
+    own = [sys.modules[name] for name in names if name is not None]
+    for module in own:
+        cloudpickle.register_pickle_by_value(module)
     try:
-        while work.runs or work.alone or work.sent:
-            now_s = time.monotonic()
-            if now_s - counted_s > COUNT_S:
-                counted_s = now_s
-                workers.count()
-                work.lost(workers.able)
-                yield from _taken_back(client, work, workers)
-                if workers.able or work.sent:
-                    seen_s = now_s
-                elif now_s - seen_s > WORKERS_S:
-                    raise SimulationError(_absence(workers))
-            for worker in sorted(workers.able):
-                while (chosen := work.next_for(worker, len(workers.able))) is not None:
-                    points, is_alone = chosen
-                    future = client.submit(
-                        run_tasks,
-                        job,
-                        versions(),
-                        worker.folder,
-                        [task_of(point) for point in points],
-                        pure=False,
-                        # Nowhere else, whatever dask thinks: only so do we know what ended with a worker.
-                        workers=[worker.address],
-                    )
-                    work.sent[future] = _Bundle(points, worker, is_alone)
-                    future.add_done_callback(done.put)
-            try:
-                future = done.get(timeout=COUNT_S)
-            except queue.Empty:
-                continue
-            if future not in work.sent:
-                continue  # it was taken back
-            bundle = work.sent.pop(future)
-            records = _arrived(work, future, bundle)
-            # Count the workers again when one may have ended.
-            if records is None or future.status != "finished":
-                counted_s = float("-inf")
-            if records is None:
-                # They may have gone with their worker; if not, they take long to come.
-                bundle.patience_s *= 2.0
-                work.sent[future] = bundle
-                done.put(future)
-                continue
-            # Release the future: dask would compute it again if its worker ended now.
-            del future
-            yield from records
+        return bytes(cloudpickle.dumps(function))
+    except Exception as error:  # noqa: BLE001 -- objects raise anything when they are pickled
+        raise SimulationError(f"{what} cannot be sent to other processes ({_line(error)})") from None
     finally:
-        with suppress(Exception):
-            client.cancel(list(work.sent))
+        for module in own:
+            cloudpickle.unregister_pickle_by_value(module)
 
 
-def _taken_back(client: Client, work: _Work, workers: Workers) -> Iterator[Record]:
-    """Take back what never comes: all that is at workers that ended, and what waits at those that are stuck."""
-    for future, bundle in list(work.sent.items()):
-        is_ended = bundle.worker not in workers.here and future.status != "error"
-        if is_ended or (bundle.worker in workers.stuck and future.status == "pending"):
-            client.cancel([future])
-            del work.sent[future]
-            if is_ended:
-                yield from _again(work, bundle)
-            else:
-                work.put_back(bundle)
+def _line(error: BaseException) -> str:
+    return f"{' '.join(str(error).split()) or type(error).__name__:.300}"
 
 
-def _arrived(work: _Work, future: Future[Any], bundle: _Bundle) -> list[Record] | None:
-    """The records of a bundle, None while they do not come; points of a worker that ended are put back."""
-    from distributed import KilledWorker
+# -- on the client ----------------------------------------------------------------------------------------------------
 
-    try:
-        if future.status in ("error", "cancelled"):
-            future.result()
-        # The future's own result() could not be given up without dask's words on the screen.
-        gather = partial(future.client.gather, [future], errors="skip", asynchronous=True)
-        found = future.client.sync(gather, callback_timeout=bundle.patience_s)
-    except TimeoutError:
+
+@dataclass(eq=False)
+class _Range:
+    """Positions of neighbouring items that are still to be sent."""
+
+    start: int
+    stop: int
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+
+@dataclass(eq=False)
+class _Chunk:
+    """Positions of the items that were sent to a worker in one task."""
+
+    positions: range
+    worker: str
+    is_alone: bool
+    #: Seconds that its results may take to come, before the workers are counted again.
+    patience_s: float = POLL_S
+
+
+class _Dispatch:
+    """
+    One run over items.
+
+    Attributes
+    ----------
+    ranges : dict of str to _Range
+        What each worker has still to be sent, by its address.
+    free : list of _Range
+        Ranges without a worker.
+    heap : list of (int, int, _Range)
+        All ranges of workers, longest first: the negative of the length when it was added, and a serial number.
+    alone : deque of range
+        Items that ended a worker, to be sent one by one.
+    """
+
+    def __init__(self, client: Client, shared: Future[Any], items: Sequence[Any], cuts: Sequence[int]) -> None:
+        self.client, self.shared, self.items, self.cuts = client, shared, items, cuts
+        self.free = [_Range(0, len(items))]
+        self.ranges: dict[str, _Range] = {}
+        self.heap: list[tuple[int, int, _Range]] = []
+        self.numbers = itertools.count()
+        self.alone: deque[range] = deque()
+        self.deaths: dict[int, int] = {}
+        self.sent: dict[Any, _Chunk] = {}
+        self.idle: set[str] = set()
+        self.states = WorkerStates(client)
+        self.done: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.item_s: float | None = None
+        self.polled_s = float("-inf")
+        self.alive_s = time.monotonic()
+        self.n_left = len(items)
+
+    def run(self) -> Iterator[tuple[Any, Any]]:
+        """Yield each item with its result, as they are done."""
+        try:
+            while self.n_left:
+                if time.monotonic() - self.polled_s > POLL_S:
+                    self._poll()
+                    yield from self._yielded(self._taken_back())
+                self._send()
+                try:
+                    future = self.done.get(timeout=POLL_S)
+                except queue.Empty:
+                    continue
+                yield from self._yielded(self._received(future))
+        finally:
+            with suppress(Exception):
+                self.client.cancel(list(self.sent))
+
+    def _yielded(self, results: Iterable[tuple[int, Any]]) -> Iterator[tuple[Any, Any]]:
+        for position, result in results:
+            self.n_left -= 1
+            yield self.items[position], result
+
+    # -- workers --------------------------------------------------------------------------------------------------------
+
+    def _poll(self) -> None:
+        """Update which workers are alive, and which are idle."""
+        self.states.update()
+        self.polled_s = time.monotonic()
+        self.idle = self.states.running - {chunk.worker for chunk in self.sent.values()}
+        for worker in self.ranges.keys() - self.states.running:
+            left = self.ranges.pop(worker)
+            if left:
+                self.free.append(left)
+        if self.states.running or self.states.n_executing:
+            self.alive_s = self.polled_s
+        elif self.polled_s - self.alive_s > ABSENT_S:
+            raise SimulationError(
+                f"the workers have computed nothing for {ABSENT_S:g} s: they are closing, or paused with their memory full"
+                if self.states.alive
+                else f"the scheduler has had no worker for {ABSENT_S:g} s"
+            )
+
+    def _taken_back(self) -> Iterator[tuple[int, Any]]:
+        """Cancel the chunks of workers that ended, and those that wait at paused workers."""
+        for future, chunk in list(self.sent.items()):
+            is_dead = chunk.worker not in self.states.alive and future.status != "error"
+            if is_dead or (chunk.worker in self.states.stuck and future.status == "pending"):
+                del self.sent[future]
+                self.client.cancel([future])
+                if is_dead:
+                    yield from self._again(chunk)
+                else:
+                    self._put_back(chunk)
+
+    def _send(self) -> None:
+        """Send a chunk to each idle worker."""
+        while self.idle:
+            worker = self.idle.pop()
+            chunk = self._next(worker)
+            if chunk is None:
+                self.idle.add(worker)
+                return
+            future = self.client.submit(
+                _compute,
+                self.shared,
+                [self.items[position] for position in chunk.positions],
+                self._chunk_s(),
+                pure=False,
+                # Where its neighbours were. When that worker ends, dask must not try the whole chunk again elsewhere.
+                workers=[worker],
+            )
+            self.sent[future] = chunk
+            future.add_done_callback(self.done.put)
+
+    def _chunk_s(self) -> float:
+        return max(CHUNK_S, len(self.states.running) / CHUNKS_PER_S)
+
+    # -- items ----------------------------------------------------------------------------------------------------------
+
+    def _next(self, worker: str) -> _Chunk | None:
+        """Take the next items for a worker: of its own range, of a free one, or of half of the longest."""
+        if self.alone:
+            return _Chunk(self.alone.popleft(), worker, is_alone=True)
+        own = self.ranges.get(worker)
+        if not own:
+            own = self.free.pop() if self.free else self._half_of_longest()
+            if own is None:
+                return None
+            self._assign(worker, own)
+        n = 1 if self.item_s is None else int(self._chunk_s() / max(self.item_s, 1e-9))
+        n = max(1, min(n, MAX_ITEMS, (len(own) + 1) // 2))
+        own.start += n
+        return _Chunk(range(own.start - n, own.start), worker, is_alone=False)
+
+    def _assign(self, worker: str, own: _Range) -> None:
+        self.ranges[worker] = own
+        self._push(own)
+
+    def _push(self, own: _Range) -> None:
+        heapq.heappush(self.heap, (-len(own), next(self.numbers), own))
+
+    def _half_of_longest(self) -> _Range | None:
+        """Cut off the second half of the longest range, at a change of shared parts where one is near."""
+        while self.heap:
+            length, _, longest = heapq.heappop(self.heap)
+            if len(longest) < -length:  # items were taken since
+                if longest:
+                    self._push(longest)
+                continue
+            middle = (longest.start + longest.stop) // 2
+            near = bisect_left(self.cuts, middle)
+            cut = min(self.cuts[max(near - 1, 0) : near + 1], key=lambda cut: abs(cut - middle), default=middle)
+            if abs(cut - middle) > len(longest) // 4:
+                cut = middle
+            half = _Range(cut, longest.stop)
+            longest.stop = cut
+            if longest:
+                self._push(longest)
+            return half
         return None
-    except KilledWorker:
-        return list(_again(work, bundle))
-    except (CancelledError, OSError):
-        raise SimulationError("the scheduler does not answer any more") from None
-    except Exception as error:  # noqa: BLE001 -- whatever a worker without the package, or without a metric's module, raises
-        raise SimulationError(f"the workers cannot run the points: {' '.join(str(error).split()):.300}") from None
-    if not found:
-        return None
-    if found[0] is None:  # dask tried them again by itself, in a worker that was begun anew
-        return list(_again(work, bundle))
-    records, spent_s = found[0]
-    took_s = spent_s / len(records)
-    work.point_s = took_s if work.point_s is None else 0.5 * (work.point_s + took_s)
-    return list(records)
 
-
-def _again(work: _Work, bundle: _Bundle) -> Iterator[Record]:
-    """Try the points of a worker that ended again, each alone; the records of those that had their chance."""
-    for point in bundle.points:
-        work.deaths[point] = work.deaths.get(point, 0) + 1
-        if work.deaths[point] < MOST_DEATHS:
-            work.alone.append(point)
+    def _put_back(self, chunk: _Chunk, n_done: int = 0) -> None:
+        """Items that were sent, and not computed."""
+        left = chunk.positions[n_done:]
+        if not left:
+            return
+        own = self.ranges.get(chunk.worker)
+        if chunk.is_alone:
+            self.alone.append(left)
+        elif own is not None and own.start == left.stop:
+            own.start = left.start
+            self._push(own)
         else:
-            yield Record(point, {}, f"ended its worker {MOST_DEATHS} times: too little memory, or a crash in a metric")
+            self.free.append(_Range(left.start, left.stop))
+
+    def _received(self, future: Future[Any]) -> Iterator[tuple[int, Any]]:
+        """Positions and results of a chunk; those of a worker that ended are tried again."""
+        chunk = self.sent.pop(future, None)
+        if chunk is None:  # it was taken back
+            return
+        try:
+            results = self._result(future, chunk.patience_s)
+        except TimeoutError:
+            # They may have gone with their worker, and dask computes them again.
+            self.polled_s = float("-inf")
+            chunk.patience_s *= 2.0
+            self.sent[future] = chunk
+            self.done.put(future)
+            return
+        if chunk.worker in self.states.running:
+            self.idle.add(chunk.worker)
+        if results is None:
+            self.polled_s = float("-inf")
+            yield from self._again(chunk)
+            return
+        took_s = results.seconds / max(len(results.values), 1)
+        self.item_s = took_s if self.item_s is None else 0.5 * (self.item_s + took_s)
+        self._put_back(chunk, len(results.values))
+        yield from zip(chunk.positions, results.values, strict=False)
+
+    def _result(self, future: Future[Any], patience_s: float) -> _Results | None:
+        """Results of a chunk; None when its worker ended."""
+        from distributed import KilledWorker
+
+        try:
+            if future.status in ("error", "cancelled"):
+                future.result()
+            # The future's own result() logs an error when it is given up.
+            gather = partial(self.client.gather, [future], errors="skip", asynchronous=True)
+            found: list[_Results] = self.client.sync(gather, callback_timeout=patience_s)
+        except KilledWorker:
+            return None
+        except TimeoutError:
+            raise
+        except (CancelledError, OSError):
+            raise SimulationError("the scheduler does not answer any more") from None
+        except FoveasimError as error:
+            raise error from None  # without the traceback of the worker
+        except Exception as error:  # noqa: BLE001 -- whatever a worker without the package, or without a module, raises
+            raise SimulationError(f"the workers cannot compute: {_line(error)}") from None
+        if not found:
+            raise TimeoutError
+        return found[0]
+
+    def _again(self, chunk: _Chunk) -> Iterator[tuple[int, Any]]:
+        """Try items of a worker that ended again, each alone; those that were alone often enough are given up."""
+        for position in chunk.positions:
+            self.deaths[position] = self.deaths.get(position, 0) + 1
+            if chunk.is_alone and self.deaths[position] >= MAX_DEATHS:
+                yield position, KILLED
+            else:
+                self.alone.append(range(position, position + 1))
 
 
-def _absence(workers: Workers) -> str:
-    """Why points are not taken."""
-    if workers.here:
-        return f"the workers have taken no points for {WORKERS_S:g} s: they are paused, for their memory is full, or closing"
-    return f"the scheduler has had no worker for {WORKERS_S:g} s"
+# -- on a worker ------------------------------------------------------------------------------------------------------
+
+#: One item at a time in a process: a camera uses the process's threads.
+_lock = Lock()
+
+
+class _Results(NamedTuple):
+    """Results of the first items of a chunk, and the seconds that they took."""
+
+    values: list[Any]
+    seconds: float
+
+
+class _Shared:
+    """
+    The function that all items have in common, unpickled once in each process.
+
+    Dask keeps it in the memory of its workers while the run lasts, and copies it to those that come later.
+    """
+
+    def __init__(self, payload: bytes, of_client: Mapping[str, str]) -> None:
+        self._payload, self._versions = payload, dict(of_client)
+        self._function: Callable[[Any], Any] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_function": None}
+
+    def __sizeof__(self) -> int:
+        return len(self._payload)
+
+    def function(self) -> Callable[[Any], Any]:
+        """
+        Return the function, the same object each time.
+
+        Raises
+        ------
+        RuntimeError
+            When this process has other versions: its results might differ.
+        """
+        import cloudpickle
+
+        if self._function is None:
+            here = versions()
+            differing = [name for name in self._versions if here.get(name) != self._versions[name]]
+            if differing:
+                theirs = ", ".join(f"{name} {here.get(name)}" for name in differing)
+                ours = ", ".join(f"{name} {self._versions[name]}" for name in differing)
+                raise RuntimeError(f"a worker has {theirs}, and here is {ours}")
+            self._function = cloudpickle.loads(self._payload)
+        return self._function
+
+
+def _compute(shared: _Shared, items: Sequence[Any], limit_s: float) -> _Results:
+    """Compute items until the time is up, at least one."""
+    with _lock:
+        function = shared.function()
+        begin_s = time.perf_counter()
+        values: list[Any] = []
+        for item in items:
+            values.append(function(item))
+            if time.perf_counter() - begin_s > limit_s:
+                break
+        return _Results(values, time.perf_counter() - begin_s)

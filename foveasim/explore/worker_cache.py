@@ -1,34 +1,33 @@
-"""A worker's bench: takes the captures of points, and keeps what the next points may have in common with them."""
+"""Captures of points, with a cache of what neighbouring points share."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import signal
 import sys
-import time
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock, current_thread, main_thread
+from threading import current_thread, main_thread
 from typing import Any
 
 import numpy as np
 
+from foveasim._core.threads import thread_count
 from foveasim.capture import Capture
 from foveasim.config import Shot, build_shot
 from foveasim.errors import FoveasimError
 from foveasim.explore._metrics import REFERENCES, Metric
 from foveasim.explore._records import Record, check_new, values_of
 
-__all__ = ["Bench", "Job", "Task", "run_tasks"]
+__all__ = ["ShotRunner", "WorkerCache"]
 
 #: What a worker keeps of earlier points, in memory and in number. Parts inside others are counted in each.
-KEPT_BYTES, MOST_PARTS = 1 << 30, 1024
+MAX_BYTES, MAX_PARTS = 1 << 30, 1024
 #: And no more than this part of a worker's memory: captures need most of it.
-SHARE_OF_MEMORY = 4
+FRACTION_OF_MEMORY = 4
 #: Parts that hold more as they are used.
 GROWING = ("camera", "images")
 #: Objects are weighed by the arrays in them, so many containers deep.
@@ -37,125 +36,177 @@ DEPTH = 6
 LONGEST_MESSAGE = 500
 
 
-@dataclass(frozen=True)
-class Job:
-    """What all points of a sweep have in common: the file for messages, metrics, threads (0: the worker's), what varies."""
-
-    source: Path
-    metrics: Mapping[str, Metric]
-    n_threads: int
-    is_geometry_varied: bool
-
-
-@dataclass(frozen=True)
-class Task:
-    """A point: its number, and all its settings."""
-
-    point: int
-    settings: Mapping[str, Any]
-
-
 @dataclass
 class _Part:
-    """Something that was made, the warnings of its making, and its weight."""
+    """A part, the warnings when it was made, and its size."""
 
     made: Any
-    told: list[str]
+    warnings: list[str]
     n_bytes: int = 0
 
 
-class Bench:
+class WorkerCache:
     """
-    Parts that were made before, up to a size in memory: layouts, scenes, lenses, compiled layouts, images, light on sites.
+    Parts of shots that were made before, up to a size in memory: layouts, scenes, lenses, cameras, images, power on sites.
 
-    Results never depend on what is kept: a part is a function of its settings, and its warnings are kept with it.
+    Results never depend on what is in the cache: a part is a function of its settings, and its warnings are stored with it.
+
+    Parameters
+    ----------
+    max_bytes : int
+        Arrays in the parts, at most; the parts of the last point stay in any case.
     """
 
-    def __init__(self, kept_bytes: int = KEPT_BYTES) -> None:
-        self._kept_bytes = kept_bytes
+    def __init__(self, max_bytes: int = MAX_BYTES) -> None:
+        self.max_bytes = max_bytes
         self._parts: OrderedDict[tuple[str, str], _Part] = OrderedDict()
         self._used: set[tuple[str, str]] = set()
-        self._told: list[str] = []
+        self._warnings: list[str] = []
         self.n_made: dict[str, int] = {}
 
-    def kept(self, part: str, settings: Any, make: Callable[[], Any]) -> Any:
-        """What a part's settings make, or made before."""
-        key = part, json.dumps(settings, sort_keys=True)
+    def part(self, kind: str, settings: Any, make: Callable[[], Any]) -> Any:
+        """Return what a part's settings make, or made before."""
+        key = kind, json.dumps(settings, sort_keys=True)
         if key not in self._parts:
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
                 made = make()
             self._parts[key] = _Part(made, [str(warning.message) for warning in caught])
-            self.n_made[part] = self.n_made.get(part, 0) + 1
+            self.n_made[kind] = self.n_made.get(kind, 0) + 1
         self._parts.move_to_end(key)
         self._used.add(key)
-        self._told += self._parts[key].told
+        self._warnings += self._parts[key].warnings
         return self._parts[key].made
 
-    def _forget(self) -> None:
-        """Let go of what was not used for longest, but not of what the last point used."""
+    def end_point(self) -> list[str]:
+        """Drop the parts that were not used for longest, but none of the last point; return the warnings of those it used."""
         for key in self._used:
-            # Weighed anew: cameras and images grow while they are used.
+            # Again: cameras and images grow while they are used.
             if self._parts[key].n_bytes == 0 or key[0] in GROWING:
                 self._parts[key].n_bytes = _n_bytes(self._parts[key].made, set())
         total = sum(part.n_bytes for part in self._parts.values())
         for key in list(self._parts):
-            if total <= self._kept_bytes and len(self._parts) <= MOST_PARTS:
+            if total <= self.max_bytes and len(self._parts) <= MAX_PARTS:
                 break
             if key not in self._used:
                 total -= self._parts.pop(key).n_bytes
-        self._used = set()
+        found, self._warnings, self._used = self._warnings, [], set()
+        return found
 
-    def captured(self, job: Job, settings: Mapping[str, Any]) -> tuple[Shot, Capture]:
-        """The shot of a point and its capture."""
-        shot = build_shot(job.source, settings, n_threads=job.n_threads, kept=self.kept)
+
+class ShotRunner:
+    """
+    Captures of shots and their metrics, with a cache of what neighbouring points share.
+
+    Parameters
+    ----------
+    source : Path
+        File of the settings, for messages.
+    metrics : mapping of str to function
+    is_geometry_varied : bool
+        Whether points differ in photosites or distortion, and so may share optical images.
+    n_threads : int, optional
+        Threads of a capture; by default those of the worker, or of this process.
+    max_bytes : int
+        Of the arrays in the cache, at most; on a worker no more than a quarter of its memory.
+
+    Notes
+    -----
+    A runner is pickled without its cache, which begins empty in each process.
+    """
+
+    def __init__(
+        self,
+        source: Path,
+        metrics: Mapping[str, Metric],
+        *,
+        is_geometry_varied: bool = True,
+        n_threads: int | None = None,
+        max_bytes: int = MAX_BYTES,
+    ) -> None:
+        self.source, self.metrics = source, metrics
+        self.is_geometry_varied, self.n_threads, self.max_bytes = is_geometry_varied, n_threads, max_bytes
+        self._cache: WorkerCache | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_cache": None}
+
+    @property
+    def cache(self) -> WorkerCache:
+        """Cache of this process."""
+        if self._cache is None:
+            worker = _worker()
+            limit = worker.memory_manager.memory_limit if worker is not None else None
+            self._cache = WorkerCache(min(self.max_bytes, limit // FRACTION_OF_MEMORY) if limit else self.max_bytes)
+            if self.n_threads is None:
+                self.n_threads = thread_count() if worker is None else int(worker.state.nthreads)
+        return self._cache
+
+    def __call__(self, point: tuple[int, Mapping[str, Any]]) -> Record:
+        """Return the record of a point: its number, and all its settings."""
+        return self.record(*point)
+
+    def captured(self, settings: Mapping[str, Any]) -> tuple[Shot, Capture]:
+        """Return the shot of some settings, and its capture."""
+        cache = self.cache
+        shot = build_shot(self.source, settings, n_threads=self.n_threads, kept=cache.part)
         camera, sensor, scene = shot.camera, shot.camera.sensor, shot.scene
         light = _light(shot, settings)
         filters = hashlib.sha256(sensor.filter_of_site.tobytes()).hexdigest()
         sites = [settings["layout"], settings.get("distortion"), settings.get("integration_order"), filters]
-        images = self.kept("images", light, dict) if job.is_geometry_varied else None
-        photo_e_per_s = self.kept(
+        images = cache.part("images", light, dict) if self.is_geometry_varied else None
+        photo_e_per_s = cache.part(
             "light on sites", [light, sites], lambda: camera.photoelectrons_per_s(scene, images=images)
         )
         capture = camera.capture(scene, exposure_s=shot.exposure_s, seed=shot.seed, photo_e_per_s=photo_e_per_s)
         return shot, capture
 
     def _measured(self, metric: Metric, shot: Shot, capture: Capture, settings: Mapping[str, Any]) -> Any:
-        """What a metric gives; what it compares captures with is made once for all that share it."""
+        """Result of a metric; the reference of a comparison is made once for all points that share it."""
         compared: Callable[..., Any] = metric
         make = next((make for own, make in REFERENCES.items() if own is metric), None)
         if make is None:
             return metric(shot, shot.camera, capture)
         key = [_light(shot, settings), settings["layout"], shot.exposure_s]
-        reference = self.kept("reference", key, lambda: make(shot, shot.camera))
+        reference = self.cache.part("reference", key, lambda: make(shot, shot.camera))
         return compared(shot, shot.camera, capture, reference)
 
-    def record(self, job: Job, task: Task) -> Record:
-        """What a point gave: its metrics, or what went wrong. Nothing that a point raises ends the others."""
-        self._told = []
+    def record(self, point: int, settings: Mapping[str, Any]) -> Record:
+        """Return the metrics of a point, or its error. Nothing that a point raises ends the others."""
         values: dict[str, Any] = {}
         errors = []
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
-                shot, capture = self.captured(job, task.settings)
+                shot, capture = self.captured(settings)
             except BaseException as error:  # noqa: BLE001 -- a point's settings may make anything of ours or of a library's raise
                 _raise_ctrl_c(error)
-                errors.append(_told(error))
+                errors.append(_message(error))
             else:
-                for name, metric in job.metrics.items():
+                for name, metric in self.metrics.items():
                     try:
-                        more = values_of(name, self._measured(metric, shot, capture, task.settings))
+                        more = values_of(name, self._measured(metric, shot, capture, settings))
                         check_new(values, more)
                         values |= more
                     except BaseException as error:  # noqa: BLE001 -- metrics are the user's, and may end with sys.exit()
                         _raise_ctrl_c(error)
-                        text = _told(error)
-                        # What we say of a result begins with its name.
+                        text = _message(error)
+                        # Messages of this package about a result begin with its name.
                         errors.append(text if text.startswith(f"'{name}") else f"{name}: {text}")
-        self._forget()
-        told = dict.fromkeys([*self._told, *(str(warning.message) for warning in caught)])
-        return Record(task.point, values, "; ".join(errors), "; ".join(_short(text) for text in told))
+        texts = dict.fromkeys([*self.cache.end_point(), *(str(warning.message) for warning in caught)])
+        return Record(point, values, "; ".join(errors), "; ".join(_short(text) for text in texts))
+
+
+def _worker() -> Any:
+    """Return the dask worker that runs this code, or None."""
+    if "distributed" not in sys.modules:
+        return None
+    from distributed import get_worker
+
+    try:
+        return get_worker()
+    except ValueError:
+        return None
 
 
 def _light(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
@@ -170,7 +221,7 @@ def _raise_ctrl_c(error: BaseException) -> None:
         raise error
 
 
-def _told(error: BaseException) -> str:
+def _message(error: BaseException) -> str:
     return _short(
         str(error) if isinstance(error, FoveasimError) else f"{type(error).__name__}: {error}".removesuffix(": ")
     )
@@ -203,56 +254,3 @@ def _n_bytes(thing: Any, seen: set[int], depth: int = DEPTH) -> int:
     else:
         return 0
     return sum(_n_bytes(item, seen, depth - 1) for item in inside)
-
-
-# -- on a worker ------------------------------------------------------------------------------------------------------
-
-#: One point at a time in a process: a camera uses the process's threads.
-_lock = Lock()
-#: The job that this process works on, and its bench.
-_current: dict[str, tuple[Job, Bench]] = {}
-
-
-def dask_setup(_worker: Any) -> None:
-    """What a worker that we start does first: Ctrl-C, which the whole terminal gets, is for the program that started it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def run_tasks(
-    job: bytes, versions: Mapping[str, str], folder: str, tasks: Sequence[Task]
-) -> tuple[list[Record], float] | None:
-    """
-    The records of some points, and the seconds that they took; called by dask on its workers.
-
-    None when this is another worker than that with the folder: dask itself tries again what ended with one.
-
-    Raises
-    ------
-    RuntimeError
-        When this worker's versions are others: its results might be, too.
-    """
-    import cloudpickle
-    from distributed import get_worker
-
-    from foveasim._core.provenance import versions as own_versions
-
-    worker = get_worker()
-    if worker.local_directory != folder:
-        return None
-    if own_versions() != dict(versions):
-        different = [
-            f"{name} {own_versions().get(name)}" for name in versions if own_versions().get(name) != versions[name]
-        ]
-        wanted = [f"{name} {versions[name]}" for name in versions if own_versions().get(name) != versions[name]]
-        raise RuntimeError(f"a worker has {', '.join(different)}, and here is {', '.join(wanted)}")
-    digest = hashlib.sha256(job).hexdigest()
-    with _lock:
-        if digest not in _current:
-            _current.clear()
-            own_job = cloudpickle.loads(job)
-            n_threads = own_job.n_threads or int(worker.state.nthreads)
-            kept_bytes = min(KEPT_BYTES, (worker.memory_manager.memory_limit or sys.maxsize) // SHARE_OF_MEMORY)
-            _current[digest] = replace(own_job, n_threads=n_threads), Bench(kept_bytes)
-        own_job, bench = _current[digest]
-        start_s = time.perf_counter()
-        return [bench.record(own_job, task) for task in tasks], time.perf_counter() - start_s

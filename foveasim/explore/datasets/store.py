@@ -4,23 +4,14 @@ from __future__ import annotations
 
 import io
 import json
-import multiprocessing
 import operator
 import os
-import pickle
 import secrets
-import shutil
-import signal
 import tarfile
-import tempfile
-import threading
 import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, suppress
-from functools import cache
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +22,9 @@ from foveasim._core.extras import needs
 from foveasim._core.threads import thread_count
 from foveasim._core.validation import check_count
 from foveasim._io.atomic import remove_folder, written_whole
-from foveasim.errors import FileError, FoveasimError, FoveasimWarning, ParameterError, SimulationError
+from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore.datasets.dataset import DataSet
+from foveasim.explore.executor import KILLED, executor
 
 __all__ = ["StoredSamples", "open_data_set", "write_data_set"]
 
@@ -50,8 +42,6 @@ DONE, SETTINGS = "done", "settings"
 MADE_OF = "__made_of__"
 #: Bytes of a SHA-256.
 DIGEST_BYTES = 32
-#: Files of the folder that processes share: what they work on, and what tells them to stop.
-WORK, STOP = "work", "stop"
 #: What takes longer than this in one process is worth others, which take seconds to start.
 ALONE_S = 10.0
 NEEDS_ZARR = needs("zarr", "explore")
@@ -66,6 +56,7 @@ def write_data_set(
     *,
     per_shard: int | None = None,
     workers: int | None = 1,
+    scheduler: str | None = None,
     tell: Tell | None = None,
 ) -> StoredSamples:
     """
@@ -84,6 +75,9 @@ def write_data_set(
     workers : int, optional
         Processes. They import the calling program's main file: keep the call under ``if __name__ == "__main__":``. None: one a
         core, as soon as what is left would take this process alone more than some seconds.
+    scheduler : str, optional
+        Address of a dask scheduler instead, such as ``"tcp://10.0.0.1:8786"``, whose workers have this package and see the
+        pictures and the path under the same names.
     tell : callable, optional
         Called with the numbers of samples that are written and of all.
 
@@ -99,9 +93,10 @@ def write_data_set(
         is full, say. Shards that are done stay, and the same call goes on from there, unless the pictures, masks or flows that
         they were made of hold something else now.
     ParameterError
-        When the photosites differ from sample to sample, which only tar files can hold.
+        When the photosites differ from sample to sample, which only tar files can hold; when no scheduler answers.
     SimulationError
-        When a sample's camera cannot be made, a process ends, or cannot take over pictures of a class of the caller's own.
+        When a sample's camera cannot be made, a process ends again and again, the scheduler is gone, or pictures cannot be sent
+        to other processes.
 
     Warns
     -----
@@ -139,7 +134,7 @@ def write_data_set(
         kind.begin(target, about, data_set, first)
     else:
         _check_same(target, about, plan, per_shard)
-    _write_shards(data_set, kind(target, about), workers, tell)
+    _write_shards(data_set, kind(target, about), scheduler, workers, tell)
     return open_data_set(target)
 
 
@@ -153,7 +148,9 @@ def _check_same(target: Path, about: Mapping[str, Any], plan: Mapping[str, Any],
         )
 
 
-def _write_shards(data_set: DataSet, shards: _Shards, workers: int | None, tell: Tell | None) -> None:
+def _write_shards(
+    data_set: DataSet, shards: _Shards, scheduler: str | None, workers: int | None, tell: Tell | None
+) -> None:
     """Write all shards that are not done, when those that are done are of the same pictures."""
     left = []
     for k in range(shards.n_shards):
@@ -171,7 +168,7 @@ def _write_shards(data_set: DataSet, shards: _Shards, workers: int | None, tell:
     told: list[str] = []
     if tell is not None:
         tell(n_done, n)
-    with closing(_written(data_set, shards, left, workers)) as written:
+    with closing(_written(data_set, shards, left, scheduler, workers)) as written:
         for k, own in written:
             told += own
             n_done += len(shards.samples(k))
@@ -186,119 +183,52 @@ def _write_shards(data_set: DataSet, shards: _Shards, workers: int | None, tell:
 
 
 def _written(
-    data_set: DataSet, shards: _Shards, left: Sequence[int], workers: int | None
+    data_set: DataSet, shards: _Shards, left: Sequence[int], scheduler: str | None, workers: int | None
 ) -> Generator[tuple[int, list[str]], None, None]:
     """Shards as they are written, with the warnings of their samples."""
+    write = _ShardWriter(data_set, shards)
     begun_s = time.monotonic()
-    for n_done, k in enumerate(left):
-        n_left = len(left) - n_done
-        left_s = n_left * (time.monotonic() - begun_s) / n_done if n_done else 0.0
-        if n_left > 1 and (left_s > ALONE_S if workers is None else workers > 1):
-            yield from _written_by_others(data_set, shards, left[n_done:], workers or thread_count())
+    n_done = 0
+    if scheduler is None and workers in (None, 1):
+        for n_done, k in enumerate(left):
+            n_left = len(left) - n_done
+            left_s = n_left * (time.monotonic() - begun_s) / n_done if n_done else 0.0
+            if workers is None and n_left > 1 and left_s > ALONE_S:
+                break
+            yield k, write(k)
+        else:
             return
-        yield k, _write_shard(data_set, shards, k)
+    what = "the pictures or labels"
+    n_workers = min(workers or thread_count(), len(left) - n_done)
+    with executor(write, what=what, scheduler=scheduler, workers=n_workers) as run:
+        for k, own in run(left[n_done:], ()):
+            if own is KILLED:
+                raise SimulationError(
+                    f"a process that wrote shard {k} ended each time, by too little memory or a crash; done shards stay, and "
+                    "the same call goes on from there"
+                )
+            yield k, own
 
 
-def _written_by_others(
-    data_set: DataSet, shards: _Shards, left: Sequence[int], workers: int
-) -> Generator[tuple[int, list[str]], None, None]:
-    """
-    Shards as other processes write them.
+class _ShardWriter:
+    """Simulates the samples of a shard and writes it, and gives their warnings."""
 
-    They take the data set from a file: one that ended while it is told through a pipe would never be noticed.
-    """
-    with tempfile.TemporaryDirectory(prefix="foveasim-", ignore_cleanup_errors=True) as name:
-        folder = Path(name)
-        _hand_over(folder, data_set, shards)
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(min(workers, len(left)), context, _begin, (folder,))
+    def __init__(self, data_set: DataSet, shards: _Shards) -> None:
+        self._data_set, self._shards = data_set, shards
+
+    def __call__(self, k: int) -> list[str]:
+        made_of = self._data_set.digest(self._shards.samples(k))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # they are reported at the end, together
+            samples = [self._data_set[index] for index in self._shards.samples(k)]
         try:
-            going_on = {pool.submit(_write_own, folder, k): k for k in left}
-            for future in as_completed(going_on):
-                yield going_on[future], future.result()
-        except BrokenProcessPool:
-            raise SimulationError(
-                "a process that writes samples ended: too little memory, a crash, or the call is not under `if __name__ == "
-                '"__main__":`; done shards stay, and the same call goes on from there'
+            self._shards.write(k, samples, made_of)
+        except OSError as error:
+            raise FileError(
+                self._shards.folder,
+                f"cannot be written: {error.strerror or error}; done shards stay, and the same call goes on from there",
             ) from None
-        except FoveasimError as error:
-            raise error from None  # without the other process's traceback
-        finally:
-            # Once all is done there is nothing to stop; before that, shards that are begun are given up at their next sample.
-            with suppress(OSError):
-                (folder / STOP).touch()
-            pool.shutdown(cancel_futures=True)
-
-
-def _hand_over(folder: Path, data_set: DataSet, shards: _Shards) -> None:
-    """Write what other processes work on."""
-    try:
-        with (folder / WORK).open("wb") as file:
-            pickle.dump((data_set, shards), file, pickle.HIGHEST_PROTOCOL)
-    except OSError as error:
-        raise FileError(folder, f"cannot be written: {error.strerror or error}") from None
-    except Exception as error:  # noqa: BLE001 -- whatever pictures of the caller's own raise
-        raise ParameterError(
-            "workers", f"must be 1 for pictures or labels that cannot go to other processes ({_line(error)})"
-        ) from None
-
-
-@cache
-def _handed_over(folder: Path) -> tuple[DataSet, _Shards]:
-    """What a process works on."""
-    try:
-        with (folder / WORK).open("rb") as file:
-            data_set, shards = pickle.load(file)  # noqa: S301 -- of the process that started this one
-    except Exception as error:  # noqa: BLE001 -- whatever pictures of the caller's own raise
-        raise SimulationError(
-            f"the data set could not go to other processes ({_line(error)}); take workers=1"
-        ) from None
-    return data_set, shards
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
-
-
-def _begin(folder: Path) -> None:
-    """What a process does first: Ctrl-C, which the whole terminal gets, is for the program that started it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, args=(folder,), daemon=True).start()
-
-
-def _end_with_parent(folder: Path) -> None:
-    """End at once when the program that started this process has ended, by whatever, and remove what it left."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    shutil.rmtree(folder, ignore_errors=True)
-    os._exit(1)
-
-
-def _write_own(folder: Path, k: int) -> list[str]:
-    return _write_shard(*_handed_over(folder), k, (folder / STOP).exists)
-
-
-def _write_shard(
-    data_set: DataSet, shards: _Shards, k: int, is_stopped: Callable[[], bool] = lambda: False
-) -> list[str]:
-    """Simulate the samples of a shard and write it, unless it is stopped before; their warnings."""
-    samples = []
-    made_of = data_set.digest(shards.samples(k))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # they are told at the end, together
-        for index in shards.samples(k):
-            if is_stopped():
-                return []
-            samples.append(data_set[index])
-    try:
-        shards.write(k, samples, made_of)
-    except OSError as error:
-        raise FileError(
-            shards.folder,
-            f"cannot be written: {error.strerror or error}; done shards stay, and the same call goes on from there",
-        ) from None
-    return [f"sample {sample['index']}: {sample['warning']}" for sample in samples if sample["warning"]]
+        return [f"sample {sample['index']}: {sample['warning']}" for sample in samples if sample["warning"]]
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------

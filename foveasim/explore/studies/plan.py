@@ -54,6 +54,8 @@ class StudyPlan:
         Limits of results, either of them None.
     n_trials : int
         Trials that the study has at its end.
+    batch : int
+        Trials that are sampled together.
     name : str
         Of the study in its storage.
     folder : Path
@@ -67,6 +69,7 @@ class StudyPlan:
     objectives: Mapping[str, Literal["maximize", "minimize"]]
     constraints: Limits
     n_trials: int
+    batch: int
     name: str
     folder: Path
     files: Mapping[str, str]
@@ -87,6 +90,7 @@ class StudyPlan:
             "search": {path: _plain(where) for path, where in self.search.items()},
             "objectives": dict(self.objectives),
             "constraints": {key: list(limits) for key, limits in self.constraints.items()},
+            "batch": self.batch,
         }
 
 
@@ -110,6 +114,9 @@ class StudySection(BaseModel):
     objectives: dict[str, Literal["maximize", "minimize"]] = Field(description="by the names of results")
     constraints: dict[str, _Limit] = Field({}, description="[low, high] by the names of results, either of them null")
     trials: int = Field(ge=1, le=MAX_POINTS, description="that the study has at its end")
+    batch: int = Field(
+        1, ge=1, le=MAX_POINTS, description="trials that are sampled together; trials is a multiple of it"
+    )
     seed: int = 0
     metrics: list[str] | None = Field(None, description="by default those that give the objectives and constraints")
     name: str = Field("study", min_length=1, description="of the study in its storage")
@@ -125,9 +132,9 @@ def read_study(path: str | Path, *, metrics: Sequence[str] = (), n_trials: int |
         With the keys ``shot`` (a file beside it, or the settings themselves), ``search`` (settings' paths to
         ``{from: 2, to: 16, step: 2}``, to ``{from: 0.5, to: 4, spacing: geometric}``, or to a list of choices; of settings that
         are whole numbers only such are tried), ``objectives`` (results' names to ``maximize`` or
-        ``minimize``), ``trials``, ``constraints`` (results' names to ``[low, high]``, either of them ``null``), ``seed``,
-        ``metrics``, ``name``, and ``set`` (settings to be replaced in all trials). The file names metrics of :data:`METRICS`
-        only: a file never makes the program import code.
+        ``minimize``), ``trials``, ``batch``, ``constraints`` (results' names to ``[low, high]``, either of them ``null``),
+        ``seed``, ``metrics``, ``name``, and ``set`` (settings to be replaced in all trials). The file names metrics of
+        :data:`METRICS` only: a file never makes the program import code.
     metrics : sequence of str
         More metrics: names, or ``module:function``, which is imported.
     n_trials : int, optional
@@ -162,6 +169,7 @@ def read_study(path: str | Path, *, metrics: Sequence[str] = (), n_trials: int |
             metrics=None if section.metrics is None and not metrics else wanted,
             changes={name: files_from(path.parent, value, name) for name, value in section.set.items()},
             seed=section.seed,
+            batch=section.batch,
             name=section.name,
             source=source,
             folder=path.parent,
@@ -178,6 +186,7 @@ def plan_study(
     metrics: Sequence[str | Metric] | Mapping[str, Metric] | None = None,
     changes: Mapping[str, Any] | None = None,
     seed: int = 0,
+    batch: int = 1,
     name: str = "study",
     source: str | Path = "settings",
     folder: str | Path = ".",
@@ -189,7 +198,7 @@ def plan_study(
     ----------
     shot, changes, source
         As for :func:`plan_sweep`.
-    search, objectives, n_trials, constraints, metrics, seed, name
+    search, objectives, n_trials, constraints, metrics, seed, batch, name
         As for :func:`study`.
     folder : path
         Where files that choices name are looked for.
@@ -200,6 +209,9 @@ def plan_study(
         When a path, a range or a name is none.
     """
     n_trials = check_count("n_trials", n_trials, at_most=MAX_POINTS)
+    batch = check_count("batch", batch, at_most=MAX_POINTS)
+    if n_trials % batch:
+        raise ParameterError("n_trials", f"must be a multiple of the batch of {batch}", n_trials)
     if not isinstance(name, str) or not name:
         raise ParameterError("name", "must be a text, and not empty", name)
     constraints = dict(constraints or {})
@@ -231,6 +243,7 @@ def plan_study(
         objectives=dict(objectives),
         constraints=constraints,
         n_trials=n_trials,
+        batch=batch,
         name=name,
         folder=Path(folder).absolute(),
         files={file: digest for plan in plans for file, digest in plan.files.items()},

@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from foveasim._core.extras import needs
 from foveasim._core.random_streams import derived_seed
-from foveasim._core.threads import thread_count
+from foveasim._core.validation import check_count
 from foveasim._io.atomic import lock
 from foveasim.errors import FileError, FoveasimError, ParameterError, printable
 from foveasim.explore._metrics import Metric
-from foveasim.explore._records import Record, Value, check_same_plan
+from foveasim.explore._records import ENDED_ITS_WORKER, Record, Value, check_same_plan
+from foveasim.explore.executor import KILLED, executor
 from foveasim.explore.studies.plan import Limits, Search, StudyPlan, plan_study
-from foveasim.explore.worker_cache import Bench, Job, Task
+from foveasim.explore.worker_cache import ShotRunner
 
 if TYPE_CHECKING:
     import optuna
@@ -45,8 +46,11 @@ def study(
     metrics: Sequence[str | Metric] | Mapping[str, Metric] | None = None,
     changes: Mapping[str, Any] | None = None,
     seed: int = 0,
+    batch: int = 1,
     storage: str | Path | None = None,
     name: str = "study",
+    scheduler: str | None = None,
+    workers: int | None = None,
     tell: Callable[[int, int], None] | None = None,
 ) -> optuna.Study:
     """
@@ -69,10 +73,16 @@ def study(
         By default those that give the objectives and constraints.
     seed : int
         Of the search, and of the noise of all captures, which is the same in all: differences are those of settings.
+    batch : int
+        Trials that are sampled together, without each other's results, so that as many workers can compute them at once.
     storage : path or str, optional
         An SQLite file, or any URL that Optuna takes. By default memory.
     name : str
         Of the study in its storage.
+    scheduler : str, optional
+        Address of a dask scheduler, whose workers have this package and see the files that the settings name.
+    workers : int, optional
+        Processes of this machine instead. By default trials are computed in this process.
     tell : callable, optional
         Called with the numbers of trials that are done and of all.
 
@@ -91,8 +101,9 @@ def study(
 
     Notes
     -----
-    The sampler (tree-structured Parzen estimators) is seeded anew for every trial from the seed and the trial's number: a study
-    that was ended and goes on finds the same as one that was not. One program at a time may write a study.
+    The sampler (tree-structured Parzen estimators) is seeded again for every trial, from the seed and the trial's number: an
+    interrupted study resumes as if it had not been, and any number of workers finds the same. One program at a time may write
+    a study.
     """
     plan = plan_study(
         shot,
@@ -103,15 +114,18 @@ def study(
         metrics=metrics,
         changes=changes,
         seed=seed,
+        batch=batch,
         name=name,
     )
-    return run_study(plan, storage=storage, tell=tell)
+    return run_study(plan, storage=storage, scheduler=scheduler, workers=workers, tell=tell)
 
 
 def run_study(
     plan: StudyPlan,
     *,
     storage: str | Path | None = None,
+    scheduler: str | None = None,
+    workers: int | None = None,
     tell: Callable[[int, int], None] | None = None,
 ) -> optuna.Study:
     """
@@ -120,7 +134,7 @@ def run_study(
     Parameters
     ----------
     plan : StudyPlan
-    storage, tell
+    storage, scheduler, workers, tell
         As for :func:`study`.
 
     Returns
@@ -131,33 +145,42 @@ def run_study(
     Raises
     ------
     ParameterError
-        When Optuna is missing.
+        When Optuna or dask is missing, or no scheduler answers.
     FileError
         When the storage cannot be used, or holds another study of this name.
+    SimulationError
+        When the scheduler or all workers are gone. Trials that are done are stored.
     """
+    if workers is not None:
+        workers = min(check_count("workers", workers, at_most=1024), plan.batch)
     optuna = _optuna()
     url = _url(storage)
     with _alone(storage, url):
         token = secrets.token_hex(8)
         with _silent(optuna), _using(storage):
             found = _opened(optuna, storage, url, plan)
-            _begin(optuna, storage, found, plan.described(), token)
-        job = Job(plan.base.source, plan.base.metrics, thread_count(), True)
-        bench = Bench()
-        n_done = len(finished_trials(found))
-        while n_done < plan.n_trials:
-            if tell is not None:
-                tell(n_done, plan.n_trials)
-            found.sampler = optuna.samplers.TPESampler(seed=derived_seed(plan.base.seed, n_done) % 2**32)
-            with _using(storage, n_done):
-                trial = found.ask()
-                _check_writer(optuna, storage, trial, token)
-                settings = plan.settings_of(trial)
-            record = bench.record(job, Task(n_done, settings))
-            with _using(storage, n_done):
-                _check_writer(optuna, storage, trial, token)
-                _told(optuna, found, trial, record, list(plan.objectives), plan.constraints)
-            n_done += 1
+            trials = _begin(optuna, storage, found, plan, token)
+        runner = ShotRunner(plan.base.source, plan.base.metrics)
+        users = list(plan.base.metrics.values())
+        with executor(runner, what="the metrics", users=users, scheduler=scheduler, workers=workers) as run:
+            n_done = len(finished_trials(found))
+            while n_done < plan.n_trials:
+                if tell is not None:
+                    tell(n_done, plan.n_trials)
+                with _using(storage, n_done):
+                    trials = trials or [_asked(optuna, found, plan, n_done + k) for k in range(plan.batch)]
+                    _check_writer(optuna, storage, trials[-1], token)
+                    points = [(trial.number, plan.settings_of(trial)) for trial in trials]
+                records = {
+                    number: Record(number, {}, ENDED_ITS_WORKER) if record is KILLED else record
+                    for (number, _), record in run(points, ())
+                }
+                with _using(storage, n_done):
+                    for trial in trials:
+                        _check_writer(optuna, storage, trial, token)
+                        _told(optuna, found, trial, records[trial.number], list(plan.objectives), plan.constraints)
+                n_done += len(trials)
+                trials = []
     if tell is not None:
         tell(plan.n_trials, plan.n_trials)
     return found
@@ -169,7 +192,8 @@ def finished_trials(found: optuna.Study) -> list[optuna.trial.FrozenTrial]:
 
     Those that failed have their message in ``user_attrs["error"]``.
     """
-    return [trial for trial in found.get_trials(deepcopy=False) if not trial.user_attrs.get(IS_CUT)]
+    trials = found.get_trials(deepcopy=False)
+    return [trial for trial in trials if trial.state.is_finished() and not trial.user_attrs.get(IS_CUT)]
 
 
 def storage_name(storage: str | Path | None) -> str:
@@ -276,10 +300,27 @@ def _opened(optuna: Any, storage: str | Path | None, url: str | None, plan: Stud
     return found
 
 
+def _asked(optuna: Any, found: optuna.Study, plan: StudyPlan, n: int) -> optuna.Trial:
+    """Sample the settings of the n-th trial, with a sampler of its own seed."""
+    found.sampler = optuna.samplers.TPESampler(seed=derived_seed(plan.base.seed, n) % 2**32)
+    trial = found.ask()
+    plan.settings_of(trial)
+    return trial
+
+
 def _begin(
-    optuna: Any, storage: str | Path | None, found: optuna.Study, described: Mapping[str, Any], token: str
-) -> None:
-    """Check that a study is this one, sign as its writer, and give up the trial that it was ended in."""
+    optuna: Any, storage: str | Path | None, found: optuna.Study, plan: StudyPlan, token: str
+) -> list[optuna.Trial]:
+    """
+    Check that a study is this one, and sign as its writer.
+
+    Returns
+    -------
+    trials : list of optuna.Trial
+        The rest of a batch whose results were being stored when the study was interrupted: their settings are sampled already.
+        Trials of a batch without results are given up, and sampled again.
+    """
+    described = plan.described()
     before = found.user_attrs.get(PLAN)
     if before is not None:
         check_same_plan(Path(storage_name(storage)), before, described)
@@ -290,9 +331,13 @@ def _begin(
     else:
         found.set_user_attr(PLAN, json.loads(json.dumps(described)))
     found.set_user_attr(WRITER, token)
-    for trial in found.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,)):
-        # It counts for nothing, and its place is taken by the next.
-        _give_up(optuna, optuna.trial.Trial(found, trial._trial_id))  # noqa: SLF001 -- Optuna has no other way
+    running = found.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,))
+    trials = [optuna.trial.Trial(found, trial._trial_id) for trial in running]  # noqa: SLF001 -- Optuna has no other way
+    if len(finished_trials(found)) % plan.batch:
+        return trials
+    for trial in trials:
+        _give_up(optuna, trial)
+    return []
 
 
 def _give_up(optuna: Any, trial: optuna.Trial) -> None:

@@ -23,7 +23,7 @@ from foveasim._io.yaml_files import read_yaml
 from foveasim.config import check_settings, files_from, put_setting, read_settings, validated
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.explore._files import digests
-from foveasim.explore._functions import described
+from foveasim.explore._functions import identity_of
 from foveasim.explore._metrics import Metric, named_metrics, with_more_metrics
 
 __all__ = [
@@ -155,7 +155,7 @@ class Plan:
     @cached_property
     def _metrics_described(self) -> dict[str, str]:
         # Once: what a function takes along may change while it works.
-        return {name: described(metric) for name, metric in self.metrics.items()}
+        return {name: identity_of(metric) for name, metric in self.metrics.items()}
 
     def _first_equal(self) -> Ints:
         """As ``choices``, with the number of the first value that is equal in the place of every value's own."""

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import itertools
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from foveasim._core.threads import thread_count
-from foveasim._core.validation import Ints, check_count
+from foveasim._core.validation import check_count
 from foveasim.errors import SimulationError
-from foveasim.explore._functions import own_module
 from foveasim.explore._metrics import Metric
-from foveasim.explore._records import Journal, Record, check_same_plan, journal_of
-from foveasim.explore.cluster import client_of
-from foveasim.explore.executor import records_of
+from foveasim.explore._records import ENDED_ITS_WORKER, Journal, Record, check_same_plan, journal_of
+from foveasim.explore.executor import KILLED, executor
 from foveasim.explore.sweeps.plan import Plan, plan_sweep
 from foveasim.explore.sweeps.results import check_store, dataset_of, open_results, stored_plan, write_store
-from foveasim.explore.worker_cache import Job, Task
+from foveasim.explore.worker_cache import ShotRunner
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -172,46 +169,35 @@ def _run(
     if n_left == 0:
         return
     n_workers = min(thread_count() if workers is None else workers, n_left)
-    runs = [[int(point) for point in run if int(point) not in known] for run in _runs(plan, n_workers)]
-    # A worker of a scheduler knows how many threads it was given.
-    n_threads = max(1, thread_count() // n_workers) if scheduler is None else 0
-    job = _pickled(Job(plan.source, plan.metrics, n_threads, plan.is_geometry_varied))
-    with client_of(scheduler, n_workers) as client:
-        if tell is not None:
-            tell(n_done, plan.n_points)
-        try:
-            for record in records_of(client, job, lambda point: Task(point, plan.settings_of(point)), runs):
-                add(record)
+    # A worker of a scheduler has the number of threads that it was started with.
+    n_threads = max(1, thread_count() // n_workers) if scheduler is None else None
+    runner = ShotRunner(plan.source, plan.metrics, is_geometry_varied=plan.is_geometry_varied, n_threads=n_threads)
+    users = list(plan.metrics.values())
+    points, changes = plan.order()
+    is_left = np.array([int(point) not in known for point in points])
+    cuts = (np.cumsum(is_left) - is_left)[changes]
+    try:
+        with executor(
+            _Points(replace(plan), runner), what="the metrics", users=users, scheduler=scheduler, workers=n_workers
+        ) as run:
+            if tell is not None:
+                tell(n_done, plan.n_points)
+            for point, record in run(points[is_left].tolist(), np.unique(cuts).tolist()):
+                add(Record(point, {}, ENDED_ITS_WORKER) if record is KILLED else record)
                 n_done += 1
                 if tell is not None:
                     tell(n_done, plan.n_points)
-        except SimulationError as error:
-            raise SimulationError(
-                f"{error}; {n_done:,} of {plan.n_points:,} points are done, and a sweep with a store goes on from there"
-            ) from None
+    except SimulationError as error:
+        raise SimulationError(
+            f"{error}; {n_done:,} of {plan.n_points:,} points are done, and a sweep with a store goes on from there"
+        ) from None
 
 
-def _runs(plan: Plan, n_runs: int) -> list[Ints]:
-    """The points in their order, cut where layout or light changes, so that each worker begins at such a place."""
-    order, begins = plan.order()
-    wished = np.linspace(0, order.size, n_runs + 1)[1:-1]
-    cuts = {int(begins[np.abs(begins - place).argmin()]) for place in wished} - {0}
-    bounds = [0, *sorted(cuts), order.size]
-    return [order[start:stop] for start, stop in itertools.pairwise(bounds)]
+class _Points:
+    """Records of a plan's points by their numbers."""
 
+    def __init__(self, plan: Plan, runner: ShotRunner) -> None:
+        self._plan, self._runner = plan, runner
 
-def _pickled(job: Job) -> bytes:
-    """The job with the functions of the user's own modules in it: workers need not find those."""
-    import cloudpickle
-
-    names = {own_module(metric) for metric in job.metrics.values()} - {None, "__main__"}
-    own = [sys.modules[name] for name in names if name is not None]
-    for module in own:
-        cloudpickle.register_pickle_by_value(module)
-    try:
-        return bytes(cloudpickle.dumps(job))
-    except Exception as error:  # noqa: BLE001 -- objects refuse to be pickled in many ways
-        raise SimulationError(f"the metrics cannot be sent to other processes: {error}") from None
-    finally:
-        for module in own:
-            cloudpickle.unregister_pickle_by_value(module)
+    def __call__(self, point: int) -> Record:
+        return self._runner.record(point, self._plan.settings_of(point))
