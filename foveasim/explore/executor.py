@@ -335,7 +335,7 @@ class _Dispatch:
             self.polled_s = float("-inf")
             yield from self._again(chunk)
             return
-        took_s = results.seconds / max(len(results.values), 1)
+        took_s = results.took_s / max(len(results.values), 1)
         self.item_s = took_s if self.item_s is None else 0.5 * (self.item_s + took_s)
         self._put_back(chunk, len(results.values))
         yield from zip(chunk.positions, results.values, strict=False)
@@ -384,7 +384,7 @@ class _Results(NamedTuple):
     """Results of the first items of a chunk, and the seconds that they took."""
 
     values: list[Any]
-    seconds: float
+    took_s: float
 
 
 class _Shared:
