@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.lib import format as npy
@@ -18,7 +18,7 @@ from foveasim._core.validation import MAX_SITES
 from foveasim._io.atomic import written_whole
 from foveasim.errors import FileError
 
-__all__ = ["opened_archive", "read_archive", "write_archive"]
+__all__ = ["opened_archive", "read_archive", "read_array", "write_archive", "zip_members"]
 
 #: Name of the text beside the arrays.
 ABOUT = "about"
@@ -27,6 +27,8 @@ SUFFIX = ".npy"
 STRAY = "allow_pickle"
 #: A file that would unpack to more than this is refused.
 MAX_UNPACKED_BYTES = 8 * 2**30
+#: Bytes that are read at once.
+PIECE_BYTES = 2**20
 
 
 def write_archive(
@@ -74,14 +76,14 @@ def read_archive(path: Path, *, max_bytes: int | None = None) -> tuple[Any, dict
         Of any kind, when it is broken; :func:`opened_archive` tells it in one sentence.
     """
     limit = MAX_UNPACKED_BYTES if max_bytes is None else max_bytes
-    with zipfile.ZipFile(path) as archive:
-        items = {item.filename.removesuffix(SUFFIX): item for item in archive.infolist()}
-        items.pop(STRAY, None)
+    arrays = {}
+    with zip_members(path) as (archive, items):
         if sum(item.file_size for item in archive.infolist()) > limit:
             raise FileError(path, f"would unpack to more than {limit} bytes")
-        if not {item.compress_type for item in items.values()} <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
-            raise FileError(path, "is packed in a way that numpy does not use")
-        arrays = {name: _array(archive, item) for name, item in items.items()}
+        for name, item in items.items():
+            if name != STRAY:
+                with archive.open(item) as file:
+                    arrays[name] = read_array(file, item.file_size)
     return json.loads(str(arrays.pop(ABOUT))) if ABOUT in arrays else None, arrays
 
 
@@ -122,19 +124,63 @@ def opened_archive(
         raise FileError(source, f"is broken or no {what} ({told:.200})") from None
 
 
-def _array(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> NDArray[Any]:
-    """One array, after its header was found to fit what follows it: no array is made larger than the file says."""
-    with archive.open(item) as file:
-        version = npy.read_magic(file)
-        if version not in ((1, 0), (2, 0)):
-            raise ValueError(f"array format {version}")
-        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, is_fortran, dtype = read_header(file)
-        if dtype.hasobject:
-            raise ValueError("an array of objects")
-        # What takes no room may be there any number of times.
-        n = math.prod(shape)
-        if n * dtype.itemsize != item.file_size - file.tell() or not 0 <= n <= max(item.file_size, MAX_SITES):
-            raise ValueError("an array of another size than its header tells")
-        flat = np.frombuffer(file.read(), dtype) if dtype.itemsize else np.zeros(n, dtype)
-    return flat.reshape(shape, order="F" if is_fortran else "C")
+@contextmanager
+def zip_members(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, zipfile.ZipInfo]]]:
+    """
+    Open a zip archive of arrays, with its members by the names of the arrays.
+
+    Raises
+    ------
+    FileError
+        When a member is compressed as numpy never does.
+    """
+    with zipfile.ZipFile(path) as archive:
+        items = {item.filename.removesuffix(SUFFIX): item for item in archive.infolist()}
+        if not {item.compress_type for item in items.values()} <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+            raise FileError(path, "is packed in a way that numpy does not use")
+        yield archive, items
+
+
+def read_array(
+    file: IO[bytes], n_bytes: int, check: Callable[[tuple[int, ...], np.dtype[Any]], None] | None = None
+) -> NDArray[Any]:
+    """
+    Read one array, after its header was found to fit what follows it: no array is made larger than the file is.
+
+    Parameters
+    ----------
+    file : binary file
+        In the ``.npy`` format.
+    n_bytes : int
+        Length of the file.
+    check : callable, optional
+        Gets shape and dtype before anything is allocated, and may raise.
+
+    Raises
+    ------
+    ValueError
+        When the header is invalid, or the array has Python objects or another size.
+    """
+    version = npy.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"array format {version}")
+    read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, is_fortran, dtype = read_header(file)
+    if check is not None:
+        check(shape, dtype)
+    if dtype.hasobject:
+        raise ValueError("an array of objects")
+    n, left = math.prod(shape), n_bytes - file.tell()
+    # Items of no bytes could be there any number of times.
+    if n * dtype.itemsize != left or min(shape, default=0) < 0 or n > max(n_bytes, MAX_SITES):
+        raise ValueError("an array of another size than its header tells")
+    if not dtype.itemsize:
+        return np.zeros(shape, dtype)
+    data = np.empty(left, np.uint8)
+    done = 0
+    while done < left and (piece := file.read(min(left - done, PIECE_BYTES))):
+        data[done : done + len(piece)] = np.frombuffer(piece, np.uint8)
+        done += len(piece)
+    if done < left:
+        raise ValueError("truncated")
+    return data.view(dtype).reshape(shape, order="F" if is_fortran else "C")

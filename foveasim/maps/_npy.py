@@ -8,17 +8,15 @@ Names in an archive are ``data``, ``pitch_um``, ``origin_um``, ``wavelength_nm``
 
 from __future__ import annotations
 
-import io
-import math
 import zipfile
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from foveasim._io.formats import FileFormat
+from foveasim._io.npz import read_array, zip_members
 from foveasim.fields import PowerMap
 from foveasim.maps._common import Found, Refusal, check_size
 from foveasim.maps._formats import MAP_FORMATS
@@ -30,7 +28,6 @@ NPY_MAGIC = b"\x93NUMPY"
 ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06")
 DATA = "data"
 ABOUT = ("pitch_um", "origin_um", "wavelength_nm", "band_width_nm", "unit")
-SUFFIX = ".npy"
 #: What stands beside the map is small.
 MAX_ABOUT_BYTES = 2**20
 
@@ -59,10 +56,7 @@ def read_npy(path: Path, name: str | None) -> Found:
 def read_npz(path: Path, name: str | None) -> Found:
     """Read the array of that name, or ``data``, or the only one, and what stands beside it."""
     n_bytes = path.stat().st_size
-    with zipfile.ZipFile(path) as archive:
-        items = {item.filename.removesuffix(SUFFIX): item for item in archive.infolist()}
-        if not {item.compress_type for item in items.values()} <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
-            raise Refusal("is packed in a way that numpy does not use")
+    with zip_members(path) as (archive, items):
         chosen = _chosen(list(items), name)
         about = {key: _member(archive, items[key], n_bytes) for key in ABOUT if key in items and key != chosen}
         data = _member(archive, items[chosen], n_bytes)
@@ -106,7 +100,7 @@ def _list(values: NDArray[Any] | None) -> list[float] | None:
 
 
 def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo, n_bytes: int) -> NDArray[Any]:
-    if item.filename.removesuffix(SUFFIX) in ABOUT and item.file_size > MAX_ABOUT_BYTES:
+    if item.filename.removesuffix(".npy") in ABOUT and item.file_size > MAX_ABOUT_BYTES:
         raise Refusal(f"is broken: {item.filename!r:.40} has {item.file_size} bytes")
     check_size((item.file_size,), 1, n_bytes)
     with archive.open(item) as file:
@@ -114,34 +108,12 @@ def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo, n_bytes: int) -> ND
 
 
 def _array(file: IO[bytes], size: int, n_bytes: int) -> NDArray[Any]:
-    """One array, after its header was found to fit what follows it: no array is made larger than the file says."""
-    version = npy.read_magic(file)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"array format {version}")
-    read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    shape, is_fortran, dtype = read_header(file)
-    if dtype.hasobject or not dtype.itemsize:
-        raise Refusal("holds Python objects or nothing; save an array of numbers")
-    check_size(shape, dtype.itemsize, n_bytes)
-    rest = size - file.tell()
-    if math.prod(shape) * dtype.itemsize != rest or any(n < 0 for n in shape):
-        raise ValueError("an array of another size than its header tells")
-    data = np.empty(rest, np.uint8)
-    if _read_into(file, data) != rest:
-        raise ValueError("cut short")
-    return data.view(dtype).reshape(shape, order="F" if is_fortran else "C")
+    def check(shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        if dtype.hasobject or not dtype.itemsize:
+            raise Refusal("holds Python objects or nothing; save an array of numbers")
+        check_size(shape, dtype.itemsize, n_bytes)
 
-
-def _read_into(file: IO[bytes], data: NDArray[np.uint8]) -> int:
-    """Fill an array from a file, a piece at a time; the bytes that there were."""
-    done = 0
-    while done < data.size:
-        piece = file.read(min(data.size - done, io.DEFAULT_BUFFER_SIZE * 128))
-        if not piece:
-            break
-        data[done : done + len(piece)] = np.frombuffer(piece, np.uint8)
-        done += len(piece)
-    return done
+    return read_array(file, size, check)
 
 
 MAP_FORMATS.register("npy", FileFormat(title="npy", suffixes=(".npy",), signatures=(NPY_MAGIC,), read=read_npy))
