@@ -64,21 +64,22 @@ def folder_written_whole(target: Path, *, is_ours: Callable[[Path], bool]) -> It
     FileError
         When something is there that is not ours, the folder around it does not exist, or writing fails.
     """
-    if target.exists() and not is_ours(target):
-        raise FileError(target, "cannot be written: something else is there")
-    if not target.parent.is_dir():
-        raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
     token = secrets.token_hex(8)
     new, old = (target.with_name(f".foveasim-{token}-{which}{target.suffix}") for which in ("new", "old"))
     try:
+        if target.exists() and not is_ours(target):
+            raise FileError(target, "cannot be written: something else is there")
+        if not target.parent.is_dir():
+            raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
         new.mkdir()
         yield new
         if target.exists():
             target.rename(old)
         new.rename(target)
     except Exception as error:
-        if old.exists() and not target.exists():
-            old.rename(target)
+        with suppress(OSError):  # no permission for the folder
+            if old.exists() and not target.exists():
+                old.rename(target)
         _raise_reason(error, target, new)
         raise
     finally:

@@ -11,7 +11,6 @@ import contextlib
 import json
 import math
 import os
-import secrets
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foveasim._core.extras import needs
-from foveasim._io.atomic import check_room, remove_folder
+from foveasim._io.atomic import check_room, folder_written_whole
 from foveasim._io.formats import FileFormat
 from foveasim.errors import FileError
 from foveasim.fields import PowerMap
@@ -83,26 +82,10 @@ def write_zarr(power_map: PowerMap, path: Path) -> None:
         When zarr is missing, the folder's place is taken by something else, or nothing can be written there.
     """
     _needs(path, "zarr")
-    if path.exists() and not is_zarr(path):
-        raise FileError(path, "cannot be written: something else is there")
-    if not path.parent.is_dir():
-        raise FileError(path, f"cannot be written: the folder {path.parent} does not exist")
-    token = secrets.token_hex(8)
-    new, old = (path.with_name(f".foveasim-{token}-{which}.zarr") for which in ("new", "old"))
-    try:
+    with folder_written_whole(path, is_ours=is_zarr) as folder:
         dataset = to_xarray(power_map).to_dataset()
         encoding: dict[str, dict[str, Any]] = {str(name): {"compressors": None} for name in dataset.variables}
-        dataset.to_zarr(new, mode="w-", encoding=encoding, consolidated=False, zarr_format=3)
-        if path.exists():
-            path.rename(old)
-        new.rename(path)
-    except OSError as error:
-        if old.exists() and not path.exists():
-            old.rename(path)
-        raise FileError(path, f"cannot be written: {error.strerror or error}") from None
-    finally:
-        for folder in (new, old):
-            remove_folder(folder)
+        dataset.to_zarr(folder, mode="w", encoding=encoding, consolidated=False, zarr_format=3)
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from foveasim._core.extras import library
 from foveasim._core.provenance import described, differences
 from foveasim._core.validation import Floats, check_count
-from foveasim._io.atomic import folder_written_whole, lock
+from foveasim._io.atomic import folder_written_whole, lock, remove_folder
 from foveasim._io.zarr_stores import ZARR, check_codecs
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
@@ -298,7 +298,7 @@ def _growing(target: Path) -> Iterator[Path]:
             yield folder
         finally:
             if folder.exists() and not _n_whole(folder):
-                shutil.rmtree(folder, ignore_errors=True)
+                remove_folder(folder)
 
 
 @contextmanager

@@ -6,7 +6,6 @@ import io
 import json
 import operator
 import os
-import secrets
 import tarfile
 import time
 import warnings
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from foveasim._core.extras import needs
 from foveasim._core.threads import thread_count
 from foveasim._core.validation import check_count
-from foveasim._io.atomic import remove_folder, written_whole
+from foveasim._io.atomic import folder_written_whole, written_whole
 from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore.datasets.dataset import DataSet
 from foveasim.explore.executor import KILLED, executor
@@ -347,21 +346,6 @@ def _zarr(path: Path) -> Any:
     return zarr
 
 
-def _begun(target: Path, make: Callable[[Path], None]) -> None:
-    """Make a folder whole or not at all."""
-    new = target.with_name(f".foveasim-{secrets.token_hex(8)}{target.suffix}")
-    try:
-        if not target.parent.is_dir():
-            raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
-        new.mkdir()
-        make(new)
-        new.rename(target)
-    except OSError as error:
-        raise FileError(target, f"cannot be written: {error.strerror or error}") from None
-    finally:
-        remove_folder(new)
-
-
 # -- shards -----------------------------------------------------------------------------------------------------------
 
 
@@ -412,12 +396,10 @@ class _TarShards(_Shards):
 
     @staticmethod
     def begin(target: Path, about: Mapping[str, Any], data_set: DataSet, first: Mapping[str, Any]) -> None:  # noqa: ARG004 -- for all kinds alike
-        def make(new: Path) -> None:
+        with folder_written_whole(target, is_ours=lambda _: False) as new:
             (new / ABOUT).write_text(json.dumps(about, indent=1), encoding="utf-8")
             if not data_set.is_layout_varied:
                 data_set.layout.write(new / "layout.npz")
-
-        _begun(target, make)
 
     def _file(self, k: int) -> Path:
         return self.folder / f"shard-{k:06d}.tar"
@@ -492,7 +474,7 @@ class _ZarrShards(_Shards):
         n, per_shard = about["n_samples"], about["per_shard"]
         n_shards = -(-n // per_shard)
 
-        def make(new: Path) -> None:
+        with folder_written_whole(target, is_ours=lambda _: False) as new:
             group = zarr.open_group(str(new), mode="w", zarr_format=3)
             for name, value in _flat(first).items():
                 if isinstance(value, str):
@@ -517,8 +499,6 @@ class _ZarrShards(_Shards):
             group.create_array("layout/filter_of_site", data=np.asarray(data_set.shot(0).camera.sensor.filter_of_site))
             # With this the folder is a data set.
             group.attrs.update(about)
-
-        _begun(target, make)
 
     def _arrays(self) -> dict[str, Any]:
         if self._opened is None or self._opened[0] != os.getpid():

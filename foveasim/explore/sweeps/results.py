@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import secrets
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.extras import needs
 from foveasim._core.validation import unit_of
-from foveasim._io.atomic import remove_folder
+from foveasim._io.atomic import folder_written_whole
 from foveasim.errors import FileError, ParameterError
 from foveasim.explore._records import FORMAT, VERSION, Record, Value
 from foveasim.explore.sweeps.plan import POINT, REPEAT, Plan, coordinate
@@ -274,27 +273,17 @@ def write_store(dataset: xr.Dataset, path: Path) -> None:
     FileError
         When nothing can be written there.
     """
-    token = secrets.token_hex(8)
-    new, old = (path.with_name(f".foveasim-{token}-{which}.zarr") for which in ("new", "old"))
-    try:
-        with warnings.catch_warnings():
-            # Zarr has it for all who open the store with xarray, and warns that others may not read it so; they need not.
-            warnings.filterwarnings("ignore", "Consolidated metadata is currently not part")
-            dataset.to_zarr(new, mode="w-", consolidated=True, zarr_format=3)
+    with (
+        folder_written_whole(path, is_ours=lambda folder: stored_plan(folder) is not None) as new,
+        warnings.catch_warnings(),
+    ):
+        # Zarr has it for all who open the store with xarray, and warns that others may not read it so; they need not.
+        warnings.filterwarnings("ignore", "Consolidated metadata is currently not part")
+        dataset.to_zarr(new, mode="w", consolidated=True, zarr_format=3)
         # On the disk before the journal is removed: a power cut leaves one of them whole.
         for file in (path for path in new.rglob("*") if path.is_file()):
             with file.open("r+b") as opened:
                 os.fsync(opened.fileno())
-        if path.exists():
-            path.rename(old)
-        new.rename(path)
-    except OSError as error:
-        if old.exists() and not path.exists():
-            old.rename(path)
-        raise FileError(path, f"cannot be written: {error.strerror or error}") from None
-    finally:
-        for folder in (new, old):
-            remove_folder(folder)
 
 
 def _xarray() -> Any:
