@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
-# Arguments of pytest in all test targets: make test PYTEST_ARGS="tests/test_cli.py"
+# Arguments of pytest in all test targets: make test PYTEST_ARGS="tests/cli"
 PYTEST_ARGS ?=
 PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 
@@ -30,11 +30,11 @@ test-lowest: $(LOWEST)/.installed
 		-W default::DeprecationWarning -W default::PendingDeprecationWarning -W error::pytest.PytestWarning $(PYTEST_ARGS)
 
 test-torch: $(TORCH_VENV)/.installed
-	FOVEASIM_TESTS_NEED=torch $(TORCH_VENV)/bin/python -m pytest tests/test_dataset_torch.py $(PYTEST_ARGS)
+	FOVEASIM_TESTS_NEED=torch $(TORCH_VENV)/bin/python -m pytest tests/explore/test_dataset_torch.py $(PYTEST_ARGS)
 
 # Kills workers at random for some minutes: every item must be computed, and none more than twice.
 soak: $(VENV)/.installed-dev
-	FOVEASIM_SOAK_ROUNDS=20 $(BIN)/python -m pytest tests/test_executor.py -k lost --verbose $(PYTEST_ARGS)
+	FOVEASIM_SOAK_ROUNDS=20 $(BIN)/python -m pytest tests/explore/test_executor.py -k lost --verbose $(PYTEST_ARGS)
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -32,7 +32,7 @@ EXTRAS = {
 #: Extras of what is not part of the package.
 FOLDERS = {"tests": {"dev"}, "benchmarks": {"dev", "learn"}, "gallery": {"dev"}, "docs": {"docs"}}
 #: What may name PyTorch: the only tests that run where it is installed, and the check whether it is.
-TORCH_TESTS = {ROOT / "tests" / "test_dataset_torch.py", ROOT / "tests" / "conftest.py"}
+TORCH_TESTS = {ROOT / "tests" / "explore" / "test_dataset_torch.py", ROOT / "tests" / "conftest.py"}
 #: Distributions that no line imports.
 INDIRECT = {
     "cryptography": "distributed makes the keys of a sweep's own scheduler with it",

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from test_dataset import SHOT, VARY, pictures
+from explore.test_dataset import SHOT, VARY, pictures
 
 from foveasim import explore
 

@@ -28,7 +28,7 @@ from foveasim.explore.datasets.label_files import files_of_pictures, read_boxes,
 from foveasim.explore.studies.plan import _suggested
 from foveasim.explore.worker_cache import ShotRunner
 
-GALLERY = Path(__file__).parents[1] / "gallery" / "sweeps"
+GALLERY = Path(__file__).parents[2] / "gallery" / "sweeps"
 SHOT = {
     "scene": {
         "kind": "flat",

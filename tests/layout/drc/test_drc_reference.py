@@ -84,7 +84,7 @@ def compare(rule, layout, rules):
 # -- twins --------------------------------------------------------------------------------------------------------------
 
 
-#: Rules about the whole field: their twins stand in test_layout_field_rules.py.
+#: Rules about the whole field: their twins stand in test_field_rules.py.
 FIELD_RULES = {"min_density", "max_density", "max_data_rate_gbit_per_s", "max_track_use"}
 
 
