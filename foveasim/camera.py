@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.provenance import described, versions
+from foveasim._core.provenance import to_plain_data, versions
 from foveasim._core.random_streams import Streams
 from foveasim._core.threads import in_order, thread_count
 from foveasim._core.validation import Bools, Floats, check_count, finite_array, read_only
@@ -371,10 +371,10 @@ class Camera:
     def _described(self) -> dict[str, Any]:
         """What all captures of the camera have in common, as plain data."""
         return {
-            "optics": described(self._optics),
-            "distortion": None if self._distortion is None else described(self._distortion),
-            "sensor": {k: v for k, v in described(self._sensor).items() if k != "layout"},
-            "layout": described(dict(self._layout.provenance)),
+            "optics": to_plain_data(self._optics),
+            "distortion": None if self._distortion is None else to_plain_data(self._distortion),
+            "sensor": {k: v for k, v in to_plain_data(self._sensor).items() if k != "layout"},
+            "layout": to_plain_data(dict(self._layout.provenance)),
         }
 
     def rates(self, frames: Iterable[Light], *, ahead: int = 0) -> Iterator[Floats]:
@@ -504,7 +504,7 @@ class Camera:
         for k, (light, place_um, rate_e_per_s) in enumerate(self._lit(frames, clock, ahead)):
             number = Streams(streams.seed, streams.frame + k)
             exposure_s = float(exposures_s[number.frame % exposures_s.size])
-            yield self._exposed(light, rate_e_per_s, exposure_s, number, clock.so_far(), **_told(place_um))
+            yield self._exposed(light, rate_e_per_s, exposure_s, number, clock.so_far(), **_place_settings(place_um))
 
     def _rolling(
         self, frames: Iterable[Light], exposures_s: Floats, streams: Streams, shutter: Shutter, every: int, ahead: int
@@ -517,7 +517,7 @@ class Camera:
         def first(last_e_per_s: Floats) -> Capture:
             k, light, place_um, exposure = going_on.popleft()
             number = Streams(streams.seed, streams.frame + k)
-            mean_e_per_s, told = exposure.mean_e_per_s(last_e_per_s), times | _told(place_um)
+            mean_e_per_s, told = exposure.mean_e_per_s(last_e_per_s), times | _place_settings(place_um)
             return self._exposed(light, mean_e_per_s, exposure.exposure_s, number, clock.so_far(), **told)
 
         rate_e_per_s = np.zeros(1)
@@ -793,7 +793,7 @@ def _check_frames(frames: object) -> None:
         )
 
 
-def _told(place_um: Place) -> dict[str, Any]:
+def _place_settings(place_um: Place) -> dict[str, Any]:
     """What a capture's settings tell of its place."""
     return {"place_um": list(place_um)} if any(place_um) else {}
 
@@ -810,7 +810,7 @@ def _parts(frame: Light) -> tuple[Scene | PowerMap, Place]:
 
 def _light_described(light: Scene | PowerMap) -> dict[str, object]:
     if isinstance(light, PowerMap):
-        return {"kind": "PowerMap", "grid": described(light.grid), "wavelength_nm": light.wavelength_nm.tolist()}
+        return {"kind": "PowerMap", "grid": to_plain_data(light.grid), "wavelength_nm": light.wavelength_nm.tolist()}
     return {
         "kind": "Scene",
         "source": light.source,
@@ -819,7 +819,7 @@ def _light_described(light: Scene | PowerMap) -> dict[str, object]:
         "distance_m": light.distance_m,
         "wavelength_nm": light.wavelength_nm.tolist(),
         "band_width_nm": light.band_width_nm.tolist(),
-        "spectrum_w_m2_sr_nm": described(light.spectrum_w_m2_sr_nm),
+        "spectrum_w_m2_sr_nm": to_plain_data(light.spectrum_w_m2_sr_nm),
     }
 
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.extras import library, needs
-from foveasim._core.provenance import copied, described
+from foveasim._core.provenance import copied, to_plain_data
 from foveasim._core.rings import same_rings
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, own, read_only, unit_of, unmasked
-from foveasim._io.atomic import folder_written_whole
+from foveasim._io.atomic import atomic_directory
 from foveasim._io.npz import opened_archive, write_archive
 from foveasim._io.zarr_stores import ZARR, Variable, free_name, opened_store, store_format, write_variables
 from foveasim.errors import FileError, ParameterError
@@ -390,7 +390,7 @@ class Capture:
         return found | {
             "settings": json.dumps(settings),
             "versions": json.dumps(settings.get("versions", {})),
-            "provenance": json.dumps(described(dict(self.layout.provenance))),
+            "provenance": json.dumps(to_plain_data(dict(self.layout.provenance))),
         }
 
     def save(self, path: str | Path) -> None:
@@ -422,7 +422,7 @@ class Capture:
             "bits": self.bits,
             "white_dn": self.white_dn.tolist(),
             "settings": self.settings,
-            "provenance": described(dict(self.layout.provenance)),
+            "provenance": to_plain_data(dict(self.layout.provenance)),
         }
         arrays = {name: getattr(self, name) for name in ARRAYS}
         write_archive(path, about, arrays | packed_layout(self.layout))
@@ -444,7 +444,7 @@ class Capture:
             # As xarray reads them: names of coordinates that are not dimensions.
             "coordinates": " ".join(name for name in coordinates if name not in (SITE, FILTER)),
         }
-        with folder_written_whole(target, is_ours=lambda folder: store_format(folder) == FILE_FORMAT) as folder:
+        with atomic_directory(target, is_ours=lambda folder: store_format(folder) == FILE_FORMAT) as folder:
             group = zarr.create_group(str(folder), zarr_format=3, attributes=attributes)
             write_variables(group, variables | coordinates)
             write_variables(group.create_group(LAYOUT_GROUP), outlines)

@@ -202,7 +202,7 @@ def view(
     ] = False,
 ) -> None:
     """Explore a layout, a capture or a report in a browser, on a page that needs no network."""
-    from foveasim._io.atomic import written_whole
+    from foveasim._io.atomic import atomic_write
     from foveasim.config import read_viewable
     from foveasim.view.web import check_page_path, open_page, serve_page, solid_page, web_page
 
@@ -220,7 +220,7 @@ def view(
         flat = None if solid else web_page(seen.thing, report=seen.report, name=seen.name)
         text = solid_page(seen.thing, name=seen.name) if flat is None else flat
     if web is not None:
-        with written_whole(web) as temporary:
+        with atomic_write(web) as temporary:
             temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
         _report(f"wrote {web}")
         return

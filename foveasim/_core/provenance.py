@@ -15,14 +15,14 @@ import numpy as np
 from foveasim._core.validation import own
 from foveasim._version import __version__
 
-__all__ = ["copied", "described", "differences", "versions"]
+__all__ = ["copied", "differences", "to_plain_data", "versions"]
 
 #: Arrays up to this size are written out; of longer ones the shape and a checksum are kept.
 WRITTEN_OUT = 64
 _ATOMS = frozenset({str, int, float, bool, type(None)})
 
 
-def described(value: Any) -> Any:
+def to_plain_data(value: Any) -> Any:
     """
     Plain data (numbers, text, lists, dicts) that tells what an object is.
 
@@ -38,13 +38,13 @@ def described(value: Any) -> Any:
         digest = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
         return {"shape": list(value.shape), "dtype": str(value.dtype), "sha256": digest}
     if isinstance(value, Mapping):
-        return {str(key): described(item) for key, item in value.items()}
+        return {str(key): to_plain_data(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [described(item) for item in value]
+        return [to_plain_data(item) for item in value]
     if is_dataclass(value):
         return {
             "kind": type(value).__name__,
-            **{f.name: described(getattr(value, f.name)) for f in fields(value) if not f.name.startswith("_")},
+            **{f.name: to_plain_data(getattr(value, f.name)) for f in fields(value) if not f.name.startswith("_")},
         }
     return repr(value)
 

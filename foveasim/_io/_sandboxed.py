@@ -18,7 +18,7 @@ from typing import Any
 __all__ = ["limit"]
 
 #: Names of the errors by which readers reject a file; any other means that it is corrupt.
-REJECTIONS = {"FoveasimError", "Refusal"}
+REJECTIONS = {"FoveasimError", "FormatError"}
 
 
 def limit(kind: str, most: int) -> None:

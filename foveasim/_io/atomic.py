@@ -14,7 +14,7 @@ from typing import IO
 
 from foveasim.errors import FileError, disk_problem
 
-__all__ = ["check_room", "folder_written_whole", "lock", "remove_folder", "written_whole"]
+__all__ = ["atomic_directory", "atomic_write", "check_room", "lock", "remove_folder"]
 
 #: A disk with less space than a block is full.
 FULL_DISK_BYTES = 4096
@@ -23,7 +23,7 @@ RETRY_S = (0.0, 0.05, 0.25)
 
 
 @contextmanager
-def written_whole(path: str | Path) -> Iterator[Path]:
+def atomic_write(path: str | Path) -> Iterator[Path]:
     """
     A temporary name in the target's folder, renamed to the target when the block ends well, removed otherwise.
 
@@ -55,7 +55,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def folder_written_whole(target: Path, *, is_ours: Callable[[Path], bool]) -> Iterator[Path]:
+def atomic_directory(target: Path, *, is_ours: Callable[[Path], bool]) -> Iterator[Path]:
     """
     A temporary folder, renamed to the target when the block ends well, removed otherwise.
 

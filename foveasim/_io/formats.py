@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from foveasim.errors import FileError, ParameterError
+from foveasim.errors import FileError, FoveasimError, ParameterError
 
-__all__ = ["FileFormat", "chosen_options", "format_of", "head_of", "writing_format"]
+__all__ = [
+    "FileFormat",
+    "FormatError",
+    "as_file_error",
+    "chosen_options",
+    "format_of",
+    "head_of",
+    "one_line",
+    "writing_format",
+]
 
 #: A file of more bytes is not read.
 MAX_FILE_BYTES = 8 * 2**30
 HEAD_BYTES = 1024
+#: Characters of a message, of this package and of others, that are kept.
+MAX_MESSAGE, MAX_REASON = 500, 300
 #: Beginnings of files that are recognised without being a format, and what to do with them.
 _HINTS = {
     b"\x1f\x8b": "is compressed with gzip; unpack it first",
@@ -62,6 +74,42 @@ class FileFormat:
         if self.matches is not None:
             return self.matches(path, head)
         return bool(self.signatures) and head.startswith(self.signatures)
+
+
+class FormatError(Exception):
+    """The content of a file is invalid, with a message that follows the file's name."""
+
+
+@contextmanager
+def as_file_error(path: Path, what: str, *, passes: tuple[type[FoveasimError], ...] = ()) -> Iterator[None]:
+    """
+    Raise whatever a malformed file makes its readers raise as one FileError with a message of one line.
+
+    Parameters
+    ----------
+    path : Path
+    what : str
+        What the file should be, for messages: ``"power map"``.
+    passes : tuple of exception types
+        Errors that are not about the file.
+    """
+    try:
+        yield
+    except passes:
+        raise
+    except (FormatError, FoveasimError) as error:
+        raise FileError(path, one_line(str(error).removeprefix(f"{path}: "), MAX_MESSAGE)) from None
+    except MemoryError:
+        raise FileError(path, "asks for more memory than there is") from None
+    except Exception as error:  # noqa: BLE001 -- readers raise anything on malformed files
+        reason = one_line(str(error), MAX_REASON) or type(error).__name__
+        raise FileError(path, f"is broken, or no {what} ({reason})") from None
+
+
+def one_line(text: str, max_characters: int) -> str:
+    """Return a message of another program, or with names from a file, in one printable line of limited length."""
+    line = " ".join("".join(c if c.isprintable() else " " for c in text[: 2 * max_characters]).split())
+    return line if len(line) <= max_characters else line[: max_characters - 3] + "..."
 
 
 def head_of(path: Path) -> bytes:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.extras import library, needs
 from foveasim._core.validation import unmasked
-from foveasim._io.atomic import written_whole
+from foveasim._io.atomic import atomic_write
 from foveasim._io.sandbox import read_in_sandbox
 from foveasim.errors import FileError, disk_problem
 
@@ -444,7 +444,7 @@ def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
             f"{' or '.join(held)}",
         )
     picture = np.ascontiguousarray(unmasked("picture", picture))
-    with written_whole(target) as temporary:
+    with atomic_write(target) as temporary:
         try:
             if ending in TIFF_ENDINGS:
                 _write_tiff(temporary, picture)

@@ -15,7 +15,8 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from foveasim._core.validation import MAX_SITES
-from foveasim._io.atomic import written_whole
+from foveasim._io.atomic import atomic_write
+from foveasim._io.formats import as_file_error
 from foveasim.errors import FileError
 
 __all__ = ["opened_archive", "read_archive", "read_array", "write_archive", "zip_members"]
@@ -59,7 +60,7 @@ def write_archive(
     if pickled:  # not by allow_pickle=False, which is an array's name to numpy before 2.2
         raise FileError(target, f"{pickled[0]!r:.40} must contain numbers or strings, got Python objects")
     members: dict[str, Any] = {ABOUT: np.array(json.dumps(about)), **arrays}
-    with written_whole(target) as temporary, temporary.open("wb") as file:
+    with atomic_write(target) as temporary, temporary.open("wb") as file:
         write = np.savez_compressed if is_packed else np.savez
         write(file, **members)
 
@@ -110,18 +111,13 @@ def opened_archive(
     source = Path(path)
     if not source.is_file():
         raise FileError(source, "is not a file" if source.exists() else "no such file")
-    try:
+    with as_file_error(source, what, passes=(FileError,)):
         about, arrays = read_archive(source)
         if not isinstance(about, dict) or about.get("format") != file_format:
             raise FileError(source, f"is no {what}")
         if about.get("version") != version:
             raise FileError(source, f"has the format version {about.get('version')!r:.40}, expected {version}")
         yield about, arrays
-    except FileError:
-        raise
-    except Exception as error:  # noqa: BLE001 -- a broken file makes its readers trip over anything
-        told = " ".join(str(error).split()) or type(error).__name__
-        raise FileError(source, f"is broken or no {what} ({told:.200})") from None
 
 
 @contextmanager

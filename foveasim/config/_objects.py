@@ -343,8 +343,8 @@ def read_rules(path: str | Path) -> DesignRules:
 
 def schema(section: Any = None, title: str = "foveasim settings") -> dict[str, Any]:
     """JSON schema of a settings file, or of a file whose model is given."""
-    described = TypeAdapter(models().shot if section is None else section).json_schema()
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **described, "title": title}
+    model_schema = TypeAdapter(models().shot if section is None else section).json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model_schema, "title": title}
 
 
 def _built_layout(path: Path, place: str, section: Any) -> LayoutFile:

@@ -8,7 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from foveasim._core.provenance import described, versions
+from foveasim._core.provenance import to_plain_data, versions
 from foveasim._core.threads import thread_count
 from foveasim.config import Shot
 from foveasim.errors import ParameterError, SimulationError
@@ -106,11 +106,11 @@ def _plan(
     assert isinstance(layout, Layout)  # a camera has no other
     files = [[path.name, path.stat().st_size] for path in (pictures_in(frames) if frames.is_dir() else [frames])]
     return {
-        "scene": {f.name: described(getattr(scene, f.name)) for f in fields(scene) if f.name not in OF_FRAMES},
-        "optics": described(camera.optics),
-        "distortion": described(camera.distortion),
-        "layout": described({**layout.provenance, "xy_um": layout.xy_um, "columns": layout.columns}),
-        "sensor": {name: value for name, value in described(camera.sensor).items() if name != "layout"},
+        "scene": {f.name: to_plain_data(getattr(scene, f.name)) for f in fields(scene) if f.name not in OF_FRAMES},
+        "optics": to_plain_data(camera.optics),
+        "distortion": to_plain_data(camera.distortion),
+        "layout": to_plain_data({**layout.provenance, "xy_um": layout.xy_um, "columns": layout.columns}),
+        "sensor": {name: value for name, value in to_plain_data(camera.sensor).items() if name != "layout"},
         "exposure_s": shot.exposure_s,
         "seed": shot.seed,
         "frames": hashlib.sha256(json.dumps(files).encode()).hexdigest(),

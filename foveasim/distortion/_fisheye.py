@@ -13,7 +13,7 @@ import numpy as np
 from foveasim._core.validation import Floats, check_choice, check_number, finite_array
 from foveasim.distortion._lens import Placed
 from foveasim.distortion._registry import LENSES
-from foveasim.distortion._solve import growing_inverse, smallest_roots
+from foveasim.distortion._solve import invert_monotonic, smallest_roots
 from foveasim.errors import ParameterError
 
 __all__ = ["Fisheye", "PolynomialFisheye", "Scaramuzza"]
@@ -189,7 +189,7 @@ class PolynomialFisheye(_ByAngle):
         return np.asarray(self._series(theta_rad))
 
     def _theta_rad(self, height: Floats) -> Floats:
-        return growing_inverse(self._series, self._series.deriv(), height, self._most_rad)
+        return invert_monotonic(self._series, self._series.deriv(), height, self._most_rad)
 
 
 @LENSES.register("scaramuzza")
@@ -288,7 +288,7 @@ class Scaramuzza(_ByAngle):
             most_rad = float(np.max(theta_rad, initial=0.0))
             while float(self._angle_rad(np.array([upper]))[0]) < most_rad and upper < 1e12:
                 upper *= 2.0
-        return growing_inverse(self._angle_rad, self._angle_slope, theta_rad, upper)
+        return invert_monotonic(self._angle_rad, self._angle_slope, theta_rad, upper)
 
     def _forward(self, xy: Floats) -> Floats:
         return np.asarray(super()._forward(xy) @ self._matrix.T)

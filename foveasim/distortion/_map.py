@@ -99,9 +99,9 @@ def distort_map(
     n_rows = max(CELLS_A_PIECE // grid.shape[1], 1)
     for first in range(0, grid.shape[0], n_rows):
         rows = slice(first, min(first + n_rows, grid.shape[0]))
-        pixel, gain = _carried_back(grid, rows, power_map.grid, lens, conserve)
+        pixel, gain = _source_coordinates(grid, rows, power_map.grid, lens, conserve)
         for band, image in enumerate(coefficients):
-            data[band, rows] = _looked_up(image, pixel, order) * gain
+            data[band, rows] = _interpolate(image, pixel, order) * gain
     return PowerMap(read_only(data), grid, power_map.wavelength_nm)
 
 
@@ -143,7 +143,7 @@ def _spline(band: NDArray[Any], order: int) -> Images:
     return np.asarray(spline_filter(np.asarray(band, np.float64), order, mode="reflect"))  # type: ignore[call-overload]
 
 
-def _looked_up(image: Images, pixel: Floats, order: int) -> Floats:
+def _interpolate(image: Images, pixel: Floats, order: int) -> Floats:
     """Values at positions (2, n_y, n_x) in rows and columns of cell middles; 0 beyond the map, and for positions NaN."""
     from scipy.ndimage import map_coordinates
 
@@ -155,7 +155,7 @@ def _looked_up(image: Images, pixel: Floats, order: int) -> Floats:
     return np.where(is_on, values, 0.0)
 
 
-def _carried_back(
+def _source_coordinates(
     grid: Grid, rows: slice, source: Grid, lens: PointMap, conserve: Conserve
 ) -> tuple[Floats, Floats | float]:
     """Of some rows of cells: where they look, in rows and columns of the source's cells, and what their light is times."""

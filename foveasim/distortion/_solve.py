@@ -9,7 +9,7 @@ import numpy as np
 
 from foveasim._core.validation import Floats
 
-__all__ = ["growing_inverse", "smallest_roots"]
+__all__ = ["invert_monotonic", "smallest_roots"]
 
 #: Steps of Newton's method kept inside a bracket: bisection alone would take 60.
 MAX_STEPS = 100
@@ -17,7 +17,7 @@ MAX_STEPS = 100
 REAL, TINY = 1e-9, 1e-12
 
 
-def growing_inverse(
+def invert_monotonic(
     function: Callable[[Floats], Floats], slope: Callable[[Floats], Floats], values: Floats, upper: float
 ) -> Floats:
     """

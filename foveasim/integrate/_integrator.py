@@ -14,7 +14,7 @@ from foveasim._core.threads import thread_count
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, finite_array, read_only, unmasked
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, PackedRings, PointMap
-from foveasim.integrate._outlines import CarriedOutlines, Outlines, outlines_of
+from foveasim.integrate._outlines import Outlines, UndistortedOutlines, outlines_of
 from foveasim.integrate._plan import Plan, compile_plan
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class Integrator:
         if distortion is not None:
             if not hasattr(distortion, "undistort"):
                 raise ParameterError("distortion", "must be a lens of foveasim.distortion", distortion)
-            outlines = CarriedOutlines(layout, distortion, min(grid.pitch_x_um, grid.pitch_y_um))
+            outlines = UndistortedOutlines(layout, distortion, min(grid.pitch_x_um, grid.pitch_y_um))
         self._plan: Plan = compile_plan(outlines, layout.site_offsets.size - 1, grid, self.n_threads, self.order)
         # A lens does not turn outlines over: its image of one that is clockwise is so too.
         inside_out = np.flatnonzero(self._plan.area_um2 <= 0.0)

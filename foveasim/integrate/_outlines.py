@@ -11,7 +11,7 @@ from foveasim._core.rings import next_vertex, positions_in_runs
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.fields import PackedRings, PointMap
 
-__all__ = ["CarriedOutlines", "Outlines", "outlines_of"]
+__all__ = ["Outlines", "UndistortedOutlines", "outlines_of"]
 
 #: A carried edge deviates from its chords by at most this share of a cell; one that is longer than a step of the grid below, or
 #: needs more than the most pieces, by a few times that.
@@ -43,7 +43,7 @@ def outlines_of(layout: PackedRings, first: int, last: int) -> Outlines:
     )
 
 
-class CarriedOutlines:
+class UndistortedOutlines:
     """
     The outlines that an ideal lens would have to fill.
 

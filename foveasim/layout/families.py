@@ -10,7 +10,7 @@ from typing import Any, ParamSpec
 import numpy as np
 import shapely
 
-from foveasim._core.provenance import described
+from foveasim._core.provenance import to_plain_data
 from foveasim._core.registry import Registry
 from foveasim.errors import SimulationError
 from foveasim.layout.model import Layout
@@ -79,4 +79,4 @@ def _plain(value: Any) -> Any:
         return shapely.to_wkt(value, rounding_precision=-1)
     if isinstance(value, np.ndarray):
         return value.tolist()
-    return described(value)
+    return to_plain_data(value)

@@ -26,12 +26,12 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.registry import import_all
 from foveasim._core.validation import handed_over
-from foveasim._io.atomic import written_whole
-from foveasim._io.formats import format_of, writing_format
+from foveasim._io.atomic import atomic_write
+from foveasim._io.formats import as_file_error, format_of, writing_format
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Pitch, PowerMap
 from foveasim.maps import _dataset, _exr, _fits, _isetcam, _npy, _tiff  # noqa: F401 -- they register their formats
-from foveasim.maps._common import Found, Given, finished, one_sentence
+from foveasim.maps._common import Found, Given, finished
 from foveasim.maps._formats import MAP_FORMATS, read_found
 from foveasim.maps._units import Unit
 from foveasim.maps._xarray import from_xarray, to_xarray
@@ -108,7 +108,7 @@ def read_power_map(
         origin_um=origin_um,
         top_row_first=top_row_first,
     )
-    with one_sentence(path):
+    with as_file_error(path, "power map", passes=(ParameterError,)):
         kind, _ = format_of(path, MAP_FORMATS, "power map")
         found = read_found(path, kind, name)
         handed_over(found.data)
@@ -144,7 +144,7 @@ def write_power_map(power_map: PowerMap, path: str | Path) -> None:
     if form.is_directory:
         form.write(power_map, path)
         return
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         try:
             form.write(power_map, temporary)
         except FileError as error:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,20 +18,19 @@ from foveasim._core.validation import (
     read_only,
     wavelengths_nm,
 )
-from foveasim.errors import FileError, FoveasimError, ParameterError
+from foveasim._io.formats import FormatError
+from foveasim.errors import ParameterError
 from foveasim.fields import Grid, Pitch, PowerMap, rising
 from foveasim.maps._units import PER_NM, UNITS, Unit, light_unit, per_band_w_m2
 
 __all__ = [
     "Found",
     "Given",
-    "Refusal",
     "as_images",
     "check_numbers",
     "check_size",
     "finished",
     "max_unpacked",
-    "one_sentence",
     "pitch_of_axes",
 ]
 
@@ -47,11 +44,6 @@ UNEVEN = 1e-4
 SQUARE = 1e-6
 #: Fourier transforms in float32 leave so much of the brightest light below 0.
 DARKEST = 1e-5
-MAX_TOLD = 300
-
-
-class Refusal(Exception):  # noqa: N818 -- becomes an error of the file, or of the parameter, that holds the map
-    """The map cannot be taken, in a sentence that follows its name."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,7 +109,7 @@ def check_size(shape: Sequence[int], itemsize: int, n_bytes: int) -> None:
 
     Raises
     ------
-    Refusal
+    FormatError
         When an array of the shape would take more memory than a file of ``n_bytes`` may.
     """
     size = itemsize
@@ -125,31 +117,10 @@ def check_size(shape: Sequence[int], itemsize: int, n_bytes: int) -> None:
         size *= int(n)
     if size > max_unpacked(n_bytes):
         told = " x ".join(map(str, shape[:5]))
-        raise Refusal(
+        raise FormatError(
             f"holds an array of {told} numbers, more than the {max_unpacked(n_bytes)} bytes that are read of a file of "
             "this size; a map that packs so well can be written unpacked"
         )
-
-
-@contextmanager
-def one_sentence(path: Path) -> Iterator[None]:
-    """Whatever a broken file makes its readers trip over, as one FileError of one sentence."""
-    try:
-        yield
-    except ParameterError:
-        raise
-    except (Refusal, FoveasimError) as error:
-        raise FileError(path, _one_line(str(error).removeprefix(f"{path}: "))) from None
-    except MemoryError:
-        raise FileError(path, "asks for more memory than there is") from None
-    except Exception as error:  # noqa: BLE001 -- a broken file makes its readers trip over anything
-        raise FileError(path, f"is broken, or no power map ({_one_line(str(error)) or type(error).__name__})") from None
-
-
-def _one_line(text: str) -> str:
-    """A text of another program, or with names of a file in it, so that it can be shown."""
-    line = " ".join("".join(c if c.isprintable() else " " for c in text[: 2 * MAX_TOLD]).split())
-    return line if len(line) <= MAX_TOLD else line[: MAX_TOLD - 3] + "..."
 
 
 def pitch_of_axes(x: Floats, y: Floats) -> tuple[float | None, float | None]:
@@ -158,13 +129,13 @@ def pitch_of_axes(x: Floats, y: Floats) -> tuple[float | None, float | None]:
 
     Raises
     ------
-    Refusal
+    FormatError
         When coordinates are no numbers, or their steps uneven.
     """
     steps: list[float | None] = []
     for name, along in (("x", x), ("y", y)):
         if not np.isfinite(along).all():
-            raise Refusal(f"has coordinates along {name} that are no numbers")
+            raise FormatError(f"has coordinates along {name} that are no numbers")
         if along.size == 1:
             steps.append(None)
             continue
@@ -172,7 +143,7 @@ def pitch_of_axes(x: Floats, y: Floats) -> tuple[float | None, float | None]:
         # Coordinates that are rounded to float32 far from 0 have uneven steps too.
         rounding = 4.0 * float(np.spacing(np.float32(np.abs(along).max())))
         if step == 0.0 or np.abs(np.diff(along) - step).max() > UNEVEN * abs(step) + rounding:
-            raise Refusal(f"has uneven steps along {name}; cells must be equal, so resample it first")
+            raise FormatError(f"has uneven steps along {name}; cells must be equal, so resample it first")
         steps.append(step)
     return steps[0], steps[1]
 
@@ -183,7 +154,7 @@ def finished(found: Found, given: Given) -> PowerMap:
 
     Raises
     ------
-    Refusal
+    FormatError
         When it holds something else than light, or lacks what nobody said.
     ParameterError
         When what was given does not fit it.
@@ -211,19 +182,19 @@ def as_images(data: NDArray[Any]) -> Images:
 
     Raises
     ------
-    Refusal
+    FormatError
         When they are no numbers, or have another number of dimensions.
     """
     if data.ndim > 3 and all(n == 1 for n in data.shape[:-3]):
         data = data.reshape(data.shape[-3:])
     if data.ndim not in (2, 3) or 0 in data.shape:
-        raise Refusal(f"holds an array of the shape {data.shape[:6]}, expected (n_y, n_x) or (n_band, n_y, n_x)")
+        raise FormatError(f"holds an array of the shape {data.shape[:6]}, expected (n_y, n_x) or (n_band, n_y, n_x)")
     if data.dtype.kind == "c":
-        raise Refusal("holds complex numbers: a field; give its power, the square of their absolute values")
+        raise FormatError("holds complex numbers: a field; give its power, the square of their absolute values")
     if data.dtype.kind not in "iuf":
-        raise Refusal(f"holds an array of the type {data.dtype!s:.40}, expected numbers")
+        raise FormatError(f"holds an array of the type {data.dtype!s:.40}, expected numbers")
     if data.ndim == 3 and data.shape[0] > MAX_BANDS:
-        raise Refusal(f"holds {data.shape[0]} bands, more than {MAX_BANDS}; bands come first: (n_band, n_y, n_x)")
+        raise FormatError(f"holds {data.shape[0]} bands, more than {MAX_BANDS}; bands come first: (n_band, n_y, n_x)")
     images = data.reshape(-1, *data.shape[-2:])
     is_small = images.dtype.itemsize <= (4 if images.dtype.kind == "f" else 2)
     converted: Images = images.astype(np.float32 if is_small else np.float64, copy=False)
@@ -236,11 +207,11 @@ def _pitch_um(found: Found, given: Given) -> Pitch:
     if given.pitch_um is not None:
         return given.pitch_um
     if found.pitch_um is None:
-        raise Refusal("does not tell the size of its cells; give pitch_um=..., their side or (width, height) in µm")
+        raise FormatError("does not tell the size of its cells; give pitch_um=..., their side or (width, height) in µm")
     try:
         along_x, along_y = check_pitch_um("pitch_um", found.pitch_um)
     except ParameterError as error:
-        raise Refusal(f"has cells of a size outside the allowed range ({error})") from None
+        raise FormatError(f"has cells of a size outside the allowed range ({error})") from None
     return along_x if abs(along_x - along_y) <= SQUARE * max(along_x, along_y) else (along_x, along_y)
 
 
@@ -254,18 +225,18 @@ def _wavelengths_nm(images: Images, found: Found, given: Given) -> Floats:
             )
         return waves_nm
     if found.wavelength_nm is None:
-        raise Refusal(f"does not tell the wavelengths of its bands; give wavelength_nm=..., {n_band} in nm")
+        raise FormatError(f"does not tell the wavelengths of its bands; give wavelength_nm=..., {n_band} in nm")
     try:
         waves_nm = wavelengths_nm("wavelength_nm", np.asarray(found.wavelength_nm, dtype=np.float64))
     except ParameterError as error:
-        raise Refusal(f"tells no wavelengths ({error})") from None
+        raise FormatError(f"tells no wavelengths ({error})") from None
     if waves_nm.size != n_band:
-        raise Refusal(f"tells {waves_nm.size} wavelengths, and has {n_band} bands")
+        raise FormatError(f"tells {waves_nm.size} wavelengths, and has {n_band} bands")
     return waves_nm
 
 
 def _in_w_m2(images: Images, waves_nm: Floats, found: Found, given: Given) -> Images:
-    unit, size = (given.unit, 1.0) if given.unit is not None else _told_unit(found.unit)
+    unit, size = (given.unit, 1.0) if given.unit is not None else _parsed_unit(found.unit)
     width_nm = _band_widths_nm(waves_nm, found, given) if unit in PER_NM else None
     factor = size * per_band_w_m2(unit, waves_nm, width_nm)
     if np.all(factor == 1.0):
@@ -277,13 +248,15 @@ def _in_w_m2(images: Images, waves_nm: Floats, found: Found, given: Given) -> Im
     return read_only(data)
 
 
-def _told_unit(text: str | None) -> tuple[Unit, float]:
+def _parsed_unit(text: str | None) -> tuple[Unit, float]:
     choices = ", ".join(map(repr, UNITS))
     if text is None:
-        raise Refusal(f"does not tell its unit; give unit=..., one of {choices}")
+        raise FormatError(f"does not tell its unit; give unit=..., one of {choices}")
     unit = light_unit(text)
     if unit is None:
-        raise Refusal(f"is in {text!r:.40}, which is no irradiance; if that is wrong give unit=..., one of {choices}")
+        raise FormatError(
+            f"is in {text!r:.40}, which is no irradiance; if that is wrong give unit=..., one of {choices}"
+        )
     return unit
 
 
@@ -295,13 +268,13 @@ def _band_widths_nm(waves_nm: Floats, found: Found, given: Given) -> Floats:
         if width_nm.shape not in ((), (1,), waves_nm.shape) or not np.all((width_nm > 0.0) & np.isfinite(width_nm)):
             rule = f"must be one positive number, or one for each of the {waves_nm.size} bands"
             if given.band_width_nm is None:
-                raise Refusal(f"tells widths of its bands that {rule}")
+                raise FormatError(f"tells widths of its bands that {rule}")
             raise ParameterError("band_width_nm", rule, given.band_width_nm, "nm")
         return np.array(np.broadcast_to(width_nm, waves_nm.shape))
     order = np.argsort(waves_nm)
     steps = np.diff(waves_nm[order])
     if steps.size == 0 or np.any(steps <= 0.0):
-        raise Refusal("is per nm, and does not tell how wide its bands are; give band_width_nm=...")
+        raise FormatError("is per nm, and does not tell how wide its bands are; give band_width_nm=...")
     # The outermost bands reach as far out as they reach in.
     width_nm = np.empty_like(waves_nm)
     width_nm[order] = 0.5 * (np.concatenate((steps[:1], steps)) + np.concatenate((steps, steps[-1:])))
@@ -314,15 +287,15 @@ def check_numbers(data: Images) -> None:
 
     Raises
     ------
-    Refusal
+    FormatError
         When a number is not finite, or below 0 by more than rounding.
     """
     lowest, highest = float(data.min()), float(data.max())
     if not (np.isfinite(lowest) and np.isfinite(highest)):
         where = np.unravel_index(int(np.argmin(np.isfinite(data))), data.shape)
-        raise Refusal(f"holds {data[where]} at [band, row, column] = {[int(i) for i in where]}; light is finite")
+        raise FormatError(f"holds {data[where]} at [band, row, column] = {[int(i) for i in where]}; light is finite")
     if lowest < -DARKEST * max(highest, 0.0):
         where = np.unravel_index(int(np.argmin(data)), data.shape)
-        raise Refusal(
+        raise FormatError(
             f"holds negative light, {lowest:.6g} W/m² at [band, row, column] = {[int(i) for i in where]}; clip it first"
         )

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foveasim._core.extras import needs
-from foveasim._io.atomic import check_room, folder_written_whole
-from foveasim._io.formats import FileFormat
+from foveasim._io.atomic import atomic_directory, check_room
+from foveasim._io.formats import FileFormat, FormatError
 from foveasim.errors import FileError
 from foveasim.fields import PowerMap
-from foveasim.maps._common import Found, Refusal, check_size
+from foveasim.maps._common import Found, check_size
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._xarray import NAME, X, Y, found_in_array, to_xarray
 
@@ -82,7 +82,7 @@ def write_zarr(power_map: PowerMap, path: Path) -> None:
         When zarr is missing, the folder's place is taken by something else, or nothing can be written there.
     """
     _needs(path, "zarr")
-    with folder_written_whole(path, is_ours=is_zarr) as folder:
+    with atomic_directory(path, is_ours=is_zarr) as folder:
         dataset = to_xarray(power_map).to_dataset()
         encoding: dict[str, dict[str, Any]] = {str(name): {"compressors": None} for name in dataset.variables}
         dataset.to_zarr(folder, mode="w", encoding=encoding, consolidated=False, zarr_format=3)
@@ -132,7 +132,7 @@ def _chosen(dataset: xr.Dataset, name: str | None) -> str:
     names = [str(n) for n in dataset.data_vars]
     if name is not None:
         if name not in names:
-            raise Refusal(f"has no variable {name!r:.40}; there are {', '.join(n[:40] for n in names[:5])}")
+            raise FormatError(f"has no variable {name!r:.40}; there are {', '.join(n[:40] for n in names[:5])}")
         return name
     if NAME in names:
         return NAME
@@ -142,7 +142,9 @@ def _chosen(dataset: xr.Dataset, name: str | None) -> str:
         if len(candidates) == 1:
             return candidates[0]
     told = f"holds {len(maps)} arrays of numbers with rows and columns"
-    raise Refusal(f"{told}: {', '.join(n[:40] for n in maps[:5])}; say which is the map with name=" if maps else told)
+    raise FormatError(
+        f"{told}: {', '.join(n[:40] for n in maps[:5])}; say which is the map with name=" if maps else told
+    )
 
 
 # -- what a file may not do -------------------------------------------------------------------------------------------
@@ -160,9 +162,9 @@ def _check_hdf5(path: Path) -> None:
             for key in group:
                 n_objects += 1
                 if n_objects > MAX_OBJECTS:
-                    raise Refusal(f"holds more than {MAX_OBJECTS} arrays and groups")
+                    raise FormatError(f"holds more than {MAX_OBJECTS} arrays and groups")
                 if not isinstance(group.get(key, getlink=True), h5py.HardLink):
-                    raise Refusal(
+                    raise FormatError(
                         "holds a link to another place, which is not followed; copy what it names into the file"
                     )
                 part = group[key]
@@ -173,20 +175,20 @@ def _check_hdf5(path: Path) -> None:
                 if isinstance(part, h5py.Group):
                     groups.append(part)
                 elif isinstance(part, h5py.Dataset) and (part.external or part.is_virtual):
-                    raise Refusal("keeps its numbers in another file, which is not opened; copy them into this one")
+                    raise FormatError("keeps its numbers in another file, which is not opened; copy them into this one")
 
 
 def _check_zarr(path: Path) -> int:
     """Refuse folders that name programs other than known packers; the bytes in the folder."""
     for number, found in enumerate(_metadata_files(path)):
         if number > MAX_OBJECTS:
-            raise Refusal(f"holds more than {MAX_OBJECTS} arrays and groups")
+            raise FormatError(f"holds more than {MAX_OBJECTS} arrays and groups")
         if found.is_symlink() or found.stat().st_size > MAX_METADATA_BYTES:
-            raise Refusal(f"has a broken {found.name}")
+            raise FormatError(f"has a broken {found.name}")
         try:
             _check_codecs(json.loads(found.read_text(encoding="utf-8")))
         except (ValueError, RecursionError) as error:
-            raise Refusal(f"has a broken {found.name} ({error})") from None
+            raise FormatError(f"has a broken {found.name} ({error})") from None
     return sum(
         (Path(folder) / file).stat().st_size for folder, _, files in os.walk(path, followlinks=False) for file in files
     )
@@ -210,7 +212,7 @@ def _check_codecs(metadata: Any) -> None:
 
     Raises
     ------
-    Refusal
+    FormatError
         When it names a program that is not known to do nothing but unpack numbers, or a type of Python objects.
     """
     stack = [metadata]
@@ -225,15 +227,15 @@ def _check_codecs(metadata: Any) -> None:
             for codec in np.atleast_1d(np.array(part.get(key) or [], dtype=object)).tolist():
                 named = codec.get("name", codec.get("id")) if isinstance(codec, dict) else codec
                 if named not in ZARR_CODECS:
-                    raise Refusal(f"is packed with {named!r:.40}, which is not known to hold nothing but numbers")
+                    raise FormatError(f"is packed with {named!r:.40}, which is not known to hold nothing but numbers")
         shape, kind = part.get("shape"), part.get("dtype", part.get("data_type"))
         if isinstance(kind, str) and ("O" in kind or "object" in kind):
-            raise Refusal("holds Python objects, expected numbers")
+            raise FormatError("holds Python objects, expected numbers")
         if isinstance(shape, list) and not all(isinstance(n, int) and 0 <= n < 2**40 for n in shape):
-            raise Refusal("has an array of an impossible shape")
+            raise FormatError("has an array of an impossible shape")
         for chunk in (part.get("chunks"), part.get("chunk_shape")):
             if isinstance(chunk, list) and not 0 < math.prod(n if isinstance(n, int) else 0 for n in chunk) < 2**33:
-                raise Refusal("has chunks of an impossible size")
+                raise FormatError("has chunks of an impossible size")
 
 
 def _needs(path: Path, engine: str) -> None:

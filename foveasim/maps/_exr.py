@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from foveasim._core.extras import needs
-from foveasim._io.formats import FileFormat
+from foveasim._io.formats import FileFormat, FormatError
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import PowerMap, to_file_rows
-from foveasim.maps._common import MAX_BANDS, Found, Refusal, check_size
+from foveasim.maps._common import MAX_BANDS, Found, check_size
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._text import about_map, found_in_text
 
@@ -70,28 +70,28 @@ def read(path: Path, name: str | None) -> Found:
     """Read the channels that are bands, by rising wavelength, or in the order in which we wrote them."""
     exr = _openexr(path)
     if name is not None:
-        raise Refusal("holds one map without a name; leave name= out")
+        raise FormatError("holds one map without a name; leave name= out")
     with exr.File(str(path), header_only=True) as file:
         if len(file.parts) != 1:
-            raise Refusal(f"holds {len(file.parts)} pictures; give a file with one")
+            raise FormatError(f"holds {len(file.parts)} pictures; give a file with one")
         header = file.header()
         low, high = (np.asarray(corner, dtype=np.int64) for corner in header["dataWindow"])
         n_x, n_y = (high - low + 1).tolist()
         channels = {c.name: (c.xSampling, c.ySampling) for c in header["channels"]}
         if len(channels) > MAX_BANDS or min(n_x, n_y) < 1:
-            raise Refusal(f"holds {len(channels)} channels of {n_x} x {n_y}")
+            raise FormatError(f"holds {len(channels)} channels of {n_x} x {n_y}")
         check_size((len(channels), n_y, n_x), ITEMSIZE, path.stat().st_size)
         text, told = (v if isinstance(v := header.get(key), str) else None for key in (ATTRIBUTE, "emissiveUnits"))
     bands = _bands(list(channels))
     if any(channels[channel] != (1, 1) for channel in bands):
-        raise Refusal("has channels of fewer cells than others")
+        raise FormatError("has channels of fewer cells than others")
     with exr.File(str(path), separate_channels=True) as file:
         pixels = file.channels()
         ours = found_in_text(text or "", np.empty((1, 1)), is_y_falling=True)
         if ours.wavelength_nm is not None:
             order = [_channel_name(wavelength) for wavelength in ours.wavelength_nm]
             if sorted(order) != sorted(bands):
-                raise Refusal("tells other wavelengths than its channels have")
+                raise FormatError("tells other wavelengths than its channels have")
             return replace(ours, data=np.stack([pixels[channel].pixels for channel in order]))
         data = np.stack([pixels[channel].pixels for channel in bands])
     waves = [wavelength for wavelength in bands.values() if wavelength is not None]
@@ -110,7 +110,7 @@ def _bands(names: list[str]) -> dict[str, float | None]:
         numbers = {name: float(match["number"].replace(",", ".")) for name, match in waves.items()}
         return {name: numbers[name] for name in sorted(numbers, key=numbers.__getitem__)}
     if len(names) > 1 and set(names) <= set("RGBA"):
-        raise Refusal("holds the colours of a picture, and not light by wavelength; make a Scene of it")
+        raise FormatError("holds the colours of a picture, and not light by wavelength; make a Scene of it")
     return dict.fromkeys(names)
 
 

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 
 from foveasim._core.extras import needs
-from foveasim._io.formats import FileFormat
+from foveasim._io.formats import FileFormat, FormatError
 from foveasim.errors import FileError
 from foveasim.fields import PowerMap
-from foveasim.maps._common import UNEVEN, Found, Refusal, check_size
+from foveasim.maps._common import UNEVEN, Found, check_size
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._text import about_map, found_in_text
 from foveasim.maps._units import length_in_um
@@ -72,14 +72,14 @@ def read(path: Path, name: str | None) -> Found:
         header = hdu.header
         check_size(hdu.shape, max(abs(int(header["BITPIX"])) // 8, 1), n_bytes)
         if math.prod(hdu.shape) * abs(int(header["BITPIX"])) // 8 > n_bytes:
-            raise Refusal("is cut short")
+            raise FormatError("is cut short")
         data = np.asarray(hdu.data)
         n_axes = data.ndim
         text = header.get(KEYWORD)
         found = found_in_text(text if isinstance(text, str) else "", data, is_y_falling=False)
         if found.pitch_um is not None:
             return found
-        return replace(found, **_told(header, data.shape, n_axes))
+        return replace(found, **_header_values(header, data.shape, n_axes))
 
 
 def _image(file: Any, name: str | None) -> Any:
@@ -94,20 +94,20 @@ def _image(file: Any, name: str | None) -> Any:
         if hdu.is_image and hdu.shape and 0 not in hdu.shape:
             return hdu
         if hdu.header.get("ZIMAGE") is True:
-            raise Refusal("is compressed; unpack it first, with funpack")
+            raise FormatError("is compressed; unpack it first, with funpack")
         if name is not None:
             break
-    raise Refusal("holds no image" if name is None else f"holds no image {name!r:.40}")
+    raise FormatError("holds no image" if name is None else f"holds no image {name!r:.40}")
 
 
-def _told(header: Any, shape: tuple[int, ...], n_axes: int) -> dict[str, Any]:
+def _header_values(header: Any, shape: tuple[int, ...], n_axes: int) -> dict[str, Any]:
     """What a header tells of pitch, place, wavelengths and unit."""
-    told: dict[str, Any] = _told_plane(header, shape)
+    told: dict[str, Any] = _plane_values(header, shape)
     if n_axes >= 3 and str(header.get("CTYPE3", "")).strip().upper() in WAVES:
         per = length_in_um(str(header.get("CUNIT3", "m")))
         step, start = _step(header, 3), _number(header, "CRVAL3", 0)
         if per is None:
-            raise Refusal(f"tells wavelengths in {str(header.get('CUNIT3'))!r:.20}, expected a length")
+            raise FormatError(f"tells wavelengths in {str(header.get('CUNIT3'))!r:.20}, expected a length")
         if step is not None:
             channel = np.arange(shape[-3]) + 1.0 - _number(header, "CRPIX3", 1)
             told["wavelength_nm"] = ((start + step * channel) * (per * 1e3)).tolist()
@@ -117,7 +117,7 @@ def _told(header: Any, shape: tuple[int, ...], n_axes: int) -> dict[str, Any]:
     return told
 
 
-def _told_plane(header: Any, shape: tuple[int, ...]) -> dict[str, Any]:
+def _plane_values(header: Any, shape: tuple[int, ...]) -> dict[str, Any]:
     steps = [_step(header, axis) for axis in (1, 2)]
     units = [length_in_um(str(header.get(f"CUNIT{axis}", ""))) for axis in (1, 2)]
     if None not in steps and None not in units:
@@ -144,7 +144,7 @@ def _step(header: Any, axis: int) -> float | None:
             if one != axis and (
                 _number(header, f"{prefix}{axis}_{one}", 0) or _number(header, f"{prefix}{one}_{axis}", 0)
             ):
-                raise Refusal("is turned against its coordinates; resample it first")
+                raise FormatError("is turned against its coordinates; resample it first")
     if f"CD{axis}_{axis}" in header:
         return _number(header, f"CD{axis}_{axis}", 0) or None
     return _number(header, f"CDELT{axis}", 0) * _number(header, f"PC{axis}_{axis}", 1) or None
@@ -153,7 +153,7 @@ def _step(header: Any, axis: int) -> float | None:
 def _number(header: Any, keyword: str, default: int) -> float:
     value = header.get(keyword, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise Refusal(f"tells {value!r:.20} as its {keyword}, expected a number")
+        raise FormatError(f"tells {value!r:.20} as its {keyword}, expected a number")
     return float(value)
 
 

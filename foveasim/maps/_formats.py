@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from foveasim._core.extras import needs
 from foveasim._core.registry import Registry
 from foveasim._io import sandbox
-from foveasim._io.formats import FileFormat
-from foveasim.maps._common import Found, Refusal, as_images, max_unpacked, one_sentence
+from foveasim._io.formats import FileFormat, FormatError, as_file_error
+from foveasim.errors import ParameterError
+from foveasim.maps._common import Found, as_images, max_unpacked
 
 __all__ = ["MAP_FORMATS", "read_found"]
 
@@ -56,11 +57,11 @@ def _read(path: str, format_name: str, name: str | None) -> tuple[dict[str, Any]
     """What a reader finds, taken apart for its way between the processes."""
     form = MAP_FORMATS[format_name]
     assert form.read is not None
-    with one_sentence(Path(path)):
+    with as_file_error(Path(path), "power map", passes=(ParameterError,)):
         try:
             found: Found = form.read(Path(path), name)
         except ModuleNotFoundError as error:
-            raise Refusal(needs(error.name or "a library", "maps")) from None
+            raise FormatError(needs(error.name or "a library", "maps")) from None
         told = asdict(replace(found, data=np.empty(0)))
         del told["data"]
         return told, [as_images(found.data)]

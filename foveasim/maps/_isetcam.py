@@ -19,9 +19,9 @@ from typing import IO, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._io.formats import FileFormat
+from foveasim._io.formats import FileFormat, FormatError
 from foveasim.fields import from_file_rows
-from foveasim.maps._common import Found, Refusal, check_size, max_unpacked
+from foveasim.maps._common import Found, check_size, max_unpacked
 from foveasim.maps._formats import MAP_FORMATS
 
 __all__ = ["MAT5_MAGIC", "MAT73_MAGIC", "read_mat5", "read_mat73"]
@@ -98,15 +98,15 @@ def _struct(names: list[str], name: str | None) -> str | None:
     if name is None and {"data", "photons"} & set(names):
         return None
     told = ", ".join(n[:40] for n in names[:5])
-    raise Refusal(f"holds no optical image {name or 'oi'!r:.40}; there are {told or 'no variables'}")
+    raise FormatError(f"holds no optical image {name or 'oi'!r:.40}; there are {told or 'no variables'}")
 
 
 def _found(field: Field) -> Found:
     photons, waves = (next((v for n in names if (v := field(n)) is not None), None) for names in (PHOTONS, WAVES))
     if photons is None:
-        raise Refusal("holds no optical image with data.photons; compute it first, with oiCompute")
+        raise FormatError("holds no optical image with data.photons; compute it first, with oiCompute")
     if photons.ndim not in (2, 3) or 0 in photons.shape:
-        raise Refusal(f"has photons of the shape {photons.shape[:5]}, expected (row, column, wave)")
+        raise FormatError(f"has photons of the shape {photons.shape[:5]}, expected (row, column, wave)")
     images = from_file_rows(_whole(photons, field))
     pitch = _pitch_um(field, photons.shape[1])
     return Found(
@@ -124,7 +124,7 @@ def _whole(photons: NDArray[Any], field: Field) -> NDArray[Any]:
         return photons
     low, high = _number(field("data/dmin")), _number(field("data/dmax"))
     if low is None or high is None or not low <= high:
-        raise Refusal("has photons as whole numbers, without the dmin and dmax that they stand between")
+        raise FormatError("has photons as whole numbers, without the dmin and dmax that they stand between")
     return low + (high - low) / float(np.iinfo(photons.dtype).max) * photons.astype(np.float64)
 
 
@@ -161,12 +161,12 @@ def _unpacked(path: Path) -> bytes:
         while len(tag := file.read(TAG_BYTES)) == TAG_BYTES:
             kind, length = int.from_bytes(tag[:4], order), int.from_bytes(tag[4:], order)  # type: ignore[arg-type]
             if kind not in (COMPRESSED, MATRIX) or length > n_bytes:
-                raise Refusal("is broken: an element of the file is no variable, or longer than the file")
+                raise FormatError("is broken: an element of the file is no variable, or longer than the file")
             element = _inflated(file, length, most - size) if kind == COMPRESSED else tag + file.read(length)
             pieces.append(element)
             size += len(element)
             if size > most:
-                raise Refusal(f"would unpack to more than {most} bytes; save it unpacked, with -v6")
+                raise FormatError(f"would unpack to more than {most} bytes; save it unpacked, with -v6")
     return b"".join(pieces)
 
 
@@ -176,7 +176,7 @@ def _inflated(file: IO[bytes], length: int, most: int) -> bytes:
     while length > 0 and size <= most:
         packed = file.read(min(length, PIECE_BYTES))
         if not packed:
-            raise Refusal("is cut short")
+            raise FormatError("is cut short")
         length -= len(packed)
         while packed and size <= most:
             parts.append(inflater.decompress(packed, PIECE_BYTES))

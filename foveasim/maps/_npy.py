@@ -15,10 +15,10 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._io.formats import FileFormat
+from foveasim._io.formats import FileFormat, FormatError
 from foveasim._io.npz import read_array, zip_members
 from foveasim.fields import PowerMap
-from foveasim.maps._common import Found, Refusal, check_size
+from foveasim.maps._common import Found, check_size
 from foveasim.maps._formats import MAP_FORMATS
 
 __all__ = ["NPY_MAGIC", "ZIP_MAGICS", "read_npy", "read_npz", "write_npz"]
@@ -74,19 +74,19 @@ def read_npz(path: Path, name: str | None) -> Found:
 
 def _check_no_name(name: str | None) -> None:
     if name is not None:
-        raise Refusal("holds one array without a name; leave name= out")
+        raise FormatError("holds one array without a name; leave name= out")
 
 
 def _chosen(names: list[str], name: str | None) -> str:
     others = [n for n in names if n not in ABOUT]
     if name is not None:
         if name not in names:
-            raise Refusal(f"has no array {name!r:.40}; there are {', '.join(map(repr, names[:5]))}")
+            raise FormatError(f"has no array {name!r:.40}; there are {', '.join(map(repr, names[:5]))}")
         return name
     if DATA in others:
         return DATA
     if len(others) != 1:
-        raise Refusal(f"holds {len(others)} arrays, none called 'data'; say which is the map with name=")
+        raise FormatError(f"holds {len(others)} arrays, none called 'data'; say which is the map with name=")
     return others[0]
 
 
@@ -101,7 +101,7 @@ def _list(values: NDArray[Any] | None) -> list[float] | None:
 
 def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo, n_bytes: int) -> NDArray[Any]:
     if item.filename.removesuffix(".npy") in ABOUT and item.file_size > MAX_ABOUT_BYTES:
-        raise Refusal(f"is broken: {item.filename!r:.40} has {item.file_size} bytes")
+        raise FormatError(f"is broken: {item.filename!r:.40} has {item.file_size} bytes")
     check_size((item.file_size,), 1, n_bytes)
     with archive.open(item) as file:
         return _array(file, item.file_size, n_bytes)
@@ -110,7 +110,7 @@ def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo, n_bytes: int) -> ND
 def _array(file: IO[bytes], size: int, n_bytes: int) -> NDArray[Any]:
     def check(shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         if dtype.hasobject or not dtype.itemsize:
-            raise Refusal("holds Python objects or nothing; save an array of numbers")
+            raise FormatError("holds Python objects or nothing; save an array of numbers")
         check_size(shape, dtype.itemsize, n_bytes)
 
     return read_array(file, size, check)

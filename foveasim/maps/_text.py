@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foveasim._io.formats import FormatError
 from foveasim.fields import PowerMap
-from foveasim.maps._common import Found, Refusal
+from foveasim.maps._common import Found
 
 __all__ = ["about_map", "found_in_text"]
 
@@ -37,20 +38,20 @@ def found_in_text(text: str, data: NDArray[Any], *, is_y_falling: bool) -> Found
 
     Raises
     ------
-    Refusal
+    FormatError
         When the text is ours, and broken.
     """
     about = _parsed(text)
     if not isinstance(about, dict) or about.get("format") != FILE_FORMAT:
         return Found(data=data, is_y_falling=is_y_falling)
     if about.get("version") != FILE_VERSION:
-        raise Refusal(f"has the format version {about.get('version')!r:.40}, expected {FILE_VERSION}")
+        raise FormatError(f"has the format version {about.get('version')!r:.40}, expected {FILE_VERSION}")
     try:
         pitch_x_um, pitch_y_um = map(float, np.broadcast_to(about["pitch_um"], (2,)))
         x0, y0 = map(float, about["origin_um"])
         waves = [float(w) for w in about["wavelength_nm"]]
     except (KeyError, TypeError, ValueError):
-        raise Refusal("tells a pitch, an origin or wavelengths that are no numbers") from None
+        raise FormatError("tells a pitch, an origin or wavelengths that are no numbers") from None
     return Found(
         data=data,
         is_y_falling=is_y_falling,

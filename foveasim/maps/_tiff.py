@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._io.formats import FileFormat
+from foveasim._io.formats import FileFormat, FormatError
 from foveasim._io.images import pixels_of_page
 from foveasim.fields import PowerMap, to_file_rows
-from foveasim.maps._common import MAX_BANDS, Found, Refusal, check_size
+from foveasim.maps._common import MAX_BANDS, Found, check_size
 from foveasim.maps._formats import MAP_FORMATS
 from foveasim.maps._text import about_map, found_in_text
 
@@ -51,22 +51,22 @@ def read(path: Path, name: str | None) -> Found:
     import tifffile
 
     if name is not None:
-        raise Refusal("holds one map without a name; leave name= out")
+        raise FormatError("holds one map without a name; leave name= out")
     n_bytes = path.stat().st_size
     with tifffile.TiffFile(path) as file:
         n_pages = len(file.pages)
         if not 1 <= n_pages <= MAX_BANDS:
-            raise Refusal(f"holds {n_pages} pages, expected one for each band")
+            raise FormatError(f"holds {n_pages} pages, expected one for each band")
         pages = [file.pages[i] for i in range(n_pages)]
         first: Any = pages[0]
         for page in pages:
             if page.shape != first.shape or page.dtype != first.dtype or page.dtype is None:
-                raise Refusal("holds pages of different sizes or types, expected one for each band")
+                raise FormatError("holds pages of different sizes or types, expected one for each band")
             if page.photometric not in (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB):
-                raise Refusal("holds colours of a picture; save numbers, with 0 as black")
+                raise FormatError("holds colours of a picture; save numbers, with 0 as black")
         check_size((n_pages, *first.shape), first.dtype.itemsize, n_bytes)
         if n_pages > 1 and first.ndim != 2:
-            raise Refusal(f"holds {n_pages} pages of the shape {first.shape}, expected one for each band")
+            raise FormatError(f"holds {n_pages} pages of the shape {first.shape}, expected one for each band")
         images = [pixels_of_page(path, page) for page in pages]
         data = images[0][np.newaxis] if n_pages == 1 else np.stack(images)
         if first.ndim == 3:
@@ -74,7 +74,7 @@ def read(path: Path, name: str | None) -> Found:
         orientation = first.tags[ORIENTATION_TAG].value if ORIENTATION_TAG in first.tags else ON_TOP
         description = str(first.description)
     if orientation not in (ON_TOP, BELOW):
-        raise Refusal(f"is turned, as its orientation {orientation!s:.10} tells; save it upright")
+        raise FormatError(f"is turned, as its orientation {orientation!s:.10} tells; save it upright")
     return found_in_text(description, data, is_y_falling=orientation == ON_TOP)
 
 

@@ -9,9 +9,10 @@ import numpy as np
 
 from foveasim._core.extras import install_hint
 from foveasim._core.validation import Floats
+from foveasim._io.formats import FormatError
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, Pitch, PowerMap
-from foveasim.maps._common import Found, Given, Refusal, finished, pitch_of_axes
+from foveasim.maps._common import Found, Given, finished, pitch_of_axes
 from foveasim.maps._units import Unit, length_in_um
 
 if TYPE_CHECKING:
@@ -109,7 +110,7 @@ def from_xarray(
     )
     try:
         return finished(found_in_array(data_array), given)
-    except Refusal as refusal:
+    except FormatError as refusal:
         raise ParameterError("data_array", str(refusal)) from None
 
 
@@ -119,7 +120,7 @@ def found_in_array(array: xr.DataArray) -> Found:
 
     Raises
     ------
-    Refusal
+    FormatError
         When its dimensions are not those of a map, or its coordinates uneven.
     """
     array = array.squeeze([d for d in array.dims if array.sizes[d] == 1 and d not in (*X, *Y, *BAND)], drop=True)
@@ -127,12 +128,12 @@ def found_in_array(array: xr.DataArray) -> Found:
     if len(names) in (2, 3) and all(str(d).startswith(NAMELESS) for d in names):
         return Found(data=array.to_numpy(), unit=_unit(array))
     if 0 in array.shape:
-        raise Refusal(f"holds an array of the shape {array.shape}, which is empty")
+        raise FormatError(f"holds an array of the shape {array.shape}, which is empty")
     x, y = _one_of(names, X), _one_of(names, Y)
     rest = [d for d in names if d not in (x, y)]
     if x is None or y is None or len(rest) > 1:
         told = ", ".join(str(d)[:20] for d in names[:6])
-        raise Refusal(f"has the dimensions ({told}), expected (wavelength, y, x); rename them")
+        raise FormatError(f"has the dimensions ({told}), expected (wavelength, y, x); rename them")
     array = array.transpose(*rest, y, x)
     along_x, along_y = (_coordinate(array, d) for d in (x, y))
     if along_x is None or along_y is None:
@@ -158,7 +159,7 @@ def _coordinate(array: xr.DataArray, name: Hashable) -> Floats | None:
         return None
     values = array.coords[name].to_numpy()
     if values.dtype.kind not in "iuf":
-        raise Refusal(f"has coordinates along {name!s:.20} that are no numbers")
+        raise FormatError(f"has coordinates along {name!s:.20} that are no numbers")
     return values.astype(np.float64)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.provenance import described
+from foveasim._core.provenance import to_plain_data
 from foveasim._core.validation import Floats, Ints
 from foveasim._io.sandbox import read_in_sandbox
 from foveasim.errors import FileError, ParameterError
@@ -48,7 +48,7 @@ def most_bytes(layout: Layout, n_before: int, t_us: Ints) -> int:
     per_event = sum(np.dtype(kind).itemsize for kind in KINDS.values())
     n_chunks = min(int(t_us[-1]) // 1000 + 1, MAX_MS) // CHUNK + 1 if t_us.size else 1
     of_layout = sum(values.nbytes for values in packed_layout(layout).values()) + 32 * layout.n_sites
-    about = len(json.dumps(described(dict(layout.provenance))))
+    about = len(json.dumps(to_plain_data(dict(layout.provenance))))
     return per_event * (n_before + t_us.size) + 8 * CHUNK * n_chunks + of_layout + about + METADATA_BYTES
 
 
@@ -81,7 +81,7 @@ class EventFile:
             if values.dtype.kind not in NUMBERS + TEXT:
                 raise ParameterError("batches", f"have a layout whose {name} is of {values.dtype}, which HDF5 has not")
             file[f"layout/{name}"] = np.char.encode(values, "utf-8") if values.dtype.kind == "U" else values
-        provenance = json.dumps(described(dict(layout.provenance)))
+        provenance = json.dumps(to_plain_data(dict(layout.provenance)))
         file["layout/provenance"] = np.frombuffer(provenance.encode(), np.uint8)
         file.attrs.update({"format": FORMAT, "version": VERSION})
 

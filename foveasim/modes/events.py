@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.extras import needs
-from foveasim._core.provenance import described
+from foveasim._core.provenance import to_plain_data
 from foveasim._core.validation import Floats, Ints, as_numbers, check_number, finite_array, own, read_only
-from foveasim._io.atomic import check_room, written_whole
+from foveasim._io.atomic import atomic_write, check_room
+from foveasim._io.formats import as_file_error
 from foveasim._io.npz import opened_archive, write_archive
 from foveasim.errors import FileError, FoveasimWarning, ParameterError
 from foveasim.layout import Layout
@@ -289,16 +290,16 @@ class Events:
             write_events([self], target, pitch_um=pitch_um)
         elif ending == ".npy":
             events = self.structured(pitch_um=pitch_um)
-            with written_whole(target) as temporary, temporary.open("wb") as file:
+            with atomic_write(target) as temporary, temporary.open("wb") as file:
                 np.save(file, events, allow_pickle=False)
         elif ending == ".txt":
             x, y = self.addresses(pitch_um)
             rows = np.stack((self.t_s, x[self.site], y[self.site], self.polarity > 0), axis=1)
-            with written_whole(target) as temporary:
+            with atomic_write(target) as temporary:
                 np.savetxt(temporary, rows, fmt=("%.9f", "%d", "%d", "%d"))
         elif ending == ".npz":
             arrays = {name: np.asarray(getattr(self, name)) for name in ARRAYS}
-            about = {"format": FORMAT, "version": VERSION, "provenance": described(dict(self.layout.provenance))}
+            about = {"format": FORMAT, "version": VERSION, "provenance": to_plain_data(dict(self.layout.provenance))}
             write_archive(target, about, arrays | packed_layout(self.layout))
         else:
             raise FileError(target, "must end in .npz, .h5, .hdf5, .npy or .txt")
@@ -318,13 +319,8 @@ class Events:
             _needs_h5py(source)
             if not source.is_file():
                 raise FileError(source, "is not a file" if source.exists() else "no such file")
-            try:
+            with as_file_error(source, "file of events"):
                 return cls(*_hdf5.read_events(source))
-            except FileError:
-                raise
-            except Exception as error:  # noqa: BLE001 -- a broken file makes its readers trip over anything
-                told = " ".join(str(error).split())
-                raise FileError(source, f"is broken or no file of events ({told:.200})") from None
         with opened_archive(source, "file of events", FORMAT, VERSION) as (about, arrays):
             layout = unpacked_layout(arrays, about.get("provenance", {}))
             return cls(arrays["t_s"], arrays["site"], arrays["polarity"], layout)
@@ -372,7 +368,7 @@ def write_events(batches: Iterable[Events], path: str | Path, *, pitch_um: float
     import h5py
 
     file: _hdf5.EventFile | None = None
-    with written_whole(target) as temporary, ExitStack() as opened:
+    with atomic_write(target) as temporary, ExitStack() as opened:
         for batch in _following("batches", batches):
             t_us = _whole_us(batch.t_s)
             # HDF5 crashes on a full disk.

@@ -73,7 +73,7 @@ def linearised(code: ArrayLike, sensor: Sensor) -> Floats:
     [-0.5, 64.0, 254.5]
     """
     _require_sensor(sensor)
-    return _looked_up(code, sensor.converter.linear_dn, 2.0**sensor.bits - 1.0)
+    return _interpolate(code, sensor.converter.linear_dn, 2.0**sensor.bits - 1.0)
 
 
 def nominal_e_per_dn(sensor: Sensor) -> Floats:
@@ -81,7 +81,7 @@ def nominal_e_per_dn(sensor: Sensor) -> Floats:
     return np.atleast_1d(volts_to_electrons(sensor.v_sat_v / 2.0**sensor.bits, np.asarray(sensor.capacitance_f)))
 
 
-def _looked_up(code: ArrayLike, linear_dn: Floats, highest_dn: float) -> Floats:
+def _interpolate(code: ArrayLike, linear_dn: Floats, highest_dn: float) -> Floats:
     values = finite_array("code", code, at_least=0.0)
     if values.size and values.max() > highest_dn:
         raise ParameterError("code", f"must be <= {highest_dn:g} everywhere", float(values.max()), "DN")
@@ -309,7 +309,7 @@ class Calibration:
             When no two sites of the layout are neighbours, or the exposure's dark signal is not known.
         """
         codes = _per_site("code", code, self.n_sites)
-        linear_dn = codes if self.linear_dn is None else _looked_up(codes, self.linear_dn, self.linear_dn.size - 1.0)
+        linear_dn = codes if self.linear_dn is None else _interpolate(codes, self.linear_dn, self.linear_dn.size - 1.0)
         is_usable = np.broadcast_to(self.gain > 0.0, codes.shape)
         if self.highest_dn is not None:
             is_usable = is_usable & (codes < self.highest_dn)
@@ -483,7 +483,7 @@ class _Frames:
             self.n_lowest, self.n_highest = np.zeros(code.size, np.int64), np.zeros(code.size, np.int64)
         self.n_frames += 1
         table = self.linear_dn
-        linear_dn = code.astype(np.float64) if table is None else _looked_up(code, table, table.size - 1.0)
+        linear_dn = code.astype(np.float64) if table is None else _interpolate(code, table, table.size - 1.0)
         off_dn = linear_dn - self.mean_dn
         self.mean_dn += off_dn / self.n_frames
         self.squares_dn2 += off_dn * (linear_dn - self.mean_dn)

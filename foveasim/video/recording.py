@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.extras import library
-from foveasim._core.provenance import described, differences
+from foveasim._core.provenance import differences, to_plain_data
 from foveasim._core.validation import Floats, check_count
-from foveasim._io.atomic import folder_written_whole, lock, remove_folder
+from foveasim._io.atomic import atomic_directory, lock, remove_folder
+from foveasim._io.formats import as_file_error
 from foveasim._io.zarr_stores import ZARR, check_codecs
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
@@ -32,7 +33,7 @@ __all__ = [
     "partial_of",
     "read_recording",
     "record",
-    "record_on",
+    "resume_recording",
 ]
 
 FORMAT, VERSION = "foveasim video", 1
@@ -167,7 +168,7 @@ def frames_kept(path: str | Path) -> int:
 def _trusted(source: Path, mode: str = "r") -> Iterator[Any]:
     """The group of a recording; what its folder holds may be anything, and whatever that breaks is told in one sentence."""
     zarr = library(source, "zarr")
-    try:
+    with as_file_error(source, "video of captures", passes=(FileError,)):
         check_codecs(source, CODECS, "video of captures")
         group = zarr.open_group(str(source), mode=mode, use_consolidated=False)  # which is not what was checked
         if group.attrs.get("format") != FORMAT:
@@ -180,10 +181,6 @@ def _trusted(source: Path, mode: str = "r") -> Iterator[Any]:
         if sum(array.nbytes for array in arrays) > MAX_UNPACKED_BYTES:
             raise FileError(source, f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
         yield group
-    except FileError:
-        raise
-    except Exception as error:  # noqa: BLE001 -- a broken folder makes its readers trip over anything
-        raise FileError(source, f"is broken or no video of captures ({' '.join(str(error).split())})") from None
 
 
 def _is_recording(folder: Path) -> bool:
@@ -222,7 +219,7 @@ def alike(captures: Iterable[Capture], *, n_before: int = 0) -> Iterator[Capture
 def record(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | None) -> int:
     """Write captures to a zarr folder, whole or not at all; their number."""
     library(target, "zarr")
-    with folder_written_whole(target, is_ours=_is_recording) as folder:
+    with atomic_directory(target, is_ours=_is_recording) as folder:
         frames = _Frames(folder, plan)
         for capture in alike(captures):
             frames.add(capture)
@@ -230,7 +227,7 @@ def record(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | 
     return frames.n_whole
 
 
-def record_on(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | None) -> int:
+def resume_recording(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | None) -> int:
     """Write captures to a zarr folder after those that are kept; the number of all."""
     library(target, "zarr")
     if target.exists():
@@ -468,7 +465,7 @@ class _Frames:
                 "white_dn": capture.white_dn.tolist(),
                 "settings": _plain(capture.settings),
                 "varied": [],
-                "provenance": described(dict(layout.provenance)),
+                "provenance": to_plain_data(dict(layout.provenance)),
                 "plan": _plain(self._plan),
             },
         )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.extras import library
 from foveasim._core.validation import check_count, check_number
-from foveasim._io.atomic import folder_written_whole, written_whole
+from foveasim._io.atomic import atomic_directory, atomic_write
 from foveasim._io.images import write_picture
 from foveasim._io.zarr_stores import ZARR
 from foveasim.capture import Capture
@@ -22,7 +22,7 @@ from foveasim.integrate import Integrator
 from foveasim.layout import Layout
 from foveasim.reconstruct import Picture, fill_channels, raster_grid
 from foveasim.reconstruct.picture import covered_share
-from foveasim.video.recording import alike, frames_kept, record, record_on
+from foveasim.video.recording import alike, frames_kept, record, resume_recording
 
 __all__ = ["write_video"]
 
@@ -107,9 +107,9 @@ def write_video(
             f"is for .zarr folders; others, as {target.name}, are written whole or not at all",
         )
     if progress:
-        captures = _told(captures, n_frames, frames_kept(target) if resume else 0)
+        captures = _with_progress(captures, n_frames, frames_kept(target) if resume else 0)
     if ending == ZARR:
-        return (record_on if resume else record)(captures, target, plan)
+        return (resume_recording if resume else record)(captures, target, plan)
     if ending == ".gif":
         return _write_gif(captures, target, frame_s, max_pixels)
     if ending in VIDEO_ENDINGS:
@@ -121,7 +121,7 @@ def write_video(
     return _write_pictures(captures, target, max_pixels)
 
 
-def _told(captures: Iterable[Capture], n_frames: int | None, n_before: int) -> Iterator[Capture]:
+def _with_progress(captures: Iterable[Capture], n_frames: int | None, n_before: int) -> Iterator[Capture]:
     from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn, TimeRemainingColumn
 
     from foveasim._io.terminal import PlainConsole, spinner_of
@@ -178,7 +178,7 @@ def _write_pictures(captures: Iterable[Capture], target: Path, max_pixels: int) 
         return folder.is_dir() and all(p.name.startswith("frame_") and p.suffix == ".png" for p in folder.iterdir())
 
     n_frames = 0
-    with folder_written_whole(target, is_ours=is_pictures) as folder:
+    with atomic_directory(target, is_ours=is_pictures) as folder:
         raster: _Raster | None = None
         for capture in alike(captures):
             raster = raster or _Raster(capture.layout, max_pixels)
@@ -200,7 +200,7 @@ def _write_gif(captures: Iterable[Capture], target: Path, frame_s: float, max_pi
             n_frames += 1
             yield Image.fromarray(raster.flat(capture)).quantize(256)
 
-    with written_whole(target) as temporary:
+    with atomic_write(target) as temporary:
         all_pictures = pictures()
         first = next(all_pictures)
         first.save(
@@ -218,7 +218,7 @@ def _write_film(captures: Iterable[Capture], target: Path, frame_s: float, max_p
     av = library(target, "av")
     codec = "libvpx-vp9" if target.suffix.lower() == ".webm" else "libx264"
     n_frames = 0
-    with written_whole(target) as temporary:
+    with atomic_write(target) as temporary:
         try:
             with av.open(str(temporary), mode="w") as container:
                 raster: _Raster | None = None

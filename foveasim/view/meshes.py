@@ -16,7 +16,7 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.extras import install_hint
-from foveasim._core.provenance import described
+from foveasim._core.provenance import to_plain_data
 from foveasim._core.rings import next_vertex, positions_in_runs
 from foveasim._core.threads import each, thread_count
 from foveasim._core.validation import Bools, Floats, Ints, as_numbers, check_length_um, finite_array, unmasked
@@ -293,7 +293,7 @@ def polydata(data: Layout | Capture) -> PolyData:
         "readout_line": layout.readout_line,
         **layout.columns,
     }
-    notes: dict[str, Mapping[str, Any]] = {"provenance": described(dict(layout.provenance))}
+    notes: dict[str, Mapping[str, Any]] = {"provenance": to_plain_data(dict(layout.provenance))}
     if isinstance(data, Capture):
         columns |= {name: getattr(data, name) for name in MEASURED}
         notes["settings"] = data.settings

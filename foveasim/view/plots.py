@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foveasim._core.validation import Floats, check_choice, unmasked
-from foveasim._io.atomic import written_whole
+from foveasim._io.atomic import atomic_write
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout import Layout, readout_order
@@ -189,7 +189,7 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = 150.0) -> None:
     options: dict[str, Any] = {"pil_kwargs": {"compress_level": 3}} if Path(path).suffix.lower() == ".png" else {}
     # In memory: on a full disk some encoders leave half a file.
     encoded = io.BytesIO()
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         try:
             figure.savefig(encoded, format=Path(path).suffix[1:].lower() or None, dpi=dpi, **options)
         except ValueError as error:
@@ -277,7 +277,7 @@ def _plot(
         _explain(ax, colours)
 
     def told(x: float, y: float) -> str:  # matplotlib calls with these names
-        return _told(layout, colours, x, y, find(x, y))
+        return _format_site(layout, colours, x, y, find(x, y))
 
     ax.format_coord = told  # type: ignore[method-assign]
     return ax
@@ -301,7 +301,7 @@ def _explain(ax: Axes, colours: SiteColours) -> None:
         ax.set_title(f"{colours.title or 'kind'}: {n_kinds} in {len(CATEGORY_COLOURS)} colours", fontsize="medium")
 
 
-def _told(layout: Layout, colours: SiteColours, x_um: float, y_um: float, site: int) -> str:
+def _format_site(layout: Layout, colours: SiteColours, x_um: float, y_um: float, site: int) -> str:
     """What stands below a window for the point under the mouse."""
     place = f"x = {x_um:.6g} µm, y = {y_um:.6g} µm"
     if site < 0:

@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.extras import library
 from foveasim._core.rings import next_vertex, positions_in_runs
 from foveasim._core.validation import Floats, Ints, check_count, check_length_um, check_number
-from foveasim._io.atomic import written_whole
+from foveasim._io.atomic import atomic_write
 from foveasim.capture import Capture
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout import Layout, inset
@@ -414,7 +414,7 @@ def write_meshes(meshes: Sequence[Mesh], path: str | Path) -> None:
     if not bodies:
         raise GeometryError("there is nothing left of the solids to write")
     whole = trimesh.Scene(bodies) if kind in (".glb", ".3mf") else trimesh.util.concatenate(list(bodies.values()))
-    with written_whole(target) as temporary, temporary.open("wb") as file:
+    with atomic_write(target) as temporary, temporary.open("wb") as file:
         content = whole.export(file_type=kind[1:])
         file.write(content.encode() if isinstance(content, str) else content)
 

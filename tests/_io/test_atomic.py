@@ -8,7 +8,7 @@ from contextlib import suppress
 
 import pytest
 
-from foveasim._io.atomic import folder_written_whole, remove_folder
+from foveasim._io.atomic import atomic_directory, remove_folder
 from foveasim.errors import FileError
 
 
@@ -41,7 +41,7 @@ def test_removing_absent_folder_does_nothing(tmp_path):
 
 def test_failed_folder_write_leaves_nothing(tmp_path):
     def write():
-        with folder_written_whole(tmp_path / "a", is_ours=bool) as new:
+        with atomic_directory(tmp_path / "a", is_ours=bool) as new:
             (new / "b").write_bytes(b"half")
             raise OSError(28, "No space left on device")
 

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from foveasim._io.atomic import check_room, written_whole
+from foveasim._io.atomic import atomic_write, check_room
 from foveasim.errors import FileError, disk_problem
 
 #: Every writer of the package, in a process that may write files of 1000 bytes.
@@ -95,7 +95,7 @@ def test_disk_errors_are_found_in_other_errors(error, tmp_path):
     (tmp_path / "x.npz").write_text("former")
     with (
         pytest.raises(FileError, match=r"x\.npz: cannot be written: No space left on device"),
-        written_whole(tmp_path / "x.npz"),
+        atomic_write(tmp_path / "x.npz"),
     ):
         raise error
 
@@ -106,7 +106,7 @@ def test_disk_errors_are_found_in_other_errors(error, tmp_path):
 def test_other_errors_keep_their_message(tmp_path):
     assert disk_problem(RuntimeError("errno=2")) == ""
     for error in (ValueError("a wrong value"), FileError("y.npz", "cannot hold that")):
-        with pytest.raises(type(error), match=str(error)), written_whole(tmp_path / "x.npz"):
+        with pytest.raises(type(error), match=str(error)), atomic_write(tmp_path / "x.npz"):
             raise error
 
 

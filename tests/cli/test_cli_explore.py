@@ -276,10 +276,10 @@ def test_a_file_says_what_a_call_says(folder):
         seed=3,
     )
 
-    assert read.described() == called.described()
+    assert read.to_dict() == called.to_dict()
     assert (read.n_trials, read.name) == (14, "study")
     assert set(read.base.metrics) == {"snr", "n_sites"}
-    assert read.described()["files"] == {}
+    assert read.to_dict()["files"] == {}
 
 
 @pytest.mark.parametrize(
@@ -319,7 +319,7 @@ def test_files_of_all_choices_are_beside_the_study_and_among_what_it_depends_on(
     by_file = {(json.loads(t.params["layout"]), t.user_attrs["n_sites"]) for t in found.trials}
     assert by_file == {("1.yaml", 1), ("2.yaml", 4)}
     (folder / "deep" / "2.yaml").write_text("changed")
-    assert explore.read_study(folder / "deep" / "study.yaml").described() != plan.described()
+    assert explore.read_study(folder / "deep" / "study.yaml").to_dict() != plan.to_dict()
 
 
 def test_the_trials_of_another_program_are_left_alone(foveasim, folder):
@@ -487,7 +487,7 @@ def test_a_recipe_in_a_file_is_the_call_of_its_name(folder, recipe):
     read = explore.read_data_set(folder / "own.yaml").data_set
     called = getattr(explore, recipe)(folder / "photos", PHOTOGRAPHED)
 
-    assert read.described() == called.described()
+    assert read.to_dict() == called.to_dict()
     assert_same(read[5 % len(read)], called[5 % len(read)])
 
 
@@ -750,8 +750,8 @@ def test_files_that_a_layouts_own_file_names_are_among_what_results_depend_on(fo
         Image.fromarray(np.full((8, 8), level, np.uint8)).save(folder / "deep" / "density.png")
         told.append(
             [
-                explore.plan_sweep(folder / "shot.yaml", {"sensor.bits": [8]}).described(),
-                explore.DataSet(folder / "photos", folder / "photographed.yaml").described(),
+                explore.plan_sweep(folder / "shot.yaml", {"sensor.bits": [8]}).to_dict(),
+                explore.DataSet(folder / "photos", folder / "photographed.yaml").to_dict(),
             ]
         )
 

@@ -165,7 +165,7 @@ def test_interrupted_batch_resumes_bit_identically(stopped_at, tmp_path, monkeyp
         return explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=24, seed=5, batch=6, **options)
 
     whole = run()
-    store_result, n_stored = study._told, []
+    store_result, n_stored = study._store_result, []
 
     def interrupted(*args):
         if len(n_stored) == stopped_at:
@@ -173,7 +173,7 @@ def test_interrupted_batch_resumes_bit_identically(stopped_at, tmp_path, monkeyp
         n_stored.append(None)
         store_result(*args)
 
-    monkeypatch.setattr(study, "_told", interrupted)
+    monkeypatch.setattr(study, "_store_result", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(storage=tmp_path / "study.db")
     monkeypatch.undo()

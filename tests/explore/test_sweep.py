@@ -545,33 +545,33 @@ PLAN = explore.plan_sweep(SHOT, {"sensor.bits": [8, 9, 10]})
 
 def test_a_journal_forgets_the_line_that_was_cut_off_and_nothing_else(tmp_path):
     store = tmp_path / "r.zarr"
-    with Journal(store, PLAN.described()) as journal:
+    with Journal(store, PLAN.to_dict()) as journal:
         for point in range(3):
             journal.add(Record(point, {"a": 0.1 + point, "curve": values_of("c", np.arange(3.0))["c"]}, "", "µ"))
     whole = journal_of(store).read_bytes()
     for n_cut in (1, 20, 60):
         journal_of(store).write_bytes(whole[:-n_cut])
-        with Journal(store, PLAN.described()) as journal:
+        with Journal(store, PLAN.to_dict()) as journal:
             assert sorted(journal.records) == [0, 1]
             assert journal.records[1].values["a"] == 1.1
             np.testing.assert_array_equal(journal.records[1].values["curve"].data, np.arange(3.0))
     damaged = bytearray(whole)
     damaged[whole.index(b'"a": 1.1') + 5] ^= 1
     journal_of(store).write_bytes(damaged)
-    with Journal(store, PLAN.described()) as journal:
+    with Journal(store, PLAN.to_dict()) as journal:
         assert sorted(journal.records) == [0, 2]
 
 
 def test_a_journal_that_was_cut_off_in_its_first_line_is_begun_anew(tmp_path):
     store = tmp_path / "r.zarr"
-    with Journal(store, PLAN.described()) as journal:
+    with Journal(store, PLAN.to_dict()) as journal:
         head = journal_of(store).read_bytes()
     for torn in (head[:40], head[:-1], b"\0" * 100, b""):
         journal_of(store).write_bytes(torn)
-        with Journal(store, PLAN.described()) as journal:
+        with Journal(store, PLAN.to_dict()) as journal:
             assert journal.records == {}
             journal.add(Record(0, {"a": 1.0}))
-        with Journal(store, PLAN.described()) as journal:
+        with Journal(store, PLAN.to_dict()) as journal:
             assert sorted(journal.records) == [0]
         journal_of(store).unlink()
 
@@ -584,20 +584,20 @@ def test_a_full_disk_is_told_and_leaves_what_was_written_whole(tmp_path, monkeyp
         write(file, bytes(data)[:10])
         raise OSError(28, "No space left on device")
 
-    with Journal(store, PLAN.described()) as journal:
+    with Journal(store, PLAN.to_dict()) as journal:
         journal.add(Record(0, {"a": 1.0}))
         monkeypatch.setattr(os, "write", full)
         with pytest.raises(FileError, match=r"No space left on device; 1 points are kept in it"):
             journal.add(Record(1, {"a": 2.0}))
     monkeypatch.undo()
-    with Journal(store, PLAN.described()) as journal:
+    with Journal(store, PLAN.to_dict()) as journal:
         assert sorted(journal.records) == [0]
 
 
 def test_two_programs_do_not_write_the_same_store(tmp_path):
     store = tmp_path / "r.zarr"
-    with Journal(store, PLAN.described()), pytest.raises(FileError, match="being written by another program"):
-        Journal(store, PLAN.described())
+    with Journal(store, PLAN.to_dict()), pytest.raises(FileError, match="being written by another program"):
+        Journal(store, PLAN.to_dict())
 
 
 def test_a_store_of_another_sweep_is_left_alone(tmp_path):
@@ -695,10 +695,10 @@ ODD = {
 def test_whatever_a_metric_gives_is_kept_and_can_be_read(odd, tmp_path):
     plan = explore.plan_sweep(SHOT, {"exposure_s": [0.01, 0.02]}, repeats=2)
     records = {k: Record(k, values_of("odd", ODD[odd](k % 2))) for k in range(plan.n_points)}
-    with Journal(tmp_path / "r.zarr", plan.described()) as journal:
+    with Journal(tmp_path / "r.zarr", plan.to_dict()) as journal:
         for record in records.values():
             journal.add(record)
-    with Journal(tmp_path / "r.zarr", plan.described()) as journal:
+    with Journal(tmp_path / "r.zarr", plan.to_dict()) as journal:
         found = dataset_of(plan, journal.records)
     write_store(found, tmp_path / "r.zarr")
 
@@ -1000,7 +1000,7 @@ def test_a_file_says_what_a_call_says(folder):
         seed=3,
     )
 
-    assert read.described() == called.described()
+    assert read.to_dict() == called.to_dict()
     assert read.shape == (2, 10, 3)
     assert read.dims == ("sensor.bits", "exposure_s", "repeat")
 
@@ -1057,7 +1057,7 @@ def test_results_are_of_the_files_as_they_were(folder):
 
     assert plans[0].settings == plans[1].settings
     assert plans[0].settings["scene"]["picture"] == str(folder / "photo.png")
-    assert plans[0].described() != plans[1].described()
+    assert plans[0].to_dict() != plans[1].to_dict()
 
 
 # -- who may talk to a sweep's own scheduler ------------------------------------------------------------------------

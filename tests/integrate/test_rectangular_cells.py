@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from reference.polygons import ZOO
 
 import foveasim as fs
-from foveasim._core.provenance import described
+from foveasim._core.provenance import to_plain_data
 from foveasim.config import read_shot, schema
 from foveasim.distortion import BrownConrady
 from foveasim.errors import FileError, ParameterError
@@ -94,7 +94,7 @@ def test_grid_pitch_is_hashable_plain_data(pitch):
     assert pickle.loads(pickle.dumps(grid)) == grid
     assert {grid: 1}[fs.Grid((3, 4), (0.5, 2.0))] == 1
     assert grid != fs.Grid((3, 4), (2.0, 0.5))
-    assert described(grid) == {"kind": "Grid", "shape": [3, 4], "pitch_um": [0.5, 2.0], "origin_um": [0.0, 0.0]}
+    assert to_plain_data(grid) == {"kind": "Grid", "shape": [3, 4], "pitch_um": [0.5, 2.0], "origin_um": [0.0, 0.0]}
 
 
 @pytest.mark.parametrize(

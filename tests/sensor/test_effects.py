@@ -323,15 +323,15 @@ def test_settings_describe_registered_effects():
     sensor = Sensor(
         layout, **FINE, read_noise_e=2.0, coupling=fs.sensor.Coupling(neighbour_share=0.01), effects=[Registered(2.5)]
     )
-    from foveasim._core.provenance import described
+    from foveasim._core.provenance import to_plain_data
 
-    settings = described(sensor)
+    settings = to_plain_data(sensor)
     again = Sensor.from_settings(layout, settings)
 
     assert again.chain[-1] == Registered(2.5)
     assert again.coupling == sensor.coupling
     with pytest.raises(ParameterError, match="'sensor' must be given: its effect 'LampFlicker' is not registered"):
-        Sensor.from_settings(layout, described(Sensor(layout, effects=[LampFlicker()])))
+        Sensor.from_settings(layout, to_plain_data(Sensor(layout, effects=[LampFlicker()])))
 
 
 @effects.EFFECTS.register("registered of test_effects")

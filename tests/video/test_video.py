@@ -810,7 +810,7 @@ def test_a_folder_that_is_no_recording_is_told(tmp_path):
     with pytest.raises(FileError, match="no such folder"):
         read_recording(tmp_path / "none.zarr")
     (tmp_path / "empty.zarr").mkdir()
-    with pytest.raises(FileError, match="broken or no video"):
+    with pytest.raises(FileError, match="broken, or no video"):
         read_recording(tmp_path / "empty.zarr")
 
 

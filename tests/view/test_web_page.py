@@ -21,7 +21,7 @@ from matplotlib import colormaps
 from reference.ray_casting import first_hits, rays_of
 
 import foveasim as fs
-from foveasim._core.provenance import described
+from foveasim._core.provenance import to_plain_data
 from foveasim._io.images import read_picture
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout.drc.report import read_lyrdb
@@ -75,7 +75,7 @@ def capture_of(layout, filters=("R", "G", "B"), **sensor):
         filter_names=filters,
         bits=10,
         white_dn=np.full(len(filters), 800.0),
-        settings={"exposure_s": 0.01, "sensor": {**described(fs.Sensor(layout, **ELECTRONICS)), **sensor}},
+        settings={"exposure_s": 0.01, "sensor": {**to_plain_data(fs.Sensor(layout, **ELECTRONICS)), **sensor}},
     )
 
 

@@ -256,7 +256,7 @@ class DataSet:
         """Whether samples differ in their photosites."""
         return any(path == LAYOUT or path.startswith(LAYOUT + ".") for path in self._draws)
 
-    def described(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """All that samples depend on, as plain data; of pictures, masks and flows not what they hold: see :meth:`digest`."""
         labels = {
             "labels": self._labels,
@@ -265,9 +265,9 @@ class DataSet:
             "flows": self._flows is not None,
         }
         return {
-            "pictures": self._pictures.described(),
+            "pictures": self._pictures.to_dict(),
             "settings": self._settings,
-            "vary": {path: draw.described() for path, draw in self._draws.items()},
+            "vary": {path: draw.to_dict() for path, draw in self._draws.items()},
             "cameras": self.cameras,
             "draws": self.draws,
             "seed": self.seed,
@@ -310,9 +310,9 @@ class DataSet:
         try:
             return what(place)
         except FoveasimError as error:
-            raise self._told_of(place, error) from None
+            raise self._with_sample_name(place, error) from None
 
-    def _told_of(self, index: int, error: FoveasimError) -> FoveasimError:
+    def _with_sample_name(self, index: int, error: FoveasimError) -> FoveasimError:
         which = f"sample {index} ({self._name_of(index)})"
         if isinstance(error, ConfigError):
             return ConfigError(error.path, f"{which}: {str(error).removeprefix(f'{error.path}: ')}")
@@ -349,7 +349,7 @@ class DataSet:
         parts = self._kept.setdefault(part, OrderedDict())
         key = json.dumps(settings, sort_keys=True)
         if key not in parts:
-            with _told_warnings() as caught:
+            with _caught_warnings() as caught:
                 made = make()
             parts[key] = made, [_warning(each.message) for each in caught]
             if len(parts) > KEPT:
@@ -399,7 +399,7 @@ class DataSet:
 
     def _sample(self, index: int) -> dict[str, Any]:
         self._told = []
-        with _told_warnings() as caught:
+        with _caught_warnings() as caught:
             drawn = self._drawn(index)
             shot, capture = self._captured(index)
             sample: dict[str, Any] = {"index": index, "picture": self._picture_of(index)}
@@ -574,7 +574,7 @@ def _filled(array: NDArray[Any], n: int, value: Any) -> NDArray[Any]:
 
 
 @contextmanager
-def _told_warnings() -> Iterator[list[warnings.WarningMessage]]:
+def _caught_warnings() -> Iterator[list[warnings.WarningMessage]]:
     """All warnings, but those that Python gives whenever it finds a file left open."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

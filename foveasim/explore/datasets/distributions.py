@@ -98,7 +98,7 @@ class Draw:
         number = min(max(number, low), high)  # rounding
         return number, number
 
-    def described(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """The distribution as plain data, as :func:`draw_of` takes it."""
         return {self.kind: list(self.values)} | ({} if self.weights is None else {"weights": list(self.weights)})
 

@@ -42,7 +42,7 @@ class Source(Protocol):
     def labels(self) -> list[Any] | None:
         """What the source itself says of every picture's class, or None."""
 
-    def described(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Plain data that tells the source from others, but what its pictures hold."""
 
     @property
@@ -137,8 +137,8 @@ class _Folder:
     def labels(self) -> list[Any] | None:
         return _folder_labels(self._names)
 
-    def described(self) -> dict[str, Any]:
-        return {"kind": "folder", **_told(self._names)}
+    def to_dict(self) -> dict[str, Any]:
+        return {"kind": "folder", **_names_digest(self._names)}
 
     def digest(self, k: int) -> str:
         return digest_of(self._folder / self._names[k])
@@ -198,8 +198,8 @@ class _Zip:
             self._opened = os.getpid(), zipfile.ZipFile(self._path)
         return self._opened[1]
 
-    def described(self) -> dict[str, Any]:
-        return {"kind": "zip", **_told(self._names)}
+    def to_dict(self) -> dict[str, Any]:
+        return {"kind": "zip", **_names_digest(self._names)}
 
     def digest(self, k: int) -> str:
         # What is unpacked is checked against this sum.
@@ -231,7 +231,7 @@ class _Array:
     def labels(self) -> list[Any] | None:
         return None
 
-    def described(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         return {"kind": "array", "shape": list(self._pictures.shape), "dtype": str(self._pictures.dtype)}
 
     def digest(self, k: int) -> str:
@@ -276,7 +276,7 @@ class _ArrayFile:
     def labels(self) -> list[Any] | None:
         return None
 
-    def described(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         array = self._array()
         return {"kind": "array file", "name": self._path.name, "shape": list(array.shape), "dtype": str(array.dtype)}
 
@@ -342,8 +342,8 @@ class _Items:
             return [self._items[k][1] for k in range(len(self))]
         return None
 
-    def described(self) -> dict[str, Any]:
-        names = {} if self.is_lazy else _told([self.name(k) for k in range(len(self))])
+    def to_dict(self) -> dict[str, Any]:
+        names = {} if self.is_lazy else _names_digest([self.name(k) for k in range(len(self))])
         return {"kind": "items", "n": len(self)} | names
 
     @property
@@ -361,7 +361,7 @@ def _is_image(item: Any) -> bool:
     return pillow is not None and isinstance(item, pillow.Image)
 
 
-def _told(names: Sequence[str]) -> dict[str, Any]:
+def _names_digest(names: Sequence[str]) -> dict[str, Any]:
     """How many names there are, and a sum of them."""
     return {"n": len(names), "sha256": hashlib.sha256("\n".join(names).encode()).hexdigest()}
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from foveasim._core.extras import needs
 from foveasim._core.threads import thread_count
 from foveasim._core.validation import check_count
-from foveasim._io.atomic import folder_written_whole, written_whole
+from foveasim._io.atomic import atomic_directory, atomic_write
 from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore.datasets.dataset import DataSet
 from foveasim.explore.executor import KILLED, executor
@@ -113,7 +113,7 @@ def write_data_set(
                 "layout", "must not vary in a zarr folder, whose arrays have one length; take a folder of tar files"
             )
         _zarr(target)
-    plan = json.loads(json.dumps(data_set.described()))
+    plan = json.loads(json.dumps(data_set.to_dict()))
     about = _about_of(target) if os.path.exists(target) else None  # noqa: PTH110 -- also where it must not be looked for
     if about is None:
         with warnings.catch_warnings():
@@ -396,7 +396,7 @@ class _TarShards(_Shards):
 
     @staticmethod
     def begin(target: Path, about: Mapping[str, Any], data_set: DataSet, first: Mapping[str, Any]) -> None:  # noqa: ARG004 -- for all kinds alike
-        with folder_written_whole(target, is_ours=lambda _: False) as new:
+        with atomic_directory(target, is_ours=lambda _: False) as new:
             (new / ABOUT).write_text(json.dumps(about, indent=1), encoding="utf-8")
             if not data_set.is_layout_varied:
                 data_set.layout.write(new / "layout.npz")
@@ -418,7 +418,7 @@ class _TarShards(_Shards):
 
     def write(self, k: int, samples: Sequence[Mapping[str, Any]], made_of: str) -> None:
         with (
-            written_whole(self._file(k)) as temporary,
+            atomic_write(self._file(k)) as temporary,
             tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar,
         ):
             _add(tar, MADE_OF, made_of.encode())
@@ -474,7 +474,7 @@ class _ZarrShards(_Shards):
         n, per_shard = about["n_samples"], about["per_shard"]
         n_shards = -(-n // per_shard)
 
-        with folder_written_whole(target, is_ours=lambda _: False) as new:
+        with atomic_directory(target, is_ours=lambda _: False) as new:
             group = zarr.open_group(str(new), mode="w", zarr_format=3)
             for name, value in _flat(first).items():
                 if isinstance(value, str):

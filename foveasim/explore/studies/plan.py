@@ -82,9 +82,9 @@ class StudyPlan:
             put_setting(self.base.source, settings, path, value)
         return dict(settings)
 
-    def described(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """All that trials depend on, as plain data: a study goes on where it equals."""
-        base = {key: value for key, value in self.base.described().items() if key not in NOT_OF_STUDIES}
+        base = {key: value for key, value in self.base.to_dict().items() if key not in NOT_OF_STUDIES}
         return base | {
             "files": dict(self.files),
             "search": {path: _plain(where) for path, where in self.search.items()},

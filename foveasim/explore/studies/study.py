@@ -178,7 +178,9 @@ def run_study(
                 with _using(storage, n_done):
                     for trial in trials:
                         _check_writer(optuna, storage, trial, token)
-                        _told(optuna, found, trial, records[trial.number], list(plan.objectives), plan.constraints)
+                        _store_result(
+                            optuna, found, trial, records[trial.number], list(plan.objectives), plan.constraints
+                        )
                 n_done += len(trials)
                 trials = []
     if tell is not None:
@@ -252,7 +254,7 @@ def _shown(value: Any, where: Search) -> str:
     return text if len(text) <= LONGEST_CHOICE else text[: LONGEST_CHOICE - 3] + "..."
 
 
-def _told(
+def _store_result(
     optuna: Any,
     found: optuna.Study,
     trial: optuna.Trial,
@@ -320,16 +322,16 @@ def _begin(
         The rest of a batch whose results were being stored when the study was interrupted: their settings are sampled already.
         Trials of a batch without results are given up, and sampled again.
     """
-    described = plan.described()
+    plan_dict = plan.to_dict()
     before = found.user_attrs.get(PLAN)
     if before is not None:
-        check_same_plan(Path(storage_name(storage)), before, described)
+        check_same_plan(Path(storage_name(storage)), before, plan_dict)
     elif found.get_trials(deepcopy=False):
         raise FileError(
             storage_name(storage), f"holds a study '{found.study_name}' of another program; take another name"
         )
     else:
-        found.set_user_attr(PLAN, json.loads(json.dumps(described)))
+        found.set_user_attr(PLAN, json.loads(json.dumps(plan_dict)))
     found.set_user_attr(WRITER, token)
     running = found.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,))
     trials = [optuna.trial.Trial(found, trial._trial_id) for trial in running]  # noqa: SLF001 -- Optuna has no other way

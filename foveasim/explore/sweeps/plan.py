@@ -139,7 +139,7 @@ class Plan:
         is_new = np.diff(layout[order], prepend=-1) | np.diff(light[order], prepend=-1)
         return order, np.flatnonzero(is_new)
 
-    def described(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """All that results depend on, as plain data: a store goes on where it equals."""
         return {
             "settings": dict(self.settings),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from foveasim._core.extras import needs
 from foveasim._core.validation import unit_of
-from foveasim._io.atomic import folder_written_whole
+from foveasim._io.atomic import atomic_directory
 from foveasim.errors import FileError, ParameterError
 from foveasim.explore._records import FORMAT, VERSION, Record, Value
 from foveasim.explore.sweeps.plan import POINT, REPEAT, Plan, coordinate
@@ -82,13 +82,13 @@ def dataset_of(plan: Plan, records: Mapping[int, Record]) -> xr.Dataset:
     if plan.repeats > 1:
         coords[REPEAT] = np.arange(plan.repeats)
     coords |= {dim: (dim, array) for dim, (array, _) in labels.items()}
-    described = plan.described()
+    plan_dict = plan.to_dict()
     attributes = {
         "format": FORMAT,
         "version": VERSION,
-        SETTINGS: json.dumps(described["settings"]),
-        VERSIONS: json.dumps(described["versions"]),
-        PLAN: json.dumps(described),
+        SETTINGS: json.dumps(plan_dict["settings"]),
+        VERSIONS: json.dumps(plan_dict["versions"]),
+        PLAN: json.dumps(plan_dict),
     }
     return xr.Dataset(variables, coords, attributes)
 
@@ -274,7 +274,7 @@ def write_store(dataset: xr.Dataset, path: Path) -> None:
         When nothing can be written there.
     """
     with (
-        folder_written_whole(path, is_ours=lambda folder: stored_plan(folder) is not None) as new,
+        atomic_directory(path, is_ours=lambda folder: stored_plan(folder) is not None) as new,
         warnings.catch_warnings(),
     ):
         # Zarr has it for all who open the store with xarray, and warns that others may not read it so; they need not.

@@ -137,13 +137,13 @@ def run_sweep(
     check_store(store)
     before = stored_plan(store)
     if before is not None:
-        check_same_plan(store, before, plan.described())
+        check_same_plan(store, before, plan.to_dict())
         if not journal_of(store).exists():
             complete = open_results(store)
             # What points gave cannot be had from a store again as it was: without the journal, all are tried.
             if not (retry and (complete["error"] != "").any()):
                 return complete
-    with Journal(store, plan.described()) as journal:
+    with Journal(store, plan.to_dict()) as journal:
         if retry:
             for point in [point for point, record in journal.records.items() if record.error]:
                 del journal.records[point]

@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 
 from foveasim._core.extras import needs
-from foveasim._io.atomic import written_whole
+from foveasim._io.atomic import atomic_write
 from foveasim.errors import FileError
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def write_lyrdb(report: Report, path: str | Path) -> None:
             item.add_value(f"photosite {sites}: {violation.value:.9g} {violation.unit}".strip())
             for shape in _shapes(db, violation.marker):
                 item.add_value(shape)
-    with written_whole(target) as temporary:
+    with atomic_write(target) as temporary:
         database.save(str(temporary))
 
 
@@ -140,7 +140,7 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
     try:
         root = ET.fromstring(content)  # noqa: S314 -- entities, which could grow without end, are refused above
     except ET.ParseError as error:
-        raise FileError(source, f"is broken or no report ({error})") from None
+        raise FileError(source, f"is broken, or no report ({error})") from None
     if root.tag != "report-database":
         raise FileError(source, "is no report database of KLayout")
     found: dict[str, list[_Found]] = {}

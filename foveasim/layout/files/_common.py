@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from foveasim._core.provenance import described
+from foveasim._core.provenance import to_plain_data
 from foveasim._core.rings import site_area_um2
 from foveasim._core.validation import MAX_SITES, Floats
-from foveasim.errors import FileError, FoveasimError, GeometryError, ParameterError
+from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout.model import Layout
 
 __all__ = [
@@ -28,7 +27,6 @@ __all__ = [
     "header",
     "lossless",
     "max_unpacked",
-    "one_sentence",
     "restored_column",
     "rounding",
     "texts",
@@ -45,9 +43,6 @@ MIN_TEXT_BYTES, TEXT_BYTES_PER_LETTER = 2**28, 64
 #: Rings and edges of a site are looked at in pairs where they may meet: pairs of either in all sites, and for each there is.
 MAX_RING_PAIRS, PAIRS_PER_RING = 2_000_000, 100
 MAX_VERTEX_PAIRS, PAIRS_PER_VERTEX = 1_000_000_000, 1000
-#: Longer messages are cut: of other libraries, and of our own.
-MAX_TOLD = 200
-MAX_SENTENCE = 500
 #: Kinds of numpy types that text formats keep: truth values, whole numbers, floating-point numbers, text.
 PLAIN_KINDS = "biufU"
 
@@ -119,24 +114,6 @@ def check_unpacked(path: Path, n_bytes: int) -> None:
         raise FileError(path, f"would unpack to more than {max_unpacked(path)} bytes")
 
 
-@contextmanager
-def one_sentence(path: Path, kind: str) -> Iterator[None]:
-    """Whatever a broken file makes its readers trip over, as one FileError of one sentence."""
-    try:
-        yield
-    except FoveasimError as error:
-        raise FileError(path, _one_line(str(error).removeprefix(f"{path}: "), MAX_SENTENCE)) from None
-    except Exception as error:  # noqa: BLE001 -- a broken file makes its readers trip over anything
-        told = _one_line(str(error), MAX_TOLD) or type(error).__name__
-        raise FileError(path, f"is broken, or no {kind} layout ({told})") from None
-
-
-def _one_line(text: str, at_most: int) -> str:
-    """A text of another program, or with names of a file in it, so that it can be shown."""
-    line = " ".join("".join(c if c.isprintable() else " " for c in text[: 2 * at_most]).split())
-    return line if len(line) <= at_most else line[: at_most - 3] + "..."
-
-
 def check_sites_of(path: Path, n_sites: int) -> None:
     """
     Refuse a file with too many sites.
@@ -195,7 +172,7 @@ def checked_layout(
 
 def header(layout: Layout) -> dict[str, Any]:
     """Plain data that stands beside the outlines in a file: format, unit, origin."""
-    provenance = described(dict(layout.provenance))
+    provenance = to_plain_data(dict(layout.provenance))
     return {"format": FILE_FORMAT, "version": FILE_VERSION, "unit": "um", "provenance": provenance}
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["Refusal", "read"]
+__all__ = ["FormatError", "read"]
 
 #: Cells that KLayout adds for its own use begin with this.
 KLAYOUT_NOTES = "$$$CONTEXT_INFO$$$"
@@ -35,7 +35,7 @@ MAX_WORDS = 128
 MAX_CHARS = 1024
 
 
-class Refusal(Exception):  # noqa: N818 -- not an error of this program, but its answer
+class FormatError(Exception):
     """The file is refused, in one sentence that follows its name."""
 
 
@@ -107,7 +107,7 @@ def read(
 
     Raises
     ------
-    Refusal
+    FormatError
         When the file is rejected.
     """
     import gdstk
@@ -117,10 +117,10 @@ def read(
         library = (gdstk.read_oas if is_oasis else gdstk.read_gds)(path)
     if is_oasis and caught:
         # Where it meets what it does not know, it leaves out what follows; GDSII tells how much to skip.
-        raise Refusal(f"is broken, or holds what gdstk does not read ({caught[0].message})")
+        raise FormatError(f"is broken, or holds what gdstk does not read ({caught[0].message})")
     dbu_um = library.precision * 1e6
     if not (math.isfinite(dbu_um) and 1e-9 <= dbu_um <= 1e3 and 1e-12 <= library.unit <= 1.0):
-        raise Refusal(f"has the impossible database unit {dbu_um:g} µm")
+        raise FormatError(f"has the impossible database unit {dbu_um:g} µm")
     cells = {cell.name: cell for cell in library.cells}
     top = _top(cells, cell)
     order = _from_the_bottom(cells, top)
@@ -148,16 +148,16 @@ def _top(cells: dict[str, Any], wanted: str | None) -> str:
     """Name of the cell to read."""
     if wanted is not None:
         if wanted not in cells:
-            raise Refusal(f"has no cell {wanted!r}; its cells are {_listed(cells)}")
+            raise FormatError(f"has no cell {wanted!r}; its cells are {_listed(cells)}")
         return wanted
     below = {reference.cell_name for cell in cells.values() for reference in cell.references}
     tops = [n for n, c in cells.items() if n not in below and not n.startswith(KLAYOUT_NOTES)]
     if len(tops) > 1:
         tops = [name for name in tops if _own(cells[name]) or cells[name].references] or tops[:1]
     if not tops:
-        raise Refusal("has no cell on top: it is empty, or its cells hold each other")
+        raise FormatError("has no cell on top: it is empty, or its cells hold each other")
     if len(tops) > 1:
-        raise Refusal(f"has several cells on top, {_listed(tops)}; say which to read with cell=")
+        raise FormatError(f"has several cells on top, {_listed(tops)}; say which to read with cell=")
     return tops[0]
 
 
@@ -177,14 +177,14 @@ def _from_the_bottom(cells: dict[str, Any], top: str) -> list[str]:
             is_open[child] = True
             stack.append((child, _held(cells, child)))
         elif is_open[child]:
-            raise Refusal(f"has a cell that holds itself, {child!r}")
+            raise FormatError(f"has a cell that holds itself, {child!r}")
     return order
 
 
 def _held(cells: dict[str, Any], name: str) -> Iterator[str]:
     for child in dict.fromkeys(reference.cell_name for reference in cells[name].references):
         if child not in cells:
-            raise Refusal(f"refers to the cell {child!r}, which is not in it")
+            raise FormatError(f"refers to the cell {child!r}, which is not in it")
         yield child
 
 
@@ -202,10 +202,10 @@ def _check_numbers(cells: dict[str, Any], order: list[str], max_sites: int, max_
         n_copied += n_polygons[name]
         # A reference without shapes costs as well.
         if max(n_polygons[name], sum(k for _, k in references)) > max_sites or n_copied > COPIES * max_sites:
-            raise Refusal(f"has more than the {max_sites} sites that are read")
+            raise FormatError(f"has more than the {max_sites} sites that are read")
         n_vertices[name] = _own_vertices(cell, max_vertices) + sum(k * n_vertices[c] for c, k in references)
         if VERTEX_BYTES * n_vertices[name] + POLYGON_BYTES * n_polygons[name] > max_memory_bytes:
-            raise Refusal("would unpack to more sites and vertices than are read from a file of its size")
+            raise FormatError("would unpack to more sites and vertices than are read from a file of its size")
 
 
 def _own_vertices(cell: Any, most: int) -> int:
@@ -347,11 +347,11 @@ def _on_one_layer(shapes: Shapes, wanted: int | None) -> Shapes:
 
     layers = np.unique(shapes.tags[:, 0])
     if wanted is None and layers.size > 1:
-        raise Refusal(f"has shapes on the layers {_listed(layers.tolist())}; say which to read with layer=")
+        raise FormatError(f"has shapes on the layers {_listed(layers.tolist())}; say which to read with layer=")
     if wanted is None or layers.tolist() == [wanted]:
         return shapes
     if wanted not in layers:
-        raise Refusal(f"has no shape on layer {wanted}; there are some on {_listed(layers.tolist())}")
+        raise FormatError(f"has no shape on layer {wanted}; there are some on {_listed(layers.tolist())}")
     is_wanted = shapes.tags[:, 0] == wanted
     is_kept_vertex = np.repeat(is_wanted, shapes.counts)
     return Shapes(shapes.xy[is_kept_vertex], shapes.counts[is_wanted], shapes.tags[is_wanted], shapes.n_placements)

@@ -34,8 +34,8 @@ from numpy.typing import NDArray
 from foveasim._core.extras import needs
 from foveasim._core.rings import positions_in_runs, ring_moments
 from foveasim._core.validation import MAX_SITES, Floats, Ints, check_count, check_number
-from foveasim._io.atomic import written_whole
-from foveasim._io.formats import FileFormat
+from foveasim._io.atomic import atomic_write
+from foveasim._io.formats import FileFormat, as_file_error
 from foveasim._io.sandbox import PATIENCE, run_in_sandbox
 from foveasim.errors import FileError, GeometryError, ParameterError
 from foveasim.layout.files._columns import MAX_COLUMN_BYTES, columns_of, kept_columns, texts_of
@@ -44,7 +44,6 @@ from foveasim.layout.files._common import (
     check_sites_of,
     check_sizes,
     checked_layout,
-    one_sentence,
     rounding,
 )
 from foveasim.layout.files._formats import FORMATS
@@ -128,7 +127,7 @@ def write(layout: Layout, path: Path, *, layer: int = 1, dbu_um: float = DEFAULT
     lost = set_properties(polygons, layout, site.tolist(), part.tolist(), n_parts.tolist())
     library = gdstk.Library("FOVEASIM", unit=1e-6, precision=dbu_um * 1e-6)
     library.new_cell(CELL_NAME).add(*polygons)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         if is_oasis:
             library.write_oas(temporary, validation="crc32")
         else:
@@ -322,7 +321,7 @@ def read(path: Path, *, layer: int | None = None, cell: str | None = None) -> La
     kind = "GDSII or OASIS"
     if layer is not None:
         layer = check_count("layer", layer, at_least=0, at_most=2**31 - 1)
-    with one_sentence(path, kind):
+    with as_file_error(path, f"{kind} layout"):
         data = path.read_bytes()
         is_oasis = data.startswith(OASIS_MAGIC)
         (_check_oasis if is_oasis else _check_records)(path, data)

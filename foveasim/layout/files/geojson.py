@@ -21,8 +21,8 @@ import shapely
 from numpy.typing import NDArray
 
 from foveasim._core.validation import Floats, Ints, exact_integers
-from foveasim._io.atomic import written_whole
-from foveasim._io.formats import FileFormat
+from foveasim._io.atomic import atomic_write
+from foveasim._io.formats import FileFormat, as_file_error
 from foveasim.errors import FileError
 from foveasim.layout.files._common import (
     WrittenLayout,
@@ -32,7 +32,6 @@ from foveasim.layout.files._common import (
     dtype_text,
     header,
     lossless,
-    one_sentence,
     plain_columns,
     restored_column,
     texts,
@@ -67,7 +66,7 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     """
     columns = plain_columns(layout, "GeoJSON")
     about = {**header(layout), "columns": dtype_text(layout)}
-    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(f'{{"type": "FeatureCollection", "foveasim": {json.dumps(about)}, "features": [')
         for start in range(0, layout.n_sites, CHUNK):
             file.write(",\n" if start else "\n")
@@ -105,7 +104,7 @@ def read(path: Path) -> Layout:
     FileError
         When it is broken, too large, or holds something else than polygons.
     """
-    with one_sentence(path, "GeoJSON"):
+    with as_file_error(path, "GeoJSON layout"):
         document = _Document(path)
         polygons = document.outlines()
         types: Any = {}

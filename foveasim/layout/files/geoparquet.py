@@ -16,8 +16,8 @@ import shapely
 from numpy.typing import NDArray
 
 from foveasim._core.extras import needs
-from foveasim._io.atomic import written_whole
-from foveasim._io.formats import FileFormat
+from foveasim._io.atomic import atomic_write
+from foveasim._io.formats import FileFormat, as_file_error
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout.files._common import (
     WrittenLayout,
@@ -29,7 +29,6 @@ from foveasim.layout.files._common import (
     header,
     lossless,
     max_unpacked,
-    one_sentence,
     plain_columns,
     restored_column,
     texts,
@@ -89,7 +88,7 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     native = {name: values.astype(values.dtype.newbyteorder("=")) for name, values in columns.items()}
     table = pa.table({GEOMETRY: outlines, **{name: pa.array(values) for name, values in native.items()}})
     table = table.replace_schema_metadata({"geo": json.dumps(geo), "foveasim": json.dumps(about)})
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         # No outline stands there twice.
         parquet.write_table(table, temporary, compression="zstd", use_dictionary=[*columns], write_page_checksum=True)
     return lossless(layout, path)
@@ -105,7 +104,7 @@ def read(path: Path) -> Layout:
         When pyarrow is missing, or the file is broken, too large, or holds something else than polygons.
     """
     pa, parquet = _pyarrow(path)
-    with one_sentence(path, "GeoParquet"), parquet.ParquetFile(path, page_checksum_verification=True) as file:
+    with as_file_error(path, "GeoParquet layout"), parquet.ParquetFile(path, page_checksum_verification=True) as file:
         check_sites_of(path, file.metadata.num_rows)
         check_unpacked(path, sum(file.metadata.row_group(i).total_byte_size for i in range(file.num_row_groups)))
         metadata = file.metadata.metadata or {}

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from foveasim._core.rings import ring_moments
-from foveasim._io.formats import FileFormat
+from foveasim._io.formats import FileFormat, as_file_error
 from foveasim._io.npz import read_archive, write_archive
 from foveasim.errors import FileError
 from foveasim.layout.files._common import (
@@ -17,7 +17,6 @@ from foveasim.layout.files._common import (
     header,
     lossless,
     max_unpacked,
-    one_sentence,
 )
 from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout
@@ -51,7 +50,7 @@ def read(path: Path) -> Layout:
     FileError
         When it is broken, too large, or something else.
     """
-    with one_sentence(path, "npz"):
+    with as_file_error(path, "npz layout"):
         about, arrays = read_archive(path, max_bytes=max_unpacked(path))
         if about is None:
             raise FileError(path, "is no foveasim layout")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from foveasim._core.validation import check_count
-from foveasim._io.atomic import written_whole
+from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat
 from foveasim.errors import ParameterError
 from foveasim.layout.files._common import WrittenLayout, rounding
@@ -45,7 +45,7 @@ def write(layout: Layout, path: Path, *, colours: Mapping[int, str] | None = Non
     width_um, height_um = x_max - x_min, y_max - y_min
     px_per_um = SHOWN_PX / max(width_um, height_um)
     fills = [colours.get(c, DEFAULT_COLOUR) for c in layout.channel.tolist()]
-    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(
             f'<svg xmlns="http://www.w3.org/2000/svg" width="{width_um * px_per_um:.3f}" '
             f'height="{height_um * px_per_um:.3f}" '

@@ -73,7 +73,7 @@ def grid(
         if width_um is not None:
             raise ParameterError("width_um", "is the side of squares; with 'pitch_y_um' give 'trench_um'", width_um)
     shares = [
-        light_share(p_um, width_um, trench_um, fill_factor)
+        linear_fill_factor(p_um, width_um, trench_um, fill_factor)
         for p_um in (pitch_um, pitch_um if pitch_y_um is None else pitch_y_um)
     ]
     check_sites(n_x * n_y)
@@ -86,7 +86,7 @@ def grid(
     )
 
 
-def light_share(
+def linear_fill_factor(
     pitch_um: float, width_um: float | None, trench_um: float | None, fill_factor: float | None
 ) -> float | None:
     """

@@ -9,7 +9,7 @@ import numpy as np
 
 from foveasim._core.validation import check_choice, check_count, check_length_um, check_sites
 from foveasim.layout.families import layout_family
-from foveasim.layout.generators.grid import light_share
+from foveasim.layout.generators.grid import linear_fill_factor
 from foveasim.layout.model import Layout
 
 __all__ = ["hexagonal"]
@@ -65,7 +65,7 @@ def hexagonal(
     """
     n_columns, n_rows = check_count("n_columns", n_columns), check_count("n_rows", n_rows)
     pitch_um = check_length_um("pitch_um", pitch_um)
-    share = light_share(pitch_um, width_um, trench_um, fill_factor)
+    share = linear_fill_factor(pitch_um, width_um, trench_um, fill_factor)
     check_choice("orientation", orientation, ("pointy", "flat"))
     check_sites(n_columns * n_rows)
     row, column = (index.ravel() for index in np.divmod(np.arange(n_rows * n_columns), n_columns))

@@ -14,7 +14,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from foveasim._io.atomic import written_whole
+from foveasim._io.atomic import atomic_write
 from foveasim.capture import Capture
 from foveasim.errors import FileError
 from foveasim.layout import Layout, Report
@@ -115,7 +115,7 @@ def write_page(path: str | Path, page: Callable[[], str]) -> None:
     """
     target = check_page_path(path)
     text = page()
-    with written_whole(target) as temporary:
+    with atomic_write(target) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
