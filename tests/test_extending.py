@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import subprocess
@@ -120,6 +121,20 @@ def test_registration_changes_version():
 
     assert registry.version > before
     assert dict(registry) == {"one": int}
+
+
+@pytest.mark.parametrize("name", ["public", "_private"])
+def test_modules_of_any_name_are_imported(name, tmp_path, monkeypatch):
+    package = tmp_path / f"some_{name}"
+    package.mkdir()
+    (package / "__init__.py").write_text(
+        "from foveasim._core.registry import import_all\nfound = []\nimport_all(__name__, __path__)\n"
+    )
+    (package / f"{name}.py").write_text(f"import some_{name}\nsome_{name}.found.append(__name__)\n")
+    (package / "_kernels.py").write_text("raise RuntimeError('compiled')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+
+    assert importlib.import_module(f"some_{name}").found == [f"some_{name}.{name}"]
 
 
 def test_wrong_extensions_give_messages():

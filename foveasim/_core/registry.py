@@ -16,9 +16,9 @@ __all__ = ["Registry", "import_all"]
 
 
 def import_all(package: str, path: Iterable[str]) -> None:
-    """Import the public modules of a package, so that what they contain is registered."""
+    """Import the modules of a package, so that what they contain is registered; kernels are imported where they are used."""
     for module in iter_modules(path):
-        if not module.name.startswith("_"):
+        if not module.name.startswith("_kernels"):
             import_module(f"{package}.{module.name}")
 
 

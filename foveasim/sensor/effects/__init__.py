@@ -10,8 +10,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from foveasim._core.registry import Registry, import_all
+from foveasim._core.registry import import_all
 from foveasim.sensor.effects.contract import (
+    EFFECTS,
     STAGES,
     AdditiveNoise,
     Effect,
@@ -57,10 +58,6 @@ __all__ = [
     "dark_current_factor",
     "draw_shot_noise",
 ]
-
-#: Further effects by their names in settings files: register a class with ``@EFFECTS.register("name")``, or in an installed
-#: package with an entry point of the group ``foveasim.effects``.
-EFFECTS: Registry[type[Effect]] = Registry("effect", "foveasim.effects")
 
 #: Classes that a sensor's keywords build, in the order of the chain; ``from_sensor`` gives None for an effect that is off.
 STANDARD: tuple[Any, ...] = (

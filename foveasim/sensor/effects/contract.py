@@ -17,12 +17,13 @@ from typing import Any, ClassVar, Literal, Protocol, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.registry import Registry
 from foveasim._core.validation import Floats, Ints, read_only
 from foveasim.errors import SimulationError
 from foveasim.fields import PackedRings
 from foveasim.sensor.device import Device
 
-__all__ = ["STAGES", "AdditiveNoise", "Effect", "FixedFactor", "FixedOffset", "Photosites", "Sites", "Stage"]
+__all__ = ["EFFECTS", "STAGES", "AdditiveNoise", "Effect", "FixedFactor", "FixedOffset", "Photosites", "Sites", "Stage"]
 
 T = TypeVar("T")
 #: Where an effect acts.
@@ -323,3 +324,8 @@ class AdditiveNoise(Effect):
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
         """Return the mean and the sum of the variances."""
         return mean, variance + sites.pattern(self, self.deviation) ** 2
+
+
+#: Further effects by their names in settings files: register a class with ``@EFFECTS.register("name")``, or in an installed
+#: package with an entry point of the group ``foveasim.effects``.
+EFFECTS: Registry[type[Effect]] = Registry("effect", "foveasim.effects")
