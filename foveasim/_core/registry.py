@@ -15,10 +15,10 @@ from foveasim.errors import ParameterError
 __all__ = ["Registry", "import_all"]
 
 
-def import_all(package: str, path: Iterable[str]) -> None:
-    """Import the modules of a package, so that what they contain is registered; kernels are imported where they are used."""
+def import_all(package: str, path: Iterable[str], *, skip: str = "_kernels") -> None:
+    """Import the modules of a package, so that what they contain is registered, but those whose names begin with ``skip``."""
     for module in iter_modules(path):
-        if not module.name.startswith("_kernels"):
+        if not module.name.startswith(skip):
             import_module(f"{package}.{module.name}")
 
 

@@ -28,4 +28,4 @@ __all__ = [
     "zernike",
 ]
 
-import_all(__name__, __path__)
+import_all(__name__, __path__, skip="_")  # they load scipy, which only images need
