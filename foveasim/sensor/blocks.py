@@ -10,8 +10,8 @@ __all__ = ["BLOCK_SITES", "in_blocks", "pieces"]
 
 #: Sites that draw from one stream of an effect; fixed, so that draws do not depend on the number of threads.
 BLOCK_SITES = 1 << 16
-#: Sites of a block that are processed at a time: some arrays of them fit the L2 cache (256 KiB each), and the interpreter, which one
-#: thread has at a time, costs little for each. Draws do not depend on it.
+#: Sites of a block that are processed at a time, on which draws do not depend: some arrays of them fit the L2 cache (256 KiB
+#: each), and interpreter time, which threads cannot share, is little for each site.
 PIECE_SITES = 1 << 15
 
 
