@@ -38,7 +38,7 @@ def every_rule(layout: Layout, **changes: Any) -> DesignRules:
         "grid_um": 1e-6, "max_overlap_um2": 0.0, "max_gap_um2": 0.0, "die_um": (x0 - 1.0, y0 - 1.0, x1 + 1.0, y1 + 1.0),
         "max_neighbour_ratio": 3.0, "max_sites": 10**9, "min_density": 0.0, "max_density": 1.0,
         "density_window_um": 400.0, "max_data_rate_gbit_per_s": 1e6, "readout": Readout(frames_per_s=30.0, bits=10),
-        "max_track_use": 1e6, "routing": Routing(width_um=0.14, space_um=0.14),
+        "max_track_utilisation": 1e6, "routing": Routing(width_um=0.14, space_um=0.14),
         "waivers": {"max_gap_um2": "the die around it"},
     }  # fmt: skip
     if "ring" in layout.columns:

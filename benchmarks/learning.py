@@ -119,7 +119,7 @@ def _digest(batches: Iterator[Any]) -> str:
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description="Data sets: samples a second beside plain pictures.")
+    parser = argparse.ArgumentParser(description="Datasets: samples a second beside plain pictures.")
     parser.add_argument("--quick", action="store_true", help="100 samples")
     options = parser.parse_args()
     report = Report(is_judged=False)

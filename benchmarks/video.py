@@ -160,8 +160,8 @@ def _pictures() -> list[np.ndarray]:
     return [rng.integers(0, 256, SHAPE, dtype=np.uint8) for _ in range(N_PICTURES)]
 
 
-def _footage(pictures: object) -> fs.video.Footage:
-    return fs.video.Footage(
+def _footage(pictures: object) -> fs.video.FrameSource:
+    return fs.video.FrameSource(
         pictures, pitch_um=PITCH_UM, distance_m=DISTANCE_M, peak_radiance_w_m2_sr_nm=0.1, band_width_nm=100.0
     )
 

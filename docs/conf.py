@@ -65,7 +65,7 @@ ROOMS = {
     "foveasim.modes": "Other ways to expose: rolling shutters, events, spikes.",
     "foveasim.metrics": "What a sensor is worth.",
     "foveasim.view": "Plots, solids, and pages for a browser.",
-    "foveasim.explore": "Many cameras: sweeps, studies, data sets.",
+    "foveasim.explore": "Many cameras: sweeps, studies, datasets.",
     "foveasim.config": "Settings files: YAML in, objects out.",
     "foveasim.errors": "What is raised.",
     "foveasim.units": "Conversions by name.",

@@ -529,7 +529,7 @@ class Camera:
             with clock.stage("shutter"):
                 for *_, exposure in going_on:
                     exposure.add(rate_e_per_s)
-            while going_on and going_on[0][-1].is_over:
+            while going_on and going_on[0][-1].is_complete:
                 yield first(rate_e_per_s)
         while going_on:
             yield first(rate_e_per_s)
@@ -706,7 +706,7 @@ class Camera:
 
     def _warn_of_uncovered(self, integrator: Integrator) -> None:
         """Tell of sites that the map of light does not reach: their darkness is no property of the scene."""
-        n_lost = integrator.lost_sites.size
+        n_lost = integrator.sites_outside_image_circle.size
         if n_lost:
             warnings.warn(
                 f"{n_lost:,} of {self._layout.n_sites:,} photosites lie outside the lens's image circle and get no light: "
@@ -787,9 +787,9 @@ def _tasks(frames: Iterable[Light]) -> Iterator[_Task]:
 
 def _check_frames(frames: object) -> None:
     if not isinstance(frames, Iterable):
-        cure = "put one into a list" if isinstance(frames, Scene | PowerMap) else ""
+        hint = "put one into a list" if isinstance(frames, Scene | PowerMap) else ""
         raise ParameterError(
-            "frames", f"must be an iterable of Scenes or PowerMaps, got a {type(frames).__name__}", cure=cure
+            "frames", f"must be an iterable of Scenes or PowerMaps, got a {type(frames).__name__}", hint=hint
         )
 
 

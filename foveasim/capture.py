@@ -24,11 +24,11 @@ from foveasim.layout import Layout
 from foveasim.layout.packed import packed_layout, unpacked_layout
 from foveasim.reconstruct import (
     Picture,
-    Readings,
+    SiteEstimates,
     cells,
-    charge_readings,
-    code_readings,
     electrons_per_code,
+    estimate_from_charge,
+    estimate_from_code,
     fill_channels,
     least_squares,
     linear,
@@ -122,10 +122,12 @@ class Capture:
         object.__setattr__(self, "stage_s", dict(self.stage_s))
 
     def __repr__(self) -> str:
-        return f"Capture({self.layout.n_sites} sites, {self.bits} bits, {100 * self.saturated_share:.1f} % saturated)"
+        return (
+            f"Capture({self.layout.n_sites} sites, {self.bits} bits, {100 * self.saturated_fraction:.1f} % saturated)"
+        )
 
     @property
-    def saturated_share(self) -> float:
+    def saturated_fraction(self) -> float:
         """Share of the sites that gave the highest code."""
         return float(np.mean(self.code == 2**self.bits - 1)) if self.code.size else 0.0
 
@@ -213,7 +215,7 @@ class Capture:
                 readings = self._readings(electronics, of)
                 values = readings.light_e / e_per_dn
                 if is_fitted:
-                    values[readings.is_full] = np.nan
+                    values[readings.is_saturated] = np.nan
                     options = {"variance": readings.variance_e2 / e_per_dn**2, **options}
         if is_fitted:
             scale = float(response.mean()) if per == "site" else 1.0
@@ -266,11 +268,11 @@ class Capture:
         """Return the sensor that is given, or the one that the settings describe."""
         return Sensor.from_settings(self.layout, self.settings.get("sensor", {})) if sensor is None else sensor
 
-    def _readings(self, electronics: Sensor, of: str) -> Readings:
+    def _readings(self, electronics: Sensor, of: str) -> SiteEstimates:
         exposure_s = float(self.settings.get("exposure_s", 0.0))
         if of in ("code", "light_e"):
-            return code_readings(self.code, electronics, exposure_s)
-        return charge_readings(getattr(self, of), electronics, exposure_s)
+            return estimate_from_code(self.code, electronics, exposure_s)
+        return estimate_from_charge(getattr(self, of), electronics, exposure_s)
 
     def to_pyvista(self) -> PolyData:
         """The sites as PolyData with what they measured, for PyVista; see :func:`foveasim.view.polydata`."""
@@ -286,7 +288,7 @@ class Capture:
 
     def to_xarray(self) -> xr.Dataset:
         """
-        Return the capture as a labelled data set, which netCDF and zarr files can store.
+        Return the capture as a labelled dataset, which netCDF and zarr files can store.
 
         Returns
         -------

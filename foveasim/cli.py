@@ -1,4 +1,4 @@
-"""The command line: words to calls, errors to one sentence. No logic."""
+"""The command line: words to calls, errors to one text. No logic."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def check(
             help="YAML file of rules, or a preset's name such as sky130_met1; by default the rules in LAYOUT.",
         ),
     ] = None,
-    lyrdb: Annotated[Path | None, typer.Option("--lyrdb", help="Write the violations for KLayout.")] = None,
+    report_file: Annotated[Path | None, typer.Option("--report", help="Write the violations for KLayout.")] = None,
 ) -> None:
     """Check a layout against design rules; the exit code is 1 when one is broken."""
     from foveasim.config import read_any_layout, read_rules
@@ -105,9 +105,9 @@ def check(
         _end(f"error: {layout}: holds no rules; name a file of rules with --rules", BAD_INPUT)
     report = file.layout.check(limits)
     console.print(report)
-    if lyrdb is not None:
-        report.write(lyrdb)
-        _report(f"wrote {lyrdb}")
+    if report_file is not None:
+        report.write(report_file)
+        _report(f"wrote {report_file}")
     if not report.ok:
         raise typer.Exit(BROKEN_RULE)
 
@@ -148,7 +148,7 @@ def describe(
     blanking: Annotated[float, typer.Option("--blanking", help="Time without data over time with data.")] = 0.0,
     lanes: Annotated[int, typer.Option("--lanes", help="Outputs that share the data.")] = 1,
 ) -> None:
-    """Tell a layout's counts, areas, fill factor, pixel sizes, channels and data rate."""
+    """Progress a layout's counts, areas, fill factor, pixel sizes, channels and data rate."""
     from foveasim.config import read_any_layout
     from foveasim.layout import Readout
 
@@ -174,10 +174,10 @@ def convert(
     from foveasim.layout import write_layout
 
     written = write_layout(read_any_layout(source).layout, target, layer=layer, dbu_um=dbu_um)
-    lost = f"; the format holds no {', '.join(written.lost_columns)}" if written.lost_columns else ""
+    lost = f"; the format holds no {', '.join(written.dropped_columns)}" if written.dropped_columns else ""
     _report(
-        f"wrote {written.path}: {written.n_sites:,} photosites, vertices moved by at most {written.worst_move_um:.3g} µm, "
-        f"areas changed by at most {100 * written.worst_area_error:.3g} %{lost}"
+        f"wrote {written.path}: {written.n_sites:,} photosites, vertices moved by at most "
+        f"{written.max_displacement_um:.3g} µm, areas changed by at most {100 * written.worst_area_error:.3g} %{lost}"
     )
 
 
@@ -217,15 +217,15 @@ def view(
     with _status("reading"):
         seen = read_viewable(file, layout=layout, rules=rules)
     with _status("making the page"):
-        flat = None if solid else web_page(seen.thing, report=seen.report, name=seen.name)
-        text = solid_page(seen.thing, name=seen.name) if flat is None else flat
+        flat = None if solid else web_page(seen.data, report=seen.report, name=seen.name)
+        text = solid_page(seen.data, name=seen.name) if flat is None else flat
     if web is not None:
         with atomic_write(web) as temporary:
             temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
         _report(f"wrote {web}")
         return
     if serve:
-        serve_page(text, port=port, tell=lambda at: _say(f"{file} is at {at} until you press Ctrl-C"))
+        serve_page(text, port=port, announce=lambda at: _say(f"{file} is at {at} until you press Ctrl-C"))
         return
     path, is_opened = open_page(text)
     _say(f"opened {path}" if is_opened else f"found no browser; open {path} in one")
@@ -249,8 +249,8 @@ def sweep(
     from foveasim.explore import read_sweep, run_sweep
 
     plan = read_sweep(settings, metrics=metrics or ())
-    with _progress(settings.stem, f"what is done is kept beside {out}") as tell:
-        results = run_sweep(plan, out=out, scheduler=scheduler, workers=workers, retry=retry, tell=tell)
+    with _progress(settings.stem, f"what is done is kept beside {out}") as progress:
+        results = run_sweep(plan, out=out, scheduler=scheduler, workers=workers, retry=retry, progress=progress)
     sizes = " x ".join(f"{n} {name}" for name, n in zip(plan.dims, plan.shape, strict=True))
     _report(f"wrote {out}: {plan.n_points:,} points ({sizes})")
     failed = [text for text in results["error"].to_numpy().ravel().tolist() if text]
@@ -291,8 +291,8 @@ def study(
     plan = read_study(settings, metrics=metrics or (), n_trials=trials)
     base = storage or str(out or "study.db")
     place = storage_name(base)
-    with _progress(settings.stem, f"the trials that are done are kept in {place}") as tell:
-        found = run_study(plan, storage=base, scheduler=scheduler, workers=workers, tell=tell)
+    with _progress(settings.stem, f"the trials that are done are kept in {place}") as progress:
+        found = run_study(plan, storage=base, scheduler=scheduler, workers=workers, progress=progress)
     done = finished_trials(found)
     failed = [trial.user_attrs["error"] for trial in done if "error" in trial.user_attrs]
     if failed:
@@ -307,14 +307,14 @@ def study(
 @app.command()
 def dataset(
     settings: Annotated[
-        Path, typer.Argument(help="YAML file of the data set: pictures, a shot, and what is drawn of its settings.")
+        Path, typer.Argument(help="YAML file of the dataset: pictures, a shot, and what is drawn of its settings.")
     ],
     out: Annotated[
         Path,
         typer.Option(
-            "--out", "-o", help="A folder of tar files, or a .zarr folder; a data set that was ended goes on in it."
+            "--out", "-o", help="A folder of tar files, or a .zarr folder; a dataset that was ended goes on in it."
         ),
-    ] = Path("data_set"),
+    ] = Path("dataset"),
     workers: Annotated[
         int | None, typer.Option("--workers", help="Processes; by default one a core, where there is enough to do.")
     ] = None,
@@ -325,14 +325,16 @@ def dataset(
 ) -> None:
     """Take pictures with cameras drawn at random, and write them as samples to learn from."""
     from foveasim._core.threads import thread_count
-    from foveasim.explore import read_data_set, write_data_set
+    from foveasim.explore import read_dataset, write_dataset
 
     n_threads = 1 if workers is None else max(1, thread_count() // max(1, workers))
     with _status("reading pictures and settings"):
-        file = read_data_set(settings, n_threads=n_threads)
-    with _progress(settings.stem, f"the shards that are done are kept in {out}") as tell:
-        write_data_set(file.data_set, out, per_shard=file.per_shard, workers=workers, scheduler=scheduler, tell=tell)
-    _report(f"wrote {out}: {len(file.data_set):,} samples")
+        file = read_dataset(settings, n_threads=n_threads)
+    with _progress(settings.stem, f"the shards that are done are kept in {out}") as progress:
+        write_dataset(
+            file.dataset, out, per_shard=file.per_shard, workers=workers, scheduler=scheduler, progress=progress
+        )
+    _report(f"wrote {out}: {len(file.dataset):,} samples")
 
 
 @app.command()
@@ -360,7 +362,7 @@ def video(
 ) -> None:
     """Take a video with the camera of a settings file: pictures or a video file in the place of its scene."""
     from foveasim.config import read_shot, run_video
-    from foveasim.video import frames_kept, partial_of
+    from foveasim.video import count_recorded_frames, partial_path
 
     if frames_per_s is not None and not frames_per_s > 0.0:
         _end(f"error: --fps must be > 0, got {frames_per_s:g}", BAD_INPUT)
@@ -372,7 +374,7 @@ def video(
     try:
         n = run_video(shot, frames, out, frame_s=frame_s, line_s=line_s, stop=stop, n_threads=threads, progress=True)
     except KeyboardInterrupt:
-        n = frames_kept(out) if is_kept and partial_of(out).is_dir() else 0
+        n = count_recorded_frames(out) if is_kept and partial_path(out).is_dir() else 0
         kept = f"; {n:,} frames are kept beside {out}, and the same command goes on from there" if n else ""
         _end(f"stopped{kept}", STOPPED)
     told = f"{out} was finished before" if was_finished else f"wrote {out}"
@@ -451,12 +453,12 @@ def _progress(name: str, kept: str) -> Iterator[Callable[[int, int], None]]:
     progress = Progress(*columns, console=console)
     bar = progress.add_task(printable(name), total=None)
 
-    def tell(n_done: int, n: int) -> None:
+    def show(n_done: int, n: int) -> None:
         progress.start()  # now that there are workers
         progress.update(bar, completed=n_done, total=n)
 
     try:
-        yield tell
+        yield show
     except KeyboardInterrupt:
         _end(f"stopped; {kept}, and the same command goes on from there", STOPPED)
     finally:
@@ -469,22 +471,22 @@ def _status(text: str) -> Status:
     return console.status(text_of(text), spinner=spinner_of(console))
 
 
-def _say(sentence: str) -> None:
+def _say(text: str) -> None:
     # Flushed: who waits for an address may read it from a pipe.
-    sys.stdout.write(printable(sentence) + "\n")
+    sys.stdout.write(printable(text) + "\n")
     sys.stdout.flush()
 
 
-def _report(sentence: str) -> None:
-    console.print(printable(sentence), soft_wrap=True)
+def _report(text: str) -> None:
+    console.print(printable(text), soft_wrap=True)
 
 
-def _tell(sentence: str) -> None:
-    console_of_errors.print(printable(sentence), soft_wrap=True)
+def _tell(text: str) -> None:
+    console_of_errors.print(printable(text), soft_wrap=True)
 
 
-def _end(sentence: str, code: int) -> NoReturn:
-    _tell(sentence)
+def _end(text: str, code: int) -> NoReturn:
+    _tell(text)
     sys.exit(code)
 
 

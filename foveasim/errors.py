@@ -15,7 +15,7 @@ Every error and warning that foveasim raises on purpose.
     ├── CoverageWarning                  photosites lie off the picture
     └── LayoutWarning                    a layout covers less of its field than its parameters ask for
 
-Each message says what is wrong, where, what was got, what was expected, and the cure.
+Each message says what is wrong, where, what was got, what was expected, and the hint.
 """
 
 from __future__ import annotations
@@ -64,14 +64,14 @@ class FoveasimError(Exception):
 class ParameterError(FoveasimError, ValueError):
     """One parameter has a value that cannot be: raise it where a value enters the package."""
 
-    def __init__(self, name: str, rule: str, value: object = _UNSAID, unit: str = "", cure: str = "") -> None:
+    def __init__(self, name: str, rule: str, value: object = _UNSAID, unit: str = "", hint: str = "") -> None:
         self.name = name
         self.value = None if value is _UNSAID else value
         self.unit = unit
         got = f", got {shown(value)}{' ' + unit if unit else ''}" if value is not _UNSAID else ""
-        #: All of the message but the name.
-        self.told = f"{rule}{got}{'; ' + cure if cure else ''}"
-        super().__init__(f"'{name}' {self.told}")
+        #: The message without the name.
+        self.detail = f"{rule}{got}{'; ' + hint if hint else ''}"
+        super().__init__(f"'{name}' {self.detail}")
 
 
 class GeometryError(FoveasimError, ValueError):

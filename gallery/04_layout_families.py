@@ -40,7 +40,7 @@ def main(out_dir: Path) -> None:
     colours = np.array([(0.55, 0.7, 0.86), (0.98, 0.85, 0.55), (0.75, 0.85, 0.65), (0.9, 0.65, 0.6)])
     for position, (name, layout) in enumerate(layouts.items(), start=1):
         axes = figure.add_subplot(3, 5, position)
-        plot_layout(layout, colours[fs.layout.colouring(layout, 4).channel], ax=axes)
+        plot_layout(layout, colours[fs.layout.graph_colouring(layout, 4).channel], ax=axes)
         axes.set_title(f"{name}: {layout.n_sites} sites")
     save_figure(figure, out_dir / "04_families.png", dpi=80)
 

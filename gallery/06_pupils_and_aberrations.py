@@ -1,7 +1,8 @@
 """
 What do the shape of the pupil and the faults of a lens make of a point, and of a letter?
 
-New here: ``Optics(pupil=, zernike=, seidel=, focus_distance_m=)``, ``Optics.psf``, ``.mtf``, ``.strehl``, ``.patchwork_error``.
+New here: ``Optics(pupil=, zernike=, seidel=, focus_distance_m=)``, ``Optics.psf``, ``.mtf``, ``.strehl``,
+``.isoplanatic_error``.
 
 Expect: rays at right angles to edges and vanes; a flare of coma that points up, where its wavefront grows; Strehl ratios of
 0.814 to 0.817 for a fourteenth of a wave rms, whatever its form; a field on which points flare away from the axis, made of
@@ -65,9 +66,9 @@ def main(out_dir: Path) -> None:
     for column, (name, lens) in zip(axes.T, all_lenses.items(), strict=True):
         psf = lens.psf(WAVELENGTH_NM, distance_m=DISTANCE_M)
         left, bottom, right, top = psf.grid.bounds_um
-        highest = psf.share_per_um2.max()
+        highest = psf.psf_per_um2.max()
         column[0].imshow(
-            psf.share_per_um2 + 1e-9,
+            psf.psf_per_um2 + 1e-9,
             origin="lower",
             extent=(left, right, bottom, top),
             norm=LogNorm(1e-4 * highest, highest),
@@ -118,11 +119,11 @@ def main(out_dir: Path) -> None:
         strehl = faulty.strehl(WAVELENGTH_NM)
         print(f"{name:>12}: Strehl {strehl:.4f} for a fourteenth of a wave")
         assert abs(strehl - np.exp(-((2.0 * np.pi * FOURTEENTH) ** 2))) < 4e-3
-    astray = field.patchwork_error(points)
+    astray = field.isoplanatic_error(points)
     print(f"7 x 7 patterns put {astray:.1%} of a point's light into wrong places, at worst")
     assert abs(astray - 0.335) < 0.02
     coma = all_lenses["coma in y"].psf(WAVELENGTH_NM)
-    weight = coma.share_per_um2 / coma.share_per_um2.sum()
+    weight = coma.psf_per_um2 / coma.psf_per_um2.sum()
     assert float((weight * coma.grid.y_um[:, np.newaxis]).sum()) > 1.0
 
 

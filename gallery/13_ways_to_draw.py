@@ -26,7 +26,7 @@ def main(out_dir: Path) -> None:
     """Write the drawings to a folder."""
     # %% One layout in four ways.
     layout = fs.layout.log_polar(n_sectors=36, min_size_um=4.0, r_max_um=102.0, fovea="hexagons", stagger=True)
-    mosaic = fs.layout.colouring(layout, 3)
+    mosaic = fs.layout.graph_colouring(layout, 3)
     rings_alone = fs.layout.log_polar(n_sectors=36, min_size_um=4.0, r_max_um=102.0)
     lines = fs.layout.readout_by(rings_alone, "sector")
     figure = Figure(figsize=(14.0, 11.0), layout="constrained")

@@ -48,7 +48,7 @@ def main(out_dir: Path) -> None:
         out_dir / "14_sensor_stack.png",
         viewpoint=view.Viewpoint(azimuth_deg=-50.0, elevation_deg=38.0),
         size_px=(1280, 800),
-        shade_corners=renderer == "pyvista",
+        ambient_occlusion=renderer == "pyvista",
         renderer=renderer,
     )
 

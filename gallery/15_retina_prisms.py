@@ -64,7 +64,7 @@ def main(out_dir: Path) -> None:
     # %% Each column in the mean colour of what its site looks at.
     of_sites = fs.Integrator(layout, light.grid)(np.moveaxis(rgb[::-1], -1, 0)) / layout.area_um2
     colours = encoded_srgb(BRIGHTENING * of_sites).T
-    columns = view.prisms(capture, by=colours, tallest_um=TALLEST_UM)
+    columns = view.prisms(capture, by=colours, max_height_um=TALLEST_UM)
 
     # %% The whole retina, and its fovea; without OpenGL without the shade of corners.
     renderer = "pyvista" if view.find_renderer() else "software"
@@ -77,7 +77,7 @@ def main(out_dir: Path) -> None:
             out_dir / f"15_retina_{name}.png",
             viewpoint=viewpoint,
             size_px=(1200, 860),
-            shade_corners=renderer == "pyvista",
+            ambient_occlusion=renderer == "pyvista",
             renderer=renderer,
         )
 
@@ -92,7 +92,7 @@ def main(out_dir: Path) -> None:
     assert abs(share - 0.28) < 0.005
     assert abs(of_area - 0.051) < 0.0005
     assert np.allclose(top_um, TALLEST_UM * capture.code / capture.code.max(), rtol=1e-12, atol=0.0)
-    assert capture.saturated_share == 0.0
+    assert capture.saturated_fraction == 0.0
     assert colours.max() < 1.0
 
 

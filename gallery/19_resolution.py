@@ -1,7 +1,7 @@
 """
 How fine a detail do photosites of different shapes, places and sizes tell, and what becomes of finer ones?
 
-New here: ``slanted_edge_mtf``, ``polygon_mtf``, ``nyquist_against_eccentricity``, ``sampling_spectrum``, ``aliasing_spectrum``.
+New here: ``slanted_edge_mtf``, ``polygon_mtf``, ``nyquist_vs_eccentricity``, ``sampling_spectrum``, ``aliasing_spectrum``.
 
 Expect: the MTF of a lens with squares and with hexagons, by a slanted edge, within 2 % of its closed form up to the Nyquist
 frequency; the Nyquist frequencies of the layouts that come with the package, constant or falling as the inverse of the
@@ -23,8 +23,8 @@ from foveasim.metrics import (
     AliasingSpectrum,
     SamplingSpectrum,
     aliasing_spectrum,
-    nyquist_against_eccentricity,
     nyquist_per_mm,
+    nyquist_vs_eccentricity,
     polygon_mtf,
     sampling_spectrum,
     slanted_edge_mtf,
@@ -114,7 +114,7 @@ def main(out_dir: Path) -> None:
     layouts = {name: read_any_layout(path).layout for name, path in shipped_layouts().items()}
     is_foveal = {}
     for name, layout in layouts.items():
-        table = nyquist_against_eccentricity(layout, n_bins=40, per_channel=True)
+        table = nyquist_vs_eccentricity(layout, n_bins=40, per_channel=True)
         middle_um = 0.5 * (table.edges_um[1:] + table.edges_um[:-1])
         is_known = np.isfinite(table.nyquist_per_mm)
         is_foveal[name] = table.growth_fraction != 0.0
@@ -144,7 +144,7 @@ def main(out_dir: Path) -> None:
     false = {}
     for axes, (name, layout) in zip(figure.subplots(3, 5).ravel(), shown.items(), strict=True):
         points, alias = spectra(layout, is_foveal=is_foveal.get(name, False))
-        false[name] = alias.false_fraction / alias.true_fraction
+        false[name] = alias.alias_fraction / alias.baseband_fraction
         reach = points.frequency_per_mm[-1] / points.nyquist_per_mm
         axes.imshow(
             np.log10(points.power + 1e-9),
@@ -157,7 +157,7 @@ def main(out_dir: Path) -> None:
         turn = np.linspace(0.0, 2.0 * np.pi, 100)
         axes.plot(np.cos(turn), np.sin(turn), "-", color="w", linewidth=0.6)
         axes.plot(*(alias.wave_per_mm / points.nyquist_per_mm), "+", color="c")
-        axes.plot(*(alias.false_per_mm / points.nyquist_per_mm), "x", color="lime")
+        axes.plot(*(alias.alias_per_mm / points.nyquist_per_mm), "x", color="lime")
         axes.set_title(f"{name}\nalias {100.0 * false[name]:.0f} % of the sine", fontsize=10)
         axes.set(xticks=(-2, 0, 2), yticks=(-2, 0, 2))
     figure.suptitle(

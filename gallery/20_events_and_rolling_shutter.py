@@ -1,7 +1,7 @@
 """
 What do a rolling shutter, event pixels and spiking pixels make of a fan that turns?
 
-New here: ``Camera.video`` and ``Camera.rates``, ``foveasim.video.Footage``, ``foveasim.modes``: ``EventPixels`` and
+New here: ``Camera.video`` and ``Camera.rates``, ``foveasim.video.FrameSource``, ``foveasim.modes``: ``EventPixels`` and
 ``SpikingPixels``.
 
 Expect: blades bent by a shutter whose lines begin 0.25 ms after each other, and a bar of 1.92 µm/ms that leans by 0.48 µm a
@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 import foveasim as fs
 from foveasim.layout import readout_by
 from foveasim.modes import EventPixels, SpikingPixels
-from foveasim.video import Footage
+from foveasim.video import FrameSource
 from foveasim.view import save_figure
 
 #: The scene: pictures of 1 ms, which the lens makes 2.5 times smaller than their pixels of 2.4 µm.
@@ -57,9 +57,9 @@ def bar() -> Iterator[np.ndarray]:
         yield picture
 
 
-def footage(pictures: Iterator[np.ndarray]) -> Footage:
+def footage(pictures: Iterator[np.ndarray]) -> FrameSource:
     """The pictures as light."""
-    return Footage(
+    return FrameSource(
         pictures,
         pitch_um=SCENE_PITCH_UM,
         distance_m=DISTANCE_M,

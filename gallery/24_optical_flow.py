@@ -28,7 +28,7 @@ from scipy.ndimage import distance_transform_edt
 import foveasim as fs
 from foveasim._io.encodings import encoded_srgb
 from foveasim.metrics import estimate_flow, flow_bound, site_gradients_e_per_um
-from foveasim.reconstruct import Readings, cells, code_readings, least_squares
+from foveasim.reconstruct import SiteEstimates, cells, estimate_from_code, least_squares
 from foveasim.view import save_figure
 
 #: The lens, whose finest detail is 5.5 µm, and the light, of up to 280 electrons per µm².
@@ -172,7 +172,7 @@ def camera_with(layout: fs.Layout) -> fs.Camera:
 
 
 def squared_error_um2(
-    layout: fs.Layout, seen: Readings, picture: np.ndarray, grid: fs.Grid, motion_um: np.ndarray, n_patches: int
+    layout: fs.Layout, seen: SiteEstimates, picture: np.ndarray, grid: fs.Grid, motion_um: np.ndarray, n_patches: int
 ) -> np.ndarray:
     """Of the motion found in each patch, from a capture and the picture before."""
     patch = patches(layout)
@@ -212,7 +212,7 @@ def told_by(layout: fs.Layout, views: Sequence[View], task: Task, n_draws: int) 
         gaze_um = pitch_um * stray
         frames = [(light, tuple(gaze_um)), (light, tuple(gaze_um - motion_um))]
         captures = camera.video(frames, exposure_s=EXPOSURE_S, seed=seed)
-        before, after = (code_readings(capture.code, camera.sensor, EXPOSURE_S) for capture in captures)
+        before, after = (estimate_from_code(capture.code, camera.sensor, EXPOSURE_S) for capture in captures)
         x, y = stray + (N_PIXELS - n_cells) // 2
         true = whole[y : y + n_cells, x : x + n_cells]
         shots.append((true, after, motion_um))
@@ -273,7 +273,9 @@ def show_sensors(axes: Sequence[Axes], view: View, layouts: dict[str, fs.Layout]
     shown = {"the light on the sensor, and its 25 patches": true}
     for name, layout in layouts.items():
         camera = camera_with(layout)
-        light_e = code_readings(camera.capture(light, exposure_s=EXPOSURE_S, seed=0).code, camera.sensor, EXPOSURE_S)
+        light_e = estimate_from_code(
+            camera.capture(light, exposure_s=EXPOSURE_S, seed=0).code, camera.sensor, EXPOSURE_S
+        )
         grid = fs.Grid.centred((560, 560), 1.0)
         shown[f"{name}: {layout.n_sites} photosites"] = cells(layout, light_e.light_e / layout.area_um2, grid).data[0]
     x_min, y_min, x_max, y_max = light.grid.bounds_um

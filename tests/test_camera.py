@@ -282,7 +282,7 @@ def test_a_flat_white_scene_looks_white_after_white_balance():
     balanced = capture.picture(max_pixels=60).data / capture.white_dn[:, np.newaxis, np.newaxis]
     levels = np.nanmedian(balanced, axis=(1, 2))
 
-    assert capture.saturated_share == 0.0
+    assert capture.saturated_fraction == 0.0
     assert levels == pytest.approx(np.full(3, levels.mean()), rel=0.01)
 
 

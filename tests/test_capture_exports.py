@@ -1,4 +1,4 @@
-"""Captures as labelled data sets, tables and stores: every number with its unit, and back to the last bit."""
+"""Captures as labelled datasets, tables and stores: every number with its unit, and back to the last bit."""
 
 from __future__ import annotations
 
@@ -288,7 +288,7 @@ def test_view_shows_store_like_archive(capture, tmp_path):
     from foveasim.config import read_viewable
 
     capture.save(tmp_path / "x.zarr")
-    assert_same(read_viewable(tmp_path / "x.zarr").thing, capture)
+    assert_same(read_viewable(tmp_path / "x.zarr").data, capture)
     (tmp_path / "folder").mkdir()
     with pytest.raises(FileError):
         read_viewable(tmp_path / "folder")

@@ -24,7 +24,7 @@ ERRORS = [
 
 def test_a_message_has_name_rule_value_unit_and_cure():
     assert str(ERRORS[0]) == "'pitch_um' must be > 0, got -1.0 µm; take a larger one"
-    assert str(ParameterError("height", ERRORS[0].told)) == "'height' must be > 0, got -1.0 µm; take a larger one"
+    assert str(ParameterError("height", ERRORS[0].detail)) == "'height' must be > 0, got -1.0 µm; take a larger one"
     assert str(ParameterError("white", "must be there")) == "'white' must be there"
     assert len(str(ParameterError("data", "must be short", np.zeros((500, 500))))) < 120
 

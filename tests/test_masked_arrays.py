@@ -16,7 +16,7 @@ from foveasim._io.images import write_picture
 from foveasim.errors import ParameterError
 from foveasim.metrics import flow
 from foveasim.metrics.photon_transfer import PhotonTransfer, SiteClasses, codes_of
-from foveasim.reconstruct import Picture, charge_readings, code_readings, least_squares, linear, natural
+from foveasim.reconstruct import Picture, estimate_from_charge, estimate_from_code, least_squares, linear, natural
 from foveasim.reconstruct import cells as fill_cells
 from foveasim.sensor import calibration, exposures, noise_budget
 from foveasim.sensor.spectral import tables
@@ -175,7 +175,7 @@ REJECTED = {
     "TableCurve call": (tables.TableCurve(wavelength_nm=[400.0, 700.0], value=[0.1, 0.2]), WAVES),
     "GaussianCurve call": (fs.sensor.GaussianCurve(centre_nm=550.0, fwhm_nm=50.0), WAVES),
     "KernelCrosstalk": (lambda a: fs.sensor.KernelCrosstalk(kernel=a).kernel, np.array([[0.1, 0.8, 0.1]])),
-    "crosstalk": (lambda a: fs.sensor.Diffusion(spread_um=0.1).mixing(LAYOUT).apply(a), SITES),
+    "crosstalk": (lambda a: fs.sensor.Diffusion(spread_um=0.1).compile(LAYOUT).apply(a), SITES),
     "calibrate": (
         lambda a: calibration.calibrate(SENSOR, exposure_s=1.0, flat_e=a, n_frames=4, seed=0).gain,
         SITES * 5,
@@ -184,7 +184,7 @@ REJECTED = {
         lambda a: calibration.Calibration.from_frames(dark=a, flat=a + 300).gain,
         FRAMES.astype(np.float64),
     ),
-    "linearised": (lambda a: calibration.linearised(a, SENSOR), CODES),
+    "linearise": (lambda a: calibration.linearise(a, SENSOR), CODES),
     "Ramp": (changed(RAMP, "code"), RAMP.code),
     "Rates": (changed(RATES, "rate_e_per_s"), SITES),
     "merge_exposures": (
@@ -243,14 +243,14 @@ REJECTED = {
     ),
     "SpikingPixels": (lambda a: modes.SpikingPixels(SENSOR, threshold_e=a).threshold_e, SITES),
     "GazePath": (lambda a: video.GazePath(a, np.zeros((2, 2))).t_s, np.array([0.0, 1.0])),
-    "Footage": (
-        lambda a: next(iter(video.Footage([a], peak_radiance_w_m2_sr_nm=1.0, encoding="linear", **LIGHT))).basis,
+    "FrameSource": (
+        lambda a: next(iter(video.FrameSource([a], peak_radiance_w_m2_sr_nm=1.0, encoding="linear", **LIGHT))).basis,
         np.ones((4, 4)),
     ),
     "cells": (lambda a: fill_cells(LAYOUT, a, GRID).data, SITES),
     "least_squares variance": (lambda a: least_squares(LAYOUT, SITES, GRID, variance=a, mu=1.0).data, SITES),
-    "charge_readings": (lambda a: charge_readings(a, SENSOR, 1.0).light_e, SITES),
-    "code_readings": (lambda a: code_readings(a, SENSOR, 1.0).light_e, CODES),
+    "estimate_from_charge": (lambda a: estimate_from_charge(a, SENSOR, 1.0).light_e, SITES),
+    "estimate_from_code": (lambda a: estimate_from_code(a, SENSOR, 1.0).light_e, CODES),
     "Picture coverage": (lambda a: Picture(np.ones((1, *GRID.shape)), a, GRID).coverage, MAP),
     "Picture.to_image": (
         lambda a: Picture(np.ones((3, 4, 4)), np.ones((4, 4)), fs.Grid((4, 4), 1.0)).to_image(a),

@@ -106,7 +106,7 @@ def _empty(directory: Path) -> None:
 
 def _unusable(directory: Path, error: Exception) -> FileError:
     reason = " ".join(str(error).split()) or type(error).__name__
-    cure = "delete this directory, or name another one in NUMBA_CACHE_DIR"
+    hint = "delete this directory, or name another one in NUMBA_CACHE_DIR"
     return FileError(
-        directory, f"contains compiled kernels that can be neither read nor replaced ({reason:.200}); {cure}"
+        directory, f"contains compiled kernels that can be neither read nor replaced ({reason:.200}); {hint}"
     )

@@ -133,4 +133,4 @@ class Registry(Mapping[str, T], Generic[T]):
             return objects[name]
         closest = get_close_matches(str(name), objects, n=1)
         hint = f"did you mean '{closest[0]}'?" if closest else f"there are {', '.join(self) or 'none'}"
-        raise ParameterError(parameter, f"must be the name of a {self.kind}", name, cure=hint)
+        raise ParameterError(parameter, f"must be the name of a {self.kind}", name, hint=hint)

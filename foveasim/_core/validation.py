@@ -125,7 +125,7 @@ def check_number(
     above: float | None = None,
     at_least: float | None = None,
     at_most: float | None = None,
-    cure: str = "",
+    hint: str = "",
 ) -> float:
     """
     The value as a finite float within its bounds.
@@ -141,23 +141,23 @@ def check_number(
             raise TypeError
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
-        raise ParameterError(name, "must be one number", value, cure=cure) from None
+        raise ParameterError(name, "must be one number", value, hint=hint) from None
     except OverflowError:
-        raise ParameterError(name, "is larger than any floating-point number", cure=cure) from None
+        raise ParameterError(name, "is larger than any floating-point number", hint=hint) from None
     unit = unit_of(name)
     got = value if isinstance(value, int) else number
     if not np.isfinite(number):
-        raise ParameterError(name, "must be finite", got, unit, cure)
+        raise ParameterError(name, "must be finite", got, unit, hint)
     if above is not None and not number > above:
-        raise ParameterError(name, f"must be > {above:g}", got, unit, cure)
+        raise ParameterError(name, f"must be > {above:g}", got, unit, hint)
     if at_least is not None and not number >= at_least:
-        raise ParameterError(name, f"must be >= {at_least:g}", got, unit, cure)
+        raise ParameterError(name, f"must be >= {at_least:g}", got, unit, hint)
     if at_most is not None and not number <= at_most:
-        raise ParameterError(name, f"must be <= {at_most:g}", got, unit, cure)
+        raise ParameterError(name, f"must be <= {at_most:g}", got, unit, hint)
     return number
 
 
-def check_count(name: str, value: object, *, at_least: int = 1, at_most: int | None = None, cure: str = "") -> int:
+def check_count(name: str, value: object, *, at_least: int = 1, at_most: int | None = None, hint: str = "") -> int:
     """
     The value as an integer within its bounds.
 
@@ -169,14 +169,14 @@ def check_count(name: str, value: object, *, at_least: int = 1, at_most: int | N
     if isinstance(value, int | np.integer) and not isinstance(value, bool):
         number = int(value)  # of any size: seeds have more digits than a float
     else:
-        floating = check_number(name, value, cure=cure)
+        floating = check_number(name, value, hint=hint)
         number = int(floating)
         if number != floating:
-            raise ParameterError(name, "must be a whole number", floating, cure=cure)
+            raise ParameterError(name, "must be a whole number", floating, hint=hint)
     if number < at_least:
-        raise ParameterError(name, f"must be >= {at_least}", number, cure=cure)
+        raise ParameterError(name, f"must be >= {at_least}", number, hint=hint)
     if at_most is not None and number > at_most:
-        raise ParameterError(name, f"must be <= {at_most}", number, cure=cure)
+        raise ParameterError(name, f"must be <= {at_most}", number, hint=hint)
     return number
 
 
@@ -196,7 +196,7 @@ def check_shape(name: str, value: object) -> tuple[int, int]:
     return n_y, n_x
 
 
-def check_memory(name: str, n_bytes: int, value: object, cure: str = "") -> None:
+def check_memory(name: str, n_bytes: int, value: object, hint: str = "") -> None:
     """
     Check that an array and what is made of it fit in memory, before the system ends the program for want of it.
 
@@ -221,7 +221,7 @@ def check_memory(name: str, n_bytes: int, value: object, cure: str = "") -> None
             f"must give {ARRAYS_IN_FLIGHT} arrays of {n_bytes / 2**30:,.4g} GiB that fit in the memory of "
             f"{memory / 2**30:.3g} GiB",
             value,
-            cure=cure or "take fewer pixels",
+            hint=hint or "take fewer pixels",
         )
 
 
@@ -237,7 +237,7 @@ def memory_bytes() -> int:
     return min(limit for limit in limits if limit > 0)
 
 
-def check_length_um(name: str, value: object, *, at_most: float | None = None, cure: str = "") -> float:
+def check_length_um(name: str, value: object, *, at_most: float | None = None, hint: str = "") -> float:
     """
     The value as a length on a sensor, in µm.
 
@@ -246,9 +246,9 @@ def check_length_um(name: str, value: object, *, at_most: float | None = None, c
     ParameterError
         When it is no number, not positive, longer than allowed, or of a size that no sensor has.
     """
-    length_um = check_number(name, value, above=0.0, at_most=at_most, cure=cure)
+    length_um = check_number(name, value, above=0.0, at_most=at_most, hint=hint)
     return check_number(
-        name, length_um, at_least=MIN_LENGTH_UM, at_most=MAX_LENGTH_UM, cure=cure or "lengths on a sensor are in µm"
+        name, length_um, at_least=MIN_LENGTH_UM, at_most=MAX_LENGTH_UM, hint=hint or "lengths on a sensor are in µm"
     )
 
 
@@ -280,7 +280,7 @@ def check_sites(n_sites: int) -> int:
     ParameterError
         When there would be too many.
     """
-    return check_count("n_sites", n_sites, at_most=MAX_SITES, cure="take fewer or larger photosites")
+    return check_count("n_sites", n_sites, at_most=MAX_SITES, hint="take fewer or larger photosites")
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> str:
@@ -329,7 +329,7 @@ def unmasked(name: str, value: Any, *, missing_is_nan: bool = False) -> Any:
     raise ParameterError(
         name,
         f"must have no masked values, got {n_masked} of {mask.size} masked",
-        cure="fill them first, for example with .filled(0)",
+        hint="fill them first, for example with .filled(0)",
     )
 
 

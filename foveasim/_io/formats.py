@@ -201,5 +201,5 @@ def chosen_options(
         if name not in known:
             titles = sorted({found.title for found in formats.values() if name in getattr(found, of)})
             belongs = f"belongs to {' and '.join(titles)} files" if titles else "is not an option of any format"
-            raise ParameterError(name, belongs, value, cure="leave it out")
+            raise ParameterError(name, belongs, value, hint="leave it out")
     return given

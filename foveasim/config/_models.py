@@ -21,7 +21,15 @@ from foveasim.layout import LAYOUTS, DesignRules, Readout, Routing
 from foveasim.maps import read_power_map
 from foveasim.optics import PUPILS, LateralColour, Optics, Seidel, Zernike
 from foveasim.scene import SCENES
-from foveasim.sensor import Coupling, Diffusion, FilterSet, KernelCrosstalk, ProductCurve, Sensor, read_filters
+from foveasim.sensor import (
+    Diffusion,
+    FilterSet,
+    InterPixelCapacitance,
+    KernelCrosstalk,
+    ProductCurve,
+    Sensor,
+    read_filters,
+)
 from foveasim.sensor.effects import EFFECTS
 from foveasim.sensor.spectral import CURVES
 
@@ -195,7 +203,7 @@ def _sensor() -> type[_Section]:
         qe=float | curve | list[float | curve],  # type: ignore[valid-type]
         filters=Literal["rgb"] | filters | None,
         crosstalk=_one_of("kind", {name: _model(name, way) for name, way in _CROSSTALK.items()}) | None,
-        coupling=_model("coupling", Coupling) | None,
+        coupling=_model("coupling", InterPixelCapacitance) | None,
         sensitivity=_PerSite,
         dark_e_per_s=_PerSite,
         full_well_e=_PerSite | None,

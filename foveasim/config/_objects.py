@@ -419,7 +419,7 @@ def _call(path: Path, place: str, function: Callable[..., Any], arguments: Mappi
         return function(**arguments)
     except ParameterError as error:
         where = f"{place}.{error.name}" if place else error.name
-        raise ConfigError(path, f"{where}: {error.told}") from None
+        raise ConfigError(path, f"{where}: {error.detail}") from None
     except FoveasimError as error:
         raise ConfigError(path, f"{place}: {error}") from None
 

@@ -158,7 +158,7 @@ def results_table(results: Sequence[Result]) -> Table:
         "most electrons": [f"{c.electrons.max():,}" for c in captures],
         "median code / DN": [f"{np.median(c.code):,.0f} of {2**c.bits - 1:,}" for c in captures],
         "sites at code 0 / %": [f"{100 * np.mean(c.code == 0):.2f}" for c in captures],
-        "saturated sites / %": [f"{100 * c.saturated_share:.2f}" for c in captures],
+        "saturated sites / %": [f"{100 * c.saturated_fraction:.2f}" for c in captures],
     }
     for stage in dict.fromkeys(stage for c in captures for stage in c.stage_s):
         rows[f"{stage} / s"] = [f"{c.stage_s.get(stage, 0.0):.3f}" for c in captures]

@@ -14,7 +14,7 @@ from foveasim.config import Shot
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import Layout
 from foveasim.scene import Scene
-from foveasim.video import Footage, frames_kept, write_video
+from foveasim.video import FrameSource, count_recorded_frames, write_video
 from foveasim.video.frame_source import pictures_in
 
 __all__ = ["run_video"]
@@ -73,11 +73,11 @@ def run_video(
         raise SimulationError(
             f"{shot.name} is of a map of light; frames need a scene, which says how large their pixels are"
         )
-    footage = Footage(frames, like=shot.scene, frame_s=frame_s, stop=stop)
+    footage = FrameSource(frames, template=shot.scene, frame_s=frame_s, stop=stop)
     if line_s and footage.frame_s is None:
         raise ParameterError("frame_s", "must be given for a rolling shutter: pictures in a folder do not say it")
     is_kept = Path(out).suffix.lower() == ".zarr"
-    n_before = frames_kept(out) if is_kept else 0
+    n_before = count_recorded_frames(out) if is_kept else 0
     captures = shot.camera.video(
         footage.from_frame(n_before),
         exposure_s=shot.exposure_s,

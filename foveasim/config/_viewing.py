@@ -23,7 +23,7 @@ CAPTURE_ARRAYS = {"code.npy", "electrons.npy"}
 class Viewable:
     """A layout or a capture, the report of a check of its layout, and a heading."""
 
-    thing: Layout | Capture
+    data: Layout | Capture
     report: Report | None
     name: str
 

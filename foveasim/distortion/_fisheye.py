@@ -238,7 +238,7 @@ class Scaramuzza(_ByAngle):
         object.__setattr__(self, "a", tuple((a * np.sign(a[0])).tolist()))
         object.__setattr__(self, "stretch", tuple(map(tuple, stretch.tolist())))
         object.__setattr__(self, "pixel_um", check_number("pixel_um", self.pixel_um, above=0.0))
-        object.__setattr__(self, "focal_um", check_number("focal_um", self.focal_um, cure="'stretch' tells axes apart"))
+        object.__setattr__(self, "focal_um", check_number("focal_um", self.focal_um, hint="'stretch' tells axes apart"))
         self._check_place()
 
     @cached_property

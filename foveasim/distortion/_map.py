@@ -93,7 +93,7 @@ def distort_map(
     elif not isinstance(grid, Grid):
         raise ParameterError("grid", f"must be a Grid, got a {type(grid).__name__}")
     if math.prod(grid.shape) > MAX_CELLS:
-        raise ParameterError("grid", f"must have at most {MAX_CELLS} cells", grid.shape, cure="give a smaller one")
+        raise ParameterError("grid", f"must have at most {MAX_CELLS} cells", grid.shape, hint="give a smaller one")
     coefficients = [_spline(band, order) for band in power_map.data]
     data = np.empty((len(coefficients), *grid.shape), power_map.data.dtype)
     n_rows = max(CELLS_A_PIECE // grid.shape[1], 1)

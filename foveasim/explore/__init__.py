@@ -5,12 +5,12 @@ from __future__ import annotations
 from foveasim._core.registry import import_all
 from foveasim.explore._metrics import METRICS, Metric, metric_of
 from foveasim.explore._schemas import schema_of
-from foveasim.explore.datasets.dataset import DataSet
-from foveasim.explore.datasets.distributions import draw_of
-from foveasim.explore.datasets.plan import DataSetFile, read_data_set
-from foveasim.explore.datasets.pytorch import torch_data_set
+from foveasim.explore.datasets.dataset import Dataset
+from foveasim.explore.datasets.distributions import parse_distribution
+from foveasim.explore.datasets.plan import DatasetFile, read_dataset
+from foveasim.explore.datasets.pytorch import torch_dataset
 from foveasim.explore.datasets.recipes import classification, denoising
-from foveasim.explore.datasets.store import StoredSamples, open_data_set, write_data_set
+from foveasim.explore.datasets.store import StoredSamples, open_dataset, write_dataset
 from foveasim.explore.studies.plan import StudyPlan, plan_study, read_study
 from foveasim.explore.studies.study import best_table, finished_trials, run_study, storage_name, study
 from foveasim.explore.sweeps.plan import Plan, plan_sweep, read_sweep
@@ -19,8 +19,8 @@ from foveasim.explore.sweeps.sweep import run_sweep, sweep
 
 __all__ = [
     "METRICS",
-    "DataSet",
-    "DataSetFile",
+    "Dataset",
+    "DatasetFile",
     "Metric",
     "Plan",
     "StoredSamples",
@@ -28,14 +28,14 @@ __all__ = [
     "best_table",
     "classification",
     "denoising",
-    "draw_of",
     "finished_trials",
     "metric_of",
-    "open_data_set",
+    "open_dataset",
     "open_results",
+    "parse_distribution",
     "plan_study",
     "plan_sweep",
-    "read_data_set",
+    "read_dataset",
     "read_study",
     "read_sweep",
     "run_study",
@@ -44,8 +44,8 @@ __all__ = [
     "storage_name",
     "study",
     "sweep",
-    "torch_data_set",
-    "write_data_set",
+    "torch_dataset",
+    "write_dataset",
 ]
 
 import_all(__name__, __path__)

@@ -53,7 +53,7 @@ def mean_code_dn(shot: Shot, camera: Camera, capture: Capture) -> float:  # noqa
 @METRICS.register("saturated_fraction")
 def saturated_fraction(shot: Shot, camera: Camera, capture: Capture) -> float:  # noqa: ARG001
     """Share of the sites that gave the highest code."""
-    return capture.saturated_share
+    return capture.saturated_fraction
 
 
 @METRICS.register("snr")
@@ -162,7 +162,7 @@ def named_metrics(metrics: Iterable[str | Metric] | Mapping[str, Metric] | None)
                 "metrics",
                 f"must be of {', '.join(sorted(METRICS))}",
                 name,
-                cure="functions of your own are given in Python, or with --metric module:function",
+                hint="functions of your own are given in Python, or with --metric module:function",
             )
         if not callable(metric):
             raise ParameterError("metrics", "must be names or functions", metric)

@@ -6,14 +6,14 @@ from typing import Any
 
 from foveasim._core.validation import check_choice
 from foveasim.config import schema
-from foveasim.explore.datasets.plan import DataSetSection
+from foveasim.explore.datasets.plan import DatasetSection
 from foveasim.explore.studies.plan import StudySection
 from foveasim.explore.sweeps.plan import SweepSection
 
 __all__ = ["schema_of"]
 
 #: Sorts of files, with their models.
-FILES: dict[str, Any] = {"sweep": SweepSection, "study": StudySection, "dataset": DataSetSection}
+FILES: dict[str, Any] = {"sweep": SweepSection, "study": StudySection, "dataset": DatasetSection}
 
 
 def schema_of(kind: str) -> dict[str, Any]:

@@ -109,7 +109,7 @@ class Integrator:
         if not isinstance(grid, Grid):
             raise ParameterError("grid", f"must be a Grid, got a {type(grid).__name__}")
         self.grid = grid
-        self.order = check_count("order", order, at_most=2, cure="1 takes cells as even, 2 as means with a gradient")
+        self.order = check_count("order", order, at_most=2, hint="1 takes cells as even, 2 as means with a gradient")
         self.n_threads = thread_count(n_threads)
         check_choice("conserve", conserve, ("flux", "density"))
         outlines: Callable[[int, int], Outlines] = partial(outlines_of, layout)
@@ -134,7 +134,7 @@ class Integrator:
                 )
 
     @property
-    def lost_sites(self) -> Ints:
+    def sites_outside_image_circle(self) -> Ints:
         """Sites outside the lens's image circle, which receive nothing."""
         return np.flatnonzero(self._plan.is_lost)
 
@@ -180,7 +180,7 @@ class Integrator:
             raise ParameterError("power_map", "must be an array of numbers", power_map) from None
         if cells.dtype.hasobject:
             raise ParameterError(
-                "power_map", f"must be an array, got a {type(power_map).__name__}", cure="of a PowerMap give its .data"
+                "power_map", f"must be an array, got a {type(power_map).__name__}", hint="of a PowerMap give its .data"
             )
         if cells.ndim < 2 or cells.shape[-2:] != self.grid.shape:
             raise ParameterError(

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from foveasim.layout.adjacency import adjacency
-from foveasim.layout.channels import MOSAICS, colouring, mosaic, random_channels
+from foveasim.layout.channels import MOSAICS, graph_colouring, mosaic, random_channels
 from foveasim.layout.drc.measurements import RULES, Rule
 from foveasim.layout.drc.presets import PRESETS, Preset
 from foveasim.layout.drc.repair import Change, enforce
-from foveasim.layout.drc.routing import Readout, Routing, crossings
+from foveasim.layout.drc.routing import Readout, Routing, track_demand
 from foveasim.layout.drc.rules import DesignRules, Report, RuleResult, Violation, min_width_um
-from foveasim.layout.edits import clip, inset, merge, merge_small, node, punch, snap, split, union
+from foveasim.layout.edits import clip, cut_out, inset, merge, merge_small, node, snap, split, union
 from foveasim.layout.families import LAYOUTS, layout_family
 from foveasim.layout.files import FORMATS, FileFormat, WrittenLayout, read_layout, shipped_layouts, write_layout
 from foveasim.layout.generators.foveal_cartesian import foveal_cartesian
@@ -52,8 +52,7 @@ __all__ = [
     "WrittenLayout",
     "adjacency",
     "clip",
-    "colouring",
-    "crossings",
+    "cut_out",
     "describe",
     "enforce",
     "fill",
@@ -61,6 +60,7 @@ __all__ = [
     "fovi",
     "giotto",
     "giotto_ratio",
+    "graph_colouring",
     "grid",
     "hexagonal",
     "inset",
@@ -74,7 +74,6 @@ __all__ = [
     "node",
     "octagonal",
     "penrose",
-    "punch",
     "quadtree",
     "random_channels",
     "read_layout",
@@ -86,6 +85,7 @@ __all__ = [
     "square_ring_ratio",
     "sunflower",
     "tiling",
+    "track_demand",
     "union",
     "voronoi",
     "write_layout",

@@ -68,7 +68,7 @@ def as_region(name: str, region: Any) -> Any:
     if outline.is_empty or not outline.is_valid or not outline.area > 0.0:
         raise ParameterError(name, "must be a valid polygon, which does not cross itself and has an area")
     if np.abs(outline.bounds).max() > MAX_LENGTH_UM:
-        raise ParameterError(name, f"must lie within {MAX_LENGTH_UM:g} µm of the origin", cure="it is in µm")
+        raise ParameterError(name, f"must lie within {MAX_LENGTH_UM:g} µm of the origin", hint="it is in µm")
     return outline
 
 

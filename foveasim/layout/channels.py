@@ -13,7 +13,7 @@ from foveasim.errors import ParameterError
 from foveasim.layout.adjacency import adjacency
 from foveasim.layout.model import Layout
 
-__all__ = ["MOSAICS", "colouring", "mosaic", "random_channels"]
+__all__ = ["MOSAICS", "graph_colouring", "mosaic", "random_channels"]
 
 #: Pairs of columns that number a layout's sites in two directions, in order of preference.
 INDEX_COLUMNS = (("row", "column"), ("ring", "sector"))
@@ -64,7 +64,7 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
         raise ParameterError(
             "layout",
             f"must have the columns {' or '.join(' and '.join(p) for p in INDEX_COLUMNS)}, got {sorted(layout.columns)}",
-            cure="set its channel column with with_columns(channel=...)",
+            hint="set its channel column with with_columns(channel=...)",
         )
     channels = np.array([[names.index(letter) for letter in row] for row in rows])
     row, column = (layout.index_column(name) for name in pair)
@@ -74,14 +74,14 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
     )
 
 
-def random_channels(layout: Layout, shares: ArrayLike, *, seed: int) -> Layout:
+def random_channels(layout: Layout, fractions: ArrayLike, *, seed: int) -> Layout:
     """
     The layout with colour filters strewn at random, in exact numbers.
 
     Parameters
     ----------
     layout : Layout
-    shares : (n_filter,)
+    fractions : (n_filter,)
         Relative numbers of the filters: ``(1, 2, 1)`` for twice as much green.
     seed : int
 
@@ -95,15 +95,15 @@ def random_channels(layout: Layout, shares: ArrayLike, *, seed: int) -> Layout:
     ParameterError
         When a share is negative, or all are 0.
     """
-    parts = finite_array("shares", shares, ndim=1, at_least=0.0)
+    parts = finite_array("fractions", fractions, ndim=1, at_least=0.0)
     if not parts.sum() > 0.0:
-        raise ParameterError("shares", "must not all be 0", shares)
+        raise ParameterError("fractions", "must not all be 0", fractions)
     borders = np.round(np.cumsum(parts) / parts.sum() * layout.n_sites).astype(np.int64)
     ordered = np.repeat(np.arange(parts.size), np.diff(borders, prepend=0))
     return layout.with_columns(channel=Streams(seed).of("layout channels").permutation(ordered))
 
 
-def colouring(layout: Layout, n_channels: int, *, max_gap_um: float | None = None) -> Layout:
+def graph_colouring(layout: Layout, n_channels: int, *, max_gap_um: float | None = None) -> Layout:
     """
     The layout with colour filters such that neighbours differ wherever they can.
 
@@ -120,7 +120,7 @@ def colouring(layout: Layout, n_channels: int, *, max_gap_um: float | None = Non
     -------
     Layout
         With the column ``channel``. Site after site, those first whose neighbours show the most filters already, takes the
-        filter that shares the least edge with neighbours of the same filter, and of those the one used least so far.
+        filter that fractions the least edge with neighbours of the same filter, and of those the one used least so far.
 
     Raises
     ------

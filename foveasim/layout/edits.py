@@ -32,7 +32,7 @@ from foveasim.layout.adjacency import TOUCHING_UM, adjacency
 from foveasim.layout.drc.measurements import is_below_size
 from foveasim.layout.model import INTEGER_RANGES, Layout
 
-__all__ = ["clip", "inset", "joining_groups", "merge", "merge_small", "node", "punch", "snap", "split", "union"]
+__all__ = ["clip", "cut_out", "inset", "joining_groups", "merge", "merge_small", "node", "snap", "split", "union"]
 
 #: A piece of a site smaller than this share of it is rounding at the border of a cut.
 SLIVER = 1e-9
@@ -94,7 +94,7 @@ def clip(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "piece
     return _kept(layout, as_region("region", region), shapely.intersection, shapely.covers, cut, "clipped to a region")
 
 
-def punch(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "pieces") -> Layout:
+def cut_out(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "pieces") -> Layout:
     """
     The part of a layout outside a region; parameters and errors as for :func:`clip`.
 

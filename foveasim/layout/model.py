@@ -606,9 +606,9 @@ def _unpacked(polygons: Any) -> tuple[Floats, Ints, Ints]:
         bad = int(np.flatnonzero(~is_polygon)[0])
         kind = type(geometries[bad]).__name__
         is_geometry = isinstance(geometries[bad], shapely.Geometry)
-        cure = "give each part of it as a site of its own" if is_geometry else "make one with shapely.Polygon(vertices)"
+        hint = "give each part of it as a site of its own" if is_geometry else "make one with shapely.Polygon(vertices)"
         raise GeometryError(
-            f"site {bad} must be a shapely Polygon, got a {kind}; {cure}",
+            f"site {bad} must be a shapely Polygon, got a {kind}; {hint}",
             (bad,),
         )
     _require(shapely.is_empty(geometries), "is empty")

@@ -49,7 +49,7 @@ def write(power_map: PowerMap, path: Path) -> None:
         raise ParameterError(
             "power_map",
             f"must be float32 for EXR, got {power_map.data.dtype}",
-            cure="convert it, or take .npz, .fits or .nc",
+            hint="convert it, or take .npz, .fits or .nc",
         )
     names = [_channel_name(wavelength) for wavelength in power_map.wavelength_nm.tolist()]
     if len(set(names)) < len(names):

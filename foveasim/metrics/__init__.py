@@ -11,11 +11,17 @@ from foveasim.metrics.quality import psnr_db, ssim
 from foveasim.metrics.sampling import (
     EccentricityTable,
     neighbour_spacing_um,
-    nyquist_against_eccentricity,
     nyquist_per_mm,
+    nyquist_vs_eccentricity,
 )
 from foveasim.metrics.slanted_edge import EdgeMtf, slanted_edge_mtf
-from foveasim.metrics.snr import SnrTable, light_at_snr_fraction, measured_snr_by_class, size_classes_um, snr_by_class
+from foveasim.metrics.snr import (
+    SnrTable,
+    measured_snr_by_class,
+    relative_exposure_at_snr_fraction,
+    size_classes_um,
+    snr_by_class,
+)
 
 __all__ = [
     "AliasingSpectrum",
@@ -32,16 +38,16 @@ __all__ = [
     "emva1288",
     "estimate_flow",
     "flow_bound",
-    "light_at_snr_fraction",
     "measured_snr_by_class",
     "neighbour_spacing_um",
-    "nyquist_against_eccentricity",
     "nyquist_per_mm",
+    "nyquist_vs_eccentricity",
     "photon_transfer",
     "polygon_mtf",
     "polygon_otf",
     "predicted_photon_transfer",
     "psnr_db",
+    "relative_exposure_at_snr_fraction",
     "sampling_spectrum",
     "site_gradients_e_per_um",
     "size_classes_um",

@@ -135,11 +135,11 @@ class AliasingSpectrum:
         and a smooth window.
     nyquist_per_mm, peak_per_mm : float, 1/mm
         Median of the region's sites, and the radius of a peak.
-    true_fraction : float
+    baseband_fraction : float
         Contrast at the wave's own frequency: the pixels' MTF.
-    false_fraction : float
+    alias_fraction : float
         Highest contrast at another frequency up to the Nyquist frequency: the alias that is seen.
-    false_per_mm : (2,) float64, 1/mm
+    alias_per_mm : (2,) float64, 1/mm
         Where it is.
     noise_fraction : float
         Share of the samples' power that is at other frequencies up to the Nyquist frequency, the alias included; the power of
@@ -151,9 +151,9 @@ class AliasingSpectrum:
     amplitude: Floats
     nyquist_per_mm: float
     peak_per_mm: float
-    true_fraction: float
-    false_fraction: float
-    false_per_mm: Floats
+    baseband_fraction: float
+    alias_fraction: float
+    alias_per_mm: Floats
     noise_fraction: float
 
 
@@ -277,9 +277,9 @@ def aliasing_spectrum(
         amplitude=read_only(amplitude),
         nyquist_per_mm=nyquist,
         peak_per_mm=peak,
-        true_fraction=float(np.abs(np.sum(weight * otf))),
-        false_fraction=false,
-        false_per_mm=read_only(at),
+        baseband_fraction=float(np.abs(np.sum(weight * otf))),
+        alias_fraction=false,
+        alias_per_mm=read_only(at),
         noise_fraction=power / own,
     )
 

@@ -253,7 +253,7 @@ def _photons(photons: ArrayLike, groups: SiteClasses, n_levels: int) -> Floats:
     else:
         raise ParameterError("photons", f"must have the shape ({n_levels},) or ({n_levels}, {n_sites})", values.shape)
     if np.any(np.diff(level_ph, axis=0) <= 0.0):
-        raise ParameterError("photons", "must rise from level to level in every class", cure="sort the levels")
+        raise ParameterError("photons", "must rise from level to level in every class", hint="sort the levels")
     return level_ph
 
 

@@ -391,7 +391,7 @@ def above_dark(transfer: PhotonTransfer, dark: PhotonTransfer | None) -> tuple[F
     if dark is None:
         if np.any(transfer.mean_dn[0] > transfer.mean_dn[-1]):
             raise ParameterError(
-                "levels", "must begin with darkness", cure="give them rising, or dark frames of their own"
+                "levels", "must begin with darkness", hint="give them rising, or dark frames of their own"
             )
         return (
             transfer.mean_dn - transfer.mean_dn[0],
@@ -413,5 +413,5 @@ def slopes(name: str, x: Floats, y: Floats, is_used: NDArray[np.bool_]) -> Float
     """Slopes of lines through the origin by least squares, (n_class,) of (n_level, n_class)."""
     squares = np.where(is_used, x * x, 0.0).sum(axis=0)
     if not np.all(squares > 0.0):
-        raise ParameterError(name, "must have light below 70 % of saturation for every class", cure="add darker levels")
+        raise ParameterError(name, "must have light below 70 % of saturation for every class", hint="add darker levels")
     return np.asarray(np.where(is_used, x * y, 0.0).sum(axis=0) / squares)

@@ -135,7 +135,7 @@ def _compared(
             raise ParameterError(
                 name,
                 f"must be finite where it is compared, and {n_infinite:,} of {np.count_nonzero(counts):,} pixels are not",
-                cure="pixels that are not known must be NaN",
+                hint="pixels that are not known must be NaN",
             )
     return planes[0], planes[1], np.asarray(counts)
 

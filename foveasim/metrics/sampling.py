@@ -16,8 +16,8 @@ from foveasim.units import per_mm_from_per_um
 __all__ = [
     "EccentricityTable",
     "neighbour_spacing_um",
-    "nyquist_against_eccentricity",
     "nyquist_per_mm",
+    "nyquist_vs_eccentricity",
     "require_layout",
 ]
 
@@ -194,7 +194,7 @@ class EccentricityTable:
         return "\n".join(lines)
 
 
-def nyquist_against_eccentricity(
+def nyquist_vs_eccentricity(
     layout: Layout,
     centre_um: tuple[float, float] = (0.0, 0.0),
     *,

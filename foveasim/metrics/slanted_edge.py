@@ -201,7 +201,7 @@ def slanted_edge_mtf(
     if bin_um is None:
         bin_um = pitch_um / BINS_PER_PITCH
     else:
-        bin_um = check_length_um("bin_um", bin_um, at_most=pitch_um, cure="one pitch is the most")
+        bin_um = check_length_um("bin_um", bin_um, at_most=pitch_um, hint="one pitch is the most")
     frequency = _frequencies_per_mm(frequency_per_mm, bin_um, pitch_um)
     edge = _find_edge(xy_um, light, pitch_um)
     across = np.array([np.cos(edge.angle_rad), np.sin(edge.angle_rad)])
@@ -398,8 +398,8 @@ def _binned(
     n_sides = min(-low, high + 1)
     least_um = max(LEAST_REACH_PITCHES * pitch_um, LEAST_REACH_WIDTHS * width_um)
     if reach_um is not None:
-        cure = f"five pitches of {pitch_um:.3g} µm, and twice the edge's width of {width_um:.3g} µm, are the least"
-        least_um = check_number("reach_um", reach_um, at_least=float(f"{least_um:.3g}"), cure=cure)
+        hint = f"five pitches of {pitch_um:.3g} µm, and twice the edge's width of {width_um:.3g} µm, are the least"
+        least_um = check_number("reach_um", reach_um, at_least=float(f"{least_um:.3g}"), hint=hint)
         n_sides = min(n_sides, int(np.ceil(least_um / bin_um)))
     if n_sides * bin_um < least_um * (1.0 - 1e-9):
         far_um = min(-distance_um.min(), distance_um.max())

@@ -27,7 +27,7 @@ from foveasim.sensor.adc import QUANTISATION_DN2, Converter
 from foveasim.sensor.limits import check_plausible
 from foveasim.sensor.signal_to_noise import CUT_OFF_SIGMAS
 
-__all__ = ["SnrTable", "light_at_snr_fraction", "measured_snr_by_class", "size_classes_um", "snr_by_class"]
+__all__ = ["SnrTable", "measured_snr_by_class", "relative_exposure_at_snr_fraction", "size_classes_um", "snr_by_class"]
 
 #: Sizes that differ by less than this share are one class.
 SIZE_ROUNDING = 1e-6
@@ -185,7 +185,7 @@ def snr_by_class(
     return _table(groups, layout.area_um2, *_linear_codes(signal_to_noise(sensor, expected_e, dark_e)))
 
 
-def light_at_snr_fraction(
+def relative_exposure_at_snr_fraction(
     camera: Camera, light: Scene | PowerMap, *, exposure_s: float, snr: float = 1.0, classes: ArrayLike | None = None
 ) -> Floats:
     """
@@ -223,7 +223,7 @@ def light_at_snr_fraction(
     full_e = sensor.expected_electrons(camera.photoelectrons_per_s(light), exposure_s)
     dark_e = sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s)
     search = _Search(groups.n_sites.size)
-    is_full = np.zeros(groups.n_sites.size, bool)
+    is_saturated = np.zeros(groups.n_sites.size, bool)
     for _ in range(MOST_STEPS):
         if search.is_done.all():
             break
@@ -232,10 +232,10 @@ def light_at_snr_fraction(
         signal_dn, noise_dn2, is_cut = _linear_codes(signal_to_noise(sensor, expected_e, dark_e))
         signal_dn, noise_dn = groups.mean(signal_dn), np.sqrt(groups.mean(noise_dn2))
         does = ~search.is_done & (signal_dn > 0.0) & (signal_dn >= snr * noise_dn * (1.0 - SHARE_ROUNDING))
-        is_full = np.where(does, groups.mean(is_cut.astype(np.float64)) >= 0.5, is_full)
+        is_saturated = np.where(does, groups.mean(is_cut.astype(np.float64)) >= 0.5, is_saturated)
         too_little = np.maximum(snr * noise_dn, np.finfo(float).tiny)
         search.step(np.log(np.clip(signal_dn, 1e-3 * too_little, 1e3 * too_little) / too_little))
-    return np.where(search.is_found & ~is_full, np.exp(search.high), np.nan)
+    return np.where(search.is_found & ~is_saturated, np.exp(search.high), np.nan)
 
 
 class _Search:
@@ -286,7 +286,7 @@ def measured_snr_by_class(
     layout : Layout
     frames, dark : (n_frame, n_site) DN, or lists of codes or captures
         Two frames or more. Codes of captures are made linear, as their settings say; others must be:
-        :func:`foveasim.sensor.linearised`.
+        :func:`foveasim.sensor.linearise`.
     bits : int, optional
         Of the codes, to tell saturation; taken from captures by default.
     full_well_e : float or (n_site,), optional, e-
@@ -324,16 +324,16 @@ def measured_snr_by_class(
         if some.shape[1] != layout.n_sites:
             raise ParameterError(name, f"must have the layout's {layout.n_sites} sites", some.shape[1])
     groups = SiteClasses(size_classes_um(layout) if classes is None else classes, layout.n_sites)
-    is_full = _is_near(codes.mean(axis=0), codes.var(axis=0, ddof=1), 2**bits - 1.5)
+    is_saturated = _is_near(codes.mean(axis=0), codes.var(axis=0, ddof=1), 2**bits - 1.5)
     well_e = _full_well_e(captures, full_well_e, layout.n_sites)
     if well_e is not None:
         mean_e = np.mean([capture.electrons for capture in captures], axis=0)
-        is_full |= _is_near(mean_e, mean_e, well_e)
+        is_saturated |= _is_near(mean_e, mean_e, well_e)
     converter = _converter(captures, bits)
     linear_dn, dark_dn = (np.interp(some, np.arange(2.0**bits), converter.linear_dn) for some in (codes, dark_codes))
     floor_dn2 = QUANTISATION_DN2 * np.square(converter.width_of_code_dn(codes.mean(axis=0)))
     noise_dn2 = np.maximum(linear_dn.var(axis=0, ddof=1), floor_dn2)
-    return _table(groups, layout.area_um2, linear_dn.mean(axis=0) - dark_dn.mean(axis=0), noise_dn2, is_full)
+    return _table(groups, layout.area_um2, linear_dn.mean(axis=0) - dark_dn.mean(axis=0), noise_dn2, is_saturated)
 
 
 def _converter(captures: Sequence[Capture], bits: int) -> Converter:
@@ -379,12 +379,14 @@ def _linear_codes(found: SiteSignals) -> tuple[Floats, Floats, Bools]:
     return gain * found.signal_e, np.square(gain * found.noise_e), found.is_saturated
 
 
-def _table(groups: SiteClasses, area_um2: Floats, signal_dn: Floats, noise_dn2: Floats, is_full: Bools) -> SnrTable:
+def _table(
+    groups: SiteClasses, area_um2: Floats, signal_dn: Floats, noise_dn2: Floats, is_saturated: Bools
+) -> SnrTable:
     return SnrTable(
         classes=read_only(groups.labels),
         n_sites=read_only(groups.n_sites),
         size_um=read_only(groups.mean(np.sqrt(area_um2))),
         signal_dn=read_only(groups.mean(signal_dn)),
         noise_dn=read_only(np.sqrt(groups.mean(noise_dn2))),
-        saturated_fraction=read_only(groups.mean(is_full.astype(np.float64))),
+        saturated_fraction=read_only(groups.mean(is_saturated.astype(np.float64))),
     )

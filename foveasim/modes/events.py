@@ -90,7 +90,7 @@ class Events:
                 raise ParameterError("site", f"must be from 0 to {n_sites - 1}, the sites of the layout", int(bad[0]))
             if not np.all(np.abs(polarity) == 1):
                 bad = polarity[np.abs(polarity) != 1]
-                raise ParameterError("polarity", "must be 1 or -1", int(bad[0]), cure="of 0 and 1 make 2 * p - 1")
+                raise ParameterError("polarity", "must be 1 or -1", int(bad[0]), hint="of 0 and 1 make 2 * p - 1")
         for name, values, kept in zip(ARRAYS, (t_s, site, polarity), (np.float64, np.int32, np.int8), strict=True):
             object.__setattr__(self, name, own(values.astype(kept, copy=False)))
 
@@ -151,7 +151,7 @@ class Events:
         return Events(self.t_s[part], self.site[part], self.polarity[part], self.layout)
 
     @classmethod
-    def joined(cls, parts: Iterable[Events]) -> Events:
+    def concatenate(cls, parts: Iterable[Events]) -> Events:
         """Events of batches that follow each other, as one."""
         batches = list(_following("parts", parts))
         if not batches:
@@ -354,7 +354,7 @@ def write_events(batches: Iterable[Events], path: str | Path, *, pitch_um: float
 
     Notes
     -----
-    HDF5 as of the data set DSEC (Gehrig et al., IEEE Robotics and Automation Letters 6, 4947, 2021), and of the tools that
+    HDF5 as of the dataset DSEC (Gehrig et al., IEEE Robotics and Automation Letters 6, 4947, 2021), and of the tools that
     read it, such as its own loaders and RVT: the group ``events`` with the arrays ``t`` (µs, int64), ``x`` and ``y`` (uint16,
     row 0 on top) and ``p`` (uint8, 0 or 1), and beside it ``ms_to_idx``, the first event of each millisecond, and ``t_offset``
     of 0. It is neither the one array (n, 4) that v2e writes, nor the HDF5 of Metavision. Moreover ``events/site``, and the
@@ -391,7 +391,7 @@ def _following(name: str, batches: Iterable[Events]) -> Iterator[Events]:
     """Batches of one layout that follow each other."""
     if isinstance(batches, Events) or not isinstance(batches, Iterable):
         cure = "put it into a list" if isinstance(batches, Events) else ""
-        raise ParameterError(name, f"must be batches of events, got a {type(batches).__name__}", cure=cure)
+        raise ParameterError(name, f"must be batches of events, got a {type(batches).__name__}", hint=cure)
     layout: Layout | None = None
     last_s = 0.0
     for batch in batches:

@@ -396,7 +396,7 @@ def _check_rates(rates: object) -> None:
         raise ParameterError(
             "rates",
             f"must be frames of one rate a site each, got a {type(rates).__name__}",
-            cure="foveasim.Camera.rates makes them of light",
+            hint="foveasim.Camera.rates makes them of light",
         )
 
 
@@ -484,7 +484,7 @@ def _rising(values: Floats) -> Ints:
 
 def _all(batches: Iterator[Events], sensor: Sensor) -> Events:
     nothing = Events(np.zeros(0), np.zeros(0, np.int32), np.zeros(0, np.int8), _layout(sensor))
-    return Events.joined([nothing, *batches])
+    return Events.concatenate([nothing, *batches])
 
 
 def _layout(sensor: Sensor) -> Layout:

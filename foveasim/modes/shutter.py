@@ -54,7 +54,7 @@ class Shutter:
     >>> import foveasim as fs
     >>> layout = fs.layout.grid(n_x=1, n_y=2, pitch_um=2.0).with_columns(readout_order=np.array([0, 1]))
     >>> shutter = Shutter(layout, frame_s=1.5, line_s=0.5)
-    >>> [shutter.share(frame, 2.0).tolist() for frame in range(3)]
+    >>> [shutter.overlap_fraction(frame, 2.0).tolist() for frame in range(3)]
     [[0.75, 0.5], [0.25, 0.5], [0.0, 0.0]]
     """
 
@@ -83,7 +83,7 @@ class Shutter:
         order = np.asarray(self.layout.columns["readout_order"], np.float64)
         return self.line_s * (order - order.min(initial=np.inf))
 
-    def share(self, frame: int, exposure_s: float) -> Floats:
+    def overlap_fraction(self, frame: int, exposure_s: float) -> Floats:
         """Share of each site's exposure that a frame lights, (n_site,) or (1,); frame 0 begins with the first line."""
         frame = check_count("frame", frame, at_least=0)
         exposure_s = check_plausible("exposure_s", exposure_s)
@@ -131,15 +131,15 @@ class Exposure:
         self._share: Floats = np.zeros(1)
 
     @property
-    def is_over(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether no frame to come lights any site."""
         return self._n_seen > self._last
 
     def add(self, rate_e_per_s: Floats) -> None:
         """Add the next frame's light, (n_site,) e-/s."""
         rate_e_per_s = self._light("rate_e_per_s", rate_e_per_s)
-        if not self.is_over:
-            share = self._shutter.share(self._n_seen, self.exposure_s)
+        if not self.is_complete:
+            share = self._shutter.overlap_fraction(self._n_seen, self.exposure_s)
             self._rate_e_per_s = self._rate_e_per_s + share * rate_e_per_s
             self._share = self._share + share
         self._n_seen += 1
@@ -147,7 +147,7 @@ class Exposure:
     def mean_e_per_s(self, last_e_per_s: Floats) -> Floats:
         """Mean light over every site's exposure, (n_site,) e-/s; the last frame's light stays until all are over."""
         last_e_per_s = self._light("last_e_per_s", last_e_per_s)
-        if self.is_over:
+        if self.is_complete:
             return self._rate_e_per_s
         return self._rate_e_per_s + (1.0 - self._share) * last_e_per_s
 

@@ -190,7 +190,7 @@ class Aperture:
             raise ParameterError(
                 "aberrations",
                 f"throw light of {wavelength_nm:g} nm {blur:.0f} times λN aside, more than {MAX_ACROSS // ACROSS_PER_BLUR}",
-                cure="see that coefficients are in their unit and focus_distance_m is in m; diffraction plays no "
+                hint="see that coefficients are in their unit and focus_distance_m is in m; diffraction plays no "
                 "part in such a blur, and a picture that was blurred beforehand does as well",
             )
         return max(MIN_ACROSS, math.ceil(blur * ACROSS_PER_BLUR))

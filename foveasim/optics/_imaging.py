@@ -23,7 +23,7 @@ from foveasim.optics._aperture import Aperture
 from foveasim.optics._transform import Transform, source_pixels
 from foveasim.optics.otf import Tables
 
-__all__ = ["Imaging", "patchwork", "patchwork_error", "reach_cells"]
+__all__ = ["Imaging", "isoplanatic_error", "patchwork", "reach_cells"]
 
 #: Of a sum's weights, a transform and tables: the factor on a spectrum where one is kept, or None.
 Kept = Callable[[Floats, Transform, Tables], NDArray[Any] | None]
@@ -220,7 +220,7 @@ def patchwork(
     yield from maps
 
 
-def patchwork_error(
+def isoplanatic_error(
     aperture: Aperture, grid: Grid, n_patches: tuple[int, int], wavelength_nm: float, lambda_n_um: float
 ) -> float:
     """Largest share of a point's light astray half-way between patches, or of one patch at the corners of the picture."""

@@ -172,7 +172,7 @@ class Optics(PointImages):
                 above=0.0,
                 at_least=0.01,
                 at_most=1e6,
-                cure="focal lengths are in mm",
+                hint="focal lengths are in mm",
             ),
             "f_number": check_number(
                 "f_number",
@@ -180,7 +180,7 @@ class Optics(PointImages):
                 above=0.0,
                 at_least=0.5,
                 at_most=1e4,
-                cure="no lens in air is faster than f/0.5",
+                hint="no lens in air is faster than f/0.5",
             ),
             "transmission": check_number("transmission", self.transmission, above=0.0, at_most=1.0),
         }
@@ -212,7 +212,7 @@ class Optics(PointImages):
             raise ParameterError(
                 "padding",
                 "must not be 'periodic' where aberrations differ over the field",
-                cure="a periodic picture has no field",
+                hint="a periodic picture has no field",
             )
 
     # -- geometry -------------------------------------------------------------------------------------------------
@@ -495,7 +495,7 @@ class Optics(PointImages):
             return imaging.maps(tables_at((0.0, 0.0)))
         return patchwork(imaging, (self.field_patches, self.field_patches), tables_at)
 
-    def patchwork_error(self, scene: SceneLike) -> float:
+    def isoplanatic_error(self, scene: SceneLike) -> float:
         """
         Largest share of a point's light that the patchwork puts in a wrong place.
 
@@ -512,14 +512,14 @@ class Optics(PointImages):
         share : float
             The largest over the wavelengths and the neighbouring patches; 0 where the pattern is the same everywhere.
         """
-        from foveasim.optics._imaging import patchwork_error
+        from foveasim.optics._imaging import isoplanatic_error
 
         grid = self.grid(scene)
         if not self._is_varying():
             return 0.0
         aperture, n = self._aperture(scene.distance_m), self.field_patches
         return max(
-            patchwork_error(aperture, grid, (n, n), float(wave_nm), float(near_um))
+            isoplanatic_error(aperture, grid, (n, n), float(wave_nm), float(near_um))
             for wave_nm, near_um in zip(scene.wavelength_nm, self._lambda_n_um(scene), strict=True)
         )
 

@@ -39,14 +39,14 @@ class PointSpread:
 
     Attributes
     ----------
-    share_per_um2 : (n_y, n_x) float64, 1/µm²
+    psf_per_um2 : (n_y, n_x) float64, 1/µm²
         Share of the light in a µm², at the cells' centres; row 0 lowest.
     grid : Grid
         Cells around the image point.
     wavelength_nm : float, nm
     """
 
-    share_per_um2: Floats
+    psf_per_um2: Floats
     grid: Grid
     wavelength_nm: float
 
@@ -179,7 +179,7 @@ class PointImages:
         n_points = check_count("n_points", n_points, at_most=8192)
         grid = Grid.centred((n_points, n_points), pitch_um)
         return PointSpread(
-            share_per_um2=point.pattern_per_um2(grid.x_um, grid.y_um), grid=grid, wavelength_nm=point.wavelength_nm
+            psf_per_um2=point.pattern_per_um2(grid.x_um, grid.y_um), grid=grid, wavelength_nm=point.wavelength_nm
         )
 
     def otf(

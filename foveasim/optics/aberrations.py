@@ -181,7 +181,7 @@ class Zernike:
         try:
             return noll_to_nm(j) if self.index == "noll" else osa_to_nm(j)
         except ParameterError as error:
-            raise ParameterError("coefficients", f"has an index that {error.told}") from None
+            raise ParameterError("coefficients", f"has an index that {error.detail}") from None
 
     def coefficients_um(self, wavelength_nm: float) -> dict[tuple[int, int], float]:
         """Coefficients at a wavelength in µm, by the orders (n, m)."""

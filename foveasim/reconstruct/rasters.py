@@ -116,7 +116,7 @@ def blur_kernel(
         raise ParameterError(
             "grid",
             f"must have pixels whose blur takes at most {MAX_SAMPLES} samples across, got {n_points}",
-            cure="take pixels nearer to square, or a smaller 'radius'",
+            hint="take pixels nearer to square, or a smaller 'radius'",
         )
     spread = optics.psf(wavelength_nm, distance_m=distance_m, pitch_um=step_um, n_points=n_points)
     # From an even pixel to the mean over a pixel, a convolution with two boxes: a product of transforms, taken back at the
@@ -128,7 +128,7 @@ def blur_kernel(
         * np.sinc(pitch_um * cycles_per_um) ** 2
         for pitch_um in (grid.pitch_y_um, grid.pitch_x_um)
     )
-    means = (along_y @ np.fft.fft2(spread.share_per_um2) @ along_x.T).real
+    means = (along_y @ np.fft.fft2(spread.psf_per_um2) @ along_x.T).real
     kernel = np.maximum(means, 0.0)
     return np.asarray(kernel / kernel.sum())
 

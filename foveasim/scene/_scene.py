@@ -346,7 +346,7 @@ def _light(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Imag
                 "picture",
                 f"must be <= {MAX_ENCODED:g} where encoding='{encoding}'",
                 float(pixels.max()),
-                cure="of floating-point numbers 1 is the peak; divide by 255, or give uint8",
+                hint="of floating-point numbers 1 is the peak; divide by 255, or give uint8",
             )
         colours = pixels[..., :-1] if has_alpha else pixels
         precise = colours.astype(np.float32) if pixels.dtype == np.float16 else colours

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from foveasim.sensor.budget import FIXED, TEMPORAL, noise_budget
-from foveasim.sensor.calibration import Calibration, calibrate, linearised
-from foveasim.sensor.effects.crosstalk import Coupling, Diffusion, KernelCrosstalk, Mixing
+from foveasim.sensor.calibration import Calibration, calibrate, linearise
+from foveasim.sensor.effects.crosstalk import CrosstalkOperator, Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.shot import draw_shot_noise
 from foveasim.sensor.exposures import Ramp, Rates, fit_ramp, merge_exposures, non_destructive_reads
 from foveasim.sensor.limits import LIMITS, Limits
@@ -39,14 +39,14 @@ __all__ = [
     "BandMean",
     "Calibration",
     "ConstantCurve",
-    "Coupling",
+    "CrosstalkOperator",
     "Curve",
     "Diffusion",
     "FilterSet",
     "GaussianCurve",
+    "InterPixelCapacitance",
     "KernelCrosstalk",
     "Limits",
-    "Mixing",
     "PassBand",
     "PolynomialCurve",
     "ProductCurve",
@@ -63,7 +63,7 @@ __all__ = [
     "ccd_qe",
     "draw_shot_noise",
     "fit_ramp",
-    "linearised",
+    "linearise",
     "merge_exposures",
     "noise_budget",
     "non_destructive_reads",

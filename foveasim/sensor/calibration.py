@@ -26,7 +26,7 @@ from foveasim.units import volts_to_electrons
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-__all__ = ["Calibration", "calibrate", "linearised", "nominal_e_per_dn"]
+__all__ = ["Calibration", "calibrate", "linearise", "nominal_e_per_dn"]
 
 #: Standard deviation of a Gaussian law over its median absolute deviation.
 SIGMA_PER_MAD = 1.482602218505602
@@ -39,7 +39,7 @@ FURTHEST_STEPS = 3
 # -- the converter, the other way -------------------------------------------------------------------------------------
 
 
-def linearised(code: ArrayLike, sensor: Sensor) -> Floats:
+def linearise(code: ArrayLike, sensor: Sensor) -> Floats:
     """
     Codes that a linear converter would have given.
 
@@ -69,7 +69,7 @@ def linearised(code: ArrayLike, sensor: Sensor) -> Floats:
     --------
     >>> import foveasim as fs
     >>> sensor = fs.Sensor(fs.layout.grid(n_x=1, n_y=1, pitch_um=2.0), companding="root")
-    >>> linearised([0, 128, 255], sensor).round(2).tolist()
+    >>> linearise([0, 128, 255], sensor).round(2).tolist()
     [-0.5, 64.0, 254.5]
     """
     _require_sensor(sensor)
@@ -195,7 +195,7 @@ class Calibration:
         highest_dn : float, optional, DN
             The code that means saturation.
         linear_dn : (n_codes,), optional, DN
-            Linear code of every code, for companding converters: ``linearised(np.arange(2**bits), sensor)``.
+            Linear code of every code, for companding converters: ``linearise(np.arange(2**bits), sensor)``.
         hot_sigmas : float
             A site is hot when its dark signal, or dark rate, is so many robust standard deviations above the median.
         dead_fraction : float
@@ -269,7 +269,7 @@ class Calibration:
             )
         return self.offset_dn + self.dark_rate_dn_per_s * (exposure_s - self.exposure_s)
 
-    def corrected(
+    def correct(
         self,
         code: ArrayLike,
         *,
@@ -284,7 +284,7 @@ class Calibration:
         Parameters
         ----------
         code : (..., n_site), DN
-            As the sensor gives them, not linearised; not changed. One call for many frames looks for neighbours once.
+            As the sensor gives them, not linearise; not changed. One call for many frames looks for neighbours once.
         exposure_s : float, optional, s
             Of these codes, when it is not that of the calibration and the dark rate is known.
         fill : Layout, optional
@@ -496,7 +496,7 @@ class _Frames:
             try:
                 self.add(frame)
             except ParameterError as error:
-                raise ParameterError(name, error.told) from None
+                raise ParameterError(name, error.detail) from None
 
 
 def _calibration(

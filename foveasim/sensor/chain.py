@@ -164,7 +164,7 @@ def check_names(names: Any, effects: Iterable[Effect]) -> tuple[str, ...]:
         if name not in known:
             closest = get_close_matches(str(name), known, n=1)
             hint = f"did you mean '{closest[0]}'?" if closest else f"the effects are {', '.join(known)}"
-            raise ParameterError("disabled", "must be names of effects", name, cure=hint)
+            raise ParameterError("disabled", "must be names of effects", name, hint=hint)
     return names
 
 

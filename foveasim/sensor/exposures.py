@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Floats, Ints, as_numbers, own, unmasked
 from foveasim.errors import ParameterError
-from foveasim.sensor.calibration import Calibration, linearised, nominal_e_per_dn
+from foveasim.sensor.calibration import Calibration, linearise, nominal_e_per_dn
 from foveasim.sensor.chain import run
 from foveasim.sensor.effects.shot import LARGEST_CHARGE_E, ROUNDING_E2, draw_shot_noise
 from foveasim.sensor.limits import check_plausible_array
@@ -369,7 +369,7 @@ def _rising(name: str, times_s: ArrayLike) -> Floats:
 
 def _readings(code: ArrayLike, n_readings: int, sensor: Sensor, what: str) -> tuple[Floats, Floats, Floats]:
     """Codes (n_reading, n_site), linear codes, and electrons of one."""
-    linear_dn = linearised(code, sensor)
+    linear_dn = linearise(code, sensor)
     codes = as_numbers("code", code)
     if codes.shape != (n_readings, sensor.layout.n_sites):
         raise ParameterError(
@@ -389,12 +389,12 @@ def _conversion_noise_e2(sensor: Sensor, codes: NDArray[Any], e_per_dn: Floats) 
 def _saturation_dn(sensor: Sensor) -> Floats:
     """Linear code from which a site is taken as saturated: the highest, or its full well's, less the noise of its readout."""
     n_sites = sensor.layout.n_sites
-    top_dn = np.full(n_sites, float(linearised(2**sensor.bits - 1, sensor)))
+    top_dn = np.full(n_sites, float(linearise(2**sensor.bits - 1, sensor)))
     if sensor.full_well_e is None:
         return top_dn
     still = sensor.without(*(e.name for e in sensor.chain if e.is_temporal or (e.stage == "charge" and not e.is_local)))
     well_e = np.broadcast_to(np.minimum(sensor.well_e, LARGEST_CHARGE_E), n_sites).astype(np.int64)
-    well_dn = linearised(still.read(well_e, streams=Streams(0)), sensor)
+    well_dn = linearise(still.read(well_e, streams=Streams(0)), sensor)
     noise_dn = np.sqrt(sensor.readout_model(sensor.well_e).noise_e2) / nominal_e_per_dn(sensor)
     return np.minimum(top_dn, well_dn - MARGIN_SIGMAS * noise_dn - 1.0)
 

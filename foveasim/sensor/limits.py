@@ -153,7 +153,7 @@ def check_plausible(name: str, value: object, *, of: str = "") -> float:
         When it is not one finite number, negative, or outside the range; the message names range and unit.
     """
     limits = LIMITS[f"{of}.{name}" if of else name]
-    number = check_number(name, value, above=0.0 if limits.is_positive else None, at_least=0.0, cure=limits.hint)
+    number = check_number(name, value, above=0.0 if limits.is_positive else None, at_least=0.0, hint=limits.hint)
     _check_range(name, np.asarray(number), limits)
     return number
 

@@ -19,7 +19,7 @@ from foveasim.sensor.chain import Factor, Nonlinearity, Offset, Step, check_effe
 from foveasim.sensor.device import Device
 from foveasim.sensor.effects import EFFECTS, STANDARD, Effect, Photosites, Sites, dark_current_factor
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset
-from foveasim.sensor.effects.crosstalk import Coupling, Diffusion, KernelCrosstalk
+from foveasim.sensor.effects.crosstalk import Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.shot import LARGEST_CHARGE_E, ShotChoice, ShotNoise
 from foveasim.sensor.limits import LIMITS, check_plausible, check_plausible_array
 from foveasim.sensor.prediction import ChargeDistributions, ReadoutModel, cut_off, quadrature, readout_model
@@ -89,7 +89,7 @@ class Sensor:
         Expectation above which ``"auto"`` draws numbers of the Poisson distribution's first three moments.
     full_well_e : float or (n_site,), optional, e-
         Charge that a site can hold; None for no limit but V_sat.
-    coupling : Coupling, optional
+    coupling : InterPixelCapacitance, optional
         Charge that is read at neighbours, after the draw.
     ktc_noise : bool
         Whether resetting leaves the noise ``sqrt(k T C)`` on the charge.
@@ -149,7 +149,7 @@ class Sensor:
     shot_noise: ShotChoice = "auto"
     gaussian_above_e: float = 100.0
     full_well_e: PerSite | None = None
-    coupling: Coupling | None = None
+    coupling: InterPixelCapacitance | None = None
     ktc_noise: bool = False
     cds: bool = False
     read_noise_e: PerSite = 0.0
@@ -216,7 +216,7 @@ class Sensor:
             if not isinstance(getattr(self, name), bool):
                 raise ParameterError(name, "must be true or false", getattr(self, name))
         check_choice("shot_noise", self.shot_noise, ("auto", "exact", "off"))
-        for name, kinds in (("crosstalk", (Diffusion, KernelCrosstalk)), ("coupling", (Coupling,))):
+        for name, kinds in (("crosstalk", (Diffusion, KernelCrosstalk)), ("coupling", (InterPixelCapacitance,))):
             part = getattr(self, name)
             if part is not None and not isinstance(part, kinds):
                 raise ParameterError(name, f"must be a {' or a '.join(k.__name__ for k in kinds)}", part)
@@ -263,7 +263,7 @@ class Sensor:
             When a parameter that has no default of 0 or none is missing, arrays of the sites were too long to be stored, or an
             effect is not known.
         """
-        kinds: tuple[Any, ...] = (Diffusion, KernelCrosstalk, Coupling, *EFFECTS.values())
+        kinds: tuple[Any, ...] = (Diffusion, KernelCrosstalk, InterPixelCapacitance, *EFFECTS.values())
         classes = {kind.__name__: kind for kind in kinds}
         values: dict[str, Any] = {}
         for parameter in fields(cls):
@@ -307,7 +307,7 @@ class Sensor:
         try:
             return self._filter_set * self.qe
         except ParameterError as error:
-            raise ParameterError("qe", error.told) from None
+            raise ParameterError("qe", error.detail) from None
 
     @property
     def n_filters(self) -> int:
@@ -334,7 +334,7 @@ class Sensor:
                 self._filter_set.transmission(wavelength_nm)
             except CurveError:
                 name = "filters"
-            raise ParameterError(name, error.told) from error.__cause__
+            raise ParameterError(name, error.detail) from error.__cause__
 
     def responsivity_e_per_j(self, wavelength_nm: Floats) -> Floats:
         """

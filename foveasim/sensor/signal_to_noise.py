@@ -128,11 +128,11 @@ def signal_to_noise(sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike) ->
     step_e = _step_e(sensor, charge_e, model)
     noise_e = np.sqrt(shot_e2 + model.noise_e2 + step_e**2 * sensor.converter.noise_dn2)
     is_saturated |= charge_e + CUT_OFF_SIGMAS * noise_e >= top_e
-    is_over = charge_e > top_e
+    is_complete = charge_e > top_e
     # A site beyond its range has the ratio of its end.
-    part = np.divide(top_e, charge_e, out=np.ones(n_sites), where=is_over)
+    part = np.divide(top_e, charge_e, out=np.ones(n_sites), where=is_complete)
     charge_e, dark = np.minimum(charge_e, top_e), np.minimum(dark, top_e)
-    step_e = np.where(is_over, _step_e(sensor, charge_e, model), step_e)
+    step_e = np.where(is_complete, _step_e(sensor, charge_e, model), step_e)
     noise_e = np.sqrt(
         shot_e2 * (part if shot.is_drawn else 1.0) + model.noise_e2 + step_e**2 * sensor.converter.noise_dn2
     )

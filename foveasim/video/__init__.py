@@ -3,26 +3,26 @@ Videos: frames of light from pictures, files and moving gazes; captures as zarr 
 
 ::
 
-    frames = fs.video.Footage("street.mp4", pitch_um=20.0, distance_m=0.8, peak_radiance_w_m2_sr_nm=0.1)
+    frames = fs.video.FrameSource("street.mp4", pitch_um=20.0, distance_m=0.8, peak_radiance_w_m2_sr_nm=0.1)
     fs.video.write_video(camera.video(frames, exposure_s=1 / 100, seed=0), "street.zarr", progress=True)
 """
 
 from __future__ import annotations
 
-from foveasim.video.frame_source import Footage
-from foveasim.video.gaze import GazePath, look, look_around, saccades
-from foveasim.video.recording import Recording, frames_kept, partial_of, read_recording
+from foveasim.video.frame_source import FrameSource
+from foveasim.video.gaze import GazePath, pan_camera, saccades, shift_sensor
+from foveasim.video.recording import Recording, count_recorded_frames, partial_path, read_recording
 from foveasim.video.writing import write_video
 
 __all__ = [
-    "Footage",
+    "FrameSource",
     "GazePath",
     "Recording",
-    "frames_kept",
-    "look",
-    "look_around",
-    "partial_of",
+    "count_recorded_frames",
+    "pan_camera",
+    "partial_path",
     "read_recording",
     "saccades",
+    "shift_sensor",
     "write_video",
 ]

@@ -1,4 +1,4 @@
-"""Footage: pictures in a row, from memory, a folder or a video file, as scenes."""
+"""Frame sources: pictures in a row, from memory, a directory or a video file, as scenes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from foveasim._io.images import PICTURE_ENDINGS, check_picture_size, picture_nam
 from foveasim.errors import FileError, ParameterError, printable
 from foveasim.scene import Scene
 
-__all__ = ["Footage", "pictures_in"]
+__all__ = ["FrameSource", "pictures_in"]
 
 #: Any wavelengths: they are left off again.
 GREY_NM, COLOUR_NM = (550.0,), (620.0, 550.0, 450.0)
@@ -29,7 +29,7 @@ MAX_FRAMES = 2**31
 NEEDS_PYAV = needs("av")
 
 
-class Footage:
+class FrameSource:
     """
     Frames of light from pictures; iterating gives a Scene for each, read when it is asked for.
 
@@ -43,12 +43,12 @@ class Footage:
         Which of the frames: as of a slice.
     frame_s : float, optional, s
         From one frame to the next; by default what the video file says.
-    like : Scene, optional
+    template : Scene, optional
         A scene whose pitch, distance and spectra the frames have, with the pictures in place of its own: colours are made grey
         for a scene of one basis image, and grey is made colour for one of three.
     **scene
         Of :meth:`foveasim.Scene.from_picture`: ``pitch_um``, ``distance_m``, ``peak_radiance_w_m2_sr_nm``, and others; beside
-        ``like`` the ``encoding`` alone.
+        ``template`` the ``encoding`` alone.
 
     Raises
     ------
@@ -61,7 +61,7 @@ class Footage:
     --------
     >>> import numpy as np
     >>> pictures = [np.full((4, 6), level) for level in (0.25, 0.5)]
-    >>> footage = Footage(
+    >>> footage = FrameSource(
     ...     pictures, pitch_um=10.0, distance_m=1.0, peak_radiance_w_m2_sr_nm=0.1, band_width_nm=10.0, encoding="linear"
     ... )
     >>> [float(scene.basis.max()) for scene in footage]
@@ -76,20 +76,22 @@ class Footage:
         stop: int | None = None,
         step: int = 1,
         frame_s: float | None = None,
-        like: Scene | None = None,
+        template: Scene | None = None,
         **scene: Any,
     ) -> None:
-        if like is not None and not isinstance(like, Scene):
-            raise ParameterError("like", f"must be a Scene, got a {type(like).__name__}")
-        if like is not None and like.basis.shape[0] not in (1, 3):
-            raise ParameterError("like", f"must have 1 or 3 basis images, as pictures have, got {like.basis.shape[0]}")
-        if like is not None and set(scene) - {"encoding"}:
+        if template is not None and not isinstance(template, Scene):
+            raise ParameterError("template", f"must be a Scene, got a {type(template).__name__}")
+        if template is not None and template.basis.shape[0] not in (1, 3):
             raise ParameterError(
-                min(set(scene) - {"encoding"}), "is that of the scene 'like', and cannot be given beside it"
+                "template", f"must have 1 or 3 basis images, as pictures have, got {template.basis.shape[0]}"
             )
-        if like is None:
+        if template is not None and set(scene) - {"encoding"}:
+            raise ParameterError(
+                min(set(scene) - {"encoding"}), "is that of the scene 'template', and cannot be given beside it"
+            )
+        if template is None:
             _check_settings(scene)
-        self._like = like
+        self._template = template
         self._start = check_count("start", start, at_least=0, at_most=MAX_FRAMES)
         self._stop = None if stop is None else check_count("stop", stop, at_least=0, at_most=MAX_FRAMES)
         self._step = check_count("step", step, at_most=MAX_FRAMES)
@@ -120,7 +122,7 @@ class Footage:
             self._check_some(self.n_frames)
 
     def __repr__(self) -> str:
-        return f"Footage({self.n_frames or 'any number of'} frames)"
+        return f"FrameSource({self.n_frames or 'any number of'} frames)"
 
     @property
     def frame_s(self) -> float | None:
@@ -136,7 +138,7 @@ class Footage:
             range(self._start, min(self._n_source, self._n_source if self._stop is None else self._stop), self._step)
         )
 
-    def from_frame(self, n: int) -> Footage:
+    def from_frame(self, n: int) -> FrameSource:
         """
         The same frames without the first ``n``, which are passed over and not made into scenes.
 
@@ -146,7 +148,7 @@ class Footage:
 
         Returns
         -------
-        Footage
+        FrameSource
 
         Raises
         ------
@@ -171,7 +173,7 @@ class Footage:
         if isinstance(self._source, _VideoFile):  # frames that are passed over are decoded, and no more
             pictures = _pixels(self._source.path, pictures)
         for k, picture in enumerate(pictures):
-            scene = Scene.from_picture(picture, **self._scene) if self._like is None else self._made_like(picture)
+            scene = Scene.from_picture(picture, **self._scene) if self._template is None else self._made_like(picture)
             if shape is not None and scene.basis.shape != shape:
                 where = picture if isinstance(picture, str | Path) else f"frame {self._start + k * self._step}"
                 raise FileError(
@@ -182,13 +184,13 @@ class Footage:
         self._check_some(0 if shape is None else None)
 
     def _made_like(self, picture: Any) -> Scene:
-        like = self._like
-        assert like is not None
-        n_basis = like.basis.shape[0]
+        template = self._template
+        assert template is not None
+        n_basis = template.basis.shape[0]
         read = Scene.from_picture(
             picture,
-            pitch_um=like.pitch_um,
-            distance_m=like.distance_m,
+            pitch_um=template.pitch_um,
+            distance_m=template.distance_m,
             peak_radiance_w_m2_sr_nm=1.0,
             # One wavelength makes colours grey. The spectra are those of the other scene.
             wavelength_nm=GREY_NM if n_basis == 1 else COLOUR_NM,
@@ -196,7 +198,7 @@ class Footage:
             **self._scene,
         )
         basis = np.broadcast_to(read.basis, (n_basis, *read.basis.shape[1:]))
-        return replace(like, basis=basis, source=read.source)
+        return replace(template, basis=basis, source=read.source)
 
 
 def pictures_in(folder: Path) -> list[Path]:
@@ -217,7 +219,7 @@ def _check_settings(scene: dict[str, Any]) -> None:
     for parameter in parameters:
         if parameter.default is parameter.empty and parameter.name not in scene:
             raise ParameterError(
-                parameter.name, "is missing: a scene from a picture needs it, or give a scene as 'like'"
+                parameter.name, "is missing: a scene from a picture needs it, or give a scene as 'template'"
             )
 
 
@@ -230,7 +232,7 @@ class _Once:
     def __iter__(self) -> Iterator[Any]:
         if self._pictures is None:
             raise ParameterError(
-                "source", "was an iterator, whose pictures are gone after the first time", cure="give a list of them"
+                "source", "was an iterator, whose pictures are gone after the first time", hint="give a list of them"
             )
         pictures, self._pictures = self._pictures, None
         return pictures

@@ -16,7 +16,7 @@ from foveasim.fields import PowerMap
 from foveasim.optics import Optics
 from foveasim.scene import Scene
 
-__all__ = ["GazePath", "look", "look_around", "saccades"]
+__all__ = ["GazePath", "pan_camera", "saccades", "shift_sensor"]
 
 #: Shape of the law of fixations' durations (a gamma law): their standard deviation is half their mean.
 FIXATION_SHAPE = 4.0
@@ -138,7 +138,7 @@ def saccades(
     return GazePath(np.asarray(t_s), xy_um)
 
 
-def look(light: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Scene | PowerMap, tuple[float, float]]]:
+def shift_sensor(light: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Scene | PowerMap, tuple[float, float]]]:
     """
     Frames of a still light that a sensor is moved over, for :meth:`foveasim.Camera.video`.
 
@@ -163,7 +163,7 @@ def look(light: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Scene | Powe
     return ((light, (float(x_um), float(y_um))) for x_um, y_um in path.xy_um)
 
 
-def look_around(
+def pan_camera(
     scene: Scene, path: GazePath, optics: Optics, *, shape: tuple[int, int]
 ) -> Iterator[tuple[Scene, tuple[float, float]]]:
     """

@@ -29,8 +29,8 @@ from foveasim.layout.packed import packed_layout
 __all__ = [
     "Recording",
     "alike",
-    "frames_kept",
-    "partial_of",
+    "count_recorded_frames",
+    "partial_path",
     "read_recording",
     "record",
     "resume_recording",
@@ -128,13 +128,13 @@ def read_recording(path: str | Path) -> Recording:
         )
 
 
-def partial_of(path: str | Path) -> Path:
+def partial_path(path: str | Path) -> Path:
     """The folder beside a recording in which it grows: there after an end of the program, until the last frame is in."""
     target = Path(path)
     return target.with_name(target.name + ".partial")
 
 
-def frames_kept(path: str | Path) -> int:
+def count_recorded_frames(path: str | Path) -> int:
     """
     How many frames of a recording are there, of one that was ended or one that is finished.
 
@@ -160,7 +160,7 @@ def frames_kept(path: str | Path) -> int:
     if target.exists():
         with _trusted(target) as group:
             return int(group["code"].shape[0])
-    folder = partial_of(target)
+    folder = partial_path(target)
     return _n_whole(folder) if folder.exists() else 0
 
 
@@ -262,7 +262,7 @@ def _finished(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any]
     if not _is_recording(target):
         raise FileError(target, "cannot be written: something else is there")
     _check_plan(target, plan)
-    n = frames_kept(target)
+    n = count_recorded_frames(target)
     # Of the same plan nothing more can come; who gives none says so by captures of which none is left.
     if plan is None and next(iter(captures), None) is not None:
         raise FileError(
@@ -276,7 +276,7 @@ def _finished(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any]
 @contextmanager
 def _growing(target: Path) -> Iterator[Path]:
     """The folder in which a recording grows, locked; it stays after the block unless no frame is in it."""
-    folder = partial_of(target)
+    folder = partial_path(target)
     if not target.parent.is_dir():
         raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
     if folder.exists() and not (folder.is_dir() and _is_ours(folder)):

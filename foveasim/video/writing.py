@@ -22,7 +22,7 @@ from foveasim.integrate import Integrator
 from foveasim.layout import Layout
 from foveasim.reconstruct import Picture, fill_channels, raster_grid
 from foveasim.reconstruct.picture import covered_share
-from foveasim.video.recording import alike, frames_kept, record, resume_recording
+from foveasim.video.recording import alike, count_recorded_frames, record, resume_recording
 
 __all__ = ["write_video"]
 
@@ -61,8 +61,8 @@ def write_video(
     progress : bool
         Whether to show how far it is, and how long it will still take.
     resume : bool
-        Whether a ``.zarr`` folder keeps its frames beside the target, in :func:`partial_of` it, until the last one is in, and
-        goes on with those that are there: ``captures`` are the ones after :func:`frames_kept`.
+        Whether a ``.zarr`` folder keeps its frames beside the target, in :func:`partial_path` it, until the last one is in, and
+        goes on with those that are there: ``captures`` are the ones after :func:`count_recorded_frames`.
     plan : mapping, optional
         Plain data that tell what is recorded, kept in a ``.zarr`` folder: what was begun after another plan is not gone on
         with, and of a finished recording of the same plan no capture is taken.
@@ -93,7 +93,7 @@ def write_video(
     --------
     The same lines begin a recording, go on with it after any end, and leave it when it is finished::
 
-        n = frames_kept("long.zarr")
+        n = count_recorded_frames("long.zarr")
         captures = camera.video(footage.from_frame(n), exposure_s=0.01, seed=0, first_frame=n)
         write_video(captures, "long.zarr", resume=True)
     """
@@ -107,7 +107,7 @@ def write_video(
             f"is for .zarr folders; others, as {target.name}, are written whole or not at all",
         )
     if progress:
-        captures = _with_progress(captures, n_frames, frames_kept(target) if resume else 0)
+        captures = _with_progress(captures, n_frames, count_recorded_frames(target) if resume else 0)
     if ending == ZARR:
         return (resume_recording if resume else record)(captures, target, plan)
     if ending == ".gif":

@@ -69,7 +69,7 @@ class SiteImage(AxesImage):
         bounds_um = (min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1))
         if self.pixels is None or (self.pixels.bounds_um, self.pixels.shape) != (bounds_um, (n_y, n_x)):
             n_samples = max(1, min(N_SAMPLES, math.isqrt(MOST_SAMPLES // (n_x * n_y))))
-            self.pixels = SitePixels.of(self._layout, (n_y, n_x), bounds_um, n_samples=n_samples)
+            self.pixels = SitePixels.from_layout(self._layout, (n_y, n_x), bounds_um, n_samples=n_samples)
         changes = self.pixels.ids[::SAMPLED_ROWS, 1:] != self.pixels.ids[::SAMPLED_ROWS, :-1]
         has_borders = self._colours.has_borders and changes.size > 0 and float(changes.mean()) < MOST_BORDERS
         picture = self.pixels.picture(self._colours.rgb, background=None, border=BORDER if has_borders else None)

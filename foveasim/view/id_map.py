@@ -103,7 +103,7 @@ class SitePixels:
     n_samples: int = 1
 
     @classmethod
-    def of(
+    def from_layout(
         cls,
         layout: PackedRings,
         shape: tuple[int, int],

@@ -202,7 +202,7 @@ def prisms(
     height: str | ArrayLike | None = None,
     *,
     by: str | ArrayLike | None = None,
-    tallest_um: float | None = None,
+    max_height_um: float | None = None,
 ) -> Mesh:
     """
     Photosites as columns whose height is what they measured.
@@ -215,7 +215,7 @@ def prisms(
         numbers, or one value a site, at least 0. By default the code of a capture, the size of a layout's sites.
     by : str or array, optional
         What the colour shows, as in :func:`foveasim.view.colours_of`; by default the same as the height.
-    tallest_um : float, µm
+    max_height_um : float, µm
         Height of the tallest column; 0.15 of the layout's longer side by default.
 
     Returns
@@ -233,7 +233,7 @@ def prisms(
     Examples
     --------
     >>> from foveasim.layout import grid
-    >>> columns = prisms(grid(n_x=2, n_y=1, pitch_um=2.0), [1.0, 3.0], tallest_um=6.0)
+    >>> columns = prisms(grid(n_x=2, n_y=1, pitch_um=2.0), [1.0, 3.0], max_height_um=6.0)
     >>> columns.points_um[:, 2].max(), columns.triangles.shape[0]
     (np.float64(6.0), 20)
     """
@@ -243,17 +243,17 @@ def prisms(
     try:
         shown = colours_of(data, height)
     except ParameterError as error:
-        raise ParameterError("height", error.told) from None
+        raise ParameterError("height", error.detail) from None
     values = finite_array("height", shown.values if shown.values is not None else height, ndim=1, at_least=0.0)
     colours = (shown if by is None else colours_of(data, by)).rgb
     x_min, y_min, x_max, y_max = layout.bounds_um
-    tallest_um = (
+    max_height_um = (
         TALLEST_SHARE * max(x_max - x_min, y_max - y_min)
-        if tallest_um is None
-        else check_length_um("tallest_um", tallest_um)
+        if max_height_um is None
+        else check_length_um("max_height_um", max_height_um)
     )
     most = float(values.max())
-    heights_um = values * (tallest_um / most if most > 0.0 else 0.0)
+    heights_um = values * (max_height_um / most if most > 0.0 else 0.0)
     points_um, triangles, photosite = extruded(layout, triangulated(layout), 0.0, heights_um, has_floor=False)
     return Mesh(
         name="columns",

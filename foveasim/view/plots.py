@@ -224,7 +224,7 @@ def save_drawing(data: Layout | Capture, path: str | Path, by: str | ArrayLike |
         raise ParameterError(
             "data",
             f"must have at most {MOST_DRAWN:,} sites for a drawing, got {layout.n_sites:,}",
-            cure="save a picture with save_figure, or a part of the layout",
+            hint="save a picture with save_figure, or a part of the layout",
         )
     colours, position = np.unique(rgb, axis=0, return_inverse=True)
     names = {k: "#{:02x}{:02x}{:02x}".format(*colour) for k, colour in enumerate(colours.tolist())}
@@ -369,7 +369,7 @@ def _draw_adjacency(layout: Layout, ax: Axes) -> None:
         raise ParameterError(
             "overlay",
             f"'adjacency' is for at most {MOST_ADJACENT:,} sites, got {layout.n_sites:,}",
-            cure="draw a part of the layout",
+            hint="draw a part of the layout",
         )
     pairs = layout.adjacency().tocoo()
     is_once = pairs.row < pairs.col

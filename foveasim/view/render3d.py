@@ -32,8 +32,8 @@ __all__ = ["SceneOfMeshes", "Viewpoint", "render", "show", "sites_in_view"]
 AMBIENT, DIFFUSE = 0.35, 0.65
 #: Where the light comes from, as seen by the viewer: to the right, toward him, up.
 LIGHT = (-0.38, 0.30, 0.87)
-#: A soft ground on which both light and dark colours stand out.
-GROUND = (238, 240, 244)
+#: A soft background on which both light and dark colours stand out.
+BACKGROUND = (238, 240, 244)
 #: The scene fills this share of the picture's narrower direction.
 FILLED_SHARE = 0.94
 #: Points that decide how far off the viewer stands.
@@ -134,8 +134,8 @@ def render(
     viewpoint: Viewpoint | None = None,
     size_px: tuple[int, int] = (1600, 1000),
     oversampling: int | None = None,
-    shade_corners: bool = False,
-    ground: tuple[int, int, int] = GROUND,
+    ambient_occlusion: bool = False,
+    background: tuple[int, int, int] = BACKGROUND,
     renderer: Literal["auto", "pyvista", "software"] = "auto",
 ) -> RgbArray:
     """
@@ -152,9 +152,9 @@ def render(
     oversampling : int, optional
         Each pixel is the mean of so many by so many; 1 has jagged edges and is faster. By default 2, and 1 for scenes of more
         than a million triangles.
-    shade_corners : bool
+    ambient_occlusion : bool
         Whether places that little light reaches are darker (ambient occlusion); by PyVista only.
-    ground : (r, g, b)
+    background : (r, g, b)
         Colour behind the scene.
     renderer : {"auto", "pyvista", "software"}
         By default PyVista where it can render, otherwise the renderer that needs nothing, with a warning that says what to
@@ -182,21 +182,21 @@ def render(
         oversampling = 2 if sum(mesh.triangles.shape[0] for mesh in meshes) <= SMOOTHED_TRIANGLES else 1
     oversampling = check_count("oversampling", oversampling, at_most=8)
     n_x, n_y = _size(size_px, oversampling)
-    if finite_array("ground", ground).shape != (3,) or not all(0 <= part <= 255 for part in ground):
-        raise ParameterError("ground", "must be three numbers from 0 to 255", ground)
+    if finite_array("background", background).shape != (3,) or not all(0 <= part <= 255 for part in background):
+        raise ParameterError("background", "must be three numbers from 0 to 255", background)
     missing = "" if renderer == "software" else what_to_install()
     if missing and renderer == "pyvista":
         raise SimulationError(missing)
     if missing:
         warnings.warn(f"{missing}; the picture is made without", FoveasimWarning, stacklevel=2)
     # The shade of corners has a stray line at the border, which is cut off.
-    margin = SHADE_MARGIN_PX * oversampling if shade_corners and not missing and renderer != "software" else 0
+    margin = SHADE_MARGIN_PX * oversampling if ambient_occlusion and not missing and renderer != "software" else 0
     width, height = n_x * oversampling, n_y * oversampling
     eye = _eye(meshes, viewpoint or Viewpoint(), (width, height))
     if renderer == "software" or missing:
-        large = _drawn(meshes, eye, (width, height), ground)
+        large = _drawn(meshes, eye, (width, height), background)
     else:
-        large = _by_pyvista(meshes, eye, (width, height), ground, shade_corners, margin)
+        large = _by_pyvista(meshes, eye, (width, height), background, ambient_occlusion, margin)
     picture = _mean(large, oversampling)
     if path is not None:
         write_picture(path, picture)
@@ -250,7 +250,7 @@ def show(scene: Shown, *, viewpoint: Viewpoint | None = None, size_px: tuple[int
         raise SimulationError(
             "this machine has no screen to open a window on; write a picture with foveasim.view.render(scene, 'picture.png')"
         )
-    plotter = _plotter(meshes, _eye(meshes, viewpoint or Viewpoint(), size), size, GROUND, off_screen=False)
+    plotter = _plotter(meshes, _eye(meshes, viewpoint or Viewpoint(), size), size, BACKGROUND, off_screen=False)
     plotter.show()
 
 
@@ -333,7 +333,7 @@ def _framing(mesh: Mesh) -> Floats:
 def _light(eye: _Eye) -> Floats:
     """Unit vector toward the light, which stands beside the viewer whichever way he looks."""
     right = eye.axes[0]
-    ahead = np.array([right[1], -right[0], 0.0])  # along the ground toward the viewer
+    ahead = np.array([right[1], -right[0], 0.0])  # along the background toward the viewer
     light = LIGHT[0] * right + LIGHT[1] * ahead + LIGHT[2] * np.array([0.0, 0.0, 1.0])
     return np.asarray(light / np.linalg.norm(light))
 
@@ -374,12 +374,12 @@ def _nearest(meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int]) -> tuple[N
     return ids, nearness
 
 
-def _drawn(meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int], ground: tuple[int, int, int]) -> RgbArray:
+def _drawn(meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int], background: tuple[int, int, int]) -> RgbArray:
     """The picture by the z-buffer; only triangles that are seen are lit."""
     ids, _ = _nearest(meshes, eye, size_px)
     n_x, n_y = size_px
     picture = np.empty((n_y, n_x, 3), np.uint8)
-    picture[:] = ground
+    picture[:] = background
     first_id = 0
     light = _light(eye)
     for mesh in meshes:
@@ -403,15 +403,15 @@ def _by_pyvista(
     meshes: list[Mesh],
     eye: _Eye,
     size_px: tuple[int, int],
-    ground: tuple[int, int, int],
-    shade_corners: bool,
+    background: tuple[int, int, int],
+    ambient_occlusion: bool,
     margin_px: int,
 ) -> RgbArray:
     """The picture by VTK; a margin is drawn around it and cut off."""
     n_x, n_y = size_px
-    plotter = _plotter(meshes, eye, (n_x + 2 * margin_px, n_y + 2 * margin_px), ground, off_screen=True)
+    plotter = _plotter(meshes, eye, (n_x + 2 * margin_px, n_y + 2 * margin_px), background, off_screen=True)
     try:
-        if shade_corners:
+        if ambient_occlusion:
             size_um = float(np.linalg.norm(np.ptp(np.stack([b for m in meshes for b in m.bounds_um]), axis=0)))
             reach_um = SHADE_REACH_SHARE * size_um
             plotter.enable_ssao(radius=reach_um, bias=SHADE_BIAS_SHARE * reach_um, kernel_size=64, blur=True)
@@ -422,14 +422,14 @@ def _by_pyvista(
 
 
 def _plotter(
-    meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int], ground: tuple[int, int, int], *, off_screen: bool
+    meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int], background: tuple[int, int, int], *, off_screen: bool
 ) -> Plotter:
     """PyVista's plotter with the scene in it: one light and no multisampling: several times as fast as its defaults."""
     begin_rendering()
     pyvista = imported_pyvista()
     plotter = pyvista.Plotter(off_screen=off_screen, window_size=list(size_px), lighting="none")
     plotter.render_window.SetMultiSamples(0 if off_screen else 4)
-    plotter.set_background([part / 255.0 for part in ground])
+    plotter.set_background([part / 255.0 for part in background])
     light = pyvista.Light(
         position=tuple(_light(eye)), focal_point=(0.0, 0.0, 0.0), light_type="scene light", intensity=1.0
     )

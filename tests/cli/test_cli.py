@@ -168,7 +168,7 @@ source: made for this test
 def test_a_broken_rule_ends_with_the_exit_code_1_and_a_kept_one_with_0(tmp_path):
     (tmp_path / "rings.yaml").write_text(LAYOUT)
     (tmp_path / "loose.yaml").write_text("min_size_um: 0.1\n")
-    broken = foveasim("check", "rings.yaml", "--lyrdb", "rings.lyrdb", cwd=tmp_path)
+    broken = foveasim("check", "rings.yaml", "--report", "rings.lyrdb", cwd=tmp_path)
     kept = foveasim("check", "rings.yaml", "--rules", "loose.yaml", cwd=tmp_path)
 
     assert broken.returncode == 1

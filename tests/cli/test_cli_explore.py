@@ -1,4 +1,4 @@
-"""Studies and data sets on the command line: the same as the calls, after any end, and bad files in one sentence."""
+"""Studies and datasets on the command line: the same as the calls, after any end, and bad files in one sentence."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def harsh(shot, camera, capture):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with a shot, a study, a data set and metrics, in which the program runs."""
+    """A folder with a shot, a study, a dataset and metrics, in which the program runs."""
     (tmp_path / "shot.yaml").write_text(json.dumps(SHOT))
     (tmp_path / "photographed.yaml").write_text(json.dumps(PHOTOGRAPHED))
     (tmp_path / "study.yaml").write_text(json.dumps(STUDY))
@@ -344,7 +344,7 @@ def test_a_storage_that_breaks_amid_a_study_is_one_sentence_and_keeps_what_is_do
             )
 
     with pytest.raises(FileError, match=r"study\.db: cannot be used .*already finished.*; 3 trials are kept") as caught:
-        explore.run_study(plan, storage=folder / "study.db", tell=spoil)
+        explore.run_study(plan, storage=folder / "study.db", progress=spoil)
     assert "\n" not in str(caught.value)
 
 
@@ -415,7 +415,7 @@ def test_a_bad_option_of_a_study_is_one_sentence_and_nothing_is_written(foveasim
     assert sorted(folder.rglob("*")) == before
 
 
-# -- data sets --------------------------------------------------------------------------------------------------------
+# -- datasets --------------------------------------------------------------------------------------------------------
 
 
 def labels_of_all_sorts(folder):
@@ -457,15 +457,15 @@ def labels_of_all_sorts(folder):
     }
 
 
-@pytest.mark.parametrize("out", ["data_set", "d.zarr"])
+@pytest.mark.parametrize("out", ["dataset", "d.zarr"])
 def test_a_data_set_on_the_command_line_is_what_the_call_gives(foveasim, folder, out):
     labels = labels_of_all_sorts(folder)
     named = {"labels": "labels.csv", "boxes": "coco.json", "masks": "masks", "flows": "flows", "per_shard": 5}
     (folder / "all.yaml").write_text(json.dumps(DATA_SET | named))
-    data = explore.DataSet("photos", "photographed.yaml", DATA_SET["vary"], cameras=2, draws=2, seed=7, **labels)
+    data = explore.Dataset("photos", "photographed.yaml", DATA_SET["vary"], cameras=2, draws=2, seed=7, **labels)
 
     code, said, wrong = foveasim("dataset", "all.yaml", "--out", out, "--workers", 1)
-    found = explore.open_data_set(folder / out)
+    found = explore.open_dataset(folder / out)
 
     assert (code, wrong) == (0, "")
     assert f"wrote {out}: 12 samples" in said
@@ -477,14 +477,14 @@ def test_a_data_set_on_the_command_line_is_what_the_call_gives(foveasim, folder,
     assert {"label", "box_um", "mask", "flow_um"} < set(found[0])
     code, _, wrong = foveasim("dataset", "all.yaml", "--out", f"again_{out}")
     assert (code, wrong) == (0, "")
-    assert_same(explore.open_data_set(folder / f"again_{out}")[11], data[11])
+    assert_same(explore.open_dataset(folder / f"again_{out}")[11], data[11])
 
 
 @pytest.mark.parametrize("recipe", ["classification", "denoising"])
 def test_a_recipe_in_a_file_is_the_call_of_its_name(folder, recipe):
     (folder / "own.yaml").write_text(json.dumps({"pictures": "photos", "shot": PHOTOGRAPHED, "recipe": recipe}))
 
-    read = explore.read_data_set(folder / "own.yaml").data_set
+    read = explore.read_dataset(folder / "own.yaml").dataset
     called = getattr(explore, recipe)(folder / "photos", PHOTOGRAPHED)
 
     assert read.to_dict() == called.to_dict()
@@ -502,7 +502,7 @@ def test_pictures_may_be_a_zip_file_an_array_or_a_list_of_files(folder):
 
     def read(**keys):
         (folder / "own.yaml").write_text(json.dumps(DATA_SET | keys))
-        return explore.read_data_set(folder / "own.yaml").data_set
+        return explore.read_dataset(folder / "own.yaml").dataset
 
     zipped = read(pictures="photos.zip")
     array = read(pictures="photos.npy", labels="numbers.csv")
@@ -518,7 +518,7 @@ def test_pictures_may_be_a_zip_file_an_array_or_a_list_of_files(folder):
 def test_a_data_set_that_was_ended_goes_on_and_gives_the_same_samples(folder):
     (folder / "long.yaml").write_text(json.dumps(DATA_SET | {"cameras": 150, "per_shard": 10}))
     command = [sys.executable, "-m", "foveasim.cli", "dataset", "long.yaml", "--workers", "2"]
-    shards = lambda: {p.name: p.stat().st_mtime_ns for p in (folder / "data_set").glob("*.tar")}  # noqa: E731
+    shards = lambda: {p.name: p.stat().st_mtime_ns for p in (folder / "dataset").glob("*.tar")}  # noqa: E731
     running = subprocess.Popen(
         command, cwd=folder, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -531,13 +531,13 @@ def test_a_data_set_that_was_ended_goes_on_and_gives_the_same_samples(folder):
     before = shards()
 
     assert running.returncode == 130
-    assert wrong == "stopped; the shards that are done are kept in data_set, and the same command goes on from there\n"
+    assert wrong == "stopped; the shards that are done are kept in dataset, and the same command goes on from there\n"
     # Shards that waited for a process were not begun.
     assert 2 <= len(before) < 90
-    assert not list((folder / "data_set").glob(".*"))
+    assert not list((folder / "dataset").glob(".*"))
 
     result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    found, data = explore.open_data_set(folder / "data_set"), explore.read_data_set("long.yaml").data_set
+    found, data = explore.open_dataset(folder / "dataset"), explore.read_dataset("long.yaml").dataset
 
     assert result.returncode == 0, result.stderr
     assert before.items() <= shards().items()
@@ -567,7 +567,7 @@ BAD_DATA_SETS = [
     ({"pictures": ["skimage:nobody"]}, "bad.yaml: pictures.0: scikit-image brings no picture 'nobody'"),
     ({"pictures": ["photos/none.png"]}, "none.png: no such file"),
     ({"shot": "none.yaml"}, "none.yaml: no such file"),
-    ({"shot": SHOT}, "bad.yaml: scene.kind: must be 'picture' for a data set"),
+    ({"shot": SHOT}, "bad.yaml: scene.kind: must be 'picture' for a dataset"),
     ({"vary": {"sensor.bitz": {"choice": [8]}}}, "bad.yaml: with photographed.yaml: sensor.bitz: no such setting"),
     ({"vary": {"sensor.bits": {"chance": [8]}}}, "bad.yaml: vary.sensor.bits.chance: no such setting"),
     ({"vary": {"sensor.bits": {"integers": [8, 40]}}}, "sensor.bits: must be <= 16, got 40"),
@@ -608,7 +608,7 @@ def test_a_bad_data_set_is_one_sentence_and_nothing_is_written(foveasim, folder,
     [
         (["--workers", "0"], "'workers' must be >= 1, got 0"),
         (["--out", "no/where"], "cannot be written: the folder"),
-        (["--out", "photos"], "photos: holds something else than a data set"),
+        (["--out", "photos"], "photos: holds something else than a dataset"),
         (["--out", "x.txt"], "must end in .zarr, or have no ending"),
     ],
 )
@@ -731,12 +731,12 @@ def test_the_schema_is_of_a_shot_unless_another_is_asked_for(foveasim):
 
 def test_the_examples_are_what_they_say():
     study = explore.read_study(GALLERY / "best_fovea.yaml")
-    file = explore.read_data_set(GALLERY / "random_cameras.yaml")
+    file = explore.read_dataset(GALLERY / "random_cameras.yaml")
 
     assert study.n_trials == 40
     assert set(study.base.metrics) == {"psnr_db", "n_sites", "saturated_fraction"}
-    assert len(file.data_set) == 24
-    assert file.data_set.class_names == ["cat", "cup", "person"]
+    assert len(file.dataset) == 24
+    assert file.dataset.class_names == ["cat", "cup", "person"]
 
 
 def test_files_that_a_layouts_own_file_names_are_among_what_results_depend_on(folder):
@@ -751,7 +751,7 @@ def test_files_that_a_layouts_own_file_names_are_among_what_results_depend_on(fo
         told.append(
             [
                 explore.plan_sweep(folder / "shot.yaml", {"sensor.bits": [8]}).to_dict(),
-                explore.DataSet(folder / "photos", folder / "photographed.yaml").to_dict(),
+                explore.Dataset(folder / "photos", folder / "photographed.yaml").to_dict(),
             ]
         )
 

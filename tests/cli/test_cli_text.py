@@ -89,7 +89,7 @@ def test_run_prints_names_as_they_are(marked, environment):
 @pytest.mark.parametrize(
     ("arguments", "code", "printed"),
     [
-        (("check", "{}.npz", "--rules", "sky130_met1", "--lyrdb", "{}.lyrdb"), (0, 1), "wrote {}.lyrdb"),
+        (("check", "{}.npz", "--rules", "sky130_met1", "--report", "{}.lyrdb"), (0, 1), "wrote {}.lyrdb"),
         (("check", "{}.npz"), (2,), "error: {}.npz: holds no rules"),
         (("check", "{}.npz", "--rules", "{}"), (2,), "error: {}: "),
         (("convert", "{}.npz", "{}.svg"), (0,), "wrote {}.svg"),

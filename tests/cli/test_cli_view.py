@@ -178,7 +178,7 @@ def test_without_a_choice_the_page_goes_to_a_browser_or_is_told_of(tmp_path, mon
 
 def test_a_port_that_is_none_is_refused():
     with pytest.raises(ParameterError, match="'port' must be >= 0"):
-        serve_page("", port=-1, tell=print)
+        serve_page("", port=-1, announce=print)
 
 
 # -- connections as they come ---------------------------------------------------------------------------------------------------
@@ -189,7 +189,7 @@ BIG_BYTES = 20_000_000
 SERVER = f"""
 from foveasim.view.web import _serve
 _serve.PATIENCE_S = {{patience_s}}
-_serve.serve_page("x" * {BIG_BYTES}, tell=lambda address: print(address, flush=True))
+_serve.serve_page("x" * {BIG_BYTES}, announce=lambda address: print(address, flush=True))
 """
 
 

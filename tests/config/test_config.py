@@ -94,8 +94,8 @@ def test_numbers_without_a_point_in_front_of_the_exponent_are_numbers(shot_file)
             lambda s: s.camera.sensor.crosstalk.kernel[1][1] == 0.92,
         ),
         (
-            "sensor.coupling={neighbour_share: 0.01}",
-            lambda s: s.camera.sensor.coupling == fs.sensor.Coupling(neighbour_share=0.01),
+            "sensor.coupling={neighbour_fraction: 0.01}",
+            lambda s: s.camera.sensor.coupling == fs.sensor.InterPixelCapacitance(neighbour_fraction=0.01),
         ),
         ("sensor.companding=root", lambda s: s.camera.sensor.converter.companding == "root"),
         ("sensor.inl_dn=[0, 1, 0]", lambda s: s.camera.sensor.converter.inl_dn == (0.0, 1.0, 0.0)),

@@ -1,4 +1,4 @@
-"""Data sets: every sample a function of the seed and its number, labels where the light goes, files whole after any end."""
+"""Datasets: every sample a function of the seed and its number, labels where the light goes, files whole after any end."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def pictures(n, seed=0):
 
 
 def labelled(n=5, **more):
-    """A data set with labels of every sort."""
+    """A dataset with labels of every sort."""
     rng = np.random.default_rng(1)
     options = {
         "cameras": 2,
@@ -77,7 +77,7 @@ def labelled(n=5, **more):
         "masks": list(rng.integers(0, 3, (n, N_Y, N_X))),
         "flows": list(rng.normal(size=(n, N_Y, N_X, 2))),
     } | more
-    return explore.DataSet(pictures(n), SHOT, VARY, **options)
+    return explore.Dataset(pictures(n), SHOT, VARY, **options)
 
 
 def assert_same(one, other):
@@ -121,7 +121,7 @@ def test_a_pickled_data_set_takes_no_kept_parts_along():
 
 
 def test_a_sample_is_what_the_shot_by_hand_gives():
-    data = explore.DataSet(pictures(3), SHOT, VARY, cameras=4, seed=5)
+    data = explore.Dataset(pictures(3), SHOT, VARY, cameras=4, seed=5)
     index = 9
     settings = data.settings_of(index)
     told = {key: value for key, value in SHOT["scene"].items() if key != "kind"}
@@ -152,14 +152,14 @@ def test_draws_differ_in_noise_alone_and_cameras_in_settings():
 
 
 def test_another_seed_draws_other_cameras():
-    found = [explore.DataSet(pictures(1), SHOT, VARY, seed=seed)[0]["settings"]["exposure_s"] for seed in range(20)]
+    found = [explore.Dataset(pictures(1), SHOT, VARY, seed=seed)[0]["settings"]["exposure_s"] for seed in range(20)]
 
     assert len(set(found)) == 20
 
 
 def test_another_setting_drawn_leaves_the_others_as_they_were():
-    few = explore.DataSet(pictures(6), SHOT, {"exposure_s": VARY["exposure_s"]})
-    more = explore.DataSet(pictures(6), SHOT, VARY)
+    few = explore.Dataset(pictures(6), SHOT, {"exposure_s": VARY["exposure_s"]})
+    more = explore.Dataset(pictures(6), SHOT, VARY)
 
     assert [s["settings"]["exposure_s"] for s in few] == [s["settings"]["exposure_s"] for s in more]
 
@@ -178,7 +178,7 @@ N_DRAWS = 4000
     ],
 )
 def test_a_distribution_is_the_one_it_says(told, share_below):
-    draw = explore.draw_of("x", told)
+    draw = explore.parse_distribution("x", told)
     shares = np.sort([share_below(draw.at(0, k)[0]) for k in range(N_DRAWS)])
 
     # Kolmogorov: the largest distance of the two distributions exceeds 2.3 / sqrt(n) once in 25,000.
@@ -194,7 +194,7 @@ def test_a_distribution_is_the_one_it_says(told, share_below):
     ],
 )
 def test_a_choice_has_its_chances(told, chances):
-    draw = explore.draw_of("x", told)
+    draw = explore.parse_distribution("x", told)
     found = [draw.at(3, k)[0] for k in range(N_DRAWS)]
 
     assert set(found) == {value for value, chance in chances.items() if chance}
@@ -205,7 +205,7 @@ def test_a_choice_has_its_chances(told, chances):
 @pytest.mark.parametrize("sigma", [1e-320, 1e-9, 0.1, 1e6])
 def test_a_normal_distribution_of_any_width_is_between_its_ends(sigma):
     """Nearly even far inside a wide one, and its mean where it is narrow."""
-    draw = explore.draw_of("x", {"normal": [1.0, sigma, 0.0, 2.0]})
+    draw = explore.parse_distribution("x", {"normal": [1.0, sigma, 0.0, 2.0]})
     found = np.array([draw.at(0, k)[0] for k in range(N_DRAWS)])
     sigma_cut = min(sigma, np.sqrt(1.0 / 3.0))
 
@@ -216,7 +216,7 @@ def test_a_normal_distribution_of_any_width_is_between_its_ends(sigma):
 
 
 def test_labels_may_be_true_and_false():
-    data = explore.DataSet(pictures(2), SHOT, labels=[True, False])
+    data = explore.Dataset(pictures(2), SHOT, labels=[True, False])
 
     assert [sample["label"] for sample in data] == [1, 0]
 
@@ -234,7 +234,7 @@ def test_pictures_of_all_depths_hold_the_same_light(tmp_path):
             archive.write(file, file.name)
 
     for source in (folder, tmp_path / "all.zip", [picture, deep, deep, exact, exact]):
-        found = [sample["expected_e"] for sample in explore.DataSet(source, SHOT, fields=("expected_e",))]
+        found = [sample["expected_e"] for sample in explore.Dataset(source, SHOT, fields=("expected_e",))]
         assert len(found) == 5
         for each in found[1:]:
             np.testing.assert_allclose(each, found[0], rtol=1e-6)
@@ -242,8 +242,8 @@ def test_pictures_of_all_depths_hold_the_same_light(tmp_path):
 
 def test_a_box_beyond_the_picture_covers_what_of_it_is_on_it():
     boxes = [[-5, -5, N_X / 2, N_Y], [N_X + 10, 5, N_X + 20, 9], [-1e300, -1e300, 1e300, 1e300]]
-    sample = explore.DataSet(pictures(1), SHOT, boxes=[boxes], fit="cover")[0]
-    left = explore.DataSet(pictures(1), SHOT, boxes=[[[0, 0, N_X / 2, N_Y]]], fit="cover")[0]
+    sample = explore.Dataset(pictures(1), SHOT, boxes=[boxes], fit="cover")[0]
+    left = explore.Dataset(pictures(1), SHOT, boxes=[[[0, 0, N_X / 2, N_Y]]], fit="cover")[0]
 
     np.testing.assert_array_equal(sample["box_covers"][0], left["box_covers"][0])
     assert 0 < left["box_covers"].sum() < left["box_covers"].size
@@ -252,7 +252,7 @@ def test_a_box_beyond_the_picture_covers_what_of_it_is_on_it():
 
 
 def test_choices_that_are_no_numbers_are_told_by_their_positions():
-    data = explore.DataSet(pictures(20), SHOT, VARY)
+    data = explore.Dataset(pictures(20), SHOT, VARY)
     choices = VARY["sensor.qe"]["choice"]
 
     for k in range(20):
@@ -260,10 +260,10 @@ def test_choices_that_are_no_numbers_are_told_by_their_positions():
 
 
 def test_codes_of_all_samples_have_the_type_of_the_most_bits():
-    data = explore.DataSet(pictures(4), SHOT, {"sensor.bits": {"choice": [8, 12]}})
+    data = explore.Dataset(pictures(4), SHOT, {"sensor.bits": {"choice": [8, 12]}})
 
     assert {sample["code"].dtype for sample in data} == {np.dtype(np.uint16)}
-    assert explore.DataSet(pictures(1), SHOT)[0]["code"].dtype == np.uint8
+    assert explore.Dataset(pictures(1), SHOT)[0]["code"].dtype == np.uint8
 
 
 @pytest.mark.parametrize("name", ["data.zarr", "data"])
@@ -278,8 +278,8 @@ def test_stored_numbers_are_those_that_samples_were_made_with(name, vary, tmp_pa
     """Whichever comes first, a whole number or another: all have the one type, and none is cut off."""
     is_whole_first = set()
     for seed in (0, 4, 5):
-        data = explore.DataSet(pictures(12), SHOT, vary, seed=seed, fields=())
-        stored = explore.write_data_set(data, tmp_path / f"{seed}{name}")
+        data = explore.Dataset(pictures(12), SHOT, vary, seed=seed, fields=())
+        stored = explore.write_dataset(data, tmp_path / f"{seed}{name}")
         for k in range(12):
             assert_same(stored[k], data[k])
             for path, number in data[k]["settings"].items():
@@ -396,7 +396,7 @@ def test_labels_go_where_the_camera_puts_the_light():
     bright = np.zeros((N_Y, N_X), np.uint8)
     bright[30:42, 36:70] = 255
     layout = {"generator": "grid", "parameters": {"n_x": 24, "n_y": 20, "pitch_um": 4.0}}
-    data = explore.DataSet(
+    data = explore.Dataset(
         [bright],
         SHOT | {"layout": layout, "distortion": BARREL, "exposure_s": 1e-4},
         masks=[bright // 255],
@@ -426,7 +426,7 @@ def test_nothing_in_a_sample_is_nan_where_sites_see_no_picture():
     shot = SHOT | {"scene": SHOT["scene"] | {"pitch_um": 120.0}, "distortion": narrow}
     flows = np.full((1, N_Y, N_X, 2), np.nan)
     with pytest.warns(CoverageWarning, match="sample 0: .*photosites lie"):
-        sample = explore.DataSet(
+        sample = explore.Dataset(
             pictures(1), shot, masks=np.zeros((1, N_Y, N_X), int), boxes=[[[0, 0, 5, 5]]], flows=flows
         )[0]
 
@@ -439,7 +439,7 @@ def test_nothing_in_a_sample_is_nan_where_sites_see_no_picture():
 @pytest.mark.parametrize(("fit", "is_covered"), [("cover", True), ("contain", False)])
 def test_pictures_of_any_size_fit_the_layout(fit, is_covered):
     wide, high = np.full((20, 90, 3), 200, np.uint8), np.full((90, 20, 3), 200, np.uint8)
-    data = explore.DataSet([wide, high], SHOT, masks=[wide[..., 0] // 200, high[..., 0] // 200], fit=fit)
+    data = explore.Dataset([wide, high], SHOT, masks=[wide[..., 0] // 200, high[..., 0] // 200], fit=fit)
     if is_covered:
         assert all((sample["mask"] == 1).all() for sample in data)
         return
@@ -490,12 +490,12 @@ def test_folders_zips_files_pairs_and_arrays_give_the_same_samples(tmp_path):
     classes = ["a", "a", "b", "b"]
     paired = [(Image.open(folder / name), label) for name, label in zip(names, classes, strict=True)]
     made = {
-        "folder": explore.DataSet(folder, SHOT, VARY),
-        "zip": explore.DataSet(archive, SHOT, VARY),
-        "files": explore.DataSet([folder / name for name in names], SHOT, VARY, labels=classes),
-        "pairs": explore.DataSet(paired, SHOT, VARY),
-        "array": explore.DataSet(stack, SHOT, VARY, labels=classes),
-        "npy": explore.DataSet(tmp_path / "stack.npy", SHOT, VARY, labels=classes),
+        "folder": explore.Dataset(folder, SHOT, VARY),
+        "zip": explore.Dataset(archive, SHOT, VARY),
+        "files": explore.Dataset([folder / name for name in names], SHOT, VARY, labels=classes),
+        "pairs": explore.Dataset(paired, SHOT, VARY),
+        "array": explore.Dataset(stack, SHOT, VARY, labels=classes),
+        "npy": explore.Dataset(tmp_path / "stack.npy", SHOT, VARY, labels=classes),
     }
 
     for data in made.values():
@@ -532,10 +532,10 @@ def test_a_name_that_a_zip_file_has_twice_is_one_picture(tmp_path):
         for picture in pictures(2):
             Image.fromarray(picture).save(tmp_path / "a.png")
             archive.write(tmp_path / "a.png", "a.png")
-    data = explore.DataSet(tmp_path / "x.zip", SHOT)
+    data = explore.Dataset(tmp_path / "x.zip", SHOT)
 
     assert len(data) == 1
-    np.testing.assert_array_equal(data[0]["code"], explore.DataSet(pictures(2)[1:], SHOT)[0]["code"])
+    np.testing.assert_array_equal(data[0]["code"], explore.Dataset(pictures(2)[1:], SHOT)[0]["code"])
 
 
 TURNED = Image.Exif()
@@ -561,12 +561,12 @@ def test_an_image_of_pillow_is_seen_as_its_file_is(ending, convert, note, tmp_pa
     image.save(file, **({} if note is None else {"exif": note}))
     opened = Image.open(file)
     opened.load()
-    of_file = explore.DataSet([file], SHOT)[0]
+    of_file = explore.Dataset([file], SHOT)[0]
 
-    assert_same(explore.DataSet([Image.open(file)], SHOT)[0], of_file)
-    assert_same(explore.DataSet([opened], SHOT)[0], of_file)
-    assert_same(pickle.loads(pickle.dumps(explore.DataSet([opened], SHOT)))[0], of_file)
-    assert_same(explore.DataSet(Made([Image.open(file)]), SHOT)[0], of_file)
+    assert_same(explore.Dataset([Image.open(file)], SHOT)[0], of_file)
+    assert_same(explore.Dataset([opened], SHOT)[0], of_file)
+    assert_same(pickle.loads(pickle.dumps(explore.Dataset([opened], SHOT)))[0], of_file)
+    assert_same(explore.Dataset(Made([Image.open(file)]), SHOT)[0], of_file)
 
 
 @pytest.mark.parametrize("mode", ["HSV", "YCbCr", "CMYK", "RGBX"])
@@ -574,7 +574,7 @@ def test_colours_of_an_image_of_pillow_are_seen_in_any_of_its_modes(mode):
     """Of black and white, which all of them hold as they are."""
     grey = np.repeat(pictures(1)[0][..., :1] // 128 * 255, 3, axis=2).astype(np.uint8)
 
-    assert_same(explore.DataSet([Image.fromarray(grey).convert(mode)], SHOT)[0], explore.DataSet([grey], SHOT)[0])
+    assert_same(explore.Dataset([Image.fromarray(grey).convert(mode)], SHOT)[0], explore.Dataset([grey], SHOT)[0])
 
 
 def test_a_broken_image_of_pillow_is_told_in_one_sentence(tmp_path):
@@ -586,7 +586,7 @@ def test_a_broken_image_of_pillow_is_told_in_one_sentence(tmp_path):
         Image.open(tmp_path / "a.png") as image,
         pytest.raises(FileError, match="picture 0: is no image that can be read") as caught,
     ):
-        explore.DataSet([image], SHOT)
+        explore.Dataset([image], SHOT)
     assert "\n" not in str(caught.value)
 
 
@@ -596,7 +596,7 @@ def test_a_mask_with_a_palette_has_its_numbers(tmp_path):
     image.putdata([3] * (N_Y * N_X))
     image.save(tmp_path / "mask.png")
 
-    sample = explore.DataSet(pictures(1), SHOT, masks=[tmp_path / "mask.png"])[0]
+    sample = explore.Dataset(pictures(1), SHOT, masks=[tmp_path / "mask.png"])[0]
 
     assert set(sample["mask"].tolist()) == {3}
 
@@ -610,8 +610,8 @@ def test_what_was_written_is_what_is_simulated(name, workers, tmp_path):
     data = labelled()
     progress = []
 
-    stored = explore.write_data_set(
-        data, tmp_path / name, per_shard=3, workers=workers, tell=lambda *told: progress.append(told)
+    stored = explore.write_dataset(
+        data, tmp_path / name, per_shard=3, workers=workers, progress=lambda *told: progress.append(told)
     )
 
     assert len(stored) == len(data)
@@ -629,7 +629,7 @@ def test_what_was_written_is_what_is_simulated(name, workers, tmp_path):
 
 def test_tar_files_are_the_same_bytes_with_any_number_of_workers_and_read_by_their_names(tmp_path):
     for workers in (1, 2):
-        explore.write_data_set(labelled(), tmp_path / f"data{workers}", per_shard=6, workers=workers)
+        explore.write_dataset(labelled(), tmp_path / f"data{workers}", per_shard=6, workers=workers)
     shards = sorted(p.name for p in (tmp_path / "data1").glob("*.tar"))
 
     assert shards == [f"shard-{k:06d}.tar" for k in range(4)]
@@ -644,8 +644,8 @@ def test_tar_files_are_the_same_bytes_with_any_number_of_workers_and_read_by_the
 
 def test_the_photosites_are_beside_the_codes(tmp_path):
     zarr = pytest.importorskip("zarr")
-    data = explore.DataSet(pictures(2), SHOT, VARY)
-    explore.write_data_set(data, tmp_path / "data.zarr")
+    data = explore.Dataset(pictures(2), SHOT, VARY)
+    explore.write_dataset(data, tmp_path / "data.zarr")
     group = zarr.open_group(str(tmp_path / "data.zarr"), mode="r")
     layout = fs.Layout(*(group[f"layout/{name}"][:] for name in ("xy_um", "ring_offsets", "site_offsets")))
 
@@ -655,13 +655,13 @@ def test_the_photosites_are_beside_the_codes(tmp_path):
 
 def test_tar_files_hold_layouts_that_differ_and_zarr_does_not(tmp_path):
     vary = {"layout.parameters.pitch_um": {"uniform": [5.0, 7.0]}, "layout.parameters.n_rows": {"integers": [6, 9]}}
-    data = explore.DataSet(pictures(5), SHOT, vary)
+    data = explore.Dataset(pictures(5), SHOT, vary)
 
-    stored = explore.write_data_set(data, tmp_path / "data", per_shard=2)
+    stored = explore.write_dataset(data, tmp_path / "data", per_shard=2)
 
     assert len({sample["code"].size for sample in stored}) > 1
     with pytest.raises(ParameterError, match="'layout' must not vary in a zarr folder"):
-        explore.write_data_set(data, tmp_path / "data.zarr")
+        explore.write_dataset(data, tmp_path / "data.zarr")
     with pytest.raises(ParameterError, match="'layout' differs from sample to sample"):
         _ = data.layout
 
@@ -688,14 +688,14 @@ def test_a_broken_picture_is_named_and_writing_goes_on_from_there(name, workers,
         else (lambda: {p: p.stat().st_mtime_ns for p in target.glob("*.tar")})
     )
     with pytest.raises(FileError, match=r"4\.png: is broken or cut short"):
-        explore.write_data_set(explore.DataSet(folder, SHOT, VARY), target, per_shard=1, workers=workers)
+        explore.write_dataset(explore.Dataset(folder, SHOT, VARY), target, per_shard=1, workers=workers)
     before = done()
-    with pytest.raises(FileError, match=r"has \d of 6 shards; write the same data set there to go on"):
-        explore.open_data_set(target)
+    with pytest.raises(FileError, match=r"has \d of 6 shards; write the same dataset there to go on"):
+        explore.open_dataset(target)
     (folder / "4.png").write_bytes(whole)
-    data = explore.DataSet(folder, SHOT, VARY)
+    data = explore.Dataset(folder, SHOT, VARY)
 
-    stored = explore.write_data_set(data, target, workers=workers)
+    stored = explore.write_dataset(data, target, workers=workers)
 
     assert len(before) >= 4 if workers == 1 else len(before) >= 1
     assert before.items() <= done().items()
@@ -719,7 +719,7 @@ def test_a_process_that_ends_amid_a_shard_leaves_whole_shards(tmp_path):
         "if __name__ == '__main__':\n"
         "    shot = json.loads(sys.argv[3])\n"
         "    for path in sys.argv[4:]:\n"
-        "        explore.write_data_set(explore.DataSet(Pictures(), shot), path, per_shard=2, workers=int(sys.argv[1]))\n"
+        "        explore.write_dataset(explore.Dataset(Pictures(), shot), path, per_shard=2, workers=int(sys.argv[1]))\n"
     )
     both = [str(tmp_path / "data.zarr"), str(tmp_path / "data")]
 
@@ -734,9 +734,9 @@ def test_a_process_that_ends_amid_a_shard_leaves_whole_shards(tmp_path):
 
     assert "SimulationError: a process that wrote shard 2 ended each time" in lost.stderr
     assert finished.returncode == 0, finished.stderr
-    data = explore.DataSet([np.random.default_rng(k).integers(0, 256, (40, 48, 3), np.uint8) for k in range(8)], SHOT)
+    data = explore.Dataset([np.random.default_rng(k).integers(0, 256, (40, 48, 3), np.uint8) for k in range(8)], SHOT)
     for path in both:
-        stored = explore.open_data_set(path)
+        stored = explore.open_dataset(path)
         for k in range(8):
             assert_same(stored[k], data[k])
 
@@ -747,8 +747,8 @@ def test_a_program_that_its_writers_cannot_import_is_told_so_and_ends(tmp_path):
         "import json, sys\n"
         "import numpy as np\n"
         "from foveasim import explore\n"
-        "data = explore.DataSet(np.zeros((64, 64, 64), np.uint8), json.loads(sys.argv[1]))\n"
-        "explore.write_data_set(data, sys.argv[2], workers=2)\n"
+        "data = explore.Dataset(np.zeros((64, 64, 64), np.uint8), json.loads(sys.argv[1]))\n"
+        "explore.write_dataset(data, sys.argv[2], workers=2)\n"
     )
     command = [sys.executable, str(script), json.dumps(SHOT), str(tmp_path / "data")]
 
@@ -774,7 +774,7 @@ def test_writers_end_with_their_program(tmp_path):
         "            time.sleep(400)\n"
         "        return np.zeros((40, 48, 3), np.uint8)\n"
         "if __name__ == '__main__':\n"
-        "    explore.write_data_set(explore.DataSet(Pictures(), json.loads(sys.argv[1])), sys.argv[2], workers=2)\n"
+        "    explore.write_dataset(explore.Dataset(Pictures(), json.loads(sys.argv[1])), sys.argv[2], workers=2)\n"
     )
     (tmp_path / "temporary").mkdir()
     running = subprocess.Popen(
@@ -809,11 +809,11 @@ def test_pictures_that_cannot_go_to_other_processes_are_told_in_one_sentence(tmp
         (local, r"the pictures or labels cannot be sent to other processes \(.*\)"),
         (Homebound(pictures(4)), r"the workers cannot compute: the pictures stay"),
     ):
-        data = explore.DataSet(made, SHOT)
+        data = explore.Dataset(made, SHOT)
         with pytest.raises(SimulationError, match=message) as caught:
-            explore.write_data_set(data, tmp_path / "data", workers=2)
+            explore.write_dataset(data, tmp_path / "data", workers=2)
         assert "\n" not in str(caught.value)
-    assert_same(explore.write_data_set(data, tmp_path / "data")[3], data[3])
+    assert_same(explore.write_dataset(data, tmp_path / "data")[3], data[3])
 
 
 def test_processes_are_started_where_there_is_enough_to_do(tmp_path, monkeypatch):
@@ -829,10 +829,10 @@ def test_processes_are_started_where_there_is_enough_to_do(tmp_path, monkeypatch
 
     monkeypatch.setattr(store, "executor", others)
     monkeypatch.setattr(store, "thread_count", lambda: 5)
-    data = explore.DataSet(pictures(6), SHOT)
+    data = explore.Dataset(pictures(6), SHOT)
     for name, alone_s, found in (("short", 1e6, []), ("long", 0.0, [(5, 5)])):
         monkeypatch.setattr(store, "ALONE_S", alone_s)
-        stored = explore.write_data_set(data, tmp_path / name, workers=None)
+        stored = explore.write_dataset(data, tmp_path / name, workers=None)
         assert started == found
         assert_same(stored[5], data[5])
 
@@ -842,7 +842,7 @@ def test_a_full_disk_is_one_sentence_and_no_broken_shard(name, tmp_path):
     """The system refuses files beyond a size, as it does where no place is left."""
     rng = np.random.default_rng(0)
     layout = {"generator": "grid", "parameters": {"n_x": 90, "n_y": 90, "pitch_um": 1.0}}
-    data = explore.DataSet(
+    data = explore.Dataset(
         rng.integers(0, 256, (4, 100, 100, 3), np.uint8), SHOT | {"layout": layout}, fields=("electrons",), fit="cover"
     )
     data[0]
@@ -850,11 +850,11 @@ def test_a_full_disk_is_one_sentence_and_no_broken_shard(name, tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (9_000, usual[1]))
     try:
         with pytest.raises(FileError, match="cannot be written: File too large"):
-            explore.write_data_set(data, tmp_path / name, per_shard=1)
+            explore.write_dataset(data, tmp_path / name, per_shard=1)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, usual)
 
-    stored = explore.write_data_set(data, tmp_path / name, per_shard=1)
+    stored = explore.write_dataset(data, tmp_path / name, per_shard=1)
 
     for k in range(4):
         assert_same(stored[k], data[k])
@@ -867,9 +867,9 @@ def test_what_must_not_be_read_or_written_is_one_sentence():
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)  # that others may enter, as pytest's they may not
         folder.chmod(0o777)
-        data = explore.DataSet(pictures(2), SHOT)
+        data = explore.Dataset(pictures(2), SHOT)
         for kind in ("a", "a.zarr"):
-            explore.write_data_set(data, folder / kind, per_shard=1)
+            explore.write_dataset(data, folder / kind, per_shard=1)
         (folder / "a" / "shard-000001.tar").unlink()
         pytest.importorskip("zarr").open_group(str(folder / "a.zarr"), mode="r+")["done"][1] = 0
         (folder / "pictures" / "closed").mkdir(parents=True)
@@ -884,15 +884,15 @@ def test_what_must_not_be_read_or_written_is_one_sentence():
         try:
             os.seteuid(os.getuid() or 65534)
             for call, message in (
-                (lambda: explore.write_data_set(data, folder / "a"), "tar: cannot be written: Permission denied"),
-                (lambda: explore.write_data_set(data, folder / "a.zarr"), "zarr: cannot be written: Permission denied"),
+                (lambda: explore.write_dataset(data, folder / "a"), "tar: cannot be written: Permission denied"),
+                (lambda: explore.write_dataset(data, folder / "a.zarr"), "zarr: cannot be written: Permission denied"),
                 (
-                    lambda: explore.write_data_set(data, closed[0] / "a"),
+                    lambda: explore.write_dataset(data, closed[0] / "a"),
                     "closed/a: cannot be written: Permission denied",
                 ),
-                (lambda: explore.open_data_set(closed[0] / "a"), "closed/a: cannot be read: Permission denied"),
-                (lambda: explore.DataSet(folder / "pictures", SHOT), "closed: cannot be read: Permission denied"),
-                (lambda: explore.DataSet(closed[0] / "a", SHOT), "closed/a: cannot be read: Permission denied"),
+                (lambda: explore.open_dataset(closed[0] / "a"), "closed/a: cannot be read: Permission denied"),
+                (lambda: explore.Dataset(folder / "pictures", SHOT), "closed: cannot be read: Permission denied"),
+                (lambda: explore.Dataset(closed[0] / "a", SHOT), "closed/a: cannot be read: Permission denied"),
             ):
                 with pytest.raises(FileError, match=message) as caught:
                     call()
@@ -904,28 +904,28 @@ def test_what_must_not_be_read_or_written_is_one_sentence():
 
 
 def test_a_store_of_something_else_is_left_alone(tmp_path):
-    data = explore.DataSet(pictures(2), SHOT, VARY)
-    explore.write_data_set(data, tmp_path / "data", per_shard=1)
+    data = explore.Dataset(pictures(2), SHOT, VARY)
+    explore.write_dataset(data, tmp_path / "data", per_shard=1)
     (tmp_path / "other").mkdir()
     (tmp_path / "other.zarr").write_text("text")
     for other, path, message in (
-        (explore.DataSet(pictures(2), SHOT, VARY, seed=1), "data", "is another data set: its 'seed' differs"),
-        (explore.DataSet(pictures(3), SHOT, VARY), "data", "its 'pictures' differs"),
-        (data, "other", "holds something else than a data set"),
-        (data, "other.zarr", "holds something else than a data set"),
+        (explore.Dataset(pictures(2), SHOT, VARY, seed=1), "data", "is another dataset: its 'seed' differs"),
+        (explore.Dataset(pictures(3), SHOT, VARY), "data", "its 'pictures' differs"),
+        (data, "other", "holds something else than a dataset"),
+        (data, "other.zarr", "holds something else than a dataset"),
         (data, "data.hdf", "must end in .zarr, or have no ending"),
         (data, "missing/data", "cannot be written: the folder .*missing does not exist"),
         (data, "data/shard-000000.tar/x", "cannot be written: the folder .* does not exist"),
     ):
         with pytest.raises(FileError, match=message):
-            explore.write_data_set(other, tmp_path / path)
+            explore.write_dataset(other, tmp_path / path)
     with pytest.raises(FileError, match="its 'per_shard' differs"):
-        explore.write_data_set(data, tmp_path / "data", per_shard=2)
+        explore.write_dataset(data, tmp_path / "data", per_shard=2)
     (tmp_path / "data" / "shard-000001.tar").write_bytes(b"cut short")
     with pytest.raises(FileError, match="has a broken sample 1"):
-        explore.open_data_set(tmp_path / "data")[1]
+        explore.open_dataset(tmp_path / "data")[1]
     with pytest.raises(FileError, match="no such folder"):
-        explore.open_data_set(tmp_path / "nothing")
+        explore.open_dataset(tmp_path / "nothing")
 
 
 def zipped(path, each):
@@ -953,21 +953,21 @@ def files_of(path, each):
     return [path / f"{k}.png" for k in range(len(each))]
 
 
-#: How contents become a data set, by what holds them.
+#: How contents become a dataset, by what holds them.
 HOLDERS = {
-    "array": lambda _, each: explore.DataSet(each, SHOT),
-    "list": lambda _, each: explore.DataSet(list(each), SHOT),
-    "Pillow": lambda _, each: explore.DataSet([Image.fromarray(picture) for picture in each], SHOT),
-    "pairs": lambda _, each: explore.DataSet([(picture, 3) for picture in each], SHOT),
-    "made": lambda _, each: explore.DataSet(Made(each), SHOT),
-    "array file": lambda path, each: explore.DataSet(saved(path / "x.npy", each), SHOT),
-    "folder": lambda path, each: explore.DataSet(folder_of(path / "x", each), SHOT),
-    "files": lambda path, each: explore.DataSet(files_of(path / "x", each), SHOT),
-    "zip": lambda path, each: explore.DataSet(zipped(path / "x.zip", each), SHOT),
-    "masks": lambda _, each: explore.DataSet(pictures(4), SHOT, masks=each[..., 0]),
-    "mask files": lambda path, each: explore.DataSet(pictures(4), SHOT, masks=files_of(path / "x", each[..., 0])),
-    "made masks": lambda _, each: explore.DataSet(pictures(4), SHOT, masks=Made(each[..., 0])),
-    "flows": lambda _, each: explore.DataSet(pictures(4), SHOT, flows=list(each[..., :2])),
+    "array": lambda _, each: explore.Dataset(each, SHOT),
+    "list": lambda _, each: explore.Dataset(list(each), SHOT),
+    "Pillow": lambda _, each: explore.Dataset([Image.fromarray(picture) for picture in each], SHOT),
+    "pairs": lambda _, each: explore.Dataset([(picture, 3) for picture in each], SHOT),
+    "made": lambda _, each: explore.Dataset(Made(each), SHOT),
+    "array file": lambda path, each: explore.Dataset(saved(path / "x.npy", each), SHOT),
+    "folder": lambda path, each: explore.Dataset(folder_of(path / "x", each), SHOT),
+    "files": lambda path, each: explore.Dataset(files_of(path / "x", each), SHOT),
+    "zip": lambda path, each: explore.Dataset(zipped(path / "x.zip", each), SHOT),
+    "masks": lambda _, each: explore.Dataset(pictures(4), SHOT, masks=each[..., 0]),
+    "mask files": lambda path, each: explore.Dataset(pictures(4), SHOT, masks=files_of(path / "x", each[..., 0])),
+    "made masks": lambda _, each: explore.Dataset(pictures(4), SHOT, masks=Made(each[..., 0])),
+    "flows": lambda _, each: explore.Dataset(pictures(4), SHOT, flows=list(each[..., :2])),
 }
 
 
@@ -979,34 +979,34 @@ def test_samples_of_other_contents_are_never_taken_for_those_asked_for(holder, t
     changed = np.array(each)
     changed[3] ^= 1
     target = tmp_path / "data"
-    explore.write_data_set(make(each), target, per_shard=2)
+    explore.write_dataset(make(each), target, per_shard=2)
     before = (target / "shard-000001.tar").read_bytes()
     other = make(changed)
 
     with pytest.raises(FileError, match="is of other pictures, masks or flows: those of its samples 2 to 3 hold"):
-        explore.write_data_set(other, target)
+        explore.write_dataset(other, target)
     assert (target / "shard-000001.tar").read_bytes() == before
     (target / "shard-000001.tar").unlink()
-    stored = explore.write_data_set(other, target)
+    stored = explore.write_dataset(other, target)
 
     for k in range(4):
         assert_same(stored[k], other[k])
-    explore.write_data_set(other, target)
+    explore.write_dataset(other, target)
 
 
 def test_samples_of_other_contents_are_refused_in_zarr_too(tmp_path):
-    explore.write_data_set(explore.DataSet(list(pictures(4)), SHOT), tmp_path / "data.zarr", per_shard=2)
+    explore.write_dataset(explore.Dataset(list(pictures(4)), SHOT), tmp_path / "data.zarr", per_shard=2)
 
     with pytest.raises(FileError, match="those of its samples 0 to 1 hold something else now"):
-        explore.write_data_set(explore.DataSet(list(pictures(4, 1)), SHOT), tmp_path / "data.zarr")
+        explore.write_dataset(explore.Dataset(list(pictures(4, 1)), SHOT), tmp_path / "data.zarr")
 
 
 def test_a_shard_that_was_broken_is_written_anew(tmp_path):
-    data = explore.DataSet(pictures(2), SHOT)
-    explore.write_data_set(data, tmp_path / "data", per_shard=1)
+    data = explore.Dataset(pictures(2), SHOT)
+    explore.write_dataset(data, tmp_path / "data", per_shard=1)
     (tmp_path / "data" / "shard-000001.tar").write_bytes(b"cut short")
 
-    assert_same(explore.write_data_set(data, tmp_path / "data")[1], data[1])
+    assert_same(explore.write_dataset(data, tmp_path / "data")[1], data[1])
 
 
 class Litter(Made):
@@ -1019,7 +1019,7 @@ class Litter(Made):
 
 def test_what_python_tells_of_files_left_open_is_no_warning_of_a_sample():
     with pytest.warns(ResourceWarning):
-        data = explore.DataSet(Litter(pictures(3)), SHOT)
+        data = explore.Dataset(Litter(pictures(3)), SHOT)
 
     assert {sample["warning"] for sample in data} == {""}
 
@@ -1027,7 +1027,7 @@ def test_what_python_tells_of_files_left_open_is_no_warning_of_a_sample():
 def test_warnings_of_samples_are_told_once_and_kept(tmp_path):
     shot = SHOT | {"scene": SHOT["scene"] | {"pitch_um": 70.0}}
     with pytest.warns(FoveasimWarning, match="3 of the samples written have warnings, such as: sample 0: ") as caught:
-        stored = explore.write_data_set(explore.DataSet(pictures(3), shot), tmp_path / "data.zarr")
+        stored = explore.write_dataset(explore.Dataset(pictures(3), shot), tmp_path / "data.zarr")
 
     assert len(caught) == 1
     assert all("photosites lie" in sample["warning"] for sample in stored)
@@ -1087,7 +1087,7 @@ def test_warnings_of_samples_are_told_once_and_kept(tmp_path):
 )
 def test_a_bad_distribution_is_refused_before_the_first_sample(vary, error, message):
     with pytest.raises(error, match=message) as caught:
-        explore.DataSet(pictures(2), SHOT, vary)
+        explore.Dataset(pictures(2), SHOT, vary)
     assert "\n" not in str(caught.value)
 
 
@@ -1142,7 +1142,7 @@ def test_a_bad_distribution_is_refused_before_the_first_sample(vary, error, mess
 def test_what_does_not_fit_is_refused_in_one_sentence(options, error, message):
     arguments = {"pictures": pictures(2), "shot": SHOT} | options
     with pytest.raises(error, match=message) as caught:
-        explore.DataSet(**arguments)
+        explore.Dataset(**arguments)
     assert "\n" not in str(caught.value)
 
 
@@ -1163,7 +1163,7 @@ def test_folders_and_files_without_pictures_are_refused(tmp_path):
         ("broken.zip", r"broken.zip!a.png: is not a picture"),
     ):
         with pytest.raises(FileError, match=message):
-            explore.DataSet(tmp_path / name, SHOT)
+            explore.Dataset(tmp_path / name, SHOT)
 
 
 def test_labels_that_do_not_fit_a_picture_name_it():
@@ -1173,16 +1173,16 @@ def test_labels_that_do_not_fit_a_picture_name_it():
     }
     huge = [np.zeros((N_Y, N_X), int), np.full((N_Y, N_X), 2**64 - 1, np.uint64)]
     with pytest.raises(SimulationError, match=r"sample 1 .*mask of picture 1' must be whole numbers of 64 bits"):
-        explore.DataSet(pictures(2), SHOT, masks=huge)[1]
+        explore.Dataset(pictures(2), SHOT, masks=huge)[1]
     for name, (given, message) in bad.items():
-        data = explore.DataSet(pictures(2), SHOT, **{name: given})
+        data = explore.Dataset(pictures(2), SHOT, **{name: given})
         data[0]
         with pytest.raises(SimulationError, match=f"sample 1 .*{message}"):
             data[1]
 
 
 def test_samples_are_counted_as_of_a_sequence():
-    data = explore.DataSet(pictures(2), SHOT, cameras=2, draws=3)
+    data = explore.Dataset(pictures(2), SHOT, cameras=2, draws=3)
 
     assert len(data) == len(list(data)) == 12
     assert_same(data[-1], data[11])
@@ -1196,7 +1196,7 @@ def test_samples_are_counted_as_of_a_sequence():
 def test_settings_in_python_may_hold_numbers_of_numpy():
     shot = SHOT | {"exposure_s": np.float32(0.5), "sensor": {"bits": np.int64(9)}}
 
-    assert explore.DataSet(pictures(1), shot).settings_of(0)["sensor"]["bits"] == 9
+    assert explore.Dataset(pictures(1), shot).settings_of(0)["sensor"]["bits"] == 9
 
 
 # -- recipes ----------------------------------------------------------------------------------------------------------
@@ -1243,10 +1243,10 @@ def test_without_torch_one_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     _kind.cache_clear()
     with pytest.raises(ParameterError, match=r"needs torch; install it with: pip install 'foveasim\[learn\]'"):
-        explore.torch_data_set(labelled(1))
+        explore.torch_dataset(labelled(1))
 
 
-def test_torch_is_not_needed_and_not_loaded_for_a_data_set():
+def test_torch_is_not_needed_and_not_loaded_for_a_dataset():
     code = "import sys; from foveasim import explore; sys.exit('torch' in sys.modules or 'zarr' in sys.modules)"
 
     assert subprocess.run([sys.executable, "-c", code], env=os.environ, check=False).returncode == 0

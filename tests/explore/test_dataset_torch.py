@@ -18,15 +18,15 @@ pytestmark = pytest.mark.needs("torch")
 def test_torch_loader_gives_equal_samples_with_workers(tmp_path):
     import torch
 
-    data = explore.DataSet(pictures(50), SHOT, VARY, cameras=20, labels=[k % 7 for k in range(50)])
-    stored = explore.write_data_set(data, tmp_path / "data.zarr")
+    data = explore.Dataset(pictures(50), SHOT, VARY, cameras=20, labels=[k % 7 for k in range(50)])
+    stored = explore.write_dataset(data, tmp_path / "data.zarr")
     found = {
         n: list(torch.utils.data.DataLoader(samples, batch_size=40, num_workers=n, shuffle=False))
-        for n, samples in ((0, data), (2, explore.torch_data_set(data)))
+        for n, samples in ((0, data), (2, explore.torch_dataset(data)))
     }
     found["stored"] = list(torch.utils.data.DataLoader(stored, batch_size=40, num_workers=2))
 
-    assert isinstance(explore.torch_data_set(data), torch.utils.data.Dataset)
+    assert isinstance(explore.torch_dataset(data), torch.utils.data.Dataset)
     assert sum(len(batch["label"]) for batch in found[0]) == len(data) == 1000
     for other in (found[2], found["stored"]):
         for one, two in zip(found[0], other, strict=True):
@@ -40,8 +40,8 @@ def test_torch_loader_gives_equal_samples_with_workers(tmp_path):
 def test_deep_codes_become_signed_tensors():
     import torch
 
-    data = explore.DataSet(pictures(1), SHOT, changes={"sensor.bits": 12})
-    transformed = explore.torch_data_set(data, partial(operator.itemgetter("code")))
+    data = explore.Dataset(pictures(1), SHOT, changes={"sensor.bits": 12})
+    transformed = explore.torch_dataset(data, partial(operator.itemgetter("code")))
 
-    assert explore.torch_data_set(data)[0]["code"].dtype == torch.int32
+    assert explore.torch_dataset(data)[0]["code"].dtype == torch.int32
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(transformed))[0].numpy(), data[0]["code"])

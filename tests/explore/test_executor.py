@@ -61,10 +61,10 @@ def lines(path):
 @pytest.mark.parametrize("seed", range(N_ROUNDS))
 def test_no_item_is_lost_with_workers(seed, tmp_path):
     rng, log = random.Random(seed), tmp_path / "log"
-    is_over, n_kills, found = threading.Event(), [0], Future()
+    is_complete, n_kills, found = threading.Event(), [0], Future()
 
     def kill():
-        while not is_over.wait(rng.uniform(*KILL_S)):
+        while not is_complete.wait(rng.uniform(*KILL_S)):
             workers = {int(pid) for _, _, pid in lines(log)[-20:]}
             try:
                 os.kill(rng.choice(sorted(workers)), signal.SIGKILL)
@@ -84,7 +84,7 @@ def test_no_item_is_lost_with_workers(seed, tmp_path):
     try:
         results = found.result(LIMIT_S)
     finally:
-        is_over.set()
+        is_complete.set()
 
     assert sorted(item for item, _ in results) == list(range(N_ITEMS))
     assert all(result == item**2 for item, result in results)
@@ -199,11 +199,11 @@ def scheduler():
 
 @pytest.mark.parametrize("name", ["data", "data.zarr"])
 def test_datasets_are_equal_on_a_scheduler(scheduler, name, tmp_path):
-    data = explore.DataSet(np.arange(20 * 24 * 24, dtype=np.uint32).astype(np.uint8).reshape(20, 24, 24), SHOT)
+    data = explore.Dataset(np.arange(20 * 24 * 24, dtype=np.uint32).astype(np.uint8).reshape(20, 24, 24), SHOT)
     (tmp_path / "here").mkdir()
-    here = explore.write_data_set(data, tmp_path / "here" / name)
+    here = explore.write_dataset(data, tmp_path / "here" / name)
 
-    there = explore.write_data_set(data, tmp_path / name, scheduler=scheduler)
+    there = explore.write_dataset(data, tmp_path / name, scheduler=scheduler)
 
     assert here.about == there.about
     for k in range(len(data)):

@@ -631,7 +631,7 @@ def test_a_file_that_is_no_journal_is_left_alone(tmp_path, text):
     assert journal_of(tmp_path / "r.zarr").read_text() == text
 
 
-# -- what a data set holds --------------------------------------------------------------------------------------------
+# -- what a dataset holds --------------------------------------------------------------------------------------------
 
 
 def test_xarray_opens_a_store_without_a_word(tmp_path):

@@ -92,7 +92,7 @@ def test_a_lens_that_changes_nothing_changes_nothing():
         plain = fs.Integrator(layout, GRID)
         carried = fs.Integrator(layout, GRID, distortion=BrownConrady(focal_um=100.0))
         np.testing.assert_allclose(carried(field_means(GRID)), plain(field_means(GRID)), rtol=1e-12)
-        assert carried.lost_sites.size == 0
+        assert carried.sites_outside_image_circle.size == 0
 
 
 @pytest.mark.parametrize("conserve", ["flux", "density"])
@@ -132,9 +132,9 @@ def test_sites_that_get_no_light_receive_nothing_and_are_told():
     power = integrator(np.ones(grid.shape))
     corner_um = np.hypot(*np.abs(layout.xy_um.reshape(-1, 4, 2)).max(axis=1).T)
 
-    assert set(integrator.lost_sites) == set(np.flatnonzero(corner_um > 100.0))
-    assert np.all(power[integrator.lost_sites] == 0.0)
-    assert np.all(integrator.uncovered_um2[integrator.lost_sites] > 0.0)
+    assert set(integrator.sites_outside_image_circle) == set(np.flatnonzero(corner_um > 100.0))
+    assert np.all(power[integrator.sites_outside_image_circle] == 0.0)
+    assert np.all(integrator.uncovered_um2[integrator.sites_outside_image_circle] > 0.0)
     inner = np.flatnonzero(corner_um < 60.0)
     assert np.all(power[inner] > layout.area_um2[inner])
 

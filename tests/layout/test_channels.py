@@ -8,7 +8,7 @@ import shapely
 
 import foveasim as fs
 from foveasim.errors import ParameterError
-from foveasim.layout import MOSAICS, colouring, mosaic, nearest_bus, random_channels, readout_by, readout_order
+from foveasim.layout import MOSAICS, graph_colouring, mosaic, nearest_bus, random_channels, readout_by, readout_order
 
 GRID = fs.layout.grid(n_x=12, n_y=12, pitch_um=1.0)
 HEXAGONS = fs.layout.hexagonal(n_columns=20, n_rows=18, pitch_um=2.0)
@@ -53,7 +53,7 @@ def test_random_channels_come_in_exact_numbers(shares):
 
 @pytest.mark.parametrize(("layout", "n_channels"), [(GRID, 2), (HEXAGONS, 3), (RINGS, 4)])
 def test_no_two_neighbours_have_the_same_colour(layout, n_channels):
-    coloured = colouring(layout, n_channels)
+    coloured = graph_colouring(layout, n_channels)
     pairs = coloured.adjacency().tocoo()
     a, b = pairs.coords
 
@@ -64,7 +64,7 @@ def test_no_two_neighbours_have_the_same_colour(layout, n_channels):
 def test_separate_sites_are_coloured_in_turn():
     apart = fs.layout.grid(n_x=6, n_y=1, pitch_um=3.0, width_um=1.0)
 
-    assert np.bincount(colouring(apart, 3).channel).tolist() == [2, 2, 2]
+    assert np.bincount(graph_colouring(apart, 3).channel).tolist() == [2, 2, 2]
 
 
 def test_a_site_is_read_by_the_nearest_bus_and_in_order_along_it():
@@ -89,9 +89,9 @@ def test_readout_by_a_column_takes_its_numbers():
     ("call", "message"),
     [
         (lambda: mosaic(GRID, "bayer", names="RRGB"), "'names' must not name a filter twice"),
-        (lambda: random_channels(GRID, (0, 0), seed=0), "'shares' must not all be 0"),
-        (lambda: random_channels(GRID, (1, -1), seed=0), "'shares' must be >= 0"),
-        (lambda: colouring(GRID, 0), "'n_channels' must be >= 1"),
+        (lambda: random_channels(GRID, (0, 0), seed=0), "'fractions' must not all be 0"),
+        (lambda: random_channels(GRID, (1, -1), seed=0), "'fractions' must be >= 0"),
+        (lambda: graph_colouring(GRID, 0), "'n_channels' must be >= 1"),
         (lambda: nearest_bus(GRID, []), "'buses' must be one or more shapely geometries"),
         (lambda: readout_by(GRID, "spoke"), "'spoke' must be a column of the layout"),
     ],

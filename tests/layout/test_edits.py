@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import foveasim as fs
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.layout.edits import clip, inset, merge, node, punch, snap, split, union
+from foveasim.layout.edits import clip, cut_out, inset, merge, node, snap, split, union
 
 GRID = fs.layout.grid(n_x=10, n_y=8, pitch_um=2.0)
 RINGS = fs.layout.log_polar(n_sectors=24, r_min_um=4.0, r_max_um=33.0, stagger=True, chords_per_arc=2)
@@ -26,7 +26,7 @@ def overlap_um2(layout):
 @pytest.mark.parametrize("name", TILINGS)
 def test_what_is_clipped_and_what_is_punched_make_up_the_layout(name):
     layout = TILINGS[name]
-    inside, outside = clip(layout, DISC), punch(layout, DISC)
+    inside, outside = clip(layout, DISC), cut_out(layout, DISC)
 
     assert inside.area_um2.sum() + outside.area_um2.sum() == pytest.approx(layout.area_um2.sum(), rel=1e-12)
     assert inside.area_um2.sum() == pytest.approx(
@@ -41,12 +41,12 @@ def test_dropping_cut_sites_keeps_the_whole_ones_as_they_are():
 
     assert 0 < is_inside.sum() < GRID.n_sites
     assert np.array_equal(kept.xy_um, GRID[is_inside].xy_um)
-    assert punch(GRID, DISC, cut="drop").n_sites == shapely.disjoint(DISC, GRID.polygons()).sum()
+    assert cut_out(GRID, DISC, cut="drop").n_sites == shapely.disjoint(DISC, GRID.polygons()).sum()
 
 
 def test_pieces_of_a_cut_site_keep_its_columns():
     bar = fs.Layout.from_rectangles([[0.0, 0.0], [0.0, 10.0]], [[20.0, 2.0], [20.0, 2.0]], channel=[1, 2])
-    pieces = punch(bar, shapely.box(-1, -20, 1, 20))
+    pieces = cut_out(bar, shapely.box(-1, -20, 1, 20))
 
     assert pieces.n_sites == 4
     assert pieces.channel.tolist() == [1, 1, 2, 2]
@@ -184,7 +184,7 @@ def test_slivers_along_a_cut_join_their_neighbours_on_the_other_side():
     disc = shapely.Point(0.0, 0.0).buffer(50.0)
     hexagons = fs.layout.hexagonal(n_columns=40, n_rows=40, pitch_um=3.0)
     zones = fs.layout.zones(pitch_um=(2.0, 4.0, 8.0), side_um=(48.0, 144.0, 288.0))
-    both = fs.layout.union([fs.layout.clip(hexagons, disc), fs.layout.punch(zones, disc)])
+    both = fs.layout.union([fs.layout.clip(hexagons, disc), fs.layout.cut_out(zones, disc)])
 
     joined = fs.layout.merge_small(both, min_size_um=1.0)
 

@@ -231,7 +231,7 @@ def test_picture_rejects_sensors_of_other_layouts(options):
             capture.picture(max_pixels=8, sensor=fs.Sensor(other), **options)
 
 
-@pytest.mark.parametrize(("estimate", "name"), [("charge_readings", "charge_e"), ("code_readings", "code")])
+@pytest.mark.parametrize(("estimate", "name"), [("estimate_from_charge", "charge_e"), ("estimate_from_code", "code")])
 def test_values_of_another_number_of_sites_are_rejected(estimate, name):
     sensor = fs.Sensor(fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0))
 

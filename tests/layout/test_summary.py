@@ -15,7 +15,7 @@ from rich.console import Console
 
 import foveasim as fs
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.layout import Readout, Routing, crossings, describe, grid, log_polar, mosaic, zones
+from foveasim.layout import Readout, Routing, describe, grid, log_polar, mosaic, track_demand, zones
 
 ZONES = zones(side_um=(64, 128, 256, 512), pitch_um=(1, 2, 4, 8))
 
@@ -137,7 +137,7 @@ def test_the_published_data_rate():
 
 def test_all_spokes_cross_the_first_ring():
     layout = log_polar(n_sectors=120, r_min_um=20.0, r_max_um=90.0)
-    found = crossings(layout, Routing(width_um=0.14, space_um=0.14))
+    found = track_demand(layout, Routing(width_um=0.14, space_um=0.14))
     first_um = np.hypot(*layout.xy_um[: layout.ring_offsets[1]].T).max()
 
     assert found.n_nets.tolist() == [120]
@@ -157,7 +157,7 @@ def test_all_spokes_cross_the_first_ring():
 def test_lines_and_tracks_agree_with_counting_at_every_radius(n_sectors, fovea, pitch_um, n_layers):
     layout = log_polar(n_sectors=n_sectors, min_size_um=2.0, r_max_um=2.0 * n_sectors, fovea=fovea)
     routing = Routing(width_um=0.5 * pitch_um, space_um=0.5 * pitch_um, n_layers=n_layers)
-    found = crossings(layout, routing)
+    found = track_demand(layout, routing)
     ends = {}
     for polygon, line in zip(layout.polygons(), layout.readout_line.tolist(), strict=True):
         end_um = max(math.hypot(x, y) for x, y in polygon.exterior.coords)
@@ -171,14 +171,14 @@ def test_lines_and_tracks_agree_with_counting_at_every_radius(n_sectors, fovea, 
 
 def test_columns_run_upwards_through_the_width_of_the_layout():
     layout = grid(n_x=50, n_y=4, pitch_um=1.0)
-    found = crossings(layout, Routing(width_um=0.25, space_um=0.25, n_layers=2, direction="upwards"))
+    found = track_demand(layout, Routing(width_um=0.25, space_um=0.25, n_layers=2, direction="upwards"))
 
     assert (found.place_um.tolist(), found.n_nets.tolist(), found.n_tracks.tolist()) == ([-1.0], [50], [200])
 
 
 def test_routing_needs_lines():
     with pytest.raises(ParameterError, match="'readout_line' must be a column of the layout"):
-        crossings(fs.Layout.from_polygons([shapely.box(0, 0, 1, 1)]), Routing(width_um=1.0, space_um=1.0))
+        track_demand(fs.Layout.from_polygons([shapely.box(0, 0, 1, 1)]), Routing(width_um=1.0, space_um=1.0))
 
 
 @pytest.mark.parametrize(

@@ -100,9 +100,9 @@ def test_a_sine_too_fine_for_a_lattice_comes_back_whole_at_the_difference_freque
     found = aliasing_spectrum(SQUARES, wave)
     mtf = polygon_mtf(SQUARES[[0]], np.hypot(*wave), angle_deg=np.degrees(np.arctan2(wave[1], wave[0])))[0, 0]
 
-    assert found.true_fraction == pytest.approx(mtf, rel=1e-9)
-    assert found.false_fraction == pytest.approx(mtf, rel=1e-3)
-    assert found.false_per_mm == pytest.approx([170.0 - 250.0, 33.0], abs=0.05)
+    assert found.baseband_fraction == pytest.approx(mtf, rel=1e-9)
+    assert found.alias_fraction == pytest.approx(mtf, rel=1e-3)
+    assert found.alias_per_mm == pytest.approx([170.0 - 250.0, 33.0], abs=0.05)
     assert found.noise_fraction == pytest.approx(1.0, abs=0.01)
 
 
@@ -110,8 +110,8 @@ def test_a_sine_that_is_coarse_enough_has_no_alias():
     for layout in (SQUARES, HEXAGONS):
         found = aliasing_spectrum(layout, (70.0, 40.0))
 
-        assert found.true_fraction > 0.8
-        assert found.false_fraction < 0.007
+        assert found.baseband_fraction > 0.8
+        assert found.alias_fraction < 0.007
         assert found.noise_fraction < 1e-3
 
 
@@ -119,14 +119,14 @@ def test_hexagons_hold_a_sine_that_squares_alias():
     # 140 line pairs per mm: above 125 of squares, below 144 of hexagons; the squares' alias is at -110.
     squares, hexagons = (aliasing_spectrum(layout, (140.0, 0.0)) for layout in (SQUARES, HEXAGONS))
 
-    assert squares.false_fraction == pytest.approx(squares.true_fraction, rel=1e-3)
-    assert hexagons.false_fraction < 0.01
+    assert squares.alias_fraction == pytest.approx(squares.baseband_fraction, rel=1e-3)
+    assert hexagons.alias_fraction < 0.01
 
 
 def test_blue_noise_turns_an_alias_into_noise():
     lattice, blue = (aliasing_spectrum(layout, (170.0, 33.0)) for layout in (SQUARES, BLUE))
 
-    assert blue.false_fraction < 0.35 * lattice.false_fraction
+    assert blue.alias_fraction < 0.35 * lattice.alias_fraction
     assert 0.3 < blue.noise_fraction < 0.9
 
 
@@ -134,8 +134,8 @@ def test_turning_layout_and_wave_together_changes_nothing():
     found = aliasing_spectrum(HEXAGONS, (215.0, 30.0), centre_um=(0.0, 0.0), radius_um=100.0)
     turned = aliasing_spectrum(HEXAGONS.rotate(90.0), (-30.0, 215.0), centre_um=(0.0, 0.0), radius_um=100.0)
 
-    assert found.false_fraction == pytest.approx(found.true_fraction, rel=1e-3)
-    assert turned.false_fraction == pytest.approx(found.false_fraction, rel=1e-6)
+    assert found.alias_fraction == pytest.approx(found.baseband_fraction, rel=1e-3)
+    assert turned.alias_fraction == pytest.approx(found.alias_fraction, rel=1e-6)
     assert turned.noise_fraction == pytest.approx(found.noise_fraction, rel=1e-6)
 
 

@@ -10,8 +10,8 @@ import foveasim as fs
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.metrics import (
     neighbour_spacing_um,
-    nyquist_against_eccentricity,
     nyquist_per_mm,
+    nyquist_vs_eccentricity,
     polygon_mtf,
     polygon_otf,
     slanted_edge_mtf,
@@ -467,7 +467,7 @@ def test_sites_at_one_place_have_no_nyquist_frequency():
     [
         nyquist_per_mm,
         neighbour_spacing_um,
-        nyquist_against_eccentricity,
+        nyquist_vs_eccentricity,
         lambda layout: nyquist_per_mm(layout, by="area"),
         lambda layout: polygon_mtf(layout, [100.0]),
         lambda layout: slanted_edge_mtf(layout, [1.0]),
@@ -490,7 +490,7 @@ def test_a_row_and_a_lone_site_have_no_nyquist_frequency_but_an_area():
 
 def test_log_polar_sampling_falls_as_the_inverse_of_eccentricity():
     layout = fs.layout.log_polar(n_sectors=200, min_size_um=2.0, r_max_um=400.0)
-    table = nyquist_against_eccentricity(layout, n_bins=10)
+    table = nyquist_vs_eccentricity(layout, n_bins=10)
     middle_um = 0.5 * (table.edges_um[1:] + table.edges_um[:-1])
 
     assert table.n_sites.sum() == layout.n_sites
@@ -506,8 +506,8 @@ def test_log_polar_sampling_falls_as_the_inverse_of_eccentricity():
 
 
 def test_a_uniform_sensor_does_not_fall_and_a_retina_has_its_e2():
-    even = nyquist_against_eccentricity(SQUARES, n_bins=5)
-    retina = nyquist_against_eccentricity(fs.layout.fovi(fov_um=400.0, a_um=20.0, n_rings=50), by="area")
+    even = nyquist_vs_eccentricity(SQUARES, n_bins=5)
+    retina = nyquist_vs_eccentricity(fs.layout.fovi(fov_um=400.0, a_um=20.0, n_rings=50), by="area")
 
     assert even.nyquist_per_mm == pytest.approx(np.full(5, 125.0))
     assert (even.e2_um, even.growth_fraction) == (np.inf, 0.0)

@@ -12,8 +12,14 @@ import foveasim as fs
 from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError
 from foveasim.explore import METRICS
-from foveasim.metrics import SnrTable, light_at_snr_fraction, measured_snr_by_class, size_classes_um, snr_by_class
-from foveasim.sensor import linearised, signal_to_noise
+from foveasim.metrics import (
+    SnrTable,
+    measured_snr_by_class,
+    relative_exposure_at_snr_fraction,
+    size_classes_um,
+    snr_by_class,
+)
+from foveasim.sensor import linearise, signal_to_noise
 from foveasim.units import volts_to_electrons
 from foveasim.view import plot_capture
 from foveasim.view.web._content import content_of
@@ -66,7 +72,7 @@ def test_draws_give_what_was_predicted():
 
 def test_the_least_light_has_a_closed_form_above_a_pedestal():
     shown = camera()
-    share = light_at_snr_fraction(shown, flat(), exposure_s=EXPOSURE_S, snr=3.0)
+    share = relative_exposure_at_snr_fraction(shown, flat(), exposure_s=EXPOSURE_S, snr=3.0)
     light_e = shown.photoelectrons_per_s(flat()) * EXPOSURE_S
     noise_e2 = 25.0 + volts_to_electrons(1.0 / 4096, 1.5e-15) ** 2 / 12.0
     needed_e = 0.5 * (9.0 + np.sqrt(81.0 + 36.0 * noise_e2))
@@ -78,7 +84,7 @@ def test_the_least_light_has_a_closed_form_above_a_pedestal():
 def test_the_least_light_counts_the_clip_at_darkness():
     for options in ({"pedestal_v": 0.0}, {"pedestal_v": 0.0, "dark_e_per_s": 500.0}):
         shown = camera(**options)
-        share = light_at_snr_fraction(shown, flat(), exposure_s=EXPOSURE_S)
+        share = relative_exposure_at_snr_fraction(shown, flat(), exposure_s=EXPOSURE_S)
         for k, part in enumerate(share):
             table = snr_by_class(shown, flat(0.02 * part), exposure_s=EXPOSURE_S)
             assert table.snr[k] == pytest.approx(1.0, rel=1e-4)
@@ -90,7 +96,7 @@ def test_large_sites_saturate_first_and_a_ratio_beyond_the_well_is_never_reached
 
     assert table.saturated_fraction.tolist() == [0.0, 0.0, 1.0]
     assert "100 %" in str(table).splitlines()[3]
-    dim = light_at_snr_fraction(shown, flat(), exposure_s=EXPOSURE_S, snr=30.0)
+    dim = relative_exposure_at_snr_fraction(shown, flat(), exposure_s=EXPOSURE_S, snr=30.0)
     assert np.all(np.diff(dim) < 0.0)
 
 
@@ -171,7 +177,7 @@ def test_the_least_light_is_found_where_rings_of_a_class_saturate(bits):
 
     found_some = False
     for snr in (50.0, 80.0, 88.0, 92.0):
-        found = light_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S, snr=snr, classes=labels)
+        found = relative_exposure_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S, snr=snr, classes=labels)
         for k, label in enumerate(np.unique(labels)):
             of = labels == label
             # By looking at all fractions: the first that does. Half of the sites within 200 e- of the well do not count.
@@ -188,17 +194,17 @@ def test_the_least_light_is_found_where_rings_of_a_class_saturate(bits):
 def test_a_ratio_beyond_the_well_is_never_reached():
     shown, light = lit(2000.0, fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0), full_well_e=1e4)
 
-    assert np.isfinite(light_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S, snr=98.0)).all()
+    assert np.isfinite(relative_exposure_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S, snr=98.0)).all()
     for snr in (103.0, 150.0, 1e4, 1e9):
-        assert np.isnan(light_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S, snr=snr)).all()
+        assert np.isnan(relative_exposure_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S, snr=snr)).all()
     nothing = fs.PowerMap(0.0 * light.data, light.grid, light.wavelength_nm)
-    assert np.isnan(light_at_snr_fraction(shown, nothing, exposure_s=EXPOSURE_S)).all()
+    assert np.isnan(relative_exposure_at_snr_fraction(shown, nothing, exposure_s=EXPOSURE_S)).all()
 
 
 def test_without_noise_quantisation_sets_threshold():
     shown, light = lit(2000.0, read_noise_e=0.0, shot_noise="off")
 
-    found = light_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S)
+    found = relative_exposure_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S)
 
     # Rounding to codes, and of charges to integers.
     step_e = volts_to_electrons(1.0 / 4096, 2e-15)
@@ -293,7 +299,7 @@ def test_noise_matches_squared_error_of_codes(companding, charge_e, dnl_dn, sigm
         pixel_fpn_fraction=2.0 * step_e / full_e,
     )
     code = sensor.read(np.full(n, charge_e), streams=Streams(5))
-    found_e = (linearised(code, sensor) + 0.5) * full_e / 256.0 - sensor.pattern("pixel_fpn") * full_e
+    found_e = (linearise(code, sensor) + 0.5) * full_e / 256.0 - sensor.pattern("pixel_fpn") * full_e
 
     told = signal_to_noise(sensor, np.full(n, float(charge_e)), np.zeros(n))
 
@@ -392,8 +398,8 @@ def test_bad_input_is_told():
     with pytest.raises(ParameterError, match=r"'camera' must be a foveasim\.Camera, got a NoneType"):
         snr_by_class(None, None, exposure_s=1.0)
     with pytest.raises(ParameterError, match=r"'camera' must be a foveasim\.Camera, got a Sensor"):
-        light_at_snr_fraction(camera().sensor, flat(), exposure_s=1.0)
+        relative_exposure_at_snr_fraction(camera().sensor, flat(), exposure_s=1.0)
     with pytest.raises(ParameterError, match=r"'layout' must be a foveasim\.Layout, got a NoneType"):
         measured_snr_by_class(None, frames, frames, bits=12)
     with pytest.raises(ParameterError, match="'snr' must be > 0"):
-        light_at_snr_fraction(camera(), flat(), exposure_s=EXPOSURE_S, snr=0.0)
+        relative_exposure_at_snr_fraction(camera(), flat(), exposure_s=EXPOSURE_S, snr=0.0)

@@ -263,7 +263,7 @@ def test_batches_of_any_size_give_the_same_events(batch, changes, light):
     whole = pixels.events(rates, frame_s=frame_s, seed=4)
 
     assert len(whole) > 500
-    assert same(Events.joined(pixels.stream(rates, frame_s=frame_s, seed=4, batch=batch)), whole)
+    assert same(Events.concatenate(pixels.stream(rates, frame_s=frame_s, seed=4, batch=batch)), whole)
 
 
 def test_events_of_a_frame_are_of_the_batch_that_it_ends():
@@ -282,7 +282,7 @@ def test_spikes_at_the_borders_of_frames_are_in_the_same_order_in_all_batches(ba
     whole = pixels.events(rates, frame_s=0.1, seed=4)
 
     assert len(whole) >= 3 * 40 * 40
-    assert same(Events.joined(pixels.stream(rates, frame_s=0.1, seed=4, batch=batch)), whole)
+    assert same(Events.concatenate(pixels.stream(rates, frame_s=0.1, seed=4, batch=batch)), whole)
 
 
 def test_events_of_the_same_time_are_in_the_order_of_their_sites():
@@ -391,7 +391,7 @@ def test_batches_of_any_size_give_the_same_spikes(batch):
     whole = pixels.events(rates, frame_s=0.01, seed=4)
 
     assert len(whole) > 1000
-    assert same(Events.joined(pixels.stream(rates, frame_s=0.01, seed=4, batch=batch)), whole)
+    assert same(Events.concatenate(pixels.stream(rates, frame_s=0.01, seed=4, batch=batch)), whole)
 
 
 def test_each_site_may_have_its_own_threshold():
@@ -638,7 +638,7 @@ def test_hdf5_has_no_table_of_a_clock_that_began_long_ago(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("join", [Events.joined, lambda parts: write_events(parts, "nowhere/e.h5")])
+@pytest.mark.parametrize("join", [Events.concatenate, lambda parts: write_events(parts, "nowhere/e.h5")])
 def test_batches_of_several_layouts_or_no_batches_are_told(join, tmp_path, monkeypatch):
     pytest.importorskip("h5py")
     monkeypatch.chdir(tmp_path)
@@ -836,7 +836,7 @@ def test_parts_in_time_are_whole_and_disjoint():
     events = some_events()
     parts = [events.between(a, b) for a, b in itertools.pairwise([-1.0, 0.05, 0.1, 9.0])]
 
-    assert same(Events.joined(parts), events)
+    assert same(Events.concatenate(parts), events)
     assert np.array_equal(events.counts(polarity=1) + events.counts(polarity=-1), events.counts())
 
 

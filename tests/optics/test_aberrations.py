@@ -94,7 +94,7 @@ def test_polynomials_have_the_forms_of_the_table(n, m, form):
 
 def test_coefficients_are_the_same_in_either_order_and_unit():
     psfs = [
-        aberrated(**c).psf(WAVELENGTH_NM).share_per_um2
+        aberrated(**c).psf(WAVELENGTH_NM).psf_per_um2
         for c in (
             {"coefficients": {7: 0.11, 11: -0.055}},
             {"coefficients": {7: 0.11, 12: -0.055}, "index": "osa"},
@@ -150,7 +150,7 @@ def test_the_middle_of_a_defocused_pattern_is_a_squared_sinc(waves):
     optics = aberrated(coefficients={4: waves / math.sqrt(12)}, unit="waves")
 
     assert optics.strehl(WAVELENGTH_NM) == pytest.approx(np.sinc(waves) ** 2, abs=3e-4)
-    middle = optics.psf(WAVELENGTH_NM, n_points=3).share_per_um2[1, 1]
+    middle = optics.psf(WAVELENGTH_NM, n_points=3).psf_per_um2[1, 1]
     assert middle * LAMBDA_N_UM**2 * 4 / np.pi == pytest.approx(np.sinc(waves) ** 2, abs=3e-4)
 
 
@@ -206,7 +206,7 @@ def test_strehl_follows_the_rms_wavefront_error(j, sigma_waves):
 def test_tilt_and_piston_are_no_aberration_of_the_pattern_s_height():
     tilted = aberrated(coefficients={1: 0.4, 2: 0.3}, unit="waves").psf(WAVELENGTH_NM, n_points=401)
 
-    assert tilted.share_per_um2.max() == pytest.approx(np.pi / 4 / LAMBDA_N_UM**2, rel=1e-2)
+    assert tilted.psf_per_um2.max() == pytest.approx(np.pi / 4 / LAMBDA_N_UM**2, rel=1e-2)
 
 
 # -- orientation ------------------------------------------------------------------------------------------------------------
@@ -230,7 +230,7 @@ def test_positive_tilt_and_coma_move_light_to_positive_coordinates(j, axis, sign
 
 def test_coma_throws_its_flare_up_and_leaves_the_brightest_place_below():
     psf = aberrated(coefficients={7: 0.25}, unit="waves").psf(WAVELENGTH_NM)
-    share = psf.share_per_um2 * psf.grid.cell_area_um2
+    share = psf.psf_per_um2 * psf.grid.cell_area_um2
     brightest = np.unravel_index(share.argmax(), share.shape)
     mean_y_um = (share * psf.grid.y_um[:, np.newaxis]).sum() / share.sum()
 
@@ -260,14 +260,14 @@ def test_coma_of_the_field_points_away_from_the_axis():
     coma = lens(seidel=Seidel(coma_um=0.5, field_radius_um=1000.0), padding="reflect")
     for field_um in ((1000.0, 0.0), (0.0, 1000.0), (-700.0, -700.0)):
         psf = coma.psf(WAVELENGTH_NM, field_um=field_um)
-        share = psf.share_per_um2 * psf.grid.cell_area_um2
+        share = psf.psf_per_um2 * psf.grid.cell_area_um2
         moved = np.array([(share * psf.grid.x_um).sum(), (share * psf.grid.y_um[:, np.newaxis]).sum()])
 
         assert moved @ np.array(field_um) > 0.9 * np.hypot(*moved) * np.hypot(*field_um)
     assert coma.strehl(WAVELENGTH_NM) == pytest.approx(1.0, abs=1e-6)
     # Coma of 0.15 µm at the rim is 0.15 r³ cos t: its rms less the best tilt is 0.15 / (3 sqrt(8)) µm.
     weak = lens(seidel=Seidel(coma_um=0.15, field_radius_um=1000.0), padding="reflect")
-    height = weak.psf(WAVELENGTH_NM, field_um=(1000.0, 0.0)).share_per_um2.max() * LAMBDA_N_UM**2 * 4 / np.pi
+    height = weak.psf(WAVELENGTH_NM, field_um=(1000.0, 0.0)).psf_per_um2.max() * LAMBDA_N_UM**2 * 4 / np.pi
     assert height == pytest.approx(math.exp(-((2 * np.pi * 0.15 / 0.55 / (3 * math.sqrt(8))) ** 2)), abs=6e-3)
 
 
@@ -355,7 +355,7 @@ def test_the_patchwork_keeps_the_light_and_its_error_falls_as_told():
         maps.append(map_of(optics, image, pitch_um=46.4).data[0])
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", SamplingWarning)
-            errors.append(optics.patchwork_error(scene_of(image, pitch_um=46.4)) if n_patches < 11 else 0.0)
+            errors.append(optics.isoplanatic_error(scene_of(image, pitch_um=46.4)) if n_patches < 11 else 0.0)
     truth = maps[-1]
     astray = [0.5 * np.abs(m - truth).sum() / truth.sum() for m in maps]
 
@@ -369,7 +369,7 @@ def test_the_patchwork_keeps_the_light_and_its_error_falls_as_told():
 
 
 def test_the_same_pattern_everywhere_has_no_patchwork_error():
-    assert aberrated(coefficients={7: 0.1}).patchwork_error(scene_of(np.ones((50, 50)))) == 0.0
+    assert aberrated(coefficients={7: 0.1}).isoplanatic_error(scene_of(np.ones((50, 50)))) == 0.0
 
 
 # -- lateral colour -----------------------------------------------------------------------------------------------------

@@ -127,7 +127,7 @@ def test_a_picture_file_of_a_pupil_is_read(tmp_path):
 def test_a_measured_wavefront_moves_light_to_where_it_grows():
     y = np.linspace(1.0, -1.0, 65)[:, np.newaxis] * np.ones(65)
     psf = lens(pupil=PupilImage(np.ones((2, 2)), wavefront_um=0.3 * y)).psf(WAVELENGTH_NM)
-    top = np.unravel_index(psf.share_per_um2.argmax(), psf.share_per_um2.shape)
+    top = np.unravel_index(psf.psf_per_um2.argmax(), psf.psf_per_um2.shape)
 
     # A path difference of w µm for each radius turns the wave by w/a: w 2N µm on the sensor (edges of its pixels aside).
     assert psf.grid.y_um[top[0]] == pytest.approx(0.3 * 8.0 * 65 / 64, abs=psf.grid.pitch_um)
@@ -205,14 +205,14 @@ def test_an_annulus_has_the_difference_of_two_airy_amplitudes(obscuration):
 
     expected = np.pi / 4 * amplitude**2 / (1 - e * e) / LAMBDA_N_UM**2
 
-    assert psf.share_per_um2 == pytest.approx(expected, abs=2e-4 * expected.max())
+    assert psf.psf_per_um2 == pytest.approx(expected, abs=2e-4 * expected.max())
 
 
 def test_a_circle_has_the_airy_pattern_by_either_way():
     closed, sampled = (lens(pupil=p).psf(WAVELENGTH_NM, n_points=129) for p in (None, clear))
 
-    assert closed.share_per_um2[64, 64] == pytest.approx(np.pi / 4 / LAMBDA_N_UM**2, rel=1e-9)
-    assert sampled.share_per_um2 == pytest.approx(closed.share_per_um2, abs=1e-4 * closed.share_per_um2.max())
+    assert closed.psf_per_um2[64, 64] == pytest.approx(np.pi / 4 / LAMBDA_N_UM**2, rel=1e-9)
+    assert sampled.psf_per_um2 == pytest.approx(closed.psf_per_um2, abs=1e-4 * closed.psf_per_um2.max())
 
 
 def test_a_hexagonal_iris_makes_a_star_of_six_rays_and_three_vanes_too():
@@ -223,7 +223,7 @@ def test_a_hexagonal_iris_makes_a_star_of_six_rays_and_three_vanes_too():
         radius, angle = np.hypot(x_um, y_um) / LAMBDA_N_UM, np.degrees(np.arctan2(y_um, x_um))
         is_far = (radius > 25) & (radius < 90)
         off_ray = np.abs((angle - first_deg + 30.0) % 60.0 - 30.0)
-        on, off = (psf.share_per_um2[is_far & there].mean() for there in (off_ray < 2.0, off_ray > 10.0))
+        on, off = (psf.psf_per_um2[is_far & there].mean() for there in (off_ray < 2.0, off_ray > 10.0))
 
         assert on > 5 * off
 
@@ -248,7 +248,7 @@ def test_light_in_squares_is_the_integral_of_the_pattern():
 
     got = optics.ensquared_energy(4.0 * LAMBDA_N_UM, WAVELENGTH_NM)
 
-    assert got == pytest.approx(psf.share_per_um2.sum() * psf.grid.cell_area_um2, abs=1e-4)
+    assert got == pytest.approx(psf.psf_per_um2.sum() * psf.grid.cell_area_um2, abs=1e-4)
 
 
 def test_the_image_of_a_near_point_is_wider_by_the_bellows_factor():
@@ -279,7 +279,7 @@ def test_a_map_of_a_point_is_its_pattern():
     share = power_map.data[0] / power_map.data.sum()
 
     # Means over cells of λN/12 against values in their middles; the map is periodic and has all the light.
-    assert share == pytest.approx(psf.share_per_um2 * psf.grid.cell_area_um2, abs=6e-3 * share.max())
+    assert share == pytest.approx(psf.psf_per_um2 * psf.grid.cell_area_um2, abs=6e-3 * share.max())
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("single", 1e-5), ("double", 1e-9)])
@@ -501,7 +501,7 @@ def test_the_tables_of_a_scene_serve_the_next_frame(monkeypatch):
     [
         ("power_map", ("x.png",), "'scene' must be a Scene, got a str"),
         ("grid", (None,), "'scene' must be a Scene, got a NoneType"),
-        ("patchwork_error", (np.ones((3, 3)),), "'scene' must be a Scene, got a ndarray"),
+        ("isoplanatic_error", (np.ones((3, 3)),), "'scene' must be a Scene, got a ndarray"),
         ("weighted_maps", ("scene", np.ones((2, 2))), r"'weights' must have the shape \(n_output, 1\)"),
         ("weighted_maps", ("scene", [1.0]), "'weights' must have 2 dimensions"),
         ("mtf", (np.ones(2), np.ones(3)), "'wavelength_nm' must be one number"),

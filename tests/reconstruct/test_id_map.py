@@ -124,7 +124,7 @@ def test_of_sites_over_each_other_the_one_with_the_highest_index_is_seen():
 def test_the_number_of_threads_cannot_be_seen():
     layout = L.log_polar(n_sectors=60, min_size_um=1.0, r_max_um=40.0, stagger=True)
     one = id_map(layout, (333, 257), n_threads=1)
-    pixels = SitePixels.of(layout, (111, 120), n_threads=1)
+    pixels = SitePixels.from_layout(layout, (111, 120), n_threads=1)
     rgb = fs.view.site_colours(layout, "area_um2")
 
     assert all(np.array_equal(id_map(layout, (333, 257), n_threads=n), one) for n in (2, 3, 7))
@@ -142,7 +142,7 @@ def test_a_window_shows_its_part_of_the_whole():
 
 def test_a_point_has_the_site_of_the_pixel_around_it():
     layout = L.penrose(side_um=2.0, size_um=14.0)
-    pixels = SitePixels.of(layout, (40, 50), (-8.0, -6.0, 8.0, 6.0), n_samples=3)
+    pixels = SitePixels.from_layout(layout, (40, 50), (-8.0, -6.0, 8.0, 6.0), n_samples=3)
     y, x = np.meshgrid(-6.0 + (np.arange(120) + 0.5) * 0.1, -8.0 + (np.arange(150) + 0.5) * (16 / 150), indexing="ij")
     found = pixels.site_at(x, y)
 
@@ -156,8 +156,8 @@ def test_a_point_has_the_site_of_the_pixel_around_it():
 def test_a_pixel_is_the_mean_of_its_samples():
     layout = L.voronoi(n_sites=50, size_um=(10.0, 10.0))
     rgb = np.random.default_rng(0).integers(0, 256, (50, 3), dtype=np.uint8)
-    one = SitePixels.of(layout, (30, 40), (-6, -6, 6, 6), n_samples=1)
-    three = SitePixels.of(layout, (30, 40), (-6, -6, 6, 6), n_samples=3)
+    one = SitePixels.from_layout(layout, (30, 40), (-6, -6, 6, 6), n_samples=1)
+    three = SitePixels.from_layout(layout, (30, 40), (-6, -6, 6, 6), n_samples=3)
     table = np.concatenate((rgb, [[10, 20, 30]]))  # -1 is the last
     samples = table[three.ids].reshape(30, 3, 40, 3, 3).mean(axis=(1, 3))
 
@@ -177,7 +177,7 @@ def test_a_pixel_is_the_mean_of_its_samples():
 
 
 def test_a_border_is_drawn_where_one_site_ends_and_another_begins():
-    pixels = SitePixels.of(L.grid(n_x=2, n_y=2, pitch_um=2.0), (6, 6), (-3, -3, 3, 3), n_samples=1)
+    pixels = SitePixels.from_layout(L.grid(n_x=2, n_y=2, pitch_um=2.0), (6, 6), (-3, -3, 3, 3), n_samples=1)
     drawn = np.all(pixels.picture(np.full((4, 3), 200, np.uint8), border=(1, 2, 3)) == (1, 2, 3), axis=-1)
 
     # Sites from pixel 1 to 2 and 3 to 4: borders at the first pixel of each, and at the first beyond.
@@ -197,9 +197,12 @@ def test_a_border_is_drawn_where_one_site_ends_and_another_begins():
         (lambda g: id_map(g, (4, 4), (0, 0, 0, 1)), "'bounds_um' must be"),
         (lambda g: id_map(g, (4, 4), (0, 0, np.nan, 1)), "'bounds_um' must be finite"),
         (lambda g: id_map(g[:0], (4, 4)), "'layout' must have sites"),
-        (lambda g: SitePixels.of(g, (4, 4), n_samples=0), "'n_samples' must be >= 1"),
-        (lambda g: SitePixels.of(g, (4, 4)).picture(np.zeros((3, 3), np.uint8)), r"'rgb' must be bytes .* n_site > 3"),
-        (lambda g: SitePixels.of(g, (4, 4)).picture(np.zeros((4, 3))), "'rgb' must be bytes"),
+        (lambda g: SitePixels.from_layout(g, (4, 4), n_samples=0), "'n_samples' must be >= 1"),
+        (
+            lambda g: SitePixels.from_layout(g, (4, 4)).picture(np.zeros((3, 3), np.uint8)),
+            r"'rgb' must be bytes .* n_site > 3",
+        ),
+        (lambda g: SitePixels.from_layout(g, (4, 4)).picture(np.zeros((4, 3))), "'rgb' must be bytes"),
     ],
 )
 def test_what_is_no_picture_is_refused(call, message):
@@ -210,4 +213,6 @@ def test_what_is_no_picture_is_refused(call, message):
 def test_a_layout_without_sites_covers_nothing():
     empty = L.grid(n_x=1, n_y=1, pitch_um=1.0)[:0]
 
-    assert np.all(SitePixels.of(empty, (3, 3), (0, 0, 1, 1)).picture(np.zeros((0, 3), np.uint8)) == [185, 196, 214])
+    assert np.all(
+        SitePixels.from_layout(empty, (3, 3), (0, 0, 1, 1)).picture(np.zeros((0, 3), np.uint8)) == [185, 196, 214]
+    )

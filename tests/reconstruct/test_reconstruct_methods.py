@@ -21,8 +21,8 @@ from foveasim.reconstruct import (
     Picture,
     blur_kernel,
     cells,
-    charge_readings,
-    code_readings,
+    estimate_from_charge,
+    estimate_from_code,
     fill_channels,
     least_squares,
     linear,
@@ -534,20 +534,20 @@ def test_codes_tell_the_light_that_made_them(parameters):
     light_e = np.linspace(200.0, 6000.0, layout.n_sites)
     streams = fs._core.random_streams.Streams(1, 0)
     code = sensor.read(sensor.collect(light_e + 100.0, streams=streams), streams=streams)
-    readings = code_readings(code, sensor, 0.01)
+    readings = estimate_from_code(code, sensor, 0.01)
     z = (readings.light_e - light_e) / np.sqrt(readings.variance_e2)
 
     assert abs(z.mean()) < 5.0 / math.sqrt(z.size)
     assert z.std() == pytest.approx(1.0, abs=5.0 / math.sqrt(2.0 * z.size))
-    assert not readings.is_full.any()
+    assert not readings.is_saturated.any()
 
 
 def test_full_sites_are_told():
     sensor = fs.Sensor(SQUARES, full_well_e=1000.0, bits=8, capacitance_f=1e-15, v_sat_v=0.1)
     charge = np.where(np.arange(SQUARES.n_sites) < 10, 1000.0, 500.0)
 
-    assert np.flatnonzero(charge_readings(charge, sensor, 0.01).is_full).tolist() == list(range(10))
-    assert code_readings(np.array([255] + [9] * (SQUARES.n_sites - 1)), sensor, 0.01).is_full.sum() == 1
+    assert np.flatnonzero(estimate_from_charge(charge, sensor, 0.01).is_saturated).tolist() == list(range(10))
+    assert estimate_from_code(np.array([255] + [9] * (SQUARES.n_sites - 1)), sensor, 0.01).is_saturated.sum() == 1
 
 
 def test_saturated_sites_are_left_out_of_least_squares():

@@ -12,7 +12,7 @@ import foveasim as fs
 from foveasim._core.random_streams import Streams
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
-from foveasim.sensor import Calibration, Coupling, Diffusion, Sensor, calibrate, linearised
+from foveasim.sensor import Calibration, Diffusion, InterPixelCapacitance, Sensor, calibrate, linearise
 
 SIGMAS = 5.0
 N_X, N_Y = 200, 100
@@ -49,7 +49,7 @@ def response_of(sensor, expected_e=1.0):
 def test_linear_codes_are_themselves(bits):
     codes = np.arange(2**bits)
 
-    assert linearised(codes, Sensor(MANY[:1], bits=bits)) == pytest.approx(codes, abs=1e-9)
+    assert linearise(codes, Sensor(MANY[:1], bits=bits)) == pytest.approx(codes, abs=1e-9)
 
 
 TABLE = [0.0, 0.5, 0.8, 0.8, 1.0]
@@ -75,7 +75,7 @@ def test_linear_codes_are_the_middle_of_the_voltages_that_give_a_code(parameters
     code = np.concatenate([sensor.read(part, streams=Streams(0)) for part in charge.reshape(-1, 1000)])
     middle_dn = np.array([charge[code == k][[0, -1]].mean() if (code == k).any() else np.nan for k in range(256)])
 
-    off = linearised(np.arange(256), sensor) - (middle_dn * 256 / n_charges - 0.5)
+    off = linearise(np.arange(256), sensor) - (middle_dn * 256 / n_charges - 0.5)
 
     assert np.isfinite(off).sum() >= 250
     assert np.nanmax(np.abs(off)) < 3 * 256 / n_charges
@@ -113,7 +113,7 @@ def test_what_is_left_of_the_fixed_pattern_falls_with_the_root_of_the_frames(n_f
 
     for share in (0.0, 0.5, 1.0, 1.5):
         mean_dn, _ = sensor.predict(sensor.expected_electrons(np.full(N, 7e4 * share), 0.1))
-        corrected_dn = calibration.corrected(mean_dn)
+        corrected_dn = calibration.correct(mean_dn)
 
         left_dn2 = ((1 - share) ** 2 * dark_dn2 + share**2 * flat_dn2) / n_frames
         # Five standard errors, and the spread of gains of a few percent in the propagated error.
@@ -134,7 +134,7 @@ def test_the_dark_rate_carries_offsets_to_other_exposures():
     assert off.mean() == pytest.approx(0.0, abs=SIGMAS / math.sqrt(N))
     mean_dn, _ = sensor.predict(sensor.expected_electrons(np.zeros(N), 0.3))
     # Half of each dark signal: (0.25 * 1064 + 0.25 * 5064) / 50.
-    corrected_dn = calibration.corrected(mean_dn, exposure_s=0.3)
+    corrected_dn = calibration.correct(mean_dn, exposure_s=0.3)
     assert corrected_dn.var() == pytest.approx((1064.0 + 5064.0) / 200, rel=SIGMAS * math.sqrt(2.0 / N) + 0.01)
     assert calibration.offset_at(0.1) is calibration.offset_dn
 
@@ -226,7 +226,7 @@ def test_sites_of_two_sizes_are_alike_where_they_give_what_they_were_to_give():
         ratio = (calibration.gain / response_of(sensor))[group]
         assert ratio.mean() == pytest.approx(1.0, abs=SIGMAS * ratio.std() / math.sqrt(group.sum()))
     mean_dn, _ = sensor.predict(sensor.expected_electrons(2000.0 * size / 0.1, 0.1))
-    corrected_dn = calibration.corrected(mean_dn)
+    corrected_dn = calibration.correct(mean_dn)
     assert corrected_dn[is_large].mean() == pytest.approx(1.5 * 2000.0, rel=1e-3)
     assert corrected_dn[~is_large].mean() == pytest.approx(2000.0, rel=1e-3)
 
@@ -239,8 +239,8 @@ def test_with_one_expectation_for_all_sites_they_are_made_alike():
     alike = Calibration.from_frames(*frames, dead_fraction=0.1)
     by_size = Calibration.from_frames(*frames, expected_dn=size)
 
-    assert alike.corrected(100.0 + 1000.0 * size) == pytest.approx(np.full(500, 1000.0 * size.mean()), rel=3e-3)
-    assert by_size.corrected(100.0 + 1000.0 * size) == pytest.approx(1000.0 * size, rel=3e-3)
+    assert alike.correct(100.0 + 1000.0 * size) == pytest.approx(np.full(500, 1000.0 * size.mean()), rel=3e-3)
+    assert by_size.correct(100.0 + 1000.0 * size) == pytest.approx(1000.0 * size, rel=3e-3)
     assert by_size.gain == pytest.approx(np.ones(500), abs=3e-3)
 
 
@@ -250,7 +250,7 @@ def test_a_mosaic_with_crosstalk_and_coupling_has_the_gains_of_its_sites():
         layout,
         filters="rgb",
         crosstalk=Diffusion(spread_um=0.2),
-        coupling=Coupling(neighbour_share=0.01),
+        coupling=InterPixelCapacitance(neighbour_fraction=0.01),
         gain_fpn_fraction=0.02,
         dark_e_per_s=1e4,
         **FINE,
@@ -277,7 +277,7 @@ def test_companded_codes_are_calibrated_as_linear_ones(companding):
     code = sensor.read(sensor.collect(expected_e, streams=Streams(1)), streams=Streams(1))
     # One frame's noise, that of the calibration, and no fixed pattern; gains spread the noise by 0.3 %.
     left_dn2 = 5064.0 + ((3 / 7) ** 2 * 1064.0 + (4 / 7) ** 2 * 8064.0) / 30
-    corrected_dn = calibration.corrected(code)
+    corrected_dn = calibration.correct(code)
     assert corrected_dn.var() == pytest.approx(left_dn2, rel=SIGMAS * math.sqrt(2.0 / N) + 0.01)
     assert corrected_dn.mean() == pytest.approx(4000.0, abs=SIGMAS * math.sqrt(left_dn2 / N) + 2.0)
 
@@ -299,7 +299,7 @@ def test_saturated_codes_are_not_a_number():
     code = np.full(25, 60.0)
     code[[3, 7]] = 255.0
 
-    corrected_dn = small().corrected(code)
+    corrected_dn = small().correct(code)
 
     assert np.flatnonzero(np.isnan(corrected_dn)).tolist() == [3, 7]
     assert corrected_dn[0] == pytest.approx(50.0)
@@ -312,7 +312,7 @@ def test_a_defective_site_takes_the_mean_of_its_good_neighbours():
     code = np.stack([code, code])
     code[1, 7] = 255.0
 
-    corrected_dn = calibration.corrected(code, fill=grid(n_x=5, n_y=5, pitch_um=2.0))
+    corrected_dn = calibration.correct(code, fill=grid(n_x=5, n_y=5, pitch_um=2.0))
 
     assert np.flatnonzero(calibration.hot).tolist() == [12]
     assert np.flatnonzero(calibration.dead).tolist() == [11, 12]
@@ -320,7 +320,7 @@ def test_a_defective_site_takes_the_mean_of_its_good_neighbours():
     assert corrected_dn[1, 12] == pytest.approx((13 + 17) / 2)
     assert corrected_dn[0, 11] == pytest.approx((6 + 10 + 16) / 3)
     assert corrected_dn[0, 3] == pytest.approx(3.0)
-    assert np.isnan(calibration.corrected(code[0])[11])
+    assert np.isnan(calibration.correct(code[0])[11])
 
 
 def test_a_site_is_filled_by_what_it_would_give_of_its_neighbours_light():
@@ -329,7 +329,7 @@ def test_a_site_is_filled_by_what_it_would_give_of_its_neighbours_light():
     expected[12] = 3.0
     calibration = small(flat={12: 10.0}, expected_dn=expected)
 
-    corrected_dn = calibration.corrected(np.full(25, 50.0), fill=grid(n_x=5, n_y=5, pitch_um=2.0))
+    corrected_dn = calibration.correct(np.full(25, 50.0), fill=grid(n_x=5, n_y=5, pitch_um=2.0))
 
     assert corrected_dn[12] == pytest.approx(120.0)
 
@@ -339,8 +339,8 @@ def test_on_a_mosaic_sites_are_filled_from_their_own_colour_two_steps_away():
     calibration = small(flat={12: 10.0})
     code = 10.0 + np.where(layout.channel == layout.channel[12], 70.0, 20.0)
 
-    assert calibration.corrected(code, fill=layout)[12] == pytest.approx(20.0)
-    assert calibration.corrected(code, fill=layout, kind=layout.channel)[12] == pytest.approx(70.0)
+    assert calibration.correct(code, fill=layout)[12] == pytest.approx(20.0)
+    assert calibration.correct(code, fill=layout, kind=layout.channel)[12] == pytest.approx(70.0)
 
 
 def test_nothing_that_is_given_is_changed_and_nothing_that_is_held_can_be():
@@ -395,7 +395,7 @@ def test_bad_codes_get_one_clear_sentence(arguments, message):
     calibration = small(flat={12: 10.0})
 
     with pytest.raises((ParameterError, SimulationError), match=message):
-        calibration.corrected(arguments.pop("code", np.zeros(25)), **arguments)
+        calibration.correct(arguments.pop("code", np.zeros(25)), **arguments)
 
 
 @pytest.mark.parametrize(
@@ -416,6 +416,6 @@ def test_bad_calibrations_get_one_clear_sentence(parameters, message):
 
 def test_only_sensors_codes_are_linearised():
     with pytest.raises(ParameterError, match="'sensor' must be a"):
-        linearised([1], None)
+        linearise([1], None)
     with pytest.raises(ParameterError, match="'code' must be <= 255"):
-        linearised([256], Sensor(MANY[:1]))
+        linearise([256], Sensor(MANY[:1]))

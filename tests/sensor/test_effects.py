@@ -321,7 +321,11 @@ def test_sites_of_block_are_parts():
 def test_settings_describe_registered_effects():
     layout = ROW[:10]
     sensor = Sensor(
-        layout, **FINE, read_noise_e=2.0, coupling=fs.sensor.Coupling(neighbour_share=0.01), effects=[Registered(2.5)]
+        layout,
+        **FINE,
+        read_noise_e=2.0,
+        coupling=fs.sensor.InterPixelCapacitance(neighbour_fraction=0.01),
+        effects=[Registered(2.5)],
     )
     from foveasim._core.provenance import to_plain_data
 

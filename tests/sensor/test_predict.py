@@ -12,7 +12,7 @@ import scipy.stats
 import foveasim as fs
 from foveasim._core.random_streams import Streams
 from foveasim.layout import grid
-from foveasim.sensor import Coupling, Diffusion, Sensor
+from foveasim.sensor import Diffusion, InterPixelCapacitance, Sensor
 
 SIGMAS = 5.0
 N_DRAWS = 2000
@@ -155,7 +155,7 @@ def test_diffusion_and_coupling_are_in_the_prediction():
     sensor = Sensor(
         layout,
         crosstalk=Diffusion(spread_um=0.5),
-        coupling=Coupling(neighbour_share=0.02),
+        coupling=InterPixelCapacitance(neighbour_fraction=0.02),
         read_noise_e=4.0,
         **ONE_E_PER_CODE,
     )
@@ -175,7 +175,7 @@ def test_with_crosstalk_too_every_noise_is_predicted_from_dark_to_saturation(lig
         v_sat_v=1.0,
         capacitance_f=9e-16,
         crosstalk=Diffusion(spread_um=0.5),
-        coupling=Coupling(neighbour_share=0.01),
+        coupling=InterPixelCapacitance(neighbour_fraction=0.01),
         pedestal_v=0.05,
         **EVERYTHING,
     )

@@ -377,7 +377,7 @@ class TestBeyondATable:
         assert curve(np.full((2, 3), 550.0)).shape == (2, 3)
 
     def test_another_choice_is_refused(self, curve):
-        with pytest.raises(ParameterError, match=r"^'beyond' must be one of 'refuse', 'zero', 'hold', got 'guess'$"):
+        with pytest.raises(ParameterError, match=r"^'beyond' must be one of 'raise', 'zero', 'hold', got 'guess'$"):
             dataclasses.replace(curve, beyond="guess")
 
 

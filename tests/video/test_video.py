@@ -21,14 +21,14 @@ from foveasim.errors import FileError, FoveasimWarning, ParameterError, Simulati
 from foveasim.modes import Exposure, Shutter
 from foveasim.sensor import merge_exposures
 from foveasim.video import (
-    Footage,
+    FrameSource,
     GazePath,
-    frames_kept,
-    look,
-    look_around,
-    partial_of,
+    count_recorded_frames,
+    pan_camera,
+    partial_path,
     read_recording,
     saccades,
+    shift_sensor,
     write_video,
 )
 from foveasim.video.frame_source import pictures_in
@@ -359,7 +359,7 @@ def test_a_moving_camera_sees_a_part_of_the_picture_where_it_looks():
     layout = rows_layout(n_x=6, n_y=5)
     camera = camera_of(layout)
     path = GazePath(np.array([0.0, 1.0]), cell_um * np.array([[0.0, 0.0], [12.25, -7.5]]))
-    parts = list(look_around(whole, path, OPTICS, shape=(120, 160)))
+    parts = list(pan_camera(whole, path, OPTICS, shape=(120, 160)))
 
     (first, place), (second, rest) = parts
 
@@ -369,14 +369,14 @@ def test_a_moving_camera_sees_a_part_of_the_picture_where_it_looks():
     assert rest[0] == pytest.approx(0.25 * cell_um)
     assert abs(rest[1]) == pytest.approx(0.5 * cell_um)
     # The sensor moved behind the lens sees the same, up to falloff over these few pixels.
-    around, behind = list(camera.rates(parts))[1], list(camera.rates(look(whole, path)))[1]
+    around, behind = list(camera.rates(parts))[1], list(camera.rates(shift_sensor(whole, path)))[1]
     assert np.allclose(around, behind, rtol=2e-3)
 
 
 def test_parts_of_odd_differences_are_centred_to_half_a_pixel():
     whole = scene_of(pictures(1, (121, 161))[0])
     cell_um = OPTICS.grid(whole).pitch_um
-    ((_, rest),) = look_around(whole, GazePath(np.zeros(1), np.zeros((1, 2))), OPTICS, shape=(100, 140))
+    ((_, rest),) = pan_camera(whole, GazePath(np.zeros(1), np.zeros((1, 2))), OPTICS, shape=(100, 140))
 
     assert np.allclose(np.abs(rest), 0.5 * cell_um)
 
@@ -385,7 +385,7 @@ def test_a_gaze_beyond_the_picture_is_told_with_its_time():
     whole = scene_of(pictures(1)[0])
     path = GazePath(np.array([0.0, 0.5]), np.array([[0.0, 0.0], [1000.0, 0.0]]))
     with pytest.raises(ParameterError, match=r"leaves the picture at 0\.5 s"):
-        list(look_around(whole, path, OPTICS, shape=(100, 100)))
+        list(pan_camera(whole, path, OPTICS, shape=(100, 100)))
 
 
 def test_saccades_stay_in_their_field_and_rest_between_jumps():
@@ -448,7 +448,7 @@ def test_gazes_that_cannot_be_are_told():
         (scene, None, "'path' must be of the class Gaze"),
     ):
         with pytest.raises(ParameterError, match=told):
-            look(light, gaze)
+            shift_sensor(light, gaze)
     for change, told in (
         ({"scene": None}, "'scene' must be of the class Scene"),
         ({"path": 3}, "'path' must be of the class GazePath"),
@@ -457,7 +457,7 @@ def test_gazes_that_cannot_be_are_told():
         ({"shape": (121, 160)}, r"'shape' must be within the picture's \(120, 160\)"),
     ):
         with pytest.raises(ParameterError, match=told):
-            look_around(**({"scene": scene, "path": path, "optics": OPTICS, "shape": (10, 10)} | change))
+            pan_camera(**({"scene": scene, "path": path, "optics": OPTICS, "shape": (10, 10)} | change))
 
 
 def test_a_path_is_straight_between_its_points():
@@ -582,9 +582,9 @@ def test_exposures_in_the_making_refuse_what_is_no_time_or_no_light():
     shutter = Shutter(rows_layout(), frame_s=0.1, line_s=0.01)
     for call, name in (
         (lambda: Shutter(None, 1.0), "layout"),
-        (lambda: shutter.share(0, -1.0), "exposure_s"),
-        (lambda: shutter.share(0, np.nan), "exposure_s"),
-        (lambda: shutter.share(-1, 1.0), "frame"),
+        (lambda: shutter.overlap_fraction(0, -1.0), "exposure_s"),
+        (lambda: shutter.overlap_fraction(0, np.nan), "exposure_s"),
+        (lambda: shutter.overlap_fraction(-1, 1.0), "frame"),
         (lambda: shutter.last_frame(np.nan), "exposure_s"),
         (lambda: Exposure(shutter, np.nan), "exposure_s"),
         (lambda: Exposure(None, 1.0), "shutter"),
@@ -606,20 +606,20 @@ def test_pictures_of_a_folder_come_in_natural_order(tmp_path):
     for k in (10, 2, 1):
         write_picture(tmp_path / f"frame {k}.png", np.full((8, 8), k, np.uint8))
     (tmp_path / "notes.txt").write_text("no picture")
-    footage = Footage(tmp_path, **LIGHT)
+    footage = FrameSource(tmp_path, **LIGHT)
 
     assert footage.n_frames == 3
     assert [round(float(scene.basis.max()) * 255) for scene in footage] == [1, 2, 10]
-    assert [round(float(s.basis.max()) * 255) for s in Footage(tmp_path, start=1, step=1, **LIGHT)] == [2, 10]
+    assert [round(float(s.basis.max()) * 255) for s in FrameSource(tmp_path, start=1, step=1, **LIGHT)] == [2, 10]
 
 
 def test_footage_may_be_seen_again():
-    footage = Footage(pictures(3), **LIGHT)
+    footage = FrameSource(pictures(3), **LIGHT)
 
     assert [s.basis.sum() for s in footage] == [s.basis.sum() for s in footage]
     assert footage.n_frames == 3
-    assert Footage(iter(pictures(2)), **LIGHT).n_frames is None
-    assert Footage(pictures(5), start=1, stop=9, step=2, **LIGHT).n_frames == 2
+    assert FrameSource(iter(pictures(2)), **LIGHT).n_frames is None
+    assert FrameSource(pictures(5), start=1, stop=9, step=2, **LIGHT).n_frames == 2
 
 
 def test_names_with_digits_that_are_no_numbers_are_ordered_too(tmp_path):
@@ -630,24 +630,24 @@ def test_names_with_digits_that_are_no_numbers_are_ordered_too(tmp_path):
 
 
 def test_pictures_of_an_iterator_are_given_once():
-    footage = Footage(iter(pictures(3)), **LIGHT)
+    footage = FrameSource(iter(pictures(3)), **LIGHT)
     assert len(list(footage)) == 3
     for again in (footage, footage.from_frame(1)):
         with pytest.raises(ParameterError, match=r"'source' was an iterator, whose pictures are gone.*give a list"):
             list(again)
-    assert len(list(Footage(iter(pictures(3)), **LIGHT).from_frame(1))) == 2
+    assert len(list(FrameSource(iter(pictures(3)), **LIGHT).from_frame(1))) == 2
 
 
 def test_footage_without_any_frame_is_told():
     for source, how in (([], {}), (pictures(3), {"start": 3}), (pictures(3), {"start": 1, "stop": 1})):
         with pytest.raises(ParameterError, match="'source' has no frame from"):
-            Footage(source, **how, **LIGHT)
+            FrameSource(source, **how, **LIGHT)
     for source, how in (((), {}), (pictures(3), {"start": 3})):
-        footage = Footage(iter(source), **how, **LIGHT)
+        footage = FrameSource(iter(source), **how, **LIGHT)
         with pytest.raises(ParameterError, match=r"'source' has no frame from .*, of any number of pictures"):
             list(footage)
     # Of a video that is gone on with nothing may be left.
-    assert list(Footage(pictures(3), **LIGHT).from_frame(3)) == []
+    assert list(FrameSource(pictures(3), **LIGHT).from_frame(3)) == []
 
 
 @pytest.mark.parametrize(
@@ -660,31 +660,31 @@ def test_footage_without_any_frame_is_told():
 def test_settings_of_scenes_are_checked_before_a_picture_is_read(changes, told):
     settings = {name: value for name, value in (LIGHT | changes).items() if value is not None}
     with pytest.raises(ParameterError, match=told):
-        Footage(["nowhere.png"], **settings)
+        FrameSource(["nowhere.png"], **settings)
 
 
 def test_frames_of_another_size_are_told():
     with pytest.raises(FileError, match="frame 1: has the shape"):
-        list(Footage([np.ones((4, 4)), np.ones((4, 5))], **LIGHT))
+        list(FrameSource([np.ones((4, 4)), np.ones((4, 5))], **LIGHT))
 
 
 def test_footage_that_is_not_there_is_told(tmp_path):
     with pytest.raises(FileError, match="no such file or folder"):
-        Footage(tmp_path / "none.mp4", **LIGHT)
+        FrameSource(tmp_path / "none.mp4", **LIGHT)
     with pytest.raises(FileError, match="holds no pictures"):
-        Footage(tmp_path, **LIGHT)
+        FrameSource(tmp_path, **LIGHT)
     with pytest.raises(ParameterError, match="source"):
-        Footage(3, **LIGHT)
+        FrameSource(3, **LIGHT)
     (tmp_path / "text.mp4").write_text("this is no video")
     with pytest.raises(FileError, match="no video file that can be read"):
-        Footage(tmp_path / "text.mp4", **LIGHT)
+        FrameSource(tmp_path / "text.mp4", **LIGHT)
 
 
 def test_a_missing_reader_is_told_in_one_sentence(tmp_path, monkeypatch):
     (tmp_path / "clip.mp4").write_bytes(b"0")
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(FileError, match=r"pip install 'foveasim\[video\]'"):
-        Footage(tmp_path / "clip.mp4", **LIGHT)
+        FrameSource(tmp_path / "clip.mp4", **LIGHT)
     camera = camera_of(rows_layout())
     captures = camera.video([scene_of(pictures(1)[0])], exposure_s=0.01, seed=0)
     with pytest.raises(FileError, match=r"pip install 'foveasim\[video\]'"):
@@ -726,7 +726,7 @@ def test_captures_of_other_sites_or_bits_do_not_come_into_the_same_video(tmp_pat
     captures = [*captures_of(2), camera.capture(scene_of(pictures(1)[0]), exposure_s=0.01, seed=0, frame=2)]
     with pytest.raises(ParameterError, match="must be of the same layout and bits"):
         write_video(captures, tmp_path / "v.zarr", resume=resume)
-    assert frames_kept(tmp_path / "v.zarr") == (2 if resume else 0)
+    assert count_recorded_frames(tmp_path / "v.zarr") == (2 if resume else 0)
 
 
 def test_what_ends_early_leaves_what_was_there(tmp_path):
@@ -781,7 +781,7 @@ def test_a_film_comes_back_through_footage(tmp_path, ending):
     path = tmp_path / f"film.{ending}"
 
     assert write_video(camera.video(lights, exposure_s=exposure_s, seed=0), path, max_pixels=64, frame_s=0.1) == 6
-    footage = Footage(path, **(LIGHT | {"encoding": "srgb", "wavelength_nm": (550.0,)}))
+    footage = FrameSource(path, **(LIGHT | {"encoding": "srgb", "wavelength_nm": (550.0,)}))
 
     assert footage.frame_s == pytest.approx(0.1)
     seen = [float(np.median(scene.basis)) for scene in footage]
@@ -850,7 +850,7 @@ class LightsOutError(Exception):
 
 def rolling(n_before, n_frames=22, **sensor):
     """Captures after those that are kept."""
-    footage = Footage(pictures(n_frames), **LIGHT).from_frame(2 * n_before)
+    footage = FrameSource(pictures(n_frames), **LIGHT).from_frame(2 * n_before)
     return camera_of(rows_layout(), **sensor).video(footage, **ROLLING, first_frame=n_before)
 
 
@@ -875,11 +875,11 @@ def small_chunks(monkeypatch):
 def test_a_recording_that_was_ended_goes_on_and_is_the_whole_one_to_the_byte(tmp_path, ends):
     path, n = tmp_path / "v.zarr", 0
     for more in ends:
-        assert frames_kept(path) == n
+        assert count_recorded_frames(path) == n
         with pytest.raises(LightsOutError) as ended:
             write_video(cut(rolling(n), more), path, resume=True)
         n += more
-        notes = [f"{n} frames are kept in {partial_of(path)}, from which the same recording goes on"] if n else []
+        notes = [f"{n} frames are kept in {partial_path(path)}, from which the same recording goes on"] if n else []
         assert getattr(ended.value, "__notes__", []) == notes
         assert [p.name for p in tmp_path.iterdir()] == (["v.zarr.partial"] if n else [])
 
@@ -887,9 +887,9 @@ def test_a_recording_that_was_ended_goes_on_and_is_the_whole_one_to_the_byte(tmp
     write_video(rolling(0), tmp_path / "whole.zarr")
 
     assert files_of(path) == files_of(tmp_path / "whole.zarr")
-    assert not partial_of(path).exists()
-    assert frames_kept(path) == read_recording(path).n_frames == 11
-    assert write_video(rolling(frames_kept(path)), path, resume=True) == 11
+    assert not partial_path(path).exists()
+    assert count_recorded_frames(path) == read_recording(path).n_frames == 11
+    assert write_video(rolling(count_recorded_frames(path)), path, resume=True) == 11
 
 
 @pytest.mark.usefixtures("small_chunks")
@@ -901,15 +901,15 @@ def test_ctrl_c_keeps_every_frame(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         write_video(interrupted(), tmp_path / "v.zarr", resume=True)
 
-    assert frames_kept(tmp_path / "v.zarr") == 6
+    assert count_recorded_frames(tmp_path / "v.zarr") == 6
 
 
 RECORDER = """
 import sys, time
 from pathlib import Path
 sys.path.insert(0, TESTS)
-from test_video import frames_kept, rolling, write_video
-recording = sys.modules[frames_kept.__module__]
+from test_video import count_recorded_frames, rolling, write_video
+recording = sys.modules[count_recorded_frames.__module__]
 recording.CHUNK_CODES, recording.WRITE_S = 500, 0.0
 
 def slowly(captures):
@@ -917,7 +917,7 @@ def slowly(captures):
         time.sleep(60.0 if capture.settings["frame"] == 10 else 0.02)
         yield capture
 
-write_video(slowly(rolling(frames_kept("v.zarr"))), "v.zarr", resume=True)
+write_video(slowly(rolling(count_recorded_frames("v.zarr"))), "v.zarr", resume=True)
 """
 
 
@@ -934,11 +934,11 @@ def test_a_program_that_is_killed_leaves_its_recording_whole(tmp_path, monkeypat
     kept = 0
     for more in (2, 3):
         running = subprocess.Popen([sys.executable, script], cwd=tmp_path)
-        wait_for(lambda enough=kept + more: frames_kept(path) >= enough)
+        wait_for(lambda enough=kept + more: count_recorded_frames(path) >= enough)
         running.kill()
         assert running.wait() == -signal.SIGKILL
-        assert kept + more <= frames_kept(path) < 11
-        kept = frames_kept(path)
+        assert kept + more <= count_recorded_frames(path) < 11
+        kept = count_recorded_frames(path)
 
     monkeypatch.setattr(sys.modules[read_recording.__module__], "CHUNK_CODES", 500)
     assert write_video(rolling(kept), path, resume=True) == 11
@@ -971,7 +971,7 @@ def test_a_disk_that_is_full_at_any_file_is_told_and_loses_no_whole_frame(tmp_pa
             n_full += 1
             assert "cannot be written: No space left on device" in str(error)  # noqa: PT017 -- some come through
         monkeypatch.setattr(Path, "replace", replace)
-        kept = frames_kept(path)
+        kept = count_recorded_frames(path)
         if kept:
             assert np.array_equal(codes_of(path, kept), read_recording(tmp_path / "whole.zarr").code[:kept])
         assert write_video(rolling(kept), path, resume=True) == 11
@@ -983,7 +983,7 @@ def codes_of(path, n):
     """The first codes of a recording, finished or not."""
     import zarr
 
-    return zarr.open_array(str(path if path.exists() else partial_of(path)), path="code", mode="r")[:n]
+    return zarr.open_array(str(path if path.exists() else partial_path(path)), path="code", mode="r")[:n]
 
 
 def test_frames_are_kept_every_few_seconds_though_no_chunk_is_full(tmp_path, monkeypatch):
@@ -991,7 +991,7 @@ def test_frames_are_kept_every_few_seconds_though_no_chunk_is_full(tmp_path, mon
 
     def watched():
         for capture in rolling(0):
-            kept.append(frames_kept(path))
+            kept.append(count_recorded_frames(path))
             yield capture
 
     monkeypatch.setattr(sys.modules[read_recording.__module__], "WRITE_S", 0.0)
@@ -1005,15 +1005,15 @@ def test_another_recording_is_not_gone_on_with(tmp_path):
     path = tmp_path / "v.zarr"
     with pytest.raises(LightsOutError):
         write_video(cut(rolling(0), 5), path, resume=True, plan={"gaze": {"seed": 1}})
-    before = files_of(partial_of(path))
+    before = files_of(partial_path(path))
 
     def other(how=None, light=None, plan=1, **sensor):
         layout = sensor.pop("layout", rows_layout())
-        footage = Footage(pictures(22), **(LIGHT | (light or {}))).from_frame(10)
+        footage = FrameSource(pictures(22), **(LIGHT | (light or {}))).from_frame(10)
         captures = camera_of(layout, **sensor).video(footage, **(ROLLING | {"first_frame": 5} | (how or {})))
         with pytest.raises((FileError, ParameterError)) as refused:
             write_video(captures, path, resume=True, plan={"gaze": {"seed": plan}})
-        assert files_of(partial_of(path)) == before
+        assert files_of(partial_path(path)) == before
         return str(refused.value)
 
     columns = rows_layout().with_columns(zone=np.arange(120))
@@ -1041,7 +1041,7 @@ def test_a_recording_through_other_filters_is_another_one(tmp_path):
     layout = rows_layout()
     layout = layout.with_columns(channel=np.arange(layout.n_sites) % 3)
     for filters, refusal in ((None, None), ("rgb", "'filters' differs")):
-        n = frames_kept(tmp_path / "v.zarr")
+        n = count_recorded_frames(tmp_path / "v.zarr")
         captures = camera_of(layout, filters=filters).video(
             [scene_of(p) for p in pictures(3)[n:]], exposure_s=0.01, seed=5, first_frame=n
         )
@@ -1123,7 +1123,7 @@ def test_only_zarr_folders_are_gone_on_with(tmp_path):
         with pytest.raises(ParameterError, match=r"'resume' is for \.zarr folders"):
             write_video(rolling(0), tmp_path / name, resume=True)
         with pytest.raises(FileError, match=r"is no \.zarr folder"):
-            frames_kept(tmp_path / name)
+            count_recorded_frames(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -1140,7 +1140,7 @@ def test_footage_from_a_frame_on_is_the_rest_of_it(tmp_path):
     film = tmp_path / "film.mp4"
     write_video(captures_of(7), film, max_pixels=64, frame_s=0.1)
     for source in (film, pictures(7)):
-        footage = Footage(source, start=1, step=2, **(LIGHT | {"wavelength_nm": (550.0,)}))
+        footage = FrameSource(source, start=1, step=2, **(LIGHT | {"wavelength_nm": (550.0,)}))
         whole = [scene.basis for scene in footage]
         assert len(whole) == 3
         for n in range(5):
@@ -1241,12 +1241,12 @@ def test_the_command_goes_on_where_it_was_stopped(folder, capsys):
     kept = 0
     for later_s in (0.1, 0.3, 1.0):  # the first frame may not be taken yet
         running = run_command("--out", "v.zarr", cwd=folder)
-        wait_for((partial_of(out) / "frame" / "zarr.json").exists)
+        wait_for((partial_path(out) / "frame" / "zarr.json").exists)
         time.sleep(later_s)
         running.send_signal(signal.SIGINT)
         _, told = running.communicate(timeout=60)
         assert running.returncode == 130
-        kept = frames_kept(out)
+        kept = count_recorded_frames(out)
         if kept:
             break
         assert told == "stopped\n"
@@ -1271,7 +1271,7 @@ def test_a_frame_that_cannot_be_read_costs_none_of_those_that_were_taken(folder,
 
     assert command(*asked) == 2
     # One may be read, and not yet seen by the sensor, when the next cannot be.
-    assert 1 <= frames_kept("v.zarr") <= 2
+    assert 1 <= count_recorded_frames("v.zarr") <= 2
     assert " frames are kept in v.zarr.partial, from which the same recording goes on" in capsys.readouterr().err
     (folder / "frames" / "2.png").write_bytes(good)
     assert command(*asked) == 0
@@ -1329,12 +1329,12 @@ def test_frames_like_a_scene_have_its_light():
     )
     white = np.full((6, 7, 3), 0.5)
     for like, frame in ((grey, white), (colour, white), (grey, white[..., 0]), (colour, white[..., 0])):
-        (scene,) = Footage([frame], like=like, encoding="linear")
+        (scene,) = FrameSource([frame], template=like, encoding="linear")
         assert scene.basis.shape == (like.basis.shape[0], 6, 7)
         assert np.allclose(scene.basis, 0.5)
         assert np.array_equal(scene.spectrum_w_m2_sr_nm, like.spectrum_w_m2_sr_nm)
         assert np.array_equal(scene.wavelength_nm, like.wavelength_nm)
     with pytest.raises(ParameterError, match="pitch_um"):
-        Footage([], like=grey, pitch_um=3.0)
-    with pytest.raises(ParameterError, match="like"):
-        Footage([], like=3)
+        FrameSource([], template=grey, pitch_um=3.0)
+    with pytest.raises(ParameterError, match="template"):
+        FrameSource([], template=3)

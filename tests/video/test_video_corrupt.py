@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from foveasim.errors import FileError
-from foveasim.video import Footage
+from foveasim.video import FrameSource
 
 av = pytest.importorskip("av")
 SCENE = {"pitch_um": 1.0, "distance_m": 1.0, "peak_radiance_w_m2_sr_nm": 1.0}
@@ -44,7 +44,7 @@ def test_flipped_bits_give_frames_or_file_errors(tmp_path, name, codec):
     for seed in range(200):
         bad.write_bytes(flipped(content, seed))
         try:
-            footage = Footage(bad, **SCENE)
+            footage = FrameSource(bad, **SCENE)
             n_read += sum(scene.basis.size > 0 for scene in footage)
             assert footage.frame_s is None or footage.frame_s > 0.0
         except FileError as error:
@@ -60,8 +60,8 @@ def test_metadata_outside_utf8_are_no_reason_to_reject(tmp_path):
     bad = content.replace(b"a title", b"\xe1 t\xff\xfeit")
     assert bad != content
     (tmp_path / "bad.mp4").write_bytes(bad)
-    expected = [scene.basis for scene in Footage(tmp_path / "a.mp4", **SCENE)]
-    found = [scene.basis for scene in Footage(tmp_path / "bad.mp4", **SCENE)]
+    expected = [scene.basis for scene in FrameSource(tmp_path / "a.mp4", **SCENE)]
+    found = [scene.basis for scene in FrameSource(tmp_path / "bad.mp4", **SCENE)]
 
     assert len(found) == 3
     np.testing.assert_array_equal(found, expected)

@@ -136,7 +136,7 @@ def test_pyvista_that_is_missing_is_named_with_its_command(monkeypatch):
 
 def test_columns_are_as_high_as_their_values():
     values = np.array([1.0, 4.0, 2.0, 0.0, 3.0])
-    columns = prisms(ODD_LAYOUT, values, tallest_um=8.0)
+    columns = prisms(ODD_LAYOUT, values, max_height_um=8.0)
     top_um = np.zeros(5)
     np.maximum.at(top_um, columns.photosite, columns.points_um[:, 2])
 
@@ -146,7 +146,7 @@ def test_columns_are_as_high_as_their_values():
 
 def test_the_surface_of_columns_is_roofs_and_walls():
     # What a layout of n sites has: the area of the sites, and their outlines times the height.
-    columns = prisms(ODD_LAYOUT, np.ones(5), tallest_um=3.0)
+    columns = prisms(ODD_LAYOUT, np.ones(5), max_height_um=3.0)
     a, b, c = (columns.points_um[columns.triangles[:, k]] for k in range(3))
     surface_um2 = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
 
@@ -179,7 +179,7 @@ def test_a_height_by_name_and_a_colour_by_another():
         ({"height": "name"}, "'height' must be an array of numbers"),
         ({"height": "no such column"}, "'height' must be one of"),
         ({"height": np.ones((5, 3))}, "'height' must have 1 dimension"),
-        ({"tallest_um": 0.0}, "'tallest_um' must be > 0"),
+        ({"max_height_um": 0.0}, "'max_height_um' must be > 0"),
     ],
 )
 def test_heights_that_are_none_are_refused(arguments, message):
@@ -201,7 +201,7 @@ def software(scene, **parameters):
 
 def test_seen_from_above_every_pixel_shows_the_site_under_it():
     # All as high as each other: what is seen is the layout, enlarged.
-    flat = prisms(ODD_LAYOUT, np.ones(5), tallest_um=0.01)
+    flat = prisms(ODD_LAYOUT, np.ones(5), max_height_um=0.01)
     site = sites_in_view(flat, viewpoint=STRAIGHT_DOWN, size_px=(980, 200))
     seen = np.argwhere(site >= 0)
     left, right, top, bottom = seen[:, 1].min(), seen[:, 1].max() + 1, seen[:, 0].min(), seen[:, 0].max() + 1
@@ -219,7 +219,7 @@ def test_the_nearer_column_hides_the_farther_one_whatever_their_order():
     for y_um in ([0.0, 20.0], [20.0, 0.0]):
         layout = fs.Layout.from_rectangles([[0.0, y_um[0]], [0.0, y_um[1]]], 4.0)
         site = sites_in_view(
-            prisms(layout, [1.0, 1.0], tallest_um=30.0), viewpoint=Viewpoint(azimuth_deg=-90, elevation_deg=0)
+            prisms(layout, [1.0, 1.0], max_height_um=30.0), viewpoint=Viewpoint(azimuth_deg=-90, elevation_deg=0)
         )
         near = int(np.argmin(y_um))  # the viewer stands at small y
 
@@ -248,7 +248,7 @@ def test_a_square_twice_as_near_is_seen_twice_as_large():
 
 def test_roofs_have_their_colour_and_walls_are_darker():
     layout = fs.Layout.from_rectangles([[0.0, 0.0]], 10.0)
-    mesh = prisms(layout, [1.0], tallest_um=10.0, by=np.array([[200, 100, 40]], np.uint8))
+    mesh = prisms(layout, [1.0], max_height_um=10.0, by=np.array([[200, 100, 40]], np.uint8))
     light = np.array(render3d.LIGHT) / np.linalg.norm(render3d.LIGHT)
     picture = software(mesh, viewpoint=Viewpoint(azimuth_deg=-90.0, elevation_deg=40.0))
     roof = np.array([200, 100, 40]) * (render3d.AMBIENT + render3d.DIFFUSE * light[2])
@@ -286,7 +286,7 @@ def test_the_picture_does_not_depend_on_the_number_of_threads(n_threads, monkeyp
 
 
 def test_a_zoom_of_two_enlarges_twice():
-    columns = prisms(fs.layout.grid(n_x=9, n_y=9, pitch_um=2.0), np.ones(81), tallest_um=0.01)
+    columns = prisms(fs.layout.grid(n_x=9, n_y=9, pitch_um=2.0), np.ones(81), max_height_um=0.01)
     plain, near = (
         sites_in_view(columns, viewpoint=Viewpoint(azimuth_deg=-90, elevation_deg=90, zoom=zoom)) for zoom in (1.0, 2.0)
     )
@@ -316,8 +316,8 @@ def test_the_whole_scene_is_in_the_picture_and_fills_it(viewpoint):
         ({"oversampling": 0}, "'oversampling' must be >= 1"),
         ({"size_px": (0, 5)}, r"'size_px\[0\]' must be >= 1"),
         ({"size_px": (100_000, 5)}, "'size_px' must be <= "),
-        ({"ground": (1, 2)}, "'ground' must be three numbers"),
-        ({"ground": (1, 2, 300)}, "'ground' must be three numbers"),
+        ({"background": (1, 2)}, "'background' must be three numbers"),
+        ({"background": (1, 2, 300)}, "'background' must be three numbers"),
         ({"renderer": "best"}, "'renderer' must be one of"),
     ],
 )
@@ -381,7 +381,7 @@ def test_pyvista_sees_the_sites_that_the_identities_name():
     layout = fs.layout.hexagonal(n_columns=12, n_rows=12, pitch_um=2.0)
     n = layout.n_sites
     colours = np.stack((np.arange(n) % 16 * 17, np.arange(n) // 16 * 25, np.full(n, 90)), axis=1).astype(np.uint8)
-    columns = prisms(layout, np.random.default_rng(4).random(n), by=colours, tallest_um=0.5)
+    columns = prisms(layout, np.random.default_rng(4).random(n), by=colours, max_height_um=0.5)
     site = sites_in_view(columns, viewpoint=STRAIGHT_DOWN, size_px=(500, 400))
     picture = render(columns, viewpoint=STRAIGHT_DOWN, size_px=(500, 400), oversampling=1, renderer="pyvista")
     light = np.array(render3d.LIGHT) / np.linalg.norm(render3d.LIGHT)
@@ -396,7 +396,7 @@ def test_the_shade_of_corners_darkens_them_and_leaves_no_line_at_the_border():
     layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0)
     columns = prisms(layout, np.indices((8, 8)).sum(axis=0).ravel() % 2 + 1.0, by=np.full((64, 3), 200, np.uint8))
     plain, shaded = (
-        render(columns, size_px=(400, 260), shade_corners=shade, renderer="pyvista").astype(int)
+        render(columns, size_px=(400, 260), ambient_occlusion=shade, renderer="pyvista").astype(int)
         for shade in (False, True)
     )
 
@@ -412,7 +412,9 @@ def test_the_shade_of_corners_leaves_a_plain_as_it_is():
     for zoom in (1.0, 4.0):
         viewpoint = Viewpoint(zoom=zoom, focus_um=(0.0, 0.0, 6.0))
         plain, shaded = (
-            render(flat, viewpoint=viewpoint, size_px=(400, 260), shade_corners=shade, renderer="pyvista").astype(int)
+            render(flat, viewpoint=viewpoint, size_px=(400, 260), ambient_occlusion=shade, renderer="pyvista").astype(
+                int
+            )
             for shade in (False, True)
         )
         inside = (slice(90, 170), slice(150, 250))
@@ -438,7 +440,7 @@ def test_without_a_renderer_the_picture_is_made_and_the_cure_is_named(monkeypatc
     columns = prisms(ODD_LAYOUT)
 
     with pytest.warns(FoveasimWarning, match="no OpenGL; install it; the picture is made without"):
-        picture = render(columns, size_px=(60, 40), shade_corners=True)
+        picture = render(columns, size_px=(60, 40), ambient_occlusion=True)
     assert np.array_equal(picture, render(columns, size_px=(60, 40), renderer="software"))
     with pytest.raises(SimulationError, match="no OpenGL; install it"):
         render(columns, renderer="pyvista")

@@ -198,7 +198,7 @@ def test_a_page_asks_for_nothing_outside_of_it():
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda: web_page(3), ParameterError, "'thing' must be a Layout or a Capture, got a int"),
+        (lambda: web_page(3), ParameterError, "'data' must be a Layout or a Capture, got a int"),
         (lambda: web_page(ZOO[:0]), GeometryError, "the layout has no sites"),
         (lambda: web_page(ZOO, report="none"), ParameterError, "'report' must be a Report of a check, got a str"),
         (
@@ -483,7 +483,19 @@ def test_everything_can_be_reached_and_done_with_the_keyboard(visit):
         page.keyboard.press("Tab")
         order.append(page.evaluate("document.activeElement.id"))
         assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") != "none" or not order[-1]
-    wanted = ["find-site", "link", "save", "theme", "help", "marks", "nearer", "farther", "fit", "colouring", "enlarge"]
+    wanted = [
+        "find-site",
+        "link",
+        "save",
+        "theme",
+        "help",
+        "marks",
+        "nearer",
+        "farther",
+        "fit",
+        "graph_colouring",
+        "enlarge",
+    ]
     assert [name for name in order if name in wanted][: len(wanted)] == wanted
 
     page.focus("#colouring")
@@ -755,10 +767,10 @@ def test_the_mouse_finds_columns_where_they_stand_and_as_high_as_they_are(visit)
     page = visit(solid_page(CAPTURE))
     page.evaluate("foveasim.lookDown()")
     x0, y0, x1, y1 = MOSAIC.bounds_um
-    tallest_um = 0.15 * max(x1 - x0, y1 - y0)
+    max_height_um = 0.15 * max(x1 - x0, y1 - y0)
     for site in (0, 37, 64, 119, int(CAPTURE.code.argmax())):
         x, y = MOSAIC.centroid_um[site]
-        z = tallest_um * CAPTURE.code[site] / CAPTURE.code.max()
+        z = max_height_um * CAPTURE.code[site] / CAPTURE.code.max()
         page.mouse.move(*page.evaluate("([x, y, z]) => foveasim.toWindow(x, y, z)", [x, y, z]))
         until(page, "site => foveasim.hovered === site", site)
 
@@ -772,7 +784,7 @@ def test_the_mouse_finds_columns_where_they_stand_and_as_high_as_they_are(visit)
     page.focus("#solid")
     page.keyboard.press("0")
     site = int(CAPTURE.code.argmax())
-    top = [*MOSAIC.centroid_um[site], tallest_um]
+    top = [*MOSAIC.centroid_um[site], max_height_um]
     picked = page.evaluate("(p) => foveasim.pick(...foveasim.toWindow(...p))", top)
     assert picked == {"site": site, "part": "columns"}
 

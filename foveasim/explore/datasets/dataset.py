@@ -1,4 +1,4 @@
-"""Data sets for learning: pictures through cameras drawn at random, every sample a function of the seed and its number."""
+"""Datasets for learning: pictures through cameras drawn at random, every sample a function of the seed and its number."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from foveasim.capture import Capture
 from foveasim.config import Shot, build_shot, check_settings, files_from, put_setting, read_settings
 from foveasim.errors import ConfigError, FileError, FoveasimError, FoveasimWarning, ParameterError, SimulationError
 from foveasim.explore._files import digests
-from foveasim.explore.datasets.distributions import LEAST, MOST, Draw, draw_of
+from foveasim.explore.datasets.distributions import LEAST, MOST, Draw, parse_distribution
 from foveasim.explore.datasets.labels import (
     NOTHING,
     boxes_on_sites,
@@ -40,7 +40,7 @@ from foveasim.explore.sweeps.plan import check_apart
 from foveasim.layout import Layout
 from foveasim.scene import Scene
 
-__all__ = ["FIELDS", "DataSet"]
+__all__ = ["FIELDS", "Dataset"]
 
 #: What a sample may have of each site.
 FIELDS = ("code", "electrons", "expected_e", "expected_dn")
@@ -54,11 +54,11 @@ MAX_REPEATS = 10**9
 LAYOUT = "layout"
 
 
-class DataSet:
+class Dataset:
     """
     Pictures through cameras drawn at random: a sample is simulated when it is asked for.
 
-    Has a length and items, and so is a map-style data set to ``torch.utils.data.DataLoader`` and others, without needing torch.
+    Has a length and items, and so is a map-style dataset to ``torch.utils.data.DataLoader`` and others, without needing torch.
     A sample is the same in any order, in any process, and alone.
 
     Parameters
@@ -71,7 +71,7 @@ class DataSet:
         A settings file, or settings as it has them, of a scene of the kind ``picture``, whose picture these take the place of.
     vary : mapping of str to distribution, optional
         By settings' paths, such as ``{"optics.f_number": {"log_uniform": [1.4, 8]}}``; see
-        :func:`foveasim.explore.draw_of`. Drawn anew for every camera.
+        :func:`foveasim.explore.parse_distribution`. Drawn anew for every camera.
     cameras : int
         Cameras that each picture is taken with.
     draws : int
@@ -131,7 +131,7 @@ class DataSet:
     ...     "exposure_s": 0.01,
     ... }
     >>> pictures = np.full((3, 32, 32), 128, np.uint8)
-    >>> data = DataSet(pictures, shot, {"optics.f_number": {"uniform": [2.0, 4.0]}}, cameras=2, labels=[0, 1, 0])
+    >>> data = Dataset(pictures, shot, {"optics.f_number": {"uniform": [2.0, 4.0]}}, cameras=2, labels=[0, 1, 0])
     >>> len(data), data[3]["code"].shape, data[3]["label"]
     (6, (64,), 1)
     """
@@ -198,7 +198,7 @@ class DataSet:
 
     def __repr__(self) -> str:
         return (
-            f"DataSet({len(self)} samples of {len(self._pictures)} pictures, {self.cameras} cameras each, "
+            f"Dataset({len(self)} samples of {len(self._pictures)} pictures, {self.cameras} cameras each, "
             f"{self.draws} draws each)"
         )
 
@@ -505,7 +505,7 @@ def _base(
         raise ParameterError("shot", f"must be a settings file, or settings, got a {type(shot).__name__}")
     scene = data.get("scene")
     if not isinstance(scene, Mapping) or scene.get("kind") != "picture":
-        raise ConfigError(file, "scene.kind: must be 'picture' for a data set, whose pictures take its place")
+        raise ConfigError(file, "scene.kind: must be 'picture' for a dataset, whose pictures take its place")
     data = files_from(
         file.parent, {**data, "scene": {key: scene[key] for key in scene if key != "picture"}}, found=found
     )
@@ -533,13 +533,13 @@ def _plain(value: Any) -> Any:
 def _draws(file: Path, vary: Mapping[str, Any], found: list[Path], *, is_fitted: bool) -> dict[str, Draw]:
     if not isinstance(vary, Mapping):
         raise ParameterError("vary", "must be distributions by settings' paths", vary)
-    draws = {str(path): draw_of(str(path), told) for path, told in vary.items()}
+    draws = {str(path): parse_distribution(str(path), told) for path, told in vary.items()}
     check_apart(file, draws)
     for path, draw in draws.items():
         if draw.kind == "choice":
             draws[path] = replace(draw, values=tuple(files_from(Path(), value, path, found) for value in draw.values))
         if path in ("seed", "scene", "scene.kind", "scene.picture"):
-            raise ParameterError(path, "cannot vary: the data set has its own seed and its own pictures")
+            raise ParameterError(path, "cannot vary: the dataset has its own seed and its own pictures")
         if is_fitted and path == "scene.pitch_um":
             raise ParameterError(path, "cannot vary beside 'fit', which chooses it")
     return draws

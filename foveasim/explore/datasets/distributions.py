@@ -16,7 +16,7 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.validation import check_count, check_number, finite_array
 from foveasim.errors import ParameterError
 
-__all__ = ["Draw", "draw_of"]
+__all__ = ["Draw", "parse_distribution"]
 
 #: What may stand in a distribution, and its numbers.
 FORMS = {
@@ -99,11 +99,11 @@ class Draw:
         return number, number
 
     def to_dict(self) -> dict[str, Any]:
-        """The distribution as plain data, as :func:`draw_of` takes it."""
+        """The distribution as plain data, as :func:`parse_distribution` takes it."""
         return {self.kind: list(self.values)} | ({} if self.weights is None else {"weights": list(self.weights)})
 
 
-def draw_of(path: str, told: Any) -> Draw:
+def parse_distribution(path: str, told: Any) -> Draw:
     """
     A distribution from plain data.
 
@@ -123,9 +123,9 @@ def draw_of(path: str, told: Any) -> Draw:
 
     Examples
     --------
-    >>> draw_of("sensor.bits", {"choice": [8, 10]}).ends
+    >>> parse_distribution("sensor.bits", {"choice": [8, 10]}).ends
     (8, 10)
-    >>> 1.4 <= draw_of("optics.f_number", {"log_uniform": [1.4, 8.0]}).at(seed=0, camera=3)[0] <= 8.0
+    >>> 1.4 <= parse_distribution("optics.f_number", {"log_uniform": [1.4, 8.0]}).at(seed=0, camera=3)[0] <= 8.0
     True
     """
     known = "; ".join(f"{kind}: {form}" for kind, form in FORMS.items())

@@ -178,7 +178,7 @@ def flow_on_sites(flow_px: Floats, integrator: Integrator, lens: Lens | None) ->
 def _seen_um2(integrator: Integrator) -> Floats:
     """Area from which each site collects light, off the picture too; 0 outside the lens's image circle."""
     on_um2 = integrator(np.ones(integrator.grid.shape))
-    lost = integrator.lost_sites
+    lost = integrator.sites_outside_image_circle
     off_um2 = np.array(integrator.uncovered_um2)
     off_um2[lost] = 0.0
     return on_um2 + off_um2
@@ -206,7 +206,7 @@ def checked_boxes(name: str, boxes: Any) -> tuple[Floats, Ints]:
         raise ParameterError(
             name,
             f"must have the shape (n, 4) or, with classes, (n, 5), got {numbers.shape}",
-            cure="x0, y0, x1, y1, class",
+            hint="x0, y0, x1, y1, class",
         )
     is_flat = (numbers[:, 2:4] <= numbers[:, :2]).any(axis=1)
     if is_flat.any():

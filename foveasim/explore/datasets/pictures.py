@@ -1,4 +1,4 @@
-"""Pictures of a data set, one at a time: of a folder, a zip file, an array, or anything that has a length and items."""
+"""Pictures of a dataset, one at a time: of a folder, a zip file, an array, or anything that has a length and items."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def source_of(pictures: Any) -> Source:
     FileError
         When there is no such file, or no picture in it.
     ParameterError
-        When it is none of what a data set takes.
+        When it is none of what a dataset takes.
     """
     if isinstance(pictures, Source):
         return pictures

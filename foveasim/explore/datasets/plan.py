@@ -1,4 +1,4 @@
-"""A data set in a YAML file: pictures, a shot, what is drawn, labels."""
+"""A dataset in a YAML file: pictures, a shot, what is drawn, labels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from foveasim._io.yaml_files import read_yaml
 from foveasim.config import files_from, picture_path, validated
-from foveasim.explore.datasets.dataset import DataSet
+from foveasim.explore.datasets.dataset import Dataset
 from foveasim.explore.datasets.label_files import (
     FLOW_ENDINGS,
     MASK_ENDINGS,
@@ -23,33 +23,33 @@ from foveasim.explore.datasets.pictures import Source, source_of
 from foveasim.explore.datasets.recipes import classification, denoising
 from foveasim.explore.sweeps.plan import telling
 
-__all__ = ["DataSetFile", "DataSetSection", "read_data_set"]
+__all__ = ["DatasetFile", "DatasetSection", "read_dataset"]
 
 #: What a file may say in the place of distributions of its own.
-RECIPES: dict[str | None, Callable[..., DataSet]] = {
-    None: DataSet,
+RECIPES: dict[str | None, Callable[..., Dataset]] = {
+    None: Dataset,
     "classification": classification,
     "denoising": denoising,
 }
 #: Of a distribution, in the unit of its setting.
 _Numbers = list[float]
-#: Keys that a data set's call has too.
+#: Keys that a dataset's call has too.
 SAME = ("cameras", "draws", "seed", "fields", "fit")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class DataSetFile:
+class DatasetFile:
     """
-    A data set with what its file says about it.
+    A dataset with what its file says about it.
 
     Attributes
     ----------
-    data_set : DataSet
+    dataset : Dataset
     per_shard : int or None
         Samples of a shard, where it says so.
     """
 
-    data_set: DataSet
+    dataset: Dataset
     per_shard: int | None
 
 
@@ -65,8 +65,8 @@ class _Distribution(BaseModel):
     weights: _Numbers | None = Field(None, description="of a choice: its chances are in proportion to them")
 
 
-class DataSetSection(BaseModel):
-    """A data set: pictures, a shot, what is drawn of its settings, how often, labels, shards."""
+class DatasetSection(BaseModel):
+    """A dataset: pictures, a shot, what is drawn of its settings, how often, labels, shards."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     pictures: str | list[str] = Field(description="a folder, a zip file, an array (.npy), or a list of files")
@@ -92,17 +92,17 @@ class DataSetSection(BaseModel):
     per_shard: int | None = Field(None, ge=1, description="samples of a shard")
 
 
-def read_data_set(path: str | Path, *, n_threads: int = 1) -> DataSetFile:
+def read_dataset(path: str | Path, *, n_threads: int = 1) -> DatasetFile:
     """
-    Read a YAML file of a data set, and make ready what it describes.
+    Read a YAML file of a dataset, and make ready what it describes.
 
     Parameters
     ----------
     path : path
         With the keys ``pictures`` (a folder, a zip file, an array, or a list of files), ``shot`` (a file beside it, or the
-        settings themselves), ``vary`` (distributions by settings' paths, as for :func:`draw_of`), ``recipe``
+        settings themselves), ``vary`` (distributions by settings' paths, as for :func:`parse_distribution`), ``recipe``
         (``classification`` or ``denoising``), ``cameras``, ``draws``, ``seed``, ``fields`` and ``fit`` (as for
-        :class:`DataSet`), ``labels`` (a CSV file with the columns ``picture`` and ``label``, an array, or a list), ``boxes`` (a
+        :class:`Dataset`), ``labels`` (a CSV file with the columns ``picture`` and ``label``, an array, or a list), ``boxes`` (a
         JSON file as COCO has it), ``masks`` and ``flows`` (folders with a file of each picture's name), ``per_shard``, and
         ``set`` (settings to be replaced in all samples). Files are looked for beside it; ``skimage:astronaut`` and its like are
         the pictures that come with scikit-image. In files of labels, pictures have the names that they have in their folder,
@@ -112,7 +112,7 @@ def read_data_set(path: str | Path, *, n_threads: int = 1) -> DataSetFile:
 
     Returns
     -------
-    DataSetFile
+    DatasetFile
 
     Raises
     ------
@@ -122,13 +122,13 @@ def read_data_set(path: str | Path, *, n_threads: int = 1) -> DataSetFile:
         When pictures or labels cannot be read, or do not go together.
     """
     path = Path(path)
-    section: DataSetSection = validated(path, DataSetSection, read_yaml(path))
+    section: DatasetSection = validated(path, DatasetSection, read_yaml(path))
     folder = path.parent
     source = _pictures(path, section.pictures)
     options = {name: value for name in SAME if (value := getattr(section, name)) is not None}
     labels = _labels(folder, section, source)
     with telling(path):
-        data_set = RECIPES[section.recipe](
+        dataset = RECIPES[section.recipe](
             source,
             folder / section.shot if isinstance(section.shot, str) else section.shot,
             {name: _distribution(folder, name, told) for name, told in section.vary.items()},
@@ -138,7 +138,7 @@ def read_data_set(path: str | Path, *, n_threads: int = 1) -> DataSetFile:
             **options,
             **labels,
         )
-    return DataSetFile(data_set=data_set, per_shard=section.per_shard)
+    return DatasetFile(dataset=dataset, per_shard=section.per_shard)
 
 
 def _pictures(path: Path, pictures: str | list[str]) -> Source:
@@ -148,8 +148,8 @@ def _pictures(path: Path, pictures: str | list[str]) -> Source:
         return source_of([picture_path(path, name, f"pictures.{k}").absolute() for k, name in enumerate(pictures)])
 
 
-def _labels(folder: Path, section: DataSetSection, pictures: Source) -> Mapping[str, Any]:
-    """What a data set's call is given of labels."""
+def _labels(folder: Path, section: DatasetSection, pictures: Source) -> Mapping[str, Any]:
+    """What a dataset's call is given of labels."""
     names = [pictures.key(k) for k in range(len(pictures))]
     found: dict[str, Any] = {}
     if isinstance(section.labels, str):
@@ -166,6 +166,6 @@ def _labels(folder: Path, section: DataSetSection, pictures: Source) -> Mapping[
 
 
 def _distribution(folder: Path, path: str, told: _Distribution) -> dict[str, Any]:
-    """A distribution as plain data, with the files that choices name beside the data set's."""
+    """A distribution as plain data, with the files that choices name beside the dataset's."""
     given = told.model_dump(exclude_none=True)
     return {kind: files_from(folder, values, path) if kind == "choice" else values for kind, values in given.items()}

@@ -11,7 +11,7 @@ import numpy as np
 from foveasim._core.extras import needs
 from foveasim.errors import ParameterError
 
-__all__ = ["torch_data_set"]
+__all__ = ["torch_dataset"]
 
 
 class Samples(Protocol):
@@ -22,13 +22,13 @@ class Samples(Protocol):
     def __getitem__(self, index: int, /) -> Any: ...
 
 
-def torch_data_set(data_set: Samples, transform: Callable[[dict[str, Any]], Any] | None = None) -> Any:
+def torch_dataset(dataset: Samples, transform: Callable[[dict[str, Any]], Any] | None = None) -> Any:
     """
     A map-style ``torch.utils.data.Dataset`` whose samples have tensors in the place of arrays.
 
     Parameters
     ----------
-    data_set : DataSet or StoredSamples
+    dataset : Dataset or StoredSamples
         Those need no torch, and ``DataLoader`` takes them as they are; this is for programs that ask for torch's own class.
     transform : callable, optional
         What becomes of each sample; for workers it must be possible to pickle it.
@@ -47,9 +47,9 @@ def torch_data_set(data_set: Samples, transform: Callable[[dict[str, Any]], Any]
     --------
     ::
 
-        loader = torch.utils.data.DataLoader(torch_data_set(data_set), batch_size=32, shuffle=True, num_workers=4)
+        loader = torch.utils.data.DataLoader(torch_dataset(dataset), batch_size=32, shuffle=True, num_workers=4)
     """
-    return _kind()(data_set, transform)
+    return _kind()(dataset, transform)
 
 
 @cache
@@ -58,7 +58,7 @@ def _kind() -> Any:
     try:
         import torch  # type: ignore[import-not-found,unused-ignore]
     except ImportError:
-        raise ParameterError("torch_data_set", needs("torch")) from None
+        raise ParameterError("torch_dataset", needs("torch")) from None
 
     def tensor(value: Any) -> Any:
         if not isinstance(value, np.ndarray):
@@ -66,20 +66,20 @@ def _kind() -> Any:
         return torch.from_numpy(value.astype(np.int32) if value.dtype == np.uint16 else value)
 
     class TorchDataSet(torch.utils.data.Dataset):  # type: ignore[misc,unused-ignore]
-        """Samples of another data set with tensors in the place of arrays."""
+        """Samples of another dataset with tensors in the place of arrays."""
 
-        def __init__(self, data_set: Samples, transform: Callable[[dict[str, Any]], Any] | None) -> None:
-            self.data_set, self.transform = data_set, transform
+        def __init__(self, dataset: Samples, transform: Callable[[dict[str, Any]], Any] | None) -> None:
+            self.dataset, self.transform = dataset, transform
 
         def __reduce__(self) -> tuple[Any, ...]:
             # A class made in a function is not found by its name.
-            return torch_data_set, (self.data_set, self.transform)
+            return torch_dataset, (self.dataset, self.transform)
 
         def __len__(self) -> int:
-            return len(self.data_set)
+            return len(self.dataset)
 
         def __getitem__(self, index: int) -> Any:
-            sample = {name: tensor(value) for name, value in self.data_set[index].items()}
+            sample = {name: tensor(value) for name, value in self.dataset[index].items()}
             return sample if self.transform is None else self.transform(sample)
 
     return TorchDataSet

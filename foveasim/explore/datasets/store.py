@@ -1,4 +1,4 @@
-"""Data sets as files: shard by shard, each written whole, by as many processes as one likes, and gone on with after any end."""
+"""Datasets as files: shard by shard, each written whole, by as many processes as one likes, and gone on with after any end."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from foveasim._core.threads import thread_count
 from foveasim._core.validation import check_count
 from foveasim._io.atomic import atomic_directory, atomic_write
 from foveasim.errors import FileError, FoveasimWarning, ParameterError, SimulationError
-from foveasim.explore.datasets.dataset import DataSet
+from foveasim.explore.datasets.dataset import Dataset
 from foveasim.explore.executor import KILLED, executor
 
-__all__ = ["StoredSamples", "open_data_set", "write_data_set"]
+__all__ = ["StoredSamples", "open_dataset", "write_dataset"]
 
-FORMAT, VERSION = "foveasim data set", 2
-ZARR, ABOUT = ".zarr", "data_set.json"
+FORMAT, VERSION = "foveasim dataset", 2
+ZARR, ABOUT = ".zarr", "dataset.json"
 #: Bytes of the samples of a shard, about, and how many they are at most: one process has them in memory.
 SHARD_BYTES, LARGEST_SHARD = 1 << 26, 512
-#: Shards of a data set, at least, so that many processes can write it and little is lost with one.
+#: Shards of a dataset, at least, so that many processes can write it and little is lost with one.
 FEWEST_SHARDS = 32
 #: Shards of a zarr folder that a process keeps when it reads: those met last.
 KEPT_SHARDS = 4
@@ -46,24 +46,24 @@ ALONE_S = 10.0
 NEEDS_ZARR = needs("zarr", "explore")
 
 #: Told how many samples are written, of how many.
-Tell = Callable[[int, int], None]
+Progress = Callable[[int, int], None]
 
 
-def write_data_set(
-    data_set: DataSet,
+def write_dataset(
+    dataset: Dataset,
     path: str | Path,
     *,
     per_shard: int | None = None,
     workers: int | None = 1,
     scheduler: str | None = None,
-    tell: Tell | None = None,
+    progress: Progress | None = None,
 ) -> StoredSamples:
     """
     Simulate all samples and write them, or go on where this was ended.
 
     Parameters
     ----------
-    data_set : DataSet
+    dataset : Dataset
     path : path
         ``.zarr``: a zarr folder with an array for each part of the samples, and a chunk of it for each shard. Without an
         ending: a folder of tar files ``shard-000000.tar`` ..., as WebDataset reads them, with the arrays (``.npz``), the rest
@@ -77,7 +77,7 @@ def write_data_set(
     scheduler : str, optional
         Address of a dask scheduler instead, such as ``"tcp://10.0.0.1:8786"``, whose workers have this package and see the
         pictures and the path under the same names.
-    tell : callable, optional
+    progress : callable, optional
         Called with the numbers of samples that are written and of all.
 
     Returns
@@ -108,33 +108,32 @@ def write_data_set(
         per_shard = check_count("per_shard", per_shard)
     kind = _kind_of(target)
     if kind is _ZarrShards:
-        if data_set.is_layout_varied:
+        if dataset.is_layout_varied:
             raise ParameterError(
                 "layout", "must not vary in a zarr folder, whose arrays have one length; take a folder of tar files"
             )
         _zarr(target)
-    plan = json.loads(json.dumps(data_set.to_dict()))
+    plan = json.loads(json.dumps(dataset.to_dict()))
     about = _about_of(target) if os.path.exists(target) else None  # noqa: PTH110 -- also where it must not be looked for
     if about is None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the shard of the first sample tells them
-            first = data_set[0]
+            first = dataset[0]
         n_bytes = max(1, sum(value.nbytes for value in first.values() if isinstance(value, np.ndarray)))
         about = {
             "format": FORMAT,
             "version": VERSION,
-            "n_samples": len(data_set),
-            "per_shard": per_shard
-            or max(1, min(SHARD_BYTES // n_bytes, LARGEST_SHARD, len(data_set) // FEWEST_SHARDS)),
+            "n_samples": len(dataset),
+            "per_shard": per_shard or max(1, min(SHARD_BYTES // n_bytes, LARGEST_SHARD, len(dataset) // FEWEST_SHARDS)),
             "has_label": "label" in first,
-            "class_names": data_set.class_names,
+            "class_names": dataset.class_names,
             "plan": plan,
         }
-        kind.begin(target, about, data_set, first)
+        kind.begin(target, about, dataset, first)
     else:
         _check_same(target, about, plan, per_shard)
-    _write_shards(data_set, kind(target, about), scheduler, workers, tell)
-    return open_data_set(target)
+    _write_shards(dataset, kind(target, about), scheduler, workers, progress)
+    return open_dataset(target)
 
 
 def _check_same(target: Path, about: Mapping[str, Any], plan: Mapping[str, Any], per_shard: int | None) -> None:
@@ -143,12 +142,12 @@ def _check_same(target: Path, about: Mapping[str, Any], plan: Mapping[str, Any],
         different = "per_shard"
     if different is not None:
         raise FileError(
-            target, f"is another data set: its {different!r} differs; write this one elsewhere, or remove that one"
+            target, f"is another dataset: its {different!r} differs; write this one elsewhere, or remove that one"
         )
 
 
 def _write_shards(
-    data_set: DataSet, shards: _Shards, scheduler: str | None, workers: int | None, tell: Tell | None
+    dataset: Dataset, shards: _Shards, scheduler: str | None, workers: int | None, progress: Progress | None
 ) -> None:
     """Write all shards that are not done, when those that are done are of the same pictures."""
     left = []
@@ -156,23 +155,23 @@ def _write_shards(
         made_of = shards.made_of(k)
         if not made_of:
             left.append(k)
-        elif made_of != data_set.digest(shards.samples(k)):
+        elif made_of != dataset.digest(shards.samples(k)):
             samples = shards.samples(k)
             raise FileError(
                 shards.folder,
                 f"is of other pictures, masks or flows: those of its samples {samples[0]} to {samples[-1]} hold something "
-                "else now; write this data set elsewhere, or remove that one",
+                "else now; write this dataset elsewhere, or remove that one",
             )
     n, n_done = shards.n_samples, shards.n_samples - sum(len(shards.samples(k)) for k in left)
     told: list[str] = []
-    if tell is not None:
-        tell(n_done, n)
-    with closing(_written(data_set, shards, left, scheduler, workers)) as written:
+    if progress is not None:
+        progress(n_done, n)
+    with closing(_written(dataset, shards, left, scheduler, workers)) as written:
         for k, own in written:
             told += own
             n_done += len(shards.samples(k))
-            if tell is not None:
-                tell(n_done, n)
+            if progress is not None:
+                progress(n_done, n)
     if told:
         warnings.warn(
             f"{len(told):,} of the samples written have warnings, such as: {min(told)}",
@@ -182,10 +181,10 @@ def _write_shards(
 
 
 def _written(
-    data_set: DataSet, shards: _Shards, left: Sequence[int], scheduler: str | None, workers: int | None
+    dataset: Dataset, shards: _Shards, left: Sequence[int], scheduler: str | None, workers: int | None
 ) -> Generator[tuple[int, list[str]], None, None]:
     """Shards as they are written, with the warnings of their samples."""
-    write = _ShardWriter(data_set, shards)
+    write = _ShardWriter(dataset, shards)
     begun_s = time.monotonic()
     n_done = 0
     if scheduler is None and workers in (None, 1):
@@ -212,14 +211,14 @@ def _written(
 class _ShardWriter:
     """Simulates the samples of a shard and writes it, and gives their warnings."""
 
-    def __init__(self, data_set: DataSet, shards: _Shards) -> None:
-        self._data_set, self._shards = data_set, shards
+    def __init__(self, dataset: Dataset, shards: _Shards) -> None:
+        self._dataset, self._shards = dataset, shards
 
     def __call__(self, k: int) -> list[str]:
-        made_of = self._data_set.digest(self._shards.samples(k))
+        made_of = self._dataset.digest(self._shards.samples(k))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they are reported at the end, together
-            samples = [self._data_set[index] for index in self._shards.samples(k)]
+            samples = [self._dataset[index] for index in self._shards.samples(k)]
         try:
             self._shards.write(k, samples, made_of)
         except OSError as error:
@@ -235,9 +234,9 @@ class _ShardWriter:
 
 class StoredSamples:
     """
-    Samples in files: the same mappings, bit for bit, as those of the :class:`DataSet` that was written.
+    Samples in files: the same mappings, bit for bit, as those of the :class:`Dataset` that was written.
 
-    Has a length and items, and so is a map-style data set too.
+    Has a length and items, and so is a map-style dataset too.
 
     Attributes
     ----------
@@ -288,9 +287,9 @@ class StoredSamples:
         return names
 
 
-def open_data_set(path: str | Path) -> StoredSamples:
+def open_dataset(path: str | Path) -> StoredSamples:
     """
-    Open what :func:`write_data_set` wrote; samples are read as they are asked for.
+    Open what :func:`write_dataset` wrote; samples are read as they are asked for.
 
     Raises
     ------
@@ -309,12 +308,12 @@ def open_data_set(path: str | Path) -> StoredSamples:
     shards = stored._shards  # noqa: SLF001 -- its own
     n_done = sum(shards.is_done(k) for k in range(shards.n_shards))
     if n_done < shards.n_shards:
-        raise FileError(source, f"has {n_done} of {shards.n_shards} shards; write the same data set there to go on")
+        raise FileError(source, f"has {n_done} of {shards.n_shards} shards; write the same dataset there to go on")
     return stored
 
 
 def _about_of(target: Path) -> dict[str, Any]:
-    """What a folder says of its data set."""
+    """What a folder says of its dataset."""
     is_zarr = target.suffix.lower() == ZARR
     file = target / ("zarr.json" if is_zarr else ABOUT)
     about: Any = None
@@ -324,7 +323,7 @@ def _about_of(target: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError):
         pass
     if not isinstance(about, dict) or about.get("format") != FORMAT:
-        raise FileError(target, "holds something else than a data set")
+        raise FileError(target, "holds something else than a dataset")
     if about.get("version") != VERSION:
         raise FileError(target, f"has the format version {about.get('version')}, expected {VERSION}")
     return about
@@ -359,7 +358,7 @@ class _Shards:
         self.has_label = bool(about["has_label"])
 
     @staticmethod
-    def begin(target: Path, about: Mapping[str, Any], data_set: DataSet, first: Mapping[str, Any]) -> None:
+    def begin(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:
         """Make the folder for samples like the first."""
         raise NotImplementedError
 
@@ -395,11 +394,11 @@ class _TarShards(_Shards):
         return self.__dict__ | {"_places": {}}
 
     @staticmethod
-    def begin(target: Path, about: Mapping[str, Any], data_set: DataSet, first: Mapping[str, Any]) -> None:  # noqa: ARG004 -- for all kinds alike
+    def begin(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:  # noqa: ARG004 -- for all kinds alike
         with atomic_directory(target, is_ours=lambda _: False) as new:
             (new / ABOUT).write_text(json.dumps(about, indent=1), encoding="utf-8")
-            if not data_set.is_layout_varied:
-                data_set.layout.write(new / "layout.npz")
+            if not dataset.is_layout_varied:
+                dataset.layout.write(new / "layout.npz")
 
     def _file(self, k: int) -> Path:
         return self.folder / f"shard-{k:06d}.tar"
@@ -469,7 +468,7 @@ class _ZarrShards(_Shards):
         return self.__dict__ | {"_opened": None, "_read": {}}
 
     @staticmethod
-    def begin(target: Path, about: Mapping[str, Any], data_set: DataSet, first: Mapping[str, Any]) -> None:
+    def begin(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:
         zarr = _zarr(target)
         n, per_shard = about["n_samples"], about["per_shard"]
         n_shards = -(-n // per_shard)
@@ -493,11 +492,11 @@ class _ZarrShards(_Shards):
                 fill_value=0,
                 compressors=None,
             )
-            layout = data_set.layout
+            layout = dataset.layout
             for name in ("xy_um", "ring_offsets", "site_offsets"):
                 group.create_array(f"layout/{name}", data=np.asarray(getattr(layout, name)))
-            group.create_array("layout/filter_of_site", data=np.asarray(data_set.shot(0).camera.sensor.filter_of_site))
-            # With this the folder is a data set.
+            group.create_array("layout/filter_of_site", data=np.asarray(dataset.shot(0).camera.sensor.filter_of_site))
+            # With this the folder is a dataset.
             group.attrs.update(about)
 
     def _arrays(self) -> dict[str, Any]:

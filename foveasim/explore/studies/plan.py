@@ -264,7 +264,7 @@ def _check_given(place: str, names: Iterable[str], metrics: Iterable[str]) -> No
                 place,
                 f"must be results of metrics ({', '.join(metrics)}), or of 'metrics' that are given",
                 name,
-                cure="functions of your own are given in Python, or with --metric module:function",
+                hint="functions of your own are given in Python, or with --metric module:function",
             )
 
 

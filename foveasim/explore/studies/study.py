@@ -51,7 +51,7 @@ def study(
     name: str = "study",
     scheduler: str | None = None,
     workers: int | None = None,
-    tell: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> optuna.Study:
     """
     Search the settings that make a shot best.
@@ -83,7 +83,7 @@ def study(
         Address of a dask scheduler, whose workers have this package and see the files that the settings name.
     workers : int, optional
         Processes of this machine instead. By default trials are computed in this process.
-    tell : callable, optional
+    progress : callable, optional
         Called with the numbers of trials that are done and of all.
 
     Returns
@@ -117,7 +117,7 @@ def study(
         batch=batch,
         name=name,
     )
-    return run_study(plan, storage=storage, scheduler=scheduler, workers=workers, tell=tell)
+    return run_study(plan, storage=storage, scheduler=scheduler, workers=workers, progress=progress)
 
 
 def run_study(
@@ -126,7 +126,7 @@ def run_study(
     storage: str | Path | None = None,
     scheduler: str | None = None,
     workers: int | None = None,
-    tell: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> optuna.Study:
     """
     Run a study that was planned, or go on with one that was ended.
@@ -134,7 +134,7 @@ def run_study(
     Parameters
     ----------
     plan : StudyPlan
-    storage, scheduler, workers, tell
+    storage, scheduler, workers, progress
         As for :func:`study`.
 
     Returns
@@ -165,8 +165,8 @@ def run_study(
         with executor(runner, what="the metrics", users=users, scheduler=scheduler, workers=workers) as run:
             n_done = len(finished_trials(found))
             while n_done < plan.n_trials:
-                if tell is not None:
-                    tell(n_done, plan.n_trials)
+                if progress is not None:
+                    progress(n_done, plan.n_trials)
                 with _using(storage, n_done):
                     trials = trials or [_asked(optuna, found, plan, n_done + k) for k in range(plan.batch)]
                     _check_writer(optuna, storage, trials[-1], token)
@@ -183,8 +183,8 @@ def run_study(
                         )
                 n_done += len(trials)
                 trials = []
-    if tell is not None:
-        tell(plan.n_trials, plan.n_trials)
+    if progress is not None:
+        progress(plan.n_trials, plan.n_trials)
     return found
 
 
@@ -262,7 +262,7 @@ def _store_result(
     objectives: Sequence[str],
     constraints: Limits,
 ) -> None:
-    """Tell a study what a trial gave."""
+    """Progress a study what a trial gave."""
     numbers: dict[str, float] = {}
     error = record.error
     for name in (*objectives, *constraints):

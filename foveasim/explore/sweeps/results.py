@@ -1,4 +1,4 @@
-"""Records of points as one labelled data set, and the zarr store that it is kept in."""
+"""Records of points as one labelled dataset, and the zarr store that it is kept in."""
 
 from __future__ import annotations
 

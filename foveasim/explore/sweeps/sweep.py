@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["run_sweep", "sweep"]
 
 #: Told how many points are done, of how many.
-Tell = Callable[[int, int], None]
+Progress = Callable[[int, int], None]
 
 
 def sweep(
@@ -41,7 +41,7 @@ def sweep(
     scheduler: str | None = None,
     workers: int | None = None,
     retry: bool = False,
-    tell: Tell | None = None,
+    progress: Progress | None = None,
 ) -> xr.Dataset:
     """
     Take a shot with many settings, and tabulate metrics over them.
@@ -50,7 +50,7 @@ def sweep(
     ----------
     shot, vary, mode, repeats, seed, metrics, changes
         As for :func:`plan_sweep`.
-    out, scheduler, workers, retry, tell
+    out, scheduler, workers, retry, progress
         As for :func:`run_sweep`.
 
     Returns
@@ -75,7 +75,7 @@ def sweep(
         results["snr_mean"].mean("repeat")
     """
     plan = plan_sweep(shot, vary, mode=mode, repeats=repeats, seed=seed, metrics=metrics, changes=changes)
-    return run_sweep(plan, out=out, scheduler=scheduler, workers=workers, retry=retry, tell=tell)
+    return run_sweep(plan, out=out, scheduler=scheduler, workers=workers, retry=retry, progress=progress)
 
 
 def run_sweep(
@@ -85,7 +85,7 @@ def run_sweep(
     scheduler: str | None = None,
     workers: int | None = None,
     retry: bool = False,
-    tell: Tell | None = None,
+    progress: Progress | None = None,
 ) -> xr.Dataset:
     """
     Run a sweep that was planned, or go on with one that was ended.
@@ -104,7 +104,7 @@ def run_sweep(
         Number of those processes; by default one a core.
     retry : bool
         Whether points that failed before are tried again; all of them, where there is a store without its journal.
-    tell : callable, optional
+    progress : callable, optional
         Called with the numbers of points that are done and of all.
 
     Returns
@@ -131,7 +131,7 @@ def run_sweep(
         workers = check_count("workers", workers, at_most=1024)
     if out is None:
         records: dict[int, Record] = {}
-        _run(plan, records, lambda record: records.update({record.point: record}), scheduler, workers, tell)
+        _run(plan, records, lambda record: records.update({record.point: record}), scheduler, workers, progress)
         return dataset_of(plan, records)
     store = Path(out)
     check_store(store)
@@ -147,7 +147,7 @@ def run_sweep(
         if retry:
             for point in [point for point, record in journal.records.items() if record.error]:
                 del journal.records[point]
-        _run(plan, journal.records, journal.add, scheduler, workers, tell)
+        _run(plan, journal.records, journal.add, scheduler, workers, progress)
         dataset = dataset_of(plan, journal.records)
         write_store(dataset, store)
         if not (dataset["error"] != "").any():
@@ -161,7 +161,7 @@ def _run(
     add: Callable[[Record], None],
     scheduler: str | None,
     workers: int | None,
-    tell: Tell | None,
+    progress: Progress | None,
 ) -> None:
     """Do all points that are not known."""
     n_left = plan.n_points - len(known)
@@ -180,13 +180,13 @@ def _run(
         with executor(
             _Points(replace(plan), runner), what="the metrics", users=users, scheduler=scheduler, workers=n_workers
         ) as run:
-            if tell is not None:
-                tell(n_done, plan.n_points)
+            if progress is not None:
+                progress(n_done, plan.n_points)
             for point, record in run(points[is_left].tolist(), np.unique(cuts).tolist()):
                 add(Record(point, {}, ENDED_ITS_WORKER) if record is KILLED else record)
                 n_done += 1
-                if tell is not None:
-                    tell(n_done, plan.n_points)
+                if progress is not None:
+                    progress(n_done, plan.n_points)
     except SimulationError as error:
         raise SimulationError(
             f"{error}; {n_done:,} of {plan.n_points:,} points are done, and a sweep with a store goes on from there"

@@ -6,7 +6,7 @@ from foveasim._core.registry import import_all
 from foveasim.layout.drc.measurements import RULES, Case, Measured, Rule
 from foveasim.layout.drc.presets import PRESETS, Preset
 from foveasim.layout.drc.repair import Change, enforce
-from foveasim.layout.drc.routing import Readout, Routing, crossings
+from foveasim.layout.drc.routing import Readout, Routing, track_demand
 from foveasim.layout.drc.rules import DesignRules, Report, RuleResult, Violation, check, min_width_um
 
 __all__ = [
@@ -24,9 +24,9 @@ __all__ = [
     "RuleResult",
     "Violation",
     "check",
-    "crossings",
     "enforce",
     "min_width_um",
+    "track_demand",
 ]
 
 import_all(__name__, __path__)

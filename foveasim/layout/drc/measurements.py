@@ -18,7 +18,7 @@ from foveasim._core.threads import each, thread_count
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.layout._noding import noded_edges
 from foveasim.layout.adjacency import TOUCHING_UM
-from foveasim.layout.drc.routing import crossings
+from foveasim.layout.drc.routing import track_demand
 from foveasim.layout.model import Layout
 
 if TYPE_CHECKING:
@@ -189,7 +189,7 @@ class Rule:
 
     Parameters
     ----------
-    sentence : str
+    description : str
         What a layout satisfies, for reports.
     unit : str
         Of values and limit.
@@ -206,7 +206,7 @@ class Rule:
         dropping it; neither.
     """
 
-    sentence: str
+    description: str
     unit: str
     measure: Callable[[Case], Measured | Floats]
     is_upper: bool = False
@@ -495,7 +495,7 @@ def _data_rates(case: Case) -> Measured:
 def _track_uses(case: Case) -> Measured:
     """Wherever lines begin, the lines that must cross over the tracks that they have."""
     assert case.rules.routing is not None
-    found = crossings(case.layout, case.rules.routing)
+    found = track_demand(case.layout, case.rules.routing)
     use = np.divide(found.n_nets, found.n_tracks, out=np.full(found.n_nets.size, np.inf), where=found.n_tracks > 0)
 
     def markers(positions: Ints) -> list[Any]:
@@ -559,7 +559,7 @@ for _name, _rule in {
     "max_data_rate_gbit_per_s": Rule(
         "a lane carries at most the limit", "Gbit/s", _data_rates, is_upper=True, rounding=0.0, mended_by=None
     ),
-    "max_track_use": Rule(
+    "max_track_utilisation": Rule(
         "readout lines have tracks to get out", "", _track_uses, is_upper=True, rounding=0.0, mended_by=None
     ),
 }.items():

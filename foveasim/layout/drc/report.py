@@ -26,12 +26,12 @@ MAX_BYTES = 2**29
 #: How many bytes of a file's beginning tell what it is.
 HEAD_BYTES = 512
 #: What write_lyrdb puts into a category's description, and into an item's text.
-LIMIT = re.compile(r"^(?P<sentence>.*) \(limit (?P<limit>\S+) ?(?P<unit>[^)]*)\)$", re.DOTALL)
+LIMIT = re.compile(r"^(?P<description>.*) \(limit (?P<limit>\S+) ?(?P<unit>[^)]*)\)$", re.DOTALL)
 FOUND = re.compile(r"photosite (?P<sites>\d+(?:, \d+)*): (?P<value>\S+) ?(?P<unit>[^']*)")
 #: Points of one ring, edge or box of a marker.
 POINTS = re.compile(r"\(([^()]*)\)")
 
-#: A rule's sentence, limit and unit; a place's sites, value and marker.
+#: A rule's description, limit and unit; a place's sites, value and marker.
 _Told: TypeAlias = tuple[str, float, str]
 _Found: TypeAlias = tuple[tuple[int, ...], float, Any]
 
@@ -65,7 +65,7 @@ def write_lyrdb(report: Report, path: str | Path) -> None:
     cell = database.create_cell(CELL_NAME).rdb_id()
     for result in report.results:
         category = database.create_category(result.rule)
-        category.description = f"{result.sentence} (limit {result.limit:g} {result.unit})"
+        category.description = f"{result.description} (limit {result.limit:g} {result.unit})"
         for violation in result.violations:
             item = database.create_item(cell, category.rdb_id())
             sites = ", ".join(map(str, violation.site_ids))
@@ -147,7 +147,7 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
     about: dict[str, _Told] = {}
     for name, category in _categories(root):
         told = LIMIT.match(category.findtext("description") or "")
-        about[name] = (told["sentence"], _number(told["limit"]), told["unit"]) if told else (name, np.nan, "")
+        about[name] = (told["description"], _number(told["limit"]), told["unit"]) if told else (name, np.nan, "")
         found[name] = []
     for item in root.iterfind("items/item"):
         name = (item.findtext("category") or "").strip().strip("'")
@@ -163,10 +163,10 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
 def _result(name: str, about: _Told, items: list[_Found]) -> Any:
     from foveasim.layout.drc.rules import RuleResult
 
-    sentence, limit, unit = about
+    description, limit, unit = about
     values = np.array([value for _, value, _ in items], dtype=np.float64)
     places = ([sites for sites, _, _ in items], [marker for _, _, marker in items])
-    return RuleResult(name, sentence, limit, unit, values, None, lambda: places)
+    return RuleResult(name, description, limit, unit, values, None, lambda: places)
 
 
 def _categories(root: Any, parent: str = "") -> list[tuple[str, Any]]:

@@ -11,7 +11,7 @@ import numpy as np
 from foveasim._core.validation import Floats, Ints, as_numbers, check_choice, check_count, check_length_um, check_number
 from foveasim.layout.model import Layout
 
-__all__ = ["Crossings", "Readout", "Routing", "crossings"]
+__all__ = ["Readout", "Routing", "TrackDemand", "track_demand"]
 
 #: Lines whose first sites end within this distance of each other start together.
 TOGETHER_UM = 1e-6
@@ -99,7 +99,7 @@ class Routing:
         return (self.n_layers * tracks).astype(np.int64)
 
 
-class Crossings(NamedTuple):
+class TrackDemand(NamedTuple):
     """
     The strips that lines must cross, one for each place where lines begin, from the inside out or upwards.
 
@@ -120,7 +120,7 @@ class Crossings(NamedTuple):
     strip: Ints
 
 
-def crossings(layout: Layout, routing: Routing) -> Crossings:
+def track_demand(layout: Layout, routing: Routing) -> TrackDemand:
     """
     Lines and tracks wherever lines begin.
 
@@ -142,7 +142,7 @@ def crossings(layout: Layout, routing: Routing) -> Crossings:
     line = layout.index_column("readout_line")
     if line.size == 0:
         nothing = np.zeros(0, np.int64)
-        return Crossings(np.zeros(0), nothing, nothing, nothing, nothing)
+        return TrackDemand(np.zeros(0), nothing, nothing, nothing, nothing)
     reach_um = np.hypot(*layout.xy_um.T) if routing.direction == "outwards" else layout.xy_um[:, 1]
     end_um = np.maximum.reduceat(reach_um, layout.ring_offsets[layout.site_offsets[:-1]])
     order = np.lexsort((end_um, line))
@@ -153,4 +153,4 @@ def crossings(layout: Layout, routing: Routing) -> Crossings:
     n_nets = np.cumsum(np.bincount(strip, minlength=place_um.size))
     x_min, _, x_max, _ = layout.bounds_um
     strips_um = 2.0 * math.pi * place_um if routing.direction == "outwards" else np.full(place_um.size, x_max - x_min)
-    return Crossings(place_um, n_nets, routing.n_tracks(strips_um), first_sites, strip)
+    return TrackDemand(place_um, n_nets, routing.n_tracks(strips_um), first_sites, strip)

@@ -39,7 +39,7 @@ NEEDS: dict[str, tuple[str, type | None]] = {
     "min_density": ("density_window_um", None),
     "max_density": ("density_window_um", None),
     "max_data_rate_gbit_per_s": ("readout", Readout),
-    "max_track_use": ("routing", Routing),
+    "max_track_utilisation": ("routing", Routing),
 }
 
 
@@ -91,9 +91,9 @@ class DesignRules:
         Largest data rate of one lane; needs ``readout``.
     readout : Readout, optional
         Frames, bits, blanking and lanes.
-    max_track_use : float, optional
+    max_track_utilisation : float, optional
         Largest number of readout lines for each track that they have, wherever lines begin; 1 where all must get out
-        (see :func:`foveasim.layout.crossings`); needs ``routing``.
+        (see :func:`foveasim.layout.track_demand`); needs ``routing``.
     routing : Routing, optional
         Tracks, layers and direction of the lines.
     waivers : mapping of str to str, optional
@@ -136,7 +136,7 @@ class DesignRules:
     density_window_um: float | None = None
     max_data_rate_gbit_per_s: float | None = None
     readout: Readout | None = None
-    max_track_use: float | None = None
+    max_track_utilisation: float | None = None
     routing: Routing | None = None
     waivers: Mapping[str, str] | None = None
     custom: Mapping[str, float] | None = None
@@ -234,7 +234,7 @@ class RuleResult:
 
     Attributes
     ----------
-    rule, sentence : str
+    rule, description : str
         Name, and what it asks.
     limit : float
         In ``unit``.
@@ -246,7 +246,7 @@ class RuleResult:
     """
 
     rule: str
-    sentence: str
+    description: str
     limit: float
     unit: str
     values: Floats
@@ -272,7 +272,7 @@ class RuleResult:
         found = self.violations
         places = ([v.site_ids for v in found], [v.marker for v in found])
         return RuleResult, (
-            self.rule, self.sentence, self.limit, self.unit, self.values, self.waiver, partial(tuple, places)
+            self.rule, self.description, self.limit, self.unit, self.values, self.waiver, partial(tuple, places)
         )  # fmt: skip
 
     @property
@@ -408,7 +408,7 @@ def check(layout: Layout, rules: DesignRules) -> Report:
         bound = 0.0 if rule.is_deviation else float(limit)
         values, places = _broken(rule, _measured(name, rule, case), bound, case)
         waiver = (rules.waivers or {}).get(name)
-        results.append(RuleResult(name, rule.sentence, bound, rule.unit, values, waiver, places))
+        results.append(RuleResult(name, rule.description, bound, rule.unit, values, waiver, places))
     return Report(layout.n_sites, tuple(results))
 
 

@@ -12,7 +12,7 @@ ending         format              what a round trip keeps
 .svg           SVG                 nothing: a drawing, written only
 =============  ==================  =================================================================================
 
-What a file does not hold of a layout's columns is told when it is written: :attr:`WrittenLayout.lost_columns`.
+What a file does not hold of a layout's columns is told when it is written: :attr:`WrittenLayout.dropped_columns`.
 Files are read by what they hold, whatever their ending; a file that is broken, cut short or hostile ends in one
 :class:`~foveasim.errors.FileError`.
 """
@@ -142,7 +142,7 @@ def write_layout(
     --------
     >>> from foveasim.layout import grid
     >>> written = write_layout(grid(n_x=3, n_y=3, pitch_um=2.0), "die.gds")  # doctest: +SKIP
-    >>> written.worst_move_um  # doctest: +SKIP
+    >>> written.max_displacement_um  # doctest: +SKIP
     0.0
     """
     path = Path(path)

@@ -58,41 +58,45 @@ class WrittenLayout:
         The file.
     n_sites : int
         Photosites in it.
-    worst_move_um : float, µm
+    max_displacement_um : float, µm
         How far rounding moved the vertex that it moved furthest.
     worst_area_error : float
         Change of a site's area by rounding, relative to its area, of the site with the largest.
-    lost_columns : tuple of str
+    dropped_columns : tuple of str
         Names of the columns that the file does not hold, sorted.
     """
 
     path: Path
     n_sites: int
-    worst_move_um: float
+    max_displacement_um: float
     worst_area_error: float
-    lost_columns: tuple[str, ...]
+    dropped_columns: tuple[str, ...]
 
 
-def lossless(layout: Layout, path: Path, lost_columns: tuple[str, ...] = ()) -> WrittenLayout:
+def lossless(layout: Layout, path: Path, dropped_columns: tuple[str, ...] = ()) -> WrittenLayout:
     """Report of a format that keeps every digit."""
     return WrittenLayout(
-        path=path, n_sites=layout.n_sites, worst_move_um=0.0, worst_area_error=0.0, lost_columns=lost_columns
+        path=path,
+        n_sites=layout.n_sites,
+        max_displacement_um=0.0,
+        worst_area_error=0.0,
+        dropped_columns=dropped_columns,
     )
 
 
-def rounding(layout: Layout, rounded_um: Floats, path: Path, lost_columns: tuple[str, ...] = ()) -> WrittenLayout:
+def rounding(layout: Layout, rounded_um: Floats, path: Path, dropped_columns: tuple[str, ...] = ()) -> WrittenLayout:
     """Report of a format that holds these vertices instead of the layout's, and not these columns."""
     if layout.n_sites == 0:
-        return lossless(layout, path, lost_columns)
+        return lossless(layout, path, dropped_columns)
     move_um = np.hypot(*(rounded_um - layout.xy_um).T)
     area_um2 = layout.area_um2
     error = site_area_um2(rounded_um, layout.ring_offsets, layout.site_offsets) / area_um2 - 1.0
     return WrittenLayout(
         path=path,
         n_sites=layout.n_sites,
-        worst_move_um=float(move_um.max()),
+        max_displacement_um=float(move_um.max()),
         worst_area_error=float(np.abs(error).max()),
-        lost_columns=lost_columns,
+        dropped_columns=dropped_columns,
     )
 
 
@@ -187,8 +191,8 @@ def check_header(path: Path, about: Any) -> dict[str, Any]:
     """
     if not isinstance(about, dict) or about.get("format") != FILE_FORMAT:
         got = about.get("format") if isinstance(about, dict) else None
-        cure = "; load it with Capture.load, whose .layout it holds" if got == "foveasim capture" else ""
-        raise FileError(path, f"is no {FILE_FORMAT}{cure}")
+        hint = "; load it with Capture.load, whose .layout it holds" if got == "foveasim capture" else ""
+        raise FileError(path, f"is no {FILE_FORMAT}{hint}")
     if about.get("version") != FILE_VERSION:
         raise FileError(path, f"has the format version {about.get('version')!r:.40}, expected {FILE_VERSION}")
     provenance = about.get("provenance")
@@ -209,7 +213,7 @@ def plain_columns(layout: Layout, format_name: str) -> dict[str, NDArray[Any]]:
     for name, column in layout.columns.items():
         if column.dtype.kind not in PLAIN_KINDS or (column.dtype.itemsize > 8 and column.dtype.kind == "f"):
             raise ParameterError(
-                name, f"of the type {column.dtype} cannot be kept in {format_name}", cure="write a .npz file"
+                name, f"of the type {column.dtype} cannot be kept in {format_name}", hint="write a .npz file"
             )
     return dict(layout.columns)
 

@@ -133,7 +133,7 @@ def write(layout: Layout, path: Path, *, layer: int = 1, dbu_um: float = DEFAULT
         else:
             library.write_gds(temporary, max_points=0, timestamp=TIMESTAMP)
         _check_end(temporary, is_oasis)
-    return replace(report, lost_columns=lost)
+    return replace(report, dropped_columns=lost)
 
 
 def _set_gds_properties(

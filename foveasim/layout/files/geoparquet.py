@@ -71,7 +71,7 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     pa, parquet = _pyarrow(path)
     columns = plain_columns(layout, "GeoParquet")
     if GEOMETRY in columns:
-        raise ParameterError(GEOMETRY, "is the name of the outlines in GeoParquet", cure="rename the column")
+        raise ParameterError(GEOMETRY, "is the name of the outlines in GeoParquet", hint="rename the column")
     column: dict[str, Any] = {
         "encoding": "WKB",
         "geometry_types": ["Polygon"],

@@ -65,7 +65,7 @@ def _checked(colours: Mapping[int, str]) -> dict[int, str]:
     for channel, colour in colours.items():
         if not isinstance(colour, str) or not COLOUR.fullmatch(colour):
             raise ParameterError(
-                f"colours[{channel!r:.20}]", "must be a name or #rrggbb", colour, cure='say "#c23b22" or "green"'
+                f"colours[{channel!r:.20}]", "must be a name or #rrggbb", colour, hint='say "#c23b22" or "green"'
             )
         checked[check_count("colours", channel, at_least=0)] = colour
     return checked

@@ -88,14 +88,14 @@ def foveal_cartesian(*, n_rings: int, ring_ratio: float, pitch_um: float, n_fove
     check_sites((2 * n_rings - 1) ** 2)
     ring_ratio = check_number("ring_ratio", ring_ratio, above=1.0 + RATIO_ROUNDING)
     pitch_um = check_length_um("pitch_um", pitch_um)
-    n_fovea = check_count("n_fovea", n_fovea, at_most=n_rings, cure="it is no larger than 'n_rings'")
+    n_fovea = check_count("n_fovea", n_fovea, at_most=n_rings, hint="it is no larger than 'n_rings'")
     n_growing = n_rings - n_fovea
     if math.log((n_fovea - 0.5) * pitch_um) + n_growing * math.log(ring_ratio) > math.log(MAX_LENGTH_UM):
         raise ParameterError(
             "ring_ratio",
             f"makes {n_growing} rings reach further than {MAX_LENGTH_UM:g} µm",
             ring_ratio,
-            cure="take a smaller ratio or fewer rings",
+            hint="take a smaller ratio or fewer rings",
         )
     xy_um, n_vertices = _outlines(n_rings, ring_ratio, pitch_um, n_fovea)
     n_sectors = np.maximum(1, 8 * np.arange(n_rings))

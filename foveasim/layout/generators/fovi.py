@@ -107,7 +107,7 @@ def _counts(r_um: Floats) -> Ints:
     """Sites on each ring but the last radius, which only tells the spacing of the one inside it."""
     spacing_um = 0.5 * (r_um[2:] - r_um[:-2])
     if not (np.diff(r_um) > 0.0).all():
-        raise ParameterError("n_rings", "must leave the rings some width", r_um.size - 2, cure="take fewer rings")
+        raise ParameterError("n_rings", "must leave the rings some width", r_um.size - 2, hint="take fewer rings")
     return np.concatenate(([1], np.ceil(2.0 * math.pi * r_um[1:-1] / spacing_um).astype(np.int64)))
 
 

@@ -138,7 +138,7 @@ def giotto(
             "n_theta",
             f"must be >= {MIN_SITES_PER_RHO * n_fovea}, three times 'n_fovea'",
             n_theta,
-            cure="or take fovea='none'",
+            hint="or take fovea='none'",
         )
     n_rings = n_rho - n_fovea
     n_per_rho = n_theta // n_fovea
@@ -181,7 +181,7 @@ def _log_ratio(n_rho: int, n_fovea: int, n_across: int) -> float:
 
     n_rho = check_count("n_rho", n_rho, at_least=2, at_most=MAX_SITES)
     n_fovea = check_count(
-        "n_fovea", n_fovea, at_most=n_rho - 1, cure="'n_rho' counts the fovea's rings and at least one around them"
+        "n_fovea", n_fovea, at_most=n_rho - 1, hint="'n_rho' counts the fovea's rings and at least one around them"
     )
     n_across = check_count("n_across", n_across, at_most=2**53)
     if n_across < 2 * n_rho:
@@ -189,7 +189,7 @@ def _log_ratio(n_rho: int, n_fovea: int, n_across: int) -> float:
             "n_across",
             f"must be > {2 * n_rho - 1}, the diameter of {n_rho} rings that do not grow",
             n_across,
-            cure="take more, or fewer rings",
+            hint="take more, or fewer rings",
         )
     n_rings = n_rho - n_fovea
     width = 0.5 * n_across - n_fovea + 0.5

@@ -101,7 +101,7 @@ def linear_fill_factor(
         raise ParameterError("width_um", "'trench_um' and 'fill_factor' say the same; give one of them")
     if width_um is not None:
         return (
-            check_length_um("width_um", width_um, at_most=pitch_um, cure="it is no larger than 'pitch_um'") / pitch_um
+            check_length_um("width_um", width_um, at_most=pitch_um, hint="it is no larger than 'pitch_um'") / pitch_um
         )
     if trench_um is not None:
         trench_um = check_number("trench_um", trench_um, at_least=0.0)

@@ -132,7 +132,7 @@ def log_polar(
     r_max_um = check_length_um("r_max_um", r_max_um)
     for name, length_um in (("min_size_um", min_size_um), ("r_min_um", r_min_um)):
         if length_um is not None:
-            check_length_um(name, length_um, at_most=r_max_um, cure="it is no larger than 'r_max_um'")
+            check_length_um(name, length_um, at_most=r_max_um, hint="it is no larger than 'r_max_um'")
     if r_min_um is None and min_size_um is None:
         raise ParameterError("r_min_um", "or 'min_size_um' must be given: without either the rings would never end")
     if n_rings is not None:
@@ -199,7 +199,7 @@ def _with_fovea(
             return annuli(np.concatenate((inside_um, radii_um[1:])), all_rings), n_sites
     raise ParameterError(
         "fovea", f"leaves no room for a site of {min_size_um:g} µm inside the first ring", filling,
-        cure="enlarge 'r_min_um', or leave it out",
+        hint="enlarge 'r_min_um', or leave it out",
     )  # fmt: skip
 
 
@@ -248,7 +248,7 @@ def _ring_radii_um(
     n = math.log(r_max_um * rounding / first_um) / math.log(ratio) if first_um < r_max_um else 0.0
     if (n + 1) * n_sectors > MAX_SITES:
         raise ParameterError(
-            "ring_ratio", f"gives more than {MAX_SITES} sites", ratio, cure="take a larger ratio or r_min_um"
+            "ring_ratio", f"gives more than {MAX_SITES} sites", ratio, hint="take a larger ratio or r_min_um"
         )
     radii_um = first_um * np.power(ratio, np.arange((int(n) if n_rings is None else n_rings) + 1))
     radii_um = radii_um[radii_um >= smallest_um]

@@ -87,7 +87,7 @@ def octagonal(
             "diamond_um",
             diamond_um,
             at_most=(1.0 - TOUCHING_ROUNDING) * pitch_um / math.sqrt(2.0),
-            cure="diamonds of the side pitch_um / √2 would touch",
+            hint="diamonds of the side pitch_um / √2 would touch",
         )
     check_choice("border", border, ("whole", "cut"))
     check_sites(n_x * n_y + (n_x + 1) * (n_y + 1))

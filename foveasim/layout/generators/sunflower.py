@@ -68,7 +68,7 @@ def sunflower(*, n_sites: int, spacing_um: float, n_chords: int | None = None) -
     n_sites = check_sites(check_count("n_sites", n_sites))
     spacing_um = check_length_um("spacing_um", spacing_um)
     k = np.arange(1, n_sites + 1)
-    radius_um = check_length_um("radius_um", C * spacing_um * math.sqrt(n_sites + 0.5), cure="take fewer sites")
+    radius_um = check_length_um("radius_um", C * spacing_um * math.sqrt(n_sites + 0.5), hint="take fewer sites")
     # The outermost centre must stay inside the chords.
     fewest = max(3, math.floor(math.pi / math.acos(math.sqrt(n_sites / (n_sites + 0.5)))) + 1)
     if n_chords is None:

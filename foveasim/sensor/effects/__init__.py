@@ -22,7 +22,7 @@ from foveasim.sensor.effects.contract import (
     Sites,
     Stage,
 )
-from foveasim.sensor.effects.crosstalk import Coupling, Diffusion, KernelCrosstalk, Mixing
+from foveasim.sensor.effects.crosstalk import CrosstalkOperator, Diffusion, InterPixelCapacitance, KernelCrosstalk
 from foveasim.sensor.effects.dark import DarkSignal, HotSites, dark_current_factor
 from foveasim.sensor.effects.fixed_pattern import ColumnOffset, PixelGain, PixelOffset
 from foveasim.sensor.effects.readout import ReadNoise, ResetNoise, TelegraphNoise
@@ -35,7 +35,7 @@ __all__ = [
     "STANDARD",
     "AdditiveNoise",
     "ColumnOffset",
-    "Coupling",
+    "CrosstalkOperator",
     "DarkSignal",
     "DeadSites",
     "Diffusion",
@@ -43,8 +43,8 @@ __all__ = [
     "FixedFactor",
     "FixedOffset",
     "HotSites",
+    "InterPixelCapacitance",
     "KernelCrosstalk",
-    "Mixing",
     "PhotoResponse",
     "Photosites",
     "PixelGain",

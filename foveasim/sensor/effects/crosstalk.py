@@ -1,8 +1,8 @@
 """
-Crosstalk: charge that diffuses to neighbours before it is collected, and readings that couple after.
+Crosstalk: diffusion of charge to neighbours before collection, and inter-pixel capacitance in the readout.
 
-Diffusion mixes expectations, and so comes before the draw: sites stay Poisson and uncorrelated. Coupling mixes what was
-drawn, and so comes after it: neighbours become correlated.
+Diffusion mixes expectations before the draw: photosites stay Poisson-distributed and uncorrelated. Inter-pixel capacitance
+mixes drawn charges: neighbours become correlated.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from foveasim.sensor.effects.contract import Effect, Sites, Stage
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-__all__ = ["Coupling", "Diffusion", "KernelCrosstalk", "Mixing", "Neighbourhood"]
+__all__ = ["CrosstalkOperator", "Diffusion", "InterPixelCapacitance", "KernelCrosstalk", "Neighbourhood"]
 
 #: What a site may lose in one exchange: with more, charge would swing to and fro between neighbours.
 LARGEST_SHARE = 0.5
@@ -76,25 +76,25 @@ class Neighbourhood(Protocol):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Mixing:
+class CrosstalkOperator:
     """
     Crosstalk compiled for a layout: make it once, apply it to every frame.
 
-    Made by ``mixing()`` of :class:`Diffusion`, :class:`KernelCrosstalk` and :class:`Coupling`.
+    Made by ``compile()`` of :class:`Diffusion`, :class:`KernelCrosstalk` and :class:`InterPixelCapacitance`.
 
     Parameters
     ----------
     matrix : csr_array (n_site, n_site) float64
         Share ``[j, i]`` of the charge of site i that one exchange brings to site j. Columns sum to 1, unless charge is lost.
-    n_exchanges : int
+    n_steps : int
         How often it is applied.
     """
 
     matrix: csr_array[Any]
-    n_exchanges: int = 1
+    n_steps: int = 1
 
     def __repr__(self) -> str:
-        return f"Mixing({self.matrix.shape[0]} sites, {self.matrix.nnz} shares, {self.n_exchanges} exchanges)"
+        return f"CrosstalkOperator({self.matrix.shape[0]} sites, {self.matrix.nnz} shares, {self.n_steps} exchanges)"
 
     def apply(self, charge_e: ArrayLike, *, n_threads: int | None = None) -> Floats:
         """
@@ -123,7 +123,7 @@ class Mixing:
         # A row a site: sparse matrices multiply columns.
         columns = np.moveaxis(self._per_site("charge_e", charge_e), -1, 0)
         mixed = columns.reshape(columns.shape[0], -1) if columns.ndim > 1 else columns
-        for _ in range(self.n_exchanges):
+        for _ in range(self.n_steps):
             mixed = self._product(mixed, n_threads)
         return np.ascontiguousarray(np.moveaxis(mixed.reshape(columns.shape), 0, -1))
 
@@ -166,9 +166,9 @@ class Mixing:
         SimulationError
             For more than one exchange: those of diffusion, which mixes expectations and no variances.
         """
-        if self.n_exchanges != 1:
+        if self.n_steps != 1:
             raise SimulationError(
-                f"variances pass one exchange only, and this mixing has {self.n_exchanges}; diffusion comes before the draw"
+                f"variances pass one exchange only, and this operator has {self.n_steps}; diffusion comes before the draw"
             )
         values = self._per_site("variance", variance)
         columns = np.moveaxis(values, -1, 0)
@@ -193,7 +193,7 @@ class _Crosstalk(Effect):
     is_temporal: ClassVar[bool] = False
     is_local: ClassVar[bool] = False
 
-    def compiled_for(self, sites: Sites) -> Mixing:
+    def compiled_for(self, sites: Sites) -> CrosstalkOperator:
         """Return the operator for all sites of the layout."""
         raise NotImplementedError
 
@@ -204,11 +204,11 @@ class _Crosstalk(Effect):
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
         """Return moments of independent charges after crosstalk, (..., n_site)."""
-        mixing = sites.once(self, self.compiled_for)
+        operator = sites.once(self, self.compiled_for)
         mean, variance = (
             np.broadcast_to(part, np.broadcast_shapes(np.shape(part), (sites.n_sites,))) for part in (mean, variance)
         )
-        return mixing.apply(mean), mixing.variance(variance) if np.any(variance) else np.zeros(1)
+        return operator.apply(mean), operator.variance(variance) if np.any(variance) else np.zeros(1)
 
 
 # -- before the draw --------------------------------------------------------------------------------------------------
@@ -259,7 +259,7 @@ class Diffusion(_Crosstalk):
     --------
     >>> import foveasim as fs
     >>> pair = fs.layout.grid(n_x=2, n_y=1, pitch_um=4.0)
-    >>> Diffusion.from_neighbour_share(0.2, pitch_um=4.0).mixing(pair).apply([1000.0, 0.0]).round(9).tolist()
+    >>> Diffusion.from_neighbour_fraction(0.2, pitch_um=4.0).compile(pair).apply([1000.0, 0.0]).round(9).tolist()
     [950.0, 50.0]
     """
 
@@ -269,9 +269,9 @@ class Diffusion(_Crosstalk):
     spread_um: float
     max_gap_um: float | None = None
 
-    def compiled_for(self, sites: Sites) -> Mixing:
+    def compiled_for(self, sites: Sites) -> CrosstalkOperator:
         """Return the operator for all sites of the layout."""
-        return self.mixing(sites.layout)
+        return self.compile(sites.layout)
 
     def __post_init__(self) -> None:
         spread_um = check_number("spread_um", self.spread_um, at_least=0.0, at_most=LARGEST_SPREAD_UM)
@@ -279,15 +279,15 @@ class Diffusion(_Crosstalk):
         object.__setattr__(self, "max_gap_um", _gap_um(self.max_gap_um))
 
     @classmethod
-    def from_neighbour_share(
-        cls, neighbour_share: float, *, pitch_um: float, max_gap_um: float | None = None
+    def from_neighbour_fraction(
+        cls, neighbour_fraction: float, *, pitch_um: float, max_gap_um: float | None = None
     ) -> Diffusion:
         """
         Diffusion as measured on square pixels of the same process, for a layout of any shapes.
 
         Parameters
         ----------
-        neighbour_share : float
+        neighbour_fraction : float
             Share of its charge that one of these pixels loses to its four neighbours together, at most one half.
         pitch_um : float, µm
             Of these pixels.
@@ -301,13 +301,13 @@ class Diffusion(_Crosstalk):
         """
         from scipy.optimize import brentq
 
-        share = check_number("neighbour_share", neighbour_share, at_least=0.0, at_most=LARGEST_SHARE)
+        share = check_number("neighbour_fraction", neighbour_fraction, at_least=0.0, at_most=LARGEST_SHARE)
         pitch_um = check_length_um("pitch_um", pitch_um)
         # A spread of a pitch loses far more than half.
         steps = float(brentq(lambda s: 2.0 * float(_squared_steps(np.array(s))) - share, 0.0, 1.0, xtol=1e-15))
         return cls(spread_um=steps * pitch_um, max_gap_um=max_gap_um)
 
-    def mixing(self, layout: Neighbourhood, *, shared_um: csr_array[Any] | None = None) -> Mixing:
+    def compile(self, layout: Neighbourhood, *, shared_um: csr_array[Any] | None = None) -> CrosstalkOperator:
         """
         The exchange compiled for a layout.
 
@@ -320,7 +320,7 @@ class Diffusion(_Crosstalk):
 
         Returns
         -------
-        Mixing
+        CrosstalkOperator
 
         Raises
         ------
@@ -352,8 +352,8 @@ class Diffusion(_Crosstalk):
                 f"beyond {MAX_EXCHANGES} exchanges a site keeps nothing of its own",
             )
         # Shares of exactly one half, computed, are that.
-        n_exchanges = max(1, math.ceil(largest / LARGEST_SHARE - 1e-9))
-        return Mixing(_with_rest(matrix, loss, n_exchanges), n_exchanges)
+        n_steps = max(1, math.ceil(largest / LARGEST_SHARE - 1e-9))
+        return CrosstalkOperator(_with_rest(matrix, loss, n_steps), n_steps)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -388,7 +388,7 @@ class KernelCrosstalk(_Crosstalk):
     --------
     >>> import foveasim as fs
     >>> upwards = KernelCrosstalk(kernel=((0.0,), (0.75,), (0.25,)))
-    >>> upwards.mixing(fs.layout.grid(n_x=1, n_y=3, pitch_um=2.0)).apply([100.0, 0.0, 8.0]).tolist()
+    >>> upwards.compile(fs.layout.grid(n_x=1, n_y=3, pitch_um=2.0)).apply([100.0, 0.0, 8.0]).tolist()
     [75.0, 25.0, 8.0]
     """
 
@@ -399,9 +399,9 @@ class KernelCrosstalk(_Crosstalk):
     border: Literal["kept", "lost"] = "kept"
     pitch_um: float | tuple[float, float] | None = None
 
-    def compiled_for(self, sites: Sites) -> Mixing:
+    def compiled_for(self, sites: Sites) -> CrosstalkOperator:
         """Return the operator for all sites of the layout."""
-        return self.mixing(sites.layout)
+        return self.compile(sites.layout)
 
     def __post_init__(self) -> None:
         kernel = finite_array("kernel", self.kernel, ndim=2, at_least=0.0)
@@ -416,7 +416,7 @@ class KernelCrosstalk(_Crosstalk):
         if self.pitch_um is not None:
             object.__setattr__(self, "pitch_um", check_pitch_um("pitch_um", self.pitch_um))
 
-    def mixing(self, layout: Neighbourhood) -> Mixing:
+    def compile(self, layout: Neighbourhood) -> CrosstalkOperator:
         """
         The convolution compiled for a layout: any sites of a grid, in any order, with any of them missing.
 
@@ -426,7 +426,7 @@ class KernelCrosstalk(_Crosstalk):
 
         Returns
         -------
-        Mixing
+        CrosstalkOperator
 
         Raises
         ------
@@ -464,22 +464,22 @@ class KernelCrosstalk(_Crosstalk):
             is_kept = np.flatnonzero(kept)
             source, target, share = [*source, is_kept], [*target, is_kept], [*share, kept[is_kept]]
         if not source:
-            return Mixing(coo_array((n_sites, n_sites)).tocsr())
+            return CrosstalkOperator(coo_array((n_sites, n_sites)).tocsr())
         pairs = (np.concatenate(target).astype(np.int32), np.concatenate(source).astype(np.int32))
-        return Mixing(coo_array((np.concatenate(share), pairs), shape=(n_sites, n_sites)).tocsr())
+        return CrosstalkOperator(coo_array((np.concatenate(share), pairs), shape=(n_sites, n_sites)).tocsr())
 
 
 # -- after the draw ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
-class Coupling(_Crosstalk):
+class InterPixelCapacitance(_Crosstalk):
     """
     Capacitances between neighbouring readout nodes: a part of each charge is read at its neighbours.
 
     Parameters
     ----------
-    neighbour_share : float
+    neighbour_fraction : float
         Share of its charge that a site shows at a neighbour with which it shares an edge of the length ``edge_um``; others in
         proportion to their edges. Hybrid near-infrared arrays (H2RG) have from 0.007 to 0.015 (Donlon, Ninkov and Baum
         2018, arXiv:1805.09413).
@@ -501,7 +501,7 @@ class Coupling(_Crosstalk):
 
     ::
 
-        q_i + sum_j a_ij (q_j - q_i),    a_ij = neighbour_share e_ij / edge_um
+        q_i + sum_j a_ij (q_j - q_i),    a_ij = neighbour_fraction e_ij / edge_um
 
     which is symmetric and keeps the sum of all readings: no electron moves, its field is seen elsewhere. Read noise of later
     amplifiers is not coupled and comes after. Independent charges of variance v get the covariance ``K diag(v) K^T``, for even
@@ -512,35 +512,35 @@ class Coupling(_Crosstalk):
     --------
     >>> import foveasim as fs
     >>> row = fs.layout.grid(n_x=3, n_y=1, pitch_um=4.0)
-    >>> Coupling(neighbour_share=0.01).mixing(row).apply([0, 5000, 0]).tolist()
+    >>> InterPixelCapacitance(neighbour_fraction=0.01).compile(row).apply([0, 5000, 0]).tolist()
     [50.0, 4900.0, 50.0]
     """
 
     name: ClassVar[str] = "ipc"
     stage: ClassVar[Stage] = "charge"
 
-    neighbour_share: float
+    neighbour_fraction: float
     edge_um: float | None = None
     max_gap_um: float | None = None
 
-    def compiled_for(self, sites: Sites) -> Mixing:
+    def compiled_for(self, sites: Sites) -> CrosstalkOperator:
         """Return the operator for all sites of the layout, with the capacitances of their sense nodes."""
-        return self.mixing(sites.layout, capacitance_f=sites.capacitance_f if sites.capacitance_f.size > 1 else None)
+        return self.compile(sites.layout, capacitance_f=sites.capacitance_f if sites.capacitance_f.size > 1 else None)
 
     def __post_init__(self) -> None:
-        share = check_number("neighbour_share", self.neighbour_share, at_least=0.0, at_most=LARGEST_SHARE)
-        object.__setattr__(self, "neighbour_share", share)
+        share = check_number("neighbour_fraction", self.neighbour_fraction, at_least=0.0, at_most=LARGEST_SHARE)
+        object.__setattr__(self, "neighbour_fraction", share)
         if self.edge_um is not None:
             object.__setattr__(self, "edge_um", check_length_um("edge_um", self.edge_um))
         object.__setattr__(self, "max_gap_um", _gap_um(self.max_gap_um))
 
-    def mixing(
+    def compile(
         self,
         layout: Neighbourhood,
         *,
         capacitance_f: ArrayLike | None = None,
         shared_um: csr_array[Any] | None = None,
-    ) -> Mixing:
+    ) -> CrosstalkOperator:
         """
         The coupling compiled for a layout.
 
@@ -555,7 +555,7 @@ class Coupling(_Crosstalk):
 
         Returns
         -------
-        Mixing
+        CrosstalkOperator
 
         Raises
         ------
@@ -578,17 +578,17 @@ class Coupling(_Crosstalk):
                     f"must be one number, or one for each of the {layout.n_sites} sites, got the shape {node_f.shape}",
                 )
             ratio = np.median(node_f) / np.broadcast_to(node_f, layout.n_sites)
-        matrix = _like(shared_um, shared_um.data * (self.neighbour_share / edge_um) * ratio[shared_um.indices])
+        matrix = _like(shared_um, shared_um.data * (self.neighbour_fraction / edge_um) * ratio[shared_um.indices])
         loss = _column_sums(matrix)
         largest = float(loss.max(initial=0.0))
         if largest > LARGEST_SHARE * (1.0 + KERNEL_ROUNDING):
             raise ParameterError(
-                "neighbour_share",
+                "neighbour_fraction",
                 f"makes site {int(np.argmax(loss))} show {largest:.3g} of its charge at its neighbours, more than half",
-                self.neighbour_share,
-                cure="this is a law for weak coupling",
+                self.neighbour_fraction,
+                hint="this is a law for weak coupling",
             )
-        return Mixing(_with_rest(matrix, loss, 1))
+        return CrosstalkOperator(_with_rest(matrix, loss, 1))
 
 
 # -- parts ------------------------------------------------------------------------------------------------------------
@@ -662,11 +662,11 @@ def _column_sums(matrix: csr_array[Any]) -> Floats:
     return np.bincount(matrix.indices, weights=matrix.data, minlength=matrix.shape[0]).astype(np.float64)
 
 
-def _with_rest(matrix: csr_array[Any], share: Floats, n_exchanges: int) -> csr_array[Any]:
+def _with_rest(matrix: csr_array[Any], share: Floats, n_steps: int) -> csr_array[Any]:
     """One of several equal exchanges; what stays, after the share of a site that goes, is on the diagonal."""
     from scipy.sparse import csr_array, diags_array
 
-    return csr_array(matrix / n_exchanges + diags_array(1.0 - share / n_exchanges))
+    return csr_array(matrix / n_steps + diags_array(1.0 - share / n_steps))
 
 
 def _grid_places(layout: Neighbourhood, pitch_um: Any) -> tuple[Ints, Ints]:

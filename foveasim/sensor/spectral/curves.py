@@ -372,12 +372,12 @@ def curve_values(curve: Curve, wavelength_nm: ArrayLike) -> Floats:
         if values.dtype.kind not in "biuf":
             raise TypeError
     except (TypeError, ValueError):
-        raise CurveError("curve", "must return one number per wavelength", given, cure=f"correct {called}") from None
+        raise CurveError("curve", "must return one number per wavelength", given, hint=f"correct {called}") from None
     if values.shape not in ((), np.shape(wavelength_nm)):
         raise CurveError(
             "curve",
             f"must return one number per wavelength, got the shape {values.shape} for {np.shape(wavelength_nm)}",
-            cure=f"correct {called}",
+            hint=f"correct {called}",
         )
     return np.broadcast_to(values.astype(np.float64, copy=False), np.shape(wavelength_nm))
 

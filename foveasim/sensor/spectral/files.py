@@ -65,7 +65,7 @@ def read_curve(
     wavelength_unit: WavelengthUnit | None = None,
     value_unit: ValueUnit | None = None,
     between: Between = "lines",
-    beyond: Beyond = "refuse",
+    beyond: Beyond = "raise",
 ) -> TableCurve | SplineCurve:
     """
     Read one curve from a text file.
@@ -82,8 +82,8 @@ def read_curve(
         Of the values; otherwise percent where the column's name says so (``QE [%]``, ``qe_percent``), or else from 0 to 1.
     between : {"lines", "spline"}
         What is between the values: :class:`TableCurve` or :class:`SplineCurve`.
-    beyond : {"refuse", "zero", "hold"}
-        What to do with wavelengths outside the table: refuse them, take 0, or take the value at the end.
+    beyond : {"raise", "zero", "hold"}
+        What to do with wavelengths outside the table: raise an error, take 0, or take the value at the end.
 
     Returns
     -------
@@ -112,7 +112,7 @@ def read_filters(
     wavelength_unit: WavelengthUnit | None = None,
     value_unit: ValueUnit | None = None,
     between: Between = "lines",
-    beyond: Beyond = "refuse",
+    beyond: Beyond = "raise",
 ) -> FilterSet:
     """
     Read a set of colour filters from a text file: every column beside the wavelengths is one.

@@ -50,7 +50,7 @@ def camera_filters() -> FilterSet:
 
     Notes
     -----
-    M. M. Darrodi et al., Reference data set for camera spectral sensitivity estimation, J. Opt. Soc. Am. A 32, 381, 2015;
+    M. M. Darrodi et al., Reference dataset for camera spectral sensitivity estimation, J. Opt. Soc. Am. A 32, 381, 2015;
     taken as response per radiance, and divided by the wavelength to give electrons per photon. J. Jiang et al. (WACV 2013)
     measured the same type: within 0.11, but for the steep edge at 420 nm.
     """

@@ -17,7 +17,7 @@ from foveasim.sensor.spectral.curves import CURVES, Multiplied, check_within
 __all__ = ["Beyond", "PolynomialCurve", "SplineCurve", "StepCurve", "TableCurve"]
 
 #: What a table says of wavelengths beyond its ends: nothing, that the curve is 0 there, or that it stays as at the end.
-Beyond = Literal["refuse", "zero", "hold"]
+Beyond = Literal["raise", "zero", "hold"]
 BEYOND_CURE = "beyond='zero' or beyond='hold' says what the curve is there"
 
 
@@ -72,8 +72,8 @@ class TableCurve(Multiplied):
     ----------
     wavelength_nm, value : sequences of the same length
         The table, in any order. Values from 0 to 1.
-    beyond : {"refuse", "zero", "hold"}
-        What to do with wavelengths outside the table: refuse them, take 0, or take the value at the end.
+    beyond : {"raise", "zero", "hold"}
+        What to do with wavelengths outside the table: raise an error, take 0, or take the value at the end.
     source : str
         Where the figures come from; kept with the results.
 
@@ -85,7 +85,7 @@ class TableCurve(Multiplied):
 
     wavelength_nm: Sequence[float]
     value: Sequence[float]
-    beyond: Beyond = "refuse"
+    beyond: Beyond = "raise"
     source: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
@@ -108,8 +108,8 @@ class SplineCurve(Multiplied):
     ----------
     wavelength_nm, value : sequences of the same length
         The table, in any order. Values from 0 to 1.
-    beyond : {"refuse", "zero", "hold"}
-        What to do with wavelengths outside the table: refuse them, take 0, or take the value at the end.
+    beyond : {"raise", "zero", "hold"}
+        What to do with wavelengths outside the table: raise an error, take 0, or take the value at the end.
     source : str
         Where the figures come from; kept with the results.
 
@@ -126,7 +126,7 @@ class SplineCurve(Multiplied):
 
     wavelength_nm: Sequence[float]
     value: Sequence[float]
-    beyond: Beyond = "refuse"
+    beyond: Beyond = "raise"
     source: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
@@ -157,8 +157,8 @@ class StepCurve(Multiplied):
         Ascending.
     value : sequence of n floats
         From 0 to 1, each from its edge up to the next, which belongs to the next value; the last edge belongs to the last.
-    beyond : {"refuse", "zero", "hold"}
-        What to do with wavelengths outside the edges: refuse them, take 0, or take the value at the end.
+    beyond : {"raise", "zero", "hold"}
+        What to do with wavelengths outside the edges: raise an error, take 0, or take the value at the end.
     source : str
         Where the figures come from; kept with the results.
 
@@ -171,7 +171,7 @@ class StepCurve(Multiplied):
 
     edge_nm: Sequence[float]
     value: Sequence[float]
-    beyond: Beyond = "refuse"
+    beyond: Beyond = "raise"
     source: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
@@ -198,7 +198,7 @@ def _shares(value: ArrayLike) -> Floats:
     """Values (n,) from 0 to 1."""
     values = finite_array("value", value, ndim=1, at_least=0.0)
     if values.size and values.max() > 1.0:
-        raise ParameterError("value", "must be <= 1 everywhere", float(values.max()), cure="percent are hundredths")
+        raise ParameterError("value", "must be <= 1 everywhere", float(values.max()), hint="percent are hundredths")
     return values
 
 
@@ -220,7 +220,7 @@ def _inside(wavelength_nm: ArrayLike, table_nm: Sequence[float], beyond: Beyond)
     """Wavelengths moved to the ends of a table that they lie beyond, and where the curve has a value, or is 0."""
     low_nm, high_nm = table_nm[0], table_nm[-1]
     waves_nm = as_numbers("wavelength_nm", wavelength_nm)
-    if beyond == "refuse":
+    if beyond == "raise":
         check_within(waves_nm, low_nm, high_nm, "the table", BEYOND_CURE)
     check_within(waves_nm, 0.0, np.finfo(np.float64).max, "the spectrum")
     inside_nm = np.clip(waves_nm, low_nm, high_nm)

@@ -59,13 +59,13 @@ class Content:
     picture_png: bytes
 
 
-def content_of(thing: Layout | Capture, report: Report | None = None, *, name: str = "") -> Content:
+def content_of(data: Layout | Capture, report: Report | None = None, *, name: str = "") -> Content:
     """
     What a page is told.
 
     Parameters
     ----------
-    thing : Layout or Capture
+    data : Layout or Capture
     report : Report, optional
         Of a check of the same layout.
     name : str
@@ -74,11 +74,11 @@ def content_of(thing: Layout | Capture, report: Report | None = None, *, name: s
     Raises
     ------
     ParameterError
-        When the thing is neither, or the report is of another number of sites.
+        When the data is neither, or the report is of another number of sites.
     GeometryError
         When the layout has no sites.
     """
-    about, arrays, layout = described_sites(thing, name=name)
+    about, arrays, layout = described_sites(data, name=name)
     if report is not None and not isinstance(report, Report):
         raise ParameterError("report", f"must be a Report of a check, got a {type(report).__name__}")
     if report is not None and report.n_sites != layout.n_sites:
@@ -86,13 +86,13 @@ def content_of(thing: Layout | Capture, report: Report | None = None, *, name: s
             "report", f"must be of this layout of {layout.n_sites:,} sites, got one of {report.n_sites:,}"
         )
     arrays |= _outlines(layout)
-    picture, place = _picture(layout, thing if isinstance(thing, Capture) else None)
+    picture, place = _picture(layout, data if isinstance(data, Capture) else None)
     rules = [] if report is None else _rules(report, arrays)
     return Content({**about, "picture": place, "rules": rules}, arrays, picture)
 
 
 def described_sites(
-    thing: Layout | Capture, *, name: str = ""
+    data: Layout | Capture, *, name: str = ""
 ) -> tuple[dict[str, Any], dict[str, NDArray[Any]], Layout]:
     """
     What every kind of page is told of photosites.
@@ -110,10 +110,10 @@ def described_sites(
     ParameterError, GeometryError
         As for :func:`content_of`.
     """
-    if not isinstance(thing, Layout | Capture):
-        raise ParameterError("thing", f"must be a Layout or a Capture, got a {type(thing).__name__}")
-    capture = thing if isinstance(thing, Capture) else None
-    layout = thing.layout if isinstance(thing, Capture) else thing
+    if not isinstance(data, Layout | Capture):
+        raise ParameterError("data", f"must be a Layout or a Capture, got a {type(data).__name__}")
+    capture = data if isinstance(data, Capture) else None
+    layout = data.layout if isinstance(data, Capture) else data
     if layout.n_sites == 0:
         raise GeometryError("the layout has no sites, and so nothing to show")
     arrays: dict[str, NDArray[Any]] = {}
@@ -279,7 +279,7 @@ def _picture(layout: Layout, capture: Capture | None) -> tuple[bytes, dict[str, 
         pixel_um = max(x_max - x_min, y_max - y_min) / PICTURE_PIXELS
         shape = (max(1, round((y_max - y_min) / pixel_um)), max(1, round((x_max - x_min) / pixel_um)))
         by = "channel" if "channel" in layout.columns and _is_index(layout.columns["channel"]) else "size_um"
-        pixels = SitePixels.of(layout, shape, n_samples=2).picture(site_colours(layout, by))[::-1]
+        pixels = SitePixels.from_layout(layout, shape, n_samples=2).picture(site_colours(layout, by))[::-1]
     file = BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(file, "PNG")
     height, width = pixels.shape[:2]
@@ -298,7 +298,7 @@ def _rules(report: Report, arrays: dict[str, NDArray[Any]]) -> list[dict[str, An
         sites += [violation.site_ids for violation in listed]
         markers += [violation.marker for violation in listed]
         rules.append({
-            "name": result.rule, "sentence": result.sentence, "limit": _finite(result.limit), "unit": result.unit,
+            "name": result.rule, "description": result.description, "limit": _finite(result.limit), "unit": result.unit,
             "count": len(result), "listed": len(listed), "waiver": result.waiver,
         })  # fmt: skip
     parts, owner = shapely.get_parts(np.array(markers, dtype=object), return_index=True)
@@ -340,5 +340,5 @@ def _notes(layout: Layout, capture: Capture | None, origin: str) -> list[str]:
         exposure_s = capture.settings.get("exposure_s")
         if isinstance(exposure_s, int | float):
             notes.append(f"{1e3 * exposure_s:.4g} ms")
-        notes.append(f"{100 * capture.saturated_share:.3g} % saturated")
+        notes.append(f"{100 * capture.saturated_fraction:.3g} % saturated")
     return notes

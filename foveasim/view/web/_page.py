@@ -35,13 +35,13 @@ IMPORT = re.compile(r'^import \{[\w$, ]+\} from "\./(\w+\.js)";\n', re.MULTILINE
 EXPORT = re.compile(r"^export (?=(?:async )?function |class |const )", re.MULTILINE)
 
 
-def web_page(thing: Layout | Capture, *, report: Report | None = None, name: str = "") -> str:
+def web_page(data: Layout | Capture, *, report: Report | None = None, name: str = "") -> str:
     """
     A page to explore a layout or a capture in a browser: zoom, values of the site under the mouse, colours, histogram.
 
     Parameters
     ----------
-    thing : Layout or Capture
+    data : Layout or Capture
     report : Report, optional
         Of a check of this layout: its violations are listed and marked.
     name : str
@@ -55,7 +55,7 @@ def web_page(thing: Layout | Capture, *, report: Report | None = None, name: str
     Raises
     ------
     ParameterError
-        When the thing is neither, or the report is of another layout.
+        When the data is neither, or the report is of another layout.
     GeometryError
         When the layout has no sites.
 
@@ -66,7 +66,7 @@ def web_page(thing: Layout | Capture, *, report: Report | None = None, name: str
     >>> "<title>a small grid</title>" in page
     True
     """
-    content = content_of(thing, report, name=name)
+    content = content_of(data, report, name=name)
     arrays = {key: packed(values) for key, values in content.arrays.items()}
     about = {**content.about, "arrays": {key: told for key, (told, _) in arrays.items()}}
     return joined(
@@ -76,18 +76,18 @@ def web_page(thing: Layout | Capture, *, report: Report | None = None, name: str
         about,
         {key: text for key, (_, text) in arrays.items()},
         title=str(content.about["name"]),
-        alt="What the sensor saw" if isinstance(thing, Capture) else "The photosites of the layout",
+        alt="What the sensor saw" if isinstance(data, Capture) else "The photosites of the layout",
         picture="data:image/png;base64," + base64.b64encode(content.picture_png).decode(),
     )
 
 
-def write_web_page(thing: Layout | Capture, path: str | Path, *, report: Report | None = None, name: str = "") -> None:
+def write_web_page(data: Layout | Capture, path: str | Path, *, report: Report | None = None, name: str = "") -> None:
     """
     Write :func:`web_page` to a file, whole or not at all.
 
     Parameters
     ----------
-    thing : Layout or Capture
+    data : Layout or Capture
     path : path
         Ending in ``.html``.
     report : Report, optional
@@ -101,7 +101,7 @@ def write_web_page(thing: Layout | Capture, path: str | Path, *, report: Report 
     ParameterError, GeometryError
         As for :func:`web_page`.
     """
-    write_page(path, lambda: web_page(thing, report=report, name=name))
+    write_page(path, lambda: web_page(data, report=report, name=name))
 
 
 def write_page(path: str | Path, page: Callable[[], str]) -> None:

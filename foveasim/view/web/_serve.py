@@ -28,7 +28,7 @@ MAX_REQUEST_BYTES = 16_384
 PIECE_BYTES = 65_536
 
 
-def serve_page(text: str, *, port: int = 0, tell: Callable[[str], None]) -> None:
+def serve_page(text: str, *, port: int = 0, announce: Callable[[str], None]) -> None:
     """
     Serve one page on localhost until the user stops it with Ctrl-C.
 
@@ -38,7 +38,7 @@ def serve_page(text: str, *, port: int = 0, tell: Callable[[str], None]) -> None
         From :func:`foveasim.view.web_page`.
     port : int
         0 for any that is free.
-    tell : function
+    announce : function
         Is called with the address, once it can be asked.
 
     Raises
@@ -57,10 +57,10 @@ def serve_page(text: str, *, port: int = 0, tell: Callable[[str], None]) -> None
     except OSError as error:
         raise ParameterError("port", f"cannot be listened on ({error.strerror or error})", port) from None
     with listener, contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(_serve(listener, text.encode(), tell))
+        asyncio.run(_serve(listener, text.encode(), announce))
 
 
-async def _serve(listener: socket.socket, content: bytes, tell: Callable[[str], None]) -> None:
+async def _serve(listener: socket.socket, content: bytes, announce: Callable[[str], None]) -> None:
     port = listener.getsockname()[1]
     names = {f"{name}:{port}" for name in (HOST, "localhost")} | ({HOST, "localhost"} if port == 80 else set())
     n_open = 0
@@ -81,7 +81,7 @@ async def _serve(listener: socket.socket, content: bytes, tell: Callable[[str], 
             n_open -= 1
 
     await asyncio.start_server(connected, sock=listener, limit=MAX_REQUEST_BYTES)
-    tell(f"http://{HOST}:{port}/")
+    announce(f"http://{HOST}:{port}/")
     await asyncio.Event().wait()
 
 

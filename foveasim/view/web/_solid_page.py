@@ -18,15 +18,15 @@ from foveasim.view.web._page import joined, write_page
 __all__ = ["solid_page", "write_solid_page"]
 
 
-def solid_page(thing: Layout | Capture, *, solids: Solids | None = None, name: str = "") -> str:
+def solid_page(data: Layout | Capture, *, solids: Solids | None = None, name: str = "") -> str:
     """
     A page to turn a sensor round in a browser.
 
     Parameters
     ----------
-    thing : Layout or Capture
+    data : Layout or Capture
     solids : Solids, optional
-        What is shown, with the photosites of this thing. By default the parts of a layout, as :func:`foveasim.view.solids`
+        What is shown, with the photosites of this data. By default the parts of a layout, as :func:`foveasim.view.solids`
         makes them; of a capture its photosites as columns, as high as their codes.
     name : str
         Heading; by default what made the layout.
@@ -39,17 +39,17 @@ def solid_page(thing: Layout | Capture, *, solids: Solids | None = None, name: s
     Raises
     ------
     ParameterError
-        When the thing is neither, or the solids are not of its photosites, each in one colour per part.
+        When the data is neither, or the solids are not of its photosites, each in one colour per part.
     GeometryError
         When there is nothing to show.
     """
-    about, arrays, layout = described_sites(thing, name=name)
-    if solids is None and isinstance(thing, Capture):
-        meshes: Sequence[Mesh] = (prisms(thing),)
+    about, arrays, layout = described_sites(data, name=name)
+    if solids is None and isinstance(data, Capture):
+        meshes: Sequence[Mesh] = (prisms(data),)
         meshes_are_closed = False  # columns have no floor
         shown = "The columns are as high as the codes."
     else:
-        meshes = (solids_of(thing) if solids is None else solids).meshes
+        meshes = (solids_of(data) if solids is None else solids).meshes
         meshes_are_closed = True
         shown = "z is toward the lens."
     bodies, surfaces = bodies_of(meshes, layout, are_closed=meshes_are_closed)
@@ -66,15 +66,13 @@ def solid_page(thing: Layout | Capture, *, solids: Solids | None = None, name: s
     )
 
 
-def write_solid_page(
-    thing: Layout | Capture, path: str | Path, *, solids: Solids | None = None, name: str = ""
-) -> None:
+def write_solid_page(data: Layout | Capture, path: str | Path, *, solids: Solids | None = None, name: str = "") -> None:
     """
     Write :func:`solid_page` to a file, whole or not at all.
 
     Parameters
     ----------
-    thing : Layout or Capture
+    data : Layout or Capture
     path : path
         Ending in ``.html``.
     solids : Solids, optional
@@ -88,4 +86,4 @@ def write_solid_page(
     ParameterError, GeometryError
         As for :func:`solid_page`.
     """
-    write_page(path, lambda: solid_page(thing, solids=solids, name=name))
+    write_page(path, lambda: solid_page(data, solids=solids, name=name))

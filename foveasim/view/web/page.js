@@ -603,7 +603,7 @@ function listViolations() {
   const count = asked.reduce((sum, r) => sum + r.count, 0), listed = asked.reduce((sum, r) => sum + r.listed, 0);
   const rest = listed < count ? " The worst " + shown(listed) + " are listed." : "";
   if (rule >= 0) {
-    const { sentence: text, limit, unit, waiver } = about.rules[rule];
+    const { description: text, limit, unit, waiver } = about.rules[rule];
     const bound = limit === null ? "" : "; the limit is " + shown(limit) + (unit ? " " + unit : "");
     $("sentence").textContent = text + bound + "." + (waiver ? " Waived: " + waiver + "." : "") + rest;
   } else $("sentence").textContent = (count ? "" : "All rules are kept.") + rest;

@@ -57,9 +57,9 @@ def write_boxes(layout: fs.Layout, path: Path, *, digits: int = 3) -> WrittenLay
     return WrittenLayout(
         path=path,
         n_sites=layout.n_sites,
-        worst_move_um=10.0**-digits,
+        max_displacement_um=10.0**-digits,
         worst_area_error=0.0,
-        lost_columns=tuple(sorted(layout.columns)),
+        dropped_columns=tuple(sorted(layout.columns)),
     )
 
 

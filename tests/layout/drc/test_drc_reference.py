@@ -85,7 +85,7 @@ def compare(rule, layout, rules):
 
 
 #: Rules about the whole field: their twins stand in test_field_rules.py.
-FIELD_RULES = {"min_density", "max_density", "max_data_rate_gbit_per_s", "max_track_use"}
+FIELD_RULES = {"min_density", "max_density", "max_data_rate_gbit_per_s", "max_track_utilisation"}
 
 
 def test_every_rule_has_a_twin():

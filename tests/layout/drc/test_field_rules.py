@@ -94,17 +94,17 @@ def test_spokes_of_a_log_polar_layout_share_the_first_ring(n_sectors, pitch_um, 
     routing = Routing(width_um=0.6 * pitch_um, space_um=0.4 * pitch_um, n_layers=n_layers)
     outer_um = math.hypot(*layout.xy_um[0])
     n_tracks = n_layers * math.floor(2 * math.pi * outer_um / pitch_um + 1e-9)
-    report = layout.check(DesignRules(max_track_use=0.0, routing=routing))
+    report = layout.check(DesignRules(max_track_utilisation=0.0, routing=routing))
 
     assert [v.value for v in report.violations] == pytest.approx([n_sectors / n_tracks])
     assert report.violations[0].site_ids == tuple(range(n_sectors))
     assert report.violations[0].marker.length == pytest.approx(2 * math.pi * outer_um, rel=0.01)
-    assert layout.check(DesignRules(max_track_use=1.0, routing=routing)).ok == (n_sectors <= n_tracks)
+    assert layout.check(DesignRules(max_track_utilisation=1.0, routing=routing)).ok == (n_sectors <= n_tracks)
 
 
 def test_columns_that_are_wider_than_the_sensor_are_told():
     layout = grid(n_x=100, n_y=3, pitch_um=0.5)
-    rules = {"max_track_use": 1.0}
+    rules = {"max_track_utilisation": 1.0}
     narrow = Routing(width_um=0.14, space_um=0.14, direction="upwards")
     wide = Routing(width_um=0.4, space_um=0.4, direction="upwards")
 
@@ -120,7 +120,7 @@ def test_one_site_or_line_too_many_among_a_hundred_thousand_sites_is_told():
     outer_um = math.hypot(*layout.xy_um[0])
     pitch_um = 2 * math.pi * outer_um / 499.5
     routing = Routing(width_um=0.5 * pitch_um, space_um=0.5 * pitch_um)
-    rules = DesignRules(max_data_rate_gbit_per_s=0.99999, readout=readout, max_track_use=1.0, routing=routing)
+    rules = DesignRules(max_data_rate_gbit_per_s=0.99999, readout=readout, max_track_utilisation=1.0, routing=routing)
     report = layout.check(rules)
 
     assert layout.n_sites == 100_000
@@ -134,7 +134,7 @@ def test_lines_without_any_track_are_told():
     layout = log_polar(n_sectors=12, r_min_um=1.0, r_max_um=24.5)
     routing = Routing(width_um=20.0, space_um=20.0)
 
-    assert layout.check(DesignRules(max_track_use=1.0, routing=routing)).results[0].worst == math.inf
+    assert layout.check(DesignRules(max_track_utilisation=1.0, routing=routing)).results[0].worst == math.inf
 
 
 # -- limits and presets ----------------------------------------------------------------------------------------------
@@ -148,7 +148,7 @@ def test_lines_without_any_track_are_told():
         ({"max_density": 0.2, "density_window_um": 0.0}, "'density_window_um' must be > 0"),
         ({"max_data_rate_gbit_per_s": 1.0}, "'readout' must be given for 'max_data_rate_gbit_per_s'"),
         ({"max_data_rate_gbit_per_s": 1.0, "readout": 30}, "'readout' must be a Readout, got 30"),
-        ({"max_track_use": 1.0}, "'routing' must be given for 'max_track_use'"),
+        ({"max_track_utilisation": 1.0}, "'routing' must be given for 'max_track_utilisation'"),
         ({"routing": "up"}, "'routing' must be a Routing, got 'up'"),
         ({"preset": "sky"}, "'preset' must be one of 'sky130_met1', .*, got 'sky'"),
     ],
@@ -187,7 +187,7 @@ def test_files_hold_presets_readouts_and_routings(tmp_path):
     (tmp_path / "rules.yaml").write_text(
         "preset: sky130_diff\nmin_width_um: 0.2\nmax_data_rate_gbit_per_s: 2.0\n"
         "readout: {frames_per_s: 30.0, bits: 10, n_lanes: 4}\n"
-        "max_track_use: 1.0\nrouting: {width_um: 0.14, space_um: 0.14, direction: upwards}\n"
+        "max_track_utilisation: 1.0\nrouting: {width_um: 0.14, space_um: 0.14, direction: upwards}\n"
     )
     (tmp_path / "layout.yaml").write_text(
         "generator: grid\nparameters: {n_x: 3, n_y: 3, pitch_um: 2.0}\nrules: {preset: paper}\n"
@@ -201,7 +201,7 @@ def test_files_hold_presets_readouts_and_routings(tmp_path):
     (tmp_path / "rules.yaml").write_text("preset: sky\n")
     with pytest.raises(ConfigError, match=r"rules.yaml: preset: must be one of 'sky130_met1'"):
         read_rules(tmp_path / "rules.yaml")
-    (tmp_path / "rules.yaml").write_text("max_track_use: 1.0\nrouting: {width_um: -0.14, space_um: 0.14}\n")
+    (tmp_path / "rules.yaml").write_text("max_track_utilisation: 1.0\nrouting: {width_um: -0.14, space_um: 0.14}\n")
     with pytest.raises(ConfigError, match=r"routing.width_um: must be > 0, got -0.14"):
         read_rules(tmp_path / "rules.yaml")
 

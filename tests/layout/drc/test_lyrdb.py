@@ -64,7 +64,7 @@ def test_a_report_that_was_written_is_read_again(tmp_path):
     assert is_lyrdb(tmp_path / "report.lyrdb")
     assert [r.rule for r in back.results] == [r.rule for r in report.results]
     for was, now in zip(report.results, back.results, strict=True):
-        assert (now.sentence, now.limit, now.unit) == (was.sentence, was.limit, was.unit)
+        assert (now.description, now.limit, now.unit) == (was.description, was.limit, was.unit)
         assert len(now) == len(was)
     for was, now in zip(report.violations, back.violations, strict=True):
         assert (now.rule, now.site_ids) == (was.rule, was.site_ids)

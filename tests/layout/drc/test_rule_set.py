@@ -164,7 +164,7 @@ def test_records_are_a_row_a_violation():
 def test_every_rule_has_a_limit_a_sentence_and_is_documented():
     for name, rule in RULES.items():
         assert hasattr(fs.DesignRules(), name)
-        assert rule.sentence
+        assert rule.description
         assert name in fs.DesignRules.__doc__
 
 

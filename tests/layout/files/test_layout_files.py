@@ -89,8 +89,8 @@ def test_exact_formats_give_back_every_bit_every_column_and_the_origin(zoo, tmp_
 
     assert_same(zoo, again)
     assert dict(again.provenance) == dict(zoo.provenance)
-    assert (report.n_sites, report.worst_move_um, report.worst_area_error) == (60, 0.0, 0.0)
-    assert report.lost_columns == ()
+    assert (report.n_sites, report.max_displacement_um, report.worst_area_error) == (60, 0.0, 0.0)
+    assert report.dropped_columns == ()
 
 
 @pytest.mark.parametrize("ending", CHIP)
@@ -123,7 +123,7 @@ def test_a_second_round_trip_changes_nothing_and_writes_the_same_bytes(tmp_path,
     report = write_layout(read_layout(first), second)
 
     assert first.read_bytes() == second.read_bytes()
-    assert report.worst_move_um == 0.0
+    assert report.max_displacement_um == 0.0
 
 
 @pytest.mark.parametrize("ending", EXACT + CHIP)
@@ -216,7 +216,7 @@ def test_chip_formats_give_back_columns_to_the_last_bit(tmp_path, ending, column
     report = write_layout(layout, tmp_path / f"a.{ending}")
     again = read_layout(tmp_path / f"a.{ending}")
 
-    assert report.lost_columns == ()
+    assert report.dropped_columns == ()
     assert sorted(again.columns) == sorted({*layout.columns, "channel"})
     assert same_bits(again.columns["a"], column)
     np.testing.assert_array_equal(again.columns["last"], layout.columns["last"])
@@ -237,8 +237,8 @@ def test_sites_in_parts_and_in_any_order_keep_their_columns(zoo, tmp_path, endin
     report = write_layout(zoo, tmp_path / f"a.{ending}")
     again = read_layout(tmp_path / f"a.{ending}")
 
-    assert report.lost_columns == (("is_dead",) if ending == "gds" else ())
-    assert {*again.columns} == {*zoo.columns} - {*report.lost_columns}
+    assert report.dropped_columns == (("is_dead",) if ending == "gds" else ())
+    assert {*again.columns} == {*zoo.columns} - {*report.dropped_columns}
     for name, column in again.columns.items():
         np.testing.assert_array_equal(column, zoo.columns[name], err_msg=name)
 
@@ -251,12 +251,12 @@ def test_a_column_that_a_gds_property_cannot_hold_for_one_site_is_left_out_for_a
     polygons = gdstk.read_gds(tmp_path / "a.gds").cells[0].polygons
     n_bytes = max(sum(2 * -(-len(v[2].rstrip(b"\0")) // 2) for v in p.properties) for p in polygons)
 
-    assert report.lost_columns == lost
+    assert report.dropped_columns == lost
     assert {*read_layout(tmp_path / "a.gds").columns} == {"channel", "first", "long"} - {*lost}
     assert n_bytes == (128 if not lost else 20)
     # gdstk speaks up when properties are longer than the format allows.
     assert capfd.readouterr().err == ""
-    assert write_layout(layout, tmp_path / "a.oas").lost_columns == ()
+    assert write_layout(layout, tmp_path / "a.oas").dropped_columns == ()
 
 
 def test_very_many_different_texts_are_left_out_of_oasis_which_would_take_minutes(tmp_path):
@@ -265,7 +265,7 @@ def test_very_many_different_texts_are_left_out_of_oasis_which_would_take_minute
     )
     report = write_layout(layout, tmp_path / "a.oas")
 
-    assert report.lost_columns == ("name",)
+    assert report.dropped_columns == ("name",)
     assert (read_layout(tmp_path / "a.oas").columns["kind"] == layout.columns["kind"]).all()
 
 
@@ -276,9 +276,9 @@ def test_what_a_format_does_not_hold_is_reported(tmp_path, ending):
     )
     kept = () if ending == "svg" else ("a", "column", "readout_line", "row")
 
-    assert write_layout(layout, tmp_path / f"a.{ending}").lost_columns == tuple(sorted({*layout.columns} - {*kept}))
+    assert write_layout(layout, tmp_path / f"a.{ending}").dropped_columns == tuple(sorted({*layout.columns} - {*kept}))
     # No shape is there to tell a column.
-    assert write_layout(layout[:0], tmp_path / f"a.{ending}").lost_columns == tuple(sorted(layout.columns))
+    assert write_layout(layout[:0], tmp_path / f"a.{ending}").dropped_columns == tuple(sorted(layout.columns))
 
 
 @pytest.mark.parametrize("ending", CHIP)
@@ -288,7 +288,7 @@ def test_columns_keep_odd_names(tmp_path, ending, name):
     report = write_layout(layout, tmp_path / f"a.{ending}")
     columns = read_layout(tmp_path / f"a.{ending}").columns
 
-    assert report.lost_columns == ()
+    assert report.dropped_columns == ()
     assert columns[name].tolist() == [0, 1, 2, 3]
     assert columns["b"].tolist() == [5, 6, 7, 8]
 
@@ -583,7 +583,7 @@ def test_svg_draws_every_ring_y_up_in_its_colour(zoo, tmp_path):
             for part in path.get("d").split("Z")[:-1]
         ]
         assert shapely.Polygon(rings[0], rings[1:]).area == pytest.approx(site.area, abs=1e-3)
-    assert 0.0 < report.worst_move_um <= 0.5e-4 * 2**0.5 + 1e-9
+    assert 0.0 < report.max_displacement_um <= 0.5e-4 * 2**0.5 + 1e-9
 
 
 @pytest.mark.parametrize("colour", ['red"/><script>', "url(#a)", "", "#12345", 7])
@@ -604,8 +604,8 @@ def test_the_report_tells_what_a_reader_finds(tmp_path, ending, dbu_um):
     move_um = max(np.hypot(*(a - b)) for a, b in zip(layout.xy_um, again.xy_um, strict=True))
     area = [q.area / p.area - 1 for p, q in zip(layout.polygons(), again.polygons(), strict=True)]
 
-    assert report.worst_move_um == pytest.approx(move_um, rel=1e-6)
-    assert 0.25 * dbu_um < report.worst_move_um <= dbu_um * 0.5**0.5 * (1 + 1e-9)
+    assert report.max_displacement_um == pytest.approx(move_um, rel=1e-6)
+    assert 0.25 * dbu_um < report.max_displacement_um <= dbu_um * 0.5**0.5 * (1 + 1e-9)
     assert report.worst_area_error == pytest.approx(np.abs(area).max(), rel=1e-4)
 
 

@@ -726,7 +726,7 @@ def whole(tmp_path_factory):
     )
     folder = tmp_path_factory.mktemp("whole")
     for ending in FORMATS:
-        assert write_layout(layout, folder / f"a.{ending}").lost_columns == ()
+        assert write_layout(layout, folder / f"a.{ending}").dropped_columns == ()
     return {ending: (folder / f"a.{ending}").read_bytes().rstrip(b"\n") for ending in FORMATS}
 
 

@@ -147,7 +147,7 @@ def test_a_small_site_alone_stays():
 def test_a_hole_is_filled_with_sites_of_the_minimum_size_and_the_nearest_columns():
     layout = grid(n_x=20, n_y=20, pitch_um=2.0).with_columns(channel=np.repeat([0, 1], 200))
     hole = shapely.Point(0, 0).buffer(9.0)
-    punched = fs.layout.punch(layout, hole, cut="drop")
+    punched = fs.layout.cut_out(layout, hole, cut="drop")
     open_part = shapely.box(-20, -20, 20, 20).difference(shapely.union_all(punched.polygons()))
     filled = fill(punched, shapely.box(-20, -20, 20, 20), size_um=1.0)
     new = filled[punched.n_sites :]

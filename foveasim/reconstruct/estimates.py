@@ -9,15 +9,15 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.validation import Bools, Floats, finite_array
 from foveasim.errors import ParameterError
-from foveasim.sensor import Sensor, linearised
+from foveasim.sensor import Sensor, linearise
 from foveasim.sensor.limits import check_plausible
 from foveasim.units import volts_to_electrons
 
-__all__ = ["Readings", "charge_readings", "code_readings", "electrons_per_code"]
+__all__ = ["SiteEstimates", "electrons_per_code", "estimate_from_charge", "estimate_from_code"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Readings:
+class SiteEstimates:
     """
     Light as sites tell it.
 
@@ -27,13 +27,13 @@ class Readings:
         Photoelectrons: charge less the dark charge that is expected. Noise may put it below 0.
     variance_e2 : (n_site,) float64, e-²
         Of its noise. For shot noise the charge and one more: the mean of the expectations that a charge may come from.
-    is_full : (n_site,) bool
+    is_saturated : (n_site,) bool
         Saturated: the light may be any above this.
     """
 
     light_e: Floats
     variance_e2: Floats
-    is_full: Bools
+    is_saturated: Bools
 
 
 def electrons_per_code(sensor: Sensor) -> Floats:
@@ -42,9 +42,9 @@ def electrons_per_code(sensor: Sensor) -> Floats:
     return np.broadcast_to(step_e, (sensor.layout.n_sites,))
 
 
-def charge_readings(charge_e: ArrayLike, sensor: Sensor, exposure_s: float) -> Readings:
+def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: float) -> SiteEstimates:
     """
-    Readings of charges before they are read out: shot noise only.
+    SiteEstimates of charges before they are read out: shot noise only.
 
     Parameters
     ----------
@@ -62,22 +62,22 @@ def charge_readings(charge_e: ArrayLike, sensor: Sensor, exposure_s: float) -> R
     exposure_s = check_plausible("exposure_s", exposure_s)
     shot = sensor.shot
     _, variance_e2 = shot.moments(np.maximum(charge, 0.0), np.full(charge.size, float(shot.is_drawn)))
-    return Readings(
+    return SiteEstimates(
         light_e=charge - sensor.nominal_dark_e_per_s * exposure_s,
         variance_e2=variance_e2,
-        is_full=np.asarray(charge >= sensor.well_e),
+        is_saturated=np.asarray(charge >= sensor.well_e),
     )
 
 
-def code_readings(code: ArrayLike, sensor: Sensor, exposure_s: float) -> Readings:
+def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: float) -> SiteEstimates:
     """
-    Readings of codes: companding and the response's bend undone, pedestal and dark charge taken off.
+    SiteEstimates of codes: companding and the response's bend undone, pedestal and dark charge taken off.
 
     Parameters
     ----------
     code : (n_site,), DN
     sensor, exposure_s
-        As for :func:`charge_readings`.
+        As for :func:`estimate_from_charge`.
 
     Raises
     ------
@@ -87,10 +87,10 @@ def code_readings(code: ArrayLike, sensor: Sensor, exposure_s: float) -> Reading
     Notes
     -----
     Crosstalk, coupling, differential non-linearity and fixed patterns are not undone: for the last,
-    :meth:`foveasim.sensor.Calibration.corrected`.
+    :meth:`foveasim.sensor.Calibration.correct`.
     """
     codes = _per_site("code", code, sensor)
-    share = (linearised(codes, sensor) + 0.5) / 2.0**sensor.bits - sensor.pedestal_v / sensor.v_sat_v
+    share = (linearise(codes, sensor) + 0.5) / 2.0**sensor.bits - sensor.pedestal_v / sensor.v_sat_v
     bend = sensor.nonlinearity_fraction
     slope = np.ones(codes.size)
     if bend:
@@ -98,12 +98,12 @@ def code_readings(code: ArrayLike, sensor: Sensor, exposure_s: float) -> Reading
         share = (1.0 - slope) / (2.0 * bend)
     full_e = electrons_per_code(sensor) * 2.0**sensor.bits
     charge = share * full_e
-    read_e = charge_readings(charge, sensor, exposure_s)
+    read_e = estimate_from_charge(charge, sensor, exposure_s)
     step_e = sensor.converter.width_of_code_dn(codes) / slope * electrons_per_code(sensor)
     readout = sensor.readout_model(np.maximum(charge, 0.0), is_device_known=False)
     noise_e2 = readout.noise_e2 + step_e**2 * sensor.converter.noise_dn2
-    is_full = read_e.is_full | (codes >= 2**sensor.bits - 1)
-    return Readings(light_e=read_e.light_e, variance_e2=read_e.variance_e2 + noise_e2, is_full=is_full)
+    is_saturated = read_e.is_saturated | (codes >= 2**sensor.bits - 1)
+    return SiteEstimates(light_e=read_e.light_e, variance_e2=read_e.variance_e2 + noise_e2, is_saturated=is_saturated)
 
 
 def _per_site(name: str, values: ArrayLike, sensor: Sensor) -> Floats:

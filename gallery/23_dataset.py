@@ -1,7 +1,7 @@
 """
 What do networks learn from that are to mind neither the camera nor its noise?
 
-New here: ``foveasim.explore.classification`` and ``denoising``, ``DataSet``, ``write_data_set``.
+New here: ``foveasim.explore.classification`` and ``denoising``, ``Dataset``, ``write_dataset``.
 
 Expect: one photograph as 8 cameras drawn at random take it, each sample with its class and the sites of its box; noisy captures
 at three exposures beside the mean code that they are noisy about, whose mean squared distance is the variance that the sensor
@@ -45,7 +45,7 @@ LAYOUTS = [
     },
     {"generator": "grid", "parameters": {"n_x": 100, "n_y": 100, "pitch_um": 12.5}, "mosaic": ["RG", "GB"]},
 ]
-#: Fewer of them for the other data set: means of few electrons take longer to compute than captures.
+#: Fewer of them for the other dataset: means of few electrons take longer to compute than captures.
 HEXAGONS = {
     "generator": "hexagonal",
     "parameters": {"n_columns": 76, "n_rows": 88, "pitch_um": 17.3},
@@ -69,7 +69,7 @@ def shown(capture: Capture, white_dn: float | None = None) -> NDArray[np.uint8]:
 
 
 def main(out_dir: Path) -> None:
-    """Write samples of both data sets to a folder."""
+    """Write samples of both datasets to a folder."""
     photograph = skimage.data.astronaut()
 
     # %% For a classifier: the same class, whatever the layout, the lens, the exposure and the electronics.
@@ -126,7 +126,7 @@ def main(out_dir: Path) -> None:
 
     # %% Written shard by shard, and read back.
     with tempfile.TemporaryDirectory() as folder:
-        stored = explore.write_data_set(noisy, Path(folder) / "noisy")
+        stored = explore.write_dataset(noisy, Path(folder) / "noisy")
         print(stored, "of seed", stored.about["plan"]["seed"])
         assert np.array_equal(stored[7]["code"], noisy[7]["code"])
     assert max(abs(ratio - 1.0) for ratio in ratios) < 0.03
