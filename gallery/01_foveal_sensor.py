@@ -1,13 +1,15 @@
 """
-What does a foveal colour sensor see of a photograph?
+What does a foveal colour sensor capture of a photograph, compared with a square grid of as many photosites?
 
 New here: ``layout.log_polar``, ``layout.mosaic``, ``Scene.from_picture``, ``Optics``, ``Sensor``, ``Camera``, ``Capture``.
 
-Expect: a blind spot of 60.12 µm radius (within 0.01 µm), the inner edge of the first ring whose pixels reach 2 µm.
+Expect: a blind spot of 60.12 µm radius (within 0.01 µm), the inner edge of the first ring whose pixels reach 2 µm; photosites of
+11.4 µm on the square grid, which covers the same field.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 
@@ -19,6 +21,19 @@ from foveasim.view import plot_capture, save_figure
 PITCH_UM = 500.0
 DISTANCE_M = 1.0
 EXPOSURE_S = 1 / 30
+
+
+def camera_of(layout: fs.Layout) -> fs.Camera:
+    """Return the camera with these photosites, of the same capacitance per area."""
+    sensor = fs.Sensor(
+        layout,
+        qe=fs.SiliconQE(depth_um=3.0),
+        filters="rgb",
+        capacitance_f=1e-15 * layout.area_um2,
+        read_noise_e=1.0,
+        bits=10,
+    )
+    return fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
 
 
 def main(out_dir: Path) -> None:
@@ -35,23 +50,26 @@ def main(out_dir: Path) -> None:
     # %% The sensor: rings of 192 sites, none smaller than 2 µm, looking at the face.
     layout = fs.layout.log_polar(n_sectors=192, min_size_um=2.0, r_max_um=690.0, stagger=True, chords_per_arc=2)
     layout = fs.layout.mosaic(layout, ("RG", "GB")).translate(-140.0, 320.0)
-    sensor = fs.Sensor(
-        layout,
-        qe=fs.SiliconQE(depth_um=3.0),
-        filters="rgb",
-        capacitance_f=1e-15 * layout.area_um2,
-        read_noise_e=1.0,
-        bits=10,
-    )
+    camera = camera_of(layout)
 
-    # %% The shot.
-    camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
+    # %% The capture.
     capture = camera.capture(scene, exposure_s=EXPOSURE_S, seed=1)
     capture.picture(max_pixels=800).save(out_dir / "01_foveal_picture.png", capture.white_dn, encode_srgb=True)
     axes = plot_capture(capture)
     save_figure(axes.figure, out_dir / "01_foveal_layout.png", dpi=100)
 
-    # %% The number.
+    # %% The same field on a square grid of as many photosites.
+    x_min, y_min, x_max, y_max = layout.bounds_um
+    n = math.isqrt(layout.n_sites)
+    pitch_um = (x_max - x_min) / n
+    square = fs.layout.mosaic(fs.layout.grid(n_x=n, n_y=n, pitch_um=pitch_um), ("RG", "GB"))
+    square = square.translate(0.5 * (x_min + x_max), 0.5 * (y_min + y_max))
+    even = camera_of(square).capture(scene, exposure_s=EXPOSURE_S, seed=1)
+    even.picture(max_pixels=800).save(out_dir / "01_square_picture.png", even.white_dn, encode_srgb=True)
+
+    # %% The numbers.
+    print(f"{square.n_sites} square photosites of {pitch_um:.1f} µm")
+    assert abs(pitch_um - 11.4) < 0.05
     blind_radius_um = layout.provenance["blind_radius_um"]
     print(f"blind spot of {blind_radius_um:.2f} µm radius, {layout.n_sites} photosites")
     assert abs(blind_radius_um - 60.12) < 0.01
