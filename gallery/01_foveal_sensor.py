@@ -3,8 +3,8 @@ What does a foveal colour sensor capture of a photograph, compared with a square
 
 New here: ``layout.log_polar``, ``layout.mosaic``, ``Scene.from_picture``, ``Optics``, ``Sensor``, ``Camera``, ``Capture``.
 
-Expect: a blind spot of 60.12 µm radius (within 0.01 µm), the inner edge of the first ring whose pixels reach 2 µm; photosites of
-11.4 µm on the square grid, which covers the same field.
+Expect: a blind spot of 60.12 µm radius (within 0.01 µm), the inner edge of the first ring whose pixels reach 2 µm;
+photosites of 11.4 µm on the square grid, which covers the same field.
 """
 
 from __future__ import annotations
