@@ -255,13 +255,13 @@ def test_roofs_have_their_colour_and_walls_are_darker():
     front = np.array([200, 100, 40]) * (render3d.AMBIENT + render3d.DIFFUSE * light[1])
 
     assert set(map(tuple, picture.reshape(-1, 3).tolist())) == {
-        render3d.GROUND, tuple(np.rint(roof).astype(int)), tuple(np.rint(front).astype(int))
+        render3d.BACKGROUND, tuple(np.rint(roof).astype(int)), tuple(np.rint(front).astype(int))
     }  # fmt: skip
 
 
 def test_no_colour_is_clipped():
     picture = software(prisms(ODD_LAYOUT, np.ones(5), by=np.full((5, 3), 255, np.uint8)))
-    seen = picture[np.any(picture != render3d.GROUND, axis=-1)]
+    seen = picture[np.any(picture != render3d.BACKGROUND, axis=-1)]
 
     assert pytest.approx(1.0) == render3d.AMBIENT + render3d.DIFFUSE
     assert seen.max() < 255
@@ -306,8 +306,8 @@ def test_the_whole_scene_is_in_the_picture_and_fills_it(viewpoint):
     assert margins.min(axis=0).min() == pytest.approx(0.5 * (1.0 - render3d.FILLED_SHARE), abs=0.002)
     assert margins[0] == pytest.approx(margins[1], abs=0.002)
     picture = software(columns, viewpoint=viewpoint)
-    assert np.all(picture[[0, -1]] == render3d.GROUND)
-    assert np.all(picture[:, [0, -1]] == render3d.GROUND)
+    assert np.all(picture[[0, -1]] == render3d.BACKGROUND)
+    assert np.all(picture[:, [0, -1]] == render3d.BACKGROUND)
 
 
 @pytest.mark.parametrize(
@@ -369,7 +369,7 @@ def test_both_renderers_make_the_same_picture(viewpoint):
         render(columns, viewpoint=viewpoint, size_px=(400, 260), oversampling=2, renderer=name).astype(int)
         for name in ("software", "pyvista")
     )
-    is_ground = [np.all(picture == render3d.GROUND, axis=-1) for picture in (ours, theirs)]
+    is_ground = [np.all(picture == render3d.BACKGROUND, axis=-1) for picture in (ours, theirs)]
 
     # Borders may fall to either side of a pixel's centre: less than one in a hundred does.
     assert np.mean(is_ground[0] != is_ground[1]) < 0.005
@@ -400,10 +400,10 @@ def test_the_shade_of_corners_darkens_them_and_leaves_no_line_at_the_border():
         for shade in (False, True)
     )
 
-    is_ground = np.all(plain == render3d.GROUND, axis=-1)
+    is_ground = np.all(plain == render3d.BACKGROUND, axis=-1)
     assert shaded[~is_ground].mean() < plain[~is_ground].mean() - 1
-    assert np.all(shaded[[0, -1]] == render3d.GROUND)
-    assert np.all(shaded[:, [0, -1]] == render3d.GROUND)
+    assert np.all(shaded[[0, -1]] == render3d.BACKGROUND)
+    assert np.all(shaded[:, [0, -1]] == render3d.BACKGROUND)
 
 
 @pytest.mark.needs("renderer")

@@ -493,7 +493,7 @@ def test_everything_can_be_reached_and_done_with_the_keyboard(visit):
         "nearer",
         "farther",
         "fit",
-        "graph_colouring",
+        "colouring",
         "enlarge",
     ]
     assert [name for name in order if name in wanted][: len(wanted)] == wanted
