@@ -245,6 +245,39 @@ def test_wrong_result_of_effect_is_rejected(returned):
         codes(made(effects=[Wrong()]))
 
 
+@dataclass(frozen=True)
+class RowNoise(Effect):
+    """Temporal row noise: one draw for all sites of a line."""
+
+    name = "row_noise"
+    stage = "charge"
+    is_temporal = True
+    is_local = False
+
+    sigma_e: float = 5.0
+
+    def apply(self, values, *, sites, rng):
+        lines, line_of_site = np.unique(sites.layout.readout_line, return_inverse=True)
+        return values + (self.sigma_e * rng.standard_normal(lines.size))[line_of_site]
+
+    def moments(self, mean, variance, *, sites):
+        return mean, variance + self.sigma_e**2
+
+
+def test_shared_draws_span_blocks():
+    """Lines of more sites than a block has get one draw each, in every frame."""
+    n_x = 40_000
+    layout = grid(n_x=n_x, n_y=3, pitch_um=2.0).with_columns(readout_line=np.repeat(np.arange(3), n_x))
+    sensor = Sensor(layout, effects=[RowNoise()], bits=16, v_sat_v=1.0, capacitance_f=1e-15)
+    charge_e = np.full(layout.n_sites, 1000)
+
+    codes = [sensor.read(charge_e, streams=Streams(seed)).reshape(3, n_x) for seed in range(2)]
+
+    assert all(np.all(each == each[:, :1]) for each in codes)
+    assert len(np.unique(np.stack(codes)[:, :, 0])) == 6
+    assert noise_budget(sensor, np.full(layout.n_sites, 1e3), 1.0)["row_noise"] == pytest.approx(5.0)
+
+
 @pytest.mark.parametrize("deviation", [np.ones(3), np.nan])
 def test_wrong_deviation_is_rejected(deviation):
     class Wrong(LampFlicker):

@@ -189,7 +189,8 @@ class Effect(ABC):
         Whether it is drawn again for each frame; otherwise it is fixed for a device, or deterministic. Before collection
         effects are fixed.
     is_local : bool
-        Whether a site's result depends on that site alone. Otherwise :meth:`apply` gets all sites at once.
+        Whether a site's result and draw are its own. Otherwise, for crosstalk or for a draw that a row of sites shares,
+        :meth:`apply` gets all sites at once.
     is_drawn_at_reset : bool
         Whether all reads between two resets share one draw.
     """
