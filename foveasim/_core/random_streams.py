@@ -7,9 +7,9 @@ from zlib import crc32
 
 import numpy as np
 
-from foveasim._core.validation import check_count
+from foveasim._core.validation import Floats, check_count
 
-__all__ = ["Streams", "derived_seed", "device_key"]
+__all__ = ["Streams", "derived_seed", "device_key", "standard_normal"]
 
 
 def device_key(seed: int, effect: str) -> tuple[np.uint64, np.uint64]:
@@ -21,6 +21,24 @@ def device_key(seed: int, effect: str) -> tuple[np.uint64, np.uint64]:
 def derived_seed(seed: int, index: int) -> int:
     """Seed below 2**63 of one run among many: it depends on the seed of them all and the run's number alone."""
     return int(np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def standard_normal(rng: np.random.Generator, n: int) -> Floats:
+    """
+    Standard Gaussian numbers, at less than half the cost of the generator's own.
+
+    One word of the generator is the key of a counter-based generator, whose numbers are turned into Gaussian ones by the
+    method of Box and Muller: see :func:`foveasim._core._kernels.standard_normal`.
+
+    Returns
+    -------
+    numbers : (n,) float64
+    """
+    from foveasim._core import _kernels
+
+    numbers = np.empty(n)
+    _kernels.standard_normal(np.uint64(rng.bit_generator.random_raw()), numbers)
+    return numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +65,8 @@ class Streams:
 
     Stability: with the same versions of this package and of numpy a seed gives the same numbers, bit for bit, on any machine;
     every capture records both versions. Between versions numbers may change (numpy promises the raw words of its generators,
-    not what its distributions make of them); where ours do, the changelog says so. What is fixed in a device comes from
-    published counter-based generators, and stays.
+    not what its distributions make of them); where ours do, the changelog says so. Gaussian noise and what is fixed in a
+    device come from published counter-based generators.
     """
 
     seed: int

@@ -19,8 +19,8 @@ import math
 import numpy as np
 from numba import types
 
+from foveasim._core._kernels import philox_4x64, uniform
 from foveasim._core.jit import njit
-from foveasim.sensor._kernels import _philox, _uniform
 
 __all__ = ["DIFFERENCE", "HAZARD", "HELD", "LEVEL", "MISSING", "change_events", "charge_spikes"]
 
@@ -43,7 +43,7 @@ _rows = types.Array(types.float64, 2, "C", readonly=True)
 
 @njit(inline="always")
 def _words(key_0, key_1, site, number):
-    return _philox(key_0, key_1, np.uint64(site), np.uint64(number), np.uint64(0), np.uint64(0))
+    return philox_4x64(key_0, key_1, np.uint64(site), np.uint64(number), np.uint64(0), np.uint64(0))
 
 
 @njit()
@@ -126,9 +126,9 @@ def change_events(
             if n_drawn[i] == 0:
                 n_drawn[i] = 1
                 word_0, word_1, _, _ = _words(key_0, key_1, first_site + i, 0)
-                memory[i, HAZARD] = -math.log(_uniform(word_0))
+                memory[i, HAZARD] = -math.log(uniform(word_0))
                 # A leaking site is anywhere between two events when the light begins.
-                memory[i, DIFFERENCE] = _uniform(word_1) * up if leak > 0.0 else 0.0
+                memory[i, DIFFERENCE] = uniform(word_1) * up if leak > 0.0 else 0.0
             change = log_light[k + 1, i] - log_light[k, i]
             slope = change / frame_s
             total = slope + leak
@@ -159,7 +159,7 @@ def change_events(
                     if noise_at < at:
                         word_0, word_1, _, _ = _words(key_0, key_1, first_site + i, n_drawn[i])
                         n_drawn[i] += 1
-                        memory[i, HAZARD] = -math.log(_uniform(word_0))
+                        memory[i, HAZARD] = -math.log(uniform(word_0))
                         at, sign = noise_at, 1 if word_1 & np.uint64(1) else -1
                     else:
                         memory[i, HAZARD] -= noise * (at - u)
@@ -190,9 +190,9 @@ def _gamma(shape, key_0, key_1, site, number):
     while True:
         word_0, word_1, word_2, _ = _words(key_0, key_1, site, number)
         number += 1
-        x = math.sqrt(-2.0 * math.log(_uniform(word_0))) * math.cos(2.0 * math.pi * _uniform(word_1))
+        x = math.sqrt(-2.0 * math.log(uniform(word_0))) * math.cos(2.0 * math.pi * uniform(word_1))
         v = (1.0 + c * x) ** 3
-        if v > 0.0 and math.log(_uniform(word_2)) < 0.5 * x * x + d - d * v + d * math.log(v):
+        if v > 0.0 and math.log(uniform(word_2)) < 0.5 * x * x + d - d * v + d * math.log(v):
             return d * v, number
 
 

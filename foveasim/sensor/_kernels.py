@@ -12,6 +12,7 @@ import math
 import numpy as np
 from numba import types
 
+from foveasim._core._kernels import philox_2x32, philox_4x64, uniform
 from foveasim._core.jit import njit
 from foveasim.sensor.adc import ConversionTables
 from foveasim.sensor.prediction import ChargeDistributions, Quadrature, Transfer
@@ -63,54 +64,7 @@ _charges = types.NamedTuple((_floats, _floats, _floats, _floats, _floats, _numbe
 _transfer = types.NamedTuple((_floats, _floats, _floats, _floats, _number, _number), Transfer)
 _quadrature = types.NamedUniTuple(_floats, 2, Quadrature)
 
-#: Philox 4x64: multipliers and Weyl steps.
-_M0, _M1 = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
-_W0, _W1 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBB67AE8584CAA73B)
-_M, _W = np.uint64(0xD256D193), np.uint64(0x9E3779B9)
-_LOW, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
-_11 = np.uint64(11)
-_ONE_IN_2_53, _ONE_IN_2_32 = 2.0**-53, 2.0**-32
-
-
-@njit(inline="always")
-def _high_word(a, b):
-    """Upper half of the product of two 64-bit numbers."""
-    a_low, a_high, b_low, b_high = a & _LOW, a >> _32, b & _LOW, b >> _32
-    middle = a_high * b_low + ((a_low * b_low) >> _32)
-    low = (middle & _LOW) + a_low * b_high
-    return a_high * b_high + (middle >> _32) + (low >> _32)
-
-
-@njit()
-def _philox(key_0, key_1, c0, c1, c2, c3):
-    """
-    Four random words of a counter and a key: Philox 4x64 with ten rounds.
-
-    J. K. Salmon, M. A. Moraes, R. O. Dror and D. E. Shaw, Parallel random numbers: as easy as 1, 2, 3 (SC11), section 3.3.
-    """
-    for _ in range(10):
-        high_0, low_0 = _high_word(_M0, c0), _M0 * c0
-        high_1, low_1 = _high_word(_M1, c2), _M1 * c2
-        c0, c1, c2, c3 = high_1 ^ c1 ^ key_0, low_1, high_0 ^ c3 ^ key_1, low_0
-        key_0 += _W0
-        key_1 += _W1
-    return c0, c1, c2, c3
-
-
-@njit(inline="always")
-def _philox_2x32(key, c0, c1):
-    """Two random words of 32 bits, in 64-bit numbers: Philox 2x32 with ten rounds (as above), at a fifth of the cost."""
-    for _ in range(10):
-        product = _M * c0
-        c0, c1 = (product >> _32) ^ key ^ c1, product & _LOW
-        key = (key + _W) & _LOW
-    return c0, c1
-
-
-@njit(inline="always")
-def _uniform(word):
-    """Number between 0 and 1, neither of them."""
-    return (np.float64(word >> _11) + 0.5) * _ONE_IN_2_53
+_LOW, _ONE_IN_2_32 = np.uint64(0xFFFFFFFF), 2.0**-32
 
 
 @njit(types.float64[::1](types.uint64, types.uint64, _words, _words))
@@ -118,8 +72,8 @@ def device_uniforms(key_0, key_1, first, second):
     """A number between 0 and 1 for every pair of words: always the same for the same key and pair."""
     out = np.empty(first.size, np.float64)
     for i in range(first.size):
-        word, _, _, _ = _philox(key_0, key_1, first[i], second[i], np.uint64(0), np.uint64(0))
-        out[i] = _uniform(word)
+        word, _, _, _ = philox_4x64(key_0, key_1, first[i], second[i], np.uint64(0), np.uint64(0))
+        out[i] = uniform(word)
     return out
 
 
@@ -242,7 +196,7 @@ def _value(charge, site, adc):
 @njit(inline="always")
 def _dnl_place(key, line, code, n_quantiles):
     """Position among the Gaussian quantiles of the DNL of a readout line and a code."""
-    word, _ = _philox_2x32(key, np.uint64(line) & _LOW, np.uint64(code))
+    word, _ = philox_2x32(key, np.uint64(line) & _LOW, np.uint64(code))
     return np.float64(word) * (_ONE_IN_2_32 * (n_quantiles - 1))
 
 

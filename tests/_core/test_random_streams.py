@@ -1,4 +1,4 @@
-"""Streams of random numbers: each hangs on seed, frame and effect, and on nothing else."""
+"""Streams of random numbers, which depend on seed, frame and effect alone; generators by counter; Gaussian numbers."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ import sys
 
 import numpy as np
 import pytest
+import scipy.stats
 
-from foveasim._core.random_streams import Streams
+from foveasim._core import _kernels
+from foveasim._core.random_streams import Streams, standard_normal
 from foveasim.errors import ParameterError
 
 N_DRAWS = 100_000
@@ -94,3 +96,111 @@ def test_a_seed_or_frame_that_is_no_count_is_refused(name, index, value, rule):
 def test_whole_numbers_of_any_type_mean_the_same_seed():
     values = [Streams(seed).of("shot").integers(2**63) for seed in (3, 3.0, np.int64(3), np.uint8(3))]
     assert all(a == b for a, b in itertools.pairwise(values))
+
+
+# -- generators by counter --------------------------------------------------------------------------------------------
+
+MASK_32 = 2**32 - 1
+
+
+def known(generator, key, counter):
+    words = generator(*(np.uint64(word) for word in (*key, *counter)))
+    return tuple(int(word) for word in words)
+
+
+@pytest.mark.parametrize(
+    ("key", "counter", "words"),
+    [
+        ((0,), (0, 0), (0xFF1DAE59, 0x6CD10DF2)),
+        ((MASK_32,), (MASK_32, MASK_32), (0x2C3F628B, 0xAB4FD7AD)),
+        ((0x13198A2E,), (0x243F6A88, 0x85A308D3), (0xDD7CE038, 0xF62A4C12)),
+    ],
+)
+def test_philox_2x32_gives_published_answers(key, counter, words):
+    """Known-answer tests that Salmon et al. publish with Random123."""
+    assert known(_kernels.philox_2x32, key, counter) == words
+
+
+@pytest.mark.parametrize(
+    ("key", "counter", "words"),
+    [
+        ((0, 0), (0, 0, 0, 0), (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
+        ((MASK_32,) * 2, (MASK_32,) * 4, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
+        (
+            (0xA4093822, 0x299F31D0),
+            (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344),
+            (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
+        ),
+    ],
+)
+def test_philox_4x32_gives_published_answers(key, counter, words):
+    """Known-answer tests that Salmon et al. publish with Random123."""
+    assert known(_kernels.philox_4x32, key, counter) == words
+
+
+# -- Gaussian numbers -------------------------------------------------------------------------------------------------
+
+
+def normals(key, n):
+    numbers = np.empty(n)
+    _kernels.standard_normal(np.uint64(key), numbers)
+    return numbers
+
+
+def reference_pair(key, counter):
+    """Box and Muller's pair by the functions of the math module."""
+    key_0, key_1 = key & MASK_32, key >> 32
+    c0, c1, c2, c3 = known(_kernels.philox_4x32, (key_0, key_1), (counter & MASK_32, counter >> 32, 0, 0))
+    # The words are read as signed; adding 2**31 modulo 2**32 makes them positive.
+    c0, c1, angle = ((word + 2**31) % 2**32 for word in (c0, c1, c2))
+    u = (c0 * 2**32 + c1 + 0.5) / 2**64
+    radius = math.sqrt(-2.0 * math.log(u))
+    theta = math.pi / 2.0 * (angle + 0.5) / 2**32
+    signs = (-1.0 if c3 >> 31 else 1.0, -1.0 if c3 >> 30 & 1 else 1.0)
+    return signs[0] * radius * math.sin(theta), signs[1] * radius * math.cos(theta)
+
+
+@pytest.mark.parametrize("key", [0, 1, 2**63, 2**64 - 1])
+def test_gaussian_numbers_follow_box_and_muller(key):
+    expected = np.ravel([reference_pair(key, counter) for counter in range(1500)])
+    np.testing.assert_allclose(normals(key, 3000), expected, rtol=1e-7, atol=1e-9)
+    assert np.abs(normals(key, 3000) - expected).max() < 1e-12
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 1023, 1024, 1025, 3001])
+def test_shorter_draws_begin_equally(n):
+    np.testing.assert_array_equal(normals(5, n), normals(5, 5000)[:n])
+
+
+def test_gaussian_numbers_have_gaussian_moments():
+    n = 4_000_000
+    z = standard_normal(Streams(11).of("read"), n)
+    # Variance of the mean of z**k: (E z**2k - (E z**k)**2) / n, with E z**2k = (2k - 1)!!.
+    for k, moment, square in ((1, 0, 1), (2, 1, 3), (3, 0, 15), (4, 3, 105), (5, 0, 945), (6, 15, 10395)):
+        assert np.mean(z**k) == pytest.approx(moment, abs=5.0 * math.sqrt((square - moment**2) / n))
+
+
+def test_gaussian_numbers_have_gaussian_tails():
+    n = 4_000_000
+    z = standard_normal(Streams(12).of("read"), n)
+    borders = np.array([-np.inf, -4.5, -4.0, -3.0, -2.0, -1.0, -0.1, 0.0, 0.1, 1.0, 2.0, 3.0, 4.0, 4.5, np.inf])
+    expected = n * np.diff(scipy.stats.norm.cdf(borders))
+    # norm.cdf near 1 loses digits that its mirror image has.
+    expected[-3:] = expected[2::-1]
+    assert scipy.stats.chisquare(np.histogram(z, borders)[0], expected).pvalue > 1e-6
+    assert scipy.stats.kstest(z[:500_000], "norm").pvalue > 1e-6
+
+
+def test_neighbouring_numbers_are_independent():
+    n = 1_000_000
+    z = standard_normal(Streams(13).of("read"), n)
+    for function in (lambda x: x, np.square, np.abs):
+        values = function(z) - function(z).mean()
+        for lag in (1, 2, 3, 1023, 1024):
+            assert abs(np.corrcoef(values[:-lag], values[lag:])[0, 1]) < 5.0 / math.sqrt(n)
+
+
+def test_successive_draws_differ():
+    rng = Streams(1).of("read")
+    first, second = standard_normal(rng, 1000), standard_normal(rng, 1000)
+    assert np.intersect1d(first, second).size == 0

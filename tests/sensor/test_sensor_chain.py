@@ -62,21 +62,6 @@ def test_numbers_of_a_device_are_those_of_the_published_generator():
         assert number == ((int(word) >> 11) + 0.5) / 2.0**53
 
 
-@pytest.mark.parametrize(
-    ("key", "counter", "words"),
-    [
-        (0, (0, 0), (0xFF1DAE59, 0x6CD10DF2)),
-        (0xFFFFFFFF, (0xFFFFFFFF, 0xFFFFFFFF), (0x2C3F628B, 0xAB4FD7AD)),
-        (0x13198A2E, (0x243F6A88, 0x85A308D3), (0xDD7CE038, 0xF62A4C12)),
-    ],
-)
-def test_the_small_generator_gives_its_authors_known_answers(key, counter, words):
-    """The known-answer tests that Salmon et al. publish with Random123."""
-    got = _kernels._philox_2x32(np.uint64(key), *(np.uint64(c) for c in counter))
-
-    assert tuple(int(word) for word in got) == words
-
-
 EFFECTS = ("prnu", "dsnu", "hot", "gain_fpn", "pixel_fpn", "rts")
 
 

@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Literal, Protocol, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foveasim._core.random_streams import standard_normal
 from foveasim._core.registry import Registry
 from foveasim._core.validation import Floats, Ints, read_only
 from foveasim.errors import SimulationError
@@ -317,7 +318,7 @@ class AdditiveNoise(Effect):
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """Return values plus a draw."""
-        noise = rng.standard_normal(values.size)
+        noise = standard_normal(rng, values.size)
         noise *= sites.pattern(self, self.deviation)
         values += noise
         return values

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from foveasim._core.random_streams import Streams
+from foveasim._core.random_streams import Streams, standard_normal
 from foveasim._core.validation import Floats, Ints, unmasked
 from foveasim.sensor.blocks import in_blocks, pieces
 from foveasim.sensor.effects.contract import Effect, Sites, Stage
@@ -67,7 +67,7 @@ class ShotNoise(Effect):
             return np.rint(np.clip(values, 0.0, LARGEST_CHARGE_E)).astype(np.int64)
         if self.how == "auto":
             electrons = np.empty(values.size, np.int64)
-            _kernels.draw_poisson(values, rng.standard_normal(values.size), self.gaussian_above_e, electrons)
+            _kernels.draw_poisson(values, standard_normal(rng, values.size), self.gaussian_above_e, electrons)
             return electrons
         is_beyond = values > LARGEST_EXACT_E
         electrons = rng.poisson(np.where(is_beyond, 0.0, values))
