@@ -1,5 +1,5 @@
 """
-What a video costs: frames a second against the Fourier transforms and the integration that none can do without, and its memory.
+Video: frames per second against the Fourier transforms and the integration that a frame needs, and peak memory.
 
     python benchmarks/video.py             1,000 frames of 1080p onto 30,240 sites, about a minute
     python benchmarks/video.py --quick     100 frames
@@ -192,7 +192,7 @@ def _memory(report: Report, n_frames: int) -> None:
     found = json.loads(told.stdout)
     console.print(
         f"{n_frames:,} frames from pictures to a zarr folder: {n_frames / found['wall_s']:.1f} frames/s of wall, "
-        f"{n_frames / found['cpu_s']:.1f} frames a second of processor time, {found['folder_mb']:.0f} MB written"
+        f"{n_frames / found['cpu_s']:.1f} frames per second of processor time, {found['folder_mb']:.0f} MB written"
     )
     report.add(
         f"peak memory of {n_frames:,} frames", f"{found['peak_gb']:.2f} GB", "GB", "", found["peak_gb"], MAX_PEAK_GB
@@ -223,7 +223,7 @@ def _stream(n_frames: int) -> None:
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description="Videos: frames a second, shares and memory.")
+    parser = argparse.ArgumentParser(description="Videos: frames per second, shares and memory.")
     parser.add_argument("--quick", action="store_true", help="100 frames")
     parser.add_argument("--stream", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()

@@ -46,9 +46,9 @@ Light = Scene | PowerMap | tuple[Scene | PowerMap, Sequence[float]]
 #: Maps of light behind each colour filter, on each grid.
 KeptImages = dict[tuple[Grid, int], NDArray[Any]]
 
-#: A map made by Fourier transforms may fall below darkness by this share of the brightest site: rounding of float32.
+#: A map made by Fourier transforms may fall below darkness by this fraction of the brightest site: rounding of float32.
 NEGATIVE_ROUNDING = 1e-4
-#: A filter that passes less than this share of the strongest one's light cannot be balanced against it.
+#: A filter that passes less than this fraction of the strongest one's light cannot be balanced against it.
 DIMMEST_WHITE = 0.01
 #: Exposures that outlast the time between them by this share do so by rounding.
 TIME_ROUNDING = 1e-9
@@ -305,7 +305,7 @@ class Camera:
         seed, frame : int
             Of the noise. The same numbers give the same capture, bit for bit.
         photo_e_per_s : (n_site,) float64, optional, e-/s
-            What :meth:`photoelectrons_per_s` gave for this light, where it is known: nothing of it is computed anew.
+            What :meth:`photoelectrons_per_s` gave for this light, where it is known: nothing of it is computed again.
 
         Returns
         -------
@@ -325,7 +325,7 @@ class Camera:
             photo_e_per_s = finite_array("photo_e_per_s", photo_e_per_s, ndim=1, at_least=0.0)
             if photo_e_per_s.size != self._layout.n_sites:
                 raise ParameterError(
-                    "photo_e_per_s", f"must be {self._layout.n_sites} numbers, one a site, got {photo_e_per_s.size}"
+                    "photo_e_per_s", f"must be {self._layout.n_sites} numbers, one per site, got {photo_e_per_s.size}"
                 )
         return self._exposed(light, photo_e_per_s, exposure_s, streams, clock)
 
@@ -457,9 +457,9 @@ class Camera:
 
         Notes
         -----
-        In memory are one frame of light, or ``ahead`` of them, and some numbers a site of every exposure that is going on; the
-        layout is compiled once.
-        The same object again is the same light: its image is not computed anew, wherever the gaze goes. A place moves the
+        Memory holds one frame of irradiance, or ``ahead`` of them, and a few numbers per site for each exposure in progress.
+        The layout is compiled once.
+        The same object again is the same light: its image is not computed again, wherever the gaze goes. A place moves the
         photosites' outlines, so that shifts of any part of a cell are exact; the layout is compiled for each new place.
 
         With ``frame_s`` a capture has the light of all frames that its exposure covers, each weighted by its time; the last

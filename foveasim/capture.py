@@ -128,7 +128,7 @@ class Capture:
 
     @property
     def saturated_fraction(self) -> float:
-        """Share of the sites that gave the highest code."""
+        """Fraction of the sites that gave the highest code."""
         return float(np.mean(self.code == 2**self.bits - 1)) if self.code.size else 0.0
 
     def picture(

@@ -143,7 +143,7 @@ def layouts() -> None:
 @app.command()
 def describe(
     layout: Annotated[Path, typer.Argument(help="File of a layout, or the name of one that comes with the package.")],
-    frames_per_s: Annotated[float | None, typer.Option("--fps", help="Frames a second, for the data rate.")] = None,
+    frames_per_s: Annotated[float | None, typer.Option("--fps", help="Frames per second, for the data rate.")] = None,
     bits: Annotated[int, typer.Option("--bits", help="Bits of a site's value.")] = 10,
     blanking: Annotated[float, typer.Option("--blanking", help="Time without data over time with data.")] = 0.0,
     lanes: Annotated[int, typer.Option("--lanes", help="Outputs that share the data.")] = 1,
@@ -241,7 +241,7 @@ def sweep(
         str | None,
         typer.Option("--scheduler", help="Address of a dask scheduler; by default processes of this machine."),
     ] = None,
-    workers: Annotated[int | None, typer.Option("--workers", help="Those processes; one a core by default.")] = None,
+    workers: Annotated[int | None, typer.Option("--workers", help="Those processes; one per core by default.")] = None,
     metrics: Metrics = None,
     retry: Annotated[bool, typer.Option("--retry", help="Try points again that failed before.")] = False,
 ) -> None:
@@ -270,7 +270,7 @@ def study(
         ),
     ] = None,
     storage: Annotated[
-        str | None, typer.Option("--storage", help="URL of a data base that Optuna takes, in the place of --out.")
+        str | None, typer.Option("--storage", help="URL of a data base that Optuna takes, instead of --out.")
     ] = None,
     trials: Annotated[
         int | None, typer.Option("--trials", help="Trials that the study has at its end; by default the file's.")
@@ -316,7 +316,7 @@ def dataset(
         ),
     ] = Path("dataset"),
     workers: Annotated[
-        int | None, typer.Option("--workers", help="Processes; by default one a core, where there is enough to do.")
+        int | None, typer.Option("--workers", help="Processes; by default one per core, where there is enough to do.")
     ] = None,
     scheduler: Annotated[
         str | None,
@@ -354,13 +354,13 @@ def video(
     ] = Path("video.zarr"),
     changes: Annotated[list[str] | None, typer.Option("--set", help="Replace a setting: sensor.bits=10.")] = None,
     frames_per_s: Annotated[
-        float | None, typer.Option("--fps", help="Frames a second of a folder of pictures.")
+        float | None, typer.Option("--fps", help="Frames per second of a folder of pictures.")
     ] = None,
     line_s: Annotated[float, typer.Option("--line-s", help="Rolling shutter: seconds from line to line.")] = 0.0,
     stop: Annotated[int | None, typer.Option("--stop", help="Frames to take, at most.")] = None,
     threads: Threads = None,
 ) -> None:
-    """Take a video with the camera of a settings file: pictures or a video file in the place of its scene."""
+    """Take a video with the camera of a settings file: pictures or a video file instead of its scene."""
     from foveasim.config import read_shot, run_video
     from foveasim.video import count_recorded_frames, partial_path
 

@@ -48,7 +48,7 @@ def main(out_dir: Path) -> None:
     axes = Figure(figsize=(6.4, 4.0), layout="constrained").add_subplot()
     axes.plot(SIDES, 100 * share, "o-", markersize=3)
     axes.set_xlabel("side of the pixel / (wavelength × f-number)")
-    axes.set_ylabel("share of a point's light / %")
+    axes.set_ylabel("fraction of a point's light / %")
     axes.set_ylim(0, 100)
     axes.grid(visible=True, alpha=0.3)
     save_figure(axes.figure, out_dir / "02_light_of_a_point.png", dpi=120)

@@ -24,7 +24,7 @@ from foveasim.view import save_figure
 
 WAVELENGTH_NM = 550.0
 DISTANCE_M = 0.56
-#: Share of a point's light in a centred square of side 1.5 x wavelength x f-number (the Airy pattern's integral).
+#: Fraction of a point's light in a centred square of side 1.5 x wavelength x f-number (the Airy pattern's integral).
 SIDE, SHARE = 1.5, 0.766734
 CELLS = np.array([3, 5, 7, 9, 13, 17, 21])
 #: Pixels of the scene's image per wavelength x f-number, and cells of the map along a pixel.
@@ -82,7 +82,7 @@ def seconds(k: int) -> float:
 
 
 def share_of_light(cells: float, side: float) -> float:
-    """Share of a point's light in a square, on a map of so many cells to wavelength x f-number."""
+    """Fraction of a point's light in a square, on a map of so many cells to wavelength x f-number."""
     power_map = OPTICS.power_map(point(cells, 1025))
     square = fs.Layout.from_rectangles([[0.0, 0.0]], side * LAMBDA_N_UM)
     power = fs.Integrator(square, power_map.grid)(power_map.data)[0, 0]
@@ -124,7 +124,7 @@ def main(out_dir: Path) -> None:
     axes.loglog(CELLS, np.abs(errors), "o-", label="edges inside cells")
     axes.loglog(CELLS, np.abs(errors[0]) * (CELLS[0] / CELLS) ** 2, ":", color="grey", label="power -2")
     axes.set_xlabel("cells to wavelength × f-number")
-    axes.set_ylabel("error of the share of light")
+    axes.set_ylabel("error of the fraction of light")
     axes.legend()
     save_figure(figure, out_dir / "03_edges_and_cells.png", dpi=120)
 

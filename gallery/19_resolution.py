@@ -43,7 +43,7 @@ PITCH_UM, ANGLE_DEG = 4.0, 5.0
 SITES_ACROSS = 28
 #: A sine this much finer than the sites tell.
 TOO_FINE = 1.4
-#: Direction of it: half-way between the rows and the diagonals of squares.
+#: Direction of it: halfway between the rows and the diagonals of squares.
 TOO_FINE_DEG = 22.5
 
 

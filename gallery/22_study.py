@@ -45,7 +45,7 @@ LEAST_SEEING_FRACTION = 0.92
 
 
 def seeing_fraction(_shot: Shot, _camera: fs.Camera, capture: fs.Capture) -> float:
-    """Share of the round field that is photosites."""
+    """Fraction of the round field that is photosites."""
     return float(capture.layout.area_um2.sum()) / (np.pi * FIELD_RADIUS_UM**2)
 
 

@@ -228,7 +228,7 @@ def test_a_nan_under_a_site_is_told_with_the_site():
         ({"exposure_s": -1.0}, "'exposure_s' must be >= 0, got -1.0 s"),
         ({"exposure_s": float("nan")}, "'exposure_s' must be finite"),
         ({"seed": -3}, "'seed' must be >= 0"),
-        ({"seed": 1.5}, "'seed' must be a whole number"),
+        ({"seed": 1.5}, "'seed' must be an integer"),
         ({"frame": -1}, "'frame' must be >= 0"),
         ({"light": "scene"}, "'light' must be a Scene or a PowerMap, got a str"),
     ],
@@ -328,13 +328,13 @@ def test_a_filter_that_sees_nothing_does_not_spoil_the_picture():
     ("spoil", "message"),
     [
         (lambda p: p.unlink(), "no such file"),
-        (lambda p: p.write_bytes(b""), "is broken, or no foveasim capture"),
-        (lambda p: p.write_bytes(b"PK\x03\x04 and nothing else"), "is broken, or no foveasim capture"),
-        (lambda p: p.write_bytes(p.read_bytes()[:-200]), "is broken, or no foveasim capture"),
-        (lambda p: p.write_bytes(p.read_bytes()[: p.stat().st_size // 2]), "is broken, or no foveasim capture"),
+        (lambda p: p.write_bytes(b""), "is corrupt, or no foveasim capture"),
+        (lambda p: p.write_bytes(b"PK\x03\x04 and nothing else"), "is corrupt, or no foveasim capture"),
+        (lambda p: p.write_bytes(p.read_bytes()[:-200]), "is corrupt, or no foveasim capture"),
+        (lambda p: p.write_bytes(p.read_bytes()[: p.stat().st_size // 2]), "is corrupt, or no foveasim capture"),
         (lambda p: np.savez(p, code=np.zeros(3)), "is no foveasim capture"),
         (lambda p: np.savez(p, about=np.array('{"format": "other"}')), "is no foveasim capture"),
-        (lambda p: np.savez(p, about=np.array({"a": 1}, dtype=object)), "is broken, or no foveasim capture"),
+        (lambda p: np.savez(p, about=np.array({"a": 1}, dtype=object)), "is corrupt, or no foveasim capture"),
     ],
 )
 def test_a_broken_capture_file_is_refused_in_one_sentence(capture, tmp_path, spoil, message):

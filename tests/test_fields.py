@@ -45,8 +45,8 @@ def test_a_centred_grid_has_its_middle_on_the_axis():
     ("values", "message"),
     [
         ({"shape": (0, 3)}, r"'shape\[0\]' must be >= 1, got 0"),
-        ({"shape": (2.5, 3)}, r"'shape\[0\]' must be a whole number"),
-        ({"shape": 7}, r"'shape' must be two whole numbers"),
+        ({"shape": (2.5, 3)}, r"'shape\[0\]' must be an integer"),
+        ({"shape": 7}, r"'shape' must be two integers"),
         ({"pitch_um": 0.0}, r"'pitch_um' must be > 0, got 0.0 µm"),
         ({"pitch_um": -1}, r"'pitch_um' must be > 0, got -1 µm"),
         ({"pitch_um": float("inf")}, r"'pitch_um' must be finite"),

@@ -164,7 +164,7 @@ def check_count(name: str, value: object, *, at_least: int = 1, at_most: int | N
     Raises
     ------
     ParameterError
-        When it is no whole number, or out of bounds.
+        When it is not an integer, or out of bounds.
     """
     if isinstance(value, int | np.integer) and not isinstance(value, bool):
         number = int(value)  # of any size: seeds have more digits than a float
@@ -172,7 +172,7 @@ def check_count(name: str, value: object, *, at_least: int = 1, at_most: int | N
         floating = check_number(name, value, hint=hint)
         number = int(floating)
         if number != floating:
-            raise ParameterError(name, "must be a whole number", floating, hint=hint)
+            raise ParameterError(name, "must be an integer", floating, hint=hint)
     if number < at_least:
         raise ParameterError(name, f"must be >= {at_least}", number, hint=hint)
     if at_most is not None and number > at_most:
@@ -190,7 +190,7 @@ def check_shape(name: str, value: object) -> tuple[int, int]:
         When it is not two integers of at least 1, or an array of float32 of that shape needs more memory than there is.
     """
     if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or len(value) != 2:
-        raise ParameterError(name, "must be two whole numbers (n_y, n_x)", value)
+        raise ParameterError(name, "must be two integers (n_y, n_x)", value)
     n_y, n_x = (check_count(f"{name}[{i}]", n, at_most=2**30) for i, n in enumerate(value))
     check_memory(name, 4 * n_y * n_x, (n_y, n_x))
     return n_y, n_x

@@ -50,12 +50,12 @@ def _answer(task: dict[str, Any]) -> dict[str, Any]:
             for array in arrays:
                 np.save(file, np.ascontiguousarray(array), allow_pickle=False)
     except MemoryError:
-        return {"rejected": "is broken or hostile: it asks for more memory than a file of its size needs"}
+        return {"rejected": "is malformed: it asks for more memory than a file of its size needs"}
     except Exception as error:  # noqa: BLE001 -- whatever a malformed file makes its reader raise
         if REJECTIONS & {kind.__name__ for kind in type(error).__mro__}:
             return {"rejected": str(error).removeprefix(f"{task['path']}: ")}
         reason = " ".join(str(error).split()) or type(error).__name__
-        return {"rejected": f"is broken or cut short ({reason:.200})"}
+        return {"rejected": f"is corrupt or truncated ({reason:.200})"}
     return {"told": told, "n_arrays": len(arrays)}
 
 

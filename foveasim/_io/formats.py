@@ -103,7 +103,7 @@ def as_file_error(path: Path, what: str, *, passes: tuple[type[FoveasimError], .
         raise FileError(path, "asks for more memory than there is") from None
     except Exception as error:  # noqa: BLE001 -- readers raise anything on malformed files
         reason = one_line(str(error), MAX_REASON) or type(error).__name__
-        raise FileError(path, f"is broken, or no {what} ({reason})") from None
+        raise FileError(path, f"is corrupt, or no {what} ({reason})") from None
 
 
 def one_line(text: str, max_characters: int) -> str:

@@ -39,7 +39,7 @@ __all__ = [
     "write_picture",
 ]
 
-#: Larger pictures are refused: 2**28 pixels are 3 GiB as three float32 channels.
+#: Larger pictures are rejected: 2**28 pixels are 3 GiB as three float32 channels.
 MAX_PIXELS = 2**28
 #: What a small EXR may unpack to, and for each byte of a larger one: deflate packs no better.
 MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**28, 1032
@@ -78,7 +78,7 @@ def picture_names(names: Iterable[str]) -> list[str]:
     )
 
     def key(name: str) -> tuple[list[tuple[int, str]], str]:
-        # Of whole numbers without the zeros before them the longer is the larger; where all are equal, the names decide.
+        # Of integers without the zeros before them the longer is the larger; where all are equal, the names decide.
         pieces = enumerate(re.split(r"([0-9]+)", name))
         return [(len(n := p.lstrip("0")), n) if k % 2 else (-1, p) for k, p in pieces if p], name
 
@@ -103,7 +103,7 @@ def read_picture(path: str | Path) -> NDArray[Any]:
     Raises
     ------
     FileError
-        When the file is missing, no picture, cut short, too large, or holds several pictures.
+        When the file is missing, no picture, truncated, too large, or holds several pictures.
 
     Notes
     -----
@@ -124,7 +124,7 @@ def read_picture(path: str | Path) -> NDArray[Any]:
         raise
     except Exception as error:  # noqa: BLE001 -- readers raise whatever a broken file made them trip over
         raise FileError(
-            path, f"is broken or cut short ({' '.join(str(error).split()) or type(error).__name__})"
+            path, f"is corrupt or truncated ({' '.join(str(error).split()) or type(error).__name__})"
         ) from None
     if picture.ndim not in (2, 3) or 0 in picture.shape or (picture.ndim == 3 and picture.shape[2] > 4):
         raise FileError(path, f"must be one picture of 1 to 4 channels, got an array of the shape {picture.shape}")
@@ -186,7 +186,7 @@ def pixels_of_image(image: Image.Image) -> NDArray[Any]:
 
 
 def _check_whole(path: Path, kind: str) -> None:
-    """Refuse what Pillow takes for whole: it passes over the sums of PNG, and does not always miss an end."""
+    """Reject what Pillow takes for whole: it passes over the sums of PNG, and does not always miss an end."""
     if kind not in ("PNG", "JPEG", "MPO", "JPEG2000"):
         return
     content = path.read_bytes()
@@ -197,7 +197,7 @@ def _check_whole(path: Path, kind: str) -> None:
         # Packed numbers are so written that they never hold the marker.
         is_whole = content.find(END_MARKER, max(begin, 0)) >= 0
     if not is_whole:
-        raise FileError(path, "is broken or cut short")
+        raise FileError(path, "is corrupt or truncated")
 
 
 def _has_true_sums(content: bytes) -> bool:
@@ -307,7 +307,7 @@ def pixels_of_page(path: Path, page: Any) -> NDArray[Any]:
     segments = list(zip(page.dataoffsets, page.databytecounts, strict=False))
     n_expected = 1 if page.is_contiguous else math.prod(page.chunked)
     if len(segments) < n_expected or any(at <= 0 or n <= 0 or at + n > n_bytes for at, n in segments):
-        raise FileError(path, "is broken or cut short")
+        raise FileError(path, "is corrupt or truncated")
     try:
         return np.asarray(page.asarray())
     except ValueError as error:
@@ -329,7 +329,7 @@ def _read_radiance(path: Path) -> NDArray[Any]:
     content = path.read_bytes()
     size = next((line.split() for line in content[:4096].split(b"\n") if line[:2] in (b"-Y", b"+Y")), [])
     if len(size) != 4:
-        raise FileError(path, "is broken or cut short (no size)")
+        raise FileError(path, "is corrupt or truncated (no size)")
     check_picture_size(path, int(size[3]), int(size[1]))
     return np.asarray(imagecodecs.rgbe_decode(content))
 

@@ -26,7 +26,7 @@ ABOUT = "about"
 SUFFIX = ".npy"
 #: numpy before 2.2 stores the argument of this name as one more array; readers ignore it.
 STRAY = "allow_pickle"
-#: A file that would unpack to more than this is refused.
+#: A file that would unpack to more than this is rejected.
 MAX_UNPACKED_BYTES = 8 * 2**30
 #: Bytes that are read at once.
 PIECE_BYTES = 2**20

@@ -136,12 +136,12 @@ def run_in_sandbox(
         except subprocess.TimeoutExpired:
             is_late = True
         if is_late:
-            raise FileError(path, f"is broken or hostile: reading it took more than {max_cpu_s} s")
+            raise FileError(path, f"is malformed: reading it took more than {max_cpu_s} s")
         if done.returncode != 0 or not done.stdout:
-            raise FileError(path, f"is broken or hostile: reading it as {kind} crashed")
+            raise FileError(path, f"is malformed: reading it as {kind} crashed")
         answer = json.loads(done.stdout)
         if is_silent and printed.stat().st_size:
-            raise FileError(path, "is broken or cut short")
+            raise FileError(path, "is corrupt or truncated")
         if "rejected" in answer:
             raise FileError(path, answer["rejected"])
         with arrays.open("rb") as file:

@@ -31,7 +31,7 @@ class _Loader(yaml.SafeLoader):
             key = self.construct_object(key_node, deep=True)
             line = key_node.start_mark.line + 1
             if not isinstance(key, str) and (not isinstance(key, int) or isinstance(key, bool)):
-                raise yaml.YAMLError(f"the key {key!r} must be a text or a whole number (line {line})")
+                raise yaml.YAMLError(f"the key {key!r} must be a text or an integer (line {line})")
             if str(key) in seen:
                 raise yaml.YAMLError(f"the key '{key}' stands there twice (line {line})")
             seen.add(str(key))

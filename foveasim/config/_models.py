@@ -37,7 +37,7 @@ __all__ = ["Models", "PerArea", "call_of", "models"]
 
 #: What a section is a call of.
 _CALLS: dict[type[BaseModel], Callable[..., Any]] = {}
-#: What sections may be of besides the package's own: when one of these changes, models are made anew.
+#: What sections may be of besides the package's own: when one of these changes, models are made again.
 _REGISTRIES: tuple[Registry[Any], ...] = (LAYOUTS, SCENES, LENSES, PUPILS, CURVES, EFFECTS)
 
 _log = logging.getLogger("foveasim")

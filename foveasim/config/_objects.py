@@ -369,7 +369,7 @@ def _built_layout(path: Path, place: str, section: Any) -> LayoutFile:
 
 
 def _picture_values(path: Path, place: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """A picture's values from 0 to 1, colours averaged, in the place of its name; for a density also where its pixels are."""
+    """A picture's values from 0 to 1, colours averaged, instead of its name; for a density also where its pixels are."""
     name = place.rpartition(".")[2]
     picture = read_picture(picture_path(path, values[name], place))
     scale = np.iinfo(picture.dtype).max if picture.dtype.kind == "u" else 1.0

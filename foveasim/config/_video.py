@@ -1,4 +1,4 @@
-"""A shot whose scene moves: the frames of a folder or a video file in the place of its picture."""
+"""A shot whose scene moves: the frames of a folder or a video file instead of its picture."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["run_video"]
 
 #: How long a frame is shown where nobody said.
 USUAL_FRAME_S = 1.0 / 25.0
-#: Parts of the shot's scene in the place of which the frames have their own.
+#: Parts of the shot's scene instead of which the frames have their own.
 OF_FRAMES = ("basis", "source")
 
 

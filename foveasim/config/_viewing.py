@@ -76,4 +76,4 @@ def _is_capture(path: Path) -> bool:
         with zipfile.ZipFile(path) as archive:
             return set(archive.namelist()) >= CAPTURE_ARRAYS
     except (OSError, zipfile.BadZipFile) as error:
-        raise FileError(path, f"is broken ({error})") from None
+        raise FileError(path, f"is corrupt ({error})") from None

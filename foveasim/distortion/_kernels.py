@@ -16,13 +16,13 @@ _numbers = types.Array(types.float64, 1, "C", readonly=True)
 MAX_STEPS, MAX_HALVINGS = 60, 30
 #: A start beyond the fold is moved inwards so often, at most.
 MAX_MOVES = 30
-#: A residual of this share of a point's distance from the centre is rounding, and one below this solves.
+#: A residual of this fraction of a point's distance from the centre is rounding, and one below this solves.
 RESIDUAL, SOLVED = 1e-15, 1e-12
 #: A point that equals one of so many before it has the same answer.
 LOOK_BACK = 8
 #: A squared residual of so many times that of rounding cannot be made smaller by shorter steps.
 NEARLY = 1e4
-#: A step of this share of a point's distance from the centre is the last: what it leaves is of the share's square.
+#: A step of this fraction of a point's distance from the centre is the last: what it leaves is of the share's square.
 LAST_STEP = 1e-9
 #: Between the directions in which it is known, the fold may be further out by this share.
 FOLD_MARGIN = 1e-3

@@ -24,7 +24,7 @@ MAX_CELLS = 2**28
 CELLS_A_PIECE = 2**20
 #: Points along the border for each cell there, and at least.
 POINTS_A_CELL, MIN_POINTS = 1, 256
-#: A border that is this share of a cell beyond a cell's edge is on it: rounding.
+#: A border that is this fraction of a cell beyond a cell's edge is on it: rounding.
 ON_EDGE = 1e-6
 #: Step of the derivative where a cell reaches over the image circle, in cells.
 STEP = 1e-3

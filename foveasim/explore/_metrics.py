@@ -52,7 +52,7 @@ def mean_code_dn(shot: Shot, camera: Camera, capture: Capture) -> float:  # noqa
 
 @METRICS.register("saturated_fraction")
 def saturated_fraction(shot: Shot, camera: Camera, capture: Capture) -> float:  # noqa: ARG001
-    """Share of the sites that gave the highest code."""
+    """Fraction of the sites that gave the highest code."""
     return capture.saturated_fraction
 
 

@@ -25,7 +25,7 @@ SCHEDULER_S = 10.0
 #: Seconds after which a task that waits at a paused worker is sent elsewhere; workers report every second or so.
 PAUSED_S = 10.0
 #: What our own workers do about memory. A worker that dask pauses may wait for ever for memory that a metric keeps; one that
-#: is ended is begun anew without it.
+#: is ended is begun again without it.
 MEMORY = {
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Integrator"]
 
-#: A site lies on the grid when no corner is further off than this share of the grid's coordinates: their rounding.
+#: A site lies on the grid when no corner is further off than this fraction of the grid's coordinates: their rounding.
 UNCOVERED_ROUNDING = 1e-12
 
 
@@ -67,7 +67,7 @@ class Integrator:
     gives it just its mean. Of a cell that an outline cuts all four neighbours are read, on the site or not, so a NaN
     reaches one cell further than at first order; and beside an edge that is sharper than the cells a site may get a little less
     than nothing of a map that is nowhere negative. The square of side λN about a diffraction pattern's centre, at any
-    offset of the cells, gets its share of 0.5289 with errors of up to 5e-2 at first and 1e-2 at second order for 3 cells
+    offset of the cells, gets its fraction of 0.5289 with errors of up to 5e-2 at first and 1e-2 at second order for 3 cells
     per λN, 7e-3 and 2e-4 for 8, 2e-3 and 1e-5 for 16. A frame takes about 1.4 times as long, compiling 1.5 times.
 
     The second order is for maps that are smooth over a few cells, as a diffraction-limited image is on cells of λN/2 or less:

@@ -51,7 +51,7 @@ SITE, ROW, COLUMN, N_PARTIAL, N_RUN = range(5)
 BLOCK = 8
 #: Shorter runs are stored cell by cell, which costs less than a header and a sum of their own.
 MIN_RUN = 12
-#: A weight below this share of all that the outline climbs in a row is the rounding of a sum of up to eight pieces, not
+#: A weight below this fraction of all that the outline climbs in a row is the rounding of a sum of up to eight pieces, not
 #: coverage; of more pieces, in proportion.
 NO_COVERAGE = 2e-15
 #: End of a linked list.
@@ -530,7 +530,7 @@ def place_spans(spans, weights, next_span, next_weight, first_slot, rows_per_ban
 
     ``next_span[row]`` and ``next_weight[row]`` say where the row's next span and weights go, and are moved on.
     A site has one accumulator, a *slot*, for each band of rows that it reaches: ``first_slot[site]`` minus the
-    site's first band, plus the band, is written in the place of the site.
+    site's first band, plus the band, is written instead of the site.
     """
     p = 0
     for i in range(spans.shape[0]):

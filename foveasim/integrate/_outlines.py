@@ -13,8 +13,8 @@ from foveasim.fields import PackedRings, PointMap
 
 __all__ = ["Outlines", "UndistortedOutlines", "outlines_of"]
 
-#: A carried edge deviates from its chords by at most this share of a cell; one that is longer than a step of the grid below, or
-#: needs more than the most pieces, by a few times that.
+#: An undistorted edge deviates from its chords by at most this fraction of a cell; an edge that is longer than a step of
+#: the grid below, or needs more than the largest number of pieces, by a few times that.
 CHORD_SHARE = 0.002
 #: How much the lens bends lines is found at so many points along either side of the layout.
 BEND_POINTS = 65

@@ -52,7 +52,7 @@ class Plan:
     rows_per_band : int
         Height of the bands of rows that are summed apart.
     first_slot : (n_site + 1,) int64
-        Site s has the slots ``first_slot[s] : first_slot[s + 1]``, one a band.
+        Site s has the slots ``first_slot[s] : first_slot[s + 1]``, one per band.
     area_um2, covered_um2 : (n_site,) float64, µm²
         Area of each site's outline, and how much of it lies on the grid.
     bounds_um : (n_site, 4) float64, µm

@@ -17,9 +17,9 @@ Points: TypeAlias = NDArray[np.complex128]
 
 #: Points outside that close the outer cells: further from every point of the region than any centre is.
 N_FAR, FAR_RADII = 8, 4.0
-#: An edge runs the wrong way when it does so by more than this share of the circles around its ends.
+#: An edge runs the wrong way when it does so by more than this fraction of the circles around its ends.
 ROUNDING = 1e-11
-#: Rounds of flips, and rounds of moving centres, after which the triangles are made anew.
+#: Rounds of flips, and rounds of moving centres, after which the triangles are made again.
 MAX_FLIPS, MAX_MOVES = 60, 12
 #: Points that cannot go this part of their way stay where they are for the time being.
 SHORTEST_WAY = 0.01
@@ -60,7 +60,7 @@ class PowerDiagram:
     Triangles come from the lower hull of the points lifted to ``z = x² + y² - weight`` (Aurenhammer 1987). From then on
     they are mended by flips of the diagonal of two triangles (Lawson 1977): where no triangle turns over as its corners
     move, and all edges run the right way after the flips, the triangles are those of the hull. Otherwise the hull is made
-    anew.
+    again.
     """
 
     def __init__(self, low_um: Floats, high_um: Floats) -> None:
@@ -152,7 +152,7 @@ def _lower_hull(points_um: Floats, weights_um2: Floats, middle_um: Floats) -> tu
 def _mended(
     old: Points, new: Points, weights_um2: Floats, triangles: Ints, beside: Ints
 ) -> tuple[Ints, Ints, Points] | None:
-    """Regular triangles of points that moved a little, from those before; None when they are to be made anew."""
+    """Regular triangles of points that moved a little, from those before; None when they are to be made again."""
     triangles, beside = triangles.copy(), beside.copy()
     centres = np.empty(triangles.shape[0], np.complex128)
     moved = np.arange(triangles.shape[0])

@@ -18,7 +18,7 @@ from foveasim.layout.model import Layout
 
 __all__ = ["CellEdges", "MovingCells", "cells_of", "edges_of_rings"]
 
-#: Edges shorter than this share of their centres' distance are one corner that rounding split, as on a square grid.
+#: Edges shorter than this fraction of their centres' distance are one corner that rounding split, as on a square grid.
 SHORT_EDGE = 1e-9
 #: Areas of all cells together, against the region's.
 AREA_ROUNDING = 1e-9

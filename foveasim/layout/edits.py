@@ -34,7 +34,7 @@ from foveasim.layout.model import INTEGER_RANGES, Layout
 
 __all__ = ["clip", "cut_out", "inset", "joining_groups", "merge", "merge_small", "node", "snap", "split", "union"]
 
-#: A piece of a site smaller than this share of it is rounding at the border of a cut.
+#: A piece of a site smaller than this fraction of it is rounding at the border of a cut.
 SLIVER = 1e-9
 
 
@@ -168,7 +168,7 @@ def merge(layout: Layout, groups: ArrayLike) -> Layout:
     """
     labels = np.asarray(unmasked("groups", groups))
     if labels.shape != (layout.n_sites,) or labels.dtype.kind not in "iu" or labels.min(initial=0) < 0:
-        raise ParameterError("groups", f"must be {layout.n_sites} whole numbers from 0, one a site", groups)
+        raise ParameterError("groups", f"must be {layout.n_sites} integers from 0, one per site", groups)
     _, first, group, count = np.unique(labels, return_index=True, return_inverse=True, return_counts=True)
     # One row a group, filled up with nothing, so that GEOS joins all groups in one call.
     order = np.argsort(group, kind="stable")

@@ -53,7 +53,7 @@ __all__ = ["Layout"]
 
 #: A layout that is smaller as a whole was given in other units.
 MIN_LAYOUT_UM = 1e-3
-#: A ring whose area is below this share of its bounding box is a line to float64.
+#: A ring whose area is below this fraction of its bounding box is a line to float64.
 ZERO_AREA_SHARE = 1e-14
 #: Columns whose values are indices, of filters and of lines: more than MAX_SITES of either are an overflow.
 INDEX_NAMES = ("channel", "readout_line")
@@ -332,7 +332,7 @@ class Layout:
 
     def index_column(self, name: str) -> Ints:
         """
-        A column of whole numbers from 0, (n_site,) int64.
+        A column of integers from 0, (n_site,) int64.
 
         Raises
         ------
@@ -418,7 +418,7 @@ class Layout:
         Raises
         ------
         ParameterError
-            When there is no key, or one is no column or has not one value a site.
+            When there is no key, or one is no column or has not one value per site.
 
         Examples
         --------
@@ -540,7 +540,7 @@ def _offsets(name: str, offsets: ArrayLike, at_least: int, total: int, of_what: 
     """Offsets as int64, when they begin at 0, end at the total, and every step is large enough."""
     array = np.array(unmasked(name, offsets))
     if array.ndim != 1 or array.size < 1 or array.dtype.kind not in "iu":
-        raise ParameterError(name, "must be a list of whole numbers", offsets)
+        raise ParameterError(name, "must be a list of integers", offsets)
     array = array.astype(np.int64)
     if array[0] != 0 or array[-1] != total:
         raise ParameterError(name, f"must begin at 0 and end at {total}, the number of {of_what}", array)

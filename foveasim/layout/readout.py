@@ -23,7 +23,7 @@ def readout_by(layout: Layout, column: str) -> Layout:
     ----------
     layout : Layout
     column : str
-        Name of a column of whole numbers from 0.
+        Name of a column of integers from 0.
 
     Returns
     -------

@@ -39,7 +39,7 @@ class Summary:
     area_um2 : float, µm²
         Of all sites together.
     fill_factor : float
-        That area as a share of the layout's convex hull.
+        That area as a fraction of the layout's convex hull.
     size_um : (5,) float64, µm
         Smallest, lower quartile, median, upper quartile and largest pixel size, the square root of a site's area.
     size_edges_um, size_counts : (n_class + 1,) float64 µm and (n_class,) int64

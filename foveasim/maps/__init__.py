@@ -7,7 +7,7 @@ ending          format                          what a file tells
 .npy            numpy array                     nothing; read only
 .npz            numpy arrays with names         everything, to the last bit
 .fits           FITS image                      everything, to the last bit
-.tif, .tiff     TIFF, a page a band             everything, to the last bit; from others nothing
+.tif, .tiff     TIFF, a page per band             everything, to the last bit; from others nothing
 .exr            EXR, a channel a band           everything, to the last bit of float32; from others wavelengths and unit
 .nc             netCDF                          everything, to the last bit
 .zarr           zarr folder                     everything, to the last bit
@@ -15,7 +15,7 @@ ending          format                          what a file tells
 ==============  ==============================  =====================================================================
 
 Files are read by what they hold, whatever their ending. What one does not tell must be said; what is said goes before what
-it tells. A file that is broken, cut short or hostile ends in one :class:`~foveasim.errors.FileError`.
+it tells. A file that is corrupt, truncated or malformed ends in one :class:`~foveasim.errors.FileError`.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def read_power_map(
     wavelength_nm : number or sequence, optional, nm
         The bands' wavelengths, where the file does not tell them.
     band_width_nm : number or sequence, optional, nm
-        Of light per nm: the bands' widths; by default they reach half-way to the neighbours.
+        Of light per nm: the bands' widths; by default they reach halfway to the neighbours.
     unit : {"w_m2", "w_m2_nm", "photons_s_m2", "photons_s_m2_nm"}, optional
         What the numbers are, where the file does not tell: power or photons a second, on a square metre, in the band or in
         each nm of it.
@@ -83,14 +83,14 @@ def read_power_map(
     Raises
     ------
     FileError
-        When the file is missing, broken, cut short, too large, no map, holds what light cannot be, or lacks what nobody
+        When the file is missing, broken, truncated, too large, no map, holds what light cannot be, or lacks what nobody
         said.
     ParameterError
         When what is said is out of range, or does not fit the file.
 
     Notes
     -----
-    Power is ``photons * h c / wavelength * width``. Negative light is refused, but for rounding: 1e-5 of the brightest.
+    Power is ``photons * h c / wavelength * width``. Negative light is rejected, but for rounding: 1e-5 of the brightest.
 
     Examples
     --------

@@ -105,7 +105,7 @@ def max_unpacked(n_bytes: int) -> int:
 
 def check_size(shape: Sequence[int], itemsize: int, n_bytes: int) -> None:
     """
-    Refuse what would unpack to too much, before it is unpacked.
+    Reject what would unpack to too much, before it is unpacked.
 
     Raises
     ------
@@ -261,7 +261,7 @@ def _parsed_unit(text: str | None) -> tuple[Unit, float]:
 
 
 def _band_widths_nm(waves_nm: Floats, found: Found, given: Given) -> Floats:
-    """Widths as given or told, or reaching half-way to the neighbouring wavelengths."""
+    """Widths as given or told, or reaching halfway to the neighbouring wavelengths."""
     told = given.band_width_nm if given.band_width_nm is not None else found.band_width_nm
     if told is not None:
         width_nm = np.asarray(told, dtype=np.float64)
@@ -283,7 +283,7 @@ def _band_widths_nm(waves_nm: Floats, found: Found, given: Given) -> Floats:
 
 def check_numbers(data: Images) -> None:
     """
-    Refuse what light cannot be.
+    Reject what light cannot be.
 
     Raises
     ------

@@ -151,7 +151,7 @@ def _chosen(dataset: xr.Dataset, name: str | None) -> str:
 
 
 def _check_hdf5(path: Path) -> None:
-    """Refuse files that point outside themselves, or hold more than any map."""
+    """Reject files that point outside themselves, or hold more than any map."""
     import h5py
 
     with h5py.File(path, "r") as file:
@@ -179,7 +179,7 @@ def _check_hdf5(path: Path) -> None:
 
 
 def _check_zarr(path: Path) -> int:
-    """Refuse folders that name programs other than known packers; the bytes in the folder."""
+    """Reject folders that name programs other than known packers; the bytes in the folder."""
     for number, found in enumerate(_metadata_files(path)):
         if number > MAX_OBJECTS:
             raise FormatError(f"holds more than {MAX_OBJECTS} arrays and groups")

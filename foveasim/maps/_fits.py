@@ -72,7 +72,7 @@ def read(path: Path, name: str | None) -> Found:
         header = hdu.header
         check_size(hdu.shape, max(abs(int(header["BITPIX"])) // 8, 1), n_bytes)
         if math.prod(hdu.shape) * abs(int(header["BITPIX"])) // 8 > n_bytes:
-            raise FormatError("is cut short")
+            raise FormatError("is truncated")
         data = np.asarray(hdu.data)
         n_axes = data.ndim
         text = header.get(KEYWORD)

@@ -4,7 +4,7 @@ Optical images of ISETCam and ISETBio, as MATLAB saves them: the struct ``oi``, 
 ``data.photons`` (row, column, wave) are photons/(s m² nm), the first row on top; ``spectrum.wave`` is in nm. The middle of
 the image lies on the axis, its samples are square, and its width is ``2 f tan(wAngular / 2)``, f the focal length
 (``oiGet(oi, 'width')`` since November 2021; before, the distance of the image). A single wavelength stands for 1 nm, as
-ISETCam's ``bin width`` does. Whole numbers, of before 2017, are unpacked between ``dmin`` and ``dmax``.
+ISETCam's ``bin width`` does. Integers, of before 2017, are unpacked between ``dmin`` and ``dmax``.
 """
 
 from __future__ import annotations
@@ -119,12 +119,12 @@ def _found(field: Field) -> Found:
 
 
 def _whole(photons: NDArray[Any], field: Field) -> NDArray[Any]:
-    """Photon rates out of the whole numbers that old versions kept."""
+    """Photon rates out of the integers that old versions kept."""
     if photons.dtype.kind != "u":
         return photons
     low, high = _number(field("data/dmin")), _number(field("data/dmax"))
     if low is None or high is None or not low <= high:
-        raise FormatError("has photons as whole numbers, without the dmin and dmax that they stand between")
+        raise FormatError("has photons as integers, without the dmin and dmax that they stand between")
     return low + (high - low) / float(np.iinfo(photons.dtype).max) * photons.astype(np.float64)
 
 
@@ -161,7 +161,7 @@ def _unpacked(path: Path) -> bytes:
         while len(tag := file.read(TAG_BYTES)) == TAG_BYTES:
             kind, length = int.from_bytes(tag[:4], order), int.from_bytes(tag[4:], order)  # type: ignore[arg-type]
             if kind not in (COMPRESSED, MATRIX) or length > n_bytes:
-                raise FormatError("is broken: an element of the file is no variable, or longer than the file")
+                raise FormatError("is corrupt: an element of the file is no variable, or longer than the file")
             element = _inflated(file, length, most - size) if kind == COMPRESSED else tag + file.read(length)
             pieces.append(element)
             size += len(element)
@@ -176,7 +176,7 @@ def _inflated(file: IO[bytes], length: int, most: int) -> bytes:
     while length > 0 and size <= most:
         packed = file.read(min(length, PIECE_BYTES))
         if not packed:
-            raise FormatError("is cut short")
+            raise FormatError("is truncated")
         length -= len(packed)
         while packed and size <= most:
             parts.append(inflater.decompress(packed, PIECE_BYTES))

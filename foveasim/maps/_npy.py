@@ -101,7 +101,7 @@ def _list(values: NDArray[Any] | None) -> list[float] | None:
 
 def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo, n_bytes: int) -> NDArray[Any]:
     if item.filename.removesuffix(".npy") in ABOUT and item.file_size > MAX_ABOUT_BYTES:
-        raise FormatError(f"is broken: {item.filename!r:.40} has {item.file_size} bytes")
+        raise FormatError(f"is corrupt: {item.filename!r:.40} has {item.file_size} bytes")
     check_size((item.file_size,), 1, n_bytes)
     with archive.open(item) as file:
         return _array(file, item.file_size, n_bytes)

@@ -1,5 +1,5 @@
 """
-Maps as TIFF: a page a band, or one page whose samples are the bands; the first row is on top.
+Maps as TIFF: a page per band, or one page whose samples are the bands; the first row is on top.
 
 What a TIFF has no place for stands as JSON in the first page's description: pitch, origin, wavelengths and unit.
 """
@@ -30,7 +30,7 @@ CLASSIC_BYTES = 2**32 - 2**24
 
 
 def write(power_map: PowerMap, path: Path) -> None:
-    """Write a page a band, unpacked."""
+    """Write a page per band, unpacked."""
     import tifffile
 
     description = json.dumps(about_map(power_map))

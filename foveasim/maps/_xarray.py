@@ -110,8 +110,8 @@ def from_xarray(
     )
     try:
         return finished(found_in_array(data_array), given)
-    except FormatError as refusal:
-        raise ParameterError("data_array", str(refusal)) from None
+    except FormatError as rejection:
+        raise ParameterError("data_array", str(rejection)) from None
 
 
 def found_in_array(array: xr.DataArray) -> Found:

@@ -103,7 +103,7 @@ class SamplingSpectrum:
         Raises
         ------
         ParameterError
-            When the number is no whole number from 1 to 4096.
+            When the number is not an integer from 1 to 4096.
         """
         n_bins = check_count("n_bins", n_bins, at_most=MOST_FREQUENCIES)
         f = self.frequency_per_mm
@@ -142,8 +142,8 @@ class AliasingSpectrum:
     alias_per_mm : (2,) float64, 1/mm
         Where it is.
     noise_fraction : float
-        Share of the samples' power that is at other frequencies up to the Nyquist frequency, the alias included; the power of
-        the samples is spread over one reciprocal cell of them.
+        Fraction of the samples' power at other frequencies up to the Nyquist frequency, the alias included; the power of the
+        samples is spread over one reciprocal cell of them.
     """
 
     wave_per_mm: Floats
@@ -373,7 +373,7 @@ def _point_transform(xy_um: Floats, weight: NDArray[np.inexact], frequency_per_m
 
 
 def _semicircle(share: Floats) -> Floats:
-    """The spreading kernel at shares of its half width: close to the narrowest in space and frequency at once."""
+    """The spreading kernel at fractions of its half width: close to the narrowest in space and frequency at once."""
     return np.asarray(
         np.exp(SPREAD_SHAPE * (np.sqrt(np.maximum(1.0 - share * share, 0.0)) - 1.0)) * (np.abs(share) <= 1.0)
     )

@@ -32,9 +32,9 @@ from foveasim.sensor.adc import QUANTISATION_DN2
 
 __all__ = ["Emva1288", "emva1288"]
 
-#: The linearity error is told between these shares of saturation.
+#: The linearity error is told between these fractions of saturation.
 LINEARITY_FRACTIONS = (0.05, 0.95)
-#: The response's non-uniformity is told at this share of saturation.
+#: The response's non-uniformity is told at this fraction of saturation.
 PRNU_FRACTION = 0.5
 #: No more of the dark codes than this may be cut off at 0.
 MOST_UNDERFLOW_FRACTION = 0.005
@@ -78,7 +78,7 @@ class Emva1288:
     dark_current_e_per_s, dark_current_of_variance_e_per_s : (n_class,) float64, e-/s
         From the growth of the mean and of the variance of darkness with exposure; NaN without a dark series.
     underflow_fraction : (n_class,) float64
-        Share of dark codes that are 0.
+        Fraction of dark codes that are 0.
     transfer, dark : PhotonTransfer
         What it was told from.
 
@@ -311,7 +311,7 @@ def _root(variance_dn2: Floats) -> Floats:
 
 
 def _underflow(dark: Any, groups: SiteClasses) -> Floats:
-    """Share of codes that are 0, with a warning where they are many."""
+    """Fraction of codes that are 0, with a warning where they are many."""
     share = groups.mean((codes_of("dark[0]", dark) == 0).mean(axis=0))
     if share.max() > MOST_UNDERFLOW_FRACTION:
         warnings.warn(

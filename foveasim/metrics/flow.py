@@ -31,7 +31,7 @@ from foveasim.metrics.sampling import require_layout
 
 __all__ = ["FlowBound", "FlowEstimate", "estimate_flow", "flow_bound", "site_gradients_e_per_um"]
 
-#: A direction about which there is less than this share of the other's information has none.
+#: A direction about which there is less than this fraction of the other's information has none.
 LEAST_INFORMATION = 1e-12
 #: A site of which more than this share lies off the map tells nothing: what was there is not known.
 OFF_SHARE = 1e-9
@@ -268,7 +268,7 @@ class _Regions:
         labels = np.zeros(n_sites, np.int64) if regions is None else as_numbers("regions", regions, keep_type=True)
         if labels.shape != (n_sites,) or labels.dtype.kind not in "iu":
             raise ParameterError(
-                "regions", f"must be {n_sites} whole numbers, got {labels.dtype} of the shape {labels.shape}"
+                "regions", f"must be {n_sites} integers, got {labels.dtype} of the shape {labels.shape}"
             )
         self._n_all = n_sites
         self._used = np.flatnonzero(labels >= 0)

@@ -45,7 +45,7 @@ __all__ = [
     "slopes",
 ]
 
-#: The gain is told from levels up to this share of saturation (EMVA 1288).
+#: The gain is told from levels up to this fraction of saturation (EMVA 1288).
 LINEAR_FRACTION = 0.7
 #: A variance below this, in DN², is quantisation's more than the sensor's (EMVA 1288).
 LEAST_DARK_DN2 = 0.24
@@ -195,7 +195,7 @@ def draw_frames(
     Raises
     ------
     ParameterError
-        When a number is out of range, or the charge has not one value a site.
+        When a number is out of range, or the charge has not one value per site.
     """
     level_e = _level("expected_e", expected_e, sensor.layout.n_sites)
     first_frame = check_count("first_frame", first_frame, at_least=0)

@@ -34,7 +34,7 @@ def psnr_db(
     data_range : float, optional
         The peak; by default the reference's largest less its smallest value, of the pixels that are compared.
     min_coverage : float
-        Pixels of a picture count when at least this share of them is covered by photosites, and no channel is NaN.
+        Pixels of a picture count when at least this fraction of them is covered by photosites, and no channel is NaN.
 
     Returns
     -------

@@ -38,12 +38,12 @@ BINS_PER_PITCH = 4
 LEAST_SITES, LEAST_REACH_PITCHES = 50, 5.0
 #: (white - black) / (white + black) below which black and white are the same.
 LEAST_CONTRAST = 0.02
-#: A sum of black and white below this share of their difference is rounding.
+#: A sum of black and white below this fraction of their difference is rounding.
 NO_SUM = 1e-9
-#: Share of the values' variance that one straight edge must explain.
+#: Fraction of the values' variance that one straight edge must explain.
 LEAST_EXPLAINED = 0.3
-#: Bins that narrow reach so far, in pitches and in widths of the edge; from there on each widens by this share of the distance.
-#: What lies so far out is smooth, and its noise at high frequencies would drown the rest.
+#: Bins of that width reach to this distance, in pitches and in widths of the edge; beyond it each is wider by this fraction of
+#: the distance. The ESF is smooth there, and noise at high frequencies would dominate the MTF.
 NARROW_PITCHES, NARROW_WIDTHS, WIDENING = 3.0, 2.0, 0.5
 #: A profile that reaches less far than so many widths of the edge, the error function's, ends on its slope.
 LEAST_REACH_WIDTHS = 2.0
@@ -51,9 +51,9 @@ LEAST_REACH_WIDTHS = 2.0
 SCATTER_BINS = 4
 #: With fewer bins to a period their aliases are no longer small: with so many they are below 1 %, with two 18 %.
 BINS_PER_PERIOD = 4
-#: An edge blurred over more than this share of the region is a ramp.
+#: An edge blurred over more than this fraction of the region is a ramp.
 WIDEST_SHARE = 0.25
-#: Residuals beyond this share of the step count less and less: a defect, or another edge at the border.
+#: Residuals beyond this fraction of the step count less and less: a defect, or another edge at the border.
 SOFT_SHARE = 0.1
 #: Frequencies of a result that asks for none, up to one a pitch, twice the Nyquist frequency of a square grid.
 N_FREQUENCIES = 101
@@ -460,7 +460,7 @@ def _curvature(distance_um: Floats, profile: Floats) -> Floats:
 
 
 def _window(window: str, share: Floats) -> Floats:
-    """Weights at shares of the reach, from -1 to 1."""
+    """Weights at fractions of the reach, from -1 to 1."""
     share = np.minimum(np.abs(share), 1.0)
     if window == "tukey":
         return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.maximum(2.0 * share - 1.0, 0.0)))

@@ -31,7 +31,7 @@ __all__ = ["SnrTable", "measured_snr_by_class", "relative_exposure_at_snr_fracti
 
 #: Sizes that differ by less than this share are one class.
 SIZE_ROUNDING = 1e-6
-#: The light at a ratio is looked for between these shares of what is given, and found to this share of it.
+#: The light at a ratio is looked for between these fractions of what is given, and found to this fraction of it.
 LEAST_SHARE, MOST_SHARE, SHARE_ROUNDING = 1e-12, 1e12, 1e-6
 #: In at most so many steps, each so many of them a half, for clips that bend the ratio; of secants between these slopes.
 MOST_STEPS, HALVED_EVERY, SLOPES = 200, 4, (0.25, 4.0)
@@ -189,7 +189,7 @@ def relative_exposure_at_snr_fraction(
     camera: Camera, light: Scene | PowerMap, *, exposure_s: float, snr: float = 1.0, classes: ArrayLike | None = None
 ) -> Floats:
     """
-    Share of a scene's light at which each class of sites has a signal-to-noise ratio: 1 for the least that can be seen.
+    Fraction of a scene's light at which each class of sites has a signal-to-noise ratio: 1 for the least that can be seen.
 
     Parameters
     ----------

@@ -125,7 +125,7 @@ def read_events(path: Path) -> tuple[Floats, NDArray[np.int32], NDArray[np.int8]
     Raises
     ------
     FileError
-        When the file is broken, hostile, or holds something else.
+        When the file is corrupt, malformed, or holds something else.
     """
     told, found = read_in_sandbox(_read, path, kind="HDF5", max_unpacked=_max_unpacked)
     arrays = dict(zip(told["names"], found, strict=True))
@@ -135,7 +135,7 @@ def read_events(path: Path) -> tuple[Floats, NDArray[np.int32], NDArray[np.int8]
         if name.startswith("layout/") and name != "layout/provenance"
     }
     layout = unpacked_layout(outlines, json.loads(arrays["layout/provenance"].tobytes()))
-    # In one step from the whole number: 0.3 s is 300,000 µs, and comes back as 0.3.
+    # In one step from the integer: 0.3 s is 300,000 µs, and comes back as 0.3.
     t_s = arrays["events/t"] / 1e6
     return t_s, arrays["events/site"], (2 * arrays["events/p"].astype(np.int8) - 1).astype(np.int8), layout
 

@@ -4,7 +4,7 @@ Numba kernels of asynchronous photosites: events of changes of log light, and sp
 They know arrays only, release the interpreter lock, and are compiled for explicit types when this module is imported. Each
 takes some sites through some frames, one frame after the other, and changes what it remembers of every site. Events go to
 arrays in that order, site by site in each frame; ``ends`` tells behind which the frames end. Where the arrays are full, events
-are only counted, so that the caller can begin anew with longer ones; behind ``n_most`` there is no counting on.
+are only counted, so that the caller can begin again with longer ones; behind ``n_most`` there is no counting on.
 
 An event that times, as floating-point numbers, would put into another frame than its own has the nearest time of its own:
 changes belong to ``(begin, end]`` of a frame, spikes to ``[begin, end)``. So frames follow each other, however they are taken.
@@ -181,7 +181,7 @@ def change_events(
 @njit()
 def _gamma(shape, key_0, key_1, site, number):
     """
-    Draw of the gamma law of a shape of at least 1, and how many numbers were drawn then.
+    Draw of the gamma distribution of a shape of at least 1, and how many numbers were drawn then.
 
     G. Marsaglia and W. W. Tsang, A simple method for generating gamma variables (ACM Trans. Math. Softw. 26, 363, 2000).
     """
@@ -210,7 +210,7 @@ def charge_spikes(
     Spikes of some sites during some frames; how many, written or not.
 
     ``current`` is (n_frame, n_site), and stays from each frame to the next. With noise, a charge comes electron by electron,
-    and the time to a threshold of N of them follows the gamma law of the shape N.
+    and the time to a threshold of N of them follows the gamma distribution of the shape N.
     """
     n = 0
     for k in range(current.shape[0]):

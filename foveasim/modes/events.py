@@ -79,7 +79,7 @@ class Events:
             if values.ndim != 1 or values.size != t_s.size:
                 raise ParameterError(name, f"must be one number for each of {t_s.size} times, got {values.shape}")
             if values.size and not np.can_cast(values.dtype, kind, "same_kind"):
-                raise ParameterError(name, f"must be whole numbers, got {values.dtype}")
+                raise ParameterError(name, f"must be integers, got {values.dtype}")
         if t_s.size:
             # Whatever is not a number is not later than any.
             if not (t_s[0] >= 0.0 and np.all(t_s[1:] >= t_s[:-1]) and t_s[-1] < np.inf):
@@ -198,7 +198,7 @@ class Events:
         places = [as_numbers(name, values, keep_type=True) for name, values in (("x", x), ("y", y))]
         for name, values in zip("xy", places, strict=True):
             if values.ndim != 1 or values.shape != places[0].shape or (values.size and values.dtype.kind not in "iu"):
-                raise ParameterError(name, f"must be one whole number an event, got {values.dtype}{values.shape}")
+                raise ParameterError(name, f"must be one integer an event, got {values.dtype}{values.shape}")
             if values.size and not 0 <= values.min() <= values.max() <= MAX_ADDRESS:
                 raise ParameterError(name, f"must be from 0 to {MAX_ADDRESS}", (int(values.min()), int(values.max())))
         wanted = places[0].astype(np.int64) * (MAX_ADDRESS + 1) + places[1].astype(np.int64)
@@ -466,7 +466,7 @@ def _whole_us(t_s: Floats) -> Ints:
     if t_s.size and t_s[-1] > MAX_T_S:
         raise ParameterError("t_s", f"must be at most {MAX_T_S:.3g} for microseconds", float(t_s[-1]), "s")
     t_us = np.floor(t_s * 1e6)
-    # The product may be rounded past a whole number: what was read from whole microseconds stays as it is.
+    # The product may be rounded past an integer: what was read from whole microseconds stays as it is.
     t_us += (t_us + 1.0) / 1e6 <= t_s
     t_us -= t_us / 1e6 > t_s
     return t_us.astype(np.int64)

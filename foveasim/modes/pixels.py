@@ -29,7 +29,7 @@ from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 
 __all__ = ["EventPixels", "SpikingPixels"]
 
-#: A site's threshold is at least this share of the mean, whatever its mismatch.
+#: A site's threshold is at least this fraction of the mean, whatever its mismatch.
 LEAST_THRESHOLD = 0.1
 #: Sites that one thread works on at a time; fixed, so that results do not depend on the number of threads.
 PIECE_SITES = 2048
@@ -63,7 +63,7 @@ class EventPixels:
     leak_per_s : float, 1/s
         Events of brightening that a site gives each second in constant light, by leakage.
     leak_spread_fraction : float
-        Standard deviation of the sites' leaks over their mean, a log-normal law, fixed in the device.
+        Standard deviation of the sites' leaks over their mean, a log-normal distribution, fixed in the device.
     noise_per_s : float, 1/s
         Events of shot noise, of either polarity alike, that a site gives each second in darkness ...
     noise_half_e_per_s : float, e-/s
@@ -263,12 +263,12 @@ class SpikingPixels:
     Raises
     ------
     ParameterError
-        When a value is out of range, or an array does not have one value a site.
+        When a value is out of range, or an array does not have one value per site.
 
     Notes
     -----
-    Without noise the rate of spikes is ``1 / (N_th / I + refractory)`` for a current of I electrons a second. With it the time
-    to a threshold of N electrons that come one by one follows the gamma law of the shape N, drawn exactly, so that intervals
+    Without noise the rate of spikes is ``1 / (N_th / I + refractory)`` for a current of I electrons per second. With it the
+    time to a threshold of N electrons follows the gamma distribution of shape N, drawn exactly, so that intervals
     vary by ``1 / sqrt(N)`` of their mean. A charge that is collected stays from frame to frame. Light stays as it is from each
     frame to the next: frame k lasts from ``k frame_s`` to ``(k + 1) frame_s``.
 

@@ -21,7 +21,7 @@ __all__ = ["Between", "Exposure", "Shutter"]
 
 #: What light does between frames: it holds until the next, or goes over into it in a straight line.
 Between = Literal["hold", "linear"]
-#: An exposure that ends this share of a frame behind one ends with it: the rounding of times.
+#: An exposure that ends this fraction of a frame behind one ends with it: the rounding of times.
 TIME_ROUNDING = 1e-9
 
 
@@ -84,7 +84,7 @@ class Shutter:
         return self.line_s * (order - order.min(initial=np.inf))
 
     def overlap_fraction(self, frame: int, exposure_s: float) -> Floats:
-        """Share of each site's exposure that a frame lights, (n_site,) or (1,); frame 0 begins with the first line."""
+        """Fraction of each site's exposure that a frame lights, (n_site,) or (1,); frame 0 begins with the first line."""
         frame = check_count("frame", frame, at_least=0)
         exposure_s = check_plausible("exposure_s", exposure_s)
         delay_s = self.delay_s

@@ -28,13 +28,13 @@ __all__ = ["Aperture", "Wavefront"]
 MIN_ACROSS = 192
 #: ... and so many for each λN by which aberrations throw the light aside: at that distance the pattern has 1.3 % too little.
 ACROSS_PER_BLUR = 16
-#: More samples than this are refused: the light would be thrown further than 128 λN.
+#: More samples than this are rejected: the light would be thrown further than 128 λN.
 MAX_ACROSS = 2048
 #: Points across the aperture at which a pupil's shape is looked up, odd so that edges at simple fractions lie between them.
 FINE = 1535
 #: Points across the aperture at which slopes of the wavefront are looked for.
 SLOPE_POINTS = 193
-#: An aperture that lets less than this share of the power through is closed.
+#: An aperture that lets less than this fraction of the power through is closed.
 CLOSED = 1e-9
 
 
@@ -46,7 +46,7 @@ class Wavefront(Protocol):
 
 
 def overlaps(n_to: int, to_step: float, n_from: int, from_step: float) -> Any:
-    """Shares of the cells of one centred line of cells in the cells of another, a sparse (n_to, n_from) matrix."""
+    """Fractions of the cells of one centred line of cells in the cells of another, a sparse (n_to, n_from) matrix."""
     from scipy.sparse import coo_array, diags_array
 
     to_edges = (np.arange(n_to + 1) - 0.5 * n_to) * to_step
@@ -122,7 +122,7 @@ class Aperture:
         return values
 
     def _share_slope_edge(self, wavelength_nm: float) -> tuple[float, float, float]:
-        """Share of the power that the shape passes, its own phase's slope in waves a radius, its edge over that of a circle."""
+        """Transmitted fraction of the power, slope of the phase in waves per radius, perimeter over that of a circle."""
         key = 0.0 if self.is_grey else wavelength_nm
         if key not in self._kept:
             shape = self._shape(wavelength_nm, FINE)
@@ -204,7 +204,7 @@ class Aperture:
         Parameters
         ----------
         n_across : float
-            Samples over the diameter, not necessarily a whole number.
+            Samples over the diameter, not necessarily an integer.
 
         Returns
         -------
@@ -265,7 +265,7 @@ class Aperture:
     def pattern_per_um2(
         self, wavelength_nm: float, lambda_n_um: float, x_um: Floats, y_um: Floats, field_um: tuple[float, float]
     ) -> Floats:
-        """Share of a point's light in a µm² at the points (y, x) of a rectangle, (n_y, n_x)."""
+        """Fraction of a point's light in a µm² at the points (y, x) of a rectangle, (n_y, n_x)."""
         reach = 2.0 * max(np.abs(x_um).max(), np.abs(y_um).max()) / lambda_n_um
         if reach > 0.5 * MAX_ACROSS:
             raise ParameterError(

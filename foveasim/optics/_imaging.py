@@ -223,7 +223,7 @@ def patchwork(
 def isoplanatic_error(
     aperture: Aperture, grid: Grid, n_patches: tuple[int, int], wavelength_nm: float, lambda_n_um: float
 ) -> float:
-    """Largest share of a point's light astray half-way between patches, or of one patch at the corners of the picture."""
+    """Largest fraction of a point's light astray halfway between patches, or of one patch at the corners of the picture."""
     node_y_um, node_x_um = _nodes_um(grid, n_patches)
     if n_patches == (1, 1):
         half_y_um, half_x_um = (0.5 * n * grid.pitch_x_um for n in grid.shape)
@@ -279,6 +279,6 @@ def _pieces(imaging: Imaging, sources: Ints, n: int, node_um: Floats) -> list[_P
 
 
 def reach_cells(share: float, lambda_n_um: float, blur_lambda_n: float, edge: float, pitch_um: float) -> int:
-    """Cells from a point's image that hold all but a share of its light: what diffraction throws aside, and geometry."""
+    """Cells from a point's image that hold all but a fraction of its light: what diffraction throws aside, and geometry."""
     # Of a clear circle 2 / (π² r) of the light lies beyond the radius r in λN; of others more, as they have more edge.
     return math.ceil((2.0 / math.pi**2 / share * edge + blur_lambda_n) * lambda_n_um / pitch_um)

@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Optics"]
 
-#: Default padding: the radius that holds all but this share of a point's light.
+#: Default padding: the radius that holds all but this fraction of a point's light.
 LOST_SHARE = 0.01
-#: Share of a point's light that a patch of the field may throw to a wrong place.
+#: Fraction of a point's light that a patch of the field may throw to a wrong place.
 PATCH_LOST_SHARE = 0.002
 #: The paper's Eq. 5 asks for an aperture radius much larger than H λ / (p0 min(M, N)): this many times.
 MUCH_LARGER = 10.0
@@ -87,7 +87,7 @@ class Optics(PointImages):
         the thin lens of the paper and ISETCam, or ``π L / (4 N²)`` of an aplanatic lens, which satisfies Abbe's sine
         condition, as corrected photographic lenses do. The second is higher by 1.6 % at f/4, 3.2 % at f/2.8, 13 % at f/1.4.
     transmission : float
-        Share of the light that the glass lets through.
+        Fraction of the light that the glass lets through.
     pupil : Annulus, Spider, Blades, Slit, PupilImage, callable, or a sequence of them, optional
         Its shape within the circle; several are multiplied. A callable ``T(x, y, wavelength_nm)`` gives real or complex
         amplitudes of at most 1 at points in units of the circle's radius. By default a clear circle.
@@ -497,9 +497,9 @@ class Optics(PointImages):
 
     def isoplanatic_error(self, scene: SceneLike) -> float:
         """
-        Largest share of a point's light that the patchwork puts in a wrong place.
+        Largest fraction of a point's light that the patchwork puts in a wrong place.
 
-        Half the integral of the difference between the pattern half-way between patches and the mean of theirs: the pattern of
+        Half the integral of the difference between the pattern halfway between patches and the mean of theirs: the pattern of
         a point is exact in the middle of a patch, and for patterns that change smoothly no point errs by more. It falls with
         the square of ``field_patches``. Of a single patch: the same between the corners of the picture and its middle.
 
@@ -579,7 +579,7 @@ class Optics(PointImages):
         )
 
     def _reach(self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats, share: float) -> int:
-        """Cells from a point's image that hold all but a share of its light."""
+        """Cells from a point's image that hold all but a fraction of its light."""
         from foveasim.optics._imaging import reach_cells
 
         return max(

@@ -40,7 +40,7 @@ class PointSpread:
     Attributes
     ----------
     psf_per_um2 : (n_y, n_x) float64, 1/µm²
-        Share of the light in a µm², at the cells' centres; row 0 lowest.
+        Fraction of the light in a µm², at the cells' centres; row 0 lowest.
     grid : Grid
         Cells around the image point.
     wavelength_nm : float, nm
@@ -62,7 +62,7 @@ class Point:
     field_um: tuple[float, float]
 
     def pattern_per_um2(self, x_um: Floats, y_um: Floats) -> Floats:
-        """Share of the light in a µm² at the points of a rectangle, (n_y, n_x)."""
+        """Fraction of the light in a µm² at the points of a rectangle, (n_y, n_x)."""
         if not self.is_clear_circle:
             return self.aperture.pattern_per_um2(self.wavelength_nm, self.lambda_n_um, x_um, y_um, self.field_um)
         from scipy.special import j1
@@ -83,7 +83,7 @@ class Point:
         return np.asarray(real + 1j * imaginary).reshape(np.shape(s_x))
 
     def in_circles(self, radius_um: Floats) -> Floats:
-        """Share of the light within radii."""
+        """Fraction of the light within radii."""
         from scipy.special import j0, j1
 
         radius = radius_um / self.lambda_n_um
@@ -98,7 +98,7 @@ class Point:
         return np.array(shares).reshape(radius.shape)
 
     def in_squares(self, side_um: Floats) -> Floats:
-        """Share of the light in upright squares of sides."""
+        """Fraction of the light in upright squares of sides."""
         side = side_um / self.lambda_n_um
         if self.is_clear_circle:
             return np.array([_airy_in_square(float(a)) for a in side.ravel()]).reshape(side.shape)
@@ -118,7 +118,7 @@ class Point:
 
 
 def _airy_in_square(side: float) -> float:
-    """Share of a clear circle's light in a square: the product of their transfer functions, in polar coordinates."""
+    """Fraction of a clear circle's light in a square: the product of their transfer functions, in polar coordinates."""
     if side > FAR_SIDE:
         # Far out the pattern falls as 1 / (π³ r³) on the mean; outside the square lies its integral.
         return 1.0 - 8.0 * math.sqrt(2.0) / (math.pi**3 * side)
@@ -165,7 +165,7 @@ class PointImages:
         Returns
         -------
         PointSpread
-            Samples of the share of the light in a µm².
+            Samples of the fraction of the light in a µm².
 
         Raises
         ------
@@ -255,7 +255,7 @@ class PointImages:
         field_um: tuple[float, float] = (0.0, 0.0),
     ) -> Floats:
         """
-        Share of a point's light in circles around its image point.
+        Fraction of a point's light in circles around its image point.
 
         Parameters
         ----------
@@ -279,7 +279,7 @@ class PointImages:
         field_um: tuple[float, float] = (0.0, 0.0),
     ) -> Floats:
         """
-        Share of a point's light in upright squares around its image point.
+        Fraction of a point's light in upright squares around its image point.
 
         Parameters
         ----------

@@ -36,7 +36,7 @@ DIRECT_ALIASES = 1
 ALIAS_NODES = 32
 #: Where geometry throws the light over many cells, a transfer function turns as often within the range: so many nodes more.
 NODES_PER_CELL = 4.0
-#: Products of that function that are smaller than this share of the factor at zero frequency are left out.
+#: Products of that function that are smaller than this fraction of the factor at zero frequency are left out.
 ALIAS_ACCURACY = 1e-9
 #: A wider padded picture is a slip: of a lens far too small for its picture, or of a unit.
 MAX_PADDED = 1 << 17

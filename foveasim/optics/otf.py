@@ -89,7 +89,7 @@ class PlaneTables:
     """
     Those of any aperture, for one point of the field: a square of complex numbers around zero frequency.
 
-    The aperture is sampled anew for each wavelength, so that the steps of all its transfer functions are the same and they
+    The aperture is sampled again for each wavelength, so that the steps of all its transfer functions are the same and they
     simply add up.
     """
 
@@ -144,7 +144,7 @@ class TableCache:
     """
     What a lens made before, up to a size in memory: the frames of a video need the same. It is never pickled.
 
-    Tables of other light than the present one give way first; what then still does not fit is made anew each time.
+    Tables of other light than the present one give way first; what then still does not fit is made again each time.
     """
 
     def __init__(self) -> None:

@@ -1,5 +1,5 @@
 """
-Pupils: the share of the light's amplitude that passes at each point of the aperture.
+Pupils: the fraction of the light's amplitude that passes at each point of the aperture.
 
 A pupil is a callable ``T(x, y, wavelength_nm)`` of arrays x, y in units of the aperture's radius, x to the right and y up as
 in the picture on the sensor; it gives real or complex amplitudes (the power is their square). The circle of the f-number
@@ -186,10 +186,10 @@ class PupilImage:
     Parameters
     ----------
     picture : path, or (n, n) array, the first row on top
-        Transmission, 0 to 1 (of whole numbers up to the type's maximum), over the square around the aperture's circle. The
+        Transmission, 0 to 1 (of integers up to the type's maximum), over the square around the aperture's circle. The
         pixels are squares; a colour picture counts by its mean, times its alpha.
     values : {"amplitude", "power"}
-        Whether a value is the share of the amplitude or of the power (its square) that passes.
+        Whether a value is the fraction of the amplitude or of the power (its square) that passes.
     wavefront_um : (n, n) array, the first row on top, optional, µm
         Optical path difference at the pixels' centres, interpolated linearly in between: light goes to where it grows.
 

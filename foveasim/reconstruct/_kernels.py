@@ -18,9 +18,9 @@ __all__ = ["add_roughness", "natural_neighbours"]
 
 #: Natural neighbours of a point, at most: a random point has six, and the middle of a ring of sites as many as the ring.
 MAX_TRIANGLES = 4096
-#: Nearer to an edge than this share of its length there is only the straight line between its ends: circles grow too large.
+#: Nearer to an edge than this fraction of its length there is only the straight line between its ends: circles grow too large.
 THIN = 1e-5
-#: A point this near to a corner, as a share of its triangle's longest edge, is the corner.
+#: A point this near to a corner, as a fraction of its triangle's longest edge, is the corner.
 AT_CORNER = 1e-10
 
 

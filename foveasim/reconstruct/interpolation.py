@@ -21,7 +21,7 @@ from foveasim.reconstruct.picture import Picture, covered_share
 
 __all__ = ["linear", "natural", "site_values"]
 
-#: Centres nearer to each other than this share of the layout's extent are one, with the mean of their values.
+#: Centres nearer to each other than this fraction of the layout's extent are one, with the mean of their values.
 SAME_PLACE = 1e-9
 #: Pixels that are interpolated as one piece of work; fixed, so that threads change nothing.
 PIXELS_PER_PIECE = 1 << 14
@@ -52,7 +52,7 @@ def linear(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | 
     Raises
     ------
     ParameterError
-        When there is not one value a site, one is infinite, or a channel has no value at all.
+        When there is not one value per site, one is infinite, or a channel has no value at all.
     """
     return _interpolated(layout, values, grid, n_threads, is_smooth=False)
 
@@ -89,7 +89,7 @@ def site_values(values: Floats, n_sites: int) -> Floats:
     Raises
     ------
     ParameterError
-        When there is not one value a site, one is infinite, or a channel has no value at all.
+        When there is not one value per site, one is infinite, or a channel has no value at all.
     """
     channels = np.atleast_2d(as_numbers("values", values, missing_is_nan=True))
     if channels.ndim != 2 or channels.shape[1] != n_sites:

@@ -29,7 +29,7 @@ __all__ = ["least_squares"]
 
 #: A site of which less than this share lies on the raster is left out.
 MIN_ON_RASTER = 1e-6
-#: The strength is right when the misfit is within this share of what the noise makes.
+#: The strength is right when the misfit is within this fraction of what the noise makes.
 MISFIT_TOLERANCE = 0.02
 #: Strengths looked at, at most, and how far below the first guess the least may lie.
 MAX_STRENGTHS, FURTHEST = 12, 1e8
@@ -66,7 +66,7 @@ def least_squares(
     grid : Grid
         The picture's pixels.
     variance : number, (n_site,) or (n_channel, n_site), optional
-        C: variance of the noise of the values. By default all sites count alike, as shares of their response.
+        C: variance of the noise of the values. By default all sites count alike, as fractions of their response.
     response : (n_site,), optional
         r: what each site gives where the picture is 1 everywhere. By default its area in µm²: charges in electrons become a
         picture in electrons per µm². With ones, values that an even scene makes equal stay what they are.
@@ -79,7 +79,7 @@ def least_squares(
         (:func:`blur_kernel`): W is then the overlaps after this convolution, and the picture is that in front of the lens.
         Beyond the raster the picture goes on by as many unknown pixels as the kernel reaches.
     tolerance : float
-        The solution is found when the root of ``g·M g`` is below this share of ``|C^-1/2 y|``, with the projected gradient g
+        The solution is found when the root of ``g·M g`` is below this fraction of ``|C^-1/2 y|``, with the projected gradient g
         and a preconditioner M: when the sum above is about as far above its smallest as the square of that.
     max_steps : int
         Applications of the operator for one solution.

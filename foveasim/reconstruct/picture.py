@@ -37,7 +37,7 @@ class Picture:
     data : (n_channel, n_y, n_x) float32
         Values in the sites' unit, row 0 lowest; NaN where no photosite is: no data is not black.
     coverage : (n_y, n_x) float32
-        Share of each pixel that photosites cover.
+        Fraction of each pixel that photosites cover.
     grid : Grid
         The pixels, in the sensor plane.
     """
@@ -55,7 +55,7 @@ class Picture:
         self, white: float | Floats | None = None, *, encode_srgb: bool = False, bits: int = 8
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
         """
-        The picture as whole numbers for a file or a screen, first row on top.
+        The picture as integers for a file or a screen, first row on top.
 
         Parameters
         ----------
@@ -102,9 +102,9 @@ class Picture:
         Parameters
         ----------
         path : path
-            ``.png`` and others of whole numbers, ``.tif`` of either kind, or, with the extra ``pictures``, ``.exr``.
+            ``.png`` and others of integers, ``.tif`` of either kind, or, with the extra ``pictures``, ``.exr``.
         white, encode_srgb
-            Of whole numbers, as for :meth:`to_image`. Floating-point files hold the values themselves, or, where ``white`` is
+            Of integers, as for :meth:`to_image`. Floating-point files hold the values themselves, or, where ``white`` is
             given, over it; they are linear, and cannot be encoded.
         bits : {8, 16, 32}, optional
             32 are floating-point numbers: NaN where no photosite is, and no alpha. By default 32 for TIFF and EXR, and 8 for
@@ -154,6 +154,6 @@ def raster_grid(layout: PackedRings, max_pixels: int) -> Grid:
 
 
 def covered_share(integrator: Integrator) -> Floats:
-    """Share of each pixel that photosites cover, exactly, (n_y, n_x); 0 where they touch it by rounding only."""
+    """Fraction of each pixel that photosites cover, exactly, (n_y, n_x); 0 where they touch it by rounding only."""
     share = integrator.spread(np.ones(integrator.n_sites)) / integrator.grid.cell_area_um2
     return np.where(share > NO_COVERAGE, share, 0.0)

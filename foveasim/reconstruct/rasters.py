@@ -14,7 +14,7 @@ from foveasim.reconstruct.picture import Picture
 
 __all__ = ["blur_kernel", "reference"]
 
-#: A kernel holds this share of a point's light, unless told otherwise; and its pixels from the middle, at most.
+#: A kernel holds this fraction of a point's light, unless told otherwise; and its pixels from the middle, at most.
 HELD_SHARE, MAX_RADIUS = 0.98, 128
 #: Distance of samples of the pattern in λN, at most: half of what its frequencies ask for.
 SAMPLE_LAMBDA_N = 0.25
@@ -39,7 +39,7 @@ def reference(light: PowerMap, grid: Grid, *, weights: Floats | None = None) -> 
     Returns
     -------
     Picture
-        NaN off the map; its coverage is the share of a pixel on the map.
+        NaN off the map; its coverage is the fraction of a pixel on the map.
 
     Raises
     ------

@@ -153,7 +153,7 @@ class Scene:
             One a channel; (620, 550, 450) for colour and 550 for grey by default. A grey picture shines alike at all of
             them; a colour one at one wavelength is first made grey. With ``spectrum`` any number.
         band_width_nm : number or sequence, optional, nm
-            Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+            Widths of the wavelengths' bands; by default they reach halfway to the neighbours. Needed for one wavelength.
         spectrum : (n_channel, n_wavelength), optional
             Relative spectrum that each channel's value 1 stands for.
         encoding : {"srgb", "sqrt", "linear"}
@@ -292,9 +292,9 @@ class Scene:
         try:
             points = np.asarray(pixels)
         except ValueError:
-            raise ParameterError("pixels", "must be pairs (iy, ix) of whole numbers", pixels) from None
+            raise ParameterError("pixels", "must be pairs (iy, ix) of integers", pixels) from None
         if points.ndim != 2 or points.shape[1] != 2 or points.dtype.kind not in "iu":
-            raise ParameterError("pixels", "must be pairs (iy, ix) of whole numbers", pixels)
+            raise ParameterError("pixels", "must be pairs (iy, ix) of integers", pixels)
         if np.any(points < 0) or np.any(points >= (n_y, n_x)):
             raise ParameterError("pixels", f"must lie in a picture of {n_y} rows and {n_x} columns", pixels)
         intensity = finite_array("intensity_w_sr_nm", intensity_w_sr_nm, at_least=0.0)
@@ -360,7 +360,7 @@ def _light(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Imag
 
 
 def band_widths_nm(wavelength_nm: Floats, band_width_nm: float | Sequence[float] | Floats | None) -> Floats:
-    """Widths as given, or reaching half-way to the neighbouring wavelengths."""
+    """Widths as given, or reaching halfway to the neighbouring wavelengths."""
     if band_width_nm is not None:
         widths = finite_array("band_width_nm", band_width_nm, above=0.0)
         if widths.ndim > 1 or (widths.ndim == 1 and widths.size != wavelength_nm.size):
@@ -370,7 +370,7 @@ def band_widths_nm(wavelength_nm: Floats, band_width_nm: float | Sequence[float]
         return np.broadcast_to(widths, wavelength_nm.shape).astype(np.float64)
     if wavelength_nm.size == 1:
         raise ParameterError(
-            "band_width_nm", "must be given for a single wavelength: it has no neighbours to reach half-way to"
+            "band_width_nm", "must be given for a single wavelength: it has no neighbours to reach halfway to"
         )
     order = np.argsort(wavelength_nm)
     steps = np.diff(wavelength_nm[order])

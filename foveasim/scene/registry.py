@@ -26,7 +26,7 @@ PICTURE = """shape : (n_y, n_x)
     wavelength_nm : sequence, nm
         Wavelengths.
     band_width_nm : number or sequence, optional, nm
-        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength."""
+        Widths of the wavelengths' bands; by default they reach halfway to the neighbours. Needed for one wavelength."""
 
 
 def chart(name: str) -> Callable[[F], F]:

@@ -32,7 +32,7 @@ __all__ = [
 
 #: Compandings of the ADC, by the numbers of ``ConversionTables.way``.
 ADC_LINEAR, ADC_ROOT, ADC_LOG, ADC_TABLE = range(4)
-#: A charge this share of a code below a code's border is on it: the rounding of a division.
+#: A charge this fraction of a code below a code's border is on it: the rounding of a division.
 CODE_ROUNDING = 1e-9
 #: Variance that rounding to integers adds.
 ROUNDING_VARIANCE = 1.0 / 12.0
@@ -107,7 +107,7 @@ def rays_met(xy, ring_offsets, site_offsets, centroid, directions):
 
 @njit(inline="always")
 def _poisson(mean, z):
-    """Poisson's law at the probability of a Gaussian number: the same number gives more where more is expected."""
+    """Poisson's distribution at the probability of a Gaussian number: the same number gives more where more is expected."""
     share = 0.5 * math.erfc(-z * math.sqrt(0.5))
     chance = math.exp(-mean)
     reached = chance

@@ -16,10 +16,10 @@ from foveasim.sensor.limits import check_plausible, check_plausible_array
 
 __all__ = ["QUANTISATION_DN2", "Companding", "ConversionTables", "Converter"]
 
-#: Ways from a share of the voltage range to a share of the codes.
+#: Ways from a fraction of the voltage range to a fraction of the codes.
 Companding = Literal["linear", "root", "log", "table"]
 COMPANDINGS: tuple[Companding, ...] = ("linear", "root", "log", "table")
-#: Nodes of the Gaussian law that differential non-linearity is drawn from; linear in between.
+#: Nodes of the Gaussian distribution that differential non-linearity is drawn from; linear in between.
 N_QUANTILES = 4096
 #: Variance of rounding to a code, in squares of its width: a uniform distribution over one code.
 QUANTISATION_DN2 = 1.0 / 12.0
@@ -49,11 +49,11 @@ class Converter:
     bits : int
         1 to 16: codes from 0 to ``2**bits - 1``, both of which are reached.
     companding : {"linear", "root", "log", "table"}
-        How a share x of the range becomes a share of the codes: x, its square root, ``log(1 + s x) / log(1 + s)``, or a curve.
+        Fraction of the codes for a fraction x of the range: x, its square root, ``log(1 + s x) / log(1 + s)``, or a curve.
     log_strength : float
         The s of ``"log"``: the slope of dark codes over that of bright ones, less one.
     companding_table : sequence, optional
-        The curve of ``"table"``: shares of the codes at equal steps of the range, from 0 to 1, never falling.
+        The curve of ``"table"``: fractions of the codes at equal steps of the range, from 0 to 1, never falling.
     inl_dn : sequence, DN
         Integral non-linearity: deviations at equal steps of the codes, linear in between.
     dnl_dn : float, DN
@@ -183,7 +183,7 @@ class Converter:
 
     @cached_property
     def quantiles(self) -> Floats:
-        """The Gaussian law at equal steps of probability, (n,)."""
+        """The Gaussian distribution at equal steps of probability, (n,)."""
         from scipy.special import ndtri
 
         return read_only(np.asarray(ndtri((np.arange(N_QUANTILES) + 0.5) / N_QUANTILES)))

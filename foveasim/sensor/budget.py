@@ -48,7 +48,7 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
     Raises
     ------
     ParameterError
-        When there is not one number a site, or the exposure is negative.
+        When there is not one number per site, or the exposure is negative.
 
     Notes
     -----
@@ -60,7 +60,7 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
     photo_e_per_s = as_numbers("photo_e_per_s", photo_e_per_s)
     n_sites = sensor.layout.n_sites
     if photo_e_per_s.shape != (n_sites,):
-        raise ParameterError("photo_e_per_s", f"must be {n_sites} numbers, one a site, got {photo_e_per_s.shape}")
+        raise ParameterError("photo_e_per_s", f"must be {n_sites} numbers, one per site, got {photo_e_per_s.shape}")
     photo = photo_e_per_s * sensor.sensitivity
     dark = np.broadcast_to(sensor.nominal_dark_e_per_s, n_sites)
     charge_e = (photo + dark) * exposure_s

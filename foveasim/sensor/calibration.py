@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Calibration", "calibrate", "linearise", "nominal_e_per_dn"]
 
-#: Standard deviation of a Gaussian law over its median absolute deviation.
+#: Standard deviation of a Gaussian distribution over its median absolute deviation.
 SIGMA_PER_MAD = 1.482602218505602
 #: Chance that a site of typical noise is taken for a noisy one, in frames as few as there are.
 FALSE_ALARM = 1e-6
@@ -199,12 +199,12 @@ class Calibration:
         hot_sigmas : float
             A site is hot when its dark signal, or dark rate, is so many robust standard deviations above the median.
         dead_fraction : float
-            A site is dead when its response is below this share of the median.
+            A site is dead when its response is below this fraction of the median.
         noisy_ratio : float
             A site is noisy when its temporal dark noise is so many times the typical one, and by more than the luck of so
             few frames: one typical site in a million.
         max_clipped_fraction : float
-            Share of the frames that a site may be clipped in.
+            Fraction of the frames that a site may be clipped in.
 
         Returns
         -------
@@ -290,7 +290,7 @@ class Calibration:
         fill : Layout, optional
             Give defective sites the mean of their good neighbours, each taken relative to what it is expected to give; where a
             site has none, of neighbours of neighbours, up to three steps. By default they keep their own, corrected.
-        kind : (n_site,) of whole numbers, optional
+        kind : (n_site,) of integers, optional
             Fill from neighbours of the same kind only: ``sensor.filter_of_site`` on a mosaic.
         max_gap_um : float, optional, µm
             Sites that face each other across a gap of up to this width are neighbours; by default those that share an edge.

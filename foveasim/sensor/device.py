@@ -33,7 +33,7 @@ from foveasim.fields import PackedRings
 
 __all__ = ["SITE_ID", "Device"]
 
-#: A column of this name, of whole numbers, tells sites apart in place of where they are.
+#: A column of this name, of integers, tells sites apart in place of where they are.
 SITE_ID = "site_id"
 #: Sites are distinguished by where their centroids lie, in units of this; vertices of outlines, too.
 PLACE_UM = 1e-4
@@ -99,7 +99,7 @@ class Device:
         return out
 
     def normals(self, effect: str) -> Floats:
-        """A number of the standard Gaussian law for every site, (n_site,)."""
+        """A number of the standard Gaussian distribution for every site, (n_site,)."""
         from scipy.special import ndtri
 
         return np.asarray(ndtri(self.uniforms(effect)))
@@ -115,7 +115,7 @@ class Device:
         return np.asarray(np.exp(sigma * self.normals(effect) - 0.5 * sigma**2))
 
     def line_normals(self, effect: str, lines: Ints) -> Floats:
-        """A number of the standard Gaussian law for each of some lines."""
+        """A number of the standard Gaussian distribution for each of some lines."""
         from scipy.special import ndtri
 
         from foveasim.sensor import _kernels

@@ -26,7 +26,7 @@ __all__ = ["Ramp", "Rates", "fit_ramp", "merge_exposures", "non_destructive_read
 
 #: A reading is saturated where it is within so many standard deviations of the noise of reading of the full well.
 MARGIN_SIGMAS = 5.0
-#: Weights fall to 0 over this last share of the range: wide against shot noise, for a charge of more than 400 e-.
+#: Weights fall to 0 over this last fraction of the range: wide against shot noise, for a charge of more than 400 e-.
 TAPER_SHARE = 0.25
 #: Times that weights are taken from the merged estimate.
 N_PASSES = 2

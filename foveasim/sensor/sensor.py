@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PerSite", "Photosites", "Sensor"]
 
-#: Means that are drawn by Poisson's law one electron after the other: more take too long.
+#: Means that are drawn by Poisson's distribution one electron after the other: more take too long.
 MOST_INVERTED_E = 700.0
 #: Parameters with one value for all sites or one per site, and those with one value.
 _PER_SITE = ("sensitivity", "dark_e_per_s", "full_well_e", "read_noise_e", "capacitance_f")
@@ -66,7 +66,7 @@ class Sensor:
     filters : None, "rgb", or FilterSet
         Colour filters; None for a sensor without, whatever the layout's channels, "rgb" for :func:`rgb_filters`.
     sensitivity : float or (n_site,)
-        Share of the light that a site collects beside its quantum efficiency and filter, as of a smaller lens or opening.
+        Fraction of the light that a site collects beside its quantum efficiency and filter, as of a smaller lens or opening.
     prnu_fraction : float
         Photo-response non-uniformity: standard deviation of the sites' response over its mean, a Gaussian distribution; at
         most 0.3.
@@ -78,9 +78,9 @@ class Sensor:
         Dark-signal non-uniformity: standard deviation of the sites' dark current over its mean, ``dark_e_per_s``, a log-normal
         distribution: no site is below 0, however wide it is.
     hot_fraction, hot_e_per_s : float
-        Share of the sites that have this much more dark current (e-/s, at ``dark_reference_k``).
+        Fraction of the sites that have this much more dark current (e-/s, at ``dark_reference_k``).
     dead_fraction : float
-        Share of the sites that collect no light.
+        Fraction of the sites that collect no light.
     crosstalk : Diffusion or KernelCrosstalk, optional
         Charge that goes to neighbours before it is collected.
     shot_noise : {"auto", "exact", "off"}
@@ -99,13 +99,13 @@ class Sensor:
     read_noise_e : float or (n_site,), e-
         Standard deviation of the Gaussian noise of reading.
     rts_fraction, rts_e : float
-        Random telegraph noise: share of the sites that are in either of two states, so many e- apart, by chance in each frame.
+        Random telegraph noise: fraction of the sites that have it, and the distance of their two states, e-.
     capacitance_f : float or (n_site,), F
         Capacitance that the charge is read on: 1e-13 F in the paper's foveal run.
     gain_fpn_fraction : float
         Standard deviation of the sites' volts per charge over its mean, a Gaussian distribution; at most 0.3.
     nonlinearity_fraction : float
-        Share of the voltage that the response lacks at V_sat, growing with the square of the voltage.
+        Fraction of the voltage that the response lacks at V_sat, growing with the square of the voltage.
     pedestal_v : float, V
         Black level: added to every voltage, so that noise of dark frames is not cut off at code 0. Less than ``v_sat_v``.
     pixel_fpn_fraction, line_fpn_fraction : float

@@ -210,7 +210,7 @@ def pictures_in(folder: Path) -> list[Path]:
 
 
 def _check_settings(scene: dict[str, Any]) -> None:
-    """Refuse settings that Scene.from_picture does not take, and lack those that it needs, before the first picture is read."""
+    """Reject settings that Scene.from_picture does not take, and lack those that it needs, before the first picture is read."""
     parameters = list(inspect.signature(Scene.from_picture).parameters.values())[1:]
     names = [p.name for p in parameters]
     for name in scene:

@@ -18,9 +18,9 @@ from foveasim.scene import Scene
 
 __all__ = ["GazePath", "pan_camera", "saccades", "shift_sensor"]
 
-#: Shape of the law of fixations' durations (a gamma law): their standard deviation is half their mean.
+#: Shape of the law of fixations' durations (a gamma distribution): their standard deviation is half their mean.
 FIXATION_SHAPE = 4.0
-#: A shortest fixation, as a share of the mean.
+#: A shortest fixation, as a fraction of the mean.
 SHORTEST_FIXATION = 0.2
 #: Longer paths are a slip of units.
 MAX_POINTS = 10**8
@@ -83,11 +83,11 @@ def saccades(
         Rectangle about the axis that all its targets lie in, each place as likely as the other; it begins on the axis.
     seed : int
     fixation_s : float, s
-        Mean duration of a rest: gamma law with a standard deviation of half of it.
+        Mean duration of a rest: gamma distribution with a standard deviation of half of it.
     saccade_s : float, s
         Duration of a jump, which is the smoothest one (least jerk): ``10 u³ - 15 u⁴ + 6 u⁵``.
     drift_um_per_root_s : float, µm / sqrt(s)
-        Standard deviation, along either axis, of the drift of a rest after one second: a random walk that begins anew
+        Standard deviation, along either axis, of the drift of a rest after one second: a random walk that begins again
         with each rest.
 
     Returns

@@ -41,12 +41,12 @@ FORMAT, VERSION = "foveasim video", 1
 CHUNK_CODES = 1 << 22
 #: A recording that can be gone on with is written at least so often, whether a chunk is full or not: what a sudden end costs.
 WRITE_S = 10.0
-#: What packs the numbers, as zarr does unless told otherwise; and a folder with more numbers beside the codes is refused.
+#: What packs the numbers, as zarr does unless told otherwise; and a folder with more numbers beside the codes is rejected.
 CODECS = ("bytes", "zstd")
 MAX_UNPACKED_BYTES = 8 * 2**30
 #: Arrays of the layout, and those that grow frame by frame: the numbers come last, and tell which frames are whole.
 GEOMETRY, GROWING = ("xy_um", "ring_offsets", "site_offsets"), ("code", "exposure_s", "frame")
-#: In the place of a frame's number until the frame is whole.
+#: Instead of a frame's number until the frame is whole.
 NO_FRAME = -1
 #: What may differ between captures of one recording, whatever else does not.
 OWN_SETTINGS = frozenset({"exposure_s", "frame", "light.source", "place_um"})
@@ -328,7 +328,7 @@ def _n_whole(folder: Path) -> int:
 
 
 def _check_plan(path: Path, plan: Mapping[str, Any] | None) -> None:
-    """Refuse a recording that was made after another plan."""
+    """Reject a recording that was made after another plan."""
     with _trusted(path) as group:
         found = group.attrs.get("plan")
     _refuse(path, differences(found, _plain(plan)))
@@ -401,7 +401,7 @@ class _Frames:
     """
     The frames of a recording in a folder, and those of the last chunk, not yet full, in memory.
 
-    A chunk is written anew when frames come to it, and every file of it whole or not at all: what the folder tells that it
+    A chunk is written again when frames come to it, and every file of it whole or not at all: what the folder tells that it
     holds is there after any end of the program.
     """
 

@@ -27,7 +27,7 @@ from foveasim.video.recording import alike, count_recorded_frames, record, resum
 __all__ = ["write_video"]
 
 VIDEO_ENDINGS = (".mp4", ".mkv", ".mov", ".webm")
-#: Grey behind what no photosite sees, as a share of white.
+#: Grey behind what no photosite sees, as a fraction of white.
 BEHIND = 0.12
 
 

@@ -1,4 +1,4 @@
-"""What matplotlib has not: an image that is painted anew for the pixels of its axes, and a bar that tells a length."""
+"""What matplotlib has not: an image that is painted again for the pixels of its axes, and a bar that tells a length."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ __all__ = ["ScaleBar", "SiteImage", "length_text", "nice_length_um"]
 
 #: Samples along a pixel's side, fewer where a picture would have more of them than 256 MB hold.
 N_SAMPLES, MOST_SAMPLES = 3, 2**26
-#: Borders are drawn where they take at most this share of the samples, told by some of the rows: sites of 7 pixels.
+#: Borders are drawn where they take at most this fraction of the samples, told by some of the rows: sites of 7 pixels.
 MOST_BORDERS, SAMPLED_ROWS = 0.05, 16
-#: Longest share of the axes that a scale bar takes.
+#: Longest fraction of the axes that a scale bar takes.
 BAR_SHARE = 0.25
 
 

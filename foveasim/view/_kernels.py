@@ -91,7 +91,7 @@ def paint_sites(xy, ring_offsets, site_offsets, rows, x, y, first_row, ids):
                 run, rise = xy[high, 0] - xy[low, 0], high_y - low_y
                 r = max(_first_at(y, per_y, low_y) - first_row, bottom)
                 while r < top and y[first_row + r] < high_y:
-                    # Multiplied first: exact where the crossing of whole numbers is one.
+                    # Multiplied first: exact where the crossing of integers is one.
                     c = _first_at(x, per_x, xy[low, 0] + (y[first_row + r] - low_y) * run / rise)
                     crossed[r, c] = not crossed[r, c]
                     left[r], right[r] = min(left[r], c), max(right[r], c)

@@ -16,7 +16,7 @@ from foveasim.view.site_colours import BACKGROUND, Rgb
 
 __all__ = ["SitePixels", "id_map", "site_at"]
 
-#: Pictures of more samples than this are refused: 4 GB of indices.
+#: Pictures of more samples than this are rejected: 4 GB of indices.
 MAX_SAMPLES = 2**30
 #: Bands of rows for each thread: two, as sites may be crowded; each band looks at all sites, so that more cost time.
 BANDS_PER_THREAD = 2

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Caps", "Mesh", "extruded", "polydata", "prisms", "triangulated"]
 
-#: A triangle of less than this share of its site's box is a line to float64.
+#: A triangle of less than this fraction of its site's box is a line to float64.
 FLAT_SHARE = 1e-12
-#: Columns are as high as this share of the layout's width, by default.
+#: Columns are as high as this fraction of the layout's width, by default.
 TALLEST_SHARE = 0.15
 #: Sites that one call of the triangulation takes.
 SITES_A_CALL = 20_000
@@ -212,7 +212,7 @@ def prisms(
     data : Layout or Capture
     height : str or (n_site,) array
         What the height shows: ``"code"``, ``"electrons"``, ``"expected_e"``, ``"area_um2"``, ``"size_um"``, any column of
-        numbers, or one value a site, at least 0. By default the code of a capture, the size of a layout's sites.
+        numbers, or one value per site, at least 0. By default the code of a capture, the size of a layout's sites.
     by : str or array, optional
         What the colour shows, as in :func:`foveasim.view.colours_of`; by default the same as the height.
     max_height_um : float, µm

@@ -32,7 +32,7 @@ MOST_OUTLINES = 4000
 MOST_ADJACENT = 50_000
 #: Drawings of more sites are slow to open everywhere.
 MOST_DRAWN = 20_000
-#: Least share of a figure's shorter side in its longer one: axes, texts and bars need room.
+#: Least fraction of a figure's shorter side in its longer one: axes, texts and bars need room.
 SLIMMEST = 0.4
 #: Readout lines are as much darker than the colours that their sites may have.
 LINE_BRIGHTNESS = 0.55
@@ -56,7 +56,7 @@ def plot_layout(
     ----------
     layout : Layout
     by : str or array, optional
-        ``"channel"``, ``"area_um2"``, ``"size_um"``, ``"readout_line"`` or any other column; one value a site, NaN where
+        ``"channel"``, ``"area_um2"``, ``"size_um"``, ``"readout_line"`` or any other column; one value per site, NaN where
         there is none; or a colour a site (n_site, 3). The bare shapes by default. See :func:`foveasim.view.colours_of`.
     label : str
         What an array holds, with its unit.
@@ -80,7 +80,7 @@ def plot_layout(
     Raises
     ------
     ParameterError
-        When there is no such column, the array has not one row a site, or the layout is no such that could be overlaid.
+        When there is no such column, the array has not one row per site, or the layout is no such that could be overlaid.
 
     Notes
     -----
@@ -199,7 +199,7 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = 150.0) -> None:
 
 def save_drawing(data: Layout | Capture, path: str | Path, by: str | ArrayLike | None = None) -> None:
     """
-    Write a layout or a capture as a drawing in the format SVG: one path a site, in µm, without axes.
+    Write a layout or a capture as a drawing in the format SVG: one path per site, in µm, without axes.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ AMBIENT, DIFFUSE = 0.35, 0.65
 LIGHT = (-0.38, 0.30, 0.87)
 #: A soft background on which both light and dark colours stand out.
 BACKGROUND = (238, 240, 244)
-#: The scene fills this share of the picture's narrower direction.
+#: The scene fills this fraction of the picture's narrower direction.
 FILLED_SHARE = 0.94
 #: Points that decide how far off the viewer stands.
 FRAMING_POINTS = 50_000
@@ -42,9 +42,9 @@ FRAMING_POINTS = 50_000
 CENTRING_STEPS = 24
 #: Rows that are drawn beyond the border and cut off: the shade of corners has a stray line there.
 SHADE_MARGIN_PX = 16
-#: How far the shade of corners reaches, as a share of the scene's size.
+#: How far the shade of corners reaches, as a fraction of the scene's size.
 SHADE_REACH_SHARE = 0.02
-#: What is nearer than this share of the reach throws no shade: with less the depth buffer's steps show as hatching.
+#: What is nearer than this fraction of the reach throws no shade: with less the depth buffer's steps show as hatching.
 SHADE_BIAS_SHARE = 0.1
 #: Scenes of more triangles are drawn with one sample a pixel, by default: a picture in seconds.
 SMOOTHED_TRIANGLES = 1_000_000

@@ -26,7 +26,7 @@ MOST_SHOWN, MOST_TEXTS = 2000, 40
 CIRCLE_PT, CIRCLE_STEP_PT = 9.0, 4.0
 #: How far below the axes the rules stand: under their numbers and their label.
 LEGEND_BELOW_PT = 36.0
-#: Room around the markers where no layout is given, as a share of their extent.
+#: Room around the markers where no layout is given, as a fraction of their extent.
 ROOM_SHARE = 0.1
 
 

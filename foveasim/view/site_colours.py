@@ -57,7 +57,7 @@ NO_DATA: Rgb = (217, 140, 150)
 PHOTOGRAPH, EVEN_STEPS = "gray", "viridis"
 #: On a colour mosaic values are raised to this power before they scale a colour, so that dark sites can be told apart.
 DISPLAY_GAMMA = 1.0 / 2.2
-#: Whole numbers of more kinds than this are shown as sizes, and texts without a legend.
+#: Integers of more kinds than this are shown as sizes, and texts without a legend.
 MOST_CATEGORIES = 10
 #: What a capture measured, and how it is called.
 MEASURED = {"code": "code / DN", "electrons": "electrons / e-", "expected_e": "expected charge / e-"}
@@ -75,7 +75,7 @@ class ColourScale:
     colour_map : str
         One of matplotlib's.
     gamma : float
-        Power that a value's share of the scale is raised to.
+        Power that a value's fraction of the scale is raised to.
     """
 
     low: float
@@ -134,10 +134,10 @@ def colours_of(data: Layout | Capture, by: str | ArrayLike | None = None, *, lab
     by : str or array, optional
         ``"code"``, ``"electrons"``, ``"expected_e"`` of a capture: as a photograph, on a colour mosaic in the filters'
         colours. ``"channel"``: the colour of the filter; a layout alone has R, G, B and W in this order. ``"area_um2"``,
-        ``"size_um"`` (the square root of the area), ``"readout_line"`` or any other column. An array: one value a site, or
+        ``"size_um"`` (the square root of the area), ``"readout_line"`` or any other column. An array: one value per site, or
         a colour a site (n_site, 3), uint8 or from 0 to 1. By default the code of a capture, the bare shapes of a layout.
     label : str
-        What an array holds, with its unit; in the place of what a name says, too.
+        What an array holds, with its unit; instead of what a name says, too.
 
     Returns
     -------
@@ -146,11 +146,11 @@ def colours_of(data: Layout | Capture, by: str | ArrayLike | None = None, *, lab
     Raises
     ------
     ParameterError
-        When there is no such column, or not one value a site, or one is infinite.
+        When there is no such column, or not one value per site, or one is infinite.
 
     Notes
     -----
-    Text, truth values and whole numbers of at most ten kinds are kinds, with a legend; readout lines are kinds in any
+    Text, truth values and integers of at most ten kinds are kinds, with a legend; readout lines are kinds in any
     number, whose colours repeat. Other numbers are sizes, on a scale from their smallest to their largest. NaN is no data.
 
     Examples

@@ -46,10 +46,10 @@ FORMATS = (".glb", ".stl", ".3mf", ".ply", ".obj")
 SILICON, OXIDE, GLASS = (116, 132, 160), (58, 64, 78), (208, 228, 240)
 #: How much of a lens's colour is its filter's, which is seen through it.
 SEEN_THROUGH = 0.35
-#: What is uncovered of the sensor cut open: from this share of its width and up to this share of its height.
+#: What is uncovered of the sensor cut open: from this fraction of its width and up to this fraction of its height.
 QUARTER = (0.5, 0.5)
 TERRACES = (((0.39, 0.61), ("filters", "lenses")), ((0.27, 0.73), ("lenses",)))
-#: Overlaps below this share of the smaller part are rounding.
+#: Overlaps below this fraction of the smaller part are rounding.
 ROUNDING = 1e-9
 #: Thicker than this is no layer on a sensor.
 MAX_THICKNESS_UM = 1000.0
@@ -193,7 +193,7 @@ class Solids:
     @property
     def fill_factor(self) -> float:
         """
-        Volume of the wells as a share of the silicon under the layout's convex hull.
+        Volume of the wells as a fraction of the silicon under the layout's convex hull.
 
         Without trenches this is the layout's own, as in :func:`foveasim.layout.describe`; with them, that of
         ``inset(layout, trench_width_um / 2)`` on the same hull.
@@ -530,7 +530,7 @@ def _free_radius_um(layout: Layout, arm_um: Floats) -> Floats:
 
 
 def _cap_height_um(radius_um: Floats, height_um: float, share: Floats) -> Floats:
-    """Height over its border of a ball's cap, at a share of its radius from its middle; at most half a ball."""
+    """Height over its border of a ball's cap, at a fraction of its radius from its middle; at most half a ball."""
     sag_um = np.minimum(height_um, radius_um)
     ball_um = (radius_um**2 + sag_um**2) / (2.0 * sag_um)
     rise_um = np.sqrt(np.maximum(ball_um**2 - (radius_um * share) ** 2, 0.0)) - (ball_um - sag_um)

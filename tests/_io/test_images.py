@@ -290,7 +290,7 @@ def test_a_tiff_in_other_colours_is_not_taken_for_red_green_and_blue(tmp_path, m
     try:
         read = read_bytes(tmp_path, encoded(Image.fromarray(red).convert(mode), "TIFF"))
     except FileError:
-        return  # refused, which is right too
+        return  # rejected, which is right too
     assert read.shape == red.shape
     assert np.abs(read.astype(int) - red).max() <= 2
 
@@ -328,7 +328,7 @@ def test_a_picture_is_upright_however_the_camera_was_held(tmp_path, orientation,
             "4578696600004d4d002a000000080002010000020000000600000026011200030000000100060000000000006d616b657200"
         ),
     ],
-    ids=["cut short", "beyond the end", "nonsense", "text for a number"],
+    ids=["truncated", "beyond the end", "nonsense", "text for a number"],
 )
 @pytest.mark.parametrize("picture_format", ["JPEG", "PNG", "WEBP"])
 def test_a_broken_note_of_the_camera_does_not_spoil_the_picture(tmp_path, exif, picture_format):
@@ -375,7 +375,7 @@ def test_the_content_counts_and_not_the_ending(tmp_path):
     np.testing.assert_array_equal(read_bytes(tmp_path, tiff(GREY16), name="picture.png"), GREY16, strict=True)
 
 
-# -- what is refused ------------------------------------------------------------------------------------------------
+# -- what is rejected ------------------------------------------------------------------------------------------------
 
 
 def test_a_missing_file_is_refused(tmp_path):
@@ -394,11 +394,11 @@ def test_a_file_that_may_not_be_opened_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "secret.png"
     path.write_bytes(encoded(GREY8, "PNG"))
 
-    def refuse(*_, **__):
+    def reject(*_, **__):
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr("pathlib.Path.open", refuse)
-    monkeypatch.setattr("builtins.open", refuse)
+    monkeypatch.setattr("pathlib.Path.open", reject)
+    monkeypatch.setattr("builtins.open", reject)
     with pytest.raises(FileError, match=r"(?i)secret\.png: .*permission"):
         read_picture(path)
 
@@ -466,7 +466,7 @@ WHOLE = {
 @pytest.mark.parametrize("content", WHOLE.values(), ids=WHOLE)
 def test_a_picture_cut_short_is_refused(tmp_path, content, share):
     cut = content[: 1 + int(share * (len(content) - 1))]
-    assert_is_refused(tmp_path, cut, "is broken or cut short|is not a picture in a format that can be read")
+    assert_is_refused(tmp_path, cut, "is corrupt or truncated|is not a picture in a format that can be read")
 
 
 @pytest.mark.usefixtures("here")
@@ -486,7 +486,7 @@ def test_an_exr_cut_short_is_refused_or_its_reader_prints(tmp_path, capfd, compr
 
 
 def test_a_broken_exr_prints_nothing(tmp_path, capfd):
-    assert_is_refused(tmp_path, exr()[0][:-1], r"is broken or cut short$")
+    assert_is_refused(tmp_path, exr()[0][:-1], r"is corrupt or truncated$")
     assert capfd.readouterr() == ("", "")
 
 
@@ -503,7 +503,7 @@ def test_a_bit_flipped_in_the_picture_of_a_png_is_found(tmp_path):
     for place in range(begin + 4, len(content) - 16, 97):
         flipped = bytearray(content)
         flipped[place] ^= 8
-        assert_is_refused(tmp_path, flipped, "is broken or cut short")
+        assert_is_refused(tmp_path, flipped, "is corrupt or truncated")
 
 
 @pytest.mark.parametrize("kind", ["png", "jpeg", "progressive jpeg", "jpeg 2000", "radiance hdr"])
@@ -512,20 +512,20 @@ def test_a_picture_whose_end_was_never_written_is_refused(tmp_path, kind):
     for share in (0.3, 0.6, 0.9):
         n = int(share * len(content))
         # pillow before 13 does not recognise a JPEG picture without its tables.
-        is_refused = "is broken or cut short|is not a picture in a format that can be read"
+        is_refused = "is corrupt or truncated|is not a picture in a format that can be read"
         assert_is_refused(tmp_path, content[:n] + bytes(len(content) - n), is_refused)
 
 
 def test_a_jpeg_2000_cut_behind_its_header_is_refused(tmp_path):
     content = WHOLE["jpeg 2000"]
-    assert_is_refused(tmp_path, content[: content.index(b"\xff\x90")], "is broken or cut short")
+    assert_is_refused(tmp_path, content[: content.index(b"\xff\x90")], "is corrupt or truncated")
 
 
 def test_a_picture_in_the_notes_of_a_jpeg_is_not_its_end(tmp_path):
     notes = b"Exif\0\0" + encoded(GREY8, "JPEG")
     content = encoded(NOISE, "JPEG", exif=notes)
     assert read_bytes(tmp_path, content + b"behind the end").shape == NOISE.shape
-    assert_is_refused(tmp_path, content[:-400] + bytes(400), "is broken or cut short")
+    assert_is_refused(tmp_path, content[:-400] + bytes(400), "is corrupt or truncated")
 
 
 def without_strips(content, name):
@@ -538,7 +538,7 @@ def without_strips(content, name):
 @pytest.mark.parametrize("name", ["StripOffsets", "StripByteCounts"])
 @pytest.mark.parametrize("kind", ["tiff in strips", "deflated tiff"])
 def test_strips_that_a_tiff_lacks_are_not_made_up(tmp_path, kind, name):
-    assert_is_refused(tmp_path, without_strips(WHOLE[kind], name), "is broken or cut short")
+    assert_is_refused(tmp_path, without_strips(WHOLE[kind], name), "is corrupt or truncated")
 
 
 def giant_tiff():
@@ -576,7 +576,7 @@ def test_a_header_of_too_many_pixels_is_refused_as_that(tmp_path, content):
 def test_a_picture_below_the_limit_is_not_called_too_large(tmp_path):
     # 144 million of the 268 million pixels allowed; their data are missing.
     content = png(width=12_000, height=12_000, depth=8, colour_type=0, rows=b"\0" * 99)
-    assert_is_refused(tmp_path, content, r": is broken or cut short")
+    assert_is_refused(tmp_path, content, r": is corrupt or truncated")
 
 
 @pytest.mark.parametrize("planes", ["contig", "separate"])

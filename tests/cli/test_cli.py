@@ -131,7 +131,7 @@ def test_bad_settings_end_with_one_sentence_and_leave_nothing(folder, change, wo
         (lambda p: p.unlink(), "no such file"),
         (lambda p: p.write_text("I am no picture"), "is not a picture in a format that can be read"),
         (lambda p: p.write_bytes(b""), "is not a picture in a format that can be read"),
-        (lambda p: p.write_bytes(p.read_bytes()[:20_000]), "is broken or cut short"),
+        (lambda p: p.write_bytes(p.read_bytes()[:20_000]), "is corrupt or truncated"),
         (lambda p: (p.unlink(), p.mkdir()), "is not a file"),
         (lambda p: Image.new("RGB", (9, 9)).save(p, "GIF", save_all=True, append_images=[Image.new("RGB", (9, 9), "red")]), "holds 2 pictures"),
         (lambda p: p.write_bytes(huge_png(p.read_bytes())), "has 65536 x 65536 pixels, more than the limit|has more than"),

@@ -655,7 +655,7 @@ def test_classes_may_be_an_array_and_no_objects_are_read(tmp_path):
     assert read_labels(tmp_path / "texts.npy", ["x", "y"]) == ["b", "a"]
     with pytest.raises(FileError, match="is no array that can be read"):
         read_labels(tmp_path / "objects.npy", ["x", "y"])
-    with pytest.raises(FileError, match="of whole numbers or of texts"):
+    with pytest.raises(FileError, match="of integers or of texts"):
         read_labels(tmp_path / "reals.npy", ["x", "y"])
     with pytest.raises(FileError, match=r"must be a \.csv file"):
         read_labels(Path(__file__), ["x", "y"])

@@ -1,4 +1,4 @@
-"""The command view as a user meets it: what it writes, what it hands out, and what it refuses in one sentence."""
+"""The command view as a user meets it: what it writes, what it hands out, and what it rejects in one sentence."""
 
 from __future__ import annotations
 
@@ -145,9 +145,9 @@ def test_a_page_is_handed_out_on_this_computer_alone_until_it_is_stopped(view, f
             with urllib.request.urlopen(address) as answer:
                 assert answer.headers["Content-Type"] == "text/html; charset=utf-8"
                 assert b"30 photosites" in answer.read()
-            with pytest.raises(urllib.error.HTTPError, match="404") as refused:
+            with pytest.raises(urllib.error.HTTPError, match="404") as rejected:
                 urllib.request.urlopen(address + "layout.npz")
-            refused.value.close()
+            rejected.value.close()
             # A stranger's name that leads to this computer.
             connection = http.client.HTTPConnection("127.0.0.1", port)
             connection.request("GET", "/", headers={"Host": f"stranger.example:{port}"})

@@ -461,7 +461,7 @@ def test_longer_lists_of_opencv_are_read_where_the_rest_is_nothing():
     ("text", "message"),
     [
         ('{"K": [1, 2, 3], "RadialDistortion": [0.1, 0.2], "ImageSize": [480, 640]}', "must have a matrix of 3 x 3 numbers, got 3"),
-        ('{"K": [[500,0,1],[0,500,1],[0,0,1]], "RadialDistortion": [0.1, 0.2], "ImageSize": [480.5, 640]}', "must be a whole number"),
+        ('{"K": [[500,0,1],[0,500,1],[0,0,1]], "RadialDistortion": [0.1, 0.2], "ImageSize": [480.5, 640]}', "must be an integer"),
         ('{"MappingCoefficients": [700, 0, 0, 0], "DistortionCenter": [320, 240], "ImageSize": [480, 640], "StretchMatrix": [1, 0, 1]}', "must have a matrix of 2 x 2"),
         ("#polynomial\ninf 1 0 0 0 0\n1\n1 1\n1 0 0\n480 640\n", "is no calib_results.txt"),
         ("#polynomial\n5 -1500 0 0 0 0\n1 2\n240 320\n1 0 0\ninf 640\n", "must be finite"),

@@ -275,7 +275,7 @@ def test_codes_of_all_samples_have_the_type_of_the_most_bits():
     ],
 )
 def test_stored_numbers_are_those_that_samples_were_made_with(name, vary, tmp_path):
-    """Whichever comes first, a whole number or another: all have the one type, and none is cut off."""
+    """Whichever comes first, an integer or another: all have the one type, and none is cut off."""
     is_whole_first = set()
     for seed in (0, 4, 5):
         data = explore.Dataset(pictures(12), SHOT, vary, seed=seed, fields=())
@@ -667,7 +667,7 @@ def test_tar_files_hold_layouts_that_differ_and_zarr_does_not(tmp_path):
 
 
 def broken_folder(tmp_path):
-    """Six pictures, of which the fifth is cut short, and its whole content."""
+    """Six pictures, of which the fifth is truncated, and its whole content."""
     folder = tmp_path / "pictures"
     folder.mkdir()
     for k, picture in enumerate(pictures(6)):
@@ -687,7 +687,7 @@ def test_a_broken_picture_is_named_and_writing_goes_on_from_there(name, workers,
         if name.endswith("zarr")
         else (lambda: {p: p.stat().st_mtime_ns for p in target.glob("*.tar")})
     )
-    with pytest.raises(FileError, match=r"4\.png: is broken or cut short"):
+    with pytest.raises(FileError, match=r"4\.png: is corrupt or truncated"):
         explore.write_dataset(explore.Dataset(folder, SHOT, VARY), target, per_shard=1, workers=workers)
     before = done()
     with pytest.raises(FileError, match=r"has \d of 6 shards; write the same dataset there to go on"):
@@ -839,7 +839,7 @@ def test_processes_are_started_where_there_is_enough_to_do(tmp_path, monkeypatch
 
 @pytest.mark.parametrize("name", ["data.zarr", "data"])
 def test_a_full_disk_is_one_sentence_and_no_broken_shard(name, tmp_path):
-    """The system refuses files beyond a size, as it does where no place is left."""
+    """The system rejects files beyond a size, as it does where no place is left."""
     rng = np.random.default_rng(0)
     layout = {"generator": "grid", "parameters": {"n_x": 90, "n_y": 90, "pitch_um": 1.0}}
     data = explore.Dataset(
@@ -921,7 +921,7 @@ def test_a_store_of_something_else_is_left_alone(tmp_path):
             explore.write_dataset(other, tmp_path / path)
     with pytest.raises(FileError, match="its 'per_shard' differs"):
         explore.write_dataset(data, tmp_path / "data", per_shard=2)
-    (tmp_path / "data" / "shard-000001.tar").write_bytes(b"cut short")
+    (tmp_path / "data" / "shard-000001.tar").write_bytes(b"truncated")
     with pytest.raises(FileError, match="has a broken sample 1"):
         explore.open_dataset(tmp_path / "data")[1]
     with pytest.raises(FileError, match="no such folder"):
@@ -1004,7 +1004,7 @@ def test_samples_of_other_contents_are_refused_in_zarr_too(tmp_path):
 def test_a_shard_that_was_broken_is_written_anew(tmp_path):
     data = explore.Dataset(pictures(2), SHOT)
     explore.write_dataset(data, tmp_path / "data", per_shard=1)
-    (tmp_path / "data" / "shard-000001.tar").write_bytes(b"cut short")
+    (tmp_path / "data" / "shard-000001.tar").write_bytes(b"truncated")
 
     assert_same(explore.write_dataset(data, tmp_path / "data")[1], data[1])
 
@@ -1070,7 +1070,7 @@ def test_warnings_of_samples_are_told_once_and_kept(tmp_path):
         ({"exposure_s": {"normal": [1, 0, 0, 2]}}, ParameterError, "a standard deviation above 0"),
         ({"exposure_s": {"normal": [1, 1e300, 0, 2]}}, ParameterError, "a standard deviation up to 1e\\+06 times"),
         ({"exposure_s": {"uniform": b"ab"}}, ParameterError, r"uniform needs \[low, high\]"),
-        ({"exposure_s": {"integers": [1, 2.5]}}, ParameterError, "must be a whole number, got 2.5"),
+        ({"exposure_s": {"integers": [1, 2.5]}}, ParameterError, "must be an integer, got 2.5"),
         ({"": {"uniform": [1, 2]}}, ConfigError, "'' is no setting's place"),
         ({"sensor.bits": {"uniform": [8, 9.5]}}, ConfigError, "sensor.bits: "),
         ({"sensor.bits": {"choice": [8, 40]}}, ConfigError, "sensor.bits: must be <= "),
@@ -1095,12 +1095,12 @@ def test_a_bad_distribution_is_refused_before_the_first_sample(vary, error, mess
     ("options", "error", "message"),
     [
         ({"labels": [1]}, ParameterError, "'labels' must have one for each of the 2 pictures, got 1"),
-        ({"labels": [1, "a"]}, ParameterError, "must all be whole numbers, or all be texts"),
-        ({"labels": [1, 2.0]}, ParameterError, "must all be whole numbers, or all be texts"),
-        ({"labels": [None, None]}, ParameterError, "must all be whole numbers, or all be texts"),
-        ({"labels": np.zeros((2, 2), int)}, ParameterError, "must all be whole numbers, or all be texts"),
+        ({"labels": [1, "a"]}, ParameterError, "must all be integers, or all be texts"),
+        ({"labels": [1, 2.0]}, ParameterError, "must all be integers, or all be texts"),
+        ({"labels": [None, None]}, ParameterError, "must all be integers, or all be texts"),
+        ({"labels": np.zeros((2, 2), int)}, ParameterError, "must all be integers, or all be texts"),
         ({"labels": [2**70, 1]}, ParameterError, "'labels' must be <= 9223372036854775807"),
-        ({"boxes": [[], [[1, 2, 3, 4, 1e300]]]}, ParameterError, "whole numbers up to 9007199254740992 as classes"),
+        ({"boxes": [[], [[1, 2, 3, 4, 1e300]]]}, ParameterError, "integers up to 9007199254740992 as classes"),
         ({"boxes": [[], [[1, 2, float("nan"), 4]]]}, ParameterError, "must be finite everywhere"),
         ({"boxes": [[], [[1, 2, 1, 4]]]}, ParameterError, "must have x0 < x1 and y0 < y1"),
         ({"boxes": [[], "ab"]}, ParameterError, "must be an array of numbers"),
@@ -1108,11 +1108,11 @@ def test_a_bad_distribution_is_refused_before_the_first_sample(vary, error, mess
         ({"boxes": [[[0, 0, 1, 1]], [[3, 0, 1, 1]]]}, ParameterError, r"'boxes\[1\]' must have x0 < x1"),
         ({"boxes": [[], [1, 2, 3]]}, ParameterError, r"'boxes\[1\]' must have 2 dimensions"),
         ({"boxes": [[], [[1, 2, 3]]]}, ParameterError, r"must have the shape \(n, 4\)"),
-        ({"boxes": [[], [[1, 2, 3, 4, 0.5]]]}, ParameterError, "must have whole numbers up to"),
+        ({"boxes": [[], [[1, 2, 3, 4, 0.5]]]}, ParameterError, "must have integers up to"),
         ({"fields": ["codes"]}, ParameterError, "'fields' must be one of 'code'"),
         ({"fit": "crop"}, ParameterError, "'fit' must be one of 'cover', 'contain'"),
         ({"cameras": 0}, ParameterError, "'cameras' must be >= 1"),
-        ({"draws": 1.5}, ParameterError, "'draws' must be a whole number"),
+        ({"draws": 1.5}, ParameterError, "'draws' must be an integer"),
         ({"seed": -1}, ParameterError, "'seed' must be >= 0"),
         ({"changes": {"optics.speed": 1}}, ConfigError, "optics.speed: no such setting"),
         ({"fit": "cover", "vary": {"scene.pitch_um": {"uniform": [1, 2]}}}, ParameterError, "cannot vary beside 'fit'"),
@@ -1132,7 +1132,7 @@ def test_a_bad_distribution_is_refused_before_the_first_sample(vary, error, mess
         ({"pictures": []}, ParameterError, "'pictures' must hold at least one picture"),
         ({"pictures": [(pictures(1)[0], 1), ()]}, ParameterError, "must all be pairs"),
         ({"pictures": [(pictures(1)[0],)]}, ParameterError, "must all be pairs"),
-        ({"pictures": [(pictures(1)[0], None)]}, ParameterError, "must all be whole numbers, or all be texts"),
+        ({"pictures": [(pictures(1)[0], None)]}, ParameterError, "must all be integers, or all be texts"),
         ({"pictures": np.zeros((3, 4))}, ParameterError, "'pictures' must have the shape"),
         ({"pictures": np.zeros((0, 4, 4))}, ParameterError, "'pictures' must have the shape"),
         ({"pictures": "missing"}, FileError, "missing: no such file or folder"),
@@ -1168,11 +1168,11 @@ def test_folders_and_files_without_pictures_are_refused(tmp_path):
 
 def test_labels_that_do_not_fit_a_picture_name_it():
     bad = {
-        "masks": ([np.zeros((N_Y, N_X), int), np.zeros((3, 3), int)], "mask of picture 1' must be whole numbers"),
+        "masks": ([np.zeros((N_Y, N_X), int), np.zeros((3, 3), int)], "mask of picture 1' must be integers"),
         "flows": ([np.zeros((N_Y, N_X, 2)), np.zeros((N_Y, N_X))], "flow of picture 1' must be numbers of the shape"),
     }
     huge = [np.zeros((N_Y, N_X), int), np.full((N_Y, N_X), 2**64 - 1, np.uint64)]
-    with pytest.raises(SimulationError, match=r"sample 1 .*mask of picture 1' must be whole numbers of 64 bits"):
+    with pytest.raises(SimulationError, match=r"sample 1 .*mask of picture 1' must be integers of 64 bits"):
         explore.Dataset(pictures(2), SHOT, masks=huge)[1]
     for name, (given, message) in bad.items():
         data = explore.Dataset(pictures(2), SHOT, **{name: given})

@@ -111,7 +111,7 @@ def plan_200(metrics=None):
 
 @pytest.fixture(scope="module")
 def by_hand():
-    """The 200 points without workers, caches or stores: each shot built anew, and captured."""
+    """The 200 points without workers, caches or stores: each shot built again, and captured."""
     plan = plan_200()
     records = {}
     for point in range(plan.n_points):
@@ -850,7 +850,7 @@ def test_a_camera_takes_light_that_is_known_and_shares_its_compiled_layout():
     np.testing.assert_array_equal(known, again)
     assert kept
     assert all(np.array_equal(images[place], image) for place, image in kept.items())
-    for anew, taken in zip(
+    for again, taken in zip(
         *(
             (c.code, c.electrons, c.expected_e)
             for c in (
@@ -860,10 +860,10 @@ def test_a_camera_takes_light_that_is_known_and_shares_its_compiled_layout():
         ),
         strict=True,
     ):
-        np.testing.assert_array_equal(anew, taken)
+        np.testing.assert_array_equal(again, taken)
     grid = shot.camera.optics.grid(shot.scene)
     assert camera.replace(optics=shot.camera.optics).integrator(grid) is camera.integrator(grid)
-    with pytest.raises(ParameterError, match="'photo_e_per_s' must be 64 numbers, one a site, got 3"):
+    with pytest.raises(ParameterError, match="'photo_e_per_s' must be 64 numbers, one per site, got 3"):
         camera.capture(shot.scene, exposure_s=0.01, seed=1, photo_e_per_s=known[:3])
 
 

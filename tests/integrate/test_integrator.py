@@ -17,7 +17,7 @@ from foveasim.integrate import _plan
 SHAPE = (7, 9)
 GRID = fs.Grid(SHAPE, 1.0)
 MAP = np.random.default_rng(5).uniform(0.5, 1.5, SHAPE)
-#: Exact up to this share of the result.
+#: Exact up to this fraction of the result.
 EXACT = 1e-11
 
 TILINGS = {

@@ -371,7 +371,7 @@ def test_many_edges_in_a_row_leave_whole_cells_without_moments():
 @cache
 def airy_means(cells_per_lambda_n, parts):
     """
-    Cell means of a point's diffraction pattern on a grid ``parts`` times finer, as shares of the light.
+    Cell means of a point's diffraction pattern on a grid ``parts`` times finer, as fractions of the light.
 
     The point lies at the middle of cell [n // 2, n // 2]; means of any size of cell are exact, and so are means of means.
     """
@@ -393,7 +393,7 @@ def airy_means(cells_per_lambda_n, parts):
 
 
 def share_in_a_square(cells_per_lambda_n, parts, offset, order):
-    """Share of a point's light in a centred square of side λN; the point lies ``offset`` fine cells from a cell's corner."""
+    """Fraction of a point's light in a centred square of side λN; the point lies ``offset`` fine cells from a cell's corner."""
     dx, dy = offset
     fine = airy_means(cells_per_lambda_n, parts)
     n = fine.shape[0] // parts - 1
@@ -440,7 +440,7 @@ def test_a_smooth_field_through_a_lens_is_tens_of_times_closer_to_the_truth():
     assert errors[2] < 2e-4
 
 
-# -- what is refused ---------------------------------------------------------------------------------------------------
+# -- what is rejected ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("order", [0, 3, 1.5, "two", None, True])

@@ -1,4 +1,4 @@
-"""Laws of the layout: what from_polygons takes and refuses, its measures against shapely, and its verbs."""
+"""Laws of the layout: what from_polygons takes and rejects, its measures against shapely, and its verbs."""
 
 from __future__ import annotations
 
@@ -355,9 +355,9 @@ SQUARE_XY = [(0, 0), (1, 0), (1, 1), (0, 1)]
         pytest.param(SQUARE_XY, [1, 4], [0, 1], "'ring_offsets' must begin at 0 and end at 4", id="begins at 1"),
         pytest.param(SQUARE_XY, [0, 3], [0, 1], "'ring_offsets' must begin at 0 and end at 4", id="ends early"),
         pytest.param(SQUARE_XY, [0, 5], [0, 1], "'ring_offsets' must begin at 0 and end at 4", id="ends late"),
-        pytest.param(SQUARE_XY, [], [0], "'ring_offsets' must be a list of whole numbers", id="no offsets"),
-        pytest.param(SQUARE_XY, [0.0, 4.0], [0, 1], "'ring_offsets' must be a list of whole numbers", id="floats"),
-        pytest.param(SQUARE_XY, [[0, 4]], [0, 1], "'ring_offsets' must be a list of whole numbers", id="nested"),
+        pytest.param(SQUARE_XY, [], [0], "'ring_offsets' must be a list of integers", id="no offsets"),
+        pytest.param(SQUARE_XY, [0.0, 4.0], [0, 1], "'ring_offsets' must be a list of integers", id="floats"),
+        pytest.param(SQUARE_XY, [[0, 4]], [0, 1], "'ring_offsets' must be a list of integers", id="nested"),
         pytest.param(
             SQUARE_XY, [0, 4, 4], [0, 2], "'ring_offsets' .*at least 1 vertices; item 1", id="ring of nothing"
         ),

@@ -80,7 +80,7 @@ def saved(tmp_path, array, name="map.npy"):
     return tmp_path / name
 
 
-def refused(path, match, error=FileError, **told):
+def rejected(path, match, error=FileError, **told):
     with pytest.raises(error, match=match) as caught:
         read_power_map(path, **told)
     assert "\n" not in str(caught.value)
@@ -223,7 +223,7 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(tmp_path, 
     with pytest.raises(FileError, match=rf"map\.{ending}: needs {library}.*pip install 'foveasim\[maps\]'"):
         write_power_map(letter_map(), tmp_path / f"map.{ending}")
     if ending == "fits":
-        refused(tmp_path / f"there.{ending}", r"needs .*pip install 'foveasim\[maps\]'")
+        rejected(tmp_path / f"there.{ending}", r"needs .*pip install 'foveasim\[maps\]'")
 
 
 def test_without_xarray_one_sentence_tells_how_to_get_it(monkeypatch):
@@ -347,8 +347,8 @@ def test_one_of_several_arrays_is_chosen_by_its_name(tmp_path):
     np.savez(tmp_path / "map.npz", a=np.ones((3, 4)), b=2.0 * np.ones((3, 4)))
 
     assert read_power_map(tmp_path / "map.npz", name="b", **TOLD).data.max() == 2.0
-    refused(tmp_path / "map.npz", r"holds 2 arrays, none called 'data'; say which is the map with name=", **TOLD)
-    refused(tmp_path / "map.npz", r"has no array 'c'; there are 'a', 'b'", name="c", **TOLD)
+    rejected(tmp_path / "map.npz", r"holds 2 arrays, none called 'data'; say which is the map with name=", **TOLD)
+    rejected(tmp_path / "map.npz", r"has no array 'c'; there are 'a', 'b'", name="c", **TOLD)
 
 
 def test_a_fits_image_tells_pitch_place_wavelengths_and_unit(tmp_path):
@@ -393,7 +393,7 @@ def test_a_fits_image_in_an_extension_with_the_size_of_pixels(tmp_path):
     assert read_power_map(tmp_path / "map.fits", **told).data.max() == 1.0
     assert read_power_map(tmp_path / "map.fits", **told, name="N2").data.max() == 2.0
     assert read_power_map(tmp_path / "map.fits", **told, name="2").grid.pitch_um == 3.5
-    refused(tmp_path / "map.fits", r"holds no image 'N3'", **told, name="N3")
+    rejected(tmp_path / "map.fits", r"holds no image 'N3'", **told, name="N3")
 
 
 def test_a_fits_image_of_the_sky_asks_for_the_pitch(tmp_path):
@@ -403,7 +403,7 @@ def test_a_fits_image_of_the_sky_asks_for_the_pitch(tmp_path):
         fits.Header({"CUNIT1": "deg", "CUNIT2": "deg", "CDELT1": 0.1, "CDELT2": 0.1}),
     )
 
-    refused(
+    rejected(
         tmp_path / "map.fits", "does not tell the size of its cells; give pitch_um=", wavelength_nm=550.0, unit="w_m2"
     )
 
@@ -411,7 +411,7 @@ def test_a_fits_image_of_the_sky_asks_for_the_pitch(tmp_path):
 def test_a_turned_fits_image_is_refused(tmp_path):
     fits.writeto(tmp_path / "map.fits", np.ones((3, 4)), fits.Header({"CD1_1": 0.1, "CD1_2": 0.1, "CD2_2": 0.1}))
 
-    refused(tmp_path / "map.fits", "is turned against its coordinates", wavelength_nm=550.0, unit="w_m2")
+    rejected(tmp_path / "map.fits", "is turned against its coordinates", wavelength_nm=550.0, unit="w_m2")
 
 
 @pytest.mark.parametrize(
@@ -467,10 +467,10 @@ def test_an_exr_of_radiance_or_of_colours_is_refused(tmp_path):
     write_exr(tmp_path / "scene.exr", {"S0.550nm": ones}, emissiveUnits="W.m^-2.sr^-1.nm^-1")
     write_exr(tmp_path / "colours.exr", dict.fromkeys("RGB", ones))
 
-    refused(
+    rejected(
         tmp_path / "scene.exr", r"is in 'W\.m\^-2\.sr\^-1\.nm\^-1', which is no irradiance; .* give unit=", pitch_um=1.0
     )
-    refused(tmp_path / "colours.exr", "colours of a picture", **TOLD)
+    rejected(tmp_path / "colours.exr", "colours of a picture", **TOLD)
     assert read_power_map(tmp_path / "scene.exr", pitch_um=1.0, unit="w_m2").data.max() == 1.0
 
 
@@ -571,10 +571,10 @@ def test_the_map_of_a_netcdf_is_the_only_one_or_named(tmp_path):
     two.to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
 
     np.testing.assert_allclose(read_power_map(tmp_path / "map.nc", name="b").data, 2.0 * from_xarray(labelled()).data)
-    refused(
+    rejected(
         tmp_path / "map.nc", r"holds 2 arrays of numbers with rows and columns: a, b; say which is the map with name="
     )
-    refused(tmp_path / "map.nc", r"has no variable 'c'; there are a, b, note", name="c")
+    rejected(tmp_path / "map.nc", r"has no variable 'c'; there are a, b, note", name="c")
 
 
 def test_packed_numbers_of_a_netcdf_are_unpacked(tmp_path):
@@ -672,7 +672,7 @@ def test_optical_images_come_under_other_names_too(tmp_path, save):
     assert maps[0].data.dtype == np.float32
     for power_map in maps[1:]:
         assert_same(power_map, maps[0])
-    refused(tmp_path / "mine.mat", r"holds no optical image 'oi'; there are mine, other")
+    rejected(tmp_path / "mine.mat", r"holds no optical image 'oi'; there are mine, other")
 
 
 @pytest.mark.parametrize("save", SAVERS.values(), ids=SAVERS)
@@ -713,7 +713,7 @@ def test_photons_that_old_versions_packed_are_unpacked(tmp_path):
 def test_an_optical_image_that_lacks_something_says_what(tmp_path, changes, message):
     scipy.io.savemat(tmp_path / "oi.mat", {"oi": optical_image(np.ones((2, 2)), [550.0], **changes)})
 
-    refused(tmp_path / "oi.mat", message)
+    rejected(tmp_path / "oi.mat", message)
 
 
 def test_what_is_said_goes_before_what_the_file_tells(tmp_path):
@@ -849,7 +849,7 @@ def test_rounding_below_darkness_is_kept(tmp_path):
     ],
 )
 def test_what_light_cannot_be_is_refused(tmp_path, array, message):
-    refused(saved(tmp_path, array), message, **TOLD)
+    rejected(saved(tmp_path, array), message, **TOLD)
 
 
 @pytest.mark.parametrize(
@@ -883,7 +883,7 @@ def test_what_light_cannot_be_is_refused(tmp_path, array, message):
     ],
 )
 def test_what_is_missing_or_said_wrongly_is_told(tmp_path, told, message, error):
-    refused(saved(tmp_path, np.ones((3, 4))), message, error, **{**TOLD, **told})
+    rejected(saved(tmp_path, np.ones((3, 4))), message, error, **{**TOLD, **told})
 
 
 def test_what_is_no_file_of_a_map_is_refused(tmp_path):
@@ -891,11 +891,11 @@ def test_what_is_no_file_of_a_map_is_refused(tmp_path):
     (tmp_path / "packed").write_bytes(b"\x1f\x8b" + bytes(50))
     (tmp_path / "text").write_text("1 2 3")
 
-    refused(tmp_path / "nowhere", "no such file")
-    refused(tmp_path, "is not a file")
-    refused(tmp_path / "empty", "is empty")
-    refused(tmp_path / "packed", "is compressed with gzip; unpack it first")
-    refused(tmp_path / "text", "is no power map: expected EXR, FITS, MAT, netCDF, npy, npz, TIFF or zarr")
+    rejected(tmp_path / "nowhere", "no such file")
+    rejected(tmp_path, "is not a file")
+    rejected(tmp_path / "empty", "is empty")
+    rejected(tmp_path / "packed", "is compressed with gzip; unpack it first")
+    rejected(tmp_path / "text", "is no power map: expected EXR, FITS, MAT, netCDF, npy, npz, TIFF or zarr")
 
 
 # -- files from strangers ---------------------------------------------------------------------------------------------
@@ -1192,7 +1192,7 @@ def whole(tmp_path_factory):
     scipy.io.savemat(folder / "map.mat", tree)
     save_v73(folder / "map.mat73", tree)
     files = {path.suffix[1:]: path.read_bytes() for path in folder.iterdir()}
-    files["fits"] = files["fits"].rstrip(b"\0")  # a file cut short in its last block's padding is whole
+    files["fits"] = files["fits"].rstrip(b"\0")  # a file truncated in its last block's padding is whole
     return files
 
 
@@ -1231,14 +1231,14 @@ def test_strips_that_a_tiff_lacks_are_not_made_up(tmp_path):
     content = path.read_bytes()
     path.write_bytes(content[:place] + struct.pack("<H", 60_000) + content[place + 2 :])
 
-    refused(path, "is broken or cut short", **TOLD)
+    rejected(path, "is corrupt or truncated", **TOLD)
 
 
 @pytest.mark.usefixtures("apart")
 def test_an_exr_that_is_cut_short_is_refused(whole, tmp_path):
     (tmp_path / "map.exr").write_bytes(whole["exr"][:-20])
 
-    refused(tmp_path / "map.exr", "is broken or cut short")
+    rejected(tmp_path / "map.exr", "is corrupt or truncated")
 
 
 @pytest.mark.usefixtures("apart")
@@ -1255,4 +1255,4 @@ def test_a_program_that_is_ended_by_what_it_reads_ends_in_one_sentence(
     (tmp_path / "map.mat").write_bytes(whole["mat"])
     monkeypatch.setattr(reading_apart, limit, value)
 
-    refused(tmp_path / "map.mat", message)
+    rejected(tmp_path / "map.mat", message)

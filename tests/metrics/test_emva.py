@@ -361,7 +361,7 @@ def test_draws_and_prediction_agree():
     n_sites, variance = told.n_sites, told.temporal_variance_dn2
     assert n_sites.tolist() == [200, 150]
     assert np.all(np.abs(drawn.mean_dn - told.mean_dn) < SIGMAS * np.sqrt(variance / (n_frames * n_sites)))
-    # By the standard's formula a share of 1 / n_sites of the variance is taken for a lamp's flicker.
+    # By the standard's formula a fraction of 1 / n_sites of the variance is taken for a lamp's flicker.
     error = variance * np.sqrt(2.0 / (n_sites * (n_frames - 1.0)))
     # At the well's edge the noise is no Gaussian: its fourth moment is larger, by less than 4 times.
     error[4:6] *= 2.0

@@ -197,7 +197,7 @@ def test_bad_input_is_told():
         flow_bound(np.ones((3, 2)), 0.0)
     with pytest.raises(ParameterError, match=r"'gradient_e_per_um' must have the shape \(n_site, 2\)"):
         flow_bound(np.ones((3, 3)), 1.0)
-    with pytest.raises(ParameterError, match="'regions' must be 3 whole numbers"):
+    with pytest.raises(ParameterError, match="'regions' must be 3 integers"):
         flow_bound(np.ones((3, 2)), 1.0, regions=[0.5, 1.0, 2.0])
     with pytest.raises(ParameterError, match=r"'layout' must be a foveasim\.Layout, got a NoneType"):
         estimate_flow(None, values, map_e, GRID, variance_e2=1.0)

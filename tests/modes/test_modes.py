@@ -189,7 +189,7 @@ def test_the_spread_of_leaks_is_fixed_in_the_device_and_keeps_their_mean():
 
     assert leaks.min() > 0.0
     assert abs(leaks.mean() - 2.0) < 5.0 * 2.0 * spread / math.sqrt(n_sites)
-    # The kurtosis of a log-normal law: for w = 1 + 0.5², w⁴ + 2w³ + 3w² - 3.
+    # The kurtosis of a log-normal distribution: for w = 1 + 0.5², w⁴ + 2w³ + 3w² - 3.
     w = 1.0 + spread**2
     kurtosis = w**4 + 2.0 * w**3 + 3.0 * w**2 - 3.0
     assert abs(leaks.var() / (2.0 * spread) ** 2 - 1.0) < 5.0 * math.sqrt((kurtosis - 1.0) / n_sites)
@@ -209,7 +209,7 @@ def test_noise_events_are_a_poisson_process_that_light_halves():
     counts = events.counts()
     for part, mean in ((counts[:1000], 20.0), (counts[1000:], 10.0)):
         assert abs(part.mean() - mean) < 5.0 * math.sqrt(mean / 1000)
-        # The variance of a variance of Poisson's law: (mean + 2 mean²) / n.
+        # The variance of a variance of Poisson's distribution: (mean + 2 mean²) / n.
         assert abs(part.var() - mean) < 5.0 * math.sqrt((mean + 2.0 * mean**2) / 1000)
     ups = (events.polarity == 1).sum()
     assert abs(ups - 0.5 * len(events)) < 5.0 * 0.5 * math.sqrt(len(events))
@@ -380,7 +380,7 @@ def test_intervals_follow_the_gamma_law(threshold_e):
     n = intervals.size
     assert n == 30 * n_sites
     assert abs(intervals.mean() - 1.0) < 5.0 / math.sqrt(threshold_e * n)
-    # The kurtosis of the gamma law of shape N is 6/N above 3.
+    # The kurtosis of the gamma distribution of shape N is 6/N above 3.
     assert abs(intervals.var() * threshold_e - 1.0) < 5.0 * math.sqrt((2.0 + 6.0 / threshold_e) / n)
 
 
@@ -420,7 +420,7 @@ def test_more_spikes_than_memory_are_told():
         SpikingPixels(sensor_of(1), threshold_e=1.0).events([[1e12]], frame_s=1.0, seed=0)
 
 
-# -- what both refuse -------------------------------------------------------------------------------------------------
+# -- what both reject -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -789,7 +789,7 @@ def test_counts_in_spans_of_time_are_those_of_the_spans(monkeypatch):
         ([1.0], [7], [1], "'site' must be from 0 to 2, the sites of the layout, got 7"),
         ([1.0], [-1], [1], "site"),
         ([1.0], [2**33], [1], "got 8589934592"),
-        ([1.0], [0.0], [1], "'site' must be whole numbers"),
+        ([1.0], [0.0], [1], "'site' must be integers"),
         ([1.0], [0], [0], "'polarity' must be 1 or -1, got 0; of 0 and 1 make 2"),
         ([1.0], [0], [257], "polarity"),
         ([1.0], [0, 1], [1], "'site' must be one number for each of 1 times"),
@@ -853,7 +853,7 @@ def test_files_that_hold_no_events_are_told(tmp_path):
     with pytest.raises(FileError, match="no such file"):
         Events.load(tmp_path / "none.npz")
     (tmp_path / "bad.npz").write_bytes(b"no zip")
-    with pytest.raises(FileError, match="is broken, or no file of events"):
+    with pytest.raises(FileError, match="is corrupt, or no file of events"):
         Events.load(tmp_path / "bad.npz")
     with pytest.raises(ParameterError, match="pitch_um"):
         some_events().addresses(1e-6)

@@ -14,7 +14,7 @@ from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.optics import circular_otf
 
 DISTANCE_M = 0.56
-#: Share of an Airy pattern's light in a centred square of side x λN (tabulated from the pattern's double integral).
+#: Fraction of an Airy pattern's light in a centred square of side x λN (tabulated from the pattern's double integral).
 ENSQUARED = {0.5: 0.177327, 1.0: 0.528891, 1.5: 0.766734, 2.0: 0.833845, 2.44: 0.844488}
 
 
@@ -108,7 +108,7 @@ def test_irradiance_of_a_point_follows_the_airy_formula(wavelength_nm):
     )
     v = np.pi * np.arange(1, 100) / 24
 
-    airy = (np.pi / 4) * (2 * j1(v) / v) ** 2 / 24**2  # share of the light in a cell of λN/24
+    airy = (np.pi / 4) * (2 * j1(v) / v) ** 2 / 24**2  # fraction of the light in a cell of λN/24
     # Cell means differ from samples by the curvature of the pattern over a cell.
     assert line[1:] == pytest.approx(airy, abs=3e-3 * airy[0])
 
@@ -438,7 +438,7 @@ def test_a_scene_inside_the_focal_length_is_refused(distance_m):
         ("emission", "lambert", "must be one of 'lambertian', 'isotropic', got 'lambert'"),
         ("transmission", 1.2, "must be <= 1, got 1.2"),
         ("padding", None, "must be one of 'reflect'"),
-        ("padding_cells", 2.5, "must be a whole number"),
+        ("padding_cells", 2.5, "must be an integer"),
         ("padding_cells", -1, "must be >= 0"),
         ("precision", "half", "must be one of 'single', 'double'"),
         ("source_pixel", "round", "must be one of 'point', 'square'"),

@@ -36,7 +36,7 @@ def rings_of(layout):
 
 @st.composite
 def lattice_sites(draw):
-    """Sites of one to three rings with corners on whole numbers: concave, crossing themselves and each other, holed."""
+    """Sites of one to three rings with corners on integers: concave, crossing themselves and each other, holed."""
     corner = st.tuples(st.integers(-4, 4), st.integers(-4, 4))
     sites = draw(st.lists(st.lists(st.lists(corner, min_size=3, max_size=7), min_size=1, max_size=3), max_size=4))
     rings = [ring for site in sites for ring in site]
@@ -53,7 +53,7 @@ def lattice_sites(draw):
 @given(layout=lattice_sites(), steps=st.sampled_from([1, 2, 4]), n_threads=st.sampled_from([1, 3]))
 @settings(max_examples=100, deadline=None)
 def test_every_sample_agrees_with_exact_fractions_on_edges_and_corners_too(layout, steps, n_threads):
-    # Centres at whole numbers, halves and quarters of them.
+    # Centres at integers, halves and quarters of them.
     n = 10 * steps
     low = -5.0 - 0.5 / steps
     ids = id_map(layout, (n, n), (low, low, low + 10, low + 10), n_threads=n_threads)
@@ -79,7 +79,7 @@ def test_in_a_tiling_a_pixel_has_one_site_no_less_and_no_more(layout, n):
 
 def test_a_centre_on_a_border_belongs_to_the_site_on_its_right_or_above():
     layout = L.grid(n_x=4, n_y=3, pitch_um=2.0)  # from -4 to 4, from -3 to 3
-    ids = id_map(layout, (7, 9), (-4.5, -3.5, 4.5, 3.5))  # centres on whole numbers: corners, borders, middles
+    ids = id_map(layout, (7, 9), (-4.5, -3.5, 4.5, 3.5))  # centres on integers: corners, borders, middles
 
     row, column = np.divmod(np.arange(12), 4)
     for iy, y in enumerate(range(-3, 4)):

@@ -24,7 +24,7 @@ def cell_of(point, others, side=1e3):
 
 
 def stolen_shares(xy, point):
-    """Share of a new point's Voronoi cell that was each site's, (n_site,)."""
+    """Fraction of a new point's Voronoi cell that was each site's, (n_site,)."""
     new = cell_of(point, xy)
     stolen = np.array([cell_of(site, np.delete(xy, k, axis=0)).intersection(new).area for k, site in enumerate(xy)])
     return stolen / new.area

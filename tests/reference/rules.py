@@ -18,7 +18,7 @@ from shapely.geometry.polygon import orient
 
 import foveasim as fs
 
-#: Sites that are closer than this touch, and smaller overlaps and gaps, as shares of a site, are the rounding of vertices.
+#: Sites that are closer than this touch, and smaller overlaps and gaps, as fractions of a site, are the rounding of vertices.
 TOUCHING_UM = 1e-6
 AREA_ROUNDING = 1e-9
 #: Between sites that meet along an edge, rounding may leave slits up to this wide; to so many of these, gaps reach a site.

@@ -20,7 +20,7 @@ PITCH_MM = 0.1
 LIGHT = {"distance_m": 1.0, "radiance_w_m2_sr_nm": 2.0, "band_width_nm": 10.0}
 EPS32 = float(np.finfo(np.float32).eps)
 
-#: A chart of each kind on 60 x 80 pixels of 0.1 mm, with sizes that are no whole numbers of pixels.
+#: A chart of each kind on 60 x 80 pixels of 0.1 mm, with sizes that are no integers of pixels.
 KINDS = {
     "point_grid": {"spacing_mm": 0.5, "intensity_w_sr_nm": 3e-6},
     "checkerboard": {"square_mm": 0.77},
@@ -532,7 +532,7 @@ def test_two_pixels_a_period_are_enough():
     chart("sine", line_pairs_per_mm=5.0)
 
 
-# -- what is refused ------------------------------------------------------------------------------------------------
+# -- what is rejected ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -581,12 +581,12 @@ def test_light_that_cannot_be_is_refused_in_one_sentence(kind, changed, name):
         (
             "point_grid",
             {"spacing_mm": 0.55},
-            "'spacing_mm' must be a whole number of pixels of 0.1 mm, got 0.55 mm; the near",
+            "'spacing_mm' must be an integer of pixels of 0.1 mm, got 0.55 mm; the near",
         ),
         (
             "point_grid",
             {"spacing_mm": 0.01},
-            "'spacing_mm' must be a whole number of pixels of 0.1 mm, got 0.01 mm; the near",
+            "'spacing_mm' must be an integer of pixels of 0.1 mm, got 0.01 mm; the near",
         ),
         (
             "point_grid",
@@ -602,9 +602,9 @@ def test_light_that_cannot_be_is_refused_in_one_sentence(kind, changed, name):
             {"square_mm": 1.0, "n_squares": (7, 8)},
             "'n_squares' must leave the chart in the picture of 8 x 6",
         ),
-        ("checkerboard", {"n_squares": (7,)}, "'n_squares' must be two whole numbers"),
+        ("checkerboard", {"n_squares": (7,)}, "'n_squares' must be two integers"),
         ("siemens_star", {"n_spokes": 1}, "'n_spokes' must be >= 2, got 1"),
-        ("siemens_star", {"n_spokes": 2.5}, "'n_spokes' must be a whole number"),
+        ("siemens_star", {"n_spokes": 2.5}, "'n_spokes' must be an integer"),
         ("siemens_star", {"n_spokes": 5000}, "'n_spokes' must be <= 1000"),
         ("siemens_star", {"radius_mm": -1.0}, "'radius_mm' must be > 0"),
         (
@@ -617,10 +617,10 @@ def test_light_that_cannot_be_is_refused_in_one_sentence(kind, changed, name):
         ("slanted_edge", {"angle_deg": 181.0}, "'angle_deg' must be <= 180, got 181.0 degrees"),
         ("zone_plate", {"line_pairs_per_mm": 0.0}, "'line_pairs_per_mm' must be > 0, got 0.0 per mm"),
         ("zone_plate", {"radius_mm": 4.0}, "'radius_mm' must leave the chart"),
-        ("bars", {"groups": []}, "'groups' must be a list of whole numbers, got []"),
-        ("bars", {"groups": 3}, "'groups' must be a list of whole numbers, got 3"),
+        ("bars", {"groups": []}, "'groups' must be a list of integers, got []"),
+        ("bars", {"groups": 3}, "'groups' must be a list of integers, got 3"),
         ("bars", {"groups": "3"}, "'groups[0]' must be one number"),
-        ("bars", {"groups": [1.5]}, "'groups[0]' must be a whole number"),
+        ("bars", {"groups": [1.5]}, "'groups[0]' must be an integer"),
         ("bars", {"groups": [2, 2]}, "'groups' must be different from each other"),
         ("bars", {"groups": [-3]}, "'groups' must leave the chart in the picture of 8 x 9 mm"),
         ("bars", {"ink": "red"}, "'ink' must be one of 'dark', 'bright', got 'red'"),

@@ -119,7 +119,7 @@ def test_two_sites_exchange_by_edge_and_area():
 
 
 def blurred(offset, spread_um, pitch_um):
-    """Share of a cell's even charge that a Gaussian blur brings so many cells away, in a row of cells."""
+    """Fraction of a cell's even charge that a Gaussian blur brings so many cells away, in a row of cells."""
 
     def ramp_um(x_um):
         """Integral of the normal distribution function from minus infinity."""

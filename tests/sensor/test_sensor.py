@@ -374,7 +374,7 @@ def test_shot_noise_and_read_noise_are_independent(mean_e):
     assert abs(np.corrcoef(electrons, noise_e)[0, 1]) < SIGMAS / math.sqrt(N)
 
 
-# -- what is refused ------------------------------------------------------------------------------------------------
+# -- what is rejected ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -402,7 +402,7 @@ def test_shot_noise_and_read_noise_are_independent(mean_e):
         ("v_sat_v", math.inf, "must be finite"),
         ("bits", 0, "must be >= 1"),
         ("bits", 17, "must be <= 16"),
-        ("bits", 7.5, "must be a whole number"),
+        ("bits", 7.5, "must be an integer"),
         ("bits", "8", "must be one number"),
         ("shot_noise", "poisson", "must be one of 'auto', 'exact', 'off', got 'poisson'"),
         ("shot_noise", None, "must be one of 'auto', 'exact', 'off'"),
@@ -500,7 +500,7 @@ def test_arrays_given_per_site_are_kept_from_later_changes():
 @pytest.mark.parametrize("bits", [8, 10, 12, 16])
 @pytest.mark.parametrize("e_per_dn", [1, 2, 4])
 def test_a_charge_on_the_border_of_a_code_has_that_code(v_sat_v, bits, e_per_dn):
-    """With a whole number of electrons to a code every border is met."""
+    """With an integer of electrons to a code every border is met."""
     layout = fs.layout.grid(n_x=2**bits, n_y=1, pitch_um=1.0)
     capacitance_f = 1.602176634e-19 * e_per_dn * 2**bits / v_sat_v
     sensor = fs.Sensor(layout, capacitance_f=capacitance_f, v_sat_v=v_sat_v, bits=bits)

@@ -424,7 +424,7 @@ def test_differential_nonlinearity_is_one_number_a_line_and_code():
 
 
 def test_differential_nonlinearity_has_its_size_between_the_codes():
-    """Over a ramp within one code the share of the next code shows each line's number."""
+    """Over a ramp within one code the fraction of the next code shows each line's number."""
     steps = np.arange(N_Y) / N_Y
     charge = np.round(65_536 / 16 * (7.0 + steps)).astype(np.int64).repeat(N_X)
     picture = codes(charge, bits=4, dnl_dn=0.2).reshape(N_Y, N_X)
@@ -593,7 +593,7 @@ def test_half_the_sensitivity_is_half_the_light_and_all_of_the_dark_charge():
         ("log_strength", 0.0, "'log_strength' must be > 0"),
         ("dnl_dn", -1.0, "'dnl_dn' must be >= 0"),
         ("device_seed", -1, "'device_seed' must be >= 0"),
-        ("device_seed", 1.5, "'device_seed' must be a whole number"),
+        ("device_seed", 1.5, "'device_seed' must be an integer"),
         ("gaussian_above_e", 1e5, "'gaussian_above_e' must be <= 700"),
         ("read_noise_e", 1e300, r"'read_noise_e' must be <= 1e\+07, got 1e\+300 e-; charges are in electrons"),
         (

@@ -203,7 +203,7 @@ def test_a_polynomial_outside_its_table_is_refused_with_the_wavelength(outside_n
         ({"value": [0.1, math.inf, 0.3]}, "'value' must be finite everywhere"),
         ({"degree": 3}, "'degree' must be <= 2"),
         ({"degree": -1}, "'degree' must be >= 0"),
-        ({"degree": 1.5}, "'degree' must be a whole number"),
+        ({"degree": 1.5}, "'degree' must be an integer"),
     ],
 )
 def test_a_bad_table_is_refused_in_one_sentence(changed, sentence):

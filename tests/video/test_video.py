@@ -453,7 +453,7 @@ def test_gazes_that_cannot_be_are_told():
         ({"scene": None}, "'scene' must be of the class Scene"),
         ({"path": 3}, "'path' must be of the class GazePath"),
         ({"optics": None}, "'optics' must be of the class Optics"),
-        ({"shape": 5}, "'shape' must be two whole numbers"),
+        ({"shape": 5}, "'shape' must be two integers"),
         ({"shape": (121, 160)}, r"'shape' must be within the picture's \(120, 160\)"),
     ):
         with pytest.raises(ParameterError, match=told):
@@ -855,7 +855,7 @@ def rolling(n_before, n_frames=22, **sensor):
 
 
 def cut(captures, n):
-    """So many captures, and an error in the place of the next."""
+    """So many captures, and an error instead of the next."""
     yield from islice(captures, n)
     raise LightsOutError
 
@@ -1011,10 +1011,10 @@ def test_another_recording_is_not_gone_on_with(tmp_path):
         layout = sensor.pop("layout", rows_layout())
         footage = FrameSource(pictures(22), **(LIGHT | (light or {}))).from_frame(10)
         captures = camera_of(layout, **sensor).video(footage, **(ROLLING | {"first_frame": 5} | (how or {})))
-        with pytest.raises((FileError, ParameterError)) as refused:
+        with pytest.raises((FileError, ParameterError)) as rejected:
             write_video(captures, path, resume=True, plan={"gaze": {"seed": plan}})
         assert files_of(partial_path(path)) == before
-        return str(refused.value)
+        return str(rejected.value)
 
     columns = rows_layout().with_columns(zone=np.arange(120))
     moved = rows_layout().translate(0.1, 0.0)
@@ -1040,12 +1040,12 @@ def test_another_recording_is_not_gone_on_with(tmp_path):
 def test_a_recording_through_other_filters_is_another_one(tmp_path):
     layout = rows_layout()
     layout = layout.with_columns(channel=np.arange(layout.n_sites) % 3)
-    for filters, refusal in ((None, None), ("rgb", "'filters' differs")):
+    for filters, rejection in ((None, None), ("rgb", "'filters' differs")):
         n = count_recorded_frames(tmp_path / "v.zarr")
         captures = camera_of(layout, filters=filters).video(
             [scene_of(p) for p in pictures(3)[n:]], exposure_s=0.01, seed=5, first_frame=n
         )
-        with pytest.raises(LightsOutError if refusal is None else FileError, match=refusal):
+        with pytest.raises(LightsOutError if rejection is None else FileError, match=rejection):
             write_video(cut(captures, 2), tmp_path / "v.zarr", resume=True)
 
 
@@ -1298,7 +1298,7 @@ def test_the_command_does_a_finished_recording_not_again_and_another_one_not_ove
     assert command(*asked) == 2
     assert "is another recording: 'frames' differs" in capsys.readouterr().err
     assert files_of(folder / "v.zarr") == before
-    # Pictures to look at are made anew, as ever.
+    # Pictures to look at are made again, as ever.
     for k in ("2", "3"):
         assert command("shot.yaml", "--frames", "frames", "--out", "v.gif", "--stop", k) == 0
 

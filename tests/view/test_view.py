@@ -404,7 +404,7 @@ def test_a_drawing_of_too_many_sites_is_refused_and_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-# -- what is refused -----------------------------------------------------------------------------------------------
+# -- what is rejected -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

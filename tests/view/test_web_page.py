@@ -640,8 +640,8 @@ def test_names_in_a_strangers_file_stay_text(visit, tmp_path):
     ZOO.check(fs.DesignRules(min_size_um=2.5)).write(tmp_path / "report.lyrdb")
     told = (tmp_path / "report.lyrdb").read_text()
     told = told.replace("min_size_um", HOSTILE[1].replace("<", "&lt;")).replace("photosite", "place")
-    (tmp_path / "hostile.lyrdb").write_text(told)
-    report = read_lyrdb(tmp_path / "hostile.lyrdb", layout.n_sites)
+    (tmp_path / "malformed.lyrdb").write_text(told)
+    report = read_lyrdb(tmp_path / "malformed.lyrdb", layout.n_sites)
     for name in (HOSTILE[0], HOSTILE[3], HOSTILE[4]):
         page = visit(web_page(layout, report=report, name=name))
         hover(page, 1.0, 1.0)

@@ -71,7 +71,7 @@ class Dataset:
         A settings file, or settings as it has them, of a scene of the kind ``picture``, whose picture these take the place of.
     vary : mapping of str to distribution, optional
         By settings' paths, such as ``{"optics.f_number": {"log_uniform": [1.4, 8]}}``; see
-        :func:`foveasim.explore.parse_distribution`. Drawn anew for every camera.
+        :func:`foveasim.explore.parse_distribution`. Drawn again for every camera.
     cameras : int
         Cameras that each picture is taken with.
     draws : int
@@ -86,7 +86,7 @@ class Dataset:
         in their alphabetical order.
     boxes : sequence of (n_box, 4) or (n_box, 5), optional, pixels
         Of each picture: x0, y0, x1, y1 from its upper left corner, y down, and a class.
-    masks : sequence of (n_y, n_x) whole numbers, or of files, optional
+    masks : sequence of (n_y, n_x) integers, or of files, optional
         Classes of each picture's pixels.
     flows : sequence of (n_y, n_x, 2), or of ``.npy`` files, optional, pixels
         How far each pixel moves, x to the right and y down; NaN where that is not known.
@@ -559,7 +559,7 @@ def _numbered(labels: Any, n: int) -> tuple[list[int] | None, list[str] | None]:
         names = sorted(set(values))
         numbers = {name: k for k, name in enumerate(names)}
         return [numbers[value] for value in values], names
-    raise ParameterError("labels", "must all be whole numbers, or all be texts", values)
+    raise ParameterError("labels", "must all be integers, or all be texts", values)
 
 
 def _ends(numbers: range) -> list[int]:

@@ -28,7 +28,7 @@ FORMS = {
 }
 #: Standard deviation over the distance of the ends: beyond it rounding leaves few numbers between them.
 WIDEST = 1e6
-#: Whole numbers of choices: those of 64 bits, as arrays of samples hold them.
+#: Integers of choices: those of 64 bits, as arrays of samples hold them.
 LEAST, MOST = -(2**63), 2**63 - 1
 
 

@@ -37,14 +37,14 @@ def read_labels(path: Path, pictures: Sequence[str]) -> list[int] | list[str]:
     ----------
     path : Path
         ``.csv`` in UTF-8 with the columns ``picture`` and ``label`` in its first line, in any order of lines; others are not
-        looked at. ``.npy``: an array of whole numbers or texts, one for each picture in their order.
+        looked at. ``.npy``: an array of integers or texts, one for each picture in their order.
     pictures : sequence of str
         What the file calls them; it may name others too.
 
     Returns
     -------
     labels : list of int or of str
-        Whole numbers where all of the file's are.
+        Integers where all of the file's are.
 
     Raises
     ------
@@ -207,5 +207,5 @@ def _array(path: Path) -> NDArray[np.generic]:
     except (OSError, ValueError, EOFError) as error:
         raise FileError(path, f"is no array that can be read ({error})") from None
     if not isinstance(array, np.ndarray) or array.ndim != 1 or array.dtype.kind not in "iuU":
-        raise FileError(path, "must be an array of one dimension, of whole numbers or of texts")
+        raise FileError(path, "must be an array of one dimension, of integers or of texts")
     return array

@@ -32,11 +32,11 @@ __all__ = [
 
 #: Label of a site that sees mostly what lies off the picture, and of boxes that only fill up a sample.
 NOTHING = -1
-#: Largest class of a box: beyond it not every whole number is a float, as which boxes are given.
+#: Largest class of a box: beyond it not every integer is a float, as which boxes are given.
 MOST_CLASS = 2**53
 #: Points along each side of a box, whose image may be bent.
 POINTS_A_SIDE = 65
-#: Areas that differ by less than this share of a site are the same up to rounding: the lower class has it.
+#: Areas that differ by less than this fraction of a site are the same up to rounding: the lower class has it.
 TIE = 1e-9
 
 
@@ -88,7 +88,7 @@ def boxes_on_sites(boxes_px: Floats, integrator: Integrator, lens: Lens | None) 
 
     Notes
     -----
-    A box that cuts a pixel has its share of the pixel, spread evenly over it; boxes along pixels are exact.
+    A box that cuts a pixel has its fraction of the pixel, spread evenly over it; boxes along pixels are exact.
     """
     grid = integrator.grid
     n_y, n_x = grid.shape
@@ -213,7 +213,7 @@ def checked_boxes(name: str, boxes: Any) -> tuple[Floats, Ints]:
         raise ParameterError(name, "must have x0 < x1 and y0 < y1", numbers[is_flat][0, :4].tolist(), "pixels")
     classes = numbers[:, 4] if numbers.shape[1] == 5 else np.full(len(numbers), float(NOTHING))
     if (classes != np.rint(classes)).any() or (np.abs(classes) > MOST_CLASS).any():
-        raise ParameterError(name, f"must have whole numbers up to {MOST_CLASS} as classes", classes.tolist())
+        raise ParameterError(name, f"must have integers up to {MOST_CLASS} as classes", classes.tolist())
     return numbers[:, :4], classes.astype(np.int64)
 
 
@@ -223,7 +223,7 @@ def read_mask(mask: Any, name: str, shape: tuple[int, int]) -> Ints:
 
     Parameters
     ----------
-    mask : path or (n_y, n_x) array of whole numbers
+    mask : path or (n_y, n_x) array of integers
         Of a file with a palette, its entries' numbers.
     name : str
         For messages.
@@ -243,20 +243,20 @@ def read_mask(mask: Any, name: str, shape: tuple[int, int]) -> Ints:
         try:
             classes = np.asarray(mask)
         except ValueError:
-            raise ParameterError(name, "must be an array of whole numbers", mask) from None
+            raise ParameterError(name, "must be an array of integers", mask) from None
     if classes.dtype == np.bool_:
         classes = classes.astype(np.uint8)
     if classes.shape == shape and classes.dtype == np.uint64 and classes.max() > np.iinfo(np.int64).max:
-        raise ParameterError(name, "must be whole numbers of 64 bits with a sign", int(classes.max()))
+        raise ParameterError(name, "must be integers of 64 bits with a sign", int(classes.max()))
     if classes.shape != shape or classes.dtype.kind not in "iu":
         raise ParameterError(
-            name, f"must be whole numbers of the picture's shape {shape}, got {classes.dtype} of {classes.shape}"
+            name, f"must be integers of the picture's shape {shape}, got {classes.dtype} of {classes.shape}"
         )
     return classes
 
 
 def _palette_numbers(path: Path) -> NDArray[Any] | None:
-    """Numbers of a picture with a palette; None of any other, which the usual reader takes or refuses."""
+    """Numbers of a picture with a palette; None of any other, which the usual reader takes or rejects."""
     from PIL import Image
 
     try:

@@ -20,7 +20,7 @@ from foveasim.explore._files import digests
 
 __all__ = ["Source", "digest_of", "is_lazy", "source_of"]
 
-#: A packed picture that would unpack to more than this is refused.
+#: A packed picture that would unpack to more than this is rejected.
 MAX_UNPACKED_BYTES = 2**30
 
 
@@ -155,7 +155,7 @@ class _Zip:
             with zipfile.ZipFile(path) as archive:
                 names = [item.filename for item in archive.infolist() if not item.is_dir()]
         except (OSError, zipfile.BadZipFile) as error:
-            raise FileError(path, f"is broken ({error})") from None
+            raise FileError(path, f"is corrupt ({error})") from None
         self._names = picture_names(names)
         if not self._names:
             raise FileError(path, f"holds no pictures ({', '.join(PICTURE_ENDINGS)})")
@@ -180,7 +180,7 @@ class _Zip:
         try:
             content = archive.read(name)
         except Exception as error:  # noqa: BLE001 -- a broken member makes its reader trip over anything
-            raise FileError(self.name(k), f"is broken ({' '.join(str(error).split())})") from None
+            raise FileError(self.name(k), f"is corrupt ({' '.join(str(error).split())})") from None
         with tempfile.TemporaryDirectory(prefix="foveasim-") as folder:
             file = Path(folder) / f"picture{PurePosixPath(name).suffix}"
             file.write_bytes(content)

@@ -25,7 +25,7 @@ from foveasim.explore.sweeps.plan import telling
 
 __all__ = ["DatasetFile", "DatasetSection", "read_dataset"]
 
-#: What a file may say in the place of distributions of its own.
+#: What a file may say instead of distributions of its own.
 RECIPES: dict[str | None, Callable[..., Dataset]] = {
     None: Dataset,
     "classification": classification,

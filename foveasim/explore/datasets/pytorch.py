@@ -24,7 +24,7 @@ class Samples(Protocol):
 
 def torch_dataset(dataset: Samples, transform: Callable[[dict[str, Any]], Any] | None = None) -> Any:
     """
-    A map-style ``torch.utils.data.Dataset`` whose samples have tensors in the place of arrays.
+    A map-style ``torch.utils.data.Dataset`` whose samples have tensors instead of arrays.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def _kind() -> Any:
         return torch.from_numpy(value.astype(np.int32) if value.dtype == np.uint16 else value)
 
     class TorchDataSet(torch.utils.data.Dataset):  # type: ignore[misc,unused-ignore]
-        """Samples of another dataset with tensors in the place of arrays."""
+        """Samples of another dataset with tensors instead of arrays."""
 
         def __init__(self, dataset: Samples, transform: Callable[[dict[str, Any]], Any] | None) -> None:
             self.dataset, self.transform = dataset, transform

@@ -37,7 +37,7 @@ def classification(
     pictures, shot, cameras, seed
         As for :class:`Dataset`. Classes are the names of the folders that pictures are in, or ``labels``.
     vary : mapping of str to distribution, optional
-        In the place of these, or beside them: the f-number from 1/1.5 to 3 times the shot's, the exposure from 1/8 to 4 times,
+        Instead of these, or beside them: the f-number from 1/1.5 to 3 times the shot's, the exposure from 1/8 to 4 times,
         read noise from 0.5 to 20 e-, 0 to 2 % photo-response non-uniformity, 0 to 1 % offset patterns of pixels and of lines,
         and any device.
     **options
@@ -85,7 +85,7 @@ def denoising(
     pictures, shot, draws, seed
         As for :class:`Dataset`.
     vary : mapping of str to distribution, optional
-        In the place of these, or beside them: the exposure from 1/32 of the shot's up to it, and read noise from 0.5 to 20 e-.
+        Instead of these, or beside them: the exposure from 1/32 of the shot's up to it, and read noise from 0.5 to 20 e-.
     **options
         Of :class:`Dataset`.
 

@@ -294,7 +294,7 @@ def open_dataset(path: str | Path) -> StoredSamples:
     Raises
     ------
     FileError
-        When there is none, it is broken, or not all shards are done.
+        When there is none, it is corrupt, or not all shards are done.
     """
     source = Path(path).absolute()
     try:

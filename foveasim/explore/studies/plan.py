@@ -95,7 +95,7 @@ class StudyPlan:
 
 
 class _SearchRange(BaseModel):
-    """From a number to another: whole numbers where the setting takes no others."""
+    """From a number to another: integers where the setting takes no others."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     low: _Number = Field(alias="from")
@@ -131,14 +131,14 @@ def read_study(path: str | Path, *, metrics: Sequence[str] = (), n_trials: int |
     path : path
         With the keys ``shot`` (a file beside it, or the settings themselves), ``search`` (settings' paths to
         ``{from: 2, to: 16, step: 2}``, to ``{from: 0.5, to: 4, spacing: geometric}``, or to a list of choices; of settings that
-        are whole numbers only such are tried), ``objectives`` (results' names to ``maximize`` or
+        are integers only such are tried), ``objectives`` (results' names to ``maximize`` or
         ``minimize``), ``trials``, ``batch``, ``constraints`` (results' names to ``[low, high]``, either of them ``null``),
         ``seed``, ``metrics``, ``name``, and ``set`` (settings to be replaced in all trials). The file names metrics of
         :data:`METRICS` only: a file never makes the program import code.
     metrics : sequence of str
         More metrics: names, or ``module:function``, which is imported.
     n_trials : int, optional
-        In the place of the file's.
+        Instead of the file's.
 
     Raises
     ------
@@ -312,7 +312,7 @@ def _ends(path: str, where: Search) -> list[Any]:
 
 
 def _as_taken(plan: Plan, path: str, where: Search) -> Search:
-    """A range in whole numbers where the setting takes no others, and otherwise in any, however its ends are written."""
+    """A range in integers where the setting takes no others, and otherwise in any, however its ends are written."""
     low, *others = _ends(path, where)
     if isinstance(where, list) or not all(isinstance(end, int) for end in (low, *others)):
         return where

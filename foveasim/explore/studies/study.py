@@ -62,7 +62,7 @@ def study(
         As for :func:`plan_sweep`.
     search : mapping of str to range
         By the settings' paths: ``(low, high)``, ``{"from": 1, "to": 64, "spacing": "geometric"}`` or
-        ``{"from": 0, "to": 64, "step": 8}``, in whole numbers where the setting takes no others; or a list of choices.
+        ``{"from": 0, "to": 64, "step": 8}``, in integers where the setting takes no others; or a list of choices.
     objectives : mapping of str to {"maximize", "minimize"}
         By the names that results of metrics have, such as ``"snr_mean"``. Of several, the study finds the Pareto front.
     n_trials : int

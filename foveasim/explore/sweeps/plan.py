@@ -158,7 +158,7 @@ class Plan:
         return {name: identity_of(metric) for name, metric in self.metrics.items()}
 
     def _first_equal(self) -> Ints:
-        """As ``choices``, with the number of the first value that is equal in the place of every value's own."""
+        """As ``choices``, with the number of the first value that is equal instead of every value's own."""
         columns = []
         for values, chosen in zip(self.values.values(), self.choices.T, strict=True):
             first: dict[str, int] = {}
@@ -210,7 +210,7 @@ class SweepSection(BaseModel):
     shot: str | dict[str, Any] = Field(description="a file beside this one, or the settings themselves")
     set: dict[str, Any] = Field({}, description="settings to be replaced in all points, by their paths")
     vary: dict[str, list[Any] | _Range] | None = Field(None, description="values or ranges, by settings' paths")
-    points: list[dict[str, Any]] | None = Field(None, description="in the place of vary: settings of each point")
+    points: list[dict[str, Any]] | None = Field(None, description="instead of vary: settings of each point")
     mode: Literal["product", "zip"] = Field("product", description="every value with every other, or side by side")
     repeats: int = Field(1, description="captures of each point, which differ in their seeds")
     seed: int = 0
@@ -381,7 +381,7 @@ def telling(path: Path) -> Iterator[None]:
     Raises
     ------
     ConfigError
-        In the place of any :class:`ParameterError`, and of other files' errors.
+        Instead of any :class:`ParameterError`, and of other files' errors.
     """
     try:
         yield

@@ -230,7 +230,7 @@ def stored_plan(path: Path) -> dict[str, Any] | None:
     Raises
     ------
     FileError
-        When the store is broken, or no sweep's.
+        When the store is corrupt, or no sweep's.
     """
     if not path.exists():
         return None
@@ -261,12 +261,12 @@ def open_results(path: str | Path) -> xr.Dataset:
             loaded: xr.Dataset = dataset.load()
             return loaded
     except Exception as error:  # noqa: BLE001 -- a broken store makes its readers trip over anything
-        raise FileError(path, f"is broken ({' '.join(str(error).split()):.200})") from None
+        raise FileError(path, f"is corrupt ({' '.join(str(error).split()):.200})") from None
 
 
 def write_store(dataset: xr.Dataset, path: Path) -> None:
     """
-    Write a zarr folder, whole or not at all, in the place of one that was there.
+    Write a zarr folder, whole or not at all, instead of one that was there.
 
     Raises
     ------

@@ -101,7 +101,7 @@ def run_sweep(
         Address of a dask scheduler, such as ``"tcp://10.0.0.1:8786"``, whose workers have this package and see the files that
         the settings name under the same names. By default processes on this machine.
     workers : int, optional
-        Number of those processes; by default one a core.
+        Number of those processes; by default one per core.
     retry : bool
         Whether points that failed before are tried again; all of them, where there is a store without its journal.
     progress : callable, optional

@@ -28,7 +28,7 @@ __all__ = ["RULES", "Case", "Measured", "Rule", "is_below_size", "min_width_um"]
 
 #: Lengths are compared with this tolerance, a thousandth of the finest manufacturing grid (1 nm).
 LENGTH_ROUNDING_UM = 1e-6
-#: Overlaps and gaps below this share of a site's area are the rounding of its vertices.
+#: Overlaps and gaps below this fraction of a site's area are the rounding of its vertices.
 AREA_ROUNDING = 1e-9
 #: Sites that are fewer than one in so many are made into polygons by themselves, rather than all at once.
 FEW = 10
@@ -288,7 +288,7 @@ def _grid_deviations(case: Case) -> Measured:
 
 
 def _per_site(reduction: np.ufunc, per_vertex: Floats, layout: Layout) -> Floats:
-    """A value a site from one a vertex."""
+    """A value per site from one a vertex."""
     if layout.n_sites == 0:
         return np.zeros(0)
     return np.asarray(reduction.reduceat(per_vertex, layout.ring_offsets[layout.site_offsets[:-1]]))

@@ -21,7 +21,7 @@ __all__ = ["is_lyrdb", "read_lyrdb", "write_lyrdb"]
 
 #: Cell that the photosites of a chip file lie in.
 CELL_NAME = "SENSOR"
-#: Larger files are refused.
+#: Larger files are rejected.
 MAX_BYTES = 2**29
 #: How many bytes of a file's beginning tell what it is.
 HEAD_BYTES = 512
@@ -138,9 +138,9 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
     if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
         raise FileError(source, "declares entities, which a report has no use for")
     try:
-        root = ET.fromstring(content)  # noqa: S314 -- entities, which could grow without end, are refused above
+        root = ET.fromstring(content)  # noqa: S314 -- entities, which could grow without end, are rejected above
     except ET.ParseError as error:
-        raise FileError(source, f"is broken, or no report ({error})") from None
+        raise FileError(source, f"is corrupt, or no report ({error})") from None
     if root.tag != "report-database":
         raise FileError(source, "is no report database of KLayout")
     found: dict[str, list[_Found]] = {}

@@ -28,7 +28,7 @@ class Readout:
     bits : int
         Of a site's value.
     blanking : float
-        Time without data as a share of the time with data, such as 0.2.
+        Time without data as a fraction of the time with data, such as 0.2.
     n_lanes : int
         Outputs that share the data evenly.
 

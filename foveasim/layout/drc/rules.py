@@ -83,7 +83,7 @@ class DesignRules:
     max_sites : int, optional
         Largest number of sites.
     min_density, max_density : float, optional
-        Limits of the share of any window of ``density_window_um`` that sites fill. Windows move by half their side over the
+        Limits of the fraction of any window of ``density_window_um`` that sites fill. Windows move by half their side over the
         die, or the layout where none is given.
     density_window_um : float, optional, µm
         Side of that window.

@@ -13,7 +13,7 @@ ending         format              what a round trip keeps
 =============  ==================  =================================================================================
 
 What a file does not hold of a layout's columns is told when it is written: :attr:`WrittenLayout.dropped_columns`.
-Files are read by what they hold, whatever their ending; a file that is broken, cut short or hostile ends in one
+Files are read by what they hold, whatever their ending; a file that is corrupt, truncated or malformed ends in one
 :class:`~foveasim.errors.FileError`.
 """
 
@@ -71,7 +71,7 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
     Raises
     ------
     FileError
-        When the file is missing, broken, cut short, too large, or no layout.
+        When the file is missing, broken, truncated, too large, or no layout.
     ParameterError
         When an option does not belong to the file's format.
     """

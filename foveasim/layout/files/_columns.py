@@ -107,7 +107,7 @@ def _is_exact_in_oasis(numbers: NDArray[Any]) -> Bools:
     """
     Which numbers come back from OASIS as they were.
 
-    gdstk crashes on the smallest whole number, and writes as a reciprocal any number whose inverse rounds to a whole one.
+    gdstk crashes on the smallest integer, and writes as a reciprocal any number whose inverse rounds to a whole one.
     """
     if numbers.dtype.kind in "iu":
         return np.asarray(numbers != np.iinfo(np.int64).min)

@@ -43,7 +43,7 @@ MIN_TEXT_BYTES, TEXT_BYTES_PER_LETTER = 2**28, 64
 #: Rings and edges of a site are looked at in pairs where they may meet: pairs of either in all sites, and for each there is.
 MAX_RING_PAIRS, PAIRS_PER_RING = 2_000_000, 100
 MAX_VERTEX_PAIRS, PAIRS_PER_VERTEX = 1_000_000_000, 1000
-#: Kinds of numpy types that text formats keep: truth values, whole numbers, floating-point numbers, text.
+#: Kinds of numpy types that text formats keep: truth values, integers, floating-point numbers, text.
 PLAIN_KINDS = "biufU"
 
 
@@ -107,7 +107,7 @@ def max_unpacked(path: Path) -> int:
 
 def check_unpacked(path: Path, n_bytes: int) -> None:
     """
-    Refuse a file that would unpack to too much.
+    Reject a file that would unpack to too much.
 
     Raises
     ------
@@ -120,7 +120,7 @@ def check_unpacked(path: Path, n_bytes: int) -> None:
 
 def check_sites_of(path: Path, n_sites: int) -> None:
     """
-    Refuse a file with too many sites.
+    Reject a file with too many sites.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def check_sites_of(path: Path, n_sites: int) -> None:
 
 def check_sizes(n_rings: NDArray[Any], n_vertices: NDArray[Any]) -> None:
     """
-    Refuse sites of so many rings or vertices that it would take minutes to see whether any two of them meet.
+    Reject sites of so many rings or vertices that it would take minutes to see whether any two of them meet.
 
     Raises
     ------

@@ -36,7 +36,7 @@ MAX_CHARS = 1024
 
 
 class FormatError(Exception):
-    """The file is refused, in one sentence that follows its name."""
+    """The file is rejected, in one sentence that follows its name."""
 
 
 class Shapes:
@@ -117,7 +117,7 @@ def read(
         library = (gdstk.read_oas if is_oasis else gdstk.read_gds)(path)
     if is_oasis and caught:
         # Where it meets what it does not know, it leaves out what follows; GDSII tells how much to skip.
-        raise FormatError(f"is broken, or holds what gdstk does not read ({caught[0].message})")
+        raise FormatError(f"is corrupt, or holds what gdstk does not read ({caught[0].message})")
     dbu_um = library.precision * 1e6
     if not (math.isfinite(dbu_um) and 1e-9 <= dbu_um <= 1e3 and 1e-12 <= library.unit <= 1.0):
         raise FormatError(f"has the impossible database unit {dbu_um:g} µm")
@@ -189,7 +189,7 @@ def _held(cells: dict[str, Any], name: str) -> Iterator[str]:
 
 
 def _check_numbers(cells: dict[str, Any], order: list[str], max_sites: int, max_memory_bytes: int) -> None:
-    """Refuse what would flatten to more than any sensor has, or take too much memory or time, before it is done."""
+    """Reject what would flatten to more than any sensor has, or take too much memory or time, before it is done."""
     n_polygons: dict[str, int] = {}
     n_vertices: dict[str, int] = {}
     max_vertices = max_memory_bytes // VERTEX_BYTES

@@ -8,7 +8,7 @@ vertices, the closing one included: other sites are written as several polygons 
 share edges and add no vertex, and are put together again when read, exactly.
 
 The other columns are a second property: attribute 2 with the text ``ring=3 gain=0.25 is_dead=true name="a"`` in GDSII,
-the property ``columns`` with names and values in turn in OASIS. Whole numbers come back as int64 (uint64 where it takes
+the property ``columns`` with names and values in turn in OASIS. Integers come back as int64 (uint64 where it takes
 that), others as float64, to the last bit. A column whose values do not fit for some site is left out for all, and
 reported: the properties of a GDSII polygon hold 128 bytes together, and gdstk takes very long for very many different
 texts in OASIS. A column that not every photosite of a file tells is not read.
@@ -179,7 +179,7 @@ def _gdstk(path: Path) -> Any:
 
 
 def _in_um(xy_dbu: NDArray[Any], dbu_um: float) -> Floats:
-    """Coordinates in µm: the nearest number to the decimal, where a µm is a whole number of database units."""
+    """Coordinates in µm: the nearest number to the decimal, where a µm is an integer of database units."""
     per_um = round(1.0 / dbu_um)
     is_whole = per_um >= 1 and abs(per_um * dbu_um - 1.0) < 1e-12
     return np.asarray(xy_dbu / per_um if is_whole else xy_dbu * dbu_um, dtype=np.float64)
@@ -315,7 +315,7 @@ def read(path: Path, *, layer: int | None = None, cell: str | None = None) -> La
     Raises
     ------
     FileError
-        When gdstk is missing, or the file is broken, cut short, hostile, or holds no photosites.
+        When gdstk is missing, or the file is corrupt, truncated, malformed, or holds no photosites.
     """
     _gdstk(path)
     kind = "GDSII or OASIS"
@@ -357,26 +357,26 @@ def _check_records(path: Path, data: bytes) -> None:
         is_known[[record << 8 | kind for record in records]] = True
     at, record = _kernels.walk_records(np.frombuffer(data, np.uint8), is_known, END_OF_LIBRARY)
     if record == -1:
-        raise FileError(path, f"is broken: byte {at} begins no GDSII record")
+        raise FileError(path, f"is corrupt: byte {at} begins no GDSII record")
     if record != END_OF_LIBRARY or at > len(data):
-        raise FileError(path, "is cut short: its GDSII records do not reach the end of the library")
+        raise FileError(path, "is truncated: its GDSII records do not reach the end of the library")
     if data[at:].strip(b"\0"):
-        raise FileError(path, f"is broken: something follows the end of the GDSII library at byte {at}")
+        raise FileError(path, f"is corrupt: something follows the end of the GDSII library at byte {at}")
 
 
 def _check_oasis(path: Path, data: bytes) -> None:
     """The END record must be there, and its CRC-32, where it tells one, must be that of the file."""
     end = data[-OASIS_END_BYTES:]
     if len(data) < len(OASIS_MAGIC) + OASIS_END_BYTES or end[0] != OASIS_END:
-        raise FileError(path, "is cut short or broken: it does not end with the END record of OASIS")
+        raise FileError(path, "is truncated or corrupt: it does not end with the END record of OASIS")
     if end[-5] == CRC32_SCHEME and int.from_bytes(end[-4:], "little") != zlib.crc32(memoryview(data)[:-4]):
-        raise FileError(path, "is broken: its CRC-32 is not that of its content")
+        raise FileError(path, "is corrupt: its CRC-32 is not that of its content")
 
 
 def _isolated(
     path: Path, is_oasis: bool, layer: int | None, cell: str | None, n_bytes: int
 ) -> tuple[dict[str, Any], Floats, Ints, Ints, bytes]:
-    """What gdstk finds in the file, read by a program of its own, which a hostile file may crash."""
+    """What gdstk finds in the file, read by a program of its own, which a malformed file may crash."""
     from foveasim.layout.files import _gdstk
 
     max_cpu_s = MAX_CPU_S + n_bytes // BYTES_PER_S

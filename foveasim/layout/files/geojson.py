@@ -159,7 +159,7 @@ class _Document:
                 raise FileError(self.path, f"feature {i} has a ring of fewer than 4 positions")
             self._vertices_of_ring.append(len(ring))
             for position in ring:
-                # type() and not isinstance(): true and false are whole numbers to Python.
+                # type() and not isinstance(): true and false are integers to Python.
                 if type(position) is not list or not 2 <= len(position) <= 3 or not {*map(type, position)} <= NUMBERS:
                     raise FileError(self.path, f"feature {i} has a position that is not two numbers")
                 self._xy.append(position[0])

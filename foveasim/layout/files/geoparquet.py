@@ -59,7 +59,7 @@ HEADS = {
 
 def write(layout: Layout, path: Path) -> WrittenLayout:
     """
-    Write a table with one row a site.
+    Write a table with one row per site.
 
     Raises
     ------

@@ -57,7 +57,7 @@ def read(path: Path) -> Layout:
         provenance = check_header(path, about)
         unknown = [name for name in arrays if not is_of_layout(name)]
         if unknown:
-            raise FileError(path, f"is broken: {unknown[0]!r:.40} is no array of a layout")
+            raise FileError(path, f"is corrupt: {unknown[0]!r:.40} is no array of a layout")
         check_sites_of(path, arrays["site_offsets"].size - 1)
         layout = unpacked_layout(arrays, provenance)
         _check_winding(path, layout)

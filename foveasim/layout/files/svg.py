@@ -1,4 +1,4 @@
-"""Layouts as drawings: one filled path a site, holes by the even-odd rule, y up. Written only."""
+"""Layouts as drawings: one filled path per site, holes by the even-odd rule, y up. Written only."""
 
 from __future__ import annotations
 

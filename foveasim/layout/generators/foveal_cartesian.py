@@ -23,9 +23,9 @@ from foveasim.layout.model import Layout
 
 __all__ = ["foveal_cartesian"]
 
-#: Rings thinner than this share of their half side are rounding: corners of two rings must stay apart.
+#: Rings thinner than this fraction of their half side are rounding: corners of two rings must stay apart.
 RATIO_ROUNDING = 1e-9
-#: Corners of two rings that are nearer than this share of the half side are one corner.
+#: Corners of two rings that are nearer than this fraction of the half side are one corner.
 CORNER_ROUNDING = 1e-12
 
 
@@ -150,7 +150,7 @@ def _outlines(n_rings: int, ring_ratio: float, pitch_um: float, n_fovea: int) ->
 
 
 def _snapped(values_um: Floats, to_um: Floats) -> Floats:
-    """The values; a number of the other, sorted list in the place of each that differs from it by rounding only."""
+    """The values; a number of the other, sorted list instead of each that differs from it by rounding only."""
     after = np.clip(np.searchsorted(to_um, values_um), 1, to_um.size - 1)
     nearest_um = np.where(values_um - to_um[after - 1] < to_um[after] - values_um, to_um[after - 1], to_um[after])
     return np.where(np.abs(values_um - nearest_um) <= CORNER_ROUNDING * to_um[-1], nearest_um, values_um)

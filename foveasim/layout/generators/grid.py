@@ -49,9 +49,9 @@ def grid(
     width_um : float, optional, µm
         Side of the light-sensitive square; sites tile the plane by default. With two pitches use ``trench_um``.
     trench_um : float, optional, µm
-        In the place of the width: what is left open between two sites.
+        Instead of the width: what is left open between two sites.
     fill_factor : float, optional
-        In the place of the width: share of a cell that is sensitive to light, ``(1 - trench / pitch)²`` for squares; cells
+        Instead of the width: fraction of a cell that is sensitive to light, ``(1 - trench / pitch)²`` for squares; cells
         of two pitches keep their shape.
     stagger : bool
         Move every second row, from the second on, by half a pitch to the right.
@@ -90,7 +90,7 @@ def linear_fill_factor(
     pitch_um: float, width_um: float | None, trench_um: float | None, fill_factor: float | None
 ) -> float | None:
     """
-    Share of a cell's width that is sensitive to light, from the one way in which it is told; None where cells tile.
+    Fraction of a cell's width that is sensitive to light, from the one way in which it is told; None where cells tile.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def square_corners_um(
     shares: Sequence[float | None] = (None, None),
 ) -> Floats:
     """
-    Corners (n, 4, 2) µm of a grid's cells with their lower left corners at (x, y), in pitches, or of a share of each.
+    Corners (n, 4, 2) µm of a grid's cells with their lower left corners at (x, y), in pitches, or of a fraction of each.
 
     Neighbours' corners are the same numbers, bit for bit, when they tile.
     """

@@ -36,7 +36,7 @@ def hexagonal(
                   ╲╱╲╱╲╱╲╱╲
                    │  ││  │  ...    every second row is moved by half a pitch
 
-        flat: the same, turned by 90 degrees (columns in the place of rows)
+        flat: the same, turned by 90 degrees (columns instead of rows)
 
     Parameters
     ----------
@@ -47,9 +47,9 @@ def hexagonal(
     width_um : float, optional, µm
         Distance of two opposite flat sides of the light-sensitive hexagon; the pitch by default.
     trench_um : float, optional, µm
-        In the place of the width: what is left open between two sites.
+        Instead of the width: what is left open between two sites.
     fill_factor : float, optional
-        In the place of the width: share of a cell that is sensitive to light, ``(width / pitch)²``.
+        Instead of the width: fraction of a cell that is sensitive to light, ``(width / pitch)²``.
     orientation : {"pointy", "flat"}
         Whether a corner or a flat side is on top.
 

@@ -29,7 +29,7 @@ __all__ = ["log_polar", "square_ring_ratio"]
 
 #: Sites that each ring of the fovea has more than the one inside it: their arcs are π/3 times as wide as they are high.
 SITES_PER_RHO = 6
-#: Rings thinner than this share of their radius are rounding.
+#: Rings thinner than this fraction of their radius are rounding.
 RATIO_ROUNDING = 1e-12
 #: A coordinate at the radius r is rounded by up to this times r (angle, cosine and product), and a side by twice that.
 COORDINATE_ROUNDING = 4.0 * np.finfo(np.float64).eps
@@ -94,7 +94,7 @@ def log_polar(
     r_min_um : float, optional, µm
         Inner radius of the first ring; by default the smallest that ``min_size_um`` allows.
     n_rings : int, optional
-        Number of rings between ``r_min_um`` and ``r_max_um``, in the place of ``ring_ratio``.
+        Number of rings between ``r_min_um`` and ``r_max_um``, instead of ``ring_ratio``.
     ring_ratio : float, optional
         Outer to inner radius of a ring; :func:`square_ring_ratio` by default.
     fovea : {"none", "rings", "linear", "hexagons"}

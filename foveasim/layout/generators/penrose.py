@@ -67,7 +67,7 @@ def penrose(*, side_um: float, size_um: float, shape: Literal["disc", "square"] 
     Notes
     -----
     Ten golden triangles around the axis are cut into smaller ones (de Bruijn's and Robinson's deflation) until they are
-    small enough; mirrored pairs make a rhomb. Corners are kept as whole numbers in powers of a fifth of a turn until the
+    small enough; mirrored pairs make a rhomb. Corners are kept as integers in powers of a fifth of a turn until the
     end. A larger ``size_um`` only adds rhombs. In a corner of a square one may touch the others by a corner alone.
 
     Examples
@@ -119,7 +119,7 @@ def _rhombs(side_um: float, size_um: float, is_disc: bool) -> tuple[Floats, Bool
 
 
 def _points(whole: Ints) -> Floats:
-    """Corners (n, 2) in sides of their four whole numbers (n, 4), each by the same sum."""
+    """Corners (n, 2) in sides of their four integers (n, 4), each by the same sum."""
     x, y = (
         whole[:, 0] * turn[0] + whole[:, 1] * turn[1] + (whole[:, 2] * turn[2] + whole[:, 3] * turn[3])
         for turn in FIFTH_TURNS

@@ -25,7 +25,7 @@ MIN_CHORDS = 64
 @layout_family(example={"n_sites": 300, "spacing_um": 1.6})
 def sunflower(*, n_sites: int, spacing_um: float, n_chords: int | None = None) -> Layout:
     """
-    Sites on a golden spiral, each taking the same share of the disc, their outlines the Voronoi cells.
+    Sites on a golden spiral, each taking the same fraction of the disc, their outlines the Voronoi cells.
 
     ::
 

@@ -27,7 +27,7 @@ CORNERS = {
     "squares": np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]),
     "hexagons": np.array([(1, -1), (1, 1), (0, 2), (-1, 1), (-1, -1), (0, -2)]),
 }
-#: Pieces of less than this share of a cell are joined to a neighbour, unless the user says otherwise.
+#: Pieces of less than this fraction of a cell are joined to a neighbour, unless the user says otherwise.
 SMALL_SHARE = 0.5
 #: Open areas below this fraction of the region are rounding.
 AREA_ROUNDING = 1e-9

@@ -41,7 +41,7 @@ Density: TypeAlias = ArrayLike | Callable[[Any], ArrayLike]
 TABLE_CELLS = 1024
 #: The first centres are looked for among at most 2**10 times as many points, or 2**27 in all.
 TRIES_LOG2, MAX_TRIES_LOG2 = 10, 27
-#: Points of a triangle as shares of its second and third corner, their weights, and those of a coarser rule. The one of 3
+#: Points of a triangle as fractions of its second and third corner, their weights, and those of a coarser rule. The one of 3
 #: points is exact for squares of x and y, the one of 7 points for fifth powers and its coarser one for squares (Radon 1948).
 THREE_POINTS = ((1 / 6, 1 / 6, 1 / 3, 1 / 3), (4 / 6, 1 / 6, 1 / 3, 1 / 3), (1 / 6, 4 / 6, 1 / 3, 1 / 3))
 SEVEN_POINTS = (
@@ -53,15 +53,15 @@ SEVEN_POINTS = (
     (0.059715871789769820, 0.470142064105115090, 0.132394152788506181, 0.0),
     (0.470142064105115090, 0.059715871789769820, 0.132394152788506181, 0.0),
 )
-#: A function's integral over a triangle may be wrong by this share of the mean cell's: triangles are quartered for that.
+#: A function's integral over a triangle may be wrong by this fraction of the mean cell's: triangles are quartered for that.
 TRIANGLE_ERROR, MAX_QUARTERINGS = 1e-8, 9
-#: Points of a line as shares of its length, of equal weight: exact for cubics (Gauss).
+#: Points of a line as fractions of its length, of equal weight: exact for cubics (Gauss).
 LINE_POINTS = (0.211324865405187118, 0.788675134594812882)
 #: Few triangles and few lines are large ones, and are taken apart as far as it costs nothing.
 LEAST_TRIANGLES, LEAST_LINE_POINTS = 2048, 1024
-#: A cell with less than this share of the mean mass holds no more than rounding.
+#: A cell with less than this fraction of the mean mass holds no more than rounding.
 EMPTY_SHARE = 1e-9
-#: Equal capacities differ from their mean by this share of it at most; Newton's steps go on to a tenth of that.
+#: Equal capacities differ from their mean by this fraction of it at most; Newton's steps go on to a tenth of that.
 CAPACITY_ERROR = 1e-6
 #: So many of Lloyd's steps are those of cells of equal capacity; and so many more are made where there are none.
 EQUAL_STEPS, MORE_STEPS = 2, 20
@@ -637,7 +637,7 @@ def _area_um2(a_um: Floats, b_um: Floats) -> Any:
 
 
 def _cut(start: Any, stop: Any, axis: int) -> tuple[Ints, Any, Any]:
-    """Lines (n, 2) cut where a coordinate is a whole number: line, and ends of the pieces, in the lines' order."""
+    """Lines (n, 2) cut where a coordinate is an integer: line, and ends of the pieces, in the lines' order."""
     a, b = start[:, axis], stop[:, axis]
     first = np.floor(np.minimum(a, b)) + 1.0
     n_cuts = np.maximum(np.ceil(np.maximum(a, b)) - first, 0.0).astype(np.int64)

@@ -22,7 +22,7 @@ __all__ = ["zones"]
 
 #: Pixels along the side of a zone, at most.
 MAX_PIXELS = 2**14
-#: Ratios of lengths may be this far from whole numbers.
+#: Ratios of lengths may be this far from integers.
 WHOLE_NUMBER_ROUNDING = 1e-9
 
 
@@ -57,7 +57,7 @@ def zones(
         Sides of square zones around the optical axis, growing. In zones of squares, a zone's side and the side of the zone
         inside it must fit whole pixels.
     outlines_um : sequence of shapely Polygons or (n, 2) vertices, optional, µm
-        In the place of the sides, any outlines, each around the one before. Pieces of pixels at a border that are below half
+        Instead of the sides, any outlines, each around the one before. Pieces of pixels at a border that are below half
         a pixel's area belong to the pixel beside them.
     cells : {"squares", "hexagons"} or a sequence of them
         Shape of the pixels, in all zones or in each. Hexagons are cut at borders as under any outline.

@@ -130,7 +130,7 @@ class Canvas:
         yield from (slice(i, min(i + n_rows, self.shape[0])) for i in range(0, self.shape[0], n_rows))
 
     def filled(self, function: Callable[[slice], Floats]) -> Shares:
-        """Picture (n_y, n_x) float32 of a function that gives the shares of white in some rows."""
+        """Picture (n_y, n_x) float32 of a function that gives the fractions of white in some rows."""
         shares = np.empty(self.shape, np.float32)
         for rows in self.row_blocks():
             np.clip(function(rows), 0.0, 1.0, out=shares[rows], casting="same_kind")
@@ -138,7 +138,7 @@ class Canvas:
 
     def check_fits(self, name: str, width_mm: float, height_mm: float) -> None:
         """
-        Refuse a chart that is larger than the picture.
+        Reject a chart that is larger than the picture.
 
         Raises
         ------
@@ -187,7 +187,7 @@ class Canvas:
         Parameters
         ----------
         shares : (n_y, n_x) float32
-            Share of white in each pixel; it is written over.
+            Fraction of white in each pixel; it is written over.
         contrast : float
             Michelson's.
         source : str
@@ -224,7 +224,7 @@ def checked_contrast(contrast: float) -> float:
 
 def inked(shares: Shares, ink: str) -> Shares:
     """
-    Shares of white where these are the shares of ink, written over.
+    Fractions of white where these are the fractions of ink, written over.
 
     Raises
     ------
@@ -237,7 +237,7 @@ def inked(shares: Shares, ink: str) -> Shares:
 
 
 def interval(edges_mm: Floats, low_mm: float, high_mm: float) -> Floats:
-    """Share of each pixel (n,) of a row with these borders (n + 1,) that lies from one place to another: exact."""
+    """Fraction of each pixel (n,) of a row with these borders (n + 1,) that lies from one place to another: exact."""
     inside_mm = np.clip(edges_mm, low_mm, high_mm)
     return np.asarray(np.diff(inside_mm) / np.diff(edges_mm))
 
@@ -255,7 +255,7 @@ def add_rectangle(
 
 def half_plane(height: Floats, x: Floats | float, y: Floats | float) -> Floats:
     """
-    Share of a square pixel on the one side of a straight line: exact.
+    Fraction of a square pixel on the one side of a straight line: exact.
 
     Parameters
     ----------
@@ -296,7 +296,7 @@ def sampled(canvas: Canvas, chosen: Bools, rows: slice, function: Callable[[Floa
     rows : slice
         Those rows.
     function : callable
-        The chart's share of white at x and y (...), mm.
+        The chart's fraction of white at x and y (...), mm.
 
     Returns
     -------

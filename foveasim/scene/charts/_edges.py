@@ -258,7 +258,7 @@ def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
     Raises
     ------
     ParameterError
-        When the groups are no whole numbers, or one is given twice.
+        When the groups are no integers, or one is given twice.
 
     Examples
     --------
@@ -267,7 +267,7 @@ def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
     (1, 6, 'horizontal', 3.56)
     """
     if not isinstance(groups, Sequence | np.ndarray) or len(groups) == 0:
-        raise ParameterError("groups", "must be a list of whole numbers", groups)
+        raise ParameterError("groups", "must be a list of integers", groups)
     numbers = sorted(
         check_count(f"groups[{i}]", g, at_least=-MAX_GROUP, at_most=MAX_GROUP) for i, g in enumerate(groups)
     )

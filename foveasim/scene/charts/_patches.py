@@ -121,7 +121,7 @@ def colour_chart(
     wavelength_nm : sequence, nm
         From 380 to 780; 400 to 700 in steps of 10 by default.
     band_width_nm : number or sequence, optional, nm
-        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+        Widths of the wavelengths' bands; by default they reach halfway to the neighbours. Needed for one wavelength.
 
     Returns
     -------

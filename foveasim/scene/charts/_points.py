@@ -14,7 +14,7 @@ from foveasim.scene.registry import SCENES
 
 __all__ = ["point_grid"]
 
-#: A spacing is a whole number of pixels when it is one but for this share of a pixel.
+#: A spacing is an integer of pixels when it is one but for this fraction of a pixel.
 ROUNDING_PIXELS = 1e-6
 
 
@@ -36,7 +36,7 @@ def point_grid(
     Parameters
     ----------
     spacing_mm : float, mm
-        Distance of two points: a whole number of pixels.
+        Distance of two points: an integer of pixels.
     n_points : (n_y, n_x), optional
         Numbers of points up and across; by default an odd number that fills the picture.
     intensity_w_sr_nm : float, W/(sr nm)
@@ -50,7 +50,7 @@ def point_grid(
     wavelength_nm : sequence, nm
         Wavelengths; the points shine alike at all of them.
     band_width_nm : number or sequence, optional, nm
-        Widths of the wavelengths' bands; by default they reach half-way to the neighbours. Needed for one wavelength.
+        Widths of the wavelengths' bands; by default they reach halfway to the neighbours. Needed for one wavelength.
 
     Returns
     -------
@@ -60,7 +60,7 @@ def point_grid(
     Raises
     ------
     ParameterError
-        When the spacing is no whole number of pixels, the points do not fit, or a value is out of range.
+        When the spacing is not an integer of pixels, the points do not fit, or a value is out of range.
 
     Warns
     -----
@@ -78,7 +78,7 @@ def point_grid(
     if step < 1 or abs(spacing_mm / canvas.pitch_mm - step) > ROUNDING_PIXELS:
         raise ParameterError(
             "spacing_mm",
-            f"must be a whole number of pixels of {canvas.pitch_mm:g} mm",
+            f"must be an integer of pixels of {canvas.pitch_mm:g} mm",
             spacing_mm,
             "mm",
             f"the nearest is {max(step, 1) * canvas.pitch_mm:.6g} mm",

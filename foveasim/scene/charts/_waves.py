@@ -130,7 +130,7 @@ def zone_plate(
 
     Notes
     -----
-    The share of white is ``(1 + cos(π f r² / R)) / 2`` with the frequency f at the rim R, so that the frequency at r is
+    The fraction of white is ``(1 + cos(π f r² / R)) / 2`` with the frequency f at the rim R, so that the frequency at r is
     ``f r / R``; outside there is the mean of black and white. The means are exact (Fresnel's integrals), except in the
     pixels that the rim cuts, which are sampled at 32 x 32 points.
     """
@@ -235,7 +235,7 @@ def siemens_star(
 
 
 def _mean_of_edges(x: Floats, y: Floats, n_spokes: int) -> Floats:
-    """Share of white spokes in pixels at x (n_x,) and y (n_row, 1), in pixels, where one edge at most cuts them."""
+    """Fraction of white spokes in pixels at x (n_x,) and y (n_row, 1), in pixels, where one edge at most cuts them."""
     angle = np.arctan2(y, x)
     number = np.rint(angle * n_spokes / np.pi - 0.5)
     edge = (number + 0.5) * np.pi / n_spokes

@@ -40,7 +40,7 @@ __all__ = ["CrosstalkOperator", "Diffusion", "InterPixelCapacitance", "KernelCro
 LARGEST_SHARE = 0.5
 #: Exchanges beyond this take seconds a frame for a million sites.
 MAX_EXCHANGES = 1000
-#: Spreads of up to this share of a step cross one border at most, to float64; for longer ones a Fourier series is short.
+#: Spreads of up to this fraction of a step cross one border at most, to float64; for longer ones a Fourier series is short.
 SHORT_SPREAD = 0.125
 #: Terms of that series: the next one is below 1e-16.
 N_TERMS = 10
@@ -50,9 +50,9 @@ LARGEST_SPREAD_UM = 1e4
 KERNEL_ROUNDING = 1e-9
 #: Sites of a grid differ by at most this share in area: rounding to a manufacturing grid.
 AREA_ROUNDING = 0.02
-#: Steps and places of a grid are off by at most this share of the pitch.
+#: Steps and places of a grid are off by at most this fraction of the pitch.
 PLACE_ROUNDING = 0.05
-#: Coordinates nearer than this share of a site's side are one row or column.
+#: Coordinates nearer than this fraction of a site's side are one row or column.
 SAME_LINE = 0.02
 
 
@@ -118,9 +118,9 @@ class CrosstalkOperator:
 
         Notes
         -----
-        Cost: one sparse product an exchange, 5 ns a site for hexagons.
+        Cost: one sparse product an exchange, 5 ns per site for hexagons.
         """
-        # A row a site: sparse matrices multiply columns.
+        # A row per site: sparse matrices multiply columns.
         columns = np.moveaxis(self._per_site("charge_e", charge_e), -1, 0)
         mixed = columns.reshape(columns.shape[0], -1) if columns.ndim > 1 else columns
         for _ in range(self.n_steps):
@@ -245,7 +245,7 @@ class Diffusion(_Crosstalk):
                             w = spread² / (2 d) + d / 12     spread above d/2: Fick's law, flow down the gradient
 
     and in general ``w = (d / 2) E[g(spread Z / d)]``, where Z is a standard normal number and g joins the squares of the
-    whole numbers by straight lines: the flow for which an evenly lit site in a square grid spreads to the variance along an
+    integers by straight lines: the flow for which an evenly lit site in a square grid spreads to the variance along an
     axis that it has in truth, ``d² E[g] = spread² + d²/6`` for spreads above d/2 and ``0.798 spread d`` for small ones.
 
     Charge is conserved: what has no neighbour to go to stays. An even light stays even on any tiling, whatever the sizes of
@@ -288,7 +288,7 @@ class Diffusion(_Crosstalk):
         Parameters
         ----------
         neighbour_fraction : float
-            Share of its charge that one of these pixels loses to its four neighbours together, at most one half.
+            Fraction of its charge that one of these pixels loses to its four neighbours together, at most one half.
         pitch_um : float, µm
             Of these pixels.
         max_gap_um : float, optional, µm
@@ -351,7 +351,7 @@ class Diffusion(_Crosstalk):
                 "µm",
                 f"beyond {MAX_EXCHANGES} exchanges a site keeps nothing of its own",
             )
-        # Shares of exactly one half, computed, are that.
+        # Fractions of exactly one half, computed, are that.
         n_steps = max(1, math.ceil(largest / LARGEST_SHARE - 1e-9))
         return CrosstalkOperator(_with_rest(matrix, loss, n_steps), n_steps)
 
@@ -365,7 +365,7 @@ class KernelCrosstalk(_Crosstalk):
     ----------
     kernel : (n_row, n_column), odd numbers
         What becomes of a charge of 1 in its middle: ``kernel[j, i]`` goes ``i - n_column // 2`` columns to the right and
-        ``j - n_row // 2`` rows **up**; row 0 is the lowest, as in every array here. Shares of at least 0 that sum to at most
+        ``j - n_row // 2`` rows **up**; row 0 is the lowest, as in every array here. Fractions of at least 0 that sum to at most
         1; what is missing to 1 is lost in the silicon.
     border : {"kept", "lost"}
         What becomes of charge that would go where there is no site: it stays where it is, or is lost.
@@ -449,7 +449,7 @@ class KernelCrosstalk(_Crosstalk):
         ordered = place[order]
         if n_sites and (ordered[1:] == ordered[:-1]).any():
             twin = order[int(np.flatnonzero(ordered[1:] == ordered[:-1])[0]) + 1]
-            raise SimulationError(f"site {twin} lies in the place of another, so the layout is no grid; {_OTHER_WAY}")
+            raise SimulationError(f"site {twin} lies instead of another, so the layout is no grid; {_OTHER_WAY}")
         source, target, share = [], [], []
         kept = np.zeros(n_sites)
         for j, i in np.argwhere(kernel > 0.0):
@@ -480,8 +480,8 @@ class InterPixelCapacitance(_Crosstalk):
     Parameters
     ----------
     neighbour_fraction : float
-        Share of its charge that a site shows at a neighbour with which it shares an edge of the length ``edge_um``; others in
-        proportion to their edges. Hybrid near-infrared arrays (H2RG) have from 0.007 to 0.015 (Donlon, Ninkov and Baum
+        Fraction of a site's charge that appears at a neighbour with a shared edge of length ``edge_um``; at others in
+        proportion to their shared edges. Hybrid near-infrared arrays (H2RG) have from 0.007 to 0.015 (Donlon, Ninkov and Baum
         2018, arXiv:1805.09413).
     edge_um : float, optional, µm
         The length of that edge; by default the median of the layout's, so that it is any edge of a regular tiling.
@@ -634,7 +634,7 @@ def _squared_steps(spread: Floats) -> Floats:
     Mean square of the steps from a cell to that where its charge ends, in a row of cells; the spread in cells.
 
     Charge starts anywhere in a cell: on a way z it makes whole steps whose mean square is g(z), the straight lines through
-    the squares of the whole numbers. ``g(z) = |z|`` up to 1, and ``z² + f (1 - f)`` with the fraction f of z everywhere, whose
+    the squares of the integers. ``g(z) = |z|`` up to 1, and ``z² + f (1 - f)`` with the fraction f of z everywhere, whose
     Fourier series has the terms ``-cos(2 pi n z) / (pi n)²``.
     """
     n = np.arange(1, N_TERMS + 1) * math.pi
@@ -663,7 +663,7 @@ def _column_sums(matrix: csr_array[Any]) -> Floats:
 
 
 def _with_rest(matrix: csr_array[Any], share: Floats, n_steps: int) -> csr_array[Any]:
-    """One of several equal exchanges; what stays, after the share of a site that goes, is on the diagonal."""
+    """One of several equal exchanges; what stays, after the fraction of a site that goes, is on the diagonal."""
     from scipy.sparse import csr_array, diags_array
 
     return csr_array(matrix / n_steps + diags_array(1.0 - share / n_steps))

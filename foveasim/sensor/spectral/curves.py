@@ -210,14 +210,14 @@ SILICON_ABSORPTION_UM = (
 @dataclass(frozen=True, kw_only=True)
 class SiliconQE(Multiplied):
     """
-    Quantum efficiency of a silicon layer: the share of the light that it absorbs.
+    Quantum efficiency of a silicon layer: the fraction of the light that it absorbs.
 
     Parameters
     ----------
     depth_um : float, µm
         Thickness from which all charge is collected.
     transmission : float
-        Share of the light that enters the silicon.
+        Fraction of the light that enters the silicon.
 
     Raises
     ------
@@ -260,7 +260,7 @@ class ProductCurve(Multiplied):
     Raises
     ------
     ParameterError
-        When there is no curve, or a number is out of range; on a call, for a wavelength that one of the curves refuses.
+        When there is no curve, or a number is out of range; on a call, for a wavelength that one of the curves rejects.
     """
 
     curves: Sequence[Factor]
@@ -384,7 +384,7 @@ def curve_values(curve: Curve, wavelength_nm: ArrayLike) -> Floats:
 
 def check_within(wavelength_nm: ArrayLike, low_nm: float, high_nm: float, what: str, cure: str = "") -> None:
     """
-    Refuse wavelengths outside a range, and those that are no numbers.
+    Reject wavelengths outside a range, and those that are no numbers.
 
     Raises
     ------

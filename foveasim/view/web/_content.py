@@ -33,7 +33,7 @@ __all__ = ["Content", "content_of", "described_sites"]
 PICTURE_PIXELS = 800
 #: Violations of a rule that a page lists, the worst first.
 MAX_LISTED = 2000
-#: Whole numbers above this are told as text: a page's numbers are float64.
+#: Integers above this are told as text: a page's numbers are float64.
 MAX_EXACT = 2**53
 #: Colours of channels that no sensor has given filters yet.
 CHANNEL_NAMES = "RGBW"
@@ -221,7 +221,7 @@ def _is_index(values: NDArray[Any]) -> bool:
 
 
 def _are_few(values: NDArray[Any]) -> bool:
-    """Whether whole numbers are so few that they name kinds, such as zones."""
+    """Whether integers are so few that they name kinds, such as zones."""
     if values.dtype.kind not in "iu":
         return False
     # A span first: finding the kinds of a million different numbers takes long.

@@ -15,7 +15,7 @@ from foveasim.layout import Layout
 
 __all__ = ["Shapes", "shapes_of"]
 
-#: A triangle of a fan may be turned over by this share of its site's area: rounding.
+#: A triangle of a fan may be turned over by this fraction of its site's area: rounding.
 ROUNDING = 1e-12
 
 

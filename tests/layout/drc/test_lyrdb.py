@@ -99,10 +99,10 @@ def test_findings_of_another_program_are_read_as_places(tmp_path):
     ("content", "n_sites", "message"),
     [
         (None, 3, "no such file"),
-        ("not xml", 3, "is broken, or no report"),
+        ("not xml", 3, "is corrupt, or no report"),
         ("<html/>", 3, "is no report database"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><report-database>&b;</report-database>', 3, "declares entities"),
-        ("cut", 3, "is broken, or no report"),
+        ("cut", 3, "is corrupt, or no report"),
         ("whole", 1, "names site 2, and the layout has 1"),
         ("marker", 3, "has a marker that is none"),
     ],

@@ -71,7 +71,7 @@ def same_bits(a, b):
 
 
 def lattice(layout):
-    """Vertices as whole numbers of database units, by decimal rounding."""
+    """Vertices as integers of database units, by decimal rounding."""
     return np.round(layout.xy_um, 4) * 10**4
 
 
@@ -804,9 +804,9 @@ def test_an_oasis_file_with_a_right_checksum_over_broken_content_cannot_harm(sma
         (b'{"type": "FeatureCollection", "features": [' + b"[" * 200_000, "GeoJSON"),
         (b"PK\x03\x04", "npz"),
         (b"PAR1" + bytes(50) + b"PAR1", "GeoParquet"),
-        (b"%SEMI-OASIS\r\n", "cut short"),
+        (b"%SEMI-OASIS\r\n", "truncated"),
         (b"%SEMI-OASIS\r\n" + bytes(300), "does not end with the END record"),
-        (b"\x00\x06\x00\x02\x00\x05", "cut short"),
+        (b"\x00\x06\x00\x02\x00\x05", "truncated"),
         (b"\x00\x06\x00\x02\x00\x05\x00\x00\x00\x00", "byte 6 begins no GDSII record"),
         (b"\x00\x06\x00\x02\x00\x05\x00\x04\x04\x00junk", "something follows the end"),
     ],

@@ -259,7 +259,7 @@ GDS_BOMBS = {
 
 
 def number(value):
-    """An unsigned whole number of OASIS: 7 bits a byte, the lowest first."""
+    """An unsigned integer of OASIS: 7 bits a byte, the lowest first."""
     data = bytearray()
     while value >= 128:
         data.append(value & 127 | 128)
@@ -537,7 +537,7 @@ def same(value, n_rows):
 
 
 def varint(value):
-    """A whole number of Thrift, by twice itself; minus one half is said as minus one is."""
+    """An integer of Thrift, by twice itself; minus one half is said as minus one is."""
     return number(int(abs(2 * value)))
 
 
@@ -742,7 +742,7 @@ HEADS = {
 
 
 def truncated(data, n):
-    """A file cut short at places all over it, and just before its end."""
+    """A file truncated at places all over it, and just before its end."""
     return [data[: len(data) * i // n] for i in range(n)] + [data[:-i] for i in (1, 2, 3, 4, 8, 16)]
 
 

@@ -280,7 +280,7 @@ def test_a_giotto_layout_scales_with_its_unit():
         ({"n_fovea": 0}, "'n_fovea' must be >= 1, got 0"),
         ({"n_fovea": 76}, "'n_fovea' must be <= 75, got 76; 'n_rho' counts the fovea's rings and at least one"),
         ({"n_across": 151}, "'n_across' must be > 151, the diameter of 76 rings that do not grow, got 151; take more"),
-        ({"n_across": 600.5}, "'n_across' must be a whole number, got 600.5"),
+        ({"n_across": 600.5}, "'n_across' must be an integer, got 600.5"),
         ({"n_across": "600"}, "'n_across' must be one number, got '600'"),
         ({"n_theta": 2, "fovea": "none"}, "'n_theta' must be >= 3, got 2"),
         ({"n_theta": 59}, "'n_theta' must be >= 60, three times 'n_fovea', got 59; or take fovea='none'"),
@@ -317,7 +317,7 @@ def foveal_parameters(draw):
     n_rings = draw(st.integers(1, 9))
     return {
         "n_rings": n_rings,
-        # Ratios of small whole numbers let corners of two rings meet, but for rounding.
+        # Ratios of small integers let corners of two rings meet, but for rounding.
         "ring_ratio": draw(st.floats(1.01, 4.0) | st.fractions(1, 5, max_denominator=9).filter(lambda q: q > 1)),
         "pitch_um": draw(units_um),
         "n_fovea": draw(st.integers(1, n_rings)),
@@ -557,7 +557,7 @@ def test_octagons_are_numbered_row_by_row_and_diamonds_after_them():
     ("changed", "message"),
     [
         ({"n_x": 0}, "'n_x' must be >= 1, got 0"),
-        ({"n_y": 1.5}, "'n_y' must be a whole number, got 1.5"),
+        ({"n_y": 1.5}, "'n_y' must be an integer, got 1.5"),
         ({"n_x": 10_000, "n_y": 10_000}, "'n_sites' must be <= 50000000"),
         ({"pitch_um": math.nan}, "'pitch_um' must be finite, got nan µm"),
         ({"diamond_um": 0.0}, "'diamond_um' must be > 0, got 0.0 µm"),

@@ -435,7 +435,7 @@ LOG_POLAR = {"n_sectors": 64, "r_max_um": 412.0, "r_min_um": 30.0}
     ("changes", "message"),
     [
         ({"n_sectors": 2}, "'n_sectors' must be >= 3, got 2"),
-        ({"n_sectors": 6.5}, "'n_sectors' must be a whole number, got 6.5"),
+        ({"n_sectors": 6.5}, "'n_sectors' must be an integer, got 6.5"),
         ({"n_sectors": True}, "'n_sectors' must be one number, got True"),
         ({"r_max_um": 0.0}, "'r_max_um' must be > 0, got 0.0 µm"),
         ({"r_max_um": np.inf}, "'r_max_um' must be finite, got inf µm"),
@@ -469,7 +469,7 @@ def test_log_polar_refuses_what_cannot_be(changes, message):
 
 @st.composite
 def zone_parameters(draw):
-    """Zones whose borders are whole numbers of their pixels wide."""
+    """Zones whose borders are integers of their pixels wide."""
     pitch_um = draw(st.sampled_from([0.1, 0.5, 0.7, 1.0, 2.2, 3.3]))
     n = draw(st.integers(1, 8))
     sides, pitches = [n * pitch_um], [pitch_um]
@@ -553,14 +553,14 @@ def test_zones_refuse_what_does_not_fit(side_um, pitch_um, message):
         zones(side_um=side_um, pitch_um=pitch_um)
 
 
-# -- what all generators refuse and record ----------------------------------------------------------------------------
+# -- what all generators reject and record ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("make", "parameters", "message"),
     [
         (grid, {"n_x": 0, "n_y": 1, "pitch_um": 1.0}, "'n_x' must be >= 1, got 0"),
-        (grid, {"n_x": 1, "n_y": 2.5, "pitch_um": 1.0}, "'n_y' must be a whole number, got 2.5"),
+        (grid, {"n_x": 1, "n_y": 2.5, "pitch_um": 1.0}, "'n_y' must be an integer, got 2.5"),
         (grid, {"n_x": "3", "n_y": 1, "pitch_um": 1.0}, "'n_x' must be one number, got '3'"),
         (grid, {"n_x": 1, "n_y": 1, "pitch_um": 0.0}, "'pitch_um' must be > 0, got 0.0 µm"),
         (grid, {"n_x": 1, "n_y": 1, "pitch_um": np.nan}, "'pitch_um' must be finite, got nan µm"),

@@ -343,7 +343,7 @@ def test_foveal_sites_are_numbered_ring_by_ring_from_the_axis_to_the_right():
         ({"a_um": 0.0}, ParameterError, "'a_um' must be > 0"),
         ({"a_um": -1.0}, ParameterError, "'a_um' must be > 0"),
         ({"n_rings": 0}, ParameterError, "'n_rings' must be >= 1"),
-        ({"n_rings": 2.5}, ParameterError, "'n_rings' must be a whole number"),
+        ({"n_rings": 2.5}, ParameterError, "'n_rings' must be an integer"),
         ({"n_rings": 20, "n_chords": 4}, ParameterError, "'n_chords' must be >= "),
         ({"fov_um": 1e4, "a_um": 1e7, "n_rings": 9000}, ParameterError, "'n_sites' must be <= "),
         ({"fov_um": 1e4, "a_um": 1e-4, "n_rings": 100}, GeometryError, "too close"),
