@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 OUT ?= out
 # Arguments of pytest in all test targets: make test PYTEST_ARGS="tests/cli"
 PYTEST_ARGS ?=
-PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
+PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadgroup
 
 # The oldest versions that pyproject.toml admits, on the oldest Python: .venv-lowest/uv chooses them, .venv-lowest/env has them.
 LOWEST := .venv-lowest

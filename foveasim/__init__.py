@@ -1,8 +1,8 @@
 """
-foveasim: what an image sensor of polygon photosites would see.
+foveasim: simulator of image sensors with polygonal photosites.
 
-A scene goes through a lens to a power map; the map is integrated exactly over every photosite; photons become
-electrons, electrons get noise, volts become codes::
+Optics form the power map of a scene; the map is integrated exactly over every photosite; photoelectrons, noise, voltages
+and codes follow::
 
     import foveasim as fs
 

@@ -1,7 +1,7 @@
 """
-The camera: a lens and a sensor, joined.
+The camera: optics, distortion and a sensor.
 
-The only place that knows the order of the stages, and that makes random streams.
+The only module that knows the order of the stages and creates random streams.
 """
 
 from __future__ import annotations
@@ -39,56 +39,56 @@ from foveasim.units import um_from_nm, w_from_w_m2_um2
 
 __all__ = ["Camera", "Light"]
 
-#: A place in the image, (x, y) in µm.
+#: A position in the image plane, (x, y) in µm.
 Place = tuple[float, float]
-#: A frame of light: a scene or a map, or one with the place in its image where the sensor's middle is put.
+#: One frame: a scene or a power map, or either with the position of the sensor's centre in its image.
 Light = Scene | PowerMap | tuple[Scene | PowerMap, Sequence[float]]
-#: Maps of light behind each colour filter, on each grid.
+#: Power maps behind each colour filter, on each grid.
 KeptImages = dict[tuple[Grid, int], NDArray[Any]]
 
-#: A map made by Fourier transforms may fall below darkness by this fraction of the brightest site: rounding of float32.
+#: Fourier transforms in float32 leave negative rates of up to this fraction of the largest one.
 NEGATIVE_ROUNDING = 1e-4
-#: A filter that passes less than this fraction of the strongest one's light cannot be balanced against it.
+#: Lower limit of a filter's response, relative to the strongest filter, for white balance.
 DIMMEST_WHITE = 0.01
-#: Exposures that outlast the time between them by this share do so by rounding.
+#: Exposures that exceed the time between them by this fraction do so by rounding.
 TIME_ROUNDING = 1e-9
-#: Compiled layouts that a camera keeps, one for each grid it met: those of this many kinds of light.
+#: Number of compiled layouts in the cache, per grid of one image.
 KEPT_INTEGRATORS = 4
-#: Where cells are at most this many λN wide the light is smooth over them, and integration of second order is up to 70 times
-#: nearer to the truth; where they are wider than 0.8 it can be further off.
+#: In cells of at most this width, in units of λN, irradiance is smooth: second-order integration is up to 70 times more
+#: accurate. In cells wider than 0.8 λN it can be less accurate than first order.
 SMOOTH_LAMBDA_N = 0.5
 
 
 class Camera:
     """
-    A lens in front of a sensor.
+    Optics in front of a sensor.
 
     Parameters
     ----------
     optics : Optics
     sensor : Sensor
     distortion : lens model of foveasim.distortion, optional
-        Displaces the image points of the ideal lens. The outlines of the photosites are undistorted once, and no picture is
+        Displaces the image points of the ideal lens. The outlines of the photosites are undistorted once; no image is
         resampled. The optical axis meets the sensor at its ``centre_um``: the ideal image, relative illumination and field
-        positions of a scene are all centred there, as in OpenCV's ``projectPoints``. Where its ``focal_um`` differs between x
-        and y, the ideal image is scaled alike, keeping its area.
+        positions of a scene are centred there, as in OpenCV's ``projectPoints``. Where its ``focal_um`` differs between x
+        and y, the ideal image is scaled accordingly, with unchanged area.
     order : {1, 2}, optional
-        Whether a map's cells are taken as even, or as means with a gradient (see :class:`foveasim.Integrator`). By default 2
-        for scenes whose image has cells of at most λN/2 at all wavelengths, and 1 for coarser ones and for power maps.
+        Order of integration: cells of constant irradiance, or with a gradient (see :class:`foveasim.Integrator`). By default
+        2 for scenes whose image has cells of at most λN/2 at all wavelengths, else 1; always 1 for power maps.
     n_threads : int, optional
-        All cores of the process by default. Results do not depend on it, bit for bit.
+        Number of threads, by default one per core. Results are bit-identical for any number.
 
     Raises
     ------
     ParameterError
-        When an argument is none of the above.
+        When an argument has another type.
 
     Warns
     -----
     CoverageWarning
-        On a capture, when photosites lie off the image, or where the lens sends no light.
+        On a capture, when photosites extend beyond the image or the image circle.
     SamplingWarning
-        On a capture, when second-order integration of a sharp image on coarse cells makes photosites negative.
+        On a capture, when second-order integration of a sharp image on coarse cells gives negative photoelectrons.
 
     Examples
     --------
@@ -136,25 +136,25 @@ class Camera:
 
     @property
     def optics(self) -> Optics:
-        """The lens. For another one make another camera."""
+        """The optics; :meth:`replace` returns a camera with others."""
         return self._optics
 
     @property
     def sensor(self) -> Sensor:
-        """The sensor. For another one make another camera."""
+        """The sensor; :meth:`replace` returns a camera with another."""
         return self._sensor
 
     @property
     def distortion(self) -> Lens | None:
-        """Where the lens puts light that an ideal one would put elsewhere, or None. For another one make another camera."""
+        """The lens model of the distortion, or None."""
         return self._distortion
 
     def oversample(self, light: Scene | PowerMap) -> int:
-        """Cells of the power map along a side of a source pixel: as :class:`Optics` specifies or chooses; 1 for power maps."""
+        """Return the number of map cells along a source pixel; 1 for power maps."""
         return 1 if isinstance(light, PowerMap) else int(self._optics.resolved(light).oversample)
 
     def order(self, light: Scene | PowerMap) -> Literal[1, 2]:
-        """Order of the integration of a kind of light."""
+        """Return the order of integration for a scene or power map."""
         if self._order is not None:
             return self._order
         if isinstance(light, PowerMap):
@@ -165,7 +165,7 @@ class Camera:
 
     def image_grid(self, scene: Scene) -> Grid:
         """
-        Return the grid on which the pixels of a scene are imaged without distortion, in the sensor frame.
+        Return the image of a scene's pixel grid without distortion, in the sensor frame.
 
         Parameters
         ----------
@@ -179,13 +179,13 @@ class Camera:
         Raises
         ------
         ParameterError
-            When the scene is not a Scene, or nearer than the focal length.
+            When the scene is not a Scene, or its distance is at most the focal length.
         """
         return self._placed(self._optics.grid(scene))
 
     def power_map(self, scene: Scene) -> PowerMap:
         """
-        Compute the irradiance of a scene on the sensor plane without distortion, in the sensor frame.
+        Compute the image irradiance of a scene without distortion, in the sensor frame.
 
         Parameters
         ----------
@@ -194,19 +194,19 @@ class Camera:
         Returns
         -------
         PowerMap
-            (n_wavelength, n_y, n_x): :meth:`Optics.power_map` with :meth:`oversample` cells along a source pixel, centred on
-            the principal point of the distortion model. Capturing it gives the capture of the scene at the same ``order``.
+            (n_wavelength, n_y, n_x), W/m²: :meth:`Optics.power_map` with :meth:`oversample` cells along a source pixel,
+            centred on the principal point of the distortion model. At the same ``order``, its capture is that of the scene.
 
         Raises
         ------
         ParameterError, SimulationError
-            When the scene is too near, or not finite.
+            When the distance of the scene is at most the focal length, or the result is not finite.
         """
         power_map = self._optics.resolved(scene).power_map(scene, n_threads=self._n_threads)
         return PowerMap(power_map.data, self._placed(power_map.grid), power_map.wavelength_nm)
 
     def _placed(self, grid: Grid) -> Grid:
-        """Move a grid from the frame of the lens, centred on the axis, to the frame of the sensor."""
+        """Transform a grid from the frame of the optics to the frame of the sensor."""
         if self._distortion is None:
             return grid
         centre_um = np.array(self._distortion.centre_um)
@@ -225,16 +225,29 @@ class Camera:
         place_um: Place = (0.0, 0.0),
     ) -> Integrator:
         """
-        The sensor's layout compiled for a grid, with its middle at a place in the image, µm.
+        Return the sensor's layout compiled for a grid.
 
-        Kept for the grids used last, of which ``n_grids`` are used together.
+        Parameters
+        ----------
+        grid : Grid
+        order : {1, 2}
+            Order of integration.
+        n_grids : int
+            Number of grids that are used together: the cache has room for them.
+        place_um : (x, y), µm
+            Position of the layout's origin in the image.
+
+        Returns
+        -------
+        Integrator
+            From the cache, when the same one was used recently.
         """
         key = grid, order, place_um
         integrator = self._integrators.get(key)
         if integrator is None:
             layout = self._layout.translate(*place_um) if any(place_um) else self._layout
             integrator = Integrator(layout, grid, distortion=self._distortion, order=order, n_threads=self._n_threads)
-        # One that is in its place already is left there: frames that are computed together find it.
+        # The most recent entry is not moved: threads that compute further frames look it up at the same time.
         if next(reversed(self._integrators), None) != key:
             self._integrators.pop(key, None)
             self._integrators[key] = integrator
@@ -244,14 +257,14 @@ class Camera:
 
     def replace(self, *, optics: Optics | None = None, sensor: Sensor | None = None) -> Camera:
         """
-        A camera with another lens, another sensor, or both.
+        Return a camera with other optics, another sensor, or both.
 
-        Layouts that were compiled for grids are shared where the new sensor has the same layout: the same object, not its like.
+        Compiled layouts are shared when the new sensor has the same layout object.
 
         Raises
         ------
         ParameterError
-            When an argument is none of the above.
+            When an argument has another type.
         """
         other = Camera(
             optics=self._optics if optics is None else optics,
@@ -266,22 +279,26 @@ class Camera:
 
     def photoelectrons_per_s(self, light: Scene | PowerMap, *, images: KeptImages | None = None) -> Floats:
         """
-        Expected photoelectrons of every site in a second, (n_site,) e-/s.
+        Return the expected photoelectrons of every site per second.
 
         Parameters
         ----------
         light : Scene or PowerMap
-            A scene to be imaged, or a map that any other optics program made.
+            A scene, or a power map from any optics program.
         images : dict, optional
-            The scene's images are put in it, and taken from it where they are there: for other layouts with the same lens,
-            scene and colour filters.
+            Cache of the scene's images, read and extended: for further layouts with the same optics, scene and colour
+            filters.
+
+        Returns
+        -------
+        rate_e_per_s : (n_site,) float64, e-/s
 
         Raises
         ------
         ParameterError
-            When the light is neither, or a wavelength outside the sensor's tables.
+            When ``light`` has another type, or a wavelength is outside the sensor's tables.
         SimulationError
-            When the map is not finite under a site.
+            When the power map is not finite within a site.
         """
         return self._photoelectrons_per_s(light, _Clock(), kept=images)
 
@@ -295,17 +312,17 @@ class Camera:
         photo_e_per_s: Floats | None = None,
     ) -> Capture:
         """
-        One exposure.
+        Simulate one exposure.
 
         Parameters
         ----------
         light : Scene or PowerMap
-            A scene to be imaged, or a map that any other optics program made.
+            A scene, or a power map from any optics program.
         exposure_s : float, s
         seed, frame : int
-            Of the noise. The same numbers give the same capture, bit for bit.
+            Seed and frame number of the noise. Equal ones give bit-identical captures.
         photo_e_per_s : (n_site,) float64, optional, e-/s
-            What :meth:`photoelectrons_per_s` gave for this light, where it is known: nothing of it is computed again.
+            Result of :meth:`photoelectrons_per_s` for the same ``light``, which is then not computed again.
 
         Returns
         -------
@@ -314,7 +331,7 @@ class Camera:
         Raises
         ------
         ParameterError, SimulationError
-            When a value is out of range, or parts do not fit together.
+            When a value is out of range, or the parts are incompatible.
         """
         streams = Streams(seed, frame)
         exposure_s = check_plausible("exposure_s", exposure_s)
@@ -338,7 +355,7 @@ class Camera:
         clock: _Clock,
         **settings: Any,
     ) -> Capture:
-        """What the sensor makes of the light on its sites."""
+        """Simulate the sensor for photoelectron rates."""
         sensor = self._sensor
         with clock.stage("sensor"):
             expected_e = sensor.expected_electrons(photo_e_per_s, exposure_s)
@@ -369,7 +386,7 @@ class Camera:
 
     @cached_property
     def _described(self) -> dict[str, Any]:
-        """What all captures of the camera have in common, as plain data."""
+        """Settings that all captures of the camera share, as plain data."""
         return {
             "optics": to_plain_data(self._optics),
             "distortion": None if self._distortion is None else to_plain_data(self._distortion),
@@ -379,23 +396,23 @@ class Camera:
 
     def rates(self, frames: Iterable[Light], *, ahead: int = 0) -> Iterator[Floats]:
         """
-        Expected photoelectrons of every site in a second, frame by frame: what the modes of acquisition take.
+        Yield the expected photoelectrons of every site per second, frame by frame.
 
         Parameters
         ----------
-        frames : iterable of Scene or PowerMap, or of pairs with a place (x_um, y_um)
+        frames : iterable of Scene or PowerMap, or of pairs with a position (x_um, y_um)
         ahead : int
             As for :meth:`video`.
 
         Yields
         ------
         photo_e_per_s : (n_site,) float64, e-/s
-            As :meth:`photoelectrons_per_s` gives it; read-only, since a frame that comes again gives the same array again.
+            As :meth:`photoelectrons_per_s` returns it. Read-only: repeated frames share one array.
 
         Raises
         ------
         ParameterError, SimulationError
-            At once, when an argument is out of range; as for :meth:`capture`, when the frame comes.
+            On the call, when an argument is out of range; during iteration, as for :meth:`capture`.
         """
         _check_frames(frames)
         ahead = check_count("ahead", ahead, at_least=0)
@@ -415,31 +432,31 @@ class Camera:
         ahead: int = 0,
     ) -> Iterator[Capture]:
         """
-        One capture after the other, each made when it is asked for.
+        Yield captures of a sequence of frames, each computed on demand.
 
         Parameters
         ----------
-        frames : iterable of Scene or PowerMap, or of pairs with a place (x_um, y_um)
-            The light, frame by frame. With a place, the sensor's middle is put there in the image behind the lens: a gaze that
-            moves. See :mod:`foveasim.video` for frames from pictures and video files, and for paths of gazes.
-        exposure_s : float, or one after the other, s
-            Of a sequence the captures take one each, over and over, as their numbers say: a bracket.
+        frames : iterable of Scene or PowerMap, or of pairs with a position (x_um, y_um)
+            A position places the sensor's centre in the image: a moving gaze. See :mod:`foveasim.video` for frames from
+            image and video files, and for gaze paths.
+        exposure_s : float or sequence of float, s
+            A sequence is an exposure bracket: the captures use its times cyclically, by their numbers.
         seed : int
-            Of the noise; fixed patterns are the device's and stay.
+            Seed of the temporal noise; fixed patterns belong to the device.
         first_frame : int
-            Number of the first capture: capture k has the noise of ``capture(..., frame=first_frame + k)``. A video is gone on
-            with from light number ``first_frame * every`` on.
+            Number of the first capture: capture k has the noise of ``capture(..., frame=first_frame + k)``. To resume a
+            video, pass the frames from number ``first_frame * every``.
         frame_s : float, optional, s
-            From one frame of light to the next. Without it every frame lights one capture and no other.
+            Frame period. Without it each frame is exposed separately.
         line_s : float, s
-            Rolling shutter: a site begins ``readout_order * line_s`` after the first. Needs ``frame_s``.
+            Line time of a rolling shutter: a site starts ``readout_order * line_s`` after the first. Requires ``frame_s``.
         every : int
-            Number of frames of light from one capture to the next.
+            Number of frames per capture.
         between : {"hold", "linear"}
-            What light does between frames: it holds until the next, or goes over into it in a straight line.
+            Irradiance between frames: constant until the next frame, or interpolated linearly.
         ahead : int
-            Frames that are computed before they are asked for, each by one thread, which is faster than all threads on one
-            frame. For frames that do not depend on the captures before.
+            Number of frames to compute in advance, each in one thread, which is faster than one frame in all threads. Only
+            for frames that do not depend on earlier captures.
 
         Yields
         ------
@@ -448,22 +465,23 @@ class Camera:
         Raises
         ------
         ParameterError, SimulationError
-            At once, when an argument is out of range; as for :meth:`capture`, when the frame comes.
+            On the call, when an argument is out of range; during iteration, as for :meth:`capture`.
 
         Warns
         -----
         FoveasimWarning
-            When an exposure outlasts the time to the begin of the next one: no photosite can be in both.
+            When an exposure is longer than the time to the start of the next one.
 
         Notes
         -----
-        Memory holds one frame of irradiance, or ``ahead`` of them, and a few numbers per site for each exposure in progress.
-        The layout is compiled once.
-        The same object again is the same light: its image is not computed again, wherever the gaze goes. A place moves the
-        photosites' outlines, so that shifts of any part of a cell are exact; the layout is compiled for each new place.
+        Memory contains one power map, or ``ahead`` of them, and a few numbers per site for each exposure in progress. The
+        layout is compiled once.
 
-        With ``frame_s`` a capture has the light of all frames that its exposure covers, each weighted by its time; the last
-        frame's light stays until the last exposure is over.
+        The image of a repeated frame (the same object) is computed once, also for a moving gaze. A position shifts the
+        photosites' outlines, so that fractions of a cell are exact; the layout is compiled for each new position.
+
+        With ``frame_s``, a capture integrates all frames during its exposure, weighted by their time; the last frame lasts
+        until the last exposure ends.
 
         Examples
         --------
@@ -483,7 +501,7 @@ class Camera:
         _check_frames(frames)
         if frame_s is None and (line_s or between != "hold" or every != 1):
             name = "line_s" if line_s else "between" if between != "hold" else "every"
-            raise ParameterError(name, "needs 'frame_s', the time from one frame of light to the next")
+            raise ParameterError(name, "requires 'frame_s', the frame period")
         streams = Streams(seed, first_frame)
         every, ahead = check_count("every", every), check_count("ahead", ahead, at_least=0)
         if frame_s is None:
@@ -491,15 +509,15 @@ class Camera:
         shutter = Shutter(self._layout, frame_s, line_s, between)
         if exposures_s.max() > (1.0 + TIME_ROUNDING) * every * shutter.frame_s:
             warnings.warn(
-                f"an exposure of {exposures_s.max():g} s outlasts the {every * shutter.frame_s:g} s to the next one's begin, "
-                "and no photosite can collect the same light for both: take a shorter 'exposure_s', or a larger 'every'",
+                f"the exposure of {exposures_s.max():g} s is longer than the {every * shutter.frame_s:g} s between the starts "
+                "of exposures, and no photosite can be exposed twice at a time; reduce 'exposure_s' or increase 'every'",
                 FoveasimWarning,
                 stacklevel=2,
             )
         return self._rolling(frames, exposures_s, streams, shutter, every, ahead)
 
     def _still(self, frames: Iterable[Light], exposures_s: Floats, streams: Streams, ahead: int) -> Iterator[Capture]:
-        """A capture for every frame, which is all that lights it."""
+        """Yield one capture per frame, each exposed to this frame alone."""
         clock = _Clock()
         for k, (light, place_um, rate_e_per_s) in enumerate(self._lit(frames, clock, ahead)):
             number = Streams(streams.seed, streams.frame + k)
@@ -509,35 +527,35 @@ class Camera:
     def _rolling(
         self, frames: Iterable[Light], exposures_s: Floats, streams: Streams, shutter: Shutter, every: int, ahead: int
     ) -> Iterator[Capture]:
-        """A capture for every so many frames, lit by all those that its exposure covers."""
+        """Yield one capture per ``every`` frames, each a sum over its exposure."""
         times = {"frame_s": shutter.frame_s, "line_s": shutter.line_s, "every": every, "between": shutter.between}
-        going_on: deque[tuple[int, Scene | PowerMap, Place, Exposure]] = deque()
+        in_progress: deque[tuple[int, Scene | PowerMap, Place, Exposure]] = deque()
         clock = _Clock()
 
         def first(last_e_per_s: Floats) -> Capture:
-            k, light, place_um, exposure = going_on.popleft()
+            k, light, place_um, exposure = in_progress.popleft()
             number = Streams(streams.seed, streams.frame + k)
-            mean_e_per_s, told = exposure.mean_e_per_s(last_e_per_s), times | _place_settings(place_um)
-            return self._exposed(light, mean_e_per_s, exposure.exposure_s, number, clock.so_far(), **told)
+            mean_e_per_s, settings = exposure.mean_e_per_s(last_e_per_s), times | _place_settings(place_um)
+            return self._exposed(light, mean_e_per_s, exposure.exposure_s, number, clock.so_far(), **settings)
 
         rate_e_per_s = np.zeros(1)
         for n, (light, place_um, rate_e_per_s) in enumerate(self._lit(frames, clock, ahead)):
             if n % every == 0:
                 k = n // every
                 exposure_s = float(exposures_s[(streams.frame + k) % exposures_s.size])
-                going_on.append((k, light, place_um, Exposure(shutter, exposure_s)))
+                in_progress.append((k, light, place_um, Exposure(shutter, exposure_s)))
             with clock.stage("shutter"):
-                for *_, exposure in going_on:
+                for *_, exposure in in_progress:
                     exposure.add(rate_e_per_s)
-            while going_on and going_on[0][-1].is_complete:
+            while in_progress and in_progress[0][-1].is_complete:
                 yield first(rate_e_per_s)
-        while going_on:
+        while in_progress:
             yield first(rate_e_per_s)
 
     def _lit(
         self, frames: Iterable[Light], clock: _Clock, ahead: int
     ) -> Iterator[tuple[Scene | PowerMap, Place, Floats]]:
-        """Every frame's light, the sensor's place, and the light on the sites; what frames have in common is computed once."""
+        """Yield source, sensor position and photoelectron rates of each frame."""
         alone = self
         if ahead:
             alone = Camera(
@@ -549,20 +567,20 @@ class Camera:
             own = _Clock()
             if task.is_repeated:
                 return task, None, own
-            # Who comes first makes the images that the next frames of the same light take.
+            # The first frame of a scene computes the images that its next frames share.
             with making if task.images == {} else nullcontext():
                 return task, alone._photoelectrons_per_s(task.light, own, task.place_um, task.images), own
 
         rate_e_per_s = np.zeros(self._layout.n_sites)
         for task, found, own in in_order(lit, _tasks(frames), self._n_threads, ahead):
-            # Who gets it twice must find it as it was.
+            # Repeated frames share the array.
             rate_e_per_s = rate_e_per_s if found is None else read_only(found)
             clock.add(own)
             yield task.light, task.place_um, rate_e_per_s
 
     def predict(self, light: Scene | PowerMap, *, exposure_s: float) -> tuple[Floats, Floats]:
         """
-        Mean and variance of every site's code over all noise, without a draw.
+        Return mean and variance of every site's code analytically.
 
         Parameters
         ----------
@@ -572,7 +590,7 @@ class Camera:
         Returns
         -------
         mean_dn, variance_dn2 : (n_site,) float64, DN and DN²
-            Of this device: its fixed patterns are in the mean.
+            Over the temporal noise of this device; its fixed patterns are part of the mean.
 
         Raises
         ------
@@ -584,20 +602,19 @@ class Camera:
 
     def reference(self, light: Scene | PowerMap, grid: Grid, *, exposure_s: float) -> Picture:
         """
-        The picture that a perfect sensor with a raster's pixels would take: what reconstructions are compared with.
+        Return the picture of an ideal raster sensor, as ground truth for reconstructions.
 
         Parameters
         ----------
         light : Scene or PowerMap
         grid : Grid
-            The raster, in the plane of the lens without distortion.
+            The pixels, in the image plane without distortion.
         exposure_s : float, s
 
         Returns
         -------
         Picture
-            Photoelectrons per µm² behind each of the sensor's filters, of the light behind the lens, without noise and dark
-            charge: exact means over the pixels. NaN off the image.
+            Exact means over the pixels, e-/µm², one channel per filter, without noise and dark signal; NaN outside the image.
 
         Raises
         ------
@@ -608,19 +625,23 @@ class Camera:
         if not isinstance(light, Scene | PowerMap):
             raise ParameterError("light", f"must be a Scene or a PowerMap, got a {type(light).__name__}")
         power_map = self.power_map(light) if isinstance(light, Scene) else light
-        # Joules on a µm².
         joules_per_w_m2 = float(w_from_w_m2_um2(exposure_s))
         weights = self._sensor.responsivity_e_per_j(light.wavelength_nm) * joules_per_w_m2
         return reference(power_map, grid, weights=weights)
 
     def noise_budget(self, light: Scene | PowerMap, *, exposure_s: float) -> dict[str, Floats]:
         """
-        Noise of every site by source, (n_site,) e- each: :func:`foveasim.sensor.noise_budget` for what the camera sees.
+        Return the noise of every site by source: :func:`foveasim.sensor.noise_budget`.
 
         Parameters
         ----------
         light : Scene or PowerMap
         exposure_s : float, s
+
+        Returns
+        -------
+        dict of str to (n_site,) float64, e-
+            Standard deviation by source.
 
         Raises
         ------
@@ -637,80 +658,103 @@ class Camera:
         kept: KeptImages | None = None,
     ) -> Floats:
         """
-        One inverse transform and one pass over the map for each colour filter, whatever the number of wavelengths.
+        Return the expected photoelectrons of every site per second.
 
-        Lateral colour makes images of several sizes, each with its own grid, and the same for each of them. The images of a
-        scene are put in ``kept``, and taken from there when they are in it.
+        ``kept`` is a cache of a scene's images by grid and filter, or None.
         """
         if not isinstance(light, Scene | PowerMap):
             raise ParameterError("light", f"must be a Scene or a PowerMap, got a {type(light).__name__}")
-        filter_of_site = self._sensor.filter_of_site
-        weights = self._sensor.responsivity_e_per_j(light.wavelength_nm)
         with clock.stage("load kernels"):
             _load_kernels(light)
         if isinstance(light, PowerMap):
-            optics, grids = self._optics, [(light.grid, np.ones(light.wavelength_nm.size, bool))]
+            maps, grids = self._bands(light), [light.grid]
         else:
+            # Lateral chromatic aberration gives images of several sizes, each with its own grid.
             optics = self._optics.resolved(light)
-            grids = optics.image_grids(light)
+            images = optics.image_grids(light)
+            maps, grids = self._images(light, optics, images, clock, kept), [self._placed(grid) for grid, _ in images]
         with clock.stage("compile layout"):
             order = self.order(light)
-            placed = [grid if isinstance(light, PowerMap) else self._placed(grid) for grid, _ in grids]
-            integrators = [self.integrator(grid, order=order, n_grids=len(grids), place_um=place_um) for grid in placed]
+            integrators = [self.integrator(grid, order=order, n_grids=len(grids), place_um=place_um) for grid in grids]
         self._warn_of_uncovered(min(integrators, key=lambda integrator: integrator.grid.cell_area_um2))
         rate_e_per_s = np.zeros(self._layout.n_sites)
-        if isinstance(light, PowerMap):
-            integrator = integrators[0]
+        for image, cells, weight in maps:
             with clock.stage("integration"):
-                for band, cells in enumerate(light.data):
-                    rate_e_per_s += weights[filter_of_site, band] * w_from_w_m2_um2(integrator(cells))
-        else:
-            used = np.unique(filter_of_site)
-            for (grid, is_on_it), integrator in zip(grids, integrators, strict=True):
-                new = used if kept is None else np.array([c for c in used if (grid, c) not in kept], np.int64)
-                maps = optics.weighted_maps(light, weights[new] * is_on_it, grid=grid, n_threads=self._n_threads)
-                for c in used:
-                    with clock.stage("optics"):
-                        cells = next(maps) if kept is None or (grid, c) not in kept else kept[grid, c]
-                        if kept is not None:
-                            kept[grid, c] = cells
-                    with clock.stage("integration"):
-                        rates = w_from_w_m2_um2(integrator(cells))
-                        del cells
-                    rate_e_per_s += np.where(filter_of_site == c, rates, 0.0)
+                rate_e_per_s += weight * w_from_w_m2_um2(integrators[image](cells))
+            del cells
+        self._check_rates(light, rate_e_per_s)
+        return np.maximum(rate_e_per_s, 0.0)
+
+    def _bands(self, power_map: PowerMap) -> Iterator[_WeightedMap]:
+        """Yield each band of a power map, with every site's photoelectrons per joule in it."""
+        e_per_j = self._sensor.responsivity_e_per_j(power_map.wavelength_nm)
+        for band, cells in enumerate(power_map.data):
+            yield _WeightedMap(0, cells, e_per_j[self._sensor.filter_of_site, band])
+
+    def _images(
+        self,
+        scene: Scene,
+        optics: Optics,
+        images: Sequence[tuple[Grid, Bools]],
+        clock: _Clock,
+        kept: KeptImages | None,
+    ) -> Iterator[_WeightedMap]:
+        """
+        Yield the photoelectron map of each filter, with weight 1 at its sites and 0 at others.
+
+        One inverse transform per filter and image, for any number of wavelengths.
+        """
+        filter_of_site = self._sensor.filter_of_site
+        e_per_j = self._sensor.responsivity_e_per_j(scene.wavelength_nm)
+        used = np.unique(filter_of_site)
+        for k, (grid, is_in_image) in enumerate(images):
+            new = used if kept is None else np.array([c for c in used if (grid, c) not in kept], np.int64)
+            maps = optics.weighted_maps(scene, e_per_j[new] * is_in_image, grid=grid, n_threads=self._n_threads)
+            for c in used:
+                with clock.stage("optics"):
+                    cells = next(maps) if kept is None or (grid, c) not in kept else kept[grid, c]
+                    if kept is not None:
+                        kept[grid, c] = cells
+                weighted = [_WeightedMap(k, cells, (filter_of_site == c).astype(np.float64))]
+                # Without a reference here, one map is in memory at a time.
+                del cells
+                yield weighted.pop()
+
+    def _check_rates(self, light: Scene | PowerMap, rate_e_per_s: Floats) -> None:
+        """Raise or warn when rates are not finite, or negative beyond rounding."""
         if not np.isfinite(rate_e_per_s).all():
             bad = int(np.flatnonzero(~np.isfinite(rate_e_per_s))[0])
             raise SimulationError(
-                f"the light on site {bad} is not finite: the power map has a NaN or an infinity there"
+                f"irradiance on site {bad} must be finite; the power map contains NaN or infinity there"
             )
-        # Transforms leave rates below 0 by rounding, second order where cells are coarse; a map from elsewhere may be negative.
         is_negative = rate_e_per_s < -NEGATIVE_ROUNDING * float(rate_e_per_s.max(initial=0.0))
-        if is_negative.any():
-            if isinstance(light, PowerMap) and (order == 1 or np.nanmin(light.data) < 0.0):
-                bad = int(rate_e_per_s.argmin())
-                raise SimulationError(f"the light on site {bad} is negative: the power map is below 0 there")
-            if order == 2:
-                self._warn_of_negative(rate_e_per_s, is_negative)
-        return np.maximum(rate_e_per_s, 0.0)
+        if not is_negative.any():
+            return
+        order = self.order(light)
+        if isinstance(light, PowerMap) and (order == 1 or np.nanmin(light.data) < 0.0):
+            bad = int(rate_e_per_s.argmin())
+            raise SimulationError(f"irradiance on site {bad} must be >= 0; the power map is negative there")
+        if order == 2:
+            self._warn_of_negative(rate_e_per_s, is_negative)
 
     def _warn_of_negative(self, rate_e_per_s: Floats, is_negative: Bools) -> None:
-        """Warn where gradients of coarse cells make photosites negative."""
+        """Warn when gradients of coarse cells give negative photoelectrons."""
         fraction = -float(rate_e_per_s[is_negative].sum()) / float(np.abs(rate_e_per_s).sum())
         warnings.warn(
             f"second-order integration makes the photoelectrons of {int(is_negative.sum()):,} of {rate_e_per_s.size:,} "
             f"photosites negative, {100.0 * fraction:.3g} % of all, and they are set to 0: the image is too sharp for cells of "
-            "this size; take order=1, or finer cells (Optics(oversample=...))",
+            "this size; use order=1, or smaller cells (Optics(oversample=...))",
             SamplingWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
 
     def _warn_of_uncovered(self, integrator: Integrator) -> None:
-        """Tell of sites that the map of light does not reach: their darkness is no property of the scene."""
+        """Warn of sites outside the image, which are dark whatever the scene is."""
         n_lost = integrator.sites_outside_image_circle.size
         if n_lost:
             warnings.warn(
-                f"{n_lost:,} of {self._layout.n_sites:,} photosites lie outside the lens's image circle and get no light: "
-                "shrink or move the layout, or take a lens model that reaches further",
+                f"{n_lost:,} of {self._layout.n_sites:,} photosites lie outside the image circle of the lens and are dark; "
+                "shrink or move the layout, or use a lens model with a larger field",
                 CoverageWarning,
                 stacklevel=4,
             )
@@ -719,16 +763,16 @@ class Camera:
             x_min, y_min, x_max, y_max = integrator.grid.bounds_um
             left, bottom, right, top = self._layout.bounds_um
             warnings.warn(
-                f"{n_uncovered:,} of {self._layout.n_sites:,} photosites lie partly or wholly off the image and get less light "
-                f"or none: the image reaches from ({x_min:.4g}, {y_min:.4g}) to ({x_max:.4g}, {y_max:.4g}) µm, the layout "
-                f"from ({left:.4g}, {bottom:.4g}) to ({right:.4g}, {top:.4g}) µm; enlarge the scene (pitch_um), or shrink or "
-                "move the layout",
+                f"{n_uncovered:,} of {self._layout.n_sites:,} photosites lie partly or completely outside the image, where "
+                f"irradiance is 0: the image extends from ({x_min:.4g}, {y_min:.4g}) to ({x_max:.4g}, {y_max:.4g}) µm, the "
+                f"layout from ({left:.4g}, {bottom:.4g}) to ({right:.4g}, {top:.4g}) µm; enlarge the scene (pitch_um), or "
+                "shrink or move the layout",
                 CoverageWarning,
                 stacklevel=4,
             )
 
     def _white(self, light: Scene | PowerMap) -> Floats:
-        """Response of every filter to equal light in all bands, the strongest being the highest code."""
+        """Return each filter's relative response to an equal-energy spectrum, as a code."""
         width_nm = light.band_width_nm if isinstance(light, Scene) else np.ones(light.wavelength_nm.size)
         response = self._sensor.responsivity_e_per_j(light.wavelength_nm) @ width_nm
         highest = float(response.max(initial=0.0))
@@ -737,8 +781,16 @@ class Camera:
         return np.maximum(response / highest, DIMMEST_WHITE) * (2**self._sensor.bits - 1)
 
 
+class _WeightedMap(NamedTuple):
+    """A power map, the index of its grid, and a weight for every site's power, (n_site,)."""
+
+    image: int
+    cells: NDArray[Any]
+    weight: Floats
+
+
 class _Clock:
-    """Adds up the seconds of named stages."""
+    """Elapsed seconds of named stages."""
 
     def __init__(self) -> None:
         self.stage_s: dict[str, float] = {}
@@ -750,19 +802,19 @@ class _Clock:
         self.stage_s[name] = self.stage_s.get(name, 0.0) + time.perf_counter() - start_s
 
     def add(self, other: _Clock) -> None:
-        """Add another's seconds."""
+        """Add the seconds of another clock."""
         for name, s in other.stage_s.items():
             self.stage_s[name] = self.stage_s.get(name, 0.0) + s
 
     def so_far(self) -> _Clock:
-        """What was added up since this was last asked."""
+        """Return the seconds since the last call, and reset."""
         before = _Clock()
         before.stage_s, self.stage_s = self.stage_s, {}
         return before
 
 
 class _Task(NamedTuple):
-    """One frame of a video: its light, the sensor's place, where its images are kept, and whether nothing changed."""
+    """One frame of a video, with the cache of its images."""
 
     light: Scene | PowerMap
     place_um: Place
@@ -771,7 +823,7 @@ class _Task(NamedTuple):
 
 
 def _tasks(frames: Iterable[Light]) -> Iterator[_Task]:
-    """The frames, with what each has in common with the one before: frames with places share the images of their light."""
+    """Yield the frames as tasks; frames of one scene with positions share their images."""
     before: _Task | None = None
     for frame in frames:
         light, place_um = _parts(frame)
@@ -787,19 +839,19 @@ def _tasks(frames: Iterable[Light]) -> Iterator[_Task]:
 
 def _check_frames(frames: object) -> None:
     if not isinstance(frames, Iterable):
-        hint = "put one into a list" if isinstance(frames, Scene | PowerMap) else ""
+        hint = "put a single one into a list" if isinstance(frames, Scene | PowerMap) else ""
         raise ParameterError(
             "frames", f"must be an iterable of Scenes or PowerMaps, got a {type(frames).__name__}", hint=hint
         )
 
 
 def _place_settings(place_um: Place) -> dict[str, Any]:
-    """What a capture's settings tell of its place."""
+    """Return the sensor position as settings of a capture; nothing at the origin."""
     return {"place_um": list(place_um)} if any(place_um) else {}
 
 
 def _parts(frame: Light) -> tuple[Scene | PowerMap, Place]:
-    """Light, and the place of the sensor's middle in its image."""
+    """Return the source and the position of the sensor's centre in its image."""
     if not isinstance(frame, tuple):
         return frame, (0.0, 0.0)
     place_um = finite_array("frames", frame[1], ndim=1) if len(frame) == 2 else np.zeros(0)
@@ -824,7 +876,7 @@ def _light_described(light: Scene | PowerMap) -> dict[str, object]:
 
 
 def _load_kernels(light: Scene | PowerMap) -> None:
-    """Import the kernels that images of this light need, so that their compilation is not timed with other work."""
+    """Import the kernels that this source needs, before other stages are timed."""
     import foveasim.integrate._kernels
 
     if isinstance(light, Scene):

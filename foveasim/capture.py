@@ -1,4 +1,4 @@
-"""The capture: what one exposure gave, with everything needed to tell how it was made."""
+"""Captures: results of one exposure, with the settings that reproduce it."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ __all__ = ["Capture"]
 
 FILE_FORMAT = "foveasim capture"
 FILE_VERSION = 1
-#: Arrays of a capture file, beside the layout's.
+#: Arrays of a capture file, in addition to those of the layout.
 ARRAYS = ("code", "electrons", "expected_e", "filter_of_site")
-#: Units of variables whose names do not carry one.
+#: Units of variables whose names do not end in one.
 UNITS = {"code": "DN", "electrons": "e-"}
 #: Names of variables that are derived from the layout, and of the dimensions' coordinates.
 DERIVED = ("x_um", "y_um", "area_um2", "filter_name")
@@ -61,7 +61,7 @@ LAYOUT_GROUP = "layout"
 @dataclass(frozen=True, eq=False)
 class Capture:
     """
-    What one exposure gave.
+    Result of one exposure.
 
     Attributes
     ----------
@@ -70,20 +70,20 @@ class Capture:
     code : (n_site,) uint8 or uint16, DN
         Digital values.
     electrons : (n_site,) int64, e-
-        Charge collected, shot noise and full well included.
+        Collected charge, with shot noise, clipped at the full well capacity.
     expected_e : (n_site,) float64, e-
-        Its expectation, without a draw.
+        Expected charge.
     filter_of_site : (n_site,) int64
         Index of each site's colour filter.
     filter_names : tuple of str
     bits : int
-        Of the codes: the highest is ``2**bits - 1``.
+        Bit depth of the codes: the highest is ``2**bits - 1``.
     white_dn : (n_filter,) float64, DN
-        Code, up to a common factor, of a white scene: equal light in every band of the scene. For white balance.
+        Code of a spectrum of equal radiance in all bands, up to a common factor, for white balance.
     settings : mapping
         Plain data: optics, sensor, layout, scene, exposure, seed, frame, versions.
     stage_s : mapping of str to float
-        Seconds that each stage took; not part of what is saved.
+        Elapsed seconds of each stage; not saved.
     """
 
     layout: Layout
@@ -117,7 +117,7 @@ class Capture:
             if limit is not None and values.size and values.max() > limit:
                 raise ParameterError(name, f"must be <= {limit} everywhere", int(values.max()))
             object.__setattr__(self, name, own(values))
-        # Captures of one camera have most of their settings in common, and each may be edited.
+        # Captures of one camera share settings; a copy lets users edit those of one.
         object.__setattr__(self, "settings", copied(self.settings))
         object.__setattr__(self, "stage_s", dict(self.stage_s))
 
@@ -128,7 +128,7 @@ class Capture:
 
     @property
     def saturated_fraction(self) -> float:
-        """Fraction of the sites that gave the highest code."""
+        """Fraction of the sites with the highest code."""
         return float(np.mean(self.code == 2**self.bits - 1)) if self.code.size else 0.0
 
     def picture(
@@ -143,50 +143,50 @@ class Capture:
         **options: Any,
     ) -> Picture:
         """
-        Raster picture of what the sensor saw.
+        Reconstruct a raster picture from the sites' values.
 
         Parameters
         ----------
         method : {"cells", "linear", "natural", "least_squares"}
-            ``"cells"``: every pixel takes the value of its photosites, weighted by area; on a colour mosaic a site's other
-            colours come from the nearest sites that see them. ``"linear"``, ``"natural"``: smooth between the sites' centres,
-            each colour between the sites that see it. ``"least_squares"``: the picture that explains the values, smooth where
-            they leave it open. See the functions of these names in :mod:`foveasim.reconstruct`.
+            ``"cells"``: area-weighted mean of the photosites in each pixel; on a colour mosaic, missing colours of a site come
+            from the nearest sites with that filter. ``"linear"``, ``"natural"``: interpolation between the sites' centroids,
+            per filter. ``"least_squares"``: regularised least squares. See the functions of these names in
+            :mod:`foveasim.reconstruct`.
         max_pixels : int
-            Length of the longer side, when no grid is given.
+            Pixels along the longer side, when ``grid`` is not given.
         grid : Grid, optional
-            The pixels; by default square ones over the whole layout.
+            The pixels; by default square ones over the bounds of the layout.
         of : {"code", "electrons", "expected_e", "light_e"}
-            Which values to show. ``"light_e"`` are the photoelectrons that the codes stand for: companding undone, pedestal and
-            dark charge taken off.
+            Values to reconstruct. ``"light_e"`` are photoelectrons estimated from the codes: without companding, pedestal and
+            dark signal.
         per : {"site", "um2"}
-            ``"site"``: the values as they are, so that a larger site is brighter where it collects more. ``"um2"``: over what
-            even light gives each site, its area in µm² times its sensitivity (and, for codes, codes per electron over their
-            mean): an even scene is even, whatever the sites' sizes.
+            ``"site"``: the values themselves, so that larger sites are brighter. ``"um2"``: values divided by the site's area
+            in µm² and its relative sensitivity (and, for codes, relative conversion gain), so that a uniform scene gives a
+            uniform picture.
         sensor : Sensor, optional
-            That made the capture, with the same sites in the same order: needed where its electronics differ from site to
-            site in a layout of more than 64 sites, since ``settings`` does not keep such.
+            The sensor of the capture, with the same sites in the same order. Required when its parameters differ between the
+            sites of a layout with more than 64 sites: ``settings`` does not contain such arrays.
         **options
-            Of the method's function. ``"least_squares"`` takes ``mu``, ``blur``, ``tolerance``, ``max_steps``, and the values'
-            ``variance``; all take ``n_threads``.
+            Options of the method's function: ``mu``, ``blur``, ``tolerance``, ``max_steps`` and ``variance`` for
+            ``"least_squares"``, ``n_threads`` for all.
 
         Returns
         -------
         Picture
-            One channel a colour filter; NaN where no photosite is.
+            One channel per colour filter; NaN outside the photosites.
 
         Raises
         ------
         ParameterError
-            When a choice is none of the above, an option none of the method's, the electronics are not known where they are
-            needed, or the sensor is of another layout.
+            When a choice or option is invalid, the sensor's parameters are required and not known, or the sensor has
+            another layout.
 
         Notes
         -----
-        Least squares need values linear in light: from codes and charges the pedestal and the dark charge are taken off,
-        companding is undone, and saturated sites are left out. What they find is light per µm²; with ``per="site"`` that is
-        shown as what a site of the mean response would give. The ``variance`` is by default that of shot noise, and for codes
-        that of resetting, reading, RTS sites and rounding too.
+        Least squares require values that are linear in irradiance: codes and charges are used without pedestal, dark signal
+        and companding, and without saturated sites. The result is irradiance in photoelectrons per µm²; with ``per="site"``
+        it is scaled to a site of mean response. The ``variance`` is by default that of shot noise, and for codes also that
+        of reset, read, RTS and quantisation noise.
         """
         methods = {"cells": cells, "linear": linear, "natural": natural, "least_squares": least_squares}
         check_choice("method", method, tuple(methods))
@@ -197,7 +197,7 @@ class Capture:
         )
         if set(options) - known:
             name = min(set(options) - known)
-            raise ParameterError(name, f"is no option of {method!r}, which has {', '.join(sorted(known))}")
+            raise ParameterError(name, f"must be an option of {method!r}: {', '.join(sorted(known))}")
         self._check_sensor(sensor)
         grid = raster_grid(self.layout, max_pixels) if grid is None else grid
         n_filters = len(self.filter_names)
@@ -239,18 +239,24 @@ class Capture:
 
     def signal_to_noise(self, *, sensor: Sensor | None = None) -> Floats:
         """
-        Signal-to-noise ratio of every site, (n_site,), without a draw: :func:`foveasim.sensor.signal_to_noise`.
+        Return the expected signal-to-noise ratio of every site.
+
+        See :func:`foveasim.sensor.signal_to_noise`.
 
         Parameters
         ----------
         sensor : Sensor, optional
-            That made the capture: needed where its electronics differ from site to site in a layout of more than 64 sites,
-            since ``settings`` does not store such, and where it has effects that are not registered.
+            The sensor of the capture. Required when its parameters differ between the sites of a layout with more than 64
+            sites, since ``settings`` does not contain such arrays, and when it has effects that are not registered.
+
+        Returns
+        -------
+        ratio : (n_site,) float64
 
         Raises
         ------
         ParameterError
-            When the electronics are not known, or the sensor is of another layout.
+            When the sensor's parameters are not known, or the sensor has another layout.
         """
         self._check_sensor(sensor)
         known = self._electronics(sensor)
@@ -258,14 +264,14 @@ class Capture:
         return signal_to_noise(known, self.expected_e, np.broadcast_to(dark_e, self.expected_e.shape)).ratio
 
     def _check_sensor(self, sensor: Sensor | None) -> None:
-        """Raise where a sensor is not of the capture's layout."""
+        """Raise when a sensor has another layout than the capture."""
         if sensor is not None and (not isinstance(sensor, Sensor) or not same_rings(sensor.layout, self.layout)):
             raise ParameterError(
                 "sensor", "must be the Sensor of the capture's layout, with the same sites in the same order", sensor
             )
 
     def _electronics(self, sensor: Sensor | None) -> Sensor:
-        """Return the sensor that is given, or the one that the settings describe."""
+        """Return the given sensor, or the one in the settings."""
         return Sensor.from_settings(self.layout, self.settings.get("sensor", {})) if sensor is None else sensor
 
     def _readings(self, electronics: Sensor, of: str) -> SiteEstimates:
@@ -275,29 +281,29 @@ class Capture:
         return estimate_from_charge(getattr(self, of), electronics, exposure_s)
 
     def to_pyvista(self) -> PolyData:
-        """The sites as PolyData with what they measured, for PyVista; see :func:`foveasim.view.polydata`."""
+        """Return the sites as PyVista PolyData with their values: :func:`foveasim.view.polydata`."""
         from foveasim.view import polydata
 
         return polydata(self)
 
     def plot(self, by: str | ArrayLike = "code", **options: Any) -> Axes:
-        """Draw the photosites on matplotlib axes, coloured by what they measured; see :func:`foveasim.view.plot_capture`."""
+        """Draw the photosites coloured by value: :func:`foveasim.view.plot_capture`."""
         from foveasim.view import plot_capture
 
         return plot_capture(self, by, **options)
 
     def to_xarray(self) -> xr.Dataset:
         """
-        Return the capture as a labelled dataset, which netCDF and zarr files can store.
+        Return the capture as a labelled dataset that netCDF and zarr files can store.
 
         Returns
         -------
         xarray.Dataset
             Dimensions ``site`` (n_site) and ``filter`` (n_filter). Variables ``code``, ``electrons``, ``expected_e``,
-            ``filter_of_site`` over sites, ``white_dn`` over filters. Coordinates: numbers of the sites, their centroids
+            ``filter_of_site`` over sites, ``white_dn`` over filters. Coordinates: index of the sites, their centroids
             ``x_um`` and ``y_um``, ``area_um2``, names of the filters, and all columns of the layout. Every variable has
-            its ``units``, ``"1"`` where it has no dimension. Attributes: ``bits``, ``seed``, ``exposure_s``, and
-            ``settings``, ``versions``, ``provenance`` as strings of JSON.
+            its ``units``, ``"1"`` when dimensionless. Attributes: ``bits``, ``seed``, ``exposure_s``, and
+            ``settings``, ``versions``, ``provenance`` as JSON strings.
 
         Raises
         ------
@@ -306,9 +312,9 @@ class Capture:
 
         Notes
         -----
-        A column of the layout is renamed where its name is taken or contains other characters than letters, digits and
-        ``_``; its attribute ``long_name`` is the one that it had. Outlines of the sites are not part of it:
-        ``layout.write`` and :meth:`save` write them.
+        A column of the layout is renamed when its name is taken or contains other characters than letters, digits and
+        ``_``; its attribute ``long_name`` is the original name. Outlines are not included: ``layout.write`` and
+        :meth:`save` write them.
         """
         try:
             import xarray as xr
@@ -329,7 +335,7 @@ class Capture:
         -------
         pandas.DataFrame
             Index ``site``. Columns ``x_um``, ``y_um``, ``area_um2``, ``filter_name``, ``filter_of_site``, ``code``,
-            ``electrons``, ``expected_e``, and the columns of the layout, named as in :meth:`to_xarray`. ``attrs`` has the
+            ``electrons``, ``expected_e``, and the columns of the layout, named as in :meth:`to_xarray`. ``attrs`` contains the
             attributes of :meth:`to_xarray`.
 
         Raises
@@ -354,7 +360,7 @@ class Capture:
             **{name: variables[name] for name in ("filter_of_site", "code", "electrons", "expected_e")},
             **{name: part for name, part in coordinates.items() if part.dims == (SITE,) and name != SITE},
         }
-        # Pandas writes into what it is given.
+        # DataFrames share memory with their arrays, which are read-only here.
         table = pd.DataFrame(
             {name: part.data.copy() for name, part in columns.items()},
             index=pd.Index(coordinates[SITE].data, name=SITE),
@@ -363,7 +369,7 @@ class Capture:
         return table
 
     def _variables(self) -> tuple[dict[str, Variable], dict[str, Variable], dict[str, str]]:
-        """All arrays of sites and filters, the coordinates apart, and the names by which the layout's columns are in them."""
+        """Return variables, coordinates, and the names of the layout's columns among these."""
         layout, centroid_um = self.layout, self.layout.centroid_um
         variables = {name: _variable(name, (SITE,), np.asarray(getattr(self, name))) for name in ARRAYS}
         variables["white_dn"] = _variable("white_dn", (FILTER,), np.asarray(self.white_dn))
@@ -381,7 +387,7 @@ class Capture:
         return variables, coordinates, names
 
     def _attributes(self) -> dict[str, Any]:
-        """What applies to all sites: numbers and strings, which any format can store."""
+        """Return attributes of the capture: numbers and strings, which all formats can store."""
         settings = self.settings
         seed = settings.get("seed")
         found: dict[str, Any] = {"bits": self.bits}
@@ -402,14 +408,13 @@ class Capture:
         Parameters
         ----------
         path : path
-            ``.npz``: one compressed file. ``.zarr``, with the extra ``video``: a store that xarray opens as what
-            :meth:`to_xarray` returns; outlines are in its group ``layout``. A capture that is there is replaced.
+            ``.npz``: one compressed file. ``.zarr``, with the extra ``video``: a store that xarray opens as the dataset of
+            :meth:`to_xarray`, with the outlines in its group ``layout``. An existing capture is replaced.
 
         Raises
         ------
         FileError
-            When the extension is another, zarr is missing, something else than a capture is there, or nothing can be
-            written.
+            When the extension is another, zarr is missing, the path exists and is not a capture, or it cannot be written.
         """
         target = Path(path)
         if target.suffix.lower() == ZARR:
@@ -443,11 +448,11 @@ class Capture:
             **self._attributes(),
             "filter_names": list(self.filter_names),
             "columns": names,
-            # As xarray reads them: names of coordinates that are not dimensions.
+            # Convention of xarray: names of the coordinates that are not dimensions.
             "coordinates": " ".join(name for name in coordinates if name not in (SITE, FILTER)),
         }
-        with atomic_directory(target, is_ours=lambda folder: store_format(folder) == FILE_FORMAT) as folder:
-            group = zarr.create_group(str(folder), zarr_format=3, attributes=attributes)
+        with atomic_directory(target, is_ours=lambda directory: store_format(directory) == FILE_FORMAT) as directory:
+            group = zarr.create_group(str(directory), zarr_format=3, attributes=attributes)
             write_variables(group, variables | coordinates)
             write_variables(group.create_group(LAYOUT_GROUP), outlines)
 
@@ -499,6 +504,6 @@ class Capture:
 
 
 def _variable(name: str, dims: tuple[str, ...], values: NDArray[Any], *, is_renamed: bool = False) -> Variable:
-    """An array with its unit, by its name; times have one already, which xarray writes itself."""
+    """Return an array with the unit in its name; xarray writes the unit of times itself."""
     units = {} if values.dtype.kind in "mM" else {"units": UNITS.get(name) or unit_of(name) or "1"}
     return Variable(dims, values, units | ({"long_name": name} if is_renamed else {}))

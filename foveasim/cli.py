@@ -1,4 +1,4 @@
-"""The command line: words to calls, errors to one text. No logic."""
+"""Command line: arguments to calls, exceptions to one line and an exit code; no logic."""
 
 from __future__ import annotations
 
@@ -23,36 +23,44 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-#: Exit code of a run that failed for what it was given.
+#: Exit code for invalid input.
 BAD_INPUT = 2
-#: Exit code of a check that found a broken rule.
-BROKEN_RULE = 1
-#: Exit code of a run that the user stopped, as shells have it.
-STOPPED = 130
+#: Exit code for design-rule violations, failed points and trials.
+FAILED = 1
+#: Exit code after Ctrl-C, by the convention of shells: 128 + SIGINT.
+INTERRUPTED = 130
 
 app = typer.Typer(
-    help="Simulates image sensors whose photosites are arbitrary polygons.",
-    add_completion=False,
+    help="Simulate image sensors with polygonal photosites.",
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
 )
 console = PlainConsole()
 console_of_errors = PlainConsole(stderr=True)
 
-Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; made when it does not exist.")]
-Threads = Annotated[int | None, typer.Option("--threads", help="Threads to use; all cores by default.")]
-
+LAYOUT_HELP = "YAML, GDSII, OASIS, GeoJSON, GeoParquet or npz file, or the name of a bundled layout."
+Out = Annotated[Path, typer.Option("--out", "-o", help="Directory for the results; created when missing.")]
+Changes = Annotated[
+    list[str] | None, typer.Option("--set", help="Replace a setting, for example sensor.bits=10; repeatable.")
+]
+FramesPerS = Annotated[float | None, typer.Option("--fps", help="Frame rate in frames per second.")]
+Threads = Annotated[int | None, typer.Option("--threads", help="Number of threads; one per core by default.")]
+Workers = Annotated[int | None, typer.Option("--workers", help="Number of worker processes; one per core by default.")]
+Scheduler = Annotated[
+    str | None, typer.Option("--scheduler", help="Address of a dask scheduler; local worker processes by default.")
+]
 Metrics = Annotated[
     list[str] | None,
-    typer.Option("--metric", help="One more metric: a name, or module:function, which is imported and run."),
+    typer.Option("--metric", help="Additional metric: a name, or module:function, which is imported; repeatable."),
 ]
 
 
 @app.callback(invoke_without_command=True)
 def options(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Print the version and end.")] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
 ) -> None:
-    """Simulate image sensors whose photosites are arbitrary polygons."""
+    """Simulate image sensors with polygonal photosites."""
     if version:
         sys.stdout.write(f"foveasim {__version__}\n")
     elif context.invoked_subcommand is None:
@@ -61,11 +69,11 @@ def options(
 
 @app.command()
 def demo(out: Out = Path("out"), threads: Threads = None) -> None:
-    """Show a photograph to a foveal colour sensor and to a four-zone sensor."""
+    """Simulate a foveal colour sensor and a four-zone sensor with a photograph as scene."""
     from foveasim.config import demo_settings, write_3d_picture
 
     foveal, *_ = _run(demo_settings(), [], out, threads)
-    with _status("drawing in three dimensions"):
+    with _status("rendering in 3D"):
         path = write_3d_picture(foveal, out)
     if path is not None:
         _report(f"wrote {path}")
@@ -74,47 +82,47 @@ def demo(out: Out = Path("out"), threads: Threads = None) -> None:
 @app.command()
 def run(
     settings: Annotated[Path, typer.Argument(help="YAML file of the shot.")],
-    changes: Annotated[list[str] | None, typer.Option("--set", help="Replace a setting: sensor.bits=10.")] = None,
+    changes: Changes = None,
     out: Out = Path("out"),
     threads: Threads = None,
 ) -> None:
-    """Take the shot that a settings file describes."""
+    """Simulate the shot of a settings file."""
     _run([settings], changes or [], out, threads)
 
 
 @app.command()
 def check(
-    layout: Annotated[
-        Path, typer.Argument(help="YAML, GDSII, OASIS, GeoJSON, GeoParquet or npz file, or a shipped layout's name.")
-    ],
+    layout: Annotated[Path, typer.Argument(help=LAYOUT_HELP)],
     rules: Annotated[
         Path | None,
         typer.Option(
             "--rules",
-            help="YAML file of rules, or a preset's name such as sky130_met1; by default the rules in LAYOUT.",
+            help="YAML file of design rules, or the name of a preset such as sky130_met1; by default the rules in LAYOUT.",
         ),
     ] = None,
-    report_file: Annotated[Path | None, typer.Option("--report", help="Write the violations for KLayout.")] = None,
+    report_file: Annotated[
+        Path | None, typer.Option("--report", help="Write the violations to a KLayout report database (.lyrdb).")
+    ] = None,
 ) -> None:
-    """Check a layout against design rules; the exit code is 1 when one is broken."""
+    """Check a layout against design rules; exit with 1 on violations."""
     from foveasim.config import read_any_layout, read_rules
 
     file = read_any_layout(layout)
     limits = file.rules if rules is None else read_rules(rules)
     if limits is None:
-        _end(f"error: {layout}: holds no rules; name a file of rules with --rules", BAD_INPUT)
+        _end(f"error: {layout}: contains no design rules; specify them with --rules", BAD_INPUT)
     report = file.layout.check(limits)
     console.print(report)
     if report_file is not None:
         report.write(report_file)
         _report(f"wrote {report_file}")
     if not report.ok:
-        raise typer.Exit(BROKEN_RULE)
+        raise typer.Exit(FAILED)
 
 
 @app.command()
 def layouts() -> None:
-    """List the bundled layouts, whose names stand for their files in every command, and the layout families."""
+    """List the bundled layouts, by name, and the layout generators."""
     from rich.table import Table
 
     from foveasim.config import read_layout_file, shipped_layouts
@@ -131,8 +139,8 @@ def layouts() -> None:
             table.add_row(name, f"{found.n_sites:,}", f"{x1 - x0:.5g} x {y1 - y0:.5g}", sizes, found.origin)
     console.print(table)
     families = Table(box=None)
-    families.add_column("family")
-    families.add_column("makes")
+    families.add_column("generator")
+    families.add_column("description")
     for name, generator in sorted(LAYOUTS.items()):
         summary = (generator.__doc__ or "").strip().split("\n\n")[0].split(". ")[0]
         families.add_row(name, " ".join(summary.replace("``", "").split()).rstrip("."))
@@ -142,13 +150,13 @@ def layouts() -> None:
 
 @app.command()
 def describe(
-    layout: Annotated[Path, typer.Argument(help="File of a layout, or the name of one that comes with the package.")],
-    frames_per_s: Annotated[float | None, typer.Option("--fps", help="Frames per second, for the data rate.")] = None,
-    bits: Annotated[int, typer.Option("--bits", help="Bits of a site's value.")] = 10,
-    blanking: Annotated[float, typer.Option("--blanking", help="Time without data over time with data.")] = 0.0,
-    lanes: Annotated[int, typer.Option("--lanes", help="Outputs that share the data.")] = 1,
+    layout: Annotated[Path, typer.Argument(help=LAYOUT_HELP)],
+    frames_per_s: FramesPerS = None,
+    bits: Annotated[int, typer.Option("--bits", help="Bit depth of the codes.")] = 10,
+    blanking: Annotated[float, typer.Option("--blanking", help="Blanking time over readout time.")] = 0.0,
+    lanes: Annotated[int, typer.Option("--lanes", help="Number of output lanes.")] = 1,
 ) -> None:
-    """Progress a layout's counts, areas, fill factor, pixel sizes, channels and data rate."""
+    """Print counts, areas, pixel sizes, channels and, with --fps, the data rate of a layout."""
     from foveasim.config import read_any_layout
     from foveasim.layout import Readout
 
@@ -160,21 +168,21 @@ def describe(
 
 @app.command()
 def convert(
-    source: Annotated[
-        Path, typer.Argument(help="YAML, GDSII, OASIS, GeoJSON, GeoParquet or npz file, or a shipped layout's name.")
+    source: Annotated[Path, typer.Argument(help=LAYOUT_HELP)],
+    target: Annotated[
+        Path, typer.Argument(help="File to write; the format by extension: .gds .oas .geojson .parquet .npz .svg.")
     ],
-    target: Annotated[Path, typer.Argument(help="Its ending names the format: .gds .oas .geojson .parquet .npz .svg")],
-    layer: Annotated[int | None, typer.Option("--layer", help="Layer of the photosites in a chip file.")] = None,
+    layer: Annotated[int | None, typer.Option("--layer", help="GDSII or OASIS layer of the photosites.")] = None,
     dbu_um: Annotated[
-        float | None, typer.Option("--dbu-um", help="Database unit of a chip file to be written.")
+        float | None, typer.Option("--dbu-um", help="Database unit of a GDSII or OASIS file in µm.")
     ] = None,
 ) -> None:
-    """Write a layout in another format, and tell what was lost."""
+    """Convert a layout to another file format, and report rounding and dropped columns."""
     from foveasim.config import read_any_layout
     from foveasim.layout import write_layout
 
     written = write_layout(read_any_layout(source).layout, target, layer=layer, dbu_um=dbu_um)
-    lost = f"; the format holds no {', '.join(written.dropped_columns)}" if written.dropped_columns else ""
+    lost = f"; dropped columns: {', '.join(written.dropped_columns)}" if written.dropped_columns else ""
     _report(
         f"wrote {written.path}: {written.n_sites:,} photosites, vertices moved by at most "
         f"{written.max_displacement_um:.3g} µm, areas changed by at most {100 * written.worst_area_error:.3g} %{lost}"
@@ -186,120 +194,118 @@ def view(
     file: Annotated[
         Path,
         typer.Argument(
-            help="A layout's file or name, a capture (.npz, .zarr), or a report of check (.lyrdb, with --layout)."
+            help="File or name of a layout, a capture (.npz, .zarr), or a report of 'check' (.lyrdb, with --layout)."
         ),
     ],
-    web: Annotated[Path | None, typer.Option("--web", help="Write the page to this .html file.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the page to this .html file.")] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Serve the page on localhost until Ctrl-C.")] = False,
-    port: Annotated[int, typer.Option("--port", help="Port of --serve; 0 for any that is free.")] = 0,
-    layout: Annotated[Path | None, typer.Option("--layout", help="The layout that a report is of.")] = None,
+    port: Annotated[int, typer.Option("--port", help="Port for --serve; 0 for any free one.")] = 0,
+    layout: Annotated[Path | None, typer.Option("--layout", help="Layout of the report.")] = None,
     rules: Annotated[
-        Path | None, typer.Option("--rules", help="Rules to check the layout against: a YAML file or a preset's name.")
+        Path | None, typer.Option("--rules", help="Design rules to check: a YAML file or the name of a preset.")
     ] = None,
     solid: Annotated[
         bool,
-        typer.Option("--solid", help="In three dimensions: a capture as columns, a layout with its wells and lenses."),
+        typer.Option("--solid", help="Show in 3D: columns of a capture, or wells and microlenses of a layout."),
     ] = False,
 ) -> None:
-    """Explore a layout, a capture or a report in a browser, on a page that needs no network."""
+    """Show a layout, a capture or a report in a browser, on a page that works offline."""
     from foveasim._io.atomic import atomic_write
     from foveasim.config import read_viewable
     from foveasim.view.web import check_page_path, open_page, serve_page, solid_page, web_page
 
-    if web is not None and serve:
-        _end("error: --web writes a file and --serve serves the page: take one of them", BAD_INPUT)
+    if out is not None and serve:
+        _end("error: --out and --serve exclude each other; use one of them", BAD_INPUT)
     if port and not serve:
-        _end("error: --port belongs to --serve", BAD_INPUT)
-    if web is not None:
-        check_page_path(web)
+        _end("error: --port requires --serve", BAD_INPUT)
+    if out is not None:
+        check_page_path(out)
     if solid and (rules is not None or layout is not None):
-        _end("error: --solid shows no violations: leave --rules and --layout out", BAD_INPUT)
+        _end("error: --solid shows no violations; omit --rules and --layout", BAD_INPUT)
     with _status("reading"):
         seen = read_viewable(file, layout=layout, rules=rules)
-    with _status("making the page"):
+    with _status("writing the page"):
         flat = None if solid else web_page(seen.data, report=seen.report, name=seen.name)
         text = solid_page(seen.data, name=seen.name) if flat is None else flat
-    if web is not None:
-        with atomic_write(web) as temporary:
+    if out is not None:
+        with atomic_write(out) as temporary:
             temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
-        _report(f"wrote {web}")
+        _report(f"wrote {out}")
         return
     if serve:
-        serve_page(text, port=port, announce=lambda at: _say(f"{file} is at {at} until you press Ctrl-C"))
+        serve_page(text, port=port, announce=lambda url: _say(f"serving {file} at {url}; press Ctrl-C to stop"))
         return
     path, is_opened = open_page(text)
-    _say(f"opened {path}" if is_opened else f"found no browser; open {path} in one")
+    _say(f"opened {path}" if is_opened else f"no browser found; open {path} in one")
 
 
 @app.command()
 def sweep(
-    settings: Annotated[Path, typer.Argument(help="YAML file of the sweep: a shot, and what varies in it.")],
+    settings: Annotated[Path, typer.Argument(help="YAML file of the sweep: a shot, and the values of its settings.")],
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Zarr folder for the results; a sweep that was ended goes on in it.")
+        Path, typer.Option("--out", "-o", help="Zarr store for the results; an interrupted sweep resumes from it.")
     ] = Path("results.zarr"),
-    scheduler: Annotated[
-        str | None,
-        typer.Option("--scheduler", help="Address of a dask scheduler; by default processes of this machine."),
-    ] = None,
-    workers: Annotated[int | None, typer.Option("--workers", help="Those processes; one per core by default.")] = None,
+    scheduler: Scheduler = None,
+    workers: Workers = None,
     metrics: Metrics = None,
-    retry: Annotated[bool, typer.Option("--retry", help="Try points again that failed before.")] = False,
+    retry: Annotated[bool, typer.Option("--retry", help="Repeat points that failed.")] = False,
 ) -> None:
-    """Take a shot with many settings, and tabulate metrics; the exit code is 1 when a point failed."""
+    """Simulate a shot over a grid of settings; exit with 1 when a point failed."""
     from foveasim.explore import read_sweep, run_sweep
 
     plan = read_sweep(settings, metrics=metrics or ())
-    with _progress(settings.stem, f"what is done is kept beside {out}") as progress:
+    with _progress(settings.stem, f"finished points are stored next to {out}") as progress:
         results = run_sweep(plan, out=out, scheduler=scheduler, workers=workers, retry=retry, progress=progress)
     sizes = " x ".join(f"{n} {name}" for name, n in zip(plan.dims, plan.shape, strict=True))
     _report(f"wrote {out}: {plan.n_points:,} points ({sizes})")
     failed = [text for text in results["error"].to_numpy().ravel().tolist() if text]
     if failed:
-        _end(f"{len(failed):,} of {plan.n_points:,} points failed; the first: {failed[0]}", BROKEN_RULE)
+        _end(f"{len(failed):,} of {plan.n_points:,} points failed; the first: {failed[0]}", FAILED)
 
 
 @app.command()
 def study(
     settings: Annotated[
-        Path, typer.Argument(help="YAML file of the study: a shot, where its settings are searched, and what is best.")
+        Path, typer.Argument(help="YAML file of the study: a shot, ranges of its settings, and objectives.")
     ],
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", "-o", help="SQLite file for the trials, study.db by default; a study that was ended goes on in it."
+            "--out", "-o", help="SQLite file for the trials, by default study.db; an interrupted study resumes from it."
         ),
     ] = None,
     storage: Annotated[
-        str | None, typer.Option("--storage", help="URL of a data base that Optuna takes, instead of --out.")
+        str | None, typer.Option("--storage", help="URL of an Optuna database, instead of --out.")
     ] = None,
     trials: Annotated[
-        int | None, typer.Option("--trials", help="Trials that the study has at its end; by default the file's.")
+        int | None, typer.Option("--trials", help="Total number of trials; by default that of the file.")
     ] = None,
-    scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a dask scheduler.")] = None,
+    scheduler: Scheduler = None,
     workers: Annotated[
-        int | None, typer.Option("--workers", help="Processes for the trials of a batch; none but this by default.")
+        int | None,
+        typer.Option("--workers", help="Number of worker processes for batches of trials; this process by default."),
     ] = None,
     metrics: Metrics = None,
 ) -> None:
-    """Search the settings that make a shot best; the exit code is 1 when no trial is good, failed or beyond the limits."""
+    """Optimise settings of a shot; exit with 1 when no trial satisfies the limits."""
     from foveasim.explore import best_table, finished_trials, read_study, run_study, storage_name
 
     if out is not None and storage is not None:
-        _end("error: --out writes a file and --storage names a data base: take one of them", BAD_INPUT)
+        _end("error: --out and --storage exclude each other; use one of them", BAD_INPUT)
     if storage is not None and "://" not in storage:
         _end(f"error: --storage must be a URL, such as sqlite:///study.db, got '{storage}'", BAD_INPUT)
     plan = read_study(settings, metrics=metrics or (), n_trials=trials)
     base = storage or str(out or "study.db")
     place = storage_name(base)
-    with _progress(settings.stem, f"the trials that are done are kept in {place}") as progress:
+    with _progress(settings.stem, f"finished trials are stored in {place}") as progress:
         found = run_study(plan, storage=base, scheduler=scheduler, workers=workers, progress=progress)
     done = finished_trials(found)
     failed = [trial.user_attrs["error"] for trial in done if "error" in trial.user_attrs]
     if failed:
-        _tell(f"{len(failed):,} of {len(done):,} trials failed; the first: {failed[0]}")
+        _report_error(f"{len(failed):,} of {len(done):,} trials failed; the first: {failed[0]}")
     if not found.best_trials:
-        why = "all failed" if len(failed) == len(done) else "those that did not fail are beyond the limits"
-        _end(f"no trial in {place} is good: {why}", BROKEN_RULE)
+        why = "all failed" if len(failed) == len(done) else "all others violate the limits"
+        _end(f"no valid trial in {place}: {why}", FAILED)
     console.print(best_table(plan, found))
     _report(f"wrote {place}: {len(done):,} trials")
 
@@ -307,30 +313,25 @@ def study(
 @app.command()
 def dataset(
     settings: Annotated[
-        Path, typer.Argument(help="YAML file of the dataset: pictures, a shot, and what is drawn of its settings.")
+        Path, typer.Argument(help="YAML file of the dataset: pictures, a shot, and distributions of its settings.")
     ],
     out: Annotated[
         Path,
         typer.Option(
-            "--out", "-o", help="A folder of tar files, or a .zarr folder; a dataset that was ended goes on in it."
+            "--out", "-o", help="Directory of tar shards, or a .zarr store; an interrupted dataset resumes from it."
         ),
     ] = Path("dataset"),
-    workers: Annotated[
-        int | None, typer.Option("--workers", help="Processes; by default one per core, where there is enough to do.")
-    ] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option("--scheduler", help="Address of a dask scheduler; by default processes of this machine."),
-    ] = None,
+    scheduler: Scheduler = None,
+    workers: Workers = None,
 ) -> None:
-    """Take pictures with cameras drawn at random, and write them as samples to learn from."""
+    """Simulate pictures with random camera settings, and write them as samples for learning."""
     from foveasim._core.threads import thread_count
     from foveasim.explore import read_dataset, write_dataset
 
     n_threads = 1 if workers is None else max(1, thread_count() // max(1, workers))
     with _status("reading pictures and settings"):
         file = read_dataset(settings, n_threads=n_threads)
-    with _progress(settings.stem, f"the shards that are done are kept in {out}") as progress:
+    with _progress(settings.stem, f"finished shards are stored in {out}") as progress:
         write_dataset(
             file.dataset, out, per_shard=file.per_shard, workers=workers, scheduler=scheduler, progress=progress
         )
@@ -340,27 +341,25 @@ def dataset(
 @app.command()
 def video(
     settings: Annotated[
-        Path, typer.Argument(help="YAML file of the shot, whose scene's size and light the frames have.")
+        Path, typer.Argument(help="YAML file of the shot; its scene specifies size and radiance of the frames.")
     ],
-    frames: Annotated[Path, typer.Option("--frames", help="Folder of pictures, or a video file.")],
+    frames: Annotated[Path, typer.Option("--frames", help="Directory of pictures, or a video file.")],
     out: Annotated[
         Path,
         typer.Option(
             "--out",
             "-o",
-            help="A .zarr folder with every code, in which a video that was ended goes on; a .mp4, .webm or .gif; or a "
-            "folder of pictures.",
+            help="A .zarr store with all codes, from which an interrupted video resumes; a .mp4, .webm or .gif file; or a "
+            "directory for pictures.",
         ),
     ] = Path("video.zarr"),
-    changes: Annotated[list[str] | None, typer.Option("--set", help="Replace a setting: sensor.bits=10.")] = None,
-    frames_per_s: Annotated[
-        float | None, typer.Option("--fps", help="Frames per second of a folder of pictures.")
-    ] = None,
-    line_s: Annotated[float, typer.Option("--line-s", help="Rolling shutter: seconds from line to line.")] = 0.0,
-    stop: Annotated[int | None, typer.Option("--stop", help="Frames to take, at most.")] = None,
+    changes: Changes = None,
+    frames_per_s: FramesPerS = None,
+    line_s: Annotated[float, typer.Option("--line-s", help="Line time of a rolling shutter in seconds.")] = 0.0,
+    stop: Annotated[int | None, typer.Option("--stop", help="Maximum number of frames.")] = None,
     threads: Threads = None,
 ) -> None:
-    """Take a video with the camera of a settings file: pictures or a video file instead of its scene."""
+    """Simulate a video: the camera of a shot, with pictures or a video file as scenes."""
     from foveasim.config import read_shot, run_video
     from foveasim.video import count_recorded_frames, partial_path
 
@@ -369,23 +368,23 @@ def video(
     with _status("reading settings"):
         shot = read_shot(settings, changes or [], n_threads=threads)
     frame_s = None if frames_per_s is None else 1.0 / frames_per_s
-    is_kept = out.suffix.lower() == ".zarr"
-    was_finished = is_kept and out.exists()
+    is_store = out.suffix.lower() == ".zarr"
+    was_finished = is_store and out.exists()
     try:
         n = run_video(shot, frames, out, frame_s=frame_s, line_s=line_s, stop=stop, n_threads=threads, progress=True)
     except KeyboardInterrupt:
-        n = count_recorded_frames(out) if is_kept and partial_path(out).is_dir() else 0
-        kept = f"; {n:,} frames are kept beside {out}, and the same command goes on from there" if n else ""
-        _end(f"stopped{kept}", STOPPED)
-    told = f"{out} was finished before" if was_finished else f"wrote {out}"
-    _report(f"{told}: {n:,} frames")
+        n = count_recorded_frames(out) if is_store and partial_path(out).is_dir() else 0
+        stored = f"; {n:,} frames are stored next to {out}, run the same command again to resume" if n else ""
+        _end(f"interrupted{stored}", INTERRUPTED)
+    done = f"{out} was already complete" if was_finished else f"wrote {out}"
+    _report(f"{done}: {n:,} frames")
 
 
 @app.command()
 def schema(
-    kind: Annotated[str, typer.Argument(help="What the file describes: shot, sweep, study or dataset.")] = "shot",
+    kind: Annotated[str, typer.Argument(help="Kind of settings file: shot, sweep, study or dataset.")] = "shot",
 ) -> None:
-    """Print the JSON schema of a settings file: of a shot, or of many."""
+    """Print the JSON schema of a kind of settings file."""
     from foveasim.explore import schema_of
 
     sys.stdout.write(json.dumps(schema_of(kind), indent=2) + "\n")
@@ -406,7 +405,7 @@ def _run(settings: Sequence[Path], changes: Sequence[str], out: Path, threads: i
                 results.append(result)
                 written += paths
     except KeyboardInterrupt:
-        _end("stopped", STOPPED)
+        _end("interrupted", INTERRUPTED)
     console.print(results_table(results))
     for path in written:
         _report(f"wrote {path}")
@@ -414,7 +413,7 @@ def _run(settings: Sequence[Path], changes: Sequence[str], out: Path, threads: i
 
 
 def main() -> None:
-    """Run the command line; bad input ends with one line on standard error and the exit code 2."""
+    """Run the command line; invalid input prints one line to standard error and exits with 2."""
     with plain_streams():
         _main()
 
@@ -427,7 +426,7 @@ def _main() -> None:
     except FoveasimError as error:
         _end("; ".join([f"error: {error}", *getattr(error, "__notes__", ())]), BAD_INPUT)
     except MemoryError:
-        _end("error: there is not enough memory for this; take a smaller picture or fewer photosites", BAD_INPUT)
+        _end("error: not enough memory; use a smaller picture or fewer photosites", BAD_INPUT)
     except OSError as error:
         reason = error.strerror or str(error)
         named = FileError(error.filename, reason) if isinstance(error.filename, str) else reason
@@ -437,8 +436,8 @@ def _main() -> None:
 
 
 @contextmanager
-def _progress(name: str, kept: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar with the time left, from the first count on; Ctrl-C ends with what is kept, and how to go on."""
+def _progress(name: str, stored: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a progress bar with the remaining time; Ctrl-C exits with a hint to resume."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -454,25 +453,25 @@ def _progress(name: str, kept: str) -> Iterator[Callable[[int, int], None]]:
     bar = progress.add_task(printable(name), total=None)
 
     def show(n_done: int, n: int) -> None:
-        progress.start()  # now that there are workers
+        progress.start()  # at the first count, when workers are running
         progress.update(bar, completed=n_done, total=n)
 
     try:
         yield show
     except KeyboardInterrupt:
-        _end(f"stopped; {kept}, and the same command goes on from there", STOPPED)
+        _end(f"interrupted; {stored}, run the same command again to resume", INTERRUPTED)
     finally:
         if progress.live.is_started:
             progress.stop()
 
 
 def _status(text: str) -> Status:
-    """A line with a spinner, on terminals only."""
+    """Show a line with a spinner, on terminals only."""
     return console.status(text_of(text), spinner=spinner_of(console))
 
 
 def _say(text: str) -> None:
-    # Flushed: who waits for an address may read it from a pipe.
+    # Flushed: a program may read the address from a pipe.
     sys.stdout.write(printable(text) + "\n")
     sys.stdout.flush()
 
@@ -481,12 +480,12 @@ def _report(text: str) -> None:
     console.print(printable(text), soft_wrap=True)
 
 
-def _tell(text: str) -> None:
+def _report_error(text: str) -> None:
     console_of_errors.print(printable(text), soft_wrap=True)
 
 
 def _end(text: str, code: int) -> NoReturn:
-    _tell(text)
+    _report_error(text)
     sys.exit(code)
 
 

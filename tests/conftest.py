@@ -1,4 +1,4 @@
-"""What some tests need of the machine: ``@pytest.mark.needs("renderer")``, ``"chromium"``, ``"torch"``; and kernels for all processes."""
+"""Requirements of tests, ``@pytest.mark.needs("renderer")``, ``"chromium"``, ``"torch"``; kernels; distribution to processes."""
 
 from __future__ import annotations
 
@@ -31,22 +31,40 @@ PACKAGE = Path(__file__).parents[1] / "foveasim"
 KERNELS = re.compile(r"^from foveasim\._core\.jit import njit$", re.MULTILINE)
 
 
+#: Files with slow tests that share no fixture: each of their tests may run in any process, after all other files, so that the
+#: processes finish at about the same time.
+INDEPENDENT = {
+    "test_gallery.py",
+    "test_docs.py",
+    "test_layout_files_malformed.py",
+    "test_cli_explore.py",
+    "test_principal_point.py",
+}
+
+
 def kernel_modules():
-    """Name of each module whose import compiles kernels."""
+    """Yield the names of the modules that compile kernels on import."""
     for path in sorted(PACKAGE.rglob("*.py")):
         if KERNELS.search(path.read_text()):
             yield ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
 
 
 def pytest_configure(config):
-    """Compile all kernels once, before there are several processes that would each compile them."""
+    """Compile all kernels once, before several processes would each compile them."""
     if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
         for name in kernel_modules():
             import_module(name)
 
 
+def pytest_collection_modifyitems(items):
+    """Run the tests of a file in one process, except for those of ``INDEPENDENT``."""
+    for item in items:
+        if item.path.name not in INDEPENDENT:
+            item.add_marker(pytest.mark.xdist_group(str(item.path)))
+
+
 def pytest_runtest_setup(item):
-    """Skip what this machine cannot run; fail where FOVEASIM_TESTS_NEED names it, so that nobody skips it unawares."""
+    """Skip tests that this machine cannot run, or fail when FOVEASIM_TESTS_NEED contains the requirement."""
     for marker in item.iter_markers("needs"):
         for what in marker.args:
             missing = MISSING[what]()

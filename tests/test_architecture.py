@@ -1,4 +1,4 @@
-"""The house rules that a reader relies on: who imports whom, what is loaded when, units in names, no global randomness."""
+"""Rules of the package: import layers, lazy imports, units in names, no global random state."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from foveasim._core.validation import UNIT_SUFFIXES
 PACKAGE = Path(foveasim.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
-#: Rooms from the bottom up: a room may import from lower lines, and not from its own line or a higher one.
-FLOORS = [
+#: Subpackages and modules by layer, from the bottom: imports from lower layers only.
+LAYERS = [
     {"errors", "_version"},
     {"_core"},
     {"_io", "units"},
@@ -32,19 +32,19 @@ FLOORS = [
     {"explore"},
     {"cli"},
 ]
-#: Loaded when they are used, not before.
+#: Packages that are imported on first use.
 HEAVY = {
     "OpenEXR", "PIL", "astropy", "av", "cv2", "dask", "distributed", "exactextract", "gdstk", "h5netcdf", "h5py", "imagecodecs", "klayout", "manifold3d", "matplotlib", "pyarrow", "numba", "optuna", "pydantic", "pyvista", "rich", "skimage", "tifffile",
     "torch", "trimesh", "typer", "vtk", "xarray", "yaml", "zarr",
 }  # fmt: skip
-#: Names of numbers without a unit, or with the unit of what they are measured with.
+#: Names of dimensionless numbers, or of numbers in the unit of other arguments.
 DIMENSIONLESS = {
     "a", "above", "amplitude", "at_least", "at_most", "blanking", "coefficients", "companding_table", "contrast", "contrast_off", "contrast_on", "custom", "data_range", "dpi", "f_number", "factor", "figure_inches", "fill_factor", "gain", "gamma", "high", "hot_sigmas", "k", "k1", "k2", "k3", "k4", "k5", "k6", "kernel",
     "limit", "log_strength", "low", "magnification", "min_coverage", "misfit", "mtf", "mtf_sigma", "mu", "max_aspect_ratio", "obscuration",
     "max_density", "max_growth", "max_neighbour_ratio", "max_track_utilisation", "min_density", "min_growth", "neighbour_fraction", "noisy_ratio", "p1", "p2", "peak", "per_vertex", "power", "profile", "qe", "ratio", "rounding",
     "ring_ratio", "sensitivity", "snr", "spectrum", "stretch", "tolerance", "transmission", "value", "values", "variance", "weight", "weights", "white", "worst_area_error", "zoom",
 }  # fmt: skip
-#: Names of parts that no user sees, in cells, pitches or steps as their docstrings say.
+#: Names in private functions, in cells, pitches or steps as their docstrings specify.
 INTERNAL = {
     "axes", "bend", "beside", "blur_cells", "blur_lambda_n", "bound", "columns", "corners", "curve", "cycles", "diagonal", "edge", "enough", "extent", "fade", "fraction", "from_step", "function", "gradient", "height", "inl", "mean", "measure",
     "n_across", "moments", "new_radius", "per_step", "pixel", "plane", "points", "quantiles", "r2", "radius", "right", "rows", "s_x", "s_y", "scale", "screen", "share", "side", "shares", "slope", "spread", "start", "tables_at",
@@ -53,7 +53,7 @@ INTERNAL = {
 FLOATING = re.compile(r"\b(float|Floats|PerSite)\b")
 
 
-def room_of(path):
+def subpackage_of(path):
     relative = path.relative_to(PACKAGE)
     return relative.parts[0].removesuffix(".py")
 
@@ -67,14 +67,14 @@ def test_package_lists_public_names_only():
     assert set(dir(foveasim)) == set(foveasim.__all__)
 
 
-#: Methods by which data hand themselves to the room that shows them: these may call upwards, and nothing else may.
+#: Methods that draw their object: only these may import from a higher layer, foveasim.view.
 SHOWN_BY = {"plot", "to_pyvista"}
 
 
-def imported_rooms(path):
-    rooms = set()
+def imported_subpackages(path):
+    subpackages = set()
     tree = ast.parse(path.read_text())
-    handed_up = {
+    upward = {
         node
         for method in ast.walk(tree)
         if isinstance(method, ast.FunctionDef) and method.name in SHOWN_BY
@@ -82,32 +82,32 @@ def imported_rooms(path):
         if isinstance(node, ast.ImportFrom) and node.module == "foveasim.view"
     }
     for node in ast.walk(tree):
-        if node in handed_up:
+        if node in upward:
             continue
         names = []
         if isinstance(node, ast.ImportFrom) and node.module:
             names = [node.module, *(f"{node.module}.{a.name}" for a in node.names if node.module == "foveasim")]
         elif isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        rooms |= {name.split(".")[1] for name in names if name.startswith("foveasim.")}
-    return {room for room in rooms if not room.startswith("__")}
+        subpackages |= {name.split(".")[1] for name in names if name.startswith("foveasim.")}
+    return {name for name in subpackages if not name.startswith("__")}
 
 
-def test_every_room_stands_on_a_floor():
-    rooms = {room_of(path) for path in MODULES} - {"__init__"}
+def test_every_subpackage_has_a_layer():
+    subpackages = {subpackage_of(path) for path in MODULES} - {"__init__"}
 
-    assert rooms == set().union(*FLOORS)
+    assert subpackages == set().union(*LAYERS)
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_imports_go_one_way(path):
-    room = room_of(path)
-    if room == "__init__":
+    name = subpackage_of(path)
+    if name == "__init__":
         return
-    floor = next(i for i, rooms in enumerate(FLOORS) if room in rooms)
-    allowed = set().union(*FLOORS[:floor]) | {room}
+    layer = next(i for i, subpackages in enumerate(LAYERS) if name in subpackages)
+    allowed = set().union(*LAYERS[:layer]) | {name}
 
-    assert imported_rooms(path) <= allowed
+    assert imported_subpackages(path) <= allowed
 
 
 def test_nothing_heavy_is_loaded_by_import():
@@ -145,7 +145,7 @@ def test_random_numbers_come_from_named_streams_only(path):
 
 
 def floating_names(path):
-    """Names of parameters and dataclass fields that are annotated as floating-point numbers."""
+    """Return the names of parameters and dataclass fields with float annotations."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef):
             arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
@@ -172,13 +172,13 @@ def test_floating_point_names_carry_their_unit(path):
     assert bad == set()
 
 
-def test_every_exception_to_the_unit_rule_is_needed():
+def test_unit_rule_exceptions_are_needed():
     used = {name for path in MODULES for name in floating_names(path)}
 
     assert used >= DIMENSIONLESS | INTERNAL
 
 
-def test_the_unit_rule_sees_a_name_without_unit(tmp_path):
+def test_unit_rule_finds_missing_unit(tmp_path):
     bad = tmp_path / "bad.py"
     bad.write_text("def f(radius: float, r_um: float | None = None) -> None: ...\n")
 

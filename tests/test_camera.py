@@ -1,4 +1,4 @@
-"""The whole chain: photometry by hand, two routes, repeatable draws, and what a capture keeps."""
+"""The complete chain: radiometry by hand, equivalent paths, reproducible draws, captures and their files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def rgb_layout():
     return fs.layout.mosaic(layout, ("RG", "GB"))
 
 
-def test_a_flat_scene_gives_the_electrons_that_photometry_says():
+def test_flat_scene_gives_radiometric_electrons():
     """n = E A t λ/(hc) QE with E = π L Δλ / (1 + 4 N²), on the axis."""
     layout = fs.Layout.from_rectangles([[0.0, 0.0]], [[3.0, 2.0]])
     camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout, qe=0.4, dark_e_per_s=7.0))
@@ -52,7 +52,7 @@ def test_a_flat_scene_gives_the_electrons_that_photometry_says():
     assert capture.expected_e[0] == pytest.approx(0.4 * photons + 7.0 * 0.02, rel=2e-5)
 
 
-def test_a_power_map_of_any_other_program_is_taken_as_it_is():
+def test_power_map_gives_its_photons():
     """1 W/m² on 1 µm² for 1 s at 550 nm are 2.76876e6 photons; two bands add up."""
     layout = fs.Layout.from_rectangles([[2.0, 2.0]], 1.0)
     grid = fs.Grid((4, 4), 1.0)
@@ -66,7 +66,7 @@ def test_a_power_map_of_any_other_program_is_taken_as_it_is():
 
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("filters", [None, "rgb"])
-def test_a_scene_and_its_power_map_give_the_same_electrons(precision, filters):
+def test_scene_equals_its_power_map(precision, filters):
     optics = fs.Optics(focal_length_mm=22.0, f_number=4.0, precision=precision)
     sensor = fs.Sensor(rgb_layout(), qe=fs.SiliconQE(depth_um=3.0), filters=filters)
     camera = fs.Camera(optics=optics, sensor=sensor, order=2)
@@ -79,7 +79,7 @@ def test_a_scene_and_its_power_map_give_the_same_electrons(precision, filters):
 
 
 @pytest.mark.parametrize(("cells_per_lambda_n", "order"), [(8.2, 2), (2.1, 2), (1.9, 1), (0.3, 1)])
-def test_cells_have_a_gradient_where_the_lens_makes_the_light_smooth(cells_per_lambda_n, order):
+def test_order_depends_on_cells_per_lambda_n(cells_per_lambda_n, order):
     lambda_n_um = 0.55 * OPTICS.working_f_number(0.5)
     pitch_um = lambda_n_um / cells_per_lambda_n / OPTICS.magnification(0.5)
     shape = (401, 401)
@@ -98,14 +98,14 @@ def test_cells_have_a_gradient_where_the_lens_makes_the_light_smooth(cells_per_l
         shares[asked] = square / whole
 
     assert shares[None] == shares[order]
-    # A square of side λN about the point; without the thin frame around the largest site.
+    # A square of side λN at the point, without the boundary of the largest site.
     if cells_per_lambda_n == 8.2:
         assert shares[2] == pytest.approx(0.528891, abs=4e-4)
         assert abs(shares[1] - 0.528891) > 1e-3
 
 
-def test_each_site_sees_through_its_own_filter():
-    """Light of one narrow band per channel: a site's electrons are those of its own filter's curve."""
+def test_each_site_has_own_filter():
+    """One narrow band per channel: a site's electrons follow its own filter's curve."""
     layout = fs.Layout.from_rectangles([[-6.0, 0.0], [0.0, 0.0], [6.0, 0.0]], 2.0, channel=[2, 0, 1])
     filters = fs.FilterSet(tuple(fs.GaussianCurve(centre_nm=c, fwhm_nm=80.0, peak=0.9) for c in (600.0, 550.0, 450.0)))
     rate = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout, filters=filters)).photoelectrons_per_s(flat_scene())
@@ -115,7 +115,7 @@ def test_each_site_sees_through_its_own_filter():
     assert rate / plain == pytest.approx(at_550, rel=1e-6)
 
 
-def test_electrons_double_with_exposure_and_light():
+def test_electrons_scale_with_exposure_and_radiance():
     camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(rgb_layout()))
     once = camera.capture(flat_scene(0.01), exposure_s=0.01, seed=0).expected_e
 
@@ -124,20 +124,20 @@ def test_electrons_double_with_exposure_and_light():
 
 
 @pytest.mark.parametrize("qe", [0.3, 1.0])
-def test_variance_over_mean_of_electrons_is_one_for_any_quantum_efficiency(qe):
+def test_shot_noise_is_poisson_for_any_qe(qe):
     layout = fs.layout.grid(n_x=200, n_y=200, pitch_um=0.5)
     capture = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout, qe=qe)).capture(
         flat_scene(0.5), exposure_s=0.01, seed=3
     )
     deviation = (capture.electrons - capture.expected_e) / np.sqrt(capture.expected_e)
 
-    # Over n sites: the mean has the standard error 1/sqrt(n), the variance sqrt(2/n).
+    # Over n sites, the standard error of the mean is 1/sqrt(n), of the variance sqrt(2/n).
     assert capture.expected_e.min() > 50
     assert abs(deviation.mean()) < 5 / np.sqrt(40_000)
     assert abs(deviation.var() - 1) < 5 * np.sqrt(2 / 40_000)
 
 
-def test_the_same_seed_gives_the_same_capture_on_any_number_of_threads():
+def test_capture_is_independent_of_threads():
     sensor = fs.Sensor(rgb_layout(), filters="rgb", read_noise_e=2.0)
     scene = picture_scene(shape=(500, 600))
     one, two, again = (
@@ -149,7 +149,7 @@ def test_the_same_seed_gives_the_same_capture_on_any_number_of_threads():
         assert np.array_equal(getattr(again, name), getattr(two, name))
 
 
-def test_other_seeds_and_frames_give_other_draws_of_the_same_expectation():
+def test_seed_and_frame_change_draws_only():
     camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(rgb_layout()))
     first = camera.capture(flat_scene(), exposure_s=0.01, seed=0)
     for other in (
@@ -160,33 +160,33 @@ def test_other_seeds_and_frames_give_other_draws_of_the_same_expectation():
         assert np.mean(other.electrons != first.electrons) > 0.9
 
 
-def test_sites_off_the_scene_are_dark():
+def test_sites_outside_image_are_dark():
     layout = fs.Layout.from_rectangles([[0.0, 0.0], [1e4, 0.0]], 2.0)
     camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout))
 
-    with pytest.warns(CoverageWarning, match="1 of 2 photosites lie partly or wholly off the image"):
+    with pytest.warns(CoverageWarning, match="1 of 2 photosites lie partly or completely outside the image"):
         assert camera.photoelectrons_per_s(flat_scene())[1] == 0.0
 
 
-def test_a_negative_map_is_told_with_the_site():
+def test_negative_irradiance_names_the_site():
     layout = fs.Layout.from_rectangles([[0.5, 0.5], [3.5, 3.5]], 1.0)
     data = np.ones((1, 4, 4))
     data[0, 3, 3] = -0.1
 
-    with pytest.raises(SimulationError, match="the light on site 1 is negative"):
+    with pytest.raises(SimulationError, match="irradiance on site 1 must be >= 0"):
         fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout)).photoelectrons_per_s(
             fs.PowerMap(data, fs.Grid((4, 4), 1.0), np.array([550.0]))
         )
 
 
-def test_a_camera_keeps_its_parts():
+def test_camera_parts_are_read_only():
     camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(rgb_layout()))
 
     with pytest.raises(AttributeError, match="sensor"):
         camera.sensor = fs.Sensor(rgb_layout())
 
 
-def test_compiled_layouts_of_the_grids_used_last_are_kept():
+def test_compiled_layouts_are_cached():
     camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(rgb_layout()))
     grids = [fs.Grid.centred((n, n), 1.0) for n in range(200, 206)]
     first = camera.integrator(grids[0])
@@ -207,18 +207,18 @@ def test_compiled_layouts_of_the_grids_used_last_are_kept():
         ({"sensor": OPTICS, "optics": fs.Sensor(rgb_layout())}, r"'optics' must be a foveasim\.Optics, got a Sensor"),
     ],
 )
-def test_parts_of_the_wrong_kind_are_refused(parts, message):
+def test_parts_of_wrong_type_are_rejected(parts, message):
     with pytest.raises(ParameterError, match=message):
         fs.Camera(**{"optics": OPTICS, "sensor": fs.Sensor(rgb_layout()), **parts})
 
 
-def test_a_nan_under_a_site_is_told_with_the_site():
+def test_nan_irradiance_names_the_site():
     data = np.ones((1, 4, 4))
     data[0, 3, 3] = np.nan
     layout = fs.Layout.from_rectangles([[0.5, 0.5], [3.5, 3.5]], 1.0)
     camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout))
 
-    with pytest.raises(SimulationError, match="the light on site 1 is not finite"):
+    with pytest.raises(SimulationError, match="irradiance on site 1 must be finite"):
         camera.photoelectrons_per_s(fs.PowerMap(data, fs.Grid((4, 4), 1.0), np.array([550.0])))
 
 
@@ -233,7 +233,7 @@ def test_a_nan_under_a_site_is_told_with_the_site():
         ({"light": "scene"}, "'light' must be a Scene or a PowerMap, got a str"),
     ],
 )
-def test_bad_arguments_are_refused_by_name(arguments, message):
+def test_invalid_arguments_are_rejected_by_name(arguments, message):
     camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(rgb_layout()))
     values = {"light": flat_scene(), "exposure_s": 0.01, "seed": 0, **arguments}
 
@@ -250,7 +250,7 @@ def capture():
     return fs.Camera(optics=OPTICS, sensor=sensor).capture(picture_scene(), exposure_s=0.02, seed=5)
 
 
-def test_a_saved_capture_comes_back_whole(capture, tmp_path):
+def test_saved_capture_loads_identically(capture, tmp_path):
     capture.save(tmp_path / "c.npz")
     loaded = fs.Capture.load(tmp_path / "c.npz")
 
@@ -263,7 +263,7 @@ def test_a_saved_capture_comes_back_whole(capture, tmp_path):
     assert loaded.layout.provenance["generator"] == "log_polar"
 
 
-def test_a_capture_tells_how_it_was_made(capture):
+def test_capture_contains_its_settings(capture):
     settings = json.loads(json.dumps(capture.settings))
 
     assert settings["seed"] == 5
@@ -274,7 +274,7 @@ def test_a_capture_tells_how_it_was_made(capture):
     assert settings["layout"]["parameters"]["n_sectors"] == 36
 
 
-def test_a_flat_white_scene_looks_white_after_white_balance():
+def test_white_balance_makes_flat_scene_white():
     sensor = fs.Sensor(rgb_layout(), filters="rgb", qe=fs.SiliconQE(depth_um=3.0), bits=14, shot_noise="off",
                        capacitance_f=rgb_layout().area_um2 * 3e-16)  # fmt: skip
     scene = flat_scene(0.004, wavelength_nm=np.linspace(420, 680, 14), band_width_nm=20.0)
@@ -295,12 +295,12 @@ def test_a_flat_white_scene_looks_white_after_white_balance():
         ({"white_dn": np.array([1.0, np.nan, 1.0])}, "'white_dn' must be finite"),
     ],
 )
-def test_a_capture_whose_parts_do_not_fit_is_refused(capture, changes, message):
+def test_inconsistent_captures_are_rejected(capture, changes, message):
     with pytest.raises(ParameterError, match=message):
         replace(capture, **changes)
 
 
-def test_a_capture_is_read_only(capture):
+def test_capture_is_read_only(capture):
     for name in ("code", "electrons", "expected_e", "filter_of_site", "white_dn"):
         with pytest.raises(ValueError, match="read-only"):
             getattr(capture, name)[0] = 1
@@ -315,7 +315,7 @@ def test_any_provenance_can_be_saved(tmp_path):
     assert fs.Capture.load(tmp_path / "c.npz").layout.provenance["n"] == 3
 
 
-def test_a_filter_that_sees_nothing_does_not_spoil_the_picture():
+def test_zero_filter_gives_finite_white():
     layout = fs.layout.mosaic(fs.layout.grid(n_x=20, n_y=20, pitch_um=2.0), ("RG", "GR"))
     curves = (fs.GaussianCurve(centre_nm=550, fwhm_nm=80), fs.GaussianCurve(centre_nm=400, fwhm_nm=5))
     camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout, filters=fs.FilterSet(curves, ("R", "G"))))
@@ -337,7 +337,7 @@ def test_a_filter_that_sees_nothing_does_not_spoil_the_picture():
         (lambda p: np.savez(p, about=np.array({"a": 1}, dtype=object)), "is corrupt, or no foveasim capture"),
     ],
 )
-def test_a_broken_capture_file_is_refused_in_one_sentence(capture, tmp_path, spoil, message):
+def test_corrupt_capture_files_are_rejected(capture, tmp_path, spoil, message):
     path = tmp_path / "c.npz"
     capture.save(path)
     spoil(path)
@@ -347,7 +347,7 @@ def test_a_broken_capture_file_is_refused_in_one_sentence(capture, tmp_path, spo
     assert caught.value.path == path
 
 
-def test_flipped_bits_give_the_capture_or_one_sentence(capture, tmp_path):
+def test_flipped_bits_are_detected(capture, tmp_path):
     path = tmp_path / "c.npz"
     capture.save(path)
     whole = path.read_bytes()
@@ -367,7 +367,7 @@ def test_flipped_bits_give_the_capture_or_one_sentence(capture, tmp_path):
     assert not any("\n" in sentence for sentence in sentences)
 
 
-def test_a_capture_that_cannot_be_written_leaves_nothing_behind(capture, tmp_path, monkeypatch):
+def test_failed_save_leaves_no_file(capture, tmp_path, monkeypatch):
     (tmp_path / "kept.npz").write_text("before")
 
     def fail(*_args, **_kwargs):
@@ -384,12 +384,12 @@ def test_a_capture_that_cannot_be_written_leaves_nothing_behind(capture, tmp_pat
 @pytest.mark.parametrize(
     ("name", "message"), [("c.txt", "must end in .npz"), ("no/such/c.npz", "the folder .* does not exist")]
 )
-def test_a_target_that_cannot_be_is_refused(capture, tmp_path, name, message):
+def test_invalid_targets_are_rejected(capture, tmp_path, name, message):
     with pytest.raises(FileError, match=message):
         capture.save(tmp_path / name)
 
 
-def test_a_file_that_would_unpack_to_too_much_is_refused(capture, tmp_path, monkeypatch):
+def test_decompression_bombs_are_rejected(capture, tmp_path, monkeypatch):
     capture.save(tmp_path / "c.npz")
     with zipfile.ZipFile(tmp_path / "c.npz") as archive:
         size = sum(item.file_size for item in archive.infolist())
@@ -399,7 +399,7 @@ def test_a_file_that_would_unpack_to_too_much_is_refused(capture, tmp_path, monk
         fs.Capture.load(tmp_path / "c.npz")
 
 
-def test_a_picture_of_a_mosaic_has_a_channel_for_each_filter(capture):
+def test_mosaic_picture_has_filter_channels(capture):
     assert capture.picture(max_pixels=40).data.shape[0] == 3
     with pytest.raises(
         ParameterError, match="'method' must be one of 'cells', 'linear', 'natural', 'least_squares', got 'magic'"
@@ -407,10 +407,10 @@ def test_a_picture_of_a_mosaic_has_a_channel_for_each_filter(capture):
         capture.picture("magic")
 
 
-def test_layouts_with_holes_and_any_shape_go_through_the_whole_chain():
+def test_chain_accepts_layouts_with_holes():
     ring = shapely.Point(0, 0).buffer(6.0).difference(shapely.Point(0, 0).buffer(2.0))
     layout = fs.Layout.from_polygons([ring, shapely.Point(0, 0).buffer(2.0)])
     capture = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout)).capture(flat_scene(), exposure_s=0.01, seed=0)
 
-    # Even light: electrons in proportion to area, but for the falloff over a few µm.
+    # Uniform radiance: electrons are proportional to area, apart from relative illumination over a few µm.
     assert capture.expected_e[0] / capture.expected_e[1] == pytest.approx(ring.area / layout.area_um2[1], rel=1e-4)

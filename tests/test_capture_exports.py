@@ -1,4 +1,4 @@
-"""Captures as labelled datasets, tables and stores: every number with its unit, and back to the last bit."""
+"""Captures as xarray datasets, pandas tables and zarr stores: units, and bit-identical round trips."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import foveasim as fs
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout.packed import packed_layout
 
-#: Names of columns that are taken, that are no names in files, or that lead elsewhere.
+#: Names of columns that are reserved, invalid in files, or paths.
 ODD_NAMES = ("code", "site", "x_um", "a/b", "..", "zarr.json", "__x", "with space", "é", "x" * 300, "area_um2")
 
 

@@ -1,4 +1,4 @@
-"""Every script of the gallery runs, asserts its own number, and writes only where it is told."""
+"""Gallery scripts run, check their own figures, and write to their output directory only."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SCRIPTS = sorted(GALLERY.glob("*.py"))
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda p: p.stem)
-def test_a_script_runs_and_writes_its_pictures(path, tmp_path, monkeypatch):
+def test_script_runs_and_writes_its_pictures(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "out").mkdir()
     spec = importlib.util.spec_from_file_location(f"gallery_{path.stem}", path)
@@ -32,7 +32,7 @@ def test_a_script_runs_and_writes_its_pictures(path, tmp_path, monkeypatch):
     assert all(p.name.startswith(path.stem[:3]) and p.stat().st_size > 1000 for p in written)
 
 
-def test_scripts_are_numbered_through_and_say_what_to_expect():
+def test_scripts_are_numbered_with_expectations():
     assert [path.name[:3] for path in SCRIPTS] == [f"{k:02d}_" for k in range(1, len(SCRIPTS) + 1)]
     for path in SCRIPTS:
         text = path.read_text()

@@ -90,7 +90,7 @@ def test_axis_point_lands_on_the_principal_point():
     lens = from_opencv(matrix_of(), BROWN_CONRADY, image_size=SIZE, pixel_um=PIXEL_UM)
 
     assert lens.centre_um == CENTRE_UM
-    scene = points_of((401, 401), [(200, 200)], 1e4)
+    scene = points_of((201, 201), [(100, 100)], 1e4)
     assert centroid_px(optics_of(), lens, scene, CENTRE_PX) == pytest.approx(CENTRE_PX, abs=1e-3)
 
 
@@ -118,7 +118,7 @@ def test_field_dependent_aberrations_centre_on_axis():
     """Coma vanishes on the axis: the image of the axial point is symmetric about the principal point."""
     lens = Fisheye(projection="equidistant", focal_um=FOCAL_PX * PIXEL_UM, centre_um=CENTRE_UM)
     seidel = fs.optics.Seidel(coma_um=2.0, field_radius_um=300.0)
-    scene = points_of((401, 401), [(200, 200)], 1e4)
+    scene = points_of((201, 201), [(100, 100)], 1e4)
 
     assert centroid_px(optics_of(seidel=seidel), lens, scene, CENTRE_PX) == pytest.approx(CENTRE_PX, abs=2e-3)
 
@@ -139,7 +139,7 @@ def test_reference_picture_centres_on_principal_point():
     sensor = fs.Sensor(fs.layout.grid(n_x=N_X, n_y=N_Y, pitch_um=PIXEL_UM))
     camera = fs.Camera(optics=optics_of(), sensor=sensor, distortion=lens)
     grid = fs.Grid.centred((N_Y, N_X), PIXEL_UM)
-    picture = camera.reference(points_of((401, 401), [(200, 200)], 1e4), grid, exposure_s=1.0)
+    picture = camera.reference(points_of((201, 201), [(100, 100)], 1e4), grid, exposure_s=1.0)
     # The principal point is a corner of pixels: a window of an even number of them is symmetric about it.
     rows, columns = (slice(n // 2 + at - 20, n // 2 + at + 20) for n, at in ((N_Y, 15), (N_X, 20)))
     cells = picture.data[0, rows, columns]

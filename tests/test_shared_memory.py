@@ -304,7 +304,7 @@ def test_read_only_arrays_are_shared():
     assert peak < 0.1 * data.nbytes
 
 
-def test_own_copies_unless_all_owners_are_read_only(tmp_path):
+def test_own_copies_unless_owners_are_read_only(tmp_path):
     data = np.arange(6.0)
     view_of_data = read_only(data[::2])
 

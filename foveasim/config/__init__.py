@@ -1,8 +1,7 @@
 """
-Settings files: YAML to objects of the package and whole shots, and the JSON schema of the settings.
+Settings files in YAML: shots, layouts and design rules, and their JSON schema.
 
-A file names a call of the package and its parameters: the file and the Python call have the same names, defaults and limits.
-A shot runs from its settings file to the files that a user inspects.
+Each section names a call of the package and its parameters: file and Python have the same names, defaults and limits.
 """
 
 from __future__ import annotations

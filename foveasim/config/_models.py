@@ -1,8 +1,8 @@
 """
-What may stand in a settings file.
+Models of settings files.
 
-Every section is a call of a function or class of the package, and its keys are that call's parameters: the file and the
-Python call have the same names, defaults and limits. pydantic reads the types off the signatures, here and nowhere else.
+Every section is a call of a function or class of the package, and its keys are the parameters of this call: file and Python
+have the same names, defaults and limits. The pydantic models follow from the signatures.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ from foveasim.sensor.spectral import CURVES
 
 __all__ = ["Models", "PerArea", "call_of", "models"]
 
-#: What a section is a call of.
+#: The function or class of each section.
 _CALLS: dict[type[BaseModel], Callable[..., Any]] = {}
-#: What sections may be of besides the package's own: when one of these changes, models are made again.
+#: Registries whose members are sections: the models are rebuilt when one of these changes.
 _REGISTRIES: tuple[Registry[Any], ...] = (LAYOUTS, SCENES, LENSES, PUPILS, CURVES, EFFECTS)
 
 _log = logging.getLogger("foveasim")
 
 
 class _Section(BaseModel):
-    """A section of a settings file: unknown keys and other types than stated are errors."""
+    """Base of all sections: unknown keys and other types are errors."""
 
     model_config = ConfigDict(extra="forbid", strict=True, protected_namespaces=())
 
 
 def _model(name: str, call: Callable[..., Any], skip: Sequence[str] = (), **types: Any) -> type[_Section]:
-    """Section with the names, types and defaults of a call's parameters: some skipped, some of other types in files."""
+    """Return a model with the parameters of a call, with file types for some."""
     hints = get_type_hints(call)
     summary, sentences = _documentation(call)
     keys: dict[str, Any] = {
@@ -67,12 +67,12 @@ def _model(name: str, call: Callable[..., Any], skip: Sequence[str] = (), **type
 
 
 def call_of(section: BaseModel) -> Callable[..., Any] | None:
-    """What a section's values are the arguments of; None for a section that only holds values."""
+    """Return the call of a section; None for a section that only contains values."""
     return next((_CALLS[kind] for kind in type(section).__mro__ if kind in _CALLS), None)
 
 
 def _documentation(call: Callable[..., Any]) -> tuple[str, dict[str, str]]:
-    """The first paragraph of a numpydoc docstring, and what it says of each parameter."""
+    """Return the summary of a numpydoc docstring, and the description of each parameter."""
     text = inspect.getdoc(call) or ""
     sentences: dict[str, str] = {}
     names: list[str] = []
@@ -85,22 +85,22 @@ def _documentation(call: Callable[..., Any]) -> tuple[str, dict[str, str]]:
 
 
 def _one_of(tag: str, models: Mapping[str, type[_Section]]) -> Any:
-    """Union of sections that are told apart by a key."""
+    """Return a union of sections with a discriminating key."""
     tagged = [create_model(f"{name} {tag}", __base__=m, **{tag: (Literal[name], ...)}) for name, m in models.items()]  # type: ignore[call-overload]
     return Annotated[Union[tuple(tagged)], Field(discriminator=tag)]  # noqa: UP007 -- a union of a list
 
 
 class PerArea(_Section):
-    """A per-site value in proportion to the site's area."""
+    """A value per site that is proportional to its area."""
 
     per_um2: float
 
 
-_Outline = Annotated[list[list[float]] | str, Field(description="vertices [x, y] in µm, or well-known text")]
-#: Parameters that files write in another way than Python does.
+_Outline = Annotated[list[list[float]] | str, Field(description="vertices [x, y] in µm, or WKT")]
+#: Parameters with other types in files than in Python.
 _IN_FILES: dict[str, Any] = {
-    "density": Annotated[str | None, Field(description="a picture: bright where sites are to be dense")],
-    "importance": Annotated[str, Field(description="a picture: bright where squares are to be small")],
+    "density": Annotated[str | None, Field(description="a picture, proportional to the density of sites")],
+    "importance": Annotated[str, Field(description="a picture, bright where squares are small")],
     "outlines_um": list[_Outline] | None,
     "path": str,
     "picture": str,
@@ -110,14 +110,14 @@ _IN_FILES: dict[str, Any] = {
 _Numbers: Any = float | list[float] | None
 #: Bands of scenes: one wavelength or several.
 _WAVELENGTHS: dict[str, Any] = {"wavelength_nm": _Numbers, "band_width_nm": _Numbers}
-#: Parameters that files do not have: the picture of a density covers the rectangle ``size_um``.
+#: Parameters that files do not contain: a density picture covers the rectangle ``size_um``.
 _NOT_IN_FILES = ("density_grid",)
 _CROSSTALK: dict[str, Callable[..., Any]] = {"diffusion": Diffusion, "kernel": KernelCrosstalk}
 _PerSite = float | PerArea | list[float]
 
 
 class Models(NamedTuple):
-    """Models of settings files: of a whole shot, of a layout, of design rules."""
+    """Models of settings files: shot, layout and design rules."""
 
     shot: type[BaseModel]
     layout: Any
@@ -125,7 +125,7 @@ class Models(NamedTuple):
 
 
 def models() -> Models:
-    """Return the models of settings files, with all that is registered."""
+    """Return the models of settings files, with all registered extensions."""
     for registry in _REGISTRIES:
         len(registry)  # loads entry points
     return _models(tuple(registry.version for registry in _REGISTRIES))
@@ -134,14 +134,14 @@ def models() -> Models:
 def _registered(
     registry: Registry[Any], skip: Sequence[str] = (), title: str = "{}", **types: Any
 ) -> dict[str, type[_Section]]:
-    """Sections of all that is registered; what has parameters of types that files cannot have is left out, with a warning."""
+    """Return sections of registered calls; warn of types that files cannot contain."""
     sections = {}
     for name, call in registry.items():
         try:
             sections[name] = _model(title.format(name), call, skip=skip, **types)
         except Exception as error:  # noqa: BLE001 -- the signature is that of another package
             reason = " ".join(str(error).split())[:200] or type(error).__name__
-            _log.warning("settings files cannot have the %s '%s' (%s)", registry.kind, name, reason)
+            _log.warning("the %s '%s' is not available in settings files (%s)", registry.kind, name, reason)
     return sections
 
 
@@ -178,7 +178,7 @@ def _models(_versions: tuple[int, ...]) -> Models:
         "seed": (int, 0),
         "integration_order": (Literal[1, 2] | None, None),
     }
-    summary = "A whole shot: scene or power map, optics, distortion, layout, sensor, exposure."
+    summary = "A shot: scene or power map, optics, distortion, layout, sensor, exposure."
     return Models(create_model("ShotSection", __base__=_Section, __doc__=summary, **fields), layout, rules)
 
 
@@ -215,7 +215,7 @@ def _sensor() -> type[_Section]:
 
 
 def _layout(rules: type[_Section]) -> Any:
-    """Union of the sections of all layout families."""
+    """Return the union of the sections of all layout generators."""
     fields: dict[str, Any] = {
         "mosaic": (str | list[str] | None, None),
         "move_um": (tuple[float, float], (0.0, 0.0)),

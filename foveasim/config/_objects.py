@@ -1,4 +1,4 @@
-"""What settings files give: layouts with their rules, and whole shots."""
+"""Objects from settings files: layouts with their design rules, and shots."""
 
 from __future__ import annotations
 
@@ -45,28 +45,28 @@ __all__ = [
     "schema",
 ]
 
-#: Pictures that come with scikit-image are named with this in front.
+#: Prefix of the names of pictures that scikit-image contains.
 BUNDLED_PICTURE = "skimage:"
-#: Endings of files that hold settings; a layout in any other file is told by its content.
+#: Extensions of settings files; the format of other layout files follows from their content.
 YAML_ENDINGS = (".yaml", ".yml")
-#: Settings whose value may be the name of a file.
+#: Settings whose value may be a file.
 FILE_SETTINGS = ("density", "importance", "layout", "path", "picture")
-#: A picture's sides may have this relative difference from those of the rectangle that it covers.
+#: Tolerance of the aspect ratio of a picture and the rectangle that it covers.
 SHAPE_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
 class LayoutFile:
     """
-    A layout with what its file says about it.
+    A layout with the design rules and the source in its file.
 
     Attributes
     ----------
     layout : Layout
     rules : DesignRules or None
-        Rules that the layout is meant to keep.
+        Rules that the layout is designed for.
     source : str
-        Where its figures come from.
+        Source of its figures.
     """
 
     layout: Layout
@@ -77,17 +77,16 @@ class LayoutFile:
 @dataclass(frozen=True, kw_only=True)
 class Shot:
     """
-    A camera, a scene and an exposure: what a settings file describes.
+    A camera, a scene and an exposure, as in a settings file.
 
     Attributes
     ----------
     name : str
-        The file's name without its ending.
+        File name without extension.
     scene : Scene or PowerMap
-        What is captured.
     camera : Camera
     rules : DesignRules or None
-        Rules that the sensor's layout is meant to keep.
+        Rules that the layout is designed for.
     exposure_s : float, s
     seed : int
     """
@@ -102,32 +101,31 @@ class Shot:
 
 def read_shot(path: str | Path, changes: Sequence[str] = (), *, n_threads: int | None = None) -> Shot:
     """
-    Read a settings file and build what it describes.
+    Read a settings file and return its shot.
 
     Parameters
     ----------
     path : path
-        YAML. Pictures and layouts that it names are looked for beside it; ``skimage:astronaut`` and its like are the
-        pictures that come with scikit-image.
+        A YAML file. Paths in it are relative to its directory; ``skimage:NAME``, such as ``skimage:astronaut``, is a picture
+        of scikit-image.
     changes : sequence of "key=value"
-        Settings to be replaced: ``sensor.bits=10``; the value is read as YAML. Files named here are looked for in the
-        current folder.
+        Settings to replace, such as ``sensor.bits=10``, with values in YAML. Paths are relative to the working directory.
     n_threads : int, optional
-        For the camera.
+        Number of threads of the camera.
 
     Raises
     ------
     ConfigError
-        With the file, the place in it, what was expected and got.
+        When a setting is invalid; with the file, the path of the key, and the expected and actual value.
     FileError
-        When a picture that the file names cannot be read.
+        When a picture of the file cannot be read.
     """
     return build_shot(path, read_settings(path, changes), n_threads=n_threads)
 
 
 def read_settings(path: str | Path, changes: Sequence[str] = ()) -> dict[str, Any]:
     """
-    What a shot's settings file says, as plain data, with changes.
+    Read a shot's settings file as plain data, with changes.
 
     Parameters
     ----------
@@ -137,7 +135,7 @@ def read_settings(path: str | Path, changes: Sequence[str] = ()) -> dict[str, An
     Raises
     ------
     ConfigError
-        When it is no YAML, or a change is none.
+        When the file is not valid YAML, or a change is not "key=value".
     """
     path = Path(path)
     data = read_yaml(path)
@@ -148,24 +146,24 @@ def read_settings(path: str | Path, changes: Sequence[str] = ()) -> dict[str, An
 
 def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
     """
-    Names and types of a shot's settings, before anything is built.
+    Check names and types of a shot's settings.
 
     Parameters
     ----------
     path : path
-        Of the file that the settings are from, for messages.
+        File of the settings, for messages.
     settings : mapping
-        As :func:`read_settings` gives them.
+        As :func:`read_settings` returns them.
 
     Raises
     ------
     ConfigError
-        With the file, the place in it, what was expected and got.
+        When a setting is invalid.
     """
     validated(Path(path), models().shot, dict(settings))
 
 
-def _made_anew(_part: str, _settings: Any, make: Callable[[], Any]) -> Any:
+def _make(_part: str, _settings: Any, make: Callable[[], Any]) -> Any:
     return make()
 
 
@@ -174,21 +172,21 @@ def build_shot(
     data: Mapping[str, Any],
     *,
     n_threads: int | None = None,
-    kept: Callable[[str, Any, Callable[[], Any]], Any] = _made_anew,
+    kept: Callable[[str, Any, Callable[[], Any]], Any] = _make,
 ) -> Shot:
     """
-    Build the shot that settings describe.
+    Return the shot of settings.
 
     Parameters
     ----------
     path : path
-        Of the file that they are from: pictures and layouts that they name are looked for beside it.
+        File of the settings; paths in them are relative to its directory.
     data : mapping
-        As :func:`read_settings` gives them.
+        As :func:`read_settings` returns them.
     n_threads : int, optional
-        For the camera.
+        Number of threads of the camera.
     kept : callable, optional
-        ``kept(part, settings, make)`` gives what ``make()`` makes of a part's settings, or what it made of the same before.
+        A cache: ``kept(part, settings, make)`` returns ``make()``, or an earlier result for equal settings of the part.
 
     Raises
     ------
@@ -220,7 +218,7 @@ def build_shot(
     )
     distortion = kept("distortion", data.get("distortion"), lambda: _built(path, "distortion", settings.distortion))
     scene = kept("scene", data["scene"], lambda: _built(path, "scene", settings.scene))
-    # What would end the capture is told before it begins, with its place in the file.
+    # Errors of a capture are raised here, before it starts, with the path of the key.
     if isinstance(scene, Scene):
         _call(path, "scene", optics.grid, {"scene": scene})
         _call(path, "optics", optics.check, {"scene": scene})
@@ -236,7 +234,7 @@ def build_shot(
     return Shot(
         name=path.stem,
         scene=scene,
-        # Another lens, or other electronics, look through the layout that was compiled for the first.
+        # Other optics and electronics share the compiled layout.
         camera=camera.replace(optics=optics, sensor=sensor),
         rules=file.rules,
         exposure_s=exposure_s,
@@ -251,7 +249,7 @@ def read_layout_file(path: str | Path) -> LayoutFile:
     Raises
     ------
     ConfigError
-        With the file, the place in it, what was expected and got.
+        When the file is invalid; with the file, the path of the key, and the expected and actual value.
     """
     path = Path(path)
     return _built_layout(path, "", validated(path, models().layout, read_yaml(path)))
@@ -259,7 +257,7 @@ def read_layout_file(path: str | Path) -> LayoutFile:
 
 def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None = None, **options: Any) -> Layout:
     """
-    Read a layout from a file of any format, or by the name of a layout that comes with the package.
+    Read a layout from a file of any format, or a bundled layout by its name.
 
     Parameters
     ----------
@@ -268,24 +266,23 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
         parameters; or a name, such as ``"giotto_2"``. A file of that name in the working directory comes first, as on
         the command line.
     layer : int, optional
-        Of GDSII and OASIS: the layer that contains the photosites; needed where shapes lie on several.
+        GDSII and OASIS: the layer of the photosites; required when several layers contain shapes.
     cell : str, optional
-        Of GDSII and OASIS: the cell to read, with all cells below it; needed where there are several top cells.
+        GDSII and OASIS: the top cell to read; required when there are several.
     **options
-        Of other formats in :data:`foveasim.layout.FORMATS`.
+        Options of other formats in :data:`foveasim.layout.FORMATS`.
 
     Returns
     -------
     Layout
-        Without the design rules and the source that a YAML file may state: :func:`foveasim.config.read_any_layout`
-        returns these too.
+        Without the design rules and the source of a YAML file: :func:`foveasim.config.read_any_layout` returns these too.
 
     Raises
     ------
     FileError
-        When there is neither such a file nor such a name, or the file is corrupt, truncated, too large, or not a layout.
+        When neither a file nor a bundled layout has this name, or the file is corrupt, too large, or not a layout.
     ParameterError
-        When an option does not belong to the file's format.
+        When the format of the file does not have an option.
 
     Examples
     --------
@@ -300,23 +297,23 @@ def read_any_layout(
     path: str | Path, *, folder: str | Path = ".", layer: int | None = None, cell: str | None = None, **options: Any
 ) -> LayoutFile:
     """
-    Read a layout from a YAML file, from a file of any other format, or by the name of a layout that comes with the package.
+    Read a layout with its design rules from a file, or a bundled one by its name.
 
     Parameters
     ----------
     path : path or str
-        A file in the folder comes before a bundled layout of the same name.
+        A file takes precedence over a bundled layout of the same name.
     folder : path
-        Where the path begins; the working directory by default.
+        Directory of relative paths; the working directory by default.
     layer, cell : optional
-        Of GDSII and OASIS, as for :func:`foveasim.layout.read_layout`.
+        GDSII and OASIS, as for :func:`foveasim.layout.read_layout`.
 
     Raises
     ------
     FileError
-        When there is neither such a file nor such a name, or it cannot be read.
+        When neither a file nor a bundled layout has this name, or it cannot be read.
     ParameterError
-        When an option does not belong to the file's format.
+        When the format of the file does not have an option.
     """
     path = layout_path(path, folder)
     if path.suffix.lower() in YAML_ENDINGS:
@@ -327,12 +324,12 @@ def read_any_layout(
 
 def read_rules(path: str | Path) -> DesignRules:
     """
-    Read a YAML file of design rules (limits by their names, and waivers), or take a preset by its name.
+    Read design rules from a YAML file of limits and waivers, or a preset by its name.
 
     Raises
     ------
     ConfigError
-        With the file, the place in it, what was expected and got.
+        When the file is invalid; with the file, the path of the key, and the expected and actual value.
     """
     path = Path(path)
     if str(path) in PRESETS and not path.exists():
@@ -342,7 +339,7 @@ def read_rules(path: str | Path) -> DesignRules:
 
 
 def schema(section: Any = None, title: str = "foveasim settings") -> dict[str, Any]:
-    """JSON schema of a settings file, or of a file whose model is given."""
+    """Return the JSON schema of shots, or of a model."""
     model_schema = TypeAdapter(models().shot if section is None else section).json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model_schema, "title": title}
 
@@ -369,7 +366,7 @@ def _built_layout(path: Path, place: str, section: Any) -> LayoutFile:
 
 
 def _picture_values(path: Path, place: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """A picture's values from 0 to 1, colours averaged, instead of its name; for a density also where its pixels are."""
+    """Return a picture's grey values, 0 to 1, and for a density their grid."""
     name = place.rpartition(".")[2]
     picture = read_picture(picture_path(path, values[name], place))
     scale = np.iinfo(picture.dtype).max if picture.dtype.kind == "u" else 1.0
@@ -378,18 +375,19 @@ def _picture_values(path: Path, place: str, values: Mapping[str, Any]) -> dict[s
     if name != "density":
         return {name: grey}
     if values["size_um"] is None:
-        raise ConfigError(path, f"{place}: needs 'size_um', the rectangle that the picture covers")
+        raise ConfigError(path, f"{place}: requires 'size_um', the rectangle that the picture covers")
     (width_um, height_um), (n_y, n_x) = values["size_um"], grey.shape
     if abs(width_um * n_y - height_um * n_x) > SHAPE_ROUNDING * abs(width_um * n_y):
         raise ConfigError(
-            path, f"{place}: has {n_x} x {n_y} pixels, which do not fit 'size_um' of {width_um:g} x {height_um:g} µm"
+            path,
+            f"{place}: must have the aspect ratio of 'size_um', {width_um:g} x {height_um:g} µm, got {n_x} x {n_y} pixels",
         )
     grid = _call(path, place, Grid.centred, {"shape": grey.shape, "pitch_um": width_um / n_x})
     return {name: grey, "density_grid": grid}
 
 
 def _values(path: Path, place: str, section: BaseModel) -> dict[str, Any]:
-    """A section's values as arguments of its call: sections inside it built, names of pictures as paths."""
+    """Return a section's values as arguments of its call, with nested sections built."""
     return {
         name: _built(path, place + name, getattr(section, name))
         for name in type(section).model_fields
@@ -414,7 +412,7 @@ def _callable(section: BaseModel) -> Callable[..., Any]:
 
 
 def _call(path: Path, place: str, function: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
-    """Call, with the place in the file put in front of what it raises."""
+    """Call a function; errors begin with the path of the key."""
     try:
         return function(**arguments)
     except ParameterError as error:
@@ -426,21 +424,21 @@ def _call(path: Path, place: str, function: Callable[..., Any], arguments: Mappi
 
 def picture_path(path: Path, picture: str, place: str) -> Path:
     """
-    The file of a picture that a settings file names: one beside it, or one that comes with scikit-image.
+    Return the file of a picture in a settings file.
 
     Parameters
     ----------
     path : Path
-        Of the settings file.
+        The settings file.
     picture : str
-        A file, or ``skimage:astronaut`` and its like.
+        A file, or a picture of scikit-image such as ``skimage:astronaut``.
     place : str
-        Of the name in the settings file, for messages.
+        Path of the key in the settings file, for messages.
 
     Raises
     ------
     ConfigError
-        When scikit-image brings no such picture.
+        When scikit-image does not contain the picture.
     """
     if not picture.startswith(BUNDLED_PICTURE):
         return path.parent / picture
@@ -449,12 +447,14 @@ def picture_path(path: Path, picture: str, place: str) -> Path:
         Path(str(f)).stem: Path(str(f)) for f in files("skimage.data").iterdir() if f.name.endswith((".png", ".jpg"))
     }
     if name not in bundled:
-        raise ConfigError(path, f"{place}: scikit-image brings no picture '{name}', only {', '.join(sorted(bundled))}")
+        raise ConfigError(
+            path, f"{place}: scikit-image does not contain '{name}'; its pictures are {', '.join(sorted(bundled))}"
+        )
     return bundled[name]
 
 
 def _replace(path: Path, data: dict[str, Any], change: str) -> None:
-    """Replace one setting by a "key=value" of the command line."""
+    """Replace one setting by a "key=value"."""
     key, equals, value = change.partition("=")
     if not equals or not all(key.strip().split(".")):
         raise ConfigError(path, f"a change must be 'key=value', such as sensor.bits=10, got '{change}'")
@@ -463,39 +463,39 @@ def _replace(path: Path, data: dict[str, Any], change: str) -> None:
 
 def put_setting(path: str | Path, data: dict[str, Any], key: str, value: Any) -> None:
     """
-    Put a value at a setting's place, such as ``"sensor.bits"``, in settings that are changed.
+    Set a value by its path, such as ``"sensor.bits"``, in place.
 
     Raises
     ------
     ConfigError
-        When the key is empty in parts, or leads through a value that is no section.
+        When a part of the path is empty, or not a section.
     """
     names = key.split(".")
     if not all(names):
-        raise ConfigError(path, f"'{key}' is no setting's place, such as sensor.bits")
+        raise ConfigError(path, f"'{key}' must be the path of a setting, such as sensor.bits")
     place: Any = data
     for i, name in enumerate(names[:-1]):
         place = place.setdefault(name, {})
         if not isinstance(place, dict):
             raise ConfigError(
-                path, f"'{key}={value}' cannot be set: {'.'.join(names[: i + 1])} is no section but {place!r}"
+                path, f"'{key}={value}' cannot be set: {'.'.join(names[: i + 1])} must be a section, got {place!r}"
             )
     place[names[-1]] = value
 
 
 def files_from(folder: Path, value: Any, key: str = "", found: list[Path] | None = None) -> Any:
     """
-    Settings with the files that they name made absolute.
+    Return settings with absolute paths of files.
 
     Parameters
     ----------
     folder : Path
-        Where they are looked for.
+        Directory of relative paths.
     value : plain data
     key : str
-        Place of the value in the settings.
+        Path of the value in the settings.
     found : list of Path, optional
-        The files are added to it.
+        Output: the files are appended.
     """
     if isinstance(value, dict):
         return {name: files_from(folder, item, name, found) for name, item in value.items()}

@@ -1,4 +1,4 @@
-"""Settings against their models, every problem told in one sentence with its place."""
+"""Validation of settings: each problem in one line, with the path of its key."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from foveasim.errors import ConfigError
 
 __all__ = ["validated"]
 
-#: Problems of a file that one message names.
+#: Maximum number of problems in one message.
 SHOWN_PROBLEMS = 3
 
 
 def validated(path: Path, kind: Any, data: dict[str, Any]) -> Any:
     """
-    The settings as a model.
+    Return settings as an instance of a model.
 
     Raises
     ------
     ConfigError
-        With the file, the place in it, what was expected and got.
+        With the file, the path of the key, and the expected and actual value.
     """
     try:
         return TypeAdapter(kind).validate_json(json.dumps(data, default=_refuse), strict=True)
@@ -34,18 +34,18 @@ def validated(path: Path, kind: Any, data: dict[str, Any]) -> Any:
         more = len(problems) - SHOWN_PROBLEMS
         raise ConfigError(path, shown + (f"; and {more} more" if more > 0 else "")) from None
     except (ValueError, RecursionError) as error:
-        raise ConfigError(path, f"holds a value that cannot be read ({error})") from None
+        raise ConfigError(path, f"contains an unreadable value ({error})") from None
 
 
 def _refuse(value: object) -> None:
-    raise ValueError(f"a {type(value).__name__} is neither number, text, list nor section")
+    raise ValueError(f"a {type(value).__name__} is not a number, string, list or section")
 
 
 def _problems(data: dict[str, Any], error: ValidationError) -> list[str]:
-    """Every problem once, as "place: what is wrong"."""
+    """Return every distinct problem as "key: problem"."""
     found = [(_place(data, item), item) for item in error.errors(include_url=False)]
-    # Where several types are allowed, pydantic tells what is wrong with each: the nearest one says what was meant.
-    told = [
+    # For a union, pydantic reports a problem for every type: only those of the deepest key matter.
+    problems = [
         f"{'.'.join(place) or 'the file'}{_sentence(item)}"
         for place, item in found
         if not (
@@ -56,15 +56,15 @@ def _problems(data: dict[str, Any], error: ValidationError) -> list[str]:
             )
         )
     ]
-    return list(dict.fromkeys(told))
+    return list(dict.fromkeys(problems))
 
 
 def _place(data: Any, error: Any) -> tuple[str, ...]:
-    """Keys and positions that lead to a problem, without the names of alternatives that pydantic puts among them."""
+    """Return the keys and indices of a problem, without pydantic's tags of union members."""
     place = []
     tags = _tags(data)
     for i, part in enumerate(error["loc"]):
-        if part in tags:  # the alternative that a section's key chose, which may be the name of another key
+        if part in tags:  # a tag of a union, which may equal the name of a key
             tags = ()
         elif (isinstance(data, dict) and part in data) or (
             isinstance(data, list) and isinstance(part, int) and part < len(data)
@@ -78,7 +78,7 @@ def _place(data: Any, error: Any) -> tuple[str, ...]:
 
 
 def _tags(data: Any) -> tuple[Any, ...]:
-    """What a section's key may have chosen among alternatives."""
+    """Return the possible union tags of a section."""
     return (data.get("kind"), data.get("generator")) if isinstance(data, dict) else ()
 
 
@@ -87,9 +87,9 @@ def _sentence(error: Any) -> str:
         case "extra_forbidden":
             return ": no such setting"
         case "missing":
-            return ": is missing"
+            return ": missing"
         case "union_tag_not_found":
-            return f": needs the key {error['ctx']['discriminator']}"
+            return f": requires the key {error['ctx']['discriminator']}"
         case "union_tag_invalid":
             key = error["ctx"]["discriminator"].strip("'")
             return f".{key}: must be one of {error['ctx']['expected_tags']}, got '{error['ctx']['tag']}'"

@@ -1,4 +1,4 @@
-"""Taking a shot, writing its results, and telling of them."""
+"""Simulation of a shot, its result files, and the summary table."""
 
 from __future__ import annotations
 
@@ -23,64 +23,64 @@ from foveasim.view.renderer import what_to_install
 
 __all__ = ["Result", "check_folder", "demo_settings", "results_table", "run_shot", "write_results"]
 
-#: The demo's shots, in the order shown.
+#: Shots of the demo, in the order of the table.
 DEMO_SHOTS = ("foveal", "four_zones")
-#: Side of the pictures that a shot writes.
+#: Longer side of the pictures that a shot writes.
 PICTURE_PIXELS = 1024
 
 
 def demo_settings() -> list[Path]:
-    """The settings files of the demo's shots, which come with the package."""
+    """Return the bundled settings files of the demo."""
     return [Path(str(files("foveasim.config") / f"{name}.yaml")) for name in DEMO_SHOTS]
 
 
 def check_folder(folder: str | Path) -> Path:
     """
-    The folder for results, before anything is computed for it.
+    Return the path of a directory for results, after a check of permissions.
 
     Raises
     ------
     FileError
-        When there is a file of its name, or it could not be made.
+        When a file is in its place, or it cannot be created or written.
     """
     folder = Path(folder)
     present = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not present.is_dir():
-        raise FileError(folder, f"cannot hold results: {present} is a file, and must be a folder")
+        raise FileError(folder, f"cannot contain results: {present} is a file; choose a directory")
     if not os.access(present, os.W_OK | os.X_OK):
-        raise FileError(folder, f"cannot hold results: nothing may be written in {present}")
+        raise FileError(folder, f"cannot contain results: {present} is not writable")
     return folder
 
 
 def write_results(shot: Shot, capture: Capture, folder: str | Path) -> tuple[list[Path], float]:
     """
-    Write a capture's files: ``NAME_picture.png``, ``NAME_layout.png``, ``NAME_capture.npz``.
+    Write ``NAME_picture.png``, ``NAME_layout.png`` and ``NAME_capture.npz``.
 
     Parameters
     ----------
     shot : Shot
     capture : Capture
     folder : path
-        Made when it does not exist. Each file is put in it when it is complete.
+        Created when missing. Each file is written atomically.
 
     Returns
     -------
     paths : list of path
     seconds : float, s
-        Time that it took.
+        Elapsed time.
 
     Raises
     ------
     FileError
-        When the folder cannot be made or written.
+        When the directory cannot be created or written.
     """
     start_s = time.perf_counter()
     folder = check_folder(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise FileError(folder, f"cannot be made: {error.strerror or error}") from None
-    picture, layout, saved = (folder / f"{shot.name}_{what}" for what in ("picture.png", "layout.png", "capture.npz"))
+        raise FileError(folder, f"cannot be created: {error.strerror or error}") from None
+    picture, layout, saved = (folder / f"{shot.name}_{part}" for part in ("picture.png", "layout.png", "capture.npz"))
     capture.picture(max_pixels=PICTURE_PIXELS).save(picture, capture.white_dn, encode_srgb=True)
     axes = plot_capture(capture)
     axes.set_title(f"{printable(shot.name)}: {capture.layout.n_sites} photosites", parse_math=False)
@@ -91,7 +91,7 @@ def write_results(shot: Shot, capture: Capture, folder: str | Path) -> tuple[lis
 
 @dataclass(frozen=True)
 class Result:
-    """A shot with its capture, the report of its design rules, and the seconds that writing its files took."""
+    """A shot with its capture, the report of its design rules, and the time to write files."""
 
     shot: Shot
     capture: Capture
@@ -101,7 +101,7 @@ class Result:
 
 def run_shot(shot: Shot, folder: str | Path) -> tuple[Result, list[Path]]:
     """
-    Take a shot, check its layout against its rules, and write its files.
+    Simulate a shot, check its design rules, and write its files.
 
     Returns
     -------
@@ -112,7 +112,7 @@ def run_shot(shot: Shot, folder: str | Path) -> tuple[Result, list[Path]]:
     Raises
     ------
     FoveasimError
-        When parts do not fit together, or files cannot be written.
+        When the parts are incompatible, or files cannot be written.
     """
     capture = shot.camera.capture(shot.scene, exposure_s=shot.exposure_s, seed=shot.seed)
     report = None if shot.rules is None else capture.layout.check(shot.rules)
@@ -122,17 +122,17 @@ def run_shot(shot: Shot, folder: str | Path) -> tuple[Result, list[Path]]:
 
 def write_3d_picture(result: Result, folder: str | Path) -> Path | None:
     """
-    Write ``NAME_3d.png``: photosites as columns as high as their codes, by PyVista.
+    Write ``NAME_3d.png``: photosites as prisms with their codes as height, by PyVista.
 
     Returns
     -------
     path : Path or None
-        None where PyVista or OpenGL is missing.
+        None when PyVista or OpenGL is missing.
 
     Raises
     ------
     FileError
-        When the folder cannot be written.
+        When the directory cannot be written.
     """
     if what_to_install():
         return None
@@ -142,8 +142,8 @@ def write_3d_picture(result: Result, folder: str | Path) -> Path | None:
 
 
 def results_table(results: Sequence[Result]) -> Table:
-    """Table of what the shots' sensors saw, a column a shot."""
-    table = Table(title="What the sensors saw")
+    """Return a table of the shots' captures, one column per shot."""
+    table = Table(title="Captures")
     table.add_column("")
     for result in results:
         table.add_column(text_of(result.shot.name), justify="right")
@@ -155,14 +155,14 @@ def results_table(results: Sequence[Result]) -> Table:
         "largest pixel / µm": [f"{np.sqrt(c.layout.area_um2.max()):.2f}" for c in captures],
         "blind-spot radius / µm": [_blind_spot(c.layout) for c in captures],
         "median electrons": [f"{np.median(c.electrons):,.0f}" for c in captures],
-        "most electrons": [f"{c.electrons.max():,}" for c in captures],
+        "maximum electrons": [f"{c.electrons.max():,}" for c in captures],
         "median code / DN": [f"{np.median(c.code):,.0f} of {2**c.bits - 1:,}" for c in captures],
         "sites at code 0 / %": [f"{100 * np.mean(c.code == 0):.2f}" for c in captures],
         "saturated sites / %": [f"{100 * c.saturated_fraction:.2f}" for c in captures],
     }
     for stage in dict.fromkeys(stage for c in captures for stage in c.stage_s):
         rows[f"{stage} / s"] = [f"{c.stage_s.get(stage, 0.0):.3f}" for c in captures]
-    rows["pictures and files / s"] = [f"{result.writing_s:.3f}" for result in results]
+    rows["write files / s"] = [f"{result.writing_s:.3f}" for result in results]
     for title, values in rows.items():
         table.add_row(title, *values)
     return table
@@ -170,16 +170,16 @@ def results_table(results: Sequence[Result]) -> Table:
 
 def _verdict(report: Report | None) -> str:
     if report is None:
-        return "none given"
-    return "kept" if report.ok else f"{sum(len(result) for result in report.results):,} violations"
+        return "none"
+    return "satisfied" if report.ok else f"{sum(len(result) for result in report.results):,} violations"
 
 
 def _blind_spot(layout: Layout) -> str:
-    """Radius of the hole in the middle of the innermost ring, when there is one."""
+    """Return the radius of the hole at the centre of the innermost ring, or "none"."""
     if "ring" not in layout.columns:
         return "none"
     innermost = layout[layout.columns["ring"] == layout.columns["ring"].min()]
-    middle_um = innermost.centroid_um.mean(axis=0)
-    if shapely.intersects_xy(innermost.polygons(), *middle_um).any():
+    centre_um = innermost.centroid_um.mean(axis=0)
+    if shapely.intersects_xy(innermost.polygons(), *centre_um).any():
         return "none"
-    return f"{np.linalg.norm(innermost.xy_um - middle_um, axis=1).min():.2f}"
+    return f"{np.linalg.norm(innermost.xy_um - centre_um, axis=1).min():.2f}"

@@ -1,4 +1,4 @@
-"""A shot whose scene moves: the frames of a folder or a video file instead of its picture."""
+"""Videos with the camera of a shot: pictures or a video file instead of its scene."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from foveasim.video.frame_source import pictures_in
 
 __all__ = ["run_video"]
 
-#: How long a frame is shown where nobody said.
+#: Frame period in video files when none is specified.
 USUAL_FRAME_S = 1.0 / 25.0
-#: Parts of the shot's scene instead of which the frames have their own.
+#: Attributes of the scene that the frames replace.
 OF_FRAMES = ("basis", "source")
 
 
@@ -37,47 +37,50 @@ def run_video(
     progress: bool = False,
 ) -> int:
     """
-    Take a video with a shot's camera, and write it; a zarr folder is gone on with where it was ended.
+    Simulate and write a video with a shot's camera; an interrupted zarr store resumes.
 
     Parameters
     ----------
     shot : Shot
-        Its scene's pitch, distance and spectra are those of the frames.
+        Pitch, distance and spectra of its scene apply to the frames.
     frames : path
-        A folder of pictures, or a video file.
+        A directory of pictures, or a video file.
     out : path
-        As of :func:`foveasim.video.write_video`. A zarr folder that is finished is left as it is.
+        As for :func:`foveasim.video.write_video`. A complete zarr store is not changed.
     frame_s : float, optional, s
-        From one frame to the next; by default what the video file says.
+        Frame period; by default that of the video file.
     line_s : float, s
-        Of a rolling shutter, from one line to the next.
+        Line time of a rolling shutter.
     stop : int, optional
-        How many frames to take, at most.
+        Maximum number of frames.
     n_threads : int, optional
-        Frames that are computed at a time; all cores by default.
+        Number of frames that are computed at a time; one per core by default.
     progress : bool
+        Whether to show a progress bar.
 
     Returns
     -------
     n_frames : int
-        How many there are.
+        Number of frames in the output.
 
     Raises
     ------
     FileError
-        When frames cannot be read, or nothing written, or a zarr folder is another recording.
+        When frames cannot be read, the output cannot be written, or a zarr store is another recording.
     ParameterError, SimulationError
-        When the shot is of a map of light and not of a scene, or parts do not fit together.
+        When the shot has a power map instead of a scene, or the parts are incompatible.
     """
     if not isinstance(shot.scene, Scene):
         raise SimulationError(
-            f"{shot.name} is of a map of light; frames need a scene, which says how large their pixels are"
+            f"{shot.name} has a power map; frames require a scene, which specifies the size of their pixels"
         )
     footage = FrameSource(frames, template=shot.scene, frame_s=frame_s, stop=stop)
     if line_s and footage.frame_s is None:
-        raise ParameterError("frame_s", "must be given for a rolling shutter: pictures in a folder do not say it")
-    is_kept = Path(out).suffix.lower() == ".zarr"
-    n_before = count_recorded_frames(out) if is_kept else 0
+        raise ParameterError(
+            "frame_s", "must be given for a rolling shutter: pictures in a directory have no frame rate"
+        )
+    is_store = Path(out).suffix.lower() == ".zarr"
+    n_before = count_recorded_frames(out) if is_store else 0
     captures = shot.camera.video(
         footage.from_frame(n_before),
         exposure_s=shot.exposure_s,
@@ -93,17 +96,17 @@ def run_video(
         frame_s=footage.frame_s or USUAL_FRAME_S,
         n_frames=footage.n_frames,
         progress=progress,
-        resume=is_kept,
-        plan=_plan(shot, shot.scene, Path(frames), footage.frame_s, line_s, stop) if is_kept else None,
+        resume=is_store,
+        plan=_plan(shot, shot.scene, Path(frames), footage.frame_s, line_s, stop) if is_store else None,
     )
 
 
 def _plan(
     shot: Shot, scene: Scene, frames: Path, frame_s: float | None, line_s: float, stop: int | None
 ) -> dict[str, Any]:
-    """All that codes depend on, as plain data; of the frames their files' names and sizes, which are quickly looked up."""
+    """Return everything that codes depend on; for frames, names and sizes of their files."""
     camera, layout = shot.camera, shot.camera.sensor.layout
-    assert isinstance(layout, Layout)  # a camera has no other
+    assert isinstance(layout, Layout)  # checked by Camera
     files = [[path.name, path.stat().st_size] for path in (pictures_in(frames) if frames.is_dir() else [frames])]
     return {
         "scene": {f.name: to_plain_data(getattr(scene, f.name)) for f in fields(scene) if f.name not in OF_FRAMES},

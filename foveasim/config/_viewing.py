@@ -1,4 +1,4 @@
-"""What a file holds that can be looked at: a layout, a capture, or a report of a layout's check."""
+"""Reading of layouts, captures and reports of design-rule checks, for viewers."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from foveasim.layout.drc.report import is_lyrdb, read_lyrdb
 
 __all__ = ["Viewable", "read_viewable"]
 
-#: Arrays that a file of numpy arrays has when it is a capture, and a layout has not.
+#: Arrays of a capture's npz file that a layout's does not contain.
 CAPTURE_ARRAYS = {"code.npy", "electrons.npy"}
 
 
 @dataclass(frozen=True)
 class Viewable:
-    """A layout or a capture, the report of a check of its layout, and a heading."""
+    """A layout or capture, the report of its design-rule check, and a title."""
 
     data: Layout | Capture
     report: Report | None
@@ -30,34 +30,36 @@ class Viewable:
 
 def read_viewable(path: str | Path, *, layout: str | Path | None = None, rules: str | Path | None = None) -> Viewable:
     """
-    Read a file of whatever can be looked at.
+    Read a layout, a capture, or a report of a design-rule check.
 
     Parameters
     ----------
     path : path
-        A layout in any format, or the name of a shipped one; a capture (``.npz``, ``.zarr``); or a report (``.lyrdb``).
+        A layout in any format, or the name of a bundled one; a capture (``.npz``, ``.zarr``); or a report (``.lyrdb``).
     layout : path, optional
-        The layout that a report is of.
+        Layout of a report.
     rules : path or name of a preset, optional
-        To check the layout against.
+        Design rules to check.
 
     Raises
     ------
     FileError
-        When a file is missing, broken, or of another kind.
+        When a file is missing, corrupt, or of another kind.
     ParameterError
-        When a report comes without its layout, another file with one, or a report with rules.
+        When a report is given without its layout or with rules, or another file with a layout.
     """
     path = Path(path)
     if is_lyrdb(path):
         if layout is None:
-            raise ParameterError("layout", f"must be given: the report {path} does not hold the layout that it is of")
+            raise ParameterError("layout", f"must be given: the report {path} does not contain its layout")
         if rules is not None:
-            raise ParameterError("rules", "cannot be given with a report, which is of a check already made", str(rules))
+            raise ParameterError(
+                "rules", "must be omitted for a report, which contains the results of a check", str(rules)
+            )
         checked = read_any_layout(layout).layout
         return Viewable(checked, read_lyrdb(path, checked.n_sites), printable(path.stem))
     if layout is not None:
-        raise ParameterError("layout", f"belongs to a report (.lyrdb), and {path} is none", str(layout))
+        raise ParameterError("layout", f"must be omitted: {path} is not a report (.lyrdb)", str(layout))
     limits = None if rules is None else read_rules(rules)
     if _is_capture(path):
         capture = Capture.load(path)
@@ -67,7 +69,7 @@ def read_viewable(path: str | Path, *, layout: str | Path | None = None, rules: 
 
 
 def _is_capture(path: Path) -> bool:
-    """Whether a file or a zarr store is a capture, rather than a layout."""
+    """Return whether a file or zarr store is a capture."""
     if path.is_dir():
         return store_format(path) is not None
     if not path.is_file() or not zipfile.is_zipfile(path):

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: in a process of its own, with its exit codes and its files."""
+"""The command line in a separate process: output, exit codes and files."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def foveasim(*arguments, cwd):
 
 
 def huge_png(png):
-    """A small PNG file that claims 65536 x 65536 pixels, with a right checksum."""
+    """Return a small PNG file with 65536 x 65536 pixels in its header and a correct checksum."""
     header = b"IHDR" + struct.pack(">II", 65536, 65536) + png[24:29]
     return png[:12] + header + struct.pack(">I", zlib.crc32(header)) + png[33:]
 
@@ -51,7 +51,7 @@ def demo(tmp_path_factory):
     return folder / "out", foveasim("demo", "-o", "out", cwd=folder)
 
 
-def test_the_demo_ends_well_and_writes_its_files(demo):
+def test_demo_writes_its_files(demo):
     out, result = demo
 
     assert result.returncode == 0, result.stderr
@@ -65,13 +65,13 @@ def test_the_demo_ends_well_and_writes_its_files(demo):
         assert word in result.stdout
 
 
-def test_the_demos_foveal_picture_shows_the_astronaut_upright_with_no_data_in_the_blind_spot(demo):
-    """Against the photograph itself: the picture correlates with it as it is, and not with it turned over."""
+def test_demo_picture_is_upright_with_blind_spot(demo):
+    """The picture correlates with the photograph, and not with its mirror images."""
     out, _ = demo
     seen = read_picture(out / "foveal_picture.png").astype(float)
     capture = fs.Capture.load(out / "foveal_capture.npz")
     photograph = read_picture(str(files("skimage.data") / "astronaut.png")).astype(float)
-    # Where each pixel of the picture lies in the photograph: 500 µm a pixel, 8 mm lens at 1 m, axis at its middle.
+    # Position of each pixel in the photograph: 500 µm per pixel, 8 mm lens at 1 m, axis at the centre.
     cell_um = 500.0 * 8 / (1000 - 8)
     grid = capture.picture(max_pixels=1024).grid
     column = np.clip(np.round(grid.x_um / cell_um + 255.5).astype(int), 0, 511)
@@ -87,7 +87,7 @@ def test_the_demos_foveal_picture_shows_the_astronaut_upright_with_no_data_in_th
     assert not seen[505:519, 505:519, 3].any()
 
 
-def test_a_run_writes_the_capture_that_the_settings_describe(folder):
+def test_run_writes_capture_of_settings(folder):
     result = foveasim("run", "shot.yaml", "--set", "sensor.bits=12", "--set", "seed=4", "-o", "out", cwd=folder)
     capture = fs.Capture.load(folder / "out" / "shot_capture.npz")
 
@@ -100,7 +100,7 @@ def test_a_run_writes_the_capture_that_the_settings_describe(folder):
     ]
 
 
-def test_the_schema_is_json(tmp_path):
+def test_schema_is_json(tmp_path):
     assert json.loads(foveasim("schema", cwd=tmp_path).stdout)["title"]
 
 
@@ -116,7 +116,7 @@ def test_the_schema_is_json(tmp_path):
         ("layout={generator: none}", "shot.yaml: layout.generator: must be one of"),
     ],
 )
-def test_bad_settings_end_with_one_sentence_and_leave_nothing(folder, change, words):
+def test_invalid_settings_print_one_line(folder, change, words):
     result = foveasim("run", "shot.yaml", "--set", change, "-o", "out", cwd=folder)
 
     assert result.returncode == 2
@@ -137,7 +137,7 @@ def test_bad_settings_end_with_one_sentence_and_leave_nothing(folder, change, wo
         (lambda p: p.write_bytes(huge_png(p.read_bytes())), "has 65536 x 65536 pixels, more than the limit|has more than"),
     ],
 )  # fmt: skip
-def test_a_bad_picture_ends_with_one_sentence_and_leaves_nothing(folder, spoil, words):
+def test_invalid_picture_prints_one_line(folder, spoil, words):
     spoil(folder / "photo.png")
     result = foveasim("run", "shot.yaml", "-o", "out", cwd=folder)
 
@@ -148,12 +148,12 @@ def test_a_bad_picture_ends_with_one_sentence_and_leaves_nothing(folder, spoil, 
     assert not (folder / "out").exists()
 
 
-def test_a_folder_that_cannot_be_made_is_told(folder):
+def test_file_as_output_directory_is_rejected(folder):
     (folder / "out").write_text("I am a file")
     result = foveasim("run", "shot.yaml", "-o", "out", cwd=folder)
 
     assert result.returncode == 2
-    assert "out: cannot hold results: out is a file, and must be a folder" in result.stderr
+    assert "out: cannot contain results: out is a file; choose a directory" in result.stderr
     assert (folder / "out").read_text() == "I am a file"
 
 
@@ -165,7 +165,7 @@ source: made for this test
 """
 
 
-def test_a_broken_rule_ends_with_the_exit_code_1_and_a_kept_one_with_0(tmp_path):
+def test_exit_code_reports_rule_violations(tmp_path):
     (tmp_path / "rings.yaml").write_text(LAYOUT)
     (tmp_path / "loose.yaml").write_text("min_size_um: 0.1\n")
     broken = foveasim("check", "rings.yaml", "--report", "rings.lyrdb", cwd=tmp_path)
@@ -178,7 +178,7 @@ def test_a_broken_rule_ends_with_the_exit_code_1_and_a_kept_one_with_0(tmp_path)
     assert "pass" in kept.stdout
 
 
-def test_a_layout_goes_from_yaml_to_a_chip_file_and_is_checked_there(tmp_path):
+def test_converted_gds_file_is_checked(tmp_path):
     (tmp_path / "rings.yaml").write_text(LAYOUT)
     (tmp_path / "rules.yaml").write_text("min_size_um: 1.0\n")
     converted = foveasim("convert", "rings.yaml", "rings.gds", "--dbu-um", "0.001", cwd=tmp_path)
@@ -194,14 +194,14 @@ def test_a_layout_goes_from_yaml_to_a_chip_file_and_is_checked_there(tmp_path):
     ("arguments", "words"),
     [
         (("check", "rings.gds"), "rings.gds: no such file"),
-        (("check", "bare.yaml"), "bare.yaml: holds no rules"),
+        (("check", "bare.yaml"), "bare.yaml: contains no design rules"),
         (("check", "rings.yaml", "--rules", "none.yaml"), "none.yaml: no such file"),
         (("check", "rings.yaml", "--rules", "wrong.yaml"), "wrong.yaml: min_sise_um: no such setting"),
         (("convert", "rings.yaml", "rings.docx"), "rings.docx: "),
         (("convert", "wrong.gds", "rings.npz"), "wrong.gds: is no layout file"),
     ],
 )
-def test_bad_layout_files_end_with_one_sentence(tmp_path, arguments, words):
+def test_invalid_layout_files_print_one_line(tmp_path, arguments, words):
     (tmp_path / "rings.yaml").write_text(LAYOUT)
     (tmp_path / "bare.yaml").write_text("generator: grid\nparameters: {n_x: 3, n_y: 3, pitch_um: 2.0}\n")
     (tmp_path / "wrong.yaml").write_text("min_sise_um: 1.0\n")
@@ -225,7 +225,7 @@ def test_bad_layout_files_end_with_one_sentence(tmp_path, arguments, words):
         ("{generator: grid, parameters: {n_x: 9, n_y: 9, pitch_um: 5}}", "none"),
     ],
 )
-def test_only_a_hole_in_the_middle_is_told_as_a_blind_spot(tmp_path, layout, radius):
+def test_blind_spot_is_central_hole_only(tmp_path, layout, radius):
     scene = (
         "{kind: flat, shape: [400, 400], pitch_um: 100, distance_m: 1.0, radiance_w_m2_sr_nm: 0.1, band_width_nm: 10}"
     )
@@ -237,7 +237,7 @@ def test_only_a_hole_in_the_middle_is_told_as_a_blind_spot(tmp_path, layout, rad
     assert line.split("│")[2].strip() == radius
 
 
-def test_layouts_lists_what_comes_with_the_package(tmp_path):
+def test_layouts_lists_bundled_layouts(tmp_path):
     result = foveasim("layouts", cwd=tmp_path)
 
     assert result.returncode == 0, result.stderr
@@ -245,7 +245,7 @@ def test_layouts_lists_what_comes_with_the_package(tmp_path):
     assert "243,712" in result.stdout
 
 
-def test_describe_tells_counts_sizes_and_the_data_rate_of_a_file_or_a_shipped_layout(tmp_path):
+def test_describe_prints_counts_and_data_rate(tmp_path):
     fs.layout.zones(side_um=(64, 128), pitch_um=(1, 2)).write(tmp_path / "two.npz")
     by_file = foveasim("describe", "two.npz", cwd=tmp_path)
     by_name = foveasim("describe", "four_zones", "--fps", "30", "--bits", "10", "--blanking", "0.2", cwd=tmp_path)
@@ -255,7 +255,7 @@ def test_describe_tells_counts_sizes_and_the_data_rate_of_a_file_or_a_shipped_la
     assert all(text in by_name.stdout for text in ("13,312", "100 % of the convex hull", "4.792 Mbit/s", "4 to 32 µm"))
 
 
-def test_describe_refuses_what_cannot_be_in_one_sentence(tmp_path):
+def test_describe_rejects_invalid_options(tmp_path):
     gone = foveasim("describe", "gone.gds", cwd=tmp_path)
     bad = foveasim("describe", "four_zones", "--fps", "-1", cwd=tmp_path)
 
@@ -264,7 +264,7 @@ def test_describe_refuses_what_cannot_be_in_one_sentence(tmp_path):
     assert bad.stderr.startswith("error: 'frames_per_s' must be > 0, got -1.0")
 
 
-def test_a_shipped_layout_is_checked_and_converted_by_its_name(tmp_path):
+def test_bundled_layouts_are_found_by_name(tmp_path):
     checked = foveasim("check", "prima_100", cwd=tmp_path)
     converted = foveasim("convert", "prima_100", "prima.gds", cwd=tmp_path)
 
@@ -273,8 +273,8 @@ def test_a_shipped_layout_is_checked_and_converted_by_its_name(tmp_path):
     assert fs.layout.read_layout(tmp_path / "prima.gds").n_sites == 378
 
 
-def test_convert_tells_what_a_drawing_does_not_hold(tmp_path):
+def test_convert_reports_dropped_columns(tmp_path):
     result = foveasim("convert", "prima_75", "prima.svg", cwd=tmp_path)
 
     assert result.returncode == 0, result.stderr
-    assert "the format holds no column, readout_line, row" in result.stdout
+    assert "dropped columns: column, readout_line, row" in result.stdout

@@ -1,4 +1,4 @@
-"""Studies and datasets on the command line: the same as the calls, after any end, and bad files in one sentence."""
+"""Studies and datasets on the command line: equal to calls, resumable, with one line for invalid files."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def harsh(shot, camera, capture):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with a shot, a study, a dataset and metrics, in which the program runs."""
+    """Working directory with a shot, a study, a dataset and metrics."""
     (tmp_path / "shot.yaml").write_text(json.dumps(SHOT))
     (tmp_path / "photographed.yaml").write_text(json.dumps(PHOTOGRAPHED))
     (tmp_path / "study.yaml").write_text(json.dumps(STUDY))
@@ -115,7 +115,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def foveasim(folder, monkeypatch, capsys):
-    """The program in this process: exit code, what it says, and what it says is wrong."""
+    """Run the program in this process: exit code, standard output, standard error."""
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["foveasim", *map(str, arguments)])
@@ -130,7 +130,7 @@ def foveasim(folder, monkeypatch, capsys):
 
 
 def told(study):
-    """What counts of a study's trials."""
+    """Return numbers, states, parameters and values of a study's trials."""
     return [(t.params, t.values, t.user_attrs.get("error")) for t in explore.finished_trials(study)]
 
 
@@ -145,7 +145,7 @@ def assert_same(one, other):
 
 
 def called_study(**options):
-    """The study of the file, as a call in Python says it."""
+    """Run the study of the file as a call in Python."""
     return explore.study(
         SHOT,
         STUDY["search"],
@@ -157,7 +157,7 @@ def called_study(**options):
 # -- studies ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_study_on_the_command_line_finds_what_the_call_finds_and_shows_the_best(foveasim, folder):
+def test_study_command_equals_call(foveasim, folder):
     called = called_study()
 
     code, said, wrong = foveasim("study", "study.yaml")
@@ -178,19 +178,19 @@ def test_a_study_on_the_command_line_finds_what_the_call_finds_and_shows_the_bes
         assert bits == trial.params["sensor.bits"]
 
 
-def test_a_study_goes_on_to_more_trials_as_if_it_had_them_from_the_start(foveasim, folder):
+def test_extended_study_equals_longer_study(foveasim, folder):
     for n_trials in (4, 9, 14):
         code, said, _ = foveasim("study", "study.yaml", "--trials", n_trials, "-o", "few.db")
         assert code == 0
         assert f"wrote few.db: {n_trials} trials" in said
-    # Fewer than there are: nothing is to be done, and nothing is lost.
+    # Fewer trials than exist: the study is unchanged.
     assert "14 trials" in foveasim("study", "study.yaml", "--trials", 2, "--storage", "sqlite:///few.db")[1]
 
     assert told(stored(folder / "few.db")) == told(called_study())
 
 
 def n_begun(path):
-    """Trials in a study's file, which is looked at and not touched."""
+    """Return the number of trials in a study's file, opened read-only."""
     try:
         with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as base:
             return base.execute("SELECT count(*) FROM trials").fetchone()[0]
@@ -199,7 +199,7 @@ def n_begun(path):
 
 
 def ended(end, folder, n_trials):
-    """A study that is ended when so many trials are begun: its exit code and its last words."""
+    """Send a signal to a study after ``n_trials``: its exit code and standard error."""
     command = [sys.executable, "-m", "foveasim.cli", "study", "slow.yaml", "--metric", "own:patient"]
     running = subprocess.Popen(
         command, cwd=folder, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -214,14 +214,14 @@ def ended(end, folder, n_trials):
     return running.returncode, said
 
 
-def test_a_study_that_was_ended_twice_goes_on_as_if_it_was_not(folder):
+def test_study_interrupted_twice_resumes_identically(folder):
     (folder / "slow.yaml").write_text(json.dumps(STUDY | {"trials": 60}))
 
     code, said = ended(signal.SIGINT, folder, 4)
     n_stop = n_begun(folder / "study.db")
 
     assert code == 130
-    assert said == "stopped; the trials that are done are kept in study.db, and the same command goes on from there\n"
+    assert said == "interrupted; finished trials are stored in study.db, run the same command again to resume\n"
     assert 4 <= n_stop < 50
 
     code, _ = ended(signal.SIGKILL, folder, n_stop + 4)
@@ -235,7 +235,7 @@ def test_a_study_that_was_ended_twice_goes_on_as_if_it_was_not(folder):
     assert {trial.user_attrs["patient"] > 0.0 for trial in explore.finished_trials(found)} == {True}
 
 
-def test_a_study_without_a_good_trial_says_so_with_its_exit_code(foveasim, folder):
+def test_study_without_valid_trial_exits_with_1(foveasim, folder):
     failing = STUDY | {"search": {"exposure_s": [-1.0, -2.0]}, "trials": 3}
     beyond = STUDY | {"constraints": {"n_sites": [None, 5]}, "trials": 2}
     (folder / "failing.yaml").write_text(json.dumps(failing))
@@ -253,7 +253,7 @@ def test_a_study_without_a_good_trial_says_so_with_its_exit_code(foveasim, folde
     assert (code, wrong) == (1, "no trial in b.db is good: those that did not fail are beyond the limits\n")
 
 
-def test_trials_that_fail_are_told_and_the_best_of_the_others_shown(foveasim, folder):
+def test_failed_trials_are_reported(foveasim, folder):
     (folder / "some.yaml").write_text(json.dumps(STUDY | {"objectives": {"harsh": "maximize"}, "trials": 8}))
 
     code, said, wrong = foveasim("study", "some.yaml", "--metric", "own:harsh")
@@ -265,7 +265,7 @@ def test_trials_that_fail_are_told_and_the_best_of_the_others_shown(foveasim, fo
     assert "wrote study.db: 8 trials" in said
 
 
-def test_a_file_says_what_a_call_says(folder):
+def test_study_file_equals_call(folder):
     read = explore.read_study(folder / "study.yaml")
     called = explore.plan_study(
         folder / "shot.yaml",
@@ -293,7 +293,7 @@ def test_a_file_says_what_a_call_says(folder):
         ([[1, 2], "a", None], {"[1, 2]", '"a"', "null"}),
     ],
 )
-def test_a_range_gives_its_steps_and_no_others(where, possible):
+def test_range_suggests_its_steps_only(where, possible):
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     found = [_suggested(study.ask(), "x", where) for _ in range(60)]
 
@@ -304,7 +304,7 @@ def test_a_range_gives_its_steps_and_no_others(where, possible):
     assert {type(value) for value in found} == {type(next(iter(possible)))}
 
 
-def test_files_of_all_choices_are_beside_the_study_and_among_what_it_depends_on(folder):
+def test_study_depends_on_files_of_choices(folder):
     (folder / "deep").mkdir()
     for k in (1, 2):
         grid = {"generator": "grid", "parameters": {"n_x": k, "n_y": k, "pitch_um": 3.0}}
@@ -322,7 +322,7 @@ def test_files_of_all_choices_are_beside_the_study_and_among_what_it_depends_on(
     assert explore.read_study(folder / "deep" / "study.yaml").to_dict() != plan.to_dict()
 
 
-def test_the_trials_of_another_program_are_left_alone(foveasim, folder):
+def test_foreign_trials_are_not_changed(foveasim, folder):
     study = optuna.create_study(study_name="study", storage="sqlite:///own.db", directions=["maximize", "minimize"])
     study.tell(study.ask(), [1.0, 2.0])
 
@@ -333,11 +333,11 @@ def test_the_trials_of_another_program_are_left_alone(foveasim, folder):
     assert len(stored(folder / "own.db").trials) == 1
 
 
-def test_a_storage_that_breaks_amid_a_study_is_one_sentence_and_keeps_what_is_done(folder):
+def test_storage_failure_keeps_finished_trials(folder):
     plan = explore.read_study(folder / "study.yaml")
 
     def spoil(n_done, _):
-        if n_done == 3:  # as another program would that runs the same study
+        if n_done == 3:  # as by another process with the same study
             running = stored(folder / "study.db").ask()
             plan.base.metrics["snr"] = lambda *_: stored(folder / "study.db").tell(
                 running.number + 1, state=optuna.trial.TrialState.FAIL
@@ -376,7 +376,7 @@ BAD_STUDIES = [
 
 
 @pytest.mark.parametrize(("change", "message"), BAD_STUDIES)
-def test_a_bad_study_is_one_sentence_and_nothing_is_written(foveasim, folder, change, message):
+def test_invalid_study_writes_nothing(foveasim, folder, change, message):
     (folder / "bad.yaml").write_text(json.dumps(STUDY | change))
     before = sorted(folder.rglob("*"))
 
@@ -395,7 +395,7 @@ def test_a_bad_study_is_one_sentence_and_nothing_is_written(foveasim, folder, ch
         (["--trials", "0"], "'trials' must be >= 1, got 0"),
         (["--out", "no/where.db"], "no/where.db: cannot be written: its folder does not exist"),
         (["--out", "."], ".: cannot be used as a study's storage (unable to open database file)"),
-        (["--out", "a.db", "--storage", "sqlite:///b.db"], "take one of them"),
+        (["--out", "a.db", "--storage", "sqlite:///b.db"], "--out and --storage exclude each other"),
         (["--storage", "b.db"], "--storage must be a URL"),
         (["--storage", "nosuch://base"], "cannot be used as a study's storage"),
         (["--storage", "nosuch://me:secret@host/base"], "error: nosuch://host/base: cannot be used"),
@@ -404,7 +404,7 @@ def test_a_bad_study_is_one_sentence_and_nothing_is_written(foveasim, folder, ch
         (["--metric", "snr"], "'metric' must have a name of its own"),
     ],
 )
-def test_a_bad_option_of_a_study_is_one_sentence_and_nothing_is_written(foveasim, folder, options, message):
+def test_invalid_study_option_writes_nothing(foveasim, folder, options, message):
     before = sorted(folder.rglob("*"))
 
     code, said, wrong = foveasim("study", "study.yaml", *options)
@@ -419,7 +419,7 @@ def test_a_bad_option_of_a_study_is_one_sentence_and_nothing_is_written(foveasim
 
 
 def labels_of_all_sorts(folder):
-    """Files of labels of the three pictures, and what they say."""
+    """Label files of the three pictures, and their content."""
     rng = np.random.default_rng(1)
     masks, flows, boxes = {}, {}, {"dogs/2.png": [[1.0, 2.0, 20.5, 30.0, 4.0]], "dogs/10.png": [], "cats/1.png": []}
     boxes["cats/1.png"] = [[0.0, 0.0, 9.0, 12.0, 1.0], [20.0, 5.0, 40.0, 39.0, 2.0]]
@@ -446,7 +446,7 @@ def labels_of_all_sorts(folder):
     crowd = {"image_id": 1, "category_id": 9, "bbox": [0, 0, 5, 5], "iscrowd": 1}
     other = {"image_id": 0, "category_id": 9, "bbox": [0, 0, 0, 0]}
     (folder / "coco.json").write_text(json.dumps({"images": images, "annotations": [crowd, *annotations, other]}))
-    # Pictures come in the natural order of their names.
+    # Pictures are in natural order of their names.
     order = sorted(NAMES, key=lambda name: (name.split("/")[0], int(Path(name).stem)))
     said = {"cats/1.png": "seal", "dogs/2.png": "lion, old", "dogs/10.png": "seal"}
     return {
@@ -458,7 +458,7 @@ def labels_of_all_sorts(folder):
 
 
 @pytest.mark.parametrize("out", ["dataset", "d.zarr"])
-def test_a_data_set_on_the_command_line_is_what_the_call_gives(foveasim, folder, out):
+def test_dataset_command_equals_call(foveasim, folder, out):
     labels = labels_of_all_sorts(folder)
     named = {"labels": "labels.csv", "boxes": "coco.json", "masks": "masks", "flows": "flows", "per_shard": 5}
     (folder / "all.yaml").write_text(json.dumps(DATA_SET | named))
@@ -481,7 +481,7 @@ def test_a_data_set_on_the_command_line_is_what_the_call_gives(foveasim, folder,
 
 
 @pytest.mark.parametrize("recipe", ["classification", "denoising"])
-def test_a_recipe_in_a_file_is_the_call_of_its_name(folder, recipe):
+def test_recipe_file_equals_call(folder, recipe):
     (folder / "own.yaml").write_text(json.dumps({"pictures": "photos", "shot": PHOTOGRAPHED, "recipe": recipe}))
 
     read = explore.read_dataset(folder / "own.yaml").dataset
@@ -491,7 +491,7 @@ def test_a_recipe_in_a_file_is_the_call_of_its_name(folder, recipe):
     assert_same(read[5 % len(read)], called[5 % len(read)])
 
 
-def test_pictures_may_be_a_zip_file_an_array_or_a_list_of_files(folder):
+def test_pictures_come_from_several_sources(folder):
     pictures = {name: np.asarray(Image.open(folder / "photos" / name)) for name in sorted(NAMES)}
     with zipfile.ZipFile(folder / "photos.zip", "w") as archive:
         for name in NAMES:
@@ -515,7 +515,7 @@ def test_pictures_may_be_a_zip_file_an_array_or_a_list_of_files(folder):
         np.testing.assert_array_equal(array[4 * k]["electrons"], files[4 * k]["electrons"], err_msg=name)
 
 
-def test_a_data_set_that_was_ended_goes_on_and_gives_the_same_samples(folder):
+def test_interrupted_dataset_resumes_identically(folder):
     (folder / "long.yaml").write_text(json.dumps(DATA_SET | {"cameras": 150, "per_shard": 10}))
     command = [sys.executable, "-m", "foveasim.cli", "dataset", "long.yaml", "--workers", "2"]
     shards = lambda: {p.name: p.stat().st_mtime_ns for p in (folder / "dataset").glob("*.tar")}  # noqa: E731
@@ -531,8 +531,8 @@ def test_a_data_set_that_was_ended_goes_on_and_gives_the_same_samples(folder):
     before = shards()
 
     assert running.returncode == 130
-    assert wrong == "stopped; the shards that are done are kept in dataset, and the same command goes on from there\n"
-    # Shards that waited for a process were not begun.
+    assert wrong == "interrupted; finished shards are stored in dataset, run the same command again to resume\n"
+    # Shards in the queue were not started.
     assert 2 <= len(before) < 90
     assert not list((folder / "dataset").glob(".*"))
 
@@ -546,7 +546,7 @@ def test_a_data_set_that_was_ended_goes_on_and_gives_the_same_samples(folder):
         assert_same(found[k], data[k])
 
 
-def test_warnings_of_samples_are_told_once(folder):
+def test_warnings_of_samples_appear_once(folder):
     layout = SHOT["layout"] | {"parameters": {"n_x": 12, "n_y": 12, "pitch_um": 30.0}}  # beyond the pictures
     (folder / "far.yaml").write_text(json.dumps(DATA_SET | {"set": {"layout": layout}}))
     command = [sys.executable, "-m", "foveasim.cli", "dataset", "far.yaml", "--workers", "1"]
@@ -560,11 +560,11 @@ def test_warnings_of_samples_are_told_once(folder):
 
 BAD_DATA_SETS = [
     ({"repeats": 3}, "bad.yaml: repeats: no such setting"),
-    ({"pictures": None}, "bad.yaml: pictures: is missing"),
+    ({"pictures": None}, "bad.yaml: pictures: missing"),
     ({"pictures": "nowhere"}, "nowhere: no such file or folder"),
     ({"pictures": "empty"}, "empty: holds no pictures"),
     ({"pictures": []}, "bad.yaml: 'pictures' must hold at least one picture"),
-    ({"pictures": ["skimage:nobody"]}, "bad.yaml: pictures.0: scikit-image brings no picture 'nobody'"),
+    ({"pictures": ["skimage:nobody"]}, "bad.yaml: pictures.0: scikit-image does not contain 'nobody'"),
     ({"pictures": ["photos/none.png"]}, "none.png: no such file"),
     ({"shot": "none.yaml"}, "none.yaml: no such file"),
     ({"shot": SHOT}, "bad.yaml: scene.kind: must be 'picture' for a dataset"),
@@ -588,7 +588,7 @@ BAD_DATA_SETS = [
 
 
 @pytest.mark.parametrize(("change", "message"), BAD_DATA_SETS)
-def test_a_bad_data_set_is_one_sentence_and_nothing_is_written(foveasim, folder, change, message):
+def test_invalid_dataset_writes_nothing(foveasim, folder, change, message):
     keys = {key: value for key, value in (DATA_SET | change).items() if value is not None}
     (folder / "bad.yaml").write_text(json.dumps(keys))
     (folder / "empty").mkdir()
@@ -612,7 +612,7 @@ def test_a_bad_data_set_is_one_sentence_and_nothing_is_written(foveasim, folder,
         (["--out", "x.txt"], "must end in .zarr, or have no ending"),
     ],
 )
-def test_a_bad_option_of_a_data_set_is_one_sentence_and_nothing_is_written(foveasim, folder, options, message):
+def test_invalid_dataset_option_writes_nothing(foveasim, folder, options, message):
     before = sorted(folder.rglob("*"))
 
     code, _, wrong = foveasim("dataset", "data.yaml", *options)
@@ -623,7 +623,7 @@ def test_a_bad_option_of_a_data_set_is_one_sentence_and_nothing_is_written(fovea
     assert sorted(folder.rglob("*")) == before
 
 
-# -- files of labels --------------------------------------------------------------------------------------------------
+# -- label files --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -637,7 +637,7 @@ def test_a_bad_option_of_a_data_set_is_one_sentence_and_nothing_is_written(fovea
         ('picture,label\na,"1\n', "is no CSV file"),
     ],
 )
-def test_a_bad_file_of_classes_is_told_with_its_place(tmp_path, text, message):
+def test_invalid_class_file_is_rejected(tmp_path, text, message):
     (tmp_path / "labels.csv").write_text(text)
 
     with pytest.raises(FileError, match=message) as caught:
@@ -645,7 +645,7 @@ def test_a_bad_file_of_classes_is_told_with_its_place(tmp_path, text, message):
     assert "\n" not in str(caught.value)
 
 
-def test_classes_may_be_an_array_and_no_objects_are_read(tmp_path):
+def test_class_arrays_load_without_pickle(tmp_path):
     np.save(tmp_path / "numbers.npy", np.array([3, 1], np.uint8))
     np.save(tmp_path / "texts.npy", np.array(["b", "a"]))
     np.save(tmp_path / "objects.npy", np.array([{}, 1], object), allow_pickle=True)
@@ -674,7 +674,7 @@ def test_classes_may_be_an_array_and_no_objects_are_read(tmp_path):
         ),
     ],
 )
-def test_a_bad_file_of_boxes_is_told_with_its_place(tmp_path, change, message):
+def test_invalid_box_file_is_rejected(tmp_path, change, message):
     coco = {"images": [{"id": 1, "file_name": "a"}], "annotations": []} | change
     (tmp_path / "coco.json").write_text(json.dumps(coco))
 
@@ -683,7 +683,7 @@ def test_a_bad_file_of_boxes_is_told_with_its_place(tmp_path, change, message):
     assert "\n" not in str(caught.value)
 
 
-def test_a_picture_has_exactly_one_file_of_its_name(tmp_path):
+def test_each_picture_has_one_label_file(tmp_path):
     (tmp_path / "a.png").touch()
     (tmp_path / "b.jpg").touch()
 
@@ -697,7 +697,7 @@ def test_a_picture_has_exactly_one_file_of_its_name(tmp_path):
         files_of_pictures(tmp_path, ["a.jpeg"], (".png", ".bmp"))
 
 
-# -- what they share --------------------------------------------------------------------------------------------------
+# -- common parts --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -709,7 +709,7 @@ def test_a_picture_has_exactly_one_file_of_its_name(tmp_path):
         ("shot", [], {"scene", "optics", "layout", "exposure_s"}),
     ],
 )
-def test_the_schema_of_a_kind_has_the_keys_of_its_examples(foveasim, kind, examples, needed):
+def test_schema_has_keys_of_examples(foveasim, kind, examples, needed):
     code, said, _ = foveasim("schema", kind)
     schema = json.loads(said)
 
@@ -720,7 +720,7 @@ def test_the_schema_of_a_kind_has_the_keys_of_its_examples(foveasim, kind, examp
         assert set(yaml.safe_load((GALLERY / example).read_text())) <= set(schema["properties"])
 
 
-def test_the_schema_is_of_a_shot_unless_another_is_asked_for(foveasim):
+def test_default_schema_is_of_shots(foveasim):
     assert foveasim("schema") == foveasim("schema", "shot")
     assert foveasim("schema", "film") == (
         2,
@@ -729,7 +729,7 @@ def test_the_schema_is_of_a_shot_unless_another_is_asked_for(foveasim):
     )
 
 
-def test_the_examples_are_what_they_say():
+def test_examples_have_documented_keys():
     study = explore.read_study(GALLERY / "best_fovea.yaml")
     file = explore.read_dataset(GALLERY / "random_cameras.yaml")
 
@@ -739,7 +739,7 @@ def test_the_examples_are_what_they_say():
     assert file.dataset.class_names == ["cat", "cup", "person"]
 
 
-def test_files_that_a_layouts_own_file_names_are_among_what_results_depend_on(folder):
+def test_results_depend_on_nested_layout_files(folder):
     density = {"n_sites": 30, "size_um": [40.0, 40.0], "density": "density.png"}
     (folder / "deep").mkdir()
     (folder / "deep" / "layout.yaml").write_text(json.dumps({"generator": "voronoi", "parameters": density}))
@@ -760,7 +760,7 @@ def test_files_that_a_layouts_own_file_names_are_among_what_results_depend_on(fo
         assert {key for key in one if one[key] != other[key]} == {"files"}
 
 
-def test_a_journals_lines_are_on_the_disk_every_second(tmp_path, monkeypatch):
+def test_journal_is_synced_every_second(tmp_path, monkeypatch):
     now_s, synced = [100.0], []
     monkeypatch.setattr(_records.time, "monotonic", lambda: now_s[0])
     monkeypatch.setattr(_records.os, "fsync", lambda _: synced.append(now_s[0]))
@@ -773,7 +773,7 @@ def test_a_journals_lines_are_on_the_disk_every_second(tmp_path, monkeypatch):
     assert synced == [100.0, 101.1, 105.0, 105.5]
 
 
-def test_what_a_picture_is_compared_with_is_made_once_and_changes_no_result():
+def test_cached_reference_changes_no_result():
     vary = {"optics.f_number": [2.0, 4.0], "sensor.bits": [8, 12], "exposure_s": [1e-4, 2e-4]}
     scene = PHOTOGRAPHED["scene"] | {"picture": "skimage:astronaut", "pitch_um": 30.0}
     plan = explore.plan_sweep(SHOT | {"scene": scene}, vary, repeats=2, metrics=["psnr_db"])
@@ -788,7 +788,7 @@ def test_what_a_picture_is_compared_with_is_made_once_and_changes_no_result():
         assert found[k].values["psnr_db"] == explore.METRICS["psnr_db"](shot, shot.camera, capture)
 
 
-def test_a_file_never_makes_the_program_import_code(foveasim, folder):
+def test_settings_files_import_no_code(foveasim, folder):
     (folder / "trap.py").write_text(f"open({str(folder / 'sprung')!r}, 'w')")
     for key in ("metrics", "objectives"):
         given = ["trap:metric"] if key == "metrics" else {"trap:metric": "maximize"}
@@ -797,7 +797,7 @@ def test_a_file_never_makes_the_program_import_code(foveasim, folder):
     assert not (folder / "sprung").exists()
 
 
-def test_a_shots_file_that_is_wrong_is_named_beside_the_file_that_names_it(folder):
+def test_error_names_both_settings_files(folder):
     (folder / "shot.yaml").write_text(json.dumps(SHOT | {"exposure": 1.0}))
     (folder / "sweep.yaml").write_text(json.dumps({"shot": "shot.yaml", "vary": {"sensor.bits": [8]}}))
 
@@ -806,7 +806,7 @@ def test_a_shots_file_that_is_wrong_is_named_beside_the_file_that_names_it(folde
             read(folder / name)
 
 
-def test_workers_that_do_not_start_are_told_in_one_sentence(foveasim, folder, monkeypatch):
+def test_failing_workers_print_one_line(foveasim, folder, monkeypatch):
     def none_start(**_):
         raise RuntimeError("Nanny failed\nto start.")
 

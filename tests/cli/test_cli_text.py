@@ -93,9 +93,9 @@ def test_run_prints_names_as_they_are(marked, environment):
         (("check", "{}.npz"), (2,), "error: {}.npz: holds no rules"),
         (("check", "{}.npz", "--rules", "{}"), (2,), "error: {}: "),
         (("convert", "{}.npz", "{}.svg"), (0,), "wrote {}.svg"),
-        (("convert", "{}.npz", "{}.svg"), (0,), "holds no {}, "),  # the column that is lost
+        (("convert", "{}.npz", "{}.svg"), (0,), "dropped columns: {}, "),  # the column that is lost
         (("convert", "{}.npz", "out.{}"), (2,), "error: out.{}"),
-        (("view", "{}.npz", "--web", "{}.html"), (0,), "wrote {}.html"),
+        (("view", "{}.npz", "--out", "{}.html"), (0,), "wrote {}.html"),
         (("view", "{}"), (2,), "error: {}: no such"),
         (("describe", "{}"), (2,), "error: {}: no such"),
         (("run", "{}.yaml", "--set", "{}.=1"), (2,), "{}"),
@@ -120,7 +120,7 @@ def test_commands_print_names_as_they_are(marked, arguments, code, printed):
     assert printed.replace("{}", name) in (result.stdout + result.stderr).decode()
 
 
-def test_report_and_summary_ignore_markup_on_any_console():
+def test_report_and_summary_print_markup_literally():
     from rich.console import Console
 
     layout = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0)
@@ -152,7 +152,7 @@ def test_names_outside_utf8_are_escaped(tmp_path):
     ran = foveasim("run", name, "-o", "out", cwd=tmp_path)
     failed = foveasim("describe", name + "x", cwd=tmp_path)
     capture = os.fsdecode(b"out/$caf\xe9$^_capture.npz")
-    viewed = foveasim("view", capture, "--web", "page.html", cwd=tmp_path)
+    viewed = foveasim("view", capture, "--out", "page.html", cwd=tmp_path)
 
     assert ran.returncode == 0, ran.stderr
     assert rb"wrote out/$caf\udce9$^_capture.npz" in ran.stdout
@@ -170,7 +170,7 @@ def test_names_outside_utf8_are_escaped(tmp_path):
         (("convert", "rings.yaml", "rings.svg"), 0, b"moved by at most 6.4e-05 um"),
         (("run", "shot.yaml", "-o", "out"), 0, b"smallest pixel / um"),
         (("video", "picture.yaml", "--frames", "frames", "-o", "seen.gif"), 0, b"2 frames"),
-        (("view", "shot.yaml", "--web", "page.html"), 2, b"error: shot.yaml"),
+        (("view", "shot.yaml", "--out", "page.html"), 2, b"error: shot.yaml"),
         (("describe", "\u00e9\u00b5.yaml"), 2, b"error: "),
         (("--help",), 0, b"Usage"),
         (("run", "--help"), 0, b"Usage"),

@@ -1,4 +1,4 @@
-"""The command view as a user meets it: what it writes, what it hands out, and what it rejects in one sentence."""
+"""The command view: pages that it writes and serves, and arguments that it rejects."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LAYOUT = fs.layout.grid(n_x=6, n_y=5, pitch_um=2.0)
 
 @pytest.fixture
 def view(folder, monkeypatch, capsys):
-    """The command, in this process: its exit code, what it says, and what it complains of."""
+    """Run the command in this process: exit code, standard output, standard error."""
 
     def run(*arguments):
         monkeypatch.chdir(folder)
@@ -78,8 +78,8 @@ def folder(tmp_path_factory):
     ],
     ids=lambda value: " ".join(value) if "photosites" not in " ".join(value) else "",
 )
-def test_a_page_is_written_of_whatever_can_be_looked_at(view, tmp_path, arguments, words):
-    code, said, complaint = view(*arguments, "--web", str(tmp_path / "out.html"))
+def test_view_writes_page_of_any_file(view, tmp_path, arguments, words):
+    code, said, complaint = view(*arguments, "--out", str(tmp_path / "out.html"))
 
     assert (code, complaint) == (0, "")
     assert said.strip() == f"wrote {tmp_path / 'out.html'}"
@@ -92,20 +92,20 @@ def test_a_page_is_written_of_whatever_can_be_looked_at(view, tmp_path, argument
     [
         (["nothing.gds"], "nothing.gds: no such file"),
         (["text.txt"], "text.txt: is no layout file"),
-        (["capture.npz", "--web", "page.txt"], "page.txt: must end in .html"),
-        (["capture.npz", "--web", "nowhere/page.html"], "the folder nowhere does not exist"),
-        (["capture.npz", "--web", "a.html", "--serve"], "take one of them"),
-        (["capture.npz", "--port", "8000"], "--port belongs to --serve"),
+        (["capture.npz", "--out", "page.txt"], "page.txt: must end in .html"),
+        (["capture.npz", "--out", "nowhere/page.html"], "the folder nowhere does not exist"),
+        (["capture.npz", "--out", "a.html", "--serve"], "--out and --serve exclude each other"),
+        (["capture.npz", "--port", "8000"], "--port requires --serve"),
         (["capture.npz", "--serve", "--port", "70000"], "'port' must be <= 65535"),
         (["layout.npz", "--solid", "--rules", "rules.yaml"], "--solid shows no violations"),
         (["report.lyrdb"], "'layout' must be given"),
-        (["report.lyrdb", "--layout", "layout.npz", "--rules", "rules.yaml"], "'rules' cannot be given with a report"),
-        (["layout.npz", "--layout", "layout.npz"], "'layout' belongs to a report"),
+        (["report.lyrdb", "--layout", "layout.npz", "--rules", "rules.yaml"], "'rules' must be omitted for a report"),
+        (["layout.npz", "--layout", "layout.npz"], "'layout' must be omitted: layout.npz is not a report"),
         (["layout.npz", "--rules", "nothing.yaml"], "nothing.yaml: no such file"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_what_cannot_be_shown_ends_in_one_sentence(view, folder, arguments, sentence):
+def test_invalid_view_arguments_print_one_line(view, folder, arguments, sentence):
     before = sorted(folder.iterdir())
     code, said, complaint = view(*arguments)
 
@@ -117,24 +117,24 @@ def test_what_cannot_be_shown_ends_in_one_sentence(view, folder, arguments, sent
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_that_cannot_be_written_is_told(view, tmp_path):
+def test_unwritable_directory_prints_one_line(view, tmp_path):
     tmp_path.chmod(0o500)
-    code, _, complaint = view("layout.npz", "--web", str(tmp_path / "out.html"))
+    code, _, complaint = view("layout.npz", "--out", str(tmp_path / "out.html"))
 
     assert code == 2
     assert "cannot be written" in complaint
 
 
-def test_a_page_in_the_place_of_a_folder_is_refused(view, tmp_path):
+def test_page_over_directory_is_rejected(view, tmp_path):
     (tmp_path / "out.html").mkdir()
-    code, _, complaint = view("layout.npz", "--web", str(tmp_path / "out.html"))
+    code, _, complaint = view("layout.npz", "--out", str(tmp_path / "out.html"))
 
     assert code == 2
     assert "it is a folder" in complaint
     assert [p.name for p in tmp_path.iterdir()] == ["out.html"]
 
 
-def test_a_page_is_handed_out_on_this_computer_alone_until_it_is_stopped(view, folder):
+def test_page_is_served_on_localhost(view, folder):
     command = [sys.executable, "-m", "foveasim.cli", "view", "layout.npz", "--serve"]
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
         try:
@@ -148,9 +148,9 @@ def test_a_page_is_handed_out_on_this_computer_alone_until_it_is_stopped(view, f
             with pytest.raises(urllib.error.HTTPError, match="404") as rejected:
                 urllib.request.urlopen(address + "layout.npz")
             rejected.value.close()
-            # A stranger's name that leads to this computer.
+            # A foreign host name that resolves to this machine: DNS rebinding.
             connection = http.client.HTTPConnection("127.0.0.1", port)
-            connection.request("GET", "/", headers={"Host": f"stranger.example:{port}"})
+            connection.request("GET", "/", headers={"Host": f"foreign.example:{port}"})
             assert connection.getresponse().status == 403
             connection.close()
             # The same port for a second server.
@@ -165,7 +165,7 @@ def test_a_page_is_handed_out_on_this_computer_alone_until_it_is_stopped(view, f
     assert (rest, errors) == ("", "")
 
 
-def test_without_a_choice_the_page_goes_to_a_browser_or_is_told_of(tmp_path, monkeypatch):
+def test_page_opens_in_browser_by_default(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     opened = []
     for has_browser in (True, False):
@@ -176,12 +176,12 @@ def test_without_a_choice_the_page_goes_to_a_browser_or_is_told_of(tmp_path, mon
         assert opened[-1] == path.as_uri()
 
 
-def test_a_port_that_is_none_is_refused():
+def test_invalid_port_is_rejected():
     with pytest.raises(ParameterError, match="'port' must be >= 0"):
         serve_page("", port=-1, announce=print)
 
 
-# -- connections as they come ---------------------------------------------------------------------------------------------------
+# -- client connections ---------------------------------------------------------------------------------------------------
 
 on_linux = pytest.mark.skipif(sys.platform != "linux", reason="asks the system for its connections and threads")
 #: More than the buffers of both ends hold.
@@ -195,7 +195,7 @@ _serve.serve_page("x" * {BIG_BYTES}, announce=lambda address: print(address, flu
 
 @pytest.fixture
 def serve():
-    """Start servers in processes of their own; in the end each stops by Ctrl-C with exit code 0 and has printed nothing."""
+    """Start servers in separate processes; each exits with 0 on Ctrl-C and prints nothing."""
     servers = []
 
     def start(patience_s=60.0):
@@ -224,7 +224,7 @@ def connect(port, text="", host="127.0.0.1"):
 
 
 def ask(port, host=None, first="GET / HTTP/1.1", more=""):
-    """All that a server answers to one request."""
+    """Return the response of a server to one request."""
     with connect(port, f"{first}\r\nHost: {host or f'127.0.0.1:{port}'}\r\n{more}\r\n") as connection:
         return b"".join(iter(lambda: connection.recv(1 << 16), b""))
 
@@ -236,7 +236,7 @@ def test_served_page_survives_clients_that_reset(serve):
             connection = connect(port, f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n")
             if n_bytes:
                 connection.recv(n_bytes)
-            # Close with a reset instead of an orderly end.
+            # Close with a TCP reset.
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             connection.close()
     head, _, body = ask(port).partition(b"\r\n\r\n")
@@ -255,7 +255,7 @@ def test_half_sent_requests_are_dropped(serve):
         for half in halves:
             with contextlib.suppress(ConnectionResetError):
                 assert half.recv(1) == b""
-        # A client that takes nothing is dropped too, before all of the page is sent.
+        # A client that does not read is dropped too, before the page is sent.
         idle = stack.enter_context(connect(port, f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n"))
         wait_until(lambda: n_connections(port) == 0)
         got = 0
@@ -266,7 +266,7 @@ def test_half_sent_requests_are_dropped(serve):
 
 
 def n_connections(port):
-    """Connections of a server, as the system counts them."""
+    """Return the number of open connections of a server, from the operating system."""
     lines = Path("/proc/net/tcp").read_text(encoding="ascii").splitlines()[1:]
     return sum(line.split()[1] == f"0100007F:{port:04X}" and line.split()[3] == "01" for line in lines)
 
@@ -319,7 +319,7 @@ def test_served_page_answers_one_request_alone(serve):
 @on_linux
 def test_served_page_listens_on_one_address(serve):
     port, _ = serve()
-    # All of 127.0.0.0/8 leads to this computer; a server of all addresses would answer.
+    # 127.0.0.0/8 is this machine: a server on all addresses would answer.
     with pytest.raises(ConnectionRefusedError):
         connect(port, host="127.0.0.2")
 

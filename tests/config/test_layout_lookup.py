@@ -59,7 +59,7 @@ def test_read_layout_reads_files_of_any_format(tmp_path, two_sites):
         fs.read_layout("giotto_2", cell="TOP")
 
 
-def test_files_come_before_bundled_names_everywhere(tmp_path, monkeypatch, two_sites):
+def test_files_precede_bundled_names(tmp_path, monkeypatch, two_sites):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "giotto_1").mkdir()
     write_as(two_sites, tmp_path / "prima_100")
@@ -70,7 +70,7 @@ def test_files_come_before_bundled_names_everywhere(tmp_path, monkeypatch, two_s
     assert fs.read_layout("giotto_1").n_sites == 8309
 
 
-def test_settings_files_look_in_their_folder_first(tmp_path, monkeypatch, two_sites):
+def test_settings_files_search_own_directory_first(tmp_path, monkeypatch, two_sites):
     (tmp_path / "settings").mkdir()
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "settings" / "shot.yaml").write_text(SHOT)
@@ -82,7 +82,7 @@ def test_settings_files_look_in_their_folder_first(tmp_path, monkeypatch, two_si
     assert read_shot(tmp_path / "settings" / "shot.yaml").camera.sensor.layout.n_sites == 2
 
 
-def test_the_reader_of_files_points_to_names(tmp_path, monkeypatch):
+def test_read_layout_suggests_bundled_names(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(
         FileError, match=r"giotto_2: no such file; foveasim.read_layout reads the bundled layout of this"

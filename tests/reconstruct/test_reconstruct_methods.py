@@ -602,10 +602,10 @@ def test_a_loaded_capture_gives_the_same_picture(tmp_path):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda c, _: c.picture("natural", mu=1.0), "'mu' is no option of 'natural', which has n_threads"),
+        (lambda c, _: c.picture("natural", mu=1.0), "'mu' must be an option of 'natural': n_threads"),
         (
             lambda c, _: c.picture("least_squares", magic=1.0),
-            "'magic' is no option of 'least_squares', which has blur, max_steps",
+            "'magic' must be an option of 'least_squares': blur, max_steps",
         ),
         (lambda c, _: c.picture(of="magic"), "'of' must be one of"),
         (lambda c, _: c.picture(per="magic"), "'per' must be one of"),

@@ -313,7 +313,7 @@ def test_frames_that_are_no_light_are_told():
         list(camera.video([(scene_of(pictures(1)[0]), 1.0, 2.0)], exposure_s=0.01, seed=0))
     with pytest.raises(ParameterError, match="'frames' must be an iterable of Scenes or PowerMaps, got a int"):
         camera.rates(5)
-    with pytest.raises(ParameterError, match="got a Scene; put one into a list"):
+    with pytest.raises(ParameterError, match="got a Scene; put a single one into a list"):
         camera.rates(scene_of(pictures(1)[0]))
 
 
@@ -572,7 +572,9 @@ def test_every_so_many_frames_begin_an_exposure():
 
 def test_exposures_that_no_photosite_can_make_are_told():
     camera, lights = camera_of(rows_layout()), [scene_of(pictures(1)[0])] * 4
-    with pytest.warns(FoveasimWarning, match=r"an exposure of 1 s outlasts the 0.1 s to the next one's begin"):
+    with pytest.warns(
+        FoveasimWarning, match=r"the exposure of 1 s is longer than the 0.1 s between the starts of exposures"
+    ):
         camera.video(lights, exposure_s=[0.05, 1.0], seed=0, frame_s=0.1)
     # One behind the other, though times are rounded.
     assert len(list(camera.video(lights, exposure_s=0.1 + 0.2, seed=0, frame_s=0.1, every=3))) == 2
