@@ -77,7 +77,7 @@ def test_installed_package_extends_every_kind(extended):
         "generator": "daisy",
         "effects": ["shot", "read", "supply_ripple"],
         "ripple": True,
-        "rules": "design rules on 13 photosites\nmin_roundness: kept",
+        "rules": "design rules on 13 photosites\nmin_roundness: satisfied",
         "square": False,
         "boxes": 13,
         "metric": True,
@@ -138,7 +138,7 @@ def test_modules_of_any_name_are_imported(name, tmp_path, monkeypatch):
 
 
 def test_wrong_extensions_give_messages():
-    with pytest.raises(ParameterError, match="'custom' must be limits by the names of rules, got 3"):
+    with pytest.raises(ParameterError, match="'custom' must be a mapping of rule name to limit, got 3"):
         foveasim.DesignRules(custom=3)
     with pytest.raises(ParameterError, match="'digits' is not an option of any format, got 3; leave it out"):
         foveasim.read_layout("prima_100", digits=3)

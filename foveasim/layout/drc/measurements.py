@@ -1,4 +1,4 @@
-"""What each design rule measures, and the table of all rules."""
+"""Measurements of the design rules, and the table of all rules."""
 
 from __future__ import annotations
 
@@ -26,31 +26,31 @@ if TYPE_CHECKING:
 
 __all__ = ["RULES", "Case", "Measured", "Rule", "is_below_size", "min_width_um"]
 
-#: Lengths are compared with this tolerance, a thousandth of the finest manufacturing grid (1 nm).
+#: Tolerance of length comparisons: a thousandth of the finest manufacturing grid (1 nm).
 LENGTH_ROUNDING_UM = 1e-6
-#: Overlaps and gaps below this fraction of a site's area are the rounding of its vertices.
+#: Overlaps and gaps below this fraction of a site's area are due to the rounding of its vertices.
 AREA_ROUNDING = 1e-9
-#: Sites that are fewer than one in so many are made into polygons by themselves, rather than all at once.
+#: A selection of fewer than one site in FEW is converted to polygons separately, without converting all sites.
 FEW = 10
-#: Pairs that a thread takes at once.
+#: Pairs per task of a thread.
 PAIRS_A_PIECE = 100_000
 
 
 @dataclass(frozen=True, slots=True)
 class Contacts:
     """
-    How sites that are near to each other lie: arrays of pairs, ordered by the first site, then the second.
+    Pairs of nearby sites and their distances, ordered by the first site, then the second.
 
     Attributes
     ----------
     first, second : (n_pair,) int64
-        The sites, first < second.
+        Indices of the sites, first < second.
     distance_um : (n_pair,) float64, µm
-        0 for sites that overlap, infinite beyond what was asked for.
+        0 for overlapping sites, infinite beyond the requested distance.
     is_apart : (n_pair,) bool
-        Whether the two surely do not overlap but for rounding.
+        Whether the two certainly do not overlap, apart from rounding.
     is_shared : (n_vertex,) bool
-        Whether the edge that begins at a vertex is another site's edge too, bit for bit.
+        Whether the edge that begins at a vertex is also, bit for bit, an edge of another site.
     """
 
     first: Ints
@@ -60,13 +60,13 @@ class Contacts:
     is_shared: Bools
 
     def of(self, pairs: Any) -> Ints:
-        """Sites of some pairs, (n, 2)."""
+        """Return the sites of the given pairs, (n, 2)."""
         return np.stack((self.first[pairs], self.second[pairs]), axis=1)
 
 
 @dataclass(frozen=True)
 class Case:
-    """A layout and its rules, with what several measures need, computed once."""
+    """A layout and its rules, with cached quantities that several measurements share."""
 
     layout: Layout
     rules: DesignRules
@@ -77,18 +77,26 @@ class Case:
         return self.layout.polygons()
 
     def shapes(self, sites: Ints) -> NDArray[Any]:
-        """Some sites as shapely polygons."""
+        """Return the given sites as shapely polygons."""
         return self.layout[sites].polygons() if FEW * sites.size < self.layout.n_sites else self.polygons[sites]
 
     def sites_near(self, box_um: Floats, reach_um: float = 0.0) -> tuple[Ints, Ints]:
-        """Pairs of some boxes, (n, 4), and sites whose boxes are at most so far apart, ordered by the sites."""
+        """
+        Return pairs (box, site) whose bounding boxes are at most ``reach_um`` apart.
+
+        The boxes have the shape (n, 4). The pairs are ordered by site.
+        """
         n = self.layout.n_sites
         site, box = _near_pairs(np.concatenate((self.layout.site_bounds_um, box_um)), reach_um)
         is_mixed = (site < n) & (box >= n)
         return box[is_mixed] - n, site[is_mixed]
 
     def sites_at(self, geometries: NDArray[Any], among: Bools, reach_um: float = 0.0) -> tuple[Ints, Ints]:
-        """Pairs of some geometries and sites, of those flagged, that are at most so far apart, ordered by the sites."""
+        """
+        Return pairs (geometry, site) that are at most ``reach_um`` apart.
+
+        Only sites flagged in ``among`` are considered. The pairs are ordered by site.
+        """
         geometry, site = self.sites_near(shapely.bounds(geometries), reach_um)
         geometry, site = geometry[among[site]], site[among[site]]
         shapely.prepare(geometries)
@@ -97,17 +105,17 @@ class Case:
 
     @cached_property
     def after(self) -> Ints:
-        """The vertex that follows each one in its ring."""
+        """Next vertex of every vertex in its ring."""
         return next_vertex(self.layout.ring_offsets)
 
     @cached_property
     def first_vertex(self) -> Ints:
-        """Where each site's vertices begin, (n_site + 1,)."""
+        """Index of the first vertex of every site, (n_site + 1,)."""
         return self.layout.ring_offsets[self.layout.site_offsets]
 
     @cached_property
     def contacts(self) -> Contacts:
-        """All pairs of sites that may touch, or break the rule for spaces."""
+        """All pairs of sites that may touch or violate ``min_space_um``."""
         from foveasim.layout import _kernels
 
         layout = self.layout
@@ -130,7 +138,11 @@ class Case:
 
     @cached_property
     def windows(self) -> tuple[Floats, Floats, Floats]:
-        """Windows of the density rule, lower left and upper right corners (n, 2) µm, and the area that sites fill in each."""
+        """
+        Windows of the density rules.
+
+        Lower left corners and upper right corners, (n, 2) µm, and the area covered by sites in each window, (n,) µm².
+        """
         layout, window_um = self.layout, float(self.rules.density_window_um or 0.0)
         field = np.asarray(self.rules.die_um or (layout.bounds_um if layout.n_sites else (0.0, 0.0, 0.0, 0.0)))
         sides_um = np.minimum(window_um, field[2:] - field[:2])
@@ -138,7 +150,7 @@ class Case:
             return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
         starts, lines = [], []
         for i in (0, 1):
-            # The last window of a row ends at the die's border.
+            # The last window of a row ends at the boundary of the die.
             room_um = field[i + 2] - field[i] - sides_um[i]
             n = math.ceil(room_um / (0.5 * sides_um[i]) - LENGTH_ROUNDING_UM) + 1
             starts.append(np.minimum(field[i] + 0.5 * sides_um[i] * np.arange(n), field[i + 2] - sides_um[i]))
@@ -154,12 +166,12 @@ class Case:
 
 
 def _pieces(n: int) -> list[slice]:
-    """Runs of pairs, for several threads."""
+    """Return slices of pairs for several threads."""
     return [slice(start, start + PAIRS_A_PIECE) for start in range(0, max(n, 1), PAIRS_A_PIECE)]
 
 
 def _near_pairs(box_um: Floats, reach_um: float) -> tuple[Ints, Ints]:
-    """Pairs of boxes that are at most so far apart, ordered by the first, then the second."""
+    """Return pairs of boxes at most ``reach_um`` apart, ordered by the first, then the second."""
     from foveasim.layout import _kernels
 
     grown_um = box_um + 0.5 * reach_um * np.array([-1.0, -1.0, 1.0, 1.0])
@@ -171,10 +183,10 @@ def _near_pairs(box_um: Floats, reach_um: float) -> tuple[Ints, Ints]:
 @dataclass(frozen=True, slots=True)
 class Measured:
     """
-    Values, with functions of positions among them.
+    Measured values, with functions that return their sites and markers.
 
-    ``sites(positions)`` are the sites that each is about (site i by default), ``markers(positions)`` the places (those sites
-    by default). Both are asked for the values that break the rule only.
+    ``sites(positions)`` returns the sites of the values at some positions (site i by default), ``markers(positions)`` the
+    marker geometries (those sites by default). Both are called for values that violate the rule only.
     """
 
     values: Floats
@@ -185,25 +197,25 @@ class Measured:
 @dataclass(frozen=True, slots=True)
 class Rule:
     """
-    How a rule is checked.
+    Design rule: measurement and comparison with the limit.
 
     Parameters
     ----------
     description : str
-        What a layout satisfies, for reports.
+        Condition that a layout satisfies, for reports.
     unit : str
-        Of values and limit.
+        Unit of values and limit.
     measure : callable
-        From a :class:`Case` to one value per site, (n_site,), or to :class:`Measured`.
+        Function from a :class:`Case` to one value per site, (n_site,), or to :class:`Measured`.
     is_upper : bool
-        Whether values above the limit are violations; otherwise those below it.
+        Whether values above the limit are violations; otherwise values below it.
     is_deviation : bool
-        Whether values are compared with 0, the limit being a step or a field.
+        Whether values are deviations, compared with 0; the limit is then a step or a field.
     rounding : float
         Values beyond the limit by no more than this satisfy the rule.
     mended_by : {"drop", "merge", None}
-        What mends a violation: dropping its site, or the smaller one of a pair; merging the site with a neighbour, or
-        dropping it; neither.
+        Repair of a violation: ``"drop"`` drops its site, or the smaller site of a pair; ``"merge"`` merges the site with a
+        neighbour, or drops it; None where neither helps.
     """
 
     description: str
@@ -215,7 +227,11 @@ class Rule:
     mended_by: Literal["drop", "merge"] | None = "drop"
 
     def excess(self, values: Floats, limit: float) -> Floats:
-        """Distance of values beyond a limit; negative for those within it. Those above ``rounding`` are violations."""
+        """
+        Return the distance of values beyond a limit, negative within it.
+
+        A distance above ``rounding`` is a violation.
+        """
         return values - limit if self.is_upper else limit - values
 
 
@@ -247,7 +263,7 @@ def _holes(case: Case) -> Measured:
 
 def _spaces(case: Case) -> Measured:
     found = case.contacts
-    # Sites that abut share their border; with a manufacturing grid, to within one step of it.
+    # Abutting sites share their boundary; with a manufacturing grid, to within one grid step.
     is_apart = found.distance_um > max(LENGTH_ROUNDING_UM, case.rules.grid_um or 0.0)
     near = np.flatnonzero(is_apart & (found.distance_um <= float(case.rules.min_space_um or 0.0)))
     return Measured(
@@ -275,7 +291,7 @@ def _corner_angles(case: Case) -> Measured:
 def _edge_angles(case: Case) -> Measured:
     step_deg = float(case.rules.edge_angle_step_deg or 90.0)
     along = case.layout.xy_um[case.after] - case.layout.xy_um
-    # An edge has no direction: 180 degrees are 0.
+    # Edges are undirected: 180 degrees are equivalent to 0.
     angle_deg = np.degrees(np.arctan2(along[:, 1], along[:, 0])) % 180.0
     off_deg = np.minimum(np.abs(angle_deg - step_deg * np.round(angle_deg / step_deg)), 180.0 - angle_deg)
     return Measured(_per_site(np.maximum, off_deg, case.layout))
@@ -288,7 +304,7 @@ def _grid_deviations(case: Case) -> Measured:
 
 
 def _per_site(reduction: np.ufunc, per_vertex: Floats, layout: Layout) -> Floats:
-    """A value per site from one a vertex."""
+    """Reduce values per vertex to one value per site."""
     if layout.n_sites == 0:
         return np.zeros(0)
     return np.asarray(reduction.reduceat(per_vertex, layout.ring_offsets[layout.site_offsets[:-1]]))
@@ -305,10 +321,10 @@ def _overlaps(case: Case) -> Measured:
 
 def _gaps(case: Case) -> Measured:
     """
-    What no site covers, of the die or of what sites surround.
+    Measure the areas that no site covers, within the die or enclosed by sites.
 
-    Sites that touch nothing are taken out last. The edges of the others that no two of them share bound faces, each covered
-    or not all over.
+    Isolated sites are subtracted last. The unshared edges of the other sites bound faces, each of which is either
+    completely covered or completely open.
     """
     layout = case.layout
     area_um2 = layout.area_um2
@@ -318,7 +334,7 @@ def _gaps(case: Case) -> Measured:
     is_alone = _is_alone(case)
     border = np.flatnonzero(~case.contacts.is_shared & ~np.repeat(is_alone, np.diff(case.first_vertex)))
     border_um = np.stack((layout.xy_um[border], layout.xy_um[case.after[border]]), axis=1)
-    # A corner on the middle of a turned edge misses it by rounding: without noding the slit would join what it divides.
+    # A corner on a rotated edge misses it by rounding; without noding, the faces on both sides would merge.
     lines = shapely.linestrings(np.stack(noded_edges(border_um[:, 0], border_um[:, 1]), axis=1))
     if case.rules.die_um is not None:
         lines = np.append(lines, shapely.box(*case.rules.die_um).exterior)
@@ -344,7 +360,12 @@ def _gaps(case: Case) -> Measured:
 
 
 def _open_um2(case: Case) -> float:
-    """The most that all gaps have together: what sites leave of the die, or of the rectangle around them."""
+    """
+    Return an upper bound of the total gap area, in µm².
+
+    The bound is the area of the die, or of the bounding box of the sites, minus the area of the sites. It is infinite
+    where sites may overlap or leave the die.
+    """
     layout = case.layout
     if not case.contacts.is_apart.all():
         return np.inf
@@ -358,7 +379,7 @@ def _open_um2(case: Case) -> float:
 
 
 def _is_alone(case: Case) -> Bools:
-    """Sites without holes that touch no other site, nor the border of the die."""
+    """Return the sites without holes that touch neither another site nor the die boundary."""
     found, box = case.contacts, case.layout.site_bounds_um
     touching = found.of(found.distance_um <= LENGTH_ROUNDING_UM)
     is_alone = np.diff(case.layout.site_offsets) == 1
@@ -372,7 +393,7 @@ def _is_alone(case: Case) -> Bools:
 
 
 def _open_faces(faces: NDArray[Any], is_alone: Bools, case: Case) -> NDArray[Any]:
-    """Faces in the die that no site covers, but for those that are alone."""
+    """Return the faces within the die that no site covers, ignoring isolated sites."""
     inner = _inner_points(faces)
     is_open = np.ones(faces.size, bool)
     if case.rules.die_um is not None:
@@ -382,7 +403,7 @@ def _open_faces(faces: NDArray[Any], is_alone: Bools, case: Case) -> NDArray[Any
 
 
 def _inner_points(faces: NDArray[Any]) -> NDArray[Any]:
-    """A point in every polygon, not in one of the cracks that rounding opens at the border of another."""
+    """Return a point in every polygon, away from slits that rounding opens at its boundary."""
     inner = np.asarray(shapely.point_on_surface(faces))
     thin = np.flatnonzero(shapely.distance(inner, shapely.boundary(faces)) < LENGTH_ROUNDING_UM)
     inner[thin] = shapely.get_point(shapely.maximum_inscribed_circle(faces[thin]), 0)
@@ -390,7 +411,7 @@ def _inner_points(faces: NDArray[Any]) -> NDArray[Any]:
 
 
 def _contents(faces: NDArray[Any], is_alone: Bools, case: Case) -> tuple[Ints, Ints]:
-    """Pairs of faces and sites that are alone in them."""
+    """Return pairs of faces and the isolated sites within them."""
     face, site = case.sites_near(shapely.bounds(faces))
     face, site = face[is_alone[site]], site[is_alone[site]]
     shapely.prepare(faces)
@@ -399,13 +420,13 @@ def _contents(faces: NDArray[Any], is_alone: Bools, case: Case) -> tuple[Ints, I
 
 
 def _grouped(key: Ints, values: Ints, n_keys: int) -> list[Ints]:
-    """The values of each key, in their order."""
+    """Return the values of each key, in their order."""
     stops = np.cumsum(np.bincount(key, minlength=n_keys))[:-1]
     return np.split(values[np.argsort(key, kind="stable")], stops) if n_keys else []
 
 
 def _punched(face: Any, sites: Ints, case: Case) -> Any:
-    """A polygon without some sites that are alone in it."""
+    """Return a polygon with the isolated sites within it cut out."""
     if sites.size == 0:
         return face
     return shapely.Polygon(face.exterior, [*face.interiors, *shapely.get_exterior_ring(case.shapes(sites))])
@@ -418,7 +439,11 @@ def _reach_beyond_die(case: Case) -> Measured:
 
 
 def _growths(case: Case) -> Measured:
-    """Of the rings in their order, the mean pixel size over that of the ring before; marked at the outer one's first site."""
+    """
+    Measure the ratio of mean site sizes of each ring and the next inner one.
+
+    The marker is the first site of the outer ring.
+    """
     rings, first, ring = np.unique(case.layout.index_column("ring"), return_index=True, return_inverse=True)
     size_um = np.bincount(ring, np.sqrt(case.layout.area_um2)) / np.bincount(ring) if rings.size else np.zeros(0)
     order = np.argsort(ring, kind="stable")
@@ -451,19 +476,19 @@ def _counts(case: Case) -> Measured:
 
 
 def _everything(case: Case) -> Any:
-    """The rectangle around all sites."""
+    """Return the bounding box of all sites."""
     return shapely.box(*(case.layout.bounds_um if case.layout.n_sites else (0.0, 0.0, 0.0, 0.0)))
 
 
 def _densities(case: Case) -> Measured:
-    """Of windows that move over the die by half their side, the share that sites fill."""
+    """Measure the fill factor of windows that advance over the die by half their side."""
     low, high, filled_um2 = case.windows
     share = filled_um2 / np.maximum((high - low).prod(axis=1), np.finfo(np.float64).tiny)
     return Measured(share, lambda k: [()] * k.size, lambda k: shapely.box(low[k, 0], low[k, 1], high[k, 0], high[k, 1]))
 
 
 def _filled_um2(layout: Layout, x_um: Floats, y_um: Floats) -> Floats:
-    """Area that sites fill in every cell between some lines, (n_y - 1, n_x - 1) µm²."""
+    """Compute the area covered by sites in every grid cell, (n_y - 1, n_x - 1) µm²."""
     box = layout.site_bounds_um
     columns, rows = x_um.size - 1, y_um.size - 1
     first_x, last_x = (np.clip(np.searchsorted(x_um, box[:, i], "right") - 1, 0, columns - 1) for i in (0, 2))
@@ -471,7 +496,7 @@ def _filled_um2(layout: Layout, x_um: Floats, y_um: Floats) -> Floats:
     inside = (box[:, 0] >= x_um[0]) & (box[:, 2] <= x_um[-1]) & (box[:, 1] >= y_um[0]) & (box[:, 3] <= y_um[-1])
     is_whole = inside & (first_x == last_x) & (first_y == last_y)
     cell, area_um2 = (first_y * columns + first_x)[is_whole], layout.area_um2[is_whole]
-    # The others are cut along the lines: all cells that their boxes reach.
+    # The other sites are clipped to every cell that their bounding boxes reach.
     cut = np.flatnonzero(~is_whole)
     wide, high = (last_x - first_x + 1)[cut], (last_y - first_y + 1)[cut]
     place = positions_in_runs(wide * high)
@@ -493,7 +518,7 @@ def _data_rates(case: Case) -> Measured:
 
 
 def _track_uses(case: Case) -> Measured:
-    """Wherever lines begin, the lines that must cross over the tracks that they have."""
+    """Measure the readout lines per available track of every strip where lines begin."""
     assert case.rules.routing is not None
     found = track_demand(case.layout, case.rules.routing)
     use = np.divide(found.n_nets, found.n_tracks, out=np.full(found.n_nets.size, np.inf), where=found.n_tracks > 0)
@@ -507,49 +532,58 @@ def _track_uses(case: Case) -> Measured:
     return Measured(use, lambda k: [found.first_sites[found.strip == i] for i in k], markers)
 
 
-#: Rules by name. Those of the package are fields of :class:`foveasim.layout.DesignRules`; others, which programs register and
-#: installed packages have as entry points of the group ``foveasim.rules``, get their limits in its ``custom``.
+#: Rules by name. The built-in rules are fields of :class:`foveasim.layout.DesignRules`. Limits of other rules, registered by
+#: programs or by installed packages (entry points of the group ``foveasim.rules``), are set with its parameter ``custom``.
 RULES: Registry[Rule] = Registry("design rule", "foveasim.rules")
 for _name, _rule in {
     "min_size_um": Rule(
-        "a site's size, the square root of its area, is at least the limit", "µm", _sizes, mended_by="merge"
+        "the size of a site, the square root of its area, is at least the limit", "µm", _sizes, mended_by="merge"
     ),
     "max_size_um": Rule(
-        "a site's size, the square root of its area, is at most the limit", "µm", _sizes, is_upper=True
+        "the size of a site, the square root of its area, is at most the limit", "µm", _sizes, is_upper=True
     ),
-    "min_area_um2": Rule("a site's area is at least the limit", "µm²", _areas, mended_by="merge"),
-    "min_hole_um2": Rule("a hole in a site has at least the limit's area", "µm²", _holes),
-    "min_width_um": Rule("a site is nowhere narrower than the limit", "µm", _widths, mended_by="merge"),
-    "min_space_um": Rule("sites that do not touch are at least the limit apart", "µm", _spaces),
-    "max_aspect_ratio": Rule("a site is at most so many times as long as wide", "", _aspect_ratios, is_upper=True),
-    "min_angle_deg": Rule("no corner is sharper than the limit", "degrees", _corner_angles),
+    "min_area_um2": Rule("the area of a site is at least the limit", "µm²", _areas, mended_by="merge"),
+    "min_hole_um2": Rule("the area of a hole in a site is at least the limit", "µm²", _holes),
+    "min_width_um": Rule("the width of a site is at least the limit", "µm", _widths, mended_by="merge"),
+    "min_space_um": Rule("the space between sites that do not touch is at least the limit", "µm", _spaces),
+    "max_aspect_ratio": Rule("the aspect ratio of a site is at most the limit", "", _aspect_ratios, is_upper=True),
+    "min_angle_deg": Rule("the interior angle of a corner is at least the limit", "degrees", _corner_angles),
     "edge_angle_step_deg": Rule(
-        "edges run at multiples of the angle", "degrees", _edge_angles, is_upper=True, is_deviation=True, rounding=1e-4
+        "edge angles are multiples of the limit",
+        "degrees",
+        _edge_angles,
+        is_upper=True,
+        is_deviation=True,
+        rounding=1e-4,
     ),
     "grid_um": Rule("vertices lie on the manufacturing grid", "µm", _grid_deviations, is_upper=True, is_deviation=True),
     "max_overlap_um2": Rule(
-        "no two sites cover more than the limit twice", "µm²", _overlaps, is_upper=True, rounding=0.0
+        "the overlap of two sites is at most the limit", "µm²", _overlaps, is_upper=True, rounding=0.0
     ),
-    "max_gap_um2": Rule("no gap is larger than the limit", "µm²", _gaps, is_upper=True, rounding=0.0, mended_by=None),
-    "die_um": Rule("no site reaches out of the die", "µm", _reach_beyond_die, is_upper=True, is_deviation=True),
-    "min_growth": Rule("pixels grow at least by the limit from ring to ring", "", _growths, mended_by=None),
+    "max_gap_um2": Rule(
+        "the area of a gap is at most the limit", "µm²", _gaps, is_upper=True, rounding=0.0, mended_by=None
+    ),
+    "die_um": Rule("sites lie within the die", "µm", _reach_beyond_die, is_upper=True, is_deviation=True),
+    "min_growth": Rule("the size ratio of successive rings is at least the limit", "", _growths, mended_by=None),
     "max_growth": Rule(
-        "pixels grow at most by the limit from ring to ring", "", _growths, is_upper=True, mended_by=None
+        "the size ratio of successive rings is at most the limit", "", _growths, is_upper=True, mended_by=None
     ),
     "max_neighbour_ratio": Rule(
-        "neighbours' sizes differ at most by the limit",
+        "the size ratio of neighbouring sites is at most the limit",
         "",
         _neighbour_ratios,
         is_upper=True,
         rounding=1e-9,
         mended_by=None,
     ),
-    "max_sites": Rule("there are at most so many sites", "", _counts, is_upper=True, rounding=0.0, mended_by=None),
+    "max_sites": Rule(
+        "the number of sites is at most the limit", "", _counts, is_upper=True, rounding=0.0, mended_by=None
+    ),
     "min_density": Rule(
-        "sites fill at least the limit of every window", "", _densities, rounding=AREA_ROUNDING, mended_by=None
+        "the fill factor of every window is at least the limit", "", _densities, rounding=AREA_ROUNDING, mended_by=None
     ),
     "max_density": Rule(
-        "sites fill at most the limit of every window",
+        "the fill factor of every window is at most the limit",
         "",
         _densities,
         is_upper=True,
@@ -557,28 +591,42 @@ for _name, _rule in {
         mended_by=None,
     ),
     "max_data_rate_gbit_per_s": Rule(
-        "a lane carries at most the limit", "Gbit/s", _data_rates, is_upper=True, rounding=0.0, mended_by=None
+        "the data rate of a lane is at most the limit",
+        "Gbit/s",
+        _data_rates,
+        is_upper=True,
+        rounding=0.0,
+        mended_by=None,
     ),
     "max_track_utilisation": Rule(
-        "readout lines have tracks to get out", "", _track_uses, is_upper=True, rounding=0.0, mended_by=None
+        "the number of readout lines per track is at most the limit",
+        "",
+        _track_uses,
+        is_upper=True,
+        rounding=0.0,
+        mended_by=None,
     ),
 }.items():
     RULES.register(_name, _rule)
 
 
 def is_below_size(area_um2: Floats, min_size_um: float) -> Bools:
-    """Whether the rule ``min_size_um`` rejects a site of an area: what makes or joins sites compares sizes as it does."""
+    """
+    Return whether sites of the given areas violate the rule ``min_size_um``.
+
+    Functions that generate or merge sites use the same comparison as the rule.
+    """
     rule = RULES["min_size_um"]
     return np.asarray(rule.excess(np.sqrt(area_um2), min_size_um) > rule.rounding)
 
 
 def min_width_um(layout: Layout) -> Floats:
     """
-    Smallest width of every site, (n_site,) µm.
+    Compute the minimum width of every site, (n_site,) µm.
 
-    The smallest of: the distance between two edges, not neighbours, that face each other across the site (opposite
-    within 26 degrees); the distance from an inward corner straight across the site to an edge; the width of the
-    narrowest strip along one of its edges that holds the site.
+    The minimum of: the distance between two non-adjacent edges that face each other across the site (antiparallel
+    within 26 degrees); the distance from a reflex vertex straight across the site to an edge; the width of the
+    narrowest strip parallel to one of its edges that contains the site.
     """
     from foveasim.layout import _kernels
 

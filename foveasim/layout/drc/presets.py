@@ -1,4 +1,8 @@
-"""Design rules of public processes, and where they are told. They are defaults of logic processes, not truth about sensors."""
+"""
+Design rule limits of public processes, with their sources.
+
+They are defaults of logic processes and not specific to image sensors.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ __all__ = ["PRESETS", "Preset"]
 
 
 class Preset(NamedTuple):
-    """Limits by the names of :class:`foveasim.layout.DesignRules`'s parameters, and their source."""
+    """Limits by parameter name of :class:`foveasim.layout.DesignRules`, and their source."""
 
     limits: Mapping[str, Any]
     source: str
@@ -18,7 +22,7 @@ class Preset(NamedTuple):
 
 _SKY130 = "SkyWater SKY130 PDK (github.com/google/skywater-pdk), docs/rules/periphery: "
 
-#: Named sets of limits: ``DesignRules(preset="sky130_met1")``.
+#: Sets of limits by name, for example ``DesignRules(preset="sky130_met1")``.
 PRESETS: Mapping[str, Preset] = MappingProxyType(
     {
         "sky130_met1": Preset(

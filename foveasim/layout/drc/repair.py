@@ -1,4 +1,4 @@
-"""Repairing a layout until it keeps its rules, and telling what was changed."""
+"""Repair of layouts that violate design rules, with a record of the changes."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ __all__ = ["Change", "enforce"]
 
 Repair: TypeAlias = Literal["drop", "merge", "refill"]
 
-#: Rounds of merging: a merged site may still be too small.
+#: Maximum number of merging rounds; a merged site may still be too small.
 MAX_ROUNDS = 100
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
     """
-    What was done to some sites, and for which rule.
+    Repair of some sites, and the rule that required it.
 
     Attributes
     ----------
     rule : str
+        Name of the violated rule.
     action : {"dropped", "merged", "replaced"}
     site_ids : tuple of int
-        Numbers of the sites in the layout that was given; merged sites with the ones they were joined to.
+        Indices of the sites in the input layout; for merged sites, all sites of the group.
     """
 
     rule: str
@@ -44,19 +45,19 @@ class Change:
 
 def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> tuple[Layout, tuple[Change, ...]]:
     """
-    A layout that keeps the rules, made from one that may not.
+    Return a layout repaired to satisfy the rules, and the changes.
 
     Parameters
     ----------
     layout : Layout
     rules : DesignRules
-        Waived rules are left broken.
+        Violations of waived rules are not repaired.
     repair : {"drop", "merge", "refill"}
-        ``"drop"`` takes away the sites that break a rule (of two that overlap or are too near, the smaller one): a minimum
-        size leaves the blind spot of a foveal layout. ``"merge"`` first joins sites that are too small to the neighbour with
-        which they share most edge, as often as it takes, and drops what is left. ``"refill"`` drops, and fills the room of
-        sites that were too small, with what they surround, with hexagons of the smallest size; a new site has the columns of
-        the nearest one that was there.
+        ``"drop"`` removes the sites that violate a rule (of two sites that overlap or are too close, the smaller one); a
+        minimum size then leaves the blind spot of a foveal layout. ``"merge"`` first merges sites that are too small with
+        the neighbour that shares the longest boundary, repeatedly, and drops the remaining ones. ``"refill"`` drops sites,
+        and fills the area of sites that were too small, including the area that they enclose, with hexagons of the minimum
+        size. A new site has the column values of the nearest dropped site.
 
     Returns
     -------
@@ -66,7 +67,8 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> t
     Raises
     ------
     GeometryError
-        When a rule is broken that no taking away of sites mends: gaps, growth, neighbours' ratio, the number of sites.
+        When the layout violates a rule that removing sites cannot repair, such as gaps, growth, the size ratio of
+        neighbours, or the number of sites.
 
     Examples
     --------
@@ -79,7 +81,7 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> t
     check_choice("repair", repair, get_args(Repair))
     waivers = rules.waivers or {}
     active = rules.only(lambda name: RULES[name].mended_by is not None and name not in waivers)
-    now = np.arange(layout.n_sites)  # where each given site is now; -1 for one that was dropped
+    now = np.arange(layout.n_sites)  # current index of each input site, -1 for dropped sites
     changes: list[Change] = []
     given = layout
     if repair == "merge":
@@ -89,12 +91,12 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> t
         layout = _refilled(layout, given, active, changes)
     rest = layout.check(rules.only(lambda name: RULES[name].mended_by is None))
     if not rest.ok:
-        raise GeometryError(f"taking away sites does not mend every rule: {_broken(rest)}")
+        raise GeometryError(f"the layout violates rules that removing sites cannot repair: {_broken(rest)}")
     return layout, tuple(changes)
 
 
 def _without_guilty(layout: Layout, rules: DesignRules, now: Ints, changes: list[Change]) -> tuple[Layout, Ints]:
-    """Sites that break a rule taken away, round after round."""
+    """Remove sites that violate a rule until none remain."""
     report = layout.check(rules)
     while not report.ok:
         gone = np.zeros(layout.n_sites, bool)
@@ -111,7 +113,7 @@ def _without_guilty(layout: Layout, rules: DesignRules, now: Ints, changes: list
 
 
 def _refilled(layout: Layout, given: Layout, rules: DesignRules, changes: list[Change]) -> Layout:
-    """The room of sites that were too small in hexagons that are not."""
+    """Fill the area of dropped sites that were too small with hexagons of the minimum size."""
     is_small = [change.action == "dropped" and _is_of_smallness(change.rule) for change in changes]
     gone = np.array([i for change, small in zip(changes, is_small, strict=True) if small for i in change.site_ids], int)
     if gone.size == 0:
@@ -121,7 +123,7 @@ def _refilled(layout: Layout, given: Layout, rules: DesignRules, changes: list[C
     room = shapely.union_all(shapely.polygons(shapely.get_exterior_ring(room)))
     n_kept = layout.n_sites
     filled = fill(layout, room, size_um=_smallest_size_um(rules), columns_of=dropped)
-    # Sites at the border may be narrower than a hexagon, or break rules of another kind.
+    # Sites at the boundary may be narrower than a hexagon, or violate other rules.
     new, _ = _merged(filled[n_kept:], rules, np.arange(filled.n_sites - n_kept), [])
     layout, _ = _without_guilty(union([layout, new]), rules, np.zeros(0, np.int64), [])
     for k, (change, small) in enumerate(zip(changes, is_small, strict=True)):
@@ -137,13 +139,17 @@ def _refilled(layout: Layout, given: Layout, rules: DesignRules, changes: list[C
 
 
 def _smallest_size_um(rules: DesignRules) -> float:
-    """Size of a hexagon that no limit of smallness forbids."""
+    """Return the smallest hexagon size that satisfies all minimum limits."""
     across_um = (rules.min_width_um or 0.0) * math.sqrt(0.5 * math.sqrt(3.0))
     return max(rules.min_size_um or 0.0, math.sqrt(rules.min_area_um2 or 0.0), across_um)
 
 
 def _guilty(layout: Layout, result: RuleResult, gone: Bools) -> Ints:
-    """Sites that a rule takes away beyond those that go already: of a pair the smaller one, unless one of them goes."""
+    """
+    Return further sites that must be removed to satisfy a rule.
+
+    Of a pair, the smaller site is removed, unless one of the two is already in ``gone``.
+    """
     going = set(np.flatnonzero(gone).tolist())
     new = set()
     for violation in result.violations:
@@ -155,7 +161,7 @@ def _guilty(layout: Layout, result: RuleResult, gone: Bools) -> Ints:
 
 
 def _merged(layout: Layout, rules: DesignRules, now: Ints, changes: list[Change]) -> tuple[Layout, Ints]:
-    """Sites that are too small joined to their neighbours, round after round."""
+    """Merge sites that are too small with their neighbours, in rounds."""
     smallness = rules.only(_is_of_smallness)
     for _ in range(MAX_ROUNDS):
         report = layout.check(smallness)
@@ -182,5 +188,5 @@ def _broken(report: Report) -> str:
 
 
 def _is_of_smallness(name: str) -> bool:
-    """Whether a site violates the rule by being too small, so that merging it with a neighbour mends it."""
+    """Return whether merging a site with a neighbour repairs violations of the rule."""
     return RULES[name].mended_by == "merge"

@@ -1,4 +1,4 @@
-"""Reports of design rules as KLayout's report database, to be opened over the chip layout."""
+"""Design rule reports as KLayout report databases (``.lyrdb``)."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ if TYPE_CHECKING:
 
 __all__ = ["is_lyrdb", "read_lyrdb", "write_lyrdb"]
 
-#: Cell that the photosites of a chip file lie in.
+#: Cell of the photosites in GDSII and OASIS files.
 CELL_NAME = "SENSOR"
 #: Larger files are rejected.
 MAX_BYTES = 2**29
-#: How many bytes of a file's beginning tell what it is.
+#: Number of first bytes that are searched for the root element.
 HEAD_BYTES = 512
-#: What write_lyrdb puts into a category's description, and into an item's text.
+#: Text of a category description and of an item, as write_lyrdb writes them.
 LIMIT = re.compile(r"^(?P<description>.*) \(limit (?P<limit>\S+) ?(?P<unit>[^)]*)\)$", re.DOTALL)
 FOUND = re.compile(r"photosite (?P<sites>\d+(?:, \d+)*): (?P<value>\S+) ?(?P<unit>[^']*)")
 #: Points of one ring, edge or box of a marker.
 POINTS = re.compile(r"\(([^()]*)\)")
 
-#: A rule's description, limit and unit; a place's sites, value and marker.
+#: Description, limit and unit of a rule; sites, value and marker of a violation.
 _Told: TypeAlias = tuple[str, float, str]
 _Found: TypeAlias = tuple[tuple[int, ...], float, Any]
 
 
 def write_lyrdb(report: Report, path: str | Path) -> None:
     """
-    Write a report for KLayout's marker browser, whole or not at all.
+    Write a report for KLayout's marker browser, atomically.
 
     Parameters
     ----------
     report : Report
     path : path
-        Ending in ``.lyrdb``. A category a rule, an item a violation, with the sites' numbers, the measured value, and the
-        marker in µm.
+        File with the extension ``.lyrdb``. It contains one category per rule and one item per violation, with the site
+        indices, the measured value, and the marker in µm.
 
     Raises
     ------
     FileError
-        When the ending is another, the library ``klayout`` is missing, or nothing can be written there.
+        When the extension differs, the library ``klayout`` is not installed, or the file cannot be written.
     """
     target = Path(path)
     if target.suffix != ".lyrdb":
@@ -77,7 +77,7 @@ def write_lyrdb(report: Report, path: str | Path) -> None:
 
 
 def _shapes(db: Any, marker: Any) -> list[Any]:
-    """A marker as KLayout's shapes in µm."""
+    """Convert a marker to KLayout shapes in µm."""
 
     def points(ring: Any) -> list[Any]:
         return [db.DPoint(float(x), float(y)) for x, y in shapely.get_coordinates(ring)]
@@ -98,7 +98,7 @@ def _shapes(db: Any, marker: Any) -> list[Any]:
 
 
 def is_lyrdb(path: str | Path) -> bool:
-    """Whether a file begins as KLayout's report databases do."""
+    """Return whether a file is a KLayout report database, from its first bytes."""
     path = Path(path)
     if not path.is_file():
         return False
@@ -108,24 +108,23 @@ def is_lyrdb(path: str | Path) -> bool:
 
 def read_lyrdb(path: str | Path, n_sites: int) -> Report:
     """
-    Read a report: one that :func:`write_lyrdb` wrote, or the findings of another program as far as they are alike.
+    Read a KLayout report database of :func:`write_lyrdb` or of another program.
 
     Parameters
     ----------
     path : path
     n_sites : int
-        Of the layout that was checked, which the file does not tell.
+        Number of sites of the checked layout, which the file does not contain.
 
     Returns
     -------
     Report
-        Of another program's findings, sites, values and limits are not known: none, NaN and NaN. Waivers are not in the
-        file.
+        Violations from another program have no sites, and NaN as value and limit. The file does not contain waivers.
 
     Raises
     ------
     FileError
-        When the file is missing, too large, broken, no report, or names a site that the layout does not have.
+        When the file is missing, too large, corrupt, not a report, or contains a site index beyond ``n_sites``.
     """
     from foveasim.layout.drc.rules import Report
 
@@ -136,13 +135,13 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
         raise FileError(source, f"is larger than {MAX_BYTES} bytes")
     content = source.read_bytes()
     if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
-        raise FileError(source, "declares entities, which a report has no use for")
+        raise FileError(source, "declares XML entities, which are not allowed in a report")
     try:
-        root = ET.fromstring(content)  # noqa: S314 -- entities, which could grow without end, are rejected above
+        root = ET.fromstring(content)  # noqa: S314 -- entities, which can expand without limit, are rejected above
     except ET.ParseError as error:
-        raise FileError(source, f"is corrupt, or no report ({error})") from None
+        raise FileError(source, f"is corrupt, or not a KLayout report database ({error})") from None
     if root.tag != "report-database":
-        raise FileError(source, "is no report database of KLayout")
+        raise FileError(source, "is not a KLayout report database")
     found: dict[str, list[_Found]] = {}
     about: dict[str, _Told] = {}
     for name, category in _categories(root):
@@ -153,7 +152,9 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
         name = (item.findtext("category") or "").strip().strip("'")
         sites, value, marker = _item(source, item)
         if any(site >= n_sites for site in sites):
-            raise FileError(source, f"names site {max(sites)}, and the layout has {n_sites}: it is of another layout")
+            raise FileError(
+                source, f"contains site {max(sites)}, but the layout has {n_sites} sites; use the report of this layout"
+            )
         found.setdefault(name, []).append((sites, value, marker))
     return Report(
         n_sites, tuple(_result(name, about.get(name, (name, np.nan, "")), items) for name, items in found.items())
@@ -170,7 +171,7 @@ def _result(name: str, about: _Told, items: list[_Found]) -> Any:
 
 
 def _categories(root: Any, parent: str = "") -> list[tuple[str, Any]]:
-    """Categories and those below them, by the names that items have for them."""
+    """Return categories and subcategories by the full names that items refer to."""
     found = []
     for category in root.iterfind("categories/category"):
         name = parent + (category.findtext("name") or "").strip()
@@ -179,12 +180,12 @@ def _categories(root: Any, parent: str = "") -> list[tuple[str, Any]]:
 
 
 def _item(source: Path, item: Any) -> _Found:
-    """Sites, value and marker of an item."""
+    """Return the sites, value and marker of an item."""
     sites: tuple[int, ...] = ()
     value = np.nan
     shapes = []
     for element in item.iterfind("values/value"):
-        # A tag in brackets may stand in front: "[#name] polygon: (...)".
+        # A tag in brackets may precede the type: "[#name] polygon: (...)".
         kind, colon, text = (element.text or "").strip().removeprefix("[").partition(":")
         told = FOUND.search(text)
         if kind.endswith("text") and told:
@@ -193,12 +194,12 @@ def _item(source: Path, item: Any) -> _Found:
             try:
                 shapes += _geometries(kind.split(" ")[-1], text)
             except ValueError:
-                raise FileError(source, f"has a marker that is none: {text.strip()[:60]}") from None
+                raise FileError(source, f"contains an invalid marker: {text.strip()[:60]}") from None
     return sites, value, shapely.GeometryCollection(shapes) if len(shapes) != 1 else shapes[0]
 
 
 def _geometries(kind: str, text: str) -> list[Any]:
-    """KLayout's text of a shape as shapely's geometries."""
+    """Convert KLayout's string of a shape to shapely geometries."""
     rings = []
     for points in POINTS.findall(text):
         for part in points.split("/"):

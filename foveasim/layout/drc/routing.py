@@ -1,4 +1,4 @@
-"""Whether the readout lines get out of a layout, and at what rate the data does."""
+"""Routing capacity for readout lines, and readout data rate."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from foveasim.layout.model import Layout
 
 __all__ = ["Readout", "Routing", "TrackDemand", "track_demand"]
 
-#: Lines whose first sites end within this distance of each other start together.
+#: Lines whose first sites end within this distance of each other begin at the same strip.
 TOGETHER_UM = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Readout:
     """
-    How often and how finely the sites are read.
+    Frame rate, bit depth and lanes of the readout.
 
     Parameters
     ----------
     frames_per_s : float, 1/s
+        Frame rate.
     bits : int
-        Of a site's value.
+        Bits per site.
     blanking : float
         Time without data as a fraction of the time with data, such as 0.2.
     n_lanes : int
-        Outputs that share the data evenly.
+        Number of output lanes, with equal data rates.
 
     Raises
     ------
@@ -51,7 +52,9 @@ class Readout:
 
     def gbit_per_s(self, n_sites: int) -> float:
         """
-        Data rate of one lane, Gbit/s: ``sites · frames/s · bits · (1 + blanking) / lanes``.
+        Compute the data rate of one lane, Gbit/s.
+
+        The data rate is ``sites · frames/s · bits · (1 + blanking) / lanes``.
 
         Examples
         --------
@@ -64,16 +67,16 @@ class Readout:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Routing:
     """
-    Metal for the readout lines.
+    Metal tracks for the readout lines.
 
     Parameters
     ----------
     width_um, space_um : float, µm
-        Smallest width of a track and smallest space between two.
+        Minimum width of a track and minimum space between two tracks.
     n_layers : int
-        Metal layers that the lines may use side by side.
+        Number of metal layers for the lines.
     direction : {"outwards", "upwards"}
-        Whether lines run away from the optical axis, as spokes do, or along y, as columns do.
+        Direction of the lines: radially away from the optical axis (sectors), or along y (columns).
 
     Raises
     ------
@@ -93,24 +96,30 @@ class Routing:
         check_choice("direction", self.direction, get_args(Literal["outwards", "upwards"]))
 
     def n_tracks(self, strip_um: Floats) -> Ints:
-        """Lines that can cross strips of these widths: ``layers · floor(strip / (width + space))``."""
-        # A strip of exactly so many tracks, up to rounding, holds them.
+        """
+        Return the number of tracks across strips of the given widths.
+
+        The number is ``layers · floor(strip / (width + space))``.
+        """
+        # Tolerance for a strip that is an exact multiple of the track pitch, up to rounding.
         tracks = np.floor(as_numbers("strip_um", strip_um) / (self.width_um + self.space_um) * (1.0 + 1e-12))
         return (self.n_layers * tracks).astype(np.int64)
 
 
 class TrackDemand(NamedTuple):
     """
-    The strips that lines must cross, one for each place where lines begin, from the inside out or upwards.
+    Readout lines and tracks of every strip where lines begin, outwards or upwards.
 
     Attributes
     ----------
     place_um : (n_strip,) float64, µm
-        Radius of the circle, or height of the line.
+        Radius of the circle, or y of the horizontal line, that is the strip.
     n_nets, n_tracks : (n_strip,) int64
-        Lines that cross it, and those that have room.
+        Lines that cross the strip, and available tracks.
     first_sites : (n_line,) int64
-        The first site of each line, and in ``strip`` (n_line,) where it ends.
+        First site of each line.
+    strip : (n_line,) int64
+        Index of the strip where each line begins.
     """
 
     place_um: Floats
@@ -122,11 +131,11 @@ class TrackDemand(NamedTuple):
 
 def track_demand(layout: Layout, routing: Routing) -> TrackDemand:
     """
-    Lines and tracks wherever lines begin.
+    Count readout lines and available tracks at every strip where lines begin.
 
-    A line begins at the outer end of its innermost (lowest) site and crosses every strip from there on: the circle of
-    ``2πr`` around the axis at that radius, or the whole width of the layout at that height. In a log-polar layout all spokes
-    meet at the first ring: that is the narrowest place.
+    A line begins at the outer end of its innermost (lowest) site and crosses every strip from there outwards (upwards).
+    A strip is the circle of length ``2πr`` around the axis at that radius, or the full width of the layout at that y. In a
+    log-polar layout, the first ring is the narrowest strip, and all lines cross it.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """
-Design rules: what a layout must keep to be made, and the report of where it does not.
+Design rules that a layout must satisfy to be manufactured, and reports of violations.
 
-A rule has a limit; a limit of None leaves the rule out. A check never raises: each rule measures something, what is
-beyond the limit is a violation, one a photosite (or pair, or gap, or ring), and :func:`check` puts them into a report.
+A rule has a limit; a limit of None disables the rule. Each rule measures a quantity per photosite (or pair, gap or ring),
+and values beyond the limit are violations. :func:`check` does not raise on violations, it collects them in a report.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 __all__ = ["RULES", "DesignRules", "Report", "RuleResult", "Violation", "check", "min_width_um"]
 
 
-#: Parameters that hold something else than a number.
+#: Parameters that are not numbers.
 NOT_NUMBERS = {"custom", "die_um", "readout", "routing", "waivers"}
-#: Limits that have an end, and those that cannot be 0.
+#: Upper bounds of limits, and limits that must be positive.
 MOST = {"min_angle_deg": 180.0, "edge_angle_step_deg": 180.0, "min_density": 1.0, "max_density": 1.0}
 ABOVE_ZERO = ("min_angle_deg", "edge_angle_step_deg", "grid_um", "density_window_um")
-#: What a rule needs beside its limit, and of which kind.
+#: Further parameter that a rule requires, and its type.
 NEEDS: dict[str, tuple[str, type | None]] = {
     "min_density": ("density_window_um", None),
     "max_density": ("density_window_um", None),
@@ -46,67 +46,67 @@ NEEDS: dict[str, tuple[str, type | None]] = {
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DesignRules:
     """
-    Limits that a layout is checked against; None leaves a rule out.
+    Limits of the design rules of a layout; None disables a rule.
 
     Parameters
     ----------
     min_size_um, max_size_um : float, optional, µm
-        Smallest and largest pixel size, the square root of a site's area.
+        Minimum and maximum size of a site, the square root of its area.
     min_area_um2 : float, optional, µm²
-        Smallest area of a site.
+        Minimum area of a site.
     min_hole_um2 : float, optional, µm²
-        Smallest area of a hole in a site.
+        Minimum area of a hole in a site.
     min_width_um : float, optional, µm
-        Smallest distance between edges of a site that face each other across it.
+        Minimum distance between edges of a site that face each other across it.
     min_space_um : float, optional, µm
-        Smallest distance between two sites that do not touch. Sites that abut keep it: check what is sensitive to light,
-        after an inset, where that is what must be apart.
+        Minimum distance between two sites that do not touch. Abutting sites satisfy this rule. To check the spacing of the
+        photosensitive areas, apply an inset first.
     max_aspect_ratio : float, optional
-        Longer over shorter side of the smallest rectangle, at any angle, around a site; of equally small ones the least
-        elongated.
+        Maximum ratio of the longer to the shorter side of the minimum-area rectangle, at any angle, around a site. Of
+        several such rectangles, the least elongated one counts.
     min_angle_deg : float, optional, degrees
-        Smallest inner angle of a corner.
+        Minimum interior angle of a corner.
     edge_angle_step_deg : float, optional, degrees
-        Edges must run at multiples of this angle: 90 or 45.
+        Angle of which all edge angles must be multiples, for example 90 or 45.
     grid_um : float, optional, µm
-        Coordinates must be multiples of this manufacturing grid.
+        Manufacturing grid; coordinates must be multiples of it.
     max_overlap_um2 : float, optional, µm²
-        Largest area that two sites may both cover; 0 for none.
+        Maximum overlap of two sites; 0 allows none.
     max_gap_um2 : float, optional, µm²
-        Largest area that may be left open: of the die where ``die_um`` is given, else of the holes between sites.
+        Maximum area of a gap that no site covers, within ``die_um`` where it is given, else enclosed by sites.
     die_um : (x_min, y_min, x_max, y_max), optional, µm
-        The field that every site must lie in.
+        Rectangle that must contain every site.
     min_growth, max_growth : float, optional
-        Limits of the ratio of mean pixel sizes from one ring (column ``ring``) to the next one out.
+        Limits of the ratio of the mean site size of a ring (column ``ring``) to that of the next inner ring.
     max_neighbour_ratio : float, optional
-        Largest ratio of the pixel sizes of two sites that share an edge.
+        Maximum ratio of the sizes of two sites that share an edge.
     max_sites : int, optional
-        Largest number of sites.
+        Maximum number of sites.
     min_density, max_density : float, optional
-        Limits of the fraction of any window of ``density_window_um`` that sites fill. Windows move by half their side over the
-        die, or the layout where none is given.
+        Limits of the fill factor of every window of ``density_window_um``. Windows advance by half their side over the die,
+        or over the bounding box of the layout where no die is given.
     density_window_um : float, optional, µm
-        Side of that window.
+        Side of the windows.
     max_data_rate_gbit_per_s : float, optional, Gbit/s
-        Largest data rate of one lane; needs ``readout``.
+        Maximum data rate of one lane; requires ``readout``.
     readout : Readout, optional
-        Frames, bits, blanking and lanes.
+        Frame rate, bits, blanking and lanes.
     max_track_utilisation : float, optional
-        Largest number of readout lines for each track that they have, wherever lines begin; 1 where all must get out
-        (see :func:`foveasim.layout.track_demand`); needs ``routing``.
+        Maximum number of readout lines per available track at every strip where lines begin; 1 for a routable layout
+        (see :func:`foveasim.layout.track_demand`); requires ``routing``.
     routing : Routing, optional
-        Tracks, layers and direction of the lines.
+        Tracks, metal layers and direction of the lines.
     waivers : mapping of str to str, optional
-        Rules that may be broken, each with the reason. They are checked and reported all the same.
+        Rules that may be violated, each with the reason. They are still checked and reported.
     custom : mapping of str to float, optional
-        Limits of further rules, by the names under which they are registered in :data:`foveasim.layout.drc.RULES`.
+        Limits of further rules, by their names in :data:`foveasim.layout.drc.RULES`.
     preset : str, optional
-        Name of one of :data:`foveasim.layout.PRESETS`, whose limits stand where none is given here.
+        Name of one of :data:`foveasim.layout.PRESETS`, whose limits are the defaults of limits not given here.
 
     Raises
     ------
     ParameterError
-        When a limit is out of range, or what a rule needs beside its limit is not given.
+        When a limit is out of range, or a further parameter that a rule requires is missing.
 
     Examples
     --------
@@ -169,24 +169,24 @@ class DesignRules:
                 raise ParameterError("die_um", "must be (x_min, y_min, x_max, y_max)", self.die_um, "µm")
             object.__setattr__(self, "die_um", tuple(float(x) for x in die))
         if self.custom is not None and not isinstance(self.custom, Mapping):
-            raise ParameterError("custom", "must be limits by the names of rules", self.custom)
+            raise ParameterError("custom", "must be a mapping of rule name to limit", self.custom)
         custom = {}
         for name, limit in dict(self.custom or {}).items():
             RULES.find("custom", name)
             if name in {rule.name for rule in fields(self)}:
-                raise ParameterError("custom", f"must name further rules; '{name}' is a parameter of its own")
+                raise ParameterError("custom", f"must contain registered rules only; set '{name}' as a parameter")
             custom[name] = check_number(f"custom[{name}]", limit)
         object.__setattr__(self, "custom", custom)
         waivers = dict(self.waivers or {})
         for name, reason in waivers.items():
             if name not in RULES:
-                raise ParameterError("waivers", f"must name rules ({', '.join(RULES)})", name)
+                raise ParameterError("waivers", f"must have names of rules as keys ({', '.join(RULES)})", name)
             if not isinstance(reason, str) or not reason.strip():
                 raise ParameterError("waivers", f"must give a reason for '{name}'", reason)
         object.__setattr__(self, "waivers", waivers)
 
     def only(self, keep: Callable[[str], bool]) -> DesignRules:
-        """Return the same limits for the rules whose names are kept, and none for others."""
+        """Return the same limits for the rules that ``keep`` selects, and None for others."""
         own = {rule.name for rule in fields(self)}
         return replace(
             self,
@@ -195,7 +195,7 @@ class DesignRules:
         )
 
     def limits(self) -> dict[str, Any]:
-        """Return the limits that are set, by the names of their rules, in the order of the rules."""
+        """Return the limits that are set by rule name, in the order of the rules."""
         custom = self.custom or {}
         found = {name: custom.get(name, getattr(self, name, None)) for name in RULES}
         return {name: limit for name, limit in found.items() if limit is not None}
@@ -204,19 +204,19 @@ class DesignRules:
 @dataclass(frozen=True, slots=True)
 class Violation:
     """
-    One place where a layout breaks a rule.
+    Violation of a rule at one location.
 
     Attributes
     ----------
     rule : str
         Name of the rule.
     site_ids : tuple of int
-        The site, or the sites around the place.
+        Indices of the site, or of the sites at the location.
     value, limit : float
-        What was measured, and the limit; in ``unit``.
+        Measured value and limit, in ``unit``.
     unit : str
     marker : shapely geometry
-        The place, in µm.
+        Location, in µm.
     """
 
     rule: str
@@ -230,19 +230,19 @@ class Violation:
 @dataclass(frozen=True, eq=False)
 class RuleResult:
     """
-    One rule's verdict.
+    Result of one rule.
 
     Attributes
     ----------
     rule, description : str
-        Name, and what it asks.
+        Name, and the condition that the rule requires.
     limit : float
-        In ``unit``.
+        Limit, in ``unit``.
     unit : str
     values : (n_violation,) float64
-        What was measured where the rule is broken, the worst first.
+        Measured values of the violations, the worst first.
     waiver : str or None
-        Why the rule may be broken.
+        Reason why the rule may be violated.
     """
 
     rule: str
@@ -255,7 +255,7 @@ class RuleResult:
 
     @cached_property
     def violations(self) -> tuple[Violation, ...]:
-        """The places where the rule is broken, the worst first; made when they are asked for."""
+        """Violations of the rule, the worst first; computed on first access."""
         if self.values.size == 0:
             return ()
         sites, markers = self._places()
@@ -268,7 +268,7 @@ class RuleResult:
         return self.values.size
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # The places are functions of the layout: only what they give can be sent.
+        # Sites and markers are functions of the layout; only their results can be pickled.
         found = self.violations
         places = ([v.site_ids for v in found], [v.marker for v in found])
         return RuleResult, (
@@ -277,34 +277,34 @@ class RuleResult:
 
     @property
     def ok(self) -> bool:
-        """Whether the rule is kept, or waived."""
+        """Whether the rule is satisfied or waived."""
         return self.values.size == 0 or self.waiver is not None
 
     def __str__(self) -> str:
         if self.worst is None:
-            return f"{self.rule}: kept"
+            return f"{self.rule}: satisfied"
         count = f"{self.values.size} violation{'s' * (self.values.size != 1)}"
         waived = "" if self.waiver is None else f" (waived: {self.waiver})"
         unit = f" {self.unit}" if self.unit else ""
-        return f"{self.rule}: {count}, worst {self.worst:.6g}{unit} for a limit of {self.limit:g}{unit}{waived}"
+        return f"{self.rule}: {count}, worst {self.worst:.6g}{unit}, limit {self.limit:g}{unit}{waived}"
 
     @property
     def worst(self) -> float | None:
-        """The value furthest beyond the limit, or None."""
+        """Value furthest beyond the limit, or None."""
         return float(self.values[0]) if self.values.size else None
 
 
 @dataclass(frozen=True)
 class Report:
     """
-    What a check found.
+    Report of a design rule check.
 
     Attributes
     ----------
     n_sites : int
-        Sites that were checked.
+        Number of sites of the layout.
     results : tuple of RuleResult
-        One a rule that has a limit.
+        One result per rule with a limit.
     """
 
     n_sites: int
@@ -312,31 +312,35 @@ class Report:
 
     @property
     def ok(self) -> bool:
-        """Whether no rule is broken but those that are waived."""
+        """Whether all rules are satisfied or waived."""
         return all(result.ok for result in self.results)
 
     @cached_property
     def violations(self) -> tuple[Violation, ...]:
-        """All violations, rule by rule, the worst first."""
+        """All violations, grouped by rule, the worst first."""
         return tuple(violation for result in self.results for violation in result.violations)
 
     def raise_if_failed(self) -> None:
         """
-        Raise when a rule is broken.
+        Raise an error when a rule is violated and not waived.
 
         Raises
         ------
         GeometryError
-            Naming every broken rule, with the sites in ``.site_ids``.
+            With the results of all violated rules, and the sites in ``.site_ids``.
         """
         if not self.ok:
             broken = [result for result in self.results if not result.ok]
             lines = [str(result) for result in broken]
             ids = sorted({site for result in broken for violation in result.violations for site in violation.site_ids})
-            raise GeometryError("the layout breaks its design rules: " + "; ".join(lines), tuple(ids))
+            raise GeometryError("the layout violates its design rules: " + "; ".join(lines), tuple(ids))
 
     def records(self) -> list[dict[str, Any]]:
-        """One dict a violation, for a table: rule, site_ids, value, limit, unit, x_um and y_um of the marker's middle."""
+        """
+        Return one dict per violation, for tables.
+
+        The keys are rule, site_ids, value, limit, unit, and x_um and y_um of the marker centroid.
+        """
         return [
             {
                 "rule": violation.rule,
@@ -351,13 +355,17 @@ class Report:
         ]
 
     def plot(self, layout: Layout | None = None, **options: Any) -> Axes:
-        """Draw the places where rules are broken, on the layout that was checked; see :func:`foveasim.view.plot_report`."""
+        """Plot the violations on the checked layout; see :func:`foveasim.view.plot_report`."""
         from foveasim.view import plot_report
 
         return plot_report(self, layout, **options)
 
     def write(self, path: str | Path) -> None:
-        """Write a KLayout report database (``.lyrdb``); see :func:`foveasim.layout.drc.report.write_lyrdb`."""
+        """
+        Write a KLayout report database (``.lyrdb``).
+
+        See :func:`foveasim.layout.drc.report.write_lyrdb`.
+        """
         from foveasim.layout.drc.report import write_lyrdb
 
         write_lyrdb(self, path)
@@ -387,7 +395,7 @@ class Report:
 
 def check(layout: Layout, rules: DesignRules) -> Report:
     """
-    Check a layout against rules.
+    Check a layout against design rules.
 
     Parameters
     ----------
@@ -397,7 +405,7 @@ def check(layout: Layout, rules: DesignRules) -> Report:
     Returns
     -------
     Report
-        One result for each rule that has a limit.
+        One result per rule with a limit.
     """
     if not isinstance(rules, DesignRules):
         raise ParameterError("rules", f"must be DesignRules, got a {type(rules).__name__}")
@@ -413,7 +421,7 @@ def check(layout: Layout, rules: DesignRules) -> Report:
 
 
 def _measured(name: str, rule: Rule, case: Case) -> Measured:
-    """What a rule measures; an array has one value per site."""
+    """Return the measurements of a rule; arrays must have one value per site."""
     found = rule.measure(case)
     if isinstance(found, Measured):
         return found
@@ -421,13 +429,13 @@ def _measured(name: str, rule: Rule, case: Case) -> Measured:
     if values.shape != (case.layout.n_sites,):
         n_sites = case.layout.n_sites
         raise ParameterError(
-            "custom", f"rule '{name}' must measure one value for each of the {n_sites} sites", values.shape
+            "custom", f"rule '{name}' must return one value for each of the {n_sites} sites", values.shape
         )
     return Measured(values)
 
 
 def _broken(rule: Rule, found: Measured, limit: float, case: Case) -> tuple[Floats, Callable[[], tuple[Any, Any]]]:
-    """The values that break the limit, the worst first, and what gives their sites and markers."""
+    """Return the values beyond the limit, worst first, and a getter of sites and markers."""
     beyond = rule.excess(found.values, limit)
     bad = np.flatnonzero(beyond > rule.rounding)
     bad = bad[np.argsort(-beyond[bad], kind="stable")]

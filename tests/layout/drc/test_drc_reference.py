@@ -1,4 +1,4 @@
-"""Every rule agrees with a slow twin on random layouts, and finds the one place planted among 100,000 sites."""
+"""Design rules against a slow reference implementation, and with one violation among 100,000 sites."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from foveasim.layout.drc.rules import RULES
 
 relaxed = settings(deadline=None, derandomize=True, max_examples=60)
 
-#: Steps to deviate from, and the deviations (degrees, µm) that count as none.
+#: Steps, and the tolerances of deviations from them (degrees, µm).
 STEPS = {
     "edge_angle_step_deg": (90.0, 45.0, 30.0, 22.5, 180.0, 7.5),
     "grid_um": (1.0, 0.005, 0.5, 0.1, 2.0, 1 / 3),
 }
 DEVIATIONS = {"edge_angle_step_deg": 1e-4, "grid_um": 1e-6, "die_um": 1e-6}
 
-#: Where a limit lies in what there is, 0 to 1.
-shares = st.integers(0, 99).map(lambda percent: percent / 100)
+#: Position of a limit within the range of measured values, 0 to 1.
+fractions = st.integers(0, 99).map(lambda percent: percent / 100)
 
 
-def die_in(layout, share):
-    """A field that cuts sites off on some sides and leaves room on others."""
+def die_in(layout, fraction):
+    """Return a die that cuts off sites on some sides and leaves open area on others."""
     x0, y0, x1, y1 = shapely.total_bounds(layout.polygons()).tolist()
     width, height = x1 - x0, y1 - y0
     return (
-        x0 + 0.5 * (share - 0.305) * width,
-        y0 + 0.5 * (0.405 - share) * height,
-        x1 + 0.5 * (0.505 - share) * width,
+        x0 + 0.5 * (fraction - 0.305) * width,
+        y0 + 0.5 * (0.405 - fraction) * height,
+        x1 + 0.5 * (0.505 - fraction) * width,
         y1 - 0.1 * height,
     )
 
 
-def between(values, share):
-    """A limit below, between or above the values, near to none of them."""
+def between(values, fraction):
+    """Return a limit below, between or above the values, not close to any of them."""
     distinct = []
     for value in sorted(value for value in values if value > 1e-5):
         if not distinct or value - distinct[-1] > 1e-5 * max(1.0, value):
@@ -50,23 +50,23 @@ def between(values, share):
     if not distinct:
         return 0.5
     limits = [0.5 * distinct[0], *(0.5 * (a + b) for a, b in pairwise(distinct)), 1.5 * distinct[-1]]
-    return limits[int(share * len(limits))]
+    return limits[int(fraction * len(limits))]
 
 
-def limited(rule, layout, share, has_field):
-    """Rules with a limit for one rule; where another rule changes its meaning, with that one or without."""
+def limited(rule, layout, fraction, has_field):
+    """Return design rules with one limit; optionally with a second limit that changes its meaning."""
     if rule in STEPS:
-        return fs.DesignRules(**{rule: STEPS[rule][int(share * len(STEPS[rule]))]})
-    field = {"die_um": die_in(layout, share)}
+        return fs.DesignRules(**{rule: STEPS[rule][int(fraction * len(STEPS[rule]))]})
+    field = {"die_um": die_in(layout, fraction)}
     if rule == "die_um":
         return fs.DesignRules(**field)
     other = {"max_gap_um2": field, "min_space_um": {"grid_um": 0.7}}.get(rule, {}) if has_field else {}
-    limit = between([value for _, value in TWINS[rule](layout, fs.DesignRules(**other))], share)
+    limit = between([value for _, value in TWINS[rule](layout, fs.DesignRules(**other))], fraction)
     return fs.DesignRules(**{rule: min(limit, 180.0) if rule == "min_angle_deg" else limit}, **other)
 
 
 def compare(rule, layout, rules):
-    """The checker names the places that the twin does, with the same values, the worst first."""
+    """Compare sites and values of the violations with the reference implementation."""
     is_upper = rule.startswith("max_") or rule in DEVIATIONS
     limit = DEVIATIONS.get(rule, getattr(rules, rule))
     measured = TWINS[rule](layout, rules)
@@ -81,50 +81,50 @@ def compare(rule, layout, rules):
     assert values == pytest.approx(sorted(values, reverse=is_upper), rel=1e-9)
 
 
-# -- twins --------------------------------------------------------------------------------------------------------------
+# -- reference implementations ------------------------------------------------------------------------------------------
 
 
-#: Rules about the whole field: their twins stand in test_field_rules.py.
+#: Rules for the complete field; their reference implementations are in test_field_rules.py.
 FIELD_RULES = {"min_density", "max_density", "max_data_rate_gbit_per_s", "max_track_utilisation"}
 
 
-def test_every_rule_has_a_twin():
+def test_every_rule_has_reference_implementation():
     assert set(TWINS) | FIELD_RULES == set(RULES)
 
 
 @pytest.mark.parametrize("rule", sorted(set(TWINS) - {"max_gap_um2"}))
-@given(layout=layouts(), share=shares, has_field=st.booleans())
+@given(layout=layouts(), fraction=fractions, has_field=st.booleans())
 @relaxed
-def test_a_rule_and_its_twin_name_the_same_places_with_the_same_values(rule, layout, share, has_field):
-    compare(rule, layout, limited(rule, layout, share, has_field))
+def test_violations_match_reference_implementation(rule, layout, fraction, has_field):
+    compare(rule, layout, limited(rule, layout, fraction, has_field))
 
 
-@given(layout=layouts(turns=False), share=shares, has_field=st.booleans())
+@given(layout=layouts(turns=False), fraction=fractions, has_field=st.booleans())
 @relaxed
-def test_gaps_and_their_twin_name_the_same_places_with_the_same_values(layout, share, has_field):
-    compare("max_gap_um2", layout, limited("max_gap_um2", layout, share, has_field))
+def test_gaps_match_reference_without_rotation(layout, fraction, has_field):
+    compare("max_gap_um2", layout, limited("max_gap_um2", layout, fraction, has_field))
 
 
-@given(layout=layouts(), share=shares, has_field=st.booleans())
+@given(layout=layouts(), fraction=fractions, has_field=st.booleans())
 @relaxed
-def test_gaps_and_their_twin_have_the_same_areas_at_any_angle_and_place(layout, share, has_field):
-    rules = limited("max_gap_um2", layout, share, has_field)
+def test_gap_areas_match_reference_with_rotation(layout, fraction, has_field):
+    rules = limited("max_gap_um2", layout, fraction, has_field)
     expected = [area_um2 for _, area_um2 in TWINS["max_gap_um2"](layout, rules) if area_um2 > rules.max_gap_um2]
     found = [violation.value for violation in layout.check(rules).violations if violation.rule == "max_gap_um2"]
 
     assert found == pytest.approx(sorted(expected, reverse=True), rel=1e-6, abs=1e-5)
 
 
-# -- one place among 100,000 sites --------------------------------------------------------------------------------------
+# -- one violation among 100,000 sites ----------------------------------------------------------------------------------
 
-#: Number of the planted site, amid the others, and the ring that it joins.
+#: Index of the planted site, and its ring.
 PLANT, RING = 61_803, 108
 PITCH_UM = {"spaced": 3.0, "abutting": 2.0}
 
 
 @pytest.fixture(scope="module")
 def squares():
-    """99,999 squares of 2 µm, apart or abutting, their rows as rings; 3 × 3 are left out in the middle of row 108."""
+    """99,999 squares of 2 µm, spaced or abutting, with rows as rings and a 3 × 3 vacancy in the centre of row 108."""
     n_x, n_y = 463, 216
     row, column = np.divmod(np.arange(n_x * n_y), n_x)
     is_kept = (np.abs(row - RING) > 1) | (np.abs(column - 231) > 1)
@@ -139,7 +139,7 @@ def alone(_layout):
 
 
 def with_site_at(x_um, y_um):
-    """The planted site and the one at a place."""
+    """Return a function for the planted site and the site at a position."""
 
     def sites(layout):
         low, high = layout.site_bounds_um[:, :2], layout.site_bounds_um[:, 2:]
@@ -162,11 +162,11 @@ DUMBBELL = shapely.union_all([shapely.box(-3, -1, -1, 1), shapely.box(-1, -0.25,
 FRAME = square(8).difference(shapely.box(-0.5, -0.25, 0.5, 0.25))
 RIGHT_TRIANGLE = shapely.Polygon([(-2, -2), (2, -2), (2, 2)])
 FLAT_TRIANGLE = shapely.Polygon([(-2, -2), (2, -2), (2, 1)])
-#: Mean size in the ring of the planted square of 3 µm, over that of other rings.
+#: Ratio of the mean site size in the ring of the planted 3 µm square to that of other rings.
 GROWTH = (460 + 1.5) / 461
 
-#: For each rule the squares that the plant joins, the plant around the middle of the free room (10 µm wide where squares
-#: are apart, 6 µm where they abut), the limit, and what is found: sites and value.
+#: For each rule: the squares, the planted site around the centre of the vacancy (10 µm wide between spaced squares, 6 µm
+#: between abutting ones), the limit, and the expected sites and value.
 PLANTS = {
     "min_size_um": ("spaced", square(1), 1.5, alone, 1.0),
     "max_size_um": ("spaced", square(3), 2.5, alone, 3.0),
@@ -189,7 +189,7 @@ PLANTS = {
 
 
 @pytest.mark.parametrize("rule", PLANTS)
-def test_one_planted_violation_among_a_hundred_thousand_sites_is_found_alone(rule, squares):
+def test_single_violation_found_among_100000_sites(rule, squares):
     name, shape, limit, sites, value = PLANTS[rule]
     plant = fs.Layout.from_polygons([shape], ring=[RING]).translate(0.0, 0.5 * PITCH_UM[name])
     layout = fs.layout.union([squares[name][:PLANT], plant, squares[name][PLANT:]])

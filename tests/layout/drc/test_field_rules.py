@@ -1,4 +1,4 @@
-"""Rules about whole fields: density in a moving window, data rate, room for readout lines; and rule sets by name."""
+"""Rules for complete fields: density in a moving window, data rate, routing capacity; and presets."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def values(layout, **rules):
 # -- density ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_periodic_layout_has_its_fill_factor_in_every_window():
+def test_periodic_layout_density_equals_fill_factor():
     layout = grid(n_x=40, n_y=40, pitch_um=1.0, width_um=0.6)
     die = (-20.0, -20.0, 20.0, 20.0)
 
@@ -31,7 +31,7 @@ def test_a_periodic_layout_has_its_fill_factor_in_every_window():
     assert layout.check(DesignRules(min_density=0.36, max_density=0.36, density_window_um=4.0, die_um=die)).ok
 
 
-def test_one_planted_block_is_found_in_the_windows_that_hold_it_and_nowhere_else():
+def test_low_density_found_only_around_hole():
     squares = grid(n_x=320, n_y=320, pitch_um=2.0, width_um=1.0)
     gone = (np.abs(squares.centroid_um - np.array([103.0, -51.0])) < 4.5).all(axis=1)
     report = squares[~gone].check(
@@ -48,7 +48,7 @@ def test_one_planted_block_is_found_in_the_windows_that_hold_it_and_nowhere_else
 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10_000), window_um=st.floats(3.0, 30.0), has_die=st.booleans())
-def test_densities_agree_with_clipping_every_site_to_every_window(seed, window_um, has_die):
+def test_densities_match_clipped_site_areas(seed, window_um, has_die):
     rng = np.random.default_rng(seed)
     layout = fs.layout.voronoi(n_sites=30, size_um=(20.0, 14.0), n_iterations=1, seed=seed)
     layout = layout[rng.random(30) < 0.7]
@@ -74,7 +74,7 @@ def test_densities_agree_with_clipping_every_site_to_every_window(seed, window_u
 # -- data rate -------------------------------------------------------------------------------------------------------
 
 
-def test_the_data_rate_of_a_layout_is_limited():
+def test_data_rate_limit_is_checked():
     layout = grid(n_x=2592 // 8, n_y=1944 // 8, pitch_um=1.0)
     readout = Readout(frames_per_s=30, bits=10, blanking=0.2)
 
@@ -83,13 +83,15 @@ def test_the_data_rate_of_a_layout_is_limited():
     assert layout.check(DesignRules(max_data_rate_gbit_per_s=0.02, readout=two)).ok
 
 
-# -- room for lines --------------------------------------------------------------------------------------------------
+# -- routing capacity ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # coarse ratios end inside r_max_um
+@pytest.mark.filterwarnings(
+    "ignore::foveasim.errors.LayoutWarning"
+)  # with coarse ratios, the last ring lies inside r_max_um
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(n_sectors=st.integers(20, 400), pitch_um=st.floats(0.2, 2.0), n_layers=st.integers(1, 4))
-def test_spokes_of_a_log_polar_layout_share_the_first_ring(n_sectors, pitch_um, n_layers):
+def test_log_polar_lines_cross_first_ring(n_sectors, pitch_um, n_layers):
     layout = log_polar(n_sectors=n_sectors, min_size_um=2.0, r_max_um=2.0 * n_sectors)
     routing = Routing(width_um=0.6 * pitch_um, space_um=0.4 * pitch_um, n_layers=n_layers)
     outer_um = math.hypot(*layout.xy_um[0])
@@ -102,7 +104,7 @@ def test_spokes_of_a_log_polar_layout_share_the_first_ring(n_sectors, pitch_um, 
     assert layout.check(DesignRules(max_track_utilisation=1.0, routing=routing)).ok == (n_sectors <= n_tracks)
 
 
-def test_columns_that_are_wider_than_the_sensor_are_told():
+def test_columns_exceeding_layout_width_are_reported():
     layout = grid(n_x=100, n_y=3, pitch_um=0.5)
     rules = {"max_track_utilisation": 1.0}
     narrow = Routing(width_um=0.14, space_um=0.14, direction="upwards")
@@ -114,7 +116,7 @@ def test_columns_that_are_wider_than_the_sensor_are_told():
     assert report.violations[0].marker.length == 50.0
 
 
-def test_one_site_or_line_too_many_among_a_hundred_thousand_sites_is_told():
+def test_single_excess_found_among_100000_sites():
     layout = log_polar(n_sectors=500, r_min_um=100.0, r_max_um=1300.0, n_rings=200)
     readout = Readout(frames_per_s=1000.0, bits=10)
     outer_um = math.hypot(*layout.xy_um[0])
@@ -130,7 +132,7 @@ def test_one_site_or_line_too_many_among_a_hundred_thousand_sites_is_told():
     assert [v.rule for v in one_less[1:].check(rules).violations] == []
 
 
-def test_lines_without_any_track_are_told():
+def test_lines_without_tracks_are_reported():
     layout = log_polar(n_sectors=12, r_min_um=1.0, r_max_um=24.5)
     routing = Routing(width_um=20.0, space_um=20.0)
 
@@ -153,20 +155,20 @@ def test_lines_without_any_track_are_told():
         ({"preset": "sky"}, "'preset' must be one of 'sky130_met1', .*, got 'sky'"),
     ],
 )
-def test_limits_without_what_they_need_are_refused(limits, message):
+def test_invalid_field_limits_are_rejected(limits, message):
     with pytest.raises(ParameterError, match=message):
         DesignRules(**limits)
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_preset_has_its_limits_and_a_source(name):
+def test_preset_has_limits_and_source(name):
     rules = DesignRules(preset=name)
 
     assert len(PRESETS[name].source) > 30
     assert all(getattr(rules, limit) == value for limit, value in PRESETS[name].limits.items())
 
 
-def test_published_limits_of_the_presets():
+def test_presets_match_published_limits():
     metal, diff, well = (DesignRules(preset=f"sky130_{layer}") for layer in ("met1", "diff", "dnwell"))
 
     assert (metal.min_width_um, metal.min_space_um, metal.min_area_um2, metal.min_hole_um2) == (0.14, 0.14, 0.083, 0.14)
@@ -177,13 +179,13 @@ def test_published_limits_of_the_presets():
     assert DesignRules(preset="paper").min_size_um == 2.2
 
 
-def test_limits_that_are_given_stand_before_those_of_a_preset():
+def test_explicit_limits_override_preset():
     rules = DesignRules(preset="sky130_met1", min_width_um=0.5)
 
     assert (rules.min_width_um, rules.min_space_um) == (0.5, 0.14)
 
 
-def test_files_hold_presets_readouts_and_routings(tmp_path):
+def test_rule_files_accept_presets_readout_routing(tmp_path):
     (tmp_path / "rules.yaml").write_text(
         "preset: sky130_diff\nmin_width_um: 0.2\nmax_data_rate_gbit_per_s: 2.0\n"
         "readout: {frames_per_s: 30.0, bits: 10, n_lanes: 4}\n"
@@ -206,5 +208,5 @@ def test_files_hold_presets_readouts_and_routings(tmp_path):
         read_rules(tmp_path / "rules.yaml")
 
 
-def test_rules_are_read_by_the_name_of_a_preset():
+def test_rules_are_read_by_preset_name():
     assert read_rules("sky130_met1") == DesignRules(preset="sky130_met1")

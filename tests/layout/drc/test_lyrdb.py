@@ -1,4 +1,4 @@
-"""Reports for KLayout: its own reader finds every violation with its marker."""
+"""KLayout report databases: violations and markers as KLayout reads them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LAYOUT = fs.Layout.from_polygons([shapely.box(0, 0, 4, 4), shapely.box(3, 0, 8, 
 RULES = fs.DesignRules(min_width_um=1.0, max_overlap_um2=0.0, min_space_um=0.5, max_sites=10)
 
 
-def test_klayout_reads_every_violation_with_its_value_and_marker(tmp_path):
+def test_klayout_reads_values_and_markers(tmp_path):
     report = LAYOUT.check(RULES)
     report.write(tmp_path / "report.lyrdb")
     database = rdb.ReportDatabase("")
@@ -33,7 +33,7 @@ def test_klayout_reads_every_violation_with_its_value_and_marker(tmp_path):
     assert found["min_space_um"][1].edge().length() == pytest.approx(0.2)
 
 
-def test_a_gap_with_an_island_keeps_its_hole(tmp_path):
+def test_gap_marker_has_hole_at_island(tmp_path):
     frame = shapely.box(0, 0, 10, 10).difference(shapely.box(2, 2, 8, 8))
     layout = fs.Layout.from_polygons([frame, shapely.box(4, 4, 6, 6)])
     layout.check(fs.DesignRules(max_gap_um2=0.0)).write(tmp_path / "gap.lyrdb")
@@ -44,19 +44,19 @@ def test_a_gap_with_an_island_keeps_its_hole(tmp_path):
     assert list(item.each_value())[1].polygon().area() == pytest.approx(32.0)
 
 
-def test_another_ending_is_refused(tmp_path):
+def test_other_extension_is_rejected(tmp_path):
     with pytest.raises(FileError, match=r"must end in \.lyrdb"):
         LAYOUT.check(RULES).write(tmp_path / "report.xml")
 
 
-def test_a_missing_library_is_named_with_the_command_that_installs_it(tmp_path, monkeypatch):
+def test_missing_klayout_gives_install_command(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "klayout", None)
     with pytest.raises(FileError, match=r"needs klayout; install it with: pip install 'foveasim\[klayout\]'"):
         LAYOUT.check(RULES).write(tmp_path / "report.lyrdb")
     assert not list(tmp_path.iterdir())
 
 
-def test_a_report_that_was_written_is_read_again(tmp_path):
+def test_report_round_trip_preserves_violations(tmp_path):
     report = LAYOUT.check(RULES)
     report.write(tmp_path / "report.lyrdb")
     back = read_lyrdb(tmp_path / "report.lyrdb", LAYOUT.n_sites)
@@ -72,7 +72,7 @@ def test_a_report_that_was_written_is_read_again(tmp_path):
         assert now.marker.equals_exact(was.marker.normalize(), 1e-6) or now.marker.equals(was.marker)
 
 
-def test_findings_of_another_program_are_read_as_places(tmp_path):
+def test_reports_of_other_programs_are_read(tmp_path):
     database = rdb.ReportDatabase("other")
     cell = database.create_cell("TOP").rdb_id()
     category = database.create_category("width").rdb_id()
@@ -99,19 +99,23 @@ def test_findings_of_another_program_are_read_as_places(tmp_path):
     ("content", "n_sites", "message"),
     [
         (None, 3, "no such file"),
-        ("not xml", 3, "is corrupt, or no report"),
-        ("<html/>", 3, "is no report database"),
-        ('<!DOCTYPE a [<!ENTITY b "c">]><report-database>&b;</report-database>', 3, "declares entities"),
-        ("cut", 3, "is corrupt, or no report"),
-        ("whole", 1, "names site 2, and the layout has 1"),
-        ("marker", 3, "has a marker that is none"),
+        ("not xml", 3, "is corrupt, or not a KLayout report"),
+        ("<html/>", 3, "is not a KLayout report database"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><report-database>&b;</report-database>', 3, "declares XML entities"),
+        ("truncated", 3, "is corrupt, or not a KLayout report"),
+        ("complete", 1, "contains site 2, but the layout has 1 sites"),
+        ("marker", 3, "contains an invalid marker"),
     ],
 )
-def test_a_broken_or_strange_report_is_refused(tmp_path, content, n_sites, message):
+def test_invalid_report_is_rejected(tmp_path, content, n_sites, message):
     path = tmp_path / "report.lyrdb"
     LAYOUT.check(RULES).write(path)
-    whole = path.read_text()
-    texts = {"cut": whole[: len(whole) // 2], "whole": whole, "marker": whole.replace("polygon: (", "polygon: (x")}
+    complete = path.read_text()
+    texts = {
+        "truncated": complete[: len(complete) // 2],
+        "complete": complete,
+        "marker": complete.replace("polygon: (", "polygon: (x"),
+    }
     path.unlink()
     if content is not None:
         path.write_text(texts.get(content, content))

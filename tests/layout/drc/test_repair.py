@@ -1,4 +1,4 @@
-"""Repair: the result keeps its rules, and the changes tell exactly what was done."""
+"""Repair: repaired layouts satisfy their rules, and the changes are complete."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def changed(changes):
     return {site for change in changes for site in change.site_ids}
 
 
-def test_a_smallest_size_leaves_the_blind_spot():
+def test_minimum_size_drops_blind_spot_sites():
     legal, changes = RINGS.enforce(fs.DesignRules(min_size_um=1.0))
     is_small = np.sqrt(RINGS.area_um2) < 1.0
 
@@ -28,7 +28,7 @@ def test_a_smallest_size_leaves_the_blind_spot():
     assert legal.columns["ring"].min() == RINGS.columns["ring"][is_small].max() + 1
 
 
-def test_merging_keeps_the_area_and_reaches_the_size():
+def test_merging_preserves_area_and_reaches_size():
     rules = fs.DesignRules(min_size_um=1.0, max_overlap_um2=0.0)
     legal, changes = RINGS.enforce(rules, repair="merge")
 
@@ -38,7 +38,7 @@ def test_merging_keeps_the_area_and_reaches_the_size():
     assert set(np.flatnonzero(np.sqrt(RINGS.area_um2) < 1.0)) <= changed(changes)
 
 
-def test_of_two_that_overlap_the_smaller_goes():
+def test_smaller_of_two_overlapping_sites_dropped():
     layout = fs.Layout.from_rectangles([[0, 0], [1.5, 0], [10, 0]], [2.0, 1.8, 2.0])
     legal, changes = layout.enforce(fs.DesignRules(max_overlap_um2=0.0))
 
@@ -48,7 +48,7 @@ def test_of_two_that_overlap_the_smaller_goes():
     assert legal.n_sites == 2
 
 
-def test_one_site_that_meets_several_goes_alone():
+def test_site_overlapping_several_is_dropped_alone():
     layout = fs.Layout.from_rectangles(
         [[0, 0], [2, 0], [-2, 0], [0, 2]], [[1.0, 1.0], [3.2, 0.7], [3.2, 0.7], [0.7, 3.2]]
     )
@@ -60,7 +60,7 @@ def test_one_site_that_meets_several_goes_alone():
 
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10_000), repair=st.sampled_from(["drop", "merge", "refill"]))
-def test_any_layout_keeps_the_rules_afterwards_and_nothing_else_changed(seed, repair):
+def test_repair_satisfies_rules_and_preserves_rest(seed, repair):
     rng = np.random.default_rng(seed)
     layout = fs.Layout.from_rectangles(rng.uniform(0, 15, (30, 2)), rng.uniform(0.3, 2.5, (30, 2)))
     rules = fs.DesignRules(min_width_um=0.6, max_overlap_um2=0.0, min_space_um=0.3, die_um=(0, 0, 15, 15))
@@ -72,7 +72,7 @@ def test_any_layout_keeps_the_rules_afterwards_and_nothing_else_changed(seed, re
     assert {polygon.normalize() for polygon in layout.polygons()[untouched]} <= kept
 
 
-def test_refilling_leaves_no_blind_spot_and_no_site_below_the_smallest_size():
+def test_refill_covers_blind_spot():
     rules = fs.DesignRules(min_size_um=1.0, max_overlap_um2=0.0, max_gap_um2=0.0)
     legal, changes = RINGS.enforce(rules, repair="refill")
     n_kept = int((np.sqrt(RINGS.area_um2) >= 1.0).sum())
@@ -88,7 +88,7 @@ def test_refilling_leaves_no_blind_spot_and_no_site_below_the_smallest_size():
     assert legal.provenance["generator"] == "log_polar"
 
 
-def test_refilling_keeps_a_smallest_width_too():
+def test_refill_satisfies_minimum_width():
     rules = fs.DesignRules(min_size_um=1.0, min_width_um=0.9, max_overlap_um2=0.0)
     legal, changes = RINGS.enforce(rules, repair="refill")
 
@@ -98,29 +98,29 @@ def test_refilling_keeps_a_smallest_width_too():
     assert 0.0 <= hole_um2 < 0.02 * legal.area_um2.sum()
 
 
-def test_waived_rules_are_left_broken():
-    rules = fs.DesignRules(min_size_um=1.0, waivers={"min_size_um": "made of test sites"})
+def test_waived_rules_are_not_repaired():
+    rules = fs.DesignRules(min_size_um=1.0, waivers={"min_size_um": "test structures"})
 
     assert RINGS.enforce(rules) == (RINGS, ())
 
 
-def test_a_layout_that_keeps_its_rules_is_left_as_it_is():
+def test_legal_layout_is_unchanged():
     assert RINGS.enforce(fs.DesignRules(min_size_um=0.1)) == (RINGS, ())
 
 
-def test_what_no_dropping_mends_is_told():
-    with pytest.raises(GeometryError, match="taking away sites does not mend every rule: max_gap_um2: 1 violation"):
+def test_irreparable_violations_raise_error():
+    with pytest.raises(GeometryError, match="rules that removing sites cannot repair: max_gap_um2: 1 violation"):
         RINGS.enforce(fs.DesignRules(min_size_um=1.0, max_gap_um2=0.0))
     with pytest.raises(GeometryError, match="max_sites: 1 violation"):
         RINGS.enforce(fs.DesignRules(max_sites=10))
 
 
-def test_an_unknown_repair_is_refused():
+def test_unknown_repair_is_rejected():
     with pytest.raises(ParameterError, match="'repair' must be one of 'drop', 'merge', 'refill', got 'shrink'"):
         RINGS.enforce(fs.DesignRules(), repair="shrink")
 
 
-def test_a_site_in_a_hole_can_be_merged_with_its_frame():
+def test_site_in_hole_merges_with_frame():
     frame = shapely.box(0, 0, 9, 9).difference(shapely.box(4, 4, 4.5, 4.5))
     layout = fs.Layout.from_polygons([frame, shapely.box(4, 4, 4.5, 4.5)])
     legal, changes = layout.enforce(fs.DesignRules(min_size_um=1.0), repair="merge")
@@ -129,12 +129,12 @@ def test_a_site_in_a_hole_can_be_merged_with_its_frame():
     assert changes[0].site_ids == (0, 1)
 
 
-def test_when_every_site_goes_an_empty_layout_is_left_that_every_rule_accepts():
+def test_repair_may_drop_all_sites():
     rules = fs.DesignRules(
         min_size_um=1e3, max_size_um=2e3, min_area_um2=1.0, min_hole_um2=1.0, min_width_um=1.0, min_space_um=1.0,
         max_aspect_ratio=9.0, min_angle_deg=1.0, edge_angle_step_deg=45.0, grid_um=0.1, max_overlap_um2=0.0, max_gap_um2=0.0,
         die_um=(0, 0, 1, 1), max_growth=3.0, min_growth=0.1, max_neighbour_ratio=2.0, max_sites=5,
-        waivers={"max_gap_um2": "nothing is left to close the die"},
+        waivers={"max_gap_um2": "no site remains to cover the die"},
     )  # fmt: skip
     legal, changes = RINGS.enforce(rules)
 

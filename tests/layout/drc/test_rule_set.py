@@ -1,4 +1,4 @@
-"""The rules beyond size and overlap: each finds what is planted, alone, with its value, and agrees with a slow twin."""
+"""Rules other than size and overlap: planted violations, values, waivers and reports."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SQUARES = fs.layout.grid(n_x=20, n_y=20, pitch_um=3.0, width_um=2.0)
 
 
 def planted(polygon):
-    """A hundred squares of 2 µm, 1 µm apart, with one shape beside them."""
+    """Return a hundred squares of 2 µm, 1 µm apart, and one shape next to them."""
     squares = list(fs.layout.grid(n_x=10, n_y=10, pitch_um=3.0, width_um=2.0).polygons())
     return fs.Layout.from_polygons([*squares, shapely.transform(polygon, lambda xy: xy + np.array([100.0, 0.0]))])
 
@@ -37,7 +37,7 @@ PLANTS = {
 
 
 @pytest.mark.parametrize("rule", [r for r in PLANTS if r != "edge_angle_step_deg"])
-def test_a_planted_violation_is_found_alone_with_its_value(rule):
+def test_planted_violation_found_alone_with_value(rule):
     shape, limit, value = PLANTS[rule]
     report = planted(shape).check(fs.DesignRules(**{rule: limit}))
 
@@ -46,14 +46,14 @@ def test_a_planted_violation_is_found_alone_with_its_value(rule):
     assert planted(shapely.box(0, 0, 2, 2)).check(fs.DesignRules(**{rule: limit})).ok
 
 
-def test_an_edge_off_the_angles_is_measured_by_its_deviation():
+def test_edge_angle_deviation_is_measured():
     report = planted(PLANTS["edge_angle_step_deg"][0]).check(fs.DesignRules(edge_angle_step_deg=45.0))
 
     assert [v.site_ids for v in report.violations] == [(100,)]
     assert report.violations[0].value == pytest.approx(45.0 - np.degrees(np.arctan2(3, 4)))
 
 
-def test_a_round_layout_breaks_the_edge_rule_in_one_line_and_can_be_waived():
+def test_edge_angle_rule_can_be_waived():
     rings = fs.layout.log_polar(n_sectors=16, r_min_um=3.0, r_max_um=22.0)
     rules = {"edge_angle_step_deg": 45.0, "min_size_um": 0.5}
     report = rings.check(fs.DesignRules(**rules))
@@ -67,7 +67,7 @@ def test_a_round_layout_breaks_the_edge_rule_in_one_line_and_can_be_waived():
     waived.raise_if_failed()
 
 
-def test_sites_that_abut_keep_the_space_rule_and_near_ones_break_it():
+def test_space_rule_ignores_abutting_sites():
     abutting = fs.layout.grid(n_x=5, n_y=5, pitch_um=2.0)
     assert abutting.check(fs.DesignRules(min_space_um=0.5)).ok
 
@@ -79,7 +79,7 @@ def test_sites_that_abut_keep_the_space_rule_and_near_ones_break_it():
 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10_000), limit_um=st.floats(0.1, 2.0))
-def test_spaces_agree_with_every_pair_measured(seed, limit_um):
+def test_spaces_match_pairwise_distances(seed, limit_um):
     rng = np.random.default_rng(seed)
     layout = fs.Layout.from_rectangles(rng.uniform(0, 20, (25, 2)), rng.uniform(0.2, 2.0, (25, 2)))
     polygons = layout.polygons()
@@ -92,7 +92,7 @@ def test_spaces_agree_with_every_pair_measured(seed, limit_um):
     assert {v.site_ids for v in layout.check(fs.DesignRules(min_space_um=limit_um)).violations} == expected
 
 
-def test_rings_of_a_log_polar_layout_grow_by_its_ratio():
+def test_log_polar_growth_equals_ring_ratio():
     rings = fs.layout.log_polar(n_sectors=30, r_min_um=5.0, r_max_um=80.0, ring_ratio=1.0945)
     ratio = float(np.sqrt(rings.area_um2[30] / rings.area_um2[0]))
 
@@ -104,7 +104,7 @@ def test_rings_of_a_log_polar_layout_grow_by_its_ratio():
     assert len(report.violations[0].site_ids) == 30
 
 
-def test_zones_step_by_two_between_neighbours():
+def test_zone_neighbours_have_size_ratio_two():
     zones = fs.layout.zones(side_um=(4, 12, 28), pitch_um=(1, 2, 4))
 
     assert zones.check(fs.DesignRules(max_neighbour_ratio=2.0)).ok
@@ -115,21 +115,21 @@ def test_zones_step_by_two_between_neighbours():
     assert {round(v.value, 9) for v in report.violations} == {2.0}
 
 
-def test_the_number_of_sites_is_limited():
+def test_number_of_sites_is_limited():
     report = SQUARES.check(fs.DesignRules(max_sites=399))
 
     assert [(v.site_ids, v.value, v.limit) for v in report.violations] == [((), 400.0, 399.0)]
     assert SQUARES.check(fs.DesignRules(max_sites=400)).ok
 
 
-def test_corners_of_holes_are_measured_from_inside_the_site():
+def test_hole_corner_angle_measured_inside_site():
     wedge = shapely.Polygon([(2, 2), (6, 2.5), (2, 3)])  # 14 degrees in the hole, 346 in the site
     frame = shapely.box(0, 0, 9, 9).difference(wedge)
 
     assert fs.Layout.from_polygons([frame]).check(fs.DesignRules(min_angle_deg=80.0)).ok
 
 
-def test_one_violation_among_a_hundred_thousand_sites_is_found_by_every_rule():
+def test_every_rule_finds_violation_among_100000_sites():
     big = fs.layout.grid(n_x=400, n_y=250, pitch_um=3.0, width_um=2.0)
     sliver = fs.Layout.from_polygons([shapely.Polygon([(900, 0), (900.9, 0.0), (900.9, 0.33), (900, 0.3)])])
     layout = fs.layout.union([big, sliver])
@@ -145,7 +145,7 @@ def test_one_violation_among_a_hundred_thousand_sites_is_found_by_every_rule():
     }
 
 
-def test_records_are_a_row_a_violation():
+def test_records_have_row_per_violation():
     records = planted(shapely.box(0, 0, 3, 3)).check(fs.DesignRules(max_size_um=2.5)).records()
 
     assert records == [
@@ -161,7 +161,7 @@ def test_records_are_a_row_a_violation():
     ]
 
 
-def test_every_rule_has_a_limit_a_sentence_and_is_documented():
+def test_every_rule_has_field_and_description():
     for name, rule in RULES.items():
         assert hasattr(fs.DesignRules(), name)
         assert rule.description
@@ -175,30 +175,30 @@ def test_every_rule_has_a_limit_a_sentence_and_is_documented():
         ({"edge_angle_step_deg": 200.0}, "'edge_angle_step_deg' must be <= 180"),
         ({"grid_um": 0.0}, "'grid_um' must be > 0"),
         ({"max_growth": -1.0}, "'max_growth' must be >= 0"),
-        ({"waivers": {"min_widht_um": "typo"}}, "'waivers' must name rules"),
+        ({"waivers": {"min_widht_um": "typo"}}, "'waivers' must have names of rules as keys"),
         ({"waivers": {"min_width_um": " "}}, "'waivers' must give a reason for 'min_width_um'"),
     ],
 )
-def test_limits_that_cannot_be_are_refused(values, message):
+def test_invalid_limits_are_rejected(values, message):
     with pytest.raises(ParameterError, match=message):
         fs.DesignRules(**values)
 
 
-def test_growth_needs_rings():
+def test_growth_requires_ring_column():
     with pytest.raises(ParameterError, match="'ring' must be a column of the layout"):
         SQUARES.check(fs.DesignRules(max_growth=1.1))
 
 
-def test_a_waived_rule_does_not_raise_and_the_others_do():
+def test_only_unwaived_violations_raise_error():
     layout = planted(shapely.box(0, 0, 3, 3))
     rules = fs.DesignRules(max_size_um=2.5, max_sites=50, waivers={"max_size_um": "the reference site"})
 
-    with pytest.raises(GeometryError, match=r"max_sites: 1 violation, worst 101 for a limit of 50$"):
+    with pytest.raises(GeometryError, match=r"max_sites: 1 violation, worst 101, limit 50$"):
         layout.check(rules).raise_if_failed()
 
 
-def test_giotto_at_a_unit_pixel_of_6_45_um_has_504_sites_narrower_than_6_8_um():
-    """What KLayout's own width check finds on these sites, once each: the two innermost rings of the 110 around the fovea."""
+def test_giotto_has_504_sites_below_minimum_width():
+    """At a unit pixel of 6.45 µm, KLayout's width check finds the same sites: the two innermost of the 110 rings."""
     rings = fs.layout.giotto(n_rho=152, n_theta=252, n_fovea=42, n_across=1090, unit_um=6.45, fovea="none")
     report = rings.check(fs.DesignRules(min_width_um=6.8))
     ids = [violation.site_ids[0] for violation in report.violations]
@@ -209,14 +209,14 @@ def test_giotto_at_a_unit_pixel_of_6_45_um_has_504_sites_narrower_than_6_8_um():
 
 
 @pytest.mark.parametrize("step_deg", [50.0, 75.0, 90.0, 45.0, 7.0])
-def test_an_edge_has_no_direction_for_the_rule_of_angles(step_deg):
+def test_edge_angle_ignores_direction(step_deg):
     upright = SQUARES.check(fs.DesignRules(edge_angle_step_deg=step_deg))
     expected = min(90.0 % step_deg, step_deg - 90.0 % step_deg)
 
     assert {round(v.value, 9) for v in upright.violations} == ({round(expected, 9)} if expected else set())
 
 
-def test_a_report_can_be_sent_to_another_process():
+def test_report_can_be_pickled():
     report = planted(shapely.box(0, 0, 3, 3)).check(fs.DesignRules(max_size_um=2.5, max_sites=50))
     back = pickle.loads(pickle.dumps(report))
 

@@ -1,4 +1,4 @@
-"""Laws of the design rules: planted violations are found alone, with their sites and values, and clean layouts pass."""
+"""Design rules: planted violations are found with their sites and values, and clean layouts pass."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from foveasim.layout.drc.rules import min_width_um
 
 relaxed = settings(deadline=None, derandomize=True, max_examples=40)
 
-#: Every rule; a layout of 25 unit squares around the origin keeps them all.
+#: All rules of this file; a layout of 25 unit squares around the origin satisfies them.
 ALL_RULES = DesignRules(
     min_size_um=0.9, min_width_um=0.2, max_overlap_um2=0.0, max_gap_um2=0.0, die_um=(-2.5, -2.5, 2.5, 2.5)
 )
@@ -29,12 +29,12 @@ RULE_NAMES = ("min_size_um", "min_width_um", "max_overlap_um2", "max_gap_um2", "
 
 
 def squares():
-    """25 unit squares that tile the die; site 12 is the middle one, 13 is on its right, 24 is the upper right one."""
+    """Return 25 unit squares that tile the die: site 12 is the centre, 13 to its right, 24 at the upper right."""
     return list(grid(n_x=5, n_y=5, pitch_um=1.0).polygons())
 
 
 def replaced(changes, dropped=()):
-    """The 25 squares with some replaced and others left out."""
+    """Return the 25 squares, some replaced and others dropped."""
     shapes = [changes.get(i, square) for i, square in enumerate(squares()) if i not in dropped]
     return Layout.from_polygons(shapes)
 
@@ -44,7 +44,7 @@ def box_at(left_um, low_um, width_um, height_um):
 
 
 def found(layout, rules=ALL_RULES):
-    """All violations as (rule, sites, value)."""
+    """Return all violations as (rule, sites, value)."""
     return [(v.rule, v.site_ids, pytest.approx(v.value, rel=1e-9)) for v in layout.check(rules).violations]
 
 
@@ -59,7 +59,7 @@ ARM = box_at(0.5, -0.02, 0.4, 0.05)
 
 PLANTED = {
     "small site": (
-        # The middle square gives a quarter to its neighbour: sqrt(0.75) is too small, 0.75 wide enough.
+        # A quarter of the centre square belongs to its neighbour: the size sqrt(0.75) is too small, the width 0.75 is not.
         replaced({12: box_at(-0.5, -0.5, 0.75, 1), 13: box_at(0.25, -0.5, 1.25, 1)}),
         ("min_size_um", (12,), math.sqrt(0.75)),
     ),
@@ -71,7 +71,7 @@ PLANTED = {
         replaced({12: box_at(-0.5, -0.5, 1.25, 1)}),
         ("max_overlap_um2", (12, 13), 0.25),
     ),
-    "site missing in the middle": (
+    "site missing in the centre": (
         replaced({}, dropped=(12,)),
         ("max_gap_um2", (6, 7, 8, 11, 12, 15, 16, 17), 1.0),
     ),
@@ -94,7 +94,7 @@ PLANTED = {
 }
 
 
-def test_the_unit_squares_keep_every_rule():
+def test_unit_squares_satisfy_every_rule():
     report = replaced({}).check(ALL_RULES)
 
     assert report.ok
@@ -103,18 +103,18 @@ def test_the_unit_squares_keep_every_rule():
 
 
 @pytest.mark.parametrize(("layout", "violation"), PLANTED.values(), ids=PLANTED)
-def test_a_planted_violation_is_found_alone_with_its_site_and_value(layout, violation):
+def test_planted_violation_found_alone_with_value(layout, violation):
     assert found(layout) == [violation]
     assert not layout.check(ALL_RULES).ok
 
 
 @pytest.mark.parametrize(("layout", "violation"), PLANTED.values(), ids=PLANTED)
-def test_a_rule_that_is_left_out_finds_nothing(layout, violation):
+def test_disabled_rule_reports_no_violations(layout, violation):
     assert found(layout, replace(ALL_RULES, **{violation[0]: None})) == []
 
 
 @pytest.mark.parametrize(("layout", "violation"), PLANTED.values(), ids=PLANTED)
-def test_a_violation_tells_its_limit_unit_and_place(layout, violation):
+def test_violation_contains_limit_unit_and_marker(layout, violation):
     (v,) = layout.check(ALL_RULES).violations
     rule, sites, value = violation
     polygons = layout.polygons()
@@ -131,7 +131,7 @@ def test_a_violation_tells_its_limit_unit_and_place(layout, violation):
 # -- min_size --------------------------------------------------------------------------------------------------------
 
 
-def test_small_sites_come_worst_first():
+def test_small_sites_sorted_worst_first():
     layout = Layout.from_rectangles([[0, 0], [10, 0], [20, 0], [30, 0]], [1.0, 3.0, 0.5, 2.0])
 
     assert found(layout, DesignRules(min_size_um=2.5)) == [
@@ -145,13 +145,13 @@ def test_small_sites_come_worst_first():
     ("width_um", "height_um", "limit_um", "ok"),
     [(2.0, 2.0, 2.0, True), (1.0, 4.0, 2.0, True), (1.0, 4.0, 2.001, False), (2.0, 2.0, 2.0 + 1e-8, True)],
 )
-def test_a_site_of_the_smallest_size_passes(width_um, height_um, limit_um, ok):
+def test_site_at_minimum_size_passes(width_um, height_um, limit_um, ok):
     layout = Layout.from_rectangles([[0, 0]], [[width_um, height_um]])
 
     assert layout.check(DesignRules(min_size_um=limit_um)).ok is ok
 
 
-def test_the_size_of_a_site_leaves_out_its_holes():
+def test_site_size_excludes_holes():
     layout = Layout.from_polygons([box_at(0, 0, 5, 5).difference(box_at(1, 1, 3, 3))])
 
     assert found(layout, DesignRules(min_size_um=4.5)) == [("min_size_um", (0,), 4.0)]
@@ -174,11 +174,11 @@ WIDTHS = {
     "L": (shapely.Polygon([(0, 0), (5, 0), (5, 0.3), (1, 0.3), (1, 5), (0, 5)]), 0.3),
     "U": (shapely.Polygon([(0, 0), (6, 0), (6, 5), (5.6, 5), (5.6, 2), (2, 2), (2, 5), (0, 5)]), 0.4),
     "U with a thin foot": (shapely.Polygon([(0, 0), (6, 0), (6, 5), (4, 5), (4, 0.1), (2, 0.1), (2, 5), (0, 5)]), 0.1),
-    "U with a foot that thins to its left": (
+    "U with a foot tapering to the left": (
         shapely.Polygon([(0, 0), (6, 0), (6, 5), (4, 5), (4, 0.3), (2, 0.1), (2, 5), (0, 5)]),
         0.1,
     ),
-    "U with a foot that thins to its right": (
+    "U with a foot tapering to the right": (
         shapely.Polygon([(0, 0), (6, 0), (6, 5), (4, 5), (4, 0.1), (2, 0.3), (2, 5), (0, 5)]),
         0.1,
     ),
@@ -207,25 +207,27 @@ WIDTHS = {
 
 
 @pytest.mark.parametrize(("shape", "width_um"), WIDTHS.values(), ids=WIDTHS)
-def test_widths_of_known_shapes(shape, width_um):
+def test_width_matches_known_shapes(shape, width_um):
     assert min_width_um(Layout.from_polygons([shape]))[0] == pytest.approx(width_um, rel=1e-9)
 
 
 @pytest.mark.parametrize("shape", [shape for shape, _ in WIDTHS.values()], ids=WIDTHS)
 @given(angle_deg=st.floats(0, 360), factor=st.floats(0.1, 10), shift_um=st.integers(-1000, 1000))
 @settings(relaxed, max_examples=15)
-def test_widths_turn_and_grow_with_their_shapes(shape, angle_deg, factor, shift_um):
+def test_width_follows_rotation_and_scale(shape, angle_deg, factor, shift_um):
     layout = Layout.from_polygons([shape])
     moved = layout.rotate(angle_deg).scale(factor).translate(shift_um, -shift_um)
 
     assert min_width_um(moved)[0] == pytest.approx(factor * min_width_um(layout)[0], rel=1e-6)
 
 
-@pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # coarse ratios end inside r_max_um
+@pytest.mark.filterwarnings(
+    "ignore::foveasim.errors.LayoutWarning"
+)  # with coarse ratios, the last ring lies inside r_max_um
 @given(st.integers(3, 16), st.floats(1.05, 2.0), st.integers(1, 4), st.booleans())
 @example(n_sectors=8, ring_ratio=2.0, chords_per_arc=1, stagger=False)
 @relaxed
-def test_all_sites_of_a_ring_have_the_same_width(n_sectors, ring_ratio, chords_per_arc, stagger):
+def test_width_is_equal_within_ring(n_sectors, ring_ratio, chords_per_arc, stagger):
     layout = log_polar(
         n_sectors=n_sectors,
         r_min_um=10.0,
@@ -241,19 +243,19 @@ def test_all_sites_of_a_ring_have_the_same_width(n_sectors, ring_ratio, chords_p
 
 @given(st.floats(0.1, 50.0), st.floats(0.1, 50.0), st.floats(-180, 180))
 @relaxed
-def test_the_width_of_a_rectangle_is_its_shorter_side(width_um, height_um, angle_deg):
+def test_rectangle_width_is_shorter_side(width_um, height_um, angle_deg):
     layout = Layout.from_rectangles([[0, 0]], [[width_um, height_um]]).rotate(angle_deg)
 
     assert min_width_um(layout)[0] == pytest.approx(min(width_um, height_um), rel=1e-9)
 
 
 @pytest.mark.parametrize("n_corners", [32, 64, 257])
-def test_the_width_of_a_disc_is_its_diameter_to_five_percent(n_corners):
+def test_disc_width_approximates_diameter(n_corners):
     assert min_width_um(Layout.from_polygons([regular(n_corners, 3.0)]))[0] == pytest.approx(6.0, rel=0.05)
 
 
 @pytest.mark.parametrize("orientation", ["pointy", "flat"])
-def test_the_width_of_hexagons_is_their_width(orientation):
+def test_hexagon_width_is_distance_across_flats(orientation):
     layout = hexagonal(n_columns=3, n_rows=4, pitch_um=100.0, width_um=85.0, orientation=orientation)
 
     np.testing.assert_allclose(min_width_um(layout), 85.0, rtol=1e-9)
@@ -261,7 +263,7 @@ def test_the_width_of_hexagons_is_their_width(orientation):
     assert len(layout.check(DesignRules(min_width_um=85.01)).violations) == 12
 
 
-def test_each_site_has_its_own_width_whatever_lies_beside_it():
+def test_width_is_independent_of_other_sites():
     shapes = [affinity.translate(shape, 200.0 * k, 0.0) for k, (shape, _) in enumerate(WIDTHS.values())]
     together = min_width_um(Layout.from_polygons(shapes))
 
@@ -290,14 +292,14 @@ def test_each_site_has_its_own_width_whatever_lies_beside_it():
         ),
     ],
 )
-def test_overlaps_are_pairs_with_their_common_area(shapes, expected):
+def test_overlaps_report_pairs_with_common_area(shapes, expected):
     layout = Layout.from_polygons(shapes)
 
     assert found(layout, DesignRules(max_overlap_um2=0.0)) == [("max_overlap_um2", *pair) for pair in expected]
 
 
 @pytest.mark.parametrize(("limit_um2", "ok"), [(0.24, False), (0.25, True), (0.3, True)])
-def test_an_overlap_up_to_the_limit_passes(limit_um2, ok):
+def test_overlap_up_to_limit_passes(limit_um2, ok):
     layout = PLANTED["overlap"][0]
 
     assert layout.check(DesignRules(max_overlap_um2=limit_um2)).ok is ok
@@ -305,7 +307,7 @@ def test_an_overlap_up_to_the_limit_passes(limit_um2, ok):
 
 @given(st.integers(0, 2**32 - 1))
 @relaxed
-def test_overlaps_of_random_rectangles_are_those_of_all_pairs(seed):
+def test_random_overlaps_match_all_pairs(seed):
     rng = np.random.default_rng(seed)
     centre, size = rng.uniform(-5, 5, (12, 2)), rng.uniform(0.5, 4.0, (12, 2))
     violations = Layout.from_rectangles(centre, size).check(DesignRules(max_overlap_um2=0.0)).violations
@@ -322,13 +324,13 @@ def test_overlaps_of_random_rectangles_are_those_of_all_pairs(seed):
 # -- gap -------------------------------------------------------------------------------------------------------------
 
 
-def test_without_a_die_a_gap_is_what_sites_surround():
+def test_gaps_without_die_are_enclosed():
     missing = replaced({}, dropped=(7, 24))
 
     assert found(missing, DesignRules(max_gap_um2=0.0)) == [("max_gap_um2", (1, 2, 3, 6, 7, 10, 11, 12), 1.0)]
 
 
-def test_with_a_die_a_gap_is_all_that_is_left_open_of_it():
+def test_gaps_with_die_include_open_boundary():
     missing = replaced({}, dropped=(7, 24))
     rules = DesignRules(max_gap_um2=0.0, die_um=(-2.5, -2.5, 3.5, 2.5))
 
@@ -339,7 +341,7 @@ def test_with_a_die_a_gap_is_all_that_is_left_open_of_it():
 
 
 @pytest.mark.parametrize("die_um", [None, (0.0, 0.0, 10.0, 10.0)])
-def test_an_island_in_a_gap_is_no_part_of_it(die_um):
+def test_gap_excludes_enclosed_island(die_um):
     ring = box_at(0, 0, 10, 10).difference(box_at(2, 2, 6, 6))
     layout = Layout.from_polygons([ring, box_at(4, 4, 2, 2)])
 
@@ -354,7 +356,7 @@ def test_an_island_in_a_gap_is_no_part_of_it(die_um):
     ],
 )
 @pytest.mark.parametrize("die_um", [None, ALL_RULES.die_um])
-def test_gaps_come_worst_first(dropped, sites_um2, die_um):
+def test_gaps_sorted_worst_first(dropped, sites_um2, die_um):
     layout = replaced({}, dropped=dropped)
 
     assert found(layout, DesignRules(max_gap_um2=0.0, die_um=die_um)) == [
@@ -362,7 +364,7 @@ def test_gaps_come_worst_first(dropped, sites_um2, die_um):
     ]
 
 
-def test_trenches_that_reach_the_outside_are_a_gap_only_in_a_die():
+def test_open_trenches_are_gaps_only_with_die():
     layout = grid(n_x=3, n_y=3, pitch_um=1.0, width_um=0.9)
 
     assert layout.check(DesignRules(max_gap_um2=0.0)).ok
@@ -372,15 +374,15 @@ def test_trenches_that_reach_the_outside_are_a_gap_only_in_a_die():
 
 
 @pytest.mark.parametrize(("limit_um2", "ok"), [(0.9, False), (1.0, True), (2.0, True)])
-def test_a_gap_up_to_the_limit_passes(limit_um2, ok):
-    layout = PLANTED["site missing in the middle"][0]
+def test_gap_up_to_limit_passes(limit_um2, ok):
+    layout = PLANTED["site missing in the centre"][0]
 
     assert layout.check(DesignRules(max_gap_um2=limit_um2)).ok is ok
 
 
 @pytest.mark.parametrize("stagger", [False, True])
 @pytest.mark.parametrize("n_sectors", [8, 33])
-def test_the_blind_spot_is_the_only_gap_of_a_log_polar_layout(n_sectors, stagger):
+def test_log_polar_gap_is_blind_spot(n_sectors, stagger):
     layout = log_polar(n_sectors=n_sectors, r_min_um=10.0, r_max_um=50.0, n_rings=4, stagger=stagger, chords_per_arc=2)
     n_corners = 2 * n_sectors
     blind_um2 = 0.5 * n_corners * math.sin(2 * math.pi / n_corners) * 100.0
@@ -388,7 +390,7 @@ def test_the_blind_spot_is_the_only_gap_of_a_log_polar_layout(n_sectors, stagger
     assert found(layout, DesignRules(max_gap_um2=0.0)) == [("max_gap_um2", tuple(range(n_sectors)), blind_um2)]
 
 
-def test_a_die_without_sites_is_one_gap():
+def test_empty_die_is_single_gap():
     report = replaced({})[:0].check(DesignRules(max_gap_um2=0.0, die_um=(0, 0, 3, 2)))
 
     assert [(v.site_ids, v.value) for v in report.violations] == [((), 6.0)]
@@ -406,10 +408,10 @@ def test_a_die_without_sites_is_one_gap():
         pytest.param((-1, -1, 0.5, 1), [((1,), 0.5), ((3,), 0.5)], id="right"),
         pytest.param((-1, -1, 1, 0.5), [((2,), 0.5), ((3,), 0.5)], id="high"),
         pytest.param((-1, -1, 0.5, 0.25), [((2,), 0.75), ((3,), 0.75), ((1,), 0.5)], id="two sides, worst first"),
-        pytest.param((10, 10, 11, 11), [((0,), 11.0), ((1,), 11.0), ((2,), 11.0), ((3,), 10.0)], id="elsewhere"),
+        pytest.param((10, 10, 11, 11), [((0,), 11.0), ((1,), 11.0), ((2,), 11.0), ((3,), 10.0)], id="outside"),
     ],
 )
-def test_how_far_sites_reach_out_of_the_die(die_um, expected):
+def test_die_rule_measures_protrusion(die_um, expected):
     layout = grid(n_x=2, n_y=2, pitch_um=1.0)
 
     assert found(layout, DesignRules(die_um=die_um)) == [("die_um", *violation) for violation in expected]
@@ -433,7 +435,7 @@ TILING = DesignRules(max_overlap_um2=0.0, max_gap_um2=0.0)
 )
 @pytest.mark.parametrize("angle_deg", [0.0, 33.0])
 @pytest.mark.parametrize("shift_um", [0.0, 12_345.678])
-def test_clean_layouts_pass_wherever_they_lie(layout, size_um, width_um, angle_deg, shift_um):
+def test_clean_layouts_pass_after_rotation_and_translation(layout, size_um, width_um, angle_deg, shift_um):
     moved = layout.rotate(angle_deg).translate(shift_um, -shift_um)
     die_um = np.add(moved.bounds_um, (-1.0, -1.0, 1.0, 1.0))
 
@@ -443,9 +445,7 @@ def test_clean_layouts_pass_wherever_they_lie(layout, size_um, width_um, angle_d
 
 @given(st.integers(3, 14), st.integers(1, 5), st.integers(1, 4), st.booleans(), st.floats(0, 360))
 @relaxed
-def test_log_polar_layouts_have_no_overlap_and_only_their_blind_spot_as_gap(
-    n_sectors, n_rings, chords_per_arc, stagger, angle_deg
-):
+def test_rotated_log_polar_has_single_gap(n_sectors, n_rings, chords_per_arc, stagger, angle_deg):
     layout = log_polar(
         n_sectors=n_sectors,
         r_min_um=3.0,
@@ -459,7 +459,7 @@ def test_log_polar_layouts_have_no_overlap_and_only_their_blind_spot_as_gap(
     assert [(v.rule, v.site_ids) for v in violations] == [("max_gap_um2", tuple(range(n_sectors)))]
 
 
-def test_a_layout_without_sites_keeps_every_rule_but_leaves_the_die_open():
+def test_empty_layout_violates_only_gap_rule():
     none = replaced({})[:0]
     report = none.check(ALL_RULES)
 
@@ -471,7 +471,7 @@ def test_a_layout_without_sites_keeps_every_rule_but_leaves_the_die_open():
 # -- report ----------------------------------------------------------------------------------------------------------
 
 
-def test_only_rules_with_a_limit_are_in_the_report():
+def test_report_contains_only_enabled_rules():
     layout = replaced({})
 
     assert layout.check(DesignRules()).results == ()
@@ -482,27 +482,27 @@ def test_only_rules_with_a_limit_are_in_the_report():
     ]
 
 
-def test_raise_if_failed_says_nothing_of_a_clean_layout():
+def test_raise_if_failed_accepts_clean_layout():
     report = replaced({}).check(ALL_RULES)
 
     assert (report.raise_if_failed(), report.n_sites) == (None, 25)
 
 
-def test_raise_if_failed_names_each_broken_rule_with_count_worst_and_limit():
+def test_raise_if_failed_lists_violated_rules():
     layout = Layout.from_rectangles([[0, 0], [5, 0], [10, 0]], [[1, 1], [0.5, 3], [0.25, 30]])
     report = layout.check(DesignRules(min_size_um=1.5, min_width_um=0.75, max_overlap_um2=0.0, die_um=(-9, -9, 9, 9)))
 
-    with pytest.raises(GeometryError, match="the layout breaks its design rules: ") as caught:
+    with pytest.raises(GeometryError, match="the layout violates its design rules: ") as caught:
         report.raise_if_failed()
     assert caught.value.site_ids == (0, 1, 2)
     assert str(caught.value).split(": ", 1)[1].split("; ") == [
-        "min_size_um: 2 violations, worst 1 µm for a limit of 1.5 µm",
-        "min_width_um: 2 violations, worst 0.25 µm for a limit of 0.75 µm",
-        "die_um: 1 violation, worst 6 µm for a limit of 0 µm",
+        "min_size_um: 2 violations, worst 1 µm, limit 1.5 µm",
+        "min_width_um: 2 violations, worst 0.25 µm, limit 0.75 µm",
+        "die_um: 1 violation, worst 6 µm, limit 0 µm",
     ]
 
 
-def test_the_worst_value_is_that_furthest_beyond_the_limit():
+def test_worst_value_is_furthest_beyond_limit():
     layout = Layout.from_rectangles([[0, 0], [5, 0], [10, 0]], [1.0, 0.5, 2.0])
     size, die = layout.check(DesignRules(min_size_um=1.5, die_um=(0, -9, 9, 9))).results
 
@@ -510,7 +510,7 @@ def test_the_worst_value_is_that_furthest_beyond_the_limit():
     assert layout.check(DesignRules(min_size_um=0.1)).results[0].worst is None
 
 
-def test_the_table_has_a_line_for_each_rule():
+def test_table_has_row_per_rule():
     layout = Layout.from_rectangles([[0, 0], [5, 0]], [[1, 1], [0.5, 3]])
     report = layout.check(DesignRules(min_size_um=1.1, min_width_um=0.25))
     screen = io.StringIO()
@@ -522,7 +522,7 @@ def test_the_table_has_a_line_for_each_rule():
     assert ["min_width_um", "pass", "0", "0.25", "µm"] in lines
 
 
-# -- the limits themselves -------------------------------------------------------------------------------------------
+# -- invalid limits --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["min_size_um", "min_width_um", "max_overlap_um2", "max_gap_um2"])
@@ -536,7 +536,7 @@ def test_the_table_has_a_line_for_each_rule():
         (True, "must be one number, got True"),
     ],
 )
-def test_limits_that_cannot_be_are_refused(name, limit, message):
+def test_invalid_limits_are_rejected(name, limit, message):
     with pytest.raises(ParameterError, match=f"'{name}' {message}"):
         DesignRules(**{name: limit})
 
@@ -553,6 +553,6 @@ def test_limits_that_cannot_be_are_refused(name, limit, message):
         (5.0, "'die_um' must have 1 dimension, got the shape"),
     ],
 )
-def test_dies_that_cannot_be_are_refused(die_um, message):
+def test_invalid_dies_are_rejected(die_um, message):
     with pytest.raises(ParameterError, match=message):
         DesignRules(die_um=die_um)

@@ -1,4 +1,4 @@
-"""Design rules against KLayout's own checks, on what it reads from our files and on the same polygons."""
+"""Design rules against KLayout's checks, on written files and on polygons in memory."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ rdb = pytest.importorskip("klayout.rdb")
 relaxed = settings(deadline=None, derandomize=True, max_examples=40)
 seeds = st.integers(0, 2**32 - 1)
 
-#: Database unit of what is compared in memory.
+#: Database unit of polygons compared in memory.
 DBU_UM = 0.001
 
 
 def on_grid(polygons):
-    """The polygons with their vertices moved to the database grid, without those that this spoils."""
+    """Round the polygons to the database grid, and drop those that become invalid."""
     rounded = [shapely.transform(polygon, lambda xy: np.round(xy / DBU_UM) * DBU_UM) for polygon in polygons]
     return fs.Layout.from_polygons([polygon for polygon in rounded if polygon.is_valid])
 
@@ -42,14 +42,14 @@ def klayout_polygon(polygon):
 
 
 def region_of(layout):
-    """The sites as a region in which every polygon stays what it is, also where it abuts or overlaps another."""
+    """Return the sites as a region without merging of abutting or overlapping polygons."""
     region = kdb.Region([klayout_polygon(polygon) for polygon in layout.polygons()])
     region.merged_semantics = False
     return region
 
 
 def read(path):
-    """Polygons and database unit of a chip file."""
+    """Read the polygons and the database unit of a GDSII or OASIS file."""
     chip = kdb.Layout()
     chip.read(str(path))
     region = kdb.Region()
@@ -59,16 +59,16 @@ def read(path):
     return region, chip.dbu
 
 
-def middle(edge):
+def edge_centre(edge):
     return shapely.Point(0.5 * (edge.x1 + edge.x2), 0.5 * (edge.y1 + edge.y2))
 
 
 def trenched(seed):
-    """Turned rectangles, or hexagons of several sizes, that keep apart."""
+    """Return rectangles and hexagons of several sizes, rotated or upright, with trenches between them."""
     rng = np.random.default_rng(seed)
     angle = np.arange(6) * math.pi / 3
     hexagon = shapely.Polygon(np.stack((np.cos(angle), np.sin(angle)), axis=1))
-    is_turned = rng.random() < 0.7
+    is_rotated = rng.random() < 0.7
     polygons = []
     for place in np.stack(np.meshgrid(np.arange(6), np.arange(5)), axis=2).reshape(-1, 2) * 3.0:
         half = rng.uniform(0.3, 0.95, 2)
@@ -77,7 +77,7 @@ def trenched(seed):
             if rng.random() < 0.6
             else shapely.transform(hexagon, lambda xy, r=half[0] * 1.4: xy * r)
         )
-        shape = rotate(shape, rng.uniform(0, 360), origin=(0, 0)) if is_turned else shape
+        shape = rotate(shape, rng.uniform(0, 360), origin=(0, 0)) if is_rotated else shape
         move = place + rng.uniform(-0.1, 0.1, 2)
         polygons.append(shapely.transform(shape, lambda xy, move=move: xy + move))
     return on_grid(polygons)
@@ -88,17 +88,17 @@ def trenched(seed):
 
 @pytest.fixture(scope="module")
 def giotto():
-    """Giotto 2 with rings into its middle, at a unit pixel of 6.45 µm."""
+    """Giotto 2 with rings up to its centre, at a unit pixel of 6.45 µm."""
     return fs.layout.giotto(n_rho=152, n_theta=252, n_fovea=42, n_across=1090, unit_um=6.45, fovea="none")
 
 
-def test_klayout_finds_the_same_504_narrow_sites_of_giotto_in_its_chip_file(giotto, tmp_path):
+def test_klayout_finds_same_narrow_giotto_sites(giotto, tmp_path):
     giotto.write(tmp_path / "giotto.gds")
     region, dbu_um = read(tmp_path / "giotto.gds")
     pairs = region.width_check(round(6.8 / dbu_um), False, kdb.Region.Projection, 80.0, None, None)
-    # A pair of edges belongs to the site that its middle lies in.
-    middles = [kdb.Edge(pair.first.bbox().center(), pair.second.bbox().center()) for pair in pairs.each()]
-    places = shapely.transform([middle(edge) for edge in middles], lambda xy: xy * dbu_um)
+    # A pair of edges belongs to the site that contains its centre.
+    centre_lines = [kdb.Edge(pair.first.bbox().center(), pair.second.bbox().center()) for pair in pairs.each()]
+    places = shapely.transform([edge_centre(edge) for edge in centre_lines], lambda xy: xy * dbu_um)
     pair, site = shapely.STRtree(giotto.polygons()).query(places, predicate="intersects")
     narrow = {violation.site_ids[0] for violation in giotto.check(fs.DesignRules(min_width_um=6.8)).violations}
 
@@ -113,13 +113,13 @@ def test_klayout_finds_the_same_504_narrow_sites_of_giotto_in_its_chip_file(giot
 
 @given(seeds, st.integers(150, 1500))
 @relaxed
-def test_near_sites_are_those_of_klayouts_space_check(seed, limit_dbu):
+def test_near_sites_match_klayout_space_check(seed, limit_dbu):
     layout = trenched(seed)
     tree = shapely.STRtree(layout.polygons())
     found = set()
     for pair in region_of(layout).isolated_check(limit_dbu, False, kdb.Region.Euclidian).each():
         sites = {
-            int(tree.nearest(shapely.transform(middle(edge), lambda xy: xy * DBU_UM)))
+            int(tree.nearest(shapely.transform(edge_centre(edge), lambda xy: xy * DBU_UM)))
             for edge in (pair.first, pair.second)
         }
         found.add(tuple(sorted(sites)))
@@ -133,7 +133,7 @@ def test_near_sites_are_those_of_klayouts_space_check(seed, limit_dbu):
 
 @given(layouts(), st.floats(0.1, 6.0))
 @relaxed
-def test_small_sites_are_those_of_klayouts_area(layout, limit_um2):
+def test_small_sites_match_klayout_areas(layout, limit_um2):
     layout = on_grid(layout.polygons())
     areas_um2 = [klayout_polygon(polygon).area2() / 2 * DBU_UM**2 for polygon in layout.polygons()]
     violations = layout.check(fs.DesignRules(min_area_um2=limit_um2)).violations
@@ -155,7 +155,7 @@ FAMILIES = {
 
 @pytest.mark.parametrize("dbu_um", [1e-4, 1e-3, 5e-3])
 @pytest.mark.parametrize("family", FAMILIES)
-def test_areas_in_chip_files_are_ours_but_for_the_rounding_of_vertices(family, dbu_um, tmp_path):
+def test_gds_areas_match_within_vertex_rounding(family, dbu_um, tmp_path):
     layout = FAMILIES[family]
     layout.write(tmp_path / "a.gds", dbu_um=dbu_um)
     region, read_dbu_um = read(tmp_path / "a.gds")
@@ -173,7 +173,7 @@ def test_areas_in_chip_files_are_ours_but_for_the_rounding_of_vertices(family, d
 
 
 def overlap_um2(layout):
-    """Sum over pairs of sites of what they share: a place under k sites counts k (k - 1) / 2 times."""
+    """Sum the overlap of all pairs of sites: area covered by k sites counts k (k - 1) / 2 times."""
     region = region_of(layout)
     total = 0
     for n_sites in range(2, layout.n_sites + 1):
@@ -186,7 +186,7 @@ def overlap_um2(layout):
 
 @given(seeds)
 @relaxed
-def test_overlaps_of_upright_rectangles_add_up_to_klayouts(seed):
+def test_rectangle_overlaps_match_klayout(seed):
     rng = np.random.default_rng(seed)
     low = rng.integers(0, 9000, (25, 2))
     boxes = [shapely.box(*a, *(a + size)) for a, size in zip(low, rng.integers(200, 4000, (25, 2)), strict=True)]
@@ -198,7 +198,7 @@ def test_overlaps_of_upright_rectangles_add_up_to_klayouts(seed):
 
 @given(layouts())
 @relaxed
-def test_overlaps_of_any_sites_add_up_to_klayouts_but_for_the_rounding_of_crossings(layout):
+def test_polygon_overlaps_match_klayout_within_rounding(layout):
     layout = on_grid(layout.polygons())
     violations = layout.check(fs.DesignRules(max_overlap_um2=0.0)).violations
     perimeter_um = shapely.length([violation.marker for violation in violations]).sum()
@@ -211,7 +211,7 @@ def test_overlaps_of_any_sites_add_up_to_klayouts_but_for_the_rounding_of_crossi
 # -- reports ------------------------------------------------------------------------------------------------------------
 
 
-def test_klayout_counts_as_many_items_of_every_rule_as_the_report(giotto, tmp_path):
+def test_klayout_report_has_same_item_counts(giotto, tmp_path):
     rules = fs.DesignRules(
         min_width_um=6.8,
         min_angle_deg=89.9,
