@@ -1,20 +1,19 @@
 """
-Layouts as files: chip layout (GDSII, OASIS), maps (GeoJSON, GeoParquet), exact arrays (npz), and drawings (SVG).
+Layout files: GDSII, OASIS, GeoJSON, GeoParquet, npz and SVG.
 
 =============  ==================  =================================================================================
-ending         format              what a round trip keeps
+extension      format              preserved by a round trip
 =============  ==================  =================================================================================
-.npz           numpy arrays        everything, to the last bit
-.parquet       GeoParquet          everything, to the last bit; small
-.geojson       GeoJSON             everything; numbers and text in columns
-.gds, .oas     GDSII, OASIS        outlines on the database grid, order of the sites, ``channel``; columns of numbers to
-                                   the last bit, as 64 bits, of truth values and of short texts
-.svg           SVG                 nothing: a drawing, written only
+.npz           numpy arrays        everything, bit for bit
+.parquet       GeoParquet          everything, bit for bit; small files
+.geojson       GeoJSON             everything; columns of numbers and strings only
+.gds, .oas     GDSII, OASIS        outlines on the database grid, order of the sites, ``channel``; columns of numbers,
+                                   exactly and as 64-bit types, of booleans and of short strings
+.svg           SVG                 nothing: a drawing, write-only
 =============  ==================  =================================================================================
 
-What a file does not hold of a layout's columns is told when it is written: :attr:`WrittenLayout.dropped_columns`.
-Files are read by what they hold, whatever their ending; a file that is corrupt, truncated or malformed ends in one
-:class:`~foveasim.errors.FileError`.
+:attr:`WrittenLayout.dropped_columns` lists the columns that a file does not contain. The format of a file is detected from
+its content, not from its extension. A corrupt, truncated or malformed file raises :class:`~foveasim.errors.FileError`.
 """
 
 from __future__ import annotations
@@ -49,29 +48,29 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
     """
     Read the photosites of a layout file.
 
-    Names of bundled layouts and YAML files are read by :func:`foveasim.read_layout`, which reads all other files by this.
+    :func:`foveasim.read_layout` also reads bundled layouts by name and YAML files; it uses this function for other files.
 
     Parameters
     ----------
     path : path
-        GDSII, OASIS, npz, GeoJSON or GeoParquet, told by its content. Coordinates of GeoJSON and GeoParquet are in µm.
+        GDSII, OASIS, npz, GeoJSON or GeoParquet, detected by content. Coordinates of GeoJSON and GeoParquet are in µm.
     layer : int, optional
-        Of GDSII and OASIS: the layer that holds the photosites; needed where shapes lie on several.
+        GDSII and OASIS: layer of the photosites; required where several layers contain shapes.
     cell : str, optional
-        Of GDSII and OASIS: the cell to read, with all cells below it; needed where several are on top.
+        GDSII and OASIS: cell to read, with its complete cell hierarchy; required where there are several top cells.
     **options
-        Of other formats in :data:`foveasim.layout.files.FORMATS`.
+        Options of other formats in :data:`foveasim.layout.files.FORMATS`.
 
     Returns
     -------
     Layout
-        In the order in which the sites were written. From GDSII and OASIS, the data type is the column ``channel``, and
-        there are those others that every site tells.
+        Layout with the sites in the order in which they were written. For GDSII and OASIS, the column ``channel`` is the
+        datatype, and the other columns are those with a value for every site.
 
     Raises
     ------
     FileError
-        When the file is missing, broken, truncated, too large, or no layout.
+        When the file is missing, corrupt, truncated, too large, or not a layout.
     ParameterError
         When an option does not belong to the file's format.
     """
@@ -87,12 +86,12 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
 
 def check_no_options(**options: object) -> None:
     """
-    Reject options of formats for a file that has none.
+    Reject format options for a file without options.
 
     Raises
     ------
     ParameterError
-        When one is given.
+        When an option is given.
     """
     chosen_options(options, (), FORMATS, "read_options")
 
@@ -107,36 +106,36 @@ def write_layout(
     **options: Any,
 ) -> WrittenLayout:
     """
-    Write a layout to a file, whole or not at all.
+    Write a layout to a file atomically.
 
     Parameters
     ----------
     layout : Layout
     path : path
-        Its ending names the format: ``.gds``, ``.oas``, ``.npz``, ``.geojson``, ``.parquet`` or ``.svg``.
+        The extension selects the format: ``.gds``, ``.oas``, ``.npz``, ``.geojson``, ``.parquet`` or ``.svg``.
     layer : int, optional
-        Of GDSII and OASIS: the layer of the photosites, by default 1.
+        GDSII and OASIS: layer of the photosites, by default 1.
     dbu_um : float, optional
-        Of GDSII and OASIS: the database unit in µm, to whose multiples the vertices move; by default 1e-4, a tenth
-        of a nanometre, with which coordinates reach 214 mm.
+        GDSII and OASIS: database unit in µm; vertices are rounded to its multiples. The default 1e-4, a tenth of a
+        nanometre, allows coordinates up to 214 mm.
     colours : mapping of int to str, optional
-        Of SVG: the colour of each channel, as ``{0: "#c23b22", 1: "green"}``; channels not named are grey.
+        SVG: colour of each channel, such as ``{0: "#c23b22", 1: "green"}``; other channels are grey.
     **options
-        Of other formats in :data:`foveasim.layout.files.FORMATS`.
+        Options of other formats in :data:`foveasim.layout.files.FORMATS`.
 
     Returns
     -------
     WrittenLayout
-        What rounding did to the outlines, zero for formats that keep every digit; and the columns left out.
+        Rounding errors of the outlines, zero for lossless formats, and the dropped columns.
 
     Raises
     ------
     FileError
-        When the ending is unknown, or nothing can be written there.
+        When the extension is unknown, or the file cannot be written.
     ParameterError
-        When an option does not belong to the format, or the format cannot hold a column or a channel.
+        When an option does not belong to the format, or the format does not support a column or a channel.
     GeometryError
-        When sites collapse or cross themselves on the database grid.
+        When sites collapse or self-intersect on the database grid.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Layouts that come with the package: their names, and the file that a name stands for."""
+"""Bundled layouts: names and files."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ __all__ = ["layout_path", "shipped_layouts"]
 
 
 def shipped_layouts() -> dict[str, Path]:
-    """Files of the layouts that come with the package, by their names: real sensors and those of the paper."""
+    """Return the files of the bundled layouts by name: real sensors and those of the paper."""
     package = Path(__file__).parents[2]
-    # An installed package has them inside; in a checkout they lie next to it.
+    # They are inside an installed package, and next to the package in a repository checkout.
     folder = next(place / "layouts" for place in (package, package.parent) if (place / "layouts").is_dir())
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
@@ -25,14 +25,14 @@ def layout_path(name: str | Path, folder: str | Path = ".") -> Path:
     Parameters
     ----------
     name : path or str
-        A file in the folder comes before a bundled layout of the same name.
+        A file in the directory takes precedence over a bundled layout of the same name.
     folder : path
-        Where the path begins; the working directory by default.
+        Directory of relative paths; the working directory by default.
 
     Raises
     ------
     FileError
-        When a name without extension is neither; with the closest name and all of them.
+        When a name without extension is neither; the message contains the closest name and all names.
     """
     file = Path(folder) / name
     bundled = shipped_layouts()

@@ -1,9 +1,11 @@
 r"""
-Columns of a layout as a short text of each site, for formats that know shapes and their properties but no tables.
+Columns of a layout as one string per site.
 
-A text is made of words as ``ring=3 gain=0.25 is_dead=true name="a"``: a key, and a value that is a number of as many
-digits as it takes to be the same again, a truth value, or text as JSON quotes it, blanks as \u0020. A key is a plain name,
-or any name quoted as text is. Nothing that is read is evaluated.
+They are used by formats with shape properties but without tables.
+
+A string consists of words such as ``ring=3 gain=0.25 is_dead=true name="a"``: a key, and a value. A value is a number with
+the digits required for an exact round trip, a boolean, or a string quoted as in JSON, with blanks as \u0020. A key is a
+plain name, or any other name quoted in the same way. Strings that are read are parsed and never evaluated.
 """
 
 from __future__ import annotations
@@ -21,19 +23,19 @@ from foveasim.layout.model import Layout
 
 __all__ = ["CHANNEL", "MAX_COLUMN_BYTES", "columns_of", "kept_columns", "texts_of"]
 
-#: The column that chip formats keep elsewhere, as the data type.
+#: Column that GDSII and OASIS store as the datatype.
 CHANNEL = "channel"
-#: Columns of a file that are read.
+#: Maximum number of columns of a file.
 MAX_COLUMNS = 64
-#: More different texts in a column than any layout has sites.
+#: Default limit of distinct strings in a column, above the number of sites of any layout.
 MAX_TEXTS = 2**62
-#: Texts with different keys in a file; more are no columns.
+#: Maximum number of distinct key sets in a file; more do not form columns.
 MAX_KINDS = 64
-#: A column of long texts, read from a small file whose cell stands there often, would take more than all outlines.
+#: Memory limit of a column: in a small file, a repeated cell with long strings could require more than all outlines.
 MAX_COLUMN_BYTES = 2**28
-#: Names that stand as they are.
+#: Names that are not quoted.
 PLAIN_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.:-]*")
-#: What is said instead of blanks and equal signs in quoted text.
+#: Escapes of blanks and equal signs in quoted strings.
 ESCAPES = str.maketrans({" ": "\\u0020", "=": "\\u003d"})
 TRUTHS = {b"true": True, b"false": False}
 QUOTED = re.compile(rb'"(?:[^"\\]|\\.)*"')
@@ -47,22 +49,22 @@ def kept_columns(
     layout: Layout, max_chars: int, max_texts: int = MAX_TEXTS
 ) -> tuple[dict[str, list[Any]], tuple[str, ...]]:
     """
-    The columns that a text of each site can hold, beside the channel.
+    Return the columns that fit into one string per site, except the channel.
 
     Parameters
     ----------
     layout : Layout
     max_chars : int
-        Length of the longest text.
+        Maximum length of a string.
     max_texts : int
-        Different values of a column that are text and not numbers.
+        Maximum number of distinct string values of a column.
 
     Returns
     -------
     kept : dict of str to list
-        Values by their key: whole and floating-point numbers, and text.
+        Values by key: integers, floating-point numbers, and strings.
     lost : tuple of str
-        Names of the columns that are left out, sorted.
+        Names of the dropped columns, sorted.
     """
     kept: dict[str, list[Any]] = {}
     lost = []
@@ -82,13 +84,13 @@ def kept_columns(
 
 
 def texts_of(kept: dict[str, list[Any]]) -> list[str]:
-    """The text of each site."""
+    """Return the string of each site."""
     words = [[f"{key}={value}" for value in values] for key, values in kept.items()]
     return list(map(" ".join, zip(*words, strict=True)))
 
 
 def _values(column: NDArray[Any]) -> list[Any] | None:
-    """Numbers, and text that stands for a value; nothing for a column of another type."""
+    """Return numbers and string representations, or None for an unsupported type."""
     kind = column.dtype.kind
     if kind == "b":
         return np.where(column, "true", "false").tolist()
@@ -105,9 +107,9 @@ def _values(column: NDArray[Any]) -> list[Any] | None:
 
 def _is_exact_in_oasis(numbers: NDArray[Any]) -> Bools:
     """
-    Which numbers come back from OASIS as they were.
+    Return whether numbers survive an OASIS round trip exactly.
 
-    gdstk crashes on the smallest integer, and writes as a reciprocal any number whose inverse rounds to a whole one.
+    gdstk crashes on the smallest integer, and writes any number whose inverse rounds to an integer as a reciprocal.
     """
     if numbers.dtype.kind in "iu":
         return np.asarray(numbers != np.iinfo(np.int64).min)
@@ -127,12 +129,12 @@ def _quoted(text: str) -> str:
 
 def columns_of(texts: bytes) -> dict[str, NDArray[Any]]:
     """
-    Columns that every text tells, one text a line.
+    Return the columns that every string contains.
 
     Parameters
     ----------
     texts : bytes
-        Printable ASCII; from a stranger.
+        One string per line, in printable ASCII; untrusted.
     """
     columns: dict[str, NDArray[Any]] = {}
     for key, values in (_values_of_like_texts(texts) or _values_of_texts(texts)).items():
@@ -143,18 +145,22 @@ def columns_of(texts: bytes) -> dict[str, NDArray[Any]]:
 
 
 def _values_of_like_texts(texts: bytes) -> dict[bytes, Sequence[bytes]]:
-    """Values by key where all texts have the same keys, as those have that were written here; else nothing."""
+    """
+    Return values by key where all strings have the same keys, else an empty dict.
+
+    Strings that foveasim wrote have the same keys.
+    """
     keys = [word.partition(b"=")[0] for word in texts.split(b"\n", 1)[0].split()]
     if len({*keys}) != len(keys) or len(keys) > MAX_COLUMNS:
         return {}
-    # The empty group makes tuples of the groups, of one also.
+    # With the additional empty group, findall returns tuples even for a single key.
     text = rb" ".join(re.escape(key) + rb"=(\S*)" for key in keys) + rb"()"
     rows = re.findall(b"^" + text + b"$", texts, re.MULTILINE)
     return dict(zip(keys, zip(*rows, strict=True), strict=False)) if len(rows) == texts.count(b"\n") + 1 else {}
 
 
 def _values_of_texts(texts: bytes) -> dict[bytes, Sequence[bytes]]:
-    """Values of the keys that every text has once."""
+    """Return the values of the keys that every string contains exactly once."""
     keys_of_text = _VALUE.sub(b"", texts).split(b"\n")
     kinds = {keys: i for i, keys in enumerate(dict.fromkeys(keys_of_text))}
     if len(kinds) > MAX_KINDS:
@@ -185,7 +191,7 @@ def _name(key: bytes) -> str | None:
 
 
 def _column(values: Sequence[bytes]) -> NDArray[Any] | None:
-    """The values as an array; nothing where they are not all of one type."""
+    """Return the values as an array, or None for values of several types."""
     try:
         if values[0] in TRUTHS:
             return np.array([TRUTHS[value] for value in values])

@@ -1,4 +1,4 @@
-"""What all layout formats share: limits, checks of files from strangers, and the report of a written file."""
+"""Limits, checks of untrusted files, and write reports shared by all layout formats."""
 
 from __future__ import annotations
 
@@ -32,38 +32,38 @@ __all__ = [
     "texts",
 ]
 
-#: Written in every file that keeps columns and origin.
+#: Identifier in every file that contains columns and provenance.
 FILE_FORMAT = "foveasim layout"
 FILE_VERSION = 1
 MAX_UNPACKED_BYTES = 8 * 2**30
-#: What a small file may unpack to, and for each byte of a larger one: regular grids, packed, unpack to 30 bytes a byte.
+#: Maximum decompressed size of a small file, and per byte of a larger one (regular grids: 30 bytes per byte).
 MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**26, 128
-#: A column of text takes the room of its longest in every row: what that may come to, and for each letter there is.
+#: A string column requires the memory of its longest string in every row: maximum, and maximum per character.
 MIN_TEXT_BYTES, TEXT_BYTES_PER_LETTER = 2**28, 64
-#: Rings and edges of a site are looked at in pairs where they may meet: pairs of either in all sites, and for each there is.
+#: Rings and edges of a site are tested in pairs for intersection: maximum number of pairs, and maximum per ring or vertex.
 MAX_RING_PAIRS, PAIRS_PER_RING = 2_000_000, 100
 MAX_VERTEX_PAIRS, PAIRS_PER_VERTEX = 1_000_000_000, 1000
-#: Kinds of numpy types that text formats keep: truth values, integers, floating-point numbers, text.
+#: Kinds of numpy types that GeoJSON and GeoParquet support: booleans, integers, floating-point numbers, strings.
 PLAIN_KINDS = "biufU"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WrittenLayout:
     """
-    What became of a layout in a file.
+    Report of a written layout file.
 
     Attributes
     ----------
     path : Path
-        The file.
+        Written file.
     n_sites : int
-        Photosites in it.
+        Number of photosites in the file.
     max_displacement_um : float, µm
-        How far rounding moved the vertex that it moved furthest.
+        Maximum displacement of a vertex by rounding.
     worst_area_error : float
-        Change of a site's area by rounding, relative to its area, of the site with the largest.
+        Maximum relative change of a site's area by rounding.
     dropped_columns : tuple of str
-        Names of the columns that the file does not hold, sorted.
+        Names of the columns that the file does not contain, sorted.
     """
 
     path: Path
@@ -74,7 +74,7 @@ class WrittenLayout:
 
 
 def lossless(layout: Layout, path: Path, dropped_columns: tuple[str, ...] = ()) -> WrittenLayout:
-    """Report of a format that keeps every digit."""
+    """Return the report of a lossless format."""
     return WrittenLayout(
         path=path,
         n_sites=layout.n_sites,
@@ -85,7 +85,7 @@ def lossless(layout: Layout, path: Path, dropped_columns: tuple[str, ...] = ()) 
 
 
 def rounding(layout: Layout, rounded_um: Floats, path: Path, dropped_columns: tuple[str, ...] = ()) -> WrittenLayout:
-    """Report of a format that holds these vertices instead of the layout's, and not these columns."""
+    """Return the report of a format with rounded vertices and dropped columns."""
     if layout.n_sites == 0:
         return lossless(layout, path, dropped_columns)
     move_um = np.hypot(*(rounded_um - layout.xy_um).T)
@@ -101,21 +101,21 @@ def rounding(layout: Layout, rounded_um: Floats, path: Path, dropped_columns: tu
 
 
 def max_unpacked(path: Path) -> int:
-    """Bytes that a file of its size may unpack to."""
+    """Return the maximum decompressed size of a file in bytes, which depends on its size."""
     return min(MIN_UNPACKED_BYTES + UNPACKED_PER_BYTE * path.stat().st_size, MAX_UNPACKED_BYTES)
 
 
 def check_unpacked(path: Path, n_bytes: int) -> None:
     """
-    Reject a file that would unpack to too much.
+    Reject a file that would decompress to too many bytes.
 
     Raises
     ------
     FileError
-        When it was made to fill the memory.
+        When the size exceeds the limit of the file.
     """
     if n_bytes > max_unpacked(path):
-        raise FileError(path, f"would unpack to more than {max_unpacked(path)} bytes")
+        raise FileError(path, f"would decompress to more than the maximum of {max_unpacked(path)} bytes")
 
 
 def check_sites_of(path: Path, n_sites: int) -> None:
@@ -125,20 +125,22 @@ def check_sites_of(path: Path, n_sites: int) -> None:
     Raises
     ------
     FileError
-        When there are more than any sensor has.
+        When there are more than ``MAX_SITES``.
     """
     if n_sites > MAX_SITES:
-        raise FileError(path, f"has {n_sites} sites, more than the {MAX_SITES} that are read")
+        raise FileError(path, f"has {n_sites} sites, more than the maximum of {MAX_SITES}")
 
 
 def check_sizes(n_rings: NDArray[Any], n_vertices: NDArray[Any]) -> None:
     """
-    Reject sites of so many rings or vertices that it would take minutes to see whether any two of them meet.
+    Reject sites with too many rings or vertices.
+
+    Tests for intersections between them would take minutes.
 
     Raises
     ------
     GeometryError
-        When there are more than photosites have.
+        When the number of pairs of rings or vertices exceeds the limit.
     """
     for what, n, at_most, more in (
         ("rings", n_rings, MAX_RING_PAIRS, PAIRS_PER_RING),
@@ -146,7 +148,7 @@ def check_sizes(n_rings: NDArray[Any], n_vertices: NDArray[Any]) -> None:
     ):
         if np.sum(n.astype(np.float64) ** 2) > at_most + more * n.sum():
             site = int(np.argmax(n))
-            raise GeometryError(f"site {site} has {n[site]} {what}, more than photosites have", (site,))
+            raise GeometryError(f"site {site} has {n[site]} {what}, too many for a photosite", (site,))
 
 
 def checked_layout(
@@ -155,12 +157,12 @@ def checked_layout(
     provenance: Mapping[str, Any],
 ) -> Layout:
     """
-    Layout of outlines from a stranger, all checks of :meth:`Layout.from_polygons` passed.
+    Return a layout of untrusted outlines, after all checks of :meth:`Layout.from_polygons`.
 
     Raises
     ------
     GeometryError, ParameterError
-        When outlines are no photosites, or a column does not fit.
+        When an outline is not a valid photosite, or a column does not match the sites.
     """
     if isinstance(polygons, tuple):
         _, ring_offsets, site_offsets = polygons
@@ -171,60 +173,62 @@ def checked_layout(
     return Layout._derived(bare.xy_um, bare.ring_offsets, bare.site_offsets, columns, provenance)  # noqa: SLF001
 
 
-# -- origin and types of columns, as text in the file -----------------------------------------------------------------
+# -- provenance and types of columns in the file ----------------------------------------------------------------------
 
 
 def header(layout: Layout) -> dict[str, Any]:
-    """Plain data that stands beside the outlines in a file: format, unit, origin."""
+    """Return the metadata of a file as plain data: format, unit, provenance."""
     provenance = to_plain_data(dict(layout.provenance))
     return {"format": FILE_FORMAT, "version": FILE_VERSION, "unit": "um", "provenance": provenance}
 
 
 def check_header(path: Path, about: Any) -> dict[str, Any]:
     """
-    The origin that a file tells.
+    Return the provenance in the metadata of a file.
 
     Raises
     ------
     FileError
-        When the file is of another format or version, or tells no origin.
+        When the file has another format or version, or no provenance.
     """
     if not isinstance(about, dict) or about.get("format") != FILE_FORMAT:
         got = about.get("format") if isinstance(about, dict) else None
-        hint = "; load it with Capture.load, whose .layout it holds" if got == "foveasim capture" else ""
-        raise FileError(path, f"is no {FILE_FORMAT}{hint}")
+        hint = "; load it with Capture.load and use its attribute layout" if got == "foveasim capture" else ""
+        raise FileError(path, f"is not a {FILE_FORMAT}{hint}")
     if about.get("version") != FILE_VERSION:
         raise FileError(path, f"has the format version {about.get('version')!r:.40}, expected {FILE_VERSION}")
     provenance = about.get("provenance")
     if not isinstance(provenance, dict) or about.get("unit") != "um":
-        raise FileError(path, "does not tell its origin and unit (µm) as this format asks")
+        raise FileError(path, "has no valid provenance, or a unit other than µm")
     return provenance
 
 
 def plain_columns(layout: Layout, format_name: str) -> dict[str, NDArray[Any]]:
     """
-    The columns, when a format for numbers and text can hold them.
+    Return the columns for a format that supports only numbers and strings.
 
     Raises
     ------
     ParameterError
-        When a column holds something else.
+        When a column has another type.
     """
     for name, column in layout.columns.items():
         if column.dtype.kind not in PLAIN_KINDS or (column.dtype.itemsize > 8 and column.dtype.kind == "f"):
             raise ParameterError(
-                name, f"of the type {column.dtype} cannot be kept in {format_name}", hint="write a .npz file"
+                name,
+                f"must contain real numbers of at most 64 bits, booleans or strings in {format_name}, got {column.dtype}",
+                hint="write a .npz file",
             )
     return dict(layout.columns)
 
 
 def dtype_text(layout: Layout) -> dict[str, str]:
-    """Type of each column as text, such as ``<i8``."""
+    """Return the type of each column as a string, such as ``<i8``."""
     return {name: column.dtype.str for name, column in layout.columns.items()}
 
 
 def restored_column(values: NDArray[Any], dtype: object) -> NDArray[Any]:
-    """A column in the type that the file names, where that is a plain one and holds the same values."""
+    """Return a column in the type that the file specifies, where the conversion is exact."""
     if not isinstance(dtype, str) or len(dtype) > 16 or dtype[1:2] not in PLAIN_KINDS:
         return values
     try:
@@ -237,12 +241,12 @@ def restored_column(values: NDArray[Any], dtype: object) -> NDArray[Any]:
         return values
     is_floating = values.dtype.kind == "f"
     is_same = np.array_equal(restored, values, equal_nan=is_floating and restored.dtype.kind == "f")
-    # An integer equals its neighbours where both are compared as floating-point numbers: so there and back again.
+    # Large integers equal their neighbours when compared as floating-point numbers, hence the test of the round trip.
     return restored if is_same and np.array_equal(again, values, equal_nan=is_floating) else values
 
 
 def texts(values: Sequence[str]) -> NDArray[Any] | None:
-    """A column of text; nothing where one text is so long that the column would fill the memory."""
+    """Return a string column, or None where a long string makes it exceed the memory limit."""
     n_letters = list(map(len, values))
     n_bytes = 4 * max(n_letters, default=0) * len(n_letters)
     return np.array(values, dtype=str) if n_bytes <= MIN_TEXT_BYTES + TEXT_BYTES_PER_LETTER * sum(n_letters) else None

@@ -7,6 +7,6 @@ from foveasim._io.formats import FileFormat
 
 __all__ = ["FORMATS"]
 
-#: Formats of layout files. ``read(path, **options)`` gives a :class:`foveasim.Layout`, ``write(layout, path, **options)`` a
-#: :class:`foveasim.layout.WrittenLayout`. Installed packages add theirs as entry points of the group ``foveasim.formats``.
+#: Formats of layout files. ``read(path, **options)`` returns a :class:`foveasim.Layout`, ``write(layout, path, **options)`` a
+#: :class:`foveasim.layout.WrittenLayout`. Installed packages add formats as entry points of the group ``foveasim.formats``.
 FORMATS: Registry[FileFormat] = Registry("layout format", "foveasim.formats")

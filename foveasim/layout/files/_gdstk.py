@@ -1,7 +1,7 @@
 """
 Flattened polygons of GDSII and OASIS files, read by gdstk in the sandbox process.
 
-The module imports nothing of the package, so that the process starts quickly.
+The module imports no other module of the package, which makes the process start quickly.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ if TYPE_CHECKING:
 
 __all__ = ["FormatError", "read"]
 
-#: Cells that KLayout adds for its own use begin with this.
+#: Prefix of cells that KLayout adds for its own metadata.
 KLAYOUT_NOTES = "$$$CONTEXT_INFO$$$"
-#: How many names a message shows.
+#: Number of names in a message.
 SHOWN = 5
-#: Memory of a vertex and of a polygon while cells are flattened: what is there, what is made of it, and both together.
+#: Memory in bytes per vertex and per polygon while cells are flattened: source, copies and concatenation.
 VERTEX_BYTES, POLYGON_BYTES = 48, 192
-#: How often the sites that are read at most may be copied from cell to cell.
+#: Limit of the polygons copied between cells, as a multiple of the maximum number of sites.
 COPIES = 2
-#: Attributes of GDSII properties that tell a photosite's number and its columns.
+#: Attributes of the GDSII properties for the number of a photosite and for its columns.
 NUMBER_PROPERTY, COLUMNS_PROPERTY = 1, 2
 NUMBER = re.compile(r"photosite ([0-9]{1,9})(?: part ([0-9]{1,9}) of ([0-9]{1,9}))?\0*")
 MAX_SITE = 10**9
-#: Names and values of a shape's columns, and their length as text; more is no columns.
+#: Maximum number of names and values of a shape's columns, and maximum length of their string.
 MAX_WORDS = 128
 MAX_CHARS = 1024
 
 
 class FormatError(Exception):
-    """The file is rejected, in one sentence that follows its name."""
+    """The file is rejected; the message follows its path."""
 
 
 class Shapes:
     """
-    Flat polygons of a cell.
+    Polygons of a flattened cell.
 
     Attributes
     ----------
@@ -49,9 +49,10 @@ class Shapes:
     counts : (n,) int64
         Vertices of each polygon.
     tags : (n, 7) int64
-        Layer, data type, photosite (-1: not told), part and number of parts (0: whole), placement of the cell, line of
-        its columns in the text of all (-1: not told).
+        Layer, datatype, photosite (-1: unknown), part and number of parts (0: undivided), placement of the cell, line of
+        its columns in the text of all columns (-1: none).
     n_placements : int
+        Number of placements of the cell.
     """
 
     def __init__(self, xy: NDArray[np.float64], counts: NDArray[np.int64], tags: NDArray[np.int64], n: int) -> None:
@@ -61,7 +62,7 @@ class Shapes:
         self.n_placements = n
 
     def placed(self, matrix: NDArray[np.float64], offsets: NDArray[np.float64]) -> Shapes:
-        """Copies at all offsets, each turned and scaled by the matrix."""
+        """Return copies at all offsets, transformed by the matrix."""
         import numpy as np
 
         k = len(offsets)
@@ -85,25 +86,25 @@ def read(
     max_cpu_s: int,
 ) -> tuple[dict[str, Any], list[Any]]:
     """
-    Read a cell with all cells below it.
+    Read a cell with its complete hierarchy.
 
     Parameters
     ----------
     path : str
     limit : callable
-        Sets limits of memory and processor time: tighter ones are in force while gdstk reads.
+        Function that sets limits of memory and processor time. Tighter limits apply while gdstk reads the file.
     is_oasis : bool
     layer, cell : optional
-        As users give them.
+        Layer and cell selected by the user.
     max_sites, max_memory_bytes, max_text_bytes, max_cpu_s : int
-        Of what is made of the file.
+        Limits of the flattened content.
 
     Returns
     -------
-    told : dict
-        ``dbu_um`` and ``cell``.
+    about : dict
+        Database unit ``dbu_um`` and name ``cell``.
     arrays : list
-        ``xy`` in database units, ``counts``, ``tags`` (see :class:`Shapes`), and the text of the columns.
+        ``xy`` in database units, ``counts``, ``tags`` (see :class:`Shapes`), and the text of all columns.
 
     Raises
     ------
@@ -116,16 +117,16 @@ def read(
         warnings.simplefilter("always")
         library = (gdstk.read_oas if is_oasis else gdstk.read_gds)(path)
     if is_oasis and caught:
-        # Where it meets what it does not know, it leaves out what follows; GDSII tells how much to skip.
-        raise FormatError(f"is corrupt, or holds what gdstk does not read ({caught[0].message})")
+        # gdstk drops the rest of an OASIS file after an unknown record; GDSII records contain their lengths.
+        raise FormatError(f"is corrupt, or contains elements that gdstk does not support ({caught[0].message})")
     dbu_um = library.precision * 1e6
     if not (math.isfinite(dbu_um) and 1e-9 <= dbu_um <= 1e3 and 1e-12 <= library.unit <= 1.0):
-        raise FormatError(f"has the impossible database unit {dbu_um:g} µm")
+        raise FormatError(f"has the invalid database unit {dbu_um:g} µm")
     cells = {cell.name: cell for cell in library.cells}
     top = _top(cells, cell)
     order = _from_the_bottom(cells, top)
     _check_numbers(cells, order, max_sites, max_memory_bytes)
-    # What follows is known to be bounded.
+    # Memory and time of the following steps are bounded.
     limit("RLIMIT_AS", max_memory_bytes)
     limit("RLIMIT_CPU", max_cpu_s)
     flat: dict[str, Shapes] = {}
@@ -145,7 +146,7 @@ def read(
 
 
 def _top(cells: dict[str, Any], wanted: str | None) -> str:
-    """Name of the cell to read."""
+    """Return the name of the cell to read."""
     if wanted is not None:
         if wanted not in cells:
             raise FormatError(f"has no cell {wanted!r}; its cells are {_listed(cells)}")
@@ -155,14 +156,14 @@ def _top(cells: dict[str, Any], wanted: str | None) -> str:
     if len(tops) > 1:
         tops = [name for name in tops if _own(cells[name]) or cells[name].references] or tops[:1]
     if not tops:
-        raise FormatError("has no cell on top: it is empty, or its cells hold each other")
+        raise FormatError("has no top cell: it is empty, or its cells contain each other")
     if len(tops) > 1:
-        raise FormatError(f"has several cells on top, {_listed(tops)}; say which to read with cell=")
+        raise FormatError(f"has several top cells, {_listed(tops)}; select one with cell=")
     return tops[0]
 
 
 def _from_the_bottom(cells: dict[str, Any], top: str) -> list[str]:
-    """Names of the cells below and including one, each after those that it holds."""
+    """Return the names of a cell and its hierarchy, subcells before their parents."""
     order: list[str] = []
     is_open = {top: True}
     stack: list[tuple[str, Iterator[str]]] = [(top, _held(cells, top))]
@@ -177,19 +178,19 @@ def _from_the_bottom(cells: dict[str, Any], top: str) -> list[str]:
             is_open[child] = True
             stack.append((child, _held(cells, child)))
         elif is_open[child]:
-            raise FormatError(f"has a cell that holds itself, {child!r}")
+            raise FormatError(f"has a cell that contains itself, {child!r}")
     return order
 
 
 def _held(cells: dict[str, Any], name: str) -> Iterator[str]:
     for child in dict.fromkeys(reference.cell_name for reference in cells[name].references):
         if child not in cells:
-            raise FormatError(f"refers to the cell {child!r}, which is not in it")
+            raise FormatError(f"references the cell {child!r}, which it does not contain")
         yield child
 
 
 def _check_numbers(cells: dict[str, Any], order: list[str], max_sites: int, max_memory_bytes: int) -> None:
-    """Reject what would flatten to more than any sensor has, or take too much memory or time, before it is done."""
+    """Reject a hierarchy that would flatten to too many sites or too much memory or time."""
     n_polygons: dict[str, int] = {}
     n_vertices: dict[str, int] = {}
     max_vertices = max_memory_bytes // VERTEX_BYTES
@@ -200,16 +201,20 @@ def _check_numbers(cells: dict[str, Any], order: list[str], max_sites: int, max_
         own = sum(map(_times, cell.polygons)) + sum(map(_times, cell.paths))
         n_polygons[name] = own + sum(k * n_polygons[c] for c, k in references)
         n_copied += n_polygons[name]
-        # A reference without shapes costs as well.
+        # References to empty cells require time, too.
         if max(n_polygons[name], sum(k for _, k in references)) > max_sites or n_copied > COPIES * max_sites:
-            raise FormatError(f"has more than the {max_sites} sites that are read")
+            raise FormatError(f"has more than the maximum of {max_sites} sites")
         n_vertices[name] = _own_vertices(cell, max_vertices) + sum(k * n_vertices[c] for c, k in references)
         if VERTEX_BYTES * n_vertices[name] + POLYGON_BYTES * n_polygons[name] > max_memory_bytes:
-            raise FormatError("would unpack to more sites and vertices than are read from a file of its size")
+            raise FormatError("would flatten to more sites and vertices than the maximum for a file of its size")
 
 
 def _own_vertices(cell: Any, most: int) -> int:
-    """Vertices of a cell's polygons and paths; paths, some of which have very many, are counted while there are not more."""
+    """
+    Count the vertices of a cell's polygons and paths.
+
+    Counting stops when the number exceeds ``most``, as paths may have very many vertices.
+    """
     n = sum(p.size * _times(p) for p in cell.polygons)
     for path in cell.paths:
         if n > most:
@@ -219,7 +224,11 @@ def _own_vertices(cell: Any, most: int) -> int:
 
 
 def _times(element: Any) -> int:
-    """How often an element stands there; columns times rows may be more than the number that gdstk has for it."""
+    """
+    Return the number of repetitions of an element.
+
+    For arrays, columns times rows can exceed the size that gdstk reports.
+    """
     repetition = element.repetition
     n = repetition.size if repetition.columns is None else repetition.columns * repetition.rows
     return max(1, n)
@@ -238,7 +247,11 @@ def _own(cell: Any) -> bool:
 
 
 def _flat(cell: Any, flat: dict[str, Shapes], lines: list[str], unit_um: float, dbu_um: float) -> Shapes:
-    """The polygons of a cell and of all cells below, in database units; lines of columns are added."""
+    """
+    Return the polygons of a cell and its hierarchy, in database units.
+
+    The column strings of the polygons are appended to ``lines``.
+    """
     import numpy as np
 
     parts = [_own_shapes(cell, lines, unit_um, dbu_um)]
@@ -267,7 +280,7 @@ def _flat(cell: Any, flat: dict[str, Shapes], lines: list[str], unit_um: float, 
 
 
 def _turn(angle_rad: float) -> NDArray[np.float64]:
-    """Matrix of a counter-clockwise turn; quarter turns are exact."""
+    """Return the matrix of a counter-clockwise rotation, exact for multiples of 90°."""
     import numpy as np
 
     quarters = angle_rad / (0.5 * math.pi)
@@ -278,13 +291,13 @@ def _turn(angle_rad: float) -> NDArray[np.float64]:
 
 
 def _own_shapes(cell: Any, lines: list[str], unit_um: float, dbu_um: float) -> Shapes:
-    """The polygons of one cell, paths as polygons, repetitions written out."""
+    """Return the polygons of one cell, with paths as polygons and repetitions expanded."""
     import numpy as np
 
     polygons = list(cell.polygons)
     for p in cell.polygons:
         if p.repetition.size:
-            # Copies are other photosites than the one whose number they carry.
+            # Copies are separate photosites, although they have the same number.
             polygons += p.apply_repetition()
     for path in cell.paths:
         polygons += [q for p in (path, *path.apply_repetition()) for q in p.to_polygons()]
@@ -302,7 +315,7 @@ def _own_shapes(cell: Any, lines: list[str], unit_um: float, dbu_um: float) -> S
 
 
 def _site(polygon: Any) -> tuple[int, int, int]:
-    """Photosite, part and number of parts that a polygon's properties tell."""
+    """Return photosite, part and number of parts from the properties of a polygon."""
     text = polygon.get_gds_property(NUMBER_PROPERTY)
     match = NUMBER.fullmatch(text) if isinstance(text, str) else None
     if match:
@@ -314,7 +327,7 @@ def _site(polygon: Any) -> tuple[int, int, int]:
 
 
 def _columns(polygon: Any) -> str:
-    """One line of words ``name=value`` of a polygon's properties; nothing where they tell no such words."""
+    """Return a polygon's column string of words ``name=value``, empty where it has none."""
     text = polygon.get_gds_property(COLUMNS_PROPERTY)
     if text is None:
         values = polygon.get_property("columns")
@@ -329,7 +342,11 @@ def _columns(polygon: Any) -> str:
 
 
 def _text_of_columns(shapes: Shapes, lines: list[str], max_bytes: int) -> NDArray[np.uint8]:
-    """The lines that the shapes tell, each once, and the shapes' tags made to fit; none if a shape tells none."""
+    """
+    Return the distinct column strings of the shapes, one per line.
+
+    The tags of the shapes are renumbered accordingly. The result is empty if a shape has no columns.
+    """
     import numpy as np
 
     told, tags = np.unique(shapes.tags[:, 6], return_inverse=True)
@@ -342,16 +359,16 @@ def _text_of_columns(shapes: Shapes, lines: list[str], max_bytes: int) -> NDArra
 
 
 def _on_one_layer(shapes: Shapes, wanted: int | None) -> Shapes:
-    """Those polygons that are photosites."""
+    """Return the polygons on the layer of the photosites."""
     import numpy as np
 
     layers = np.unique(shapes.tags[:, 0])
     if wanted is None and layers.size > 1:
-        raise FormatError(f"has shapes on the layers {_listed(layers.tolist())}; say which to read with layer=")
+        raise FormatError(f"has shapes on several layers, {_listed(layers.tolist())}; select one with layer=")
     if wanted is None or layers.tolist() == [wanted]:
         return shapes
     if wanted not in layers:
-        raise FormatError(f"has no shape on layer {wanted}; there are some on {_listed(layers.tolist())}")
+        raise FormatError(f"has no shape on layer {wanted}; its layers with shapes are {_listed(layers.tolist())}")
     is_wanted = shapes.tags[:, 0] == wanted
     is_kept_vertex = np.repeat(is_wanted, shapes.counts)
     return Shapes(shapes.xy[is_kept_vertex], shapes.counts[is_wanted], shapes.tags[is_wanted], shapes.n_placements)

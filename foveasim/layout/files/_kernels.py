@@ -1,4 +1,4 @@
-"""The layout files' numba kernel: a walk along the records of GDSII."""
+"""Numba kernel that follows the records of a GDSII file."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _flags = types.Array(types.boolean, 1, "C", readonly=True)
 @njit(types.UniTuple(types.int64, 2)(_bytes, _flags, types.int64))
 def walk_records(data, is_known, last):
     """
-    Walk to the end of the record that has the number ``last``, to a record that is none, or to the end of the data.
+    Follow the records up to the record type ``last``, an invalid record, or the data end.
 
     Returns
     -------
     at : int
-        Where the walk ended; beyond the data if that is where the record's length leads.
+        Final position, behind the last record; beyond the data if the length of that record exceeds them.
     record : int
-        Number of the record walked last, with its data type; -1 if what begins there is no record.
+        Type of the last record, with its data type; -1 if no valid record begins at ``at``.
     """
     at, record = 0, 0
     while at + 4 <= data.size and record != last:

@@ -1,17 +1,17 @@
 """
-Chip layout files: GDSII and OASIS, through gdstk.
+GDSII and OASIS files, through gdstk.
 
-A photosite is a polygon on one layer, its channel the data type, its number a property: attribute 1 with the text
-``photosite 17`` in GDSII, the property ``photosite`` in OASIS, so that the order survives programs that sort shapes.
-Coordinates are whole multiples of the database unit. Neither format has holes, and a GDSII polygon has at most 8,190
-vertices, the closing one included: other sites are written as several polygons (``photosite 17 part 1 of 3``) that
-share edges and add no vertex, and are put together again when read, exactly.
+A photosite is a polygon on one layer. Its channel is the datatype, and its number is a property, which preserves the order
+in programs that sort shapes: attribute 1 with the string ``photosite 17`` in GDSII, the property ``photosite`` in OASIS.
+Coordinates are integer multiples of the database unit. Neither format has holes, and a GDSII polygon has at most 8,190
+vertices including the closing one. Sites with holes or more vertices are written as several polygons (``photosite 17 part
+1 of 3``) that share edges and add no vertex; reading merges them exactly.
 
-The other columns are a second property: attribute 2 with the text ``ring=3 gain=0.25 is_dead=true name="a"`` in GDSII,
-the property ``columns`` with names and values in turn in OASIS. Integers come back as int64 (uint64 where it takes
-that), others as float64, to the last bit. A column whose values do not fit for some site is left out for all, and
-reported: the properties of a GDSII polygon hold 128 bytes together, and gdstk takes very long for very many different
-texts in OASIS. A column that not every photosite of a file tells is not read.
+The other columns are a second property: attribute 2 with the string ``ring=3 gain=0.25 is_dead=true name="a"`` in GDSII,
+the property ``columns`` with alternating names and values in OASIS. Integers are read as int64 (uint64 where required),
+other numbers as float64, bit for bit. A column with values that do not fit for some site is dropped for all sites, and
+reported: the properties of a GDSII polygon contain at most 128 bytes, and gdstk is very slow for a large number of distinct
+strings in OASIS. A column without a value for every photosite of a file is not read.
 
 References: Calma, GDSII Stream Format Manual 6.0 (1987); SEMI P39, OASIS.
 """
@@ -57,28 +57,28 @@ GDS_MAGIC = b"\x00\x06\x00\x02"
 OASIS_MAGIC = b"%SEMI-OASIS\r\n"
 
 DEFAULT_DBU_UM = 1e-4
-#: Layers and data types beyond this are negative to some programs, which read 16 bits with sign.
+#: Maximum layer and datatype: some programs read them as signed 16-bit integers.
 MAX_NUMBER = 32767
-#: Vertices of a GDSII polygon: with the closing one 8,190, beyond which gdstk warns that others may not read it.
+#: Maximum vertices of a GDSII polygon, without the closing one: gdstk warns of incompatibility above 8,190 in total.
 MAX_GDS_VERTICES = 8189
-#: Bytes of a GDSII property, and of all properties of a polygon together, that any program reads.
+#: Maximum bytes of a GDSII property, and of all properties of a polygon, that all programs read.
 MAX_GDS_TEXT, MAX_GDS_PROPERTIES = 126, 128
-#: Bytes of a site's columns in OASIS that are read again.
+#: Maximum bytes of the columns of a site in OASIS.
 MAX_OASIS_TEXT = 1024
-#: gdstk looks for each text of an OASIS file among all different ones before it: a second's worth of looking.
+#: Comparisons in about a second: gdstk compares each string of an OASIS file with all previous distinct ones.
 OASIS_TEXT_STEPS = 4e8
-#: Coordinates are 32-bit with sign.
+#: Coordinates are signed 32-bit integers.
 MAX_DBU = 2**31 - 1
-#: Layouts made at different times are the same bytes.
-TIMESTAMP = datetime(2000, 1, 1)  # noqa: DTZ001 -- GDSII knows no time zones
+#: Constant timestamp, for reproducible files.
+TIMESTAMP = datetime(2000, 1, 1)  # noqa: DTZ001 -- GDSII has no time zones
 CELL_NAME = "SENSOR"
 
-#: Of the reading program: memory while gdstk reads, and in all; texts of columns; time; more of each for a large file.
+#: Limits of the sandbox process: memory while gdstk reads, and in total; column strings; time; larger for large files.
 MIN_READING_BYTES, READING_PER_BYTE = 2**30, 256
 MIN_MEMORY_BYTES, MEMORY_PER_BYTE, MAX_MEMORY_BYTES = 2**31, 256, 2**35
 MIN_TEXT_BYTES, TEXT_PER_BYTE = 2**27, 32
 MAX_CPU_S, BYTES_PER_S = 5, 2**20
-#: GDSII records by the data type that they have: none, bits, 16-bit, 32-bit, 64-bit floating, text.
+#: GDSII record types by data type: none, bit array, 16-bit, 32-bit, 64-bit floating point, string.
 RECORDS_OF_TYPE = {
     0: b"\x04\x07\x08\x09\x0a\x0b\x0c\x11\x15\x2d\x38",
     1: b"\x17\x1a\x26\x34",
@@ -88,9 +88,9 @@ RECORDS_OF_TYPE = {
     6: b"\x02\x06\x12\x19\x1f\x20\x23\x24\x2c\x37\x3a",
 }
 END_OF_LIBRARY = 0x0400
-#: Vertices that an outline passes on its way through slits, for each that it has.
+#: Maximum number of vertices after noding an outline with slits, as a multiple of its own.
 MAX_STOPS = 16
-#: Of OASIS: the END record fills the last bytes of the file; a checksum follows the scheme's number.
+#: OASIS: size and type of the END record, which ends the file, and number of the validation scheme CRC-32.
 OASIS_END_BYTES = 256
 OASIS_END = 2
 CRC32_SCHEME = 1
@@ -101,16 +101,16 @@ CRC32_SCHEME = 1
 
 def write(layout: Layout, path: Path, *, layer: int = 1, dbu_um: float = DEFAULT_DBU_UM) -> WrittenLayout:
     """
-    Write GDSII or OASIS, by the ending.
+    Write GDSII or OASIS, depending on the extension.
 
     Raises
     ------
     GeometryError
-        When sites collapse or cross themselves on the database grid.
+        When sites collapse or self-intersect on the database grid.
     ParameterError
-        When the layer, a channel or a coordinate is beyond what the format holds.
+        When the layer, a channel or a coordinate exceeds the range of the format.
     FileError
-        When gdstk is missing, or nothing can be written there.
+        When gdstk is not installed, or the file cannot be written.
     """
     gdstk = _gdstk(path)
     layer = check_count("layer", layer, at_least=0, at_most=MAX_NUMBER)
@@ -139,7 +139,7 @@ def write(layout: Layout, path: Path, *, layer: int = 1, dbu_um: float = DEFAULT
 def _set_gds_properties(
     polygons: list[Any], layout: Layout, site: list[int], part: list[int], n_parts: list[int]
 ) -> tuple[str, ...]:
-    """Give each polygon its site's number and columns; the names of the columns that do not fit."""
+    """Set the number and columns of each polygon's site; return the dropped columns."""
     numbers = [
         f"photosite {s}" if n == 0 else f"photosite {s} part {k} of {n}"
         for s, k, n in zip(site, part, n_parts, strict=True)
@@ -148,7 +148,7 @@ def _set_gds_properties(
     kept, lost = kept_columns(layout, min(MAX_GDS_TEXT, MAX_GDS_PROPERTIES - longest - longest % 2))
     texts = texts_of(kept)
     if texts:
-        # gdstk writes first what was set last.
+        # gdstk writes the property that was set last first.
         for polygon, s in zip(polygons, site, strict=True):
             polygon.set_gds_property(2, texts[s])
     for polygon, number in zip(polygons, numbers, strict=True):
@@ -159,7 +159,7 @@ def _set_gds_properties(
 def _set_oasis_properties(
     polygons: list[Any], layout: Layout, site: list[int], part: list[int], n_parts: list[int]
 ) -> tuple[str, ...]:
-    """Give each polygon its site's number and columns; the names of the columns that would take too long."""
+    """Set the number and columns of each polygon's site; return the dropped columns."""
     kept, lost = kept_columns(layout, MAX_OASIS_TEXT, int(OASIS_TEXT_STEPS // max(len(polygons), 1)))
     rows = list(zip(*chain.from_iterable((repeat(key), values) for key, values in kept.items()), strict=False))
     if rows:
@@ -179,20 +179,20 @@ def _gdstk(path: Path) -> Any:
 
 
 def _in_um(xy_dbu: NDArray[Any], dbu_um: float) -> Floats:
-    """Coordinates in µm: the nearest number to the decimal, where a µm is an integer of database units."""
+    """Convert to µm; correctly rounded where 1 µm is an integer number of database units."""
     per_um = round(1.0 / dbu_um)
     is_whole = per_um >= 1 and abs(per_um * dbu_um - 1.0) < 1e-12
     return np.asarray(xy_dbu / per_um if is_whole else xy_dbu * dbu_um, dtype=np.float64)
 
 
 def _snapped(layout: Layout, dbu_um: float) -> Layout:
-    """The layout with its vertices on the database grid, photosites still."""
+    """Round the vertices of a layout to the database grid, and check the photosites."""
     xy_dbu = np.rint(layout.xy_um / dbu_um)
     if xy_dbu.size and np.abs(xy_dbu).max() > MAX_DBU:
         raise ParameterError(
             "dbu_um", f"must be >= {np.abs(layout.xy_um).max() / MAX_DBU:.3g} for this layout", dbu_um, "µm"
         )
-    # Its holes are checked below.
+    # The holes are checked below.
     snapped = Layout._derived(_in_um(xy_dbu, dbu_um), layout.ring_offsets, layout.site_offsets, {}, {})  # noqa: SLF001
     if layout.n_sites:
         area_um2 = ring_moments(snapped.xy_um, snapped.ring_offsets)[0]
@@ -203,19 +203,19 @@ def _snapped(layout: Layout, dbu_um: float) -> Layout:
         if is_bad.any():
             bad = np.flatnonzero(is_bad)
             raise GeometryError(
-                f"site {bad[0]}{f' and {bad.size - 1} more' if bad.size > 1 else ''} would collapse or cross itself on "
-                f"the database grid of {dbu_um:g} µm; take a smaller dbu_um",
+                f"site {bad[0]}{f' and {bad.size - 1} more' if bad.size > 1 else ''} would collapse or self-intersect on "
+                f"the database grid of {dbu_um:g} µm; use a smaller dbu_um",
                 tuple(int(i) for i in bad),
             )
     return snapped
 
 
 def _check_end(path: Path, is_oasis: bool) -> None:
-    """No word comes from gdstk when a disk is full: a whole file ends as its format asks."""
+    """Check that a file is complete, as gdstk does not report a full disk."""
     data = path.read_bytes()[-OASIS_END_BYTES:]
     is_whole = data[:1] == bytes([OASIS_END]) if is_oasis else data[-4:] == b"\x00\x04\x04\x00"
     if not is_whole:
-        raise OSError("not all of it was written")
+        raise OSError("the written file is incomplete")
 
 
 # -- sites as polygons without holes ----------------------------------------------------------------------------------
@@ -223,12 +223,12 @@ def _check_end(path: Path, is_oasis: bool) -> None:
 
 def _pieces(layout: Layout, max_vertices: int | None) -> tuple[Ints, Ints, Ints, list[Floats]]:
     """
-    Hole-free rings of all sites, in their order.
+    Return hole-free rings of all sites, in their order.
 
     Returns
     -------
     site, part, n_parts : (n_ring,) int64
-        Number of the site; which of how many parts from 1, or 0 and 0 for a whole site.
+        Index of the site, number of the part from 1, and number of parts; 0 and 0 for an undivided site.
     rings_um : list of (n, 2), µm
     """
     rings_of_site = np.diff(layout.site_offsets)
@@ -255,12 +255,12 @@ def _pieces(layout: Layout, max_vertices: int | None) -> tuple[Ints, Ints, Ints,
 
 def _hole_free_parts(polygon: Any, max_vertices: int | None) -> list[Floats]:
     """
-    Rings without holes that fill a polygon and have no other vertices than it has.
+    Divide a polygon into rings without holes and without additional vertices.
 
     Notes
     -----
-    Triangles of a constrained Delaunay triangulation are joined as long as each brings a new vertex: such a part has
-    no vertex twice, so it is simple and surrounds nothing.
+    Triangles of a constrained Delaunay triangulation are merged as long as each adds a new vertex. Such a part has no
+    repeated vertex, and is therefore simple and without holes.
     """
     triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
     corners = shapely.get_coordinates(shapely.normalize(triangles)).reshape(-1, 4, 2)[:, :3]
@@ -286,7 +286,7 @@ def _grown(
     is_free: list[bool],
     max_vertices: int | None,
 ) -> list[int]:
-    """Vertices, in order, of a part that grows from one triangle; its triangles are no longer free."""
+    """Return the vertices, in order, of a part grown from one triangle; mark its triangles."""
     after = dict(zip(corner_ids[first], [*corner_ids[first][1:], corner_ids[first][0]], strict=True))
     edges = list(after.items())
     while edges and (max_vertices is None or len(after) < max_vertices):
@@ -310,12 +310,14 @@ def _grown(
 
 def read(path: Path, *, layer: int | None = None, cell: str | None = None) -> Layout:
     """
-    Read GDSII or OASIS, by the content; cells flattened, sites in the order of their numbers.
+    Read GDSII or OASIS, detected by content.
+
+    The cell hierarchy is flattened, and the sites are ordered by their numbers.
 
     Raises
     ------
     FileError
-        When gdstk is missing, or the file is corrupt, truncated, malformed, or holds no photosites.
+        When gdstk is not installed, or the file is corrupt, truncated, malformed, or contains invalid photosites.
     """
     _gdstk(path)
     kind = "GDSII or OASIS"
@@ -349,7 +351,7 @@ def read(path: Path, *, layer: int | None = None, cell: str | None = None) -> La
 
 
 def _check_records(path: Path, data: bytes) -> None:
-    """Records of GDSII must have lengths that lead to the end of the library, and types that are known."""
+    """Check that the GDSII records have known types and are complete up to ENDLIB."""
     from foveasim.layout.files import _kernels
 
     is_known = np.zeros(2**16, bool)
@@ -357,26 +359,26 @@ def _check_records(path: Path, data: bytes) -> None:
         is_known[[record << 8 | kind for record in records]] = True
     at, record = _kernels.walk_records(np.frombuffer(data, np.uint8), is_known, END_OF_LIBRARY)
     if record == -1:
-        raise FileError(path, f"is corrupt: byte {at} begins no GDSII record")
+        raise FileError(path, f"is corrupt: no valid GDSII record begins at byte {at}")
     if record != END_OF_LIBRARY or at > len(data):
-        raise FileError(path, "is truncated: its GDSII records do not reach the end of the library")
+        raise FileError(path, "is truncated: the GDSII record ENDLIB is missing or incomplete")
     if data[at:].strip(b"\0"):
-        raise FileError(path, f"is corrupt: something follows the end of the GDSII library at byte {at}")
+        raise FileError(path, f"is corrupt: unexpected data after the end of the GDSII library at byte {at}")
 
 
 def _check_oasis(path: Path, data: bytes) -> None:
-    """The END record must be there, and its CRC-32, where it tells one, must be that of the file."""
+    """Check that the END record exists, and that its CRC-32, if any, matches the file."""
     end = data[-OASIS_END_BYTES:]
     if len(data) < len(OASIS_MAGIC) + OASIS_END_BYTES or end[0] != OASIS_END:
         raise FileError(path, "is truncated or corrupt: it does not end with the END record of OASIS")
     if end[-5] == CRC32_SCHEME and int.from_bytes(end[-4:], "little") != zlib.crc32(memoryview(data)[:-4]):
-        raise FileError(path, "is corrupt: its CRC-32 is not that of its content")
+        raise FileError(path, "is corrupt: its CRC-32 does not match its content")
 
 
 def _isolated(
     path: Path, is_oasis: bool, layer: int | None, cell: str | None, n_bytes: int
 ) -> tuple[dict[str, Any], Floats, Ints, Ints, bytes]:
-    """What gdstk finds in the file, read by a program of its own, which a malformed file may crash."""
+    """Read the file with gdstk in the sandbox process, which a malformed file may crash."""
     from foveasim.layout.files import _gdstk
 
     max_cpu_s = MAX_CPU_S + n_bytes // BYTES_PER_S
@@ -404,21 +406,21 @@ def _isolated(
 
 def _sites(path: Path, xy_um: Floats, counts: Ints, tags: Ints) -> tuple[Layout, Ints, Ints]:
     """
-    The polygons of the file in the order of their sites' numbers, and which of them are the parts of one site.
+    Sort the polygons of the file by site number, and group the parts of divided sites.
 
     Returns
     -------
     pieces : Layout
-        Each polygon a site, unchecked.
+        One unchecked site per polygon.
     piece : (n_piece,) int64
-        Their places in the file.
+        Positions of the polygons in the file.
     first : (n_site,) int64
-        The first piece of each site.
+        Index of the first piece of each site.
     """
     if counts.size and counts.min() < 3:
-        raise FileError(path, f"holds a polygon of {counts.min()} vertices")
+        raise FileError(path, f"contains a polygon with {counts.min()} vertices, expected at least 3")
     site, part, n_parts, placement = tags[:, 2:6].T
-    # Sites without a number keep their place behind those that have one.
+    # Sites without a number follow the numbered ones, in the order of the file.
     number = np.where(site >= 0, site, site.max(initial=-1) + 1)
     order = np.lexsort((part, number, placement))
     pieces = Layout(xy_um, np.concatenate(([0], np.cumsum(counts))), np.arange(counts.size + 1))
@@ -434,12 +436,12 @@ def _sites(path: Path, xy_um: Floats, counts: Ints, tags: Ints) -> tuple[Layout,
     is_wrong &= n_parts[order] > 0
     if is_wrong.any():
         bad = order[np.flatnonzero(is_wrong)[0]]
-        raise FileError(path, f"has other parts of photosite {site[bad]} than the {n_parts[bad]} that it was cut into")
+        raise FileError(path, f"has missing or duplicate parts of photosite {site[bad]}, expected {n_parts[bad]} parts")
     return pieces, order, first
 
 
 def _outlines(pieces: Layout, first: Ints) -> NDArray[Any]:
-    """Polygons of the sites, put together of their pieces."""
+    """Merge the pieces of each site into one polygon."""
     polygons = pieces.polygons()
     whole = polygons[first]
     size = np.diff(np.append(first, polygons.size))
@@ -449,7 +451,11 @@ def _outlines(pieces: Layout, first: Ints) -> NDArray[Any]:
 
 
 def _columns(texts: bytes, line: Ints, first: Ints) -> dict[str, NDArray[Any]]:
-    """The columns that all pieces of all sites tell, the pieces of a site the same; ``line`` of each piece."""
+    """
+    Return the columns with a value for all pieces, equal for all pieces of a site.
+
+    ``line`` is the line of each piece in ``texts``.
+    """
     columns = {}
     size = np.diff(np.append(first, line.size))
     for name, told in columns_of(texts).items() if texts else ():
@@ -464,9 +470,9 @@ def _columns(texts: bytes, line: Ints, first: Ints) -> dict[str, NDArray[Any]]:
 
 def _without_keyholes(polygons: NDArray[Any]) -> NDArray[Any]:
     """
-    Polygons as they are, and those whose outline reaches a hole through a slit of no width as one with that hole.
+    Convert outlines with keyholes to polygons with holes; other polygons are unchanged.
 
-    Other programs write holes this way.
+    Other programs write holes as keyholes: the outline reaches the hole through a slit of zero width.
     """
     walks = np.flatnonzero(~shapely.is_valid(polygons) & (shapely.get_num_interior_rings(polygons) == 0))
     mended = np.full(len(polygons), None)
@@ -479,7 +485,7 @@ def _without_keyholes(polygons: NDArray[Any]) -> NDArray[Any]:
 
 
 def _with_all_vertices(walk: list[Point]) -> list[Point]:
-    """A closed walk that stops at each of its vertices wherever it passes one, on horizontal and vertical ways."""
+    """Node a closed path: insert its vertices that lie on its horizontal and vertical edges."""
     stops: tuple[dict[float, list[float]], ...] = ({}, {})
     for axis, of_line in enumerate(stops):
         for vertex in set(walk):
@@ -489,7 +495,7 @@ def _with_all_vertices(walk: list[Point]) -> list[Point]:
     whole = walk[:1]
     for a, b in pairwise(walk):
         axis = 0 if a[0] == b[0] else 1
-        # A walk that passes very many is no outline.
+        # A path with too many nodes is not a valid outline.
         if a[axis] == b[axis] and len(whole) < MAX_STOPS * len(walk):
             values, (low, high) = stops[axis][a[axis]], sorted((a[1 - axis], b[1 - axis]))
             passed = values[bisect_right(values, low) : bisect_left(values, high)]
@@ -500,7 +506,7 @@ def _with_all_vertices(walk: list[Point]) -> list[Point]:
 
 
 def _loops(walk: list[Point]) -> list[list[Point]]:
-    """Rings that are left of a closed walk without the ways that it goes there and back again."""
+    """Return the rings of a closed path without the edges traversed in both directions."""
     n_times = Counter(pairwise(walk))
     ways: dict[Point, list[Point]] = {}
     for (a, b), n in n_times.items():
@@ -523,7 +529,11 @@ def _loops(walk: list[Point]) -> list[list[Point]]:
 
 
 def _of_loops(loops: list[list[Point]]) -> Any:
-    """The polygon of the largest ring, with the others as holes; nothing if one goes round the same way as that."""
+    """
+    Return the polygon of the largest ring, with the others as holes.
+
+    The result is None if another ring has the same winding order as the largest.
+    """
     if not loops:
         return None
     offsets = np.cumsum([0, *map(len, loops)])

@@ -1,8 +1,8 @@
 """
-Layouts as GeoJSON (RFC 7946), for programs that know maps: one feature a site, its columns as properties.
+Layouts as GeoJSON (RFC 7946): one feature per site, columns as properties.
 
-Coordinates are µm in the sensor's plane and not degrees; numbers have as many digits as it takes to be the same again.
-What GeoJSON does not know (unit, origin, types of the columns) stands in the member ``foveasim``, which others ignore.
+Coordinates are in µm in the sensor plane, not in degrees. Numbers have the digits required for an exact round trip. The
+member ``foveasim``, which other programs ignore, contains the unit, the provenance and the types of the columns.
 """
 
 from __future__ import annotations
@@ -41,28 +41,28 @@ from foveasim.layout.model import Layout
 
 __all__ = ["read", "write"]
 
-#: Features that are made into text at a time.
+#: Number of features formatted at a time.
 CHUNK = 10_000
-#: JSON has no infinity, but numbers beyond float64, which are read as such.
+#: JSON has no infinity, but numbers beyond the range of float64 are read as infinity.
 INFINITY = "1e999"
 NUMBERS = {int, float}
-#: All integers up to this are floating-point numbers, and none beyond the other is.
+#: Integers up to the first are exact in float64; integers above the second are not supported.
 MAX_EXACT, MAX_FLOAT = 2**53, 2**1023
-#: Among more names of properties, only those of all features are columns: other names could be new for every feature.
+#: With more property names, only properties of all features are columns, as names could differ for every feature.
 MAX_NAMES = 256
 _BLANK = re.compile(r"[ \t\r\n]*")
 
 
 def write(layout: Layout, path: Path) -> WrittenLayout:
     """
-    Write a collection of features.
+    Write a GeoJSON FeatureCollection.
 
     Raises
     ------
     ParameterError
-        When a column holds neither numbers nor text.
+        When a column contains neither numbers nor strings.
     FileError
-        When nothing can be written there.
+        When the file cannot be written.
     """
     columns = plain_columns(layout, "GeoJSON")
     about = {**header(layout), "columns": dtype_text(layout)}
@@ -85,8 +85,8 @@ def _features(layout: Layout, columns: Mapping[str, NDArray[Any]], start: int) -
 
 
 def _texts(values: NDArray[Any]) -> list[str]:
-    """Values of a column as JSON; a float that is no number as null."""
-    # The shortest digits of a float32 are those of another number than its own.
+    """Return the values of a column as JSON, NaN as null."""
+    # The shortest digits of a float32 are not exact in float64.
     plain = values.astype(np.float64) if values.dtype.kind == "f" else values
     texts = [json.dumps(v) for v in plain.tolist()]
     return [{"NaN": "null", "Infinity": INFINITY, "-Infinity": "-" + INFINITY}.get(t, t) for t in texts]
@@ -94,15 +94,15 @@ def _texts(values: NDArray[Any]) -> list[str]:
 
 def read(path: Path) -> Layout:
     """
-    Read a collection of polygons, in the order of the features.
+    Read a GeoJSON FeatureCollection of polygons, in the order of the features.
 
-    Properties that every feature has, and that are all numbers, all truth values or all text, become columns; null
-    among numbers is NaN, among text the empty text. The names of others stand in the layout's provenance.
+    Properties of all features that are all numbers, all booleans or all strings become columns; null is NaN among
+    numbers, and an empty string among strings. The provenance of the layout lists the names of other properties.
 
     Raises
     ------
     FileError
-        When it is broken, too large, or holds something else than polygons.
+        When the file is corrupt, too large, or contains other geometries than polygons.
     """
     with as_file_error(path, "GeoJSON layout"):
         document = _Document(path)
@@ -121,12 +121,14 @@ def read(path: Path) -> Layout:
 
 class _Document:
     """
-    A collection of features, read one by one: as objects of Python all together would take ten times their text.
+    FeatureCollection, decoded feature by feature.
+
+    As Python objects, all features together would require ten times the memory of their text.
 
     Attributes
     ----------
     members : dict
-        Members of the collection beside the features.
+        Members of the collection other than the features.
     """
 
     def __init__(self, path: Path) -> None:
@@ -140,10 +142,10 @@ class _Document:
         for key, value in _members(text, self._add):
             self.members[key] = value
         if self.members.get("type") != "FeatureCollection" or "features" not in self.members:
-            raise FileError(path, "is no GeoJSON FeatureCollection")
+            raise FileError(path, "is not a GeoJSON FeatureCollection")
 
     def _add(self, feature: Any) -> None:
-        """Keep the outline and the properties of one more feature."""
+        """Add the outline and the properties of a feature."""
         i = len(self._rows)
         check_sites_of(self.path, i + 1)
         geometry = feature.get("geometry") if isinstance(feature, dict) else None
@@ -152,29 +154,31 @@ class _Document:
         if kind == "MultiPolygon" and isinstance(rings, list) and len(rings) == 1:
             kind, rings = "Polygon", rings[0]
         if kind != "Polygon" or not isinstance(rings, list) or not rings:
-            raise FileError(self.path, f"feature {i} must be one polygon, got {str(kind)[:40]}; a site is one piece")
+            raise FileError(
+                self.path, f"feature {i} must be one polygon, got {str(kind)[:40]}; write one feature per site"
+            )
         self._rings_of_site.append(len(rings))
         for ring in rings:
             if not isinstance(ring, list) or len(ring) < 4:
                 raise FileError(self.path, f"feature {i} has a ring of fewer than 4 positions")
             self._vertices_of_ring.append(len(ring))
             for position in ring:
-                # type() and not isinstance(): true and false are integers to Python.
+                # type() instead of isinstance(), as booleans are integers in Python.
                 if type(position) is not list or not 2 <= len(position) <= 3 or not {*map(type, position)} <= NUMBERS:
-                    raise FileError(self.path, f"feature {i} has a position that is not two numbers")
+                    raise FileError(self.path, f"feature {i} has a position that is not two or three numbers")
                 self._xy.append(position[0])
                 self._xy.append(position[1])
         properties = feature.get("properties")
         self._rows.append(properties if isinstance(properties, dict) else {})
 
     def outlines(self) -> tuple[Floats, Ints, Ints]:
-        """Packed rings of all features, as they stand there."""
+        """Return the packed rings of all features, unchecked."""
         ring_offsets = np.concatenate(([0], np.cumsum(np.array(self._vertices_of_ring, np.int64))))
         site_offsets = np.concatenate(([0], np.cumsum(np.array(self._rings_of_site, np.int64))))
         return np.array(self._xy, np.float64).reshape(-1, 2), ring_offsets, site_offsets
 
     def columns(self, types: Mapping[str, Any]) -> tuple[dict[str, NDArray[Any]], list[str]]:
-        """Columns of the features' properties, and the names of those that are none."""
+        """Return the columns of the properties, and the names of unsupported properties."""
         n_rows = Counter(chain.from_iterable(self._rows))
         names = dict.fromkeys(chain(types, n_rows))
         columns, left_out = {}, []
@@ -189,7 +193,7 @@ class _Document:
 
 
 def _members(text: str, add: Callable[[Any], None]) -> Iterator[tuple[str, Any]]:
-    """Members of the object that a text is; elements of the list ``features`` are handed over and not kept."""
+    """Yield the members of a JSON object; pass elements of ``features`` to ``add`` instead."""
     decode = json.JSONDecoder().raw_decode
 
     def after(at: int, expected: str) -> int:
@@ -223,11 +227,11 @@ def _members(text: str, add: Callable[[Any], None]) -> Iterator[tuple[str, Any]]
         if text[at - 1] == "}":
             break
     if text[at:].strip():
-        raise ValueError(f"something follows the end at character {at}")
+        raise ValueError(f"unexpected data after the end at character {at}")
 
 
 def _is_exact(value: Any) -> bool:
-    """Whether a float64 contains a value, where it is an integer."""
+    """Return whether a value is exact in float64, if it is an integer."""
     return type(value) is not int or abs(value) <= MAX_EXACT or (abs(value) < MAX_FLOAT and int(float(value)) == value)
 
 

@@ -1,8 +1,8 @@
 """
-Layouts as GeoParquet 1.1, through pyarrow: outlines as WKB, columns as columns; exact, small, and read by map programs.
+Layouts as GeoParquet 1.1, through pyarrow.
 
-Coordinates are µm in the sensor's plane, without a coordinate reference system. Unit and origin stand in the metadata
-``foveasim``.
+Outlines are WKB, and columns are Parquet columns. The files are exact and small, and GIS programs read them. Coordinates
+are in µm in the sensor plane, without a coordinate reference system. The metadata ``foveasim`` contain unit and provenance.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ __all__ = ["MAGIC", "read", "write"]
 MAGIC = b"PAR1"
 GEOMETRY = "geometry"
 VERSION = "1.1.0"
-#: Rows that are unpacked at a time.
+#: Number of rows decompressed at a time.
 BATCH = 4096
-#: Numbers of WKB's polygons and multipolygons, and the bit of those that tell a reference system before anything else.
+#: WKB types of polygons and multipolygons, and the flag of a leading spatial reference identifier.
 POLYGON, MULTIPOLYGON = 3, 6
 WITH_SRID = 1 << 29
-#: The first five bytes of both, in either byte order, with or without heights and other extras.
+#: First five bytes of both, in either byte order, with or without z, m and flags.
 HEADS = {
     kind: {
         bytes([is_little]) + number.to_bytes(4, "little" if is_little else "big"): number
@@ -64,14 +64,16 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     Raises
     ------
     ParameterError
-        When a column holds neither numbers nor text, or is called like the outlines.
+        When a column contains neither numbers nor strings, or has the name of the geometry column.
     FileError
-        When pyarrow is missing, or nothing can be written there.
+        When pyarrow is not installed, or the file cannot be written.
     """
     pa, parquet = _pyarrow(path)
     columns = plain_columns(layout, "GeoParquet")
     if GEOMETRY in columns:
-        raise ParameterError(GEOMETRY, "is the name of the outlines in GeoParquet", hint="rename the column")
+        raise ParameterError(
+            GEOMETRY, "must not be a column name in GeoParquet: it is the geometry column", hint="rename the column"
+        )
     column: dict[str, Any] = {
         "encoding": "WKB",
         "geometry_types": ["Polygon"],
@@ -84,12 +86,12 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     geo = {"version": VERSION, "primary_column": GEOMETRY, "columns": {GEOMETRY: column}}
     about = {**header(layout), "columns": dtype_text(layout)}
     outlines = pa.array(shapely.to_wkb(layout.polygons(), byte_order=1), type=pa.binary())
-    # numpy's text of fixed width has no null, and other byte orders no place in Arrow.
+    # Arrow supports only the native byte order; numpy's fixed-width strings have no null.
     native = {name: values.astype(values.dtype.newbyteorder("=")) for name, values in columns.items()}
     table = pa.table({GEOMETRY: outlines, **{name: pa.array(values) for name, values in native.items()}})
     table = table.replace_schema_metadata({"geo": json.dumps(geo), "foveasim": json.dumps(about)})
     with atomic_write(path) as temporary:
-        # No outline stands there twice.
+        # Outlines are distinct, so that a dictionary would not reduce their size.
         parquet.write_table(table, temporary, compression="zstd", use_dictionary=[*columns], write_page_checksum=True)
     return lossless(layout, path)
 
@@ -101,7 +103,7 @@ def read(path: Path) -> Layout:
     Raises
     ------
     FileError
-        When pyarrow is missing, or the file is broken, too large, or holds something else than polygons.
+        When pyarrow is not installed, or the file is corrupt, too large, or contains other geometries than polygons.
     """
     pa, parquet = _pyarrow(path)
     with as_file_error(path, "GeoParquet layout"), parquet.ParquetFile(path, page_checksum_verification=True) as file:
@@ -109,17 +111,19 @@ def read(path: Path) -> Layout:
         check_unpacked(path, sum(file.metadata.row_group(i).total_byte_size for i in range(file.num_row_groups)))
         metadata = file.metadata.metadata or {}
         if b"geo" not in metadata:
-            raise FileError(path, "is a Parquet table without outlines: it has no metadata 'geo'")
+            raise FileError(path, "is a Parquet table without geometry: it has no metadata 'geo'")
         geo = json.loads(metadata[b"geo"])
         name = geo["primary_column"]
         if geo["columns"][name]["encoding"] != "WKB":
-            raise FileError(path, f"has outlines in the encoding {geo['columns'][name]['encoding']!r:.40}, not WKB")
+            raise FileError(path, f"has the geometry encoding {geo['columns'][name]['encoding']!r:.40}, expected WKB")
         kind = file.schema_arrow.field(name).type
         if not (pa.types.is_binary(kind) or pa.types.is_large_binary(kind)):
-            raise FileError(path, f"has outlines as {str(kind)[:40]}, not as bytes of WKB")
+            raise FileError(path, f"has geometry of type {str(kind)[:40]}, expected binary WKB")
         table = _table(path, pa, file)
         if table.num_rows != file.metadata.num_rows:
-            raise FileError(path, f"holds {table.num_rows} rows, and tells of {file.metadata.num_rows}")
+            raise FileError(
+                path, f"is corrupt: it contains {table.num_rows} rows, but declares {file.metadata.num_rows}"
+            )
         table.validate(full=True)
         polygons = _polygons(path, table.column(name).to_numpy(zero_copy_only=False))
         types: Any = {}
@@ -160,7 +164,11 @@ def _pyarrow(path: Path) -> tuple[Any, Any]:
 
 
 def _table(path: Path, pa: Any, file: Any) -> Any:
-    """All rows, a few at a time: one long value may stand in a small file for very many rows."""
+    """
+    Read all rows in batches, up to the maximum decompressed size.
+
+    A small file may repeat one long value in very many rows.
+    """
     batches, n_bytes, most = [], 0, max_unpacked(path)
     for batch in file.iter_batches(batch_size=_rows_at_a_time(path, file.metadata), use_threads=False):
         n_bytes += batch.nbytes
@@ -172,20 +180,24 @@ def _table(path: Path, pa: Any, file: Any) -> Any:
 
 
 def _rows_at_a_time(path: Path, metadata: Any) -> int:
-    """Rows that do not unpack to too much even if each is the longest value there can be, out of a dictionary."""
-    # Nothing is asked about single columns: pyarrow ends the program where what the file tells of them is wrong.
+    """
+    Return the number of rows that stay within the maximum decompressed size.
+
+    Each row may be the longest possible value of a dictionary.
+    """
+    # Metadata of single columns are not read: pyarrow aborts the process where they are invalid.
     longest = max((metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups)), default=1)
     return int(min(max(max_unpacked(path) // max(longest, 1), 1), BATCH))
 
 
 def _polygons(path: Path, outlines: NDArray[Any]) -> NDArray[Any]:
-    """Polygons of WKB; a row that holds one in a multipolygon gives that."""
+    """Convert WKB to polygons; multipolygons of one polygon are supported."""
     plain = HEADS[POLYGON]
     others = [row for row, wkb in enumerate(outlines) if wkb is None or wkb[:5] not in plain]
     for row in others:
-        # What holds itself over and over would crash GEOS.
+        # Deeply nested collections would crash GEOS.
         if not _is_multipolygon_of_one(outlines[row]):
-            raise FileError(path, f"row {row} must be one polygon; a site is one piece")
+            raise FileError(path, f"row {row} must be one polygon; write one row per site")
     geometries = np.asarray(shapely.from_wkb(outlines, on_invalid="raise"), dtype=object)
     geometries[others] = shapely.get_geometry(geometries[others], 0)
     return geometries

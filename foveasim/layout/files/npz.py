@@ -1,4 +1,8 @@
-"""Layouts as numpy arrays in one file: exact, columns of any type and the origin included. Nothing is ever unpickled."""
+"""
+Layouts as numpy arrays in one npz file: exact, with provenance and columns of any type.
+
+Pickled objects are never loaded.
+"""
 
 from __future__ import annotations
 
@@ -24,18 +28,18 @@ from foveasim.layout.packed import is_of_layout, packed_layout, unpacked_layout
 
 __all__ = ["MAGICS", "read", "write"]
 
-#: A zip archive, and an empty one.
+#: Signatures of a zip archive and of an empty one.
 MAGICS = (b"PK\x03\x04", b"PK\x05\x06")
 
 
 def write(layout: Layout, path: Path) -> WrittenLayout:
     """
-    Write all arrays, columns and the origin.
+    Write all arrays, columns and the provenance.
 
     Raises
     ------
     FileError
-        When nothing can be written there.
+        When the file cannot be written.
     """
     write_archive(path, header(layout), packed_layout(layout), is_packed=False)
     return lossless(layout, path)
@@ -48,16 +52,16 @@ def read(path: Path) -> Layout:
     Raises
     ------
     FileError
-        When it is broken, too large, or something else.
+        When the file is corrupt, too large, or not a layout.
     """
     with as_file_error(path, "npz layout"):
         about, arrays = read_archive(path, max_bytes=max_unpacked(path))
         if about is None:
-            raise FileError(path, "is no foveasim layout")
+            raise FileError(path, "is not a foveasim layout")
         provenance = check_header(path, about)
         unknown = [name for name in arrays if not is_of_layout(name)]
         if unknown:
-            raise FileError(path, f"is corrupt: {unknown[0]!r:.40} is no array of a layout")
+            raise FileError(path, f"is corrupt: {unknown[0]!r:.40} is not an array of a layout")
         check_sites_of(path, arrays["site_offsets"].size - 1)
         layout = unpacked_layout(arrays, provenance)
         _check_winding(path, layout)
@@ -65,7 +69,11 @@ def read(path: Path) -> Layout:
 
 
 def _check_winding(path: Path, layout: Layout) -> None:
-    """Outlines go counter-clockwise, holes clockwise, as a layout's plain constructor takes for granted."""
+    """
+    Check that outlines are counter-clockwise and holes clockwise.
+
+    The constructor of Layout does not check the winding order.
+    """
     is_outline = np.zeros(layout.ring_offsets.size - 1, bool)
     is_outline[layout.site_offsets[:-1]] = True
     with np.errstate(all="ignore"):
@@ -74,7 +82,7 @@ def _check_winding(path: Path, layout: Layout) -> None:
     if not is_right.all():
         ring = int(np.flatnonzero(~is_right)[0])
         site = int(np.searchsorted(layout.site_offsets, ring, side="right")) - 1
-        raise FileError(path, f"holds no photosites: a ring of site {site} is wound the wrong way, or has no area")
+        raise FileError(path, f"is corrupt: a ring of site {site} is wound the wrong way, or has no area")
 
 
 FORMATS.register("npz", FileFormat(title="npz", suffixes=(".npz",), signatures=MAGICS, read=read, write=write))

@@ -1,4 +1,8 @@
-"""Layouts as drawings: one filled path per site, holes by the even-odd rule, y up. Written only."""
+"""
+Layouts as SVG drawings: one filled path per site.
+
+Holes use the even-odd rule, and y points up. The format is write-only.
+"""
 
 from __future__ import annotations
 
@@ -18,27 +22,27 @@ from foveasim.layout.model import Layout
 
 __all__ = ["write"]
 
-#: Digits behind the point of a µm: a drawing to a tenth of a nanometre.
+#: Decimal places of coordinates in µm: a resolution of a tenth of a nanometre.
 DIGITS = 4
-#: Longer side of the drawing on a page, in the pixels of CSS.
+#: Longer side of the drawing, in CSS pixels.
 SHOWN_PX = 1000
 DEFAULT_COLOUR = "#9a9a9a"
-#: Names of CSS, and numbers as #rgb or #rrggbb; nothing that could end an attribute.
+#: CSS colour names, #rgb and #rrggbb; quotation marks would end the XML attribute.
 COLOUR = re.compile(r"#[0-9a-fA-F]{3}|#[0-9a-fA-F]{6}|[a-zA-Z]{3,24}")
-#: Sites that are made into text at a time.
+#: Number of sites formatted at a time.
 CHUNK = 10_000
 
 
 def write(layout: Layout, path: Path, *, colours: Mapping[int, str] | None = None) -> WrittenLayout:
     """
-    Draw the layout.
+    Write the layout as a drawing.
 
     Raises
     ------
     ParameterError
-        When a colour is none.
+        When a colour is invalid.
     FileError
-        When nothing can be written there.
+        When the file cannot be written.
     """
     colours = _checked(colours or {})
     x_min, y_min, x_max, y_max = layout.bounds_um if layout.n_sites else (0.0, 0.0, 1.0, 1.0)
@@ -65,21 +69,24 @@ def _checked(colours: Mapping[int, str]) -> dict[int, str]:
     for channel, colour in colours.items():
         if not isinstance(colour, str) or not COLOUR.fullmatch(colour):
             raise ParameterError(
-                f"colours[{channel!r:.20}]", "must be a name or #rrggbb", colour, hint='say "#c23b22" or "green"'
+                f"colours[{channel!r:.20}]",
+                "must be a CSS colour name, #rgb or #rrggbb",
+                colour,
+                hint='use "#c23b22" or "green"',
             )
         checked[check_count("colours", channel, at_least=0)] = colour
     return checked
 
 
 def _outlines(layout: Layout) -> list[str]:
-    """Path data of each site: every ring closed."""
+    """Return the path data of each site, with all rings closed."""
     n_vertices = layout.xy_um.shape[0]
     point = f"%.{DIGITS}f %.{DIGITS}f"
     parts = np.full(n_vertices, "L" + point, dtype=object)
     parts[layout.ring_offsets[:-1]] = "M" + point
     parts[layout.ring_offsets[1:] - 1] += "Z"
     parts[layout.ring_offsets[layout.site_offsets[1:]] - 1] += "\n"
-    # Adding 0 turns -0 into 0.
+    # Adding 0 converts -0 to 0.
     numbers = np.round(layout.xy_um, DIGITS) + 0.0
     return ("".join(parts) % tuple(numbers.ravel().tolist())).splitlines()
 

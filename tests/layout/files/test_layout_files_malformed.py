@@ -1,4 +1,4 @@
-"""Layout files made to harm: each ends in a layout or in one sentence, within seconds and within two gigabytes."""
+"""Malformed layout files: each gives a layout or a one-line error, within seconds and 2 GiB of memory."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ pq = pytest.importorskip("pyarrow.parquet")
 MAX_S = 10.0
 HANGING_S = 60.0
 MAX_BYTES = 2 * 2**30
-#: What reading may raise.
+#: Permitted exceptions of reading.
 ERRORS = {"ConfigError", "FileError", "GeometryError", "ParameterError"}
 READ = """
 import json, resource, sys, time
@@ -44,20 +44,19 @@ for path in sys.stdin.read().splitlines():
     except BaseException as error:
         answer = ["!" + type(error).__name__, str(error)]
     seconds = [time.perf_counter() - began_s, busy_s() - began_busy_s]
-    # What getrusage tells of a program itself includes the one that started it.
+    # ru_maxrss of RUSAGE_SELF includes the memory of the parent process.
     own = next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmHWM")) * 1024
     children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
     print(json.dumps([*answer, *seconds, own, children]), flush=True)
 """
 
 
-def read_apart(paths):
+def read_in_process(paths):
     """
-    What a program of its own makes of files, one after the other.
+    Read files one after the other in a separate process.
 
-    Of each: kind, sentence, seconds, seconds that a processor was busy, bytes of the program and of its children.
-
-    A file that ends the program is a kind of its own, and the next program goes on after it.
+    Each answer contains: kind, message, wall time and processor time in seconds, peak memory of the process and of its
+    children in bytes. If a file terminates the process, its kind is ``!ended``, and a new process reads the other files.
     """
     answers = []
     while len(answers) < len(paths):
@@ -68,23 +67,23 @@ def read_apart(paths):
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-        ) as program:
+        ) as process:
             try:
-                out, err = program.communicate("\n".join(map(str, rest)), timeout=HANGING_S + len(rest))
+                out, err = process.communicate("\n".join(map(str, rest)), timeout=HANGING_S + len(rest))
             except subprocess.TimeoutExpired:
-                program.kill()
-                out, err = program.communicate()
+                process.kill()
+                out, err = process.communicate()
         answers += map(json.loads, out.splitlines())
         if len(answers) < len(paths):
-            answers.append([f"!ended with {program.returncode}", err[-300:], 0.0, 0.0, 0, 0])
+            answers.append([f"!ended with {process.returncode}", err[-300:], 0.0, 0.0, 0, 0])
     return answers
 
 
 def assert_harmless(answer, kinds):
-    kind, sentence, _, busy_s, own_bytes, child_bytes = answer
+    kind, message, _, busy_s, own_bytes, child_bytes = answer
     assert kind in kinds, answer
-    assert sentence.isprintable(), answer
-    assert len(sentence) < 700
+    assert message.isprintable(), answer
+    assert len(message) < 700
     assert busy_s < MAX_S, answer
     assert own_bytes + child_bytes < MAX_BYTES, answer
 
@@ -93,7 +92,7 @@ def assert_harmless(answer, kinds):
 
 
 def gds_real(value):
-    """An 8-byte number of GDSII: sign, exponent of 16, 56 bits of mantissa."""
+    """Return an 8-byte GDSII real: sign, exponent to base 16, 56 bits of mantissa."""
     exponent = 64
     while value and abs(value) >= 1.0:
         value, exponent = value / 16, exponent + 1
@@ -111,7 +110,7 @@ def text_record(kind, text):
 
 
 def gds(*cells, dbu_m=1e-10):
-    """A GDSII file of cells as (name, elements)."""
+    """Return a GDSII file of cells given as (name, elements)."""
     now = struct.pack(">12h", *[1] * 12)
     data = record(0x00, 2, b"\x02\x58") + record(0x01, 2, now) + text_record(0x02, b"LIB")
     data += record(0x03, 5, gds_real(dbu_m * 1e6) + gds_real(dbu_m))
@@ -132,7 +131,7 @@ SQUARE = gds_shape(0, 0, 10000, 0, 10000, 10000, 0, 10000, 0, 0)
 
 
 def gds_reference(name, n_columns=None, n_rows=None, *, magnification=None, angle=None, step=20000, x=0):
-    """One reference to a cell, or an array of them."""
+    """Return a reference to a cell, or an array of references."""
     is_array = n_columns is not None
     element = record(0x0B if is_array else 0x0A, 0) + text_record(0x12, name)
     if magnification is not None or angle is not None:
@@ -155,7 +154,7 @@ def gds_path(width, end, n=2):
 
 
 def nested(n_levels, n_each, base=SQUARE):
-    """Cells of which each holds many of the one before."""
+    """Return nested cells, each with ``n_each`` references to the previous one."""
     cells = [(b"C0", base)]
     for i in range(1, n_levels + 1):
         inner = b"C%d" % (i - 1)
@@ -171,7 +170,7 @@ GDS_BOMBS = {
     "array of 32767 x 32767": lambda: gds((b"C", SQUARE), (b"TOP", gds_reference(b"C", 32767, 32767))),
     "10 levels of 10": lambda: nested(10, 10),
     "60 levels of 2": lambda: nested(60, 2),
-    "arrays of arrays of nothing": lambda: gds(
+    "arrays of arrays of empty cells": lambda: gds(
         (b"C", b""),
         (b"D", gds_reference(b"C", 32767, 32767)),
         (b"TOP", gds_reference(b"D", 32767, 32767)),
@@ -179,26 +178,26 @@ GDS_BOMBS = {
     "array of 7000 x 7000": lambda: gds((b"C", SQUARE), (b"TOP", gds_reference(b"C", 7000, 7000, step=11000))),
     "array of 0 x -1": lambda: gds((b"C", SQUARE), (b"TOP", gds_reference(b"C", 0, -1))),
     "array of -32768 x -32768": lambda: gds((b"C", SQUARE), (b"TOP", gds_reference(b"C", -32768, -32768))),
-    "chain of 1000 cells about 20000 squares": lambda: gds(
+    "chain of 1000 cells with 20000 squares": lambda: gds(
         (b"C0", SQUARE * 20_000),
         *((b"C%d" % i, gds_reference(b"C%d" % (i - 1))) for i in range(1, 1000)),
     ),
     "5000 cells in a chain": lambda: gds(
         (b"C0", SQUARE), *((b"C%d" % i, gds_reference(b"C%d" % (i - 1))) for i in range(1, 5000))
     ),
-    "5000 cells on top": lambda: gds(*((b"C%d" % i, SQUARE) for i in range(5000))),
+    "5000 top cells": lambda: gds(*((b"C%d" % i, SQUARE) for i in range(5000))),
     "round paths, wide": lambda: gds((b"C", gds_path(2**31 - 1, 1) * 20_000)),
     "array of round paths": lambda: gds((b"C", gds_path(2**31 - 1, 1)), (b"TOP", gds_reference(b"C", 3000, 3000))),
-    "path of no width": lambda: gds((b"C", gds_path(0, 0))),
+    "path of zero width": lambda: gds((b"C", gds_path(0, 0))),
     "path of 8000 spikes": lambda: gds((b"C", gds_path(2**30, 1, 8000))),
     "magnified to infinity": lambda: gds(
         (b"C", SQUARE), (b"TOP", gds_reference(b"C", magnification=b"\x7f" + b"\xff" * 7))
     ),
-    "turned by a huge angle": lambda: gds((b"C", SQUARE), (b"TOP", gds_reference(b"C", angle=b"\x7f" + b"\xff" * 7))),
-    "magnified by nothing": lambda: gds((b"C", SQUARE), (b"TOP", gds_reference(b"C", magnification=bytes(8)))),
-    "unit of nothing": lambda: gds((b"C", SQUARE), dbu_m=0.0),
-    "unit of a light year": lambda: gds((b"C", SQUARE), dbu_m=1e16),
-    "cell names with line ends": lambda: gds((b"A\n\x1b[31m\xff", SQUARE), (b"B\r\n", SQUARE)),
+    "rotated by a huge angle": lambda: gds((b"C", SQUARE), (b"TOP", gds_reference(b"C", angle=b"\x7f" + b"\xff" * 7))),
+    "magnified by zero": lambda: gds((b"C", SQUARE), (b"TOP", gds_reference(b"C", magnification=bytes(8)))),
+    "database unit of zero": lambda: gds((b"C", SQUARE), dbu_m=0.0),
+    "database unit of a light year": lambda: gds((b"C", SQUARE), dbu_m=1e16),
+    "cell names with line breaks": lambda: gds((b"A\n\x1b[31m\xff", SQUARE), (b"B\r\n", SQUARE)),
     "shape of two vertices": lambda: gds((b"C", gds_shape(0, 0, 5, 5, 0, 0))),
     "shape without vertices": lambda: gds((b"C", gds_shape())),
     "shapes of four billion vertices": lambda: gds(
@@ -207,11 +206,11 @@ GDS_BOMBS = {
     "outline of 8000 random vertices": lambda: gds(
         (b"C", gds_shape(*np.random.default_rng(1).integers(-(10**6), 10**6, 16_000).tolist()))
     ),
-    "outline that goes to and fro on a line": lambda: gds(
+    "outline that oscillates along a line": lambda: gds(
         (b"C", gds_shape(*[v for i in range(4000) for v in ((i % 2) * 10**6 - i, (i % 5) * 10)]))
     ),
-    "outline on one line": lambda: gds((b"C", gds_shape(*[v for i in range(8000) for v in (i * 7919 % 8009, 0)]))),
-    "3000 parts of a site that overlap": lambda: gds(
+    "collinear outline": lambda: gds((b"C", gds_shape(*[v for i in range(8000) for v in (i * 7919 % 8009, 0)]))),
+    "3000 overlapping parts of a site": lambda: gds(
         (
             b"C",
             b"".join(
@@ -222,7 +221,7 @@ GDS_BOMBS = {
             ),
         )
     ),
-    "parts of a site, most missing": lambda: gds(
+    "missing parts of a site": lambda: gds(
         (b"C", gds_shape(0, 0, 9, 0, 9, 9, 0, 0, properties=[(1, b"photosite 0 part 1 of 999999999")]))
     ),
     "same part twice": lambda: gds(
@@ -231,13 +230,13 @@ GDS_BOMBS = {
     "properties of 60000 bytes": lambda: gds(
         (b"C", gds_shape(0, 0, 9999, 0, 9999, 9999, 0, 0, properties=columns(b"a" * 60_000)) * 300)
     ),
-    "columns of endless digits": lambda: gds(
+    "columns of very many digits": lambda: gds(
         (b"C", gds_shape(0, 0, 9999, 0, 9999, 9999, 0, 0, properties=columns(b"a=" + b"9" * 900)) * 300)
     ),
     "columns of a thousand names": lambda: gds(
         (b"C", gds_shape(0, 0, 9999, 0, 9999, 9999, 0, 0, properties=columns(b"a=1 b= " * 140)) * 2000)
     ),
-    "columns of other names for each shape": lambda: gds(
+    "columns of different names for each shape": lambda: gds(
         (
             b"C",
             b"".join(
@@ -245,11 +244,11 @@ GDS_BOMBS = {
             ),
         )
     ),
-    "long texts in an array": lambda: gds(
+    "long strings in an array": lambda: gds(
         (b"C", gds_shape(0, 0, 9999, 0, 9999, 9999, 0, 0, properties=columns(b'a="' + b"a" * 900 + b'"'))),
         (b"TOP", gds_reference(b"C", 400, 400)),
     ),
-    "columns that would be evaluated": lambda: gds(
+    "columns with Python code": lambda: gds(
         (b"C", gds_shape(0, 0, 9999, 0, 9999, 9999, 0, 0, properties=columns(b"a=__import__('os').abort()")))
     ),
 }
@@ -259,7 +258,7 @@ GDS_BOMBS = {
 
 
 def number(value):
-    """An unsigned integer of OASIS: 7 bits a byte, the lowest first."""
+    """Return an OASIS unsigned integer: 7 bits per byte, least significant first."""
     data = bytearray()
     while value >= 128:
         data.append(value & 127 | 128)
@@ -272,28 +271,28 @@ def string(text):
 
 
 def oasis(content, scheme=0):
-    """An OASIS file: a start, a cell of the content, and an end of 256 bytes."""
+    """Return an OASIS file: START record, a cell with the content, and an END record of 256 bytes."""
     data = b"%SEMI-OASIS\r\n" + b"\x01" + string(b"1.0") + b"\x00" + number(10_000) + b"\x00" + bytes(12)
     data += b"\x0e" + string(b"C") + content
     return data + b"\x02" + number(252) + bytes(252) + bytes([scheme])
 
 
 def packed(content, n_bytes=None):
-    """A compressed block that claims to unpack to a number of bytes."""
+    """Return a compressed block with a declared decompressed size."""
     deflate = zlib.compressobj(9, zlib.DEFLATED, -15)
     data = deflate.compress(content) + deflate.flush()
     return b"\x22\x00" + number(len(content) if n_bytes is None else n_bytes) + number(len(data)) + data
 
 
 def packed_zeros(n_bytes):
-    """A compressed block of very many empty records."""
+    """Return a compressed block of very many empty records."""
     deflate, piece = zlib.compressobj(9, zlib.DEFLATED, -15), bytes(2**20)
     data = b"".join(deflate.compress(piece) for _ in range(n_bytes // 2**20)) + deflate.flush()
     return b"\x22\x00" + number(n_bytes) + number(len(data)) + data
 
 
 def oasis_rectangle(repetition=b""):
-    """A square on layer 1, perhaps repeated."""
+    """Return a square on layer 1, optionally repeated."""
     side = number(20_000)
     return bytes([20, 0b01111011 | (0b100 if repetition else 0)]) + b"\x01\x00" + 2 * side + b"\x00\x00" + repetition
 
@@ -307,41 +306,41 @@ def oasis_polygon(n_claimed, data=b""):
 
 
 def spike(i):
-    """A step of an outline that goes from a point to a side, along it, and back again."""
+    """Return step i of an outline of spikes from a common point."""
     up = 100 * (i // 3)
     x, y = ((50_000, up), (0, 50), (-50_000, -up - 50))[i % 3]
     return number(abs(x) << 2 | (x < 0) << 1 | 1) + number(abs(y) << 1 | (y < 0))
 
 
 def oasis_property(values, name=b"columns"):
-    """A property with its name and values, then once more without."""
+    """Return a property with its name and values."""
     head = bytes([28, 0b00000100 | (min(len(values), 15) << 4)]) + string(name)
     return head + (number(len(values)) if len(values) >= 15 else b"") + b"".join(values)
 
 
 OASIS_BOMBS = {
     "a million times a million": lambda: oasis(oasis_rectangle(repeated(10**6, 10**6))),
-    "2^32 x 2^32, no number of 64 bits": lambda: oasis(oasis_rectangle(repeated(2**32, 2**32))),
-    "2^63 x 4, no number of 64 bits": lambda: oasis(oasis_rectangle(repeated(2**63 + 2, 4))),
+    "2^32 x 2^32, beyond 64 bits": lambda: oasis(oasis_rectangle(repeated(2**32, 2**32))),
+    "2^63 x 4, beyond 64 bits": lambda: oasis(oasis_rectangle(repeated(2**63 + 2, 4))),
     "2^33 x (2^31 + 1)": lambda: oasis(oasis_rectangle(repeated(2**33, 2**31 + 1))),
-    "list of 2^40 places": lambda: oasis(oasis_rectangle(b"\x0a" + number(2**40) + b"\x10\x10")),
-    "list of 2^26 places in a row": lambda: oasis(oasis_rectangle(b"\x04" + number(2**26) + b"\x10\x10")),
+    "list of 2^40 positions": lambda: oasis(oasis_rectangle(b"\x0a" + number(2**40) + b"\x10\x10")),
+    "list of 2^26 positions in a row": lambda: oasis(oasis_rectangle(b"\x04" + number(2**26) + b"\x10\x10")),
     "polygon of 2^60 vertices": lambda: oasis(oasis_polygon(2**60)),
     "polygon of a billion vertices": lambda: oasis(oasis_polygon(10**9)),
     "polygon of 2^26 vertices": lambda: oasis(oasis_polygon(2**26)),
     "name of 2^40 bytes": lambda: oasis(b"\x0e" + number(2**40) + b"C"),
     "name of 2^30 bytes": lambda: oasis(b"\x0e" + number(2**30) + b"C"),
-    "endless number": lambda: oasis(b"\x0e" + b"\xff" * 10**6),
-    "block that claims 2^40 bytes": lambda: oasis(packed(oasis_rectangle(), 2**40)),
-    "block that claims 2^30 bytes": lambda: oasis(packed(oasis_rectangle(), 2**30)),
-    "block that claims 3 bytes": lambda: oasis(packed(oasis_rectangle() * 1000, 3)),
+    "integer of a million bytes": lambda: oasis(b"\x0e" + b"\xff" * 10**6),
+    "block that declares 2^40 bytes": lambda: oasis(packed(oasis_rectangle(), 2**40)),
+    "block that declares 2^30 bytes": lambda: oasis(packed(oasis_rectangle(), 2**30)),
+    "block that declares 3 bytes": lambda: oasis(packed(oasis_rectangle() * 1000, 3)),
     "block of a hundred million empty records": lambda: oasis(packed_zeros(100 * 2**20)),
     "block in a block": lambda: oasis(packed(packed(packed(oasis_rectangle() * 1000)))),
     "block of ten million squares": lambda: oasis(packed(oasis_rectangle() * 10**7)),
-    "block of a property said a million times": lambda: oasis(
+    "block of a property repeated a million times": lambda: oasis(
         packed(oasis_rectangle() + oasis_property([b"\x08\x01"] * 10**4) + (oasis_rectangle() + b"\x1d") * 10**6)
     ),
-    "million properties of a square": lambda: oasis(
+    "a million properties of a square": lambda: oasis(
         packed(oasis_rectangle() + oasis_property([b"\x08\x01"]) + b"\x1d" * 10**6)
     ),
     "columns of long words on 20000 squares": lambda: oasis(
@@ -349,7 +348,7 @@ OASIS_BOMBS = {
     ),
     "circle of 2^50": lambda: oasis(bytes([27, 0b00111011]) + b"\x01\x00" + number(2**50) + b"\x00\x00"),
     "trapezoid of type 255": lambda: oasis(bytes([26, 0b11111011]) + b"\x01\x00\xff\x08\x08\x00\x00"),
-    "cell that places itself": lambda: oasis(bytes([17, 0b10110000]) + string(b"C") + b"\x00\x00"),
+    "cell that contains itself": lambda: oasis(bytes([17, 0b10110000]) + string(b"C") + b"\x00\x00"),
     "cell number 2^60": lambda: oasis(oasis_rectangle() + b"\x0d" + number(2**60) + oasis_rectangle()),
     "outline to a point and back 20000 times": lambda: oasis(
         oasis_polygon(59_999, b"".join(map(spike, range(59_999))))
@@ -365,7 +364,7 @@ ABOUT = json.dumps({"format": "foveasim layout", "version": 1, "unit": "um", "pr
 
 
 def npy(descr, shape, data):
-    """An array file with any header."""
+    """Return an npy file with an arbitrary header."""
     head = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}".encode()
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + data
 
@@ -379,7 +378,7 @@ def zipped(items, compression=zipfile.ZIP_STORED):
 
 
 def npz(compression=zipfile.ZIP_STORED, **changes):
-    """A layout of one triangle, some of its arrays replaced by others."""
+    """Return an npz layout of one triangle, with some arrays replaced."""
     arrays = {
         "about": npy(f"'<U{len(ABOUT)}'", (), ABOUT.encode("utf-32-le")),
         "xy_um": npy("'<f8'", (3, 2), np.array([[0.0, 0], [1, 0], [0, 1]]).tobytes()),
@@ -389,14 +388,14 @@ def npz(compression=zipfile.ZIP_STORED, **changes):
     return zipped({f"{name}.npy": data for name, data in {**arrays, **changes}.items()}, compression)
 
 
-def pickled():
+def pickled_array():
     buffer = io.BytesIO()
     np.save(buffer, np.array([{"a": 1}], dtype=object), allow_pickle=True)
     return buffer.getvalue()
 
 
-def lying(data):
-    """An archive that says of its arrays that they are much larger than they are."""
+def with_wrong_sizes(data):
+    """Return an archive that declares much larger arrays than it contains."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         sizes = [item.file_size for item in archive.infolist() if item.filename == "xy_um.npy"]
     return data.replace(struct.pack("<I", sizes[0]), struct.pack("<I", 2**32 - 2))
@@ -409,28 +408,30 @@ NPZ_BOMBS = {
     "a million zeros as offsets": lambda: npz(
         zipfile.ZIP_DEFLATED, ring_offsets=npy("'<i8'", (10**6,), bytes(8 * 10**6))
     ),
-    "objects": lambda: npz(column_evil=pickled()),
-    "objects for outlines": lambda: npz(xy_um=pickled()),
-    "nothing, 10^18 times": lambda: npz(column_a=npy("'|V0'", (10**18,), b"")),
-    "empty texts, 10^15 times": lambda: npz(column_a=npy("'<U0'", (10**15,), b"")),
+    "pickled objects": lambda: npz(column_evil=pickled_array()),
+    "pickled objects as vertices": lambda: npz(xy_um=pickled_array()),
+    "10^18 elements of zero bytes": lambda: npz(column_a=npy("'|V0'", (10**18,), b"")),
+    "10^15 empty strings": lambda: npz(column_a=npy("'<U0'", (10**15,), b"")),
     "rows of a billion": lambda: npz(column_a=npy("('<f8', (1000000000,))", (0,), b"")),
-    "2^62 dimensions of nothing": lambda: npz(column_a=npy("'<f8'", (2**62, 2**62, 0), b"")),
-    "shape below nothing": lambda: npz(xy_um=npy("'<f8'", (-3, -2), bytes(48))),
+    "empty array of shape 2^62 x 2^62": lambda: npz(column_a=npy("'<f8'", (2**62, 2**62, 0), b"")),
+    "negative shape": lambda: npz(xy_um=npy("'<f8'", (-3, -2), bytes(48))),
     "shape of 60 dimensions": lambda: npz(column_a=npy("'<f8'", (1,) * 60, bytes(8))),
-    "header that would be evaluated": lambda: npz(column_a=npy("__import__('os').abort()", (1,), bytes(8))),
+    "header with Python code": lambda: npz(column_a=npy("__import__('os').abort()", (1,), bytes(8))),
     "header of nested brackets": lambda: npz(column_a=npy("(" * 3000 + ")" * 3000, (1,), bytes(8))),
     "header of many fields": lambda: npz(
         column_a=npy([(f"f{i}", "<f8") for i in range(400)], (1,), bytes(3200)),
     ),
-    "origin nested deeply": lambda: npz(about=npy("'<U100000'", (), ("[" * 100_000).encode("utf-32-le"))),
-    "archive that lies": lambda: lying(npz()),
+    "deeply nested provenance": lambda: npz(about=npy("'<U100000'", (), ("[" * 100_000).encode("utf-32-le"))),
+    "archive with wrong sizes": lambda: with_wrong_sizes(npz()),
     "archive of 100000 names": lambda: zipped({f"column_{i}.npy": b"" for i in range(100_000)}),
-    "array of another name": lambda: npz(columm_a=npy("'<i8'", (1,), bytes(8))),
-    "column with line ends and many letters": lambda: npz(
+    "array with unknown name": lambda: npz(columm_a=npy("'<i8'", (1,), bytes(8))),
+    "long column name with line breaks": lambda: npz(
         **{"column_\n\x1b[31m" + "a" * 60_000: npy("'<i8'", (2,), bytes(16))}
     ),
-    "archive packed by lzma": lambda: npz(zipfile.ZIP_LZMA, xy_um=npy("'<f8'", (3_000_000, 2), bytes(48_000_000))),
-    "times beyond counting": lambda: npz(column_a=npy("'<M8[as]'", (1,), b"\xff" * 8)),
+    "archive compressed with lzma": lambda: npz(
+        zipfile.ZIP_LZMA, xy_um=npy("'<f8'", (3_000_000, 2), bytes(48_000_000))
+    ),
+    "timestamps out of range": lambda: npz(column_a=npy("'<M8[as]'", (1,), b"\xff" * 8)),
 }
 
 
@@ -457,7 +458,7 @@ def origin(**columns):
 
 
 def fan(n):
-    """A square with triangular holes of which all have one corner in its middle: a valid polygon."""
+    """Return a square whose triangular holes all have a corner in its centre: a valid polygon."""
     angle = np.arange(2 * n + 1) * np.pi / n
     x, y = 50 * np.cos(angle), 50 * np.sin(angle)
     holes = [f"[[0,0],[{x[i + 1]},{y[i + 1]}],[{x[i]},{y[i]}],[0,0]]" for i in range(0, 2 * n, 2)]
@@ -465,7 +466,7 @@ def fan(n):
 
 
 def diagonals(n):
-    """A square with long holes side by side, whose bounding boxes all meet: a valid polygon."""
+    """Return a square with adjacent long holes whose bounding boxes all overlap: a valid polygon."""
     holes = [f"[[{i / 100},0],[{i / 100 + 900},900],[{i / 100 + 900.001},900],[{i / 100},0]]" for i in range(n)]
     return f"[[[-10,-10],[5000,-10],[5000,5000],[-10,5000],[-10,-10]],{','.join(holes)}]"
 
@@ -474,40 +475,40 @@ GEOJSON_BOMBS = {
     "coordinates nested 100000 deep": lambda: collection(feature("[" * 100_000 + "]" * 100_000)),
     "properties nested 100000 deep": lambda: collection(feature(properties='{"a":' * 100_000 + "1" + "}" * 100_000)),
     "a million positions": lambda: collection(feature("[[" + "[0,0]," * 10**6 + "[0,0]]]")),
-    "30000 rings that are the same": lambda: collection(feature("[" + f"{RING}," * 30_000 + f"{RING}]")),
+    "30000 identical rings": lambda: collection(feature("[" + f"{RING}," * 30_000 + f"{RING}]")),
     "5000 holes that meet in a point": lambda: collection(feature(fan(5000))),
     "5000 holes along a diagonal": lambda: collection(feature(diagonals(5000))),
     "outline to a point and back 20000 times": lambda: collection(
         feature("[[" + "".join(f"[0,0],[50,{i}],[50,{i}.5]," for i in range(20_000)) + "[0,0]]]")
     ),
-    "another property for each of 20000": lambda: collection(
+    "a different property for each of 20000": lambda: collection(
         *(feature(properties=f'{{"a{i}": 1}}') for i in range(20_000))
     ),
     "200 properties of 20000 features": lambda: collection(
         feature(properties=json.dumps({f"a{i}": 1 for i in range(200)})), *[feature()] * 20_000
     ),
-    "100000 columns promised": lambda: collection(
+    "100000 declared columns": lambda: collection(
         *[feature()] * 1000, foveasim=origin(**{f"a{i}": "<i8" for i in range(10**5)})
     ),
-    "one long text among 1000": lambda: collection(
+    "one long string among 1000": lambda: collection(
         feature(properties=json.dumps({"a": "x" * 10**6})), *[feature(properties='{"a": "y"}')] * 1000
     ),
-    "texts promised to be long": lambda: collection(
+    "strings declared to be long": lambda: collection(
         *[feature(properties='{"a": "y"}')] * 20, foveasim=origin(a="<U99999999")
     ),
-    "column of a huge type": lambda: collection(
+    "column declared with a huge type": lambda: collection(
         *[feature(properties='{"a": 1}')] * 10, foveasim=origin(a="V999999999")
     ),
     "numbers of 4000 digits": lambda: collection(*[feature(properties=f'{{"a": {"9" * 4000}}}')] * 300),
     "positions of 4000 digits": lambda: collection(feature(f"[[[0,0],[{'9' * 4000},0],[9,9],[0,0]]]")),
     "exponent of a billion": lambda: collection(feature("[[[0,0],[1e1000000000,0],[9,9],[0,0]]]")),
-    "bytes that are no text": lambda: collection(feature()) + b"\xff\xfe",
-    "text of 16 bits": lambda: collection(feature()).decode().encode("utf-16"),
-    "text that ends in a text": lambda: b'{"type": "FeatureCollection", "features": [], "a": "' + b"\\" * 10**6,
+    "bytes that are not UTF-8": lambda: collection(feature()) + b"\xff\xfe",
+    "UTF-16": lambda: collection(feature()).decode().encode("utf-16"),
+    "unterminated string": lambda: b'{"type": "FeatureCollection", "features": [], "a": "' + b"\\" * 10**6,
     "200000 members": lambda: b"{" + b",".join(b'"a%d": 0' % i for i in range(200_000)) + b"}",
     "10 MB of blanks": lambda: b"{" + b" " * 10**7,
-    "kind with line ends": lambda: collection(feature().replace("Polygon", "Poly\\n\\u001b[31mgon")),
-    "half a pair": lambda: collection(feature(properties='{"\\ud800": "\\udfff"}')),
+    "geometry type with line breaks": lambda: collection(feature().replace("Polygon", "Poly\\n\\u001b[31mgon")),
+    "unpaired surrogates": lambda: collection(feature(properties='{"\\ud800": "\\udfff"}')),
 }
 
 
@@ -518,7 +519,7 @@ TRIANGLE = shapely.to_wkb(shapely.Polygon([(0, 0), (9, 0), (9, 9)]), byte_order=
 
 
 def parquet(*tables, geo=GEO, about=None, **options):
-    """A table with the outlines' description, its types as in the file alone."""
+    """Return a Parquet file with geometry metadata, without the Arrow schema."""
     buffer = io.BytesIO()
     with pq.ParquetWriter(buffer, tables[0].schema, store_schema=False, compression="zstd", **options) as writer:
         for table in tables:
@@ -532,17 +533,17 @@ def outlines(*wkb, **others):
 
 
 def same(value, n_rows):
-    """A column that says one value many times, in a few bytes."""
+    """Return a dictionary column that repeats one value in a few bytes."""
     return pa.DictionaryArray.from_arrays(pa.array(np.zeros(n_rows, np.int32)), pa.array([value]))
 
 
 def varint(value):
-    """An integer of Thrift, by twice itself; minus one half is said as minus one is."""
+    """Return a Thrift zigzag integer; -0.5 encodes -1."""
     return number(int(abs(2 * value)))
 
 
 def declared(n_rows):
-    """A table of 777 rows that says it has more."""
+    """Return a table of 777 rows with another declared number of rows."""
     data = parquet(outlines(*[TRIANGLE] * 777))
     length = int.from_bytes(data[-8:-4], "little")
     footer = data[-8 - length : -8].replace(b"\x16" + varint(777), b"\x16" + varint(n_rows))
@@ -556,15 +557,15 @@ def nested_wkb(n, kind):
 PARQUET_BOMBS = {
     "a billion rows declared": lambda: declared(10**9),
     "40 million rows declared": lambda: declared(4 * 10**7),
-    "rows below nothing": lambda: declared(-0.5),
+    "negative number of rows declared": lambda: declared(-0.5),
     "40 million rows of one outline": lambda: parquet(*[pa.table({"geometry": same(TRIANGLE, 10**6)})] * 40),
-    "outlines of a megabyte, said 4000 times": lambda: parquet(
+    "outline of 1 MiB, repeated 4000 times": lambda: parquet(
         pa.table({"geometry": same(bytes(2**20), 4000)}), dictionary_pagesize_limit=2**24
     ),
-    "a text of 4 MB, said 5000 times": lambda: parquet(
+    "string of 4 MiB, repeated 5000 times": lambda: parquet(
         outlines(*[TRIANGLE] * 5000, a=same("x" * 2**22, 5000)), dictionary_pagesize_limit=2**24
     ),
-    "one long text among 10000": lambda: parquet(
+    "one long string among 10000": lambda: parquet(
         outlines(*[TRIANGLE] * 10_000, a=pa.array(["x" * 10**6] + ["y"] * 9999)), use_dictionary=False
     ),
     "100 MB of zeros": lambda: parquet(outlines(bytes(100_000_000)), use_dictionary=False),
@@ -579,16 +580,16 @@ PARQUET_BOMBS = {
     "curved polygons, 100000 deep": lambda: parquet(outlines(nested_wkb(100_000, 10))),
     "outline of 2^32 rings": lambda: parquet(outlines(struct.pack("<BII", 1, 3, 2**32 - 1) + bytes(100))),
     "outline of 2^32 vertices": lambda: parquet(outlines(struct.pack("<BIII", 1, 3, 1, 2**32 - 1) + bytes(100))),
-    "outline of no bytes": lambda: parquet(outlines(b"")),
-    "outline that is not there": lambda: parquet(outlines(None)),
-    "description nested deeply": lambda: parquet(outlines(TRIANGLE), geo="[" * 100_000),
-    "description of something else": lambda: parquet(outlines(TRIANGLE), geo="[]"),
-    "types that are none": lambda: parquet(
+    "empty outline": lambda: parquet(outlines(b"")),
+    "null outline": lambda: parquet(outlines(None)),
+    "deeply nested metadata": lambda: parquet(outlines(TRIANGLE), geo="[" * 100_000),
+    "metadata of another type": lambda: parquet(outlines(TRIANGLE), geo="[]"),
+    "invalid column types": lambda: parquet(
         outlines(TRIANGLE, a=pa.array([1])), about=origin(a="<U999999999", geometry="<f8")
     ),
-    "lists in lists": lambda: parquet(outlines(TRIANGLE, a=pa.array([[[[[[[1] * 1000]]]]]]))),
+    "nested lists": lambda: parquet(outlines(TRIANGLE, a=pa.array([[[[[[[1] * 1000]]]]]]))),
     "3000 columns": lambda: parquet(outlines(TRIANGLE, **{f"a{i}": pa.array([i]) for i in range(3000)})),
-    "end of the wrong length": lambda: parquet(outlines(TRIANGLE))[:-8] + b"\xff\xff\xff\x7fPAR1",
+    "footer of the wrong length": lambda: parquet(outlines(TRIANGLE))[:-8] + b"\xff\xff\xff\x7fPAR1",
 }
 
 
@@ -600,18 +601,16 @@ def yaml_layout(parameters, generator="grid"):
 
 
 YAML_BOMBS = {
-    "an object of Python": lambda: b"!!python/object/apply:os._exit [3]\n",
-    "an object of Python as a value": lambda: yaml_layout(
-        "n_x: !!python/object/apply:os._exit [3], n_y: 3, pitch_um: 2.0"
-    ),
-    "a name of Python": lambda: b"generator: !!python/name:os.system\n",
-    "a tag of its own": lambda: b"generator: !evil grid\n",
+    "Python object": lambda: b"!!python/object/apply:os._exit [3]\n",
+    "Python object as a value": lambda: yaml_layout("n_x: !!python/object/apply:os._exit [3], n_y: 3, pitch_um: 2.0"),
+    "Python name": lambda: b"generator: !!python/name:os.system\n",
+    "unknown tag": lambda: b"generator: !evil grid\n",
     "a billion laughs": lambda: (
         b"a: &a [x, x, x, x, x, x, x, x, x]\n"
         + b"".join(b"%c: &%c [%s]\n" % (c, c, b", ".join([b"*%c" % (c - 1)] * 9)) for c in range(98, 110))
     ),
-    "a list that holds itself": lambda: b"a: &a [*a]\n",
-    "a merge": lambda: b"a: &a {b: 1}\nc: {<<: *a}\n",
+    "list that contains itself": lambda: b"a: &a [*a]\n",
+    "merge key": lambda: b"a: &a {b: 1}\nc: {<<: *a}\n",
     "a billion columns": lambda: yaml_layout("n_x: 1000000000, n_y: 2, pitch_um: 0.001"),
     "a billion columns and rows": lambda: yaml_layout("n_x: 1000000000, n_y: 1000000000, pitch_um: 2.0"),
     "columns of 4000 digits": lambda: yaml_layout(f"n_x: {'9' * 4000}, n_y: 2, pitch_um: 2.0"),
@@ -623,26 +622,26 @@ YAML_BOMBS = {
         "r_min_um: 1e-3, r_max_um: 1e7, n_sectors: 3, ring_ratio: 1.0000001", "log_polar"
     ),
     "a billion seeds": lambda: yaml_layout("n_sites: 1000000000, spacing_um: 1.0", "sunflower"),
-    "rhombs without number": lambda: yaml_layout("side_um: 1e-3, size_um: [1e6, 1e6]", "penrose"),
-    "a place beyond all numbers": lambda: yaml_layout(
+    "very many rhombs": lambda: yaml_layout("side_um: 1e-3, size_um: [1e6, 1e6]", "penrose"),
+    "coordinate of infinity": lambda: yaml_layout(
         "n_sites: 10, region: 'POLYGON ((0 0, 1e999 0, 1 1, 0 0))'", "voronoi"
     ),
     "a billion vertices declared": lambda: yaml_layout("n_sites: 10, region: [[0, 0], [1e9, 0], [0, 1e9]]", "voronoi"),
     "lists nested 100000 deep": lambda: b"[" * 100_000,
     "mappings nested 20000 deep": lambda: b"{a: " * 20_000,
     "blocks nested 100000 deep": lambda: b"- " * 100_000,
-    "blocks nested by blanks": lambda: b"".join(b" " * i + b"a:\n" for i in range(1000)),
+    "blocks nested by indentation": lambda: b"".join(b" " * i + b"a:\n" for i in range(1000)),
     "a file of 2 MB": lambda: b"#" * (2 * 2**20),
-    "bytes that are no text": lambda: b"\xff\xfe\x00",
+    "bytes that are not UTF-8": lambda: b"\xff\xfe\x00",
     "control characters": lambda: b"generator: \x00\x1b[31m\n",
-    "a key twice": lambda: b"generator: grid\ngenerator: grid\n",
-    "a key that is a list": lambda: b"? [1, 2]\n: 3\n",
+    "duplicate key": lambda: b"generator: grid\ngenerator: grid\n",
+    "list as a key": lambda: b"? [1, 2]\n: 3\n",
     "two documents": lambda: b"a: 1\n---\nb: 2\n",
     "30000 numbers": lambda: b"- 1\n" * 30_000,
 }
 
 
-# -- reading them -----------------------------------------------------------------------------------------------------
+# -- reading ----------------------------------------------------------------------------------------------------------
 
 BOMBS = {
     "gds": GDS_BOMBS,
@@ -656,65 +655,67 @@ BOMBS = {
 
 @pytest.fixture(scope="module")
 def answers(tmp_path_factory):
-    """What reading gives, by format and name; the files of a format are read when it is first asked for."""
-    folder, known = tmp_path_factory.mktemp("bombs"), {}
+    """Answers of reading by format and name; the files of a format are read on first access."""
+    directory, known = tmp_path_factory.mktemp("bombs"), {}
 
-    def answer(ending, name):
-        if ending not in known:
-            paths = [folder / f"{i}.{ending}" for i in range(len(BOMBS[ending]))]
-            for path, make in zip(paths, BOMBS[ending].values(), strict=True):
+    def answer(extension, name):
+        if extension not in known:
+            paths = [directory / f"{i}.{extension}" for i in range(len(BOMBS[extension]))]
+            for path, make in zip(paths, BOMBS[extension].values(), strict=True):
                 path.write_bytes(make())
-            known[ending] = dict(zip(BOMBS[ending], read_apart(paths), strict=True))
-        return known[ending][name]
+            known[extension] = dict(zip(BOMBS[extension], read_in_process(paths), strict=True))
+        return known[extension][name]
 
     return answer
 
 
-#: What looks worse than it is.
+#: Files that are read as a layout.
 HARMLESS = {
     "gds": {
         "array of 0 x -1",
-        "chain of 1000 cells about 20000 squares",
+        "chain of 1000 cells with 20000 squares",
         "5000 cells in a chain",
-        "turned by a huge angle",
-        "magnified by nothing",
+        "rotated by a huge angle",
+        "magnified by zero",
         "properties of 60000 bytes",
-        "columns of endless digits",
+        "columns of very many digits",
         "columns of a thousand names",
-        "columns of other names for each shape",
-        "long texts in an array",
-        "columns that would be evaluated",
+        "columns of different names for each shape",
+        "long strings in an array",
+        "columns with Python code",
     },
     "oas": {
         "block of a hundred million empty records",
-        "million properties of a square",
+        "a million properties of a square",
         "columns of long words on 20000 squares",
         "unknown checksum",
     },
-    "npz": {"header of many fields", "times beyond counting"},
+    "npz": {"header of many fields", "timestamps out of range"},
     "geojson": {
-        "another property for each of 20000",
+        "a different property for each of 20000",
         "200 properties of 20000 features",
-        "100000 columns promised",
-        "one long text among 1000",
-        "texts promised to be long",
-        "column of a huge type",
+        "100000 declared columns",
+        "one long string among 1000",
+        "strings declared to be long",
+        "column declared with a huge type",
         "numbers of 4000 digits",
-        "half a pair",
+        "unpaired surrogates",
     },
-    "parquet": {"one long text among 10000", "types that are none", "lists in lists", "3000 columns"},
+    "parquet": {"one long string among 10000", "invalid column types", "nested lists", "3000 columns"},
     "yaml": set(),
 }
 
 
-@pytest.mark.parametrize(("ending", "name"), [(ending, name) for ending, bombs in BOMBS.items() for name in bombs])
-def test_a_file_made_to_harm_ends_in_one_sentence_or_in_a_layout_where_that_is_harmless(answers, ending, name):
-    assert_harmless(answers(ending, name), {"Layout"} if name in HARMLESS[ending] else ERRORS)
+@pytest.mark.parametrize(
+    ("extension", "name"), [(extension, name) for extension, bombs in BOMBS.items() for name in bombs]
+)
+def test_malformed_file_raises_unless_harmless(answers, extension, name):
+    assert_harmless(answers(extension, name), {"Layout"} if name in HARMLESS[extension] else ERRORS)
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """A file of each format: nine sites with holes, and columns of every type that all formats hold."""
+def valid_files(tmp_path_factory):
+    """A valid file of each format: nine sites with holes, and columns of every type that all formats support."""
     centre_um = np.stack(np.divmod(np.arange(9), 3), 1) * 5.0
     layout = Layout.from_polygons(
         [shapely.Point(c).buffer(2.0, 3) - shapely.Point(c).buffer(0.5, 1) for c in centre_um],
@@ -724,14 +725,14 @@ def whole(tmp_path_factory):
         is_dead=np.arange(9) % 2 == 0,
         name=np.array([f"s{i}" for i in range(9)]),
     )
-    folder = tmp_path_factory.mktemp("whole")
-    for ending in FORMATS:
-        assert write_layout(layout, folder / f"a.{ending}").dropped_columns == ()
-    return {ending: (folder / f"a.{ending}").read_bytes().rstrip(b"\n") for ending in FORMATS}
+    directory = tmp_path_factory.mktemp("valid")
+    for extension in FORMATS:
+        assert write_layout(layout, directory / f"a.{extension}").dropped_columns == ()
+    return {extension: (directory / f"a.{extension}").read_bytes().rstrip(b"\n") for extension in FORMATS}
 
 
 FORMATS = ("gds", "oas", "npz", "geojson", "parquet")
-#: What a file of a format begins with.
+#: First bytes of a file of each format.
 HEADS = {
     "gds": b"\x00\x06\x00\x02\x02\x58",
     "oas": b"%SEMI-OASIS\r\n\x01\x031.0",
@@ -742,56 +743,56 @@ HEADS = {
 
 
 def truncated(data, n):
-    """A file truncated at places all over it, and just before its end."""
+    """Return a file truncated at regular positions, and just before its end."""
     return [data[: len(data) * i // n] for i in range(n)] + [data[:-i] for i in (1, 2, 3, 4, 8, 16)]
 
 
-def flipped(data, rng, n, ending, first=0):
-    """A file with one to three bits changed from some place on; OASIS with a checksum that fits nevertheless."""
+def flipped(data, rng, n, extension, first=0):
+    """Return copies of a file with one to three bits flipped behind ``first``; OASIS with a valid checksum."""
     files = []
     for i in range(n):
-        broken = bytearray(data)
+        corrupt = bytearray(data)
         for at in rng.integers(first, len(data), 1 + i % 3):
-            broken[at] ^= 1 << rng.integers(8)
+            corrupt[at] ^= 1 << rng.integers(8)
         files.append(
-            bytes(broken[:-4]) + struct.pack("<I", zlib.crc32(broken[:-4])) if ending == "oas" else bytes(broken)
+            bytes(corrupt[:-4]) + struct.pack("<I", zlib.crc32(corrupt[:-4])) if extension == "oas" else bytes(corrupt)
         )
     return files
 
 
-def noise(rng, n, ending):
-    """Random bytes, alone and behind what a file begins with."""
+def noise(rng, n, extension):
+    """Return random bytes, with and without the first bytes of the format."""
     sizes = rng.integers(1, 5000, n)
-    return [HEADS[ending] * (i % 2) + rng.bytes(size) for i, size in enumerate(sizes)]
+    return [HEADS[extension] * (i % 2) + rng.bytes(size) for i, size in enumerate(sizes)]
 
 
-def numbered(folder, files, ending):
-    paths = [folder / f"{i}.{ending}" for i in range(len(files))]
+def numbered(directory, files, extension):
+    paths = [directory / f"{i}.{extension}" for i in range(len(files))]
     for path, data in zip(paths, files, strict=True):
         path.write_bytes(data)
     return paths
 
 
-@pytest.mark.parametrize("ending", FORMATS)
-def test_files_that_are_cut_short_or_noise_are_refused(whole, tmp_path, ending):
-    files = truncated(whole[ending], 30) + noise(np.random.default_rng(21), 20, ending)
+@pytest.mark.parametrize("extension", FORMATS)
+def test_truncated_files_and_noise_are_rejected(valid_files, tmp_path, extension):
+    files = truncated(valid_files[extension], 30) + noise(np.random.default_rng(21), 20, extension)
 
-    for answer in read_apart(numbered(tmp_path, files, ending)):
+    for answer in read_in_process(numbered(tmp_path, files, extension)):
         assert_harmless(answer, ERRORS)
 
 
-@pytest.mark.parametrize("ending", FORMATS)
-def test_files_with_changed_bits_end_in_a_layout_or_in_one_sentence(whole, tmp_path, ending):
-    files = flipped(whole[ending], np.random.default_rng(22), 30, ending)
+@pytest.mark.parametrize("extension", FORMATS)
+def test_flipped_bits_raise_or_give_layout(valid_files, tmp_path, extension):
+    files = flipped(valid_files[extension], np.random.default_rng(22), 30, extension)
 
-    for answer in read_apart(numbered(tmp_path, files, ending)):
+    for answer in read_in_process(numbered(tmp_path, files, extension)):
         assert_harmless(answer, ERRORS | {"Layout"})
 
 
-@pytest.mark.parametrize("ending", ["npz", "parquet"])
-def test_a_changed_table_of_contents_ends_in_a_layout_or_in_one_sentence(whole, tmp_path, ending):
-    data = whole[ending]
-    files = flipped(data, np.random.default_rng(23), 150, ending, first=max(0, len(data) - 3000))
+@pytest.mark.parametrize("extension", ["npz", "parquet"])
+def test_flipped_directory_bits_raise_or_give_layout(valid_files, tmp_path, extension):
+    data = valid_files[extension]
+    files = flipped(data, np.random.default_rng(23), 150, extension, first=max(0, len(data) - 3000))
 
-    for answer in read_apart(numbered(tmp_path, files, ending)):
+    for answer in read_in_process(numbered(tmp_path, files, extension)):
         assert_harmless(answer, ERRORS | {"Layout"})
