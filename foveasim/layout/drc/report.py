@@ -25,7 +25,7 @@ CELL_NAME = "SENSOR"
 MAX_BYTES = 2**29
 #: Number of first bytes that are searched for the root element.
 HEAD_BYTES = 512
-#: Text of a category description and of an item, as write_lyrdb writes them.
+#: Patterns of the category descriptions and item texts of write_lyrdb.
 LIMIT = re.compile(r"^(?P<description>.*) \(limit (?P<limit>\S+) ?(?P<unit>[^)]*)\)$", re.DOTALL)
 FOUND = re.compile(r"photosite (?P<sites>\d+(?:, \d+)*): (?P<value>\S+) ?(?P<unit>[^']*)")
 #: Points of one ring, edge or box of a marker.

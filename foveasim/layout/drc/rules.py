@@ -73,7 +73,7 @@ class DesignRules:
     max_overlap_um2 : float, optional, µm²
         Maximum overlap of two sites; 0 allows none.
     max_gap_um2 : float, optional, µm²
-        Maximum area of a gap that no site covers, within ``die_um`` where it is given, else enclosed by sites.
+        Maximum area of a gap (a connected area without sites), within ``die_um`` where it is given, else enclosed by sites.
     die_um : (x_min, y_min, x_max, y_max), optional, µm
         Rectangle that must contain every site.
     min_growth, max_growth : float, optional

@@ -16,12 +16,12 @@ _flags = types.Array(types.boolean, 1, "C", readonly=True)
 @njit(types.UniTuple(types.int64, 2)(_bytes, _flags, types.int64))
 def walk_records(data, is_known, last):
     """
-    Follow the records up to the record type ``last``, an invalid record, or the data end.
+    Follow the records up to type ``last``, an invalid record, or the end of the data.
 
     Returns
     -------
     at : int
-        Final position, behind the last record; beyond the data if the length of that record exceeds them.
+        Final position, behind the last record; beyond the data if that record is incomplete.
     record : int
         Type of the last record, with its data type; -1 if no valid record begins at ``at``.
     """

@@ -148,7 +148,7 @@ def _set_gds_properties(
     kept, lost = kept_columns(layout, min(MAX_GDS_TEXT, MAX_GDS_PROPERTIES - longest - longest % 2))
     texts = texts_of(kept)
     if texts:
-        # gdstk writes the property that was set last first.
+        # gdstk writes properties in reverse order of setting.
         for polygon, s in zip(polygons, site, strict=True):
             polygon.set_gds_property(2, texts[s])
     for polygon, number in zip(polygons, numbers, strict=True):
