@@ -1,4 +1,4 @@
-"""Sensors: quantum efficiency, colour filters, noise, conversion to codes."""
+"""Image sensors: quantum efficiency, colour filters, noise and conversion to codes."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """
-The sensor's numba kernels: numbers of a device by place, shot noise, and the way from charge to code.
+Numba kernels of the sensor: device random numbers, shot noise, conversion to codes.
 
-They take arrays, and named tuples of arrays and numbers, and are compiled for explicit types when this module is
-imported. An array that may hold one value for all sites has the size 1 or n.
+The kernels accept arrays and named tuples of arrays and numbers. They are compiled for explicit types when this module is
+imported. Arrays of per-site parameters have size n, or size 1 for a value common to all sites.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ __all__ = [
     "rays_met",
 ]
 
-#: Compandings of the ADC, by the numbers of ``ConversionTables.way``.
+#: ADC transfer functions, as numbered by ``ConversionTables.way``.
 ADC_LINEAR, ADC_ROOT, ADC_LOG, ADC_TABLE = range(4)
-#: A charge this fraction of a code below a code's border is on it: the rounding of a division.
+#: Tolerance of code transitions, in codes: covers the rounding error of a division.
 CODE_ROUNDING = 1e-9
-#: Variance that rounding to integers adds.
+#: Variance of rounding to integers: a uniform distribution of width 1.
 ROUNDING_VARIANCE = 1.0 / 12.0
-#: Coefficients of the quadratic term of a draw, and of its correction: see foveasim.sensor.effects.ShotNoise.
+#: Quadratic coefficient of the Poisson approximation and its 1/λ correction: see foveasim.sensor.effects.ShotNoise.
 QUADRATIC, QUADRATIC_CORRECTION = 1.0 / 6.0, 11.0 / 648.0
-#: No charge is larger: 2**62 fits int64 with room for sums.
+#: Upper limit of charges: 2**62 fits int64 with headroom for sums.
 LARGEST_CHARGE_E = 2.0**62
-#: One draw of a Poisson law is at most so many of its standard deviations, and so many electrons more, above its mean.
+#: Upper limit of a Poisson draw above its mean: this many standard deviations plus this many electrons.
 FAR_SIGMAS, FAR_ELECTRONS = 12.0, 40
-#: Charges further from their mean than so many standard deviations weigh nothing.
+#: Probabilities further than this many standard deviations from the mean are neglected.
 REACH_SIGMAS = 9.0
-#: Points of a mixture of charges, at most; chances below the smallest are left out; charges are whole to this.
+#: Maximum number of nodes of a discrete charge distribution; smallest probability included; tolerance of integer charges.
 MOST_NODES, TINY, WHOLE = 2048, 1e-18, 1e-6
-#: Sites per pass through all steps of the readout: their buffers fit the L1 cache.
+#: Sites per pass through all readout steps: their buffers fit the L1 cache.
 PIECE = 1024
-#: Halvings that find a number to its last bit.
+#: Bisections that determine a float64 to its last bit.
 BISECTIONS = 60
 SQRT_HALF, SQRT_TWO_PI = math.sqrt(0.5), math.sqrt(2.0 * math.pi)
 
@@ -69,7 +69,7 @@ _LOW, _ONE_IN_2_32 = np.uint64(0xFFFFFFFF), 2.0**-32
 
 @njit(types.float64[::1](types.uint64, types.uint64, _words, _words))
 def device_uniforms(key_0, key_1, first, second):
-    """A number between 0 and 1 for every pair of words: always the same for the same key and pair."""
+    """Return a reproducible uniform number in (0, 1) for each pair of counter words."""
     out = np.empty(first.size, np.float64)
     for i in range(first.size):
         word, _, _, _ = philox_4x64(key_0, key_1, first[i], second[i], np.uint64(0), np.uint64(0))
@@ -80,9 +80,9 @@ def device_uniforms(key_0, key_1, first, second):
 @njit(types.int64[::1](_points, _ints, _ints, _points, _points))
 def rays_met(xy, ring_offsets, site_offsets, centroid, directions):
     """
-    Number of rays from every site's centroid that meet its outline; 0 for a site that contains its centroid.
+    Count the rays from each site's centroid that intersect the site's outline.
 
-    Contained by the even-odd rule along the first ray; ``directions`` are unit vectors.
+    The count is 0 for sites that contain their centroid (even-odd rule along the first ray). ``directions`` are unit vectors.
     """
     met = np.zeros(site_offsets.size - 1, np.int64)
     for i in range(met.size):
@@ -107,7 +107,7 @@ def rays_met(xy, ring_offsets, site_offsets, centroid, directions):
 
 @njit(inline="always")
 def _poisson(mean, z):
-    """Poisson's distribution at the probability of a Gaussian number: the same number gives more where more is expected."""
+    """Invert the Poisson distribution at the cumulative probability of a Gaussian number."""
     share = 0.5 * math.erfc(-z * math.sqrt(0.5))
     chance = math.exp(-mean)
     reached = chance
@@ -122,8 +122,12 @@ def _poisson(mean, z):
 
 @njit(types.void(_floats, _floats, types.float64, types.int64[::1]), error_model="numpy")
 def draw_poisson(expected_e, z, gaussian_above_e, electrons):
-    """Poisson draws from Gaussian numbers: exact up to an expectation, above it correct to the third moment."""
-    # The first loop has no branches, so that the compiler vectorises it.
+    """
+    Convert Gaussian numbers to Poisson draws.
+
+    Draws are exact up to the mean ``gaussian_above_e``; above it, their first three moments are exact.
+    """
+    # The first loop has no branches so that the compiler vectorises it.
     charge = np.empty(PIECE)
     for first in range(0, expected_e.size, PIECE):
         sites = slice(first, min(first + PIECE, expected_e.size))
@@ -145,7 +149,7 @@ def _at(values, i):
 
 @njit(inline="always")
 def _companded(share, adc):
-    """Fraction of the codes for a fraction of the voltage range."""
+    """Map a fraction of the voltage range to a fraction of the code range."""
     if adc.way == ADC_ROOT:
         return math.sqrt(share)
     if adc.way == ADC_LOG:
@@ -159,34 +163,34 @@ def _companded(share, adc):
 
 @njit(inline="always")
 def _bent(v, bend, v_sat_v):
-    """Voltage after the nonlinearity."""
+    """Return the voltage after the nonlinearity."""
     return v * (1.0 - bend * min(max(v / v_sat_v, 0.0), 1.0))
 
 
 @njit(types.void(types.float64[::1], types.float64, types.float64), error_model="numpy")
 def bend_voltages(voltage_v, bend, v_sat_v):
-    """Apply the nonlinearity in place; ``bend`` is the fraction that the response lacks at full range."""
+    """Apply the nonlinearity in place; ``bend`` is the relative signal loss at full range."""
     for i in range(voltage_v.size):
         voltage_v[i] = _bent(voltage_v[i], bend, v_sat_v)
 
 
 @njit(inline="always")
 def _share(v, v_sat_v):
-    """Fraction of the voltage range, clipped."""
+    """Return the fraction of the voltage range, clipped to 0 .. 1."""
     return min(max(v / v_sat_v, 0.0), 1.0)
 
 
 @njit(inline="always")
 def _with_inl(value, n_codes, inl):
-    """Add the integral nonlinearity to a code before quantisation."""
+    """Add the integral nonlinearity to an unquantised code."""
     place = min(value / n_codes, 1.0) * (inl.size - 1)
-    k = np.uint32(min(int(place), inl.size - 2))  # unsigned: indices from the end need no check
+    k = np.uint32(min(int(place), inl.size - 2))  # unsigned: avoids the check for negative indices
     return value + (inl[k] + (place - k) * (inl[k + 1] - inl[k]))
 
 
 @njit(inline="always")
 def _value(charge, site, adc):
-    """Code of a charge before quantisation; ``site`` is (v_per_e, sense_v, scale, output_v, bend)."""
+    """Return the unquantised code; ``site`` is (v_per_e, sense_v, scale, output_v, bend)."""
     per_e, sense_v, scale, output_v, bend = site
     v = _bent(charge * per_e + sense_v, bend, adc.v_sat_v) * scale + output_v
     value = _companded(_share(v, adc.v_sat_v), adc) * adc.n_codes
@@ -195,7 +199,7 @@ def _value(charge, site, adc):
 
 @njit(inline="always")
 def _dnl_place(key, line, code, n_quantiles):
-    """Position among the Gaussian quantiles of the DNL of a readout line and a code."""
+    """Return the fractional index into the Gaussian quantiles for a readout line and a code."""
     word, _ = philox_2x32(key, np.uint64(line) & _LOW, np.uint64(code))
     return np.float64(word) * (_ONE_IN_2_32 * (n_quantiles - 1))
 
@@ -209,13 +213,13 @@ def _between(quantiles, place):
 
 @njit(inline="always")
 def _dnl_normal(key, line, code, quantiles):
-    """DNL of a readout line and a code: a standard Gaussian number."""
+    """Return the standard Gaussian DNL number of a readout line and a code."""
     return _between(quantiles, _dnl_place(key, line, code, quantiles.size))
 
 
 @njit(inline="always")
 def _whole(value, n_codes):
-    """Quantise to a code, as float64."""
+    """Quantise to a code in float64."""
     return np.float64(int(min(max(value + CODE_ROUNDING, 0.0), n_codes - 1.0)))
 
 
@@ -230,7 +234,7 @@ def _code(value, line, adc):
 
 @njit()
 def _charge(value, site, adc):
-    """Invert :func:`_value`: the charge that gives a code before quantisation, infinite beyond the ends."""
+    """Invert :func:`_value`; codes outside the range give infinite charges."""
     per_e, sense_v, scale, output_v, bend = site
     v_sat_v, inl = adc.v_sat_v, adc.inl
     share_of_codes = value / adc.n_codes
@@ -277,13 +281,12 @@ def _charge(value, site, adc):
 @njit([types.void(_floats, _ints, _adc, code[::1]) for code in (types.uint8, types.uint16)], error_model="numpy")
 def convert(voltage_v, line, adc, code):
     """
-    Codes of voltages: clip, companding, integral and differential nonlinearity, quantisation.
+    Convert voltages to codes: clipping, companding, INL, DNL, quantisation.
 
-    ``adc.dnl_dn`` is the standard deviation, in codes, of a number that each line adds before each code, a Gaussian by its
-    quantiles.
+    ``adc.dnl_dn`` is the standard deviation, in codes, of the Gaussian offset of each code transition in each readout line.
     """
-    # One short loop per step, over buffers that stay in the cache. The compiler vectorises them, as numpy's error model does
-    # not check divisions.
+    # One short loop per step over buffers that fit the cache. The compiler vectorises the loops because numpy's error model
+    # does not check divisions.
     value, place = np.empty(PIECE), np.empty(PIECE)
     n_codes, inl, dnl, quantiles = adc.n_codes, adc.inl, adc.dnl_dn, adc.quantiles
     for first in range(0, voltage_v.size, PIECE):
@@ -311,7 +314,7 @@ def convert(voltage_v, line, adc, code):
 
 @njit(inline="always")
 def _normal_below(x, skewness):
-    """Distribution function of a standardised variable: the Gaussian, and Edgeworth's term of its skewness."""
+    """Return the standardised Gaussian CDF with the first Edgeworth term (skewness)."""
     gaussian = 0.5 * math.erfc(-x * SQRT_HALF)
     if skewness == 0.0:
         return gaussian
@@ -321,10 +324,11 @@ def _normal_below(x, skewness):
 @njit(inline="always")
 def _below(q, nodes, weights, n_nodes, mean, deviation, third, well_e, sigma, half_step):
     """
-    Probability that a charge lies below ``q``.
+    Return the probability that a charge plus readout noise is below ``q``.
 
-    It is a mixture of points (``n_nodes`` of them) or, without any, near a Gaussian of a mean, a deviation and a third central
-    moment that ends at the well; then the Gaussian noise ``sigma``, then one of two states ``half_step`` up or down.
+    The charge distribution consists of ``n_nodes`` discrete values. For ``n_nodes = 0`` it is a Gaussian with Edgeworth
+    correction, given by its mean, standard deviation and third central moment, and truncated at the full well. The readout
+    noise is Gaussian with standard deviation ``sigma``, plus RTS noise of ``+half_step`` or ``-half_step``.
     """
     total = 0.0
     n_states = 2 if half_step > 0.0 else 1
@@ -347,7 +351,11 @@ def _below(q, nodes, weights, n_nodes, mean, deviation, third, well_e, sigma, ha
 
 @njit()
 def _mixture(mean, is_poisson, well_e, quadrature, nodes, weights):
-    """Points and probabilities of a Poisson charge that a well cuts off: integers, or Edgeworth's series by quadrature."""
+    """
+    Compute nodes and probabilities of a Poisson charge clipped at the full well.
+
+    Returns the number of nodes. They are integers for ``is_poisson``; otherwise quadrature points of the Edgeworth series.
+    """
     points, shares = quadrature
     n = 0
     rest = 1.0
@@ -384,10 +392,10 @@ def _mixture(mean, is_poisson, well_e, quadrature, nodes, weights):
 @njit(types.void(_charges, _transfer, _ints, _adc, _quadrature, types.float64[::1], types.float64[::1]))
 def predict_codes(charges, transfer, line, adc, quadrature, mean_dn, variance_dn2):
     """
-    Mean and variance of the codes of sites.
+    Compute mean and variance of the code of each site.
 
-    With ``charges.is_drawn`` a charge is drawn of its mean (Poisson) and cut off by the well; without, it is a Gaussian of
-    ``variance_e2``, or that mean itself where this is 0.
+    With ``charges.is_drawn``, charges are Poisson-distributed and clipped at the full well. Otherwise they are Gaussian with
+    variance ``variance_e2``, or equal to their mean where the variance is 0.
     """
     nodes, weights = np.empty(MOST_NODES), np.empty(MOST_NODES)
     n_codes, bend = adc.n_codes, transfer.bend
@@ -415,8 +423,8 @@ def predict_codes(charges, transfer, line, adc, quadrature, mean_dn, variance_dn
         reach = REACH_SIGMAS * math.sqrt(deviation**2 + sigma**2) + half_step + (FAR_ELECTRONS if n_nodes > 1 else 1.0)
         low, high = min(mean, well) - reach, min(mean, well) + reach
         first, last = _value(low, site, adc), _value(high, site, adc)
-        # Spread over more than a code of an even converter, and nowhere near its ends: a floor takes half a code off, and
-        # spreads by a twelfth, to 1e-8.
+        # Closed form for a linear ADC where noise exceeds one code and nothing is clipped: quantisation lowers the mean by
+        # 1/2 DN and adds a variance of 1/12 DN², to 1e-8.
         dn_per_e = site[0] * site[2] / adc.v_sat_v * n_codes
         smooth_dn = dn_per_e * (sigma if n_nodes > 0 else math.sqrt(deviation**2 + sigma**2))
         is_even = adc.way == ADC_LINEAR and adc.inl.size == 1 and adc.dnl_dn == 0.0 and bend == 0.0
@@ -429,7 +437,7 @@ def predict_codes(charges, transfer, line, adc, quadrature, mean_dn, variance_dn
         total, squares = 0.0, 0.0
         at, reached = low, 0.0
         for k in range(k_first, k_last + 1):
-            # Within one step of the even converter the line's own number splits it once.
+            # DNL adds at most one transition inside each code interval.
             jump = 1.0
             if adc.dnl_dn > 0.0:
                 moved = adc.dnl_dn * _dnl_normal(adc.dnl_key, line[i], k, adc.quantiles)

@@ -1,4 +1,4 @@
-"""The analogue-to-digital converter: codes, companding, and its faults."""
+"""Analogue-to-digital converter (ADC): quantisation, companding and nonlinearity."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from foveasim.sensor.limits import check_plausible, check_plausible_array
 
 __all__ = ["QUANTISATION_DN2", "Companding", "ConversionTables", "Converter"]
 
-#: Ways from a fraction of the voltage range to a fraction of the codes.
+#: Transfer functions from fraction of the voltage range to fraction of the code range.
 Companding = Literal["linear", "root", "log", "table"]
 COMPANDINGS: tuple[Companding, ...] = ("linear", "root", "log", "table")
-#: Nodes of the Gaussian distribution that differential non-linearity is drawn from; linear in between.
+#: Number of tabulated Gaussian quantiles for differential nonlinearity, interpolated linearly.
 N_QUANTILES = 4096
-#: Variance of rounding to a code, in squares of its width: a uniform distribution over one code.
+#: Quantisation variance in units of the squared code width: a uniform distribution over one code.
 QUANTISATION_DN2 = 1.0 / 12.0
 
 
 class ConversionTables(NamedTuple):
-    """An ADC as the kernels take it: numbers, and read-only arrays of float64."""
+    """ADC parameters for the kernels: numbers and read-only float64 arrays."""
 
     v_sat_v: float
     way: int
@@ -42,28 +42,29 @@ class ConversionTables(NamedTuple):
 @dataclass(frozen=True, kw_only=True)
 class Converter:
     """
-    A converter from volts to codes.
+    Analogue-to-digital converter with companding and nonlinearity.
 
     Parameters
     ----------
     bits : int
-        1 to 16: codes from 0 to ``2**bits - 1``, both of which are reached.
+        Resolution, 1 to 16: codes from 0 to ``2**bits - 1``, both of which occur.
     companding : {"linear", "root", "log", "table"}
-        Fraction of the codes for a fraction x of the range: x, its square root, ``log(1 + s x) / log(1 + s)``, or a curve.
+        Transfer function from a fraction x of the voltage range to a fraction of the code range: x, its square root,
+        ``log(1 + s x) / log(1 + s)``, or a tabulated curve.
     log_strength : float
-        The s of ``"log"``: the slope of dark codes over that of bright ones, less one.
+        The s of ``"log"``: ratio of the slopes at zero and at full range, minus 1.
     companding_table : sequence, optional
-        The curve of ``"table"``: fractions of the codes at equal steps of the range, from 0 to 1, never falling.
+        The curve of ``"table"``: fractions of the code range at equal voltage steps, non-decreasing from 0 to 1.
     inl_dn : sequence, DN
-        Integral non-linearity: deviations at equal steps of the codes, linear in between.
+        Integral nonlinearity (INL): deviations at equal code intervals, interpolated linearly.
     dnl_dn : float, DN
-        Differential non-linearity: standard deviation of the number that each readout line adds before each code (the
-        paper, 0.5). Fixed for a device; codes may then fall where the voltage rises.
+        Differential nonlinearity (DNL): standard deviation of the offset of each code transition in each readout line (0.5 in
+        the paper). It is fixed for a device. The transfer function is then not necessarily monotonic.
 
     Raises
     ------
     ParameterError
-        When a value is out of range.
+        If a value is out of range.
     """
 
     bits: int = 8
@@ -80,17 +81,19 @@ class Converter:
             object.__setattr__(self, name, check_plausible(name, getattr(self, name)))
         inl = check_plausible_array("inl_dn", self.inl_dn, ndim=1)
         if inl.size == 1:
-            raise ParameterError(
-                "inl_dn", "must be at least two numbers, at equal steps of the codes", self.inl_dn, "DN"
-            )
+            raise ParameterError("inl_dn", "must have at least two values, at equal code intervals", self.inl_dn, "DN")
         object.__setattr__(self, "inl_dn", tuple(inl.tolist()))
         if (self.companding_table is not None) != (self.companding == "table"):
-            raise ParameterError("companding_table", "and companding='table' belong together", self.companding_table)
+            raise ParameterError(
+                "companding_table", "must be given if and only if companding='table'", self.companding_table
+            )
         if self.companding_table is not None:
             curve = finite_array("companding_table", self.companding_table, ndim=1)
             if curve.size < 2 or curve[0] != 0.0 or curve[-1] != 1.0 or np.any(np.diff(curve) < 0.0):
                 raise ParameterError(
-                    "companding_table", "must be two or more numbers from 0 to 1 that never fall", self.companding_table
+                    "companding_table",
+                    "must have at least two non-decreasing values from 0 to 1",
+                    self.companding_table,
                 )
             object.__setattr__(self, "companding_table", tuple(curve.tolist()))
 
@@ -101,25 +104,26 @@ class Converter:
 
     @property
     def way(self) -> int:
-        """The companding as the kernels number it."""
+        """Number of the companding in the kernels."""
         return COMPANDINGS.index(self.companding)
 
     @cached_property
     def curve(self) -> Floats:
-        """The table, or a zero."""
+        """Companding table; a single 0 without a table."""
         return read_only(np.array(self.companding_table if self.companding_table is not None else [0.0]))
 
     @cached_property
     def inl(self) -> Floats:
-        """Integral non-linearity at equal steps, or a zero."""
+        """Integral nonlinearity at equal code intervals, DN; a single 0 without INL."""
         return read_only(np.array(self.inl_dn or [0.0]))
 
     @cached_property
     def borders(self) -> Floats:
         """
-        Fractions of the range at which the codes begin, and 1, (n_codes + 1,); never falling.
+        Code transition levels as fractions of the voltage range, (n_codes + 1,).
 
-        A code that integral non-linearity or a companding table leaves out has two equal borders.
+        The levels are non-decreasing, and the last level is 1. Codes that are missing because of INL or the companding table
+        have zero width.
         """
         border = np.arange(self.n_codes + 1) / self.n_codes
         if self.inl.size > 1:
@@ -131,44 +135,44 @@ class Converter:
             border = np.expm1(border * np.log1p(self.log_strength)) / self.log_strength
         elif self.companding == "table":
             border = _first_at(self.curve, np.linspace(0.0, 1.0, self.curve.size), border)
-        border[-1] = 1.0  # the highest code takes the rest of the range
+        border[-1] = 1.0  # the highest code extends to the end of the range
         return read_only(border)
 
     @cached_property
     def linear_dn(self) -> Floats:
-        """Linear code of every code: the centre of the fractions of the range that it stands for, (n_codes,) DN."""
+        """Linear code of each code, (n_codes,) DN: the centre of its voltage interval."""
         return read_only(0.5 * (self.borders[:-1] + self.borders[1:]) * self.n_codes - 0.5)
 
     @cached_property
     def widths_dn(self) -> Floats:
-        """Width of every code in linear codes, (n_codes,) DN: 1 each where the converter is linear."""
+        """Width of each code in linear codes, (n_codes,) DN; 1 for a linear ADC."""
         return read_only(np.diff(self.borders) * self.n_codes)
 
     def width_of_code_dn(self, code: ArrayLike) -> Floats:
-        """Width in linear codes at given codes, (...) DN; between two codes on a straight line."""
+        """Interpolate the code width at given codes, (...) DN in linear codes."""
         return np.interp(np.asarray(code, np.float64), np.arange(self.n_codes), self.widths_dn)
 
     def width_at_dn(self, fraction: ArrayLike) -> Floats:
         """
-        Local step of the converter at fractions of the range, (...) DN: width of a code in linear codes.
+        Interpolate the code width at fractions of the voltage range, (...) DN in linear codes.
 
-        Widths belong to the centres of codes, with straight lines between them, so that the step is continuous: for a
-        logarithmic converter it is the slope's inverse, for a square root that of high codes.
+        Widths are defined at code centres and interpolated linearly, so that the local step is continuous. For logarithmic
+        companding the step is the inverse of the slope; for square-root companding it is so at high codes.
         """
         return np.interp(np.asarray(fraction) * self.n_codes - 0.5, self.linear_dn, self.widths_dn)
 
     @property
     def noise_dn2(self) -> float:
         """
-        Variance of conversion in squares of the local step: 1/12 of quantisation, and that of differential non-linearity.
+        Variance of quantisation (1/12) plus DNL, in units of the squared local step.
 
-        A charge that moves over several codes meets them as temporal noise: rounding errors are uniform over a step (EMVA 1288,
-        Release 4.0 Linear, equation 6), and each line adds a number of its own before each code.
+        Where noise covers several codes, both contribute to temporal noise: rounding errors are uniform over a step (EMVA
+        1288, Release 4.0 Linear, equation 6), and each code transition of a readout line has its own offset.
         """
         return QUANTISATION_DN2 + self.dnl_dn**2
 
     def tables(self, v_sat_v: float, dnl_key: np.uint64) -> ConversionTables:
-        """Return the arguments of the kernels, with the full range in V and the key of a device's DNL numbers."""
+        """Return the kernel arguments for a full range in V and a device's DNL key."""
         return ConversionTables(
             v_sat_v=v_sat_v,
             way=self.way,
@@ -183,14 +187,18 @@ class Converter:
 
     @cached_property
     def quantiles(self) -> Floats:
-        """The Gaussian distribution at equal steps of probability, (n,)."""
+        """Standard Gaussian quantiles at equal probability steps, (n,)."""
         from scipy.special import ndtri
 
         return read_only(np.asarray(ndtri((np.arange(N_QUANTILES) + 0.5) / N_QUANTILES)))
 
 
 def _first_at(values: Floats, at_fraction: Floats, wanted_fraction: Floats) -> Floats:
-    """Place where straight lines through values first reach what is wanted; the last place where they never do."""
+    """
+    Invert a piecewise linear function.
+
+    The result is the first position at which the function reaches each wanted value, or the last position if it never does.
+    """
     rising = np.maximum.accumulate(values)
     after = np.searchsorted(rising, wanted_fraction, side="left")
     inside = np.clip(after, 1, values.size - 1)

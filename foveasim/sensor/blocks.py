@@ -1,4 +1,4 @@
-"""Blocks of sites: what draws from one random stream, and what is in the cache at a time."""
+"""Blocks of sites for random streams, and pieces of blocks for the CPU cache."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from foveasim._core.threads import each, thread_count
 
 __all__ = ["BLOCK_SITES", "in_blocks", "pieces"]
 
-#: Sites that draw from one stream of an effect; fixed, so that draws do not depend on the number of threads.
+#: Number of sites per random stream of an effect. It is fixed so that draws do not depend on the number of threads.
 BLOCK_SITES = 1 << 16
-#: Sites of a block that are processed at a time, on which draws do not depend: some arrays of them fit the L2 cache (256 KiB
-#: each), and interpreter time, which threads cannot share, is little for each site.
+#: Number of sites processed at a time; draws do not depend on it. A few arrays of this length fit the L2 cache (256 KiB each),
+#: and the interpreter overhead per site, which threads cannot parallelise, is small.
 PIECE_SITES = 1 << 15
 
 
 def in_blocks(n_sites: int, work: Callable[[int, slice], None], n_threads: int | None = None) -> None:
-    """Call a function for every block of sites, with its number and its slice."""
+    """Call a function with the number and the slice of each block of sites, in threads."""
     n_blocks = -(-n_sites // BLOCK_SITES)
     each(
         lambda block: work(block, slice(block * BLOCK_SITES, min((block + 1) * BLOCK_SITES, n_sites))),

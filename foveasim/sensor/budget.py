@@ -1,4 +1,4 @@
-"""The noise budget: how much each effect contributes, in electrons, to tell which one to reduce."""
+"""Noise budget: contribution of each effect to temporal noise and non-uniformity, in e-."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from foveasim.sensor.signal_to_noise import local_step_e
 
 __all__ = ["FIXED", "TEMPORAL", "noise_budget"]
 
-#: Standard lines of the budget: noise that changes from frame to frame, and fixed patterns.
+#: Standard entries of the budget: temporal noise and fixed patterns.
 TEMPORAL = (
     "photon_shot",
     "dark_shot",
@@ -28,39 +28,42 @@ FIXED = tuple(effect.name for effect in STANDARD if not effect.is_temporal)
 
 def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> dict[str, Floats]:
     """
-    Return the standard deviation that each effect alone gives to a site's charge.
+    Compute the standard deviation of a site's charge due to each effect alone.
 
     Parameters
     ----------
     sensor : Sensor
     photo_e_per_s : (n_site,) float64, e-/s
-        Photoelectrons of a site without fixed patterns, as a camera expects them.
+        Photoelectron rate of each site without fixed patterns, as from :meth:`foveasim.Camera.photoelectrons_per_s`.
     exposure_s : float, s
 
     Returns
     -------
     noise_e : dict of (n_site,) float64, e-
-        By name: :data:`TEMPORAL`, further temporal effects of the sensor, :data:`FIXED`, further fixed ones; 0 for effects that
-        the sensor does not have. Effects on the signal are referred to the charge by the slope of the whole chain at the
-        site's mean, and so is the noise of conversion: a step over the root of 12, and differential nonlinearity. As long as
-        nothing is clipped, squares add up: temporal ones to the variance of a site, fixed ones to that between like sites.
+        Entries by name: :data:`TEMPORAL`, further temporal effects of the sensor, :data:`FIXED`, further fixed effects; 0 for
+        effects that the sensor does not have. Effects on voltages are referred to the charge by the slope of the complete
+        chain at the site's mean, as is conversion noise: the step divided by ``sqrt(12)``, and differential nonlinearity.
+        Without clipping, the squares of temporal entries add up to the temporal variance of a site, and the squares of fixed
+        entries to the variance between identical sites.
 
     Raises
     ------
     ParameterError
-        When there is not one number per site, or the exposure is negative.
+        If the number of rates is not the number of sites, or the exposure is negative.
 
     Notes
     -----
-    An effect's line is the root mean square of what it adds to the nominal values: ``sqrt(variance + (mean - nominal)²)`` of
-    its :meth:`~foveasim.sensor.effects.Effect.moments`, of fixed patterns over all devices. Crosstalk and inter-pixel
-    capacitance, which mix sites, are left out.
+    An entry is the root mean square deviation from the nominal value: ``sqrt(variance + (mean - nominal)²)`` from
+    :meth:`~foveasim.sensor.effects.Effect.moments`, for fixed patterns over all devices. Crosstalk and inter-pixel
+    capacitance, which mix sites, are not included.
     """
     exposure_s = check_plausible("exposure_s", exposure_s)
     photo_e_per_s = as_numbers("photo_e_per_s", photo_e_per_s)
     n_sites = sensor.layout.n_sites
     if photo_e_per_s.shape != (n_sites,):
-        raise ParameterError("photo_e_per_s", f"must be {n_sites} numbers, one per site, got {photo_e_per_s.shape}")
+        raise ParameterError(
+            "photo_e_per_s", f"must have one value for each of the {n_sites} sites, got the shape {photo_e_per_s.shape}"
+        )
     photo = photo_e_per_s * sensor.sensitivity
     dark = np.broadcast_to(sensor.nominal_dark_e_per_s, n_sites)
     charge_e = (photo + dark) * exposure_s
@@ -68,7 +71,7 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
     fraction = np.clip(volts / sensor.v_sat_v, 0.0, 1.0)
     bend = sensor.nonlinearity_fraction
     slope = np.maximum(1.0 - 2.0 * bend * fraction, LEAST_SLOPE)
-    # Nominal values at each stage, and electrons of one of their unit.
+    # Nominal values at each stage, and the number of electrons per unit of that stage.
     nominal = {
         "photo": (photo, exposure_s),
         "dark": (dark, exposure_s),

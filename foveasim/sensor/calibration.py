@@ -1,8 +1,8 @@
 """
-Calibration: a device's fixed patterns from dark and flat frames, and codes without them.
+Calibration: fixed patterns of a device from dark and flat frames, and their correction.
 
 Terms follow EMVA Standard 1288, Release 4.0 Linear: dark signal and its non-uniformity, photo response non-uniformity,
-temporal dark noise, defect pixels. Codes are linear: what a companding converter made of them is undone first.
+temporal dark noise, defect pixels. All quantities refer to linear codes: companding is inverted first.
 """
 
 from __future__ import annotations
@@ -28,42 +28,43 @@ if TYPE_CHECKING:
 
 __all__ = ["Calibration", "calibrate", "linearise", "nominal_e_per_dn"]
 
-#: Standard deviation of a Gaussian distribution over its median absolute deviation.
+#: Ratio of the standard deviation of a Gaussian distribution to its median absolute deviation.
 SIGMA_PER_MAD = 1.482602218505602
-#: Chance that a site of typical noise is taken for a noisy one, in frames as few as there are.
+#: Probability that a site with typical noise is classified as noisy, for the given number of frames.
 FALSE_ALARM = 1e-6
-#: A defective site's value comes from neighbours at most so many steps away.
+#: Maximum distance, in steps of adjacency, of the neighbours that replace a defective site.
 FURTHEST_STEPS = 3
 
 
-# -- the converter, the other way -------------------------------------------------------------------------------------
+# -- inversion of the ADC transfer function ---------------------------------------------------------------------------
 
 
 def linearise(code: ArrayLike, sensor: Sensor) -> Floats:
     """
-    Codes that a linear converter would have given.
+    Convert codes to linear codes by inverting companding and integral nonlinearity.
 
     Parameters
     ----------
     code : (...), DN
-        Codes of the sensor, in any shape, whole or means of several; what lies between two codes is taken on a straight line.
+        Codes of the sensor, of any shape: integers, or means of several frames, which are interpolated linearly.
     sensor : Sensor
-        Its ``bits``, ``companding`` and ``inl_dn`` count.
+        Only ``bits``, ``companding`` and ``inl_dn`` are used.
 
     Returns
     -------
     linear_dn : (...) float64, DN
-        The middle of the voltages that a code stands for, in linear codes: the code itself where the converter is linear.
+        Centre of the voltage interval of each code, in linear codes; equal to the code for a linear ADC.
 
     Raises
     ------
     ParameterError
-        When a code is none of the sensor's, or the second argument is no sensor.
+        If a code is out of the sensor's range, or ``sensor`` is not a Sensor.
 
     Notes
     -----
-    A linear code ``y`` stands for ``(y + 1/2) * v_sat_v / 2**bits``. Differential non-linearity is not undone, as it is not
-    known to a user; nor is the response's bend, ``nonlinearity_fraction``, which comes before the offsets.
+    A linear code ``y`` corresponds to the voltage ``(y + 1/2) * v_sat_v / 2**bits``. Differential nonlinearity is not
+    corrected because it is unknown for a real device. The response nonlinearity, ``nonlinearity_fraction``, is not corrected
+    because it precedes the offsets.
 
     Examples
     --------
@@ -77,7 +78,7 @@ def linearise(code: ArrayLike, sensor: Sensor) -> Floats:
 
 
 def nominal_e_per_dn(sensor: Sensor) -> Floats:
-    """Electrons of one linear code as the electronics are meant, without the device's faults, (n_site,) or (1,) e-/DN."""
+    """Return the nominal number of electrons per linear code, (n_site,) or (1,) e-/DN."""
     return np.atleast_1d(volts_to_electrons(sensor.v_sat_v / 2.0**sensor.bits, np.asarray(sensor.capacitance_f)))
 
 
@@ -88,40 +89,40 @@ def _interpolate(code: ArrayLike, linear_dn: Floats, highest_dn: float) -> Float
     return np.interp(values, np.arange(linear_dn.size), linear_dn)
 
 
-# -- a calibration ----------------------------------------------------------------------------------------------------
+# -- calibration ------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Calibration:
     """
-    What dark and flat frames tell of a device, site by site.
+    Calibration of a device: offset, gain, noise and defects of each site.
 
-    Made by :func:`calibrate`, or of measured frames by :meth:`from_frames`.
+    Created by :func:`calibrate`, or from measured frames by :meth:`from_frames`.
 
     Attributes
     ----------
     offset_dn : (n_site,) float64, DN
         Mean dark frame, in linear codes.
     gain : (n_site,) float64
-        Relative response: flat less dark over ``expected_dn``, of mean 1 over the sites that are neither defective nor clipped.
-        A site of twice the area that gives twice the signal has the gain 1, when it was expected to.
+        Relative response: (flat - dark) / ``expected_dn``, normalised to mean 1 over the sites that are neither defective nor
+        clipped. A site with twice the area and twice the signal has gain 1 if ``expected_dn`` accounts for its area.
     read_noise_dn : (n_site,) float64, DN
-        Temporal dark noise: standard deviation of the dark frames in time, with that of dark charge and of rounding.
+        Temporal dark noise: standard deviation over the dark frames, including dark-current shot noise and quantisation.
     expected_dn : (n_site,) float64, DN
-        What the flat was to give, up to a common factor.
+        Expected signal of the flat frames, up to a common factor.
     hot, dead, noisy : (n_site,) bool
-        Sites with too much dark signal, too little response, too much noise.
+        Sites with excessive dark signal, insufficient response, or excessive noise.
     clipped : (n_site,) bool
-        Sites with codes of 0 in the dark, or the highest one in the flat, in too many frames: their offset or gain is not known
-        well, and they have no part in the mean. When these are many, give the sensor a pedestal, or the flat less light.
+        Sites with code 0 in too many dark frames, or the highest code in too many flat frames. Their offset or gain is
+        uncertain, and they are excluded from the mean. If there are many, increase the pedestal or reduce the flat signal.
     exposure_s : float, optional, s
-        Exposure of the dark frames, where it is known.
+        Exposure time of the dark frames, if known.
     dark_rate_dn_per_s : (n_site,) float64, optional, DN/s
-        Dark signal of a second, where there were dark frames of two exposures.
+        Dark signal per second, if there were dark frames of two exposure times.
     highest_dn : float, optional, DN
-        The code that means saturation; None for no test.
+        Saturation code; None for no saturation test.
     linear_dn : (n_codes,) float64, optional, DN
-        Linear code of every code; None where codes are linear.
+        Linear code of each code; None if codes are linear.
     """
 
     offset_dn: Floats
@@ -176,35 +177,35 @@ class Calibration:
         max_clipped_fraction: float = 0.005,
     ) -> Calibration:
         """
-        Calibration of frames that were measured, or of simulated ones.
+        Compute a calibration from measured or simulated frames.
 
         Parameters
         ----------
         dark, flat : (n_frame, n_site), DN
-            Codes in the dark, at least two frames, and under even light, at least one; of the same exposure.
+            Codes of at least two dark frames, and of at least one flat frame (uniform irradiance) of the same exposure time.
         dark_long : (n_frame, n_site), optional, DN
-            Codes in the dark of a longer exposure, for the dark rate; with it go ``exposure_s`` and ``long_exposure_s``.
+            Codes of dark frames of a longer exposure time, for the dark rate; requires ``exposure_s`` and ``long_exposure_s``.
         exposure_s, long_exposure_s : float, optional, s
         expected_dn : number or (n_site,), DN
-            What each site is to give under the flat's light, up to a common factor: area times filter over capacitance. What is
-            in it is not taken for a fixed pattern, and is left in corrected codes; with 1 all sites are made alike.
+            Expected signal of each site in the flat frames, up to a common factor: area times filter over capacitance.
+            Expected differences do not count as fixed pattern and remain in corrected codes; with 1 all sites are equalised.
         expected_dark_dn_per_s : number or (n_site,), DN/s
-            Dark signal as it was meant; hot sites are those with more. With other than 0 goes ``exposure_s``.
+            Nominal dark signal; hot sites are those in excess of it. Values other than 0 require ``exposure_s``.
         expected_noise_dn : number or (n_site,), DN
-            Temporal dark noise as it was meant, up to a common factor.
+            Nominal temporal dark noise, up to a common factor.
         highest_dn : float, optional, DN
-            The code that means saturation.
+            Saturation code.
         linear_dn : (n_codes,), optional, DN
-            Linear code of every code, for companding converters: ``linearise(np.arange(2**bits), sensor)``.
+            Linear code of each code, for companding ADCs: ``linearise(np.arange(2**bits), sensor)``.
         hot_sigmas : float
-            A site is hot when its dark signal, or dark rate, is so many robust standard deviations above the median.
+            A site is hot if its dark signal, or dark rate, exceeds the median by this number of robust standard deviations.
         dead_fraction : float
-            A site is dead when its response is below this fraction of the median.
+            A site is dead if its response is below this fraction of the median.
         noisy_ratio : float
-            A site is noisy when its temporal dark noise is so many times the typical one, and by more than the luck of so
-            few frames: one typical site in a million.
+            A site is noisy if the ratio of its temporal dark noise to the typical noise exceeds this number, and the excess
+            is statistically significant for the number of frames (false-alarm probability 1e-6).
         max_clipped_fraction : float
-            Fraction of the frames that a site may be clipped in.
+            Maximum fraction of the frames in which a site may be clipped.
 
         Returns
         -------
@@ -213,15 +214,16 @@ class Calibration:
         Raises
         ------
         ParameterError
-            When frames have not the same sites, are too few, or a value is out of range.
+            If frames differ in their number of sites, are too few, or a value is out of range.
         SimulationError
-            When the flat is no brighter than the dark, saturates half of the sites, or leaves no good site.
+            If the flat signal is not above the dark signal, more than half of the sites are saturated, or no site is free of
+            defects.
 
         Notes
         -----
-        With temporal variances ``d`` and ``f`` of a dark and a flat frame, ``n`` frames of each leave on corrected codes, at
-        a share x of the flat's signal, a fixed pattern of variance ``((1 - x)**2 d + x**2 f) / n``. The robust standard
-        deviation is 1.4826 times the median absolute deviation, and no less than that of rounding.
+        With temporal variances ``d`` and ``f`` of a dark and a flat frame, a calibration from ``n`` frames of each leaves a
+        residual fixed pattern of variance ``((1 - x)**2 d + x**2 f) / n`` in corrected codes, at a fraction x of the flat
+        signal. The robust standard deviation is 1.4826 times the median absolute deviation, and at least that of rounding.
         """
         table = None if linear_dn is None else finite_array("linear_dn", linear_dn, ndim=1)
         stacks = {"dark": _Frames(highest_dn, table), "flat": _Frames(highest_dn, table)}
@@ -248,14 +250,16 @@ class Calibration:
 
     def offset_at(self, exposure_s: float | None = None) -> Floats:
         """
-        Dark signal of an exposure, (n_site,) DN; of the calibration's own by default.
+        Return the dark signal of an exposure time, (n_site,) DN.
+
+        The exposure time of the calibration is the default.
 
         Raises
         ------
         ParameterError
-            When the exposure is negative.
+            If the exposure time is negative.
         SimulationError
-            When it is another than the calibration's, and the dark rate is not known.
+            If the exposure time differs from that of the calibration, and the dark rate is unknown.
         """
         if exposure_s is None:
             return self.offset_dn
@@ -264,7 +268,7 @@ class Calibration:
             return self.offset_dn
         if self.dark_rate_dn_per_s is None or self.exposure_s is None:
             raise SimulationError(
-                f"the dark signal of {exposure_s:g} s is not known; calibrate with dark frames of a second exposure "
+                f"the dark signal at {exposure_s:g} s is unknown; calibrate with dark frames of a second exposure time "
                 "('long_exposure_s')"
             )
         return self.offset_dn + self.dark_rate_dn_per_s * (exposure_s - self.exposure_s)
@@ -279,34 +283,35 @@ class Calibration:
         max_gap_um: float | None = None,
     ) -> Floats:
         """
-        Codes without offsets and differences of gain.
+        Correct codes for offset and gain differences.
 
         Parameters
         ----------
         code : (..., n_site), DN
-            As the sensor gives them, not linearise; not changed. One call for many frames looks for neighbours once.
+            Codes of the sensor, not linearised; not modified. With ``fill``, pass many frames in one call, as neighbours are
+            determined once per call.
         exposure_s : float, optional, s
-            Of these codes, when it is not that of the calibration and the dark rate is known.
+            Exposure time of the codes, if it differs from that of the calibration; requires a known dark rate.
         fill : Layout, optional
-            Give defective sites the mean of their good neighbours, each taken relative to what it is expected to give; where a
-            site has none, of neighbours of neighbours, up to three steps. By default they keep their own, corrected.
+            Replace defective sites by the mean of their good neighbours, each relative to its expected signal. Sites without
+            good neighbours use neighbours of neighbours, up to three steps. By default defective sites are not replaced.
         kind : (n_site,) of integers, optional
-            Fill from neighbours of the same kind only: ``sensor.filter_of_site`` on a mosaic.
+            Replace only from neighbours of the same kind, such as ``sensor.filter_of_site`` on a mosaic.
         max_gap_um : float, optional, µm
-            Sites that face each other across a gap of up to this width are neighbours; by default those that share an edge.
+            Maximum width of gaps between neighbouring sites; by default neighbours share an edge.
 
         Returns
         -------
         corrected_dn : (..., n_site) float64, DN
-            ``(linear code - offset) / gain``: 0 in the dark. NaN where the code is saturated, where the gain is not above 0,
-            and where there is nothing to fill from.
+            ``(linear code - offset) / gain``: 0 in dark frames. NaN for saturated codes, for a gain that is not above 0, and
+            for defective sites without good neighbours.
 
         Raises
         ------
         ParameterError
-            When there is not one code a site, or one is out of range.
+            If the number of codes is not the number of sites, or a code is out of range.
         SimulationError
-            When no two sites of the layout are neighbours, or the exposure's dark signal is not known.
+            If no two sites of the layout are neighbours, or the dark signal of the exposure time is unknown.
         """
         codes = _per_site("code", code, self.n_sites)
         linear_dn = codes if self.linear_dn is None else _interpolate(codes, self.linear_dn, self.linear_dn.size - 1.0)
@@ -322,20 +327,20 @@ class Calibration:
     def _filled(
         self, values: Floats, layout: Neighbourhood, kind: ArrayLike | None, max_gap_um: float | None
     ) -> Floats:
-        """Frames (n_frame, n_site) with defective sites taken from the nearest good ones."""
+        """Replace defective sites in frames (n_frame, n_site) by their nearest good neighbours."""
         if not hasattr(layout, "adjacency") or layout.n_sites != self.n_sites:
             raise ParameterError("fill", f"must be the layout of these {self.n_sites} sites", layout)
         kinds = None if kind is None else finite_array("kind", kind, ndim=1)
         if kinds is not None and kinds.size != self.n_sites:
-            raise ParameterError("kind", f"must be one number for each of the {self.n_sites} sites, got {kinds.size}")
+            raise ParameterError("kind", f"must have one value for each of the {self.n_sites} sites, got {kinds.size}")
         bad = np.flatnonzero(self.defective)
         if bad.size == 0:
             return values
         neighbours = _pattern(layout.adjacency(max_gap_um=max_gap_um))
         if neighbours.nnz == 0:
             raise SimulationError(
-                "no two sites of the layout share an edge, so nothing can be filled; for sites behind trenches give "
-                "'max_gap_um', the width of a trench"
+                "no two sites of the layout share an edge, so defective sites have no neighbours; for sites separated by "
+                "trenches, set 'max_gap_um' to the trench width"
             )
         is_good = np.isfinite(values) & ~self.defective
         relative = np.where(is_good, values / self.expected_dn, 0.0).T
@@ -371,43 +376,43 @@ def calibrate(
     n_threads: int | None = None,
 ) -> Calibration:
     """
-    Take dark and flat frames with a sensor, and calibrate it.
+    Simulate dark and flat frames of a sensor, and compute its calibration.
 
     Parameters
     ----------
     sensor : Sensor
     exposure_s : float, s
-        Of both kinds of frames.
+        Exposure time of dark and flat frames.
     flat_e : number or (n_site,), e-
-        Photoelectrons that the flat light is to give each site, before the device's non-uniformity: in proportion to area and
-        filter where sites differ. About half of the range is right.
+        Expected photoelectrons of each site in the flat frames without non-uniformity, proportional to area and filter where
+        sites differ. About half of the range is suitable.
     n_frames : int
-        Of each kind, at least 2.
+        Number of dark frames and of flat frames, at least 2.
     seed : int
-        Of the frames' noise.
+        Seed of the temporal noise.
     long_exposure_s : float, optional, s
-        Exposure of further dark frames, for the dark rate.
+        Exposure time of additional dark frames, for the dark rate.
     hot_sigmas, dead_fraction, noisy_ratio, max_clipped_fraction : float
         See :meth:`Calibration.from_frames`.
     n_threads : int, optional
-        All cores by default. The frames do not depend on it.
+        Number of threads; all cores by default. The frames do not depend on it.
 
     Returns
     -------
     Calibration
-        Its gain is against what the electronics were meant to give of ``flat_e``: capacitances, crosstalk and coupling of the
-        sensor's settings are expected, and are left in corrected codes.
+        The gain is relative to the nominal response to ``flat_e``: capacitances, crosstalk and inter-pixel capacitance of the
+        sensor's settings are part of the expectation, and remain in corrected codes.
 
     Raises
     ------
     ParameterError
-        When a value is out of range, or there is not one expectation a site.
+        If a value is out of range, or ``flat_e`` does not match the number of sites.
     SimulationError
-        When the flat saturates half of the sites, or leaves no good site.
+        If the flat frames saturate more than half of the sites, or no site is free of defects.
 
     Notes
     -----
-    Frames are taken one after the other; memory is a few arrays of a frame's size, whatever their number.
+    Frames are processed one at a time; memory is a few arrays of the size of a frame for any number of frames.
 
     Examples
     --------
@@ -428,7 +433,7 @@ def calibrate(
     darkness = np.zeros(n_sites)
     dark_e = meant.expected_electrons(darkness, exposure_s)
     signal_e = meant.expected_electrons(flat / exposure_s, exposure_s) - dark_e
-    # RTS noise is a defect, which makes a site noisy: not part of what is meant.
+    # RTS noise counts as a defect (noisy site), so the nominal noise excludes it.
     quiet = meant.without(*(effect.name for effect in meant.chain if effect.half_step(meant.sites) is not None))
     dark_e2 = dark_e if sensor.shot.is_drawn else np.zeros(1)
     noise_e2 = dark_e2 + quiet.readout_model(dark_e).noise_e2
@@ -468,7 +473,7 @@ def calibrate(
 
 
 class _Frames:
-    """Mean and variance of linear codes over frames, one frame at a time (Welford's sums), and how often they clip."""
+    """Running mean, variance (Welford's algorithm) and clipping counts of linear codes."""
 
     def __init__(self, highest_dn: float | None, linear_dn: Floats | None) -> None:
         self.highest_dn = None if highest_dn is None else check_number("highest_dn", highest_dn, above=0.0)
@@ -528,20 +533,23 @@ def _calibration(
     if exposure_s is not None:
         exposure_s = check_plausible("exposure_s", exposure_s)
     elif dark_long is not None or meant_rate.any():
-        raise ParameterError("exposure_s", "must be given with a second exposure or an expected dark signal", None)
+        raise ParameterError("exposure_s", "must be given with 'dark_long' or 'expected_dark_dn_per_s'", None)
     if (dark_long is None) != (long_exposure_s is None):
-        raise ParameterError("long_exposure_s", "and 'dark_long' belong together", long_exposure_s)
+        raise ParameterError("long_exposure_s", "must be given if and only if 'dark_long' is", long_exposure_s)
 
     is_saturated = flat.n_highest > most_clipped * flat.n_frames
     if is_saturated.mean() > 0.5:
         raise SimulationError(
-            f"the flat saturates {100 * is_saturated.mean():.0f} % of the sites, so their response is unknown; take less light"
+            f"the flat frames saturate {100 * is_saturated.mean():.0f} % of the sites, so their response is unknown; reduce "
+            "the flat signal"
         )
     is_clipped = is_saturated | (dark.n_lowest > most_clipped * dark.n_frames)
     response = (flat.mean_dn - dark.mean_dn) / expected
     typical = float(np.median(response[~is_saturated]))
     if not typical > 0.0:
-        raise SimulationError("the flat is no brighter than the dark, so the response is not known; take more light")
+        raise SimulationError(
+            "the flat signal is not above the dark signal, so the response is unknown; increase the flat signal"
+        )
 
     is_hot = _outliers(dark.mean_dn - meant_rate * (exposure_s or 0.0), hot_sigmas, np.sqrt(QUANTISATION_DN2))
     rate: Floats | None = None
@@ -554,10 +562,10 @@ def _calibration(
     is_noisy = _noisy(noise_dn, meant_noise, _rounding_dn(dark), dark.n_frames, noisy_ratio)
     is_good = ~(is_hot | is_dead | is_noisy | is_clipped)
     if not is_good.any():
-        # A sensor without pedestal clips everywhere in the dark; what is not defective still tells the mean.
+        # Without a pedestal all sites clip in dark frames; the mean is then over all sites that are not defective.
         is_good = ~(is_hot | is_dead | is_noisy | is_saturated)
     if not is_good.any():
-        raise SimulationError("no site is free of defects, so there is no mean response; relax the thresholds")
+        raise SimulationError("no site is free of defects, so the mean response is undefined; relax the thresholds")
     return Calibration(
         offset_dn=dark.mean_dn,
         gain=response / float(response[is_good].mean()),
@@ -575,14 +583,18 @@ def _calibration(
 
 
 def _outliers(values: Floats, hot_sigmas: float, smallest_dn: float) -> Bools:
-    """Values far above their median, by the robust spread."""
+    """Return the mask of values above the median by many robust standard deviations."""
     median = np.median(values)
     sigma = max(SIGMA_PER_MAD * float(np.median(np.abs(values - median))), float(smallest_dn))
     return np.asarray(values > median + hot_sigmas * sigma)
 
 
 def _noisy(noise_dn: Floats, meant_dn: Floats, rounding_dn: Floats, n_frames: int, noisy_ratio: float) -> Bools:
-    """Sites whose variance is above what is typical, by a ratio of standard deviations and by more than luck."""
+    """
+    Return the mask of sites whose temporal noise is above the typical noise.
+
+    Both the ratio of standard deviations and the statistical significance of the excess are tested.
+    """
     from scipy.stats import chi2
 
     n_free = n_frames - 1
@@ -592,7 +604,7 @@ def _noisy(noise_dn: Floats, meant_dn: Floats, rounding_dn: Floats, n_frames: in
 
 
 def _rounding_dn(frames: _Frames) -> Floats:
-    """Standard deviation of rounding where the sites' mean codes lie: wider apart codes round more."""
+    """Return the standard deviation of rounding at each site's mean code, by the code spacing."""
     table = frames.linear_dn
     if table is None or table.size < 2:
         return np.sqrt([QUANTISATION_DN2])
@@ -624,7 +636,7 @@ def _per_site(name: str, values: ArrayLike, n_sites: int) -> Floats:
 
 
 def _pattern(matrix: Any) -> csr_array[Any]:
-    """Ones where a sparse matrix has entries."""
+    """Return the sparsity pattern of a matrix, with ones as values."""
     from scipy.sparse import csr_array
 
     out = csr_array(matrix)

@@ -1,4 +1,4 @@
-"""The sensor chain: an ordered tuple of effects, and running values through a part of it in blocks of sites."""
+"""Sensor chain: an ordered tuple of effects, applied in blocks of sites."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from foveasim.sensor.effects import STAGES, STANDARD, Effect, FixedFactor, Fixed
 
 __all__ = ["Factor", "Nonlinearity", "Offset", "Step", "check_effects", "check_names", "merged", "ordered", "run"]
 
-#: Stages whose values have no random stream.
+#: Stages before collection, which have no random stream.
 FIXED_STAGES = ("photo", "dark", "expected")
 #: Names of the effects that keywords build.
 BUILT = frozenset({"crosstalk", "ipc", "shot", *(cls.name for cls in STANDARD)})
-#: Names of lines of the noise budget that belong to no effect of the same name.
+#: Entries of the noise budget that are not effect names.
 RESERVED = ("photon_shot", "dark_shot", "quantisation")
 
 
 class _Deterministic:
-    """A deterministic part of the chain between effects."""
+    """Deterministic step of the chain between effects."""
 
     name = ""
     is_local = True
@@ -36,12 +36,12 @@ class _Deterministic:
         self.values = np.asarray(values)
 
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
-        """Return values after it."""
+        """Return the values after the step."""
         raise NotImplementedError
 
 
 class Factor(_Deterministic):
-    """Multiplication by numbers (n_site,) or one number."""
+    """Multiplication by an array (n_site,) or a number."""
 
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
         """Return the product."""
@@ -51,7 +51,7 @@ class Factor(_Deterministic):
 
 
 class Offset(_Deterministic):
-    """Addition of numbers (n_site,) or one number."""
+    """Addition of an array (n_site,) or a number."""
 
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
         """Return the sum."""
@@ -61,14 +61,18 @@ class Offset(_Deterministic):
 
 
 class Nonlinearity(_Deterministic):
-    """The response that lacks a fraction of the voltage at full range, growing with the square of the voltage."""
+    """
+    Quadratic response nonlinearity.
+
+    ``fraction`` is the relative signal loss at full range; the loss grows with the square of the voltage.
+    """
 
     def __init__(self, fraction: float, v_sat_v: float) -> None:
         super().__init__(fraction)
         self.bend, self.v_sat_v = fraction, v_sat_v
 
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
-        """Return voltages after the nonlinearity."""
+        """Return the voltages after the nonlinearity."""
         from foveasim.sensor import _kernels
 
         _ = sites, rng
@@ -76,15 +80,15 @@ class Nonlinearity(_Deterministic):
         return values
 
 
-#: What values run through.
+#: Effect or deterministic step.
 Step: TypeAlias = Effect | _Deterministic
 
 
 def merged(steps: Iterable[Step], sites: Sites) -> tuple[Step, ...]:
     """
-    Return steps of the same result, to rounding, in which consecutive factors are one, and consecutive offsets.
+    Merge consecutive factors, and consecutive offsets, into single steps.
 
-    A pass over a piece of sites costs as much as the arithmetic, and each pattern is read from memory.
+    The result is the same to rounding. Merging avoids passes over the sites and reads of patterns from memory.
     """
     done: list[Step] = []
     for step in steps:
@@ -104,54 +108,54 @@ def merged(steps: Iterable[Step], sites: Sites) -> tuple[Step, ...]:
 
 
 def ordered(effects: Iterable[Effect]) -> tuple[Effect, ...]:
-    """Return effects in the order of the chain; those of one stage stay in their order."""
+    """Sort effects by stage; effects of the same stage stay in their order."""
     order = list(STAGES)
     return tuple(sorted(effects, key=lambda effect: order.index(effect.stage)))
 
 
 def check_effects(added: Any) -> tuple[Effect, ...]:
     """
-    Return effects that are added to a sensor's own as a tuple.
+    Validate additional effects of a sensor and return them as a tuple.
 
     Raises
     ------
     ParameterError
-        When one does not fulfil the contract, or its name is taken.
+        If an effect violates the contract, or its name is not unique.
     """
     if not isinstance(added, list | tuple):
-        raise ParameterError("effects", "must be a list of effects", added)
+        raise ParameterError("effects", "must be a list of Effect objects", added)
     taken = {*BUILT, *RESERVED}
     for effect in added:
         if not isinstance(effect, Effect):
-            raise ParameterError("effects", "must be foveasim.sensor.effects.Effect objects", effect)
+            raise ParameterError("effects", "must contain only foveasim.sensor.effects.Effect objects", effect)
         for attribute, kind in (("name", str), ("stage", str), ("is_temporal", bool)):
             if not isinstance(getattr(effect, attribute, None), kind):
                 raise ParameterError(
-                    "effects", f"must have a class attribute '{attribute}' of type {kind.__name__}", effect
+                    "effects", f"must define the class attribute '{attribute}' of type {kind.__name__}", effect
                 )
         if effect.name in taken:
-            raise ParameterError("effects", f"must have names that no other effect has, got two '{effect.name}'")
+            raise ParameterError("effects", f"must have unique names, got '{effect.name}' twice")
         taken.add(effect.name)
         if effect.stage not in STAGES or effect.stage == "collection":
             stages = ", ".join(stage for stage in STAGES if stage != "collection")
-            raise ParameterError("effects", f"must have a stage of {stages}; '{effect.name}' has '{effect.stage}'")
+            raise ParameterError("effects", f"must have a stage from {stages}; '{effect.name}' has '{effect.stage}'")
         if effect.is_temporal and effect.stage in FIXED_STAGES:
             raise ParameterError(
                 "effects",
                 f"before collection must be fixed, but '{effect.name}' at the stage '{effect.stage}' is temporal; "
-                "give it the stage 'charge'",
+                "use the stage 'charge'",
             )
     return tuple(added)
 
 
 def check_names(names: Any, effects: Iterable[Effect]) -> tuple[str, ...]:
     """
-    Return names of effects as a tuple.
+    Validate names of effects and return them as a tuple.
 
     Raises
     ------
     ParameterError
-        When one is not the name of an effect; with the closest name.
+        If a name is not that of an effect; the message suggests the closest name.
     """
     if isinstance(names, str):
         names = (names,)
@@ -159,12 +163,12 @@ def check_names(names: Any, effects: Iterable[Effect]) -> tuple[str, ...]:
     try:
         names = tuple(names)
     except TypeError:
-        raise ParameterError("disabled", "must be names of effects", names) from None
+        raise ParameterError("disabled", "must contain names of effects", names) from None
     for name in names:
         if name not in known:
             closest = get_close_matches(str(name), known, n=1)
             hint = f"did you mean '{closest[0]}'?" if closest else f"the effects are {', '.join(known)}"
-            raise ParameterError("disabled", "must be names of effects", name, hint=hint)
+            raise ParameterError("disabled", "must contain names of effects", name, hint=hint)
     return names
 
 
@@ -179,23 +183,23 @@ def run(
     last: Callable[[Any, Sites, NDArray[Any]], None] | None = None,
 ) -> NDArray[Any]:
     """
-    Run values of all sites through steps of the chain.
+    Apply steps of the chain to the values of all sites.
 
     Parameters
     ----------
     steps : iterable of Step
     values : (n_site,)
-        Not changed.
+        Not modified.
     sites : Sites
         All sites.
     streams : Streams, optional
-        Of the frame; needed where a step is temporal.
+        Random streams of the frame; required for temporal steps.
     n_threads : int, optional
-        All cores by default. Results do not depend on it.
+        Number of threads; all cores by default. Results do not depend on it.
     out : (n_site,), optional
-        Array for the result; float64 by default.
+        Array for the result; a float64 array by default.
     last : callable, optional
-        Called as ``last(values, sites, out)`` for each piece, to write into its part of ``out``.
+        Called as ``last(values, sites, out)`` for each piece of sites; it writes to that part of ``out``.
 
     Returns
     -------
@@ -220,11 +224,11 @@ def run(
 
 
 def _applied(step: Step, values: Any, sites: Sites, rng: Any) -> Any:
-    """Values after a step, one for each site."""
+    """Apply a step and check the shape of its result."""
     found = step.apply(values, sites=sites, rng=rng)
     if getattr(found, "shape", None) != values.shape:
         raise SimulationError(
-            f"the effect '{step.name}' must return an array of the shape {values.shape}, got "
+            f"the effect '{step.name}' must return an array of shape {values.shape}, got "
             f"{getattr(found, 'shape', type(found).__name__)}; check its apply()"
         )
     return found
@@ -239,7 +243,7 @@ def _pass(
     streams: Streams | None,
     n_threads: int | None,
 ) -> NDArray[Any]:
-    """Run values through local steps, piece by piece, so that all steps of a piece find it in the cache."""
+    """Apply local steps piece by piece, so that each piece stays in the cache for all steps."""
 
     def block(number: int, whole: slice) -> None:
         rngs: list[Any] = [

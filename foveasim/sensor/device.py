@@ -1,19 +1,19 @@
 """
-What makes one device differ from the next of its kind: patterns that are fixed from its making on.
+Fixed patterns of a device: random numbers per site that do not change between frames.
 
-Every number hangs on the seed of the device, the name of the effect, and the place of the site (or the number of its line)
-alone, by a counter-based generator: so a crop of a layout, its sites in another order, another frame or another number of
-workers see the same device.
+A counter-based generator computes each number from the seed of the device, the name of the effect and the identity of the site
+(or the number of its readout line). Crops of a layout, permutations of its sites, other frames and other numbers of workers
+therefore give the same device.
 
-The place of a site is its centroid. Of sites that do not overlap, at most one contains the centroid that they share, as a disc
-does among concentric rings. A site that surrounds its centroid without containing it (a ring, a C) therefore has its outline
-as its place: the positions of all its vertices, in any order. So rings of one centroid are different sites, and each is the
-same device with or without the others.
+The identity of a site is its centroid. Of non-overlapping sites that share a centroid, at most one contains it, for example the
+disc among concentric rings. The identity of a site that surrounds its centroid without containing it (a ring, a C shape) is
+therefore its outline: the positions of all its vertices, in any order. Concentric rings are thus distinct sites, and each has
+the same numbers with or without the others.
 
-An arc of up to 180 degrees, as of a log-polar layout of few sectors, does not contain its centroid either, but another site's
-centroid is there by a rare coincidence only. Its place is its centroid, unless the layout has that other site: of such a pair
-alone, the arc is another device where it is cropped out. Two sites with equal outlines are one site that is listed twice, and
-have the same numbers, unless a column ``site_id`` distinguishes them.
+An arc of up to 180 degrees, as in log-polar layouts with few sectors, does not contain its centroid either, but the centroid of
+another site rarely coincides with it. The identity of an arc is its centroid, unless the layout contains such a coinciding
+site; only then the numbers of the arc change when it is cropped out of the layout. Two sites with equal outlines have the same
+numbers, unless a column ``site_id`` distinguishes them.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from foveasim.fields import PackedRings
 
 __all__ = ["SITE_ID", "Device"]
 
-#: A column of this name, of integers, tells sites apart in place of where they are.
+#: Name of an integer column that identifies sites instead of their positions.
 SITE_ID = "site_id"
-#: Sites are distinguished by where their centroids lie, in units of this; vertices of outlines, too.
+#: Resolution of the centroids and vertices that identify sites.
 PLACE_UM = 1e-4
-#: Unit vectors of eight rays, off the axes: an opening is often on one.
+#: Unit vectors of eight rays, off the axes because the openings of C shapes are often on an axis.
 _ANGLES_RAD = 2.0 * np.pi * np.arange(8) / 8.0 + 0.3
 RAYS = read_only(np.stack((np.cos(_ANGLES_RAD), np.sin(_ANGLES_RAD)), axis=1))
-#: A site that meets as many of them as this from its centroid surrounds it: a thin arc of 180 degrees covers 245 of 360.
+#: Minimum number of rays from the centroid that intersect a surrounding site; a thin arc of 180 degrees covers 245 of 360.
 FEWEST_RAYS_AROUND = 6
 
 Words = NDArray[np.uint64]
@@ -49,14 +49,14 @@ Words = NDArray[np.uint64]
 @dataclass(frozen=True, eq=False)
 class Device:
     """
-    The fixed patterns of a device.
+    Source of the fixed patterns of a device.
 
     Parameters
     ----------
     seed : int
-        Of the device.
+        Seed of the device.
     layout : packed rings with ``columns``
-        Its sites.
+        Sites of the device.
     """
 
     seed: int
@@ -64,14 +64,14 @@ class Device:
 
     @cached_property
     def _sites(self) -> tuple[Words, Words]:
-        """Two words for every site, that no site of another outline has."""
+        """Two words per site that identify it."""
         from foveasim.sensor import _kernels
 
         columns: Any = getattr(self.layout, "columns", {})
         if SITE_ID in columns:
             given = columns[SITE_ID]
             if given.dtype.kind not in "iu":
-                raise ParameterError(SITE_ID, f"is a column of the layout, and must hold integers, got {given.dtype}")
+                raise ParameterError(SITE_ID, f"must be a layout column of integers, got {given.dtype}")
             ids = np.ascontiguousarray(given).astype(np.int64)
             return ids.view(np.uint64), np.full(ids.size, 1 << 63, np.uint64)
         rings = self.layout.xy_um, self.layout.ring_offsets, self.layout.site_offsets
@@ -88,34 +88,34 @@ class Device:
         return x, y
 
     def key(self, effect: str) -> tuple[np.uint64, np.uint64]:
-        """Key of an effect's numbers."""
+        """Return the generator key of an effect."""
         return device_key(self.seed, effect)
 
     def uniforms(self, effect: str) -> Floats:
-        """A number between 0 and 1 for every site, (n_site,)."""
+        """Return a uniform number in (0, 1) for each site, (n_site,)."""
         from foveasim.sensor import _kernels
 
         out: Floats = _kernels.device_uniforms(*self.key(effect), *self._sites)
         return out
 
     def normals(self, effect: str) -> Floats:
-        """A number of the standard Gaussian distribution for every site, (n_site,)."""
+        """Return a standard Gaussian number for each site, (n_site,)."""
         from scipy.special import ndtri
 
         return np.asarray(ndtri(self.uniforms(effect)))
 
     def log_normals(self, effect: str, spread_fraction: float) -> Floats:
         """
-        A number of the log-normal distribution for every site, (n_site,).
+        Return a log-normal number for each site, (n_site,).
 
-        The mean is 1 and the standard deviation ``spread_fraction``: the logarithm is a Gaussian of the variance
-        ``s² = ln(1 + spread_fraction²)`` and the mean ``-s² / 2``.
+        The mean is 1 and the standard deviation ``spread_fraction``: the logarithm is Gaussian with variance
+        ``s² = ln(1 + spread_fraction²)`` and mean ``-s² / 2``.
         """
         sigma = np.sqrt(np.log1p(spread_fraction**2))
         return np.asarray(np.exp(sigma * self.normals(effect) - 0.5 * sigma**2))
 
     def line_normals(self, effect: str, lines: Ints) -> Floats:
-        """A number of the standard Gaussian distribution for each of some lines."""
+        """Return a standard Gaussian number for each given readout line."""
         from scipy.special import ndtri
 
         from foveasim.sensor import _kernels
@@ -124,12 +124,12 @@ class Device:
         return np.asarray(ndtri(_kernels.device_uniforms(*self.key(effect), words, np.zeros_like(words))))
 
 
-#: Odd factors of the two words of an outline, and of its coordinates (fractions of 2**64 of the golden ratio and others).
+#: Odd multipliers for the two words of an outline and for its coordinates (the first is 2**64 over the golden ratio).
 _FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 
 
 def _outline_words(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints, sites: Ints) -> tuple[Words, Words]:
-    """Two words for the outlines of some sites: sums over vertices of a hash of each, whatever vertex is the first."""
+    """Hash the outlines of sites to two words each, independent of the vertex order."""
     begins, ends = ring_offsets[site_offsets[sites]], ring_offsets[site_offsets[sites + 1]]
     lengths = ends - begins
     if not sites.size:
@@ -145,7 +145,7 @@ def _outline_words(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints, sites:
 
 
 def _mixed(words: Words) -> Words:
-    """Words whose bits all hang on all bits: the last steps of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014)."""
+    """Mix the bits of words: finaliser of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014)."""
     words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return words ^ (words >> np.uint64(31))

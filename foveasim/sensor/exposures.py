@@ -1,8 +1,8 @@
 """
-Several readings of the same sites: exposures merged for a high dynamic range, and reads along one exposure.
+Multiple reads of the same sites: HDR merge of several exposures, and up-the-ramp reads.
 
-Both estimate electrons per second by weights of inverse variance. Shot noise enters the weights by an estimate that all
-readings share, never by a reading's own value, which would favour readings that are low by chance.
+Both estimate electrons per second with inverse-variance weights. The shot noise in the weights is computed from an estimate
+common to all reads; weights from individual reads would favour those that are low by chance and bias the result.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from foveasim.sensor.sensor import Sensor
 
 __all__ = ["Ramp", "Rates", "fit_ramp", "merge_exposures", "non_destructive_reads"]
 
-#: A reading is saturated where it is within so many standard deviations of the noise of reading of the full well.
+#: A read counts as saturated within this number of read-noise standard deviations of the full well.
 MARGIN_SIGMAS = 5.0
-#: Weights fall to 0 over this last fraction of the range: wide against shot noise, for a charge of more than 400 e-.
+#: Final fraction of the range over which weights taper to 0: wide compared with shot noise for charges above 400 e-.
 TAPER_SHARE = 0.25
-#: Times that weights are taken from the merged estimate.
+#: Number of iterations of the weights from the merged estimate.
 N_PASSES = 2
 
 
 @dataclass(frozen=True, eq=False)
 class Rates:
     """
-    Estimates of electrons per second.
+    Estimated charge rates, in electrons per second.
 
     Attributes
     ----------
     rate_e_per_s : (n_site,) float64, e-/s
-        NaN where no reading could be used.
+        NaN for sites without usable reads.
     sigma_e_per_s : (n_site,) float64, e-/s
-        Standard deviation that the weights predict: the inverse root of the sum of inverse variances.
+        Predicted standard deviation: the inverse square root of the sum of inverse variances.
     n_used : (n_site,) int64
-        Number of readings that were used.
+        Number of reads used.
     """
 
     rate_e_per_s: Floats
@@ -58,14 +58,14 @@ class Rates:
 @dataclass(frozen=True, eq=False)
 class Ramp:
     """
-    Reads along one exposure.
+    Up-the-ramp reads of one exposure.
 
     Attributes
     ----------
     times_s : (n_read,) float64, s
-        Of the reads, since the reset.
+        Times of the reads since the reset.
     electrons : (n_read, n_site) int64, e-
-        Charge collected so far, without the noise of resetting and reading.
+        Charge collected up to each read, without reset noise and read noise.
     code : (n_read, n_site) uint8 or uint16, DN
     """
 
@@ -84,19 +84,19 @@ def merge_exposures(
     code: ArrayLike, exposures_s: ArrayLike, sensor: Sensor, *, calibration: Calibration | None = None
 ) -> Rates:
     """
-    Electrons per second of several exposures of the same light.
+    Merge several exposures of the same scene into charge rates (HDR merge).
 
     Parameters
     ----------
     code : (n_exposure, n_site), DN
-        Codes as the sensor gives them, one row an exposure; not changed.
+        Codes of the sensor, one row per exposure; not modified.
     exposures_s : (n_exposure,), s
-        In any order.
+        Exposure times, in any order.
     sensor : Sensor
-        Its converter, capacitances, full well and noises count.
+        Its ADC, capacitances, full well and noise are used.
     calibration : Calibration, optional
-        Takes offsets, dark signal and differences of gain out of the codes. Without one a linear code y is
-        ``y + 1/2`` codes of charge, dark charge is part of the rate, and the sensor's offsets are errors.
+        Calibration for the correction of offsets, dark signal and gain differences. Without one, a linear code y corresponds
+        to a charge of ``y + 1/2`` codes, the dark signal is part of the rate, and offsets of the sensor are errors.
 
     Returns
     -------
@@ -105,9 +105,9 @@ def merge_exposures(
     Raises
     ------
     ParameterError
-        When codes, exposures and sensor do not fit together, or a value is out of range.
+        If codes, exposure times and sensor do not match, or a value is out of range.
     SimulationError
-        When the calibration does not know the dark signal of an exposure.
+        If the calibration does not contain the dark signal of an exposure time.
 
     Notes
     -----
@@ -117,34 +117,36 @@ def merge_exposures(
 
         v_j = r t_j + dark charge + read² + reset² + rts² / 4 + step² (1/12 + dnl²)
 
-    with ``rts`` on the device's RTS sites and ``step`` the width of the code, and
+    with ``rts`` on the device's RTS sites and ``step`` the width of the code. The rate is
 
     ::
 
         r = sum_j w_j N_j / t_j / sum_j w_j,    w_j = a_j t_j² / v_j
 
-    with the shot noise of the common r: first ``sum a N / sum a t``, then twice the result. Below saturation ``a = 1``: weights
-    are the inverse variances, and the result's variance is the inverse of their sum (the likeliest r for Gaussian noise; see
-    Granados et al., Optimal HDR reconstruction with linear digital cameras, CVPR 2010).
+    with the shot noise of the common r: initially ``sum a N / sum a t``, followed by two iterations with the result. Below
+    saturation ``a = 1``: the weights are inverse variances, and the variance of the result is the inverse of their sum. This
+    is the maximum-likelihood estimate for Gaussian noise (Granados et al., Optimal HDR reconstruction with linear digital
+    cameras, CVPR 2010).
 
-    Never used are the highest code, and codes within five standard deviations of the full well's. That alone would keep
-    exposures near saturation only when they are low by chance. So ``a`` falls from 1 to 0 over the last quarter of the range,
-    and what is left of this selection is taken off: a weight a(x) that depends on the Gaussian number x itself moves the mean
-    by ``variance * E[a'(x)]`` (C. Stein, Annals of Statistics 9, 1135, 1981). There the predicted variance is that of the
-    result's slopes in all exposures; within two standard deviations of saturation it is too large, by up to a third.
+    The highest code and codes within five standard deviations of the full well are never used. This criterion alone would
+    select exposures near saturation only if they are low by chance. The weight ``a`` therefore tapers from 1 to 0 over the
+    last quarter of the range, and the remaining selection bias is subtracted: a weight a(x) that depends on the Gaussian
+    variable x itself shifts the mean by ``variance * E[a'(x)]`` (C. Stein, Annals of Statistics 9, 1135, 1981). In the taper,
+    the predicted variance follows from the derivatives of the result with respect to all exposures; within two standard
+    deviations of saturation it is too large by up to a third.
 
-    Codes of 0 are clipped noise: without a pedestal above the read noise, dark sites come out too bright.
+    Noise is clipped at code 0: without a pedestal above the read noise, the rates of dark sites are too high.
 
     Examples
     --------
-    A site of 5000 e-/s in two exposures; the second is saturated at 1000 e-:
+    A site with 5000 e-/s in two exposures, of which the second is saturated at 1000 e-:
 
     >>> import foveasim as fs
     >>> sensor = fs.Sensor(fs.layout.grid(n_x=1, n_y=1, pitch_um=2.0), bits=10, v_sat_v=1.0, capacitance_f=1.6406288e-16)
     >>> merge_exposures([[499.5], [1023]], [0.1, 10.0], sensor).rate_e_per_s.round(1).tolist()
     [5000.0]
 
-    Large and small sites side by side (sub-pixel HDR) are two classes of sites, here of the sensitivities 1 and 0.1:
+    Adjacent large and small sites (sub-pixel HDR) are two classes of sites, here with sensitivities 1 and 0.1:
 
     >>> sensor = fs.Sensor(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0), bits=10, v_sat_v=1.0, capacitance_f=1.6406288e-16)
     >>> rates, sensitivity = merge_exposures([[1023, 499.5]], [0.1], sensor), np.array([1.0, 0.1])
@@ -196,26 +198,26 @@ def merge_exposures(
     )
 
 
-# -- reads along one exposure -----------------------------------------------------------------------------------------
+# -- up-the-ramp reads ------------------------------------------------------------------------------------------------
 
 
 def non_destructive_reads(
     sensor: Sensor, photo_e_per_s: ArrayLike, times_s: ArrayLike, *, streams: Streams, n_threads: int | None = None
 ) -> Ramp:
     """
-    Reads of one charge while it collects.
+    Simulate non-destructive reads during one exposure.
 
     Parameters
     ----------
     sensor : Sensor
     photo_e_per_s : number or (n_site,), e-/s
-        As :meth:`foveasim.Camera.photoelectrons_per_s` gives it.
+        Photoelectron rate, as from :meth:`foveasim.Camera.photoelectrons_per_s`.
     times_s : (n_read,), s
-        Of the reads since the reset, rising.
+        Times of the reads since the reset, strictly increasing.
     streams : Streams
-        Of the frame.
+        Random streams of the frame.
     n_threads : int, optional
-        All cores by default. Draws do not depend on it.
+        Number of threads; all cores by default. Draws do not depend on it.
 
     Returns
     -------
@@ -224,13 +226,14 @@ def non_destructive_reads(
     Raises
     ------
     ParameterError
-        When times do not rise, or there is not one rate a site.
+        If the times do not increase, or the number of rates is not the number of sites.
 
     Notes
     -----
-    What comes between two reads is drawn by itself and added, then the full well cuts off: later charges contain earlier ones,
-    ``cov(N_i, N_j) = E[N_i]`` for ``i <= j``, and increments are uncorrelated. Noise of reading is drawn for each read; that of
-    resetting once, the same in all reads. The state of RTS sites is drawn for each read, as if it were fast.
+    The charge collected between two reads is drawn independently and added, then clipped at the full well. Later charges
+    include earlier ones, ``cov(N_i, N_j) = E[N_i]`` for ``i <= j``, and increments are uncorrelated. Read noise is drawn for
+    each read; reset noise is drawn once and is the same in all reads. The state of RTS sites is drawn for each read, which
+    assumes fast switching.
 
     Examples
     --------
@@ -252,7 +255,7 @@ def non_destructive_reads(
     well_e = np.minimum(sensor.well_e, LARGEST_CHARGE_E).astype(np.int64)
     at_reset = [effect for effect in sensor.chain if effect.is_drawn_at_reset]
     reset_e = run(at_reset, np.zeros(n_sites), sites=sensor.sites, streams=streams, n_threads=n_threads)
-    # What is drawn at the reset is in the charge already.
+    # Noise drawn at the reset is already part of the charge.
     reader = sensor.without(*(effect.name for effect in at_reset)) if at_reset else sensor
     electrons = np.empty((times.size, n_sites), np.int64)
     codes = []
@@ -276,44 +279,44 @@ def fit_ramp(
     code: ArrayLike, times_s: ArrayLike, sensor: Sensor, *, weight_rate_e_per_s: ArrayLike | None = None
 ) -> Rates:
     """
-    Slopes of ramps: electrons per second of reads along one exposure.
+    Fit the slopes of up-the-ramp reads, in electrons per second.
 
     Parameters
     ----------
     code : (n_read, n_site), DN
-        Codes as the sensor gives them; not changed.
+        Codes of the sensor; not modified.
     times_s : (n_read,), s
-        Rising.
+        Times of the reads, strictly increasing.
     sensor : Sensor
-        Its converter, capacitances, full well, read noise and RTS sites count.
+        Its ADC, capacitances, full well, read noise and RTS sites are used.
     weight_rate_e_per_s : number or (n_site,), optional, e-/s
-        Rate that the weights are of; by default each site's own, from its first and last usable read.
+        Rate for the shot noise in the weights; by default each site's rate from its first and last usable reads.
 
     Returns
     -------
     Rates
-        Dark charge is part of the rate. NaN where fewer than two reads could be used.
+        The dark signal is part of the rate. NaN for fewer than two usable reads.
 
     Raises
     ------
     ParameterError
-        When codes, times and sensor do not fit together, or a value is out of range.
+        If codes, times and sensor do not match, or a value is out of range.
 
     Notes
     -----
-    Differences of one read and the next have no offset and no noise of resetting. Their covariance has ``r dt_k + 2 s²`` on the
-    diagonal and ``-s²`` off it, with the noise s of reading, of RTS sites and of conversion; the slope is the one of
-    generalised least squares, solved in time proportional to the reads (T. D. Brandt, PASP 136, 045004, 2024;
-    arXiv:2309.08753).
+    Differences of consecutive reads contain neither offset nor reset noise. Their covariance matrix is tridiagonal with
+    ``r dt_k + 2 s²`` on the diagonal and ``-s²`` next to it, where s combines read, RTS and conversion noise. The slope is the
+    generalised least-squares solution, computed in time proportional to the number of reads (T. D. Brandt, PASP 136, 045004,
+    2024; arXiv:2309.08753).
 
-    For given ``weight_rate_e_per_s`` the slope is a fixed sum of the reads, and so unbiased; for weights of the site's own
-    rate it is off by a fraction of an electron a ramp.
+    For a given ``weight_rate_e_per_s`` the slope is a fixed linear combination of the reads, and therefore unbiased; for
+    weights from the site's own rate the bias is a fraction of an electron per ramp.
 
-    Reads count up to the first that is saturated (the highest code, or within five standard deviations of the full well's).
+    Reads are used up to the first saturated one (highest code, or within five standard deviations of the full well).
     """
     times = _rising("times_s", times_s)
     if times.size < 2:
-        raise ParameterError("times_s", "must be at least two times", times_s, "s")
+        raise ParameterError("times_s", "must have at least two values", times_s, "s")
     codes, linear_dn, e_per_dn = _readings(code, times.size, sensor, "read")
     n_sites = sensor.layout.n_sites
     charge_e = linear_dn * e_per_dn
@@ -363,31 +366,35 @@ def _protect(carrier: Any) -> None:
 def _rising(name: str, times_s: ArrayLike) -> Floats:
     times = check_plausible_array(name, times_s, ndim=1)
     if times.size == 0 or np.any(np.diff(times) <= 0.0):
-        raise ParameterError(name, "must be one or more times, each later than the one before", times_s, "s")
+        raise ParameterError(name, "must be one or more strictly increasing times", times_s, "s")
     return times
 
 
 def _readings(code: ArrayLike, n_readings: int, sensor: Sensor, what: str) -> tuple[Floats, Floats, Floats]:
-    """Codes (n_reading, n_site), linear codes, and electrons of one."""
+    """Return codes (n_reading, n_site), linear codes, and electrons per linear code."""
     linear_dn = linearise(code, sensor)
     codes = as_numbers("code", code)
     if codes.shape != (n_readings, sensor.layout.n_sites):
         raise ParameterError(
             "code",
-            f"must have a row for each {what} and a column for each site, {(n_readings, sensor.layout.n_sites)}, "
+            f"must have one row per {what} and one column per site, {(n_readings, sensor.layout.n_sites)}, "
             f"got the shape {codes.shape}",
         )
     return codes, linear_dn, nominal_e_per_dn(sensor)
 
 
 def _conversion_noise_e2(sensor: Sensor, codes: NDArray[Any], e_per_dn: Floats) -> Floats:
-    """Variance of conversion to codes, (n_reading, n_site) e-²: wider codes err more."""
+    """Return the variance of conversion from the width of each code, (n_reading, n_site) e-²."""
     step_e = sensor.converter.width_of_code_dn(codes) * e_per_dn
     return np.asarray(step_e**2 * sensor.converter.noise_dn2)
 
 
 def _saturation_dn(sensor: Sensor) -> Floats:
-    """Linear code from which a site is taken as saturated: the highest, or its full well's, less the noise of its readout."""
+    """
+    Return the linear code above which a site counts as saturated, (n_site,) DN.
+
+    It is the highest code, or the code of the full well minus a margin for readout noise.
+    """
     n_sites = sensor.layout.n_sites
     top_dn = np.full(n_sites, float(linearise(2**sensor.bits - 1, sensor)))
     if sensor.full_well_e is None:
@@ -400,7 +407,7 @@ def _saturation_dn(sensor: Sensor) -> Floats:
 
 
 def _solved(diagonal: Floats, beside: Floats, right: Floats) -> Floats:
-    """Solutions of symmetric tridiagonal systems, one a column: elimination downwards, then upwards."""
+    """Solve symmetric tridiagonal systems, one per column, by the Thomas algorithm."""
     n = diagonal.shape[0]
     pivot, solved = diagonal.copy(), right.copy()
     for k in range(1, n):

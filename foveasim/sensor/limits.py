@@ -1,7 +1,7 @@
 """
-Plausible ranges of the parameters of sensors and of their exposures: one table for all.
+Plausible ranges of sensor and exposure parameters, in one table.
 
-A value outside its range is a slip of units or of digits. The ranges are wide: no sensor in use reaches their ends.
+Values outside these ranges indicate errors of units or digits. The ranges are wide: no sensor in use reaches their limits.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from foveasim.errors import ParameterError
 
 __all__ = ["LIMITS", "MAX_SPREAD", "Limits", "check_plausible", "check_plausible_array"]
 
-#: A wider Gaussian spread about 1 has more than one in 2,300 values below 0, where it is cut off.
+#: Maximum relative standard deviation of Gaussian factors: 1 in 2,300 values is then below 0 and clipped.
 MAX_SPREAD = 0.3
-_GAUSSIAN = "0.03 is 3 %; a Gaussian spread above 0.3 would be cut off at 0"
+_GAUSSIAN = "0.03 is 3 %; a Gaussian distribution with a standard deviation above 0.3 would be clipped at 0"
 _ELECTRONS = "charges are in electrons: 1 fC is 6242 e-"
 _RATES = "rates are in electrons per second: 1 fA is 6242 e-/s"
 _SECONDS = "times are in seconds: 1 ms is 1e-3"
@@ -32,18 +32,18 @@ _PER_SECOND = "rates are per second and photosite"
 @dataclass(frozen=True, kw_only=True)
 class Limits:
     """
-    A plausible range.
+    Plausible range of a parameter.
 
     Parameters
     ----------
     high : float
         Largest plausible value, in the parameter's unit.
     low : float
-        Smallest plausible value; below 0 only where values of both signs are.
+        Smallest plausible value; negative only for parameters of both signs.
     is_positive : bool
-        Whether 0 is outside; otherwise it is inside, whatever ``low`` is.
+        Whether 0 is excluded; otherwise 0 is valid for any ``low``.
     hint : str
-        Reminder of the unit, for the message.
+        Reminder of the unit, for error messages.
     """
 
     high: float
@@ -53,7 +53,7 @@ class Limits:
 
     @property
     def rule(self) -> str:
-        """The range as a message states it."""
+        """Rule of the range for error messages."""
         if self.low == 0.0:
             return f"must be <= {self.high:g}"
         is_apart = self.low > 0.0 and not self.is_positive
@@ -62,20 +62,20 @@ class Limits:
 
 _FRACTION = Limits(high=1.0, hint="fractions are from 0 to 1")
 _SPREAD = Limits(high=MAX_SPREAD, hint=_GAUSSIAN)
-#: Of log-normal distributions.
-_WIDE_SPREAD = Limits(high=10.0, hint="a standard deviation over the mean: 0.1 is 10 %")
+#: Relative standard deviation of log-normal distributions.
+_WIDE_SPREAD = Limits(high=10.0, hint="the value is the ratio of standard deviation to mean: 0.1 is 10 %")
 _RATE_E = Limits(high=1e15, hint=_RATES)
 _CHARGE_E = Limits(high=1e15, hint=_ELECTRONS)
-#: A microfarad at room temperature has a reset noise of 4e5 e-.
+#: For comparison: the reset noise of a microfarad at room temperature is 4e5 e-.
 _NOISE_E = Limits(high=1e7, hint=_ELECTRONS)
 _TIME_S = Limits(low=1e-12, high=1e7, hint=_SECONDS)
 _DURATION_S = Limits(low=1e-12, high=1e7, is_positive=True, hint=_SECONDS)
 _EVENTS = Limits(high=1e9, hint=_PER_SECOND)
-#: Thresholds below 1e-3 are below the noise of any circuit, and their events beyond any memory.
-_CONTRAST = Limits(low=1e-3, high=20.0, is_positive=True, hint="contrasts are of natural logarithms: 0.2 is 22 %")
+#: Thresholds below 1e-3 are below the noise of any circuit, and would emit too many events for memory.
+_CONTRAST = Limits(low=1e-3, high=20.0, is_positive=True, hint="contrasts are natural logarithms: 0.2 is 22 %")
 _OFFSET = Limits(high=1.0, hint="offsets are fractions of v_sat_v: 0.02 is 2 %")
 
-#: By the names of keywords; where two classes have one name for different things, the class comes first.
+#: Ranges by keyword; keywords with different meanings in two classes are prefixed with the class.
 LIMITS: Mapping[str, Limits] = MappingProxyType(
     {
         # Sensor
@@ -83,7 +83,7 @@ LIMITS: Mapping[str, Limits] = MappingProxyType(
         "hot_fraction": _FRACTION,
         "dead_fraction": _FRACTION,
         "rts_fraction": _FRACTION,
-        "nonlinearity_fraction": Limits(high=0.5, hint="above 0.5 the voltage would fall with charge"),
+        "nonlinearity_fraction": Limits(high=0.5, hint="above 0.5 the voltage would decrease with charge"),
         "prnu_fraction": _SPREAD,
         "gain_fpn_fraction": _SPREAD,
         "dsnu_fraction": _WIDE_SPREAD,
@@ -137,20 +137,20 @@ LIMITS: Mapping[str, Limits] = MappingProxyType(
 
 def check_plausible(name: str, value: object, *, of: str = "") -> float:
     """
-    Return the value as a float within its plausible range.
+    Return the value as a float after checking its plausible range.
 
     Parameters
     ----------
     name : str
-        The keyword, a key of :data:`LIMITS`.
+        Keyword, a key of :data:`LIMITS`.
     value : object
     of : str
-        Class of the keyword, where the table has one of its own for it.
+        Class of the keyword, for keywords that are prefixed with their class in the table.
 
     Raises
     ------
     ParameterError
-        When it is not one finite number, negative, or outside the range; the message names range and unit.
+        If the value is not one finite number, or outside the range; the message states range and unit.
     """
     limits = LIMITS[f"{of}.{name}" if of else name]
     number = check_number(name, value, above=0.0 if limits.is_positive else None, at_least=0.0, hint=limits.hint)
@@ -160,20 +160,20 @@ def check_plausible(name: str, value: object, *, of: str = "") -> float:
 
 def check_plausible_array(name: str, value: ArrayLike, *, ndim: int | None = None) -> NDArray[np.float64]:
     """
-    Return the values as a float64 array within their plausible range.
+    Return the values as a float64 array after checking their plausible range.
 
     Parameters
     ----------
     name : str
-        The keyword, a key of :data:`LIMITS`.
+        Keyword, a key of :data:`LIMITS`.
     value : array_like
     ndim : int, optional
-        Number of dimensions; any by default.
+        Required number of dimensions; any by default.
 
     Raises
     ------
     ParameterError
-        When a value is not finite, negative, or outside the range; the message names the first one's index.
+        If a value is not finite, or outside the range; the message states the index of the first such value.
     """
     limits = LIMITS[name]
     least = 0.0 if limits.low >= 0.0 else None

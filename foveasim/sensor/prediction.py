@@ -1,4 +1,4 @@
-"""The chain without draws: moments of charges and voltages, and how charges become voltages to first order."""
+"""Analytic sensor chain: moments of charges, and a first-order model of the readout."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from foveasim.sensor.effects.contract import Effect, Sites
 
 __all__ = ["ChargeDistributions", "Quadrature", "ReadoutModel", "Transfer", "cut_off", "quadrature", "readout_model"]
 
-#: Points of the quadrature over a charge that the full well cuts off.
+#: Number of quadrature nodes for charges clipped at the full well.
 QUADRATURE_NODES = 96
-#: Least slope of a bent response at its end, relative to that at 0.
+#: Minimum slope of a nonlinear response, relative to the slope at zero signal.
 LEAST_SLOPE = 1e-6
 
 
 class ChargeDistributions(NamedTuple):
-    """Distributions of charges as the kernels take them: read-only arrays (n,) or (1,)."""
+    """Charge distributions for the kernels: read-only arrays (n,) or (1,)."""
 
     mean_e: Floats
     variance_e2: Floats
@@ -33,9 +33,10 @@ class ChargeDistributions(NamedTuple):
 
 class Transfer(NamedTuple):
     """
-    Way from a charge to the voltage at the ADC, as the kernels take it: read-only arrays (n,) or (1,).
+    Transfer function from charge to ADC voltage, for the kernels.
 
-    ``v = bent(charge * v_per_e + sense_v) * scale + output_v``.
+    ``v = f(charge * v_per_e + sense_v) * scale + output_v``, with the response nonlinearity f. Arrays are read-only, (n,) or
+    (1,).
     """
 
     v_per_e: Floats
@@ -47,7 +48,7 @@ class Transfer(NamedTuple):
 
 
 class Quadrature(NamedTuple):
-    """Gauss-Legendre points and weights from -1 to 1."""
+    """Gauss-Legendre nodes and weights on the interval -1 to 1."""
 
     points: Floats
     weights: Floats
@@ -55,20 +56,20 @@ class Quadrature(NamedTuple):
 
 class ReadoutModel(NamedTuple):
     """
-    How collected charges become voltages, to first order at their means.
+    First-order model of the readout at the mean collected charges.
 
     Attributes
     ----------
     mean_e, variance_e2 : (..., n_site), e- and e-²
         Moments of the charges after effects that mix sites, such as inter-pixel capacitance.
     is_mixed : bool
-        Whether such an effect acted, so that charges are no longer Poisson distributed.
+        Whether such an effect is present, so that charges are no longer Poisson-distributed.
     transfer : Transfer
-        Of these charges; effects of the signal chain are in it.
+        Transfer function of these charges, including effects of the signal chain.
     gaussian_e2 : (..., n_site) or (1,), e-²
         Variance of the Gaussian temporal noise of the readout, referred to the charge.
     half_step_e : (..., n_site) or (1,), e-
-        Half the distance of two equally probable states, referred to the charge.
+        Half the difference between two equally probable (RTS) states, referred to the charge.
     """
 
     mean_e: Floats
@@ -80,12 +81,12 @@ class ReadoutModel(NamedTuple):
 
     @property
     def noise_e2(self) -> Floats:
-        """Variance of all temporal noise of the readout, referred to the charge, e-²."""
+        """Variance of the total temporal noise of the readout, referred to the charge, e-²."""
         return np.asarray(self.gaussian_e2 + self.half_step_e**2)
 
 
 class _Linear:
-    """The effects of one stage to first order: ``factor * value + offset``, noise, and a step of two states."""
+    """First-order model of a stage: ``factor * value + offset``, Gaussian and RTS noise."""
 
     def __init__(self, effects: Iterable[Effect], mean: Floats, variance: Floats, sites: Sites) -> None:
         self.factor, self.offset = np.ones(1), np.zeros(1)
@@ -105,7 +106,7 @@ class _Linear:
             self.offset = mean - factor * (self.mean - self.offset)
             self.factor = factor * self.factor
             self.noise = factor**2 * self.noise + added
-            # Without a device, fixed patterns are unknown; they are no temporal noise.
+            # Without a device, fixed patterns are unknown, but do not contribute to temporal noise.
             self.mean, self.variance = mean, factor**2 * self.variance + added
 
 
@@ -123,7 +124,7 @@ def readout_model(
     pedestal_v: float,
 ) -> ReadoutModel:
     """
-    Return the readout to first order at the means of collected charges.
+    Compute the first-order readout model at the mean collected charges.
 
     Parameters
     ----------
@@ -136,7 +137,7 @@ def readout_model(
     v_per_e : (n_site,) or (1,), V/e-
         Nominal conversion gain.
     bend : float
-        Fraction that the response lacks at full range.
+        Response nonlinearity: relative signal loss at full range.
     v_sat_v, pedestal_v : float, V
     """
     is_mixed = False
@@ -178,18 +179,22 @@ def readout_model(
 
 @cache
 def quadrature() -> Quadrature:
-    """Return Gauss-Legendre points and weights: an eigenvalue problem, which takes longer than the codes of a small sensor."""
+    """
+    Compute Gauss-Legendre nodes and weights.
+
+    The result is cached because the eigenvalue problem takes longer than the prediction for a small sensor.
+    """
     return Quadrature(*(read_only(part) for part in np.polynomial.legendre.leggauss(QUADRATURE_NODES)))
 
 
 def cut_off(mean_e: Floats, variance_e2: Floats, end_e: Floats) -> tuple[Floats, Floats]:
-    """Return mean and variance of a Gaussian whose values beyond an end are set to it."""
+    """Compute mean and variance of a Gaussian variable clipped at an upper limit."""
     from scipy.special import ndtr
 
     deviation = np.sqrt(np.maximum(variance_e2, 1e-12))
     z = np.clip((end_e - mean_e) / deviation, -40.0, 40.0)
     below, at = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
-    # How far below the end, and its square; where all lies far below, the Gaussian itself.
+    # First and second moments of the distance to the limit; without clipping, the Gaussian moments themselves.
     short = deviation * (z * below + at)
     short2 = deviation**2 * ((1.0 + z * z) * below + z * at)
     is_free = z >= 40.0

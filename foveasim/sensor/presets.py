@@ -1,4 +1,4 @@
-"""Electronics of published sensors: parameters of :class:`foveasim.Sensor`, with their sources and nothing else."""
+"""Published electronic parameters as keywords of :class:`foveasim.Sensor`, with sources."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 __all__ = ["PRESETS"]
 
-#: By name: ``fs.Sensor(layout, **fs.sensor.PRESETS["paper_foveal"])``. Of "From the radiance reflected by a scene to a digital
-#: picture", the table of its runs: read noise, capacity, voltage range and bits (with 1/30 s and 1/60 s); and its Fig. 9, of
-#: which the read noise is 0, 50 or 200 e-. What the paper does not tell has the sensor's defaults.
+#: Presets by name: ``fs.Sensor(layout, **fs.sensor.PRESETS["paper_foveal"])``. Source: "From the radiance reflected by a scene
+#: to a digital picture": table of its runs (read noise, capacitance, voltage range and bits, for exposures of 1/30 s and
+#: 1/60 s), and Fig. 9, with a read noise of 0, 50 or 200 e-. Parameters that the paper does not specify have their defaults.
 PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         "paper_foveal": MappingProxyType({"read_noise_e": 1.0, "capacitance_f": 1e-13, "v_sat_v": 3.0, "bits": 8}),

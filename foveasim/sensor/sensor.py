@@ -1,4 +1,4 @@
-"""The sensor: from watts on its photosites to digital codes."""
+"""Sensor: conversion of optical power at the photosites to digital codes."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 __all__ = ["PerSite", "Photosites", "Sensor"]
 
-#: Means that are drawn by Poisson's distribution one electron after the other: more take too long.
+#: Maximum mean of exact Poisson draws by inversion, the cost of which is proportional to the mean.
 MOST_INVERTED_E = 700.0
-#: Parameters with one value for all sites or one per site, and those with one value.
+#: Parameters with one value or one per site, and parameters with one value only.
 _PER_SITE = ("sensitivity", "dark_e_per_s", "full_well_e", "read_noise_e", "capacitance_f")
 _NUMBERS = (
     *("prnu_fraction", "dsnu_fraction", "pixel_fpn_fraction", "line_fpn_fraction", "gain_fpn_fraction"),
@@ -49,86 +49,86 @@ PerSite = float | NDArray[np.float64]
 @dataclass(frozen=True, eq=False, repr=False)
 class Sensor:
     """
-    Photosites with their electronics.
+    Image sensor: photosites with their electronics.
 
-    The order of effects: expected photons x quantum efficiency x filter x PRNU, + dark charge, charge diffusion, **one**
-    Poisson draw, full well, inter-pixel capacitance, + reset (kTC), read and RTS noise, volts (q/C) with gain FPN and
-    nonlinearity, + offset FPN of pixels and columns, clip to 0 .. V_sat, ADC with its nonlinearities. The defaults are a
-    perfect sensor: every photon an electron, no noise but photon shot noise.
+    Order of effects: expected photons x quantum efficiency x filter x PRNU, + dark signal, charge diffusion, **one** Poisson
+    draw, full well, inter-pixel capacitance, + reset (kTC), read and RTS noise, conversion to volts (q/C) with gain FPN and
+    nonlinearity, + pixel and column FPN, clipping to 0 .. V_sat, ADC with its nonlinearities. The defaults describe an ideal
+    sensor: one electron per photon, and no noise except photon shot noise.
 
     Parameters
     ----------
     layout : Layout
-        The photosites; their ``channel`` chooses the filter, and their ``readout_line`` the line of the converter.
+        Photosites; the column ``channel`` selects the filter, and ``readout_line`` the readout line (ADC).
     qe : float or curve, or one for each filter
         Quantum efficiency, electrons per photon: a number, or a function of the wavelength in nm, such as
         :class:`SiliconQE` or :class:`PolynomialCurve`.
     filters : None, "rgb", or FilterSet
-        Colour filters; None for a sensor without, whatever the layout's channels, "rgb" for :func:`rgb_filters`.
+        Colour filters; "rgb" for :func:`rgb_filters`, None for a sensor without filters, for any channels of the layout.
     sensitivity : float or (n_site,)
-        Fraction of the light that a site collects beside its quantum efficiency and filter, as of a smaller lens or opening.
+        Fraction of the incident power that a site collects, in addition to quantum efficiency and filter, as for a smaller
+        microlens or opening.
     prnu_fraction : float
-        Photo-response non-uniformity: standard deviation of the sites' response over its mean, a Gaussian distribution; at
-        most 0.3.
+        Photo-response non-uniformity (PRNU): standard deviation over mean of a Gaussian distribution, at most 0.3.
     dark_e_per_s : float or (n_site,), e-/s
         Dark current at ``dark_reference_k``.
     temperature_k, dark_reference_k, dark_doubling_k : float, K
-        Temperature of the sensor, the one that the dark current is of, and the rise that doubles it.
+        Temperature of the sensor, reference temperature of the dark current, and temperature rise that doubles it.
     dsnu_fraction : float
-        Dark-signal non-uniformity: standard deviation of the sites' dark current over its mean, ``dark_e_per_s``, a log-normal
-        distribution: no site is below 0, however wide it is.
+        Dark-signal non-uniformity (DSNU): standard deviation over mean of the dark current. The distribution is log-normal
+        with mean ``dark_e_per_s``, so that values are never negative.
     hot_fraction, hot_e_per_s : float
-        Fraction of the sites that have this much more dark current (e-/s, at ``dark_reference_k``).
+        Fraction of hot sites, and their additional dark current (e-/s, at ``dark_reference_k``).
     dead_fraction : float
-        Fraction of the sites that collect no light.
+        Fraction of dead sites, which have no photo response.
     crosstalk : Diffusion or KernelCrosstalk, optional
-        Charge that goes to neighbours before it is collected.
+        Charge exchange between neighbours before collection.
     shot_noise : {"auto", "exact", "off"}
         See :class:`foveasim.sensor.effects.ShotNoise`.
     gaussian_above_e : float, e-
-        Expectation above which ``"auto"`` draws numbers of the Poisson distribution's first three moments.
+        Expectation above which ``"auto"`` approximates the Poisson distribution by its first three moments.
     full_well_e : float or (n_site,), optional, e-
-        Charge that a site can hold; None for no limit but V_sat.
+        Full well capacity; None for no limit except V_sat.
     coupling : InterPixelCapacitance, optional
-        Charge that is read at neighbours, after the draw.
+        Inter-pixel capacitance, which acts after the draw.
     ktc_noise : bool
-        Whether resetting leaves the noise ``sqrt(k T C)`` on the charge.
+        Whether reset adds kTC noise, ``sqrt(k T C)`` in charge.
     cds : bool
-        Correlated double sampling: the level after the reset is subtracted, which takes off kTC noise and the pixels' offset
-        FPN. ``read_noise_e`` is what remains.
+        Correlated double sampling: subtracts the reset level, which removes kTC noise and pixel FPN. ``read_noise_e`` is then
+        the remaining noise.
     read_noise_e : float or (n_site,), e-
-        Standard deviation of the Gaussian noise of reading.
+        Standard deviation of the Gaussian read noise.
     rts_fraction, rts_e : float
-        Random telegraph noise: fraction of the sites that have it, and the distance of their two states, e-.
+        Random telegraph (RTS) noise: fraction of affected sites, and difference between their two states, e-.
     capacitance_f : float or (n_site,), F
-        Capacitance that the charge is read on: 1e-13 F in the paper's foveal run.
+        Capacitance of the sense node: 1e-13 F in the paper's foveal run.
     gain_fpn_fraction : float
-        Standard deviation of the sites' volts per charge over its mean, a Gaussian distribution; at most 0.3.
+        Gain FPN: standard deviation over mean of the conversion gain, a Gaussian distribution; at most 0.3.
     nonlinearity_fraction : float
-        Fraction of the voltage that the response lacks at V_sat, growing with the square of the voltage.
+        Response nonlinearity: relative voltage loss at V_sat; the loss grows with the square of the voltage.
     pedestal_v : float, V
-        Black level: added to every voltage, so that noise of dark frames is not cut off at code 0. Less than ``v_sat_v``.
+        Black level added to all voltages, so that noise of dark frames is not clipped at code 0. Less than ``v_sat_v``.
     pixel_fpn_fraction, line_fpn_fraction : float
-        Standard deviation of the offsets of pixels, and of readout lines, over V_sat (the paper: 0.02).
+        Standard deviation of pixel FPN and of column FPN over V_sat (the paper: 0.02).
     v_sat_v : float, V
-        Voltage that gives the highest code; nothing above it is seen.
+        Saturation voltage, at the end of the ADC range; higher voltages are clipped.
     bits, companding, log_strength, companding_table, inl_dn, dnl_dn
-        Of the converter: see :class:`foveasim.sensor.Converter`.
+        ADC parameters: see :class:`foveasim.sensor.adc.Converter`.
     device_seed : int
-        Which of all devices of this kind it is: seed of everything that is fixed from its making on.
+        Seed of the fixed patterns, which identifies one device among all devices of this kind.
     effects : sequence of Effect
-        Further noise sources and fixed patterns: :mod:`foveasim.sensor.effects`. They take part in captures, predictions, the
-        noise budget and all weights that depend on noise.
+        Additional noise sources and fixed patterns: :mod:`foveasim.sensor.effects`. They are included in captures, predictions,
+        the noise budget and all weights that depend on noise.
     disabled : sequence of str
-        Names of effects that are switched off, those of keywords too; the draws of all others stay as they are.
+        Names of effects to switch off, including those of keywords. Draws of the other effects do not change.
 
     Raises
     ------
     ParameterError
-        When a value is out of range or implausible (:data:`foveasim.sensor.LIMITS`), or an array does not have one value a
-        site.
+        If a value is out of range or implausible (:data:`foveasim.sensor.LIMITS`), or the length of an array is not the number
+        of sites.
     SimulationError
-        When the layout's channels need more filters than there are, or lines are told apart that the layout has not.
+        If the layout has channels without a filter, or lacks the column ``channel`` or ``readout_line`` where it is required.
     """
 
     layout: Photosites
@@ -199,7 +199,7 @@ class Sensor:
                 f"must be < v_sat_v = {numbers['v_sat_v']:g} V",
                 numbers["pedestal_v"],
                 "V",
-                "a pedestal above the range gives every site the highest code",
+                "with a pedestal above the range all sites have the highest code",
             )
         for name, number in numbers.items():
             object.__setattr__(self, name, number)
@@ -214,7 +214,7 @@ class Sensor:
             )
         for name in ("ktc_noise", "cds"):
             if not isinstance(getattr(self, name), bool):
-                raise ParameterError(name, "must be true or false", getattr(self, name))
+                raise ParameterError(name, "must be True or False", getattr(self, name))
         check_choice("shot_noise", self.shot_noise, ("auto", "exact", "off"))
         for name, kinds in (("crosstalk", (Diffusion, KernelCrosstalk)), ("coupling", (InterPixelCapacitance,))):
             part = getattr(self, name)
@@ -227,41 +227,41 @@ class Sensor:
             object.__setattr__(self, name, getattr(self.converter, name))
         if (self.line_fpn_fraction or self.dnl_dn) and "readout_line" not in self.layout.columns:
             raise SimulationError(
-                "lines of readout differ, but the layout does not say which site is on which; give it a column 'readout_line', "
+                "column FPN and DNL require a readout line for each site, but the layout has no column 'readout_line'; add it, "
                 "for example with foveasim.layout.readout_by or nearest_bus"
             )
         if self.filters is None:
             return
         if self.n_filters > 1 and "channel" not in self.layout.columns:
             raise SimulationError(
-                f"the sensor has {self.n_filters} filters, but the layout does not say which site has which; give it a column "
-                "'channel', for example with foveasim.layout.mosaic(layout, ('RG', 'GB'))"
+                f"the sensor has {self.n_filters} filters, but the layout has no column 'channel'; add it, for example with "
+                "foveasim.layout.mosaic(layout, ('RG', 'GB'))"
             )
         highest = int(self.layout.channel.max(initial=0))
         if highest >= self.n_filters:
             raise SimulationError(
-                f"the layout has sites of channel {highest}, but the sensor only the filters 0 to {self.n_filters - 1} "
+                f"the layout has sites of channel {highest}, but the sensor has only filters 0 to {self.n_filters - 1} "
                 f"({', '.join(self.filter_names)})"
             )
 
     @classmethod
     def from_settings(cls, layout: Photosites, settings: Mapping[str, Any]) -> Sensor:
         """
-        Return the sensor that the settings of a capture describe, without its filters and quantum efficiency.
+        Create a sensor from the settings of a capture, without filters and quantum efficiency.
 
         Parameters
         ----------
         layout : Layout
-            That of the capture.
+            Layout of the capture.
         settings : mapping
-            ``capture.settings["sensor"]``. Effects are looked up by class among those of the package and
+            ``capture.settings["sensor"]``. Effects are identified by class among those of the package and
             :data:`foveasim.sensor.effects.EFFECTS`.
 
         Raises
         ------
         ParameterError
-            When a parameter that has no default of 0 or none is missing, arrays of the sites were too long to be stored, or an
-            effect is not known.
+            If a parameter with a non-zero default is missing, per-site arrays were too long to be stored, or an effect is not
+            registered.
         """
         kinds: tuple[Any, ...] = (Diffusion, KernelCrosstalk, InterPixelCapacitance, *EFFECTS.values())
         classes = {kind.__name__: kind for kind in kinds}
@@ -273,9 +273,9 @@ class Sensor:
             value = settings.get(name)
             is_array = isinstance(value, Mapping) and "sha256" in value
             if is_array or (name not in settings and parameter.default):
-                of_sites = " of every site" if is_array else ""
+                of_sites = " per site" if is_array else ""
                 raise ParameterError(
-                    "sensor", f"must be given: the capture's settings do not tell its {name!r}{of_sites}"
+                    "sensor", f"must be given: the settings of the capture do not contain {name!r}{of_sites}"
                 )
             if name in settings:
                 values[name] = _object(classes, value)
@@ -311,12 +311,12 @@ class Sensor:
 
     @property
     def n_filters(self) -> int:
-        """Number of different colour filters; 1 for a sensor without."""
+        """Number of colour filters; 1 for a sensor without filters."""
         return len(self._filter_set)
 
     @property
     def filter_names(self) -> tuple[str, ...]:
-        """The filters' names."""
+        """Names of the filters."""
         return tuple(self._filter_set.names or ())
 
     @property
@@ -325,7 +325,7 @@ class Sensor:
         return np.zeros(self.layout.n_sites, np.int64) if self.filters is None else self.layout.channel
 
     def _transmission(self, wavelength_nm: Floats) -> Floats:
-        """Filter times efficiency, (n_filter, n_wavelength); a function that fails is named by its parameter."""
+        """Compute filter times quantum efficiency, (n_filter, n_wavelength)."""
         try:
             return self._filters_and_qe.transmission(wavelength_nm)
         except CurveError as error:
@@ -338,7 +338,7 @@ class Sensor:
 
     def responsivity_e_per_j(self, wavelength_nm: Floats) -> Floats:
         """
-        Electrons per joule of light that falls on a site.
+        Compute the responsivity: electrons per joule incident on a site.
 
         Parameters
         ----------
@@ -352,19 +352,19 @@ class Sensor:
         Raises
         ------
         ParameterError
-            When a quantum efficiency or a filter leaves 0 .. 1, or is not known at a wavelength; when a function given for one
-            fails, or returns other than one number per wavelength: the message names it, and its error is the cause.
+            If a quantum efficiency or a filter is outside 0 to 1, or undefined at a wavelength; if a user-defined curve fails,
+            or does not return one number per wavelength (the message names the curve, its exception is the cause).
         """
         curves = self._transmission(wavelength_nm)
         if not (np.isfinite(curves).all() and curves.min() >= 0.0 and curves.max() <= 1.0):
-            raise ParameterError("qe", "and the filters must give values from 0 to 1 at every wavelength", curves)
+            raise ParameterError("qe", "and 'filters' must have values from 0 to 1 at every wavelength", curves)
         return curves / photon_energy_j(wavelength_nm)
 
-    # -- what differs from site to site ------------------------------------------------------------------------------
+    # -- ADC and device ------------------------------------------------------------------------------------------------
 
     @cached_property
     def converter(self) -> Converter:
-        """The analogue-to-digital converter."""
+        """Analogue-to-digital converter (ADC)."""
         return Converter(
             bits=self.bits,
             companding=self.companding,
@@ -376,27 +376,27 @@ class Sensor:
 
     @cached_property
     def device(self) -> Device:
-        """What is fixed from the device's making on."""
+        """Source of the fixed patterns."""
         return Device(self.device_seed, self.layout)
 
     # -- effects ------------------------------------------------------------------------------------------------
 
     @cached_property
     def chain(self) -> tuple[Effect, ...]:
-        """All effects of the sensor that are not disabled, in the order in which they act."""
+        """All enabled effects of the sensor, in the order in which they act."""
         standard = [
             *(effect for cls in STANDARD if (effect := cls.from_sensor(self)) is not None),
             *(effect for effect in (self.crosstalk, self.coupling) if effect is not None),
             ShotNoise("off" if ShotNoise.name in self.disabled else self.shot_noise, self.gaussian_above_e),
         ]
-        # Inter-pixel capacitance comes before the noise of the readout.
+        # Inter-pixel capacitance precedes the readout noise.
         standard.sort(key=lambda effect: effect.is_local)
         chain = ordered((*standard, *self.effects))
         return tuple(effect for effect in chain if effect.name not in self.disabled or effect.stage == "collection")
 
     def without(self, *names: str) -> Sensor:
         """
-        Return the sensor with some effects switched off; the draws of all others stay as they are.
+        Return the sensor with some effects switched off; other draws do not change.
 
         Parameters
         ----------
@@ -406,7 +406,7 @@ class Sensor:
         Raises
         ------
         ParameterError
-            When a name is not that of an effect.
+            If a name is not that of an effect.
         """
         return replace(self, disabled=tuple(dict.fromkeys((*self.disabled, *names))))
 
@@ -416,13 +416,13 @@ class Sensor:
 
     @property
     def shot(self) -> ShotNoise:
-        """The draw from expected to collected charge."""
+        """Shot-noise draw from expected to collected charge."""
         (shot,) = (effect for effect in self.chain if isinstance(effect, ShotNoise))
         return shot
 
     @cached_property
     def sites(self) -> Sites:
-        """The photosites as effects take them: with the device and the capacitances of the sense nodes."""
+        """Photosites with device and sense-node capacitances, for effects."""
         capacitance_f = read_only(np.atleast_1d(np.asarray(self.capacitance_f, np.float64)).copy())
         return Sites(self.layout, self.device, capacitance_f)
 
@@ -436,17 +436,17 @@ class Sensor:
         Parameters
         ----------
         name : str
-            Name of an effect that is a fixed factor or offset, such as "prnu", or "rts".
+            Name of a fixed factor or offset, such as "prnu", or "rts".
 
         Returns
         -------
         pattern : (n_site,) or (1,) float64
-            Factors, or offsets in the unit of the effect's stage; for "rts" half the distance of the two states, e-.
+            Factors, or offsets in the unit of the effect's stage; for "rts" half the difference between the two states, e-.
 
         Raises
         ------
         ParameterError
-            When the sensor has no such effect.
+            If the sensor has no such effect.
         """
         patterns: dict[str, Floats] = {}
         for effect in self.chain:
@@ -461,21 +461,29 @@ class Sensor:
 
     @cached_property
     def response(self) -> Floats:
-        """Relative response of every site to light, (n_site,) or (1,): sensitivity, PRNU, dead sites and further effects."""
+        """
+        Relative photo response of each site, (n_site,) or (1,).
+
+        Includes sensitivity, PRNU, dead sites and additional effects.
+        """
         return self._fixed(self.sensitivity, "photo")
 
     @cached_property
     def dark_rate_e_per_s(self) -> Floats:
-        """Dark current of every site at the sensor's temperature, (n_site,) or (1,) e-/s: DSNU, hot sites, further effects."""
+        """
+        Dark current of each site at the sensor's temperature, (n_site,) or (1,) e-/s.
+
+        Includes DSNU, hot sites and additional effects.
+        """
         return self._fixed(self.nominal_dark_e_per_s, "dark")
 
     @property
     def nominal_dark_e_per_s(self) -> Floats:
-        """Dark current at the sensor's temperature without fixed patterns, (n_site,) or (1,) e-/s."""
+        """Nominal dark current at the sensor's temperature, (n_site,) or (1,) e-/s."""
         return np.atleast_1d(np.asarray(self.dark_e_per_s, np.float64)) * self.heat
 
     def _fixed(self, values: PerSite | Floats, stage: str) -> Floats:
-        """Values of all sites after the effects of a stage."""
+        """Return the values of all sites after the effects of a stage."""
         effects, values = self._at(stage), np.atleast_1d(np.asarray(values, np.float64))
         if not effects:
             return read_only(values.copy())
@@ -483,7 +491,7 @@ class Sensor:
 
     @property
     def heat(self) -> float:
-        """Dark current at the sensor's temperature over that at ``dark_reference_k``."""
+        """Ratio of the dark current at ``temperature_k`` to that at ``dark_reference_k``."""
         return dark_current_factor(self.temperature_k, self.dark_reference_k, self.dark_doubling_k)
 
     @cached_property
@@ -493,7 +501,7 @@ class Sensor:
 
     @cached_property
     def well_e(self) -> Floats:
-        """Full well capacity in whole electrons, (n_site,) or (1,) e-; infinite where there is no limit."""
+        """Full well capacity in whole electrons, (n_site,) or (1,) e-; infinite without limit."""
         if self.full_well_e is None:
             return read_only(np.full(1, np.inf))
         return read_only(np.floor(np.atleast_1d(np.asarray(self.full_well_e, np.float64))))
@@ -515,12 +523,14 @@ class Sensor:
 
     def expected_electrons(self, photo_e_per_s: Floats, exposure_s: float, *, n_threads: int | None = None) -> Floats:
         """
-        Expected charge of every site at the end of an exposure, (n_site,) e-: photoelectrons and dark charge, diffused.
+        Compute the expected charge of each site for an exposure, (n_site,) e-.
+
+        The charge consists of photoelectrons and dark signal, after charge diffusion.
 
         Raises
         ------
         ParameterError
-            When the exposure is negative, or implausible.
+            If the exposure is negative or implausible.
         """
         exposure_s = check_plausible("exposure_s", exposure_s)
         photo = np.broadcast_to(np.asarray(unmasked("photo_e_per_s", photo_e_per_s)), self.layout.n_sites)
@@ -528,7 +538,7 @@ class Sensor:
         return run(steps, photo, sites=self.sites, n_threads=n_threads)
 
     def collect(self, expected_e: Floats, *, streams: Streams, n_threads: int | None = None) -> Ints:
-        """Charge that a draw gives, (n_site,) int64 e-: shot noise, then the full well."""
+        """Draw the collected charge, (n_site,) int64 e-: shot noise, then full well."""
         expected_e = self._checked_charges("expected_e", expected_e)
         well_e = np.minimum(self.well_e, LARGEST_CHARGE_E).astype(np.int64)
 
@@ -549,10 +559,11 @@ class Sensor:
 
     def read(self, electrons: Ints, *, streams: Streams, n_threads: int | None = None) -> NDArray[Any]:
         """
-        Digital code of every charge, (n_site,) uint8 or uint16.
+        Convert collected charges to digital codes, (n_site,) uint8 or uint16.
 
-        Effects on the charge, volts, nonlinearity, effects on the signal, the clip at V_sat and the converter: without
-        companding and faults code ``k`` stands for the voltages from ``k * V_sat / 2**bits`` to the next.
+        The steps are effects on the charge, conversion to volts, nonlinearity, effects on the voltage, clipping at V_sat, and
+        the ADC. For a linear ADC, code ``k`` covers the voltages from ``k * V_sat / 2**bits`` to
+        ``(k + 1) * V_sat / 2**bits``.
         """
         from foveasim.sensor import _kernels
 
@@ -575,7 +586,7 @@ class Sensor:
         charges = np.asarray(unmasked(name, charge_e))
         if charges.shape != (self.layout.n_sites,):
             raise ParameterError(
-                name, f"must be one number for each of the {self.layout.n_sites} sites, got {charges.shape}"
+                name, f"must have one value for each of the {self.layout.n_sites} sites, got the shape {charges.shape}"
             )
         if charges.size and not np.min(charges) >= at_least:
             raise ParameterError(name, f"must be >= {at_least:g} everywhere", float(np.min(charges)), "e-")
@@ -583,19 +594,19 @@ class Sensor:
 
     def checked_charges(self, name: str, charge_e: ArrayLike) -> Floats:
         """
-        Charges of all sites as an array, (n_site,) float64 e-.
+        Return charges as an array (n_site,) float64, e-, after validation.
 
         Raises
         ------
         ParameterError
-            When there is not one charge of at least 0 for each site.
+            If the number of charges is not the number of sites, or a charge is negative.
         """
         return np.ascontiguousarray(self._checked_charges(name, charge_e), np.float64)
 
     def calibrate(
         self, *, exposure_s: float, flat_e: ArrayLike, n_frames: int, seed: int, **options: Any
     ) -> Calibration:
-        """Take dark and flat frames, and calibrate: :func:`foveasim.sensor.calibrate`, whose parameters these are."""
+        """Simulate dark and flat frames, and calibrate: see :func:`foveasim.sensor.calibrate`."""
         from foveasim.sensor.calibration import calibrate
 
         return calibrate(self, exposure_s=exposure_s, flat_e=flat_e, n_frames=n_frames, seed=seed, **options)
@@ -609,16 +620,16 @@ class Sensor:
         is_device_known: bool = True,
     ) -> ReadoutModel:
         """
-        Return how collected charges become voltages, to first order at their means, and the noise that is added.
+        Compute a first-order model of the readout at the mean charges, including noise.
 
         Parameters
         ----------
         mean_e, variance_e2 : (..., n_site) or number, e- and e-²
             Moments of the collected charges, such as those of :attr:`shot`.
         is_reset : bool
-            Whether noise that is drawn at the reset counts: it does not in differences of reads of one charge.
+            Whether to include noise drawn at the reset, which cancels in differences of non-destructive reads.
         is_device_known : bool
-            Whether the fixed patterns of the device are known; otherwise means over all devices take their place.
+            Whether the fixed patterns of the device are known; otherwise means over all devices are used instead.
         """
         mean_e, variance_e2 = (np.atleast_1d(np.asarray(part, np.float64)) for part in (mean_e, variance_e2))
         return readout_model(
@@ -636,31 +647,32 @@ class Sensor:
 
     def predict(self, expected_e: Floats, *, n_threads: int | None = None) -> tuple[Floats, Floats]:
         """
-        Mean and variance of every site's code over all draws, for this device, without a draw.
+        Compute mean and temporal variance of each site's code analytically, for this device.
 
         Parameters
         ----------
         expected_e : (n_site,) float64, e-
-            As :meth:`expected_electrons` gives it.
+            Expected charge from :meth:`expected_electrons`.
         n_threads : int, optional
+            Number of threads; all cores by default.
 
         Returns
         -------
         mean_dn, variance_dn2 : (n_site,) float64, DN and DN²
-            Of the codes: quantisation, clips and the converter's faults included.
+            Moments of the codes, including quantisation, clipping and the nonlinearities of the ADC.
 
         Raises
         ------
         ParameterError
-            When there is not one charge of at least 0 for each site.
+            If the number of charges is not the number of sites, or a charge is negative.
 
         Notes
         -----
-        The code is constant between borders of the charge, and weighs the probability that the charge's distribution has
-        between: Poisson up to ``gaussian_above_e`` (for ``"exact"`` too), above it a Gaussian with Edgeworth's term of the
-        skewness, cut off by the full well. Effects of the readout act by their moments: to first order at the mean, and
-        temporal noise as Gaussian, but RTS noise by its two states. Charges that are mixed after the draw, as by
-        inter-pixel capacitance, are taken as Gaussian.
+        Each code is weighted with the probability that the charge is between its transition levels. The charge distribution
+        is Poisson up to ``gaussian_above_e`` (also for ``"exact"``), above it Gaussian with the first Edgeworth term
+        (skewness), and clipped at the full well. Readout effects are represented by their moments: to first order at the mean
+        charge, with Gaussian temporal noise, except RTS noise, which has its two states. Charges that are mixed after the
+        draw, as by inter-pixel capacitance, are assumed to be Gaussian.
         """
         from foveasim.sensor import _kernels
 
@@ -672,7 +684,7 @@ class Sensor:
             drawn_e = np.minimum(np.rint(expected_e), well_e)
         model = self.readout_model(*cut_off(drawn_e, drawn_e if is_drawn else np.zeros(1), well_e))
         if model.is_mixed:
-            # What the well leaves of a draw is mixed, and taken as a Gaussian.
+            # Mixed charges, after clipping at the full well, are approximated as Gaussian.
             drawn_e, drawn_e2 = model.mean_e, model.variance_e2
             is_drawn, well_e = False, np.array([np.inf])
         sigma_e, way = np.sqrt(model.gaussian_e2), model.transfer
@@ -710,7 +722,7 @@ class Sensor:
 
 
 def _object(classes: Mapping[str, Any], data: Any) -> Any:
-    """The object of one of some classes that plain data describe; other data as they are."""
+    """Create the effect objects that plain data describe; return other data unchanged."""
     if isinstance(data, list):
         return [_object(classes, item) for item in data]
     if not isinstance(data, Mapping):

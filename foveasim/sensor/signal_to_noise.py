@@ -1,8 +1,8 @@
 """
-The signal-to-noise ratio of photosites: one definition for tables, metrics, plots and web pages.
+Signal-to-noise ratio of photosites, as used in tables, metrics, plots and web pages.
 
-It is EMVA 1288's (Release 4.0 Linear, equation 17), site by site and referred to the charge: the light's part of the expected
-charge over its temporal noise, quantisation included.
+The definition is that of EMVA 1288 (Release 4.0 Linear, equation 17) for each site, referred to the charge: photoelectrons over
+the temporal noise of the charge, including quantisation.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ from foveasim.sensor.sensor import Sensor
 
 __all__ = ["SiteSignals", "local_step_e", "signal_to_noise"]
 
-#: Within this many standard deviations of the full well or of the highest code, noise is cut off: its variance falls from there
-#: on, which is EMVA 1288's saturation.
+#: Noise is clipped within this number of standard deviations of the full well or the highest code. Its variance decreases from
+#: there on, which is the saturation criterion of EMVA 1288.
 CUT_OFF_SIGMAS = 2.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SiteSignals:
     """
-    Signal and temporal noise of every site, referred to its charge.
+    Signal and temporal noise of each site, referred to its charge.
 
     Attributes
     ----------
     signal_e : (n_site,) float64, e-
-        Expected charge less that of a dark frame.
+        Expected charge minus that of a dark frame.
     noise_e : (n_site,) float64, e-
-        Standard deviation from frame to frame, of conversion to codes too.
+        Temporal standard deviation, including conversion to codes.
     gain_dn_per_e : (n_site,) or (1,) float64, DN/e-
-        Linear codes per electron.
+        System gain: linear codes per electron.
     is_saturated : (n_site,) bool
-        Whether the full well or the highest code cuts off noise: within two standard deviations.
+        Whether noise is clipped by the full well or the highest code, within two standard deviations.
     """
 
     signal_e: Floats
@@ -47,21 +47,21 @@ class SiteSignals:
 
     @property
     def ratio(self) -> Floats:
-        """Signal-to-noise ratio, (n_site,); 0 where there is neither signal nor noise."""
+        """Signal-to-noise ratio, (n_site,); 0 for sites without noise."""
         return np.divide(self.signal_e, self.noise_e, out=np.zeros_like(self.signal_e), where=self.noise_e > 0.0)
 
 
 def signal_to_noise(sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike) -> SiteSignals:
     """
-    Return signal and temporal noise of every site, without a draw.
+    Compute signal and temporal noise of each site analytically.
 
     Parameters
     ----------
     sensor : Sensor
     expected_e : (n_site,) float64, e-
-        Expected charge, as :meth:`Sensor.expected_electrons` gives it.
+        Expected charge from :meth:`Sensor.expected_electrons`.
     dark_e : (n_site,) float64, e-
-        The same of a dark frame of the same exposure.
+        Expected charge of a dark frame with the same exposure.
 
     Returns
     -------
@@ -70,42 +70,43 @@ def signal_to_noise(sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike) ->
     Raises
     ------
     ParameterError
-        When there is not one charge of at least 0 for each site.
+        If the number of charges is not the number of sites, or a charge is negative.
 
     Notes
     -----
-    For an expected charge N of which D is dark charge, and a system gain K in codes per electron,
+    For an expected charge N, which includes a dark signal D, and a system gain K in codes per electron,
 
     ::
 
         SNR = (N - D) / sqrt(N + reset² + read² + rts² / 4 + q² / K²),    q² = 1/12 DN² + dnl²
 
-    The variance is that of the signal before conversion, and conversion adds to it once. It is not the variance of the codes,
-    which has quantisation in it only where noise spans several codes, and vanishes inside one code: over all positions of the
-    charge within a code, variance and squared error of the codes together are ``K² sigma² + 1/12`` for any sigma, the second
-    moment of a Gaussian and a uniform distribution that are independent. Where noise spans more than one code the
-    ratio is that of the codes.
+    The variance is that of the signal before conversion, plus the variance of conversion. It is not the variance of the codes,
+    which includes quantisation only if noise spans several codes, and vanishes for noise within one code. Averaged over all
+    positions of the charge within a code, the mean squared error of the codes is ``K² sigma² + 1/12`` for any sigma: the
+    second moment of independent Gaussian and uniform distributions. If noise spans more than one code, the ratio is that of
+    the codes.
 
-    Since the denominator is at least the root of N, and N at least the signal, ``SNR <= sqrt(N - D)``. It grows with
-    exposure as long as the step ``1 / K`` grows no faster than the charge: so for linear, square-root and logarithmic
-    converters. A companding table with a kink has a fall of the ratio there, as such sensors have.
+    Since the denominator is at least ``sqrt(N)``, and N is at least the signal, ``SNR <= sqrt(N - D)``. The SNR increases with
+    exposure if the step ``1 / K`` does not increase faster than the charge, as for linear, square-root and logarithmic
+    companding. At a kink of a companding table the SNR drops, as in real sensors of this kind.
 
-    - Companding: K is the local slope, from the width of the codes at the site's mean. The ratio in companded codes would be
-      twice as high for a square root.
-    - Bent response: K has its local slope.
-    - Saturation: clips reduce neither noise nor signal here before they are reached. Beyond the full well, or the charge at
-      which the highest code begins, the ratio stays at its value there, EMVA's highest, and :attr:`SiteSignals.is_saturated`
-      holds. Clips at code 0 are not counted: give a pedestal.
-    - Differential non-linearity: its variance in squares of a code adds to that of quantisation, of which it is a further part:
-      each line adds a number of its own before each code.
-    - Without shot noise charges are rounded to integers, of the variance 1/12 e-².
-    - Inter-pixel coupling mixes drawn charges, so that a site's variance is below its charge and ratios may pass its root.
+    - Companding: K is the local slope, from the width of the codes at the site's mean. For square-root companding, the ratio
+      in companded codes would be twice as high.
+    - Response nonlinearity: K includes its local slope.
+    - Saturation: clipping reduces neither noise nor signal before saturation. Above the full well, or above the first charge
+      with the highest code, the SNR remains at its value there, the maximum SNR of EMVA 1288, and
+      :attr:`SiteSignals.is_saturated` is True. Clipping at code 0 is not included: use a pedestal.
+    - Differential nonlinearity: its variance in squared codes adds to that of quantisation, because each code transition of a
+      readout line has its own offset.
+    - Without shot noise, charges are rounded to integers, with a variance of 1/12 e-².
+    - Inter-pixel capacitance mixes drawn charges: the variance of a site is below its charge, and its SNR may exceed
+      ``sqrt(N)``.
 
-    Fixed patterns of the device count where they change gain or dark charge, but not as noise: the ratio is temporal.
+    Fixed patterns of the device affect gain and dark signal, but do not count as noise: the SNR is temporal.
 
     Examples
     --------
-    Eight bits of 100 e- each hide the shot noise of 400 e-:
+    Quantisation with 100 e- per code (8 bits) dominates the shot noise of 400 e-:
 
     >>> import foveasim as fs
     >>> layout = fs.layout.grid(n_x=1, n_y=1, pitch_um=2.0)
@@ -129,7 +130,7 @@ def signal_to_noise(sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike) ->
     noise_e = np.sqrt(shot_e2 + model.noise_e2 + step_e**2 * sensor.converter.noise_dn2)
     is_saturated |= charge_e + CUT_OFF_SIGMAS * noise_e >= top_e
     is_complete = charge_e > top_e
-    # A site beyond its range has the ratio of its end.
+    # Sites above their range have the SNR of the end of the range.
     part = np.divide(top_e, charge_e, out=np.ones(n_sites), where=is_complete)
     charge_e, dark = np.minimum(charge_e, top_e), np.minimum(dark, top_e)
     step_e = np.where(is_complete, _step_e(sensor, charge_e, model), step_e)
@@ -147,23 +148,25 @@ def signal_to_noise(sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike) ->
 
 def local_step_e(sensor: Sensor, charge_e: Floats, volts_per_e: Floats, offset_v: Floats) -> Floats:
     """
-    Width of a code at every site's mean, (n_site,) e-: the inverse of the local gain of the whole chain.
+    Compute the code width at each site's mean charge, (n_site,) e-.
+
+    The width is the inverse of the local gain of the complete chain.
 
     Parameters
     ----------
     sensor : Sensor
-        Its converter and its bent response count.
+        Its ADC and response nonlinearity are used.
     charge_e : (n_site,) float64, e-
         Mean charge.
     volts_per_e, offset_v : (n_site,) or (1,) float64, V
-        As they are in the device, or as they are meant.
+        Conversion gain and offset, of the device or nominal.
     """
     offset = np.asarray(offset_v, np.float64)
     return _local_step_e(sensor, charge_e, volts_per_e, np.zeros(1), np.ones(1), offset)
 
 
 def _step_e(sensor: Sensor, charge_e: Floats, model: ReadoutModel) -> Floats:
-    """Width of a code at given charges on this device, e-."""
+    """Compute the code width at given charges on this device, e-."""
     way = model.transfer
     return _local_step_e(sensor, charge_e, way.v_per_e, way.sense_v, way.scale, way.output_v)
 
@@ -181,7 +184,7 @@ def _local_step_e(
 
 
 def _top_e(sensor: Sensor, model: ReadoutModel) -> Floats:
-    """Charge at which the highest code begins, at least 0, infinite where no charge gives it."""
+    """Compute the lowest charge with the highest code, at least 0; infinite if none has it."""
     way = model.transfer
     with np.errstate(divide="ignore", invalid="ignore"):
         fraction = np.maximum((sensor.converter.borders[-2] - way.output_v / sensor.v_sat_v) / way.scale, 0.0)

@@ -239,7 +239,7 @@ def test_power_map_file_is_captured(shot_file, tmp_path, monkeypatch):
 
 def test_wavelengths_outside_tables_are_rejected_early(shot_file):
     with pytest.raises(
-        ConfigError, match=r"scene\.wavelength_nm: must lie in the table of silicon's absorption.*1500.0 nm"
+        ConfigError, match=r"scene\.wavelength_nm: must be within the absorption table of silicon.*1500.0 nm"
     ):
         read_shot(shot_file, ["sensor.qe={kind: silicon, depth_um: 3}", "scene.wavelength_nm=[1500]"])
 

@@ -611,7 +611,7 @@ def test_a_loaded_capture_gives_the_same_picture(tmp_path):
         (lambda c, _: c.picture(per="magic"), "'per' must be one of"),
         (
             lambda c, _: c.picture("least_squares"),
-            "'sensor' must be given: the capture's settings do not tell its 'capacitance_f' of every site",
+            "'sensor' must be given: the settings of the capture do not contain 'capacitance_f' per site",
         ),
         (lambda c, _: c.picture(per="um2", sensor="magic"), "'sensor' must be the Sensor of the capture's layout"),
         (

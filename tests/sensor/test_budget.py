@@ -74,7 +74,7 @@ def test_temporal_sources_add_up_to_the_variance_of_the_code(companding, bend):
 
 
 def test_a_list_that_is_not_one_a_site_is_refused():
-    with pytest.raises(ParameterError, match="'photo_e_per_s' must be 400 numbers, one per site, got"):
+    with pytest.raises(ParameterError, match="'photo_e_per_s' must have one value for each of the 400 sites, got"):
         noise_budget(Sensor(LINE), np.ones(3), 1.0)
     with pytest.raises(ParameterError, match="'exposure_s' must be >= 0"):
         noise_budget(Sensor(LINE), np.ones(N), -1.0)

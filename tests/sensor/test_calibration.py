@@ -362,12 +362,17 @@ DARK, FLAT = np.full((2, 25), 10.0), np.full((1, 25), 110.0)
         (DARK[:1], FLAT, {}, "'dark' must be at least 2 frames"),
         (DARK[0], FLAT, {}, "'dark' must have 2 dimensions"),
         (DARK, FLAT[:, :7], {}, "'flat' must have the 25 sites of the dark frames, got 7"),
-        (DARK, DARK, {}, "the flat is no brighter than the dark"),
-        (DARK, FLAT, {"highest_dn": 110}, "the flat saturates 100 % of the sites"),
+        (DARK, DARK, {}, "the flat signal is not above the dark signal"),
+        (DARK, FLAT, {"highest_dn": 110}, "the flat frames saturate 100 % of the sites"),
         (DARK, FLAT, {"expected_dn": np.zeros(25)}, "'expected_dn' must be > 0"),
         (DARK, FLAT, {"expected_dn": np.ones(3)}, "'expected_dn' must be one number, or one for each of the 25 sites"),
-        (DARK, FLAT, {"dark_long": DARK}, "'exposure_s' must be given with a second exposure"),
-        (DARK, FLAT, {"exposure_s": 1.0, "dark_long": DARK}, "'long_exposure_s' and 'dark_long' belong together"),
+        (DARK, FLAT, {"dark_long": DARK}, "'exposure_s' must be given with 'dark_long'"),
+        (
+            DARK,
+            FLAT,
+            {"exposure_s": 1.0, "dark_long": DARK},
+            "'long_exposure_s' must be given if and only if 'dark_long' is",
+        ),
         (DARK, FLAT, {"exposure_s": 2.0, "dark_long": DARK, "long_exposure_s": 1.0}, "'long_exposure_s' must be > 2"),
         (DARK, FLAT, {"hot_sigmas": 0.0}, "'hot_sigmas' must be > 0"),
         (DARK, FLAT, {"dead_fraction": 2.0}, "'dead_fraction' must be <= 1"),
@@ -385,10 +390,10 @@ def test_bad_frames_get_one_clear_sentence(dark, flat, parameters, message):
     ("arguments", "message"),
     [
         ({"code": np.zeros(7)}, "'code' must have one value for each of the 25 sites"),
-        ({"exposure_s": 3.0}, "the dark signal of 3 s is not known"),
+        ({"exposure_s": 3.0}, "the dark signal at 3 s is unknown"),
         ({"fill": grid(n_x=2, n_y=2, pitch_um=2.0)}, "'fill' must be the layout of these 25 sites"),
         ({"fill": grid(n_x=5, n_y=5, pitch_um=2.0, trench_um=0.5)}, "no two sites of the layout share an edge"),
-        ({"fill": grid(n_x=5, n_y=5, pitch_um=2.0), "kind": [1, 2]}, "'kind' must be one number for each"),
+        ({"fill": grid(n_x=5, n_y=5, pitch_um=2.0), "kind": [1, 2]}, "'kind' must have one value for each"),
     ],
 )
 def test_bad_codes_get_one_clear_sentence(arguments, message):
@@ -405,7 +410,7 @@ def test_bad_codes_get_one_clear_sentence(arguments, message):
         ({"exposure_s": 0.0}, "'exposure_s' must be > 0"),
         ({"flat_e": np.ones(3)}, "'flat_e' must be one number, or one for each"),
         ({"flat_e": 0.0}, "'flat_e' must be > 0"),
-        ({"flat_e": 1e9}, "the flat saturates 100 %"),
+        ({"flat_e": 1e9}, "the flat frames saturate 100 %"),
         ({"long_exposure_s": 0.1}, "'long_exposure_s' must be > 0.1"),
     ],
 )

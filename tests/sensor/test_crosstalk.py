@@ -390,7 +390,7 @@ def test_any_grid_along_the_axes_is_seen(layout):
 
 def test_a_pitch_tells_a_grid_from_few_sites():
     layout = grid(n_x=4, n_y=4, pitch_um=2.0)[[0, 5, 15]]
-    with pytest.raises(SimulationError, match=r"no two stand side by side.*give 'pitch_um' when sites are missing$"):
+    with pytest.raises(SimulationError, match=r"no two sites are side by side.*set 'pitch_um' if sites are missing$"):
         KernelCrosstalk(kernel=KERNEL).compile(layout)
 
     for pitch_um in (2.0, (2.0, 2.0)):
@@ -409,7 +409,9 @@ def test_a_layout_that_is_no_grid_is_told_in_a_sentence(name):
         "slightly turned": grid(n_x=50, n_y=50, pitch_um=2.0).rotate(2.0),
         "doubled": LAYOUTS["grid"][[0, 1, 2, 1]],
     }[name]
-    with pytest.raises(SimulationError, match=r"no grid[^\n]*take Diffusion, which serves sites of any shape[^\n]*$"):
+    with pytest.raises(
+        SimulationError, match=r"not a grid[^\n]*use Diffusion, which supports sites of any shape[^\n]*$"
+    ):
         KernelCrosstalk(kernel=KERNEL).compile(layout)
 
 
@@ -557,10 +559,10 @@ def test_a_gap_or_an_edge_that_cannot_be_is_refused(value):
 @pytest.mark.parametrize(
     ("kernel", "rule"),
     [
-        (np.full((2, 3), 0.1), r"must have odd numbers of rows and columns, a middle, got the shape \(2, 3\)"),
+        (np.full((2, 3), 0.1), r"must have odd numbers of rows and columns, got the shape \(2, 3\)"),
         (np.full((3, 4), 0.01), "must have odd numbers of rows and columns"),
         (np.zeros((3, 0)), "must have odd numbers of rows and columns"),
-        (np.full((3, 3), 0.2), "must sum to at most 1: charge does not grow, got 1.8"),
+        (np.full((3, 3), 0.2), "must have a sum of at most 1, got 1.8"),
         ([[0.0, -0.1, 0.0]], "must be >= 0.0 everywhere, got -0.1"),
         ([[0.0, math.nan, 0.0]], "must be finite everywhere"),
         ([0.1, 0.8, 0.1], "must have 2 dimensions"),
@@ -591,7 +593,7 @@ def test_what_is_no_layout_is_refused(crosstalk):
 @pytest.mark.parametrize("crosstalk", [Diffusion(spread_um=1.0), InterPixelCapacitance(neighbour_fraction=0.01)])
 def test_sites_that_all_stand_alone_are_told_with_the_cure(crosstalk):
     with pytest.raises(
-        SimulationError, match=r"no two sites of the layout share an edge.*'max_gap_um', the width of a trench$"
+        SimulationError, match=r"no two sites of the layout share an edge.*set 'max_gap_um' to the trench width$"
     ):
         crosstalk.compile(grid(n_x=3, n_y=3, pitch_um=2.0, trench_um=0.2))
 
@@ -601,14 +603,14 @@ def test_a_spread_beyond_all_reason_names_the_site():
         [shapely.box(0, 0, 5, 5), shapely.box(5, 0, 5.001, 5), shapely.box(5.001, 0, 9, 5)]
     )
     with pytest.raises(
-        ParameterError, match=r"'spread_um' is too long for site 1 of only 0.005 µm², got 20.0 µm; beyond"
+        ParameterError, match=r"'spread_um' must be shorter for site 1 with an area of only 0.005 µm², got 20.0 µm; the"
     ):
         Diffusion(spread_um=20.0).compile(layout)
 
 
 def test_coupling_that_is_not_weak_names_the_site():
     with pytest.raises(
-        ParameterError, match=r"'neighbour_fraction' makes site 8 show 0.8 of its charge at its neighbours"
+        ParameterError, match=r"'neighbour_fraction' must be smaller: site 8 would couple 0.8 of its charge"
     ):
         InterPixelCapacitance(neighbour_fraction=0.2).compile(LAYOUTS["grid"])
 
@@ -622,12 +624,12 @@ def test_charges_of_other_sites_are_refused(charge_e):
 
 
 def test_variances_do_not_pass_many_exchanges():
-    with pytest.raises(SimulationError, match="variances pass one exchange only, and this operator has"):
+    with pytest.raises(SimulationError, match="variances are defined for operators of one step, and this operator has"):
         Diffusion(spread_um=9.0).compile(HEXAGONS).variance(np.ones(72))
 
 
 def test_edges_and_capacitances_of_other_layouts_are_refused():
-    with pytest.raises(ParameterError, match=r"'shared_um' must be a sparse array of the shape \(72, 72\)"):
+    with pytest.raises(ParameterError, match=r"'shared_um' must be a sparse array of shape \(72, 72\)"):
         Diffusion(spread_um=1.0).compile(HEXAGONS, shared_um=SMALL.adjacency())
     with pytest.raises(ParameterError, match="'capacitance_f' must be one number, or one for each of the 72 sites"):
         InterPixelCapacitance(neighbour_fraction=0.01).compile(HEXAGONS, capacitance_f=np.ones(3))

@@ -239,9 +239,7 @@ def test_wrong_result_of_effect_is_rejected(returned):
         def apply(self, values, *, sites, rng):
             return returned
 
-    with pytest.raises(
-        SimulationError, match=r"the effect 'hum' must return an array of the shape .*; check its apply"
-    ):
+    with pytest.raises(SimulationError, match=r"the effect 'hum' must return an array of shape .*; check its apply"):
         codes(made(effects=[Wrong()]))
 
 
@@ -285,7 +283,7 @@ def test_wrong_deviation_is_rejected(deviation):
             return deviation
 
     with pytest.raises(
-        SimulationError, match="the effect 'flicker' must give one finite number, or one for each of the"
+        SimulationError, match="the effect 'flicker' must return one finite number, or one for each of the"
     ):
         codes(made(effects=[Wrong()]))
 
@@ -296,7 +294,7 @@ def test_wrong_moments_are_rejected(returned):
         def moments(self, mean, variance, *, sites):
             return returned
 
-    with pytest.raises(SimulationError, match="the effect 'hum' must return a mean and a variance of the shape"):
+    with pytest.raises(SimulationError, match="the effect 'hum' must return a mean and a variance of shape"):
         made(effects=[Wrong()]).predict(np.full(N, 100.0))
 
 
@@ -319,15 +317,15 @@ class Twin(LampFlicker):
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"effects": [3.0]}, "'effects' must be foveasim.sensor.effects.Effect objects, got 3.0"),
-        ({"effects": LampFlicker()}, "'effects' must be a list of effects, got"),
-        ({"effects": [Nameless()]}, "'effects' must have a class attribute 'name' of type str"),
-        ({"effects": [Early()]}, "'early' at the stage 'photo' is temporal; give it the stage 'charge'"),
-        ({"effects": [Elsewhere()]}, "'effects' must have a stage of photo, dark, .*; 'elsewhere' has 'lens'"),
-        ({"effects": [Twin()]}, "'effects' must have names that no other effect has, got two 'read'"),
-        ({"effects": [LampFlicker(), LampFlicker()]}, "got two 'flicker'"),
-        ({"disabled": ["raed"]}, "'disabled' must be names of effects, got 'raed'; did you mean 'read'"),
-        ({"disabled": 3}, "'disabled' must be names of effects, got 3"),
+        ({"effects": [3.0]}, "'effects' must contain only foveasim.sensor.effects.Effect objects, got 3.0"),
+        ({"effects": LampFlicker()}, "'effects' must be a list of Effect objects, got"),
+        ({"effects": [Nameless()]}, "'effects' must define the class attribute 'name' of type str"),
+        ({"effects": [Early()]}, "'early' at the stage 'photo' is temporal; use the stage 'charge'"),
+        ({"effects": [Elsewhere()]}, "'effects' must have a stage from photo, dark, .*; 'elsewhere' has 'lens'"),
+        ({"effects": [Twin()]}, "'effects' must have unique names, got 'read' twice"),
+        ({"effects": [LampFlicker(), LampFlicker()]}, "got 'flicker' twice"),
+        ({"disabled": ["raed"]}, "'disabled' must contain names of effects, got 'raed'; did you mean 'read'"),
+        ({"disabled": 3}, "'disabled' must contain names of effects, got 3"),
     ],
 )
 def test_invalid_effects_are_rejected(keywords, message):

@@ -395,7 +395,7 @@ CODE = np.full((2, 3), 100)
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: merge_exposures(CODE, [0.1], FEW), r"'code' must have a row for each exposure and a column for each"),
+        (lambda: merge_exposures(CODE, [0.1], FEW), r"'code' must have one row per exposure and one column per site"),
         (lambda: merge_exposures(CODE, [0.1, 0.0], FEW), "'exposures_s' must be > 0"),
         (lambda: merge_exposures(CODE + 5000, [0.1, 1.0], FEW), "'code' must be <= 4095 everywhere"),
         (lambda: merge_exposures(CODE, [0.1, 1.0], None), "'sensor' must be a"),
@@ -411,7 +411,7 @@ CODE = np.full((2, 3), 100)
         ),
         (
             lambda: non_destructive_reads(FEW, 1.0, [1.0, 1.0], streams=Streams(0)),
-            "'times_s' must be one or more times, each",
+            "'times_s' must be one or more strictly increasing times",
         ),
         (
             lambda: non_destructive_reads(FEW, [1.0, 2.0], [1.0], streams=Streams(0)),
@@ -419,8 +419,8 @@ CODE = np.full((2, 3), 100)
         ),
         (lambda: non_destructive_reads(FEW, -1.0, [1.0], streams=Streams(0)), "'photo_e_per_s' must be >= 0"),
         (lambda: non_destructive_reads(None, 1.0, [1.0], streams=Streams(0)), "'sensor' must be a"),
-        (lambda: fit_ramp(CODE[:1], [1.0], FEW), "'times_s' must be at least two times"),
-        (lambda: fit_ramp(CODE, [1.0, 2.0, 3.0], FEW), "'code' must have a row for each read"),
+        (lambda: fit_ramp(CODE[:1], [1.0], FEW), "'times_s' must have at least two values"),
+        (lambda: fit_ramp(CODE, [1.0, 2.0, 3.0], FEW), "'code' must have one row per read"),
         (
             lambda: fit_ramp(CODE, [1.0, 2.0], FEW, weight_rate_e_per_s=[1.0]),
             "'weight_rate_e_per_s' must be one number, or",
@@ -436,5 +436,5 @@ def test_bad_input_gets_one_clear_sentence(call, message):
 def test_exposures_of_unknown_dark_signal_are_refused():
     calibration = Calibration.from_frames(np.full((2, 3), 9.0), np.full((1, 3), 99.0), exposure_s=0.1)
 
-    with pytest.raises(SimulationError, match="the dark signal of 1 s is not known; calibrate with"):
+    with pytest.raises(SimulationError, match="the dark signal at 1 s is unknown; calibrate with"):
         merge_exposures(CODE, [0.1, 1.0], FEW, calibration=calibration)

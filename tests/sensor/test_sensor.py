@@ -416,7 +416,7 @@ def test_a_sensor_that_cannot_be_is_refused_in_one_sentence(name, value, rule):
 
 
 def test_a_channel_without_a_filter_is_refused():
-    with pytest.raises(SimulationError, match=r"channel 3, but the sensor only the filters 0 to 2 \(R, G, B\)$"):
+    with pytest.raises(SimulationError, match=r"channel 3, but the sensor has only filters 0 to 2 \(R, G, B\)$"):
         Sensor(FOUR.with_columns(channel=[0, 1, 2, 3]), filters="rgb")
 
 
@@ -512,16 +512,14 @@ def test_a_charge_on_the_border_of_a_code_has_that_code(v_sat_v, bits, e_per_dn)
 
 
 def test_filters_need_a_layout_that_says_which_site_has_which():
-    with pytest.raises(
-        SimulationError, match="the sensor has 3 filters, but the layout does not say which site has which"
-    ):
+    with pytest.raises(SimulationError, match="the sensor has 3 filters, but the layout has no column 'channel'"):
         fs.Sensor(fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0), filters="rgb")
 
 
 def test_one_filter_does_not_serve_a_mosaic_of_three():
     layout = fs.layout.mosaic(fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0), ("RG", "GB"))
 
-    with pytest.raises(SimulationError, match="sites of channel 2, but the sensor only the filters 0 to 0"):
+    with pytest.raises(SimulationError, match="sites of channel 2, but the sensor has only filters 0 to 0"):
         fs.Sensor(layout, filters=fs.FilterSet((fs.GaussianCurve(centre_nm=550, fwhm_nm=80),)))
 
 

@@ -85,9 +85,7 @@ def test_a_column_may_tell_sites_apart_in_place_of_where_they_are():
 def test_site_ids_must_be_integers():
     halves = MANY[:4].with_columns(site_id=[0.0, 0.5, 1.0, 1.5])
 
-    with pytest.raises(
-        ParameterError, match="'site_id' is a column of the layout, and must hold integers, got float64"
-    ):
+    with pytest.raises(ParameterError, match="'site_id' must be a layout column of integers, got float64"):
         Device(seed=3, layout=halves).normals("prnu")
 
 
@@ -583,12 +581,12 @@ def test_half_the_sensitivity_is_half_the_light_and_all_of_the_dark_charge():
         ("temperature_k", 0.0, "'temperature_k' must be > 0"),
         ("temperature_k", -20.0, "'temperature_k' must be > 0"),
         ("dark_doubling_k", 0.0, "'dark_doubling_k' must be > 0"),
-        ("ktc_noise", 1, "'ktc_noise' must be true or false"),
-        ("cds", "yes", "'cds' must be true or false"),
+        ("ktc_noise", 1, "'ktc_noise' must be True or False"),
+        ("cds", "yes", "'cds' must be True or False"),
         ("companding", "gamma", "'companding' must be one of 'linear', 'root', 'log', 'table'"),
-        ("companding_table", [0.0, 1.0], "'companding_table' and companding='table' belong together"),
-        ("companding", "table", "'companding_table' and companding='table' belong together"),
-        ("inl_dn", [3.0], "'inl_dn' must be at least two numbers"),
+        ("companding_table", [0.0, 1.0], "'companding_table' must be given if and only if companding='table'"),
+        ("companding", "table", "'companding_table' must be given if and only if companding='table'"),
+        ("inl_dn", [3.0], "'inl_dn' must have at least two values"),
         ("inl_dn", [0.0, float("inf")], "'inl_dn' must be finite"),
         ("log_strength", 0.0, "'log_strength' must be > 0"),
         ("dnl_dn", -1.0, "'dnl_dn' must be >= 0"),
@@ -640,21 +638,21 @@ def test_implausible_exposure_is_rejected(exposure_s):
 @pytest.mark.parametrize("table", [[0.0, 0.6, 0.5, 1.0], [0.1, 1.0], [0.0, 0.9], [1.0]])
 def test_a_companding_table_that_falls_or_does_not_reach_its_ends_is_refused(table):
     with pytest.raises(
-        ParameterError, match="'companding_table' must be two or more numbers from 0 to 1 that never fall"
+        ParameterError, match="'companding_table' must have at least two non-decreasing values from 0 to 1"
     ):
         sensor(companding="table", companding_table=table)
 
 
 @pytest.mark.parametrize("parameters", [{"dnl_dn": 0.5}, {"line_fpn_fraction": 0.02}])
 def test_lines_that_differ_need_a_layout_that_says_which_is_which(parameters):
-    with pytest.raises(SimulationError, match="give it a column 'readout_line'"):
+    with pytest.raises(SimulationError, match="the layout has no column 'readout_line'"):
         Sensor(fs.Layout.from_rectangles([[0.0, 0.0], [3.0, 0.0]], 2.0), **parameters)
 
 
 @pytest.mark.parametrize(
     ("charge_e", "message"),
     [
-        (np.ones(3), f"must be one number for each of the {N} sites, got \\(3,\\)"),
+        (np.ones(3), f"must have one value for each of the {N} sites, got the shape \\(3,\\)"),
         (np.full(N, -1.0), "must be >= 0 everywhere, got -1.0 e-"),
         (np.full(N, np.nan), "must be >= 0 everywhere, got nan e-"),
     ],
@@ -665,5 +663,5 @@ def test_charges_that_are_not_those_of_the_sites_are_refused(charge_e, message):
     for step in (lambda: one.collect(charge_e, streams=Streams(0)), lambda: one.predict(charge_e)):
         with pytest.raises(ParameterError, match=message):
             step()
-    with pytest.raises(ParameterError, match="'electrons' must be one number for each of the"):
+    with pytest.raises(ParameterError, match="'electrons' must have one value for each of the"):
         one.read(np.ones(3, np.int64), streams=Streams(0))

@@ -89,7 +89,7 @@ def test_silicon_between_two_wavelengths_of_the_table_has_the_geometric_mean_len
 
 @pytest.mark.parametrize("outside_nm", [399.9, 300.0, 1050.1, math.inf, -math.inf])
 def test_silicon_outside_its_table_is_refused_with_the_wavelength(outside_nm):
-    with pytest.raises(ParameterError, match=rf"must lie in .*silicon.*400 to 1050 nm, got {outside_nm} nm$"):
+    with pytest.raises(ParameterError, match=rf"must be within .*silicon.*400 to 1050 nm, got {outside_nm} nm$"):
         SiliconQE(depth_um=3.0)([500.0, outside_nm])
 
 
@@ -183,14 +183,14 @@ def test_a_whole_number_of_any_type_is_a_degree():
 @pytest.mark.parametrize("outside_nm", [399.0, 701.0, math.inf])
 def test_a_polynomial_outside_its_table_is_refused_with_the_wavelength(outside_nm):
     curve = PolynomialCurve(wavelength_nm=[700, 400, 500], value=[0.1, 0.2, 0.3], degree=1)
-    with pytest.raises(ParameterError, match=rf"must lie in the table .*400 to 700 nm, got {outside_nm} nm$"):
+    with pytest.raises(ParameterError, match=rf"must be within the table .*400 to 700 nm, got {outside_nm} nm$"):
         curve(outside_nm)
 
 
 @pytest.mark.parametrize(
     ("changed", "sentence"),
     [
-        ({"wavelength_nm": [400, 500]}, "'value' must have as many values as 'wavelength_nm'"),
+        ({"wavelength_nm": [400, 500]}, "'value' must have the same length as 'wavelength_nm'"),
         ({"wavelength_nm": [500], "value": [0.5], "degree": 0}, "'value' must have .* at least 2, got 1"),
         ({"wavelength_nm": [], "value": [], "degree": 0}, "'value' must have .* at least 2, got 0"),
         ({"wavelength_nm": [400, 400, 600]}, "'wavelength_nm' must not repeat a wavelength"),
@@ -353,7 +353,7 @@ class TestBeyondATable:
     @pytest.mark.parametrize("outside_nm", [399.9, 700.1, math.inf, math.nan])
     def test_wavelengths_are_refused_with_the_cure(self, curve, outside_nm):
         with pytest.raises(
-            ParameterError, match=rf"must lie in the table, 400 to 700 nm, got {outside_nm} nm; beyond="
+            ParameterError, match=rf"must be within the table, 400 to 700 nm, got {outside_nm} nm; set beyond="
         ):
             curve([500.0, outside_nm])
 
@@ -369,7 +369,7 @@ class TestBeyondATable:
 
     @pytest.mark.parametrize("beyond", ["zero", "hold"])
     def test_what_is_no_wavelength_is_refused_all_the_same(self, curve, beyond):
-        with pytest.raises(ParameterError, match=r"^'wavelength_nm' must lie in"):
+        with pytest.raises(ParameterError, match=r"^'wavelength_nm' must be within"):
             dataclasses.replace(curve, beyond=beyond)(math.nan)
 
     def test_the_shape_is_that_of_the_wavelengths(self, curve):
@@ -392,8 +392,8 @@ def test_wavelengths_in_micrometres_are_told_to_be_none_in_nm(kind):
 @pytest.mark.parametrize(
     ("edge_nm", "value", "sentence"),
     [
-        ([400, 500], [0.1, 0.2], "'edge_nm' must be one more than the values, of which there are 2, got 2"),
-        ([400], [], "'edge_nm' must be one more than the values"),
+        ([400, 500], [0.1, 0.2], "'edge_nm' must have one element more than 'value', which has 2, got 2"),
+        ([400], [], "'edge_nm' must have one element more than 'value'"),
         ([400, 400], [0.1], "'edge_nm' must ascend"),
         ([500, 400], [0.1], "'edge_nm' must ascend"),
         ([400, 500], [1.1], "'value' must be <= 1 everywhere, got 1.1"),
@@ -492,7 +492,7 @@ def test_a_function_is_a_curve_in_a_product():
 
 
 def test_a_product_is_known_where_all_its_curves_are():
-    with pytest.raises(ParameterError, match=r"must lie in the table of silicon's absorption, 400 to 1050 nm"):
+    with pytest.raises(ParameterError, match=r"must be within the absorption table of silicon, 400 to 1050 nm"):
         (GREEN * SILICON)(390.0)
 
 
@@ -593,7 +593,7 @@ def test_a_mean_keeps_the_shape_and_the_range():
 
 
 def test_a_band_that_reaches_beyond_the_curve_is_refused():
-    with pytest.raises(ParameterError, match=r"must lie in the table of silicon's absorption"):
+    with pytest.raises(ParameterError, match=r"must be within the absorption table of silicon"):
         BandMean(curve=SILICON, band_width_nm=20.0)([400.0, 500.0])
 
 
@@ -611,7 +611,7 @@ def test_impossible_means_are_refused(parameters, name):
 
 
 def test_a_band_below_zero_is_refused():
-    with pytest.raises(ParameterError, match=r"^'wavelength_nm' must be > 500, half a band, got 400.0 nm"):
+    with pytest.raises(ParameterError, match=r"^'wavelength_nm' must be > 500, half the band width, got 400.0 nm"):
         BandMean(curve=GREEN, band_width_nm=1000.0)(400.0)
 
 
@@ -667,14 +667,14 @@ def test_filters_have_the_names_of_their_columns(tmp_path):
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("", "holds no table: no line but comments"),
-        ("# nothing\n\n  \n", "holds no table"),
-        ("wavelength_nm,qe\n", "must have at least 2 lines of numbers, got 0"),
-        ("400,0.5\n", "must have at least 2 lines of numbers, got 1"),
+        ("", "contains no table, only comments and empty lines"),
+        ("# nothing\n\n  \n", "contains no table"),
+        ("wavelength_nm,qe\n", "must have at least 2 rows of numbers, got 0"),
+        ("400,0.5\n", "must have at least 2 rows of numbers, got 1"),
         ("400\n500\n", "must have 2 to 1000 columns, wavelengths and values, got 1"),
         (",".join(["400"] * 2000) + "\n" + ",".join(["500"] * 2000), "must have 2 to 1000 columns"),
-        ("400,0.1\n500\n", "line 2 must have 2 columns, as the first has, got 1"),
-        ("nm,qe\n400,0.1\n500,0.2,\n", "line 3 must have 2 columns, as the first has, got 3"),
+        ("400,0.1\n500\n", "line 2 must have 2 columns, as in the first row, got 1"),
+        ("nm,qe\n400,0.1\n500,0.2,\n", "line 3 must have 2 columns, as in the first row, got 3"),
         ("400,0.1\n500,high\n", "line 2, column 2: must be a number, got 'high'"),
         ("400,0.1\n500,\n", "line 2, column 2: must be a number, got ''"),
         ("400,0.1\n500,nan\n", "line 2, column 2: must be a number, got 'nan'"),
@@ -683,27 +683,30 @@ def test_filters_have_the_names_of_their_columns(tmp_path):
         ("400,0x1\n500,0.2\n", "line 1, column 2: must be a number"),
         ("400,1_0\n500,0.2\n", "line 1, column 2: must be a number"),
         ("400,__import__('os')\n500,0.2\n", "line 1, column 2: must be a number"),
-        ("400;0,1\n500;0,2\n", "line 1, column 2: must be a number, got '0,1'; write decimals with a point"),
-        ('400,"0.1\n500,0.2\n', "line 1 cannot be parted into columns"),
-        ("400,0.1\n500,1.2\n", r"line 2, column '1': 1\.2 must be <= 1; where it is percent, say value_unit='percent'"),
+        ("400;0,1\n500;0,2\n", "line 1, column 2: must be a number, got '0,1'; use a decimal point"),
+        ('400,"0.1\n500,0.2\n', "line 1 cannot be split into columns"),
+        ("400,0.1\n500,1.2\n", r"line 2, column '1': 1\.2 must be <= 1; for percentages set value_unit='percent'"),
         ("400,0.1\n500,1e999\n", "line 2, column '1': inf must be <= 1"),
         ("nm,QE [%]\n400,10\n500,101\n", "line 3, column 'QE': 101 must be <= 100 %"),
-        ("400,0.1\n500,-0.01\n", r"line 2, column '1': -0\.01 must be >= 0; set to 0 what is noise"),
+        ("400,0.1\n500,-0.01\n", r"line 2, column '1': -0\.01 must be >= 0; set negative noise to 0"),
         (
             "0.4,0.1\n0.5,0.2\n",
-            r"line 1: the wavelength must be from 10 to 1e\+06 nm, got 0\.4; where .* wavelength_unit='um'",
+            r"line 1: the wavelength must be from 10 to 1e\+06 nm, got 0\.4; for .* wavelength_unit='um'",
         ),
         ("400,0.1\n-500,0.2\n", "line 2: the wavelength must be from"),
         ("um,qe\n400,0.1\n5000,0.2\n", r"line 3: the wavelength must be .*, got 5e\+06$"),
         ("400,0.1\n500,0.2\n400.0,0.1\n", "lines 1 and 3 have the same wavelength, 400 nm"),
-        ("wavelength (Angstrom),qe\n4000,0.1\n5000,0.2\n", "wavelengths must be in nm or µm, got 'wavelength "),
-        ("nm,R,R\n400,0.1,0.2\n500,0.2,0.2\n", "column 3 has the name 'R' again in the first line"),
-        ("nm,R,\n400,0.1,0.2\n500,0.2,0.2\n", "column 3 has no name in the first line"),
-        ("nm,%\n400,0.1\n500,0.2\n", "column 2 has no name in the first line"),
+        (
+            "wavelength (Angstrom),qe\n4000,0.1\n5000,0.2\n",
+            "wavelengths must be in nm or µm, got the column name 'wavelength ",
+        ),
+        ("nm,R,R\n400,0.1,0.2\n500,0.2,0.2\n", "column 3 repeats the name 'R' in the header"),
+        ("nm,R,\n400,0.1,0.2\n500,0.2,0.2\n", "column 3 has no name in the header"),
+        ("nm,%\n400,0.1\n500,0.2\n", "column 2 has no name in the header"),
         ("400,0.1\x00\n500,0.2\n", "line 1, column 2: must be a number"),
-        (b"\xff\xfe4\x000\x000\x00", "is no text in UTF-8"),
-        (b"400,0.1\n" * 600_000, "is larger than 4194304 bytes, and so no table of curves"),
-        (b"4,1\n" * 100_001, "has more than 100000 lines, and so is no table of curves"),
+        (b"\xff\xfe4\x000\x000\x00", "is not valid UTF-8 text"),
+        (b"400,0.1\n" * 600_000, "must be a table of curves with at most 4194304 bytes"),
+        (b"4,1\n" * 100_001, "must be a table of curves with at most 100000 lines"),
     ],
 )
 @pytest.mark.parametrize("read", [lambda path: read_curve(path, 1), read_filters], ids=["curve", "filters"])
@@ -722,8 +725,8 @@ def test_a_file_that_is_none_is_refused(tmp_path, read, name, sentence):
 @pytest.mark.parametrize(
     ("column", "sentence"),
     [
-        (None, "has 2 columns of values, say which: R, G"),
-        ("B", "has no column 'B', only R, G, or their numbers from 1 to 2"),
+        (None, "has 2 value columns; specify one of R, G"),
+        ("B", "has no column 'B'; the columns are R, G, or 1 to 2"),
         (0, "has no column 0"),
         (3, "has no column 3"),
         (True, "has no column True"),
@@ -832,7 +835,7 @@ def test_filters_in_a_settings_file_are_read_beside_it(shot_file, tmp_path, monk
     ("change", "sentence"),
     [
         ("sensor.qe={kind: file, path: no.csv}", r"sensor\.qe: .*no\.csv: no such file"),
-        ("sensor.qe={kind: file, path: curves.csv}", r"sensor\.qe: .*has 3 columns of values, say which: R, G, B"),
+        ("sensor.qe={kind: file, path: curves.csv}", r"sensor\.qe: .*has 3 value columns; specify one of R, G, B"),
         ("sensor.qe={kind: product, curves: [{kind: step}]}", r"sensor\.qe\.curves\.0\.edge_nm: is missing"),
         ("sensor.qe={kind: product, curves: [2]}", r"sensor\.qe\.curves: must be <= 1, got 2"),
         ("sensor.filters={path: shot.yaml}", r"sensor\.filters: .*shot\.yaml: "),

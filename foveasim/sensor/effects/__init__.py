@@ -1,9 +1,9 @@
 """
 Effects: noise sources, fixed patterns and crosstalk, one frozen class each.
 
-``STANDARD`` lists, in the order of the chain, the classes that the keywords of :class:`foveasim.Sensor` build. Others derive
-from :class:`Effect`, or from :class:`AdditiveNoise`, :class:`FixedFactor` or :class:`FixedOffset`, and are given to a sensor
-as ``effects=[...]``, in settings files by their names in :data:`EFFECTS`.
+``STANDARD`` lists the classes that the keywords of :class:`foveasim.Sensor` create, in the order of the chain. Further effects
+derive from :class:`Effect`, or from :class:`AdditiveNoise`, :class:`FixedFactor` or :class:`FixedOffset`. They are passed to a
+sensor as ``effects=[...]``, or specified in settings files by their names in :data:`EFFECTS`.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ __all__ = [
     "draw_shot_noise",
 ]
 
-#: Classes that a sensor's keywords build, in the order of the chain; ``from_sensor`` gives None for an effect that is off.
+#: Effects of a sensor's keywords, in the order of the chain; ``from_sensor`` returns None for an effect that is off.
 STANDARD: tuple[Any, ...] = (
     PhotoResponse,
     DeadSites,

@@ -1,8 +1,8 @@
 """
-The contract of effects: noise sources, fixed patterns and crosstalk.
+Base classes of effects: noise sources, fixed patterns and crosstalk.
 
-The sensor chain is an ordered tuple of effects. All that a sensor computes (draws, predictions, the noise budget, the weights
-of reconstruction and of merged exposures) goes through :meth:`Effect.apply` and :meth:`Effect.moments`.
+The sensor chain is an ordered tuple of effects. All results of a sensor (random draws, predictions, the noise budget, the
+weights of reconstructions and HDR merges) use only :meth:`Effect.apply` and :meth:`Effect.moments`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from foveasim.sensor.device import Device
 __all__ = ["EFFECTS", "STAGES", "AdditiveNoise", "Effect", "FixedFactor", "FixedOffset", "Photosites", "Sites", "Stage"]
 
 T = TypeVar("T")
-#: Where an effect acts.
+#: Stage of the chain at which an effect acts.
 Stage = Literal["photo", "dark", "expected", "collection", "charge", "sense_node", "output"]
 #: Unit of the values at each stage, in the order of the chain.
 STAGES: Mapping[Stage, str] = MappingProxyType(
@@ -35,7 +35,7 @@ STAGES: Mapping[Stage, str] = MappingProxyType(
         "photo": "e-/s",  # photocurrent
         "dark": "e-/s",  # dark current
         "expected": "e-",  # expected charge
-        "collection": "e-",  # the shot-noise draw, of which there is one
+        "collection": "e-",  # the single shot-noise draw
         "charge": "e-",  # collected charge
         "sense_node": "V",  # charge over capacitance
         "output": "V",  # after the nonlinearity, before clipping and conversion
@@ -44,7 +44,7 @@ STAGES: Mapping[Stage, str] = MappingProxyType(
 
 
 class Photosites(PackedRings, Protocol):
-    """Outlines with columns per site, as the sensor needs them; :class:`foveasim.Layout` is one."""
+    """Protocol of photosite layouts for sensors, implemented by :class:`foveasim.Layout`."""
 
     @property
     def n_sites(self) -> int:
@@ -68,29 +68,29 @@ class Photosites(PackedRings, Protocol):
 
     @property
     def columns(self) -> Mapping[str, NDArray[Any]]:
-        """Data per site by name; ``channel`` is among them where sites differ in colour."""
+        """Data columns per site by name; colour layouts have ``channel``."""
 
     def adjacency(self, *, max_gap_um: float | None = None) -> Any:
-        """Lengths of the edges that sites share, (n_site, n_site) sparse, µm."""
+        """Return the lengths of shared edges, (n_site, n_site) sparse, µm."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sites:
     """
-    Photosites that an effect acts on: all of a layout, or a block of them.
+    Photosites that an effect acts on: all sites of a layout, or a block of them.
 
     Attributes
     ----------
     layout : Layout
         All photosites.
     known_device : Device or None
-        None stands for any device of the kind: moments are then those over all devices.
+        Device with its fixed patterns. With None, moments are over all devices of the kind.
     capacitance_f : (n_site,) or (1,) float64, F
         Capacitance of the sense nodes.
     index : slice
-        Which sites of the layout these are.
+        Indices of these sites in the layout.
     n_threads : int or None
-        Threads that an effect on all sites may use; None for all cores.
+        Number of threads for effects on all sites; None for all cores.
     """
 
     layout: Photosites
@@ -111,18 +111,18 @@ class Sites:
         return replace(self, index=index, n_threads=n_threads)
 
     def of_any_device(self) -> Sites:
-        """Return the same sites without a device: moments are then those over all devices of the kind."""
+        """Return the same sites without a device, for moments over all devices of the kind."""
         return replace(self, known_device=None)
 
     @property
     def device(self) -> Device:
         """
-        Source of the numbers that fabrication fixes, :meth:`Device.normals` among them.
+        Source of the random numbers of fixed patterns, such as :meth:`Device.normals`.
 
         Raises
         ------
         SimulationError
-            When the device is not known.
+            If the device is not known.
         """
         if self.known_device is None:
             raise SimulationError(
@@ -131,18 +131,22 @@ class Sites:
         return self.known_device
 
     def of(self, values: ArrayLike) -> Any:
-        """Return the part of an array (n_site, ...) of the layout that belongs to these sites; one value for all as it is."""
+        """
+        Return the elements of an array (n_site, ...) that belong to these sites.
+
+        Single values are returned unchanged.
+        """
         array = np.asarray(values)
         return array[self.index] if array.ndim and array.shape[0] > 1 else array
 
     def once(self, key: Any, compute: Callable[[Sites], T]) -> T:
         """
-        Return what a function of all sites gives, computed at the first call.
+        Return the cached result of a function of all sites, computed at the first call.
 
         Parameters
         ----------
         key : object
-            The effect that asks, or a tuple of it and a name.
+            Key of the cache: the effect, or a tuple of the effect and a name.
         compute : callable
             Called with all sites of the layout.
         """
@@ -155,12 +159,14 @@ class Sites:
 
     def pattern(self, effect: Any, compute: Callable[[Sites], ArrayLike]) -> Floats:
         """
-        Return the part for these sites of an array (n_site,) or number, computed for all sites at the first call.
+        Return the elements for these sites of a cached array (n_site,) or number.
+
+        The array is computed for all sites at the first call.
 
         Raises
         ------
         SimulationError
-            When it has another shape, or a number is not finite.
+            If the array has another shape, or a number is not finite.
         """
 
         def computed(sites: Sites) -> Floats:
@@ -168,8 +174,8 @@ class Sites:
             if found.shape not in ((1,), (sites.n_sites,)) or not np.isfinite(found).all():
                 name = getattr(effect, "name", type(effect).__name__)
                 raise SimulationError(
-                    f"the effect '{name}' must give one finite number, or one for each of the {sites.n_sites} sites, "
-                    f"got an array of the shape {found.shape}"
+                    f"the effect '{name}' must return one finite number, or one for each of the {sites.n_sites} sites, "
+                    f"got an array of shape {found.shape}"
                 )
             return read_only(found.copy())
 
@@ -178,20 +184,22 @@ class Sites:
 
 class Effect(ABC):
     """
-    One noise source, fixed pattern or crosstalk. Subclasses are frozen dataclasses.
+    Base class of noise sources, fixed patterns and crosstalk.
+
+    Subclasses are frozen dataclasses.
 
     Attributes
     ----------
     name : str
-        Key of the noise budget and of the random stream; unique in a sensor.
+        Key of the noise budget and of the random stream; unique within a sensor.
     stage : Stage
-        Where the effect acts, which also sets the unit of its values: :data:`STAGES`.
+        Stage of the chain, which determines the unit of the values: :data:`STAGES`.
     is_temporal : bool
-        Whether it is drawn again for each frame; otherwise it is fixed for a device, or deterministic. Before collection
-        effects are fixed.
+        Whether the effect is drawn again for each frame; otherwise it is fixed for a device, or deterministic. Effects before
+        collection must be fixed.
     is_local : bool
-        Whether a site's result and draw are its own. Otherwise, for crosstalk or for a draw that a row of sites shares,
-        :meth:`apply` gets all sites at once.
+        Whether each site's result and draw are independent of other sites. Otherwise, as for crosstalk or for draws that are
+        common to a row of sites, :meth:`apply` is called with all sites at once.
     is_drawn_at_reset : bool
         Whether all reads between two resets share one draw.
     """
@@ -205,38 +213,38 @@ class Effect(ABC):
     @abstractmethod
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """
-        Return values after the effect.
+        Return the values after the effect.
 
         Parameters
         ----------
         values : (n,) float64, unit of the stage
             May be overwritten and returned.
         sites : Sites
-            The ``n`` sites that the values belong to.
+            The ``n`` sites of the values.
         rng : numpy.random.Generator
-            Stream of this effect, frame and block of sites. Fixed effects get None: they take numbers from ``sites.device``.
+            Random stream of this effect, frame and block of sites. It is None for fixed effects, which use ``sites.device``.
         """
 
     @abstractmethod
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
         """
-        Return mean and variance after the effect, without drawing.
+        Compute mean and variance after the effect analytically.
 
         Parameters
         ----------
         mean, variance : (n,) or (1,) float64, unit of the stage and its square
         sites : Sites
-            With a device, fixed patterns are its known numbers; without one, moments are over all devices.
+            With a device, its fixed patterns are known constants; without one, moments are over all devices.
         """
 
     def checked_moments(self, mean: Floats, variance: Floats, sites: Sites) -> tuple[Floats, Floats]:
         """
-        Return what :meth:`moments` gives.
+        Return the result of :meth:`moments` after checking its shape.
 
         Raises
         ------
         SimulationError
-            When that is not a mean and a variance of the shape of the values.
+            If the result is not a mean and a variance of the shape of the values.
         """
         found = self.moments(mean, variance, sites=sites)
         shape = np.broadcast_shapes(np.shape(mean), np.shape(variance), (sites.n_sites,))
@@ -246,12 +254,16 @@ class Effect(ABC):
                 raise ValueError
         except (TypeError, ValueError):
             raise SimulationError(
-                f"the effect '{self.name}' must return a mean and a variance of the shape {shape}; check its moments()"
+                f"the effect '{self.name}' must return a mean and a variance of shape {shape}; check its moments()"
             ) from None
         return after, spread2
 
     def half_step(self, sites: Sites) -> Floats | None:
-        """Return half the distance of two equally probable states, (n,) or (1,); None for effects of other distributions."""
+        """
+        Return half the difference between two equally probable states, (n,) or (1,).
+
+        None for effects with other distributions.
+        """
         _ = sites
         return None
 
@@ -261,28 +273,28 @@ class _FixedPattern(Effect):
 
     @abstractmethod
     def pattern(self, sites: Sites) -> ArrayLike:
-        """Return the pattern of ``sites.device``, (n,) or one number for all sites."""
+        """Return the pattern of ``sites.device``, (n,) or one number common to all sites."""
 
     def pattern_moments(self, sites: Sites) -> tuple[ArrayLike, ArrayLike]:
         """
         Return mean and variance of the pattern over devices, (n,) or one number each.
 
-        By default those of a pattern that all devices share: the pattern itself, and 0.
+        The default is for a pattern common to all devices: the pattern itself, and 0.
         """
         return self.pattern(sites), 0.0
 
 
 class FixedFactor(_FixedPattern):
-    """A fixed pattern that multiplies the values; a subclass gives :meth:`pattern`."""
+    """Multiplicative fixed pattern; subclasses define :meth:`pattern`."""
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
-        """Return values times the pattern."""
+        """Return the values times the pattern."""
         _ = rng
         values *= sites.pattern(self, self.pattern)
         return values
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
-        """Return the moments of a product of independent factors."""
+        """Compute the moments of a product of independent factors."""
         if sites.known_device is not None:
             factor = sites.pattern(self, self.pattern)
             return mean * factor, variance * factor**2
@@ -291,16 +303,16 @@ class FixedFactor(_FixedPattern):
 
 
 class FixedOffset(_FixedPattern):
-    """A fixed pattern that is added to the values; a subclass gives :meth:`pattern`, in the unit of the stage."""
+    """Additive fixed pattern; subclasses define :meth:`pattern`, in the unit of the stage."""
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
-        """Return values plus the pattern."""
+        """Return the values plus the pattern."""
         _ = rng
         values += sites.pattern(self, self.pattern)
         return values
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
-        """Return the moments of a sum of independent terms."""
+        """Compute the moments of a sum of independent terms."""
         if sites.known_device is not None:
             return mean + sites.pattern(self, self.pattern), variance
         centre, spread2 = (sites.of(part) for part in self.pattern_moments(replace(sites, index=slice(None))))
@@ -308,16 +320,16 @@ class FixedOffset(_FixedPattern):
 
 
 class AdditiveNoise(Effect):
-    """Gaussian temporal noise of mean 0 that is added to the values; a subclass gives :meth:`deviation`."""
+    """Additive Gaussian temporal noise of mean 0; subclasses define :meth:`deviation`."""
 
     is_temporal: ClassVar[bool] = True
 
     @abstractmethod
     def deviation(self, sites: Sites) -> ArrayLike:
-        """Return the standard deviation, (n,) or one number for all sites, in the unit of the stage."""
+        """Return the standard deviation, (n,) or one number, in the unit of the stage."""
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
-        """Return values plus a draw."""
+        """Return the values plus a Gaussian draw."""
         noise = standard_normal(rng, values.size)
         noise *= sites.pattern(self, self.deviation)
         values += noise
@@ -328,6 +340,6 @@ class AdditiveNoise(Effect):
         return mean, variance + sites.pattern(self, self.deviation) ** 2
 
 
-#: Further effects by their names in settings files: register a class with ``@EFFECTS.register("name")``, or in an installed
-#: package with an entry point of the group ``foveasim.effects``.
+#: Additional effects by their names in settings files. Classes are registered with ``@EFFECTS.register("name")``, or by entry
+#: points of the group ``foveasim.effects`` in installed packages.
 EFFECTS: Registry[type[Effect]] = Registry("effect", "foveasim.effects")

@@ -1,8 +1,8 @@
 """
-Crosstalk: diffusion of charge to neighbours before collection, and inter-pixel capacitance in the readout.
+Crosstalk: charge diffusion before collection, inter-pixel capacitance in the readout.
 
-Diffusion mixes expectations before the draw: photosites stay Poisson-distributed and uncorrelated. Inter-pixel capacitance
-mixes drawn charges: neighbours become correlated.
+Diffusion mixes expected charges before the draw: photosites remain Poisson-distributed and uncorrelated. Inter-pixel
+capacitance (IPC) mixes drawn charges: neighbours become correlated.
 """
 
 from __future__ import annotations
@@ -36,28 +36,28 @@ if TYPE_CHECKING:
 
 __all__ = ["CrosstalkOperator", "Diffusion", "InterPixelCapacitance", "KernelCrosstalk", "Neighbourhood"]
 
-#: What a site may lose in one exchange: with more, charge would swing to and fro between neighbours.
+#: Maximum fraction of charge that a site loses in one step; larger fractions would make the exchange oscillate.
 LARGEST_SHARE = 0.5
-#: Exchanges beyond this take seconds a frame for a million sites.
+#: Maximum number of steps; more would take seconds per frame for a million sites.
 MAX_EXCHANGES = 1000
-#: Spreads of up to this fraction of a step cross one border at most, to float64; for longer ones a Fourier series is short.
+#: Up to this ratio of spread to distance, charge crosses at most one boundary (to float64); above it, a Fourier series is used.
 SHORT_SPREAD = 0.125
-#: Terms of that series: the next one is below 1e-16.
+#: Number of terms of that series: the next one is below 1e-16.
 N_TERMS = 10
-#: No spread is larger; the squares of greater ones leave float64.
+#: Upper limit of the spread; squares of much larger values overflow float64.
 LARGEST_SPREAD_UM = 1e4
-#: Sum of a kernel above 1 that is rounding of its entries.
+#: Rounding tolerance for the sum of a kernel.
 KERNEL_ROUNDING = 1e-9
-#: Sites of a grid differ by at most this share in area: rounding to a manufacturing grid.
+#: Maximum relative difference in area between sites of a grid: rounding to a manufacturing grid.
 AREA_ROUNDING = 0.02
-#: Steps and places of a grid are off by at most this fraction of the pitch.
+#: Maximum deviation of grid positions and steps, relative to the pitch.
 PLACE_ROUNDING = 0.05
-#: Coordinates nearer than this fraction of a site's side are one row or column.
+#: Maximum difference between coordinates in the same row or column, relative to the side of a site.
 SAME_LINE = 0.02
 
 
 class Neighbourhood(Protocol):
-    """Photosites that know their neighbours, as crosstalk needs them; :class:`foveasim.Layout` is one."""
+    """Protocol of photosite layouts for crosstalk, implemented by :class:`foveasim.Layout`."""
 
     @property
     def n_sites(self) -> int:
@@ -69,43 +69,44 @@ class Neighbourhood(Protocol):
 
     @property
     def centroid_um(self) -> Floats:
-        """Centre of area of each site, (n_site, 2) µm."""
+        """Centroid of each site, (n_site, 2) µm."""
 
     def adjacency(self, *, max_gap_um: float | None = None) -> csr_array[Any]:
-        """Lengths of the edges that sites share, (n_site, n_site) µm, symmetric, the diagonal empty."""
+        """Return the lengths of shared edges, (n_site, n_site) µm, symmetric, empty diagonal."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CrosstalkOperator:
     """
-    Crosstalk compiled for a layout: make it once, apply it to every frame.
+    Crosstalk compiled for a layout, applicable to any number of frames.
 
-    Made by ``compile()`` of :class:`Diffusion`, :class:`KernelCrosstalk` and :class:`InterPixelCapacitance`.
+    Created by ``compile()`` of :class:`Diffusion`, :class:`KernelCrosstalk` and :class:`InterPixelCapacitance`.
 
     Parameters
     ----------
     matrix : csr_array (n_site, n_site) float64
-        Share ``[j, i]`` of the charge of site i that one exchange brings to site j. Columns sum to 1, unless charge is lost.
+        Element ``[j, i]`` is the fraction of the charge of site i that moves to site j in one step. Columns sum to 1 unless
+        charge is lost.
     n_steps : int
-        How often it is applied.
+        Number of times that the matrix is applied.
     """
 
     matrix: csr_array[Any]
     n_steps: int = 1
 
     def __repr__(self) -> str:
-        return f"CrosstalkOperator({self.matrix.shape[0]} sites, {self.matrix.nnz} shares, {self.n_steps} exchanges)"
+        return f"CrosstalkOperator({self.matrix.shape[0]} sites, {self.matrix.nnz} fractions, {self.n_steps} steps)"
 
     def apply(self, charge_e: ArrayLike, *, n_threads: int | None = None) -> Floats:
         """
-        Charges after crosstalk.
+        Apply crosstalk to charges.
 
         Parameters
         ----------
         charge_e : (..., n_site), e-
-            Expected charges or drawn ones, or anything that mixes as they do. Not changed.
+            Expected or drawn charges, or other quantities that mix linearly. Not modified.
         n_threads : int, optional
-            All cores by default.
+            Number of threads; all cores by default.
 
         Returns
         -------
@@ -114,13 +115,13 @@ class CrosstalkOperator:
         Raises
         ------
         ParameterError
-            When there is not one charge a site.
+            If the last dimension is not the number of sites.
 
         Notes
         -----
-        Cost: one sparse product an exchange, 5 ns per site for hexagons.
+        The cost is one sparse product per step, 5 ns per site for hexagons.
         """
-        # A row per site: sparse matrices multiply columns.
+        # Sparse matrices multiply columns, so sites are moved to the first axis.
         columns = np.moveaxis(self._per_site("charge_e", charge_e), -1, 0)
         mixed = columns.reshape(columns.shape[0], -1) if columns.ndim > 1 else columns
         for _ in range(self.n_steps):
@@ -128,7 +129,7 @@ class CrosstalkOperator:
         return np.ascontiguousarray(np.moveaxis(mixed.reshape(columns.shape), 0, -1))
 
     def _product(self, columns: Floats, n_threads: int | None) -> Floats:
-        """The matrix times columns, in blocks of rows."""
+        """Multiply the matrix by columns, in blocks of rows."""
         if len(self._row_blocks) < 2:
             return np.asarray(self.matrix @ columns)
         out = np.empty_like(columns)
@@ -147,12 +148,12 @@ class CrosstalkOperator:
 
     def variance(self, variance: ArrayLike) -> Floats:
         """
-        Variances after a mixing of independent sites, as for a prediction without a draw.
+        Propagate variances of independent sites through crosstalk.
 
         Parameters
         ----------
         variance : (..., n_site)
-            Before it, in the square of any unit.
+            Variances before crosstalk, in the square of any unit.
 
         Returns
         -------
@@ -162,13 +163,14 @@ class CrosstalkOperator:
         Raises
         ------
         ParameterError
-            When there is not one variance a site.
+            If the last dimension is not the number of sites.
         SimulationError
-            For more than one exchange: those of diffusion, which mixes expectations and no variances.
+            If the operator has several steps, as for diffusion, which mixes expectations rather than variances.
         """
         if self.n_steps != 1:
             raise SimulationError(
-                f"variances pass one exchange only, and this operator has {self.n_steps}; diffusion comes before the draw"
+                f"variances are defined for operators of one step, and this operator has {self.n_steps}; diffusion acts "
+                "before the draw"
             )
         values = self._per_site("variance", variance)
         columns = np.moveaxis(values, -1, 0)
@@ -183,12 +185,14 @@ class CrosstalkOperator:
         array = as_numbers(name, values)
         n_sites = self.matrix.shape[0]
         if array.ndim == 0 or array.shape[-1] != n_sites:
-            raise ParameterError(name, f"must have one value for each of the {n_sites} sites, got {array.shape}")
+            raise ParameterError(
+                name, f"must have one value for each of the {n_sites} sites, got the shape {array.shape}"
+            )
         return array
 
 
 class _Crosstalk(Effect):
-    """Crosstalk in the chain: compiled for the sites at the first use."""
+    """Crosstalk in the chain, compiled for the sites at first use."""
 
     is_temporal: ClassVar[bool] = False
     is_local: ClassVar[bool] = False
@@ -198,12 +202,12 @@ class _Crosstalk(Effect):
         raise NotImplementedError
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
-        """Return charges after crosstalk, (n_site,)."""
+        """Return the charges after crosstalk, (n_site,)."""
         _ = rng
         return sites.once(self, self.compiled_for).apply(values, n_threads=sites.n_threads)
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
-        """Return moments of independent charges after crosstalk, (..., n_site)."""
+        """Compute the moments of independent charges after crosstalk, (..., n_site)."""
         operator = sites.once(self, self.compiled_for)
         mean, variance = (
             np.broadcast_to(part, np.broadcast_shapes(np.shape(part), (sites.n_sites,))) for part in (mean, variance)
@@ -217,43 +221,43 @@ class _Crosstalk(Effect):
 @dataclass(frozen=True, kw_only=True)
 class Diffusion(_Crosstalk):
     """
-    Charge that wanders sideways while it drifts to its photosite: an exchange between neighbours of any shape.
+    Charge diffusion between neighbouring photosites of arbitrary shape, before collection.
 
     Parameters
     ----------
     spread_um : float, µm
-        Root mean square of an electron's sideways way along one axis until it is collected; ``sqrt(2 D t)`` for a
-        diffusivity D and a time t. 0 for none.
+        RMS lateral displacement of an electron along one axis until collection: ``sqrt(2 D t)`` for a diffusivity D and a
+        time t. 0 for no diffusion.
     max_gap_um : float, optional, µm
-        Sites that face each other across a gap of up to this width are neighbours, and exchange charge as if they touched;
-        by default only those that share an edge.
+        Maximum width of gaps between neighbouring sites, which exchange charge as if they were in contact. By default only
+        sites that share an edge are neighbours.
 
     Raises
     ------
     ParameterError
-        When a number is negative or not finite, or the spread no length on a sensor.
+        If a number is negative or not finite, or the spread is out of range.
 
     Notes
     -----
-    Of charge that fills the plane evenly with a density n, a Gaussian spread carries ``n * spread / sqrt(2 pi)`` over each
-    unit of length of a straight border, either way. So a site of area A passes to a neighbour with which it shares an edge
-    of length e the share
+    For a uniform charge density n, a Gaussian spread moves ``n * spread / sqrt(2 pi)`` across each unit of length of a
+    straight boundary, in either direction. A site of area A therefore passes to a neighbour with a shared edge of length e
+    the fraction
 
     ::
 
-        share = e w / A,    w = spread / sqrt(2 pi)          spread well below the distance d of the two centres
-                            w = spread² / (2 d) + d / 12     spread above d/2: Fick's law, flow down the gradient
+        fraction = e w / A,    w = spread / sqrt(2 pi)          spread well below the distance d between the two centroids
+                               w = spread² / (2 d) + d / 12     spread above d/2: Fick's law
 
-    and in general ``w = (d / 2) E[g(spread Z / d)]``, where Z is a standard normal number and g joins the squares of the
-    integers by straight lines: the flow for which an evenly lit site in a square grid spreads to the variance along an
-    axis that it has in truth, ``d² E[g] = spread² + d²/6`` for spreads above d/2 and ``0.798 spread d`` for small ones.
+    In general, ``w = (d / 2) E[g(spread Z / d)]``, where Z is a standard normal number and g interpolates the squares of the
+    integers linearly. With this w, the charge of a uniformly lit site in a square grid has the exact variance along each
+    axis: ``d² E[g] = spread² + d²/6`` for spreads above d/2, and ``0.798 spread d`` for small spreads.
 
-    Charge is conserved: what has no neighbour to go to stays. An even light stays even on any tiling, whatever the sizes of
-    its sites, as ``e w`` is the same both ways.
+    Charge is conserved: charge at the array boundary stays in its site. Uniform irradiance remains uniform on any tiling,
+    because ``e w`` is the same in both directions.
 
-    What goes over a corner is left out of a single exchange: it is of the order of the square of a share. No site may give
-    more than half of its charge at once; for long spreads the exchange is therefore divided into ``n`` equal ones,
-    ``(I + L / n)^n``, near ``exp(L)`` and of the same variance.
+    A single step neglects charge that crosses a corner, which is of the order of the squared fraction. A site cannot lose more
+    than half of its charge in one step; for long spreads the exchange is therefore divided into ``n`` equal steps,
+    ``(I + L / n)^n``, which approximates ``exp(L)`` and has the same variance.
 
     Examples
     --------
@@ -283,40 +287,41 @@ class Diffusion(_Crosstalk):
         cls, neighbour_fraction: float, *, pitch_um: float, max_gap_um: float | None = None
     ) -> Diffusion:
         """
-        Diffusion as measured on square pixels of the same process, for a layout of any shapes.
+        Create the diffusion that corresponds to crosstalk measured on square pixels.
+
+        The result applies to layouts of any shape in the same process.
 
         Parameters
         ----------
         neighbour_fraction : float
-            Fraction of its charge that one of these pixels loses to its four neighbours together, at most one half.
+            Fraction of its charge that a square pixel loses to its four neighbours in total, at most one half.
         pitch_um : float, µm
-            Of these pixels.
+            Pitch of the square pixels.
         max_gap_um : float, optional, µm
             As for the class.
 
         Raises
         ------
         ParameterError
-            When a number is out of range.
+            If a number is out of range.
         """
         from scipy.optimize import brentq
 
         share = check_number("neighbour_fraction", neighbour_fraction, at_least=0.0, at_most=LARGEST_SHARE)
         pitch_um = check_length_um("pitch_um", pitch_um)
-        # A spread of a pitch loses far more than half.
+        # Upper bracket: with a spread equal to the pitch a pixel loses far more than half.
         steps = float(brentq(lambda s: 2.0 * float(_squared_steps(np.array(s))) - share, 0.0, 1.0, xtol=1e-15))
         return cls(spread_um=steps * pitch_um, max_gap_um=max_gap_um)
 
     def compile(self, layout: Neighbourhood, *, shared_um: csr_array[Any] | None = None) -> CrosstalkOperator:
         """
-        The exchange compiled for a layout.
+        Compile the diffusion for a layout.
 
         Parameters
         ----------
         layout : Layout
         shared_um : csr_array (n_site, n_site), optional, µm
-            Lengths of shared edges, where they are known already; ``layout.adjacency()`` by default, which is most of the
-            cost.
+            Precomputed lengths of shared edges; ``layout.adjacency()`` by default, which is most of the cost.
 
         Returns
         -------
@@ -325,16 +330,16 @@ class Diffusion(_Crosstalk):
         Raises
         ------
         ParameterError
-            When the layout knows no neighbours, or the spread is beyond all reason for its smallest sites.
+            If the argument is not a layout, or the spread is too long for its smallest sites.
         SimulationError
-            When no two sites share an edge.
+            If no two sites share an edge.
         """
         shared_um = _shared_um(layout, shared_um, self.max_gap_um)
         site, neighbour = shared_um.indices, _rows(shared_um)
         centre_um = layout.centroid_um
         distance_um = np.hypot(*np.moveaxis(centre_um[site] - centre_um[neighbour], -1, 0))
         if distance_um.size:
-            # Sites in holes of others have the same centre; how deep sites lie behind their edges tells their distance.
+            # A site in the hole of another has the same centroid; the ratio of area to edge length then gives the distance.
             edges_um = shared_um.sum(axis=1)
             depth_um = layout.area_um2 / np.where(edges_um > 0.0, edges_um, 1.0)
             distance_um = np.maximum(distance_um, 0.5 * (depth_um[site] + depth_um[neighbour]))
@@ -346,12 +351,12 @@ class Diffusion(_Crosstalk):
             smallest = int(np.argmax(loss))
             raise ParameterError(
                 "spread_um",
-                f"is too long for site {smallest} of only {layout.area_um2[smallest]:.3g} µm²",
+                f"must be shorter for site {smallest} with an area of only {layout.area_um2[smallest]:.3g} µm²",
                 self.spread_um,
                 "µm",
-                f"beyond {MAX_EXCHANGES} exchanges a site keeps nothing of its own",
+                f"the diffusion would need more than {MAX_EXCHANGES} steps",
             )
-        # Fractions of exactly one half, computed, are that.
+        # Tolerance for computed fractions of exactly one half.
         n_steps = max(1, math.ceil(largest / LARGEST_SHARE - 1e-9))
         return CrosstalkOperator(_with_rest(matrix, loss, n_steps), n_steps)
 
@@ -359,30 +364,30 @@ class Diffusion(_Crosstalk):
 @dataclass(frozen=True, kw_only=True)
 class KernelCrosstalk(_Crosstalk):
     """
-    The same few shares around every site of a rectangular grid: a convolution, as in the paper.
+    Crosstalk as a convolution kernel on a rectangular grid, as in the paper.
 
     Parameters
     ----------
     kernel : (n_row, n_column), odd numbers
-        What becomes of a charge of 1 in its middle: ``kernel[j, i]`` goes ``i - n_column // 2`` columns to the right and
-        ``j - n_row // 2`` rows **up**; row 0 is the lowest, as in every array here. Fractions of at least 0 that sum to at most
-        1; what is missing to 1 is lost in the silicon.
+        Distribution of a unit charge at the central element: ``kernel[j, i]`` moves ``i - n_column // 2`` columns to the right
+        and ``j - n_row // 2`` rows **up**; row 0 is the lowest, as in all arrays of this package. The elements are
+        non-negative fractions with a sum of at most 1; the difference from 1 is lost in the silicon.
     border : {"kept", "lost"}
-        What becomes of charge that would go where there is no site: it stays where it is, or is lost.
+        Charge that would move to a position without a site remains in its site ("kept"), or is lost.
     pitch_um : number or (pitch_x, pitch_y), optional, µm
-        Of the grid, where a crop has too few sites to show it; by default the smallest step within a row, and within a
+        Pitch of the grid, for crops with too few sites to derive it; by default the smallest step within a row, and within a
         column.
 
     Raises
     ------
     ParameterError
-        When the kernel has an even side, or a share or the sum is out of range.
+        If the kernel has an even number of rows or columns, or an element or the sum is out of range.
 
     Notes
     -----
-    On a full grid ``border="lost"`` is ``scipy.ndimage.convolve(picture, kernel, mode="constant")``, row 0 lowest in both.
-    No kernel is offered as a default: those published belong to one pixel and one wavelength. Measure one, or take
-    :class:`Diffusion`, which also serves sites of other shapes.
+    On a full grid, ``border="lost"`` equals ``scipy.ndimage.convolve(picture, kernel, mode="constant")``, with row 0 lowest in
+    both. There is no default kernel because published kernels are specific to one pixel and one wavelength. Use a measured
+    kernel, or :class:`Diffusion`, which supports sites of any shape.
 
     Examples
     --------
@@ -406,11 +411,9 @@ class KernelCrosstalk(_Crosstalk):
     def __post_init__(self) -> None:
         kernel = finite_array("kernel", self.kernel, ndim=2, at_least=0.0)
         if any(n % 2 == 0 for n in kernel.shape):
-            raise ParameterError(
-                "kernel", f"must have odd numbers of rows and columns, a middle, got the shape {kernel.shape}"
-            )
+            raise ParameterError("kernel", f"must have odd numbers of rows and columns, got the shape {kernel.shape}")
         if kernel.sum() > 1.0 + KERNEL_ROUNDING:
-            raise ParameterError("kernel", "must sum to at most 1: charge does not grow", float(kernel.sum()))
+            raise ParameterError("kernel", "must have a sum of at most 1", float(kernel.sum()))
         object.__setattr__(self, "kernel", tuple(tuple(float(share) for share in row) for row in kernel))
         check_choice("border", self.border, ("kept", "lost"))
         if self.pitch_um is not None:
@@ -418,7 +421,7 @@ class KernelCrosstalk(_Crosstalk):
 
     def compile(self, layout: Neighbourhood) -> CrosstalkOperator:
         """
-        The convolution compiled for a layout: any sites of a grid, in any order, with any of them missing.
+        Compile the convolution for a layout of grid sites, in any order and with gaps.
 
         Parameters
         ----------
@@ -431,9 +434,9 @@ class KernelCrosstalk(_Crosstalk):
         Raises
         ------
         ParameterError
-            When the argument is no layout.
+            If the argument is not a layout.
         SimulationError
-            When its sites are no part of a grid along the axes.
+            If the sites are not part of a grid parallel to the axes.
         """
         from scipy.sparse import coo_array
 
@@ -442,14 +445,16 @@ class KernelCrosstalk(_Crosstalk):
         column, row = _grid_places(layout, self.pitch_um)
         kernel = np.array(self.kernel)
         half_y, half_x = kernel.shape[0] // 2, kernel.shape[1] // 2
-        # Places as one number, with room at the ends of rows, so that no row runs over into the next.
+        # Linear index with padding at the ends of rows, so that the kernel does not wrap into the next row.
         stride = int(column.max(initial=0)) + 1 + 2 * half_x
         place = row * stride + column
         order = np.argsort(place, kind="stable")
         ordered = place[order]
         if n_sites and (ordered[1:] == ordered[:-1]).any():
             twin = order[int(np.flatnonzero(ordered[1:] == ordered[:-1])[0]) + 1]
-            raise SimulationError(f"site {twin} lies instead of another, so the layout is no grid; {_OTHER_WAY}")
+            raise SimulationError(
+                f"the layout is not a grid: site {twin} has the same position as another site; {_OTHER_WAY}"
+            )
         source, target, share = [], [], []
         kept = np.zeros(n_sites)
         for j, i in np.argwhere(kernel > 0.0):
@@ -475,38 +480,38 @@ class KernelCrosstalk(_Crosstalk):
 @dataclass(frozen=True, kw_only=True)
 class InterPixelCapacitance(_Crosstalk):
     """
-    Capacitances between neighbouring readout nodes: a part of each charge is read at its neighbours.
+    Inter-pixel capacitance (IPC): capacitive coupling between neighbouring readout nodes.
 
     Parameters
     ----------
     neighbour_fraction : float
-        Fraction of a site's charge that appears at a neighbour with a shared edge of length ``edge_um``; at others in
-        proportion to their shared edges. Hybrid near-infrared arrays (H2RG) have from 0.007 to 0.015 (Donlon, Ninkov and Baum
-        2018, arXiv:1805.09413).
+        Fraction of a site's charge that appears at a neighbour with a shared edge of length ``edge_um``; for other edges it is
+        proportional to their length. Hybrid near-infrared arrays (H2RG) have 0.007 to 0.015 (Donlon, Ninkov and Baum 2018,
+        arXiv:1805.09413).
     edge_um : float, optional, µm
-        The length of that edge; by default the median of the layout's, so that it is any edge of a regular tiling.
+        Length of that edge; by default the median over the layout, which is the common edge length of a regular tiling.
     max_gap_um : float, optional, µm
-        Sites that face each other across a gap of up to this width are neighbours; by default only those that share an edge.
+        Maximum width of gaps between neighbouring sites; by default neighbours share an edge.
 
     Raises
     ------
     ParameterError
-        When the share is not from 0 to 1/2, or a length is out of range.
+        If the fraction is not from 0 to 1/2, or a length is out of range.
 
     Notes
     -----
-    Two nodes that face each other along a length e have a coupling capacitance ``k e`` between them. With a capacitance C to
-    ground the voltages of charges q obey ``C V_i + sum_j k e_ij (V_i - V_j) = q_i``; to first order in ``k e / C`` the reading
-    ``C V`` is
+    Two nodes with a common boundary of length e have a coupling capacitance ``k e``. With a capacitance C to ground, the
+    voltages due to charges q obey ``C V_i + sum_j k e_ij (V_i - V_j) = q_i``; to first order in ``k e / C`` the measured
+    charge ``C V`` is
 
     ::
 
         q_i + sum_j a_ij (q_j - q_i),    a_ij = neighbour_fraction e_ij / edge_um
 
-    which is symmetric and keeps the sum of all readings: no electron moves, its field is seen elsewhere. Read noise of later
-    amplifiers is not coupled and comes after. Independent charges of variance v get the covariance ``K diag(v) K^T``, for even
-    light ``2 a v`` between neighbours (Moore, Ninkov and Forrest, Opt. Eng. 45, 076402, 2006: which makes a conversion gain
-    from variances wrong by about ``1 - 2 sum_j a``).
+    The coupling is symmetric and conserves the sum of all measured charges: no electron moves, only its field acts on other
+    nodes. Read noise of subsequent amplifiers is not coupled. Independent charges with variances v get the covariance
+    ``K diag(v) K^T``, which is ``2 a v`` between neighbours under uniform irradiance. A conversion gain derived from variances
+    is then wrong by a factor of about ``1 - 2 sum_j a`` (Moore, Ninkov and Forrest, Opt. Eng. 45, 076402, 2006).
 
     Examples
     --------
@@ -524,7 +529,7 @@ class InterPixelCapacitance(_Crosstalk):
     max_gap_um: float | None = None
 
     def compiled_for(self, sites: Sites) -> CrosstalkOperator:
-        """Return the operator for all sites of the layout, with the capacitances of their sense nodes."""
+        """Return the operator for all sites of the layout and their sense-node capacitances."""
         return self.compile(sites.layout, capacitance_f=sites.capacitance_f if sites.capacitance_f.size > 1 else None)
 
     def __post_init__(self) -> None:
@@ -542,16 +547,16 @@ class InterPixelCapacitance(_Crosstalk):
         shared_um: csr_array[Any] | None = None,
     ) -> CrosstalkOperator:
         """
-        The coupling compiled for a layout.
+        Compile the coupling for a layout.
 
         Parameters
         ----------
         layout : Layout
         capacitance_f : number or (n_site,), optional, F
-            Capacitance of every node, where they differ: the share is then that of a node with their median, the smaller
-            ones show more of their charge elsewhere, and the sum of the charges that are read stays.
+            Capacitance of each node, if they differ. ``neighbour_fraction`` then refers to a node with the median
+            capacitance; nodes with smaller capacitances couple more of their charge. The sum of measured charges is conserved.
         shared_um : csr_array (n_site, n_site), optional, µm
-            Lengths of shared edges, where they are known already; ``layout.adjacency()`` by default.
+            Precomputed lengths of shared edges; ``layout.adjacency()`` by default.
 
         Returns
         -------
@@ -560,10 +565,10 @@ class InterPixelCapacitance(_Crosstalk):
         Raises
         ------
         ParameterError
-            When the layout knows no neighbours, there is not one capacitance a site, or a site would show more than half
-            of its charge elsewhere.
+            If the first argument is not a layout, the number of capacitances is not the number of sites, or a site would
+            couple more than half of its charge to its neighbours.
         SimulationError
-            When no two sites share an edge.
+            If no two sites share an edge.
         """
         shared_um = _shared_um(layout, shared_um, self.max_gap_um)
         edge_um = self.edge_um
@@ -584,16 +589,17 @@ class InterPixelCapacitance(_Crosstalk):
         if largest > LARGEST_SHARE * (1.0 + KERNEL_ROUNDING):
             raise ParameterError(
                 "neighbour_fraction",
-                f"makes site {int(np.argmax(loss))} show {largest:.3g} of its charge at its neighbours, more than half",
+                f"must be smaller: site {int(np.argmax(loss))} would couple {largest:.3g} of its charge to its neighbours, "
+                "more than half",
                 self.neighbour_fraction,
-                hint="this is a law for weak coupling",
+                hint="the model is valid for weak coupling only",
             )
         return CrosstalkOperator(_with_rest(matrix, loss, 1))
 
 
 # -- parts ------------------------------------------------------------------------------------------------------------
 
-_OTHER_WAY = "take Diffusion, which serves sites of any shape"
+_OTHER_WAY = "use Diffusion, which supports sites of any shape"
 
 
 def _gap_um(max_gap_um: object) -> float | None:
@@ -606,7 +612,7 @@ def _require_layout(layout: object) -> None:
 
 
 def _shared_um(layout: Neighbourhood, shared_um: csr_array[Any] | None, max_gap_um: float | None) -> csr_array[Any]:
-    """Lengths of shared edges with small indices, checked."""
+    """Return checked lengths of shared edges, with int32 indices if possible."""
     from scipy.sparse import csr_array, issparse
 
     _require_layout(layout)
@@ -615,13 +621,13 @@ def _shared_um(layout: Neighbourhood, shared_um: csr_array[Any] | None, max_gap_
         shared_um = layout.adjacency(max_gap_um=max_gap_um)
     elif not issparse(shared_um) or shared_um.shape != (n_sites, n_sites):
         raise ParameterError(
-            "shared_um", f"must be a sparse array of the shape {(n_sites, n_sites)}, as layout.adjacency() gives"
+            "shared_um", f"must be a sparse array of shape {(n_sites, n_sites)}, as from layout.adjacency()"
         )
     shared_um = csr_array(shared_um)
     if n_sites > 1 and shared_um.nnz == 0:
         raise SimulationError(
-            "no two sites of the layout share an edge, so nothing can cross; for sites behind trenches give 'max_gap_um', the "
-            "width of a trench"
+            "no two sites of the layout share an edge, so there is no crosstalk; for sites separated by trenches, set "
+            "'max_gap_um' to the trench width"
         )
     if shared_um.nnz < np.iinfo(np.int32).max:
         small = (shared_um.data, shared_um.indices.astype(np.int32), shared_um.indptr.astype(np.int32))
@@ -631,11 +637,12 @@ def _shared_um(layout: Neighbourhood, shared_um: csr_array[Any] | None, max_gap_
 
 def _squared_steps(spread: Floats) -> Floats:
     """
-    Mean square of the steps from a cell to that where its charge ends, in a row of cells; the spread in cells.
+    Compute the mean square number of cells that charge moves in a row of cells.
 
-    Charge starts anywhere in a cell: on a way z it makes whole steps whose mean square is g(z), the straight lines through
-    the squares of the integers. ``g(z) = |z|`` up to 1, and ``z² + f (1 - f)`` with the fraction f of z everywhere, whose
-    Fourier series has the terms ``-cos(2 pi n z) / (pi n)²``.
+    ``spread`` is in units of cells. Charge starts uniformly distributed in a cell; for a displacement z, the mean square
+    number of cell boundaries crossed is g(z), the linear interpolation of the squares of the integers: ``g(z) = |z|`` up to
+    1, and ``z² + f (1 - f)`` with the fractional part f of z in general, whose Fourier series has the terms
+    ``-cos(2 pi n z) / (pi n)²``.
     """
     n = np.arange(1, N_TERMS + 1) * math.pi
     is_long = spread > SHORT_SPREAD
@@ -648,7 +655,7 @@ def _squared_steps(spread: Floats) -> Floats:
 
 
 def _rows(matrix: csr_array[Any]) -> Ints:
-    """Row of every entry, (nnz,)."""
+    """Return the row of each stored entry, (nnz,)."""
     return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
 
 
@@ -663,14 +670,14 @@ def _column_sums(matrix: csr_array[Any]) -> Floats:
 
 
 def _with_rest(matrix: csr_array[Any], share: Floats, n_steps: int) -> csr_array[Any]:
-    """One of several equal exchanges; what stays, after the fraction of a site that goes, is on the diagonal."""
+    """Return the matrix of one of several equal steps; the diagonal is the remaining fraction."""
     from scipy.sparse import csr_array, diags_array
 
     return csr_array(matrix / n_steps + diags_array(1.0 - share / n_steps))
 
 
 def _grid_places(layout: Neighbourhood, pitch_um: Any) -> tuple[Ints, Ints]:
-    """Column and row of every site in the grid that the sites are a part of, from 0."""
+    """Return column and row of each site in the underlying grid, from 0."""
     n_sites = layout.n_sites
     if n_sites == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -679,7 +686,8 @@ def _grid_places(layout: Neighbourhood, pitch_um: Any) -> tuple[Ints, Ints]:
     odd = int(np.argmax(np.abs(area_um2 - typical_um2)))
     if abs(area_um2[odd] - typical_um2) > AREA_ROUNDING * typical_um2:
         raise SimulationError(
-            f"the layout is no grid: site {odd} has {area_um2[odd]:.4g} µm², and others {typical_um2:.4g} µm²; {_OTHER_WAY}"
+            f"the layout is not a grid: site {odd} has an area of {area_um2[odd]:.4g} µm², the median is "
+            f"{typical_um2:.4g} µm²; {_OTHER_WAY}"
         )
     same_um = SAME_LINE * math.sqrt(typical_um2)
     centre_um = layout.centroid_um
@@ -693,8 +701,8 @@ def _grid_places(layout: Neighbourhood, pitch_um: Any) -> tuple[Ints, Ints]:
         if at_um.size > 1:
             if not math.isfinite(step_um):
                 raise SimulationError(
-                    f"the layout is no grid that shows its pitch: of sites in several {name} no two stand side by side; "
-                    f"{_OTHER_WAY}, or give 'pitch_um' when sites are missing"
+                    f"the layout is not a grid of known pitch: there are several {name}, but no two sites are side by "
+                    f"side; {_OTHER_WAY}, or set 'pitch_um' if sites are missing"
                 )
             steps = np.diff(at_um) / step_um
             is_odd = ~(np.abs(steps - np.rint(steps)) <= PLACE_ROUNDING) | (np.rint(steps) < 1)
@@ -703,15 +711,19 @@ def _grid_places(layout: Neighbourhood, pitch_um: Any) -> tuple[Ints, Ints]:
             is_off = np.abs(fitted - at_um) > PLACE_ROUNDING * step_um
             if is_odd.any() or is_off.any():
                 raise SimulationError(
-                    f"the layout is no grid along the axes: its {name} are not at equal steps of {step_um:.6g} µm; "
-                    f"{_OTHER_WAY}, or give 'pitch_um' when sites are missing"
+                    f"the layout is not a grid parallel to the axes: its {name} do not have equal steps of {step_um:.6g} "
+                    f"µm; {_OTHER_WAY}, or set 'pitch_um' if sites are missing"
                 )
         places.append(place[line])
     return places[0], places[1]
 
 
 def _lines(position_um: Floats, same_um: float) -> tuple[Ints, Floats]:
-    """Line of every site, and the positions of the lines, rising; a line is a run of positions without a gap."""
+    """
+    Return the line index of each site, and the ascending positions of the lines.
+
+    A line is a run of positions without gaps.
+    """
     order = np.argsort(position_um, kind="stable")
     rising_um = position_um[order]
     line_of_ordered = np.concatenate(([0], np.cumsum(np.diff(rising_um) > same_um)))
@@ -721,13 +733,13 @@ def _lines(position_um: Floats, same_um: float) -> tuple[Ints, Floats]:
     ends = np.append(starts[1:], position_um.size) - 1
     if np.any(rising_um[ends] - rising_um[starts] > same_um):
         raise SimulationError(
-            f"the layout is no grid along the axes: its sites do not stand in rows and columns; {_OTHER_WAY}"
+            f"the layout is not a grid parallel to the axes: its sites are not in rows and columns; {_OTHER_WAY}"
         )
     return line, np.add.reduceat(rising_um, starts) / (ends + 1 - starts)
 
 
 def _smallest_step_um(line: Ints, at_um: Floats, other_line: Ints) -> float:
-    """Smallest distance of two sites in one line across; infinite where none has two."""
+    """Return the smallest step between sites of the same perpendicular line, or infinity."""
     order = np.lexsort((line, other_line))
     together = np.diff(other_line[order]) == 0
     step_um = np.abs(np.diff(at_um[line[order]])[together])

@@ -1,4 +1,4 @@
-"""Dark current: its temperature dependence, its non-uniformity, and hot sites."""
+"""Dark current: temperature dependence, non-uniformity (DSNU) and hot sites."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["DarkSignal", "HotSites", "dark_current_factor"]
 
 def dark_current_factor(temperature_k: float, reference_k: float, doubling_k: float) -> float:
     """
-    Return dark current at a temperature over that at a reference, which doubles every ``doubling_k``.
+    Compute the ratio of the dark currents at two temperatures.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ def dark_current_factor(temperature_k: float, reference_k: float, doubling_k: fl
     Returns
     -------
     factor : float
-        ``2 ** ((temperature_k - reference_k) / doubling_k)``; infinite beyond float64.
+        ``2 ** ((temperature_k - reference_k) / doubling_k)``; infinite on overflow.
     """
     try:
         return float(2.0 ** ((temperature_k - reference_k) / doubling_k))
@@ -40,7 +40,7 @@ class DarkSignal(FixedFactor):
     Parameters
     ----------
     dsnu_fraction : float
-        Standard deviation over the mean.
+        Ratio of standard deviation to mean.
     """
 
     name: ClassVar[str] = "dsnu"
@@ -66,14 +66,14 @@ class DarkSignal(FixedFactor):
 @dataclass(frozen=True)
 class HotSites(FixedOffset):
     """
-    Sites with more dark current than others.
+    Hot sites: sites with additional dark current.
 
     Parameters
     ----------
     hot_fraction : float
-        Probability of a site to be one.
+        Probability that a site is hot.
     hot_e_per_s : float, e-/s
-        How much more, at the sensor's temperature.
+        Additional dark current at the sensor's temperature.
     """
 
     name: ClassVar[str] = "hot"

@@ -1,4 +1,4 @@
-"""Fixed-pattern noise (FPN) of the readout: gains and offsets of pixels, offsets of columns."""
+"""Fixed-pattern noise (FPN) of the readout: pixel gain, pixel offset and column offset."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["ColumnOffset", "PixelGain", "PixelOffset"]
 @dataclass(frozen=True)
 class PixelGain(FixedFactor):
     """
-    Gain FPN: factors of mean 1 on the conversion gain, Gaussian, cut off at 0.
+    Gain FPN: Gaussian factors of mean 1 on the conversion gain, clipped at 0.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class PixelGain(FixedFactor):
 @dataclass(frozen=True)
 class PixelOffset(FixedOffset):
     """
-    Offset FPN of pixels, Gaussian; correlated double sampling removes it.
+    Pixel FPN: Gaussian offsets, which correlated double sampling removes.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class PixelOffset(FixedOffset):
 @dataclass(frozen=True)
 class ColumnOffset(FixedOffset):
     """
-    Offset FPN of readout lines (columns), Gaussian: the same for all sites of a line.
+    Column FPN: Gaussian offsets, the same for all sites of a readout line.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class ColumnOffset(FixedOffset):
         return cls(sensor.v_sat_v * sensor.line_fpn_fraction) if sensor.line_fpn_fraction else None
 
     def pattern(self, sites: Sites) -> Floats:
-        """Return the offset of every site's line, (n,) V."""
+        """Return the offset of each site's readout line, (n,) V."""
         lines, line_of_site = np.unique(sites.layout.readout_line, return_inverse=True)
         return (self.offset_v * sites.device.line_normals(self.name, lines))[line_of_site]
 

@@ -1,4 +1,4 @@
-"""Temporal noise of the readout: reset, read and random telegraph noise."""
+"""Temporal noise of the readout: reset (kTC), read and random telegraph (RTS) noise."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ResetNoise(AdditiveNoise):
 
     @classmethod
     def from_sensor(cls, sensor: Any) -> Self | None:
-        """Return the effect that a sensor's keywords specify, or None; correlated double sampling removes it."""
+        """Return the effect that a sensor's keywords specify, or None, as with CDS."""
         return cls(sensor.temperature_k) if sensor.ktc_noise and not sensor.cds else None
 
     def deviation(self, sites: Sites) -> Floats:
@@ -43,7 +43,7 @@ class ResetNoise(AdditiveNoise):
 @dataclass(frozen=True, eq=False)
 class ReadNoise(AdditiveNoise):
     """
-    Gaussian noise of reading.
+    Gaussian read noise.
 
     Parameters
     ----------
@@ -70,18 +70,20 @@ class ReadNoise(AdditiveNoise):
 @dataclass(frozen=True)
 class TelegraphNoise(Effect):
     """
-    Random telegraph signals (RTS): some sites are in one of two equally probable states in each frame.
+    Random telegraph signal (RTS) noise: two equally probable states on some sites.
+
+    The state of each affected site is drawn for each frame.
 
     Parameters
     ----------
     rts_fraction : float
-        Probability of a site to have this noise.
+        Probability that a site has RTS noise.
     rts_e : float, e-
-        Distance of the two states.
+        Difference between the two states.
 
     Notes
     -----
-    The variance is ``rts_e² / 4`` on RTS sites; over all devices a site has ``rts_fraction`` of it.
+    The variance is ``rts_e² / 4`` on RTS sites. Averaged over all devices it is ``rts_fraction * rts_e² / 4`` on each site.
     """
 
     name: ClassVar[str] = "rts"
@@ -97,14 +99,14 @@ class TelegraphNoise(Effect):
         return cls(sensor.rts_fraction, sensor.rts_e) if sensor.rts_fraction and sensor.rts_e else None
 
     def half_step(self, sites: Sites) -> Floats:
-        """Return half the distance of the states, 0 on other sites, (n,) e-."""
+        """Return half the difference between the states, 0 on other sites, (n,) e-."""
         return sites.pattern(
             self,
             lambda every: np.where(every.device.uniforms(self.name) < self.rts_fraction, 0.5 * self.rts_e, 0.0),
         )
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
-        """Return values with one of the two states, half a step above or below, on RTS sites."""
+        """Return the values plus or minus half the difference of the states on RTS sites."""
         every = sites.once((self, "sites"), lambda whole: np.flatnonzero(self.half_step(whole)))
         first, end, _ = sites.index.indices(sites.layout.n_sites)
         where = every[slice(*np.searchsorted(every, (first, end)))] - first

@@ -1,4 +1,4 @@
-"""Fixed patterns of the response to light: photo-response non-uniformity and dead sites."""
+"""Fixed patterns of the photo response: non-uniformity (PRNU) and dead sites."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["DeadSites", "PhotoResponse"]
 @dataclass(frozen=True)
 class PhotoResponse(FixedFactor):
     """
-    Photo-response non-uniformity (PRNU): factors of mean 1, Gaussian, cut off at 0.
+    Photo-response non-uniformity (PRNU): Gaussian factors of mean 1, clipped at 0.
 
     Parameters
     ----------
@@ -47,12 +47,12 @@ class PhotoResponse(FixedFactor):
 @dataclass(frozen=True)
 class DeadSites(FixedFactor):
     """
-    Sites that collect no light.
+    Dead sites: sites without photo response.
 
     Parameters
     ----------
     dead_fraction : float
-        Probability of a site to be one.
+        Probability that a site is dead.
     """
 
     name: ClassVar[str] = "dead"

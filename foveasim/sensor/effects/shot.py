@@ -1,4 +1,4 @@
-"""Shot noise: one Poisson draw of the expected charge, of photoelectrons and dark charge together."""
+"""Shot noise: one Poisson draw of the expected charge, photoelectrons plus dark signal."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ __all__ = ["LARGEST_CHARGE_E", "ShotChoice", "ShotNoise", "draw_shot_noise"]
 
 ShotChoice = Literal["auto", "exact", "off"]
 
-#: Expectations beyond this are beyond numpy's Poisson generator; the Gaussian is exact to 1e-9 long before.
+#: Limit of numpy's Poisson generator. Larger expectations are rounded: their relative shot noise is below 1e-9.
 LARGEST_EXACT_E = 1e18
-#: No charge is larger: 2**62 fits int64 with room for sums.
+#: Upper limit of charges: 2**62 fits int64 with headroom for sums.
 LARGEST_CHARGE_E = 2.0**62
 #: Variance of rounding to integers.
 ROUNDING_E2 = 1.0 / 12.0
@@ -27,23 +27,23 @@ ROUNDING_E2 = 1.0 / 12.0
 @dataclass(frozen=True)
 class ShotNoise(Effect):
     """
-    The draw from expected to collected charge; collected charges are integers.
+    Shot-noise draw from expected to collected charge, in whole electrons.
 
     Parameters
     ----------
     how : {"auto", "exact", "off"}
-        ``"auto"``: exactly Poisson up to ``gaussian_above_e``; above it, a quadratic in a Gaussian number, rounded, of the
-        same mean, variance and third central moment. A site's draw does not depend on the expectations of others.
-        ``"exact"``: Poisson everywhere. ``"off"``: the expectation, rounded.
+        ``"auto"``: exact Poisson draws for expectations up to ``gaussian_above_e``; above it, a rounded quadratic function of
+        a Gaussian number with the mean, variance and third central moment of the Poisson distribution. A site's draw does not
+        depend on the expectations of other sites. ``"exact"``: Poisson draws everywhere. ``"off"``: the rounded expectation.
     gaussian_above_e : float, e-
 
     Notes
     -----
-    A Poisson distribution of mean λ has variance and third central moment λ. With a standard normal z, the number
-    ``λ + s z + c (z² - 1)`` has the mean λ, the variance ``s² + 2 c²`` and the third central moment ``6 c s² + 8 c³``;
-    rounding adds 1/12 to the variance. So ``s² = λ - 1/12 - 2 c²``, and c solves ``6 c (λ - 1/12) - 4 c³ = λ``: to the order
-    1/λ it is ``1/6 + 11 / (648 λ)``. This is the Cornish-Fisher expansion (Abramowitz and Stegun, 26.2.49) to second order,
-    corrected for rounding.
+    A Poisson distribution of mean λ has variance λ and third central moment λ. With a standard normal z, the random variable
+    ``λ + s z + c (z² - 1)`` has mean λ, variance ``s² + 2 c²`` and third central moment ``6 c s² + 8 c³``; rounding adds 1/12
+    to the variance. Hence ``s² = λ - 1/12 - 2 c²``, and c solves ``6 c (λ - 1/12) - 4 c³ = λ``: to order 1/λ it is
+    ``1/6 + 11 / (648 λ)``. This is the second-order Cornish-Fisher expansion (Abramowitz and Stegun, 26.2.49), corrected for
+    rounding.
     """
 
     name: ClassVar[str] = "shot"
@@ -55,7 +55,7 @@ class ShotNoise(Effect):
 
     @property
     def is_drawn(self) -> bool:
-        """Whether charges are drawn, not only rounded."""
+        """Whether charges are drawn, rather than only rounded."""
         return self.how != "off"
 
     def apply(self, values: Floats, *, sites: Sites | None, rng: np.random.Generator) -> Any:
@@ -75,7 +75,7 @@ class ShotNoise(Effect):
         return electrons
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites | None = None) -> tuple[Floats, Floats]:
-        """Return the mean, and the variance plus the mean of a Poisson distribution, or plus that of rounding."""
+        """Return the mean, and the variance plus shot noise, or plus rounding if not drawn."""
         _ = sites
         return mean, variance + (np.maximum(mean, 0.0) if self.is_drawn else ROUNDING_E2)
 
@@ -90,16 +90,16 @@ def draw_shot_noise(
     ----------
     expected_e : (n_site,) float64, e-
     how, gaussian_above_e
-        As for :class:`foveasim.sensor.effects.ShotNoise`.
+        See :class:`foveasim.sensor.effects.ShotNoise`.
     streams : Streams
-        Uses the stream ``shot``.
+        Random streams of the frame; the stream ``shot`` is used.
     n_threads : int, optional
-        All cores by default. Draws do not depend on it.
+        Number of threads; all cores by default. Draws do not depend on it.
 
     Returns
     -------
     electrons : (n_site,) int64, e-
-        Never below 0.
+        Non-negative.
     """
     expected_e = np.ascontiguousarray(unmasked("expected_e", expected_e), np.float64)
     shot = ShotNoise(how, gaussian_above_e)

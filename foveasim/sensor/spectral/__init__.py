@@ -1,4 +1,4 @@
-"""Quantum efficiency and colour filters: curves over wavelength, and the filters of a sensor."""
+"""Spectral curves (quantum efficiency, filter transmission) and sets of colour filters."""
 
 from __future__ import annotations
 

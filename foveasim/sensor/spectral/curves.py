@@ -1,8 +1,8 @@
 """
-Curves over wavelength in closed form, and what is made of other curves: products and means over bands.
+Spectral curves in closed form, and their products and band means.
 
 A curve is a function of the wavelength in nm with values from 0 to 1: a quantum efficiency, the transmission of a filter, or
-both in one, since they mix by their product.
+the product of both.
 """
 
 from __future__ import annotations
@@ -38,40 +38,40 @@ __all__ = [
 
 
 class CurveError(ParameterError):
-    """A function given for a curve that fails, or returns other than one number per wavelength."""
+    """Error of a user-defined curve: it raises, or does not return one number per wavelength."""
 
 
 class Curve(Protocol):
-    """A function of wavelength with values from 0 to 1."""
+    """Function of wavelength with values from 0 to 1."""
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Values at the wavelengths, of the same shape."""
+        """Return the values at the wavelengths, of the same shape."""
 
 
-#: What a curve may be multiplied with: a curve, or a number from 0 to 1, the same at every wavelength.
+#: Valid factors of a curve: another curve, or a constant from 0 to 1.
 Factor = Curve | float
 
 
 class Multiplied(ABC):
-    """What all curves of this package share: ``curve * curve`` and ``0.9 * curve`` are curves."""
+    """Base class of curves that defines products: ``curve * curve`` and ``0.9 * curve``."""
 
-    #: numpy's numbers leave the product to the curve.
+    #: Makes numpy scalars defer multiplication to the curve.
     __array_ufunc__ = None
 
     @abstractmethod
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Values at the wavelengths, of the same shape."""
+        """Return the values at the wavelengths, of the same shape."""
 
     def __mul__(self, other: Factor) -> ProductCurve:
-        """Product with another curve, or with a number from 0 to 1."""
+        """Return the product with another curve, or with a number from 0 to 1."""
         return ProductCurve((self, other))
 
     def __rmul__(self, other: Factor) -> ProductCurve:
-        """Product of another curve, or of a number from 0 to 1, with this one."""
+        """Return the product of another curve, or of a number from 0 to 1, with this curve."""
         return ProductCurve((other, self))
 
 
-#: Curves over wavelength by their names in settings files. Installed packages add theirs as entry points of the group
+#: Spectral curves by their names in settings files. Installed packages add curves by entry points of the group
 #: ``foveasim.curves``.
 CURVES: Registry[Callable[..., Any]] = Registry("curve", "foveasim.curves")
 
@@ -80,17 +80,17 @@ CURVES: Registry[Callable[..., Any]] = Registry("curve", "foveasim.curves")
 @dataclass(frozen=True)
 class ConstantCurve(Multiplied):
     """
-    The same value at every wavelength.
+    Constant curve.
 
     Parameters
     ----------
     value : float
-        From 0 to 1.
+        Value at all wavelengths, from 0 to 1.
 
     Raises
     ------
     ParameterError
-        When it is not.
+        If the value is out of range.
     """
 
     value: float = 1.0
@@ -99,7 +99,7 @@ class ConstantCurve(Multiplied):
         check_number("value", self.value, at_least=0.0, at_most=1.0)
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Values at the wavelengths, of the same shape."""
+        """Return the values at the wavelengths, of the same shape."""
         return np.full(np.shape(wavelength_nm), float(self.value))
 
 
@@ -107,19 +107,19 @@ class ConstantCurve(Multiplied):
 @dataclass(frozen=True, kw_only=True)
 class GaussianCurve(Multiplied):
     """
-    A smooth band: a Gaussian over wavelength.
+    Gaussian band.
 
     Parameters
     ----------
     centre_nm, fwhm_nm : float, nm
-        Where it is highest, and its full width at half maximum.
+        Centre wavelength and full width at half maximum.
     peak : float
-        Its value there.
+        Value at the centre.
 
     Raises
     ------
     ParameterError
-        When a value is out of range.
+        If a value is out of range.
     """
 
     centre_nm: float
@@ -132,7 +132,7 @@ class GaussianCurve(Multiplied):
         check_number("peak", self.peak, above=0.0, at_most=1.0)
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Values at the wavelengths, of the same shape."""
+        """Return the values at the wavelengths, of the same shape."""
         offset = (as_numbers("wavelength_nm", wavelength_nm) - self.centre_nm) / self.fwhm_nm
         return np.asarray(self.peak * np.exp(-4.0 * np.log(2.0) * offset**2))
 
@@ -141,27 +141,27 @@ class GaussianCurve(Multiplied):
 @dataclass(frozen=True, kw_only=True)
 class PassBand(Multiplied):
     """
-    A filter that passes a band, all above a wavelength (long-pass), or all below one (short-pass: an infrared cut).
+    Band-pass, long-pass or short-pass (infrared-cut) filter.
 
     Parameters
     ----------
     from_nm, to_nm : float, optional, nm
-        Where the band begins and ends: half of the peak. Without the first it is a short-pass, without the second a
-        long-pass.
+        Cut-on and cut-off wavelengths, at half of the peak. Without ``from_nm`` the filter is a short-pass, without ``to_nm``
+        a long-pass.
     edge_nm : float, nm
-        Width of the edges, from 10 % to 90 %; 0 for sharp ones.
+        Width of the edges from 10 % to 90 %; 0 for sharp edges.
     peak : float
-        What it passes inside.
+        Transmission in the pass band.
 
     Raises
     ------
     ParameterError
-        When there is neither beginning nor end, or a value is out of range.
+        If neither wavelength is given, or a value is out of range.
 
     Notes
     -----
-    Edges are logistic functions, and a band is the difference of two of them: neighbouring bands add up to the band of
-    both, the area is ``peak * (to_nm - from_nm)``, and a band narrower than its edges does not reach its peak.
+    Edges are logistic functions, and a band is the difference of two edges: adjacent bands add up to the combined band, the
+    area is ``peak * (to_nm - from_nm)``, and a band narrower than its edges does not reach its peak.
 
     Examples
     --------
@@ -177,7 +177,9 @@ class PassBand(Multiplied):
 
     def __post_init__(self) -> None:
         if self.from_nm is None and self.to_nm is None:
-            raise ParameterError("from_nm", "or 'to_nm' must be given; without both, ConstantCurve passes all alike")
+            raise ParameterError(
+                "from_nm", "or 'to_nm' must be given; for the same transmission at all wavelengths use ConstantCurve"
+            )
         if self.from_nm is not None:
             check_number("from_nm", self.from_nm, above=0.0)
         if self.to_nm is not None:
@@ -186,20 +188,20 @@ class PassBand(Multiplied):
         check_number("peak", self.peak, above=0.0, at_most=1.0)
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Values at the wavelengths, of the same shape."""
+        """Return the values at the wavelengths, of the same shape."""
         waves_nm = as_numbers("wavelength_nm", wavelength_nm)
         begun = 1.0 if self.from_nm is None else self._step(waves_nm - self.from_nm)
         ended = 0.0 if self.to_nm is None else self._step(waves_nm - self.to_nm)
         return np.asarray(self.peak * np.maximum(begun - ended, 0.0))
 
     def _step(self, offset_nm: Floats) -> Floats:
-        """From 0 far below to 1 far above."""
+        """Return the edge function: 0 far below the edge, 1 far above."""
         if self.edge_nm == 0.0:
             return np.heaviside(offset_nm, 0.5)
         return 0.5 + 0.5 * np.tanh(np.log(9.0) * offset_nm / self.edge_nm)
 
 
-#: Absorption lengths of crystalline silicon at room temperature, nm to µm; interpolated in the logarithm.
+#: Absorption lengths of crystalline silicon at room temperature, µm by nm; interpolated logarithmically.
 SILICON_NM = (400, 450, 500, 550, 600, 650, 700, 750, 800, 850, 900, 950, 1000, 1050)
 SILICON_ABSORPTION_UM = (
     0.0971, 0.3755, 0.8195, 1.561, 2.578, 3.580, 5.243, 7.838, 12.09, 19.55, 33.96, 66.35, 162.3, 640.7,
@@ -210,23 +212,23 @@ SILICON_ABSORPTION_UM = (
 @dataclass(frozen=True, kw_only=True)
 class SiliconQE(Multiplied):
     """
-    Quantum efficiency of a silicon layer: the fraction of the light that it absorbs.
+    Quantum efficiency of a silicon layer: its absorbed fraction of the photons.
 
     Parameters
     ----------
     depth_um : float, µm
-        Thickness from which all charge is collected.
+        Collection depth: thickness from which all charge is collected.
     transmission : float
-        Fraction of the light that enters the silicon.
+        Fraction of the photons that enter the silicon.
 
     Raises
     ------
     ParameterError
-        When a value is out of range; on a call, for a wavelength outside 400 to 1050 nm, where no absorption is known here.
+        If a value is out of range; when called, if a wavelength is outside the absorption table, 400 to 1050 nm.
 
     Notes
     -----
-    ``transmission * (1 - exp(-depth / l))`` with the absorption length ``l(wavelength)`` (Beer and Lambert).
+    ``transmission * (1 - exp(-depth / l))`` with the absorption length ``l(wavelength)`` (Beer-Lambert law).
     """
 
     depth_um: float
@@ -237,8 +239,8 @@ class SiliconQE(Multiplied):
         check_number("transmission", self.transmission, above=0.0, at_most=1.0)
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Values at the wavelengths, of the same shape."""
-        check_within(wavelength_nm, SILICON_NM[0], SILICON_NM[-1], "the table of silicon's absorption")
+        """Return the values at the wavelengths, of the same shape."""
+        check_within(wavelength_nm, SILICON_NM[0], SILICON_NM[-1], "the absorption table of silicon")
         length_um = np.exp(
             np.interp(as_numbers("wavelength_nm", wavelength_nm), SILICON_NM, np.log(SILICON_ABSORPTION_UM))
         )
@@ -248,19 +250,19 @@ class SiliconQE(Multiplied):
 @dataclass(frozen=True)
 class ProductCurve(Multiplied):
     """
-    The product of curves: light goes through one filter after the other, and what is left becomes electrons.
+    Product of curves, such as stacked filters and a quantum efficiency.
 
-    Also written as ``curve * curve``.
+    ``curve * curve`` creates the same product.
 
     Parameters
     ----------
     curves : sequence of curves or numbers
-        Numbers from 0 to 1 stand for the same at every wavelength. Products among them are taken apart.
+        Numbers from 0 to 1 are constants. Nested products are flattened.
 
     Raises
     ------
     ParameterError
-        When there is no curve, or a number is out of range; on a call, for a wavelength that one of the curves rejects.
+        If there is no curve, or a number is out of range; when called, if one of the curves rejects a wavelength.
     """
 
     curves: Sequence[Factor]
@@ -275,7 +277,7 @@ class ProductCurve(Multiplied):
         object.__setattr__(self, "curves", tuple(flat))
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Values at the wavelengths, of the same shape."""
+        """Return the values at the wavelengths, of the same shape."""
         return np.asarray(
             reduce(np.multiply, (curve_values(as_curve("curves", c), wavelength_nm) for c in self.curves))
         )
@@ -284,27 +286,28 @@ class ProductCurve(Multiplied):
 @dataclass(frozen=True, kw_only=True)
 class BandMean(Multiplied):
     """
-    The mean of a curve over a band around each wavelength, where few wavelengths stand for broad bands of light.
+    Mean of a curve over a band around each wavelength, for scenes with few broad bands.
 
     Parameters
     ----------
     curve : Curve
     band_width_nm : float, nm
-        Width of the bands, such as the scene's.
+        Width of the bands, such as that of the scene.
     n_points : int
-        Wavelengths in a band at which the curve is taken.
+        Number of wavelengths per band at which the curve is evaluated.
 
     Raises
     ------
     ParameterError
-        When a value is out of range; on a call, when a band reaches where the curve is not known, or below 0 nm.
+        If a value is out of range; when called, if a band extends beyond the domain of the curve, or below 0 nm.
 
     Notes
     -----
-    Every wavelength is taken by its number of photons per energy: light of the same radiance all over the band gives the
-    electrons that it gives wavelength by wavelength. A band's mean is that of its halves, each by its photons. A filter
-    narrower than the distance of the scene's wavelengths is not to be taken at these wavelengths alone: one of 10 nm gives
-    between 0.2 and 1.9 of its electrons where they are 20 nm apart, and all of them by this mean.
+    Wavelengths are weighted with their number of photons per energy: for constant spectral radiance within the band, the
+    number of electrons equals that of a wavelength-by-wavelength calculation. The mean of a band is the photon-weighted mean
+    of its halves. A filter narrower than the wavelength interval of the scene must not be evaluated at these wavelengths
+    alone: for a filter of 10 nm and an interval of 20 nm, this gives 0.2 to 1.9 times the true number of electrons, whereas
+    the band mean is exact.
     """
 
     curve: Curve
@@ -318,12 +321,12 @@ class BandMean(Multiplied):
         object.__setattr__(self, "n_points", check_count("n_points", self.n_points, at_most=100_000))
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Values at the wavelengths, of the same shape."""
+        """Return the values at the wavelengths, of the same shape."""
         centre_nm = as_numbers("wavelength_nm", wavelength_nm)[..., np.newaxis]
         if np.any(centre_nm <= 0.5 * self.band_width_nm):
             raise ParameterError(
                 "wavelength_nm",
-                f"must be > {0.5 * self.band_width_nm:g}, half a band",
+                f"must be > {0.5 * self.band_width_nm:g}, half the band width",
                 float(np.min(centre_nm)),
                 "nm",
             )
@@ -334,12 +337,12 @@ class BandMean(Multiplied):
 
 def as_curve(name: str, value: object) -> Curve:
     """
-    The value as a curve: itself, or a number as the same at every wavelength.
+    Return the value as a curve; numbers become constant curves.
 
     Raises
     ------
     ParameterError
-        When it is neither a function nor a number from 0 to 1; ``name`` is what the message calls it.
+        If the value is neither a function nor a number from 0 to 1; ``name`` is its name in the message.
     """
     if callable(value):
         return value
@@ -348,14 +351,16 @@ def as_curve(name: str, value: object) -> Curve:
 
 def curve_values(curve: Curve, wavelength_nm: ArrayLike) -> Floats:
     """
-    Return a curve's values at wavelengths, of the same shape; one number stands for all of them.
+    Return the values of a curve at wavelengths, of the same shape.
+
+    A curve that returns a single number is constant.
 
     Raises
     ------
     CurveError
-        When the function fails, which is the cause, or returns other than one real number per wavelength.
+        If the function raises (its exception is the cause), or does not return one real number per wavelength.
     ParameterError
-        As the curves of this package raise it.
+        If a curve of this package rejects a wavelength.
     """
     called = getattr(curve, "__qualname__", None) or type(curve).__qualname__
     try:
@@ -384,16 +389,16 @@ def curve_values(curve: Curve, wavelength_nm: ArrayLike) -> Floats:
 
 def check_within(wavelength_nm: ArrayLike, low_nm: float, high_nm: float, what: str, cure: str = "") -> None:
     """
-    Reject wavelengths outside a range, and those that are no numbers.
+    Reject wavelengths outside a range, including NaN.
 
     Raises
     ------
     ParameterError
-        With the first such wavelength.
+        If a wavelength is outside; the message states the first one.
     """
     waves_nm = as_numbers("wavelength_nm", wavelength_nm)
     outside = waves_nm[~((waves_nm >= low_nm) & (waves_nm <= high_nm))]
     if outside.size:
         raise ParameterError(
-            "wavelength_nm", f"must lie in {what}, {low_nm:g} to {high_nm:g} nm", float(outside[0]), "nm", cure
+            "wavelength_nm", f"must be within {what}, {low_nm:g} to {high_nm:g} nm", float(outside[0]), "nm", cure
         )

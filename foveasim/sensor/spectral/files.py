@@ -1,9 +1,9 @@
 """
-Curves over wavelength from text files: one column of wavelengths, and one or more of values.
+Spectral curves from text files with one column of wavelengths and columns of values.
 
-Columns are parted by commas, semicolons, tabs or blanks; lines that begin with ``#`` and empty lines are left out; a first
-line that does not begin with a number names the columns. Nothing is guessed: wavelengths are in nm and values from 0 to 1,
-unless the caller or the first line says otherwise (``wavelength_um``, ``QE [%]``).
+Columns are separated by commas, semicolons, tabs or spaces. Lines that begin with ``#`` and empty lines are ignored. A first
+line that does not begin with a number is a header with column names. Units are never inferred from the values: wavelengths are
+in nm and values from 0 to 1, unless the caller or the header specifies another unit (``wavelength_um``, ``QE [%]``).
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ WavelengthUnit = Literal["nm", "um"]
 ValueUnit = Literal["fraction", "percent"]
 Between = Literal["lines", "spline"]
 
-#: A table of curves is written by hand or by an instrument; a longer one is something else.
+#: Size limits of tables that are written by hand or by an instrument; larger files are not tables of curves.
 MAX_FILE_BYTES = 4 << 20
 MAX_ROWS, MAX_COLUMNS = 100_000, 1000
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
-#: Numbers to programs, and no names of columns.
+#: Non-finite numbers, which do not count as column names.
 NO_NAME = re.compile(r"[-+]?(nan|inf|infinity)", re.IGNORECASE)
-#: Words in the first line that say a unit: how many nm it is.
+#: Wavelength units in the header, in nm.
 UNITS_NM = {
     **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), 1.0),
     **dict.fromkeys(
         ("um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"), 1e3
     ),
 }
-#: Words that say a unit that is not read.
+#: Unsupported wavelength units in the header.
 OTHER_UNITS = {"angstrom", "angstroms", "ångström", "å", "mm", "m", "cm", "ev", "hz", "thz"}
-#: What is cut from a column's name, for it says the unit and no name.
+#: Percent markers, which are removed from column names.
 PERCENT = re.compile(r"[\s_]*[\[(]?\s*(%|\bpercent\b|\bpct\b|(?<=_)percent|(?<=_)pct)\s*[\])]?", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class _Table:
-    """Columns of a file, wavelengths taken apart and in nm, values from 0 to 1."""
+    """Columns of a file: wavelengths in nm, values from 0 to 1."""
 
     names: tuple[str, ...]
     wavelength_nm: Floats
@@ -73,17 +73,17 @@ def read_curve(
     Parameters
     ----------
     path : path
-        Text in UTF-8 with a column of wavelengths first.
+        UTF-8 text file, with the wavelengths in the first column.
     column : str or int, optional
-        Name of the values' column, or its number: 1 is the first beside the wavelengths. Needed where there are several.
+        Name or number of the value column, where 1 is the column after the wavelengths. Required if there are several.
     wavelength_unit : {"nm", "um"}, optional
-        Of the wavelengths; otherwise what the first line says (``wavelength_um``, ``lambda [µm]``), or else nm.
+        Unit of the wavelengths; by default that of the header (``wavelength_um``, ``lambda [µm]``), otherwise nm.
     value_unit : {"fraction", "percent"}, optional
-        Of the values; otherwise percent where the column's name says so (``QE [%]``, ``qe_percent``), or else from 0 to 1.
+        Unit of the values; by default percent if the column name states it (``QE [%]``, ``qe_percent``), otherwise 0 to 1.
     between : {"lines", "spline"}
-        What is between the values: :class:`TableCurve` or :class:`SplineCurve`.
+        Interpolation: :class:`TableCurve` or :class:`SplineCurve`.
     beyond : {"raise", "zero", "hold"}
-        What to do with wavelengths outside the table: raise an error, take 0, or take the value at the end.
+        Behaviour outside the table: raise an error, return 0, or return the value at the end.
 
     Returns
     -------
@@ -93,15 +93,15 @@ def read_curve(
     Raises
     ------
     FileError
-        With the line and what was expected and got, when the file is missing, too large, no such table, or a value is out
-        of range.
+        If the file is missing, too large or not a valid table, or a value is out of range; the message states the line, the
+        rule and the value.
     ParameterError
-        When a choice is none of the above.
+        If an option is invalid.
     """
     path = Path(path)
     table = _read(path, wavelength_unit, value_unit)
     if column is None and len(table.names) > 1:
-        raise FileError(path, f"has {len(table.names)} columns of values, say which: {', '.join(table.names)}")
+        raise FileError(path, f"has {len(table.names)} value columns; specify one of {', '.join(table.names)}")
     k = _position(path, table, 1 if column is None else column)
     return _curve(table, k, f"{path.name}, {table.names[k]}", between, beyond)
 
@@ -115,27 +115,27 @@ def read_filters(
     beyond: Beyond = "raise",
 ) -> FilterSet:
     """
-    Read a set of colour filters from a text file: every column beside the wavelengths is one.
+    Read a set of colour filters from a text file, one per value column.
 
     Parameters
     ----------
     path : path
-        Text in UTF-8 with a column of wavelengths first; its first line names the filters.
+        UTF-8 text file, with the wavelengths in the first column and the filter names in the header.
     wavelength_unit, value_unit, between, beyond
         As for :func:`read_curve`.
 
     Returns
     -------
     FilterSet
-        In the order of the columns, which is the order of a layout's channels.
+        Filters in the order of the columns, which corresponds to the channels of a layout.
 
     Raises
     ------
     FileError
-        With the line and what was expected and got, when the file is missing, too large, no such table, or a value is out
-        of range.
+        If the file is missing, too large or not a valid table, or a value is out of range; the message states the line, the
+        rule and the value.
     ParameterError
-        When a choice is none of the above.
+        If an option is invalid.
     """
     path = Path(path)
     table = _read(path, wavelength_unit, value_unit)
@@ -151,13 +151,13 @@ def _curve(table: _Table, k: int, source: str, between: Between, beyond: Beyond)
 
 
 def _position(path: Path, table: _Table, column: str | int) -> int:
-    """Position of a column among the values."""
+    """Return the index of a column among the value columns."""
     if isinstance(column, str) and column in table.names:
         return table.names.index(column)
     if isinstance(column, int) and not isinstance(column, bool) and 1 <= column <= len(table.names):
         return column - 1
     raise FileError(
-        path, f"has no column {column!r}, only {', '.join(table.names)}, or their numbers from 1 to {len(table.names)}"
+        path, f"has no column {column!r}; the columns are {', '.join(table.names)}, or 1 to {len(table.names)}"
     )
 
 
@@ -168,15 +168,15 @@ def _read(path: Path, wavelength_unit: WavelengthUnit | None, value_unit: ValueU
         check_choice("value_unit", value_unit, get_args(ValueUnit))
     rows = list(_rows(path, _text(path)))
     if not rows:
-        raise FileError(path, "holds no table: no line but comments")
+        raise FileError(path, "contains no table, only comments and empty lines")
     first = rows[0][1][0]
     header = None if NUMBER.fullmatch(first) or NO_NAME.fullmatch(first) else rows.pop(0)[1]
     if len(rows) < 2:
-        raise FileError(path, f"must have at least 2 lines of numbers, got {len(rows)}")
+        raise FileError(path, f"must have at least 2 rows of numbers, got {len(rows)}")
     n_columns = len(rows[0][1]) if header is None else len(header)
     if not 2 <= n_columns <= MAX_COLUMNS:
         raise FileError(
-            path, f"must have 2 to {MAX_COLUMNS} columns, wavelengths and values, got {n_columns} in its first line"
+            path, f"must have 2 to {MAX_COLUMNS} columns, wavelengths and values, got {n_columns} in its first row"
         )
     numbers = np.array([_numbers(path, line, cells, n_columns) for line, cells in rows])
     scale_nm, is_percent, names = _said(path, header, n_columns - 1)
@@ -194,10 +194,10 @@ def _text(path: Path) -> str:
         if not path.is_file():
             raise FileError(path, "is not a file" if path.exists() else "no such file")
         if path.stat().st_size > MAX_FILE_BYTES:
-            raise FileError(path, f"is larger than {MAX_FILE_BYTES} bytes, and so no table of curves")
+            raise FileError(path, f"must be a table of curves with at most {MAX_FILE_BYTES} bytes")
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
-        raise FileError(path, "is no text in UTF-8") from None
+        raise FileError(path, "is not valid UTF-8 text") from None
     except (OSError, ValueError) as error:
         if isinstance(error, FileError):
             raise
@@ -205,36 +205,36 @@ def _text(path: Path) -> str:
 
 
 def _rows(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
-    """Numbers of the lines that hold something, and their cells."""
+    """Yield line number and cells of each line with content."""
     numbered = [
         (k, line)
         for k, line in enumerate(text.splitlines(), start=1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
     if len(numbered) > MAX_ROWS:
-        raise FileError(path, f"has more than {MAX_ROWS} lines, and so is no table of curves")
+        raise FileError(path, f"must be a table of curves with at most {MAX_ROWS} lines")
     first = numbered[0][1] if numbered else ""
     separator = next((mark for mark in ";\t," if mark in first), " ")
     for k, line in numbered:
         try:
             cells = line.split() if separator == " " else next(csv.reader([line], delimiter=separator, strict=True))
         except csv.Error as error:
-            raise FileError(path, f"line {k} cannot be parted into columns: {error}") from None
+            raise FileError(path, f"line {k} cannot be split into columns: {error}") from None
         yield k, [cell.strip() for cell in cells]
 
 
 def _numbers(path: Path, line: int, cells: list[str], n_columns: int) -> list[float]:
     if len(cells) != n_columns:
-        raise FileError(path, f"line {line} must have {n_columns} columns, as the first has, got {len(cells)}")
+        raise FileError(path, f"line {line} must have {n_columns} columns, as in the first row, got {len(cells)}")
     for k, cell in enumerate(cells, start=1):
         if not NUMBER.fullmatch(cell):
-            cure = "; write decimals with a point" if re.fullmatch(r"[-+]?\d+,\d+", cell) else ""
+            cure = "; use a decimal point" if re.fullmatch(r"[-+]?\d+,\d+", cell) else ""
             raise FileError(path, f"line {line}, column {k}: must be a number, got {cell[:40]!r}{cure}")
     return [float(cell) for cell in cells]
 
 
 def _said(path: Path, header: list[str] | None, n_values: int) -> tuple[float, np.ndarray, tuple[str, ...]]:
-    """What the first line says: nm per unit of the wavelengths, which columns are percent, and the columns' names."""
+    """Parse the header: nm per wavelength unit, mask of percent columns, and column names."""
     is_percent = np.zeros(n_values, np.bool_)
     if header is None:
         return 1.0, is_percent, tuple(str(k + 1) for k in range(n_values))
@@ -242,13 +242,13 @@ def _said(path: Path, header: list[str] | None, n_values: int) -> tuple[float, n
     scales = [UNITS_NM[word] for word in words if word in UNITS_NM]
     other = [word for word in words[1:] if word in OTHER_UNITS]
     if other and not scales:
-        raise FileError(path, f"wavelengths must be in nm or µm, got {header[0][:40]!r}")
+        raise FileError(path, f"wavelengths must be in nm or µm, got the column name {header[0][:40]!r}")
     names = tuple(PERCENT.sub("", cell).strip() for cell in header[1:])
     for k, (cell, name) in enumerate(zip(header[1:], names, strict=True)):
         is_percent[k] = PERCENT.search(cell) is not None
         if not name or name in names[:k]:
-            problem = "has no name" if not name else f"has the name {name!r} again"
-            raise FileError(path, f"column {k + 2} {problem} in the first line")
+            problem = "has no name" if not name else f"repeats the name {name!r}"
+            raise FileError(path, f"column {k + 2} {problem} in the header")
     return (scales or [1.0])[0], is_percent, names
 
 
@@ -257,7 +257,7 @@ def _checked_wavelengths_nm(path: Path, lines: list[int], waves_nm: Floats, scal
     if is_odd.any():
         k = int(np.argmax(is_odd))
         cure = (
-            "; where they are in µm, say wavelength_unit='um'"
+            "; for wavelengths in µm set wavelength_unit='um'"
             if scale_nm == 1.0 and waves_nm[k] < MIN_WAVELENGTH_NM
             else ""
         )
@@ -278,9 +278,9 @@ def _checked_values(
     path: Path, lines: list[int], names: tuple[str, ...], values: Floats, is_percent: np.ndarray
 ) -> Floats:
     for is_bad, rule in (
-        (values < 0.0, "must be >= 0; set to 0 what is noise"),
+        (values < 0.0, "must be >= 0; set negative noise to 0"),
         (is_percent & (values > 100.0), "must be <= 100 %"),
-        (~is_percent & (values > 1.0), "must be <= 1; where it is percent, say value_unit='percent'"),
+        (~is_percent & (values > 1.0), "must be <= 1; for percentages set value_unit='percent'"),
     ):
         if is_bad.any():
             row, column = (int(i) for i in np.argwhere(is_bad)[0])

@@ -1,4 +1,4 @@
-"""Curves of real devices, from tables that come with the package: each data file says where its figures are from."""
+"""Measured curves of real devices from bundled tables; each data file states its source."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ __all__ = ["camera_filters", "ccd_qe"]
 @CURVES.register("ccd")
 def ccd_qe() -> TableCurve | SplineCurve:
     """
-    Quantum efficiency of a back-illuminated silicon CCD, as measured: a table for the paper's Fig. 5.
+    Read the measured quantum efficiency of a back-illuminated CCD (cf. the paper's Fig. 5).
 
     Returns
     -------
     TableCurve
-        From 320 to 1100 nm; its highest value is 0.857, at 440 nm.
+        Range 320 to 1100 nm; maximum 0.857 at 440 nm.
 
     Notes
     -----
-    The European Southern Observatory's test report of one of OmegaCAM's devices, EEV 44-82-1-A57 'Centaurus'. Another device
-    of the type is the same within 0.045 above 480 nm, and lower by up to 0.13 below.
+    Source: test report of the European Southern Observatory on an OmegaCAM device, EEV 44-82-1-A57 'Centaurus'. Another device
+    of this type agrees within 0.045 above 480 nm, and is lower by up to 0.13 below.
 
     Examples
     --------
@@ -40,19 +40,21 @@ def ccd_qe() -> TableCurve | SplineCurve:
 
 def camera_filters() -> FilterSet:
     """
-    Red, green and blue of a camera (Nikon D5100) with its infrared cut, as measured: the quantum efficiency is included.
+    Read the measured RGB sensitivities of a camera (Nikon D5100).
+
+    The sensitivities include infrared-cut filter and quantum efficiency.
 
     Returns
     -------
     FilterSet
-        "R", "G" and "B" from 380 to 780 nm. The measurement is relative: each colour's highest value is 1, and the sensor's
-        ``qe`` is to be the one number that it stands for.
+        "R", "G" and "B" from 380 to 780 nm. The data are relative, with a maximum of 1 for each colour; the sensor's ``qe``
+        should therefore be a number, the quantum efficiency at the maximum.
 
     Notes
     -----
-    M. M. Darrodi et al., Reference dataset for camera spectral sensitivity estimation, J. Opt. Soc. Am. A 32, 381, 2015;
-    taken as response per radiance, and divided by the wavelength to give electrons per photon. J. Jiang et al. (WACV 2013)
-    measured the same type: within 0.11, but for the steep edge at 420 nm.
+    Source: M. M. Darrodi et al., Reference data set for camera spectral sensitivity estimation, J. Opt. Soc. Am. A 32, 381,
+    2015. The data are interpreted as response per radiance, and divided by the wavelength to give electrons per photon. J.
+    Jiang et al. (WACV 2013) measured the same camera type: the difference is at most 0.11, except at the steep edge at 420 nm.
     """
     measured = read_filters(_data("nikon_d5100_rgb"))
     curves = []

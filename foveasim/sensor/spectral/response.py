@@ -1,4 +1,4 @@
-"""The colour filters of a sensor: one curve over wavelength for each channel of its sites."""
+"""Colour filters of a sensor: one spectral curve for each channel."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ __all__ = ["ConstantCurve", "Curve", "FilterSet", "rgb_filters"]
 @dataclass(frozen=True)
 class FilterSet:
     """
-    The colour filters of a sensor; a site's ``channel`` is the position of its filter.
+    Set of colour filters of a sensor; the ``channel`` of a site is the index of its filter.
 
-    ``filters * curve`` is the set with every filter times a curve (an infrared cut, a quantum efficiency) or a number;
-    ``filters * [curve, ...]`` with each filter times its own, which gives every channel a quantum efficiency of its own.
+    ``filters * curve`` multiplies all filters by a curve (an infrared-cut filter, a quantum efficiency) or a number;
+    ``filters * [curve, ...]`` multiplies each filter by its own curve, such as a quantum efficiency per channel.
 
     Parameters
     ----------
     curves : sequence of Curve
-        Transmissions, with or without the quantum efficiency behind them.
+        Transmissions, with or without quantum efficiency.
     names : sequence of str, optional
-        One a curve; "0", "1", ... by default.
+        One name per curve; "0", "1", ... by default.
 
     Raises
     ------
     ParameterError
-        When there is no curve, or names and curves differ in number.
+        If there is no curve, or the numbers of names and curves differ.
     """
 
     curves: Sequence[Curve]
     names: Sequence[str] | None = None
 
-    #: numpy's numbers and arrays leave the product to the set.
+    #: Makes numpy scalars and arrays defer multiplication to the set.
     __array_ufunc__ = None
 
     def __post_init__(self) -> None:
@@ -64,7 +64,7 @@ class FilterSet:
         return len(self.curves)
 
     def __mul__(self, other: Factor | Sequence[Factor]) -> FilterSet:
-        """The set with every filter times a curve or number, or each times its own of a list."""
+        """Return the set with all filters times a curve or number, or times one curve each."""
         factors = [other] * len(self) if callable(other) or not isinstance(other, Sequence | np.ndarray) else other
         if len(factors) != len(self):
             raise ParameterError(
@@ -80,32 +80,32 @@ class FilterSet:
 
     def over_bands(self, band_width_nm: float) -> FilterSet:
         """
-        The set with every filter as its mean over the bands of a scene: :class:`foveasim.sensor.BandMean`.
+        Return the set of the filters' band means: :class:`foveasim.sensor.BandMean`.
 
         Raises
         ------
         ParameterError
-            When the width is not above 0.
+            If the width is not positive.
         """
         return FilterSet([BandMean(curve=curve, band_width_nm=band_width_nm) for curve in self.curves], self.names)
 
     def transmission(self, wavelength_nm: Floats) -> Floats:
         """
-        Transmission of every filter, (n_filter, n_wavelength).
+        Compute the transmission of each filter, (n_filter, n_wavelength).
 
         Raises
         ------
         ParameterError
-            When a curve fails, or returns other than one number per wavelength; its own error is the cause.
+            If a curve raises (its exception is the cause), or does not return one number per wavelength.
         """
         return np.stack([curve_values(curve, wavelength_nm) for curve in self.curves])
 
 
 def rgb_filters() -> FilterSet:
     """
-    Red, green and blue filters as three smooth overlapping bands.
+    Return generic red, green and blue filters with Gaussian bands.
 
-    A stand-in of the usual shape, no measured product: Gaussians at 610, 540 and 460 nm, 90 nm wide at half maximum. For
-    those of a camera see :func:`foveasim.sensor.camera_filters`.
+    The bands have a typical shape, but are not measured: centres 610, 540 and 460 nm, FWHM 90 nm. For measured filters see
+    :func:`foveasim.sensor.camera_filters`.
     """
     return FilterSet(tuple(GaussianCurve(centre_nm=c, fwhm_nm=90.0) for c in (610.0, 540.0, 460.0)), ("R", "G", "B"))

@@ -1,4 +1,4 @@
-"""Curves over wavelength from tables: fitted by a polynomial, interpolated by lines or a spline, or in steps."""
+"""Spectral curves from tables: polynomial fits, linear and spline interpolation, steps."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from foveasim.sensor.spectral.curves import CURVES, Multiplied, check_within
 
 __all__ = ["Beyond", "PolynomialCurve", "SplineCurve", "StepCurve", "TableCurve"]
 
-#: What a table says of wavelengths beyond its ends: nothing, that the curve is 0 there, or that it stays as at the end.
+#: Values outside the table: raise an error, 0, or the value at the end.
 Beyond = Literal["raise", "zero", "hold"]
-BEYOND_CURE = "beyond='zero' or beyond='hold' says what the curve is there"
+BEYOND_CURE = "set beyond='zero' or beyond='hold' to extrapolate"
 
 
 @CURVES.register("polynomial")
 @dataclass(frozen=True, kw_only=True)
 class PolynomialCurve(Multiplied):
     """
-    A polynomial fitted to a table by least squares: the paper's quantum efficiency (Fig. 5).
+    Least-squares polynomial fit of a table, as for the paper's quantum efficiency (Fig. 5).
 
     Parameters
     ----------
     wavelength_nm, value : sequences of the same length
-        The table, in any order. Values from 0 to 1.
+        Table, in any order. Values from 0 to 1.
     degree : int
-        Degree of the polynomial, below the number of values.
+        Degree of the polynomial, less than the number of values.
 
     Raises
     ------
     ParameterError
-        When the table is out of range; on a call, for a wavelength outside the table, where a polynomial means nothing.
+        If the table is invalid; when called, if a wavelength is outside the table, where the polynomial is not meaningful.
 
     Notes
     -----
-    What the polynomial makes of a table near 0 or 1 is limited to that range.
+    Values of the polynomial are clipped to 0 .. 1.
     """
 
     wavelength_nm: Sequence[float]
@@ -57,7 +57,7 @@ class PolynomialCurve(Multiplied):
         return np.polynomial.Polynomial.fit(self.wavelength_nm, self.value, self.degree)
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Values at the wavelengths, of the same shape."""
+        """Return the values at the wavelengths, of the same shape."""
         check_within(wavelength_nm, self.wavelength_nm[0], self.wavelength_nm[-1], "the table of the fit")
         return np.clip(self._fit(as_numbers("wavelength_nm", wavelength_nm)), 0.0, 1.0)
 
@@ -66,21 +66,21 @@ class PolynomialCurve(Multiplied):
 @dataclass(frozen=True, kw_only=True)
 class TableCurve(Multiplied):
     """
-    A table with straight lines between its values.
+    Table with linear interpolation.
 
     Parameters
     ----------
     wavelength_nm, value : sequences of the same length
-        The table, in any order. Values from 0 to 1.
+        Table, in any order. Values from 0 to 1.
     beyond : {"raise", "zero", "hold"}
-        What to do with wavelengths outside the table: raise an error, take 0, or take the value at the end.
+        Behaviour outside the table: raise an error, return 0, or return the value at the end.
     source : str
-        Where the figures come from; kept with the results.
+        Source of the data; stored with the results.
 
     Raises
     ------
     ParameterError
-        When the table is out of range; on a call, for a wavelength outside it, unless ``beyond`` says what is there.
+        If the table is invalid; when called, if a wavelength is outside the table and ``beyond`` is "raise".
     """
 
     wavelength_nm: Sequence[float]
@@ -93,7 +93,7 @@ class TableCurve(Multiplied):
         check_choice("beyond", self.beyond, get_args(Beyond))
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Values at the wavelengths, of the same shape."""
+        """Return the values at the wavelengths, of the same shape."""
         waves_nm, is_known = _inside(wavelength_nm, self.wavelength_nm, self.beyond)
         return np.where(is_known, np.interp(waves_nm, self.wavelength_nm, self.value), 0.0)
 
@@ -102,26 +102,26 @@ class TableCurve(Multiplied):
 @dataclass(frozen=True, kw_only=True)
 class SplineCurve(Multiplied):
     """
-    A table with a smooth curve through its values that keeps their shape: no dip or hump that the table has not.
+    Table with shape-preserving (monotone) cubic interpolation.
 
     Parameters
     ----------
     wavelength_nm, value : sequences of the same length
-        The table, in any order. Values from 0 to 1.
+        Table, in any order. Values from 0 to 1.
     beyond : {"raise", "zero", "hold"}
-        What to do with wavelengths outside the table: raise an error, take 0, or take the value at the end.
+        Behaviour outside the table: raise an error, return 0, or return the value at the end.
     source : str
-        Where the figures come from; kept with the results.
+        Source of the data; stored with the results.
 
     Raises
     ------
     ParameterError
-        When the table is out of range; on a call, for a wavelength outside it, unless ``beyond`` says what is there.
+        If the table is invalid; when called, if a wavelength is outside the table and ``beyond`` is "raise".
 
     Notes
     -----
-    Cubic pieces with the slopes of Fritsch and Butland (SIAM J. Sci. Stat. Comput. 5, 1984): between two values the curve
-    goes from one to the other without turning, and so stays from 0 to 1. A peak between two values is cut off, as by lines.
+    Cubic pieces with the slopes of Fritsch and Butland (SIAM J. Sci. Stat. Comput. 5, 1984): the curve is monotonic between
+    adjacent values, and therefore stays within 0 to 1. As with linear interpolation, a peak between two values is lost.
     """
 
     wavelength_nm: Sequence[float]
@@ -140,7 +140,7 @@ class SplineCurve(Multiplied):
         return PchipInterpolator(self.wavelength_nm, self.value)
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Values at the wavelengths, of the same shape."""
+        """Return the values at the wavelengths, of the same shape."""
         waves_nm, is_known = _inside(wavelength_nm, self.wavelength_nm, self.beyond)
         return np.where(is_known, np.clip(self._pieces(waves_nm), 0.0, 1.0), 0.0)
 
@@ -149,24 +149,24 @@ class SplineCurve(Multiplied):
 @dataclass(frozen=True, kw_only=True)
 class StepCurve(Multiplied):
     """
-    Constant between edges: the simplest stand-in for a quantum efficiency.
+    Piecewise constant curve, the simplest model of a quantum efficiency.
 
     Parameters
     ----------
     edge_nm : sequence of n + 1 floats, nm
-        Ascending.
+        Interval edges, ascending.
     value : sequence of n floats
-        From 0 to 1, each from its edge up to the next, which belongs to the next value; the last edge belongs to the last.
+        Values from 0 to 1 in the half-open intervals ``[edge_nm[k], edge_nm[k + 1])``; the last interval includes its end.
     beyond : {"raise", "zero", "hold"}
-        What to do with wavelengths outside the edges: raise an error, take 0, or take the value at the end.
+        Behaviour outside the edges: raise an error, return 0, or return the value at the end.
     source : str
-        Where the figures come from; kept with the results.
+        Source of the data; stored with the results.
 
     Raises
     ------
     ParameterError
-        When the edges do not ascend or a value is out of range; on a call, for a wavelength outside the edges, unless
-        ``beyond`` says what is there.
+        If the edges do not ascend, or a value is out of range; when called, if a wavelength is outside the edges and
+        ``beyond`` is "raise".
     """
 
     edge_nm: Sequence[float]
@@ -179,7 +179,7 @@ class StepCurve(Multiplied):
         edges_nm = wavelengths_nm("edge_nm", self.edge_nm)
         if values.size < 1 or edges_nm.size != values.size + 1:
             raise ParameterError(
-                "edge_nm", f"must be one more than the values, of which there are {values.size}", edges_nm.size
+                "edge_nm", f"must have one element more than 'value', which has {values.size}", edges_nm.size
             )
         if np.any(np.diff(edges_nm) <= 0.0):
             raise ParameterError("edge_nm", "must ascend", self.edge_nm, "nm")
@@ -188,26 +188,26 @@ class StepCurve(Multiplied):
         object.__setattr__(self, "value", tuple(values.tolist()))
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
-        """Values at the wavelengths, of the same shape."""
+        """Return the values at the wavelengths, of the same shape."""
         waves_nm, is_known = _inside(wavelength_nm, self.edge_nm, self.beyond)
         step = np.minimum(np.searchsorted(self.edge_nm, waves_nm, side="right") - 1, len(self.value) - 1)
         return np.where(is_known, np.asarray(self.value)[step], 0.0)
 
 
 def _shares(value: ArrayLike) -> Floats:
-    """Values (n,) from 0 to 1."""
+    """Return validated values (n,) from 0 to 1."""
     values = finite_array("value", value, ndim=1, at_least=0.0)
     if values.size and values.max() > 1.0:
-        raise ParameterError("value", "must be <= 1 everywhere", float(values.max()), hint="percent are hundredths")
+        raise ParameterError("value", "must be <= 1 everywhere", float(values.max()), hint="divide percentages by 100")
     return values
 
 
 def _set_table(curve: PolynomialCurve | TableCurve | SplineCurve) -> None:
-    """Check a curve's table, and keep it by ascending wavelength as tuples."""
+    """Validate the table of a curve, and store it in ascending order as tuples."""
     waves_nm = finite_array("wavelength_nm", curve.wavelength_nm, ndim=1, above=0.0)
     values = _shares(curve.value)
     if values.size != waves_nm.size or values.size < 2:
-        raise ParameterError("value", f"must have as many values as 'wavelength_nm', at least 2, got {values.size}")
+        raise ParameterError("value", f"must have the same length as 'wavelength_nm', at least 2, got {values.size}")
     waves_nm = wavelengths_nm("wavelength_nm", waves_nm)
     order = np.argsort(waves_nm)
     if np.any(np.diff(waves_nm[order]) == 0.0):
@@ -217,7 +217,7 @@ def _set_table(curve: PolynomialCurve | TableCurve | SplineCurve) -> None:
 
 
 def _inside(wavelength_nm: ArrayLike, table_nm: Sequence[float], beyond: Beyond) -> tuple[Floats, Any]:
-    """Wavelengths moved to the ends of a table that they lie beyond, and where the curve has a value, or is 0."""
+    """Return wavelengths clipped to the table, and the mask of those that are not set to 0."""
     low_nm, high_nm = table_nm[0], table_nm[-1]
     waves_nm = as_numbers("wavelength_nm", wavelength_nm)
     if beyond == "raise":
