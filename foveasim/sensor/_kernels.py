@@ -125,7 +125,7 @@ def draw_poisson(expected_e, z, gaussian_above_e, electrons):
     """
     Convert Gaussian numbers to Poisson draws.
 
-    Draws are exact up to the mean ``gaussian_above_e``; above it, their first three moments are exact.
+    Draws are exact up to the mean ``gaussian_above_e``; above it, their first three moments are correct.
     """
     # The first loop has no branches so that the compiler vectorises it.
     charge = np.empty(PIECE)

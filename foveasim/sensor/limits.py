@@ -102,7 +102,7 @@ LIMITS: Mapping[str, Limits] = MappingProxyType(
         ),
         "pedestal_v": Limits(high=1e3, hint=_VOLTS),
         "v_sat_v": Limits(low=1e-6, high=1e3, is_positive=True, hint=_VOLTS),
-        # Converter
+        # ADC
         "log_strength": Limits(high=1e9, is_positive=True),
         "dnl_dn": Limits(high=2.0**16, hint="deviations are in codes"),
         "inl_dn": Limits(low=-(2.0**16), high=2.0**16, hint="deviations are in codes"),

@@ -1,4 +1,4 @@
-"""The noise budget: its parts, and their sum against the prediction of the whole chain."""
+"""Noise budget: individual entries, and their sum against the prediction of the chain."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ N = 400
 LINE = grid(n_x=N, n_y=1, pitch_um=2.0).with_columns(readout_line=np.arange(N))
 
 
-def test_the_sources_have_their_textbook_sizes():
-    """kTC of 0.1 pF at 300 K: 127.0 e-; 8 bits of 3 V on it: 7314 e- a step, 2111 e- rms (physics of the paper's run)."""
+def test_budget_entries_match_textbook_values():
+    """kTC noise of 0.1 pF at 300 K: 127.0 e-; 8 bits over 3 V: 7314 e- per step, 2111 e- rms (parameters of the paper)."""
     sensor = Sensor(
         LINE,
         ktc_noise=True,
@@ -47,7 +47,7 @@ def test_the_sources_have_their_textbook_sizes():
 
 @pytest.mark.parametrize("companding", [{}, {"companding": "root"}, {"companding": "log", "log_strength": 5.0}])
 @pytest.mark.parametrize("bend", [0.0, 0.1])
-def test_temporal_sources_add_up_to_the_variance_of_the_code(companding, bend):
+def test_temporal_entries_sum_to_code_variance(companding, bend):
     full_e = 20_000.0
     sensor = Sensor(
         LINE,
@@ -66,21 +66,23 @@ def test_temporal_sources_add_up_to_the_variance_of_the_code(companding, bend):
 
     slope_dn_per_e = np.gradient(mean_dn, photo_e)
     total_e2 = sum(budget[name] ** 2 for name in TEMPORAL)
-    inner = slice(5, -5)
-    # A step of the converter is worth what the slope of the whole chain says, at the level that the pedestal lifts it to.
+    interior = slice(5, -5)
+    # The step in electrons follows from the slope of the complete chain at the level raised by the pedestal.
     steps_e = 1.0 / np.sqrt(12.0) / slope_dn_per_e
-    assert np.mean(budget["quantisation"][inner] / steps_e[inner]) == pytest.approx(1.0, abs=0.01)
-    assert np.mean(variance_dn2[inner] / slope_dn_per_e[inner] ** 2 / total_e2[inner]) == pytest.approx(1.0, abs=0.01)
+    assert np.mean(budget["quantisation"][interior] / steps_e[interior]) == pytest.approx(1.0, abs=0.01)
+    assert np.mean(variance_dn2[interior] / slope_dn_per_e[interior] ** 2 / total_e2[interior]) == pytest.approx(
+        1.0, abs=0.01
+    )
 
 
-def test_a_list_that_is_not_one_a_site_is_refused():
+def test_invalid_rates_and_exposures_are_rejected():
     with pytest.raises(ParameterError, match="'photo_e_per_s' must have one value for each of the 400 sites, got"):
         noise_budget(Sensor(LINE), np.ones(3), 1.0)
     with pytest.raises(ParameterError, match="'exposure_s' must be >= 0"):
         noise_budget(Sensor(LINE), np.ones(N), -1.0)
 
 
-def test_a_camera_and_a_sensor_give_what_their_functions_give():
+def test_camera_and_sensor_methods_match_functions():
     layout = grid(n_x=20, n_y=20, pitch_um=4.0)
     sensor = Sensor(layout, prnu_fraction=0.02, **PRESETS["paper_foveal"])
     camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
@@ -91,21 +93,21 @@ def test_a_camera_and_a_sensor_give_what_their_functions_give():
     calibration = sensor.calibrate(exposure_s=0.03, flat_e=5e5, n_frames=4, seed=1)
 
     assert all(np.array_equal(budget[name], by_hand[name]) for name in by_hand)
-    # 8 bits of 3 V on 0.1 pF: 7314 e- a step, 2111 e- rms.
+    # 8 bits over 3 V on 0.1 pF: 7314 e- per step, 2111 e- rms.
     assert budget["quantisation"] == pytest.approx(np.full(400, 2111.4), rel=1e-4)
     assert np.corrcoef(calibration.gain, sensor.response)[0, 1] > 0.5
 
 
 @pytest.mark.parametrize(
-    ("name", "facts"),
+    ("name", "published"),
     [
         ("paper_foveal", {"read_noise_e": 1.0, "capacitance_f": 1e-13, "v_sat_v": 3.0, "bits": 8}),
         ("paper_distortion", {"read_noise_e": 1.0, "capacitance_f": 4.8e-13, "v_sat_v": 3.0, "bits": 8}),
         ("paper_read_noise", {"read_noise_e": 50.0, "full_well_e": 7000.0}),
     ],
 )
-def test_presets_are_the_papers_table(name, facts):
+def test_presets_match_published_parameters(name, published):
     sensor = Sensor(LINE, **PRESETS[name])
 
-    assert {key: getattr(sensor, key) for key in facts} == facts
-    assert set(PRESETS[name]) == set(facts)
+    assert {key: getattr(sensor, key) for key in published} == published
+    assert set(PRESETS[name]) == set(published)

@@ -1,4 +1,4 @@
-"""Calibrations against the faults that were put into a device, and what is left of them against error propagation."""
+"""Calibrations against the simulated device, and residual fixed patterns against error propagation."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ SIGMAS = 5.0
 N_X, N_Y = 200, 100
 N = N_X * N_Y
 MANY = grid(n_x=N_X, n_y=N_Y, pitch_um=2.0).with_columns(readout_line=np.tile(np.arange(N_X), N_Y))
-#: 14 bits of 1 electron each.
+#: 14 bits, 1 electron per code.
 FINE = {"bits": 14, "v_sat_v": 1.0, "capacitance_f": 16_384 * scipy.constants.e}
-#: Every kind of fixed pattern, on a pedestal of 1000 e- of dark charge.
+#: All fixed patterns, with a dark signal of 1000 e- in 0.1 s.
 FAULTY = {
     "prnu_fraction": 0.02,
     "gain_fpn_fraction": 0.01,
@@ -37,7 +37,7 @@ def gain_of(sensor):
 
 
 def response_of(sensor, expected_e=1.0):
-    """Relative response of a device, of mean 1."""
+    """Return the relative response of a device, normalised to mean 1."""
     gain = sensor.response * gain_of(sensor) * expected_e
     return gain / gain.mean()
 
@@ -46,7 +46,7 @@ def response_of(sensor, expected_e=1.0):
 
 
 @pytest.mark.parametrize("bits", [1, 8, 16])
-def test_linear_codes_are_themselves(bits):
+def test_linearise_linear_codes_is_identity(bits):
     codes = np.arange(2**bits)
 
     assert linearise(codes, Sensor(MANY[:1], bits=bits)) == pytest.approx(codes, abs=1e-9)
@@ -66,16 +66,16 @@ TABLE = [0.0, 0.5, 0.8, 0.8, 1.0]
     ],
     ids=str,
 )
-def test_linear_codes_are_the_middle_of_the_voltages_that_give_a_code(parameters):
-    """The oracle reads a fine staircase of charges, and takes each code's middle."""
+def test_linearised_codes_are_voltage_interval_centres(parameters):
+    """The reference reads finely spaced charges, and computes the centre of each code's interval."""
     n_charges = 400_000
     row = grid(n_x=1000, n_y=1, pitch_um=2.0)
     sensor = Sensor(row, bits=8, v_sat_v=1.0, capacitance_f=n_charges * scipy.constants.e, **parameters)
     charge = np.arange(n_charges)
     code = np.concatenate([sensor.read(part, streams=Streams(0)) for part in charge.reshape(-1, 1000)])
-    middle_dn = np.array([charge[code == k][[0, -1]].mean() if (code == k).any() else np.nan for k in range(256)])
+    centre_dn = np.array([charge[code == k][[0, -1]].mean() if (code == k).any() else np.nan for k in range(256)])
 
-    off = linearise(np.arange(256), sensor) - (middle_dn * 256 / n_charges - 0.5)
+    off = linearise(np.arange(256), sensor) - (centre_dn * 256 / n_charges - 0.5)
 
     assert np.isfinite(off).sum() >= 250
     assert np.nanmax(np.abs(off)) < 3 * 256 / n_charges
@@ -84,7 +84,7 @@ def test_linear_codes_are_the_middle_of_the_voltages_that_give_a_code(parameters
 # -- fixed patterns ---------------------------------------------------------------------------------------------------
 
 
-def test_offsets_and_gains_are_those_of_the_device():
+def test_offset_and_gain_match_device():
     sensor = Sensor(MANY, **FINE, **FAULTY)
     n_frames = 100
 
@@ -105,25 +105,25 @@ def test_offsets_and_gains_are_those_of_the_device():
 
 
 @pytest.mark.parametrize("n_frames", [4, 16, 64])
-def test_what_is_left_of_the_fixed_pattern_falls_with_the_root_of_the_frames(n_frames):
-    """Codes without temporal noise at any level, by prediction, against the propagated errors of the calibration."""
+def test_residual_fixed_pattern_matches_error_propagation(n_frames):
+    """Predicted codes without temporal noise at several levels, against the propagated errors of the calibration."""
     sensor = Sensor(MANY, **FINE, **FAULTY)
     calibration = calibrate(sensor, exposure_s=0.1, flat_e=7000.0, n_frames=n_frames, seed=2)
     dark_dn2, flat_dn2 = 1000.0 + 64.0 + 1 / 12, 8000.0 + 64.0 + 1 / 12
 
-    for share in (0.0, 0.5, 1.0, 1.5):
-        mean_dn, _ = sensor.predict(sensor.expected_electrons(np.full(N, 7e4 * share), 0.1))
+    for fraction in (0.0, 0.5, 1.0, 1.5):
+        mean_dn, _ = sensor.predict(sensor.expected_electrons(np.full(N, 7e4 * fraction), 0.1))
         corrected_dn = calibration.correct(mean_dn)
 
-        left_dn2 = ((1 - share) ** 2 * dark_dn2 + share**2 * flat_dn2) / n_frames
-        # Five standard errors, and the spread of gains of a few percent in the propagated error.
+        residual_dn2 = ((1 - fraction) ** 2 * dark_dn2 + fraction**2 * flat_dn2) / n_frames
+        # Five standard errors, plus the effect of gain differences of a few percent on the propagated error.
         rel = SIGMAS * math.sqrt(2.0 / N) + 0.01
-        assert corrected_dn.var() == pytest.approx(left_dn2, rel=rel)
-        assert corrected_dn.mean() == pytest.approx(7000.0 * share, rel=2e-3, abs=1.0)
+        assert corrected_dn.var() == pytest.approx(residual_dn2, rel=rel)
+        assert corrected_dn.mean() == pytest.approx(7000.0 * fraction, rel=2e-3, abs=1.0)
         assert mean_dn.var() > 5.0 * corrected_dn.var()
 
 
-def test_the_dark_rate_carries_offsets_to_other_exposures():
+def test_dark_rate_extrapolates_offsets():
     sensor = Sensor(MANY, **FINE, **FAULTY)
     calibration = calibrate(sensor, exposure_s=0.1, flat_e=7000.0, n_frames=50, seed=3, long_exposure_s=0.5)
 
@@ -142,8 +142,8 @@ def test_the_dark_rate_carries_offsets_to_other_exposures():
 # -- defects ----------------------------------------------------------------------------------------------------------
 
 
-def test_injected_hot_and_dead_sites_are_found_and_hardly_any_others():
-    """Hot sites of 2000 e- stand 20 robust standard deviations out; dead sites give nothing."""
+def test_injected_hot_and_dead_sites_are_detected():
+    """Hot sites with 2000 e- exceed the median by 20 robust standard deviations; dead sites have no response."""
     sensor = Sensor(MANY, **FINE, **FAULTY, hot_fraction=0.005, hot_e_per_s=2e4, dead_fraction=0.005)
     is_hot = sensor.dark_rate_e_per_s > 2e4
     is_dead = sensor.response == 0.0
@@ -158,8 +158,8 @@ def test_injected_hot_and_dead_sites_are_found_and_hardly_any_others():
     assert np.median(calibration.gain[~is_dead]) == pytest.approx(1.0, abs=2e-3)
 
 
-def test_hot_sites_below_the_offsets_spread_are_found_by_their_rate():
-    """Offsets spread by 80 DN hide 200 e- in the dark frame; 0.9 s more show them."""
+def test_dark_rate_reveals_weak_hot_sites():
+    """Offsets with a standard deviation of 80 DN mask 200 e- in the dark frame; an exposure longer by 0.9 s reveals them."""
     parameters = {**FAULTY, "dsnu_fraction": 0.0, "dark_e_per_s": 1e3}
     sensor = Sensor(MANY, **FINE, **parameters, hot_fraction=0.01, hot_e_per_s=2e3)
     is_hot = sensor.dark_rate_e_per_s > 2e3
@@ -172,18 +172,18 @@ def test_hot_sites_below_the_offsets_spread_are_found_by_their_rate():
 
 
 @pytest.mark.parametrize("n_frames", [3, 30])
-def test_sites_with_telegraph_noise_are_noisy_and_others_are_not(n_frames):
+def test_rts_sites_are_classified_as_noisy(n_frames):
     sensor = Sensor(MANY, **FINE, dark_e_per_s=1e4, read_noise_e=5.0, rts_fraction=0.01, rts_e=600.0)
     is_noisy = sensor.pattern("rts") > 0.0
 
     calibration = calibrate(sensor, exposure_s=0.01, flat_e=7000.0, n_frames=n_frames, seed=6)
 
     assert (calibration.noisy & ~is_noisy).sum() <= 2
-    # In three frames both states show in three of four.
+    # In three frames, both states occur with a probability of 3/4.
     assert calibration.noisy[is_noisy].mean() > (0.99 if n_frames > 10 else 0.6)
 
 
-def test_sites_at_the_ends_of_the_codes_are_told_and_have_no_part_in_the_mean():
+def test_clipped_sites_are_excluded_from_mean_gain():
     dark, flat = np.full((4, 25), 10.0), np.full((4, 25), 110.0)
     dark[2, 4] = 0.0
     flat[1, 7] = 255.0
@@ -195,7 +195,7 @@ def test_sites_at_the_ends_of_the_codes_are_told_and_have_no_part_in_the_mean():
     assert Calibration.from_frames(dark, flat, highest_dn=255, max_clipped_fraction=0.3).clipped.sum() == 0
 
 
-def test_a_perfect_sensor_has_no_defects():
+def test_ideal_sensor_has_no_defects():
     calibration = calibrate(Sensor(MANY, bits=8), exposure_s=0.1, flat_e=9e5, n_frames=4, seed=0)
 
     assert calibration.defective.sum() == 0
@@ -205,8 +205,8 @@ def test_a_perfect_sensor_has_no_defects():
 # -- sites that differ by design --------------------------------------------------------------------------------------
 
 
-def test_sites_of_two_sizes_are_alike_where_they_give_what_they_were_to_give():
-    """Large sites of three times the light, dark charge and capacitance twice: no fixed pattern, no hot site."""
+def test_expected_size_differences_leave_gain_unchanged():
+    """Large sites with triple power and dark signal and double capacitance: neither fixed pattern nor hot sites."""
     is_large = np.arange(N) % 10 == 0
     size = np.where(is_large, 3.0, 1.0)
     sensor = Sensor(
@@ -231,20 +231,20 @@ def test_sites_of_two_sizes_are_alike_where_they_give_what_they_were_to_give():
     assert corrected_dn[~is_large].mean() == pytest.approx(2000.0, rel=1e-3)
 
 
-def test_with_one_expectation_for_all_sites_they_are_made_alike():
+def test_common_expectation_equalises_all_sites():
     rng = np.random.default_rng(0)
     size = rng.uniform(0.5, 2.0, 500)
     frames = [100.0 + rng.normal(0, 3.0, (40, 500)), 100.0 + 4000.0 * size + rng.normal(0, 3.0, (40, 500))]
 
-    alike = Calibration.from_frames(*frames, dead_fraction=0.1)
+    equalised = Calibration.from_frames(*frames, dead_fraction=0.1)
     by_size = Calibration.from_frames(*frames, expected_dn=size)
 
-    assert alike.correct(100.0 + 1000.0 * size) == pytest.approx(np.full(500, 1000.0 * size.mean()), rel=3e-3)
+    assert equalised.correct(100.0 + 1000.0 * size) == pytest.approx(np.full(500, 1000.0 * size.mean()), rel=3e-3)
     assert by_size.correct(100.0 + 1000.0 * size) == pytest.approx(1000.0 * size, rel=3e-3)
     assert by_size.gain == pytest.approx(np.ones(500), abs=3e-3)
 
 
-def test_a_mosaic_with_crosstalk_and_coupling_has_the_gains_of_its_sites():
+def test_gain_excludes_expected_crosstalk_and_ipc():
     layout = fs.layout.mosaic(grid(n_x=40, n_y=40, pitch_um=2.0), ("RG", "GB"))
     sensor = Sensor(
         layout,
@@ -255,9 +255,9 @@ def test_a_mosaic_with_crosstalk_and_coupling_has_the_gains_of_its_sites():
         dark_e_per_s=1e4,
         **FINE,
     )
-    light_e = np.array([8000.0, 5000.0, 2000.0])[sensor.filter_of_site]
+    flat_e = np.array([8000.0, 5000.0, 2000.0])[sensor.filter_of_site]
 
-    calibration = calibrate(sensor, exposure_s=0.1, flat_e=light_e, n_frames=100, seed=8)
+    calibration = calibrate(sensor, exposure_s=0.1, flat_e=flat_e, n_frames=100, seed=8)
 
     ratio = calibration.gain / response_of(sensor)
     for colour in range(3):
@@ -267,7 +267,7 @@ def test_a_mosaic_with_crosstalk_and_coupling_has_the_gains_of_its_sites():
 
 
 @pytest.mark.parametrize("companding", ["root", "log"])
-def test_companded_codes_are_calibrated_as_linear_ones(companding):
+def test_companded_codes_calibrate_like_linear_codes(companding):
     sensor = Sensor(MANY, bits=14, v_sat_v=1.0, capacitance_f=FINE["capacitance_f"], companding=companding, **FAULTY)
 
     calibration = calibrate(sensor, exposure_s=0.1, flat_e=7000.0, n_frames=30, seed=9)
@@ -275,18 +275,18 @@ def test_companded_codes_are_calibrated_as_linear_ones(companding):
     assert np.corrcoef(calibration.gain, response_of(sensor))[0, 1] > 0.95
     expected_e = sensor.expected_electrons(np.full(N, 4e4), 0.1)
     code = sensor.read(sensor.collect(expected_e, streams=Streams(1)), streams=Streams(1))
-    # One frame's noise, that of the calibration, and no fixed pattern; gains spread the noise by 0.3 %.
-    left_dn2 = 5064.0 + ((3 / 7) ** 2 * 1064.0 + (4 / 7) ** 2 * 8064.0) / 30
+    # Noise of one frame and of the calibration, without fixed pattern; gain differences change the noise by 0.3 %.
+    residual_dn2 = 5064.0 + ((3 / 7) ** 2 * 1064.0 + (4 / 7) ** 2 * 8064.0) / 30
     corrected_dn = calibration.correct(code)
-    assert corrected_dn.var() == pytest.approx(left_dn2, rel=SIGMAS * math.sqrt(2.0 / N) + 0.01)
-    assert corrected_dn.mean() == pytest.approx(4000.0, abs=SIGMAS * math.sqrt(left_dn2 / N) + 2.0)
+    assert corrected_dn.var() == pytest.approx(residual_dn2, rel=SIGMAS * math.sqrt(2.0 / N) + 0.01)
+    assert corrected_dn.mean() == pytest.approx(4000.0, abs=SIGMAS * math.sqrt(residual_dn2 / N) + 2.0)
 
 
 # -- correction -------------------------------------------------------------------------------------------------------
 
 
-def small(**kinds):
-    """A calibration of a 5 by 5 grid without noise, with defects put in."""
+def small_calibration(**kinds):
+    """Return a noise-free calibration of a 5 by 5 grid with injected defects."""
     dark, flat = np.full((2, 25), 10.0), np.full((1, 25), 110.0)
     for site, value in kinds.get("dark", {}).items():
         dark[:, site] = value
@@ -295,19 +295,19 @@ def small(**kinds):
     return Calibration.from_frames(dark, flat, highest_dn=255, expected_dn=kinds.get("expected_dn", 1.0))
 
 
-def test_saturated_codes_are_not_a_number():
+def test_saturated_codes_become_nan():
     code = np.full(25, 60.0)
     code[[3, 7]] = 255.0
 
-    corrected_dn = small().correct(code)
+    corrected_dn = small_calibration().correct(code)
 
     assert np.flatnonzero(np.isnan(corrected_dn)).tolist() == [3, 7]
     assert corrected_dn[0] == pytest.approx(50.0)
     assert code[3] == 255.0
 
 
-def test_a_defective_site_takes_the_mean_of_its_good_neighbours():
-    calibration = small(dark={12: 90.0}, flat={11: 10.0})
+def test_defective_site_is_mean_of_good_neighbours():
+    calibration = small_calibration(dark={12: 90.0}, flat={11: 10.0})
     code = 10.0 + np.arange(25.0)
     code = np.stack([code, code])
     code[1, 7] = 255.0
@@ -323,27 +323,27 @@ def test_a_defective_site_takes_the_mean_of_its_good_neighbours():
     assert np.isnan(calibration.correct(code[0])[11])
 
 
-def test_a_site_is_filled_by_what_it_would_give_of_its_neighbours_light():
-    """The site in the middle is expected to give three times as much."""
+def test_replacement_scales_with_expected_signal():
+    """The expected signal of the central site is three times that of the others."""
     expected = np.ones(25)
     expected[12] = 3.0
-    calibration = small(flat={12: 10.0}, expected_dn=expected)
+    calibration = small_calibration(flat={12: 10.0}, expected_dn=expected)
 
     corrected_dn = calibration.correct(np.full(25, 50.0), fill=grid(n_x=5, n_y=5, pitch_um=2.0))
 
     assert corrected_dn[12] == pytest.approx(120.0)
 
 
-def test_on_a_mosaic_sites_are_filled_from_their_own_colour_two_steps_away():
+def test_mosaic_sites_are_replaced_by_same_colour():
     layout = fs.layout.mosaic(grid(n_x=5, n_y=5, pitch_um=2.0), ("RG", "GB"))
-    calibration = small(flat={12: 10.0})
+    calibration = small_calibration(flat={12: 10.0})
     code = 10.0 + np.where(layout.channel == layout.channel[12], 70.0, 20.0)
 
     assert calibration.correct(code, fill=layout)[12] == pytest.approx(20.0)
     assert calibration.correct(code, fill=layout, kind=layout.channel)[12] == pytest.approx(70.0)
 
 
-def test_nothing_that_is_given_is_changed_and_nothing_that_is_held_can_be():
+def test_inputs_unchanged_and_results_read_only():
     frames = np.full((2, 25), 10.0), np.full((1, 25), 110.0)
     calibration = Calibration.from_frames(*frames)
 
@@ -380,7 +380,7 @@ DARK, FLAT = np.full((2, 25), 10.0), np.full((1, 25), 110.0)
         (DARK, FLAT, {"linear_dn": np.arange(64.0)}, "'flat' must be <= 63 everywhere, got 110.0 DN"),
     ],
 )
-def test_bad_frames_get_one_clear_sentence(dark, flat, parameters, message):
+def test_invalid_frames_are_rejected(dark, flat, parameters, message):
     with pytest.raises((ParameterError, SimulationError), match=message) as caught:
         Calibration.from_frames(dark, flat, **parameters)
     assert "\n" not in str(caught.value)
@@ -396,8 +396,8 @@ def test_bad_frames_get_one_clear_sentence(dark, flat, parameters, message):
         ({"fill": grid(n_x=5, n_y=5, pitch_um=2.0), "kind": [1, 2]}, "'kind' must have one value for each"),
     ],
 )
-def test_bad_codes_get_one_clear_sentence(arguments, message):
-    calibration = small(flat={12: 10.0})
+def test_invalid_correction_arguments_are_rejected(arguments, message):
+    calibration = small_calibration(flat={12: 10.0})
 
     with pytest.raises((ParameterError, SimulationError), match=message):
         calibration.correct(arguments.pop("code", np.zeros(25)), **arguments)
@@ -414,12 +414,12 @@ def test_bad_codes_get_one_clear_sentence(arguments, message):
         ({"long_exposure_s": 0.1}, "'long_exposure_s' must be > 0.1"),
     ],
 )
-def test_bad_calibrations_get_one_clear_sentence(parameters, message):
+def test_invalid_calibrate_arguments_are_rejected(parameters, message):
     with pytest.raises((ParameterError, SimulationError), match=message):
         calibrate(Sensor(MANY[:9]), **{"exposure_s": 0.1, "flat_e": 1e6, "n_frames": 3, "seed": 0, **parameters})
 
 
-def test_only_sensors_codes_are_linearised():
+def test_linearise_rejects_invalid_sensor_and_code():
     with pytest.raises(ParameterError, match="'sensor' must be a"):
         linearise([1], None)
     with pytest.raises(ParameterError, match="'code' must be <= 255"):

@@ -1,4 +1,4 @@
-"""The contract of effects: draws, moments and the noise budget agree, and effects are independent of each other."""
+"""Contract of effects: draws, moments and noise budget agree, and effects are independent of each other."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ SIGMAS = 5.0
 N = 40_000
 ROW = grid(n_x=N, n_y=1, pitch_um=2.0).with_columns(readout_line=np.arange(N))
 PHOTO_E, EXPOSURE_S = 5000.0, 0.5
-#: 16 bits of 1 e- each, far from both ends, and a pedestal.
+#: 16 bits, 1 e- per code, with a pedestal; signals are far from both ends of the range.
 FINE = {"bits": 16, "v_sat_v": 3.0, "capacitance_f": 65_536 * scipy.constants.e / 3.0, "pedestal_v": 0.5}
 
 
 @dataclass(frozen=True)
 class LampFlicker(AdditiveNoise):
-    """Noise of the test: Gaussian, of the output voltage, larger at sites further to the right."""
+    """Test effect: Gaussian noise of the output voltage that increases from left to right."""
 
     name: ClassVar[str] = "flicker"
     stage: ClassVar[str] = "output"
@@ -41,7 +41,7 @@ class LampFlicker(AdditiveNoise):
 
 @dataclass(frozen=True)
 class LensShading(FixedFactor):
-    """A fixed pattern of the test: mean response 0.9, and a random part."""
+    """Test effect: fixed pattern with mean response 0.9 and a random part."""
 
     name: ClassVar[str] = "shading"
     stage: ClassVar[str] = "photo"
@@ -55,7 +55,7 @@ class LensShading(FixedFactor):
 
 @dataclass(frozen=True)
 class Hum(Effect):
-    """Noise of the test from the bare contract: a factor of all sites of a frame on the charge."""
+    """Test effect derived from Effect only: multiplicative temporal noise of the charge, non-local."""
 
     name: ClassVar[str] = "hum"
     stage: ClassVar[str] = "charge"
@@ -71,7 +71,7 @@ class Hum(Effect):
         return mean, variance * (1.0 + self.sigma**2) + (mean * self.sigma) ** 2
 
 
-#: Keywords that switch on one effect each, by its name.
+#: Keywords that enable a single effect, by its name.
 CASES = {
     "shot": {},
     "prnu": {"prnu_fraction": 0.02},
@@ -91,7 +91,7 @@ CASES = {
 every_effect = pytest.mark.parametrize("name", CASES)
 
 
-def made(name="", *, shot_noise="off", **more):
+def make_sensor(name="", *, shot_noise="off", **more):
     keywords = CASES.get(name, {})
     return Sensor(ROW, **FINE, **{"shot_noise": "auto" if name == "shot" else shot_noise, **keywords, **more})
 
@@ -103,7 +103,7 @@ def codes(sensor, frame=0, seed=1):
 
 
 def assert_moments(draws, mean, variance):
-    """Over sites, the scatter about the means has the variance: to five standard errors, and the rounding of charges to codes."""
+    """Check mean and variance over sites to five standard errors, with a tolerance for rounding to codes."""
     z = (draws - mean) / np.sqrt(variance)
     rounding = 0.25 / np.min(variance)
     assert abs(z.mean()) < SIGMAS * z.std() / np.sqrt(z.size) + 0.1 * np.sqrt(rounding)
@@ -116,7 +116,7 @@ def test_every_standard_effect_is_tested():
 
 @every_effect
 def test_draws_moments_and_budget_agree(name):
-    quiet, noisy = made(), made(name)
+    quiet, noisy = make_sensor(), make_sensor(name)
     (effect,) = (e for e in noisy.chain if e.name == name)
     dark_e = float(np.mean(noisy.nominal_dark_e_per_s)) * EXPOSURE_S
     sites = noisy.sites if effect.is_temporal else noisy.sites.of_any_device()
@@ -141,7 +141,7 @@ def test_draws_moments_and_budget_agree(name):
 
 @every_effect
 def test_prediction_agrees_with_draws(name):
-    sensor = made(name, shot_noise="auto")
+    sensor = make_sensor(name, shot_noise="auto")
     expected_e = sensor.expected_electrons(np.full(N, PHOTO_E / EXPOSURE_S), EXPOSURE_S)
 
     mean_dn, variance_dn2 = sensor.predict(expected_e)
@@ -155,7 +155,7 @@ def test_prediction_agrees_with_draws(name):
 def test_disabled_effect_leaves_other_draws(name):
     everything = {key: value for case in CASES.values() for key, value in case.items()}
     everything["effects"] = [LampFlicker(), LensShading(), Hum()]
-    sensor = made(shot_noise="auto", **everything)
+    sensor = make_sensor(shot_noise="auto", **everything)
     without = sensor.without(name)
 
     assert [e.name for e in without.chain if e.name != "shot"] == [
@@ -170,14 +170,14 @@ def test_disabled_effect_leaves_other_draws(name):
             if e.name == effect.name and e.name != name
         ]
         assert all(np.array_equal(drawn[0], other) for other in drawn)
-    alone = made(shot_noise="off", **CASES[name]) if name != "shot" else made("shot")
+    alone = make_sensor(shot_noise="off", **CASES[name]) if name != "shot" else make_sensor("shot")
     assert not np.array_equal(codes(alone), codes(alone.without(name)))
 
 
-def test_charge_and_codes_depend_on_own_effects():
-    """The chain of two sensors, one of which has one effect more, differs at the sites of that effect alone."""
-    few = made(shot_noise="auto", read_noise_e=3.0, ktc_noise=True)
-    more = made(shot_noise="auto", read_noise_e=3.0, ktc_noise=True, rts_fraction=0.1, rts_e=100.0)
+def test_additional_effect_changes_only_its_sites():
+    """Two sensors that differ by one effect have different codes only at the sites of that effect."""
+    few = make_sensor(shot_noise="auto", read_noise_e=3.0, ktc_noise=True)
+    more = make_sensor(shot_noise="auto", read_noise_e=3.0, ktc_noise=True, rts_fraction=0.1, rts_e=100.0)
 
     moved = codes(few) != codes(more)
 
@@ -186,7 +186,7 @@ def test_charge_and_codes_depend_on_own_effects():
 
 @pytest.mark.parametrize("mean_e", [30.0, 99.9, 100.1, 150.0, 1000.0, 1e5])
 def test_shot_noise_has_poisson_moments(mean_e):
-    """Third central moment too: a Gaussian's would be 0 in place of the mean."""
+    """Includes the third central moment, which equals the mean (0 for a Gaussian)."""
     n = 2_000_000
     rng = np.random.default_rng(5)
 
@@ -208,7 +208,7 @@ def test_shot_noise_tails_are_poisson():
 
 
 def test_added_effects_enter_all_estimates():
-    plain, noisy = made(shot_noise="auto"), made("flicker", shot_noise="auto")
+    plain, noisy = make_sensor(shot_noise="auto"), make_sensor("flicker", shot_noise="auto")
     expected_e, dark_e = np.full(N, PHOTO_E), np.zeros(N)
     added_e2 = np.square(LampFlicker().deviation(noisy.sites) / 3.0 * 65_536)
     ratios = [signal_to_noise(sensor, expected_e, dark_e).ratio for sensor in (plain, noisy)]
@@ -218,7 +218,7 @@ def test_added_effects_enter_all_estimates():
     np.testing.assert_allclose(np.square(0.5 * merged[1]) - np.square(0.5 * merged[0]), added_e2, rtol=1e-5)
 
 
-def test_moments_without_device_need_declaring():
+def test_fixed_patterns_must_define_pattern_moments():
     @dataclass(frozen=True)
     class Undeclared(FixedOffset):
         name: ClassVar[str] = "undeclared"
@@ -228,7 +228,7 @@ def test_moments_without_device_need_declaring():
             return 1e-3 * sites.device.normals(self.name)
 
     with pytest.raises(SimulationError, match=r"must define pattern_moments\(\), its mean and variance over devices"):
-        noise_budget(made(effects=[Undeclared()]), np.full(N, 100.0), 1.0)
+        noise_budget(make_sensor(effects=[Undeclared()]), np.full(N, 100.0), 1.0)
 
 
 @pytest.mark.parametrize("returned", [None, np.zeros(3)])
@@ -240,12 +240,12 @@ def test_wrong_result_of_effect_is_rejected(returned):
             return returned
 
     with pytest.raises(SimulationError, match=r"the effect 'hum' must return an array of shape .*; check its apply"):
-        codes(made(effects=[Wrong()]))
+        codes(make_sensor(effects=[Wrong()]))
 
 
 @dataclass(frozen=True)
 class RowNoise(Effect):
-    """Temporal row noise: one draw for all sites of a line."""
+    """Temporal row noise: one draw per readout line."""
 
     name = "row_noise"
     stage = "charge"
@@ -262,8 +262,8 @@ class RowNoise(Effect):
         return mean, variance + self.sigma_e**2
 
 
-def test_shared_draws_span_blocks():
-    """Lines of more sites than a block has get one draw each, in every frame."""
+def test_shared_draws_span_site_blocks():
+    """Readout lines that are longer than a block have one draw per frame."""
     n_x = 40_000
     layout = grid(n_x=n_x, n_y=3, pitch_um=2.0).with_columns(readout_line=np.repeat(np.arange(3), n_x))
     sensor = Sensor(layout, effects=[RowNoise()], bits=16, v_sat_v=1.0, capacitance_f=1e-15)
@@ -285,7 +285,7 @@ def test_wrong_deviation_is_rejected(deviation):
     with pytest.raises(
         SimulationError, match="the effect 'flicker' must return one finite number, or one for each of the"
     ):
-        codes(made(effects=[Wrong()]))
+        codes(make_sensor(effects=[Wrong()]))
 
 
 @pytest.mark.parametrize("returned", [None, 3.0, (np.ones(3), np.ones(3))])
@@ -295,7 +295,7 @@ def test_wrong_moments_are_rejected(returned):
             return returned
 
     with pytest.raises(SimulationError, match="the effect 'hum' must return a mean and a variance of shape"):
-        made(effects=[Wrong()]).predict(np.full(N, 100.0))
+        make_sensor(effects=[Wrong()]).predict(np.full(N, 100.0))
 
 
 class Nameless(LampFlicker):
@@ -310,7 +310,7 @@ class Elsewhere(LampFlicker):
     name, stage = "elsewhere", "lens"
 
 
-class Twin(LampFlicker):
+class Duplicate(LampFlicker):
     name = "read"
 
 
@@ -322,7 +322,7 @@ class Twin(LampFlicker):
         ({"effects": [Nameless()]}, "'effects' must define the class attribute 'name' of type str"),
         ({"effects": [Early()]}, "'early' at the stage 'photo' is temporal; use the stage 'charge'"),
         ({"effects": [Elsewhere()]}, "'effects' must have a stage from photo, dark, .*; 'elsewhere' has 'lens'"),
-        ({"effects": [Twin()]}, "'effects' must have unique names, got 'read' twice"),
+        ({"effects": [Duplicate()]}, "'effects' must have unique names, got 'read' twice"),
         ({"effects": [LampFlicker(), LampFlicker()]}, "got 'flicker' twice"),
         ({"disabled": ["raed"]}, "'disabled' must contain names of effects, got 'raed'; did you mean 'read'"),
         ({"disabled": 3}, "'disabled' must contain names of effects, got 3"),
@@ -337,11 +337,11 @@ def test_unknown_pattern_lists_patterns():
     with pytest.raises(
         ParameterError, match=r"'name' must be one of the sensor's fixed patterns \(prnu, rts\), got 'gain'"
     ):
-        made("prnu", **CASES["rts"]).pattern("gain")
+        make_sensor("prnu", **CASES["rts"]).pattern("gain")
 
 
-def test_sites_of_block_are_parts():
-    sites = made("prnu").sites
+def test_block_contains_its_sites():
+    sites = make_sensor("prnu").sites
     block = sites.block(slice(10, 20))
 
     assert block.n_sites == 10

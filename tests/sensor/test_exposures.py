@@ -1,4 +1,4 @@
-"""Merged exposures and ramps against the light that was put in, and against the variances that theory gives."""
+"""Merged exposures and ramp fits against simulated rates and theoretical variances."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ SIGMAS = 5.0
 N = 20_000
 ROW = grid(n_x=200, n_y=100, pitch_um=2.0)
 E_PER_DN = 2.5
-#: 12 bits of 2.5 electrons each, noise of reading well above a code: rounding is even.
+#: 12 bits, 2.5 electrons per code; read noise exceeds the code width, so that rounding errors are uniform.
 SENSOR = {"bits": 12, "v_sat_v": 1.0, "capacitance_f": E_PER_DN * 4096 * scipy.constants.e, "read_noise_e": 6.0}
 FULL_E = 4095 * E_PER_DN
 EXPOSURES_S = [1e-3, 0.03, 1.0]
 PEDESTAL_DN = 20.0
 
 
-def pedestal(n_sites=N):
-    """A calibration of a device whose only fault is an offset of 20 codes."""
+def pedestal_calibration(n_sites=N):
+    """Return a calibration of a device with an offset of 20 codes and no other fixed pattern."""
     dark = np.full((2, n_sites), PEDESTAL_DN - 0.5)
     return Calibration.from_frames(dark, dark[:1] + 100.0, highest_dn=4095)
 
 
-def exposed(rate_e_per_s, exposures_s, seed, n_sites=N, full_well_e=math.inf):
-    """Codes of Poisson's charges with Gaussian noise of reading on a pedestal, by numpy alone."""
+def simulate_exposures(rate_e_per_s, exposures_s, seed, n_sites=N, full_well_e=math.inf):
+    """Simulate codes of Poisson charges with Gaussian read noise on a pedestal, with numpy only."""
     rng = np.random.default_rng(seed)
     codes = []
     for t_s in exposures_s:
@@ -51,23 +51,23 @@ def exposed(rate_e_per_s, exposures_s, seed, n_sites=N, full_well_e=math.inf):
 # -- several exposures ------------------------------------------------------------------------------------------------
 
 
-def test_without_noise_and_rounding_the_light_comes_out_exactly():
-    """Codes between whole ones, as a converter without steps would give them; weights that fall correct for rounding."""
+def test_merge_without_noise_recovers_rate_exactly():
+    """Non-integer codes, as from an ADC without quantisation; in the taper, the bias correction causes small deviations."""
     rate = np.geomspace(2e3, 1e7, 200)
     code = np.minimum(rate * np.array(EXPOSURES_S)[:, None] / E_PER_DN - 0.5, 4095.0)
     sensor = Sensor(ROW[:200], **{**SENSOR, "shot_noise": "off", "read_noise_e": 0.0})
 
     merged = merge_exposures(code, EXPOSURES_S, sensor)
 
-    is_falling = ((code > 3000.0) & (code < 4095.0)).any(axis=0)
-    assert merged.rate_e_per_s[~is_falling] == pytest.approx(rate[~is_falling], rel=1e-12)
+    is_tapered = ((code > 3000.0) & (code < 4095.0)).any(axis=0)
+    assert merged.rate_e_per_s[~is_tapered] == pytest.approx(rate[~is_tapered], rel=1e-12)
     assert merged.rate_e_per_s == pytest.approx(rate, rel=1e-4)
     assert set(merged.n_used) == {1, 2, 3}
 
 
 @pytest.mark.parametrize("companding", ["linear", "root", "log"])
-def test_without_noise_the_light_comes_out_to_the_rounding_of_charge_and_code(companding):
-    """Both are off by a half at most: 2.5 of their standard deviations in one exposure, at most 4.3 in three together."""
+def test_merge_without_noise_is_within_rounding(companding):
+    """Rounding errors are at most 1/2: 2.5 standard deviations in one exposure, at most 4.3 in three exposures together."""
     rate = np.geomspace(100.0, 1e7, 200)
     sensor = Sensor(ROW[:200], **{**SENSOR, "companding": companding, "shot_noise": "off", "read_noise_e": 0.0})
     charge_e = np.array([np.rint(rate * t_s).astype(np.int64) for t_s in EXPOSURES_S])
@@ -81,10 +81,12 @@ def test_without_noise_the_light_comes_out_to_the_rounding_of_charge_and_code(co
 
 
 @pytest.mark.parametrize("rate_e_per_s", [30.0, 300.0, 3e3, 9.5e3, 1.05e4, 3e4, 3.2e5, 3e6])
-def test_five_decades_of_light_are_unbiased_with_the_variance_of_the_weights(rate_e_per_s):
+def test_merge_is_unbiased_with_predicted_variance(rate_e_per_s):
     sensor = Sensor(ROW, **SENSOR)
 
-    merged = merge_exposures(exposed(rate_e_per_s, EXPOSURES_S, 1), EXPOSURES_S, sensor, calibration=pedestal())
+    merged = merge_exposures(
+        simulate_exposures(rate_e_per_s, EXPOSURES_S, 1), EXPOSURES_S, sensor, calibration=pedestal_calibration()
+    )
 
     rate, sigma = merged.rate_e_per_s, merged.sigma_e_per_s
     variance = np.mean(sigma**2)
@@ -93,13 +95,16 @@ def test_five_decades_of_light_are_unbiased_with_the_variance_of_the_weights(rat
     assert rate.var() == pytest.approx(variance, rel=SIGMAS * math.sqrt(2.0 / N))
 
 
-@pytest.mark.parametrize("share", [0.72, 0.76, 0.8, 0.9, 0.97, 0.99, 1.0, 1.01, 1.03])
-def test_exposures_about_saturation_are_unbiased_too(share):
-    """Keeping them whenever they are below, only when they are low by chance, would be off by 13 standard errors."""
-    rate_e_per_s = share * (4095 - PEDESTAL_DN) * E_PER_DN
+@pytest.mark.parametrize("fraction", [0.72, 0.76, 0.8, 0.9, 0.97, 0.99, 1.0, 1.01, 1.03])
+def test_merge_is_unbiased_near_saturation(fraction):
+    """Using exposures whenever their codes are below saturation would give a bias of 13 standard errors."""
+    rate_e_per_s = fraction * (4095 - PEDESTAL_DN) * E_PER_DN
 
     merged = merge_exposures(
-        exposed(rate_e_per_s, EXPOSURES_S, 11), EXPOSURES_S, Sensor(ROW, **SENSOR), calibration=pedestal()
+        simulate_exposures(rate_e_per_s, EXPOSURES_S, 11),
+        EXPOSURES_S,
+        Sensor(ROW, **SENSOR),
+        calibration=pedestal_calibration(),
     )
 
     variance = np.mean(merged.sigma_e_per_s**2)
@@ -107,12 +112,14 @@ def test_exposures_about_saturation_are_unbiased_too(share):
     assert 0.65 < merged.rate_e_per_s.var() / variance < 1.0 + SIGMAS * math.sqrt(2.0 / N)
 
 
-def test_the_variance_is_that_of_the_best_weights():
-    """Both exposures below saturation: the inverse of the sum of both inverse variances, in closed form."""
+def test_merge_variance_is_inverse_variance_sum():
+    """Closed form for two exposures below saturation: the inverse of the sum of inverse variances."""
     sensor = Sensor(ROW, **SENSOR)
     rate, exposures_s = 2000.0, [0.2, 1.0]
 
-    merged = merge_exposures(exposed(rate, exposures_s, 2), exposures_s, sensor, calibration=pedestal())
+    merged = merge_exposures(
+        simulate_exposures(rate, exposures_s, 2), exposures_s, sensor, calibration=pedestal_calibration()
+    )
 
     fixed_e2 = 36.0 + E_PER_DN**2 / 12
     information = sum(t_s**2 / (rate * t_s + fixed_e2) for t_s in exposures_s)
@@ -122,23 +129,25 @@ def test_the_variance_is_that_of_the_best_weights():
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
-def test_saturated_codes_are_never_used(order):
-    """A light that saturates the longer exposures: the result is that of the shortest, whatever the others say."""
+def test_merge_ignores_saturated_codes(order):
+    """With saturated longer exposures, the result equals that of the shortest exposure alone."""
     sensor = Sensor(ROW, **SENSOR)
     exposures_s = [1e-3, 0.1, 1.0]
-    codes = exposed(2e6, exposures_s, 3)
+    codes = simulate_exposures(2e6, exposures_s, 3)
     assert (codes[1:] == 4095).all()
 
-    merged = merge_exposures(codes[list(order)], [exposures_s[k] for k in order], sensor, calibration=pedestal())
-    alone = merge_exposures(codes[:1], exposures_s[:1], sensor, calibration=pedestal())
+    merged = merge_exposures(
+        codes[list(order)], [exposures_s[k] for k in order], sensor, calibration=pedestal_calibration()
+    )
+    alone = merge_exposures(codes[:1], exposures_s[:1], sensor, calibration=pedestal_calibration())
 
     assert (merged.n_used == 1).all()
     assert merged.rate_e_per_s == pytest.approx(alone.rate_e_per_s, rel=1e-12)
 
 
-def test_a_full_well_below_the_highest_code_is_saturation_too():
+def test_full_well_below_highest_code_saturates():
     sensor = Sensor(ROW, full_well_e=4000.0, **SENSOR)
-    codes = exposed(1e5, [0.01, 0.1], 4, full_well_e=4000.0)
+    codes = simulate_exposures(1e5, [0.01, 0.1], 4, full_well_e=4000.0)
     assert codes.max() < 4095
 
     merged = merge_exposures(codes, [0.01, 0.1], sensor)
@@ -146,7 +155,7 @@ def test_a_full_well_below_the_highest_code_is_saturation_too():
     assert (merged.n_used == 1).all()
 
 
-def test_where_all_is_saturated_there_is_no_number():
+def test_fully_saturated_sites_are_nan():
     merged = merge_exposures(np.full((2, 3), 4095), [0.1, 1.0], Sensor(ROW[:3], **SENSOR))
 
     assert np.isnan(merged.rate_e_per_s).all()
@@ -154,19 +163,21 @@ def test_where_all_is_saturated_there_is_no_number():
     assert merged.n_used.tolist() == [0, 0, 0]
 
 
-def test_a_dark_site_keeps_its_long_exposure_though_the_short_one_says_nothing():
-    """Read noise of the shortest exposure, carried to the longest, is ten times the range."""
+def test_noisy_short_exposure_does_not_bias_merge():
+    """The read noise of the shortest exposure, scaled to the longest, is ten times the range."""
     sensor = Sensor(ROW, **SENSOR)
     exposures_s = [1e-4, 1.0]
 
-    merged = merge_exposures(exposed(50.0, exposures_s, 5), exposures_s, sensor, calibration=pedestal())
+    merged = merge_exposures(
+        simulate_exposures(50.0, exposures_s, 5), exposures_s, sensor, calibration=pedestal_calibration()
+    )
 
     assert (merged.n_used == 2).all()
     assert merged.rate_e_per_s.mean() == pytest.approx(50.0, abs=SIGMAS * math.sqrt((50.0 + 37.0) / N))
 
 
-def test_a_calibration_takes_the_device_out():
-    """All fixed patterns, in the package's own chain."""
+def test_calibration_removes_fixed_patterns_from_merge():
+    """Uses all fixed patterns of the sensor chain."""
     sensor = Sensor(
         ROW,
         prnu_fraction=0.02,
@@ -183,15 +194,15 @@ def test_a_calibration_takes_the_device_out():
         expected_e = sensor.expected_electrons(np.full(N, rate), t_s)
         streams = Streams(9, k)
         codes.append(sensor.read(sensor.collect(expected_e, streams=streams), streams=streams))
-    seen = ~calibration.clipped
+    is_usable = ~calibration.clipped
 
     merged = merge_exposures(codes, exposures_s, sensor, calibration=calibration)
 
-    off = (merged.rate_e_per_s - rate)[seen]
-    assert seen.mean() > 0.9
+    off = (merged.rate_e_per_s - rate)[is_usable]
+    assert is_usable.mean() > 0.9
     assert abs(off.mean()) < 2e-3 * rate
-    # The calibration's own errors come on top: a few percent of the variance.
-    assert off.var() == pytest.approx(np.mean(merged.sigma_e_per_s[seen] ** 2), rel=0.1)
+    # Errors of the calibration add a few percent to the variance.
+    assert off.var() == pytest.approx(np.mean(merged.sigma_e_per_s[is_usable] ** 2), rel=0.1)
 
 
 # -- ramps ------------------------------------------------------------------------------------------------------------
@@ -200,7 +211,7 @@ TIMES_S = [0.5, 1.0, 1.5, 2.5, 3.0, 4.0]
 
 
 @pytest.mark.parametrize(("rate_e_per_s", "shot_noise"), [(15.0, "auto"), (15.0, "exact"), (900.0, "auto")])
-def test_reads_contain_the_earlier_ones_and_increments_are_uncorrelated(rate_e_per_s, shot_noise):
+def test_ramp_charge_covariance_has_uncorrelated_increments(rate_e_per_s, shot_noise):
     sensor = Sensor(ROW, shot_noise=shot_noise, **SENSOR)
     times = np.array(TIMES_S)
 
@@ -209,7 +220,7 @@ def test_reads_contain_the_earlier_ones_and_increments_are_uncorrelated(rate_e_p
     covariance = np.cov(electrons)
     expected = rate_e_per_s * np.minimum(times[:, None], times)
     variance = np.diag(expected)
-    # Of a sample covariance of nearly Gaussian numbers; Poisson's excess adds its mean.
+    # Standard error of the sample covariance of nearly Gaussian numbers; the Poisson kurtosis adds the mean.
     error = np.sqrt((np.outer(variance, variance) + expected**2 + expected) / N)
     assert np.abs((covariance - expected) / error).max() < SIGMAS
     increments = np.diff(electrons, axis=0, prepend=0.0)
@@ -221,7 +232,7 @@ def test_reads_contain_the_earlier_ones_and_increments_are_uncorrelated(rate_e_p
     )
 
 
-def test_noise_of_reading_is_new_in_each_read_and_that_of_resetting_the_same():
+def test_read_noise_varies_and_reset_noise_persists():
     sensor = Sensor(
         ROW,
         bits=16,
@@ -243,7 +254,7 @@ def test_noise_of_reading_is_new_in_each_read_and_that_of_resetting_the_same():
     assert np.cov(increments)[0, 1] == pytest.approx(-36.0 - 1 / 12, abs=SIGMAS * 72.0 * math.sqrt(1.25 / N))
 
 
-def test_the_full_well_holds_what_it_holds_and_dark_charge_collects_too():
+def test_ramp_includes_full_well_and_dark_signal():
     sensor = Sensor(ROW[:3], shot_noise="off", full_well_e=[100.5, 1e4, 1e4], dark_e_per_s=[0.0, 0.0, 50.0])
 
     ramp = non_destructive_reads(sensor, [60.0, 60.0, 0.3], [1.0, 2.0, 3.0], streams=Streams(0))
@@ -251,7 +262,7 @@ def test_the_full_well_holds_what_it_holds_and_dark_charge_collects_too():
     assert ramp.electrons.tolist() == [[60, 60, 50], [100, 120, 101], [100, 180, 151]]
 
 
-def test_a_ramp_is_its_seeds_and_frames_alone():
+def test_ramp_is_reproducible_from_seed_and_frame():
     sensor = Sensor(ROW, **SENSOR)
     code = non_destructive_reads(sensor, 300.0, TIMES_S, streams=Streams(3, 1), n_threads=1).code
 
@@ -261,8 +272,8 @@ def test_a_ramp_is_its_seeds_and_frames_alone():
     assert (code != non_destructive_reads(sensor, 300.0, TIMES_S, streams=Streams(3, 2)).code).mean() > 0.5
 
 
-def ramp_codes(rate_e_per_s, times_s, seed):
-    """Codes of ramps by numpy alone, on a pedestal."""
+def simulate_ramps(rate_e_per_s, times_s, seed):
+    """Simulate codes of ramps on a pedestal, with numpy only."""
     rng = np.random.default_rng(seed)
     steps_s = np.diff(times_s, prepend=0.0)
     charge_e = rng.poisson(rate_e_per_s * steps_s[:, None], (steps_s.size, N)).cumsum(axis=0)
@@ -271,11 +282,11 @@ def ramp_codes(rate_e_per_s, times_s, seed):
 
 
 @pytest.mark.parametrize("rate_e_per_s", [0.0, 3.0, 30.0, 300.0, 2000.0])
-def test_slopes_are_unbiased_with_the_variance_of_least_squares(rate_e_per_s):
-    """The oracle inverts the covariance of the reads themselves, with a free offset."""
+def test_ramp_slope_matches_generalised_least_squares(rate_e_per_s):
+    """The reference inverts the covariance matrix of the reads, with a free offset."""
     sensor = Sensor(ROW, **SENSOR)
     times = np.array(TIMES_S)
-    code = ramp_codes(rate_e_per_s, times, 4)
+    code = simulate_ramps(rate_e_per_s, times, 4)
 
     fit = fit_ramp(code, times, sensor, weight_rate_e_per_s=rate_e_per_s)
     own = fit_ramp(code, times, sensor)
@@ -285,21 +296,21 @@ def test_slopes_are_unbiased_with_the_variance_of_least_squares(rate_e_per_s):
     design = np.stack([np.ones(times.size), times], axis=1)
     inverse = np.linalg.inv(covariance)
     normal = np.linalg.inv(design.T @ inverse @ design)
-    oracle = (normal @ design.T @ inverse @ ((code - PEDESTAL_DN + 0.5) * E_PER_DN))[1]
+    reference = (normal @ design.T @ inverse @ ((code - PEDESTAL_DN + 0.5) * E_PER_DN))[1]
     sigma = math.sqrt(normal[1, 1])
     assert fit.sigma_e_per_s == pytest.approx(np.full(N, sigma), rel=1e-9)
-    assert fit.rate_e_per_s == pytest.approx(oracle, rel=1e-9, abs=1e-9)
+    assert fit.rate_e_per_s == pytest.approx(reference, rel=1e-9, abs=1e-9)
     assert fit.rate_e_per_s.mean() == pytest.approx(rate_e_per_s, abs=SIGMAS * sigma / math.sqrt(N))
     assert fit.rate_e_per_s.var() == pytest.approx(sigma**2, rel=SIGMAS * math.sqrt(2.0 / N))
-    # Own weights: less than half an electron over the ramp.
+    # Weights from each site's own rate: bias below half an electron per ramp.
     assert own.rate_e_per_s.mean() == pytest.approx(rate_e_per_s, abs=0.5 / times[-1] + SIGMAS * sigma / math.sqrt(N))
     assert own.rate_e_per_s.var() == pytest.approx(sigma**2, rel=0.08)
 
 
-def test_reads_after_saturation_are_not_used():
+def test_ramp_fit_ignores_reads_after_saturation():
     sensor = Sensor(ROW, **SENSOR)
     times = np.arange(1.0, 9.0)
-    code = ramp_codes(2000.0, times, 5)
+    code = simulate_ramps(2000.0, times, 5)
     n_below = (code < 4095).sum(axis=0)
 
     fit = fit_ramp(code, times, sensor)
@@ -313,17 +324,17 @@ def test_reads_after_saturation_are_not_used():
     assert fit.rate_e_per_s[is_five] == pytest.approx(first_five.rate_e_per_s[is_five], rel=1e-12)
 
 
-def test_a_ramp_whose_last_read_saturates_by_chance_has_an_unbiased_slope():
+def test_ramp_slope_is_unbiased_at_saturation_onset():
     rate_e_per_s, times = 2037.0, np.arange(1.0, 9.0)
 
-    fit = fit_ramp(ramp_codes(rate_e_per_s, times, 7), times, Sensor(ROW, **SENSOR))
+    fit = fit_ramp(simulate_ramps(rate_e_per_s, times, 7), times, Sensor(ROW, **SENSOR))
 
     assert np.bincount(fit.n_used)[[4, 5]].min() > 0.4 * N
     sigma = fit.rate_e_per_s.std()
     assert fit.rate_e_per_s.mean() == pytest.approx(rate_e_per_s, abs=SIGMAS * sigma / math.sqrt(N))
 
 
-def test_one_usable_read_has_no_slope():
+def test_single_usable_read_gives_nan_slope():
     code = np.array([[100, 4095], [4095, 4095], [200, 4095]])
 
     fit = fit_ramp(code, [1.0, 2.0, 3.0], Sensor(ROW[:2], **SENSOR))
@@ -332,7 +343,7 @@ def test_one_usable_read_has_no_slope():
     assert fit.n_used.tolist() == [1, 0]
 
 
-def test_a_ramp_of_the_chain_has_the_slope_of_its_light_and_dark_charge():
+def test_simulated_ramp_slope_includes_dark_signal():
     sensor = Sensor(ROW, dark_e_per_s=100.0, ktc_noise=True, cds=False, **{**SENSOR, "v_sat_v": 4.0, "bits": 14})
     times = np.linspace(0.2, 4.0, 12)
 
@@ -345,19 +356,19 @@ def test_a_ramp_of_the_chain_has_the_slope_of_its_light_and_dark_charge():
 
 # -- random telegraph noise -------------------------------------------------------------------------------------------
 
-#: Charges of 1,000 to 4,000 e-, far from both ends of the codes.
+#: Charges of 1,000 to 4,000 e-, far from both ends of the range.
 RTS_RATE_E_PER_S, RTS_TIMES_S = 2e4, [0.05, 0.1, 0.2]
 
 
 def assert_drawn_as_predicted(found, n_sites=N):
-    """The spread over sites is the predicted one, to five standard errors of the spread."""
+    """Check the standard deviation over sites to five standard errors."""
     sigma = np.broadcast_to(found.sigma_e_per_s, n_sites)
     spread = (found.rate_e_per_s - RTS_RATE_E_PER_S) / sigma
     assert spread.std() == pytest.approx(1.0, abs=SIGMAS / math.sqrt(2.0 * n_sites) + 1e-3)
 
 
-def exposed_in_turn(sensor):
-    """Codes of several exposures of one rate, as the sensor draws them."""
+def sensor_exposures(sensor):
+    """Simulate codes of several exposures with the sensor."""
     rows = []
     for frame, t_s in enumerate(RTS_TIMES_S):
         streams = Streams(11, frame)
@@ -368,9 +379,9 @@ def exposed_in_turn(sensor):
 
 @pytest.mark.parametrize("shot_noise", ["auto", "off"])
 @pytest.mark.parametrize("rts_fraction", [1.0, 0.5])
-def test_merged_exposures_predict_rts_spread(rts_fraction, shot_noise):
+def test_merged_exposures_predict_rts_noise(rts_fraction, shot_noise):
     sensor = Sensor(ROW, **SENSOR, rts_fraction=rts_fraction, rts_e=200.0, shot_noise=shot_noise)
-    merged = merge_exposures(exposed_in_turn(sensor), RTS_TIMES_S, sensor)
+    merged = merge_exposures(sensor_exposures(sensor), RTS_TIMES_S, sensor)
 
     is_rts = sensor.pattern("rts") > 0.0
     assert_drawn_as_predicted(merged)
@@ -378,7 +389,7 @@ def test_merged_exposures_predict_rts_spread(rts_fraction, shot_noise):
 
 
 @pytest.mark.parametrize("rts_fraction", [1.0, 0.5])
-def test_ramps_predict_rts_spread(rts_fraction):
+def test_ramp_fits_predict_rts_noise(rts_fraction):
     sensor = Sensor(ROW, **SENSOR, rts_fraction=rts_fraction, rts_e=200.0)
     times = np.linspace(0.05, 0.25, 6)
     ramp = non_destructive_reads(sensor, RTS_RATE_E_PER_S, times, streams=Streams(12))
@@ -406,7 +417,7 @@ CODE = np.full((2, 3), 100)
             r"'weight_rate_e_per_s' must be from .* to 1e\+15, got 1e\+300 e-/s",
         ),
         (
-            lambda: merge_exposures(CODE, [0.1, 1.0], FEW, calibration=pedestal(7)),
+            lambda: merge_exposures(CODE, [0.1, 1.0], FEW, calibration=pedestal_calibration(7)),
             "'calibration' must be a Calibration",
         ),
         (
@@ -427,13 +438,13 @@ CODE = np.full((2, 3), 100)
         ),
     ],
 )
-def test_bad_input_gets_one_clear_sentence(call, message):
+def test_invalid_input_is_rejected(call, message):
     with pytest.raises(ParameterError, match=message) as caught:
         call()
     assert "\n" not in str(caught.value)
 
 
-def test_exposures_of_unknown_dark_signal_are_refused():
+def test_unknown_dark_signal_is_rejected():
     calibration = Calibration.from_frames(np.full((2, 3), 9.0), np.full((1, 3), 99.0), exposure_s=0.1)
 
     with pytest.raises(SimulationError, match="the dark signal at 1 s is unknown; calibrate with"):

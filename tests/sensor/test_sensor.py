@@ -1,4 +1,4 @@
-"""The sensor: statistics of its electrons and steps of its codes, against closed forms and published numbers."""
+"""Sensor: statistics of electrons and code transitions against closed forms and published values."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from foveasim.errors import ParameterError, SimulationError
 from foveasim.layout import grid
 from foveasim.sensor import ConstantCurve, FilterSet, Sensor, SiliconQE, draw_shot_noise
 
-#: Enough sites for statistics to 0.3 %.
+#: Number of sites for statistics to 0.3 %.
 N = 200_000
 MANY = grid(n_x=500, n_y=400, pitch_um=2.0)
 FOUR = grid(n_x=4, n_y=1, pitch_um=2.0)
 COLOURED = FOUR.with_columns(channel=[0, 1, 1, 0])
-#: Five standard errors: a right sensor is outside once in 1.7 million.
+#: Five standard errors: false-alarm probability 1 in 1.7 million.
 SIGMAS = 5.0
 GREEN_NM = np.array([550.0])
-#: 16 bits of 1 electron each.
+#: 16 bits, 1 electron per code.
 ONE_E_PER_CODE = {"bits": 16, "v_sat_v": 3.0, "capacitance_f": 65_536 * scipy.constants.e / 3.0}
 
 
-def light_w(photons_per_s):
-    """Power of green photons."""
+def green_power_w(photons_per_s):
+    """Return the power of green photons (550 nm)."""
     return photons_per_s * scipy.constants.h * scipy.constants.c / 550e-9
 
 
 def electrons_of(sensor, photons, *, seed):
-    """Charge of every site where so many photons are expected within a second."""
-    photo_e_per_s = sensor.responsivity_e_per_j(GREEN_NM)[0, 0] * np.full(sensor.layout.n_sites, light_w(photons))
+    """Draw the charge of each site for a number of expected photons in one second."""
+    photo_e_per_s = sensor.responsivity_e_per_j(GREEN_NM)[0, 0] * np.full(sensor.layout.n_sites, green_power_w(photons))
     return sensor.collect(sensor.expected_electrons(photo_e_per_s, 1.0), streams=Streams(seed))
 
 
 def collected(expected_e, *, seed=0, **parameters):
-    """Charge of every site where so many electrons are expected."""
+    """Draw the charge of each site for a number of expected electrons."""
     sensor = Sensor(MANY, **parameters)
     return sensor.collect(np.broadcast_to(np.asarray(expected_e, float), N).copy(), streams=Streams(seed))
 
@@ -57,85 +57,85 @@ def charge_for(voltage_v, capacitance_f):
 # -- photons to electrons -------------------------------------------------------------------------------------------
 
 
-def test_a_watt_per_square_metre_on_a_square_micrometre_is_2_77_million_green_electrons():
+def test_photon_rate_matches_si_conversion():
     sensor = Sensor(FOUR, qe=1.0)
     rate_e_per_s = sensor.responsivity_e_per_j(GREEN_NM)[0] * 1e-12
     assert math.isclose(sensor.expected_electrons(rate_e_per_s, 1.0)[0], 2.76876e6, rel_tol=2e-6)
 
 
-def test_electrons_per_joule_grow_with_wavelength():
-    at = Sensor(FOUR).responsivity_e_per_j(np.array([400.0, 800.0]))[0]
-    assert math.isclose(at[1] / at[0], 2.0, rel_tol=1e-15)
+def test_responsivity_is_proportional_to_wavelength():
+    responsivity = Sensor(FOUR).responsivity_e_per_j(np.array([400.0, 800.0]))[0]
+    assert math.isclose(responsivity[1] / responsivity[0], 2.0, rel_tol=1e-15)
 
 
-def test_electrons_per_joule_are_the_product_of_efficiency_and_filter():
+def test_responsivity_multiplies_efficiency_and_filter():
     filters = FilterSet([ConstantCurve(0.25), ConstantCurve(1.0)])
-    at = Sensor(COLOURED, qe=SiliconQE(depth_um=1.561), filters=filters).responsivity_e_per_j(GREEN_NM)[:, 0] * light_w(
-        1.0
+    responsivity = Sensor(COLOURED, qe=SiliconQE(depth_um=1.561), filters=filters).responsivity_e_per_j(GREEN_NM)[:, 0]
+    np.testing.assert_allclose(
+        responsivity * green_power_w(1.0), [0.25 * (1.0 - 1.0 / math.e), 1.0 - 1.0 / math.e], rtol=1e-9
     )
-    np.testing.assert_allclose(at, [0.25 * (1.0 - 1.0 / math.e), 1.0 - 1.0 / math.e], rtol=1e-9)
 
 
-def test_a_channel_takes_its_filter():
+def test_channel_selects_filter():
     sensor = Sensor(FOUR.with_columns(channel=[2, 0, 1, 2]), filters="rgb")
     assert [sensor.filter_names[k] for k in sensor.filter_of_site] == ["B", "R", "G", "B"]
 
 
-def test_dark_charge_adds_to_photoelectrons_and_grows_with_time():
+def test_dark_signal_adds_to_photoelectrons():
     sensor = Sensor(FOUR, dark_e_per_s=np.array([0.0, 10.0, 20.0, 30.0]))
     expected_e = sensor.expected_electrons(np.full(4, 100.0), 0.5)
     assert expected_e.tolist() == [50.0, 55.0, 60.0, 65.0]
 
 
-def test_no_time_gives_no_charge():
+def test_zero_exposure_gives_zero_charge():
     expected_e = Sensor(FOUR, dark_e_per_s=99.0).expected_electrons(np.full(4, 1e6), 0.0)
     assert expected_e.tolist() == [0.0] * 4
 
 
 # -- shot noise -----------------------------------------------------------------------------------------------------
 
-MEANS_E = [3.0, 60.0, 99.0, 101.0, 1e3, 1e6]  # on both sides of the switch to the Gaussian at 100
+MEANS_E = [3.0, 60.0, 99.0, 101.0, 1e3, 1e6]  # below and above the limit of exact Poisson draws, 100 e-
 
 
 @pytest.mark.parametrize("mean_e", MEANS_E)
 @pytest.mark.parametrize("qe", [0.3, 1.0])
 @pytest.mark.parametrize("how", ["auto", "exact"])
-def test_electrons_vary_as_much_as_there_are(how, qe, mean_e):
+def test_electron_variance_equals_mean(how, qe, mean_e):
     electrons = electrons_of(Sensor(MANY, qe=qe, shot_noise=how), mean_e / qe, seed=17)
-    # (n - 1) variance / mean of Poisson counts is chi-squared of n - 1 degrees of freedom.
+    # (n - 1) variance / mean of Poisson counts has a chi-squared distribution with n - 1 degrees of freedom.
     assert abs(electrons.var(ddof=1) / electrons.mean() - 1.0) < SIGMAS * math.sqrt(2.0 / (N - 1))
 
 
 @pytest.mark.parametrize("mean_e", MEANS_E)
 @pytest.mark.parametrize("qe", [0.3, 1.0])
 @pytest.mark.parametrize("how", ["auto", "exact"])
-def test_electrons_are_as_many_as_expected(how, qe, mean_e):
+def test_electron_mean_equals_expectation(how, qe, mean_e):
     electrons = electrons_of(Sensor(MANY, qe=qe, shot_noise=how), mean_e / qe, seed=23)
     assert abs(electrons.mean() - mean_e) < SIGMAS * math.sqrt(mean_e / N)
 
 
 @pytest.mark.parametrize("mean_e", [0.4, 3.0, 60.0, 99.0])
-def test_few_electrons_are_distributed_as_poisson_found(mean_e):
+def test_small_charges_are_poisson_distributed(mean_e):
     electrons = collected(mean_e, seed=5)
-    law = scipy.stats.poisson(mean_e)
-    # Bins of at least 20 expected sites each, the outer ones open.
-    low, high = law.ppf(20.0 / N), law.isf(20.0 / N) - 1
+    distribution = scipy.stats.poisson(mean_e)
+    # Bins with at least 20 expected sites; the outer bins are open.
+    low, high = distribution.ppf(20.0 / N), distribution.isf(20.0 / N) - 1
     edges = np.arange(low, high + 1)
     counted = np.histogram(electrons, np.concatenate(([-np.inf], edges + 0.5, [np.inf])))[0]
-    expected = N * np.diff(np.concatenate(([0.0], law.cdf(edges), [1.0])))
+    expected = N * np.diff(np.concatenate(([0.0], distribution.cdf(edges), [1.0])))
     assert scipy.stats.chisquare(counted, expected).pvalue > 2.0 * scipy.stats.norm.sf(SIGMAS)
 
 
-def test_half_of_many_electrons_lie_within_the_quartiles_of_the_gaussian():
+def test_large_charges_have_gaussian_quartiles():
     electrons = collected(1e6, seed=6)
     inside = np.abs(electrons - 1e6) < 0.6744897501960817 * 1e3
     assert abs(inside.mean() - 0.5) < SIGMAS * math.sqrt(0.25 / N)
 
 
-def test_rounding_to_whole_electrons_adds_no_variance():
+def test_rounding_to_electrons_adds_no_variance():
     n = 4_000_000
     electrons = draw_shot_noise(np.full(n, 12.0), "auto", 10.0, Streams(7))
-    # Rounding alone would add 1 / 12 to the variance of 12, twice the threshold here.
+    # Uncorrected rounding would add 1 / 12 to the variance of 12, twice the threshold.
     assert abs(electrons.var(ddof=1) / 12.0 - 1.0) < SIGMAS * math.sqrt(2.0 / n)
 
 
@@ -146,28 +146,28 @@ def test_electrons_are_never_negative(how, mean_e):
 
 
 @pytest.mark.parametrize("how", ["auto", "exact", "off"])
-def test_no_light_gives_no_electron(how):
+def test_zero_expectation_gives_zero_charge(how):
     assert not collected(0.0, shot_noise=how).any()
 
 
-def test_without_shot_noise_charge_is_the_expectation_to_half_an_electron():
+def test_charge_without_shot_noise_is_rounded_expectation():
     expected_e = np.linspace(0.0, 1e4, N)
     assert np.abs(collected(expected_e, shot_noise="off") - expected_e).max() <= 0.5
 
 
-def test_a_full_well_of_7000_electrons_has_a_signal_to_noise_ratio_of_83_7():
+def test_snr_of_7000_electrons_is_83_7():
     electrons = collected(7000.0, seed=8)
-    # The standard error of a standard deviation is its share 1 / sqrt(2 n).
+    # The relative standard error of a standard deviation is 1 / sqrt(2 n).
     assert abs(electrons.mean() / electrons.std() / 83.7 - 1.0) < SIGMAS / math.sqrt(2.0 * N) + 0.05 / 83.7
 
 
-def test_neighbours_are_uncorrelated():
+def test_neighbouring_sites_are_uncorrelated():
     electrons = collected(1e3, seed=9).reshape(400, 500)
     for near, far in ((electrons[:, 1:], electrons[:, :-1]), (electrons[1:], electrons[:-1])):
         assert abs(np.corrcoef(near.ravel(), far.ravel())[0, 1]) < SIGMAS / math.sqrt(near.size)
 
 
-def test_more_dark_charge_means_more_dark_noise():
+def test_dark_signal_has_shot_noise():
     sensor = Sensor(MANY, dark_e_per_s=50.0)
     electrons = sensor.collect(sensor.expected_electrons(np.zeros(N), 2.0), streams=Streams(3))
     assert abs(electrons.mean() - 100.0) < SIGMAS * math.sqrt(100.0 / N)
@@ -177,24 +177,24 @@ def test_more_dark_charge_means_more_dark_noise():
 # -- full well ------------------------------------------------------------------------------------------------------
 
 
-def test_no_site_holds_more_than_its_full_well():
+def test_charge_never_exceeds_full_well():
     full_well_e = np.linspace(900.0, 1100.0, N)
     electrons = collected(1000.0, full_well_e=full_well_e)
     assert np.all(electrons <= full_well_e)
 
 
-def test_sites_far_above_their_full_well_hold_just_that():
+def test_excess_charge_equals_full_well():
     assert np.all(collected(1e5, full_well_e=7000.0) == 7000)
 
 
-def test_a_full_well_leaves_smaller_charges_as_they_were():
-    free = collected(1000.0, seed=4)
-    held = collected(1000.0, seed=4, full_well_e=1000.0)
-    np.testing.assert_array_equal(held, np.minimum(free, 1000))
+def test_full_well_clips_only_excess_charge():
+    unlimited = collected(1000.0, seed=4)
+    clipped = collected(1000.0, seed=4, full_well_e=1000.0)
+    np.testing.assert_array_equal(clipped, np.minimum(unlimited, 1000))
 
 
 @pytest.mark.parametrize("full_well_e", [1e9, 1e15])
-def test_a_well_too_deep_to_fill_holds_everything(full_well_e):
+def test_large_full_well_has_no_effect(full_well_e):
     np.testing.assert_array_equal(collected(1000.0, full_well_e=full_well_e), collected(1000.0))
 
 
@@ -202,33 +202,33 @@ def test_a_well_too_deep_to_fill_holds_everything(full_well_e):
 
 
 @pytest.mark.parametrize("noise_e", [5.0, 50.0, 200.0])
-def test_read_noise_has_its_standard_deviation_in_the_codes(noise_e):
+def test_read_noise_has_stated_standard_deviation(noise_e):
     code = codes(np.full(N, 30_000), layout=MANY, read_noise_e=noise_e, **ONE_E_PER_CODE)
-    # A code holds 1 electron, and rounding to it adds 1 / 12 to the variance.
+    # Quantisation to codes of 1 electron adds 1 / 12 to the variance.
     variance = noise_e**2 + 1.0 / 12.0
     assert abs(code.astype(float).var(ddof=1) / variance - 1.0) < SIGMAS * math.sqrt(2.0 / (N - 1))
 
 
-def test_read_noise_moves_no_mean():
+def test_read_noise_has_zero_mean():
     code = codes(np.full(N, 30_000), layout=MANY, read_noise_e=50.0, **ONE_E_PER_CODE)
-    # Code k stands for the voltages from k to k + 1.
+    # Code k covers the charges from k to k + 1 electrons.
     assert abs(code.mean() + 0.5 - 30_000.0) < SIGMAS * 50.0 / math.sqrt(N)
 
 
-def test_read_noise_comes_after_the_full_well():
+def test_read_noise_acts_after_full_well():
     sensor = Sensor(MANY, full_well_e=7000.0, read_noise_e=50.0, **ONE_E_PER_CODE)
     electrons = sensor.collect(np.full(N, 1e6), streams=Streams(2))
     code = sensor.read(electrons, streams=Streams(2)).astype(float)
     assert abs(code.var(ddof=1) / (50.0**2 + 1.0 / 12.0) - 1.0) < SIGMAS * math.sqrt(2.0 / (N - 1))
 
 
-def test_in_the_dark_read_noise_lifts_half_of_the_codes():
+def test_dark_codes_clip_negative_read_noise():
     code = codes(np.zeros(N), layout=MANY, read_noise_e=100.0, **ONE_E_PER_CODE)
-    share = scipy.stats.norm.sf(1.0 / 100.0)  # what reaches code 1
-    assert abs(np.mean(code > 0) - share) < SIGMAS * math.sqrt(share * (1.0 - share) / N)
+    probability = scipy.stats.norm.sf(1.0 / 100.0)  # of at least code 1
+    assert abs(np.mean(code > 0) - probability) < SIGMAS * math.sqrt(probability * (1.0 - probability) / N)
 
 
-def test_read_noise_of_one_site_leaves_the_others_quiet():
+def test_read_noise_is_per_site():
     noise_e = np.where(np.arange(N) % 2 == 0, 50.0, 0.0)
     code = codes(np.full(N, 30_000), layout=MANY, read_noise_e=noise_e, **ONE_E_PER_CODE)
     assert np.unique(code[1::2]).size == 1
@@ -240,26 +240,26 @@ def test_read_noise_of_one_site_leaves_the_others_quiet():
 # -- volts to codes -------------------------------------------------------------------------------------------------
 
 
-def test_a_code_of_8_bits_3_volts_and_a_tenth_of_a_picofarad_is_7314_electrons():
+def test_code_width_matches_published_7314_electrons():
     assert codes([7314, 7315, 14_628, 14_629]).tolist() == [0, 1, 1, 2]
 
 
-def test_3_volts_on_a_tenth_of_a_picofarad_are_full_at_1_87_million_electrons():
+def test_saturation_charge_matches_published_value():
     assert codes([1_865_000, 1_870_000]).tolist() == [254, 255]
 
 
 @pytest.mark.parametrize("bits", [4, 8, 12])
-def test_quantisation_errs_by_a_step_over_the_root_of_12(bits):
+def test_quantisation_error_variance_is_one_twelfth(bits):
     capacitance_f, n_codes = 1e-10, 2**bits
     voltage_v = np.random.default_rng(12).uniform(0.0, 3.0, N)
     code = codes(charge_for(voltage_v, capacitance_f), layout=MANY, bits=bits, capacitance_f=capacitance_f)
     error = voltage_v * n_codes / 3.0 - code - 0.5
-    # The fourth moment of an even distribution over one step is 1 / 80.
+    # The fourth central moment of a uniform distribution of width 1 is 1 / 80.
     assert abs(np.mean(error**2) - 1.0 / 12.0) < SIGMAS * math.sqrt((1.0 / 80.0 - 1.0 / 144.0) / N)
 
 
 @pytest.mark.parametrize("bits", range(1, 17))
-def test_every_code_is_reached_by_the_voltages_in_its_step(bits):
+def test_every_code_occurs_at_its_centre(bits):
     capacitance_f, n_codes = 1e-10, 2**bits
     charge_e = charge_for((np.arange(n_codes) + 0.5) * 3.0 / n_codes, capacitance_f)
     code = codes(charge_e, bits=bits, capacitance_f=capacitance_f)
@@ -268,7 +268,7 @@ def test_every_code_is_reached_by_the_voltages_in_its_step(bits):
 
 @pytest.mark.parametrize("bits", range(1, 17))
 @pytest.mark.parametrize("read_noise_e", [0.0, 10.0])
-def test_no_charge_leaves_the_range_of_the_codes(bits, read_noise_e):
+def test_codes_are_clipped_to_range(bits, read_noise_e):
     full_e = charge_for(3.0, 1e-13)
     charge_e = np.array([-(2**62), -1, 0, full_e - 1, full_e, full_e + 1, 2 * full_e, 2**40, 2**63 - 1])
     code = codes(charge_e, bits=bits, read_noise_e=read_noise_e).astype(int)
@@ -278,33 +278,33 @@ def test_no_charge_leaves_the_range_of_the_codes(bits, read_noise_e):
 
 @pytest.mark.parametrize("how", ["auto", "exact", "off"])
 @pytest.mark.parametrize("expected_e", [1e12, 1e18, 1e19, 1e25])
-def test_light_beyond_all_measure_gives_the_highest_code(how, expected_e):
+def test_extreme_charges_give_highest_code(how, expected_e):
     sensor = Sensor(FOUR, shot_noise=how)
     electrons = sensor.collect(np.full(4, expected_e), streams=Streams(1))
     assert sensor.read(electrons, streams=Streams(1)).tolist() == [255] * 4
 
 
-def test_more_charge_never_means_a_lower_code():
+def test_codes_are_monotonic_in_charge():
     code = codes(np.linspace(0, 2.2e6, 5000), bits=10).astype(int)
     assert np.all(np.diff(code) >= 0)
 
 
 @pytest.mark.parametrize("bits", range(1, 17))
-def test_codes_come_in_the_smallest_type_that_holds_them(bits):
+def test_codes_have_smallest_sufficient_dtype(bits):
     assert codes([0], bits=bits).dtype == np.min_scalar_type(2**bits - 1)
 
 
-def test_double_the_capacitance_is_half_the_code():
+def test_double_capacitance_halves_code():
     code = codes([1_000_000] * 2, bits=16, capacitance_f=np.array([1e-13, 2e-13])).astype(int)
     assert abs(code[0] - 2 * code[1]) <= 1
 
 
-def test_double_the_range_is_half_the_code():
+def test_double_voltage_range_halves_code():
     low, high = (int(codes([1_000_000], bits=16, v_sat_v=v)[0]) for v in (3.0, 6.0))
     assert abs(low - 2 * high) <= 1
 
 
-# -- effects do not disturb each other ------------------------------------------------------------------------------
+# -- independence of effects ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -319,48 +319,48 @@ def test_double_the_range_is_half_the_code():
     ids=lambda changed: next(iter(changed)),
 )
 @pytest.mark.parametrize("mean_e", [20.0, 500.0])
-def test_reading_otherwise_leaves_the_electrons_bit_for_bit(mean_e, changed):
+def test_readout_parameters_do_not_change_electrons(mean_e, changed):
     np.testing.assert_array_equal(collected(mean_e, **changed), collected(mean_e))
 
 
-def test_shot_noise_on_or_off_leaves_the_read_noise():
+def test_shot_noise_does_not_change_read_noise():
     noise_e = []
     for how in ("auto", "off"):
         quiet, noisy = (Sensor(MANY, shot_noise=how, read_noise_e=e, **ONE_E_PER_CODE) for e in (0.0, 50.0))
         electrons = quiet.collect(np.full(N, 30_000.0), streams=Streams(6))
         code, code_with_noise = (sensor.read(electrons, streams=Streams(6)).astype(int) for sensor in (quiet, noisy))
         noise_e.append(code_with_noise - code)
-    # Each difference is the same noise to within a step.
+    # Both differences are the same read noise to within one code.
     assert np.abs(noise_e[0] - noise_e[1]).max() <= 1
 
 
-def test_read_noise_of_nought_is_no_read_noise():
+def test_zero_read_noise_has_no_effect():
     charge_e = np.arange(0, 2 * N, 2)
     quiet = codes(charge_e, layout=MANY, bits=12)
     np.testing.assert_array_equal(codes(charge_e, layout=MANY, bits=12, read_noise_e=np.zeros(N)), quiet)
 
 
-def test_bright_sites_draw_the_same_whatever_the_others_get():
+def test_draws_are_independent_of_other_expectations():
     expected_e = np.full(N, 1e4)
     other_e = np.where(np.arange(N) % 2 == 0, 1e4, 7.0)
     np.testing.assert_array_equal(collected(expected_e, seed=2)[::2], collected(other_e, seed=2)[::2])
 
 
-def test_the_same_seed_gives_the_same_codes():
+def test_same_seed_gives_identical_codes():
     runs = [codes(collected(500.0, seed=3), layout=MANY, seed=3, read_noise_e=50.0, **ONE_E_PER_CODE) for _ in range(2)]
     np.testing.assert_array_equal(*runs)
 
 
 @pytest.mark.parametrize("other", [Streams(2, 0), Streams(1, 1)], ids=["seed", "frame"])
 @pytest.mark.parametrize("mean_e", [20.0, 1e4])
-def test_another_seed_or_frame_gives_independent_electrons(mean_e, other):
+def test_seeds_and_frames_give_independent_electrons(mean_e, other):
     sensor = Sensor(MANY)
     a, b = (sensor.collect(np.full(N, mean_e), streams=streams) for streams in (Streams(1, 0), other))
     assert abs(np.corrcoef(a, b)[0, 1]) < SIGMAS / math.sqrt(N)
 
 
 @pytest.mark.parametrize("other", [Streams(2, 0), Streams(1, 1)], ids=["seed", "frame"])
-def test_another_seed_or_frame_gives_independent_read_noise(other):
+def test_seeds_and_frames_give_independent_noise(other):
     sensor = Sensor(MANY, read_noise_e=50.0, **ONE_E_PER_CODE)
     a, b = (sensor.read(np.full(N, 30_000), streams=streams) for streams in (Streams(1, 0), other))
     assert abs(np.corrcoef(a, b)[0, 1]) < SIGMAS / math.sqrt(N)
@@ -374,7 +374,7 @@ def test_shot_noise_and_read_noise_are_independent(mean_e):
     assert abs(np.corrcoef(electrons, noise_e)[0, 1]) < SIGMAS / math.sqrt(N)
 
 
-# -- what is rejected ------------------------------------------------------------------------------------------------
+# -- invalid input ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -410,33 +410,33 @@ def test_shot_noise_and_read_noise_are_independent(mean_e):
         ("gaussian_above_e", math.nan, "must be finite"),
     ],
 )
-def test_a_sensor_that_cannot_be_is_refused_in_one_sentence(name, value, rule):
+def test_invalid_sensor_parameters_are_rejected(name, value, rule):
     with pytest.raises(ParameterError, match=rf"^'{name}' {rule}[^\n]*$"):
         Sensor(FOUR, **{name: value})
 
 
-def test_a_channel_without_a_filter_is_refused():
+def test_channel_without_filter_is_rejected():
     with pytest.raises(SimulationError, match=r"channel 3, but the sensor has only filters 0 to 2 \(R, G, B\)$"):
         Sensor(FOUR.with_columns(channel=[0, 1, 2, 3]), filters="rgb")
 
 
 @pytest.mark.parametrize("exposure_s", [-1.0, math.nan, math.inf, "1/30", None])
-def test_an_exposure_that_cannot_be_is_refused(exposure_s):
+def test_invalid_exposure_is_rejected(exposure_s):
     with pytest.raises(ParameterError, match=r"^'exposure_s' must be"):
         Sensor(FOUR).expected_electrons(np.ones(4), exposure_s)
 
 
 @pytest.mark.parametrize("value", [1.5, -0.5, math.nan])
 @pytest.mark.parametrize("filters", [None, "rgb"])
-def test_an_efficiency_beyond_0_to_1_is_refused_in_one_line(value, filters):
+def test_quantum_efficiency_outside_range_is_rejected(value, filters):
     sensor = Sensor(COLOURED, qe=lambda wavelength_nm: np.full(np.shape(wavelength_nm), value), filters=filters)
     with pytest.raises(ParameterError, match=r"values from 0 to 1 at every wavelength[^\n]*$") as caught:
         sensor.responsivity_e_per_j(np.array([450.0, 540.0, 610.0]))
     assert "\n" not in str(caught.value)
 
 
-def returning(value):
-    """A curve of the user's that returns anything at all."""
+def curve_returning(value):
+    """Return a user-defined curve that returns a fixed value."""
 
     def my_curve(_wavelength_nm):
         return value
@@ -444,26 +444,29 @@ def returning(value):
     return my_curve
 
 
-def failing(_wavelength_nm):
+def failing_curve(_wavelength_nm):
     raise KeyError("no such filter")
 
 
 @pytest.mark.parametrize(
     ("curve", "message"),
     [
-        (failing, r"'{name}' must be a function of wavelength that returns numbers, but failing raised KeyError"),
-        (returning("high"), r"'{name}' must return one number per wavelength, got 'high'; correct .*my_curve"),
         (
-            returning(["a", "b", "c"]),
+            failing_curve,
+            r"'{name}' must be a function of wavelength that returns numbers, but failing_curve raised KeyError",
+        ),
+        (curve_returning("high"), r"'{name}' must return one number per wavelength, got 'high'; correct .*my_curve"),
+        (
+            curve_returning(["a", "b", "c"]),
             r"'{name}' must return one number per wavelength, got \['a', 'b', 'c'\]; correct .*my_curve",
         ),
-        (returning(None), r"'{name}' must return one number per wavelength, got None; correct .*my_curve"),
+        (curve_returning(None), r"'{name}' must return one number per wavelength, got None; correct .*my_curve"),
         (
-            returning([0.5, 0.5]),
+            curve_returning([0.5, 0.5]),
             r"'{name}' must return one number per wavelength, got the shape \(2,\) for \(3,\); correct",
         ),
         (
-            returning(0.5 + 0.5j),
+            curve_returning(0.5 + 0.5j),
             r"'{name}' must return one number per wavelength, got \(0.5\+0.5j\); correct .*my_curve",
         ),
         (
@@ -473,7 +476,7 @@ def failing(_wavelength_nm):
     ],
 )
 @pytest.mark.parametrize("name", ["qe", "filters"])
-def test_curve_failures_name_the_function(name, curve, message):
+def test_curve_errors_name_function(name, curve, message):
     given = curve if name == "qe" else FilterSet((SiliconQE(depth_um=3.0), curve))
     sensor = Sensor(COLOURED, **{"filters": "rgb", name: given})
 
@@ -489,7 +492,7 @@ def test_scalar_curves_are_constant():
     assert np.array_equal(sensor.responsivity_e_per_j(GREEN_NM), Sensor(FOUR, qe=0.5).responsivity_e_per_j(GREEN_NM))
 
 
-def test_arrays_given_per_site_are_kept_from_later_changes():
+def test_per_site_arrays_are_copied():
     noise_e = np.full(4, 1.0)
     sensor = Sensor(FOUR, read_noise_e=noise_e)
     noise_e[...] = 99.0
@@ -499,8 +502,8 @@ def test_arrays_given_per_site_are_kept_from_later_changes():
 @pytest.mark.parametrize("v_sat_v", [1.0, 1.8, 3.0, 3.3])
 @pytest.mark.parametrize("bits", [8, 10, 12, 16])
 @pytest.mark.parametrize("e_per_dn", [1, 2, 4])
-def test_a_charge_on_the_border_of_a_code_has_that_code(v_sat_v, bits, e_per_dn):
-    """With an integer of electrons to a code every border is met."""
+def test_transition_charges_have_higher_code(v_sat_v, bits, e_per_dn):
+    """With an integer number of electrons per code, charges coincide with code transitions."""
     layout = fs.layout.grid(n_x=2**bits, n_y=1, pitch_um=1.0)
     capacitance_f = 1.602176634e-19 * e_per_dn * 2**bits / v_sat_v
     sensor = fs.Sensor(layout, capacitance_f=capacitance_f, v_sat_v=v_sat_v, bits=bits)
@@ -511,12 +514,12 @@ def test_a_charge_on_the_border_of_a_code_has_that_code(v_sat_v, bits, e_per_dn)
         assert np.array_equal(sensor.read(codes * e_per_dn + e_per_dn - 1, streams=Streams(0)), codes)
 
 
-def test_filters_need_a_layout_that_says_which_site_has_which():
+def test_filters_require_channel_column():
     with pytest.raises(SimulationError, match="the sensor has 3 filters, but the layout has no column 'channel'"):
         fs.Sensor(fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0), filters="rgb")
 
 
-def test_one_filter_does_not_serve_a_mosaic_of_three():
+def test_single_filter_rejects_three_channel_mosaic():
     layout = fs.layout.mosaic(fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0), ("RG", "GB"))
 
     with pytest.raises(SimulationError, match="sites of channel 2, but the sensor has only filters 0 to 0"):
@@ -524,6 +527,6 @@ def test_one_filter_does_not_serve_a_mosaic_of_three():
 
 
 @pytest.mark.parametrize("capacitance_f", [100.0, 1e-30])
-def test_a_capacitance_in_other_units_is_refused(capacitance_f):
+def test_implausible_capacitance_is_rejected(capacitance_f):
     with pytest.raises(ParameterError, match=r"'capacitance_f' must be from .* capacitances are in farad"):
         fs.Sensor(fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0), capacitance_f=capacitance_f)

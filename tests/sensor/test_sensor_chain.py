@@ -1,4 +1,4 @@
-"""Every effect of the electronic chain: how much it does, where it stands, and that it leaves all others as they were."""
+"""Effects of the electronic chain: magnitude, order, and independence of other effects."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ N_X, N_Y = 500, 400
 N = N_X * N_Y
 MANY = grid(n_x=N_X, n_y=N_Y, pitch_um=2.0).with_columns(readout_line=np.tile(np.arange(N_X), N_Y))
 SIGMAS = 5.0
-#: 16 bits of 1 electron each, up to 3 V.
+#: 16 bits, 1 electron per code, up to 3 V.
 FINE = {"bits": 16, "v_sat_v": 3.0, "capacitance_f": 65_536 * scipy.constants.e / 3.0, "shot_noise": "off"}
 V_PER_DN = 3.0 / 65_536
 
@@ -43,16 +43,16 @@ def codes(charge_e=30_000, *, seed=0, frame=0, **parameters):
 
 
 def assert_spread(values, sigma, extra_variance=0.0):
-    """The standard deviation is right to five of its standard errors."""
+    """Check the standard deviation to five standard errors."""
     variance = sigma**2 + extra_variance
     assert values.var() == pytest.approx(variance, rel=SIGMAS * math.sqrt(2.0 / (values.size - 1)))
 
 
-# -- numbers of a device ----------------------------------------------------------------------------------------------
+# -- random numbers of a device ---------------------------------------------------------------------------------------
 
 
-def test_numbers_of_a_device_are_those_of_the_published_generator():
-    """numpy's Philox 4x64, whose counter goes up before the first word."""
+def test_device_uniforms_match_philox_reference():
+    """numpy's Philox 4x64 increments its counter before the first word."""
     device = Device(seed=7, layout=MANY)
     key = device.key("prnu")
     ours = _kernels.device_uniforms(*key, np.array([5, 2**63], np.uint64), np.array([1, 0], np.uint64))
@@ -66,52 +66,52 @@ EFFECTS = ("prnu", "dsnu", "hot", "gain_fpn", "pixel_fpn", "rts")
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
-def test_a_crop_and_another_order_are_the_same_device(effect):
-    whole = Device(seed=3, layout=MANY).normals(effect)
+def test_device_is_invariant_to_crop_and_order(effect):
+    complete = Device(seed=3, layout=MANY).normals(effect)
     ids = np.random.default_rng(0).permutation(N)[:1000]
 
-    assert np.array_equal(Device(seed=3, layout=MANY[ids]).normals(effect), whole[ids])
+    assert np.array_equal(Device(seed=3, layout=MANY[ids]).normals(effect), complete[ids])
 
 
-def test_a_column_may_tell_sites_apart_in_place_of_where_they_are():
-    named = MANY[:100].with_columns(site_id=np.arange(100) + 7)
+def test_site_id_column_replaces_position():
+    identified = MANY[:100].with_columns(site_id=np.arange(100) + 7)
 
-    there = Device(seed=3, layout=named.translate(5.0, 1.0)).normals("prnu")
+    moved = Device(seed=3, layout=identified.translate(5.0, 1.0)).normals("prnu")
 
-    assert np.array_equal(there, Device(seed=3, layout=named).normals("prnu"))
-    assert not np.any(there == Device(seed=3, layout=MANY[:100]).normals("prnu"))
+    assert np.array_equal(moved, Device(seed=3, layout=identified).normals("prnu"))
+    assert not np.any(moved == Device(seed=3, layout=MANY[:100]).normals("prnu"))
 
 
-def test_site_ids_must_be_integers():
-    halves = MANY[:4].with_columns(site_id=[0.0, 0.5, 1.0, 1.5])
+def test_non_integer_site_ids_are_rejected():
+    layout = MANY[:4].with_columns(site_id=[0.0, 0.5, 1.0, 1.5])
 
     with pytest.raises(ParameterError, match="'site_id' must be a layout column of integers, got float64"):
-        Device(seed=3, layout=halves).normals("prnu")
+        Device(seed=3, layout=layout).normals("prnu")
 
 
 def concentric_rings():
-    """Four circular rings of one centroid, around a disc."""
+    """Return a disc and four concentric rings."""
     centre = shapely.Point(3.0, -2.0)
     discs = [centre.buffer(radius_um, quad_segs=16) for radius_um in (2.0, 4.0, 6.0, 8.0, 10.0)]
     return fs.Layout.from_polygons([discs[0], *(outer.difference(inner) for inner, outer in pairwise(discs))])
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
-def test_sites_of_one_centroid_have_distinct_devices(effect):
+def test_concentric_sites_have_distinct_devices(effect):
     rings = concentric_rings()
-    whole = Device(seed=3, layout=rings).normals(effect)
+    complete = Device(seed=3, layout=rings).normals(effect)
 
     assert np.ptp(rings.centroid_um, axis=0).max() < 1e-9
-    assert np.unique(whole).size == 5
+    assert np.unique(complete).size == 5
     for site in range(5):
-        assert Device(seed=3, layout=rings[[site]]).normals(effect) == whole[site]
-    # The disc contains its centroid, and has the draw of any site there.
+        assert Device(seed=3, layout=rings[[site]]).normals(effect) == complete[site]
+    # The disc contains its centroid, and is therefore identified by it.
     square = fs.Layout.from_rectangles([[3.0, -2.0]], 1.0)
-    assert Device(seed=3, layout=square).normals(effect) == whole[0]
+    assert Device(seed=3, layout=square).normals(effect) == complete[0]
 
 
-def test_crescent_around_a_site_has_its_own_device():
-    """Neither has a hole: a bracket, and a square at the bracket's centroid, in its opening."""
+def test_crescent_around_site_has_own_device():
+    """A bracket, and a square at the bracket's centroid, in its opening; neither has a hole."""
     bracket = shapely.box(0.0, 0.0, 6.0, 6.0).difference(shapely.box(1.0, 1.0, 7.0, 5.0))
     x, y = bracket.centroid.coords[0]
     assert not bracket.contains(bracket.centroid)
@@ -122,8 +122,8 @@ def test_crescent_around_a_site_has_its_own_device():
 
 
 @pytest.mark.parametrize("n_sectors", [3, 4, 5, 8])
-def test_arcs_keep_device_of_centroid(n_sectors):
-    """Thin arcs do not contain their centroids; squares there do, and have the same numbers."""
+def test_arcs_are_identified_by_centroid(n_sectors):
+    """Thin arcs do not contain their centroids; squares at these centroids have the same numbers."""
     arcs = fs.layout.log_polar(n_sectors=n_sectors, n_rings=60, r_min_um=5.0, r_max_um=60.0, chords_per_arc=8)
     squares = fs.Layout.from_rectangles(arcs.centroid_um, 0.1)
     contained = shapely.contains_xy(arcs.polygons(), *arcs.centroid_um.T)
@@ -132,7 +132,7 @@ def test_arcs_keep_device_of_centroid(n_sectors):
     assert np.array_equal(Device(seed=3, layout=arcs).normals("prnu"), Device(seed=3, layout=squares).normals("prnu"))
 
 
-def test_arc_around_a_site_has_its_own_device():
+def test_arc_around_site_has_own_device():
     arc = fs.layout.log_polar(n_sectors=3, n_rings=60, r_min_um=5.0, r_max_um=60.0, chords_per_arc=8)[[170]]
     x, y = arc.centroid_um[0]
     pair = fs.Layout.from_polygons([arc.polygons()[0], shapely.box(x - 0.5, y - 0.5, x + 0.5, y + 0.5)])
@@ -141,9 +141,9 @@ def test_arc_around_a_site_has_its_own_device():
     assert np.unique(Device(seed=3, layout=pair).normals("prnu")).size == 2
 
 
-def test_ring_device_ignores_order_of_vertices():
+def test_ring_device_is_invariant_to_vertex_order():
     rings = concentric_rings()
-    turned = fs.Layout.from_polygons(
+    reordered = fs.Layout.from_polygons(
         [
             shapely.Polygon(
                 np.roll(ring.exterior.coords[:-1], 5, axis=0),
@@ -154,14 +154,14 @@ def test_ring_device_ignores_order_of_vertices():
     )
 
     assert np.array_equal(
-        Device(seed=3, layout=turned).normals("prnu")[1:], Device(seed=3, layout=rings).normals("prnu")[1:]
+        Device(seed=3, layout=reordered).normals("prnu")[1:], Device(seed=3, layout=rings).normals("prnu")[1:]
     )
 
 
 def test_equal_polygons_share_one_device():
-    twice = fs.Layout.from_polygons([concentric_rings().polygons()[2]] * 2)
+    duplicates = fs.Layout.from_polygons([concentric_rings().polygons()[2]] * 2)
 
-    assert np.ptp(Device(seed=3, layout=twice).normals("prnu")) == 0.0
+    assert np.ptp(Device(seed=3, layout=duplicates).normals("prnu")) == 0.0
 
 
 def test_devices_effects_and_sites_are_independent():
@@ -178,24 +178,24 @@ def test_devices_effects_and_sites_are_independent():
 # -- before the draw --------------------------------------------------------------------------------------------------
 
 
-def test_photo_response_differs_by_its_share_and_dark_charge_does_not():
-    light, dark = expected(1000.0, prnu_fraction=0.02), expected(0.0, prnu_fraction=0.02, dark_e_per_s=1000.0)
+def test_prnu_affects_only_photoelectrons():
+    photo_e, dark_e = expected(1000.0, prnu_fraction=0.02), expected(0.0, prnu_fraction=0.02, dark_e_per_s=1000.0)
 
-    assert_spread(light, 20.0)
-    assert light.mean() == pytest.approx(1000.0, abs=SIGMAS * 20.0 / math.sqrt(N))
-    assert np.ptp(dark) == 0.0
+    assert_spread(photo_e, 20.0)
+    assert photo_e.mean() == pytest.approx(1000.0, abs=SIGMAS * 20.0 / math.sqrt(N))
+    assert np.ptp(dark_e) == 0.0
 
 
-def test_dark_signal_differs_by_its_share_and_light_does_not():
-    dark, light = expected(0.0, 2.0, dsnu_fraction=0.1, dark_e_per_s=300.0), expected(500.0, dsnu_fraction=0.1)
+def test_dsnu_affects_only_dark_signal():
+    dark_e, photo_e = expected(0.0, 2.0, dsnu_fraction=0.1, dark_e_per_s=300.0), expected(500.0, dsnu_fraction=0.1)
 
-    assert_spread(dark, 60.0)
-    assert np.ptp(light) == 0.0
+    assert_spread(dark_e, 60.0)
+    assert np.ptp(photo_e) == 0.0
 
 
 @pytest.mark.parametrize("fraction", [0.1, 0.5, 1.0, 2.0])
-def test_dark_signal_has_stated_mean_and_spread(fraction):
-    """Fourth moment of the log-normal distribution: kurtosis w^4 + 2 w^3 + 3 w^2 - 3, w = 1 + fraction^2."""
+def test_dark_signal_has_stated_log_normal_moments(fraction):
+    """Kurtosis of the log-normal distribution: w^4 + 2 w^3 + 3 w^2 - 3, w = 1 + fraction^2."""
     dark = expected(0.0, dsnu_fraction=fraction, dark_e_per_s=300.0)
 
     w = 1.0 + fraction**2
@@ -212,7 +212,7 @@ def test_dark_current_doubles_every_eight_kelvin(temperature_k, factor):
     assert expected(100.0, temperature_k=temperature_k)[0] == 100.0
 
 
-def test_hot_sites_are_as_many_as_said_and_so_hot():
+def test_hot_sites_have_stated_fraction_and_current():
     dark = expected(hot_fraction=0.01, hot_e_per_s=5000.0, dark_e_per_s=10.0)
 
     is_hot = dark > 100.0
@@ -220,14 +220,14 @@ def test_hot_sites_are_as_many_as_said_and_so_hot():
     assert is_hot.sum() == pytest.approx(0.01 * N, abs=SIGMAS * math.sqrt(0.01 * N))
 
 
-def test_dead_sites_collect_no_light_but_dark_charge():
+def test_dead_sites_collect_only_dark_signal():
     charge = expected(1000.0, dead_fraction=0.02, dark_e_per_s=10.0)
 
     assert np.unique(charge).tolist() == [10.0, 1010.0]
     assert (charge == 10.0).sum() == pytest.approx(0.02 * N, abs=SIGMAS * math.sqrt(0.02 * N))
 
 
-def test_fixed_patterns_stay_from_frame_to_frame_and_differ_between_devices():
+def test_fixed_patterns_depend_only_on_device():
     one, same, other = (sensor(prnu_fraction=0.05, device_seed=s).response for s in (1, 1, 2))
 
     assert np.array_equal(one, same)
@@ -238,7 +238,7 @@ def test_fixed_patterns_stay_from_frame_to_frame_and_differ_between_devices():
 
 
 @pytest.mark.parametrize("mean_e", [0.3, 4.0, 60.0, 99.9])
-def test_few_electrons_follow_poissons_law_whatever_the_neighbours_get(mean_e):
+def test_small_charges_are_poisson_independent_of_neighbours(mean_e):
     noisy = sensor(shot_noise="auto")
     expected_e = np.full(N, mean_e)
     expected_e[::2] = np.random.default_rng(0).uniform(0.0, 1e4, N // 2)
@@ -247,15 +247,15 @@ def test_few_electrons_follow_poissons_law_whatever_the_neighbours_get(mean_e):
     among = noisy.collect(expected_e, streams=Streams(4))
 
     assert np.array_equal(alone[1::2], among[1::2])
-    law = scipy.stats.poisson(mean_e)
-    low, high = int(law.ppf(1e-3)), int(law.ppf(1 - 1e-3))
+    distribution = scipy.stats.poisson(mean_e)
+    low, high = int(distribution.ppf(1e-3)), int(distribution.ppf(1 - 1e-3))
     edges = np.concatenate(([-np.inf], np.arange(low, high + 1) + 0.5, [np.inf]))
     counts = np.histogram(alone, edges)[0]
-    chances = np.diff(np.concatenate(([0.0], law.cdf(np.arange(low, high + 1)), [1.0])))
-    assert scipy.stats.chisquare(counts, chances * N).pvalue > 1e-6
+    probability = np.diff(np.concatenate(([0.0], distribution.cdf(np.arange(low, high + 1)), [1.0])))
+    assert scipy.stats.chisquare(counts, probability * N).pvalue > 1e-6
 
 
-def test_draws_and_codes_do_not_depend_on_the_number_of_threads():
+def test_draws_are_independent_of_thread_count():
     noisy = sensor(shot_noise="auto", read_noise_e=3.0, ktc_noise=True, dnl_dn=0.5, rts_fraction=0.1, rts_e=20.0)
     expected_e = np.random.default_rng(0).uniform(0.0, 300.0, N)
     exact = sensor(shot_noise="exact")
@@ -272,15 +272,15 @@ def reset_noise_e(some):
     return noise_budget(some, np.zeros(N), 0.0)["reset"]
 
 
-# -- noise of reading --------------------------------------------------------------------------------------------------
+# -- readout noise -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("capacitance_f", "noise_e"), [(1e-15, 12.70), (1e-13, 127.0), (4.8e-13, 278.3)])
-def test_reset_noise_has_its_published_sizes_at_300_kelvin(capacitance_f, noise_e):
+def test_reset_noise_matches_published_values(capacitance_f, noise_e):
     assert reset_noise_e(sensor(ktc_noise=True, capacitance_f=capacitance_f))[0] == pytest.approx(noise_e, rel=5e-4)
 
 
-def test_reset_noise_is_in_the_codes_and_double_sampling_takes_it_off():
+def test_cds_removes_reset_noise():
     size_e = reset_noise_e(sensor(ktc_noise=True))[0]
 
     assert_spread(codes(ktc_noise=True), size_e, 1 / 12)
@@ -288,7 +288,7 @@ def test_reset_noise_is_in_the_codes_and_double_sampling_takes_it_off():
     assert reset_noise_e(sensor(ktc_noise=True, temperature_k=75.0))[0] == pytest.approx(size_e / 2)
 
 
-def test_reset_noise_is_of_each_sites_own_capacitance():
+def test_reset_noise_scales_with_site_capacitance():
     two = np.where(np.arange(N) % 2, FINE["capacitance_f"], 4.0 * FINE["capacitance_f"])
 
     noise = reset_noise_e(sensor(ktc_noise=True, capacitance_f=two))
@@ -296,13 +296,13 @@ def test_reset_noise_is_of_each_sites_own_capacitance():
     assert noise[0] == pytest.approx(2.0 * noise[1])
 
 
-def test_noises_of_resetting_and_reading_add_in_squares():
+def test_reset_and_read_noise_add_in_quadrature():
     size_e = reset_noise_e(sensor(ktc_noise=True))[0]
 
     assert_spread(codes(ktc_noise=True, read_noise_e=40.0), math.hypot(size_e, 40.0), 1 / 12)
 
 
-def test_telegraph_sites_jump_between_two_states_from_frame_to_frame():
+def test_rts_sites_alternate_between_two_states():
     frames = np.stack([codes(rts_fraction=0.1, rts_e=40.0, frame=k) for k in range(30)])
     moves = np.ptp(frames, axis=0)
 
@@ -311,7 +311,7 @@ def test_telegraph_sites_jump_between_two_states_from_frame_to_frame():
     assert frames[:, moves > 0].mean() == pytest.approx(30_000.0, abs=0.1)
 
 
-def test_noise_of_reading_comes_after_the_full_well():
+def test_read_noise_acts_after_full_well():
     full = sensor(full_well_e=7000.0, read_noise_e=50.0, ktc_noise=False)
     charge = full.collect(np.full(N, 9000.0), streams=Streams(0))
 
@@ -323,12 +323,12 @@ def test_noise_of_reading_comes_after_the_full_well():
 
 
 @pytest.mark.parametrize(("charge_e", "spread_dn"), [(30_000, 300.0), (15_000, 150.0)])
-def test_gains_differ_by_their_share_of_the_signal(charge_e, spread_dn):
+def test_gain_fpn_is_proportional_to_signal(charge_e, spread_dn):
     assert_spread(codes(charge_e, gain_fpn_fraction=0.01), spread_dn, 1 / 12)
 
 
 @pytest.mark.parametrize("charge_e", [20_000, 40_000])
-def test_pixels_have_offsets_of_their_share_of_the_range_at_any_signal(charge_e):
+def test_pixel_fpn_is_independent_of_signal(charge_e):
     got = codes(charge_e, pixel_fpn_fraction=0.02)
 
     assert_spread(got, 0.02 * 65_536, 1 / 12)
@@ -336,25 +336,25 @@ def test_pixels_have_offsets_of_their_share_of_the_range_at_any_signal(charge_e)
     assert np.ptp(codes(charge_e, pixel_fpn_fraction=0.02, cds=True)) == 0.0
 
 
-def test_lines_have_offsets_that_all_their_sites_share():
+def test_column_fpn_is_common_to_line():
     picture = codes(line_fpn_fraction=0.02).reshape(N_Y, N_X)
 
     assert np.all(picture == picture[0])
     assert picture[0].std() == pytest.approx(0.02 * 65_536, rel=SIGMAS / math.sqrt(2 * N_X))
 
 
-def test_offsets_come_before_the_clip_and_gains_do_not_touch_them():
+def test_offsets_are_clipped_and_independent_of_gain():
     dark = codes(0, pixel_fpn_fraction=0.02, gain_fpn_fraction=0.3)
 
-    # Half the offsets are negative and end at 0.
+    # Half of the offsets are negative and clipped at 0.
     assert (dark == 0.0).mean() == pytest.approx(0.5, abs=SIGMAS / math.sqrt(N))
     assert np.array_equal(dark, codes(0, pixel_fpn_fraction=0.02))
     assert codes(65_000, pixel_fpn_fraction=0.02).max() == 65_535
-    # Half as much again as the range: no offset brings that below its end.
+    # 1.5 times the range: no offset moves this signal below saturation.
     assert codes(98_000, pixel_fpn_fraction=0.02).min() == 65_535
 
 
-def test_a_pedestal_lifts_darkness_and_keeps_its_noise_whole():
+def test_pedestal_prevents_clipping_of_dark_noise():
     dark = codes(0, pedestal_v=0.3, read_noise_e=100.0)
 
     assert dark.mean() == pytest.approx(0.1 * 65_536 - 0.5, abs=SIGMAS * 100.0 / math.sqrt(N))
@@ -363,10 +363,10 @@ def test_a_pedestal_lifts_darkness_and_keeps_its_noise_whole():
     assert codes(0, pedestal_v=0.3, cds=True)[0] == codes(0, pedestal_v=0.3)[0] == 6553
 
 
-def test_a_response_that_bends_lacks_its_share_at_full_range():
-    for share in (0.25, 0.5, 1.0):
-        charge = round(share * 65_536)
-        assert codes(charge, nonlinearity_fraction=0.04)[0] == pytest.approx(charge * (1 - 0.04 * share), abs=1.0)
+def test_nonlinearity_loss_grows_with_signal():
+    for fraction in (0.25, 0.5, 1.0):
+        charge = round(fraction * 65_536)
+        assert codes(charge, nonlinearity_fraction=0.04)[0] == pytest.approx(charge * (1 - 0.04 * fraction), abs=1.0)
 
 
 # -- codes ------------------------------------------------------------------------------------------------------------------
@@ -374,7 +374,7 @@ def test_a_response_that_bends_lacks_its_share_at_full_range():
 
 @pytest.mark.parametrize("bits", [4, 8, 12])
 @pytest.mark.parametrize(
-    ("companding", "share_of_codes"),
+    ("companding", "code_fraction"),
     [
         ({"companding": "linear"}, lambda x: x),
         ({"companding": "root"}, np.sqrt),
@@ -385,49 +385,49 @@ def test_a_response_that_bends_lacks_its_share_at_full_range():
         ),
     ],
 )
-def test_a_companding_converter_has_its_curve_and_both_its_ends(bits, companding, share_of_codes):
+def test_companding_adc_follows_transfer_function(bits, companding, code_fraction):
     charge = np.linspace(0, 65_536, N).astype(np.int64)
     got = codes(charge, **{**companding, "bits": bits})
 
     assert got.min() == 0
     assert got.max() == 2**bits - 1
     assert np.all(np.diff(got) >= 0)
-    exact = share_of_codes(charge / 65_536) * 2**bits
-    is_sure = np.abs(exact - np.rint(exact)) > 1e-4  # a hair from the border of a code either may be
-    assert np.array_equal(got[is_sure], np.minimum(np.floor(exact[is_sure]), 2**bits - 1))
+    exact = code_fraction(charge / 65_536) * 2**bits
+    is_unambiguous = np.abs(exact - np.rint(exact)) > 1e-4  # near a transition rounding decides
+    assert np.array_equal(got[is_unambiguous], np.minimum(np.floor(exact[is_unambiguous]), 2**bits - 1))
 
 
-def test_integral_nonlinearity_is_added_where_its_table_says():
+def test_inl_matches_table():
     charge = np.linspace(0, 65_535, N).astype(np.int64)
     moved = codes(charge, inl_dn=[0.0, 30.0, 0.0]) - codes(charge)
 
-    middle = np.abs(charge - 32_768) < 100
-    assert np.abs(moved[middle] - 30.0).max() <= 1.0
+    is_central = np.abs(charge - 32_768) < 100
+    assert np.abs(moved[is_central] - 30.0).max() <= 1.0
     assert np.abs(moved - 30.0 * (1 - np.abs(charge / 32_768 - 1))).max() <= 1.0
 
 
-def test_differential_nonlinearity_is_one_number_a_line_and_code():
-    """Half a code in the middle of code 7 of 16: the number added moves it where it is beyond half a code."""
+def test_dnl_is_independent_per_line_and_code():
+    """Signal at the centre of code 7 of 16: DNL beyond half a code changes the code."""
     charge = np.full(N, round(65_536 / 16 * 7.5), np.int64)
     picture = codes(charge, bits=4, dnl_dn=0.5).reshape(N_Y, N_X)
 
     assert np.all(picture == picture[0])
     moved = picture[0] - 7.0
-    law = scipy.stats.norm(scale=0.5)
+    dnl = scipy.stats.norm(scale=0.5)
     for step in (-1, 0, 1):
-        chance = law.cdf(step + 0.5) - law.cdf(step - 0.5)
-        assert (moved == step).mean() == pytest.approx(chance, abs=SIGMAS * math.sqrt(chance * (1 - chance) / N_X))
+        p = dnl.cdf(step + 0.5) - dnl.cdf(step - 0.5)
+        assert (moved == step).mean() == pytest.approx(p, abs=SIGMAS * math.sqrt(p * (1 - p) / N_X))
     other_code = codes(np.full(N, round(65_536 / 16 * 8.5)), bits=4, dnl_dn=0.5).reshape(N_Y, N_X)[0] - 8.0
     assert abs(np.corrcoef(moved, other_code)[0, 1]) < SIGMAS / math.sqrt(N_X)
 
 
-def test_differential_nonlinearity_has_its_size_between_the_codes():
-    """Over a ramp within one code the fraction of the next code shows each line's number."""
+def test_dnl_has_stated_standard_deviation():
+    """On a ramp within one code, the fraction of the next code measures the DNL of each line."""
     steps = np.arange(N_Y) / N_Y
     charge = np.round(65_536 / 16 * (7.0 + steps)).astype(np.int64).repeat(N_X)
     picture = codes(charge, bits=4, dnl_dn=0.2).reshape(N_Y, N_X)
 
-    added = picture.mean(axis=0) - 7.0  # about the number, where it is between -1 and 1
+    added = picture.mean(axis=0) - 7.0  # DNL plus a constant, for DNL between -1 and 1
     assert added.std() == pytest.approx(0.2, rel=SIGMAS / math.sqrt(2 * N_X))
 
 
@@ -451,7 +451,7 @@ ALL = {
     "dnl_dn": 0.5,
     "shot_noise": "auto",
 }
-#: Effects, what switches each off, and what it must not change.
+#: Keyword of each effect, and the value that disables it.
 SWITCHES = {
     "prnu_fraction": 0.0,
     "dark_e_per_s": 0.0,
@@ -468,13 +468,13 @@ SWITCHES = {
     "line_fpn_fraction": 0.0,
     "dnl_dn": 0.0,
 }
-BEFORE_THE_DRAW = ("prnu_fraction", "dark_e_per_s", "dsnu_fraction", "hot_fraction", "dead_fraction")
+BEFORE_COLLECTION = ("prnu_fraction", "dark_e_per_s", "dsnu_fraction", "hot_fraction", "dead_fraction")
 PATTERNS = {
     "response": lambda s: s.response,
     "dark_rate_e_per_s": lambda s: s.dark_rate_e_per_s,
     **{name: lambda s, name=name: s.pattern(name) for name in ("gain_fpn", "pixel_fpn", "column_fpn", "rts")},
 }
-OF_PATTERN = {
+PATTERN_OF_KEYWORD = {
     "prnu_fraction": "response",
     "dead_fraction": "response",
     "dark_e_per_s": "dark_rate_e_per_s",
@@ -488,26 +488,26 @@ OF_PATTERN = {
 
 
 @pytest.mark.parametrize("effect", SWITCHES)
-def test_an_effect_switched_off_changes_something_and_leaves_all_other_draws(effect):
+def test_disabled_effect_leaves_other_draws_unchanged(effect):
     on, off = sensor(**ALL), sensor(**{**ALL, effect: SWITCHES[effect]})
     streams = Streams(3, 2)
-    light_e = np.linspace(0.0, 50_000.0, N)
+    photo_e = np.linspace(0.0, 50_000.0, N)
 
-    charges = [s.collect(s.expected_electrons(light_e, 1.0), streams=streams) for s in (on, off)]
+    charges = [s.collect(s.expected_electrons(photo_e, 1.0), streams=streams) for s in (on, off)]
     read = [s.read(charge, streams=streams) for s, charge in zip((on, off), charges, strict=True)]
 
     assert not np.array_equal(*read)
     for pattern, of in PATTERNS.items():
-        if OF_PATTERN.get(effect) != pattern:
+        if PATTERN_OF_KEYWORD.get(effect) != pattern:
             assert np.array_equal(of(on), of(off))
-    if effect in BEFORE_THE_DRAW or effect in {"shot_noise", "full_well_e"}:
-        # From the same charge on, the same codes.
+    if effect in BEFORE_COLLECTION or effect in {"shot_noise", "full_well_e"}:
+        # Equal charges give equal codes.
         assert np.array_equal(on.read(charges[0], streams=streams), off.read(charges[0], streams=streams))
     else:
         assert np.array_equal(*charges)
 
 
-def test_sites_without_an_effect_of_their_own_draw_as_before():
+def test_rts_changes_only_rts_sites():
     on, off = sensor(**ALL), sensor(**{**ALL, "rts_fraction": 0.0})
     charge = np.full(N, 20_000, np.int64)
     moved = on.read(charge, streams=Streams(0)) != off.read(charge, streams=Streams(0))
@@ -516,27 +516,27 @@ def test_sites_without_an_effect_of_their_own_draw_as_before():
 
 
 @pytest.mark.parametrize("effect", ["prnu_fraction", "dsnu_fraction", "gain_fpn_fraction", "pixel_fpn_fraction", "dnl_dn", "line_fpn_fraction", "dead_fraction", "hot_fraction", "rts_fraction"])  # fmt: skip
-def test_a_crop_of_a_sensor_reads_the_same_codes_as_the_whole(effect):
-    """Without temporal noise, whose numbers are those of places in the list of sites."""
+def test_cropped_sensor_gives_identical_codes(effect):
+    """Temporal noise is disabled because its draws depend on the site index."""
     quiet = {**ALL, "shot_noise": "off", "ktc_noise": False, "read_noise_e": 0.0, "rts_e": 0.0, effect: ALL[effect]}
     ids = np.random.default_rng(1).permutation(N)[:5000]
     crop = Sensor(MANY[ids], **{**FINE, **quiet})
-    light_e = np.linspace(100.0, 30_000.0, N)
+    photo_e = np.linspace(100.0, 30_000.0, N)
 
-    whole = sensor(**quiet)
+    complete = sensor(**quiet)
     codes = [
-        s.read(s.collect(s.expected_electrons(light, 1.0), streams=Streams(0)), streams=Streams(0))
-        for s, light in ((whole, light_e), (crop, light_e[ids]))
+        s.read(s.collect(s.expected_electrons(photo_e_per_s, 1.0), streams=Streams(0)), streams=Streams(0))
+        for s, photo_e_per_s in ((complete, photo_e), (crop, photo_e[ids]))
     ]
 
     assert np.array_equal(codes[1], codes[0][ids])
     if effect != "rts_fraction":
         return
-    crop, whole = (Sensor(layout, **{**FINE, **quiet, "rts_e": 9.0}).pattern("rts") for layout in (MANY[ids], MANY))
-    assert np.array_equal(crop, whole[ids])
+    crop, complete = (Sensor(layout, **{**FINE, **quiet, "rts_e": 9.0}).pattern("rts") for layout in (MANY[ids], MANY))
+    assert np.array_equal(crop, complete[ids])
 
 
-def test_another_process_and_another_order_of_frames_draw_the_same_codes():
+def test_codes_are_independent_of_process_and_order():
     program = """
 import hashlib, sys
 import numpy as np
@@ -544,10 +544,10 @@ import foveasim as fs
 from foveasim._core.random_streams import Streams
 layout = fs.layout.grid(n_x=400, n_y=300, pitch_um=2.0)
 sensor = fs.Sensor(layout, prnu_fraction=0.02, read_noise_e=3.0, ktc_noise=True, dnl_dn=0.5, rts_fraction=0.1, rts_e=9.0, bits=12)
-light = np.linspace(0.0, 500.0, layout.n_sites)
+photo_e = np.linspace(0.0, 500.0, layout.n_sites)
 for frame in map(int, sys.argv[2:]):
     streams = Streams(9, frame)
-    charge = sensor.collect(sensor.expected_electrons(light, 1.0), streams=streams, n_threads=int(sys.argv[1]))
+    charge = sensor.collect(sensor.expected_electrons(photo_e, 1.0), streams=streams, n_threads=int(sys.argv[1]))
     code = sensor.read(charge, streams=streams, n_threads=int(sys.argv[1]))
     print(frame, hashlib.sha256(code.tobytes()).hexdigest())
 """
@@ -560,7 +560,7 @@ for frame in map(int, sys.argv[2:]):
     assert sorted(runs[0].splitlines()) == sorted(runs[1].splitlines())
 
 
-def test_half_the_sensitivity_is_half_the_light_and_all_of_the_dark_charge():
+def test_sensitivity_affects_only_photoelectrons():
     halves = np.where(np.arange(N) % 2, 0.5, 1.0)
     charge = expected(1000.0, sensitivity=halves, dark_e_per_s=10.0)
 
@@ -617,12 +617,12 @@ def test_half_the_sensitivity_is_half_the_light_and_all_of_the_dark_charge():
         ("capacitance_f", 1.0, "'capacitance_f' must be from 1e-18 to 1e-06, got 1.0 F; capacitances are in farad"),
     ],
 )
-def test_what_cannot_be_is_refused_by_its_name(name, value, message):
+def test_invalid_chain_parameters_are_rejected(name, value, message):
     with pytest.raises(ParameterError, match=f"^{message}"):
         sensor(**{name: value})
 
 
-def test_implausible_heat_is_rejected():
+def test_implausible_dark_current_is_rejected():
     with pytest.raises(ParameterError, match=r"'dark_e_per_s' must be <= 1e\+15 at temperature_k = 900 K, got .* e-/s"):
         sensor(dark_e_per_s=1.0, temperature_k=900.0, dark_reference_k=300.0, dark_doubling_k=5.0)
 
@@ -636,7 +636,7 @@ def test_implausible_exposure_is_rejected(exposure_s):
 
 
 @pytest.mark.parametrize("table", [[0.0, 0.6, 0.5, 1.0], [0.1, 1.0], [0.0, 0.9], [1.0]])
-def test_a_companding_table_that_falls_or_does_not_reach_its_ends_is_refused(table):
+def test_invalid_companding_table_is_rejected(table):
     with pytest.raises(
         ParameterError, match="'companding_table' must have at least two non-decreasing values from 0 to 1"
     ):
@@ -644,7 +644,7 @@ def test_a_companding_table_that_falls_or_does_not_reach_its_ends_is_refused(tab
 
 
 @pytest.mark.parametrize("parameters", [{"dnl_dn": 0.5}, {"line_fpn_fraction": 0.02}])
-def test_lines_that_differ_need_a_layout_that_says_which_is_which(parameters):
+def test_line_effects_require_readout_line_column(parameters):
     with pytest.raises(SimulationError, match="the layout has no column 'readout_line'"):
         Sensor(fs.Layout.from_rectangles([[0.0, 0.0], [3.0, 0.0]], 2.0), **parameters)
 
@@ -657,7 +657,7 @@ def test_lines_that_differ_need_a_layout_that_says_which_is_which(parameters):
         (np.full(N, np.nan), "must be >= 0 everywhere, got nan e-"),
     ],
 )
-def test_charges_that_are_not_those_of_the_sites_are_refused(charge_e, message):
+def test_invalid_charges_are_rejected(charge_e, message):
     one = sensor(read_noise_e=1.0)
 
     for step in (lambda: one.collect(charge_e, streams=Streams(0)), lambda: one.predict(charge_e)):

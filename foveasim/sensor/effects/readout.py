@@ -32,7 +32,7 @@ class ResetNoise(AdditiveNoise):
 
     @classmethod
     def from_sensor(cls, sensor: Any) -> Self | None:
-        """Return the effect that a sensor's keywords specify, or None, as with CDS."""
+        """Return the effect that a sensor's keywords specify, or None; CDS removes it."""
         return cls(sensor.temperature_k) if sensor.ktc_noise and not sensor.cds else None
 
     def deviation(self, sites: Sites) -> Floats:
