@@ -260,8 +260,8 @@ class Sensor:
         Raises
         ------
         ParameterError
-            If a parameter with a non-zero default is missing, per-site arrays were too long to be stored, or an effect is not
-            registered.
+            If a parameter whose default is not 0 or None is missing, per-site arrays were too long to be stored, or an effect
+            is not registered.
         """
         kinds: tuple[Any, ...] = (Diffusion, KernelCrosstalk, InterPixelCapacitance, *EFFECTS.values())
         classes = {kind.__name__: kind for kind in kinds}
