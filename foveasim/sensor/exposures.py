@@ -77,7 +77,7 @@ class Ramp:
         _protect(self)
 
 
-# -- several exposures ------------------------------------------------------------------------------------------------
+# -- HDR merge --------------------------------------------------------------------------------------------------------
 
 
 def merge_exposures(
@@ -115,7 +115,7 @@ def merge_exposures(
 
     ::
 
-        v_j = r t_j + dark charge + read² + reset² + rts² / 4 + step² (1/12 + dnl²)
+        v_j = r t_j + dark signal + read² + reset² + rts² / 4 + step² (1/12 + dnl²)
 
     with ``rts`` on the device's RTS sites and ``step`` the width of the code. The rate is
 
@@ -354,7 +354,7 @@ def fit_ramp(
     )
 
 
-# -- parts ------------------------------------------------------------------------------------------------------------
+# -- helpers ----------------------------------------------------------------------------------------------------------
 
 
 def _protect(carrier: Any) -> None:

@@ -219,7 +219,7 @@ class Sensor:
         for name, kinds in (("crosstalk", (Diffusion, KernelCrosstalk)), ("coupling", (InterPixelCapacitance,))):
             part = getattr(self, name)
             if part is not None and not isinstance(part, kinds):
-                raise ParameterError(name, f"must be a {' or a '.join(k.__name__ for k in kinds)}", part)
+                raise ParameterError(name, f"must be of type {' or '.join(k.__name__ for k in kinds)}", part)
         object.__setattr__(self, "effects", check_effects(self.effects))
         object.__setattr__(self, "disabled", check_names(self.disabled, self.effects))
         _ = self._filters_and_qe
@@ -294,7 +294,7 @@ class Sensor:
             )
         return read_only(array.copy())
 
-    # -- colour -------------------------------------------------------------------------------------------------
+    # -- filters and quantum efficiency -------------------------------------------------------------------------
 
     @property
     def _filter_set(self) -> FilterSet:
@@ -506,7 +506,7 @@ class Sensor:
             return read_only(np.full(1, np.inf))
         return read_only(np.floor(np.atleast_1d(np.asarray(self.full_well_e, np.float64))))
 
-    # -- charge and code ------------------------------------------------------------------------------------------
+    # -- charges and codes ----------------------------------------------------------------------------------------
 
     @cached_property
     def _before_exposure(self) -> tuple[Step, ...]:

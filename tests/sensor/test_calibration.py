@@ -202,7 +202,7 @@ def test_ideal_sensor_has_no_defects():
     assert calibration.gain.mean() == pytest.approx(1.0, abs=1e-12)
 
 
-# -- sites that differ by design --------------------------------------------------------------------------------------
+# -- sites of different design ----------------------------------------------------------------------------------------
 
 
 def test_expected_size_differences_leave_gain_unchanged():
@@ -351,7 +351,7 @@ def test_inputs_unchanged_and_results_read_only():
     assert all(not getattr(calibration, name).flags.writeable for name in ("offset_dn", "gain", "hot", "expected_dn"))
 
 
-# -- bad input --------------------------------------------------------------------------------------------------------
+# -- invalid input ----------------------------------------------------------------------------------------------------
 
 DARK, FLAT = np.full((2, 25), 10.0), np.full((1, 25), 110.0)
 

@@ -529,7 +529,7 @@ def test_common_capacitance_does_not_change_coupling():
     assert (coupling.compile(HEXAGONS, capacitance_f=1e-13).matrix != coupling.compile(HEXAGONS).matrix).nnz == 0
 
 
-# -- bad input --------------------------------------------------------------------------------------------------------
+# -- invalid input ----------------------------------------------------------------------------------------------------
 
 BAD = [-0.1, math.nan, math.inf, "much", None]
 

@@ -48,7 +48,7 @@ def simulate_exposures(rate_e_per_s, exposures_s, seed, n_sites=N, full_well_e=m
     return np.array(codes)
 
 
-# -- several exposures ------------------------------------------------------------------------------------------------
+# -- HDR merge --------------------------------------------------------------------------------------------------------
 
 
 def test_merge_without_noise_recovers_rate_exactly():
@@ -397,7 +397,7 @@ def test_ramp_fits_predict_rts_noise(rts_fraction):
     assert_drawn_as_predicted(fit_ramp(ramp.code, times, sensor, weight_rate_e_per_s=RTS_RATE_E_PER_S))
 
 
-# -- bad input --------------------------------------------------------------------------------------------------------
+# -- invalid input ----------------------------------------------------------------------------------------------------
 
 FEW = Sensor(ROW[:3], **SENSOR)
 CODE = np.full((2, 3), 100)

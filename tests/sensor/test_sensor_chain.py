@@ -175,7 +175,7 @@ def test_devices_effects_and_sites_are_independent():
     assert scipy.stats.kstest(patterns[0], "norm").pvalue > 1e-6
 
 
-# -- before the draw --------------------------------------------------------------------------------------------------
+# -- before collection ------------------------------------------------------------------------------------------------
 
 
 def test_prnu_affects_only_photoelectrons():
@@ -234,7 +234,7 @@ def test_fixed_patterns_depend_only_on_device():
     assert abs(np.corrcoef(one, other)[0, 1]) < SIGMAS / math.sqrt(N)
 
 
-# -- the draw -----------------------------------------------------------------------------------------------------------
+# -- shot noise ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mean_e", [0.3, 4.0, 60.0, 99.9])
@@ -319,7 +319,7 @@ def test_read_noise_acts_after_full_well():
     assert_spread(full.read(charge, streams=Streams(0)).astype(float), 50.0, 1 / 12)
 
 
-# -- volts ----------------------------------------------------------------------------------------------------------------
+# -- conversion to volts --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("charge_e", "spread_dn"), [(30_000, 300.0), (15_000, 150.0)])
@@ -569,7 +569,7 @@ def test_sensitivity_affects_only_photoelectrons():
         sensor(sensitivity=2.0)
 
 
-# -- limits -------------------------------------------------------------------------------------------------------------
+# -- invalid input ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

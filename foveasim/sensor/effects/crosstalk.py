@@ -597,7 +597,7 @@ class InterPixelCapacitance(_Crosstalk):
         return CrosstalkOperator(_with_rest(matrix, loss, 1))
 
 
-# -- parts ------------------------------------------------------------------------------------------------------------
+# -- helpers ----------------------------------------------------------------------------------------------------------
 
 _OTHER_WAY = "use Diffusion, which supports sites of any shape"
 
