@@ -1,4 +1,4 @@
-"""From codes per site back to a raster picture."""
+"""Reconstruction of raster pictures from photosite values."""
 
 from __future__ import annotations
 

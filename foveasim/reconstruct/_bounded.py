@@ -1,10 +1,10 @@
 """
-Least squares under x >= 0, by conjugate gradients that know the bound.
+Quadratic minimisation under x >= 0 by preconditioned conjugate gradients.
 
 MPRGP, modified proportioning with reduced gradient projections, preconditioned in the face (Dostál 2009, Optimal Quadratic
-Programming Algorithms, sections 5.7 and 5.10): conjugate gradients among the unknowns that are above 0, a projected step of
-fixed length where one would fall below, and a step that frees unknowns at 0 when their part of the gradient prevails. It
-converges to the one minimum from anywhere.
+Programming Algorithms, sections 5.7 and 5.10): conjugate gradient steps among the unknowns above 0, a projected step of fixed
+length when an unknown would become negative, and a step that frees unknowns at 0 when their part of the gradient dominates. It
+converges to the unique minimum from any starting point.
 """
 
 from __future__ import annotations
@@ -33,33 +33,33 @@ def least_nonnegative(
     max_steps: int,
 ) -> tuple[Floats, int]:
     """
-    The x >= 0 that minimises ``x·A x / 2 - b·x``.
+    Minimise ``x·A x / 2 - b·x`` subject to x >= 0.
 
     Parameters
     ----------
     matrix : callable
-        A, symmetric and positive semi-definite: from x to A x, (n,).
+        A, symmetric and positive semi-definite: maps x to A x, (n,).
     bound : (n,) float64
-        A diagonal matrix that is nowhere below A, so that ``x·A x <= x·D x``.
+        Diagonal of a matrix D with ``x·A x <= x·D x`` for all x.
     precondition : callable
-        About the inverse of A, symmetric and positive definite.
+        Approximate inverse of A, symmetric and positive definite.
     right, start : (n,) float64
-        b, and where to begin.
+        b, and the starting point.
     enough : float
-        The end is where the root of ``g·M g``, with the projected gradient g and the preconditioner M (of unknowns at 0,
-        the bound's inverse), is below this: about the distance from the minimum in the norm of A.
+        Convergence threshold of the root of ``g·M g``, with the projected gradient g and the preconditioner M (the inverse
+        of D for unknowns at 0): approximately the distance from the minimum in the norm of A.
     max_steps : int
 
     Returns
     -------
     x : (n,) float64
     n_steps : int
-        Times that A was applied.
+        Number of applications of A.
 
     Raises
     ------
     SimulationError
-        When the steps do not suffice.
+        When the iteration does not converge within ``max_steps``.
     """
     x = np.maximum(start, 0.0)
     gradient = matrix(x) - right
@@ -76,14 +76,14 @@ def least_nonnegative(
             return x, n_steps
         if n_steps >= max_steps:
             raise SimulationError(
-                f"the picture did not converge in {max_steps} steps; give a larger 'tolerance' or 'mu', or more 'max_steps'"
+                f"the picture did not converge in {max_steps} steps; increase 'tolerance', 'mu' or 'max_steps'"
             )
         if chopped2 > _dot(np.minimum(x, free / bound), free):
             down = chopped / bound
             image = matrix(down)
             n_steps += 1
             length = _dot(gradient, down) / _dot(down, image)
-            x = np.maximum(x - length * down, 0.0)  # grows where it was 0; the clip is for rounding
+            x = np.maximum(x - length * down, 0.0)  # unknowns at 0 increase; the clip is for rounding
             gradient -= length * image
             direction = None
             continue
@@ -91,7 +91,7 @@ def least_nonnegative(
         image = matrix(direction)
         n_steps += 1
         curvature = _dot(direction, image)
-        if curvature <= 0.0:  # A does not see this direction: only rounding is left of the gradient
+        if curvature <= 0.0:  # null space of A: the gradient is rounding error
             return x, n_steps
         length = _dot(gradient, direction) / curvature
         falls = direction > 0.0
@@ -100,7 +100,7 @@ def least_nonnegative(
             x = np.maximum(x - length * direction, 0.0)
             gradient -= length * image
             continue
-        # All that would fall below stops at 0 at once, as long as that leads down; if not, only as far as the first of them.
+        # Clip all negative unknowns to 0 if this decreases the objective; otherwise step to the first unknown at 0.
         tried = np.maximum(x - length * direction, 0.0)
         tried_gradient = matrix(tried) - right
         n_steps += 1
@@ -116,5 +116,5 @@ def least_nonnegative(
 
 
 def _dot(x: Floats, y: Floats) -> float:
-    """Scalar product, by one thread: those of a library would wait for each other longer than they work."""
+    """Return the scalar product, in one thread: synchronising BLAS threads takes longer."""
     return float(np.einsum("i,i->", x, y))

@@ -1,10 +1,10 @@
 """
-The reconstruction's numba kernels: natural neighbours, and the roughness of a picture.
+Numba kernels of reconstruction: natural neighbours and the roughness gradient.
 
-A **triangulation** is three arrays, one row a triangle: ``corners`` (its sites, counter-clockwise), ``beyond`` (the triangle
-across the edge that faces each corner, -1 where there is none) and ``circles`` (centre and squared radius of the circle through
-the corners). They know arrays only, release the interpreter lock, and are compiled for explicit types when this module is
-imported; the machine code is cached on disk.
+A **triangulation** is three arrays with one row per triangle: ``corners`` (its sites, counter-clockwise), ``beyond`` (the
+triangle across the edge opposite each corner, -1 where there is none) and ``circles`` (centre and squared radius of the
+circumcircle). The kernels take arrays only, release the interpreter lock, and are compiled for explicit types when this module
+is imported; the machine code is cached on disk.
 """
 
 from __future__ import annotations
@@ -16,16 +16,17 @@ from foveasim._core.jit import njit
 
 __all__ = ["add_roughness", "natural_neighbours"]
 
-#: Natural neighbours of a point, at most: a random point has six, and the middle of a ring of sites as many as the ring.
+#: Largest number of natural neighbours: a random point has six, and the centre of a ring of sites has the complete ring.
 MAX_TRIANGLES = 4096
-#: Nearer to an edge than this fraction of its length there is only the straight line between its ends: circles grow too large.
+#: Values are linear between the ends of a hull edge at points closer to it than this fraction of its length, where
+#: circumcircles become too large.
 THIN = 1e-5
-#: A point this near to a corner, as a fraction of its triangle's longest edge, is the corner.
+#: A point closer to a corner than this fraction of its triangle's longest edge coincides with the corner.
 AT_CORNER = 1e-10
 
 
 def _input(dtype, ndim):
-    """Type of an argument that is only read: read-only and writeable arrays, C-contiguous."""
+    """Return the type of an input array: C-contiguous, read-only or writeable."""
     return types.Array(dtype, ndim, "C", readonly=True)
 
 
@@ -52,14 +53,14 @@ def _cross(ax, ay, bx, by):
 )
 def natural_neighbours(points, start, xy, values, corners, beyond, circles, out):
     """
-    Sibson's interpolant at points that lie in known triangles.
+    Evaluate Sibson's interpolant at points in known triangles.
 
-    ``points`` (n, 2) with the triangle of each in ``start``; sites at ``xy`` (n_site, 2) with ``values`` (n_site, n_channel);
-    results go to ``out`` (n, n_channel).
+    ``points`` (n, 2) lie in the triangles ``start``; sites at ``xy`` (n_site, 2) have ``values`` (n_site, n_channel); results
+    are written to ``out`` (n, n_channel).
 
-    The triangles whose circles hold a point are those that it would replace. What its Voronoi cell takes from a site's is a
-    polygon: its corners are the centres of those triangles, and of the circles through the point and each edge of their union.
-    Its area is summed edge by edge about the point, so that the polygons need not be put in order.
+    Inserting a point replaces the triangles whose circumcircles contain it. Its Voronoi cell takes a polygon from the cell of
+    each of their sites. The polygon vertices are the circumcentres of those triangles, and the centres of the circles through
+    the point and each edge of their union. Areas are summed edge by edge about the point, so that the vertices need no sorting.
     """
     n_channels = values.shape[1]
     triangles = np.empty(MAX_TRIANGLES, np.int64)
@@ -67,7 +68,7 @@ def natural_neighbours(points, start, xy, values, corners, beyond, circles, out)
     edge_to = np.empty(MAX_TRIANGLES + 2, np.int64)
     edge_x = np.empty(MAX_TRIANGLES + 2, np.float64)
     edge_y = np.empty(MAX_TRIANGLES + 2, np.float64)
-    # What each site gives, kept for all sites and cleared where it was touched.
+    # Area taken from each site; allocated once and cleared where it was used.
     area = np.zeros(xy.shape[0], np.float64)
     is_inside = np.zeros(corners.shape[0], np.bool_)
 
@@ -75,7 +76,7 @@ def natural_neighbours(points, start, xy, values, corners, beyond, circles, out)
         px, py = points[p, 0], points[p, 1]
         home = start[p]
 
-        # Straight lines where the triangle, or the point's place in it, is too thin for circles.
+        # Linear interpolation where the triangle, or the point's distance from the hull, is too small for circumcircles.
         longest2 = 0.0
         for k in range(3):
             a, b = corners[home, k], corners[home, (k + 1) % 3]
@@ -123,13 +124,13 @@ def natural_neighbours(points, start, xy, values, corners, beyond, circles, out)
                     a, b = corners[t, (k + 1) % 3], corners[t, (k + 2) % 3]
                     other = beyond[t, k]
                     if other >= 0 and is_inside[other]:
-                        # The old border of a and b, from the centre beyond it to this one, with a on its left.
+                        # Boundary of the old cells of a and b, from the adjacent circumcentre to this one, a on its left.
                         area[a] += _cross(circles[other, 0] - px, circles[other, 1] - py, cx, cy)
                         continue
                     ax, ay, bx, by = xy[a, 0] - px, xy[a, 1] - py, xy[b, 0] - px, xy[b, 1] - py
                     twice = 2.0 * _cross(ax, ay, bx, by)
                     a2, b2 = ax * ax + ay * ay, bx * bx + by * by
-                    if twice <= 1e-14 * (a2 + b2):  # beside the edge's ends by rounding: on the edge itself
+                    if twice <= 1e-14 * (a2 + b2):  # the point lies on the edge within rounding error
                         is_straight = True
                         continue
                     nx, ny = (a2 * by - b2 * ay) / twice, (b2 * ax - a2 * bx) / twice
@@ -167,10 +168,10 @@ def natural_neighbours(points, start, xy, values, corners, beyond, circles, out)
 @njit(types.void(_points, types.float64, types.float64, types.float64[:, ::1]))
 def add_roughness(picture, weight_x, weight_y, out):
     """
-    Add the gradient of half the weighted sum of squared differences between neighbouring pixels.
+    Add the gradient of half the weighted sum of squared neighbour differences.
 
-    ``picture`` and ``out`` (n_y, n_x): each pixel gets the sum of its differences from its two to four neighbours, those in its
-    row times ``weight_x``, those in its column times ``weight_y``.
+    ``picture`` and ``out`` (n_y, n_x): the differences from its two to four neighbours are added to each pixel, multiplied by
+    ``weight_x`` in the row and ``weight_y`` in the column.
     """
     n_y, n_x = picture.shape
     for row in range(n_y):

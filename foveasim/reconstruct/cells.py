@@ -1,4 +1,4 @@
-"""Pictures of what a sensor saw: every raster pixel takes the value of the photosites under it."""
+"""Reconstruction by area-weighted means of the photosites under each pixel."""
 
 from __future__ import annotations
 
@@ -12,27 +12,28 @@ from foveasim.reconstruct.picture import Picture, covered_share
 
 __all__ = ["cells", "fill_channels"]
 
-#: Sites whose values stand in for a colour that a site does not see.
+#: Nearest sites of a channel that are averaged in demosaicing.
 NEIGHBOURS = 4
 
 
 def cells(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | None = None) -> Picture:
     """
-    Raster picture in which every pixel has the mean of the sites that it shows, weighted by area.
+    Compute a raster picture of area-weighted means of photosite values.
 
     Parameters
     ----------
     layout : Layout
     values : (n_site,) or (n_channel, n_site)
     grid : Grid
-        The picture's pixels.
+        Pixels of the picture.
     n_threads : int, optional
         All cores by default.
 
     Returns
     -------
     Picture
-        ``Wᵀ values / Wᵀ 1`` with the exact overlaps W of sites and pixels: borders are smooth, a flat field stays flat.
+        ``Wᵀ values / Wᵀ 1`` with the exact overlap areas W of sites and pixels: boundaries are anti-aliased, and a uniform
+        field stays uniform.
     """
     integrator = Integrator(layout, grid, n_threads=n_threads)
     channels = np.atleast_2d(finite_array("values", values))
@@ -44,7 +45,7 @@ def cells(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | N
 
 def fill_channels(layout: PackedRings, values: Floats, channel: Ints, n_channels: int) -> Floats:
     """
-    Every channel's value at every site of a colour mosaic.
+    Interpolate every channel at every site of a colour mosaic.
 
     Parameters
     ----------
@@ -56,8 +57,8 @@ def fill_channels(layout: PackedRings, values: Floats, channel: Ints, n_channels
     Returns
     -------
     filled : (n_channel, n_site) float64
-        A site's own value in its own channel; in the others the mean of the nearest sites of that channel, weighted by
-        the inverse of their distance. NaN for a channel without sites.
+        The site's value in its own channel; in other channels the mean of the nearest sites of that channel, weighted by
+        inverse distance. NaN for a channel without sites.
     """
     from scipy.spatial import cKDTree
 

@@ -1,4 +1,8 @@
-"""What codes and charges tell of the light, by the electronics as they are meant: photoelectrons, and their noise."""
+"""
+Estimation of photoelectrons and their noise from codes or charges.
+
+Estimates use the nominal electronics of the sensor, without the deviations of an individual device.
+"""
 
 from __future__ import annotations
 
@@ -19,16 +23,16 @@ __all__ = ["SiteEstimates", "electrons_per_code", "estimate_from_charge", "estim
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SiteEstimates:
     """
-    Light as sites tell it.
+    Estimated photoelectrons of each photosite, with noise variance and saturation.
 
     Attributes
     ----------
     light_e : (n_site,) float64, e-
-        Photoelectrons: charge less the dark charge that is expected. Noise may put it below 0.
+        Photoelectrons: charge minus the expected dark signal. Noise can make it negative.
     variance_e2 : (n_site,) float64, e-²
-        Of its noise. For shot noise the charge and one more: the mean of the expectations that a charge may come from.
+        Noise variance of ``light_e``. For shot noise, the charge plus one: the posterior mean of the expected charge.
     is_saturated : (n_site,) bool
-        Saturated: the light may be any above this.
+        Whether a site is saturated, so that ``light_e`` is a lower bound.
     """
 
     light_e: Floats
@@ -37,26 +41,26 @@ class SiteEstimates:
 
 
 def electrons_per_code(sensor: Sensor) -> Floats:
-    """Electrons of one linear code, without the device's faults, (n_site,) e-/DN."""
+    """Return the electrons per linear code of the nominal sensor, (n_site,) e-/DN."""
     step_e = volts_to_electrons(sensor.v_sat_v / 2.0**sensor.bits, sensor.capacitance_f)
     return np.broadcast_to(step_e, (sensor.layout.n_sites,))
 
 
 def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: float) -> SiteEstimates:
     """
-    SiteEstimates of charges before they are read out: shot noise only.
+    Estimate photoelectrons from charges before readout, with shot noise only.
 
     Parameters
     ----------
     charge_e : (n_site,), e-
     sensor : Sensor
-        As it is meant: its fixed patterns are not known to who reads.
+        Nominal sensor: its fixed patterns are not used.
     exposure_s : float, s
 
     Raises
     ------
     ParameterError
-        When a charge is not finite, there is not one for each of the sensor's sites, or the exposure is negative.
+        When a charge is not finite, there is not one charge per site of the sensor, or the exposure is negative.
     """
     charge = _per_site("charge_e", charge_e, sensor)
     exposure_s = check_plausible("exposure_s", exposure_s)
@@ -71,7 +75,9 @@ def estimate_from_charge(charge_e: ArrayLike, sensor: Sensor, exposure_s: float)
 
 def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: float) -> SiteEstimates:
     """
-    SiteEstimates of codes: companding and the response's bend undone, pedestal and dark charge taken off.
+    Estimate photoelectrons from codes.
+
+    Companding and response nonlinearity are inverted; pedestal and expected dark signal are subtracted.
 
     Parameters
     ----------
@@ -82,12 +88,12 @@ def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: float) -> Si
     Raises
     ------
     ParameterError
-        When a code is none of the sensor's, there is not one for each of its sites, or the exposure is negative.
+        When a code is out of the sensor's range, there is not one code per site, or the exposure is negative.
 
     Notes
     -----
-    Crosstalk, coupling, differential non-linearity and fixed patterns are not undone: for the last,
-    :meth:`foveasim.sensor.Calibration.correct`.
+    Crosstalk, inter-pixel capacitance, differential nonlinearity and fixed patterns are not corrected. For fixed patterns
+    see :meth:`foveasim.sensor.Calibration.correct`.
     """
     codes = _per_site("code", code, sensor)
     share = (linearise(codes, sensor) + 0.5) / 2.0**sensor.bits - sensor.pedestal_v / sensor.v_sat_v

@@ -1,8 +1,8 @@
 """
-Smooth pictures: values between the centres of photosites, exact at the centres.
+Interpolation of photosite values between site centroids.
 
-The centres are those of gravity. Coverage is that of the sites' outlines, not of the triangles between centres: a blind spot
-stays open.
+Both methods are exact at the centroids. The coverage is that of the site outlines, not of the triangles between centroids, so
+that a blind spot remains without data.
 """
 
 from __future__ import annotations
@@ -21,48 +21,48 @@ from foveasim.reconstruct.picture import Picture, covered_share
 
 __all__ = ["linear", "natural", "site_values"]
 
-#: Centres nearer to each other than this fraction of the layout's extent are one, with the mean of their values.
+#: Centroids closer than this fraction of the layout's extent are merged, with the mean of their values.
 SAME_PLACE = 1e-9
-#: Pixels that are interpolated as one piece of work; fixed, so that threads change nothing.
+#: Pixels per work item; fixed, so that the result does not depend on the number of threads.
 PIXELS_PER_PIECE = 1 << 14
-#: Distances to edges of the hull that are looked at together.
+#: Distances from points to hull edges that are computed at a time, which limits memory.
 DISTANCES_AT_ONCE = 1 << 22
 
 
 def linear(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | None = None) -> Picture:
     """
-    Raster picture that is linear in each triangle of the Delaunay triangulation of the sites' centres.
+    Interpolate values linearly on the Delaunay triangulation of the site centroids.
 
     Parameters
     ----------
     layout : Layout
     values : (n_site,) or (n_channel, n_site)
-        NaN where a site does not know a channel: it is interpolated between those that do.
+        NaN where a site does not measure a channel, which is then interpolated from the other sites.
     grid : Grid
-        The picture's pixels; values are those at their centres.
+        Pixels of the picture; values are those at the pixel centres.
     n_threads : int, optional
         All cores by default.
 
     Returns
     -------
     Picture
-        Exact at the centres; a linear field comes back as it is inside their hull. Where sites reach beyond the hull a pixel
-        has the value of the hull's nearest point: nothing is extrapolated. NaN where no site is.
+        Exact at the centroids; linear fields are reproduced inside their convex hull. Covered pixels outside the hull have
+        the value of the nearest point of the hull, without extrapolation. NaN where no photosite lies.
 
     Raises
     ------
     ParameterError
-        When there is not one value per site, one is infinite, or a channel has no value at all.
+        When there is not one value per site, a value is infinite, or a channel has no values.
     """
     return _interpolated(layout, values, grid, n_threads, is_smooth=False)
 
 
 def natural(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | None = None) -> Picture:
     """
-    Raster picture by Sibson's natural neighbours of the sites' centres.
+    Interpolate values by Sibson's natural neighbours of the site centroids.
 
-    A pixel's value is the mean of the sites that would lose area to it, were it the centre of a Voronoi cell, each by the
-    area that it would lose (Sibson 1981, A brief description of natural neighbour interpolation).
+    A pixel's value is the weighted mean of its natural neighbours. The weight of a site is the area that its Voronoi cell
+    would lose if the pixel centre were inserted (Sibson 1981, A brief description of natural neighbour interpolation).
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def natural(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int |
     Returns
     -------
     Picture
-        As that of :func:`linear`, and without its creases: its gradient is continuous except at the centres.
+        As for :func:`linear`, but with a continuous gradient except at the centroids.
 
     Raises
     ------
@@ -84,21 +84,21 @@ def natural(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int |
 
 def site_values(values: Floats, n_sites: int) -> Floats:
     """
-    Values that may be missing, as (n_channel, n_site).
+    Return values, NaN where missing, with the shape (n_channel, n_site).
 
     Raises
     ------
     ParameterError
-        When there is not one value per site, one is infinite, or a channel has no value at all.
+        When there is not one value per site, a value is infinite, or a channel has no values.
     """
     channels = np.atleast_2d(as_numbers("values", values, missing_is_nan=True))
     if channels.ndim != 2 or channels.shape[1] != n_sites:
         raise ParameterError("values", f"must have the shape (..., {n_sites}), got {np.shape(values)}")
     if np.isinf(channels).any():
-        raise ParameterError("values", "must be finite, or NaN where a site knows nothing")
+        raise ParameterError("values", "must be finite, or NaN where a site has no value")
     empty = np.flatnonzero(np.isnan(channels).all(axis=1))
     if empty.size:
-        raise ParameterError("values", f"must have a number at one site at least, got none in channel {empty[0]}")
+        raise ParameterError("values", f"must have a number for at least one site, got none in channel {empty[0]}")
     return channels
 
 
@@ -124,9 +124,9 @@ def _interpolated(
 @dataclass(frozen=True, eq=False)
 class _Mesh:
     """
-    Places with values, and the triangles between them.
+    Distinct points with values, and their Delaunay triangulation.
 
-    Coordinates are measured from ``middle_um`` in units of ``extent_um``.
+    Coordinates are relative to ``middle_um``, in units of ``extent_um``.
     """
 
     xy: Floats
@@ -136,7 +136,7 @@ class _Mesh:
 
     @classmethod
     def of(cls, centroid_um: Floats, values: Floats) -> _Mesh:
-        """Places (n, 2) with values (n_channel, n); equal places are one."""
+        """Create from centroids (n, 2) with values (n_channel, n); equal centroids are merged."""
         middle_um = 0.5 * (centroid_um.min(axis=0) + centroid_um.max(axis=0))
         extent_um = float(np.ptp(centroid_um, axis=0).max()) or 1.0
         xy = (centroid_um - middle_um) / extent_um
@@ -147,7 +147,7 @@ class _Mesh:
         return cls(np.ascontiguousarray(xy[first]), np.ascontiguousarray((sums / count).T), middle_um, extent_um)
 
     def at(self, points_um: Floats, n_threads: int, *, is_smooth: bool) -> Floats:
-        """Values at points (n, 2), (n_channel, n)."""
+        """Interpolate values at points (n, 2), as (n_channel, n)."""
         from scipy.spatial import Delaunay, QhullError
 
         from foveasim.reconstruct import _kernels
@@ -155,7 +155,7 @@ class _Mesh:
         points = (points_um - self.middle_um) / self.extent_um
         try:
             mesh = Delaunay(self.xy)
-        except (QhullError, ValueError):  # fewer than three places, or all on one line
+        except (QhullError, ValueError):  # fewer than three points, or all collinear
             return self._along_a_line(points)
         found = np.empty((points.shape[0], self.values.shape[1]))
         pieces = [slice(i, i + PIXELS_PER_PIECE) for i in range(0, points.shape[0], PIXELS_PER_PIECE)]
@@ -191,7 +191,7 @@ class _Mesh:
         return np.asarray(np.einsum("nk,nkc->nc", shares, self.values[corners]))
 
     def _on_the_hull(self, points: Floats, edges: Ints) -> Floats:
-        """Values at the hull's nearest points."""
+        """Return values at the nearest points of the convex hull."""
         start = self.xy[edges[:, 0]]
         along = self.xy[edges[:, 1]] - start
         length2 = np.einsum("ij,ij->i", along, along)
@@ -208,7 +208,7 @@ class _Mesh:
         return found
 
     def _along_a_line(self, points: Floats) -> Floats:
-        """Values at the nearest points of the line on which all places lie, clamped at its ends."""
+        """Interpolate along the line of collinear points, clamped at its ends."""
         order = np.lexsort(self.xy.T)
         first, last = self.xy[order[0]], self.xy[order[-1]]
         place, at = ((xy - first) @ (last - first) for xy in (self.xy, points))
@@ -217,7 +217,7 @@ class _Mesh:
 
 
 def _circles(corners: Floats) -> Floats:
-    """Centres and squared radii of the circles through triangles' corners (n, 3, 2), (n, 3)."""
+    """Return centres and squared radii of triangle circumcircles, (n, 3) from (n, 3, 2)."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     twice = 2.0 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     twice = np.where(twice == 0.0, np.finfo(np.float64).tiny, twice)
@@ -225,5 +225,5 @@ def _circles(corners: Floats) -> Floats:
     with np.errstate(over="ignore", invalid="ignore"):
         centre = np.stack((a2 * b[:, 1] - b2 * a[:, 1], b2 * a[:, 0] - a2 * b[:, 0]), axis=1) / twice[:, np.newaxis]
         circles = np.concatenate((corners[:, 0] + centre, (centre**2).sum(axis=1, keepdims=True)), axis=1)
-    # No circle goes through corners on a line; such a triangle is never looked into.
+    # Collinear corners have no circumcircle: a squared radius of -1 contains no point.
     return np.ascontiguousarray(np.where(np.isfinite(circles).all(axis=1, keepdims=True), circles, (0.0, 0.0, -1.0)))

@@ -1,8 +1,8 @@
 """
-The picture that would have given these values: regularised least squares with the exact overlaps of sites and pixels.
+Regularised least-squares reconstruction with exact overlaps of sites and pixels.
 
-What a site gives is its response times the mean of the picture over its area, so that small and large sites, and those that a
-pixel holds many of, all say what they know about the pixels under them.
+The value of a site is modelled as its response times the mean of the picture over its area. Sites of any size, including
+several sites within one pixel, thus contribute to the pixels under them.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from foveasim.reconstruct.picture import Picture, covered_share
 
 __all__ = ["least_squares"]
 
-#: A site of which less than this share lies on the raster is left out.
+#: Sites with less than this fraction of their area on the raster are ignored.
 MIN_ON_RASTER = 1e-6
-#: The strength is right when the misfit is within this fraction of what the noise makes.
+#: Relative tolerance of the misfit, compared with the noise, in the discrepancy rule.
 MISFIT_TOLERANCE = 0.02
-#: Strengths looked at, at most, and how far below the first guess the least may lie.
+#: Largest number of regularisation strengths that are tried, and ratio of the first guess to the smallest strength.
 MAX_STRENGTHS, FURTHEST = 12, 1e8
-#: The largest strength, times the largest curvature of the data's part: beyond it nothing is left but one even value.
+#: Largest strength, as a multiple of the largest curvature of the data term: beyond it the picture is constant.
 STRONGEST = 1e6
-#: No picture's roughness along one axis is larger than this times its sum of squares; and pixels across the coarsest level, at
-#: most.
+#: Upper bound of a picture's roughness along one axis over its sum of squares; and largest number of pixels across the
+#: coarsest level of the preconditioner.
 ROUGHEST, COARSEST = 4.0, 4
-#: While the strength is looked for, solutions may be this much further from convergence.
+#: Factor by which the tolerance is relaxed during the search for the strength.
 LOOSER = 3.0
 
 
@@ -56,59 +56,61 @@ def least_squares(
     n_threads: int | None = None,
 ) -> Picture:
     """
-    Raster picture x >= 0 that makes ``|C^-1/2 (r W x - y)|² + mu |grad x|²`` smallest.
+    Compute the picture x >= 0 that minimises ``|C^-1/2 (r W x - y)|² + mu |grad x|²``.
 
     Parameters
     ----------
     layout : Layout
     values : (n_site,) or (n_channel, n_site)
-        y: linear in light, 0 without any. NaN where a site does not count: it sees another colour, is saturated, or dead.
+        y: linear in irradiance, 0 at zero irradiance. NaN excludes a site, for example one of another colour, a saturated or
+        a dead one.
     grid : Grid
-        The picture's pixels.
+        Pixels of the picture.
     variance : number, (n_site,) or (n_channel, n_site), optional
-        C: variance of the noise of the values. By default all sites count alike, as fractions of their response.
+        C: noise variance of the values. By default the noise is the same fraction of the response at all sites.
     response : (n_site,), optional
-        r: what each site gives where the picture is 1 everywhere. By default its area in µm²: charges in electrons become a
-        picture in electrons per µm². With ones, values that an even scene makes equal stay what they are.
+        r: value of each site for a picture of 1 everywhere. By default its area in µm², so that charges in electrons give a
+        picture in electrons per µm². With ones, values that are equal for a uniform scene are not rescaled.
     mu : float, "roughness" or "discrepancy"
-        Strength of the smoothness: ``|grad x|²`` is the sum of the squared differences of neighbouring pixels, over the whole
-        raster, and does not depend on how fine it is; along x it is times height over width of a pixel, along y the inverse, so
-        that it stands for the integral of the squared gradient for pixels of any form. Both rules need the variance: see below.
+        Strength of the regularisation. ``|grad x|²`` is the sum of the squared differences of neighbouring pixels over the
+        complete raster, weighted by pixel height over width along x, and by the inverse along y. It approximates the integral
+        of the squared gradient for pixels of any aspect ratio and does not depend on the pixel pitch. Both rules need the
+        variance; see Notes.
     blur : (m_y, m_x) or (n_channel, m_y, m_x), optional
-        What the lens makes of one pixel, on the raster's pixels, an odd number along each side, the pixel in the middle
-        (:func:`blur_kernel`): W is then the overlaps after this convolution, and the picture is that in front of the lens.
-        Beyond the raster the picture goes on by as many unknown pixels as the kernel reaches.
+        Response of the lens to one pixel, on the pixels of the raster, with an odd number along each side and the pixel in
+        the centre (see :func:`blur_kernel`). W then includes the convolution with this kernel, and the picture is the
+        deblurred one. The raster is padded by unknown pixels to the reach of the kernel.
     tolerance : float
-        The solution is found when the root of ``g·M g`` is below this fraction of ``|C^-1/2 y|``, with the projected gradient g
-        and a preconditioner M: when the sum above is about as far above its smallest as the square of that.
+        The iteration stops when the root of ``g·M g`` is below this fraction of ``|C^-1/2 y|``, with the projected gradient g
+        and a preconditioner M. The objective then exceeds its minimum by about the square of this limit.
     max_steps : int
-        Applications of the operator for one solution.
+        Largest number of applications of the operator per solution.
     n_threads : int, optional
-        All cores by default. Channels are solved side by side.
+        All cores by default. Channels are solved in parallel.
 
     Returns
     -------
     Picture
-        In the values' unit over that of the response. NaN where no site is, whatever the smoothness makes of it.
+        In the unit of the values divided by that of the response. NaN where no photosite lies, despite the regularisation.
 
     Raises
     ------
     ParameterError
-        When an array has another shape, a value is out of range, or the rule for ``mu`` lacks the variance.
+        When an array has a wrong shape, a value is out of range, or a rule for ``mu`` is given without the variance.
     SimulationError
-        When ``max_steps`` do not suffice.
+        When the iteration does not converge within ``max_steps``.
 
     Notes
     -----
-    ``"roughness"``: the number of values over the squared differences of neighbouring pixels of the cell-filled picture. To
-    Bayes, mu says how rough pictures are before one is seen, ``mu |grad x|²`` being about the number of values, and the cells
-    tell how rough this one is. ``"discrepancy"`` (Morozov): so strong that the values are explained no better than their
-    noise asks for, ``|C^-1/2 (r W x - y)|²`` being their number within 2 %, or the strongest there is. It takes several
-    solutions, and follows the noise alone: of photographs in little light it makes pictures that are too smooth.
+    ``"roughness"`` sets mu to the number of values over the sum of squared differences of neighbouring pixels of the
+    cell-filled picture. In Bayesian terms, mu is the prior of the roughness, with ``mu |grad x|²`` of about the number of
+    values, and the cell-filled picture estimates the roughness. ``"discrepancy"`` (Morozov) chooses mu so that the misfit
+    equals the noise, that is ``|C^-1/2 (r W x - y)|²`` equals the number of values within 2 %, or uses the largest possible
+    mu. It takes several solutions and depends on the noise alone: it oversmooths photographs at low signal levels.
 
-    Of a site that reaches beyond the raster, what lies on it stands for all of it.
+    A site that extends beyond the raster is represented by its part on the raster.
 
-    Solved by conjugate gradients with the bound (see ``_bounded``), preconditioned on pixels of all sizes.
+    Solved by conjugate gradients with bounds (see ``_bounded``) and a multilevel preconditioner.
     """
     integrator = Integrator(layout, grid, n_threads=n_threads)
     channels = site_values(values, integrator.n_sites)
@@ -116,7 +118,7 @@ def least_squares(
     if not isinstance(mu, str):
         mu = check_number("mu", mu, above=0.0)
     elif check_choice("mu", mu, ("roughness", "discrepancy")) and variance is None:
-        raise ParameterError("mu", "must be a number where no 'variance' is given: the noise is what it is chosen by")
+        raise ParameterError("mu", "must be a number without 'variance', as both rules depend on the noise")
     tolerance = check_number("tolerance", tolerance, above=0.0, at_most=0.1)
     max_steps = check_count("max_steps", max_steps)
     share = covered_share(integrator)
@@ -135,7 +137,9 @@ def least_squares(
     def solved(channel: int) -> Floats:
         known = np.flatnonzero(counts & ~np.isnan(channels[channel]))
         if known.size == 0:
-            raise ParameterError("values", f"must have a number at a site on the raster, got none in channel {channel}")
+            raise ParameterError(
+                "values", f"must have a number for a site on the raster, got none in channel {channel}"
+            )
         weight = gain[known] / covered_um2[known] / np.sqrt(noise[channel, known])
         problem = _Problem(
             overlaps=_scaled_rows(overlaps[known], weight),
@@ -160,19 +164,19 @@ def least_squares(
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """
-    One channel, in units of its noise.
+    Least-squares problem of one channel, in units of its noise.
 
     Attributes
     ----------
     overlaps : csr_array (n_value, n_pixel)
-        What each pixel adds to each value, over the value's noise.
+        Contribution of each pixel to each value, divided by the noise of the value.
     right : (n_value,)
-        The values over their noise.
+        Values divided by their noise.
     shape : (n_y, n_x)
     weights : (along x, along y)
         Weights of the squared differences of neighbours: 1 for square pixels.
     transfer : (n_y, n_x // 2 + 1) complex, optional
-        Of the blur before it.
+        Transfer function of the blur.
     tolerance : float
     max_steps : int
     """
@@ -198,11 +202,11 @@ class _Problem:
         return np.asarray(fft.irfft2(plane * transfer, s=self.shape)).ravel()
 
     def forward(self, x: Floats) -> Floats:
-        """What a picture gives, over the noise."""
+        """Return the values of a picture, divided by their noise."""
         return np.asarray(self.overlaps @ self._blurred(x, self.transfer))
 
     def backward(self, y: Floats) -> Floats:
-        """The transpose of :meth:`forward`."""
+        """Apply the adjoint of :meth:`forward`."""
         return self._blurred(np.asarray(self._transposed @ y), None if self.transfer is None else self.transfer.conj())
 
     @cached_property
@@ -211,11 +215,11 @@ class _Problem:
 
     @cached_property
     def _reach(self) -> Floats:
-        """Sum of each row of the data's part of the normal equations, which bounds it."""
+        """Row sums of the data term of the normal equations, a diagonal that bounds it."""
         return np.maximum(self.backward(self.forward(np.ones(self.overlaps.shape[1]))), 0.0)
 
     def _levels(self, mu: float) -> list[Floats]:
-        """Inverse diagonals of the preconditioner, from the raster to ever coarser pixels."""
+        """Return inverse diagonals of the preconditioner, from the finest level to the coarsest."""
         level, levels = self._reach.reshape(self.shape), []
         while True:
             levels.append(1.0 / (level + ROUGHEST * sum(self.weights) * mu))
@@ -225,7 +229,7 @@ class _Problem:
 
     @cached_property
     def first_guess(self) -> Floats:
-        """The mean, by area, of what the sites alone say."""
+        """Area-weighted mean of the site values over each pixel."""
         total = np.asarray(self._transposed @ np.ones(self.right.size))
         means = self.right / np.asarray(self.overlaps.sum(axis=1)).ravel()
         weighted = np.asarray(self._transposed @ means)
@@ -233,7 +237,7 @@ class _Problem:
         return np.maximum(np.where(total > 0.0, weighted / np.where(total > 0.0, total, 1.0), flat), 0.0)
 
     def solved(self, mu: float, start: Floats | None = None, tolerance: float | None = None) -> Floats:
-        """The picture for one strength."""
+        """Return the picture for one regularisation strength."""
         from foveasim.reconstruct import _kernels
 
         add_roughness: Callable[..., None] = _kernels.add_roughness
@@ -266,25 +270,33 @@ class _Problem:
         return x
 
     def misfit(self, x: Floats) -> float:
-        """Squared distance from the values, over their number: 1 is what the noise makes."""
+        """Return the mean squared residual in units of the noise, whose expectation is 1."""
         apart = self.forward(x) - self.right
         return float(apart @ apart) / self.right.size
 
     def roughness(self, x: Floats) -> float:
-        """Weighted sum of the squared differences of neighbours."""
+        """Return the weighted sum of the squared differences of neighbouring pixels."""
         picture, (weight_x, weight_y) = x.reshape(self.shape), self.weights
         across, along = (np.diff(picture, axis=1) ** 2).sum(), (np.diff(picture, axis=0) ** 2).sum()
         return float(weight_y * along + weight_x * across)
 
     @cached_property
     def natural_strength(self) -> float:
-        """Number of values over the roughness of what the sites alone say; for even pictures the largest strength."""
+        """
+        Number of values over the roughness of the first guess.
+
+        For uniform pictures the largest strength.
+        """
         return self.right.size / max(
             self.roughness(self.first_guess), self.right.size / (STRONGEST * float(self._reach.max()))
         )
 
     def as_smooth_as_noise_allows(self) -> Floats:
-        """The discrepancy principle: a secant in the logarithms of strength and misfit, between too much and too little."""
+        """
+        Return the picture whose misfit equals the noise (discrepancy principle).
+
+        The strength is found by a bracketed secant method in the logarithms of strength and misfit.
+        """
         x, mu = self.first_guess, self.natural_strength
         low, high = math.log(mu / FURTHEST), math.log(STRONGEST * float(self._reach.max()))
         before: tuple[float, float] | None = None
@@ -296,7 +308,7 @@ class _Problem:
                 break
             slope = 1.0 if before is None or at == before[0] else (value - before[1]) / (at - before[0])
             before = at, value
-            # Misfits grow with the strength, and never faster than its square.
+            # The misfit increases with the strength, at most with its square.
             following = at - value / min(max(slope, 0.1), 2.0)
             mu = math.exp(following if low < following < high else 0.5 * (low + high))
         return self.solved(mu, x)
@@ -306,14 +318,14 @@ class _Problem:
 
 
 def _coarser(plane: Floats) -> Floats:
-    """The transpose of :func:`_finer`."""
+    """Apply the adjoint of :func:`_finer`."""
     for axis in (0, 1):
         plane = np.moveaxis(_halved(np.moveaxis(plane, axis, 0)), 0, axis)
     return plane
 
 
 def _finer(plane: Floats, shape: tuple[int, ...]) -> Floats:
-    """Pixels of half the size, linear between the middles of the coarse ones."""
+    """Interpolate linearly between pixel centres to pixels of half the size."""
     for axis in (0, 1):
         plane = np.moveaxis(_doubled(np.moveaxis(plane, axis, 0), shape[axis]), 0, axis)
     return plane
@@ -342,7 +354,7 @@ def _halved(rows: Floats) -> Floats:
 
 
 def _noise(variance: ArrayLike | None, gain: Floats, shape: tuple[int, int]) -> Floats:
-    """Variance of every value, (n_channel, n_site)."""
+    """Return the noise variance of every value, (n_channel, n_site)."""
     if variance is None:
         typical = float(np.median(gain[gain > 0.0])) if (gain > 0.0).any() else 1.0
         return np.broadcast_to(np.where(gain > 0.0, gain / typical, 1.0) ** 2, shape)
@@ -356,21 +368,21 @@ def _noise(variance: ArrayLike | None, gain: Floats, shape: tuple[int, int]) -> 
 
 
 def _fast(n: int) -> int:
-    """The next length of which transforms are fast."""
+    """Return the next length for which Fourier transforms are fast."""
     from scipy import fft
 
     return int(fft.next_fast_len(n, real=True))
 
 
 def _scaled_rows(matrix: Any, weight: Floats) -> Any:
-    """A sparse matrix whose rows are multiplied by weights."""
+    """Return a sparse matrix with its rows multiplied by weights."""
     scaled = matrix.copy()
     scaled.data *= np.repeat(weight, np.diff(scaled.indptr))
     return scaled
 
 
 def _padded(integrator: Integrator, pad: tuple[int, ...], shape: tuple[int, ...]) -> Any:
-    """The overlaps as a sparse matrix on a raster with more pixels around."""
+    """Return the overlaps as a sparse matrix on a padded raster."""
     from scipy.sparse import csr_array
 
     matrix = integrator.weights()
@@ -380,13 +392,13 @@ def _padded(integrator: Integrator, pad: tuple[int, ...], shape: tuple[int, ...]
 
 
 def _kernels_of(blur: ArrayLike | None, n_channels: int) -> list[Floats]:
-    """A kernel for each channel, of the sum that it has; none without a blur."""
+    """Return one kernel per channel, not normalised; empty without a blur."""
     if blur is None:
         return []
     kernel = finite_array("blur", blur, at_least=0.0)
     if kernel.ndim not in (2, 3) or any(n % 2 == 0 for n in kernel.shape[-2:]) or kernel.sum() <= 0.0:
         raise ParameterError(
-            "blur", f"must have an odd number of pixels along each side and light in them, got {kernel.shape}"
+            "blur", f"must have an odd number of pixels along each side and a positive sum, got {kernel.shape}"
         )
     if kernel.ndim == 3 and kernel.shape[0] not in (1, n_channels):
         raise ParameterError(
@@ -396,7 +408,7 @@ def _kernels_of(blur: ArrayLike | None, n_channels: int) -> list[Floats]:
 
 
 def _transfer(kernel: Floats, shape: tuple[int, ...]) -> Any:
-    """Transform of a kernel whose middle is a picture's first pixel."""
+    """Return the transfer function of a kernel centred on the first pixel of a raster."""
     from scipy import fft
 
     plane = np.zeros(shape)

@@ -1,4 +1,4 @@
-"""The raster picture that every method of reconstruction gives."""
+"""Raster pictures, the result of all reconstruction methods."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from foveasim.integrate import Integrator
 
 __all__ = ["Picture", "covered_share", "raster_grid"]
 
-#: A raster pixel covered by less than this share is touched by rounding only.
+#: Coverage below this fraction is rounding error.
 NO_COVERAGE = 1e-9
-#: Endings of files that hold floating-point numbers, unless told otherwise.
+#: File extensions that store floating-point numbers by default.
 FLOATING = (".tif", ".tiff", ".exr")
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
     """
-    A raster picture of per-site values.
+    Raster picture of photosite values.
 
-    Arrays are read-only; later edits of arrays that it was made of do not change it.
+    Arrays are read-only; later changes of the source arrays have no effect.
 
     Attributes
     ----------
     data : (n_channel, n_y, n_x) float32
-        Values in the sites' unit, row 0 lowest; NaN where no photosite is: no data is not black.
+        Values in the unit of the sites, lowest row first; NaN, not 0, where no photosite lies.
     coverage : (n_y, n_x) float32
         Fraction of each pixel that photosites cover.
     grid : Grid
-        The pixels, in the sensor plane.
+        Pixels in the sensor plane.
     """
 
     data: Images
@@ -55,25 +55,25 @@ class Picture:
         self, white: float | Floats | None = None, *, encode_srgb: bool = False, bits: int = 8
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
         """
-        The picture as integers for a file or a screen, first row on top.
+        Return the picture as integers for a file or a screen, top row first.
 
         Parameters
         ----------
         white : number or (n_channel,), optional
-            Values that become the highest number; the largest value by default.
+            Values that map to the largest integer; by default the largest value of the picture.
         encode_srgb : bool
-            Whether the values are linear light and are to be encoded as a screen expects.
+            Whether to encode linear values with the sRGB transfer function.
         bits : {8, 16}
 
         Returns
         -------
         image : (n_y, n_x, n_channel + 1) uint8 or uint16
-            Grey or colour, and the coverage as alpha: where no photosite is, the picture is transparent.
+            Grey or RGB, with the coverage as alpha: pixels without photosites are transparent.
 
         Raises
         ------
         ParameterError
-            When the picture has neither 1 nor 3 channels, white is not positive, or the bits are neither 8 nor 16.
+            When the picture has neither 1 nor 3 channels, ``white`` is not positive, or ``bits`` is neither 8 nor 16.
         """
         if self.data.shape[0] not in (1, 3):
             raise ParameterError("data", f"must have 1 or 3 channels to be shown, got {self.data.shape[0]}")
@@ -97,25 +97,26 @@ class Picture:
         bits: int | None = None,
     ) -> None:
         """
-        Write the picture to a file, whole or not at all.
+        Write the picture to a file atomically.
 
         Parameters
         ----------
         path : path
-            ``.png`` and others of integers, ``.tif`` of either kind, or, with the extra ``pictures``, ``.exr``.
+            ``.png`` and other integer formats, ``.tif`` with integers or floating-point numbers, or, with the extra
+            ``pictures``, ``.exr``.
         white, encode_srgb
-            Of integers, as for :meth:`to_image`. Floating-point files hold the values themselves, or, where ``white`` is
-            given, over it; they are linear, and cannot be encoded.
+            For integers, as for :meth:`to_image`. Floating-point files contain linear values, divided by ``white`` if it is
+            given, and cannot be encoded.
         bits : {8, 16, 32}, optional
-            32 are floating-point numbers: NaN where no photosite is, and no alpha. By default 32 for TIFF and EXR, and 8 for
-            others.
+            32 writes floating-point numbers, with NaN where no photosite lies and without alpha. By default 32 for TIFF and
+            EXR, and 8 for other formats.
 
         Raises
         ------
         FileError
-            When the ending names no format, or none for these bits, or nothing can be written.
+            When the extension is unknown, the format does not support ``bits``, or the file cannot be written.
         ParameterError
-            When the bits are none of these, or as for :meth:`to_image`.
+            When ``bits`` is none of these, or as for :meth:`to_image`.
         """
         if bits is None:
             bits = 32 if Path(path).suffix.lower() in FLOATING else 8
@@ -125,7 +126,7 @@ class Picture:
             write_picture(path, self.to_image(white, encode_srgb=encode_srgb, bits=bits))
             return
         if encode_srgb:
-            raise ParameterError("encode_srgb", "must be off for floating-point numbers, which are linear light")
+            raise ParameterError("encode_srgb", "must be False for floating-point files, which store linear values")
         if self.data.shape[0] not in (1, 3):
             raise ParameterError("data", f"must have 1 or 3 channels to be saved, got {self.data.shape[0]}")
         values = self.data if white is None else self.data / self._levels(white)
@@ -141,10 +142,10 @@ class Picture:
 
 
 def raster_grid(layout: PackedRings, max_pixels: int) -> Grid:
-    """Grid of square pixels over the layout, the longer side ``max_pixels`` long."""
+    """Return a grid of square pixels over the layout, ``max_pixels`` along its longer side."""
     max_pixels = check_count("max_pixels", max_pixels, at_most=2**15)
     if layout.xy_um.size == 0:
-        raise GeometryError("the layout has no sites, and so no picture")
+        raise GeometryError("the layout has no sites; a picture needs at least one")
     low, high = layout.xy_um.min(axis=0), layout.xy_um.max(axis=0)
     pitch_um = float((high - low).max()) / max_pixels
     n_x, n_y = (max(1, math.ceil(length / pitch_um - 1e-6)) for length in high - low)
@@ -154,6 +155,10 @@ def raster_grid(layout: PackedRings, max_pixels: int) -> Grid:
 
 
 def covered_share(integrator: Integrator) -> Floats:
-    """Fraction of each pixel that photosites cover, exactly, (n_y, n_x); 0 where they touch it by rounding only."""
+    """
+    Compute the exact fraction of each pixel that photosites cover, (n_y, n_x).
+
+    Fractions within rounding error of 0 are 0.
+    """
     share = integrator.spread(np.ones(integrator.n_sites)) / integrator.grid.cell_area_um2
     return np.where(share > NO_COVERAGE, share, 0.0)

@@ -1,4 +1,4 @@
-"""What a reconstruction is compared with, and what it may undo: light on a picture's pixels, and a lens's blur on them."""
+"""Reference pictures, resampled from power maps, and blur kernels of lenses."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from foveasim.reconstruct.picture import Picture
 
 __all__ = ["blur_kernel", "reference"]
 
-#: A kernel holds this fraction of a point's light, unless told otherwise; and its pixels from the middle, at most.
+#: Default encircled energy of a kernel, and its largest radius in pixels.
 HELD_SHARE, MAX_RADIUS = 0.98, 128
-#: Distance of samples of the pattern in λN, at most: half of what its frequencies ask for.
+#: Largest sample pitch of the PSF in λN: half the Nyquist pitch.
 SAMPLE_LAMBDA_N = 0.25
-#: The pattern is sampled at this many points along an axis, at most.
+#: Largest number of PSF samples along an axis.
 MAX_SAMPLES = 8192
-#: Sum of coverage above which a pixel lies on the map.
+#: Coverage above which a pixel lies on the map.
 ON_THE_MAP = 1e-9
 
 
 def reference(light: PowerMap, grid: Grid, *, weights: Floats | None = None) -> Picture:
     """
-    A map of light on the pixels of a picture, exactly: every pixel has the mean of the map over it, by area.
+    Resample a power map to the pixels of a picture by exact area-weighted means.
 
     Parameters
     ----------
     light : PowerMap
     grid : Grid
-        The picture's pixels, of any pitch and place.
+        Pixels of the picture, of any pitch and position.
     weights : (n_channel, n_band), optional
-        What 1 W/m² of each band is worth in each channel; by default a channel a band, in W/m².
+        Value of 1 W/m² of each band in each channel; by default one channel per band, in W/m².
 
     Returns
     -------
     Picture
-        NaN off the map; its coverage is the fraction of a pixel on the map.
+        NaN outside the map; the coverage is the fraction of a pixel on the map.
 
     Raises
     ------
     ParameterError
-        When the weights do not fit the bands.
+        When the shape of ``weights`` does not match the bands.
     """
     worth = np.eye(light.wavelength_nm.size) if weights is None else finite_array("weights", weights, ndim=2)
     if worth.shape[1] != light.wavelength_nm.size:
@@ -72,24 +72,24 @@ def blur_kernel(
     radius: int | None = None,
 ) -> Floats:
     """
-    What a lens makes of one even pixel of a picture, on the picture's pixels: the ``blur`` of :func:`least_squares`.
+    Compute the blur of a uniform pixel by a lens, the ``blur`` of :func:`least_squares`.
 
     Parameters
     ----------
     optics : Optics
     grid : Grid
-        The picture's pixels.
+        Pixels of the picture.
     wavelength_nm : float, nm
     distance_m : float, optional, m
-        Of the scene; by default the distance of the focus, or infinity.
+        Distance of the scene; by default the focus distance, or infinity.
     radius : int, optional
-        Pixels from the middle to either side; by default as many as hold 98 % of a point's light along the shorter side of a
-        pixel, 128 at most.
+        Pixels from the centre to either side; by default the smallest radius with an encircled energy of 98 %, in units of
+        the shorter side of a pixel, at most 128.
 
     Returns
     -------
     kernel : (2 radius + 1, 2 radius + 1) float64
-        Of the sum 1: light that falls further off is put back.
+        Normalised to a sum of 1, which redistributes the energy outside the kernel.
 
     Raises
     ------
@@ -98,8 +98,8 @@ def blur_kernel(
 
     Notes
     -----
-    On the axis: aberrations that differ over the field are taken as in its middle. The pattern is sampled at λN/4 or finer,
-    and averaged exactly over both pixels, the one that shines and the one that is lit.
+    On the optical axis: field-dependent aberrations are those of the field centre. The PSF is sampled at λN/4 or finer, and
+    averaged exactly over both the emitting and the receiving pixel.
     """
     if not isinstance(optics, Optics):
         raise ParameterError("optics", f"must be a foveasim.Optics, got a {type(optics).__name__}")
@@ -115,12 +115,11 @@ def blur_kernel(
     if n_points > MAX_SAMPLES:
         raise ParameterError(
             "grid",
-            f"must have pixels whose blur takes at most {MAX_SAMPLES} samples across, got {n_points}",
-            hint="take pixels nearer to square, or a smaller 'radius'",
+            f"must have pixels whose PSF needs at most {MAX_SAMPLES} samples along an axis, got {n_points}",
+            hint="use pixels closer to square or a smaller 'radius'",
         )
     spread = optics.psf(wavelength_nm, distance_m=distance_m, pitch_um=step_um, n_points=n_points)
-    # From an even pixel to the mean over a pixel, a convolution with two boxes: a product of transforms, taken back at the
-    # pixels' centres alone.
+    # Convolution with the boxes of both pixels, as a product of Fourier transforms that is evaluated at pixel centres only.
     cycles_per_um = np.fft.fftfreq(n_points, step_um)
     centre_um, offset = 0.5 * (n_points - 1) * step_um, np.arange(-radius, radius + 1)
     along_y, along_x = (
@@ -134,7 +133,11 @@ def blur_kernel(
 
 
 def _overlaps_1d(to: Grid, source: Grid, axis: int) -> Any:
-    """Lengths that the cells of two grids share along an axis (0 is y), a sparse (n_to, n_source) matrix, µm."""
+    """
+    Return the overlap lengths of the cells of two grids along an axis, (n_to, n_source) µm.
+
+    Axis 0 is y. The matrix is sparse.
+    """
     from scipy.sparse import csr_array
 
     edges_to, edges_from = (

@@ -1,4 +1,8 @@
-"""Looking at layouts and captures. Needs matplotlib, which is loaded when something is drawn."""
+"""
+Plots, three-dimensional rendering and web pages of layouts and captures.
+
+matplotlib is imported when something is drawn.
+"""
 
 from __future__ import annotations
 

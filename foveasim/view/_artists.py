@@ -1,4 +1,4 @@
-"""What matplotlib has not: an image that is painted again for the pixels of its axes, and a bar that tells a length."""
+"""Matplotlib artists: an image of photosites at display resolution, and a scale bar."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from foveasim.view.site_colours import BORDER, SiteColours
 
 __all__ = ["ScaleBar", "SiteImage", "length_text", "nice_length_um"]
 
-#: Samples along a pixel's side, fewer where a picture would have more of them than 256 MB hold.
+#: Samples along a pixel side, fewer in pictures that would have more than 2^26 samples (256 MB).
 N_SAMPLES, MOST_SAMPLES = 3, 2**26
-#: Borders are drawn where they take at most this fraction of the samples, told by some of the rows: sites of 7 pixels.
+#: Boundaries are drawn if they take at most this fraction of the samples in every 16th row: sites of 7 pixels.
 MOST_BORDERS, SAMPLED_ROWS = 0.05, 16
-#: Longest fraction of the axes that a scale bar takes.
+#: Largest length of a scale bar as a fraction of the axes.
 BAR_SHARE = 0.25
 
 
 class SiteImage(AxesImage):
     """
-    Photosites in colours, painted for the very pixels that are drawn: sharp at any zoom and any resolution of a file.
+    Image of coloured photosites, sampled for each view and each file resolution.
 
     Parameters
     ----------
@@ -44,23 +44,23 @@ class SiteImage(AxesImage):
     def __init__(self, ax: Axes, layout: Layout, colours: SiteColours) -> None:
         x_min, y_min, x_max, y_max = layout.bounds_um
         super().__init__(ax, interpolation="nearest", origin="lower", extent=(x_min, x_max, y_min, y_max))
-        self.set_data(np.zeros((1, 1, 4), np.uint8))  # what asks for data before the first picture gets this
+        self.set_data(np.zeros((1, 1, 4), np.uint8))  # placeholder until the first draw
         self._layout, self._colours = layout, colours
         self.pixels: SitePixels | None = None
 
     def recolour(self, colours: SiteColours) -> None:
-        """Other colours for the same sites; which site each pixel shows stays known."""
+        """Change the colours of the sites without sampling the layout again."""
         self._colours = colours
         self.stale = True
 
     def site_at(self, x_um: float, y_um: float) -> int:
-        """The site that is seen at a point, -1 for none."""
+        """Return the site drawn at a point, -1 for none."""
         return site_at(self._layout, x_um, y_um) if self.pixels is None else int(self.pixels.site_at(x_um, y_um))
 
     def make_image(
         self, renderer: RendererBase, magnification: float = 1.0, unsampled: bool = False
     ) -> tuple[NDArray[np.uint8], float, float, Affine2D]:
-        """The picture as bytes with alpha, lowest row first, and where its lower left corner comes to be."""
+        """Return the RGBA picture, lowest row first, and the position of its lower left corner."""
         del renderer, unsampled
         window = self.axes.bbox
         low, high = np.floor(window.min), np.ceil(window.max)
@@ -81,7 +81,11 @@ class SiteImage(AxesImage):
 
 
 class ScaleBar(Artist):
-    """A bar of 1, 2 or 5 times a power of ten in the lower left corner, as long as fits, at any zoom."""
+    """
+    Scale bar in the lower left corner.
+
+    Its length is the largest 1, 2 or 5 times a power of ten that fits at the current zoom.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -90,7 +94,7 @@ class ScaleBar(Artist):
 
     @allow_rasterization  # type: ignore[untyped-decorator]
     def draw(self, renderer: RendererBase) -> None:
-        """Draw the bar for the limits that the axes have now."""
+        """Draw the bar for the current axis limits."""
         if not self.get_visible() or self.axes is None:
             return
         window, pt = self.axes.bbox, float(renderer.points_to_pixels(1.0))  # type: ignore[arg-type]
@@ -117,7 +121,7 @@ class ScaleBar(Artist):
 
 
 def nice_length_um(limit_um: float) -> float:
-    """The largest of 1, 2 and 5 times a power of ten that is not above a limit."""
+    """Return the largest 1, 2 or 5 times a power of ten that is at most a limit."""
     power = 10.0 ** math.floor(math.log10(limit_um))
     steps = [step * power for step in (1.0, 2.0, 5.0, 10.0)]
     return max(step for step in steps if step <= limit_um * (1.0 + 1e-12))
@@ -125,7 +129,7 @@ def nice_length_um(limit_um: float) -> float:
 
 def length_text(length_um: float) -> str:
     """
-    A length in the unit that suits it.
+    Format a length in nm, µm or mm.
 
     Examples
     --------

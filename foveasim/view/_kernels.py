@@ -1,4 +1,4 @@
-"""The view room's numba kernels: which photosite lies under each pixel of a picture, and the colours of the pixels."""
+"""Numba kernels that rasterise photosites and average the colours of pixels."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ _ids = types.Array(types.int32, 2, "C", readonly=True)
 _colours = types.Array(types.uint8, 2, "C", readonly=True)
 
 
-#: Samples over a shorter length than this are at one place.
+#: Samples over a shorter length than this are at one position.
 SMALLEST = 1e-200
 
 
 @njit()
 def _per_length(samples):
-    """How many evenly spaced samples there are in a unit of length; any number where there is but one."""
+    """Return the number of evenly spaced samples per unit length; 0 for a single sample."""
     length = samples[-1] - samples[0]
     return (samples.size - 1) / length if length > SMALLEST else 0.0
 
 
 @njit()
 def _first_at(samples, per_length, value):
-    """Index of the first of the evenly spaced, rising samples that is at or beyond a value; exact."""
+    """Return the index of the first of ascending, evenly spaced samples >= a value; exact."""
     if value <= samples[0]:
         return 0
     if value > samples[-1]:
         return samples.size
     k = int((value - samples[0]) * per_length) + 1
-    # The guess is off by its rounding at most: the samples themselves decide.
+    # The estimate has rounding errors; comparison with the samples makes it exact.
     while k == samples.size or samples[k - 1] >= value:
         k -= 1
     while samples[k] < value:
@@ -46,9 +46,10 @@ def _first_at(samples, per_length, value):
 @njit(types.void(_points, _ints, _floats, _floats, types.int64, types.int32[:, ::1]))
 def rows_of_sites(xy, starts, x, y, first, rows):
     """
-    First row and end of the rows of samples that each site reaches: empty when it lies between rows, or beside all columns.
+    Compute the range of sample rows that each site covers.
 
-    Site ``first + i`` has the vertices ``starts[first + i] : starts[first + i + 1]``, and its rows come to ``rows[i]``.
+    The range is empty for a site between rows, or outside all columns. Site ``first + i`` has the vertices
+    ``starts[first + i] : starts[first + i + 1]``; first row and end of its range are written to ``rows[i]``.
     """
     per_y = _per_length(y)
     for i in range(rows.shape[0]):
@@ -65,11 +66,12 @@ def rows_of_sites(xy, starts, x, y, first, rows):
 @njit(types.void(_points, _ints, _ints, _ids, _floats, _floats, types.int64, types.int32[:, ::1]))
 def paint_sites(xy, ring_offsets, site_offsets, rows, x, y, first_row, ids):
     """
-    Write the index of the site over each sample of a band of rows, the highest one where several are; others stay.
+    Write the index of the site at each sample of a band of rows.
 
-    Even-odd: every edge is crossed by the rows from its lower end (included) to its upper end (not), and turns inside to
-    outside for the samples at and beyond the crossing. The crossing is calculated from the lower end whichever way the
-    edge runs: both sites of a shared edge find the same samples.
+    Where sites overlap, the highest index is written; samples without a site are not changed. Even-odd rule: an edge is crossed
+    by the rows from its lower end (included) to its upper end (excluded), and toggles inside and outside for the samples at and
+    beyond the crossing. The crossing is always computed from the lower end, so that both sites of a shared edge find the same
+    samples.
     """
     n_rows, n_columns = ids.shape
     per_x, per_y = _per_length(x), _per_length(y)
@@ -91,7 +93,7 @@ def paint_sites(xy, ring_offsets, site_offsets, rows, x, y, first_row, ids):
                 run, rise = xy[high, 0] - xy[low, 0], high_y - low_y
                 r = max(_first_at(y, per_y, low_y) - first_row, bottom)
                 while r < top and y[first_row + r] < high_y:
-                    # Multiplied first: exact where the crossing of integers is one.
+                    # Multiply before dividing: exact for integer coordinates with an integer crossing.
                     c = _first_at(x, per_x, xy[low, 0] + (y[first_row + r] - low_y) * run / rise)
                     crossed[r, c] = not crossed[r, c]
                     left[r], right[r] = min(left[r], c), max(right[r], c)
@@ -110,10 +112,11 @@ def paint_sites(xy, ring_offsets, site_offsets, rows, x, y, first_row, ids):
 @njit(types.void(_ids, _colours, types.int64, types.boolean, types.int64, types.uint8[:, :, ::1]))
 def blended(ids, colours, n_samples, has_borders, first_row, band):
     """
-    Mean colour of the ``n_samples`` x ``n_samples`` samples of each pixel of a band of rows: red, green, blue, alpha.
+    Average the ``n_samples`` x ``n_samples`` samples of each pixel in a band of rows.
 
-    ``colours[i + 1]`` (red, green, blue, weight) is that of site i, ``colours[0]`` that of no site, and the last one, where
-    asked for, that of samples whose left or lower neighbour shows another site. Weights are 0 or 255: alpha is their mean.
+    ``colours[i + 1]`` (red, green, blue, weight) is the colour of site i, ``colours[0]`` that of the background, and the last
+    one, if ``has_borders``, that of samples whose left or lower neighbour belongs to another site. Weights are 0 or 255; alpha
+    is their mean.
     """
     border = colours.shape[0] - 1
     for row in range(band.shape[0]):

@@ -1,4 +1,4 @@
-"""The view room's numba kernel for stills without OpenGL: which triangle is nearest behind each pixel."""
+"""Numba kernel of the software renderer: the nearest triangle at each pixel (z-buffer)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["draw_triangles"]
 _points = types.Array(types.float64, 2, "C", readonly=True)
 _triangles = types.Array(types.int32, 2, "C", readonly=True)
 
-#: Pixels whose centre lies on an edge, or off it by rounding, are drawn: no light comes through between two triangles.
+#: Tolerance in pixels within which a pixel centre lies on an edge and is drawn, so that adjacent triangles leave no gap.
 ON_EDGE = 1e-9
 
 
@@ -23,9 +23,10 @@ def draw_triangles(screen, triangles, first_id, first_row, end_row, nearness, id
     """
     Draw the triangles that face the viewer into a band of rows.
 
-    ``screen`` (n_point, 3) is the place in pixels, x to the right and y **down**, and the nearness, one over the distance
-    from the plane of the eye: unlike the distance it is linear on the screen. ``nearness`` and ``ids`` (n_y, n_x) hold the
-    nearest so far; triangle i writes ``first_id + i``. Triangles that reach behind the eye (nearness <= 0) are left out.
+    ``screen`` (n_point, 3) is the position in pixels, x to the right and y **down**, and the inverse depth: one over the
+    distance from the plane of the viewer, which unlike the distance is linear on the screen. ``nearness`` and ``ids``
+    (n_y, n_x) contain the largest inverse depth so far and its triangle; triangle i writes ``first_id + i``. Triangles that
+    extend behind the viewer (inverse depth <= 0) are skipped.
     """
     n_x = ids.shape[1]
     for i in range(triangles.shape[0]):
@@ -37,7 +38,7 @@ def draw_triangles(screen, triangles, first_id, first_row, end_row, nearness, id
         if top > bottom:
             continue
         ax, bx, cx = screen[a, 0], screen[b, 0], screen[c, 0]
-        # Counter-clockwise from outside is clockwise where y points down: the others show their back.
+        # Counter-clockwise from outside is clockwise with y pointing down: other triangles are back faces.
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         az, bz, cz = screen[a, 2], screen[b, 2], screen[c, 2]
         if area >= 0.0 or min(az, bz, cz) <= 0.0:

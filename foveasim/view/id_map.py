@@ -1,4 +1,8 @@
-"""Which photosite lies under each pixel of a picture: with it, colours and the mouse are a matter of looking up."""
+"""
+Index maps: the photosite under each pixel of a picture.
+
+Colours and the site under the mouse are lookups in such a map.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +20,11 @@ from foveasim.view.site_colours import BACKGROUND, Rgb
 
 __all__ = ["SitePixels", "id_map", "site_at"]
 
-#: Pictures of more samples than this are rejected: 4 GB of indices.
+#: Largest number of samples in a picture: 4 GB of indices.
 MAX_SAMPLES = 2**30
-#: Bands of rows for each thread: two, as sites may be crowded; each band looks at all sites, so that more cost time.
+#: Bands of rows per thread: two balance the load of clustered sites; each band visits all sites, so that more are slower.
 BANDS_PER_THREAD = 2
-#: Sites whose rows are found at a time.
+#: Sites per work item in the search for their rows.
 CHUNK_SITES = 65_536
 
 Bounds = tuple[float, float, float, float]
@@ -34,16 +38,16 @@ def id_map(
     n_threads: int | None = None,
 ) -> NDArray[np.int32]:
     """
-    The photosite under the centre of each pixel.
+    Return the photosite under the centre of each pixel.
 
     Parameters
     ----------
     layout : Layout
-        Convex sites, concave ones, holes.
+        With convex or concave sites, with or without holes.
     shape : (n_y, n_x)
         Numbers of pixels.
     bounds_um : (x_min, y_min, x_max, y_max), optional, µm
-        What the pixels cover; the layout's own bounds by default.
+        Extent of the pixels; the bounds of the layout by default.
     n_threads : int, optional
         All cores by default; the result does not depend on it.
 
@@ -55,14 +59,14 @@ def id_map(
     Raises
     ------
     ParameterError
-        When the shape or the bounds are none, or the layout has no sites and no bounds are given.
+        When the shape or the bounds are invalid, or the layout has no sites and no bounds are given.
 
     Notes
     -----
-    A centre on the border of two sites belongs to the one on its +x side, or on its +y side where the border is
-    horizontal: in a tiling every pixel has one site. What lies on a slanted border is told by float64, in the same way
-    for both sites. Where sites overlap, the one with the highest index is seen. The inside of rings is told by the
-    even-odd rule, whatever their winding.
+    A pixel centre on the boundary of two sites belongs to the site on the +x side, or on the +y side if the boundary is
+    horizontal, so that every pixel of a tiling has exactly one site. Slanted boundaries are evaluated in float64, identically
+    for both sites. Where sites overlap, the highest index has priority. The interior of rings follows the even-odd rule,
+    independent of their winding.
 
     Examples
     --------
@@ -79,7 +83,11 @@ def id_map(
 
 
 def site_at(layout: PackedRings, x_um: float, y_um: float) -> int:
-    """Index of the site at a point, -1 where there is none; borders and overlaps as for :func:`id_map`."""
+    """
+    Return the index of the site at a point, -1 where there is none.
+
+    Boundaries and overlaps are resolved as in :func:`id_map`.
+    """
     point = finite_array("x_um, y_um", (x_um, y_um))
     return int(_sites_at(layout, point[:1], point[1:], 1)[0, 0])
 
@@ -87,7 +95,7 @@ def site_at(layout: PackedRings, x_um: float, y_um: float) -> int:
 @dataclass(frozen=True, eq=False)
 class SitePixels:
     """
-    A picture's pixels by the sites that they show.
+    Photosite indices of the samples of a picture.
 
     Attributes
     ----------
@@ -113,7 +121,7 @@ class SitePixels:
         n_threads: int | None = None,
     ) -> SitePixels:
         """
-        The pixels of a layout.
+        Sample a layout.
 
         Parameters
         ----------
@@ -121,9 +129,9 @@ class SitePixels:
         shape : (n_y, n_x)
             Numbers of pixels.
         bounds_um : (x_min, y_min, x_max, y_max), optional, µm
-            What the pixels cover; the layout's own bounds by default.
+            Extent of the pixels; the bounds of the layout by default.
         n_samples : int
-            Samples along each side of a pixel, for smooth borders.
+            Samples along each side of a pixel, for anti-aliased boundaries.
         n_threads : int, optional
             All cores by default.
 
@@ -153,30 +161,30 @@ class SitePixels:
         n_threads: int | None = None,
     ) -> NDArray[np.uint8]:
         """
-        The picture in which each site has a colour.
+        Return a picture with one colour per site.
 
         Parameters
         ----------
         rgb : (n_site, 3) uint8
             From :func:`foveasim.view.site_colours`.
         background : (r, g, b) or None
-            Colour of what no site covers; None for none.
+            Colour of areas without sites; None makes them transparent.
         border : (r, g, b), optional
-            Colour of lines, one sample wide, where one site ends and another begins.
+            Colour of the boundaries between sites, lines of one sample width.
         n_threads : int, optional
             All cores by default.
 
         Returns
         -------
         picture : (n_y, n_x, 3) uint8, or (n_y, n_x, 4) without a background
-            Red, green, blue, and the share that sites cover as alpha; row 0 is the lowest y. A pixel is the mean of its
-            samples' numbers as they are: on a grey scale, and nearly so on another, the mean of the values. Drawings by
-            outlines are smoothed the same way.
+            Red, green, blue, and the fraction covered by sites as alpha; row 0 is the lowest y. A pixel is the mean of its
+            encoded sample colours. On a grey scale this is the mean of the values, on other colour maps approximately. Outline
+            plots are anti-aliased in the same way.
 
         Raises
         ------
         ParameterError
-            When there are fewer colours than sites in the picture, or they are no bytes.
+            When ``rgb`` has fewer rows than there are sites in the picture, or is not uint8.
         """
         from foveasim.view import _kernels
 
@@ -184,7 +192,7 @@ class SitePixels:
         highest = int(self.ids.max(initial=-1))
         if rgb.dtype != np.uint8 or rgb.ndim != 2 or rgb.shape[1] != 3 or rgb.shape[0] <= highest:
             raise ParameterError(
-                "rgb", f"must be bytes of the shape (n_site, 3), n_site > {highest}, got {rgb.dtype} of {rgb.shape}"
+                "rgb", f"must be uint8 of shape (n_site, 3), n_site > {highest}, got {rgb.dtype} of shape {rgb.shape}"
             )
         table = np.full((rgb.shape[0] + 2, 4), 255, np.uint8)
         table[0] = (0, 0, 0, 0) if background is None else (*background, 255)
@@ -200,7 +208,11 @@ class SitePixels:
         return picture if background is None else picture[..., :3]
 
     def site_at(self, x_um: ArrayLike, y_um: ArrayLike) -> NDArray[np.int32]:
-        """The site of the sample nearest to each point, (...) int32; -1 where there is none, or beyond the picture."""
+        """
+        Return the site of the sample nearest to each point, (...) int32.
+
+        -1 where there is no site, and outside the picture.
+        """
         x, y = np.broadcast_arrays(finite_array("x_um", x_um), finite_array("y_um", y_um))
         x_min, y_min, x_max, y_max = self.bounds_um
         n_y, n_x = self.ids.shape
@@ -213,12 +225,12 @@ class SitePixels:
 def _checked(layout: PackedRings, bounds_um: Sequence[float] | Floats | None) -> Bounds:
     if bounds_um is None:
         if layout.xy_um.size == 0:
-            raise ParameterError("layout", "must have sites, or 'bounds_um' be given")
+            raise ParameterError("layout", "must have sites unless 'bounds_um' is given")
         x_um, y_um = layout.xy_um[:, 0], layout.xy_um[:, 1]
         bounds_um = (x_um.min(), y_um.min(), x_um.max(), y_um.max())
     bounds = finite_array("bounds_um", bounds_um, ndim=1)
     if bounds.size != 4 or not (bounds[0] < bounds[2] and bounds[1] < bounds[3]):
-        raise ParameterError("bounds_um", "must be (x_min, y_min, x_max, y_max)", bounds_um, "µm")
+        raise ParameterError("bounds_um", "must be (x_min, y_min, x_max, y_max) in ascending order", bounds_um, "µm")
     x_min, y_min, x_max, y_max = bounds.tolist()
     return x_min, y_min, x_max, y_max
 
@@ -228,13 +240,13 @@ def _centres_um(low_um: float, high_um: float, n: int) -> Floats:
 
 
 def _bands(n_rows: int, n_threads: int) -> list[slice]:
-    """The rows in pieces. A row is painted by itself, so that their number cannot be seen in the result."""
+    """Split rows into bands; rows are independent, so that the result does not depend on them."""
     height = -(-n_rows // (BANDS_PER_THREAD * n_threads)) if n_threads > 1 else n_rows
     return [slice(start, min(start + height, n_rows)) for start in range(0, n_rows, height)]
 
 
 def _sites_at(layout: PackedRings, x_um: Floats, y_um: Floats, n_threads: int) -> NDArray[np.int32]:
-    """The site at each sample of rising columns and rows, (n_y, n_x) int32."""
+    """Return the site at each sample of ascending columns and rows, (n_y, n_x) int32."""
     from foveasim.view import _kernels
 
     n_sites = layout.site_offsets.size - 1

@@ -1,7 +1,7 @@
 """
-Photosites as surfaces in three dimensions: flat polygons for PyVista, triangles, columns as high as what a site measured.
+Surface meshes of photosites: flat polygons for PyVista, triangulations, and prisms.
 
-One frame with the sensor's: x to the right, y up, z toward the lens. Triangles are counter-clockwise seen from outside.
+Coordinates are those of the sensor: x to the right, y up, z toward the lens. Triangles are counter-clockwise from outside.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Caps", "Mesh", "extruded", "polydata", "prisms", "triangulated"]
 
-#: A triangle of less than this fraction of its site's box is a line to float64.
+#: Triangles below this fraction of the area of their site's bounding box are degenerate in float64.
 FLAT_SHARE = 1e-12
-#: Columns are as high as this fraction of the layout's width, by default.
+#: Default height of the tallest prism as a fraction of the layout's longer side.
 TALLEST_SHARE = 0.15
-#: Sites that one call of the triangulation takes.
+#: Sites per call of the triangulation.
 SITES_A_CALL = 20_000
-#: What a capture measured, in its PolyData.
+#: Measured quantities of a capture in its PolyData.
 MEASURED = ("code", "electrons", "expected_e", "filter_of_site")
 
 Indices = NDArray[np.int32]
@@ -46,21 +46,21 @@ RgbArray = NDArray[np.uint8]
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Mesh:
     """
-    A surface of triangles whose points know their photosite.
+    Triangle mesh with the photosite, value and colour of every point.
 
     Attributes
     ----------
     name : str
-        What it is: ``"wells"``.
+        Name of the part, such as ``"wells"``.
     points_um : (n_point, 3) float64, µm
     triangles : (n_triangle, 3) int32
-        Points of each triangle, counter-clockwise from outside. All three are of one photosite.
+        Points of each triangle, counter-clockwise from outside. All three belong to one photosite.
     photosite : (n_point,) int32
-        Site that a point belongs to; -1 for none.
+        Photosite of each point; -1 for none.
     values : (n_point,) float64
-        What is shown of the site, in its unit.
+        Value of the photosite, in its unit.
     colours : (n_point, 3) uint8
-        Red, green, blue, encoded as screens expect.
+        Red, green, blue, sRGB-encoded.
     """
 
     name: str
@@ -75,14 +75,14 @@ class Mesh:
 
     @property
     def bounds_um(self) -> tuple[Floats, Floats]:
-        """Lowest and highest corner of its box, (3,) µm each."""
+        """Lowest and highest corner of the bounding box, (3,) µm each."""
         if self.points_um.size == 0:
-            raise GeometryError(f"the mesh {self.name!r} is empty, and so has no bounds")
+            raise GeometryError(f"the mesh {self.name!r} is empty and has no bounds")
         return self.points_um.min(axis=0), self.points_um.max(axis=0)
 
     def to_pyvista(self) -> PolyData:
         """
-        The surface as PolyData with the cell data ``photosite``, ``value`` and ``rgb``.
+        Return the mesh as PolyData with the cell data ``photosite``, ``value`` and ``rgb``.
 
         Raises
         ------
@@ -100,24 +100,24 @@ class Mesh:
 
 
 class Caps(NamedTuple):
-    """Triangles that cover photosites."""
+    """Triangulation of photosites."""
 
     triangles: Ints
     """(n_triangle, 3) vertices of the layout, counter-clockwise."""
     site: Ints
-    """(n_triangle,) site of each."""
+    """(n_triangle,) site of each triangle."""
     weld: Ints
-    """(n_vertex,) the vertex that stands for each: itself, save where a hole touches its outline in a corner."""
+    """(n_vertex,) representative of each vertex: itself, except where a hole touches the outline in a vertex."""
 
 
 def triangulated(layout: Layout) -> Caps:
     """
-    Triangles that cover every photosite exactly, with its own vertices only.
+    Triangulate every photosite exactly, with its own vertices only.
 
     Parameters
     ----------
     layout : Layout
-        Of sites that do not cross themselves.
+        With sites that do not intersect themselves.
 
     Returns
     -------
@@ -125,9 +125,9 @@ def triangulated(layout: Layout) -> Caps:
 
     Notes
     -----
-    A fan from one corner covers the site when no triangle of it is turned over: the signed areas of its triangles add up to
-    one inside the outline and nought outside, everywhere. Other sites, and those with holes, are given to GEOS's
-    constrained Delaunay triangulation.
+    A fan from one vertex covers the site when none of its triangles is reversed: the winding numbers of its triangles then sum
+    to 1 inside the outline and to 0 outside. Other sites, and those with holes, use the constrained Delaunay triangulation of
+    GEOS.
     """
     n_vertices = np.diff(layout.ring_offsets)
     has_hole = np.diff(layout.site_offsets) > 1
@@ -159,22 +159,22 @@ def extruded(
     layout: Layout, caps: Caps, low_um: ArrayLike, high_um: ArrayLike, *, has_floor: bool = True
 ) -> tuple[Floats, Indices, Indices]:
     """
-    Prisms over photosites.
+    Extrude photosites to prisms.
 
     Parameters
     ----------
     layout : Layout
     caps : Caps
-        Of the same layout.
+        Triangulation of the same layout.
     low_um, high_um : number or (n_site,), µm
-        Heights of floor and roof.
+        Heights of the bottom and top faces.
     has_floor : bool
-        Whether they are closed below.
+        Whether the prisms have bottom faces.
 
     Returns
     -------
     points_um : (2 n_vertex, 3) float64, µm
-        The layout's vertices on the floor, then on the roof.
+        Vertices of the layout at the bottom, then at the top.
     triangles : (n_triangle, 3) int32
     photosite : (2 n_vertex,) int32
     """
@@ -205,30 +205,30 @@ def prisms(
     max_height_um: float | None = None,
 ) -> Mesh:
     """
-    Photosites as columns whose height is what they measured.
+    Return photosites as prisms whose heights show their values.
 
     Parameters
     ----------
     data : Layout or Capture
     height : str or (n_site,) array
-        What the height shows: ``"code"``, ``"electrons"``, ``"expected_e"``, ``"area_um2"``, ``"size_um"``, any column of
-        numbers, or one value per site, at least 0. By default the code of a capture, the size of a layout's sites.
+        Quantity shown by the height: ``"code"``, ``"electrons"``, ``"expected_e"``, ``"area_um2"``, ``"size_um"``, any
+        numerical column, or one value per site, at least 0. By default the code of a capture, or the site sizes of a layout.
     by : str or array, optional
-        What the colour shows, as in :func:`foveasim.view.colours_of`; by default the same as the height.
+        Quantity shown by the colour, as in :func:`foveasim.view.colours_of`; by default that of the height.
     max_height_um : float, µm
-        Height of the tallest column; 0.15 of the layout's longer side by default.
+        Height of the tallest prism; 0.15 of the layout's longer side by default.
 
     Returns
     -------
     Mesh
-        Open below. ``values`` are what the height shows.
+        Without bottom faces. ``values`` are those that the height shows.
 
     Raises
     ------
     GeometryError
-        When there are no sites.
+        When the layout has no sites.
     ParameterError
-        When a name is no column, or there is not one finite value of at least 0 a site.
+        When a column does not exist, or there is not one finite value of at least 0 per site.
 
     Examples
     --------
@@ -267,7 +267,7 @@ def prisms(
 
 def polydata(data: Layout | Capture) -> PolyData:
     """
-    Photosites as polygons in the plane z = 0, for PyVista.
+    Return photosites as PyVista polygons in the plane z = 0.
 
     Parameters
     ----------
@@ -276,10 +276,9 @@ def polydata(data: Layout | Capture) -> PolyData:
     Returns
     -------
     pyvista.PolyData
-        One polygon a site, in the sites' order, when none has a hole or an inward corner; such sites are several
-        triangles each. Cell data: ``photosite``, ``area_um2``, ``channel``, ``readout_line``, every column, and of a
-        capture ``code``, ``electrons``, ``expected_e``, ``filter_of_site``. Field data: ``provenance`` and of a capture
-        ``settings``, as JSON.
+        One polygon per site, in site order; sites with a hole or a reflex vertex are several triangles. Cell data:
+        ``photosite``, ``area_um2``, ``channel``, ``readout_line``, every column, and for a capture ``code``, ``electrons``,
+        ``expected_e``, ``filter_of_site``. Field data: ``provenance``, and for a capture ``settings``, as JSON.
 
     Raises
     ------
@@ -315,7 +314,11 @@ def polydata(data: Layout | Capture) -> PolyData:
 
 
 def _cells(layout: Layout) -> tuple[Ints, Ints, Ints]:
-    """Polygons of all sites: offsets, vertices and sites; sites that VTK would fill wrongly as triangles."""
+    """
+    Return polygons of all sites: offsets, vertices and sites.
+
+    Sites that VTK would fill incorrectly are split into triangles.
+    """
     counts = np.diff(layout.ring_offsets)
     is_whole = _is_convex(layout)
     if is_whole.all():
@@ -327,7 +330,7 @@ def _cells(layout: Layout) -> tuple[Ints, Ints, Ints]:
     sizes = np.concatenate((counts[whole_rings], np.full(parts.shape[0], 3)))
     photosite = np.concatenate((whole, caps.site[~is_whole[caps.site]]))
     vertices = np.repeat(layout.ring_offsets[whole_rings], counts[whole_rings]) + positions_in_runs(counts[whole_rings])
-    # In the order of the sites, so that a cell is found beside its neighbours.
+    # In site order, so that the cells of a site are contiguous.
     order = np.argsort(photosite, kind="stable")
     starts = np.concatenate(([0], np.cumsum(sizes)))[:-1]
     flat = np.concatenate((vertices, parts.ravel()))
@@ -336,7 +339,7 @@ def _cells(layout: Layout) -> tuple[Ints, Ints, Ints]:
 
 
 def _is_convex(layout: Layout) -> Bools:
-    """Whether a site has no hole and no inward corner, (n_site,)."""
+    """Return whether each site has neither a hole nor a reflex vertex, (n_site,)."""
     if layout.n_sites == 0:
         return np.zeros(0, bool)
     turn = _turns(layout.xy_um, layout.ring_offsets)
@@ -345,7 +348,7 @@ def _is_convex(layout: Layout) -> Bools:
 
 
 def _turns(xy_um: Floats, ring_offsets: Ints) -> Floats:
-    """Sine of the angle by which the outline turns to the left at each vertex, (n_vertex,)."""
+    """Return the sine of the left turn of the outline at each vertex, (n_vertex,)."""
     after = next_vertex(ring_offsets)
     out = xy_um[after] - xy_um
     into = np.empty_like(out)
@@ -355,7 +358,11 @@ def _turns(xy_um: Floats, ring_offsets: Ints) -> Floats:
 
 
 def _fans(xy_um: Floats, ring_offsets: Ints) -> tuple[Ints, Bools]:
-    """Triangles of every ring from one of its corners (sum of n - 2, 3), and whether none is flat or turned over."""
+    """
+    Return a triangle fan of every ring (sum of n - 2, 3), and whether it is valid.
+
+    A fan is valid when none of its triangles is degenerate or reversed.
+    """
     counts = np.diff(ring_offsets)
     if counts.size == 0:
         return np.zeros((0, 3), np.int64), np.zeros(0, bool)
@@ -366,11 +373,11 @@ def _fans(xy_um: Floats, ring_offsets: Ints) -> tuple[Ints, Bools]:
     after = next_vertex(ring_offsets)
     before = np.empty_like(after)
     before[after] = np.arange(after.size)
-    # From the sharpest inward corner; else from where both neighbours are true corners, so that no triangle is flat.
+    # From the sharpest reflex vertex; otherwise from a vertex between two true corners, so that no triangle is degenerate.
     merit = np.where(is_inward[ring], -turn, np.minimum(turn[before], turn[after]))
     best = np.flatnonzero(merit == np.maximum.reduceat(merit, starts)[ring])
     apex = np.empty(counts.size, np.int64)
-    apex[ring[best][::-1]] = best[::-1]  # the first of equals
+    apex[ring[best][::-1]] = best[::-1]  # the first of equal candidates
     n_triangles = counts - 2
     of = np.repeat(np.arange(counts.size), n_triangles)
     step = positions_in_runs(n_triangles) + 1
@@ -386,14 +393,18 @@ def _fans(xy_um: Floats, ring_offsets: Ints) -> tuple[Ints, Bools]:
 
 
 def _delaunay(layout: Layout, sites: Ints) -> tuple[Ints, Ints, Ints, Ints]:
-    """Triangles and sites of some photosites by GEOS; the photosites' vertices, and which vertex stands for each."""
+    """
+    Triangulate some photosites with GEOS.
+
+    Returns triangles and their sites, the vertices of the photosites, and the representative of each vertex.
+    """
     part = layout[sites]
     triangles, owner = shapely.get_parts(shapely.constrained_delaunay_triangles(part.polygons()), return_index=True)
     corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     is_turned = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] < 0.0
     corners[is_turned] = corners[is_turned, ::-1]
-    # Each corner is found among the vertices of its site by its coordinates, which are the same numbers.
+    # Corners are matched to the vertices of their site by their coordinates, which are bit-identical.
     first = layout.ring_offsets[layout.site_offsets[sites]]
     counts = layout.ring_offsets[layout.site_offsets[sites + 1]] - first
     vertices = np.repeat(first, counts) + positions_in_runs(counts)
@@ -409,12 +420,12 @@ def _delaunay(layout: Layout, sites: Ints) -> tuple[Ints, Ints, Ints, Ints]:
     found = stand_in[group]
     if found.min(initial=0) < 0:
         bad = sites[site[np.flatnonzero(found < 0)[0]]]
-        raise GeometryError(f"site {bad} cannot be cut into triangles; repair its outline", (int(bad),))
+        raise GeometryError(f"site {bad} cannot be triangulated; repair its outline", (int(bad),))
     return found[vertices.size :].reshape(-1, 3), sites[owner], vertices, found[: vertices.size]
 
 
 def _polydata(points_um: Floats, offsets: Indices, corners: Indices) -> PolyData:
-    """PolyData of polygons with these corners."""
+    """Return PolyData of polygons."""
     pyvista = imported_pyvista()
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonDataModel import vtkCellArray
@@ -429,12 +440,12 @@ def _polydata(points_um: Floats, offsets: Indices, corners: Indices) -> PolyData
 
 def imported_pyvista() -> Any:
     """
-    The package PyVista.
+    Import and return PyVista.
 
     Raises
     ------
     ParameterError
-        When it is not installed.
+        When PyVista is not installed.
     """
     try:
         import pyvista

@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 
 __all__ = ["plot_capture", "plot_layout", "plot_noise_budget", "save_drawing", "save_figure"]
 
-#: Layouts of more sites are drawn as an image, which takes less time than their outlines.
+#: Layouts of more sites are drawn as an image, which is faster than outlines.
 MOST_OUTLINES = 4000
-#: Layouts of more sites are not drawn with their adjacency: nobody could see it, and finding it takes long.
+#: Layouts of more sites are not drawn with their adjacency, which would be illegible and slow to compute.
 MOST_ADJACENT = 50_000
-#: Drawings of more sites are slow to open everywhere.
+#: Drawings of more sites open slowly in all viewers.
 MOST_DRAWN = 20_000
-#: Least fraction of a figure's shorter side in its longer one: axes, texts and bars need room.
+#: Smallest ratio of a figure's shorter side to its longer one, which leaves space for axes, labels and colour bars.
 SLIMMEST = 0.4
-#: Readout lines are as much darker than the colours that their sites may have.
+#: Brightness of readout lines relative to the category colours of their sites.
 LINE_BRIGHTNESS = 0.55
 
 
@@ -50,43 +50,43 @@ def plot_layout(
     figure_inches: float = 8.0,
 ) -> Axes:
     """
-    Draw photosites, filled by a value or a colour each.
+    Draw photosites, filled by a value or a colour.
 
     Parameters
     ----------
     layout : Layout
     by : str or array, optional
-        ``"channel"``, ``"area_um2"``, ``"size_um"``, ``"readout_line"`` or any other column; one value per site, NaN where
-        there is none; or a colour a site (n_site, 3). The bare shapes by default. See :func:`foveasim.view.colours_of`.
+        ``"channel"``, ``"area_um2"``, ``"size_um"``, ``"readout_line"`` or any other column; one value per site, NaN for no
+        data; or a colour per site (n_site, 3). By default only the shapes. See :func:`foveasim.view.colours_of`.
     label : str
-        What an array holds, with its unit.
+        Quantity and unit of an array.
     overlay : str or sequence of str
-        ``"readout_lines"``: a line through the centres of the sites in the order in which they are read, from a dot.
-        ``"adjacency"``: a line between the centres of any two sites that share an edge.
+        ``"readout_lines"``: a line through the site centres in readout order, starting at a dot. ``"adjacency"``: a line
+        between the centres of any two sites that share an edge.
     scale_bar : bool
-        Whether a bar tells a length.
+        Whether to draw a scale bar.
     legend : bool
-        Whether a colour bar or a legend tells what the colours mean.
+        Whether to draw a colour bar or a legend.
     ax : matplotlib axes, optional
-        New ones by default.
+        New axes by default.
     figure_inches : float
         Longer side of a new figure.
 
     Returns
     -------
     matplotlib axes
-        In µm, x to the right and y up. In a window, the site under the mouse is told.
+        In µm, x to the right and y up. In a window, the status bar shows the site under the mouse.
 
     Raises
     ------
     ParameterError
-        When there is no such column, the array has not one row per site, or the layout is no such that could be overlaid.
+        When a column does not exist, the array does not have one row per site, or the layout does not support an overlay.
 
     Notes
     -----
-    Up to 4,000 sites are outlines, which stay outlines in a file of vectors. More are an image, painted for the pixels
-    there are: again after each zoom, and at the resolution of the file that is saved. Its borders are smoothed by 3 x 3
-    samples a pixel.
+    Up to 4,000 sites are drawn as outlines, which remain vector graphics in files. Larger layouts are drawn as an image, which
+    is sampled again after each zoom and at the resolution of a saved file. Its boundaries are anti-aliased with 3 x 3 samples
+    per pixel.
     """
     return _plot(layout, colours_of(layout, by, label=label), overlay, scale_bar, legend, ax, figure_inches)
 
@@ -103,21 +103,21 @@ def plot_capture(
     figure_inches: float = 8.0,
 ) -> Axes:
     """
-    Draw the photosites of a capture, coloured by what they measured.
+    Draw the photosites of a capture, coloured by their measured values.
 
     Parameters
     ----------
     capture : Capture
     by : str or array
-        ``"code"``, ``"electrons"``, ``"expected_e"``, ``"snr"`` (:meth:`Capture.signal_to_noise`), or what :func:`plot_layout`
-        takes.
+        ``"code"``, ``"electrons"``, ``"expected_e"``, ``"snr"`` (:meth:`Capture.signal_to_noise`), or any value that
+        :func:`plot_layout` accepts.
     label, overlay, scale_bar, legend, ax, figure_inches
         As for :func:`plot_layout`.
 
     Returns
     -------
     matplotlib axes
-        On a colour mosaic each site has its filter's colour, as bright as its value.
+        On a colour mosaic each site has the colour of its filter, scaled by its value.
 
     Raises
     ------
@@ -133,16 +133,16 @@ def plot_noise_budget(
     noise_e: Mapping[str, Floats], *, classes: ArrayLike | None = None, ax: Axes | None = None
 ) -> Axes:
     """
-    Draw the noise budget as bars: the root of the mean square of every source, temporal sources above fixed ones.
+    Draw the noise budget as bars of the RMS of every source, temporal sources on top.
 
     Parameters
     ----------
     noise_e : mapping of (n_site,) arrays, e-
         From :func:`foveasim.sensor.noise_budget`.
     classes : (n_site,) integers, optional
-        Sites of the same number share bars, such as a column of sizes or the channel; by default all do.
+        Sites with the same number share bars, for example a column of sizes or the channel; by default all sites do.
     ax : matplotlib axes, optional
-        New ones by default.
+        New axes by default.
 
     Returns
     -------
@@ -151,7 +151,7 @@ def plot_noise_budget(
     Raises
     ------
     ParameterError
-        When there is not one class a site.
+        When there is not one class per site.
     """
     from matplotlib.figure import Figure
 
@@ -160,7 +160,7 @@ def plot_noise_budget(
     n_sites = next(iter(noise_e.values())).size
     labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(unmasked("classes", classes))
     if labels.shape != (n_sites,):
-        raise ParameterError("classes", f"must be one for each of the {n_sites} sites, got {labels.shape}")
+        raise ParameterError("classes", f"must have one value for each of the {n_sites} sites, got {labels.shape}")
     shown = {name: values for name, values in noise_e.items() if np.any(values > 0.0)}
     kinds = np.unique(labels)
     for k, kind in enumerate(kinds):
@@ -178,16 +178,16 @@ def plot_noise_budget(
 
 def save_figure(figure: Figure, path: str | Path, dpi: float = 150.0) -> None:
     """
-    Write a figure, whole or not at all.
+    Write a figure atomically.
 
     Raises
     ------
     FileError
-        When nothing can be written there.
+        When the format is unknown, or the file cannot be written.
     """
-    # As small as the usual level 6, in two thirds of its time.
+    # Same size as the default level 6, in two thirds of the time.
     options: dict[str, Any] = {"pil_kwargs": {"compress_level": 3}} if Path(path).suffix.lower() == ".png" else {}
-    # In memory: on a full disk some encoders leave half a file.
+    # Encoded in memory: on a full disk some encoders leave a partial file.
     encoded = io.BytesIO()
     with atomic_write(path) as temporary:
         try:
@@ -199,22 +199,22 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = 150.0) -> None:
 
 def save_drawing(data: Layout | Capture, path: str | Path, by: str | ArrayLike | None = None) -> None:
     """
-    Write a layout or a capture as a drawing in the format SVG: one path per site, in µm, without axes.
+    Write a layout or a capture as an SVG drawing: one path per site, in µm, without axes.
 
     Parameters
     ----------
     data : Layout or Capture
     path : str or Path
-        Ends in ``.svg``.
+        With the extension ``.svg``.
     by : str or array, optional
-        What the colours show; see :func:`foveasim.view.colours_of`.
+        Quantity shown by the colours; see :func:`foveasim.view.colours_of`.
 
     Raises
     ------
     ParameterError
         When there are more than 20,000 sites.
     FileError
-        When the path ends in something else, or nothing can be written there.
+        When the extension is another, or the file cannot be written.
     """
     layout = data.layout if isinstance(data, Capture) else data
     rgb = colours_of(data, by).rgb
@@ -224,7 +224,7 @@ def save_drawing(data: Layout | Capture, path: str | Path, by: str | ArrayLike |
         raise ParameterError(
             "data",
             f"must have at most {MOST_DRAWN:,} sites for a drawing, got {layout.n_sites:,}",
-            hint="save a picture with save_figure, or a part of the layout",
+            hint="save a picture with save_figure, or draw a part of the layout",
         )
     colours, position = np.unique(rgb, axis=0, return_inverse=True)
     names = {k: "#{:02x}{:02x}{:02x}".format(*colour) for k, colour in enumerate(colours.tolist())}
@@ -232,7 +232,7 @@ def save_drawing(data: Layout | Capture, path: str | Path, by: str | ArrayLike |
 
 
 def new_axes(figure_inches: float, ratio: float = 1.0) -> Axes:
-    """Axes of their own for what is ``ratio`` times as high as wide, on a figure whose longer side is given."""
+    """Return axes on a new figure, for content with the given ratio of height to width."""
     from matplotlib.figure import Figure
 
     width, height = max(SLIMMEST, min(1.0, 1.0 / ratio)), max(SLIMMEST, min(1.0, ratio))
@@ -284,7 +284,7 @@ def _plot(
 
 
 def _explain(ax: Axes, colours: SiteColours) -> None:
-    """A colour bar for sizes, a legend for kinds."""
+    """Add a colour bar for a scale, or a legend for categories."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import PowerNorm
     from matplotlib.patches import Patch
@@ -302,7 +302,7 @@ def _explain(ax: Axes, colours: SiteColours) -> None:
 
 
 def _format_site(layout: Layout, colours: SiteColours, x_um: float, y_um: float, site: int) -> str:
-    """What stands below a window for the point under the mouse."""
+    """Return the status bar text for the point under the mouse."""
     place = f"x = {x_um:.6g} µm, y = {y_um:.6g} µm"
     if site < 0:
         return place
@@ -317,7 +317,11 @@ def _format_site(layout: Layout, colours: SiteColours, x_um: float, y_um: float,
 
 
 def _coloured_outlines(layout: Layout, colours: SiteColours) -> Collection:
-    """All sites as one collection: polygons where none has a hole, which matplotlib draws faster, else paths."""
+    """
+    Return all sites as one collection.
+
+    Polygons if no site has a hole, which matplotlib draws faster, otherwise paths.
+    """
     from matplotlib.collections import PathCollection, PolyCollection
     from matplotlib.path import Path as Outline
 
@@ -325,7 +329,7 @@ def _coloured_outlines(layout: Layout, colours: SiteColours) -> Collection:
     style["edgecolors"] = [shares(BORDER)] if colours.has_borders else "face"
     counts = np.diff(layout.ring_offsets)
     if counts.size == layout.n_sites:
-        # One array where all have as many vertices: matplotlib's types know sequences only, its code takes both.
+        # One array if all sites have the same number of vertices: matplotlib accepts it, although its types ask for sequences.
         is_even = counts.size > 0 and bool(np.all(counts == counts[0]))
         rings: Any = (
             layout.xy_um.reshape(layout.n_sites, -1, 2)
@@ -334,7 +338,7 @@ def _coloured_outlines(layout: Layout, colours: SiteColours) -> Collection:
         )
         return PolyCollection(rings, **style)
     outlines = []
-    for site in range(layout.n_sites):  # matplotlib wants an object for each site
+    for site in range(layout.n_sites):  # matplotlib needs one object per site
         ids = range(layout.site_offsets[site], layout.site_offsets[site + 1])
         parts = [layout.xy_um[layout.ring_offsets[r] : layout.ring_offsets[r + 1]] for r in ids]
         outlines.append(Outline.make_compound_path(*(Outline(part, closed=False) for part in map(_closed, parts))))
@@ -346,7 +350,7 @@ def _closed(ring_um: Floats) -> Floats:
 
 
 def _draw_readout_lines(layout: Layout, ax: Axes) -> None:
-    """A line through the centres of the sites of each readout line, and a dot where it begins."""
+    """Draw a line through the site centres of each readout line, and a dot at its start."""
     from matplotlib.collections import LineCollection
 
     line = layout.index_column("readout_line")
@@ -362,13 +366,13 @@ def _draw_readout_lines(layout: Layout, ax: Axes) -> None:
 
 
 def _draw_adjacency(layout: Layout, ax: Axes) -> None:
-    """A line between the centres of any two sites that share an edge."""
+    """Draw a line between the centres of any two sites that share an edge."""
     from matplotlib.collections import LineCollection
 
     if layout.n_sites > MOST_ADJACENT:
         raise ParameterError(
             "overlay",
-            f"'adjacency' is for at most {MOST_ADJACENT:,} sites, got {layout.n_sites:,}",
+            f"must not be 'adjacency' above {MOST_ADJACENT:,} sites, got {layout.n_sites:,}",
             hint="draw a part of the layout",
         )
     pairs = layout.adjacency().tocoo()
@@ -377,7 +381,7 @@ def _draw_adjacency(layout: Layout, ax: Axes) -> None:
     ax.add_collection(LineCollection(list(ends_um), colors="#202020", linewidths=0.9))
 
 
-#: What can be drawn over the sites.
+#: Overlays by their names.
 OVERLAYS: Mapping[str, Callable[[Layout, Axes], None]] = {
     "readout_lines": _draw_readout_lines,
     "adjacency": _draw_adjacency,

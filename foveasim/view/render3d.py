@@ -1,8 +1,8 @@
 """
-Pictures of scenes in three dimensions, with PyVista or without.
+Rendering of three-dimensional scenes, with PyVista or in software.
 
-Both renderers share the viewpoint, one light, flat shading and the smoothing of edges, so that their pictures agree: PyVista's
-is made where the machine has OpenGL, and adds windows and the shade of corners; the other one needs nothing.
+Both renderers share the viewpoint, one light source, flat shading and anti-aliasing, so that their pictures agree. PyVista
+needs OpenGL, and adds windows and ambient occlusion; the software renderer has no requirements.
 """
 
 from __future__ import annotations
@@ -28,27 +28,28 @@ if TYPE_CHECKING:
 
 __all__ = ["SceneOfMeshes", "Viewpoint", "render", "show", "sites_in_view"]
 
-#: Light that every face gets, and that one facing the light gets more. Together 1: no colour is clipped.
+#: Ambient reflection of every face, and additional reflection of a face toward the light source. Their sum is 1, so that no
+#: colour is clipped.
 AMBIENT, DIFFUSE = 0.35, 0.65
-#: Where the light comes from, as seen by the viewer: to the right, toward him, up.
+#: Direction of the light source relative to the viewer: to the right, horizontally toward the viewer, up.
 LIGHT = (-0.38, 0.30, 0.87)
-#: A soft background on which both light and dark colours stand out.
+#: Background with contrast to both light and dark colours.
 BACKGROUND = (238, 240, 244)
 #: The scene fills this fraction of the picture's narrower direction.
 FILLED_SHARE = 0.94
-#: Points that decide how far off the viewer stands.
+#: Number of points that determine the viewing distance.
 FRAMING_POINTS = 50_000
-#: Bisections that find the scene's middle to a thousandth of a pixel.
+#: Bisections that locate the centre of the scene to a thousandth of a pixel.
 CENTRING_STEPS = 24
-#: Rows that are drawn beyond the border and cut off: the shade of corners has a stray line there.
+#: Margin that is rendered and cropped: ambient occlusion has a line artefact at the picture boundary.
 SHADE_MARGIN_PX = 16
-#: How far the shade of corners reaches, as a fraction of the scene's size.
+#: Radius of ambient occlusion as a fraction of the scene's size.
 SHADE_REACH_SHARE = 0.02
-#: What is nearer than this fraction of the reach throws no shade: with less the depth buffer's steps show as hatching.
+#: Bias of ambient occlusion as a fraction of its radius: a smaller bias shows the steps of the depth buffer as hatching.
 SHADE_BIAS_SHARE = 0.1
-#: Scenes of more triangles are drawn with one sample a pixel, by default: a picture in seconds.
+#: Scenes of more triangles have one sample per pixel by default, which renders them in seconds.
 SMOOTHED_TRIANGLES = 1_000_000
-#: More pixels than this are a slip.
+#: Largest side of a picture, to catch mistakes.
 MAX_SIDE_PX = 32_768
 
 RgbArray: TypeAlias = NDArray[np.uint8]
@@ -56,11 +57,11 @@ RgbArray: TypeAlias = NDArray[np.uint8]
 
 @runtime_checkable
 class SceneOfMeshes(Protocol):
-    """Something that consists of meshes, such as :class:`foveasim.view.Solids`."""
+    """Protocol of objects that consist of meshes, such as :class:`foveasim.view.Solids`."""
 
     @property
     def meshes(self) -> tuple[Mesh, ...]:
-        """Its parts."""
+        """Parts of the scene."""
 
 
 Shown: TypeAlias = Mesh | Iterable[Mesh] | SceneOfMeshes
@@ -69,20 +70,22 @@ Shown: TypeAlias = Mesh | Iterable[Mesh] | SceneOfMeshes
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Viewpoint:
     """
-    From where a scene is looked at. The viewer stands so far off that it fills the picture.
+    Viewing direction, zoom and angle of view of a scene.
+
+    The distance of the viewer is such that the scene fills the picture.
 
     Parameters
     ----------
     azimuth_deg : float
-        Direction in which the viewer stands, from +x counter-clockwise: at -90 he sees x to the right.
+        Azimuth of the viewer, counter-clockwise from +x: at -90, x points to the right.
     elevation_deg : float
-        Height of the viewer over the sensor's plane, from -90 to 90.
+        Elevation of the viewer over the sensor plane, from -90 to 90.
     zoom : float
-        2 shows things twice as large.
+        Magnification: 2 doubles all lengths in the picture.
     focus_um : (x, y, z), optional, µm
-        What is in the picture's middle; that of the scene by default.
+        Point in the centre of the picture; the centre of the scene by default.
     view_deg : float
-        Vertical angle of view: small ones flatten, large ones draw in.
+        Vertical angle of view: small angles flatten the perspective, large angles exaggerate it.
 
     Raises
     ------
@@ -107,7 +110,7 @@ class Viewpoint:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Eye:
-    """A viewpoint on a given scene and picture."""
+    """Viewpoint for a given scene and picture size."""
 
     position_um: Floats
     focus_um: Floats
@@ -117,7 +120,7 @@ class _Eye:
     view_deg: float
 
     def on_screen(self, points_um: Floats, size_px: tuple[int, int]) -> Floats:
-        """Place in the picture in pixels, x to the right and y down, and the nearness, (n_point, 3)."""
+        """Project points to pixels, x to the right and y down, and inverse depth, (n_point, 3)."""
         seen = (points_um - self.position_um) @ self.axes.T  # to the right, up, toward the viewer
         with np.errstate(divide="ignore"):
             np.divide(-1.0, seen[:, 2], out=seen[:, 2])
@@ -139,42 +142,41 @@ def render(
     renderer: Literal["auto", "pyvista", "software"] = "auto",
 ) -> RgbArray:
     """
-    A picture of a scene, off screen.
+    Render a scene to a picture, off screen.
 
     Parameters
     ----------
-    scene : Mesh, several of them, or Solids
+    scene : Mesh, sequence of Mesh, or Solids
     path : path, optional
-        Where the picture is written, too; its ending chooses the format.
+        File to which the picture is also written; its extension selects the format.
     viewpoint : Viewpoint, optional
     size_px : (int, int)
         Width and height of the picture.
     oversampling : int, optional
-        Each pixel is the mean of so many by so many; 1 has jagged edges and is faster. By default 2, and 1 for scenes of more
-        than a million triangles.
+        Each pixel is the mean of n x n samples; 1 has jagged edges and is faster. By default 2, and 1 for scenes of more than
+        a million triangles.
     ambient_occlusion : bool
-        Whether places that little light reaches are darker (ambient occlusion); by PyVista only.
+        Whether to darken corners and gaps by ambient occlusion; PyVista only.
     background : (r, g, b)
         Colour behind the scene.
     renderer : {"auto", "pyvista", "software"}
-        By default PyVista where it can render, otherwise the renderer that needs nothing, with a warning that says what to
-        install.
+        By default PyVista if it can render, otherwise the software renderer, with a warning that names the missing software.
 
     Returns
     -------
     picture : (n_y, n_x, 3) uint8
-        First row on top.
+        Top row first.
 
     Raises
     ------
     FileError
-        When the path cannot be written.
+        When the file cannot be written.
     GeometryError
-        When there is nothing to show.
+        When the scene is empty.
     ParameterError
         When a parameter is out of range.
     SimulationError
-        When ``renderer="pyvista"`` and it cannot render here.
+        When ``renderer="pyvista"`` and PyVista cannot render on this machine.
     """
     meshes = _meshes(scene)
     check_choice("renderer", renderer, ("auto", "pyvista", "software"))
@@ -188,8 +190,8 @@ def render(
     if missing and renderer == "pyvista":
         raise SimulationError(missing)
     if missing:
-        warnings.warn(f"{missing}; the picture is made without", FoveasimWarning, stacklevel=2)
-    # The shade of corners has a stray line at the border, which is cut off.
+        warnings.warn(f"{missing}; the software renderer is used", FoveasimWarning, stacklevel=2)
+    # Ambient occlusion has a line artefact at the picture boundary, which is cropped.
     margin = SHADE_MARGIN_PX * oversampling if ambient_occlusion and not missing and renderer != "software" else 0
     width, height = n_x * oversampling, n_y * oversampling
     eye = _eye(meshes, viewpoint or Viewpoint(), (width, height))
@@ -207,7 +209,7 @@ def sites_in_view(
     scene: Shown, *, viewpoint: Viewpoint | None = None, size_px: tuple[int, int] = (1600, 1000)
 ) -> NDArray[np.int32]:
     """
-    The photosite seen in each pixel of the picture that :func:`render` makes of the same scene.
+    Return the photosite visible in each pixel of the picture by :func:`render`.
 
     Parameters
     ----------
@@ -217,7 +219,7 @@ def sites_in_view(
     Returns
     -------
     site : (n_y, n_x) int32
-        First row on top; -1 where no photosite is seen.
+        Top row first; -1 where no photosite is visible.
     """
     meshes = _meshes(scene)
     n_x, n_y = _size(size_px, 1)
@@ -229,7 +231,7 @@ def sites_in_view(
 
 def show(scene: Shown, *, viewpoint: Viewpoint | None = None, size_px: tuple[int, int] = (1600, 1000)) -> None:
     """
-    Open a window on a scene, which the mouse turns; returns when it is closed.
+    Show a scene in an interactive window until the window is closed.
 
     Parameters
     ----------
@@ -239,7 +241,7 @@ def show(scene: Shown, *, viewpoint: Viewpoint | None = None, size_px: tuple[int
     Raises
     ------
     SimulationError
-        When this machine has no screen, no OpenGL or no PyVista; the message says what to do.
+        When this machine has no screen, no OpenGL or no PyVista; the message names a remedy.
     """
     meshes = _meshes(scene)
     size = _size(size_px, 1)
@@ -254,7 +256,7 @@ def show(scene: Shown, *, viewpoint: Viewpoint | None = None, size_px: tuple[int
     plotter.show()
 
 
-# -- what is shared ------------------------------------------------------------------------------------------------------
+# -- both renderers ------------------------------------------------------------------------------------------------------
 
 
 def _meshes(scene: Shown) -> list[Mesh]:
@@ -265,7 +267,9 @@ def _meshes(scene: Shown) -> list[Mesh]:
     else:
         found = list(scene) if isinstance(scene, Iterable) else [scene]
     if not all(isinstance(mesh, Mesh) for mesh in found):
-        raise ParameterError("scene", "must be a Mesh, several of them, or Solids; make one with view.prisms", scene)
+        raise ParameterError(
+            "scene", "must be a Mesh, a sequence of them, or Solids; create one with view.prisms", scene
+        )
     found = [mesh for mesh in found if mesh.triangles.size]
     if not found:
         raise GeometryError("the scene is empty: there is nothing to show")
@@ -280,7 +284,7 @@ def _size(size_px: tuple[int, int], oversampling: int) -> tuple[int, int]:
 
 
 def _eye(meshes: list[Mesh], viewpoint: Viewpoint, size_px: tuple[int, int]) -> _Eye:
-    """Where the viewer stands: in his direction, so far off that the scene just fits, with its middle in the middle."""
+    """Place the viewer at the distance at which the scene just fits, centred in the picture."""
     azimuth, elevation = np.radians(viewpoint.azimuth_deg), np.radians(viewpoint.elevation_deg)
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     toward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
@@ -292,8 +296,8 @@ def _eye(meshes: list[Mesh], viewpoint: Viewpoint, size_px: tuple[int, int]) -> 
     reach = FILLED_SHARE * 0.5 * np.array(size_px) / focal_px
     seen = (points - middle_um) @ axes.T
     across_um, toward_um = seen[:, :2], seen[:, 2:]
-    # A point at s across and z toward the viewer is inside when |s - offset| <= reach (distance - z): two lines in the
-    # offset, whose crossing is the nearest place from which both borders hold.
+    # A point at s across and z toward the viewer is visible when |s - offset| <= reach (distance - z). Both limits are lines
+    # in the offset, whose intersection is the smallest distance that satisfies both.
     from_right, from_left = (np.max(sign * across_um / reach + toward_um, axis=0) for sign in (1.0, -1.0))
     if viewpoint.focus_um is None:
         distance = _beyond(float(np.max(0.5 * (from_right + from_left))), toward_um, size_um)
@@ -308,12 +312,16 @@ def _eye(meshes: list[Mesh], viewpoint: Viewpoint, size_px: tuple[int, int]) -> 
 
 
 def _beyond(distance_um: float, toward_um: Floats, size_um: float) -> float:
-    """The distance, or a little before the nearest point where the scene is flat and seen from its edge."""
+    """
+    Limit the distance to at least slightly in front of the nearest point.
+
+    This matters for a flat scene viewed along its plane.
+    """
     return max(distance_um, float(toward_um.max()) + 1e-3 * size_um)
 
 
 def _centred(across_um: Floats, before_um: Floats) -> Floats:
-    """Where the viewer looks so that the outermost points are equally far from the middle, (2,)."""
+    """Return the offset at which the outermost points are equally far from the centre, (2,)."""
     low, high = across_um.min(axis=0), across_um.max(axis=0)
     for _ in range(CENTRING_STEPS):
         middle = 0.5 * (low + high)
@@ -324,22 +332,22 @@ def _centred(across_um: Floats, before_um: Floats) -> Floats:
 
 
 def _framing(mesh: Mesh) -> Floats:
-    """Some of a mesh's points, those on its box among them."""
+    """Return a subset of the points of a mesh that includes its extreme points."""
     step = max(1, mesh.points_um.shape[0] // FRAMING_POINTS)
     extremes = np.concatenate((mesh.points_um.argmin(axis=0), mesh.points_um.argmax(axis=0)))
     return np.concatenate((mesh.points_um[::step], mesh.points_um[extremes]))
 
 
 def _light(eye: _Eye) -> Floats:
-    """Unit vector toward the light, which stands beside the viewer whichever way he looks."""
+    """Return the unit vector toward the light source, which moves with the viewer."""
     right = eye.axes[0]
-    ahead = np.array([right[1], -right[0], 0.0])  # along the background toward the viewer
+    ahead = np.array([right[1], -right[0], 0.0])  # horizontal, toward the viewer
     light = LIGHT[0] * right + LIGHT[1] * ahead + LIGHT[2] * np.array([0.0, 0.0, 1.0])
     return np.asarray(light / np.linalg.norm(light))
 
 
 def _mean(large: RgbArray, oversampling: int) -> RgbArray:
-    """Mean of each square of pixels."""
+    """Average each square of samples."""
     if oversampling == 1:
         return large
     n_y, n_x = (n // oversampling for n in large.shape[:2])
@@ -350,11 +358,11 @@ def _mean(large: RgbArray, oversampling: int) -> RgbArray:
     return ((total + oversampling**2 // 2) // oversampling**2).astype(np.uint8)
 
 
-# -- without OpenGL -----------------------------------------------------------------------------------------------------
+# -- software renderer --------------------------------------------------------------------------------------------------
 
 
 def _nearest(meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int]) -> tuple[NDArray[np.int32], Floats]:
-    """Number of the nearest triangle behind each pixel (n_y, n_x), -1 for none; and how near it is."""
+    """Return the nearest triangle (-1 for none) and its inverse depth, (n_y, n_x) each."""
     from foveasim.view import _zbuffer_kernels
 
     draw = _zbuffer_kernels.draw_triangles
@@ -375,7 +383,7 @@ def _nearest(meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int]) -> tuple[N
 
 
 def _drawn(meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int], background: tuple[int, int, int]) -> RgbArray:
-    """The picture by the z-buffer; only triangles that are seen are lit."""
+    """Render with the z-buffer; only visible triangles are shaded."""
     ids, _ = _nearest(meshes, eye, size_px)
     n_x, n_y = size_px
     picture = np.empty((n_y, n_x, 3), np.uint8)
@@ -396,7 +404,7 @@ def _drawn(meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int], background: 
     return picture
 
 
-# -- with PyVista -------------------------------------------------------------------------------------------------------
+# -- PyVista ------------------------------------------------------------------------------------------------------------
 
 
 def _by_pyvista(
@@ -407,7 +415,7 @@ def _by_pyvista(
     ambient_occlusion: bool,
     margin_px: int,
 ) -> RgbArray:
-    """The picture by VTK; a margin is drawn around it and cut off."""
+    """Render with VTK; a margin is rendered around the picture and cropped."""
     n_x, n_y = size_px
     plotter = _plotter(meshes, eye, (n_x + 2 * margin_px, n_y + 2 * margin_px), background, off_screen=True)
     try:
@@ -424,7 +432,11 @@ def _by_pyvista(
 def _plotter(
     meshes: list[Mesh], eye: _Eye, size_px: tuple[int, int], background: tuple[int, int, int], *, off_screen: bool
 ) -> Plotter:
-    """PyVista's plotter with the scene in it: one light and no multisampling: several times as fast as its defaults."""
+    """
+    Return a PyVista plotter of the scene.
+
+    One light source and, off screen, no multisampling are several times as fast as the defaults of PyVista.
+    """
     begin_rendering()
     pyvista = imported_pyvista()
     plotter = pyvista.Plotter(off_screen=off_screen, window_size=list(size_px), lighting="none")
@@ -438,7 +450,7 @@ def _plotter(
         surface = mesh.to_pyvista()
         surface.points = surface.points.astype(
             np.float32
-        )  # what graphics cards take; VTK would convert them one by one
+        )  # native type of graphics cards; VTK would convert element by element
         plotter.add_mesh(
             surface,
             scalars="rgb",
@@ -455,7 +467,7 @@ def _plotter(
     camera.position = tuple(eye.position_um)
     camera.focal_point = tuple(eye.focus_um)
     camera.up = tuple(eye.axes[1])
-    # The margin widens the angle by what it adds in pixels.
+    # The angle of view includes the margin.
     camera.view_angle = float(np.degrees(2.0 * np.arctan(0.5 * size_px[1] / eye.focal_px)))
     plotter.reset_camera_clipping_range()
     return plotter

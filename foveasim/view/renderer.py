@@ -1,8 +1,8 @@
 """
-What this machine can render three dimensions with, found without the crash of trying.
+Detection of the OpenGL renderers that VTK can use on this machine.
 
-Where no OpenGL is, VTK ends the interpreter instead of raising. So libraries are asked first, without VTK; then a program of
-its own draws a few pixels with VTK and is read: what survives that may be used here.
+Without OpenGL, VTK terminates the interpreter instead of raising an exception. Libraries are therefore queried first, without
+VTK; then a separate process renders a few pixels with VTK. A renderer that passes this trial is used.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from foveasim._core.extras import install_hint
 
 __all__ = ["ON_SCREEN", "begin_rendering", "find_renderer", "what_to_install"]
 
-#: Names by which VTK's window classes are chosen, and the variable that chooses.
+#: Environment variable that selects VTK's window class, and names of these classes.
 VTK_CHOICE = "VTK_DEFAULT_OPENGL_WINDOW"
 X11, EGL, OSMESA = "vtkXOpenGLRenderWindow", "vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow"
-#: Systems whose own windows VTK always has.
+#: Systems whose native windows VTK always supports.
 OF_SYSTEM = {"darwin": "vtkCocoaRenderWindow", "win32": "vtkWin32OpenGLRenderWindow"}
-#: Those that a person can look at.
+#: Window classes that display on a screen.
 ON_SCREEN = frozenset({X11, *OF_SYSTEM.values()})
-#: From EGL's headers: a display without screen (EGL_MESA_platform_surfaceless).
+#: From the EGL headers: a display without a screen (EGL_MESA_platform_surfaceless).
 EGL_PLATFORM_SURFACELESS_MESA = 0x31DD
-#: A renderer that has drawn nothing after this time hangs.
+#: Time limit of a trial.
 TRIAL_S = 60.0
-#: Draws eight by eight pixels of one colour and looks at them.
+#: Renders 8 x 8 pixels of one colour and compares them.
 TRIAL = """
 import vtkmodules.vtkRenderingOpenGL2
 from vtkmodules.util.numpy_support import vtk_to_numpy
@@ -52,17 +52,17 @@ raise SystemExit(vtk_to_numpy(pixels).tolist() != [[255, 0, 255]] * 64)
 @cache
 def find_renderer() -> str | None:
     """
-    The window class with which VTK can render on this machine, found once.
+    Return the window class with which VTK can render on this machine; cached.
 
     Returns
     -------
     str or None
-        The name of the VTK class: on a screen, by EGL or by OSMesa without one; None where there is none, or no VTK.
+        Name of the VTK class: on a screen, or without a screen by EGL or OSMesa; None if there is none, or no VTK.
 
     Notes
     -----
-    A ``VTK_DEFAULT_OPENGL_WINDOW`` in the environment is tried first. On the first call a program of its own renders a
-    few pixels, which takes some tenths of a second; a crash ends that program alone.
+    ``VTK_DEFAULT_OPENGL_WINDOW`` in the environment is tried first. On the first call a separate process renders a few
+    pixels, which takes some tenths of a second; a crash terminates that process only.
     """
     if find_spec("vtkmodules") is None:
         return None
@@ -70,14 +70,18 @@ def find_renderer() -> str | None:
 
 
 def begin_rendering() -> None:
-    """Tell VTK which window to use; to be called before its first one, where :func:`find_renderer` found one."""
+    """
+    Select VTK's window class in the environment.
+
+    Must be called before VTK creates its first window. Without effect if :func:`find_renderer` finds no class.
+    """
     found = find_renderer()
     if found is not None:
         os.environ[VTK_CHOICE] = found
 
 
 def what_to_install() -> str:
-    """What is missing for pictures by PyVista, as a sentence; empty where nothing is."""
+    """Return a message on the software that PyVista rendering lacks; empty if it is complete."""
     if any(find_spec(module) is None for module in ("pyvista", "vtkmodules")):
         return f"PyVista is not installed; {install_hint('pyvista')}"
     if find_renderer() is None:
@@ -86,7 +90,7 @@ def what_to_install() -> str:
 
 
 def _candidates() -> Iterator[str]:
-    """Window classes whose libraries are here and answer, the best first."""
+    """Yield the window classes whose libraries are available and respond, the best first."""
     if os.environ.get(VTK_CHOICE):
         yield os.environ[VTK_CHOICE]
     if sys.platform in OF_SYSTEM:
@@ -101,10 +105,10 @@ def _candidates() -> Iterator[str]:
 
 
 def _survives(window: str) -> bool:
-    """Whether a program of its own renders with this class of window."""
+    """Return whether a separate process renders with a window class."""
     command = [sys.executable, "-P", "-c", TRIAL]
     try:
-        trial = subprocess.run(  # noqa: S603 -- our own text
+        trial = subprocess.run(  # noqa: S603 -- fixed command
             command, env={**os.environ, VTK_CHOICE: window}, capture_output=True, timeout=TRIAL_S, check=False
         )
     except (OSError, subprocess.TimeoutExpired):
@@ -120,7 +124,7 @@ def _library(name: str) -> ctypes.CDLL | None:
 
 
 def _opens_display() -> bool:
-    """Whether X11 is here and shows something: a name alone in DISPLAY does not."""
+    """Return whether X11 opens a display; the variable DISPLAY alone is not sufficient."""
     x11 = _library("libX11.so.6")
     if x11 is None:
         return False
@@ -135,8 +139,12 @@ def _opens_display() -> bool:
 
 
 def _initialises_egl() -> bool:
-    """Whether EGL finds a driver for a display without screen: the library alone, without a driver, makes VTK crash."""
-    os.environ.setdefault("EGL_LOG_LEVEL", "fatal")  # Mesa would print where it has looked in vain
+    """
+    Return whether EGL finds a driver for a display without a screen.
+
+    The library without a driver makes VTK crash.
+    """
+    os.environ.setdefault("EGL_LOG_LEVEL", "fatal")  # otherwise Mesa prints missing paths
     egl = _library("libEGL.so.1")
     if egl is None:
         return False

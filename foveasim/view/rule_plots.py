@@ -1,4 +1,4 @@
-"""Broken design rules where they are: on the layout, a colour and a line of text for each rule."""
+"""Plots of design rule violations, with one colour and one legend entry per rule."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 __all__ = ["plot_report"]
 
-#: Strong colours, one a rule, none of them among those of bare shapes.
+#: Saturated colours, one per rule, distinct from those of bare shapes.
 RULE_COLOURS = ("#d62728", "#1f5fd0", "#c218b8", "#e07b00", "#0a8a5a", "#6a3fb5", "#8a5a2b", "#008ba3")
-#: Of each rule the worst violations are drawn, and these have their values beside them when there are few in all.
+#: Number of violations that are drawn per rule, the worst first; and largest total number that is annotated with values.
 MOST_SHOWN, MOST_TEXTS = 2000, 40
-#: Circles of the first rule, in points; each further rule's are wider, so that several at one place can be told apart.
+#: Circles of the first rule, in points; those of each further rule are wider, so that circles at one position differ.
 CIRCLE_PT, CIRCLE_STEP_PT = 9.0, 4.0
-#: How far below the axes the rules stand: under their numbers and their label.
+#: Distance of the legend below the axes, clear of their tick labels and axis label.
 LEGEND_BELOW_PT = 36.0
-#: Room around the markers where no layout is given, as a fraction of their extent.
+#: Margin around the markers if no layout is given, as a fraction of their extent.
 ROOM_SHARE = 0.1
 
 
@@ -34,37 +34,35 @@ def plot_report(
     report: Report, layout: Layout | None = None, *, ax: Axes | None = None, figure_inches: float = 8.0
 ) -> Axes:
     """
-    Draw the places where a layout breaks its design rules.
+    Draw the design rule violations of a layout.
 
     Parameters
     ----------
     report : Report
         From :meth:`foveasim.Layout.check`.
     layout : Layout, optional
-        The layout that was checked, drawn below.
+        The checked layout, drawn below the violations.
     ax : matplotlib axes, optional
-        New ones by default.
+        New axes by default.
     figure_inches : float
         Longer side of a new figure.
 
     Returns
     -------
     matplotlib axes
-        In µm. The shape and a circle for each place, in the colour of its rule; what was measured beside it, where there
-        are at most 40 places; the rules with their worst values below. What is waived is dashed. Of each rule at most the
-        worst 2,000 places are drawn.
+        In µm. Each violation is drawn as its marker and a circle in the colour of its rule, with the measured value if there
+        are at most 40 violations. The legend below lists the violated rules with their worst values. Waived violations are
+        dashed. At most the worst 2,000 violations of each rule are drawn.
 
     Raises
     ------
     ParameterError
-        When the layout has another number of sites than was checked.
+        When the number of sites differs from that of the checked layout.
     """
     from matplotlib.transforms import ScaledTranslation
 
     if layout is not None and layout.n_sites != report.n_sites:
-        raise ParameterError(
-            "layout", f"must be the one that was checked, of {report.n_sites} sites", layout.n_sites, "sites"
-        )
+        raise ParameterError("layout", f"must be the checked layout of {report.n_sites} sites", layout.n_sites, "sites")
     broken = [result for result in report.results if len(result)]
     if layout is not None and layout.n_sites:
         ax = plot_layout(layout, ax=ax, figure_inches=figure_inches)
@@ -91,7 +89,7 @@ def plot_report(
     n_kept = len(report.results) - len(broken)
     ax.set_title(
         f"{n_violations:,} violation{'s' * (n_violations != 1)} on {report.n_sites:,} photosites, "
-        f"{n_kept} of {len(report.results)} rules kept",
+        f"{n_kept} of {len(report.results)} rules satisfied",
         fontsize="medium",
     )
     if broken:
@@ -104,7 +102,7 @@ def plot_report(
 
 
 def _draw_result(ax: Axes, result: RuleResult, markers: NDArray[Any], k: int) -> None:
-    """The shapes and the circles of one rule."""
+    """Draw the markers and circles of one rule."""
     from matplotlib.collections import LineCollection, PolyCollection
 
     colour = RULE_COLOURS[k % len(RULE_COLOURS)]
@@ -125,12 +123,12 @@ def _draw_result(ax: Axes, result: RuleResult, markers: NDArray[Any], k: int) ->
 
 
 def _middles_um(markers: NDArray[Any]) -> NDArray[np.float64]:
-    """The middles that the report's records give, (n, 2)."""
+    """Return the marker centroids, as in the records of the report, (n, 2)."""
     return np.asarray(shapely.get_coordinates(shapely.centroid(markers)))
 
 
 def _write(ax: Axes, text: str, place_um: NDArray[np.float64], k: int) -> None:
-    """A text beside a place of the k-th broken rule, legible on any ground."""
+    """Annotate a position of the k-th violated rule, legible on any background."""
     from matplotlib.patheffects import withStroke
 
     colour, beside_pt = RULE_COLOURS[k % len(RULE_COLOURS)], 0.4 * (CIRCLE_PT + k * CIRCLE_STEP_PT) + 2.0

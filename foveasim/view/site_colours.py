@@ -1,4 +1,4 @@
-"""One colour for each photosite, for every kind of picture: of what it measured, its filter, its size, any column."""
+"""Colours of photosites by measured value, filter, size or any column."""
 
 from __future__ import annotations
 
@@ -27,55 +27,55 @@ __all__ = [
     "site_colours",
 ]
 
-#: Values that differ by less than this share are equal up to rounding, and get one colour.
+#: Values within this relative difference are equal up to rounding, and have one colour.
 SAME = 1e-9
-#: Colours as red, green and blue from 0 to 255, encoded as screens expect (sRGB).
+#: Colours as red, green and blue from 0 to 255, sRGB-encoded.
 Rgb: TypeAlias = tuple[int, int, int]
 RgbArray: TypeAlias = NDArray[np.uint8]
 
-#: Colours of filters by their names.
+#: Colours of filters by name.
 FILTER_COLOURS: Mapping[str, Rgb] = {
     "R": (255, 64, 51), "G": (77, 230, 77), "B": (77, 115, 255), "W": (255, 255, 255), "C": (64, 220, 230),
     "M": (235, 80, 220), "Y": (245, 225, 60), "IR": (150, 60, 90), "NIR": (150, 60, 90), "all": (255, 255, 255),
 }  # fmt: skip
-#: Names of the channels of a layout that no sensor has given filters yet: the order of :func:`foveasim.layout.mosaic`.
+#: Channel names of a layout without filters, in the order of :func:`foveasim.layout.mosaic`.
 CHANNEL_NAMES = "RGBW"
-#: Colours of things that differ in kind, of middling brightness: lines and text can lie on them.
+#: Colours of categories, of medium brightness, so that lines and text on them are legible.
 CATEGORY_COLOURS: tuple[Rgb, ...] = (
     (86, 140, 200), (236, 160, 60), (70, 165, 130), (205, 95, 80), (150, 120, 190),
     (130, 195, 225), (190, 180, 70), (225, 145, 185), (140, 110, 90), (150, 155, 160),
 )  # fmt: skip
-#: Pale shades of sites that are shown for their shapes alone, neighbours mostly different.
+#: Pale shades of sites without values; neighbours mostly differ.
 SHADES: tuple[Rgb, ...] = ((222, 226, 232), (202, 209, 218), (232, 228, 219), (212, 219, 212), (236, 236, 238))
-#: What no photosite covers is neither black nor white.
+#: Areas without photosites: neither black nor white.
 BACKGROUND: Rgb = (185, 196, 214)
-#: Lines between sites.
+#: Boundaries between sites.
 BORDER: Rgb = (64, 64, 64)
-#: Sites without a value (NaN): a colour of none of the colour maps in use.
+#: Sites without a value (NaN): in none of the colour maps in use.
 NO_DATA: Rgb = (217, 140, 150)
-#: What was measured is shown as a photograph; what is known of a site in a map of even steps, also to the colour-blind.
+#: Colour maps of measured signals, and of other columns: the latter is perceptually uniform and colour-blind safe.
 PHOTOGRAPH, EVEN_STEPS = "gray", "viridis"
-#: On a colour mosaic values are raised to this power before they scale a colour, so that dark sites can be told apart.
+#: Exponent of values before they scale a filter colour on a mosaic, so that dark sites are distinguishable.
 DISPLAY_GAMMA = 1.0 / 2.2
-#: Integers of more kinds than this are shown as sizes, and texts without a legend.
+#: Integers with more distinct values are shown on a scale, and strings without a legend.
 MOST_CATEGORIES = 10
-#: What a capture measured, and how it is called.
+#: Measured quantities of a capture, with their titles.
 MEASURED = {"code": "code / DN", "electrons": "electrons / e-", "expected_e": "expected charge / e-"}
 
 
 @dataclass(frozen=True, slots=True)
 class ColourScale:
     """
-    What a colour bar shows.
+    Value range and colour map of a colour bar.
 
     Attributes
     ----------
     low, high : float
-        Values at the ends of the map, ``low < high``.
+        Values at the ends of the colour map, ``low < high``.
     colour_map : str
-        One of matplotlib's.
+        Name of a matplotlib colour map.
     gamma : float
-        Power that a value's fraction of the scale is raised to.
+        Exponent of a value's fraction of the scale.
     """
 
     low: float
@@ -87,22 +87,22 @@ class ColourScale:
 @dataclass(frozen=True, eq=False, slots=True)
 class SiteColours:
     """
-    Colours of photosites, and what they mean.
+    Colours of photosites with their scale or legend.
 
     Attributes
     ----------
     rgb : (n_site, 3) uint8
-        Red, green, blue, encoded as screens expect.
+        Red, green, blue, sRGB-encoded.
     title : str
-        What is shown, with its unit: ``"area / µm²"``; empty for bare shapes.
+        Quantity and unit, such as ``"area / µm²"``; empty for bare shapes.
     values : (n_site,) array or None
-        What is shown, of each site: numbers or texts.
+        Value of each site: numbers or strings.
     scale : ColourScale or None
-        For a colour bar, when values are sizes.
+        Scale of the colour bar of numerical values.
     legend : tuple of (str, (r, g, b))
-        Names of colours, when values are kinds; empty when there are too many.
+        Names and colours of categories; empty if there are too many.
     has_borders : bool
-        Whether sites are to be set off from each other: not in a photograph, nor where the colours are given.
+        Whether boundaries between sites are drawn; not for measured signals and given colours.
     """
 
     rgb: RgbArray
@@ -114,30 +114,30 @@ class SiteColours:
 
 
 def shares(rgb: Rgb, factor: float = 1.0) -> tuple[float, float, float]:
-    """A colour by numbers from 0 to 1, as matplotlib has them, times a factor that makes it darker."""
+    """Return a colour as fractions from 0 to 1, as in matplotlib, multiplied by a factor."""
     red, green, blue = (factor * c / 255.0 for c in rgb)
     return red, green, blue
 
 
 def site_colours(data: Layout | Capture, by: str | ArrayLike | None = None) -> RgbArray:
-    """The colours alone, (n_site, 3) uint8; see :func:`colours_of`."""
+    """Return the RGB colours of photosites, (n_site, 3) uint8; see :func:`colours_of`."""
     return colours_of(data, by).rgb
 
 
 def colours_of(data: Layout | Capture, by: str | ArrayLike | None = None, *, label: str = "") -> SiteColours:
     """
-    A colour for each photosite.
+    Return a colour for each photosite, with its scale or legend.
 
     Parameters
     ----------
     data : Layout or Capture
     by : str or array, optional
-        ``"code"``, ``"electrons"``, ``"expected_e"`` of a capture: as a photograph, on a colour mosaic in the filters'
-        colours. ``"channel"``: the colour of the filter; a layout alone has R, G, B and W in this order. ``"area_um2"``,
+        ``"code"``, ``"electrons"``, ``"expected_e"`` of a capture: in grey, or on a colour mosaic in the filter colours.
+        ``"channel"``: the colour of the filter; channels of a layout are R, G, B and W in this order. ``"area_um2"``,
         ``"size_um"`` (the square root of the area), ``"readout_line"`` or any other column. An array: one value per site, or
-        a colour a site (n_site, 3), uint8 or from 0 to 1. By default the code of a capture, the bare shapes of a layout.
+        a colour per site (n_site, 3), uint8 or from 0 to 1. By default the code of a capture, or the bare shapes of a layout.
     label : str
-        What an array holds, with its unit; instead of what a name says, too.
+        Quantity and unit of an array; replaces the title of a named column.
 
     Returns
     -------
@@ -146,12 +146,13 @@ def colours_of(data: Layout | Capture, by: str | ArrayLike | None = None, *, lab
     Raises
     ------
     ParameterError
-        When there is no such column, or not one value per site, or one is infinite.
+        When a column does not exist, there is not one value per site, or a value is infinite.
 
     Notes
     -----
-    Text, truth values and integers of at most ten kinds are kinds, with a legend; readout lines are kinds in any
-    number, whose colours repeat. Other numbers are sizes, on a scale from their smallest to their largest. NaN is no data.
+    Strings, booleans and integers with at most ten distinct values are categories, with a legend. Readout lines are always
+    categories; their colours repeat. Other numbers are shown on a scale from their smallest to their largest value. NaN is no
+    data.
 
     Examples
     --------
@@ -193,19 +194,19 @@ def _column(layout: Layout, by: str, is_capture: bool) -> NDArray[Any]:
 
 
 def _title(name: str) -> str:
-    """What a column's name says, and its unit."""
+    """Return the title of a column: its name in words and its unit."""
     suffix = next((suffix for suffix in UNIT_SUFFIXES if name.lower().endswith(suffix)), "")
     bare, unit = name[: len(name) - len(suffix)].replace("_", " "), UNIT_SUFFIXES.get(suffix, "")
     return f"{bare} / {unit}" if bare and unit else bare or unit
 
 
 def _of_array(by: ArrayLike, n_sites: int, label: str) -> SiteColours:
-    """Colours of values, or given ones as they are."""
+    """Return the colours of an array of values, or given colours."""
     by = unmasked("by", by, missing_is_nan=True)
     try:
         array = own(np.asarray(by))
     except ValueError:
-        raise ParameterError("by", "must be one value for each site", by) from None
+        raise ParameterError("by", "must have one value for each site", by) from None
     if array.ndim == 0 or array.shape[0] != n_sites or array.shape[1:] not in ((), (3,)):
         raise ParameterError("by", f"must have one row for each of the {n_sites} sites, got {array.shape}")
     if array.ndim == 2:
@@ -218,7 +219,7 @@ def _of_array(by: ArrayLike, n_sites: int, label: str) -> SiteColours:
 
 
 def _photograph(capture: Capture, values: Floats, title: str) -> SiteColours:
-    """What was measured in shades of grey, or of each site's filter."""
+    """Return measured values in shades of grey, or of the filter of each site."""
     if len(capture.filter_names) == 1:
         return _sizes(values, title, PHOTOGRAPH)
     base = np.array([_filter_colour(k, name) for k, name in enumerate(capture.filter_names)], np.float64)
@@ -248,14 +249,14 @@ def _filters(channel: Ints, names: tuple[str, ...], title: str) -> SiteColours:
 def _is_kind(values: NDArray[Any]) -> bool:
     if values.dtype.kind not in "iu":
         return values.dtype.kind in "bU"
-    # A span first: finding the kinds of a million different numbers takes long.
+    # The range is checked first: np.unique is slow for a million different numbers.
     span = int(values.max(initial=0)) - int(values.min(initial=0))
     return span < 2**16 and np.unique(values).size <= MOST_CATEGORIES
 
 
 def _kinds(values: NDArray[Any], title: str) -> SiteColours:
     names, kind = np.unique(values, return_inverse=True)
-    # Lines keep the colours of their numbers, whichever of them a layout has.
+    # Integers select the colour directly, so that readout lines have the same colours in any part of a layout.
     if names.dtype.kind in "iu":
         kind = values.astype(np.int64)
     kind = kind % len(CATEGORY_COLOURS)
@@ -268,7 +269,11 @@ def _kinds(values: NDArray[Any], title: str) -> SiteColours:
 
 
 def _sizes(values: Floats, title: str, colour_map: str) -> SiteColours:
-    """Colours of a map from the smallest value to the largest; one in the middle where all are equal."""
+    """
+    Return colours of a colour map from the smallest value to the largest.
+
+    Equal values have the colour at the centre of the map.
+    """
     from matplotlib import colormaps
 
     is_known = ~np.isnan(values)
@@ -287,7 +292,7 @@ def _sizes(values: Floats, title: str, colour_map: str) -> SiteColours:
 
 
 def _strewn(n: int, n_kinds: int) -> Ints:
-    """Numbers below ``n_kinds`` that look thrown, the same at each call: the last steps of Murmur's hash of the positions."""
+    """Return reproducible pseudo-random integers below ``n_kinds`` (MurmurHash3 finaliser)."""
     mixed = np.arange(n, dtype=np.uint64)
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35), (16, 1)):
         mixed = ((mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)) & np.uint64(0xFFFFFFFF)

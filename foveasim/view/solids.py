@@ -1,17 +1,19 @@
 """
-The sensor as solids: wells, the trenches between them, colour filters and microlenses, closed and with their thicknesses.
+Solid models of a sensor: wells, trenches, colour filters and microlenses.
+
+Parts are closed surfaces with physical thicknesses.
 
 ::
 
         ╭──────╮╭──────╮   lenses: caps over the sites
         ├──────┤├──────┤   filters: prisms over the sites         z = filter_thickness_um
         ├┬────┬┤├┬────┬┤                                           z = 0
-        ││    │││││    ││   trenches: each site less its well
-        ││    ││││    ││   wells: the site with its border moved inwards
+        ││    │││││    ││   trenches: each site minus its well
+        ││    ││││    ││   wells: sites with their boundaries offset inwards
         └┴────┴┘└┴────┴┘                                           z = -well_depth_um
 
-Every part is made by numpy, site by site, so that a photosite keeps its number in it; manifold3d checks it and makes true cuts,
-trimesh writes it.
+All parts are created with numpy, site by site, so that every point has the number of its photosite. manifold3d checks and cuts
+them, trimesh writes them.
 """
 
 from __future__ import annotations
@@ -40,41 +42,41 @@ from foveasim.view.site_colours import colours_of
 
 __all__ = ["PartReport", "SensorStack", "Solids", "SolidsReport", "solids", "stack", "write_meshes"]
 
-#: Kinds of files, by their endings.
+#: Supported file extensions.
 FORMATS = (".glb", ".stl", ".3mf", ".ply", ".obj")
-#: Colours of what has no filter's: silicon, oxide in the trenches, the glass of lenses.
+#: Colours of parts without a filter: silicon, oxide in the trenches, glass of the lenses.
 SILICON, OXIDE, GLASS = (116, 132, 160), (58, 64, 78), (208, 228, 240)
-#: How much of a lens's colour is its filter's, which is seen through it.
+#: Fraction of the filter colour in the colour of a lens, through which the filter is visible.
 SEEN_THROUGH = 0.35
-#: What is uncovered of the sensor cut open: from this fraction of its width and up to this fraction of its height.
+#: Regions that are removed in the cut-away view: from this fraction of the width, up to this fraction of the height.
 QUARTER = (0.5, 0.5)
 TERRACES = (((0.39, 0.61), ("filters", "lenses")), ((0.27, 0.73), ("lenses",)))
-#: Overlaps below this fraction of the smaller part are rounding.
+#: Overlaps below this fraction of the smaller part are rounding errors.
 ROUNDING = 1e-9
-#: Thicker than this is no layer on a sensor.
+#: Upper limit of the thickness of a layer.
 MAX_THICKNESS_UM = 1000.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorStack:
     """
-    Thicknesses of what a sensor is made of.
+    Layer thicknesses of a sensor.
 
     Parameters
     ----------
     well_depth_um : float, µm
         Depth of the silicon that collects charge, and of the trenches.
     trench_width_um : float, µm
-        Between two neighbours' wells; each site gives half of it. 0 for none.
+        Distance between the wells of neighbours; each site contributes half of it. 0 for none.
     filter_thickness_um : float, µm
         0 for no filters.
     lens_height_um : float, µm
-        Of a lens's middle over its border; over a site too small for it, that of a half ball of the site's area. 0 for none.
+        Height of the apex of a lens above its rim, at most that of a hemisphere with the area of the site. 0 for none.
     n_lens_steps : int
-        Steps by which a lens rises.
+        Number of height steps of a lens.
     n_lens_corners : int
-        A lens's outline has at least so many corners, and grows rounder toward its middle; 0 for those of the site alone, from
-        border to middle.
+        Minimum number of vertices of a lens outline, which becomes rounder toward the apex. 0 uses the vertices of the site,
+        and its shape from rim to apex.
 
     Raises
     ------
@@ -102,7 +104,7 @@ class SensorStack:
 @dataclass(frozen=True, kw_only=True)
 class PartReport:
     """
-    What manifold3d says of one part.
+    Result of the manifold3d check of one part.
 
     Attributes
     ----------
@@ -112,7 +114,7 @@ class PartReport:
     n_triangles : int
     volume_um3 : float, µm³
     euler_characteristic : int
-        2 for each ball-like piece, 0 for each ring.
+        2 for each sphere-like piece, 0 for each ring-like piece.
     """
 
     name: str
@@ -125,13 +127,13 @@ class PartReport:
 @dataclass(frozen=True, kw_only=True)
 class SolidsReport:
     """
-    What manifold3d says of solids.
+    Result of the manifold3d check of all parts.
 
     Attributes
     ----------
     parts : tuple of PartReport
     overlap_um3 : mapping of (name, name) to float, µm³
-        Volume that two parts share.
+        Overlap volume of two parts.
     """
 
     parts: tuple[PartReport, ...]
@@ -139,7 +141,7 @@ class SolidsReport:
 
     @property
     def ok(self) -> bool:
-        """Whether every part is closed and no two share volume."""
+        """Whether every part is closed and no two parts overlap."""
         volumes_um3 = {part.name: part.volume_um3 for part in self.parts}
         return all(part.status == "NoError" for part in self.parts) and all(
             shared_um3 <= ROUNDING * min(volumes_um3[a], volumes_um3[b])
@@ -150,15 +152,15 @@ class SolidsReport:
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Solids:
     """
-    The parts of a sensor as closed surfaces; made by :func:`solids`.
+    Parts of a sensor as closed surfaces; created by :func:`solids`.
 
     Attributes
     ----------
     layout : Layout
     sensor_stack : SensorStack
     parts : mapping of str to Mesh
-        ``"wells"``, ``"trenches"``, ``"filters"``, ``"lenses"``: those that the stack has. The surfaces of every photosite are
-        closed by themselves; neighbours touch.
+        ``"wells"``, ``"trenches"``, ``"filters"``, ``"lenses"``: those in the stack. The surface of every photosite is closed
+        separately; those of neighbours touch.
     """
 
     layout: Layout
@@ -170,21 +172,21 @@ class Solids:
 
     @property
     def meshes(self) -> tuple[Mesh, ...]:
-        """The parts, from the bottom up."""
+        """Parts from bottom to top."""
         return tuple(self.parts.values())
 
     def volumes_um3(self, part: str) -> Floats:
         """
-        Volume of a part at every photosite, (n_site,) µm³.
+        Return the volume of a part at every photosite, (n_site,) µm³.
 
         Raises
         ------
         ParameterError
-            When there is no such part.
+            When the part does not exist.
         """
         mesh = self._part(part)
         site = mesh.photosite[mesh.triangles[:, 0]]
-        # From the middle of each site, so that small sites far from the origin keep their digits.
+        # Relative to the centroid of each site, which preserves digits for small sites far from the origin.
         anchor = np.column_stack((self.layout.centroid_um, np.zeros(self.layout.n_sites)))[site]
         a, b, c = (mesh.points_um[mesh.triangles[:, k]] - anchor for k in range(3))
         six_um3 = np.einsum("ij,ij->i", a, np.cross(b, c))
@@ -195,7 +197,7 @@ class Solids:
         """
         Volume of the wells as a fraction of the silicon under the layout's convex hull.
 
-        Without trenches this is the layout's own, as in :func:`foveasim.layout.describe`; with them, that of
+        Without trenches this is the fill factor of the layout, as in :func:`foveasim.layout.describe`; with trenches, that of
         ``inset(layout, trench_width_um / 2)`` on the same hull.
         """
         hull_um2 = float(shapely.MultiPoint(self.layout.xy_um).convex_hull.area)
@@ -203,7 +205,7 @@ class Solids:
 
     def check(self) -> SolidsReport:
         """
-        Whether every part is closed, and how much volume any two of them share.
+        Check that every part is closed, and compute the overlap volume of any two parts.
 
         Raises
         ------
@@ -211,7 +213,7 @@ class Solids:
 
         Notes
         -----
-        Neighbouring sites of one part are not held against each other: the rule ``max_overlap_um2`` does this on the layout.
+        Overlaps between the sites of one part are not checked; the design rule ``max_overlap_um2`` checks them on the layout.
         """
         made = {name: _manifold(mesh.points_um, mesh.triangles) for name, mesh in self.parts.items()}
         return SolidsReport(
@@ -233,27 +235,27 @@ class Solids:
 
     def cut(self, region: Any = None, *, of: Sequence[str] | None = None, whole: bool = False) -> Solids:
         """
-        The solids without what stands over a region.
+        Return the solids without their volume over a region.
 
         Parameters
         ----------
         region : shapely polygon or (n, 2) vertices, µm
-            By default the quarter of the layout with the largest x and the smallest y, which faces the viewer of
-            :class:`foveasim.view.Viewpoint`'s defaults.
+            By default the quarter of the layout with the largest x and the smallest y, which faces the viewer of the default
+            :class:`foveasim.view.Viewpoint`.
         of : sequence of str, optional
-            Parts that are cut; all by default.
+            Parts to cut; all by default.
         whole : bool
-            Whether sites go or stay as wholes, by their centres of area.
+            Whether to remove complete sites, selected by their centroids, instead of cutting them.
 
         Returns
         -------
         Solids
-            Closed again: sites on the border are cut by manifold3d, others stay as they are or go.
+            Closed: sites on the boundary of the region are cut by manifold3d, others are unchanged or removed.
 
         Raises
         ------
         ParameterError
-            When the region is none, or a part is unknown.
+            When the region is invalid, or a part does not exist.
         """
         region = _near_quarter(self.layout, QUARTER) if region is None else as_region("region", region)
         names = tuple(self.parts) if of is None else tuple(of)
@@ -287,15 +289,15 @@ def solids(
     data: Layout | Capture, sensor_stack: SensorStack | None = None, *, by: str | ArrayLike | None = None
 ) -> Solids:
     """
-    The sensor's parts as closed surfaces with their thicknesses.
+    Return the parts of a sensor as closed surfaces with physical thicknesses.
 
     Parameters
     ----------
     data : Layout or Capture
     sensor_stack : SensorStack, optional
     by : str or array, optional
-        What the wells' colours and the points' values show, as in :func:`foveasim.view.colours_of`; by default the code of a
-        capture, and bare silicon of a layout. Filters have the colours of their channels.
+        Quantity shown by the colours of the wells and the values of the points, as in :func:`foveasim.view.colours_of`; by
+        default the code of a capture, or plain silicon for a layout. Filters have the colours of their channels.
 
     Returns
     -------
@@ -304,10 +306,10 @@ def solids(
     Raises
     ------
     GeometryError
-        When a site is too narrow for its trench, or cannot carry a lens: it has a hole, or is not seen whole from any place in
-        it; ``.site_ids`` names them.
+        When a site is too narrow for its trench, or cannot have a lens because it has a hole or is not star-shaped about its
+        centroid or the centre of its largest inscribed circle; ``.site_ids`` lists the sites.
     ParameterError
-        When ``by`` is no column.
+        When the column ``by`` does not exist.
 
     Examples
     --------
@@ -319,7 +321,7 @@ def solids(
     sensor_stack = sensor_stack or SensorStack()
     layout = data.layout if isinstance(data, Capture) else data
     if layout.n_sites == 0:
-        raise GeometryError("the layout has no sites, and so no solids")
+        raise GeometryError("the layout has no sites; solids need at least one")
     bare = np.zeros(layout.n_sites)
     in_silicon = _Colouring(_tinted(layout, SILICON), bare)
     if by is not None or isinstance(data, Capture):
@@ -336,7 +338,7 @@ def solids(
     except GeometryError as error:
         at = f"site {error.site_ids[0]}" + (f" (and {len(error.site_ids) - 1} more)" if len(error.site_ids) > 1 else "")
         raise GeometryError(
-            f"{at} is too narrow for a trench of {sensor_stack.trench_width_um:g} µm around it: take a smaller trench_width_um",
+            f"{at} is too narrow for a trench of {sensor_stack.trench_width_um:g} µm; use a smaller trench_width_um",
             error.site_ids,
         ) from None
     parts = {"wells": _prisms("wells", footprint, (-depth_um, 0.0), in_silicon)}
@@ -354,7 +356,9 @@ def stack(
     data: Layout | Capture, sensor_stack: SensorStack | None = None, *, by: str | ArrayLike | None = None
 ) -> Solids:
     """
-    The sensor cut open: the near quarter taken away down to the floor, filters and lenses uncovered in terraces around it.
+    Return the sensor as a cut-away view.
+
+    The near quarter is removed at full depth; around it filters and lenses are removed in terraces.
 
     Parameters
     ----------
@@ -384,22 +388,22 @@ def stack(
 
 def write_meshes(meshes: Sequence[Mesh], path: str | Path) -> None:
     """
-    Write surfaces to a file, whole or not at all.
+    Write meshes to a file atomically.
 
     Parameters
     ----------
     meshes : sequence of Mesh
     path : path
-        ``.glb`` keeps the parts apart, with their colours and the attributes ``_photosite`` and ``_value`` of every point;
-        ``.3mf`` the parts apart; ``.ply`` and ``.obj`` colours; ``.stl`` the bare triangles. One unit is 1 µm, z is toward
-        the lens.
+        ``.glb`` stores separate parts, with colours and the attributes ``_photosite`` and ``_value`` of every point; ``.3mf``
+        stores separate parts; ``.ply`` and ``.obj`` store colours; ``.stl`` stores triangles only. The unit is 1 µm; z points
+        toward the lens.
 
     Raises
     ------
     FileError
-        When the ending is another, nothing can be written there, or a library for ``.3mf`` is not installed.
+        When the extension is another, the file cannot be written, or a library for ``.3mf`` is not installed.
     GeometryError
-        When there is not a single triangle.
+        When there are no triangles.
     """
     import trimesh
 
@@ -412,7 +416,7 @@ def write_meshes(meshes: Sequence[Mesh], path: str | Path) -> None:
             library(target, module)
     bodies = {mesh.name: _body(trimesh, mesh) for mesh in meshes if mesh.triangles.size}
     if not bodies:
-        raise GeometryError("there is nothing left of the solids to write")
+        raise GeometryError("the solids have no triangles to write")
     whole = trimesh.Scene(bodies) if kind in (".glb", ".3mf") else trimesh.util.concatenate(list(bodies.values()))
     with atomic_write(target) as temporary, temporary.open("wb") as file:
         content = whole.export(file_type=kind[1:])
@@ -420,7 +424,11 @@ def write_meshes(meshes: Sequence[Mesh], path: str | Path) -> None:
 
 
 def _near_quarter(layout: Layout, shares: tuple[float, float]) -> Any:
-    """Rectangle over the corner of largest x and smallest y, its inner sides through the middles of sites."""
+    """
+    Return a rectangle over the corner of largest x and smallest y.
+
+    Its inner sides pass through centroids of sites.
+    """
     x_min, y_min, x_max, y_max = layout.bounds_um
     width, height = x_max - x_min, y_max - y_min
     x, y = layout.centroid_um.T
@@ -445,7 +453,7 @@ def _mixed(rgb: NDArray[np.uint8], glass: tuple[int, int, int]) -> NDArray[np.ui
 
 
 def _walls(layout: Layout, wells: Layout) -> tuple[Layout, Ints]:
-    """What is left of each site around its well, and the site of each piece."""
+    """Return each site minus its well, in pieces, and the site of each piece."""
     pieces, owner = shapely.get_parts(shapely.difference(layout.polygons(), wells.polygons()), return_index=True)
     return Layout.from_polygons(pieces), owner
 
@@ -453,7 +461,11 @@ def _walls(layout: Layout, wells: Layout) -> tuple[Layout, Ints]:
 def _prisms(
     name: str, footprint: Layout, z_um: tuple[float, float], look: _Colouring, owner: Ints | None = None
 ) -> Mesh:
-    """Prisms between two heights, one for each polygon of a layout; ``owner`` is the photosite of each."""
+    """
+    Return prisms between two heights, one per polygon of a layout.
+
+    ``owner`` is the photosite of each polygon.
+    """
     points_um, triangles, position = extruded(footprint, triangulated(footprint), *z_um)
     return _coloured(name, points_um, triangles, position if owner is None else owner.astype(np.int32)[position], look)
 
@@ -472,7 +484,11 @@ def _coloured(
 
 
 def _lenses(layout: Layout, floor_um: float, sensor_stack: SensorStack, look: _Colouring) -> Mesh:
-    """Caps of balls, drawn out to the sites' outlines: the outline shrinks toward a middle as it rises."""
+    """
+    Return lenses: spherical caps, stretched to the outlines of the sites.
+
+    The outline shrinks toward the apex with increasing height.
+    """
     if sensor_stack.n_lens_corners:
         layout = _with_corners(layout, sensor_stack.n_lens_corners)
     caps = triangulated(layout)
@@ -480,11 +496,11 @@ def _lenses(layout: Layout, floor_um: float, sensor_stack: SensorStack, look: _C
     site = np.repeat(np.arange(n_sites), np.diff(layout.ring_offsets[layout.site_offsets]))
     middle_um = _middles(layout, site)
     arm_um = layout.xy_um - middle_um[site]
-    # Steps of equal angle from the border (1) to the middle (0), where a last fan closes the cap.
+    # Steps of equal angle from the rim (1) to the apex (0), where a fan closes the cap.
     share = np.cos(0.5 * np.pi * np.arange(n_steps) / n_steps)[:, np.newaxis]
     drawn_in = np.broadcast_to(share, (n_steps, n))
     if sensor_stack.n_lens_corners:
-        # Toward the largest circle around the middle, which lies inside: no step is wider than the one below.
+        # Toward the largest inscribed circle about the apex, so that no step is wider than the one below.
         round_share = _free_radius_um(layout, arm_um)[site] / np.hypot(*arm_um.T)
         drawn_in = share * (share**4 + (1.0 - share**4) * round_share)
     radius_um = np.sqrt(layout.area_um2 / np.pi)
@@ -492,7 +508,7 @@ def _lenses(layout: Layout, floor_um: float, sensor_stack: SensorStack, look: _C
     steps = points_um[: n_steps * n].reshape(n_steps, n, 3)
     steps[..., :2] = middle_um[site] + drawn_in[..., np.newaxis] * arm_um
     steps[..., 2] = floor_um + _cap_height_um(radius_um, sensor_stack.lens_height_um, share)[:, site]
-    points_um[:n, :2] = layout.xy_um  # the very numbers of the filter below
+    points_um[:n, :2] = layout.xy_um  # bit-identical to the filter below
     points_um[n_steps * n :, :2] = middle_um
     points_um[n_steps * n :, 2] = floor_um + np.minimum(radius_um, sensor_stack.lens_height_um)
     here, after = caps.weld, caps.weld[next_vertex(layout.ring_offsets)]
@@ -509,7 +525,7 @@ def _lenses(layout: Layout, floor_um: float, sensor_stack: SensorStack, look: _C
 
 
 def _with_corners(layout: Layout, n_corners: int) -> Layout:
-    """The same sites, long edges divided so that every ring has at least so many vertices."""
+    """Divide long edges so that every ring has at least ``n_corners`` vertices."""
     edge_um = layout.xy_um[next_vertex(layout.ring_offsets)] - layout.xy_um
     length_um = np.hypot(*edge_um.T)
     starts = layout.ring_offsets[:-1]
@@ -522,7 +538,11 @@ def _with_corners(layout: Layout, n_corners: int) -> Layout:
 
 
 def _free_radius_um(layout: Layout, arm_um: Floats) -> Floats:
-    """Radius of the largest circle in every site around its middle, (n_site,); ``arm_um`` leads from there to the vertices."""
+    """
+    Return the radius of the largest circle in every site about its apex, (n_site,).
+
+    ``arm_um`` are the vectors from the apex to the vertices.
+    """
     after = next_vertex(layout.ring_offsets)
     edge_um = arm_um[after] - arm_um
     height_um = (arm_um[:, 0] * edge_um[:, 1] - arm_um[:, 1] * edge_um[:, 0]) / np.hypot(*edge_um.T)
@@ -530,7 +550,11 @@ def _free_radius_um(layout: Layout, arm_um: Floats) -> Floats:
 
 
 def _cap_height_um(radius_um: Floats, height_um: float, share: Floats) -> Floats:
-    """Height over its border of a ball's cap, at a fraction of its radius from its middle; at most half a ball."""
+    """
+    Return the height of a spherical cap above its rim, at a fraction of its radius.
+
+    The cap is at most a hemisphere.
+    """
     sag_um = np.minimum(height_um, radius_um)
     ball_um = (radius_um**2 + sag_um**2) / (2.0 * sag_um)
     rise_um = np.sqrt(np.maximum(ball_um**2 - (radius_um * share) ** 2, 0.0)) - (ball_um - sag_um)
@@ -538,7 +562,11 @@ def _cap_height_um(radius_um: Floats, height_um: float, share: Floats) -> Floats
 
 
 def _middles(layout: Layout, site: Ints) -> Floats:
-    """A place in every site that sees its whole outline, (n_site, 2) µm: the centre of area, or of the largest circle in it."""
+    """
+    Return a point in every site about which its outline is star-shaped, (n_site, 2) µm.
+
+    The point is the centroid, or the centre of the largest inscribed circle.
+    """
     has_hole = np.diff(layout.site_offsets) > 1
     middle_um = layout.centroid_um.copy()
     hidden = np.flatnonzero(~_sees_all(layout, middle_um, site) & ~has_hole)
@@ -549,7 +577,7 @@ def _middles(layout: Layout, site: Ints) -> Floats:
     if bad.size:
         more = f" (and {bad.size - 1} more)" if bad.size > 1 else ""
         raise GeometryError(
-            f"site {bad[0]} cannot carry a lens{more}: it has a hole, or is not seen whole from any middle; take "
+            f"site {bad[0]} cannot have a lens{more}: it has a hole, or is not star-shaped; use "
             "lens_height_um=0, or other sites",
             tuple(int(i) for i in bad),
         )
@@ -557,7 +585,7 @@ def _middles(layout: Layout, site: Ints) -> Floats:
 
 
 def _sees_all(layout: Layout, middle_um: Floats, site: Ints) -> NDArray[np.bool_]:
-    """Whether every edge of a site runs counter-clockwise around its middle, (n_site,)."""
+    """Return whether all edges of each site run counter-clockwise about its apex, (n_site,)."""
     arm_um = layout.xy_um - middle_um[site]
     after_um = arm_um[next_vertex(layout.ring_offsets)]
     double_um2 = arm_um[:, 0] * after_um[:, 1] - arm_um[:, 1] * after_um[:, 0]
@@ -569,14 +597,14 @@ def _sees_all(layout: Layout, middle_um: Floats, site: Ints) -> NDArray[np.bool_
 
 
 def _manifold(points_um: Floats, triangles: NDArray[np.integer[Any]]) -> Any:
-    """The surface as a Manifold; columns of ``points_um`` beyond the third are carried along."""
+    """Return a surface as a Manifold; columns of ``points_um`` after the third are properties."""
     import manifold3d
 
     return manifold3d.Manifold(manifold3d.Mesh64(np.ascontiguousarray(points_um), triangles.astype(np.uint64)))
 
 
 def _share_height(one: Mesh, other: Mesh) -> bool:
-    """Whether two parts are at the same height anywhere; if not, they share nothing, and no boolean is needed to know it."""
+    """Return whether two parts overlap in height; otherwise no boolean operation is needed."""
     if not (one.triangles.size and other.triangles.size):
         return False
     (low, high), (other_low, other_high) = one.bounds_um, other.bounds_um
@@ -584,13 +612,13 @@ def _share_height(one: Mesh, other: Mesh) -> bool:
 
 
 def _without(mesh: Mesh, is_gone: NDArray[np.bool_], is_crossed: NDArray[np.bool_], region: Any) -> Mesh:
-    """A part without some sites, and with others cut by what stands over a region."""
+    """Return a part without some sites, and with others cut by a region."""
     site_of = mesh.photosite[mesh.triangles[:, 0]]
     is_whole = ~is_gone[site_of] & ~is_crossed[site_of]
     points_um, photosite, triangles = _compact(mesh.points_um, mesh.photosite, mesh.triangles[is_whole])
     crossed = _compact(mesh.points_um, mesh.photosite, mesh.triangles[is_crossed[site_of]])
     if crossed[2].size:
-        # The number of its site goes with every point; those that the cut makes have nought, and the site of their piece.
+        # Points have the property site + 1. Points created by the cut have 0, and take the site of their connected piece.
         numbered = np.column_stack((crossed[0], crossed[1] + 1.0))
         left = (_manifold(numbered, crossed[2]) - _over(region, mesh)).to_mesh64()
         weld = np.arange(left.vert_properties.shape[0])
@@ -609,7 +637,7 @@ def _without(mesh: Mesh, is_gone: NDArray[np.bool_], is_crossed: NDArray[np.bool
 
 
 def _over(region: Any, mesh: Mesh) -> Any:
-    """What stands over a region, from below a mesh to above it."""
+    """Return a prism over a region, from below a mesh to above it."""
     outline = Layout.from_polygons(shapely.get_parts([region]))
     low, high = mesh.bounds_um
     margin_um = high[2] - low[2]
@@ -618,7 +646,7 @@ def _over(region: Any, mesh: Mesh) -> Any:
 
 
 def _of_pieces(triangles: Ints, number: Ints) -> Ints:
-    """The largest number among the points of each connected piece, for every point."""
+    """Return for every point the largest number in its connected piece."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -632,7 +660,7 @@ def _of_pieces(triangles: Ints, number: Ints) -> Ints:
 
 
 def _compact(points_um: Floats, photosite: NDArray[np.int32], triangles: Any) -> tuple[Floats, Any, NDArray[np.int32]]:
-    """The points that triangles use, their sites, and the triangles renumbered."""
+    """Return the points that triangles use, their sites, and the renumbered triangles."""
     is_used = np.zeros(points_um.shape[0], bool)
     is_used[triangles] = True
     renumbered = np.cumsum(is_used) - 1
@@ -640,7 +668,11 @@ def _compact(points_um: Floats, photosite: NDArray[np.int32], triangles: Any) ->
 
 
 def _body(trimesh: Any, mesh: Mesh) -> Any:
-    """The part as trimesh knows it; glTF gives own attributes of points an underscore."""
+    """
+    Return a part as a trimesh object.
+
+    In glTF, custom attributes of points begin with an underscore.
+    """
     body = trimesh.Trimesh(
         mesh.points_um,
         mesh.triangles,

@@ -73,8 +73,8 @@ def folder(tmp_path_factory):
         (["capture.npz"], ["30 photosites", '"kind": "capture"', "expected electrons"]),
         (["layout.npz", "--rules", "rules.yaml"], ["min_size_um", '"count": 30']),
         (["report.lyrdb", "--layout", "layout.npz"], ["min_size_um", '"count": 30']),
-        (["layout.npz", "--solid"], ["30 photosites", "z is toward the lens"]),
-        (["capture.npz", "--solid"], ["30 photosites", "as high as the codes"]),
+        (["layout.npz", "--solid"], ["30 photosites", "z points toward the lens"]),
+        (["capture.npz", "--solid"], ["30 photosites", "Column heights show the codes"]),
     ],
     ids=lambda value: " ".join(value) if "photosites" not in " ".join(value) else "",
 )
@@ -93,7 +93,7 @@ def test_view_writes_page_of_any_file(view, tmp_path, arguments, words):
         (["nothing.gds"], "nothing.gds: no such file"),
         (["text.txt"], "text.txt: is no layout file"),
         (["capture.npz", "--out", "page.txt"], "page.txt: must end in .html"),
-        (["capture.npz", "--out", "nowhere/page.html"], "the folder nowhere does not exist"),
+        (["capture.npz", "--out", "nowhere/page.html"], "the directory nowhere does not exist"),
         (["capture.npz", "--out", "a.html", "--serve"], "--out and --serve exclude each other"),
         (["capture.npz", "--port", "8000"], "--port requires --serve"),
         (["capture.npz", "--serve", "--port", "70000"], "'port' must be <= 65535"),
@@ -156,7 +156,7 @@ def test_page_is_served_on_localhost(view, folder):
             # The same port for a second server.
             code, _, complaint = view("layout.npz", "--serve", "--port", str(port))
             assert code == 2
-            assert "'port' cannot be listened on" in complaint
+            assert "'port' must be a free port" in complaint
         finally:
             server.send_signal(signal.SIGINT)
             rest, errors = server.communicate(timeout=20)

@@ -1,4 +1,4 @@
-"""The photosite under each pixel: exact on borders, without gaps, whatever the shapes."""
+"""Index maps of the photosite under each pixel: exact on boundaries, without gaps, for all shapes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from foveasim.errors import ParameterError
 from foveasim.view import SitePixels, id_map, site_at
 
 L = fs.layout
-#: Families whose sites fill the plane, with straight, slanted and hanging borders.
+#: Families whose sites fill the plane, with straight and slanted boundaries, and T-junctions.
 TILINGS = {
     "grid": L.grid(n_x=7, n_y=5, pitch_um=2.0),
     "bricks": L.grid(n_x=7, n_y=6, pitch_um=2.0, stagger=True),
@@ -36,7 +36,7 @@ def rings_of(layout):
 
 @st.composite
 def lattice_sites(draw):
-    """Sites of one to three rings with corners on integers: concave, crossing themselves and each other, holed."""
+    """Generate sites of one to three rings with integer corners: concave, intersecting themselves and others, with holes."""
     corner = st.tuples(st.integers(-4, 4), st.integers(-4, 4))
     sites = draw(st.lists(st.lists(st.lists(corner, min_size=3, max_size=7), min_size=1, max_size=3), max_size=4))
     rings = [ring for site in sites for ring in site]
@@ -52,8 +52,8 @@ def lattice_sites(draw):
 
 @given(layout=lattice_sites(), steps=st.sampled_from([1, 2, 4]), n_threads=st.sampled_from([1, 3]))
 @settings(max_examples=100, deadline=None)
-def test_every_sample_agrees_with_exact_fractions_on_edges_and_corners_too(layout, steps, n_threads):
-    # Centres at integers, halves and quarters of them.
+def test_samples_match_exact_rational_arithmetic(layout, steps, n_threads):
+    # Pixel centres at multiples of 1, 1/2 and 1/4.
     n = 10 * steps
     low = -5.0 - 0.5 / steps
     ids = id_map(layout, (n, n), (low, low, low + 10, low + 10), n_threads=n_threads)
@@ -64,7 +64,7 @@ def test_every_sample_agrees_with_exact_fractions_on_edges_and_corners_too(layou
 
 @pytest.mark.parametrize("layout", TILINGS.values(), ids=TILINGS)
 @pytest.mark.parametrize("n", [16, 61])
-def test_in_a_tiling_a_pixel_has_one_site_no_less_and_no_more(layout, n):
+def test_tiling_pixels_have_exactly_one_site(layout, n):
     alone = [id_map(layout[[i]], (n, n), layout.bounds_um) >= 0 for i in range(layout.n_sites)]
     together = id_map(layout, (n, n), layout.bounds_um)
 
@@ -77,9 +77,9 @@ def test_in_a_tiling_a_pixel_has_one_site_no_less_and_no_more(layout, n):
     assert together[is_inside].min() >= 0
 
 
-def test_a_centre_on_a_border_belongs_to_the_site_on_its_right_or_above():
+def test_boundary_centres_belong_right_or_above():
     layout = L.grid(n_x=4, n_y=3, pitch_um=2.0)  # from -4 to 4, from -3 to 3
-    ids = id_map(layout, (7, 9), (-4.5, -3.5, 4.5, 3.5))  # centres on integers: corners, borders, middles
+    ids = id_map(layout, (7, 9), (-4.5, -3.5, 4.5, 3.5))  # integer pixel centres: on corners, edges and site centres
 
     row, column = np.divmod(np.arange(12), 4)
     for iy, y in enumerate(range(-3, 4)):
@@ -89,19 +89,19 @@ def test_a_centre_on_a_border_belongs_to_the_site_on_its_right_or_above():
 
 
 @pytest.mark.parametrize("name", ZOO)
-def test_pixels_cover_the_area_of_any_shape(name):
+def test_pixels_cover_area_of_any_shape(name):
     layout = fs.Layout.from_polygons([ZOO[name]])
     x_min, y_min, x_max, y_max = layout.bounds_um
     ids = id_map(layout, (700, 700))
     pixel_um2 = (x_max - x_min) * (y_max - y_min) / 700**2
     length_um = shapely.length(ZOO[name])
 
-    # Off by less than one pixel for each that the outline crosses.
+    # The error is less than one pixel per pixel that the outline crosses.
     pitch_um = max(x_max - x_min, y_max - y_min) / 700
     assert abs((ids == 0).sum() * pixel_um2 - layout.area_um2[0]) <= length_um * pitch_um
 
 
-def test_a_centre_away_from_borders_is_in_the_site_that_shapely_says():
+def test_interior_centres_match_shapely():
     layout = L.voronoi(n_sites=200, size_um=(20.0, 20.0))
     ids = id_map(layout, (83, 91))
     x_min, y_min, x_max, y_max = layout.bounds_um
@@ -114,14 +114,14 @@ def test_a_centre_away_from_borders_is_in_the_site_that_shapely_says():
     assert np.array_equal(ids.ravel()[point], site)
 
 
-def test_of_sites_over_each_other_the_one_with_the_highest_index_is_seen():
+def test_overlapping_sites_show_highest_index():
     boxes = [shapely.box(0, 0, 4, 4), shapely.box(1, 1, 3, 3), shapely.box(2, 0, 6, 4)]
     ids = id_map(fs.Layout.from_polygons(boxes), (4, 6))
 
     assert ids.tolist() == [[0, 0, 2, 2, 2, 2], [0, 1, 2, 2, 2, 2], [0, 1, 2, 2, 2, 2], [0, 0, 2, 2, 2, 2]]
 
 
-def test_the_number_of_threads_cannot_be_seen():
+def test_result_independent_of_threads():
     layout = L.log_polar(n_sectors=60, min_size_um=1.0, r_max_um=40.0, stagger=True)
     one = id_map(layout, (333, 257), n_threads=1)
     pixels = SitePixels.from_layout(layout, (111, 120), n_threads=1)
@@ -131,7 +131,7 @@ def test_the_number_of_threads_cannot_be_seen():
     assert all(np.array_equal(pixels.picture(rgb, n_threads=n), pixels.picture(rgb, n_threads=1)) for n in (2, 5))
 
 
-def test_a_window_shows_its_part_of_the_whole():
+def test_window_matches_part_of_full_map():
     layout = L.octagonal(n_x=16, n_y=16, pitch_um=2.0)
     whole = id_map(layout, (256, 256), (-16, -16, 16, 16))
     window = id_map(layout, (64, 128), (-8, -4, 8, 4))
@@ -140,7 +140,7 @@ def test_a_window_shows_its_part_of_the_whole():
     assert np.all(id_map(layout, (5, 5), (100, 100, 110, 110)) == -1)
 
 
-def test_a_point_has_the_site_of_the_pixel_around_it():
+def test_site_at_matches_enclosing_pixel():
     layout = L.penrose(side_um=2.0, size_um=14.0)
     pixels = SitePixels.from_layout(layout, (40, 50), (-8.0, -6.0, 8.0, 6.0), n_samples=3)
     y, x = np.meshgrid(-6.0 + (np.arange(120) + 0.5) * 0.1, -8.0 + (np.arange(150) + 0.5) * (16 / 150), indexing="ij")
@@ -153,19 +153,19 @@ def test_a_point_has_the_site_of_the_pixel_around_it():
     assert pixels.site_at([-8.1, 8.0, 0.0], [0.0, 0.0, 6.5]).tolist() == [-1, -1, -1]
 
 
-def test_a_pixel_is_the_mean_of_its_samples():
+def test_pixel_is_mean_of_samples():
     layout = L.voronoi(n_sites=50, size_um=(10.0, 10.0))
     rgb = np.random.default_rng(0).integers(0, 256, (50, 3), dtype=np.uint8)
     one = SitePixels.from_layout(layout, (30, 40), (-6, -6, 6, 6), n_samples=1)
     three = SitePixels.from_layout(layout, (30, 40), (-6, -6, 6, 6), n_samples=3)
-    table = np.concatenate((rgb, [[10, 20, 30]]))  # -1 is the last
+    table = np.concatenate((rgb, [[10, 20, 30]]))  # index -1 is the last row
     samples = table[three.ids].reshape(30, 3, 40, 3, 3).mean(axis=(1, 3))
 
     assert np.array_equal(one.picture(rgb, background=(10, 20, 30)), table[one.ids])
     assert np.array_equal(one.ids, three.ids[1::3, 1::3])
     assert np.abs(three.picture(rgb, background=(10, 20, 30)) - samples).max() <= 0.5
 
-    # Without a background: the mean of the samples that show a site, and their share.
+    # Without a background: the mean of the samples in sites, and their fraction.
     is_site = (three.ids >= 0).reshape(30, 3, 40, 3)
     counts = is_site.sum(axis=(1, 3))
     alone = (table[three.ids].reshape(30, 3, 40, 3, 3) * is_site[..., None]).sum(axis=(1, 3)) / np.maximum(counts, 1)[
@@ -176,11 +176,11 @@ def test_a_pixel_is_the_mean_of_its_samples():
     assert np.abs(clear[..., 3] - 255 * counts / 9).max() <= 0.5
 
 
-def test_a_border_is_drawn_where_one_site_ends_and_another_begins():
+def test_boundaries_drawn_between_sites():
     pixels = SitePixels.from_layout(L.grid(n_x=2, n_y=2, pitch_um=2.0), (6, 6), (-3, -3, 3, 3), n_samples=1)
     drawn = np.all(pixels.picture(np.full((4, 3), 200, np.uint8), border=(1, 2, 3)) == (1, 2, 3), axis=-1)
 
-    # Sites from pixel 1 to 2 and 3 to 4: borders at the first pixel of each, and at the first beyond.
+    # Sites at pixels 1 to 2 and 3 to 4: boundaries at the first pixel of each, and at the first pixel after them.
     within = np.arange(6) > 0
     at = np.isin(np.arange(6), (1, 3, 5))
     assert np.array_equal(
@@ -196,21 +196,21 @@ def test_a_border_is_drawn_where_one_site_ends_and_another_begins():
         (lambda g: id_map(g, (2**16, 2**16)), "'shape' must (have at most|give 3 arrays)"),
         (lambda g: id_map(g, (4, 4), (0, 0, 0, 1)), "'bounds_um' must be"),
         (lambda g: id_map(g, (4, 4), (0, 0, np.nan, 1)), "'bounds_um' must be finite"),
-        (lambda g: id_map(g[:0], (4, 4)), "'layout' must have sites"),
+        (lambda g: id_map(g[:0], (4, 4)), "'layout' must have sites unless"),
         (lambda g: SitePixels.from_layout(g, (4, 4), n_samples=0), "'n_samples' must be >= 1"),
         (
             lambda g: SitePixels.from_layout(g, (4, 4)).picture(np.zeros((3, 3), np.uint8)),
-            r"'rgb' must be bytes .* n_site > 3",
+            r"'rgb' must be uint8 .* n_site > 3",
         ),
-        (lambda g: SitePixels.from_layout(g, (4, 4)).picture(np.zeros((4, 3))), "'rgb' must be bytes"),
+        (lambda g: SitePixels.from_layout(g, (4, 4)).picture(np.zeros((4, 3))), "'rgb' must be uint8"),
     ],
 )
-def test_what_is_no_picture_is_refused(call, message):
+def test_invalid_arguments_raise(call, message):
     with pytest.raises(ParameterError, match=message):
         call(L.grid(n_x=2, n_y=2, pitch_um=2.0))
 
 
-def test_a_layout_without_sites_covers_nothing():
+def test_empty_layout_covers_nothing():
     empty = L.grid(n_x=1, n_y=1, pitch_um=1.0)[:0]
 
     assert np.all(

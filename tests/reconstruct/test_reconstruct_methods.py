@@ -1,4 +1,4 @@
-"""Pictures between sites and of least squares: flat stays flat, no data is not black, and what was measured is explained."""
+"""Interpolation and least-squares reconstruction: uniform fields, missing data, and agreement with measured values."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SMOOTH = {"linear": linear, "natural": natural}
 
 
 def fitted(layout, values, grid, **options):
-    """Least squares of values as they are: an even scene makes them equal."""
+    """Least squares with equal responses: values of a uniform scene are equal."""
     return least_squares(layout, values, grid, response=np.ones(layout.n_sites), **{"variance": 1.0, **options})
 
 
@@ -59,17 +59,17 @@ def centres_um(grid):
 
 
 def grid_through(point_um, n=1, pitch_um=0.1):
-    """A raster whose middle pixel's centre is a point."""
+    """Raster whose central pixel is centred on a point."""
     x, y = point_um
     return fs.Grid((n, n), pitch_um, (x - 0.5 * n * pitch_um, y - 0.5 * n * pitch_um))
 
 
-# -- what holds of every method ---------------------------------------------------------------------------------------
+# -- all methods ------------------------------------------------------------------------------------------------------
 
 
 @LAYOUT
 @METHOD
-def test_a_flat_field_comes_back_flat(layout, method):
+def test_flat_field_stays_flat(layout, method):
     picture = method(layout, np.full(layout.n_sites, 7.5), raster_grid(layout, 90))
 
     assert np.isfinite(picture.data).any()
@@ -77,7 +77,7 @@ def test_a_flat_field_comes_back_flat(layout, method):
 
 
 @METHOD
-def test_a_blind_spot_is_no_data_and_nothing_is_said_outside(method):
+def test_uncovered_pixels_are_nan(method):
     grid = raster_grid(FOVEAL, 151)
     picture = method(FOVEAL, plane(FOVEAL.centroid_um), grid)
     covered = shapely.union_all(FOVEAL.polygons())
@@ -92,7 +92,7 @@ def test_a_blind_spot_is_no_data_and_nothing_is_said_outside(method):
 
 @METHOD
 @pytest.mark.parametrize("layout", [FOVEAL, ZONES], ids=["log-polar", "zones"])
-def test_the_order_of_sites_changes_nothing(layout, method):
+def test_result_independent_of_site_order(layout, method):
     values = np.random.default_rng(3).uniform(20.0, 90.0, layout.n_sites)
     order = np.random.default_rng(4).permutation(layout.n_sites)
     grid = raster_grid(layout, 60)
@@ -100,7 +100,7 @@ def test_the_order_of_sites_changes_nothing(layout, method):
     one = method(layout, values, grid, **options).data
     other = method(layout[order], values[order], grid, **options).data
 
-    # Squares have four neighbours on a circle: which diagonal divides them is a matter of order.
+    # Four centroids of squares lie on a circle: the diagonal of their triangulation depends on the order.
     if method is linear and layout is ZONES:
         assert np.nanmean(np.abs(one - other) > 1e-3) < 0.4
         return
@@ -108,7 +108,7 @@ def test_the_order_of_sites_changes_nothing(layout, method):
 
 
 @METHOD
-def test_threads_change_nothing(method):
+def test_result_independent_of_threads(method):
     values = np.random.default_rng(5).uniform(20.0, 90.0, (2, HEXAGONS.n_sites))
     grid = raster_grid(HEXAGONS, 160)
     one, two = (method(HEXAGONS, values, grid, n_threads=n).data for n in (1, 2))
@@ -117,7 +117,7 @@ def test_threads_change_nothing(method):
 
 
 @METHOD
-def test_a_moved_layout_has_a_moved_picture(method):
+def test_translated_layout_translates_picture(method):
     values = np.random.default_rng(6).uniform(20.0, 90.0, HEXAGONS.n_sites)
     moved = HEXAGONS.translate(1000.0, -700.0)
     one, other = (method(layout, values, raster_grid(layout, 64)).data for layout in (HEXAGONS, moved))
@@ -125,12 +125,12 @@ def test_a_moved_layout_has_a_moved_picture(method):
     assert np.nanmax(np.abs(one - other)) < 0.05
 
 
-# -- between the centres ----------------------------------------------------------------------------------------------
+# -- interpolation ----------------------------------------------------------------------------------------------------
 
 
 @BETWEEN
 @LAYOUT
-def test_smooth_pictures_are_exact_at_the_centres(layout, method):
+def test_interpolation_exact_at_centroids(layout, method):
     values = np.random.default_rng(1).uniform(1.0, 9.0, layout.n_sites)
 
     for site in range(0, layout.n_sites, max(1, layout.n_sites // 10)):
@@ -140,7 +140,7 @@ def test_smooth_pictures_are_exact_at_the_centres(layout, method):
 
 @BETWEEN
 @LAYOUT
-def test_a_linear_field_comes_back_inside_the_hull_and_is_clamped_outside(layout, method):
+def test_linear_field_exact_inside_hull_clamped_outside(layout, method):
     grid = raster_grid(layout, 120)
     picture = method(layout, plane(layout.centroid_um), grid)
     points_um = centres_um(grid)
@@ -157,7 +157,7 @@ def test_a_linear_field_comes_back_inside_the_hull_and_is_clamped_outside(layout
     assert np.abs(picture.data[0] - expected)[is_seen].max() < 2e-5
 
 
-def test_natural_neighbours_agree_with_voronoi_cells_that_are_cut_out():
+def test_natural_neighbours_match_voronoi_reference():
     layout = fs.layout.sunflower(n_sites=40, spacing_um=2.0)
     xy = layout.centroid_um
     values = np.random.default_rng(2).uniform(1.0, 9.0, layout.n_sites)
@@ -169,20 +169,20 @@ def test_natural_neighbours_agree_with_voronoi_cells_that_are_cut_out():
         assert picture.data[0, 0, 0] == pytest.approx(stolen_shares(xy, point) @ values, rel=1e-6)
 
 
-def test_natural_neighbours_on_a_square_grid_are_symmetric():
+def test_natural_neighbours_symmetric_on_square_grid():
     values = np.zeros(9)
     values[4] = 1.0
     layout = fs.layout.grid(n_x=3, n_y=3, pitch_um=1.0)
     picture = natural(layout, values, fs.Grid.centred((21, 21), 0.1)).data[0]
 
-    for turned in (picture[::-1], picture[:, ::-1], picture.swapaxes(0, 1)):
-        assert turned == pytest.approx(picture, abs=1e-6)
+    for mirrored in (picture[::-1], picture[:, ::-1], picture.swapaxes(0, 1)):
+        assert mirrored == pytest.approx(picture, abs=1e-6)
 
 
-def test_natural_neighbours_have_no_crease_where_triangles_have_one():
+def test_natural_neighbours_smoother_than_linear():
     xy = np.array([[0, 0], [4, 0], [4.2, 4], [0, 4.1], [8, 0.2], [8.1, 4.0], [4.1, 8], [4, -4.0], [-4, 2.0], [12, 2.0]])
     layout = fs.Layout.from_rectangles(xy, 0.01)
-    # A strip of sites that cover the line along which is looked, far apart in value from none of the others.
+    # One pixel row through the sites, and one large site without a value that covers it.
     grid = fs.Grid((1, 4001), 0.001, (2.0, 2.0))
     around = fs.Layout.from_rectangles([[4.0, 2.0]], 14.0)
     rings = fs.Layout.from_polygons([*layout.polygons(), *around.polygons()])
@@ -196,7 +196,7 @@ def test_natural_neighbours_have_no_crease_where_triangles_have_one():
 
 
 @BETWEEN
-def test_a_site_that_knows_nothing_is_bridged_by_its_neighbours(method):
+def test_missing_sites_interpolated_from_neighbours(method):
     values = plane(HEXAGONS.centroid_um)
     bad = int(np.hypot(*HEXAGONS.centroid_um.T).argmin())
     values[bad] = np.nan
@@ -206,7 +206,7 @@ def test_a_site_that_knows_nothing_is_bridged_by_its_neighbours(method):
 
 
 @BETWEEN
-def test_centres_at_the_same_place_have_their_mean(method):
+def test_coincident_centroids_are_averaged(method):
     rings = [shapely.Point(0, 0).buffer(r + 1).difference(shapely.Point(0, 0).buffer(r)) for r in (1, 2)]
     others = [shapely.box(x - 1, y - 1, x + 1, y + 1) for x, y in ((9, 0), (-9, 1), (0, 9), (1, -9))]
     layout = fs.Layout.from_polygons([*rings, *others])
@@ -226,7 +226,7 @@ def test_centres_at_the_same_place_have_their_mean(method):
     ],
     ids=["one", "two", "on a line", "beyond its end"],
 )
-def test_too_few_centres_for_triangles_lie_on_a_line(method, centres, values, at, expected):
+def test_collinear_centroids_interpolate_along_line(method, centres, values, at, expected):
     layout = fs.Layout.from_rectangles(centres, 1.0)
 
     assert method(layout, np.array(values), grid_through(at)).data[0, 0, 0] == pytest.approx(expected)
@@ -236,46 +236,46 @@ def test_too_few_centres_for_triangles_lie_on_a_line(method, centres, values, at
 
 
 @LAYOUT
-def test_least_squares_explain_noise_free_data_as_exactly_as_is_asked_for(layout):
+def test_least_squares_fits_noise_free_data(layout):
     grid = raster_grid(layout, 64)
     truth = 40.0 + 20.0 * np.sin(centres_um(grid)[..., 0] / 5.0) * np.cos(centres_um(grid)[..., 1] / 7.0)
     integrator = Integrator(layout, grid)
     values = integrator(truth)
     picture = least_squares(layout, values, grid, mu=1e-9, tolerance=1e-8)
-    told = integrator(np.nan_to_num(picture.data[0].astype(np.float64)))
+    fit = integrator(np.nan_to_num(picture.data[0].astype(np.float64)))
 
-    assert np.abs(told / values - 1.0).max() < 1e-6
+    assert np.abs(fit / values - 1.0).max() < 1e-6
 
 
 @pytest.mark.parametrize("layout", [FOVEAL, HEXAGONS], ids=["log-polar", "hexagons"])
-def test_the_discrepancy_rule_leaves_the_misfit_that_the_noise_makes(layout):
+def test_discrepancy_rule_misfit_equals_noise(layout):
     grid = raster_grid(layout, 80)
     integrator = Integrator(layout, grid)
     truth = 400.0 + 200.0 * np.sin(centres_um(grid)[..., 0] / 6.0)
     expected = integrator(truth)
     values = np.random.default_rng(1).poisson(expected).astype(float)
     picture = least_squares(layout, values, grid, variance=expected, mu="discrepancy")
-    told = integrator(np.nan_to_num(picture.data[0].astype(np.float64)))
+    fit = integrator(np.nan_to_num(picture.data[0].astype(np.float64)))
 
-    assert np.mean((told - values) ** 2 / expected) == pytest.approx(1.0, abs=0.03)
+    assert np.mean((fit - values) ** 2 / expected) == pytest.approx(1.0, abs=0.03)
 
 
-def test_a_stronger_smoothness_explains_less_and_is_less_rough():
+def test_larger_mu_increases_misfit_decreases_roughness():
     grid = raster_grid(FOVEAL, 60)
     integrator = Integrator(FOVEAL, grid)
     values = np.random.default_rng(1).uniform(10.0, 90.0, FOVEAL.n_sites) * FOVEAL.area_um2
     misfits, roughness = [], []
     for mu in (1e-5, 1e-3, 1e-1, 10.0):
         picture = least_squares(FOVEAL, values, grid, variance=values, mu=mu, tolerance=1e-6).data[0]
-        told = integrator(np.nan_to_num(picture.astype(np.float64)))
-        misfits.append(np.sum((told - values) ** 2 / values))
+        fit = integrator(np.nan_to_num(picture.astype(np.float64)))
+        misfits.append(np.sum((fit - values) ** 2 / values))
         roughness.append(np.nansum(np.diff(picture, axis=0) ** 2) + np.nansum(np.diff(picture, axis=1) ** 2))
 
     assert np.all(np.diff(misfits) > 0.0)
     assert np.all(np.diff(roughness) < 0.0)
 
 
-def test_least_squares_agree_with_a_dense_solution_under_the_same_bound():
+def test_least_squares_matches_dense_nnls():
     from scipy.optimize import nnls
 
     layout, grid = SQUARES, raster_grid(SQUARES, 24)
@@ -296,14 +296,14 @@ def test_least_squares_agree_with_a_dense_solution_under_the_same_bound():
     assert picture.data[0].ravel() == pytest.approx(expected, abs=1e-5 * expected.max())
 
 
-def test_light_is_never_negative():
+def test_least_squares_is_nonnegative():
     values = np.random.default_rng(2).normal(0.0, 5.0, FOVEAL.n_sites)
     picture = least_squares(FOVEAL, values, raster_grid(FOVEAL, 60), variance=25.0)
 
     assert np.nanmin(picture.data) == 0.0
 
 
-def test_a_site_that_does_not_count_changes_nothing_and_is_filled_smoothly():
+def test_excluded_site_is_filled_smoothly():
     grid = raster_grid(HEXAGONS, 80)
     good = plane(HEXAGONS.centroid_um)
     bad = int(np.hypot(*HEXAGONS.centroid_um.T).argmin())
@@ -316,14 +316,14 @@ def test_a_site_that_does_not_count_changes_nothing_and_is_filled_smoothly():
     assert fitted(HEXAGONS, other, grid, mu=1e-3).data[0][place] > 1e5
 
 
-def test_larger_sites_are_no_brighter_when_their_response_is_their_area():
+def test_response_normalises_site_areas():
     grid = raster_grid(ZONES, 64)
     picture = least_squares(ZONES, 3.0 * ZONES.area_um2, grid, variance=3.0 * ZONES.area_um2)
 
     assert picture.data == pytest.approx(np.full((1, 64, 64), 3.0), rel=1e-5)
 
 
-def test_a_blur_is_undone():
+def test_blur_is_deconvolved():
     layout = fs.layout.grid(n_x=64, n_y=64, pitch_um=1.0)
     grid = raster_grid(layout, 64)
     scene = np.full((64, 64), 5.0)
@@ -338,11 +338,11 @@ def test_a_blur_is_undone():
     assert psnr_db(sharp, scene[np.newaxis]) > psnr_db(as_seen, scene[np.newaxis]) + 6.0
 
 
-def test_an_asymmetric_blur_is_undone_the_right_way():
+def test_asymmetric_blur_deconvolved_in_correct_direction():
     layout = fs.layout.grid(n_x=21, n_y=21, pitch_um=1.0)
     grid = raster_grid(layout, 21)
     values = np.zeros((21, 21))
-    values[10, 13] = 100.0  # light from [10, 10] that the lens throws three pixels to the right
+    values[10, 13] = 100.0  # signal of [10, 10], displaced by the lens by three pixels to the right
     kernel = np.zeros((1, 7))
     kernel[0, 6] = 1.0
     picture = least_squares(layout, values.ravel(), grid, variance=1.0, mu=1e-6, blur=kernel).data[0]
@@ -350,7 +350,7 @@ def test_an_asymmetric_blur_is_undone_the_right_way():
     assert np.unravel_index(picture.argmax(), picture.shape) == (10, 10)
 
 
-def test_colours_are_solved_from_their_own_sites():
+def test_channels_use_their_own_sites():
     layout = fs.layout.mosaic(fs.layout.grid(n_x=16, n_y=16, pitch_um=1.0), ("RG", "GB"))
     levels = np.array([100.0, 50.0, 20.0])
     values = np.where(layout.channel == np.arange(3)[:, np.newaxis], levels[:, np.newaxis], np.nan)
@@ -362,7 +362,7 @@ def test_colours_are_solved_from_their_own_sites():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "'mu' must be a number where no 'variance' is given"),
+        ({}, "'mu' must be a number without 'variance'"),
         ({"mu": 0.0}, "'mu' must be > 0"),
         ({"mu": "magic"}, "'mu' must be one of 'roughness', 'discrepancy'"),
         ({"variance": 0.0}, "'variance' must be > 0.0 everywhere"),
@@ -372,12 +372,12 @@ def test_colours_are_solved_from_their_own_sites():
         ({"variance": 1.0, "blur": np.ones((2, 3))}, "'blur' must have an odd number of pixels"),
         (
             {"variance": 1.0, "blur": np.zeros((3, 3))},
-            "'blur' must have an odd number of pixels along each side and light",
+            "'blur' must have an odd number of pixels along each side and a positive sum",
         ),
         ({"variance": 1.0, "blur": np.ones((2, 3, 3))}, "'blur' must be one kernel, or one for each of the 1 channels"),
     ],
 )
-def test_bad_options_of_least_squares_are_refused_by_name(options, message):
+def test_invalid_least_squares_options_raise(options, message):
     with pytest.raises(ParameterError, match=message):
         least_squares(SQUARES, np.ones(SQUARES.n_sites), raster_grid(SQUARES, 20), **options)
 
@@ -387,20 +387,20 @@ def test_bad_options_of_least_squares_are_refused_by_name(options, message):
     ("values", "message"),
     [
         (np.ones(3), r"'values' must have the shape \(\.\.\., 108\), got \(3,\)"),
-        (np.full(108, np.inf), "'values' must be finite, or NaN where a site knows nothing"),
-        (np.full((2, 108), np.nan), "'values' must have a number at one site at least, got none in channel 0"),
+        (np.full(108, np.inf), "'values' must be finite, or NaN where a site has no value"),
+        (np.full((2, 108), np.nan), "'values' must have a number for at least one site, got none in channel 0"),
         (["a"], "'values' must be an array of numbers"),
     ],
 )
-def test_bad_values_are_refused_by_name(method, values, message):
+def test_invalid_values_raise_by_name(method, values, message):
     with pytest.raises(ParameterError, match=message):
         method(SQUARES, values, raster_grid(SQUARES, 20))
 
 
-def test_a_solution_that_takes_too_long_is_told():
+def test_nonconvergence_raises_simulation_error():
     values = np.random.default_rng(1).uniform(1.0, 9.0, FOVEAL.n_sites)
 
-    with pytest.raises(SimulationError, match="did not converge in 2 steps; give a larger 'tolerance'"):
+    with pytest.raises(SimulationError, match="did not converge in 2 steps; increase 'tolerance', 'mu' or 'max_steps'"):
         fitted(FOVEAL, values, raster_grid(FOVEAL, 60), mu=1e-3, max_steps=2)
 
 
@@ -414,7 +414,7 @@ def test_a_solution_that_takes_too_long_is_told():
     ],
     ids=["log-polar", "hexagons", "zones"],
 )
-def test_photographs_of_least_squares_are_nearer_to_the_light_than_those_of_cells(layout, name):
+def test_least_squares_has_higher_psnr_than_cells(layout, name):
     grid = fs.Grid.centred((128, 128), 2.0)
     light = 1.0 + 99.0 * resize(rgb2gray(getattr(skimage.data, name)()), (128, 128), anti_aliasing=True)[::-1] ** 2.2
     values = np.random.default_rng(1).poisson(Integrator(layout, grid)(light)).astype(float)
@@ -429,7 +429,7 @@ def test_photographs_of_least_squares_are_nearer_to_the_light_than_those_of_cell
 # -- rasters ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_reference_agrees_with_the_integrator_on_square_sites():
+def test_reference_matches_integrator_on_squares():
     light = fs.PowerMap.from_array(
         np.random.default_rng(1).uniform(0, 9, (2, 23, 31)), pitch_um=0.7, wavelength_nm=[500, 600]
     )
@@ -441,7 +441,7 @@ def test_a_reference_agrees_with_the_integrator_on_square_sites():
     assert picture.coverage == pytest.approx(np.ones((7, 9)))
 
 
-def test_a_reference_says_nothing_off_the_map_and_keeps_its_light():
+def test_reference_conserves_power_nan_off_map():
     light = fs.PowerMap.from_array(np.arange(12.0).reshape(3, 4), pitch_um=1.0, wavelength_nm=500)
     picture = reference(light, fs.Grid.centred((9, 9), 0.8), weights=np.array([[2.0]]))
     total = np.nansum(picture.data[0] * picture.coverage, dtype=np.float64) * 0.64
@@ -450,7 +450,7 @@ def test_a_reference_says_nothing_off_the_map_and_keeps_its_light():
     assert total == pytest.approx(2.0 * 66.0, rel=1e-6)
 
 
-def test_a_blur_kernel_is_what_the_lens_makes_of_one_even_pixel():
+def test_blur_kernel_matches_imaged_pixel():
     optics = fs.Optics(focal_length_mm=8.0, f_number=4.0, source_pixel="square", padding_cells=40, precision="double")
     picture = np.zeros((81, 81))
     picture[40, 40] = 1.0
@@ -466,17 +466,17 @@ def test_a_blur_kernel_is_what_the_lens_makes_of_one_even_pixel():
     )
     lit = optics.power_map(scene).data[0]
     kernel = blur_kernel(optics, optics.grid(scene), wavelength_nm=550.0, distance_m=0.5, radius=6)
-    middle = lit[34:47, 34:47]
+    centre = lit[34:47, 34:47]
 
     assert kernel.shape == (13, 13)
-    assert kernel == pytest.approx(middle / middle.sum(), abs=3e-3 * kernel.max())
+    assert kernel == pytest.approx(centre / centre.sum(), abs=3e-3 * kernel.max())
 
 
 # -- captures ---------------------------------------------------------------------------------------------------------
 
 
 def captured(layout, **parameters):
-    """A capture of an even scene of a hundred electrons a µm²."""
+    """Return camera, power map and capture of a uniform scene of 100 electrons per µm²."""
     sensor = fs.Sensor(layout, **{"bits": 12, "capacitance_f": 5e-14, "v_sat_v": 1.0, **parameters})
     camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=4.0), sensor=sensor)
     low, high = layout.xy_um.min(0), layout.xy_um.max(0)
@@ -488,10 +488,10 @@ def captured(layout, **parameters):
 
 @pytest.mark.parametrize("method", ["cells", "linear", "natural", "least_squares"])
 @pytest.mark.parametrize("of", ["code", "electrons", "expected_e", "light_e"])
-def test_an_even_scene_is_even_per_area_whatever_the_sites_sizes(method, of):
+def test_uniform_scene_is_uniform_per_area(method, of):
     _, _, capture = captured(ZONES)
     picture = capture.picture(method, of=of, per="um2", max_pixels=64)
-    dn_per_e = 2.0**12 / 312_075.0  # of 50 fF at 1 V
+    dn_per_e = 2.0**12 / 312_075.0  # full scale of 50 fF at 1 V
     expected = 100.0 * (dn_per_e if of == "code" else 1.0)
 
     assert np.mean(picture.data) == pytest.approx(expected, rel=0.2 if of == "code" else 0.05)
@@ -499,7 +499,7 @@ def test_an_even_scene_is_even_per_area_whatever_the_sites_sizes(method, of):
         assert picture.data == pytest.approx(np.full_like(picture.data, 100.0), rel=1e-5)
 
 
-def test_codes_of_capacitances_that_grow_with_the_area_are_even_as_they_are():
+def test_area_scaled_capacitances_give_uniform_codes():
     capacitance_f = 1e-15 * ZONES.area_um2
     camera, _, capture = captured(ZONES, capacitance_f=capacitance_f, shot_noise="off")
     site, area = (
@@ -511,7 +511,7 @@ def test_codes_of_capacitances_that_grow_with_the_area_are_even_as_they_are():
     assert area.std() / area.mean() < 0.01
 
 
-def test_dark_charge_and_pedestal_are_no_light():
+def test_dark_signal_and_pedestal_are_subtracted():
     dark = {"dark_e_per_s": 2e6, "pedestal_v": 0.05}
     camera, _, capture = captured(SQUARES, **dark)
     for of in ("light_e", "electrons", "expected_e"):
@@ -524,9 +524,9 @@ def test_dark_charge_and_pedestal_are_no_light():
 @pytest.mark.parametrize(
     "parameters",
     [{}, {"companding": "root"}, {"companding": "log"}, {"nonlinearity_fraction": 0.2}, {"pedestal_v": 0.1}],
-    ids=["linear", "root", "log", "bent", "pedestal"],
+    ids=["linear", "root", "log", "nonlinear", "pedestal"],
 )
-def test_codes_tell_the_light_that_made_them(parameters):
+def test_photoelectrons_estimated_from_code_unbiased(parameters):
     layout = fs.layout.grid(n_x=50, n_y=40, pitch_um=2.0)
     sensor = fs.Sensor(
         layout, bits=12, capacitance_f=1e-15, v_sat_v=2.0, read_noise_e=5.0, dark_e_per_s=1e4, **parameters
@@ -534,15 +534,15 @@ def test_codes_tell_the_light_that_made_them(parameters):
     light_e = np.linspace(200.0, 6000.0, layout.n_sites)
     streams = fs._core.random_streams.Streams(1, 0)
     code = sensor.read(sensor.collect(light_e + 100.0, streams=streams), streams=streams)
-    readings = estimate_from_code(code, sensor, 0.01)
-    z = (readings.light_e - light_e) / np.sqrt(readings.variance_e2)
+    estimates = estimate_from_code(code, sensor, 0.01)
+    z = (estimates.light_e - light_e) / np.sqrt(estimates.variance_e2)
 
     assert abs(z.mean()) < 5.0 / math.sqrt(z.size)
     assert z.std() == pytest.approx(1.0, abs=5.0 / math.sqrt(2.0 * z.size))
-    assert not readings.is_saturated.any()
+    assert not estimates.is_saturated.any()
 
 
-def test_full_sites_are_told():
+def test_saturated_sites_are_flagged():
     sensor = fs.Sensor(SQUARES, full_well_e=1000.0, bits=8, capacitance_f=1e-15, v_sat_v=0.1)
     charge = np.where(np.arange(SQUARES.n_sites) < 10, 1000.0, 500.0)
 
@@ -550,7 +550,7 @@ def test_full_sites_are_told():
     assert estimate_from_code(np.array([255] + [9] * (SQUARES.n_sites - 1)), sensor, 0.01).is_saturated.sum() == 1
 
 
-def test_saturated_sites_are_left_out_of_least_squares():
+def test_least_squares_excludes_saturated_sites():
     _, _, capture = captured(SQUARES)
     code = capture.code.copy()
     code[54] = 4095
@@ -577,7 +577,7 @@ def test_saturated_sites_are_left_out_of_least_squares():
 
 
 @pytest.mark.parametrize("method", ["cells", "linear", "natural", "least_squares"])
-def test_a_mosaic_has_a_channel_for_each_filter(method):
+def test_mosaic_has_one_channel_per_filter(method):
     layout = fs.layout.mosaic(fs.layout.grid(n_x=16, n_y=12, pitch_um=2.0), ("RG", "GB"))
     camera, light, capture = captured(layout, filters="rgb")
     grid = raster_grid(layout, 32)
@@ -588,7 +588,7 @@ def test_a_mosaic_has_a_channel_for_each_filter(method):
     assert picture.data == pytest.approx(expected.data, rel=1e-4)
 
 
-def test_a_loaded_capture_gives_the_same_picture(tmp_path):
+def test_loaded_capture_gives_same_picture(tmp_path):
     _, _, capture = captured(ZONES, read_noise_e=4.0)
     capture.save(tmp_path / "c.npz")
     one, other = (
@@ -620,7 +620,7 @@ def test_a_loaded_capture_gives_the_same_picture(tmp_path):
         ),
     ],
 )
-def test_bad_choices_of_a_picture_are_refused_by_name(call, message):
+def test_invalid_picture_options_raise(call, message):
     camera, _, capture = captured(SQUARES, capacitance_f=np.full(SQUARES.n_sites, 5e-14))
 
     with pytest.raises(ParameterError, match=message):
@@ -631,7 +631,7 @@ def test_bad_choices_of_a_picture_are_refused_by_name(call, message):
 
 
 def asymmetric(n_channels):
-    """A picture without symmetry, one pixel of which no site covers."""
+    """Picture without symmetry and with one uncovered pixel."""
     data = np.random.default_rng(1).uniform(0.0, 2.0, (n_channels, 5, 4)).astype(np.float32)
     data[:, 1, 2] = np.nan
     coverage = np.ones((5, 4), np.float32)
@@ -641,7 +641,7 @@ def asymmetric(n_channels):
 
 @pytest.mark.parametrize("n_channels", [1, 3])
 @pytest.mark.parametrize("name", ["p.tif", "p.tiff", "p.exr"])
-def test_floating_point_files_keep_every_value_and_no_data(tmp_path, n_channels, name):
+def test_float_files_preserve_values_and_nan(tmp_path, n_channels, name):
     picture = asymmetric(n_channels)
     picture.save(tmp_path / name)
     read = read_picture(tmp_path / name)
@@ -653,7 +653,7 @@ def test_floating_point_files_keep_every_value_and_no_data(tmp_path, n_channels,
 @pytest.mark.parametrize("n_channels", [1, 3])
 @pytest.mark.parametrize("name", ["p.png", "p.tif"])
 @pytest.mark.parametrize(("bits", "kind"), [(8, np.uint8), (16, np.uint16)])
-def test_files_of_whole_numbers_keep_every_number(tmp_path, n_channels, name, bits, kind):
+def test_integer_files_preserve_values(tmp_path, n_channels, name, bits, kind):
     picture = asymmetric(n_channels)
     picture.save(tmp_path / name, 2.0, bits=bits)
     image = picture.to_image(2.0, bits=bits)
@@ -664,7 +664,7 @@ def test_files_of_whole_numbers_keep_every_number(tmp_path, n_channels, name, bi
     np.testing.assert_array_equal(read_picture(tmp_path / name), image, strict=True)
 
 
-def test_a_floating_point_file_is_relative_to_white_where_that_is_given(tmp_path):
+def test_float_file_is_relative_to_white(tmp_path):
     picture = asymmetric(3)
     picture.save(tmp_path / "p.tif", np.array([1.0, 2.0, 4.0]))
     expected = np.moveaxis(picture.data / np.array([1.0, 2.0, 4.0]).reshape(3, 1, 1), 0, -1)[::-1]
@@ -679,27 +679,25 @@ def test_a_floating_point_file_is_relative_to_white_where_that_is_given(tmp_path
         (1, "p.png", {"bits": 32}, fs.errors.FileError, "only 1 to 4 channels of uint8 or uint16"),
         (1, "p.exr", {"bits": 16}, fs.errors.FileError, "only 1 to 4 channels of float32"),
         (1, "p.jpg", {"bits": 16}, fs.errors.FileError, "only 1 to 4 channels of uint8"),
-        (1, "p.tif", {"encode_srgb": True}, ParameterError, "'encode_srgb' must be off for floating-point numbers"),
+        (1, "p.tif", {"encode_srgb": True}, ParameterError, "'encode_srgb' must be False for floating-point files"),
         (2, "p.tif", {}, ParameterError, "'data' must have 1 or 3 channels to be saved, got 2"),
         (2, "p.png", {}, ParameterError, "'data' must have 1 or 3 channels to be shown, got 2"),
         (1, "nowhere/p.exr", {}, fs.errors.FileError, "the folder .*nowhere does not exist"),
     ],
 )
-def test_a_file_that_cannot_hold_a_picture_is_refused_and_not_begun(
-    tmp_path, n_channels, name, options, error, message
-):
+def test_unsupported_files_raise_without_output(tmp_path, n_channels, name, options, error, message):
     with pytest.raises(error, match=message):
         asymmetric(n_channels).save(tmp_path / name, **options)
 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_16_bit_image_of_three_bits_is_refused():
+def test_image_of_three_bits_raises():
     with pytest.raises(ParameterError, match="'bits' must be 8 or 16, got 3"):
         asymmetric(1).to_image(bits=3)
 
 
-def test_borrowed_colours_of_a_channel_without_sites_are_none():
+def test_channel_without_sites_is_nan():
     filled = fill_channels(SQUARES, np.ones(SQUARES.n_sites), np.zeros(SQUARES.n_sites, np.int64), 2)
 
     assert np.isnan(filled[1]).all()

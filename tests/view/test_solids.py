@@ -1,4 +1,4 @@
-"""The sensor as solids: closed, of the right volumes, without overlap, cut truly, and the same in the files."""
+"""Solid models of sensors: closed surfaces, volumes, overlaps, cuts and files."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def hull_um2(layout):
     return shapely.MultiPoint(layout.xy_um).convex_hull.area
 
 
-# -- closed, and of the right volume -------------------------------------------------------------------------------------
+# -- closed surfaces and volumes -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_every_part_is_closed_and_no_two_share_volume(name):
+def test_parts_are_closed_without_overlap(name):
     made = solids(LAYOUTS[name](), STACK)
     report = made.check()
 
@@ -53,7 +53,7 @@ def test_every_part_is_closed_and_no_two_share_volume(name):
         body = as_trimesh(mesh)
         assert body.is_watertight
         assert body.is_winding_consistent
-    # Balls and rings: as many as there are sites.
+    # One sphere-like or ring-like piece per site.
     n = made.layout.n_sites
     assert [part.euler_characteristic for part in report.parts] == [2 * n, 0, 2 * n, 2 * n]
     assert max(report.overlap_um3.values()) <= 1e-9
@@ -68,12 +68,12 @@ def test_volumes_are_areas_times_thicknesses(name):
     assert made.volumes_um3("wells") == pytest.approx(3.0 * well_um2, rel=1e-9)
     assert made.volumes_um3("trenches") == pytest.approx(3.0 * (layout.area_um2 - well_um2), rel=1e-9)
     assert made.volumes_um3("filters") == pytest.approx(0.6 * layout.area_um2, rel=1e-9)
-    for part in made.check().parts:  # manifold3d's own sums, of millions of triangles far from the origin too
+    for part in made.check().parts:  # sums by manifold3d, also far from the origin
         assert part.volume_um3 == pytest.approx(made.volumes_um3(part.name).sum(), rel=1e-7)
 
 
-def test_the_trench_of_a_square_is_what_a_pencil_says():
-    # 2 µm squares: wells of 1.8 µm, walls of 4 - 3.24 µm².
+def test_square_trench_volumes_match_hand_calculation():
+    # 2 µm squares: wells of 1.8 µm side, trenches of 4 - 3.24 µm².
     made = solids(fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0), STACK)
 
     assert made.volumes_um3("wells") == pytest.approx(np.full(9, 3.0 * 3.24), rel=1e-12)
@@ -85,8 +85,8 @@ def test_the_trench_of_a_square_is_what_a_pencil_says():
 
 
 @pytest.mark.parametrize("n_steps", [1, 4, 32])
-def test_a_lens_is_a_stack_of_frustums_over_its_site(n_steps):
-    # A frustum between scaled copies of an area A at shares s and t has the volume A h (s² + s t + t²) / 3.
+def test_lens_volume_is_sum_of_frustums(n_steps):
+    # A frustum between copies of an area A, scaled by s and t, has the volume A h (s² + s t + t²) / 3.
     layout = fs.layout.hexagonal(n_columns=4, n_rows=4, pitch_um=3.0)
     made = solids(layout, SensorStack(lens_height_um=0.5, n_lens_steps=n_steps))
     radius_um = np.sqrt(layout.area_um2[0] / np.pi)
@@ -98,7 +98,7 @@ def test_a_lens_is_a_stack_of_frustums_over_its_site(n_steps):
     assert made.volumes_um3("lenses") == pytest.approx(layout.area_um2 * frustums.sum(), rel=1e-9)
 
 
-def test_the_lens_of_a_disc_comes_to_the_cap_of_a_ball():
+def test_disc_lens_approaches_spherical_cap():
     disc = fs.Layout.from_polygons([shapely.Point(5.0, 5.0).buffer(4.0, quad_segs=64)])
     made = solids(disc, SensorStack(lens_height_um=1.5, n_lens_steps=48))
     cap_um3 = np.pi * 1.5 * (3.0 * 16.0 + 1.5**2) / 6.0
@@ -106,7 +106,7 @@ def test_the_lens_of_a_disc_comes_to_the_cap_of_a_ball():
     assert made.volumes_um3("lenses")[0] == pytest.approx(cap_um3, rel=2e-3)
 
 
-def test_a_lens_is_at_most_half_a_ball_over_a_small_site():
+def test_lens_is_at_most_a_hemisphere():
     made = solids(fs.Layout.from_rectangles([[0, 0], [20, 0]], [1.0, 9.0]), SensorStack(lens_height_um=3.0))
     mesh = made.parts["lenses"]
     top_um = [mesh.points_um[mesh.photosite == k, 2].max() for k in (0, 1)]
@@ -115,7 +115,7 @@ def test_a_lens_is_at_most_half_a_ball_over_a_small_site():
 
 
 @pytest.mark.parametrize("name", ["squares", "rings with arcs", "gaps"])
-def test_rounder_lenses_are_closed_and_touch_their_filters_only(name):
+def test_round_lenses_closed_without_overlap(name):
     made = solids(LAYOUTS[name](), SensorStack(n_lens_corners=20, n_lens_steps=5))
     lenses = made.parts["lenses"]
     report = made.check()
@@ -123,7 +123,7 @@ def test_rounder_lenses_are_closed_and_touch_their_filters_only(name):
     assert report.ok
     assert as_trimesh(lenses).is_watertight
     assert report.parts[3].euler_characteristic == 2 * made.layout.n_sites
-    # Seen from above no part of a lens hangs over another one: all but the floor faces up.
+    # No part of a lens overhangs another one: all faces except the floor face up.
     a, b, c = (lenses.points_um[lenses.triangles[:, k]] for k in range(3))
     upward = np.cross(b - a, c - a)[:, 2]
     assert np.all((upward > 0.0) | (np.maximum(np.maximum(a, b), c)[:, 2] <= 0.6))
@@ -131,7 +131,7 @@ def test_rounder_lenses_are_closed_and_touch_their_filters_only(name):
     assert roof_um2 == pytest.approx(made.layout.area_um2, rel=1e-9)
 
 
-def test_the_fill_factor_is_the_layouts_own():
+def test_fill_factor_matches_layout():
     for make in LAYOUTS.values():
         layout = make()
         whole = solids(layout, SensorStack(trench_width_um=0.0))
@@ -144,7 +144,7 @@ def test_the_fill_factor_is_the_layouts_own():
         )
 
 
-def test_ten_thousand_sites_are_closed_and_share_nothing():
+def test_ten_thousand_sites_closed_without_overlap():
     layout = fs.layout.grid(n_x=100, n_y=100, pitch_um=4.0)
     made = solids(layout, SensorStack(trench_width_um=0.4))
     report = made.check()
@@ -158,19 +158,19 @@ def test_ten_thousand_sites_are_closed_and_share_nothing():
     assert report.parts[2].volume_um3 == pytest.approx(10_000 * 16.0 * 0.6, rel=1e-9)
 
 
-def test_the_check_sees_parts_that_share_volume_and_surfaces_that_are_open():
+def test_check_detects_overlaps_and_open_surfaces():
     made = solids(fs.layout.grid(n_x=3, n_y=3, pitch_um=2.0), STACK)
     wells = made.parts["wells"]
     moved = type(wells)(**{**fields_of(wells), "points_um": wells.points_um + np.array([0.05, 0.0, 0.0])})
     opened = type(wells)(**{**fields_of(wells), "triangles": wells.triangles[1:]})
 
     shared = with_wells(made, moved).check()
-    # Every well stands 0.05 µm deep in its own trench's wall, over 1.8 µm by 3 µm.
+    # Every well overlaps its own trench by 0.05 µm, over 1.8 µm by 3 µm.
     assert shared.overlap_um3["wells", "trenches"] == pytest.approx(9 * 0.05 * 1.8 * 3.0)
     assert not shared.ok
-    broken = with_wells(made, opened).check()
-    assert broken.parts[0].status == "NotManifold"
-    assert not broken.ok
+    not_closed = with_wells(made, opened).check()
+    assert not_closed.parts[0].status == "NotManifold"
+    assert not not_closed.ok
 
 
 def fields_of(mesh):
@@ -181,11 +181,11 @@ def with_wells(made, wells):
     return type(made)(layout=made.layout, sensor_stack=made.sensor_stack, parts={**made.parts, "wells": wells})
 
 
-# -- odd sites -----------------------------------------------------------------------------------------------------------
+# -- sites with holes and reflex vertices --------------------------------------------------------------------------------
 
 
-def test_holes_and_inward_corners_are_carried():
-    # The frame's well is a frame too; its trench runs along the outline and around the hole.
+def test_holes_and_reflex_vertices_are_preserved():
+    # The well of the frame is also a frame; its trench follows the outline and the hole.
     layout = fs.Layout.from_polygons([FRAME, HOOK])
     made = solids(layout, NO_LENSES)
     report = made.check()
@@ -202,7 +202,7 @@ def test_holes_and_inward_corners_are_carried():
     }
 
 
-def test_a_hole_that_meets_the_outline_in_a_corner_is_closed():
+def test_hole_touching_outline_gives_closed_solid():
     bitten = shapely.Polygon([(30, 0), (38, 0), (38, 8), (30, 8)], [[(30, 0), (34, 6), (36, 4)]])
     made = solids(fs.Layout.from_polygons([bitten]), SensorStack(trench_width_um=0.0, lens_height_um=0.0))
 
@@ -210,20 +210,20 @@ def test_a_hole_that_meets_the_outline_in_a_corner_is_closed():
     assert made.volumes_um3("wells")[0] == pytest.approx(3.0 * bitten.area, rel=1e-9)
 
 
-def test_a_site_that_no_place_sees_whole_carries_no_lens_and_is_named():
+def test_lens_on_non_star_shaped_site_raises():
     box = shapely.box(-9, 0, -1, 8)
     with pytest.raises(
-        GeometryError, match=r"site 1 cannot carry a lens: .* take lens_height_um=0, or other sites"
+        GeometryError, match=r"site 1 cannot have a lens: .* use lens_height_um=0, or other sites"
     ) as raised:
         solids(fs.Layout.from_polygons([box, HORSESHOE]), STACK)
     assert raised.value.site_ids == (1,)
-    with pytest.raises(GeometryError, match=r"site 0 cannot carry a lens \(and 1 more\): it has a hole"):
+    with pytest.raises(GeometryError, match=r"site 0 cannot have a lens \(and 1 more\): it has a hole"):
         solids(fs.Layout.from_polygons([FRAME, box, HORSESHOE]), STACK)
     assert solids(fs.Layout.from_polygons([FRAME, box, HORSESHOE]), NO_LENSES).check().ok
 
 
-def test_a_hook_carries_a_lens_from_its_corner():
-    # The centre of area lies outside; that of the largest circle in the corner sees all.
+def test_hook_lens_uses_inscribed_circle():
+    # The centroid lies outside; about the centre of the largest inscribed circle the site is star-shaped.
     hook = shapely.Polygon([(0, 0), (8, 0), (8, 3), (3, 3), (3, 8), (0, 8)])
     assert not hook.contains(hook.centroid)
     made = solids(fs.Layout.from_polygons([hook]), SensorStack())
@@ -232,15 +232,15 @@ def test_a_hook_carries_a_lens_from_its_corner():
     assert made.volumes_um3("lenses")[0] > 0.0
 
 
-def test_a_site_too_narrow_for_its_trench_is_named():
+def test_trench_wider_than_site_raises():
     layout = fs.Layout.from_rectangles([[0, 0], [5, 0], [10, 0]], [[2, 2], [0.15, 2], [2, 2]])
 
-    with pytest.raises(GeometryError, match=r"site 1 is too narrow for a trench of 0\.2 µm around it") as raised:
+    with pytest.raises(GeometryError, match=r"site 1 is too narrow for a trench of 0\.2 µm; use a smaller") as raised:
         solids(layout, STACK)
     assert raised.value.site_ids == (1,)
 
 
-def test_a_layout_without_sites_has_no_solids():
+def test_solids_of_empty_layout_raise():
     with pytest.raises(GeometryError, match="no sites"):
         solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0)[np.zeros(4, bool)])
 
@@ -256,7 +256,7 @@ def test_a_layout_without_sites_has_no_solids():
         ({"n_lens_corners": -1}, "'n_lens_corners' must be >= 0"),
     ],
 )
-def test_thicknesses_that_cannot_be_are_refused(parameters, message):
+def test_invalid_thicknesses_raise_by_name(parameters, message):
     with pytest.raises(ParameterError, match=message):
         SensorStack(**parameters)
 
@@ -266,7 +266,7 @@ def test_thicknesses_that_cannot_be_are_refused(parameters, message):
 
 @pytest.mark.parametrize("name", ["squares", "rings with arcs", "zones"])
 @pytest.mark.parametrize("shape", ["quarter", "slanted", "disc", "two pieces"])
-def test_a_cut_leaves_closed_solids_of_the_remaining_area(name, shape):
+def test_cut_solids_closed_with_remaining_volume(name, shape):
     layout = LAYOUTS[name]()
     x0, y0, x1, y1 = layout.bounds_um
     x, y, size = 0.5 * (x0 + x1) + 0.123, 0.5 * (y0 + y1) - 0.217, max(x1 - x0, y1 - y0)
@@ -284,12 +284,12 @@ def test_a_cut_leaves_closed_solids_of_the_remaining_area(name, shape):
 
     assert cut.check().ok
     assert all(as_trimesh(mesh).is_watertight for mesh in cut.meshes)
-    # Site by site: so every cut face knows whose it is.
+    # Volumes per site require that every cut face has the correct photosite.
     assert cut.volumes_um3("filters") == pytest.approx(0.6 * left_um2, abs=1e-9 * layout.area_um2.max())
     assert cut.volumes_um3("wells") == pytest.approx(3.0 * well_left_um2, abs=1e-9 * layout.area_um2.max())
 
 
-def test_a_cut_lens_loses_what_manifold3d_says():
+def test_cut_lens_volume_matches_manifold3d():
     made = solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=4.0), STACK)
     region = shapely.box(-1.0, -5.0, 5.0, 1.2)
     lenses = made.parts["lenses"]
@@ -299,7 +299,7 @@ def test_a_cut_lens_loses_what_manifold3d_says():
     assert made.cut(region).volumes_um3("lenses").sum() == pytest.approx((body - box).volume(), rel=1e-12)
 
 
-def test_pieces_of_a_cut_keep_the_colour_and_the_value_of_their_site():
+def test_cut_pieces_keep_site_values():
     layout = LAYOUTS["squares"]()
     values = np.arange(layout.n_sites, dtype=float)
     cut = solids(layout, STACK, by=values).cut(shapely.box(-0.5, -50, 50, 0.4))
@@ -311,7 +311,7 @@ def test_pieces_of_a_cut_keep_the_colour_and_the_value_of_their_site():
         assert reach_um <= 1.0 + 1e-9
 
 
-def test_a_cut_of_some_parts_leaves_the_others():
+def test_partial_cut_leaves_other_parts():
     made = solids(LAYOUTS["hexagons"](), STACK)
     cut = made.cut(of=["lenses", "filters"])
 
@@ -321,36 +321,36 @@ def test_a_cut_of_some_parts_leaves_the_others():
         made.cut(of=["glass"])
 
 
-def test_whole_sites_go_by_their_middles():
-    layout = fs.layout.grid(n_x=4, n_y=1, pitch_um=2.0)  # middles at -3, -1, 1, 3
+def test_whole_cut_selects_sites_by_centroid():
+    layout = fs.layout.grid(n_x=4, n_y=1, pitch_um=2.0)  # centres at -3, -1, 1, 3
     cut = solids(layout, STACK).cut(shapely.box(0.9, -5, 9, 5), whole=True)
 
     assert cut.volumes_um3("filters") == pytest.approx([2.4, 2.4, 0.0, 0.0])
 
 
-def test_a_region_over_everything_leaves_nothing_and_says_so(tmp_path):
+def test_cut_of_everything_leaves_empty_solids(tmp_path):
     made = solids(fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0), STACK)
     nothing = made.cut(shapely.box(-9, -9, 9, 9))
 
     assert nothing.volumes_um3("wells").sum() == 0.0
     with pytest.raises(GeometryError, match="nothing to show"):
         render(nothing, renderer="software")
-    with pytest.raises(GeometryError, match="nothing left of the solids to write"):
+    with pytest.raises(GeometryError, match="the solids have no triangles to write"):
         nothing.write(tmp_path / "none.glb")
     assert nothing.cut().fill_factor == 0.0
 
 
-def test_the_sensor_cut_open_shows_every_layer():
+def test_stack_shows_every_layer():
     opened = stack(fs.layout.grid(n_x=20, n_y=20, pitch_um=2.0), STACK)
     volumes = [opened.volumes_um3(part) for part in PARTS]
 
     assert opened.check().ok
-    # More is taken away the higher the layer.
+    # Higher layers have fewer complete sites.
     n_whole = [np.count_nonzero(v > 0.99 * v.max()) for v in volumes]
     assert n_whole[0] == n_whole[1] > n_whole[2] > n_whole[3] > 0
 
 
-def test_a_capture_shows_its_code_in_the_wells():
+def test_capture_wells_show_code():
     layout = LAYOUTS["squares"]()
     sensor = fs.Sensor(layout, filters="rgb", capacitance_f=1e-15)
     scene = fs.Scene.flat(
@@ -372,7 +372,7 @@ def made():
     return solids(LAYOUTS["hexagons"](), STACK, by=np.arange(100.0))
 
 
-def test_a_glb_holds_the_same_faces_sites_and_values(made, tmp_path):
+def test_glb_file_preserves_faces_and_attributes(made, tmp_path):
     made.write(tmp_path / "sensor.glb")
     loaded = trimesh.load(tmp_path / "sensor.glb", process=False)
 
@@ -380,17 +380,17 @@ def test_a_glb_holds_the_same_faces_sites_and_values(made, tmp_path):
     for name, mesh in made.parts.items():
         body = loaded.geometry[name]
         assert np.array_equal(body.faces, mesh.triangles)
-        assert np.allclose(body.vertices, mesh.points_um, rtol=1e-6, atol=1e-5)  # glTF's numbers are float32
+        assert np.allclose(body.vertices, mesh.points_um, rtol=1e-6, atol=1e-5)  # glTF stores float32
         assert np.array_equal(np.ravel(body.vertex_attributes["_photosite"]), mesh.photosite)
         assert np.array_equal(np.ravel(body.vertex_attributes["_value"]), mesh.values)
         assert np.array_equal(body.visual.vertex_colors[:, :3], mesh.colours)
         assert body.is_watertight
 
 
-@pytest.mark.parametrize("ending", [".stl", ".ply", ".obj", ".3mf"])
-def test_other_files_hold_as_many_faces_and_the_same_volume(made, ending, tmp_path):
-    made.write(tmp_path / f"sensor{ending}")
-    loaded = trimesh.load(tmp_path / f"sensor{ending}", process=False)
+@pytest.mark.parametrize("extension", [".stl", ".ply", ".obj", ".3mf"])
+def test_other_files_preserve_faces_and_volume(made, extension, tmp_path):
+    made.write(tmp_path / f"sensor{extension}")
+    loaded = trimesh.load(tmp_path / f"sensor{extension}", process=False)
     bodies = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
     n_faces = sum(len(body.faces) for body in bodies)
     volume_um3 = sum(made.volumes_um3(part).sum() for part in PARTS)
@@ -399,7 +399,7 @@ def test_other_files_hold_as_many_faces_and_the_same_volume(made, ending, tmp_pa
     assert sum(body.volume for body in bodies) == pytest.approx(volume_um3, rel=1e-5)
 
 
-def test_an_unknown_ending_is_refused_and_leaves_nothing(made, tmp_path):
+def test_unknown_extension_raises_without_output(made, tmp_path):
     with pytest.raises(FileError, match=r"must end in \.glb, \.stl"):
         made.write(tmp_path / "sensor.step")
     with pytest.raises(FileError, match=r"the folder .* does not exist"):
@@ -407,20 +407,20 @@ def test_an_unknown_ending_is_refused_and_leaves_nothing(made, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_an_export_that_fails_leaves_what_was_there(made, tmp_path, monkeypatch):
+def test_failed_export_keeps_existing_file(made, tmp_path, monkeypatch):
     (tmp_path / "sensor.glb").write_bytes(b"before")
 
-    def broken(*_, **__):
+    def fail(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(trimesh.Scene, "export", broken)
+    monkeypatch.setattr(trimesh.Scene, "export", fail)
     with pytest.raises(FileError, match="cannot be written: No space left on device"):
         made.write(tmp_path / "sensor.glb")
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"before"]
 
 
 @pytest.mark.parametrize("library", ["lxml", "networkx"])
-def test_a_library_that_is_missing_is_named_with_its_command(made, library, tmp_path, monkeypatch):
+def test_missing_library_error_names_install_command(made, library, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, library, None)
 
     with pytest.raises(FileError, match=rf"needs {library}; install it with: pip install 'foveasim\[view\]'"):
@@ -428,7 +428,7 @@ def test_a_library_that_is_missing_is_named_with_its_command(made, library, tmp_
     assert not list(tmp_path.iterdir())
 
 
-def test_solids_tell_what_they_are(made):
+def test_solids_repr_lists_parts(made):
     assert (
         repr(made)
         == "Solids(2,000 triangles of wells, 4,800 triangles of trenches, 2,000 triangles of filters, 7,000 triangles of lenses)"

@@ -1,4 +1,4 @@
-"""Plots on matplotlib axes: every site drawn where it is, in the colour of what it measured."""
+"""Plots on matplotlib axes: positions and colours of photosites, overlays, reports and files."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from foveasim.view.site_colours import BACKGROUND, CATEGORY_COLOURS, FILTER_COLO
 
 FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
 LAYOUT = fs.Layout.from_polygons([FRAME, shapely.box(10, 0, 12, 8)])
-#: More sites than are drawn as outlines.
+#: More sites than the limit for outlines.
 MANY = fs.layout.grid(n_x=64, n_y=64, pitch_um=2.0)
 CHEQUERED = np.add.outer(np.arange(64), np.arange(64)).ravel() % 2
 
 
 def drawn(axes, tmp_path, dpi=100):
-    """The picture of the axes' inside, which are stretched over the whole figure, first row on top."""
+    """Render the interior of the axes, stretched over the figure, top row first."""
     axes.set_position((0, 0, 1, 1))
     axes.axis("off")
     axes.figure.set_layout_engine("none")
@@ -60,19 +60,19 @@ def mosaic_capture():
 # -- outlines and images -------------------------------------------------------------------------------------------
 
 
-def test_sites_are_drawn_where_they_are_holes_and_gaps_left_open(tmp_path):
+def test_outlines_leave_holes_and_gaps_open(tmp_path):
     axes = plot_layout(LAYOUT, np.array([[1.0, 0, 0], [0, 0, 1.0]]), scale_bar=False, ax=bare_axes())
     picture = drawn(axes, tmp_path)
     red, blue = (np.all(picture == colour, axis=-1).mean() for colour in ([255, 0, 0], [0, 0, 255]))
 
-    # Of the plot's 12 x 8 µm the frame covers 64 - 16 and the box 16.
+    # Of the plot's 12 x 8 µm the frame covers 64 - 16 µm² and the box 16 µm².
     assert red == pytest.approx(48 / 96, abs=0.02)
     assert blue == pytest.approx(16 / 96, abs=0.02)
     assert not np.all(picture[200, 200] == [255, 0, 0])
 
 
 @pytest.mark.parametrize("n", [1, 60], ids=["outlines", "image"])
-def test_y_points_up_and_x_to_the_right(tmp_path, n):
+def test_y_up_and_x_right(tmp_path, n):
     layout = fs.layout.grid(n_x=2 * n, n_y=2 * n, pitch_um=2.0)
     is_high, is_right = (layout.centroid_um[:, i] > 0 for i in (1, 0))
     assert (layout.n_sites > MOST_OUTLINES) == (n > 1)
@@ -84,7 +84,7 @@ def test_y_points_up_and_x_to_the_right(tmp_path, n):
     assert np.all(picture[50:150, 250:350] == 255)
 
 
-def test_an_image_of_many_sites_shows_each_where_it_is_and_what_none_covers(tmp_path):
+def test_image_shows_sites_and_uncovered_areas(tmp_path):
     whole = fs.layout.grid(n_x=64, n_y=96, pitch_um=2.0)
     layout = whole[(whole.centroid_um[:, 0] > 0) | (whole.centroid_um[:, 0] < -32.0)]
     assert layout.n_sites > MOST_OUTLINES
@@ -97,7 +97,7 @@ def test_an_image_of_many_sites_shows_each_where_it_is_and_what_none_covers(tmp_
     assert np.all(picture[:, 201:] == 0)
 
 
-def test_an_image_is_as_the_outlines_are(tmp_path, monkeypatch):
+def test_image_matches_outlines(tmp_path, monkeypatch):
     layout = fs.layout.log_polar(n_sectors=60, min_size_um=1.0, r_max_um=20.0)
     colours = np.random.default_rng(0).integers(0, 256, (layout.n_sites, 3), dtype=np.uint8)
     pictures = []
@@ -112,7 +112,7 @@ def test_an_image_is_as_the_outlines_are(tmp_path, monkeypatch):
     assert difference.mean() < 3.0  # of 255: outlines have a rim of 0.3 points
 
 
-def test_an_image_is_sharp_at_any_zoom_and_resolution(tmp_path):
+def test_image_sharp_at_any_zoom(tmp_path):
     axes = plot_layout(MANY, CHEQUERED[:, None] * np.ones(3), scale_bar=False, ax=bare_axes(4, 4))
     axes.set_xlim(-2.0, 2.0)
     axes.set_ylim(-2.0, 2.0)
@@ -120,12 +120,12 @@ def test_an_image_is_sharp_at_any_zoom_and_resolution(tmp_path):
         picture = drawn(axes, tmp_path, dpi=dpi)
         values, counts = np.unique(picture, return_counts=True)
 
-        # Four squares of one colour each, up to the pixels on their borders.
+        # Four squares of one colour each, except for the pixels on their boundaries.
         assert counts[np.isin(values, (0, 255))].sum() / picture.size > 1 - 4.5 / (4 * dpi)
         assert (picture == 255).mean() == pytest.approx(0.5, abs=2.5 / (4 * dpi))
 
 
-def test_many_sites_smaller_than_pixels_give_their_mean(tmp_path):
+def test_subpixel_sites_are_averaged(tmp_path):
     axes = plot_layout(MANY, CHEQUERED[:, None] * np.ones(3), scale_bar=False, ax=bare_axes(0.2, 0.2))
     picture = drawn(axes, tmp_path)
 
@@ -133,7 +133,7 @@ def test_many_sites_smaller_than_pixels_give_their_mean(tmp_path):
     assert picture.mean() == pytest.approx(127.5, abs=3.0)
 
 
-def test_axes_turned_over_turn_the_image(tmp_path):
+def test_inverted_axes_flip_image(tmp_path):
     colours = np.where(MANY.centroid_um[:, :1] > 0, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     axes = plot_layout(MANY, colours, scale_bar=False, ax=bare_axes(4, 4))
     axes.invert_xaxis()
@@ -143,7 +143,7 @@ def test_axes_turned_over_turn_the_image(tmp_path):
     assert np.all(picture[:, 201:] == [0, 0, 255])
 
 
-def test_an_image_is_painted_once_for_the_same_view_and_recoloured_without():
+def test_image_cache_survives_recolouring():
     axes = plot_layout(MANY, np.zeros((MANY.n_sites, 3)), ax=bare_axes())
     (image,) = axes.images
     assert isinstance(image, SiteImage)
@@ -158,19 +158,19 @@ def test_an_image_is_painted_once_for_the_same_view_and_recoloured_without():
     assert image.pixels is not first
 
 
-@pytest.mark.parametrize("ending", ["pdf", "svg"])
-def test_an_image_can_stand_in_a_file_of_vectors(tmp_path, ending):
-    save_figure(plot_layout(MANY, "row", figure_inches=3.0).figure, tmp_path / f"plot.{ending}")
+@pytest.mark.parametrize("extension", ["pdf", "svg"])
+def test_image_embeds_in_vector_files(tmp_path, extension):
+    save_figure(plot_layout(MANY, "row", figure_inches=3.0).figure, tmp_path / f"plot.{extension}")
 
-    assert (tmp_path / f"plot.{ending}").stat().st_size > 5000
+    assert (tmp_path / f"plot.{extension}").stat().st_size > 5000
 
 
-# -- what is told beside the sites ---------------------------------------------------------------------------------
+# -- annotations ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("layout", [LAYOUT, MANY], ids=["outlines", "image"])
 @pytest.mark.parametrize("is_drawn", [False, True])
-def test_the_site_under_the_mouse_is_told_with_its_size_and_value(layout, is_drawn):
+def test_status_bar_shows_site_under_mouse(layout, is_drawn):
     axes = layout.plot(np.arange(layout.n_sites) * 1.5, label="charge / e-")
     if is_drawn:
         axes.figure.draw_without_rendering()
@@ -187,17 +187,17 @@ def test_the_site_under_the_mouse_is_told_with_its_size_and_value(layout, is_dra
     ("limit_um", "expected_um"),
     [(0.7, 0.5), (1.0, 1.0), (1.99, 1.0), (2.0, 2.0), (4.9, 2.0), (50.0, 50.0), (999.0, 500.0), (2e4, 2e4)],
 )
-def test_a_scale_bar_is_one_two_or_five(limit_um, expected_um):
+def test_scale_bar_length_is_round(limit_um, expected_um):
     assert nice_length_um(limit_um) == pytest.approx(expected_um, rel=1e-12)
 
 
 @pytest.mark.parametrize(("length_um", "text"), [(0.2, "200 nm"), (1.0, "1 µm"), (500.0, "500 µm"), (5000.0, "5 mm")])
-def test_a_scale_bar_has_the_unit_that_suits_it(length_um, text):
+def test_scale_bar_unit_matches_length(length_um, text):
     assert length_text(length_um) == text
 
 
 @pytest.mark.parametrize("zoom", [1.0, 0.1, 0.013])
-def test_a_scale_bar_is_as_long_as_it_says(tmp_path, zoom):
+def test_scale_bar_length_matches_label(tmp_path, zoom):
     axes = plot_layout(MANY, np.ones((MANY.n_sites, 3)), ax=bare_axes(6, 6))
     axes.set_xlim(-64.0 * zoom, 64.0 * zoom)
     axes.set_ylim(-64.0 * zoom, 64.0 * zoom)
@@ -208,7 +208,7 @@ def test_a_scale_bar_is_as_long_as_it_says(tmp_path, zoom):
     assert length_px * 128.0 * zoom / 600 == pytest.approx(nice_length_um(32.0 * zoom), rel=0.02)
 
 
-def test_a_colour_bar_has_the_unit_and_the_range_and_a_legend_the_kinds():
+def test_colour_bar_and_legend_contents():
     layout = fs.layout.mosaic(fs.layout.log_polar(n_sectors=8, min_size_um=1.0, r_max_um=4.3), ("RG", "GB"))
     sized = layout.plot("area_um2")
     (bar,) = [axes for axes in sized.figure.axes if axes is not sized]
@@ -226,7 +226,7 @@ def test_a_colour_bar_has_the_unit_and_the_range_and_a_legend_the_kinds():
     assert lines.get_title() == f"readout line: {layout.n_sites} in 10 colours"
 
 
-def test_readout_lines_pass_through_the_centres_in_their_order():
+def test_readout_lines_follow_readout_order():
     layout = fs.layout.readout_by(fs.layout.grid(n_x=3, n_y=4, pitch_um=2.0), "column")
     axes = layout.plot(overlay="readout_lines")
     lines = axes.collections[1].get_segments()
@@ -236,7 +236,7 @@ def test_readout_lines_pass_through_the_centres_in_their_order():
     assert axes.collections[2].get_offsets().tolist() == [[x, -3] for x in (-2, 0, 2)]
 
 
-def test_adjacency_is_a_line_for_each_shared_edge():
+def test_adjacency_draws_shared_edges():
     axes = fs.layout.grid(n_x=3, n_y=4, pitch_um=2.0).plot(overlay=["adjacency"])
     segments = np.array(axes.collections[1].get_segments())
 
@@ -247,11 +247,11 @@ def test_adjacency_is_a_line_for_each_shared_edge():
 # -- colours -------------------------------------------------------------------------------------------------------
 
 
-def test_a_mosaic_is_drawn_in_the_colours_of_its_filters(mosaic_capture):
+def test_mosaic_drawn_in_filter_colours(mosaic_capture):
     axes = mosaic_capture.plot()
     colours = axes.collections[0].get_facecolor()[:, :3]
 
-    # The filter's own colour is the strongest of the three.
+    # The channel of the filter is the strongest of the three.
     assert np.array_equal(colours.argmax(axis=1), mosaic_capture.layout.channel)
     assert np.array_equal(
         site_colours(mosaic_capture, "channel"), [FILTER_COLOURS["RGB"[c]] for c in mosaic_capture.layout.channel]
@@ -261,14 +261,14 @@ def test_a_mosaic_is_drawn_in_the_colours_of_its_filters(mosaic_capture):
     assert bar.get_ylim() == (0.0, mosaic_capture.code.max())
 
 
-def test_the_brightest_site_of_a_mosaic_has_its_filters_colour(mosaic_capture):
+def test_brightest_mosaic_site_has_filter_colour(mosaic_capture):
     brightest = int(mosaic_capture.electrons.argmax())
 
     expected = FILTER_COLOURS["RGB"[mosaic_capture.layout.channel[brightest]]]
     assert tuple(site_colours(mosaic_capture, "electrons")[brightest]) == expected
 
 
-def test_values_rise_through_the_colour_map_and_no_data_is_none_of_it():
+def test_colour_map_monotonic_nan_distinct():
     layout = fs.layout.grid(n_x=256, n_y=1, pitch_um=1.0)
     values = np.arange(256.0)
     values[7] = np.nan
@@ -281,7 +281,7 @@ def test_values_rise_through_the_colour_map_and_no_data_is_none_of_it():
     assert np.abs(np.delete(rgb, 7, axis=0) - NO_DATA).sum(axis=1).min() > 60
 
 
-def test_equal_values_have_one_colour_and_a_scale_of_some_length():
+def test_equal_values_share_one_colour():
     shown = colours_of(MANY, np.full(MANY.n_sites, 3.0))
 
     assert np.unique(shown.rgb, axis=0).shape == (1, 3)
@@ -296,9 +296,9 @@ def test_equal_values_have_one_colour_and_a_scale_of_some_length():
         (np.array(list("abcabc")), ["a", "b", "c"]),
         (np.array([3, 3, 5, 5, 3, 3]), ["3", "5"]),
     ],
-    ids=["truth", "text", "numbers"],
+    ids=["booleans", "strings", "integers"],
 )
-def test_kinds_have_a_colour_each_which_the_legend_names(values, names):
+def test_categories_have_colours_and_legend(values, names):
     layout = fs.layout.grid(n_x=6, n_y=1, pitch_um=1.0).with_columns(kind=values)
     shown = colours_of(layout, "kind")
     legend = dict(shown.legend)
@@ -309,7 +309,7 @@ def test_kinds_have_a_colour_each_which_the_legend_names(values, names):
     assert shown.scale is None
 
 
-def test_a_readout_line_has_the_colour_of_its_number_in_any_part_of_a_layout():
+def test_readout_line_colours_independent_of_subset():
     layout = fs.layout.readout_by(fs.layout.grid(n_x=30, n_y=2, pitch_um=1.0), "column")
 
     rgb = site_colours(layout, "readout_line")
@@ -317,10 +317,10 @@ def test_a_readout_line_has_the_colour_of_its_number_in_any_part_of_a_layout():
     assert np.array_equal(rgb, np.array(CATEGORY_COLOURS)[layout.readout_line % 10])
 
 
-def test_neighbours_of_a_bare_layout_mostly_differ():
+def test_bare_layout_neighbours_mostly_differ():
     rgb = site_colours(fs.layout.grid(n_x=50, n_y=40, pitch_um=1.0)).reshape(40, 50, 3).astype(int)
 
-    # Five shades without any order: 4 of 5 pairs differ.
+    # With five random shades, 4 of 5 pairs differ.
     assert np.any(np.diff(rgb, axis=1), axis=-1).mean() > 0.75
     assert np.any(np.diff(rgb, axis=0), axis=-1).mean() > 0.75
 
@@ -328,7 +328,7 @@ def test_neighbours_of_a_bare_layout_mostly_differ():
 # -- design rules --------------------------------------------------------------------------------------------------
 
 
-def test_a_report_is_drawn_with_every_violation_in_its_place():
+def test_report_plot_shows_every_violation():
     layout = fs.Layout.from_rectangles([[0, 0], [10, 0], [10.5, 6], [20, 0]], [[4, 4], [0.5, 4], [4, 4], [1, 1]])
     rules = fs.DesignRules(min_width_um=0.8, min_size_um=1.8, max_sites=3, waivers={"min_size_um": "test pixels"})
     report = layout.check(rules)
@@ -345,12 +345,12 @@ def test_a_report_is_drawn_with_every_violation_in_its_place():
     assert len(colours) == len(by_label)
     texts = {text.get_text() for text in axes.texts}
     assert {"0.5 µm", "1 µm", "1.41 µm"} <= texts
-    assert axes.get_title() == "4 violations on 4 photosites, 0 of 3 rules kept"
+    assert axes.get_title() == "4 violations on 4 photosites, 0 of 3 rules satisfied"
     waived = next(c for label, c in by_label.items() if "waived" in label)
     assert waived.get_linestyle()[0][1] is not None
 
 
-def test_a_report_without_a_layout_shows_the_places_alone():
+def test_report_plot_without_layout():
     report = LAYOUT.check(fs.DesignRules(min_width_um=3.0))
     axes = plot_report(report)
 
@@ -358,19 +358,19 @@ def test_a_report_without_a_layout_shows_the_places_alone():
     x, y = np.asarray([[r["x_um"], r["y_um"]] for r in report.records()]).T
     assert axes.get_xlim()[0] < x.min() <= x.max() < axes.get_xlim()[1]
     assert axes.get_ylim()[0] < y.min() <= y.max() < axes.get_ylim()[1]
-    with pytest.raises(ParameterError, match="'layout' must be the one that was checked, of 2 sites"):
+    with pytest.raises(ParameterError, match="'layout' must be the checked layout of 2 sites"):
         report.plot(MANY)
 
 
-def test_a_report_of_a_sound_layout_says_so(tmp_path):
+def test_report_plot_without_violations(tmp_path):
     axes = LAYOUT.check(fs.DesignRules(min_size_um=1.0)).plot(LAYOUT)
 
-    assert axes.get_title() == "0 violations on 2 photosites, 1 of 1 rules kept"
+    assert axes.get_title() == "0 violations on 2 photosites, 1 of 1 rules satisfied"
     assert axes.get_legend() is None
     save_figure(axes.figure, tmp_path / "report.png", dpi=50)
 
 
-def test_of_too_many_violations_the_worst_are_drawn_and_the_legend_says_so(tmp_path):
+def test_report_plot_limits_violations(tmp_path):
     report = MANY.check(fs.DesignRules(min_size_um=3.0))
     axes = report.plot(MANY)
 
@@ -384,7 +384,7 @@ def test_of_too_many_violations_the_worst_are_drawn_and_the_legend_says_so(tmp_p
 # -- drawings ------------------------------------------------------------------------------------------------------
 
 
-def test_a_drawing_has_a_path_a_site_in_the_colours_of_the_plot(tmp_path, mosaic_capture):
+def test_drawing_paths_match_plot_colours(tmp_path, mosaic_capture):
     save_drawing(mosaic_capture, tmp_path / "capture.svg", "electrons")
     paths = list(ET.parse(tmp_path / "capture.svg").iter("{http://www.w3.org/2000/svg}path"))
 
@@ -395,7 +395,7 @@ def test_a_drawing_has_a_path_a_site_in_the_colours_of_the_plot(tmp_path, mosaic
     assert re.match(rf"M{x0:.4f} {y0:.4f}L", paths[0].get("d"))
 
 
-def test_a_drawing_of_too_many_sites_is_refused_and_leaves_nothing(tmp_path):
+def test_oversized_drawing_raises_without_output(tmp_path):
     with pytest.raises(ParameterError, match="'data' must have at most 20,000 sites for a drawing, got 20,022"):
         save_drawing(fs.layout.grid(n_x=142, n_y=141, pitch_um=1.0), tmp_path / "layout.svg")
     with pytest.raises(FileError, match=r"must end in \.svg"):
@@ -404,7 +404,7 @@ def test_a_drawing_of_too_many_sites_is_refused_and_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-# -- what is rejected -----------------------------------------------------------------------------------------------
+# -- errors ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -414,7 +414,7 @@ def test_a_drawing_of_too_many_sites_is_refused_and_leaves_nothing(tmp_path):
         ({"by": np.ones(3)}, "'by' must have one row for each of the 2 sites"),
         ({"by": np.ones((5, 3))}, "'by' must have one row for each of the 2 sites"),
         ({"by": np.ones((2, 4))}, "'by' must have one row for each of the 2 sites"),
-        ({"by": [[1.0], [1.0, 2.0]]}, "'by' must be one value for each site"),
+        ({"by": [[1.0], [1.0, 2.0]]}, "'by' must have one value for each site"),
         ({"by": [1j, 2.0]}, "'by' must be an array of numbers"),
         ({"by": np.array([1.0, np.inf])}, "'by' must be finite everywhere, or NaN"),
         ({"by": np.full((2, 3), np.nan)}, "'by' must be finite everywhere"),
@@ -423,29 +423,29 @@ def test_a_drawing_of_too_many_sites_is_refused_and_leaves_nothing(tmp_path):
         ({"overlay": "readout_lines"}, "'readout_line' must be a column of the layout"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(arguments, message):
+def test_invalid_plot_arguments_raise(arguments, message):
     with pytest.raises(ParameterError, match=message):
         plot_layout(LAYOUT, **arguments)
 
 
-def test_adjacency_of_too_many_sites_is_refused():
-    with pytest.raises(ParameterError, match="'adjacency' is for at most 50,000 sites, got 50,176"):
+def test_adjacency_of_many_sites_raises():
+    with pytest.raises(ParameterError, match="'overlay' must not be 'adjacency' above 50,000 sites, got 50,176"):
         plot_layout(fs.layout.grid(n_x=224, n_y=224, pitch_um=1.0), overlay="adjacency")
 
 
-def test_only_layouts_and_captures_have_sites_to_colour():
+def test_colours_of_other_types_raises():
     with pytest.raises(ParameterError, match="'data' must be a Layout or a Capture, got a dict"):
         colours_of({})
 
 
-def test_an_unknown_format_is_refused_and_leaves_nothing(tmp_path):
+def test_unknown_format_raises_without_output(tmp_path):
     with pytest.raises(FileError, match="cannot be written in this format"):
         save_figure(plot_layout(LAYOUT).figure, tmp_path / "plot.xyz")
 
     assert not list(tmp_path.iterdir())
 
 
-def test_a_noise_budget_has_a_bar_for_each_source_and_class():
+def test_noise_budget_bars_per_source_and_class():
     layout = fs.layout.grid(n_x=4, n_y=1, pitch_um=2.0)
     sensor = fs.Sensor(layout, read_noise_e=[3.0, 3.0, 5.0, 5.0], prnu_fraction=0.01)
     noise_e = fs.sensor.noise_budget(sensor, np.full(4, 400.0), 1.0)
@@ -459,11 +459,11 @@ def test_a_noise_budget_has_a_bar_for_each_source_and_class():
     assert widths[0] == pytest.approx(20.0)
     assert widths[1] == pytest.approx(np.sqrt(17.0))
     assert [bar.get_width() for bar in apart.patches][1::4] == pytest.approx([3.0, 5.0])
-    with pytest.raises(ParameterError, match="'classes' must be one for each of the 4 sites"):
+    with pytest.raises(ParameterError, match="'classes' must have one value for each of the 4 sites"):
         plot_noise_budget(noise_e, classes=[0, 1])
 
 
-def test_sizes_that_differ_by_rounding_have_one_colour():
+def test_sizes_within_rounding_share_one_colour():
     layout = fs.layout.grid(n_x=20, n_y=20, pitch_um=0.1).rotate(17.0)
 
     assert np.ptp(layout.area_um2) > 0.0

@@ -1,4 +1,4 @@
-"""Three dimensions: what PyVista gets, columns as high as a response, and two renderers that see the same."""
+"""Three-dimensional views: PyVista data, prisms with the heights of values, and agreement of both renderers."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from foveasim.view.meshes import triangulated
 
 FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
 HOOK = shapely.Polygon([(20, 0), (28, 0), (28, 2), (22, 2), (22, 8), (20, 8)])
-#: The hole meets the outline in a corner.
+#: The hole touches the outline in a corner.
 BITTEN = shapely.Polygon([(30, 0), (38, 0), (38, 8), (30, 8)], [[(30, 0), (34, 6), (36, 4)]])
-#: Every edge has vertices in its middle: no fan from a corner is without flat triangles.
+#: Edges have collinear vertices, so that every fan from a corner has degenerate triangles.
 NODED = shapely.Polygon(
     [(40 + x, y) for x, y in [(0, 0), (3, 0), (6, 0), (9, 0), (9, 3), (9, 6), (9, 9), (5, 9), (0, 9), (0, 5)]]
 )
@@ -61,14 +61,14 @@ LAYOUTS = {
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_triangles_cover_every_site_once_and_none_is_flat_or_turned_over(name):
+def test_triangles_cover_every_site_once(name):
     layout = LAYOUTS[name]()
     caps = triangulated(layout)
     areas_um2 = area_um2(layout, caps)
 
     assert np.all(areas_um2 > 0.0)
     assert np.bincount(caps.site, weights=areas_um2) == pytest.approx(layout.area_um2, rel=1e-12)
-    # Triangles of their own site's vertices, all of them: n - 2 for an outline, 2 more for a hole that does not touch it.
+    # Triangles use all vertices of their own site: n - 2 for an outline, 2 more for a hole that does not touch it.
     n_vertices = np.diff(layout.ring_offsets[layout.site_offsets])
     n_holes = np.where(np.arange(layout.n_sites) == 3, 0, np.diff(layout.site_offsets) - 1)
     assert np.array_equal(np.bincount(caps.site), n_vertices - 2 + 2 * n_holes)
@@ -76,7 +76,7 @@ def test_triangles_cover_every_site_once_and_none_is_flat_or_turned_over(name):
     assert np.array_equal(site_of_vertex[caps.triangles], np.repeat(caps.site[:, np.newaxis], 3, axis=1))
 
 
-def test_no_triangle_lies_outside_its_site():
+def test_triangles_lie_inside_their_site():
     caps = triangulated(ODD_LAYOUT)
     triangles = shapely.polygons(ODD_LAYOUT.xy_um[caps.triangles])
     outside = shapely.difference(triangles, np.array(ODD)[caps.site])
@@ -84,10 +84,10 @@ def test_no_triangle_lies_outside_its_site():
     assert shapely.area(outside).max() < 1e-12
 
 
-# -- PyVista's data ------------------------------------------------------------------------------------------------------
+# -- PyVista data --------------------------------------------------------------------------------------------------------
 
 
-def test_every_column_goes_with_its_polygon():
+def test_polydata_cells_have_all_columns():
     layout = fs.layout.hexagonal(n_columns=4, n_rows=3, pitch_um=2.0).with_columns(zone=np.arange(12) // 5)
     mesh = layout.to_pyvista()
 
@@ -100,7 +100,7 @@ def test_every_column_goes_with_its_polygon():
     assert json.loads(mesh.field_data["provenance"][0])["generator"] == "hexagonal"
 
 
-def test_sites_with_holes_and_inward_corners_keep_their_area_and_their_number():
+def test_concave_sites_keep_area_and_index():
     mesh = ODD_LAYOUT.to_pyvista()
     photosite = np.asarray(mesh.cell_data["photosite"])
     sizes = np.asarray(mesh.compute_cell_sizes()["Area"])
@@ -111,7 +111,7 @@ def test_sites_with_holes_and_inward_corners_keep_their_area_and_their_number():
     assert [str(name) for name in mesh.cell_data["name"]] == [list("abcde")[site] for site in photosite]
 
 
-def test_a_capture_gives_what_it_measured_and_how():
+def test_polydata_contains_capture_values_and_settings():
     taken = capture()
     mesh = taken.to_pyvista()
 
@@ -120,21 +120,21 @@ def test_a_capture_gives_what_it_measured_and_how():
     assert json.loads(mesh.field_data["settings"][0]) == json.loads(json.dumps(taken.settings))
 
 
-def test_an_empty_layout_is_an_empty_mesh():
+def test_empty_layout_gives_empty_mesh():
     assert ODD_LAYOUT[np.zeros(5, bool)].to_pyvista().n_cells == 0
 
 
-def test_pyvista_that_is_missing_is_named_with_its_command(monkeypatch):
+def test_missing_pyvista_error_names_install_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyvista", None)
 
     with pytest.raises(ParameterError, match=r"is missing; install it with: pip install 'foveasim\[view\]'"):
         ODD_LAYOUT.to_pyvista()
 
 
-# -- columns -------------------------------------------------------------------------------------------------------------
+# -- prisms --------------------------------------------------------------------------------------------------------------
 
 
-def test_columns_are_as_high_as_their_values():
+def test_prism_heights_proportional_to_values():
     values = np.array([1.0, 4.0, 2.0, 0.0, 3.0])
     columns = prisms(ODD_LAYOUT, values, max_height_um=8.0)
     top_um = np.zeros(5)
@@ -144,8 +144,8 @@ def test_columns_are_as_high_as_their_values():
     assert np.array_equal(columns.values, values[columns.photosite])
 
 
-def test_the_surface_of_columns_is_roofs_and_walls():
-    # What a layout of n sites has: the area of the sites, and their outlines times the height.
+def test_prism_surface_is_tops_and_walls():
+    # Area of the sites, and length of their outlines times the height.
     columns = prisms(ODD_LAYOUT, np.ones(5), max_height_um=3.0)
     a, b, c = (columns.points_um[columns.triangles[:, k]] for k in range(3))
     surface_um2 = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
@@ -153,7 +153,7 @@ def test_the_surface_of_columns_is_roofs_and_walls():
     assert surface_um2 == pytest.approx(ODD_LAYOUT.area_um2.sum() + 3.0 * shapely.length(np.array(ODD)).sum())
 
 
-def test_columns_of_a_capture_show_its_code_in_the_colours_of_its_filters():
+def test_capture_prisms_show_code_and_filters():
     taken = capture()
     columns = prisms(taken)
 
@@ -162,7 +162,7 @@ def test_columns_of_a_capture_show_its_code_in_the_colours_of_its_filters():
     assert np.all(columns.colours[is_red].argmax(axis=1) == 0)
 
 
-def test_a_height_by_name_and_a_colour_by_another():
+def test_prism_height_and_colour_columns():
     layout = ODD_LAYOUT.with_columns(depth_um=np.arange(5.0))
     columns = prisms(layout, "depth_um", by="channel")
 
@@ -182,32 +182,32 @@ def test_a_height_by_name_and_a_colour_by_another():
         ({"max_height_um": 0.0}, "'max_height_um' must be > 0"),
     ],
 )
-def test_heights_that_are_none_are_refused(arguments, message):
+def test_invalid_heights_raise_by_name(arguments, message):
     with pytest.raises(ParameterError, match=message):
         prisms(ODD_LAYOUT, **arguments)
 
 
-def test_a_layout_without_sites_has_no_columns():
+def test_prisms_of_empty_layout_raise():
     with pytest.raises(GeometryError, match="no sites"):
         prisms(ODD_LAYOUT[np.zeros(5, bool)])
 
 
-# -- the software's renderer ---------------------------------------------------------------------------------------------
+# -- software renderer ---------------------------------------------------------------------------------------------------
 
 
 def software(scene, **parameters):
     return render(scene, renderer="software", **{"size_px": (300, 200), "oversampling": 1, **parameters})
 
 
-def test_seen_from_above_every_pixel_shows_the_site_under_it():
-    # All as high as each other: what is seen is the layout, enlarged.
+def test_top_view_shows_site_under_pixel():
+    # Prisms of equal height show the layout, enlarged.
     flat = prisms(ODD_LAYOUT, np.ones(5), max_height_um=0.01)
     site = sites_in_view(flat, viewpoint=STRAIGHT_DOWN, size_px=(980, 200))
     seen = np.argwhere(site >= 0)
     left, right, top, bottom = seen[:, 1].min(), seen[:, 1].max() + 1, seen[:, 0].min(), seen[:, 0].max() + 1
     x0, y0, x1, y1 = ODD_LAYOUT.bounds_um
     x_um = x0 + (np.arange(left, right) + 0.5 - left) / (right - left) * (x1 - x0)
-    y_um = y1 - (np.arange(top, bottom) + 0.5 - top) / (bottom - top) * (y1 - y0)  # first row on top: y up
+    y_um = y1 - (np.arange(top, bottom) + 0.5 - top) / (bottom - top) * (y1 - y0)  # top row first: y up
     expected = np.full((bottom - top, right - left), -1)
     for k, polygon in enumerate(ODD):
         expected[shapely.contains_xy(polygon, *np.meshgrid(x_um, y_um))] = k
@@ -215,18 +215,18 @@ def test_seen_from_above_every_pixel_shows_the_site_under_it():
     assert np.mean(site[top:bottom, left:right] == expected) > 0.98
 
 
-def test_the_nearer_column_hides_the_farther_one_whatever_their_order():
+def test_nearer_prism_hides_farther_in_any_order():
     for y_um in ([0.0, 20.0], [20.0, 0.0]):
         layout = fs.Layout.from_rectangles([[0.0, y_um[0]], [0.0, y_um[1]]], 4.0)
         site = sites_in_view(
             prisms(layout, [1.0, 1.0], max_height_um=30.0), viewpoint=Viewpoint(azimuth_deg=-90, elevation_deg=0)
         )
-        near = int(np.argmin(y_um))  # the viewer stands at small y
+        near = int(np.argmin(y_um))  # the viewer is at small y
 
         assert set(np.unique(site)) == {-1, near}
 
 
-def test_a_square_twice_as_near_is_seen_twice_as_large():
+def test_projected_size_follows_perspective():
     corners = np.array([[-2.0, -2.0], [2.0, -2.0], [2.0, 2.0], [-2.0, 2.0]])
     squares = Mesh(
         name="squares",
@@ -246,7 +246,7 @@ def test_a_square_twice_as_near_is_seen_twice_as_large():
     assert above_um / (above_um - 40.0) > 1.5
 
 
-def test_roofs_have_their_colour_and_walls_are_darker():
+def test_shading_of_tops_and_walls():
     layout = fs.Layout.from_rectangles([[0.0, 0.0]], 10.0)
     mesh = prisms(layout, [1.0], max_height_um=10.0, by=np.array([[200, 100, 40]], np.uint8))
     light = np.array(render3d.LIGHT) / np.linalg.norm(render3d.LIGHT)
@@ -259,7 +259,7 @@ def test_roofs_have_their_colour_and_walls_are_darker():
     }  # fmt: skip
 
 
-def test_no_colour_is_clipped():
+def test_shading_clips_no_colour():
     picture = software(prisms(ODD_LAYOUT, np.ones(5), by=np.full((5, 3), 255, np.uint8)))
     seen = picture[np.any(picture != render3d.BACKGROUND, axis=-1)]
 
@@ -268,7 +268,7 @@ def test_no_colour_is_clipped():
     assert len(np.unique(seen[:, 0])) >= 3
 
 
-def test_oversampling_is_the_mean_of_finer_pixels():
+def test_oversampling_averages_finer_pixels():
     columns = prisms(ODD_LAYOUT, np.arange(5.0))
     fine = software(columns, size_px=(600, 400)).astype(float)
     mean = fine.reshape(200, 2, 300, 2, 3).mean(axis=(1, 3))
@@ -277,7 +277,7 @@ def test_oversampling_is_the_mean_of_finer_pixels():
 
 
 @pytest.mark.parametrize("n_threads", [1, 3, 7])
-def test_the_picture_does_not_depend_on_the_number_of_threads(n_threads, monkeypatch):
+def test_rendering_independent_of_threads(n_threads, monkeypatch):
     columns = prisms(ODD_LAYOUT, np.arange(5.0))
     expected = software(columns)
     monkeypatch.setattr(render3d, "thread_count", lambda: n_threads)
@@ -285,7 +285,7 @@ def test_the_picture_does_not_depend_on_the_number_of_threads(n_threads, monkeyp
     assert np.array_equal(software(columns), expected)
 
 
-def test_a_zoom_of_two_enlarges_twice():
+def test_zoom_two_doubles_lengths():
     columns = prisms(fs.layout.grid(n_x=9, n_y=9, pitch_um=2.0), np.ones(81), max_height_um=0.01)
     plain, near = (
         sites_in_view(columns, viewpoint=Viewpoint(azimuth_deg=-90, elevation_deg=90, zoom=zoom)) for zoom in (1.0, 2.0)
@@ -297,7 +297,7 @@ def test_a_zoom_of_two_enlarges_twice():
 @pytest.mark.parametrize(
     "viewpoint", [Viewpoint(azimuth_deg=a, elevation_deg=e) for a in (-120, 10, 200) for e in (-30, 5, 60, 90)]
 )
-def test_the_whole_scene_is_in_the_picture_and_fills_it(viewpoint):
+def test_scene_fits_and_fills_picture(viewpoint):
     columns, size_px = prisms(ODD_LAYOUT, np.arange(5.0)), np.array([400, 300])
     place = render3d._eye([columns], viewpoint, (400, 300)).on_screen(columns.points_um, (400, 300))
     margins = np.array([place[:, :2].min(axis=0), size_px - place[:, :2].max(axis=0)]) / size_px
@@ -321,7 +321,7 @@ def test_the_whole_scene_is_in_the_picture_and_fills_it(viewpoint):
         ({"renderer": "best"}, "'renderer' must be one of"),
     ],
 )
-def test_pictures_that_cannot_be_are_refused(parameters, message):
+def test_invalid_render_parameters_raise(parameters, message):
     with pytest.raises(ParameterError, match=message):
         render(prisms(ODD_LAYOUT), **{"renderer": "software", **parameters})
 
@@ -335,19 +335,19 @@ def test_pictures_that_cannot_be_are_refused(parameters, message):
         ({"focus_um": (1.0, 2.0)}, "'focus_um' must be three numbers"),
     ],
 )
-def test_viewpoints_that_cannot_be_are_refused(parameters, message):
+def test_invalid_viewpoints_raise_by_name(parameters, message):
     with pytest.raises(ParameterError, match=message):
         Viewpoint(**parameters)
 
 
-def test_a_scene_that_is_none_is_refused():
+def test_invalid_scene_raises():
     with pytest.raises(ParameterError, match="'scene' must be a Mesh"):
         render(ODD_LAYOUT)
     with pytest.raises(GeometryError, match="nothing to show"):
         render([])
 
 
-def test_a_picture_is_written_as_it_is_given_back(tmp_path):
+def test_written_picture_equals_returned_one(tmp_path):
     picture = render(prisms(ODD_LAYOUT), tmp_path / "still.png", renderer="software", size_px=(60, 40))
 
     assert np.array_equal(read_picture(tmp_path / "still.png"), picture)
@@ -356,12 +356,12 @@ def test_a_picture_is_written_as_it_is_given_back(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["still.png"]
 
 
-# -- PyVista's renderer --------------------------------------------------------------------------------------------------
+# -- PyVista renderer ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.needs("renderer")
 @pytest.mark.parametrize("viewpoint", [Viewpoint(), Viewpoint(azimuth_deg=30, elevation_deg=15, zoom=1.7, view_deg=50)])
-def test_both_renderers_make_the_same_picture(viewpoint):
+def test_both_renderers_agree(viewpoint):
     layout = fs.layout.giotto(n_rho=20, n_theta=40, n_fovea=6, n_across=80, unit_um=1.0, chords_per_arc=3)
     response = 2.0 + np.cos(layout.centroid_um[:, 0] / 5.0)
     columns = prisms(layout, response)
@@ -371,13 +371,13 @@ def test_both_renderers_make_the_same_picture(viewpoint):
     )
     is_ground = [np.all(picture == render3d.BACKGROUND, axis=-1) for picture in (ours, theirs)]
 
-    # Borders may fall to either side of a pixel's centre: less than one in a hundred does.
+    # Boundaries may lie on either side of a pixel centre; this affects less than one pixel in a hundred.
     assert np.mean(is_ground[0] != is_ground[1]) < 0.005
     assert np.mean(np.abs(ours - theirs).max(axis=-1) > 3) < 0.01
 
 
 @pytest.mark.needs("renderer")
-def test_pyvista_sees_the_sites_that_the_identities_name():
+def test_pyvista_picture_matches_sites_in_view():
     layout = fs.layout.hexagonal(n_columns=12, n_rows=12, pitch_um=2.0)
     n = layout.n_sites
     colours = np.stack((np.arange(n) % 16 * 17, np.arange(n) // 16 * 25, np.full(n, 90)), axis=1).astype(np.uint8)
@@ -392,7 +392,7 @@ def test_pyvista_sees_the_sites_that_the_identities_name():
 
 
 @pytest.mark.needs("renderer")
-def test_the_shade_of_corners_darkens_them_and_leaves_no_line_at_the_border():
+def test_ambient_occlusion_darkens_without_edge_artefact():
     layout = fs.layout.grid(n_x=8, n_y=8, pitch_um=2.0)
     columns = prisms(layout, np.indices((8, 8)).sum(axis=0).ravel() % 2 + 1.0, by=np.full((64, 3), 200, np.uint8))
     plain, shaded = (
@@ -407,7 +407,7 @@ def test_the_shade_of_corners_darkens_them_and_leaves_no_line_at_the_border():
 
 
 @pytest.mark.needs("renderer")
-def test_the_shade_of_corners_leaves_a_plain_as_it_is():
+def test_ambient_occlusion_leaves_plane_unchanged():
     flat = prisms(fs.layout.grid(n_x=40, n_y=40, pitch_um=2.0), np.ones(1600), by=np.full((1600, 3), 200, np.uint8))
     for zoom in (1.0, 4.0):
         viewpoint = Viewpoint(zoom=zoom, focus_um=(0.0, 0.0, 6.0))
@@ -419,27 +419,27 @@ def test_the_shade_of_corners_leaves_a_plain_as_it_is():
         )
         inside = (slice(90, 170), slice(150, 250))
 
-        # All but single pixels between two columns; with a fifth of the bias all of them are hatched.
+        # All except single pixels between two prisms; with a fifth of the bias all tops are hatched.
         assert np.mean(plain[inside] == np.median(plain[inside])) > 0.998
         assert np.mean(np.abs(shaded - plain)[inside] <= 1) > 0.998
 
 
 @pytest.mark.needs("renderer")
-def test_a_machine_without_a_screen_opens_no_window(monkeypatch):
+def test_show_raises_without_screen(monkeypatch):
     monkeypatch.setattr(render3d, "find_renderer", lambda: renderer.EGL)
 
     with pytest.raises(SimulationError, match="no screen to open a window on; write a picture with"):
         show(prisms(ODD_LAYOUT))
 
 
-# -- machines that lack something ----------------------------------------------------------------------------------------
+# -- missing software ----------------------------------------------------------------------------------------------------
 
 
-def test_without_a_renderer_the_picture_is_made_and_the_cure_is_named(monkeypatch):
+def test_missing_renderer_warns_and_uses_software(monkeypatch):
     monkeypatch.setattr(render3d, "what_to_install", lambda: "this machine has no OpenGL; install it")
     columns = prisms(ODD_LAYOUT)
 
-    with pytest.warns(FoveasimWarning, match="no OpenGL; install it; the picture is made without"):
+    with pytest.warns(FoveasimWarning, match="no OpenGL; install it; the software renderer is used"):
         picture = render(columns, size_px=(60, 40), ambient_occlusion=True)
     assert np.array_equal(picture, render(columns, size_px=(60, 40), renderer="software"))
     with pytest.raises(SimulationError, match="no OpenGL; install it"):
@@ -448,13 +448,13 @@ def test_without_a_renderer_the_picture_is_made_and_the_cure_is_named(monkeypatc
         show(columns)
 
 
-#: What machines lack, played by the environment: no driver, a library without its drivers, screens that are none.
+#: Environments that emulate missing software: no driver, a library without its drivers, an invalid display.
 MACHINES = {
     "no EGL driver": {"__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
-    "EGL without OpenGL's drivers": {"LIBGL_DRIVERS_PATH": "/nonexistent", "GBM_BACKENDS_PATH": "/nonexistent"},
-    "a screen that is none": {"DISPLAY": ":77", "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
-    "a window class that is none": {renderer.VTK_CHOICE: "vtkNoRenderWindow", "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
-    "a window class without its library": {renderer.VTK_CHOICE: renderer.OSMESA, "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
+    "EGL without OpenGL drivers": {"LIBGL_DRIVERS_PATH": "/nonexistent", "GBM_BACKENDS_PATH": "/nonexistent"},
+    "invalid display": {"DISPLAY": ":77", "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
+    "invalid window class": {renderer.VTK_CHOICE: "vtkNoRenderWindow", "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
+    "window class without its library": {renderer.VTK_CHOICE: renderer.OSMESA, "__EGL_VENDOR_LIBRARY_FILENAMES": "/dev/null"},
 }  # fmt: skip
 STILL = """
 import warnings
@@ -469,21 +469,21 @@ print(fs.view.find_renderer(), len(np.unique(picture)) > 2, *[w.message for w in
 
 
 @pytest.mark.parametrize("machine", MACHINES)
-def test_no_machine_ends_the_interpreter(machine):
+def test_missing_drivers_do_not_crash_interpreter(machine):
     bare = {k: v for k, v in os.environ.items() if k not in {"DISPLAY", renderer.VTK_CHOICE}}
     run = subprocess.run(
         [sys.executable, "-c", STILL], env={**bare, **MACHINES[machine]}, capture_output=True, text=True, check=False
     )
-    found, is_drawn, *told = run.stdout.strip().split("|")
+    found, is_drawn, *messages = run.stdout.strip().split("|")
 
     assert (run.returncode, is_drawn) == (0, "True")
-    # Where a library of another kind is here, it is found; otherwise one sentence says what to install.
-    assert [bool(found == "None")] == [len(told) == 1]
-    assert all("apt install libegl1 libgl1" in sentence for sentence in told)
+    # A library of another kind is found if it is installed; otherwise one message names the missing packages.
+    assert [bool(found == "None")] == [len(messages) == 1]
+    assert all("apt install libegl1 libgl1" in message for message in messages)
 
 
 @pytest.mark.parametrize("outcome", ["crashes", "raises", "hangs"])
-def test_a_trial_that_fails_counts_as_no_renderer(outcome, monkeypatch):
+def test_failed_trial_gives_no_renderer(outcome, monkeypatch):
     trials = {
         "crashes": "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
         "raises": "1 / 0",
@@ -496,14 +496,14 @@ def test_a_trial_that_fails_counts_as_no_renderer(outcome, monkeypatch):
     assert renderer.find_renderer.__wrapped__() is None
 
 
-def test_the_first_window_that_survives_is_taken(monkeypatch):
+def test_first_working_window_is_used(monkeypatch):
     monkeypatch.setattr(renderer, "_candidates", lambda: iter([renderer.X11, renderer.EGL, renderer.OSMESA]))
     monkeypatch.setattr(renderer, "_survives", lambda window: window == renderer.EGL)
 
     assert renderer.find_renderer.__wrapped__() == renderer.EGL
 
 
-def test_libraries_that_are_missing_are_no_candidates(monkeypatch):
+def test_missing_libraries_give_no_candidates(monkeypatch):
     for variable in ("DISPLAY", renderer.VTK_CHOICE):
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.setattr(renderer, "_library", lambda _: None)
@@ -517,13 +517,13 @@ def test_libraries_that_are_missing_are_no_candidates(monkeypatch):
     assert list(renderer._candidates()) == [renderer.OSMESA]
 
 
-def test_without_pyvista_the_command_is_named(monkeypatch):
+def test_missing_pyvista_message_names_command(monkeypatch):
     monkeypatch.setattr(renderer, "find_spec", lambda _: None)
 
     assert renderer.what_to_install() == "PyVista is not installed; install it with: pip install 'foveasim[view]'"
     assert renderer.find_renderer.__wrapped__() is None
 
 
-def test_a_mesh_shows_itself():
+def test_mesh_repr_shows_triangle_count():
     assert repr(prisms(fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0))) == "Mesh('columns', 20 triangles)"
     assert isinstance(prisms(ODD_LAYOUT), Mesh)

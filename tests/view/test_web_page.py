@@ -1,4 +1,4 @@
-"""The page in a real browser: every site where it is, with its values; and in Python: what is packed into it."""
+"""Web pages in a browser: positions, values and colours of sites, controls; and in Python: the encoded data."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ from foveasim.view.web._shapes import shapes_of
 
 SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
-#: A frame with an island in it, an L, an arrow that no fan from its first vertex fills, a comb that none fills at all,
-#: two boxes that share a border, and two that overlap.
+#: A frame with an island in it, an L, an arrow that no fan from its first vertex fills, a comb that no fan fills,
+#: two boxes with a common boundary, and two that overlap.
 FRAME = shapely.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)], [[(2, 2), (2, 6), (6, 6), (6, 2)]])
 ELL = shapely.Polygon([(10, 0), (16, 0), (16, 2), (12, 2), (12, 8), (10, 8)])
 ARROW = shapely.Polygon([(0, 10), (8, 14), (0, 18), (3, 14)])
@@ -58,7 +58,7 @@ N_X, N_Y, PITCH_UM = 12, 10, 2.5
 MOSAIC = fs.layout.mosaic(fs.layout.grid(n_x=N_X, n_y=N_Y, pitch_um=PITCH_UM), ("RG", "GB"))
 
 
-#: A code of 5 e-, as :func:`capture_of` makes them.
+#: Electronics with 5 e- per code, as in :func:`capture_of`.
 ELECTRONICS = {"bits": 10, "v_sat_v": 1.0, "capacitance_f": 5 * 1024 * 1.602176634e-19, "read_noise_e": 3.0}
 
 
@@ -82,11 +82,11 @@ def capture_of(layout, filters=("R", "G", "B"), **sensor):
 CAPTURE = capture_of(MOSAIC)
 
 
-# -- what is packed ---------------------------------------------------------------------------------------------------------
+# -- encoded data -----------------------------------------------------------------------------------------------------------
 
 
 def triangles_of(shapes):
-    """Triangles as the page makes them, with their sites, in plain loops."""
+    """Yield triangles as the page creates them, with their sites, in plain loops."""
     cut = dict(zip(shapes.cut_sites.tolist(), range(len(shapes.cut_sites)), strict=True))
     for site in range(len(shapes.site_offsets) - 1):
         if site in cut:
@@ -106,7 +106,7 @@ def triangles_of(shapes):
     ],
     ids=["zoo", "log-polar", "penrose"],
 )
-def test_triangles_fill_each_site_and_nothing_else(layout, n_cut):
+def test_triangles_fill_exactly_their_site(layout, n_cut):
     shapes = shapes_of(layout)
     filled_um2 = np.zeros(layout.n_sites)
     polygons = layout.polygons()
@@ -119,7 +119,7 @@ def test_triangles_fill_each_site_and_nothing_else(layout, n_cut):
     assert shapes.cut_sites.size == n_cut
 
 
-def test_a_place_that_sites_share_is_there_once_and_rings_come_back_from_what_is_told_of_them():
+def test_shared_vertices_stored_once_and_decoded():
     for layout in (ZOO, MOSAIC):
         shapes = shapes_of(layout)
         place, seen = [], 0
@@ -141,20 +141,22 @@ def test_a_place_that_sites_share_is_there_once_and_rings_come_back_from_what_is
     ],
     ids=str,
 )  # fmt: skip
-def test_packed_numbers_come_back_to_the_last_bit(values):
+def test_packed_numbers_decode_bit_identically(values):
     small = smallest(values)
-    told, text = packed(small)
+    about, text = packed(small)
     planes = np.frombuffer(gzip.decompress(base64.b64decode(text)), np.uint8)
-    back = (
-        np.ascontiguousarray(planes.reshape(-1, told["size"]).T).view(told["type"]).ravel() if told["size"] else small
+    decoded = (
+        np.ascontiguousarray(planes.reshape(-1, about["size"]).T).view(about["type"]).ravel()
+        if about["size"]
+        else small
     )
 
-    assert np.array_equal(back.astype(np.float64), values.astype(np.float64), equal_nan=True)
-    assert back.nbytes <= max(values.nbytes, 1)
+    assert np.array_equal(decoded.astype(np.float64), values.astype(np.float64), equal_nan=True)
+    assert decoded.nbytes <= max(values.nbytes, 1)
 
 
 def snr_column(capture):
-    """Signal-to-noise ratios that a page of a capture has; None where it has none."""
+    """Return the signal-to-noise ratios in the page of a capture, or None."""
     page = content_of(capture)
     names = [column["array"] for column in page.about["columns"] if column["key"] == "snr"]
     return page.arrays[names[0]] if names else None
@@ -166,13 +168,13 @@ def test_page_snr_includes_quantisation():
     assert snr_column(CAPTURE) == pytest.approx(expected_e / np.sqrt(expected_e + 9.0 + 25.0 / 12.0), rel=1e-6)
     quiet = snr_column(capture_of(MOSAIC, shot_noise="off"))
     assert quiet == pytest.approx(expected_e / np.sqrt(9.0 + 26.0 / 12.0), rel=1e-6)
-    # An array of which only the checksum was kept, and settings without a sensor.
+    # An array of which the settings contain only the checksum, and settings without a sensor.
     assert snr_column(capture_of(MOSAIC, read_noise_e={"shape": [120], "sha256": "..."})) is None
     assert snr_column(replace(CAPTURE, settings={})) is None
 
 
 class Elements(HTMLParser):
-    """What a page is made of."""
+    """Elements of a page."""
 
     def __init__(self, text):
         super().__init__()
@@ -183,7 +185,7 @@ class Elements(HTMLParser):
         self.found.append((tag, dict(attrs)))
 
 
-def test_a_page_asks_for_nothing_outside_of_it():
+def test_page_loads_no_external_resources():
     text = web_page(CAPTURE)
     links = [v for _, attrs in Elements(text).found for k, v in attrs.items() if k in {"src", "href", "action"}]
 
@@ -204,18 +206,18 @@ def test_a_page_asks_for_nothing_outside_of_it():
         (
             lambda: web_page(ZOO, report=MOSAIC.check(fs.DesignRules(min_size_um=1.0))),
             ParameterError,
-            "'report' must be of this layout of 10 sites, got one of 120",
+            "'report' must be a check of this layout of 10 sites, got one of 120",
         ),
         (lambda: write_web_page(ZOO, "page.txt"), FileError, r"page.txt: must end in .html"),
-        (lambda: write_web_page(ZOO, "nowhere/page.html"), FileError, "the folder nowhere does not exist"),
+        (lambda: write_web_page(ZOO, "nowhere/page.html"), FileError, "the directory nowhere does not exist"),
     ],
 )
-def test_what_cannot_be_shown_is_refused(call, error, message):
+def test_invalid_page_arguments_raise(call, error, message):
     with pytest.raises(error, match=message):
         call()
 
 
-def test_a_page_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+def test_page_is_written_atomically(tmp_path, monkeypatch):
     (tmp_path / "page.html").write_text("before")
     monkeypatch.setattr("foveasim.view.web._page.web_page", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
@@ -240,8 +242,8 @@ def browser():
 
 @pytest.fixture
 def visit(browser, tmp_path):
-    """Opens pages, and at the end asks of each that nothing went wrong and nothing was asked of the network."""
-    contexts, problems, asked = [], [], []
+    """Open pages; at the end check that they had no errors and no network requests."""
+    contexts, problems, requested = [], [], []
 
     def open_page(text, *, hash_text="", script=None, **options):
         path = tmp_path / f"page{len(contexts)}.html"
@@ -255,7 +257,7 @@ def visit(browser, tmp_path):
         page = context.new_page()
         page.on("console", lambda message: problems.append(message.text))
         page.on("pageerror", lambda error: problems.append(str(error)))
-        page.on("request", lambda request: asked.append(request.url))
+        page.on("request", lambda request: requested.append(request.url))
         page.goto(path.as_uri() + hash_text)
         page.evaluate("foveasim.complete")
         return page
@@ -264,11 +266,11 @@ def visit(browser, tmp_path):
     for context in contexts:
         context.close()
     assert problems == []
-    assert [url for url in asked if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert [url for url in requested if not url.startswith(("file:", "data:", "blob:"))] == []
 
 
 def until(page, condition, argument=None):
-    """Wait for a condition, asked from outside: the page's own rules let nothing evaluate text in it."""
+    """Poll a condition from outside, because the page's content security policy forbids evaluation of strings."""
     for _ in range(300):
         if page.evaluate(condition, argument):
             return
@@ -282,7 +284,7 @@ def hover(page, x_um, y_um):
 
 
 def row(page, label):
-    """What the panel says of the site under the mouse."""
+    """Return the value of a label in the panel of the site under the mouse."""
     return page.evaluate(
         "label => { const dt = [...document.querySelectorAll('#values dt')].find((e) => e.textContent === label);"
         " return dt && dt.nextElementSibling.textContent; }",
@@ -291,7 +293,7 @@ def row(page, label):
 
 
 @pytest.mark.needs("chromium")
-def test_the_mouse_finds_every_kind_of_site_and_its_values(visit):
+def test_mouse_shows_site_and_values(visit):
     page = visit(web_page(ZOO))
     inside = {0: (1, 1), 1: (4, 4), 2: (11, 6), 3: (5, 14), 4: (19, 17), 5: (23, 2), 6: (28, 2), 9: (26, 7)}
     for site, point in inside.items():
@@ -304,7 +306,7 @@ def test_the_mouse_finds_every_kind_of_site_and_its_values(visit):
         assert row(page, "is dark") == ("yes" if site == 3 else "no")
         assert row(page, "wide") == f"{site * 10**15:,}"
     assert row(page, "gain") == "9"
-    # The frame's hole beside the island, the arrow's notch, a gap of the comb, and beyond the layout.
+    # The hole of the frame next to the island, the notch of the arrow, a gap of the comb, and outside the layout.
     for point in [(2.5, 4.0), (1.0, 14.0), (17.0, 15.0), (21.0, 9.0)]:
         hover(page, *point)
         assert page.evaluate("foveasim.hovered") == -1
@@ -317,7 +319,7 @@ def test_the_mouse_finds_every_kind_of_site_and_its_values(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_the_page_and_python_agree_on_every_point_and_a_border_has_one_site(visit):
+def test_page_picks_match_python(visit):
     pick = "points => points.map(([x, y]) => foveasim.pickAll(x, y))"
     hexagons = fs.layout.hexagonal(n_columns=7, n_rows=6, pitch_um=3.0)
     for layout, is_straight in ((ZOO, False), (MOSAIC, True), (hexagons, False), (MOSAIC.rotate(30.0), False)):
@@ -326,7 +328,7 @@ def test_the_page_and_python_agree_on_every_point_and_a_border_has_one_site(visi
         anywhere = np.random.default_rng(0).uniform((x0 - 1, y0 - 1), (x1 + 1, y1 + 1), (1500, 2))
         closed = np.concatenate((layout.xy_um, layout.xy_um[:1]))
         on_borders = np.concatenate((layout.xy_um, 0.5 * (closed[1:] + closed[:-1])))
-        # The middle of a slanted edge is on one side of it or the other, by rounding; of straight ones it is exact.
+        # The midpoint of a slanted edge is on either side by rounding; that of axis-parallel edges is exact.
         points = np.concatenate((anywhere, on_borders)) if is_straight else anywhere
         found = page.evaluate(pick, points.tolist())
 
@@ -339,7 +341,7 @@ def test_the_page_and_python_agree_on_every_point_and_a_border_has_one_site(visi
 
 
 @pytest.mark.needs("chromium")
-def test_the_wheel_zooms_about_what_is_under_it(visit):
+def test_wheel_zooms_about_cursor(visit):
     page = visit(web_page(CAPTURE))
     page.mouse.move(320, 510)
     under = page.evaluate("foveasim.fromWindow(320, 510)")
@@ -354,7 +356,7 @@ def test_the_wheel_zooms_about_what_is_under_it(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_the_mouse_pans_pins_and_the_buttons_zoom(visit):
+def test_mouse_pans_and_pins_buttons_zoom(visit):
     page = visit(web_page(CAPTURE))
     hover(page, 0.0, 0.0)
     before = page.evaluate("foveasim.view")
@@ -379,7 +381,7 @@ def test_the_mouse_pans_pins_and_the_buttons_zoom(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_two_fingers_zoom_by_as_much_as_they_part(visit):
+def test_pinch_zooms_by_finger_distance(visit):
     page = visit(web_page(CAPTURE), has_touch=True)
     before = page.evaluate("foveasim.view")
     fingers = page.context.new_cdp_session(page)
@@ -397,7 +399,7 @@ def test_two_fingers_zoom_by_as_much_as_they_part(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_sites_have_the_colours_of_what_is_chosen(visit):
+def test_site_colours_follow_selected_column(visit):
     page = visit(web_page(CAPTURE))
     site = int(np.argmax(CAPTURE.code * (MOSAIC.channel == 1)))
     x, y = MOSAIC.centroid_um[site]
@@ -429,7 +431,7 @@ def test_sites_have_the_colours_of_what_is_chosen(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_holes_and_notches_show_the_ground_and_sites_do_not(visit):
+def test_holes_and_notches_show_background(visit):
     page = visit(web_page(ZOO), color_scheme="light")
     points = [(2.5, 4.0), (1.0, 14.0), (17.0, 15.0), (13.0, 5.0), (1.0, 1.0), (4.0, 4.0), (7.0, 14.0), (19.0, 17.0)]
     is_ground = [page.evaluate("([x, y]) => foveasim.pixel(x, y)", list(p))[:3] == [185, 196, 214] for p in points]
@@ -438,7 +440,7 @@ def test_holes_and_notches_show_the_ground_and_sites_do_not(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_a_range_of_values_fades_all_others(visit):
+def test_value_range_fades_other_sites(visit):
     page = visit(web_page(CAPTURE), hash_text="#by=electrons")
     low, high = np.argsort(CAPTURE.electrons)[[5, -5]]
     point = {site: (MOSAIC.centroid_um[site] + 0.6).tolist() for site in (low, high)}
@@ -467,7 +469,7 @@ def test_a_range_of_values_fades_all_others(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_a_bound_that_is_not_touched_keeps_all_its_digits(visit):
+def test_unchanged_range_bound_keeps_precision(visit):
     page = visit(web_page(CAPTURE), hash_text="#by=expected_e")
     page.fill("#range-from", "1000")
     page.keyboard.press("Enter")
@@ -476,7 +478,7 @@ def test_a_bound_that_is_not_touched_keeps_all_its_digits(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_everything_can_be_reached_and_done_with_the_keyboard(visit):
+def test_page_is_operable_by_keyboard(visit):
     page = visit(web_page(CAPTURE))
     order = []
     for _ in range(20):
@@ -522,7 +524,7 @@ def test_everything_can_be_reached_and_done_with_the_keyboard(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_a_number_finds_its_site_and_one_that_is_none_is_told(visit):
+def test_site_search_finds_number_or_reports(visit):
     page = visit(web_page(CAPTURE))
     page.keyboard.press("/")
     page.keyboard.type("57")
@@ -533,13 +535,13 @@ def test_a_number_finds_its_site_and_one_that_is_none_is_told(visit):
     assert (view["x"], view["y"]) == pytest.approx(MOSAIC.centroid_um[57])
     page.fill("#find-site", "120")
     page.keyboard.press("Enter")
-    assert page.inner_text("#told") == "Sites have the numbers 0 to 119"
+    assert page.inner_text("[role=status]") == "Photosites are numbered from 0 to 119"
     assert page.get_attribute("#find-site", "aria-invalid") == "true"
     assert page.evaluate("foveasim.pinned") == 57
 
 
 @pytest.mark.needs("chromium")
-def test_a_violation_is_flown_to_by_a_click_and_by_enter(visit):
+def test_violation_list_navigates_by_click_and_enter(visit):
     rules = fs.DesignRules(max_overlap_um2=0.0, min_size_um=2.5, min_space_um=2.5, max_sites=50)
     report = ZOO.check(rules)
     page = visit(web_page(ZOO, report=report))
@@ -566,7 +568,7 @@ def test_a_violation_is_flown_to_by_a_click_and_by_enter(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_a_link_opens_the_same_view(visit):
+def test_link_restores_view(visit):
     page = visit(web_page(CAPTURE), hash_text="#x=2.5&y=-3.25&width=9&by=snr&site=41")
 
     view = page.evaluate("foveasim.view")
@@ -580,7 +582,7 @@ def test_a_link_opens_the_same_view(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_the_picture_and_the_map_show_the_same_place(visit):
+def test_picture_and_map_positions_agree(visit):
     page = visit(web_page(CAPTURE))
     x_um, y_um = 6.2, 8.4
     box = page.locator("#picture-frame").bounding_box()
@@ -606,7 +608,7 @@ def test_the_picture_and_the_map_show_the_same_place(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_the_view_is_saved_as_a_picture(visit, tmp_path):
+def test_view_is_saved_as_picture(visit, tmp_path):
     page = visit(web_page(CAPTURE, name="a/b <c>"))
     with page.expect_download() as download:
         page.click("#save")
@@ -616,11 +618,11 @@ def test_the_view_is_saved_as_a_picture(visit, tmp_path):
 
     assert download.value.suggested_filename == "a_b_c_.png"
     assert picture.shape[:2] == (view["height"] + 46, view["width"])
-    middle = picture[: int(view["height"])].reshape(-1, picture.shape[2])
-    assert len(np.unique(middle[:, :3], axis=0)) > 50
+    pixels = picture[: int(view["height"])].reshape(-1, picture.shape[2])
+    assert len(np.unique(pixels[:, :3], axis=0)) > 50
 
 
-HOSTILE = (
+MALICIOUS = (
     "</script><script>window.hacked = 1</script>",
     "<img src=x onerror='window.hacked = 1'>",
     "\"'><svg onload=window.hacked=1>",
@@ -630,35 +632,36 @@ HOSTILE = (
 
 
 @pytest.mark.needs("chromium")
-def test_names_in_a_strangers_file_stay_text(visit, tmp_path):
+def test_untrusted_names_are_escaped(visit, tmp_path):
     layout = ZOO.with_columns(**{
-        text: np.array([HOSTILE[(i + k) % len(HOSTILE)] for i in range(ZOO.n_sites)]) for k, text in enumerate(HOSTILE)
+        text: np.array([MALICIOUS[(i + k) % len(MALICIOUS)] for i in range(ZOO.n_sites)])
+        for k, text in enumerate(MALICIOUS)
     })  # fmt: skip
     layout = fs.Layout(
-        layout.xy_um, layout.ring_offsets, layout.site_offsets, layout.columns, {"generator": HOSTILE[0]}
+        layout.xy_um, layout.ring_offsets, layout.site_offsets, layout.columns, {"generator": MALICIOUS[0]}
     )
     ZOO.check(fs.DesignRules(min_size_um=2.5)).write(tmp_path / "report.lyrdb")
-    told = (tmp_path / "report.lyrdb").read_text()
-    told = told.replace("min_size_um", HOSTILE[1].replace("<", "&lt;")).replace("photosite", "place")
-    (tmp_path / "malformed.lyrdb").write_text(told)
+    text = (tmp_path / "report.lyrdb").read_text()
+    text = text.replace("min_size_um", MALICIOUS[1].replace("<", "&lt;")).replace("photosite", "place")
+    (tmp_path / "malformed.lyrdb").write_text(text)
     report = read_lyrdb(tmp_path / "malformed.lyrdb", layout.n_sites)
-    for name in (HOSTILE[0], HOSTILE[3], HOSTILE[4]):
+    for name in (MALICIOUS[0], MALICIOUS[3], MALICIOUS[4]):
         page = visit(web_page(layout, report=report, name=name))
         hover(page, 1.0, 1.0)
         page.locator("#violations button").first.click()
-        page.select_option("#colouring", HOSTILE[0])
-        until(page, "name => foveasim.column === name", HOSTILE[0])
+        page.select_option("#colouring", MALICIOUS[0])
+        until(page, "name => foveasim.column === name", MALICIOUS[0])
         page.evaluate("() => new Promise((done) => setTimeout(done, 50))")
 
         assert page.evaluate("window.hacked") is None
         assert page.evaluate("document.querySelector('h1').textContent") == name
         assert page.evaluate("document.title") == name.strip().replace("\u2028", "\u2028")
-        assert page.evaluate("foveasim.values(0)")[HOSTILE[0]] == HOSTILE[0]
+        assert page.evaluate("foveasim.values(0)")[MALICIOUS[0]] == MALICIOUS[0]
         assert page.evaluate("document.querySelectorAll('img, svg[onload]').length") == 1
 
 
 @pytest.mark.needs("chromium")
-def test_without_webgl2_the_page_says_so_and_shows_the_picture(visit):
+def test_missing_webgl2_shows_message_and_picture(visit):
     without = (
         "const get = HTMLCanvasElement.prototype.getContext;"
         "HTMLCanvasElement.prototype.getContext = function (kind, ...rest)"
@@ -666,7 +669,7 @@ def test_without_webgl2_the_page_says_so_and_shows_the_picture(visit):
     )
     page = visit(web_page(CAPTURE), script=without)
 
-    assert page.inner_text("#told").startswith("This browser has no WebGL2")
+    assert page.inner_text("[role=status]").startswith("This browser has no WebGL2")
     box = page.locator("#picture").bounding_box()
     assert box["width"] > 600
     assert box["height"] > 400
@@ -680,7 +683,7 @@ def luminance(colour):
 
 
 @pytest.mark.needs("chromium")
-def test_text_stands_out_in_light_and_dark_and_the_button_changes_them(visit):
+def test_theme_button_and_text_contrast(visit):
     page = visit(web_page(CAPTURE), color_scheme="dark")
     theme = "document.documentElement.dataset.theme"
     for expected in ("dark", "light"):
@@ -701,7 +704,7 @@ def test_text_stands_out_in_light_and_dark_and_the_button_changes_them(visit):
 
 @pytest.mark.needs("chromium")
 @pytest.mark.parametrize("size", [(1280, 720), (1024, 640), (640, 800)])
-def test_nothing_sticks_out_of_a_small_window(visit, size):
+def test_page_fits_small_windows(visit, size):
     page = visit(
         web_page(CAPTURE, name="a rather long name of a sensor that nobody would think of"),
         viewport={"width": size[0], "height": size[1]},
@@ -716,7 +719,7 @@ def test_nothing_sticks_out_of_a_small_window(visit, size):
 
 @pytest.mark.needs("chromium")
 @pytest.mark.parametrize(("n_x", "n_y"), [(100, 100), (500, 400)])
-def test_many_sites_open_and_are_found(visit, n_x, n_y):
+def test_large_layout_sites_are_pickable(visit, n_x, n_y):
     layout = fs.layout.grid(n_x=n_x, n_y=n_y, pitch_um=1.5)
     capture = capture_of(layout, filters=("all",))
     page = visit(web_page(capture))
@@ -736,8 +739,8 @@ def test_many_sites_open_and_are_found(visit, n_x, n_y):
 
 
 @pytest.mark.needs("chromium")
-def test_outlines_stay_sharp_however_near_one_goes(visit):
-    """A border a thousandth of a nanometre from the middle of a view two picometres wide, on a sensor of ten millimetres."""
+def test_outlines_sharp_at_extreme_zoom(visit):
+    """Boundary in the centre of a view of 2 nm width, on a sensor of 10 mm."""
     border_um = 3.0
     layout = fs.Layout.from_polygons(
         [shapely.box(0, 0, border_um, 10), shapely.box(border_um, 0, 6, 10), shapely.box(9_000, 9_000, 10_000, 10_000)],
@@ -750,7 +753,7 @@ def test_outlines_stay_sharp_however_near_one_goes(visit):
     assert colours == [list(FILTER_COLOURS["R"]), list(FILTER_COLOURS["G"])]
 
 
-def test_about_is_plain_json_with_a_name_for_every_array():
+def test_about_json_names_every_array():
     text = web_page(ZOO, report=ZOO.check(fs.DesignRules(min_size_um=2.5)))
     about = json.loads(re.search(r'<script type="application/json" id="about">(.*?)</script>', text)[1])
     ids = {attrs["id"] for tag, attrs in Elements(text).found if tag == "script" and attrs.get("type") == "text/plain"}
@@ -763,7 +766,7 @@ def test_about_is_plain_json_with_a_name_for_every_array():
 
 
 @pytest.mark.needs("chromium")
-def test_the_mouse_finds_columns_where_they_stand_and_as_high_as_they_are(visit):
+def test_mouse_picks_prisms_in_3d(visit):
     page = visit(solid_page(CAPTURE))
     page.evaluate("foveasim.lookDown()")
     x0, y0, x1, y1 = MOSAIC.bounds_um
@@ -780,7 +783,7 @@ def test_the_mouse_finds_columns_where_they_stand_and_as_high_as_they_are(visit)
         assert row(page, "filter") == "RGB"[MOSAIC.channel[site]]
     page.mouse.move(3, 3)
     until(page, "foveasim.hovered === -1")
-    # From the side, the tallest column hides what is right behind its top.
+    # From the side, the tallest prism hides the sites directly behind its top.
     page.focus("#solid")
     page.keyboard.press("0")
     site = int(CAPTURE.code.argmax())
@@ -790,7 +793,7 @@ def test_the_mouse_finds_columns_where_they_stand_and_as_high_as_they_are(visit)
 
 
 @pytest.mark.needs("chromium")
-def test_parts_of_the_stack_can_be_hidden_and_what_is_under_them_is_found(visit):
+def test_hidden_parts_expose_parts_below(visit):
     layout = fs.layout.mosaic(fs.layout.grid(n_x=6, n_y=4, pitch_um=3.0), ("RG", "GB"))
     stack = solids(layout, SensorStack(well_depth_um=4.0, trench_width_um=0.4))
     page = visit(solid_page(layout, solids=stack))
@@ -808,7 +811,7 @@ def test_parts_of_the_stack_can_be_hidden_and_what_is_under_them_is_found(visit)
 
 
 @pytest.mark.needs("chromium")
-def test_keys_turn_the_solids_and_the_hovered_site_is_lit_up(visit, tmp_path):
+def test_keys_rotate_and_hover_highlights_site(visit, tmp_path):
     page = visit(solid_page(CAPTURE))
     shots = [page.screenshot()]
     page.focus("#solid")
@@ -823,22 +826,22 @@ def test_keys_turn_the_solids_and_the_hovered_site_is_lit_up(visit, tmp_path):
     page.evaluate("() => new Promise(requestAnimationFrame)")
     (tmp_path / "lit.png").write_bytes(page.screenshot(clip={"x": x - 4, "y": y - 4, "width": 8, "height": 8}))
     red, green, blue = read_picture(tmp_path / "lit.png")[..., :3].reshape(-1, 3).mean(axis=0)
-    assert red > green > 1.3 * blue  # the yellow of what is lit up, over any filter's colour
+    assert red > green > 1.3 * blue  # the yellow highlight over any filter colour
 
 
 @pytest.mark.needs("chromium")
-def test_names_stay_text_on_the_page_of_solids_too(visit):
-    layout = MOSAIC.with_columns(**{HOSTILE[0]: np.full(MOSAIC.n_sites, HOSTILE[1])})
-    page = visit(solid_page(layout, name=HOSTILE[1]))
+def test_solid_page_escapes_names(visit):
+    layout = MOSAIC.with_columns(**{MALICIOUS[0]: np.full(MOSAIC.n_sites, MALICIOUS[1])})
+    page = visit(solid_page(layout, name=MALICIOUS[1]))
     page.evaluate("foveasim.lookDown()")
     page.mouse.move(*page.evaluate("(p) => foveasim.toWindow(...p)", [*MOSAIC.centroid_um[40], 0.0]))
     until(page, "foveasim.hovered === 40")
 
-    assert row(page, HOSTILE[0].replace("_", " ").strip()) == HOSTILE[1]
+    assert row(page, MALICIOUS[0].replace("_", " ").strip()) == MALICIOUS[1]
     assert page.evaluate("window.hacked") is None
 
 
-def test_a_page_of_solids_asks_for_nothing_outside_of_it_and_needs_a_right_ending(tmp_path):
+def test_solid_page_is_self_contained(tmp_path):
     write_solid_page(MOSAIC, tmp_path / "solid.html")
     text = (tmp_path / "solid.html").read_text()
 
@@ -849,11 +852,11 @@ def test_a_page_of_solids_asks_for_nothing_outside_of_it_and_needs_a_right_endin
         write_solid_page(MOSAIC, tmp_path / "solid.glb")
 
 
-# -- three dimensions: what is packed ------------------------------------------------------------------------------------------
+# -- three dimensions: encoded data --------------------------------------------------------------------------------------------
 
 
 def surfaces_of(about, arrays):
-    """Surfaces as the page makes them, in plain loops: name, corners (n, 3, 3) in µm, sites and colours of triangles."""
+    """Yield decoded surfaces, in plain loops: name, corners (n, 3, 3) in µm, sites and colours of triangles."""
     x, y = np.cumsum(arrays["place_x"], dtype=np.int64), np.cumsum(arrays["place_y"], dtype=np.int64)
     place, seen = [], 0
     for back in arrays["places"].tolist():
@@ -879,7 +882,7 @@ def surfaces_of(about, arrays):
 
 
 def in_one_order(triangles_um, sites, *more):
-    """Triangles from their lowest corner on, sorted by sites and places: equal for equal surfaces."""
+    """Return triangles in canonical order, starting at their lowest corner, sorted by site and position."""
     rounded = np.round(triangles_um, 3)
     start = [min(range(3), key=lambda k: tuple(corners[k])) for corners in rounded]
     turned = np.array([np.roll(corners, -k, axis=0) for corners, k in zip(triangles_um, start, strict=True)])
@@ -939,8 +942,8 @@ def test_solid_page_needs_no_trimesh(monkeypatch):
     assert len(solid_page(CAPTURE)) < 150_000
 
 
-def test_scripts_are_source_text_of_this_package():
-    """Nothing minified, nothing of other people's: modules that are read, and written, line by line."""
+def test_scripts_are_readable_source():
+    """Scripts are neither minified nor third-party code."""
     web = files("foveasim.view.web")
     names = sorted(path.name for path in web.iterdir() if not path.name.startswith("__"))
     scripts = [name for name in names if name.endswith(".js")]
@@ -975,7 +978,7 @@ STACK = solids(MOSAIC, SensorStack(well_depth_um=4.0, trench_width_um=0.5, filte
 
 
 def columns_of(layout):
-    """A page of columns of many heights, and the same as prisms for rays: name, polygons, sites, floors, roofs."""
+    """Return a page of columns of many heights, and the same prisms for ray casting: name, polygons, floors, roofs."""
     capture = capture_of(layout, filters=("all",) * (int(layout.channel.max()) + 1))
     x0, y0, x1, y1 = layout.bounds_um
     roofs_um = 0.15 * max(x1 - x0, y1 - y0) * capture.code / capture.code.max()
@@ -998,7 +1001,7 @@ def stack_prisms():
 
 
 def rest(page):
-    """Wait until nothing is drawn any more."""
+    """Wait until drawing has finished."""
     page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => requestAnimationFrame(done))))")  # fmt: skip
 
 
@@ -1018,7 +1021,7 @@ def drag(page, dx, dy, button="left"):
 VIEWS = {
     "aside": lambda _: None,
     "above": lambda page: press(page, "t"),
-    "turned, near, moved": lambda page: (drag(page, 190, -60), press(page, "+", "+", "+", "Shift+ArrowLeft")),
+    "rotated, near, panned": lambda page: (drag(page, 190, -60), press(page, "+", "+", "+", "Shift+ArrowLeft")),
     "low, twice as high": lambda page: (press(page, *["ArrowDown"] * 5), page.fill("#height", "1")),
     "below": lambda page: press(page, *["ArrowDown"] * 14),
     "inside": lambda page: press(page, *["+"] * 9),
@@ -1031,7 +1034,7 @@ VIEWS = {
     [lambda: columns_of(ZOO), lambda: columns_of(ODD), lambda: columns_of(RINGS), stack_prisms],
     ids=["notches and holes", "hexagons", "log-polar", "stack"],
 )
-def test_picks_equal_rays_through_prisms(visit, made):
+def test_picks_match_ray_casting(visit, made):
     text, parts, has_floor = made()
     page = visit(text)
     box = page.locator("#solid").bounding_box()
@@ -1045,14 +1048,14 @@ def test_picks_equal_rays_through_prisms(visit, made):
         pixels = np.floor(rng.uniform((0, 0), (int(box["width"]), int(box["height"])), (250, 2))) + 0.5
         places = pixels + np.array([box["x"], box["y"]])
         found = page.evaluate("points => points.map(([x, y]) => foveasim.pick(x, y))", places.tolist())
-        # Where all of a pixel shows one site, and no other is as near; rounding decides on the borders of all others.
+        # Compare pixels within one site without another site at the same depth; at boundaries rounding decides.
         around = [pixels + offset for offset in ((0, 0), (0.6, 0.6), (-0.6, 0.6), (0.6, -0.6), (-0.6, -0.6))]
         rays = rays_of(camera, box["width"], box["height"], np.concatenate(around))
         hits = np.concatenate([
             first_hits(polygons, floors * camera["height"], roofs * camera["height"], camera["eye"], rays, has_floor=has_floor)
             for _, polygons, floors, roofs in parts
         ], axis=1)  # fmt: skip
-        hits[hits < 0.01 * camera["distance"]] = np.inf  # nearer than what is drawn
+        hits[hits < 0.01 * camera["distance"]] = np.inf  # in front of the near plane
         order = np.argsort(hits, axis=1)
         first, second = np.take_along_axis(hits, order[:, :2], axis=1).T
         which = np.where(np.isfinite(first), order[:, 0], -1).reshape(5, -1)
@@ -1078,7 +1081,7 @@ def test_picks_equal_rays_through_prisms(visit, made):
 
 
 @pytest.mark.needs("chromium")
-def test_gestures_change_the_view_and_nothing_else(visit):
+def test_gestures_change_only_the_view(visit):
     page = visit(solid_page(CAPTURE))
     page.mouse.click(440, 470)
     pinned = page.evaluate("foveasim.pinned")
@@ -1133,7 +1136,7 @@ def test_gestures_change_the_view_and_nothing_else(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_two_fingers_zoom_one_turns_solids(visit):
+def test_solid_page_touch_gestures(visit):
     page = visit(solid_page(CAPTURE), has_touch=True)
     fingers = page.context.new_cdp_session(page)
 
@@ -1188,7 +1191,7 @@ def test_ids_are_drawn_once_per_view(visit):
     drag(page, 50, 50)
     page.mouse.move(3, 3)
     rest(page)
-    # Nothing is drawn while nothing happens.
+    # Nothing is drawn without interaction.
     quiet = page.evaluate("foveasim.counts")
     assert quiet["image"] > before["image"]
     assert quiet["ids"] <= before["ids"] + 2
@@ -1197,7 +1200,7 @@ def test_ids_are_drawn_once_per_view(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_wheel_approaches_the_surface_under_the_mouse(visit):
+def test_wheel_approaches_surface_under_mouse(visit):
     page = visit(solid_page(CAPTURE))
     site = int(CAPTURE.code.argmax())
     x0, y0, x1, y1 = MOSAIC.bounds_um
@@ -1215,8 +1218,8 @@ def test_wheel_approaches_the_surface_under_the_mouse(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_solids_stay_sharp_however_near_one_goes(visit):
-    """Two sites of micrometres on a sensor of ten millimetres, from as near as one can go."""
+def test_solids_sharp_at_extreme_zoom(visit):
+    """Two sites of micrometres on a sensor of 10 mm, from the smallest distance."""
     layout = fs.Layout.from_polygons(
         [shapely.box(0, 0, 3, 10), shapely.box(3, 0, 6, 10), shapely.box(9_000, 9_000, 10_000, 10_000)],
         channel=[0, 1, 2],
@@ -1237,7 +1240,7 @@ def test_solids_stay_sharp_however_near_one_goes(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_click_and_enter_pin_a_site(visit):
+def test_click_and_enter_pin_site(visit):
     page = visit(solid_page(CAPTURE))
     press(page, "t")
     rest(page)
@@ -1261,7 +1264,7 @@ def test_click_and_enter_pin_a_site(visit):
 
 @pytest.mark.needs("chromium")
 @pytest.mark.parametrize("make", [web_page, solid_page])
-def test_question_mark_lists_the_keys(visit, make):
+def test_question_mark_shows_key_list(visit, make):
     page = visit(make(CAPTURE))
     canvas = "#marks" if make is web_page else "#solid"
     is_open = "document.getElementById('keys').open"
@@ -1271,7 +1274,7 @@ def test_question_mark_lists_the_keys(visit, make):
         page.keyboard.press("?")
         assert page.evaluate(is_open)
         assert page.locator("#keys").get_by_text("?", exact=True).is_visible()
-        # Keys of the page rest meanwhile.
+        # Other keys have no effect while the list is open.
         before = page.screenshot()
         for key in ("+", "t", "0", "-"):
             page.keyboard.press(key)
@@ -1291,7 +1294,7 @@ def test_question_mark_lists_the_keys(visit, make):
 
 @pytest.mark.needs("chromium")
 @pytest.mark.parametrize("make", [web_page, solid_page])
-def test_lost_graphics_come_back(visit, make):
+def test_lost_graphics_context_is_restored(visit, make):
     page = visit(make(CAPTURE))
     page.evaluate("foveasim.draw && foveasim.draw()")
     rest(page)
@@ -1302,14 +1305,14 @@ def test_lost_graphics_come_back(visit, make):
         " losing.loseContext(); }",
         canvas,
     )
-    until(page, "!document.getElementById('told').hidden")
-    assert "has lost" in page.inner_text("#told")
+    until(page, "!document.querySelector('[role=status]').hidden")
+    assert "was lost" in page.inner_text("[role=status]")
     page.mouse.move(300, 300)
     page.mouse.wheel(0, -100)
     page.mouse.wheel(0, 100)
     page.mouse.move(3, 3)
     page.evaluate("losing.restoreContext()")
-    until(page, "document.getElementById('told').hidden")
+    until(page, "document.querySelector('[role=status]').hidden")
     rest(page)
     if make is solid_page:
         press(page, "0")
@@ -1327,7 +1330,7 @@ def test_lost_graphics_come_back(visit, make):
 
 
 def assert_alike(one, other):
-    """Two screenshots differ in few pixels: where a cursor blinks, or a hovered button fades."""
+    """Check that two screenshots differ in few pixels, such as a blinking cursor or a fading button."""
     from io import BytesIO
 
     from PIL import Image
@@ -1351,7 +1354,7 @@ def test_solid_page_reports_missing_webgl2(visit):
 
 
 @pytest.mark.needs("chromium")
-def test_solids_fill_fine_screens(visit):
+def test_solids_fill_high_resolution_screens(visit):
     page = visit(solid_page(CAPTURE), device_scale_factor=2)
     size = "[document.getElementById('solid').width, document.getElementById('solid').height]"
     for width, height in ((1200, 800), (900, 620), (640, 760)):
@@ -1371,7 +1374,7 @@ def test_solids_fill_fine_screens(visit):
 
 @pytest.mark.needs("chromium")
 @pytest.mark.parametrize(("theme", "ground"), [("light", (185, 196, 214)), ("dark", (43, 51, 64))])
-def test_solids_show_their_colours_on_the_ground(visit, tmp_path, theme, ground):
+def test_solids_show_colours_on_background(visit, tmp_path, theme, ground):
     layout = fs.layout.mosaic(fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0), ("RG", "GB"))
     page = visit(solid_page(layout, solids=solids(layout, SensorStack(lens_height_um=0.0))), color_scheme=theme)
     press(page, "t")
@@ -1383,7 +1386,7 @@ def test_solids_show_their_colours_on_the_ground(visit, tmp_path, theme, ground)
         px, py = page.evaluate("(p) => foveasim.toWindow(...p)", [x, y, 0.6])
         return picture[int(py), int(px), :3].astype(int).tolist()
 
-    # From above, sky and sun add up to this part of the light that shows a colour as it is.
+    # From above, ambient and direct illumination add up to this fraction of the full colour.
     light = 0.42 + 0.60 * 0.856
     for site in (0, 1, 4):
         colour = np.array(FILTER_COLOURS["RGB"[layout.channel[site]]]) / 255
@@ -1393,7 +1396,7 @@ def test_solids_show_their_colours_on_the_ground(visit, tmp_path, theme, ground)
     assert drawn(layout.bounds_um[0] - 0.8, 0.0) == list(ground)
 
 
-#: Makes a page take the processor for a graphics card, for which edges are smoothed.
+#: Emulates a graphics card, for which edges are anti-aliased.
 AS_IF_FAST = (
     "const ask = WebGL2RenderingContext.prototype.getParameter;"
     "WebGL2RenderingContext.prototype.getParameter = function (name) { return name === 0x9246 ? 'card' : ask.call(this, name); };"
@@ -1401,7 +1404,7 @@ AS_IF_FAST = (
 
 
 @pytest.mark.needs("chromium")
-def test_fast_graphics_smooth_edges_of_solids(visit, tmp_path):
+def test_fast_graphics_antialias_solid_edges(visit, tmp_path):
     layout = fs.Layout.from_polygons([shapely.Polygon([(0, 0), (30, 2), (28, 20), (1, 18)])])
     flat = SensorStack(trench_width_um=0.0, filter_thickness_um=0.0, lens_height_um=0.0)
     n_colours, sites = {}, {}
@@ -1410,7 +1413,7 @@ def test_fast_graphics_smooth_edges_of_solids(visit, tmp_path):
         press(page, "t")
         rest(page)
         page.evaluate("document.activeElement.blur()")
-        # Without the buttons over the view.
+        # Clipped to exclude the buttons over the view.
         (tmp_path / "edge.png").write_bytes(page.screenshot(clip={"x": 4, "y": 70, "width": 800, "height": 700}))
         picture = read_picture(tmp_path / "edge.png")[..., :3]
         n_colours[name] = len(np.unique(picture.reshape(-1, 3), axis=0))
@@ -1419,12 +1422,12 @@ def test_fast_graphics_smooth_edges_of_solids(visit, tmp_path):
 
     assert sites == {"slow": 0, "fast": 0}
     assert n_colours["slow"] == 2
-    assert 4 <= n_colours["fast"] <= 16  # some of four samples on either side
+    assert 4 <= n_colours["fast"] <= 16  # mixtures of four samples per pixel
 
 
 @pytest.mark.needs("chromium")
 @pytest.mark.parametrize(("n_x", "n_y"), [(100, 100), (500, 400)])
-def test_many_solids_open_and_are_found(visit, n_x, n_y):
+def test_large_solid_page_sites_are_pickable(visit, n_x, n_y):
     layout = fs.layout.grid(n_x=n_x, n_y=n_y, pitch_um=1.5)
     wells = solids(layout, SensorStack(trench_width_um=0.0, filter_thickness_um=0.0, lens_height_um=0.0))
     page = visit(solid_page(layout, solids=wells))
@@ -1436,11 +1439,11 @@ def test_many_solids_open_and_are_found(visit, n_x, n_y):
     if n_x == 100:
         assert found == sites.tolist()
     else:
-        # A site is one or two pixels.
+        # A site covers one or two pixels.
         step = np.abs(layout.centroid_um[found] - layout.centroid_um[sites]).max(axis=1)
         assert step.max() <= 1.5 * 1.001
     assert page.inner_text("#parts") == f"wells · {12 * layout.n_sites:,} triangles"
-    # Near, most tiles are out of view, and what is in view is all there.
+    # In a close view most tiles are not visible; those that are visible are complete.
     page.mouse.move(*page.evaluate("foveasim.toWindow(0.1, 0.1, 0)"))
     rest(page)
     for _ in range(8):
@@ -1453,8 +1456,8 @@ def test_many_solids_open_and_are_found(visit, n_x, n_y):
 
 
 @pytest.mark.needs("chromium")
-def test_scripts_are_modules_that_browsers_import(browser):
-    """Each as it is, with nothing around it: so that other pages and notebooks may take them."""
+def test_scripts_import_as_modules(browser):
+    """Each module can be imported separately by other pages and notebooks."""
     web = files("foveasim.view.web")
     context = browser.new_context()
     page = context.new_page()

@@ -1,4 +1,4 @@
-"""Pages for a browser: one file each, that needs no network."""
+"""Self-contained web pages that need no network."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 """
-Surfaces as a page of solids draws them: vertices on a lattice of integers, photosite by photosite.
+Integer encoding of surfaces for the page of solids.
 
-Photosites of equal shape have equal triangles, counted from their own first point, and a point is mostly above or next to the
-one before it: so do the arrays compress to a fraction of glTF's.
+Vertices lie on an integer lattice, sorted by photosite. Photosites of equal shape have equal triangles, with indices relative
+to their first point, and most points are above or next to the previous one. The arrays therefore compress to a fraction of the
+size of glTF.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from foveasim.view.web._pack import back_references, smallest
 
 __all__ = ["bodies_of"]
 
-#: Steps of the lattice along the longest side of all surfaces, at most: their differences are exact as int32.
+#: Largest number of lattice steps along the longest side of all surfaces: differences are exact in int32.
 MAX_STEPS = 2**30
-#: ... and at least, as many as float32 has.
+#: Smallest number of lattice steps: the resolution of float32.
 MIN_STEPS = 2**24
-#: Steps across the smallest photosite or part, where MAX_STEPS allows it.
+#: Steps across the smallest photosite or part, if MAX_STEPS allows it.
 STEPS_PER_FEATURE = 2**12
-#: Photosites of a tile, which is drawn when any of it is in view.
+#: Photosites per tile; tiles out of view are not drawn.
 SITES_PER_TILE = 1500
 
 
@@ -41,28 +42,28 @@ def bodies_of(
     Parameters
     ----------
     meshes : sequence of Mesh
-        Of photosites of the layout; -1 for none.
+        Surfaces of photosites of the layout; -1 for no photosite.
     layout : Layout
     are_closed : bool
-        Whether the surfaces are closed, so that no back of a triangle is seen from outside.
+        Whether the surfaces are closed, so that back faces are not visible from outside.
 
     Returns
     -------
     about : dict
-        ``lattice_um``, ``origin_um``, ``low_um`` and ``high_um`` of their box, and ``list`` of the surfaces.
+        ``lattice_um``, ``origin_um``, the bounding box ``low_um`` and ``high_um``, and the ``list`` of surfaces.
     arrays : dict of str to array
-        ``place_x``, ``place_y``: steps on the lattice from one place to the next; ``places``: place of each point, as
-        references back; ``z`` of each point on the lattice; ``run_sites``: site + 1 of each run of points, with
-        ``run_points``, ``run_triangles``, ``run_colours`` of each; ``corners`` of triangles, counted from the first point of
-        their run; ``tile_runs``: runs of each tile.
+        ``place_x``, ``place_y``: lattice steps from one position to the next; ``places``: position of each point, as back
+        references; ``z``: height of each point on the lattice; ``run_sites``: site + 1 of each run of points, with
+        ``run_points``, ``run_triangles``, ``run_colours`` of each run; ``corners``: triangles, as indices relative to the first
+        point of their run; ``tile_runs``: number of runs of each tile.
 
     Raises
     ------
     GeometryError
-        When there is not a single triangle.
+        When there are no triangles.
     ParameterError
-        When a triangle spans several photosites, a photosite is not of the layout, or a part has a photosite in several
-        colours.
+        When a triangle spans several photosites, a photosite is not in the layout, or a part has several colours at a
+        photosite.
     """
     meshes = [mesh for mesh in meshes if mesh.triangles.size]
     if not meshes:
@@ -123,14 +124,14 @@ def _check(mesh: Mesh, n_sites: int) -> None:
 
 
 def _lattice_um(meshes: Sequence[Mesh], layout: Layout, extent_um: float) -> float:
-    """Step of the lattice: fine for the smallest photosite and the thinnest part, as far as integers reach."""
+    """Return the lattice step that resolves the smallest photosite and the thinnest part."""
     thickness_um = np.array([high[2] - low[2] for low, high in (mesh.bounds_um for mesh in meshes)])
     feature_um = min(float(np.sqrt(layout.area_um2.min())), float(thickness_um[thickness_um > 0.0].min(initial=np.inf)))
     return max(extent_um / MAX_STEPS, min(extent_um / MIN_STEPS, feature_um / STEPS_PER_FEATURE))
 
 
 def _tiles(layout: Layout) -> Ints:
-    """Tile of each photosite, (n_site,), in rows over the layout's bounds."""
+    """Return the tile of each photosite, (n_site,), in rows over the layout's bounds."""
     n = max(1, round(np.sqrt(layout.n_sites / SITES_PER_TILE)))
     x_min, y_min, x_max, y_max = layout.bounds_um
     share = (layout.centroid_um - (x_min, y_min)) / np.maximum((x_max - x_min, y_max - y_min), np.finfo(float).tiny)
@@ -139,9 +140,13 @@ def _tiles(layout: Layout) -> Ints:
 
 
 def _runs(mesh: Mesh, place: Ints, tile_of_site: Ints, offset: int) -> dict[str, NDArray[Any]]:
-    """Points and triangles of a surface sorted by tiles and photosites, points of a photosite at one place together."""
+    """
+    Sort points and triangles of a surface by tile and photosite.
+
+    Points of a photosite at the same position are contiguous.
+    """
     site = mesh.photosite.astype(np.int64)
-    tile = np.append(tile_of_site, 0)[site]  # the last one: of no photosite
+    tile = np.append(tile_of_site, 0)[site]  # the last entry: no photosite
     rank_of_site = np.empty(tile_of_site.size + 1, np.int64)
     by_tile = np.lexsort((np.arange(tile_of_site.size + 1), np.append(tile_of_site, 0)))
     rank_of_site[by_tile] = np.arange(by_tile.size)
@@ -168,10 +173,10 @@ def _runs(mesh: Mesh, place: Ints, tile_of_site: Ints, offset: int) -> dict[str,
 
 
 def _by_first_occurrence(place: Ints) -> tuple[Ints, Ints]:
-    """Places numbered in the order in which they occur, and where each does first."""
+    """Number positions in order of first occurrence; also return the index of the latter."""
     n = int(place.max()) + 1
     first = np.empty(n, np.int64)
-    first[place[::-1]] = np.arange(place.size)[::-1]  # the last one written is the first one met
+    first[place[::-1]] = np.arange(place.size)[::-1]  # the last write is the first occurrence
     by_first = np.argsort(first)
     rank = np.empty(n, np.int64)
     rank[by_first] = np.arange(n)

@@ -1,4 +1,4 @@
-"""What a page is told of a layout, a capture and a report: plain data, arrays and a picture."""
+"""Data of a page: description, arrays and picture of a layout, a capture and a report."""
 
 from __future__ import annotations
 
@@ -31,27 +31,27 @@ __all__ = ["Content", "content_of", "described_sites"]
 
 #: Longer side of the picture.
 PICTURE_PIXELS = 800
-#: Violations of a rule that a page lists, the worst first.
+#: Largest number of listed violations per rule, the worst first.
 MAX_LISTED = 2000
-#: Integers above this are told as text: a page's numbers are float64.
+#: Larger integers are written as strings: numbers in JavaScript are float64.
 MAX_EXACT = 2**53
-#: Colours of channels that no sensor has given filters yet.
+#: Channel names of a layout without filters.
 CHANNEL_NAMES = "RGBW"
 
 
 @dataclass(frozen=True, eq=False)
 class Content:
     """
-    What is shown.
+    Data of a page.
 
     Attributes
     ----------
     about : mapping
-        Plain data for JSON: numbers of sites, columns, rules, the picture's place.
+        Plain data for JSON: number of sites, columns, rules, position of the picture.
     arrays : mapping of str to array
-        By the names that ``about`` has for them.
+        Arrays by their names in ``about``.
     picture_png : bytes
-        What the sensor saw; of a layout alone, its sites.
+        Picture of the capture, or of the sites of a layout.
     """
 
     about: Mapping[str, Any]
@@ -61,15 +61,15 @@ class Content:
 
 def content_of(data: Layout | Capture, report: Report | None = None, *, name: str = "") -> Content:
     """
-    What a page is told.
+    Return the data of a page.
 
     Parameters
     ----------
     data : Layout or Capture
     report : Report, optional
-        Of a check of the same layout.
+        Check of the same layout.
     name : str
-        Heading; by default what made the layout.
+        Heading; by default the generator of the layout.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def content_of(data: Layout | Capture, report: Report | None = None, *, name: st
         raise ParameterError("report", f"must be a Report of a check, got a {type(report).__name__}")
     if report is not None and report.n_sites != layout.n_sites:
         raise ParameterError(
-            "report", f"must be of this layout of {layout.n_sites:,} sites, got one of {report.n_sites:,}"
+            "report", f"must be a check of this layout of {layout.n_sites:,} sites, got one of {report.n_sites:,}"
         )
     arrays |= _outlines(layout)
     picture, place = _picture(layout, data if isinstance(data, Capture) else None)
@@ -95,14 +95,14 @@ def described_sites(
     data: Layout | Capture, *, name: str = ""
 ) -> tuple[dict[str, Any], dict[str, NDArray[Any]], Layout]:
     """
-    What every kind of page is told of photosites.
+    Return the data of photosites for all kinds of pages.
 
     Returns
     -------
     about : dict
         Heading, notes, number of sites, bounds, columns, palette.
     arrays : dict of str to array
-        Of the columns.
+        Arrays of the columns.
     layout : Layout
 
     Raises
@@ -115,7 +115,7 @@ def described_sites(
     capture = data if isinstance(data, Capture) else None
     layout = data.layout if isinstance(data, Capture) else data
     if layout.n_sites == 0:
-        raise GeometryError("the layout has no sites, and so nothing to show")
+        raise GeometryError("the layout has no sites; a page needs at least one")
     arrays: dict[str, NDArray[Any]] = {}
     columns = _columns(layout, capture, arrays)
     provenance = layout.provenance
@@ -160,14 +160,14 @@ def _outlines(layout: Layout) -> dict[str, NDArray[Any]]:
 
 
 def _columns(layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
-    """What can be shown of a site, in the order of a list: how it is called, its unit, and how it becomes colours."""
+    """Return the columns of a page in list order: label, unit, and type of colour scale."""
     columns: list[dict[str, Any]] = []
 
     def add(key: str, label: str, unit: str, values: NDArray[Any], kind: str | None = None, **more: Any) -> str:
         name = f"column-{len(arrays)}"
         told, numbers = _as_numbers(values)
         arrays[name] = numbers
-        # A column of sizes may hold few of them: a name for each is for what is no number, and for what is told to be.
+        # Numerical columns with few values have a scale too; only strings and columns passed with names are categories.
         kind = kind or ("kinds" if "names" in told else "even")
         columns.append({"key": key, "label": label, "unit": unit, "array": name, "kind": kind, **told, **more})
         return name
@@ -209,7 +209,7 @@ def _columns(layout: Layout, capture: Capture | None, arrays: dict[str, NDArray[
 
 
 def _signal_to_noise(capture: Capture) -> Floats | None:
-    """Ratio of every site, (n_site,); None where the capture's settings do not specify the electronics."""
+    """Return the ratio of every site, (n_site,); None if settings lack the electronics."""
     try:
         return capture.signal_to_noise()
     except (ParameterError, SimulationError):
@@ -221,16 +221,16 @@ def _is_index(values: NDArray[Any]) -> bool:
 
 
 def _are_few(values: NDArray[Any]) -> bool:
-    """Whether integers are so few that they name kinds, such as zones."""
+    """Return whether integers have few distinct values and are categories, such as zones."""
     if values.dtype.kind not in "iu":
         return False
-    # A span first: finding the kinds of a million different numbers takes long.
+    # The range is checked first: np.unique is slow for a million different numbers.
     low, high = int(values.min(initial=0)), int(values.max(initial=0))
     return high - low < 2**16 and np.unique(values).size <= len(CATEGORY_COLOURS)
 
 
 def _as_numbers(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any]]:
-    """A column as numbers that a page has exactly, and what it must know of them."""
+    """Return metadata of a column, and its values as numbers that are exact in JavaScript."""
     if values.dtype.kind == "b":
         return {"names": ["no", "yes"], "whole": True}, values.astype(np.uint8)
     if values.dtype.kind in "iu" and (values.max(initial=0) <= MAX_EXACT and values.min(initial=0) >= -MAX_EXACT):
@@ -245,7 +245,7 @@ def _as_numbers(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any]]:
 
 
 def _label(key: str) -> tuple[str, str]:
-    """A column's name in words, and the unit that it ends in."""
+    """Return the name of a column in words, and the unit in its suffix."""
     suffix = next((suffix for suffix in UNIT_SUFFIXES if key.lower().endswith(suffix) and len(suffix) < len(key)), "")
     return key[: len(key) - len(suffix)].replace("_", " ").strip() or key, UNIT_SUFFIXES.get(suffix, "")
 
@@ -258,11 +258,15 @@ def _hex(colour: Rgb) -> str:
     return "#{:02x}{:02x}{:02x}".format(*colour)
 
 
-# -- the picture, the rules, the notes ------------------------------------------------------------------------------------
+# -- picture, rules, notes ----------------------------------------------------------------------------------------------
 
 
 def _picture(layout: Layout, capture: Capture | None) -> tuple[bytes, dict[str, Any]]:
-    """What the sensor saw as a PNG, and where it lies; of a layout, its sites in the colours of their channels or sizes."""
+    """
+    Return the picture as a PNG, and its position.
+
+    For a layout, the picture shows the sites in the colours of their channels or sizes.
+    """
     from PIL import Image
 
     if capture is not None:
@@ -287,7 +291,7 @@ def _picture(layout: Layout, capture: Capture | None) -> tuple[bytes, dict[str, 
 
 
 def _rules(report: Report, arrays: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
-    """What was asked and found; the worst violations of each rule as arrays, one rule after the other."""
+    """Return rules and results; add the worst violations to arrays, rule by rule."""
     rules = []
     values: list[float] = []
     sites: list[tuple[int, ...]] = []
@@ -315,7 +319,11 @@ def _rules(report: Report, arrays: dict[str, NDArray[Any]]) -> list[dict[str, An
 
 
 def _outlines_of_parts(parts: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
-    """Lines of markers, and the part that each is of: rings of polygons closed, lines and points as they are."""
+    """
+    Return the lines of marker parts, and the part of each line.
+
+    Rings of polygons are closed; lines and points are unchanged.
+    """
     is_polygon = shapely.get_type_id(parts) == shapely.GeometryType.POLYGON
     rings, of_polygon = shapely.get_rings(parts[is_polygon], return_index=True)
     lines = np.concatenate((rings, parts[~is_polygon]))

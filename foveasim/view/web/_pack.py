@@ -1,4 +1,4 @@
-"""Arrays as text in a page: their bytes sorted by significance, gzip, base64."""
+"""Text encoding of arrays in a page: bytes sorted by significance, gzip, base64."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from foveasim._core.validation import Ints
 
 __all__ = ["back_references", "packed", "smallest"]
 
-#: Higher levels take several times longer for some hundredths of the size.
+#: Higher levels take several times longer and save a few per cent.
 GZIP_LEVEL = 5
 
 
 def packed(array: NDArray[Any]) -> tuple[dict[str, Any], str]:
     """
-    An array for ``unpack.js``.
+    Encode an array for ``unpack.js``.
 
     Returns
     -------
     about : dict
-        Its type and number of values.
+        Type and number of values.
     text : str
-        base64 of gzip of all first bytes, all second bytes, and so on: neighbours' high bytes are much alike.
+        base64 of gzip of all first bytes, all second bytes, and so on: the high bytes of adjacent values are similar.
     """
     flat = np.ascontiguousarray(array).reshape(-1)
     flat = flat.astype(flat.dtype.newbyteorder("<"), copy=False)
@@ -36,7 +36,7 @@ def packed(array: NDArray[Any]) -> tuple[dict[str, Any], str]:
 
 
 def smallest(values: NDArray[Any]) -> NDArray[Any]:
-    """The same numbers in the smallest type that a page has and that holds all of them to the last bit."""
+    """Convert numbers to the smallest JavaScript array type that represents them exactly."""
     if values.dtype.kind == "b":
         return values.astype(np.uint8)
     if values.dtype.kind in "iu":
@@ -53,7 +53,9 @@ def smallest(values: NDArray[Any]) -> NDArray[Any]:
 
 def back_references(place: Ints) -> Ints:
     """
-    Places that rings come to, told so that they pack well: 0 for the next new one, else how many came since.
+    Encode positions as back references, which compress well.
+
+    0 is the next new position; n is the n-th last of the distinct positions so far.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The page: template, style, scripts and data joined to one file that needs no network."""
+"""Assembly of pages: template, style, scripts and data in one file that needs no network."""
 
 from __future__ import annotations
 
@@ -23,34 +23,36 @@ from foveasim.view.web._pack import packed
 
 __all__ = ["bundled", "check_page_path", "joined", "web_page", "write_web_page"]
 
-#: Endings of pages.
+#: File extensions of pages.
 ENDINGS = (".html", ".htm")
-#: A page loads nothing: its own scripts and style alone, told by their checksums, and pictures that stand in it.
+#: Content security policy: only embedded scripts and style, identified by checksums, and embedded pictures.
 POLICY = (
     "default-src 'none'; script-src '{script}'; style-src '{style}'; img-src data: blob:; base-uri 'none'; "
     "form-action 'none'"
 )
-#: What modules take from each other, and what they give: lines of their own, without other names for the same.
+#: Import and export statements of modules: on separate lines, without aliases.
 IMPORT = re.compile(r'^import \{[\w$, ]+\} from "\./(\w+\.js)";\n', re.MULTILINE)
 EXPORT = re.compile(r"^export (?=(?:async )?function |class |const )", re.MULTILINE)
 
 
 def web_page(data: Layout | Capture, *, report: Report | None = None, name: str = "") -> str:
     """
-    A page to explore a layout or a capture in a browser: zoom, values of the site under the mouse, colours, histogram.
+    Return a page to explore a layout or a capture in a browser.
+
+    The page has zoom, values of the site under the mouse, colour scales and a histogram.
 
     Parameters
     ----------
     data : Layout or Capture
     report : Report, optional
-        Of a check of this layout: its violations are listed and marked.
+        Check of this layout, whose violations are listed and marked.
     name : str
-        Heading; by default what made the layout.
+        Heading; by default the generator of the layout.
 
     Returns
     -------
     text : str
-        HTML with everything in it, for a browser with WebGL2; it loads nothing from anywhere.
+        Self-contained HTML for a browser with WebGL2; it loads no other resources.
 
     Raises
     ------
@@ -76,28 +78,28 @@ def web_page(data: Layout | Capture, *, report: Report | None = None, name: str 
         about,
         {key: text for key, (_, text) in arrays.items()},
         title=str(content.about["name"]),
-        alt="What the sensor saw" if isinstance(data, Capture) else "The photosites of the layout",
+        alt="Picture of the capture" if isinstance(data, Capture) else "Photosites of the layout",
         picture="data:image/png;base64," + base64.b64encode(content.picture_png).decode(),
     )
 
 
 def write_web_page(data: Layout | Capture, path: str | Path, *, report: Report | None = None, name: str = "") -> None:
     """
-    Write :func:`web_page` to a file, whole or not at all.
+    Write :func:`web_page` to a file atomically.
 
     Parameters
     ----------
     data : Layout or Capture
     path : path
-        Ending in ``.html``.
+        With the extension ``.html``.
     report : Report, optional
     name : str
-        Heading; by default what made the layout.
+        Heading; by default the generator of the layout.
 
     Raises
     ------
     FileError
-        When the ending is another, or nothing can be written there.
+        When the extension is another, or the file cannot be written.
     ParameterError, GeometryError
         As for :func:`web_page`.
     """
@@ -106,12 +108,12 @@ def write_web_page(data: Layout | Capture, path: str | Path, *, report: Report |
 
 def write_page(path: str | Path, page: Callable[[], str]) -> None:
     """
-    Write a page atomically; it is made after its path was checked.
+    Write a page atomically; it is created after its path is checked.
 
     Raises
     ------
     FileError
-        When the path does not end as pages do, its directory does not exist, or nothing can be written there.
+        When the extension is not that of a page, the directory does not exist, or the file cannot be written.
     """
     target = check_page_path(path)
     text = page()
@@ -121,18 +123,18 @@ def write_page(path: str | Path, page: Callable[[], str]) -> None:
 
 def check_page_path(path: str | Path) -> Path:
     """
-    The path of a page, before anything is computed for it.
+    Check the path of a page before the page is computed.
 
     Raises
     ------
     FileError
-        When it does not end as pages do, or its folder does not exist.
+        When the extension is not that of a page, or the directory does not exist.
     """
     target = Path(path)
     if target.suffix.lower() not in ENDINGS:
         raise FileError(target, "must end in .html")
     if not target.parent.is_dir():
-        raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
+        raise FileError(target, f"cannot be written: the directory {target.parent} does not exist")
     return target
 
 
@@ -145,7 +147,7 @@ def joined(
     **texts: str,
 ) -> str:
     """
-    One HTML text of its parts.
+    Return one HTML document of its parts.
 
     Parameters
     ----------
@@ -154,13 +156,13 @@ def joined(
     about : dict
         Plain data, for the element ``about``.
     data : dict of str to base64
-        Packed arrays, for elements ``data-NAME``.
+        Encoded arrays, for elements ``data-NAME``.
     **texts : str
-        For the template's places, escaped.
+        Texts of the placeholders in the template, which are escaped.
     """
     style = "".join(map(_part, styles))
     script = bundled(script)
-    # Of what ends a script element nothing may stand in one, whatever a column of a stranger's file is called.
+    # Angle brackets are escaped: column names in untrusted files must not close the script element.
     plain = json.dumps(about, ensure_ascii=True, allow_nan=False).replace("<", "\\u003c").replace(">", "\\u003e")
     elements = [f'<script type="application/json" id="about">{plain}</script>']
     elements += [f'<script type="text/plain" id="data-{key}">{text}</script>' for key, text in data.items()]
@@ -176,18 +178,20 @@ def joined(
 @cache
 def bundled(name: str) -> str:
     """
-    Return a module and all that it imports as one script, which a page from a file may run where it may not import.
+    Return a module and all its imports as one script.
+
+    A page opened from a file can run scripts, but cannot import modules.
 
     Parameters
     ----------
     name : str
-        A module in this package, such as ``"page.js"``. Modules import names from each other as they are, at their top, and
-        no two have the same names.
+        A module in this package, such as ``"page.js"``. Modules import names from each other without aliases, at their top, and
+        no two modules have the same names.
 
     Returns
     -------
     text : str
-        Every module once, behind those that it imports, in a scope that is closed to others.
+        Every module once, after its imports, in a closed scope.
     """
     modules: dict[str, str] = {}
 

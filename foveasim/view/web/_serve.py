@@ -1,4 +1,4 @@
-"""A page served on this computer, to its own browser and to nobody else."""
+"""Local server of a page, which other computers cannot reach."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from foveasim.errors import ParameterError
 
 __all__ = ["open_page", "serve_page"]
 
-#: The only address that is listened on: no other computer reaches it.
+#: Loopback address: other computers cannot reach it.
 HOST = "127.0.0.1"
-#: A connection has this long to send its request, and after that as long for each piece of the page that it takes.
+#: Time limit of a connection for its request, and for each piece of the page.
 PATIENCE_S = 10.0
-#: ... and this long to close it.
+#: Time limit of a connection for closing.
 LINGER_S = 1.0
-#: Connections at a time; those beyond are answered that the server is busy. A browser opens six.
+#: Simultaneous connections; further ones receive 503 (service unavailable). A browser opens six.
 MAX_CONNECTIONS = 128
-#: A request of a browser has a few hundred bytes.
+#: Largest request; those of browsers have a few hundred bytes.
 MAX_REQUEST_BYTES = 16_384
-#: The page is sent in pieces, so that slow connections cost no memory.
+#: Size of the pieces in which the page is sent, which limits the memory of slow connections.
 PIECE_BYTES = 65_536
 
 
@@ -37,25 +37,25 @@ def serve_page(text: str, *, port: int = 0, announce: Callable[[str], None]) -> 
     text : str
         From :func:`foveasim.view.web_page`.
     port : int
-        0 for any that is free.
+        0 for any free port.
     announce : function
-        Is called with the address, once it can be asked.
+        Called with the address when the server accepts requests.
 
     Raises
     ------
     ParameterError
-        When the port is out of range, or taken.
+        When the port is out of range or in use.
 
     Notes
     -----
-    Answers GET and HEAD of ``/``, one request per connection, all in one thread. A request must name this computer as its
-    ``Host``: a page of another site whose name leads here (DNS rebinding) gets nothing.
+    Answers GET and HEAD of ``/``, one request per connection, in one thread. Requests with a ``Host`` other than this computer
+    are rejected, which prevents DNS rebinding by other sites.
     """
     port = check_count("port", port, at_least=0, at_most=2**16 - 1)
     try:
         listener = socket.create_server((HOST, port), backlog=MAX_CONNECTIONS)
     except OSError as error:
-        raise ParameterError("port", f"cannot be listened on ({error.strerror or error})", port) from None
+        raise ParameterError("port", f"must be a free port ({error.strerror or error})", port) from None
     with listener, contextlib.suppress(KeyboardInterrupt):
         asyncio.run(_serve(listener, text.encode(), announce))
 
@@ -75,7 +75,7 @@ async def _serve(listener: socket.socket, content: bytes, announce: Callable[[st
                 await _send(writer, HTTPStatus.SERVICE_UNAVAILABLE)
             await _end(reader, writer)
         except (OSError, asyncio.IncompleteReadError, asyncio.CancelledError):
-            # Gone, silent for too long (TimeoutError is an OSError), or the server stops: nothing to say to anybody.
+            # Disconnected, timed out (TimeoutError is an OSError), or the server stops: no response is possible.
             writer.transport.abort()
         finally:
             n_open -= 1
@@ -112,7 +112,7 @@ async def _answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, na
 async def _send(
     writer: asyncio.StreamWriter, status: HTTPStatus, content: bytes | None = None, *, with_content: bool = True
 ) -> None:
-    """Send an answer; one without a page of its own says in plain text what it is."""
+    """Send a response; without content, the status as plain text."""
     is_page = content is not None
     body = f"{status.value} {status.phrase}\n".encode() if content is None else content
     head = [
@@ -121,7 +121,7 @@ async def _send(
         f"Content-Length: {len(body)}",
         "Cache-Control: no-store",
         "Connection: close",
-        # No page of another site frames this one, embeds it, or guesses at its kind.
+        # Other sites must neither frame nor embed this page, and browsers must not guess its type.
         "Content-Security-Policy: frame-ancestors 'none'",
         "Cross-Origin-Resource-Policy: same-origin",
         "X-Content-Type-Options: nosniff",
@@ -136,7 +136,11 @@ async def _send(
 
 
 async def _end(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Close once the client has read the answer: with a request half read, it would lose the answer to a reset."""
+    """
+    Close the connection after the client has read the response.
+
+    Closing with unread request data resets the connection, and the client loses the response.
+    """
     writer.write_eof()
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(min(LINGER_S, PATIENCE_S)):
@@ -152,9 +156,9 @@ def open_page(text: str) -> tuple[Path, bool]:
     Returns
     -------
     path : Path
-        Of the file, which stays.
+        Path of the file, which is not deleted.
     is_opened : bool
-        Whether there was a browser.
+        Whether a browser was found.
     """
     import tempfile
     import webbrowser

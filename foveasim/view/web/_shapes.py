@@ -1,4 +1,4 @@
-"""Outlines of photosites as a page draws and picks them: shared vertices, and triangles that keep notches and holes open."""
+"""Outlines and triangles of photosites for pages, with shared vertices."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from foveasim.layout import Layout
 
 __all__ = ["Shapes", "shapes_of"]
 
-#: A triangle of a fan may be turned over by this fraction of its site's area: rounding.
+#: Tolerance for reversed triangles of a fan, as a fraction of the site's area.
 ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
     """
-    Outlines and triangles.
+    Outlines and triangles of photosites.
 
     Attributes
     ----------
     xy_um : (n_place, 2) float64, µm
-        Every place where a vertex is, once, in the order in which rings come to it.
+        Distinct vertex positions, in the order of their first use by a ring.
     place : (n_vertex,) int64
-        Place of each vertex of each ring. Rings of one ring sites may begin at another vertex than the layout's.
+        Position of each vertex of each ring. Sites with one ring may begin at another vertex than in the layout.
     ring_offsets, site_offsets : int64
-        As of the layout.
+        As in the layout.
     cut_sites : (n_cut,) int64
-        Sites that no fan from their first vertex fills, in rising order. All others are filled by theirs.
+        Sites that the fan from their first vertex does not fill, in ascending order. Fans fill all others.
     cut_offsets : (n_cut + 1,) int64
         Site ``cut_sites[i]`` has the triangles ``cut_offsets[i] : cut_offsets[i + 1]``.
     cuts : (n_triangle, 3) int64
-        Vertices of their triangles.
+        Vertices of these triangles.
     """
 
     xy_um: Floats
@@ -51,17 +51,17 @@ class Shapes:
 
 def shapes_of(layout: Layout) -> Shapes:
     """
-    What a page draws of a layout.
+    Return the outlines and triangles of a layout for a page.
 
     Parameters
     ----------
     layout : Layout
-        Of at least one site.
+        With at least one site.
 
     Notes
     -----
-    A fan from a vertex fills a simple ring when none of its triangles is turned over: so convex sites need no triangles
-    of their own, nor do those with a notch that a fan from its deepest vertex looks into.
+    A fan from a vertex fills a simple ring when none of its triangles is reversed. Convex sites therefore need no explicit
+    triangles, nor do sites that the fan from their deepest reflex vertex fills.
     """
     order, is_filled = _fans(layout, np.diff(layout.site_offsets) == 1)
     xy_um, place = _shared(layout.xy_um[order])
@@ -71,8 +71,8 @@ def shapes_of(layout: Layout) -> Shapes:
 
 
 def _shared(xy_um: Floats) -> tuple[Floats, Ints]:
-    """Places in the order of their first vertex, and each vertex's place."""
-    keys = (np.ascontiguousarray(xy_um) + 0.0).view(np.complex128)[:, 0]  # + 0.0: -0 and 0 are one place
+    """Return distinct positions in order of their first vertex, and each vertex's position."""
+    keys = (np.ascontiguousarray(xy_um) + 0.0).view(np.complex128)[:, 0]  # + 0.0 replaces -0 by 0
     _, first, place = np.unique(keys, return_index=True, return_inverse=True)
     rank = np.empty(first.size, np.int64)
     by_first = np.argsort(first)
@@ -81,7 +81,7 @@ def _shared(xy_um: Floats) -> tuple[Floats, Ints]:
 
 
 def _fans(layout: Layout, may_fan: Bools) -> tuple[Ints, Bools]:
-    """The vertices in an order in which fans fill as many sites as can be, and whether they fill each."""
+    """Reorder vertices so that fans fill more sites; also return whether they fill each."""
     xy_um, ring_offsets = layout.xy_um, layout.ring_offsets
     n_vertices = np.diff(ring_offsets)
     first_ring = layout.site_offsets[:-1]
@@ -91,7 +91,7 @@ def _fans(layout: Layout, may_fan: Bools) -> tuple[Ints, Bools]:
     is_filled[may_fan] = _is_filled(xy_um, ring_offsets, order, first_ring[may_fan], tolerance_um2[may_fan])
     left = np.flatnonzero(may_fan & ~is_filled)
     if left.size:
-        # The deepest vertex: where the outline turns to the right the most.
+        # The deepest reflex vertex: the strongest right turn of the outline.
         after = next_vertex(ring_offsets)
         before = np.empty_like(after)
         before[after] = np.arange(after.size)
@@ -111,7 +111,7 @@ def _fans(layout: Layout, may_fan: Bools) -> tuple[Ints, Bools]:
 
 
 def _is_filled(xy_um: Floats, ring_offsets: Ints, order: Ints, rings: Ints, tolerance_um2: Floats) -> Bools:
-    """Whether the fan from the first vertex of each ring, in this order, turns no triangle over."""
+    """Return whether the fan from the first vertex of each ring has no reversed triangle."""
     if rings.size == 0:
         return np.zeros(0, bool)
     n_triangles = ring_offsets[rings + 1] - ring_offsets[rings] - 2
@@ -125,17 +125,17 @@ def _is_filled(xy_um: Floats, ring_offsets: Ints, order: Ints, rings: Ints, tole
 
 
 def _cut(layout: Layout, sites: Ints, place: Ints, xy_um: Floats) -> tuple[Ints, Ints]:
-    """Triangles of sites that fans do not fill, as vertices: the constrained Delaunay triangulation of each."""
+    """Triangulate sites that fans do not fill (constrained Delaunay triangulation)."""
     if sites.size == 0:
         return np.zeros(1, np.int64), np.zeros((0, 3), np.int64)
     polygons = layout[sites].polygons()
-    # An outline that crosses itself, which only the plain constructor lets in, is drawn as what it encloses.
+    # Self-intersecting outlines, which only the plain constructor accepts, are drawn as their enclosed area.
     is_valid = shapely.is_valid(polygons)
     polygons[~is_valid] = shapely.buffer(polygons[~is_valid], 0.0)
     parts, owner = shapely.get_parts(shapely.constrained_delaunay_triangles(polygons), return_index=True)
     corners_um = shapely.get_coordinates(parts).reshape(-1, 4, 2)[:, :3]
     owner = sites[owner]
-    # A corner is the vertex of its site that lies at its place; what has none came from the repair above.
+    # Corners are matched to vertices of their site by position; corners without a match come from the repair above.
     sorted_keys, by_key = _keys(xy_um)
     corner_keys = np.ascontiguousarray(corners_um.reshape(-1, 2) + 0.0).view(np.complex128)[:, 0]
     found = np.minimum(np.searchsorted(sorted_keys, corner_keys), sorted_keys.size - 1)

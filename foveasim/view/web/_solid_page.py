@@ -1,4 +1,4 @@
-"""The page of solids: a sensor in three dimensions, with the values of the photosite under the mouse."""
+"""Page of a sensor in three dimensions, with the values of the site under the mouse."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ __all__ = ["solid_page", "write_solid_page"]
 
 def solid_page(data: Layout | Capture, *, solids: Solids | None = None, name: str = "") -> str:
     """
-    A page to turn a sensor round in a browser.
+    Return a page to explore a sensor in three dimensions in a browser.
 
     Parameters
     ----------
     data : Layout or Capture
     solids : Solids, optional
-        What is shown, with the photosites of this data. By default the parts of a layout, as :func:`foveasim.view.solids`
-        makes them; of a capture its photosites as columns, as high as their codes.
+        Solids of the photosites of this data. By default the parts of a layout, from :func:`foveasim.view.solids`, or the
+        photosites of a capture as prisms whose heights are their codes.
     name : str
-        Heading; by default what made the layout.
+        Heading; by default the generator of the layout.
 
     Returns
     -------
     text : str
-        HTML with everything in it, for a browser with WebGL2; it loads nothing from anywhere.
+        Self-contained HTML for a browser with WebGL2; it loads no other resources.
 
     Raises
     ------
     ParameterError
-        When the data is neither, or the solids are not of its photosites, each in one colour per part.
+        When the data is neither, or the solids are not of its photosites with one colour per site and part.
     GeometryError
         When there is nothing to show.
     """
     about, arrays, layout = described_sites(data, name=name)
     if solids is None and isinstance(data, Capture):
         meshes: Sequence[Mesh] = (prisms(data),)
-        meshes_are_closed = False  # columns have no floor
-        shown = "The columns are as high as the codes."
+        meshes_are_closed = False  # prisms have no bottom faces
+        shown = "Column heights show the codes."
     else:
         meshes = (solids_of(data) if solids is None else solids).meshes
         meshes_are_closed = True
-        shown = "z is toward the lens."
+        shown = "z points toward the lens."
     bodies, surfaces = bodies_of(meshes, layout, are_closed=meshes_are_closed)
     arrays |= {**surfaces, "area_um2": layout.area_um2}
     told = {key: packed(values) for key, values in arrays.items()}
@@ -68,21 +68,21 @@ def solid_page(data: Layout | Capture, *, solids: Solids | None = None, name: st
 
 def write_solid_page(data: Layout | Capture, path: str | Path, *, solids: Solids | None = None, name: str = "") -> None:
     """
-    Write :func:`solid_page` to a file, whole or not at all.
+    Write :func:`solid_page` to a file atomically.
 
     Parameters
     ----------
     data : Layout or Capture
     path : path
-        Ending in ``.html``.
+        With the extension ``.html``.
     solids : Solids, optional
     name : str
-        Heading; by default what made the layout.
+        Heading; by default the generator of the layout.
 
     Raises
     ------
     FileError
-        When the ending is another, or nothing can be written there.
+        When the extension is another, or the file cannot be written.
     ParameterError, GeometryError
         As for :func:`solid_page`.
     """

@@ -606,13 +606,13 @@ function listViolations() {
     const { description: text, limit, unit, waiver } = about.rules[rule];
     const bound = limit === null ? "" : "; the limit is " + shown(limit) + (unit ? " " + unit : "");
     $("sentence").textContent = text + bound + "." + (waiver ? " Waived: " + waiver + "." : "") + rest;
-  } else $("sentence").textContent = (count ? "" : "All rules are kept.") + rest;
-  if (!$("sentence").textContent) $("sentence").textContent = shown(about.rules.filter((r) => !r.count).length) + " of " + about.rules.length + " rules are kept.";
+  } else $("sentence").textContent = (count ? "" : "All rules are satisfied.") + rest;
+  if (!$("sentence").textContent) $("sentence").textContent = shown(about.rules.filter((r) => !r.count).length) + " of " + about.rules.length + " rules are satisfied.";
 }
 
 function violationItem(i) {
   const { violations } = state, rule = about.rules[violations.rule[i]], ids = [...violations.sitesOf(i)];
-  const sites = ids.length ? (ids.length > 1 ? "sites " : "site ") + ids.slice(0, 4).join(", ") + (ids.length > 4 ? ", …" : "") : "place";
+  const sites = ids.length ? (ids.length > 1 ? "sites " : "site ") + ids.slice(0, 4).join(", ") + (ids.length > 4 ? ", …" : "") : "position";
   const value = Number.isNaN(violations.value[i]) ? "" : shown(violations.value[i]) + (rule.unit ? " " + rule.unit : "");
   const item = make("li"), button = make("button");
   button.type = "button";
@@ -641,7 +641,7 @@ function flyToViolation(i) {
     width = Math.max(width, Math.min(Math.max(c - a, d - b), 20 * width || Infinity));
   }
   choose(i);
-  if (!Number.isFinite(box[0])) { notice("The report tells no place"); return; }
+  if (!Number.isFinite(box[0])) { notice("The report has no position for this violation"); return; }
   fly(0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]), (0.3 * Math.min(map.width, map.height)) / (width || 1));
 }
 
@@ -683,7 +683,7 @@ async function copyLink() {
     await navigator.clipboard.writeText(location.href);
     notice("Link to this view copied");
   } catch {
-    notice("The address above is the link to this view");
+    notice("Copy the link to this view from the address bar");
   }
 }
 
@@ -731,7 +731,7 @@ function listenToTools() {
     const isThere = Number.isInteger(site) && site >= 0 && site < state.sites.n;
     $("find-site").setAttribute("aria-invalid", !isThere);
     if (isThere) goTo(site);
-    else notice("Sites have the numbers 0 to " + shown(state.sites.n - 1));
+    else notice("Photosites are numbered from 0 to " + shown(state.sites.n - 1));
   });
   window.addEventListener("hashchange", async () => {
     const [key, range] = readHash();
@@ -753,7 +753,7 @@ function showTheme() {
 function listenToLosses() {
   $("cells").addEventListener("webglcontextlost", (event) => {
     event.preventDefault();
-    stayingNotice("The graphics card has lost the map; it comes back when the card does.");
+    stayingNotice("The graphics context was lost; the map returns when the context is restored.");
   });
   $("cells").addEventListener("webglcontextrestored", () => {
     state.map.restore();
@@ -776,7 +776,7 @@ async function open() {
   $("notes").textContent = about.notes.join(" · ");
   const renderer = findRenderer();
   if (!renderer) {
-    showPlain("This browser has no WebGL2, which the map needs; the picture shows what the page holds.");
+    showPlain("This browser has no WebGL2, which the map needs; only the picture is shown.");
     return;
   }
   state.isSlow = renderer.isSlow;
@@ -846,7 +846,7 @@ const handle = {
 };
 window.foveasim = handle;
 handle.ready = open().then(() => { handle.readyMs = performance.now(); }).catch((error) => {
-  showPlain("The map cannot be shown (" + error.message + "); the picture shows what the page holds.");
+  showPlain("The map cannot be shown (" + error.message + "); only the picture is shown.");
   throw error;
 });
 handle.complete = handle.ready.then(() => state.sites && openRest());

@@ -137,7 +137,7 @@ function listenToCanvas() {
     else if (way) turn(0.12 * way[0], 0.1 * way[1]);
     else if (event.key === "Enter" || event.key === " ") {
       const found = state.view.pick(0.5 * orbit.width, 0.5 * orbit.tall);
-      if (found.site < 0) notice("No photosite in the middle of the view");
+      if (found.site < 0) notice("No photosite in the centre of the view");
       pin(found.site, found.part);
     } else return;
     event.preventDefault();
@@ -187,7 +187,7 @@ function listenToLosses() {
   const canvas = $("solid");
   canvas.addEventListener("webglcontextlost", (event) => {
     event.preventDefault();
-    stayingNotice("The graphics card has lost this view; it comes back when the card does.");
+    stayingNotice("The graphics context was lost; the view returns when the context is restored.");
   });
   canvas.addEventListener("webglcontextrestored", () => {
     state.view.load();
@@ -202,7 +202,7 @@ async function open() {
   $("notes").textContent = about.notes.join(" · ");
   const renderer = findRenderer();
   if (!renderer) {
-    $("opening").textContent = "This browser has no WebGL2, which three dimensions need. Another browser, or graphics acceleration in the settings of this one, shows them.";
+    $("opening").textContent = "This browser has no WebGL2, which three dimensions need. Use another browser, or enable graphics acceleration in the settings.";
     return;
   }
   const arrays = Object.fromEntries(await Promise.all([...ARRAYS, "area_um2"].map(async (name) => [name, await unpack(name, about.arrays[name])])));

@@ -19,7 +19,7 @@ export async function unpack(name, about) {
   const stream = new Blob([zipped]).stream().pipeThrough(new DecompressionStream("gzip"));
   const planes = new Uint8Array(await new Response(stream).arrayBuffer());
   const Type = TYPES[about.type], n = about.size, width = Type.BYTES_PER_ELEMENT;
-  if (planes.length !== n * width) throw new Error("array " + name + " is cut short");
+  if (planes.length !== n * width) throw new Error("array " + name + " is truncated");
   if (width === 1) return new Type(planes.buffer);
   const bytes = new Uint8Array(n * width);
   for (let plane = 0; plane < width; plane++) {
