@@ -1,4 +1,4 @@
-// Surfaces out of the page: from what is stored per photosite to vertices and triangles for the graphics card.
+// Decodes surfaces of a page: from data per photosite to vertices and triangles for the graphics card.
 
 import { offsetsOf, placesOf } from "./unpack.js";
 
@@ -25,7 +25,7 @@ export class Bodies {
     });
   }
 
-  // Vertices on the lattice, the number of each one's site plus 1, corners, and tiles with their boxes on the lattice.
+  // Vertices on the lattice, site + 1 of each vertex, corners, and tiles with their boxes on the lattice.
   build(body) {
     const { x, y, place, firstPoint, firstTriangle } = this, { z, corners, run_sites: runSites, tile_runs: tileRuns } = this.arrays;
     const [fromRun, toRun] = body.runs, base = firstPoint[fromRun], n = firstPoint[toRun] - base;
@@ -56,7 +56,7 @@ export class Bodies {
     return { places, sites, indices, tiles };
   }
 
-  // Colours of a body's sites as bytes r, g, b, a, at the number of each plus 1.
+  // Colours of the sites of a body as bytes r, g, b, a, at index site + 1.
   paint(body, bytes) {
     const { run_sites: runSites, run_colours: colours } = this.arrays;
     for (let run = body.runs[0]; run < body.runs[1]; run++) {

@@ -1,6 +1,6 @@
-// Values to colours: scales, their ticks, and numbers as people read them.
+// Values to colours: scales, their ticks, and formatted numbers.
 
-// matplotlib's viridis, which steps evenly to the eye: 256 colours of three bytes.
+// matplotlib's viridis, which is perceptually uniform: 256 colours of three bytes.
 const VIRIDIS = [
   "44015444025645045745055946075a46085c460a5d460b5e470d60470e61471063471164471365481467481668481769",
   "48186a481a6c481b6d481c6e481d6f481f70482071482173482374482475482576482677482878482979472a7a472c7a",
@@ -32,16 +32,17 @@ function viridis(share) {
   return [0, 2, 4].map((i) => parseInt(VIRIDIS.slice(at + i, at + i + 2), 16));
 }
 
-// What a screen shows of light: a share of white through a filter, dark ones lifted so that they can be told apart.
+// Displayed colour of a signal: a fraction of white through a filter, with gamma so that dark sites are distinguishable.
 function lit(share, colour, palette) {
   const level = share ** palette.gamma;
   return colour.map((c) => Math.round(c * level));
 }
 
-// How a column's values become colours. Kinds of columns:
-//   even   numbers, in steps even to the eye        grey  numbers as light
-//   lit    numbers as light through each site's filter
-//   kinds  whole numbers that name things
+// Mapping of a column's values to colours. Kinds of columns:
+//   even   numbers, on a perceptually uniform scale
+//   grey   numbers as grey levels
+//   lit    numbers as brightness of the colour of each site's filter
+//   kinds  integers of categories
 export class Scale {
   constructor(column, values, filterOf, palette, wantsLog) {
     Object.assign(this, { column, values, filterOf, palette });
@@ -54,16 +55,16 @@ export class Scale {
     if (low === Infinity) { low = 0; high = 0; }
     this.lowest = low;
     this.highest = high;
-    // Light begins at darkness.
+    // Signals begin at zero.
     if (column.kind === "grey" || column.kind === "lit") low = 0;
-    // Values that differ by rounding alone are one value, in the middle of the scale.
+    // Values that differ by rounding only are one value, in the centre of the scale.
     const isOne = high - low <= 1e-9 * Math.max(Math.abs(low), Math.abs(high));
     this.from = isOne && !column.whole && low !== 0 ? low - 0.5 : low;
     this.to = isOne ? this.from + 1 : high;
     this.canLog = column.kind === "even" && low > 0 && high / low > 4;
-    // Sizes that differ much are told apart on a scale of ratios.
+    // Values of a large range have a logarithmic scale.
     this.isLog = this.canLog && (wantsLog ?? (Boolean(column.of) && high / low > 40));
-    // Colours of kinds repeat; a column may name more of them than there are colours.
+    // Colours of categories repeat; a column may name more categories than there are colours.
     this.nKinds = column.colours ? column.colours.length : palette.kinds.length;
     if (column.kind === "even") this.tables = [table(viridis)];
     else if (column.kind === "grey") this.tables = [table((share) => lit(share, [255, 255, 255], palette))];
@@ -92,7 +93,7 @@ export class Scale {
     return bytesOfHex(own || this.palette.kinds[kind % this.palette.kinds.length]);
   }
 
-  // Colours of all sites for the map; those outside a range of values fade into the ground.
+  // Colours of all sites for the map; sites outside a range of values fade into the background.
   paint(out, range, ground) {
     const { values, column, filterOf } = this;
     const fade = (colour) => packedColour(colour.map((c, i) => Math.round(0.12 * c + 0.88 * ground[i])));
@@ -127,7 +128,7 @@ export class Scale {
     return ticks;
   }
 
-  // How many sites have a value in each of some steps along the scale.
+  // Number of sites in each of n steps along the scale.
   histogram(most) {
     const { values } = this, span = this.to - this.from;
     const isCounted = this.column.whole && !this.isLog && span < most;
@@ -141,7 +142,7 @@ export class Scale {
   }
 }
 
-// The next of 1, 2, 5, 10, ... above a length.
+// The next of 1, 2, 5, 10, ... at or above a length.
 export function roundStep(length, isWhole) {
   if (!(length > 0)) return 1;
   const power = 10 ** Math.floor(Math.log10(length)), lead = length / power;
@@ -149,7 +150,7 @@ export function roundStep(length, isWhole) {
   return isWhole ? Math.max(1, step) : step;
 }
 
-// Whole numbers whole, others to six figures.
+// Formats integers exactly, other numbers with six significant digits.
 export function shown(value) {
   if (Number.isNaN(value)) return "no value";
   if (!Number.isFinite(value)) return value > 0 ? "infinite" : "minus infinite";
@@ -158,7 +159,7 @@ export function shown(value) {
   return size >= 1e-3 && size < 1e7 ? String(Number(value.toPrecision(6))) : value.toExponential(4);
 }
 
-// A site's value of a column with its unit, by the sites' areas in µm²; "…" while the column is not there yet.
+// Formats a site's value of a column with its unit, using the site areas in µm²; "…" while the column is not loaded.
 export function textOf(column, site, areas) {
   if (column.of) return shown(column.of === "size" ? Math.sqrt(areas[site]) : areas[site]) + " " + column.unit;
   if (!column.values) return "…";
@@ -167,7 +168,7 @@ export function textOf(column, site, areas) {
   return column.unit ? shown(value) + " " + column.unit : shown(value);
 }
 
-// Short ones for axes.
+// Short number format for axes.
 export function brief(value) {
   const size = Math.abs(value);
   if (size >= 1e6 || (size < 1e-3 && size > 0)) return value.toExponential(0).replace("e+", "e");

@@ -1,12 +1,12 @@
-// Mouse, pen and fingers on a canvas, as drags, pinches, turns of the wheel and clicks; places are in its CSS pixels.
+// Mouse, pen and touch events on a canvas as drags, pinches, wheel steps and clicks; positions are in its CSS pixels.
 
 import { clamp } from "./colours.js";
 
-// A pointer that travels less than this between down and up is a click.
+// A pointer that moves less than this between down and up is a click.
 const CLICK_PIXELS = 4;
 
-// Calls what there is of: press(), drag(dx, dy, { px, py, isSecond, isMiddle }), pinch(factor, px, py),
-// wheel(factor, px, py), click(px, py), move(px, py, isHeld), leave(). A factor above 1 is for nearer. isSecond: with
+// Calls the callbacks that are given: press(), drag(dx, dy, { px, py, isSecond, isMiddle }), pinch(factor, px, py),
+// wheel(factor, px, py), click(px, py), move(px, py, isHeld), leave(). Factors above 1 zoom in. isSecond: with
 // two fingers, the right button, or Shift, Ctrl or Meta.
 export function listenToPointers(canvas, on) {
   const pointers = new Map();

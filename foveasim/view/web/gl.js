@@ -1,9 +1,9 @@
-// WebGL 2: what draws it here, programs from their sources, and the size of a canvas in pixels.
+// WebGL 2: detection of the renderer, programs from their sources, and the size of a canvas in pixels.
 
-// More pixels than this for one of CSS cost time that nobody can see.
+// More pixels than this per CSS pixel cost time without a visible effect.
 const MAX_PIXEL_RATIO = 2;
 
-// What draws WebGL2 here: null where nothing does, else whether it is the processor, where smooth edges cost too much.
+// Detects the WebGL2 renderer: null for none, else whether it is the processor, where anti-aliasing is too slow.
 export function findRenderer() {
   const gl = document.createElement("canvas").getContext("webgl2");
   if (!gl) return null;
@@ -16,7 +16,7 @@ export function findRenderer() {
 
 export const pixelRatio = () => Math.min(window.devicePixelRatio || 1, MAX_PIXEL_RATIO);
 
-// Gives a canvas the pixels of a size in CSS pixels; whether that changed anything.
+// Sets the pixels of a canvas to a size in CSS pixels; returns whether this changed anything.
 export function fitCanvas(canvas, width, height) {
   const ratio = pixelRatio(), w = Math.max(1, Math.round(width * ratio)), h = Math.max(1, Math.round(height * ratio));
   if (canvas.width === w && canvas.height === h) return false;
@@ -25,7 +25,7 @@ export function fitCanvas(canvas, width, height) {
   return true;
 }
 
-// Calls back when an element has another size, or its window another number of pixels for one of CSS.
+// Calls back when the size of an element changes, or the device pixel ratio of its window.
 export function watchSize(element, onChange) {
   new ResizeObserver(onChange).observe(element);
   const watchRatio = () => {
@@ -34,7 +34,7 @@ export function watchSize(element, onChange) {
   watchRatio();
 }
 
-// A linked program and the locations of its uniforms by their names; its attributes are numbered in this order.
+// Returns a linked program and the locations of its uniforms by name; its attributes are numbered in this order.
 export function buildProgram(gl, vertexSource, fragmentSource, attributes = []) {
   const program = gl.createProgram();
   attributes.forEach((name, i) => gl.bindAttribLocation(program, i, name));
@@ -58,7 +58,7 @@ export function buildProgram(gl, vertexSource, fragmentSource, attributes = []) 
   return { program, at };
 }
 
-// An attribute of integers by its number, for the vertex array that is bound.
+// Sets an integer attribute by its number, for the bound vertex array.
 export function bindIntegers(gl, location, data, size, type) {
   gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
   gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
@@ -66,7 +66,7 @@ export function bindIntegers(gl, location, data, size, type) {
   gl.vertexAttribIPointer(location, size, type, 0, 0);
 }
 
-// One colour per site, in rows of a texture that shaders read with texelFetch.
+// Texture with one colour per site, in rows, which shaders read with texelFetch.
 export const TEXTURE_WIDTH = 2048;
 
 export const textureSize = (n) => TEXTURE_WIDTH * Math.max(1, Math.ceil(n / TEXTURE_WIDTH));
@@ -79,7 +79,7 @@ export function createLookup(gl) {
   return texture;
 }
 
-// Colours as bytes r, g, b, a, for the texture that is bound.
+// Sets colours as bytes r, g, b, a, in the bound texture.
 export function sendLookup(gl, bytes) {
   gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, TEXTURE_WIDTH, bytes.length / 4 / TEXTURE_WIDTH, 0, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
 }

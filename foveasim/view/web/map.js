@@ -1,4 +1,4 @@
-// The map: draws all sites by WebGL2 and keeps what part of the sensor is in view.
+// The map: draws all sites by WebGL2 and stores the visible part of the sensor.
 
 import { clamp } from "./colours.js";
 import { TEXTURE_WIDTH, bindIntegers, buildProgram, createLookup, fitCanvas, sendLookup, textureSize } from "./gl.js";
@@ -13,7 +13,7 @@ uniform highp sampler2D colours;
 flat out vec4 colour;
 void main() {
   colour = texelFetch(colours, ivec2(int(site) % ${TEXTURE_WIDTH}, int(site) / ${TEXTURE_WIDTH}), 0);
-  // Whole numbers subtract exactly, so that outlines stay sharp however near one goes.
+  // Integers subtract exactly, so that outlines are sharp at any zoom.
   gl_Position = vec4((vec2(place - centre) - rest) * zoom, 0.0, 1.0);
 }`;
 const FRAGMENT_SHADER = `#version 300 es
@@ -21,9 +21,9 @@ precision mediump float;
 flat in vec4 colour;
 out vec4 pixel;
 void main() { pixel = colour; }`;
-// Places as whole numbers: the longer side of the layout is so many steps.
+// Positions as integers: number of steps along the longer side of the layout.
 const LATTICE = 2 ** 30;
-// How near one can go: the view may be this many times narrower than the layout.
+// Largest zoom: ratio of the width of the layout to that of the view.
 const DEEPEST = 1e7;
 
 export class SensorMap {
@@ -68,13 +68,13 @@ export class SensorMap {
 
   sendColours() { sendLookup(this.gl, new Uint8Array(this.colours.buffer)); }
 
-  // Everything again, after the graphics card lost its memory.
+  // Restores all GPU resources after the graphics context was lost.
   restore() {
     this._load();
     this.sendColours();
   }
 
-  // From µm on the sensor to CSS pixels of the map, and back; y points up on the sensor.
+  // Conversion from µm on the sensor to CSS pixels of the map, and back; y points up on the sensor.
   toX(x) { return 0.5 * this.width + (x - this.x) * this.scale; }
   toY(y) { return 0.5 * this.height - (y - this.y) * this.scale; }
   fromX(px) { return this.x + (px - 0.5 * this.width) / this.scale; }
@@ -86,7 +86,7 @@ export class SensorMap {
     fitCanvas(this.canvas, this.width, this.height);
   }
 
-  // The scale at which the whole layout is in view.
+  // The scale at which the complete layout is in view.
   fitScale() {
     const [x0, y0, x1, y1] = this.sites.bounds;
     return 0.94 * Math.min(this.width / (x1 - x0), this.height / (y1 - y0));
@@ -99,7 +99,7 @@ export class SensorMap {
     this.y = clamp(y, y0, y1);
   }
 
-  // Zooms by a factor, with what is under a pixel staying there.
+  // Zooms by a factor about a pixel.
   zoom(factor, px, py) {
     const x = this.fromX(px), y = this.fromY(py), fit = this.fitScale();
     const scale = clamp(this.scale * factor, 0.5 * fit, DEEPEST * fit);

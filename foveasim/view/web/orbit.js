@@ -1,16 +1,16 @@
-// A camera that orbits a target. Right-handed, x to the right, y up, z toward the lens; lengths in µm, heights scaled.
+// Camera that orbits a target. Right-handed, x to the right, y up, z toward the lens; lengths in µm, heights scaled.
 
 import { clamp } from "./colours.js";
 
 const HALF_FOV = (17.5 * Math.PI) / 180;
 const FOCAL = 1 / Math.tan(HALF_FOV);
-// How much of the view all of it fills.
+// Fraction of the view that the complete scene fills.
 const FILLED = 0.94;
-// Nothing is drawn nearer than this part of the target's distance: depths keep enough digits.
+// Distance of the near plane as a fraction of the target's distance, which preserves depth precision.
 const NEAREST_DEPTH = 0.01;
 
 export class Orbit {
-  // What is looked at lies between two corners; one can go as near as a length.
+  // The scene lies between two corners; the second length is the smallest distance.
   constructor(low, high, nearest) {
     this.corners = [low, high];
     this.nearest = nearest;
@@ -20,7 +20,7 @@ export class Orbit {
     this.right = new Float64Array(3);
     this.up = new Float64Array(3);
     this.toEye = new Float64Array(3);
-    // From what is relative to the target, in units of its distance, to clip space; by columns.
+    // From positions relative to the target, in units of its distance, to clip space; column-major.
     this.toClip = new Float32Array(16);
     this.azimuth = -0.5 * Math.PI;
     this.elevation = 0.5 * Math.PI;
@@ -41,7 +41,7 @@ export class Orbit {
     this._update();
   }
 
-  // Scales heights; what was looked at stays in the middle of the view.
+  // Scales heights; the target remains in the centre of the view.
   setHeight(factor) {
     this.target[2] *= factor / this.height;
     this.height = factor;
@@ -54,14 +54,14 @@ export class Orbit {
     this._update();
   }
 
-  // Moves what is at a depth, in units of the target's distance, by pixels.
+  // Pans points at a depth, in units of the target's distance, by pixels.
   pan(dx, dy, depth = 1) {
     const perPixel = (2 * this.distance * depth) / (FOCAL * this.tall);
     for (let i = 0; i < 3; i++) this.target[i] += perPixel * (dy * this.up[i] - dx * this.right[i]);
     this._update();
   }
 
-  // Goes so many times farther from a point, which stays where it is in the view.
+  // Changes the distance by a factor about a point, whose position in the view does not change.
   zoom(factor, point = this.target) {
     const distance = clamp(this.distance * factor, this.nearest, 4 * this.fitDistance()), ratio = distance / this.distance;
     for (let i = 0; i < 3; i++) this.target[i] = point[i] + (this.target[i] - point[i]) * ratio;
@@ -69,7 +69,7 @@ export class Orbit {
     this._update();
   }
 
-  // All of it, seen from a direction.
+  // Shows the complete scene from a direction.
   look(azimuth, elevation) {
     this.azimuth = azimuth;
     this.elevation = elevation;
@@ -79,7 +79,7 @@ export class Orbit {
     this._update();
   }
 
-  // The distance from the middle of the box at which none of its corners is out of view.
+  // Returns the distance from the centre of the box at which all its corners are in view.
   fitDistance() {
     const { right, up, toEye } = this, wide = (this.width / this.tall / FOCAL) * FILLED, tall = FILLED / FOCAL;
     let distance = this.nearest;
@@ -101,7 +101,7 @@ export class Orbit {
     return out;
   }
 
-  // What is at a pixel of the view and a depth.
+  // Returns the point at a pixel of the view and a depth.
   pointAt(px, py, depth, out) {
     const x = ((2 * px) / this.width - 1) * (this.width / this.tall / FOCAL) * depth, y = ((1 - (2 * py) / this.tall) / FOCAL) * depth;
     for (let i = 0; i < 3; i++) {
@@ -110,13 +110,13 @@ export class Orbit {
     return out;
   }
 
-  // The depth that a window depth from 0 to 1 stands for.
+  // Returns the depth of a window depth from 0 to 1.
   depthOf(windowDepth) {
     const { near, far } = this;
     return (far * near) / (far - windowDepth * (far - near));
   }
 
-  // The pixel at which a point is seen, whose height is not scaled yet.
+  // Returns the pixel of a point whose height is not scaled yet.
   project(x, y, z, out) {
     let right = 0, up = 0, toEye = 0;
     for (let i = 0; i < 3; i++) {
@@ -150,7 +150,7 @@ export class Orbit {
       nearest = Math.min(nearest, depth);
       farthest = Math.max(farthest, depth);
     }
-    // The box alone, and a little more: the tighter, the finer are depths.
+    // Only the box with a small margin: a tight range gives fine depths.
     const near = Math.max(0.999 * nearest, NEAREST_DEPTH), far = Math.max(1.001 * farthest, 1.01 * near);
     this.near = near;
     this.far = far;

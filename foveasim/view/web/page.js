@@ -1,4 +1,4 @@
-// The page: controls, the photosite under the mouse, colours, rules, the picture, links.
+// The page: controls, the photosite under the mouse, colours, design rules, picture, links.
 
 import { Scale, brief, bytesOfHex, clamp, roundStep, shown, textOf } from "./colours.js";
 import { listenToPointers } from "./gestures.js";
@@ -10,7 +10,7 @@ import { offsetsOf, unpack } from "./unpack.js";
 
 const about = JSON.parse($("about").textContent);
 const reducesMotion = matchMedia("(prefers-reduced-motion: reduce)");
-// More outlines than this are not drawn: they would be a grey mush.
+// More outlines than this are not drawn, because they would not be distinguishable.
 const MOST_OUTLINES = 4000;
 const VIOLATIONS_AT_A_TIME = 200;
 const STEPS = 72;
@@ -70,7 +70,7 @@ function groundColour() {
 function fitted(canvas) {
   const ratio = pixelRatio(), width = canvas.clientWidth, height = canvas.clientHeight;
   fitCanvas(canvas, width, height);
-  // Where the processor draws, it does so twenty times faster without the way through WebGL.
+  // With software rendering, drawing without WebGL is twenty times faster.
   const context = canvas.getContext("2d", { willReadFrequently: state.isSlow });
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   return { context, width, height };
@@ -122,7 +122,7 @@ function drawLegend() {
     (column.note ? " (" + column.note + ")" : "");
 }
 
-// Heights are roots of counts, so that a few sites among many can be seen.
+// Heights are square roots of counts, so that a few sites among many are visible.
 function drawHistogram() {
   const { scale, histogram, column } = state;
   if (!histogram || column.kind === "kinds") return;
@@ -175,7 +175,7 @@ function listenToHistogram() {
   canvas.addEventListener("pointerup", (event) => { if (start !== null && valueAt(event) === start) setRange(null); start = null; });
   for (const id of ["range-from", "range-to"]) {
     $(id).addEventListener("change", () => {
-      // A bound that was not changed keeps the digits that its field does not show.
+      // An unchanged bound keeps its full precision, which its field does not show.
       const [low, high] = state.range || [state.scale.lowest, state.scale.highest], [lowText, highText] = state.rangeTexts;
       const from = $("range-from").value === lowText ? low : Number($("range-from").value);
       const to = $("range-to").value === highText ? high : Number($("range-to").value);
@@ -214,7 +214,7 @@ function drawMap() {
   state.drawMs = performance.now() - start;
 }
 
-// Outlines of sites that are large enough to have them, and markers of violations.
+// Draws outlines of sufficiently large sites, and markers of violations.
 function drawLines() {
   const { map, sites } = state, { context, width, height } = state.lines;
   context.clearRect(0, 0, width, height);
@@ -224,9 +224,9 @@ function drawLines() {
     const side = Math.sqrt((width * height) / found.size), ink = clamp((side - 7) / 25, 0, 0.5);
     if (ink > 0) {
       context.lineWidth = 1;
-      // Between the grey of dark sites and that of bright ones, so that it is seen on both.
+      // A grey between those of dark and bright sites, visible on both.
       context.strokeStyle = "rgb(112 120 134 / " + 1.6 * ink + ")";
-      // A few at a time: the time that a path takes grows faster than its length.
+      // In groups: the time per path grows faster than its length.
       let traced = 0;
       context.beginPath();
       for (const site of found) {
@@ -278,7 +278,7 @@ function drawMarks() {
   const ring = (site, inks) => {
     const [a, b, c, d] = sites.box.subarray(4 * site, 4 * site + 4);
     outline(context, () => sites.trace(context, site, map), [5, 2.5], inks);
-    // A site of a few pixels could be missed: a circle around it.
+    // A circle around sites of a few pixels, which could be missed.
     if ((c - a) * map.scale < 10 && (d - b) * map.scale < 10) {
       outline(context, () => context.arc(map.toX(0.5 * (a + c)), map.toY(0.5 * (b + d)), 9, 0, 7), [4, 2], inks);
     }
@@ -308,7 +308,7 @@ function drawScaleBar() {
 
 // -- the picture -----------------------------------------------------------------------------------------------------------------
 
-// Where the picture lies in its frame, in CSS pixels, whatever space is left beside it.
+// Position of the picture in its frame, in CSS pixels, including letterboxing.
 function pictureBox() {
   const frame = $("picture-frame"), { width, height, bounds_um: bounds } = about.picture;
   const scale = Math.min(frame.clientWidth / width, frame.clientHeight / height);
@@ -379,7 +379,7 @@ function leave() {
   ask("marks");
 }
 
-// As many digits as the view can tell apart.
+// Formats a position with the digits that the view resolves.
 function lengthText(value) {
   return value.toFixed(clamp(Math.ceil(Math.log10(state.map.scale)) + 1, 0, 6));
 }
@@ -438,7 +438,7 @@ function goTo(site) {
   tellSite();
 }
 
-// -- moving -----------------------------------------------------------------------------------------------------------------------------
+// -- navigation -------------------------------------------------------------------------------------------------------------------------
 
 let flight = 0;
 
@@ -452,7 +452,7 @@ function fly(x, y, scale) {
   const start = performance.now(), ratio = to.scale / from.scale;
   const step = () => {
     const t = clamp((performance.now() - start) / 450, 0, 1), eased = t * t * (3 - 2 * t);
-    // The way goes as the width of the view does, so that it looks as if one fell towards the place.
+    // The path follows the width of the view, which gives the impression of falling towards the target.
     const way = Math.abs(ratio - 1) < 1e-3 ? eased : (1 - ratio ** -eased) / (1 - 1 / ratio);
     map.set(from.x + way * (to.x - from.x), from.y + way * (to.y - from.y), from.scale * ratio ** eased);
     if (t < 1) { ask("map"); flight = requestAnimationFrame(step); } else { map.set(to.x, to.y, to.scale); moved(); }
@@ -550,7 +550,7 @@ class Violations {
         box[2] = Math.max(box[2], this.xy[2 * p]);
         box[3] = Math.max(box[3], this.xy[2 * p + 1]);
       }
-      // A place without a marker is where its sites are.
+      // A violation without a marker is at its sites.
       if (from === to) for (const site of this.sitesOf(i)) box.splice(0, 4, ...state.sites.box.subarray(4 * site, 4 * site + 4));
       this.boxes.set(box, 4 * i);
     }
@@ -590,7 +590,7 @@ async function loadRules() {
   listViolations();
 }
 
-// The next violations of the chosen rule, behind those that are listed.
+// Lists the next violations of the chosen rule after those that are listed.
 function listViolations() {
   const rule = Number($("rule").value), { violations } = state, asked = rule < 0 ? about.rules : [about.rules[rule]];
   const of = [];
@@ -645,7 +645,7 @@ function flyToViolation(i) {
   fly(0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]), (0.3 * Math.min(map.width, map.height)) / (width || 1));
 }
 
-// -- links, pictures, light and dark ---------------------------------------------------------------------------------------------------------
+// -- links, pictures, themes -----------------------------------------------------------------------------------------------------------------
 
 let remembering = 0;
 
@@ -666,7 +666,7 @@ function viewHash() {
   return "#" + words;
 }
 
-// The view that a link asks for, as far as it makes sense.
+// Restores the view of a link, as far as it is valid.
 function readHash() {
   const words = new URLSearchParams(location.hash.slice(1)), { map, sites } = state;
   const [x, y, width] = ["x", "y", "width"].map((name) => (words.has(name) ? Number(words.get(name)) : NaN));
@@ -687,7 +687,7 @@ async function copyLink() {
   }
 }
 
-// The map as it is shown, with its scale bar and what its colours mean.
+// Returns the displayed map with its scale bar and colour scale.
 function viewAsPicture() {
   const { map, scale, column } = state, cells = $("cells"), ratio = cells.width / map.width;
   const picture = document.createElement("canvas"), foot = 46;
@@ -741,7 +741,7 @@ function listenToTools() {
   });
 }
 
-// -- opening --------------------------------------------------------------------------------------------------------------------------------
+// -- loading --------------------------------------------------------------------------------------------------------------------------------
 
 function showTheme() {
   if (!state.scale) return;
@@ -749,7 +749,7 @@ function showTheme() {
   drawLegend();
 }
 
-// What the graphics card forgot is sent to it again as soon as it is back.
+// After the graphics context was lost, all data are sent again when it is restored.
 function listenToLosses() {
   $("cells").addEventListener("webglcontextlost", (event) => {
     event.preventDefault();
@@ -762,7 +762,7 @@ function listenToLosses() {
   });
 }
 
-// Without WebGL2 the picture stands in for the map.
+// Without WebGL2 the picture replaces the map.
 function showPlain(why) {
   document.body.classList.add("plain");
   $("opening").hidden = true;
@@ -808,7 +808,7 @@ async function open() {
   $("opening").hidden = true;
 }
 
-// All other columns, when the page can be used already.
+// Loads all other columns after the page is usable.
 async function openRest() {
   for (const column of about.columns) await valuesOf(column);
   state.loaded = true;
@@ -832,10 +832,10 @@ const handle = {
   get range() { return state.range; },
   get drawMs() { return state.drawMs; },
   get column() { return state.column.key; },
-  // CSS pixels of the window, for a mouse.
+  // CSS pixels of the window, for mouse events.
   toWindow: (x, y) => { const box = $("marks").getBoundingClientRect(); return [box.left + state.map.toX(x), box.top + state.map.toY(y)]; },
   fromWindow: (px, py) => { const box = $("marks").getBoundingClientRect(); return [state.map.fromX(px - box.left), state.map.fromY(py - box.top)]; },
-  // Colours of the map's pixels as they are drawn, (r, g, b, a) at a place on the sensor.
+  // Colours of the drawn pixels of the map, (r, g, b, a) at a position on the sensor.
   pixel: (x, y) => {
     const { map } = state, { gl } = map, ratio = map.canvas.width / map.width, bytes = new Uint8Array(4);
     map.draw(groundColour());

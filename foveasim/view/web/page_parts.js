@@ -1,4 +1,4 @@
-// What every page has: elements by their names, light and dark, short notices, downloads, the list of keys.
+// Common parts of all pages: elements by id, themes, short notices, downloads, the list of keys.
 
 export const $ = (id) => document.getElementById(id);
 
@@ -11,9 +11,9 @@ export function make(tag, text, className) {
 
 export const inkOf = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
-// -- light and dark -------------------------------------------------------------------------------------------------------
+// -- themes ---------------------------------------------------------------------------------------------------------------
 
-// As was chosen on some page before, else as the system; onChange is called when that changes and by the button.
+// Uses the theme chosen on an earlier page, else that of the system; onChange is called when the theme changes.
 export function startTheme(onChange) {
   const root = document.documentElement, system = matchMedia("(prefers-color-scheme: dark)");
   let chosen = null;
@@ -30,7 +30,7 @@ export function startTheme(onChange) {
   });
 }
 
-// -- notices, for eyes and for screen readers ---------------------------------------------------------------------------------
+// -- notices, visible and for screen readers ----------------------------------------------------------------------------------
 
 let noticing = 0, speaking = 0;
 
@@ -41,14 +41,14 @@ export function notice(text) {
   noticing = setTimeout(() => { $("told").hidden = true; }, 2600);
 }
 
-// A notice that stays until it is null.
+// Shows a notice until it is null.
 export function stayingNotice(text) {
   clearTimeout(noticing);
   $("told").hidden = text === null;
   if (text !== null) $("told").textContent = text;
 }
 
-// What a screen reader says once it has been true for a moment; null for nothing.
+// Announces a text to screen readers after a short delay; null for none.
 export function speak(textOrNull) {
   clearTimeout(speaking);
   if (textOrNull) speaking = setTimeout(() => { $("live").textContent = textOrNull(); }, 300);
@@ -68,13 +68,13 @@ export function downloadPicture(canvas, name) {
 
 // -- keys -------------------------------------------------------------------------------------------------------------------
 
-// Whether a key is one for the page: no text is typed, nothing is chosen, no dialog is open, no modifier is held.
+// Whether a key event is for the page: no text input, no selection, no open dialog, no modifier key.
 export function isForPage(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return false;
   return !event.target.closest("input[type='text'], select");
 }
 
-// The list of keys opens by its button and by "?", and closes by "?", Escape and a click on its outside.
+// The list of keys opens by its button and by "?", and closes by "?", Escape and a click outside.
 export function listenToHelp() {
   const keys = $("keys");
   $("help").addEventListener("click", () => keys.showModal());

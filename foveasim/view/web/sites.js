@@ -1,4 +1,4 @@
-// Photosites: exact outlines, what lies under a point, and triangles to draw.
+// Photosites: exact outlines, sites under a point, and triangles to draw.
 
 import { offsetsOf, placesOf } from "./unpack.js";
 
@@ -18,7 +18,7 @@ export class Sites {
   firstRing(site) { return this.siteOffsets ? this.siteOffsets[site] : site; }
   firstVertex(site) { return this.ringOffsets[this.firstRing(site)]; }
 
-  // Boxes and areas of all sites; holes are wound the other way, so their areas subtract.
+  // Boxes and areas of all sites; holes have the opposite winding, so that their areas subtract.
   _measure() {
     const { n, xy, place, ringOffsets } = this;
     this.box = new Float64Array(4 * n);
@@ -45,7 +45,7 @@ export class Sites {
     }
   }
 
-  // A grid of bins, each with the sites whose boxes reach into it; coarser where boxes are large or many overlap.
+  // A grid of bins, each with the sites whose boxes intersect it; coarser where boxes are large or many overlap.
   _sortIntoBins() {
     const [x0, y0, x1, y1] = this.bounds, { n, box } = this;
     const width = Math.max(x1 - x0, 1e-12), height = Math.max(y1 - y0, 1e-12);
@@ -83,8 +83,8 @@ export class Sites {
     }
   }
 
-  // All sites that hold a point, the lowest number first. A point on a border belongs to the site on its +x side,
-  // on a horizontal one to the site on its +y side.
+  // All sites that contain a point, in ascending order. A point on a boundary belongs to the site on its +x side,
+  // on a horizontal boundary to the site on its +y side.
   pickAll(x, y) {
     const found = [], [x0, y0, x1, y1] = this.bounds;
     if (!(x >= x0 && x <= x1 && y >= y0 && y <= y1)) return found;
@@ -105,7 +105,7 @@ export class Sites {
       for (let v = ringOffsets[ring]; v < to; v++) {
         const q = 2 * place[v], py = xy[p + 1], qy = xy[q + 1];
         if (py > y !== qy > y) {
-          // From the lower end, whichever way the edge runs: so that its two sites agree to the last bit.
+          // From the lower end in both directions, so that both sites of the edge agree bit-identically.
           const low = py < qy ? p : q, high = py < qy ? q : p;
           const share = (y - xy[low + 1]) / (xy[high + 1] - xy[low + 1]);
           if (x < xy[low] + share * (xy[high] - xy[low])) inside = !inside;
@@ -116,7 +116,7 @@ export class Sites {
     return inside;
   }
 
-  // Sites whose boxes meet a rectangle, or null when there are more than a limit.
+  // Sites whose boxes intersect a rectangle, or null when there are more than a limit.
   within(x0, y0, x1, y1, limit) {
     const a = this._column(x0), b = this._row(y0), c = this._column(x1), d = this._row(y1), { box } = this;
     const found = new Set();
@@ -151,7 +151,7 @@ export class Sites {
     return [ax + mx / (3 * twice), ay + my / (3 * twice)];
   }
 
-  // Corners of all triangles, by tiles of the layout, so that those out of sight need not be drawn.
+  // Corners of all triangles, by tiles of the layout, so that tiles out of view need not be drawn.
   triangles() {
     const { n, ringOffsets, box, cuts } = this, [x0, y0, x1, y1] = this.bounds;
     const side = Math.max(1, Math.min(64, Math.round(Math.sqrt(n / 1500))));
@@ -198,7 +198,7 @@ export class Sites {
     return { corners, tiles };
   }
 
-  // Traces a site's rings on a canvas, through a function from µm to pixels.
+  // Traces the rings of a site on a canvas, through a function from µm to pixels.
   trace(context, site, view) {
     const { xy, place, ringOffsets } = this;
     for (let ring = this.firstRing(site); ring < this.firstRing(site + 1); ring++) {

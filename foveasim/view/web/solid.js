@@ -28,7 +28,7 @@ function showSite() {
   speak(site < 0 ? null : () => "Photosite " + site + ": " + columns.map((column) => column.label + " " + textOf(column, site, state.area)).join(", "));
 }
 
-// The site of the nearest surface under the pointer, and its part; the surface stays under it while one zooms.
+// The site and part of the nearest surface under the pointer; the surface stays under it during zoom.
 function hover() {
   const { view, pointer } = state, found = pointer ? view.pick(pointer[0], pointer[1]) : null;
   const site = found ? found.site : -1, part = found ? found.part : -1;
@@ -56,7 +56,7 @@ function ask() {
   requestAnimationFrame(drawFrame);
 }
 
-// Ids are drawn a frame after the view came to rest: while it moves, only the image is.
+// Ids are drawn one frame after the view has stopped; during motion only the image is drawn.
 function drawFrame() {
   const { view } = state, wasMoving = view.isImageStale && view.areIdsStale;
   state.isAsked = false;
@@ -66,7 +66,7 @@ function drawFrame() {
   if (wasMoving) ask();
 }
 
-// The view has changed, by more than a zoom about what is under the pointer.
+// The view has changed, by more than a zoom about the pointer.
 function moved() {
   state.anchor = null;
   changed();
@@ -103,11 +103,11 @@ function resize() {
   moved();
 }
 
-// -- mouse, fingers and keys ----------------------------------------------------------------------------------------------
+// -- mouse, touch and keys ------------------------------------------------------------------------------------------------
 
 function listenToCanvas() {
   const canvas = $("solid"), { orbit } = state.view, point = new Float64Array(3);
-  // Where the pointer is on a surface, known since it came there; else in front of the target.
+  // Point of the pointer on a surface, cached since it arrived there; else in front of the target.
   const under = (px, py) => state.anchor || orbit.pointAt(px, py, 1, point);
   const depthOf = (place) => {
     let depth = 1;
@@ -180,9 +180,9 @@ function partItem(part) {
   return item;
 }
 
-// -- opening --------------------------------------------------------------------------------------------------------------
+// -- loading --------------------------------------------------------------------------------------------------------------
 
-// What the graphics card forgot is sent to it again as soon as it is back.
+// After the graphics context was lost, all data are sent again when it is restored.
 function listenToLosses() {
   const canvas = $("solid");
   canvas.addEventListener("webglcontextlost", (event) => {
@@ -235,7 +235,7 @@ window.foveasim = {
   ready: null,
   complete: null,
   readyMs: NaN,
-  // What is seen at a place of the window, in CSS pixels.
+  // Site and part at a position in the window, in CSS pixels.
   pick: (px, py) => {
     const box = $("solid").getBoundingClientRect(), { site, part } = state.view.pick(px - box.left, py - box.top);
     return { site, part: part < 0 ? null : state.view.parts[part].name };
@@ -246,12 +246,12 @@ window.foveasim = {
   get pinned() { return state.pinned; },
   get parts() { return state.view.parts.map((part) => part.name); },
   get counts() { return { ...state.view.counts }; },
-  // The eye, the point that it looks at and the length of what is seen of a vertical line there, in µm with heights scaled.
+  // The eye, the target, and the visible length of a vertical line at the target, in µm with heights scaled.
   get camera() {
     const { orbit } = state.view;
     return { eye: [...orbit.eye([0, 0, 0])], target: [...orbit.target], distance: orbit.distance, height: orbit.height, near: orbit.near, far: orbit.far };
   },
-  // CSS pixels of the window where a place on the sensor, in µm, is seen.
+  // CSS pixels in the window of a position on the sensor in µm.
   toWindow: (x, y, z) => {
     const box = $("solid").getBoundingClientRect(), [px, py] = state.view.orbit.project(x, y, z, [0, 0]);
     return [box.left + px, box.top + py];

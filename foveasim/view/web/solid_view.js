@@ -1,4 +1,4 @@
-// Surfaces in three dimensions by WebGL2: an image that is drawn when the view changes, ids of what is seen for picking.
+// Surfaces in three dimensions by WebGL2: an image that is drawn when the view changes, and ids of sites for picking.
 
 import { TEXTURE_WIDTH, bindIntegers, buildProgram, createLookup, fitCanvas, sendLookup, textureSize } from "./gl.js";
 
@@ -16,7 +16,7 @@ out vec3 at;
 flat out vec3 colour;
 flat out uint owner;
 void main() {
-  // Integers subtract exactly, so that surfaces stay sharp however near one goes.
+  // Integers subtract exactly, so that surfaces are sharp at any zoom.
   at = (vec3(place - centre) - rest) * unit;
   gl_Position = toClip * vec4(at, 1.0);
   colour = texelFetch(colours, ivec2(int(site) % ${TEXTURE_WIDTH}, int(site) / ${TEXTURE_WIDTH}), 0).rgb;
@@ -25,7 +25,7 @@ void main() {
 const SRGB = `
 vec3 toLinear(vec3 c) { return mix(c / 12.92, pow((c + 0.055) / 1.055, vec3(2.4)), step(0.04045, c)); }
 vec3 toScreen(vec3 c) { return mix(c * 12.92, 1.055 * pow(c, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c)); }`;
-// Light from the sky all around and from a sun: what faces the sun is as bright as its colour, nothing is brighter.
+// Ambient and directional light: a face toward the light source has its full colour, and none is brighter.
 const IMAGE_SHADER = `#version 300 es
 precision highp float;
 in vec3 at;
@@ -38,14 +38,14 @@ const vec3 FLOOR = vec3(0.32, 0.37, 0.46);
 const vec3 MARK = vec3(0.02, 0.25, 1.0);
 ${SRGB}
 void main() {
-  // The plane of a triangle from its neighbours on the screen: it faces the eye, whichever way it is wound.
+  // The plane of a triangle from its neighbours on the screen: it faces the eye, independent of its winding.
   vec3 normal = normalize(cross(dFdx(at), dFdy(at)));
   vec3 light = 0.42 * mix(FLOOR, vec3(1.0), 0.5 * normal.z + 0.5) + 0.60 * max(dot(normal, SUN), 0.0);
   vec3 own = toLinear(colour);
   if (pinned != 0u && owner == pinned) own = mix(own, MARK, 0.7);
   pixel = vec4(toScreen(own * min(light, 1.0)), min(light.g, 1.0));
 }`;
-// Site plus 1 and 0 for none; part plus 1, and the depth above it.
+// Site + 1, 0 for none; part + 1, and the depth in the upper bits.
 const ID_SHADER = `#version 300 es
 precision highp float;
 precision highp int;
@@ -55,7 +55,7 @@ out uvec2 id;
 void main() { id = uvec2(owner, part | (uint(gl_FragCoord.z * 16777215.0) << 8)); }`;
 const SCREEN_SHADER = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID == 1, gl_VertexID == 2) * 4.0 - 1.0, 0.0, 1.0); }`;
-// The image, with the hovered site lit up where the ids have it.
+// The image, with the hovered site highlighted according to the ids.
 const COMPOSE_SHADER = `#version 300 es
 precision highp float;
 precision highp int;
@@ -71,12 +71,12 @@ void main() {
   if (hovered != 0u && texelFetch(ids, place, 0).r == hovered) seen.rgb = toScreen(mix(toLinear(seen.rgb), MARK * seen.a, 0.7));
   pixel = vec4(seen.rgb, 1.0);
 }`;
-// Samples of a pixel, where the graphics card is fast.
+// Samples per pixel on fast graphics cards.
 const SAMPLES = 4;
 const MAX_PARTS = 254;
 
 export class SolidView {
-  // The canvas, Bodies, an Orbit around them, the number of sites, and findRenderer().
+  // Takes the canvas, Bodies, an Orbit around them, the number of sites, and findRenderer().
   constructor(canvas, bodies, orbit, nSites, renderer) {
     if (bodies.list.length > MAX_PARTS) throw new Error("more than " + MAX_PARTS + " parts");
     this.canvas = canvas;
@@ -88,7 +88,7 @@ export class SolidView {
     this.ground = [0, 0, 0];
     this.hovered = -1;
     this.pinned = -1;
-    // How often each was drawn.
+    // Number of times that each was drawn.
     this.counts = { image: 0, ids: 0, screen: 0 };
     this.found = { site: -1, part: -1, depth: 1 };
     this.planes = new Float64Array(24);
@@ -98,10 +98,10 @@ export class SolidView {
     this.load();
   }
 
-  // Everything that the graphics card holds; again after it lost its memory.
+  // Creates all GPU resources; again after the context was lost.
   load() {
     const { gl, bodies, nSites } = this;
-    // The same numbers of attributes: one vertex array serves both programs.
+    // The same attribute numbers, so that one vertex array serves both programs.
     this.image = buildProgram(gl, VERTEX_SHADER, IMAGE_SHADER, ATTRIBUTES);
     this.id = buildProgram(gl, VERTEX_SHADER, ID_SHADER, ATTRIBUTES);
     this.screen = buildProgram(gl, SCREEN_SHADER, COMPOSE_SHADER);
@@ -168,12 +168,12 @@ export class SolidView {
     this.targets = { width, height, buffers, textures, frames };
   }
 
-  // The view has changed: its image is drawn with the next frame, ids when something is picked.
+  // The view has changed: its image is drawn with the next frame, ids at the next pick.
   change() {
     this.isImageStale = this.areIdsStale = true;
   }
 
-  // Only colours have changed: nothing is seen elsewhere.
+  // Only colours have changed: ids remain valid.
   changeColours() { this.isImageStale = true; }
 
   resize(width, height) {
@@ -188,7 +188,7 @@ export class SolidView {
   setVisible(part, isVisible) { part.isVisible = isVisible; this.change(); }
   setHeight(factor) { this.orbit.setHeight(factor); this.change(); }
 
-  // Draws what is out of date, and the screen.
+  // Draws outdated buffers, and the screen.
   draw() {
     const { gl } = this;
     if (gl.isContextLost()) return;
@@ -239,7 +239,7 @@ export class SolidView {
     this._drawParts(this.id);
   }
 
-  // All visible parts by a program that is in use: no tile that is out of view, no face that is turned away.
+  // Draws all visible parts with the current program, without tiles out of view and back faces.
   _drawParts({ at }) {
     const { gl, orbit, bodies: { lattice, origin }, targets: { width, height } } = this, { target, distance } = orbit;
     const cx = (target[0] - origin[0]) / lattice, cy = (target[1] - origin[1]) / lattice, cz = (target[2] / orbit.height - origin[2]) / lattice;
@@ -252,7 +252,7 @@ export class SolidView {
     gl.uniform3f(at.unit, unit, unit, unit * orbit.height);
     gl.uniformMatrix4fv(at.toClip, false, orbit.toClip);
     this._findPlanes(cx, cy, cz, unit);
-    // What is open below shows its inside to an eye below, and only there.
+    // Open parts show their inside to an eye below, and only there.
     const isAbove = target[2] + distance * orbit.toEye[2] >= orbit.low(2);
     gl.activeTexture(gl.TEXTURE0);
     for (let k = 0; k < this.parts.length; k++) {
@@ -278,7 +278,7 @@ export class SolidView {
     gl.bindVertexArray(null);
   }
 
-  // The six planes of the view, for boxes on the lattice: a x + b y + c z + d is at least 0 within each.
+  // The six planes of the view, for boxes on the lattice: a x + b y + c z + d is at least 0 inside each.
   _findPlanes(cx, cy, cz, unit) {
     const { planes, orbit: { toClip: m, height } } = this;
     for (let k = 0; k < 6; k++) {
@@ -299,7 +299,7 @@ export class SolidView {
     return true;
   }
 
-  // What is seen at a pixel of the view: the site and the part, -1 for none, and the depth for Orbit.pointAt.
+  // Returns the visible site and part at a pixel, -1 for none, and the depth for Orbit.pointAt.
   pick(px, py) {
     const { gl, found, word, canvas, orbit } = this;
     found.site = found.part = -1;

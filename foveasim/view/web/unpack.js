@@ -1,4 +1,4 @@
-// Arrays out of the page: base64 of gzip of bytes sorted by significance.
+// Decodes arrays of the page: base64 of gzip of bytes sorted by significance.
 
 const TYPES = {
   uint8: Uint8Array, int8: Int8Array, uint16: Uint16Array, int16: Int16Array,
@@ -29,14 +29,14 @@ export async function unpack(name, about) {
   return new Type(bytes.buffer);
 }
 
-// Running sums with a 0 in front: counts to offsets.
+// Cumulative sums with a leading 0: counts to offsets.
 export function offsetsOf(counts) {
   const offsets = new Uint32Array(counts.length + 1);
   for (let i = 0; i < counts.length; i++) offsets[i + 1] = offsets[i] + counts[i];
   return offsets;
 }
 
-// Places that rings come to, from references back: 0 for the next new one, else how many came since.
+// Decodes positions from back references: 0 is the next new position, n the n-th last of the distinct ones so far.
 export function placesOf(references) {
   const place = new Uint32Array(references.length);
   for (let v = 0, seen = 0; v < place.length; v++) place[v] = references[v] === 0 ? seen++ : seen - references[v];
