@@ -272,7 +272,7 @@ def _meshes(scene: Shown) -> list[Mesh]:
         )
     found = [mesh for mesh in found if mesh.triangles.size]
     if not found:
-        raise GeometryError("the scene is empty: there is nothing to show")
+        raise GeometryError("the scene is empty; it must have at least one triangle")
     return found
 
 

@@ -333,7 +333,7 @@ def test_cut_of_everything_leaves_empty_solids(tmp_path):
     nothing = made.cut(shapely.box(-9, -9, 9, 9))
 
     assert nothing.volumes_um3("wells").sum() == 0.0
-    with pytest.raises(GeometryError, match="nothing to show"):
+    with pytest.raises(GeometryError, match="the scene is empty"):
         render(nothing, renderer="software")
     with pytest.raises(GeometryError, match="the solids have no triangles to write"):
         nothing.write(tmp_path / "none.glb")

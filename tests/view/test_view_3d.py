@@ -343,7 +343,7 @@ def test_invalid_viewpoints_raise_by_name(parameters, message):
 def test_invalid_scene_raises():
     with pytest.raises(ParameterError, match="'scene' must be a Mesh"):
         render(ODD_LAYOUT)
-    with pytest.raises(GeometryError, match="nothing to show"):
+    with pytest.raises(GeometryError, match="the scene is empty"):
         render([])
 
 

@@ -173,7 +173,7 @@ def _runs(mesh: Mesh, place: Ints, tile_of_site: Ints, offset: int) -> dict[str,
 
 
 def _by_first_occurrence(place: Ints) -> tuple[Ints, Ints]:
-    """Number positions in order of first occurrence; also return the index of the latter."""
+    """Number positions in order of first occurrence, and return where each occurs first."""
     n = int(place.max()) + 1
     first = np.empty(n, np.int64)
     first[place[::-1]] = np.arange(place.size)[::-1]  # the last write is the first occurrence
