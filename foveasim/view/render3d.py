@@ -31,7 +31,7 @@ __all__ = ["SceneOfMeshes", "Viewpoint", "render", "show", "sites_in_view"]
 #: Ambient reflection of every face, and additional reflection of a face toward the light source. Their sum is 1, so that no
 #: colour is clipped.
 AMBIENT, DIFFUSE = 0.35, 0.65
-#: Direction of the light source relative to the viewer: to the right, horizontally toward the viewer, up.
+#: Direction toward the light source in components to the right, horizontally toward the viewer, and up.
 LIGHT = (-0.38, 0.30, 0.87)
 #: Background with contrast to both light and dark colours.
 BACKGROUND = (238, 240, 244)
