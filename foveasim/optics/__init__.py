@@ -1,4 +1,4 @@
-"""Lenses: from the radiance of a scene to the irradiance on the sensor plane."""
+"""Lens models: from scene radiance to irradiance on the sensor plane."""
 
 from __future__ import annotations
 
@@ -28,4 +28,4 @@ __all__ = [
     "zernike",
 ]
 
-import_all(__name__, __path__, skip="_")  # they load scipy, which only images need
+import_all(__name__, __path__, skip="_")  # deferred: these modules import scipy, which only imaging needs

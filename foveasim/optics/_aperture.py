@@ -1,9 +1,9 @@
 """
-The light in the aperture, sampled, and the transfer functions and patterns that it makes.
+Sampled complex amplitude in the aperture, and the OTF and PSF computed from it.
 
-The amplitude ``P(r)`` in the aperture of radius a makes at the point x of the sensor, at the image distance D, the amplitude
-``∫ P(r) exp(-2πi x·r / (λD)) dr``; the transfer function is the normalised autocorrelation of P, at lags ``λ D f``.
-In units of the aperture's radius, with the image-side f-number ``N = D / 2a``, the lag is ``2 λN f``.
+The amplitude ``P(r)`` in the aperture of radius a produces the amplitude ``∫ P(r) exp(-2πi x·r / (λD)) dr`` at the point x
+of the sensor, at the image distance D. The OTF is the normalised autocorrelation of P, at lags ``λ D f``. In units of the
+aperture radius, with the image-side f-number ``N = D / 2a``, the lag is ``2 λN f``.
 """
 
 from __future__ import annotations
@@ -24,29 +24,39 @@ from foveasim.units import um_from_nm
 
 __all__ = ["Aperture", "Wavefront"]
 
-#: Samples across the aperture when the pupil's shape alone spreads the light: its transfer function is right to 4e-4 ...
+#: Samples across an unaberrated aperture; the OTF is then accurate to 4e-4.
 MIN_ACROSS = 192
-#: ... and so many for each λN by which aberrations throw the light aside: at that distance the pattern has 1.3 % too little.
+#: Samples across the aperture per λN of geometric blur; the PSF at the blur radius is then too low by 1.3 %.
 ACROSS_PER_BLUR = 16
-#: More samples than this are rejected: the light would be thrown further than 128 λN.
+#: Upper limit of the samples across the aperture, which limits the geometric blur to 128 λN.
 MAX_ACROSS = 2048
-#: Points across the aperture at which a pupil's shape is looked up, odd so that edges at simple fractions lie between them.
+#: Points across the aperture at which pupil callables are evaluated; odd, so that edges at simple fractions lie between points.
 FINE = 1535
-#: Points across the aperture at which slopes of the wavefront are looked for.
+#: Points across the aperture at which the wavefront slope is evaluated.
 SLOPE_POINTS = 193
-#: An aperture that lets less than this fraction of the power through is closed.
+#: Power transmittance below which a pupil counts as empty.
 CLOSED = 1e-9
 
 
 class Wavefront(Protocol):
-    """An aberration: path differences in µm at points of the aperture, in its radius."""
+    """Aberration as optical path difference over the aperture."""
 
     def wavefront_um(self, x: Floats, y: Floats, wavelength_nm: float, field_um: tuple[float, float]) -> Floats:
-        """Path differences for a point of the image at ``field_um`` (x, y) on the sensor."""
+        """
+        Return the path difference in µm for the image point ``field_um`` (x, y) on the sensor.
+
+        ``x`` and ``y`` are in aperture radii.
+        """
 
 
 def overlaps(n_to: int, to_step: float, n_from: int, from_step: float) -> Any:
-    """Fractions of the cells of one centred line of cells in the cells of another, a sparse (n_to, n_from) matrix."""
+    """
+    Compute the overlaps of two centred rows of cells, as fractions of the target cells.
+
+    Returns
+    -------
+    fractions : (n_to, n_from) sparse array
+    """
     from scipy.sparse import coo_array, diags_array
 
     to_edges = (np.arange(n_to + 1) - 0.5 * n_to) * to_step
@@ -63,16 +73,16 @@ def overlaps(n_to: int, to_step: float, n_from: int, from_step: float) -> Any:
 @dataclass(frozen=True, eq=False)
 class Aperture:
     """
-    Everything that shapes the light in the aperture.
+    Amplitude transmission and wavefront of an aperture.
 
     Attributes
     ----------
     pupils : sequence of callables
-        Their amplitudes are multiplied; outside the unit circle it is dark.
+        Amplitude transmissions, multiplied; 0 outside the unit circle.
     wavefronts : sequence of Wavefront
-        Their path differences add up.
+        Path differences, added.
     defocus_um : float, µm
-        Path difference at the aperture's edge, growing with the square of the radius.
+        Path difference at the edge of the aperture; proportional to the squared radius.
     """
 
     pupils: Sequence[Pupil]
@@ -81,17 +91,17 @@ class Aperture:
 
     @cached_property
     def is_grey(self) -> bool:
-        """Whether every pupil is known to be the same in all colours."""
+        """Whether all pupils are known to be independent of the wavelength."""
         plain = (Annulus, Blades, Slit, Spider)
         return all(isinstance(p, plain) or (isinstance(p, PupilImage) and p.wavefront_um is None) for p in self.pupils)
 
     @cached_property
     def _kept(self) -> dict[Any, Any]:
-        """What was computed before: the last shape, and of every wavelength its transmittance and slope."""
+        """Cache: the last sampled shape, and transmittance and slope per wavelength."""
         return {}
 
     def _shape(self, wavelength_nm: float, n: int) -> NDArray[Any]:
-        """Amplitudes (n, n) at points of the square around the aperture."""
+        """Sample the amplitudes on an (n, n) grid over the square around the aperture."""
         key = "shape", 0.0 if self.is_grey else wavelength_nm, n
         if self._kept.get("shape of", None) != key:
             at: Floats = np.asarray((np.arange(n) + 0.5) * (2.0 / n) - 1.0, np.float64)
@@ -109,33 +119,33 @@ class Aperture:
         name = "pupil" if len(self.pupils) == 1 else f"pupil[{i}]"
         values = np.asarray(pupil(x, y, wavelength_nm))
         if values.dtype.kind not in "biufc":
-            raise ParameterError(name, f"must give real or complex amplitudes, got the type {values.dtype}")
+            raise ParameterError(name, f"must return real or complex amplitudes, got dtype {values.dtype}")
         try:
             values = np.where(disc, values, 0.0)
         except ValueError:
             raise ParameterError(
-                name, f"must give an amplitude for each of the points x and y, got the shape {values.shape}"
+                name, f"must return amplitudes that broadcast with x and y, got shape {values.shape}"
             ) from None
         highest = float(np.abs(values).max())
         if not highest <= 1.0 + 1e-9:
-            raise ParameterError(name, f"must give amplitudes of at most 1 at {wavelength_nm:g} nm", highest)
+            raise ParameterError(name, f"must return amplitudes <= 1 at {wavelength_nm:g} nm", highest)
         return values
 
     def _share_slope_edge(self, wavelength_nm: float) -> tuple[float, float, float]:
-        """Transmitted fraction of the power, slope of the phase in waves per radius, perimeter over that of a circle."""
+        """Return transmittance, phase slope in waves per radius, and relative edge length."""
         key = 0.0 if self.is_grey else wavelength_nm
         if key not in self._kept:
             shape = self._shape(wavelength_nm, FINE)
             at = (np.arange(FINE) + 0.5) * (2.0 / FINE) - 1.0
             share = float(np.sum(np.abs(shape) ** 2) / np.count_nonzero(at**2 + at[:, np.newaxis] ** 2 <= 1.0))
             if share < CLOSED:
-                raise ParameterError("pupil", f"is empty: no light of {wavelength_nm:g} nm passes it")
+                raise ParameterError("pupil", f"must transmit power, got an empty pupil at {wavelength_nm:g} nm")
             slope = 0.0
             for a, b in ((shape[1:], shape[:-1]), (shape[:, 1:], shape[:, :-1])) if np.iscomplexobj(shape) else ():
                 turn = np.abs(np.angle(a * np.conj(b)))[(a != 0.0) & (b != 0.0)]
-                # A jump is diffraction, no slope: that is what all but a few points keep below.
+                # The 99 % quantile excludes phase steps, which diffract but do not displace the PSF.
                 slope += float(np.quantile(turn, 0.99)) / (2.0 * np.pi) * 0.5 * FINE if turn.size else 0.0
-            # Steps along both axes cross a line of any direction 4/π times for its length.
+            # Crofton: the steps along both axes count an edge of random direction 4/π times its length.
             steps = sum(float(np.sum(np.abs(np.diff(shape, axis=axis)) ** 2)) for axis in (0, 1))
             edge = 0.25 * np.pi * steps * (2.0 / FINE) / (share * np.pi)
             self._kept[key] = share, slope, max(0.5 * edge, 1.0)
@@ -144,28 +154,28 @@ class Aperture:
 
     def transmittance(self, wavelength_nm: float) -> float:
         """
-        Power that passes over the power that would pass the clear circle.
+        Return the transmitted power relative to that of the clear circle.
 
         Raises
         ------
         ParameterError
-            When it is none.
+            When no power is transmitted.
         """
         return self._share_slope_edge(wavelength_nm)[0] if self.pupils else 1.0
 
     def edge(self, wavelength_nm: float) -> float:
-        """Length of the shape's edge over its area, over that of a clear circle: at least 1."""
+        """Return the edge length per area of the pupil, relative to a clear circle; at least 1."""
         return self._share_slope_edge(wavelength_nm)[2] if self.pupils else 1.0
 
     def path_um(self, x: Floats, y: Floats, wavelength_nm: float, field_um: tuple[float, float]) -> Floats:
-        """The whole wavefront in µm at points of the aperture."""
+        """Return the total path difference in µm, defocus included, at points of the aperture."""
         total_um = self.defocus_um * (x * x + y * y)
         for part in self.wavefronts:
             total_um = total_um + part.wavefront_um(x, y, wavelength_nm, field_um)
         return np.asarray(total_um)
 
     def blur_lambda_n(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
-        """How far geometry throws the light from the image point, in units of λN: twice the wavefront's slope in waves."""
+        """Return the largest geometric ray displacement in units of λN: twice the slope in waves."""
         slope = self._share_slope_edge(wavelength_nm)[1] if self.pupils else 0.0
         key = wavelength_nm, field_um
         if (self.wavefronts or self.defocus_um) and key not in self._kept:
@@ -178,20 +188,20 @@ class Aperture:
 
     def n_across(self, wavelength_nm: float, field_um: tuple[float, float]) -> int:
         """
-        Samples across the aperture that its transfer function needs.
+        Return the number of samples across the aperture that the OTF requires.
 
         Raises
         ------
         ParameterError
-            When the light is thrown over more than the largest transform holds.
+            When the geometric blur exceeds the limit of the largest transform.
         """
         blur = self.blur_lambda_n(wavelength_nm, field_um)
         if blur * ACROSS_PER_BLUR > MAX_ACROSS:
             raise ParameterError(
                 "aberrations",
-                f"throw light of {wavelength_nm:g} nm {blur:.0f} times λN aside, more than {MAX_ACROSS // ACROSS_PER_BLUR}",
-                hint="see that coefficients are in their unit and focus_distance_m is in m; diffraction plays no "
-                "part in such a blur, and a picture that was blurred beforehand does as well",
+                f"must blur a point by at most {MAX_ACROSS // ACROSS_PER_BLUR} λN, got {blur:.0f} λN at {wavelength_nm:g} nm",
+                hint="check the unit of the coefficients and that focus_distance_m is in m; diffraction is negligible "
+                "in a larger blur, so the picture can be blurred beforehand instead",
             )
         return max(MIN_ACROSS, math.ceil(blur * ACROSS_PER_BLUR))
 
@@ -199,21 +209,21 @@ class Aperture:
         self, wavelength_nm: float, n_across: float, field_um: tuple[float, float]
     ) -> tuple[NDArray[np.complex128], Floats, float]:
         """
-        Amplitudes at points of the aperture.
+        Sample the complex amplitude in the aperture.
 
         Parameters
         ----------
         n_across : float
-            Samples over the diameter, not necessarily an integer.
+            Samples across the diameter, not necessarily an integer.
 
         Returns
         -------
         amplitude : (n, n) complex128
-            Means of the pupil's shape over squares around the points, with the wavefront's phase at the points.
+            Pupil transmission, averaged over the squares around the points, times the phase factor at the points.
         at : (n,) float64
-            The points along either axis, in aperture radii.
+            Sample positions along either axis, in aperture radii.
         power : float
-            Sum of the squares that finer samples would have.
+            Sum of the squared amplitudes in the limit of fine sampling.
         """
         n = math.ceil(n_across)
         pitch = 2.0 / n_across
@@ -238,7 +248,7 @@ class Aperture:
         real: type[np.floating[Any]],
     ) -> NDArray[np.complexfloating[Any]]:
         """
-        Transfer function at lags of whole samples: its autocorrelation, normalised.
+        Compute the OTF at integer lags, as the normalised autocorrelation of the amplitude.
 
         Returns
         -------
@@ -259,19 +269,19 @@ class Aperture:
         whole = np.zeros((2 * n_lags + 1, 2 * n_lags + 1), complex_type)
         lags = np.arange(-k, k + 1)
         whole[n_lags - k : n_lags + k + 1, n_lags - k : n_lags + k + 1] = otf[np.ix_(lags, lags)]
-        whole[n_lags, n_lags] = 1.0  # no light is lost
+        whole[n_lags, n_lags] = 1.0  # conserves energy exactly
         return whole
 
     def pattern_per_um2(
         self, wavelength_nm: float, lambda_n_um: float, x_um: Floats, y_um: Floats, field_um: tuple[float, float]
     ) -> Floats:
-        """Fraction of a point's light in a µm² at the points (y, x) of a rectangle, (n_y, n_x)."""
+        """Sample the PSF, normalised to unit energy, at the points (y, x); (n_y, n_x), 1/µm²."""
         reach = 2.0 * max(np.abs(x_um).max(), np.abs(y_um).max()) / lambda_n_um
         if reach > 0.5 * MAX_ACROSS:
             raise ParameterError(
                 "pitch_um",
-                f"and n_points reach {0.5 * reach * lambda_n_um:.4g} µm from the image point, more than {MAX_ACROSS // 4} λN = "
-                f"{0.25 * MAX_ACROSS * lambda_n_um:.4g} µm, from where on a sampled pupil's pattern would repeat",
+                f"times (n_points - 1) / 2 must be at most {MAX_ACROSS // 4} λN = "
+                f"{0.25 * MAX_ACROSS * lambda_n_um:.4g} µm for a sampled pupil, got {0.5 * reach * lambda_n_um:.4g} µm",
             )
         n_across = max(self.n_across(wavelength_nm, field_um), min(MAX_ACROSS, math.ceil(4.0 * reach)))
         amplitude, at, power = self.samples(wavelength_nm, n_across, field_um)
@@ -280,6 +290,6 @@ class Aperture:
         return np.asarray(np.abs(field) ** 2 / power / (n_across * lambda_n_um) ** 2)
 
     def strehl(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
-        """Height of the pattern's middle over that of the same aperture without any phase."""
+        """Return the PSF at the image point relative to that of the same aperture without phase."""
         amplitude, _, _ = self.samples(wavelength_nm, self.n_across(wavelength_nm, field_um), field_um)
         return float(np.abs(amplitude.sum()) ** 2 / np.abs(amplitude).sum() ** 2)

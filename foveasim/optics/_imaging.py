@@ -1,8 +1,9 @@
 """
-From a scene's basis images to maps of light: one forward transform an image, one inverse transform a map.
+Power maps from the basis images of a scene, by Fourier transforms.
 
-Where aberrations differ over the field, the picture is cut into overlapping patches, each fading linearly into the next, and
-every patch has the pattern of its own middle (overlap-add): in between the pattern is interpolated linearly.
+The cost is one forward transform per basis image and one inverse transform per map. Where aberrations differ over the
+field, the picture is divided into overlapping isoplanatic patches with linear weights, each with the PSF at its own centre
+(overlap-add). This interpolates the PSF linearly between patch centres.
 """
 
 from __future__ import annotations
@@ -25,46 +26,46 @@ from foveasim.optics.otf import Tables
 
 __all__ = ["Imaging", "isoplanatic_error", "patchwork", "reach_cells"]
 
-#: Of a sum's weights, a transform and tables: the factor on a spectrum where one is kept, or None.
+#: Callable of (weights of a sum, transform, tables) that returns the cached factor on a spectrum, or None.
 Kept = Callable[[Floats, Transform, Tables], NDArray[Any] | None]
-#: Patterns of neighbouring patches are compared at so many points along either axis, so far beyond what geometry throws aside.
+#: Comparison of the PSFs of neighbouring patches: points along either axis, and margin in λN beyond the geometric blur.
 COMPARED_POINTS, COMPARED_LAMBDA_N = 257, 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Imaging:
     """
-    What maps are made from.
+    Inputs of the computation of power maps.
 
     Attributes
     ----------
     basis : (n_basis, n_y, n_x)
     light_w_m2 : (n_basis, n_wavelength)
-        Irradiance on the axis that the value 1 of an image makes in each band, W/m².
+        On-axis irradiance in each band for an image value of 1, W/m².
     weights : (n_output, n_wavelength)
     tangent2_x, tangent2_y : (n_x,), (n_y,)
-        Squares of the tangents of the angles to the axis.
+        Squared tangents of the angles to the axis.
     falloff_power : int
-        Of the cosine.
+        Exponent of the cosine.
     grid : Grid
-        Of the images of the source pixels.
+        Images of the source pixels.
     padding : str
     pad : int
-        Cells of padding on each side, at least.
+        Minimum number of padding cells on each side.
     f_max_per_um : float
-        Highest frequency that passes.
+        Highest cut-off frequency.
     blur_cells : float
-        How far geometry throws the light, at most.
+        Largest geometric ray displacement.
     guard : int
-        Cells around a patch of the field that its light reaches.
+        Cells around an isoplanatic patch that its PSF reaches.
     is_square_source : bool
-        Whether source pixels emit uniformly from their squares, instead of from their centres.
+        Whether source pixels are uniform squares instead of points at their centres.
     oversample : int
-        Cells of a map along a side of a source pixel.
+        Map cells along a side of a source pixel.
     real : float32 or float64
     n_threads : int
-    kept : function
-        Where factors of former maps are found.
+    kept : callable
+        Look-up of cached factors.
     """
 
     basis: Images
@@ -86,22 +87,22 @@ class Imaging:
     kept: Kept
 
     def is_needed(self) -> Bools:
-        """Which basis images shine in which output, (n_output, n_basis)."""
+        """Return whether each basis image contributes to each output, (n_output, n_basis)."""
         return np.array(
             [[bool(np.any(output * light_w_m2)) for light_w_m2 in self.light_w_m2] for output in self.weights], bool
         )
 
     def sums(self) -> list[Floats]:
-        """Weights of the wavelengths in all the tables that will be asked for."""
+        """Return the wavelength weights of all required tables."""
         return [self.weights[c] * self.light_w_m2[b] for c, b in np.argwhere(self.is_needed())]
 
     def sources(self) -> tuple[Ints, Ints]:
-        """Rows and columns of the picture that each row and column of the padded one shows, -1 for darkness."""
+        """Return the picture rows and columns of the padded rows and columns; -1 for zero."""
         rows, columns = (source_pixels(n, self.padding, self.pad) for n in self.grid.shape)
         return rows, columns
 
     def transform(self, rows: Ints, columns: Ints, shape: tuple[int, int]) -> Transform:
-        """Transforms of pictures of a size, padded."""
+        """Return the Fourier transforms of padded pictures of one size."""
         return Transform(
             shape=shape,
             rows=rows,
@@ -116,7 +117,7 @@ class Imaging:
         )
 
     def maps(self, table_of: Tables) -> Iterator[NDArray[Any]]:
-        """Maps with the same pattern all over the field, each computed when it is asked for."""
+        """Yield maps with the same PSF over the whole field, computed lazily."""
         transform = self.transform(*self.sources(), self.grid.shape)
 
         def spectrum(b: int) -> NDArray[Any]:
@@ -141,7 +142,7 @@ class Imaging:
                 is_last_use = not is_needed[c + 1 :, b].any()
                 is_first_term = total is None
                 spectrum = transform.refine(spectra[b])
-                # A copy, and the last use of a spectrum, may be overwritten.
+                # A copy may be overwritten, and so may a spectrum at its last use.
                 is_free = is_last_use or spectrum is not spectra[b]
                 if is_last_use:
                     del spectra[b]
@@ -157,7 +158,7 @@ class Imaging:
             yield np.zeros(transform.map_shape, self.real) if total is None else transform.inverse(total)
 
     def patch_maps(self, rows: _Piece, columns: _Piece, table_of: Tables) -> Iterator[NDArray[Any]]:
-        """What a patch gives to every map, over the cells that its light reaches."""
+        """Yield the contribution of a patch to every map, over the cells that its PSF reaches."""
         shape = rows.cells.size, columns.cells.size
         transform = self.transform(np.arange(shape[0]), np.arange(shape[1]), shape)
         x2, y2 = self.tangent2_x[columns.sources], self.tangent2_y[rows.sources]
@@ -176,16 +177,16 @@ class Imaging:
 @dataclass(frozen=True)
 class _Piece:
     """
-    A patch along one axis.
+    Extent of an isoplanatic patch along one axis.
 
     Attributes
     ----------
     sources, fade : (n_lit,)
-        The picture's pixels that it shows, and how it fades into its neighbours.
+        Indices of the picture pixels of the patch, and their linear weights.
     lit : slice
-        Where they lie among its cells.
+        Position of these pixels among the cells.
     cells : (n_cell,)
-        Cells of the picture that its light reaches, in order; below 0 or beyond the picture in the padding.
+        Indices of the picture cells that the patch reaches, in order; negative or beyond the picture in the padding.
     """
 
     sources: Ints
@@ -198,10 +199,10 @@ def patchwork(
     imaging: Imaging, n_patches: tuple[int, int], tables_at: Callable[[tuple[float, float]], Tables]
 ) -> Iterator[NDArray[Any]]:
     """
-    Maps with patterns that differ over the field; all maps are in memory together.
+    Yield maps with a PSF that varies over the field; all maps are in memory together.
 
-    A patch lies on the same endless repetition of the padded picture as the picture does without patches, so that patterns
-    which are alike give the same maps either way, but for light that a point throws beyond the patch's guard.
+    Patches use the same periodic continuation of the padded picture as the computation without patches. With equal PSFs
+    both give the same maps, except for energy that falls beyond the guard of a patch.
     """
     k = imaging.oversample
     n_y, n_x = imaging.grid.shape
@@ -223,7 +224,11 @@ def patchwork(
 def isoplanatic_error(
     aperture: Aperture, grid: Grid, n_patches: tuple[int, int], wavelength_nm: float, lambda_n_um: float
 ) -> float:
-    """Largest fraction of a point's light astray halfway between patches, or of one patch at the corners of the picture."""
+    """
+    Return the largest fraction of PSF energy displaced by the isoplanatic patches.
+
+    The fraction is evaluated midway between patch centres, or at the corners of the picture for a single patch.
+    """
     node_y_um, node_x_um = _nodes_um(grid, n_patches)
     if n_patches == (1, 1):
         half_y_um, half_x_um = (0.5 * n * grid.pitch_x_um for n in grid.shape)
@@ -247,7 +252,7 @@ def isoplanatic_error(
 
 
 def _nodes_um(grid: Grid, n_patches: tuple[int, int]) -> tuple[Floats, Floats]:
-    """Middles of the patches along y and x: from border to border, or on the axis when there is one."""
+    """Return patch centres along y and x: edge to edge, or on the axis for a single patch."""
     y, x = (
         np.linspace(-0.5, 0.5, n) * size * grid.pitch_x_um if n > 1 else np.zeros(1)
         for n, size in zip(n_patches, grid.shape, strict=True)
@@ -256,7 +261,7 @@ def _nodes_um(grid: Grid, n_patches: tuple[int, int]) -> tuple[Floats, Floats]:
 
 
 def _pieces(imaging: Imaging, sources: Ints, n: int, node_um: Floats) -> list[_Piece]:
-    """Along one axis, the patch of each node."""
+    """Return the patch of each node along one axis."""
     first = -((sources.size - n) // 2)
     half_um = 0.5 * n * imaging.grid.pitch_x_um
     at_um = np.clip((first + np.arange(sources.size) + 0.5) * imaging.grid.pitch_x_um - half_um, -half_um, half_um)
@@ -269,7 +274,7 @@ def _pieces(imaging: Imaging, sources: Ints, n: int, node_um: Floats) -> list[_P
         low, high = (int(used[0]), int(used[-1]) + 1) if used.size else (0, 1)
         fade = np.where(sources >= 0, fade, 0.0)[low:high]
         size = int(scipy.fft.next_fast_len(high - low + 2 * imaging.guard, real=True))
-        if size >= sources.size:  # the whole padded picture, which repeats
+        if size >= sources.size:  # the complete padded picture, which is periodic
             size, begin = sources.size, 0
         else:
             begin = low - (size - (high - low)) // 2
@@ -279,6 +284,6 @@ def _pieces(imaging: Imaging, sources: Ints, n: int, node_um: Floats) -> list[_P
 
 
 def reach_cells(share: float, lambda_n_um: float, blur_lambda_n: float, edge: float, pitch_um: float) -> int:
-    """Cells from a point's image that hold all but a fraction of its light: what diffraction throws aside, and geometry."""
-    # Of a clear circle 2 / (π² r) of the light lies beyond the radius r in λN; of others more, as they have more edge.
+    """Return the radius in cells that contains all but a fraction of the PSF energy."""
+    # Beyond r λN lies 2 / (π² r) of the Airy energy; other pupils scale with their edge length. Geometric blur adds up.
     return math.ceil((2.0 / math.pi**2 / share * edge + blur_lambda_n) * lambda_n_um / pitch_um)

@@ -1,8 +1,8 @@
 """
-The optics' numba kernels: falloff and padding in one writing, the transfer function in one pass over a spectrum.
+Numba kernels of the optics: relative illumination, padding, transfer functions.
 
-They know arrays only, release the interpreter lock, and are compiled for explicit types when this module is
-imported; the machine code is cached on disk.
+The kernels operate on plain arrays and release the global interpreter lock. They are compiled for explicit types when this
+module is imported; the machine code is cached on disk.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ _floats = types.Array(types.float64, 1, "C", readonly=True)
 )
 def expose(rows, x2, y2, power, source_column, before, out):
     """
-    Write some rows of a picture times ``cos(theta) ** power``, padded on both sides.
+    Write rows of a picture times ``cos(theta) ** power``, padded on both sides.
 
-    ``x2`` and ``y2`` are (x0/H)² and (y0/H)² of the picture's columns and of the rows, so that ``cos² = 1 / (1 + x2 + y2)``.
-    ``source_column`` names the picture's column of each column of ``out``, -1 for darkness; the picture's own
-    column 0 comes to lie at column ``before``.
+    ``x2`` and ``y2`` are (x0/H)² of the picture columns and (y0/H)² of the rows, so that ``cos² = 1 / (1 + x2 + y2)``.
+    ``source_column`` contains the picture column of each column of ``out``, -1 for zero. Picture column 0 is written to
+    column ``before``.
     """
     n_x = rows.shape[1]
     one = x2.dtype.type(1.0)
@@ -78,10 +78,10 @@ def expose(rows, x2, y2, power, source_column, before, out):
 )
 def replicate(spectrum, n_columns, phase_x, phase_y, first_row, last_row, out):
     """
-    Write some rows of a spectrum repeated over a larger range of frequencies, times ``phase_y[row] * phase_x[column]``.
+    Write rows of a periodically repeated spectrum, times a phase factor.
 
-    ``spectrum`` is that of ``n_columns`` real samples along x: its columns run from zero frequency to at most half a cycle per
-    sample, and the others are the conjugates of the rows mirrored.
+    The factor is ``phase_y[row] * phase_x[column]``. ``spectrum`` is the transform of ``n_columns`` real samples along x: its
+    columns range from zero frequency to at most half a cycle per sample; the other half is its complex conjugate, mirrored.
     """
     n_rows = spectrum.shape[0]
     half = n_columns // 2
@@ -116,12 +116,12 @@ def replicate(spectrum, n_columns, phase_x, phase_y, first_row, last_row, out):
 )
 def transfer(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is_added, first_row, last_row, out):
     """
-    ``out = spectrum * H`` or ``out += spectrum * H`` over some rows of frequencies.
+    Compute ``out = spectrum * H`` or ``out += spectrum * H`` over a range of rows.
 
-    ``H`` is a sum over the aliases ``k`` of each frequency: ``table(|f + k|) * gain_x[k] * gain_y[k]``, and over the
-    products ``far_x[r] * far_y[r]``, which stand for many aliases together. The table holds a radial function at equal
-    steps, 0 beyond its end; ``per_step`` is steps over frequency. ``fx``, ``gain_x`` are (n_alias, n_x), ``far_x``
-    (n_rank, n_x), and the same for y. ``out`` may be ``spectrum``.
+    ``H`` is the sum of ``table(|f + k|) * gain_x[k] * gain_y[k]`` over the aliases ``k`` of each frequency, plus the sum of
+    the products ``far_x[r] * far_y[r]``, a low-rank approximation of the remaining aliases. The table samples a radial
+    function at equal steps, 0 beyond its end; ``per_step`` is the number of steps per unit of frequency. ``fx`` and
+    ``gain_x`` are (n_alias, n_x), ``far_x`` is (n_rank, n_x), and likewise for y. ``out`` may be ``spectrum``.
     """
     n_alias, n_x = fx.shape
     last = table.size - 1
@@ -171,7 +171,11 @@ def transfer(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is
     ],
 )
 def multiply(spectrum, factor, is_added, first_row, last_row, out):
-    """``out = spectrum * factor`` or ``out += spectrum * factor`` over some rows, as :func:`transfer` does with its own."""
+    """
+    Compute ``out = spectrum * factor`` or ``out += spectrum * factor`` for some rows.
+
+    The order of operations is that of :func:`transfer`, so that results are bit-identical.
+    """
     for row in range(first_row, last_row):
         if is_added:
             for ix in range(spectrum.shape[1]):
@@ -184,9 +188,9 @@ def multiply(spectrum, factor, is_added, first_row, last_row, out):
 @njit(inline="always")
 def _in_plane(table, u, v):
     """
-    Value between the points of a plane of frequencies, linear in both; 0 beyond its border.
+    Interpolate a table over (f_y, f_x) bilinearly; 0 outside.
 
-    ``u`` and ``v`` are in steps of the table, whose middle point is zero frequency.
+    ``u`` and ``v`` are in steps of the table, whose centre is zero frequency.
     """
     half = table.shape[0] // 2
     u += half
@@ -224,7 +228,7 @@ def _in_plane(table, u, v):
     ],
 )
 def transfer_plane(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is_added, first_row, last_row, out):
-    """As :func:`transfer`, for a transfer function of any form: a square of complex numbers over f_y and f_x."""
+    """Compute :func:`transfer` for a square complex table over (f_y, f_x)."""
     n_alias, n_x = fx.shape
     half = table.shape[0] // 2
     h = np.empty(n_x, table.dtype)
@@ -251,9 +255,9 @@ def transfer_plane(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far
 @njit(inline="always")
 def _alias_gain(cycles, k, source_cells, is_alternating):
     """
-    Factors ``sinc(f) * sinc(source_cells * f)`` of the aliases ``f = cycles + k``, (n_alias, n).
+    Return ``sinc(f) * sinc(source_cells * f)`` for ``f = cycles + k``, (n_alias, n).
 
-    ``source_cells`` is the side of the source pixels in cells, 0 for points. With ``is_alternating`` odd aliases are negative.
+    ``source_cells`` is the side of the source pixels in cells, 0 for points. ``is_alternating`` negates odd aliases.
     """
     gain = np.empty((k.size, cycles.size))
     for a in range(k.size):
@@ -275,7 +279,7 @@ def _alias_gain(cycles, k, source_cells, is_alternating):
     ),
 )
 def alias_sum_plane(table, per_step, cycles, n_alias, source_cells, is_alternating):
-    """As :func:`alias_sum`, for a transfer function of any form: a square of complex numbers over f_y and f_x."""
+    """Compute :func:`alias_sum` for a square complex table over (f_y, f_x)."""
     n = cycles.size
     k = np.arange(-n_alias, n_alias + 1)
     gain = _alias_gain(cycles, k, source_cells, is_alternating)
@@ -303,10 +307,10 @@ def alias_sum_plane(table, per_step, cycles, n_alias, source_cells, is_alternati
 )
 def alias_sum(table, per_step, cycles, n_alias, source_cells, is_alternating):
     """
-    Sum of ``table(|f + k|) * gain(f_x + k_x) * gain(f_y + k_y)`` over all aliases but ``k = 0``.
+    Sum a radial table over all aliases except ``k = 0``.
 
-    The factors are those of :func:`_alias_gain`. At the frequencies ``cycles`` x ``cycles``, in cycles per cell; ``per_step``
-    is steps of the table over them.
+    The terms are ``table(|f + k|) * gain(f_x + k_x) * gain(f_y + k_y)`` with the factors of :func:`_alias_gain`, evaluated at
+    the frequencies ``cycles`` x ``cycles`` in cycles per cell; ``per_step`` is the number of table steps per cycle per cell.
     """
     n = cycles.size
     last = table.size - 1

@@ -1,4 +1,4 @@
-"""The lens: from the light of a scene to the light on the sensor plane."""
+"""Lens model: from scene radiance to irradiance on the sensor plane."""
 
 from __future__ import annotations
 
@@ -37,33 +37,33 @@ if TYPE_CHECKING:
 
 __all__ = ["Optics"]
 
-#: Default padding: the radius that holds all but this fraction of a point's light.
+#: Fraction of the PSF energy outside the default padding radius.
 LOST_SHARE = 0.01
-#: Fraction of a point's light that a patch of the field may throw to a wrong place.
+#: Fraction of the PSF energy that an isoplanatic patch may displace.
 PATCH_LOST_SHARE = 0.002
-#: The paper's Eq. 5 asks for an aperture radius much larger than H λ / (p0 min(M, N)): this many times.
+#: Factor by which the aperture radius should exceed H λ / (p0 min(M, N)); the paper's Eq. 5 requires "much larger".
 MUCH_LARGER = 10.0
-#: Finer cells than this along a source pixel are a mistake.
+#: Largest number of cells along a source pixel.
 MAX_OVERSAMPLE = 16
-#: Cells per λN from which on a photosite of side λN collects the light of a point to within 1e-3 of it, wherever its edges are,
-#: at second order: the largest error found over 600 positions is 1.3e-3 at 5 and 6e-4 at 6 (gallery/03_edges_and_cells.py).
+#: Cells per λN for which the energy of a point in a photosite of side λN is within 1e-3 at second order, for any position of
+#: its edges: the largest error over 600 positions is 1.3e-3 at 5 cells and 6e-4 at 6 (gallery/03_edges_and_cells.py).
 FINE_CELLS_PER_LAMBDA_N = 5.5
-#: A larger map does not fit into memory: 16 GiB in single precision.
+#: Memory limit of a map: 16 GiB in single precision.
 MAX_CELLS = 1 << 32
-#: Cells of a map that oversampling chosen automatically stays below: 512 MiB in single precision.
+#: Memory limit of a map with automatic oversampling: 512 MiB in single precision.
 MAX_AUTO_CELLS = 1 << 27
 PADDINGS = ("reflect", "edge", "zero", "periodic")
 
 
 def _is_pupil(pupil: object) -> bool:
-    """Whether something can be called with x, y and a wavelength."""
+    """Return whether an object is callable with x, y and a wavelength."""
     if not callable(pupil) or isinstance(pupil, type):
         return False
     try:
         inspect.signature(pupil).bind(0.0, 0.0, 0.0)
     except TypeError:
         return False
-    except ValueError:  # a builtin that does not tell
+    except ValueError:  # builtin without a signature
         return True
     return True
 
@@ -71,51 +71,52 @@ def _is_pupil(pupil: object) -> bool:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Optics(PointImages):
     """
-    A thin lens: diffraction at its pupil, aberrations, defocus, falloff.
+    Thin lens with diffraction, aberrations, defocus and relative illumination.
 
     Parameters
     ----------
     focal_length_mm : float, mm
     f_number : float
-        As engraved on the lens: focal length over the diameter of the circle around the pupil.
+        Nominal f-number: focal length over the diameter of the circle around the pupil.
     emission : {"lambertian", "isotropic"}
-        ``"lambertian"``: the scene has a radiance L that is the same in all directions; irradiance falls as cos⁴ from its
-        value on the axis (see ``lens``). ``"isotropic"``: Eq. 3 of the paper, points that radiate L (W/m²) evenly into a
-        hemisphere; irradiance falls as cos³ and is ``L / (8 N²)`` on the axis.
+        ``"lambertian"``: the scene radiance L is the same in all directions; irradiance falls off as cos⁴ from its on-axis
+        value (see ``lens``). ``"isotropic"``: Eq. 3 of the paper, points that radiate L (W/m²) uniformly into a hemisphere;
+        irradiance falls off as cos³ and is ``L / (8 N²)`` on the axis.
     lens : {"thin", "aplanatic"}
-        Irradiance on the axis of a Lambertian scene of radiance L, with the image-side f-number N: ``π L / (1 + 4 N²)`` of
-        the thin lens of the paper and ISETCam, or ``π L / (4 N²)`` of an aplanatic lens, which satisfies Abbe's sine
-        condition, as corrected photographic lenses do. The second is higher by 1.6 % at f/4, 3.2 % at f/2.8, 13 % at f/1.4.
+        On-axis irradiance for a Lambertian scene of radiance L and the image-side f-number N: ``π L / (1 + 4 N²)`` for the
+        thin lens of the paper and ISETCam, or ``π L / (4 N²)`` for an aplanatic lens, which satisfies Abbe's sine condition,
+        as corrected photographic lenses do. The second is higher by 1.6 % at f/4, 3.2 % at f/2.8, 13 % at f/1.4.
     transmission : float
-        Fraction of the light that the glass lets through.
+        Power transmittance of the glass.
     pupil : Annulus, Spider, Blades, Slit, PupilImage, callable, or a sequence of them, optional
-        Its shape within the circle; several are multiplied. A callable ``T(x, y, wavelength_nm)`` gives real or complex
-        amplitudes of at most 1 at points in units of the circle's radius. By default a clear circle.
+        Pupil function within the circle; several are multiplied. A callable ``T(x, y, wavelength_nm)`` returns real or complex
+        amplitudes of modulus at most 1 at points in units of the circle's radius. By default a clear circle.
     zernike : Zernike, optional
-        Aberrations that are the same all over the field; any of them may depend on the colour.
+        Aberrations that are constant over the field; each may depend on the wavelength.
     seidel : Seidel, optional
-        Aberrations that grow with the distance from the axis.
+        Aberrations that depend on the distance from the axis.
     focus_distance_m : float, optional, m
-        Distance at which the lens is focused, infinity allowed; by default that of the scene. Others are blurred by defocus.
+        Distance at which the lens is focused, infinity allowed; by default the distance of the scene. Scenes at other
+        distances are defocused.
     lateral_colour : LateralColour, optional
-        Image sizes of different colours. A smaller image leaves the border of a power map dark.
+        Image size per wavelength. Outside a smaller image the power map is 0.
     field_patches : int
-        Where aberrations differ over the field: so many patterns along each side of the picture, linear in between. What a
-        point throws further than its patch reaches, 0.2 % of its light, may come to a wrong place.
+        Isoplanatic patches along each side of the picture, where aberrations vary over the field; the PSF is interpolated
+        linearly between them. Energy beyond the reach of a patch, 0.2 % of the PSF, may be displaced.
     source_pixel : {"point", "square"}
-        Whether a picture's pixel shines from its centre (the paper) or evenly from its square.
+        Whether a scene pixel emits from its centre (the paper) or uniformly from its square.
     oversample : int or "auto"
-        Cells of a map along a side of a source pixel, k: maps have k x k times the cells, each with its exact mean. ``"auto"``
-        is 1, but in a :class:`foveasim.Camera`, which chooses k by :meth:`auto_oversample` for each scene. Finer cells resolve
-        the irradiance under photosites whose edges cut cells. They also resolve the lattice of the emitters where source
-        pixels emit from their centres and are wider than λN; take ``source_pixel="square"`` there.
+        Map cells along a side of a source pixel, k: maps have k x k times as many cells, each with its exact mean. ``"auto"``
+        is 1, except in a :class:`foveasim.Camera`, which chooses k for each scene by :meth:`auto_oversample`. Finer cells
+        resolve the irradiance under photosites whose edges cut cells. They also resolve the lattice of point emitters if
+        source pixels are wider than λN; use ``source_pixel="square"`` in this case.
     padding : {"reflect", "edge", "zero", "periodic"}
-        What lies beyond the picture. ``"periodic"`` adds nothing: light that leaves on one side enters on the other,
-        so that none is lost.
+        Continuation of the picture beyond its boundary. ``"periodic"`` adds no cells: power that leaves on one side enters on
+        the opposite side, so that power is conserved.
     padding_cells : int, optional
-        Width of the padding; by default about the radius that holds 99 % of a point's light.
+        Width of the padding; by default approximately the radius of 99 % encircled energy.
     precision : {"single", "double"}
-        Of the Fourier transforms and the maps.
+        Precision of the Fourier transforms and the maps.
 
     Raises
     ------
@@ -124,26 +125,27 @@ class Optics(PointImages):
 
     Notes
     -----
-    Each cell of a map is the *mean* irradiance over the cell: the point spread function is integrated over the cell
-    exactly, whatever its size (for cells wider than λN/2 the aliases of every frequency are summed).
+    Each cell of a map contains the *mean* irradiance over the cell: the point spread function is integrated exactly over
+    cells of any size (for cells wider than λN/2 the aliases of each frequency are summed).
 
-    The Gauss conditions (pupil much smaller than the distances, small angles) make the point spread function the same
-    all over the field, so a map is ``IFFT(FFT(scene * falloff) * OTF)``.
+    Under the Gauss conditions (pupil much smaller than the distances, small angles) the point spread function is
+    shift-invariant, so that a map is ``IFFT(FFT(scene * falloff) * OTF)``.
 
     The irradiance on the axis is ``π L sin²α``, α the half-angle of the image-side cone (Born and Wolf, Principles of Optics,
     section on the photometry of images). A flat pupil of radius a at the distance D has ``tan α = a / D = 1 / 2N``, which gives
-    ``π L / (1 + 4 N²)``: the thin lens. An aplanatic lens has its principal surface on a sphere around the image, so that
+    ``π L / (1 + 4 N²)``: the thin lens. The principal surface of an aplanatic lens is a sphere around the image, so that
     ``sin α = 1 / 2N`` (Abbe's sine condition), which gives ``π L / 4 N²`` at every aperture. The same follows from the flux
-    that passes the entrance pupil, ``π L a² / D²``, spread over the geometric image; Eq. 3 of the paper counts that flux, so
+    through the entrance pupil, ``π L a² / D²``, spread over the geometric image. Eq. 3 of the paper specifies that flux, so
     the isotropic ``L / (8 N²)`` is consistent with the aplanatic lens. The two agree in the limit of large N.
 
-    The clear circle in focus has the closed-form OTF. Any other pupil's is the autocorrelation of the sampled pupil, complex
-    where it is not symmetric, sampled finely enough for the light that aberrations throw aside, and within 7e-4 of the closed
-    form for a circle. In either case OTF(0) = 1: the light is what the pupil lets through, exactly. A scene out of focus has
+    The clear circle in focus has a closed-form OTF. The OTF of any other pupil is the autocorrelation of the sampled pupil; it
+    is complex for an asymmetric pupil. The sampling increases with the geometric blur of the aberrations, and is within 7e-4
+    of the closed form for a circle. In both cases OTF(0) = 1, so that the transmitted power is exact. A defocused scene has
     the path difference ``(a²/2) (1/H - 1/H_focus)`` at the edge of a pupil of radius a: Goodman, Introduction to Fourier
     Optics, section on focusing errors.
 
-    The pupil, like the picture, is seen upright: light goes to where a wavefront in the sensor's coordinates grows.
+    The pupil, like the picture, is upright in sensor coordinates: the PSF moves in the direction in which the wavefront
+    increases.
     """
 
     focal_length_mm: float
@@ -172,7 +174,7 @@ class Optics(PointImages):
                 above=0.0,
                 at_least=0.01,
                 at_most=1e6,
-                hint="focal lengths are in mm",
+                hint="check the unit: focal lengths are in mm",
             ),
             "f_number": check_number(
                 "f_number",
@@ -180,7 +182,7 @@ class Optics(PointImages):
                 above=0.0,
                 at_least=0.5,
                 at_most=1e4,
-                hint="no lens in air is faster than f/0.5",
+                hint="f/0.5 is the limit for a lens in air",
             ),
             "transmission": check_number("transmission", self.transmission, above=0.0, at_most=1.0),
         }
@@ -211,8 +213,8 @@ class Optics(PointImages):
         if self._is_varying() and self.padding == "periodic":
             raise ParameterError(
                 "padding",
-                "must not be 'periodic' where aberrations differ over the field",
-                hint="a periodic picture has no field",
+                "must not be 'periodic' with aberrations that vary over the field",
+                hint="choose 'reflect', 'edge' or 'zero': the field position in a periodic picture is undefined",
             )
 
     # -- geometry -------------------------------------------------------------------------------------------------
@@ -229,35 +231,47 @@ class Optics(PointImages):
         return distance_m
 
     def _image_distance_mm(self, distance_m: float) -> float:
-        """Distance of the sensor from the pupil, ``1/f = 1/H + 1/D``, for a scene that sets the focus unless that is set."""
+        """
+        Return the sensor distance D from the pupil, ``1/f = 1/H + 1/D``.
+
+        H is the focus distance, or the distance of the scene if the focus distance is not set.
+        """
         focus_m = distance_m if self.focus_distance_m is None else self.focus_distance_m
         return self.focal_length_mm / (1.0 - float(m_from_mm(self.focal_length_mm)) / focus_m)
 
     def magnification(self, distance_m: float) -> float:
         """
-        Size of the image over the size of the scene, ``D / H`` with ``1/f = 1/H + 1/D``, H the distance in focus for D.
+        Return the image size over the scene size, ``D / H``.
+
+        D is the sensor distance, ``1/f = 1/H_focus + 1/D``, and H is ``distance_m``.
 
         Raises
         ------
         ParameterError
-            When the scene is not further away than the focal length.
+            When the scene is not farther away than the focal length.
         """
         distance_m = self._check_distance("distance_m", distance_m)
         return float(m_from_mm(self._image_distance_mm(distance_m))) / distance_m
 
     def working_f_number(self, distance_m: float) -> float:
-        """Image-side f-number ``D / 2a``: when focused at the scene, the engraved one times (1 + magnification)."""
+        """
+        Return the image-side f-number ``D / 2a``.
+
+        For a scene in focus, it is the nominal f-number times (1 + magnification).
+        """
         distance_m = self._check_distance("distance_m", distance_m)
         return self.f_number * self._image_distance_mm(distance_m) / self.focal_length_mm
 
     def defocus_um(self, distance_m: float) -> float:
         """
-        Path difference at the pupil's edge for a scene out of focus, µm; positive for a scene nearer than the focus.
+        Return the defocus path difference at the pupil edge in µm.
+
+        It is positive for a scene nearer than the focus distance.
 
         Raises
         ------
         ParameterError
-            When the scene is not further away than the focal length.
+            When the scene is not farther away than the focal length.
         """
         return self._defocus_um(self._check_distance("distance_m", distance_m))
 
@@ -268,7 +282,7 @@ class Optics(PointImages):
         return float(um_from_m(0.5 * radius_m**2 * (1.0 / distance_m - 1.0 / self.focus_distance_m)))
 
     def grid(self, scene: SceneLike) -> Grid:
-        """The sensor-plane grid on which a scene's pixels are imaged, upright and centred on the axis."""
+        """Return the sensor-plane grid of the scene pixels, upright and centred on the axis."""
         if not hasattr(scene, "spectrum_w_m2_sr_nm"):
             raise ParameterError("scene", f"must be a Scene, got a {type(scene).__name__}")
         shape = scene.basis.shape
@@ -276,10 +290,10 @@ class Optics(PointImages):
 
     def image_grids(self, scene: SceneLike) -> list[tuple[Grid, Bools]]:
         """
-        Grids of the cells of maps, each with the wavelengths that it is of, (n_wavelength,) bool.
+        Return the map grids, each with a mask of its wavelengths, (n_wavelength,) bool.
 
-        One, ``oversample`` times finer than :meth:`grid`, unless lateral colour makes images of different sizes: the pixels of
-        a larger image are larger, and no picture is resampled.
+        There is one grid, ``oversample`` times finer than :meth:`grid`, unless lateral chromatic aberration gives images of
+        different sizes. The cells scale with the image size, so that no picture is resampled.
         """
         grid = self.grid(scene)
         if self.lateral_colour is None:
@@ -292,16 +306,20 @@ class Optics(PointImages):
 
     @property
     def _n_fine(self) -> int:
-        """Cells along a side of a source pixel."""
+        """Map cells along a side of a source pixel."""
         return 1 if self.oversample == "auto" else self.oversample
 
     def _refined(self, grid: Grid) -> Grid:
-        """The cells of a map on a grid of source pixels."""
+        """Return the grid of map cells for a grid of source pixels."""
         n_y, n_x = grid.shape
         return Grid((self._n_fine * n_y, self._n_fine * n_x), grid.pitch_x_um / self._n_fine, grid.origin_um)
 
     def resolved(self, scene: SceneLike) -> Optics:
-        """Return the lens with ``oversample`` as a number, chosen for a scene where it is "auto"; both share their tables."""
+        """
+        Return a lens with a numerical ``oversample``, chosen for a scene if it is "auto".
+
+        Both lenses share the cache of OTF tables.
+        """
         if self.oversample != "auto":
             return self
         lens = replace(self, oversample=self.auto_oversample(scene))
@@ -310,7 +328,7 @@ class Optics(PointImages):
 
     def auto_oversample(self, scene: SceneLike) -> int:
         """
-        Choose how many times finer than source pixels the cells of a map should be.
+        Choose the number of map cells along a side of a source pixel.
 
         Parameters
         ----------
@@ -319,9 +337,9 @@ class Optics(PointImages):
         Returns
         -------
         k : int
-            The smallest with at least 5.5 cells per λN at the shortest wavelength, so that the fraction of a point's energy
-            that a photosite of side λN collects is within 1e-3 at second order. Less where the map would have more than 2^27
-            cells, and 1 where source pixels are wider than λN: finer cells would resolve their emitters one by one.
+            The smallest number with at least 5.5 cells per λN at the shortest wavelength, so that the fraction of a point's
+            energy that a photosite of side λN collects is accurate to 1e-3 at second order. It is smaller if the map would
+            exceed 2^27 cells, and 1 if source pixels are wider than λN, where finer cells would resolve single emitters.
         """
         per_lambda_n = float(self._lambda_n_um(scene).min()) / self.grid(scene).pitch_x_um
         if per_lambda_n < 1.0:
@@ -331,19 +349,19 @@ class Optics(PointImages):
         return max(1, min(wanted, affordable))
 
     def irradiance_per_radiance(self, distance_m: float) -> float:
-        """Irradiance on the axis over the scene's radiance (sr), transmission included."""
+        """Return on-axis irradiance over scene radiance (sr), including the transmission."""
         n = self.working_f_number(distance_m)
         sin2 = 0.25 / (n * n) if self.lens == "aplanatic" or self.emission == "isotropic" else 1.0 / (1.0 + 4.0 * n * n)
         return (math.pi if self.emission == "lambertian" else 0.5) * sin2 * self.transmission
 
     def check(self, scene: SceneLike) -> None:
         """
-        Raise what would end a map of a scene, before it begins.
+        Validate the lens for a scene without computing a map.
 
         Raises
         ------
         ParameterError
-            When the scene is no scene or too near, the pupil is empty, or aberrations throw light too far.
+            When the scene is not a Scene or is too near, the pupil is empty, or the aberrations exceed the largest blur.
         """
         grid, aperture = self.grid(scene), self._aperture(scene.distance_m)
         if not self._is_clear_circle(aperture):
@@ -352,11 +370,11 @@ class Optics(PointImages):
                 for place_um in self._places_um(grid):
                     aperture.n_across(float(wave_nm), place_um)
 
-    # -- light ----------------------------------------------------------------------------------------------------
+    # -- irradiance -----------------------------------------------------------------------------------------------
 
     def power_map(self, scene: SceneLike, *, n_threads: int | None = None) -> PowerMap:
         """
-        Irradiance on the sensor plane, one map for each wavelength.
+        Compute the irradiance on the sensor plane for each wavelength.
 
         Parameters
         ----------
@@ -367,13 +385,13 @@ class Optics(PointImages):
         Returns
         -------
         PowerMap
-            (n_wavelength, k n_y, k n_x) with k = ``oversample``, float32 or float64 as ``precision`` says, W/m² within each
-            wavelength's band.
+            (n_wavelength, k n_y, k n_x) with k = ``oversample``, float32 or float64 according to ``precision``, W/m² per
+            wavelength band.
 
         Raises
         ------
         ParameterError, SimulationError
-            When the scene is too near, or not finite.
+            When the scene is too near or not finite.
         """
         grid = self._refined(self.grid(scene))
         n_bands = scene.wavelength_nm.size
@@ -386,7 +404,7 @@ class Optics(PointImages):
         self, scene: SceneLike, weights: Floats, *, grid: Grid | None = None, n_threads: int | None = None
     ) -> Iterator[NDArray[Any]]:
         """
-        Weighted sums of the power maps of all wavelengths, one after the other.
+        Yield weighted sums of the power maps over wavelength.
 
         Parameters
         ----------
@@ -394,31 +412,31 @@ class Optics(PointImages):
         weights : (n_output, n_wavelength) float64
             Output c is ``sum_k weights[c, k] * power_map[k]``.
         grid : Grid, optional
-            One of :meth:`image_grids`, whose wavelengths alone have weights. By default the one without lateral colour: images
-            of other sizes are put on it by the areas that their cells share with its own.
+            One of :meth:`image_grids`; only its wavelengths may have nonzero weights. By default the grid without lateral
+            chromatic aberration, to which images of other sizes are resampled by the areas of overlap of the cells.
         n_threads : int, optional
             All cores by default.
 
         Returns
         -------
         maps : iterator of (k n_y, k n_x) float32 or float64
-            Each is computed when it is asked for.
+            Computed lazily.
 
         Notes
         -----
-        Since a sum over wavelengths can be taken before the inverse transform, and the scene is a sum of B basis
-        images, the cost is B forward transforms and one inverse transform an output, for any number of wavelengths.
-        Lateral colour costs that for each size of image, and aberrations that differ over the field for each patch.
+        The sum over wavelengths is taken before the inverse transform, and the scene is a sum of B basis images. The cost is
+        therefore B forward transforms, and one inverse transform per output, for any number of wavelengths. This cost applies
+        to each image size with lateral chromatic aberration, and to each isoplanatic patch with field-dependent aberrations.
         """
         common = self._refined(self.grid(scene))
         weights = finite_array("weights", weights, ndim=2)
         if weights.shape[1] != scene.wavelength_nm.size:
             raise ParameterError(
                 "weights",
-                f"must have the shape (n_output, {scene.wavelength_nm.size}), one for each wavelength, got {weights.shape}",
+                f"must have shape (n_output, {scene.wavelength_nm.size}), one column per wavelength, got {weights.shape}",
             )
         if grid is not None and not grid.is_square:
-            raise ParameterError("grid", "must have square cells, as a scene's pixels are", grid.pitch_um, "µm")
+            raise ParameterError("grid", "must have square cells, like the scene pixels", grid.pitch_um, "µm")
         self._warn_if_too_small(self._lambda_n_um(scene), common)
         if math.prod(common.shape) > MAX_CELLS:
             raise ParameterError(
@@ -454,7 +472,7 @@ class Optics(PointImages):
             scene.spectrum_w_m2_sr_nm * scene.band_width_nm * share * self.irradiance_per_radiance(scene.distance_m)
         )
         tangent2_x, tangent2_y = self._squared_tangents(scene)
-        # What a factor on a spectrum hangs on, beside the lens and the weights.
+        # Cache key: a factor depends on these, the lens and the weights.
         light = scene.wavelength_nm.tobytes(), scene.distance_m, grid.shape, grid.pitch_x_um, self._n_fine
 
         def kept(weight: Floats, transform: Transform, table_of: Tables) -> NDArray[Any] | None:
@@ -497,11 +515,12 @@ class Optics(PointImages):
 
     def isoplanatic_error(self, scene: SceneLike) -> float:
         """
-        Largest fraction of a point's light that the patchwork puts in a wrong place.
+        Return the largest fraction of PSF energy displaced by the isoplanatic patches.
 
-        Half the integral of the difference between the pattern halfway between patches and the mean of theirs: the pattern of
-        a point is exact in the middle of a patch, and for patterns that change smoothly no point errs by more. It falls with
-        the square of ``field_patches``. Of a single patch: the same between the corners of the picture and its middle.
+        This is half the integral of the absolute difference between the PSF midway between patch centres and the mean of the
+        PSFs there. The PSF is exact at patch centres, and for a smooth field dependence this is the largest error. It
+        decreases with the square of ``field_patches``. For a single patch, the corners of the picture are compared with its
+        centre.
 
         Parameters
         ----------
@@ -510,7 +529,7 @@ class Optics(PointImages):
         Returns
         -------
         share : float
-            The largest over the wavelengths and the neighbouring patches; 0 where the pattern is the same everywhere.
+            Maximum over wavelengths and neighbouring patches; 0 for a constant PSF.
         """
         from foveasim.optics._imaging import isoplanatic_error
 
@@ -565,13 +584,13 @@ class Optics(PointImages):
         return np.asarray(um_from_nm(scene.wavelength_nm) * self.working_f_number(scene.distance_m))
 
     def _places_um(self, grid: Grid) -> list[tuple[float, float]]:
-        """Points of the field where aberrations are strongest."""
+        """Return the field points with the strongest aberrations."""
         half_x_um, half_y_um = (0.5 * n * grid.pitch_x_um for n in grid.shape[::-1])
         corners = [(sx * half_x_um, sy * half_y_um) for sx in (-1, 1) for sy in (-1, 1)]
         return [(0.0, 0.0), *(corners if self._is_varying() else ())]
 
     def _blur_um(self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats) -> float:
-        """How far geometry throws the light on the sensor, at most."""
+        """Return the largest geometric ray displacement on the sensor."""
         return max(
             aperture.blur_lambda_n(float(wave_nm), place_um) * float(near_um)
             for wave_nm, near_um in zip(scene.wavelength_nm, lambda_n_um, strict=True)
@@ -579,7 +598,7 @@ class Optics(PointImages):
         )
 
     def _reach(self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats, share: float) -> int:
-        """Cells from a point's image that hold all but a fraction of its light."""
+        """Return the radius in cells that contains all but a fraction of the PSF energy."""
         from foveasim.optics._imaging import reach_cells
 
         return max(
@@ -598,23 +617,23 @@ class Optics(PointImages):
         return np.float32 if self.precision == "single" else np.float64
 
     def _warn_if_too_small(self, lambda_n_um: Floats, grid: Grid) -> None:
-        """Warn where the paper's Eq. 5, a >> H λ / (p0 min(M, N)), does not hold."""
-        # On the sensor side the ratio of its two sides is min(M, N) p / (2 λ N).
+        """Warn if the paper's Eq. 5, a >> H λ / (p0 min(M, N)), is not satisfied."""
+        # In sensor coordinates the ratio of both sides of Eq. 5 is min(M, N) p / (2 λ N).
         widest_um = float(max(lambda_n_um.max(), grid.pitch_x_um / MAX_ALIASES))
         ratio = 0.5 * min(grid.shape) * grid.pitch_x_um / widest_um
         if ratio < MUCH_LARGER:
             height, width = (n * grid.pitch_x_um for n in grid.shape)
             warnings.warn(
-                f"the image of the scene is only {width:.4g} x {height:.4g} µm, and the lens spreads a point over "
-                f"{2.44 * widest_um:.3g} µm: the paper's Eq. 5 wants the aperture's radius to be much "
-                f"larger than H λ / (p0 min(M, N)), and it is {ratio:.3g} times that; take a larger picture or a smaller "
-                "f-number, and see that pitch_um, distance_m and focal_length_mm are in their units",
+                f"the image of the scene is only {width:.4g} x {height:.4g} µm, and the Airy disc has a diameter of "
+                f"{2.44 * widest_um:.3g} µm: Eq. 5 of the paper requires an aperture radius much larger than "
+                f"H λ / (p0 min(M, N)), got {ratio:.3g} times this value; use a larger picture or a smaller "
+                "f-number, and check the units of pitch_um, distance_m and focal_length_mm",
                 SamplingWarning,
                 stacklevel=4,
             )
 
     def _squared_tangents(self, scene: SceneLike) -> tuple[Floats, Floats]:
-        """(x0/H)² of the scene's columns and (y0/H)² of its rows."""
+        """Return (x0/H)² of the scene columns and (y0/H)² of the scene rows."""
         _, n_y, n_x = scene.basis.shape
         step = float(m_from_um(scene.pitch_um)) / scene.distance_m
         return ((np.arange(n_x) - 0.5 * (n_x - 1)) * step) ** 2, ((np.arange(n_y) - 0.5 * (n_y - 1)) * step) ** 2

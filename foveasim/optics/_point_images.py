@@ -1,7 +1,7 @@
 """
-The image of one point: its pattern, its transfer function, the light in circles and squares around it.
+Point images: PSF, OTF, encircled and ensquared energy.
 
-The clear circle in focus has closed forms; every other aperture is sampled.
+A clear circular pupil in focus uses closed forms; every other aperture is sampled.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from foveasim.optics.otf import circular_otf
 
 __all__ = ["Point", "PointImages", "PointSpread"]
 
-#: Points along either axis of a point spread function, and their distance in λN, unless told otherwise.
+#: Default number of PSF samples along either axis, and their pitch in λN.
 PSF_POINTS, PSF_LAMBDA_N = 257, 0.125
-#: Samples across the aperture for the numbers of one point, at least: half the error that maps have.
+#: Minimum number of samples across the aperture for point images; halves the error of power maps.
 POINT_ACROSS = 384
-#: Nodes of the radial and angular quadratures of a circle's light in squares, at least, and more for each λN of the side.
+#: Radial and angular quadratures of the ensquared energy: minimum number of nodes, and additional nodes per λN of the side.
 QUADRATURE_NODES, NODES_PER_LAMBDA_N = 64, 8
-#: From this side on (λN) the pattern's mean fall tells the rest, to 1e-5.
+#: Side (λN) above which the asymptotic PSF gives the ensquared energy to 1e-5.
 FAR_SIDE = 100.0
-#: Circles and squares that a sampled pupil's light is told of (λN): its pattern repeats at eight times this.
+#: Largest circle or square (λN) for a sampled pupil, whose PSF repeats at eight times this distance.
 MAX_EXTENT = 256.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PointSpread:
     """
-    The image of a point.
+    Sampled point spread function.
 
     Attributes
     ----------
     psf_per_um2 : (n_y, n_x) float64, 1/µm²
-        Fraction of the light in a µm², at the cells' centres; row 0 lowest.
+        PSF of unit total energy at the cell centres; row 0 is the bottom row.
     grid : Grid
         Cells around the image point.
     wavelength_nm : float, nm
@@ -53,7 +53,7 @@ class PointSpread:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Point:
-    """A point of light behind an aperture, imaged at ``field_um`` on the sensor; λN is with the image-side f-number N."""
+    """Point source imaged at ``field_um`` on the sensor; N in λN is the image-side f-number."""
 
     aperture: Aperture
     is_clear_circle: bool
@@ -62,7 +62,7 @@ class Point:
     field_um: tuple[float, float]
 
     def pattern_per_um2(self, x_um: Floats, y_um: Floats) -> Floats:
-        """Fraction of the light in a µm² at the points of a rectangle, (n_y, n_x)."""
+        """Sample the PSF at the points (y, x), (n_y, n_x)."""
         if not self.is_clear_circle:
             return self.aperture.pattern_per_um2(self.wavelength_nm, self.lambda_n_um, x_um, y_um, self.field_um)
         from scipy.special import j1
@@ -72,7 +72,7 @@ class Point:
         return np.asarray(0.25 * np.pi * (2.0 * j1(v) / v) ** 2 / self.lambda_n_um**2)
 
     def transfer(self, s_x: Floats, s_y: Floats) -> NDArray[np.complex128]:
-        """Transfer function at frequencies in units of 1/λN."""
+        """Return the OTF at frequencies in units of 1/λN."""
         if self.is_clear_circle:
             return circular_otf(np.hypot(s_x, s_y)).astype(np.complex128)
         from scipy.ndimage import map_coordinates
@@ -83,7 +83,7 @@ class Point:
         return np.asarray(real + 1j * imaginary).reshape(np.shape(s_x))
 
     def in_circles(self, radius_um: Floats) -> Floats:
-        """Fraction of the light within radii."""
+        """Return the encircled energy."""
         from scipy.special import j0, j1
 
         radius = radius_um / self.lambda_n_um
@@ -93,12 +93,12 @@ class Point:
         otf, n = self._plane(float(radius.max(initial=0.0)), "radius_um")
         s = np.arange(-n, n + 1) / n
         frequency = np.maximum(np.hypot(s[:, np.newaxis], s), 1e-9)
-        # A disc's transform is R J1(2π R f) / f.
+        # Fourier transform of a disc of radius R: R J1(2π R f) / f.
         shares = [np.sum(otf.real * (r * j1(2.0 * np.pi * r * frequency) / frequency)) / n**2 for r in radius.ravel()]
         return np.array(shares).reshape(radius.shape)
 
     def in_squares(self, side_um: Floats) -> Floats:
-        """Fraction of the light in upright squares of sides."""
+        """Return the ensquared energy of squares parallel to the axes."""
         side = side_um / self.lambda_n_um
         if self.is_clear_circle:
             return np.array([_airy_in_square(float(a)) for a in side.ravel()]).reshape(side.shape)
@@ -107,20 +107,24 @@ class Point:
         return np.einsum("ij,jk,ik->i", boxes, otf.real, boxes, optimize=True).reshape(side.shape) / n**2
 
     def _plane(self, extent: float, name: str) -> tuple[NDArray[np.complexfloating], int]:
-        """Transfer function on a square of frequencies ``k / n``, k from -n to n, and n."""
+        """Return the OTF at the frequencies ``k / n`` along both axes, k from -n to n, and n."""
         if extent > MAX_EXTENT:
             raise ParameterError(
-                name, f"must be <= {MAX_EXTENT:.0f} λN where the pupil is sampled", extent * self.lambda_n_um, "µm"
+                name, f"must be <= {MAX_EXTENT:.0f} λN for a sampled pupil", extent * self.lambda_n_um, "µm"
             )
-        # The step makes the pattern repeat: no copy of it may touch what is looked at, up to ``extent`` in λN.
+        # Sampling in frequency makes the PSF periodic: the period must exceed ``extent`` (λN) by a wide margin.
         n = max(POINT_ACROSS, self.aperture.n_across(self.wavelength_nm, self.field_um), int(8.0 * extent))
         return self.aperture.transfer(self.wavelength_nm, n, n, self.field_um, np.float64), n
 
 
 def _airy_in_square(side: float) -> float:
-    """Fraction of a clear circle's light in a square: the product of their transfer functions, in polar coordinates."""
+    """
+    Compute the ensquared energy of the Airy pattern.
+
+    By Parseval's theorem, this is the integral of the OTF times the transform of the square, in polar coordinates.
+    """
     if side > FAR_SIDE:
-        # Far out the pattern falls as 1 / (π³ r³) on the mean; outside the square lies its integral.
+        # Asymptotic mean of the Airy pattern: 1 / (π³ r³), integrated outside the square.
         return 1.0 - 8.0 * math.sqrt(2.0) / (math.pi**3 * side)
     nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_NODES + int(NODES_PER_LAMBDA_N * side))
     s, ds = 0.5 * (nodes + 1.0), 0.5 * weights
@@ -130,12 +134,12 @@ def _airy_in_square(side: float) -> float:
 
 
 class PointImages:
-    """What a lens makes of one point: methods of :class:`foveasim.Optics`."""
+    """Point-image methods of :class:`foveasim.Optics`."""
 
     __slots__ = ()
 
     def _point(self, wavelength_nm: float, distance_m: float | None, field_um: tuple[float, float]) -> Point:
-        """A point of light, its parameters checked."""
+        """Return a point source with validated parameters."""
         raise NotImplementedError
 
     def psf(
@@ -148,24 +152,24 @@ class PointImages:
         n_points: int = PSF_POINTS,
     ) -> PointSpread:
         """
-        Point spread function.
+        Compute the point spread function.
 
         Parameters
         ----------
         wavelength_nm : float, nm
         distance_m : float, optional, m
-            Of the point; by default the distance of the focus, or infinity.
+            Distance of the point; by default the focus distance, or infinity.
         field_um : (x, y), µm
-            Where on the sensor the point is imaged.
+            Position of the image point on the sensor.
         pitch_um : float, optional, µm
-            Distance of the samples; by default λN/8.
+            Sampling pitch; by default λN/8.
         n_points : int
-            Samples along either axis, the middle one at the image point.
+            Number of samples along either axis, centred on the image point.
 
         Returns
         -------
         PointSpread
-            Samples of the fraction of the light in a µm².
+            Samples of the PSF, normalised to unit energy (1/µm²).
 
         Raises
         ------
@@ -192,14 +196,14 @@ class PointImages:
         field_um: tuple[float, float] = (0.0, 0.0),
     ) -> NDArray[np.complex128]:
         """
-        Optical transfer function.
+        Compute the optical transfer function.
 
         Parameters
         ----------
         frequency_per_mm : array, cycles per mm on the sensor
         wavelength_nm : float, nm
         angle_deg : float, degrees
-            Direction in which the grating varies, counter-clockwise from the x axis.
+            Direction of the frequency vector, counter-clockwise from the x axis.
         distance_m, field_um
             As for :meth:`psf`.
 
@@ -227,7 +231,7 @@ class PointImages:
         distance_m: float | None = None,
         field_um: tuple[float, float] = (0.0, 0.0),
     ) -> Floats:
-        """Modulation transfer function: the absolute value of :meth:`otf`, whose parameters it has."""
+        """Compute the MTF, the absolute value of :meth:`otf`; parameters as for :meth:`otf`."""
         return np.asarray(
             np.abs(
                 self.otf(frequency_per_mm, wavelength_nm, angle_deg=angle_deg, distance_m=distance_m, field_um=field_um)
@@ -238,10 +242,10 @@ class PointImages:
         self, wavelength_nm: float, *, distance_m: float | None = None, field_um: tuple[float, float] = (0.0, 0.0)
     ) -> float:
         """
-        Strehl ratio: the pattern's height at the image point over that of the same pupil without aberrations.
+        Compute the Strehl ratio: PSF at the image point, relative to the unaberrated PSF.
 
-        Parameters and errors as for :meth:`psf`. About ``exp(-(2πσ)²)`` for a wavefront error of σ waves rms (Mahajan, J. Opt.
-        Soc. Am. 73 (1983) 860).
+        Parameters and errors as for :meth:`psf`. Approximately ``exp(-(2πσ)²)`` for a wavefront error of σ waves rms
+        (Mahajan, J. Opt. Soc. Am. 73 (1983) 860).
         """
         point = self._point(wavelength_nm, distance_m, field_um)
         return 1.0 if point.is_clear_circle else point.aperture.strehl(point.wavelength_nm, point.field_um)
@@ -255,7 +259,7 @@ class PointImages:
         field_um: tuple[float, float] = (0.0, 0.0),
     ) -> Floats:
         """
-        Fraction of a point's light in circles around its image point.
+        Compute the encircled energy around the image point.
 
         Parameters
         ----------
@@ -279,7 +283,7 @@ class PointImages:
         field_um: tuple[float, float] = (0.0, 0.0),
     ) -> Floats:
         """
-        Fraction of a point's light in upright squares around its image point.
+        Compute the ensquared energy around the image point, for squares parallel to the axes.
 
         Parameters
         ----------

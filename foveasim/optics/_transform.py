@@ -1,14 +1,13 @@
 """
-Fourier transforms of pictures of one size, and what is done to their spectra.
+Fourier transforms of padded pictures, and filtering of their spectra.
 
-Cells are means of the irradiance: points at cell centres have a spectrum that repeats with 1/p, and the mean over a cell
-multiplies frequency f by sinc(f p), a square source pixel once more. Every alias f + k/p passes with the pupil's factor at
-f + k/p, so that a cell's mean is exact whether it is smaller than the diffraction pattern or larger.
+Cells contain the mean irradiance. Points at cell centres have a spectrum of period 1/p. The mean over a cell multiplies
+frequency f by sinc(f p), and a square source pixel does so once more. Each alias f + k/p is multiplied by the OTF at
+f + k/p, so that cell means are exact for cells both smaller and larger than the PSF.
 
-Cells may be k times finer than the source pixels. The spectrum of points at the centres of source pixels is known at all
-frequencies, since it repeats: it is written k x k times side by side, multiplied by the factors of the fine cells, and
-transformed back at k times the size. The centre of the first fine cell lies (p - p/k) / 2 before that of the first source
-pixel, which is a phase.
+Cells may be k times finer than the source pixels. The spectrum of points at the centres of source pixels is periodic: it is
+repeated k x k times, multiplied by the factors of the fine cells, and transformed back at k times the size. The centre of
+the first fine cell is (p - p/k) / 2 before the centre of the first source pixel, which is a phase factor.
 """
 
 from __future__ import annotations
@@ -28,21 +27,21 @@ from foveasim.optics.otf import MAX_ALIASES
 
 __all__ = ["Transform", "source_pixels"]
 
-#: Up to so many aliases to a side are added frequency by frequency ...
+#: Largest number of aliases per side that are summed directly at each frequency.
 DIRECT_ALIASES = 1
-#: ... and more by a smooth function of the frequency, through this many Chebyshev nodes an axis. The transfer function's bend
-#: at its cut-off leaves an error: of a clear circle at most 3e-7 of the brightest cell of a point's image, over 1.6 to 60 λN a
-#: cell, and of others 1e-4.
+#: Chebyshev nodes per axis of the interpolated sum of more aliases. The derivative of the OTF is discontinuous at cut-off. For
+#: cells of 1.6 to 60 λN, the resulting error is at most 3e-7 of the peak cell of a point image for a clear circle, and 1e-4
+#: for other pupils.
 ALIAS_NODES = 32
-#: Where geometry throws the light over many cells, a transfer function turns as often within the range: so many nodes more.
+#: Additional nodes per cell of geometric blur, because the phase of the OTF then rotates once per cell.
 NODES_PER_CELL = 4.0
-#: Products of that function that are smaller than this fraction of the factor at zero frequency are left out.
+#: Singular values below this fraction of the OTF at zero frequency are omitted from the interpolated sum.
 ALIAS_ACCURACY = 1e-9
-#: A wider padded picture is a slip: of a lens far too small for its picture, or of a unit.
+#: Memory limit; a wider padded picture indicates a far too small aperture or a wrong unit.
 MAX_PADDED = 1 << 17
-#: Rows that one thread works on at a time.
+#: Rows per task of a thread.
 ROWS_PER_PIECE = 64
-#: How numpy calls our paddings; -1 stands for darkness.
+#: Arguments of ``numpy.pad`` for each padding; index -1 denotes zero.
 NUMPY_PADDING: dict[str, dict[str, Any]] = {
     "reflect": {"mode": "reflect"},
     "edge": {"mode": "edge"},
@@ -52,12 +51,13 @@ NUMPY_PADDING: dict[str, dict[str, Any]] = {
 
 
 def source_pixels(n: int, padding: str, pad: int) -> Ints:
-    """Along one axis of n cells, the picture's cell that each padded cell shows, or -1; the padded size is a fast one."""
+    """Return the picture index of each padded cell, or -1; padded to a fast FFT size."""
     if padding == "periodic":
         return np.arange(n)
     if n + 2 * pad > MAX_PADDED:
         raise ParameterError(
-            "padding_cells", f"of {pad} makes a picture of {n} cells {n + 2 * pad} cells wide, more than {MAX_PADDED}"
+            "padding_cells",
+            f"must give a padded picture of at most {MAX_PADDED} cells, got {n} + 2 x {pad} = {n + 2 * pad}",
         )
     extra = int(scipy.fft.next_fast_len(n + 2 * pad, real=True)) - n
     return np.pad(np.arange(n), (extra // 2, extra - extra // 2), **NUMPY_PADDING[padding])
@@ -65,10 +65,10 @@ def source_pixels(n: int, padding: str, pad: int) -> Ints:
 
 class Transform:
     """
-    The transforms of one size of picture, with nothing computed that is not used.
+    Fourier transforms of padded pictures of one size.
 
-    A spectrum has the padded number of rows, and only the columns whose frequencies pass the pupil; the rows of the
-    padding are copies of the picture's, so neither they nor the padded picture are ever transformed or stored.
+    A spectrum has all padded rows, but only the columns below the cut-off frequency. Padding rows are copies of picture
+    rows, so they are not transformed separately, and the padded picture is never stored.
     """
 
     def __init__(
@@ -89,13 +89,13 @@ class Transform:
 
         self._picture_shape, self._rows, self._columns = shape, rows, columns
         self._real, self._n_threads, self._oversample = real, n_threads, oversample
-        self._kernels = _kernels  # once, before there are threads
+        self._kernels = _kernels  # imported before threads start
         self._n_rows = oversample * rows.size
         self._pitch_um = pitch_um / oversample
         f_max = f_max_per_um * self._pitch_um
         self._n_alias = min(MAX_ALIASES, max(0, math.ceil(f_max - 0.5)))
         self._source_cells = float(oversample) if is_square_source else 0.0
-        # The phase of an alias differs from that of its frequency by the factor -1 where the cells divide a pixel evenly.
+        # For even oversampling, the half-cell shift of the origin changes the sign of odd aliases.
         self._is_alternating = oversample % 2 == 0
         self._n_plane_nodes = 2 * ALIAS_NODES + math.ceil(NODES_PER_CELL * blur_cells * oversample)
         n_near = self._n_alias if self._n_alias <= DIRECT_ALIASES else 0
@@ -115,22 +115,22 @@ class Transform:
 
     @property
     def map_shape(self) -> tuple[int, int]:
-        """Rows and columns of a map's cells."""
+        """Numbers of rows and columns of a map."""
         n_y, n_x = self._picture_shape
         return self._oversample * n_y, self._oversample * n_x
 
     @property
     def _before(self) -> tuple[int, int]:
-        """Rows and columns of padding before the picture."""
+        """Numbers of padding rows and columns before the picture."""
         n_y, n_x = self._picture_shape
         return (self._rows.size - n_y) // 2, (self._columns.size - n_x) // 2
 
     def _far_aliases(self, table: NDArray[Any], per_step: float) -> tuple[NDArray[Any], NDArray[Any]]:
         """
-        Aliases beyond the frequency itself as a sum of products, (n_rank, n_x) and (n_rank, n_y), when they are many.
+        Return the sum of many aliases as separable products, (n_rank, n_x) and (n_rank, n_y).
 
-        Within half a cycle per cell their sum is smooth, so that a few Chebyshev polynomials hold it; that of a radial table is
-        even too, and half the range does.
+        Within half a cycle per cell the sum is smooth, so that a few Chebyshev polynomials represent it. For a radial table it
+        is an even function, so that half the range suffices.
         """
         if self._n_alias <= DIRECT_ALIASES:
             return np.zeros((0, self._cycles_x.size), table.dtype), np.zeros((0, self._cycles_y.size), table.dtype)
@@ -158,8 +158,7 @@ class Transform:
 
         far_x = at(self._cycles_x, x_modes[:rank].T)
         far_y = at(self._cycles_y, y_modes[:, :rank] * sizes[:rank])
-        # At zero frequency every alias has the factor 0: one more product takes off what the polynomials leave there,
-        # so that no light is lost or made.
+        # Every alias is 0 at zero frequency: one more product cancels the interpolation error there, which conserves energy.
         dc_x, dc_y = np.zeros((1, far_x.shape[1]), table.dtype), np.zeros((1, far_y.shape[1]), table.dtype)
         dc_x[0, 0], dc_y[0, 0] = 1.0, -(far_x[:, 0] @ far_y[:, 0])
         return np.concatenate((far_x, dc_x)), np.concatenate((far_y, dc_y))
@@ -172,7 +171,7 @@ class Transform:
         )
 
     def forward(self, image: Images, x2: Floats, y2: Floats, falloff_power: int) -> NDArray[Any]:
-        """Spectrum of a picture with falloff and padding."""
+        """Return the spectrum of a picture with relative illumination and padding."""
         (n_y, _), (top, left) = self._picture_shape, self._before
         n_columns = min(self._n_columns, self._columns.size // 2 + 1)
         spectrum = np.empty((self._rows.size, n_columns), np.result_type(self._real, np.complex64))
@@ -189,14 +188,18 @@ class Transform:
             spectrum[row] = spectrum[top + self._rows[row]] if self._rows[row] >= 0 else 0.0
         spectrum = scipy.fft.fft(spectrum, axis=0, overwrite_x=True, workers=self._n_threads)
         if not np.isfinite(spectrum[0, 0]):
-            raise SimulationError("the scene has values that are not finite")
+            raise SimulationError("the scene must be finite, got NaN or infinite values; mask or replace them")
         return spectrum
 
     def refine(self, spectrum: NDArray[Any]) -> NDArray[Any]:
-        """Spectrum of the points over the frequencies of the map's cells; the same array where cells are source pixels."""
+        """
+        Return the spectrum of the source points over the frequencies of the map cells.
+
+        Without oversampling this is the same array.
+        """
         if self._oversample == 1:
             return spectrum
-        # k² as many cells share the sum of the points. The phases move the origin to the first fine cell.
+        # Factor k per axis: the means of k² times as many cells add up to k² times the sum. The phase shifts the origin.
         phase_x, phase_y = (
             (self._oversample * np.exp(-1j * np.pi * (self._oversample - 1) * cycles)).astype(spectrum.dtype)
             for cycles in (self._cycles_x, self._cycles_y)
@@ -214,10 +217,10 @@ class Transform:
         self, spectrum: NDArray[Any], table: NDArray[Any], per_step: float, out: NDArray[Any], *, is_added: bool
     ) -> None:
         """
-        Write a spectrum times a transfer function to ``out``, or add it; ``out`` may be the spectrum.
+        Write or add a spectrum times a transfer function to ``out``, which may be the spectrum.
 
-        The table is a radial one (n,) from zero frequency on, or a square (2 n + 1, 2 n + 1) around it, at ``per_step`` steps
-        over the frequency (µm).
+        The table is radial, (n,) from zero frequency, or square, (2 n + 1, 2 n + 1) centred on zero frequency, with
+        ``per_step`` steps per 1/µm.
         """
         far_x, far_y = self._far_aliases(table, per_step)
         kernel = self._kernels.transfer if table.ndim == 1 else self._kernels.transfer_plane
@@ -243,23 +246,23 @@ class Transform:
 
     @property
     def spectrum_shape(self) -> tuple[int, int]:
-        """Rows and columns of a spectrum."""
+        """Numbers of rows and columns of a spectrum."""
         return self._n_rows, self._n_columns
 
     def factor(self, table: NDArray[Any], per_step: float) -> NDArray[Any]:
-        """What :meth:`multiply` multiplies by, as an array of the spectrum's shape; real for a radial table."""
+        """Return the factor of :meth:`multiply` as an array; real for a radial table."""
         ones = np.ones(self.spectrum_shape, np.result_type(self._real, np.complex64))
         self.multiply(ones, table, per_step, ones, is_added=False)
         return np.ascontiguousarray(ones.real) if table.ndim == 1 else ones
 
     def multiply_by(self, spectrum: NDArray[Any], factor: NDArray[Any], out: NDArray[Any], *, is_added: bool) -> None:
-        """As :meth:`multiply`, bit for bit, with the factor at hand."""
+        """Compute :meth:`multiply` with a precomputed factor; bit-identical."""
         self._each_rows(
             lambda first, last: self._kernels.multiply(spectrum, factor, is_added, first, last, out), spectrum.shape[0]
         )
 
     def inverse(self, spectrum: NDArray[Any]) -> NDArray[Any]:
-        """The picture of a spectrum, without its padding; the spectrum is used up."""
+        """Return the picture of a spectrum without padding; overwrites the spectrum."""
         n_y, n_x = self.map_shape
         top, left = (self._oversample * before for before in self._before)
         lines = scipy.fft.ifft(spectrum, axis=0, overwrite_x=True, workers=self._n_threads)

@@ -1,9 +1,9 @@
 """
-Aberrations: how far the wavefront in the pupil is from the sphere that would meet in a point.
+Wave aberrations: deviation of the wavefront in the pupil from the reference sphere.
 
 A wavefront ``W(x, y)`` in µm is the optical path difference at points of the aperture, in units of its radius, x to the right
-and y up as in the picture on the sensor. The amplitude there has the phase ``exp(2πi W / λ)``, and light goes to where W
-grows: a positive tilt in y moves a point up, positive coma in y throws its flare up.
+and y up as in the picture on the sensor. The amplitude has the phase factor ``exp(2πi W / λ)``. The PSF moves in the
+direction in which W increases: a positive tilt in y moves the image point up, and the flare of positive coma in y points up.
 """
 
 from __future__ import annotations
@@ -31,26 +31,27 @@ from foveasim.units import um_from_nm
 
 __all__ = ["LateralColour", "Seidel", "Zernike", "noll_to_nm", "osa_to_nm", "zernike"]
 
-#: Highest index: radial order 100, whose polynomials are still exact to 1e-12.
+#: Highest index, of radial order 100; polynomials up to this order are accurate to 1e-12.
 MAX_INDEX = 5151
 
 
 def noll_to_nm(j: int) -> tuple[int, int]:
     """
-    Radial order n and azimuthal order m (negative for sines) of the Zernike polynomial j = 1, 2, ... in Noll's order.
+    Convert a Noll index to the orders (n, m) of a Zernike polynomial.
 
+    The index j counts from 1; n is the radial order, and m the azimuthal order, negative for sines.
     R. J. Noll, Zernike polynomials and atmospheric turbulence, J. Opt. Soc. Am. 66 (1976) 207, Table I.
 
     Examples
     --------
-    Defocus, coma in y, spherical:
+    Defocus, coma in y, spherical aberration:
 
     >>> noll_to_nm(4), noll_to_nm(7), noll_to_nm(11)
     ((2, 0), (3, -1), (4, 0))
     """
     j = check_count("j", j, at_least=1, at_most=MAX_INDEX)
     n = (math.isqrt(8 * j - 7) - 1) // 2
-    # Within a row |m| rises by two; of a pair the even j is the cosine.
+    # |m| increases in steps of two within a radial order; even j are cosines.
     k = j - n * (n + 1) // 2
     m = 2 * (k // 2) if n % 2 == 0 else 2 * ((k - 1) // 2) + 1
     return n, m if j % 2 == 0 else -m
@@ -58,13 +59,14 @@ def noll_to_nm(j: int) -> tuple[int, int]:
 
 def osa_to_nm(j: int) -> tuple[int, int]:
     """
-    Radial order n and azimuthal order m (negative for sines) of the Zernike polynomial j = 0, 1, ... in OSA/ANSI order.
+    Convert an OSA/ANSI index to the orders (n, m) of a Zernike polynomial.
 
+    The index j counts from 0; n is the radial order, and m the azimuthal order, negative for sines.
     Thibos et al., Standards for reporting the optical aberrations of eyes, J. Refract. Surg. 18 (2002) S652; ANSI Z80.28.
 
     Examples
     --------
-    Defocus, coma in y, spherical:
+    Defocus, coma in y, spherical aberration:
 
     >>> osa_to_nm(4), osa_to_nm(7), osa_to_nm(12)
     ((2, 0), (3, -1), (4, 0))
@@ -76,28 +78,29 @@ def osa_to_nm(j: int) -> tuple[int, int]:
 
 def zernike(n: int, m: int, x: ArrayLike, y: ArrayLike) -> Floats:
     """
-    Zernike polynomial of unit variance over the unit disc.
+    Evaluate a Zernike polynomial of unit variance over the unit disc.
 
     Parameters
     ----------
     n, m : int
         Radial and azimuthal order, ``n >= |m|`` of the same parity; sines for negative m.
     x, y : array
-        Points, in units of the aperture's radius.
+        Points in units of the aperture radius.
 
     Returns
     -------
     value : array, float64
-        ``sqrt(n + 1) R(r)`` for m = 0, else ``sqrt(2 (n + 1)) R(r) cos(m t)`` or ``sin(|m| t)``, as for Noll and OSA/ANSI.
+        ``sqrt(n + 1) R(r)`` for m = 0, else ``sqrt(2 (n + 1)) R(r) cos(m t)`` or ``sin(|m| t)``, as in Noll and OSA/ANSI.
 
     Raises
     ------
     ParameterError
-        When there is no such polynomial.
+        When n and m are not the orders of a Zernike polynomial.
 
     Notes
     -----
-    ``R`` by the Jacobi polynomials, which lose no digits at high orders: Born and Wolf, Principles of Optics, section 9.2.1.
+    ``R`` is computed from Jacobi polynomials, which are numerically stable at high orders: Born and Wolf, Principles of
+    Optics, section 9.2.1.
     """
     from scipy.special import eval_jacobi
 
@@ -109,34 +112,34 @@ def zernike(n: int, m: int, x: ArrayLike, y: ArrayLike) -> Floats:
     radial = (-1) ** k * eval_jacobi(k, abs(m), 0, 1.0 - 2.0 * r2)
     if m == 0:
         return np.asarray(math.sqrt(n + 1) * radial)
-    power = (x + 1j * y) ** abs(m)  # r^|m| times cosine and sine
+    power = (x + 1j * y) ** abs(m)  # r^|m| (cos |m|t + i sin |m|t)
     return np.asarray(math.sqrt(2 * (n + 1)) * radial * (power.real if m > 0 else power.imag))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Zernike:
     """
-    Wavefront as a sum of Zernike polynomials of unit variance, the same all over the field.
+    Wavefront as a sum of Zernike polynomials of unit variance, constant over the field.
 
     Parameters
     ----------
-    coefficients : {index: number, or one for each wavelength}
+    coefficients : {index: number, or one number per wavelength}
         RMS wavefront error of each polynomial.
     index : {"noll", "osa"}
-        What the indices are: Noll's (defocus 4, coma 7 in y and 8 in x, spherical 11), or those of OSA and ANSI (4; 7, 8; 12).
+        Index scheme: Noll (defocus 4, coma 7 in y and 8 in x, spherical aberration 11), or OSA/ANSI (4; 7, 8; 12).
     unit : {"um", "waves"}
     wavelength_nm : number or sequence, optional, nm
-        For "waves": the wavelength that they are of; by default each one's own, whatever it is. Where the coefficients are
-        sequences: their wavelengths, rising. In between the wavefront is linear, and constant beyond.
+        Reference wavelength of coefficients in "waves"; by default the wavelength of the light itself. For sequences of
+        coefficients: their wavelengths, increasing. The wavefront is interpolated linearly and is constant outside the range.
 
     Raises
     ------
     ParameterError
-        When an index does not exist, or numbers and wavelengths do not fit together.
+        When an index does not exist, or the numbers of coefficients and wavelengths differ.
 
     Examples
     --------
-    A quarter of a wave of coma that throws light upwards, and defocus that depends on the colour:
+    A quarter wave of coma with the flare upwards, and defocus that depends on the wavelength:
 
     >>> coma = Zernike(coefficients={7: 0.25}, unit="waves", wavelength_nm=550.0)
     >>> colour = Zernike(coefficients={4: [0.1, 0.0, 0.05]}, wavelength_nm=[450.0, 550.0, 650.0])
@@ -154,11 +157,11 @@ class Zernike:
         check_choice("unit", self.unit, ("um", "waves"))
         if not isinstance(self.coefficients, Mapping) or not self.coefficients:
             raise ParameterError(
-                "coefficients", "must be numbers by their indices, such as {4: 0.1}", self.coefficients
+                "coefficients", "must be a mapping of indices to numbers, such as {4: 0.1}", self.coefficients
             )
         waves_nm = None if self.wavelength_nm is None else wavelengths_nm("wavelength_nm", self.wavelength_nm)
         if waves_nm is not None and np.any(np.diff(waves_nm) <= 0.0):
-            raise ParameterError("wavelength_nm", "must rise", self.wavelength_nm, "nm")
+            raise ParameterError("wavelength_nm", "must be strictly increasing", self.wavelength_nm, "nm")
         n_waves = 1 if waves_nm is None else waves_nm.size
         clean: dict[int, float | tuple[float, ...]] = {}
         for j, value in self.coefficients.items():
@@ -184,7 +187,7 @@ class Zernike:
             raise ParameterError("coefficients", f"has an index that {error.detail}") from None
 
     def coefficients_um(self, wavelength_nm: float) -> dict[tuple[int, int], float]:
-        """Coefficients at a wavelength in µm, by the orders (n, m)."""
+        """Return the coefficients at a wavelength in µm, keyed by the orders (n, m)."""
         own_um = float(um_from_nm(wavelength_nm))
         table_nm = None if self.wavelength_nm is None else np.atleast_1d(np.asarray(self.wavelength_nm, np.float64))
         um = {}
@@ -200,7 +203,7 @@ class Zernike:
         return um
 
     def wavefront_um(self, x: Floats, y: Floats, wavelength_nm: float, field_um: tuple[float, float]) -> Floats:  # noqa: ARG002
-        """Wavefront in µm at points of the aperture."""
+        """Return the path difference in µm at points of the aperture."""
         total_um = np.zeros(np.broadcast(x, y).shape)
         for (n, m), number_um in self.coefficients_um(wavelength_nm).items():
             if number_um:
@@ -215,22 +218,22 @@ def _zernike(coefficients: Any, index: Any, unit: Any, wavelength_nm: Any) -> Ze
 @dataclass(frozen=True, kw_only=True)
 class Seidel:
     """
-    The third-order aberrations of a lens, which grow from the axis to the border of the field.
+    Third-order (Seidel) wave aberrations, which depend on the field position.
 
-    At a point of the image at h times ``field_radius_um`` from the axis, in the direction t, and a point of the aperture at the
-    radius r in the direction t + u: ``W = spherical r⁴ + coma h r³ cos u + astigmatism h² r² cos² u + field_curvature h² r²``.
+    For an image point at h times ``field_radius_um`` from the axis, in the direction t, and an aperture point at the radius r
+    in the direction t + u: ``W = spherical r⁴ + coma h r³ cos u + astigmatism h² r² cos² u + field_curvature h² r²``.
 
     Parameters
     ----------
     spherical_um, coma_um, astigmatism_um, field_curvature_um : float, µm
-        Each one's largest wavefront error: at the edge of the aperture, for a point at ``field_radius_um``.
+        Path difference of each aberration at the edge of the aperture, for an image point at ``field_radius_um``.
     field_radius_um : float, µm
-        Distance from the axis, on the sensor, that the numbers are of.
+        Reference distance from the axis on the sensor.
 
     Raises
     ------
     ParameterError
-        When a value is not finite, or the radius not positive.
+        When a value is not finite, or the radius is not positive.
 
     Notes
     -----
@@ -252,11 +255,11 @@ class Seidel:
 
     @property
     def is_varying(self) -> bool:
-        """Whether the aberrations differ between points of the field."""
+        """Whether the aberrations vary over the field."""
         return any((self.coma_um, self.astigmatism_um, self.field_curvature_um))
 
     def wavefront_um(self, x: Floats, y: Floats, wavelength_nm: float, field_um: tuple[float, float]) -> Floats:  # noqa: ARG002
-        """Wavefront in µm at points of the aperture, for a point of the image."""
+        """Return the path difference in µm at points of the aperture, for an image point."""
         hx, hy = (c / self.field_radius_um for c in field_um)
         r2 = x * x + y * y
         along = x * hx + y * hy  # h r cos u
@@ -271,18 +274,18 @@ class Seidel:
 @dataclass(frozen=True, kw_only=True)
 class LateralColour:
     """
-    Images of different sizes in different colours.
+    Lateral chromatic aberration: image size as a function of wavelength.
 
     Parameters
     ----------
-    wavelength_nm : sequence, nm, rising
+    wavelength_nm : sequence, nm, increasing
     magnification : sequence
-        Size of the image at each wavelength over that of the ideal lens; linear in between, constant beyond.
+        Image size at each wavelength, relative to the ideal lens; interpolated linearly, constant outside the range.
 
     Raises
     ------
     ParameterError
-        When the sequences do not fit together, or a size differs from 1 by more than a tenth.
+        When the lengths of the sequences differ, or a size differs from 1 by more than 0.1.
     """
 
     wavelength_nm: Sequence[float]
@@ -293,7 +296,10 @@ class LateralColour:
         sizes = finite_array("magnification", self.magnification, ndim=1)
         if sizes.shape != waves_nm.shape or np.any(np.diff(waves_nm) <= 0.0):
             raise ParameterError(
-                "wavelength_nm", "must rise, and be as many as the magnifications", self.wavelength_nm, "nm"
+                "wavelength_nm",
+                "must be strictly increasing and have one value per magnification",
+                self.wavelength_nm,
+                "nm",
             )
         if np.any(np.abs(sizes - 1.0) > 0.1):
             raise ParameterError(
@@ -303,5 +309,5 @@ class LateralColour:
         object.__setattr__(self, "magnification", tuple(sizes.tolist()))
 
     def at(self, wavelength_nm: Any) -> Floats:
-        """Relative size of the image at wavelengths."""
+        """Return the relative image size at the given wavelengths."""
         return np.asarray(np.interp(wavelength_nm, self.wavelength_nm, self.magnification))

@@ -1,4 +1,4 @@
-"""Transfer functions: that of a clear circular pupil, and tables of weighted sums of any."""
+"""Optical transfer function of the clear circle, and tables of weighted sums of OTFs."""
 
 from __future__ import annotations
 
@@ -16,39 +16,38 @@ from foveasim.optics._aperture import Aperture
 
 __all__ = ["MAX_ALIASES", "PlaneTables", "RadialTables", "Tables", "circular_otf"]
 
-#: More aliases to a side than this are left out, and of a clear circle the pattern is widened to have no more: 0.3 % of the
-#: light or less goes astray.
+#: Largest number of aliases per side. Further aliases are omitted; for a clear circle, the PSF is widened instead. At most
+#: 0.3 % of the energy is displaced.
 MAX_ALIASES = 128
 
-#: Points of a radial table up to the smallest cut-off; the one of float32 fits the first-level cache. Linear interpolation
-#: errs by at most 2.4e-7 of the value at zero frequency in float32 and 3.0e-8 in float64, next to the cut-off.
+#: Points of a radial table up to the smallest cut-off; the float32 table fits the L1 cache. The error of linear interpolation
+#: is at most 2.4e-7 of the value at zero frequency in float32 and 3.0e-8 in float64, near the cut-off.
 TABLE_POINTS = {np.float32: 1 << 13, np.float64: 1 << 15}
-#: Distances of scenes whose apertures are kept.
+#: Largest number of cached apertures, one per scene distance.
 KEPT_APERTURES = 4
-#: Numbers that the tables of all wavelengths may hold together, 128 MiB; beyond that their steps grow.
+#: Memory limit of the tables of all wavelengths, in numbers (128 MiB); beyond it, their step increases.
 MAX_TABLE_SIZE = 1 << 24
-#: Complex numbers that a lens keeps for the next frames, 512 MiB in single precision.
+#: Memory limit of the tables cached per lens, in complex numbers (512 MiB in single precision).
 MAX_KEPT_SIZE = 1 << 26
-#: Numbers of the factors on spectra that it keeps, 128 MiB in single precision: those of a colour video of 1080p fit.
+#: Memory limit of the cached factors on spectra, in numbers (128 MiB in single precision); fits a colour video at 1080p.
 MAX_FACTOR_SIZE = 1 << 25
-#: Sums that it remembers to have been asked for a factor of; the oldest is forgotten first.
+#: Largest number of sums with recorded requests; the oldest entry is removed first.
 REMEMBERED_SUMS = 64
 
 
 def circular_otf(s: ArrayLike) -> Floats:
     """
-    Optical transfer function of a clear circle in focus.
+    Compute the optical transfer function of a clear circular pupil in focus.
 
     Parameters
     ----------
     s : array
-        Spatial frequency over the cut-off, ``f * wavelength * N`` with the image-side f-number N; the sign does not
-        matter.
+        Spatial frequency over the cut-off, ``f * wavelength * N`` with the image-side f-number N; the sign is ignored.
 
     Returns
     -------
     otf : array of the same shape, float64
-        ``(2/π) (acos s - s sqrt(1 - s²))``, and 0 from ``s = 1`` on. OTF(0) = 1: no light is lost.
+        ``(2/π) (acos s - s sqrt(1 - s²))``, and 0 for ``s >= 1``. OTF(0) = 1 conserves energy.
 
     Notes
     -----
@@ -59,14 +58,14 @@ def circular_otf(s: ArrayLike) -> Floats:
 
 
 class Tables(Protocol):
-    """Transfer functions of weighted sums of wavelengths, as :class:`foveasim.optics._transform.Transform` takes them."""
+    """Tables of weighted sums of OTFs, for :class:`foveasim.optics._transform.Transform`."""
 
     def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
-        """Table of ``sum_k weight[k] * OTF_k``, and its steps over frequency (µm)."""
+        """Return the table of ``sum_k weight[k] * OTF_k``, and its steps per frequency (µm)."""
 
 
 class RadialTables:
-    """Those of a clear circle in focus: over ``|f|`` at equal steps, the last one beyond every cut-off."""
+    """OTF tables of a clear circle in focus, over ``|f|`` up to the highest cut-off."""
 
     def __init__(self, cutoff_per_um: Floats, real: type[np.floating[Any]]) -> None:
         f_max_per_um = float(cutoff_per_um.max())
@@ -81,16 +80,15 @@ class RadialTables:
         return circular_otf(self._f_per_um / self._cutoff_per_um[:, np.newaxis])
 
     def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
-        """The table, and its steps over frequency (µm)."""
+        """Return the table, and its steps per frequency (µm)."""
         return (weight @ self._otf).astype(self._real), self._per_step
 
 
 class PlaneTables:
     """
-    Those of any aperture, for one point of the field: a square of complex numbers around zero frequency.
+    Complex OTF tables over (f_y, f_x) of an arbitrary aperture, for one field point.
 
-    The aperture is sampled again for each wavelength, so that the steps of all its transfer functions are the same and they
-    simply add up.
+    The sampling of the aperture is adapted to each wavelength, so that all OTFs have the same frequency step and can be added.
     """
 
     def __init__(
@@ -111,7 +109,7 @@ class PlaneTables:
         return float((n_across * self._lambda_n_um).max())
 
     def prepare(self, weights: Sequence[Floats]) -> None:
-        """Make the tables of many sums in one go through the wavelengths, as far as they fit the memory."""
+        """Compute the tables of several sums in one pass over the wavelengths."""
         n_lags = math.ceil(self._per_step / float(self._lambda_n_um.min()))
         n_kept = max(1, MAX_TABLE_SIZE // (2 * n_lags + 1) ** 2)
         weights = [w for w in weights if w.tobytes() not in self._kept][:n_kept]
@@ -129,22 +127,23 @@ class PlaneTables:
         self._kept |= {weight.tobytes(): total for weight, total in zip(weights, sums, strict=True)}
 
     def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
-        """The table, and its steps over frequency (µm)."""
+        """Return the table, and its steps per frequency (µm)."""
         if weight.tobytes() not in self._kept:
             self.prepare([weight])
         return self._kept[weight.tobytes()], self._per_step
 
     @property
     def size(self) -> int:
-        """Numbers that it keeps."""
+        """Number of cached values."""
         return sum(table.size for table in self._kept.values())
 
 
 class TableCache:
     """
-    What a lens made before, up to a size in memory: the frames of a video need the same. It is never pickled.
+    Cache of apertures, OTF tables and factors of a lens, with memory limits; not pickled.
 
-    Tables of other light than the present one give way first; what then still does not fit is made again each time.
+    All frames of a video use the same tables. Tables of other spectra are evicted first; tables that still exceed the limit are
+    recomputed for each frame.
     """
 
     def __init__(self) -> None:
@@ -157,7 +156,7 @@ class TableCache:
         return TableCache, ()
 
     def aperture(self, distance_m: float, made: Callable[[], Aperture]) -> Aperture:
-        """The aperture that a scene at a distance sees; the ones used last are kept."""
+        """Return the aperture for a scene distance; the most recently used ones are cached."""
         with self._lock:
             aperture = self._apertures.pop(distance_m) if distance_m in self._apertures else made()
             self._apertures[distance_m] = aperture
@@ -172,7 +171,7 @@ class TableCache:
         made: Callable[[], PlaneTables],
         weights: Sequence[Floats],
     ) -> PlaneTables:
-        """The tables of a kind of light and a point of the field, with those of some weighted sums."""
+        """Return tables for a spectrum and a field point, with the given weighted sums computed."""
         with self._lock:
             tables = self._made.get((light, field_um)) or made()
         tables.prepare(weights)
@@ -189,10 +188,10 @@ class TableCache:
         self, light: Hashable, weight: Floats, n_numbers: int, made: Callable[[], NDArray[Any]]
     ) -> NDArray[Any] | None:
         """
-        What spectra are multiplied by for a weighted sum, from the second time on that it is asked for.
+        Return the cached factor on spectra for a weighted sum, from the second request on.
 
-        None the first time, since that of a single picture is not worth its memory, and where there is no room: factors of
-        other light, or of other sizes of pictures, give way.
+        Return None at the first request, since caching does not pay for a single picture, and if the memory limit is reached.
+        Factors of other spectra or picture sizes are evicted first.
         """
         key = light, weight.tobytes()
         with self._lock:

@@ -1,9 +1,9 @@
 """
-Pupils: the fraction of the light's amplitude that passes at each point of the aperture.
+Pupil functions: amplitude transmittance over the aperture.
 
-A pupil is a callable ``T(x, y, wavelength_nm)`` of arrays x, y in units of the aperture's radius, x to the right and y up as
-in the picture on the sensor; it gives real or complex amplitudes (the power is their square). The circle of the f-number
-surrounds it: what lies outside the unit circle is dark.
+A pupil is a callable ``T(x, y, wavelength_nm)`` of arrays x, y in units of the aperture radius, x to the right and y up as
+in the picture on the sensor. It returns real or complex amplitudes; the power transmittance is their squared modulus.
+Outside the unit circle, which corresponds to the f-number, the transmittance is 0.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from foveasim.fields import from_file_rows
 
 __all__ = ["Annulus", "Blades", "Pupil", "PupilImage", "Slit", "Spider"]
 
-#: Amplitudes (real or complex) at points x, y in aperture radii, for a wavelength in nm.
+#: Callable of x, y in aperture radii and the wavelength in nm that returns real or complex amplitudes.
 Pupil = Callable[[Floats, Floats, float], NDArray[Any]]
 
-#: Pupils by their names in settings files: what a call gives is a function of pupil coordinates and wavelength. Installed
-#: packages add theirs as entry points of the group ``foveasim.pupils``.
+#: Pupil factories by their names in settings files; each returns a function of pupil coordinates and wavelength. Installed
+#: packages register pupils as entry points of the group ``foveasim.pupils``.
 PUPILS: Registry[Callable[..., Any]] = Registry("pupil", "foveasim.pupils")
 
 
@@ -45,17 +45,17 @@ PUPILS: Registry[Callable[..., Any]] = Registry("pupil", "foveasim.pupils")
 @dataclass(frozen=True, slots=True)
 class Annulus:
     """
-    Circle with a dark disc in its middle, as of a telescope with a secondary mirror.
+    Annular pupil with a central obscuration, as in a telescope with a secondary mirror.
 
     Parameters
     ----------
     obscuration : float
-        Radius of the dark disc over that of the aperture, 0 to 1.
+        Radius of the obscuration over the aperture radius, 0 to 0.999.
 
     Raises
     ------
     ParameterError
-        When it is out of range.
+        When the value is out of range.
     """
 
     obscuration: float
@@ -65,8 +65,8 @@ class Annulus:
             self, "obscuration", check_number("obscuration", self.obscuration, at_least=0.0, at_most=0.999)
         )
 
-    def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002 -- the form of all pupils
-        """Amplitudes at points of the aperture."""
+    def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002 -- signature of all pupils
+        """Return the amplitudes at points of the aperture."""
         return np.asarray(x * x + y * y >= self.obscuration**2)
 
 
@@ -74,13 +74,13 @@ class Annulus:
 @dataclass(frozen=True, slots=True)
 class Spider:
     """
-    Vanes that hold a secondary mirror: straight bars from the axis outwards.
+    Spider vanes: radial bars that support a secondary mirror.
 
     Parameters
     ----------
     n_vanes : int
     width_fraction : float
-        Width of a vane over the aperture's diameter, 0 to 1.
+        Width of a vane over the aperture diameter, 0 to 1.
     angle_deg : float, degrees
         Direction of the first vane, counter-clockwise from the x axis.
 
@@ -101,7 +101,7 @@ class Spider:
         object.__setattr__(self, "angle_deg", check_number("angle_deg", self.angle_deg))
 
     def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002
-        """Amplitudes at points of the aperture."""
+        """Return the amplitudes at points of the aperture."""
         is_open = np.ones(np.broadcast(x, y).shape, bool)
         for angle in np.radians(self.angle_deg + 360.0 / self.n_vanes * np.arange(self.n_vanes)):
             along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
@@ -113,14 +113,14 @@ class Spider:
 @dataclass(frozen=True, slots=True)
 class Blades:
     """
-    Regular polygon with its corners on the circle: the iris of a camera lens.
+    Iris diaphragm: regular polygon with its vertices on the circle.
 
     Parameters
     ----------
     n_blades : int
-        At least 3.
+        Number of blades, at least 3.
     angle_deg : float, degrees
-        Direction of the first corner, counter-clockwise from the x axis.
+        Direction of the first vertex, counter-clockwise from the x axis.
 
     Raises
     ------
@@ -136,7 +136,7 @@ class Blades:
         object.__setattr__(self, "angle_deg", check_number("angle_deg", self.angle_deg))
 
     def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002
-        """Amplitudes at points of the aperture."""
+        """Return the amplitudes at points of the aperture."""
         is_open = np.ones(np.broadcast(x, y).shape, bool)
         inner = np.cos(np.pi / self.n_blades)
         for angle in np.radians(self.angle_deg + 360.0 / self.n_blades * (np.arange(self.n_blades) + 0.5)):
@@ -153,7 +153,7 @@ class Slit:
     Parameters
     ----------
     width_fraction : float
-        Width over the aperture's diameter, above 0, to 1.
+        Width over the aperture diameter, above 0 and at most 1.
     angle_deg : float, degrees
         Direction of the slit's long side, counter-clockwise from the x axis.
 
@@ -172,7 +172,7 @@ class Slit:
         object.__setattr__(self, "angle_deg", check_number("angle_deg", self.angle_deg))
 
     def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> Bools:  # noqa: ARG002
-        """Amplitudes at points of the aperture."""
+        """Return the amplitudes at points of the aperture."""
         angle = np.radians(self.angle_deg)
         return np.asarray(np.abs(y * np.cos(angle) - x * np.sin(angle)) <= self.width_fraction)
 
@@ -181,24 +181,25 @@ class Slit:
 @dataclass(frozen=True, eq=False)
 class PupilImage:
     """
-    Pupil given by a picture, or by measured amplitudes and a wavefront.
+    Pupil specified by a picture, or by measured amplitudes and a wavefront.
 
     Parameters
     ----------
-    picture : path, or (n, n) array, the first row on top
-        Transmission, 0 to 1 (of integers up to the type's maximum), over the square around the aperture's circle. The
-        pixels are squares; a colour picture counts by its mean, times its alpha.
+    picture : path, or (n, n) array, top row first
+        Transmittance, 0 to 1 (integers: 0 to the maximum of the type), over the square around the circular aperture. The
+        pixels are uniform squares; colour channels are averaged and multiplied by alpha.
     values : {"amplitude", "power"}
-        Whether a value is the fraction of the amplitude or of the power (its square) that passes.
-    wavefront_um : (n, n) array, the first row on top, optional, µm
-        Optical path difference at the pixels' centres, interpolated linearly in between: light goes to where it grows.
+        Whether values are amplitude or power (squared amplitude) transmittances.
+    wavefront_um : (n, n) array, top row first, optional, µm
+        Optical path difference at the pixel centres, interpolated linearly. The PSF moves in the direction in which it
+        increases.
 
     Raises
     ------
     FileError
         When the file cannot be read.
     ParameterError
-        When an array is not square, not finite, or a transmission not from 0 to 1.
+        When an array is not square or not finite, or a transmittance is outside 0 to 1.
     """
 
     picture: str | Path | ArrayLike = field(repr=False)
@@ -212,11 +213,11 @@ class PupilImage:
         peak = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else 1.0
         amplitude = finite_array("picture", pixels, at_least=0.0) / peak
         if amplitude.ndim not in (2, 3) or amplitude.shape[0] != amplitude.shape[1] or amplitude.size == 0:
-            raise ParameterError("picture", f"must be square, got the shape {amplitude.shape}")
+            raise ParameterError("picture", f"must be square, got shape {amplitude.shape}")
         if amplitude.max() > 1.0:
-            raise ParameterError("picture", "must be from 0 to 1", float(amplitude.max()))
+            raise ParameterError("picture", "must be within 0 to 1", float(amplitude.max()))
         channels = from_file_rows(amplitude)
-        # What is transparent in a picture is no light, as in a scene.
+        # Transparent pixels transmit no power; scenes apply alpha in the same way.
         alpha = channels[-1] if channels.shape[0] in (2, 4) else 1.0
         amplitude = (channels[:-1] if channels.shape[0] in (2, 4) else channels).mean(axis=0) * alpha
         if self.values == "power":
@@ -226,11 +227,11 @@ class PupilImage:
         if self.wavefront_um is not None:
             wavefront_um = finite_array("wavefront_um", self.wavefront_um, ndim=2)
             if wavefront_um.shape[0] != wavefront_um.shape[1]:
-                raise ParameterError("wavefront_um", f"must be square, got the shape {wavefront_um.shape}")
+                raise ParameterError("wavefront_um", f"must be square, got shape {wavefront_um.shape}")
             object.__setattr__(self, "wavefront_um", read_only(wavefront_um.copy()))
 
     def __call__(self, x: Floats, y: Floats, wavelength_nm: float) -> NDArray[Any]:
-        """Amplitudes at points of the aperture."""
+        """Return the amplitudes at points of the aperture."""
         amplitude = as_numbers("picture", self.picture)  # type: ignore[arg-type]
         n = amplitude.shape[0]
         row, column = (

@@ -159,7 +159,7 @@ def test_change_replaces_one_setting(shot_file, change, value):
         ("optics.pupil={kind: image, picture: no.png}", r"no\.png: no such file"),
         ("optics.zernike={coefficients: {0: 0.1}}", r"optics\.zernike\.coefficients: has an index that must be >= 1"),
         ("optics.zernike={coefficients: {coma: 0.1}}", r"optics\.zernike\.coefficients"),
-        ("optics.zernike={coefficients: {4: 500}}", r"optics\.aberrations: throw light of 550 nm"),
+        ("optics.zernike={coefficients: {4: 500}}", r"optics\.aberrations: must blur a point by at most 128 λN"),
         ("optics.focus_distance_m=0.001", r"optics\.focus_distance_m: must be larger than the focal length"),
     ],
 )

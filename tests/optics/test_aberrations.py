@@ -1,4 +1,4 @@
-"""Aberrations against closed forms: Zernike's polynomials, Hopkins' defocus, Strehl ratios, orientation, the field."""
+"""Aberrations against closed forms: Zernike polynomials, defocus, Strehl ratio, orientation, field."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ def map_of(optics, image, **changes):
 
 
 def centroid_um(power_map, band=0):
-    share = power_map.data[band] / power_map.data[band].sum()
-    return float((share * power_map.grid.x_um).sum()), float((share * power_map.grid.y_um[:, np.newaxis]).sum())
+    psf = power_map.data[band] / power_map.data[band].sum()
+    return float((psf * power_map.grid.x_um).sum()), float((psf * power_map.grid.y_um[:, np.newaxis]).sum())
 
 
-# -- Zernike's polynomials ------------------------------------------------------------------------------------------------
+# -- Zernike polynomials --------------------------------------------------------------------------------------------------
 
 
-def test_indices_follow_the_published_tables():
+def test_zernike_indices_match_published_tables():
     """Noll (1976), Table I; Thibos et al. (2002), Table 1."""
     noll = [(0, 0), (1, 1), (1, -1), (2, 0), (2, -2), (2, 2), (3, -1), (3, 1), (3, -3), (3, 3), (4, 0), (4, 2), (4, -2), (4, 4), (4, -4), (5, 1), (5, -1), (5, 3), (5, -3), (5, 5), (5, -5), (6, 0)]  # fmt: skip
     osa = [(0, 0), (1, -1), (1, 1), (2, -2), (2, 0), (2, 2), (3, -3), (3, -1), (3, 1), (3, 3), (4, -4), (4, -2), (4, 0), (4, 2), (4, 4), (5, -5)]  # fmt: skip
@@ -56,11 +56,11 @@ def test_indices_follow_the_published_tables():
     assert [noll_to_nm(j + 1) for j in range(len(noll))] == noll
     assert [osa_to_nm(j) for j in range(len(osa))] == osa
     for to_nm, first in ((noll_to_nm, 1), (osa_to_nm, 0)):
-        all_orders = [to_nm(j) for j in range(first, first + 231)]  # whole rows, up to n = 20
+        all_orders = [to_nm(j) for j in range(first, first + 231)]  # complete radial orders, up to n = 20
         assert sorted(all_orders) == sorted({(n, m) for n in range(21) for m in range(-n, n + 1, 2)})
 
 
-def test_polynomials_are_orthonormal_over_the_disc():
+def test_zernike_polynomials_are_orthonormal():
     radial, weight = np.polynomial.legendre.leggauss(40)
     r, dr = 0.5 * (radial + 1.0), 0.5 * weight
     angle = np.arange(64) * (2.0 * np.pi / 64)
@@ -86,13 +86,13 @@ def test_polynomials_are_orthonormal_over_the_disc():
         (5, 3, lambda r, t: math.sqrt(12) * (5 * r**5 - 4 * r**3) * np.cos(3 * t)),
     ],
 )
-def test_polynomials_have_the_forms_of_the_table(n, m, form):
+def test_zernike_polynomials_match_closed_forms(n, m, form):
     r, t = np.meshgrid(np.linspace(0, 1, 11), np.linspace(0, 6, 13))
 
     assert zernike(n, m, r * np.cos(t), r * np.sin(t)) == pytest.approx(form(r, t), abs=1e-13)
 
 
-def test_coefficients_are_the_same_in_either_order_and_unit():
+def test_psf_is_independent_of_index_and_unit():
     psfs = [
         aberrated(**c).psf(WAVELENGTH_NM).psf_per_um2
         for c in (
@@ -108,7 +108,7 @@ def test_coefficients_are_the_same_in_either_order_and_unit():
         assert psf == pytest.approx(psfs[0], abs=1e-12)
 
 
-def test_a_coefficient_depends_on_the_colour_as_it_says():
+def test_coefficients_vary_with_wavelength():
     own = Zernike(coefficients={4: 0.2}, unit="waves")
     of_one = Zernike(coefficients={4: 0.2}, unit="waves", wavelength_nm=550.0)
     table = Zernike(coefficients={4: [0.0, 1.0]}, unit="waves", wavelength_nm=[400.0, 600.0])
@@ -125,7 +125,7 @@ def test_a_coefficient_depends_on_the_colour_as_it_says():
 
 
 def hopkins(s, waves):
-    """The overlap of two shifted discs, with the phase that a parabola's difference has there."""
+    """OTF of a defocused circle: overlap of two shifted discs with the phase difference of the parabola."""
     if s >= 1.0:
         return 0.0
     value, _ = quad(
@@ -136,7 +136,7 @@ def hopkins(s, waves):
 
 
 @pytest.mark.parametrize(("waves", "tolerance"), [(0.25, 2e-4), (0.5, 2e-4), (1.0, 3e-4), (2.0, 5e-4), (5.0, 2e-3)])
-def test_a_defocused_circle_has_hopkins_transfer_function(waves, tolerance):
+def test_defocused_circle_has_hopkins_otf(waves, tolerance):
     optics = aberrated(coefficients={4: waves / math.sqrt(12)}, unit="waves")
     s = np.linspace(0.0, 1.1, 45)
 
@@ -146,32 +146,32 @@ def test_a_defocused_circle_has_hopkins_transfer_function(waves, tolerance):
 
 
 @pytest.mark.parametrize("waves", [0.1, 0.5, 0.9, 1.5, 3.3])
-def test_the_middle_of_a_defocused_pattern_is_a_squared_sinc(waves):
+def test_defocused_psf_centre_is_squared_sinc(waves):
     optics = aberrated(coefficients={4: waves / math.sqrt(12)}, unit="waves")
 
     assert optics.strehl(WAVELENGTH_NM) == pytest.approx(np.sinc(waves) ** 2, abs=3e-4)
-    middle = optics.psf(WAVELENGTH_NM, n_points=3).psf_per_um2[1, 1]
-    assert middle * LAMBDA_N_UM**2 * 4 / np.pi == pytest.approx(np.sinc(waves) ** 2, abs=3e-4)
+    centre = optics.psf(WAVELENGTH_NM, n_points=3).psf_per_um2[1, 1]
+    assert centre * LAMBDA_N_UM**2 * 4 / np.pi == pytest.approx(np.sinc(waves) ** 2, abs=3e-4)
 
 
 @pytest.mark.parametrize("distance_m", [0.3, 0.45, 0.8, 3.0])
-def test_a_scene_out_of_focus_has_the_path_difference_of_two_spheres(distance_m):
-    """Exact spheres about the two image points, from the pupil's edge, against the parabola that the package takes."""
+def test_defocus_matches_sphere_path_difference(distance_m):
+    """Reference: exact spheres around the two image points at the pupil edge; the package uses a parabola."""
     optics = lens(focus_distance_m=0.5, f_number=11.0)
     radius_mm = 1.0
     images_mm = [1.0 / (1.0 / 22.0 - 1e-3 / d) for d in (0.5, distance_m)]
 
-    # The wave to the scene's own image, against the wave to the sensor: the sag of one sphere less that of the other.
+    # Difference of the sags of the spheres that converge to the sensor and to the image of the scene.
     sags_mm = [d - math.sqrt(d**2 - radius_mm**2) for d in images_mm]
 
-    # A nearer scene has its image behind the sensor, with the flatter sphere.
+    # A nearer scene is imaged behind the sensor, with a flatter sphere.
     assert optics.defocus_um(distance_m) == pytest.approx((sags_mm[0] - sags_mm[1]) * 1e3, rel=5e-3)
     assert lens().defocus_um(distance_m) == 0.0
     assert optics.defocus_um(0.5) == 0.0
 
 
-def test_a_far_scene_out_of_focus_is_blurred_over_the_circle_of_confusion():
-    """Geometry: a cone over the pupil, cut by the sensor before or behind its tip."""
+def test_defocus_blur_matches_circle_of_confusion():
+    """Reference: geometric cone from the pupil, intersected by the sensor plane."""
     optics = lens(focus_distance_m=0.4, f_number=2.0)
     image_mm, focus_mm = (1.0 / (1.0 / 22.0 - 1e-3 / d) for d in (0.5, 0.4))
     circle_um = 11.0 * abs(focus_mm - image_mm) / image_mm * 1e3  # diameter
@@ -183,7 +183,7 @@ def test_a_far_scene_out_of_focus_is_blurred_over_the_circle_of_confusion():
     assert got == pytest.approx([0.25, 0.64, 1.0], abs=0.03)
 
 
-def test_what_is_out_of_focus_has_the_size_that_the_sensors_place_gives():
+def test_magnification_of_defocused_scene_uses_sensor_distance():
     optics = lens(focus_distance_m=0.4)
     image_mm = 1.0 / (1.0 / 22.0 - 1.0 / 400.0)
 
@@ -192,18 +192,18 @@ def test_what_is_out_of_focus_has_the_size_that_the_sensors_place_gives():
     assert optics.magnification(0.4) == pytest.approx(lens().magnification(0.4))
 
 
-# -- Strehl -----------------------------------------------------------------------------------------------------------------
+# -- Strehl ratio-----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("j", [4, 5, 6, 7, 8, 9, 11, 12, 16, 22, 37])
 @pytest.mark.parametrize("sigma_waves", [0.01, 0.03, 0.07])
-def test_strehl_follows_the_rms_wavefront_error(j, sigma_waves):
+def test_strehl_follows_rms_wavefront_error(j, sigma_waves):
     got = aberrated(coefficients={j: sigma_waves}, unit="waves").strehl(WAVELENGTH_NM)
 
     assert got == pytest.approx(math.exp(-((2 * np.pi * sigma_waves) ** 2)), abs=5e-5 + 500 * sigma_waves**4)
 
 
-def test_tilt_and_piston_are_no_aberration_of_the_pattern_s_height():
+def test_tilt_and_piston_preserve_psf_peak():
     tilted = aberrated(coefficients={1: 0.4, 2: 0.3}, unit="waves").psf(WAVELENGTH_NM, n_points=401)
 
     assert tilted.psf_per_um2.max() == pytest.approx(np.pi / 4 / LAMBDA_N_UM**2, rel=1e-2)
@@ -214,21 +214,21 @@ def test_tilt_and_piston_are_no_aberration_of_the_pattern_s_height():
 
 @pytest.mark.parametrize(("j", "axis"), [(2, 0), (3, 1), (8, 0), (7, 1)])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_positive_tilt_and_coma_move_light_to_positive_coordinates(j, axis, sign):
+def test_tilt_and_coma_move_centroid_by_sign(j, axis, sign):
     image = np.zeros((201, 201))
     image[100, 100] = 1.0
 
     power_map = map_of(aberrated(coefficients={j: sign * 0.15}), image)
     moved = centroid_um(power_map)
 
-    # The mean slope over the disc, times 2N: by Gauss of W n over its rim, of tilt 2 c x or coma c sqrt(8) (3r³ - 2r) cos t.
-    # The far wings of the pattern, which lie beyond the picture, have a tenth of the moment.
+    # Mean slope over the disc times 2N, by the divergence theorem, for W = 2 c x (tilt) and c sqrt(8) (3r³ - 2r) cos t (coma).
+    # The tolerance accounts for the wings of the PSF beyond the picture, which contain a tenth of the moment.
     slope_um = sign * 0.15 * (2.0 if j in (2, 3) else math.sqrt(8))
     assert moved[axis] == pytest.approx(2 * lens().working_f_number(DISTANCE_M) * slope_um, rel=0.12)
     assert moved[1 - axis] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_coma_throws_its_flare_up_and_leaves_the_brightest_place_below():
+def test_positive_coma_flare_points_up():
     psf = aberrated(coefficients={7: 0.25}, unit="waves").psf(WAVELENGTH_NM)
     share = psf.psf_per_um2 * psf.grid.cell_area_um2
     brightest = np.unravel_index(share.argmax(), share.shape)
@@ -238,25 +238,25 @@ def test_coma_throws_its_flare_up_and_leaves_the_brightest_place_below():
     assert psf.grid.y_um[brightest[0]] < 0.0 < mean_y_um
 
 
-def test_the_letter_f_stays_upright_through_coma_and_its_flare_points_up():
+def test_letter_f_is_upright_with_coma():
     letter = np.zeros((120, 100))
-    letter[20:100, 30:40] = letter[90:100, 30:75] = letter[55:65, 30:60] = 1.0  # rows count from below
+    letter[20:100, 30:40] = letter[90:100, 30:75] = letter[55:65, 30:60] = 1.0  # rows count from the bottom
 
     sharp, flared = (map_of(o, letter, pitch_um=116.0).data[0] for o in (lens(), aberrated(coefficients={7: 0.3})))
 
-    # Upright: the long bar above, nothing to the right of the lower half.
+    # Upright: the long bar is at the top, and the lower right is empty.
     assert sharp[95, 70] > 0.5 * sharp.max()
     assert sharp[60, 70] < 0.1 * sharp.max() > sharp[25, 60]
-    # Light of the upper bar is thrown above it, not below.
+    # The flare of the upper bar lies above it.
     above, below = flared[101:109, 45:70].sum(), flared[81:89, 45:70].sum()
     assert above > 4 * below
     assert sharp[101:109, 45:70].sum() == pytest.approx(sharp[81:89, 45:70].sum(), rel=0.2)
 
 
-# -- aberrations that grow with the field -------------------------------------------------------------------------------
+# -- field-dependent aberrations ----------------------------------------------------------------------------------------
 
 
-def test_coma_of_the_field_points_away_from_the_axis():
+def test_field_coma_points_away_from_axis():
     coma = lens(seidel=Seidel(coma_um=0.5, field_radius_um=1000.0), padding="reflect")
     for field_um in ((1000.0, 0.0), (0.0, 1000.0), (-700.0, -700.0)):
         psf = coma.psf(WAVELENGTH_NM, field_um=field_um)
@@ -265,7 +265,7 @@ def test_coma_of_the_field_points_away_from_the_axis():
 
         assert moved @ np.array(field_um) > 0.9 * np.hypot(*moved) * np.hypot(*field_um)
     assert coma.strehl(WAVELENGTH_NM) == pytest.approx(1.0, abs=1e-6)
-    # Coma of 0.15 µm at the rim is 0.15 r³ cos t: its rms less the best tilt is 0.15 / (3 sqrt(8)) µm.
+    # Coma of 0.15 µm at the edge is 0.15 r³ cos t; its rms without tilt is 0.15 / (3 sqrt(8)) µm.
     weak = lens(seidel=Seidel(coma_um=0.15, field_radius_um=1000.0), padding="reflect")
     height = weak.psf(WAVELENGTH_NM, field_um=(1000.0, 0.0)).psf_per_um2.max() * LAMBDA_N_UM**2 * 4 / np.pi
     assert height == pytest.approx(math.exp(-((2 * np.pi * 0.15 / 0.55 / (3 * math.sqrt(8))) ** 2)), abs=6e-3)
@@ -280,7 +280,7 @@ def test_coma_of_the_field_points_away_from_the_axis():
         ({"field_curvature_um": 1.0}, lambda x, y, hx, hy: (hx * hx + hy * hy) * (x * x + y * y)),
     ],
 )
-def test_each_aberration_is_one_micrometre_where_it_says(part, at_edge):
+def test_seidel_wavefronts_match_closed_forms(part, at_edge):
     seidel = Seidel(**part, field_radius_um=50.0)
     x, y = np.array([1.0, 0.3]), np.array([0.0, -0.4])
 
@@ -298,17 +298,17 @@ def field_lens(**changes):
 
 
 @pytest.mark.parametrize("n_patches", [3, 5])
-def test_a_point_in_the_middle_of_a_patch_has_exactly_its_own_pattern(n_patches):
+def test_psf_is_exact_at_patch_centre(n_patches):
     n = 161
     optics = field_lens(field_patches=n_patches, source_pixel="point")
     image = np.zeros((n, n))
-    at = (120, 40) if n_patches == 5 else (80, 80)  # the middles are quarters or halves of the picture apart
+    at = (120, 40) if n_patches == 5 else (80, 80)  # patch centres are quarters or halves of the picture apart
     image[at] = 1.0
     power_map = map_of(optics, image)
     p_um = power_map.grid.pitch_um
     field_um = tuple((i - 80) * p_um * (161 / 160 if n_patches == 5 else 0) for i in (at[1], at[0]))
 
-    twin = map_of(
+    reference = map_of(
         lens(
             padding="zero",
             padding_cells=40,
@@ -317,33 +317,33 @@ def test_a_point_in_the_middle_of_a_patch_has_exactly_its_own_pattern(n_patches)
         image,
     )
 
-    # The point lies less than half a cell from the patch's middle.
-    assert power_map.data[0] == pytest.approx(twin.data[0], abs=0.02 * twin.data.max())
+    # The point is within half a cell of the patch centre.
+    assert power_map.data[0] == pytest.approx(reference.data[0], abs=0.02 * reference.data.max())
 
 
 @pytest.mark.parametrize("padding_cells", [None, 0, 30])
 @pytest.mark.parametrize("padding", ["reflect", "edge", "zero"])
-def test_the_patchwork_of_patterns_that_are_alike_is_the_plain_convolution(padding, padding_cells):
+def test_patches_with_equal_psfs_match_convolution(padding, padding_cells):
     image = np.random.default_rng(5).random((70, 90)) + 0.5
     options = {"padding": padding, "padding_cells": padding_cells}
     plain = map_of(lens(seidel=Seidel(spherical_um=0.3), **options), image).data
-    # Its field is so wide that the picture lies on the axis.
-    pieces = map_of(lens(seidel=Seidel(spherical_um=0.3, coma_um=1.0, field_radius_um=1e7), **options), image).data
+    # With so large a field radius, all pixels are practically on the axis.
+    patched = map_of(lens(seidel=Seidel(spherical_um=0.3, coma_um=1.0, field_radius_um=1e7), **options), image).data
 
-    # The repetition of the padded picture is the same, but for what a point throws beyond the guard of its patch.
-    assert pieces == pytest.approx(plain, rel=2e-3)
-    assert pieces.sum() == pytest.approx(plain.sum(), rel=1e-3)
+    # The periodic continuation is the same, except for PSF energy beyond the guard of a patch.
+    assert patched == pytest.approx(plain, rel=2e-3)
+    assert patched.sum() == pytest.approx(plain.sum(), rel=1e-3)
 
 
-def test_an_even_field_stays_even_through_a_patchwork_of_large_pictures():
+def test_uniform_scene_stays_uniform_with_patches():
     image = np.ones((400, 420))
-    pieces = map_of(lens(seidel=Seidel(coma_um=1e-9), padding="reflect"), image, pitch_um=46.4).data
+    patched = map_of(lens(seidel=Seidel(coma_um=1e-9), padding="reflect"), image, pitch_um=46.4).data
     plain = map_of(lens(padding="reflect"), image, pitch_um=46.4).data
 
-    assert pieces == pytest.approx(plain, rel=2e-3)
+    assert patched == pytest.approx(plain, rel=2e-3)
 
 
-def test_the_patchwork_keeps_the_light_and_its_error_falls_as_told():
+def test_isoplanatic_error_decreases_with_patch_count():
     image = np.zeros((161, 161))
     rng = np.random.default_rng(2)
     for at in rng.integers(50, 111, (12, 2)):
@@ -357,25 +357,25 @@ def test_the_patchwork_keeps_the_light_and_its_error_falls_as_told():
             warnings.simplefilter("ignore", SamplingWarning)
             errors.append(optics.isoplanatic_error(scene_of(image, pitch_um=46.4)) if n_patches < 11 else 0.0)
     truth = maps[-1]
-    astray = [0.5 * np.abs(m - truth).sum() / truth.sum() for m in maps]
+    displaced = [0.5 * np.abs(m - truth).sum() / truth.sum() for m in maps]
 
     for got in maps:
         assert got.sum() == pytest.approx(truth.sum(), rel=5e-3)
-    assert errors[1] < 0.32 * errors[0]  # a quarter, nearly
-    # What is told is that of the worst place; the points lie all over.
-    assert astray[0] < errors[0]
-    assert astray[1] < errors[1]
-    assert astray[0] > 0.1 * errors[0]
+    assert errors[1] < 0.32 * errors[0]  # approximately a quarter
+    # The reported error is the maximum over the field; the points are spread over it.
+    assert displaced[0] < errors[0]
+    assert displaced[1] < errors[1]
+    assert displaced[0] > 0.1 * errors[0]
 
 
-def test_the_same_pattern_everywhere_has_no_patchwork_error():
+def test_constant_psf_has_zero_isoplanatic_error():
     assert aberrated(coefficients={7: 0.1}).isoplanatic_error(scene_of(np.ones((50, 50)))) == 0.0
 
 
-# -- lateral colour -----------------------------------------------------------------------------------------------------
+# -- lateral chromatic aberration ---------------------------------------------------------------------------------------
 
 
-def test_lateral_colour_moves_points_outwards_by_its_factor():
+def test_lateral_colour_scales_point_positions():
     optics = lens(lateral_colour=LateralColour(wavelength_nm=[450.0, 650.0], magnification=[0.98, 1.02]))
     image = np.zeros((161, 161))
     image[120, 140] = 1.0
@@ -392,8 +392,8 @@ def test_lateral_colour_moves_points_outwards_by_its_factor():
     assert power_map.data.sum(axis=(1, 2)) == pytest.approx(plain.data.sum(axis=(1, 2)), rel=3e-3)
 
 
-def test_a_camera_sees_lateral_colour_without_resampling():
-    """A layout of large squares against the same scene drawn at its two sizes, one wavelength each."""
+def test_camera_applies_lateral_colour_without_resampling():
+    """Reference: the same scene at both image sizes, one wavelength each, on a layout of large squares."""
     colour = LateralColour(wavelength_nm=[450.0, 650.0], magnification=[0.97, 1.0])
     rng = np.random.default_rng(8)
     image = rng.random((150, 150))
@@ -408,7 +408,7 @@ def test_a_camera_sees_lateral_colour_without_resampling():
     for band, size in enumerate(colour.magnification):
         alone = lens(focal_length_mm=22.0).power_map(scene)
         grid = fs.Grid.centred(alone.grid.shape, alone.grid.pitch_um * size)
-        # The same light in smaller cells; diffraction is that of the sensor, not of the cell.
+        # The same power in smaller cells; diffraction depends on the sensor coordinates, not on the cells.
         small = lens(padding="periodic")
         narrow = fs.Scene(
             scene.basis,
@@ -419,7 +419,7 @@ def test_a_camera_sees_lateral_colour_without_resampling():
             DISTANCE_M,
         )
         irradiance = small.power_map(narrow).data[0]
-        # Falloff is that of the scene as it stands.
+        # Relative illumination depends on the unscaled scene.
         y, x = ((np.arange(150) - 74.5)[:, None] * 11.6e-6, (np.arange(150) - 74.5) * 11.6e-6)
         ratio = ((1 + (x**2 + y**2) * size**2 / DISTANCE_M**2) / (1 + (x**2 + y**2) / DISTANCE_M**2)) ** 2
         joules = fs.units.photon_energy_j(scene.wavelength_nm[band])
@@ -429,7 +429,7 @@ def test_a_camera_sees_lateral_colour_without_resampling():
     assert got == pytest.approx(expected, rel=1e-4)
 
 
-def test_a_capture_through_a_lens_without_lateral_colour_is_the_same_bit_for_bit():
+def test_unit_lateral_colour_is_bit_identical():
     scene = scene_of(np.random.default_rng(0).random((80, 80)), wavelength_nm=(500.0, 600.0))
     sensor = fs.Sensor(fs.layout.grid(n_x=6, n_y=6, pitch_um=3.0))
     flat = LateralColour(wavelength_nm=[500.0, 600.0], magnification=[1.0, 1.0])
@@ -443,14 +443,14 @@ def test_a_capture_through_a_lens_without_lateral_colour_is_the_same_bit_for_bit
 
 
 @pytest.mark.parametrize("moved_cells", [3.0, 11.3, 27.0])
-def test_light_that_is_moved_over_many_wide_cells_arrives_there(moved_cells):
-    """A tilt on cells of 2.6 λN, against the same on cells a fifth as wide, added up."""
+def test_tilt_displaces_psf_over_wide_cells(moved_cells):
+    """Reference: the same tilt on cells a fifth as wide as 2.6 λN, binned."""
     n = 81
     maps = []
     lambda_n_um = 0.55 * lens().working_f_number(DISTANCE_M)
     for finer in (1, 5):
         cell_um = 2.6 * lambda_n_um / finer
-        # A tilt of c µm rms moves light by 2N times its slope, 2c a radius.
+        # A tilt of c µm rms has a slope of 2c per radius, and displaces the image by 2N times the slope.
         tilt_um = moved_cells * 2.6 * lambda_n_um / (4.0 * lens().working_f_number(DISTANCE_M))
         image = np.zeros((n * finer, n * finer))
         image[n * finer // 2, (n // 2 - 20) * finer + finer // 2] = 1.0
@@ -458,11 +458,11 @@ def test_light_that_is_moved_over_many_wide_cells_arrives_there(moved_cells):
         data = map_of(optics, image, pitch_um=cell_um / optics.magnification(DISTANCE_M)).data[0]
         maps.append(data.reshape(n, finer, n, finer).sum(axis=(1, 3)) / data.sum())
 
-    # As far out as geometry throws the light, its transfer function is sampled for all but 1.3 % of it.
+    # At the geometric blur radius, the sampled OTF represents all but 1.3 % of the energy.
     assert 0.5 * np.abs(maps[0] - maps[1]).sum() < 0.015
 
 
-def test_aberrations_are_compared_and_hashed_and_keep_their_numbers():
+def test_zernike_is_hashable_and_immutable():
     waves = [450.0, 650.0]
     one = Zernike(coefficients={4: [0.1, 0.2]}, wavelength_nm=waves)
     waves[1] = 5000.0
@@ -481,8 +481,8 @@ def test_aberrations_are_compared_and_hashed_and_keep_their_numbers():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Zernike(coefficients={}), "'coefficients' must be numbers by their indices"),
-        (lambda: Zernike(coefficients=[0.1]), "'coefficients' must be numbers by their indices"),
+        (lambda: Zernike(coefficients={}), "'coefficients' must be a mapping of indices to numbers"),
+        (lambda: Zernike(coefficients=[0.1]), "'coefficients' must be a mapping of indices to numbers"),
         (lambda: Zernike(coefficients={0: 0.1}), "'coefficients' has an index that must be >= 1, got 0"),
         (lambda: Zernike(coefficients={-1: 0.1}, index="osa"), "'coefficients' has an index that must be >= 0, got -1"),
         (lambda: Zernike(coefficients={10**6: 0.1}), "'coefficients' has an index that must be <= 5151"),
@@ -495,26 +495,29 @@ def test_aberrations_are_compared_and_hashed_and_keep_their_numbers():
         (lambda: Zernike(coefficients={4: 0.1}, index="fringe"), "'index' must be one of 'noll', 'osa'"),
         (lambda: Zernike(coefficients={4: 0.1}, unit="nm"), "'unit' must be one of 'um', 'waves'"),
         (lambda: Zernike(coefficients={4: 0.1}, wavelength_nm=0.0), "'wavelength_nm' must be > 0"),
-        (lambda: Zernike(coefficients={4: 0.1}, wavelength_nm=[600.0, 500.0]), "'wavelength_nm' must rise"),
+        (
+            lambda: Zernike(coefficients={4: 0.1}, wavelength_nm=[600.0, 500.0]),
+            "'wavelength_nm' must be strictly increasing",
+        ),
         (lambda: Seidel(coma_um=float("inf")), "'coma_um' must be finite"),
         (lambda: Seidel(coma_um=1.0, field_radius_um=0.0), "'field_radius_um' must be > 0"),
         (lambda: LateralColour(wavelength_nm=[500.0], magnification=[2.0]), "'magnification' must be from 0.9 to 1.1"),
         (
             lambda: LateralColour(wavelength_nm=[500.0, 600.0], magnification=[1.0]),
-            "'wavelength_nm' must rise, and be as many",
+            "'wavelength_nm' must be strictly increasing and have one value per",
         ),
         (lambda: zernike(2, 1, 0.0, 0.0), "'m' must be from -n to n = 2 in steps of two, got 1"),
         (lambda: lens(zernike={4: 0.1}), "'zernike' must be a foveasim.optics.Zernike, got a dict"),
-        (lambda: lens(seidel=Seidel(coma_um=1.0)), "'padding' must not be 'periodic' where aberrations differ"),
+        (lambda: lens(seidel=Seidel(coma_um=1.0)), "'padding' must not be 'periodic' with aberrations that vary"),
         (lambda: lens(focus_distance_m=0.02), "'focus_distance_m' must be larger than the focal length, 0.022 m"),
         (lambda: lens(focus_distance_m=-1.0), "'focus_distance_m' must be > 0"),
         (lambda: lens(field_patches=0), "'field_patches' must be >= 1"),
         (
             lambda: aberrated(coefficients={4: 1000.0}).mtf(1.0, 550.0),
-            "'aberrations' throw light of 550 nm .* times λN aside, more than 128; see that coefficients are in their unit",
+            "'aberrations' must blur a point by at most 128 λN, got .* at 550 nm; check the unit of the coefficients",
         ),
     ],
 )
-def test_bad_aberrations_are_refused(make, message):
+def test_invalid_aberrations_raise(make, message):
     with pytest.raises(ParameterError, match=f"^{message}"):
         make()

@@ -1,4 +1,4 @@
-"""Optics against closed forms: Airy pattern, falloff, photometry of the lens, energy."""
+"""Optics against closed forms: Airy pattern, relative illumination, lens photometry, energy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from foveasim.errors import ParameterError, SamplingWarning
 from foveasim.optics import circular_otf
 
 DISTANCE_M = 0.56
-#: Fraction of an Airy pattern's light in a centred square of side x λN (tabulated from the pattern's double integral).
+#: Ensquared energy of the Airy pattern for squares of side x λN, from numerical double integration.
 ENSQUARED = {0.5: 0.177327, 1.0: 0.528891, 1.5: 0.766734, 2.0: 0.833845, 2.44: 0.844488}
 
 
@@ -24,7 +24,7 @@ def lens(**changes):
 
 
 def airy_map(cells_per_lambda_n, n, optics=None, wavelength_nm=550.0):
-    """Map of one point source whose λN is so many cells wide, with the point at the middle of the map."""
+    """Map of a point source at the centre of the map, with the given number of cells per λN."""
     optics = lens() if optics is None else optics
     lambda_n_um = wavelength_nm * 1e-3 * optics.working_f_number(DISTANCE_M)
     pitch_um = lambda_n_um / cells_per_lambda_n
@@ -46,27 +46,27 @@ def ensquared(power_map, side_um):
     return fs.Integrator(square, power_map.grid)(power_map.data)[0, 0] / total
 
 
-# -- the transfer function -------------------------------------------------------------------------------------------
+# -- transfer function -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("s", "mtf"), [(0.0, 1.0), (0.25, 0.68504), (0.5, 0.39100), (0.40397, 0.5), (1.0, 0.0), (3.0, 0.0)]
 )
-def test_otf_of_a_circle_has_its_tabulated_values(s, mtf):
+def test_circular_otf_matches_tabulated_values(s, mtf):
     assert circular_otf(s) == pytest.approx(mtf, abs=5e-6)
 
 
-def test_otf_is_the_overlap_of_two_circles():
+def test_circular_otf_equals_circle_overlap():
     x, y = np.meshgrid(np.linspace(-1, 1, 2001), np.linspace(-1, 1, 2001))
     is_inside = x**2 + y**2 < 1
     for shift in (100, 400, 900):
         overlap = (is_inside[:, shift:] & is_inside[:, : 2001 - shift]).sum() / is_inside.sum()
 
-        # The circles' centres are `shift` cells of 1/1000 radius apart; s is that over the diameter.
+        # The centres of the circles are `shift` / 1000 radii apart; s is this distance over the diameter.
         assert circular_otf(shift / 2000) == pytest.approx(overlap, abs=2e-4)
 
 
-# -- the diffraction pattern ----------------------------------------------------------------------------------------
+# -- point spread function ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -81,25 +81,25 @@ def test_otf_is_the_overlap_of_two_circles():
         (2.44, 25 / 2.44, 2049),
     ],
 )
-def test_ensquared_energy_is_exact_where_the_square_has_its_edges_on_cell_borders(side, cells_per_lambda_n, n):
+def test_cell_aligned_ensquared_energy_is_exact(side, cells_per_lambda_n, n):
     power_map, lambda_n_um = airy_map(cells_per_lambda_n, n)
 
     assert ensquared(power_map, side * lambda_n_um) == pytest.approx(ENSQUARED[side], abs=1e-5)
 
 
 @pytest.mark.parametrize("side", [0.5, 1.5, 2.0, 2.44])
-def test_ensquared_energy_errs_by_the_square_of_the_cell_elsewhere(side):
+def test_ensquared_energy_error_is_second_order(side):
     errors = []
     for cells_per_lambda_n in (5, 15):
         power_map, lambda_n_um = airy_map(cells_per_lambda_n, 1537)
         errors.append(ensquared(power_map, side * lambda_n_um) - ENSQUARED[side])
 
-    # Three times finer: nine times less. A square's edge lies at another place of its cell each time, so only about.
+    # Cells three times finer reduce the error about nine times; the factor varies with the position of the edge in its cell.
     assert abs(errors[1]) < abs(errors[0]) / 4.5
 
 
 @pytest.mark.parametrize("wavelength_nm", [450.0, 620.0])
-def test_irradiance_of_a_point_follows_the_airy_formula(wavelength_nm):
+def test_point_irradiance_follows_airy_pattern(wavelength_nm):
     power_map, _ = airy_map(24, 1201, wavelength_nm=wavelength_nm)
     line = (
         power_map.data[0, 600, 600:700]
@@ -108,27 +108,27 @@ def test_irradiance_of_a_point_follows_the_airy_formula(wavelength_nm):
     )
     v = np.pi * np.arange(1, 100) / 24
 
-    airy = (np.pi / 4) * (2 * j1(v) / v) ** 2 / 24**2  # fraction of the light in a cell of λN/24
-    # Cell means differ from samples by the curvature of the pattern over a cell.
+    airy = (np.pi / 4) * (2 * j1(v) / v) ** 2 / 24**2  # fraction of the energy in a cell of λN/24
+    # Cell means differ from samples by the curvature of the PSF over a cell.
     assert line[1:] == pytest.approx(airy, abs=3e-3 * airy[0])
 
 
 @pytest.mark.parametrize("cells_per_lambda_n", [0.07, 0.13, 0.19, 0.3, 0.4, 0.9, 1.7])
-def test_cells_wider_than_the_pattern_hold_its_exact_share(cells_per_lambda_n):
-    """The middle cell is a square of side 1/cells λN, whatever the sampling theorem says of the pattern."""
+def test_wide_cells_contain_exact_ensquared_energy(cells_per_lambda_n):
+    """The centre cell is a square of side 1/cells λN, also where the PSF is undersampled."""
     power_map, lambda_n_um = airy_map(cells_per_lambda_n, 301)
     fine, _ = airy_map(cells_per_lambda_n * 15, 301 * 5)
 
-    share = power_map.data[0, 150, 150] / power_map.data.sum()
+    fraction = power_map.data[0, 150, 150] / power_map.data.sum()
 
-    assert share == pytest.approx(ensquared(fine, lambda_n_um / cells_per_lambda_n), abs=2e-4)
+    assert fraction == pytest.approx(ensquared(fine, lambda_n_um / cells_per_lambda_n), abs=2e-4)
 
 
-def test_a_square_source_pixel_widens_the_pattern_by_its_square():
+def test_square_source_pixel_convolves_psf():
     point, _ = airy_map(3, 301)
     square, _ = airy_map(3, 301, lens(source_pixel="square"))
     fine, _ = airy_map(15, 1505)
-    # A square pixel is the sum of its 25 parts, each a point on the finer grid (which errs by the part's square).
+    # A square pixel is the sum of 25 points on the finer grid, up to the size of its cells.
     steps = range(-2, 3)
     parts = sum(np.roll(fine.data[0], (dy, dx), (0, 1)) for dy in steps for dx in steps) / 25
     coarse = parts.reshape(301, 5, 301, 5).sum(axis=(1, 3))
@@ -138,12 +138,12 @@ def test_a_square_source_pixel_widens_the_pattern_by_its_square():
     assert square.data.max() < 0.97 * point.data.max()
 
 
-# -- energy and falloff ---------------------------------------------------------------------------------------------
+# -- energy and relative illumination -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("single", 1e-6), ("double", 1e-12)])
 @pytest.mark.parametrize("f_number", [1.4, 4.0, 16.0])
-def test_no_light_is_lost(precision, tolerance, f_number):
+def test_power_map_conserves_flux(precision, tolerance, f_number):
     rng = np.random.default_rng(0)
     scene = fs.Scene.from_picture(
         rng.random((120, 150)),
@@ -159,7 +159,7 @@ def test_no_light_is_lost(precision, tolerance, f_number):
         got_w = optics.power_map(scene).data.sum(dtype=np.float64) * optics.grid(scene).cell_area_um2
     x, y = np.meshgrid((np.arange(150) - 74.5) * 30e-6, (np.arange(120) - 59.5) * 30e-6)
     cos4 = (0.56**2 / (0.56**2 + x**2 + y**2)) ** 2
-    # Every pixel's flux into the pupil: radiance x area x projected solid angle of the lens, on the scene's side.
+    # Flux of each pixel into the pupil: radiance x area x projected solid angle of the lens in object space.
     into_image = np.pi / (1 + 4 * optics.working_f_number(0.56) ** 2) * optics.magnification(0.56) ** 2
     flux_w = (2.0 * scene.basis[0].astype(np.float64) * 30.0**2 * cos4).sum() * into_image
 
@@ -168,7 +168,7 @@ def test_no_light_is_lost(precision, tolerance, f_number):
 
 @pytest.mark.parametrize("f_number", [1.4, 2.8, 8.0])
 @pytest.mark.parametrize("distance_m", [0.06, 0.56, 1e4])
-def test_radiance_on_the_axis_gives_the_irradiance_of_the_camera_equation(f_number, distance_m):
+def test_on_axis_irradiance_follows_camera_equation(f_number, distance_m):
     optics = lens(f_number=f_number)
     d_mm = 1.0 / (1.0 / 22.0 - 1e-3 / distance_m)
     n_image = d_mm / (22.0 / f_number)  # image distance over pupil diameter
@@ -185,12 +185,12 @@ def test_radiance_on_the_axis_gives_the_irradiance_of_the_camera_equation(f_numb
 @pytest.mark.parametrize(("emission", "power"), [("lambertian", 4), ("isotropic", 3)])
 @pytest.mark.parametrize(("precision", "tolerance"), [("single", 1e-6), ("double", 1e-12)])
 @pytest.mark.parametrize("at", [(64, 128), (0, 64), (128, 0), (10, 97)])
-def test_light_of_a_point_falls_off_by_the_cosine_law(emission, power, precision, tolerance, at):
-    half_m = 0.56 * np.tan(np.radians(30.0))  # the middle of the border is at 30 degrees
+def test_point_flux_follows_cosine_falloff(emission, power, precision, tolerance, at):
+    half_m = 0.56 * np.tan(np.radians(30.0))  # the centre of an edge is at 30 degrees
     pitch_um = half_m * 1e6 / 64
     optics = lens(emission=emission, precision=precision, f_number=1.4)
 
-    def light_of(pixel):
+    def flux_of(pixel):
         scene = fs.Scene.point_sources(
             shape=(129, 129),
             pixels=[pixel],
@@ -204,13 +204,13 @@ def test_light_of_a_point_falls_off_by_the_cosine_law(emission, power, precision
     radius_m = np.hypot(at[0] - 64, at[1] - 64) * pitch_um * 1e-6
     cos = 0.56 / np.hypot(0.56, radius_m)
 
-    assert light_of(at) / light_of((64, 64)) == pytest.approx(cos**power, rel=tolerance)
+    assert flux_of(at) / flux_of((64, 64)) == pytest.approx(cos**power, rel=tolerance)
     assert at != (64, 128) or cos**4 == pytest.approx(0.5625)
 
 
 @pytest.mark.parametrize(("emission", "power"), [("lambertian", 4), ("isotropic", 3)])
-def test_a_flat_scene_shows_the_cosine_law_over_its_field(emission, power):
-    """The far wings of the diffraction pattern mix the field a little, here by less than 2e-5."""
+def test_uniform_scene_follows_cosine_falloff(emission, power):
+    """The far wings of the PSF average over the field; the effect is below 2e-5 here."""
     n = 257
     half_m = 0.56 * np.tan(np.radians(30.0))
     scene = fs.Scene.flat(
@@ -224,7 +224,7 @@ def test_a_flat_scene_shows_the_cosine_law_over_its_field(emission, power):
     assert (data / data[n // 2, n // 2])[inside, inside] == pytest.approx((cos**power)[inside, inside], abs=2e-5)
 
 
-def test_isotropic_points_give_the_irradiance_of_equation_3():
+def test_isotropic_irradiance_follows_equation_3():
     """Eq. 3 integrated over the sensor plane: A0² p0² cos³ (π a²) / (2π H²) for each pixel of the scene."""
     optics = lens(emission="isotropic")
     power_map, _ = airy_map(3, 201, optics)
@@ -248,19 +248,19 @@ def test_aplanatic_irradiance_conserves_entrance_pupil_flux(f_number, distance_m
     projected_sr = (2.0 * np.pi * r_m * cos2**2 / distance_m**2).sum() * a_m / 2000
     per_radiance_sr = projected_sr / optics.magnification(distance_m) ** 2
 
-    # Small pupil against the distance of the scene: off by (a/H)², at most 2.5e-4 here.
+    # The small-pupil approximation is off by (a/H)², at most 2.5e-4 here.
     assert optics.irradiance_per_radiance(distance_m) == pytest.approx(
         per_radiance_sr, rel=(a_m / distance_m) ** 2 + 1e-6
     )
     isotropic = lens(f_number=f_number, lens="aplanatic", emission="isotropic")
-    # A hemisphere of even radiance emits π L per area, isotropic points L in 2π sr: a factor of 2π on the axis.
+    # A Lambertian surface emits π L per area, isotropic points emit L into 2π sr: a factor of 2π on the axis.
     assert optics.irradiance_per_radiance(distance_m) == pytest.approx(
         2.0 * np.pi * isotropic.irradiance_per_radiance(distance_m), rel=1e-14
     )
 
 
 @pytest.mark.parametrize(("f_number", "percent"), [(4.0, 1.56), (2.8, 3.19), (1.4, 12.76)])
-def test_thin_and_aplanatic_irradiance_differ(f_number, percent):
+def test_aplanatic_irradiance_exceeds_thin_lens(f_number, percent):
     thin, aplanatic = (
         lens(f_number=f_number, lens=kind).irradiance_per_radiance(np.inf) for kind in ("thin", "aplanatic")
     )
@@ -269,7 +269,7 @@ def test_thin_and_aplanatic_irradiance_differ(f_number, percent):
     assert lens(f_number=f_number).irradiance_per_radiance(np.inf) == thin
 
 
-def test_transmission_scales_the_light():
+def test_transmission_scales_irradiance():
     full, _ = airy_map(3, 101)
     half, _ = airy_map(3, 101, lens(transmission=0.5))
 
@@ -282,13 +282,13 @@ def test_transmission_scales_the_light():
 @pytest.mark.parametrize(
     ("focal_mm", "distance_m", "m"), [(22.0, 0.56, 22 / 538), (50.0, 0.1, 1.0), (35.0, 35.035, 1e-3)]
 )
-def test_magnification_is_that_of_the_thin_lens(focal_mm, distance_m, m):
+def test_magnification_follows_thin_lens_equation(focal_mm, distance_m, m):
     assert lens(focal_length_mm=focal_mm).magnification(distance_m) == pytest.approx(m, rel=1e-12)
 
 
-def test_the_picture_is_upright_and_not_mirrored():
+def test_picture_is_upright_and_not_mirrored():
     target = np.zeros((40, 60))
-    target[30, 45] = 1.0  # high and to the right
+    target[30, 45] = 1.0  # upper right
     scene = fs.Scene(target[np.newaxis], np.ones((1, 1)), np.array([550.0]), np.array([1.0]), 100.0, 0.56)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SamplingWarning)
@@ -303,18 +303,18 @@ def test_the_picture_is_upright_and_not_mirrored():
 
 
 @pytest.mark.parametrize("padding", ["reflect", "edge"])
-def test_a_flat_scene_stays_flat_to_its_borders(padding):
+def test_uniform_scene_stays_uniform_at_boundary(padding):
     scene = fs.Scene.flat(shape=(150, 151), pitch_um=11.6, distance_m=10.0, radiance_w_m2_sr_nm=1.0, band_width_nm=1.0)
     data = lens(padding=padding, focal_length_mm=400.0).power_map(scene).data[0]
 
     assert data == pytest.approx(np.full(data.shape, data.mean()), rel=1e-6)
 
 
-def test_darkness_around_the_picture_takes_light_from_its_border():
+def test_zero_padding_reduces_boundary_irradiance():
     scene = fs.Scene.flat(shape=(150, 151), pitch_um=11.6, distance_m=0.56, radiance_w_m2_sr_nm=1.0, band_width_nm=1.0)
     data = lens(padding="zero").power_map(scene).data[0]
 
-    # At a straight border half the blur's weight lies in the dark, in a corner three quarters.
+    # Outside the picture lies half of the PSF at an edge, and three quarters at a corner.
     assert data[75, 0] / data[75, 75] == pytest.approx(0.5, abs=0.1)
     assert data[0, 0] / data[75, 75] == pytest.approx(0.25, abs=0.1)
 
@@ -322,8 +322,8 @@ def test_darkness_around_the_picture_takes_light_from_its_border():
 @pytest.mark.parametrize("shape", [(60, 41), (33, 1), (1, 50)])
 @pytest.mark.parametrize("padding", ["reflect", "edge", "zero", "periodic"])
 @pytest.mark.parametrize("cells_per_lambda_n", [4.1, 1.3, 0.21])
-def test_a_map_is_the_padded_picture_convolved_with_the_pattern(shape, padding, cells_per_lambda_n):
-    """The twin adds up shifted copies of the pattern of one point, from a far larger periodic picture."""
+def test_map_equals_padded_picture_convolved_with_psf(shape, padding, cells_per_lambda_n):
+    """Reference: sum of shifted PSFs, taken from a much larger periodic picture."""
     rng = np.random.default_rng(shape[0])
     pad = 15
     mode = {"reflect": "reflect", "edge": "edge", "zero": "constant", "periodic": "wrap"}[padding]
@@ -339,7 +339,7 @@ def test_a_map_is_the_padded_picture_convolved_with_the_pattern(shape, padding, 
 
     tan2 = [((np.arange(n) - (n - 1) / 2) * pitch_um * 1e-6 / DISTANCE_M) ** 2 for n in shape]
     lit = image / (1 + tan2[0][:, np.newaxis] + tan2[1]) ** 2
-    # Periods as the transform has them: the padded size made fast, or the picture itself.
+    # Periods of the transform: the padded size rounded up to a fast FFT size, or the picture size.
     periods = [n if padding == "periodic" else scipy.fft.next_fast_len(n + 2 * pad, real=True) for n in shape]
     widths = [((p - n) // 2, p - n - (p - n) // 2) for n, p in zip(shape, periods, strict=True)]
     padded = np.pad(lit, widths, mode=mode)
@@ -349,17 +349,16 @@ def test_a_map_is_the_padded_picture_convolved_with_the_pattern(shape, padding, 
     expected = np.real(np.fft.ifft2(np.fft.fft2(padded) * np.fft.fft2(wrapped)))
     expected = expected[widths[0][0] :, widths[1][0] :][: shape[0], : shape[1]]
 
-    # The pattern's own picture ends at 200 cells: 2 / (π² r) of its light lies beyond r = 200 cells in units of λN, and comes
-    # back on its other side.
-    astray = 2 / np.pi**2 / (200 / cells_per_lambda_n)
-    assert got == pytest.approx(expected, abs=astray * lit.max() + 1e-6)
+    # The PSF is known up to 200 cells: 2 / (π² r) of its energy lies beyond r = 200 cells, in units of λN, and wraps around.
+    wrapped_fraction = 2 / np.pi**2 / (200 / cells_per_lambda_n)
+    assert got == pytest.approx(expected, abs=wrapped_fraction * lit.max() + 1e-6)
 
 
 # -- wavelengths --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
-def test_the_collapsed_route_equals_the_sum_of_the_power_maps(precision):
+def test_weighted_maps_equal_weighted_sum_of_maps(precision):
     rng = np.random.default_rng(1)
     wavelength_nm = np.linspace(420.0, 700.0, 15)
     scene = fs.Scene(
@@ -381,7 +380,7 @@ def test_the_collapsed_route_equals_the_sum_of_the_power_maps(precision):
     assert collapsed == pytest.approx(expected, abs=expected.max() * (3e-6 if precision == "single" else 3e-8))
 
 
-def test_each_wavelength_has_its_own_blur():
+def test_psf_width_scales_with_wavelength():
     blue, _ = airy_map(6, 401, wavelength_nm=450.0)
     scene = fs.Scene.point_sources(
         shape=(401, 401),
@@ -395,11 +394,11 @@ def test_each_wavelength_has_its_own_blur():
     both = lens().power_map(scene).data
 
     assert both[0] == pytest.approx(blue.data[0], rel=1e-6, abs=1e-9 * blue.data.max())
-    # Twice the wavelength: four times the area, a quarter of the peak (less what a cell mean takes off the sharper one).
+    # Twice the wavelength: four times the area and a quarter of the peak, apart from the averaging over cells.
     assert both[1].max() / both[0].max() == pytest.approx(0.25, rel=0.02)
 
 
-def test_weights_of_zero_cost_and_give_nothing():
+def test_zero_weights_give_zero_map():
     scene = fs.Scene.flat(shape=(32, 32), pitch_um=500.0, distance_m=1.0, radiance_w_m2_sr_nm=1.0, band_width_nm=1.0)
     dark, light = lens(padding="reflect").weighted_maps(scene, np.array([[0.0], [1.0]]))
 
@@ -410,16 +409,16 @@ def test_weights_of_zero_cost_and_give_nothing():
 # -- limits -------------------------------------------------------------------------------------------------------------
 
 
-def test_too_small_a_picture_for_the_aperture_is_warned_of():
+def test_small_picture_warns_about_equation_5():
     scene = fs.Scene.flat(shape=(20, 400), pitch_um=11.6, distance_m=0.56, radiance_w_m2_sr_nm=1.0, band_width_nm=1.0)
 
     # a / (H λ / (p0 min(M, N))) = 1.375 mm / (0.56 m x 550 nm / (11.6 µm x 20)) = 1.04 at f/8
-    with pytest.warns(SamplingWarning, match=r"Eq\. 5 wants .*, and it is 1\.04 times that"):
+    with pytest.warns(SamplingWarning, match=r"Eq\. 5 of the paper requires .*, got 1\.04 times"):
         lens(f_number=8.0).power_map(scene)
 
 
 @pytest.mark.parametrize("distance_m", [0.022, 0.01, 1e-6])
-def test_a_scene_inside_the_focal_length_is_refused(distance_m):
+def test_scene_within_focal_length_raises(distance_m):
     scene = fs.Scene.flat(
         shape=(20, 20), pitch_um=1.0, distance_m=distance_m, radiance_w_m2_sr_nm=1.0, band_width_nm=1.0
     )
@@ -444,6 +443,6 @@ def test_a_scene_inside_the_focal_length_is_refused(distance_m):
         ("source_pixel", "round", "must be one of 'point', 'square'"),
     ],
 )
-def test_a_bad_parameter_is_refused_by_name(name, value, message):
+def test_invalid_optics_parameter_raises(name, value, message):
     with pytest.raises(ParameterError, match=f"'{name}' {message}"):
         lens(**{name: value})

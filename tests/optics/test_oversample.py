@@ -1,4 +1,4 @@
-"""Cells of power maps finer than the source pixels: exact means, and photosites as small as the PSF."""
+"""Oversampled power maps: exact cell means, and photosites as small as the PSF."""
 
 import warnings
 from dataclasses import replace
@@ -17,7 +17,7 @@ LAMBDA_N_UM = 1e-3 * WAVELENGTH_NM * OPTICS.working_f_number(DISTANCE_M)
 
 
 def pitch_of(cells_per_lambda_n):
-    """Pixel pitch of a scene whose image has a number of pixels per λN."""
+    """Pixel pitch of a scene for a given number of image pixels per λN."""
     return LAMBDA_N_UM / cells_per_lambda_n / OPTICS.magnification(DISTANCE_M)
 
 
@@ -39,7 +39,7 @@ def block_means(cells, k):
 
 
 def airy_energy(centre, sides):
-    """Energy of the Airy pattern in rectangles around points, all in λN: Gauss quadrature of (2 J1(πr) / πr)² π/4."""
+    """Energy of the Airy pattern in rectangles, in λN: Gauss quadrature of (2 J1(πr) / πr)² π/4."""
     node, weight = np.polynomial.legendre.leggauss(24)
     found = []
     for (x, y), (width, height) in zip(centre, sides, strict=True):
@@ -62,13 +62,13 @@ def test_fine_cells_average_to_source_cells(k, cells_per_lambda_n, source_pixel,
 
     assert fine.grid.bounds_um == pytest.approx(coarse.grid.bounds_um, rel=1e-12)
     assert fine.grid.shape == (66 * k, 70 * k)
-    # Many aliases are summed through a fit: 3e-7 of the peak for a circle, 1e-4 for other pupils.
+    # Sums of many aliases are interpolated: 3e-7 of the peak for a circle, 1e-4 for other pupils.
     tolerance = {"circle": 1e-6, "coma": 1e-4}[pupil] if cells_per_lambda_n < 0.7 else 1e-12
     np.testing.assert_allclose(block_means(fine.data[0], k), coarse.data[0], atol=tolerance * coarse.data.max())
 
 
 @pytest.mark.parametrize(("cells_per_lambda_n", "k"), [(0.5, 2), (0.7, 3), (1.2, 2), (2.0, 2), (1.0, 5)])
-def test_fine_cells_hold_the_airy_energy(cells_per_lambda_n, k):
+def test_fine_cells_contain_airy_energy(cells_per_lambda_n, k):
     n = 160
     scene = points_of(cells_per_lambda_n, (n, n), [(n // 2, n // 2)])
     fine = replace(OPTICS, oversample=k).power_map(scene)
@@ -79,13 +79,13 @@ def test_fine_cells_hold_the_airy_energy(cells_per_lambda_n, k):
     sides = np.full(centre.shape, fine.grid.pitch_x_um / LAMBDA_N_UM)
     got = fine.data[0, near, near].ravel() / fine.data.sum()
 
-    # A periodic picture of 80 λN or more returns the 0.25 % of the energy beyond it to all cells alike.
+    # In a periodic picture of at least 80 λN, the 0.25 % of the energy beyond it is spread uniformly over the cells.
     np.testing.assert_allclose(got, airy_energy(centre, sides), atol=2e-3 * sides[0, 0] ** 2)
 
 
 @pytest.mark.parametrize("padding", ["reflect", "zero", "periodic"])
 @pytest.mark.parametrize("source_pixel", ["point", "square"])
-def test_flat_scene_stays_flat_on_fine_cells(padding, source_pixel):
+def test_uniform_scene_stays_uniform_on_fine_cells(padding, source_pixel):
     optics = replace(OPTICS, padding=padding, source_pixel=source_pixel, oversample=3)
     scene = fs.Scene.flat(
         shape=(80, 90),
@@ -96,15 +96,15 @@ def test_flat_scene_stays_flat_on_fine_cells(padding, source_pixel):
         band_width_nm=1.0,
     )
     data = optics.power_map(scene).data[0]
-    middle = data[90:150, 90:180]
+    centre = data[90:150, 90:180]
 
-    # Off the axis by at most 0.03 mm at 10 mm. Zeros beyond the picture take the wings of the PSF.
-    assert np.ptp(middle) / middle.mean() < (0.02 if padding == "zero" else 5e-5)
+    # At most 0.03 mm off the axis at 10 mm. With zero padding, the wings of the PSF are missing.
+    assert np.ptp(centre) / centre.mean() < (0.02 if padding == "zero" else 5e-5)
 
 
 @pytest.mark.parametrize("cells_per_lambda_n", [1.0, 1.2, 1.5, 2.0, 3.0, 4.5])
 def test_auto_oversample_bounds_pixel_error(cells_per_lambda_n):
-    """The fraction of a point's energy in pixels of side λN anywhere around it, against quadrature of the Airy pattern."""
+    """Energy of a point in pixels of side λN at random offsets, against quadrature of the Airy pattern."""
     n = int(80 * cells_per_lambda_n) // 2 * 2
     scene = points_of(cells_per_lambda_n, (n, n), [(n // 2, n // 2)])
     point_um = 0.5 * LAMBDA_N_UM / cells_per_lambda_n
@@ -137,8 +137,8 @@ def test_capture_settings_contain_oversample():
     assert camera.power_map(points_of(1.5, (100, 100), [(50, 50)])).grid.shape == (400, 400)
 
 
-def test_wide_source_pixels_are_not_oversampled():
-    """Pixels wider than λN: finer cells would show each emitter by itself."""
+def test_wide_source_pixels_disable_auto_oversample():
+    """For pixels wider than λN, finer cells would resolve each emitter."""
     scene = points_of(0.9, (120, 120), [(60, 60)])
     sensor = fs.Sensor(fs.layout.grid(n_x=10, n_y=10, pitch_um=2.0))
     auto, plain = (fs.Camera(optics=replace(OPTICS, oversample=k), sensor=sensor) for k in ("auto", 1))
@@ -147,8 +147,8 @@ def test_wide_source_pixels_are_not_oversampled():
     assert (auto.photoelectrons_per_s(scene) == plain.photoelectrons_per_s(scene)).all()
 
 
-def test_auto_oversample_stays_within_memory():
-    """Maps of at most 2^27 cells: the pixels of a large scene are divided less, or not at all."""
+def test_auto_oversample_respects_memory_limit():
+    """Maps have at most 2^27 cells, so that large scenes are oversampled less."""
     for shape, expected in (((1000, 1000), 4), ((5000, 4000), 2), ((6000, 6000), 1)):
         scene = fs.Scene.flat(
             shape=shape,
@@ -161,8 +161,8 @@ def test_auto_oversample_stays_within_memory():
         assert OPTICS.auto_oversample(scene) == expected
 
 
-def test_field_patches_and_lateral_colour_oversample():
-    """Each band on the grid of its own image size, with aberrations that grow from the axis."""
+def test_oversample_supports_patches_and_lateral_colour():
+    """Each band has its own image size and grid, with field-dependent aberrations."""
     optics = replace(
         OPTICS,
         padding="reflect",
@@ -190,13 +190,13 @@ def test_field_patches_and_lateral_colour_oversample():
 
 
 @pytest.mark.parametrize("oversample", [0, 17, 1.5, "fine"])
-def test_bad_oversample_raises_by_name(oversample):
+def test_invalid_oversample_raises(oversample):
     with pytest.raises(fs.errors.ParameterError, match="oversample"):
         replace(OPTICS, oversample=oversample)
 
 
-def test_negative_sites_of_coarse_cells_warn():
-    """Order 2 asked for on cells wider than the PSF: gradients at a point overshoot below 0."""
+def test_negative_site_values_warn_on_coarse_cells():
+    """With order=2 on cells wider than the PSF, gradients at a point undershoot 0."""
     scene = points_of(0.8, (60, 60), [(30, 30)])
     cell_um = LAMBDA_N_UM / 0.8
     layout = fs.layout.grid(n_x=40, n_y=40, pitch_um=0.25 * cell_um).translate(0.5 * cell_um, 0.5 * cell_um)
@@ -206,7 +206,7 @@ def test_negative_sites_of_coarse_cells_warn():
 
     assert rate.min() == 0.0
 
-    # The photosites that are negative by themselves: none is left to compare with.
+    # A layout of the negative photosites alone: all values are negative.
     every = np.array(
         [camera.integrator(camera.power_map(scene).grid, order=2)(camera.power_map(scene).data[0])]
     ).ravel()

@@ -1,4 +1,4 @@
-"""Pupils against closed forms: areas, transfer functions, patterns, and the light of maps made through them."""
+"""Pupils against closed forms: areas, transfer functions, PSFs, and power maps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from foveasim.optics import Annulus, Blades, PupilImage, Slit, Spider, circular_
 from foveasim.optics._aperture import Aperture, overlaps
 
 WAVELENGTH_NM = 550.0
-#: λN in µm of the lens below at infinity.
+#: λN in µm of the lens below, focused at infinity.
 LAMBDA_N_UM = 0.55 * 4.0
 
 
@@ -25,7 +25,7 @@ def lens(**changes):
 
 
 def clear(x, y, wavelength_nm):
-    """A clear circle that the package cannot know to be one."""
+    """Clear circle as a callable, so that the package samples it."""
     return np.ones(np.broadcast_shapes(x.shape, y.shape))
 
 
@@ -47,11 +47,11 @@ def point_scene(optics, cells_per_lambda_n=4.0, n=301, wavelength_nm=(WAVELENGTH
     )
 
 
-# -- the shapes -------------------------------------------------------------------------------------------------------
+# -- shapes -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("pupil", "share"),
+    ("pupil", "fraction"),
     [
         (Annulus(0.0), 1.0),
         (Annulus(0.5), 0.75),
@@ -66,19 +66,19 @@ def point_scene(optics, cells_per_lambda_n=4.0, n=301, wavelength_nm=(WAVELENGTH
         (lambda x, y, w: 1j * np.ones((1, 1)), 1.0),  # noqa: ARG005
     ],
 )
-def test_the_light_of_a_pupil_is_its_area(pupil, share):
+def test_pupil_transmittance_equals_area_fraction(pupil, fraction):
     optics, circle = lens(pupil=pupil), lens()
 
     total = [o.power_map(point_scene(o, n=151)).data.sum() for o in (optics, circle)]
 
-    assert total[0] / total[1] == pytest.approx(share, rel=8e-4)
+    assert total[0] / total[1] == pytest.approx(fraction, rel=8e-4)
 
 
-def test_a_spider_takes_off_the_area_of_its_vanes():
-    whole, vaned = Aperture([], [], 0.0), Aperture([Spider(3, 0.02, angle_deg=10.0)], [], 0.0)
+def test_spider_removes_vane_area():
+    clear_circle, vaned = Aperture([], [], 0.0), Aperture([Spider(3, 0.02, angle_deg=10.0)], [], 0.0)
 
-    # Three bars of the width 0.04 and the length 1, in radii; in the middle they meet over a small triangle's reach.
-    assert whole.transmittance(550.0) - vaned.transmittance(550.0) == pytest.approx(3 * 0.04 / np.pi, rel=0.02)
+    # Three bars of width 0.04 and length 1, in radii; they overlap in a small central triangle.
+    assert clear_circle.transmittance(550.0) - vaned.transmittance(550.0) == pytest.approx(3 * 0.04 / np.pi, rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -91,15 +91,15 @@ def test_a_spider_takes_off_the_area_of_its_vanes():
         (Annulus(0.3), [(0.4, 0.0)], [(0.0, 0.2)]),
     ],
 )
-def test_a_pupil_is_open_where_it_says(pupil, open_at, closed_at):
-    for places, is_open in ((open_at, True), (closed_at, False)):
-        for x, y in places:
+def test_pupil_is_open_at_expected_points(pupil, open_at, closed_at):
+    for positions, is_open in ((open_at, True), (closed_at, False)):
+        for x, y in positions:
             assert bool(pupil(np.array([x]), np.array([y]), 550.0)[0]) is is_open
 
 
-def test_a_picture_of_a_pupil_is_upright_and_its_pixels_are_squares():
+def test_pupil_image_is_upright_with_square_pixels():
     picture = np.zeros((4, 4), np.uint8)
-    picture[0, 3] = 255  # above, to the right
+    picture[0, 3] = 255  # upper right
     picture[3, 0] = 128
     pupil = PupilImage(picture)
     x, y = points(8)
@@ -112,7 +112,7 @@ def test_a_picture_of_a_pupil_is_upright_and_its_pixels_are_squares():
     assert PupilImage(picture, values="power")(x, y, 550.0)[0, 0] == pytest.approx(np.sqrt(128 / 255))
 
 
-def test_a_picture_file_of_a_pupil_is_read(tmp_path):
+def test_pupil_image_reads_picture_file(tmp_path):
     from PIL import Image
 
     n = 400
@@ -124,12 +124,12 @@ def test_a_picture_file_of_a_pupil_is_read(tmp_path):
         PupilImage(tmp_path / "no.png")
 
 
-def test_a_measured_wavefront_moves_light_to_where_it_grows():
+def test_measured_tilt_displaces_psf():
     y = np.linspace(1.0, -1.0, 65)[:, np.newaxis] * np.ones(65)
     psf = lens(pupil=PupilImage(np.ones((2, 2)), wavefront_um=0.3 * y)).psf(WAVELENGTH_NM)
     top = np.unravel_index(psf.psf_per_um2.argmax(), psf.psf_per_um2.shape)
 
-    # A path difference of w µm for each radius turns the wave by w/a: w 2N µm on the sensor (edges of its pixels aside).
+    # A path difference of w µm per radius tilts the wave by w/a: w 2N µm on the sensor, apart from the pixel edges.
     assert psf.grid.y_um[top[0]] == pytest.approx(0.3 * 8.0 * 65 / 64, abs=psf.grid.pitch_um)
     assert psf.grid.x_um[top[1]] == 0.0
 
@@ -138,7 +138,7 @@ def test_a_measured_wavefront_moves_light_to_where_it_grows():
 
 
 @pytest.mark.parametrize("n_across", [192.0, 200.3, 333.3, 512.0])
-def test_the_sampled_circle_has_the_transfer_function_of_the_closed_form(n_across):
+def test_sampled_circle_otf_matches_closed_form(n_across):
     n = int(np.ceil(n_across))
     otf = Aperture([clear], [], 0.0).transfer(550.0, n_across, n + 3, (0.0, 0.0), np.float64)
     s = np.arange(-n - 3, n + 4) / n_across
@@ -148,7 +148,7 @@ def test_the_sampled_circle_has_the_transfer_function_of_the_closed_form(n_acros
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 30.0, 77.0])
-def test_between_samples_it_is_right_too(angle_deg):
+def test_interpolated_otf_matches_closed_form(angle_deg):
     s = np.linspace(0.0, 1.2, 601)
 
     got = lens(pupil=clear).otf(s / LAMBDA_N_UM * 1e3, WAVELENGTH_NM, angle_deg=angle_deg)
@@ -158,8 +158,8 @@ def test_between_samples_it_is_right_too(angle_deg):
 
 
 @pytest.mark.parametrize("obscuration", [0.2, 0.5, 0.8])
-def test_an_annulus_has_oneills_transfer_function(obscuration):
-    """Overlap of two discs with holes, from the areas of the lenses in which pairs of circles meet."""
+def test_annulus_has_oneill_mtf(obscuration):
+    """Overlap of two annuli, from the lens-shaped intersections of pairs of circles."""
     s = np.linspace(0.0, 1.0, 101)
 
     def lens_area(r1, r2, distance):
@@ -181,23 +181,23 @@ def test_an_annulus_has_oneills_transfer_function(obscuration):
     assert lens(pupil=Annulus(e)).mtf(s / LAMBDA_N_UM * 1e3, WAVELENGTH_NM) == pytest.approx(expected, abs=2e-3)
 
 
-def test_a_slit_passes_fine_gratings_along_itself_alone():
+def test_slit_mtf_depends_on_direction():
     slit = lens(pupil=Slit(0.1))
     frequency_per_mm = np.array([0.3, 0.9]) / LAMBDA_N_UM * 1e3
 
     along = slit.mtf(frequency_per_mm, WAVELENGTH_NM)
     across = slit.mtf(frequency_per_mm, WAVELENGTH_NM, angle_deg=90.0)
 
-    # As good as a rectangle: a triangle of its own length's cut-off.
+    # Approximately a rectangle, whose MTF is a triangle up to the cut-off of its length.
     assert along == pytest.approx([0.7, 0.1], abs=0.01)
     assert across == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
-# -- patterns -------------------------------------------------------------------------------------------------------------
+# -- point spread functions -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("obscuration", [0.2, 0.4, 0.7])
-def test_an_annulus_has_the_difference_of_two_airy_amplitudes(obscuration):
+def test_annulus_psf_is_airy_amplitude_difference(obscuration):
     psf = lens(pupil=Annulus(obscuration)).psf(WAVELENGTH_NM)
     v = np.pi * np.hypot(psf.grid.x_um, psf.grid.y_um[:, np.newaxis]) / LAMBDA_N_UM + 1e-12
     e = obscuration
@@ -208,15 +208,15 @@ def test_an_annulus_has_the_difference_of_two_airy_amplitudes(obscuration):
     assert psf.psf_per_um2 == pytest.approx(expected, abs=2e-4 * expected.max())
 
 
-def test_a_circle_has_the_airy_pattern_by_either_way():
+def test_sampled_circle_psf_is_airy_pattern():
     closed, sampled = (lens(pupil=p).psf(WAVELENGTH_NM, n_points=129) for p in (None, clear))
 
     assert closed.psf_per_um2[64, 64] == pytest.approx(np.pi / 4 / LAMBDA_N_UM**2, rel=1e-9)
     assert sampled.psf_per_um2 == pytest.approx(closed.psf_per_um2, abs=1e-4 * closed.psf_per_um2.max())
 
 
-def test_a_hexagonal_iris_makes_a_star_of_six_rays_and_three_vanes_too():
-    # Rays stand at right angles to edges: of the hexagon with a corner on the x axis at 30, 90, 150 ... degrees.
+def test_hexagon_and_three_vanes_give_six_rays():
+    # Rays are perpendicular to edges: at 30, 90, 150 ... degrees for the hexagon with a vertex on the x axis.
     for pupil, first_deg in ((Blades(6), 30.0), (Spider(3, 0.03), 90.0)):
         psf = lens(pupil=pupil).psf(WAVELENGTH_NM, n_points=801, pitch_um=0.25 * LAMBDA_N_UM)
         x_um, y_um = psf.grid.x_um, psf.grid.y_um[:, np.newaxis]
@@ -228,8 +228,8 @@ def test_a_hexagonal_iris_makes_a_star_of_six_rays_and_three_vanes_too():
         assert on > 5 * off
 
 
-def test_light_in_circles_and_squares_has_its_tabulated_values():
-    """Airy's first three dark rings hold 83.778, 90.993 and 93.765 %; squares as integrated from the pattern."""
+def test_encircled_and_ensquared_energy_match_tables():
+    """Encircled energy of the first three Airy zeros: 83.778, 90.993 and 93.765 %; squares by integration."""
     radius_um = np.array([1.21967, 2.23313, 3.23832]) * LAMBDA_N_UM
     side_um = np.array([[0.5, 1.0], [1.5, 2.0]]) * LAMBDA_N_UM
     in_squares = [[0.177327, 0.528891], [0.766734, 0.833845]]
@@ -242,7 +242,7 @@ def test_light_in_circles_and_squares_has_its_tabulated_values():
     assert lens().ensquared_energy(200.0 * LAMBDA_N_UM, WAVELENGTH_NM) == pytest.approx(1.0, abs=5e-3)
 
 
-def test_light_in_squares_is_the_integral_of_the_pattern():
+def test_ensquared_energy_is_psf_integral():
     optics = lens(pupil=(Blades(5, angle_deg=12.0), Annulus(0.3)))
     psf = optics.psf(WAVELENGTH_NM, n_points=400, pitch_um=0.01 * LAMBDA_N_UM)
 
@@ -251,17 +251,17 @@ def test_light_in_squares_is_the_integral_of_the_pattern():
     assert got == pytest.approx(psf.psf_per_um2.sum() * psf.grid.cell_area_um2, abs=1e-4)
 
 
-def test_the_image_of_a_near_point_is_wider_by_the_bellows_factor():
+def test_near_point_psf_scales_with_bellows_factor():
     near, far = (lens().psf(WAVELENGTH_NM, distance_m=d).grid.pitch_um for d in (0.044, None))
 
     assert near / far == pytest.approx(2.0)
 
 
-# -- maps -------------------------------------------------------------------------------------------------------------------
+# -- power maps--------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("cells_per_lambda_n", [4.1, 1.3, 0.4, 0.11])
-def test_a_map_through_a_sampled_circle_equals_that_of_the_closed_form(cells_per_lambda_n):
+def test_sampled_circle_map_matches_closed_form(cells_per_lambda_n):
     closed, sampled = lens(), lens(pupil=clear)
 
     data = [
@@ -272,30 +272,30 @@ def test_a_map_through_a_sampled_circle_equals_that_of_the_closed_form(cells_per
     assert data[1].sum() == pytest.approx(data[0].sum(), rel=1e-9)
 
 
-def test_a_map_of_a_point_is_its_pattern():
+def test_point_map_equals_psf():
     optics = lens(pupil=Blades(5, angle_deg=20.0), zernike=fs.optics.Zernike(coefficients={7: 0.1, 5: -0.05}))
     power_map = optics.power_map(point_scene(optics, 12.0, n=401))
     psf = optics.psf(WAVELENGTH_NM, distance_m=0.56, pitch_um=power_map.grid.pitch_um, n_points=401)
-    share = power_map.data[0] / power_map.data.sum()
+    fraction = power_map.data[0] / power_map.data.sum()
 
-    # Means over cells of λN/12 against values in their middles; the map is periodic and has all the light.
-    assert share == pytest.approx(psf.psf_per_um2 * psf.grid.cell_area_um2, abs=6e-3 * share.max())
+    # Means over cells of λN/12 against samples at their centres; the periodic map contains the total energy.
+    assert fraction == pytest.approx(psf.psf_per_um2 * psf.grid.cell_area_um2, abs=6e-3 * fraction.max())
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("single", 1e-5), ("double", 1e-9)])
-def test_a_pupil_of_any_form_loses_no_light(precision, tolerance):
+def test_obstructed_pupil_conserves_flux(precision, tolerance):
     optics = lens(pupil=(Annulus(0.3), Spider(4, 0.02)), precision=precision)
     rng = np.random.default_rng(3)
     scene = fs.Scene(rng.random((1, 90, 110)), np.ones((1, 1)), np.array([550.0]), np.array([2.0]), 40.0, 0.56)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SamplingWarning)
-        got, whole = (o.power_map(scene).data.sum(dtype=np.float64) for o in (optics, lens()))
+        got, full = (o.power_map(scene).data.sum(dtype=np.float64) for o in (optics, lens()))
 
-    assert got / whole == pytest.approx(Aperture(optics.pupil, [], 0.0).transmittance(550.0), rel=tolerance)
+    assert got / full == pytest.approx(Aperture(optics.pupil, [], 0.0).transmittance(550.0), rel=tolerance)
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
-def test_the_collapsed_route_equals_the_sum_of_the_power_maps(precision):
+def test_weighted_maps_equal_weighted_sum_of_maps(precision):
     rng = np.random.default_rng(1)
     wavelength_nm = np.linspace(420.0, 700.0, 9)
     scene = fs.Scene(
@@ -319,8 +319,8 @@ def test_the_collapsed_route_equals_the_sum_of_the_power_maps(precision):
     assert collapsed == pytest.approx(expected, abs=expected.max() * (3e-6 if precision == "single" else 1e-12))
 
 
-def test_a_pupil_may_depend_on_the_colour():
-    """A filter in the pupil: red passes the whole circle, blue the inner half of its radius."""
+def test_pupil_depends_on_wavelength():
+    """Spectral filter in the pupil: the full circle transmits red, the inner half of its radius blue."""
     optics = lens(pupil=lambda x, y, w: (x**2 + y**2 < (1.0 if w > 500.0 else 0.25)) * 1.0)
     data = optics.power_map(point_scene(optics, wavelength_nm=(450.0, 620.0))).data
 
@@ -328,7 +328,7 @@ def test_a_pupil_may_depend_on_the_colour():
     assert data[0, 150, 150] / data[0].sum() < 0.6 * data[1, 150, 150] / data[1].sum()
 
 
-def test_a_lens_is_pickled_without_what_it_keeps():
+def test_pickled_optics_excludes_cache():
     optics = lens(pupil=Blades(7))
     optics.power_map(point_scene(optics, n=101))
 
@@ -341,7 +341,7 @@ def test_a_lens_is_pickled_without_what_it_keeps():
     )
 
 
-def test_overlaps_are_shares_of_cells():
+def test_overlaps_are_cell_fractions():
     assert overlaps(3, 2.0, 4, 1.5).toarray() == pytest.approx(
         np.array([[0.75, 0.25, 0, 0], [0, 0.5, 0.5, 0], [0, 0, 0.25, 0.75]])
     )
@@ -359,15 +359,15 @@ def test_overlaps_are_shares_of_cells():
         (lambda: Blades(2), "'n_blades' must be >= 3"),
         (lambda: Slit(0.0), "'width_fraction' must be > 0"),
         (lambda: Spider(0, 0.1), "'n_vanes' must be >= 1"),
-        (lambda: PupilImage(np.ones((3, 4))), "'picture' must be square, got the shape"),
-        (lambda: PupilImage(np.full((3, 3), 2.0)), "'picture' must be from 0 to 1, got 2.0"),
+        (lambda: PupilImage(np.ones((3, 4))), "'picture' must be square, got shape"),
+        (lambda: PupilImage(np.full((3, 3), 2.0)), "'picture' must be within 0 to 1, got 2.0"),
         (lambda: PupilImage(np.full((3, 3), np.nan)), "'picture' must be finite everywhere"),
         (lambda: PupilImage(np.ones((3, 3)), wavefront_um=np.ones((2, 3))), "'wavefront_um' must be square"),
         (lambda: lens(pupil="circle"), "'pupil' must be a pupil of foveasim.optics, or a callable"),
         (lambda: lens(pupil=3.0), "'pupil' must be a pupil of foveasim.optics, or a callable"),
     ],
 )
-def test_a_bad_pupil_is_refused(make, message):
+def test_invalid_pupil_raises(make, message):
     with pytest.raises(ParameterError, match=f"^{message}"):
         make()
 
@@ -375,15 +375,18 @@ def test_a_bad_pupil_is_refused(make, message):
 @pytest.mark.parametrize(
     ("pupil", "message"),
     [
-        (lambda x, y, w: 0.0 * x * y, "'pupil' is empty: no light of 550 nm passes it"),  # noqa: ARG005
-        ((Annulus(0.9), lambda x, y, w: x**2 + y**2 < 0.7), "'pupil' is empty"),  # noqa: ARG005
-        (lambda x, y, w: np.full(x.shape, np.nan), "'pupil' must give amplitudes of at most 1 at 550 nm, got nan"),  # noqa: ARG005
-        (lambda x, y, w: 2.0, "'pupil' must give amplitudes of at most 1 at 550 nm, got 2.0"),  # noqa: ARG005
-        ((Annulus(0.9), lambda x, y, w: np.ones(7)), r"'pupil\[1\]' must give an amplitude for each of the points"),  # noqa: ARG005
-        (lambda x, y, w: "open", "'pupil' must give real or complex amplitudes"),  # noqa: ARG005
+        (lambda x, y, w: 0.0 * x * y, "'pupil' must transmit power, got an empty pupil at 550 nm"),  # noqa: ARG005
+        ((Annulus(0.9), lambda x, y, w: x**2 + y**2 < 0.7), "'pupil' must transmit power"),  # noqa: ARG005
+        (lambda x, y, w: np.full(x.shape, np.nan), "'pupil' must return amplitudes <= 1 at 550 nm, got nan"),  # noqa: ARG005
+        (lambda x, y, w: 2.0, "'pupil' must return amplitudes <= 1 at 550 nm, got 2.0"),  # noqa: ARG005
+        (
+            (Annulus(0.9), lambda x, y, w: np.ones(7)),  # noqa: ARG005
+            r"'pupil\[1\]' must return amplitudes that broadcast with x and y",
+        ),
+        (lambda x, y, w: "open", "'pupil' must return real or complex amplitudes"),  # noqa: ARG005
     ],
 )
-def test_a_pupil_that_lets_nothing_through_or_too_much_is_told_when_used(pupil, message):
+def test_invalid_pupil_amplitudes_raise_on_use(pupil, message):
     optics = lens(pupil=pupil)
 
     with pytest.raises(ParameterError, match=f"^{message}"):
@@ -409,12 +412,12 @@ def test_a_pupil_that_lets_nothing_through_or_too_much_is_told_when_used(pupil, 
         (lambda o: o.ensquared_energy([1.0, -1.0], 550.0), "'side_um' must be >= 0"),
     ],
 )
-def test_a_bad_question_about_a_point_is_refused(call, message):
+def test_invalid_point_image_argument_raises(call, message):
     with pytest.raises(ParameterError, match=f"^{message}"):
         call(lens())
 
 
-def test_a_single_frequency_has_a_single_answer():
+def test_mtf_of_scalar_frequency_is_scalar():
     for optics in (lens(), lens(pupil=Annulus(0.3))):
         got = optics.mtf(50.0, WAVELENGTH_NM)
         assert got.shape == ()
@@ -423,20 +426,18 @@ def test_a_single_frequency_has_a_single_answer():
 
 @pytest.mark.parametrize("obscuration", [0.0, 0.5, 0.9])
 @pytest.mark.parametrize("side", [99.0, 101.0, 300.0])
-def test_far_out_the_rest_of_the_light_falls_as_the_pupil_has_edge(side, obscuration):
-    """Outside a square of side a a clear circle leaves 8 sqrt(2) / (π³ a), and an annulus as much more as it has edge."""
+def test_ensquared_energy_tail_scales_with_edge_length(side, obscuration):
+    """Outside a square of side a lies 8 sqrt(2) / (π³ a) for a clear circle, times the relative edge length for an annulus."""
     edge = (1.0 + obscuration) / (1.0 - obscuration**2)
     optics = lens(pupil=Annulus(obscuration)) if obscuration else lens()
     if obscuration and side > 256.0:
-        with pytest.raises(
-            ParameterError, match=r"'side_um' must be <= 256 λN where the pupil is sampled, got 660.0 µm"
-        ):
+        with pytest.raises(ParameterError, match=r"'side_um' must be <= 256 λN for a sampled pupil, got 660.0 µm"):
             optics.ensquared_energy(side * LAMBDA_N_UM, WAVELENGTH_NM)
         return
 
-    rest = 1.0 - optics.ensquared_energy(side * LAMBDA_N_UM, WAVELENGTH_NM)
+    tail = 1.0 - optics.ensquared_energy(side * LAMBDA_N_UM, WAVELENGTH_NM)
 
-    assert rest == pytest.approx(edge * 8 * np.sqrt(2) / (np.pi**3 * side), rel=0.08)
+    assert tail == pytest.approx(edge * 8 * np.sqrt(2) / (np.pi**3 * side), rel=0.08)
 
 
 @pytest.mark.parametrize(
@@ -448,18 +449,20 @@ def test_far_out_the_rest_of_the_light_falls_as_the_pupil_has_edge(side, obscura
         (Blades(4, angle_deg=22.5), 4 * np.sqrt(2) / 2 / 2),
     ],
 )
-def test_padding_grows_with_the_edge_of_the_pupil(pupil, edge):
+def test_aperture_edge_matches_pupil_perimeter(pupil, edge):
     aperture = Aperture([pupil], [], 0.0)
 
     assert aperture.edge(550.0) == pytest.approx(edge, rel=0.05)
 
 
-def test_a_pattern_is_not_shown_beyond_where_it_repeats():
-    with pytest.raises(ParameterError, match=r"'pitch_um' and n_points reach 4506 µm.* more than 512 λN = 1126 µm"):
+def test_psf_beyond_sampled_range_raises():
+    with pytest.raises(
+        ParameterError, match=r"'pitch_um' times .* at most 512 λN = 1126 µm for a sampled pupil, got 4506 µm"
+    ):
         lens(pupil=Annulus(0.3)).psf(WAVELENGTH_NM, pitch_um=LAMBDA_N_UM, n_points=4097)
 
 
-def test_transparency_of_a_picture_of_a_pupil_is_no_light():
+def test_transparent_pupil_pixels_transmit_no_power():
     picture = np.zeros((4, 4, 4), np.uint8)
     picture[..., :3] = 255
     picture[:2, :, 3] = 255  # the upper half is opaque
@@ -473,12 +476,12 @@ def test_transparency_of_a_picture_of_a_pupil_is_no_light():
 @pytest.mark.parametrize(
     "picture", [np.exp(1j * np.ones((3, 3))), [["0.5", "1"], ["1", "1"]], [[1, 0], [0]], np.ones((0, 0))]
 )
-def test_pictures_of_pupils_that_are_no_real_numbers_are_refused(picture):
+def test_non_numeric_pupil_image_raises(picture):
     with pytest.raises(ParameterError, match=r"^'picture' must be (an array of numbers|square)"):
         PupilImage(picture)
 
 
-def test_the_tables_of_a_scene_serve_the_next_frame(monkeypatch):
+def test_otf_tables_are_cached_between_frames(monkeypatch):
     calls = []
     transfer = Aperture.transfer
     monkeypatch.setattr(Aperture, "transfer", lambda self, *a: calls.append(a) or transfer(self, *a))
@@ -502,12 +505,12 @@ def test_the_tables_of_a_scene_serve_the_next_frame(monkeypatch):
         ("power_map", ("x.png",), "'scene' must be a Scene, got a str"),
         ("grid", (None,), "'scene' must be a Scene, got a NoneType"),
         ("isoplanatic_error", (np.ones((3, 3)),), "'scene' must be a Scene, got a ndarray"),
-        ("weighted_maps", ("scene", np.ones((2, 2))), r"'weights' must have the shape \(n_output, 1\)"),
+        ("weighted_maps", ("scene", np.ones((2, 2))), r"'weights' must have shape \(n_output, 1\)"),
         ("weighted_maps", ("scene", [1.0]), "'weights' must have 2 dimensions"),
         ("mtf", (np.ones(2), np.ones(3)), "'wavelength_nm' must be one number"),
     ],
 )
-def test_what_is_no_scene_or_weight_is_refused(method, arguments, message):
+def test_invalid_scene_or_weights_raise(method, arguments, message):
     optics = lens(pupil=Annulus(0.2))
     scene = point_scene(optics, n=64)
 
@@ -516,27 +519,28 @@ def test_what_is_no_scene_or_weight_is_refused(method, arguments, message):
 
 
 @pytest.mark.parametrize("pupil", [Annulus, lambda x: x, [Annulus(0.2), None], print])
-def test_what_cannot_be_called_as_a_pupil_is_refused(pupil):
-    if pupil is print:  # takes anything, and gives nothing
-        with pytest.raises(ParameterError, match="'pupil' must give real or complex amplitudes"):
+def test_uncallable_pupil_raises(pupil):
+    if pupil is print:  # accepts any arguments and returns None
+        with pytest.raises(ParameterError, match="'pupil' must return real or complex amplitudes"):
             lens(pupil=pupil).mtf(1.0, 550.0)
         return
     with pytest.raises(ParameterError, match=r"^'pupil' must be a pupil"):
         lens(pupil=pupil)
 
 
-def test_a_distance_must_be_one_number_and_padding_of_a_size():
+def test_invalid_distance_and_padding_raise():
     optics = lens(padding="zero", padding_cells=200_000)
 
     with pytest.raises(ParameterError, match="'distance_m' must be one number"):
         optics.strehl(550.0, distance_m=np.ones(3))
     with pytest.raises(
-        ParameterError, match="'padding_cells' of 200000 makes a picture of 301 cells 400301 cells wide"
+        ParameterError,
+        match=r"'padding_cells' must give a padded picture of at most 131072 cells, got 301 \+ 2 x 200000 = 400301",
     ):
         list(optics.weighted_maps(point_scene(optics), [[1.0]]))
 
 
-def test_a_list_of_pupils_is_kept_from_later_changes():
+def test_pupil_list_is_copied():
     pupils = [Annulus(0.2)]
     optics = lens(pupil=pupils)
     pupils.append(Slit(0.1))
