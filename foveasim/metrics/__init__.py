@@ -1,4 +1,8 @@
-"""What a sensor and its pictures are worth, in numbers: photon transfer, EMVA 1288, resolution, aliasing, flow, similarity."""
+"""
+Image-quality metrics of sensors and pictures.
+
+Photon transfer, EMVA 1288 parameters, resolution, aliasing, optical flow, and image similarity.
+"""
 
 from __future__ import annotations
 

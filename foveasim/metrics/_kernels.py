@@ -1,4 +1,4 @@
-"""The metrics room's numba kernels: Fourier transforms of polygons."""
+"""Numba kernels of the metrics: Fourier transforms of polygons."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ _ints = types.Array(types.int64, 1, "C", readonly=True)
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 _points = types.Array(types.float64, 2, "C", readonly=True)
 
-#: Below this angle (rad) two terms of the series of sin(v)/v - 1 are exact to float64 ...
+#: Angle (rad) below which the truncated series of sin(v)/v - 1 is exact to float64.
 SERIES_BELOW = 1e-2
-#: ... and below this phase (rad) across a site its transform is its area.
+#: Phase (rad) across a site below which the normalised transform is 1.
 STILL = 1e-140
 
 
 @njit()
 def _sinc_less_one(v):
-    """sin(v) / v - 1 without loss of digits."""
+    """Compute sin(v) / v - 1 without cancellation."""
     if abs(v) < SERIES_BELOW:
         v2 = v * v
         return -v2 / 6.0 * (1.0 - v2 / 20.0 * (1.0 - v2 / 42.0 * (1.0 - v2 / 72.0)))
@@ -31,11 +31,11 @@ def _sinc_less_one(v):
 @njit(types.complex128[:, ::1](_points, _ints, _ints, _points, _floats, _points))
 def polygon_transforms(xy, ring_offsets, site_offsets, centre, area, wave):
     """
-    Integral of exp(-i k·(x - centre)) over each site, over its area, (n_site, n_wave).
+    Compute the mean of exp(-i k·(x - centre)) over each site, (n_site, n_wave).
 
-    ``wave`` are vectors k in rad per unit of length. By Green's theorem the integral is ``(i/k²) Σ (k × e) exp(-i k·m)
-    sin(v)/v`` over edges e with middles m and ``v = k·e/2``. The sum of ``k × e`` around a ring is 0, so 1 is taken off each
-    factor: what is left is small where k is, and no digits cancel on the way to k = 0.
+    ``wave`` contains vectors k in rad per unit of length. By Green's theorem the integral is ``(i/k²) Σ (k × e) exp(-i k·m)
+    sin(v)/v`` over edges e with midpoints m and ``v = k·e/2``. The sum of ``k × e`` around a ring is 0, so 1 can be
+    subtracted from each factor. The differences are small for small k, which avoids cancellation near k = 0.
     """
     out = np.empty((site_offsets.size - 1, wave.shape[0]), np.complex128)
     for site in range(site_offsets.size - 1):

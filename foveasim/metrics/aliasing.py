@@ -1,9 +1,10 @@
 """
-Aliasing: which false frequencies a layout's sites make of a sine that is too fine for them.
+Aliasing: spectra of sampling points, and alias frequencies of sine waves.
 
-A site's value is a sample at its centroid. The transform of samples is the true spectrum convolved with that of the sampling
-points: a lattice has one as strong as the true one at every point of its reciprocal lattice, so that a fine sine comes back
-whole as a coarse one. Points without order spread it as noise, and good ones of these leave the low frequencies clean.
+The value of a site is a sample at its centroid. The transform of the samples is the signal spectrum convolved with the
+spectrum of the sampling points. A lattice has a replica of full strength at each point of its reciprocal lattice, so that a
+sine above the Nyquist frequency appears with full contrast at a lower one. Disordered points spread its power as noise;
+blue-noise points leave low frequencies free of it.
 """
 
 from __future__ import annotations
@@ -31,27 +32,27 @@ from foveasim.units import per_mm_from_per_um, per_um_from_per_mm
 
 __all__ = ["AliasingSpectrum", "SamplingSpectrum", "aliasing_spectrum", "sampling_spectrum"]
 
-#: Steps of the spectrum to the inverse of the region's diameter: a peak of the window is some four steps wide.
+#: Frequency steps per inverse diameter of the region; a peak of the window is approximately four steps wide.
 STEPS = 2
-#: Frequencies to a side, at most: 2 GB at work.
+#: Largest number of frequencies per axis; requires 2 GB of memory.
 MOST_FREQUENCIES = 4096
-#: Highest frequency by default, in median Nyquist frequencies: a lattice's first ring of peaks is at 2.
+#: Default highest frequency in median Nyquist frequencies; the first peaks of a lattice are at 2.
 REACH_NYQUISTS = 4.0
-#: Fewer sites have no spectrum to speak of.
+#: Minimum number of sites for a spectrum.
 LEAST_SITES = 16
-#: The transform of points off a grid: width of the spreading kernel in cells of a grid twice as fine, and its shape (Barnett,
-#: Magland, af Klinteberg 2019, "exponential of semicircle"): right to 1e-7 of the sum of the weights.
+#: Nonuniform FFT: width of the spreading kernel in cells of a grid with twofold oversampling, and its shape parameter (Barnett,
+#: Magland, af Klinteberg 2019, "exponential of semicircle"). The error is 1e-7 of the sum of the weights.
 SPREAD_CELLS, SPREAD_SHAPE = 8, 2.30 * 8
-#: Points spread together: what bounds the memory.
+#: Points per block; limits the memory.
 BLOCK_POINTS = 1 << 16
-#: A peak with its first ring ends at this many inverse radii of the disc: beyond, cos² over a disc has a transform below 0.6 %.
+#: Radius of a peak with its first ring, in inverse radii of the disc; beyond it, the transform of cos² is below 0.6 %.
 PEAK_RADII = 1.6
-#: Rounds of refining the place of a peak, each a quarter of the last one's step.
+#: Iterations that refine the position of a peak; the step is divided by 4 in each.
 N_REFINED = 4
 
 
 class _Region(NamedTuple):
-    """Sites within a disc: places from its centre, weights that fall smoothly to 0 at its border, and its radius."""
+    """Sites within a disc: positions from its centre, window weights, and radius."""
 
     sites: NDArray[np.int64]
     xy_um: Floats
@@ -67,15 +68,15 @@ class SamplingSpectrum:
     Attributes
     ----------
     frequency_per_mm : (n,) float64, 1/mm
-        Of rows and columns, line pairs per mm, 0 in the middle.
+        Frequencies of rows and columns in line pairs per mm, 0 at the centre.
     power : (n, n) float64
-        ``|Σ w exp(-2πi f·x)|² / Σ w²`` at [fy, fx], w the window: 1 on average for points by chance (Poisson), and
-        ``(Σ w)² / Σ w²`` at the peaks of a lattice, which is about half the number of sites: those at the border weigh
-        little. The peak at 0 is a disc of the radius ``peak_per_mm``.
+        ``|Σ w exp(-2πi f·x)|² / Σ w²`` at [fy, fx] for the window w: 1 on average for random (Poisson) points, and
+        ``(Σ w)² / Σ w²`` at the peaks of a lattice. This is approximately half the number of sites, because sites near the
+        boundary have small weights. The peak at 0 is a disc of the radius ``peak_per_mm``.
     nyquist_per_mm : float, 1/mm
-        Median of the region's sites.
+        Median Nyquist frequency of the sites in the region.
     peak_per_mm : float, 1/mm
-        Radius of a peak: what the window makes of a point.
+        Radius of a peak, given by the transform of the window.
     n_sites : int
     """
 
@@ -87,7 +88,7 @@ class SamplingSpectrum:
 
     def radial(self, n_bins: int = 64) -> tuple[Floats, Floats, Floats]:
         """
-        Mean over all directions, and how much directions differ.
+        Compute the radial mean and the anisotropy of the power.
 
         Parameters
         ----------
@@ -96,14 +97,14 @@ class SamplingSpectrum:
         Returns
         -------
         frequency_per_mm : (n_bins,) float64, 1/mm
-            Middles of rings from 0 to the highest frequency; the first ones hold the peak at 0.
+            Centres of rings from 0 to the highest frequency; the first rings contain the peak at 0.
         power, anisotropy : (n_bins,) float64
-            Mean, and variance over the mean squared: about 1 for points without order, more for lattices. NaN in empty rings.
+            Mean, and variance over squared mean: approximately 1 for random points, more for lattices. NaN in empty rings.
 
         Raises
         ------
         ParameterError
-            When the number is not an integer from 1 to 4096.
+            When ``n_bins`` is not an integer from 1 to 4096.
         """
         n_bins = check_count("n_bins", n_bins, at_most=MOST_FREQUENCIES)
         f = self.frequency_per_mm
@@ -122,28 +123,28 @@ class SamplingSpectrum:
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AliasingSpectrum:
     """
-    What a layout makes of one sine wave.
+    Spectrum of a sine wave sampled by a layout.
 
     Attributes
     ----------
     wave_per_mm : (2,) float64, 1/mm
-        The wave's vector.
+        Wave vector.
     frequency_per_mm : (n,) float64, 1/mm
-        Of rows and columns, line pairs per mm, 0 in the middle.
+        Frequencies of rows and columns in line pairs per mm, 0 at the centre.
     amplitude : (n, n) float64
-        Contrast at [fy, fx] in what the sites tell of a wave ``exp(2πi q·x)`` of contrast 1, sites weighted by their area
-        and a smooth window.
+        Contrast at [fy, fx] of the sampled wave ``exp(2πi q·x)`` of contrast 1, with sites weighted by their area and a
+        smooth window.
     nyquist_per_mm, peak_per_mm : float, 1/mm
-        Median of the region's sites, and the radius of a peak.
+        Median Nyquist frequency of the sites in the region, and the radius of a peak.
     baseband_fraction : float
-        Contrast at the wave's own frequency: the pixels' MTF.
+        Contrast at the frequency of the wave; equals the aperture MTF of the sites.
     alias_fraction : float
-        Highest contrast at another frequency up to the Nyquist frequency: the alias that is seen.
+        Highest contrast at any other frequency up to the Nyquist frequency: the visible alias.
     alias_per_mm : (2,) float64, 1/mm
-        Where it is.
+        Frequency vector of the alias.
     noise_fraction : float
-        Fraction of the samples' power at other frequencies up to the Nyquist frequency, the alias included; the power of the
-        samples is spread over one reciprocal cell of them.
+        Power at other frequencies up to the Nyquist frequency, alias included, as a fraction of the power of the samples over
+        one cell of their reciprocal lattice.
     """
 
     wave_per_mm: Floats
@@ -166,21 +167,21 @@ def sampling_spectrum(
     weights: Literal["sites", "area"] = "sites",
 ) -> SamplingSpectrum:
     """
-    Spectrum of a layout's sampling points: their structure factor.
+    Compute the power spectrum (structure factor) of the sampling points of a layout.
 
     Parameters
     ----------
     layout : Layout
         For one filter of a mosaic: ``layout[layout.channel == 1]``.
     centre_um : (x, y), optional, µm
-        Of the disc that is looked at; by default the middle of the layout.
+        Centre of the analysed disc; by default the centre of the layout.
     radius_um : float, optional, µm
-        Half the shorter side of the layout by default. Sites differ in size all over a foveal layout: take a disc in which
-        they do not.
+        Radius of the disc; by default half the shorter side of the layout. In a foveal layout, choose a disc with sites of
+        similar size.
     max_per_mm : float, optional, 1/mm
-        Highest frequency along x and y; by default four times the sites' median Nyquist frequency.
+        Highest frequency along x and y; by default four times the median Nyquist frequency of the sites.
     weights : {"sites", "area"}
-        Whether all sites count alike, or by their area.
+        Whether sites have equal weights or are weighted by area.
 
     Returns
     -------
@@ -189,13 +190,13 @@ def sampling_spectrum(
     Raises
     ------
     ParameterError
-        When an argument is out of range, there are fewer than 16 sites in the disc, or too many frequencies.
+        When an argument is out of range, the disc contains fewer than 16 sites, or there are too many frequencies.
 
     Notes
     -----
-    Sites are weighted by ``cos²(π r / 2R)``, so that the disc's border makes no rings. Frequencies are half the inverse of its
-    diameter apart: no peak falls between. The sum over sites is a fast Fourier transform of points spread on a grid, right to
-    1e-7 of the largest amplitude.
+    Sites are weighted by the window ``cos²(π r / 2R)``, which suppresses rings from the boundary of the disc. The frequency
+    step is half the inverse diameter, so that no peak is missed. The sum over sites is a nonuniform fast Fourier transform with
+    an error of 1e-7 of the largest amplitude.
     """
     check_choice("weights", weights, ("sites", "area"))
     region = _region(layout, centre_um, radius_um)
@@ -221,7 +222,7 @@ def aliasing_spectrum(
     max_per_mm: float | None = None,
 ) -> AliasingSpectrum:
     """
-    How much of a sine wave's contrast comes back at false frequencies.
+    Compute the contrast of a sine wave at its own and at alias frequencies.
 
     Parameters
     ----------
@@ -231,7 +232,7 @@ def aliasing_spectrum(
     centre_um, radius_um
         As for :func:`sampling_spectrum`.
     max_per_mm : float, optional, 1/mm
-        Highest frequency along x and y; by default four times the sites' median Nyquist frequency.
+        Highest frequency along x and y; by default four times the median Nyquist frequency of the sites.
 
     Returns
     -------
@@ -244,7 +245,7 @@ def aliasing_spectrum(
 
     Notes
     -----
-    Each site gives the mean of the wave over its polygon (:func:`polygon_otf`), exactly.
+    Each site measures the exact mean of the wave over its polygon (:func:`polygon_otf`).
     """
     wave = finite_array("wave_per_mm", wave_per_mm, ndim=1)
     if wave.size != 2:
@@ -254,7 +255,7 @@ def aliasing_spectrum(
     weight /= weight.sum()
     nyquist, peak = _median_nyquist_per_mm(layout, region), _peak_per_mm(region)
     frequency = _frequencies_per_mm(region, nyquist, max_per_mm)
-    # The mean over a site is the wave at its centroid, times the site's transfer at the opposite frequency.
+    # The mean over a site is the wave at its centroid, times the OTF of the site at the opposite frequency.
     otf = polygon_otf(layout[region.sites], -wave[np.newaxis])[:, 0]
     sample = weight * otf * np.exp(2j * np.pi * (region.xy_um @ per_um_from_per_mm(wave)))
     amplitude = np.abs(_point_transform(region.xy_um, sample, frequency))
@@ -266,7 +267,7 @@ def aliasing_spectrum(
         best = np.unravel_index(np.where(is_false, amplitude, -1.0).argmax(), amplitude.shape)
         first = np.array([frequency[best[1]], frequency[best[0]]])
         false, at = _refined(region.xy_um, sample, first, float(frequency[1] - frequency[0]), wave, peak)
-    # Parseval: the mean of |amplitude|² over a reciprocal cell of the sites, of the area of their density, is Σ |sample|².
+    # Parseval: the mean of |amplitude|² over a reciprocal cell, whose area is the site density, is Σ |sample|².
     step = per_um_from_per_mm(float(frequency[1] - frequency[0]))
     power = float(np.square(amplitude[is_false]).sum() * step**2)
     density_per_um2 = float(region.weight.sum() / (region.weight * layout.area_um2[region.sites]).sum())
@@ -287,7 +288,7 @@ def aliasing_spectrum(
 def _region(layout: Layout, centre_um: tuple[float, float] | None, radius_um: float | None) -> _Region:
     require_layout(layout)
     if layout.n_sites == 0:
-        raise ParameterError("layout", "must have sites")
+        raise ParameterError("layout", "must have at least one site")
     x_min, y_min, x_max, y_max = layout.bounds_um
     centre = np.array([0.5 * (x_min + x_max), 0.5 * (y_min + y_max)])
     if centre_um is not None:
@@ -301,7 +302,7 @@ def _region(layout: Layout, centre_um: tuple[float, float] | None, radius_um: fl
     sites = np.flatnonzero(r_um < radius_um)
     if sites.size < LEAST_SITES:
         raise ParameterError(
-            "radius_um", f"must take in at least {LEAST_SITES} sites, takes in {sites.size}", radius_um, "µm"
+            "radius_um", f"must enclose at least {LEAST_SITES} sites, encloses {sites.size}", radius_um, "µm"
         )
     return _Region(sites, xy_um[sites], np.cos(0.5 * np.pi * r_um[sites] / radius_um) ** 2, radius_um)
 
@@ -309,7 +310,7 @@ def _region(layout: Layout, centre_um: tuple[float, float] | None, radius_um: fl
 def _median_nyquist_per_mm(layout: Layout, region: _Region) -> float:
     nyquist = nyquist_per_mm(layout[region.sites])
     if not np.isfinite(nyquist).any():
-        raise ParameterError("layout", "must have sites in more than one row")
+        raise ParameterError("layout", "must have sites in more than one row within the region")
     return float(np.nanmedian(nyquist))
 
 
@@ -318,7 +319,7 @@ def _peak_per_mm(region: _Region) -> float:
 
 
 def _frequencies_per_mm(region: _Region, limit_per_mm: float, max_per_mm: float | None) -> Floats:
-    """Equal steps from -max to max, 0 among them."""
+    """Return equally spaced frequencies from -max to max, including 0."""
     highest = REACH_NYQUISTS * limit_per_mm if max_per_mm is None else check_number("max_per_mm", max_per_mm, above=0.0)
     step = float(per_mm_from_per_um(1.0 / (STEPS * 2.0 * region.radius_um)))
     n = int(np.ceil(highest / step * (1.0 - 1e-12)))
@@ -328,7 +329,7 @@ def _frequencies_per_mm(region: _Region, limit_per_mm: float, max_per_mm: float 
             f"must be at most {MOST_FREQUENCIES // 2 * step:.4g} for a region of this size",
             highest,
             "1/mm",
-            "take a smaller radius_um or max_per_mm",
+            "reduce radius_um or max_per_mm",
         )
     return step * np.arange(-n, n + 1, dtype=np.float64)
 
@@ -338,10 +339,11 @@ def _frequencies_per_mm(region: _Region, limit_per_mm: float, max_per_mm: float 
 
 def _point_transform(xy_um: Floats, weight: NDArray[np.inexact], frequency_per_mm: Floats) -> NDArray[np.complex128]:
     """
-    ``Σ w exp(-2πi f·x)`` of points (n, 2) at all pairs of some frequencies around 0 in equal steps, (n_f, n_f) at [fy, fx].
+    Compute ``Σ w exp(-2πi f·x)`` of points (n, 2) by a nonuniform FFT.
 
-    Points must lie within half the inverse of the step from 0. Each is spread over some cells of a fine grid by a smooth
-    kernel, the grid is transformed, and the kernel's own transform divided out.
+    The frequencies are equally spaced around 0; the result is (n_f, n_f) at [fy, fx]. Points must lie within half the inverse
+    frequency step from 0. Each point is spread over cells of a fine grid by a smooth kernel, the grid is transformed, and the
+    transform of the kernel is divided out.
     """
     import scipy.fft
 
@@ -351,7 +353,7 @@ def _point_transform(xy_um: Floats, weight: NDArray[np.inexact], frequency_per_m
     cells = np.zeros(n_grid * n_grid, np.complex128)
     for start in range(0, len(xy_um), BLOCK_POINTS):
         part = slice(start, start + BLOCK_POINTS)
-        # In cells of the grid, one period of which is the inverse of the step.
+        # Positions in grid cells; the period of the grid is the inverse frequency step.
         place = xy_um[part] * (step * n_grid)
         first = np.ceil(place - 0.5 * SPREAD_CELLS).astype(np.int64)
         near = first[..., np.newaxis] + np.arange(SPREAD_CELLS)
@@ -373,7 +375,7 @@ def _point_transform(xy_um: Floats, weight: NDArray[np.inexact], frequency_per_m
 
 
 def _semicircle(share: Floats) -> Floats:
-    """The spreading kernel at fractions of its half width: close to the narrowest in space and frequency at once."""
+    """Evaluate the spreading kernel at fractions of its half width."""
     return np.asarray(
         np.exp(SPREAD_SHAPE * (np.sqrt(np.maximum(1.0 - share * share, 0.0)) - 1.0)) * (np.abs(share) <= 1.0)
     )
@@ -387,12 +389,12 @@ def _refined(
     wave_per_mm: Floats,
     peak_per_mm: float,
 ) -> tuple[float, Floats]:
-    """Height and place of a peak near a frequency and off the wave's own, by direct sums on finer and finer grids."""
+    """Return height and position of an alias peak, by direct sums on successively finer grids."""
     height, half_per_mm = 0.0, 0.5 * step_per_mm
     for _ in range(N_REFINED):
         off = half_per_mm * np.arange(-2, 3)
         near = at_per_mm + np.stack(np.meshgrid(off, off), axis=-1).reshape(-1, 2)
-        # The middle one is off the wave's peak, so there is always one.
+        # The central point lies outside the peak of the wave, so at least one point remains.
         near = near[np.hypot(*(near - wave_per_mm).T) >= peak_per_mm]
         sums = np.array([abs(np.exp(-2j * np.pi * (xy_um @ f)) @ sample) for f in per_um_from_per_mm(near)])
         at_per_mm, height = near[sums.argmax()], float(sums.max())

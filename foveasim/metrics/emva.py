@@ -1,9 +1,10 @@
 """
-The parameters of EMVA 1288 from frames: gain, noise, efficiency, saturation, non-uniformity, linearity, dark current.
+EMVA 1288 parameters from frames of a sensor.
 
-EMVA Standard 1288, Release 4.0 Linear (https://www.emva.org/standards-technology/emva-1288/), of a sensor whose codes grow in
-proportion to the light. What the standard tells of one sort of pixels is told here of each class of photosites. Its split of
-the spatial variance into rows, columns and pixels asks for a grid and is left out, and so are its pictures and histograms.
+System gain, noise, quantum efficiency, saturation, nonuniformity, linearity and dark current according to EMVA Standard 1288,
+Release 4.0 Linear (https://www.emva.org/standards-technology/emva-1288/), for sensors with a linear response. The parameters
+are computed for each class of photosites. The split of the spatial variance into rows, columns and pixels requires a grid and
+is omitted, as are the plots and histograms of the standard.
 """
 
 from __future__ import annotations
@@ -32,60 +33,60 @@ from foveasim.sensor.adc import QUANTISATION_DN2
 
 __all__ = ["Emva1288", "emva1288"]
 
-#: The linearity error is told between these fractions of saturation.
+#: Range of the linearity error in fractions of saturation.
 LINEARITY_FRACTIONS = (0.05, 0.95)
-#: The response's non-uniformity is told at this fraction of saturation.
+#: Level of the PRNU in fractions of saturation.
 PRNU_FRACTION = 0.5
-#: No more of the dark codes than this may be cut off at 0.
+#: Largest permitted fraction of dark codes that are clipped at 0.
 MOST_UNDERFLOW_FRACTION = 0.005
-#: A dark current is a line's slope over at least so many exposures.
+#: Minimum number of points of a straight-line fit: exposures for the dark current, levels for the linearity error.
 LEAST_EXPOSURES = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Emva1288:
     """
-    Parameters of EMVA 1288, for each class of sites.
+    EMVA 1288 parameters of each class of sites.
 
     Attributes
     ----------
     classes : (n_class,)
         Labels of the classes, sorted.
     gain_dn_per_e : (n_class,) float64, DN/e-
-        System gain K: slope of the temporal variance against the mean, less darkness, up to 70 % of saturation.
+        System gain K: slope of the temporal variance against the mean, both dark-corrected, up to 70 % of saturation.
     responsivity_dn_per_ph : (n_class,) float64, DN per photon
-        R: slope of the mean against photons, less darkness, up to 70 % of saturation.
+        Responsivity R: slope of the dark-corrected mean against photons, up to 70 % of saturation.
     qe : (n_class,) float64
         Quantum efficiency, electrons per photon: R / K.
     dark_noise_dn : (n_class,) float64, DN
-        Temporal noise of darkness, quantisation included; at exposure 0 where a dark series was given. At least sqrt(0.24).
+        Temporal dark noise including quantisation; extrapolated to exposure 0 if a dark series is given. At least sqrt(0.24).
     dark_noise_e : (n_class,) float64, e-
-        The same without quantisation: ``sqrt(dark_noise_dn**2 - 1/12) / K``.
+        Dark noise without quantisation: ``sqrt(dark_noise_dn**2 - 1/12) / K``.
     is_hidden : (n_class,) bool
-        Whether quantisation hides the dark noise (a variance below 0.24 DN²): it is then an upper bound.
+        Whether quantisation masks the dark noise (variance below 0.24 DN²), which is then an upper bound.
     saturation_ph : (n_class,) float64, photons
-        Light at the level of the highest temporal variance.
+        Saturation: photons at the level of the highest temporal variance.
     threshold_ph : (n_class,) float64, photons
-        Absolute sensitivity threshold, where the signal is as large as its noise: ``(dark_noise_dn / K + 1/2) / qe``.
+        Absolute sensitivity threshold, at which the SNR is 1: ``(dark_noise_dn / K + 1/2) / qe``.
     linearity_error_min_fraction, linearity_error_max_fraction : (n_class,) float64
-        Largest relative deviations of the mean, down and up, from a line fitted with relative weights from 5 to 95 % of
-        saturation; NaN where there are fewer than three levels.
+        Largest negative and positive relative deviation of the mean from a line fitted with relative weights from 5 to 95 %
+        of saturation; NaN for fewer than three levels.
     dsnu_e : (n_class,) float64, e-
-        DSNU1288: standard deviation from site to site in the dark, over K; NaN where its variance comes out below 0.
+        DSNU1288: spatial standard deviation of dark frames over K; NaN if the estimated variance is negative.
     prnu_fraction : (n_class,) float64
-        PRNU1288: standard deviation from site to site at the level nearest to half saturation, dark variance taken off,
-        over the mean less darkness; NaN where its variance comes out below 0.
+        PRNU1288: spatial standard deviation at the level closest to half saturation, less the dark variance, over the
+        dark-corrected mean; NaN if the estimated variance is negative.
     dark_current_e_per_s, dark_current_of_variance_e_per_s : (n_class,) float64, e-/s
-        From the growth of the mean and of the variance of darkness with exposure; NaN without a dark series.
+        Dark current from the mean and from the variance of dark frames against exposure; NaN without a dark series.
     underflow_fraction : (n_class,) float64
         Fraction of dark codes that are 0.
     transfer, dark : PhotonTransfer
-        What it was told from.
+        Photon transfer curves of the frames and the dark frames.
 
     Notes
     -----
-    The saturation is one of the levels given: it is no finer than they are. A full well cuts off the fluctuations above it, so
-    the variance is highest some 2 standard deviations of the shot noise below the full well.
+    The saturation is one of the given levels, so that its resolution is their spacing. A full well clips the fluctuations
+    above it, so that the variance is highest approximately 2 standard deviations of the shot noise below the full well.
     """
 
     classes: NDArray[Any]
@@ -122,22 +123,22 @@ class Emva1288:
 
     @property
     def snr_max(self) -> Floats:
-        """Highest signal-to-noise ratio, (n_class,): ``sqrt(saturation_e)``, of shot noise alone as the standard defines it."""
+        """Maximum SNR, (n_class,): ``sqrt(saturation_e)``, the shot noise limit of the standard."""
         return np.sqrt(self.saturation_e)
 
     @property
     def snr_max_db(self) -> Floats:
-        """The same in decibels, ``20 log10``, (n_class,)."""
+        """Maximum SNR in decibels, ``20 log10``, (n_class,)."""
         return 20.0 * np.log10(self.snr_max)
 
     @property
     def dynamic_range(self) -> Floats:
-        """Saturation over threshold, (n_class,)."""
+        """Dynamic range: saturation over absolute sensitivity threshold, (n_class,)."""
         return self.saturation_ph / self.threshold_ph
 
     @property
     def dynamic_range_db(self) -> Floats:
-        """The same in decibels, ``20 log10``, (n_class,)."""
+        """Dynamic range in decibels, ``20 log10``, (n_class,)."""
         return 20.0 * np.log10(self.dynamic_range)
 
 
@@ -151,24 +152,24 @@ def emva1288(
     exposure_s: ArrayLike | None = None,
 ) -> Emva1288:
     """
-    Parameters of EMVA 1288 from frames of even light and of darkness.
+    Compute EMVA 1288 parameters from uniformly illuminated frames and dark frames.
 
     Parameters
     ----------
     frames : sequence of levels
-        For each level of light, rising, two or more frames: ``(n_frame, n_site)`` DN, or a list of codes or captures. Levels
-        should reach beyond saturation, and be many: the standard asks for 50. Many frames at about half of saturation,
-        and in the dark, make PRNU and DSNU sharper.
+        Two or more frames for each irradiance level, in increasing order: ``(n_frame, n_site)`` DN, or a list of codes or
+        captures. The levels should exceed saturation; the standard requires 50 levels. Many frames near half saturation and
+        in the dark reduce the uncertainty of PRNU and DSNU.
     dark : sequence of levels
-        Frames of darkness in the same form: one level where all exposures were equally long, or one for each level.
+        Dark frames in the same form: one level for a constant exposure time, or one for each level.
     photons : (n_level,) or (n_level, n_site) float64
-        Expected photons per site at each level: they differ from site to site where sizes do.
+        Expected photons per site at each level; they differ between sites of different size.
     classes : (n_site,), optional
-        Label of each site's class, such as its size or filter; one class of all by default.
+        Class label of each site, such as its size or filter; a single class by default.
     dark_series : sequence of levels, optional
-        Frames of darkness at the exposures ``exposure_s``, three or more, for the dark current, and for the dark noise at
-        exposure 0.
+        Dark frames at three or more exposures ``exposure_s``, for the dark current and the dark noise at exposure 0.
     exposure_s : (n_exposure,) float64, s
+        Exposure of each level of ``dark_series``.
 
     Returns
     -------
@@ -177,13 +178,13 @@ def emva1288(
     Raises
     ------
     ParameterError
-        When shapes do not fit together, a level has fewer than two frames, there is no light, or levels do not rise.
+        When shapes are inconsistent, a level has fewer than two frames, there is no signal, or levels do not increase.
 
     Warns
     -----
     FoveasimWarning
-        When more than 0.5 % of the dark codes are 0: noise is cut off there, and dark noise and DSNU come out too small.
-        When the variance is highest at the last level: saturation is beyond it, and what is told from it, too.
+        When more than 0.5 % of the dark codes are 0: the clipping biases dark noise and DSNU low. When the variance is
+        highest at the last level: the saturation, and the parameters derived from it, are underestimated.
     """
     for name, levels in (("frames", frames), ("dark", dark)):
         if not isinstance(levels, Iterable):
@@ -198,7 +199,7 @@ def emva1288(
     if np.any(top == len(frames) - 1):
         warnings.warn(
             f"the variance is highest at the last level for {np.count_nonzero(top == len(frames) - 1)} of {top.size} classes: "
-            "their saturation is not reached, and comes out too low; add brighter levels",
+            "saturation is not reached and is underestimated; add levels of higher irradiance",
             FoveasimWarning,
             stacklevel=2,
         )
@@ -243,7 +244,7 @@ def emva1288(
 
 
 def _photons(photons: ArrayLike, groups: SiteClasses, n_levels: int) -> Floats:
-    """Photons per site of each level and class, (n_level, n_class)."""
+    """Return the mean photons per site of each level and class, (n_level, n_class)."""
     values = finite_array("photons", photons, at_least=0.0)
     n_sites = int(groups.n_sites.sum())
     if values.shape == (n_levels,):
@@ -251,9 +252,9 @@ def _photons(photons: ArrayLike, groups: SiteClasses, n_levels: int) -> Floats:
     elif values.shape == (n_levels, n_sites):
         level_ph = np.stack([groups.mean(level) for level in values])
     else:
-        raise ParameterError("photons", f"must have the shape ({n_levels},) or ({n_levels}, {n_sites})", values.shape)
+        raise ParameterError("photons", f"must have shape ({n_levels},) or ({n_levels}, {n_sites})", values.shape)
     if np.any(np.diff(level_ph, axis=0) <= 0.0):
-        raise ParameterError("photons", "must rise from level to level in every class", hint="sort the levels")
+        raise ParameterError("photons", "must increase from level to level in every class", hint="sort the levels")
     return level_ph
 
 
@@ -264,17 +265,21 @@ def _dark_current(
     gain_dn_per_e: Floats,
     noise_dn2: Floats,
 ) -> tuple[Floats, Floats, Floats]:
-    """Dark current of the mean and of the variance, (n_class,) e-/s, and the variance at exposure 0, DN²."""
+    """
+    Return the dark currents from mean and variance, and the variance at exposure 0.
+
+    Dark currents are (n_class,) in e-/s, variances (n_class,) in DN².
+    """
     if dark_series is None and exposure_s is None:
         return np.full_like(gain_dn_per_e, np.nan), np.full_like(gain_dn_per_e, np.nan), noise_dn2
     if dark_series is None or exposure_s is None:
-        raise ParameterError("dark_series", "and exposure_s must be given together")
+        raise ParameterError("dark_series", "must be given together with exposure_s")
     series = photon_transfer(dark_series, classes=classes)
     times_s = finite_array("exposure_s", exposure_s, ndim=1, at_least=0.0)
     if times_s.size != series.n_frames.size or np.unique(times_s).size < LEAST_EXPOSURES:
         raise ParameterError(
             "exposure_s",
-            f"must have one exposure for each of the {series.n_frames.size} levels, and at least {LEAST_EXPOSURES} different",
+            f"must have one exposure for each of {series.n_frames.size} levels, at least {LEAST_EXPOSURES} of them different",
             times_s.tolist(),
             "s",
         )
@@ -286,12 +291,12 @@ def _dark_current(
 
 
 def _linearity(level_ph: Floats, mean_dn: Floats, saturation_dn: Floats) -> tuple[Floats, Floats]:
-    """Smallest and largest relative deviation from a line that is fitted with weights of 1 over the signal squared."""
+    """Return the extreme relative deviations from a line fitted with weights 1 / signal²."""
     lowest, highest = np.full_like(saturation_dn, np.nan), np.full_like(saturation_dn, np.nan)
     for c, full_dn in enumerate(saturation_dn):
         y = mean_dn[:, c]
         level = np.arange(y.size)
-        # From the first level above to the last level below, as with the gain.
+        # From the first level above the lower limit to the last level below the upper one.
         is_above, is_below = y >= LINEARITY_FRACTIONS[0] * full_dn, y <= LINEARITY_FRACTIONS[1] * full_dn
         first = np.where(is_above, level, y.size).min()
         last = np.where(is_below, level, -1).max()
@@ -306,17 +311,17 @@ def _linearity(level_ph: Floats, mean_dn: Floats, saturation_dn: Floats) -> tupl
 
 
 def _root(variance_dn2: Floats) -> Floats:
-    """Standard deviation in DN; NaN below 0."""
+    """Return the standard deviation in DN; NaN for a negative variance estimate."""
     return np.sqrt(np.where(variance_dn2 >= 0.0, variance_dn2, np.nan))
 
 
 def _underflow(dark: Any, groups: SiteClasses) -> Floats:
-    """Fraction of codes that are 0, with a warning where they are many."""
+    """Return the fraction of codes that are 0; warn if it is too large."""
     share = groups.mean((codes_of("dark[0]", dark) == 0).mean(axis=0))
     if share.max() > MOST_UNDERFLOW_FRACTION:
         warnings.warn(
-            f"{100 * share.max():.1f} % of the dark codes are 0, where noise is cut off: dark noise and DSNU come out too "
-            "small; let some dark charge lift darkness above 0",
+            f"{100 * share.max():.1f} % of the dark codes are 0, which clips the noise: dark noise and DSNU are "
+            "underestimated; raise the dark level above 0, for example by a pedestal",
             FoveasimWarning,
             stacklevel=3,
         )

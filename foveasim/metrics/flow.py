@@ -1,8 +1,8 @@
 """
-Optical flow on photosites of any shape: how well a shift can be known (Cramér–Rao), and an estimator that gets there.
+Optical flow on polygonal photosites: Cramér–Rao bound and maximum-likelihood estimator.
 
-A picture P that moves by (u, v) gives site i the charge ``e_i = ∫ P(x - u) dx`` over its polygon, so ``-de_i/du`` is the
-integral of the picture's gradient over the site. That is all that a site can tell of the motion.
+An image P displaced by (u, v) gives site i the charge ``e_i = ∫ P(x - u) dx`` over its polygon, so that ``-de_i/du`` is the
+integral of the image gradient over the site.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from foveasim.metrics.sampling import require_layout
 
 __all__ = ["FlowBound", "FlowEstimate", "estimate_flow", "flow_bound", "site_gradients_e_per_um"]
 
-#: A direction about which there is less than this fraction of the other's information has none.
+#: Relative information below which a direction is unobservable.
 LEAST_INFORMATION = 1e-12
-#: A site of which more than this share lies off the map tells nothing: what was there is not known.
+#: Largest uncovered area fraction of a usable site.
 OFF_SHARE = 1e-9
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FlowBound:
     """
-    The Cramér–Rao bound of the flow in some regions: no unbiased estimator has a smaller covariance.
+    Cramér–Rao bound of the flow per region: smallest covariance of an unbiased estimator.
 
     Attributes
     ----------
     regions : (n_region,) int64
-        Their labels, sorted.
+        Labels of the regions, sorted.
     n_sites : (n_region,) int64
-        That tell of it: of an estimate, those that lie wholly on the map.
+        Sites used; for an estimate, those that lie entirely within the map.
     information_per_um2 : (n_region, 2, 2) float64, 1/µm²
         Fisher information of (u, v): ``Σ g gᵀ / var``.
     """
@@ -58,12 +58,16 @@ class FlowBound:
 
     @property
     def covariance_um2(self) -> Floats:
-        """Inverse of the information, (n_region, 2, 2) µm²; infinite where one direction is not seen (the aperture problem)."""
+        """
+        Inverse of the information, (n_region, 2, 2) µm².
+
+        It is infinite if a direction is unobservable (the aperture problem).
+        """
         return _inverse(self.information_per_um2)
 
     @property
     def sigma_um(self) -> Floats:
-        """Least standard deviations of u and of v, (n_region, 2) µm; infinite where nothing tells it."""
+        """Smallest standard deviations of u and v, (n_region, 2) µm; infinite if unobservable."""
         left = np.stack([_rest_per_um2(self.information_per_um2, axis) for axis in (0, 1)], axis=1)
         with np.errstate(divide="ignore"):
             return np.asarray(1.0 / np.sqrt(left))
@@ -72,19 +76,19 @@ class FlowBound:
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FlowEstimate:
     """
-    The flow in some regions.
+    Estimated flow per region.
 
     Attributes
     ----------
     regions : (n_region,) int64
-        Their labels, sorted.
+        Labels of the regions, sorted.
     flow_um : (n_region, 2) float64, µm
-        By how much the picture moved, (u, v); NaN where a direction is not seen.
+        Displacement (u, v) of the image; NaN if a direction is unobservable.
     bound : FlowBound
-        At the estimate.
+        Cramér–Rao bound at the estimate.
     misfit : (n_region,) float64
-        Mean of the squared residuals over their variances, of the sites on the map: about 1 where the model holds. NaN where
-        there are none.
+        Mean of squared residuals over their variances, for the sites within the map: approximately 1 if the model is valid,
+        NaN without sites.
     """
 
     regions: Ints
@@ -97,31 +101,33 @@ def site_gradients_e_per_um(
     layout: Layout, map_e_per_um2: ArrayLike, grid: Grid, *, n_threads: int | None = None
 ) -> Floats:
     """
-    Integrals of a map's gradient over the sites: by how much each one's charge falls when the picture moves by a µm.
+    Integrate the gradient of a map over the sites.
+
+    This is the decrease of the charge of each site per µm of image displacement.
 
     Parameters
     ----------
     layout : Layout
     map_e_per_um2 : (n_y, n_x), e-/µm²
-        Electrons per area at every place, cell means; smooth over a few cells, as behind a lens.
+        Electrons per area, cell means; smooth over a few cells, as in an optical image.
     grid : Grid
-        Where the cells are.
+        Cells of the map.
     n_threads : int, optional
 
     Returns
     -------
     gradient : (n_site, 2) float64, e-/µm
-        Along x and y; 0 for sites that lie partly or wholly off the map, which tell nothing.
+        Components along x and y; 0 for sites that lie partly or entirely off the map.
 
     Raises
     ------
     ParameterError
-        When the map does not fit the grid, or has fewer than 5 rows or columns.
+        When the shapes of map and grid differ, or the map has fewer than 5 rows or columns.
 
     Warns
     -----
     CoverageWarning
-        When sites lie partly or wholly off the map.
+        When sites lie partly or entirely off the map.
     """
     require_layout(layout)
     cells = _checked_map(map_e_per_um2, grid)
@@ -129,8 +135,8 @@ def site_gradients_e_per_um(
     is_on = _is_on_map(integrator, layout)
     if not is_on.all():
         warnings.warn(
-            f"{np.count_nonzero(~is_on):,} of {layout.n_sites:,} photosites lie partly or wholly off the map, and are taken to "
-            "tell nothing: take a larger map, or fewer sites",
+            f"{np.count_nonzero(~is_on):,} of {layout.n_sites:,} photosites lie partly or entirely off the map and have a "
+            "gradient of 0; use a larger map or fewer sites",
             CoverageWarning,
             stacklevel=2,
         )
@@ -140,16 +146,16 @@ def site_gradients_e_per_um(
 
 def flow_bound(gradient_e_per_um: ArrayLike, variance_e2: ArrayLike, *, regions: ArrayLike | None = None) -> FlowBound:
     """
-    Cramér–Rao bound on the flow.
+    Compute the Cramér–Rao bound of the flow.
 
     Parameters
     ----------
     gradient_e_per_um : (n_site, 2), e-/µm
-        From :func:`site_gradients_e_per_um`; or in DN/µm, with variances in DN².
+        Result of :func:`site_gradients_e_per_um`; or in DN/µm, with variances in DN².
     variance_e2 : (n_site,) or number, e-²
-        Of each site's noise: the expected charge and the read noise squared, or what :meth:`Camera.predict` tells.
+        Noise variance of each site: expected charge plus squared read noise, or the variance of :meth:`Camera.predict`.
     regions : (n_site,) integers, optional
-        Sites of one label move together; those below 0 are left out. All together by default.
+        Region label of each site; negative labels are excluded. A single region by default.
 
     Returns
     -------
@@ -158,16 +164,16 @@ def flow_bound(gradient_e_per_um: ArrayLike, variance_e2: ArrayLike, *, regions:
     Raises
     ------
     ParameterError
-        When shapes do not fit together, or a variance is not above 0.
+        When shapes are inconsistent, or a variance is not positive.
 
     Notes
     -----
-    For Gaussian noise of known variance, and for Poisson noise whose variance is the expected charge. That the variance
-    itself changes with the charge would tell a little more in the presence of read noise; it is not counted.
+    The bound is valid for Gaussian noise of known variance, and for Poisson noise whose variance is the expected charge. With
+    read noise, the dependence of the variance on the charge contains additional information, which is neglected.
     """
     gradient = finite_array("gradient_e_per_um", gradient_e_per_um, ndim=2)
     if gradient.shape[1] != 2:
-        raise ParameterError("gradient_e_per_um", f"must have the shape (n_site, 2), got {gradient.shape}")
+        raise ParameterError("gradient_e_per_um", f"must have shape (n_site, 2), got {gradient.shape}")
     variance = _per_site("variance_e2", finite_array("variance_e2", variance_e2, above=0.0), len(gradient))
     return _bound(gradient, variance, _Regions(regions, len(gradient)), np.ones(len(gradient), bool))
 
@@ -185,26 +191,29 @@ def estimate_flow(
     n_threads: int | None = None,
 ) -> FlowEstimate:
     """
-    By how much a known picture moved, from sites' values: weighted least squares (Lucas and Kanade), with Gauss–Newton steps.
+    Estimate the displacement of a known image from site values.
+
+    The method is weighted least squares (Lucas and Kanade) with Gauss–Newton iterations.
 
     Parameters
     ----------
     layout : Layout
     values_e : (n_site,), e-
-        What the sites measured after the motion.
+        Site values after the displacement.
     map_e_per_um2 : (n_y, n_x), e-/µm²
-        The picture before, cell means: the true one, or one reconstructed from an earlier frame.
+        Image before the displacement, cell means: the true image, or a reconstruction from an earlier frame.
     grid : Grid
-        Where its cells are.
+        Cells of the map.
     variance_e2 : (n_site,) or number, e-²
-        Of each site's noise.
+        Noise variance of each site.
     regions : (n_site,) integers, optional
-        Sites of one label move together; those below 0 are left out. All together by default.
+        Region label of each site; negative labels are excluded. A single region by default.
     n_steps : int
-        Steps at most. One is the method of Lucas and Kanade, right for shifts that are small against the picture's detail; with
-        more the sites' outlines are carried back by the shift found so far, and what is left of it is found.
+        Maximum number of iterations. One iteration is the method of Lucas and Kanade, which is accurate for displacements
+        small against the image detail. Further iterations displace the site outlines by the negative estimate and estimate
+        the remaining displacement.
     tolerance_um : float, µm
-        No further step is taken when the last one was nowhere longer.
+        Iterations end when no component of the last step exceeds this length.
     n_threads : int, optional
 
     Returns
@@ -214,13 +223,13 @@ def estimate_flow(
     Raises
     ------
     ParameterError
-        When shapes do not fit together, or a variance is not above 0.
+        When shapes are inconsistent, or a variance is not positive.
 
     Notes
     -----
-    For Gaussian noise it is the estimate of maximum likelihood, and reaches the bound where noise is small against the
-    picture. Steps converge to the nearest minimum: for large shifts begin with a blurred picture. Sites whose outlines,
-    carried back, lie partly or wholly off the map are left out: what they should see is not known.
+    For Gaussian noise this is the maximum-likelihood estimate, which attains the bound for a high signal-to-noise ratio. The
+    iterations converge to the nearest minimum; for large displacements, start with a blurred image. Sites whose displaced
+    outlines lie partly or entirely off the map are excluded, because their expected value is unknown.
     """
     require_layout(layout)
     cells = _checked_map(map_e_per_um2, grid)
@@ -233,7 +242,7 @@ def estimate_flow(
     vertices_of_site = np.diff(layout.ring_offsets[layout.site_offsets])
     flow_um = np.zeros((groups.labels.size, 2))
     for step in range(n_steps + 1):
-        # The picture moved by u, seen by a site, is the picture seen by the site moved by -u.
+        # A site samples the image displaced by u like a site displaced by -u samples the original image.
         moved_um = np.repeat(groups.of_sites(flow_um), vertices_of_site, axis=0)
         carried = Layout(layout.xy_um - moved_um, layout.ring_offsets, layout.site_offsets)
         integrator = Integrator(carried, grid, order=2, n_threads=n_threads)
@@ -262,31 +271,29 @@ def estimate_flow(
 
 
 class _Regions:
-    """Sums over the sites of each region."""
+    """Region labels of sites, and sums over the sites of each region."""
 
     def __init__(self, regions: ArrayLike | None, n_sites: int) -> None:
         labels = np.zeros(n_sites, np.int64) if regions is None else as_numbers("regions", regions, keep_type=True)
         if labels.shape != (n_sites,) or labels.dtype.kind not in "iu":
-            raise ParameterError(
-                "regions", f"must be {n_sites} integers, got {labels.dtype} of the shape {labels.shape}"
-            )
+            raise ParameterError("regions", f"must be {n_sites} integers, got {labels.dtype} of shape {labels.shape}")
         self._n_all = n_sites
         self._used = np.flatnonzero(labels >= 0)
         self.labels, self._position = np.unique(labels[self._used].astype(np.int64), return_inverse=True)
 
     def counts(self, is_counted: Bools) -> Ints:
-        """Sites of each region that count, (n_region,)."""
+        """Count the selected sites of each region, (n_region,)."""
         return np.bincount(self._position[is_counted[self._used]], minlength=self.labels.size).astype(np.int64)
 
     def sums(self, values: Floats) -> Floats:
-        """(n_region, k) of (n_site, k)."""
+        """Sum values over the sites of each region: (n_region, k) from (n_site, k)."""
         columns = [
             np.bincount(self._position, column[self._used], self.labels.size) for column in np.moveaxis(values, 1, 0)
         ]
         return np.stack(columns, axis=1)
 
     def of_sites(self, values: Floats) -> Floats:
-        """(n_site, k) of (n_region, k); 0 for sites that are left out."""
+        """Assign region values to sites: (n_site, k) from (n_region, k); 0 for excluded sites."""
         spread = np.zeros((self._n_all, values.shape[1]))
         spread[self._used] = values[self._position]
         return spread
@@ -296,13 +303,17 @@ def _checked_map(map_e_per_um2: ArrayLike, grid: Grid) -> Floats:
     cells = finite_array("map_e_per_um2", map_e_per_um2, ndim=2)
     if not isinstance(grid, Grid) or cells.shape != grid.shape or min(cells.shape) < 5:
         raise ParameterError(
-            "map_e_per_um2", f"must have the grid's shape, and at least 5 rows and columns, got {cells.shape}"
+            "map_e_per_um2", f"must have the grid's shape and at least 5 rows and columns, got {cells.shape}"
         )
     return cells
 
 
 def _gradients(values: Floats, grid: Grid) -> Floats:
-    """Slopes of a map along x and y, (2, n_y, n_x) per µm: differences of fourth order, of second at the borders."""
+    """
+    Compute the gradient of a map along x and y, (2, n_y, n_x) per µm.
+
+    Central differences are of fourth order inside, and of second order at the boundary.
+    """
     pitch_x_um, pitch_y_um = grid.pitch_x_um, grid.pitch_y_um
     slopes = np.stack((np.gradient(values, pitch_x_um, axis=1), np.gradient(values, pitch_y_um, axis=0)))
     for along, out, pitch_um in (
@@ -315,7 +326,7 @@ def _gradients(values: Floats, grid: Grid) -> Floats:
 
 
 def _is_on_map(integrator: Integrator, layout: Layout) -> Bools:
-    """Sites that lie wholly on the map, (n_site,)."""
+    """Return whether sites lie entirely within the map, (n_site,)."""
     return np.asarray(integrator.uncovered_um2 <= OFF_SHARE * layout.area_um2)
 
 
@@ -333,14 +344,14 @@ def _bound(gradient: Floats, variance_e2: Floats, groups: _Regions, is_counted: 
 
 
 def _rest_per_um2(information_per_um2: Floats, axis: int) -> Floats:
-    """What is known of u or v when the other is not known either, (n_region,): 0 where nothing is left but rounding."""
+    """Return the marginal information of u or v, (n_region,); 0 below rounding error."""
     own, other = information_per_um2[:, axis, axis], information_per_um2[:, 1 - axis, 1 - axis]
     shared = information_per_um2[:, 0, 1] ** 2 / np.where(other > 0.0, other, 1.0)
     return np.where(own - shared > LEAST_INFORMATION * own, own - shared, 0.0)
 
 
 def _inverse(information_per_um2: Floats) -> Floats:
-    """Inverses of symmetric matrices (n, 2, 2); infinite where one is singular to float64."""
+    """Invert symmetric matrices (n, 2, 2); infinite if singular to float64."""
     xx, xy, yy = (information_per_um2[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     determinant = xx * yy - xy * xy
     is_good = determinant > LEAST_INFORMATION * xx * yy
@@ -354,5 +365,5 @@ def _inverse(information_per_um2: Floats) -> Floats:
 
 def _per_site(name: str, values: NDArray[np.float64], n_sites: int) -> Floats:
     if values.shape not in ((), (n_sites,)):
-        raise ParameterError(name, f"must be one for each of the {n_sites} sites, got the shape {values.shape}")
+        raise ParameterError(name, f"must have one value for each of the {n_sites} sites, got shape {values.shape}")
     return np.broadcast_to(values, (n_sites,))

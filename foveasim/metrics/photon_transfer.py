@@ -1,11 +1,11 @@
 """
-Photon transfer: mean and variance of codes over levels of even light, for each class of photosites.
+Photon transfer: mean and variance of codes over irradiance levels, per class of sites.
 
-The temporal variance is that of EMVA 1288, Release 4.0 Linear (https://www.emva.org/standards-technology/emva-1288/): of two
-frames of one level, half the mean square of their difference, less half the square of the difference of their means, so that
-neither fixed patterns nor a light that flickers as a whole are in it. For more than two frames the same holds of the
-sample variance over frames. The spatial variance is that of the sites' means over frames, less the temporal variance of a
-single frame over the number of frames.
+The temporal variance follows EMVA 1288, Release 4.0 Linear (https://www.emva.org/standards-technology/emva-1288/). For two
+frames of one level it is half the mean square of their difference, less half the square of the difference of their means.
+This excludes fixed patterns and global flicker. For more than two frames, the sample variance over frames is used in the
+same way. The spatial variance is the variance of the site means over frames, less the temporal variance of a single frame
+over the number of frames.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ __all__ = [
     "slopes",
 ]
 
-#: The gain is told from levels up to this fraction of saturation (EMVA 1288).
+#: Upper limit of the levels used for the gain, in fractions of saturation (EMVA 1288).
 LINEAR_FRACTION = 0.7
-#: A variance below this, in DN², is quantisation's more than the sensor's (EMVA 1288).
+#: Variance in DN² below which quantisation masks the dark noise (EMVA 1288).
 LEAST_DARK_DN2 = 0.24
 
 
 @dataclass(frozen=True, eq=False)
 class PhotonTransfer:
     """
-    Mean and variance of codes at several levels of light, for each class of sites.
+    Mean and variance of codes at several irradiance levels, for each class of sites.
 
     Attributes
     ----------
@@ -63,13 +63,13 @@ class PhotonTransfer:
     n_sites : (n_class,) int64
         Sites of each class.
     n_frames : (n_level,) int64
-        Frames that each level was told from; 0 where it was predicted.
+        Frames of each level; 0 for a prediction.
     mean_dn : (n_level, n_class) float64, DN
         Mean code over sites and frames.
     temporal_variance_dn2 : (n_level, n_class) float64, DN²
-        Variance from frame to frame, mean over the sites; its mean over many runs is ``1 - 1 / n_sites`` of the sites'.
+        Variance between frames, averaged over the sites; its expectation is ``1 - 1 / n_sites`` times the site variance.
     spatial_variance_dn2 : (n_level, n_class) float64, DN²
-        Variance from site to site, without the temporal part; by chance it may come out below 0.
+        Variance between sites without the temporal part; a measured estimate may be negative.
     """
 
     classes: NDArray[Any]
@@ -84,7 +84,7 @@ class PhotonTransfer:
         for name in ("mean_dn", "temporal_variance_dn2", "spatial_variance_dn2"):
             values = finite_array(name, getattr(self, name))
             if values.shape != shape:
-                raise ParameterError(name, f"must have the shape (n_level, n_class) = {shape}, got {values.shape}")
+                raise ParameterError(name, f"must have shape (n_level, n_class) = {shape}, got {values.shape}")
             object.__setattr__(self, name, own(values))
         for name in ("classes", "n_sites", "n_frames"):
             object.__setattr__(self, name, own(np.asarray(unmasked(name, getattr(self, name)))))
@@ -94,45 +94,46 @@ class PhotonTransfer:
 
     @property
     def saturation_level(self) -> Ints:
-        """Index of the level of the highest temporal variance, (n_class,): EMVA 1288's saturation."""
+        """Index of the saturation level (highest temporal variance, EMVA 1288), (n_class,)."""
         return np.asarray(self.temporal_variance_dn2.argmax(axis=0), np.int64)
 
     def gain_dn_per_e(self, dark: PhotonTransfer | None = None) -> Floats:
         """
-        System gain: slope of the temporal variance against the mean, both less those of darkness.
+        Compute the system gain from dark-corrected temporal variance against mean.
 
         Parameters
         ----------
         dark : PhotonTransfer, optional
-            Darkness, as one level or as one for each level; the first level by default.
+            Dark frames, as one level or one for each level; the first level by default.
 
         Returns
         -------
         gain : (n_class,) float64, DN/e-
-            Least squares through the origin, over levels up to 70 % of saturation.
+            Slope of a least-squares line through the origin, over levels up to 70 % of saturation.
 
         Raises
         ------
         ParameterError
-            When the dark levels do not fit, there is no light, or none are given and the first level is not the darkest.
+            When the dark levels are inconsistent, no level has a signal, or the first level is not dark and ``dark`` is not
+            given.
         """
         mean_dn, variance_dn2 = above_dark(self, dark)
         return slopes("levels", mean_dn, variance_dn2, is_linear(mean_dn, self.saturation_level))
 
     def dark_noise_e(self, dark: PhotonTransfer | None = None) -> Floats:
         """
-        Temporal noise of darkness without that of quantisation.
+        Compute the temporal dark noise without quantisation noise.
 
         Parameters
         ----------
         dark : PhotonTransfer, optional
-            Darkness, of which the first level counts; this curve's first level by default.
+            Dark frames, of which the first level is used; the first level of this curve by default.
 
         Returns
         -------
         noise : (n_class,) float64, e-
-            ``sqrt(variance - 1/12) / gain``: read noise, and the noise of what dark charge there is. Where the variance is
-            below 0.24 DN², quantisation hides it, and this is an upper bound, ``0.40 / gain``.
+            ``sqrt(variance - 1/12) / gain``: read noise and dark-current shot noise. If the variance is below 0.24 DN²,
+            quantisation masks it, and the result is the upper bound ``0.40 / gain``.
 
         Raises
         ------
@@ -144,7 +145,7 @@ class PhotonTransfer:
 
 
 class SiteClasses:
-    """Means over the sites of each class."""
+    """Class labels of sites, and statistics over the sites of each class."""
 
     def __init__(self, classes: ArrayLike | None, n_sites: int) -> None:
         labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(unmasked("classes", classes))
@@ -157,11 +158,11 @@ class SiteClasses:
             raise ParameterError("classes", "must have at least two sites each", few)
 
     def mean(self, values: Floats) -> Floats:
-        """Mean over each class's sites, (n_class,) of (n_site,)."""
+        """Compute the mean over the sites of each class: (n_class,) from (n_site,)."""
         return np.bincount(self.of_site, weights=values) / self.n_sites
 
     def variance(self, values: Floats) -> Floats:
-        """Sample variance over each class's sites, (n_class,) of (n_site,)."""
+        """Compute the sample variance over the sites of each class: (n_class,) from (n_site,)."""
         off = values - self.mean(values)[self.of_site]
         return np.bincount(self.of_site, weights=off * off) / (self.n_sites - 1)
 
@@ -176,16 +177,16 @@ def draw_frames(
     n_threads: int | None = None,
 ) -> NDArray[Any]:
     """
-    Several frames of one level of light.
+    Simulate several frames at one irradiance level.
 
     Parameters
     ----------
     sensor : Sensor
     expected_e : number or (n_site,) float64, e-
-        Expected charge, as :meth:`Sensor.expected_electrons` gives it.
+        Expected charge, as returned by :meth:`Sensor.expected_electrons`.
     n_frames : int
     seed, first_frame : int
-        Of the noise. The same numbers give the same frames, bit for bit, whatever the number of threads.
+        Seed of the noise and index of the first frame. Equal numbers give bit-identical frames for any number of threads.
     n_threads : int, optional
 
     Returns
@@ -195,7 +196,7 @@ def draw_frames(
     Raises
     ------
     ParameterError
-        When a number is out of range, or the charge has not one value per site.
+        When a number is out of range, or ``expected_e`` does not have one value per site.
     """
     level_e = _level("expected_e", expected_e, sensor.layout.n_sites)
     first_frame = check_count("first_frame", first_frame, at_least=0)
@@ -220,19 +221,19 @@ def photon_transfer(
     n_threads: int | None = None,
 ) -> PhotonTransfer:
     """
-    Mean, temporal and spatial variance of codes at several levels, for each class of sites.
+    Compute mean, temporal and spatial variance of codes for each level and class.
 
     Parameters
     ----------
     source : Sensor, or sequence of levels
-        A sensor to draw frames of; or frames: for each level two or more, as an array ``(n_frame, n_site)`` in DN, or as a
-        list of codes or of :class:`foveasim.Capture`.
+        Sensor whose frames are simulated; or frames: two or more for each level, as an array ``(n_frame, n_site)`` in DN, or
+        as a list of codes or of :class:`foveasim.Capture`.
     expected_e : (n_level,) or (n_level, n_site) float64, or a sequence of either, e-
-        With a sensor: the expected charge at each level, as :meth:`Sensor.expected_electrons` gives it.
+        With a sensor: expected charge at each level, as returned by :meth:`Sensor.expected_electrons`.
     classes : (n_site,), optional
-        Label of each site's class, such as its size or filter; one class of all by default.
+        Class label of each site, such as its size or filter; a single class by default.
     n_frames, seed, n_threads
-        With a sensor: frames a level, the seed of their noise, and threads, of which the result does not depend.
+        With a sensor: frames per level, seed of the noise, and number of threads, which does not affect the result.
 
     Returns
     -------
@@ -254,7 +255,7 @@ def photon_transfer(
     """
     if isinstance(source, Sensor):
         if expected_e is None or seed is None:
-            raise ParameterError("expected_e" if expected_e is None else "seed", "must be given with a sensor")
+            raise ParameterError("expected_e" if expected_e is None else "seed", "must be given for a sensor")
         sensor, n_frames = source, check_count("n_frames", n_frames, at_least=2)
         groups = SiteClasses(classes, sensor.layout.n_sites)
         measured = [
@@ -268,7 +269,9 @@ def photon_transfer(
         ]
         return _transfer(groups, [n_frames] * len(measured), measured)
     if expected_e is not None or seed is not None:
-        raise ParameterError("expected_e" if seed is None else "seed", "goes with a sensor, not with frames")
+        raise ParameterError(
+            "expected_e" if seed is None else "seed", "must not be given with frames; omit it, or give a sensor"
+        )
     measured, counts, n_sites = [], [], None
     if not isinstance(source, Iterable):
         raise ParameterError("source", f"must be a foveasim.Sensor or a list of levels, got a {type(source).__name__}")
@@ -278,7 +281,7 @@ def photon_transfer(
             n_sites = codes.shape[1]
             groups = SiteClasses(classes, n_sites)
         if codes.shape[1] != n_sites:
-            raise ParameterError(f"frames[{k}]", f"must have the {n_sites} sites of the first level", codes.shape[1])
+            raise ParameterError(f"frames[{k}]", f"must have {n_sites} sites, as the first level", codes.shape[1])
         measured.append(_statistics(codes, groups))
         counts.append(codes.shape[0])
     if n_sites is None:
@@ -294,21 +297,23 @@ def predicted_photon_transfer(
     n_threads: int | None = None,
 ) -> PhotonTransfer:
     """
-    What :func:`photon_transfer` of infinitely many frames would give, by :meth:`Sensor.predict`, without a draw.
+    Predict the result of :func:`photon_transfer` for infinitely many frames.
+
+    The prediction is analytical (:meth:`Sensor.predict`).
 
     Parameters
     ----------
     sensor : Sensor
     expected_e : (n_level,) or (n_level, n_site) float64, or a sequence of either, e-
-        The expected charge at each level.
+        Expected charge at each level.
     classes : (n_site,), optional
-        Label of each site's class.
+        Class label of each site.
     n_threads : int, optional
 
     Returns
     -------
     PhotonTransfer
-        With 0 frames a level.
+        ``n_frames`` is 0 for each level.
 
     Raises
     ------
@@ -324,7 +329,7 @@ def predicted_photon_transfer(
 
 
 def codes_of(name: str, frames: Any) -> NDArray[Any]:
-    """Codes of some frames, (n_frame, n_site), of an array or a list of arrays or captures."""
+    """Return codes (n_frame, n_site) from an array, or a list of captures or arrays."""
     if not isinstance(frames, np.ndarray):
         try:
             frames = [getattr(frame, "code", frame) for frame in frames]
@@ -332,14 +337,14 @@ def codes_of(name: str, frames: Any) -> NDArray[Any]:
             raise ParameterError(name, "must be a list of frames") from None
     codes = as_numbers(name, frames, keep_type=True)
     if codes.ndim != 2 or codes.shape[0] < 2 or codes.shape[1] < 2:
-        raise ParameterError(name, "must have the shape (n_frame, n_site), at least two of both", codes.shape)
+        raise ParameterError(name, "must have shape (n_frame, n_site), with at least two of each", codes.shape)
     if codes.dtype.kind == "f" and not np.isfinite(codes).all():
         raise ParameterError(name, "must be finite everywhere")
     return codes
 
 
 def _statistics(codes: NDArray[Any], groups: SiteClasses) -> tuple[Floats, Floats, Floats]:
-    """Mean, temporal variance and spatial variance of each class."""
+    """Compute mean, temporal variance and spatial variance of each class."""
     n_frames = codes.shape[0]
     mean_dn = codes.mean(axis=0, dtype=np.float64)
     off = codes - mean_dn
@@ -366,7 +371,7 @@ def _transfer(
 
 
 def _level(name: str, expected_e: ArrayLike, n_sites: int) -> Floats:
-    """Charge of one level for every site."""
+    """Return the expected charge of one level at every site."""
     if np.ndim(expected_e) == 0:
         return np.full(n_sites, check_number(name, expected_e, at_least=0.0))
     level_e = finite_array(name, expected_e, ndim=1, at_least=0.0)
@@ -381,37 +386,37 @@ def _levels(expected_e: Sequence[ArrayLike] | Floats, n_sites: int) -> list[Floa
     except TypeError:
         raise ParameterError("expected_e", "must be a list of levels", expected_e, "e-") from None
     if np.ndim(expected_e[0] if n_levels else 0) > 1:
-        raise ParameterError("expected_e", "must have the shape (n_level,) or (n_level, n_site)")
+        raise ParameterError("expected_e", "must have shape (n_level,) or (n_level, n_site)")
     return [_level(f"expected_e[{k}]", level_e, n_sites) for k, level_e in enumerate(expected_e)]
 
 
 def above_dark(transfer: PhotonTransfer, dark: PhotonTransfer | None) -> tuple[Floats, Floats]:
-    """Mean and temporal variance, less those of darkness, (n_level, n_class)."""
+    """Return the dark-corrected mean and temporal variance, (n_level, n_class)."""
     n_levels = transfer.n_frames.size
     if dark is None:
         if np.any(transfer.mean_dn[0] > transfer.mean_dn[-1]):
             raise ParameterError(
-                "levels", "must begin with darkness", hint="give them rising, or dark frames of their own"
+                "levels", "must begin with a dark level", hint="sort the levels, or give separate dark frames"
             )
         return (
             transfer.mean_dn - transfer.mean_dn[0],
             transfer.temporal_variance_dn2 - transfer.temporal_variance_dn2[0],
         )
     if dark.n_frames.size not in (1, n_levels) or not np.array_equal(dark.classes, transfer.classes):
-        raise ParameterError(
-            "dark", f"must have the same classes, and one level or {n_levels} as the light", dark.n_frames.size
-        )
+        raise ParameterError("dark", f"must have the same classes, and one level or {n_levels}", dark.n_frames.size)
     return transfer.mean_dn - dark.mean_dn, transfer.temporal_variance_dn2 - dark.temporal_variance_dn2
 
 
 def is_linear(mean_dn: Floats, saturation_level: Ints) -> NDArray[np.bool_]:
-    """Whether a level counts for the gain: at most 70 % of saturation, (n_level, n_class)."""
+    """Return whether a level is at most 70 % of saturation, (n_level, n_class)."""
     return np.asarray(mean_dn <= LINEAR_FRACTION * np.take_along_axis(mean_dn, saturation_level[None, :], axis=0))
 
 
 def slopes(name: str, x: Floats, y: Floats, is_used: NDArray[np.bool_]) -> Floats:
-    """Slopes of lines through the origin by least squares, (n_class,) of (n_level, n_class)."""
+    """Fit lines through the origin to (n_level, n_class) values; return slopes (n_class,)."""
     squares = np.where(is_used, x * x, 0.0).sum(axis=0)
     if not np.all(squares > 0.0):
-        raise ParameterError(name, "must have light below 70 % of saturation for every class", hint="add darker levels")
+        raise ParameterError(
+            name, "must have a signal below 70 % of saturation for every class", hint="add levels of lower irradiance"
+        )
     return np.asarray(np.where(is_used, x * y, 0.0).sum(axis=0) / squares)

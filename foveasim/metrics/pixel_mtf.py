@@ -1,4 +1,4 @@
-"""What a photosite's own shape does to contrast: the Fourier transform of its polygon, in closed form."""
+"""Closed-form OTF and MTF of photosite apertures, from the Fourier transforms of polygons."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from foveasim.units import per_um_from_per_mm
 
 __all__ = ["polygon_mtf", "polygon_otf", "wave_vectors_per_mm"]
 
-#: Sites that one call of the kernel takes, whatever the number of threads.
+#: Sites per call of the kernel; independent of the number of threads.
 BLOCK_SITES = 1024
 
 
 def wave_vectors_per_mm(frequency_per_mm: ArrayLike, angle_deg: ArrayLike = 0.0) -> Floats:
     """
-    Wave vectors of sines.
+    Return wave vectors for given frequencies and directions.
 
     Parameters
     ----------
     frequency_per_mm : (n,) or number, 1/mm
         Line pairs per mm on the sensor.
     angle_deg : (n,) or number, degrees
-        Direction in which the sine varies, counter-clockwise from x.
+        Direction of the wave vector, counter-clockwise from the x axis.
 
     Returns
     -------
@@ -36,7 +36,7 @@ def wave_vectors_per_mm(frequency_per_mm: ArrayLike, angle_deg: ArrayLike = 0.0)
     Raises
     ------
     ParameterError
-        When a number is not finite, or the two have different lengths.
+        When a number is not finite, or the lengths of both differ.
     """
     frequency = np.atleast_1d(finite_array("frequency_per_mm", frequency_per_mm))
     angle = np.deg2rad(np.atleast_1d(finite_array("angle_deg", angle_deg)))
@@ -47,30 +47,31 @@ def wave_vectors_per_mm(frequency_per_mm: ArrayLike, angle_deg: ArrayLike = 0.0)
 
 def polygon_otf(layout: Layout, wave_per_mm: ArrayLike, *, n_threads: int | None = None) -> NDArray[np.complex128]:
     """
-    Optical transfer functions of photosites: what is left of a sine's contrast in a site's mean, and its phase.
+    Compute the optical transfer function of each photosite aperture in closed form.
 
     Parameters
     ----------
     layout : Layout
-        For some of its sites: ``layout[sites]``.
+        For a selection of sites: ``layout[sites]``.
     wave_per_mm : (n_wave, 2), 1/mm
         Wave vectors, line pairs per mm along x and y.
     n_threads : int, optional
-        All cores by default. Results do not depend on it, bit for bit.
+        All cores by default. Results are bit-identical for any number of threads.
 
     Returns
     -------
     otf : (n_site, n_wave) complex128
-        Mean of ``exp(-2πi f·(x - c))`` over the site, c its centroid: 1 at frequency 0, real for sites of point symmetry.
+        Mean of ``exp(-2πi f·(x - c))`` over the site with centroid c: 1 at frequency 0, real for point-symmetric sites.
 
     Raises
     ------
     ParameterError
-        When the vectors are not finite numbers of this shape.
+        When the vectors are not finite, or have a different shape.
 
     Notes
     -----
-    Exact: a sum over the outline's edges (Green's theorem), holes included, right to some 1e-15 at any frequency.
+    The result is a sum over the edges of the outline, holes included (Green's theorem), accurate to about 1e-15 at any
+    frequency.
 
     Examples
     --------
@@ -84,7 +85,7 @@ def polygon_otf(layout: Layout, wave_per_mm: ArrayLike, *, n_threads: int | None
     require_layout(layout)
     waves = finite_array("wave_per_mm", wave_per_mm, ndim=2)
     if waves.shape[1] != 2:
-        raise ParameterError("wave_per_mm", f"must have the shape (n_wave, 2), got {waves.shape}")
+        raise ParameterError("wave_per_mm", f"must have shape (n_wave, 2), got {waves.shape}")
     rad_per_um = np.ascontiguousarray(2.0 * np.pi * per_um_from_per_mm(waves))
     transforms = _kernels.polygon_transforms
     otf = np.empty((layout.n_sites, waves.shape[0]), np.complex128)
@@ -108,28 +109,28 @@ def polygon_mtf(
     layout: Layout, frequency_per_mm: ArrayLike, *, angle_deg: ArrayLike = 0.0, n_threads: int | None = None
 ) -> Floats:
     """
-    Modulation transfer functions of photosites, in closed form: what is left of a sine's contrast in a site's mean.
+    Compute the modulation transfer function of each photosite aperture in closed form.
 
     Parameters
     ----------
     layout : Layout
-        For some of its sites: ``layout[sites]``.
+        For a selection of sites: ``layout[sites]``.
     frequency_per_mm : (n_wave,) or number, 1/mm
         Line pairs per mm on the sensor.
     angle_deg : (n_wave,) or number, degrees
-        Direction in which the sine varies, counter-clockwise from x.
+        Direction of the wave vector, counter-clockwise from the x axis.
     n_threads : int, optional
         All cores by default.
 
     Returns
     -------
     mtf : (n_site, n_wave) float64
-        ``|sinc(f w)|`` across a square of side w.
+        For example ``|sinc(f w)|`` for a square of side w, perpendicular to its side.
 
     Raises
     ------
     ParameterError
-        When a number is not finite, or there is not one angle, or one a frequency.
+        When a number is not finite, or the lengths of frequencies and angles differ.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""How near a picture is to a reference: PSNR and structural similarity, of the pixels that photosites cover."""
+"""Image similarity to a reference: PSNR and SSIM of pixels covered by photosites."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from foveasim.reconstruct import Picture
 
 __all__ = ["psnr_db", "ssim"]
 
-#: Pixels that photosites cover by less than this are left out, unless told otherwise.
+#: Default minimum fraction of a pixel's area that photosites cover.
 COVERED = 0.5
 
 
@@ -25,26 +25,26 @@ def psnr_db(
     min_coverage: float = COVERED,
 ) -> float:
     """
-    Peak signal-to-noise ratio.
+    Compute the peak signal-to-noise ratio (PSNR).
 
     Parameters
     ----------
     picture, reference : Picture or (..., n_y, n_x)
-        Of the same shape, in the same unit.
+        Images of the same shape and unit.
     data_range : float, optional
-        The peak; by default the reference's largest less its smallest value, of the pixels that are compared.
+        Peak value; by default the range of the reference over the compared pixels.
     min_coverage : float
-        Pixels of a picture count when at least this fraction of them is covered by photosites, and no channel is NaN.
+        Minimum area fraction of a pixel covered by photosites. Pixels below it, or with NaN in a channel, are excluded.
 
     Returns
     -------
     psnr_db : float, dB
-        ``20 log10(data_range / root mean square of the difference)``; infinite for equal pictures.
+        ``20 log10(data_range / root mean square of the difference)``; infinite for identical images.
 
     Raises
     ------
     ParameterError
-        When shapes differ, no pixel can be compared, one that counts is infinite, or the range is not above 0.
+        When shapes differ, no pixel can be compared, a compared pixel is infinite, or the range is not positive.
 
     Examples
     --------
@@ -66,19 +66,21 @@ def ssim(
     window: int = 7,
 ) -> float:
     """
-    Mean structural similarity (Wang, Bovik, Sheikh, Simoncelli 2004), as scikit-image has it.
+    Compute the mean structural similarity (SSIM).
+
+    The definition is that of Wang, Bovik, Sheikh and Simoncelli (2004), as implemented by scikit-image.
 
     Parameters
     ----------
     picture, reference, data_range, min_coverage
         As for :func:`psnr_db`.
     window : int, pixels
-        Odd side of the square in which means and variances are taken.
+        Odd side of the square window for means and variances.
 
     Returns
     -------
     ssim : float
-        Up to 1. The mean over the channels and the pixels whose windows have nothing but pixels that count.
+        At most 1. Mean over the channels and the pixels whose windows contain only compared pixels.
 
     Raises
     ------
@@ -94,9 +96,11 @@ def ssim(
         raise ParameterError("window", "must be odd", window)
     fits = minimum_filter(counts, size=window, mode="constant", cval=0)
     if not fits.any():
-        raise ParameterError("window", "must fit on the pixels that count; no such place", window)
+        raise ParameterError("window", "must fit within the compared pixels", window)
     peak = _range(other[:, counts], data_range)
-    one, other = (np.where(counts, plane, 0.0) for plane in (one, other))  # what is not looked at must be a number
+    one, other = (
+        np.where(counts, plane, 0.0) for plane in (one, other)
+    )  # scikit-image requires numbers also in excluded pixels
     maps = [
         structural_similarity(a, b, win_size=window, data_range=peak, full=True)[1]
         for a, b in zip(one, other, strict=True)
@@ -107,35 +111,37 @@ def ssim(
 def _compared(
     picture: Picture | ArrayLike, reference: Picture | ArrayLike, min_coverage: float
 ) -> tuple[Floats, Floats, Bools]:
-    """Both as (n_channel, n_y, n_x), and the pixels that count, (n_y, n_x)."""
+    """Return both images as (n_channel, n_y, n_x), and the mask of compared pixels."""
     min_coverage = check_number("min_coverage", min_coverage, at_least=0.0, at_most=1.0)
     planes, covered = [], []
     for name, one in (("picture", picture), ("reference", reference)):
         is_picture = isinstance(one, Picture)
         values = as_numbers(name, one.data if isinstance(one, Picture) else one, missing_is_nan=True)
         if values.ndim < 2:
-            raise ParameterError(name, f"must have the shape (..., n_y, n_x), got {values.shape}")
+            raise ParameterError(name, f"must have shape (..., n_y, n_x), got {values.shape}")
         planes.append(values.reshape(-1, *values.shape[-2:]))
-        # Shares are float32: a whole pixel may be short of 1 by their rounding.
+        # Coverage is float32: the tolerance accounts for rounding in fully covered pixels.
         covered.append(one.coverage >= min_coverage - 1e-6 if is_picture else True)  # type: ignore[union-attr]
     if planes[0].shape != planes[1].shape:
-        raise ParameterError("reference", f"must have the picture's shape {planes[0].shape}, got {planes[1].shape}")
+        raise ParameterError(
+            "reference", f"must have the same shape as the picture, {planes[0].shape}, got {planes[1].shape}"
+        )
     if (
         isinstance(picture, Picture)
         and isinstance(reference, Picture)
         and not np.allclose(picture.grid.bounds_um, reference.grid.bounds_um, rtol=1e-9, atol=1e-6)
     ):
-        raise ParameterError("reference", "must lie on the picture's grid", reference.grid.bounds_um)
+        raise ParameterError("reference", "must have the same grid as the picture", reference.grid.bounds_um)
     counts = ~np.isnan(planes).any(axis=(0, 1)) & covered[0] & covered[1]
     if not counts.any():
-        raise ParameterError("picture", "and reference must have a pixel that both know")
+        raise ParameterError("picture", "must have at least one pixel in common with the reference")
     for name, plane in zip(("picture", "reference"), planes, strict=True):
         n_infinite = int(np.count_nonzero(np.isinf(plane).any(axis=0) & counts))
         if n_infinite:
             raise ParameterError(
                 name,
-                f"must be finite where it is compared, and {n_infinite:,} of {np.count_nonzero(counts):,} pixels are not",
-                hint="pixels that are not known must be NaN",
+                f"must be finite, got infinity in {n_infinite:,} of {np.count_nonzero(counts):,} compared pixels",
+                hint="mark unknown pixels by NaN",
             )
     return planes[0], planes[1], np.asarray(counts)
 
@@ -145,5 +151,5 @@ def _range(values: Floats, data_range: float | None) -> float:
         return check_number("data_range", data_range, above=0.0)
     peak = float(np.ptp(values))
     if peak == 0.0:
-        raise ParameterError("data_range", "must be given where the reference is the same everywhere")
+        raise ParameterError("data_range", "must be given for a constant reference")
     return peak

@@ -1,4 +1,4 @@
-"""How finely photosites sample a picture: the Nyquist frequency of every site, and how it falls with eccentricity."""
+"""Sampling density of photosites: Nyquist frequency per site and against eccentricity."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ __all__ = [
     "require_layout",
 ]
 
-#: The second neighbour is at least 30 degrees off the line through the first: in a lattice's reduced basis it is 60 or more.
+#: Sine of the minimum angle (30 degrees) between the directions of both neighbours; it is 60 degrees or more in the reduced
+#: basis of a lattice.
 LEAST_SINE = 0.5
-#: So many sites nearby are looked at for it, then four times as many, and so on up to the last: enough for rectangles 300
-#: times as long as wide.
+#: Number of candidate neighbours: initial value, multiplied by 4 up to the largest value, which suffices for rectangles of an
+#: aspect ratio of 300.
 FIRST_NEIGHBOURS, MOST_NEIGHBOURS = 12, 768
-#: Pairs of sites looked at together: what bounds the memory.
+#: Pairs of sites per block; limits the memory.
 BLOCK_PAIRS = 1 << 18
-#: Sizes that differ by less than this share are the same.
+#: Relative difference below which sizes are equal.
 SIZE_ROUNDING = 1e-9
 
 
@@ -36,31 +37,31 @@ def nyquist_per_mm(
     layout: Layout, *, by: Literal["neighbours", "area"] = "neighbours", per_channel: bool = False
 ) -> Floats:
     """
-    Nyquist frequency at every site: the finest sine that the sites around it tell from a coarser one.
+    Compute the Nyquist frequency at every site.
 
     Parameters
     ----------
     layout : Layout
     by : {"neighbours", "area"}
-        ``"neighbours"``: ``1 / (2 h)``, h the distance of two rows of sites. A site's nearest neighbour gives the direction of
-        the row, and the nearest one off that line the next row. Of a lattice this is exactly the frequency below which
-        nothing is aliased in any direction: ``1 / (2 p)`` for squares, ``1 / (√3 p)`` for hexagons of pitch p. Gaps between
-        sites do not matter. Of sites in groups, as one filter's in a quad-Bayer mosaic, it is that within a group: for their
-        repeat see :func:`foveasim.metrics.sampling_spectrum`.
-        ``"area"``: ``1 / (2 sqrt(area))`` of the site itself: the same in all directions, and smooth where sites are irregular,
-        but right only where sites are without gaps.
+        ``"neighbours"``: ``1 / (2 h)`` for the distance h between two rows of sites. The nearest neighbour of a site gives the
+        direction of the row, and the nearest site off that line the next row. For a lattice, this is exactly the highest
+        frequency without aliasing in any direction: ``1 / (2 p)`` for squares, ``1 / (√3 p)`` for hexagons of pitch p. Gaps
+        between sites have no effect. For grouped sites, such as one filter of a quad-Bayer mosaic, it is the value within a
+        group; for the period of the groups, see :func:`foveasim.metrics.sampling_spectrum`.
+        ``"area"``: ``1 / (2 sqrt(area))`` of the site itself. It is isotropic, and smooth for irregular sites, but valid only
+        for gap-free layouts.
     per_channel : bool
-        Whether only neighbours of the same filter count, as in a mosaic of colours; by neighbours only.
+        Whether only neighbours of the same filter are considered, as in a colour mosaic; requires ``by="neighbours"``.
 
     Returns
     -------
     nyquist : (n_site,) float64, 1/mm
-        Line pairs per mm. NaN where there are no such neighbours, as in a single row, or where one is at the same place.
+        Line pairs per mm. NaN without suitable neighbours, as in a single row, or with coincident sites.
 
     Raises
     ------
     ParameterError
-        When a choice is none of the above.
+        When an option is invalid.
 
     Examples
     --------
@@ -73,26 +74,30 @@ def nyquist_per_mm(
     require_layout(layout)
     if check_choice("by", by, ("neighbours", "area")) == "area":
         if per_channel:
-            raise ParameterError("per_channel", "goes with by='neighbours': an area does not tell how far its like is")
+            raise ParameterError(
+                "per_channel", "must be False with by='area'; use by='neighbours' for one filter of a mosaic"
+            )
         return per_mm_from_per_um(0.5 / np.sqrt(layout.area_um2))
     return per_mm_from_per_um(0.5 / neighbour_spacing_um(layout, per_channel=per_channel)[1])
 
 
 def neighbour_spacing_um(layout: Layout, *, per_channel: bool = False) -> tuple[Floats, Floats]:
     """
-    Distances of a site's nearest neighbour, and of the nearest row of sites beside the line through the two.
+    Compute the distances to the nearest neighbour and to the nearest row of sites.
+
+    The nearest row is the one next to the line through a site and its nearest neighbour.
 
     Parameters
     ----------
     layout : Layout
     per_channel : bool
-        Whether only neighbours of the same filter count.
+        Whether only neighbours of the same filter are considered.
 
     Returns
     -------
     nearest_um, row_um : (n_site,) float64, µm
-        Between centroids; their product is the area of a lattice's cell. NaN where there is no such neighbour; sites with
-        another one at the same place have a distance of 0 and no row.
+        Distances between centroids; their product is the cell area of a lattice. NaN without such a neighbour; coincident
+        sites have a distance of 0 and NaN for the row.
     """
     require_layout(layout)
     nearest_um, row_um = np.full(layout.n_sites, np.nan), np.full(layout.n_sites, np.nan)
@@ -104,7 +109,7 @@ def neighbour_spacing_um(layout: Layout, *, per_channel: bool = False) -> tuple[
 
 
 def _spacing_um(xy_um: Floats) -> tuple[Floats, Floats]:
-    """The same for points (n, 2)."""
+    """Compute the distances of :func:`neighbour_spacing_um` for points (n, 2)."""
     from scipy.spatial import cKDTree
 
     n = len(xy_um)
@@ -117,12 +122,12 @@ def _spacing_um(xy_um: Floats) -> tuple[Floats, Floats]:
         block = BLOCK_PAIRS // k
         for start in range(0, left.size, block):
             sites = left[start : start + block]
-            # The first is the site itself; beyond the last one distances are infinite.
+            # k = 1 is the site itself; missing neighbours have infinite distances.
             distance_um, ids = map(np.asarray, tree.query(xy_um[sites], k=list(range(2, min(k, n) + 1))))
             step_um = xy_um[ids] - xy_um[sites, np.newaxis]
             along = step_um[:, 0] / np.maximum(distance_um[:, :1], np.finfo(float).tiny)
             off_um = np.abs(along[:, :1] * step_um[..., 1] - along[:, 1:] * step_um[..., 0])
-            # One at the same place gives no direction.
+            # A coincident site does not define a direction.
             is_beside = (off_um >= LEAST_SINE * distance_um) & (distance_um[:, :1] > 0.0)
             first = is_beside.argmax(axis=1)
             nearest_um[sites] = distance_um[:, 0]
@@ -136,22 +141,22 @@ def _spacing_um(xy_um: Floats) -> tuple[Floats, Floats]:
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EccentricityTable:
     """
-    Sampling against the distance from a centre.
+    Sampling density against the distance from a centre.
 
     Attributes
     ----------
     edges_um : (n_bin + 1,) float64, µm
-        Limits of the bins.
+        Edges of the bins.
     n_sites : (n_bin,) int64
     nyquist_per_mm, nyquist_min_per_mm, nyquist_max_per_mm : (n_bin,) float64, 1/mm
-        Median, lowest and highest Nyquist frequency of each bin's sites; NaN where there are none.
+        Median, lowest and highest Nyquist frequency of the sites in each bin; NaN for empty bins.
     size_um : (n_bin,) float64, µm
-        Mean square root of the sites' areas; NaN where there are none.
+        Mean square root of the site areas; NaN for empty bins.
     size_at_centre_um : float, µm
-        Of the line ``size = size_at_centre + growth · r`` through all sites, by least squares: 0 for a log-polar layout. The
-        linear magnification, sites to a µm, is ``1 / size``, as that of the cortex is.
+        Intercept of the least-squares line ``size = size_at_centre + growth · r`` over all sites: 0 for a log-polar layout.
+        The linear magnification in sites per µm is ``1 / size``, like the cortical magnification.
     growth_fraction : float
-        The line's slope: 0 where sites are of one size.
+        Slope of this line: 0 for sites of equal size.
     """
 
     edges_um: Floats
@@ -165,11 +170,11 @@ class EccentricityTable:
 
     @property
     def e2_um(self) -> float:
-        """Eccentricity at which sites are twice as large as at the centre; infinite where they are of one size, µm."""
+        """Eccentricity at which the site size has doubled, µm; infinite for sites of equal size."""
         return self.size_at_centre_um / self.growth_fraction if self.growth_fraction else float("inf")
 
     def records(self) -> list[dict[str, Any]]:
-        """One dict a bin."""
+        """Return one dict per bin."""
         return [
             {
                 "from_um": float(self.edges_um[k]),
@@ -203,15 +208,15 @@ def nyquist_vs_eccentricity(
     per_channel: bool = False,
 ) -> EccentricityTable:
     """
-    Nyquist frequency and size of the sites in rings around a centre.
+    Compute Nyquist frequency and size of the sites in rings around a centre.
 
     Parameters
     ----------
     layout : Layout
     centre_um : (x, y), µm
-        On the optical axis by default.
+        Centre of the rings; the optical axis by default.
     n_bins : int
-        Rings of equal widths, from the nearest site to the furthest.
+        Number of rings of equal width, from the nearest site to the farthest.
     by, per_channel
         As for :func:`nyquist_per_mm`.
 
@@ -230,7 +235,7 @@ def nyquist_vs_eccentricity(
         raise ParameterError("centre_um", "must be two numbers (x, y)", centre_um, "µm")
     n_bins = check_count("n_bins", n_bins, at_most=100_000)
     if layout.n_sites == 0:
-        raise ParameterError("layout", "must have sites")
+        raise ParameterError("layout", "must have at least one site")
     nyquist = nyquist_per_mm(layout, by=by, per_channel=per_channel)
     r_um, size_um = np.hypot(*(layout.centroid_um - centre).T), np.sqrt(layout.area_um2)
     edges_um = np.linspace(r_um.min(), max(r_um.max(), r_um.min() + 1e-9), n_bins + 1)
@@ -240,7 +245,7 @@ def nyquist_vs_eccentricity(
     off_um = r_um - r_um.mean()
     slope = float(off_um @ size_um / max(off_um @ off_um, np.finfo(float).tiny))
     at_centre_um = float(size_um.mean() - slope * r_um.mean())
-    # Sizes that differ by rounding alone have no slope, and lines through the origin no size there.
+    # Set rounding errors to 0: the slope for equal sizes, and the intercept of a line through the origin.
     rounding_um = SIZE_ROUNDING * float(size_um.mean())
     slope = 0.0 if abs(slope) * np.ptp(r_um) <= rounding_um else slope
     at_centre_um = 0.0 if abs(at_centre_um) <= rounding_um else at_centre_um
@@ -259,19 +264,19 @@ def nyquist_vs_eccentricity(
 
 def require_layout(layout: object) -> None:
     """
-    Pass a layout.
+    Validate that an argument is a layout.
 
     Raises
     ------
     ParameterError
-        When it is something else.
+        When it is not a :class:`foveasim.Layout`.
     """
     if not isinstance(layout, Layout):
         raise ParameterError("layout", f"must be a foveasim.Layout, got a {type(layout).__name__}")
 
 
 def _low_middle_high(values: Floats, position: NDArray[np.intp], n_bins: int) -> tuple[Floats, Floats, Floats]:
-    """Lowest, median and highest value of every bin; NaN where there is none."""
+    """Return lowest, median and highest value of each bin; NaN for empty bins."""
     is_known = np.isfinite(values)
     values, position = values[is_known], position[is_known]
     order = np.lexsort((values, position))

@@ -1,8 +1,8 @@
 """
-The modulation transfer function (MTF) from a slanted edge, in the manner of ISO 12233, for photosites of any shapes and places.
+Slanted-edge MTF after ISO 12233, for photosites of arbitrary shape and position.
 
-On a grid the standard projects pixels along the edge, so that rows at slightly different phases make one finely sampled
-profile. Nothing of that needs a grid: every site is a sample at its own distance from the edge.
+On a grid, the standard projects pixels along the edge, so that rows at slightly different phases form one finely sampled edge
+spread function (ESF). The method does not require a grid: every site is a sample at its own distance from the edge.
 """
 
 from __future__ import annotations
@@ -32,63 +32,63 @@ from foveasim.units import per_mm_from_per_um, per_um_from_per_mm
 
 __all__ = ["EdgeMtf", "slanted_edge_mtf"]
 
-#: Bins to a pitch, as the standard has it.
+#: Bins per pitch, as in the standard.
 BINS_PER_PITCH = 4
-#: Fewer sites tell no edge, and a shorter profile to each side, in pitches, no frequencies.
+#: Minimum number of sites, and minimum extent of the ESF on each side in pitches.
 LEAST_SITES, LEAST_REACH_PITCHES = 50, 5.0
-#: (white - black) / (white + black) below which black and white are the same.
+#: Minimum contrast (white - black) / (white + black).
 LEAST_CONTRAST = 0.02
-#: A sum of black and white below this fraction of their difference is rounding.
+#: Sum of black and white, as a fraction of their difference, below which it is rounding error.
 NO_SUM = 1e-9
-#: Fraction of the values' variance that one straight edge must explain.
+#: Minimum fraction of the variance of the values that one straight edge explains.
 LEAST_EXPLAINED = 0.3
-#: Bins of that width reach to this distance, in pitches and in widths of the edge; beyond it each is wider by this fraction of
-#: the distance. The ESF is smooth there, and noise at high frequencies would dominate the MTF.
+#: Extent of bins of constant width, in pitches and in widths of the edge; beyond it, the bin width increases by this fraction
+#: of the distance. The ESF is smooth there, and noise at high frequencies would dominate the MTF.
 NARROW_PITCHES, NARROW_WIDTHS, WIDENING = 3.0, 2.0, 0.5
-#: A profile that reaches less far than so many widths of the edge, the error function's, ends on its slope.
+#: Minimum extent of the ESF in widths of the error function; a shorter one would end on the slope of the edge.
 LEAST_REACH_WIDTHS = 2.0
-#: Bins on either side whose sites tell together how much values scatter.
+#: Neighbouring bins on either side that contribute to the noise estimate of a bin.
 SCATTER_BINS = 4
-#: With fewer bins to a period their aliases are no longer small: with so many they are below 1 %, with two 18 %.
+#: Minimum number of bins per period; aliases are below 1 % for 4 bins, and 18 % for 2 bins.
 BINS_PER_PERIOD = 4
-#: An edge blurred over more than this fraction of the region is a ramp.
+#: Largest edge width as a fraction of the region; a wider transition is a ramp.
 WIDEST_SHARE = 0.25
-#: Residuals beyond this fraction of the step count less and less: a defect, or another edge at the border.
+#: Residual, as a fraction of the step, above which the robust loss reduces its weight (defects, other edges at the boundary).
 SOFT_SHARE = 0.1
-#: Frequencies of a result that asks for none, up to one a pitch, twice the Nyquist frequency of a square grid.
+#: Default number of frequencies, up to one line pair per pitch, twice the Nyquist frequency of a square grid.
 N_FREQUENCIES = 101
-#: Levels of the histogram that tells black from white.
+#: Levels of the histogram that separates black from white.
 N_LEVELS = 256
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EdgeMtf:
     """
-    What a slanted edge tells.
+    Result of the slanted-edge method.
 
     Attributes
     ----------
     frequency_per_mm : (n_frequency,) float64, 1/mm
-        Line pairs per mm on the sensor, across the edge.
+        Line pairs per mm on the sensor, perpendicular to the edge.
     mtf : (n_frequency,) float64
-        1 at frequency 0.
+        MTF, 1 at frequency 0.
     mtf_sigma : (n_frequency,) float64
-        Its standard deviation, as far as it comes of noise that differs from site to site; told from the scatter of the sites
-        about the profile. Where the MTF itself is no larger, its mean is too high.
+        Standard deviation of the MTF due to noise that is independent between sites, estimated from the scatter of the sites
+        about the ESF. Where the MTF is not larger than this value, it is biased high.
     angle_deg : float, degrees
-        Of the edge from the vertical, counter-clockwise, from -180 to 180: 0 has white to the right of it, 90 above it.
+        Angle of the edge from the vertical, counter-clockwise, from -180 to 180: white is to the right at 0, and above at 90.
     offset_um : float, µm
         Distance of the edge from the origin, towards white.
     contrast : float
-        (white - black) / (white + black); infinite where black is as far below 0 as white is above.
+        (white - black) / (white + black); infinite if black and white have opposite values.
     bin_um, pitch_um : float, µm
-        Width of a bin near the edge, and the reference pitch: the median distance of a site from its nearest neighbour.
+        Bin width near the edge, and the reference pitch: the median distance between a site and its nearest neighbour.
     distance_um : (n_bin,) float64, µm
-        Mean distance of each bin's sites from the edge, black first.
+        Mean distance of the sites in each bin from the edge, black first.
     profile : (n_bin,) float64
-        The edge spread function: mean of each bin's sites, in the unit of the values.
+        Edge spread function (ESF): mean of the sites in each bin, in the unit of the values.
     n_sites : int
-        Sites in the bins.
+        Number of sites in the bins.
     """
 
     frequency_per_mm: Floats
@@ -111,7 +111,7 @@ class EdgeMtf:
 
     @property
     def mtf50_per_mm(self) -> float:
-        """Lowest frequency where the MTF falls to 1/2, linear in between; NaN where it does not, 1/mm."""
+        """MTF50, the lowest frequency with an MTF of 1/2, linearly interpolated, 1/mm; or NaN."""
         below = np.flatnonzero(self.mtf < 0.5)
         if below.size == 0 or below[0] == 0:
             return float("nan")
@@ -131,29 +131,30 @@ def slanted_edge_mtf(
     window: Literal["tukey", "hamming", "none"] = "tukey",
 ) -> EdgeMtf:
     """
-    MTF of everything between a scene and the sites' values, from one straight edge between black and white.
+    Measure the MTF of a complete system from one straight edge between black and white.
 
     Parameters
     ----------
     layout : Layout
     values : (n_site,)
-        Linear in light per area: ``capture.expected_e``, ``capture.electrons`` or linear codes; where sites differ in size,
-        divided by ``layout.area_um2``. A site that is to be left out may be NaN.
+        Values linear in irradiance: ``capture.expected_e``, ``capture.electrons`` or linear codes; divided by
+        ``layout.area_um2`` if sites differ in size. Sites with NaN are excluded.
     where : (n_site,) bool, optional
-        Sites to take: a region where one edge is all there is, one filter of a mosaic, or an annulus of a foveal layout, whose
-        sites are of about one size. All by default.
+        Mask of the sites used: a region with a single edge, one filter of a mosaic, or an annulus of a foveal layout with sites
+        of similar size. All by default.
     bin_um : float, optional, µm
-        Width of the bins of the edge spread function near the edge; a quarter of the reference pitch by default, one
-        pitch at most.
+        Bin width of the edge spread function near the edge; a quarter of the reference pitch by default, at most one
+        pitch.
     reach_um : float, optional, µm
-        How far from the edge sites are looked at; by default as far as there are sites in every bin on both sides. Light that
-        falls off over the region is taken for a part of the edge: give a shorter reach then, five pitches at least.
+        Largest distance from the edge of the sites used; by default as far as all bins on both sides contain sites. Shading
+        over the region is interpreted as a part of the edge; in this case give a shorter reach, at least five pitches.
     frequency_per_mm : (n,), optional, 1/mm
-        Rising, up to one line pair in four bins. By default from 0 to there, or to one line pair a pitch, in 100 steps.
+        Increasing frequencies, at most one line pair per four bins. By default from 0 to this limit, or to one line pair per
+        pitch, in 100 steps.
     window : {"tukey", "hamming", "none"}
-        By which the line spread function is multiplied: flat over the middle half of the reach with cosine ends; the bell of
-        the standard's first editions; or none. The narrower the window, the more of the light that a lens spreads far is left
-        out, and the higher the MTF comes out.
+        Window of the line spread function: ``"tukey"`` is flat over the central half of the reach with cosine flanks,
+        ``"hamming"`` is the window of the standard's first editions. A narrower window excludes more of the PSF tails of the
+        lens, which increases the measured MTF.
 
     Returns
     -------
@@ -164,24 +165,25 @@ def slanted_edge_mtf(
     ParameterError
         When an argument is out of range, or there are too few sites.
     SimulationError
-        When no straight edge is found, there is too little contrast, or the edge runs along rows of sites.
+        When no straight edge is found, the contrast is too low, or the edge is parallel to rows of sites.
 
     Notes
     -----
-    The edge is where an error function across a line fits best, at any angle and place, with soft losses. Sites are binned by
-    the distance of their centroids from it, weighted by area. Where a bin's sites lie about their mean place, its mean is off
-    by half the places' variance times the profile's curvature, which is taken off: for sites spread evenly over a bin that is
-    the bin's own ``sinc(f b)``, and right for any others. The line spread function is the difference of neighbouring bins, at
-    places d apart; that multiplies its spectrum by ``sinc(f d)``, which is divided out, as the standard does.
+    The edge position and angle are found by a robust least-squares fit of an error function. Sites are binned by the distance
+    of their centroids from the edge, weighted by area. The mean of a bin differs from the ESF at the mean distance by half the
+    variance of the distances times the curvature of the ESF, and is corrected by this amount. For sites uniformly distributed
+    over a bin, this corresponds to the ``sinc(f b)`` of the bin. The line spread function (LSF) is the difference of
+    neighbouring bins at the distance d, which multiplies its spectrum by ``sinc(f d)``; this factor is divided out, as in the
+    standard.
 
-    Bins are narrow up to three pitches or twice the edge's width from it, and from there on half as wide as the way beyond. So
-    far out the line spread function is smooth, as that of a lens is: all of its light is counted, and of its noise little. Its
-    differences are spread over their steps, which multiplies their spectrum by ``sinc(f d)`` once more. Of 100
-    by 100 squares with an edge of 50 and of 20 times the noise, the MTF up to the Nyquist frequency is off by 0.008 and 0.021
-    (root mean square), four tenths of what narrow bins as far as the region reaches have.
+    Bins have constant width up to three pitches or two edge widths, whichever is larger, and beyond it half the additional
+    distance. At such distances the LSF of a lens is smooth: wide bins include its tails with little noise. The differences are
+    distributed uniformly over their steps, which multiplies their spectrum by ``sinc(f d)`` once more. For 100 by 100 squares
+    and an edge of 50 and of 20 times the noise, the error of the MTF up to the Nyquist frequency is 0.008 and 0.021 (root mean
+    square), four tenths of the error with constant bins over the complete region.
 
-    The MTF is that across the edge, of the sites near it. It contains the sites' own shape (:func:`polygon_mtf`), the lens,
-    diffusion between sites, and the chart's own pixels.
+    The MTF is perpendicular to the edge and applies to the sites near it. It includes the aperture of the sites
+    (:func:`polygon_mtf`), the lens, diffusion between sites, and the pixels of the chart.
 
     References
     ----------
@@ -190,18 +192,20 @@ def slanted_edge_mtf(
     require_layout(layout)
     site_values = as_numbers("values", values, missing_is_nan=True)
     if site_values.shape != (layout.n_sites,):
-        raise ParameterError("values", f"must be one for each of the {layout.n_sites} sites, got {site_values.shape}")
+        raise ParameterError(
+            "values", f"must have one value for each of the {layout.n_sites} sites, got shape {site_values.shape}"
+        )
     is_used = np.isfinite(site_values) & _mask(where, layout.n_sites)
     check_choice("window", window, ("tukey", "hamming", "none"))
     n_used = int(np.count_nonzero(is_used))
     if n_used < LEAST_SITES:
-        raise ParameterError("where", f"must leave at least {LEAST_SITES} sites", n_used)
+        raise ParameterError("where", f"must select at least {LEAST_SITES} sites", n_used)
     xy_um, light, area_um2 = layout.centroid_um[is_used], site_values[is_used], layout.area_um2[is_used]
     pitch_um = _pitch_um(xy_um)
     if bin_um is None:
         bin_um = pitch_um / BINS_PER_PITCH
     else:
-        bin_um = check_length_um("bin_um", bin_um, at_most=pitch_um, hint="one pitch is the most")
+        bin_um = check_length_um("bin_um", bin_um, at_most=pitch_um, hint="the limit is one pitch")
     frequency = _frequencies_per_mm(frequency_per_mm, bin_um, pitch_um)
     edge = _find_edge(xy_um, light, pitch_um)
     across = np.array([np.cos(edge.angle_rad), np.sin(edge.angle_rad)])
@@ -227,27 +231,25 @@ def _mask(where: ArrayLike | None, n_sites: int) -> Bools:
         return np.ones(n_sites, bool)
     mask = np.asarray(unmasked("where", where))
     if mask.dtype != bool or mask.shape != (n_sites,):
-        raise ParameterError(
-            "where", f"must be a mask of the {n_sites} sites, got {mask.dtype} of the shape {mask.shape}"
-        )
+        raise ParameterError("where", f"must be a mask of the {n_sites} sites, got {mask.dtype} of shape {mask.shape}")
     return mask
 
 
 def _frequencies_per_mm(frequency_per_mm: ArrayLike | None, bin_um: float, pitch_um: float) -> Floats:
-    """Those asked for, checked, or the default ones."""
+    """Return the validated frequencies, or the default ones."""
     highest = float(per_mm_from_per_um(1.0 / (BINS_PER_PERIOD * bin_um)))
     if frequency_per_mm is None:
         return np.linspace(0.0, min(highest, float(per_mm_from_per_um(1.0 / pitch_um))), N_FREQUENCIES)
     frequency = np.atleast_1d(finite_array("frequency_per_mm", frequency_per_mm, at_least=0.0)).copy()
     if frequency.ndim != 1 or frequency.size == 0 or np.any(np.diff(frequency) <= 0.0):
-        raise ParameterError("frequency_per_mm", "must be rising numbers, (n,)", frequency_per_mm, "1/mm")
+        raise ParameterError("frequency_per_mm", "must be strictly increasing, (n,)", frequency_per_mm, "1/mm")
     if frequency[-1] > highest * (1.0 + 1e-9):
         raise ParameterError(
             "frequency_per_mm",
             f"must be <= {highest:.4g} with bins of {bin_um:.4g} µm",
             float(frequency[-1]),
             "1/mm",
-            "take narrower bins (bin_um)",
+            "use narrower bins (bin_um)",
         )
     return frequency
 
@@ -259,11 +261,11 @@ def _pitch_um(xy_um: Floats) -> float:
 
 
 def _mtf(bins: _Bins, window: str, cycles_per_um: Floats) -> tuple[Floats, Floats]:
-    """The MTF and its standard deviation, (n_frequency,)."""
+    """Compute the MTF and its standard deviation, (n_frequency,)."""
     rise, step_um = np.diff(bins.profile), np.diff(bins.distance_um)
     at_um = 0.5 * (bins.distance_um[1:] + bins.distance_um[:-1])
     weight = _window(window, at_um / max(-bins.distance_um[0], bins.distance_um[-1]))
-    # What a difference over a step leaves of each frequency, for the narrow ones in the mean by their sizes.
+    # Transfer factor of a difference over a step; averaged over constant bins, weighted by the differences.
     left = np.sinc(np.multiply.outer(cycles_per_um, step_um))
     is_narrow = bins.is_narrow[1:] & bins.is_narrow[:-1]
     size = np.abs(rise * weight) * is_narrow
@@ -273,18 +275,18 @@ def _mtf(bins: _Bins, window: str, cycles_per_um: Floats) -> tuple[Floats, Float
     spectrum, total = kernel @ rise, float(weight @ rise)
     modulus = np.abs(spectrum)
     mtf = modulus / total
-    # To first order in the noise of the profile: a bin is the end of one rise and the beginning of the next.
+    # First-order error propagation from the ESF: each bin contributes to two adjacent differences.
     phase = spectrum.conj() / np.maximum(modulus, np.finfo(float).tiny)
     of_rise = ((phase[:, np.newaxis] * kernel).real - np.multiply.outer(mtf, weight)) / total
     of_bin = -np.diff(of_rise, axis=1, prepend=0.0, append=0.0)
     return mtf, np.sqrt(np.square(of_bin) @ bins.variance)
 
 
-# -- the edge ------------------------------------------------------------------------------------------------------
+# -- edge fit -----------------------------------------------------------------------------------------------------
 
 
 class _Edge(NamedTuple):
-    """Direction towards white (rad), the edge's distance from the origin in that direction, its width, and its contrast."""
+    """Direction towards white (rad), distance from the origin, width and contrast of an edge."""
 
     angle_rad: float
     offset_um: float
@@ -293,7 +295,7 @@ class _Edge(NamedTuple):
 
 
 def _find_edge(xy_um: Floats, values: Floats, pitch_um: float) -> _Edge:
-    """The straight edge between black and white that fits best, from sites at (n, 2) points."""
+    """Fit a straight edge between black and white to values at points (n, 2)."""
     from scipy.optimize import least_squares
     from scipy.special import erf
 
@@ -302,9 +304,9 @@ def _find_edge(xy_um: Floats, values: Floats, pitch_um: float) -> _Edge:
     is_white = values > level
     n_white = int(np.count_nonzero(is_white))
     if n_white in (0, values.size):
-        raise SimulationError("no edge is found: all values are the same")
+        raise SimulationError("no edge found: all values are equal; use a region with one edge")
     black, white = float(np.median(values[~is_white])), float(np.median(values[is_white]))
-    # Sites of either kind, told apart by a line as well as may be; so many on its black side as are black.
+    # Initial line: linear discriminant of black and white sites, with as many sites on its black side as there are black ones.
     xy = (xy_um - middle_um) / extent_um
     towards = np.linalg.solve(np.cov(xy.T), xy.T @ (is_white - is_white.mean()))
     angle = float(np.arctan2(towards[1], towards[0]))
@@ -327,21 +329,21 @@ def _find_edge(xy_um: Floats, values: Floats, pitch_um: float) -> _Edge:
     explained = 1.0 - float(np.square(residuals(fit.x)).mean()) / float(share.var())
     if explained < LEAST_EXPLAINED:
         raise SimulationError(
-            f"no edge is found: a straight edge explains {100.0 * max(explained, 0.0):.0f} % of the values' variance, less "
-            f"than {100.0 * LEAST_EXPLAINED:.0f} %; take a region with one edge and less noise"
+            f"no edge found: a straight edge explains {100.0 * max(explained, 0.0):.0f} % of the variance of the values, less "
+            f"than {100.0 * LEAST_EXPLAINED:.0f} %; use a region with one edge and less noise"
         )
     if width > WIDEST_SHARE:
         raise SimulationError(
-            f"no edge is found: the values rise over {width * extent_um:.4g} µm, more than a quarter of the region"
+            f"no edge found: the fit is {width * extent_um:.4g} µm wide, more than a quarter of the region; use a larger region"
         )
     low, high = black + (white - black) * low, black + (white - black) * high
-    # Of values around 0 a contrast has no meaning.
+    # The contrast of values symmetric about 0 is undefined.
     contrast = (high - low) / (high + low) if abs(high + low) > NO_SUM * (high - low) else np.inf
     contrast = abs(contrast)
     if contrast < LEAST_CONTRAST:
         raise SimulationError(
-            f"the edge has too little contrast: black is {low:.4g} and white {high:.4g}, a contrast of {contrast:.2g}, less "
-            f"than {LEAST_CONTRAST:g}"
+            f"the contrast of the edge must be at least {LEAST_CONTRAST:g}, got {contrast:.2g} (black {low:.4g}, white "
+            f"{high:.4g})"
         )
     angle = float((angle + np.pi) % (2.0 * np.pi) - np.pi)
     direction = np.array([np.cos(angle), np.sin(angle)])
@@ -349,7 +351,7 @@ def _find_edge(xy_um: Floats, values: Floats, pitch_um: float) -> _Edge:
 
 
 def _level_between(values: Floats) -> float:
-    """The level that parts values best into two kinds (Otsu 1979)."""
+    """Return the threshold that best separates two classes of values (Otsu 1979)."""
     counts, edges = np.histogram(values, N_LEVELS)
     n_below = np.cumsum(counts)
     sums = np.cumsum(counts * 0.5 * (edges[1:] + edges[:-1]))
@@ -359,16 +361,16 @@ def _level_between(values: Floats) -> float:
         return float(edges[-1])
     means = sums / np.maximum(n_below, 1), (sums[-1] - sums) / np.maximum(n_above, 1)
     between = np.where(both, n_below * n_above * (means[1] - means[0]) ** 2, 0.0)
-    # Over the gap between the two kinds it is the same everywhere: its middle.
+    # The criterion is constant over the gap between both classes; use the centre of the gap.
     best = np.flatnonzero(between >= between.max() * (1.0 - 1e-12))
     return float(0.5 * (edges[best[0] + 1] + edges[best[-1] + 1]))
 
 
-# -- the profile ---------------------------------------------------------------------------------------------------
+# -- edge spread function ------------------------------------------------------------------------------------------
 
 
 class _Bins(NamedTuple):
-    """Mean distances of the bins' sites, the profile there and its variance, which are narrow, and how many sites there are."""
+    """Mean distances, ESF, its variance, mask of bins of constant width, and number of sites."""
 
     distance_um: Floats
     profile: Floats
@@ -386,29 +388,30 @@ def _binned(
     pitch_um: float,
     width_um: float,
 ) -> _Bins:
-    """Edge spread function: means over bins of the distance from the edge, weighted by area."""
-    # Bin 0 begins at the edge.
+    """Compute the ESF as area-weighted means over bins of the distance from the edge."""
+    # Bin 0 starts at the edge.
     k = np.floor(distance_um / bin_um).astype(np.int64)
     first = int(k.min())
     weight = np.bincount(k - first, weights=area_um2)
     empty = np.flatnonzero(weight == 0.0) + first
-    # As far as no bin is empty.
+    # Largest contiguous range of bins with sites.
     low = int(empty[empty < 0].max(initial=first - 1)) + 1
     high = int(empty[empty >= 0].min(initial=int(k.max()) + 1)) - 1
     n_sides = min(-low, high + 1)
     least_um = max(LEAST_REACH_PITCHES * pitch_um, LEAST_REACH_WIDTHS * width_um)
     if reach_um is not None:
-        hint = f"five pitches of {pitch_um:.3g} µm, and twice the edge's width of {width_um:.3g} µm, are the least"
+        hint = f"the minimum is five pitches of {pitch_um:.3g} µm and two edge widths of {width_um:.3g} µm"
         least_um = check_number("reach_um", reach_um, at_least=float(f"{least_um:.3g}"), hint=hint)
         n_sides = min(n_sides, int(np.ceil(least_um / bin_um)))
     if n_sides * bin_um < least_um * (1.0 - 1e-9):
         far_um = min(-distance_um.min(), distance_um.max())
         raise SimulationError(
-            f"the edge's profile has gaps or ends {max(n_sides, 0) * bin_um:.4g} µm from it, before {least_um:.4g} µm: "
+            f"the edge spread function must extend to {least_um:.4g} µm without empty bins, "
+            f"got {max(n_sides, 0) * bin_um:.4g} µm; "
             + (
-                "the edge is too near to the region's border"
+                "the edge is too close to the boundary of the region"
                 if far_um < least_um
-                else "turn the edge by a few degrees from the rows of sites, take a larger region, or wider bins (bin_um)"
+                else "rotate the edge by a few degrees from the rows of sites, or use a larger region or wider bins (bin_um)"
             )
         )
     is_in = (k >= -n_sides) & (k < n_sides)
@@ -421,9 +424,9 @@ def _binned(
     off_um = distance_um[is_in] - mean_um[position]
     variance_um2 = np.bincount(position, weights=weights * np.square(off_um)) / total
     profile = np.bincount(position, weights=weights * value) / total
-    # The mean over places that vary about a middle is off from the value there by half the variance times the curvature.
+    # The bin mean differs from the ESF at the mean distance by half the variance of the distances times the curvature.
     profile -= 0.5 * variance_um2 * _curvature(mean_um, profile)
-    # What values are off from the profile's parabola at their own places is noise.
+    # Noise: deviation of the values from a local parabola through the ESF.
     slope, bend = np.gradient(profile, mean_um), 0.5 * _curvature(mean_um, profile)
     noise = value - (profile[position] + (slope[position] + bend[position] * off_um) * off_um)
     return _Bins(
@@ -436,7 +439,7 @@ def _binned(
 
 
 def _widening_borders(n_narrow: int, n_sides: int) -> Ints:
-    """Borders of the bins, in narrow ones, from -n_sides to n_sides."""
+    """Return the bin edges from -n_sides to n_sides, in units of the narrow bin width."""
     side = list(range(min(n_narrow, n_sides) + 1))
     while side[-1] < n_sides:
         step, rest = round(1.0 + max(0.0, WIDENING * (side[-1] - n_narrow))), n_sides - side[-1]
@@ -445,7 +448,11 @@ def _widening_borders(n_narrow: int, n_sides: int) -> Ints:
 
 
 def _scatter(values: Floats, position: NDArray[np.intp]) -> Floats:
-    """Variance of values about 0 in each bin, told from its neighbours too; NaN where all hold one site alone."""
+    """
+    Estimate the variance of values about 0 in each bin, pooled with neighbouring bins.
+
+    It is NaN if all these bins contain a single site each.
+    """
     around = np.ones(2 * SCATTER_BINS + 1)
     squares = np.convolve(np.pad(np.bincount(position, weights=np.square(values)), SCATTER_BINS), around, "valid")
     freedom = np.convolve(np.pad(np.bincount(position) - 1.0, SCATTER_BINS), around, "valid")
@@ -453,14 +460,14 @@ def _scatter(values: Floats, position: NDArray[np.intp]) -> Floats:
 
 
 def _curvature(distance_um: Floats, profile: Floats) -> Floats:
-    """Second derivative of the profile at its inner points by second differences, 0 at its ends."""
+    """Compute the second derivative of the ESF by second differences; 0 at both ends."""
     step_um, rise = np.diff(distance_um), np.diff(profile)
     slope = rise / step_um
     return np.pad(2.0 * np.diff(slope) / (step_um[1:] + step_um[:-1]), 1)
 
 
 def _window(window: str, share: Floats) -> Floats:
-    """Weights at fractions of the reach, from -1 to 1."""
+    """Return the window at fractions of the reach, from -1 to 1."""
     share = np.minimum(np.abs(share), 1.0)
     if window == "tukey":
         return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.maximum(2.0 * share - 1.0, 0.0)))

@@ -1,7 +1,7 @@
 """
-Signal and noise of the sites of each size or class: predicted, without a draw, and measured from captures.
+Signal-to-noise ratio (SNR) per class of sites, predicted or measured from captures.
 
-Predictions are those of :func:`foveasim.sensor.signal_to_noise`, the package's one definition of the ratio.
+Predictions use :func:`foveasim.sensor.signal_to_noise`, the only definition of the SNR in the package.
 """
 
 from __future__ import annotations
@@ -29,20 +29,21 @@ from foveasim.sensor.signal_to_noise import CUT_OFF_SIGMAS
 
 __all__ = ["SnrTable", "measured_snr_by_class", "relative_exposure_at_snr_fraction", "size_classes_um", "snr_by_class"]
 
-#: Sizes that differ by less than this share are one class.
+#: Relative difference below which sizes form one class.
 SIZE_ROUNDING = 1e-6
-#: The light at a ratio is looked for between these fractions of what is given, and found to this fraction of it.
+#: Search range of the relative exposure, and relative tolerance of the result.
 LEAST_SHARE, MOST_SHARE, SHARE_ROUNDING = 1e-12, 1e12, 1e-6
-#: In at most so many steps, each so many of them a half, for clips that bend the ratio; of secants between these slopes.
+#: Maximum number of iterations, interval of the bisection steps (clipping makes the SNR nonlinear), and slope limits of the
+#: secant steps.
 MOST_STEPS, HALVED_EVERY, SLOPES = 200, 4, (0.25, 4.0)
-#: Between two columns of a printed table.
+#: Separator between the columns of a printed table.
 GAP = "  "
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SnrTable:
     """
-    Signal and temporal noise of each class of sites, in linear codes.
+    Signal, temporal noise and SNR of each class of sites, in linear codes.
 
     Attributes
     ----------
@@ -50,15 +51,15 @@ class SnrTable:
         Labels of the classes, sorted.
     n_sites : (n_class,) int64
     size_um : (n_class,) float64, µm
-        Mean square root of the sites' areas.
+        Mean square root of the site areas.
     signal_dn : (n_class,) float64, DN
-        Mean code less that of dark frames.
+        Mean code less the mean dark code.
     noise_dn : (n_class,) float64, DN
-        Root of the mean temporal variance, quantisation included.
+        Square root of the mean temporal variance, including quantisation.
     saturated_fraction : (n_class,) float64
-        Fraction of the sites whose noise is cut off: the mean charge is within two standard deviations of its shot noise of
-        the full well, or the mean code within two of its own of the highest. A prediction has the ratio of saturation there;
-        a measured ratio is too high.
+        Fraction of sites with clipped noise: the mean charge is within two standard deviations of its shot noise of the full
+        well, or the mean code is within two standard deviations of the highest code. Predictions for such sites have the SNR
+        at saturation; a measured SNR is too high.
     """
 
     classes: NDArray[Any]
@@ -70,17 +71,21 @@ class SnrTable:
 
     @property
     def snr(self) -> Floats:
-        """Signal over noise, (n_class,): at most the root of the signal's electrons, unless measured ones are saturated."""
+        """
+        Signal over noise, (n_class,).
+
+        It is at most the square root of the signal in electrons, except for a measurement at saturation.
+        """
         return np.divide(self.signal_dn, self.noise_dn, out=np.zeros_like(self.signal_dn), where=self.noise_dn > 0.0)
 
     @property
     def snr_db(self) -> Floats:
-        """The same in decibels, ``20 log10``, (n_class,); -inf without signal."""
+        """SNR in decibels, ``20 log10``, (n_class,); -inf without signal."""
         with np.errstate(divide="ignore"):
             return 20.0 * np.log10(np.maximum(self.snr, 0.0))
 
     def records(self) -> list[dict[str, Any]]:
-        """One dict a class."""
+        """Return one dict per class."""
         columns = {
             "class": self.classes,
             "n_sites": self.n_sites,
@@ -109,7 +114,7 @@ class SnrTable:
             )
             for row in self.records()
         ]
-        # As wide as their widest cell: numbers of any magnitude stay apart.
+        # Column width of the widest cell, so that numbers of any magnitude remain separated.
         widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
         return "\n".join(
             GAP.join(cell.rjust(width) for cell, width in zip(cells, widths, strict=True)) for cells in (heads, *rows)
@@ -118,28 +123,28 @@ class SnrTable:
 
 def size_classes_um(layout: Layout, n_classes: int = 6) -> Floats:
     """
-    The class of size of every site: equal ratios from the smallest to the largest.
+    Assign each site to a size class, with logarithmically spaced class limits.
 
     Parameters
     ----------
     layout : Layout
     n_classes : int
-        At most; classes without sites are not there.
+        Maximum number of classes; empty classes are omitted.
 
     Returns
     -------
     size_um : (n_site,) float64, µm
-        The middle of its class, the geometric mean of its limits; size is the square root of area.
+        Centre of the class, the geometric mean of its limits; the size is the square root of the area.
 
     Raises
     ------
     ParameterError
-        When the number is below 1, or the layout has no sites.
+        When ``n_classes`` is below 1, or the layout has no sites.
     """
     require_layout(layout)
     n_classes = check_count("n_classes", n_classes)
     if layout.n_sites == 0:
-        raise ParameterError("layout", "must have sites")
+        raise ParameterError("layout", "must have at least one site")
     size_um = np.sqrt(layout.area_um2)
     low_um, high_um = float(size_um.min()), float(size_um.max())
     if high_um <= low_um * (1.0 + SIZE_ROUNDING):
@@ -153,7 +158,7 @@ def snr_by_class(
     camera: Camera, light: Scene | PowerMap, *, exposure_s: float, classes: ArrayLike | None = None
 ) -> SnrTable:
     """
-    Predict signal and noise of each class of sites, without a draw.
+    Predict signal and noise of each class of sites analytically.
 
     Parameters
     ----------
@@ -161,7 +166,7 @@ def snr_by_class(
     light : Scene or PowerMap
     exposure_s : float, s
     classes : (n_site,), optional
-        Label of each site's class, such as a filter or zone; by default :func:`size_classes_um`. Two sites or more each.
+        Class label of each site, such as a filter or zone; by default :func:`size_classes_um`. At least two sites each.
 
     Returns
     -------
@@ -174,8 +179,8 @@ def snr_by_class(
 
     Notes
     -----
-    Signal and noise are those of :func:`foveasim.sensor.signal_to_noise`, in linear codes: quantisation is in the noise once,
-    companding and the response's bend are referred to the charge.
+    Signal and noise are those of :func:`foveasim.sensor.signal_to_noise`, in linear codes: the noise includes quantisation
+    once; companding and response nonlinearity are referred to the charge.
     """
     exposure_s = check_plausible("exposure_s", exposure_s)
     sensor, layout = _sensor_and_layout(camera)
@@ -189,7 +194,9 @@ def relative_exposure_at_snr_fraction(
     camera: Camera, light: Scene | PowerMap, *, exposure_s: float, snr: float = 1.0, classes: ArrayLike | None = None
 ) -> Floats:
     """
-    Fraction of a scene's light at which each class of sites has a signal-to-noise ratio: 1 for the least that can be seen.
+    Return the relative exposure at which each class of sites reaches a given SNR.
+
+    With ``snr=1`` this is the absolute sensitivity threshold, relative to the given exposure.
 
     Parameters
     ----------
@@ -197,15 +204,15 @@ def relative_exposure_at_snr_fraction(
     light : Scene or PowerMap
     exposure_s : float, s
     snr : float
-        The ratio that is asked for.
+        Required signal-to-noise ratio.
     classes : (n_site,), optional
         As for :func:`snr_by_class`.
 
     Returns
     -------
     share : (n_class,) float64
-        In the order of the sorted labels; more than 1 where the light given does not do. NaN where no light does: half of the
-        sites saturate before (:attr:`SnrTable.saturated_fraction`), or they see nothing.
+        Values in the order of the sorted labels; above 1 if the given exposure is too low. NaN if the SNR is not reached at any
+        exposure: half of the sites saturate before (:attr:`SnrTable.saturated_fraction`), or the sites have no signal.
 
     Raises
     ------
@@ -214,7 +221,7 @@ def relative_exposure_at_snr_fraction(
 
     Notes
     -----
-    Found by predicting the ratio of :func:`snr_by_class` at other fractions.
+    The relative exposure is found by iteration over predictions as in :func:`snr_by_class`.
     """
     exposure_s = check_plausible("exposure_s", exposure_s)
     snr = check_number("snr", snr, above=0.0)
@@ -239,7 +246,7 @@ def relative_exposure_at_snr_fraction(
 
 
 class _Search:
-    """Roots of rising functions of a logarithm, each of its own: secants, and halves where these leave what is left."""
+    """Simultaneous root search of increasing functions: secant steps with bisection fallback."""
 
     def __init__(self, n: int) -> None:
         self.at = np.zeros(n)
@@ -249,7 +256,7 @@ class _Search:
         self._n_steps = 0
 
     def step(self, value: Floats) -> None:
-        """Take the functions' values at ``at``, and go on to the next places; those that are done stay."""
+        """Update the brackets from the values at ``at``, and choose the next points."""
         at, goes = self.at, ~self.is_done
         is_above = value >= -SHARE_ROUNDING
         self.is_found |= goes & is_above
@@ -257,7 +264,7 @@ class _Search:
         self.low = np.where(goes & ~is_above, at, self.low)
         is_root = np.abs(value) <= SHARE_ROUNDING
         self.is_done |= is_root | (self.high - self.low <= SHARE_ROUNDING)
-        # Signals grow as the light and ratios as it or its root, where no clip bends them.
+        # Without clipping, the SNR is proportional to the exposure (slope 1) or to its square root (slope 1/2).
         slope = np.ones(at.size)
         if self._last is not None:
             moved = at - self._last[0]
@@ -279,19 +286,19 @@ def measured_snr_by_class(
     classes: ArrayLike | None = None,
 ) -> SnrTable:
     """
-    Measure signal and noise of each class of sites from frames of one scene and dark frames.
+    Measure signal and noise of each class of sites from frames and dark frames.
 
     Parameters
     ----------
     layout : Layout
     frames, dark : (n_frame, n_site) DN, or lists of codes or captures
-        Two frames or more. Codes of captures are made linear, as their settings say; others must be:
-        :func:`foveasim.sensor.linearise`.
+        Two frames or more of one scene, and dark frames. Codes of captures are linearised according to their settings; other
+        codes must be linear, see :func:`foveasim.sensor.linearise`.
     bits : int, optional
-        Of the codes, to tell saturation; taken from captures by default.
+        Bits per code, to detect saturation; taken from captures by default.
     full_well_e : float or (n_site,), optional, e-
-        Full wells, to tell saturation by captures' electrons; taken from their settings by default. Codes alone do not tell
-        that a well is full: without captures only saturation of the codes is told.
+        Full well capacity, to detect saturation from the electrons of captures; taken from their settings by default. Without
+        captures, only saturation of the codes is detected.
     classes : (n_site,), optional
         As for :func:`snr_by_class`.
 
@@ -302,14 +309,14 @@ def measured_snr_by_class(
     Raises
     ------
     ParameterError
-        When shapes do not fit together, there are fewer than two frames, the bits are not known, or captures' settings do
-        not tell the full well of every site.
+        When shapes are inconsistent, there are fewer than two frames, the bits are unknown, or the settings of captures do not
+        contain the full well capacity of every site.
 
     Notes
     -----
-    The variance is that of the codes, and no less than the 1/12 DN² of quantisation (times the square of the code's width where
-    codes are companded). Where noise spans more than one code it is that of :func:`snr_by_class`; inside one code, frames do
-    not show what there is of noise, and the ratio is an upper bound. A bent response is not made straight.
+    The variance is that of the codes, and at least the 1/12 DN² of quantisation (times the squared width of the code for
+    companded codes). If the noise exceeds one code, the result agrees with :func:`snr_by_class`. Within one code, frames do not
+    resolve the noise, and the SNR is an upper bound. Response nonlinearity is not corrected.
     """
     require_layout(layout)
     captures = frames if isinstance(frames, Sequence) and all(isinstance(frame, Capture) for frame in frames) else ()
@@ -317,12 +324,12 @@ def measured_snr_by_class(
         first = frames[0] if isinstance(frames, Sequence) and len(frames) else None
         bits = getattr(first, "bits", None)
         if bits is None:
-            raise ParameterError("bits", "must be given where frames are no captures")
+            raise ParameterError("bits", "must be given for frames that are not captures")
     bits = check_count("bits", bits, at_most=16)
     codes, dark_codes = codes_of("frames", frames), codes_of("dark", dark)
     for name, some in (("frames", codes), ("dark", dark_codes)):
         if some.shape[1] != layout.n_sites:
-            raise ParameterError(name, f"must have the layout's {layout.n_sites} sites", some.shape[1])
+            raise ParameterError(name, f"must have the {layout.n_sites} sites of the layout", some.shape[1])
     groups = SiteClasses(size_classes_um(layout) if classes is None else classes, layout.n_sites)
     is_saturated = _is_near(codes.mean(axis=0), codes.var(axis=0, ddof=1), 2**bits - 1.5)
     well_e = _full_well_e(captures, full_well_e, layout.n_sites)
@@ -337,7 +344,7 @@ def measured_snr_by_class(
 
 
 def _converter(captures: Sequence[Capture], bits: int) -> Converter:
-    """Converter that made the codes, as captures' settings specify it; a linear one where they do not."""
+    """Return the ADC specified by the settings of the captures, or a linear one."""
     settings = captures[0].settings.get("sensor", {}) if captures else {}
     names = ("companding", "log_strength", "companding_table", "inl_dn")
     return Converter(bits=bits, **{name: settings[name] for name in names if name in settings})
@@ -346,22 +353,26 @@ def _converter(captures: Sequence[Capture], bits: int) -> Converter:
 def _sensor_and_layout(camera: Camera) -> tuple[Sensor, Layout]:
     if not isinstance(camera, Camera):
         raise ParameterError("camera", f"must be a foveasim.Camera, got a {type(camera).__name__}")
-    assert isinstance(camera.sensor.layout, Layout)  # a camera takes no other
+    assert isinstance(camera.sensor.layout, Layout)  # guaranteed by Camera
     return camera.sensor, camera.sensor.layout
 
 
 def _full_well_e(captures: Sequence[Capture], full_well_e: ArrayLike | None, n_sites: int) -> Floats | None:
-    """Wells of the captures' sites, one or (n_site,); None where there are none, or no captures."""
+    """Return the full well capacity, one or (n_site,); None if unlimited or without captures."""
     if full_well_e is None:
         if not captures:
             return None
         full_well_e = captures[0].settings.get("sensor", {}).get("full_well_e")
         if isinstance(full_well_e, Mapping):
-            raise ParameterError("full_well_e", "must be given: the captures' settings do not tell it of every site")
+            raise ParameterError(
+                "full_well_e", "must be given, because the settings of the captures do not contain it for every site"
+            )
         if full_well_e is None:
             return None
     elif not captures:
-        raise ParameterError("full_well_e", "goes with captures: codes alone do not tell the charge")
+        raise ParameterError(
+            "full_well_e", "must not be given without captures; codes alone do not determine the charge"
+        )
     well_e = finite_array("full_well_e", full_well_e, above=0.0)
     if well_e.shape not in ((), (n_sites,)):
         raise ParameterError("full_well_e", f"must be one number, or one for each of the {n_sites} sites", well_e.shape)
@@ -369,12 +380,12 @@ def _full_well_e(captures: Sequence[Capture], full_well_e: ArrayLike | None, n_s
 
 
 def _is_near(value: Floats, variance: Floats, limit: Floats | float) -> Bools:
-    """Whether a limit is within some standard deviations of a value, or below it."""
+    """Return whether a value is above a limit or within some standard deviations below it."""
     return np.asarray(value + CUT_OFF_SIGMAS * np.sqrt(variance) >= limit)
 
 
 def _linear_codes(found: SiteSignals) -> tuple[Floats, Floats, Bools]:
-    """Signal in linear codes, its variance, and whether sites are saturated, (n_site,) each."""
+    """Return signal and variance in linear codes, and the saturation mask, (n_site,) each."""
     gain = found.gain_dn_per_e
     return gain * found.signal_e, np.square(gain * found.noise_e), found.is_saturated
 

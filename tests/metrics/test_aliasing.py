@@ -1,4 +1,4 @@
-"""Spectra of sampling points: peaks of lattices where theory has them, none in a disordered layout, aliases at their places."""
+"""Spectra of sampling points: lattice peaks, disordered layouts, and alias frequencies."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ BLUE = fs.layout.voronoi(n_sites=3600, size_um=(240.0, 240.0), seed=1)
 
 
 def scattered(n=3600, seed=3):
-    """Points without any order."""
+    """Random points."""
     return fs.Layout.from_rectangles(np.random.default_rng(seed).uniform(-120.0, 120.0, (n, 2)), 0.5)
 
 
 @pytest.mark.parametrize("kind", ["real", "complex"])
-def test_the_fast_transform_is_the_direct_sum(kind):
+def test_nonuniform_fft_matches_direct_sum(kind):
     rng = np.random.default_rng(0)
     xy_um, weight = rng.uniform(-50.0, 50.0, (400, 2)), rng.normal(size=400)
     if kind == "complex":
@@ -39,7 +39,7 @@ def test_the_fast_transform_is_the_direct_sum(kind):
 
 
 def peaks(spectrum, least):
-    """Places of local maxima of at least some power, (n, 2) as (fx, fy)."""
+    """Positions of local maxima above a minimum power, (n, 2) as (fx, fy)."""
     power = spectrum.power
     around = np.max([np.roll(power, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)
     iy, ix = np.nonzero((power == around) & (power >= least))
@@ -51,7 +51,7 @@ def peaks(spectrum, least):
     [(SQUARES, [[4.0, 0.0], [0.0, 4.0]]), (HEXAGONS, [[4.0, 0.0], [2.0, 2.0 * np.sqrt(3.0)]])],
     ids=["squares", "hexagons"],
 )
-def test_a_lattice_has_peaks_at_its_reciprocal_lattice_and_nowhere_else(layout, basis_um):
+def test_lattice_peaks_match_reciprocal_lattice(layout, basis_um):
     spectrum = sampling_spectrum(layout, max_per_mm=560.0)
     n = np.stack(np.meshgrid(np.arange(-4, 5), np.arange(-4, 5)), axis=-1).reshape(-1, 2)
     reciprocal = 1e3 * n @ np.linalg.inv(basis_um).transpose()
@@ -69,18 +69,18 @@ def test_a_lattice_has_peaks_at_its_reciprocal_lattice_and_nowhere_else(layout, 
     assert spectrum.nyquist_per_mm == pytest.approx(0.5 * np.sort(np.linalg.norm(reciprocal, axis=1))[1])
 
 
-def test_points_without_order_have_the_same_power_everywhere():
+def test_random_points_have_flat_spectrum():
     spectrum = sampling_spectrum(scattered(), max_per_mm=400.0)
     frequency, power, anisotropy = spectrum.radial(16)
     high = frequency > 2.0 * spectrum.peak_per_mm
 
     assert power[high] == pytest.approx(np.ones(high.sum()), abs=0.35)
     assert power[high].mean() == pytest.approx(1.0, abs=0.06)
-    # Powers of chance follow an exponential law, whose variance is its mean squared.
+    # The power of random points has an exponential distribution, whose variance is the squared mean.
     assert anisotropy[high].mean() == pytest.approx(1.0, abs=0.15)
 
 
-def test_blue_noise_has_a_valley_a_ring_and_no_peaks():
+def test_blue_noise_spectrum_has_no_peaks():
     spectrum, lattice = sampling_spectrum(BLUE, max_per_mm=400.0), sampling_spectrum(SQUARES, max_per_mm=400.0)
     frequency, power, _ = spectrum.radial(40)
     valley = (frequency > 2.0 * spectrum.peak_per_mm) & (frequency < 125.0)
@@ -95,7 +95,7 @@ def test_blue_noise_has_a_valley_a_ring_and_no_peaks():
     assert lattice.power[np.hypot(g, g[:, None]) > 2.0 * lattice.peak_per_mm].max() > 0.95 * lattice.power.max()
 
 
-def test_a_sine_too_fine_for_a_lattice_comes_back_whole_at_the_difference_frequency():
+def test_lattice_alias_has_full_contrast():
     wave = (170.0, 33.0)
     found = aliasing_spectrum(SQUARES, wave)
     mtf = polygon_mtf(SQUARES[[0]], np.hypot(*wave), angle_deg=np.degrees(np.arctan2(wave[1], wave[0])))[0, 0]
@@ -106,7 +106,7 @@ def test_a_sine_too_fine_for_a_lattice_comes_back_whole_at_the_difference_freque
     assert found.noise_fraction == pytest.approx(1.0, abs=0.01)
 
 
-def test_a_sine_that_is_coarse_enough_has_no_alias():
+def test_sine_below_nyquist_has_no_alias():
     for layout in (SQUARES, HEXAGONS):
         found = aliasing_spectrum(layout, (70.0, 40.0))
 
@@ -115,34 +115,34 @@ def test_a_sine_that_is_coarse_enough_has_no_alias():
         assert found.noise_fraction < 1e-3
 
 
-def test_hexagons_hold_a_sine_that_squares_alias():
-    # 140 line pairs per mm: above 125 of squares, below 144 of hexagons; the squares' alias is at -110.
+def test_hexagons_resolve_sine_that_squares_alias():
+    # 140 line pairs per mm: above 125 for squares (alias at -110), below 144 for hexagons.
     squares, hexagons = (aliasing_spectrum(layout, (140.0, 0.0)) for layout in (SQUARES, HEXAGONS))
 
     assert squares.alias_fraction == pytest.approx(squares.baseband_fraction, rel=1e-3)
     assert hexagons.alias_fraction < 0.01
 
 
-def test_blue_noise_turns_an_alias_into_noise():
+def test_blue_noise_converts_alias_to_noise():
     lattice, blue = (aliasing_spectrum(layout, (170.0, 33.0)) for layout in (SQUARES, BLUE))
 
     assert blue.alias_fraction < 0.35 * lattice.alias_fraction
     assert 0.3 < blue.noise_fraction < 0.9
 
 
-def test_turning_layout_and_wave_together_changes_nothing():
+def test_aliasing_is_rotation_invariant():
     found = aliasing_spectrum(HEXAGONS, (215.0, 30.0), centre_um=(0.0, 0.0), radius_um=100.0)
-    turned = aliasing_spectrum(HEXAGONS.rotate(90.0), (-30.0, 215.0), centre_um=(0.0, 0.0), radius_um=100.0)
+    rotated = aliasing_spectrum(HEXAGONS.rotate(90.0), (-30.0, 215.0), centre_um=(0.0, 0.0), radius_um=100.0)
 
     assert found.alias_fraction == pytest.approx(found.baseband_fraction, rel=1e-3)
-    assert turned.alias_fraction == pytest.approx(found.alias_fraction, rel=1e-6)
-    assert turned.noise_fraction == pytest.approx(found.noise_fraction, rel=1e-6)
+    assert rotated.alias_fraction == pytest.approx(found.alias_fraction, rel=1e-6)
+    assert rotated.noise_fraction == pytest.approx(found.noise_fraction, rel=1e-6)
 
 
-def test_bad_regions_are_told():
-    with pytest.raises(ParameterError, match="'radius_um' must take in at least 16 sites, takes in 4"):
+def test_invalid_aliasing_arguments_raise():
+    with pytest.raises(ParameterError, match="'radius_um' must enclose at least 16 sites, encloses 4"):
         sampling_spectrum(SQUARES, radius_um=4.0)
-    with pytest.raises(ParameterError, match=r"'max_per_mm' must be at most .* take a smaller radius_um"):
+    with pytest.raises(ParameterError, match=r"'max_per_mm' must be at most .* reduce radius_um"):
         sampling_spectrum(SQUARES, max_per_mm=1e5)
     with pytest.raises(ParameterError, match="'layout' must have sites in more than one row"):
         sampling_spectrum(fs.layout.grid(n_x=60, n_y=1, pitch_um=4.0), radius_um=100.0)
@@ -152,19 +152,19 @@ def test_bad_regions_are_told():
         sampling_spectrum(SQUARES, weights="none")
 
 
-def test_a_lattices_peaks_are_as_high_as_the_windows_sums():
-    """In closed form over the disc: the mean of cos² is (1/2 - 2/π²), that of its square (3/8 - 2/π²)."""
+def test_lattice_peak_height_matches_window_sums():
+    """Closed forms over the disc: the mean of cos² is (1/2 - 2/π²), the mean of its square (3/8 - 2/π²)."""
     spectrum = sampling_spectrum(SQUARES)
-    middle = spectrum.frequency_per_mm.size // 2
+    centre = spectrum.frequency_per_mm.size // 2
     window, square = 0.5 - 2.0 / np.pi**2, 3.0 / 8.0 - 2.0 / np.pi**2
 
-    peaks = spectrum.power[middle, middle], spectrum.power[middle, np.abs(spectrum.frequency_per_mm - 250.0).argmin()]
+    peaks = spectrum.power[centre, centre], spectrum.power[centre, np.abs(spectrum.frequency_per_mm - 250.0).argmin()]
 
     assert peaks[0] == pytest.approx(spectrum.n_sites * window**2 / square, rel=0.01)
     assert peaks[0] == pytest.approx(0.51 * spectrum.n_sites, rel=0.02)
 
 
 @pytest.mark.parametrize("n_bins", [0, -1, 2.5, 10_000, None])
-def test_rings_are_a_whole_number(n_bins):
+def test_invalid_radial_bin_count_raises(n_bins):
     with pytest.raises(ParameterError, match="'n_bins' must be"):
         sampling_spectrum(SQUARES).radial(n_bins)

@@ -1,4 +1,4 @@
-"""Photon transfer and EMVA 1288: every parameter of a sensor that is known, found again in its frames."""
+"""Photon transfer and EMVA 1288: parameters of a known sensor, recovered from its frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from foveasim.units import photon_energy_j
 SIGMAS = 5.0
 Q = scipy.constants.e
 
-# Small sites inside, large ones around them: 40,000 and 30,000.
+# 40,000 small sites inside, 30,000 large sites around them.
 LAYOUT = fs.layout.zones(side_um=(400, 800), pitch_um=(2, 4))
 SIZE_UM = np.where(LAYOUT.columns["zone"] == 0, 2.0, 4.0)
 IS_LARGE = SIZE_UM == 4.0
@@ -29,9 +29,9 @@ GAIN_DN_PER_E = 2**BITS * Q / (V_SAT_V * CAPACITANCE_F)
 QE, PRNU, DSNU = 0.6, 0.02, 0.1
 EXPOSURE_S = 0.05
 EXPOSURES_S = np.array([0.02, 0.04, 0.06, 0.08, 0.1])
-#: Photons on a µm²: spaced by 3 % of the large sites' saturation, from nothing to beyond the small ones'.
+#: Photons per µm², in steps of 3 % of the saturation of the large sites, up to beyond that of the small sites.
 LIGHT_PER_UM2 = np.arange(1, 53) * 48.0
-#: Half of saturation is told from more frames.
+#: Levels near half saturation have more frames, for the PRNU.
 N_FRAMES = np.where((LIGHT_PER_UM2 > 600) & (LIGHT_PER_UM2 < 1200), 6, 2)
 N_DARK = 8
 
@@ -40,7 +40,7 @@ def per_site(of_classes):
     return np.where(IS_LARGE, of_classes[1], of_classes[0])
 
 
-#: Every so many sites: a prediction of all would take long.
+#: Every 200th site of each class; a prediction for all sites is slow.
 SOME = np.sort(np.concatenate([np.flatnonzero(of)[::200] for of in (~IS_LARGE, IS_LARGE)]))
 
 
@@ -63,7 +63,7 @@ def two_sizes(layout=LAYOUT, **parameters):
 
 
 def measured(n_threads=1, levels=slice(None), **parameters):
-    """The whole measurement: even light of 550 nm through the camera's integration, darkness, and a series of exposures."""
+    """Complete measurement: uniform irradiance at 550 nm, dark frames, and a dark series over exposure."""
     sensor = two_sizes(**parameters)
     camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=4.0), sensor=sensor, order=1, n_threads=n_threads)
     one_per_s_um2_w_m2 = float(photon_energy_j(550.0)) * 1e12
@@ -100,7 +100,7 @@ def result():
     return measured()
 
 
-# -- standard errors, from the sensor's parameters alone ---------------------------------------------------------------
+# -- standard errors from the sensor parameters ------------------------------------------------------------------------
 
 DARK_E = DARK_E_PER_S * EXPOSURE_S
 LIGHT_E = QE * LIGHT_PER_UM2[:, None] * AREA_UM2
@@ -111,13 +111,13 @@ def variance_dn2(light_e, dark_e):
 
 
 def error_of_variance(variance, n_frames):
-    """Of a variance of Gaussian noise, from ``n_frames - 1`` differences of every site."""
+    """Standard error of a variance of Gaussian noise, from ``n_frames - 1`` degrees of freedom per site."""
     return variance * np.sqrt(2.0 / (N_SITES * (np.asarray(n_frames) - 1.0)))
 
 
 def relative_error_of_gain():
-    """The variances are uncertain, the one of darkness in all levels alike; the means are known far better."""
-    linear = 0.66 * FULL_WELL_E  # a little less than the 70 % of saturation that are used: larger errors, if anything
+    """Relative standard error of the gain: errors of the variances, with a common dark variance; errors of means are negligible."""
+    linear = 0.66 * FULL_WELL_E  # slightly below the 70 % of saturation that are used, which overestimates the errors
     x = np.where(linear >= LIGHT_E, LIGHT_E, 0.0)
     error_e2 = error_of_variance(variance_dn2(LIGHT_E, DARK_E), N_FRAMES[:, None]) / GAIN_DN_PER_E**2
     dark_e2 = error_of_variance(variance_dn2(0.0, DARK_E), N_DARK) / GAIN_DN_PER_E**2
@@ -126,7 +126,7 @@ def relative_error_of_gain():
 
 
 def errors_of_dark_line():
-    """Of the intercept and the slope of the dark variance over exposure, DN² and DN²/s."""
+    """Standard errors of intercept and slope of the dark variance over exposure, DN² and DN²/s."""
     error = error_of_variance(variance_dn2(0.0, DARK_E_PER_S * EXPOSURES_S[:, None]), N_DARK)
     off_s = EXPOSURES_S - EXPOSURES_S.mean()
     of_slope = off_s / (off_s @ off_s)
@@ -135,38 +135,38 @@ def errors_of_dark_line():
 
 
 def error_of_spatial(spatial_dn2, temporal_dn2, n_frames):
-    """Of a spatial variance from means over frames, the temporal part taken off, DN²."""
+    """Standard error of a spatial variance of frame means, less the temporal part, DN²."""
     chance = (spatial_dn2 + temporal_dn2 / n_frames) * np.sqrt(2.0 / (N_SITES - 1))
     return np.hypot(chance, error_of_variance(temporal_dn2, n_frames) / n_frames)
 
 
 def assert_within(got, true, error):
     off = np.abs(got - true) / error
-    assert np.all(off < SIGMAS), f"{got} is not {true} by {off} standard errors"
-    assert np.all(error < 0.1 * np.abs(true)), "a test that cannot fail"
+    assert np.all(off < SIGMAS), f"{got} differs from {true} by {off} standard errors"
+    assert np.all(error < 0.1 * np.abs(true)), "standard error too large for a meaningful test"
 
 
-# -- each parameter -----------------------------------------------------------------------------------------------------
+# -- parameters ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_classes_are_the_two_sizes(result):
+def test_classes_match_site_sizes(result):
     assert result.classes.tolist() == [2.0, 4.0]
     assert result.transfer.n_sites.tolist() == N_SITES.tolist()
     assert result.transfer.n_frames.tolist() == N_FRAMES.tolist()
 
 
-def test_the_gain_is_codes_per_electron(result):
+def test_gain_matches_sensor(result):
     assert_within(result.gain_dn_per_e, GAIN_DN_PER_E, GAIN_DN_PER_E * relative_error_of_gain())
 
 
-def test_the_quantum_efficiency_is_that_of_the_sensor(result):
-    # PRNU of the sites that there are; shot noise of the mean of the level with the most light.
+def test_quantum_efficiency_matches_sensor(result):
+    # PRNU of a finite number of sites, and shot noise of the mean at the highest level used.
     of_response = np.sqrt(PRNU**2 / N_SITES + 1.0 / (N_SITES * 0.66 * FULL_WELL_E))
     assert_within(result.qe, np.full(2, QE), QE * np.hypot(relative_error_of_gain(), of_response))
 
 
-def test_the_dark_noise_is_the_read_noise(result):
-    """At exposure 0, and with the twelfth of quantisation taken off once."""
+def test_dark_noise_matches_read_noise(result):
+    """Extrapolated to exposure 0, with the quantisation variance of 1/12 subtracted once."""
     error_dn2, _ = errors_of_dark_line()
     error_e = np.hypot(error_dn2 / (2.0 * GAIN_DN_PER_E**2 * READ_E), READ_E * relative_error_of_gain())
 
@@ -176,7 +176,7 @@ def test_the_dark_noise_is_the_read_noise(result):
     assert_within(result.dark_noise_dn, np.sqrt((GAIN_DN_PER_E * READ_E) ** 2 + 1 / 12), error_dn)
 
 
-def test_the_dark_current_follows_from_the_mean_and_from_the_variance(result):
+def test_dark_current_from_mean_and_variance(result):
     _, slope_error_dn2 = errors_of_dark_line()
     relative = relative_error_of_gain()
     shot = np.sqrt(DARK_E_PER_S * 0.1 / (N_SITES * N_DARK)) / (DARK_E_PER_S * 0.08)
@@ -189,7 +189,7 @@ def test_the_dark_current_follows_from_the_mean_and_from_the_variance(result):
     )
 
 
-def test_dark_signal_non_uniformity_is_without_the_temporal_part(result):
+def test_dsnu_excludes_temporal_noise(result):
     true_e = DSNU * DARK_E
     error_dn2 = error_of_spatial((GAIN_DN_PER_E * true_e) ** 2, variance_dn2(0.0, DARK_E), N_DARK)
     error_e = np.hypot(error_dn2 / (2.0 * GAIN_DN_PER_E**2 * true_e), true_e * relative_error_of_gain())
@@ -197,38 +197,38 @@ def test_dark_signal_non_uniformity_is_without_the_temporal_part(result):
     assert_within(result.dsnu_e, true_e, error_e)
 
 
-def test_photo_response_non_uniformity_is_without_darkness_and_the_temporal_part(result):
+def test_prnu_excludes_dsnu_and_temporal_noise(result):
     light_e = 0.49 * FULL_WELL_E
     spread_e, dark_spread_e = PRNU * light_e, DSNU * DARK_E
     both = error_of_spatial(
         GAIN_DN_PER_E**2 * (spread_e**2 + dark_spread_e**2), variance_dn2(light_e, DARK_E), N_FRAMES.max()
     )
     dark = error_of_spatial((GAIN_DN_PER_E * dark_spread_e) ** 2, variance_dn2(0.0, DARK_E), N_DARK)
-    # The two patterns' chance correlation is in the first of them already, as a part of its chance.
+    # The random correlation of both patterns is included in the first term.
     relative = np.hypot(both, dark) / (2.0 * (GAIN_DN_PER_E * spread_e) ** 2)
 
     assert_within(result.prnu_fraction, np.full(2, PRNU), PRNU * relative)
 
 
-def test_saturation_is_where_the_variance_is_highest(result):
+def test_saturation_is_at_maximum_variance(result):
     chosen = SOME[::5]
-    kept = {
+    parameters = {
         name: getattr(two_sizes(), name)[chosen]
         for name in ("capacitance_f", "read_noise_e", "full_well_e", "dark_e_per_s")
     }
-    sensor = two_sizes(LAYOUT[chosen], **kept)
+    sensor = two_sizes(LAYOUT[chosen], **parameters)
     near = slice(20, 50)
     light_e = LIGHT_E[near, IS_LARGE[chosen].astype(int)]
-    told = predicted_photon_transfer(
+    predicted = predicted_photon_transfer(
         sensor, light_e * sensor.response + sensor.dark_rate_e_per_s * EXPOSURE_S, classes=SIZE_UM[chosen]
     )
-    highest = told.temporal_variance_dn2.max(axis=0)
-    found = told.temporal_variance_dn2[result.transfer.saturation_level - near.start, [0, 1]]
+    highest = predicted.temporal_variance_dn2.max(axis=0)
+    found = predicted.temporal_variance_dn2[result.transfer.saturation_level - near.start, [0, 1]]
 
     error = np.sqrt(2.0) * error_of_variance(highest, 2)
-    # That of 40 and 30 sites' response is another than of all by a few per mille.
+    # The mean response of 40 and 30 sites differs from that of all sites by a few per mille.
     assert np.all(highest - found < SIGMAS * error + 0.01 * highest)
-    # Above it the charge does not fluctuate: of light and dark charge, less what the well's edge takes.
+    # Above the full well the total charge (signal and dark) does not fluctuate.
     with_dark_e = result.saturation_e + DARK_E
     assert np.all((with_dark_e > 0.92 * FULL_WELL_E) & (with_dark_e < FULL_WELL_E))
     full_dn = GAIN_DN_PER_E * FULL_WELL_E
@@ -236,7 +236,7 @@ def test_saturation_is_where_the_variance_is_highest(result):
     assert result.transfer.temporal_variance_dn2[-1] == pytest.approx((GAIN_DN_PER_E * READ_E) ** 2 + 1 / 12, rel=0.05)
 
 
-def test_threshold_ratio_and_range_follow(result):
+def test_threshold_snr_and_dynamic_range(result):
     noise_e = np.sqrt(READ_E**2 + 1 / 12 / GAIN_DN_PER_E**2)
     error_dn2, _ = errors_of_dark_line()
     relative = np.hypot(error_dn2 / (2.0 * GAIN_DN_PER_E**2 * noise_e**2), relative_error_of_gain())
@@ -249,7 +249,7 @@ def test_threshold_ratio_and_range_follow(result):
     assert result.dynamic_range_db == pytest.approx(20 * np.log10(result.saturation_e / result.threshold_e))
 
 
-def test_a_linear_sensor_has_no_linearity_error(result):
+def test_linear_sensor_has_zero_linearity_error(result):
     faintest_e = 0.05 * FULL_WELL_E
     error = np.sqrt((faintest_e + DARK_E + READ_E**2) / (2 * N_SITES)) / faintest_e
     of_dark = np.sqrt((DARK_E + READ_E**2) / (N_DARK * N_SITES)) / faintest_e
@@ -260,14 +260,14 @@ def test_a_linear_sensor_has_no_linearity_error(result):
     assert np.all(result.linearity_error_max_fraction > 0.0)
 
 
-def test_a_bent_response_has_the_error_of_its_line():
-    """A quadratic: the line of least relative squares by numpy, and its largest deviations."""
+def test_nonlinear_response_has_expected_linearity_error():
+    """Reference: weighted least-squares line of a quadratic response by numpy, and its largest deviations."""
     photons = np.arange(1.0, 101.0) * 30.0
     mean = np.where(photons < 2700.0, photons * (1.0 - 0.1 * photons / 2700.0), 2430.0)
     spread = np.where(photons < 2700.0, np.sqrt(photons), 0.0)
-    # Two frames of sites that stand off the mean by just the spread, in turns.
-    turn = np.array([1.0, -1.0, -1.0, 1.0])
-    frames = [np.stack((m + s * turn, m - s * turn)) for m, s in zip(mean, spread, strict=True)]
+    # Two frames whose sites deviate from the mean by plus or minus the standard deviation.
+    sign = np.array([1.0, -1.0, -1.0, 1.0])
+    frames = [np.stack((m + s * sign, m - s * sign)) for m, s in zip(mean, spread, strict=True)]
 
     with pytest.warns(FoveasimWarning, match="dark codes are 0"):
         result = emva1288(frames, [np.zeros((2, 4))], photons)
@@ -281,50 +281,48 @@ def test_a_bent_response_has_the_error_of_its_line():
     assert deviation.max() > 0.005
 
 
-#: Frames of a sensor of 0.2 DN an electron, whose noise ends at 9000 e-, and the photons of their levels.
+#: Photons per level for a sensor of 0.2 DN/e- and a full well capacity of 9000 e-.
 LEVELS_PH = np.arange(100.0, 11_000.0, 200.0)
 
 
-def of_five_electrons_a_code(photons, n_sites=4000):
+def frames_at_five_e_per_dn(photons, n_sites=4000):
     rng = np.random.default_rng(1)
     return [0.2 * np.minimum(rng.poisson(p, (2, n_sites)), 9000) + rng.normal(50.0, 1.0, (2, n_sites)) for p in photons]
 
 
-def test_levels_must_rise():
-    frames, dark = of_five_electrons_a_code(LEVELS_PH), of_five_electrons_a_code([0.0])
+def test_unsorted_levels_raise():
+    frames, dark = frames_at_five_e_per_dn(LEVELS_PH), frames_at_five_e_per_dn([0.0])
     per_site = np.repeat(LEVELS_PH[:, None], 4000, axis=1)
 
     assert emva1288(frames, dark, LEVELS_PH).gain_dn_per_e[0] == pytest.approx(0.2, rel=0.02)
     for photons in (LEVELS_PH[::-1], np.r_[LEVELS_PH[1], LEVELS_PH[0], LEVELS_PH[2:]], np.minimum(LEVELS_PH, 9000.0)):
-        with pytest.raises(ParameterError, match="'photons' must rise from level to level"):
+        with pytest.raises(ParameterError, match="'photons' must increase from level to level"):
             emva1288(frames[::-1], dark, photons)
-    with pytest.raises(ParameterError, match="'photons' must rise from level to level"):
+    with pytest.raises(ParameterError, match="'photons' must increase from level to level"):
         emva1288(frames[::-1], dark, per_site[::-1])
 
 
-def test_the_gain_does_not_hang_on_the_order_of_levels():
-    frames = [*of_five_electrons_a_code([0.0]), *of_five_electrons_a_code(LEVELS_PH)]
+def test_gain_is_independent_of_level_order():
+    frames = [*frames_at_five_e_per_dn([0.0]), *frames_at_five_e_per_dn(LEVELS_PH)]
     dark = photon_transfer(frames[:1])
 
     rising, falling = photon_transfer(frames), photon_transfer(frames[::-1])
 
     assert rising.gain_dn_per_e()[0] == pytest.approx(0.2, rel=0.02)
     assert falling.gain_dn_per_e(dark)[0] == pytest.approx(rising.gain_dn_per_e(dark)[0], rel=1e-12)
-    with pytest.raises(ParameterError, match="'levels' must begin with darkness"):
+    with pytest.raises(ParameterError, match="'levels' must begin with a dark level"):
         falling.gain_dn_per_e()
 
 
-def test_levels_that_never_saturate_are_told():
+def test_levels_below_saturation_warn():
     faint = LEVELS_PH < 2500.0
-    frames, dark = of_five_electrons_a_code(LEVELS_PH[faint]), of_five_electrons_a_code([0.0])
+    frames, dark = frames_at_five_e_per_dn(LEVELS_PH[faint]), frames_at_five_e_per_dn([0.0])
 
-    with pytest.warns(
-        FoveasimWarning, match="highest at the last level for 1 of 1 classes: their saturation is not reached"
-    ):
+    with pytest.warns(FoveasimWarning, match="highest at the last level for 1 of 1 classes: saturation is not reached"):
         emva1288(frames, dark, LEVELS_PH[faint])
 
 
-def test_nothing_hangs_on_the_number_of_threads():
+def test_emva_result_is_independent_of_threads():
     one, two = (measured(n_threads=n, levels=slice(0, 52, 8)) for n in (1, 2))
 
     for name in ("gain_dn_per_e", "qe", "dark_noise_e", "dsnu_e", "prnu_fraction", "dark_current_e_per_s"):
@@ -341,9 +339,9 @@ def capacitance_of(range_e, v_sat_v=1.0):
     return range_e * Q / v_sat_v
 
 
-def test_draws_and_prediction_agree():
+def test_photon_transfer_agrees_with_prediction():
     n_frames, light = 800, np.array([0.0, 100.0, 1000.0, 3000.0, 4700.0, 5200.0, 9000.0])[:, None]
-    kept = {
+    parameters = {
         name: per_site(values)[SOME]
         for name, values in (
             ("capacitance_f", CAPACITANCE_F),
@@ -352,30 +350,30 @@ def test_draws_and_prediction_agree():
             ("dark_e_per_s", DARK_E_PER_S),
         )
     }
-    sensor = two_sizes(LAYOUT[SOME], pixel_fpn_fraction=0.01, **kept)
+    sensor = two_sizes(LAYOUT[SOME], pixel_fpn_fraction=0.01, **parameters)
     expected_e = light * per_site([1.0, 3.0])[SOME] * sensor.response + sensor.dark_rate_e_per_s * EXPOSURE_S
 
     drawn = photon_transfer(sensor, expected_e, classes=SIZE_UM[SOME], n_frames=n_frames, seed=1, n_threads=1)
-    told = predicted_photon_transfer(sensor, expected_e, classes=SIZE_UM[SOME])
+    predicted = predicted_photon_transfer(sensor, expected_e, classes=SIZE_UM[SOME])
 
-    n_sites, variance = told.n_sites, told.temporal_variance_dn2
+    n_sites, variance = predicted.n_sites, predicted.temporal_variance_dn2
     assert n_sites.tolist() == [200, 150]
-    assert np.all(np.abs(drawn.mean_dn - told.mean_dn) < SIGMAS * np.sqrt(variance / (n_frames * n_sites)))
-    # By the standard's formula a fraction of 1 / n_sites of the variance is taken for a lamp's flicker.
+    assert np.all(np.abs(drawn.mean_dn - predicted.mean_dn) < SIGMAS * np.sqrt(variance / (n_frames * n_sites)))
+    # The formula of the standard attributes a fraction 1 / n_sites of the variance to flicker of the light source.
     error = variance * np.sqrt(2.0 / (n_sites * (n_frames - 1.0)))
-    # At the well's edge the noise is no Gaussian: its fourth moment is larger, by less than 4 times.
+    # Near the full well the noise is not Gaussian: its fourth moment is larger, by a factor below 4.
     error[4:6] *= 2.0
     assert np.all(np.abs(drawn.temporal_variance_dn2 - variance * (1.0 - 1.0 / n_sites)) < SIGMAS * error)
-    # The pattern is the same in both; its product with the frames' noise is left.
-    cross = 2.0 * np.sqrt(told.spatial_variance_dn2 * variance / (n_frames * n_sites))
+    # The fixed pattern is the same in both; the cross term with the temporal noise remains.
+    cross = 2.0 * np.sqrt(predicted.spatial_variance_dn2 * variance / (n_frames * n_sites))
     error = np.hypot(cross, variance / n_frames * np.sqrt(2.0 / n_sites)) * 1.2
-    assert np.all(np.abs(drawn.spatial_variance_dn2 - told.spatial_variance_dn2) < SIGMAS * error)
-    assert told.n_frames.tolist() == [0] * 7
+    assert np.all(np.abs(drawn.spatial_variance_dn2 - predicted.spatial_variance_dn2) < SIGMAS * error)
+    assert predicted.n_frames.tolist() == [0] * 7
     assert drawn.n_frames.tolist() == [n_frames] * 7
 
 
-def test_the_slopes_are_nought_a_half_and_one_and_it_collapses_at_full_well():
-    """Standard deviation against the mean, on logarithms: read noise, shot noise, PRNU (Janesick, Photon Transfer, 2007)."""
+def test_noise_slopes_of_photon_transfer_curve():
+    """Log-log slopes 0, 1/2 and 1 for read noise, shot noise and PRNU (Janesick, Photon Transfer, 2007)."""
     read_e, pedestal_e, prnu, well_e = 50.0, 400.0, 0.03, 5e5
     sensor = Sensor(
         GRID,
@@ -399,43 +397,43 @@ def test_the_slopes_are_nought_a_half_and_one_and_it_collapses_at_full_well():
         x = np.log(light_e[is_used])
         return relative_error * math.sqrt(1.0 / ((x - x.mean()) ** 2).sum())
 
-    one_in = math.sqrt(0.5 / GRID.n_sites)  # of a standard deviation from one difference a site
+    one_in = math.sqrt(0.5 / GRID.n_sites)  # relative error of a standard deviation from one difference per site
     is_faint = (light_e > 0.0) & (light_e < 30.0)
     is_shot = (light_e > 3e4) & (light_e < 4.1e5)
-    # Light adds at most 30 e-² to 2900: a slope of 0.005, and no more.
+    # Shot noise adds at most 30 e-² to 2900 e-²: a slope of 0.005 at most.
     assert abs(slope(temporal, is_faint)) < 0.5 * 30.0 / floor_e2 + SIGMAS * error(is_faint, one_in)
     assert slope(temporal - temporal[0], is_shot) == pytest.approx(0.5, abs=SIGMAS * error(is_shot, 1.2 * one_in))
-    # Fixed patterns are the same in all levels: only shot noise, at most a hundredth of them, moves the slope.
+    # Fixed patterns are equal at all levels: only shot noise, at most 1 % of them, affects the slope.
     assert slope(spatial, is_shot) == pytest.approx(1.0, abs=SIGMAS * error(is_shot, 0.2 * one_in))
     assert np.sqrt(spatial[is_shot]) / mean_dn[is_shot] == pytest.approx(
         np.full(is_shot.sum(), prnu), rel=SIGMAS * one_in
     )
-    # Beyond the full well the read noise alone is left.
+    # Beyond the full well only the read noise remains.
     gain = 65_536 / 6e5
     assert temporal[-1] == pytest.approx((gain * read_e) ** 2 + 1 / 12, rel=SIGMAS * 2 * one_in)
     assert temporal[-1] < 0.02 * temporal[-2]
     assert spatial[-1] < 1e-4 * spatial[-2]
 
 
-def test_a_full_well_of_7000_electrons_has_a_signal_to_noise_ratio_of_83_7():
+def test_full_well_of_7000_limits_snr():
     well_e = 7000.0
     sensor = Sensor(GRID, bits=14, v_sat_v=1.0, capacitance_f=capacitance_of(8000.0), full_well_e=well_e)
-    open_end = Sensor(GRID, bits=14, v_sat_v=1.0, capacitance_f=capacitance_of(8000.0))
+    unlimited = Sensor(GRID, bits=14, v_sat_v=1.0, capacitance_f=capacitance_of(8000.0))
 
-    at_well = photon_transfer(open_end, [0.0, well_e], seed=2)
+    at_well = photon_transfer(unlimited, [0.0, well_e], seed=2)
     ratio = (at_well.mean_dn[1] - at_well.mean_dn[0]) / np.sqrt(at_well.temporal_variance_dn2[1])
     assert ratio[0] == pytest.approx(83.7, abs=83.7 * SIGMAS * math.sqrt(0.5 / GRID.n_sites) + 0.04)
     photons = np.arange(100.0, 8000.0, 50.0)
     frames = [draw_frames(sensor, p, seed=2, first_frame=2 * k) for k, p in enumerate(photons)]
     with pytest.warns(FoveasimWarning, match=r"100.0 % of the dark codes are 0"):
         result = emva1288(frames, [draw_frames(sensor, 0.0, seed=3)], photons)
-    # The variance is highest 1 to 3 times sqrt(7000) below the well, whose root is 0.6 to 1.8 % less.
+    # The variance is highest 1 to 3 times sqrt(7000) below the full well, which reduces the square root by 0.6 to 1.8 %.
     assert 83.7 * 0.98 < result.snr_max[0] < 83.7
     assert np.isnan(result.dark_current_e_per_s[0])
 
 
 @pytest.mark.parametrize(("capacitance_f", "noise_e"), [(1e-15, 12.70), (1e-13, 127.0), (4.8e-13, 278.3)])
-def test_the_noise_of_resetting_is_that_of_the_capacitance(capacitance_f, noise_e):
+def test_reset_noise_matches_capacitance(capacitance_f, noise_e):
     sensor = Sensor(GRID, bits=16, v_sat_v=3.0, capacitance_f=capacitance_f, ktc_noise=True, shot_noise="off")
     gain = 65_536 * Q / (3.0 * capacitance_f)
     level_e = 0.5 * 65_536 / gain
@@ -447,7 +445,7 @@ def test_the_noise_of_resetting_is_that_of_the_capacitance(capacitance_f, noise_
     assert got_e == pytest.approx(noise_e, rel=SIGMAS * math.sqrt(0.5 / GRID.n_sites) + 5e-4)
 
 
-def test_eight_bits_of_three_volts_on_a_tenth_of_a_picofarad_are_all_quantisation():
+def test_quantisation_dominates_with_eight_bits():
     sensor = Sensor(GRID, bits=8, v_sat_v=3.0, capacitance_f=1e-13, ktc_noise=True, read_noise_e=1.0)
     full_e = 3.0 * 1e-13 / Q
     code_e = full_e / 256
@@ -455,14 +453,14 @@ def test_eight_bits_of_three_volts_on_a_tenth_of_a_picofarad_are_all_quantisatio
     assert code_e == pytest.approx(7314.0, abs=1.0)
     assert code_e / math.sqrt(12.0) == pytest.approx(2111.0, abs=1.0)
 
-    # From code to code: the spread of what a code stands for is far above shot, reset and read noise together.
+    # Over many codes, the quantisation noise is far above shot, reset and read noise together.
     expected_e = np.linspace(0.1, 0.6, GRID.n_sites) * full_e
     codes = draw_frames(sensor, expected_e, n_frames=2, seed=1)
     off_e = (codes + 0.5) * code_e - expected_e
     others_e2 = expected_e.mean() + 127.0**2 + 1.0
     assert off_e.std() == pytest.approx(math.hypot(2111.0, math.sqrt(others_e2)), rel=0.01)
     assert off_e.var() / others_e2 > 5.0
-    # In the middle of a code no frame differs from the next: the dark noise is hidden, and told as 0.40 codes at most.
+    # At the centre of a code all frames are equal: the dark noise is masked, with an upper bound of 0.40 DN.
     light = np.linspace(10.0, 300.0, 30) * code_e
     frames = [
         draw_frames(sensor, np.full(GRID.n_sites, e) + expected_e * 0.01, seed=2, first_frame=2 * k)
@@ -473,19 +471,19 @@ def test_eight_bits_of_three_volts_on_a_tenth_of_a_picofarad_are_all_quantisatio
     assert result.dark_noise_e[0] == pytest.approx(math.sqrt(0.24 - 1 / 12) / result.gain_dn_per_e[0])
 
 
-def test_gain_and_noise_follow_from_a_curve_whose_first_level_is_dark():
+def test_gain_and_dark_noise_from_curve():
     few = fs.layout.grid(n_x=2, n_y=1, pitch_um=2.0)
     sensor = Sensor(few, bits=14, v_sat_v=1.0, capacitance_f=capacitance_of(10_000.0), read_noise_e=10.0)
     levels_e = np.linspace(0.0, 9000.0, 31) + 400.0
 
-    told = predicted_photon_transfer(sensor, levels_e)
+    curve = predicted_photon_transfer(sensor, levels_e)
 
-    assert told.gain_dn_per_e()[0] == pytest.approx(1.6384, rel=1e-3)
-    assert told.dark_noise_e()[0] == pytest.approx(math.sqrt(100.0 + 400.0), rel=1e-3)
+    assert curve.gain_dn_per_e()[0] == pytest.approx(1.6384, rel=1e-3)
+    assert curve.dark_noise_e()[0] == pytest.approx(math.sqrt(100.0 + 400.0), rel=1e-3)
 
 
-def test_two_frames_give_half_the_square_of_their_difference():
-    """By hand, with a lamp that is brighter by 2 in the second frame, which is taken off."""
+def test_temporal_variance_of_two_frames():
+    """Calculated by hand; the flicker between both frames is subtracted."""
     first, second = np.array([10.0, 20.0, 30.0, 40.0]), np.array([13.0, 20.0, 33.0, 42.0])
 
     curve = photon_transfer([[first, second]], classes=["a", "a", "b", "b"])
@@ -496,7 +494,7 @@ def test_two_frames_give_half_the_square_of_their_difference():
     assert curve.spatial_variance_dn2[0] == pytest.approx([8.5**2 / 2 - 2.25 / 2, 9.5**2 / 2 - 3.25 / 2])
 
 
-def test_captures_are_frames():
+def test_photon_transfer_accepts_captures():
     scene = fs.Scene.flat(shape=(80, 80), pitch_um=60.0, distance_m=1.0, radiance_w_m2_sr_nm=0.01, band_width_nm=10.0)
     sensor = Sensor(fs.layout.grid(n_x=8, n_y=8, pitch_um=4.0), bits=10, capacitance_f=4e-15)
     camera = fs.Camera(optics=fs.Optics(focal_length_mm=8.0, f_number=2.8), sensor=sensor)
@@ -510,7 +508,7 @@ def test_captures_are_frames():
     assert curve.temporal_variance_dn2[0, 0] == pytest.approx(expected)
 
 
-# -- what cannot be -------------------------------------------------------------------------------------------------------
+# -- invalid arguments ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -522,7 +520,7 @@ def test_captures_are_frames():
         (lambda: photon_transfer([np.zeros((2, 5)), np.zeros((2, 6))]), "5 sites"),
         (lambda: photon_transfer([np.zeros((2, 5))], classes=[0, 1, 1, 1, 1]), "two sites each"),
         (lambda: photon_transfer([np.zeros((2, 5))], classes=[0, 1]), "one label for each"),
-        (lambda: photon_transfer([np.zeros((2, 5))], seed=1), "goes with a sensor"),
+        (lambda: photon_transfer([np.zeros((2, 5))], seed=1), "must not be given with frames"),
         (lambda: photon_transfer([3, 4]), "list of frames"),
         (lambda: emva1288(5, [np.ones((2, 4))], [1.0]), "'frames' must be a list of levels, got a int"),
         (lambda: emva1288([np.ones((2, 4))], None, [1.0]), "'dark' must be a list of levels, got a NoneType"),
@@ -535,32 +533,32 @@ def test_captures_are_frames():
         (lambda: photon_transfer(Sensor(GRID), [1.0], seed=1, n_frames=1), ">= 2"),
         (lambda: predicted_photon_transfer(Sensor(GRID), []), "at least one level"),
         (lambda: predicted_photon_transfer(Sensor(GRID), [np.ones(3)]), "40000 sites"),
-        (lambda: predicted_photon_transfer(Sensor(GRID), [5.0]).gain_dn_per_e(), "must have light"),
+        (lambda: predicted_photon_transfer(Sensor(GRID), [5.0]).gain_dn_per_e(), "must have a signal"),
         (lambda: emva1288([np.ones((2, 4))], [np.ones((2, 4))] * 2, [1.0]), "one level or 1"),
         (lambda: emva1288([np.ones((2, 4))], [np.ones((2, 4))], [1.0, 2.0]), "'photons'"),
     ],
 )
-def test_what_cannot_be_measured_is_refused(call, match):
+def test_invalid_photon_transfer_arguments_raise(call, match):
     with pytest.raises(ParameterError, match=match):
         call()
 
 
-def test_a_dark_series_goes_with_its_exposures():
+def test_inconsistent_dark_series_raises():
     rng = np.random.default_rng(0)
     frames = [rng.normal(100.0 + m, math.sqrt(m), (2, 50)) for m in (10.0, 20.0, 30.0, 40.0)]
     arguments = {"frames": frames, "dark": [rng.normal(100.0, 1.0, (2, 50))], "photons": [10.0, 20.0, 30.0, 40.0]}
 
-    for wrong in (
+    for invalid in (
         {"exposure_s": [1.0, 2.0, 3.0]},
         {"dark_series": frames[:3]},
         {"dark_series": frames[:3], "exposure_s": [1.0, 2.0, 2.0]},
         {"dark_series": frames[:3], "exposure_s": [1.0, 2.0]},
     ):
         with pytest.raises(ParameterError, match="exposure"):
-            emva1288(**arguments, **wrong)
+            emva1288(**arguments, **invalid)
 
 
-def test_results_say_what_they_are(result):
+def test_results_have_repr_and_are_immutable(result):
     assert repr(result) == "Emva1288(52 levels, 2 classes)"
     assert repr(result.transfer) == "PhotonTransfer(52 levels, 2 classes of 70000 sites)"
     with pytest.raises(ValueError, match="read-only"):

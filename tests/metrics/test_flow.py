@@ -1,4 +1,4 @@
-"""Optical flow on polygons: gradients are derivatives, the bound is what a best estimator scatters by, and shifts are found."""
+"""Optical flow on polygons: gradients, Cramér–Rao bound, and estimated displacements."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ READ_E2 = 9.0
 
 
 def picture(u=0.0, v=0.0, level=60.0, grid=GRID):
-    """Exact cell means of some waves that moved by (u, v), e-/µm²; at least 25 anywhere at the given level."""
+    """Exact cell means of a sum of waves displaced by (u, v), e-/µm²; at least 25 at the default level."""
     rng = np.random.default_rng(5)
     x, y = np.meshgrid(grid.x_um - u, grid.y_um - v)
     values = np.full(grid.shape, level)
@@ -32,7 +32,7 @@ def picture(u=0.0, v=0.0, level=60.0, grid=GRID):
 EXPECT = fs.Integrator(FOVEAL, GRID, order=2)
 
 
-def test_gradients_are_what_sites_lose_when_the_picture_moves():
+def test_site_gradients_match_finite_differences():
     d = 1e-3
     gradient = site_gradients_e_per_um(FOVEAL, picture(), GRID)
     by_x = (EXPECT(picture(-d)) - EXPECT(picture(d))) / (2 * d)
@@ -41,7 +41,7 @@ def test_gradients_are_what_sites_lose_when_the_picture_moves():
     assert np.abs(gradient - np.stack((by_x, by_y), axis=1)).max() < 3e-4 * np.abs(gradient).max()
 
 
-def test_a_ramp_gives_each_site_its_area_up_to_the_border():
+def test_ramp_gradient_equals_slope_times_area():
     x, y = np.meshgrid(GRID.x_um, GRID.y_um)
     layout = fs.layout.grid(n_x=20, n_y=20, pitch_um=4.0)
 
@@ -51,7 +51,7 @@ def test_a_ramp_gives_each_site_its_area_up_to_the_border():
     assert gradient[:, 1] == pytest.approx(-3.0 * layout.area_um2)
 
 
-def test_a_shift_without_noise_is_found():
+def test_noise_free_flow_is_recovered():
     for u, v in ((0.8, -0.5), (-2.0, 1.7)):
         values = EXPECT(picture(u, v))
         found = estimate_flow(FOVEAL, values, picture(), GRID, variance_e2=values + READ_E2)
@@ -60,7 +60,7 @@ def test_a_shift_without_noise_is_found():
         assert found.misfit[0] < 1e-4
 
 
-def test_one_step_is_lucas_and_kanade():
+def test_single_step_matches_lucas_kanade():
     values, map_e = EXPECT(picture(0.05, -0.03)), picture()
     gradient, before = site_gradients_e_per_um(FOVEAL, map_e, GRID), EXPECT(picture())
     root = np.sqrt(before + READ_E2)
@@ -73,7 +73,7 @@ def test_one_step_is_lucas_and_kanade():
 
 
 @pytest.mark.parametrize("noise", ["Gaussian", "Poisson"])
-def test_the_best_estimate_scatters_by_the_bound(noise):
+def test_flow_covariance_attains_cramer_rao_bound(noise):
     n_runs, shift = 400, np.array([0.3, -0.2])
     rng = np.random.default_rng(11)
     mean = EXPECT(picture(*shift, level=90.0))
@@ -87,7 +87,7 @@ def test_the_best_estimate_scatters_by_the_bound(noise):
     )
     gradient = site_gradients_e_per_um(FOVEAL, picture(*shift, level=90.0), GRID)
     bound = flow_bound(gradient, variance).covariance_um2[0]
-    # What scatters, made white by the bound: unit variances and no correlation, each known to sqrt(2 / n) and sqrt(1 / n).
+    # Errors whitened by the bound: unit variances, no correlation, with standard errors sqrt(2 / n) and sqrt(1 / n).
     white = np.linalg.solve(np.linalg.cholesky(bound), np.moveaxis(found - shift, 0, 1))
     covariance = np.cov(white)
 
@@ -96,7 +96,7 @@ def test_the_best_estimate_scatters_by_the_bound(noise):
     assert abs(covariance[0, 1]) < 4.0 / np.sqrt(n_runs)
 
 
-def test_the_bound_is_the_inverse_of_the_information_and_information_adds_up():
+def test_flow_bound_inverts_fisher_information():
     rng = np.random.default_rng(0)
     gradient, variance = rng.normal(size=(60, 2)), rng.uniform(1.0, 5.0, 60)
     regions = np.repeat([7, 2, -1], 20)
@@ -111,7 +111,7 @@ def test_the_bound_is_the_inverse_of_the_information_and_information_adds_up():
     assert flow_bound(gradient, 4.0 * variance).sigma_um == pytest.approx(2.0 * flow_bound(gradient, variance).sigma_um)
 
 
-def test_regions_move_by_themselves():
+def test_regions_have_independent_flow():
     left = (FOVEAL.centroid_um[:, 0] > 0.0).astype(int)
     values = np.where(left == 0, EXPECT(picture(0.5, 0.2)), EXPECT(picture(-0.4, 0.6)))
 
@@ -121,42 +121,42 @@ def test_regions_move_by_themselves():
     assert found.bound.n_sites.sum() == FOVEAL.n_sites
 
 
-#: 24 x 24 squares of 4 µm, of which the map has 19 x 19 wholly, others partly, and others not at all.
+#: 24 x 24 squares of 4 µm, of which the map covers 19 x 19 completely, others partly, and others not at all.
 WIDE = fs.layout.grid(n_x=24, n_y=24, pitch_um=4.0).translate(1.3, 0.7)
-IS_WHOLE = (np.abs(WIDE.centroid_um) <= 38.0).all(axis=1)
-IS_AWAY = (np.abs(WIDE.centroid_um) >= 42.0).any(axis=1)
+IS_COVERED = (np.abs(WIDE.centroid_um) <= 38.0).all(axis=1)
+IS_OUTSIDE = (np.abs(WIDE.centroid_um) >= 42.0).any(axis=1)
 
 
-def test_sites_off_the_map_bias_nothing():
+def test_uncovered_sites_do_not_bias_flow():
     around = fs.Grid.centred((240, 240), 0.5)
     values = fs.Integrator(WIDE, around, order=2)(picture(0.7, -0.4, grid=around))
     left = (WIDE.centroid_um[:, 0] > 0.0).astype(int)
 
     found = estimate_flow(WIDE, values, picture(), GRID, variance_e2=values, regions=left)
 
-    assert np.any(~IS_WHOLE & ~IS_AWAY)
+    assert np.any(~IS_COVERED & ~IS_OUTSIDE)
     assert found.flow_um == pytest.approx(np.array([[0.7, -0.4], [0.7, -0.4]]), abs=1e-3)
-    # By where they are when carried back by the shift.
-    lost = (np.abs(WIDE.centroid_um - [0.7, -0.4]) > 38.0).any(axis=1)
-    assert found.bound.n_sites.tolist() == [np.sum(~lost & (left == k)) for k in (0, 1)]
+    # Coverage is determined after the displacement of the outlines.
+    uncovered = (np.abs(WIDE.centroid_um - [0.7, -0.4]) > 38.0).any(axis=1)
+    assert found.bound.n_sites.tolist() == [np.sum(~uncovered & (left == k)) for k in (0, 1)]
     assert np.all(found.misfit < 1e-4)
 
 
-def test_the_misfit_counts_the_sites_on_the_map():
+def test_misfit_uses_covered_sites_only():
     around = fs.Grid.centred((240, 240), 0.5)
     mean = fs.Integrator(WIDE, around, order=2)(picture(0.3, 0.2, grid=around))
     values = mean + np.random.default_rng(3).normal(size=mean.size) * np.sqrt(mean)
 
     found = estimate_flow(WIDE, values, picture(), GRID, variance_e2=mean)
 
-    # A mean of squares of n normal numbers, two of which the flow has taken.
+    # Chi-squared distribution: n normal residuals less two degrees of freedom of the flow.
     n_on = found.bound.n_sites[0]
     assert n_on == 19 * 19
     assert found.misfit[0] == pytest.approx(1.0 - 2.0 / n_on, abs=4.0 * np.sqrt(2.0 / n_on))
 
 
-def test_a_region_off_the_map_is_not_known():
-    labels = IS_AWAY.astype(int)
+def test_flow_of_uncovered_region_is_nan():
+    labels = IS_OUTSIDE.astype(int)
     values = np.full(WIDE.n_sites, 900.0)
 
     found = estimate_flow(WIDE, values, picture(), GRID, variance_e2=values, regions=labels)
@@ -167,15 +167,17 @@ def test_a_region_off_the_map_is_not_known():
     assert np.isinf(found.bound.sigma_um[1]).all()
 
 
-def test_gradients_of_sites_off_the_map_are_nothing_and_it_is_told():
-    with pytest.warns(CoverageWarning, match=f"{np.sum(~IS_WHOLE)} of 576 photosites lie partly or wholly off the map"):
+def test_uncovered_sites_have_zero_gradient():
+    with pytest.warns(
+        CoverageWarning, match=f"{np.sum(~IS_COVERED)} of 576 photosites lie partly or entirely off the map"
+    ):
         gradient = site_gradients_e_per_um(WIDE, picture(), GRID)
 
-    assert np.all(gradient[~IS_WHOLE] == 0.0)
-    assert np.array_equal(gradient[IS_WHOLE], site_gradients_e_per_um(WIDE[IS_WHOLE], picture(), GRID))
+    assert np.all(gradient[~IS_COVERED] == 0.0)
+    assert np.array_equal(gradient[IS_COVERED], site_gradients_e_per_um(WIDE[IS_COVERED], picture(), GRID))
 
 
-def test_along_an_edge_nothing_is_known():
+def test_flow_along_edge_is_unobservable():
     x, y = np.meshgrid(GRID.x_um, GRID.y_um)
     upright, slanted = 50.0 + 20.0 * np.tanh(x / 4.0), 50.0 + 20.0 * np.tanh((x + y) / 4.0)
     straight, oblique = (
@@ -191,11 +193,11 @@ def test_along_an_edge_nothing_is_known():
     assert np.isinf(flat.bound.sigma_um).all()
 
 
-def test_bad_input_is_told():
+def test_invalid_flow_arguments_raise():
     map_e, values = picture(), np.ones(FOVEAL.n_sites)
     with pytest.raises(ParameterError, match="'variance_e2' must be > 0"):
         flow_bound(np.ones((3, 2)), 0.0)
-    with pytest.raises(ParameterError, match=r"'gradient_e_per_um' must have the shape \(n_site, 2\)"):
+    with pytest.raises(ParameterError, match=r"'gradient_e_per_um' must have shape \(n_site, 2\)"):
         flow_bound(np.ones((3, 3)), 1.0)
     with pytest.raises(ParameterError, match="'regions' must be 3 integers"):
         flow_bound(np.ones((3, 2)), 1.0, regions=[0.5, 1.0, 2.0])
@@ -203,7 +205,7 @@ def test_bad_input_is_told():
         estimate_flow(None, values, map_e, GRID, variance_e2=1.0)
     with pytest.raises(ParameterError, match=r"'layout' must be a foveasim\.Layout, got a list"):
         site_gradients_e_per_um([FOVEAL], map_e, GRID)
-    with pytest.raises(ParameterError, match="'values_e' must be one for each of the"):
+    with pytest.raises(ParameterError, match="'values_e' must have one value for each of the"):
         estimate_flow(FOVEAL, values[:5], map_e, GRID, variance_e2=1.0)
     with pytest.raises(ParameterError, match="'map_e_per_um2' must have the grid's shape"):
         estimate_flow(FOVEAL, values, map_e[:50], GRID, variance_e2=1.0)

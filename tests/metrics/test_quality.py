@@ -1,4 +1,4 @@
-"""How near a picture is to a reference: closed forms, and what is not covered does not count."""
+"""Image similarity: closed forms, scikit-image as reference, and uncovered pixels."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ def picture(data, coverage=1.0, pitch_um=1.0):
     return Picture(data, np.broadcast_to(np.float32(coverage), data.shape[1:]), fs.Grid(data.shape[1:], pitch_um))
 
 
-def test_psnr_of_an_even_difference_is_its_share_of_the_range():
+def test_psnr_of_constant_difference():
     assert psnr_db(TRUTH + 0.01, TRUTH, 1.0) == pytest.approx(40.0)
     assert psnr_db(3.0 * TRUTH + 0.3, 3.0 * TRUTH, 3.0) == pytest.approx(20.0)
 
 
-def test_psnr_is_that_of_scikit_image_where_all_is_covered():
+def test_psnr_matches_scikit_image():
     assert psnr_db(NOISY, TRUTH, 1.0) == pytest.approx(peak_signal_noise_ratio(TRUTH, NOISY, data_range=1.0))
     assert psnr_db(NOISY, TRUTH) == pytest.approx(psnr_db(NOISY, TRUTH, float(np.ptp(TRUTH))))
 
 
-def test_equal_pictures_have_no_noise():
+def test_identical_pictures_have_infinite_psnr():
     assert psnr_db(TRUTH, TRUTH) == math.inf
     assert ssim(TRUTH, TRUTH) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("wrong", [np.nan, 1e9])
-def test_what_is_not_covered_does_not_count(wrong):
+def test_psnr_excludes_uncovered_pixels(wrong):
     is_hole = np.hypot(*np.meshgrid(np.arange(50) - 25, np.arange(40) - 20)) < 8
     seen = np.where(is_hole, wrong, NOISY)
     expected = 10 * np.log10(1.0 / np.mean((NOISY - TRUTH)[~is_hole] ** 2))
@@ -47,7 +47,7 @@ def test_what_is_not_covered_does_not_count(wrong):
     assert psnr_db(picture(seen, ~is_hole), TRUTH[np.newaxis], 1.0) == pytest.approx(expected)
 
 
-def test_ssim_is_that_of_scikit_image_over_windows_that_are_covered():
+def test_ssim_uses_fully_covered_windows():
     is_hole = np.zeros(TRUTH.shape, bool)
     is_hole[10:15, 20:30] = True
     full = structural_similarity(NOISY, TRUTH, win_size=7, data_range=1.0, full=True)[1]
@@ -58,22 +58,22 @@ def test_ssim_is_that_of_scikit_image_over_windows_that_are_covered():
     assert ssim(np.where(is_hole, np.nan, NOISY), TRUTH, 1.0) == pytest.approx(full[counts].mean(), abs=1e-12)
 
 
-def test_ssim_of_a_whole_picture_is_that_of_scikit_image():
+def test_ssim_matches_scikit_image():
     expected = structural_similarity(NOISY, TRUTH, win_size=7, data_range=1.0)
 
     assert ssim(NOISY, TRUTH, 1.0) == pytest.approx(expected, rel=1e-6)
 
 
-def test_pixels_at_the_rim_count_by_choice():
+def test_min_coverage_selects_partly_covered_pixels():
     coverage = np.full(TRUTH.shape, 0.7)
     seen = picture(NOISY, coverage)
 
     assert psnr_db(seen, TRUTH[np.newaxis]) == pytest.approx(psnr_db(NOISY, TRUTH))
-    with pytest.raises(ParameterError, match="'picture' and reference must have a pixel that both know"):
+    with pytest.raises(ParameterError, match="'picture' must have at least one pixel in common with the reference"):
         psnr_db(seen, TRUTH[np.newaxis], min_coverage=1.0)
 
 
-def test_colours_count_alike():
+def test_psnr_averages_channels_equally():
     colour = np.stack((TRUTH, TRUTH, TRUTH))
     seen = colour + np.array([0.1, 0.0, 0.0])[:, None, None]
 
@@ -81,19 +81,19 @@ def test_colours_count_alike():
 
 
 @pytest.mark.parametrize("wrong", [np.inf, -np.inf])
-def test_an_infinite_pixel_is_no_unknown_one(wrong):
-    """A reconstruction that diverged has no score: it is not left out like what photosites do not cover."""
+def test_infinite_pixel_raises(wrong):
+    """Infinite pixels of a diverged reconstruction are not excluded like uncovered pixels."""
     diverged = TRUTH.copy()
     diverged[3, 4:7] = wrong
     is_seen = np.isfinite(diverged)
 
     for score in (psnr_db, ssim):
         with pytest.raises(
-            ParameterError, match="'picture' must be finite where it is compared, and 3 of 2,000 pixels"
+            ParameterError, match="'picture' must be finite, got infinity in 3 of 2,000 compared pixels"
         ):
             score(diverged, TRUTH, 1.0)
         with pytest.raises(
-            ParameterError, match="'reference' must be finite where it is compared, and 3 of 2,000 pixels"
+            ParameterError, match="'reference' must be finite, got infinity in 3 of 2,000 compared pixels"
         ):
             score(TRUTH, diverged, 1.0)
     assert psnr_db(picture(np.where(is_seen, TRUTH + 0.1, wrong), is_seen), TRUTH[np.newaxis], 1.0) == pytest.approx(
@@ -104,15 +104,18 @@ def test_an_infinite_pixel_is_no_unknown_one(wrong):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: psnr_db(TRUTH, TRUTH[1:]), "'reference' must have the picture's shape"),
-        (lambda: psnr_db(TRUTH[0], TRUTH[0]), r"'picture' must have the shape \(\.\.\., n_y, n_x\)"),
+        (lambda: psnr_db(TRUTH, TRUTH[1:]), "'reference' must have the same shape as the picture"),
+        (lambda: psnr_db(TRUTH[0], TRUTH[0]), r"'picture' must have shape \(\.\.\., n_y, n_x\)"),
         (lambda: psnr_db(NOISY, np.ones_like(TRUTH)), "'data_range' must be given"),
         (lambda: psnr_db(NOISY, TRUTH, -1.0), "'data_range' must be > 0"),
-        (lambda: psnr_db(picture(TRUTH), picture(TRUTH, pitch_um=2.0)), "'reference' must lie on the picture's grid"),
+        (
+            lambda: psnr_db(picture(TRUTH), picture(TRUTH, pitch_um=2.0)),
+            "'reference' must have the same grid as the picture",
+        ),
         (lambda: ssim(NOISY, TRUTH, window=4), "'window' must be odd"),
-        (lambda: ssim(NOISY, TRUTH, window=51), "'window' must fit on the pixels that count"),
+        (lambda: ssim(NOISY, TRUTH, window=51), "'window' must fit within the compared pixels"),
     ],
 )
-def test_what_cannot_be_compared_is_refused_by_name(call, message):
+def test_invalid_comparison_raises(call, message):
     with pytest.raises(ParameterError, match=message):
         call()

@@ -1,4 +1,4 @@
-"""Resolution: polygons' transforms in closed form, the slanted edge against lens times pixel, Nyquist frequencies of lattices."""
+"""Resolution: closed-form polygon transforms, slanted-edge MTF, and Nyquist frequencies."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from foveasim.metrics import (
 from foveasim.optics import circular_otf
 from foveasim.scene import charts
 
-#: From frequencies where float64 could not tell a sine from 1, to 40 periods across a site.
+#: From frequencies at which the transform is 1 to float64, to 40 periods across a site.
 FREQUENCIES = np.array([0.0, 1e-300, 1e-200, 1e-12, 1e-6, 1e-3, 0.1, 1.0, 10.0, 99.7, 250.0, 333.3, 1000.0, 1e4])
 ANGLES = (0.0, 17.0, 45.0, 90.0, 133.0, 270.0)
 
-# -- polygons ---------------------------------------------------------------------------------------------------------
+# -- polygon transforms------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("angle_deg", ANGLES)
-def test_a_rectangle_is_a_product_of_sincs(angle_deg):
+def test_rectangle_otf_is_product_of_sincs(angle_deg):
     layout = fs.layout.grid(n_x=1, n_y=1, pitch_um=4.0, pitch_y_um=3.0).translate(5000.0, -300.0)
     waves = wave_vectors_per_mm(FREQUENCIES, angle_deg)
     expected = np.sinc(4e-3 * waves[:, 0]) * np.sinc(3e-3 * waves[:, 1])
@@ -36,40 +36,42 @@ def test_a_rectangle_is_a_product_of_sincs(angle_deg):
     assert np.abs(polygon_otf(layout, waves)[0] - expected).max() <= 1e-12
 
 
-def test_a_hexagon_has_its_closed_forms_across_sides_and_corners():
+def test_hexagon_otf_matches_closed_forms():
     layout = fs.layout.hexagonal(n_columns=1, n_rows=1, pitch_um=4.0)
     w, s = 4e-3, 4e-3 / np.sqrt(3.0)
     f = FREQUENCIES
 
-    sides, corners = polygon_otf(layout, wave_vectors_per_mm(f, 0.0)), polygon_otf(layout, wave_vectors_per_mm(f, 90.0))
+    flat, vertex = polygon_otf(layout, wave_vectors_per_mm(f, 0.0)), polygon_otf(layout, wave_vectors_per_mm(f, 90.0))
 
-    assert np.abs(sides - (2 / 3 * np.sinc(w * f) + 1 / 3 * np.sinc(w * f / 2) ** 2)).max() <= 1e-12
-    assert np.abs(corners - np.sinc(1.5 * s * f) * np.sinc(0.5 * s * f)).max() <= 1e-12
+    assert np.abs(flat - (2 / 3 * np.sinc(w * f) + 1 / 3 * np.sinc(w * f / 2) ** 2)).max() <= 1e-12
+    assert np.abs(vertex - np.sinc(1.5 * s * f) * np.sinc(0.5 * s * f)).max() <= 1e-12
 
 
 def l_shape():
-    whole = shapely.Polygon([(0, 0), (5, 0), (5, 2), (2, 2.5), (1, 6), (0, 6)], [[(0.5, 0.5), (1.2, 0.6), (0.8, 1.5)]])
-    return whole, fs.Layout.from_polygons([whole])
+    polygon = shapely.Polygon(
+        [(0, 0), (5, 0), (5, 2), (2, 2.5), (1, 6), (0, 6)], [[(0.5, 0.5), (1.2, 0.6), (0.8, 1.5)]]
+    )
+    return polygon, fs.Layout.from_polygons([polygon])
 
 
-def test_pieces_of_a_site_add_up_to_it():
-    whole, layout = l_shape()
+def test_polygon_otf_is_additive():
+    polygon, layout = l_shape()
     cut = shapely.Polygon([(-1, -1), (3, -1), (0.3, 7), (-1, 7)])
-    parts = fs.Layout.from_polygons([whole & cut, whole - cut])
+    parts = fs.Layout.from_polygons([polygon & cut, polygon - cut])
     waves = np.random.default_rng(0).normal(0.0, 200.0, (50, 2))
 
     def integrals(some):
         away = np.exp(-2e-3j * np.pi * (some.centroid_um @ np.moveaxis(waves, 0, 1)))
         return some.area_um2[:, None] * polygon_otf(some, waves) * away
 
-    assert integrals(parts).sum(axis=0) == pytest.approx(integrals(layout)[0], abs=1e-12 * whole.area)
+    assert integrals(parts).sum(axis=0) == pytest.approx(integrals(layout)[0], abs=1e-12 * polygon.area)
 
 
-def test_a_site_is_its_mean_over_many_points():
-    whole, layout = l_shape()
+def test_polygon_otf_matches_point_sampling():
+    polygon, layout = l_shape()
     step = 0.01
     x, y = np.meshgrid(np.arange(0.0, 5.0, step) + step / 2, np.arange(0.0, 6.0, step) + step / 2)
-    inside = shapely.contains_xy(whole, x, y)
+    inside = shapely.contains_xy(polygon, x, y)
     points = np.stack((x[inside], y[inside]), axis=1) - layout.centroid_um[0]
     waves = np.array([[30.0, 10.0], [-120.0, 75.0], [0.0, 240.0], [310.0, 0.0]])
 
@@ -78,17 +80,17 @@ def test_a_site_is_its_mean_over_many_points():
     assert np.abs(polygon_otf(layout, waves)[0] - slow).max() <= 2e-4
 
 
-def test_moving_a_site_changes_nothing_and_turning_it_turns_its_transform():
+def test_polygon_mtf_follows_translation_and_rotation():
     _, layout = l_shape()
     f = np.array([3.0, 80.0, 300.0])
 
-    still = polygon_mtf(layout, f, angle_deg=20.0)
+    reference = polygon_mtf(layout, f, angle_deg=20.0)
 
-    assert polygon_mtf(layout.translate(4000.0, 77.0), f, angle_deg=20.0) == pytest.approx(still, abs=1e-12)
-    assert polygon_mtf(layout.rotate(31.0), f, angle_deg=51.0) == pytest.approx(still, abs=1e-12)
+    assert polygon_mtf(layout.translate(4000.0, 77.0), f, angle_deg=20.0) == pytest.approx(reference, abs=1e-12)
+    assert polygon_mtf(layout.rotate(31.0), f, angle_deg=51.0) == pytest.approx(reference, abs=1e-12)
 
 
-def test_near_frequency_0_the_second_moment_is_left_with_all_its_digits():
+def test_polygon_otf_is_accurate_near_zero():
     layout = fs.layout.grid(n_x=1, n_y=1, pitch_um=4.0)
     f = np.array([1e-3, 1e-2, 1e-1])
     otf = polygon_otf(layout, wave_vectors_per_mm(f))[0]
@@ -96,11 +98,11 @@ def test_near_frequency_0_the_second_moment_is_left_with_all_its_digits():
     odd = polygon_otf(tilted, wave_vectors_per_mm(f))[0].imag
 
     assert otf.imag.tolist() == [0.0, 0.0, 0.0]
-    # The third moment of x of this triangle about its centroid, over its area, is 0.2; exp(-ikx) has (i k³ / 6) of it.
+    # The normalised third central moment of x of this triangle is 0.2; its term in exp(-ikx) has the factor i k³ / 6.
     assert odd == pytest.approx((2e-3 * np.pi * f) ** 3 / 6.0 * 0.2, rel=1e-4)
 
 
-def test_all_sites_give_what_each_gives_alone_on_any_number_of_threads():
+def test_polygon_otf_is_independent_of_threads():
     layout = fs.layout.log_polar(n_sectors=90, min_size_um=2.0, r_max_um=150.0, stagger=True)
     waves = np.random.default_rng(1).normal(0.0, 150.0, (7, 2))
     together = polygon_otf(layout, waves, n_threads=1)
@@ -111,15 +113,15 @@ def test_all_sites_give_what_each_gives_alone_on_any_number_of_threads():
     assert np.array_equal(together[some], polygon_otf(layout[some], waves))
 
 
-def test_bad_waves_are_told():
+def test_invalid_wave_vectors_raise():
     layout = fs.layout.grid(n_x=1, n_y=1, pitch_um=1.0)
-    with pytest.raises(ParameterError, match=r"'wave_per_mm' must have the shape \(n_wave, 2\)"):
+    with pytest.raises(ParameterError, match=r"'wave_per_mm' must have shape \(n_wave, 2\)"):
         polygon_otf(layout, [[1.0, 2.0, 3.0]])
     with pytest.raises(ParameterError, match="'angle_deg' must be one number, or one for each of the 3 frequencies"):
         polygon_mtf(layout, [1.0, 2.0, 3.0], angle_deg=[1.0, 2.0])
 
 
-# -- the slanted edge -------------------------------------------------------------------------------------------------
+# -- slanted edge -----------------------------------------------------------------------------------------------------
 
 OPTICS = fs.Optics(focal_length_mm=10.0, f_number=4.0)
 CELL_UM, DISTANCE_M = 0.5, 0.5
@@ -142,7 +144,7 @@ def edge_capture(layout, angle_deg, n_cells=760):
 
 
 def lens_times_pixel(layout, frequency_per_mm, angle_deg):
-    """Closed forms of the clear circle, the sites, and the chart's and the map's cells, across an edge."""
+    """Product of the closed-form MTFs of the lens, the sites, and the cells of chart and map, across an edge."""
     wave = wave_vectors_per_mm(frequency_per_mm, angle_deg)
     lens = circular_otf(frequency_per_mm * 0.55e-3 * OPTICS.working_f_number(DISTANCE_M))
     cells = np.prod(np.sinc(1e-3 * CELL_UM * wave), axis=1) ** 2
@@ -151,7 +153,7 @@ def lens_times_pixel(layout, frequency_per_mm, angle_deg):
 
 @pytest.mark.parametrize("angle_deg", [5.0, -5.0, 85.0, 175.0, -95.0, 23.0])
 @pytest.mark.parametrize("layout", [SQUARES, HEXAGONS], ids=["squares", "hexagons"])
-def test_the_mtf_by_the_edge_is_that_of_lens_times_pixel_up_to_nyquist(layout, angle_deg):
+def test_edge_mtf_matches_lens_times_pixel(layout, angle_deg):
     found = slanted_edge_mtf(layout, edge_capture(layout, angle_deg).expected_e)
     f = found.frequency_per_mm
     is_in = f <= nyquist_per_mm(layout)[0] * 1.0001
@@ -164,7 +166,7 @@ def test_the_mtf_by_the_edge_is_that_of_lens_times_pixel_up_to_nyquist(layout, a
     assert found.mtf50_per_mm == pytest.approx(np.interp(-0.5, -expected, f), rel=0.015)
 
 
-def test_the_edge_need_not_pass_through_the_middle():
+def test_edge_mtf_supports_off_centre_edges():
     layout = SQUARES.translate(37.0, 11.0)
     found = slanted_edge_mtf(layout, edge_capture(layout, 5.0).expected_e)
     is_in = found.frequency_per_mm <= 125.0
@@ -173,8 +175,8 @@ def test_the_edge_need_not_pass_through_the_middle():
     assert np.abs(found.mtf / lens_times_pixel(layout[[0]], found.frequency_per_mm, 5.0) - 1.0)[is_in].max() < 0.02
 
 
-def test_sites_in_few_lines_along_the_edge_tell_it_too():
-    # At 60 degrees hexagons lie in lines 2 µm apart, and bins of 1 µm hold one line or none, or parts of one.
+def test_edge_mtf_supports_sparse_phases():
+    # At 60 degrees hexagons form lines 2 µm apart, so that bins of 1 µm contain one line, a part of one, or none.
     found = slanted_edge_mtf(HEXAGONS, edge_capture(HEXAGONS, 60.0).expected_e)
     is_in = found.frequency_per_mm <= 144.0
 
@@ -182,7 +184,7 @@ def test_sites_in_few_lines_along_the_edge_tell_it_too():
     assert np.abs(found.mtf / expected - 1.0)[is_in].max() < 0.02
 
 
-def test_an_annulus_of_a_foveal_layout_has_the_mtf_of_its_pixels():
+def test_edge_mtf_of_foveal_annulus():
     layout = fs.layout.log_polar(n_sectors=200, min_size_um=2.0, r_max_um=140.0).translate(-70.0, 0.0)
     r_um = np.hypot(layout.centroid_um[:, 0] + 70.0, layout.centroid_um[:, 1])
     where = (r_um > 80.0) & (r_um < 120.0) & (layout.centroid_um[:, 0] > -60.0)
@@ -196,7 +198,7 @@ def test_an_annulus_of_a_foveal_layout_has_the_mtf_of_its_pixels():
     assert np.abs(found.mtf - expected)[is_in].max() < 0.02
 
 
-def test_noise_and_a_dead_block_move_the_mtf_a_little():
+def test_edge_mtf_is_robust_to_defects():
     capture = edge_capture(SQUARES, 5.0)
     noisy = capture.electrons.astype(float)
     noisy[np.hypot(*(SQUARES.centroid_um - [60.0, 60.0]).T) < 15.0] = 0.0
@@ -210,8 +212,8 @@ def test_noise_and_a_dead_block_move_the_mtf_a_little():
     assert found.mtf50_per_mm == pytest.approx(clean.mtf50_per_mm, rel=0.02)
 
 
-def test_an_edge_of_known_blur_has_its_known_mtf():
-    # A Gaussian blur of 3 µm on points without size: its transform, and nothing else.
+def test_edge_mtf_of_gaussian_blur():
+    # Point samples of an edge with a Gaussian blur of 3 µm: the MTF is the transform of the Gaussian.
     from scipy.special import ndtr
 
     layout = fs.layout.grid(n_x=150, n_y=150, pitch_um=2.0)
@@ -227,7 +229,7 @@ def test_an_edge_of_known_blur_has_its_known_mtf():
     assert found.profile[-1] == pytest.approx(300.0)
 
 
-def test_windows_and_bins_change_little():
+def test_edge_mtf_varies_little_with_window():
     values = edge_capture(SQUARES, 5.0).expected_e
     f = np.linspace(0.0, 125.0, 26)
     plain = slanted_edge_mtf(SQUARES, values, frequency_per_mm=f, window="none")
@@ -240,15 +242,15 @@ GRID = fs.layout.grid(n_x=100, n_y=100, pitch_um=3.0)
 
 
 def squares_at_an_edge(angle_deg=5.0, sigma_um=1.0):
-    """Means over the sites of GRID of an edge from 0 to 1 with a Gaussian blur, by quadrature, and the closed form of the MTF."""
+    """Site means on GRID of an edge from 0 to 1 with a Gaussian blur, by quadrature, and the closed-form MTF."""
     from scipy.special import ndtr
 
     across = np.array([np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))])
-    nodes, shares = np.polynomial.legendre.leggauss(8)
+    nodes, weights = np.polynomial.legendre.leggauss(8)
     values = np.zeros(GRID.n_sites)
     for i, j in np.ndindex(8, 8):
-        place = (GRID.centroid_um + 1.5 * np.array([nodes[i], nodes[j]])) @ across
-        values += 0.25 * shares[i] * shares[j] * ndtr(place / sigma_um)
+        position_um = (GRID.centroid_um + 1.5 * np.array([nodes[i], nodes[j]])) @ across
+        values += 0.25 * weights[i] * weights[j] * ndtr(position_um / sigma_um)
 
     def mtf(frequency_per_mm):
         box = np.prod(np.sinc(3e-3 * np.multiply.outer(frequency_per_mm, across)), axis=1)
@@ -258,66 +260,66 @@ def squares_at_an_edge(angle_deg=5.0, sigma_um=1.0):
 
 
 def plain_standard(picture, pitch_um, frequency_per_mm):
-    """ISO 12233's e-SFR on rows of a grid: lines' centroids, four bins a pixel, differences, a bell, and a Fourier sum."""
+    """Reference: e-SFR of ISO 12233 on a grid, with row centroids, four bins per pixel, Hamming window and DFT."""
     n_y, n_x = picture.shape
     x, y = np.arange(n_x), np.arange(n_y)
     rise = np.gradient(picture, axis=1)
-    middle = np.full(n_y, 0.5 * (n_x - 1))
+    centre = np.full(n_y, 0.5 * (n_x - 1))
     for _ in range(2):
-        bell = 0.54 + 0.46 * np.cos(2.0 * np.pi * (x - middle[:, None]) / n_x)
-        line = np.polyfit(y, (rise * bell * x).sum(axis=1) / (rise * bell).sum(axis=1), 1)
-        middle = np.polyval(line, y)
-    k = np.floor(4.0 * (x - middle[:, None])).astype(int)
+        window = 0.54 + 0.46 * np.cos(2.0 * np.pi * (x - centre[:, None]) / n_x)
+        line = np.polyfit(y, (rise * window * x).sum(axis=1) / (rise * window).sum(axis=1), 1)
+        centre = np.polyval(line, y)
+    k = np.floor(4.0 * (x - centre[:, None])).astype(int)
     first = k.min()
     count = np.bincount((k - first).ravel())
     profile = np.bincount((k - first).ravel(), weights=picture.ravel()) / np.maximum(count, 1)
     profile = np.interp(np.arange(count.size), np.flatnonzero(count), profile[count > 0])
     at = np.arange(count.size - 1) + first + 1.0
     spread = np.diff(profile) * (0.54 + 0.46 * np.cos(np.pi * at / np.abs(at).max()))
-    # Distances are along x; across the edge they are shorter.
-    share = 1e-3 * frequency_per_mm * pitch_um * np.cos(np.arctan(line[0]))
-    found = np.abs(np.exp(-0.5j * np.pi * np.multiply.outer(share, at)) @ spread) / spread.sum()
-    return found / np.sinc(share / 4.0)
+    # Bins are measured along x; the factor converts to the distance perpendicular to the edge.
+    cycles = 1e-3 * frequency_per_mm * pitch_um * np.cos(np.arctan(line[0]))
+    found = np.abs(np.exp(-0.5j * np.pi * np.multiply.outer(cycles, at)) @ spread) / spread.sum()
+    return found / np.sinc(cycles / 4.0)
 
 
-def test_under_noise_the_error_is_less_than_the_plain_standards_by_a_third():
+def test_edge_mtf_noise_is_below_standard():
     values, mtf = squares_at_an_edge()
     f = np.linspace(0.0, 500.0 / 3.0, 51)
     rng = np.random.default_rng(4)
-    ours, plain = [], []
+    found, standard = [], []
     for _ in range(40):
         noisy = values + rng.normal(0.0, 1.0 / 50.0, values.size)
-        ours.append(slanted_edge_mtf(GRID, noisy, frequency_per_mm=f).mtf - mtf(f))
-        plain.append(plain_standard(noisy.reshape(100, 100), 3.0, f) - mtf(f))
+        found.append(slanted_edge_mtf(GRID, noisy, frequency_per_mm=f).mtf - mtf(f))
+        standard.append(plain_standard(noisy.reshape(100, 100), 3.0, f) - mtf(f))
 
-    # The plain one is right but for its noise.
+    # Without noise the reference is accurate.
     assert np.abs(plain_standard(values.reshape(100, 100), 3.0, f) - mtf(f)).max() < 0.02
-    assert np.sqrt(np.mean(np.square(ours))) < 2.0 / 3.0 * np.sqrt(np.mean(np.square(plain)))
+    assert np.sqrt(np.mean(np.square(found))) < 2.0 / 3.0 * np.sqrt(np.mean(np.square(standard)))
     assert np.abs(slanted_edge_mtf(GRID, values, frequency_per_mm=f).mtf - mtf(f)).max() < 0.002
 
 
-def test_the_mtf_scatters_by_what_it_says():
+def test_mtf_sigma_matches_scatter():
     values, mtf = squares_at_an_edge()
     f = np.array([0.0, 20.0, 60.0, 100.0, 140.0, 166.0])
     rng, n_runs = np.random.default_rng(9), 200
-    # Noisier in white, as of photons.
+    # Noise increases with the signal, as for shot noise.
     noise = 0.02 * np.sqrt(0.3 + values)
     draws = [
         slanted_edge_mtf(GRID, values + noise * rng.normal(size=values.size), frequency_per_mm=f) for _ in range(n_runs)
     ]
-    found, told = np.array([one.mtf for one in draws]), np.array([one.mtf_sigma for one in draws])
-    scatter, mean = found.std(axis=0, ddof=1), np.sqrt(np.square(told).mean(axis=0))
+    found, sigma = np.array([one.mtf for one in draws]), np.array([one.mtf_sigma for one in draws])
+    scatter, mean = found.std(axis=0, ddof=1), np.sqrt(np.square(sigma).mean(axis=0))
 
     assert mtf(f)[-1] > 10.0 * mean[-1]
     assert (scatter[0], mean[0]) == pytest.approx((0.0, 0.0), abs=1e-12)
-    # A standard deviation of n numbers is known to 1 / sqrt(2 n).
+    # The relative error of a standard deviation of n values is 1 / sqrt(2 n).
     assert scatter[1:] == pytest.approx(mean[1:], rel=5.0 / np.sqrt(2.0 * n_runs))
     assert np.all(np.abs(found.mean(axis=0) - mtf(f))[1:] < 5.0 * mean[1:] / np.sqrt(n_runs) + 5e-4)
     assert slanted_edge_mtf(GRID, values).mtf_sigma.max() < 0.002
 
 
 @pytest.mark.parametrize("kind", ["box of 2 pitches", "box of 20 pitches", "two-sided exponential", "core and halo"])
-def test_wide_bins_far_out_lose_nothing_of_wide_edges(kind):
+def test_widening_bins_preserve_mtf_of_wide_edges(kind):
     from scipy.special import ndtr
 
     layout = fs.layout.grid(n_x=150, n_y=150, pitch_um=2.0)
@@ -342,7 +344,7 @@ def test_wide_bins_far_out_lose_nothing_of_wide_edges(kind):
 
 
 @pytest.mark.parametrize("bin_um", [0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0])
-def test_what_bins_of_any_width_tell_is_right(bin_um):
+def test_edge_mtf_is_accurate_for_bin_widths(bin_um):
     values, mtf = squares_at_an_edge()
 
     found = slanted_edge_mtf(GRID, values, bin_um=bin_um)
@@ -356,27 +358,27 @@ def test_what_bins_of_any_width_tell_is_right(bin_um):
         slanted_edge_mtf(GRID, values, bin_um=bin_um, frequency_per_mm=[0.0, 251.0 / bin_um])
 
 
-def test_what_an_edge_cannot_tell_is_refused():
+def test_invalid_edge_arguments_raise():
     values, _ = squares_at_an_edge()
     blurred, _ = squares_at_an_edge(sigma_um=9.0)
-    for options, sentence in (
+    for options, message in (
         (
             {"frequency_per_mm": [0.0, 1e5]},
             "'frequency_per_mm' must be <= 333.3 with bins of 0.75 µm, got 100000.* narrower",
         ),
-        ({"frequency_per_mm": [[0.0, 1.0], [2.0, 3.0]]}, "'frequency_per_mm' must be rising numbers"),
-        ({"frequency_per_mm": [0.0, 20.0, 10.0]}, "'frequency_per_mm' must be rising numbers"),
-        ({"frequency_per_mm": []}, "'frequency_per_mm' must be rising numbers"),
-        ({"bin_um": 3.1}, "'bin_um' must be <= 3, got 3.1 µm; one pitch is the most"),
-        ({"reach_um": 2.0}, "'reach_um' must be >= 15, got 2.0 µm; five pitches of 3 µm"),
+        ({"frequency_per_mm": [[0.0, 1.0], [2.0, 3.0]]}, "'frequency_per_mm' must be strictly increasing"),
+        ({"frequency_per_mm": [0.0, 20.0, 10.0]}, "'frequency_per_mm' must be strictly increasing"),
+        ({"frequency_per_mm": []}, "'frequency_per_mm' must be strictly increasing"),
+        ({"bin_um": 3.1}, "'bin_um' must be <= 3, got 3.1 µm; the limit is one pitch"),
+        ({"reach_um": 2.0}, "'reach_um' must be >= 15, got 2.0 µm; the minimum is five pitches of 3 µm"),
     ):
-        with pytest.raises(ParameterError, match=sentence):
+        with pytest.raises(ParameterError, match=message):
             slanted_edge_mtf(GRID, values, **options)
-    with pytest.raises(ParameterError, match=r"'reach_um' must be >= 25\.6.* twice the edge's width of 12\.8"):
+    with pytest.raises(ParameterError, match=r"'reach_um' must be >= 25\.6.* two edge widths of 12\.8"):
         slanted_edge_mtf(GRID, blurred, reach_um=20.0)
 
 
-def test_values_about_0_have_an_mtf_and_no_contrast():
+def test_values_symmetric_about_zero_have_mtf():
     values, _ = squares_at_an_edge()
     plain, about_0 = slanted_edge_mtf(GRID, values), slanted_edge_mtf(GRID, 100.0 * values - 50.0)
 
@@ -384,30 +386,36 @@ def test_values_about_0_have_an_mtf_and_no_contrast():
     assert about_0.mtf == pytest.approx(plain.mtf, abs=1e-4)
 
 
-def test_what_is_no_edge_is_told():
+def test_values_without_edge_raise():
     rng = np.random.default_rng(0)
     x, y = SQUARES.centroid_um[:, 0], SQUARES.centroid_um[:, 1]
     tilted = x + 0.1 * y
-    for values, sentence in (
-        (np.full(x.size, 3.0), "no edge is found: all values are the same"),
-        (rng.normal(100.0, 5.0, x.size), "no edge is found: a straight edge explains .* % of the values' variance"),
-        ((np.floor(x / 20) + np.floor(y / 20)) % 2, "no edge is found: a straight edge explains"),
-        (100.0 + x, "no edge is found: the values rise over .* µm, more than a quarter"),
-        (1000.0 + 10.0 * (tilted > 0), "the edge has too little contrast: black is 1000 and white 1010"),
-        (100.0 * (x > 0.1), "the edge's profile has gaps .* turn the edge by a few degrees from the rows"),
-        (100.0 * (tilted > 122), "the edge is too near to the region's border"),
+    for values, message in (
+        (np.full(x.size, 3.0), "no edge found: all values are equal"),
+        (rng.normal(100.0, 5.0, x.size), "no edge found: a straight edge explains .* % of the variance of the values"),
+        ((np.floor(x / 20) + np.floor(y / 20)) % 2, "no edge found: a straight edge explains"),
+        (100.0 + x, "no edge found: the fit is .* µm wide, more than a quarter"),
+        (
+            1000.0 + 10.0 * (tilted > 0),
+            r"the contrast of the edge must be at least 0\.02, got .* \(black 1000, white 1010\)",
+        ),
+        (
+            100.0 * (x > 0.1),
+            "the edge spread function must extend to .* rotate the edge by a few degrees from the rows",
+        ),
+        (100.0 * (tilted > 122), "the edge is too close to the boundary of the region"),
     ):
-        with pytest.raises(SimulationError, match=sentence):
+        with pytest.raises(SimulationError, match=message):
             slanted_edge_mtf(SQUARES, values)
-    with pytest.raises(ParameterError, match="'where' must leave at least 50 sites, got 40"):
+    with pytest.raises(ParameterError, match="'where' must select at least 50 sites, got 40"):
         slanted_edge_mtf(SQUARES, tilted, where=np.arange(3600) < 40)
     with pytest.raises(ParameterError, match="'where' must be a mask of the 3600 sites"):
         slanted_edge_mtf(SQUARES, tilted, where=[1, 2, 3])
-    with pytest.raises(ParameterError, match="'values' must be one for each of the 3600 sites"):
+    with pytest.raises(ParameterError, match="'values' must have one value for each of the 3600 sites"):
         slanted_edge_mtf(SQUARES, tilted[:5])
 
 
-# -- sampling ---------------------------------------------------------------------------------------------------------
+# -- sampling density--------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -421,11 +429,11 @@ def test_what_is_no_edge_is_told():
         (fs.layout.hexagonal(n_columns=9, n_rows=8, pitch_um=2.0, orientation="flat"), 1000.0 / (np.sqrt(3.0) * 2.0)),
     ],
 )
-def test_nyquist_of_lattices_is_that_of_theory(layout, expected_per_mm):
+def test_nyquist_matches_lattice_theory(layout, expected_per_mm):
     assert nyquist_per_mm(layout) == pytest.approx(np.full(layout.n_sites, expected_per_mm), rel=1e-9)
 
 
-def test_the_two_spacings_of_any_lattice_give_its_cell_and_its_nyquist_frequency():
+def test_neighbour_spacings_match_random_lattices():
     rng = np.random.default_rng(2)
     for _ in range(20):
         basis = rng.uniform(-3.0, 3.0, (2, 2))
@@ -435,25 +443,25 @@ def test_the_two_spacings_of_any_lattice_give_its_cell_and_its_nyquist_frequency
         layout = fs.Layout.from_rectangles(i @ basis, 0.01)
         inner = np.hypot(*layout.centroid_um.T) < 4.0
         nearest_um, row_um = (values[inner] for values in neighbour_spacing_um(layout))
-        # The slow way: half the shortest vector of the reciprocal lattice.
+        # Reference: half the shortest vector of the reciprocal lattice.
         reciprocal = np.linalg.norm(np.delete(i, len(i) // 2, axis=0) @ np.linalg.inv(basis).transpose(), axis=1).min()
 
         assert nearest_um * row_um == pytest.approx(np.full(inner.sum(), abs(np.linalg.det(basis))), rel=1e-6)
         assert 1e-3 * nyquist_per_mm(layout)[inner] == pytest.approx(np.full(inner.sum(), 0.5 * reciprocal), rel=1e-6)
 
 
-def test_filters_of_a_mosaic_have_nyquist_frequencies_of_their_own():
+def test_nyquist_per_channel_of_mosaic():
     layout = fs.layout.mosaic(fs.layout.grid(n_x=12, n_y=12, pitch_um=2.0), ["RG", "GB"])
     found = nyquist_per_mm(layout, per_channel=True)
 
-    # Red and blue at twice the pitch; green on a square lattice turned by 45 degrees.
+    # Red and blue have twice the pitch; green is a square lattice rotated by 45 degrees.
     for channel, expected in ((0, 125.0), (1, 250.0 / np.sqrt(2.0)), (2, 125.0)):
         assert found[layout.channel == channel] == pytest.approx(expected)
-    with pytest.raises(ParameterError, match="'per_channel' goes with by='neighbours'"):
+    with pytest.raises(ParameterError, match="'per_channel' must be False with by='area'"):
         nyquist_per_mm(layout, by="area", per_channel=True)
 
 
-def test_sites_at_one_place_have_no_nyquist_frequency():
+def test_coincident_sites_have_nan_nyquist():
     one = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0)
     twice = fs.Layout.from_rectangles(np.concatenate((one.centroid_um, one.centroid_um[:1])), 1.0)
     found = nyquist_per_mm(twice)
@@ -475,12 +483,12 @@ def test_sites_at_one_place_have_no_nyquist_frequency():
         fs.metrics.size_classes_um,
     ],
 )
-def test_what_is_no_layout_is_told(call):
+def test_invalid_layout_raises(call):
     with pytest.raises(ParameterError, match=r"'layout' must be a foveasim\.Layout, got a NoneType"):
         call(None)
 
 
-def test_a_row_and_a_lone_site_have_no_nyquist_frequency_but_an_area():
+def test_single_row_has_nan_nyquist():
     row = fs.layout.grid(n_x=20, n_y=1, pitch_um=2.0)
 
     assert np.isnan(nyquist_per_mm(row)).all()
@@ -488,28 +496,28 @@ def test_a_row_and_a_lone_site_have_no_nyquist_frequency_but_an_area():
     assert nyquist_per_mm(row, by="area") == pytest.approx(250.0)
 
 
-def test_log_polar_sampling_falls_as_the_inverse_of_eccentricity():
+def test_log_polar_nyquist_is_inverse_to_eccentricity():
     layout = fs.layout.log_polar(n_sectors=200, min_size_um=2.0, r_max_um=400.0)
     table = nyquist_vs_eccentricity(layout, n_bins=10)
-    middle_um = 0.5 * (table.edges_um[1:] + table.edges_um[:-1])
+    centre_um = 0.5 * (table.edges_um[1:] + table.edges_um[:-1])
 
     assert table.n_sites.sum() == layout.n_sites
     assert table.size_at_centre_um == 0.0
-    assert table.nyquist_per_mm * middle_um == pytest.approx(1000.0 * 200 / (4 * np.pi), rel=0.05)
+    assert table.nyquist_per_mm * centre_um == pytest.approx(1000.0 * 200 / (4 * np.pi), rel=0.05)
     assert np.all(
         (table.nyquist_min_per_mm <= table.nyquist_per_mm) & (table.nyquist_per_mm <= table.nyquist_max_per_mm)
     )
-    # In squarish sites 2π r is 200 of them.
+    # A circumference 2π r consists of 200 approximately square sites.
     assert table.growth_fraction == pytest.approx(2 * np.pi / 200, rel=0.01)
     assert "size = 0 µm" in str(table)
     assert table.records()[0]["n_sites"] == table.n_sites[0]
 
 
-def test_a_uniform_sensor_does_not_fall_and_a_retina_has_its_e2():
-    even = nyquist_vs_eccentricity(SQUARES, n_bins=5)
+def test_e2_of_uniform_and_retinal_layouts():
+    uniform = nyquist_vs_eccentricity(SQUARES, n_bins=5)
     retina = nyquist_vs_eccentricity(fs.layout.fovi(fov_um=400.0, a_um=20.0, n_rings=50), by="area")
 
-    assert even.nyquist_per_mm == pytest.approx(np.full(5, 125.0))
-    assert (even.e2_um, even.growth_fraction) == (np.inf, 0.0)
-    # Its rings are as thick as (r + a): twice as large at r = a.
+    assert uniform.nyquist_per_mm == pytest.approx(np.full(5, 125.0))
+    assert (uniform.e2_um, uniform.growth_fraction) == (np.inf, 0.0)
+    # The ring width is proportional to (r + a), so it has doubled at r = a.
     assert retina.e2_um == pytest.approx(20.0, rel=0.1)
