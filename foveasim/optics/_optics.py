@@ -139,10 +139,10 @@ class Optics(PointImages):
     the isotropic ``L / (8 N²)`` is consistent with the aplanatic lens. The two agree in the limit of large N.
 
     The clear circle in focus has a closed-form OTF. The OTF of any other pupil is the autocorrelation of the sampled pupil; it
-    is complex for an asymmetric pupil. The sampling increases with the geometric blur of the aberrations, and is within 7e-4
-    of the closed form for a circle. In both cases OTF(0) = 1, so that the transmitted power is exact. A defocused scene has
-    the path difference ``(a²/2) (1/H - 1/H_focus)`` at the edge of a pupil of radius a: Goodman, Introduction to Fourier
-    Optics, section on focusing errors.
+    is complex for an asymmetric pupil. The sampling density increases with the geometric blur of the aberrations; for a circle,
+    the result is within 7e-4 of the closed form. In both cases OTF(0) = 1, so that the transmitted power is exact. A defocused
+    scene has the path difference ``(a²/2) (1/H - 1/H_focus)`` at the edge of a pupil of radius a: Goodman, Introduction to
+    Fourier Optics, section on focusing errors.
 
     The pupil, like the picture, is upright in sensor coordinates: the PSF moves in the direction in which the wavefront
     increases.

@@ -64,11 +64,11 @@ def test_single_step_matches_lucas_kanade():
     values, map_e = EXPECT(picture(0.05, -0.03)), picture()
     gradient, before = site_gradients_e_per_um(FOVEAL, map_e, GRID), EXPECT(picture())
     root = np.sqrt(before + READ_E2)
-    slow = np.linalg.lstsq(-gradient / root[:, None], (values - before) / root, rcond=None)[0]
+    expected = np.linalg.lstsq(-gradient / root[:, None], (values - before) / root, rcond=None)[0]
 
     found = estimate_flow(FOVEAL, values, map_e, GRID, variance_e2=before + READ_E2, n_steps=1)
 
-    assert found.flow_um[0] == pytest.approx(slow, rel=1e-9)
+    assert found.flow_um[0] == pytest.approx(expected, rel=1e-9)
     assert found.flow_um[0] == pytest.approx([0.05, -0.03], rel=0.02)
 
 
@@ -101,12 +101,12 @@ def test_flow_bound_inverts_fisher_information():
     gradient, variance = rng.normal(size=(60, 2)), rng.uniform(1.0, 5.0, 60)
     regions = np.repeat([7, 2, -1], 20)
     apart, together = flow_bound(gradient, variance, regions=regions), flow_bound(gradient[:40], variance[:40])
-    slow = np.linalg.inv(sum(np.outer(g, g) / s for g, s in zip(gradient[20:40], variance[20:40], strict=True)))
+    expected = np.linalg.inv(sum(np.outer(g, g) / s for g, s in zip(gradient[20:40], variance[20:40], strict=True)))
 
     assert apart.regions.tolist() == [2, 7]
     assert apart.n_sites.tolist() == [20, 20]
-    assert apart.covariance_um2[0] == pytest.approx(slow)
-    assert apart.sigma_um[0] == pytest.approx(np.sqrt(np.diag(slow)))
+    assert apart.covariance_um2[0] == pytest.approx(expected)
+    assert apart.sigma_um[0] == pytest.approx(np.sqrt(np.diag(expected)))
     assert apart.information_per_um2.sum(axis=0) == pytest.approx(together.information_per_um2[0])
     assert flow_bound(gradient, 4.0 * variance).sigma_um == pytest.approx(2.0 * flow_bound(gradient, variance).sigma_um)
 

@@ -41,10 +41,10 @@ def test_identical_pictures_have_infinite_psnr():
 @pytest.mark.parametrize("wrong", [np.nan, 1e9])
 def test_psnr_excludes_uncovered_pixels(wrong):
     is_hole = np.hypot(*np.meshgrid(np.arange(50) - 25, np.arange(40) - 20)) < 8
-    seen = np.where(is_hole, wrong, NOISY)
+    measured = np.where(is_hole, wrong, NOISY)
     expected = 10 * np.log10(1.0 / np.mean((NOISY - TRUTH)[~is_hole] ** 2))
 
-    assert psnr_db(picture(seen, ~is_hole), TRUTH[np.newaxis], 1.0) == pytest.approx(expected)
+    assert psnr_db(picture(measured, ~is_hole), TRUTH[np.newaxis], 1.0) == pytest.approx(expected)
 
 
 def test_ssim_uses_fully_covered_windows():
@@ -66,18 +66,18 @@ def test_ssim_matches_scikit_image():
 
 def test_min_coverage_selects_partly_covered_pixels():
     coverage = np.full(TRUTH.shape, 0.7)
-    seen = picture(NOISY, coverage)
+    measured = picture(NOISY, coverage)
 
-    assert psnr_db(seen, TRUTH[np.newaxis]) == pytest.approx(psnr_db(NOISY, TRUTH))
+    assert psnr_db(measured, TRUTH[np.newaxis]) == pytest.approx(psnr_db(NOISY, TRUTH))
     with pytest.raises(ParameterError, match="'picture' must have at least one pixel in common with the reference"):
-        psnr_db(seen, TRUTH[np.newaxis], min_coverage=1.0)
+        psnr_db(measured, TRUTH[np.newaxis], min_coverage=1.0)
 
 
 def test_psnr_averages_channels_equally():
     colour = np.stack((TRUTH, TRUTH, TRUTH))
-    seen = colour + np.array([0.1, 0.0, 0.0])[:, None, None]
+    measured = colour + np.array([0.1, 0.0, 0.0])[:, None, None]
 
-    assert psnr_db(seen, colour, 1.0) == pytest.approx(20.0 + 10 * np.log10(3.0))
+    assert psnr_db(measured, colour, 1.0) == pytest.approx(20.0 + 10 * np.log10(3.0))
 
 
 @pytest.mark.parametrize("wrong", [np.inf, -np.inf])

@@ -41,9 +41,9 @@ def camera(**options):
 
 
 def test_snr_matches_closed_form():
-    shown = camera()
-    table = snr_by_class(shown, flat(), exposure_s=EXPOSURE_S)
-    light_e = shown.photoelectrons_per_s(flat()) * EXPOSURE_S
+    system = camera()
+    table = snr_by_class(system, flat(), exposure_s=EXPOSURE_S)
+    light_e = system.photoelectrons_per_s(flat()) * EXPOSURE_S
     e_per_dn = volts_to_electrons(1.0 / 4096, 1.5e-15)
     for k, pitch_um in enumerate((1.0, 2.0, 4.0)):
         of = np.isclose(ZONES.area_um2, pitch_um**2)
@@ -58,11 +58,11 @@ def test_snr_matches_closed_form():
 
 
 def test_measured_snr_agrees_with_prediction():
-    shown = camera()
-    frames = [shown.capture(flat(), exposure_s=EXPOSURE_S, seed=1, frame=k) for k in range(12)]
-    dark = [shown.capture(flat(0.0), exposure_s=EXPOSURE_S, seed=2, frame=k) for k in range(12)]
+    system = camera()
+    frames = [system.capture(flat(), exposure_s=EXPOSURE_S, seed=1, frame=k) for k in range(12)]
+    dark = [system.capture(flat(0.0), exposure_s=EXPOSURE_S, seed=2, frame=k) for k in range(12)]
 
-    predicted, found = snr_by_class(shown, flat(), exposure_s=EXPOSURE_S), measured_snr_by_class(ZONES, frames, dark)
+    predicted, found = snr_by_class(system, flat(), exposure_s=EXPOSURE_S), measured_snr_by_class(ZONES, frames, dark)
 
     # The relative error of variances of 1,200 sites and 12 frames is sqrt(2 / (1200 · 11)).
     assert found.noise_dn == pytest.approx(predicted.noise_dn, rel=4 * 0.5 * np.sqrt(2 / (1200 * 11)))
@@ -72,9 +72,9 @@ def test_measured_snr_agrees_with_prediction():
 
 
 def test_relative_exposure_matches_closed_form():
-    shown = camera()
-    relative = relative_exposure_at_snr_fraction(shown, flat(), exposure_s=EXPOSURE_S, snr=3.0)
-    light_e = shown.photoelectrons_per_s(flat()) * EXPOSURE_S
+    system = camera()
+    relative = relative_exposure_at_snr_fraction(system, flat(), exposure_s=EXPOSURE_S, snr=3.0)
+    light_e = system.photoelectrons_per_s(flat()) * EXPOSURE_S
     noise_e2 = 25.0 + volts_to_electrons(1.0 / 4096, 1.5e-15) ** 2 / 12.0
     needed_e = 0.5 * (9.0 + np.sqrt(81.0 + 36.0 * noise_e2))
     for k, pitch_um in enumerate((1.0, 2.0, 4.0)):
@@ -84,20 +84,20 @@ def test_relative_exposure_matches_closed_form():
 
 def test_relative_exposure_accounts_for_clipping():
     for options in ({"pedestal_v": 0.0}, {"pedestal_v": 0.0, "dark_e_per_s": 500.0}):
-        shown = camera(**options)
-        relative = relative_exposure_at_snr_fraction(shown, flat(), exposure_s=EXPOSURE_S)
+        system = camera(**options)
+        relative = relative_exposure_at_snr_fraction(system, flat(), exposure_s=EXPOSURE_S)
         for k, part in enumerate(relative):
-            table = snr_by_class(shown, flat(0.02 * part), exposure_s=EXPOSURE_S)
+            table = snr_by_class(system, flat(0.02 * part), exposure_s=EXPOSURE_S)
             assert table.snr[k] == pytest.approx(1.0, rel=1e-4)
 
 
 def test_large_sites_saturate_first():
-    shown = camera(full_well_e=4000.0, pedestal_v=0.0, v_sat_v=0.4)
-    table = snr_by_class(shown, flat(), exposure_s=EXPOSURE_S)
+    system = camera(full_well_e=4000.0, pedestal_v=0.0, v_sat_v=0.4)
+    table = snr_by_class(system, flat(), exposure_s=EXPOSURE_S)
 
     assert table.saturated_fraction.tolist() == [0.0, 0.0, 1.0]
     assert "100 %" in str(table).splitlines()[3]
-    dim = relative_exposure_at_snr_fraction(shown, flat(), exposure_s=EXPOSURE_S, snr=30.0)
+    dim = relative_exposure_at_snr_fraction(system, flat(), exposure_s=EXPOSURE_S, snr=30.0)
     assert np.all(np.diff(dim) < 0.0)
 
 
@@ -107,10 +107,10 @@ UNIFORM = fs.layout.grid(n_x=30, n_y=30, pitch_um=3.0)
 def lit(charge_e, layout=UNIFORM, **options):
     """A camera, and a uniform power map that gives its smallest sites a charge in EXPOSURE_S."""
     sensor = fs.Sensor(layout, **({"capacitance_f": 2e-15, "v_sat_v": 1.0, "bits": 12, "read_noise_e": 5.0} | options))
-    shown = fs.Camera(optics=OPTICS, sensor=sensor)
+    system = fs.Camera(optics=OPTICS, sensor=sensor)
     uniform = fs.PowerMap.from_array(np.ones((100, 100)), pitch_um=4.0, wavelength_nm=550.0)
-    rate_e_per_s = shown.photoelectrons_per_s(uniform).min()
-    return shown, fs.PowerMap.from_array(
+    rate_e_per_s = system.photoelectrons_per_s(uniform).min()
+    return system, fs.PowerMap.from_array(
         np.full((100, 100), charge_e / EXPOSURE_S / rate_e_per_s), pitch_um=4.0, wavelength_nm=550.0
     )
 
@@ -122,9 +122,9 @@ def lit(charge_e, layout=UNIFORM, **options):
 @pytest.mark.parametrize("bits", [10, 12])
 def test_full_well_saturates_where_noise_is_clipped(charge_e, saturated, bits):
     # Twice the shot noise of 10,000 e- is 200 e-.
-    shown, light = lit(charge_e, full_well_e=1e4, bits=bits)
+    system, light = lit(charge_e, full_well_e=1e4, bits=bits)
 
-    table = snr_by_class(shown, light, exposure_s=EXPOSURE_S)
+    table = snr_by_class(system, light, exposure_s=EXPOSURE_S)
 
     assert table.saturated_fraction.tolist() == [saturated]
     # Below saturation, clipping increases the SNR over the shot noise limit by less than 1 %.
@@ -134,16 +134,16 @@ def test_full_well_saturates_where_noise_is_clipped(charge_e, saturated, bits):
 @pytest.mark.parametrize(("below_e", "saturated"), [(150.0, 1.0), (350.0, 0.0)])
 def test_highest_code_saturates_where_noise_is_clipped(below_e, saturated):
     # 1 V on 2 fF is 12,483 e-, with a shot noise of 112 e-.
-    shown, light = lit(volts_to_electrons(1.0, 2e-15) - below_e)
+    system, light = lit(volts_to_electrons(1.0, 2e-15) - below_e)
 
-    assert snr_by_class(shown, light, exposure_s=EXPOSURE_S).saturated_fraction.tolist() == [saturated]
+    assert snr_by_class(system, light, exposure_s=EXPOSURE_S).saturated_fraction.tolist() == [saturated]
 
 
 def test_measured_saturation_uses_captured_electrons():
     for charge_e, saturated in ((9000.0, 0.0), (10_100.0, 1.0)):
-        shown, light = lit(charge_e, full_well_e=1e4)
+        system, light = lit(charge_e, full_well_e=1e4)
         frames, dark = (
-            [shown.capture(some, exposure_s=EXPOSURE_S, seed=k, frame=k) for k in range(4)]
+            [system.capture(some, exposure_s=EXPOSURE_S, seed=k, frame=k) for k in range(4)]
             for some in (light, fs.PowerMap(0.0 * light.data, light.grid, light.wavelength_nm))
         )
         codes, dark_codes = (np.stack([one.code for one in some]) for some in (frames, dark))
@@ -158,12 +158,12 @@ def test_measured_saturation_uses_captured_electrons():
 
 
 def test_missing_full_well_in_settings_raises():
-    shown, light = lit(5000.0, full_well_e=np.linspace(9e3, 1e4, 900))
-    frames = [shown.capture(light, exposure_s=EXPOSURE_S, seed=k, frame=k) for k in range(2)]
+    system, light = lit(5000.0, full_well_e=np.linspace(9e3, 1e4, 900))
+    frames = [system.capture(light, exposure_s=EXPOSURE_S, seed=k, frame=k) for k in range(2)]
 
     with pytest.raises(ParameterError, match="'full_well_e' must be given, because the settings of the captures"):
         measured_snr_by_class(UNIFORM, frames, frames)
-    table = measured_snr_by_class(UNIFORM, frames, frames, full_well_e=shown.sensor.full_well_e)
+    table = measured_snr_by_class(UNIFORM, frames, frames, full_well_e=system.sensor.full_well_e)
     assert table.saturated_fraction.tolist() == [0.0]
 
 
@@ -171,15 +171,15 @@ def test_missing_full_well_in_settings_raises():
 def test_relative_exposure_with_partly_saturated_class(bits):
     # The areas within a class differ by 25 % and more: large sites saturate before small ones reach the SNR.
     layout = fs.layout.log_polar(n_sectors=6, n_rings=10, r_min_um=5.0, r_max_um=60.0)
-    shown, light = lit(2000.0, layout, full_well_e=1e4, bits=bits)
-    sensor, labels = shown.sensor, size_classes_um(layout, 3)
-    full_e = sensor.expected_electrons(shown.photoelectrons_per_s(light), EXPOSURE_S)
+    system, light = lit(2000.0, layout, full_well_e=1e4, bits=bits)
+    sensor, labels = system.sensor, size_classes_um(layout, 3)
+    full_e = sensor.expected_electrons(system.photoelectrons_per_s(light), EXPOSURE_S)
     fractions = np.geomspace(1e-2, 20.0, 700)
     step_e = volts_to_electrons(1.0 / 2**bits, 2e-15)
 
     found_some = False
     for snr in (50.0, 80.0, 88.0, 92.0):
-        found = relative_exposure_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S, snr=snr, classes=labels)
+        found = relative_exposure_at_snr_fraction(system, light, exposure_s=EXPOSURE_S, snr=snr, classes=labels)
         for k, label in enumerate(np.unique(labels)):
             of = labels == label
             # Exhaustive search for the first fraction; half of the sites within 200 e- of the full well give NaN.
@@ -194,19 +194,19 @@ def test_relative_exposure_with_partly_saturated_class(bits):
 
 
 def test_unreachable_snr_gives_nan():
-    shown, light = lit(2000.0, fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0), full_well_e=1e4)
+    system, light = lit(2000.0, fs.layout.grid(n_x=4, n_y=4, pitch_um=3.0), full_well_e=1e4)
 
-    assert np.isfinite(relative_exposure_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S, snr=98.0)).all()
+    assert np.isfinite(relative_exposure_at_snr_fraction(system, light, exposure_s=EXPOSURE_S, snr=98.0)).all()
     for snr in (103.0, 150.0, 1e4, 1e9):
-        assert np.isnan(relative_exposure_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S, snr=snr)).all()
+        assert np.isnan(relative_exposure_at_snr_fraction(system, light, exposure_s=EXPOSURE_S, snr=snr)).all()
     nothing = fs.PowerMap(0.0 * light.data, light.grid, light.wavelength_nm)
-    assert np.isnan(relative_exposure_at_snr_fraction(shown, nothing, exposure_s=EXPOSURE_S)).all()
+    assert np.isnan(relative_exposure_at_snr_fraction(system, nothing, exposure_s=EXPOSURE_S)).all()
 
 
 def test_without_noise_quantisation_sets_threshold():
-    shown, light = lit(2000.0, read_noise_e=0.0, shot_noise="off")
+    system, light = lit(2000.0, read_noise_e=0.0, shot_noise="off")
 
-    found = relative_exposure_at_snr_fraction(shown, light, exposure_s=EXPOSURE_S)
+    found = relative_exposure_at_snr_fraction(system, light, exposure_s=EXPOSURE_S)
 
     # Quantisation to codes, and rounding of charges to integers.
     step_e = volts_to_electrons(1.0 / 4096, 2e-15)
@@ -249,8 +249,8 @@ def test_snr_table_stays_below_shot_limit():
     """One code of 10 bits is 1,828 e-: 2,031 e- lie within one code, where the variance of the codes is 0."""
     ratios = []
     for charge_e in (2031.0, 1e4, 1e5, 1e6):
-        shown, light = lit(charge_e, LARGE, bits=10, read_noise_e=2.0, capacitance_f=1e-13, v_sat_v=3.0)
-        table = snr_by_class(shown, light, exposure_s=EXPOSURE_S)
+        system, light = lit(charge_e, LARGE, bits=10, read_noise_e=2.0, capacitance_f=1e-13, v_sat_v=3.0)
+        table = snr_by_class(system, light, exposure_s=EXPOSURE_S)
         ratios.append(table.snr[0])
         assert table.snr[0] <= np.sqrt(charge_e)
     # 2,031 / sqrt(2,031 + 4 + 1,828² / 12), in e-.
@@ -289,13 +289,19 @@ def test_noise_matches_squared_error_of_codes(companding, charge_e, dnl_dn, sigm
     n = 40_000
     layout = fs.layout.grid(n_x=200, n_y=200, pitch_um=2.0).with_columns(readout_line=np.arange(n))
     full_e = 40_000.0
-    known = {"bits": 8, "v_sat_v": 1.0, "capacitance_f": full_e * 1.602176634e-19, "shot_noise": "off", **companding}
-    ideal = fs.Sensor(layout, **known)
+    parameters = {
+        "bits": 8,
+        "v_sat_v": 1.0,
+        "capacitance_f": full_e * 1.602176634e-19,
+        "shot_noise": "off",
+        **companding,
+    }
+    ideal = fs.Sensor(layout, **parameters)
     step_e = signal_to_noise(ideal, np.full(n, float(charge_e)), np.zeros(n)).noise_e[0] * np.sqrt(12.0)
     # The noise is relative to the code width at this charge.
     sensor = fs.Sensor(
         layout,
-        **known,
+        **parameters,
         dnl_dn=dnl_dn,
         read_noise_e=sigma_dn * step_e,
         pixel_fpn_fraction=2.0 * step_e / full_e,
@@ -313,7 +319,7 @@ def test_noise_matches_squared_error_of_codes(companding, charge_e, dnl_dn, sigm
 
 def test_snr_definition_is_consistent():
     layout = fs.layout.grid(n_x=6, n_y=6, pitch_um=8.0).with_columns(readout_line=np.repeat(np.arange(6), 6))
-    shown, light = lit(
+    system, light = lit(
         5000.0,
         layout,
         bits=10,
@@ -333,14 +339,14 @@ def test_snr_definition_is_consistent():
         pedestal_v=0.05,
         device_seed=4,
     )
-    sensor = shown.sensor
-    capture = shown.capture(light, exposure_s=EXPOSURE_S, seed=1)
+    sensor = system.sensor
+    capture = system.capture(light, exposure_s=EXPOSURE_S, seed=1)
     dark_e = sensor.expected_electrons(np.zeros(36), EXPOSURE_S)
     ratio = signal_to_noise(sensor, capture.expected_e, dark_e).ratio
     page = content_of(capture)
     column = next(column for column in page.about["columns"] if column["key"] == "snr")
     # All sites in a single class.
-    by_site = snr_by_class(shown, light, exposure_s=EXPOSURE_S, classes=np.zeros(36, np.int64))
+    by_site = snr_by_class(system, light, exposure_s=EXPOSURE_S, classes=np.zeros(36, np.int64))
 
     assert np.ptp(ratio) > 5.0
     assert capture.signal_to_noise() == pytest.approx(ratio)
@@ -348,18 +354,18 @@ def test_snr_definition_is_consistent():
     assert page.arrays[column["array"]] == pytest.approx(ratio, rel=1e-6)
     assert ratio.min() < by_site.snr[0] < ratio.max()
     shot = SimpleNamespace(exposure_s=EXPOSURE_S)
-    assert METRICS["snr"](shot, shown, capture)["mean"] == pytest.approx(ratio.mean())
+    assert METRICS["snr"](shot, system, capture)["mean"] == pytest.approx(ratio.mean())
     assert plot_capture(capture, "snr").collections[0].get_facecolor().shape == (36, 4)
 
 
 def test_measured_snr_linearises_companding():
-    shown, light = lit(6000.0, companding="root", bits=10)
+    system, light = lit(6000.0, companding="root", bits=10)
     nothing = fs.PowerMap(0.0 * light.data, light.grid, light.wavelength_nm)
     frames, dark = (
-        [shown.capture(some, exposure_s=EXPOSURE_S, seed=k, frame=k) for k in range(12)] for some in (light, nothing)
+        [system.capture(some, exposure_s=EXPOSURE_S, seed=k, frame=k) for k in range(12)] for some in (light, nothing)
     )
 
-    predicted, found = snr_by_class(shown, light, exposure_s=EXPOSURE_S), measured_snr_by_class(UNIFORM, frames, dark)
+    predicted, found = snr_by_class(system, light, exposure_s=EXPOSURE_S), measured_snr_by_class(UNIFORM, frames, dark)
 
     # The relative error of variances of 900 sites and 12 frames is sqrt(2 / (900 * 11)); dark noise is half clipped.
     assert found.snr[0] == pytest.approx(predicted.snr[0], rel=5 * 0.5 * np.sqrt(2 / (900 * 11)) + 1e-3)

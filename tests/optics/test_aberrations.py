@@ -230,9 +230,9 @@ def test_tilt_and_coma_move_centroid_by_sign(j, axis, sign):
 
 def test_positive_coma_flare_points_up():
     psf = aberrated(coefficients={7: 0.25}, unit="waves").psf(WAVELENGTH_NM)
-    share = psf.psf_per_um2 * psf.grid.cell_area_um2
-    brightest = np.unravel_index(share.argmax(), share.shape)
-    mean_y_um = (share * psf.grid.y_um[:, np.newaxis]).sum() / share.sum()
+    energy = psf.psf_per_um2 * psf.grid.cell_area_um2
+    brightest = np.unravel_index(energy.argmax(), energy.shape)
+    mean_y_um = (energy * psf.grid.y_um[:, np.newaxis]).sum() / energy.sum()
 
     assert psf.grid.x_um[brightest[1]] == 0.0
     assert psf.grid.y_um[brightest[0]] < 0.0 < mean_y_um
@@ -260,8 +260,8 @@ def test_field_coma_points_away_from_axis():
     coma = lens(seidel=Seidel(coma_um=0.5, field_radius_um=1000.0), padding="reflect")
     for field_um in ((1000.0, 0.0), (0.0, 1000.0), (-700.0, -700.0)):
         psf = coma.psf(WAVELENGTH_NM, field_um=field_um)
-        share = psf.psf_per_um2 * psf.grid.cell_area_um2
-        moved = np.array([(share * psf.grid.x_um).sum(), (share * psf.grid.y_um[:, np.newaxis]).sum()])
+        energy = psf.psf_per_um2 * psf.grid.cell_area_um2
+        moved = np.array([(energy * psf.grid.x_um).sum(), (energy * psf.grid.y_um[:, np.newaxis]).sum()])
 
         assert moved @ np.array(field_um) > 0.9 * np.hypot(*moved) * np.hypot(*field_um)
     assert coma.strehl(WAVELENGTH_NM) == pytest.approx(1.0, abs=1e-6)
