@@ -228,9 +228,10 @@ def test_saturation_is_at_maximum_variance(result):
     error = np.sqrt(2.0) * error_of_variance(highest, 2)
     # The mean response of 40 and 30 sites differs from that of all sites by a few per mille.
     assert np.all(highest - found < SIGMAS * error + 0.01 * highest)
-    # Above the full well the total charge (signal and dark) does not fluctuate.
+    # Above the full well the total charge (signal and dark) does not fluctuate. Below it the variance is flat over three
+    # levels of 2.3 %, so that the level found depends on the noise.
     with_dark_e = result.saturation_e + DARK_E
-    assert np.all((with_dark_e > 0.92 * FULL_WELL_E) & (with_dark_e < FULL_WELL_E))
+    assert np.all((with_dark_e > 0.9 * FULL_WELL_E) & (with_dark_e < FULL_WELL_E))
     full_dn = GAIN_DN_PER_E * FULL_WELL_E
     assert result.transfer.mean_dn[-1] == pytest.approx(full_dn - 0.5, abs=0.6)
     assert result.transfer.temporal_variance_dn2[-1] == pytest.approx((GAIN_DN_PER_E * READ_E) ** 2 + 1 / 12, rel=0.05)
@@ -243,8 +244,8 @@ def test_threshold_snr_and_dynamic_range(result):
 
     assert_within(result.threshold_e, noise_e + 0.5, (noise_e + 0.5) * relative)
     assert_within(result.threshold_ph, (noise_e + 0.5) / QE, (noise_e + 0.5) / QE * 2 * relative)
-    assert result.snr_max == pytest.approx(np.sqrt(FULL_WELL_E - DARK_E), rel=0.04)
-    assert result.dynamic_range == pytest.approx((FULL_WELL_E - DARK_E) / (noise_e + 0.5), rel=0.08)
+    assert result.snr_max == pytest.approx(np.sqrt(FULL_WELL_E - DARK_E), rel=0.06)
+    assert result.dynamic_range == pytest.approx((FULL_WELL_E - DARK_E) / (noise_e + 0.5), rel=0.12)
     assert result.snr_max_db == pytest.approx(10 * np.log10(result.saturation_e))
     assert result.dynamic_range_db == pytest.approx(20 * np.log10(result.saturation_e / result.threshold_e))
 
