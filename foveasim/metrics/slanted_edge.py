@@ -153,8 +153,8 @@ def slanted_edge_mtf(
         pitch, in 100 steps.
     window : {"tukey", "hamming", "none"}
         Window of the line spread function: ``"tukey"`` is flat over the central half of the reach with cosine flanks,
-        ``"hamming"`` is the window of the standard's first editions. A narrower window excludes more of the PSF tails of the
-        lens, which increases the measured MTF.
+        ``"hamming"`` is the window of the first editions of the standard, ``"none"`` applies no window. A narrower window
+        excludes more of the PSF tails of the lens, which increases the measured MTF.
 
     Returns
     -------

@@ -37,7 +37,7 @@ ALIAS_NODES = 32
 NODES_PER_CELL = 4.0
 #: Singular values below this fraction of the OTF at zero frequency are omitted from the interpolated sum.
 ALIAS_ACCURACY = 1e-9
-#: Memory limit; a wider padded picture indicates a far too small aperture or a wrong unit.
+#: Largest width of a padded picture in cells; a wider one indicates a far too small aperture or a wrong unit.
 MAX_PADDED = 1 << 17
 #: Rows per task of a thread.
 ROWS_PER_PIECE = 64
