@@ -1,9 +1,9 @@
 """
-Where a lens puts light that an ideal one would put elsewhere.
+Lens distortion models.
 
-A model maps points of the sensor plane, nothing else: :meth:`distort` from the ideal (pinhole) position to the real one,
-:meth:`undistort` back. Pictures are never resampled: the integrator carries the outlines of photosites back once. To look
-at a distorted map, there is :func:`distort_map`.
+A model maps points of the sensor plane: :meth:`distort` from the ideal (pinhole) position to the real position,
+:meth:`undistort` in the opposite direction. The simulation never resamples images: the integrator undistorts the outlines
+of the photosites once. :func:`distort_map` resamples a power map for display and comparison.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The Brown-Conrady model: radial and tangential distortion of a nearly ideal lens."""
+"""Brown-Conrady model: radial and tangential distortion of a nearly ideal lens."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from foveasim.distortion._solve import smallest_roots
 
 __all__ = ["BrownConrady"]
 
-#: Directions in which the fold is looked for.
+#: Number of directions in which the fold radius is computed.
 N_DIRECTIONS = 720
-#: Points that a thread takes at once.
+#: Points per work item of a thread.
 POINTS_A_PIECE = 50_000
-#: Points of the table where the search for the inverse begins.
+#: Size of the table of start values for the inverse.
 START_POINTS = 4097
-#: The fold is looked for up to this radius in focal lengths: 89.4 degrees from the axis.
+#: Largest radius of the table of start values, in focal lengths: 89.4 degrees from the axis.
 MAX_RADIUS = 100.0
 
 
@@ -31,34 +31,37 @@ MAX_RADIUS = 100.0
 @dataclass(frozen=True, kw_only=True)
 class BrownConrady(Placed):
     """
-    Radial and tangential distortion (Brown 1966; the paper's Eq. 6; OpenCV's model up to eight coefficients).
+    Radial and tangential distortion with up to eight coefficients.
+
+    Equation 6 of the paper (Brown 1966); OpenCV's model up to eight coefficients.
 
     Parameters
     ----------
     focal_um : float or (x, y), µm
-        Distance of the image plane: what positions are divided by. Two where a calibration found two.
+        Distance of the image plane, by which positions are normalised. Two values if the calibration has one per axis.
     k1, k2, k3 : float
-        Radial coefficients: ``1 + k1 r² + k2 r⁴ + k3 r⁶``.
+        Radial coefficients of the numerator ``1 + k1 r² + k2 r⁴ + k3 r⁶``.
     k4, k5, k6 : float
-        Of the rational model, which divides by ``1 + k4 r² + k5 r⁴ + k6 r⁶``.
+        Radial coefficients of the denominator ``1 + k4 r² + k5 r⁴ + k6 r⁶`` of the rational model.
     p1, p2 : float
-        Tangential coefficients, with y **up**: the paper's r1 and r2. OpenCV's p1, for y down, has the other sign.
+        Tangential coefficients for y pointing **up**: the paper's r1 and r2. OpenCV's p1, for y pointing down, has the
+        opposite sign.
     centre_um : (x, y), µm
-        Where the axis meets the sensor.
+        Intersection of the optical axis with the sensor plane.
 
     Raises
     ------
     ParameterError
-        When a number is not finite, or the focal length not positive.
+        If a parameter is not finite or the focal length is not positive.
 
     Notes
     -----
-    With x, y the ideal and r their distance from the centre, all over the focal length::
+    With the ideal position (x, y), its radius r and the radial factor R, all normalised by the focal length::
 
         x_d = x R + 2 p1 x y + p2 (r² + 2 x²)
         y_d = y R + 2 p2 x y + p1 (r² + 2 y²)
 
-    The model can be inverted up to its fold, where the Jacobian's determinant is 0; the inverse is Newton's method.
+    The model is invertible up to its fold, where the determinant of the Jacobian is 0. The inverse uses Newton's method.
 
     Examples
     --------
@@ -86,7 +89,7 @@ class BrownConrady(Placed):
         self._check_place()
 
     def _radial(self, r2: Floats) -> tuple[Floats, Floats]:
-        """The radial factor and its derivative by r²."""
+        """Return the radial factor and its derivative with respect to r²."""
         above = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         below = 1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
         above_slope = self.k1 + r2 * (2.0 * self.k2 + 3.0 * r2 * self.k3)
@@ -108,7 +111,7 @@ class BrownConrady(Placed):
         )
 
     def _jacobian(self, xy: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Derivatives of x_d by x and y, and of y_d by x and y."""
+        """Return the derivatives of x_d and y_d with respect to x and y."""
         x, y = xy[:, 0], xy[:, 1]
         factor, slope = self._radial(x * x + y * y)
         across = 2.0 * (x * y * slope + self.p1 * x + self.p2 * y)
@@ -125,15 +128,15 @@ class BrownConrady(Placed):
 
     @cached_property
     def _fold(self) -> Floats:
-        """Ideal radius at which the determinant first vanishes, in each of the directions; infinite without a fold."""
+        """Smallest ideal radius with determinant 0 per direction; infinite without a fold."""
         angle_rad = 2.0 * math.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
         if self.p1 == self.p2 == 0.0:
             return np.full(N_DIRECTIONS, self._radial_fold)
-        # Along each direction the determinant times the denominator's fourth power is a polynomial of the radius.
+        # Along each direction the determinant times the fourth power of the denominator is a polynomial in the radius.
         c, s = np.cos(angle_rad)[:, np.newaxis], np.sin(angle_rad)[:, np.newaxis]
         above, below, r = self._parts()
         plain = above * below
-        # r times the factor's slope by r, and r, both times the denominator's square.
+        # r times dR/dr, and r, both multiplied by the square of the denominator.
         slope = (r * (above.deriv() * below - above * below.deriv())).coef
         linear = (below * below * r).coef
         size = max(slope.size, linear.size, plain.coef.size)
@@ -145,7 +148,7 @@ class BrownConrady(Placed):
         return np.minimum(smallest_roots(np.array(product)), smallest_roots(below.coef)[0])
 
     def _parts(self) -> tuple[Any, Any, Any]:
-        """Numerator and denominator of the radial factor as polynomials of the radius, and the radius."""
+        """Return numerator and denominator of R as polynomials in r, and the polynomial r."""
         polynomial = np.polynomial.Polynomial
         return (
             polynomial([1.0, 0.0, self.k1, 0.0, self.k2, 0.0, self.k3]),
@@ -155,7 +158,11 @@ class BrownConrady(Placed):
 
     @cached_property
     def _radial_fold(self) -> float:
-        """Without tangential terms: where r times the radial factor stops growing, or the factor has a pole."""
+        """
+        Fold radius without tangential terms.
+
+        The smallest radius at which r R(r) stops increasing or R has a pole.
+        """
         above, below, r = self._parts()
         growth = (above + r * above.deriv()) * below - r * above * below.deriv()
         return float(min(smallest_roots(p.coef)[0] for p in (growth, above, below)))
@@ -169,10 +176,10 @@ class BrownConrady(Placed):
         return ideal, float(np.hypot(*self._map(border).T).min())
 
     def _is_inside(self, xy: Floats) -> Bools:
-        """Whether points lie within the fold."""
+        """Return whether points lie within the fold."""
         turn = np.arctan2(xy[:, 1], xy[:, 0]) / (2.0 * math.pi) * N_DIRECTIONS
         low = np.floor(turn).astype(np.int64)
-        # Between two directions the fold is a curve: the larger of the two, with the determinant, tells.
+        # The fold is curved between two directions: compare with the larger radius, and check the determinant's sign.
         most = np.maximum(self._fold[low % N_DIRECTIONS], self._fold[(low + 1) % N_DIRECTIONS])
         return np.asarray((np.hypot(xy[:, 0], xy[:, 1]) <= most * (1.0 + 1e-3)) & (self._determinant(xy) > 0.0))
 
@@ -191,7 +198,11 @@ class BrownConrady(Placed):
 
     @cached_property
     def _ideal(self) -> tuple[Floats, float]:
-        """Ideal radii at equal steps of the distorted one, without tangential terms, and the steps over the latter."""
+        """
+        Table of start values for the inverse.
+
+        Ideal radii at equally spaced distorted radii, without tangential terms, and the number of steps per distorted radius.
+        """
         end = min(self._radial_fold, float(self._fold.max()), MAX_RADIUS)
         table = end * np.linspace(0.0, 1.0, START_POINTS)
         factor, _ = self._radial(table * table)

@@ -1,8 +1,9 @@
 """
-Lens models from the calibrations of other programs, and back: OpenCV, ROS, MATLAB, OCamCalib.
+Conversion of lens models from and to the calibrations of other programs.
 
-Other programs count pixels from the upper left one with y down; here the origin is the middle of the image and y is up. A
-calibration's principal point becomes ``centre_um``. Positions of pixels are their centres.
+Supported programs are OpenCV, ROS, MATLAB and OCamCalib. They count pixels from the upper left pixel with y pointing down;
+in foveasim the origin is the centre of the image and y points up. The principal point of a calibration becomes
+``centre_um``. Pixel positions are pixel centres.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from foveasim.errors import ConfigError, ParameterError
 
 __all__ = ["from_opencv", "read_calibration", "to_opencv"]
 
-#: OpenCV's order of coefficients; it takes the first 4, 5 or 8 of them.
+#: OpenCV's order of coefficients; calibrations contain the first 4, 5 or 8 of them.
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-#: Names of the same thing in calibration files, in lower case without underscores.
+#: Alternative keys in calibration files, in lower case without underscores.
 MATRIX_KEYS = ("cameramatrix", "k", "intrinsicmatrix")
 COEFFICIENT_KEYS = ("distortioncoefficients", "distcoeffs", "d")
 MODEL_KEYS = ("distortionmodel", "cameramodel", "model")
@@ -43,20 +44,20 @@ def from_opencv(
     fisheye: bool = False,
 ) -> BrownConrady | PolynomialFisheye:
     """
-    A lens from OpenCV's camera matrix and distortion coefficients.
+    Convert an OpenCV camera matrix and distortion coefficients to a lens.
 
     Parameters
     ----------
     camera_matrix : (3, 3), pixels
         ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``.
-    coefficients : (4,), (5,) or (8,), or (12,) or (14,) where the rest is 0
-        ``k1, k2, p1, p2[, k3[, k4, k5, k6]]``; with ``fisheye`` the four of ``cv2.fisheye``.
+    coefficients : (4,), (5,) or (8,), or (12,) or (14,) with zeros after the eighth
+        ``k1, k2, p1, p2[, k3[, k4, k5, k6]]``; with ``fisheye`` the four coefficients of ``cv2.fisheye``.
     image_size : (width, height), pixels
-        Of the images that were calibrated.
+        Size of the calibration images.
     pixel_um : float, µm
-        Side of a pixel.
+        Pixel size.
     fisheye : bool
-        Whether the coefficients are those of ``cv2.fisheye``.
+        Whether the coefficients belong to the model of ``cv2.fisheye``.
 
     Returns
     -------
@@ -65,7 +66,7 @@ def from_opencv(
     Raises
     ------
     ParameterError
-        When a shape or a number is not as above, or the matrix has a skew.
+        If a shape or a value differs from the above, or the matrix has a skew.
     """
     matrix = finite_array("camera_matrix", camera_matrix, ndim=2)
     if matrix.shape != (3, 3) or matrix[0, 1] or matrix[1, 0] or not (matrix[2] == (0.0, 0.0, 1.0)).all():
@@ -84,7 +85,7 @@ def from_opencv(
     if fisheye:
         return PolynomialFisheye(k=k.tolist(), **place)
     values: dict[str, Any] = dict(zip(OPENCV_ORDER, k.tolist(), strict=False))
-    # With y up instead of down, the tangential term along y changes its sign.
+    # The tangential term along y changes its sign because y points up instead of down.
     values["p1"] = -values["p1"]
     return BrownConrady(**values, **place)
 
@@ -93,12 +94,14 @@ def to_opencv(
     lens: BrownConrady | PolynomialFisheye, *, image_size: tuple[int, int], pixel_um: float
 ) -> tuple[Floats, Floats]:
     """
-    OpenCV's camera matrix (3, 3) and coefficients, (8,) or for a fisheye (4,); the inverse of :func:`from_opencv`.
+    Convert a lens to an OpenCV camera matrix and distortion coefficients.
+
+    The inverse of :func:`from_opencv`. The matrix is (3, 3); the coefficients are (8,), or (4,) for a fisheye lens.
 
     Raises
     ------
     ParameterError
-        When the lens has no such form.
+        If OpenCV has no equivalent of the lens model.
     """
     if not isinstance(lens, BrownConrady | PolynomialFisheye):
         raise ParameterError("lens", "must be a BrownConrady or a PolynomialFisheye", lens)
@@ -131,16 +134,16 @@ def read_calibration(
         YAML or JSON of OpenCV or ROS (camera matrix, distortion coefficients, model), JSON of MATLAB's ``cameraParameters`` or
         ``fisheyeParameters``, or ``calib_results.txt`` of OCamCalib.
     pixel_um : float, µm
-        Side of a pixel.
+        Pixel size.
     focal_um : float, optional, µm
-        Distance of the ideal image plane, for Scaramuzza's model, which knows none.
+        Distance of the ideal image plane. Required for Scaramuzza's model, whose calibrations have no focal length.
     image_size : (width, height), optional, pixels
-        Where the file does not tell it.
+        Image size, required if the file does not contain it.
 
     Raises
     ------
     ConfigError
-        When the file is none of these, or lacks what a lens needs.
+        If the file has none of these formats or lacks a parameter of the lens.
     """
     from foveasim._io.yaml_files import parsed, read_text
 
@@ -152,7 +155,9 @@ def read_calibration(
             return _from_ocamcalib(path, text, pixel_um, focal_um)
         data = parsed(path, _plain_yaml(text))
         if not isinstance(data, dict):
-            raise ConfigError(path, "holds no calibration: keys with a camera matrix and distortion coefficients")
+            raise ConfigError(
+                path, "contains no calibration; provide the keys camera_matrix and distortion_coefficients"
+            )
         keys = {re.sub("[_ -]", "", str(key)).lower(): value for key, value in data.items()}
         if "mappingcoefficients" in keys or "intrinsics" in keys:
             return _from_matlab_fisheye(path, keys, pixel_um, focal_um)
@@ -164,7 +169,7 @@ def read_calibration(
 
 
 def _plain_yaml(text: str) -> str:
-    """OpenCV's YAML without its own header and tags."""
+    """Remove the nonstandard header and tags of OpenCV's YAML."""
     return re.sub(r"!!opencv-[\w-]+", "", re.sub(r"\A%YAML[: ]1\.\d\s*\n", "", text))
 
 
@@ -180,7 +185,7 @@ def _from_keys(path: Path, keys: Mapping[str, Any], pixel_um: float, image_size:
     size: list[Any] = [next((keys[key] for key in names if key in keys), None) for names in (WIDTH_KEYS, HEIGHT_KEYS)]
     if None in size:
         if image_size is None:
-            raise ConfigError(path, "tells no image_width and image_height; give 'image_size'")
+            raise ConfigError(path, "must specify image_width and image_height; pass 'image_size' instead")
         size = list(_size(image_size))
     return from_opencv(
         matrix.reshape(3, 3),
@@ -194,14 +199,14 @@ def _from_keys(path: Path, keys: Mapping[str, Any], pixel_um: float, image_size:
 def _from_matlab(path: Path, keys: Mapping[str, Any], pixel_um: float) -> Lens:
     if "k" in keys:
         matrix = _square(path, keys["k"], 3)
-    else:  # MATLAB's older form is transposed
+    else:  # IntrinsicMatrix of older MATLAB releases is transposed
         matrix = _square(path, _value(path, keys, ("intrinsicmatrix",), "an intrinsic matrix"), 3).T
     radial = _numbers(path, keys["radialdistortion"]).ravel()
     tangential = _numbers(path, keys.get("tangentialdistortion", [0.0, 0.0])).ravel()
     size = _numbers(path, _value(path, keys, ("imagesize",), "an image size")).ravel()
     if radial.size not in (2, 3) or tangential.size != 2 or size.size != 2:
-        raise ConfigError(path, "must have 2 or 3 radial and 2 tangential coefficients, and two image sizes")
-    matrix = matrix - np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])  # pixels counted from 1
+        raise ConfigError(path, "must have 2 or 3 radial and 2 tangential coefficients and 2 image dimensions")
+    matrix = matrix - np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])  # MATLAB counts pixels from 1
     coefficients = [*radial[:2], *tangential, *radial[2:]]
     return from_opencv(matrix, coefficients, image_size=(size[1], size[0]), pixel_um=pixel_um)
 
@@ -215,7 +220,7 @@ def _from_matlab_fisheye(path: Path, keys: Mapping[str, Any], pixel_um: float, f
     size = _numbers(path, _value(path, keys, ("imagesize",), "an image size")).ravel()
     matrix = _square(path, keys.get("stretchmatrix", [[1.0, 0.0], [0.0, 1.0]]), 2)
     if centre.size != 2 or size.size != 2:
-        raise ConfigError(path, "must have two numbers of the distortion centre and two of the image size")
+        raise ConfigError(path, "must have 2 numbers for the distortion centre and 2 for the image size")
     return Scaramuzza(
         a=a.tolist(),
         pixel_um=pixel_um,
@@ -234,12 +239,14 @@ def _from_ocamcalib(path: Path, text: str, pixel_um: float, focal_um: float | No
         centre, affine, size = rows[2][:2], rows[3][:3], rows[4][:2]
     except (ValueError, IndexError, OverflowError):
         raise ConfigError(
-            path, "is no calib_results.txt: five lines of numbers (polynomial, inverse, centre, affine, size)"
+            path, "must have the five lines of numbers of calib_results.txt: polynomial, inverse, centre, affine, size"
         ) from None
     if n != len(direct) or n != 5 or direct[1] != 0.0 or len(centre) + len(affine) + len(size) != 7:
-        raise ConfigError(path, "must have the five coefficients a0, 0, a2, a3, a4, a centre, c d e, and an image size")
+        raise ConfigError(
+            path, "must have the five coefficients a0, 0, a2, a3, a4, the centre, c d e and the image size"
+        )
     c, d, e = affine
-    # Their x runs along rows, downwards, and their y along columns, to the right.
+    # OCamCalib's x axis points down (row index), its y axis to the right (column index).
     return Scaramuzza(
         a=[direct[0], direct[2], direct[3], direct[4]],
         pixel_um=pixel_um,
@@ -251,7 +258,7 @@ def _from_ocamcalib(path: Path, text: str, pixel_um: float, focal_um: float | No
 
 def _given(path: Path, focal_um: float | None) -> float:
     if focal_um is None:
-        raise ConfigError(path, "holds Scaramuzza's model, which has no focal length; give 'focal_um'")
+        raise ConfigError(path, "contains Scaramuzza's model, which has no focal length; pass 'focal_um'")
     return focal_um
 
 
@@ -263,15 +270,15 @@ def _value(path: Path, keys: Mapping[str, Any], names: tuple[str, ...], what: st
 
 
 def _numbers(path: Path, value: Any) -> Floats:
-    """A list of numbers, or the data of a matrix as OpenCV and ROS write it."""
+    """Return the numbers of a list, or of a matrix as written by OpenCV and ROS."""
     try:
         return finite_array("data", value["data"] if isinstance(value, dict) else value)
     except (ParameterError, KeyError):
-        raise ConfigError(path, f"must hold finite numbers, got {str(value)[:60]}") from None
+        raise ConfigError(path, f"must contain finite numbers, got {str(value)[:60]}") from None
 
 
 def _square(path: Path, value: Any, n: int) -> Floats:
-    """A square matrix."""
+    """Return a square matrix of n rows."""
     numbers = _numbers(path, value)
     if numbers.size != n * n:
         raise ConfigError(path, f"must have a matrix of {n} x {n} numbers, got {numbers.size}")

@@ -1,4 +1,4 @@
-"""Fisheye lenses: the image height as a function of the angle to the axis, in closed form or as a polynomial."""
+"""Fisheye lenses: image height as a function of the angle to the optical axis."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from foveasim.errors import ParameterError
 __all__ = ["Fisheye", "PolynomialFisheye", "Scaramuzza"]
 
 Projection = Literal["equidistant", "equisolid", "stereographic", "orthographic"]
-#: Points as near to the axis as this are mapped to themselves, times the scale there.
+#: Points within this normalised radius are scaled linearly, which avoids a division by 0.
 NEAR = 1e-12
-#: A pinhole has no image of rays at right angles to its axis: angles end this much before.
+#: Margin below 90° in radians, where the pinhole projection diverges.
 GRAZING = 1e-9
 
 
 class _ByAngle(Placed):
-    """A model that is a function of the angle θ to the axis alone: image height over the focal length, and back."""
+    """Base of models with an image height that depends only on the angle θ to the axis."""
 
     def _height(self, theta_rad: Floats) -> Floats:
         raise NotImplementedError
@@ -44,7 +44,7 @@ class _ByAngle(Placed):
 
     @cached_property
     def _highest(self) -> float:
-        """Image height of the largest angle."""
+        """Image height at the largest angle."""
         return float(self._height(np.array([self._max_theta_rad()]))[0])
 
     def _forward(self, xy: Floats) -> Floats:
@@ -61,12 +61,12 @@ class _ByAngle(Placed):
         return _scaled(xy, radius, np.where(is_inside, np.tan(theta_rad), np.nan), 1.0 / float(self._slope()))
 
     def _slope(self) -> float:
-        """Image height over angle at the axis."""
+        """Return the derivative of the image height with respect to the angle at the axis."""
         return 1.0
 
 
 def _scaled(xy: Floats, radius: Floats, new_radius: Floats, slope: float) -> Floats:
-    """Points moved along their direction to new radii."""
+    """Move points radially to new radii."""
     is_near = radius < NEAR
     scale = np.where(is_near, slope, new_radius / np.where(is_near, 1.0, radius))
     return np.asarray(xy * scale[:, np.newaxis])
@@ -76,25 +76,25 @@ def _scaled(xy: Floats, radius: Floats, new_radius: Floats, slope: float) -> Flo
 @dataclass(frozen=True, kw_only=True)
 class Fisheye(_ByAngle):
     """
-    Fisheye by one of the classical projections.
+    Fisheye lens with one of the classical projections.
 
     Parameters
     ----------
     projection : {"equidistant", "equisolid", "stereographic", "orthographic"}
-        Image height f θ, 2 f sin(θ/2), 2 f tan(θ/2) or f sin θ of a ray at the angle θ to the axis.
+        Image height f θ, 2 f sin(θ/2), 2 f tan(θ/2) or f sin θ for a ray at the angle θ to the axis.
     focal_um : float or (x, y), µm
         Distance of the image plane, f.
     centre_um : (x, y), µm
-        Where the axis meets the sensor.
+        Intersection of the optical axis with the sensor plane.
 
     Raises
     ------
     ParameterError
-        When a number is out of range, or the projection unknown.
+        If a value is out of range or the projection is unknown.
 
     Notes
     -----
-    The scene is a plane in front of the lens: rays up to 90° from the axis have an ideal position, f tan θ.
+    The scene is a plane in front of the lens: rays at less than 90° to the axis have the ideal position f tan θ.
 
     Examples
     --------
@@ -141,7 +141,9 @@ class Fisheye(_ByAngle):
 @dataclass(frozen=True, kw_only=True)
 class PolynomialFisheye(_ByAngle):
     """
-    Fisheye whose image height is a polynomial of the angle: OpenCV's ``fisheye`` model (Kannala and Brandt 2006).
+    Fisheye lens with an odd polynomial of the angle as image height.
+
+    OpenCV's ``fisheye`` model (Kannala and Brandt 2006).
 
     Parameters
     ----------
@@ -150,16 +152,16 @@ class PolynomialFisheye(_ByAngle):
     focal_um : float or (x, y), µm
         Distance of the image plane, f.
     centre_um : (x, y), µm
-        Where the axis meets the sensor.
+        Intersection of the optical axis with the sensor plane.
 
     Raises
     ------
     ParameterError
-        When a number is out of range.
+        If a value is out of range.
 
     Notes
     -----
-    The model ends where the height stops growing, or at 90°.
+    The model is valid up to the angle at which the height stops increasing, at most 90°.
     """
 
     k: Sequence[float]
@@ -196,30 +198,34 @@ class PolynomialFisheye(_ByAngle):
 @dataclass(frozen=True, kw_only=True)
 class Scaramuzza(_ByAngle):
     """
-    Scaramuzza's model, as OCamCalib and MATLAB fit it: the ray through a pixel is a polynomial of its distance to the centre.
+    Scaramuzza's omnidirectional camera model, as fitted by OCamCalib and MATLAB.
+
+    The direction of the ray through a pixel is a polynomial of the distance of the pixel from the centre.
 
     Parameters
     ----------
     a : (4,), pixels
-        ``a0, a2, a3, a4`` of ``f(r) = a0 + a2 r² + a3 r³ + a4 r⁴``, r in pixels: a pixel at (x, y) sees along (x, y, f(r)).
-        Coefficients with a negative a0 (an axis into the camera) are turned round.
+        ``a0, a2, a3, a4`` of ``f(r) = a0 + a2 r² + a3 r³ + a4 r⁴``, r in pixels: the ray of the pixel at (x, y) has the
+        direction (x, y, f(r)). The signs of all coefficients are inverted if a0 is negative (axis pointing into the camera).
     pixel_um : float, µm
-        Side of the pixels in which the coefficients are.
+        Pixel size, the unit of the coefficients.
     focal_um : float, µm
-        Distance of the ideal image plane behind the pupil. With another than the optics' own, the picture is scaled too.
+        Distance of the ideal image plane behind the pupil. A value other than the focal length of the optics also scales the
+        image.
     stretch : (2, 2)
-        Matrix S of Eq. 8: distorted positions are S times those above, with x to the right and y up.
+        Matrix S of Eq. 8: distorted positions are S times the above positions, with x to the right and y up.
     centre_um : (x, y), µm
-        Where the axis meets the sensor.
+        Intersection of the optical axis with the sensor plane.
 
     Raises
     ------
     ParameterError
-        When a number is out of range, a0 is 0, or the stretch cannot be undone.
+        If a value is out of range, a0 is 0, or the determinant of the stretch matrix is not positive.
 
     Notes
     -----
-    Eqs. 7 and 8 of the paper, with r̃ = sqrt(x̃² + ỹ²). The model ends at 90°, or where the angle stops growing with r.
+    Equations 7 and 8 of the paper, with r̃ = sqrt(x̃² + ỹ²). The model is valid up to the angle at which the angle stops
+    increasing with r, at most 90°.
     """
 
     a: Sequence[float]
@@ -238,7 +244,9 @@ class Scaramuzza(_ByAngle):
         object.__setattr__(self, "a", tuple((a * np.sign(a[0])).tolist()))
         object.__setattr__(self, "stretch", tuple(map(tuple, stretch.tolist())))
         object.__setattr__(self, "pixel_um", check_number("pixel_um", self.pixel_um, above=0.0))
-        object.__setattr__(self, "focal_um", check_number("focal_um", self.focal_um, hint="'stretch' tells axes apart"))
+        object.__setattr__(
+            self, "focal_um", check_number("focal_um", self.focal_um, hint="use 'stretch' for unequal axes")
+        )
         self._check_place()
 
     @cached_property
@@ -247,7 +255,7 @@ class Scaramuzza(_ByAngle):
 
     @cached_property
     def _depth(self) -> np.polynomial.Polynomial:
-        """Depth of the ray against height, both in focal lengths."""
+        """Ray depth f(r) as a polynomial of the image height, both in focal lengths."""
         unit = self.pixel_um / self.focal_um
         a0, a2, a3, a4 = self.a
         return np.polynomial.Polynomial([a0 * unit, 0.0, a2 / unit, a3 / unit**2, a4 / unit**3])
@@ -259,7 +267,7 @@ class Scaramuzza(_ByAngle):
         return float(min(*smallest_roots(depth.coef), *smallest_roots(growth.coef)))
 
     def _limits(self) -> tuple[float, float]:
-        # Stretched circles are ellipses: the radius is that of the largest circle inside.
+        # The stretched image circle is an ellipse: use the radius of its largest inscribed circle.
         ideal, height = super()._limits()
         return ideal, height * float(np.linalg.svd(self._matrix, compute_uv=False).min())
 
@@ -283,7 +291,7 @@ class Scaramuzza(_ByAngle):
 
     def _height(self, theta_rad: Floats) -> Floats:
         upper = self._max_height
-        if math.isinf(upper):  # without an end the height at the largest angle is one
+        if math.isinf(upper):  # without a limit, double until the height covers the largest angle
             upper = 1.0
             most_rad = float(np.max(theta_rad, initial=0.0))
             while float(self._angle_rad(np.array([upper]))[0]) < most_rad and upper < 1e12:

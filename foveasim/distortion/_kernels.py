@@ -1,4 +1,4 @@
-"""The distortion room's numba kernel: Newton's method for the inverse of the Brown-Conrady model."""
+"""Numba kernel of the distortion models: inverse Brown-Conrady by Newton's method."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ __all__ = ["brown_conrady_inverse"]
 _points = types.Array(types.float64, 2, "C", readonly=True)
 _numbers = types.Array(types.float64, 1, "C", readonly=True)
 
-#: Newton's steps, and how often one is halved.
+#: Maximum number of Newton steps, and of halvings per step.
 MAX_STEPS, MAX_HALVINGS = 60, 30
-#: A start beyond the fold is moved inwards so often, at most.
+#: Maximum number of times that a start value beyond the fold is moved inwards.
 MAX_MOVES = 30
-#: A residual of this fraction of a point's distance from the centre is rounding, and one below this solves.
+#: Residuals relative to the distance from the centre: the level of rounding errors, and the tolerance of a solution.
 RESIDUAL, SOLVED = 1e-15, 1e-12
-#: A point that equals one of so many before it has the same answer.
+#: Number of preceding points that are compared, to reuse the result of an equal point.
 LOOK_BACK = 8
-#: A squared residual of so many times that of rounding cannot be made smaller by shorter steps.
+#: Shorter steps cannot reduce a squared residual below this multiple of the squared rounding error.
 NEARLY = 1e4
-#: A step of this fraction of a point's distance from the centre is the last: what it leaves is of the share's square.
+#: Relative size of the last Newton step: convergence is quadratic, so the remaining error is the square of this fraction.
 LAST_STEP = 1e-9
-#: Between the directions in which it is known, the fold may be further out by this share.
+#: Relative margin of the fold radius between the sampled directions.
 FOLD_MARGIN = 1e-3
 
 
 @njit(inline="always")
 def _map(x, y, k1, k2, k3, k4, k5, k6, p1, p2):
-    """Distorted position of a point, and the Jacobian: x_d, y_d, dx/dx, dx/dy, dy/dy."""
+    """Return the distorted position and its Jacobian: x_d, y_d, dx_d/dx, dx_d/dy, dy_d/dy."""
     r2 = x * x + y * y
     over_below = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     factor = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) * over_below
@@ -45,7 +45,7 @@ def _map(x, y, k1, k2, k3, k4, k5, k6, p1, p2):
 
 @njit(inline="always")
 def _is_inside(x, y, determinant, fold, min_fold):
-    """Whether an ideal point lies within the fold, whose radius is given in equal directions."""
+    """Return whether an ideal point lies within the fold radii of equally spaced directions."""
     if not determinant > 0.0:
         return False
     radius = np.sqrt(x * x + y * y)
@@ -53,7 +53,7 @@ def _is_inside(x, y, determinant, fold, min_fold):
         return True
     turn = np.arctan2(y, x) / (2.0 * np.pi) * fold.size
     low = int(np.floor(turn))
-    # Between two directions the fold is a curve: the larger of the two, with the determinant, tells.
+    # The fold is curved between two directions: compare with the larger radius; the determinant is positive.
     return radius <= max(fold[low % fold.size], fold[(low + 1) % fold.size]) * (1.0 + FOLD_MARGIN)
 
 
@@ -62,10 +62,11 @@ def _is_inside(x, y, determinant, fold, min_fold):
 )
 def brown_conrady_inverse(xy, k, p1, p2, fold, ideal, per_step):
     """
-    Ideal points (n, 2) within the fold whose distorted positions are ``xy``, NaN where there are none.
+    Return the ideal points (n, 2) within the fold of distorted points ``xy``.
 
-    ``ideal`` is the ideal radius at equal steps of the distorted one, without tangential terms: Newton's steps begin there.
-    Steps that do not come nearer, leave the fold's circle, or reach a point where the determinant is not positive are halved.
+    Points without a solution are NaN. ``ideal`` contains the ideal radii at equally spaced distorted radii without tangential
+    terms, the start values of Newton's method. Steps that do not reduce the residual, leave the circle around the fold, or
+    reach a point with a determinant that is not positive are halved.
     """
     found = np.empty_like(xy)
     min_fold, max_fold = fold.min(), fold.max() * (1.0 + FOLD_MARGIN)
@@ -73,7 +74,7 @@ def brown_conrady_inverse(xy, k, p1, p2, fold, ideal, per_step):
     last = ideal.size - 1
     for i in range(xy.shape[0]):
         u, v = xy[i, 0], xy[i, 1]
-        # Neighbours in a layout share corners.
+        # Adjacent sites of a layout share corners.
         same = -1
         for j in range(max(i - LOOK_BACK, 0), i):
             if xy[j, 0] == u and xy[j, 1] == v:
@@ -86,7 +87,7 @@ def brown_conrady_inverse(xy, k, p1, p2, fold, ideal, per_step):
         at = int(min(place, float(last - 1)))
         radius = ideal[at] + min(place - at, 1.0) * (ideal[at + 1] - ideal[at])
         scale = radius / distance if distance > 0.0 else 1.0
-        # Near the fold tangential terms may put the start beyond it.
+        # Tangential terms can move a start value near the fold beyond it.
         for _ in range(MAX_MOVES):
             x, y = u * scale, v * scale
             x_d, y_d, xx, xy_, yy = _map(x, y, k1, k2, k3, k4, k5, k6, p1, p2)
@@ -118,7 +119,7 @@ def brown_conrady_inverse(xy, k, p1, p2, fold, ideal, per_step):
                 ):
                     is_better = True
                     break
-                if error <= NEARLY * goal:  # rounding: shorter steps come no nearer
+                if error <= NEARLY * goal:  # at the level of rounding errors shorter steps do not help
                     break
                 length *= 0.5
             if not is_better:

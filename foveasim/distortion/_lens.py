@@ -1,4 +1,4 @@
-"""What all lens models share: their place in the sensor plane, and what becomes of points that they cannot map."""
+"""Common interface of lens models: position in the sensor plane, points outside the model."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from foveasim.errors import GeometryError, ParameterError
 
 __all__ = ["Lens", "Outside", "Placed"]
 
-#: What becomes of points that a lens cannot map: an error that names the radius, or NaN.
+#: Treatment of points outside the valid radius of a lens: raise an error, or return NaN.
 Outside: TypeAlias = Literal["error", "mask"]
 
 
 @runtime_checkable
 class Lens(Protocol):
-    """A lens model as cameras take it; those of this package and any other class with these members."""
+    """Protocol of lens models for cameras."""
 
     @property
     def focal_um(self) -> float | tuple[float, float]:
-        """Focal length in µm; two of them, along x and y, where the image is stretched."""
+        """Focal length, µm; one value each for x and y if the image is stretched."""
 
     @property
     def centre_um(self) -> tuple[float, float]:
-        """Where the optical axis meets the sensor, µm."""
+        """Intersection of the optical axis with the sensor plane, µm."""
 
     def distort(self, xy_um: ArrayLike, *, outside: Outside = "error") -> Floats:
         """Return real positions, (..., 2) µm, of ideal ones."""
@@ -38,10 +38,10 @@ class Lens(Protocol):
 
 class Placed:
     """
-    A model in units of the focal length around a centre, placed in the sensor plane.
+    Base of lens models that are normalised by the focal length around a centre.
 
-    Models give ``_forward`` and ``_backward`` from (n, 2) normalised points to such points, NaN where there is no answer, and
-    ``_limits``, the radii (normalised) that the two are right up to.
+    Subclasses define ``_forward`` and ``_backward``, which map (n, 2) normalised points to normalised points (NaN where the
+    model is not valid), and ``_limits``, the normalised radii up to which the two are valid.
     """
 
     focal_um: float | tuple[float, float]
@@ -61,14 +61,14 @@ class Placed:
 
     def distort(self, xy_um: ArrayLike, *, outside: Outside = "error") -> Floats:
         """
-        Where the lens puts points that an ideal lens would put at ``xy_um``.
+        Return the real positions of ideal positions.
 
         Parameters
         ----------
         xy_um : (..., 2), µm
             Ideal positions in the sensor plane.
         outside : {"error", "mask"}
-            Whether points beyond the model's reach raise, or become NaN.
+            Whether points outside the valid radius raise an error or become NaN.
 
         Returns
         -------
@@ -77,20 +77,20 @@ class Placed:
         Raises
         ------
         GeometryError
-            When a point lies beyond the radius up to which the model can be inverted, and ``outside`` is ``"error"``.
+            If a point lies outside the radius up to which the model is invertible, and ``outside`` is ``"error"``.
         """
         return self._mapped(xy_um, self._forward, 0, outside)
 
     def undistort(self, xy_um: ArrayLike, *, outside: Outside = "error") -> Floats:
         """
-        Where an ideal lens would put what this one puts at ``xy_um``; as :meth:`distort`.
+        Return the ideal positions of real positions.
 
         Parameters
         ----------
         xy_um : (..., 2), µm
             Real positions in the sensor plane.
         outside : {"error", "mask"}
-            As for :meth:`distort`: beyond the image circle there is no light.
+            As for :meth:`distort`; the irradiance outside the image circle is 0.
 
         Returns
         -------
@@ -100,7 +100,7 @@ class Placed:
 
     @property
     def max_radius_um(self) -> tuple[float, float]:
-        """Radii around the centre up to which every point can be distorted and undistorted, µm; infinite without end."""
+        """Largest valid radii of ``distort`` and ``undistort``, µm; may be infinite."""
         ideal, real = self._limits()
         least_um = float(np.min(self.focal_um))
         return ideal * least_um, real * least_um
@@ -129,6 +129,6 @@ class Placed:
             limit = self.max_radius_um[which]
             raise GeometryError(
                 f"{int(is_lost.sum())} points cannot be {('distorted', 'undistorted')[which]}: the nearest lies {at:.6g} µm "
-                f"from the lens's centre, and the model is right up to {limit:.6g} µm; keep to that, or take outside='mask'"
+                f"from the lens centre, and the model is valid up to {limit:.6g} µm; use points within, or outside='mask'"
             )
         return from_frame(mapped, centre, focal).reshape(points.shape)

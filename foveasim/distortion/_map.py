@@ -1,4 +1,4 @@
-"""A map of light as a lens distorts it, by looking back and interpolating: for the eye, and to compare with."""
+"""Distorted power maps by inverse mapping and interpolation, for display and comparison."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from foveasim.fields import Grid, PointMap, PowerMap
 
 __all__ = ["Conserve", "distort_map"]
 
-#: What a lens keeps: the power that falls on a piece of the image, or its power per area.
+#: Conserved quantity: the power on an area of the image, or the power per area.
 Conserve: TypeAlias = Literal["flux", "density"]
-#: Splines of a higher order are not interpolated with.
+#: Highest spline order of ``scipy.ndimage``.
 MAX_ORDER = 5
-#: A larger picture is a slip: the lens throws the border far out.
+#: Memory limit: strong distortion can map the boundary to infinity.
 MAX_CELLS = 2**28
-#: Cells that are looked up at once.
+#: Cells that are interpolated at once, a memory limit.
 CELLS_A_PIECE = 2**20
-#: Points along the border for each cell there, and at least.
+#: Sample points of the boundary: per cell, and minimum per side.
 POINTS_A_CELL, MIN_POINTS = 1, 256
-#: A border that is this fraction of a cell beyond a cell's edge is on it: rounding.
+#: Tolerance for rounding errors of positions on cell edges, in cells.
 ON_EDGE = 1e-6
-#: Step of the derivative where a cell reaches over the image circle, in cells.
+#: Step of the finite differences for cells that extend beyond the image circle, in cells.
 STEP = 1e-3
 
 
@@ -39,38 +39,40 @@ def distort_map(
     order: int = 1,
 ) -> PowerMap:
     """
-    The map of an ideal lens as a real one distorts it.
+    Distort the power map of an ideal lens.
 
     Parameters
     ----------
     power_map : PowerMap
-        Light in the plane of an ideal lens.
+        Power map in the image plane of an ideal lens.
     lens : BrownConrady, Fisheye, PolynomialFisheye or Scaramuzza
         Any object with ``distort`` and ``undistort``.
     grid : Grid, optional
-        Cells of the distorted map; by default of the same pitch, around all of the map's distorted border, on the map's
-        own cells where nothing is distorted.
+        Grid of the distorted map. The default has the same pitch, covers the complete distorted boundary of the map, and is
+        aligned with the cells of the map.
     conserve : {"flux", "density"}
-        Whether the power on a piece of the image stays what it was, which is physics, or its power per area, as when a picture
-        is warped.
+        Whether the power on an area of the image is conserved (physical), or the power per area (as in image warping).
     order : int
-        Of the spline between cell means: 0 the nearest, 1 linear, up to 5. From 2 on, there may be less light than none.
+        Order of the spline between cell means, from 0 (nearest) and 1 (linear) to 5. Orders of 2 and above can yield negative
+        values.
 
     Returns
     -------
     PowerMap
-        Of the map's type and wavelengths. Cells that look beyond the map, or out of the image circle, are 0.
+        Distorted map with the dtype and wavelengths of the input. Cells with a source position outside the map or outside the
+        image circle are 0.
 
     Raises
     ------
     ParameterError
-        When an argument is none of the above, or the distorted map would be too large.
+        If an argument differs from the above, or the distorted map would be too large.
 
     Notes
     -----
-    The paper's way (its section on distortion): each cell's middle is carried back, and the map interpolated there. "flux"
-    multiplies by the area of the cell carried back over its own, the determinant of ``d x_u / d x_d``. Interpolation
-    blurs, and a coarser grid samples: photosites need neither, since :class:`foveasim.Integrator` carries their outlines back.
+    The method of the paper (section on distortion): the centre of each cell is undistorted, and the map is interpolated
+    there. "flux" multiplies by the ratio of the areas of the undistorted and the distorted cell, the determinant of
+    ``d x_u / d x_d``. Interpolation blurs the image, and a coarser grid aliases it. Photosites avoid both, because
+    :class:`foveasim.Integrator` undistorts their outlines.
 
     Examples
     --------
@@ -93,7 +95,7 @@ def distort_map(
     elif not isinstance(grid, Grid):
         raise ParameterError("grid", f"must be a Grid, got a {type(grid).__name__}")
     if math.prod(grid.shape) > MAX_CELLS:
-        raise ParameterError("grid", f"must have at most {MAX_CELLS} cells", grid.shape, hint="give a smaller one")
+        raise ParameterError("grid", f"must have at most {MAX_CELLS} cells", grid.shape, hint="reduce its shape")
     coefficients = [_spline(band, order) for band in power_map.data]
     data = np.empty((len(coefficients), *grid.shape), power_map.data.dtype)
     n_rows = max(CELLS_A_PIECE // grid.shape[1], 1)
@@ -106,7 +108,7 @@ def distort_map(
 
 
 def _bounding_grid(grid: Grid, lens: Any) -> Grid:
-    """The smallest grid of the map's pitch and cell edges around all that the lens makes of the map."""
+    """Return the smallest aligned grid of equal pitch around the distorted map."""
     x0, y0, x1, y1 = grid.bounds_um
     n_y, n_x = (max(POINTS_A_CELL * n, MIN_POINTS) + 1 for n in grid.shape)
     x, y = np.linspace(x0, x1, n_x), np.linspace(y0, y1, n_y)
@@ -117,25 +119,25 @@ def _bounding_grid(grid: Grid, lens: Any) -> Grid:
     is_lost = np.isnan(real).any(axis=1)
     corners = real[~is_lost]
     if is_lost.any():
-        # The border folds over: what lies within it fills the image circle.
+        # Part of the boundary lies beyond the fold: the distorted map fills the image circle.
         radius_um, centre = lens.max_radius_um[1], np.asarray(lens.centre_um)
         corners = np.concatenate((corners, [centre - radius_um, centre + radius_um]))
     low, high = corners.min(axis=0), corners.max(axis=0)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        raise ParameterError("grid", "must be given: the lens throws the map's border to infinity")
+        raise ParameterError("grid", "must be specified, because the lens maps the map boundary to infinity")
     first = np.floor((low - (x0, y0)) / grid.pitch_xy_um + ON_EDGE)
     last = np.ceil((high - (x0, y0)) / grid.pitch_xy_um - ON_EDGE)
     n_x, n_y = (int(n) for n in np.maximum(last - first, 1))
     if n_x * n_y > MAX_CELLS:
         raise ParameterError(
-            "grid", f"must be given: the whole distorted map has {n_y} x {n_x} cells, more than {MAX_CELLS}"
+            "grid", f"must be specified, because the distorted map has {n_y} x {n_x} cells, more than {MAX_CELLS}"
         )
     origin = np.array([x0, y0]) + first * grid.pitch_xy_um
     return Grid((n_y, n_x), grid.pitch_um, (float(origin[0]), float(origin[1])))
 
 
 def _spline(band: NDArray[Any], order: int) -> Images:
-    """Coefficients of the spline through the cell means."""
+    """Return the coefficients of the spline through the cell means."""
     from scipy.ndimage import spline_filter
 
     if order < 2:
@@ -144,7 +146,11 @@ def _spline(band: NDArray[Any], order: int) -> Images:
 
 
 def _interpolate(image: Images, pixel: Floats, order: int) -> Floats:
-    """Values at positions (2, n_y, n_x) in rows and columns of cell middles; 0 beyond the map, and for positions NaN."""
+    """
+    Return interpolated values at positions (2, n_y, n_x) in rows and columns.
+
+    Integer positions are cell centres. Values are 0 outside the map and at NaN positions.
+    """
     from scipy.ndimage import map_coordinates
 
     n = np.array(image.shape)[:, np.newaxis, np.newaxis]
@@ -158,7 +164,11 @@ def _interpolate(image: Images, pixel: Floats, order: int) -> Floats:
 def _source_coordinates(
     grid: Grid, rows: slice, source: Grid, lens: PointMap, conserve: Conserve
 ) -> tuple[Floats, Floats | float]:
-    """Of some rows of cells: where they look, in rows and columns of the source's cells, and what their light is times."""
+    """
+    Return source positions of rows of cells, and the factors of their values.
+
+    Positions are in rows and columns of the source cells.
+    """
     middles = np.stack(np.meshgrid(grid.x_um, grid.y_um[rows]), axis=-1)
     ideal = lens.undistort(middles, outside="mask")
     cell = (ideal - source.origin_um) / source.pitch_xy_um - 0.5
@@ -176,14 +186,18 @@ def _source_coordinates(
 
 
 def _corners(grid: Grid, rows: slice) -> Floats:
-    """Corners of some rows of cells, (n_row + 1, n_x + 1, 2), µm."""
+    """Return the corners of rows of cells, (n_row + 1, n_x + 1, 2), µm."""
     x_um = grid.origin_um[0] + np.arange(grid.shape[1] + 1) * grid.pitch_x_um
     y_um = grid.origin_um[1] + np.arange(rows.start, rows.stop + 1) * grid.pitch_y_um
     return np.stack(np.meshgrid(x_um, y_um), axis=-1)
 
 
 def _determinant(lens: PointMap, points_um: Floats, ideal_um: Floats, step_um: Floats) -> Floats:
-    """Determinant of d x_u / d x_d at points whose cells reach out of the image circle, looking towards its middle."""
+    """
+    Return the determinant of d x_u / d x_d for cells that extend beyond the image circle.
+
+    One-sided differences towards the centre of the image circle.
+    """
     columns = []
     for axis in (0, 1):
         step = np.zeros(2)

@@ -9,6 +9,6 @@ from foveasim._core.registry import Registry
 
 __all__ = ["LENSES"]
 
-#: Lens models by their names in settings files: what a call gives maps points with ``distort`` and ``undistort``. Installed
-#: packages add theirs as entry points of the group ``foveasim.lenses``.
+#: Lens models by their names in settings files; calling an entry returns an object with ``distort`` and ``undistort``.
+#: Installed packages add models as entry points of the group ``foveasim.lenses``.
 LENSES: Registry[Callable[..., Any]] = Registry("lens model", "foveasim.lenses")

@@ -1,4 +1,4 @@
-"""Inverses of growing functions, for many values at once."""
+"""Vectorised inverses of increasing functions and roots of polynomials."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from foveasim._core.validation import Floats
 
 __all__ = ["invert_monotonic", "smallest_roots"]
 
-#: Steps of Newton's method kept inside a bracket: bisection alone would take 60.
+#: Maximum number of bracketed Newton steps; bisection alone needs 60.
 MAX_STEPS = 100
-#: A root is real when its imaginary part is this much smaller; one beyond the reciprocal of TINY is none.
+#: Largest ratio of imaginary and absolute value of a real root; roots above 1 / TINY are ignored.
 REAL, TINY = 1e-9, 1e-12
 
 
@@ -21,9 +21,9 @@ def invert_monotonic(
     function: Callable[[Floats], Floats], slope: Callable[[Floats], Floats], values: Floats, upper: float
 ) -> Floats:
     """
-    Where a function that grows from 0 at 0 has some values, all of them at most that at ``upper``.
+    Invert an increasing function with f(0) = 0 for values up to f(``upper``).
 
-    Newton's steps, replaced by halving wherever they leave the bracket.
+    Newton's method, with bisection for steps that leave the bracket.
     """
     low, high = np.zeros_like(values), np.full_like(values, upper)
     x = np.minimum(values / max(float(slope(np.zeros(1))[0]), 1e-300), 0.5 * upper)
@@ -41,10 +41,14 @@ def invert_monotonic(
 
 
 def smallest_roots(coefficients: Any) -> Floats:
-    """Smallest positive roots of polynomials (n, degree + 1), lowest power first; infinite where there is none."""
+    """
+    Return the smallest positive root of each polynomial, infinite where there is none.
+
+    Coefficients are (n, degree + 1), lowest power first.
+    """
     table = np.atleast_2d(np.asarray(coefficients, dtype=np.float64))
     roots = np.full(table.shape[0], np.inf)
-    # The reversed polynomial has the roots' reciprocals, and never a leading 0: these polynomials are not 0 at 0.
+    # The reversed polynomial has the reciprocal roots and no leading 0, because the constant term is not 0.
     degree = table.shape[1] - 1
     if degree == 0:
         return roots

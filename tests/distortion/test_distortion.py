@@ -1,4 +1,4 @@
-"""Lens models: closed forms, inverses to rounding, folds at their true radius, OpenCV as the oracle, files of other programs."""
+"""Lens models: closed forms, inverses, fold radii, comparison with OpenCV, calibration files of other programs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def disc(radius, n=400, seed=0):
 
 
 def to_pixels(xy_um):
-    """Positions in OpenCV's pixels of positions in the sensor plane."""
+    """Convert positions in the sensor plane to OpenCV pixel coordinates."""
     return np.stack(
         (xy_um[:, 0] / PIXEL_UM + 0.5 * (SIZE[0] - 1), 0.5 * (SIZE[1] - 1) - xy_um[:, 1] / PIXEL_UM), axis=1
     )
@@ -50,7 +50,7 @@ def to_um(pixels):
 # -- Brown-Conrady ---------------------------------------------------------------------------------------------------
 
 
-def test_the_inverse_is_right_over_the_whole_disc_for_a_thousand_sets_of_coefficients():
+def test_inverse_is_accurate_for_random_coefficients():
     rng = np.random.default_rng(1)
     worst_px = 0.0
     for i in range(1000):
@@ -72,8 +72,8 @@ def test_the_inverse_is_right_over_the_whole_disc_for_a_thousand_sets_of_coeffic
     k=st.tuples(st.floats(-0.4, 0.4), st.floats(-0.2, 0.2), st.floats(-0.1, 0.1)),
     p=st.tuples(st.floats(-0.03, 0.03), st.floats(-0.03, 0.03)),
 )
-def test_the_fold_is_where_the_map_first_stops_to_be_one_to_one(k, p):
-    """By sampling: the determinant of differences keeps its sign inside the radius, and not on every point beyond it."""
+def test_fold_is_smallest_radius_without_injectivity(k, p):
+    """The determinant from finite differences is positive at all samples within the fold, and negative at some beyond."""
     lens = BrownConrady(focal_um=1.0, k1=k[0], k2=k[1], k3=k[2], p1=p[0], p2=p[1])
     ideal = lens.max_radius_um[0]
     angle = np.linspace(0, 2 * np.pi, 721)
@@ -86,29 +86,29 @@ def test_the_fold_is_where_the_map_first_stops_to_be_one_to_one(k, p):
         dy = (lens._map(xy + up) - lens._map(xy - up)) / (2 * h)
         return dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]
 
-    for share in np.linspace(0.05, 0.995, 20):
-        assert determinant(share * min(ideal, 5.0)).min() > 0.0
+    for fraction in np.linspace(0.05, 0.995, 20):
+        assert determinant(fraction * min(ideal, 5.0)).min() > 0.0
     if ideal < 5.0:
         assert determinant(1.01 * ideal).min() < 0.0
 
 
-def test_a_barrel_folds_at_its_closed_form():
+def test_barrel_fold_matches_closed_form():
     lens = BrownConrady(focal_um=1000.0, k1=-0.3)
     fold = math.sqrt(1 / 0.9)  # 1 + 3 k1 r² = 0
 
     assert lens.max_radius_um == pytest.approx((1000 * fold, 1000 * fold * (1 - 0.3 * fold**2)))
     with pytest.raises(
-        GeometryError, match=r"1 points cannot be distorted: the nearest lies 1100 µm .* right up to 1054.09 µm"
+        GeometryError, match=r"1 points cannot be distorted: the nearest lies 1100 µm .* valid up to 1054.09 µm"
     ):
         lens.distort([[1100.0, 0.0]])
-    with pytest.raises(GeometryError, match=r"cannot be undistorted: .* take outside='mask'"):
+    with pytest.raises(GeometryError, match=r"cannot be undistorted: .* or outside='mask'"):
         lens.undistort([[10.0, 0.0], [0.0, 800.0]])
     masked = lens.undistort([[10.0, 0.0], [0.0, 800.0]], outside="mask")
     assert np.isnan(masked[1]).all()
     assert lens.distort(masked[:1]) == pytest.approx(np.array([[10.0, 0.0]]))
 
 
-def test_a_lens_without_coefficients_changes_nothing():
+def test_lens_without_coefficients_is_identity():
     points_um = disc(5000.0)
 
     assert BrownConrady(focal_um=1000.0).distort(points_um) == pytest.approx(points_um, rel=1e-15)
@@ -116,7 +116,7 @@ def test_a_lens_without_coefficients_changes_nothing():
 
 
 @pytest.mark.parametrize("n", [4, 5, 8])
-def test_points_are_where_opencv_projects_them(n):
+def test_distorted_points_match_opencv_projection(n):
     matrix = np.array([[1480.3, 0, 948.2], [0, 1485.1, 561.7], [0, 0, 1]])
     k = np.array([-0.21, 0.08, 0.004, -0.003, 0.01, 0.05, -0.02, 0.003])[:n]
     lens = from_opencv(matrix, k, image_size=SIZE, pixel_um=PIXEL_UM)
@@ -128,7 +128,7 @@ def test_points_are_where_opencv_projects_them(n):
     np.testing.assert_allclose(to_pixels(lens.distort(to_um(ideal_px))), real_px, atol=1e-6)
     np.testing.assert_allclose(to_pixels(lens.undistort(to_um(real_px))), ideal_px, atol=1e-6)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
-    undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # of OpenCV 4, and of 5
+    undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # OpenCV 4 / OpenCV 5
     back = undistort(real_px[:, None], matrix, k, None, matrix, criteria=criteria)[:, 0]
     np.testing.assert_allclose(to_pixels(lens.undistort(to_um(real_px))), back, atol=1e-6)
     matrix_again, k_again = to_opencv(lens, image_size=SIZE, pixel_um=PIXEL_UM)
@@ -136,20 +136,20 @@ def test_points_are_where_opencv_projects_them(n):
     np.testing.assert_allclose(k_again[:n], k, rtol=1e-12)
 
 
-def test_an_f_is_upright_and_leans_as_in_opencv():
-    """An asymmetric target: with tangential terms alone, up and down differ, and so do left and right."""
+def test_tangential_signs_match_opencv():
+    """An asymmetric letter F with tangential terms only: up and down differ, and so do left and right."""
     letter_px = np.array([[900, 300], [900, 700], [1100, 300], [1020, 480], [900, 480]], float)
     matrix = np.array([[1000.0, 0, 960], [0, 1000.0, 540], [0, 0, 1]])
     k = np.array([0.0, 0.0, 0.05, -0.02])
     lens = from_opencv(matrix, k, image_size=(1921, 1081), pixel_um=1.0)
     world = np.concatenate(((letter_px - matrix[:2, 2]) / 1000.0, np.ones((5, 1))), axis=1)
-    seen_px = cv2.projectPoints(world, np.zeros(3), np.zeros(3), matrix, k)[0][:, 0]
+    opencv_px = cv2.projectPoints(world, np.zeros(3), np.zeros(3), matrix, k)[0][:, 0]
     ours = lens.distort(np.stack((letter_px[:, 0] - 960, 540 - letter_px[:, 1]), axis=1))
 
-    np.testing.assert_allclose(np.stack((ours[:, 0] + 960, 540 - ours[:, 1]), axis=1), seen_px, atol=1e-9)
+    np.testing.assert_allclose(np.stack((ours[:, 0] + 960, 540 - ours[:, 1]), axis=1), opencv_px, atol=1e-9)
     assert lens.p1 == -0.05
-    # Light above the axis moves down: p1 of OpenCV pushes everything towards its +y.
-    assert np.all(seen_px[:, 1] > letter_px[:, 1])
+    # Points move down: a positive p1 of OpenCV displaces points towards +y of its image coordinates.
+    assert np.all(opencv_px[:, 1] > letter_px[:, 1])
 
 
 # -- fisheyes --------------------------------------------------------------------------------------------------------
@@ -164,7 +164,7 @@ HEIGHTS = {
 
 @pytest.mark.parametrize("projection", HEIGHTS)
 @pytest.mark.parametrize("degrees", [0.0, 1e-9, 5.0, 45.0, 80.0, 89.9])
-def test_a_ray_lands_where_its_projection_says(projection, degrees):
+def test_image_height_matches_projection(projection, degrees):
     lens = Fisheye(projection=projection, focal_um=1000.0)
     theta = math.radians(degrees)
     ideal_um = np.array([[0.6, -0.8]]) * 1000.0 * math.tan(theta)
@@ -174,7 +174,7 @@ def test_a_ray_lands_where_its_projection_says(projection, degrees):
     np.testing.assert_allclose(lens.undistort(real_um), ideal_um, rtol=1e-10, atol=1e-12)
 
 
-def test_light_beyond_the_image_circle_is_masked():
+def test_points_beyond_image_circle_are_masked():
     lens = Fisheye(projection="orthographic", focal_um=1000.0)
 
     assert lens.max_radius_um == (math.inf, pytest.approx(1000.0))
@@ -182,7 +182,7 @@ def test_light_beyond_the_image_circle_is_masked():
     assert np.isfinite(lens.undistort([[999.9, 0.0]], outside="mask")).all()
 
 
-def test_a_polynomial_fisheye_is_opencvs():
+def test_polynomial_fisheye_matches_opencv():
     matrix = np.array([[520.0, 0, 955.5], [0, 521.0, 544.2], [0, 0, 1]])
     k = np.array([0.05, -0.01, 0.004, -0.0007])
     lens = from_opencv(matrix, k, image_size=SIZE, pixel_um=PIXEL_UM, fisheye=True)
@@ -199,7 +199,7 @@ def test_a_polynomial_fisheye_is_opencvs():
 
 @relaxed
 @given(k=st.tuples(*[st.floats(-0.1, 0.1)] * 4))
-def test_polynomial_fisheyes_are_inverted_up_to_where_they_stop_growing(k):
+def test_polynomial_fisheye_inverts_over_increasing_range(k):
     lens = PolynomialFisheye(k=k, focal_um=1000.0)
     theta = np.linspace(0, 0.9999 * lens._max_theta_rad(), 200)
     height = np.array([t + k[0] * t**3 + k[1] * t**5 + k[2] * t**7 + k[3] * t**9 for t in theta])
@@ -215,7 +215,7 @@ def test_polynomial_fisheyes_are_inverted_up_to_where_they_stop_growing(k):
 MOBIUS = {"a": (1.57e3, -2.75e-4, 3.76e-8, -3.64e-11), "pixel_um": 2.2, "focal_um": 22e3}
 
 
-def test_a_polynomial_of_a0_alone_is_the_pinhole():
+def test_scaramuzza_with_a0_only_is_pinhole():
     lens = Scaramuzza(a=(1000.0, 0, 0, 0), pixel_um=2.0, focal_um=2000.0)
     points_um = disc(4000.0)
 
@@ -223,7 +223,7 @@ def test_a_polynomial_of_a0_alone_is_the_pinhole():
     np.testing.assert_allclose(lens.undistort(points_um), points_um, rtol=1e-12)
 
 
-def test_the_series_of_the_equidistant_projection_is_one():
+def test_scaramuzza_series_approximates_equidistant_projection():
     f = 1000.0
     lens = Scaramuzza(a=(f, -1 / (3 * f), 0, -1 / (45 * f**3)), pixel_um=1.0, focal_um=f)
     same = Fisheye(projection="equidistant", focal_um=f)
@@ -233,7 +233,7 @@ def test_the_series_of_the_equidistant_projection_is_one():
 
 
 @pytest.mark.parametrize("stretch", [((1, 0), (0, 1)), ((1.01, 0.02), (-0.01, 1.0))])
-def test_scaramuzza_is_inverted_to_a_ten_billionth_of_a_pixel(stretch):
+def test_scaramuzza_inverse_is_accurate(stretch):
     lens = Scaramuzza(**MOBIUS, stretch=stretch, centre_um=(31.0, -12.0))
     real_um = disc(0.99 * min(lens.max_radius_um[1], 4000.0), 1000) + np.array([31.0, -12.0])
     ideal_um = lens.undistort(real_um)
@@ -242,7 +242,7 @@ def test_scaramuzza_is_inverted_to_a_ten_billionth_of_a_pixel(stretch):
     np.testing.assert_allclose(lens.undistort(lens.distort(ideal_um)), ideal_um, rtol=1e-12)
 
 
-def test_a_pixel_sees_along_its_polynomial():
+def test_ray_direction_matches_scaramuzza_polynomial():
     lens = Scaramuzza(**MOBIUS)
     a0, a2, a3, a4 = MOBIUS["a"]
     for r in (1.0, 300.0, 900.0):
@@ -251,10 +251,10 @@ def test_a_pixel_sees_along_its_polynomial():
         assert ideal_um == pytest.approx(22e3 * r / depth * np.array([0.6, 0.8]), rel=1e-12)
 
 
-def test_an_axis_into_the_camera_is_turned_round():
-    turned = Scaramuzza(**{**MOBIUS, "a": tuple(-x for x in MOBIUS["a"])})
+def test_negative_a0_inverts_all_signs():
+    negated = Scaramuzza(**{**MOBIUS, "a": tuple(-x for x in MOBIUS["a"])})
 
-    assert turned == Scaramuzza(**MOBIUS)
+    assert negated == Scaramuzza(**MOBIUS)
 
 
 # -- files -----------------------------------------------------------------------------------------------------------
@@ -306,7 +306,7 @@ OCAMCALIB = """#polynomial coefficients for the DIRECT mapping function (ocam_mo
 """
 
 
-def test_opencv_writes_what_is_read(tmp_path):
+def test_calibration_written_by_opencv_is_read(tmp_path):
     path = tmp_path / "calibration.yaml"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     for name, value in (("image_width", 1920), ("image_height", 1080), ("camera_matrix", np.array(MATRIX))):
@@ -336,7 +336,7 @@ def test_opencv_writes_what_is_read(tmp_path):
         ),
     ],
 )  # fmt: skip
-def test_calibrations_of_other_programs_are_one_lens(tmp_path, text):
+def test_calibration_formats_yield_equal_lens(tmp_path, text):
     path = tmp_path / "calibration"
     path.write_text(text)
     lens = read_calibration(path, pixel_um=PIXEL_UM)
@@ -346,7 +346,7 @@ def test_calibrations_of_other_programs_are_one_lens(tmp_path, text):
     assert [lens.k1, lens.k2, lens.k3, lens.p1, lens.p2] == pytest.approx([-0.21, 0.08, 0.01, -0.004, -0.003])
 
 
-def test_a_ros_fisheye_is_a_polynomial_fisheye(tmp_path):
+def test_ros_fisheye_yields_polynomial_fisheye(tmp_path):
     path = tmp_path / "fisheye.yaml"
     text = ROS_YAML.replace("plumb_bob", "equidistant").replace("cols: 5", "cols: 4").replace(", 0.01]", "]")
     path.write_text(text)
@@ -355,7 +355,7 @@ def test_a_ros_fisheye_is_a_polynomial_fisheye(tmp_path):
 
 
 def ocam_ray(row, column):
-    """The ray of a pixel as OCamCalib's cam2world finds it: x down, y to the right, z into the camera."""
+    """Return the ray of a pixel as OCamCalib's cam2world: x down, y to the right, z into the camera."""
     c, d, e, xc, yc = 1.001, 0.002, -0.003, 520.5, 970.25
     inverse = np.linalg.inv(np.array([[c, d], [e, 1.0]]))
     x, y = inverse @ np.array([row - xc, column - yc])
@@ -363,7 +363,7 @@ def ocam_ray(row, column):
     return x, y, -7.5e2 + 4.1e-4 * r**2 - 1.2e-7 * r**3 + 3.3e-10 * r**4
 
 
-def test_ocamcalibs_results_see_along_the_same_rays(tmp_path):
+def test_ocamcalib_file_yields_same_rays(tmp_path):
     path = tmp_path / "calib_results.txt"
     path.write_text(OCAMCALIB)
     lens = read_calibration(path, pixel_um=PIXEL_UM, focal_um=1650.0)
@@ -373,7 +373,7 @@ def test_ocamcalibs_results_see_along_the_same_rays(tmp_path):
         assert ideal_um == pytest.approx(1650.0 * np.array([y / -z, -x / -z]), abs=1e-8)
 
 
-def test_matlabs_fisheye_sees_along_the_same_rays(tmp_path):
+def test_matlab_fisheye_yields_same_rays(tmp_path):
     path = tmp_path / "fisheye.json"
     intrinsics = {
         "MappingCoefficients": list(MOBIUS["a"]), "StretchMatrix": [[1.001, 0.002], [-0.003, 1.0]],
@@ -381,7 +381,7 @@ def test_matlabs_fisheye_sees_along_the_same_rays(tmp_path):
     }  # fmt: skip
     path.write_text(json.dumps({"Intrinsics": intrinsics}))
     lens = read_calibration(path, pixel_um=2.2, focal_um=22e3)
-    u, v = 1500.0, 200.0  # pixels from 0
+    u, v = 1500.0, 200.0  # pixels counted from 0
     x, y = np.linalg.inv([[1.001, 0.002], [-0.003, 1.0]]) @ np.array([u - 970.25, v - 520.5])
     r = math.hypot(x, y)
     depth = np.polynomial.Polynomial([MOBIUS["a"][0], 0, *MOBIUS["a"][1:]])(r)
@@ -393,24 +393,27 @@ def test_matlabs_fisheye_sees_along_the_same_rays(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("just text", "holds no calibration"),
+        ("just text", "contains no calibration; provide the keys"),
         ("camera_matrix: 3", "the camera matrix must have 9 numbers, got 1"),
         ("distortion_coefficients: [1, 2, 3, 4]", "lacks a camera matrix"),
         (ROS_YAML.replace("plumb_bob", "magic"), "the distortion model must be one of .*, got 'magic'"),
-        (ROS_YAML.replace("image_width: 1920\n", ""), "tells no image_width and image_height; give 'image_size'"),
-        (ROS_YAML.replace("-0.21", ".nan"), "must hold finite numbers"),
+        (ROS_YAML.replace("image_width: 1920\n", ""), "must specify image_width and image_height; pass 'image_size'"),
+        (ROS_YAML.replace("-0.21", ".nan"), "must contain finite numbers"),
         (ROS_YAML.replace(", 0.01]", "]").replace("0.08, ", ""), "'coefficients' must be 4, 5, 8 numbers"),
         (ROS_YAML.replace("0.0, 0.0, 1.0]", "0.0, 1.0, 1.0]"), "'camera_matrix' must be"),
         (ROS_YAML.replace("1480.0", "-1480.0"), "'focal_um' must be > 0"),
         ("a: &x [1]\nb: *x", "anchors and aliases are not allowed"),
         ("a: !!python/object/apply:os.system ['true']", "is not YAML"),
-        (OCAMCALIB, "holds Scaramuzza's model, which has no focal length; give 'focal_um'"),
-        (OCAMCALIB.replace("520.5 970.25", "520.5"), "must have the five coefficients|is no calib_results"),
-        ("#polynomial\n5 1 2", "is no calib_results.txt"),
-        ("%YAML:1.0\n---\n", "holds no calibration"),
+        (OCAMCALIB, "contains Scaramuzza's model, which has no focal length; pass 'focal_um'"),
+        (
+            OCAMCALIB.replace("520.5 970.25", "520.5"),
+            "must have the five (coefficients|lines of numbers of calib_results)",
+        ),
+        ("#polynomial\n5 1 2", "must have the five lines of numbers of calib_results.txt"),
+        ("%YAML:1.0\n---\n", "contains no calibration"),
     ],
 )
-def test_broken_calibrations_are_refused_in_one_sentence(tmp_path, text, message):
+def test_invalid_calibration_raises_one_line_error(tmp_path, text, message):
     path = tmp_path / "calibration"
     path.write_text(text)
     with pytest.raises(ConfigError, match=message) as caught:
@@ -435,18 +438,18 @@ def test_broken_calibrations_are_refused_in_one_sentence(tmp_path, text, message
         (lambda: to_opencv(Scaramuzza(**MOBIUS), image_size=SIZE, pixel_um=1.0), "'lens' must be a BrownConrady"),
     ],
 )
-def test_lenses_that_cannot_be_are_refused(call, message):
+def test_lens_models_reject_invalid_arguments(call, message):
     with pytest.raises(ParameterError, match=message):
         call()
 
 
-def test_a_scaramuzza_lens_has_one_distance_of_its_ideal_plane():
-    """Its rays are round; axes that differ are a stretch."""
-    with pytest.raises(ParameterError, match=r"'focal_um' must be one number, .*'stretch' tells axes apart"):
+def test_scaramuzza_rejects_two_focal_lengths():
+    """The model is rotationally symmetric; the stretch matrix describes unequal axes."""
+    with pytest.raises(ParameterError, match=r"'focal_um' must be one number, .*use 'stretch' for unequal axes"):
         distortion.Scaramuzza(a=[1500.0, 0.0, 0.0, 0.0], pixel_um=2.0, focal_um=(3000.0, 6000.0))
 
 
-def test_longer_lists_of_opencv_are_read_where_the_rest_is_nothing():
+def test_from_opencv_accepts_trailing_zero_coefficients():
     matrix, k = [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], [-0.1, 0.01, 0.001, 0.002, 0.0, 0.0, 0.0, 0.0]
     options = {"image_size": (640, 480), "pixel_um": 2.0}
 
@@ -463,11 +466,11 @@ def test_longer_lists_of_opencv_are_read_where_the_rest_is_nothing():
         ('{"K": [1, 2, 3], "RadialDistortion": [0.1, 0.2], "ImageSize": [480, 640]}', "must have a matrix of 3 x 3 numbers, got 3"),
         ('{"K": [[500,0,1],[0,500,1],[0,0,1]], "RadialDistortion": [0.1, 0.2], "ImageSize": [480.5, 640]}', "must be an integer"),
         ('{"MappingCoefficients": [700, 0, 0, 0], "DistortionCenter": [320, 240], "ImageSize": [480, 640], "StretchMatrix": [1, 0, 1]}', "must have a matrix of 2 x 2"),
-        ("#polynomial\ninf 1 0 0 0 0\n1\n1 1\n1 0 0\n480 640\n", "is no calib_results.txt"),
+        ("#polynomial\ninf 1 0 0 0 0\n1\n1 1\n1 0 0\n480 640\n", "must have the five lines of numbers of calib_results.txt"),
         ("#polynomial\n5 -1500 0 0 0 0\n1 2\n240 320\n1 0 0\ninf 640\n", "must be finite"),
     ],
 )  # fmt: skip
-def test_calibrations_with_numbers_too_many_or_too_few_are_told_in_one_sentence(tmp_path, text, message):
+def test_wrong_number_count_raises_one_line_error(tmp_path, text, message):
     path = tmp_path / "calibration.txt"
     path.write_text(text)
 
@@ -477,7 +480,7 @@ def test_calibrations_with_numbers_too_many_or_too_few_are_told_in_one_sentence(
 
 
 @pytest.mark.parametrize("image_size", [(640,), 5, (640.5, 480), ("640", "480")])
-def test_sizes_of_images_that_are_none_are_refused(tmp_path, image_size):
+def test_read_calibration_rejects_invalid_image_size(tmp_path, image_size):
     path = tmp_path / "calibration.yaml"
     path.write_text("camera_matrix: [500, 0, 320, 0, 500, 240, 0, 0, 1]\ndistortion_coefficients: [0.1, 0, 0, 0]\n")
 
