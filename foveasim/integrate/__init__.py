@@ -1,10 +1,9 @@
 """
-Exact integrals of maps over polygons.
+Exact integration of maps over polygons.
 
-The map is known by the mean of every cell of its grid. What a site receives is
-``sum over cells of map[cell] * area(site ∩ cell)``, exactly, when the map is even within each cell; at second order
-a cell has a gradient, too. An :class:`Integrator` compiles outlines and a grid once; every frame, sweep point and
-reconstruction then uses the same plan.
+A map contains the mean of every cell of its grid. If the map is constant within each cell, the integral over a site is
+exactly ``sum over cells of map[cell] * area(site ∩ cell)``; at second order each cell also has a gradient. An
+:class:`Integrator` compiles outlines and a grid once. All frames, sweep points and reconstructions use the same plan.
 """
 
 from __future__ import annotations

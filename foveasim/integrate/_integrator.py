@@ -1,4 +1,4 @@
-"""The integrator: what users hold of a compiled plan."""
+"""Public interface to a compiled integration plan."""
 
 from __future__ import annotations
 
@@ -22,57 +22,58 @@ if TYPE_CHECKING:
 
 __all__ = ["Integrator"]
 
-#: A site lies on the grid when no corner is further off than this fraction of the grid's coordinates: their rounding.
+#: Tolerance for rounding errors of vertices outside the grid, relative to the largest grid coordinate.
 UNCOVERED_ROUNDING = 1e-12
 
 
 class Integrator:
     """
-    Integrates maps over the sites of a layout, exactly, in one pass over the map.
+    Exact integration of maps over the sites of a layout, in one pass over the map.
 
     Parameters
     ----------
     layout : Layout, or any object with ``xy_um``, ``ring_offsets``, ``site_offsets``
         Outlines in the sensor plane, outer rings counter-clockwise and holes clockwise.
     grid : Grid
-        The cells of the maps to come.
+        Grid of the maps.
     distortion : object with ``undistort(xy_um, outside="mask")``, optional
-        A lens of :mod:`foveasim.distortion`: the outlines are carried back into the map's plane, once. Maps are those of the
-        ideal lens.
+        A lens of :mod:`foveasim.distortion`. The outlines are undistorted once into the plane of the map, which is the image
+        of the ideal lens.
     conserve : {"flux", "density"}
-        What the lens keeps: the power that falls on a piece of the image, which is physics; or its power per area, as when a
-        picture is warped.
+        Quantity that the distortion conserves: the power on an area of the image (physical), or the power per area (as in
+        image warping).
     order : {1, 2}
-        How the map is read between its means: 1 takes every cell as even, 2 as its mean with a gradient, so that linear fields
-        are exact too.
+        Order of the reconstruction within cells: 1 treats cells as constant, 2 as a mean with a gradient, so that linear maps
+        are also exact.
     n_threads : int, optional
-        All cores of the process by default. Results do not depend on it, bit for bit.
+        Number of threads, by default all cores of the process. Results are bit-identical for any number.
 
     Raises
     ------
     ParameterError
-        When an argument is none of the above; on a call, when a map does not fit the grid.
+        If an argument differs from the above; on a call, if a map does not match the grid.
     GeometryError
-        When an outline is clockwise.
+        If an outline is clockwise.
 
     Notes
     -----
-    Exact means: up to float64 rounding, for every polygon (concave, with holes, smaller than a cell, larger than
-    the map, with edges on cell borders). A part of a site that is off the grid receives nothing and is told by
-    ``uncovered_um2``. Compiling costs the number of crossings of outlines and cell borders; a frame one reading of
-    the map and two operations a cut cell. Method: Green's theorem on a map that is constant on its cells.
+    Results are exact up to float64 rounding for every polygon (concave, with holes, smaller than a cell, larger than the
+    map, with edges on cell boundaries). Areas of sites outside the grid contribute 0; ``uncovered_um2`` reports them. The
+    cost of compiling is proportional to the number of crossings of outlines and cell boundaries. A frame reads the map once
+    and needs two operations per cut cell. Method: Green's theorem for a map that is constant within cells.
 
-    At second order the gradient is half the difference of the cells on either side, or the whole difference of the two last
-    cells at the map's borders (0 along a single cell). Means are kept, and so is the light: a cell that a site covers wholly
-    gives it just its mean. Of a cell that an outline cuts all four neighbours are read, on the site or not, so a NaN
-    reaches one cell further than at first order; and beside an edge that is sharper than the cells a site may get a little less
-    than nothing of a map that is nowhere negative. The square of side λN about a diffraction pattern's centre, at any
-    offset of the cells, gets its fraction of 0.5289 with errors of up to 5e-2 at first and 1e-2 at second order for 3 cells
-    per λN, 7e-3 and 2e-4 for 8, 2e-3 and 1e-5 for 16. A frame takes about 1.4 times as long, compiling 1.5 times.
+    At second order the gradient is half the difference of the two adjacent cells, or the difference of the two outermost
+    cells at the boundary of the map (0 along a single cell). Cell means are preserved, and so is the total power: a cell that
+    a site covers completely contributes exactly its mean. A cell that an outline cuts also reads its four neighbours, whether
+    or not they overlap the site. A NaN therefore reaches one cell further than at first order, and near an edge that is
+    sharper than the cells a site can receive a slightly negative value from a map without negative values. For the square of
+    side λN centred on a diffraction pattern (ensquared energy 0.5289) the largest errors over all offsets of the cells are
+    5e-2 at first and 1e-2 at second order for 3 cells per λN, 7e-3 and 2e-4 for 8, 2e-3 and 1e-5 for 16. A frame takes
+    about 1.4 times as long, compiling 1.5 times.
 
-    The second order is for maps that are smooth over a few cells, as a diffraction-limited image is on cells of λN/2 or less:
-    there its errors are 2 to 70 times less. A picture whose pixels are even squares, each one cell and wider than λN, is
-    what the first order takes it for, and the better for it.
+    Use the second order for maps that are smooth over a few cells, such as a diffraction-limited image on cells of λN/2 or
+    less: its errors are 2 to 70 times smaller. Use the first order for images of uniform square pixels of one cell each, wider
+    than λN: the first order represents them exactly.
 
     Examples
     --------
@@ -86,7 +87,7 @@ class Integrator:
            [0.5 , 1.  , 0.5 ],
            [0.25, 0.5 , 0.25]])
 
-    A ramp is even in no cell, so a site that cuts cells needs the second order:
+    A ramp is not constant within cells, so a site that cuts cells needs the second order:
 
     >>> ramp = np.broadcast_to([0.5, 1.5, 2.5], (3, 3))
     >>> left = fs.Layout.from_rectangles([[0.75, 1.5]], 0.5)
@@ -105,11 +106,13 @@ class Integrator:
         n_threads: int | None = None,
     ) -> None:
         if not all(hasattr(layout, name) for name in ("xy_um", "ring_offsets", "site_offsets")):
-            raise ParameterError("layout", f"must be a Layout, or packed rings, got a {type(layout).__name__}")
+            raise ParameterError("layout", f"must be a Layout or packed rings, got a {type(layout).__name__}")
         if not isinstance(grid, Grid):
             raise ParameterError("grid", f"must be a Grid, got a {type(grid).__name__}")
         self.grid = grid
-        self.order = check_count("order", order, at_most=2, hint="1 takes cells as even, 2 as means with a gradient")
+        self.order = check_count(
+            "order", order, at_most=2, hint="use 1 for constant cells, 2 for cells with a gradient"
+        )
         self.n_threads = thread_count(n_threads)
         check_choice("conserve", conserve, ("flux", "density"))
         outlines: Callable[[int, int], Outlines] = partial(outlines_of, layout)
@@ -118,11 +121,11 @@ class Integrator:
                 raise ParameterError("distortion", "must be a lens of foveasim.distortion", distortion)
             outlines = UndistortedOutlines(layout, distortion, min(grid.pitch_x_um, grid.pitch_y_um))
         self._plan: Plan = compile_plan(outlines, layout.site_offsets.size - 1, grid, self.n_threads, self.order)
-        # A lens does not turn outlines over: its image of one that is clockwise is so too.
+        # A lens preserves the winding: the undistorted image of a clockwise outline is also clockwise.
         inside_out = np.flatnonzero(self._plan.area_um2 <= 0.0)
         if inside_out.size:
             raise GeometryError(
-                f"site {inside_out[0]} has no positive area: its outline must be counter-clockwise, as from_polygons makes it",
+                f"the outline of site {inside_out[0]} must be counter-clockwise with a positive area; use Layout.from_polygons",
                 tuple(int(i) for i in inside_out),
             )
         self._gain: Floats | None = None
@@ -135,7 +138,7 @@ class Integrator:
 
     @property
     def sites_outside_image_circle(self) -> Ints:
-        """Sites outside the lens's image circle, which receive nothing."""
+        """Indices of sites outside the image circle of the lens, which receive no power."""
         return np.flatnonzero(self._plan.is_lost)
 
     def __repr__(self) -> str:
@@ -148,7 +151,11 @@ class Integrator:
 
     @cached_property
     def uncovered_um2(self) -> Floats:
-        """Area of each site, in the map's plane, that lies off the grid or gets no light through the lens, (n_site,) µm²."""
+        """
+        Area of each site outside the grid or the image circle, (n_site,) µm².
+
+        Areas are measured in the plane of the map.
+        """
         plan, (x_min, y_min, x_max, y_max) = self._plan, self.grid.bounds_um
         rounding_um = UNCOVERED_ROUNDING * max(map(abs, self.grid.bounds_um))
         low_um, high_um = plan.bounds_um[:, :2], plan.bounds_um[:, 2:]
@@ -161,17 +168,17 @@ class Integrator:
 
     def __call__(self, power_map: ArrayLike) -> Floats:
         """
-        Integral of the map over every site.
+        Integrate a map over every site.
 
         Parameters
         ----------
         power_map : (..., n_y, n_x) float32 or float64
-            Cell means, row 0 lowest. Other types are converted to float64. A site that reads a NaN gets NaN; masked cells are
-            rejected, since a mask does not say what they contain.
+            Cell means, bottom row first. Other dtypes are converted to float64. A site that reads a NaN returns NaN. Masked
+            arrays are rejected, because the value of a masked cell is undefined.
 
         Returns
         -------
-        power : (..., n_site) float64, the map's unit times µm²
+        power : (..., n_site) float64, unit of the map times µm²
         """
         power_map = unmasked("power_map", power_map)
         try:
@@ -180,7 +187,9 @@ class Integrator:
             raise ParameterError("power_map", "must be an array of numbers", power_map) from None
         if cells.dtype.hasobject:
             raise ParameterError(
-                "power_map", f"must be an array, got a {type(power_map).__name__}", hint="of a PowerMap give its .data"
+                "power_map",
+                f"must be an array, got a {type(power_map).__name__}",
+                hint="pass the attribute .data of a PowerMap",
             )
         if cells.ndim < 2 or cells.shape[-2:] != self.grid.shape:
             raise ParameterError(
@@ -189,7 +198,7 @@ class Integrator:
             )
         if cells.dtype not in (np.float32, np.float64):
             if not np.can_cast(cells.dtype, np.float64):
-                raise ParameterError("power_map", f"must have real numbers, got the type {cells.dtype}")
+                raise ParameterError("power_map", f"must contain real numbers, got the dtype {cells.dtype}")
             cells = cells.astype(np.float64)
         power = np.empty((*cells.shape[:-2], self.n_sites))
         for band in np.ndindex(*cells.shape[:-2]):
@@ -201,7 +210,7 @@ class Integrator:
 
     def spread(self, values: ArrayLike) -> Floats:
         """
-        The transpose: what every cell gets when each site spreads its value over its area.
+        Apply the adjoint operator: spread the value of each site over its area.
 
         Parameters
         ----------
@@ -209,7 +218,7 @@ class Integrator:
 
         Returns
         -------
-        cells : (..., n_y, n_x) float64, the values' unit times µm²
+        cells : (..., n_y, n_x) float64, unit of the values times µm²
             ``sum over sites of values[site] * area(site ∩ cell)``.
         """
         values = finite_array("values", values)
@@ -225,7 +234,7 @@ class Integrator:
 
     def weights(self) -> csr_array[Any]:
         """
-        The operator as a sparse matrix.
+        Return the operator as a sparse matrix.
 
         Returns
         -------

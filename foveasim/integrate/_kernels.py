@@ -1,23 +1,23 @@
 """
-The integrator's numba kernels: outlines to spans of cells, spans in the order of the map, a map through them.
+Numba kernels of the integrator: outline tracing, span sorting, map integration.
 
 Coordinates are in *cells* of the grid, ``u = (x - x0) / pitch_x`` to the right and ``v = (y - y0) / pitch_y`` up, so
 that cell ``[iy, ix]`` is the unit square from ``(ix, iy)`` to ``(ix + 1, iy + 1)``.
 
-By Green's theorem the overlap of a site with a cell is a sum over the site's edges (:func:`trace_sites`). What
-is kept is the result, run-length coded. A **span** is one row of ``spans``, five integers: a site, a row of
-the grid, a first column, ``n_partial`` cells from there on that each have a weight of their own (their overlap
-with the site, 0 to 1), then ``n_run`` cells that share one weight (the site's interior: 1). A frame then costs
-one reading of the map, a multiplication for each cell that an outline cuts, and additions inside
-(:func:`gather`). No sum runs along a whole row, so a bright source costs a dark site beside it no digits.
+By Green's theorem the overlap of a site with a cell is a sum over the edges of the site (:func:`trace_sites`). The
+result is stored run-length encoded. A **span** is one row of ``spans``, five integers: a site, a row of the grid, a
+first column, the number ``n_partial`` of cells with individual weights (their overlap with the site, 0 to 1), and the
+number ``n_run`` of subsequent cells with one common weight (the interior of the site: 1). A frame then costs one pass
+over the map, a multiplication for each cell that an outline cuts, and additions in the interior (:func:`gather`). No sum
+runs along a complete row, so a bright source does not reduce the precision of a dark site in the same row.
 
-At **second order** the cells that an outline cuts are listed a second time, as rows of ``cuts`` (a site, a row, a
-column), each with its row of ``moments``: the overlap's first moments about the cell's centre, along u and along v,
-over the distance in cells of the two neighbours whose difference is the gradient (2; 1 at the map's borders, where the
-cell stands in for the neighbour that is not there). Cells that are covered wholly have none, and their neighbours are
-not looked at. At first order both are empty.
+At **second order** the cells that an outline cuts are also listed as rows of ``cuts`` (a site, a row, a column), each
+with a row of ``moments``: the first moments of the overlap about the cell centre, along u and along v, divided by the
+distance in cells between the two neighbours whose difference is the gradient (2; 1 at the boundary of the map, where the
+cell itself replaces the missing neighbour). Cells that are covered completely have no moments, and their neighbours are
+not read. At first order both arrays are empty.
 
-The kernels know arrays only, release the interpreter lock, and are compiled for explicit types when this module
+The kernels use arrays only, release the global interpreter lock, and are compiled for explicit types when this module
 is imported; the machine code is cached on disk.
 """
 
@@ -43,25 +43,25 @@ __all__ = [
     "trace_sites",
 ]
 
-#: Columns of ``spans``, and the first three of ``cuts``. In a finished plan the first holds the accumulator's index
-#: instead of the site's.
+#: Columns of ``spans``; the first three are also the columns of ``cuts``. In a finished plan the first column is the index
+#: of the accumulator instead of the site.
 SITE, ROW, COLUMN, N_PARTIAL, N_RUN = range(5)
 
-#: Cells that one block of a row's partial sums holds. Eight float32 make one vector of eight float64: measured best.
+#: Cells per block of the partial sums of a row: fastest measured value (eight float32 convert to one vector of float64).
 BLOCK = 8
-#: Shorter runs are stored cell by cell, which costs less than a header and a sum of their own.
+#: Shorter runs are stored cell by cell, which is faster than a separate sum.
 MIN_RUN = 12
-#: A weight below this fraction of all that the outline climbs in a row is the rounding of a sum of up to eight pieces, not
-#: coverage; of more pieces, in proportion.
+#: Weights below this fraction of the total height of the edges in a row are rounding errors. The limit is for up to eight
+#: pieces and increases in proportion to their number.
 NO_COVERAGE = 2e-15
 #: End of a linked list.
 END = -1
-#: Sites in a box of so many columns and rows have all its cells at hand; in fewer columns than a run needs there is none.
+#: Largest bounding box, in columns and rows, with preallocated scratch cells; too few columns for a run.
 BOX_COLUMNS, BOX_ROWS = MIN_RUN + 1, 64
 
 
 def _input(dtype, ndim):
-    """Type of an argument that is only read: read-only and writeable arrays, C-contiguous."""
+    """Return the type of an input array: C-contiguous, read-only or writeable."""
     return types.Array(dtype, ndim, "C", readonly=True)
 
 
@@ -80,7 +80,7 @@ _int_list = types.int64[::1]
 
 @njit()
 def _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_rows):
-    """Upper bound of the number of cells on the grid that the rings' edges touch."""
+    """Return the maximum number of cells that the edges of rings touch."""
     bound = 0
     for ring in range(first_ring, last_ring):
         start, stop = ring_offsets[ring], ring_offsets[ring + 1]
@@ -96,10 +96,10 @@ def _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_rows):
 @njit(inline="always")
 def _find_cell(head, recent, links, n_cells, row, column):
     """
-    Scratch cell (row, column): its index, and the count of cells, one higher when it had to be made.
+    Return the index of scratch cell (row, column) and the number of cells.
 
-    ``links[i]`` is (column, next, previous cell of the row); a row's list is in order of columns. The search begins at
-    the row's most recent cell: an outline is continuous, so the next one is near.
+    ``links[i]`` is (column, next, previous cell of the row); the list of a row is in column order. The search begins at
+    the most recent cell of the row, because successive cells of an outline are adjacent.
     """
     here = recent[row]
     if here == END:
@@ -134,10 +134,11 @@ def _find_cell(head, recent, links, n_cells, row, column):
 @njit(inline="always")
 def _add_moments(moment, ua, ub, va, vb, height):
     """
-    Add the moments of a piece from (ua, va) to (ub, vb), relative to its cell's centre, that climbs ``height``.
+    Add the moments of an edge piece of signed ``height`` from (ua, va) to (ub, vb).
 
-    ``moment`` is (of every cell on the left, along v; of the area between the piece and the cell's left border, along u;
-    the same, along v). Along u a whole row of a cell has none.
+    Coordinates are relative to the cell centre. The three elements of ``moment`` are the moment along v of every cell to the
+    left, and the moments along u and along v of the area between the piece and the left boundary of the cell. The moment
+    along u of the cells to the left is 0.
     """
     u_mean, v_mean = 0.5 * (ua + ub), 0.5 * (va + vb)
     spread = (ub - ua) / 12.0
@@ -151,24 +152,24 @@ def _trace_edge(
     ua, va, ub, vb, n_y, n_x, bottom, left_column, box_columns, head, recent, climb, links, cover, moment, n_cells
 ):
     """
-    Add one edge to the scratch cells; returns their count.
+    Add one edge to the scratch cells and return their number.
 
-    With ``box_columns`` > 0 the cells are those of a box whose corner is (``bottom``, ``left_column``), row by row; else they
-    are made when an edge touches them.
+    With ``box_columns`` > 0 the cells are preallocated row by row for a box with the corner (``bottom``, ``left_column``);
+    otherwise they are created when an edge touches them.
 
-    ``cover[i]`` is (height, area): the signed height of the edge's pieces in the cell, and the area between
-    them and the cell's left border. ``climb[row]`` is (height of all pieces in the row without their signs, number of them).
-    ``moment[i]`` is what :func:`_add_moments` says, at second order.
+    ``cover[i]`` is (height, area): the signed height of the edge pieces in the cell, and the area between them and the left
+    boundary of the cell. ``climb[row]`` is (sum of the unsigned heights of all pieces in the row, number of pieces). At second
+    order ``moment[i]`` is as in :func:`_add_moments`.
     """
     sign = 1.0
-    if va > vb:  # always upwards, so that two neighbours cut a shared edge at the same points
+    if va > vb:  # always upwards, so that adjacent sites split a shared edge at the same points
         ua, va, ub, vb = ub, vb, ua, va
         sign = -1.0
     if va == vb or va >= n_y or vb <= 0.0:
         return n_cells
     slope = (ub - ua) / (vb - va)
     steepness = (vb - va) / abs(ub - ua) if ub != ua else 0.0
-    if not np.isfinite(steepness):  # as good as vertical
+    if not np.isfinite(steepness):  # vertical up to rounding
         steepness = 0.0
     u_low, u_high = min(ua, ub), max(ua, ub)
     top = min(vb, float(n_y))
@@ -178,20 +179,20 @@ def _trace_edge(
         high = min(vb, row + 1.0)
         left = ua if low == va else min(max(ua + (low - va) * slope, u_low), u_high)
         right = ub if high == vb else min(max(ua + (high - va) * slope, u_low), u_high)
-        v_left = low - (row + 0.5)  # from the row's middle
+        v_left = low - (row + 0.5)  # relative to the centre of the row
         upwards = 1.0
         if left > right:
             left, right = right, left
             v_left = high - (row + 0.5)
             upwards = -1.0
-        if right > 0.0 or left == 0.0:  # what is left of the map has no cell on its left
+        if right > 0.0 or left == 0.0:  # pieces left of the map have no cell on their left
             rise = high - low
             climb[row - bottom, 0] += rise
             u = max(left, 0.0)
             climbed = (u - left) * steepness
             column = int(min(u, float(n_x)))
             while True:
-                # Right of the map an edge has every cell of the row on its left: column n_x stands for it.
+                # An edge right of the map has every cell of the row on its left: it is assigned to column n_x.
                 is_last = right <= column + 1.0 or column == n_x
                 u_next = right if is_last else column + 1.0
                 height = rise if is_last else (u_next - left) * steepness
@@ -227,11 +228,11 @@ def _trace_edge(
 
 @njit(inline="always")
 def _grown(array, n_used, n_more):
-    """The array itself, or a longer copy when ``n_more`` further rows would not fit."""
+    """Return the array, or a longer copy if ``n_more`` further rows do not fit."""
     if n_used + n_more <= array.shape[0]:
         return array
     larger = np.empty((2 * array.shape[0] + n_more, *array.shape[1:]), array.dtype)
-    # Number by number: the assignment of a slice takes numba seconds to compile, for the text of an error.
+    # Element by element: numba needs seconds to compile a slice assignment, because of its error message.
     to, old = larger.ravel(), array.ravel()
     for i in range(n_used * (larger.size // larger.shape[0])):
         to[i] = old[i]
@@ -240,22 +241,22 @@ def _grown(array, n_used, n_more):
 
 @njit(inline="always")
 def _rounding(climb):
-    """Largest weight or moment in a row that is nothing but rounding."""
+    """Return the rounding error of weights and moments in a row."""
     return NO_COVERAGE * climb[0] * max(climb[1] / 8.0, 1.0)
 
 
 @njit(inline="always")
 def _write_row(first_cell, links, cover, climb, n_x, site, row, spans, n_spans, weights, n_weights):
-    """Append the spans of one row of one site; returns the new counts, and the area covered."""
-    winding = 0.0  # weight of the cells before the next touched one: the sum of the heights from there on
+    """Append the spans of one row of one site; return the new counts and the covered area."""
+    winding = 0.0  # weight of the cells before the next touched cell: sum of the heights from that cell on
     here = first_cell
     while here != END:
         winding += cover[here, 0]
         here = links[here, 1]
     rounding = _rounding(climb)
     covered = 0.0
-    column = 0  # the next one to be written
-    is_open = False  # whether the last span goes on
+    column = 0  # the next column to be written
+    is_open = False  # whether the last span can be extended
     here = first_cell
     while here != END:
         n_between = links[here, 0] - column
@@ -300,7 +301,7 @@ def _write_row(first_cell, links, cover, climb, n_x, site, row, spans, n_spans, 
 
 @njit(inline="always")
 def _gradient_share(index, n):
-    """One over the distance of the neighbours that the gradient at a cell is taken from; 0 along a single cell."""
+    """Return the reciprocal distance of the neighbours of the gradient; 0 along a single cell."""
     if n == 1:
         return 0.0
     return 0.5 if 0 < index < n - 1 else 1.0
@@ -308,14 +309,14 @@ def _gradient_share(index, n):
 
 @njit(inline="always")
 def _write_cuts(first_cell, links, moment, climb, n_y, n_x, site, row, cuts, moments, n_cuts):
-    """Append the cuts of one row of one site; returns their new count."""
-    tilt = 0.0  # moment along v of the cells before the next touched one
+    """Append the cuts of one row of one site; return their new number."""
+    tilt = 0.0  # moment along v of the cells before the next touched cell
     here = first_cell
     while here != END:
         tilt += moment[here, 0]
         here = links[here, 1]
     rounding = _rounding(climb)
-    column = 0  # the next one to be written
+    column = 0  # the next column to be written
     here = first_cell
     while here != END:
         touched = links[here, 0]
@@ -343,9 +344,10 @@ def _write_cuts(first_cell, links, moment, climb, n_y, n_x, site, row, cuts, mom
 @njit(types.Tuple((_float_list, _moment_list))(_points, _ints, _ints))
 def measure_sites(xy, ring_offsets, site_offsets):
     """
-    Area (n_site,) of every site, holes taken off, negative when clockwise; and its bounds (n_site, 4): low, then high.
+    Return the signed area (n_site,) and the bounds (n_site, 4) of every site.
 
-    Rings are measured from their first vertex, so that small ones far from the origin keep their digits.
+    Areas exclude holes and are negative for clockwise outlines. Bounds are x_min, y_min, x_max, y_max. Coordinates are taken
+    relative to the first vertex of each ring, which preserves the precision of small rings far from the origin.
     """
     n_sites = site_offsets.size - 1
     areas = np.empty(n_sites, np.float64)
@@ -373,9 +375,10 @@ def measure_sites(xy, ring_offsets, site_offsets):
 )
 def count_pieces(xy, ring_offsets, first, step, pieces_per_length, most):
     """
-    Return the number of pieces of the edge after each vertex, 1 to ``most``: its length times a density at its midpoint, (n,).
+    Return the number of pieces of the edge after each vertex, (n,), from 1 to ``most``.
 
-    The density (n_y, n_x) is that of the nearest point of a grid from ``first`` on at steps of ``step`` (x, y).
+    The number is the length of the edge times the piece density at its midpoint. The density (n_y, n_x) is sampled at the
+    nearest point of a grid that starts at ``first`` with steps of ``step`` (x, y).
     """
     n_y, n_x = pieces_per_length.shape
     out = np.ones(xy.shape[0], np.int64)
@@ -398,24 +401,25 @@ def count_pieces(xy, ring_offsets, first, step, pieces_per_length, most):
 )
 def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
     """
-    Spans of some sites, the first of which is number ``first_site``, on a grid of ``n_y`` rows and ``n_x`` columns.
+    Return the spans of sites on a grid of ``n_y`` rows and ``n_x`` columns.
 
-    ``F(u)``, the integral of the map along a row from its left end to ``u``, makes the integral over a polygon
-    the sum over its edges of (height climbed) x (mean of F). Split at the cell borders, a piece of height
-    ``d`` with its middle at ``u_m`` in column ``c`` gives the weight ``d * (u_m - c)`` to cell ``c`` and ``d`` to
-    every cell left of it. What lies off the grid gives nothing. The moments come from the same pieces.
+    ``first_site`` is the index of the first site. Let ``F(u)`` be the integral of the map along a row from its left end to
+    ``u``. The integral over a polygon is then the sum over its edges of (signed height) x (mean of F). Edges are split at
+    cell boundaries; a piece of height ``d`` with its midpoint at ``u_m`` in column ``c`` adds the weight ``d * (u_m - c)``
+    to cell ``c`` and ``d`` to every cell to the left. Areas outside the grid contribute 0. The moments are computed from the
+    same pieces.
 
     Returns
     -------
     spans : (n_span, 5) int32
-        Site by site, each site's in the order of row and column.
+        Site by site, sorted by row and column within each site.
     weights : (n_weight,) float64
-        Per span its ``n_partial`` weights, then one for the run where ``n_run > 0``.
+        Per span its ``n_partial`` weights, followed by one weight for the run if ``n_run > 0``.
     cuts : (n_cut, 3) int32
-        At second order, in the order of the spans; empty at first.
+        In the order of the spans at second order; empty at first order.
     moments : (n_cut, 2) float64
     covered : (n_site,) float64, cells
-        Area of each site that lies on the grid.
+        Area of each site on the grid.
     """
     n_sites = site_offsets.size - 1
     covered = np.zeros(n_sites, np.float64)
@@ -423,7 +427,7 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
     weights = np.empty(16 * n_sites + 64, np.float64)
     has_moments = order == 2
     n_cuts = 0
-    room = 0  # for all cuts, but for those along horizontal edges
+    room = 0  # capacity for all cuts except those along horizontal edges
     if has_moments:
         first_ring, last_ring = site_offsets[0], site_offsets[n_sites]
         room = n_x + _scratch_size(uv, ring_offsets, first_ring, last_ring, n_y, n_x, n_y * n_sites)
@@ -502,7 +506,7 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
                     n_cells,
                 )
                 a = b
-        # A touched cell gives at most two spans, its own weight, and a run or the weights of a short one.
+        # A touched cell adds at most two spans, its own weight, and one weight of a run or the weights of a short run.
         spans = _grown(spans, n_spans, 2 * n_cells)
         weights = _grown(weights, n_weights, MIN_RUN * n_cells)
         for row in range(n_rows):
@@ -526,11 +530,11 @@ def trace_sites(uv, ring_offsets, site_offsets, first_site, n_y, n_x, order):
 )
 def place_spans(spans, weights, next_span, next_weight, first_slot, rows_per_band, out_spans, out_weights):
     """
-    Copy spans from the order of sites into the order of rows.
+    Copy spans from site order into row order.
 
-    ``next_span[row]`` and ``next_weight[row]`` say where the row's next span and weights go, and are moved on.
-    A site has one accumulator, a *slot*, for each band of rows that it reaches: ``first_slot[site]`` minus the
-    site's first band, plus the band, is written instead of the site.
+    ``next_span[row]`` and ``next_weight[row]`` are the positions of the next span and weights of the row; they are advanced.
+    A site has one accumulator, a *slot*, for each band of rows that it reaches. The index of the site is replaced by
+    ``first_slot[site]`` minus the first band of the site plus the band.
     """
     p = 0
     for i in range(spans.shape[0]):
@@ -554,7 +558,7 @@ def place_spans(spans, weights, next_span, next_weight, first_slot, rows_per_ban
     types.void(_cuts, _points, _int_list, _ints, _count, _cut_list, _moment_list),
 )
 def place_cuts(cuts, moments, next_cut, first_slot, rows_per_band, out_cuts, out_moments):
-    """Copy cuts and their moments into the order of rows, as :func:`place_spans` does with spans and weights."""
+    """Copy cuts and their moments into row order, as :func:`place_spans`."""
     i = 0
     while i < cuts.shape[0]:
         site, row = cuts[i, SITE], cuts[i, ROW]
@@ -573,7 +577,7 @@ def place_cuts(cuts, moments, next_cut, first_slot, rows_per_band, out_cuts, out
 
 @njit(inline="always")
 def _add_gradients(cells, row, row_cuts, cuts, moments, slots):
-    """Add moment x gradient over the cuts of a row into the slots."""
+    """Add moment x gradient over the cuts of a row to the slots."""
     n_y, n_x = cells.shape
     line, below, above = cells[row], cells[max(row - 1, 0)], cells[min(row + 1, n_y - 1)]
     for i in range(row_cuts[row], row_cuts[row + 1]):
@@ -591,15 +595,15 @@ def _add_gradients(cells, row, row_cuts, cuts, moments, slots):
 )
 def gather(cells, first_row, last_row, row_spans, row_weights, spans, weights, row_cuts, cuts, moments, slots):
     """
-    Add weight x cell over the rows ``first_row .. last_row - 1`` of a map into the slots.
+    Add weight x cell over the rows ``first_row .. last_row - 1`` of a map to the slots.
 
-    The only reading of the map: each row is summed by blocks of ``BLOCK`` cells, which a span's run then uses. Of a
-    cell in ``cuts`` the four neighbours are read again, for moment x gradient, while they are in the processor's cache.
+    The map is read in a single pass: each row is summed in blocks of ``BLOCK`` cells, which the runs of spans use. The four
+    neighbours of a cell in ``cuts`` are read again for moment x gradient while they are in the processor cache.
     """
     n_x = cells.shape[1]
     blocks = np.empty(n_x // BLOCK + 1, np.float64)
     for row in range(first_row, last_row + 2):
-        if row >= first_row + 2:  # the rows on either side of it have been read
+        if row >= first_row + 2:  # both adjacent rows have been read
             _add_gradients(cells, row - 2, row_cuts, cuts, moments, slots)
         if row >= last_row or row_spans[row] == row_spans[row + 1]:
             continue
@@ -644,10 +648,10 @@ def gather(cells, first_row, last_row, row_spans, row_weights, spans, weights, r
 )
 def scatter(values, first_row, last_row, row_spans, row_weights, spans, weights, row_cuts, cuts, moments, cells):
     """
-    The transpose of :func:`gather`: add weight x (value of the slot) to the cells of some rows.
+    Add weight x (value of the slot) to the cells of rows: the adjoint of gather.
 
-    What the cuts of the rows just outside give to those inside is added, and nothing to the rows outside, which are
-    another call's.
+    Cuts in the adjacent rows outside the range contribute to the rows inside. Rows outside the range are not written, because
+    another call computes them.
     """
     n_y, n_x = cells.shape
     for row in range(first_row, last_row):

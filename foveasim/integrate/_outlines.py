@@ -1,4 +1,4 @@
-"""Outlines of photosites in the map's plane: as they are, or carried back through a lens, some sites at a time."""
+"""Outlines of photosites in the plane of the map, optionally undistorted."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from foveasim.fields import PackedRings, PointMap
 
 __all__ = ["Outlines", "UndistortedOutlines", "outlines_of"]
 
-#: An undistorted edge deviates from its chords by at most this fraction of a cell; an edge that is longer than a step of
-#: the grid below, or needs more than the largest number of pieces, by a few times that.
+#: Maximum deviation of an undistorted edge from its chords, as a fraction of a cell; exceeded a few times by edges that are
+#: longer than a step of the grid below or need more than the maximum number of pieces.
 CHORD_SHARE = 0.002
-#: How much the lens bends lines is found at so many points along either side of the layout.
+#: Number of points along either axis of the layout at which the curvature of undistorted lines is sampled.
 BEND_POINTS = 65
-#: An edge is cut into so many pieces at most: those that need more reach the lens's border.
+#: Maximum number of pieces per edge; edges that need more reach the boundary of the image circle.
 MAX_PIECES = 256
 
 
 class Outlines(NamedTuple):
-    """Packed rings of some sites in the map's plane, and which of the sites have no place there."""
+    """Packed rings in the plane of the map, with a mask of sites outside the image circle."""
 
     xy_um: Floats
     ring_offsets: Ints
@@ -32,7 +32,7 @@ class Outlines(NamedTuple):
 
 
 def outlines_of(layout: PackedRings, first: int, last: int) -> Outlines:
-    """The outlines of the sites from the first to before the last, as they are in the sensor plane."""
+    """Return the outlines of the sites ``first`` to ``last - 1`` in the sensor plane."""
     site_offsets = layout.site_offsets[first : last + 1]
     ring_offsets = layout.ring_offsets[site_offsets[0] : site_offsets[-1] + 1]
     return Outlines(
@@ -45,21 +45,21 @@ def outlines_of(layout: PackedRings, first: int, last: int) -> Outlines:
 
 class UndistortedOutlines:
     """
-    The outlines that an ideal lens would have to fill.
+    Outlines of photosites undistorted into the plane of an ideal lens.
 
     Parameters
     ----------
     layout : packed rings
         Outlines in the sensor plane.
     lens : object with ``undistort(xy_um, outside="mask")``
-        NaN for points that the lens sends no light to.
+        Lens that returns NaN for points outside its image circle.
     pitch_um : float, µm
-        Shorter side of the map's cells: edges are cut until their chords are within 0.2 % of it.
+        Shorter side of the cells of the map: edges are split until the chord error is at most 0.2 % of this length.
 
     Notes
     -----
-    Sites with a vertex that gets no light are lost, and keep their outlines in the sensor plane. An edge is cut at the same
-    points from both of its sides, so that what tiles the sensor tiles the carried plane.
+    Sites with a vertex outside the image circle are marked as lost and remain in the sensor plane. Edges shared by two sites
+    are split at identical points, so that a tiling remains a tiling.
     """
 
     def __init__(self, layout: PackedRings, lens: PointMap, pitch_um: float) -> None:
@@ -67,19 +67,19 @@ class UndistortedOutlines:
         self._bends = _Bends(layout.xy_um, lens, CHORD_SHARE * pitch_um) if layout.xy_um.size else None
 
     def __call__(self, first: int, last: int) -> Outlines:
-        """Those of the sites from the first to before the last."""
+        """Return the outlines of the sites ``first`` to ``last - 1``."""
         outlines = outlines_of(self._layout, first, last)
         return outlines if self._bends is None else _carried(outlines, self._lens, self._bends)
 
 
 def _carried(outlines: Outlines, lens: PointMap, bends: _Bends) -> Outlines:
-    """Outlines in the sensor plane, carried back."""
+    """Return undistorted outlines."""
     xy_um, ring_offsets, site_offsets, _ = outlines
     n_pieces = bends.n_pieces(xy_um, ring_offsets)
     points = xy_um
     if n_pieces.max() > 1:
         end = xy_um[next_vertex(ring_offsets)]
-        # From the smaller end to the larger one: neighbours cut the edge that they share alike.
+        # Interpolate from the lexicographically smaller vertex, so that adjacent sites split a shared edge identically.
         is_turned = (end[:, 0] < xy_um[:, 0]) | ((end[:, 0] == xy_um[:, 0]) & (end[:, 1] < xy_um[:, 1]))
         low, high = np.where(is_turned[:, np.newaxis], end, xy_um), np.where(is_turned[:, np.newaxis], xy_um, end)
         edge = np.repeat(np.arange(xy_um.shape[0]), n_pieces)
@@ -97,7 +97,7 @@ def _carried(outlines: Outlines, lens: PointMap, bends: _Bends) -> Outlines:
 
 
 class _Bends:
-    """How much a lens bends lines near the points of a coarse grid over a layout."""
+    """Number of chords per length of edges, sampled on a coarse grid over a layout."""
 
     def __init__(self, xy_um: Floats, lens: PointMap, chord_um: float) -> None:
         self._first_um = np.array([xy_um[:, i].min() for i in (0, 1)])
@@ -107,7 +107,7 @@ class _Bends:
         self._pieces_per_um = np.sqrt(_bends(self._first_um, self._step_um, lens) / (8.0 * chord_um))
 
     def n_pieces(self, xy_um: Floats, ring_offsets: Ints) -> Ints:
-        """Return the number of pieces of every edge, in the order of their first vertices."""
+        """Return the number of pieces of every edge, in the order of the first vertices."""
         from foveasim.integrate import _kernels
 
         count: Callable[..., Ints] = _kernels.count_pieces
@@ -115,10 +115,14 @@ class _Bends:
 
 
 def _bends(first_um: Floats, step_um: Floats, lens: PointMap) -> Floats:
-    """The largest second derivative of the carried position along any direction, near every point of a coarse grid, 1/µm."""
+    """
+    Return the largest second derivative of the undistorted position, 1/µm.
+
+    The maximum over all directions and the neighbourhood of every point of a coarse grid.
+    """
     from scipy.ndimage import maximum_filter
 
-    # One point more on every side, for the differences.
+    # One additional point on every side for the finite differences.
     x, y = (first_um[i] + step_um[i] * np.arange(-1, BEND_POINTS + 1) for i in (0, 1))
     carried = lens.undistort(np.stack(np.meshgrid(x, y), axis=-1), outside="mask")
     inner = carried[1:-1, 1:-1]
@@ -126,7 +130,7 @@ def _bends(first_um: Floats, step_um: Floats, lens: PointMap) -> Floats:
     yy = (carried[2:, 1:-1] - 2.0 * inner + carried[:-2, 1:-1]) / step_um[1] ** 2
     mixed = carried[2:, 2:] - carried[2:, :-2] - carried[:-2, 2:] + carried[:-2, :-2]
     xy = mixed / (4.0 * step_um[0] * step_um[1])
-    # Along (c, s) it is c² xx + 2 c s xy + s² yy.
+    # The second derivative along (c, s) is c² xx + 2 c s xy + s² yy.
     size = np.hypot(xx[..., 0], xx[..., 1]), np.hypot(yy[..., 0], yy[..., 1]), np.hypot(xy[..., 0], xy[..., 1])
     bend = np.maximum(size[0], size[1]) + size[2]
     return np.asarray(maximum_filter(np.nan_to_num(bend, nan=0.0), size=3, mode="nearest"))

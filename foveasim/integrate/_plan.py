@@ -1,4 +1,4 @@
-"""The compiled plan of a set of outlines on a grid, and the three things that are done with it."""
+"""Compiled plan of outlines on a grid: gather, scatter and sparse matrix."""
 
 from __future__ import annotations
 
@@ -20,45 +20,45 @@ if TYPE_CHECKING:
 
 __all__ = ["Plan", "compile_plan"]
 
-#: Sites that are traced as one piece of work; fixed, so that a plan does not depend on the number of threads.
+#: Sites per work item of tracing; fixed, so that a plan does not depend on the number of threads.
 SITES_PER_PIECE = 2048
-#: A map has at most this many bands of rows, each summed by one thread into slots of its own ...
+#: Maximum number of bands of rows; one thread sums each band into separate slots.
 MAX_BANDS = 64
-#: ... and none is thinner than this, where handing out the work would cost more than the work.
+#: Minimum height of a band; the overhead of distributing thinner bands exceeds their computing time.
 MIN_ROWS_PER_BAND = 32
-#: Below this many cells a frame is done by the calling thread.
+#: Maps up to this number of cells are processed by the calling thread.
 SMALL_MAP = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
     """
-    Spans of cells in the order of a map's rows (see ``_kernels``).
+    Spans of cells in the order of the rows of a map (see ``_kernels``).
 
     Attributes
     ----------
     grid : Grid
     n_sites : int
     row_spans, row_weights : (n_y + 1,) int64
-        Where each row's spans and weights begin.
+        Index of the first span and the first weight of each row.
     spans : (n_span, 5) int32
     weights : (n_weight,) float64
     row_cuts : (n_y + 1,) int64
-        Where each row's cuts begin.
+        Index of the first cut of each row.
     cuts : (n_cut, 3) int32
-        Cells that an outline cuts; none at first order.
+        Cells that an outline cuts; empty at first order.
     moments : (n_cut, 2) float64
-        What the differences of their neighbours along x and along y weigh.
+        Weights of the differences of the neighbours along x and along y.
     rows_per_band : int
-        Height of the bands of rows that are summed apart.
+        Height of the bands of rows that are summed separately.
     first_slot : (n_site + 1,) int64
         Site s has the slots ``first_slot[s] : first_slot[s + 1]``, one per band.
     area_um2, covered_um2 : (n_site,) float64, µm²
-        Area of each site's outline, and how much of it lies on the grid.
+        Area of each outline, and its area on the grid.
     bounds_um : (n_site, 4) float64, µm
-        Of each site's outline: x_min, y_min, x_max, y_max.
+        Bounds of each outline: x_min, y_min, x_max, y_max.
     is_lost : (n_site,) bool
-        Sites whose outline has no place in the map's plane.
+        Sites with a vertex outside the image circle.
     """
 
     grid: Grid
@@ -78,7 +78,7 @@ class Plan:
     is_lost: Bools
 
     def _pass(self, kernel: Callable[..., None], read: NDArray[Any], written: NDArray[Any], n_threads: int) -> None:
-        """Run a kernel over all bands of rows: bands write to different places, and none depends on ``n_threads``."""
+        """Run a kernel over all bands of rows, which write to disjoint elements."""
         n_y, n_x = self.grid.shape
         plan = (self.row_spans, self.row_weights, self.spans, self.weights, self.row_cuts, self.cuts, self.moments)
 
@@ -89,7 +89,11 @@ class Plan:
         each(band, range(0, n_y, self.rows_per_band), 1 if n_y * n_x <= SMALL_MAP else n_threads)
 
     def gather(self, cells: NDArray[Any], n_threads: int) -> Floats:
-        """Sum of weight x cell for every site, (n_site,), of one map (n_y, n_x) float32 or float64, C-contiguous."""
+        """
+        Return the sum of weight x cell for every site, (n_site,).
+
+        The map is (n_y, n_x) float32 or float64, C-contiguous.
+        """
         from foveasim.integrate import _kernels
 
         slots = np.zeros(int(self.first_slot[-1]))
@@ -101,7 +105,7 @@ class Plan:
         return sums
 
     def scatter(self, values: Floats, n_threads: int) -> Floats:
-        """Sum of weight x value of the site for every cell, (n_y, n_x): the transpose of :meth:`gather`."""
+        """Return the sum of weight x site value for every cell, (n_y, n_x): the adjoint of gather."""
         from foveasim.integrate import _kernels
 
         cells = np.zeros(self.grid.shape)
@@ -110,14 +114,18 @@ class Plan:
         return cells
 
     def matrix(self) -> csr_array[Any]:
-        """The plan as a sparse matrix (n_site, n_y * n_x), of overlaps in cells at first order; runs are written out."""
+        """
+        Return the plan as a sparse matrix (n_site, n_y * n_x) with expanded runs.
+
+        At first order the elements are the overlaps in cells.
+        """
         from scipy.sparse import coo_array
 
         from foveasim.integrate import _kernels
 
         n_partial, n_run = (self.spans[:, column].astype(np.int64) for column in (_kernels.N_PARTIAL, _kernels.N_RUN))
         n_cells = n_partial + n_run
-        # A span's k-th cell has its k-th weight, and every cell of the run the one after the partial ones.
+        # The k-th cell of a span has the k-th weight; all cells of the run have the weight after the partial weights.
         n_weights = n_partial + (n_run > 0)
         first_weight = np.cumsum(n_weights) - n_weights
         k = positions_in_runs(n_cells)
@@ -134,10 +142,10 @@ class Plan:
         return matrix
 
     def _gradients(self, slot_site: Ints) -> tuple[Floats, Ints, Ints]:
-        """What the cuts add to the matrix: its entries' weights, sites and cells."""
+        """Return the matrix entries of the cuts: weights, sites and cells."""
         slot, row, column = self.cuts.T.astype(np.int64)
         weights, sites, cells = [], [], []
-        # The neighbours (rows up, columns to the right), and the axis of their difference.
+        # Offsets of the neighbours (rows up, columns to the right), and the axis and sign of the difference.
         for up, right, axis, sign in ((0, 1, 0, 1), (0, -1, 0, -1), (1, 0, 1, 1), (-1, 0, 1, -1)):
             is_cut = self.moments[:, axis] != 0.0
             weights.append(sign * self.moments[is_cut, axis])
@@ -148,7 +156,7 @@ class Plan:
 
 
 class _Traced(NamedTuple):
-    """What tracing some sites gives (see ``_kernels``), and how much of it belongs to each row."""
+    """Traced spans and cuts of sites (see ``_kernels``), and their numbers per row."""
 
     spans: NDArray[np.int32]
     weights: Floats
@@ -167,10 +175,10 @@ def compile_plan(
     outlines: Callable[[int, int], Outlines], n_sites: int, grid: Grid, n_threads: int, order: int = 1
 ) -> Plan:
     """
-    Trace every outline on the grid, and put what it covers in the order of the grid's rows.
+    Trace every outline on the grid and sort the spans by the rows of the grid.
 
-    ``outlines(first, last)`` gives those of the sites from the first to before the last: they are asked for piece by piece, so
-    that what has just been carried is traced while it is in the cache, and never are all of them in memory.
+    ``outlines(first, last)`` returns the outlines of the sites ``first`` to ``last - 1``. It is called for one piece of the
+    layout at a time, so that undistorted outlines are traced while they are in the cache, and memory use is limited.
     """
     from foveasim.integrate import _kernels
 
@@ -181,7 +189,7 @@ def compile_plan(
         n_threads,
     )
 
-    # Where the next span of (piece, row) goes: behind all lower rows, and the same row of the pieces before.
+    # Position of the next span of (piece, row): after all lower rows, and after the same row of the previous pieces.
     row_spans, next_span = _starts([t.row_spans for t in traced], n_y)
     row_weights, next_weight = _starts([t.row_weights for t in traced], n_y)
     row_cuts, next_cut = _starts([t.row_cuts for t in traced], n_y)
@@ -226,7 +234,7 @@ def compile_plan(
 
 
 def _traced(outlines: Outlines, first_site: int, grid: Grid, order: int) -> _Traced:
-    """Trace some sites, the first of which is number ``first_site``."""
+    """Trace the sites from the index ``first_site`` on."""
     from foveasim.integrate import _kernels
 
     n_y, n_x = grid.shape
@@ -251,7 +259,7 @@ def _traced(outlines: Outlines, first_site: int, grid: Grid, order: int) -> _Tra
 
 
 def _starts(counts: list[NDArray[np.int64]], n_y: int) -> tuple[Ints, Ints]:
-    """Offsets of the rows (n_y + 1,), and of each piece within each row (n_piece, n_y)."""
+    """Return offsets of the rows (n_y + 1,) and of the pieces in each row (n_piece, n_y)."""
     by_piece = np.array(counts, dtype=np.int64).reshape(len(counts), n_y)
     offsets = np.concatenate(([0], np.cumsum(by_piece.sum(axis=0))))
     within = np.cumsum(by_piece, axis=0) - by_piece

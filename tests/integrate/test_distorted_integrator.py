@@ -1,4 +1,4 @@
-"""Outlines carried back through a lens: brute force agrees, light is conserved, nothing is lost but what gets no light."""
+"""Integration with undistorted outlines: brute force, conservation of power, sites outside the image circle."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ LAYOUTS = {
 
 
 def field(x_um, y_um):
-    """A smooth irradiance in the ideal plane."""
+    """Return a smooth irradiance in the ideal plane."""
     return 2.0 + np.sin(0.05 * x_um + 0.3) * np.cos(0.04 * y_um) + 0.01 * x_um
 
 
 def field_means(grid, n=3):
-    """Means over cells, by Gauss points."""
+    """Return means over cells by Gauss-Legendre quadrature."""
     nodes, weights = np.polynomial.legendre.leggauss(n)
     x, y = grid.x_um[np.newaxis, :], grid.y_um[:, np.newaxis]
     return sum(
@@ -38,7 +38,7 @@ def field_means(grid, n=3):
 
 
 def real_irradiance(lens, grid, *, density):
-    """What falls on the cells of the sensor plane: the ideal field there, times the Jacobian where the flux is kept."""
+    """Return the irradiance in the sensor plane: the ideal field, times the Jacobian determinant if flux is conserved."""
     x, y = np.meshgrid(grid.x_um, grid.y_um)
     points = np.stack((x.ravel(), y.ravel()), axis=1)
     h = 1e-4
@@ -51,15 +51,15 @@ def real_irradiance(lens, grid, *, density):
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_warping_a_finer_and_finer_map_tends_to_what_carried_outlines_give(name):
+def test_distorted_maps_converge_to_undistorted_outlines(name):
     layout = LAYOUTS[name]
     fine = fs.Grid.centred((1000, 1000), 0.14)
-    carried = fs.Integrator(layout, fine, distortion=BARREL)(field_means(fine))
+    undistorted = fs.Integrator(layout, fine, distortion=BARREL)(field_means(fine))
     errors = []
     for n in (48, 150, 600):
         grid = fs.Grid.centred((n, n), 120.0 / n)
         warped = fs.Integrator(layout, grid)(real_irradiance(BARREL, grid, density=False))
-        errors.append(float(np.abs(warped / carried - 1).max()))
+        errors.append(float(np.abs(warped / undistorted - 1).max()))
 
     assert errors[0] > 3 * errors[1]
     assert errors[1] > 3 * errors[2]
@@ -67,36 +67,36 @@ def test_warping_a_finer_and_finer_map_tends_to_what_carried_outlines_give(name)
 
 
 @pytest.mark.parametrize("name", ["hexagons", "rings", "quads"])
-def test_the_light_of_a_tiling_is_that_of_the_whole(name):
+def test_tiling_power_sums_to_union_power(name):
     layout = LAYOUTS[name]
-    whole = fs.Layout.from_polygons([shapely.coverage_union_all(layout.polygons())])
+    union = fs.Layout.from_polygons([shapely.coverage_union_all(layout.polygons())])
     cells = field_means(GRID)
     parts = fs.Integrator(layout, GRID, distortion=BARREL)(cells)
-    total = fs.Integrator(whole, GRID, distortion=BARREL)(cells)
+    total = fs.Integrator(union, GRID, distortion=BARREL)(cells)
 
     assert parts.sum() == pytest.approx(total[0], rel=1e-9)
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_a_lens_that_keeps_densities_shows_an_even_field_as_even(name):
+def test_conserving_density_preserves_uniform_field(name):
     layout = LAYOUTS[name]
-    even = fs.Integrator(layout, GRID, distortion=BARREL, conserve="density")(np.full(GRID.shape, 3.0))
+    density = fs.Integrator(layout, GRID, distortion=BARREL, conserve="density")(np.full(GRID.shape, 3.0))
     flux = fs.Integrator(layout, GRID, distortion=BARREL)(np.full(GRID.shape, 3.0))
 
-    np.testing.assert_allclose(even, 3.0 * layout.area_um2, rtol=1e-12)
+    np.testing.assert_allclose(density, 3.0 * layout.area_um2, rtol=1e-12)
     assert np.ptp(flux / layout.area_um2) > 0.05
 
 
-def test_a_lens_that_changes_nothing_changes_nothing():
+def test_ideal_lens_leaves_integrals_unchanged():
     for layout in LAYOUTS.values():
         plain = fs.Integrator(layout, GRID)
-        carried = fs.Integrator(layout, GRID, distortion=BrownConrady(focal_um=100.0))
-        np.testing.assert_allclose(carried(field_means(GRID)), plain(field_means(GRID)), rtol=1e-12)
-        assert carried.sites_outside_image_circle.size == 0
+        undistorted = fs.Integrator(layout, GRID, distortion=BrownConrady(focal_um=100.0))
+        np.testing.assert_allclose(undistorted(field_means(GRID)), plain(field_means(GRID)), rtol=1e-12)
+        assert undistorted.sites_outside_image_circle.size == 0
 
 
 @pytest.mark.parametrize("conserve", ["flux", "density"])
-def test_the_operator_its_transpose_and_its_matrix_are_one(conserve):
+def test_operator_adjoint_and_matrix_agree(conserve):
     layout = LAYOUTS["hexagons"]
     integrator = fs.Integrator(layout, GRID, distortion=BARREL, conserve=conserve)
     cells = field_means(GRID)
@@ -108,23 +108,23 @@ def test_the_operator_its_transpose_and_its_matrix_are_one(conserve):
 
 @settings(deadline=None, derandomize=True, max_examples=12)
 @given(x_um=st.floats(-40, 40), y_um=st.floats(-40, 40))
-def test_a_point_of_light_is_seen_where_the_lens_puts_it(x_um, y_um):
-    """Of an asymmetric lens, in all four quadrants: left is left, and up is up."""
+def test_point_source_appears_at_distorted_position(x_um, y_um):
+    """An asymmetric lens, points in all four quadrants: neither axis is mirrored."""
     layout = fs.layout.grid(n_x=100, n_y=100, pitch_um=1.0)
     grid = fs.Grid.centred((400, 400), 0.3)
     column, row = (int(np.floor((v + 60.0) / 0.3)) for v in (x_um, y_um))
     cells = np.zeros(grid.shape)
     cells[row, column] = 1.0
     lens = BrownConrady(focal_um=100.0, k1=-0.2, p1=0.1, p2=-0.05)
-    seen = fs.Integrator(layout, grid, distortion=lens)(cells)
-    place_um = lens.distort([[grid.x_um[column], grid.y_um[row]]])[0]
-    centre_um = (layout.centroid_um * seen[:, np.newaxis]).sum(axis=0) / seen.sum()
+    power = fs.Integrator(layout, grid, distortion=lens)(cells)
+    expected_um = lens.distort([[grid.x_um[column], grid.y_um[row]]])[0]
+    centroid_um = (layout.centroid_um * power[:, np.newaxis]).sum(axis=0) / power.sum()
 
-    assert seen.sum() == pytest.approx(grid.cell_area_um2, rel=1e-9)
-    assert np.hypot(*(centre_um - place_um)) < 0.8
+    assert power.sum() == pytest.approx(grid.cell_area_um2, rel=1e-9)
+    assert np.hypot(*(centroid_um - expected_um)) < 0.8
 
 
-def test_sites_that_get_no_light_receive_nothing_and_are_told():
+def test_sites_outside_image_circle_are_reported():
     layout = fs.layout.grid(n_x=30, n_y=30, pitch_um=10.0)
     lens = Fisheye(projection="orthographic", focal_um=100.0)
     grid = fs.Grid.centred((400, 400), 4.0)
@@ -139,7 +139,7 @@ def test_sites_that_get_no_light_receive_nothing_and_are_told():
     assert np.all(power[inner] > layout.area_um2[inner])
 
 
-def test_a_camera_has_a_lens_of_any_model():
+def test_camera_accepts_any_lens_model():
     layout = fs.layout.hexagonal(n_columns=12, n_rows=12, pitch_um=8.0)
     optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)
     scene = fs.Scene.flat(
@@ -147,16 +147,16 @@ def test_a_camera_has_a_lens_of_any_model():
     )
     plain = fs.Camera(optics=optics, sensor=fs.Sensor(layout))
     lens = Scaramuzza(a=(3600.0, -2e-5, 0.0, 0.0), pixel_um=2.2, focal_um=8000.0)
-    bent = fs.Camera(optics=optics, sensor=fs.Sensor(layout), distortion=lens)
-    captures = [camera.capture(scene, exposure_s=0.01, seed=1) for camera in (plain, bent)]
+    distorted = fs.Camera(optics=optics, sensor=fs.Sensor(layout), distortion=lens)
+    captures = [camera.capture(scene, exposure_s=0.01, seed=1) for camera in (plain, distorted)]
 
     assert captures[1].settings["distortion"]["a"] == list(lens.a)
     assert captures[0].settings["distortion"] is None
-    assert bent.distortion == lens
+    assert distorted.distortion == lens
     assert not np.allclose(captures[0].expected_e, captures[1].expected_e, rtol=1e-6)
 
 
-def test_a_camera_warns_of_sites_that_its_lens_leaves_dark():
+def test_camera_warns_of_sites_outside_image_circle():
     layout = fs.layout.hexagonal(n_columns=12, n_rows=12, pitch_um=8.0)
     optics = fs.Optics(focal_length_mm=8.0, f_number=2.8)
     scene = fs.Scene.flat(
@@ -176,6 +176,6 @@ def test_a_camera_warns_of_sites_that_its_lens_leaves_dark():
         ({"distortion": BARREL, "conserve": "light"}, "'conserve' must be one of 'flux', 'density', got 'light'"),
     ],
 )
-def test_distortions_that_cannot_be_are_refused(options, message):
+def test_integrator_rejects_invalid_distortion(options, message):
     with pytest.raises(ParameterError, match=message):
         fs.Integrator(LAYOUTS["hexagons"], GRID, **options)

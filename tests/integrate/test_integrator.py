@@ -1,4 +1,4 @@
-"""The integrator against clipped polygons, closed forms, conservation and symmetry."""
+"""Integrator: comparison with clipped polygons, closed forms, conservation and symmetry."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from foveasim.integrate import _plan
 SHAPE = (7, 9)
 GRID = fs.Grid(SHAPE, 1.0)
 MAP = np.random.default_rng(5).uniform(0.5, 1.5, SHAPE)
-#: Exact up to this fraction of the result.
+#: Relative tolerance of exact results.
 EXACT = 1e-11
 
 TILINGS = {
@@ -46,14 +46,14 @@ def weights_of(polygon, grid=GRID):
 
 
 @pytest.mark.parametrize("name", ZOO)
-def test_zoo_weights_are_those_of_rational_clipping(name):
+def test_zoo_weights_equal_rational_clipping(name):
     expected = exact_weights(ZOO[name], SHAPE)
 
     assert weights_of(ZOO[name]) == pytest.approx(expected, rel=EXACT, abs=1e-15)
 
 
 @pytest.mark.parametrize("name", ZOO)
-def test_zoo_sums_are_those_of_rational_clipping(name):
+def test_zoo_sums_equal_rational_clipping(name):
     expected = float((exact_weights(ZOO[name], SHAPE) * MAP).sum())
     layout = fs.Layout.from_polygons([ZOO[name]])
 
@@ -62,7 +62,7 @@ def test_zoo_sums_are_those_of_rational_clipping(name):
 
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(polygon=polygons(SHAPE))
-def test_random_polygons_agree_with_rational_clipping(polygon):
+def test_random_polygons_equal_rational_clipping(polygon):
     expected = float((exact_weights(polygon, SHAPE) * MAP).sum())
     layout = fs.Layout.from_polygons([polygon])
 
@@ -71,21 +71,21 @@ def test_random_polygons_agree_with_rational_clipping(polygon):
 
 @settings(max_examples=2500, deadline=None, derandomize=True)
 @given(polygon=polygons(SHAPE))
-def test_random_polygons_agree_with_clipping_by_shapely(polygon):
+def test_random_polygons_agree_with_shapely_clipping(polygon):
     expected = float((shapely_weights(polygon, SHAPE) * MAP).sum())
     layout = fs.Layout.from_polygons([polygon])
 
     assert fs.Integrator(layout, GRID)(MAP)[0] == pytest.approx(expected, rel=EXACT, abs=0.0)
 
 
-def test_half_overlapped_square_has_its_textbook_weights():
+def test_half_overlapped_square_has_textbook_weights():
     weights = weights_of(shapely.box(0.5, 0.5, 2.5, 2.5), fs.Grid((3, 3), 1.0))
 
     assert weights.tolist() == [[0.25, 0.5, 0.25], [0.5, 1.0, 0.5], [0.25, 0.5, 0.25]]
 
 
 @pytest.mark.parametrize("name", TILINGS)
-def test_weights_of_a_tiling_sum_to_the_cell_area_in_every_covered_cell(name):
+def test_tiling_weights_sum_to_cell_area(name):
     grid = fs.Grid((40, 40), 0.317, (-0.5 * 40 * 0.317, -0.5 * 40 * 0.317))
     layout = TILINGS[name]
     cell_sums = np.asarray(fs.Integrator(layout, grid).weights().sum(axis=0)).reshape(grid.shape)
@@ -98,7 +98,7 @@ def test_weights_of_a_tiling_sum_to_the_cell_area_in_every_covered_cell(name):
 
 
 @pytest.mark.parametrize("name", TILINGS)
-def test_rows_of_the_operator_sum_to_the_area_on_the_grid(name):
+def test_operator_rows_sum_to_site_area(name):
     layout = TILINGS[name]
     integrator = fs.Integrator(layout, fs.Grid((60, 60), 0.31, (-9.3, -9.3)))
     row_sums = np.asarray(integrator.weights().sum(axis=1)).ravel()
@@ -108,9 +108,9 @@ def test_rows_of_the_operator_sum_to_the_area_on_the_grid(name):
 
 
 @pytest.mark.parametrize("name", TILINGS)
-def test_uniform_light_gives_each_site_its_area_on_the_map(name):
+def test_uniform_map_yields_covered_site_area(name):
     layout = TILINGS[name]
-    grid = fs.Grid((23, 31), 0.25, (-2.0, -1.5))  # much of every layout lies off it
+    grid = fs.Grid((23, 31), 0.25, (-2.0, -1.5))  # covers every layout only partly
     on_map_um2 = shapely.area(shapely.intersection(layout.polygons(), shapely.box(*grid.bounds_um)))
     integrator = fs.Integrator(layout, grid)
 
@@ -119,13 +119,13 @@ def test_uniform_light_gives_each_site_its_area_on_the_map(name):
 
 
 @pytest.mark.parametrize("name", ZOO)
-def test_the_map_and_the_matrix_give_the_same(name):
+def test_matrix_product_equals_integrator_call(name):
     integrator = fs.Integrator(fs.Layout.from_polygons([ZOO[name]]), GRID)
 
     assert integrator(MAP) == pytest.approx(integrator.weights() @ MAP.ravel(), rel=1e-14, abs=1e-15)
 
 
-def test_spread_is_the_transpose():
+def test_spread_equals_matrix_transpose():
     integrator = fs.Integrator(TILINGS["log_polar"], fs.Grid((70, 50), 0.2, (-5.0, -7.0)))
     values = np.random.default_rng(1).normal(size=(2, integrator.n_sites))
 
@@ -133,18 +133,18 @@ def test_spread_is_the_transpose():
 
 
 @pytest.mark.parametrize("name", ["star", "two holes in a row", "off to the left and right", "U shape"])
-def test_winding_and_start_vertex_change_nothing(name):
+def test_weights_ignore_winding_and_start_vertex(name):
     polygon = ZOO[name]
-    turned = shapely.Polygon(
+    reordered = shapely.Polygon(
         np.roll(polygon.exterior.coords[:-1], 2, axis=0)[::-1],
         [np.roll(h.coords[:-1], 1, axis=0) for h in polygon.interiors],
     )
 
-    assert weights_of(turned) == pytest.approx(weights_of(polygon), abs=1e-15)
+    assert weights_of(reordered) == pytest.approx(weights_of(polygon), abs=1e-15)
 
 
 @pytest.mark.parametrize("name", ["star", "two holes in a row", "comb with teeth in one row", "ring"])
-def test_shifting_by_whole_cells_shifts_the_weights(name):
+def test_integer_cell_shift_shifts_weights(name):
     shifted = shapely.transform(ZOO[name], lambda xy: xy + np.array([16.0, 8.0]))
     grid = fs.Grid((15, 25), 1.0)
 
@@ -152,46 +152,47 @@ def test_shifting_by_whole_cells_shifts_the_weights(name):
 
 
 @pytest.mark.parametrize("name", ["star", "L shape", "hole", "long sliver along a row"])
-def test_a_quarter_turn_turns_the_weights(name):
-    turned = shapely.transform(ZOO[name], lambda xy: np.stack((7.0 - xy[:, 1], xy[:, 0]), axis=1))
+def test_quarter_rotation_rotates_weights(name):
+    rotated = shapely.transform(ZOO[name], lambda xy: np.stack((7.0 - xy[:, 1], xy[:, 0]), axis=1))
 
-    assert weights_of(turned, fs.Grid((9, 7), 1.0)) == pytest.approx(np.rot90(weights_of(ZOO[name]), -1), abs=1e-14)
+    assert weights_of(rotated, fs.Grid((9, 7), 1.0)) == pytest.approx(np.rot90(weights_of(ZOO[name]), -1), abs=1e-14)
 
 
 @pytest.mark.parametrize("name", ["star", "circle", "U shape", "hole"])
-def test_the_parts_of_a_split_site_add_up(name):
+def test_split_site_parts_add_up(name):
     knife = shapely.Polygon([(-20, -20), (30, -20), (30, 4.1), (-20, 2.3)])
     lower = shapely.get_parts(shapely.intersection(ZOO[name], knife))
     upper = shapely.get_parts(shapely.difference(ZOO[name], knife))
-    whole = fs.Integrator(fs.Layout.from_polygons([ZOO[name]]), GRID)(MAP)[0]
+    unsplit = fs.Integrator(fs.Layout.from_polygons([ZOO[name]]), GRID)(MAP)[0]
+    parts = fs.Integrator(fs.Layout.from_polygons([*lower, *upper]), GRID)(MAP)
 
-    assert fs.Integrator(fs.Layout.from_polygons([*lower, *upper]), GRID)(MAP).sum() == pytest.approx(whole, rel=EXACT)
+    assert parts.sum() == pytest.approx(unsplit, rel=EXACT)
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)
 @given(
     pitch_um=st.floats(2.0, 1e3), x0=st.floats(-1e4, 1e4), y0=st.floats(-1e4, 1e4), name=st.sampled_from(sorted(ZOO))
 )
-def test_pitch_and_origin_only_scale_and_move(pitch_um, x0, y0, name):
+def test_pitch_and_origin_scale_and_translate(pitch_um, x0, y0, name):
     moved = shapely.transform(ZOO[name], lambda xy: xy * pitch_um + np.array([x0, y0]))
     layout = fs.Layout.from_polygons([moved])
-    # Corners at |x0| have lost |x0| / pitch x 2**-53 of a cell.
-    lost = 2.0**-50 * (1 + max(abs(x0), abs(y0)) / pitch_um)
+    # The rounding error of vertices at |x0| is |x0| / pitch x 2**-53 of a cell.
+    rounding = 2.0**-50 * (1 + max(abs(x0), abs(y0)) / pitch_um)
     expected = fs.Integrator(fs.Layout.from_polygons([ZOO[name]]), GRID)(MAP)[0] * pitch_um**2
 
     got = fs.Integrator(layout, fs.Grid(SHAPE, pitch_um, (x0, y0)))(MAP)[0]
 
-    assert got == pytest.approx(expected, rel=EXACT, abs=lost * ZOO[name].length * 4 * pitch_um**2 + 1e-300)
+    assert got == pytest.approx(expected, rel=EXACT, abs=rounding * ZOO[name].length * 4 * pitch_um**2 + 1e-300)
 
 
-def test_float32_maps_are_read_as_they_are():
+def test_float32_map_agrees_with_float64():
     integrator = fs.Integrator(TILINGS["hexagonal"], fs.Grid((50, 50), 0.25, (-6.0, -6.0)))
     cells = np.random.default_rng(2).random((50, 50), dtype=np.float32)
 
     assert integrator(cells) == pytest.approx(integrator(cells.astype(np.float64)), rel=1e-14, abs=1e-16)
 
 
-def test_many_bands_are_done_one_by_one():
+def test_leading_dimensions_are_integrated_independently():
     integrator = fs.Integrator(TILINGS["zones"], fs.Grid((50, 50), 0.25, (-6.0, -6.0)))
     cells = np.random.default_rng(3).random((2, 3, 50, 50))
 
@@ -204,20 +205,20 @@ def test_many_bands_are_done_one_by_one():
 @pytest.mark.parametrize(
     "view", [np.asfortranarray, lambda a: a[::-1][::-1], lambda a: np.repeat(a, 2, axis=1)[:, ::2]]
 )
-def test_maps_of_any_memory_order_give_the_same(view):
+def test_result_is_independent_of_memory_order(view):
     integrator = fs.Integrator(fs.Layout.from_polygons(list(ZOO.values())), GRID)
 
     assert np.array_equal(integrator(view(MAP)), integrator(MAP))
 
 
-def test_whole_numbers_are_taken_as_a_map():
+def test_integer_map_is_accepted():
     layout = fs.Layout.from_polygons([shapely.box(0, 0, 2, 2)])
 
     assert fs.Integrator(layout, GRID)(np.full(SHAPE, 7, np.int32))[0] == 28.0
 
 
 @pytest.mark.parametrize("n_threads", [2, 3, 8])
-def test_results_do_not_depend_on_the_number_of_threads(n_threads):
+def test_results_are_bit_identical_across_threads(n_threads):
     grid = fs.Grid.centred((700, 900), 0.5)
     layout = fs.layout.log_polar(n_sectors=120, r_min_um=3.0, r_max_um=160.0)
     cells = np.random.default_rng(4).random(grid.shape, dtype=np.float32)
@@ -229,7 +230,7 @@ def test_results_do_not_depend_on_the_number_of_threads(n_threads):
     assert np.array_equal(many.spread(np.arange(layout.n_sites)), one.spread(np.arange(layout.n_sites)))
 
 
-def test_pieces_of_work_do_not_change_the_plan(monkeypatch):
+def test_result_is_independent_of_piece_size(monkeypatch):
     grid = fs.Grid.centred((300, 300), 0.1)
     cells = np.random.default_rng(6).random(grid.shape)
     expected = fs.Integrator(TILINGS["log_polar"], grid)(cells)
@@ -241,7 +242,7 @@ def test_pieces_of_work_do_not_change_the_plan(monkeypatch):
     assert fs.Integrator(TILINGS["log_polar"], grid)(cells) == pytest.approx(expected, rel=1e-13)
 
 
-def test_a_bright_neighbour_costs_a_dark_site_no_digits():
+def test_dark_site_is_precise_near_bright_cells():
     cells = np.full((8, 400), 1.0)
     cells[:, :200] = 1e12
     layout = fs.Layout.from_polygons([shapely.box(300.25, 2.25, 380.5, 6.5)])
@@ -249,7 +250,7 @@ def test_a_bright_neighbour_costs_a_dark_site_no_digits():
     assert fs.Integrator(layout, fs.Grid((8, 400), 1.0))(cells)[0] == pytest.approx(80.25 * 4.25, rel=1e-14)
 
 
-def test_a_nan_stays_with_the_sites_that_see_it():
+def test_nan_reaches_overlapping_sites_only():
     cells = np.ones((10, 200))
     cells[5, 50] = np.nan
     layout = fs.Layout.from_rectangles([[50.5, 5.5], [150.0, 5.5]], [3.0, 80.0])
@@ -259,7 +260,7 @@ def test_a_nan_stays_with_the_sites_that_see_it():
     assert power[1] == pytest.approx(80 * 10)
 
 
-def test_a_nan_beside_a_site_is_none_of_its_business():
+def test_adjacent_nan_does_not_affect_site():
     layout = fs.Layout.from_rectangles([[1.5, 1.5]], 1.0)
     integrator = fs.Integrator(layout, fs.Grid((3, 3), 1.0))
     cells = np.full((3, 3), np.nan)
@@ -269,27 +270,27 @@ def test_a_nan_beside_a_site_is_none_of_its_business():
     assert integrator.weights().nnz == 1
 
 
-@pytest.mark.parametrize("turn", [0, 180])
-def test_a_comb_of_a_thousand_fingers_is_exact_either_way_up(turn):
-    """Many edges cross each row, in ascending order of columns one way up and in descending the other."""
+@pytest.mark.parametrize("angle_deg", [0, 180])
+def test_comb_with_many_edges_is_exact(angle_deg):
+    """Many edges cross each row, in ascending column order at 0° and in descending order at 180°."""
     x = np.arange(1000) * 7.0 + 1.3
     finger = np.array([[0, 90.2], [3.1, 90.2], [3.1, 5.7], [7.0, 5.7]])
     teeth = (finger + np.stack((x, np.zeros(1000)), axis=1)[:, np.newaxis]).reshape(-1, 2)
     ring = np.concatenate((teeth, [[x[-1] + 7.0, 2.5], [1.3, 2.5]]))
-    comb = fs.Layout.from_polygons([shapely.Polygon(ring)]).rotate(turn, (3510.0, 50.0))
+    comb = fs.Layout.from_polygons([shapely.Polygon(ring)]).rotate(angle_deg, (3510.0, 50.0))
     integrator = fs.Integrator(comb, fs.Grid((100, 7020), 1.0))
 
-    # A back of 3.2 and fingers of 84.5, each 3.1 wide.
+    # Back of height 3.2 and fingers of height 84.5 and width 3.1.
     assert integrator(np.ones((100, 7020)))[0] == pytest.approx(1000 * (7.0 * 3.2 + 3.1 * 84.5), rel=1e-11)
 
 
-def test_an_almost_vertical_edge_is_vertical():
+def test_almost_vertical_edge_counts_as_vertical():
     layout = fs.Layout.from_polygons([shapely.Polygon([(0, 0), (1, 0), (1, 1), (1e-310, 1)])])
 
     assert fs.Integrator(layout, fs.Grid((2, 2), 1.0))(np.ones((2, 2)))[0] == 1.0
 
 
-def test_many_edges_in_a_row_leave_nothing_outside():
+def test_rounding_adds_no_weights_outside():
     angle = np.linspace(0, 2 * np.pi, 100_000, endpoint=False)
     ring = np.stack((1002.0 + 2.0 * np.cos(angle), 0.5 + 0.4 * np.sin(angle)), axis=1)
     layout = fs.Layout.from_polygons([shapely.Polygon(ring)])
@@ -299,7 +300,7 @@ def test_many_edges_in_a_row_leave_nothing_outside():
     assert weights.sum() == pytest.approx(np.pi * 0.8, rel=1e-8)
 
 
-def test_small_sites_far_from_the_origin_are_wholly_covered():
+def test_small_sites_far_away_are_covered():
     rng = np.random.default_rng(8)
     grid = fs.Grid((400, 8000), 0.37, (-1500.0, -100.0))
     centre = rng.uniform((-1499, -99), (1400, 40), (2000, 2))
@@ -307,34 +308,34 @@ def test_small_sites_far_from_the_origin_are_wholly_covered():
     assert fs.Integrator(fs.Layout.from_rectangles(centre, 0.01), grid).uncovered_um2.max() == 0.0
 
 
-def test_a_clockwise_outline_is_refused():
+def test_integrator_rejects_clockwise_outline():
     layout = fs.Layout(np.array([[0.0, 0], [0, 1], [1, 1], [1, 0]]), np.array([0, 4]), np.array([0, 1]))
 
-    with pytest.raises(GeometryError, match="site 0 has no positive area: its outline must be counter-clockwise"):
+    with pytest.raises(GeometryError, match="the outline of site 0 must be counter-clockwise with a positive area"):
         fs.Integrator(layout, GRID)
 
 
 @pytest.mark.parametrize(
     ("layout", "grid", "message"),
     [
-        (GRID, TILINGS["grid"], "'layout' must be a Layout, or packed rings, got a Grid"),
-        ([shapely.box(0, 0, 1, 1)], GRID, "'layout' must be a Layout, or packed rings, got a list"),
+        (GRID, TILINGS["grid"], "'layout' must be a Layout or packed rings, got a Grid"),
+        ([shapely.box(0, 0, 1, 1)], GRID, "'layout' must be a Layout or packed rings, got a list"),
         (TILINGS["grid"], (7, 9), "'grid' must be a Grid, got a tuple"),
     ],
 )
-def test_swapped_or_wrong_arguments_are_refused(layout, grid, message):
+def test_integrator_rejects_swapped_or_wrong_arguments(layout, grid, message):
     with pytest.raises(ParameterError, match=message):
         fs.Integrator(layout, grid)
 
 
-def test_thousands_of_edges_in_one_cell_add_up():
+def test_many_edges_in_one_cell_add_up():
     ring = shapely.Point(3.5, 3.5).buffer(0.4, quad_segs=3000)
 
     assert weights_of(ring).sum() == pytest.approx(ring.area, rel=1e-12)
     assert np.count_nonzero(weights_of(ring)) == 1
 
 
-def test_a_layout_without_sites_gives_nothing():
+def test_layout_without_sites_yields_empty_result():
     empty = TILINGS["grid"][np.zeros(TILINGS["grid"].n_sites, bool)]
     integrator = fs.Integrator(empty, GRID)
 
@@ -347,16 +348,16 @@ def test_a_layout_without_sites_gives_nothing():
     [
         (np.ones((7, 8)), r"'power_map' must have the shape .* \(7, 9\), got \(7, 8\)"),
         (np.ones(63), r"'power_map' must have the shape"),
-        (np.ones(SHAPE, complex), r"'power_map' must have real numbers, got the type complex128"),
-        (np.full(SHAPE, "a"), r"'power_map' must have real numbers"),
+        (np.ones(SHAPE, complex), r"'power_map' must contain real numbers, got the dtype complex128"),
+        (np.full(SHAPE, "a"), r"'power_map' must contain real numbers"),
     ],
 )
-def test_a_map_that_does_not_fit_is_refused_in_one_sentence(cells, message):
+def test_integrator_rejects_mismatched_map(cells, message):
     with pytest.raises(ParameterError, match=message):
         fs.Integrator(TILINGS["grid"], GRID)(cells)
 
 
 @pytest.mark.parametrize("n_threads", [0, -1, 1.5, "two"])
-def test_a_number_of_threads_that_cannot_be_is_refused(n_threads):
+def test_integrator_rejects_invalid_thread_count(n_threads):
     with pytest.raises(ParameterError, match="'n_threads' must be"):
         fs.Integrator(TILINGS["grid"], GRID, n_threads=n_threads)

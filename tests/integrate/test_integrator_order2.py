@@ -19,7 +19,7 @@ from foveasim.errors import ParameterError
 SHAPE = (7, 9)
 GRID = fs.Grid(SHAPE, 1.0)
 MAP = np.random.default_rng(5).uniform(0.5, 1.5, SHAPE)
-#: A field a + b x + c y that is positive on the map.
+#: Coefficients of a field a + b x + c y that is positive on the map.
 LINEAR = (20.0, 1.3, -2.1)
 EXACT = 1e-11
 BARREL = BrownConrady(focal_um=200.0, k1=-0.12, k2=0.02, p1=0.03, p2=-0.02)
@@ -41,24 +41,24 @@ def weights_of(polygon, grid=GRID):
     return second(polygon, grid).weights().toarray().reshape(grid.shape)
 
 
-# -- the twin: rational clipping ---------------------------------------------------------------------------------------
+# -- reference implementation: rational clipping ------------------------------------------------------------------------
 
 
 def clip(ring, axis, bound, side):
-    """Part of a ring on one side of a line (Sutherland and Hodgman), in rational numbers."""
-    kept = []
+    """Clip a ring to one side of a line (Sutherland and Hodgman) in rational arithmetic."""
+    clipped = []
     for a, b in pairwise([*ring, ring[0]] if ring else []):
         a_in, b_in = side * (a[axis] - bound) >= 0, side * (b[axis] - bound) >= 0
         if a_in:
-            kept.append(a)
+            clipped.append(a)
         if a_in != b_in:
             t = (bound - a[axis]) / (b[axis] - a[axis])
-            kept.append((a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])))
-    return kept
+            clipped.append((a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])))
+    return clipped
 
 
 def integrals(ring):
-    """∬ 1, ∬ x and ∬ y over a ring, positive whatever its winding."""
+    """Return ∬ 1, ∬ x and ∬ y over a ring, independent of its winding."""
     area = x_sum = y_sum = Fraction(0)
     for a, b in pairwise([*ring, ring[0]] if ring else []):
         cross = a[0] * b[1] - b[0] * a[1]
@@ -69,7 +69,7 @@ def integrals(ring):
 
 
 def exact_integrals(polygon, bands):
-    """The same over a polygon clipped to rectangles (x0, y0, x1, y1), one row of three each."""
+    """Return the same integrals over a polygon clipped to rectangles (x0, y0, x1, y1)."""
     rings = [
         [(Fraction(float(x)), Fraction(float(y))) for x, y in ring.coords[:-1]]
         for ring in (polygon.exterior, *polygon.interiors)
@@ -85,7 +85,7 @@ def exact_integrals(polygon, bands):
 
 
 def linear_integral(polygon, shape=SHAPE, field=LINEAR):
-    """∬ a + b x + c y over the part of a polygon on a map of unit cells."""
+    """Return ∬ a + b x + c y over the part of a polygon on a map of unit cells."""
     ((area, x_sum, y_sum),) = exact_integrals(polygon, [(0, 0, shape[1], shape[0])])
     a, b, c = map(Fraction, field)
     return float(a * area + b * x_sum + c * y_sum)
@@ -96,8 +96,8 @@ def linear_means(shape=SHAPE, field=LINEAR):
     return field[0] + field[1] * x + field[2] * y
 
 
-def slow_second_order(polygon, cells):
-    """Mean and gradient of every cell over its part of the polygon, cell by cell."""
+def second_order_by_clipping(polygon, cells):
+    """Integrate mean and gradient of every cell over its part of the polygon, cell by cell."""
     gy, gx = np.gradient(cells)
     at = [(iy, ix) for iy in range(cells.shape[0]) for ix in range(cells.shape[1])]
     parts = exact_integrals(polygon, [(ix, iy, ix + 1, iy + 1) for iy, ix in at])
@@ -108,7 +108,7 @@ def slow_second_order(polygon, cells):
     )
 
 
-# -- exact for linear fields -------------------------------------------------------------------------------------------
+# -- linear fields -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ZOO)
@@ -123,19 +123,19 @@ def test_linear_fields_are_exact_over_random_polygons(polygon):
 
 
 @pytest.mark.parametrize("name", ZOO)
-def test_any_map_gives_what_clipping_cell_by_cell_gives(name):
-    assert second(ZOO[name])(MAP)[0] == pytest.approx(slow_second_order(ZOO[name], MAP), rel=EXACT, abs=1e-15)
+def test_random_map_equals_clipping_over_zoo(name):
+    assert second(ZOO[name])(MAP)[0] == pytest.approx(second_order_by_clipping(ZOO[name], MAP), rel=EXACT, abs=1e-15)
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(polygon=polygons(SHAPE))
-def test_any_map_gives_what_clipping_gives_over_random_polygons(polygon):
-    assert second(polygon)(MAP)[0] == pytest.approx(slow_second_order(polygon, MAP), rel=EXACT, abs=1e-15)
+def test_random_map_equals_clipping_over_polygons(polygon):
+    assert second(polygon)(MAP)[0] == pytest.approx(second_order_by_clipping(polygon, MAP), rel=EXACT, abs=1e-15)
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(polygon=polygons((2, 2)))
-def test_the_smallest_map_that_has_gradients_is_exact(polygon):
+def test_two_by_two_map_is_exact(polygon):
     got = second(polygon, fs.Grid((2, 2), 1.0))(linear_means((2, 2)))[0]
 
     assert got == pytest.approx(linear_integral(polygon, (2, 2)), rel=EXACT, abs=0.0)
@@ -147,14 +147,14 @@ def test_the_smallest_map_that_has_gradients_is_exact(polygon):
 @pytest.mark.parametrize(
     "name", ["star", "off to the left and right", "tiny triangle inside one cell", "long sliver along a row"]
 )
-def test_maps_of_one_row_or_column_are_exact_for_fields_along_it(shape, field, name):
+def test_single_row_or_column_is_exact(shape, field, name):
     for dx, dy in ((0.0, 0.0), (0.0, -3.2), (-4.4, 0.0), (-4.3, -3.1)):
         polygon = shapely.transform(ZOO[name], lambda xy, d=(dx, dy): xy + np.array(d))
         got = second(polygon, fs.Grid(shape, 1.0))(linear_means(shape, field))[0]
         assert got == pytest.approx(linear_integral(polygon, shape, field), rel=EXACT, abs=1e-15)
 
 
-def test_two_parts_that_overlap_count_twice():
+def test_overlapping_rings_count_twice():
     a, b = shapely.box(1.2, 1.3, 5.4, 4.6), shapely.Polygon([(3.1, 2.2), (7.7, 2.9), (4.2, 6.4)])
     rings = fs.Layout.from_polygons([a, b])
     # Two outlines as one site: the constructor would reject the second, which is not a hole.
@@ -166,25 +166,25 @@ def test_two_parts_that_overlap_count_twice():
 
 
 @pytest.mark.parametrize("order", [1, 2])
-def test_a_cell_of_no_weight_may_have_moments(order):
-    """A bow tie covers cell [3, 4] with two equal triangles, one of which counts negative."""
+def test_cell_without_weight_can_have_moments(order):
+    """A self-intersecting outline covers cell [3, 4] with two equal triangles of opposite sign."""
     ring = np.array([[2.0, 1.0], [6.0, 1.0], [6.0, 3.0], [4.2, 3.0], [4.8, 4.0], [4.2, 4.0], [4.8, 3.0], [2.0, 3.0]])
     layout = fs.Layout(ring, np.array([0, 8]), np.array([0, 1]))
     right = [shapely.box(2, 1, 6, 3), shapely.Polygon([(4.5, 3.5), (4.8, 4), (4.2, 4)])]
     left = shapely.Polygon([(4.2, 3), (4.8, 3), (4.5, 3.5)])
-    seen = {
+    expected = {
         1: linear_integral(shapely.box(2, 1, 6, 3)),
         2: sum(linear_integral(p) for p in right) - linear_integral(left),
     }
 
-    assert fs.Integrator(layout, GRID, order=order)(linear_means())[0] == pytest.approx(seen[order], rel=EXACT)
+    assert fs.Integrator(layout, GRID, order=order)(linear_means())[0] == pytest.approx(expected[order], rel=EXACT)
 
 
 # -- conservation and symmetry -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", TILINGS)
-def test_a_tiling_conserves_the_light_of_the_map(name):
+def test_tiling_conserves_power_of_map(name):
     grid = fs.Grid((23, 31), 0.1, (-1.5, -1.1))
     cells = np.random.default_rng(3).random(grid.shape)
     integrator = fs.Integrator(TILINGS[name], grid, order=2)
@@ -194,7 +194,7 @@ def test_a_tiling_conserves_the_light_of_the_map(name):
 
 
 @pytest.mark.parametrize("name", TILINGS)
-def test_moments_of_a_tiling_sum_to_zero_in_every_cell(name):
+def test_tiling_moments_sum_to_zero(name):
     grid = fs.Grid((23, 31), 0.1, (-1.5, -1.1))
     plan = fs.Integrator(TILINGS[name], grid, order=2)._plan
     sums = np.zeros((*grid.shape, 2))
@@ -205,7 +205,7 @@ def test_moments_of_a_tiling_sum_to_zero_in_every_cell(name):
 
 
 @pytest.mark.parametrize("name", [*TILINGS, "zoo"])
-def test_overlaps_are_those_of_first_order_to_the_bit(name):
+def test_overlaps_are_bit_identical_to_first_order(name):
     layout = fs.Layout.from_polygons(list(ZOO.values())) if name == "zoo" else TILINGS[name]
     one, two = (fs.Integrator(layout, fs.Grid((40, 40), 0.3, (-6.0, -6.0)), order=order)._plan for order in (1, 2))
 
@@ -215,18 +215,18 @@ def test_overlaps_are_those_of_first_order_to_the_bit(name):
 
 
 @pytest.mark.parametrize("name", ["star", "two holes in a row", "off to the left and right", "U shape"])
-def test_winding_and_start_vertex_change_nothing(name):
+def test_weights_ignore_winding_and_start_vertex(name):
     polygon = ZOO[name]
-    turned = shapely.Polygon(
+    reordered = shapely.Polygon(
         np.roll(polygon.exterior.coords[:-1], 2, axis=0)[::-1],
         [np.roll(h.coords[:-1], 1, axis=0) for h in polygon.interiors],
     )
 
-    assert weights_of(turned) == pytest.approx(weights_of(polygon), abs=1e-15)
+    assert weights_of(reordered) == pytest.approx(weights_of(polygon), abs=1e-15)
 
 
 @pytest.mark.parametrize("name", ["star", "two holes in a row", "comb with teeth in one row", "ring"])
-def test_shifting_by_whole_cells_shifts_the_weights(name):
+def test_integer_cell_shift_shifts_weights(name):
     grid = fs.Grid((25, 35), 1.0)
     near, far = (shapely.transform(ZOO[name], lambda xy, d=d: xy + np.array(d)) for d in ((2.0, 3.0), (18.0, 11.0)))
 
@@ -234,14 +234,14 @@ def test_shifting_by_whole_cells_shifts_the_weights(name):
 
 
 @pytest.mark.parametrize("name", ["star", "L shape", "hole", "long sliver along a row", "off to the left and right"])
-def test_a_quarter_turn_turns_the_weights(name):
-    turned = shapely.transform(ZOO[name], lambda xy: np.stack((7.0 - xy[:, 1], xy[:, 0]), axis=1))
+def test_quarter_rotation_rotates_weights(name):
+    rotated = shapely.transform(ZOO[name], lambda xy: np.stack((7.0 - xy[:, 1], xy[:, 0]), axis=1))
 
-    assert weights_of(turned, fs.Grid((9, 7), 1.0)) == pytest.approx(np.rot90(weights_of(ZOO[name]), -1), abs=1e-14)
+    assert weights_of(rotated, fs.Grid((9, 7), 1.0)) == pytest.approx(np.rot90(weights_of(ZOO[name]), -1), abs=1e-14)
 
 
 @pytest.mark.parametrize("name", ["star", "circle", "U shape", "hole"])
-def test_the_parts_of_a_split_site_add_up(name):
+def test_split_site_parts_add_up(name):
     knife = shapely.Polygon([(-20, -20), (30, -20), (30, 4.1), (-20, 2.3)])
     lower = shapely.get_parts(shapely.intersection(ZOO[name], knife))
     upper = shapely.get_parts(shapely.difference(ZOO[name], knife))
@@ -251,7 +251,7 @@ def test_the_parts_of_a_split_site_add_up(name):
 
 
 @pytest.mark.parametrize("n_threads", [2, 3, 8])
-def test_results_do_not_depend_on_the_number_of_threads(n_threads):
+def test_results_are_bit_identical_across_threads(n_threads):
     grid = fs.Grid.centred((700, 900), 0.5)
     layout = fs.layout.log_polar(n_sectors=120, r_min_um=3.0, r_max_um=160.0)
     cells = np.random.default_rng(4).random(grid.shape, dtype=np.float32)
@@ -261,13 +261,13 @@ def test_results_do_not_depend_on_the_number_of_threads(n_threads):
     assert np.array_equal(many.spread(np.arange(layout.n_sites)), one.spread(np.arange(layout.n_sites)))
 
 
-# -- one operator ------------------------------------------------------------------------------------------------------
+# -- operator, adjoint and matrix --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("conserve", ["flux", "density"])
 @pytest.mark.parametrize("distortion", [None, BARREL])
 @pytest.mark.parametrize("shape", [(70, 90), (300, 280), (1, 90), (70, 1), (2, 3)])
-def test_the_operator_its_transpose_and_its_matrix_are_one(shape, distortion, conserve):
+def test_operator_adjoint_and_matrix_agree(shape, distortion, conserve):
     layout = TILINGS["log_polar"]
     grid = fs.Grid.centred(shape, 12.0 / max(shape))
     integrator = fs.Integrator(layout, grid, order=2, distortion=distortion, conserve=conserve)
@@ -281,13 +281,13 @@ def test_the_operator_its_transpose_and_its_matrix_are_one(shape, distortion, co
 
 
 @pytest.mark.parametrize("name", ZOO)
-def test_the_matrix_is_the_operator_over_the_zoo(name):
+def test_matrix_equals_operator_over_zoo(name):
     integrator = second(ZOO[name])
 
     assert integrator.weights() @ MAP.ravel() == pytest.approx(integrator(MAP), rel=1e-12, abs=1e-15)
 
 
-def test_thin_bands_of_rows_spread_over_their_borders(monkeypatch):
+def test_spread_crosses_band_boundaries(monkeypatch):
     from foveasim.integrate import _plan
 
     grid = fs.Grid((70, 50), 0.2, (-5.0, -7.0))
@@ -299,17 +299,17 @@ def test_thin_bands_of_rows_spread_over_their_borders(monkeypatch):
     assert integrator.spread(values).ravel() == pytest.approx(values @ integrator.weights().toarray(), abs=1e-13)
 
 
-def test_float32_maps_are_read_as_they_are():
+def test_float32_map_agrees_with_float64():
     integrator = fs.Integrator(TILINGS["hexagonal"], fs.Grid((50, 50), 0.25, (-6.0, -6.0)), order=2)
     cells = np.random.default_rng(2).random((50, 50), dtype=np.float32)
 
     assert integrator(cells) == pytest.approx(integrator(cells.astype(np.float64)), rel=1e-14, abs=1e-16)
 
 
-# -- what is read ------------------------------------------------------------------------------------------------------
+# -- cells that are read -----------------------------------------------------------------------------------------------
 
 
-def test_a_site_that_cuts_no_cell_reads_no_neighbour():
+def test_site_without_cut_cells_ignores_neighbours():
     cells = np.full((5, 5), np.nan)
     cells[1:4, 1:3] = 2.0
     integrator = second(shapely.box(1.0, 1.0, 3.0, 4.0), fs.Grid((5, 5), 1.0))
@@ -319,22 +319,22 @@ def test_a_site_that_cuts_no_cell_reads_no_neighbour():
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_bad_cell_reaches_the_sites_that_cut_a_cell_beside_it_and_no_other(bad):
+def test_nonfinite_cell_reaches_sites_cutting_neighbours_only(bad):
     cells = np.ones((40, 40))
     cells[20, 20] = bad
     centre = np.stack(np.meshgrid(np.arange(12) + 15.0, np.arange(12) + 15.0), axis=-1).reshape(-1, 2)
-    layout = fs.Layout.from_rectangles(centre, 0.6)  # each on the corner of four cells, and cuts all of them
+    layout = fs.Layout.from_rectangles(centre, 0.6)  # each cuts four cells around a corner
     power = fs.Integrator(layout, fs.Grid((40, 40), 1.0), order=2)(cells)
 
     is_bad = ~np.isfinite(power)
     dx, dy = np.abs(centre - 20.5).T
-    is_beside = ((dx == 0.5) & (dy <= 1.5)) | ((dy == 0.5) & (dx <= 1.5))
+    is_adjacent = ((dx == 0.5) & (dy <= 1.5)) | ((dy == 0.5) & (dx <= 1.5))
     assert is_bad.sum() == 12
-    assert np.array_equal(is_bad, is_beside)
+    assert np.array_equal(is_bad, is_adjacent)
     assert power[~is_bad] == pytest.approx(0.36)
 
 
-def test_a_bright_neighbour_costs_a_dark_site_no_digits():
+def test_dark_site_is_precise_near_bright_cells():
     cells = np.full((8, 400), 1.0)
     cells[:, :200] = 1e12
 
@@ -343,8 +343,8 @@ def test_a_bright_neighbour_costs_a_dark_site_no_digits():
     )
 
 
-def test_a_long_edge_along_a_row_needs_no_more_room_than_there_is():
-    """Half a row has a moment in each of its cells, in the last of many sites too."""
+def test_moment_buffer_grows_for_long_edges():
+    """A site that covers part of a row has a moment in each cell of the row; this includes the last of many sites."""
     boxes = [shapely.box(0.0, y + 0.1, 5000.0, y + 0.4) for y in range(60)]
     integrator = fs.Integrator(fs.Layout.from_polygons(boxes), fs.Grid((60, 5000), 1.0), order=2)
     up = np.broadcast_to(np.arange(60.0)[:, np.newaxis] + 0.5, (60, 5000))
@@ -352,7 +352,7 @@ def test_a_long_edge_along_a_row_needs_no_more_room_than_there_is():
     assert integrator(up) == pytest.approx(5000 * 0.3 * (np.arange(60) + 0.25), rel=1e-12)
 
 
-def test_many_edges_in_a_row_leave_whole_cells_without_moments():
+def test_covered_cells_have_no_moments():
     x = np.arange(1000) * 7.0 + 1.3
     finger = np.array([[0, 90.2], [3.1, 90.2], [3.1, 5.7], [7.0, 5.7]])
     teeth = (finger + np.stack((x, np.zeros(1000)), axis=1)[:, np.newaxis]).reshape(-1, 2)
@@ -360,7 +360,7 @@ def test_many_edges_in_a_row_leave_whole_cells_without_moments():
     plan = second(comb, fs.Grid((100, 7020), 1.0))._plan
     column = plan.cuts[(plan.cuts[:, 1] > 10) & (plan.cuts[:, 1] < 90), 2]
 
-    # Two cut cells to each finger in a row, but where 3.1 ends on a border.
+    # Two cut cells per finger and row, except where an edge lies on a cell boundary.
     assert column.size <= 79 * 2000
     assert np.all(np.abs((column + 0.5 - 1.3) % 7.0 - 1.55) > 0.8)
 
@@ -371,9 +371,9 @@ def test_many_edges_in_a_row_leave_whole_cells_without_moments():
 @cache
 def airy_means(cells_per_lambda_n, parts):
     """
-    Cell means of a point's diffraction pattern on a grid ``parts`` times finer, as fractions of the light.
+    Return cell means of a diffraction pattern on a grid ``parts`` times finer, as fractions of the total power.
 
-    The point lies at the middle of cell [n // 2, n // 2]; means of any size of cell are exact, and so are means of means.
+    The point source is at the centre of cell [n // 2, n // 2]. Means are exact for any cell size, and so are means of means.
     """
     optics = fs.Optics(focal_length_mm=22.0, f_number=4.0, precision="double", padding="periodic")
     lambda_n_um = 0.55 * optics.working_f_number(0.56)
@@ -388,12 +388,12 @@ def airy_means(cells_per_lambda_n, parts):
         band_width_nm=1.0,
     )
     fine = optics.power_map(scene).data[0]
-    middle, half = n // 2, 20 * parts
-    return fine[middle - half : middle + half + parts, middle - half : middle + half + parts] / fine.sum()
+    centre, half = n // 2, 20 * parts
+    return fine[centre - half : centre + half + parts, centre - half : centre + half + parts] / fine.sum()
 
 
-def share_in_a_square(cells_per_lambda_n, parts, offset, order):
-    """Fraction of a point's light in a centred square of side λN; the point lies ``offset`` fine cells from a cell's corner."""
+def ensquared_energy(cells_per_lambda_n, parts, offset, order):
+    """Return the ensquared energy in a side of λN for a point ``offset`` fine cells from the corner of a cell."""
     dx, dy = offset
     fine = airy_means(cells_per_lambda_n, parts)
     n = fine.shape[0] // parts - 1
@@ -406,10 +406,10 @@ def share_in_a_square(cells_per_lambda_n, parts, offset, order):
 @pytest.mark.parametrize(
     ("cells_per_lambda_n", "parts", "second_order", "first_order"), [(8.2, 5, 4e-4, 3e-3), (16.2, 5, 3e-5, 8e-4)]
 )
-def test_a_square_of_an_airy_disc_is_right_at_any_offset(cells_per_lambda_n, parts, second_order, first_order):
+def test_ensquared_energy_of_airy_disc_is_accurate(cells_per_lambda_n, parts, second_order, first_order):
     offsets = [(dx, dy) for dx in range(parts) for dy in range(parts)]
     errors = {
-        order: np.abs([share_in_a_square(cells_per_lambda_n, parts, o, order) - 0.528891 for o in offsets]).max()
+        order: np.abs([ensquared_energy(cells_per_lambda_n, parts, o, order) - 0.528891 for o in offsets]).max()
         for order in (1, 2)
     }
 
@@ -417,14 +417,14 @@ def test_a_square_of_an_airy_disc_is_right_at_any_offset(cells_per_lambda_n, par
     assert errors[1] >= first_order
 
 
-# -- with a lens -------------------------------------------------------------------------------------------------------
+# -- with distortion ---------------------------------------------------------------------------------------------------
 
 
-def test_a_smooth_field_through_a_lens_is_tens_of_times_closer_to_the_truth():
+def test_second_order_reduces_error_with_distortion():
     layout = fs.layout.tiling(pitch_um=9.0, radius_um=50.0)
 
     def means(grid):
-        # Of 2 + sin(0.15 x + 0.3) cos(0.1 y) over cells: the field at the middle, times a sinc along each axis.
+        # Cell means of 2 + sin(0.15 x + 0.3) cos(0.1 y): the varying part at the centre times a sinc along each axis.
         x, y = np.meshgrid(grid.x_um, grid.y_um)
         sincs = np.sinc(0.15 * grid.pitch_um / (2 * np.pi)) * np.sinc(0.1 * grid.pitch_um / (2 * np.pi))
         return 2.0 + sincs * np.sin(0.15 * x + 0.3) * np.cos(0.1 * y)
@@ -440,10 +440,10 @@ def test_a_smooth_field_through_a_lens_is_tens_of_times_closer_to_the_truth():
     assert errors[2] < 2e-4
 
 
-# -- what is rejected ---------------------------------------------------------------------------------------------------
+# -- invalid arguments ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("order", [0, 3, 1.5, "two", None, True])
-def test_orders_that_are_not_there_are_refused(order):
+def test_integrator_rejects_invalid_order(order):
     with pytest.raises(ParameterError, match="'order' must be"):
         fs.Integrator(TILINGS["grid"], GRID, order=order)

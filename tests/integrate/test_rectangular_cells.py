@@ -1,4 +1,4 @@
-"""Grids whose cells are not square: symmetry under scaling, clipping by shapely, closed forms, files written and read."""
+"""Grids with rectangular cells: symmetry under scaling, clipping with shapely, closed forms, file round trips."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def scaled(layout, sizes):
 
 
 def clipped_um2(layout, grid):
-    """Overlap of every site with every cell by GEOS, (n_site, n_y, n_x)."""
+    """Return the overlap area of every site with every cell by GEOS, (n_site, n_y, n_x)."""
     x0, y0, *_ = grid.bounds_um
     left, low = x0 + np.arange(grid.shape[1]) * grid.pitch_x_um, y0 + np.arange(grid.shape[0]) * grid.pitch_y_um
     left, low = np.meshgrid(left, low)
@@ -52,7 +52,7 @@ def clipped_um2(layout, grid):
 
 
 class ScaledLens:
-    """A lens in coordinates that are scaled along the axes."""
+    """Lens in coordinates that are scaled along the axes."""
 
     def __init__(self, lens, sizes):
         self.lens, self.sizes = lens, np.array(sizes)
@@ -121,7 +121,7 @@ def test_grid_rejects_malformed_pitch(pitch, message):
 @ORDER
 @LAYOUT
 def test_integration_is_symmetric_under_scaling(layout, order):
-    """Cells of p_x by p_y and a layout are unit cells and the layout divided by p_x along x and by p_y along y."""
+    """Cells of p_x by p_y are equivalent to unit cells with the layout divided by p_x along x and by p_y along y."""
     square = fs.Grid(SHAPE, 1.0, tuple(np.array(GRID.origin_um) / PITCH))
     there = fs.Integrator(layout, GRID, order=order)
     here = fs.Integrator(scaled(layout, 1.0 / np.array(PITCH)), square, order=order)
@@ -166,7 +166,7 @@ def test_any_pitch_agrees_with_shapely_clipping(order, pitch, origin, name):
 @ORDER
 @LAYOUT
 def test_uniform_map_gives_irradiance_times_area(layout, order):
-    grid = fs.Grid.centred((90, 40), PITCH)  # reaches beyond every layout but one
+    grid = fs.Grid.centred((90, 40), PITCH)  # larger than every layout except one
     on_um2 = shapely.area(shapely.intersection(layout.polygons(), shapely.box(*grid.bounds_um)))
 
     power = fs.Integrator(layout, grid, order=order)(np.full(grid.shape, 3.0))
@@ -189,7 +189,7 @@ def test_linear_map_is_exact_at_second_order(layout):
 
 @ORDER
 @LAYOUT
-def test_spread_is_adjoint_and_rows_sum_to_area(layout, order):
+def test_spread_is_adjoint_of_operator(layout, order):
     integrator = fs.Integrator(layout, GRID, order=order)
     values = np.random.default_rng(2).normal(size=layout.n_sites)
 
@@ -202,7 +202,7 @@ def test_spread_is_adjoint_and_rows_sum_to_area(layout, order):
 @pytest.mark.parametrize(("name", "repeats"), [("wide", (1, 3)), ("high", (3, 1))])
 @pytest.mark.parametrize("conserve", ["flux", "density"])
 def test_distorted_rectangular_cells_equal_repeated_squares(name, repeats, conserve):
-    """A cell of three squares is three squares of one value: the outlines behind the lens are the same."""
+    """A cell of three squares is equivalent to three squares of equal value, with identical undistorted outlines."""
     del name
     layout = LAYOUTS["rings"]
     coarse = fs.Grid.centred((20, 22), (0.7 * repeats[1], 0.7 * repeats[0]))
@@ -226,12 +226,12 @@ def test_distorted_integration_is_symmetric_under_scaling(order):
     here = fs.Integrator(layout, square, distortion=BARREL, order=order)
     there = fs.Integrator(scaled(layout, sizes), grid, distortion=ScaledLens(BARREL, sizes), order=order)
 
-    # Chords differ: they are within 0.2 % of the shorter side of a cell.
+    # The chords differ: their error is up to 0.2 % of the shorter side of a cell.
     np.testing.assert_allclose(there(values), here(values) * sizes.prod(), rtol=2e-4)
 
 
-def test_distorted_map_moves_rectangular_cells_alike():
-    """Warping with the nearest cell of a map of repeated squares is the same for either form of the source's cells."""
+def test_distorted_map_is_independent_of_cell_shape():
+    """Nearest-cell interpolation of rectangular cells equals that of squares with repeated values."""
     coarse, fine = fs.Grid.centred((30, 12), (0.9, 0.3)), fs.Grid.centred((30, 36), 0.3)
     values = np.random.default_rng(5).uniform(0.5, 1.5, coarse.shape)
     maps = [
@@ -252,10 +252,10 @@ def test_distorted_map_conserves_power_of_rectangular_cells():
 
     assert distorted.grid.pitch_um == (0.4, 0.2)
     power = [float(m.data.sum() * m.grid.cell_area_um2) for m in (light, distorted)]
-    assert power[1] == pytest.approx(power[0], rel=0.03)  # cells at the boundary are taken whole or not
+    assert power[1] == pytest.approx(power[0], rel=0.03)  # boundary cells are either included or excluded
 
 
-def test_undistorting_lens_leaves_rectangular_map():
+def test_ideal_lens_leaves_rectangular_map_unchanged():
     light = fs.PowerMap.from_array(MAP, pitch_um=PITCH, wavelength_nm=550.0, origin_um=(-3.0, -2.0))
     same = fs.distortion.distort_map(light, BrownConrady(focal_um=100.0))
 
@@ -284,12 +284,12 @@ def rectangular_map():
     return fs.PowerMap(rng.random((2, 5, 7), dtype=np.float32), grid, np.array([450.0, 620.5]))
 
 
-@pytest.mark.parametrize("ending", ["npz", "fits", "tif", "exr", "nc", "zarr"])
-def test_files_round_trip_rectangular_cells(tmp_path, ending):
+@pytest.mark.parametrize("extension", ["npz", "fits", "tif", "exr", "nc", "zarr"])
+def test_files_round_trip_rectangular_cells(tmp_path, extension):
     light = rectangular_map()
-    write_power_map(light, tmp_path / f"map.{ending}")
+    write_power_map(light, tmp_path / f"map.{extension}")
 
-    read = read_power_map(tmp_path / f"map.{ending}")
+    read = read_power_map(tmp_path / f"map.{extension}")
 
     assert read.grid == light.grid
     np.testing.assert_array_equal(read.data, light.data)
@@ -308,8 +308,8 @@ def test_labelled_array_round_trips_rectangular_cells():
     np.testing.assert_allclose(part.grid.origin_um, (-1.23456789 + 0.6, 0.1 + 1.7))
 
 
-def test_fits_axes_give_both_pitches(tmp_path):
-    """CDELT, CRPIX and CRVAL of the standard, in mm and µm, the row axis falling."""
+def test_fits_axes_specify_both_pitches(tmp_path):
+    """Standard keywords CDELT, CRPIX and CRVAL in mm and µm, with a descending row axis."""
     header = fits.Header(
         {"CUNIT1": "mm", "CDELT1": 2e-3, "CRPIX1": 1.0, "CRVAL1": 0.05}
         | {"CUNIT2": "um", "CDELT2": -0.5, "CRPIX2": 3.0, "CRVAL2": 7.0, "BUNIT": "W m-2"}
@@ -325,7 +325,7 @@ def test_fits_axes_give_both_pitches(tmp_path):
     np.testing.assert_array_equal(read.data[0], np.arange(12.0).reshape(3, 4)[::-1])
 
 
-def test_fits_pixel_sizes_give_both_pitches(tmp_path):
+def test_fits_pixel_sizes_specify_both_pitches(tmp_path):
     fits.writeto(tmp_path / "map.fits", np.ones((3, 4)), fits.Header({"XPIXSZ": 2.0, "YPIXSZ": 3.5, "BUNIT": "W m-2"}))
 
     read = read_power_map(tmp_path / "map.fits", wavelength_nm=550.0)
@@ -333,7 +333,7 @@ def test_fits_pixel_sizes_give_both_pitches(tmp_path):
     assert read.grid == fs.Grid.centred((3, 4), (2.0, 3.5))
 
 
-def test_netcdf_coordinates_give_both_pitches(tmp_path):
+def test_netcdf_coordinates_specify_both_pitches(tmp_path):
     light = xr.DataArray(
         np.arange(12.0).reshape(3, 4),
         dims=("y", "x"),
@@ -353,7 +353,7 @@ def test_netcdf_coordinates_give_both_pitches(tmp_path):
     np.testing.assert_array_equal(read.data[0], np.arange(12.0).reshape(3, 4)[::-1])
 
 
-def test_float32_coordinates_of_squares_stay_square():
+def test_float32_coordinates_yield_square_cells():
     array = xr.DataArray(
         np.ones((5, 9)),
         dims=("y", "x"),
@@ -367,7 +367,7 @@ def test_float32_coordinates_of_squares_stay_square():
     assert isinstance(from_xarray(array, wavelength_nm=550.0).grid.pitch_um, float)
 
 
-def test_arguments_give_both_pitches(tmp_path):
+def test_arguments_specify_both_pitches(tmp_path):
     np.save(tmp_path / "map.npy", np.ones((3, 4)))
     np.savez(tmp_path / "map.npz", data=np.ones((3, 4)), pitch_um=[0.5, 2.0])
     given_values = {"wavelength_nm": 550.0, "unit": "w_m2"}
@@ -402,10 +402,10 @@ def test_settings_file_takes_both_pitches(tmp_path):
     assert {kind["type"] for kind in pitch["anyOf"]} == {"number", "array", "null"}
 
 
-# -- what is made on a grid -----------------------------------------------------------------------------------------------
+# -- other uses of grids --------------------------------------------------------------------------------------------------
 
 
-def test_reference_takes_means_over_rectangular_pixels():
+def test_reference_averages_over_rectangular_pixels():
     light = fs.PowerMap.from_array(MAP, pitch_um=PITCH, wavelength_nm=550.0)
     pixels = fs.Grid.centred((6, 5), (1.3, 0.8))
     layout = fs.Layout.from_rectangles(
@@ -429,8 +429,8 @@ def test_uniform_values_fill_rectangular_pixels(method):
     np.testing.assert_allclose(picture.data[0][picture.coverage > 0], 7.0, rtol=1e-6)
 
 
-def test_least_squares_smoothness_does_not_depend_on_pixel_form():
-    """The same smooth picture is found on squares and on pixels of twice their height."""
+def test_least_squares_smoothness_ignores_pixel_shape():
+    """The same smooth image is reconstructed on squares and on pixels of twice the height or width."""
     layout = fs.layout.grid(n_x=12, n_y=12, pitch_um=2.0)
     rng = np.random.default_rng(7)
     values = 100.0 + 5.0 * layout.centroid_um @ [0.5, 0.3] + rng.normal(0.0, 10.0, layout.n_sites)
@@ -446,11 +446,11 @@ def test_least_squares_smoothness_does_not_depend_on_pixel_form():
 
 
 def test_blur_kernel_sums_over_rectangular_pixels():
-    """A kernel on pixels of three squares is the sum over squares, averaged over the square that shines."""
+    """A kernel on pixels of three squares is the sum over squares, averaged over the position of the source square."""
     optics = fs.Optics(focal_length_mm=8.0, f_number=4.0)
     fine = blur_kernel(optics, fs.Grid((9, 9), 0.7), wavelength_nm=550.0, radius=20)
     wide = blur_kernel(optics, fs.Grid((9, 9), (2.1, 0.7)), wavelength_nm=550.0, radius=5)
-    # From columns of pixels to columns of squares, with weights of a square's place in the pixel that shines.
+    # From columns of pixels to columns of squares, weighted by the position of a square within the source pixel.
     expected = np.zeros((11, 11))
     for i, offset in enumerate(range(-5, 6)):
         for shift, weight in zip(range(-2, 3), (1 / 3, 2 / 3, 1.0, 2 / 3, 1 / 3), strict=True):
