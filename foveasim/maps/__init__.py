@@ -1,21 +1,22 @@
 """
-Light on the sensor from other programs: power maps as files, and as labelled arrays.
+Exchange of power maps with other programs, as files and as labelled arrays.
 
 ==============  ==============================  =====================================================================
-ending          format                          what a file tells
+extension       format                          metadata in the file
 ==============  ==============================  =====================================================================
-.npy            numpy array                     nothing; read only
-.npz            numpy arrays with names         everything, to the last bit
-.fits           FITS image                      everything, to the last bit
-.tif, .tiff     TIFF, a page per band             everything, to the last bit; from others nothing
-.exr            EXR, a channel a band           everything, to the last bit of float32; from others wavelengths and unit
-.nc             netCDF                          everything, to the last bit
-.zarr           zarr folder                     everything, to the last bit
-.mat            optical image of ISETCam        everything; read only
+.npy            numpy array                     none; read only
+.npz            named numpy arrays              all, lossless
+.fits           FITS image                      all, lossless
+.tif, .tiff     TIFF, one page per band         all, lossless; none in files of other programs
+.exr            EXR, one channel per band       all, lossless float32; wavelengths and unit in files of other programs
+.nc             netCDF                          all, lossless
+.zarr           zarr directory                  all, lossless
+.mat            optical image of ISETCam        all; read only
 ==============  ==============================  =====================================================================
 
-Files are read by what they hold, whatever their ending. What one does not tell must be said; what is said goes before what
-it tells. A file that is corrupt, truncated or malformed ends in one :class:`~foveasim.errors.FileError`.
+The format is detected from the content of a file, not from its extension. Metadata that a file lacks must be passed as
+arguments; arguments override the metadata of the file. A corrupt, truncated or malformed file raises a
+:class:`~foveasim.errors.FileError`.
 """
 
 from __future__ import annotations
@@ -51,46 +52,47 @@ def read_power_map(
     name: str | None = None,
 ) -> PowerMap:
     """
-    Read the light on a sensor, from a file of any program.
+    Read a power map from a file.
 
     Parameters
     ----------
     path : path
-        A file of one of the formats above, told by its content, or a zarr folder.
+        File in one of the formats of :mod:`foveasim.maps`, detected from its content, or a zarr directory.
     pitch_um : float, or (pitch_x, pitch_y), optional, µm
-        Side of a square cell, or width and height of a rectangular one, where the file does not contain them.
+        Side of a square cell, or width and height of a rectangular cell, if the file does not contain them.
     wavelength_nm : number or sequence, optional, nm
-        The bands' wavelengths, where the file does not tell them.
+        Wavelengths of the bands, if the file does not contain them.
     band_width_nm : number or sequence, optional, nm
-        Of light per nm: the bands' widths; by default they reach halfway to the neighbours.
+        Widths of the bands for units per nm. By default bands extend halfway to the adjacent wavelengths.
     unit : {"w_m2", "w_m2_nm", "photons_s_m2", "photons_s_m2_nm"}, optional
-        What the numbers are, where the file does not tell: power or photons a second, on a square metre, in the band or in
-        each nm of it.
+        Unit of the values, if the file does not contain it: power or photons per second, per square metre, in the band or
+        per nm.
     origin_um : (x0, y0), optional, µm
-        Lower left corner of the map; by default what the file tells, or its middle on the axis. With ``pitch_um`` the file
-        is not asked.
+        Lower left corner of the map. By default the origin in the file, or a map centred on the axis. If ``pitch_um`` is
+        given, the origin in the file is ignored.
     top_row_first : bool, optional
-        Whether the file's first row is the one on top; by default what the format says: TIFF, EXR and ISETCam yes; npy, npz
-        and FITS no; netCDF and zarr by their coordinate y.
+        Whether the first row of the file is the top row. The default depends on the format: true for TIFF, EXR and ISETCam;
+        false for npy, npz and FITS; given by the coordinate y for netCDF and zarr.
     name : str, optional
-        Of the array, the variable or the extension, where the file holds several.
+        Name of the array, variable or extension, if the file contains several.
 
     Returns
     -------
     PowerMap
-        float32 where the file has no more digits, W/m² per band.
+        W/m² per band; float32 if this represents the values of the file exactly, otherwise float64.
 
     Raises
     ------
     FileError
-        When the file is missing, broken, truncated, too large, no map, holds what light cannot be, or lacks what nobody
-        said.
+        If the file is missing, corrupt, truncated, too large or not a map, contains invalid irradiance, or lacks metadata
+        that were not passed.
     ParameterError
-        When what is said is out of range, or does not fit the file.
+        If an argument is out of range or inconsistent with the file.
 
     Notes
     -----
-    Power is ``photons * h c / wavelength * width``. Negative light is rejected, but for rounding: 1e-5 of the brightest.
+    Power is ``photons * h c / wavelength * width``. Negative values are rejected, except rounding errors of up to 1e-5 of the
+    maximum.
 
     Examples
     --------
@@ -117,20 +119,20 @@ def read_power_map(
 
 def write_power_map(power_map: PowerMap, path: str | Path) -> None:
     """
-    Write a map to a file, whole or not at all.
+    Write a power map to a file atomically.
 
     Parameters
     ----------
     power_map : PowerMap
     path : path
-        Its ending names the format: ``.npz``, ``.fits``, ``.tif``, ``.exr``, ``.nc`` or ``.zarr``.
+        The extension selects the format: ``.npz``, ``.fits``, ``.tif``, ``.exr``, ``.nc`` or ``.zarr``.
 
     Raises
     ------
     FileError
-        When the ending is unknown, a library is missing, or nothing can be written there.
+        If the extension is unknown, a library is missing, or the file cannot be written.
     ParameterError
-        When it is no map, or the format cannot hold it.
+        If ``power_map`` is not a PowerMap, or the format cannot represent it.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What all formats of maps share: limits, what a file tells and what its reader adds, and the checks of both."""
+"""Common parts of the map formats: size limits, metadata and their validation."""
 
 from __future__ import annotations
 
@@ -35,33 +35,33 @@ __all__ = [
 ]
 
 MAX_UNPACKED_BYTES = 8 * 2**30
-#: What a small file may unpack to, and for each byte of a larger one.
+#: Limit of the decompressed size: a constant plus a factor of the file size.
 MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**28, 256
 MAX_BANDS = 4096
-#: Steps are even when they differ by less than this share: coordinates may be float32.
+#: Relative tolerance of uniform steps: coordinates may be float32.
 UNEVEN = 1e-4
-#: Cells are square when their sides differ by less than this fraction: what float32 coordinates leave of one pitch.
+#: Relative tolerance of square cells: rounding error of a pitch from float32 coordinates.
 SQUARE = 1e-6
-#: Fourier transforms in float32 leave so much of the brightest light below 0.
+#: Largest negative value relative to the maximum: rounding error of Fourier transforms in float32.
 DARKEST = 1e-5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Found:
     """
-    What a file tells of a map, None where it tells nothing.
+    Data and metadata of a map in a file; None for missing metadata.
 
     Attributes
     ----------
     data : (n_y, n_x) or (n_band, n_y, n_x)
-        Numbers of any type, rows and columns in the file's order.
+        Values of any numeric dtype, rows and columns in file order.
     is_y_falling, is_x_falling : bool
-        Whether the first row is the highest, and the first column the rightmost.
+        Whether the first row is the top row, and the first column the rightmost column.
     pitch_um : (along x, along y), µm
     origin_um : (x0, y0), µm
     wavelength_nm, band_width_nm : (n_band,), nm
     unit : str
-        As the file writes it: ``w_m2``, ``W m-2 nm-1``, ``uW/cm^2``, ...
+        Unit as written in the file: ``w_m2``, ``W m-2 nm-1``, ``uW/cm^2``, ...
     """
 
     data: NDArray[Any]
@@ -76,7 +76,7 @@ class Found:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Given:
-    """What the caller says of a map, which goes before what the file tells; None where nothing is said."""
+    """Metadata of a map passed by the caller, which override the file; None if not passed."""
 
     pitch_um: Pitch | None = None
     wavelength_nm: ArrayLike | None = None
@@ -99,18 +99,18 @@ class Given:
 
 
 def max_unpacked(n_bytes: int) -> int:
-    """Bytes that a file of so many may unpack to."""
+    """Return the limit of the decompressed size of a file of ``n_bytes``."""
     return min(MIN_UNPACKED_BYTES + UNPACKED_PER_BYTE * n_bytes, MAX_UNPACKED_BYTES)
 
 
 def check_size(shape: Sequence[int], itemsize: int, n_bytes: int) -> None:
     """
-    Reject what would unpack to too much, before it is unpacked.
+    Reject arrays that are too large, before they are decompressed.
 
     Raises
     ------
     FormatError
-        When an array of the shape would take more memory than a file of ``n_bytes`` may.
+        If an array of the shape would exceed the memory limit of a file of ``n_bytes``.
     """
     size = itemsize
     for n in shape:
@@ -118,46 +118,46 @@ def check_size(shape: Sequence[int], itemsize: int, n_bytes: int) -> None:
     if size > max_unpacked(n_bytes):
         told = " x ".join(map(str, shape[:5]))
         raise FormatError(
-            f"holds an array of {told} numbers, more than the {max_unpacked(n_bytes)} bytes that are read of a file of "
-            "this size; a map that packs so well can be written unpacked"
+            f"contains an array of {told} elements, more than the limit of {max_unpacked(n_bytes)} bytes for a file of "
+            "this size; write the map uncompressed"
         )
 
 
 def pitch_of_axes(x: Floats, y: Floats) -> tuple[float | None, float | None]:
     """
-    Steps of two axes' coordinates, with their signs; none of an axis with one cell.
+    Return the signed coordinate steps of two axes; None for an axis with one cell.
 
     Raises
     ------
     FormatError
-        When coordinates are no numbers, or their steps uneven.
+        If coordinates are not finite, or their steps are not uniform.
     """
     steps: list[float | None] = []
     for name, along in (("x", x), ("y", y)):
         if not np.isfinite(along).all():
-            raise FormatError(f"has coordinates along {name} that are no numbers")
+            raise FormatError(f"has non-finite coordinates along {name}")
         if along.size == 1:
             steps.append(None)
             continue
         step = float((along[-1] - along[0]) / (along.size - 1))
-        # Coordinates that are rounded to float32 far from 0 have uneven steps too.
+        # Coordinates far from 0 that were rounded to float32 also have non-uniform steps.
         rounding = 4.0 * float(np.spacing(np.float32(np.abs(along).max())))
         if step == 0.0 or np.abs(np.diff(along) - step).max() > UNEVEN * abs(step) + rounding:
-            raise FormatError(f"has uneven steps along {name}; cells must be equal, so resample it first")
+            raise FormatError(f"has non-uniform steps along {name}; resample it to equal cells")
         steps.append(step)
     return steps[0], steps[1]
 
 
 def finished(found: Found, given: Given) -> PowerMap:
     """
-    The map in W/m² per band, every check passed.
+    Return the validated map in W/m² per band.
 
     Raises
     ------
     FormatError
-        When it holds something else than light, or lacks what nobody said.
+        If the data are not an irradiance, or metadata are missing.
     ParameterError
-        When what was given does not fit it.
+        If passed metadata are inconsistent with the data.
     """
     images = as_images(found.data)
     pitch_um = _pitch_um(found, given)
@@ -178,23 +178,25 @@ def finished(found: Found, given: Given) -> PowerMap:
 
 def as_images(data: NDArray[Any]) -> Images:
     """
-    The numbers as floating-point images (n_band, n_y, n_x) in this machine's byte order.
+    Return floating-point images (n_band, n_y, n_x) in native byte order.
 
     Raises
     ------
     FormatError
-        When they are no numbers, or have another number of dimensions.
+        If the dtype is not real, or the number of dimensions is wrong.
     """
     if data.ndim > 3 and all(n == 1 for n in data.shape[:-3]):
         data = data.reshape(data.shape[-3:])
     if data.ndim not in (2, 3) or 0 in data.shape:
-        raise FormatError(f"holds an array of the shape {data.shape[:6]}, expected (n_y, n_x) or (n_band, n_y, n_x)")
+        raise FormatError(f"contains an array of shape {data.shape[:6]}, expected (n_y, n_x) or (n_band, n_y, n_x)")
     if data.dtype.kind == "c":
-        raise FormatError("holds complex numbers: a field; give its power, the square of their absolute values")
+        raise FormatError("contains complex values (a field); write the power, the square of their modulus")
     if data.dtype.kind not in "iuf":
-        raise FormatError(f"holds an array of the type {data.dtype!s:.40}, expected numbers")
+        raise FormatError(f"contains an array of dtype {data.dtype!s:.40}, expected real numbers")
     if data.ndim == 3 and data.shape[0] > MAX_BANDS:
-        raise FormatError(f"holds {data.shape[0]} bands, more than {MAX_BANDS}; bands come first: (n_band, n_y, n_x)")
+        raise FormatError(
+            f"contains {data.shape[0]} bands, more than {MAX_BANDS}; store bands first: (n_band, n_y, n_x)"
+        )
     images = data.reshape(-1, *data.shape[-2:])
     is_small = images.dtype.itemsize <= (4 if images.dtype.kind == "f" else 2)
     converted: Images = images.astype(np.float32 if is_small else np.float64, copy=False)
@@ -207,11 +209,11 @@ def _pitch_um(found: Found, given: Given) -> Pitch:
     if given.pitch_um is not None:
         return given.pitch_um
     if found.pitch_um is None:
-        raise FormatError("does not tell the size of its cells; give pitch_um=..., their side or (width, height) in µm")
+        raise FormatError("does not specify the cell size; pass pitch_um=..., the side or (width, height) in µm")
     try:
         along_x, along_y = check_pitch_um("pitch_um", found.pitch_um)
     except ParameterError as error:
-        raise FormatError(f"has cells of a size outside the allowed range ({error})") from None
+        raise FormatError(f"has a cell size outside the allowed range ({error})") from None
     return along_x if abs(along_x - along_y) <= SQUARE * max(along_x, along_y) else (along_x, along_y)
 
 
@@ -221,17 +223,19 @@ def _wavelengths_nm(images: Images, found: Found, given: Given) -> Floats:
         waves_nm = wavelengths_nm("wavelength_nm", given.wavelength_nm)
         if waves_nm.size != n_band:
             raise ParameterError(
-                "wavelength_nm", f"must have {n_band} values, one for each band of the map, got {waves_nm.size}"
+                "wavelength_nm", f"must have {n_band} values, one per band of the map, got {waves_nm.size}"
             )
         return waves_nm
     if found.wavelength_nm is None:
-        raise FormatError(f"does not tell the wavelengths of its bands; give wavelength_nm=..., {n_band} in nm")
+        raise FormatError(
+            f"does not specify the wavelengths of its bands; pass wavelength_nm=..., {n_band} values in nm"
+        )
     try:
         waves_nm = wavelengths_nm("wavelength_nm", np.asarray(found.wavelength_nm, dtype=np.float64))
     except ParameterError as error:
-        raise FormatError(f"tells no wavelengths ({error})") from None
+        raise FormatError(f"contains invalid wavelengths ({error})") from None
     if waves_nm.size != n_band:
-        raise FormatError(f"tells {waves_nm.size} wavelengths, and has {n_band} bands")
+        raise FormatError(f"contains {waves_nm.size} wavelengths for {n_band} bands")
     return waves_nm
 
 
@@ -241,7 +245,7 @@ def _in_w_m2(images: Images, waves_nm: Floats, found: Found, given: Given) -> Im
     factor = size * per_band_w_m2(unit, waves_nm, width_nm)
     if np.all(factor == 1.0):
         return images
-    # A float32 holds a photon rate and its power, but not always what lies between.
+    # float32 represents photon rates and powers, but intermediate products can overflow: multiply in float64.
     data = np.empty_like(images)
     for band, scale in enumerate(factor):
         np.multiply(images[band], scale, out=data[band], dtype=np.float64, casting="same_kind")
@@ -251,31 +255,31 @@ def _in_w_m2(images: Images, waves_nm: Floats, found: Found, given: Given) -> Im
 def _parsed_unit(text: str | None) -> tuple[Unit, float]:
     choices = ", ".join(map(repr, UNITS))
     if text is None:
-        raise FormatError(f"does not tell its unit; give unit=..., one of {choices}")
+        raise FormatError(f"does not specify its unit; pass unit=..., one of {choices}")
     unit = light_unit(text)
     if unit is None:
         raise FormatError(
-            f"is in {text!r:.40}, which is no irradiance; if that is wrong give unit=..., one of {choices}"
+            f"has the unit {text!r:.40}, which is not an irradiance; to override it pass unit=..., one of {choices}"
         )
     return unit
 
 
 def _band_widths_nm(waves_nm: Floats, found: Found, given: Given) -> Floats:
-    """Widths as given or told, or reaching halfway to the neighbouring wavelengths."""
+    """Return the specified widths, or widths that extend halfway to the adjacent wavelengths."""
     told = given.band_width_nm if given.band_width_nm is not None else found.band_width_nm
     if told is not None:
         width_nm = np.asarray(told, dtype=np.float64)
         if width_nm.shape not in ((), (1,), waves_nm.shape) or not np.all((width_nm > 0.0) & np.isfinite(width_nm)):
             rule = f"must be one positive number, or one for each of the {waves_nm.size} bands"
             if given.band_width_nm is None:
-                raise FormatError(f"tells widths of its bands that {rule}")
+                raise FormatError(f"contains invalid band widths, which {rule}")
             raise ParameterError("band_width_nm", rule, given.band_width_nm, "nm")
         return np.array(np.broadcast_to(width_nm, waves_nm.shape))
     order = np.argsort(waves_nm)
     steps = np.diff(waves_nm[order])
     if steps.size == 0 or np.any(steps <= 0.0):
-        raise FormatError("is per nm, and does not tell how wide its bands are; give band_width_nm=...")
-    # The outermost bands reach as far out as they reach in.
+        raise FormatError("has a unit per nm and does not specify the band widths; pass band_width_nm=...")
+    # The outermost bands are symmetric about their wavelengths.
     width_nm = np.empty_like(waves_nm)
     width_nm[order] = 0.5 * (np.concatenate((steps[:1], steps)) + np.concatenate((steps, steps[-1:])))
     return width_nm
@@ -283,19 +287,21 @@ def _band_widths_nm(waves_nm: Floats, found: Found, given: Given) -> Floats:
 
 def check_numbers(data: Images) -> None:
     """
-    Reject what light cannot be.
+    Reject invalid irradiance.
 
     Raises
     ------
     FormatError
-        When a number is not finite, or below 0 by more than rounding.
+        If a value is not finite, or negative by more than the rounding error.
     """
     lowest, highest = float(data.min()), float(data.max())
     if not (np.isfinite(lowest) and np.isfinite(highest)):
         where = np.unravel_index(int(np.argmin(np.isfinite(data))), data.shape)
-        raise FormatError(f"holds {data[where]} at [band, row, column] = {[int(i) for i in where]}; light is finite")
+        raise FormatError(
+            f"irradiance must be finite, got {data[where]} at [band, row, column] = {[int(i) for i in where]}; replace it"
+        )
     if lowest < -DARKEST * max(highest, 0.0):
         where = np.unravel_index(int(np.argmin(data)), data.shape)
         raise FormatError(
-            f"holds negative light, {lowest:.6g} W/m² at [band, row, column] = {[int(i) for i in where]}; clip it first"
+            f"irradiance must be >= 0, got {lowest:.6g} W/m² at [band, row, column] = {[int(i) for i in where]}; clip it"
         )

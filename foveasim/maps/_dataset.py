@@ -1,8 +1,7 @@
 """
-Maps as netCDF files and zarr folders, through xarray.
+Power maps in netCDF files and zarr directories, read and written with xarray.
 
-Nothing that such a file names outside itself is opened, and nothing in it is unpickled: what could ask for it is looked for
-before xarray sees the file.
+External references are not opened and objects are not unpickled: files are checked for both before xarray opens them.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ __all__ = ["HDF5_MAGIC", "NETCDF3_MAGICS", "is_zarr", "read_netcdf", "read_zarr"
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 NETCDF3_MAGICS = (b"CDF\x01", b"CDF\x02")
 ZARR_FILES = ("zarr.json", ".zgroup", ".zarray", ".zattrs", ".zmetadata")
-#: Parts of zarr's metadata that name programs to run on the chunks, and those that only pack numbers.
+#: Keys of zarr metadata that name codecs for the chunks, and the safe codecs, which only encode numbers.
 ZARR_CODEC_KEYS = ("codecs", "index_codecs", "filters", "compressor", "storage_transformers")
 ZARR_CODECS = frozenset(
     {
@@ -54,10 +53,10 @@ ZARR_CODECS = frozenset(
     | {"numcodecs." + name for name in ("zlib", "zstd", "blosc", "lz4", "bz2", "lzma", "gzip", "shuffle")}
     | {"shuffle"}
 )
-#: More groups, arrays and links than this are no map.
+#: Maximum number of groups, arrays and links in a file.
 MAX_OBJECTS = 1000
 MAX_METADATA_BYTES = 2**22
-#: At most as much of a netCDF file of ours is not numbers of the map: coordinates are counted apart.
+#: Upper bound of the size of headers and attributes in a netCDF file written here, without data and coordinates.
 NETCDF_BYTES = 2**16
 
 
@@ -65,21 +64,21 @@ NETCDF_BYTES = 2**16
 
 
 def write_netcdf(power_map: PowerMap, path: Path) -> None:
-    """Write netCDF 4, unpacked."""
+    """Write an uncompressed netCDF 4 file."""
     _needs(path, "h5netcdf")
-    # HDF5 crashes on a full disk.
+    # HDF5 crashes if the disk is full.
     check_room(path, power_map.data.nbytes + 8 * sum(power_map.data.shape) + NETCDF_BYTES)
     to_xarray(power_map).to_dataset().to_netcdf(path, engine="h5netcdf", encoding={NAME: {"_FillValue": None}})
 
 
 def write_zarr(power_map: PowerMap, path: Path) -> None:
     """
-    Write a zarr folder, unpacked, whole or not at all.
+    Write an uncompressed zarr directory atomically.
 
     Raises
     ------
     FileError
-        When zarr is missing, the folder's place is taken by something else, or nothing can be written there.
+        If zarr is missing, the path exists and is not a zarr directory, or it cannot be written.
     """
     _needs(path, "zarr")
     with atomic_directory(path, is_ours=is_zarr) as folder:
@@ -92,7 +91,7 @@ def write_zarr(power_map: PowerMap, path: Path) -> None:
 
 
 def read_netcdf(path: Path, name: str | None) -> Found:
-    """Read the variable of that name, or ``irradiance``, or the only one that is a map."""
+    """Read the named variable, or ``irradiance``, or the only variable that is a map."""
     import xarray as xr
 
     with path.open("rb") as file:
@@ -107,7 +106,7 @@ def read_netcdf(path: Path, name: str | None) -> Found:
 
 
 def read_zarr(path: Path, name: str | None) -> Found:
-    """Read the array of that name, or ``irradiance``, or the only one that is a map."""
+    """Read the named array, or ``irradiance``, or the only array that is a map."""
     import xarray as xr
 
     n_bytes = _check_zarr(path)
@@ -116,7 +115,7 @@ def read_zarr(path: Path, name: str | None) -> Found:
 
 
 def is_zarr(path: Path) -> bool:
-    """Whether a folder is a zarr group or array."""
+    """Return whether a directory is a zarr group or array."""
     return path.is_dir() and any((path / name).is_file() for name in ZARR_FILES[:3])
 
 
@@ -132,7 +131,9 @@ def _chosen(dataset: xr.Dataset, name: str | None) -> str:
     names = [str(n) for n in dataset.data_vars]
     if name is not None:
         if name not in names:
-            raise FormatError(f"has no variable {name!r:.40}; there are {', '.join(n[:40] for n in names[:5])}")
+            raise FormatError(
+                f"has no variable {name!r:.40}; available variables: {', '.join(n[:40] for n in names[:5])}"
+            )
         return name
     if NAME in names:
         return NAME
@@ -141,17 +142,15 @@ def _chosen(dataset: xr.Dataset, name: str | None) -> str:
     for candidates in (with_axes, maps):
         if len(candidates) == 1:
             return candidates[0]
-    told = f"holds {len(maps)} arrays of numbers with rows and columns"
-    raise FormatError(
-        f"{told}: {', '.join(n[:40] for n in maps[:5])}; say which is the map with name=" if maps else told
-    )
+    told = f"contains {len(maps)} numeric arrays with rows and columns"
+    raise FormatError(f"{told}: {', '.join(n[:40] for n in maps[:5])}; select the map with name=" if maps else told)
 
 
-# -- what a file may not do -------------------------------------------------------------------------------------------
+# -- checks of untrusted files ----------------------------------------------------------------------------------------
 
 
 def _check_hdf5(path: Path) -> None:
-    """Reject files that point outside themselves, or hold more than any map."""
+    """Reject files with external references or too many objects."""
     import h5py
 
     with h5py.File(path, "r") as file:
@@ -162,10 +161,10 @@ def _check_hdf5(path: Path) -> None:
             for key in group:
                 n_objects += 1
                 if n_objects > MAX_OBJECTS:
-                    raise FormatError(f"holds more than {MAX_OBJECTS} arrays and groups")
+                    raise FormatError(f"contains more than {MAX_OBJECTS} arrays and groups")
                 if not isinstance(group.get(key, getlink=True), h5py.HardLink):
                     raise FormatError(
-                        "holds a link to another place, which is not followed; copy what it names into the file"
+                        "contains a soft or external link, which is not followed; copy its target into the file"
                     )
                 part = group[key]
                 address = h5py.h5o.get_info(part.id).addr
@@ -175,27 +174,27 @@ def _check_hdf5(path: Path) -> None:
                 if isinstance(part, h5py.Group):
                     groups.append(part)
                 elif isinstance(part, h5py.Dataset) and (part.external or part.is_virtual):
-                    raise FormatError("keeps its numbers in another file, which is not opened; copy them into this one")
+                    raise FormatError("stores its data in another file, which is not opened; copy them into this file")
 
 
 def _check_zarr(path: Path) -> int:
-    """Reject folders that name programs other than known packers; the bytes in the folder."""
+    """Reject directories with unsafe metadata; return the total size in bytes."""
     for number, found in enumerate(_metadata_files(path)):
         if number > MAX_OBJECTS:
-            raise FormatError(f"holds more than {MAX_OBJECTS} arrays and groups")
+            raise FormatError(f"contains more than {MAX_OBJECTS} arrays and groups")
         if found.is_symlink() or found.stat().st_size > MAX_METADATA_BYTES:
-            raise FormatError(f"has a broken {found.name}")
+            raise FormatError(f"has a {found.name} that is a symbolic link or too large")
         try:
             _check_codecs(json.loads(found.read_text(encoding="utf-8")))
         except (ValueError, RecursionError) as error:
-            raise FormatError(f"has a broken {found.name} ({error})") from None
+            raise FormatError(f"has an invalid {found.name} ({error})") from None
     return sum(
         (Path(folder) / file).stat().st_size for folder, _, files in os.walk(path, followlinks=False) for file in files
     )
 
 
 def _metadata_files(path: Path) -> Iterator[Path]:
-    """Files of metadata, in folders that have some, from the outermost inwards."""
+    """Yield the metadata files of directories that contain some, from the root downwards."""
     folders = [path]
     while folders:
         folder = folders.pop()
@@ -208,12 +207,12 @@ def _metadata_files(path: Path) -> Iterator[Path]:
 
 def _check_codecs(metadata: Any) -> None:
     """
-    Walk all of the metadata.
+    Check the codecs, dtypes, shapes and chunks in zarr metadata.
 
     Raises
     ------
     FormatError
-        When it names a program that is not known to do nothing but unpack numbers, or a type of Python objects.
+        If the metadata specify a codec that is not known to be safe, a dtype of Python objects, or an invalid size.
     """
     stack = [metadata]
     while stack:
@@ -227,15 +226,15 @@ def _check_codecs(metadata: Any) -> None:
             for codec in np.atleast_1d(np.array(part.get(key) or [], dtype=object)).tolist():
                 named = codec.get("name", codec.get("id")) if isinstance(codec, dict) else codec
                 if named not in ZARR_CODECS:
-                    raise FormatError(f"is packed with {named!r:.40}, which is not known to hold nothing but numbers")
+                    raise FormatError(f"is encoded with the unsupported codec {named!r:.40}; use zstd, gzip or blosc")
         shape, kind = part.get("shape"), part.get("dtype", part.get("data_type"))
         if isinstance(kind, str) and ("O" in kind or "object" in kind):
-            raise FormatError("holds Python objects, expected numbers")
+            raise FormatError("contains Python objects, expected numbers")
         if isinstance(shape, list) and not all(isinstance(n, int) and 0 <= n < 2**40 for n in shape):
-            raise FormatError("has an array of an impossible shape")
+            raise FormatError("contains an array of invalid shape")
         for chunk in (part.get("chunks"), part.get("chunk_shape")):
             if isinstance(chunk, list) and not 0 < math.prod(n if isinstance(n, int) else 0 for n in chunk) < 2**33:
-                raise FormatError("has chunks of an impossible size")
+                raise FormatError("contains chunks of invalid size")
 
 
 def _needs(path: Path, engine: str) -> None:

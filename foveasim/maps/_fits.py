@@ -1,9 +1,9 @@
 """
-Maps as FITS images: the first axis is x, the second y, the third the wavelength; the first row is the lowest.
+Power maps in FITS images: axes x, y and wavelength, bottom row first.
 
-Read is a linear world coordinate system (FITS standard 4.0, section 8: ``CTYPE``, ``CRPIX``, ``CRVAL``, ``CDELT`` or a diagonal
-``CD``) whose ``CUNIT`` is a length, or the size of a pixel in µm, ``XPIXSZ`` and ``YPIXSZ``; and ``BUNIT``. What we write
-says the same, and once more as JSON in the keyword ``FOVEASIM``, since numbers in a header are rounded.
+The reader supports a linear world coordinate system (FITS standard 4.0, section 8: ``CTYPE``, ``CRPIX``, ``CRVAL``, ``CDELT``
+or a diagonal ``CD``) with a length as ``CUNIT``, or the pixel size in µm, ``XPIXSZ`` and ``YPIXSZ``; and ``BUNIT``. The writer
+also stores these metadata as JSON in the keyword ``FOVEASIM``, because numbers in a header are rounded.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ __all__ = ["MAGIC", "read", "write"]
 
 MAGIC = b"SIMPLE  ="
 KEYWORD = "FOVEASIM"
-#: More parts of a file are not looked through.
+#: Maximum number of header-data units that are searched.
 MAX_HDUS = 64
-#: Axes of light waves: wavelength in vacuum and in air.
+#: Names of wavelength axes: in vacuum and in air.
 WAVES = ("WAVE", "AWAV", "WAVELENGTH", "LAMBDA")
 
 
@@ -54,20 +54,20 @@ def write(power_map: PowerMap, path: Path) -> None:
         header["CTYPE3"], header["CUNIT3"], header["CRPIX3"] = "WAVE", "nm", 1.0
         header["CRVAL3"], header["CDELT3"] = float(waves_nm[0]), float(step_nm[0]) if step_nm.size else 1.0
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about a long text
+        warnings.simplefilter("ignore")  # warns about long strings
         header[KEYWORD] = json.dumps(about_map(power_map))
         hdu.writeto(path, overwrite=True)
 
 
 def read(path: Path, name: str | None) -> Found:
-    """Read the image of that name or number, or the first."""
+    """Read the image with a name or number, or the first image."""
     fits = _astropy(path)
     n_bytes = path.stat().st_size
     with (
         warnings.catch_warnings(),
         fits.open(path, mode="readonly", memmap=False, disable_image_compression=True, lazy_load_hdus=True) as file,
     ):
-        warnings.simplefilter("ignore")  # about what is beside the standard
+        warnings.simplefilter("ignore")  # warns about deviations from the standard
         hdu = _image(file, name)
         header = hdu.header
         check_size(hdu.shape, max(abs(int(header["BITPIX"])) // 8, 1), n_bytes)
@@ -83,7 +83,7 @@ def read(path: Path, name: str | None) -> Found:
 
 
 def _image(file: Any, name: str | None) -> Any:
-    """The part of the file that is the map."""
+    """Return the header-data unit of the map."""
     for number in range(MAX_HDUS):
         try:
             hdu = file[number]
@@ -94,20 +94,20 @@ def _image(file: Any, name: str | None) -> Any:
         if hdu.is_image and hdu.shape and 0 not in hdu.shape:
             return hdu
         if hdu.header.get("ZIMAGE") is True:
-            raise FormatError("is compressed; unpack it first, with funpack")
+            raise FormatError("is compressed; decompress it with funpack")
         if name is not None:
             break
-    raise FormatError("holds no image" if name is None else f"holds no image {name!r:.40}")
+    raise FormatError("contains no image" if name is None else f"contains no image {name!r:.40}")
 
 
 def _header_values(header: Any, shape: tuple[int, ...], n_axes: int) -> dict[str, Any]:
-    """What a header tells of pitch, place, wavelengths and unit."""
+    """Return pitch, origin, wavelengths and unit from a header."""
     told: dict[str, Any] = _plane_values(header, shape)
     if n_axes >= 3 and str(header.get("CTYPE3", "")).strip().upper() in WAVES:
         per = length_in_um(str(header.get("CUNIT3", "m")))
         step, start = _step(header, 3), _number(header, "CRVAL3", 0)
         if per is None:
-            raise FormatError(f"tells wavelengths in {str(header.get('CUNIT3'))!r:.20}, expected a length")
+            raise FormatError(f"has the wavelength unit {str(header.get('CUNIT3'))!r:.20}, expected a unit of length")
         if step is not None:
             channel = np.arange(shape[-3]) + 1.0 - _number(header, "CRPIX3", 1)
             told["wavelength_nm"] = ((start + step * channel) * (per * 1e3)).tolist()
@@ -138,13 +138,13 @@ def _plane_values(header: Any, shape: tuple[int, ...]) -> dict[str, Any]:
 
 
 def _step(header: Any, axis: int) -> float | None:
-    """Step along an axis, None where the header tells none."""
+    """Return the step along an axis, None if the header has none."""
     for one in (1, 2, 3):
         for prefix in ("CD", "PC"):
             if one != axis and (
                 _number(header, f"{prefix}{axis}_{one}", 0) or _number(header, f"{prefix}{one}_{axis}", 0)
             ):
-                raise FormatError("is turned against its coordinates; resample it first")
+                raise FormatError("has rotated coordinate axes; resample it without rotation")
     if f"CD{axis}_{axis}" in header:
         return _number(header, f"CD{axis}_{axis}", 0) or None
     return _number(header, f"CDELT{axis}", 0) * _number(header, f"PC{axis}_{axis}", 1) or None
@@ -153,7 +153,7 @@ def _step(header: Any, axis: int) -> float | None:
 def _number(header: Any, keyword: str, default: int) -> float:
     value = header.get(keyword, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise FormatError(f"tells {value!r:.20} as its {keyword}, expected a number")
+        raise FormatError(f"has the invalid value {keyword} = {value!r:.20}, expected a finite number")
     return float(value)
 
 

@@ -1,4 +1,4 @@
-"""Table of formats of power maps, and reading them in the sandbox process."""
+"""Registry of power map formats, and reading in the sandbox process."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from foveasim.maps._common import Found, as_images, max_unpacked
 
 __all__ = ["MAP_FORMATS", "read_found"]
 
-#: Formats of power maps. ``read(path, name)`` gives a :class:`foveasim.maps.Found`, ``write(power_map, path)`` nothing.
-#: Installed packages add theirs as entry points of the group ``foveasim.map_formats``.
+#: Formats of power maps. ``read(path, name)`` returns a :class:`foveasim.maps.Found`, ``write(power_map, path)`` None.
+#: Installed packages add formats as entry points of the group ``foveasim.map_formats``.
 MAP_FORMATS: Registry[FileFormat] = Registry("power map format", "foveasim.map_formats")
 
 
 def read_found(path: Path, kind: str, name: str | None) -> Found:
     """
-    Return what a file contains, in the sandbox process where its format asks for it.
+    Read data and metadata of a file, in the sandbox process if the format requires it.
 
     Parameters
     ----------
@@ -33,19 +33,19 @@ def read_found(path: Path, kind: str, name: str | None) -> Found:
     kind : str
         Name in :data:`MAP_FORMATS`.
     name : str, optional
-        Of the array, where there are several.
+        Name of the array, if there are several.
 
     Raises
     ------
     FileError
-        When it is corrupt, malformed, too large, or no map.
+        If the file is corrupt, malformed, too large, or not a map.
     """
     form = MAP_FORMATS[kind]
     assert form.read is not None
     if not form.is_sandboxed:
         found: Found = form.read(path, name)
         return found
-    # OpenEXR prints what it could not read, and may go on without it.
+    # OpenEXR prints read errors and can return incomplete data: any output counts as an error.
     told, (data,) = sandbox.read_in_sandbox(
         _read, path, kind=form.title, max_unpacked=max_unpacked, is_silent=kind == "exr", format_name=kind, name=name
     )
@@ -54,7 +54,7 @@ def read_found(path: Path, kind: str, name: str | None) -> Found:
 
 
 def _read(path: str, format_name: str, name: str | None) -> tuple[dict[str, Any], list[NDArray[Any]]]:
-    """What a reader finds, taken apart for its way between the processes."""
+    """Return the result of a reader as plain data and arrays, for transfer between processes."""
     form = MAP_FORMATS[format_name]
     assert form.read is not None
     with as_file_error(Path(path), "power map", passes=(ParameterError,)):

@@ -1,10 +1,10 @@
 """
-Optical images of ISETCam and ISETBio, as MATLAB saves them: the struct ``oi``, or its fields.
+Optical images of ISETCam and ISETBio in MAT files: the struct ``oi``, or its fields.
 
-``data.photons`` (row, column, wave) are photons/(s m² nm), the first row on top; ``spectrum.wave`` is in nm. The middle of
-the image lies on the axis, its samples are square, and its width is ``2 f tan(wAngular / 2)``, f the focal length
-(``oiGet(oi, 'width')`` since November 2021; before, the distance of the image). A single wavelength stands for 1 nm, as
-ISETCam's ``bin width`` does. Integers, of before 2017, are unpacked between ``dmin`` and ``dmax``.
+``data.photons`` (row, column, wave) are photons/(s m² nm), top row first; ``spectrum.wave`` is in nm. The image is centred on
+the axis, its samples are square, and its width is ``2 f tan(wAngular / 2)`` with the focal length f (``oiGet(oi, 'width')``
+since November 2021; earlier versions used the image distance). A single wavelength has a band width of 1 nm, as ISETCam's
+``bin width``. Integer data from versions before 2017 are scaled to the range ``dmin`` to ``dmax``.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from foveasim.maps._formats import MAP_FORMATS
 __all__ = ["MAT5_MAGIC", "MAT73_MAGIC", "read_mat5", "read_mat73"]
 
 MAT5_MAGIC, MAT73_MAGIC = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
-#: Names of the struct: as scripts save it, and as vcExportObject does.
+#: Names of the struct in files of scripts and of vcExportObject.
 NAMES = ("oi", "opticalimage", "opticalImage")
 PHOTONS, WAVES = ("data/photons", "photons"), ("spectrum/wave", "wave", "data/wave")
 FIELDS = ("data", "photons", "spectrum", "wave", "wAngular", "optics")
-#: Of a MAT file of version 5: its header; types of elements; bytes of a packed element that are unpacked at a time.
+#: MAT files of version 5: sizes of header and tag, types of elements, and bytes that are decompressed at a time.
 HEADER_BYTES, TAG_BYTES, COMPRESSED, MATRIX = 128, 8, 15, 14
 PIECE_BYTES = 2**20
-#: Values of a field that is no map.
+#: Maximum number of values of fields other than the photons.
 MAX_VALUES = 10_000
 
-#: Looks up a field by its path, ``optics/focalLength``; None where there is none, or it is no array of numbers or text.
+#: Function that returns a field by its path, ``optics/focalLength``; None if it is missing or not an array of numbers or text.
 Field: TypeAlias = Callable[[str], "NDArray[Any] | None"]
 
 
@@ -65,7 +65,7 @@ def read_mat5(path: Path, name: str | None) -> Found:
 
 
 def read_mat73(path: Path, name: str | None) -> Found:
-    """Read a MAT file of version 7.3, which is HDF5 with the axes the other way round."""
+    """Read a MAT file of version 7.3, which is HDF5 with reversed axes."""
     import h5py
 
     n_bytes = path.stat().st_size
@@ -91,26 +91,26 @@ def read_mat73(path: Path, name: str | None) -> Found:
 
 
 def _struct(names: list[str], name: str | None) -> str | None:
-    """The variable that is the optical image; none when the variables are its fields."""
+    """Return the name of the optical image; None if the variables are its fields."""
     for one in NAMES if name is None else (name,):
         if one in names:
             return one
     if name is None and {"data", "photons"} & set(names):
         return None
     told = ", ".join(n[:40] for n in names[:5])
-    raise FormatError(f"holds no optical image {name or 'oi'!r:.40}; there are {told or 'no variables'}")
+    raise FormatError(f"contains no optical image {name or 'oi'!r:.40}; available variables: {told or 'none'}")
 
 
 def _found(field: Field) -> Found:
     photons, waves = (next((v for n in names if (v := field(n)) is not None), None) for names in (PHOTONS, WAVES))
     if photons is None:
-        raise FormatError("holds no optical image with data.photons; compute it first, with oiCompute")
+        raise FormatError("contains no optical image with data.photons; compute it with oiCompute")
     if photons.ndim not in (2, 3) or 0 in photons.shape:
-        raise FormatError(f"has photons of the shape {photons.shape[:5]}, expected (row, column, wave)")
+        raise FormatError(f"contains photons of shape {photons.shape[:5]}, expected (row, column, wave)")
     images = from_file_rows(_whole(photons, field))
     pitch = _pitch_um(field, photons.shape[1])
     return Found(
-        data=images,  # turned already
+        data=images,  # already bottom row first
         pitch_um=None if pitch is None else (pitch, pitch),
         wavelength_nm=None if waves is None else waves.ravel().tolist(),
         band_width_nm=[1.0] if images.shape[0] == 1 else None,
@@ -119,17 +119,17 @@ def _found(field: Field) -> Found:
 
 
 def _whole(photons: NDArray[Any], field: Field) -> NDArray[Any]:
-    """Photon rates out of the integers that old versions kept."""
+    """Return photon rates, scaled from the integers of old versions."""
     if photons.dtype.kind != "u":
         return photons
     low, high = _number(field("data/dmin")), _number(field("data/dmax"))
     if low is None or high is None or not low <= high:
-        raise FormatError("has photons as integers, without the dmin and dmax that they stand between")
+        raise FormatError("contains photons as integers without their range, dmin and dmax")
     return low + (high - low) / float(np.iinfo(photons.dtype).max) * photons.astype(np.float64)
 
 
 def _pitch_um(field: Field, n_columns: int) -> float | None:
-    """Side of a cell, from the field of view; nothing for a pinhole, and what has neither."""
+    """Return the side of a cell from the field of view; None without angle or focal length."""
     angle_deg, focal_m = _number(field("wAngular")), _number(field("optics/focalLength"))
     model = field("optics/model")
     if model is not None and "".join(model.ravel().astype(str).tolist()).lower().replace(" ", "") == "raytrace":
@@ -147,11 +147,11 @@ def _number(values: NDArray[Any] | None) -> float | None:
     return number if math.isfinite(number) else None
 
 
-# -- unpacking, with a limit --------------------------------------------------------------------------------------------
+# -- decompression with a limit -----------------------------------------------------------------------------------------
 
 
 def _unpacked(path: Path) -> bytes:
-    """The file with its packed elements unpacked, as far as such a file may be."""
+    """Return the file with decompressed elements, up to the size limit."""
     n_bytes = path.stat().st_size
     most = max_unpacked(n_bytes)
     with path.open("rb") as file:
@@ -161,17 +161,17 @@ def _unpacked(path: Path) -> bytes:
         while len(tag := file.read(TAG_BYTES)) == TAG_BYTES:
             kind, length = int.from_bytes(tag[:4], order), int.from_bytes(tag[4:], order)  # type: ignore[arg-type]
             if kind not in (COMPRESSED, MATRIX) or length > n_bytes:
-                raise FormatError("is corrupt: an element of the file is no variable, or longer than the file")
+                raise FormatError("is corrupt: an element is not a variable, or is longer than the file")
             element = _inflated(file, length, most - size) if kind == COMPRESSED else tag + file.read(length)
             pieces.append(element)
             size += len(element)
             if size > most:
-                raise FormatError(f"would unpack to more than {most} bytes; save it unpacked, with -v6")
+                raise FormatError(f"would decompress to more than {most} bytes; save it uncompressed, with -v6")
     return b"".join(pieces)
 
 
 def _inflated(file: IO[bytes], length: int, most: int) -> bytes:
-    """One packed element, not much more than ``most`` bytes of it."""
+    """Return one decompressed element, limited to little more than ``most`` bytes."""
     inflater, parts, size = zlib.decompressobj(), [], 0
     while length > 0 and size <= most:
         packed = file.read(min(length, PIECE_BYTES))

@@ -1,9 +1,9 @@
 """
-Maps as numpy arrays: one array (npy), or named arrays in an archive (npz). Nothing is ever unpickled.
+Power maps as numpy arrays: one array (npy), or named arrays in an archive (npz).
 
-Names in an archive are ``data``, ``pitch_um``, ``origin_um``, ``wavelength_nm``, ``band_width_nm`` and ``unit``, as
-``np.savez(path, data=..., pitch_um=0.5, wavelength_nm=[450, 550], unit="w_m2")`` writes them; the lowest row is first.
-``pitch_um`` is one number, or the two of (x, y).
+Names in an archive are ``data``, ``pitch_um``, ``origin_um``, ``wavelength_nm``, ``band_width_nm`` and ``unit``, as written by
+``np.savez(path, data=..., pitch_um=0.5, wavelength_nm=[450, 550], unit="w_m2")``; the bottom row is first. ``pitch_um`` is one
+number, or a pair (x, y). Objects are never unpickled.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from foveasim.maps._formats import MAP_FORMATS
 __all__ = ["NPY_MAGIC", "ZIP_MAGICS", "read_npy", "read_npz", "write_npz"]
 
 NPY_MAGIC = b"\x93NUMPY"
-#: A zip archive, and an empty one.
+#: Signatures of zip archives: nonempty and empty.
 ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06")
 DATA = "data"
 ABOUT = ("pitch_um", "origin_um", "wavelength_nm", "band_width_nm", "unit")
-#: What stands beside the map is small.
+#: Maximum size of an array of metadata.
 MAX_ABOUT_BYTES = 2**20
 
 
 def write_npz(power_map: PowerMap, path: Path) -> None:
-    """Write the map's arrays, unpacked."""
+    """Write the arrays of the map without compression."""
     with path.open("wb") as file:
         np.savez(
             file,
@@ -46,7 +46,7 @@ def write_npz(power_map: PowerMap, path: Path) -> None:
 
 
 def read_npy(path: Path, name: str | None) -> Found:
-    """Read one array, which tells nothing of itself."""
+    """Read one array without metadata."""
     _check_no_name(name)
     n_bytes = path.stat().st_size
     with path.open("rb") as file:
@@ -54,7 +54,7 @@ def read_npy(path: Path, name: str | None) -> Found:
 
 
 def read_npz(path: Path, name: str | None) -> Found:
-    """Read the array of that name, or ``data``, or the only one, and what stands beside it."""
+    """Read the named array, or ``data``, or the only array, and the metadata."""
     n_bytes = path.stat().st_size
     with zip_members(path) as (archive, items):
         chosen = _chosen(list(items), name)
@@ -74,19 +74,19 @@ def read_npz(path: Path, name: str | None) -> Found:
 
 def _check_no_name(name: str | None) -> None:
     if name is not None:
-        raise FormatError("holds one array without a name; leave name= out")
+        raise FormatError("contains one unnamed array; omit name=")
 
 
 def _chosen(names: list[str], name: str | None) -> str:
     others = [n for n in names if n not in ABOUT]
     if name is not None:
         if name not in names:
-            raise FormatError(f"has no array {name!r:.40}; there are {', '.join(map(repr, names[:5]))}")
+            raise FormatError(f"has no array {name!r:.40}; available arrays: {', '.join(map(repr, names[:5]))}")
         return name
     if DATA in others:
         return DATA
     if len(others) != 1:
-        raise FormatError(f"holds {len(others)} arrays, none called 'data'; say which is the map with name=")
+        raise FormatError(f"contains {len(others)} arrays, none of them named 'data'; select the map with name=")
     return others[0]
 
 
@@ -110,7 +110,7 @@ def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo, n_bytes: int) -> ND
 def _array(file: IO[bytes], size: int, n_bytes: int) -> NDArray[Any]:
     def check(shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         if dtype.hasobject or not dtype.itemsize:
-            raise FormatError("holds Python objects or nothing; save an array of numbers")
+            raise FormatError("contains Python objects or elements of size 0; save an array of numbers")
         check_size(shape, dtype.itemsize, n_bytes)
 
     return read_array(file, size, check)

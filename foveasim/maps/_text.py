@@ -1,4 +1,4 @@
-"""What a format has no place for, as JSON in a text that it has: pitch, origin, wavelengths, unit."""
+"""Metadata of maps as a JSON string, for formats without fields for them."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ __all__ = ["about_map", "found_in_text"]
 
 FILE_FORMAT = "foveasim power map"
 FILE_VERSION = 1
-#: A longer text is somebody else's.
+#: Longer strings are not metadata of foveasim.
 MAX_CHARS = 2**20
 
 
 def about_map(power_map: PowerMap) -> dict[str, Any]:
-    """What is told of a map: Python's JSON keeps every bit of a float64."""
+    """Return the metadata of a map; Python's JSON represents float64 losslessly."""
     return {
         "format": FILE_FORMAT,
         "version": FILE_VERSION,
@@ -34,12 +34,12 @@ def about_map(power_map: PowerMap) -> dict[str, Any]:
 
 def found_in_text(text: str, data: NDArray[Any], *, is_y_falling: bool) -> Found:
     """
-    The map with what its text tells, when that is ours.
+    Return the map with the metadata of a string that foveasim wrote.
 
     Raises
     ------
     FormatError
-        When the text is ours, and broken.
+        If the string has the format of foveasim and is invalid.
     """
     about = _parsed(text)
     if not isinstance(about, dict) or about.get("format") != FILE_FORMAT:
@@ -51,7 +51,7 @@ def found_in_text(text: str, data: NDArray[Any], *, is_y_falling: bool) -> Found
         x0, y0 = map(float, about["origin_um"])
         waves = [float(w) for w in about["wavelength_nm"]]
     except (KeyError, TypeError, ValueError):
-        raise FormatError("tells a pitch, an origin or wavelengths that are no numbers") from None
+        raise FormatError("contains an invalid pitch, origin or wavelength") from None
     return Found(
         data=data,
         is_y_falling=is_y_falling,

@@ -1,7 +1,7 @@
 """
-Maps as TIFF: a page per band, or one page whose samples are the bands; the first row is on top.
+Power maps in TIFF files: bands as pages, or as samples of one page; top row first.
 
-What a TIFF has no place for stands as JSON in the first page's description: pitch, origin, wavelengths and unit.
+Pitch, origin, wavelengths and unit are stored as JSON in the description of the first page.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from foveasim.maps._text import about_map, found_in_text
 __all__ = ["MAGICS", "read", "write"]
 
 MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-#: Tag and values of TIFF that tell where the first row lies: on top, and below.
+#: TIFF tag of the orientation, and its values for top row first and bottom row first.
 ORIENTATION_TAG, ON_TOP, BELOW = 274, 1, 4
-#: Room for what stands beside the pages of a classic TIFF.
+#: Maximum data size of a classic TIFF: 4 GiB minus a reserve for metadata.
 CLASSIC_BYTES = 2**32 - 2**24
 
 
 def write(power_map: PowerMap, path: Path) -> None:
-    """Write a page per band, unpacked."""
+    """Write one uncompressed page per band."""
     import tifffile
 
     description = json.dumps(about_map(power_map))
@@ -47,26 +47,26 @@ def write(power_map: PowerMap, path: Path) -> None:
 
 
 def read(path: Path, name: str | None) -> Found:
-    """Read all pages as bands, or the samples of one."""
+    """Read all pages as bands, or the samples of one page."""
     import tifffile
 
     if name is not None:
-        raise FormatError("holds one map without a name; leave name= out")
+        raise FormatError("contains one unnamed map; omit name=")
     n_bytes = path.stat().st_size
     with tifffile.TiffFile(path) as file:
         n_pages = len(file.pages)
         if not 1 <= n_pages <= MAX_BANDS:
-            raise FormatError(f"holds {n_pages} pages, expected one for each band")
+            raise FormatError(f"contains {n_pages} pages, expected 1 to {MAX_BANDS}, one per band")
         pages = [file.pages[i] for i in range(n_pages)]
         first: Any = pages[0]
         for page in pages:
             if page.shape != first.shape or page.dtype != first.dtype or page.dtype is None:
-                raise FormatError("holds pages of different sizes or types, expected one for each band")
+                raise FormatError("contains pages of different sizes or dtypes; write one equal page per band")
             if page.photometric not in (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB):
-                raise FormatError("holds colours of a picture; save numbers, with 0 as black")
+                raise FormatError("has an unsupported photometric interpretation; save values with 0 as black")
         check_size((n_pages, *first.shape), first.dtype.itemsize, n_bytes)
         if n_pages > 1 and first.ndim != 2:
-            raise FormatError(f"holds {n_pages} pages of the shape {first.shape}, expected one for each band")
+            raise FormatError(f"contains {n_pages} pages of shape {first.shape}, expected (n_y, n_x) per band")
         images = [pixels_of_page(path, page) for page in pages]
         data = images[0][np.newaxis] if n_pages == 1 else np.stack(images)
         if first.ndim == 3:
@@ -74,7 +74,7 @@ def read(path: Path, name: str | None) -> Found:
         orientation = first.tags[ORIENTATION_TAG].value if ORIENTATION_TAG in first.tags else ON_TOP
         description = str(first.description)
     if orientation not in (ON_TOP, BELOW):
-        raise FormatError(f"is turned, as its orientation {orientation!s:.10} tells; save it upright")
+        raise FormatError(f"has the unsupported orientation {orientation!s:.10}; save it with orientation 1 or 4")
     return found_in_text(description, data, is_y_falling=orientation == ON_TOP)
 
 

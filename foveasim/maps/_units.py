@@ -1,4 +1,4 @@
-"""Units that other programs write beside their numbers, and what they are in ours."""
+"""Units in files of other programs, and their conversion."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from foveasim.units import photon_energy_j
 
 __all__ = ["PER_NM", "UNITS", "Unit", "length_in_um", "light_unit", "per_band_w_m2"]
 
-#: What the numbers of a map are: power or photons a second, on a square metre, in the whole band or in a nanometre of it.
+#: Units of a map: power or photons per second, per square metre, per band or per nanometre.
 Unit: TypeAlias = Literal["w_m2", "w_m2_nm", "photons_s_m2", "photons_s_m2_nm"]
 UNITS: tuple[Unit, ...] = get_args(Unit)
 PER_NM: tuple[Unit, ...] = ("w_m2_nm", "photons_s_m2_nm")
@@ -36,7 +36,7 @@ _BASE: dict[str, _Quantity] = {
     **dict.fromkeys(("s", "sec", "second", "seconds"), (1.0, _SECOND)),
     **dict.fromkeys(("photon", "photons", "ph", "quanta"), (1.0, _PHOTON)),
 }
-#: Powers of the units of light, and their sizes in SI.
+#: Units of irradiance by their powers of the base units, with their sizes in SI.
 _LIGHT: dict[tuple[int, int, int, int], tuple[Unit, float]] = {
     (1, -2, 0, 0): ("w_m2", 1.0),
     (1, -3, 0, 0): ("w_m2_nm", 1e9),
@@ -44,13 +44,13 @@ _LIGHT: dict[tuple[int, int, int, int], tuple[Unit, float]] = {
     (0, -3, -1, 1): ("photons_s_m2_nm", 1e9),
 }
 _TOKEN = re.compile(r"(?P<name>[A-Za-z]+)(?P<power>[-+]?[0-9]{1,2}(?![0-9]))?|(?P<sign>[/()1])")
-#: A longer text is no unit.
+#: Maximum length of a unit string.
 _MAX_CHARS = 64
 
 
 def light_unit(text: str) -> tuple[Unit, float] | None:
     """
-    The unit of light that a text tells, and how much of ours one of it is; nothing when it tells none.
+    Parse a unit of irradiance; return the supported unit and the factor, or None.
 
     Examples
     --------
@@ -72,7 +72,7 @@ def light_unit(text: str) -> tuple[Unit, float] | None:
 
 def length_in_um(text: str) -> float | None:
     """
-    How many µm the unit of length is that a text tells; nothing when it tells none.
+    Parse a unit of length; return its size in µm, or None.
 
     Examples
     --------
@@ -84,7 +84,11 @@ def length_in_um(text: str) -> float | None:
 
 
 def per_band_w_m2(unit: Unit, wavelength_nm: Floats, band_width_nm: Floats | None) -> Floats:
-    """What one of a unit is in W/m² per band, (n_band,): times the band's width, and the energy of its photons."""
+    """
+    Return the factors that convert a unit to W/m² per band, (n_band,).
+
+    Units per nm are multiplied by the band width, photon rates by the photon energy.
+    """
     factor = np.ones_like(wavelength_nm)
     if band_width_nm is not None and unit in PER_NM:
         factor = factor * band_width_nm
@@ -92,12 +96,16 @@ def per_band_w_m2(unit: Unit, wavelength_nm: Floats, band_width_nm: Floats | Non
 
 
 def _near(factor: float) -> float:
-    """The decimal that was meant: 1e-6 / 1e-4 is not 0.01 to the last bit."""
+    """Round to 12 digits: 1e-6 / 1e-4 differs from 0.01 in the last bit."""
     return float(f"{factor:.12g}")
 
 
 def _quantity(text: str) -> _Quantity | None:
-    """Size and powers of a product of units with powers; a stroke stands before one unit, or a bracket of them."""
+    """
+    Parse a product of units with powers; return its size and powers of the base units.
+
+    A slash applies to the next unit or bracket only.
+    """
     plain = text.strip()
     for other, ours in (("²", "2"), ("µ", "u"), ("μ", "u"), ("⁻", "-"), ("¹", "1"), ("**", ""), ("^", "")):
         plain = plain.replace(other, ours)

@@ -1,4 +1,4 @@
-"""Maps as labelled arrays: dimensions (wavelength, y, x), coordinates in the middle of cells, units as attributes."""
+"""Power maps as labelled arrays (wavelength, y, x) with cell-centre coordinates."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ if TYPE_CHECKING:
 
 __all__ = ["NAME", "found_in_array", "from_xarray", "to_xarray"]
 
-#: What the map is called in a file of several arrays.
+#: Name of the map in a file with several arrays.
 NAME = "irradiance"
-#: Names of dimensions, ours first.
+#: Accepted names of dimensions; the first is the name that is written.
 X = ("x", "x_um", "col", "cols", "column", "n_x")
 Y = ("y", "y_um", "row", "rows", "n_y")
 BAND = ("wavelength", "wavelength_nm", "wavelengths", "wave", "wl", "lambda", "band", "bands", "channel")
-#: What libraries call dimensions that a file does not name.
+#: Prefixes of names that libraries generate for unnamed dimensions.
 NAMELESS = ("phony_dim_", "dim_")
-#: Pitch and origin as attributes are those of the coordinates when no coordinate is off by more of a cell: rounding.
+#: Largest difference, in cells, of coordinates from the pitch and origin in attributes: rounding errors.
 ROUNDING = 1e-6
 
 
 def to_xarray(power_map: PowerMap) -> xr.DataArray:
     """
-    The map as a labelled array.
+    Convert a power map to a labelled array.
 
     Parameters
     ----------
@@ -44,13 +44,13 @@ def to_xarray(power_map: PowerMap) -> xr.DataArray:
     Returns
     -------
     xarray.DataArray (wavelength, y, x), W/m² per band
-        Coordinates are the wavelengths in nm and the middles of cells in µm, each with its ``units``. Pitch and origin also
-        stand as attributes, exactly.
+        The coordinates are wavelengths in nm and cell centres in µm, each with the attribute ``units``. The exact pitch and
+        origin are also stored as attributes.
 
     Raises
     ------
     ParameterError
-        When it is no map, or xarray is missing.
+        If ``power_map`` is not a PowerMap, or xarray is missing.
     """
     if not isinstance(power_map, PowerMap):
         raise ParameterError("power_map", f"must be a PowerMap, got a {type(power_map).__name__}")
@@ -84,12 +84,12 @@ def from_xarray(
     origin_um: tuple[float, float] | None = None,
 ) -> PowerMap:
     """
-    Map of a labelled array.
+    Convert a labelled array to a power map.
 
     Parameters
     ----------
     data_array : xarray.DataArray (y, x) or (wavelength, y, x), in any order
-        Coordinates with ``units`` give pitch, place and wavelengths; they may rise or fall, in even steps.
+        Coordinates with ``units`` specify pitch, origin and wavelengths. Positions may increase or decrease in uniform steps.
     pitch_um, wavelength_nm, band_width_nm, unit, origin_um
         As for :func:`read_power_map`.
 
@@ -100,7 +100,7 @@ def from_xarray(
     Raises
     ------
     ParameterError
-        When it is no such array, or lacks what nobody said.
+        If the array has other dimensions or invalid values, or metadata are missing.
     """
     xr = _xarray()
     if not isinstance(data_array, xr.DataArray):
@@ -116,19 +116,19 @@ def from_xarray(
 
 def found_in_array(array: xr.DataArray) -> Found:
     """
-    What a labelled array tells.
+    Return data and metadata of a labelled array.
 
     Raises
     ------
     FormatError
-        When its dimensions are not those of a map, or its coordinates uneven.
+        If the dimensions are not those of a map, or the coordinates are not uniform.
     """
     array = array.squeeze([d for d in array.dims if array.sizes[d] == 1 and d not in (*X, *Y, *BAND)], drop=True)
     names = list(array.dims)
     if len(names) in (2, 3) and all(str(d).startswith(NAMELESS) for d in names):
         return Found(data=array.to_numpy(), unit=_unit(array))
     if 0 in array.shape:
-        raise FormatError(f"holds an array of the shape {array.shape}, which is empty")
+        raise FormatError(f"contains an empty array of shape {array.shape}")
     x, y = _one_of(names, X), _one_of(names, Y)
     rest = [d for d in names if d not in (x, y)]
     if x is None or y is None or len(rest) > 1:
@@ -159,12 +159,12 @@ def _coordinate(array: xr.DataArray, name: Hashable) -> Floats | None:
         return None
     values = array.coords[name].to_numpy()
     if values.dtype.kind not in "iuf":
-        raise FormatError(f"has coordinates along {name!s:.20} that are no numbers")
+        raise FormatError(f"has non-numeric coordinates along {name!s:.20}")
     return values.astype(np.float64)
 
 
 def _place(array: xr.DataArray, x: Floats, y: Floats, names: tuple[Hashable, Hashable]) -> dict[str, Any]:
-    """Directions of the axes, and pitch and origin where the coordinates have units of length."""
+    """Return axis directions, and pitch and origin if the coordinates have units of length."""
     step_x, step_y = pitch_of_axes(x, y)
     told: dict[str, Any] = {"is_x_falling": (step_x or 1.0) < 0.0, "is_y_falling": (step_y or 1.0) < 0.0}
     per = [_per_um(array.coords[name], name) for name in names]
@@ -189,7 +189,11 @@ def _per_um(coordinate: xr.DataArray, name: Hashable) -> float | None:
 
 
 def _exact(array: xr.DataArray, x_um: Floats, y_um: Floats) -> Grid | None:
-    """The grid that the attributes tell to the last bit, when the coordinates are its: a cut-out keeps the attributes."""
+    """
+    Return the exact grid from the attributes, or None if the coordinates differ from it.
+
+    A slice of an array has the attributes of the complete array.
+    """
     pitch, origin = array.attrs.get("pitch_um"), array.attrs.get("origin_um")
     if pitch is None or origin is None:
         return None
@@ -204,7 +208,7 @@ def _exact(array: xr.DataArray, x_um: Floats, y_um: Floats) -> Grid | None:
 
 
 def _wavelengths_nm(array: xr.DataArray, dimension: Hashable | None) -> list[float] | None:
-    """Wavelengths of the bands: the coordinate of their dimension, or one along it that is called so."""
+    """Return the wavelengths from the coordinate of the dimension, or from a known name."""
     for name in (dimension, *BAND[:6]):
         if name not in array.coords:
             continue
@@ -229,5 +233,5 @@ def _xarray() -> Any:
     try:
         import xarray as xr
     except ImportError:
-        raise ParameterError("xarray", f"is missing; {install_hint('xarray', 'maps')}") from None
+        raise ParameterError("xarray", f"must be installed; {install_hint('xarray', 'maps')}") from None
     return xr

@@ -384,7 +384,7 @@ def test_arguments_specify_both_pitches(tmp_path):
 def test_file_rejects_pitch_out_of_range(tmp_path, pitch):
     np.savez(tmp_path / "map.npz", data=np.ones((3, 4)), pitch_um=pitch)
 
-    with pytest.raises(FileError, match=r"map\.npz: has cells of a size outside the allowed range"):
+    with pytest.raises(FileError, match=r"map\.npz: has a cell size outside the allowed range"):
         read_power_map(tmp_path / "map.npz", wavelength_nm=550.0, unit="w_m2")
 
 
