@@ -117,7 +117,7 @@ def _bands(names: list[str]) -> dict[str, float | None]:
 
 
 def _channel_name(wavelength_nm: float) -> str:
-    """Return the channel name of a band, with a comma because a point ends a layer name in EXR."""
+    """Return the channel name of a band; a point would end a layer name in EXR."""
     return f"S0.{wavelength_nm!r}nm".replace(".", ",").replace("S0,", "S0.")
 
 

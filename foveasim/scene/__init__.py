@@ -1,4 +1,4 @@
-"""Scenes: photographs, flat fields, point sources and test charts as light in physical units."""
+"""Scenes: photographs, flat fields, point sources and test charts in radiometric units."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scene: light from a plane in front of the lens."""
+"""Scene: spectral radiance of a plane in front of the lens."""
 
 from __future__ import annotations
 
@@ -32,43 +32,44 @@ from foveasim.units import m_from_um
 
 __all__ = ["Scene"]
 
-#: Wavelengths that a colour picture's red, green and blue stand for, and a grey one's, unless told otherwise.
+#: Default wavelengths of the channels of colour pictures (red, green, blue) and of grey pictures.
 RGB_NM = (620.0, 550.0, 450.0)
 GREY_NM = (550.0,)
-#: Encoded floating-point numbers above this are no picture from 0 to 1, but one from 0 to 255.
+#: Larger encoded floating-point values indicate a picture in the range 0 to 255 instead of 0 to 1.
 MAX_ENCODED = 16.0
-#: Pixels and distances larger than these are a slip of units: an astronomical scene is 1e9 m away, and as wide.
+#: Larger values are errors of units: 1e9 m is the distance and width of an astronomical scene.
 MAX_PITCH_UM, MAX_DISTANCE_M = 1e15, 1e9
-#: Weights of red, green and blue in the brightness of a colour (Rec. ITU-R BT.709).
+#: Weights of red, green and blue in the luminance of a colour (Rec. ITU-R BT.709).
 BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
     """
-    Light from a plane at some distance in front of the lens.
+    Spectral radiance of a plane at a given distance in front of the lens.
 
-    Usually made by :meth:`from_picture`, :meth:`flat` or :meth:`point_sources`.
+    Usually created by :meth:`from_picture`, :meth:`flat` or :meth:`point_sources`.
 
     Parameters
     ----------
     basis : (n_basis, n_y, n_x) float32 or float64
-        Images, row 0 lowest, values of at least 0. Copied, so that later edits of the array do not change the scene; an array
-        that is read-only already, with all that it is a view of, is shared.
+        Basis images, bottom row first, values >= 0. The array is copied, so that later changes do not affect the scene; an
+        array that is read-only, with all its base arrays, is shared.
     spectrum_w_m2_sr_nm : (n_basis, n_wavelength) float64, W/(m² sr nm)
-        The spectral radiance that the value 1 of each image stands for.
+        Spectral radiance of the value 1 in each basis image.
     wavelength_nm : (n_wavelength,) float64, nm
+        Wavelengths of the bands.
     band_width_nm : (n_wavelength,) float64, nm
-        Width of the band that each wavelength stands for.
+        Widths of the bands.
     pitch_um : float, µm
-        Distance of two pixels in the scene.
+        Pixel pitch in the scene.
     distance_m : float, m
-        Distance of the scene from the lens's pupil.
+        Distance of the scene from the pupil of the lens.
 
     Raises
     ------
     ParameterError
-        When the arrays do not fit together, are not finite, or negative.
+        If the arrays have inconsistent shapes, or contain values that are not finite or negative.
 
     Notes
     -----
@@ -91,15 +92,15 @@ class Scene:
             raise ParameterError("basis", f"must have the shape (n_basis, n_y, n_x), got {basis.shape}")
         lowest, highest = float(basis.min()), float(basis.max())
         if not (np.isfinite(lowest) and np.isfinite(highest)):
-            raise ParameterError("basis", "must be finite everywhere; the picture has a NaN or an infinity")
+            raise ParameterError("basis", "must be finite; replace NaN and infinite values")
         if lowest < 0.0:
-            raise ParameterError("basis", "must be >= 0 everywhere, since light is not negative", lowest)
+            raise ParameterError("basis", "must be >= 0", lowest)
         wavelength_nm = wavelengths_nm("wavelength_nm", self.wavelength_nm)
         width_nm = finite_array("band_width_nm", np.atleast_1d(self.band_width_nm), ndim=1, above=0.0)
         spectrum = finite_array("spectrum_w_m2_sr_nm", self.spectrum_w_m2_sr_nm, ndim=2, at_least=0.0)
         if width_nm.shape != wavelength_nm.shape:
             raise ParameterError(
-                "band_width_nm", f"must have one width for each of the {wavelength_nm.size} wavelengths", width_nm
+                "band_width_nm", f"must have one value for each of the {wavelength_nm.size} wavelengths", width_nm
             )
         if spectrum.shape != (basis.shape[0], wavelength_nm.size):
             raise ParameterError(
@@ -135,36 +136,37 @@ class Scene:
         encoding: Encoding = "srgb",
     ) -> Scene:
         """
-        Scene from a photograph.
+        Create a scene from a photograph.
 
         Parameters
         ----------
         picture : path, or (n_y, n_x) or (n_y, n_x, n_channel) array
-            A file, or an array as image libraries give it, the first row on top: grey or colour, with alpha or without.
-            8-bit and 16-bit numbers reach from 0 to the type's maximum; of floating-point numbers 1 is the peak, and more
-            is allowed. What is transparent gives no light.
+            File, or array in the convention of image libraries, top row first: grey or colour, with or without alpha. 8-bit
+            and 16-bit values range from 0 to the maximum of the dtype; floating-point values have the peak 1 and may exceed
+            it. The radiance is multiplied by alpha.
         pitch_um : float, µm
-            Distance of two pixels in the scene.
+            Pixel pitch in the scene.
         distance_m : float, m
             Distance of the scene from the lens.
         peak_radiance_w_m2_sr_nm : float, W/(m² sr nm)
-            Spectral radiance of the value 1 (where ``spectrum`` is given: of the value 1 in it).
+            Spectral radiance of the value 1; if ``spectrum`` is given, of a pixel value of 1 where ``spectrum`` is 1.
         wavelength_nm : sequence, optional, nm
-            One a channel; (620, 550, 450) for colour and 550 for grey by default. A grey picture shines alike at all of
-            them; a colour one at one wavelength is first made grey. With ``spectrum`` any number.
+            One wavelength per channel; (620, 550, 450) for colour and 550 for grey by default. A grey picture has the same
+            radiance at all wavelengths. For one wavelength a colour picture is converted to grey. With ``spectrum`` any
+            number of wavelengths is allowed.
         band_width_nm : number or sequence, optional, nm
-            Widths of the wavelengths' bands; by default they reach halfway to the neighbours. Needed for one wavelength.
+            Widths of the bands; by default bands extend halfway to the adjacent wavelengths. Required for one wavelength.
         spectrum : (n_channel, n_wavelength), optional
-            Relative spectrum that each channel's value 1 stands for.
+            Relative spectrum of each channel at the value 1.
         encoding : {"srgb", "sqrt", "linear"}
-            What the numbers are: sRGB (photographs), the square root of the radiance (the paper), the radiance.
+            Encoding of the values: sRGB (photographs), square root of the radiance (the paper), or radiance.
 
         Raises
         ------
         FileError
-            When the file cannot be read.
+            If the file cannot be read.
         ParameterError
-            When channels, wavelengths and spectra do not fit together, or a value is out of range.
+            If channels, wavelengths and spectra are inconsistent, or a value is out of range.
         """
         check_choice("encoding", encoding, get_args(Encoding))
         peak = check_number("peak_radiance_w_m2_sr_nm", peak_radiance_w_m2_sr_nm, at_least=0.0)
@@ -205,10 +207,10 @@ class Scene:
         else:
             raise ParameterError(
                 "wavelength_nm",
-                f"must have as many values as the picture has channels, {n_channels}, or one",
+                f"must have one value, or one for each of the {n_channels} channels",
                 waves_nm.tolist(),
                 "nm",
-                "or give 'spectrum', the spectrum of each channel",
+                "for other wavelengths pass 'spectrum', the spectrum of each channel",
             )
         return cls(
             handed_over(channels),
@@ -232,7 +234,7 @@ class Scene:
         band_width_nm: float | Sequence[float] | None = None,
     ) -> Scene:
         """
-        Scene of the same spectral radiance everywhere and at every wavelength.
+        Create a scene of uniform spectral radiance at all positions and wavelengths.
 
         Parameters
         ----------
@@ -244,7 +246,7 @@ class Scene:
         Raises
         ------
         ParameterError
-            When a value is out of range.
+            If a value is out of range.
         """
         return cls.from_picture(
             np.ones(check_shape("shape", shape), np.float32),
@@ -269,14 +271,14 @@ class Scene:
         band_width_nm: float | Sequence[float] | None = None,
     ) -> Scene:
         """
-        Dark scene with points of light.
+        Create a scene of point sources on a black background.
 
         Parameters
         ----------
         shape : (n_y, n_x)
         pixels : sequence of (iy, ix)
-            The pixels that shine; row 0 is the lowest.
-        intensity_w_sr_nm : number, or one a point, W/(sr nm)
+            Pixels of the point sources; row 0 is the bottom row.
+        intensity_w_sr_nm : number, or one per point, W/(sr nm)
             Spectral radiant intensity of the points.
         pitch_um, distance_m, wavelength_nm, band_width_nm
             As for :meth:`from_picture`.
@@ -284,7 +286,7 @@ class Scene:
         Raises
         ------
         ParameterError
-            When a pixel lies outside, or a value is out of range.
+            If a pixel lies outside the picture, or a value is out of range.
         """
         pitch_um = check_number("pitch_um", pitch_um, above=0.0)
         n_y, n_x = check_shape("shape", shape)
@@ -296,7 +298,7 @@ class Scene:
         if points.ndim != 2 or points.shape[1] != 2 or points.dtype.kind not in "iu":
             raise ParameterError("pixels", "must be pairs (iy, ix) of integers", pixels)
         if np.any(points < 0) or np.any(points >= (n_y, n_x)):
-            raise ParameterError("pixels", f"must lie in a picture of {n_y} rows and {n_x} columns", pixels)
+            raise ParameterError("pixels", f"must lie within {n_y} rows and {n_x} columns", pixels)
         intensity = finite_array("intensity_w_sr_nm", intensity_w_sr_nm, at_least=0.0)
         if intensity.ndim > 1 or (intensity.ndim == 1 and intensity.size != points.shape[0]):
             raise ParameterError(
@@ -305,7 +307,7 @@ class Scene:
         image = np.zeros((1, n_y, n_x))
         np.add.at(image[0], (points[:, 0], points[:, 1]), intensity)
         waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
-        # A pixel of the pitch p0 with the radiance I / p0² has the intensity I.
+        # A pixel of pitch p0 and radiance I / p0² has the intensity I.
         per_area = np.full((1, waves_nm.size), 1.0 / float(m_from_um(pitch_um)) ** 2)
         return cls(
             read_only(image),
@@ -327,7 +329,7 @@ def _picture_array(picture: ArrayLike) -> NDArray[Any]:
 
 
 def _light(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Images:
-    """Relative radiance (n_channel, n_y, n_x) float32 of a picture as in its file, transparency taken off."""
+    """Return the relative radiance (n_channel, n_y, n_x) float32, multiplied by alpha."""
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     if pixels.dtype == np.bool_:
         pixels = pixels.astype(np.uint8) * np.uint8(255)
@@ -340,27 +342,27 @@ def _light(pixels: NDArray[Any], encoding: Encoding, *, has_alpha: bool) -> Imag
         alpha = values[from_file_rows(pixels[..., -1])] if has_alpha else None
     elif pixels.dtype.kind == "f":
         if not np.isfinite(pixels).all() or pixels.min() < 0:
-            raise ParameterError("picture", "must be finite and >= 0 everywhere")
+            raise ParameterError("picture", "must be finite and >= 0 in all pixels")
         if encoding != "linear" and pixels.max() > MAX_ENCODED:
             raise ParameterError(
                 "picture",
-                f"must be <= {MAX_ENCODED:g} where encoding='{encoding}'",
+                f"must be <= {MAX_ENCODED:g} for encoding='{encoding}'",
                 float(pixels.max()),
-                hint="of floating-point numbers 1 is the peak; divide by 255, or give uint8",
+                hint="the peak of floating-point pictures is 1: divide by 255, or pass uint8",
             )
         colours = pixels[..., :-1] if has_alpha else pixels
         precise = colours.astype(np.float32) if pixels.dtype == np.float16 else colours
         light = decoded(np.ascontiguousarray(from_file_rows(precise)), encoding).astype(np.float32)
         alpha = from_file_rows(pixels[..., -1]).astype(np.float32) if has_alpha else None
     else:
-        raise ParameterError("picture", f"must hold uint8, uint16 or floating-point numbers, got {pixels.dtype}")
+        raise ParameterError("picture", f"must have the dtype uint8, uint16 or float, got {pixels.dtype}")
     if alpha is not None:
         light *= alpha
     return light
 
 
 def band_widths_nm(wavelength_nm: Floats, band_width_nm: float | Sequence[float] | Floats | None) -> Floats:
-    """Widths as given, or reaching halfway to the neighbouring wavelengths."""
+    """Return the specified widths, or widths that extend halfway to the adjacent wavelengths."""
     if band_width_nm is not None:
         widths = finite_array("band_width_nm", band_width_nm, above=0.0)
         if widths.ndim > 1 or (widths.ndim == 1 and widths.size != wavelength_nm.size):
@@ -370,13 +372,13 @@ def band_widths_nm(wavelength_nm: Floats, band_width_nm: float | Sequence[float]
         return np.broadcast_to(widths, wavelength_nm.shape).astype(np.float64)
     if wavelength_nm.size == 1:
         raise ParameterError(
-            "band_width_nm", "must be given for a single wavelength: it has no neighbours to reach halfway to"
+            "band_width_nm", "must be given for a single wavelength, which has no adjacent wavelengths"
         )
     order = np.argsort(wavelength_nm)
     steps = np.diff(wavelength_nm[order])
     if np.any(steps <= 0):
-        raise ParameterError("wavelength_nm", "must be different from each other", wavelength_nm.tolist(), "nm")
-    # The outermost bands reach as far out as they reach in.
+        raise ParameterError("wavelength_nm", "must be unique", wavelength_nm.tolist(), "nm")
+    # The outermost bands are symmetric about their wavelengths.
     widths = np.empty(wavelength_nm.size)
     widths[order] = 0.5 * (np.concatenate((steps[:1], steps)) + np.concatenate((steps, steps[-1:])))
     return widths

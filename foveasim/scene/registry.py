@@ -11,12 +11,12 @@ __all__ = ["SCENES", "chart"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-#: Functions that give a :class:`foveasim.Scene`, by their names in settings files. Installed packages add theirs as entry
-#: points of the group ``foveasim.scenes``.
+#: Functions that return a :class:`foveasim.Scene`, by their names in settings files. Installed packages add functions as
+#: entry points of the group ``foveasim.scenes``.
 SCENES: Registry[Callable[..., Any]] = Registry("scene", "foveasim.scenes")
-#: What the docstring of a chart has in place of ``{picture}``: the parameters that all charts have.
+#: Documentation of the common parameters of charts, which replaces ``{picture}`` in their docstrings.
 PICTURE = """shape : (n_y, n_x)
-        Numbers of pixels.
+        Number of pixels.
     pitch_um : float, µm
         Pixel pitch in the scene.
     distance_m : float, m
@@ -26,11 +26,11 @@ PICTURE = """shape : (n_y, n_x)
     wavelength_nm : sequence, nm
         Wavelengths.
     band_width_nm : number or sequence, optional, nm
-        Widths of the wavelengths' bands; by default they reach halfway to the neighbours. Needed for one wavelength."""
+        Widths of the bands; by default bands extend halfway to the adjacent wavelengths. Required for one wavelength."""
 
 
 def chart(name: str) -> Callable[[F], F]:
-    """Decorate a chart: register it, and complete its docstring by the parameters that all charts have."""
+    """Register a chart function and insert the common parameters into its docstring."""
 
     def decorate(function: F) -> F:
         function.__doc__ = (function.__doc__ or "").replace("{picture}", PICTURE)

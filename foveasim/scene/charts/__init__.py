@@ -1,14 +1,14 @@
 """
 Test charts as scenes, in physical sizes.
 
-Each function gives a :class:`foveasim.Scene`. The chart's origin is the middle of the picture, x to the right, y up. A pixel
-has the *mean* of the ideal chart over its square, so that edges have no steps and the light is right; each function says
-whether that mean is exact.
+Each function returns a :class:`foveasim.Scene`. The origin of a chart is the centre of the picture, x to the right, y up.
+The value of a pixel is the *mean* of the ideal chart over its square, so that edges are anti-aliased and the total power is
+correct. The documentation of each function states whether this mean is exact.
 
-All take the picture's ``shape`` and ``pitch_um``, its ``distance_m``, the ``radiance_w_m2_sr_nm`` of white, ``wavelength_nm``
-and ``band_width_nm``. ``contrast`` is Michelson's, (white - black) / (white + black), everywhere: white keeps its
-radiance, and black has ``(1 - contrast) / (1 + contrast)`` of it. A pattern with less than 2 pixels a period is averaged
-away, as on any print; then there is a :class:`foveasim.errors.SamplingWarning`.
+All functions have the parameters ``shape``, ``pitch_um``, ``distance_m``, ``radiance_w_m2_sr_nm`` (of white),
+``wavelength_nm`` and ``band_width_nm``. ``contrast`` is the Michelson contrast, (white - black) / (white + black): the
+radiance of white is fixed, and the radiance of black is the fraction ``(1 - contrast) / (1 + contrast)`` of it. A pattern
+with fewer than 2 pixels per period averages to grey and raises a :class:`foveasim.errors.SamplingWarning`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ __all__ = [
 ]
 
 import_all(__name__, __path__)
-# A chart comes before a module of its name.
+# A chart takes precedence over a module of the same name.
 globals().update(SCENES.within(__name__))
-if not TYPE_CHECKING:  # charts of other packages, and new ones of this
+if not TYPE_CHECKING:  # charts of other packages and charts registered later
     __getattr__ = SCENES.attributes_of(__name__)

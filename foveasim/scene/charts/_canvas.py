@@ -1,4 +1,4 @@
-"""What all charts share: the picture that they are drawn on, its light, and exact means over pixels."""
+"""Common parts of the charts: raster, radiance of white, and exact means over pixels."""
 
 from __future__ import annotations
 
@@ -39,27 +39,27 @@ __all__ = [
 OneOrMore = float | Sequence[float]
 Shares = NDArray[np.float32]
 
-#: Pixels that are drawn at once: a few arrays of float64 of this size stay in the cache of a processor.
+#: Pixels per block: a few float64 arrays of this size fit into the processor cache.
 BLOCK_PIXELS = 2**18
-#: Samples on each side of a pixel whose mean has no closed form.
+#: Samples along each side of a pixel without a closed-form mean.
 SAMPLES = 32
-#: Fewer pixels in a period of a pattern do not show it (Nyquist).
+#: Nyquist limit of patterns.
 MIN_PIXELS_PER_PERIOD = 2.0
-#: Sizes that fit but for this relative rounding fit.
+#: Relative tolerance of sizes: rounding errors.
 ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class Canvas:
     """
-    The picture that a chart is drawn on, and the light on it.
+    Raster of a chart and radiance of white.
 
     Parameters
     ----------
     shape : (n_y, n_x)
     pitch_um : float, µm
     distance_m : float, m
-    radiance_w_m2_sr_nm : number, or one a wavelength, W/(m² sr nm)
+    radiance_w_m2_sr_nm : number, or one per wavelength, W/(m² sr nm)
     wavelength_nm : sequence, nm
     band_width_nm : number or sequence or None, nm
         As for :meth:`Scene.from_picture`.
@@ -67,7 +67,7 @@ class Canvas:
     Raises
     ------
     ParameterError
-        When a value is out of range.
+        If a value is out of range.
     """
 
     shape: tuple[int, int]
@@ -96,41 +96,41 @@ class Canvas:
 
     @property
     def pitch_mm(self) -> float:
-        """Side of a pixel."""
+        """Pixel pitch, mm."""
         return 1e3 * float(m_from_um(self.pitch_um))
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """Width and height of the picture."""
+        """Width and height of the picture, mm."""
         return self.shape[1] * self.pitch_mm, self.shape[0] * self.pitch_mm
 
     @property
     def x_edges_mm(self) -> Floats:
-        """Borders of the columns (n_x + 1,), the middle of the picture being 0."""
+        """Boundaries of the columns (n_x + 1,), relative to the centre of the picture."""
         return np.asarray((np.arange(self.shape[1] + 1) - 0.5 * self.shape[1]) * self.pitch_mm)
 
     @property
     def y_edges_mm(self) -> Floats:
-        """Borders of the rows (n_y + 1,), the lowest first."""
+        """Boundaries of the rows (n_y + 1,), bottom first."""
         return np.asarray((np.arange(self.shape[0] + 1) - 0.5 * self.shape[0]) * self.pitch_mm)
 
     @property
     def x_mm(self) -> Floats:
-        """Middles of the columns (n_x,)."""
+        """Centres of the columns (n_x,)."""
         return np.asarray((np.arange(self.shape[1]) - 0.5 * (self.shape[1] - 1)) * self.pitch_mm)
 
     @property
     def y_mm(self) -> Floats:
-        """Middles of the rows (n_y,), the lowest first."""
+        """Centres of the rows (n_y,), bottom first."""
         return np.asarray((np.arange(self.shape[0]) - 0.5 * (self.shape[0] - 1)) * self.pitch_mm)
 
     def row_blocks(self) -> Iterator[slice]:
-        """Rows in blocks that stay in the cache."""
+        """Yield blocks of rows that fit into the cache."""
         n_rows = max(1, BLOCK_PIXELS // self.shape[1])
         yield from (slice(i, min(i + n_rows, self.shape[0])) for i in range(0, self.shape[0], n_rows))
 
     def filled(self, function: Callable[[slice], Floats]) -> Shares:
-        """Picture (n_y, n_x) float32 of a function that gives the fractions of white in some rows."""
+        """Return a raster (n_y, n_x) float32 from a function of rows that returns fractions of white."""
         shares = np.empty(self.shape, np.float32)
         for rows in self.row_blocks():
             np.clip(function(rows), 0.0, 1.0, out=shares[rows], casting="same_kind")
@@ -143,24 +143,24 @@ class Canvas:
         Raises
         ------
         ParameterError
-            With the name of the parameter that makes it so large.
+            If the chart does not fit; ``name`` is the parameter that determines its size.
         """
         picture_width_mm, picture_height_mm = self.size_mm
         if width_mm > picture_width_mm * (1 + ROUNDING) or height_mm > picture_height_mm * (1 + ROUNDING):
             raise ParameterError(
                 name,
-                f"must leave the chart in the picture of {picture_width_mm:.4g} x {picture_height_mm:.4g} mm; "
-                f"it would be {width_mm:.4g} x {height_mm:.4g} mm",
+                f"must yield a chart within the picture of {picture_width_mm:.4g} x {picture_height_mm:.4g} mm, "
+                f"got {width_mm:.4g} x {height_mm:.4g} mm",
             )
 
     def radius_mm(self, radius_mm: float | None) -> float:
         """
-        Radius of a round chart: the one given, or the largest that the picture holds.
+        Return the radius of a round chart, by default the largest that fits into the picture.
 
         Raises
         ------
         ParameterError
-            When it is no length, or larger than the picture.
+            If the radius is not positive, or the chart is larger than the picture.
         """
         largest_mm = 0.5 * min(self.size_mm)
         if radius_mm is None:
@@ -170,27 +170,28 @@ class Canvas:
         return radius_mm
 
     def warn_if_fine(self, name: str, period_mm: float) -> None:
-        """Warn of a pattern with less than two pixels a period; called by a chart that a user calls."""
+        """Warn of a pattern with fewer than two pixels per period; to be called by chart functions directly."""
         n_pixels = period_mm / self.pitch_mm
         if n_pixels < MIN_PIXELS_PER_PERIOD * (1 - ROUNDING):
             warnings.warn(
-                f"'{name}' gives a pattern of {n_pixels:.3g} pixels a period where it is finest, and with less than 2 it is "
-                f"averaged away; take a coarser pattern, or pixels of at most {500.0 * period_mm:.4g} µm",
+                f"'{name}' yields {n_pixels:.3g} pixels per period in the finest part of the pattern, which averages to grey "
+                f"below 2; use a coarser pattern, or a pixel pitch of at most {500.0 * period_mm:.4g} µm",
                 SamplingWarning,
                 stacklevel=3,
             )
 
     def scene(self, shares: Shares, contrast: float, source: str) -> Scene:
         """
-        Scene of a chart in black and white.
+        Return the scene of a chart in black and white.
 
         Parameters
         ----------
         shares : (n_y, n_x) float32
-            Fraction of white in each pixel; it is written over.
+            Fraction of white in each pixel; overwritten.
         contrast : float
-            Michelson's.
+            Michelson contrast.
         source : str
+            Description of the chart.
         """
         black = (1.0 - contrast) / (1.0 + contrast)
         shares *= np.float32(1.0 - black)
@@ -198,7 +199,11 @@ class Canvas:
         return self.scene_of(shares[np.newaxis], np.asarray(self.radiance_w_m2_sr_nm)[np.newaxis], source)
 
     def scene_of(self, basis: Shares, spectrum_w_m2_sr_nm: Floats, source: str) -> Scene:
-        """Scene of basis images (n_basis, n_y, n_x), which it keeps, and their spectra (n_basis, n_wavelength)."""
+        """
+        Return the scene of basis images and their spectra.
+
+        The images (n_basis, n_y, n_x) are not copied; the spectra are (n_basis, n_wavelength).
+        """
         return Scene(
             handed_over(basis),
             spectrum_w_m2_sr_nm,
@@ -212,24 +217,24 @@ class Canvas:
 
 def checked_contrast(contrast: float) -> float:
     """
-    Michelson's contrast.
+    Return a Michelson contrast after validation.
 
     Raises
     ------
     ParameterError
-        When it is not from 0 to 1.
+        If it is not from 0 to 1.
     """
     return check_number("contrast", contrast, at_least=0.0, at_most=1.0)
 
 
 def inked(shares: Shares, ink: str) -> Shares:
     """
-    Fractions of white where these are the fractions of ink, written over.
+    Convert fractions of ink to fractions of white, in place.
 
     Raises
     ------
     ParameterError
-        When the ink is neither dark nor bright.
+        If the ink is neither dark nor bright.
     """
     if check_choice("ink", ink, ("dark", "bright")) == "dark":
         np.subtract(np.float32(1.0), shares, out=shares)
@@ -237,7 +242,7 @@ def inked(shares: Shares, ink: str) -> Shares:
 
 
 def interval(edges_mm: Floats, low_mm: float, high_mm: float) -> Floats:
-    """Fraction of each pixel (n,) of a row with these borders (n + 1,) that lies from one place to another: exact."""
+    """Return the exact fraction of each pixel (n,) with boundaries (n + 1,) in an interval."""
     inside_mm = np.clip(edges_mm, low_mm, high_mm)
     return np.asarray(np.diff(inside_mm) / np.diff(edges_mm))
 
@@ -245,7 +250,7 @@ def interval(edges_mm: Floats, low_mm: float, high_mm: float) -> Floats:
 def add_rectangle(
     picture: Shares, canvas: Canvas, x_mm: tuple[float, float], y_mm: tuple[float, float], value: float = 1.0
 ) -> None:
-    """Add a rectangle from one x to another and one y to another to a picture: exact."""
+    """Add the exact pixel means of a rectangle with the bounds ``x_mm`` and ``y_mm``."""
     columns, rows = interval(canvas.x_edges_mm, *x_mm), interval(canvas.y_edges_mm, *y_mm)
     (i_x,), (i_y,) = np.nonzero(columns), np.nonzero(rows)
     if i_x.size and i_y.size:
@@ -255,23 +260,23 @@ def add_rectangle(
 
 def half_plane(height: Floats, x: Floats | float, y: Floats | float) -> Floats:
     """
-    Fraction of a square pixel on the one side of a straight line: exact.
+    Return the exact fraction of a square pixel on one side of a straight line.
 
     Parameters
     ----------
     height : (...) float64, pixels
-        Distance of the pixel's middle from the line, positive on that side.
+        Signed distance of the pixel centre from the line, positive on that side.
     x, y : float, or (...) float64
-        The unit vector across the line.
+        Unit normal of the line.
 
     Returns
     -------
-    share : (...) float64
+    fraction : (...) float64
 
     Notes
     -----
-    The distance of a point of the square from a line through its middle is spread as the sum of two uniform numbers of the
-    widths ``|x|`` and ``|y|``, a trapezium; the share is its integral.
+    The distance of a random point of the square from a line through its centre is the sum of two uniform variables of the
+    widths ``|x|`` and ``|y|``, with a trapezoidal density; the fraction is its integral.
     """
     wide = np.maximum(np.abs(x), np.abs(y))
     narrow = np.maximum(np.minimum(np.abs(x), np.abs(y)), np.finfo(np.float64).tiny)
@@ -286,17 +291,19 @@ def half_plane(height: Floats, x: Floats | float, y: Floats | float) -> Floats:
 
 def sampled(canvas: Canvas, chosen: Bools, rows: slice, function: Callable[[Floats, Floats], Floats]) -> Floats:
     """
-    Means over some pixels from 32 x 32 points in each: within 1/64 of the exact one at a sharp edge.
+    Return means over selected pixels from 32 x 32 samples each.
+
+    The error at a sharp edge is at most 1/64.
 
     Parameters
     ----------
     canvas : Canvas
     chosen : (n_row, n_x) bool
-        The pixels, in the rows of a block.
+        Selected pixels in the rows of a block.
     rows : slice
-        Those rows.
+        Rows of the block.
     function : callable
-        The chart's fraction of white at x and y (...), mm.
+        Function that returns the fraction of white at x and y (...), mm.
 
     Returns
     -------

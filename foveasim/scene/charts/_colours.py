@@ -1,4 +1,4 @@
-"""Reflectances of the colour chart, and the light that falls on it."""
+"""Spectral reflectances of the colour chart, and illuminants."""
 
 from __future__ import annotations
 
@@ -16,46 +16,46 @@ __all__ = ["PATCH_NAMES", "Illuminant", "illuminant", "light_of", "nonnegative_f
 
 Illuminant = Literal["A", "D50", "D55", "D65", "D75", "E"]
 
-#: The patches, row by row from the upper left.
+#: Names of the patches, row by row from the upper left.
 PATCH_NAMES = (
     *("dark skin", "light skin", "blue sky", "foliage", "blue flower", "bluish green"),
     *("orange", "purplish blue", "moderate red", "purple", "yellow green", "orange yellow"),
     *("blue", "green", "red", "yellow", "magenta", "cyan"),
     *("white 9.5", "neutral 8", "neutral 6.5", "neutral 5", "neutral 3.5", "black 2"),
 )
-#: Colour temperatures of the CIE's daylights: their names' after the change of Planck's second constant.
+#: Correlated colour temperatures of the CIE daylight illuminants; their names precede the revision of Planck's second constant.
 DAYLIGHTS_K = {"D50": 5003.0, "D55": 5503.0, "D65": 6504.0, "D75": 7504.0}
-#: Where relative spectra are 1.
+#: Normalisation wavelength of relative spectra.
 REFERENCE_NM = 560.0
 #: Planck's second constant and the temperature that define illuminant A (CIE 15).
 PLANCK_NM_K, A_K = 1.435e7, 2848.0
-#: Rounds of the factorisation: three times as many make its error (root of mean square) 8 % smaller.
+#: Iterations of the factorisation: three times as many reduce its RMS error by 8 %.
 N_ROUNDS = 3000
 
 
 def patch_reflectance(wavelength_nm: ArrayLike) -> Floats:
     """
-    Spectral reflectance of the 24 patches of :func:`colour_chart`.
+    Return the spectral reflectance of the 24 patches of :func:`colour_chart`.
 
     Parameters
     ----------
     wavelength_nm : (n,), nm
-        From 380 to 780; between the table's values, which are 10 nm apart, straight lines are drawn.
+        From 380 to 780; values are interpolated linearly in a table with steps of 10 nm.
 
     Returns
     -------
     reflectance : (24, n) float64
-        Row by row from the upper left: :data:`PATCH_NAMES`.
+        Row by row from the upper left, in the order of :data:`PATCH_NAMES`.
 
     Raises
     ------
     ParameterError
-        When a wavelength lies outside the table.
+        If a wavelength lies outside the table.
 
     Notes
     -----
-    The Macbeth ColorChecker as N. Ohta measured it (The Basis of Color Reproduction Engineering, Corona-sha, 1997). Other
-    charts differ: those that X-Rite's values of 2005 describe by 1.7 units of CIELAB on average, and 3.5 at most.
+    Measurement of the Macbeth ColorChecker by N. Ohta (The Basis of Color Reproduction Engineering, Corona-sha, 1997). Other
+    charts differ: the colour difference to X-Rite's values of 2005 is 1.7 CIELAB units on average and at most 3.5.
 
     Examples
     --------
@@ -67,14 +67,14 @@ def patch_reflectance(wavelength_nm: ArrayLike) -> Floats:
 
 def illuminant(name: Illuminant, wavelength_nm: ArrayLike) -> Floats:
     """
-    Relative spectrum of one of the CIE's illuminants, 1 at 560 nm.
+    Return the relative spectrum of a CIE illuminant, 1 at 560 nm.
 
     Parameters
     ----------
     name : {"A", "D50", "D55", "D65", "D75", "E"}
-        A bulb, daylights by their colour temperatures, or the same at all wavelengths.
+        Incandescent light (A), daylight by colour temperature (D), or equal energy (E).
     wavelength_nm : (n,), nm
-        From 380 to 780 for daylights.
+        From 380 to 780 for daylight.
 
     Returns
     -------
@@ -83,11 +83,12 @@ def illuminant(name: Illuminant, wavelength_nm: ArrayLike) -> Floats:
     Raises
     ------
     ParameterError
-        When there is no such illuminant, or a wavelength lies outside the table.
+        If the illuminant is unknown, or a wavelength lies outside the table.
 
     Notes
     -----
-    Daylights after CIE 15:2004: S0 + M1 S1 + M2 S2, M1 and M2 rounded to three decimals; linear between 10 nm.
+    Daylight according to CIE 15:2004: S0 + M1 S1 + M2 S2 with M1 and M2 rounded to three decimals; the components are
+    interpolated linearly between steps of 10 nm.
     """
     check_choice("illuminant", name, (*DAYLIGHTS_K, "A", "E"))
     waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
@@ -96,18 +97,18 @@ def illuminant(name: Illuminant, wavelength_nm: ArrayLike) -> Floats:
     if name == "A":
         planck = np.expm1(PLANCK_NM_K / (A_K * REFERENCE_NM)) / np.expm1(PLANCK_NM_K / (A_K * waves_nm))
         return np.asarray((REFERENCE_NM / waves_nm) ** 5 * planck)
-    # 100 at 560 nm, where the other components are 0.
+    # S0 is 100 at 560 nm, and the other components are 0.
     return np.asarray(_daylight_weights(DAYLIGHTS_K[name]) @ _between(_table("cie_daylight"), waves_nm) / 100.0)
 
 
 def light_of(name: Illuminant, wavelength_nm: ArrayLike) -> Floats:
-    """:func:`illuminant`, for functions that have a parameter of its name."""
+    """Return :func:`illuminant`; for functions with a parameter of that name."""
     return illuminant(name, wavelength_nm)
 
 
 def _daylight_weights(temperature_k: float) -> Floats:
-    """Weights (3,) of the components of daylight of a colour temperature, CIE 15:2004, 3.1."""
-    # x of the chromaticity as a polynomial of 1/T, below 7000 K and above.
+    """Return the weights (3,) of the daylight components, CIE 15:2004, section 3.1."""
+    # Chromaticity x as a polynomial in 1/T, up to 7000 K and above.
     below, above = (0.244063, 99.11, 2.9678e6, -4.6070e9), (0.237040, 247.48, 1.9018e6, -2.0064e9)
     x = float(np.polynomial.Polynomial(below if temperature_k <= 7000.0 else above)(1.0 / temperature_k))
     y = -3.0 * x * x + 2.87 * x - 0.275
@@ -119,23 +120,24 @@ def _daylight_weights(temperature_k: float) -> Floats:
 @cache
 def nonnegative_factors(n_factors: int) -> tuple[Floats, Floats]:
     """
-    The patches' reflectances as sums of a few spectra with weights of at least 0.
+    Approximate the patch reflectances by nonnegative matrix factorisation.
 
     Parameters
     ----------
     n_factors : int
-        From 1 to 24; 24 are the patches themselves.
+        Number of spectra, from 1 to 24; 24 spectra are the patches themselves.
 
     Returns
     -------
     weights : (24, n_factors) float64
     spectra : (n_factors, 41) float64
-        At the table's wavelengths.
+        Spectra at the wavelengths of the table.
 
     Notes
     -----
-    Least squares by hierarchical alternation (Cichocki and Phan 2009), from the patches that successive projection picks
-    (Araújo et al. 2001) and the best weights for these: no random numbers.
+    Hierarchical alternating least squares (Cichocki and Phan 2009). The initial spectra are the patches selected by the
+    successive projections algorithm (Araújo et al. 2001), the initial weights their nonnegative least-squares fit, so that
+    the result is deterministic.
     """
     from scipy.optimize import nnls
 
@@ -151,7 +153,7 @@ def nonnegative_factors(n_factors: int) -> tuple[Floats, Floats]:
 
 
 def _improve(weights: Floats, values: Floats, spectrum: Floats) -> None:
-    """Fit values (n, m) = weights (n, k) @ spectrum (k, m), one column of the weights after the other, in place."""
+    """Update the weights of values (n, m) = weights (n, k) @ spectrum (k, m) in place."""
     products, target = spectrum @ spectrum.T, values @ spectrum.T
     for k in range(weights.shape[1]):
         step = (target[:, k] - weights @ products[:, k]) / max(products[k, k], np.finfo(np.float64).tiny)
@@ -159,7 +161,7 @@ def _improve(weights: Floats, values: Floats, spectrum: Floats) -> None:
 
 
 def _extremes(values: Floats, n: int) -> list[int]:
-    """The rows that are largest, each after what it shares with the ones before is taken off all."""
+    """Select n rows by the successive projections algorithm."""
     rest, picked = values.copy(), []
     for _ in range(n):
         picked.append(int(np.argmax((rest**2).sum(axis=1))))
@@ -170,21 +172,21 @@ def _extremes(values: Floats, n: int) -> list[int]:
 
 @cache
 def _table(name: str) -> Floats:
-    """Columns (n_column, n_wavelength) of a data file, the first being wavelengths in nm."""
+    """Return the columns (n_column, n_wavelength) of a data file; the first is the wavelength in nm."""
     with (files("foveasim.scene") / "data" / f"{name}.csv").open(encoding="utf-8") as file:
         lines = [line for line in file if not line.startswith("#")]
     return read_only(np.loadtxt(lines[1:], delimiter=",").T.copy())
 
 
 def _between(values: Floats, wavelength_nm: ArrayLike) -> Floats:
-    """Columns (n_column, n) of a table, whose first is its wavelengths, at wavelengths between these."""
+    """Return the columns (n_column, n) of a table, interpolated at wavelengths."""
     waves_nm = wavelengths_nm("wavelength_nm", wavelength_nm)
     first, last = values[0, 0], values[0, -1]
     is_outside = (waves_nm < first) | (waves_nm > last)
     if is_outside.any():
         raise ParameterError(
             "wavelength_nm",
-            f"must be from {first:g} to {last:g}, where the tables are",
+            f"must be from {first:g} to {last:g}, the range of the tables",
             waves_nm[is_outside].tolist()[:3],
             "nm",
         )

@@ -1,4 +1,4 @@
-"""Charts of straight edges: exact means over pixels."""
+"""Charts of straight edges with exact means over pixels."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ __all__ = ["BarElement", "bar_elements", "bars", "checkerboard", "letter_f", "sl
 
 Ink = Literal["dark", "bright"]
 
-#: Elements of a group, each finer than the one before by the sixth root of 2.
+#: Elements per group; the ratio of successive frequencies is the sixth root of 2.
 N_ELEMENTS = 6
-#: Bars of an element, and their length in widths.
+#: Bars per element, and their length in bar widths.
 N_BARS, BAR_LENGTH = 3, 5.0
-#: Gaps in widths of a bar: between the two halves of an element, below it, and right of a group's first one.
+#: Gaps in bar widths: between the two halves of an element, below it, and right of the first element of a group.
 INNER_GAP, LOWER_GAP, COLUMN_GAP = 2.0, 2.0, 4.0
-#: Groups outside this range are a slip: 1e-9 and 1e9 line pairs per mm.
+#: Larger absolute numbers are input errors: 1e-9 and 1e9 line pairs per mm.
 MAX_GROUP = 30
-#: The F in fifths of its height, (x0, x1, y0, y1) from its lower left corner: stem, upper arm, lower arm.
+#: Strokes of the F in fifths of its height, (x0, x1, y0, y1) from the lower left corner: stem, upper arm, lower arm.
 F_STROKES = ((0.0, 1.0, 0.0, 5.0), (1.0, 3.0, 4.0, 5.0), (1.0, 2.0, 2.0, 3.0))
 F_WIDTH, F_HEIGHT = 3.0, 5.0
 
@@ -42,19 +42,19 @@ F_WIDTH, F_HEIGHT = 3.0, 5.0
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BarElement:
     """
-    One half of an element of :func:`bars`: three bars that fill a square.
+    Half of an element of :func:`bars`: three bars that fill a square.
 
     Attributes
     ----------
     group, element : int
     direction : {"vertical", "horizontal"}
-        Of the bars: vertical ones show what a lens resolves across.
+        Direction of the bars; vertical bars measure the resolution along x.
     line_pairs_per_mm : float, 1/mm
-        In the scene.
+        Spatial frequency in the scene.
     x_mm, y_mm : float, mm
-        Middle of the square.
+        Centre of the square.
     side_mm : float, mm
-        Side of the square, five widths of a bar.
+        Side of the square, five bar widths.
     """
 
     group: int
@@ -80,15 +80,15 @@ def checkerboard(
     band_width_nm: OneOrMore | None = None,
 ) -> Scene:
     """
-    Black and white squares: for calibrations of lenses, and for moiré. Exact.
+    Return a checkerboard, for lens calibration and moiré. Exact.
 
     Parameters
     ----------
     square_mm : float, mm
         Side of a square.
     n_squares : (n_y, n_x), optional
-        A board of so many squares in the middle of white, its lower left square black. By default the squares fill the
-        picture, four of them meet in its middle, and the one right of and above it is black.
+        Number of squares of a centred board on white, with a black lower left square. By default the squares fill the
+        picture, a corner of four squares is at the centre, and the square to its upper right is black.
     contrast : float
         (white - black) / (white + black).
     {picture}
@@ -101,12 +101,12 @@ def checkerboard(
     Raises
     ------
     ParameterError
-        When the board does not fit, or a value is out of range.
+        If the board does not fit, or a value is out of range.
 
     Warns
     -----
     SamplingWarning
-        When a square is smaller than a pixel.
+        If a square is smaller than a pixel.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
     contrast = checked_contrast(contrast)
@@ -125,7 +125,7 @@ def checkerboard(
         np.diff(_integral_of_square_wave_mm(e - low, square_mm)) / canvas.pitch_mm
         for e, low in zip(edges_mm, first_mm, strict=True)
     )
-    # Black where the signs of column and row are the same.
+    # Squares are black if the signs of column and row are equal.
     shares = canvas.filled(
         lambda rows: 1.0 - 0.5 * (np.multiply.outer(inside[0][rows], inside[1]) + np.multiply.outer(y[rows], x))
     )
@@ -145,14 +145,16 @@ def slanted_edge(
     band_width_nm: OneOrMore | None = None,
 ) -> Scene:
     """
-    A straight edge through the middle, black on the left, white on the right: for the MTF after ISO 12233. Exact.
+    Return a slanted edge through the centre, for the MTF of ISO 12233. Exact.
+
+    The left side is black, the right side white.
 
     Parameters
     ----------
     angle_deg : float, degrees
-        Of the edge from the vertical, counter-clockwise; 90 is a horizontal edge with white above it.
+        Angle of the edge from the vertical, counter-clockwise; 90 is a horizontal edge with white above it.
     contrast : float
-        (white - black) / (white + black); 0.6 by default, where white is four times black, as ISO 12233 has it.
+        (white - black) / (white + black); 0.6 by default, a ratio of 4 between white and black, as in ISO 12233.
     {picture}
 
     Returns
@@ -163,7 +165,7 @@ def slanted_edge(
     Raises
     ------
     ParameterError
-        When a value is out of range.
+        If a value is out of range.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
     contrast = checked_contrast(contrast)
@@ -189,14 +191,14 @@ def bars(
     band_width_nm: OneOrMore | None = None,
 ) -> Scene:
     """
-    Groups of three bars, upright and lying, that grow finer as those of the USAF 1951 target do. Exact.
+    Return a three-bar target with the frequencies of the USAF 1951 chart. Exact.
 
     Parameters
     ----------
     groups : sequence of int
-        Each has six elements of ``2**(group + (element - 1) / 6)`` line pairs per mm in the scene.
+        Group numbers. A group has six elements of ``2**(group + (element - 1) / 6)`` line pairs per mm in the scene.
     ink : {"dark", "bright"}
-        Black bars on white, or white ones on black.
+        Black bars on white, or white bars on black.
     contrast : float
         (white - black) / (white + black).
     {picture}
@@ -209,18 +211,18 @@ def bars(
     Raises
     ------
     ParameterError
-        When the groups do not fit, or a value is out of range.
+        If the groups do not fit, or a value is out of range.
 
     Warns
     -----
     SamplingWarning
-        When the finest element has less than two pixels a period.
+        If the finest element has fewer than two pixels per period.
 
     Notes
     -----
-    Bars are as far apart as they are wide and five times as long (MIL-STD-150A). The standard's spiral of numbered groups
-    is not followed: each group is a column, its first element on top, the coarsest group on the left, and an element's
-    upright bars are left of its lying ones. Where they are, :func:`bar_elements` says.
+    The gaps between bars are equal to their width, their length is five widths (MIL-STD-150A). The arrangement differs from
+    the spiral of the standard: each group is a column with its first element on top, the coarsest group is on the left, and
+    vertical bars are left of horizontal bars. :func:`bar_elements` returns the positions.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
     contrast = checked_contrast(contrast)
@@ -244,7 +246,7 @@ def bars(
 
 def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
     """
-    Where :func:`bars` puts its elements, and how fine they are.
+    Return positions and frequencies of the elements of :func:`bars`.
 
     Parameters
     ----------
@@ -253,12 +255,12 @@ def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
     Returns
     -------
     elements : tuple of BarElement
-        Group by group from the coarsest, element by element, upright bars before lying ones.
+        Sorted by group from the coarsest, then by element; vertical bars before horizontal bars.
 
     Raises
     ------
     ParameterError
-        When the groups are no integers, or one is given twice.
+        If the groups are not integers, or not unique.
 
     Examples
     --------
@@ -272,7 +274,7 @@ def bar_elements(groups: Sequence[int]) -> tuple[BarElement, ...]:
         check_count(f"groups[{i}]", g, at_least=-MAX_GROUP, at_most=MAX_GROUP) for i, g in enumerate(groups)
     )
     if len(set(numbers)) != len(numbers):
-        raise ParameterError("groups", "must be different from each other", list(groups))
+        raise ParameterError("groups", "must be unique", list(groups))
     placed = []
     left_mm = lowest_mm = right_mm = 0.0
     for group in numbers:
@@ -318,14 +320,14 @@ def letter_f(
     band_width_nm: OneOrMore | None = None,
 ) -> Scene:
     """
-    A letter F in the middle, which looks different however it is turned or mirrored. Exact.
+    Return a centred letter F, which has no rotation or mirror symmetry. Exact.
 
     Parameters
     ----------
     height_mm : float, mm
-        Its strokes are a fifth of it, its width three fifths.
+        Height of the letter; the stroke width is a fifth of it, the width of the letter three fifths.
     ink : {"dark", "bright"}
-        A black letter on white, or a white one on black.
+        Black letter on white, or white letter on black.
     contrast : float
         (white - black) / (white + black).
     {picture}
@@ -338,12 +340,12 @@ def letter_f(
     Raises
     ------
     ParameterError
-        When the letter does not fit, or a value is out of range.
+        If the letter does not fit, or a value is out of range.
 
     Warns
     -----
     SamplingWarning
-        When a stroke is narrower than a pixel.
+        If a stroke is narrower than a pixel.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
     contrast = checked_contrast(contrast)
@@ -360,5 +362,5 @@ def letter_f(
 
 
 def _integral_of_square_wave_mm(x_mm: Floats, half_mm: float) -> Floats:
-    """Integral from 0 of a wave that is 1 from 0 to half a period, and -1 from there to a period."""
+    """Return the integral from 0 of a square wave with values 1 and -1, starting with 1."""
     return np.asarray(half_mm - np.abs(np.mod(x_mm, 2.0 * half_mm) - half_mm))

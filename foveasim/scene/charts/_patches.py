@@ -1,4 +1,4 @@
-"""Charts of even patches: greys and colours."""
+"""Charts of uniform patches: greys and colours."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from foveasim.scene.registry import SCENES, chart
 
 __all__ = ["colour_chart", "grey_scale"]
 
-#: Wavelengths of a colour chart unless told otherwise.
+#: Default wavelengths of a colour chart.
 COLOUR_NM = tuple(400.0 + 10.0 * k for k in range(31))
-#: Wavelengths of the factors' table.
+#: Wavelengths of the tabulated factors.
 TABLE_NM = 380.0 + 10.0 * np.arange(41)
 N_ROWS, N_COLUMNS = 4, 6
 MAX_STEPS = 1000
@@ -42,14 +42,16 @@ def grey_scale(
     band_width_nm: OneOrMore | None = None,
 ) -> Scene:
     """
-    Square patches in a row, each darker than the one on its left, on black: for response curves and dynamic range. Exact.
+    Return a grey scale on black, for response curves and dynamic range. Exact.
+
+    Square patches in a row, with radiance decreasing from left to right.
 
     Parameters
     ----------
     n_steps : int
         Number of patches; the first is white.
     ratio : float
-        Radiance of a patch over that of the next one: 2 is a stop, ``10**0.15`` a step of 0.15 in density.
+        Ratio of the radiances of successive patches: 2 is a stop, ``10**0.15`` a density step of 0.15.
     patch_mm : float, mm
         Side of a patch.
     {picture}
@@ -57,17 +59,17 @@ def grey_scale(
     Returns
     -------
     scene : Scene
-        One basis image. Patch k, from 0 on the left, has the middle ``((k - (n_steps - 1) / 2) * patch_mm, 0)``.
+        One basis image. The centre of patch k, from 0 on the left, is ``((k - (n_steps - 1) / 2) * patch_mm, 0)``.
 
     Raises
     ------
     ParameterError
-        When the patches do not fit, or a value is out of range.
+        If the patches do not fit, or a value is out of range.
 
     Warns
     -----
     SamplingWarning
-        When a patch is smaller than a pixel.
+        If a patch is smaller than a pixel.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
     n_steps = check_count("n_steps", n_steps, at_most=MAX_STEPS)
@@ -98,54 +100,56 @@ def colour_chart(
     band_width_nm: OneOrMore | None = None,
 ) -> Scene:
     """
-    The 24 patches of the Macbeth ColorChecker in four rows of six, on black, in the light of an illuminant.
+    Return the Macbeth ColorChecker on black under an illuminant.
+
+    The 24 patches are arranged in four rows of six.
 
     Parameters
     ----------
     patch_mm : float, mm
         Side of a patch.
     gap_mm : float, mm
-        Between two patches.
+        Gap between patches.
     illuminant : {"A", "D50", "D55", "D65", "D75", "E"}
-        The light on the chart.
+        CIE illuminant of the chart.
     n_basis : int
-        Number of basis images, at most 24; the lens's work grows with it. See the notes.
+        Number of basis images, at most 24. The computing time of the optics is proportional to it; see the notes.
     shape : (n_y, n_x)
-        Numbers of pixels.
+        Number of pixels.
     pitch_um : float, µm
-        Distance of two pixels in the scene.
+        Pixel pitch in the scene.
     distance_m : float, m
         Distance of the scene from the lens.
     radiance_w_m2_sr_nm : float, W/(m² sr nm)
-        Spectral radiance at 560 nm of a white that reflects all light.
+        Spectral radiance at 560 nm of a white with reflectance 1.
     wavelength_nm : sequence, nm
-        From 380 to 780; 400 to 700 in steps of 10 by default.
+        Wavelengths from 380 to 780; by default 400 to 700 in steps of 10.
     band_width_nm : number or sequence, optional, nm
-        Widths of the wavelengths' bands; by default they reach halfway to the neighbours. Needed for one wavelength.
+        Widths of the bands; by default bands extend halfway to the adjacent wavelengths. Required for one wavelength.
 
     Returns
     -------
     scene : Scene
-        With ``n_basis`` basis images, or as many as there are wavelengths where these are fewer.
+        Scene with ``n_basis`` basis images, or one per wavelength if there are fewer wavelengths.
 
     Raises
     ------
     ParameterError
-        When the patches do not fit, or a value is out of range.
+        If the patches do not fit, or a value is out of range.
 
     Warns
     -----
     SamplingWarning
-        When a patch is smaller than a pixel.
+        If a patch is smaller than a pixel.
 
     Notes
     -----
-    Areas are exact. The first patch, dark skin, is on the upper left, and white on the lower left. Reflectances are those
-    of :func:`patch_reflectance`.
+    Areas are exact. The first patch, dark skin, is at the upper left, white at the lower left. The reflectances are those of
+    :func:`patch_reflectance`.
 
-    With 24 basis images, or one for each of a few wavelengths, spectra are exact. With fewer, they are sums of ``n_basis``
-    spectra, and colours differ from the exact ones by 0.1 units of CIELAB on average and 0.5 at most with 12 basis images,
-    0.3 and 1.3 with 10, 0.8 and 2.5 with 8.
+    Spectra are exact with 24 basis images, or with one basis image per wavelength. With fewer basis images the spectra are
+    sums of ``n_basis`` spectra, with a mean and maximum colour difference of 0.1 and 0.5 CIELAB units for 12 basis images,
+    0.3 and 1.3 for 10, 0.8 and 2.5 for 8.
     """
     canvas = Canvas(shape, pitch_um, distance_m, 1.0, wavelength_nm, band_width_nm)
     radiance = check_number("radiance_w_m2_sr_nm", radiance_w_m2_sr_nm, at_least=0.0)
@@ -161,7 +165,7 @@ def colour_chart(
 
 
 def _patch_spectra(wavelength_nm: Floats, n_basis: int) -> tuple[Floats, Floats]:
-    """Weights (24, n) and reflectances (n, n_wavelength) whose sums are those of the patches."""
+    """Return weights (24, n) and reflectances (n, n_wavelength) of the basis images."""
     if wavelength_nm.size <= n_basis:
         return patch_reflectance(wavelength_nm), np.eye(wavelength_nm.size)
     exact = patch_reflectance(wavelength_nm)
@@ -172,7 +176,7 @@ def _patch_spectra(wavelength_nm: Floats, n_basis: int) -> tuple[Floats, Floats]
 
 
 def _patches(canvas: Canvas, weights: Floats, patch_mm: float, step_mm: float) -> Shares:
-    """Basis images (n_basis, n_y, n_x) of patches with weights (24, n_basis)."""
+    """Return basis images (n_basis, n_y, n_x) of patches with weights (24, n_basis)."""
     basis = np.zeros((weights.shape[1], *canvas.shape), np.float32)
     for patch, row_of_weights in enumerate(weights):
         row, column = divmod(patch, N_COLUMNS)

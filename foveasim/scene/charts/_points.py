@@ -1,4 +1,4 @@
-"""Points of light."""
+"""Charts of point sources."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from foveasim.scene.registry import SCENES
 
 __all__ = ["point_grid"]
 
-#: A spacing is an integer of pixels when it is one but for this fraction of a pixel.
+#: Tolerance of a spacing from an integer number of pixels.
 ROUNDING_PIXELS = 1e-6
 
 
@@ -31,26 +31,26 @@ def point_grid(
     band_width_nm: OneOrMore | None = None,
 ) -> Scene:
     """
-    Points of light in rows and columns, on black: for point spread functions all over the field, and for distortion.
+    Return a grid of point sources on black, for field-dependent PSFs and distortion.
 
     Parameters
     ----------
     spacing_mm : float, mm
-        Distance of two points: an integer of pixels.
+        Spacing of the points, an integer multiple of the pixel pitch.
     n_points : (n_y, n_x), optional
-        Numbers of points up and across; by default an odd number that fills the picture.
+        Number of rows and columns of points; by default the largest odd numbers that fit into the picture.
     intensity_w_sr_nm : float, W/(sr nm)
         Spectral radiant intensity of each point.
     shape : (n_y, n_x)
-        Numbers of pixels.
+        Number of pixels.
     pitch_um : float, µm
-        Distance of two pixels in the scene.
+        Pixel pitch in the scene.
     distance_m : float, m
         Distance of the scene from the lens.
     wavelength_nm : sequence, nm
-        Wavelengths; the points shine alike at all of them.
+        Wavelengths; the intensity is the same at all of them.
     band_width_nm : number or sequence, optional, nm
-        Widths of the wavelengths' bands; by default they reach halfway to the neighbours. Needed for one wavelength.
+        Widths of the bands; by default bands extend halfway to the adjacent wavelengths. Required for one wavelength.
 
     Returns
     -------
@@ -60,17 +60,18 @@ def point_grid(
     Raises
     ------
     ParameterError
-        When the spacing is not an integer of pixels, the points do not fit, or a value is out of range.
+        If the spacing is not an integer number of pixels, the points do not fit, or a value is out of range.
 
     Warns
     -----
     SamplingWarning
-        When every pixel is a point.
+        If every pixel is a point.
 
     Notes
     -----
-    Each point lights the pixel that holds it. A point on the border of two lights the right or upper one: where the
-    middle of the picture is such a border, the whole grid lies half a pixel to the right, or up.
+    The power of a point is assigned to the pixel that contains it. A point on the boundary of two pixels is assigned to the
+    right or upper pixel: if the centre of the picture is such a boundary, the grid is shifted by half a pixel to the right
+    or up.
     """
     canvas = Canvas(shape, pitch_um, distance_m, 1.0, wavelength_nm, band_width_nm)
     spacing_mm = check_number("spacing_mm", spacing_mm, above=0.0)
@@ -78,15 +79,15 @@ def point_grid(
     if step < 1 or abs(spacing_mm / canvas.pitch_mm - step) > ROUNDING_PIXELS:
         raise ParameterError(
             "spacing_mm",
-            f"must be an integer of pixels of {canvas.pitch_mm:g} mm",
+            f"must be an integer number of pixels of {canvas.pitch_mm:g} mm",
             spacing_mm,
             "mm",
-            f"the nearest is {max(step, 1) * canvas.pitch_mm:.6g} mm",
+            f"the nearest value is {max(step, 1) * canvas.pitch_mm:.6g} mm",
         )
     counts = tuple(2 * ((n - n // 2 - 1) // step) + 1 for n in canvas.shape)
     if n_points is not None:
         counts = check_shape("n_points", n_points)
-        # The outermost points lie in the middles of pixels, or on their borders.
+        # The outermost points lie at pixel centres or on pixel boundaries.
         canvas.check_fits(
             "n_points", ((counts[1] - 1) * step + 1) * canvas.pitch_mm, ((counts[0] - 1) * step + 1) * canvas.pitch_mm
         )

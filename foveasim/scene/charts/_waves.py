@@ -1,4 +1,4 @@
-"""Charts of periods: a wave, rings and spokes."""
+"""Periodic charts: sine wave, zone plate and Siemens star."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from foveasim.scene.registry import chart
 
 __all__ = ["siemens_star", "sine", "zone_plate"]
 
-#: More spokes are a slip, and their middle would take minutes.
+#: Limit of computing time: the sampled centre of a star with more sectors takes minutes.
 MAX_SPOKES = 1000
-#: A pixel is cut by one edge of a star at most where a spoke is wider than this many pixels: more than its diagonal.
+#: Sectors wider than this, more than a pixel diagonal, have at most one edge within a pixel.
 CLEAR_WIDTH_PIXELS = 1.5
-#: Half the diagonal of a pixel, and a little more.
+#: Half the pixel diagonal, rounded up.
 HALF_DIAGONAL_PIXELS = 0.7072
-#: Height of the wave whose middle is cut out for black and white; what lies on an edge is half of either.
+#: Amplitude of the wave that is clipped to a square wave; the value on an edge is 1/2.
 STEEP = 1e9
-#: Gauss and Legendre's three points and weights for means from -1/2 to 1/2.
+#: Points and weights of three-point Gauss-Legendre quadrature for means from -1/2 to 1/2.
 GAUSS = ((-0.5 * np.sqrt(0.6), 5.0 / 18.0), (0.0, 8.0 / 18.0), (0.5 * np.sqrt(0.6), 5.0 / 18.0))
 
 
@@ -41,18 +41,18 @@ def sine(
     band_width_nm: OneOrMore | None = None,
 ) -> Scene:
     """
-    A sinusoidal wave of one frequency and direction: what each of them becomes is the MTF itself. Exact.
+    Return a sine wave of one frequency and direction, for direct MTF measurements. Exact.
 
     Parameters
     ----------
     line_pairs_per_mm : float, 1/mm
-        Frequency in the scene.
+        Spatial frequency in the scene.
     angle_deg : float, degrees
-        Direction in which the wave runs, counter-clockwise from x; at 0 the lines are upright.
+        Direction of the wave vector, counter-clockwise from x; at 0 the lines are vertical.
     phase_deg : float, degrees
-        By which the white line through the middle is moved on; 90 is a quarter of a period.
+        Shift of the central white line along the wave vector; 90 is a quarter of a period.
     contrast : float
-        (white - black) / (white + black), of the ideal wave; the means over pixels have a little less.
+        (white - black) / (white + black) of the ideal wave; the contrast of the pixel means is slightly lower.
     {picture}
 
     Returns
@@ -63,12 +63,12 @@ def sine(
     Raises
     ------
     ParameterError
-        When a value is out of range.
+        If a value is out of range.
 
     Warns
     -----
     SamplingWarning
-        When a period is less than two pixels.
+        If a period is shorter than two pixels.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
     contrast = checked_contrast(contrast)
@@ -77,7 +77,7 @@ def sine(
     phase = np.deg2rad(check_number("phase_deg", phase_deg, at_least=-360.0, at_most=360.0))
     canvas.warn_if_fine("line_pairs_per_mm", 1.0 / per_mm)
     along_x, along_y = per_mm * np.cos(angle), per_mm * np.sin(angle)
-    # The mean of a wave over a pixel is its value in the middle, times a sinc along either side.
+    # The mean of a wave over a pixel is its value at the centre times a sinc along each side.
     height = 0.5 * np.sinc(along_x * canvas.pitch_mm) * np.sinc(along_y * canvas.pitch_mm)
     x = np.exp(2j * np.pi * along_x * canvas.x_mm - 1j * phase)
     y = height * np.exp(2j * np.pi * along_y * canvas.y_mm)
@@ -101,14 +101,14 @@ def zone_plate(
     band_width_nm: OneOrMore | None = None,
 ) -> Scene:
     """
-    Sinusoidal rings whose frequency grows with the radius: every frequency in every direction, and its aliases.
+    Return a sinusoidal zone plate, for aliasing at all frequencies and directions.
 
     Parameters
     ----------
     line_pairs_per_mm : float, 1/mm
-        Frequency at the rim, in the scene.
+        Spatial frequency at the rim, in the scene.
     radius_mm : float, optional, mm
-        Of the rim; by default the largest that the picture holds.
+        Radius of the rim; by default the largest that fits into the picture.
     contrast : float
         (white - black) / (white + black).
     {picture}
@@ -121,25 +121,25 @@ def zone_plate(
     Raises
     ------
     ParameterError
-        When the rings do not fit, or a value is out of range.
+        If the rings do not fit, or a value is out of range.
 
     Warns
     -----
     SamplingWarning
-        When a period at the rim is less than two pixels.
+        If a period at the rim is shorter than two pixels.
 
     Notes
     -----
     The fraction of white is ``(1 + cos(π f r² / R)) / 2`` with the frequency f at the rim R, so that the frequency at r is
-    ``f r / R``; outside there is the mean of black and white. The means are exact (Fresnel's integrals), except in the
-    pixels that the rim cuts, which are sampled at 32 x 32 points.
+    ``f r / R``. The background outside the rim is the mean of black and white. The means are exact (Fresnel integrals),
+    except in pixels on the rim, which are sampled at 32 x 32 points.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
     contrast = checked_contrast(contrast)
     per_mm = check_number("line_pairs_per_mm", line_pairs_per_mm, above=0.0)
     radius_mm = canvas.radius_mm(radius_mm)
     canvas.warn_if_fine("line_pairs_per_mm", 1.0 / per_mm)
-    # Fresnel's integrals are those of cos(π t² / 2): t is this many times a length.
+    # Fresnel integrals are integrals of cos(π t² / 2): t is this factor times a length.
     scale_per_mm = float(np.sqrt(2.0 * per_mm / radius_mm))
     (cos_x, sin_x), (cos_y, sin_y) = (_mean_chirp(e, scale_per_mm) for e in (canvas.x_edges_mm, canvas.y_edges_mm))
 
@@ -173,17 +173,17 @@ def siemens_star(
     band_width_nm: OneOrMore | None = None,
 ) -> Scene:
     """
-    Spokes that meet in the middle: every frequency in every direction, without a lattice of its own.
+    Return a Siemens star, for resolution and aliasing in all directions.
 
     Parameters
     ----------
     n_spokes : int
-        White spokes, and as many black ones; the middle of a white one points to the right. At the radius r there are
-        ``n_spokes / (2 π r)`` line pairs per mm.
+        Number of white sectors, equal to the number of black sectors; a white sector is centred on the x axis. The spatial
+        frequency at the radius r is ``n_spokes / (2 π r)`` line pairs per mm.
     radius_mm : float, optional, mm
-        By default the largest that the picture holds.
+        Radius of the star; by default the largest that fits into the picture.
     profile : {"square", "sine"}
-        Across the spokes: black and white, or a wave (the star of ISO 12233:2014, which has 144 spokes).
+        Profile across the sectors: black and white, or sinusoidal (as the star of ISO 12233:2014 with 144 sectors).
     contrast : float
         (white - black) / (white + black).
     {picture}
@@ -196,17 +196,18 @@ def siemens_star(
     Raises
     ------
     ParameterError
-        When the star does not fit, or a value is out of range.
+        If the star does not fit, or a value is out of range.
 
     Warns
     -----
     SamplingWarning
-        When a period is less than two pixels even at the rim. In the middle it always is.
+        If a period at the rim is shorter than two pixels. Near the centre it always is.
 
     Notes
     -----
-    Outside there is the mean of black and white. Where a spoke is wider than 1.5 pixels its edges are exact, and waves
-    within 1e-4; nearer to the middle, and in the pixels that the rim cuts, pixels are sampled at 32 x 32 points.
+    The background outside the rim is the mean of black and white. Where sectors are wider than 1.5 pixels, means of the
+    square profile are exact and means of the sinusoidal profile are accurate to 1e-4. Pixels nearer to the centre and pixels
+    on the rim are sampled at 32 x 32 points.
     """
     canvas = Canvas(shape, pitch_um, distance_m, radiance_w_m2_sr_nm, wavelength_nm, band_width_nm)
     contrast = checked_contrast(contrast)
@@ -235,18 +236,26 @@ def siemens_star(
 
 
 def _mean_of_edges(x: Floats, y: Floats, n_spokes: int) -> Floats:
-    """Fraction of white spokes in pixels at x (n_x,) and y (n_row, 1), in pixels, where one edge at most cuts them."""
+    """
+    Return the fraction of white sectors in pixels at x (n_x,) and y (n_row, 1), in pixels.
+
+    Valid for pixels with at most one edge.
+    """
     angle = np.arctan2(y, x)
     number = np.rint(angle * n_spokes / np.pi - 0.5)
     edge = (number + 0.5) * np.pi / n_spokes
     across_x, across_y = -np.sin(edge), np.cos(edge)
     share = half_plane(across_x * x + across_y * y, across_x, across_y)
-    # Counter-clockwise of the first edge is black, of the next one white, and so on.
+    # The sector counter-clockwise of the first edge is black, of the next edge white, and so on.
     return np.where(np.mod(number, 2.0) == 0.0, 1.0 - share, share)
 
 
 def _mean_of_waves(x: Floats, y: Floats, n_spokes: int) -> Floats:
-    """Mean of the wave around the middle in pixels at x (n_x,) and y (n_row, 1), in pixels, where it is not too fine."""
+    """
+    Return the mean of the angular wave in pixels at x (n_x,) and y (n_row, 1), in pixels.
+
+    Gauss-Legendre quadrature, accurate where sectors are wide.
+    """
     mean = np.full(np.broadcast_shapes(x.shape, y.shape), 0.5)
     for dx, weight_x in GAUSS:
         for dy, weight_y in GAUSS:
@@ -255,7 +264,7 @@ def _mean_of_waves(x: Floats, y: Floats, n_spokes: int) -> Floats:
 
 
 def _mean_chirp(edges_mm: Floats, scale_per_mm: float) -> tuple[Floats, Floats]:
-    """Means (n,) of cos(π (s x)² / 2) and its sine between borders (n + 1,): Fresnel's integrals."""
+    """Return means (n,) of cos and sin of π (s x)² / 2 between boundaries (n + 1,)."""
     from scipy.special import fresnel
 
     sines, cosines = fresnel(scale_per_mm * edges_mm)
