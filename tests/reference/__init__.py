@@ -1,1 +1,1 @@
-"""Slow plain twins of what the package computes fast."""
+"""Slow reference implementations of algorithms of the package."""

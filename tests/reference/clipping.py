@@ -1,4 +1,4 @@
-"""Integration over polygons by clipping them against every cell: exact in rational numbers, and by shapely."""
+"""Integration over polygons by clipping against every cell, in rational arithmetic and with shapely."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import shapely
 
 
 def _half_plane(ring, axis, bound, keep_above):
-    """Part of a ring (list of points) with coordinate >= bound, or <= bound (Sutherland and Hodgman)."""
-    kept = []
+    """Clip a ring (list of points) to coordinates >= bound or <= bound (Sutherland and Hodgman)."""
+    clipped = []
     for a, b in pairwise([*ring, ring[0]] if ring else []):
         a_in = a[axis] >= bound if keep_above else a[axis] <= bound
         b_in = b[axis] >= bound if keep_above else b[axis] <= bound
         if a_in:
-            kept.append(a)
+            clipped.append(a)
         if a_in != b_in:
             t = (bound - a[axis]) / (b[axis] - a[axis])
-            kept.append((a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])))
-    return kept
+            clipped.append((a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])))
+    return clipped
 
 
 def _signed_area(ring):
@@ -32,7 +32,7 @@ def _signed_area(ring):
 
 
 def exact_weights(polygon, shape):
-    """Overlap of a polygon with every unit cell of a grid at the origin, (n_y, n_x), in rational arithmetic."""
+    """Return overlap areas of a polygon with unit cells of a grid at the origin, (n_y, n_x), in rational arithmetic."""
     weights = np.zeros(shape)
     rings = [polygon.exterior, *polygon.interiors]
     for k, ring in enumerate(rings):
@@ -49,6 +49,6 @@ def exact_weights(polygon, shape):
 
 
 def shapely_weights(polygon, shape):
-    """The same by GEOS, cell by cell."""
+    """Return the same overlap areas computed with GEOS, cell by cell."""
     iy, ix = np.mgrid[: shape[0], : shape[1]]
     return shapely.area(shapely.intersection(polygon, shapely.box(ix, iy, ix + 1, iy + 1)))

@@ -1,4 +1,4 @@
-"""Which site covers each sample, by exact fractions: slow, and plain enough to be believed."""
+"""Map of site indices at sample points, in rational arithmetic."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 
 def track_demand(rings, y):
-    """Where a row crosses the edges, each from its lower end (included) to its upper end (not): fractions."""
+    """Return the crossings of a row with edges, which include their lower and exclude their upper end, as fractions."""
     found = []
     for ring in rings:
         points = [(Fraction(float(px)), Fraction(float(py))) for px, py in ring]
@@ -20,9 +20,9 @@ def track_demand(rings, y):
 
 def id_map(sites, x_um, y_um):
     """
-    The highest of the sites (lists of rings) over each sample, (n_y, n_x); -1 where there is none.
+    Return the largest index of the sites (lists of rings) that cover each sample, (n_y, n_x); -1 without a site.
 
-    Even-odd; a sample on an edge lies on the edge's +x side, on a horizontal edge on its +y side.
+    Even-odd rule; a sample on an edge belongs to the +x side of the edge, on a horizontal edge to its +y side.
     """
     ids = np.full((len(y_um), len(x_um)), -1)
     for site, rings in enumerate(sites):

@@ -1,4 +1,4 @@
-"""Sibson's coordinates by cutting Voronoi cells out of a large square with half-planes: slow, and plain."""
+"""Sibson coordinates by clipping Voronoi cells from a large square with half-planes."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import shapely
 
 
 def nearer_to(cell, point, other):
-    """The part of a polygon that is nearer to a point than to another."""
-    middle, away = 0.5 * (point + other), other - point
+    """Return the part of a polygon that is nearer to ``point`` than to ``other``."""
+    centre, away = 0.5 * (point + other), other - point
     along = np.array([-away[1], away[0]]) / np.hypot(*away) * 1e4
     back = -away / np.hypot(*away) * 1e4
-    half = shapely.Polygon([middle - along, middle + along, middle + along + back, middle - along + back])
+    half = shapely.Polygon([centre - along, centre + along, centre + along + back, centre - along + back])
     return cell.intersection(half)
 
 
 def cell_of(point, others, side=1e3):
-    """Voronoi cell of a point among others."""
+    """Return the Voronoi cell of a point among others."""
     cell = shapely.box(-side, -side, side, side)
     for other in others:
         cell = nearer_to(cell, point, other)
@@ -24,7 +24,7 @@ def cell_of(point, others, side=1e3):
 
 
 def stolen_shares(xy, point):
-    """Fraction of a new point's Voronoi cell that was each site's, (n_site,)."""
+    """Return the fractions of the Voronoi cell of a new point that belonged to each site, (n_site,)."""
     new = cell_of(point, xy)
     stolen = np.array([cell_of(site, np.delete(xy, k, axis=0)).intersection(new).area for k, site in enumerate(xy)])
     return stolen / new.area

@@ -1,4 +1,4 @@
-"""Rays of a pinhole camera through prisms over polygons, by plain geometry: what a pixel of a 3D view shows."""
+"""Ray casting of a pinhole camera onto prisms over polygons, a reference for pixels of the 3D view."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import itertools
 import numpy as np
 import shapely
 
-#: Vertical field of view of the page.
+#: Vertical field of view of the web page.
 FIELD_DEG = 35.0
 
 
 def rays_of(camera, width, height, pixels):
-    """Directions (n, 3) of the rays through places of a window ``width`` by ``height``, from its top left corner."""
+    """Return ray directions (n, 3) through positions in a window ``width`` by ``height``, from its top left corner."""
     eye, target = np.array(camera["eye"]), np.array(camera["target"])
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, (0.0, 0.0, 1.0))
-    # Straight from above x stays to the right.
+    # In a vertical view from above, x points to the right.
     right = np.array((1.0, 0.0, 0.0)) if np.linalg.norm(right) < 1e-9 else right / np.linalg.norm(right)
     up = np.cross(right, forward)
     half = np.tan(np.radians(FIELD_DEG / 2))
@@ -28,9 +28,9 @@ def rays_of(camera, width, height, pixels):
 
 def first_hits(polygons, floors, roofs, eye, directions, *, has_floor):
     """
-    Distances (n, n_prism) along rays to the first surface of every prism, inf where a ray misses it.
+    Return the distances (n, n_prism) along rays to the first surface of every prism, inf if a ray misses it.
 
-    Prisms stand over polygons between two heights each; without a floor one sees into them from below.
+    Prisms extend over polygons between two heights each; without a floor they are open at the bottom.
     """
     eye = np.asarray(eye, float)
     hits = np.full((len(directions), len(polygons)), np.inf)
@@ -46,7 +46,7 @@ def first_hits(polygons, floors, roofs, eye, directions, *, has_floor):
             corners = np.array(ring.coords)
             for a, b in itertools.pairwise(corners):
                 edge = b - a
-                # eye + t direction = a + s edge, in the plane.
+                # Solve eye + t direction = a + s edge in the plane.
                 cross = directions[:, 0] * edge[1] - directions[:, 1] * edge[0]
                 with np.errstate(divide="ignore", invalid="ignore"):
                     t = ((a[0] - eye[0]) * edge[1] - (a[1] - eye[1]) * edge[0]) / cross

@@ -1,4 +1,4 @@
-"""Test charts: closed forms, shapely's areas, means of finer pictures, and published colours."""
+"""Test charts: closed forms, areas from shapely, means of finer rasters, and published colours."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PITCH_MM = 0.1
 LIGHT = {"distance_m": 1.0, "radiance_w_m2_sr_nm": 2.0, "band_width_nm": 10.0}
 EPS32 = float(np.finfo(np.float32).eps)
 
-#: A chart of each kind on 60 x 80 pixels of 0.1 mm, with sizes that are no integers of pixels.
+#: A chart of each kind on 60 x 80 pixels of 0.1 mm, with sizes that are not multiples of the pixel pitch.
 KINDS = {
     "point_grid": {"spacing_mm": 0.5, "intensity_w_sr_nm": 3e-6},
     "checkerboard": {"square_mm": 0.77},
@@ -34,7 +34,7 @@ KINDS = {
     "colour_chart": {"patch_mm": 1.03, "gap_mm": 0.11},
 }
 BLACK_AND_WHITE = sorted(KINDS.keys() - {"point_grid", "grey_scale", "colour_chart"})
-#: Where pixels are sampled, at the rim of a disc and in the middle of a star, a sharp edge is within this.
+#: Tolerance for sharp edges in sampled pixels, at the rim of a disc and near the centre of a star.
 SAMPLED = 1 / 64 + 1e-6
 
 
@@ -47,21 +47,21 @@ def chart(kind, shape=None, pitch_um=PITCH_UM, **changed):
     )
 
 
-def share(scene):
-    """Radiance over that of white, (n_y, n_x)."""
+def relative_radiance(scene):
+    """Return the radiance relative to white, (n_y, n_x)."""
     assert scene.basis.shape[0] == 1
     return scene.basis[0].astype(np.float64)
 
 
-def middles_mm(n, pitch_mm=PITCH_MM):
+def centres_mm(n, pitch_mm=PITCH_MM):
     return (np.arange(n) - 0.5 * (n - 1)) * pitch_mm
 
 
-# -- all of them ----------------------------------------------------------------------------------------------------
+# -- all charts -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_chart_is_a_scene_of_the_size_asked_for(kind):
+def test_chart_has_requested_size(kind):
     scene = chart(kind)
     assert isinstance(scene, fs.Scene)
     assert scene.basis.shape[1:] == KINDS[kind].get("shape", (60, 80))
@@ -71,7 +71,7 @@ def test_a_chart_is_a_scene_of_the_size_asked_for(kind):
     assert scene.source != "arrays"
 
 
-def test_every_chart_is_tested_and_in_settings_files():
+def test_every_chart_function_is_tested():
     functions = {name for name in charts.__all__ if name in KINDS or name.islower()}
     assert functions - {"bar_elements", "illuminant", "patch_reflectance"} == set(KINDS)
     assert fs.scene.charts is charts
@@ -79,16 +79,16 @@ def test_every_chart_is_tested_and_in_settings_files():
 
 @pytest.mark.parametrize("kind", sorted(KINDS.keys() - {"point_grid"}))
 @pytest.mark.parametrize("n", [2, 5])
-def test_a_pixel_has_the_mean_of_the_smaller_pixels_in_it(kind, n):
+def test_pixel_is_mean_of_finer_pixels(kind, n):
     coarse = chart(kind)
     _, n_y, n_x = coarse.basis.shape
     fine = chart(kind, shape=(n_y * n, n_x * n), pitch_um=PITCH_UM / n)
     means = fine.basis.reshape(-1, n_y, n, n_x, n).mean(axis=(2, 4), dtype=np.float64)
     difference = np.abs(means - coarse.basis)
     if kind in {"siemens_star", "zone_plate"}:
-        is_sampled = np.abs(np.hypot(middles_mm(80), middles_mm(60)[:, np.newaxis]) - 3.0) < PITCH_MM
+        is_sampled = np.abs(np.hypot(centres_mm(80), centres_mm(60)[:, np.newaxis]) - 3.0) < PITCH_MM
         if kind == "siemens_star":
-            is_sampled |= np.hypot(middles_mm(80), middles_mm(60)[:, np.newaxis]) < 9 * PITCH_MM
+            is_sampled |= np.hypot(centres_mm(80), centres_mm(60)[:, np.newaxis]) < 9 * PITCH_MM
         assert difference[:, is_sampled].max() < SAMPLED
         difference = difference[:, ~is_sampled]
     assert difference.max() < 4 * EPS32
@@ -96,8 +96,8 @@ def test_a_pixel_has_the_mean_of_the_smaller_pixels_in_it(kind, n):
 
 @pytest.mark.parametrize("kind", BLACK_AND_WHITE)
 @pytest.mark.parametrize("contrast", [0.0, 0.2, 1.0])
-def test_contrast_is_michelsons_and_white_keeps_its_radiance(kind, contrast):
-    full, less = (share(chart(kind, contrast=c, pitch_um=20.0, shape=(500, 400))) for c in (1.0, contrast))
+def test_michelson_contrast_leaves_white_unchanged(kind, contrast):
+    full, less = (relative_radiance(chart(kind, contrast=c, pitch_um=20.0, shape=(500, 400))) for c in (1.0, contrast))
     black = (1.0 - contrast) / (1.0 + contrast)
     np.testing.assert_allclose(less, black + (1.0 - black) * full, atol=2 * EPS32)
     assert 0.0 <= full.min() < 0.01
@@ -106,19 +106,19 @@ def test_contrast_is_michelsons_and_white_keeps_its_radiance(kind, contrast):
 
 
 @pytest.mark.parametrize("kind", BLACK_AND_WHITE)
-def test_white_may_have_a_radiance_for_each_wavelength(kind):
+def test_white_radiance_per_wavelength_is_accepted(kind):
     scene = chart(kind, radiance_w_m2_sr_nm=[1.0, 3.0], wavelength_nm=[500.0, 600.0], band_width_nm=None)
     assert scene.spectrum_w_m2_sr_nm.tolist() == [[1.0, 3.0]]
     assert scene.band_width_nm.tolist() == [100.0, 100.0]
 
 
-# -- areas that have closed forms -----------------------------------------------------------------------------------
+# -- areas in closed form -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("angle_deg", [-180.0, -135.0, -60.0, -5.0, 0.0, 1e-9, 5.0, 45.0, 90.0, 170.0])
 @pytest.mark.parametrize("shape", [(7, 9), (8, 6)])
-def test_an_edge_has_the_areas_of_its_polygon(angle_deg, shape):
-    got = share(chart("slanted_edge", shape=shape, angle_deg=angle_deg, contrast=1.0, pitch_um=1000.0))
+def test_slanted_edge_matches_polygon_areas(angle_deg, shape):
+    got = relative_radiance(chart("slanted_edge", shape=shape, angle_deg=angle_deg, contrast=1.0, pitch_um=1000.0))
     angle = math.radians(angle_deg)
     along, across = np.array([-math.sin(angle), math.cos(angle)]), np.array([math.cos(angle), math.sin(angle)])
     white = shapely.Polygon([-50 * along, -50 * along + 50 * across, 50 * along + 50 * across, 50 * along])
@@ -128,9 +128,9 @@ def test_an_edge_has_the_areas_of_its_polygon(angle_deg, shape):
 
 
 @pytest.mark.parametrize("n_spokes", [2, 3, 8, 31])
-def test_a_star_has_the_areas_of_its_wedges(n_spokes):
+def test_star_matches_sector_areas(n_spokes):
     shape, radius_mm = (41, 46), 19.3
-    got = share(chart("siemens_star", shape=shape, pitch_um=1000.0, n_spokes=n_spokes, radius_mm=radius_mm))
+    got = relative_radiance(chart("siemens_star", shape=shape, pitch_um=1000.0, n_spokes=n_spokes, radius_mm=radius_mm))
     wedges = [
         shapely.Polygon(
             [(0, 0), *(99 * np.array([[math.cos(a), math.sin(a)] for a in (low, low + math.pi / n_spokes)]))]
@@ -150,21 +150,21 @@ def test_a_star_has_the_areas_of_its_wedges(n_spokes):
     assert is_clear.mean() > 0.5
 
 
-def test_a_letter_f_has_eight_fifths_by_fifths_of_ink():
-    got = share(chart("letter_f", height_mm=4.7))
+def test_letter_f_has_correct_ink_area():
+    got = relative_radiance(chart("letter_f", height_mm=4.7))
     assert math.isclose((1.0 - got).sum() * PITCH_MM**2, 8 * (4.7 / 5) ** 2, rel_tol=1e-6)
 
 
-def test_a_letter_f_stands_upright():
+def test_letter_f_is_upright():
     rows_from_the_top = ["XXX", "X..", "XX.", "X..", "X.."]
     expected = [[float(c == ".") for c in row] for row in reversed(rows_from_the_top)]
-    got = share(chart("letter_f", shape=(5, 3), height_mm=5.0, pitch_um=1000.0))
+    got = relative_radiance(chart("letter_f", shape=(5, 3), height_mm=5.0, pitch_um=1000.0))
     np.testing.assert_allclose(got, expected, atol=EPS32)
-    bright = share(chart("letter_f", shape=(5, 3), height_mm=5.0, pitch_um=1000.0, ink="bright"))
+    bright = relative_radiance(chart("letter_f", shape=(5, 3), height_mm=5.0, pitch_um=1000.0, ink="bright"))
     np.testing.assert_allclose(bright, 1.0 - np.array(expected), atol=EPS32)
 
 
-def test_a_letter_f_stays_upright_through_the_lens_onto_the_sensor():
+def test_letter_f_is_upright_on_sensor():
     scene = chart("letter_f", shape=(200, 120), height_mm=20.0 * 0.99, ink="bright")
     layout = fs.layout.grid(
         n_x=3, n_y=5, pitch_um=4.0 * fs.Optics(focal_length_mm=10.0, f_number=2.0).magnification(1.0) * 1e3
@@ -179,12 +179,12 @@ def test_a_letter_f_stays_upright_through_the_lens_onto_the_sensor():
     assert bright == {(-1, -2), (-1, -1), (-1, 0), (-1, 1), (-1, 2), (0, 0), (0, 2), (1, 2)}
 
 
-def test_squares_are_half_black_and_a_board_has_its_corner_black():
-    filled = share(chart("checkerboard", square_mm=0.5))
+def test_checkerboard_has_specified_arrangement():
+    filled = relative_radiance(chart("checkerboard", square_mm=0.5))
     assert math.isclose(filled.mean(), 0.5, rel_tol=1e-6)
     assert filled[30:35, 40:45].max() < 1e-6
     assert filled[25:30, 40:45].min() > 1.0 - 1e-6
-    board = share(chart("checkerboard", square_mm=1.0, n_squares=(3, 5)))
+    board = relative_radiance(chart("checkerboard", square_mm=1.0, n_squares=(3, 5)))
     dark = 1.0 - board
     assert math.isclose(dark.sum() * PITCH_MM**2, 8.0, rel_tol=1e-6)
     assert dark[15:25, 15:25].min() > 1.0 - 1e-6
@@ -192,30 +192,30 @@ def test_squares_are_half_black_and_a_board_has_its_corner_black():
     assert dark[:15].max() + dark[:, :15].max() + dark[45:].max() < 1e-6
 
 
-def test_squares_that_split_pixels_give_their_shares():
-    got = share(chart("checkerboard", shape=(2, 4), square_mm=1.5, pitch_um=1000.0))
-    # Along x: columns from -2 to 2 mm, borders at -1.5, 0 and 1.5 mm.
+def test_checkerboard_averages_split_pixels():
+    got = relative_radiance(chart("checkerboard", shape=(2, 4), square_mm=1.5, pitch_um=1000.0))
+    # Along x: columns from -2 to 2 mm, edges at -1.5, 0 and 1.5 mm.
     np.testing.assert_allclose(got[1], [0.5, 1.0, 0.0, 0.5], atol=EPS32)
     np.testing.assert_allclose(got[0], [0.5, 0.0, 1.0, 0.5], atol=EPS32)
 
 
-def test_rings_have_their_integral():
+def test_zone_plate_matches_analytic_integral():
     radius_mm, per_mm = 2.7, 3.3
-    got = share(chart("zone_plate", line_pairs_per_mm=per_mm, radius_mm=radius_mm))
+    got = relative_radiance(chart("zone_plate", line_pairs_per_mm=per_mm, radius_mm=radius_mm))
     a = math.pi * per_mm / radius_mm
     expected = 0.5 * 8.0 * 6.0 + 0.5 * math.pi * math.sin(a * radius_mm**2) / a
     assert math.isclose(got.sum() * PITCH_MM**2, expected, rel_tol=1e-4)
 
 
-def test_a_star_and_an_edge_are_half_white():
+def test_star_and_edge_are_half_white():
     for kind in ("siemens_star", "slanted_edge"):
-        assert math.isclose(share(chart(kind, contrast=1.0)).mean(), 0.5, rel_tol=1e-3)
-    assert math.isclose(share(chart("slanted_edge", contrast=0.6)).mean(), 0.5 * 1.25, rel_tol=1e-6)
+        assert math.isclose(relative_radiance(chart(kind, contrast=1.0)).mean(), 0.5, rel_tol=1e-3)
+    assert math.isclose(relative_radiance(chart("slanted_edge", contrast=0.6)).mean(), 0.5 * 1.25, rel_tol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["siemens_star", "zone_plate"])
-def test_round_charts_have_their_symmetries(kind):
-    got = share(chart(kind, shape=(60, 60), **({"n_spokes": 8} if kind == "siemens_star" else {})))
+def test_round_charts_are_symmetric(kind):
+    got = relative_radiance(chart(kind, shape=(60, 60), **({"n_spokes": 8} if kind == "siemens_star" else {})))
     for mirrored in (got[::-1], got[:, ::-1], got.T):
         np.testing.assert_allclose(mirrored, got, atol=SAMPLED)
 
@@ -225,7 +225,7 @@ def test_round_charts_have_their_symmetries(kind):
 
 @pytest.mark.parametrize("phase_deg", [0.0, 90.0, -45.0])
 @pytest.mark.parametrize(("cycles_x", "cycles_y"), [(10, 0), (0, 7), (10, 7), (-10, 7)])
-def test_a_wave_has_its_frequency_phase_and_height(cycles_x, cycles_y, phase_deg):
+def test_sine_has_frequency_phase_and_amplitude(cycles_x, cycles_y, phase_deg):
     fx, fy = cycles_x / 8.0, cycles_y / 6.0
     scene = chart(
         "sine",
@@ -234,56 +234,56 @@ def test_a_wave_has_its_frequency_phase_and_height(cycles_x, cycles_y, phase_deg
         phase_deg=phase_deg,
         contrast=0.5,
     )
-    # Centred on the middle of the picture: exp(-2πi f·x) at the pixels' middles.
-    wave = np.exp(-2j * math.pi * np.add.outer(fy * middles_mm(60), fx * middles_mm(80)))
-    component = (share(scene) * wave).mean()
-    # White 1, black 1/3: the mean is 2/3, the amplitude 1/3, half of it at either frequency.
+    # The origin is the centre of the picture: exp(-2πi f·x) at the pixel centres.
+    wave = np.exp(-2j * math.pi * np.add.outer(fy * centres_mm(60), fx * centres_mm(80)))
+    component = (relative_radiance(scene) * wave).mean()
+    # White 1, black 1/3: the mean is 2/3, the amplitude 1/3, half of it at each of the frequencies f and -f.
     amplitude = np.sinc(fx * PITCH_MM) * np.sinc(fy * PITCH_MM) / 6.0
     np.testing.assert_allclose(component, amplitude * np.exp(-1j * math.radians(phase_deg)), atol=1e-7)
-    assert math.isclose(share(scene).mean(), 2.0 / 3.0, rel_tol=1e-6)
+    assert math.isclose(relative_radiance(scene).mean(), 2.0 / 3.0, rel_tol=1e-6)
 
 
 @pytest.mark.parametrize("profile", ["square", "sine"])
 @pytest.mark.parametrize("n_spokes", [2, 9, 24])
-def test_a_star_has_its_spokes_at_every_radius(n_spokes, profile):
-    got = share(chart("siemens_star", shape=(600, 600), n_spokes=n_spokes, profile=profile, pitch_um=10.0))
+def test_star_has_all_sectors_at_every_radius(n_spokes, profile):
+    got = relative_radiance(chart("siemens_star", shape=(600, 600), n_spokes=n_spokes, profile=profile, pitch_um=10.0))
     angle = 2 * math.pi * np.arange(1024) / 1024
     for r in (120.0, 200.0, 290.0):
         i = np.rint(299.5 + r * np.array([np.sin(angle), np.cos(angle)])).astype(int)
         waves = np.fft.rfft(got[i[0], i[1]] - 0.5) / 1024
         assert np.argmax(np.abs(waves)) == n_spokes
-        # A square wave's first harmonic is 4/π of its height; white points to the right.
+        # The first harmonic of a square wave is 4/π of its amplitude; a white sector is centred on the x axis.
         height = 0.25 * (4 / math.pi if profile == "square" else 1.0)
         assert abs(waves[n_spokes] - height) < 0.03 * height
 
 
-def test_the_rings_frequency_grows_with_the_radius():
-    got = share(chart("zone_plate", shape=(1201, 1201), pitch_um=5.0, line_pairs_per_mm=10.0))
+def test_zone_plate_frequency_increases_with_radius():
+    got = relative_radiance(chart("zone_plate", shape=(1201, 1201), pitch_um=5.0, line_pairs_per_mm=10.0))
     radius_mm, row = 3.0025, got[600, 600:] - 0.5
     r = np.arange(601) * 0.005
     k = np.flatnonzero(row[:-1] * row[1:] < 0)
     crossings = r[k] + 0.005 * row[k] / (row[k] - row[k + 1])
-    # cos(π f r²/R) = 0 where r² = (k + 1/2) R/f.
+    # cos(π f r²/R) = 0 for r² = (k + 1/2) R/f.
     slope = np.polyfit(np.arange(k.size) + 0.5, crossings**2, 1)
     np.testing.assert_allclose(slope, [radius_mm / 10.0, 0.0], rtol=1e-4, atol=1e-3)
     assert got[600, 600] > 0.999
 
 
 @pytest.mark.parametrize("angle_deg", [-20.0, -5.0, 2.0, 5.0, 11.3])
-def test_an_edges_angle_is_found_again_to_a_millionth(angle_deg):
-    got = share(chart("slanted_edge", angle_deg=angle_deg, contrast=1.0))
-    # The white of a row reaches from the edge to the right border.
+def test_edge_angle_is_recovered_accurately(angle_deg):
+    got = relative_radiance(chart("slanted_edge", angle_deg=angle_deg, contrast=1.0))
+    # In each row white extends from the edge to the right boundary.
     edge_mm = 4.0 - got.sum(axis=1) * PITCH_MM
-    slope, middle = np.polyfit(middles_mm(60), edge_mm, 1)
+    slope, offset = np.polyfit(centres_mm(60), edge_mm, 1)
     assert abs(math.degrees(math.atan(-slope)) - angle_deg) < 1e-5
-    assert abs(middle) < 1e-6
-    np.testing.assert_allclose(edge_mm, slope * middles_mm(60), atol=1e-6)
+    assert abs(offset) < 1e-6
+    np.testing.assert_allclose(edge_mm, slope * centres_mm(60), atol=1e-6)
 
 
 @pytest.mark.parametrize("ink", ["dark", "bright"])
-def test_bars_are_where_they_are_said_to_be_and_as_fine(ink):
+def test_bars_match_bar_elements(ink):
     pitch_mm, shape = 0.01, (800, 800)
-    got = share(chart("bars", shape=shape, pitch_um=10.0, groups=[2, 1], ink=ink))
+    got = relative_radiance(chart("bars", shape=shape, pitch_um=10.0, groups=[2, 1], ink=ink))
     got = 1.0 - got if ink == "dark" else got
     elements = charts.bar_elements([2, 1])
     assert len(elements) == 24
@@ -291,7 +291,7 @@ def test_bars_are_where_they_are_said_to_be_and_as_fine(ink):
     for e in elements:
         assert math.isclose(e.line_pairs_per_mm, 2 ** (e.group + (e.element - 1) / 6))
         half = e.side_mm / 2 + 2 * pitch_mm
-        i_x, i_y = (np.flatnonzero(np.abs(middles_mm(800, pitch_mm) - centre) < half) for centre in (e.x_mm, e.y_mm))
+        i_x, i_y = (np.flatnonzero(np.abs(centres_mm(800, pitch_mm) - centre) < half) for centre in (e.x_mm, e.y_mm))
         element = got[np.ix_(i_y, i_x)]
         width_mm = 0.5 / e.line_pairs_per_mm
         assert math.isclose(element.sum() * pitch_mm**2, 3 * 5 * width_mm**2, rel_tol=1e-5)
@@ -304,8 +304,8 @@ def test_bars_are_where_they_are_said_to_be_and_as_fine(ink):
     assert math.isclose(got.sum() * pitch_mm**2, total, rel_tol=1e-5)
 
 
-def test_the_elements_have_the_standards_frequencies():
-    # MIL-STD-150A, in line pairs per mm, as its table rounds them.
+def test_bar_elements_have_standard_frequencies():
+    # MIL-STD-150A, in line pairs per mm, rounded as in its table.
     table = {
         (-2, 1): 0.25,
         (-1, 3): 0.63,
@@ -321,8 +321,8 @@ def test_the_elements_have_the_standards_frequencies():
         assert math.isclose(found[key], line_pairs_per_mm, rel_tol=0.005)
 
 
-def test_steps_of_grey_have_their_ratio():
-    got = share(chart("grey_scale", n_steps=4, ratio=10.0, patch_mm=1.0))
+def test_grey_scale_steps_have_specified_ratio():
+    got = relative_radiance(chart("grey_scale", n_steps=4, ratio=10.0, patch_mm=1.0))
     np.testing.assert_allclose(got[30, 25:65:10], [1.0, 0.1, 0.01, 0.001], rtol=1e-6)
     assert math.isclose(got.sum() * PITCH_MM**2, 1.111, rel_tol=1e-6)
     assert got[:25].max() + got[:, :20].max() < 1e-12
@@ -332,10 +332,10 @@ def test_steps_of_grey_have_their_ratio():
 
 
 def lit_pixels(scene):
-    return [tuple(int(i) for i in place) for place in np.argwhere(scene.basis[0] > 0)]
+    return [tuple(int(i) for i in index) for index in np.argwhere(scene.basis[0] > 0)]
 
 
-def test_points_fill_the_picture_around_a_pixel_in_its_middle():
+def test_default_points_fill_picture_symmetrically():
     scene = chart("point_grid", shape=(7, 12), spacing_mm=0.3)
     assert lit_pixels(scene) == [(y, x) for y in (0, 3, 6) for x in (3, 6, 9)]
 
@@ -346,16 +346,16 @@ def test_points_fill_the_picture_around_a_pixel_in_its_middle():
         ((5, 5), (1, 1), 2, [(2, 2)]),
         ((5, 5), (1, 3), 2, [(2, 0), (2, 2), (2, 4)]),
         ((4, 4), (2, 2), 3, [(0, 0), (0, 3), (3, 0), (3, 3)]),
-        ((4, 4), (1, 2), 2, [(2, 1), (2, 3)]),  # on borders of pixels: the right and the upper one
+        ((4, 4), (1, 2), 2, [(2, 1), (2, 3)]),  # on pixel boundaries: right and upper pixel
         ((1, 1), (1, 1), 4, [(0, 0)]),
     ],
 )
-def test_points_are_centred_and_on_a_border_go_up_and_to_the_right(shape, n_points, step, expected):
+def test_point_grid_is_centred(shape, n_points, step, expected):
     assert lit_pixels(chart("point_grid", shape=shape, n_points=n_points, spacing_mm=step * PITCH_MM)) == expected
 
 
 @pytest.mark.parametrize("n_points", [None, (3, 4)])
-def test_points_have_their_intensities(n_points):
+def test_points_have_specified_intensity(n_points):
     scene = chart("point_grid", n_points=n_points)
     n = len(lit_pixels(scene))
     assert n == (11 * 15 if n_points is None else 12)
@@ -377,7 +377,7 @@ OBSERVER = np.array(
     ]
 )  # fmt: skip
 WAVES_NM = np.arange(380.0, 781.0, 10.0)
-#: CIELAB under D50 of the chart's maker (GretagMacbeth 2005; X-Rite, "before November 2014"): other prints than Ohta's.
+#: CIELAB under D50 from the manufacturer (GretagMacbeth 2005; X-Rite, "before November 2014"), other specimens than Ohta's.
 MAKERS_LAB = np.array(
     [
         [37.986, 13.555, 14.059], [65.711, 18.13, 17.81], [49.927, -4.88, -21.905], [43.139, -13.095, 21.905],
@@ -391,14 +391,14 @@ MAKERS_LAB = np.array(
 
 
 def lab(spectra, light):
-    """CIELAB (n, 3) of spectra (n, 41) under a light (41,) that a white reflects."""
+    """Return CIELAB (n, 3) of reflected spectra (n, 41) relative to the illuminant (41,)."""
     relative = (spectra @ OBSERVER.T) / (OBSERVER @ light)
     f = np.where(relative > (6 / 29) ** 3, np.cbrt(relative), relative * (29 / 6) ** 2 / 3 + 4 / 29)
     return np.stack([116 * f[:, 1] - 16, 500 * (f[:, 0] - f[:, 1]), 200 * (f[:, 1] - f[:, 2])], axis=1)
 
 
 def patch_spectra(scene, patch_mm, gap_mm=0.0):
-    """Spectral radiance (24, n_wavelength) in the middles of the patches, row by row from the upper left."""
+    """Return the spectral radiance (24, n_wavelength) at the patch centres, row by row from the upper left."""
     n_y, n_x = scene.basis.shape[1:]
     step = (patch_mm + gap_mm) / (scene.pitch_um * 1e-3)
     i_y = np.floor(0.5 * n_y + (1.5 - np.repeat(np.arange(4), 6)) * step).astype(int)
@@ -418,13 +418,13 @@ def colours(**changed):
 
 
 @pytest.mark.parametrize(("n_basis", "mean", "worst"), [(24, 1.7, 3.6), (12, 1.8, 3.6)])
-def test_the_patches_have_the_colours_that_their_maker_publishes(n_basis, mean, worst):
+def test_patch_colours_agree_with_manufacturer(n_basis, mean, worst):
     light = charts.illuminant("D50", WAVES_NM)
     found = lab(patch_spectra(colours(illuminant="D50", n_basis=n_basis), 1.0, 0.2), light)
     difference = np.linalg.norm(found - MAKERS_LAB, axis=1)
     assert difference.mean() < mean
     assert difference.max() < worst
-    # The nearest of the maker's colours is the patch's own.
+    # The nearest of the manufacturer's colours belongs to the same patch.
     nearest = np.linalg.norm(found[:, np.newaxis] - MAKERS_LAB, axis=2).argmin(axis=1)
     assert nearest.tolist() == list(range(24))
 
@@ -433,7 +433,7 @@ def test_the_patches_have_the_colours_that_their_maker_publishes(n_basis, mean, 
     ("n_basis", "mean", "worst"), [(24, 1e-4, 1e-4), (12, 0.11, 0.5), (10, 0.33, 1.3), (8, 0.78, 2.5)]
 )
 @pytest.mark.parametrize("illuminant", ["D65", "A"])
-def test_few_basis_images_change_colours_by_as_much_as_is_said(n_basis, mean, worst, illuminant):
+def test_colour_error_of_few_basis_images(n_basis, mean, worst, illuminant):
     light = charts.illuminant(illuminant, WAVES_NM)
     scene = colours(illuminant=illuminant, n_basis=n_basis)
     assert scene.basis.shape[0] == n_basis
@@ -443,7 +443,7 @@ def test_few_basis_images_change_colours_by_as_much_as_is_said(n_basis, mean, wo
     assert difference.max() < worst
 
 
-def test_a_few_wavelengths_are_exact_with_a_basis_image_each():
+def test_few_wavelengths_are_exact():
     waves_nm = [620.0, 550.0, 455.0]
     scene = colours(wavelength_nm=waves_nm, radiance_w_m2_sr_nm=0.3, illuminant="D65")
     assert scene.basis.shape[0] == 3
@@ -451,15 +451,15 @@ def test_a_few_wavelengths_are_exact_with_a_basis_image_each():
     np.testing.assert_allclose(patch_spectra(scene, 1.0, 0.2), expected, rtol=1e-6)
 
 
-def test_the_chart_has_its_area_and_is_black_around():
+def test_colour_chart_has_black_surround():
     scene = colours(wavelength_nm=[550.0], band_width_nm=10.0, illuminant="E")
     area_mm2 = scene.basis.sum(dtype=np.float64) * PITCH_MM**2
     assert math.isclose(area_mm2, charts.patch_reflectance([550.0]).sum(), rel_tol=1e-6)
     assert scene.basis[0, :6].max() == scene.basis[0, :, :4].max() == 0.0
 
 
-def test_reflectances_are_those_of_the_publication():
-    # Ohta's table at 550 nm and 445 nm, the latter between two of ours.
+def test_reflectances_match_publication():
+    # Ohta's table has steps of 5 nm: 550 nm is tabulated here, 445 nm is interpolated.
     assert charts.PATCH_NAMES[0] == "dark skin"
     np.testing.assert_allclose(charts.patch_reflectance([550.0, 700.0])[[0, 13, 18, 23]].T,
                                [[0.079, 0.323, 0.886, 0.034], [0.282, 0.088, 0.888, 0.032]])  # fmt: skip
@@ -478,7 +478,7 @@ def test_reflectances_are_those_of_the_publication():
         ("E", 1 / 3, 1 / 3),
     ],
 )
-def test_illuminants_have_their_chromaticities(name, x, y):
+def test_illuminants_have_standard_chromaticities(name, x, y):
     xyz = OBSERVER @ charts.illuminant(name, WAVES_NM)
     np.testing.assert_allclose(xyz[:2] / xyz.sum(), [x, y], atol=3e-4)
 
@@ -490,12 +490,12 @@ def test_illuminants_have_their_chromaticities(name, x, y):
         ("A", {380: 9.7951, 400: 14.708, 500: 59.8611, 560: 100.0, 700: 198.261, 780: 241.675}),
     ],
 )
-def test_illuminants_have_their_published_spectra(name, table):
+def test_illuminants_have_published_spectra(name, table):
     found = charts.illuminant(name, [float(w) for w in table])
     np.testing.assert_allclose(100.0 * found, list(table.values()), rtol=1e-3)
 
 
-# -- what is too fine -----------------------------------------------------------------------------------------------
+# -- aliasing -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -512,27 +512,25 @@ def test_illuminants_have_their_published_spectra(name, table):
         ("point_grid", {"spacing_mm": 0.1}),
     ],
 )
-def test_a_pattern_finer_than_pixels_show_is_told(kind, changed):
-    with pytest.warns(
-        SamplingWarning, match=r"^'\w+' gives a pattern of .* pixels a period .* averaged away"
-    ) as caught:
+def test_pattern_beyond_nyquist_warns(kind, changed):
+    with pytest.warns(SamplingWarning, match=r"^'\w+' yields .* pixels per period .* averages to grey") as caught:
         chart(kind, **changed)
     assert len(caught) == 1
     assert caught[0].filename == __file__
 
 
-def test_a_pattern_too_fine_is_the_mean():
+def test_too_fine_pattern_averages_to_grey():
     with pytest.warns(SamplingWarning):
-        got = share(chart("checkerboard", square_mm=0.001))
+        got = relative_radiance(chart("checkerboard", square_mm=0.001))
     np.testing.assert_allclose(got, 0.5, atol=1e-3)
 
 
-def test_two_pixels_a_period_are_enough():
+def test_two_pixels_per_period_do_not_warn():
     chart("checkerboard", square_mm=0.1)
     chart("sine", line_pairs_per_mm=5.0)
 
 
-# -- what is rejected ------------------------------------------------------------------------------------------------
+# -- invalid arguments -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -550,7 +548,7 @@ def test_two_pixels_a_period_are_enough():
     ],
     ids=str,
 )
-def test_a_picture_that_cannot_be_is_refused_in_one_sentence(kind, changed, name):
+def test_charts_reject_invalid_picture_parameters(kind, changed, name):
     with pytest.raises(ParameterError, match=rf"^'{re.escape(name)}' must [^\n]*$"):
         chart(kind, **changed)
 
@@ -568,30 +566,30 @@ def test_a_picture_that_cannot_be_is_refused_in_one_sentence(kind, changed, name
     ],
     ids=str,
 )
-def test_light_that_cannot_be_is_refused_in_one_sentence(kind, changed, name):
+def test_charts_reject_invalid_contrast_or_radiance(kind, changed, name):
     with pytest.raises(ParameterError, match=rf"^'{name}' must [^\n]*$"):
         chart(kind, **changed)
 
 
 @pytest.mark.parametrize(
-    ("kind", "changed", "sentence"),
+    ("kind", "changed", "message"),
     [
         ("point_grid", {"spacing_mm": 0.0}, "'spacing_mm' must be > 0, got 0.0 mm"),
         ("point_grid", {"spacing_mm": math.nan}, "'spacing_mm' must be finite"),
         (
             "point_grid",
             {"spacing_mm": 0.55},
-            "'spacing_mm' must be an integer of pixels of 0.1 mm, got 0.55 mm; the near",
+            "'spacing_mm' must be an integer number of pixels of 0.1 mm, got 0.55 mm; the nearest value",
         ),
         (
             "point_grid",
             {"spacing_mm": 0.01},
-            "'spacing_mm' must be an integer of pixels of 0.1 mm, got 0.01 mm; the near",
+            "'spacing_mm' must be an integer number of pixels of 0.1 mm, got 0.01 mm; the nearest value",
         ),
         (
             "point_grid",
             {"n_points": (13, 2)},
-            "'n_points' must leave the chart in the picture of 8 x 6 mm; it would be 0.6 x",
+            "'n_points' must yield a chart within the picture of 8 x 6 mm, got 0.6 x",
         ),
         ("point_grid", {"n_points": (0, 2)}, "'n_points[0]' must be >= 1"),
         ("point_grid", {"intensity_w_sr_nm": -1.0}, "'intensity_w_sr_nm' must be >= 0"),
@@ -600,7 +598,7 @@ def test_light_that_cannot_be_is_refused_in_one_sentence(kind, changed, name):
         (
             "checkerboard",
             {"square_mm": 1.0, "n_squares": (7, 8)},
-            "'n_squares' must leave the chart in the picture of 8 x 6",
+            "'n_squares' must yield a chart within the picture of 8 x 6",
         ),
         ("checkerboard", {"n_squares": (7,)}, "'n_squares' must be two integers"),
         ("siemens_star", {"n_spokes": 1}, "'n_spokes' must be >= 2, got 1"),
@@ -610,39 +608,39 @@ def test_light_that_cannot_be_is_refused_in_one_sentence(kind, changed, name):
         (
             "siemens_star",
             {"radius_mm": 3.1},
-            "'radius_mm' must leave the chart in the picture of 8 x 6 mm; it would be 6.2 x",
+            "'radius_mm' must yield a chart within the picture of 8 x 6 mm, got 6.2 x",
         ),
         ("siemens_star", {"profile": "saw"}, "'profile' must be one of 'square', 'sine', got 'saw'"),
         ("slanted_edge", {"angle_deg": math.nan}, "'angle_deg' must be finite"),
         ("slanted_edge", {"angle_deg": 181.0}, "'angle_deg' must be <= 180, got 181.0 degrees"),
         ("zone_plate", {"line_pairs_per_mm": 0.0}, "'line_pairs_per_mm' must be > 0, got 0.0 per mm"),
-        ("zone_plate", {"radius_mm": 4.0}, "'radius_mm' must leave the chart"),
+        ("zone_plate", {"radius_mm": 4.0}, "'radius_mm' must yield a chart within"),
         ("bars", {"groups": []}, "'groups' must be a list of integers, got []"),
         ("bars", {"groups": 3}, "'groups' must be a list of integers, got 3"),
         ("bars", {"groups": "3"}, "'groups[0]' must be one number"),
         ("bars", {"groups": [1.5]}, "'groups[0]' must be an integer"),
-        ("bars", {"groups": [2, 2]}, "'groups' must be different from each other"),
-        ("bars", {"groups": [-3]}, "'groups' must leave the chart in the picture of 8 x 9 mm"),
+        ("bars", {"groups": [2, 2]}, "'groups' must be unique"),
+        ("bars", {"groups": [-3]}, "'groups' must yield a chart within the picture of 8 x 9 mm"),
         ("bars", {"ink": "red"}, "'ink' must be one of 'dark', 'bright', got 'red'"),
         ("sine", {"line_pairs_per_mm": -2.0}, "'line_pairs_per_mm' must be > 0, got -2.0 per mm"),
         ("sine", {"phase_deg": math.inf}, "'phase_deg' must be finite"),
         (
             "letter_f",
             {"height_mm": 6.1},
-            "'height_mm' must leave the chart in the picture of 8 x 6 mm; it would be 3.66 x 6.1",
+            "'height_mm' must yield a chart within the picture of 8 x 6 mm, got 3.66 x 6.1",
         ),
         ("letter_f", {"height_mm": 0.0}, "'height_mm' must be > 0"),
         (
             "grey_scale",
             {"patch_mm": 1.0},
-            "'patch_mm' must leave the chart in the picture of 8 x 6 mm; it would be 12 x 1 mm",
+            "'patch_mm' must yield a chart within the picture of 8 x 6 mm, got 12 x 1 mm",
         ),
         ("grey_scale", {"ratio": 0.5}, "'ratio' must be >= 1"),
         ("grey_scale", {"n_steps": 0}, "'n_steps' must be >= 1"),
         (
             "colour_chart",
             {"patch_mm": 1.4, "gap_mm": 0.0},
-            "'patch_mm' must leave the chart in the picture of 8 x 6 mm",
+            "'patch_mm' must yield a chart within the picture of 8 x 6 mm",
         ),
         ("colour_chart", {"gap_mm": -0.1}, "'gap_mm' must be >= 0"),
         ("colour_chart", {"n_basis": 25}, "'n_basis' must be <= 24"),
@@ -650,13 +648,13 @@ def test_light_that_cannot_be_is_refused_in_one_sentence(kind, changed, name):
         (
             "colour_chart",
             {"wavelength_nm": [370.0]},
-            "'wavelength_nm' must be from 380 to 780, where the tables are, got [370.0]",
+            "'wavelength_nm' must be from 380 to 780, the range of the tables, got [370.0]",
         ),
         ("colour_chart", {"radiance_w_m2_sr_nm": math.nan}, "'radiance_w_m2_sr_nm' must be finite"),
     ],
 )
-def test_a_chart_that_cannot_be_is_refused_in_one_sentence(kind, changed, sentence):
-    with pytest.raises(ParameterError, match=rf"^{re.escape(sentence)}[^\n]*$"):
+def test_charts_reject_invalid_parameters(kind, changed, message):
+    with pytest.raises(ParameterError, match=rf"^{re.escape(message)}[^\n]*$"):
         chart(kind, **changed)
 
 
@@ -683,13 +681,13 @@ def shot_of(tmp_path):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_settings_file_gives_the_chart_of_the_call(shot_of, kind):
+def test_settings_file_and_call_agree(shot_of, kind):
     by_file, by_call = shot_of(kind).scene, chart(kind)
     np.testing.assert_array_equal(by_file.basis, by_call.basis)
     np.testing.assert_array_equal(by_file.spectrum_w_m2_sr_nm, by_call.spectrum_w_m2_sr_nm)
 
 
-def test_a_settings_files_pairs_and_lists_are_taken(shot_of):
+def test_settings_file_accepts_pairs_and_lists(shot_of):
     board = shot_of(
         "checkerboard", n_squares=[3, 4], radiance_w_m2_sr_nm=[1.0, 2.0], wavelength_nm=[500.0, 600.0]
     ).scene
@@ -700,18 +698,18 @@ def test_a_settings_files_pairs_and_lists_are_taken(shot_of):
 @pytest.mark.parametrize(
     ("kind", "changed", "message"),
     [
-        ("siemens_star", {"radius_mm": 99.0}, r"scene\.radius_mm: must leave the chart in the picture"),
+        ("siemens_star", {"radius_mm": 99.0}, r"scene\.radius_mm: must yield a chart within the picture"),
         ("siemens_star", {"profile": "saw"}, r"scene\.profile: must be 'square' or 'sine', got \"saw\""),
         ("slanted_edge", {"angle": 3}, r"scene\.angle: no such setting"),
-        ("bars", {"groups": [1, 1]}, r"scene\.groups: must be different"),
+        ("bars", {"groups": [1, 1]}, r"scene\.groups: must be unique"),
     ],
 )
-def test_a_charts_wrong_setting_is_told_with_its_place(shot_of, kind, changed, message):
+def test_invalid_chart_setting_error_names_key(shot_of, kind, changed, message):
     with pytest.raises(ConfigError, match=message):
         shot_of(kind, **changed)
 
 
-def test_the_schema_describes_the_charts():
+def test_schema_contains_all_charts():
     text = json.dumps(schema())
     for name in (*KINDS, "line_pairs_per_mm", "square_mm", "n_spokes", "illuminant"):
         assert f'"{name}"' in text

@@ -1,4 +1,4 @@
-"""Scenes: which way up they are, how bright, and at which wavelengths, against published values and by hand."""
+"""Scenes: orientation, radiance and wavelengths, compared with published values and manual calculation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from foveasim.scene import Scene
 
 EPS32 = float(np.finfo(np.float32).eps)
 
-#: A letter without any symmetry, the first row on top, as in a file.
+#: Letter without symmetry, top row first, as in a file.
 F = np.array(
     [
         [0, 0, 0, 0, 0],
@@ -34,13 +34,13 @@ F = np.array(
 
 
 def scene_of(picture, **changed):
-    """A scene of 1 W/(m² sr nm) where the picture is white."""
+    """Return a scene with a radiance of 1 W/(m² sr nm) for white."""
     given = {"pitch_um": 10.0, "distance_m": 0.5, "peak_radiance_w_m2_sr_nm": 1.0, "band_width_nm": 10.0}
     return Scene.from_picture(picture, **(given | changed))
 
 
 def radiance(scene):
-    """Spectral radiance (n_wavelength, n_y, n_x), by the definition of a scene."""
+    """Return the spectral radiance (n_wavelength, n_y, n_x) from the definition of a scene."""
     return np.einsum("byx,bk->kyx", scene.basis, scene.spectrum_w_m2_sr_nm)
 
 
@@ -61,25 +61,25 @@ def flat(**changed):
     return Scene.flat(**(given | changed))
 
 
-# -- numbers to light -----------------------------------------------------------------------------------------------
+# -- decoding -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("value", "light"),
     [
         (0.0, 0.0),
-        (0.04045, 0.0031308),  # where the straight part of IEC 61966-2-1 ends
+        (0.04045, 0.0031308),  # end of the linear segment of IEC 61966-2-1
         (0.1, 0.01002283),
         (0.5, 0.21404114),
         (0.735357, 0.5),
         (1.0, 1.0),
     ],
 )
-def test_srgb_numbers_are_the_light_of_the_standard(value, light):
+def test_srgb_decoding_matches_standard(value, light):
     assert abs(decoded(np.array(value), "srgb") - light) < 1e-6
 
 
-def test_srgb_codes_are_the_light_that_another_library_finds():
+def test_srgb_codes_agree_with_scikit_image():
     codes = np.arange(256, dtype=np.uint8)
     greys = np.repeat(codes[np.newaxis, :, np.newaxis], 3, axis=2)
     brightness = skimage.color.rgb2xyz(greys)[0, :, 1]
@@ -87,13 +87,13 @@ def test_srgb_codes_are_the_light_that_another_library_finds():
 
 
 @pytest.mark.parametrize(("encoding", "power"), [("linear", 1), ("sqrt", 2)])
-def test_linear_and_square_root_numbers_are_powers(encoding, power):
+def test_linear_and_square_root_encodings_are_powers(encoding, power):
     values = np.array([[0.0, 0.25, 0.5, 1.0, 1.5]])
     np.testing.assert_allclose(radiance(scene_of(values, encoding=encoding))[0], values**power, rtol=EPS32)
 
 
 @pytest.mark.parametrize("encoding", ["srgb", "sqrt", "linear"])
-def test_more_light_has_larger_numbers_in_every_encoding(encoding):
+def test_encodings_are_strictly_increasing(encoding):
     assert np.all(np.diff(decoded(np.linspace(0.0, 2.0, 2001), encoding)) > 0.0)
 
 
@@ -110,58 +110,58 @@ def test_more_light_has_larger_numbers_in_every_encoding(encoding):
     ],
     ids=lambda value: value.dtype.name,
 )
-def test_black_gives_no_light_and_white_the_peak_whatever_the_type(black, white, encoding):
+def test_black_is_zero_and_white_peak(black, white, encoding):
     scene = scene_of(np.array([[black, white]]), encoding=encoding, peak_radiance_w_m2_sr_nm=0.25)
     np.testing.assert_allclose(radiance(scene), [[[0.0, 0.25]]], rtol=EPS32)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-def test_a_half_is_decoded_to_the_accuracy_of_single_precision_whatever_the_type(dtype):
+def test_float_decoding_has_single_precision(dtype):
     light = float(radiance(scene_of(np.full((1, 1), 0.5, dtype)))[0, 0, 0])
     assert math.isclose(light, 0.21404114048223255, rel_tol=4 * EPS32)
 
 
-def test_eight_bits_are_the_same_light_as_sixteen():
-    # 65535 = 257 x 255, so that code k of 8 bits is code 257 k of 16.
+def test_eight_and_sixteen_bits_agree():
+    # 65535 = 257 x 255: the 8-bit code k is equivalent to the 16-bit code 257 k.
     codes = np.arange(256, dtype=np.uint8)[np.newaxis]
     np.testing.assert_array_equal(scene_of(codes).basis, scene_of(codes.astype(np.uint16) * np.uint16(257)).basis)
 
 
-def test_the_byte_order_of_an_array_does_not_matter():
+def test_byte_order_is_ignored():
     codes = F * np.uint16(40_000)
     np.testing.assert_array_equal(scene_of(codes.astype(">u2")).basis, scene_of(codes.astype("<u2")).basis)
 
 
-def test_floats_above_1_are_brighter_than_the_peak():
+def test_floats_above_one_exceed_peak():
     assert radiance(scene_of(np.array([[4.0]]), encoding="linear"))[0, 0, 0] == 4.0
 
 
-def test_radiance_is_proportional_to_the_peak():
+def test_radiance_is_proportional_to_peak():
     one, seven = (radiance(scene_of(F * np.uint8(99), peak_radiance_w_m2_sr_nm=peak)) for peak in (1.0, 7.0))
     np.testing.assert_allclose(seven, 7.0 * one, rtol=1e-15)
 
 
-# -- which way up ---------------------------------------------------------------------------------------------------
+# -- orientation ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.bool_])
-def test_row_0_is_the_lowest(dtype):
+def test_array_row_0_is_bottom_row(dtype):
     picture = F.astype(dtype) * dtype(1 if dtype in (np.float32, np.bool_) else np.iinfo(dtype).max)
     np.testing.assert_array_equal(scene_of(picture).basis[0], F[::-1])
 
 
-def test_row_0_of_a_file_is_the_lowest(tmp_path):
+def test_file_row_0_is_bottom_row(tmp_path):
     Image.fromarray(F * np.uint8(255)).save(tmp_path / "f.png")
     np.testing.assert_array_equal(scene_of(tmp_path / "f.png").basis[0], F[::-1])
 
 
-def test_a_file_gives_the_scene_of_its_array(tmp_path):
+def test_file_and_array_yield_same_scene(tmp_path):
     colour = np.random.default_rng(1).integers(0, 256, (7, 5, 3), dtype=np.uint8)
     Image.fromarray(colour).save(tmp_path / "f.png")
     np.testing.assert_array_equal(scene_of(str(tmp_path / "f.png")).basis, scene_of(colour).basis)
 
 
-def test_channels_keep_their_order():
+def test_channel_order_is_preserved():
     colour = np.stack([F, np.zeros_like(F), 1 - F], axis=-1) * np.uint8(255)
     red, green, blue = scene_of(colour).basis
     np.testing.assert_array_equal(red, F[::-1])
@@ -173,7 +173,7 @@ def test_channels_keep_their_order():
 
 
 @pytest.mark.parametrize(
-    ("picture", "share"),
+    ("picture", "expected"),
     [
         (np.full((1, 1, 2), [255, 0], np.uint8), 0.0),
         (np.full((1, 1, 2), [255, 51], np.uint8), 0.2),
@@ -184,8 +184,8 @@ def test_channels_keep_their_order():
     ],
     ids=["clear grey", "grey", "colour", "16-bit colour", "float colour", "opaque colour"],
 )
-def test_what_is_transparent_gives_its_share_of_the_light(picture, share):
-    np.testing.assert_allclose(radiance(scene_of(picture)), share, rtol=EPS32)
+def test_alpha_scales_radiance(picture, expected):
+    np.testing.assert_allclose(radiance(scene_of(picture)), expected, rtol=EPS32)
 
 
 # -- colours and wavelengths ----------------------------------------------------------------------------------------
@@ -195,18 +195,18 @@ def test_what_is_transparent_gives_its_share_of_the_light(picture, share):
     ("colour", "brightness"),  # Rec. ITU-R BT.709
     [((255, 0, 0), 0.2126), ((0, 255, 0), 0.7152), ((0, 0, 255), 0.0722), ((255, 255, 255), 1.0), ((0, 0, 0), 0.0)],
 )
-def test_a_colour_picture_at_one_wavelength_is_its_brightness(colour, brightness):
+def test_colour_at_one_wavelength_becomes_luminance(colour, brightness):
     scene = scene_of(np.full((1, 1, 3), colour, np.uint8), wavelength_nm=[550.0])
     assert math.isclose(radiance(scene)[0, 0, 0], brightness, rel_tol=4 * EPS32)
 
 
-def test_a_grey_picture_shines_alike_at_many_wavelengths():
+def test_grey_picture_has_flat_spectrum():
     wavelength_nm = np.arange(400.0, 701.0, 10.0)
     at_all = radiance(scene_of(F * np.uint8(255), wavelength_nm=wavelength_nm))
     np.testing.assert_array_equal(at_all, np.tile(F[::-1], (31, 1, 1)))
 
 
-def test_a_colour_picture_shines_each_colour_at_its_own_wavelength():
+def test_colour_channels_map_to_their_wavelengths():
     scene = scene_of(np.full((1, 1, 3), [255, 0, 0], np.uint8), wavelength_nm=[650.0, 540.0, 460.0])
     assert radiance(scene)[:, 0, 0].tolist() == [1.0, 0.0, 0.0]
 
@@ -214,11 +214,11 @@ def test_a_colour_picture_shines_each_colour_at_its_own_wavelength():
 @pytest.mark.parametrize(
     ("shape", "wavelength_nm"), [((1, 1), [550.0]), ((1, 1, 1), [550.0]), ((1, 1, 3), [620.0, 550.0, 450.0])]
 )
-def test_wavelengths_not_given_are_those_of_the_papers_colours(shape, wavelength_nm):
+def test_default_wavelengths_are_those_of_paper(shape, wavelength_nm):
     assert scene_of(np.ones(shape)).wavelength_nm.tolist() == wavelength_nm
 
 
-def test_channels_shine_in_their_spectra():
+def test_channels_are_weighted_by_spectra():
     spectrum = [[1.0, 0.0, 0.5, 0.0], [0.0, 2.0, 0.5, 0.0], [0.0, 0.0, 0.5, 3.0]]
     scene = scene_of(
         np.full((1, 1, 3), [1.0, 0.5, 0.25]),
@@ -240,13 +240,13 @@ def test_channels_shine_in_their_spectra():
         ([500.0, 600.0], [100.0, 100.0]),
     ],
 )
-def test_bands_reach_half_way_to_the_neighbours(wavelength_nm, width_nm):
+def test_default_bands_extend_to_midpoints(wavelength_nm, width_nm):
     scene = scene_of(F * np.uint8(255), wavelength_nm=wavelength_nm, band_width_nm=None)
     np.testing.assert_allclose(scene.band_width_nm, width_nm, rtol=1e-15)
 
 
 @pytest.mark.parametrize(("given", "width_nm"), [(12.0, [12.0, 12.0]), ([5.0, 7.0], [5.0, 7.0])])
-def test_bands_given_are_kept(given, width_nm):
+def test_specified_band_widths_are_used(given, width_nm):
     scene = scene_of(F * np.uint8(255), wavelength_nm=[600.0, 500.0], band_width_nm=given)
     assert scene.band_width_nm.tolist() == width_nm
 
@@ -254,18 +254,18 @@ def test_bands_given_are_kept(given, width_nm):
 # -- flat scenes and points -----------------------------------------------------------------------------------------
 
 
-def test_a_flat_scene_has_its_radiance_everywhere_at_every_wavelength():
+def test_flat_scene_has_uniform_radiance():
     np.testing.assert_array_equal(radiance(flat(wavelength_nm=[450.0, 550.0])), np.full((2, 4, 6), 0.25))
 
 
 @pytest.mark.parametrize("pitch_um", [0.5, 10.0, 11.6])
-def test_a_point_has_its_intensity_as_radiance_times_area(pitch_um):
+def test_point_intensity_is_radiance_times_area(pitch_um):
     scene = points(pitch_um=pitch_um, intensity_w_sr_nm=3e-6, wavelength_nm=[450.0, 550.0])
     area_m2 = (pitch_um * 1e-6) ** 2
     np.testing.assert_allclose(radiance(scene).sum(axis=(1, 2)) * area_m2, 3e-6, rtol=1e-14)
 
 
-def test_points_shine_where_they_are_and_nowhere_else():
+def test_point_sources_illuminate_their_pixels_only():
     light = radiance(points(pixels=[(0, 0), (3, 5), (1, 4)], intensity_w_sr_nm=[1.0, 2.0, 3.0]))[0] * (10e-6) ** 2
     expected = np.zeros((4, 6))
     expected[0, 0], expected[3, 5], expected[1, 4] = 1.0, 2.0, 3.0
@@ -278,22 +278,22 @@ def test_two_points_in_one_pixel_add_up():
     )
 
 
-# -- what is rejected ------------------------------------------------------------------------------------------------
+# -- invalid arguments -----------------------------------------------------------------------------------------------
 
 WHITE = np.ones((2, 2))
 COLOUR = np.ones((2, 2, 3))
 
 
 @pytest.mark.parametrize(
-    ("picture", "sentence"),
+    ("picture", "message"),
     [
         (np.array([[1.0, math.nan]]), "'picture' must be finite"),
         (np.array([[1.0, math.inf]]), "'picture' must be finite"),
         (np.array([[1.0, -0.1]]), "'picture' must be finite and >= 0"),
-        (np.ones((2, 2), np.int64), "'picture' must hold uint8, uint16 or floating-point numbers, got int64"),
-        ([[1, 2], [3, 4]], "'picture' must hold uint8, uint16 or floating-point numbers, got int64"),
-        (np.ones((2, 2), np.int8), "'picture' must hold uint8, uint16 or floating-point numbers, got int8"),
-        (np.ones((2, 2), complex), "'picture' must hold uint8, uint16 or floating-point numbers, got complex128"),
+        (np.ones((2, 2), np.int64), "'picture' must have the dtype uint8, uint16 or float, got int64"),
+        ([[1, 2], [3, 4]], "'picture' must have the dtype uint8, uint16 or float, got int64"),
+        (np.ones((2, 2), np.int8), "'picture' must have the dtype uint8, uint16 or float, got int8"),
+        (np.ones((2, 2), complex), "'picture' must have the dtype uint8, uint16 or float, got complex128"),
         (np.ones(4), "'picture' must have the shape"),
         (np.ones((2, 2, 5)), "'picture' must have the shape"),
         (np.ones((1, 2, 2, 3)), "'picture' must have the shape"),
@@ -319,25 +319,25 @@ COLOUR = np.ones((2, 2, 3))
         "none",
     ],
 )
-def test_an_array_that_is_no_picture_is_refused_in_one_sentence(picture, sentence):
-    with pytest.raises(ParameterError, match=rf"^{re.escape(sentence)}[^\n]*$"):
+def test_from_picture_rejects_invalid_arrays(picture, message):
+    with pytest.raises(ParameterError, match=rf"^{re.escape(message)}[^\n]*$"):
         scene_of(picture)
 
 
 @pytest.mark.parametrize(
-    ("picture", "changed", "sentence"),
+    ("picture", "changed", "message"),
     [
         (
             COLOUR,
             {"wavelength_nm": [500.0, 600.0]},
-            "'wavelength_nm' must have as many values as the picture has channels, 3",
+            "'wavelength_nm' must have one value, or one for each of the 3 channels, got [500.0, 600.0] nm; for other",
         ),
-        (COLOUR, {"wavelength_nm": np.arange(400.0, 701.0, 10.0)}, "'wavelength_nm' must have as many values"),
+        (COLOUR, {"wavelength_nm": np.arange(400.0, 701.0, 10.0)}, "'wavelength_nm' must have one value, or one for"),
         (COLOUR, {"wavelength_nm": [500.0, 600.0], "spectrum": np.ones((2, 2))}, "'spectrum' must have the shape"),
         (WHITE, {"wavelength_nm": [500.0, 600.0], "spectrum": [[1.0, -1.0]]}, "'spectrum' must be >= 0"),
         (WHITE, {"wavelength_nm": [500.0, -600.0]}, "'wavelength_nm' must be > 0"),
         (WHITE, {"wavelength_nm": [500.0, math.nan]}, "'wavelength_nm' must be finite"),
-        (WHITE, {"wavelength_nm": [500.0, 500.0], "band_width_nm": None}, "'wavelength_nm' must be different"),
+        (WHITE, {"wavelength_nm": [500.0, 500.0], "band_width_nm": None}, "'wavelength_nm' must be unique"),
         (WHITE, {"band_width_nm": None}, "'band_width_nm' must be given for a single wavelength"),
         (COLOUR, {"band_width_nm": [10.0, 10.0]}, "'band_width_nm' must be one number, or one for each of the 3"),
         (COLOUR, {"band_width_nm": [10.0, 0.0, 10.0]}, "'band_width_nm' must be > 0"),
@@ -350,23 +350,23 @@ def test_an_array_that_is_no_picture_is_refused_in_one_sentence(picture, sentenc
         (WHITE, {"peak_radiance_w_m2_sr_nm": math.nan}, "'peak_radiance_w_m2_sr_nm' must be finite"),
     ],
 )
-def test_a_scene_that_cannot_be_is_refused_in_one_sentence(picture, changed, sentence):
-    with pytest.raises(ParameterError, match=rf"^{re.escape(sentence)}[^\n]*$"):
+def test_from_picture_rejects_invalid_parameters(picture, changed, message):
+    with pytest.raises(ParameterError, match=rf"^{re.escape(message)}[^\n]*$"):
         scene_of(picture, **changed)
 
 
-def test_a_message_shows_plain_numbers():
+def test_error_message_shows_plain_numbers():
     with pytest.raises(ParameterError, match=r"got \[500\.0, 600\.0\] nm"):
         scene_of(COLOUR, wavelength_nm=[500.0, 600.0])
 
 
-def test_a_file_with_a_negative_number_is_refused_by_its_name(tmp_path):
+def test_negative_file_value_error_names_file(tmp_path):
     tifffile.imwrite(tmp_path / "f.tif", np.array([[1.0, -1.0], [0.0, 0.0]], np.float32))
-    with pytest.raises(FileError, match=r"f\.tif: 'picture' must be finite and >= 0 everywhere$"):
+    with pytest.raises(FileError, match=r"f\.tif: 'picture' must be finite and >= 0 in all pixels$"):
         scene_of(tmp_path / "f.tif")
 
 
-def test_a_missing_file_is_refused(tmp_path):
+def test_from_picture_rejects_missing_file(tmp_path):
     with pytest.raises(FileError, match=r"nowhere\.png: no such file$"):
         scene_of(tmp_path / "nowhere.png")
 
@@ -390,13 +390,13 @@ def test_a_missing_file_is_refused(tmp_path):
         ({"shape": (4, 6, 3)}, "shape"),
     ],
 )
-def test_points_that_cannot_be_are_refused(changed, name):
+def test_point_sources_reject_invalid_parameters(changed, name):
     with pytest.raises(ParameterError, match=rf"^'{name}' [^\n]*$"):
         points(**changed)
 
 
 @pytest.mark.parametrize("shape", [(0, 6), (-1, 6), (4.5, 6), (4,), (4, 6, 3)], ids=str)
-def test_a_flat_scene_of_no_possible_shape_is_refused_by_the_name_of_the_parameter(shape):
+def test_flat_scene_rejects_invalid_shape(shape):
     with pytest.raises(ParameterError, match=r"^'shape(\[0\])?' "):
         flat(shape=shape)
 
@@ -418,7 +418,7 @@ def test_a_flat_scene_of_no_possible_shape_is_refused_by_the_name_of_the_paramet
         ({"distance_m": 0.0}, "distance_m"),
     ],
 )
-def test_arrays_that_do_not_fit_together_are_refused(changed, name):
+def test_scene_rejects_inconsistent_arrays(changed, name):
     given = {
         "basis": np.ones((1, 2, 2)),
         "spectrum_w_m2_sr_nm": np.ones((1, 1)),
@@ -432,14 +432,14 @@ def test_arrays_that_do_not_fit_together_are_refused(changed, name):
 
 
 @pytest.mark.parametrize("name", ["basis", "spectrum_w_m2_sr_nm", "wavelength_nm", "band_width_nm"])
-def test_a_scene_cannot_be_written_into(name):
+def test_scene_arrays_are_read_only(name):
     array = getattr(scene_of(F * np.uint8(255)), name)
     with pytest.raises(ValueError, match=r"read-only"):
         array[...] = 0.0
 
 
-def test_far_scene_takes_pixels_of_kilometres():
-    """As ISETCam's scenes at 1e6 m: pixels of 9 km, imaged on cells of 36 µm by a lens of 4 mm."""
+def test_far_scene_accepts_pixels_of_kilometres():
+    """Distance of ISETCam scenes, 1e6 m: pixels of 9 km are imaged to 36 µm by a focal length of 4 mm."""
     far = fs.Scene.flat(shape=(12, 16), pitch_um=9e9, distance_m=1e6, radiance_w_m2_sr_nm=0.5, band_width_nm=10.0)
     optics = fs.Optics(focal_length_mm=4.0, f_number=4.0)
     near = fs.Scene.flat(shape=(12, 16), pitch_um=9e6, distance_m=1e3, radiance_w_m2_sr_nm=0.5, band_width_nm=10.0)

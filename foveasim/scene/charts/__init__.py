@@ -8,7 +8,7 @@ correct. The documentation of each function states whether this mean is exact.
 All functions have the parameters ``shape``, ``pitch_um``, ``distance_m``, ``radiance_w_m2_sr_nm`` (of white),
 ``wavelength_nm`` and ``band_width_nm``. ``contrast`` is the Michelson contrast, (white - black) / (white + black): the
 radiance of white is fixed, and the radiance of black is the fraction ``(1 - contrast) / (1 + contrast)`` of it. A pattern
-with fewer than 2 pixels per period averages to grey and raises a :class:`foveasim.errors.SamplingWarning`.
+with fewer than 2 pixels per period averages to grey and issues a :class:`foveasim.errors.SamplingWarning`.
 """
 
 from __future__ import annotations

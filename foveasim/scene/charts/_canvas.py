@@ -130,7 +130,7 @@ class Canvas:
         yield from (slice(i, min(i + n_rows, self.shape[0])) for i in range(0, self.shape[0], n_rows))
 
     def filled(self, function: Callable[[slice], Floats]) -> Shares:
-        """Return a raster (n_y, n_x) float32 from a function of rows that returns fractions of white."""
+        """Return a raster (n_y, n_x) float32 of the fractions of white in blocks of rows."""
         shares = np.empty(self.shape, np.float32)
         for rows in self.row_blocks():
             np.clip(function(rows), 0.0, 1.0, out=shares[rows], casting="same_kind")
@@ -170,7 +170,7 @@ class Canvas:
         return radius_mm
 
     def warn_if_fine(self, name: str, period_mm: float) -> None:
-        """Warn of a pattern with fewer than two pixels per period; to be called by chart functions directly."""
+        """Warn of fewer than two pixels per period; to be called directly by chart functions."""
         n_pixels = period_mm / self.pitch_mm
         if n_pixels < MIN_PIXELS_PER_PERIOD * (1 - ROUNDING):
             warnings.warn(

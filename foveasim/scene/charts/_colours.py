@@ -172,7 +172,7 @@ def _extremes(values: Floats, n: int) -> list[int]:
 
 @cache
 def _table(name: str) -> Floats:
-    """Return the columns (n_column, n_wavelength) of a data file; the first is the wavelength in nm."""
+    """Return the columns (n_column, n_wavelength) of a data file, wavelengths in nm first."""
     with (files("foveasim.scene") / "data" / f"{name}.csv").open(encoding="utf-8") as file:
         lines = [line for line in file if not line.startswith("#")]
     return read_only(np.loadtxt(lines[1:], delimiter=",").T.copy())
