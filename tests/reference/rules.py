@@ -1,8 +1,8 @@
 """
-Design rules measured again: loops over vertices and pairs, one polygon at a time; and small layouts to measure.
+Reference implementations of the design rules, and random layouts for tests.
 
-A twin takes a layout and its rules and gives what it measures as pairs of site numbers and value, whatever the limit; the
-value is nan where rounding alone decides what is measured.
+The implementations are loops over vertices and pairs of polygons. Each returns the measurements of a layout as pairs of site
+indices and value, independent of the limit of the rule; the value is NaN if it depends on rounding errors.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from shapely.geometry.polygon import orient
 
 import foveasim as fs
 
-#: Sites that are closer than this touch, and smaller overlaps and gaps, as fractions of a site, are the rounding of vertices.
+#: Tolerances for rounding errors of vertices: distance of touching sites, and overlaps and gaps as fractions of a site.
 TOUCHING_UM = 1e-6
 AREA_ROUNDING = 1e-9
-#: Between sites that meet along an edge, rounding may leave slits up to this wide; to so many of these, gaps reach a site.
+#: Maximum width of slits between adjacent sites from rounding, and distance of a gap from its sites in slit widths.
 SLIT_UM = 1e-7
 N_SLITS = 100
 
 
 def _edges(polygon):
-    """Edges (a, b) of all rings, the polygon on their left; ring after ring."""
-    turned = orient(polygon)
-    return [list(pairwise(ring.coords)) for ring in (turned.exterior, *turned.interiors)]
+    """Return the edges (a, b) of each ring, with the polygon on their left."""
+    oriented = orient(polygon)
+    return [list(pairwise(ring.coords)) for ring in (oriented.exterior, *oriented.interiors)]
 
 
 def _heading_rad(edge):
@@ -38,20 +38,20 @@ def _heading_rad(edge):
 
 
 def _is_left(edge, point):
-    """Whether a point lies on the left of an edge's line."""
+    """Return whether a point lies to the left of the line through an edge."""
     (ax, ay), (bx, by) = edge
     return (bx - ax) * (point[1] - ay) - (by - ay) * (point[0] - ax) > 0.0
 
 
 def _inner_angle_deg(before, corner, after):
-    """Angle on the left of the path over a corner, 0 to 360."""
+    """Return the angle to the left of the path over a corner, 0 to 360."""
     u = np.subtract(before, corner)
     v = np.subtract(after, corner)
     angle_deg = math.degrees(math.acos(np.clip(u @ v / (np.linalg.norm(u) * np.linalg.norm(v)), -1.0, 1.0)))
     return angle_deg if _is_left((before, corner), after) else 360.0 - angle_deg
 
 
-# -- one site at a time -------------------------------------------------------------------------------------------------
+# -- single sites -------------------------------------------------------------------------------------------------------
 
 
 def sizes(layout, _rules):
@@ -69,7 +69,7 @@ def holes(layout, _rules):
 
 
 def _width_um(polygon, facing_deg, slack):
-    """As in the description of ``min_width_um``; ``slack`` is how far below a right angle still counts as across."""
+    """Return the width as defined for ``min_width_um``; ``slack`` is the tolerance of the cosine of right angles."""
     rings = _edges(polygon)
     edges = [edge for ring in rings for edge in ring]
     lines = [shapely.LineString(edge) for edge in edges]
@@ -94,7 +94,7 @@ def _width_um(polygon, facing_deg, slack):
                 if edge in (into, out) or not _is_left(edge, into[1]):
                     continue
                 foot = line.interpolate(line.project(corner))
-                # Straight across: nobody comes nearer by leaving the corner along one of its edges.
+                # Local minimum: moving from the corner along either of its edges does not reduce the distance.
                 if all(
                     math.cos(_inner_angle_deg(step.coords[0], into[1], foot.coords[0]) * math.pi / 180.0) <= slack
                     for step in steps
@@ -104,7 +104,7 @@ def _width_um(polygon, facing_deg, slack):
 
 
 def widths(layout, _rules):
-    """Nan where edges face each other within 26 degrees or a right angle just so, and where a ring touches another."""
+    """Return widths; NaN at the tolerance of facing edges (26 degrees) or right angles, and for touching rings."""
     measured = []
     for i, polygon in enumerate(layout.polygons()):
         vertices = [tuple(vertex) for ring in _edges(polygon) for vertex, _ in ring]
@@ -117,7 +117,7 @@ def widths(layout, _rules):
 
 
 def aspect_ratios(layout, _rules):
-    """Of the smallest rectangle with a side along the hull, the least elongated of several as small."""
+    """Return the aspect ratio of the smallest bounding rectangle; of equal areas, the smallest ratio."""
     measured = []
     for i, polygon in enumerate(layout.polygons()):
         boxes = []
@@ -189,7 +189,7 @@ def overlaps(layout, _rules):
 
 
 def _shares_an_edge(a, b):
-    """Whether some points on an edge of one, not just where it crosses, have the other right behind them."""
+    """Return whether a section of an edge of one polygon, not only a crossing, adjoins the other polygon."""
     for edge in (edge for ring in _edges(a) for edge in ring):
         if shapely.LineString(edge).distance(b) > TOUCHING_UM:
             continue
@@ -216,11 +216,11 @@ def neighbour_ratios(layout, _rules):
     return measured
 
 
-# -- the whole layout ---------------------------------------------------------------------------------------------------
+# -- complete layouts ---------------------------------------------------------------------------------------------------
 
 
 def gaps(layout, rules):
-    """With sites a little too large, so that no slit is left; the gaps are then as much too small."""
+    """Return gaps between sites that are buffered to close slits, and buffered by the same distance."""
     polygons = layout.polygons()
     covered = shapely.unary_union([polygon.buffer(SLIT_UM, join_style="mitre") for polygon in polygons])
     if rules.die_um is None:
@@ -251,7 +251,7 @@ def counts(layout, _rules):
     return [((), float(len(list(layout.polygons()))))]
 
 
-#: The twin of every rule.
+#: Reference implementation of every rule.
 TWINS = {
     "min_size_um": sizes,
     "max_size_um": sizes,
@@ -277,7 +277,7 @@ TWINS = {
 
 
 def _star(rng):
-    """Around the origin: convex or not, with a hole or without, in either winding."""
+    """Return a polygon around the origin, convex or concave, with or without a hole, of either winding."""
     n = int(rng.integers(3, 13))
     angle = (np.arange(n) + rng.uniform(0.0, 0.7, n)) * 2 * np.pi / n
     ring = rng.uniform(rng.choice([0.35, 1.0]), 1.0, (n, 1)) * np.stack((np.cos(angle), np.sin(angle)), axis=1)
@@ -290,12 +290,12 @@ def _hull(rng):
     return shapely.MultiPoint(rng.normal(0.0, 0.8, (int(rng.integers(5, 12)), 2))).convex_hull
 
 
-def _turned_rectangle(rng):
+def _tilted_rectangle(rng):
     return rotate(shapely.box(0.0, 0.0, *rng.uniform(0.3, 3.0, 2)), rng.uniform(0.0, 360.0))
 
 
 def _rugged(rng):
-    """Crossed bars, so with notches, courts and corners of all sorts, cut into by a wedge."""
+    """Return a union of crossed bars, cut by a wedge: notches, courtyards and corners of many kinds."""
     bars = [
         shapely.box(*low, *(low + size))
         for low, size in zip(rng.integers(0, 6, (5, 2)), rng.integers(1, 6, (5, 2)), strict=True)
@@ -306,24 +306,24 @@ def _rugged(rng):
 
 
 def _scattered(shape):
-    """Shapes of one kind, from crowded, with overlaps, to far apart."""
+    """Return a generator of random shapes of one kind, from overlapping to widely spaced."""
 
     def make(rng, n_sites):
         side_um = rng.choice([0.8, 1.5, 4.0, 10.0]) * math.sqrt(n_sites)
-        places = rng.uniform(-side_um, side_um, (n_sites, 2))
-        return [shapely.transform(shape(rng), lambda xy, place=place: xy + place) for place in places]
+        positions = rng.uniform(-side_um, side_um, (n_sites, 2))
+        return [shapely.transform(shape(rng), lambda xy, position=position: xy + position) for position in positions]
 
     return make
 
 
 def _lattice(rng, n_sites):
-    """Rectangles with whole-numbered corners anywhere: they abut, overlap, coincide or leave gaps."""
+    """Return random rectangles with integer corners, which abut, overlap, coincide or leave gaps."""
     low = rng.integers(0, 14, (n_sites, 2))
     return [shapely.box(*a, *(a + size)) for a, size in zip(low, rng.integers(1, 6, (n_sites, 2)), strict=True)]
 
 
 def _cut(rng, n_sites):
-    """A square cut on and on along lines of a lattice, some pieces left out."""
+    """Return a square divided recursively along lattice lines, with some pieces omitted."""
     boxes = [(0, 0, 24, 24)]
     while len(boxes) < n_sites + 3:
         x0, y0, x1, y1 = box = boxes[int(rng.integers(len(boxes)))]
@@ -337,7 +337,7 @@ def _cut(rng, n_sites):
 
 
 def _bricks(rng, n_sites):
-    """Courses of bricks, each shifted against the one below, hardly a corner on another; some are left out."""
+    """Return rows of bricks with random shifts, so that few corners coincide; some bricks are omitted."""
     n_rows = int(rng.integers(2, 6))
     height_um, shift_um = rng.integers(8, 17, n_rows) / 8, rng.integers(0, 24, n_rows) / 8
     floor_um = np.cumsum(height_um) - height_um
@@ -378,7 +378,7 @@ def _cells(rng, n_sites):
 
 
 def _moved(rng, polygons):
-    """Up to three vertices moved, in one site or in all that meet there; unchanged where that would cross an outline."""
+    """Return polygons with up to three displaced vertices, in one or all sites at a vertex, if all remain valid."""
     for _ in range(int(rng.integers(0, 4))):
         k = int(rng.integers(len(polygons)))
         vertex = rng.choice(shapely.get_coordinates(polygons[k]))
@@ -397,11 +397,11 @@ def _moved(rng, polygons):
     return polygons
 
 
-#: Families of layouts by name, and those of them where outlines may cross.
+#: Families of layouts by name; outlines can cross in those of ``CROSSING``.
 CROSSING = {
     "stars": _scattered(_star),
     "hulls": _scattered(_hull),
-    "turned rectangles": _scattered(_turned_rectangle),
+    "tilted rectangles": _scattered(_tilted_rectangle),
     "rugged": _scattered(_rugged),
 }
 FAMILIES = {
@@ -417,12 +417,12 @@ FAMILIES = {
 
 @st.composite
 def layouts(draw, *, turns=True):
-    """Layouts of 5 to 30 sites with a column ``ring``; with turns, some lie at any angle far from the origin."""
+    """Draw layouts of 5 to 30 sites with a column ``ring``; with ``turns``, half are rotated and far from the origin."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     family = draw(st.sampled_from(sorted(FAMILIES)))
     polygons = FAMILIES[family](rng, int(rng.integers(5, 31)))
     if family not in CROSSING:
         polygons = _moved(rng, polygons)
     layout = fs.Layout.from_polygons(polygons, ring=rng.choice([0, 1, 2, 3, 5, 8], len(polygons)))
-    is_turned = rng.random() < 0.5
-    return layout.rotate(rng.uniform(0, 360)).translate(*rng.uniform(-1e4, 1e4, 2)) if turns and is_turned else layout
+    is_rotated = rng.random() < 0.5
+    return layout.rotate(rng.uniform(0, 360)).translate(*rng.uniform(-1e4, 1e4, 2)) if turns and is_rotated else layout
