@@ -266,7 +266,7 @@ def _value(path: Path, keys: Mapping[str, Any], names: tuple[str, ...], what: st
     for name in names:
         if name in keys:
             return keys[name]
-    raise ConfigError(path, f"lacks {what} (one of the keys {', '.join(names)})")
+    raise ConfigError(path, f"lacks {what}; add one of the keys {', '.join(names)}")
 
 
 def _numbers(path: Path, value: Any) -> Floats:

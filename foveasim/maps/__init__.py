@@ -136,7 +136,7 @@ def write_power_map(power_map: PowerMap, path: str | Path) -> None:
 
     Examples
     --------
-    >>> write_power_map(power_map, "light.fits")  # doctest: +SKIP
+    >>> write_power_map(power_map, "map.fits")  # doctest: +SKIP
     """
     if not isinstance(power_map, PowerMap):
         raise ParameterError("power_map", f"must be a PowerMap, got a {type(power_map).__name__}")

@@ -289,27 +289,29 @@ def test_distorted_letter_matches_opencv_image():
     u, v = np.meshgrid(np.arange(n_x, dtype=float), np.arange(n_y, dtype=float))
     source = cv2.undistortPoints(np.stack((u, v), axis=-1).reshape(-1, 1, 2), matrix, coefficients, P=matrix)
     # Accuracy of OpenCV: 5 iterations for the points, 1/32 pixel for the image.
-    theirs = cv2.remap(letter, source.reshape(n_y, n_x, 2).astype(np.float32), None, cv2.INTER_LINEAR, borderValue=0.1)
+    expected = cv2.remap(
+        letter, source.reshape(n_y, n_x, 2).astype(np.float32), None, cv2.INTER_LINEAR, borderValue=0.1
+    )
 
     pixel_um = 2.0
     lens = fs.distortion.from_opencv(matrix, coefficients, image_size=(n_x, n_y), pixel_um=pixel_um)
     light = fs.PowerMap.from_array(letter, pitch_um=pixel_um, wavelength_nm=550.0, top_row_first=True)
     pixels = fs.layout.grid(n_x=n_x, n_y=n_y, pitch_um=pixel_um)
     sites = fs.Integrator(pixels, light.grid, distortion=lens, conserve="density")(light.data)[0] / pixel_um**2
-    ours = np.zeros((n_y, n_x))
+    site_means = np.zeros((n_y, n_x))
     column, row = ((pixels.centroid_um / pixel_um + np.array([n_x, n_y]) / 2).astype(int)).T
-    ours[n_y - 1 - row, column] = sites  # back to top row first
+    site_means[n_y - 1 - row, column] = sites  # back to top row first
     warped = distort_map(light, lens, grid=light.grid, conserve="density").data[0, ::-1]
 
     interior = slice(15, -15), slice(15, -15)
 
     def mean_difference(picture):
-        return np.abs(picture - theirs)[interior].mean()
+        return np.abs(picture - expected)[interior].mean()
 
     # Means over curved pixels and linear interpolation differ at the edges of the letter.
-    for picture in (ours, warped):
+    for picture in (site_means, warped):
         assert mean_difference(picture) < 0.01
-        assert np.corrcoef(picture[interior].ravel(), theirs[interior].ravel())[0, 1] > 0.98
+        assert np.corrcoef(picture[interior].ravel(), expected[interior].ravel())[0, 1] > 0.98
         # Wrong signs of a tangential term or of the centre coordinates would increase the difference.
         for wrong in (picture[::-1], picture[:, ::-1], np.roll(picture, 2, 0), np.roll(picture, 2, 1)):
             assert mean_difference(wrong) > 2 * mean_difference(picture)

@@ -144,9 +144,9 @@ def test_tangential_signs_match_opencv():
     lens = from_opencv(matrix, k, image_size=(1921, 1081), pixel_um=1.0)
     world = np.concatenate(((letter_px - matrix[:2, 2]) / 1000.0, np.ones((5, 1))), axis=1)
     opencv_px = cv2.projectPoints(world, np.zeros(3), np.zeros(3), matrix, k)[0][:, 0]
-    ours = lens.distort(np.stack((letter_px[:, 0] - 960, 540 - letter_px[:, 1]), axis=1))
+    distorted = lens.distort(np.stack((letter_px[:, 0] - 960, 540 - letter_px[:, 1]), axis=1))
 
-    np.testing.assert_allclose(np.stack((ours[:, 0] + 960, 540 - ours[:, 1]), axis=1), opencv_px, atol=1e-9)
+    np.testing.assert_allclose(np.stack((distorted[:, 0] + 960, 540 - distorted[:, 1]), axis=1), opencv_px, atol=1e-9)
     assert lens.p1 == -0.05
     # Points move down: a positive p1 of OpenCV displaces points towards +y of its image coordinates.
     assert np.all(opencv_px[:, 1] > letter_px[:, 1])

@@ -39,9 +39,9 @@ def first_hits(polygons, floors, roofs, eye, directions, *, has_floor):
             with np.errstate(divide="ignore", invalid="ignore"):
                 t = (z - eye[2]) / directions[:, 2]
                 x, y = (eye[i] + t * directions[:, i] for i in range(2))
-            seen = (t > 0) & np.isfinite(t)
-            seen[seen] = shapely.contains_xy(polygon, x[seen], y[seen])
-            hits[seen, k] = np.minimum(hits[seen, k], t[seen])
+            is_hit = (t > 0) & np.isfinite(t)
+            is_hit[is_hit] = shapely.contains_xy(polygon, x[is_hit], y[is_hit])
+            hits[is_hit, k] = np.minimum(hits[is_hit, k], t[is_hit])
         for ring in (polygon.exterior, *polygon.interiors):
             corners = np.array(ring.coords)
             for a, b in itertools.pairwise(corners):
@@ -52,6 +52,6 @@ def first_hits(polygons, floors, roofs, eye, directions, *, has_floor):
                     t = ((a[0] - eye[0]) * edge[1] - (a[1] - eye[1]) * edge[0]) / cross
                     s = ((a[0] - eye[0]) * directions[:, 1] - (a[1] - eye[1]) * directions[:, 0]) / cross
                     z = eye[2] + t * directions[:, 2]
-                    seen = (t > 0) & (s >= 0) & (s <= 1) & (z >= floor) & (z <= roof)
-                hits[seen, k] = np.minimum(hits[seen, k], t[seen])
+                    is_hit = (t > 0) & (s >= 0) & (s <= 1) & (z >= floor) & (z <= roof)
+                hits[is_hit, k] = np.minimum(hits[is_hit, k], t[is_hit])
     return hits
