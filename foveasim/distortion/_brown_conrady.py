@@ -33,7 +33,7 @@ class BrownConrady(Placed):
     """
     Radial and tangential distortion with up to eight coefficients.
 
-    Equation 6 of the paper (Brown 1966); OpenCV's model up to eight coefficients.
+    The model of Brown (1966), Eq. 6 of the paper; equal to OpenCV's model with up to eight coefficients.
 
     Parameters
     ----------

@@ -224,8 +224,8 @@ class Scaramuzza(_ByAngle):
 
     Notes
     -----
-    Equations 7 and 8 of the paper, with r̃ = sqrt(x̃² + ỹ²). The model is valid up to the angle at which the angle stops
-    increasing with r, at most 90°.
+    Equations 7 and 8 of the paper, with r̃ = sqrt(x̃² + ỹ²). The model is valid up to the radius r at which the angle stops
+    increasing, and for angles of less than 90°.
     """
 
     a: Sequence[float]

@@ -59,7 +59,7 @@ class UndistortedOutlines:
     Notes
     -----
     Sites with a vertex outside the image circle are marked as lost and remain in the sensor plane. Edges shared by two sites
-    are split at identical points, so that a tiling remains a tiling.
+    are split at identical points, so that tilings have no gaps or overlaps after the transformation.
     """
 
     def __init__(self, layout: PackedRings, lens: PointMap, pitch_um: float) -> None:
