@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 import subprocess
 import sys
 import zlib
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -278,3 +280,16 @@ def test_convert_reports_dropped_columns(tmp_path):
 
     assert result.returncode == 0, result.stderr
     assert "dropped columns: column, readout_line, row" in result.stdout
+
+
+def test_short_option_prints_help(tmp_path):
+    short, long = (foveasim("run", option, cwd=tmp_path) for option in ("-h", "--help"))
+    assert short.returncode == 0
+    assert short.stdout == long.stdout != ""
+
+
+def test_shell_completion_suggests_commands(tmp_path):
+    environment = {**os.environ, "_FOVEASIM_COMPLETE": "complete_bash", "COMP_WORDS": "foveasim s", "COMP_CWORD": "1"}
+    program = Path(sys.executable).with_name("foveasim")
+    result = subprocess.run([program], env=environment, capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert result.stdout.split() == ["sweep", "study", "schema"]
