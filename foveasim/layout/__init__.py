@@ -1,4 +1,4 @@
-"""Photosites: the layout model, generators (one file a family), edits, neighbours, colour filters, readout, design rules."""
+"""Photosite layouts: model, generators, edits, colour filters, readout and design rules."""
 
 from __future__ import annotations
 
@@ -92,5 +92,5 @@ __all__ = [
     "zones",
 ]
 
-if not TYPE_CHECKING:  # families of other packages, and new ones of this
+if not TYPE_CHECKING:  # families registered by other packages or at run time
     __getattr__ = LAYOUTS.attributes_of(__name__)

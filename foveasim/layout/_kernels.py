@@ -1,4 +1,4 @@
-"""The layout room's numba kernels: widths and shapes of photosites, how they meet their neighbours, colours of neighbours."""
+"""Numba kernels: photosite widths, aspect ratios, contacts, shared edges, graph colouring."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ _floats = types.Array(types.float64, 1, "C", readonly=True)
 _points = types.Array(types.float64, 2, "C", readonly=True)
 _flags = types.Array(types.boolean, 1, "C")
 
-#: Edges face each other across the site when they run opposite ways within 26 degrees. At 45 degrees, say, the corners of
-#: octagons and the near-right corners between a chord and a side would be measured as widths; this cosine is that of no
-#: angle between edges of a regular figure.
+#: Cosine of the largest angle (26 degrees) between antiparallel edges that face each other across the site. With 45 degrees,
+#: corners of octagons and the almost right angles between a chord and a side would count as widths. No two edges of a regular
+#: polygon enclose an angle with this cosine.
 MIN_OPPOSITION = 0.9
 
 
 @njit()
 def _point_to_edge(px, py, ax, ay, bx, by):
-    """Distance of a point from a segment."""
+    """Return the distance of a point from a segment."""
     dx, dy = bx - ax, by - ay
     t = ((px - ax) * dx + (py - ay) * dy) / (dx * dx + dy * dy)
     t = min(max(t, 0.0), 1.0)
@@ -33,7 +33,7 @@ def _point_to_edge(px, py, ax, ay, bx, by):
 
 @njit()
 def _across_from_inward_corner(xy, a, b, after, first, last):
-    """Distance from an inward corner b, straight across the site, to the nearest edge; infinite for an outward one."""
+    """Return the distance across the site from reflex vertex b to the nearest edge, else inf."""
     bx, by = xy[b, 0], xy[b, 1]
     in_x, in_y = bx - xy[a, 0], by - xy[a, 1]
     out_x, out_y = xy[after[b], 0] - bx, xy[after[b], 1] - by
@@ -45,11 +45,11 @@ def _across_from_inward_corner(xy, a, b, after, first, last):
             continue
         cx, cy = xy[k, 0], xy[k, 1]
         ex, ey = xy[after[k], 0] - cx, xy[after[k], 1] - cy
-        if ex * (by - cy) - ey * (bx - cx) <= 0.0:  # the corner is not on the edge's inner side
+        if ex * (by - cy) - ey * (bx - cx) <= 0.0:  # the vertex is not on the inner side of the edge
             continue
         t = min(max(((bx - cx) * ex + (by - cy) * ey) / (ex * ex + ey * ey), 0.0), 1.0)
         vx, vy = cx + t * ex - bx, cy + t * ey - by
-        # Straight across: between the continuations of the corner's two edges into the site.
+        # Across the site: within the sector between the extensions of both edges of the vertex.
         if vx * in_x + vy * in_y >= 0.0 and vx * out_x + vy * out_y <= 0.0:
             nearest = min(nearest, np.hypot(vx, vy))
     return nearest
@@ -58,9 +58,11 @@ def _across_from_inward_corner(xy, a, b, after, first, last):
 @njit(types.float64[::1](_points, _ints, _ints, _ints, _ints))
 def min_widths(xy, after, before, ring_offsets, site_offsets):
     """
-    Smallest width of every site: between edges that face each other, from inward corners across, of a strip that holds it.
+    Return the minimum width of each site.
 
-    ``after[i]`` and ``before[i]`` are the neighbours of vertex i in its ring. O(edges squared) a site.
+    The width is the smallest of three distances: between edges that face each other, from a reflex vertex across the site,
+    and between parallel lines that enclose the site. ``after[i]`` and ``before[i]`` are the neighbours of vertex i in its
+    ring. O(n_edge²) per site.
     """
     n_sites = site_offsets.size - 1
     widths = np.empty(n_sites)
@@ -87,7 +89,7 @@ def min_widths(xy, after, before, ring_offsets, site_offsets):
                 fx, fy = (dx - cx) / other, (dy - cy) / other
                 if ex * fx + ey * fy > -MIN_OPPOSITION:
                     continue
-                # The site lies on the left of its edges; each edge must reach the left side of the other.
+                # The interior is to the left of each edge: each edge must extend to the left side of the other.
                 if max(ex * (cy - ay) - ey * (cx - ax), ex * (dy - ay) - ey * (dx - ax)) <= 0.0:
                     continue
                 if max(fx * (ay - cy) - fy * (ax - cx), fx * (by - cy) - fy * (bx - cx)) <= 0.0:
@@ -102,13 +104,13 @@ def min_widths(xy, after, before, ring_offsets, site_offsets):
     return widths
 
 
-#: Rectangles whose areas differ by less than this share are equally small.
+#: Relative difference of area below which two rectangles count as equal.
 EQUAL_AREAS = 1e-9
 
 
 @njit()
 def _next_hull_corner(xy, corner, first, last):
-    """The vertex that no other one lies on the right of, seen from a corner of the hull; of several the furthest."""
+    """Return the next vertex of the convex hull, counter-clockwise; skip collinear ones."""
     best = -1
     for k in range(first, last):
         kx, ky = xy[k, 0] - xy[corner, 0], xy[k, 1] - xy[corner, 1]
@@ -126,9 +128,10 @@ def _next_hull_corner(xy, corner, first, last):
 @njit(types.float64[::1](_points, _ints, _ints))
 def aspect_ratios(xy, ring_offsets, site_offsets):
     """
-    Longer over shorter side of the smallest rectangle around every site; of equally small ones the least elongated.
+    Return the aspect ratio of the minimum-area rectangle around each site.
 
-    The smallest rectangle has a side along an edge of the convex hull. O(vertices times corners of the hull) a site.
+    The ratio is that of the longer to the shorter side; of rectangles of equal area the least elongated counts. The
+    minimum-area rectangle has a side along an edge of the convex hull. O(n_vertex n_hull_vertex) per site.
     """
     n_sites = site_offsets.size - 1
     ratios = np.empty(n_sites)
@@ -164,10 +167,10 @@ def aspect_ratios(xy, ring_offsets, site_offsets):
 @njit(types.int64[::1](_points, _ints))
 def meeting_boxes(box, order):
     """
-    Pairs (i, j), i < j, of boxes (x_min, y_min, x_max, y_max) that meet, as i n + j; ``order`` is that of x_min.
+    Return the pairs (i, j), i < j, of boxes that intersect or touch, encoded as i n + j.
 
-    Boxes are listed in every strip that they reach, the strips being about as high as the mean box, and swept from left to
-    right; a pair counts in its lowest strip.
+    Boxes are (x_min, y_min, x_max, y_max), and ``order`` sorts them by x_min. The plane is divided into horizontal strips
+    about as high as the mean box, and each strip is swept from left to right; a pair counts in its lowest common strip.
     """
     n = box.shape[0]
     bottom, top, mean = np.inf, -np.inf, 0.0
@@ -210,7 +213,7 @@ def meeting_boxes(box, order):
 
 @njit(types.float64[::1](_points, _ints, _ints))
 def overhangs(xy, after, first_vertex):
-    """How far every edge's site reaches out beyond the edge's line, to its right; 0 all around a convex site."""
+    """Return the extent of a site to the right of each edge line; 0 for convex sites."""
     reach = np.zeros(xy.shape[0])
     for site in range(first_vertex.size - 1):
         first, last = first_vertex[site], first_vertex[site + 1]
@@ -226,17 +229,17 @@ def overhangs(xy, after, first_vertex):
 
 @njit()
 def _is_same(xy, a, c):
-    """Whether two vertices coincide, bit for bit."""
+    """Return whether two vertices are bit-identical."""
     return xy[a, 0] == xy[c, 0] and xy[a, 1] == xy[c, 1]
 
 
 @njit()
 def _edge_to_edge(xy, a, b, c, d):
-    """Distance of the segments from a to b and from c to d; 0 where they cross."""
+    """Return the distance between the segments a-b and c-d; 0 where they cross."""
     ax, ay, bx, by = xy[a, 0], xy[a, 1], xy[b, 0], xy[b, 1]
     cx, cy, dx, dy = xy[c, 0], xy[c, 1], xy[d, 0], xy[d, 1]
     ex, ey, fx, fy = bx - ax, by - ay, dx - cx, dy - cy
-    # Ends on both sides of each other; where all four are in line to rounding, only boxes that meet tell.
+    # End points on both sides of each other; for segments collinear within rounding, the bounding boxes decide.
     if (
         (ex * (cy - ay) - ey * (cx - ax)) * (ex * (dy - ay) - ey * (dx - ax)) < 0.0
         and (fx * (ay - cy) - fy * (ax - cx)) * (fx * (by - cy) - fy * (bx - cx)) < 0.0
@@ -253,7 +256,7 @@ def _edge_to_edge(xy, a, b, c, d):
 
 @njit()
 def _edges_meeting(xy, a, b, c, d):
-    """Distance of the edges from a to b and from c to d, and how near they come besides one common end."""
+    """Return the distance between edges a-b and c-d, and that apart from a common end point."""
     is_ac, is_ad, is_bc, is_bd = _is_same(xy, a, c), _is_same(xy, a, d), _is_same(xy, b, c), _is_same(xy, b, d)
     if is_ac and is_bd:
         return 0.0, 0.0
@@ -268,7 +271,7 @@ def _edges_meeting(xy, a, b, c, d):
 
 @njit()
 def _is_inside(xy, after, first, last, x, y):
-    """Whether a point lies in a site."""
+    """Return whether a point lies in a site."""
     is_inside = False
     for a in range(first, last):
         ay, by = xy[a, 1], xy[after[a], 1]
@@ -279,13 +282,13 @@ def _is_inside(xy, after, first, last, x, y):
 
 @njit()
 def _is_in_box(x, y, box, site):
-    """Whether a point lies in a site's box."""
+    """Return whether a point lies in the bounding box of a site."""
     return box[site, 0] <= x <= box[site, 2] and box[site, 1] <= y <= box[site, 3]
 
 
 @njit()
 def _has_edge_inside(xy, after, box, i_first, i_last, j, j_first, j_last):
-    """Whether the middle of an edge of one site, that is no edge of the other, lies in the other."""
+    """Return whether the midpoint of any unshared edge of one site lies in the other."""
     for a in range(i_first, i_last):
         b = after[a]
         x, y = 0.5 * (xy[a, 0] + xy[b, 0]), 0.5 * (xy[a, 1] + xy[b, 1])
@@ -301,7 +304,7 @@ def _has_edge_inside(xy, after, box, i_first, i_last, j, j_first, j_last):
 
 @njit()
 def _is_parted(xy, after, overhang, depth, i_first, i_last, j_first, j_last):
-    """Whether two sites lie on the two sides of an edge of the first, but for a strip of some depth."""
+    """Return whether an edge of the first site separates both sites, up to a strip."""
     for a in range(i_first, i_last):
         if overhang[a] > depth:
             continue
@@ -316,7 +319,7 @@ def _is_parted(xy, after, overhang, depth, i_first, i_last, j_first, j_last):
 
 @njit()
 def _common_edges(xy, after, box, overhang, depth, i_first, i_last, j, j_first, j_last, is_shared):
-    """Whether two sites have a common vertex, and whether a common edge parts them; such edges are flagged."""
+    """Return whether sites share a vertex and a separating edge; flag shared edges."""
     is_met, is_parted = False, False
     for a in range(i_first, i_last):
         if not _is_in_box(xy[a, 0], xy[a, 1], box, j):
@@ -332,7 +335,7 @@ def _common_edges(xy, after, box, overhang, depth, i_first, i_last, j, j_first, 
 
 @njit()
 def _nearest_edges(xy, after, box, i_first, i_last, j, j_first, j_last, nearest, reach, touching):
-    """Distance of two outlines, up to what is known and a reach; how near they come besides common vertices and edges."""
+    """Return the distance between outlines, and that apart from common vertices and edges."""
     besides = np.inf
     for a in range(i_first, i_last):
         b = after[a]
@@ -360,13 +363,14 @@ def _nearest_edges(xy, after, box, i_first, i_last, j, j_first, j_last, nearest,
 )
 def contacts(xy, after, first_vertex, box, overhang, depth, first, second, reach, touching, is_shared):
     """
-    How the sites of every pair (first[i], second[i]) lie to each other: their distance, and whether they surely do not overlap.
+    Return the distance of each pair of sites, and whether they certainly do not overlap.
 
-    Distances above ``reach`` are infinite, those of sites that overlap 0. Sites do not overlap where a line along an edge
-    parts them but for a strip of the smaller one's ``depth``; or where their outlines meet in common vertices and edges
-    only, else staying further apart than ``touching``, and no edge of one lies in the other.
+    Pairs are (first[i], second[i]). Distances above ``reach`` are infinite, and overlapping sites have the distance 0. Sites
+    do not overlap if a line along an edge separates them up to a strip of the smaller ``depth`` of both. Nor do they overlap
+    if no edge of one lies in the other and their outlines, apart from common vertices and edges, are further apart than
+    ``touching``.
 
-    Edges that are an edge of the other site, backwards, are flagged in ``is_shared``.
+    Edges that coincide with a reversed edge of the other site are flagged in ``is_shared``.
     """
     distances = np.zeros(first.size)
     is_apart = np.ones(first.size, np.bool_)
@@ -402,17 +406,17 @@ def contacts(xy, after, first_vertex, box, overhang, depth, first, second, reach
     return distances, is_apart
 
 
-#: Edges that run along each other for less than this, in µm, meet in a corner: the rounding of positions.
+#: Common length, in µm, up to which edges count as touching in a corner only: the rounding of coordinates.
 CORNER_UM = 1e-6
 
 
 @njit(types.float64[::1](_points, _ints, _ints, _ints, _ints, types.float64))
 def shared_lengths(xy, after, first_vertex, first, second, max_gap):
     """
-    Length over which the outlines of two sites run along each other, for every pair (first[i], second[i]).
+    Return the length of the common boundary of each pair of sites (first[i], second[i]).
 
-    ``first_vertex[s] : first_vertex[s + 1]`` are a site's vertices, ``after[v]`` the one that follows in its ring. Edges run
-    along each other when they go opposite ways and are nowhere further apart than ``max_gap`` where they overlap.
+    ``first_vertex[s] : first_vertex[s + 1]`` are the vertices of a site, and ``after[v]`` is the next vertex of the ring.
+    Edges are common where they have opposite directions and are nowhere further apart than ``max_gap``.
     """
     lengths = np.zeros(first.size)
     for pair in range(first.size):
@@ -425,13 +429,15 @@ def shared_lengths(xy, after, first_vertex, first, second, max_gap):
             for c in range(first_vertex[j], first_vertex[j + 1]):
                 cx, cy = xy[c, 0] - ax, xy[c, 1] - ay
                 dx, dy = xy[after[c], 0] - ax, xy[after[c], 1] - ay
-                high = cx * ex + cy * ey  # the other edge comes back: it begins where this one ends
+                high = cx * ex + cy * ey  # the other edge has the opposite direction
                 low = dx * ex + dy * ey
                 begin, end = max(low, 0.0), min(high, length)
                 if end - begin <= CORNER_UM:
                     continue
                 slope = ((cy - dy) * ex - (cx - dx) * ey) / (high - low)
-                away = dy * ex - dx * ey - slope * low  # distance of the other edge's line at the start of this one
+                away = (
+                    dy * ex - dx * ey - slope * low
+                )  # distance of the line of the other edge at the start of this one
                 if abs(away + slope * begin) <= max_gap and abs(away + slope * end) <= max_gap:
                     lengths[pair] += end - begin
     return lengths
@@ -440,22 +446,23 @@ def shared_lengths(xy, after, first_vertex, first, second, max_gap):
 @njit(types.int64[::1](_ints, _ints, _floats, types.int64))
 def colour_greedily(first, neighbour, shared, n_colours):
     """
-    A colour for every site: the one with the least shared edge to coloured neighbours, and of those the rarest so far.
+    Colour sites greedily, to minimise the edge length shared by sites of equal colour.
 
-    ``neighbour[first[s] : first[s + 1]]`` are a site's neighbours, ``shared`` the lengths of the common edges. Next comes the
-    site whose neighbours have the most different colours already (Brélaz, Commun. ACM 22, 1979), then the lowest number.
+    Of equally good colours the least used one is taken. ``neighbour[first[s] : first[s + 1]]`` are the neighbours of a site,
+    and ``shared`` contains the lengths of their common edges. The next site is the one whose neighbours have the most
+    different colours (Brélaz, Commun. ACM 22, 1979), and of those the one with the lowest index.
     """
     n_sites = first.size - 1
     colour = np.full(n_sites, -1, np.int64)
     used = np.zeros(n_colours, np.int64)
     conflict = np.empty(n_colours)
-    seen = np.zeros(n_sites, np.uint64)  # colours of the neighbours, a bit each
-    variety = np.zeros(n_sites, np.int64)  # and how many they are
+    seen = np.zeros(n_sites, np.uint64)  # bit mask of the colours of the neighbours
+    variety = np.zeros(n_sites, np.int64)  # number of different colours of the neighbours
     queue = [(0, s) for s in range(n_sites)]
     while len(queue) > 0:
         saturation, site = heappop(queue)
         if colour[site] >= 0 or -saturation < variety[site]:
-            continue  # told again with more colours around it
+            continue  # outdated: the queue contains a newer entry of this site
         conflict[:] = 0.0
         for k in range(first[site], first[site + 1]):
             if colour[neighbour[k]] >= 0:

@@ -1,4 +1,4 @@
-"""Points that lie on edges but for rounding: what noding a layout and looking for gaps have in common."""
+"""Points on edges within rounding, for noding of layouts and for the detection of gaps."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from foveasim._core.validation import Floats, Ints
 
 __all__ = ["ON_EDGE_UM", "noded_edges", "points_on_edges"]
 
-#: A point this close to an edge lies on it, and two points this close are one.
+#: Tolerance within which a point lies on an edge, and two points are the same.
 ON_EDGE_UM = 1e-6
 
 
 def points_on_edges(points_um: Floats, begin_um: Floats, end_um: Floats) -> tuple[Ints, Ints, Floats]:
     """
-    Points that lie on edges, not at their ends.
+    Return the points that lie on edges, end points excluded.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ def points_on_edges(points_um: Floats, begin_um: Floats, end_um: Floats) -> tupl
     -------
     edge, point : (n,) int64
     share : (n,) float64
-        How far along the edge, from 0 to 1.
+        Position along the edge, from 0 to 1.
     """
     edges = shapely.linestrings(np.stack((begin_um, end_um), axis=1))
     edge, point = shapely.STRtree(shapely.points(points_um)).query(edges, predicate="dwithin", distance=ON_EDGE_UM)
@@ -40,7 +40,7 @@ def points_on_edges(points_um: Floats, begin_um: Floats, end_um: Floats) -> tupl
 
 def noded_edges(begin_um: Floats, end_um: Floats) -> tuple[Floats, Floats]:
     """
-    Edges with ends that are one wherever they are as good as one, cut at all ends of others that lie on them.
+    Return edges with coincident end points merged, split at end points of other edges.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def noded_edges(begin_um: Floats, end_um: Floats) -> tuple[Floats, Floats]:
     if first.size == 0:
         return np.zeros((0, 2)), np.zeros((0, 2))
     edge, point, share = points_on_edges(points, points[first], points[last])
-    # Every edge as a run of points: its first one, those on it in their order, its last one.
+    # Each edge becomes a run of points: its start, the points on it in order, its end.
     owner = np.concatenate((np.arange(first.size), edge, np.arange(first.size)))
     order = np.lexsort((np.concatenate((np.full(first.size, -1.0), share, np.full(first.size, 2.0))), owner))
     run = np.concatenate((first, point, last))[order]
@@ -66,7 +66,7 @@ def noded_edges(begin_um: Floats, end_um: Floats) -> tuple[Floats, Floats]:
 
 
 def _one_point_each(xy_um: Floats) -> tuple[Floats, Ints]:
-    """Points without those that are another one but for rounding, and which of them each is."""
+    """Return the points without duplicates within rounding, and the index of each in them."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree

@@ -1,4 +1,4 @@
-"""Power diagrams that follow their centres: edges of Voronoi cells, with a weight for each centre, as arrays."""
+"""Incrementally updated power diagrams: Voronoi diagrams with a weight for each centre."""
 
 from __future__ import annotations
 
@@ -12,55 +12,54 @@ from foveasim._core.validation import Bools, Floats, Ints
 
 __all__ = ["N_FAR", "PowerDiagram", "far_points_um"]
 
-#: Points of the plane as x + i y, in µm: quicker to gather than pairs.
+#: Points of the plane as x + i y, in µm: faster to gather than pairs.
 Points: TypeAlias = NDArray[np.complex128]
 
-#: Points outside that close the outer cells: further from every point of the region than any centre is.
+#: Auxiliary points that bound the outer cells: further from each point of the region than any centre.
 N_FAR, FAR_RADII = 8, 4.0
-#: An edge runs the wrong way when it does so by more than this fraction of the circles around its ends.
+#: Reversal of an edge, relative to the circumradii at its ends, above which it is no longer rounding.
 ROUNDING = 1e-11
-#: Rounds of flips, and rounds of moving centres, after which the triangles are made again.
+#: Rounds of flips, and of partial displacements, after which the triangulation is computed from scratch.
 MAX_FLIPS, MAX_MOVES = 60, 12
-#: Points that cannot go this part of their way stay where they are for the time being.
+#: Smallest fraction of a displacement; points that cannot move by it do not move in this round.
 SHORTEST_WAY = 0.01
 
 
 def far_points_um(low_um: Floats, high_um: Floats) -> Floats:
-    """Points (N_FAR, 2) on a wide circle around the middle of a box, from that middle."""
+    """Return auxiliary points (N_FAR, 2) on a circle around a box, relative to its centre."""
     turn = 2.0 * math.pi * (np.arange(N_FAR) + 0.5) / N_FAR
     return FAR_RADII * 0.5 * math.hypot(*(high_um - low_um)) * np.stack((np.cos(turn), np.sin(turn)), axis=1)
 
 
 class PowerDiagram:
     """
-    Edges of the power diagram of points in a box, quick to bring up to date when points or weights change a little.
+    Edges of the power diagram of points in a box, updated incrementally.
 
-    A point x belongs to the centre c of the least power ``|x - c|² - weight``: to the nearest one when all weights are
-    the same, which is Voronoi's diagram. Three centres whose cells meet in a corner are a triangle, and these regular
-    triangles (Delaunay's, when weights are the same) are what is kept.
+    A point x belongs to the centre c of the least power ``|x - c|² - weight``. For equal weights this is the nearest
+    centre, and the diagram is the Voronoi diagram. Three centres whose cells meet in a corner form a triangle of the regular
+    triangulation (the Delaunay triangulation for equal weights), which is stored between updates.
 
     Parameters
     ----------
     low_um, high_um : (2,) float64, µm
-        Corners of a box that holds all centres.
+        Corners of a box that contains all centres.
 
     Attributes
     ----------
     points_um : (n + N_FAR, 2) float64, µm
-        The centres, and far points around the box.
+        The centres, then the auxiliary points around the box.
     corners_um : (n_corner, 2) float64, µm
-        Where cells meet.
+        Points in which cells meet.
     sites : (n_edge, 2) int64
-        The points on both sides of each edge, one of them at least a centre.
+        The points on both sides of each edge, at least one of them a centre.
     ends : (n_edge, 2) int64
-        Corners from which and to which an edge runs, counter-clockwise around the first of its two points.
+        First and last corner of each edge, counter-clockwise around the first of its two points.
 
     Notes
     -----
-    Triangles come from the lower hull of the points lifted to ``z = x² + y² - weight`` (Aurenhammer 1987). From then on
-    they are mended by flips of the diagonal of two triangles (Lawson 1977): where no triangle turns over as its corners
-    move, and all edges run the right way after the flips, the triangles are those of the hull. Otherwise the hull is made
-    again.
+    The triangles are the lower hull of the points lifted to ``z = x² + y² - weight`` (Aurenhammer 1987). Updates flip
+    the diagonals of pairs of triangles (Lawson 1977). If no triangle is inverted while its corners move, and all edges have
+    the correct direction after the flips, the triangles are those of the hull. Otherwise the hull is computed again.
     """
 
     def __init__(self, low_um: Floats, high_um: Floats) -> None:
@@ -73,12 +72,12 @@ class PowerDiagram:
 
     def follow(self, centres_um: Floats, weights_um2: Floats | None = None) -> bool:
         """
-        Make these the diagram's centres (n, 2) and weights (n,), all the same by default.
+        Set the centres (n, 2) and weights (n,) of the diagram; weights are equal by default.
 
         Returns
         -------
         bool
-            Whether every centre has a cell. If not, the diagram stays as it was.
+            Whether every centre has a cell. If not, the diagram is unchanged.
         """
         points_um = np.concatenate((centres_um, self._far_um))
         weights = np.zeros(points_um.shape[0])
@@ -98,7 +97,7 @@ class PowerDiagram:
         return True
 
     def reach_um(self) -> Floats:
-        """Distance (n,) of each centre from the furthest corner of its cell."""
+        """Return the distance (n,) of each centre from the furthest corner of its cell."""
         first = self._triangles[:, 0]
         to_corner = _complex(self.corners_um) - _complex(self.points_um)[first]
         power_um2 = to_corner.real**2 + to_corner.imag**2 - self._weights_um2[first]
@@ -121,9 +120,10 @@ def _cross(a: Points, b: Points) -> Floats:
 
 def _lower_hull(points_um: Floats, weights_um2: Floats, middle_um: Floats) -> tuple[Ints, Ints, Points] | None:
     """
-    Regular triangles of points around a middle; None when a point has no cell, or float64 cannot tell.
+    Return the regular triangulation of points around a centre.
 
-    Corners of the triangles, counter-clockwise, the triangles beside them across from each corner, and their power centres.
+    The result contains the corners of the triangles, counter-clockwise, the triangle opposite each corner, and the power
+    centres. It is None if a point has no cell, or float64 does not resolve the points.
     """
     from scipy.spatial import ConvexHull, QhullError
 
@@ -134,7 +134,7 @@ def _lower_hull(points_um: Floats, weights_um2: Floats, middle_um: Floats) -> tu
         hull = ConvexHull(np.column_stack((offset_um / scale_um, height_um2 / scale_um**2)))
     except QhullError:
         return None
-    # Far points lie at one height: the faces that they close above are no triangles of ours.
+    # The auxiliary points have equal heights: the upper faces between them are not part of the triangulation.
     is_lower = hull.equations[:, 2] < 0.0
     number = np.cumsum(is_lower) - 1
     triangles = hull.simplices[is_lower].astype(np.int64)
@@ -152,7 +152,7 @@ def _lower_hull(points_um: Floats, weights_um2: Floats, middle_um: Floats) -> tu
 def _mended(
     old: Points, new: Points, weights_um2: Floats, triangles: Ints, beside: Ints
 ) -> tuple[Ints, Ints, Points] | None:
-    """Regular triangles of points that moved a little, from those before; None when they are to be made again."""
+    """Update the triangles of moved points; None if they must be computed from scratch."""
     triangles, beside = triangles.copy(), beside.copy()
     centres = np.empty(triangles.shape[0], np.complex128)
     moved = np.arange(triangles.shape[0])
@@ -169,7 +169,7 @@ def _mended(
 
 
 def _unturned(old: Points, new: Points, triangles: Ints) -> Points:
-    """The new points, but for those that may go only a part of their way for no triangle to turn over."""
+    """Return the new points, with displacements shortened such that no triangle is inverted."""
     points = new
     way = np.ones(new.size)
     while True:
@@ -185,13 +185,13 @@ def _unturned(old: Points, new: Points, triangles: Ints) -> Points:
 def _made_regular(
     points: Points, weights_um2: Floats, triangles: Ints, beside: Ints, centres: Points, changed: Ints
 ) -> bool:
-    """Flip triangles in place until all are regular, from those that changed on: whether flips could do it."""
+    """Flip edges in place until all triangles are regular; return whether this succeeded."""
     for _ in range(MAX_FLIPS):
         centres[changed] = _power_centres(points, weights_um2, triangles[changed])
         t, k = _wrong_edges(points, triangles, beside, centres, changed)
         if t.size == 0:
             return True
-        # Only edges of triangles that change now can be wrong next, and those that have to wait.
+        # The next round needs only the edges of triangles that change now, and the deferred ones.
         changed = np.unique(np.concatenate((t, beside[t, k])))
         if not _flip(points, triangles, beside, t, k):
             return False
@@ -200,15 +200,18 @@ def _made_regular(
 
 def _flip(points: Points, triangles: Ints, beside: Ints, t: Ints, k: Ints) -> bool:
     """
-    Give pairs of triangles their other diagonal, in place: t, and the one beside it across from its corner k.
+    Flip the common edge of triangles t and their neighbours opposite corners k, in place.
+
+    Only pairs with a convex outline are flipped, and of pairs that change the same triangle only one. The result is whether
+    any pair was flipped.
 
     ::
 
              c                c
-            ╱ ╲              ╱│╲          only pairs whose outline is convex, and of pairs that
-           ╱ t ╲            ╱ │ ╲         would change the same triangles only one
+            ╱ ╲              ╱│╲
+           ╱ t ╲            ╱ │ ╲
           a ─── b    ->    a t│u b
-           ╲ u ╱            ╲ │ ╱         returns whether there was any
+           ╲ u ╱            ╲ │ ╱
             ╲ ╱              ╲│╱
              d                d
     """
@@ -233,16 +236,16 @@ def _flip(points: Points, triangles: Ints, beside: Ints, t: Ints, k: Ints) -> bo
 
 
 def _are_apart(changes: Ints, n_triangles: int) -> Bools:
-    """A choice of rows (n, 6) that share no triangle (-1 is none), the last row always among them."""
+    """Select rows (n, 6) that share no triangle (-1: none), the last row included."""
     number = np.arange(changes.shape[0])[:, np.newaxis]
-    # Each row puts its number on all its triangles, and the last number stands.
+    # Each row writes its index to all its triangles; the last one written wins.
     claimed = np.full(n_triangles + 1, -1)
     claimed[changes.ravel()] = np.repeat(number, changes.shape[1])
     return np.asarray(((claimed[changes] == number) | (changes < 0)).all(axis=1))
 
 
 def _wrong_edges(points: Points, triangles: Ints, beside: Ints, centres: Points, some: Ints) -> tuple[Ints, Ints]:
-    """Edges of some triangles across which the power centres lie the wrong way round: triangle, corner across from it."""
+    """Find edges whose power centres are in the wrong order: triangle and opposite corner."""
     is_some = np.zeros(triangles.shape[0], bool)
     is_some[some] = True
     wrong_t, wrong_k = [], []
@@ -253,7 +256,7 @@ def _wrong_edges(points: Points, triangles: Ints, beside: Ints, centres: Points,
         a = points[triangles[t, (k + 1) % 3]]
         along = points[triangles[t, (k + 2) % 3]] - a
         to_t, to_u = centres[t] - a, centres[u] - a
-        # The centre of t lies to the left of the edge from a, that of u to the right.
+        # The power centre of t is to the left of the edge from a, that of u to the right.
         size = np.abs(along)
         is_wrong = _cross(along, to_t - to_u) < -ROUNDING * size * (size + np.abs(to_t) + np.abs(to_u))
         wrong_t.append(t[is_wrong])
@@ -267,7 +270,7 @@ def _twice_area(points: Points, triangles: Ints) -> Floats:
 
 
 def _power_centres(points: Points, weights_um2: Floats, triangles: Ints) -> Points:
-    """The points (n_triangle,) of the same power from all three corners of each triangle."""
+    """Return the points (n_triangle,) of equal power from the three corners of each triangle."""
     first, second, third = triangles.T
     a, weight = points[first], weights_um2[first]
     b, c = points[second] - a, points[third] - a
@@ -277,7 +280,7 @@ def _power_centres(points: Points, weights_um2: Floats, triangles: Ints) -> Poin
 
 
 def _dual_edges(triangles: Ints, beside: Ints, n_centres: int) -> tuple[Ints, Ints]:
-    """Points on both sides of each edge of the diagram, and its corners, counter-clockwise around the first point."""
+    """Return the points on both sides of each edge, and its corners around the first point."""
     t, k = np.nonzero(beside > np.arange(triangles.shape[0])[:, np.newaxis])
     sites = np.stack((triangles[t, (k + 1) % 3], triangles[t, (k + 2) % 3]), axis=1)
     ends = np.stack((beside[t, k], t), axis=1)

@@ -1,4 +1,4 @@
-"""Regions of the sensor plane that users give: rectangles, discs, outlines, shapely polygons."""
+"""User-defined regions of the sensor plane: rectangles, discs, outlines, shapely polygons."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from foveasim.errors import ParameterError
 
 __all__ = ["as_region", "disc", "one_region", "told_region"]
 
-#: Corners of a disc that nothing else gives corners to: its area is that of the circle to 7 ppm.
+#: Vertices of a polygonal disc, by default: its area is that of the circle within 7 ppm.
 DISC_CORNERS = 960
 
 
 def one_region(*, size_um: Any = None, radius_um: float | None = None, region: Any = None) -> Any:
     """
-    The one region that was given, as a shapely Polygon or MultiPolygon in µm.
+    Return the specified region as a shapely Polygon or MultiPolygon in µm.
 
     Parameters
     ----------
@@ -32,10 +32,10 @@ def one_region(*, size_um: Any = None, radius_um: float | None = None, region: A
     Raises
     ------
     ParameterError
-        When not exactly one is given, or it is no region.
+        When not exactly one is specified, or it is not a valid region.
     """
     if sum(x is not None for x in (size_um, radius_um, region)) != 1:
-        raise ParameterError("region", "or 'size_um' or 'radius_um' must be given: one of them")
+        raise ParameterError("region", "or 'size_um' or 'radius_um' must be given, but only one of them")
     if size_um is not None:
         if as_numbers("size_um", size_um).shape != (2,):
             raise ParameterError("size_um", "must be two numbers (width, height)", size_um, "µm")
@@ -48,12 +48,14 @@ def one_region(*, size_um: Any = None, radius_um: float | None = None, region: A
 
 def as_region(name: str, region: Any) -> Any:
     """
-    A shapely Polygon or MultiPolygon with area, from one, from its well-known text, or from (n, 2) vertices in µm.
+    Return a region as a shapely Polygon or MultiPolygon with a positive area.
+
+    The region is such a polygon, its well-known text (WKT), or an (n, 2) array of vertices in µm.
 
     Raises
     ------
     ParameterError
-        When it is neither, crosses itself, is empty, or lies too far from the origin.
+        When it is none of these, crosses itself, is empty, or lies too far from the origin.
     """
     outline = region
     if isinstance(region, str):
@@ -66,20 +68,20 @@ def as_region(name: str, region: Any) -> Any:
     if not isinstance(outline, shapely.Polygon | shapely.MultiPolygon):
         raise ParameterError(name, f"must be a shapely Polygon or MultiPolygon, got a {type(outline).__name__}")
     if outline.is_empty or not outline.is_valid or not outline.area > 0.0:
-        raise ParameterError(name, "must be a valid polygon, which does not cross itself and has an area")
+        raise ParameterError(name, "must be a valid polygon without self-intersections and with a positive area")
     if np.abs(outline.bounds).max() > MAX_LENGTH_UM:
-        raise ParameterError(name, f"must lie within {MAX_LENGTH_UM:g} µm of the origin", hint="it is in µm")
+        raise ParameterError(name, f"must lie within {MAX_LENGTH_UM:g} µm of the origin", hint="coordinates are in µm")
     return outline
 
 
 def disc(radius_um: float, n_chords: int) -> shapely.Polygon:
-    """Disc around the axis as a regular polygon with its corners on the circle, the first at angle 0."""
+    """Return a disc around the axis as a regular inscribed polygon, first vertex at angle 0."""
     angle_rad = 2.0 * math.pi * np.arange(n_chords) / n_chords
     return shapely.Polygon(radius_um * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1))
 
 
 def told_region(region: Any) -> Any:
-    """A region as a provenance tells it: the vertices that were given, or the well-known text of a geometry."""
+    """Convert a region to plain data: its vertices, or the well-known text of a geometry."""
     if isinstance(region, str):
         return region
     if isinstance(region, shapely.Geometry):

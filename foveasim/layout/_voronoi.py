@@ -1,4 +1,4 @@
-"""Voronoi cells of any points in any region, as packed rings: what the irregular families share."""
+"""Voronoi cells of points in a region, as packed rings, for the irregular layout families."""
 
 from __future__ import annotations
 
@@ -18,41 +18,40 @@ from foveasim.layout.model import Layout
 
 __all__ = ["CellEdges", "MovingCells", "cells_of", "edges_of_rings"]
 
-#: Edges shorter than this fraction of their centres' distance are one corner that rounding split, as on a square grid.
+#: Edges shorter than this fraction of the distance of their centres are one corner split by rounding, as on a square grid.
 SHORT_EDGE = 1e-9
-#: Areas of all cells together, against the region's.
+#: Relative tolerance of the total area of all cells, against the area of the region.
 AREA_ROUNDING = 1e-9
 
 
 def cells_of(centres_um: Floats, region: shapely.Polygon) -> tuple[Floats, Ints]:
     """
-    Voronoi cells of points, clipped to a region: one cell a point, in the points' order.
+    Compute the Voronoi cells of points, clipped to a region, one per point in their order.
 
     Parameters
     ----------
     centres_um : (n, 2) float64, µm
-        Points inside the region, no two the same.
+        Distinct points inside the region.
     region : shapely Polygon, µm
-        Convex or not.
+        Convex or concave.
 
     Returns
     -------
     xy_um : (n_vertex, 2) float64, µm
-        Corners, cell after cell, counter-clockwise. Neighbours' corners are the same numbers, bit for bit.
+        Corners, cell after cell, counter-clockwise. Corners that neighbours share are bit-identical.
     ring_offsets : (n + 1,) int64
         Cell i has the corners ``ring_offsets[i] : ring_offsets[i + 1]``.
 
     Raises
     ------
     GeometryError
-        When a point lies outside, two are the same or too close for float64, or a cell goes round a hole
-        of the region.
+        When a point lies outside, two are equal or too close for float64, or a cell encloses a hole of the region.
 
     Notes
     -----
-    Cells inside the region come from arrays of corner numbers. The few at its border are the faces of all their edges
-    and the region's outline, cut where they cross once for both neighbours. A part that a region's notch cuts off its
-    cell goes to the neighbour with which it shares the longest border.
+    Cells inside the region are assembled from arrays of corner indices. The few cells at its boundary are the faces of
+    their edges and the outline of the region; each intersection is computed once for both neighbours. A part that a notch
+    of the region separates from its cell is assigned to the neighbour with which it shares the longest boundary.
     """
     centres_um = np.ascontiguousarray(centres_um, np.float64)
     _require_apart_and_inside(centres_um, region)
@@ -65,19 +64,19 @@ def cells_of(centres_um: Floats, region: shapely.Polygon) -> tuple[Floats, Ints]
 @dataclass(frozen=True)
 class CellEdges:
     """
-    Edges of all cells, each seen from the cell that it runs around counter-clockwise.
+    Edges of all cells, each with the orientation that is counter-clockwise around its cell.
 
     Parameters
     ----------
     cell : (n_edge,) int64
-        The cell.
+        Index of the cell.
     owner : (n_edge,) int64
-        The centre to which the cell's part at this edge is nearest: another one where a notch of the region cut the
-        part off its cell.
+        The centre nearest to the part of the cell at this edge: another one than the cell's own where a notch of the
+        region separates the part.
     start_um, stop_um : (n_edge, 2) float64, µm
-        Ends.
+        End points.
     n_twins : int
-        The first ``n_twins`` edges are the next ``n_twins`` ones, seen from the other side.
+        The first ``n_twins`` edges are equal to the next ``n_twins`` ones, with the opposite orientation.
     """
 
     cell: Ints
@@ -87,7 +86,7 @@ class CellEdges:
     n_twins: int = 0
 
     def twins(self) -> tuple[Ints, Ints]:
-        """Edges that are the same, seen from both sides: numbers of the ones, numbers of the others."""
+        """Return the indices of all pairs of coincident edges of opposite orientation."""
         one, other = np.arange(self.n_twins), np.arange(self.n_twins, 2 * self.n_twins)
         ends = np.concatenate((self.start_um, self.stop_um), axis=1)[2 * self.n_twins :]
         is_backward = (ends[:, 0] > ends[:, 2]) | ((ends[:, 0] == ends[:, 2]) & (ends[:, 1] > ends[:, 3]))
@@ -99,34 +98,34 @@ class CellEdges:
 
 
 def edges_of_rings(xy_um: Floats, ring_offsets: Ints) -> CellEdges:
-    """Edges of cells that are packed rings."""
+    """Return the edges of cells given as packed rings."""
     cell = np.repeat(np.arange(ring_offsets.size - 1), np.diff(ring_offsets))
     return CellEdges(cell, cell, xy_um, xy_um[next_vertex(ring_offsets)])
 
 
-#: Masses (n,) of n polygons from their edges.
+#: Function that returns the masses (n,) of n polygons from their edges.
 MassOf: TypeAlias = Callable[[CellEdges, int], Any]
 
 
 class MovingCells:
     """
-    Cells in a region that follow their centres: as edges in no order, enough for areas and masses, and quick to have.
+    Voronoi or power cells in a region, updated incrementally as unordered edges.
 
-    Parts of cells that the region's notches cut off go to neighbours as those of :func:`cells_of` do, and are edges of
-    their own.
+    Unordered edges are sufficient for areas and masses, and faster to compute than rings. Parts of cells that notches of the
+    region separate are assigned to neighbours as in :func:`cells_of`, and have edges of their own.
 
     Parameters
     ----------
     region : shapely Polygon, µm
-        Convex or not.
+        Convex or concave.
     mass_of : callable, optional
-        Gives the masses (n,) of n polygons from their edges: a cell that a notch cuts apart is its heaviest part then, and
-        the one with its centre otherwise.
+        Returns the masses (n,) of n polygons from their edges. Of a cell that a notch divides, the heaviest part is then
+        the cell; otherwise the part that contains the centre.
 
     Attributes
     ----------
     centres_um : (n, 2) float64, µm
-        The centres that were followed last.
+        The centres of the last update.
     """
 
     def __init__(self, region: shapely.Polygon, mass_of: MassOf | None = None) -> None:
@@ -140,10 +139,10 @@ class MovingCells:
 
     def follow(self, centres_um: Floats, weights_um2: Floats | None = None) -> CellEdges | None:
         """
-        Edges of the Voronoi cells of centres (n, 2) inside the region, or of their power cells.
+        Compute the edges of the Voronoi or power cells of centres (n, 2) inside the region.
 
-        With weights (n,) a point x belongs to the centre c of the least power ``|x - c|² - weight``. None when a centre has
-        no cell in the region: there are no :meth:`rings` then.
+        With weights (n,) a point x belongs to the centre c of the least power ``|x - c|² - weight``. The result is None if a
+        centre has no cell in the region; :meth:`rings` is not available then.
         """
         if not self._power.follow(centres_um, weights_um2):
             return None
@@ -167,12 +166,17 @@ class MovingCells:
 
     def rings(self) -> tuple[Floats, Ints]:
         """
-        The last cells as packed rings: corners (n_vertex, 2) and offsets (n + 1,), as of :func:`cells_of`.
+        Return the last cells as packed rings, like :func:`cells_of`.
+
+        Returns
+        -------
+        xy_um : (n_vertex, 2) float64, µm
+        ring_offsets : (n + 1,) int64
 
         Raises
         ------
         GeometryError
-            When centres are too close for float64, or a cell goes round a hole of the region.
+            When centres are too close for float64, or a cell encloses a hole of the region.
         """
         diagram = _without_short_edges(self._diagram())
         whole = _whole_rings(diagram, self.centres_um if self._weights_um2 is None else _middles_um(diagram))
@@ -183,10 +187,10 @@ class MovingCells:
         return _Diagram(self.centres_um, self._weights_um2, power.points_um, power.corners_um, power.sites, power.ends)
 
     def _sure_inside(self, centres_um: Floats) -> Bools:
-        """Whether each cell is surely inside the region: its corners are closer to its centre than the boundary is."""
+        """Return whether each cell certainly is inside: its corners are closer than the boundary."""
         reach_um = self._power.reach_um()
         if self.centres_um.shape == centres_um.shape:
-            # The boundary has come closer by no more than the centre has moved.
+            # The distance to the boundary decreases by at most the displacement of the centre.
             self._clearance_um = self._clearance_um - np.hypot(*(centres_um - self.centres_um).T)
         else:
             self._clearance_um = np.zeros(centres_um.shape[0])
@@ -203,25 +207,23 @@ def _require_apart_and_inside(centres_um: Floats, region: shapely.Polygon) -> No
     if outside.size:
         x, y = centres_um[outside[0]]
         raise GeometryError(
-            f"centre {outside[0]} at ({x:g}, {y:g}) µm does not lie inside the region", tuple(outside.tolist())
+            f"centre {outside[0]} at ({x:g}, {y:g}) µm must lie inside the region", tuple(outside.tolist())
         )
     order = np.lexsort(centres_um.T)
     is_same = (np.diff(centres_um[order], axis=0) == 0.0).all(axis=1)
     if is_same.any():
         first = int(np.flatnonzero(is_same)[0])
         pair = sorted(order[first : first + 2].tolist())
-        raise GeometryError(
-            f"centres {pair[0]} and {pair[1]} are the same point; every cell needs its own", tuple(pair)
-        )
+        raise GeometryError(f"centres {pair[0]} and {pair[1]} must be distinct points, one per cell", tuple(pair))
 
 
 @dataclass(frozen=True)
 class _Diagram:
     """
-    Edges of Voronoi or power cells, as far as they reach.
+    Edges of Voronoi or power cells, not clipped.
 
-    Centres (n, 2) and weights (n,), the same and far points (n + N_FAR, 2), corners of cells (n_corner, 2), and of each
-    edge: points on its sides (n_edge, 2), and corners at its ends (n_edge, 2).
+    Fields: centres (n, 2), weights (n,), centres and auxiliary points (n + N_FAR, 2), corners of cells (n_corner, 2), and
+    for each edge the points on its two sides (n_edge, 2) and the corners at its ends (n_edge, 2).
     """
 
     centres_um: Floats
@@ -243,16 +245,16 @@ def _voronoi(centres_um: Floats, region: shapely.Polygon) -> _Diagram:
     found = Voronoi(np.concatenate((centres_um - middle, far_points_um(low, high))))
     sites = np.asarray(found.ridge_points, dtype=np.int64)
     corners = np.asarray(found.ridge_vertices, dtype=np.int64)
-    # Edges of far points alone belong to no cell, and only they can be endless.
+    # Edges between two auxiliary points belong to no cell, and only these can be infinite.
     is_ours = (sites < centres_um.shape[0]).any(axis=1)
     if (corners[is_ours] < 0).any():
-        raise GeometryError("the centres lie too close together for float64")
+        raise GeometryError("the centres are too close together for float64; increase their distances")
     diagram = _Diagram(centres_um, None, found.points, found.vertices, sites[is_ours], corners[is_ours])
     return replace(_without_short_edges(diagram), xy_um=found.vertices + middle)
 
 
 def _without_short_edges(diagram: _Diagram) -> _Diagram:
-    """The edges that are longer than rounding, corners that are one having one number."""
+    """Return the diagram without edges shorter than rounding; their corners are merged."""
     sites, corners = diagram.sites, diagram.corners
     length_um = np.hypot(*(diagram.xy_um[corners[:, 0]] - diagram.xy_um[corners[:, 1]]).T)
     distance_um = np.hypot(*(diagram.points_um[sites[:, 0]] - diagram.points_um[sites[:, 1]]).T)
@@ -273,14 +275,14 @@ def _without_short_edges(diagram: _Diagram) -> _Diagram:
 
 
 def _at_border(diagram: _Diagram, is_inside: Bools) -> tuple[_Diagram, _Diagram]:
-    """The diagram with the edges of cells that are not all inside, and with the others."""
+    """Split the diagram into edges of boundary cells and edges between inner cells."""
     is_inner = np.append(is_inside, np.zeros(N_FAR, bool))
     is_both = np.asarray(is_inner[diagram.sites[:, 0]] & is_inner[diagram.sites[:, 1]])
     return _without_short_edges(diagram.with_edges(~is_both)), diagram.with_edges(is_both)
 
 
 def _edges_around(diagram: _Diagram, is_inside: Bools) -> CellEdges:
-    """Edges around the cells that are inside: the twins first, then those with cells at the border."""
+    """Return the edges around inner cells: paired ones, then those to boundary cells."""
     one, both = _at_border(diagram, is_inside)
     is_inner = np.append(is_inside, np.zeros(N_FAR, bool))
     first, second = is_inner[one.sites[:, 0]], is_inner[one.sites[:, 1]]
@@ -293,7 +295,7 @@ def _edges_around(diagram: _Diagram, is_inside: Bools) -> CellEdges:
 
 
 def _middles_um(diagram: _Diagram) -> Floats:
-    """Means of the corners of each cell, which lie inside it, (n, 2)."""
+    """Return the mean (n, 2) of the corners of each cell, a point inside it."""
     n = diagram.centres_um.shape[0]
     middle_um = diagram.xy_um[diagram.corners].mean(axis=1)
     total_um, count = np.zeros((n, 2)), np.zeros(n)
@@ -306,7 +308,7 @@ def _middles_um(diagram: _Diagram) -> Floats:
 
 
 def _whole_rings(diagram: _Diagram, inside_um: Floats) -> tuple[Floats, Ints]:
-    """Packed rings of the cells as far as they reach; a point (n, 2) lies inside each."""
+    """Return packed rings of the unclipped cells, given a point (n, 2) inside each."""
     site, start, stop = _walks(inside_um, diagram.xy_um, diagram.sites, diagram.corners)
     offsets = np.concatenate(([0], np.cumsum(np.bincount(site, minlength=inside_um.shape[0]))))
     _require_closed(start, stop, offsets)
@@ -314,7 +316,7 @@ def _whole_rings(diagram: _Diagram, inside_um: Floats) -> tuple[Floats, Ints]:
 
 
 def _walks(inside_um: Floats, xy_um: Floats, sites: Ints, corners: Ints) -> tuple[Ints, Ints, Ints]:
-    """All edges of all cells, cell by cell and counter-clockwise around a point in each: cell, first corner, second."""
+    """Sort all edges by cell and counter-clockwise: cell, first corner, second corner."""
     site = sites.ravel()
     start, stop = np.repeat(corners, 2, axis=0).T
     is_ours = site < inside_um.shape[0]
@@ -328,7 +330,7 @@ def _walks(inside_um: Floats, xy_um: Floats, sites: Ints, corners: Ints) -> tupl
 
 
 def _require_closed(start: Ints, stop: Ints, offsets: Ints) -> None:
-    """Each edge of a cell must end where the next begins: the corners' order is not left to rounding."""
+    """Check that each edge of a cell ends where the next begins, so rounding changed no order."""
     is_bad = np.diff(offsets) < 3
     if not is_bad.any():
         after = np.roll(start, -1)
@@ -336,7 +338,7 @@ def _require_closed(start: Ints, stop: Ints, offsets: Ints) -> None:
         is_bad = np.logical_or.reduceat(after != stop, offsets[:-1])
     bad = np.flatnonzero(is_bad)
     if bad.size:
-        raise GeometryError(f"centre {bad[0]} lies too close to others for float64", tuple(bad.tolist()))
+        raise GeometryError(f"centre {bad[0]} is too close to another centre for float64", tuple(bad.tolist()))
 
 
 def _polygons(xy_um: Floats, offsets: Ints) -> NDArray[Any]:
@@ -351,14 +353,14 @@ def _clipped(
     region: shapely.Polygon,
     mass_of: MassOf | None = None,
 ) -> tuple[Floats, Ints]:
-    """Packed rings of the cells within the region, of those as far as they reach: the ones not inside are clipped."""
+    """Return packed rings of the cells within the region: those not inside are clipped."""
     parts, is_inside = _border_parts(diagram, is_inside, region, mass_of)
     border = np.flatnonzero(~is_inside)
     rings_um, ring_offsets = np.zeros((0, 2)), np.zeros(1, np.int64)
     if parts is not None:
         if parts.lost.size:
             raise GeometryError(
-                f"centre {parts.lost[0]} lies too close to others for float64", tuple(parts.lost.tolist())
+                f"centre {parts.lost[0]} is too close to another centre for float64", tuple(parts.lost.tolist())
             )
         rings_um, ring_offsets = _rings(parts.joined(border), border)
     return _merged(whole_um, offsets, rings_um, ring_offsets, border, float(region.area))
@@ -367,9 +369,10 @@ def _clipped(
 @dataclass(frozen=True)
 class _Parts:
     """
-    The cells at the border within the region.
+    Parts of the boundary cells within the region.
 
-    Their parts: polygons, the centre of the least power, and the cell each belongs to; their edges; and centres without.
+    Fields: the polygons of the parts, their nearest centre (of least power), the cell to which each is assigned, their
+    edges, and the centres without a part.
     """
 
     polygons: NDArray[Any]
@@ -379,7 +382,7 @@ class _Parts:
     lost: Ints
 
     def joined(self, border: Ints) -> NDArray[Any]:
-        """The cells with these numbers, each one polygon if its parts touch."""
+        """Return the cells with these indices, each a single polygon if its parts touch."""
         order = np.argsort(self.cell, kind="stable")
         polygons, cell = self.polygons[order], self.cell[order]
         is_first = np.append(True, cell[1:] != cell[:-1])
@@ -393,7 +396,7 @@ class _Parts:
 def _border_parts(
     diagram: _Diagram, is_inside: Bools, region: shapely.Polygon, mass_of: MassOf | None
 ) -> tuple[_Parts | None, Bools]:
-    """Parts of the cells that are not inside, None when all are; and which are, but for those that may get a part."""
+    """Return the parts of boundary cells, or None, and a mask of the unaffected inner cells."""
     if is_inside.all():
         return None, is_inside
     parts = _parts(_at_border(diagram, is_inside)[0], region, ~is_inside, mass_of)
@@ -411,7 +414,7 @@ def _border_parts(
 
 
 def _parts(diagram: _Diagram, region: shapely.Polygon, is_border: Bools, mass_of: MassOf | None) -> _Parts:
-    """Faces of the edges of the cells at the border, which are all in the diagram, and of the region's outline."""
+    """Return the faces between the edges of boundary cells and the outline of the region."""
     ends = np.unique(np.sort(diagram.corners, axis=1), axis=0)
     lines = np.append(shapely.linestrings(diagram.xy_um[ends]), region.boundary)
     faces = shapely.get_parts(shapely.polygonize(shapely.get_parts(shapely.union_all(lines))))
@@ -421,7 +424,7 @@ def _parts(diagram: _Diagram, region: shapely.Polygon, is_border: Bools, mass_of
     owner = _least_power(shapely.get_coordinates(points), diagram)
     is_ours = is_border[owner]
     faces, owner = shapely.orient_polygons(faces[is_ours]), owner[is_ours]
-    # The first face of each owner is the one with its centre, or the heaviest; others are parts that the outline cut off.
+    # The first face of each owner contains its centre, or is the heaviest; the outline separates the others from it.
     edges = _edges_of(faces)
     if mass_of is None:
         size, has_centre = shapely.area(faces), shapely.intersects(faces, shapely.points(diagram.centres_um[owner]))
@@ -435,14 +438,14 @@ def _parts(diagram: _Diagram, region: shapely.Polygon, is_border: Bools, mass_of
 
 
 def _least_power(points_um: Floats, diagram: _Diagram) -> Ints:
-    """The centre of the least power from each point, of those at the edges of the diagram."""
+    """Return the centre of least power for each point, of those with edges in the diagram."""
     from scipy.spatial import cKDTree
 
     near = np.unique(diagram.sites)
     near = near[near < diagram.centres_um.shape[0]]
     centres_um = diagram.centres_um[near]
     if diagram.weights_um2 is not None:
-        # The nearest one, when each is lifted by what its weight lacks from the largest.
+        # Power as distance: each centre is lifted by the root of the difference of its weight from the largest.
         weights_um2 = diagram.weights_um2[near]
         centres_um = np.column_stack((centres_um, np.sqrt(weights_um2.max() - weights_um2)))
         points_um = np.column_stack((points_um, np.zeros(points_um.shape[0])))
@@ -450,7 +453,7 @@ def _least_power(points_um: Floats, diagram: _Diagram) -> Ints:
 
 
 def _adopted(cell: Ints, owner: Ints, edges: CellEdges) -> Ints:
-    """Cells of all parts, those without one (-1) given to the neighbours with which they share the longest border."""
+    """Assign each part without a cell (-1) to the neighbour with the longest shared boundary."""
     cell = cell.copy()
     if (cell >= 0).all():
         return cell
@@ -459,7 +462,7 @@ def _adopted(cell: Ints, owner: Ints, edges: CellEdges) -> Ints:
     part, beside = edges.cell[np.stack((np.append(one, other), np.append(other, one)))]
     length_um = np.append(length_um, length_um)
     while True:
-        # A part may hang on another part: those with a neighbour go first, round by round.
+        # A part may touch only other parts: in each round, the parts with an assigned neighbour come first.
         is_open = (cell[part] < 0) & (cell[beside] >= 0)
         if not is_open.any():
             return np.where(cell < 0, owner, cell)
@@ -470,7 +473,7 @@ def _adopted(cell: Ints, owner: Ints, edges: CellEdges) -> Ints:
 
 
 def _edges_of(polygons: NDArray[Any]) -> CellEdges:
-    """Edges of polygons that are wound as packed rings are: outlines counter-clockwise, holes clockwise."""
+    """Return the edges of polygons with outlines counter-clockwise and holes clockwise."""
     rings, polygon = shapely.get_rings(polygons, return_index=True)
     closed_um, ring = shapely.get_coordinates(rings, return_index=True)
     is_start = ring[1:] == ring[:-1]
@@ -479,14 +482,14 @@ def _edges_of(polygons: NDArray[Any]) -> CellEdges:
 
 
 def _rings(polygons: NDArray[Any], ids: Ints) -> tuple[Floats, Ints]:
-    """Packed outlines of polygons, which must have no holes."""
+    """Return the packed outlines of polygons; raise for holes and multiple parts."""
     is_odd = (shapely.get_type_id(polygons) != shapely.GeometryType.POLYGON) | (
         shapely.get_num_interior_rings(polygons) > 0
     )
     if is_odd.any():
         bad = tuple(int(i) for i in ids[is_odd])
         raise GeometryError(
-            f"the cell of centre {bad[0]} would be no simple outline within the region; take more centres", bad
+            f"the cell of centre {bad[0]} within the region must be one polygon without holes; use more centres", bad
         )
     closed_um, ring_of = shapely.get_coordinates(shapely.get_exterior_ring(polygons), return_index=True)
     is_last = np.append(ring_of[1:] != ring_of[:-1], True)
@@ -497,7 +500,7 @@ def _rings(polygons: NDArray[Any], ids: Ints) -> tuple[Floats, Ints]:
 def _merged(
     xy_um: Floats, offsets: Ints, border_um: Floats, border_offsets: Ints, border: Ints, region_um2: float
 ) -> tuple[Floats, Ints]:
-    """Packed rings of all cells, those at the border replaced."""
+    """Return packed rings of all cells, with those at the boundary replaced."""
     counts = np.diff(offsets)
     is_inside = np.ones(counts.size, bool)
     is_inside[border] = False
@@ -511,5 +514,7 @@ def _merged(
     area_um2, _ = ring_moments(merged_um, merged_offsets)
     bad = np.flatnonzero(area_um2 <= 0.0)
     if bad.size or abs(area_um2.sum() - region_um2) > AREA_ROUNDING * region_um2:
-        raise GeometryError("the centres lie too close together for float64", tuple(bad.tolist()))
+        raise GeometryError(
+            "the centres are too close together for float64; increase their distances", tuple(bad.tolist())
+        )
     return merged_um, merged_offsets

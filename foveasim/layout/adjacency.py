@@ -1,4 +1,4 @@
-"""Which photosites share an edge, and how long it is."""
+"""Adjacency of photosites: lengths of shared edges."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ if TYPE_CHECKING:
 
 __all__ = ["TOUCHING_UM", "adjacency"]
 
-#: Edges that are this close touch: far below any manufacturing grid, far above the rounding of positions.
+#: Distance within which edges touch: far below any manufacturing grid, far above the rounding of coordinates.
 TOUCHING_UM = 1e-6
 
 
 def adjacency(layout: Layout, *, max_gap_um: float = TOUCHING_UM) -> csr_array[Any]:
     """
-    Lengths of the edges that photosites share.
+    Compute the lengths of the edges that photosites share.
 
     Parameters
     ----------
     layout : Layout
     max_gap_um : float, µm
-        Edges that face each other at up to this distance count as shared: set it to the width of the trench where sites
-        are separated by one.
+        Largest distance between facing edges that count as shared: set it to the trench width if trenches separate the
+        sites.
 
     Returns
     -------
     shared_um : csr_array (n_site, n_site) float64, µm
-        Symmetric, its diagonal empty: the length over which the outlines of two sites run along each other. Corners that
-        only touch share nothing. A long edge against several short ones (a T-junction) is shared with each of them.
+        Length of the common boundary of two sites; symmetric, with an empty diagonal. Sites that touch only in a corner
+        share no edge. A long edge facing several short ones (a T-junction) is shared with each of them.
 
     Raises
     ------
@@ -44,8 +44,8 @@ def adjacency(layout: Layout, *, max_gap_um: float = TOUCHING_UM) -> csr_array[A
 
     Notes
     -----
-    Without gaps the lengths of a site surrounded by others add up to its perimeter. Cost: the pairs of sites whose boxes
-    meet, times the edges of one times those of the other.
+    Without gaps, the lengths of a site surrounded by others add up to its perimeter. Cost: the number of pairs of sites
+    with intersecting bounding boxes, times the product of their numbers of edges.
 
     Examples
     --------

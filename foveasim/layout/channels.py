@@ -1,4 +1,4 @@
-"""Which colour filter each photosite has."""
+"""Colour filters of photosites: mosaics, random fractions, graph colouring."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from foveasim.layout.model import Layout
 
 __all__ = ["MOSAICS", "graph_colouring", "mosaic", "random_channels"]
 
-#: Pairs of columns that number a layout's sites in two directions, in order of preference.
+#: Pairs of columns that index the sites in two directions, in order of preference.
 INDEX_COLUMNS = (("row", "column"), ("ring", "sector"))
-#: Blocks with names, row 0 lowest. ``rgbw`` is a Bayer block with one of its greens left clear.
+#: Named blocks, row 0 lowest. ``rgbw`` is a Bayer block with one green filter replaced by a clear one.
 MOSAICS = {
     "bayer": ("RG", "GB"),
     "quad_bayer": ("RRGG", "RRGG", "GGBB", "GGBB"),
@@ -29,17 +29,17 @@ MOSAICS = {
 
 def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None) -> Layout:
     """
-    The layout with a repeating block of colour filters.
+    Return the layout with a repeating block of colour filters.
 
     Parameters
     ----------
     layout : Layout
         With the columns ``row`` and ``column``, or ``ring`` and ``sector``.
     block : str or sequence of str
-        One of :data:`MOSAICS` by name, or rows of letters, a letter a site: ``("RG", "GB")`` is a Bayer block with red at
-        row 0, column 0. Row 0 is the lowest.
+        Name in :data:`MOSAICS`, or rows of letters, one letter per site: ``("RG", "GB")`` is a Bayer block with red at row
+        0, column 0. Row 0 is the lowest.
     names : str, optional
-        The filters' letters in the order of the sensor's filters: a site's ``channel`` is its letter's position. "RGB" by
+        Letters in the order of the sensor's filters: the ``channel`` of a site is the index of its letter. "RGB" by
         default, "RGBW" for a block with a W.
 
     Raises
@@ -55,7 +55,7 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
     if names is None:
         names = "RGBW" if any("W" in row for row in rows) else "RGB"
     if len(set(names)) != len(names):
-        raise ParameterError("names", "must not name a filter twice", names)
+        raise ParameterError("names", "must not contain a letter twice", names)
     unknown = sorted(set("".join(rows)) - set(names))
     if unknown:
         raise ParameterError("block", f"must use the letters {names!r}, got {', '.join(map(repr, unknown))}")
@@ -64,11 +64,11 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
         raise ParameterError(
             "layout",
             f"must have the columns {' or '.join(' and '.join(p) for p in INDEX_COLUMNS)}, got {sorted(layout.columns)}",
-            hint="set its channel column with with_columns(channel=...)",
+            hint="set the column with with_columns(channel=...)",
         )
     channels = np.array([[names.index(letter) for letter in row] for row in rows])
     row, column = (layout.index_column(name) for name in pair)
-    return layout._with_columns(  # noqa: SLF001 -- of the same room
+    return layout._with_columns(  # noqa: SLF001 -- of the same subpackage
         {"channel": channels[row % channels.shape[0], column % channels.shape[1]]},
         f"mosaic {' '.join(rows)} of {names}",
     )
@@ -76,24 +76,24 @@ def mosaic(layout: Layout, block: str | Sequence[str], names: str | None = None)
 
 def random_channels(layout: Layout, fractions: ArrayLike, *, seed: int) -> Layout:
     """
-    The layout with colour filters strewn at random, in exact numbers.
+    Return the layout with randomly placed colour filters in exact proportions.
 
     Parameters
     ----------
     layout : Layout
     fractions : (n_filter,)
-        Relative numbers of the filters: ``(1, 2, 1)`` for twice as much green.
+        Relative frequencies of the filters: ``(1, 2, 1)`` for twice as much green.
     seed : int
 
     Returns
     -------
     Layout
-        With the column ``channel``: as many sites of each filter as its share asks for, to within one.
+        With the column ``channel``: the number of sites of each filter equals its fraction to within one site.
 
     Raises
     ------
     ParameterError
-        When a share is negative, or all are 0.
+        When a fraction is negative, or all are 0.
     """
     parts = finite_array("fractions", fractions, ndim=1, at_least=0.0)
     if not parts.sum() > 0.0:
@@ -105,12 +105,12 @@ def random_channels(layout: Layout, fractions: ArrayLike, *, seed: int) -> Layou
 
 def graph_colouring(layout: Layout, n_channels: int, *, max_gap_um: float | None = None) -> Layout:
     """
-    The layout with colour filters such that neighbours differ wherever they can.
+    Return the layout with colour filters that differ between neighbours where possible.
 
     Parameters
     ----------
     layout : Layout
-        Any tiling: rings, Voronoi cells, what has no rows and columns.
+        Any tiling, such as rings or Voronoi cells; rows and columns are not required.
     n_channels : int
         Number of filters. Four suffice for neighbours to differ on most layouts, three on hexagons.
     max_gap_um : float, optional, µm
@@ -119,8 +119,8 @@ def graph_colouring(layout: Layout, n_channels: int, *, max_gap_um: float | None
     Returns
     -------
     Layout
-        With the column ``channel``. Site after site, those first whose neighbours show the most filters already, takes the
-        filter that fractions the least edge with neighbours of the same filter, and of those the one used least so far.
+        With the column ``channel``. Sites whose neighbours already have the most different filters come first. Each site
+        gets the filter with the shortest edges shared with neighbours of the same filter, and of those the least used one.
 
     Raises
     ------

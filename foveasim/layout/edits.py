@@ -1,8 +1,8 @@
 """
-Composing layouts: join, cut to a region, set sites apart, merge, split, put on a manufacturing grid.
+Edits of layouts: union, clip, cut out, inset, merge, split, node, snap.
 
-Every edit takes a layout and gives a new one; columns go with their sites, and the provenance notes the step. Regions are
-shapely polygons in µm.
+Each function returns a new layout: sites retain their columns, and the provenance records the step. Regions are shapely
+polygons in µm.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from foveasim.layout.model import INTEGER_RANGES, Layout
 
 __all__ = ["clip", "cut_out", "inset", "joining_groups", "merge", "merge_small", "node", "snap", "split", "union"]
 
-#: A piece of a site smaller than this fraction of it is rounding at the border of a cut.
+#: Area of a piece, relative to its site, below which it is a rounding artefact of the cut.
 SLIVER = 1e-9
 
 
 def union(layouts: Sequence[Layout]) -> Layout:
     """
-    One layout of the sites of several, in their order.
+    Concatenate the sites of several layouts, in order.
 
     Parameters
     ----------
@@ -49,19 +49,19 @@ def union(layouts: Sequence[Layout]) -> Layout:
     Returns
     -------
     Layout
-        With the columns that all of them have. Whether sites overlap is not looked at: check the rule ``max_overlap_um2``.
+        With the columns that all of them have. Overlaps are not checked: use the rule ``max_overlap_um2``.
 
     Raises
     ------
     ParameterError
-        When there is none, one is no layout, or no type contains all integers of a column.
+        When the sequence is empty or contains another object, or no integer type fits all values of a column.
     """
     layouts = list(layouts)
     if not layouts or not all(isinstance(layout, Layout) for layout in layouts):
         raise ParameterError("layouts", "must be one or more layouts", layouts)
     check_sites(sum(layout.n_sites for layout in layouts) or 1)
     names = set.intersection(*(set(layout.columns) for layout in layouts))
-    return Layout._derived(  # noqa: SLF001 -- of the same room
+    return Layout._derived(  # noqa: SLF001 -- of the same subpackage
         np.concatenate([layout.xy_um for layout in layouts]),
         _joined([layout.ring_offsets for layout in layouts]),
         _joined([layout.site_offsets for layout in layouts]),
@@ -72,7 +72,7 @@ def union(layouts: Sequence[Layout]) -> Layout:
 
 def clip(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "pieces") -> Layout:
     """
-    The part of a layout inside a region.
+    Return the part of a layout inside a region.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def clip(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "piece
     region : shapely Polygon or MultiPolygon, or (n, 2) vertices, µm
         A die, a zone, an image circle.
     cut : {"pieces", "drop"}
-        What becomes of sites that the border cuts: their pieces inside, each a site of its own; or nothing.
+        Result for sites that the boundary cuts: their pieces inside, each a separate site; or none.
 
     Returns
     -------
@@ -89,35 +89,35 @@ def clip(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "piece
     Raises
     ------
     ParameterError
-        When the region is no valid polygon.
+        When the region is not a valid polygon.
     """
     return _kept(layout, as_region("region", region), shapely.intersection, shapely.covers, cut, "clipped to a region")
 
 
 def cut_out(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "pieces") -> Layout:
     """
-    The part of a layout outside a region; parameters and errors as for :func:`clip`.
+    Return the part of a layout outside a region; parameters and errors as for :func:`clip`.
 
     Parameters
     ----------
     layout : Layout
     region : shapely Polygon or MultiPolygon, or (n, 2) vertices, µm
-        What is taken out: room for a circuit, a fiducial mark, a fovea to be filled.
+        Area to remove: for a circuit, a fiducial mark, or a fovea that is filled later.
     cut : {"pieces", "drop"}
         As for :func:`clip`.
     """
-    return _kept(layout, as_region("region", region), shapely.difference, shapely.disjoint, cut, "punched by a region")
+    return _kept(layout, as_region("region", region), shapely.difference, shapely.disjoint, cut, "region cut out")
 
 
 def inset(layout: Layout, margin_um: ArrayLike) -> Layout:
     """
-    Every site with its border moved inwards: a trench of twice the margin between neighbours.
+    Offset the boundary of each site inwards, for trenches of twice the margin.
 
     Parameters
     ----------
     layout : Layout
     margin_um : number or (n_site,), µm
-        How far each border moves. Corners stay sharp.
+        Inward offset of the boundary. Corners remain sharp.
 
     Returns
     -------
@@ -126,7 +126,7 @@ def inset(layout: Layout, margin_um: ArrayLike) -> Layout:
     Raises
     ------
     GeometryError
-        When a site would vanish or fall into parts; ``.site_ids`` names them.
+        When a site would vanish or split into parts; ``.site_ids`` are their indices.
     ParameterError
         When a margin is negative.
     """
@@ -137,7 +137,7 @@ def inset(layout: Layout, margin_um: ArrayLike) -> Layout:
     gone = np.flatnonzero(shapely.is_empty(shrunk) | (shapely.get_type_id(shrunk) != shapely.GeometryType.POLYGON))
     if gone.size:
         raise GeometryError(
-            f"site {gone[0]} would vanish or fall into parts{f' (and {gone.size - 1} more)' if gone.size > 1 else ''}: it is "
+            f"site {gone[0]} would vanish or split into parts{f' (and {gone.size - 1} more)' if gone.size > 1 else ''}: it is "
             "too narrow for the margin",
             tuple(int(i) for i in gone),
         )
@@ -146,7 +146,7 @@ def inset(layout: Layout, margin_um: ArrayLike) -> Layout:
 
 def merge(layout: Layout, groups: ArrayLike) -> Layout:
     """
-    Sites of the same group made into one: binning, wells shared by sub-pixels.
+    Merge the sites of each group into one, for binning or wells shared by sub-pixels.
 
     Parameters
     ----------
@@ -157,51 +157,51 @@ def merge(layout: Layout, groups: ArrayLike) -> Layout:
     Returns
     -------
     Layout
-        One site a group, in the order of the groups' numbers, with the columns of each group's first site.
+        One site per group, in the order of the group numbers, with the columns of the first site of each group.
 
     Raises
     ------
     GeometryError
-        When the sites of a group do not hang together; ``.site_ids`` names them.
+        When the sites of a group are not connected; ``.site_ids`` are their indices.
     ParameterError
-        When there is not one group a site.
+        When ``groups`` does not contain one non-negative integer per site.
     """
     labels = np.asarray(unmasked("groups", groups))
     if labels.shape != (layout.n_sites,) or labels.dtype.kind not in "iu" or labels.min(initial=0) < 0:
-        raise ParameterError("groups", f"must be {layout.n_sites} integers from 0, one per site", groups)
+        raise ParameterError("groups", f"must be {layout.n_sites} integers >= 0, one per site", groups)
     _, first, group, count = np.unique(labels, return_index=True, return_inverse=True, return_counts=True)
-    # One row a group, filled up with nothing, so that GEOS joins all groups in one call.
+    # One row per group, padded with None, so that GEOS merges all groups in one call.
     order = np.argsort(group, kind="stable")
     rows = np.full((count.size, int(count.max(initial=1))), None, dtype=object)
     rows[group[order], positions_in_runs(count)] = layout.polygons()[order]
     joined = shapely.union_all(rows, axis=1) if count.size else np.zeros(0, dtype=object)
     apart = shapely.get_type_id(joined) != shapely.GeometryType.POLYGON
-    # Edges that were cut apart are neighbours' up to rounding: on a fine grid they are one.
+    # Edges separated by a cut coincide only within rounding: on a fine grid they are equal.
     joined[apart] = shapely.union_all(rows[apart], axis=1, grid_size=TOUCHING_UM)
     apart = shapely.get_type_id(joined) != shapely.GeometryType.POLYGON
     if apart.any():
         bad = np.flatnonzero(apart[group])
         raise GeometryError(
-            f"site {bad[0]} does not hang together with the other sites of its group", tuple(int(i) for i in bad)
+            f"site {bad[0]} must be connected to the other sites of its group", tuple(int(i) for i in bad)
         )
     return _rebuilt(layout, joined, first, "merged by groups")
 
 
 def merge_small(layout: Layout, *, min_size_um: float) -> Layout:
     """
-    Sites below a size made part of the neighbour with which they share most edge, as often as it takes.
+    Merge each site below a size with the neighbour of the longest shared edge, repeatedly.
 
     Parameters
     ----------
     layout : Layout
     min_size_um : float, µm
-        Smallest size, the square root of a site's area. Sites that the design rule ``min_size_um`` accepts stay as they
-        are.
+        Minimum size, the square root of the area of a site. Sites that satisfy the design rule ``min_size_um`` are
+        unchanged.
 
     Returns
     -------
     Layout
-        In the order of each site's first part, with that part's columns. A small site without neighbours stays.
+        In the order of the first part of each site, with its columns. A small site without neighbours is unchanged.
 
     Raises
     ------
@@ -219,9 +219,10 @@ def merge_small(layout: Layout, *, min_size_um: float) -> Layout:
 
 def joining_groups(layout: Layout, small: Ints) -> Ints:
     """
-    Groups for :func:`merge` that join each small site, in this order, to the neighbour with which it shares most edge.
+    Return groups for :func:`merge` that join each small site to a neighbour, in order.
 
-    A site is joined once: later ones that need it stay alone for now.
+    The neighbour is the one with the longest shared edge. A site is joined at most once: later small sites that require it
+    remain single.
     """
     groups = np.arange(layout.n_sites)
     if small.size == 0:
@@ -242,18 +243,19 @@ def joining_groups(layout: Layout, small: Ints) -> Ints:
 
 def split(layout: Layout, *, n_x: int = 2, n_y: int = 1) -> Layout:
     """
-    Every site cut into ``n_x`` by ``n_y`` parts of equal width and height: dual pixels, quad pixels.
+    Split each site into ``n_x`` by ``n_y`` parts, for dual pixels and quad pixels.
 
     Parameters
     ----------
     layout : Layout
     n_x, n_y : int
-        Parts from left to right and from bottom to top of each site's bounding box.
+        Number of parts from left to right and from bottom to top, of equal width and height in the bounding box of each
+        site.
 
     Returns
     -------
     Layout
-        The parts of site 0, then those of site 1, ..., with the columns ``parent`` (the site's number) and ``part``
+        The parts of site 0, then those of site 1, ..., with the columns ``parent`` (index of the site) and ``part``
         (``iy * n_x + ix``).
 
     Raises
@@ -265,7 +267,7 @@ def split(layout: Layout, *, n_x: int = 2, n_y: int = 1) -> Layout:
     check_sites(max(1, layout.n_sites * n_x * n_y))
     box = layout.site_bounds_um[:, np.newaxis, :]
     iy, ix = np.divmod(np.arange(n_x * n_y), n_x)
-    # Inner cuts are at the same numbers from both sides; the outermost reach beyond the box.
+    # Inner cuts have identical coordinates on both sides; the outermost lie outside the box.
     x = box[..., 0:1] + (box[..., 2:3] - box[..., 0:1]) * np.arange(n_x + 1) / n_x
     y = box[..., 1:2] + (box[..., 3:4] - box[..., 1:2]) * np.arange(n_y + 1) / n_y
     x[..., 0], x[..., -1], y[..., 0], y[..., -1] = x[..., 0] - 1.0, x[..., -1] + 1.0, y[..., 0] - 1.0, y[..., -1] + 1.0
@@ -277,7 +279,7 @@ def split(layout: Layout, *, n_x: int = 2, n_y: int = 1) -> Layout:
 
 def node(layout: Layout) -> Layout:
     """
-    The layout with every vertex that lies on a neighbour's edge made a vertex of the neighbour too.
+    Insert each vertex that lies on the edge of a neighbour into that edge.
 
     Parameters
     ----------
@@ -286,46 +288,46 @@ def node(layout: Layout) -> Layout:
     Returns
     -------
     Layout
-        The same sites. T-junctions have a vertex on both sides afterwards, so that turning, snapping or a chip file's
-        database unit can open no gap there.
+        The same sites. T-junctions have a vertex on both sides afterwards, so rotation, snapping and the database unit of
+        a GDSII file do not open gaps there.
     """
     points, _ = np.unique(layout.xy_um, axis=0, return_index=True)
     after = next_vertex(layout.ring_offsets)
     begin, end = layout.xy_um, layout.xy_um[after]
     edge, point, t = points_on_edges(points, begin, end)
-    # The new vertices come behind the edge's first one, in the order along it.
+    # The new vertices follow the first one of the edge, in order along it.
     owner = np.concatenate((np.arange(begin.shape[0]), edge))
     order = np.lexsort((np.concatenate((np.zeros(begin.shape[0]), t)), owner))
     n_new = np.bincount(edge, minlength=begin.shape[0])
-    return Layout._derived(  # noqa: SLF001 -- of the same room
+    return Layout._derived(  # noqa: SLF001 -- of the same subpackage
         np.concatenate((begin, points[point]))[order],
         np.concatenate(([0], np.cumsum(n_new + 1)))[layout.ring_offsets],
         layout.site_offsets,
         layout.columns,
-        layout._then("noded"),  # noqa: SLF001 -- of the same room
+        layout._then("noded"),  # noqa: SLF001 -- of the same subpackage
     )
 
 
 def snap(layout: Layout, grid_um: float) -> Layout:
     """
-    The layout with every vertex on a manufacturing grid.
+    Snap each vertex to a manufacturing grid.
 
     Parameters
     ----------
     layout : Layout
     grid_um : float, µm
-        Every coordinate becomes a multiple of it: 0.005 for the 5 nm of many processes.
+        Coordinates are rounded to multiples of it: 0.005 for the 5 nm of many processes.
 
     Returns
     -------
     Layout
-        Neighbours that shared a vertex share the snapped one, and vertices on a neighbour's edge are shared first
-        (:func:`node`): nothing is opened, and nothing covered twice.
+        Neighbours that share a vertex share the snapped one, and vertices on the edge of a neighbour are inserted first
+        (:func:`node`): no gaps and no overlaps arise.
 
     Raises
     ------
     GeometryError
-        When a site has no area left on the grid, or crosses itself.
+        When a snapped site has no area, or crosses itself.
     ParameterError
         When the grid is not positive.
     """
@@ -338,7 +340,7 @@ def snap(layout: Layout, grid_um: float) -> Layout:
         snapped.ring_offsets,
         snapped.site_offsets,
         layout.columns,
-        layout._then(f"snapped to {grid_um:g} µm"),  # noqa: SLF001 -- of the same room
+        layout._then(f"snapped to {grid_um:g} µm"),  # noqa: SLF001 -- of the same subpackage
     )
 
 
@@ -351,7 +353,7 @@ def _joined(offsets: Sequence[Ints]) -> Ints:
 
 
 def _joined_columns(name: str, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Parts of a column one after the other; signed and unsigned integers exactly, of which numpy makes floats."""
+    """Concatenate parts of a column; signed and unsigned integers remain exact."""
     if {part.dtype.kind for part in parts} == {"i", "u"} and np.result_type(*parts).kind == "f":
         used = [part for part in parts if part.size]
         low, high = (min(int(p.min()) for p in used), max(int(p.max()) for p in used)) if used else (0, 0)
@@ -374,7 +376,7 @@ def _kept(layout: Layout, region: Any, operation: Any, keeps_whole: Any, cut: st
 
 
 def _pieces(layout: Layout, shapes: NDArray[Any], parent: Ints, step: str, **columns: NDArray[Any]) -> Layout:
-    """Layout of all polygons that shapes consist of, each with the columns of its parent site."""
+    """Return the layout of all polygons of the shapes, each with the columns of its parent."""
     parts, shape = shapely.get_parts(shapes, return_index=True)
     is_real = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (
         shapely.area(parts) > SLIVER * layout.area_um2[parent[shape]]
@@ -387,7 +389,7 @@ def _pieces(layout: Layout, shapes: NDArray[Any], parent: Ints, step: str, **col
 
 
 def _rebuilt(layout: Layout, polygons: NDArray[Any], parent: Ints, step: str) -> Layout:
-    """Layout of these polygons, each with the columns of its parent site."""
+    """Return the layout of these polygons, each with the columns of its parent site."""
     rings = Layout.from_polygons(polygons)
     columns = {name: values[parent] for name, values in layout.columns.items()}
     return Layout._derived(rings.xy_um, rings.ring_offsets, rings.site_offsets, columns, layout._then(step))  # noqa: SLF001

@@ -1,4 +1,4 @@
-"""Layout families: the registry of generators, and how their layouts record what they were made from."""
+"""Layout families: registry of generators, and provenance of generated layouts."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ __all__ = ["LAYOUTS", "layout_family"]
 
 P = ParamSpec("P")
 
-#: Every generator of layouts by its name in settings files and in :mod:`foveasim.layout`. Installed packages add theirs as
-#: entry points of the group ``foveasim.layouts``.
+#: Layout generators by their name in settings files and in :mod:`foveasim.layout`. Installed packages register more as entry
+#: points of the group ``foveasim.layouts``.
 LAYOUTS: Registry[Callable[..., Layout]] = Registry("layout family", "foveasim.layouts")
 
 
@@ -28,19 +28,19 @@ def layout_family(
     *, example: Mapping[str, Any], picture: str | None = None
 ) -> Callable[[Callable[P, Layout]], Callable[P, Layout]]:
     """
-    Decorate a generator: register it, and record its name and parameters in the provenance of its layouts.
+    Register a generator, and record its parameters in the provenance of layouts.
 
     Parameters
     ----------
     example : mapping
-        Parameters of a small layout, from which the gallery and the tests of all families make one.
+        Parameters of a small layout, used by the gallery and by the tests of all families.
     picture : str, optional
-        Parameter that settings files give as the path of a picture.
+        Name of the parameter that is the path of a picture in settings files.
 
     Notes
     -----
-    The decorated function has the attributes ``example`` and ``picture``. Parameters are recorded as plain data. A generator
-    that records one in another way has it in the ``"parameters"`` of its own provenance.
+    The decorated function has the attributes ``example`` and ``picture``. Parameters are recorded as plain data. To record
+    one in another form, a generator includes it in the ``"parameters"`` of its own provenance.
 
     Examples
     --------
@@ -74,7 +74,7 @@ def layout_family(
 
 
 def _plain(value: Any) -> Any:
-    """A parameter as a settings file would have it."""
+    """Convert a parameter to the plain data of a settings file."""
     if isinstance(value, shapely.Geometry):
         return shapely.to_wkt(value, rounding_precision=-1)
     if isinstance(value, np.ndarray):

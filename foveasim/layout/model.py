@@ -1,4 +1,4 @@
-"""The layout: any number of polygon photosites as packed rings, with columns of data per site and their origin."""
+"""Layout of polygonal photosites: packed rings, data columns per site, and provenance."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from foveasim.errors import GeometryError, ParameterError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from pyvista import PolyData  # noqa: TID251 -- a type alone
+    from pyvista import PolyData  # noqa: TID251 -- for annotations only
     from scipy.sparse import csr_array
 
     from foveasim.layout.drc.repair import Change
@@ -51,20 +51,20 @@ if TYPE_CHECKING:
 
 __all__ = ["Layout"]
 
-#: A layout that is smaller as a whole was given in other units.
+#: A smaller extent of a layout indicates wrong units.
 MIN_LAYOUT_UM = 1e-3
-#: A ring whose area is below this fraction of its bounding box is a line to float64.
+#: Area of a ring, relative to its bounding box, below which it is degenerate in float64.
 ZERO_AREA_SHARE = 1e-14
-#: Columns whose values are indices, of filters and of lines: more than MAX_SITES of either are an overflow.
+#: Columns of indices, of filters and of lines: values above MAX_SITES indicate an overflow.
 INDEX_NAMES = ("channel", "readout_line")
-#: Values of a column of integers.
+#: Valid ranges of integer columns.
 INTEGER_RANGES = "integers from -2**63 to 2**63 - 1, or from 0 to 2**64 - 1"
-#: Reasons of GEOS for invalid holes, and their messages here.
+#: GEOS reasons for invalid holes, and the corresponding messages.
 HOLE_REASONS = {
     "Hole lies outside shell": "has a hole outside its outline",
     "Holes are nested": "has a hole inside another hole",
 }
-#: How many bad sites a message names.
+#: Number of invalid sites that a message lists.
 SHOWN_SITES = 5
 
 
@@ -73,37 +73,36 @@ class Layout:
     """
     Photosites of a sensor: polygons in the sensor plane.
 
-    Made by a generator (:func:`foveasim.layout.log_polar` and its neighbours), by :meth:`from_rectangles`, or by
-    :meth:`from_polygons`; the plain constructor takes packed rings that are right already and checks their structure and
-    the sites with holes.
+    Generators such as :func:`foveasim.layout.log_polar`, :meth:`from_rectangles` and :meth:`from_polygons` create layouts.
+    The constructor expects valid packed rings, and checks only their structure and the sites with holes.
 
     Parameters
     ----------
     xy_um : (n_vertex, 2) float64, µm
-        Vertices as ``[x, y]``, ring after ring, the first vertex of a ring not repeated.
+        Vertices as ``[x, y]``, ring after ring, without repetition of the first vertex of a ring.
     ring_offsets : (n_ring + 1,) int64
         Ring r has the vertices ``ring_offsets[r] : ring_offsets[r + 1]``.
     site_offsets : (n_site + 1,) int64
-        Site s has the rings ``site_offsets[s] : site_offsets[s + 1]``: its outline, counter-clockwise, then its
-        holes, clockwise.
+        Site s has the rings ``site_offsets[s] : site_offsets[s + 1]``: the outline, counter-clockwise, then the holes,
+        clockwise.
     columns : mapping of str to (n_site,) array
-        Data per site: ``channel`` (index of the colour filter), ``readout_line``, and anything else.
+        Data per site: ``channel`` (index of the colour filter), ``readout_line``, and user-defined columns.
     provenance : mapping
-        Where the layout comes from: generator and parameters, and what followed.
+        Origin of the layout: generator, parameters and subsequent steps.
 
     Raises
     ------
     GeometryError
         When a coordinate is too large, or holes overlap, are wound counter-clockwise, or do not lie inside their outline;
-        ``.site_ids`` and the message name the sites.
+        ``.site_ids`` and the message specify the sites.
     ParameterError
-        When the arrays do not fit together or contain numbers that are not finite, or a column has integers beyond 64 bits
-        or, for ``channel`` and ``readout_line``, integers that are not indices.
+        When array sizes are inconsistent, numbers are not finite, a column has integers beyond 64 bits, or ``channel`` or
+        ``readout_line`` has integers that are not valid indices.
 
     Notes
     -----
-    All arrays are read-only; every change gives a new layout. Indexing with a mask, a slice or site numbers
-    selects: ``layout[layout.area_um2 > 4.0]``.
+    All arrays are read-only, and methods return new layouts. Indexing with a mask, a slice or site indices selects sites:
+    ``layout[layout.area_um2 > 4.0]``.
     """
 
     xy_um: Floats
@@ -118,7 +117,7 @@ class Layout:
 
     @classmethod
     def _derived(cls, *fields: Any) -> Layout:
-        """Layout whose holes were checked before: moved by a map that keeps them, or selected."""
+        """Build a layout without hole checks, from sites selected or mapped from a checked layout."""
         layout = object.__new__(cls)
         names = ("xy_um", "ring_offsets", "site_offsets", "columns", "provenance")
         for name, value in zip(names, fields, strict=True):
@@ -127,7 +126,7 @@ class Layout:
         return layout
 
     def with_provenance(self, provenance: Mapping[str, Any]) -> Layout:
-        """Return the same layout with another record of what it was made from: plain data."""
+        """Return the layout with another provenance record of plain data."""
         layout = object.__new__(type(self))
         for name in ("xy_um", "ring_offsets", "site_offsets", "columns"):
             object.__setattr__(layout, name, getattr(self, name))
@@ -135,16 +134,14 @@ class Layout:
         return layout
 
     def _store(self) -> None:
-        """Check the structure of the fields, and keep read-only copies."""
+        """Check the structure of the fields, and store read-only copies."""
         xy_um = finite_array("xy_um", self.xy_um, ndim=2)
         if xy_um.shape[1:] != (2,):
             raise ParameterError("xy_um", f"must have the shape (n_vertex, 2), got {xy_um.shape}")
         ring_offsets = _offsets("ring_offsets", self.ring_offsets, 3, xy_um.shape[0], "vertices")
         site_offsets = _offsets("site_offsets", self.site_offsets, 1, ring_offsets.size - 1, "rings")
         if xy_um.size and np.abs(xy_um).max() > MAX_LENGTH_UM:
-            raise GeometryError(
-                f"the layout lies further than {MAX_LENGTH_UM:g} µm from the origin; coordinates are in µm"
-            )
+            raise GeometryError(f"the layout must lie within {MAX_LENGTH_UM:g} µm of the origin; coordinates are in µm")
         columns = {}
         for name, values in self.columns.items():
             column = _column(name, values)
@@ -162,12 +159,12 @@ class Layout:
         object.__setattr__(self, "columns", MappingProxyType(columns))
         object.__setattr__(self, "provenance", MappingProxyType(copied(self.provenance)))
 
-    # -- making -----------------------------------------------------------------------------------------------
+    # -- constructors -----------------------------------------------------------------------------------------------
 
     @classmethod
     def from_rectangles(cls, centre_um: ArrayLike, size_um: ArrayLike, **columns: ArrayLike) -> Layout:
         """
-        Layout from a list of photosites, each with its position and size.
+        Build a layout of rectangular photosites from their centres and sizes.
 
         Parameters
         ----------
@@ -181,7 +178,7 @@ class Layout:
         Raises
         ------
         ParameterError
-            When a number is not finite, or a size not positive.
+            When a number is not finite, or a size is not positive.
         """
         centre_um = finite_array("centre_um", centre_um, ndim=2)
         if centre_um.shape[1] != 2:
@@ -205,12 +202,12 @@ class Layout:
         provenance: Mapping[str, Any] | None = None,
     ) -> Layout:
         """
-        Layout of sites with the same number of vertices each.
+        Build a layout of sites with equal numbers of vertices.
 
         Parameters
         ----------
         rings_um : (n_site, n_vertex, 2), µm
-            Outlines, counter-clockwise and simple: neither is checked.
+            Simple outlines, counter-clockwise; neither property is checked.
         columns, provenance : mappings
             As for the class.
         """
@@ -234,23 +231,23 @@ class Layout:
         **columns: ArrayLike,
     ) -> Layout:
         """
-        Layout from any simple polygons, with holes or without, in any winding.
+        Build a layout from simple polygons, with or without holes, of any winding order.
 
         Parameters
         ----------
         polygons : sequence of shapely Polygon, or the tuple (xy_um, ring_offsets, site_offsets)
-            Coordinates in µm. Packed rings are as for the class, except that rings may be wound either way and may
-            repeat their first vertex at the end.
+            Coordinates in µm. Packed rings are as for the class, but may have any winding order and may repeat the first
+            vertex at the end.
         channel, readout_line, **columns : (n_site,) arrays, optional
             Data per site.
         provenance : mapping, optional
-            Where the polygons come from.
+            Origin of the polygons.
 
         Raises
         ------
         GeometryError
-            When a polygon is empty, has a coordinate that is not finite, no area, or crosses itself, or when a
-            geometry is no polygon; ``.site_ids`` and the message name the sites.
+            When a polygon is empty, has a coordinate that is not finite, has no area, or crosses itself, or when a
+            geometry is not a polygon; ``.site_ids`` and the message specify the sites.
 
         Examples
         --------
@@ -270,18 +267,19 @@ class Layout:
         )
         if xy_um.size and np.ptp(xy_um, axis=0).max() < MIN_LAYOUT_UM:
             raise GeometryError(
-                f"the whole layout is only {np.ptp(xy_um, axis=0).max():g} µm wide; coordinates are in µm"
+                f"the layout must be at least {MIN_LAYOUT_UM:g} µm wide, got {np.ptp(xy_um, axis=0).max():g} µm; "
+                "coordinates are in µm"
             )
         xy_um, ring_offsets = _without_repeats(xy_um, ring_offsets)
         _require(
             np.logical_or.reduceat(np.diff(ring_offsets) < 3, site_offsets[:-1]),
-            "has a ring of fewer than 3 different vertices",
+            "has a ring of fewer than 3 distinct vertices",
         )
         box = site_bounds_um(xy_um, ring_offsets, np.arange(ring_offsets.size))
         box_um2 = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])
         rounding_um2 = ZERO_AREA_SHARE * np.maximum(box_um2, np.finfo(np.float64).tiny)
         is_line = ring_spread_um2(xy_um, ring_offsets) <= rounding_um2
-        _require(np.logical_or.reduceat(is_line, site_offsets[:-1]), "has a ring without area")
+        _require(np.logical_or.reduceat(is_line, site_offsets[:-1]), "has a ring with zero area")
         _require_valid(Layout._derived(xy_um, ring_offsets, site_offsets, {}, {}))
         area_um2, _ = ring_moments(xy_um, ring_offsets)
         is_outline = np.zeros(area_um2.size, bool)
@@ -298,7 +296,7 @@ class Layout:
             provenance or {"made_by": "from_polygons"},
         )
 
-    # -- reading ----------------------------------------------------------------------------------------------
+    # -- properties ----------------------------------------------------------------------------------------------
 
     @property
     def n_sites(self) -> int:
@@ -309,7 +307,7 @@ class Layout:
         return self.n_sites
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Read-only mappings cannot be pickled as they are.
+        # Read-only mappings cannot be pickled.
         fields = (self.xy_um, self.ring_offsets, self.site_offsets, dict(self.columns), dict(self.provenance))
         return Layout._derived, fields
 
@@ -319,12 +317,12 @@ class Layout:
 
     @property
     def channel(self) -> Ints:
-        """Index of each site's colour filter, (n_site,); 0 where the layout has no column ``channel``."""
+        """Colour filter index of each site, (n_site,); 0 without a column ``channel``."""
         return self._index_column("channel")
 
     @property
     def readout_line(self) -> Ints:
-        """Line that each site is read through, (n_site,); 0 where the layout has no column ``readout_line``."""
+        """Readout line of each site, (n_site,); 0 without a column ``readout_line``."""
         return self._index_column("readout_line")
 
     def _index_column(self, name: str) -> Ints:
@@ -332,12 +330,12 @@ class Layout:
 
     def index_column(self, name: str) -> Ints:
         """
-        A column of integers from 0, (n_site,) int64.
+        Return a column of indices, (n_site,) int64.
 
         Raises
         ------
         ParameterError
-            When the layout has no such column, or it holds something else.
+            When the layout has no such column, or it contains other values than integers from 0 to the maximum.
         """
         if name not in self.columns:
             raise ParameterError(name, f"must be a column of the layout, which has {sorted(self.columns)}")
@@ -354,31 +352,31 @@ class Layout:
 
     @property
     def area_um2(self) -> Floats:
-        """Area of each site without its holes, (n_site,) µm²."""
+        """Area of each site, holes excluded, (n_site,) µm²."""
         return self._moments[0]
 
     @property
     def centroid_um(self) -> Floats:
-        """Centre of area of each site, (n_site, 2) µm."""
+        """Centroid of each site, (n_site, 2) µm."""
         return self._moments[1]
 
     @cached_property
     def site_bounds_um(self) -> Floats:
-        """(x_min, y_min, x_max, y_max) of each site, (n_site, 4) µm."""
+        """Bounding box (x_min, y_min, x_max, y_max) of each site, (n_site, 4) µm."""
         return read_only(site_bounds_um(self.xy_um, self.ring_offsets, self.site_offsets))
 
     @property
     def bounds_um(self) -> tuple[float, float, float, float]:
-        """(x_min, y_min, x_max, y_max) of the whole layout, µm."""
+        """Bounding box (x_min, y_min, x_max, y_max) of the layout, µm."""
         if self.n_sites == 0:
-            raise GeometryError("the layout has no sites, and so no bounds")
-        x_um, y_um = self.xy_um[:, 0], self.xy_um[:, 1]  # one by one: many times as fast as both along axis 0
+            raise GeometryError("the layout has no sites, so its bounds are undefined")
+        x_um, y_um = self.xy_um[:, 0], self.xy_um[:, 1]  # separately: many times faster than a reduction along axis 0
         return float(x_um.min()), float(y_um.min()), float(x_um.max()), float(y_um.max())
 
     def polygons(self) -> NDArray[Any]:
-        """The sites as shapely polygons, (n_site,) array of objects."""
+        """Return the sites as shapely polygons, (n_site,) array of objects."""
         n_vertices = np.diff(self.ring_offsets)
-        # A closed ring has its first vertex once more at its end.
+        # shapely requires the first vertex again at the end of a ring.
         ring_of = np.repeat(np.arange(n_vertices.size), n_vertices + 1)
         closed = self.xy_um[self.ring_offsets[:-1][ring_of] + positions_in_runs(n_vertices + 1) % n_vertices[ring_of]]
         rings = shapely.linearrings(closed, indices=ring_of)
@@ -386,10 +384,10 @@ class Layout:
             shapely.polygons(rings, indices=np.repeat(np.arange(self.n_sites), np.diff(self.site_offsets)))
         )
 
-    # -- changing: every verb gives a new layout ----------------------------------------------------------------
+    # -- transformations: each returns a new layout ----------------------------------------------------------------
 
     def __getitem__(self, selection: Any) -> Layout:
-        """Layout of the selected sites: a mask, a slice, site numbers, or a function of the layout that gives one of these."""
+        """Select sites by a mask, a slice, indices, or a function that returns one of these."""
         chosen = unmasked("selection", selection(self) if callable(selection) else selection)
         ids = np.atleast_1d(np.arange(self.n_sites)[chosen])
         if ids.ndim != 1:
@@ -406,19 +404,21 @@ class Layout:
 
     def sort_by(self, *keys: str | ArrayLike, descending: bool = False) -> Layout:
         """
-        Layout with its sites in the order of one or more keys, the first the most important; equal sites keep their order.
+        Sort the sites by one or more keys, the first key being the primary one.
+
+        The sort is stable.
 
         Parameters
         ----------
         *keys : str or (n_site,) array
-            Names of columns, or values.
+            Names of columns, or arrays of values.
         descending : bool
-            The largest first.
+            Whether the largest values come first.
 
         Raises
         ------
         ParameterError
-            When there is no key, or one is no column or has not one value per site.
+            When there is no key, or a key is neither a column nor one value per site.
 
         Examples
         --------
@@ -437,7 +437,7 @@ class Layout:
                 raise ParameterError(
                     "keys", f"must have one value for each of the {self.n_sites} sites, got {value.shape}"
                 )
-            # Ranks, so that texts can be turned round as numbers can.
+            # Ranks, because strings cannot be negated for descending order.
             rank = np.unique(value, return_inverse=True)[1]
             values.append(-rank if descending else rank)
         if not values:
@@ -449,7 +449,7 @@ class Layout:
         )
 
     def with_columns(self, **columns: ArrayLike) -> Layout:
-        """Layout with these columns added or replaced."""
+        """Return the layout with columns added or replaced."""
         return self._with_columns(columns, f"columns {', '.join(columns)} set")
 
     def _with_columns(self, columns: Mapping[str, ArrayLike], step: str) -> Layout:
@@ -457,12 +457,12 @@ class Layout:
         return Layout._derived(self.xy_um, self.ring_offsets, self.site_offsets, merged, self._then(step))
 
     def translate(self, dx_um: float, dy_um: float) -> Layout:
-        """Layout moved by (dx, dy) in µm."""
+        """Translate the layout by (dx, dy) in µm."""
         step = np.array([check_number("dx_um", dx_um), check_number("dy_um", dy_um)])
-        return self._moved(self.xy_um + step, f"moved by ({dx_um:g}, {dy_um:g}) µm")
+        return self._moved(self.xy_um + step, f"translated by ({dx_um:g}, {dy_um:g}) µm")
 
     def rotate(self, angle_deg: float, origin_um: tuple[float, float] = (0.0, 0.0)) -> Layout:
-        """Layout turned counter-clockwise about a point; quarter turns about the origin are exact."""
+        """Rotate counter-clockwise about a point; multiples of 90° about the origin are exact."""
         angle_deg = check_number("angle_deg", angle_deg)
         quarters, rest = divmod(angle_deg, 90.0)
         exact = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
@@ -470,10 +470,10 @@ class Layout:
         centre = _point("origin_um", origin_um)
         # (A @ xy) row by row: x' = c x - s y, y' = s x + c y
         turned = (self.xy_um - centre) @ np.array([[c, s], [-s, c]]) + centre
-        return self._moved(turned, f"turned by {angle_deg:g} degrees")
+        return self._moved(turned, f"rotated by {angle_deg:g} degrees")
 
     def scale(self, factor: float, origin_um: tuple[float, float] = (0.0, 0.0)) -> Layout:
-        """Layout enlarged about a point."""
+        """Scale the layout about a point."""
         factor = check_number("factor", factor, above=0.0)
         centre = _point("origin_um", origin_um)
         return self._moved((self.xy_um - centre) * factor + centre, f"scaled by {factor:g}")
@@ -485,25 +485,25 @@ class Layout:
         return {**self.provenance, "steps": [*self.provenance.get("steps", []), step]}
 
     def write(self, path: str | Path, **options: Any) -> WrittenLayout:
-        """Write to a file whose ending tells the format; see :func:`foveasim.layout.write_layout`."""
+        """Write to a file, format by extension; see :func:`foveasim.layout.write_layout`."""
         from foveasim.layout.files import write_layout
 
         return write_layout(self, path, **options)
 
     def describe(self, readout: Readout | None = None) -> Summary:
-        """Counts, sizes, areas, channels and lines, for a table; see :func:`foveasim.layout.describe`."""
+        """Return counts, sizes, areas, channels and lines; see :func:`foveasim.layout.describe`."""
         from foveasim.layout.summary import describe
 
         return describe(self, readout)
 
     def to_pyvista(self) -> PolyData:
-        """The sites as PolyData with every column, for PyVista; see :func:`foveasim.view.polydata`."""
+        """Convert to PyVista PolyData with all columns; see :func:`foveasim.view.polydata`."""
         from foveasim.view import polydata
 
         return polydata(self)
 
     def plot(self, by: str | ArrayLike | None = None, **options: Any) -> Axes:
-        """Draw the layout on matplotlib axes, coloured by a column or an array; see :func:`foveasim.view.plot_layout`."""
+        """Draw on matplotlib axes, coloured by values; see :func:`foveasim.view.plot_layout`."""
         from foveasim.view import plot_layout
 
         return plot_layout(self, by, **options)
@@ -511,15 +511,15 @@ class Layout:
     # -- neighbours ----------------------------------------------------------------------------------------------
 
     def adjacency(self, *, max_gap_um: float | None = None) -> csr_array[Any]:
-        """Lengths of the edges that sites share, csr_array (n_site, n_site) µm; see :func:`foveasim.layout.adjacency`."""
+        """Compute shared edge lengths (n, n) in µm; see :func:`foveasim.layout.adjacency`."""
         from foveasim.layout.adjacency import adjacency
 
         return adjacency(self) if max_gap_um is None else adjacency(self, max_gap_um=max_gap_um)
 
-    # -- rules --------------------------------------------------------------------------------------------------
+    # -- design rules --------------------------------------------------------------------------------------------------
 
     def check(self, rules: DesignRules) -> Report:
-        """Report of the sites that break a rule; never raises for a broken rule."""
+        """Check design rules; violations are reported, not raised."""
         from foveasim.layout.drc.rules import check
 
         return check(self, rules)
@@ -527,17 +527,17 @@ class Layout:
     def enforce(
         self, rules: DesignRules, *, repair: Literal["drop", "merge"] = "drop"
     ) -> tuple[Layout, tuple[Change, ...]]:
-        """Layout that keeps the rules, and what was changed for it; see :func:`foveasim.layout.enforce`."""
+        """Repair violations of design rules; see :func:`foveasim.layout.enforce`."""
         from foveasim.layout.drc.repair import enforce
 
         return enforce(self, rules, repair=repair)
 
 
-# -- checks of polygons from outside --------------------------------------------------------------------------------
+# -- validation of input polygons --------------------------------------------------------------------------------
 
 
 def _offsets(name: str, offsets: ArrayLike, at_least: int, total: int, of_what: str) -> Ints:
-    """Offsets as int64, when they begin at 0, end at the total, and every step is large enough."""
+    """Return offsets as int64 after checks of their range and smallest step."""
     array = np.array(unmasked(name, offsets))
     if array.ndim != 1 or array.size < 1 or array.dtype.kind not in "iu":
         raise ParameterError(name, "must be a list of integers", offsets)
@@ -547,13 +547,13 @@ def _offsets(name: str, offsets: ArrayLike, at_least: int, total: int, of_what: 
     small = np.flatnonzero(np.diff(array) < at_least)
     if small.size:
         raise ParameterError(
-            name, f"must give every item at least {at_least} {of_what}; item {small[0]} has fewer", array
+            name, f"must assign at least {at_least} {of_what} to each item, but item {small[0]} has fewer", array
         )
     return array
 
 
 def _column(name: str, values: ArrayLike) -> NDArray[Any]:
-    """A column of data as an array of numbers or text."""
+    """Convert a data column to an array of numbers or strings."""
     values = unmasked(name, values)
     try:
         column = np.array(values)
@@ -568,12 +568,12 @@ def _column(name: str, values: ArrayLike) -> NDArray[Any]:
                 raise ParameterError(name, f"must contain {INTEGER_RANGES}", values)
             return integers
     if column.dtype.hasobject:
-        raise ParameterError(name, "must be an array of numbers or text", values)
+        raise ParameterError(name, "must be an array of numbers or strings", values)
     return column
 
 
 def _require_indices(name: str, column: NDArray[Any]) -> None:
-    """Reject integers that no filter or line can have as its index."""
+    """Check that integers are valid indices of filters or lines."""
     if column.dtype.kind in "iu" and column.size:
         worst = int(column.min()) if column.min() < 0 else int(column.max())
         if not 0 <= worst <= MAX_SITES:
@@ -596,7 +596,7 @@ def _packed(xy_um: ArrayLike, ring_offsets: ArrayLike, site_offsets: ArrayLike) 
 
 
 def _unpacked(polygons: Any) -> tuple[Floats, Ints, Ints]:
-    """Packed rings of shapely polygons, closing vertex included."""
+    """Return packed rings of shapely polygons, closing vertices included."""
     items = polygons.geoms if hasattr(polygons, "geoms") else polygons
     if isinstance(items, str | bytes | shapely.Geometry) or not isinstance(items, Iterable):
         raise ParameterError("polygons", "must be a sequence of shapely polygons, or packed rings", items)
@@ -606,7 +606,9 @@ def _unpacked(polygons: Any) -> tuple[Floats, Ints, Ints]:
         bad = int(np.flatnonzero(~is_polygon)[0])
         kind = type(geometries[bad]).__name__
         is_geometry = isinstance(geometries[bad], shapely.Geometry)
-        hint = "give each part of it as a site of its own" if is_geometry else "make one with shapely.Polygon(vertices)"
+        hint = (
+            "pass each of its parts as a separate site" if is_geometry else "create one with shapely.Polygon(vertices)"
+        )
         raise GeometryError(
             f"site {bad} must be a shapely Polygon, got a {kind}; {hint}",
             (bad,),
@@ -619,7 +621,7 @@ def _unpacked(polygons: Any) -> tuple[Floats, Ints, Ints]:
 
 
 def _per_site(is_bad: Bools, ring_offsets: Ints, site_offsets: Ints) -> Bools:
-    """Whether any coordinate (n_vertex, 2) of a site is bad, (n_site,)."""
+    """Return whether any coordinate (n_vertex, 2) of each site is flagged, (n_site,)."""
     if site_offsets.size == 1:
         return np.zeros(0, bool)
     return np.asarray(np.logical_or.reduceat(np.any(is_bad, axis=1), ring_offsets[site_offsets[:-1]]))
@@ -635,12 +637,12 @@ def _require(is_bad_site: Bools, what: str) -> None:
 
 
 def _require_sound_holes(layout: Layout) -> None:
-    """Sites with holes must be valid, and their holes wound clockwise; where there are none, this costs nothing."""
+    """Check that sites with holes are valid, and that their holes are wound clockwise."""
     if layout.ring_offsets.size == layout.site_offsets.size:
         return
     has_holes = np.diff(layout.site_offsets) > 1
     area_um2, _ = ring_moments(layout.xy_um, layout.ring_offsets)
-    area_um2[layout.site_offsets[:-1]] *= -1.0  # so that all rings count alike
+    area_um2[layout.site_offsets[:-1]] *= -1.0  # so that valid outlines and holes have the same sign
     _require(
         has_holes & np.logical_or.reduceat(area_um2 >= 0.0, layout.site_offsets[:-1]),
         "has a hole that is wound the wrong way, or has no area",
@@ -650,7 +652,7 @@ def _require_sound_holes(layout: Layout) -> None:
 
 
 def _require_valid(layout: Layout, sites: Ints | None = None, n_sites: int = 0) -> None:
-    """Sites must be valid polygons in the sense of OGC; those given are all, or have these numbers among more."""
+    """Check that all sites are valid OGC polygons; ``sites`` are indices in a larger layout."""
     is_bad = ~valid_sites(layout)
     if not is_bad.any():
         return
@@ -663,9 +665,9 @@ def _require_valid(layout: Layout, sites: Ints | None = None, n_sites: int = 0) 
 
 def valid_sites(layout: Layout) -> Bools:
     """
-    Whether each site is a valid polygon in the sense of OGC, (n_site,) bool.
+    Return whether each site is a valid OGC polygon, (n_site,) bool.
 
-    No ring crosses itself or another, and holes lie inside. Only outlines that are not convex are passed to shapely.
+    Rings of a valid polygon do not cross, and holes lie inside the outline. Only concave outlines are passed to shapely.
     """
     outlines, n_rings = layout.site_offsets[:-1], np.diff(layout.site_offsets)
     is_valid = (n_rings == 1) & are_convex(layout.xy_um, layout.ring_offsets)[outlines]
@@ -676,7 +678,7 @@ def valid_sites(layout: Layout) -> Bools:
 
 
 def _without_repeats(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Ints]:
-    """Rings without vertices that equal the one after; so also without a closing vertex."""
+    """Remove vertices equal to the next one, closing vertices included."""
     if ring_offsets.size == 1:
         return xy_um, ring_offsets
     is_new = (xy_um != xy_um[next_vertex(ring_offsets)]).any(axis=1)
@@ -685,7 +687,7 @@ def _without_repeats(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Ints]:
 
 
 def _wound(xy_um: Floats, ring_offsets: Ints, is_reversed: Bools) -> Floats:
-    """Vertices with some rings turned round, their first vertex staying first."""
+    """Reverse some rings, without change of their first vertices."""
     n_vertices = np.diff(ring_offsets)
     ring_of = np.repeat(np.arange(n_vertices.size), n_vertices)
     position = positions_in_runs(n_vertices)
@@ -694,5 +696,5 @@ def _wound(xy_um: Floats, ring_offsets: Ints, is_reversed: Bools) -> Floats:
 
 
 def _ranges(starts: Ints, stops: Ints) -> Ints:
-    """The numbers of all half-open ranges, one range after the other."""
+    """Return the concatenated indices of half-open ranges."""
     return np.repeat(starts, stops - starts) + positions_in_runs(stops - starts)

@@ -1,4 +1,4 @@
-"""A layout as named arrays, to lie in one file with others."""
+"""Conversion of layouts to and from named arrays, for files with several objects."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from foveasim.layout.model import Layout
 __all__ = ["is_of_layout", "packed_layout", "unpacked_layout"]
 
 OUTLINES = ("xy_um", "ring_offsets", "site_offsets")
-#: How a column is named among the arrays.
+#: Prefix of the array name of a column.
 COLUMN_PREFIX = "column_"
 
 
 def packed_layout(layout: Layout) -> dict[str, NDArray[Any]]:
-    """Outlines and columns by name."""
+    """Return the outlines and columns of a layout as arrays by name."""
     arrays = {name: np.asarray(getattr(layout, name)) for name in OUTLINES}
     return arrays | {COLUMN_PREFIX + name: values for name, values in layout.columns.items()}
 
 
 def unpacked_layout(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str, Any]) -> Layout:
     """
-    The layout among arrays; of untrusted outlines, only structure and holes are checked.
+    Build a layout from named arrays; only structure and holes of the outlines are checked.
 
     Raises
     ------
     KeyError
-        When an array of its outlines is not there.
+        When an array of the outlines is missing.
     GeometryError, ParameterError
-        When the arrays do not fit together, holes do not lie in their outlines, or a column is malformed.
+        When array sizes are inconsistent, holes do not lie in their outlines, or a column is malformed.
     """
     from foveasim.layout.files._common import check_sizes
 
@@ -47,5 +47,5 @@ def unpacked_layout(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str,
 
 
 def is_of_layout(name: str) -> bool:
-    """Whether an array of this name is a layout's."""
+    """Return whether an array of this name belongs to a layout."""
     return name in OUTLINES or name.startswith(COLUMN_PREFIX)

@@ -1,4 +1,4 @@
-"""Which line each photosite is read through, and in which order."""
+"""Readout lines of photosites, and the readout order along each line."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ __all__ = ["nearest_bus", "readout_by", "readout_order"]
 
 def readout_by(layout: Layout, column: str) -> Layout:
     """
-    The layout read through lines that a column numbers: ``column``, ``row``, ``sector`` (spokes), ``ring``.
+    Assign readout lines by a column: ``column``, ``row``, ``sector`` or ``ring``.
 
     Parameters
     ----------
     layout : Layout
     column : str
-        Name of a column of integers from 0.
+        Name of a column of integers >= 0, the indices of the lines.
 
     Returns
     -------
     Layout
-        With the column ``readout_line``, and the lines' order of sites in ``readout_order`` (see :func:`readout_order`).
+        With the columns ``readout_line`` and ``readout_order`` (see :func:`readout_order`).
 
     Raises
     ------
@@ -40,13 +40,13 @@ def readout_by(layout: Layout, column: str) -> Layout:
 
 def nearest_bus(layout: Layout, buses: Sequence[Any]) -> Layout:
     """
-    The layout with every site read through the bus that its centre is nearest to.
+    Assign each site to the readout bus nearest to its centroid.
 
     Parameters
     ----------
     layout : Layout
     buses : sequence of shapely geometries, µm
-        Usually LineStrings; bus k is readout line k. Of two equally near ones the first is taken.
+        Usually LineStrings; bus k is readout line k. At equal distances the first bus is taken.
 
     Returns
     -------
@@ -56,7 +56,7 @@ def nearest_bus(layout: Layout, buses: Sequence[Any]) -> Layout:
     Raises
     ------
     ParameterError
-        When there is no bus, or one is no geometry.
+        When there is no bus, or one is not a geometry.
     """
     lines = list(buses) if isinstance(buses, Sequence | np.ndarray) else []
     if not lines or not all(isinstance(line, shapely.Geometry) and not line.is_empty for line in lines):
@@ -69,7 +69,7 @@ def nearest_bus(layout: Layout, buses: Sequence[Any]) -> Layout:
 
 def readout_order(layout: Layout) -> Layout:
     """
-    The layout with the order in which each line reads its sites: from the bottom, and from the left where level.
+    Order the sites of each readout line by y, and by x where y is equal.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def readout_order(layout: Layout) -> Layout:
     Returns
     -------
     Layout
-        With the column ``readout_order``, numbered from 0 in each ``readout_line``: lines are read side by side.
+        With the column ``readout_order``, counted from 0 in each ``readout_line``: lines are read in parallel.
     """
     line = layout.readout_line
     order = np.lexsort((layout.centroid_um[:, 0], layout.centroid_um[:, 1], line))

@@ -1,4 +1,4 @@
-"""What a layout is, in a dozen numbers."""
+"""Summary figures of a layout: counts, sizes, areas, channels and readout lines."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ if TYPE_CHECKING:
 
 __all__ = ["Summary", "describe"]
 
-#: Classes of size in a histogram, at most.
+#: Maximum number of size classes of a histogram.
 SIZE_CLASSES = 12
-#: Sizes that differ by less than this share are one class.
+#: Relative difference below which all sizes form one class.
 SIZE_ROUNDING = 1e-6
-#: Characters of the longest bar of a histogram.
+#: Length of the longest histogram bar, in characters.
 BAR_WIDTH = 40
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Summary:
     """
-    A layout in numbers.
+    Summary figures of a layout.
 
     Attributes
     ----------
     n_sites, n_vertices : int
     bounds_um : (x_min, y_min, x_max, y_max), µm
     area_um2 : float, µm²
-        Of all sites together.
+        Total area of all sites.
     fill_factor : float
-        That area as a fraction of the layout's convex hull.
+        Total area as a fraction of the area of the convex hull.
     size_um : (5,) float64, µm
-        Smallest, lower quartile, median, upper quartile and largest pixel size, the square root of a site's area.
+        Minimum, lower quartile, median, upper quartile and maximum pixel size, the square root of the area of a site.
     size_edges_um, size_counts : (n_class + 1,) float64 µm and (n_class,) int64
-        Histogram of the sizes, classes of equal ratios.
+        Histogram of the sizes, with class limits of equal ratios.
     channels : mapping of int to int
-        Sites of each colour filter.
+        Number of sites per colour filter.
     n_lines : int
-        Readout lines.
+        Number of readout lines.
     readout : Readout or None
     origin : str
-        The generator, or how the layout was made.
+        Name of the generator, or of the function that made the layout.
     """
 
     n_sites: int
@@ -67,7 +67,7 @@ class Summary:
     origin: str
 
     def rows(self) -> list[tuple[str, str]]:
-        """Names and values as text, in the order of the table."""
+        """Return names and values as strings, in the order of the table."""
         x0, y0, x1, y1 = self.bounds_um
         low, lower, middle, upper, high = self.size_um
         rows = [
@@ -77,7 +77,7 @@ class Summary:
             ("field", f"{x1 - x0:.6g} x {y1 - y0:.6g} µm, from ({x0:.6g}, {y0:.6g}) to ({x1:.6g}, {y1:.6g})"),
             ("area", f"{self.area_um2:,.6g} µm²"),
             ("fill factor", f"{100.0 * self.fill_factor:.4g} % of the convex hull"),
-            ("pixel size", f"{low:.4g} to {high:.4g} µm, median {middle:.4g}, half of them {lower:.4g} to {upper:.4g}"),
+            ("pixel size", f"{low:.4g} to {high:.4g} µm, median {middle:.4g}, quartiles {lower:.4g} and {upper:.4g}"),
             ("channels", ", ".join(f"{channel}: {n:,}" for channel, n in self.channels.items())),
             ("readout lines", f"{self.n_lines:,}"),
         ]
@@ -91,7 +91,7 @@ class Summary:
         return rows
 
     def records(self) -> list[dict[str, Any]]:
-        """One dict a class of the size histogram: its limits in µm and the number of sites."""
+        """Return one dict per class of the size histogram: limits in µm and number of sites."""
         edges = self.size_edges_um.tolist()
         return [
             {"from_um": low, "to_um": high, "n_sites": int(n)}
@@ -123,25 +123,25 @@ class Summary:
 
 def describe(layout: Layout, readout: Readout | None = None) -> Summary:
     """
-    Counts, sizes, areas, channels and lines of a layout.
+    Summarise a layout: counts, sizes, areas, channels and readout lines.
 
     Parameters
     ----------
     layout : Layout
     readout : Readout, optional
-        For the data rate.
+        Frame rate, bit depth and lanes, for the data rate.
 
     Returns
     -------
     Summary
-        Prints as a table with a histogram in rich's console.
+        Rendered as a table with a histogram by a rich console.
 
     Raises
     ------
     GeometryError
         When the layout has no sites.
     ParameterError
-        When the readout is no Readout.
+        When ``readout`` is not a Readout.
     """
     if readout is not None and not isinstance(readout, Readout):
         raise ParameterError("readout", "must be a Readout", readout)
@@ -167,7 +167,7 @@ def describe(layout: Layout, readout: Readout | None = None) -> Summary:
 
 
 def _classes_um(low_um: float, high_um: float) -> Floats:
-    """Limits of classes of equal ratios that hold all sizes; one class where all are equal."""
+    """Return class limits of equal ratios that contain all sizes; one class for equal sizes."""
     if high_um <= low_um * (1.0 + SIZE_ROUNDING):
         return np.array([low_um * (1.0 - SIZE_ROUNDING), high_um * (1.0 + SIZE_ROUNDING)])
     edges_um = np.geomspace(low_um, high_um, SIZE_CLASSES + 1)

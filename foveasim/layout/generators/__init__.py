@@ -1,4 +1,4 @@
-"""Generators of layouts, one module per family; each registers itself in :data:`foveasim.layout.LAYOUTS`."""
+"""Layout generators, one module per family, registered in :data:`foveasim.layout.LAYOUTS`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rings of sites around the optical axis, neighbours sharing every point of their arcs: what the log-polar families share."""
+"""Concentric rings of sites with common vertices on arcs, for the log-polar families."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from foveasim._core.validation import Floats, Ints
 
 __all__ = ["MIN_SITES_PER_RHO", "Annuli", "Fovea", "Ring", "annuli", "fovea_rings", "ring_outlines"]
 
-#: A ring of the fovea has at least so many sites for each unit of its radius.
+#: Minimum number of sites of a ring of the fovea, per unit of its radius.
 MIN_SITES_PER_RHO = 3
-#: What fills the middle: nothing, rings of as many sites as their radius asks, rings cut by the same spokes, hexagons.
+#: Filling of the centre: none, rings with sites in proportion to the radius, linear-polar rings of the same sectors, hexagons.
 Fovea: TypeAlias = Literal["none", "rings", "linear", "hexagons"]
 
 
 class Ring(NamedTuple):
-    """A ring's sites, the half sectors that it is turned by, and the chords that each of its arcs is cut into."""
+    """Number of sites of a ring, rotation in half sectors, and number of chords per arc."""
 
     n_sites: int
     turn: int
@@ -27,7 +27,7 @@ class Ring(NamedTuple):
 
 
 class Annuli(NamedTuple):
-    """Outlines of all sites, ring by ring from the inside: packed rings, and each site's ring and place in it."""
+    """Packed outlines of all sites from the innermost ring, with ring and sector indices."""
 
     xy_um: Floats
     ring_offsets: Ints
@@ -36,7 +36,7 @@ class Annuli(NamedTuple):
 
 
 class _Circle(NamedTuple):
-    """Points of a circle, counter-clockwise, and where they lie on it in ``n_steps`` steps of a whole turn."""
+    """Points of a circle, counter-clockwise, and their angles in steps of 360° / ``n_steps``."""
 
     xy_um: Floats
     step: Ints
@@ -45,19 +45,19 @@ class _Circle(NamedTuple):
 
 def annuli(radii_um: Floats, rings: Sequence[Ring]) -> Annuli:
     """
-    Sites of concentric rings.
+    Return the sites of concentric rings.
 
     Parameters
     ----------
     radii_um : (n_ring + 1,) float64, µm
-        Circles between which the rings lie, growing; the first may be 0 for one site or for sectors in the middle.
+        Increasing radii of the circles between the rings; the first may be 0 for one site or for sectors at the centre.
     rings : sequence of Ring
-        Only the innermost may have one site alone.
+        Only the innermost ring may have a single site.
 
     Returns
     -------
     Annuli
-        An arc has the corners of the sites on both of its sides, so that nothing is left open or covered twice.
+        Each arc has the corners of the sites on both of its sides, so there are no gaps or overlaps.
     """
     outlines, n_vertices = [], []
     has_disc = rings[0].n_sites == 1
@@ -83,20 +83,22 @@ def fovea_rings(
     filling: Literal["rings", "linear"], *, n_rings: int, n_sectors: int, n_per_ring: int, n_chords: int
 ) -> tuple[Floats, list[Ring]]:
     """
-    Circles and rings that fill a disc: ring 0 one site of half a unit's radius, each other ring one unit high.
+    Return circles and rings that fill a disc.
+
+    Ring 0 is one site with a radius of half a unit; all other rings have a height of one unit.
 
     Parameters
     ----------
     filling : {"rings", "linear"}
-        ``"rings"``: ring ρ holds ``n_per_ring · ρ`` sites. ``"linear"``: linear-polar, cut by the spokes of the rings
-        outside, of which ring ρ has as many as leave its sites one unit of arc on their centre line.
+        ``"rings"``: ring ρ has ``n_per_ring · ρ`` sites. ``"linear"``: linear-polar, with sector boundaries of the outer
+        rings; ring ρ has as many sectors as possible with an arc of at least one unit on the centre line.
     n_rings, n_sectors, n_per_ring, n_chords : int
-        Rings in the fovea, sites of a ring outside it, sites that a ring has more than the one inside it, chords an arc.
+        Number of rings in the fovea, sites per ring outside it, increment of sites per ring, chords per arc.
 
     Returns
     -------
     radii : (n_rings + 1,) float64
-        0, 1/2, 3/2, ... in units: the rings' height.
+        0, 1/2, 3/2, ... in units of the ring height.
     rings : list of Ring
     """
     radii = np.concatenate(([0.0], np.arange(n_rings) + 0.5))
@@ -106,7 +108,7 @@ def fovea_rings(
         divisors = np.array([d for d in range(1, n_sectors + 1) if n_sectors % d == 0])
         rho = np.arange(n_rings)
         place = np.searchsorted(divisors, 2.0 * math.pi * rho, side="right") - 1
-        # Fewer than 3ρ corners, and a ring's inner circle would cross its outer one.
+        # With fewer than 3ρ corners, the inner circle of a ring would cross its outer one.
         place = np.where(divisors[place] < MIN_SITES_PER_RHO * rho, place + 1, place)
         counts = divisors[np.minimum(place, divisors.size - 1)]
     counts[0] = 1
@@ -117,22 +119,22 @@ def ring_outlines(
     outer_um: Floats, outer_first: Ints, outer_last: Ints, inner_um: Floats, inner_first: Ints, inner_last: Ints
 ) -> tuple[Floats, Ints]:
     """
-    Outlines of the sites of a ring between two closed loops of points, each loop counter-clockwise and shared.
+    Return the outlines of the sites of a ring between two closed loops of points.
 
     Parameters
     ----------
     outer_um, inner_um : (n_point, 2) float64, µm
-        The loops.
+        The loops, counter-clockwise, shared with the adjacent rings.
     outer_first, outer_last, inner_first, inner_last : (n_site,) int64
-        Each site's corners on them, as positions that run on beyond a loop's end; a site has the points between its
-        corners as well, and so its neighbours' corners.
+        Positions of the corners of each site on the loops, unwrapped beyond the end of a loop. A site includes the points
+        between its corners, and therefore the corners of its neighbours.
 
     Returns
     -------
     xy_um : (n_vertex, 2) float64, µm
-        Site after site: its part of the outer loop, then its part of the inner loop backwards.
+        Site after site: its part of the outer loop, then its part of the inner loop in reverse.
     n_vertices : (n_site,) int64
-        How many vertices each has.
+        Number of vertices of each site.
     """
     n_outer = outer_last - outer_first + 1
     n_vertices = n_outer + inner_last - inner_first + 1
@@ -148,7 +150,7 @@ def ring_outlines(
 
 
 def _circle(radius_um: float, rings: Sequence[Ring]) -> _Circle:
-    """Circle with the corners and chords of the rings on both of its sides; those that coincide are one point."""
+    """Return a circle with the distinct corners and chord ends of the rings on both sides."""
     meeting = [ring for ring in rings if ring.n_sites > 1]
     if radius_um <= 0.0 or not meeting:
         return _Circle(np.zeros((1, 2)), np.zeros(1, np.int64), 1)
@@ -163,7 +165,7 @@ def _circle(radius_um: float, rings: Sequence[Ring]) -> _Circle:
 
 
 def _ends(circle: _Circle, ring: Ring) -> tuple[Ints, Ints]:
-    """Positions of the first and last corner of each site of a ring on a circle."""
+    """Return the positions of the first and last corner of each site of a ring on a circle."""
     if circle.n_steps == 1:  # the axis
         nowhere = np.zeros(ring.n_sites, np.int64)
         return nowhere, nowhere

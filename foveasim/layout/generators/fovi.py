@@ -1,4 +1,4 @@
-"""The isotropic foveal layout: rings around a central site, as far apart as their sites are from each other."""
+"""Isotropic foveal layout: rings with equal radial and tangential spacing of sites."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from foveasim.layout.model import Layout
 
 __all__ = ["fovi"]
 
-#: Rings around the centre, at most; MAX_SITES is met before.
+#: Maximum number of rings; MAX_SITES is reached before.
 MAX_RINGS = 10_000
-#: Chords of the outline for each site of the outermost ring.
+#: Chords of the outline per site of the outermost ring.
 CHORDS_PER_SITE = 4
 
 
 @layout_family(example={"fov_um": 36.0, "a_um": 3.0, "n_rings": 12})
 def fovi(*, fov_um: float, a_um: float, n_rings: int, n_chords: int | None = None) -> Layout:
     """
-    A central site and rings around it whose spacing grows with the radius, no site wider than it is high.
+    Generate isotropic rings around a central site, with a spacing that grows outwards.
 
     ::
 
-               ╱ ─ · ─ ╲              · centre of a site; its outline is its Voronoi cell
+               ╱ ─ · ─ ╲              · centre of a site; the outline is its Voronoi cell
              ·  ╱ ─·─ ╲  ·
-            │  ·   ·   ·  │           ring i: r_i = e^w_i - a,  w even on [ln a, ln(fov/2 + a)]
-             ·  ╲ ─·─ ╱  ·            it has ceil(2π r_i / dr_i) sites,  dr_i = (r_(i+1) - r_(i-1)) / 2
+            │  ·   ·   ·  │           ring i: r_i = e^w_i - a,  w uniform on [ln a, ln(fov/2 + a)]
+             ·  ╲ ─·─ ╱  ·            has ceil(2π r_i / dr_i) sites,  dr_i = (r_(i+1) - r_(i-1)) / 2
                ╲ ─ · ─ ╱
             ├─────────────┤
                  fov_um, from centre to centre of the outermost ring
@@ -40,32 +40,31 @@ def fovi(*, fov_um: float, a_um: float, n_rings: int, n_chords: int | None = Non
     Parameters
     ----------
     fov_um : float, µm
-        Diameter of the outermost ring's centres. Half a step of the rule beyond it the layout ends.
+        Diameter of the outermost ring, through the centres of its sites. The layout ends half a step of w further out.
     a_um : float, µm
-        Radius of the fovea: spacing is even far inside it, and grows in proportion to the radius far outside.
+        Radius of the fovea: the spacing is uniform far inside it, and proportional to the radius far outside.
     n_rings : int
-        Rings around the central site.
+        Number of rings around the central site.
     n_chords : int, optional
-        Sides of the regular polygon that stands for the outline of the layout; by default 4 for each site of the outermost
-        ring.
+        Number of sides of the regular polygon that approximates the circular outline of the layout; by default 4 for each
+        site of the outermost ring.
 
     Returns
     -------
     Layout
-        Ring by ring from the central site, with the columns ``ring``, ``sector`` (from angle 0 on), ``readout_line`` (the
-        ring). ``provenance`` tells ``radius_um``, that of the outline's corners.
+        Ring by ring from the central site, with the columns ``ring``, ``sector`` (from angle 0), ``readout_line`` (the
+        ring). ``provenance`` contains ``radius_um``, the circumradius of the outline.
 
     Raises
     ------
     ParameterError
         When a number is out of range, there would be too many sites, or chords would cut through centres.
     GeometryError
-        When the central sites are too small beside the field for float64.
+        When the central sites are too small relative to the field for float64.
 
     Notes
     -----
-    There is no blind spot for any ``a_um > 0``. The radii are those of the rule one step further for the spacing at the
-    outermost ring.
+    There is no blind spot for any ``a_um > 0``. The spacing at the outermost ring uses the radius of one further ring.
 
     Examples
     --------
@@ -76,7 +75,7 @@ def fovi(*, fov_um: float, a_um: float, n_rings: int, n_chords: int | None = Non
     fov_um, a_um = check_length_um("fov_um", fov_um), check_length_um("a_um", a_um)
     n_rings = check_count("n_rings", n_rings, at_most=MAX_RINGS)
     step = math.log1p(0.5 * fov_um / a_um) / n_rings
-    # e^w - a with w = ln a + i step, without the loss of digits
+    # e^w - a with w = ln a + i step, without cancellation
     r_um = a_um * np.expm1(step * np.arange(n_rings + 2))
     r_um[n_rings] = 0.5 * fov_um
     counts = _counts(r_um)
@@ -104,13 +103,13 @@ def fovi(*, fov_um: float, a_um: float, n_rings: int, n_chords: int | None = Non
 
 
 def _counts(r_um: Floats) -> Ints:
-    """Sites on each ring but the last radius, which only tells the spacing of the one inside it."""
+    """Return the sites per ring; the last radius only defines the spacing before it."""
     spacing_um = 0.5 * (r_um[2:] - r_um[:-2])
     if not (np.diff(r_um) > 0.0).all():
-        raise ParameterError("n_rings", "must leave the rings some width", r_um.size - 2, hint="take fewer rings")
+        raise ParameterError("n_rings", "must leave each ring a positive width", r_um.size - 2, hint="take fewer rings")
     return np.concatenate(([1], np.ceil(2.0 * math.pi * r_um[1:-1] / spacing_um).astype(np.int64)))
 
 
 def _fewest_chords(inner_um: float, outer_um: float) -> int:
-    """Chords of the outer circle that leave the inner circle whole."""
+    """Return the minimum number of outer chords that do not cut the inner circle."""
     return max(3, math.floor(math.pi / math.acos(inner_um / outer_um)) + 1)

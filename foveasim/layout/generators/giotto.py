@@ -1,9 +1,9 @@
 """
-The log-polar layout by the Giotto rule: a fovea of rings of unit height, and around it rings that grow.
+Log-polar layout by the Giotto rule: a fovea of unit rings, then growing rings.
 
-The rule fixes how much a ring is larger than the one inside it by the whole diameter: with ``E = n_rho - n_fovea`` rings
-outside the fovea and R smallest pixels across, ``λ (λ^E - 1) / (λ - 1) = R / 2 - n_fovea + 0.5``, since the rings' heights
-are ``λ, λ², ... λ^E`` and the fovea's edge lies at ``n_fovea - 0.5``.
+The total diameter determines the ratio λ of the heights of adjacent rings. With ``E = n_rho - n_fovea`` rings outside the
+fovea and a diameter of R smallest pixels, ``λ (λ^E - 1) / (λ - 1) = R / 2 - n_fovea + 0.5``: the heights of the rings are
+``λ, λ², ... λ^E``, and the boundary of the fovea has the radius ``n_fovea - 0.5``.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from foveasim.layout.model import Layout
 
 __all__ = ["giotto", "giotto_ratio"]
 
-#: log λ is solved to this; the ratio itself then has fifteen digits.
+#: Absolute tolerance of log λ; the ratio itself then has fifteen significant digits.
 LOG_RATIO_ROUNDING = 1e-16
 
 
 def giotto_ratio(*, n_rho: int, n_fovea: int, n_across: int) -> float:
     """
-    Ratio λ of the heights of neighbouring rings outside the fovea.
+    Compute the ratio λ of the heights of adjacent rings outside the fovea.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def giotto_ratio(*, n_rho: int, n_fovea: int, n_across: int) -> float:
     Raises
     ------
     ParameterError
-        When a number is out of range, or so few pixels across that rings would shrink outwards.
+        When a number is out of range, or the diameter is so small that rings would shrink outwards.
 
     Examples
     --------
@@ -61,7 +61,7 @@ def giotto(
     chords_per_arc: int = 1,
 ) -> Layout:
     """
-    Rings around the optical axis: ``n_fovea`` of one unit's height, then rings each λ times as high as the one inside.
+    Generate ``n_fovea`` rings of unit height, then rings that grow by the ratio λ.
 
     ::
 
@@ -69,7 +69,7 @@ def giotto(
             ╱   ╭───┬───┴───┬───╮   ╲     ...
            │  ╱   ╭─┴─┬───┬─┴─╮   ╲  │    ring n_fovea: n_theta sites, λ units high
            │ │   │ ╭──┴─┬─┴──╮ │   │ │    ring ρ of the fovea: (n_theta // n_fovea) · ρ sites, one unit high
-           ├─┼───┼─┤    o    ├─┼───┼─┤    ring 0: one site, of half a unit's radius
+           ├─┼───┼─┤    o    ├─┼───┼─┤    ring 0: one site with a radius of half a unit
            │ │   │ ╰──┬─┴─┬──╯ │   │ │
            │  ╲   ╰─┬─┴───┴─┬─╯   ╱  │
             ╲   ╰───┴───┬───┴───╯   ╱
@@ -79,44 +79,44 @@ def giotto(
     Parameters
     ----------
     n_rho : int
-        All rings, ring 0 included.
+        Number of rings, including ring 0.
     n_theta : int
-        Sites of a ring outside the fovea; at least 3 for each of the fovea's rings.
+        Number of sites per ring outside the fovea; at least 3 per ring of the fovea.
     n_fovea : int
-        Rings of the fovea, which reaches to the radius ``n_fovea - 0.5``.
+        Number of rings of the fovea, whose radius is ``n_fovea - 0.5``.
     n_across : int
-        Diameter of the whole in smallest pixels, more than ``2 n_rho - 1``.
+        Diameter of the layout in smallest pixels, more than ``2 n_rho - 1``.
     unit_um : float, µm
-        The smallest pixel: the height of the fovea's rings.
+        Size of the smallest pixel: the height of the rings of the fovea.
     fovea : {"rings", "linear", "hexagons", "none"}
-        What fills the fovea: rings of (n_theta // n_fovea) · ρ sites; rings cut by some of the spokes outside, with sites at
-        least a unit wide where n_theta has the divisors; hexagons of a unit's area, those at the border larger; nothing, which
-        is the blind spot.
+        Filling of the fovea. ``"rings"``: rings of (n_theta // n_fovea) · ρ sites. ``"linear"``: rings with some of the
+        sector boundaries outside, and sites at least one unit wide if n_theta has suitable divisors. ``"hexagons"``: hexagons
+        with an area of one square unit, larger at the boundary. ``"none"``: no sites, a blind spot.
     stagger : bool
-        Turn every second ring outside the fovea by half a sector, π / n_theta.
+        Rotate every second ring outside the fovea by half a sector, π / n_theta.
     chords_per_arc : int
-        Straight edges that stand for an arc. Where ``stagger`` would set odd numbers of chords against each other, arcs
-        outside the fovea get twice as many. In the fovea an arc has also the corners of the neighbours across it, so
-        that nothing is left open or covered twice.
+        Number of straight edges that approximate an arc. With ``stagger`` and an odd number, arcs outside the fovea have
+        twice as many. In the fovea, arcs include the corners of the neighbours on the other side, so there are no gaps or
+        overlaps.
 
     Returns
     -------
     Layout
-        Ring by ring from the inside, with the columns ``ring`` (ρ, which begins at ``n_fovea`` without a fovea),
-        ``sector`` and ``readout_line`` (the one of ``n_theta`` spokes in which the site begins; of a hexagon, its middle).
-        Hexagons are the ring ``n_fovea - 1``. ``provenance`` tells ``ring_ratio``, λ, and without a fovea
+        Ring by ring from the inside, with the columns ``ring`` (ρ, from ``n_fovea`` without a fovea), ``sector`` and
+        ``readout_line`` (the one of ``n_theta`` sectors in which the site begins, or which contains the centre of a hexagon).
+        Hexagons have the ring ``n_fovea - 1``. ``provenance`` contains ``ring_ratio``, λ, and without a fovea
         ``blind_radius_um``.
 
     Raises
     ------
     ParameterError
-        When a number is out of range, or the rule has no rings that grow.
+        When a number is out of range, or the rule results in rings that do not grow.
 
     Notes
     -----
-    A site of the fovea is ``2π / (n_theta // n_fovea)`` units wide on its centre line: 1.05 units when there are six for
-    each ring. The edge of ring ρ outside the fovea lies at ``A + B λ^(ρ - n_fovea)`` with ``B = λ / (λ - 1)`` and
-    ``A = n_fovea - B - 0.5``.
+    The n sites of ring ρ of the fovea, ``n = (n_theta // n_fovea) ρ``, have the width ``2π ρ / n`` units on the centre line:
+    1.05 units for n = 6 ρ. The inner radius of ring ρ outside the fovea is ``A + B λ^(ρ - n_fovea)`` with
+    ``B = λ / (λ - 1)`` and ``A = n_fovea - B - 0.5``.
 
     Examples
     --------
@@ -181,24 +181,27 @@ def _log_ratio(n_rho: int, n_fovea: int, n_across: int) -> float:
 
     n_rho = check_count("n_rho", n_rho, at_least=2, at_most=MAX_SITES)
     n_fovea = check_count(
-        "n_fovea", n_fovea, at_most=n_rho - 1, hint="'n_rho' counts the fovea's rings and at least one around them"
+        "n_fovea",
+        n_fovea,
+        at_most=n_rho - 1,
+        hint="'n_rho' includes the rings of the fovea and at least one around them",
     )
     n_across = check_count("n_across", n_across, at_most=2**53)
     if n_across < 2 * n_rho:
         raise ParameterError(
             "n_across",
-            f"must be > {2 * n_rho - 1}, the diameter of {n_rho} rings that do not grow",
+            f"must be > {2 * n_rho - 1}, the diameter of {n_rho} rings of unit height",
             n_across,
-            hint="take more, or fewer rings",
+            hint="take a larger diameter, or fewer rings",
         )
     n_rings = n_rho - n_fovea
     width = 0.5 * n_across - n_fovea + 0.5
 
     def excess(x: float) -> float:
-        """Summed heights of the rings, less the width that they have, at the logarithm x of the ratio."""
+        """Return the total ring height minus the required one, for the logarithm x of the ratio."""
         heights = math.exp(x) * math.expm1(n_rings * x) / math.expm1(x) if x > 0.0 else float(n_rings)
         return heights - width
 
-    # The last ring alone is no higher than all of them together.
+    # Upper bracket: the last ring is no higher than all rings together.
     largest = math.log(width) / n_rings * (1.0 + 1e-9)
     return float(brentq(excess, 0.0, largest, xtol=LOG_RATIO_ROUNDING, rtol=4 * np.finfo(np.float64).eps))

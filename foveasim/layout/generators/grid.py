@@ -1,4 +1,4 @@
-"""The rectangular grid."""
+"""Rectangular grid."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def grid(
     stagger: bool = False,
 ) -> Layout:
     """
-    Square or rectangular photosites in rows and columns, the middle of the grid on the optical axis.
+    Generate square or rectangular photosites in rows and columns around the optical axis.
 
     ::
 
-        ┌────┐ ┌────┐ ┌────┐  ─┬─             stagger: every second row moved by half a pitch
+        ┌────┐ ┌────┐ ┌────┐  ─┬─             stagger: every second row shifted by half a pitch
         │    │ │    │ │    │   │ width_um          ┌────┐ ┌────┐ ┌────┐
         └────┘ └────┘ └────┘  ─┴─                  └────┘ └────┘ └────┘
         ├──────┤    ├─┤                       ┌────┐ ┌────┐ ┌────┐
@@ -41,20 +41,20 @@ def grid(
     Parameters
     ----------
     n_x, n_y : int
-        Numbers of columns and rows.
+        Number of columns and rows.
     pitch_um : float, µm
-        Distance of two centres in a row.
+        Pitch of the columns.
     pitch_y_um : float, optional, µm
-        Distance of two rows; ``pitch_um`` by default.
+        Pitch of the rows; ``pitch_um`` by default.
     width_um : float, optional, µm
-        Side of the light-sensitive square; sites tile the plane by default. With two pitches use ``trench_um``.
+        Side of the photosensitive square; sites tile the plane by default. With two pitches use ``trench_um``.
     trench_um : float, optional, µm
-        Instead of the width: what is left open between two sites.
+        Instead of the width: gap between two sites.
     fill_factor : float, optional
-        Instead of the width: fraction of a cell that is sensitive to light, ``(1 - trench / pitch)²`` for squares; cells
-        of two pitches keep their shape.
+        Instead of the width: photosensitive fraction of a cell, ``(1 - trench / pitch)²`` for squares; with two pitches,
+        sites have the aspect ratio of the cells.
     stagger : bool
-        Move every second row, from the second on, by half a pitch to the right.
+        Shift every second row, from the second, by half a pitch to the right.
 
     Returns
     -------
@@ -64,14 +64,14 @@ def grid(
     Raises
     ------
     ParameterError
-        When a number is out of range, the width larger than the pitch, or the width told twice.
+        When a number is out of range, the width exceeds the pitch, or the width is specified twice.
     """
     n_x, n_y = check_count("n_x", n_x), check_count("n_y", n_y)
     pitch_um = check_length_um("pitch_um", pitch_um)
     if pitch_y_um is not None:
         pitch_y_um = check_length_um("pitch_y_um", pitch_y_um)
         if width_um is not None:
-            raise ParameterError("width_um", "is the side of squares; with 'pitch_y_um' give 'trench_um'", width_um)
+            raise ParameterError("width_um", "must be replaced by 'trench_um' if 'pitch_y_um' is given", width_um)
     shares = [
         linear_fill_factor(p_um, width_um, trench_um, fill_factor)
         for p_um in (pitch_um, pitch_um if pitch_y_um is None else pitch_y_um)
@@ -90,19 +90,17 @@ def linear_fill_factor(
     pitch_um: float, width_um: float | None, trench_um: float | None, fill_factor: float | None
 ) -> float | None:
     """
-    Fraction of a cell's width that is sensitive to light, from the one way in which it is told; None where cells tile.
+    Return the photosensitive fraction of the width of a cell; None if sites tile the plane.
 
     Raises
     ------
     ParameterError
-        When it is told twice, or is out of range.
+        When more than one parameter is specified, or a value is out of range.
     """
     if sum(x is not None for x in (width_um, trench_um, fill_factor)) > 1:
-        raise ParameterError("width_um", "'trench_um' and 'fill_factor' say the same; give one of them")
+        raise ParameterError("width_um", "and 'trench_um' and 'fill_factor' exclude each other; give one of them")
     if width_um is not None:
-        return (
-            check_length_um("width_um", width_um, at_most=pitch_um, hint="it is no larger than 'pitch_um'") / pitch_um
-        )
+        return check_length_um("width_um", width_um, at_most=pitch_um, hint="the upper limit is 'pitch_um'") / pitch_um
     if trench_um is not None:
         trench_um = check_number("trench_um", trench_um, at_least=0.0)
         if not trench_um < pitch_um:
@@ -122,9 +120,10 @@ def square_corners_um(
     shares: Sequence[float | None] = (None, None),
 ) -> Floats:
     """
-    Corners (n, 4, 2) µm of a grid's cells with their lower left corners at (x, y), in pitches, or of a fraction of each.
+    Return the corners (n, 4, 2) µm of grid cells, or of a centred fraction of each cell.
 
-    Neighbours' corners are the same numbers, bit for bit, when they tile.
+    ``x`` and ``y`` are the lower left corners of the cells in pitches. Corners that neighbours share are bit-identical when
+    cells tile.
     """
     margins = [0.0 if share is None else 0.5 * (1.0 - share) for share in shares]
     (x0, y0), (x1, y1) = margins, [1.0 - margin for margin in margins]

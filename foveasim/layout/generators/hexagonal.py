@@ -1,4 +1,4 @@
-"""The hexagonal grid."""
+"""Hexagonal grid."""
 
 from __future__ import annotations
 
@@ -27,31 +27,31 @@ def hexagonal(
     orientation: Literal["pointy", "flat"] = "pointy",
 ) -> Layout:
     """
-    Regular hexagons in close packing, the middle of their centres on the optical axis.
+    Generate closely packed regular hexagons around the optical axis.
 
     ::
 
         pointy:   ╱╲  ╱╲  ╱╲        pitch_um = centre to centre
                  │  ││  ││  │                = flat side to flat side of a full cell
                   ╲╱╲╱╲╱╲╱╲
-                   │  ││  │  ...    every second row is moved by half a pitch
+                   │  ││  │  ...    every second row is shifted by half a pitch
 
-        flat: the same, turned by 90 degrees (columns instead of rows)
+        flat: the same, rotated by 90 degrees (columns instead of rows)
 
     Parameters
     ----------
     n_columns, n_rows : int
-        Sites along a row, and rows; for ``"flat"`` a row runs upwards.
+        Sites per row, and rows; for ``"flat"`` rows are vertical.
     pitch_um : float, µm
-        Distance of two neighbours' centres.
+        Pitch: distance between the centres of neighbours.
     width_um : float, optional, µm
-        Distance of two opposite flat sides of the light-sensitive hexagon; the pitch by default.
+        Distance between opposite sides of the photosensitive hexagon; the pitch by default.
     trench_um : float, optional, µm
-        Instead of the width: what is left open between two sites.
+        Instead of the width: gap between two sites.
     fill_factor : float, optional
-        Instead of the width: fraction of a cell that is sensitive to light, ``(width / pitch)²``.
+        Instead of the width: photosensitive fraction of a cell, ``(width / pitch)²``.
     orientation : {"pointy", "flat"}
-        Whether a corner or a flat side is on top.
+        Orientation: a corner or a flat side at the top.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def hexagonal(
     Raises
     ------
     ParameterError
-        When a number is out of range, the width larger than the pitch, or the width told twice.
+        When a number is out of range, the width exceeds the pitch, or the width is specified twice.
     """
     n_columns, n_rows = check_count("n_columns", n_columns), check_count("n_rows", n_rows)
     pitch_um = check_length_um("pitch_um", pitch_um)
@@ -69,7 +69,7 @@ def hexagonal(
     check_choice("orientation", orientation, ("pointy", "flat"))
     check_sites(n_columns * n_rows)
     row, column = (index.ravel() for index in np.divmod(np.arange(n_rows * n_columns), n_columns))
-    # Every corner of the packing lies on a lattice of half pitches and half sides: neighbours' corners are equal.
+    # All corners lie on a lattice of half pitches and half sides, so shared corners are bit-identical.
     half_um = np.array([0.5 * pitch_um, 0.5 * pitch_um / math.sqrt(3.0)])
     centre = np.stack((2 * column + row % 2, 3 * row), axis=1)
     middle = np.array([n_columns - 1 + 0.5 * (n_rows > 1), 1.5 * (n_rows - 1)])

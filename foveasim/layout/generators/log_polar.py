@@ -1,4 +1,4 @@
-"""The log-polar layout: rings whose sites grow with their distance from the axis."""
+"""Log-polar layout: rings whose sites grow with the distance from the axis."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from foveasim.layout.model import Layout, valid_sites
 
 __all__ = ["log_polar", "square_ring_ratio"]
 
-#: Sites that each ring of the fovea has more than the one inside it: their arcs are π/3 times as wide as they are high.
+#: Increment of sites per ring of the fovea: the arcs of the sites are π/3 times as long as the ring is high.
 SITES_PER_RHO = 6
-#: Rings thinner than this fraction of their radius are rounding.
+#: Minimum height of a ring relative to its radius in float64.
 RATIO_ROUNDING = 1e-12
-#: A coordinate at the radius r is rounded by up to this times r (angle, cosine and product), and a side by twice that.
+#: Rounding error of a coordinate, relative to the radius (angle, cosine and product); that of a side is twice as large.
 COORDINATE_ROUNDING = 4.0 * np.finfo(np.float64).eps
-#: Rings that end inside this fraction of ``r_max_um`` leave a fifth of the field's area open, which needs a warning.
+#: Fraction of ``r_max_um`` below which the outermost ring leaves a fifth of the field uncovered, which causes a warning.
 MIN_REACH = 0.9
 
 
 def square_ring_ratio(n_sectors: int) -> float:
     """
-    Ratio of a ring's outer to its inner radius that makes its sites as high as they are wide.
+    Compute the ratio of outer to inner ring radius for sites as high as wide.
 
     Notes
     -----
@@ -64,7 +64,7 @@ def log_polar(
     chords_per_arc: int = 1,
 ) -> Layout:
     """
-    Rings of ``n_sectors`` sites around the optical axis, each ring ``ring_ratio`` times as large as the one inside.
+    Generate rings of ``n_sectors`` sites that grow outwards by ``ring_ratio``.
 
     ::
 
@@ -73,58 +73,59 @@ def log_polar(
                   │ ╱   ╭───┼──╮   ╲  │       ring k: r_k to r_k · ring_ratio
                   ├─┼───┤ fovea├───┼──┤
                   │ ╲   ╰───┼──╯   ╱  │       site: one of n_sectors parts of a ring,
-                   ╲  ╰─────┼────╯   ╱              its arcs cut into chords_per_arc chords
+                   ╲  ╰─────┼────╯   ╱              arcs divided into chords_per_arc chords
                      ╰──────┴──────╯
                        ├─┤ r_min_um
 
     Parameters
     ----------
     n_sectors : int
-        Sites a ring, at least 3.
+        Number of sites per ring, at least 3.
     r_max_um : float, µm
-        No ring reaches further out. Rings grow by their ratio and end where one more would cross this radius: with
-        ``n_rings`` exactly here, otherwise inside.
+        Upper limit of the outer radius. Rings grow by their ratio as long as they fit: the outermost ring ends exactly at
+        this radius with ``n_rings``, otherwise inside it.
     min_size_um : float, optional, µm
-        Smallest pixel that can be made. No site is smaller as the design rule ``min_size_um`` measures it, by the square
-        root of its area between chords; and no ring is thinner, and no arc on a ring's centre line shorter. Rings whose
-        sites would be smaller are left out: that is the **blind spot**. Where sites are squarish, its radius on the first
-        ring's centre line is ``min_size / (2 sin(π / n_sectors))`` with two chords an arc or more, and tends to
-        ``min_size * n_sectors / 2π`` for many sectors. A site is narrower than its size at its inner arc, which the rule
-        ``min_width_um`` measures.
+        Minimum pixel size that can be manufactured. It limits the size of all sites as the design rule ``min_size_um``
+        measures it, the square root of the area between chords, and also the height of rings and the arc length on their
+        centre line. Rings with smaller sites are omitted, which results in the **blind spot**. With approximately square
+        sites, its radius on the centre line of the first ring is ``min_size / (2 sin(π / n_sectors))`` for two or more
+        chords per arc, and tends to ``min_size * n_sectors / 2π`` for many sectors. The width at the inner arc is smaller
+        than the size; the rule ``min_width_um`` measures it.
     r_min_um : float, optional, µm
-        Inner radius of the first ring; by default the smallest that ``min_size_um`` allows.
+        Inner radius of the first ring; by default the smallest that satisfies ``min_size_um``.
     n_rings : int, optional
         Number of rings between ``r_min_um`` and ``r_max_um``, instead of ``ring_ratio``.
     ring_ratio : float, optional
-        Outer to inner radius of a ring; :func:`square_ring_ratio` by default.
+        Ratio of the outer to the inner radius of a ring; :func:`square_ring_ratio` by default.
     fovea : {"none", "rings", "linear", "hexagons"}
-        What fills the middle: nothing; ``λ / (λ - 1)`` rings of equal heights (λ the ring ratio), the height that a next
-        ring inside would have, fewer where a site would be below ``min_size_um``. Ring 0 is one site, ring ρ holds 6ρ sites
-        (``"rings"``) or is linear-polar, cut by those of the spokes that leave its sites as wide as high (``"linear"``).
-        ``"hexagons"`` are of ``min_size_um`` (without it, of the first ring's size), pieces at the border joined to others.
+        Filling of the centre. ``"none"``: no sites. ``"rings"`` and ``"linear"``: ``λ / (λ - 1)`` rings (λ the ring ratio)
+        with the height of the next inner ring, fewer if a site would be below ``min_size_um``. Ring 0 is one site. Ring ρ
+        has 6ρ sites (``"rings"``), or is linear-polar with as many of the sector boundaries outside as leave sites
+        approximately square (``"linear"``). ``"hexagons"``: hexagons of ``min_size_um`` (without it, of the size in the
+        first ring), with pieces at the boundary merged into neighbours.
     stagger : bool
-        Turn every second ring outside the fovea by half a sector.
+        Rotate every second ring outside the fovea by half a sector.
     chords_per_arc : int
-        Straight edges that stand for an arc. The area is that of the arcs times ``sin(d)/d``, with d the angle of one
-        chord. Where ``stagger`` would set odd numbers of chords against each other, arcs get twice as many, so that
-        neighbours always share their corners and nothing is left open or covered twice.
+        Number of straight edges that approximate an arc. The area is that of the arcs times ``sin(d)/d``, where d is the
+        angle of one chord. With ``stagger`` and an odd number, arcs have twice as many, so that neighbours share their
+        corners without gaps or overlaps.
 
     Returns
     -------
     Layout
-        Ring by ring from the inside, with the columns ``ring`` (hexagons are ring 0), ``sector``, ``readout_line`` (the
-        spoke in which the site begins, of a hexagon that of its middle). ``provenance`` tells ``blind_radius_um``, the inner
-        radius of the first ring as generated, where the middle is left open.
+        Ring by ring from the inside, with the columns ``ring`` (0 for hexagons), ``sector``, ``readout_line`` (the sector in
+        which the site begins, or which contains the centre of a hexagon). Without a fovea, ``provenance`` contains
+        ``blind_radius_um``, the inner radius of the first ring as generated.
 
     Raises
     ------
     ParameterError
-        When a number is out of range, no ring fits, or a fovea inside a given ``r_min_um`` has no site of the minimum size.
+        When a number is out of range, no ring fits, or no site of the minimum size fits inside a given ``r_min_um``.
 
     Warns
     -----
     LayoutWarning
-        When the rings end inside nine tenths of ``r_max_um``, as those of a coarse ratio may.
+        When the outermost ring ends below 0.9 ``r_max_um``, which a large ratio may cause.
     """
     n_sectors = check_count("n_sectors", n_sectors, at_least=3, at_most=MAX_SITES)
     check_choice("fovea", fovea, get_args(Fovea))
@@ -132,16 +133,20 @@ def log_polar(
     r_max_um = check_length_um("r_max_um", r_max_um)
     for name, length_um in (("min_size_um", min_size_um), ("r_min_um", r_min_um)):
         if length_um is not None:
-            check_length_um(name, length_um, at_most=r_max_um, hint="it is no larger than 'r_max_um'")
+            check_length_um(name, length_um, at_most=r_max_um, hint="the upper limit is 'r_max_um'")
     if r_min_um is None and min_size_um is None:
-        raise ParameterError("r_min_um", "or 'min_size_um' must be given: without either the rings would never end")
+        raise ParameterError("r_min_um", "or 'min_size_um' must be given, to limit the number of rings")
     if n_rings is not None:
         n_rings = check_count("n_rings", n_rings, at_most=max(1, MAX_SITES // n_sectors))
         if ring_ratio is not None or r_min_um is None or not r_min_um < r_max_um:
-            raise ParameterError("n_rings", "takes 'r_min_um' below 'r_max_um', and no 'ring_ratio'", n_rings)
+            raise ParameterError(
+                "n_rings", "must be used with 'r_min_um' below 'r_max_um' and without 'ring_ratio'", n_rings
+            )
         ratio = (r_max_um / r_min_um) ** (1.0 / n_rings)
         if ratio <= 1.0 + RATIO_ROUNDING:
-            raise ParameterError("r_min_um", f"must leave {n_rings} rings some width below 'r_max_um'", r_min_um, "µm")
+            raise ParameterError(
+                "r_min_um", f"must leave {n_rings} rings a positive width below 'r_max_um'", r_min_um, "µm"
+            )
     elif ring_ratio is not None:
         ratio = check_number("ring_ratio", ring_ratio, above=1.0 + RATIO_ROUNDING)
     else:
@@ -183,7 +188,7 @@ def _with_fovea(
     min_size_um: float,
     n_chords: int,
 ) -> tuple[Annuli, Ints]:
-    """Rings with a fovea of as many rings as leave no site below the minimum size, and the number of sites of each ring."""
+    """Return rings with the largest possible fovea, and the number of sites of each ring."""
     n_sectors = rings[0].n_sites
     n_rings = max(1, min(round(ratio / (ratio - 1.0) + 0.5), n_sectors // MIN_SITES_PER_RHO))
     for n in range(n_rings, 0, -1):
@@ -191,20 +196,20 @@ def _with_fovea(
             filling, n_rings=n, n_sectors=n_sectors, n_per_ring=SITES_PER_RHO, n_chords=n_chords
         )
         inside_um = heights * (radii_um[0] / heights[-1])
-        # The fovea gives corners to the ring around it, which take some of its area, or all where chords are coarse.
+        # Corners of the fovea on the surrounding ring reduce its area, to zero or less if chords are coarse.
         if _are_sites(annuli(np.concatenate((inside_um, radii_um[1:2])), [*inside, rings[0]]), min_size_um):
             all_rings = [*inside, *rings]
             n_sites = np.array([ring.n_sites for ring in all_rings])
             check_sites(int(n_sites.sum()))
             return annuli(np.concatenate((inside_um, radii_um[1:])), all_rings), n_sites
     raise ParameterError(
-        "fovea", f"leaves no room for a site of {min_size_um:g} µm inside the first ring", filling,
-        hint="enlarge 'r_min_um', or leave it out",
+        "fovea", f"must fit a site of {min_size_um:g} µm inside the first ring", filling,
+        hint="enlarge or omit 'r_min_um'",
     )  # fmt: skip
 
 
 def _are_sites(sites: Annuli, min_size_um: float) -> bool:
-    """Whether all outlines are simple and none is below the minimum size, not by a rounding error that rules allow either."""
+    """Return whether all outlines are simple and none is below the minimum size."""
     area_um2, _ = ring_moments(sites.xy_um, sites.ring_offsets)
     if area_um2.min() <= 0.0 or math.sqrt(area_um2.min()) < min_size_um:
         return False
@@ -214,23 +219,24 @@ def _are_sites(sites: Annuli, min_size_um: float) -> bool:
 
 def _radius_per_size(n_sectors: int, ratio: float, n_chords: int, fovea: Fovea, *, is_given: bool) -> float:
     """
-    Smallest inner radius of a ring whose sites are not below a minimum size, over that size.
+    Return the ratio of the smallest valid inner ring radius to the minimum size.
 
-    With the inner radius 1, a ring is ``ratio - 1`` high, its arc on the centre line ``π (1 + ratio) / n_sectors`` long, and
-    the triangles between the axis and the chords of a sector have the areas ``triangles`` and ``ratio² triangles``.
+    With the inner radius 1, a ring has the height ``ratio - 1`` and the arc length ``π (1 + ratio) / n_sectors`` on the
+    centre line. The triangles between the axis and the chords of a sector have the areas ``triangles`` and
+    ``ratio² triangles``.
     """
     sector_rad = 2.0 * math.pi / n_sectors
     triangles = 0.5 * n_chords * math.sin(sector_rad / n_chords)
     area = triangles * (ratio**2 - 1.0)
     if fovea == "rings":
-        # The fovea's corners on the inner circle may take what lies between its chords and its arc. Where that is most
-        # of the site, the fovea must have fewer corners instead.
+        # Corners of the fovea on the inner circle may remove the area between its chords and its arc from the site. Where
+        # that is most of the site, the fovea must have fewer corners instead.
         least = triangles * ratio**2 - 0.5 * sector_rad
         area = least if least > 0.5 * area else area
     needs = [1.0 / math.sqrt(area), 1.0 / (ratio - 1.0), 2.0 / (sector_rad * (1.0 + ratio))]
     if fovea != "none" and not is_given:
-        needs.append(1.0 / math.sqrt(n_sectors * triangles))  # the disc is one site at least
-    # A site is the larger by this that the rounding of its corners takes from its sides.
+        needs.append(1.0 / math.sqrt(n_sectors * triangles))  # the disc contains at least one site
+    # Margin for the rounding of the corners.
     return max(needs) * (1.0 + COORDINATE_ROUNDING * (n_sectors + ratio / (ratio - 1.0)))
 
 
@@ -242,20 +248,20 @@ def _ring_radii_um(
     smallest_um: float,
     n_rings: int | None,
 ) -> Floats:
-    """Radii of the circles between the rings that are kept, (n_ring + 1,), none of which begins inside ``smallest_um``."""
+    """Return the radii (n_ring + 1,) of the circles between rings, none below ``smallest_um``."""
     first_um = smallest_um if r_min_um is None else r_min_um
     rounding = 1.0 + 1e-12
     n = math.log(r_max_um * rounding / first_um) / math.log(ratio) if first_um < r_max_um else 0.0
     if (n + 1) * n_sectors > MAX_SITES:
         raise ParameterError(
-            "ring_ratio", f"gives more than {MAX_SITES} sites", ratio, hint="take a larger ratio or r_min_um"
+            "ring_ratio", f"must give at most {MAX_SITES} sites", ratio, hint="take a larger ratio or 'r_min_um'"
         )
     radii_um = first_um * np.power(ratio, np.arange((int(n) if n_rings is None else n_rings) + 1))
     radii_um = radii_um[radii_um >= smallest_um]
     if radii_um.size < 2:
         raise ParameterError(
             "r_max_um",
-            f"leaves no room for a ring: the first would reach from {max(first_um, smallest_um):g} to "
+            f"must leave room for a ring: the first would extend from {max(first_um, smallest_um):g} to "
             f"{max(first_um, smallest_um) * ratio:g} µm",
             r_max_um,
             "µm",
@@ -264,9 +270,9 @@ def _ring_radii_um(
     if radii_um[-1] < MIN_REACH * r_max_um:
         last_um, next_um = float(radii_um[-1]), float(radii_um[-1]) * ratio
         warnings.warn(
-            f"'r_max_um' is {r_max_um:g} µm, and the rings end at {last_um:.6g} µm: the next one, {ratio:.6g} times as large, "
-            f"would reach {next_um:.6g} µm; take 'r_max_um' = {next_um * (1.0 + 1e-5):.6g} µm, or 'n_rings' with 'r_min_um' = "
-            f"{radii_um[0]:.6g} µm, which end at 'r_max_um'",
+            f"'r_max_um' is {r_max_um:g} µm, but the outermost ring ends at {last_um:.6g} µm: the next one, {ratio:.6g} times "
+            f"as large, would extend to {next_um:.6g} µm; take 'r_max_um' = {next_um * (1.0 + 1e-5):.6g} µm, or 'n_rings' with "
+            f"'r_min_um' = {radii_um[0]:.6g} µm for rings that end at 'r_max_um'",
             LayoutWarning,
             stacklevel=3,
         )

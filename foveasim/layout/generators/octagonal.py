@@ -1,4 +1,4 @@
-"""The layout of two sizes: large octagons, and small squares between them that stand on a corner."""
+"""Octagonal layout: large octagons with small diamonds between them."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ __all__ = ["octagonal"]
 
 #: Side of the diamonds between regular octagons, in pitches.
 REGULAR_SIDE = math.sqrt(2.0) - 1.0
-#: Corners as (x, y) in lines of the lattice: three for each border between cells, half a diamond apart.
+#: Corners as (x, y) in lattice lines: three lines per cell boundary, half a diamond apart.
 OCTAGON = np.array([(2, 1), (3, 1), (4, 2), (4, 3), (3, 4), (2, 4), (1, 3), (1, 2)])
 DIAMOND = np.array([(1, 0), (2, 1), (1, 2), (0, 1)])
-#: The diamonds stay this share below the size at which they would touch.
+#: Relative margin of the diamonds below the size at which they touch.
 TOUCHING_ROUNDING = 1e-9
 
 
@@ -32,7 +32,9 @@ def octagonal(
     border: Literal["whole", "cut"] = "whole",
 ) -> Layout:
     """
-    Octagons on a square grid, its middle on the optical axis, and a diamond where four of them meet.
+    Generate octagons on a square grid, with a diamond where four of them meet.
+
+    The grid is centred on the optical axis.
 
     ::
 
@@ -50,30 +52,29 @@ def octagonal(
     Parameters
     ----------
     n_x, n_y : int
-        Numbers of columns and rows of octagons.
+        Number of columns and rows of octagons.
     pitch_um : float, µm
-        Distance of two octagons' centres.
+        Pitch of the octagons.
     diamond_um : float, optional, µm
-        Side of the diamonds, less than ``pitch_um / √2``; by default ``(√2 - 1) pitch_um``, which makes the octagons
-        regular.
+        Side of the diamonds, less than ``pitch_um / √2``; by default ``(√2 - 1) pitch_um``, for regular octagons.
     border : {"whole", "cut"}
-        Whether there are diamonds only where four octagons meet, or also halves and quarters of them along the border,
-        which make the sites tile the rectangle of ``n_x`` by ``n_y`` pitches.
+        ``"whole"``: diamonds only where four octagons meet. ``"cut"``: also halves and quarters of diamonds along the
+        boundary, so that the sites tile the rectangle of ``n_x`` by ``n_y`` pitches.
 
     Returns
     -------
     Layout
         The octagons, then the diamonds, row by row from the lowest y, with the columns ``kind`` (0 octagon, 1 diamond),
-        ``row``, ``column`` (in the grid of its kind) and ``readout_line`` (the columns of both kinds, numbered through).
+        ``row``, ``column`` (in the grid of its kind) and ``readout_line`` (columns of both kinds, numbered consecutively).
 
     Raises
     ------
     ParameterError
-        When a number is out of range, or the diamonds so large that they would touch.
+        When a number is out of range, or the diamonds are so large that they would touch.
 
     Notes
     -----
-    A diamond's area is ``diamond_um²``, an octagon's ``pitch_um² - diamond_um²``: together they are a cell of the grid.
+    The area of a diamond is ``diamond_um²``, that of an octagon ``pitch_um² - diamond_um²``; their sum is a cell of the grid.
 
     Examples
     --------
@@ -87,12 +88,12 @@ def octagonal(
             "diamond_um",
             diamond_um,
             at_most=(1.0 - TOUCHING_ROUNDING) * pitch_um / math.sqrt(2.0),
-            hint="diamonds of the side pitch_um / √2 would touch",
+            hint="diamonds with a side of pitch_um / √2 would touch",
         )
     check_choice("border", border, ("whole", "cut"))
     check_sites(n_x * n_y + (n_x + 1) * (n_y + 1))
     half_um = (REGULAR_SIDE * pitch_um if diamond_um is None else diamond_um) / math.sqrt(2.0)
-    # Every corner lies on a cell's border, or half a diamond beside it: neighbours' corners are the same numbers.
+    # Corners lie on cell boundaries, or half a diamond away from them, so shared corners are bit-identical.
     x_um, y_um = (
         (pitch_um * (np.arange(n + 1) - 0.5 * n)[:, np.newaxis] + (-half_um, 0.0, half_um)).ravel() for n in (n_x, n_y)
     )
@@ -118,16 +119,16 @@ def octagonal(
 
 
 def _places(n_rows: int, n_columns: int) -> tuple[Ints, Ints]:
-    """Row and column of each site of a grid, row by row."""
+    """Return the row and column of each site of a grid, row by row."""
     row, column = np.divmod(np.arange(n_rows * n_columns), max(1, n_columns))
     return row, column
 
 
 def _cut(diamond: Ints, n_x: int, n_y: int) -> tuple[Ints, Bools]:
     """
-    Diamonds (n, 4, 2) without what lies outside the octagons' cells, and which of their corners (n, 4) are left.
+    Clip diamonds (n, 4, 2) to the octagon cells; return them with a corner mask (n, 4).
 
-    The corners outside move to the diamond's centre. In a half that is no corner, in a quarter it is one.
+    Corners outside move to the centre of the diamond, which is a corner of a quarter, but not of a half.
     """
     inside = np.clip(diamond, 1, (3 * n_x + 1, 3 * n_y + 1))
     is_moved = (inside != diamond).any(axis=2)

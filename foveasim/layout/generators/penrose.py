@@ -1,4 +1,4 @@
-"""Penrose's rhombs: two shapes that tile the plane without ever repeating."""
+"""Penrose layout: an aperiodic tiling of thick and thin rhombs."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from foveasim.layout.model import Layout
 __all__ = ["penrose"]
 
 GOLDEN_RATIO = (1.0 + math.sqrt(5.0)) / 2.0
-#: Area of a rhomb in squares of its side, on average over the plane: golden ratio of thick ones to each thin one.
+#: Mean area of a rhomb in squared sides: in the plane, the number ratio of thick to thin rhombs is the golden ratio.
 MEAN_AREA = (GOLDEN_RATIO * math.sin(math.radians(72.0)) + math.sin(math.radians(36.0))) / (GOLDEN_RATIO + 1.0)
-#: Corners are whole combinations of the four powers 0 to 3 of a fifth of a turn: exact, and so equal for neighbours.
+#: Corners are integer combinations of the powers 0 to 3 of a rotation by 72°: exact, and therefore equal for neighbours.
 FIFTH_TURNS = np.stack(
     ([math.cos(2.0 * math.pi * k / 5.0) for k in range(4)], [math.sin(2.0 * math.pi * k / 5.0) for k in range(4)])
 )
-#: The golden ratio times a corner, on its four numbers (rows): -(z² + z³) z^k with z⁴ = -1 - z - z² - z³.
+#: Multiplication of the four integers of a corner by the golden ratio: rows -(z² + z³) z^k with z⁴ = -1 - z - z² - z³.
 TIMES_GOLDEN = np.array([(0, 0, -1, -1), (1, 1, 1, 0), (0, 1, 1, 1), (-1, -1, 0, 0)])
-#: After so many cuts the middle looks as before, so that a larger layout holds every rhomb of a smaller one.
+#: Number of subdivisions after which the centre repeats, so that a larger layout contains each rhomb of a smaller one.
 PERIOD = 4
-#: Four numbers below 2**15 in size as one.
+#: Weights that combine four integers of magnitude below 2**15 into one.
 KEY = 2 ** np.array((48, 32, 16, 0), np.int64)
-#: Cosine of a tenth of a turn's half: how far inside its corners the sides of the first decagon lie.
+#: Ratio of inradius to circumradius of the first decagon.
 DECAGON_INSIDE = math.cos(math.pi / 10.0)
 
 
 @layout_family(example={"side_um": 2.0, "size_um": 30.0})
 def penrose(*, side_um: float, size_um: float, shape: Literal["disc", "square"] = "disc") -> Layout:
     """
-    Thick and thin rhombs with one side, the same after every fifth of a turn around the optical axis.
+    Generate thick and thin rhombs with fivefold symmetry around the optical axis.
 
     ::
 
               ╱╲                 thick: corners of 72 and 108 degrees, area sin 72° · side_um²
             ╱    ╲  side_um      thin:  corners of 36 and 144 degrees, area sin 36° · side_um²
           ╱        ╲
-          ╲        ╱             kept: rhombs with their centre in the disc or square of size_um
+          ╲        ╱             included: rhombs with their centre in the disc or square
             ╲    ╱
               ╲╱                 thick to thin: 1.618034 by area, and → 1.618034 by number
 
@@ -50,25 +50,25 @@ def penrose(*, side_um: float, size_um: float, shape: Literal["disc", "square"] 
     side_um : float, µm
         Side of all rhombs.
     size_um : float, µm
-        Diameter of the disc, or side of the square, around the axis, that the rhombs' centres lie in.
+        Diameter of the disc, or side of the square, around the axis that contains the centres of the rhombs.
     shape : {"disc", "square"}
-        Which of them.
+        Shape of this region.
 
     Returns
     -------
     Layout
-        Whole rhombs from the lowest centre up, with the column ``is_thick`` (1 or 0).
+        Complete rhombs in the order of their centres from bottom to top, with the column ``is_thick`` (1 or 0).
 
     Raises
     ------
     ParameterError
-        When a number is out of range, there would be too many sites, or none.
+        When a number is out of range, or there would be no sites, or too many.
 
     Notes
     -----
-    Ten golden triangles around the axis are cut into smaller ones (de Bruijn's and Robinson's deflation) until they are
-    small enough; mirrored pairs make a rhomb. Corners are kept as integers in powers of a fifth of a turn until the
-    end. A larger ``size_um`` only adds rhombs. In a corner of a square one may touch the others by a corner alone.
+    Ten golden triangles around the axis are subdivided (deflation of de Bruijn and Robinson) to the required size; mirrored
+    pairs form a rhomb. Corners are represented by integers, the coefficients of powers of a rotation by 72°, until the final
+    step. A larger ``size_um`` only adds rhombs. In a corner of a square, a rhomb may touch the others only in a vertex.
 
     Examples
     --------
@@ -81,10 +81,10 @@ def penrose(*, side_um: float, size_um: float, shape: Literal["disc", "square"] 
     check_choice("shape", shape, ("disc", "square"))
     n_expected = (0.25 * math.pi if shape == "disc" else 1.0) * (size_um / side_um) ** 2 / MEAN_AREA
     if n_expected > MAX_SITES:
-        raise ParameterError("side_um", f"gives more than {MAX_SITES} sites", side_um, "µm", "take larger rhombs")
+        raise ParameterError("side_um", f"must give at most {MAX_SITES} sites", side_um, "µm", "take larger rhombs")
     rings_um, is_thick = _rhombs(side_um, size_um, shape == "disc")
     if is_thick.size == 0:
-        raise ParameterError("size_um", "leaves no rhomb whose centre lies inside", size_um, "µm", "enlarge it")
+        raise ParameterError("size_um", "must enclose the centre of at least one rhomb", size_um, "µm", "enlarge it")
     return Layout.from_equal_rings(
         rings_um,
         {"is_thick": is_thick.astype(np.int64)},
@@ -92,19 +92,19 @@ def penrose(*, side_um: float, size_um: float, shape: Literal["disc", "square"] 
 
 
 def _rhombs(side_um: float, size_um: float, is_disc: bool) -> tuple[Floats, Bools]:
-    """Corners (n, 4, 2) µm, counter-clockwise, and whether each rhomb is thick."""
-    half = 0.5 * size_um / side_um  # all else is in sides
+    """Return the corners (n, 4, 2) µm, counter-clockwise, and whether each rhomb is thick."""
+    half = 0.5 * size_um / side_um  # all further lengths are in sides
     reach = half * (1.0 if is_disc else math.sqrt(2.0))
-    # The first triangles have the side 1, and then the golden ratio to the number of cuts.
+    # The triangles have the side 1, scaled by the golden ratio in each subdivision.
     n_cuts = PERIOD * math.ceil(math.log((reach + 2.0) / DECAGON_INSIDE, GOLDEN_RATIO) / PERIOD)
     triangles, is_thick = _decagon()
     for left in range(n_cuts - 1, -1, -1):
         triangles, is_thick = _cut(triangles, is_thick)
-        # What the cuts that are left make of a triangle stays inside it; none is 2 sides long.
+        # The remaining subdivisions stay inside a triangle, and no triangle has the length 2.
         is_near = np.abs(_points(triangles[:, 0])).max(axis=1) <= half * GOLDEN_RATIO**-left + 2.0
         triangles, is_thick = triangles[is_near], is_thick[is_near]
     a, b, c = np.moveaxis(triangles, 1, 0)
-    # Both halves of a rhomb have the same middle b + c of their common side.
+    # Both halves of a rhomb have the same midpoint (b + c) / 2 of their common side.
     _, first = np.unique((b + c) @ KEY, return_index=True)
     a, b, c, is_thick = a[first], b[first], c[first], is_thick[first]
     corners = np.stack([_points(p) for p in (a, b, b + c - a, c)], axis=1)
@@ -119,7 +119,7 @@ def _rhombs(side_um: float, size_um: float, is_disc: bool) -> tuple[Floats, Bool
 
 
 def _points(whole: Ints) -> Floats:
-    """Corners (n, 2) in sides of their four integers (n, 4), each by the same sum."""
+    """Convert corners from integers (n, 4) to sides (n, 2), with a fixed summation order."""
     x, y = (
         whole[:, 0] * turn[0] + whole[:, 1] * turn[1] + (whole[:, 2] * turn[2] + whole[:, 3] * turn[3])
         for turn in FIFTH_TURNS
@@ -128,9 +128,9 @@ def _points(whole: Ints) -> Floats:
 
 
 def _decagon() -> tuple[Ints, Bools]:
-    """Ten acute triangles (10, 3, 4) around the axis, every second one mirrored, and that they are halves of thin rhombs."""
+    """Return ten acute triangles (10, 3, 4) around the axis, halves of thin rhombs."""
     fifths = np.concatenate((np.eye(4, dtype=np.int64), -np.ones((1, 4), np.int64)))
-    # A tenth of a turn is minus three fifths.
+    # A rotation by 36° is the negative of a rotation by 216°. Every second triangle is mirrored.
     tips = np.stack([fifths[(3 * k) % 5] * (-1) ** k for k in range(11)])
     k = np.arange(10)
     odd = k % 2
@@ -139,7 +139,7 @@ def _decagon() -> tuple[Ints, Bools]:
 
 
 def _cut(triangles: Ints, is_thick: Bools) -> tuple[Ints, Bools]:
-    """Robinson's triangles one step finer, and all the golden ratio larger, so that their sides stay 1."""
+    """Subdivide Robinson triangles and scale them by the golden ratio, so that sides remain 1."""
     a, b, c = np.moveaxis(triangles[~is_thick], 1, 0)
     ga, gb, gc = a @ TIMES_GOLDEN, b @ TIMES_GOLDEN, c @ TIMES_GOLDEN
     p = ga + b - a

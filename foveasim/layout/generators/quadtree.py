@@ -1,4 +1,4 @@
-"""The quadtree: squares that are split where an importance picture asks, neighbours differing by one level at most."""
+"""Quadtree layout: squares split by an importance picture, balanced to one level per edge."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from foveasim.layout.model import Layout
 
 __all__ = ["quadtree"]
 
-#: More levels than this would be a slip: 2**15 pixels along the largest square.
+#: Upper limit of levels: 2**15 pixels along the largest square.
 MAX_LEVELS = 15
 
 
@@ -45,7 +45,7 @@ def quadtree(
     measure: Literal["sum", "peak"] = "sum",
 ) -> Layout:
     """
-    Squares of sides that are powers of two, the smaller the more important the picture says their place is.
+    Generate squares with power-of-two sides, smaller where an importance picture is larger.
 
     ::
 
@@ -55,8 +55,8 @@ def quadtree(
         │       ├─┼─┤   │   │            smallest: one pixel of the picture, pitch_um
         ├───┬───┼─┴─┴───┤   │
         │   │   │       │   │ n_y · pitch_um
-        ├───┼───┤       │   │            no square meets one of less than half or more than twice
-        │   │   │       │   │            its side along an edge
+        ├───┼───┤       │   │            sides of squares that share an edge differ by a factor
+        │   │   │       │   │            of 2 at most
         └───┴───┴───────┘  ─┴─
         ├───────────────┤
           n_x · pitch_um
@@ -64,35 +64,36 @@ def quadtree(
     Parameters
     ----------
     importance : (n_y, n_x) array
-        A number of at least 0 for each smallest square, the lowest row first; both sides multiples of 2^n_levels.
+        Importance >= 0 of each smallest square, the lowest row first; both sides are multiples of 2^n_levels.
     pitch_um : float, µm
-        Side of the smallest squares, and of the picture's pixels.
+        Side of the smallest squares, and pixel pitch of the picture.
     limit : float
-        A square is split while the importance in it is above this.
+        Importance above which a square is split.
     n_levels : int
-        How often a largest square may be split.
+        Maximum number of subdivisions of a largest square.
     measure : {"sum", "peak"}
-        Whether the importance in a square is the sum over its pixels, or that of its most important pixel.
+        Importance of a square: the sum or the maximum over its pixels.
 
     Returns
     -------
     Layout
-        Row by row of lower left corners, the middle of the picture on the optical axis, with the columns ``level`` (how
-        often split), ``row`` and ``column`` (of the lower left corner, in pixels) and ``readout_line`` (the column).
+        In the order of the rows of lower left corners, with the centre of the picture on the optical axis, and with the
+        columns ``level`` (number of subdivisions), ``row`` and ``column`` (of the lower left corner, in pixels) and
+        ``readout_line`` (the column).
 
     Raises
     ------
     ParameterError
-        When a number is out of range, or the picture does not fit whole largest squares.
+        When a number is out of range, or a side of the picture is not a multiple of 2^n_levels.
 
     Notes
     -----
-    Where a square meets two smaller ones along a side, the corner that they share is a corner of its outline too, so that
-    neighbours always share whole edges.
+    If a square shares a side with two smaller ones, their common corner is also a vertex of its outline, so that neighbours
+    always share complete edges.
 
     Examples
     --------
-    One important pixel in a corner of 8 × 8 takes 3 squares of each side, and itself:
+    A single important pixel in a corner of 8 × 8 results in 3 squares of each size, and itself:
 
     >>> picture = np.zeros((8, 8))
     >>> picture[0, 0] = 1.0
@@ -113,10 +114,10 @@ def quadtree(
     splits = [*_splits(picture, limit, n_levels, measure), np.zeros(picture.shape, bool)]
     level, row, column, has_middle = _leaves(splits)
 
-    # Corners and the middles of sides, counter-clockwise from the lower left, in half sides.
+    # Corners and midpoints of sides, counter-clockwise from the lower left, in half sides.
     outline = np.array([(0, 0), (1, 0), (2, 0), (2, 1), (2, 2), (1, 2), (0, 2), (0, 1)])
     side = 2 ** (n_levels - level)
-    # Middles exist on squares of an even side alone.
+    # Only squares with an even side have midpoints.
     steps = outline * side[:, np.newaxis, np.newaxis] // 2 + np.stack((column, row), axis=1)[:, np.newaxis]
     is_vertex = np.ones((level.size, 8), bool)
     is_vertex[:, 1::2] = has_middle
@@ -133,19 +134,19 @@ def quadtree(
 
 
 def _blocks(values: Floats | Bools) -> Floats | Bools:
-    """The 2 × 2 blocks of a picture, (n_y / 2, n_x / 2, 4)."""
+    """Return the 2 × 2 blocks of a picture, (n_y / 2, n_x / 2, 4)."""
     n_y, n_x = values.shape
     return np.moveaxis(values.reshape(n_y // 2, 2, n_x // 2, 2), 1, 2).reshape(n_y // 2, n_x // 2, 4)
 
 
 def _splits(values: Floats, limit: float, n_levels: int, measure: str) -> list[Bools]:
-    """Which squares of each level are split, the largest first: where asked, where a part is, and for balance."""
+    """Return masks of split squares per level, the largest first, balanced between neighbours."""
     splits: list[Bools] = []
     finer = np.zeros(values.shape, bool)
     for _ in range(n_levels):
         blocks = _blocks(values)
         values = np.asarray(blocks.sum(axis=2) if measure == "sum" else blocks.max(axis=2))
-        # A square that is split needs neighbours of its own size at least, so their squares are split as well.
+        # A split square requires neighbours of at least its own size, so their parents are split as well.
         padded = np.pad(finer, 1)
         needs = finer | padded[2:, 1:-1] | padded[:-2, 1:-1] | padded[1:-1, 2:] | padded[1:-1, :-2]
         finer = (values > limit) | np.asarray(_blocks(needs).any(axis=2))
@@ -154,13 +155,13 @@ def _splits(values: Floats, limit: float, n_levels: int, measure: str) -> list[B
 
 
 def _leaves(splits: list[Bools]) -> tuple[Ints, Ints, Ints, Bools]:
-    """Level, row and column in pixels of every square that is left whole, and which of its sides meet two squares."""
+    """Return level, row and column (pixels) of unsplit squares, and a mask of divided sides."""
     parts = []
     exists = np.ones(splits[0].shape, bool)
     for level, split in enumerate(splits):
         row, column = np.nonzero(exists & ~split)
         around = np.pad(split, 1)
-        # Below, right, above, left: a neighbour that is split has two squares along this side.
+        # Below, right, above, left: a split neighbour has two squares along this side.
         has_middle = np.stack([around[row + dy, column + dx] for dy, dx in ((0, 1), (1, 2), (2, 1), (1, 0))], axis=1)
         side = 2 ** (len(splits) - 1 - level)
         parts.append((np.full(row.size, level), row * side, column * side, has_middle))

@@ -1,4 +1,4 @@
-"""The sunflower layout: sites of one size in a golden spiral, without rows and without rings."""
+"""Sunflower layout: sites of equal size on a golden spiral, without rows and rings."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from foveasim.layout.model import Layout
 
 __all__ = ["sunflower"]
 
-#: From each site to the next: a whole turn over the square of the golden ratio, 137.5 degrees.
+#: Angle between consecutive sites: 360° / φ² = 137.5°, with the golden ratio φ.
 GOLDEN_ANGLE_RAD = math.pi * (3.0 - math.sqrt(5.0))
-#: Radius of site 1 that puts the closest pair, sites 1 and 4, at distance 1: 0.6242.
+#: Radius of site 1 for which the closest pair, sites 1 and 4, has the distance 1: 0.6242.
 C = 1.0 / math.sqrt(5.0 - 4.0 * math.cos(3.0 * GOLDEN_ANGLE_RAD))
-#: Fewest chords of the outline by default.
+#: Minimum number of chords of the default outline.
 MIN_CHORDS = 64
 
 
 @layout_family(example={"n_sites": 300, "spacing_um": 1.6})
 def sunflower(*, n_sites: int, spacing_um: float, n_chords: int | None = None) -> Layout:
     """
-    Sites on a golden spiral, each taking the same fraction of the disc, their outlines the Voronoi cells.
+    Generate Voronoi cells of approximately equal area on a golden spiral.
 
     ::
 
               ·  ·  ·            site k = 1, 2, ... n_sites at the radius c √k · spacing_um, c = 0.6242,
-            ·  · 4·  ·           137.5 degrees on from site k - 1
+            ·  · 4·  ·           137.5 degrees from site k - 1
            ·  ·  ╲ · ·
-            ·  ·  1  ·           spacing_um: from site 1 to site 4, the closest pair of any
+            ·  ·  1  ·           spacing_um: from site 1 to site 4, the closest pair
               ·  ·  ·
 
     Parameters
@@ -40,16 +40,16 @@ def sunflower(*, n_sites: int, spacing_um: float, n_chords: int | None = None) -
     n_sites : int
         Number of sites.
     spacing_um : float, µm
-        Distance of the closest two centres, when there are 4 sites or more; the others are a little further apart.
+        Minimum distance between centres, for 4 or more sites; other distances are slightly larger.
     n_chords : int, optional
-        Sides of the regular polygon that stands for the outline of the layout; by default 4 times as many as
-        leave the outermost centre inside.
+        Number of sides of the regular polygon that approximates the circular outline of the layout; by default 4 times the
+        minimum number that encloses the outermost centre.
 
     Returns
     -------
     Layout
-        From the middle outwards, with the column ``turn`` (whole turns of the spiral before the site). ``provenance``
-        tells ``radius_um``, that of the outline's corners: ``c √(n_sites + 1/2) · spacing_um``.
+        From the centre outwards, with the column ``turn`` (completed turns of the spiral before the site). ``provenance``
+        contains ``radius_um``, the circumradius of the outline: ``c √(n_sites + 1/2) · spacing_um``.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def sunflower(*, n_sites: int, spacing_um: float, n_chords: int | None = None) -
 
     Notes
     -----
-    Vogel's model of a sunflower's head. A site's share is ``π c² spacing_um²``, 1.2242 spacings squared.
+    Vogel's model of a sunflower head. The mean area per site is ``π c² spacing_um²``, 1.2242 squared spacings.
 
     Examples
     --------
@@ -69,7 +69,7 @@ def sunflower(*, n_sites: int, spacing_um: float, n_chords: int | None = None) -
     spacing_um = check_length_um("spacing_um", spacing_um)
     k = np.arange(1, n_sites + 1)
     radius_um = check_length_um("radius_um", C * spacing_um * math.sqrt(n_sites + 0.5), hint="take fewer sites")
-    # The outermost centre must stay inside the chords.
+    # The outermost centre must lie inside the chords.
     fewest = max(3, math.floor(math.pi / math.acos(math.sqrt(n_sites / (n_sites + 0.5)))) + 1)
     if n_chords is None:
         n_sides = max(MIN_CHORDS, 4 * fewest)

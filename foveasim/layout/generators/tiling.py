@@ -1,4 +1,4 @@
-"""Squares or hexagons of one size in any region, and the filling of open places with them."""
+"""Tiling of regions with equal squares or hexagons, and filling of gaps in layouts."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ __all__ = ["Cells", "fill", "tiling", "with_hexagons"]
 Cells: TypeAlias = Literal["hexagons", "squares"]
 Border: TypeAlias = Literal["merge", "cut", "drop"]
 
-#: Corners of a cell around its centre, counter-clockwise, in the lattice's steps.
+#: Corners of a cell around its centre, counter-clockwise, in lattice steps.
 CORNERS = {
     "squares": np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]),
     "hexagons": np.array([(1, -1), (1, 1), (0, 2), (-1, 1), (-1, -1), (0, -2)]),
 }
-#: Pieces of less than this fraction of a cell are joined to a neighbour, unless the user says otherwise.
+#: Default fraction of a cell below which a piece is merged into a neighbour.
 SMALL_SHARE = 0.5
-#: Open areas below this fraction of the region are rounding.
+#: Fraction of the region below which uncovered area is rounding.
 AREA_ROUNDING = 1e-9
 
 
@@ -46,55 +46,55 @@ def tiling(
     origin_um: tuple[float, float] = (0.0, 0.0),
 ) -> Layout:
     """
-    Equal squares or hexagons that fill a region to its border.
+    Generate equal squares or hexagons that fill a region up to its boundary.
 
     ::
 
           ╭──┬───┬──╮
-         ╱ ╲ │ ╱╲│╱ ╲          whole cells: pitch_um from centre to centre
+         ╱ ╲ │ ╱╲│╱ ╲          complete cells: pitch_um from centre to centre
         │   ╳   ╳   │
         │  │ │ · │ ││          · origin_um, the centre of a cell
          ╲ ╱ ╲ ╱ ╲ ╱
-          ╰───┴───┴─╯          border: small pieces belong to the cell beside them
+          ╰───┴───┴─╯          border: small pieces are merged into adjacent cells
 
     Parameters
     ----------
     pitch_um : float, µm
-        Distance of neighbouring cells' centres.
+        Distance between the centres of adjacent cells.
     cells : {"hexagons", "squares"}
-        Hexagons stand on a corner.
+        Shape of the cells. Hexagons have a corner at the top.
     size_um : (width, height), optional, µm
-        Rectangle around the optical axis that is filled.
+        Rectangular region around the optical axis.
     radius_um : float, optional, µm
-        Disc around the optical axis that is filled, a polygon of 960 sides.
+        Circular region around the optical axis, a polygon of 960 sides.
     region : shapely Polygon or MultiPolygon, or (n, 2) vertices, optional, µm
-        Any other region, with holes or without, in one part or several.
+        Arbitrary region, with one or more parts, with or without holes.
     border : {"merge", "cut", "drop"}
-        What becomes of cells that the border cuts: pieces below ``min_size_um`` are joined to the neighbour with which
-        they share most edge; pieces stay as they are; or only whole cells are kept.
+        Treatment of cells that the boundary cuts. ``"merge"``: pieces below ``min_size_um`` are merged into the neighbour
+        with the longest shared edge. ``"cut"``: all pieces remain separate sites. ``"drop"``: only complete cells remain.
     min_size_um : float, optional, µm
-        Smallest size, the square root of the area, of a site, as the design rule ``min_size_um`` measures it; half a cell's
-        area by default. It does not go with ``border="cut"``, nor with ``"drop"`` where whole cells are smaller.
+        Minimum size of a site, the square root of its area, as in the design rule ``min_size_um``; by default that of half
+        a cell. Invalid with ``border="cut"``, and with ``"drop"`` if complete cells are smaller.
     origin_um : (x, y), µm
-        Where a cell has its centre.
+        Centre of one of the cells.
 
     Returns
     -------
     Layout
-        Row by row, with the columns ``row``, ``column`` (of the lattice, from 0; a joined site has those of one of its
+        Row by row, with the columns ``row``, ``column`` (of the lattice, from 0; a merged site has those of one of its
         parts) and ``readout_line`` (the column).
 
     Raises
     ------
     ParameterError
-        When a number is out of range, not exactly one region is given, or the border leaves sites below ``min_size_um``.
+        When a number is out of range, not exactly one region is given, or ``border`` allows sites below ``min_size_um``.
     GeometryError
-        When no site is left: the region is smaller than one.
+        When the region is too small for a single site.
 
     Warns
     -----
     LayoutWarning
-        When parts of the region that are smaller than a site stay open, where pieces are joined.
+        When parts of the region that are smaller than a site remain uncovered with ``border="merge"``.
 
     Examples
     --------
@@ -114,7 +114,7 @@ def tiling(
         if border == "cut":
             raise ParameterError(
                 "min_size_um",
-                "must be left out with border='cut', which keeps every piece",
+                "must be omitted with border='cut', which retains all pieces",
                 min_size_um,
                 "µm",
                 "take border='merge'",
@@ -123,7 +123,7 @@ def tiling(
     if border == "drop" and min_size_um is not None and is_below_size(lattice.area_um2, min_size_um).any():
         raise ParameterError(
             "min_size_um",
-            f"must be <= {math.sqrt(lattice.area_um2[0]):.6g}, the size of a whole cell",
+            f"must be <= {math.sqrt(lattice.area_um2[0]):.6g}, the size of a complete cell",
             min_size_um,
             "µm",
             "take a larger pitch, or border='merge'",
@@ -136,13 +136,13 @@ def tiling(
         open_um2 = pieces_um2 - float(layout.area_um2.sum())
         if layout.n_sites and open_um2 > AREA_ROUNDING * pieces_um2:
             warnings.warn(
-                f"{open_um2:.6g} µm² of the region stay open, in parts that are smaller than a site of {smallest_um:.6g} µm; "
-                "leave them out of the region, or take a smaller 'min_size_um'",
+                f"{open_um2:.6g} µm² of the region remain uncovered, in parts smaller than a site of {smallest_um:.6g} µm; "
+                "exclude them from the region, or take a smaller 'min_size_um'",
                 LayoutWarning,
                 stacklevel=2,
             )
     if layout.n_sites == 0:
-        raise GeometryError("the region holds no site: it is smaller than one; enlarge it, or take a smaller pitch")
+        raise GeometryError("the region is too small for a single site; enlarge it, or take a smaller pitch")
     row, column = (layout.columns[name] - layout.columns[name].min() for name in ("row", "column"))
     return Layout(
         layout.xy_um,
@@ -157,29 +157,29 @@ def tiling(
 
 def fill(layout: Layout, region: Any, *, size_um: float, columns_of: Layout | None = None) -> Layout:
     """
-    A layout with a region of it filled with hexagons of one size: a blind spot, the room of sites that were taken away.
+    Fill the uncovered part of a region of a layout, such as a blind spot, with hexagons.
 
     Parameters
     ----------
     layout : Layout
     region : shapely Polygon or MultiPolygon, or (n, 2) vertices, µm
-        What is filled; what sites there cover already stays theirs.
+        Region to fill; areas that existing sites cover are excluded.
     size_um : float, µm
-        Size, the square root of the area, of the hexagons. Pieces at the border that are smaller are joined to a
-        neighbour, so that no new site is below it.
+        Size of the hexagons, the square root of their area. Smaller pieces at the boundary are merged into a neighbour, so
+        that no new site is smaller.
     columns_of : Layout, optional
-        New sites have the columns of the nearest site of this layout, which has all of ``layout``'s; of ``layout`` itself
-        by default.
+        Layout whose nearest sites provide the column values of new sites, with all columns of ``layout``; by default
+        ``layout`` itself.
 
     Returns
     -------
     Layout
-        The layout's sites, then the new ones. A part of the region too small for any site is left open.
+        The sites of the layout, then the new ones. Parts of the region that are too small for a site remain uncovered.
 
     Raises
     ------
     ParameterError
-        When the region is none, or the size out of range.
+        When the region is not a valid polygon, or the size is out of range.
     """
     size_um = check_length_um("size_um", size_um)
     open_region = _open_part(layout, as_region("region", region))
@@ -189,15 +189,13 @@ def fill(layout: Layout, region: Any, *, size_um: float, columns_of: Layout | No
 
 
 def with_hexagons(layout: Layout, size_um: float, n_lines: int) -> Layout:
-    """A layout of rings, its middle filled with hexagons: the ring inside the innermost one, read by the nearest spoke."""
+    """Fill the centre of a layout of rings with hexagons, read through the nearest sector."""
     ring = layout.columns["ring"]
     first = int(ring.min())
     around = shapely.coverage_union_all(layout[ring == first].polygons())
     middle = _hexagons(shapely.Polygon(around.interiors[0]), size_um)
     if middle.n_sites == 0:
-        raise ParameterError(
-            "fovea", f"leaves no room for a hexagon of {size_um:g} µm inside the first ring", "hexagons"
-        )
+        raise ParameterError("fovea", f"must fit a hexagon of {size_um:g} µm inside the first ring", "hexagons")
     angle_rad = np.arctan2(middle.centroid_um[:, 1], middle.centroid_um[:, 0]) % (2.0 * math.pi)
     line = np.floor(angle_rad * n_lines / (2.0 * math.pi)).astype(np.int64) % n_lines
     shift = 1 if first == 0 else 0
@@ -212,21 +210,21 @@ def with_hexagons(layout: Layout, size_um: float, n_lines: int) -> Layout:
 
 
 def _hexagons(region: Any, size_um: float) -> Layout:
-    """A region in hexagons of the area of a square of this side, and larger sites at the border."""
-    # A hair more, for the rounding of areas.
+    """Tile a region with hexagons of an area of size², and larger sites at the boundary."""
+    # The factor above 1 compensates for the rounding of areas.
     pitch_um = size_um * math.sqrt(2.0 / math.sqrt(3.0)) * (1.0 + 1e-9)
     return _merged(clip(_lattice(region.bounds, pitch_um, "hexagons", np.zeros(2)), region), size_um)
 
 
 def _merged(pieces: Layout, min_size_um: float) -> Layout:
-    """Small pieces joined to their neighbours; those that have none are left out."""
+    """Merge small pieces into their neighbours; omit those without neighbours."""
     layout = merge_small(pieces, min_size_um=min_size_um)
     return layout[~is_below_size(layout.area_um2, min_size_um)]
 
 
 def _lattice(bounds_um: tuple[float, float, float, float], pitch_um: float, cells: str, origin_um: Floats) -> Layout:
-    """All cells of the lattice that reach into some bounds."""
-    # Corners lie on a lattice of half pitches (and half sides): neighbours' corners are equal bit for bit.
+    """Return all cells of the lattice that overlap a bounding box."""
+    # Corners lie on a lattice of half pitches (and half sides), so shared corners are bit-identical.
     step_um = 0.5 * pitch_um * np.array([1.0, 1.0 if cells == "squares" else 1.0 / math.sqrt(3.0)])
     row_steps = 2 if cells == "squares" else 3
     low, high = ((np.asarray(bounds_um[i : i + 2]) - origin_um) / step_um for i in (0, 2))
@@ -246,7 +244,7 @@ def _lattice(bounds_um: tuple[float, float, float, float], pitch_um: float, cell
 
 
 def _open_part(layout: Layout, region: Any) -> Any:
-    """What sites leave open of a region."""
+    """Return the part of a region that no site covers."""
     polygons = layout.polygons()
     near = polygons[shapely.STRtree(polygons).query(region)]
     return shapely.difference(region, shapely.union_all(near)) if near.size else region
@@ -261,4 +259,4 @@ def _joined(layout: Layout, new: Layout, source: Layout, size_um: float) -> Layo
         new = Layout(new.xy_um, new.ring_offsets, new.site_offsets, columns)
     both = union([layout, new])
     step = f"filled with {new.n_sites} sites of at least {size_um:g} µm"
-    return Layout(both.xy_um, both.ring_offsets, both.site_offsets, both.columns, layout._then(step))  # noqa: SLF001 -- of the same room
+    return Layout(both.xy_um, both.ring_offsets, both.site_offsets, both.columns, layout._then(step))  # noqa: SLF001 -- of the same subpackage

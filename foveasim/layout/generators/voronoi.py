@@ -1,4 +1,4 @@
-"""The density-driven layout: sites as dense as any picture or function asks, evened out by Lloyd's steps."""
+"""Density-driven layout: Voronoi cells of a given density, relaxed by Lloyd's algorithm."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ if TYPE_CHECKING:
 
 __all__ = ["voronoi"]
 
-#: A picture (n_y, n_x), or a function of points (n, 2) µm that gives (n,) numbers.
+#: A picture (n_y, n_x), or a function of points (n, 2) µm that returns (n,) numbers.
 Density: TypeAlias = ArrayLike | Callable[[Any], ArrayLike]
 
-#: Cells along the longer side of the region in which a function is tabulated for the first centres.
+#: Cells along the longer side of the region, for the table of a function that initial centres are drawn from.
 TABLE_CELLS = 1024
-#: The first centres are looked for among at most 2**10 times as many points, or 2**27 in all.
+#: Initial centres are selected from at most 2**10 candidates per centre, and 2**27 in total.
 TRIES_LOG2, MAX_TRIES_LOG2 = 10, 27
-#: Points of a triangle as fractions of its second and third corner, their weights, and those of a coarser rule. The one of 3
-#: points is exact for squares of x and y, the one of 7 points for fifth powers and its coarser one for squares (Radon 1948).
+#: Quadrature points of a triangle as fractions of its second and third corner, their weights, and those of a coarser rule. The
+#: 3-point rule is exact up to degree 2, the 7-point rule up to degree 5, and its coarser rule up to degree 2 (Radon 1948).
 THREE_POINTS = ((1 / 6, 1 / 6, 1 / 3, 1 / 3), (4 / 6, 1 / 6, 1 / 3, 1 / 3), (1 / 6, 4 / 6, 1 / 3, 1 / 3))
 SEVEN_POINTS = (
     (0.333333333333333333, 0.333333333333333333, 0.225, 0.484071797961957087),
@@ -53,21 +53,21 @@ SEVEN_POINTS = (
     (0.059715871789769820, 0.470142064105115090, 0.132394152788506181, 0.0),
     (0.470142064105115090, 0.059715871789769820, 0.132394152788506181, 0.0),
 )
-#: A function's integral over a triangle may be wrong by this fraction of the mean cell's: triangles are quartered for that.
+#: Tolerance of the integral over a triangle, relative to that of the mean cell, and the limit of recursive quartering.
 TRIANGLE_ERROR, MAX_QUARTERINGS = 1e-8, 9
-#: Points of a line as fractions of its length, of equal weight: exact for cubics (Gauss).
+#: Gauss points of a line as fractions of its length, of equal weight: exact up to degree 3.
 LINE_POINTS = (0.211324865405187118, 0.788675134594812882)
-#: Few triangles and few lines are large ones, and are taken apart as far as it costs nothing.
+#: Small numbers of triangles and lines, which are large ones, are subdivided up to these numbers at negligible cost.
 LEAST_TRIANGLES, LEAST_LINE_POINTS = 2048, 1024
-#: A cell with less than this fraction of the mean mass holds no more than rounding.
+#: Fraction of the mean mass below which a cell counts as empty.
 EMPTY_SHARE = 1e-9
-#: Equal capacities differ from their mean by this fraction of it at most; Newton's steps go on to a tenth of that.
+#: Largest relative deviation of equal capacities from their mean; Newton iteration ends at a tenth of it.
 CAPACITY_ERROR = 1e-6
-#: So many of Lloyd's steps are those of cells of equal capacity; and so many more are made where there are none.
+#: Lloyd iterations with cells of equal capacity, and additional ones if no such cells are found.
 EQUAL_STEPS, MORE_STEPS = 2, 20
-#: Newton's steps, at most; and the smallest part of one that is tried.
+#: Maximum number of Newton steps, and the smallest damping factor.
 MAX_NEWTON_STEPS, SMALLEST_PART = 30, 0.01
-#: Where they fail, an even density is added at first: its mean, and then this part of it, so many times.
+#: If Newton iteration fails, a uniform density is added: the mean density, reduced by this factor in each of N_FADINGS steps.
 FADING, N_FADINGS = 0.25, 16
 
 
@@ -84,7 +84,7 @@ def voronoi(
     seed: int = 0,
 ) -> Layout:
     """
-    Voronoi cells of seeded centres, as many per area as a density asks.
+    Generate Voronoi cells whose number per area follows a density.
 
     ::
 
@@ -103,46 +103,47 @@ def voronoi(
     n_sites : int
         Number of sites.
     density : (n_y, n_x) array or callable, optional
-        Sites per area, on any scale, at least 0 and somewhere above: a picture on ``density_grid``, or a function of
-        points (n, 2) in µm that gives (n,) values. The same everywhere by default.
+        Relative number of sites per area, >= 0 and not 0 everywhere: a picture on ``density_grid``, or a function of points
+        (n, 2) in µm that returns (n,) values. Uniform by default.
     density_grid : Grid, optional
-        Where the picture's cells are; it must cover the region.
+        Grid of the picture; it must cover the region.
     size_um : (width, height), µm, optional
-        Rectangle around the optical axis that the sites tile.
+        Rectangular region around the optical axis.
     region : shapely Polygon or (n, 2) vertices, µm, optional
-        Any other outline, convex or not. Without it and ``size_um`` the sites tile ``density_grid``.
+        Arbitrary region, convex or concave. Without ``region`` and ``size_um`` the sites tile ``density_grid``.
     n_iterations : int
-        Lloyd's steps: each moves all centres to the centres of mass of their cells.
+        Number of Lloyd iterations, each of which moves all centres to the centres of mass of their cells.
     capacity : "free" or "equal"
-        The density's integral over a site: about the same for all, as it comes, or the same to 1e-6. Equal sites are the
-        cells of a power diagram.
+        Constraint on the capacity, the integral of the density over a site: unconstrained and approximately equal, or equal
+        to within 1e-6. Sites of equal capacity are the cells of a power diagram.
     seed : int
-        Of the first centres; the same seed gives the same layout.
+        Seed of the initial centres; equal seeds give equal layouts.
 
     Returns
     -------
     Layout
-        In no order that means anything, with the column ``share`` (the site's part of the whole density, in mean sites:
-        1 where sites follow the density; exact for a picture, to about 1e-7 for a function that is smooth within sites).
+        In arbitrary order, with the column ``share`` (capacity of a site relative to the mean capacity: 1 where sites follow
+        the density; exact for a picture, accurate to about 1e-7 for a function that is smooth within sites).
 
     Raises
     ------
     ParameterError
-        When a number is out of range, a density negative or nowhere above 0, or the region is not told once.
+        When a number is out of range, a density is negative or 0 everywhere, or not exactly one region is specified.
     GeometryError
-        When a cell would be no simple outline within the region, centres are too close together for float64, or no cells
-        of equal capacity were found.
+        When a cell within the region is not a single polygon without holes, centres are too close together for float64, or
+        no cells of equal capacity are found.
 
     Notes
     -----
-    First centres: a scrambled Sobol sequence through the density's inverse distribution, points outside the region left
-    out; evenly spread without a pattern. Centres of mass are weighted with the square of the density, because cells at
-    rest are as dense as the square root of their weight (Gersho 1979).
+    Initial centres are a scrambled Sobol sequence, uniform without a regular pattern, mapped by the inverse distribution of
+    the density; points outside the region are omitted. Centres of mass are weighted with the square of the density, because
+    the density of converged cells is proportional to the square root of the weight (Gersho 1979).
 
     Equal capacity: a point x belongs to the centre c of the least power ``|x - c|² - w`` (Aurenhammer, Hoffmann and Aronov
-    1998), and damped Newton's steps find the weights w (Kitagawa, Mérigot and Thibert 2019). The last 2 of Lloyd's steps
-    take the centres of mass of these cells, weighted with the density itself (de Goes, Breeden, Ostromoukhov and Desbrun
-    2012). A function that jumps within sites has no integrals to 1e-6: give it as a picture, whose integrals are exact.
+    1998), and a damped Newton iteration determines the weights w (Kitagawa, Mérigot and Thibert 2019). The last 2 Lloyd
+    iterations use the centres of mass of these cells, weighted with the density itself (de Goes, Breeden, Ostromoukhov and
+    Desbrun 2012). The integrals of a function that is discontinuous within sites are not accurate to 1e-6: use a picture,
+    whose integrals are exact.
 
     Examples
     --------
@@ -193,7 +194,7 @@ def _described(density: Density | None) -> str | None:
 
 
 def _rings_um(outline: shapely.Polygon) -> list[Any]:
-    """Vertices of the outline, and a list of such lists when it has holes."""
+    """Return the vertices of the outline, or a list of vertex lists if it has holes."""
     rings = [shapely.get_coordinates(ring)[:-1].tolist() for ring in (outline.exterior, *outline.interiors)]
     return rings[0] if len(rings) == 1 else rings
 
@@ -203,7 +204,7 @@ def _region(size_um: tuple[float, float] | None, region: Any, density_grid: Grid
         raise ParameterError("region", "and 'size_um' exclude each other; give one of them")
     if size_um is None and region is None:
         if density_grid is None:
-            raise ParameterError("size_um", "or 'region' or 'density_grid' must tell what the sites tile")
+            raise ParameterError("size_um", "or 'region' or 'density_grid' must be given, to define the region")
         return shapely.box(*density_grid.bounds_um)
     outline = one_region(size_um=size_um, region=region)
     if not isinstance(outline, shapely.Polygon):
@@ -214,10 +215,10 @@ def _region(size_um: tuple[float, float] | None, region: Any, density_grid: Grid
 def _density(
     density: Density | None, density_grid: Grid | None, outline: shapely.Polygon
 ) -> tuple[_Field, Floats, Grid]:
-    """The density, and a table of it on a grid over the region."""
+    """Return the density, a table of it over the region, and the grid of the table."""
     if density is not None and not callable(density):
         if not isinstance(density_grid, Grid):
-            raise ParameterError("density_grid", "must be the Grid of the density's picture", density_grid)
+            raise ParameterError("density_grid", "must be the Grid of the density picture", density_grid)
         picture = finite_array("density", density, ndim=2, at_least=0.0)
         if picture.shape != density_grid.shape:
             raise ParameterError("density", f"must have the grid's shape {density_grid.shape}, got {picture.shape}")
@@ -241,12 +242,12 @@ def _positive(values: Floats) -> Floats:
 
 
 def _covering(values: Floats, grid: Grid, outline: shapely.Polygon) -> Floats:
-    """The picture, 0 in cells off the region, when its grid covers the region up to rounding."""
+    """Set the picture to 0 outside the region; check that its grid covers the region."""
     x0, y0, x1, y1 = grid.bounds_um
     low_x, low_y, high_x, high_y = outline.bounds
     rounding_um = 1e-9 * max(x1 - x0, y1 - y0)
     if min(low_x - x0, low_y - y0, x1 - high_x, y1 - high_y) < -rounding_um:
-        raise ParameterError("density_grid", "must cover the whole region", grid.bounds_um, "µm")
+        raise ParameterError("density_grid", "must cover the complete region", grid.bounds_um, "µm")
     half_x_um, half_y_um = 0.5 * grid.pitch_x_um, 0.5 * grid.pitch_y_um
     is_near_x = (grid.x_um + half_x_um > low_x) & (grid.x_um - half_x_um < high_x)
     is_near_y = (grid.y_um + half_y_um > low_y) & (grid.y_um - half_y_um < high_y)
@@ -254,13 +255,13 @@ def _covering(values: Floats, grid: Grid, outline: shapely.Polygon) -> Floats:
 
 
 def _checked(density: Callable[[Any], ArrayLike]) -> Callable[[Any], Any]:
-    """The function, its values checked each time."""
+    """Wrap the function with a check of its values."""
 
     def at_points(xy_um: Any) -> Any:
         values = as_numbers("density", density(xy_um))
         if values.shape != xy_um.shape[:1]:
             raise ParameterError(
-                "density", f"must give one value for each of {xy_um.shape[0]} points, got the shape {values.shape}"
+                "density", f"must return one value for each of {xy_um.shape[0]} points, got the shape {values.shape}"
             )
         return finite_array("density", values, at_least=0.0)
 
@@ -268,10 +269,10 @@ def _checked(density: Callable[[Any], ArrayLike]) -> Callable[[Any], Any]:
 
 
 def _first_centres(n_sites: int, weight: Floats, grid: Grid, outline: shapely.Polygon, seed: int) -> Floats:
-    """Points (n_sites, 2) µm in the region, in proportion to the weight of the grid's cells and evenly spread."""
+    """Return quasi-random points (n_sites, 2) µm in the region, with the weights as density."""
     from scipy.stats import qmc
 
-    # One run through all cells, column by column: a point's first number finds the column, its second the row.
+    # Inverse cumulative distribution, column by column: the first coordinate selects the column, the second the row.
     n_y, n_x = weight.shape
     total = np.concatenate(([0.0], np.cumsum(weight.ravel(order="F"))))
     columns = total[::n_y]
@@ -292,21 +293,21 @@ def _first_centres(n_sites: int, weight: Floats, grid: Grid, outline: shapely.Po
         points_um = points_um[shapely.contains_xy(outline, points_um)]
         if points_um.shape[0] >= n_sites:
             return np.asarray(points_um[:n_sites])
-    raise ParameterError("density", "must be above 0 in more of the region: too few points of it lie inside")
+    raise ParameterError("density", "must be > 0 in a larger part of the region, which contains too few points")
 
 
-# -- Lloyd's steps ---------------------------------------------------------------------------------------------------
+# -- Lloyd iteration ---------------------------------------------------------------------------------------------------
 
 
 def _edges(cells: MovingCells, centres_um: Floats, weights_um2: Floats | None = None) -> CellEdges:
     edges = cells.follow(centres_um, weights_um2)
     if edges is None:
-        raise GeometryError("the centres lie too close together for float64")
+        raise GeometryError("the centres are too close together for float64; take fewer sites")
     return edges
 
 
 def _moved(centres_um: Floats, mass: Any, moment: Any, outline: shapely.Polygon) -> Floats:
-    """Centres of mass of the cells; a centre stays where its cell is empty, or its centre of mass lies outside."""
+    """Move centres to the centres of mass, except of empty cells and to points outside."""
     has_mass = mass > EMPTY_SHARE * mass.mean()
     moved_um = np.where(has_mass[:, np.newaxis], moment / np.where(has_mass, mass, 1.0)[:, np.newaxis], centres_um)
     is_inside = shapely.contains_xy(outline, moved_um)
@@ -314,7 +315,7 @@ def _moved(centres_um: Floats, mass: Any, moment: Any, outline: shapely.Polygon)
 
 
 def _moments(edges: CellEdges, n_cells: int, field: _Integrals) -> tuple[Any, Any]:
-    """Integrals over each cell of the density, (n,), and of that times x and y, (n, 2), by triangles from its middle."""
+    """Return the mass (n,) and first moments (n, 2) of each cell, from its triangles."""
     corners_um = np.zeros((n_cells, 2))
     corners_um[edges.cell] = edges.start_um
     area_um2, moment_um3 = _EvenField().moments(edges, corners_um)
@@ -326,7 +327,7 @@ def _moments(edges: CellEdges, n_cells: int, field: _Integrals) -> tuple[Any, An
 
 @dataclass(frozen=True)
 class _Capacities:
-    """Cells of some weights (n,), and the masses (n,) and first moments (n, 2) of the density in them."""
+    """Cells for given weights (n,), with their masses (n,) and first moments (n, 2)."""
 
     weights_um2: Floats
     edges: CellEdges
@@ -335,21 +336,22 @@ class _Capacities:
 
     @property
     def share(self) -> Any:
-        """Masses (n,), in mean ones."""
+        """Masses (n,) relative to their mean."""
         return self.mass * (self.mass.size / self.mass.sum())
 
     @property
     def worst(self) -> float:
-        """Largest difference of a share from 1."""
+        """Largest deviation of the relative masses from 1."""
         return float(np.abs(self.share - 1.0).max())
 
 
 def _follow_equal(cells: MovingCells, centres_um: Floats, field: _Integrals, n_moves: int) -> None:
     """
-    Let cells be those of equal capacity, of the centres after some moves to the centres of mass of such cells.
+    Update cells to equal capacity, after moves of the centres to their centres of mass.
 
-    The weights that make cells equal always exist when cells keep the parts that a notch of the region cuts off. Where
-    neighbours get them, capacities jump when a part is cut off, and there may be no such weights: until centres have moved.
+    Weights for equal capacities always exist if cells retain the parts that a notch of the region separates. If these parts
+    are assigned to neighbours, capacities are discontinuous in the weights, and a solution may require further moves of the
+    centres.
     """
     worst = np.inf
     for move in range(n_moves + MORE_STEPS + 1):
@@ -370,19 +372,19 @@ def _follow_equal(cells: MovingCells, centres_um: Floats, field: _Integrals, n_m
 def _require_equal(worst: Any) -> None:
     if not worst <= CAPACITY_ERROR:
         raise GeometryError(
-            f"found no cells of equal capacity: the best ones differ from the mean by {worst:.1g} of it; take capacity "
-            "'free', more sites, or, for a density that jumps, a picture of it"
+            f"found no cells of equal capacity: the smallest relative deviation from the mean is {worst:.1g}; take "
+            "capacity='free', more sites, or a picture instead of a discontinuous function"
         )
 
 
 def _with_own_parts(cells: MovingCells, centres_um: Floats, field: _Integrals) -> _Capacities:
-    """Cells of equal capacity when each keeps the parts that the region cuts off it."""
+    """Return cells of equal capacity that retain the parts separated by the region."""
     weights_um2 = np.zeros(centres_um.shape[0])
     start = _capacities(_edges(cells, centres_um, weights_um2), weights_um2, field, is_own=True)
     found = _newton(cells, centres_um, field, start, is_own=True)
     if found.worst <= CAPACITY_ERROR:
         return found
-    # Where the density is 0, or about, masses do not tell which way to go: come from an even density.
+    # Masses have no gradient where the density is almost 0: start with a uniform density.
     mean = start.mass.sum() / cells.region.area
     for even in (*(mean * FADING**i for i in range(N_FADINGS)), 0.0):
         faded = _FadedField(field, even)
@@ -394,7 +396,7 @@ def _with_own_parts(cells: MovingCells, centres_um: Floats, field: _Integrals) -
 
 
 def _capacities(edges: CellEdges, weights_um2: Floats, field: _Integrals, *, is_own: bool) -> _Capacities:
-    """Masses of the cells of these edges, with their own parts or with those given to them."""
+    """Return the masses of cells, with their own separated parts or with assigned ones."""
     whole = replace(edges, cell=edges.owner) if is_own else edges
     return _Capacities(weights_um2, edges, *_moments(whole, weights_um2.size, field))
 
@@ -402,7 +404,7 @@ def _capacities(edges: CellEdges, weights_um2: Floats, field: _Integrals, *, is_
 def _newton(
     cells: MovingCells, centres_um: Floats, field: _Integrals, found: _Capacities, *, is_own: bool
 ) -> _Capacities:
-    """The cells that damped Newton's steps lead to, equal or not."""
+    """Return the cells after a damped Newton iteration, converged or not."""
     for _ in range(MAX_NEWTON_STEPS):
         if found.worst <= 0.1 * CAPACITY_ERROR:
             break
@@ -417,7 +419,7 @@ def _newton(
 def _damped(
     cells: MovingCells, centres_um: Floats, field: _Integrals, found: _Capacities, step_um2: Floats, *, is_own: bool
 ) -> _Capacities | None:
-    """The cells after the largest part of a step that leaves all cells some mass and makes them more equal; or None."""
+    """Return the cells after the largest damped step that improves the masses, or None."""
     least, before = 0.5 * min(found.share.min(), 1.0), np.linalg.norm(found.share - 1.0)
     part = 1.0
     while part >= SMALLEST_PART:
@@ -433,9 +435,9 @@ def _damped(
 
 def _newton_step_um2(centres_um: Floats, field: _Integrals, found: _Capacities, *, is_own: bool) -> Floats | None:
     """
-    Change of the weights (n,) that would make masses equal if they were linear in them; None when they do not tell.
+    Return the Newton step of the weights (n,) towards equal masses; None if singular.
 
-    Only differences of weights count, so that the last one stays.
+    Only differences of weights matter, so the last weight is fixed.
     """
     from scipy.sparse.linalg import splu
 
@@ -444,17 +446,17 @@ def _newton_step_um2(centres_um: Floats, field: _Integrals, found: _Capacities, 
     slopes = _slopes(centres_um, field, found.edges, is_own=is_own)
     try:
         step_um2 = splu(slopes[:-1, :-1]).solve((found.mass.mean() - found.mass)[:-1])
-    except RuntimeError:  # singular: some cells have no edge where there is density
+    except RuntimeError:  # singular: some cells have no edge in areas of positive density
         return None
     return np.append(step_um2, 0.0) if np.isfinite(step_um2).all() else None
 
 
 def _slopes(centres_um: Floats, field: _Integrals, edges: CellEdges, *, is_own: bool) -> csc_array[Any]:
     """
-    Derivatives of the masses with the weights, csc_array (n, n).
+    Return the derivatives (n, n) of the masses with respect to the weights.
 
-    A weight larger by dw moves the edge between two centres at the distance d by ``dw / 2d``; the mass that it sweeps over
-    changes sides, from the cell of the part on the one side to that on the other.
+    An increase of a weight by dw displaces the edge between two centres at the distance d by ``dw / 2d``, which transfers
+    the mass of the swept area from the cell on one side to the cell on the other.
     """
     from scipy.sparse import coo_array
 
@@ -468,7 +470,7 @@ def _slopes(centres_um: Floats, field: _Integrals, edges: CellEdges, *, is_own: 
     return coo_array((np.concatenate((swept, -swept, -swept, swept)), (rows, columns)), shape=(n, n)).tocsc()
 
 
-# -- the density's integrals -----------------------------------------------------------------------------------------
+# -- integrals of the density -----------------------------------------------------------------------------------------
 
 
 class _Integrals(Protocol):
@@ -476,25 +478,25 @@ class _Integrals(Protocol):
 
     def moments(self, edges: CellEdges, anchors_um: Floats, *, is_rough: bool = False) -> tuple[Any, Any]:
         """
-        Integrals over each cell of the density, (n,), and of that times x and y, (n, 2).
+        Return the mass (n,) and first moments (n, 2) of each cell.
 
-        Cells are taken apart into triangles of their edges and their anchors (n, 2), wherever these lie; ``is_rough``
-        allows an error that does not matter for a centre of mass.
+        Cells are divided into signed triangles of their edges and arbitrary anchor points (n, 2). ``is_rough`` allows an
+        error that is negligible for centres of mass.
         """
 
     def along(self, start_um: Floats, stop_um: Floats) -> Any:
-        """Integral of the density along each of some lines, (n,)."""
+        """Return the line integrals (n,) of the density."""
 
 
 class _Field(_Integrals, Protocol):
     """A density over the region."""
 
     def squared(self) -> _Field:
-        """The density's square."""
+        """Return the square of the density."""
 
 
 class _EvenField:
-    """The density 1 everywhere: exact."""
+    """Uniform density of 1, integrated exactly."""
 
     def squared(self) -> _Field:
         return self
@@ -513,7 +515,7 @@ class _EvenField:
 
 
 class _FunctionField:
-    """A function of points: triangles are quartered where it bends."""
+    """Density as a function of points, integrated by adaptive quartering of triangles."""
 
     def __init__(self, at: Callable[[Any], Any]) -> None:
         self.at = at
@@ -523,13 +525,13 @@ class _FunctionField:
 
     def moments(self, edges: CellEdges, anchors_um: Floats, *, is_rough: bool = False) -> tuple[Any, Any]:
         n, cell, origin = anchors_um.shape[0], edges.cell, anchors_um.take(edges.cell, 0)
-        # Corners as seen from the anchor of their cell, which is the first one.
+        # Corners relative to the anchor of their cell, which is the first corner.
         corners: Any = np.zeros_like(origin), edges.start_um - origin, edges.stop_um - origin
         total, limit = np.zeros((3, n)), 0.0
         for depth in range(MAX_QUARTERINGS + 1):
             sums, coarse = self._sums(origin, corners, THREE_POINTS if is_rough else SEVEN_POINTS)
             limit = limit or TRIANGLE_ERROR * abs(float(sums[0].sum())) / n
-            # Of a rule of twice the order the error is about the square of that of the coarse one, in shares.
+            # The relative error of a rule of twice the order is about the square of that of the coarse rule.
             is_bent = (sums[0] - coarse) ** 2 > limit * np.abs(sums[0])
             is_bent |= cell.size < LEAST_TRIANGLES
             is_bent &= depth < MAX_QUARTERINGS and not is_rough
@@ -543,7 +545,7 @@ class _FunctionField:
         return total[0], total[1:].T + total[0][:, np.newaxis] * anchors_um
 
     def _sums(self, origin: Any, corners: Any, rule: Any) -> tuple[Any, Any]:
-        """Integrals (3, n) over triangles, of the function and of it times x and y from the origin; coarse ones (n,)."""
+        """Return mass and first moments (3, n) of triangles, and coarse masses (n,)."""
         a, ab, ac = corners[0], corners[1] - corners[0], corners[2] - corners[0]
         area_um2 = _area_um2(ab, ac)
         sums, coarse = np.zeros((3, area_um2.size)), np.zeros(area_um2.size)
@@ -566,10 +568,10 @@ class _FunctionField:
 
 class _PictureField:
     """
-    A picture, at each point the value of the cell it lies in: exact.
+    Density as a picture, constant in each cell, integrated exactly.
 
-    By Green's theorem the integral over a site is one along its outline, of ``F dy``, where F is the picture's integral
-    along its row from the left: linear in x on any piece of the outline that lies in one cell of the picture.
+    By Green's theorem the integral over a site is the line integral of ``F dy`` along its outline, where F is the integral of
+    the picture along its row from the left. F is linear in x on each piece of the outline within a cell of the picture.
     """
 
     def __init__(self, values: Floats, grid: Grid) -> None:
@@ -587,7 +589,7 @@ class _PictureField:
         edge, (x0, y0), (x1, y1), at = self._pieces(edges.start_um[once], edges.stop_um[once])
         value, column, dy = self.values[at], at[1], y1 - y0
         left, x, y = self._left[at] - value * column, 0.5 * (x0 + x1), 0.5 * (y0 + y1)
-        # Means along a piece: of x², and of x y.
+        # Means of x² and of x y along a piece.
         xx, xy = (x0 * x0 + x0 * x1 + x1 * x1) / 3.0, x * y + (x1 - x0) * dy / 12.0
         lines = (left + value * x, self._left_x[at] + 0.5 * value * (xx - column**2), left * y + value * xy)
         total = np.zeros((3, n))
@@ -607,7 +609,7 @@ class _PictureField:
         return np.bincount(edge, self.values[at] * length_um, minlength=start_um.shape[0])
 
     def _pieces(self, start_um: Floats, stop_um: Floats) -> tuple[Ints, Any, Any, tuple[Ints, Ints]]:
-        """Lines cut where they leave a cell of the picture: line, ends (2, n) in cells from the corner, row and column."""
+        """Split lines at cell boundaries: line, ends (2, n) in cells, row and column."""
         start, stop = ((xy_um - np.array(self.grid.origin_um)) / self.grid.pitch_xy_um for xy_um in (start_um, stop_um))
         line, start, stop = _cut(start, stop, axis=1)
         piece, start, stop = _cut(start, stop, axis=0)
@@ -617,7 +619,7 @@ class _PictureField:
 
 
 class _FadedField:
-    """A density and an even one."""
+    """Sum of a density and a uniform density."""
 
     def __init__(self, field: _Integrals, even: Any) -> None:
         self.field, self.even = field, even
@@ -632,12 +634,12 @@ class _FadedField:
 
 
 def _area_um2(a_um: Floats, b_um: Floats) -> Any:
-    """Signed areas (n,) of triangles with these two sides from one corner."""
+    """Return the signed areas (n,) of triangles from two side vectors."""
     return 0.5 * (a_um[:, 0] * b_um[:, 1] - a_um[:, 1] * b_um[:, 0])
 
 
 def _cut(start: Any, stop: Any, axis: int) -> tuple[Ints, Any, Any]:
-    """Lines (n, 2) cut where a coordinate is an integer: line, and ends of the pieces, in the lines' order."""
+    """Split lines (n, 2) at integer values of a coordinate: line index and ends of the pieces."""
     a, b = start[:, axis], stop[:, axis]
     first = np.floor(np.minimum(a, b)) + 1.0
     n_cuts = np.maximum(np.ceil(np.maximum(a, b)) - first, 0.0).astype(np.int64)

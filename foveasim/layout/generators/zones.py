@@ -1,4 +1,4 @@
-"""Nested zones of any outline, each with pixels of its own size around the zone inside it."""
+"""Nested zones of arbitrary outlines, each with its own pixel pitch."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from foveasim.layout.model import Layout
 
 __all__ = ["zones"]
 
-#: Pixels along the side of a zone, at most.
+#: Maximum number of pixels along the side of a zone.
 MAX_PIXELS = 2**14
-#: Ratios of lengths may be this far from integers.
+#: Tolerance of integer ratios of lengths.
 WHOLE_NUMBER_ROUNDING = 1e-9
 
 
@@ -35,7 +35,7 @@ def zones(
     cells: Cells | Sequence[Cells] = "squares",
 ) -> Layout:
     """
-    Zones around each other, each filled with its own grid where the zone inside leaves room.
+    Generate nested zones, each with its own grid around the inner zone.
 
     ::
 
@@ -52,44 +52,46 @@ def zones(
     Parameters
     ----------
     pitch_um : sequence of float, µm
-        Pixel pitch in each zone, from the innermost.
+        Pixel pitch of each zone, from the innermost.
     side_um : sequence of float, optional, µm
-        Sides of square zones around the optical axis, growing. In zones of squares, a zone's side and the side of the zone
-        inside it must fit whole pixels.
+        Increasing sides of square zones around the optical axis. In zones of squares, the side of the zone and that of the
+        inner zone must be multiples of the pitch, with an integer number of pixels on each side of the inner zone.
     outlines_um : sequence of shapely Polygons or (n, 2) vertices, optional, µm
-        Instead of the sides, any outlines, each around the one before. Pieces of pixels at a border that are below half
-        a pixel's area belong to the pixel beside them.
+        Arbitrary outlines instead of the sides, each enclosing the previous one. Pieces of pixels at a boundary with less
+        than half the area of a pixel are merged into the adjacent pixel.
     cells : {"squares", "hexagons"} or a sequence of them
-        Shape of the pixels, in all zones or in each. Hexagons are cut at borders as under any outline.
+        Shape of the pixels, in all zones or in each. Hexagons are cut at zone boundaries as with arbitrary outlines.
 
     Returns
     -------
     Layout
-        Zone by zone, with the columns ``zone``, ``row``, ``column`` (in the zone's own grid) and ``readout_line``
-        (the columns of all zones, numbered through).
+        Zone by zone, with the columns ``zone``, ``row``, ``column`` (in the grid of the zone) and ``readout_line`` (columns
+        of all zones, numbered consecutively).
 
     Raises
     ------
     ParameterError
-        When the lists differ in length, zones do not lie in each other, or pixels do not fit.
+        When the sequences differ in length, zones are not nested, or the number of pixels is not an integer.
     GeometryError
         When a zone is smaller than one of its pixels.
 
     Examples
     --------
-    The same field that takes 262,144 sites of the fovea's size:
+    A field that would require 262,144 sites with the pitch of the fovea:
 
     >>> zones(side_um=(64, 128, 256, 512), pitch_um=(1, 2, 4, 8)).n_sites
     13312
     """
     if (side_um is None) == (outlines_um is None):
-        raise ParameterError("side_um", "or 'outlines_um' must be given: one of them")
+        raise ParameterError("side_um", "or 'outlines_um' must be given, but only one of them")
     pitches_um = finite_array("pitch_um", pitch_um, ndim=1, above=0.0)
     shapes = [cells] * pitches_um.size if isinstance(cells, str) else list(cells)
     for i, shape in enumerate(shapes):
         check_choice("cells" if isinstance(cells, str) else f"cells[{i}]", shape, get_args(Cells))
     if len(shapes) != pitches_um.size:
-        raise ParameterError("cells", f"must be one or one for each of the {pitches_um.size} zones, got {len(shapes)}")
+        raise ParameterError(
+            "cells", f"must be one shape, or one for each of the {pitches_um.size} zones, got {len(shapes)}"
+        )
     outlines = None if outlines_um is None else _outlines(outlines_um, pitches_um.size)
     sides_um = None if side_um is None else _sides(side_um, pitches_um)
     if sides_um is not None and all(shape == "squares" for shape in shapes):
@@ -116,7 +118,7 @@ def _sides(side_um: Sequence[float], pitches_um: Floats) -> Floats:
     if sides_um.max() > MAX_LENGTH_UM:
         raise ParameterError("side_um", f"must be <= {MAX_LENGTH_UM:g}", float(sides_um.max()), "µm")
     if np.any(np.diff(sides_um) <= 0):
-        raise ParameterError("side_um", "must grow from zone to zone", sides_um.tolist(), "µm")
+        raise ParameterError("side_um", "must increase from zone to zone", sides_um.tolist(), "µm")
     return sides_um
 
 
@@ -133,7 +135,7 @@ def _outlines(outlines_um: Sequence[Any], n_zones: int) -> list[Any]:
 
 
 def _squares(sides_um: Floats, pitches_um: Floats) -> tuple[Floats, dict[str, Ints]]:
-    """Corners and columns of whole squares in square zones."""
+    """Return the corners and columns of complete squares in square zones."""
     corners, columns = [], []
     n_lines = 0
     inner_um = 0.0
@@ -155,12 +157,12 @@ def _squares(sides_um: Floats, pitches_um: Floats) -> tuple[Floats, dict[str, In
 
 
 def _tiled(outlines: Sequence[Any], pitches_um: Floats, shapes: Sequence[Cells]) -> Layout:
-    """Zones of any outlines, cut from their lattices."""
+    """Return zones of arbitrary outlines, clipped from their lattices."""
     parts = []
     n_lines = 0
     for zone, (outer, p_um, shape) in enumerate(zip(outlines, pitches_um, shapes, strict=True)):
         region = shapely.difference(outer, outlines[zone - 1]) if zone > 0 else outer
-        # Whole squares from the lower left corner: all of a rectangle's that fit are whole.
+        # Aligned with the lower left corner, so that as many squares of a rectangle as possible are complete.
         x_um, y_um = (float(x + 0.5 * p_um) for x in outer.bounds[:2])
         part = tiling(region=region, pitch_um=float(p_um), cells=shape, origin_um=(x_um, y_um))
         line = n_lines + part.readout_line
@@ -171,11 +173,11 @@ def _tiled(outlines: Sequence[Any], pitches_um: Floats, shapes: Sequence[Cells])
 
 def _whole(name: str, value: float, of_um: float, ratio: float) -> int:
     if ratio > MAX_PIXELS:
-        raise ParameterError(name, f"asks for {ratio:g} pixels in a row, more than {MAX_PIXELS}")
+        raise ParameterError(name, f"must give at most {MAX_PIXELS} pixels in a row, got {ratio:g}")
     if round(ratio) < 1 or abs(ratio - round(ratio)) > WHOLE_NUMBER_ROUNDING * max(ratio, 1.0):
         raise ParameterError(
             name,
-            f"must fit whole pixels between the zones' borders ({of_um:g} µm gives {ratio:g} pixels)",
+            f"must give an integer number of pixels between zone boundaries ({of_um:g} µm gives {ratio:g} pixels)",
             float(value),
             "µm",
         )
