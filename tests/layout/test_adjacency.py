@@ -1,4 +1,4 @@
-"""Neighbours: every shared edge is found once, with its length, T-junctions included."""
+"""Adjacency: lengths of shared edges, including T-junctions."""
 
 from __future__ import annotations
 
@@ -24,45 +24,45 @@ TILINGS = {
 
 @pytest.mark.parametrize("angle_deg", [0.0, 17.3, 90.0])
 @pytest.mark.parametrize("name", TILINGS)
-def test_shared_edges_and_the_outer_border_make_up_every_perimeter(name, angle_deg):
+def test_shared_and_boundary_edges_sum_to_perimeters(name, angle_deg):
     layout = TILINGS[name].rotate(angle_deg).translate(321.0, -123.0)
     polygons = layout.polygons()
-    outside_um = 2 * shapely.length(polygons).sum() - 2 * layout.adjacency().sum()
-    border_um = 2 * shapely.length(shapely.union_all(shapely.set_precision(polygons, 1e-7)))
+    unshared_um = 2 * shapely.length(polygons).sum() - 2 * layout.adjacency().sum()
+    boundary_um = 2 * shapely.length(shapely.union_all(shapely.set_precision(polygons, 1e-7)))
 
-    assert outside_um == pytest.approx(border_um, rel=1e-6)
+    assert unshared_um == pytest.approx(boundary_um, rel=1e-6)
 
 
-def test_a_hexagon_in_the_middle_shares_a_side_with_each_of_six():
+def test_central_hexagon_shares_sides_with_six():
     shared_um = TILINGS["hexagonal"].adjacency().toarray()
-    middle = shared_um[3 * 7 + 3]
+    centre = shared_um[3 * 7 + 3]
 
-    assert np.count_nonzero(middle) == 6
-    assert middle[middle > 0] == pytest.approx(2.3 / np.sqrt(3))
+    assert np.count_nonzero(centre) == 6
+    assert centre[centre > 0] == pytest.approx(2.3 / np.sqrt(3))
 
 
-def test_squares_that_touch_in_a_corner_are_no_neighbours():
+def test_squares_touching_in_corner_are_not_adjacent():
     shared_um = fs.layout.grid(n_x=2, n_y=2, pitch_um=1.0).adjacency().toarray()
 
     assert shared_um.tolist() == [[0, 1, 1, 0], [1, 0, 0, 1], [1, 0, 0, 1], [0, 1, 1, 0]]
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 31.7])
-def test_a_long_edge_is_shared_with_every_short_one_along_it(angle_deg):
+def test_long_edge_is_shared_with_short_ones(angle_deg):
     boxes = [shapely.box(0, 0, 4, 2), shapely.box(0, 2, 1, 3), shapely.box(1, 2, 3, 3), shapely.box(3, 2, 4.5, 3)]
     layout = fs.Layout.from_polygons(boxes).rotate(angle_deg, (7.0, -3.0))
 
     assert layout.adjacency().toarray()[0] == pytest.approx([0, 1, 2, 1], abs=1e-9)
 
 
-def test_a_site_in_a_hole_is_a_neighbour():
+def test_site_in_hole_is_adjacent():
     frame = shapely.box(0, 0, 8, 8).difference(shapely.box(2, 2, 5, 5))
     layout = fs.Layout.from_polygons([frame, shapely.box(2, 2, 5, 5)])
 
     assert layout.adjacency().toarray().tolist() == [[0, 12], [12, 0]]
 
 
-def test_sites_across_a_trench_are_neighbours_when_asked():
+def test_max_gap_includes_sites_across_trench():
     layout = fs.layout.grid(n_x=3, n_y=1, pitch_um=2.0, width_um=1.8)
 
     assert layout.adjacency().nnz == 0
@@ -74,7 +74,7 @@ def test_sites_across_a_trench_are_neighbours_when_asked():
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10_000), angle_deg=st.floats(0, 360))
 def test_random_tilings_agree_with_shapely(seed, angle_deg):
-    """Cells of random guillotine cuts; the twin measures the common line of each pair before the turn."""
+    """Random guillotine cuts; the reference is the common line of each pair before the rotation."""
     rng = np.random.default_rng(seed)
     boxes = [(0.0, 0.0, 16.0, 16.0)]
     for _ in range(12):
@@ -93,16 +93,16 @@ def test_random_tilings_agree_with_shapely(seed, angle_deg):
     assert np.array_equal(shared_um, shared_um.T)
 
 
-def test_a_layout_without_sites_has_no_neighbours():
+def test_empty_layout_has_empty_adjacency():
     assert TILINGS["grid"][[]].adjacency().shape == (0, 0)
 
 
-def test_a_negative_gap_is_refused():
+def test_negative_gap_raises():
     with pytest.raises(ParameterError, match="'max_gap_um' must be >= 0"):
         TILINGS["grid"].adjacency(max_gap_um=-1.0)
 
 
-def test_corners_that_overlap_by_rounding_share_no_edge():
+def test_corners_overlapping_by_rounding_share_nothing():
     layout = fs.Layout.from_polygons([shapely.box(0, 0, 2, 2), shapely.box(2 + 1e-8, 2 - 1e-8, 4, 4)])
 
     assert layout.adjacency().nnz == 0

@@ -1,4 +1,4 @@
-"""Colour filters and readout lines: published counts, exact quotas, neighbours that differ."""
+"""Colour filters and readout lines: published counts, exact fractions, distinct neighbours."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ RINGS = fs.layout.log_polar(n_sectors=30, r_min_um=4.0, r_max_um=50.0, stagger=T
         ("rgbw", [36] * 4),
     ],
 )
-def test_named_mosaics_have_their_published_counts(name, counts):
+def test_named_mosaics_have_published_counts(name, counts):
     assert np.bincount(mosaic(GRID, name).channel).tolist() == counts
 
 
-def test_every_row_and_column_of_x_trans_has_all_three_colours():
+def test_x_trans_lines_contain_all_colours():
     channel = mosaic(GRID, "x_trans").channel.reshape(12, 12)
 
     assert all(set(line) == {0, 1, 2} for line in [*channel, *channel.T])
 
 
-def test_quad_bayer_binned_two_by_two_is_bayer():
+def test_binned_quad_bayer_is_bayer():
     binned = fs.layout.merge(mosaic(GRID, "quad_bayer"), GRID.columns["row"] // 2 * 6 + GRID.columns["column"] // 2)
 
     assert binned.channel.reshape(6, 6)[:2, :2].tolist() == [[0, 1], [1, 2]]
 
 
-@pytest.mark.parametrize("shares", [(1, 2, 1), (1, 1, 1, 1), (0.3, 0.0, 0.7)])
-def test_random_channels_come_in_exact_numbers(shares):
-    layout = random_channels(RINGS, shares, seed=3)
-    counts = np.bincount(layout.channel, minlength=len(shares))
+@pytest.mark.parametrize("fractions", [(1, 2, 1), (1, 1, 1, 1), (0.3, 0.0, 0.7)])
+def test_random_channels_have_exact_fractions(fractions):
+    layout = random_channels(RINGS, fractions, seed=3)
+    counts = np.bincount(layout.channel, minlength=len(fractions))
 
-    assert np.abs(counts - np.array(shares) / sum(shares) * RINGS.n_sites).max() < 1
-    assert np.array_equal(random_channels(RINGS, shares, seed=3).channel, layout.channel)
-    assert not np.array_equal(random_channels(RINGS, shares, seed=4).channel, layout.channel)
+    assert np.abs(counts - np.array(fractions) / sum(fractions) * RINGS.n_sites).max() < 1
+    assert np.array_equal(random_channels(RINGS, fractions, seed=3).channel, layout.channel)
+    assert not np.array_equal(random_channels(RINGS, fractions, seed=4).channel, layout.channel)
 
 
 @pytest.mark.parametrize(("layout", "n_channels"), [(GRID, 2), (HEXAGONS, 3), (RINGS, 4)])
-def test_no_two_neighbours_have_the_same_colour(layout, n_channels):
+def test_graph_colouring_separates_neighbours(layout, n_channels):
     coloured = graph_colouring(layout, n_channels)
     pairs = coloured.adjacency().tocoo()
     a, b = pairs.coords
@@ -61,26 +61,26 @@ def test_no_two_neighbours_have_the_same_colour(layout, n_channels):
     assert np.bincount(coloured.channel).min() > 0.8 * layout.n_sites / n_channels - 15
 
 
-def test_separate_sites_are_coloured_in_turn():
-    apart = fs.layout.grid(n_x=6, n_y=1, pitch_um=3.0, width_um=1.0)
+def test_graph_colouring_balances_isolated_sites():
+    isolated = fs.layout.grid(n_x=6, n_y=1, pitch_um=3.0, width_um=1.0)
 
-    assert np.bincount(graph_colouring(apart, 3).channel).tolist() == [2, 2, 2]
+    assert np.bincount(graph_colouring(isolated, 3).channel).tolist() == [2, 2, 2]
 
 
-def test_a_site_is_read_by_the_nearest_bus_and_in_order_along_it():
+def test_nearest_bus_assigns_ordered_sites():
     buses = [shapely.LineString([(x, -10), (x, 10)]) for x in (-3.0, 3.0)]
     layout = nearest_bus(GRID, buses)
 
     assert np.array_equal(layout.readout_line, (GRID.centroid_um[:, 0] > 0).astype(int))
     for line in (0, 1):
-        of_line = layout.readout_line == line
-        order = np.argsort(layout.columns["readout_order"][of_line])
-        y_um = layout.centroid_um[of_line][order, 1]
-        assert sorted(layout.columns["readout_order"][of_line]) == list(range(72))
+        is_on_line = layout.readout_line == line
+        order = np.argsort(layout.columns["readout_order"][is_on_line])
+        y_um = layout.centroid_um[is_on_line][order, 1]
+        assert sorted(layout.columns["readout_order"][is_on_line]) == list(range(72))
         assert np.all(np.diff(y_um) > -1e-9)
 
 
-def test_readout_by_a_column_takes_its_numbers():
+def test_readout_by_column_uses_its_indices():
     assert np.array_equal(readout_by(RINGS, "ring").readout_line, RINGS.columns["ring"])
     assert readout_order(GRID).columns["readout_order"].tolist() == GRID.columns["row"].tolist()
 
@@ -88,7 +88,7 @@ def test_readout_by_a_column_takes_its_numbers():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: mosaic(GRID, "bayer", names="RRGB"), "'names' must not name a filter twice"),
+        (lambda: mosaic(GRID, "bayer", names="RRGB"), "'names' must not contain a letter twice"),
         (lambda: random_channels(GRID, (0, 0), seed=0), "'fractions' must not all be 0"),
         (lambda: random_channels(GRID, (1, -1), seed=0), "'fractions' must be >= 0"),
         (lambda: graph_colouring(GRID, 0), "'n_channels' must be >= 1"),
@@ -96,10 +96,10 @@ def test_readout_by_a_column_takes_its_numbers():
         (lambda: readout_by(GRID, "spoke"), "'spoke' must be a column of the layout"),
     ],
 )
-def test_bad_arguments_are_refused_by_name(call, message):
+def test_invalid_argument_raises_with_name(call, message):
     with pytest.raises(ParameterError, match=message):
         call()
 
 
-def test_blocks_are_rectangles():
+def test_named_blocks_are_rectangular():
     assert all(len({len(row) for row in block}) == 1 for block in MOSAICS.values())

@@ -1,4 +1,4 @@
-"""Composing layouts: area is kept where it should be, columns go with their sites, and nothing opens or overlaps."""
+"""Edits of layouts: preserved areas and columns, no gaps and no overlaps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def overlap_um2(layout):
 
 
 @pytest.mark.parametrize("name", TILINGS)
-def test_what_is_clipped_and_what_is_punched_make_up_the_layout(name):
+def test_clip_and_cut_out_are_complementary(name):
     layout = TILINGS[name]
     inside, outside = clip(layout, DISC), cut_out(layout, DISC)
 
@@ -35,16 +35,16 @@ def test_what_is_clipped_and_what_is_punched_make_up_the_layout(name):
     assert overlap_um2(inside) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_dropping_cut_sites_keeps_the_whole_ones_as_they_are():
-    kept = clip(GRID, DISC, cut="drop")
+def test_dropping_cut_sites_preserves_complete_ones():
+    clipped = clip(GRID, DISC, cut="drop")
     is_inside = shapely.covers(DISC, GRID.polygons())
 
     assert 0 < is_inside.sum() < GRID.n_sites
-    assert np.array_equal(kept.xy_um, GRID[is_inside].xy_um)
+    assert np.array_equal(clipped.xy_um, GRID[is_inside].xy_um)
     assert cut_out(GRID, DISC, cut="drop").n_sites == shapely.disjoint(DISC, GRID.polygons()).sum()
 
 
-def test_pieces_of_a_cut_site_keep_its_columns():
+def test_pieces_inherit_columns_of_site():
     bar = fs.Layout.from_rectangles([[0.0, 0.0], [0.0, 10.0]], [[20.0, 2.0], [20.0, 2.0]], channel=[1, 2])
     pieces = cut_out(bar, shapely.box(-1, -20, 1, 20))
 
@@ -54,13 +54,13 @@ def test_pieces_of_a_cut_site_keep_its_columns():
 
 
 @pytest.mark.parametrize("margin_um", [0.05, 0.2])
-def test_an_inset_leaves_the_fill_factor_of_a_trench(margin_um):
+def test_inset_has_fill_factor_of_trench(margin_um):
     fill = inset(GRID, margin_um).area_um2 / GRID.area_um2
 
     assert fill == pytest.approx((1 - margin_um) ** 2)  # (1 - t/p)² with t = 2 margins and p = 2 µm
 
 
-def test_an_inset_moves_every_border_by_its_site_s_margin():
+def test_inset_offsets_boundaries_by_site_margins():
     margins_um = np.linspace(0.1, 0.3, RINGS.n_sites)
     shrunk = inset(RINGS, margins_um)
     away_um = shapely.distance(shrunk.polygons(), shapely.boundary(RINGS.polygons()))
@@ -68,13 +68,13 @@ def test_an_inset_moves_every_border_by_its_site_s_margin():
     assert away_um == pytest.approx(margins_um, abs=1e-9)
 
 
-def test_sites_too_narrow_for_the_margin_are_named():
-    with pytest.raises(GeometryError, match=r"site 0 would vanish or fall into parts \(and 15 more\)") as caught:
+def test_inset_lists_sites_narrower_than_margin():
+    with pytest.raises(GeometryError, match=r"site 0 would vanish or split into parts \(and 15 more\)") as caught:
         inset(ZONES, 0.6)
     assert caught.value.site_ids == tuple(np.flatnonzero(ZONES.columns["zone"] == 0))
 
 
-def test_binning_two_by_two_gives_squares_of_twice_the_pitch():
+def test_binning_doubles_the_pitch():
     groups = GRID.columns["row"] // 2 * 5 + GRID.columns["column"] // 2
     binned = merge(GRID, groups)
 
@@ -84,7 +84,7 @@ def test_binning_two_by_two_gives_squares_of_twice_the_pitch():
     assert overlap_um2(binned) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_merging_into_one_group_gives_the_outline():
+def test_merging_all_sites_gives_outline():
     ring = merge(RINGS, np.zeros(RINGS.n_sites, int))
 
     assert ring.n_sites == 1
@@ -92,15 +92,15 @@ def test_merging_into_one_group_gives_the_outline():
     assert np.diff(ring.site_offsets)[0] == 2  # the outline and the blind spot
 
 
-def test_sites_that_do_not_touch_cannot_be_merged():
-    with pytest.raises(GeometryError, match="site 0 does not hang together") as caught:
+def test_merging_disconnected_sites_raises():
+    with pytest.raises(GeometryError, match="site 0 must be connected to the other sites") as caught:
         merge(GRID, np.where(np.isin(np.arange(80), (0, 79)), 1, 2 + np.arange(80)))
     assert caught.value.site_ids == (0, 79)
 
 
 @pytest.mark.parametrize(("n_x", "n_y"), [(2, 1), (1, 2), (2, 2), (3, 2)])
 @pytest.mark.parametrize("name", TILINGS)
-def test_the_parts_of_split_sites_make_up_the_sites(name, n_x, n_y):
+def test_split_parts_sum_to_sites(name, n_x, n_y):
     layout = TILINGS[name]
     parts = split(layout, n_x=n_x, n_y=n_y)
     sums = np.bincount(parts.columns["parent"], parts.area_um2, layout.n_sites)
@@ -109,7 +109,7 @@ def test_the_parts_of_split_sites_make_up_the_sites(name, n_x, n_y):
     assert overlap_um2(parts) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_dual_pixels_are_halves_left_and_right():
+def test_dual_pixels_are_left_and_right_halves():
     halves = split(GRID, n_x=2)
 
     assert halves.n_sites == 160
@@ -119,17 +119,17 @@ def test_dual_pixels_are_halves_left_and_right():
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 17.3])
-def test_noding_makes_a_coverage_of_a_tiling_with_t_junctions(angle_deg):
-    turned = node(ZONES).rotate(angle_deg)
+def test_noding_t_junctions_gives_valid_coverage(angle_deg):
+    rotated = node(ZONES).rotate(angle_deg)
 
     assert not shapely.coverage_is_valid(ZONES.polygons())
-    assert shapely.coverage_is_valid(turned.polygons())
-    assert turned.area_um2 == pytest.approx(ZONES.area_um2, rel=1e-12)
+    assert shapely.coverage_is_valid(rotated.polygons())
+    assert rotated.area_um2 == pytest.approx(ZONES.area_um2, rel=1e-12)
 
 
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(angle_deg=st.floats(0, 90), grid_um=st.sampled_from([0.001, 0.005, 0.02]), name=st.sampled_from(sorted(TILINGS)))
-def test_snapping_opens_and_covers_nothing(angle_deg, grid_um, name):
+def test_snapping_creates_no_gaps_or_overlaps(angle_deg, grid_um, name):
     layout = node(TILINGS[name]).rotate(angle_deg).translate(0.3, 0.7)
     snapped = snap(layout, grid_um)
     steps = snapped.xy_um / grid_um
@@ -140,12 +140,12 @@ def test_snapping_opens_and_covers_nothing(angle_deg, grid_um, name):
     assert snapped.n_sites == layout.n_sites
 
 
-def test_a_site_smaller_than_the_grid_is_named():
+def test_snapping_reports_site_below_grid():
     with pytest.raises(GeometryError, match="site 0 "):
         snap(fs.Layout.from_rectangles([[0.3, 0.3], [10.0, 10.0]], [0.1, 4.0]), 1.0)
 
 
-def test_a_union_has_the_sites_of_all_and_the_columns_of_each():
+def test_union_has_all_sites_and_common_columns():
     fovea = clip(fs.layout.hexagonal(n_columns=9, n_rows=9, pitch_um=0.9), shapely.Point(0, 0).buffer(3.5))
     joined = union(
         [RINGS.with_columns(extra=np.zeros(RINGS.n_sites)), fovea.with_columns(channel=np.ones(fovea.n_sites, int))]
@@ -168,27 +168,27 @@ def test_a_union_has_the_sites_of_all_and_the_columns_of_each():
         (lambda: clip(GRID, DISC, cut="shrink"), "'cut' must be one of 'pieces', 'drop'"),
         (lambda: inset(GRID, -0.1), "'margin_um' must be >= 0"),
         (lambda: inset(GRID, [0.1, 0.2]), "'margin_um' must be one number, or one for each of the 80 sites"),
-        (lambda: merge(GRID, [1, 2]), "'groups' must be 80 integers from 0"),
-        (lambda: merge(GRID, np.full(80, -1)), "'groups' must be 80 integers from 0"),
+        (lambda: merge(GRID, [1, 2]), "'groups' must be 80 integers >= 0"),
+        (lambda: merge(GRID, np.full(80, -1)), "'groups' must be 80 integers >= 0"),
         (lambda: split(GRID, n_x=0), "'n_x' must be >= 1"),
         (lambda: snap(GRID, 0.0), "'grid_um' must be > 0"),
     ],
 )
-def test_bad_arguments_are_refused_by_name(call, message):
+def test_invalid_argument_raises_with_name(call, message):
     with pytest.raises(ParameterError, match=message):
         call()
 
 
-def test_slivers_along_a_cut_join_their_neighbours_on_the_other_side():
-    """Both sides of a cut are computed apart, so their borders agree up to rounding only."""
+def test_merge_small_joins_slivers_across_cut():
+    """Both sides of a cut are computed separately, so their boundaries agree only within rounding."""
     disc = shapely.Point(0.0, 0.0).buffer(50.0)
     hexagons = fs.layout.hexagonal(n_columns=40, n_rows=40, pitch_um=3.0)
     zones = fs.layout.zones(pitch_um=(2.0, 4.0, 8.0), side_um=(48.0, 144.0, 288.0))
     both = fs.layout.union([fs.layout.clip(hexagons, disc), fs.layout.cut_out(zones, disc)])
 
-    joined = fs.layout.merge_small(both, min_size_um=1.0)
+    merged = fs.layout.merge_small(both, min_size_um=1.0)
 
     assert both.area_um2.min() < 0.1
-    assert joined.area_um2.min() >= 1.0
-    assert joined.area_um2.sum() == pytest.approx(both.area_um2.sum(), abs=1e-3)
-    assert joined.n_sites > 0.9 * both.n_sites
+    assert merged.area_um2.min() >= 1.0
+    assert merged.area_um2.sum() == pytest.approx(both.area_um2.sum(), abs=1e-3)
+    assert merged.n_sites > 0.9 * both.n_sites

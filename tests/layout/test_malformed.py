@@ -1,4 +1,4 @@
-"""Input that layouts, readers and captures reject: integers beyond 64 bits, misplaced holes, sensors of other layouts."""
+"""Malformed layouts: integers beyond 64 bits, invalid holes, sensors of other layouts."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MAKERS = {
 @pytest.mark.parametrize("name", ["channel", "readout_line"])
 @pytest.mark.parametrize("value", [BEYOND, 2**63, 2**32, -1])
 @pytest.mark.parametrize("as_array", [False, True])
-def test_indices_beyond_any_sensor_are_rejected(make, name, value, as_array):
+def test_out_of_range_index_raises(make, name, value, as_array):
     values = np.array([0, value], np.uint64 if value > 0 else np.int64) if as_array else [0, value]
 
     with pytest.raises(ParameterError, match=f"'{name}' must contain integers from 0 to 50000000, got {value}"):
@@ -48,7 +48,7 @@ def test_integer_columns_are_exact(make):
 
 
 @pytest.mark.parametrize("values", [[-1, BEYOND], [0, 2**64], [-(2**63) - 1, 0]])
-def test_integers_that_no_type_contains_are_rejected(values):
+def test_integers_beyond_64_bits_raise(values):
     with pytest.raises(
         ParameterError,
         match=r"'number' must contain integers from -2\*\*63 to 2\*\*63 - 1, or from 0 to 2\*\*64 - 1, got",
@@ -56,7 +56,7 @@ def test_integers_that_no_type_contains_are_rejected(values):
         fs.Layout.from_polygons(squares(), number=values)
 
 
-def test_union_keeps_integers_exact():
+def test_union_preserves_integers_exactly():
     small = fs.Layout.from_polygons(squares(), number=np.array([1, 2]))
     large = fs.Layout.from_polygons(squares(), number=np.array([1, BEYOND], np.uint64))
     negative = fs.Layout.from_polygons(squares(), number=np.array([-1, 2]))
@@ -69,7 +69,7 @@ def test_union_keeps_integers_exact():
 
 @pytest.mark.parametrize("name", ["channel", "readout_line"])
 @pytest.mark.parametrize("value", [BEYOND, -1])
-def test_files_with_impossible_indices_are_rejected(tmp_path, name, value):
+def test_geojson_and_npz_reject_invalid_indices(tmp_path, name, value):
     layout = fs.Layout.from_polygons(squares(), **{name: [0, 1]})
     layout.write(tmp_path / "a.geojson")
     text = (tmp_path / "a.geojson").read_text()
@@ -85,7 +85,7 @@ def test_files_with_impossible_indices_are_rejected(tmp_path, name, value):
             fs.read_layout(tmp_path / file)
 
 
-def test_chip_and_parquet_files_with_impossible_indices_are_rejected(tmp_path):
+def test_gdsii_and_parquet_reject_invalid_indices(tmp_path):
     gdstk, pq = pytest.importorskip("gdstk"), pytest.importorskip("pyarrow.parquet")
     import pyarrow as pa
 
@@ -109,7 +109,7 @@ def test_chip_and_parquet_files_with_impossible_indices_are_rejected(tmp_path):
             fs.read_layout(tmp_path / file)
 
 
-def test_geojson_integers_among_floats_stay_exact(tmp_path):
+def test_geojson_preserves_integers_among_floats(tmp_path):
     layout = fs.Layout.from_polygons(squares())
     layout.write(tmp_path / "a.geojson")
     document = json.loads((tmp_path / "a.geojson").read_text())
@@ -118,7 +118,7 @@ def test_geojson_integers_among_floats_stay_exact(tmp_path):
     (tmp_path / "a.geojson").write_text(json.dumps(document))
     read = fs.read_layout(tmp_path / "a.geojson")
 
-    # As floats with NaN for null it would be another number.
+    # Converted to float, with NaN for null, the integer would change.
     assert "number" not in read.columns
     assert read.provenance["left_out_properties"] == ["number"]
     assert read.columns["value"].tolist() == [1.0, 0.5]
@@ -128,7 +128,7 @@ def test_geojson_integers_among_floats_stay_exact(tmp_path):
 
 
 def with_holes(*holes, clockwise=True):
-    """Packed rings of three sites, of which site 1 is a square of 10 µm with these holes."""
+    """Packed rings of three sites; site 1 is a square of 10 µm with the holes."""
     near = [[-5, 0], [-4, 0], [-4, 1], [-5, 1]]
     far = [[40, 0], [41, 0], [41, 1], [40, 1]]
     rings = [near, SQUARE, *(hole[::-1] if clockwise else hole for hole in holes), far]
@@ -147,20 +147,20 @@ BAD_HOLES = {
     "the outline itself": ([box(0, 0, 10, 10)], "crosses or touches itself"),
     "overlapping": ([box(2, 2, 5, 5), box(4, 4, 7, 7)], "crosses or touches itself"),
     "nested": ([box(2, 2, 8, 8), box(4, 4, 6, 6)], "has a hole inside another hole"),
-    "twice the same": ([box(2, 2, 8, 8), box(2, 2, 8, 8)], "crosses or touches itself"),
+    "duplicate": ([box(2, 2, 8, 8), box(2, 2, 8, 8)], "crosses or touches itself"),
 }
 
 
 @pytest.mark.parametrize(("holes", "message"), BAD_HOLES.values(), ids=BAD_HOLES)
-def test_holes_must_lie_apart_inside_their_outline(holes, message, tmp_path):
+def test_misplaced_hole_raises(holes, message, tmp_path):
     xy_um, ring_offsets, site_offsets = with_holes(*holes)
     for make in (fs.Layout, lambda *rings: fs.Layout.from_polygons(rings)):
         with pytest.raises(GeometryError, match=f"site 1 {message}") as caught:
             make(xy_um, ring_offsets, site_offsets)
         assert caught.value.site_ids == (1,)
 
-    sound = fs.Layout(*with_holes(box(2, 2, 3, 3)))
-    sound.write(tmp_path / "a.npz")
+    valid = fs.Layout(*with_holes(box(2, 2, 3, 3)))
+    valid.write(tmp_path / "a.npz")
     with np.load(tmp_path / "a.npz") as arrays:
         rings = {"xy_um": xy_um, "ring_offsets": ring_offsets, "site_offsets": site_offsets}
         np.savez(tmp_path / "a.npz", **(dict(arrays) | rings))
@@ -168,32 +168,32 @@ def test_holes_must_lie_apart_inside_their_outline(holes, message, tmp_path):
         fs.read_layout(tmp_path / "a.npz")
 
 
-def test_holes_must_be_wound_clockwise():
+def test_counter_clockwise_hole_raises():
     with pytest.raises(GeometryError, match="site 1 has a hole that is wound the wrong way, or has no area"):
         fs.Layout(*with_holes(box(2, 2, 3, 3), clockwise=False))
 
 
-def test_sound_holes_pass_and_may_touch_in_points():
+def test_valid_holes_may_touch_in_points():
     diamond = [[5, 5], [6, 6], [5, 7], [4, 6]]
-    at_border = [[0, 5], [2, 4], [2, 6]]  # touches the outline in one point
-    layout = fs.Layout(*with_holes(box(2, 2, 4, 4), diamond, at_border))
+    at_boundary = [[0, 5], [2, 4], [2, 6]]  # touches the outline in one point
+    layout = fs.Layout(*with_holes(box(2, 2, 4, 4), diamond, at_boundary))
 
     assert layout.area_um2.tolist() == pytest.approx([1.0, 100.0 - 4.0 - 2.0 - 2.0, 1.0])
 
 
 @pytest.mark.parametrize("angle_deg", [1.0, 33.3, 71.2])
-def test_moves_keep_layouts_with_touching_holes(angle_deg):
-    at_border = [[0, 5], [2, 4], [2, 6]]
-    layout = fs.Layout(*with_holes(at_border, box(5, 5, 6, 6)))
+def test_transformations_preserve_touching_holes(angle_deg):
+    at_boundary = [[0, 5], [2, 4], [2, 6]]
+    layout = fs.Layout(*with_holes(at_boundary, box(5, 5, 6, 6)))
     moved = layout.rotate(angle_deg).translate(1e3 / 3.0, -7.7).scale(0.1)
 
-    # Where rounding puts the shared point on one side or the other does not matter.
+    # Rounding may move the common point to either side of the outline.
     assert moved.area_um2.sum() == pytest.approx(0.01 * layout.area_um2.sum())
     assert moved[1:].n_sites == 2
     assert moved.with_columns(channel=[0, 1, 2]).n_sites == 3
 
 
-def test_all_bad_sites_are_named():
+def test_error_lists_all_invalid_sites():
     n = 8
     shells = [box(20 * i, 0, 20 * i + 10, 10) for i in range(n)]
     holes = [box(20 * i + (12 if i % 2 else 2), 2, 20 * i + (14 if i % 2 else 4), 4)[::-1] for i in range(n)]
@@ -221,7 +221,7 @@ def capture_of(layout):
 
 
 @pytest.mark.parametrize("options", [{}, {"of": "light_e"}, {"per": "um2"}, {"method": "least_squares"}])
-def test_picture_rejects_sensors_of_other_layouts(options):
+def test_picture_rejects_sensor_of_other_layout(options):
     layout = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0)
     capture = capture_of(layout)
     others = [layout.translate(0.5, 0.0), fs.layout.grid(n_x=2, n_y=8, pitch_um=2.0), layout[::-1], layout[:8]]
@@ -232,20 +232,20 @@ def test_picture_rejects_sensors_of_other_layouts(options):
 
 
 @pytest.mark.parametrize(("estimate", "name"), [("estimate_from_charge", "charge_e"), ("estimate_from_code", "code")])
-def test_values_of_another_number_of_sites_are_rejected(estimate, name):
+def test_estimates_reject_wrong_number_of_values(estimate, name):
     sensor = fs.Sensor(fs.layout.grid(n_x=2, n_y=2, pitch_um=2.0))
 
     with pytest.raises(ParameterError, match=f"'{name}' must have one value for each of the 4 sites, got 3"):
         getattr(fs.reconstruct, estimate)(np.ones(3), sensor, 0.1)
 
 
-def test_picture_takes_sensors_of_equal_layouts(tmp_path):
+def test_picture_accepts_sensor_of_equal_layout(tmp_path):
     layout = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0)
     capture = capture_of(layout)
     capture.save(tmp_path / "capture.npz")
-    again = fs.Capture.load(tmp_path / "capture.npz")
+    loaded = fs.Capture.load(tmp_path / "capture.npz")
     sensor = fs.Sensor(fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0).with_columns(note=np.arange(16)))
     expected = capture.picture(max_pixels=8, of="light_e", sensor=fs.Sensor(layout)).data
 
-    for taken in (capture, again):
-        assert np.array_equal(taken.picture(max_pixels=8, of="light_e", sensor=sensor).data, expected)
+    for each in (capture, loaded):
+        assert np.array_equal(each.picture(max_pixels=8, of="light_e", sensor=sensor).data, expected)

@@ -1,4 +1,4 @@
-"""Laws of the layout: what from_polygons takes and rejects, its measures against shapely, and its verbs."""
+"""Layout model: accepted and rejected input, measures against shapely, transformations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STEP_UM = 2.0**-16
 
 
 def star(radii_um, jitters, x_um=0.0, y_um=0.0):
-    """Vertices of a ring that is star-shaped about (x, y), one in each equal sector, counter-clockwise."""
+    """Vertices of a star-shaped ring about (x, y), one per sector, counter-clockwise."""
     n = len(radii_um)
     angle = 2 * np.pi * (np.arange(n) + 0.5 * np.asarray(jitters)) / n
     xy = np.stack((x_um + radii_um * np.cos(angle), y_um + radii_um * np.sin(angle)), axis=1)
@@ -42,22 +42,22 @@ def stars(draw, low_um, high_um, x_um=0.0, y_um=0.0):
 
 @st.composite
 def holed_polygons(draw):
-    """A simple polygon about the origin, 1 to 3 µm in radius, with up to two holes."""
+    """Simple polygon around the origin with a radius of 1 to 3 µm and up to two holes."""
     outline = draw(stars(1.0, 3.0))
-    # The outline's edges keep 0.38 µm from the origin: its sectors are at most 135 degrees wide.
-    places = draw(st.sampled_from([(), (0.0,), (-0.17, 0.17)]))
-    return shapely.Polygon(outline, [draw(stars(0.05, 0.15, x_um=x)) for x in places])
+    # Sectors are at most 135 degrees wide, so edges are at least 0.38 µm from the origin.
+    centres_x_um = draw(st.sampled_from([(), (0.0,), (-0.17, 0.17)]))
+    return shapely.Polygon(outline, [draw(stars(0.05, 0.15, x_um=x)) for x in centres_x_um])
 
 
 @st.composite
 def polygon_lists(draw):
-    """Polygons side by side on a row."""
+    """Disjoint polygons in a row."""
     shapes = draw(st.lists(holed_polygons(), min_size=1, max_size=5))
     return [affinity.translate(shape, 8.0 * k, draw(st.integers(-4, 4))) for k, shape in enumerate(shapes)]
 
 
-def packed_anyhow(draw, polygons):
-    """Packed rings of polygons, each ring wound, begun, closed and stuttering as drawn."""
+def pack_randomly(draw, polygons):
+    """Packed rings with random winding, first vertex, closure and repeated vertices."""
     vertices, ring_lengths, site_lengths = [], [], []
     for polygon in polygons:
         rings = [polygon.exterior, *polygon.interiors]
@@ -74,7 +74,7 @@ def packed_anyhow(draw, polygons):
 
 
 def ring_signs(layout):
-    """Whether each ring is counter-clockwise, by shapely."""
+    """Orientation of each ring by shapely: True for counter-clockwise."""
     return [
         [bool(shapely.is_ccw(ring)) for ring in (polygon.exterior, *polygon.interiors)] for polygon in layout.polygons()
     ]
@@ -108,7 +108,7 @@ def mixed():
 
 @given(polygon_lists())
 @relaxed
-def test_measures_are_those_of_shapely(polygons):
+def test_measures_agree_with_shapely(polygons):
     layout = Layout.from_polygons(polygons)
 
     np.testing.assert_allclose(layout.area_um2, shapely.area(polygons), rtol=1e-12)
@@ -119,7 +119,7 @@ def test_measures_are_those_of_shapely(polygons):
 
 @given(polygon_lists(), st.integers(-9_000_000, 9_000_000), st.integers(-9_000_000, 9_000_000))
 @relaxed
-def test_measures_keep_their_digits_far_from_the_origin(polygons, dx_um, dy_um):
+def test_measures_are_accurate_far_from_origin(polygons, dx_um, dy_um):
     layout = Layout.from_polygons([affinity.translate(polygon, dx_um, dy_um) for polygon in polygons])
     centroid_um = shapely.get_coordinates(shapely.centroid(polygons)) + np.array([dx_um, dy_um])
 
@@ -129,8 +129,8 @@ def test_measures_keep_their_digits_far_from_the_origin(polygons, dx_um, dy_um):
 
 @given(st.data(), polygon_lists())
 @relaxed
-def test_packed_rings_give_the_same_sites_however_they_are_wound_closed_and_repeated(data, polygons):
-    layout = Layout.from_polygons(packed_anyhow(data.draw, polygons))
+def test_packed_rings_are_normalised(data, polygons):
+    layout = Layout.from_polygons(pack_randomly(data.draw, polygons))
 
     assert bool(np.all(shapely.equals_exact(layout.polygons(), polygons, tolerance=0.0, normalize=True)))
     assert np.diff(layout.ring_offsets).tolist() == [
@@ -141,14 +141,14 @@ def test_packed_rings_give_the_same_sites_however_they_are_wound_closed_and_repe
 @given(st.data(), polygon_lists())
 @relaxed
 def test_outlines_are_counter_clockwise_and_holes_clockwise(data, polygons):
-    layout = Layout.from_polygons(packed_anyhow(data.draw, polygons))
+    layout = Layout.from_polygons(pack_randomly(data.draw, polygons))
 
     assert ring_signs(layout) == [[True, *[False] * len(polygon.interiors)] for polygon in polygons]
 
 
 @given(polygon_lists())
 @relaxed
-def test_polygons_make_a_round_trip(polygons):
+def test_polygons_round_trip_exactly(polygons):
     assert bool(
         np.all(shapely.equals_exact(Layout.from_polygons(polygons).polygons(), polygons, tolerance=0.0, normalize=True))
     )
@@ -156,32 +156,32 @@ def test_polygons_make_a_round_trip(polygons):
 
 @given(polygon_lists())
 @relaxed
-def test_a_second_round_trip_changes_no_array(polygons):
+def test_second_round_trip_preserves_arrays(polygons):
     layout = Layout.from_polygons(polygons)
 
     assert_same_arrays(Layout.from_polygons(layout.polygons()), layout)
 
 
-def test_a_closed_ring_keeps_its_first_vertex():
+def test_closed_ring_retains_first_vertex():
     layout = Layout.from_polygons(([(5, 5), (6, 5), (6, 6), (5, 6), (5, 5)], [0, 5], [0, 1]))
 
     assert layout.xy_um.tolist() == [[5, 5], [6, 5], [6, 6], [5, 6]]
 
 
-def test_reversing_a_ring_keeps_its_first_vertex():
+def test_reversed_ring_retains_first_vertex():
     layout = Layout.from_polygons(([(5, 5), (5, 6), (6, 6), (6, 5)], [0, 4], [0, 1]))
 
     assert layout.xy_um.tolist() == [[5, 5], [6, 5], [6, 6], [5, 6]]
 
 
-def test_sites_with_different_numbers_of_vertices_lie_packed_one_after_the_other(mixed):
+def test_mixed_vertex_counts_are_packed_consecutively(mixed):
     assert mixed.ring_offsets.tolist() == [0, 4, 8, 12, 15, 21]
     assert mixed.site_offsets.tolist() == [0, 1, 3, 4, 5]
     assert mixed.area_um2.tolist() == pytest.approx([1.0, 15.0, 6.0, 1.5 * math.sqrt(3)], rel=1e-14)
 
 
 @pytest.mark.parametrize(
-    "many",
+    "polygons",
     [
         pytest.param([UNIT, TRIANGLE, HEXAGON], id="list"),
         pytest.param((UNIT, TRIANGLE, HEXAGON), id="tuple of three"),
@@ -191,31 +191,31 @@ def test_sites_with_different_numbers_of_vertices_lie_packed_one_after_the_other
         pytest.param((polygon for polygon in (UNIT, TRIANGLE, HEXAGON)), id="generator"),
     ],
 )
-def test_every_kind_of_sequence_of_polygons_is_taken_in_order(many):
-    layout = Layout.from_polygons(many)
+def test_polygon_collections_are_accepted_in_order(polygons):
+    layout = Layout.from_polygons(polygons)
 
     assert np.diff(layout.ring_offsets).tolist() == [4, 3, 6]
     assert layout.area_um2[1] == 6.0
 
 
-def test_heights_of_polygons_are_left_out():
+def test_z_coordinates_are_ignored():
     layout = Layout.from_polygons([shapely.Polygon([(0, 0, 7), (2, 0, 8), (2, 2, 9)])])
 
     assert layout.xy_um.shape == (3, 2)
     assert layout.area_um2.tolist() == [2.0]
 
 
-def test_a_hole_may_touch_the_outline_in_a_point():
+def test_hole_may_touch_outline_in_point():
     layout = Layout.from_polygons([shapely.Polygon([(0, 0), (4, 0), (4, 4), (0, 4)], [[(0, 2), (2, 3), (2, 1)]])])
 
     assert layout.area_um2.tolist() == [14.0]
 
 
 @pytest.mark.parametrize(
-    "nothing", [pytest.param([], id="list"), pytest.param((np.zeros((0, 2)), [0], [0]), id="packed")]
+    "polygons", [pytest.param([], id="list"), pytest.param((np.zeros((0, 2)), [0], [0]), id="packed")]
 )
-def test_no_polygons_make_a_layout_without_sites(nothing):
-    layout = Layout.from_polygons(nothing)
+def test_empty_input_gives_empty_layout(polygons):
+    layout = Layout.from_polygons(polygons)
 
     assert (len(layout), layout.area_um2.shape, layout.centroid_um.shape) == (0, (0,), (0, 2))
     assert layout.site_bounds_um.shape == (0, 4)
@@ -237,17 +237,17 @@ BAD_SITES = {
         shapely.Polygon([(0, 0), (2, 0), (2, 2), (1, 0), (0, 2)]),
         "site 1 crosses or touches itself",
     ),
-    "flat": (shapely.Polygon([(0, 0), (1, 1), (2, 2)]), "site 1 has a ring without area"),
+    "flat": (shapely.Polygon([(0, 0), (1, 1), (2, 2)]), "site 1 has a ring with zero area"),
     "flat far out": (
         shapely.Polygon([(1e6, 1e6), (1e6 + 1, 1e6 + 1), (1e6 + 3, 1e6 + 3), (1e6 + 2, 1e6 + 2)]),
-        "site 1 has a ring without area",
+        "site 1 has a ring with zero area",
     ),
     "flat hole": (
         shapely.Polygon(shapely.box(0, 0, 4, 4).exterior, [[(1, 1), (2, 2), (3, 3)]]),
-        "site 1 has a ring without area",
+        "site 1 has a ring with zero area",
     ),
-    "one point": (shapely.Polygon([(1, 1), (1, 1), (1, 1), (1, 1)]), "site 1 has a ring of fewer than 3 different"),
-    "two points": (shapely.Polygon([(0, 0), (1, 1), (0, 0)]), "site 1 has a ring of fewer than 3 different"),
+    "one point": (shapely.Polygon([(1, 1), (1, 1), (1, 1), (1, 1)]), "site 1 has a ring of fewer than 3 distinct"),
+    "two points": (shapely.Polygon([(0, 0), (1, 1), (0, 0)]), "site 1 has a ring of fewer than 3 distinct"),
     "several parts": (
         shapely.MultiPolygon([UNIT, shapely.box(3, 3, 4, 4)]),
         "site 1 must be a shapely Polygon, got a Mul",
@@ -274,7 +274,7 @@ BAD_SITES = {
 
 
 @pytest.mark.parametrize(("bad", "message"), BAD_SITES.values(), ids=BAD_SITES)
-def test_a_bad_polygon_is_refused_by_its_index(bad, message):
+def test_invalid_polygon_raises_with_index(bad, message):
     with pytest.raises(GeometryError, match=message) as caught:
         Layout.from_polygons([UNIT, bad, UNIT])
 
@@ -286,16 +286,16 @@ BAD_RINGS = {
     "not a number": ([(0, 0), (np.nan, 0), (1, 1)], "site 1 has a coordinate that is not finite"),
     "infinite": ([(0, 0), (1, 0), (1, np.inf)], "site 1 has a coordinate that is not finite"),
     "crossing itself": ([(0, 0), (2, 2), (2, 0), (0, 1)], "site 1 crosses or touches itself"),
-    "flat": ([(0, 0), (1, 0), (2, 0), (3, 0)], "site 1 has a ring without area"),
-    "there and back": ([(0, 0), (1, 0), (0, 0), (1, 0)], "site 1 has a ring without area"),
-    "one vertex": ([(0, 0)], "site 1 has a ring of fewer than 3 different vertices"),
-    "two vertices, closed": ([(0, 0), (1, 0), (0, 0)], "site 1 has a ring of fewer than 3 different vertices"),
+    "flat": ([(0, 0), (1, 0), (2, 0), (3, 0)], "site 1 has a ring with zero area"),
+    "doubled back": ([(0, 0), (1, 0), (0, 0), (1, 0)], "site 1 has a ring with zero area"),
+    "one vertex": ([(0, 0)], "site 1 has a ring of fewer than 3 distinct vertices"),
+    "two vertices, closed": ([(0, 0), (1, 0), (0, 0)], "site 1 has a ring of fewer than 3 distinct vertices"),
     "metres for micrometres": ([(0, -1e8), (1, 0), (0, 1)], "site 1 lies further than 1e.07 µm from the origin"),
 }
 
 
 @pytest.mark.parametrize(("ring", "message"), BAD_RINGS.values(), ids=BAD_RINGS)
-def test_a_bad_packed_ring_is_refused_by_its_site(ring, message):
+def test_invalid_packed_ring_raises_with_site(ring, message):
     good = [(5, 5), (6, 5), (6, 6)]
     offsets = np.cumsum([0, 3, len(ring), 3])
     with pytest.raises(GeometryError, match=message) as caught:
@@ -309,17 +309,17 @@ def test_a_bad_packed_ring_is_refused_by_its_site(ring, message):
     ("bad", "message"),
     [
         pytest.param(shapely.Polygon(), "site 1 is empty .and 3 more: 3, 4, 6.", id="a few"),
-        pytest.param(shapely.Polygon([(0, 0), (1, 1), (2, 2)]), "without area .and 3 more: 3, 4, 6.", id="flat"),
+        pytest.param(shapely.Polygon([(0, 0), (1, 1), (2, 2)]), "zero area .and 3 more: 3, 4, 6.", id="flat"),
     ],
 )
-def test_the_message_names_all_of_a_few_bad_sites(bad, message):
+def test_message_lists_few_invalid_sites(bad, message):
     with pytest.raises(GeometryError, match=message) as caught:
         Layout.from_polygons([UNIT, bad, UNIT, bad, bad, UNIT, bad])
 
     assert caught.value.site_ids == (1, 3, 4, 6)
 
 
-def test_the_message_names_the_first_of_many_bad_sites_and_the_error_holds_all():
+def test_message_abbreviates_many_invalid_sites():
     with pytest.raises(GeometryError, match=r"site 0 is empty \(and 999 more: 1, 2, 3, 4, \.\.\.\)") as caught:
         Layout.from_polygons([shapely.Polygon()] * 1000)
 
@@ -327,7 +327,7 @@ def test_the_message_names_the_first_of_many_bad_sites_and_the_error_holds_all()
 
 
 @pytest.mark.parametrize(
-    "not_many",
+    "polygons",
     [
         pytest.param(UNIT, id="one polygon"),
         pytest.param(shapely.Point(0, 0), id="point"),
@@ -335,9 +335,9 @@ def test_the_message_names_the_first_of_many_bad_sites_and_the_error_holds_all()
         pytest.param(3.0, id="number"),
     ],
 )
-def test_what_is_no_sequence_of_polygons_is_refused_in_a_sentence(not_many):
+def test_non_sequence_of_polygons_raises(polygons):
     with pytest.raises((GeometryError, ParameterError), match="polygons"):
-        Layout.from_polygons(not_many)
+        Layout.from_polygons(polygons)
 
 
 SQUARE_XY = [(0, 0), (1, 0), (1, 1), (0, 1)]
@@ -350,7 +350,7 @@ SQUARE_XY = [(0, 0), (1, 0), (1, 1), (0, 1)]
         pytest.param(
             [[0, 0, 0]] * 3, [0, 3], [0, 1], r"'xy_um' must have the shape \(n_vertex, 2\)", id="three columns"
         ),
-        pytest.param([["a", "b"]] * 3, [0, 3], [0, 1], "'xy_um' must be an array of numbers", id="text"),
+        pytest.param([["a", "b"]] * 3, [0, 3], [0, 1], "'xy_um' must be an array of numbers", id="string"),
         pytest.param([[0, 0], [1, 0], [1]], [0, 3], [0, 1], "'xy_um' must be an array of numbers", id="ragged"),
         pytest.param(SQUARE_XY, [1, 4], [0, 1], "'ring_offsets' must begin at 0 and end at 4", id="begins at 1"),
         pytest.param(SQUARE_XY, [0, 3], [0, 1], "'ring_offsets' must begin at 0 and end at 4", id="ends early"),
@@ -359,19 +359,31 @@ SQUARE_XY = [(0, 0), (1, 0), (1, 1), (0, 1)]
         pytest.param(SQUARE_XY, [0.0, 4.0], [0, 1], "'ring_offsets' must be a list of integers", id="floats"),
         pytest.param(SQUARE_XY, [[0, 4]], [0, 1], "'ring_offsets' must be a list of integers", id="nested"),
         pytest.param(
-            SQUARE_XY, [0, 4, 4], [0, 2], "'ring_offsets' .*at least 1 vertices; item 1", id="ring of nothing"
+            SQUARE_XY,
+            [0, 4, 4],
+            [0, 2],
+            "'ring_offsets' .*at least 1 vertices to each item, but item 1",
+            id="empty ring",
         ),
-        pytest.param(SQUARE_XY, [0, 9, 4], [0, 2], "'ring_offsets' .*at least 1 vertices; item 1", id="backwards"),
+        pytest.param(
+            SQUARE_XY,
+            [0, 9, 4],
+            [0, 2],
+            "'ring_offsets' .*at least 1 vertices to each item, but item 1",
+            id="backwards",
+        ),
         pytest.param(SQUARE_XY, [0, 4], [0, 2], "'site_offsets' must begin at 0 and end at 1", id="too many rings"),
-        pytest.param(SQUARE_XY, [0, 4], [0, 0, 1], "'site_offsets' .*at least 1 rings; item 0", id="site of nothing"),
+        pytest.param(
+            SQUARE_XY, [0, 4], [0, 0, 1], "'site_offsets' .*at least 1 rings to each item, but item 0", id="empty site"
+        ),
     ],
 )
-def test_packed_arrays_that_do_not_fit_together_are_refused(xy_um, ring_offsets, site_offsets, message):
+def test_inconsistent_packed_arrays_raise(xy_um, ring_offsets, site_offsets, message):
     with pytest.raises(ParameterError, match=message):
         Layout.from_polygons((xy_um, ring_offsets, site_offsets))
 
 
-def test_a_message_about_long_offsets_stays_on_one_line():
+def test_message_about_offsets_is_one_line():
     with pytest.raises(ParameterError, match="must begin at 0 and end at 100") as caught:
         Layout.from_polygons((np.zeros((100, 2)), np.arange(0, 90, 3), np.arange(30)))
 
@@ -385,7 +397,7 @@ def test_a_message_about_long_offsets_stays_on_one_line():
         pytest.param({"readout_line": [0, 1, 2]}, "'readout_line' must have one value for each of the 2", id="long"),
         pytest.param({"channel": 1}, "'channel' must have one value for each of the 2 sites", id="one number"),
         pytest.param({"tag": [[1, 2], [3, 4]]}, "'tag' must have one value for each of the 2 sites", id="nested"),
-        pytest.param({"tag": [None, {}]}, "'tag' must be an array of numbers or text", id="objects"),
+        pytest.param({"tag": [None, {}]}, "'tag' must be an array of numbers or strings", id="objects"),
         pytest.param({"tag": [[1], [1, 2]]}, "'tag' must ", id="ragged"),
     ],
 )
@@ -397,7 +409,7 @@ def test_a_message_about_long_offsets_stays_on_one_line():
         pytest.param(lambda columns: Layout.from_polygons([UNIT, TRIANGLE]).with_columns(**columns), id="with_columns"),
     ],
 )
-def test_a_column_that_does_not_fit_is_refused_by_its_name(make, columns, message):
+def test_invalid_column_raises_with_name(make, columns, message):
     with pytest.raises(ParameterError, match=message):
         make(columns)
 
@@ -408,7 +420,7 @@ def test_a_column_that_does_not_fit_is_refused_by_its_name(make, columns, messag
     [
         pytest.param([0.0, 1.5], id="fractions"),
         pytest.param([0, -1], id="negative"),
-        pytest.param(["R", "G"], id="text"),
+        pytest.param(["R", "G"], id="string"),
         pytest.param([True, False], id="booleans"),
     ],
 )
@@ -417,7 +429,7 @@ def test_indices_must_be_integers_from_zero(name, values):
         getattr(Layout.from_rectangles([[0, 0], [1, 1]], 1.0, **{name: values}), name)
 
 
-# -- the plain constructor -------------------------------------------------------------------------------------------
+# -- constructor -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -428,13 +440,19 @@ def test_indices_must_be_integers_from_zero(name, values):
         pytest.param(
             {"xy_um": [[0, 0], [1, np.nan], [1, 1], [0, 1]]}, r"'xy_um' must be finite.* at \[1, 1\]", id="nan"
         ),
-        pytest.param({"ring_offsets": [0, 2, 4]}, "'ring_offsets' .*at least 3 vertices; item 0", id="two vertices"),
-        pytest.param({"site_offsets": [0, 0, 1]}, "'site_offsets' .*at least 1 rings; item 0", id="no ring"),
-        pytest.param({"site_offsets": [0]}, "'site_offsets' must begin at 0 and end at 1", id="rings left over"),
+        pytest.param(
+            {"ring_offsets": [0, 2, 4]},
+            "'ring_offsets' .*at least 3 vertices to each item, but item 0",
+            id="two vertices",
+        ),
+        pytest.param(
+            {"site_offsets": [0, 0, 1]}, "'site_offsets' .*at least 1 rings to each item, but item 0", id="no ring"
+        ),
+        pytest.param({"site_offsets": [0]}, "'site_offsets' must begin at 0 and end at 1", id="unused rings"),
         pytest.param({"columns": {"channel": [1, 2]}}, "'channel' must have one value for each of the 1", id="column"),
     ],
 )
-def test_the_constructor_refuses_arrays_without_structure(changes, message):
+def test_constructor_rejects_invalid_arrays(changes, message):
     good = {"xy_um": np.array(SQUARE_XY, float), "ring_offsets": [0, 4], "site_offsets": [0, 1]}
 
     with pytest.raises(ParameterError, match=message):
@@ -448,11 +466,11 @@ def test_the_constructor_refuses_arrays_without_structure(changes, message):
     ("size_um", "sizes_um"),
     [
         pytest.param(2.0, [(2, 2), (2, 2)], id="one size"),
-        pytest.param([2.0, 4.0], [(2, 2), (4, 4)], id="a size a site"),
+        pytest.param([2.0, 4.0], [(2, 2), (4, 4)], id="size per site"),
         pytest.param([[2.0, 4.0], [1.0, 3.0]], [(2, 4), (1, 3)], id="width and height"),
     ],
 )
-def test_rectangles_have_their_places_and_sizes(size_um, sizes_um):
+def test_rectangles_have_given_centres_and_sizes(size_um, sizes_um):
     centres = [(0.0, 0.0), (10.0, -3.0)]
     layout = Layout.from_rectangles(centres, size_um, channel=[1, 2])
     expected = [
@@ -466,7 +484,7 @@ def test_rectangles_have_their_places_and_sizes(size_um, sizes_um):
     assert layout.centroid_um.tolist() == [list(centre) for centre in centres]
 
 
-def test_no_rectangles_make_a_layout_without_sites():
+def test_no_rectangles_give_empty_layout():
     assert len(Layout.from_rectangles(np.zeros((0, 2)), 1.0)) == 0
 
 
@@ -476,16 +494,16 @@ def test_no_rectangles_make_a_layout_without_sites():
         pytest.param([0, 0], 1.0, "'centre_um' must have 2 dimensions", id="one point"),
         pytest.param([[0, 0, 0]], 1.0, r"'centre_um' must have the shape \(n_site, 2\)", id="three coordinates"),
         pytest.param([[0, 0], [np.nan, 1]], 1.0, r"'centre_um' must be finite .* at \[1, 0\]", id="nan"),
-        pytest.param([[0, 0], [1, 1]], 0.0, "'size_um' must be > 0", id="no size"),
+        pytest.param([[0, 0], [1, 1]], 0.0, "'size_um' must be > 0", id="zero"),
         pytest.param([[0, 0], [1, 1]], [1.0, -2.0], r"'size_um' must be > 0.*got -2.0 µm at \[1\]", id="negative"),
         pytest.param([[0, 0], [1, 1]], [1.0, np.inf], r"'size_um' must be finite .* at \[1\]", id="infinite"),
         pytest.param([[0, 0], [1, 1]], [1.0, 1.0, 1.0], r"'size_um' must be one number, or have the shape", id="long"),
         pytest.param([[0, 0], [1, 1]], [[1.0], [1.0]], r"'size_um' must be one number, or have the shape", id="thin"),
-        pytest.param([["a", "b"]], 1.0, "'centre_um' must be an array of numbers", id="text"),
-        pytest.param([[1e20, 0]], 1.0, "µm", id="far beyond any sensor"),
+        pytest.param([["a", "b"]], 1.0, "'centre_um' must be an array of numbers", id="string"),
+        pytest.param([[1e20, 0]], 1.0, "µm", id="beyond maximum length"),
     ],
 )
-def test_rectangles_that_cannot_be_are_refused(centre_um, size_um, message):
+def test_invalid_rectangles_raise(centre_um, size_um, message):
     with pytest.raises((ParameterError, GeometryError), match=message):
         Layout.from_rectangles(centre_um, size_um)
 
@@ -500,7 +518,7 @@ SELECTIONS = {
     "ids": ([3, 1], [3, 1]),
     "ids from the end": ([-1, -4], [3, 0]),
     "one id": (1, [1]),
-    "one twice": ([1, 1], [1, 1]),
+    "duplicate id": ([1, 1], [1, 1]),
     "none by mask": (np.zeros(4, bool), []),
     "none by slice": (slice(0, 0), []),
     "none by ids": ([], []),
@@ -509,29 +527,29 @@ SELECTIONS = {
 
 
 @pytest.mark.parametrize(("selection", "ids"), SELECTIONS.values(), ids=SELECTIONS)
-def test_a_selection_keeps_the_outlines_holes_and_columns_of_its_sites(mixed, selection, ids):
-    some = mixed[selection]
+def test_selection_preserves_outlines_and_columns(mixed, selection, ids):
+    selected = mixed[selection]
 
-    assert [p.wkb for p in some.polygons()] == [mixed.polygons()[i].wkb for i in ids]
-    assert some.area_um2.tolist() == [mixed.area_um2[i] for i in ids]
-    assert {name: column.tolist() for name, column in some.columns.items()} == {
+    assert [p.wkb for p in selected.polygons()] == [mixed.polygons()[i].wkb for i in ids]
+    assert selected.area_um2.tolist() == [mixed.area_um2[i] for i in ids]
+    assert {name: column.tolist() for name, column in selected.columns.items()} == {
         name: [column[i] for i in ids] for name, column in mixed.columns.items()
     }
 
 
 @given(st.data(), polygon_lists())
 @relaxed
-def test_a_selection_by_ids_is_the_layout_of_those_polygons(data, polygons):
+def test_selection_by_ids_equals_selected_polygons(data, polygons):
     ids = data.draw(st.lists(st.integers(0, len(polygons) - 1), max_size=8))
 
     assert_same_arrays(Layout.from_polygons(polygons)[ids], Layout.from_polygons([polygons[i] for i in ids]))
 
 
-def test_sites_can_be_selected_by_their_own_measures(mixed):
+def test_selection_by_area(mixed):
     assert mixed[mixed.area_um2 > 5.0].columns["name"].tolist() == ["b", "c"]
 
 
-def test_iterating_gives_each_site_once(mixed):
+def test_iteration_yields_each_site_once(mixed):
     assert [float(site.area_um2[0]) for site in mixed] == mixed.area_um2.tolist()
 
 
@@ -545,16 +563,16 @@ def test_iterating_gives_each_site_once(mixed):
         pytest.param(np.array([[0, 1], [2, 3]]), (IndexError, ParameterError), "dimension", id="two dimensions"),
     ],
 )
-def test_sites_that_are_not_there_cannot_be_selected(mixed, selection, error, message):
+def test_invalid_selection_raises(mixed, selection, error, message):
     with pytest.raises(error, match=message):
         mixed[selection]
 
 
-# -- moving ----------------------------------------------------------------------------------------------------------
+# -- transformations ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("angle_deg", "turned"),
+    ("angle_deg", "rotated"),
     [
         (0, lambda x, y: (x, y)),
         (90, lambda x, y: (-y, x)),
@@ -569,14 +587,14 @@ def test_sites_that_are_not_there_cannot_be_selected(mixed, selection, error, me
 )
 @given(polygons=polygon_lists())
 @settings(relaxed, max_examples=10)
-def test_quarter_turns_are_exact(angle_deg, turned, polygons):
+def test_quarter_turns_are_exact(angle_deg, rotated, polygons):
     layout = Layout.from_polygons(polygons)
     x, y = layout.xy_um.T
 
-    assert layout.rotate(angle_deg).xy_um.tolist() == np.stack(turned(x, y), axis=1).tolist()
+    assert layout.rotate(angle_deg).xy_um.tolist() == np.stack(rotated(x, y), axis=1).tolist()
 
 
-def test_quarter_turns_about_another_point_are_exact_where_the_numbers_are(mixed):
+def test_quarter_turn_about_exact_point_is_exact(mixed):
     layout = mixed[:3]
     x, y = layout.xy_um.T
 
@@ -590,27 +608,27 @@ def test_quarter_turns_about_another_point_are_exact_where_the_numbers_are(mixed
     st.floats(0.01, 100.0),
 )
 @relaxed
-def test_moves_are_those_of_shapely_and_scale_the_areas(polygons, angle_deg, origin_um, factor):
+def test_transformations_agree_with_shapely(polygons, angle_deg, origin_um, factor):
     layout = Layout.from_polygons(polygons)
     dx_um, dy_um = origin_um
-    moves = (
+    transformations = (
         (layout.translate(dx_um, dy_um), lambda p: affinity.translate(p, dx_um, dy_um), 1.0),
         (layout.rotate(angle_deg, origin_um), lambda p: affinity.rotate(p, angle_deg, origin_um), 1.0),
         (layout.scale(factor, origin_um), lambda p: affinity.scale(p, factor, factor, origin=origin_um), factor**2),
     )
 
-    for moved, by_shapely, grown in moves:
+    for moved, by_shapely, area_ratio in transformations:
         np.testing.assert_allclose(
             shapely.get_coordinates(moved.polygons()),
             shapely.get_coordinates([by_shapely(p) for p in layout.polygons()]),
             rtol=1e-10,
             atol=1e-9,
         )
-        np.testing.assert_allclose(moved.area_um2, layout.area_um2 * grown, rtol=1e-9)
+        np.testing.assert_allclose(moved.area_um2, layout.area_um2 * area_ratio, rtol=1e-9)
         assert ring_signs(moved) == ring_signs(layout)
 
 
-def test_the_centre_of_a_move_defaults_to_the_origin(mixed):
+def test_transformation_centre_defaults_to_origin(mixed):
     assert mixed.scale(2.0).xy_um.tolist() == (2.0 * mixed.xy_um).tolist()
     assert mixed.rotate(30.0).xy_um.tolist() == mixed.rotate(30.0, (0.0, 0.0)).xy_um.tolist()
 
@@ -625,7 +643,7 @@ def test_the_centre_of_a_move_defaults_to_the_origin(mixed):
         pytest.param(lambda layout: layout.with_columns(extra=[1, 2, 3, 4]), id="with_columns"),
     ],
 )
-def test_every_verb_leaves_the_layout_unchanged_and_keeps_its_columns(mixed, move):
+def test_transformation_preserves_layout_and_columns(mixed, move):
     before = mixed.xy_um.copy(), mixed.ring_offsets.copy(), mixed.site_offsets.copy()
     moved = move(mixed)
 
@@ -639,8 +657,8 @@ def test_every_verb_leaves_the_layout_unchanged_and_keeps_its_columns(mixed, mov
     ("move", "message"),
     [
         pytest.param(lambda x: x.translate(np.nan, 0), "'dx_um' must be finite, got nan µm", id="dx nan"),
-        pytest.param(lambda x: x.translate(0, "1"), "'dy_um' must be one number", id="dy text"),
-        pytest.param(lambda x: x.translate(1e20, 0), "µm", id="far beyond any sensor"),
+        pytest.param(lambda x: x.translate(0, "1"), "'dy_um' must be one number", id="dy string"),
+        pytest.param(lambda x: x.translate(1e20, 0), "µm", id="beyond maximum length"),
         pytest.param(lambda x: x.rotate(np.inf), "'angle_deg' must be finite", id="angle"),
         pytest.param(lambda x: x.rotate(10, (1, 2, 3)), "'origin_um' must ", id="origin of three"),
         pytest.param(lambda x: x.rotate(10, (1,)), "'origin_um' must ", id="origin of one"),
@@ -649,30 +667,30 @@ def test_every_verb_leaves_the_layout_unchanged_and_keeps_its_columns(mixed, mov
         pytest.param(lambda x: x.scale(-1.0), "'factor' must be > 0, got -1.0", id="mirror"),
         pytest.param(lambda x: x.scale(2, (1, 2, 3)), "'origin_um' must ", id="scale about three"),
         pytest.param(lambda x: x.scale(2, (1,)), "'origin_um' must ", id="scale about one"),
-        pytest.param(lambda x: x.scale(1e200), "µm", id="scaled beyond any sensor"),
+        pytest.param(lambda x: x.scale(1e200), "µm", id="scaled beyond maximum length"),
     ],
 )
-def test_a_move_that_cannot_be_is_refused(mixed, move, message):
+def test_invalid_transformation_raises(mixed, move, message):
     with pytest.raises((ParameterError, GeometryError), match=message):
         move(mixed)
 
 
-def test_verbs_work_on_a_layout_without_sites(mixed):
-    none = mixed[:0]
+def test_transformations_accept_empty_layout(mixed):
+    empty = mixed[:0]
 
-    assert [len(x) for x in (none.translate(1, 2), none.rotate(30), none.scale(2), none[[]], none[:])] == [0] * 5
-    assert none.channel.tolist() == []
+    assert [len(x) for x in (empty.translate(1, 2), empty.rotate(30), empty.scale(2), empty[[]], empty[:])] == [0] * 5
+    assert empty.channel.tolist() == []
 
 
-def test_a_layout_without_sites_has_no_bounds(mixed):
-    with pytest.raises(GeometryError, match="the layout has no sites, and so no bounds"):
+def test_bounds_of_empty_layout_raise(mixed):
+    with pytest.raises(GeometryError, match="the layout has no sites, so its bounds are undefined"):
         _ = mixed[:0].bounds_um
 
 
 # -- columns, provenance, immutability ---------------------------------------------------------------------------------
 
 
-def test_channel_and_readout_line_are_zero_without_columns():
+def test_index_columns_default_to_zero():
     layout = Layout.from_polygons([UNIT, TRIANGLE])
 
     assert layout.channel.tolist() == [0, 0]
@@ -680,7 +698,7 @@ def test_channel_and_readout_line_are_zero_without_columns():
     assert dict(layout.columns) == {}
 
 
-def test_channel_and_readout_line_are_those_of_the_columns(mixed):
+def test_index_properties_equal_columns(mixed):
     assert mixed.channel.tolist() == [0, 1, 2, 1]
     assert mixed.readout_line.tolist() == [3, 2, 1, 0]
 
@@ -694,15 +712,15 @@ def test_with_columns_adds_and_replaces(mixed):
     assert "zone" not in mixed.columns
 
 
-def test_provenance_is_kept_and_every_change_noted():
+def test_provenance_records_each_step():
     first = Layout.from_polygons([UNIT, TRIANGLE], provenance={"source": "drawing 7"})
     last = first.translate(1, 2).rotate(90).scale(2).with_columns(zone=[0, 1])[[1]]
 
     assert dict(first.provenance) == {"source": "drawing 7"}
     assert last.provenance["source"] == "drawing 7"
     assert last.provenance["steps"] == [
-        "moved by (1, 2) µm",
-        "turned by 90 degrees",
+        "translated by (1, 2) µm",
+        "rotated by 90 degrees",
         "scaled by 2",
         "columns zone set",
         "selected 1 of 2 sites",
@@ -716,7 +734,7 @@ def test_provenance_is_kept_and_every_change_noted():
         pytest.param(Layout.from_rectangles([[0, 0]], 1.0), "from_rectangles", id="from_rectangles"),
     ],
 )
-def test_the_origin_of_a_layout_is_told(layout, made_by):
+def test_repr_shows_origin_of_layout(layout, made_by):
     assert layout.provenance["made_by"] == made_by
     assert repr(layout) == f"Layout(1 sites from {made_by}, columns [])"
 
@@ -730,7 +748,7 @@ ARRAYS = {
     "site_bounds_um": lambda x: x.site_bounds_um,
     "column": lambda x: x.columns["channel"],
     "column of a selection": lambda x: x[1:].columns["channel"],
-    "xy_um moved": lambda x: x.translate(1, 1).xy_um,
+    "translated xy_um": lambda x: x.translate(1, 1).xy_um,
 }
 
 
@@ -749,30 +767,30 @@ def test_columns_and_provenance_are_read_only(mixed):
         mixed.xy_um = np.zeros((3, 2))
 
 
-def test_the_layout_owns_its_arrays_and_leaves_the_callers_alone():
-    mine = SimpleNamespace(
+def test_layout_copies_input_arrays():
+    source = SimpleNamespace(
         xy=np.array(SQUARE_XY, float), rings=np.array([0, 4]), sites=np.array([0, 1]), channel=np.array([3])
     )
-    layout = Layout(mine.xy, mine.rings, mine.sites, {"channel": mine.channel})
-    taken = Layout.from_polygons((mine.xy, mine.rings, mine.sites), channel=mine.channel)
-    for array in vars(mine).values():
+    layout = Layout(source.xy, source.rings, source.sites, {"channel": source.channel})
+    from_polygons = Layout.from_polygons((source.xy, source.rings, source.sites), channel=source.channel)
+    for array in vars(source).values():
         np.add(array, 1, out=array)
 
-    for each in (layout, taken):
+    for each in (layout, from_polygons):
         assert each.xy_um.tolist() == [list(map(float, p)) for p in SQUARE_XY]
         assert (each.ring_offsets.tolist(), each.site_offsets.tolist(), each.channel.tolist()) == ([0, 4], [0, 1], [3])
 
 
 @pytest.mark.parametrize(
-    "copied",
+    "copy_of",
     [
         pytest.param(copy.deepcopy, id="deepcopy"),
         pytest.param(lambda layout: pickle.loads(pickle.dumps(layout)), id="pickle"),
     ],
 )
-def test_a_layout_survives_being_copied(mixed, copied):
-    again = copied(mixed)
+def test_copies_equal_the_layout(mixed, copy_of):
+    copied = copy_of(mixed)
 
-    assert_same_arrays(again, mixed)
-    assert again.columns["name"].tolist() == ["a", "b", "c", "d"]
-    assert dict(again.provenance) == dict(mixed.provenance)
+    assert_same_arrays(copied, mixed)
+    assert copied.columns["name"].tolist() == ["a", "b", "c", "d"]
+    assert dict(copied.provenance) == dict(mixed.provenance)

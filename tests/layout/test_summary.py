@@ -1,4 +1,4 @@
-"""A layout in numbers, its order, and whether its lines and its data get out."""
+"""Layout summary, sorting, selection, data rate and routing demand."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from foveasim.layout import Readout, Routing, describe, grid, log_polar, mosaic,
 ZONES = zones(side_um=(64, 128, 256, 512), pitch_um=(1, 2, 4, 8))
 
 
-def printed(item):
+def render(item):
     stream = io.StringIO()
     Console(file=stream, width=120).print(item)
     return stream.getvalue()
@@ -29,7 +29,7 @@ def printed(item):
 # -- describe --------------------------------------------------------------------------------------------------------
 
 
-def test_four_zones_are_described_by_their_closed_forms():
+def test_summary_of_zones_matches_closed_form():
     found = describe(ZONES)
 
     assert (found.n_sites, found.n_vertices, found.n_lines) == (13_312, 4 * 13_312, 4 * 64)
@@ -42,7 +42,7 @@ def test_four_zones_are_described_by_their_closed_forms():
     assert sorted(found.size_counts[found.size_counts > 0].tolist()) == [3072, 3072, 3072, 4096]
 
 
-def test_trenches_and_blind_spots_are_left_out_of_the_fill_factor():
+def test_fill_factor_excludes_trenches_and_blind_spot():
     trenched = grid(n_x=200, n_y=200, pitch_um=1.0, trench_um=0.1).describe()
     rings = log_polar(n_sectors=360, r_min_um=30.0, r_max_um=60.0).describe()
 
@@ -50,10 +50,10 @@ def test_trenches_and_blind_spots_are_left_out_of_the_fill_factor():
     assert rings.fill_factor == pytest.approx(1 - (30 / rings.bounds_um[2]) ** 2, rel=1e-3)
 
 
-def test_the_table_tells_what_the_fields_hold():
+def test_table_contains_all_fields():
     layout = mosaic(grid(n_x=20, n_y=10, pitch_um=2.0), "bayer")
     readout = Readout(frames_per_s=60.0, bits=12, blanking=0.25, n_lanes=2)
-    text = printed(layout.describe(readout))
+    text = render(layout.describe(readout))
 
     assert "200" in text
     assert "0: 50, 1: 100, 2: 50" in text
@@ -63,7 +63,7 @@ def test_the_table_tells_what_the_fields_hold():
     assert str(layout.describe()).splitlines()[1] == "photosites: 200"
 
 
-def test_the_histogram_holds_every_site_whatever_the_sizes():
+def test_histogram_contains_all_sites():
     rng = np.random.default_rng(1)
     layout = fs.Layout.from_rectangles(100.0 * rng.random((500, 2)), 10.0 ** rng.uniform(-2, 1, 500))
     records = layout.describe().records()
@@ -74,7 +74,7 @@ def test_the_histogram_holds_every_site_whatever_the_sizes():
     np.testing.assert_allclose(ratios, ratios[0], rtol=1e-9)
 
 
-def test_what_cannot_be_described_is_refused():
+def test_describe_rejects_invalid_input():
     with pytest.raises(GeometryError, match="the layout has no sites"):
         describe(ZONES[[]])
     with pytest.raises(ParameterError, match="'readout' must be a Readout"):
@@ -84,19 +84,19 @@ def test_what_cannot_be_described_is_refused():
 # -- order and selection ---------------------------------------------------------------------------------------------
 
 
-def test_sites_are_sorted_by_columns_and_values():
+def test_sort_by_accepts_columns_and_values():
     layout = grid(n_x=3, n_y=2, pitch_um=1.0).with_columns(name=np.array(list("fdbeca")))
 
     assert layout.sort_by("name").columns["name"].tolist() == list("abcdef")
     assert layout.sort_by("name", descending=True).columns["name"].tolist() == list("fedcba")
     assert layout.sort_by("column", "row").readout_line.tolist() == [0, 0, 1, 1, 2, 2]
-    turned = layout.sort_by(-layout.centroid_um[:, 1], layout.centroid_um[:, 0])
-    assert turned.columns["row"].tolist() == [1, 1, 1, 0, 0, 0]
-    assert turned.provenance["steps"][-1] == "sorted by values, values"
-    assert turned.provenance["generator"] == "grid"
+    reordered = layout.sort_by(-layout.centroid_um[:, 1], layout.centroid_um[:, 0])
+    assert reordered.columns["row"].tolist() == [1, 1, 1, 0, 0, 0]
+    assert reordered.provenance["steps"][-1] == "sorted by values, values"
+    assert reordered.provenance["generator"] == "grid"
 
 
-def test_equal_sites_keep_their_order():
+def test_sorting_is_stable():
     layout = ZONES.sort_by("zone", descending=True)
     zone = layout.columns["zone"]
 
@@ -113,12 +113,12 @@ def test_equal_sites_keep_their_order():
         (([1, 2],), "'keys' must have one value for each of the 13312 sites"),
     ],
 )
-def test_keys_that_cannot_sort_are_refused(keys, message):
+def test_invalid_sort_key_raises(keys, message):
     with pytest.raises(ParameterError, match=message):
         ZONES.sort_by(*keys)
 
 
-def test_a_function_of_the_layout_selects():
+def test_selection_by_function_of_layout():
     small = ZONES[lambda layout: layout.area_um2 < 3.0]
 
     assert small.n_sites == 4096
@@ -128,14 +128,14 @@ def test_a_function_of_the_layout_selects():
 # -- readout and routing ---------------------------------------------------------------------------------------------
 
 
-def test_the_published_data_rate():
+def test_data_rate_matches_published_value():
     assert Readout(frames_per_s=30, bits=10, blanking=0.2).gbit_per_s(2592 * 1944) == pytest.approx(1.814, abs=5e-4)
     assert Readout(frames_per_s=30, bits=10, blanking=0.2, n_lanes=4).gbit_per_s(2592 * 1944) == pytest.approx(
         0.4535, abs=5e-4
     )
 
 
-def test_all_spokes_cross_the_first_ring():
+def test_all_lines_cross_first_ring():
     layout = log_polar(n_sectors=120, r_min_um=20.0, r_max_um=90.0)
     found = track_demand(layout, Routing(width_um=0.14, space_um=0.14))
     first_um = np.hypot(*layout.xy_um[: layout.ring_offsets[1]].T).max()
@@ -146,7 +146,7 @@ def test_all_spokes_cross_the_first_ring():
     assert sorted(found.first_sites.tolist()) == list(range(120))
 
 
-@pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # coarse ratios end inside r_max_um
+@pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # large ratios end below r_max_um
 @settings(deadline=None, derandomize=True, max_examples=40)
 @given(
     n_sectors=st.integers(10, 40),
@@ -154,7 +154,7 @@ def test_all_spokes_cross_the_first_ring():
     pitch_um=st.floats(0.2, 3.0),
     n_layers=st.integers(1, 3),
 )
-def test_lines_and_tracks_agree_with_counting_at_every_radius(n_sectors, fovea, pitch_um, n_layers):
+def test_track_demand_agrees_with_counting(n_sectors, fovea, pitch_um, n_layers):
     layout = log_polar(n_sectors=n_sectors, min_size_um=2.0, r_max_um=2.0 * n_sectors, fovea=fovea)
     routing = Routing(width_um=0.5 * pitch_um, space_um=0.5 * pitch_um, n_layers=n_layers)
     found = track_demand(layout, routing)
@@ -169,14 +169,14 @@ def test_lines_and_tracks_agree_with_counting_at_every_radius(n_sectors, fovea, 
         assert n_tracks == n_layers * int(2 * math.pi * place_um / pitch_um + 1e-9)
 
 
-def test_columns_run_upwards_through_the_width_of_the_layout():
+def test_upward_columns_cross_layout_width():
     layout = grid(n_x=50, n_y=4, pitch_um=1.0)
     found = track_demand(layout, Routing(width_um=0.25, space_um=0.25, n_layers=2, direction="upwards"))
 
     assert (found.place_um.tolist(), found.n_nets.tolist(), found.n_tracks.tolist()) == ([-1.0], [50], [200])
 
 
-def test_routing_needs_lines():
+def test_routing_requires_readout_lines():
     with pytest.raises(ParameterError, match="'readout_line' must be a column of the layout"):
         track_demand(fs.Layout.from_polygons([shapely.box(0, 0, 1, 1)]), Routing(width_um=1.0, space_um=1.0))
 
@@ -194,6 +194,6 @@ def test_routing_needs_lines():
         (Routing, {"width_um": 1.0, "space_um": 1.0, "direction": "in"}, "'direction' must be one of 'outwards'"),
     ],
 )
-def test_readouts_and_routings_that_cannot_be_are_refused(make, values, message):
+def test_invalid_readout_or_routing_raises(make, values, message):
     with pytest.raises(ParameterError, match=message):
         make(**values)

@@ -1,4 +1,4 @@
-"""Laws of the Giotto, foveal Cartesian and octagonal layouts: published numbers, closed forms, exact tilings, refusals."""
+"""Giotto, foveal Cartesian and octagonal layouts: published numbers, closed forms, exact tilings, errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ units_um = st.floats(0.05, 50.0)
 
 
 def assert_tiles(layout):
-    """Neighbours share whole edges, no two sites overlap, and areas add up to what the sites cover together."""
+    """Assert that sites share complete edges, do not overlap, and sum to the covered area."""
     polygons = layout.polygons()
     a, b = shapely.STRtree(polygons).query(polygons, predicate="intersects")
     common_um2 = shapely.area(shapely.intersection(polygons[a[a < b]], polygons[b[a < b]]))
@@ -37,15 +37,15 @@ def assert_tiles(layout):
 
 
 def covered(layout):
-    """All sites together, made without dissolving anything that is not shared exactly."""
+    """Union of all sites, in which only exactly shared edges dissolve."""
     return shapely.coverage_union_all(layout.polygons())
 
 
 def edge_counts(layout):
-    """How many edges belong to one site, to two, and so on: vertices are the same only when bit for bit so."""
+    """Number of edges by the number of sites that they belong to, for bit-identical vertices."""
     edges = Counter()
     for polygon in layout.polygons():
-        xy = (shapely.get_coordinates(polygon) + 0.0).tolist()  # a zero has no sign
+        xy = (shapely.get_coordinates(polygon) + 0.0).tolist()  # without negative zeros
         edges.update(frozenset((tuple(p), tuple(q))) for p, q in pairwise(xy))
     return Counter(edges.values())
 
@@ -89,29 +89,29 @@ def giotto_parameters(draw):
 
 
 def outer_corners(parameters):
-    """Corners of a circle outside the fovea: odd numbers of chords are doubled where rings are staggered."""
+    """Number of corners of a circle outside the fovea; odd numbers of chords are doubled for staggered rings."""
     chords = parameters["chords_per_arc"]
     return parameters["n_theta"] * (2 * chords if parameters["stagger"] and chords % 2 else chords)
 
 
 def decimal_ratio(n_rho, n_fovea, n_across):
-    """The ratio by bisection of the summed powers, in forty digits."""
+    """Ratio by bisection of the sum of powers, with forty digits."""
     with localcontext() as context:
         context.prec = 40
         low, high = Decimal(1), Decimal(n_across)
         width = Decimal(n_across) / 2 - n_fovea + Decimal("0.5")
         for _ in range(110):
-            middle = (low + high) / 2
-            is_large = sum(middle**i for i in range(1, n_rho - n_fovea + 1)) > width
-            low, high = (low, middle) if is_large else (middle, high)
+            ratio = (low + high) / 2
+            is_large = sum(ratio**i for i in range(1, n_rho - n_fovea + 1)) > width
+            low, high = (low, ratio) if is_large else (ratio, high)
         return float(low)
 
 
-def test_the_ratio_of_giotto_2_is_the_published_one():
+def test_giotto_2_ratio_matches_published_value():
     assert abs(giotto_ratio(n_rho=152, n_fovea=42, n_across=1090) - 1.02314422608633) < 1e-12
 
 
-def test_the_ratio_of_giotto_1_is_the_published_one():
+def test_giotto_1_ratio_matches_published_value():
     assert giotto_ratio(n_rho=76, n_fovea=20, n_across=600) == pytest.approx(1.0481, abs=5e-5)
 
 
@@ -119,13 +119,13 @@ def test_the_ratio_of_giotto_1_is_the_published_one():
     ("n_rho", "n_fovea", "n_across"),
     [(152, 42, 1090), (76, 20, 600), (2, 1, 4), (2, 1, 10**6), (50, 1, 100), (300, 299, 600), (40, 3, 10**9)],
 )
-def test_the_ratio_solves_the_rule_to_twelve_digits(n_rho, n_fovea, n_across):
+def test_giotto_ratio_has_twelve_digits(n_rho, n_fovea, n_across):
     ratio = giotto_ratio(n_rho=n_rho, n_fovea=n_fovea, n_across=n_across)
 
     assert ratio == pytest.approx(decimal_ratio(n_rho, n_fovea, n_across), rel=1e-12)
 
 
-def test_one_ring_around_the_fovea_is_as_high_as_the_room_it_has():
+def test_single_ring_fills_available_height():
     assert giotto_ratio(n_rho=5, n_fovea=4, n_across=31) == pytest.approx(15.5 - 3.5, rel=1e-14)
 
 
@@ -133,14 +133,14 @@ def test_one_ring_around_the_fovea_is_as_high_as_the_room_it_has():
     ("parameters", "n_in_fovea", "n_around"), [(GIOTTO_2, 5167, 27_720), (GIOTTO_1, 1141, 7168)], ids=["2", "1"]
 )
 @pytest.mark.parametrize("chords_per_arc", [1, 2])
-def test_giotto_has_the_published_numbers_of_sites(parameters, n_in_fovea, n_around, chords_per_arc):
+def test_giotto_has_published_site_counts(parameters, n_in_fovea, n_around, chords_per_arc):
     layout = giotto(**parameters, unit_um=6.45, chords_per_arc=chords_per_arc)
     is_fovea = layout.columns["ring"] < parameters["n_fovea"]
 
     assert (is_fovea.sum(), (~is_fovea).sum()) == (n_in_fovea, n_around)
 
 
-def test_the_log_part_of_giotto_2_spans_41_5_to_545_units_and_ends_with_a_ring_of_12_39():
+def test_giotto_2_log_part_matches_published_radii():
     layout = giotto(**GIOTTO_2, unit_um=6.45, fovea="none")
     inner_um, outer_um = ring_radii_um(layout)
 
@@ -151,7 +151,7 @@ def test_the_log_part_of_giotto_2_spans_41_5_to_545_units_and_ends_with_a_ring_o
 
 
 @pytest.mark.parametrize("parameters", [GIOTTO_1, GIOTTO_2], ids=["1", "2"])
-def test_the_edges_of_rings_are_those_of_the_rule(parameters):
+def test_giotto_ring_radii_follow_rule(parameters):
     n_fovea, n_rho = parameters["n_fovea"], parameters["n_rho"]
     ratio = decimal_ratio(n_rho, n_fovea, parameters["n_across"])
     inner_um, outer_um = ring_radii_um(giotto(**parameters, unit_um=2.0))
@@ -166,32 +166,32 @@ def test_the_edges_of_rings_are_those_of_the_rule(parameters):
 
 @given(giotto_parameters())
 @settings(relaxed, max_examples=80)
-def test_a_giotto_layout_tiles_its_disc_or_its_annulus(parameters):
+def test_giotto_tiles_disc_or_annulus(parameters):
     layout = giotto(**parameters)
     n_corners = outer_corners(parameters)
     disc_um2 = regular_polygon_um2(n_corners, 0.5 * parameters["n_across"] * parameters["unit_um"])
     blind_um2 = regular_polygon_um2(n_corners, (parameters["n_fovea"] - 0.5) * parameters["unit_um"])
-    is_open = parameters["fovea"] == "none"
+    has_blind_spot = parameters["fovea"] == "none"
 
     assert_tiles(layout)
-    assert (covered(layout).geom_type, len(covered(layout).interiors)) == ("Polygon", int(is_open))
-    assert layout.area_um2.sum() == pytest.approx(disc_um2 - is_open * blind_um2, rel=1e-9)
+    assert (covered(layout).geom_type, len(covered(layout).interiors)) == ("Polygon", int(has_blind_spot))
+    assert layout.area_um2.sum() == pytest.approx(disc_um2 - has_blind_spot * blind_um2, rel=1e-9)
 
 
 @given(giotto_parameters())
 @relaxed
-def test_neighbours_in_a_giotto_layout_share_their_edges_bit_for_bit(parameters):
+def test_giotto_neighbours_share_edges_exactly(parameters):
     counts = edge_counts(giotto(**parameters))
-    n_borders = 2 if parameters["fovea"] == "none" else 1
+    n_boundaries = 2 if parameters["fovea"] == "none" else 1
 
-    assert counts[1] == n_borders * outer_corners(parameters)
+    assert counts[1] == n_boundaries * outer_corners(parameters)
     assert set(counts) == {1, 2}
 
 
 @pytest.mark.parametrize("chords_per_arc", [1, 2, 3, 4, 7])
 @pytest.mark.parametrize("stagger", [False, True])
 @pytest.mark.parametrize("fovea", ["rings", "none"])
-def test_giotto_1_is_without_gap_or_overlap_for_any_number_of_chords(fovea, stagger, chords_per_arc):
+def test_giotto_1_tiles_with_any_chords(fovea, stagger, chords_per_arc):
     parameters = {**GIOTTO_1, "unit_um": 3.0, "fovea": fovea, "stagger": stagger, "chords_per_arc": chords_per_arc}
     layout = giotto(**parameters)
     n_corners = outer_corners(parameters)
@@ -205,7 +205,7 @@ def test_giotto_1_is_without_gap_or_overlap_for_any_number_of_chords(fovea, stag
 
 @given(st.integers(1, 12), st.integers(3, 9), st.integers(0, 50))
 @relaxed
-def test_ring_rho_of_the_fovea_holds_rho_times_as_many_sites_as_ring_1(n_fovea, n_per_rho, rest):
+def test_giotto_fovea_counts_grow_with_rho(n_fovea, n_per_rho, rest):
     n_theta = n_per_rho * n_fovea + rest % n_fovea
     layout = giotto(n_rho=n_fovea + 2, n_theta=n_theta, n_fovea=n_fovea, n_across=4 * n_fovea + 8, unit_um=1.0)
     counts = [1] + [n_per_rho * rho for rho in range(1, n_fovea)] + [n_theta, n_theta]
@@ -214,7 +214,7 @@ def test_ring_rho_of_the_fovea_holds_rho_times_as_many_sites_as_ring_1(n_fovea, 
     assert layout.columns["sector"].tolist() == [s for n in counts for s in range(n)]
 
 
-def test_sites_of_the_fovea_have_one_area_all_over():
+def test_giotto_fovea_sites_have_equal_area():
     layout = giotto(n_rho=14, n_theta=72, n_fovea=12, n_across=40, unit_um=2.0, chords_per_arc=60)
     unit_areas = layout.area_um2[layout.columns["ring"] < 12] / 4.0
 
@@ -224,8 +224,8 @@ def test_sites_of_the_fovea_have_one_area_all_over():
 
 @pytest.mark.parametrize("chords_per_arc", [1, 2, 3])
 @pytest.mark.parametrize("fovea", ["rings", "none"])
-@pytest.mark.parametrize(("stagger", "turn"), [(False, 0.0), (True, 0.5)])
-def test_every_second_ring_around_the_fovea_is_turned_by_half_a_sector(stagger, turn, fovea, chords_per_arc):
+@pytest.mark.parametrize(("stagger", "shift"), [(False, 0.0), (True, 0.5)])
+def test_giotto_stagger_rotates_every_second_ring(stagger, shift, fovea, chords_per_arc):
     layout = giotto(
         n_rho=9,
         n_theta=31,
@@ -240,33 +240,33 @@ def test_every_second_ring_around_the_fovea_is_turned_by_half_a_sector(stagger, 
     angle = (np.arctan2(y, x) / (2 * math.pi / 31)).reshape(3, 31) % 31
 
     np.testing.assert_allclose(angle[1], np.arange(31) + 0.5, atol=1e-9)
-    np.testing.assert_allclose(angle[[0, 2]], np.tile((np.arange(31) + 0.5 + turn) % 31, (2, 1)), atol=1e-9)
+    np.testing.assert_allclose(angle[[0, 2]], np.tile((np.arange(31) + 0.5 + shift) % 31, (2, 1)), atol=1e-9)
 
 
-def test_a_giotto_layout_without_fovea_is_the_outer_part_of_the_whole():
+def test_giotto_without_fovea_is_outer_part():
     parameters = {**GIOTTO_1, "unit_um": 2.2, "chords_per_arc": 2}
-    whole, part = giotto(**parameters), giotto(**parameters, fovea="none")
-    outer = whole[whole.columns["ring"] >= 20]
+    complete, part = giotto(**parameters), giotto(**parameters, fovea="none")
+    outer = complete[complete.columns["ring"] >= 20]
 
     assert {name: values.tolist() for name, values in part.columns.items()} == {
         name: values.tolist() for name, values in outer.columns.items()
     }
-    assert part.area_um2[128:].tolist() == outer.area_um2[128:].tolist()  # ring 20 touches the fovea
+    assert part.area_um2[128:].tolist() == outer.area_um2[128:].tolist()  # ring 20 includes corners of the fovea
     assert part.provenance["blind_radius_um"] == pytest.approx(19.5 * 2.2, rel=1e-14)
-    assert "blind_radius_um" not in whole.provenance
+    assert "blind_radius_um" not in complete.provenance
 
 
-def test_the_readout_line_is_the_spoke_in_which_a_site_begins():
+def test_readout_line_is_sector_of_site_start():
     layout = giotto(**GIOTTO_1, unit_um=1.0, stagger=False)
     ring = layout.columns["ring"]
     n_in_ring = np.where(ring < 20, np.maximum(1, 6 * ring), 128)
-    spoke = layout.columns["sector"] / n_in_ring * 128
+    start = layout.columns["sector"] / n_in_ring * 128
 
     assert layout.readout_line[ring >= 20].tolist() == layout.columns["sector"][ring >= 20].tolist()
-    assert bool(np.all((layout.readout_line <= spoke + 1e-9) & (spoke < layout.readout_line + 1)))
+    assert bool(np.all((layout.readout_line <= start + 1e-9) & (start < layout.readout_line + 1)))
 
 
-def test_a_giotto_layout_scales_with_its_unit():
+def test_giotto_scales_with_unit():
     small, large = (giotto(**GIOTTO_1, unit_um=unit_um) for unit_um in (1.0, 8.0))
 
     assert (8.0 * small.xy_um).tolist() == large.xy_um.tolist()
@@ -278,8 +278,11 @@ def test_a_giotto_layout_scales_with_its_unit():
     [
         ({"n_rho": 1}, "'n_rho' must be >= 2, got 1"),
         ({"n_fovea": 0}, "'n_fovea' must be >= 1, got 0"),
-        ({"n_fovea": 76}, "'n_fovea' must be <= 75, got 76; 'n_rho' counts the fovea's rings and at least one"),
-        ({"n_across": 151}, "'n_across' must be > 151, the diameter of 76 rings that do not grow, got 151; take more"),
+        ({"n_fovea": 76}, "'n_fovea' must be <= 75, got 76; 'n_rho' includes the rings of the fovea and at least"),
+        (
+            {"n_across": 151},
+            "'n_across' must be > 151, the diameter of 76 rings of unit height, got 151; take a larger",
+        ),
         ({"n_across": 600.5}, "'n_across' must be an integer, got 600.5"),
         ({"n_across": "600"}, "'n_across' must be one number, got '600'"),
         ({"n_theta": 2, "fovea": "none"}, "'n_theta' must be >= 3, got 2"),
@@ -291,7 +294,7 @@ def test_a_giotto_layout_scales_with_its_unit():
         ({"chords_per_arc": 0}, "'chords_per_arc' must be >= 1, got 0"),
     ],
 )
-def test_giotto_refuses_what_cannot_be(changed, message):
+def test_giotto_rejects_invalid_parameters(changed, message):
     with pytest.raises(ParameterError, match=message):
         giotto(**{**GIOTTO_1, "unit_um": 1.0, **changed})
 
@@ -304,7 +307,7 @@ def test_giotto_refuses_what_cannot_be(changed, message):
         ({"n_rho": 1e9}, "'n_rho' must be <="),
     ],
 )
-def test_the_ratio_refuses_what_has_no_growing_rings(changed, message):
+def test_giotto_ratio_rejects_invalid_parameters(changed, message):
     with pytest.raises(ParameterError, match=message):
         giotto_ratio(**{"n_rho": 76, "n_fovea": 20, "n_across": 600, **changed})
 
@@ -317,7 +320,7 @@ def foveal_parameters(draw):
     n_rings = draw(st.integers(1, 9))
     return {
         "n_rings": n_rings,
-        # Ratios of small integers let corners of two rings meet, but for rounding.
+        # With ratios of small integers, corners of two rings coincide within rounding.
         "ring_ratio": draw(st.floats(1.01, 4.0) | st.fractions(1, 5, max_denominator=9).filter(lambda q: q > 1)),
         "pitch_um": draw(units_um),
         "n_fovea": draw(st.integers(1, n_rings)),
@@ -333,7 +336,7 @@ def half_sides_um(n_rings, ring_ratio, pitch_um, n_fovea=1):
 
 @given(foveal_parameters())
 @settings(relaxed, max_examples=80)
-def test_a_foveal_cartesian_layout_tiles_its_square_with_2n_minus_1_squared_sites(parameters):
+def test_foveal_cartesian_tiles_its_square(parameters):
     layout = foveal_cartesian(**parameters)
     half_um = half_sides_um(**parameters)[-1]
 
@@ -346,7 +349,7 @@ def test_a_foveal_cartesian_layout_tiles_its_square_with_2n_minus_1_squared_site
 
 @given(foveal_parameters())
 @relaxed
-def test_neighbours_in_a_foveal_cartesian_layout_share_their_edges_bit_for_bit(parameters):
+def test_foveal_cartesian_neighbours_share_edges_exactly(parameters):
     counts = edge_counts(foveal_cartesian(**parameters))
 
     assert counts[1] == 4 * (2 * parameters["n_rings"] - 1)
@@ -357,7 +360,7 @@ def test_neighbours_in_a_foveal_cartesian_layout_share_their_edges_bit_for_bit(p
 @example({"n_rings": 7, "ring_ratio": 5 / 3, "pitch_um": 0.7, "n_fovea": 1})
 @example({"n_rings": 8, "ring_ratio": 1.4, "pitch_um": 0.1, "n_fovea": 3})
 @relaxed
-def test_every_edge_of_a_foveal_cartesian_layout_is_parallel_to_an_axis_and_none_is_a_rounding(parameters):
+def test_foveal_cartesian_edges_are_axis_parallel(parameters):
     layout = foveal_cartesian(**parameters)
     edges_um = np.concatenate([np.diff(shapely.get_coordinates(p), axis=0) for p in layout.polygons()])
 
@@ -367,7 +370,7 @@ def test_every_edge_of_a_foveal_cartesian_layout_is_parallel_to_an_axis_and_none
 
 @given(foveal_parameters())
 @relaxed
-def test_ring_r_has_8r_rectangles_of_the_sizes_in_closed_form(parameters):
+def test_foveal_cartesian_sizes_match_closed_form(parameters):
     layout = foveal_cartesian(**parameters)
     half_um = half_sides_um(**parameters)
     sizes_um = layout.site_bounds_um[:, 2:] - layout.site_bounds_um[:, :2]
@@ -384,7 +387,7 @@ def test_ring_r_has_8r_rectangles_of_the_sizes_in_closed_form(parameters):
 
 @given(foveal_parameters())
 @relaxed
-def test_sites_keep_the_order_of_the_grid_that_they_are_numbered_as(parameters):
+def test_foveal_cartesian_preserves_grid_order(parameters):
     layout = foveal_cartesian(**parameters)
     n = 2 * parameters["n_rings"] - 1
     row, column = layout.columns["row"], layout.columns["column"]
@@ -394,7 +397,7 @@ def test_sites_keep_the_order_of_the_grid_that_they_are_numbered_as(parameters):
     assert len(set(zip(row.tolist(), column.tolist(), strict=True))) == n * n
     assert layout.readout_line.tolist() == column.tolist()
     assert np.maximum(abs(row - n // 2), abs(column - n // 2)).tolist() == layout.columns["ring"].tolist()
-    # In its ring a site's neighbours along a row or column lie to its right, or above it.
+    # Within a ring, the next site along a row or column is to the right or above.
     ring = np.zeros((n, n), int)
     ring[row, column] = layout.columns["ring"]
     assert bool(np.all(np.diff(x, axis=1)[ring[:, 1:] == ring[:, :-1]] > 0))
@@ -403,7 +406,7 @@ def test_sites_keep_the_order_of_the_grid_that_they_are_numbered_as(parameters):
 
 @given(st.integers(1, 8), units_um)
 @relaxed
-def test_a_foveal_cartesian_layout_that_is_all_fovea_is_a_grid(n_rings, pitch_um):
+def test_foveal_cartesian_fovea_is_a_grid(n_rings, pitch_um):
     layout = foveal_cartesian(n_rings=n_rings, ring_ratio=1.5, pitch_um=pitch_um, n_fovea=n_rings)
     uniform = grid(n_x=2 * n_rings - 1, n_y=2 * n_rings - 1, pitch_um=pitch_um)
     order = np.lexsort((layout.columns["column"], layout.columns["row"]))
@@ -414,7 +417,7 @@ def test_a_foveal_cartesian_layout_that_is_all_fovea_is_a_grid(n_rings, pitch_um
     )
 
 
-def test_a_ratio_of_three_around_one_square_makes_each_ring_of_squares_in_its_corners():
+def test_foveal_cartesian_with_ratio_three():
     layout = foveal_cartesian(n_rings=3, ring_ratio=3.0, pitch_um=2.0)
 
     assert layout.area_um2[:9].tolist() == [4.0] * 9
@@ -425,8 +428,8 @@ def test_a_ratio_of_three_around_one_square_makes_each_ring_of_squares_in_its_co
 
 @given(st.integers(1, 6), st.integers(1, 8), st.floats(0.0, 1.0))
 @relaxed
-def test_no_site_is_below_the_pitch_where_the_ratio_is_at_least_that_of_the_fovea(n_fovea, n_growing, more):
-    ratio = 1 + 2 / (2 * n_fovea - 1) + more
+def test_foveal_cartesian_minimum_size_is_pitch(n_fovea, n_growing, excess):
+    ratio = 1 + 2 / (2 * n_fovea - 1) + excess
     layout = foveal_cartesian(n_rings=n_fovea + n_growing, ring_ratio=ratio, pitch_um=2.2, n_fovea=n_fovea)
     sizes_um = layout.site_bounds_um[:, 2:] - layout.site_bounds_um[:, :2]
 
@@ -442,14 +445,14 @@ def test_no_site_is_below_the_pitch_where_the_ratio_is_at_least_that_of_the_fove
         ({"ring_ratio": math.inf}, "'ring_ratio' must be finite"),
         (
             {"ring_ratio": 10.0},
-            "'ring_ratio' makes 9 rings reach further than 1e.07 µm, got 10.0; take a smaller ratio",
+            "'ring_ratio' must keep the radius of 9 growing rings within 1e.07 µm, got 10.0; take a smaller ratio",
         ),
         ({"pitch_um": -1}, "'pitch_um' must be > 0, got -1 µm"),
         ({"n_fovea": 0}, "'n_fovea' must be >= 1, got 0"),
-        ({"n_fovea": 11}, "'n_fovea' must be <= 10, got 11; it is no larger than 'n_rings'"),
+        ({"n_fovea": 11}, "'n_fovea' must be <= 10, got 11; the upper limit is 'n_rings'"),
     ],
 )
-def test_foveal_cartesian_refuses_what_cannot_be(changed, message):
+def test_foveal_cartesian_rejects_invalid_parameters(changed, message):
     with pytest.raises(ParameterError, match=message):
         foveal_cartesian(**{"n_rings": 10, "ring_ratio": 1.2, "pitch_um": 1.0, **changed})
 
@@ -464,14 +467,14 @@ def octagonal_parameters(draw):
         "n_x": draw(st.integers(1, 6)),
         "n_y": draw(st.integers(1, 6)),
         "pitch_um": pitch_um,
-        "diamond_um": draw(st.none() | st.floats(0.01, 0.7).map(lambda share: share * pitch_um)),
+        "diamond_um": draw(st.none() | st.floats(0.01, 0.7).map(lambda fraction: fraction * pitch_um)),
         "border": draw(st.sampled_from(["whole", "cut"])),
     }
 
 
 @given(octagonal_parameters())
 @settings(relaxed, max_examples=60)
-def test_octagons_and_diamonds_tile_without_a_hole(parameters):
+def test_octagons_and_diamonds_tile_without_holes(parameters):
     layout = octagonal(**parameters)
 
     assert_tiles(layout)
@@ -480,7 +483,7 @@ def test_octagons_and_diamonds_tile_without_a_hole(parameters):
 
 @given(octagonal_parameters())
 @relaxed
-def test_cut_diamonds_complete_the_rectangle(parameters):
+def test_cut_diamonds_complete_rectangle(parameters):
     layout = octagonal(**{**parameters, "border": "cut"})
     wide_um, high_um = (parameters[n] * parameters["pitch_um"] for n in ("n_x", "n_y"))
 
@@ -491,7 +494,7 @@ def test_cut_diamonds_complete_the_rectangle(parameters):
 
 @given(octagonal_parameters())
 @relaxed
-def test_an_octagon_and_a_diamond_make_a_cell(parameters):
+def test_octagon_and_diamond_fill_cell(parameters):
     layout = octagonal(**parameters)
     pitch_um = parameters["pitch_um"]
     diamond_um = parameters["diamond_um"] or (math.sqrt(2) - 1) * pitch_um
@@ -507,16 +510,16 @@ def test_an_octagon_and_a_diamond_make_a_cell(parameters):
 
 @given(octagonal_parameters())
 @relaxed
-def test_octagons_and_diamonds_share_their_edges_bit_for_bit(parameters):
+def test_octagonal_neighbours_share_edges_exactly(parameters):
     n_x, n_y = parameters["n_x"], parameters["n_y"]
     is_cut = parameters["border"] == "cut"
     counts = edge_counts(octagonal(**parameters))
     flat, slanted = n_x * (n_y - 1) + n_y * (n_x - 1), 4 * (n_x * n_y if is_cut else (n_x - 1) * (n_y - 1))
 
     assert counts[2] == flat + slanted
-    # Along the border lie the octagons' flat sides and, cut, a side of each half and two of each quarter.
-    n_on_border = 2 * (n_x + n_y) + (2 * (n_x + n_y - 2) + 8 if is_cut else 4 * n_x * n_y - slanted)
-    assert counts[1] == n_on_border
+    # The boundary consists of flat sides of octagons and, if cut, of one side per half and two per quarter.
+    n_on_boundary = 2 * (n_x + n_y) + (2 * (n_x + n_y - 2) + 8 if is_cut else 4 * n_x * n_y - slanted)
+    assert counts[1] == n_on_boundary
     assert set(counts) <= {1, 2}
 
 
@@ -535,7 +538,7 @@ def test_octagons_are_regular_by_default(n_x, n_y, pitch_um):
     np.testing.assert_allclose(turn_rad, math.pi / 4, rtol=1e-9)
 
 
-def test_diamonds_are_squares_on_their_corners_where_four_octagons_meet():
+def test_diamonds_are_between_four_octagons():
     layout = octagonal(n_x=3, n_y=2, pitch_um=4.0, diamond_um=math.sqrt(2))
     diamonds = layout[layout.columns["kind"] == 1]
 
@@ -543,7 +546,7 @@ def test_diamonds_are_squares_on_their_corners_where_four_octagons_meet():
     np.testing.assert_allclose(diamonds.xy_um[:4], [[-2, -1], [-1, 0], [-2, 1], [-3, 0]], atol=1e-12)
 
 
-def test_octagons_are_numbered_row_by_row_and_diamonds_after_them():
+def test_octagons_precede_diamonds_row_by_row():
     layout = octagonal(n_x=3, n_y=3, pitch_um=2.0)
 
     assert layout.columns["kind"].tolist() == [0] * 9 + [1] * 4
@@ -565,12 +568,12 @@ def test_octagons_are_numbered_row_by_row_and_diamonds_after_them():
         ({"border": "open"}, "'border' must be one of 'whole', 'cut', got 'open'"),
     ],
 )
-def test_octagonal_refuses_what_cannot_be(changed, message):
+def test_octagonal_rejects_invalid_parameters(changed, message):
     with pytest.raises(ParameterError, match=message):
         octagonal(**{"n_x": 3, "n_y": 3, "pitch_um": 2.0, **changed})
 
 
-# -- all three ---------------------------------------------------------------------------------------------------------
+# -- all families ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -599,7 +602,7 @@ def test_octagonal_refuses_what_cannot_be(changed, message):
         ),
     ],
 )
-def test_a_million_sites_have_the_area_that_they_must(make, parameters, n_sites, area_um2):
+def test_million_sites_have_expected_area(make, parameters, n_sites, area_um2):
     layout = make(**parameters)
 
     assert layout.n_sites == n_sites
@@ -616,7 +619,7 @@ def test_a_million_sites_have_the_area_that_they_must(make, parameters, n_sites,
         (octagonal, {"n_x": 4, "n_y": 3, "pitch_um": 5.0, "diamond_um": 1.5, "border": "whole"}),
     ],
 )
-def test_a_layout_of_these_families_can_be_made_again_from_its_provenance(make, parameters):
+def test_provenance_reproduces_layout(make, parameters):
     layout = make(**parameters)
 
     assert layout.provenance["generator"] == make.__name__

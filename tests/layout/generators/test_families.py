@@ -1,8 +1,8 @@
 """
-Promises of the layout families, for all generators of the package.
+Common properties of all layout generators of the package.
 
-The list of generators is the registry ``foveasim.layout.LAYOUTS``, with an example each; one that takes ``min_size_um`` is
-found by its signature. Families whose area is known in closed form are listed here.
+The generators and their examples are those of the registry ``foveasim.layout.LAYOUTS``; generators with ``min_size_um`` are
+identified by their signature. Families with an area in closed form are listed here.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from foveasim.config import schema
 from foveasim.errors import FoveasimError
 from foveasim.layout import LAYOUTS
 
-#: Generators draw what is not possible together: most of it is rejected by them, with an error of the package.
-drawn = settings(
+#: Most random combinations of parameters are invalid, and generators reject them with an error of the package.
+random_settings = settings(
     deadline=None,
     derandomize=True,
     max_examples=60,
     suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
 )
-quiet = pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")
+without_warnings = pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")
 
 
 class Family(NamedTuple):
-    """Parameters of a generator, the area that its sites tile in closed form (None: they do not tile), and open holes."""
+    """Parameters of a generator, area in closed form (None: sites do not tile), and number of holes."""
 
     generator: str
     parameters: dict[str, Any]
@@ -84,18 +84,18 @@ FAMILIES = [
     Family("zones", {"side_um": [8.0, 16.0, 48.0], "pitch_um": [1.0, 2.0, 4.0]}, 48.0**2),
     Family("zones", {"side_um": [8.0, 17.0], "pitch_um": [1.0, 2.0], "cells": "hexagons"}, 17.0**2),
 ]
-#: What every family is registered with.
+#: Registered example of each family.
 FAMILIES += [Family(name, generator.example, None) for name, generator in LAYOUTS.items()]
 names = [f"{family.generator} {i}" for i, family in enumerate(FAMILIES)]
 every_family = pytest.mark.parametrize("family", FAMILIES, ids=names)
 
 
-def made(family):
+def generate(family):
     return LAYOUTS[family.generator](**family.parameters)
 
 
 def test_public_generators_are_registered():
-    # A family is a function that is called like its module and makes a layout from nothing but numbers and shapes.
+    # A family is a function with the name of its module that returns a layout and has no parameter ``layout``.
     public = {
         name
         for name in fs.layout.__all__
@@ -110,20 +110,20 @@ def test_public_generators_are_registered():
 
 @every_family
 def test_sites_are_simple_polygons_with_area(family):
-    layout = made(family)
+    layout = generate(family)
     rebuilt = fs.Layout.from_polygons((layout.xy_um, layout.ring_offsets, layout.site_offsets))
 
     assert layout.n_sites > 1
     assert shapely.is_valid(layout.polygons()).all()
     assert layout.area_um2.min() > 0.0
-    # Nothing had to be wound round or left out.
+    # No ring was reversed, and no vertex was removed.
     assert np.array_equal(rebuilt.xy_um, layout.xy_um)
     assert all(column.shape == (layout.n_sites,) for column in layout.columns.values())
 
 
 @every_family
 def test_sites_tile_without_gap_or_overlap(family):
-    layout = made(family)
+    layout = generate(family)
     polygons = layout.polygons()
     first, second = shapely.STRtree(polygons).query(polygons, predicate="intersects")
     common_um2 = shapely.area(shapely.intersection(polygons[first], polygons[second])[first < second])
@@ -143,8 +143,8 @@ def test_sites_tile_without_gap_or_overlap(family):
 
 
 @every_family
-def test_npz_keeps_every_family_bit_for_bit(family, tmp_path):
-    layout = made(family)
+def test_npz_round_trip_is_bit_identical(family, tmp_path):
+    layout = generate(family)
     layout.write(tmp_path / "layout.npz")
     read = fs.read_layout(tmp_path / "layout.npz")
 
@@ -158,18 +158,18 @@ def test_npz_keeps_every_family_bit_for_bit(family, tmp_path):
 
 
 @every_family
-def test_provenance_repeats_every_family(family):
-    layout = made(family)
+def test_provenance_reproduces_layout(family):
+    layout = generate(family)
     parameters = layout.provenance["parameters"]
 
     assert layout.provenance["generator"] == family.generator
     assert set(parameters) == set(inspect.signature(LAYOUTS[family.generator]).parameters)
-    if family.generator != "quadtree":  # whose picture is not kept
+    if family.generator != "quadtree":  # the picture is not recorded
         assert np.array_equal(LAYOUTS[family.generator](**parameters).xy_um, layout.xy_um)
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_settings_files_take_every_generator(name):
+def test_settings_schema_contains_generator(name):
     sections = schema()["$defs"]
     keys = next(s for s in sections.values() if s["title"] == f"{name} parameters")["properties"]
     not_in_files = {"density_grid"}
@@ -178,13 +178,13 @@ def test_settings_files_take_every_generator(name):
     assert f'"const": "{name}"' in json.dumps(sections)
 
 
-# -- the minimum size ------------------------------------------------------------------------------------------------
+# -- minimum size ------------------------------------------------------------------------------------------------
 
 WITH_MIN_SIZE = [name for name, call in LAYOUTS.items() if "min_size_um" in inspect.signature(call).parameters]
 
 
 def values_of(name, hint):
-    """Values of a parameter by its type, and for numbers by the unit in its name; None where the type does not help."""
+    """Strategy for a parameter by its type and, for numbers, its name; None for other types."""
     if get_origin(hint) is Literal:
         return st.sampled_from(get_args(hint))
     if get_origin(hint) in (Union, types.UnionType):
@@ -200,47 +200,47 @@ def values_of(name, hint):
 
 @st.composite
 def parameters_of(draw, call):
-    """Parameters of a generator: those with a default are often left out."""
+    """Random parameters of a generator; those with a default are often omitted."""
     hints = get_type_hints(call)
     found = {}
     for name, parameter in inspect.signature(call).parameters.items():
         values = values_of(name, hints[name])
-        is_needed = parameter.default is inspect.Parameter.empty or name == "min_size_um"
+        is_required = parameter.default is inspect.Parameter.empty or name == "min_size_um"
         if values is None:
-            assert not is_needed, f"no values for '{name}' of {call.__name__}: extend values_of"
-        elif is_needed or draw(st.booleans()):
+            assert not is_required, f"no values for '{name}' of {call.__name__}: extend values_of"
+        elif is_required or draw(st.booleans()):
             found[name] = draw(values)
     return found
 
 
-def assert_no_site_is_rejected(layout, min_size_um):
+def assert_minimum_size(layout, min_size_um):
     report = layout.check(fs.DesignRules(min_size_um=min_size_um))
 
     assert report.ok, str(report)
 
 
-def test_some_generators_take_a_minimum_size():
+def test_generators_with_minimum_size():
     assert {"log_polar", "tiling"} <= set(WITH_MIN_SIZE)
 
 
-@quiet
+@without_warnings
 @pytest.mark.parametrize("name", WITH_MIN_SIZE)
-def test_no_generator_makes_a_site_below_its_minimum_size(name):
-    n_made = 0
+def test_generator_satisfies_minimum_size(name):
+    n_generated = 0
 
-    @drawn
+    @random_settings
     @given(parameters=parameters_of(LAYOUTS[name]))
     def check(parameters):
-        nonlocal n_made
+        nonlocal n_generated
         try:
             layout = LAYOUTS[name](**parameters)
         except FoveasimError:
             assume(False)
-        n_made += 1
-        assert_no_site_is_rejected(layout, parameters["min_size_um"])
+        n_generated += 1
+        assert_minimum_size(layout, parameters["min_size_um"])
 
     check()
-    assert n_made >= 30
+    assert n_generated >= 30
 
 
 @st.composite
@@ -262,25 +262,25 @@ def log_polar_parameters(draw):
     }
 
 
-@quiet
-@drawn
+@without_warnings
+@random_settings
 @given(parameters=log_polar_parameters())
 @example(parameters={"n_sectors": 192, "min_size_um": 2.0, "r_max_um": 690.0, "stagger": True, "chords_per_arc": 2})
 @example(parameters={"n_sectors": 192, "min_size_um": 2.0, "r_max_um": 300.0, "fovea": "rings"})
 @example(parameters={"n_sectors": 6, "min_size_um": 2.0, "r_max_um": 100.0, "ring_ratio": 9.0, "fovea": "linear"})
 @example(parameters={"n_sectors": 471, "min_size_um": 0.01171875, "r_max_um": 1.756921363975376, "fovea": "rings"})
-def test_log_polar_sites_reach_the_minimum_size_without_rounding(parameters):
+def test_log_polar_minimum_size_is_exact(parameters):
     try:
         layout = fs.layout.log_polar(**parameters)
     except FoveasimError:
         assume(False)
 
     assert np.sqrt(layout.area_um2).min() >= parameters["min_size_um"]
-    assert_no_site_is_rejected(layout, parameters["min_size_um"])
+    assert_minimum_size(layout, parameters["min_size_um"])
 
 
-@quiet
-@drawn
+@without_warnings
+@random_settings
 @given(
     n_sectors=st.integers(3, 40),
     ring_ratio=st.floats(1.005, 1.2),
@@ -288,7 +288,7 @@ def test_log_polar_sites_reach_the_minimum_size_without_rounding(parameters):
     chords_per_arc=st.integers(1, 3),
     stagger=st.booleans(),
 )
-def test_foveas_inside_coarse_chords_do_not_cross_them(n_sectors, ring_ratio, fovea, chords_per_arc, stagger):
+def test_fovea_does_not_cross_coarse_chords(n_sectors, ring_ratio, fovea, chords_per_arc, stagger):
     layout = fs.layout.log_polar(
         n_sectors=n_sectors,
         r_min_um=10.0,
@@ -307,41 +307,41 @@ def test_foveas_inside_coarse_chords_do_not_cross_them(n_sectors, ring_ratio, fo
 
 @pytest.mark.parametrize("cells", ["squares", "hexagons"])
 @pytest.mark.parametrize("pitch_um", [0.7, 2.2, 3.9])
-def test_whole_cells_of_exactly_the_minimum_size_stay(cells, pitch_um):
+def test_cells_of_exact_minimum_size_remain(cells, pitch_um):
     area_um2 = pitch_um**2 * (1.0 if cells == "squares" else math.sqrt(3.0) / 2.0)
     parameters = {"pitch_um": pitch_um, "cells": cells, "size_um": (61 * pitch_um, 53 * pitch_um)}
     layout = fs.layout.tiling(**parameters, min_size_um=math.sqrt(area_um2))
-    whole = fs.layout.tiling(**parameters, border="drop", min_size_um=math.sqrt(area_um2))
-    is_whole = np.isclose(layout.area_um2, area_um2, rtol=1e-9)
+    complete = fs.layout.tiling(**parameters, border="drop", min_size_um=math.sqrt(area_um2))
+    is_complete = np.isclose(layout.area_um2, area_um2, rtol=1e-9)
 
-    assert_no_site_is_rejected(layout, math.sqrt(area_um2))
-    # Squares fit the rectangle; hexagons at its border are joined to some of the whole ones.
-    assert is_whole.sum() == whole.n_sites if cells == "squares" else is_whole.sum() > 0.9 * whole.n_sites
+    assert_minimum_size(layout, math.sqrt(area_um2))
+    # Squares fit the rectangle; pieces of hexagons at its boundary are merged into some of the complete ones.
+    assert is_complete.sum() == complete.n_sites if cells == "squares" else is_complete.sum() > 0.9 * complete.n_sites
 
 
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"border": "cut"}, "'min_size_um' must be left out with border='cut'"),
-        ({"border": "drop"}, "'min_size_um' must be <= 1.86121, the size of a whole cell, got 2.0 µm"),
+        ({"border": "cut"}, "'min_size_um' must be omitted with border='cut'"),
+        ({"border": "drop"}, "'min_size_um' must be <= 1.86121, the size of a complete cell, got 2.0 µm"),
     ],
 )
-def test_tiling_rejects_a_minimum_size_it_cannot_keep(parameters, message):
+def test_tiling_rejects_unattainable_minimum_size(parameters, message):
     with pytest.raises(fs.errors.ParameterError, match=message):
         fs.layout.tiling(pitch_um=2.0, radius_um=20.0, min_size_um=2.0, **parameters)
 
 
-def test_tiling_warns_of_parts_too_small_for_a_site():
+def test_tiling_warns_about_uncovered_parts():
     region = shapely.MultiPolygon([shapely.box(0, 0, 20, 20), shapely.box(30, 0, 31, 1)])
 
-    with pytest.warns(fs.errors.LayoutWarning, match="1 µm² of the region stay open, in parts that are smaller than a"):
+    with pytest.warns(
+        fs.errors.LayoutWarning, match="1 µm² of the region remain uncovered, in parts smaller than a site"
+    ):
         layout = fs.layout.tiling(pitch_um=3.0, region=region)
     assert layout.area_um2.sum() == pytest.approx(400.0)
 
 
 @pytest.mark.parametrize("fovea", ["rings", "linear", "hexagons"])
-def test_fovea_of_a_given_radius_too_small_for_a_site_is_rejected(fovea):
-    with pytest.raises(
-        fs.errors.ParameterError, match=r"'fovea' leaves no room for a .* of 5 µm inside the first ring"
-    ):
+def test_fovea_too_small_for_site_raises(fovea):
+    with pytest.raises(fs.errors.ParameterError, match=r"'fovea' must fit a .* of 5 µm inside the first ring"):
         fs.layout.log_polar(n_sectors=4, r_min_um=2.0, r_max_um=19.0, min_size_um=5.0, ring_ratio=9.0, fovea=fovea)

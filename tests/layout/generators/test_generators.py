@@ -1,4 +1,4 @@
-"""Laws of the layout generators and of the filter mosaic: closed forms, tilings by shapely, counts, refusals."""
+"""Layout generators and colour filter mosaics: closed forms, tilings by shapely, counts, errors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ pitches_um = st.floats(0.05, 50.0)
 
 
 def assert_tiles(layout):
-    """No two sites overlap, and their areas add up to the area that they cover together."""
+    """Assert that sites do not overlap, and that their areas sum to the covered area."""
     polygons = layout.polygons()
     a, b = shapely.STRtree(polygons).query(polygons, predicate="intersects")
     common_um2 = shapely.area(shapely.intersection(polygons[a[a < b]], polygons[b[a < b]]))
@@ -35,7 +35,7 @@ def assert_tiles(layout):
 
 
 def edge_counts(layout):
-    """How many edges belong to one site, to two, and so on: vertices are the same only when bit for bit so."""
+    """Number of edges by the number of sites that they belong to, for bit-identical vertices."""
     edges = Counter()
     for polygon in layout.polygons():
         xy = shapely.get_coordinates(polygon).tolist()
@@ -58,7 +58,7 @@ def radii_um(layout):
 
 @given(st.integers(1, 9), st.integers(1, 9), pitches_um)
 @relaxed
-def test_a_grid_tiles_its_rectangle(n_x, n_y, pitch_um):
+def test_grid_tiles_its_rectangle(n_x, n_y, pitch_um):
     layout = grid(n_x=n_x, n_y=n_y, pitch_um=pitch_um)
 
     assert_tiles(layout)
@@ -70,7 +70,7 @@ def test_a_grid_tiles_its_rectangle(n_x, n_y, pitch_um):
 
 @given(st.integers(1, 9), st.integers(1, 9), pitches_um)
 @relaxed
-def test_neighbours_on_a_grid_share_their_edges_bit_for_bit(n_x, n_y, pitch_um):
+def test_grid_neighbours_share_edges_exactly(n_x, n_y, pitch_um):
     n_shared = n_x * (n_y - 1) + n_y * (n_x - 1)
     counts = edge_counts(grid(n_x=n_x, n_y=n_y, pitch_um=pitch_um))
 
@@ -81,7 +81,7 @@ def test_neighbours_on_a_grid_share_their_edges_bit_for_bit(n_x, n_y, pitch_um):
     ("pitch_um", "width_um", "fill"),
     [(1.0, 0.9, 0.81), (0.7, 0.6, 0.735), (2.2, 2.2, 1.0), (4.0, 1.0, 0.0625), (0.56, 0.49, 0.766)],
 )
-def test_the_fill_factor_of_a_grid_with_trenches(pitch_um, width_um, fill):
+def test_fill_factor_of_grid_with_trenches(pitch_um, width_um, fill):
     layout = grid(n_x=5, n_y=4, pitch_um=pitch_um, width_um=width_um)
 
     np.testing.assert_allclose(layout.area_um2 / pitch_um**2, fill, atol=5e-4)
@@ -89,16 +89,16 @@ def test_the_fill_factor_of_a_grid_with_trenches(pitch_um, width_um, fill):
 
 @given(st.integers(1, 6), st.integers(1, 6), pitches_um, st.floats(0.01, 1.0))
 @relaxed
-def test_trenches_leave_the_centres_of_a_grid_where_they_are(n_x, n_y, pitch_um, share):
-    layout = grid(n_x=n_x, n_y=n_y, pitch_um=pitch_um, width_um=share * pitch_um)
+def test_trenches_do_not_move_centres(n_x, n_y, pitch_um, fraction):
+    layout = grid(n_x=n_x, n_y=n_y, pitch_um=pitch_um, width_um=fraction * pitch_um)
     centres = [[(i - (n_x - 1) / 2) * pitch_um, (j - (n_y - 1) / 2) * pitch_um] for j in range(n_y) for i in range(n_x)]
     box = layout.site_bounds_um
 
     np.testing.assert_allclose(layout.centroid_um, centres, atol=1e-9 * pitch_um)
-    np.testing.assert_allclose(box[:, 2:] - box[:, :2], share * pitch_um, rtol=1e-9)
+    np.testing.assert_allclose(box[:, 2:] - box[:, :2], fraction * pitch_um, rtol=1e-9)
 
 
-def test_a_grid_is_numbered_row_by_row_from_the_lowest():
+def test_grid_is_ordered_by_rows():
     layout = grid(n_x=3, n_y=2, pitch_um=2.0)
 
     assert layout.columns["row"].tolist() == [0, 0, 0, 1, 1, 1]
@@ -114,7 +114,7 @@ orientations = st.sampled_from(["pointy", "flat"])
 
 @given(st.integers(1, 8), st.integers(1, 8), pitches_um, orientations)
 @relaxed
-def test_hexagons_tile_with_the_area_of_close_packing(n_columns, n_rows, pitch_um, orientation):
+def test_hexagons_tile_with_close_packing(n_columns, n_rows, pitch_um, orientation):
     layout = hexagonal(n_columns=n_columns, n_rows=n_rows, pitch_um=pitch_um, orientation=orientation)
 
     assert layout.n_sites == n_columns * n_rows
@@ -124,7 +124,7 @@ def test_hexagons_tile_with_the_area_of_close_packing(n_columns, n_rows, pitch_u
 
 @given(st.integers(1, 8), st.integers(1, 8), pitches_um, orientations)
 @relaxed
-def test_neighbouring_hexagons_share_their_edges_bit_for_bit(n_columns, n_rows, pitch_um, orientation):
+def test_hexagonal_neighbours_share_edges_exactly(n_columns, n_rows, pitch_um, orientation):
     layout = hexagonal(n_columns=n_columns, n_rows=n_rows, pitch_um=pitch_um, orientation=orientation)
     n_neighbours = len(cKDTree(layout.centroid_um).query_pairs(1.1 * pitch_um))
     counts = edge_counts(layout)
@@ -134,7 +134,7 @@ def test_neighbouring_hexagons_share_their_edges_bit_for_bit(n_columns, n_rows, 
 
 @given(st.integers(2, 8), st.integers(2, 8), pitches_um, orientations)
 @relaxed
-def test_the_nearest_centres_of_hexagons_are_one_pitch_apart(n_columns, n_rows, pitch_um, orientation):
+def test_nearest_hexagons_are_one_pitch_apart(n_columns, n_rows, pitch_um, orientation):
     layout = hexagonal(n_columns=n_columns, n_rows=n_rows, pitch_um=pitch_um, orientation=orientation)
     nearest_um, _ = cKDTree(layout.centroid_um).query(layout.centroid_um, k=2)
 
@@ -145,7 +145,7 @@ def test_the_nearest_centres_of_hexagons_are_one_pitch_apart(n_columns, n_rows, 
     ("pitch_um", "width_um", "fill"), [(100, 85, 0.7225), (75, 70, 0.8711), (55, 50, 0.8264), (40, 35, 0.7656)]
 )
 @pytest.mark.parametrize("orientation", ["pointy", "flat"])
-def test_the_fill_factors_of_photovoltaic_arrays(pitch_um, width_um, fill, orientation):
+def test_fill_factors_of_photovoltaic_arrays(pitch_um, width_um, fill, orientation):
     layout = hexagonal(n_columns=4, n_rows=3, pitch_um=pitch_um, width_um=width_um, orientation=orientation)
     cell_um2 = 0.5 * math.sqrt(3) * pitch_um**2
 
@@ -153,7 +153,7 @@ def test_the_fill_factors_of_photovoltaic_arrays(pitch_um, width_um, fill, orien
 
 
 @pytest.mark.parametrize(("orientation", "flat_axis"), [("pointy", 0), ("flat", 1)])
-def test_the_orientation_says_what_is_on_top(orientation, flat_axis):
+def test_orientation_determines_flat_axis(orientation, flat_axis):
     layout = hexagonal(n_columns=3, n_rows=3, pitch_um=60.0, width_um=50.0, orientation=orientation)
     extent = layout.site_bounds_um[:, 2:] - layout.site_bounds_um[:, :2]
 
@@ -163,8 +163,8 @@ def test_the_orientation_says_what_is_on_top(orientation, flat_axis):
 
 @given(st.integers(1, 6), st.integers(1, 6), pitches_um, st.floats(0.05, 1.0), orientations)
 @relaxed
-def test_the_flat_sides_of_hexagons_are_one_width_apart(n_columns, n_rows, pitch_um, share, orientation):
-    width_um = share * pitch_um
+def test_hexagon_sides_are_one_width_apart(n_columns, n_rows, pitch_um, fraction, orientation):
+    width_um = fraction * pitch_um
     layout = hexagonal(
         n_columns=n_columns, n_rows=n_rows, pitch_um=pitch_um, width_um=width_um, orientation=orientation
     )
@@ -175,13 +175,13 @@ def test_the_flat_sides_of_hexagons_are_one_width_apart(n_columns, n_rows, pitch
 
 @pytest.mark.parametrize("orientation", ["pointy", "flat"])
 @pytest.mark.parametrize(("n_columns", "n_rows"), [(1, 1), (5, 1), (1, 4), (4, 4), (3, 5)])
-def test_the_middle_of_the_hexagons_centres_is_on_the_axis(n_columns, n_rows, orientation):
+def test_hexagonal_layout_is_centred_on_axis(n_columns, n_rows, orientation):
     centre = hexagonal(n_columns=n_columns, n_rows=n_rows, pitch_um=10.0, orientation=orientation).centroid_um
 
     np.testing.assert_allclose(centre.min(axis=0) + centre.max(axis=0), 0.0, atol=1e-11)
 
 
-def test_every_second_row_of_hexagons_is_moved_by_half_a_pitch():
+def test_hexagonal_rows_alternate_by_half_pitch():
     layout = hexagonal(n_columns=2, n_rows=3, pitch_um=4.0)
     high = 2.0 * math.sqrt(3)
 
@@ -192,7 +192,7 @@ def test_every_second_row_of_hexagons_is_moved_by_half_a_pitch():
     )
 
 
-def test_a_million_hexagons_have_a_million_cells_of_area():
+def test_million_hexagons_have_expected_area():
     layout = hexagonal(n_columns=1000, n_rows=1000, pitch_um=2.2)
 
     assert layout.n_sites == 1_000_000
@@ -216,13 +216,13 @@ def log_polar_parameters(draw):
 
 
 def chords_of(layout):
-    """Chords per arc that a log-polar layout really has."""
+    """Actual number of chords per arc of a log-polar layout."""
     return (len(layout.xy_um) // layout.n_sites) // 2 - 1
 
 
 @given(log_polar_parameters())
 @settings(relaxed, max_examples=60)
-def test_a_log_polar_layout_tiles_its_annulus(parameters):
+def test_log_polar_tiles_its_annulus(parameters):
     layout = log_polar(**parameters)
     n_corners = parameters["n_sectors"] * chords_of(layout)
     covered = shapely.union_all(layout.polygons())
@@ -237,7 +237,7 @@ def test_a_log_polar_layout_tiles_its_annulus(parameters):
 
 @pytest.mark.parametrize("chords_per_arc", [1, 2, 3, 4, 7])
 @pytest.mark.parametrize("stagger", [False, True])
-def test_arcs_of_any_number_of_chords_leave_nothing_open_and_cover_nothing_twice(stagger, chords_per_arc):
+def test_log_polar_tiles_with_any_chords(stagger, chords_per_arc):
     layout = log_polar(
         n_sectors=12, r_min_um=10.0, r_max_um=90.0, n_rings=7, stagger=stagger, chords_per_arc=chords_per_arc
     )
@@ -253,7 +253,7 @@ def test_arcs_of_any_number_of_chords_leave_nothing_open_and_cover_nothing_twice
 
 @given(log_polar_parameters())
 @relaxed
-def test_neighbours_in_a_log_polar_layout_share_their_edges_bit_for_bit(parameters):
+def test_log_polar_neighbours_share_edges_exactly(parameters):
     layout = log_polar(**parameters)
     arcs = parameters["n_sectors"] * chords_of(layout)
     counts = edge_counts(layout)
@@ -264,7 +264,7 @@ def test_neighbours_in_a_log_polar_layout_share_their_edges_bit_for_bit(paramete
 
 @given(log_polar_parameters())
 @relaxed
-def test_the_area_of_a_site_is_that_of_its_arcs_less_the_chords_share(parameters):
+def test_log_polar_area_matches_closed_form(parameters):
     layout = log_polar(**parameters)
     inner, outer = radii_um(layout)
     sector_rad = 2 * math.pi / parameters["n_sectors"]
@@ -278,7 +278,7 @@ def test_the_area_of_a_site_is_that_of_its_arcs_less_the_chords_share(parameters
     ("stagger", "chords_per_arc", "chords"),
     [(False, 1, 1), (False, 3, 3), (False, 4, 4), (True, 1, 2), (True, 2, 2), (True, 3, 6), (True, 4, 4)],
 )
-def test_arcs_get_twice_the_chords_only_where_odd_numbers_would_meet(stagger, chords_per_arc, chords):
+def test_stagger_doubles_odd_numbers_of_chords(stagger, chords_per_arc, chords):
     layout = log_polar(
         n_sectors=8, r_min_um=5.0, r_max_um=20.0, n_rings=3, stagger=stagger, chords_per_arc=chords_per_arc
     )
@@ -286,17 +286,17 @@ def test_arcs_get_twice_the_chords_only_where_odd_numbers_would_meet(stagger, ch
     assert chords_of(layout) == chords
 
 
-@pytest.mark.parametrize(("stagger", "turn"), [(False, 0.0), (True, 0.5)])
-def test_stagger_turns_every_second_ring_by_half_a_sector(stagger, turn):
+@pytest.mark.parametrize(("stagger", "shift"), [(False, 0.0), (True, 0.5)])
+def test_stagger_rotates_every_second_ring(stagger, shift):
     layout = log_polar(n_sectors=10, r_min_um=5.0, r_max_um=40.0, n_rings=4, stagger=stagger, chords_per_arc=3)
     x, y = layout.centroid_um.T
     sectors = (np.arctan2(y, x) / (2 * math.pi / 10)).reshape(4, 10) % 10
 
     np.testing.assert_allclose(sectors[[0, 2]], np.tile(np.arange(10) + 0.5, (2, 1)), atol=1e-9)
-    np.testing.assert_allclose(sectors[[1, 3]] % 10, np.tile((np.arange(10) + 0.5 + turn) % 10, (2, 1)), atol=1e-9)
+    np.testing.assert_allclose(sectors[[1, 3]] % 10, np.tile((np.arange(10) + 0.5 + shift) % 10, (2, 1)), atol=1e-9)
 
 
-def test_sites_are_numbered_ring_by_ring_from_the_inside_and_read_by_spokes():
+def test_log_polar_sites_are_ordered_by_ring():
     layout = log_polar(n_sectors=5, r_min_um=5.0, r_max_um=40.0, n_rings=3)
     inner, _ = radii_um(layout)
 
@@ -306,19 +306,19 @@ def test_sites_are_numbered_ring_by_ring_from_the_inside_and_read_by_spokes():
 
 
 @pytest.mark.parametrize(("n_sectors", "ratio"), [(3, 7 + 4 * math.sqrt(3)), (4, 3 + 2 * math.sqrt(2)), (6, 3.0)])
-def test_square_ring_ratios_in_closed_form(n_sectors, ratio):
+def test_square_ring_ratio_matches_closed_form(n_sectors, ratio):
     assert square_ring_ratio(n_sectors) == pytest.approx(ratio, rel=1e-13)
 
 
 @pytest.mark.parametrize("n_sectors", [-1, 0, 1, 2, 3.5])
-def test_square_ring_ratio_refuses_what_is_no_ring(n_sectors):
+def test_square_ring_ratio_rejects_invalid_sectors(n_sectors):
     with pytest.raises(ParameterError, match="n_sectors"):
         square_ring_ratio(n_sectors)
 
 
-@pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # coarse ratios end inside r_max_um
+@pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # large ratios end below r_max_um
 @pytest.mark.parametrize("n_sectors", [8, 64, 128, 252])
-def test_sites_are_as_high_as_they_are_wide_on_their_centre_line(n_sectors):
+def test_default_ring_ratio_gives_square_sites(n_sectors):
     layout = log_polar(n_sectors=n_sectors, r_max_um=1000.0, min_size_um=2.2)
     inner, outer = radii_um(layout)
     sides = np.stack((layout.polygons()[0].exterior.coords[0], layout.polygons()[0].exterior.coords[1]))
@@ -331,28 +331,28 @@ def test_sites_are_as_high_as_they_are_wide_on_their_centre_line(n_sectors):
 
 @pytest.mark.parametrize(("n_sectors", "min_size_um"), [(64, 2.2), (128, 2.2), (64, 5.0), (252, 0.56), (40, 30.0)])
 @pytest.mark.parametrize("chords_per_arc", [2, 3, 16])
-def test_blind_spot_of_squarish_sites_in_closed_form(n_sectors, min_size_um, chords_per_arc):
+def test_square_site_blind_spot_matches_formula(n_sectors, min_size_um, chords_per_arc):
     layout = log_polar(n_sectors=n_sectors, r_max_um=1000.0, min_size_um=min_size_um, chords_per_arc=chords_per_arc)
     inner, outer = radii_um(layout)
     s = math.sin(math.pi / n_sectors)
 
-    # A squarish ring is 2 s times its centre line high, and as high as the minimum size.
+    # The ring height is 2 s times the radius of the centre line, and equals the minimum size.
     assert 0.5 * (inner[0] + outer[0]) == pytest.approx(min_size_um / (2.0 * s), rel=1e-11)
     assert inner[0] == pytest.approx(min_size_um * (1.0 - s) / (2.0 * s), rel=1e-11)
     assert layout.provenance["blind_radius_um"] == pytest.approx(inner[0], rel=1e-12)
 
 
 @pytest.mark.parametrize("n_sectors", [64, 128, 252])
-def test_blind_spot_with_one_chord_in_closed_form(n_sectors):
+def test_single_chord_blind_spot_matches_formula(n_sectors):
     layout = log_polar(n_sectors=n_sectors, r_max_um=1000.0, min_size_um=2.2)
     inner, outer = radii_um(layout)
-    # A trapezium of area sin(2π/n) (R² - r²) / 2 = 2 s sin(2π/n) c² on the centre line c.
+    # Trapezium with the area sin(2π/n) (R² - r²) / 2 = 2 s sin(2π/n) c² and the centre line radius c.
     area_per_square = 2.0 * math.sin(math.pi / n_sectors) * math.sin(2.0 * math.pi / n_sectors)
 
     assert 0.5 * (inner[0] + outer[0]) == pytest.approx(2.2 / math.sqrt(area_per_square), rel=1e-11)
 
 
-def test_blind_spot_tends_to_size_times_sectors_over_a_turn():
+def test_blind_spot_limit_for_many_sectors():
     n_sectors = np.array([64, 256, 1024])
     rings = [log_polar(n_sectors=int(n), r_max_um=1000.0, min_size_um=2.0, chords_per_arc=8) for n in n_sectors]
     centre_um = np.array([0.5 * (layout.provenance["blind_radius_um"] + radii_um(layout)[1][0]) for layout in rings])
@@ -362,20 +362,20 @@ def test_blind_spot_tends_to_size_times_sectors_over_a_turn():
     np.testing.assert_allclose(centre_um / limit_um - 1.0, (math.pi / n_sectors) ** 2 / 6.0, rtol=1e-3)
 
 
-@pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # coarse ratios end inside r_max_um
+@pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # large ratios end below r_max_um
 @given(st.integers(3, 100), st.floats(0.1, 10.0), st.floats(1.01, 3.0), st.floats(0.1, 10.0))
 @relaxed
-def test_given_rings_below_the_minimum_size_are_left_out(n_sectors, min_size_um, ring_ratio, r_min_um):
-    everything = log_polar(n_sectors=n_sectors, r_min_um=r_min_um, r_max_um=2000.0, ring_ratio=ring_ratio)
-    kept = log_polar(
+def test_rings_below_minimum_size_are_omitted(n_sectors, min_size_um, ring_ratio, r_min_um):
+    all_rings = log_polar(n_sectors=n_sectors, r_min_um=r_min_um, r_max_um=2000.0, ring_ratio=ring_ratio)
+    remaining = log_polar(
         n_sectors=n_sectors, r_min_um=r_min_um, r_max_um=2000.0, ring_ratio=ring_ratio, min_size_um=min_size_um
     )
-    inner, outer = radii_um(everything)
+    inner, outer = radii_um(all_rings)
     arc_um = math.pi / n_sectors * (inner + outer)
     chord_um2 = 0.5 * math.sin(2.0 * math.pi / n_sectors) * (outer**2 - inner**2)
     is_large = np.min((arc_um, outer - inner, np.sqrt(chord_um2)), axis=0) >= min_size_um * (1 + 1e-9)
 
-    np.testing.assert_allclose(radii_um(kept)[0], inner[is_large], rtol=1e-9)
+    np.testing.assert_allclose(radii_um(remaining)[0], inner[is_large], rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -387,14 +387,14 @@ def test_given_rings_below_the_minimum_size_are_left_out(n_sectors, min_size_um,
 )
 def test_log_polar_warns_when_rings_end_early(parameters, end_um):
     with pytest.warns(
-        LayoutWarning, match=f"'r_max_um' is {parameters['r_max_um']:g} µm, and the rings end at"
+        LayoutWarning, match=f"'r_max_um' is {parameters['r_max_um']:g} µm, but the outermost ring ends at"
     ) as caught:
         layout = log_polar(**parameters)
     (r_min_um, _), (_, last_um) = (radii_um(layout)[0][[0, -1]], radii_um(layout)[1][[0, -1]])
     (next_um,) = re.findall(r"take 'r_max_um' = ([\d.]+) µm, or", str(caught[0].message))
 
     assert last_um == pytest.approx(end_um, rel=1e-4)
-    # What the message advises ends where it is asked to, without a warning.
+    # The proposed radius gives rings that end there, without a warning.
     assert radii_um(log_polar(**{**parameters, "r_max_um": float(next_um)}))[1].max() == pytest.approx(
         float(next_um), rel=1e-4
     )
@@ -402,7 +402,7 @@ def test_log_polar_warns_when_rings_end_early(parameters, end_um):
     assert radii_um(exact)[1].max() == pytest.approx(parameters["r_max_um"], rel=1e-12)
 
 
-def test_rings_fill_the_field_and_no_ring_reaches_out_of_it():
+def test_rings_fill_field_up_to_r_max():
     layout = log_polar(n_sectors=32, r_max_um=500.0, r_min_um=20.0, ring_ratio=1.3)
     _, outer = radii_um(layout)
 
@@ -410,7 +410,7 @@ def test_rings_fill_the_field_and_no_ring_reaches_out_of_it():
     assert layout.columns["ring"].max() + 1 == 12
 
 
-def test_the_thirty_rings_of_the_log_polar_ccd():
+def test_log_polar_ccd_has_thirty_rings():
     layout = log_polar(n_sectors=64, r_min_um=30.0, r_max_um=412.0, n_rings=30)
     inner, outer = radii_um(layout)
 
@@ -422,7 +422,7 @@ def test_the_thirty_rings_of_the_log_polar_ccd():
 
 @pytest.mark.parametrize("n_rings", [1, 2, 3, 7, 30, 152])
 @pytest.mark.parametrize(("r_min_um", "r_max_um"), [(30.0, 412.0), (0.1, 0.7), (41.5, 545.0)])
-def test_a_given_number_of_rings_is_that_number(r_min_um, r_max_um, n_rings):
+def test_n_rings_sets_number_of_rings(r_min_um, r_max_um, n_rings):
     layout = log_polar(n_sectors=8, r_min_um=r_min_um, r_max_um=r_max_um, n_rings=n_rings)
 
     assert layout.n_sites == 8 * n_rings
@@ -444,14 +444,23 @@ LOG_POLAR = {"n_sectors": 64, "r_max_um": 412.0, "r_min_um": 30.0}
         ({"r_min_um": None}, "'r_min_um' or 'min_size_um' must be given"),
         ({"min_size_um": 0.0}, "'min_size_um' must be > 0, got 0.0 µm"),
         ({"min_size_um": np.nan}, "'min_size_um' must be finite, got nan µm"),
-        ({"min_size_um": 100.0}, "'r_max_um' leaves no room for a ring.*got 412.0 µm"),
-        ({"r_min_um": 400.0}, "'r_max_um' leaves no room for a ring: the first would reach from 400 to 441.*µm"),
+        ({"min_size_um": 100.0}, "'r_max_um' must leave room for a ring.*got 412.0 µm"),
+        ({"r_min_um": 400.0}, "'r_max_um' must leave room for a ring: the first would extend from 400 to 441.*µm"),
         ({"ring_ratio": 1.0}, "'ring_ratio' must be > 1, got 1.0"),
-        ({"ring_ratio": 1 + 1e-9}, "'ring_ratio' gives more than 50000000 sites"),
+        ({"ring_ratio": 1 + 1e-9}, "'ring_ratio' must give at most 50000000 sites"),
         ({"n_rings": 0}, "'n_rings' must be >= 1, got 0"),
-        ({"n_rings": 5, "ring_ratio": 1.1}, "'n_rings' takes 'r_min_um' below 'r_max_um', and no 'ring_ratio'"),
-        ({"n_rings": 5, "r_min_um": 412.0}, "'n_rings' takes 'r_min_um' below 'r_max_um', and no 'ring_ratio'"),
-        ({"n_rings": 5, "r_min_um": None, "min_size_um": 2.2}, "'n_rings' takes 'r_min_um' below 'r_max_um'"),
+        (
+            {"n_rings": 5, "ring_ratio": 1.1},
+            "'n_rings' must be used with 'r_min_um' below 'r_max_um' and without 'ring_ratio'",
+        ),
+        (
+            {"n_rings": 5, "r_min_um": 412.0},
+            "'n_rings' must be used with 'r_min_um' below 'r_max_um' and without 'ring_ratio'",
+        ),
+        (
+            {"n_rings": 5, "r_min_um": None, "min_size_um": 2.2},
+            "'n_rings' must be used with 'r_min_um' below 'r_max_um'",
+        ),
         ({"n_rings": 10**7}, "'n_rings' must be <= 781250"),
         ({"n_rings": 5, "n_sectors": 10**9}, "'n_sectors'"),
         ({"n_rings": 3, "r_min_um": 412.0 * (1 - 2.0**-53)}, "r_min_um"),
@@ -459,7 +468,7 @@ LOG_POLAR = {"n_sectors": 64, "r_max_um": 412.0, "r_min_um": 30.0}
         ({"chords_per_arc": 1001}, "'chords_per_arc' must be <= 1000"),
     ],
 )
-def test_log_polar_refuses_what_cannot_be(changes, message):
+def test_log_polar_rejects_invalid_parameters(changes, message):
     with pytest.raises(ParameterError, match=message):
         log_polar(**{**LOG_POLAR, **changes})
 
@@ -469,7 +478,7 @@ def test_log_polar_refuses_what_cannot_be(changes, message):
 
 @st.composite
 def zone_parameters(draw):
-    """Zones whose borders are integers of their pixels wide."""
+    """Zones with an integer number of pixels on each side of the inner zone."""
     pitch_um = draw(st.sampled_from([0.1, 0.5, 0.7, 1.0, 2.2, 3.3]))
     n = draw(st.integers(1, 8))
     sides, pitches = [n * pitch_um], [pitch_um]
@@ -493,7 +502,7 @@ def test_zones_tile_their_square(parameters):
     )
 
 
-def test_the_four_zones_of_the_nested_sensor():
+def test_four_nested_zones_have_expected_counts():
     layout = zones(side_um=(64, 128, 256, 512), pitch_um=(1, 2, 4, 8))
 
     assert layout.n_sites == 13_312
@@ -502,7 +511,7 @@ def test_the_four_zones_of_the_nested_sensor():
     assert layout.area_um2.sum() == 512.0**2
 
 
-def test_zones_are_numbered_in_their_own_grids_and_their_lines_through():
+def test_zone_columns_and_lines_are_indexed():
     layout = zones(side_um=(2, 6), pitch_um=(1, 2))
 
     assert layout.columns["zone"].tolist() == [0] * 4 + [1] * 8
@@ -517,10 +526,10 @@ def test_zones_are_numbered_in_their_own_grids_and_their_lines_through():
     [
         pytest.param([5], [1], 25, id="one zone"),
         pytest.param([3, 9], [1, 3], 9 + 8, id="two zones"),
-        pytest.param([1, 3, 9], [1, 1, 3], 1 + 8 + 8, id="one pixel in the middle"),
+        pytest.param([1, 3, 9], [1, 1, 3], 1 + 8 + 8, id="one pixel in the centre"),
     ],
 )
-def test_the_fovea_may_have_an_odd_number_of_pixels_a_side(side_um, pitch_um, n_sites):
+def test_zones_accept_odd_numbers_of_pixels(side_um, pitch_um, n_sites):
     layout = zones(side_um=side_um, pitch_um=pitch_um)
 
     assert layout.n_sites == n_sites
@@ -532,28 +541,34 @@ def test_the_fovea_may_have_an_odd_number_of_pixels_a_side(side_um, pitch_um, n_
     [
         pytest.param([], [], "'side_um' and 'pitch_um' must have the same length of at least 1, got 0 and 0", id="no"),
         pytest.param([4, 8], [1], "'side_um' and 'pitch_um' must have the same length .* got 2 and 1", id="lengths"),
-        pytest.param([8, 4], [1, 2], r"'side_um' must grow from zone to zone, got \[8.0, 4.0\] µm", id="shrinking"),
-        pytest.param([8, 8], [1, 2], r"'side_um' must grow from zone to zone", id="equal"),
+        pytest.param([8, 4], [1, 2], r"'side_um' must increase from zone to zone, got \[8.0, 4.0\] µm", id="shrinking"),
+        pytest.param([8, 8], [1, 2], r"'side_um' must increase from zone to zone", id="equal"),
         pytest.param([8, -8], [1, 2], r"'side_um' must be > 0.* at \[1\]", id="negative"),
-        pytest.param([8, 16], [1, 0], r"'pitch_um' must be > 0.* at \[1\]", id="no pitch"),
+        pytest.param([8, 16], [1, 0], r"'pitch_um' must be > 0.* at \[1\]", id="zero pitch"),
         pytest.param([8, np.nan], [1, 2], r"'side_um' must be finite.* at \[1\]", id="nan"),
-        pytest.param([8.5, 16], [1, 2], r"'side_um\[0\]' must fit whole pixels", id="half a pixel"),
-        pytest.param([8, 17], [1, 2], r"'side_um\[1\]' must fit whole pixels", id="half a pixel outside"),
-        pytest.param([8, 18], [1, 3], r"'pitch_um\[1\]' must fit whole pixels", id="border of part pixels"),
-        pytest.param([4, 6], [1, 2], r"'pitch_um\[1\]' must fit whole pixels", id="border of half a pixel"),
-        pytest.param([1e-10], [1.0], r"must fit whole pixels", id="no pixel"),
-        pytest.param([8, 8 + 1e-9], [1, 1], r"must fit whole pixels", id="no pixel in the border"),
-        pytest.param([1e6], [1.0], "pixels.* 16384", id="too many pixels"),
+        pytest.param([8.5, 16], [1, 2], r"'side_um\[0\]' must give an integer number of pixels", id="half a pixel"),
+        pytest.param(
+            [8, 17], [1, 2], r"'side_um\[1\]' must give an integer number of pixels", id="half a pixel outside"
+        ),
+        pytest.param(
+            [8, 18], [1, 3], r"'pitch_um\[1\]' must give an integer number of pixels", id="fraction of a pixel around"
+        ),
+        pytest.param(
+            [4, 6], [1, 2], r"'pitch_um\[1\]' must give an integer number of pixels", id="half a pixel around"
+        ),
+        pytest.param([1e-10], [1.0], r"must give an integer number of pixels", id="no pixel"),
+        pytest.param([8, 8 + 1e-9], [1, 1], r"must give an integer number of pixels", id="no pixel around"),
+        pytest.param([1e6], [1.0], "must give at most 16384 pixels", id="too many pixels"),
         pytest.param(8, 1, "'pitch_um' must have 1 dimension", id="numbers"),
-        pytest.param(["a"], [1], "'side_um' must be an array of numbers", id="text"),
+        pytest.param(["a"], [1], "'side_um' must be an array of numbers", id="string"),
     ],
 )
-def test_zones_refuse_what_does_not_fit(side_um, pitch_um, message):
+def test_zones_reject_invalid_parameters(side_um, pitch_um, message):
     with pytest.raises(ParameterError, match=message):
         zones(side_um=side_um, pitch_um=pitch_um)
 
 
-# -- what all generators reject and record ----------------------------------------------------------------------------
+# -- errors and provenance of all generators ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -579,7 +594,7 @@ def test_zones_refuse_what_does_not_fit(side_um, pitch_um, message):
         ),
     ],
 )
-def test_grids_refuse_what_cannot_be(make, parameters, message):
+def test_grids_reject_invalid_parameters(make, parameters, message):
     with pytest.raises(ParameterError, match=message):
         make(**parameters)
 
@@ -612,7 +627,7 @@ def test_grids_refuse_what_cannot_be(make, parameters, message):
         (tiling, {"pitch_um": 2.0, "region": "POLYGON ((0 0, 9 0, 0 7, 0 0))", "cells": "squares"}),
     ],
 )
-def test_a_layout_can_be_made_again_from_its_provenance(make, parameters):
+def test_provenance_reproduces_layout(make, parameters):
     layout = make(**parameters)
     moved = layout.rotate(10.0)[1:]
 
@@ -639,14 +654,14 @@ X_TRANS = ("RBGBRG", "GGRGGB", "GGBGGR", "BRGRBG", "GGBGGR", "GGRGGB")
         pytest.param("RGB", "RGB", [48, 48, 48], id="stripes"),
     ],
 )
-def test_the_filters_of_a_mosaic_come_in_their_shares(block, names, counts):
+def test_mosaic_filter_counts(block, names, counts):
     layout = mosaic(grid(n_x=12, n_y=12, pitch_um=1.0), block, names)
 
     assert np.bincount(layout.channel, minlength=len(names)).tolist() == counts
 
 
 @pytest.mark.parametrize("block", [("RG", "GB"), ("GR", "BG"), ("RGB", "BRG"), X_TRANS])
-def test_row_0_of_a_block_is_the_lowest_and_the_block_repeats(block):
+def test_mosaic_block_repeats_from_lowest_row(block):
     layout = mosaic(grid(n_x=7, n_y=5, pitch_um=1.0), block)
     letters = ["RGB"[c] for c in layout.channel]
     x, y = np.round(layout.centroid_um - layout.centroid_um.min(axis=0)).astype(int).T
@@ -654,13 +669,13 @@ def test_row_0_of_a_block_is_the_lowest_and_the_block_repeats(block):
     assert letters == [block[j % len(block)][i % len(block[0])] for i, j in zip(x, y, strict=True)]
 
 
-def test_a_mosaic_on_rings_runs_over_rings_and_sectors():
+def test_mosaic_accepts_rings_and_sectors():
     layout = mosaic(log_polar(n_sectors=4, r_min_um=1.0, r_max_um=8.0, n_rings=3), ("RG", "GB"))
 
     assert layout.channel.tolist() == [0, 1, 0, 1, 1, 2, 1, 2, 0, 1, 0, 1]
 
 
-def test_a_mosaic_keeps_the_sites_and_their_other_columns():
+def test_mosaic_preserves_sites_and_columns():
     bare = grid(n_x=4, n_y=4, pitch_um=1.0)
     layout = mosaic(bare, ("RG", "GB"))
 
@@ -670,12 +685,12 @@ def test_a_mosaic_keeps_the_sites_and_their_other_columns():
     assert "channel" not in bare.columns
 
 
-def test_a_mosaic_follows_the_sites_that_are_left():
+def test_mosaic_of_selected_sites():
     layout = grid(n_x=6, n_y=6, pitch_um=1.0)
-    some = layout[layout.columns["column"] % 3 > 0]
+    selected = layout[layout.columns["column"] % 3 > 0]
 
     assert (
-        mosaic(some, X_TRANS).channel.tolist()
+        mosaic(selected, X_TRANS).channel.tolist()
         == mosaic(layout, X_TRANS)[layout.columns["column"] % 3 > 0].channel.tolist()
     )
 
@@ -687,23 +702,23 @@ def test_a_mosaic_follows_the_sites_that_are_left():
         pytest.param(("", ""), "RGB", "'block' must be rows of letters of equal length", id="empty rows"),
         pytest.param(("RG", "G"), "RGB", "'block' must be rows of letters of equal length", id="ragged"),
         pytest.param(("RX", "GB"), "RGB", "'block' must use the letters 'RGB', .*'X'", id="unknown letter"),
-        pytest.param(("rg", "gb"), "RGB", "'block' must use the letters 'RGB', .*'b', 'g', 'r'", id="small letters"),
+        pytest.param(("rg", "gb"), "RGB", "'block' must use the letters 'RGB', .*'b', 'g', 'r'", id="lower case"),
         pytest.param(None, "RGB", "'block' must be", id="nothing"),
     ],
 )
-def test_a_block_that_is_no_mosaic_is_refused(block, names, message):
+def test_mosaic_rejects_invalid_block(block, names, message):
     with pytest.raises(ParameterError, match=message):
         mosaic(grid(n_x=4, n_y=4, pitch_um=1.0), block, names)
 
 
-def test_the_message_about_an_unknown_letter_says_once_what_it_got():
+def test_unknown_letter_message_contains_one_value():
     with pytest.raises(ParameterError, match="'X'") as caught:
         mosaic(grid(n_x=4, n_y=4, pitch_um=1.0), ("RX", "GB"))
 
     assert str(caught.value).count("got ") == 1
 
 
-def test_a_mosaic_needs_sites_that_are_numbered_in_two_directions():
+def test_mosaic_requires_two_index_columns():
     layout = Layout.from_rectangles([[0, 0], [1, 0]], 1.0, row=[0, 0])
 
     with pytest.raises(ParameterError, match=r"'layout' must have the columns row and column or ring and sector"):
@@ -711,19 +726,19 @@ def test_a_mosaic_needs_sites_that_are_numbered_in_two_directions():
 
 
 @pytest.mark.parametrize("row", [[0.0, 1.5], ["a", "b"]])
-def test_a_mosaic_refuses_rows_that_are_no_numbers_of_rows(row):
+def test_mosaic_rejects_non_integer_rows(row):
     layout = Layout.from_rectangles([[0, 0], [1, 0]], 1.0, row=row, column=[0, 1])
 
     with pytest.raises(ParameterError, match="'row' must contain integers from 0 to"):
         mosaic(layout, ("RG", "GB"))
 
 
-def test_hexagons_need_13_4_percent_fewer_samples_than_squares_for_a_circular_band():
-    """The replicas of a circular band of radius W, at the points of the reciprocal lattice, may not overlap."""
+def test_hexagons_need_13_4_percent_fewer_samples():
+    """Replicas of a circular band of radius W at the points of the reciprocal lattice must not overlap."""
     band_per_um = 0.25
 
     def nearest_replica_per_um(layout):
-        """Shortest vector of the reciprocal lattice of the sites' centres."""
+        """Length of the shortest reciprocal lattice vector of the site centres."""
         centre_um = layout.centroid_um
         offsets = centre_um[1:] - centre_um[0]
         order = np.argsort(np.hypot(*offsets.T), kind="stable")

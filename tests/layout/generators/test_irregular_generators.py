@@ -1,4 +1,4 @@
-"""Laws of the irregular families: Voronoi cells, foveal rings, sunflower, density, quadtree, Penrose's rhombs."""
+"""Irregular families: Voronoi cells, foveal rings, sunflower, density, quadtree, Penrose tiling."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ seeds = st.integers(0, 2**32)
 
 
 def assert_tiles(layout, region_um2):
-    """The sites are one edge-matched coverage of this area: no overlap, no gap, no corner on another's side."""
+    """Assert an edge-matched coverage of this area: no overlaps, gaps or T-junctions."""
     polygons = layout.polygons()
     a, b = shapely.STRtree(polygons).query(polygons, predicate="intersects")
     common_um2 = shapely.area(shapely.intersection(polygons[a[a < b]], polygons[b[a < b]]))
@@ -78,7 +78,7 @@ def nearest_um(points):
 
 @given(regions, st.integers(1, 120), seeds)
 @relaxed
-def test_cells_tile_any_region_one_for_each_centre(region, n, seed):
+def test_cells_tile_region_one_per_centre(region, n, seed):
     centres = points_in(region, n, seed)
     layout = as_layout(*cells_of(centres, region))
 
@@ -89,7 +89,7 @@ def test_cells_tile_any_region_one_for_each_centre(region, n, seed):
 
 @given(st.sampled_from([BOX, disc(7.0, 31)]), st.integers(2, 60), seeds)
 @relaxed
-def test_every_point_of_a_cell_is_nearest_to_its_centre(region, n, seed):
+def test_cell_points_are_nearest_to_centre(region, n, seed):
     centres = points_in(region, n, seed)
     layout = as_layout(*cells_of(centres, region))
     points = points_in(region, 500, seed + 1)
@@ -100,8 +100,8 @@ def test_every_point_of_a_cell_is_nearest_to_its_centre(region, n, seed):
 
 @given(st.integers(1, 12), st.integers(1, 12), st.floats(0.05, 50.0), st.floats(-1e4, 1e4))
 @relaxed
-def test_cells_of_a_square_grid_are_its_squares(n_x, n_y, pitch_um, x0_um):
-    """Four cells meet in every corner: the case where rounding splits corners in two."""
+def test_cells_of_square_grid_are_squares(n_x, n_y, pitch_um, x0_um):
+    """Four cells meet in every corner, which rounding may split in two."""
     x, y = np.meshgrid((np.arange(n_x) + 0.5) * pitch_um + x0_um, (np.arange(n_y) + 0.5) * pitch_um)
     region = shapely.box(x0_um, 0, x0_um + n_x * pitch_um, n_y * pitch_um)
     layout = as_layout(*cells_of(np.stack((x.ravel(), y.ravel()), axis=1), region))
@@ -110,7 +110,7 @@ def test_cells_of_a_square_grid_are_its_squares(n_x, n_y, pitch_um, x0_um):
     np.testing.assert_allclose(layout.area_um2, pitch_um**2, rtol=1e-6)
 
 
-def test_cells_of_a_hexagonal_packing_are_hexagons_inside():
+def test_inner_cells_of_hexagonal_packing_are_hexagons():
     row, column = np.divmod(np.arange(400), 20)
     centres = np.stack((column + 0.5 * (row % 2), row * math.sqrt(3) / 2), axis=1)
     layout = as_layout(*cells_of(centres, shapely.box(-1, -1, 21, 18)))
@@ -120,8 +120,8 @@ def test_cells_of_a_hexagonal_packing_are_hexagons_inside():
     np.testing.assert_allclose(layout.area_um2[is_inside], math.sqrt(3) / 2, rtol=1e-12)
 
 
-def test_a_part_that_a_notch_cuts_off_goes_to_its_neighbour():
-    """The arms of a U: the centre of the left arm is nearest to the end of the right arm, too."""
+def test_separated_part_is_assigned_to_neighbour():
+    """Arms of a U: the centre in the left arm is also nearest to the end of the right arm."""
     u = shapely.Polygon([(0, 0), (10, 0), (10, 10), (6, 10), (6, 1), (4, 1), (4, 10), (0, 10)])
     layout = as_layout(*cells_of(np.array([(3.9, 9.0), (9.9, 0.5)]), u))
 
@@ -132,15 +132,15 @@ def test_a_part_that_a_notch_cuts_off_goes_to_its_neighbour():
 
 @given(st.sampled_from([NOTCH, STAR]), st.integers(8, 80), seeds)
 @settings(relaxed, max_examples=60)
-def test_a_part_that_is_cut_off_goes_where_it_has_the_longest_border(region, n, seed):
-    """The oracle's cells are shapely's; layouts with one such part."""
+def test_separated_part_joins_longest_shared_boundary(region, n, seed):
+    """The reference cells are those of shapely, for layouts with one separated part."""
     centres = points_in(region, n, seed)
-    whole = shapely.voronoi_polygons(shapely.multipoints(centres), extend_to=region, ordered=True)
-    cells = shapely.intersection(shapely.get_parts(whole), region)
+    unclipped = shapely.voronoi_polygons(shapely.multipoints(centres), extend_to=region, ordered=True)
+    cells = shapely.intersection(shapely.get_parts(unclipped), region)
     parts, owner = shapely.get_parts(cells, return_index=True)
-    is_left = ~shapely.intersects(parts, shapely.points(centres[owner]))
-    assume(is_left.sum() == 1)
-    part, mains = parts[is_left][0], parts[~is_left]
+    is_separated = ~shapely.intersects(parts, shapely.points(centres[owner]))
+    assume(is_separated.sum() == 1)
+    part, mains = parts[is_separated][0], parts[~is_separated]
     shared_um = shapely.length(shapely.intersection(shapely.buffer(part, 1e-6), shapely.boundary(mains)))
     layout = as_layout(*cells_of(centres, region))
     assume(np.diff(np.sort(shared_um)[-2:])[0] > 1e-3)
@@ -148,19 +148,19 @@ def test_a_part_that_is_cut_off_goes_where_it_has_the_longest_border(region, n, 
     assert bool(shapely.contains(layout.polygons()[shared_um.argmax()], part.point_on_surface()))
 
 
-def test_one_centre_takes_the_whole_region():
+def test_single_cell_is_the_region():
     layout = as_layout(*cells_of(np.array([(0.3, -0.2)]), STAR))
 
     assert shapely.equals(layout.polygons()[0], STAR)
 
 
-def test_a_region_with_a_hole_is_tiled_when_no_cell_goes_round_it():
+def test_cells_tile_region_with_hole():
     layout = as_layout(*cells_of(points_in(FRAME, 60, 1), FRAME))
 
     assert_tiles(layout, 400 - 64)
 
 
-def test_a_hundred_thousand_cells_tile():
+def test_100000_cells_tile():
     layout = as_layout(*cells_of(points_in(BOX, 100_000, 2), BOX))
 
     assert layout.n_sites == 100_000
@@ -171,33 +171,33 @@ def test_a_hundred_thousand_cells_tile():
 @pytest.mark.parametrize(
     ("centres", "region", "error", "message"),
     [
-        ([(0, 0), (30, 0)], BOX, GeometryError, "centre 1 at .30, 0. µm does not lie inside"),
-        ([(0, 0), (20, 0)], BOX, GeometryError, "centre 1 .* does not lie inside"),
-        ([(0, 0), (1, 1), (0, 0)], BOX, GeometryError, "centres 0 and 2 are the same point"),
+        ([(0, 0), (30, 0)], BOX, GeometryError, "centre 1 at .30, 0. µm must lie inside"),
+        ([(0, 0), (20, 0)], BOX, GeometryError, "centre 1 .* must lie inside"),
+        ([(0, 0), (1, 1), (0, 0)], BOX, GeometryError, "centres 0 and 2 must be distinct points"),
         ([(0, 0), (1e-300, 0)], BOX, GeometryError, "too close"),
-        ([(7, 0)], FRAME, GeometryError, "centre 0 would be no simple outline"),
+        ([(7, 0)], FRAME, GeometryError, "centre 0 within the region must be one polygon"),
         (np.zeros((0, 2)), BOX, ParameterError, "shape .n, 2. with n >= 1"),
         (np.zeros((3, 3)), BOX, ParameterError, "shape .n, 2. with n >= 1"),
     ],
 )
-def test_centres_without_a_cell_are_refused(centres, region, error, message):
+def test_centres_without_cell_raise(centres, region, error, message):
     with pytest.raises(error, match=message):
         cells_of(np.array(centres, float), region)
 
 
-# -- cells that follow their centres -----------------------------------------------------------------------------------
+# -- incrementally updated cells -----------------------------------------------------------------------------------------
 
 
 def areas_um2(edges, n):
-    """Shoelace sums of edges in any order."""
+    """Areas of cells by shoelace sums of unordered edges."""
     (x0, y0), (x1, y1) = edges.start_um.T, edges.stop_um.T
     return np.bincount(edges.cell, 0.5 * (x0 * y1 - x1 * y0), minlength=n)
 
 
 @given(st.sampled_from([BOX, NOTCH, STAR, FRAME]), st.integers(5, 120), st.sampled_from([0.05, 0.3, 1.0]), seeds)
 @relaxed
-def test_cells_that_follow_their_centres_are_those_made_anew(region, n, share_of_way, seed):
-    """Also where a notch cuts cells apart, and whether centres move a little or anywhere."""
+def test_updated_cells_equal_new_cells(region, n, step_fraction, seed):
+    """Including cells divided by notches, and both small and large displacements of centres."""
     centres, targets = points_in(region, n, seed), points_in(region, n, seed + 1)
     cells = MovingCells(region)
     for _ in range(4):
@@ -212,14 +212,14 @@ def test_cells_that_follow_their_centres_are_those_made_anew(region, n, share_of
         if expected is not None:
             np.testing.assert_allclose(areas_um2(edges, n), expected.area_um2, atol=tolerance_um2)
             assert_tiles(as_layout(*cells.rings()), region.area)
-        moved = centres + share_of_way * (targets - centres)
+        moved = centres + step_fraction * (targets - centres)
         centres = np.where(shapely.contains_xy(region, moved)[:, np.newaxis], moved, centres)
 
 
 @given(st.sampled_from([BOX, disc(7.0, 31)]), st.integers(1, 60), st.floats(0.0, 3.0), seeds)
 @relaxed
-def test_every_point_of_a_power_cell_has_the_least_power_from_its_centre(region, n, spread, seed):
-    """Twice: for weights met first, and after other weights."""
+def test_power_cell_points_have_least_power(region, n, spread, seed):
+    """For the first weights and for an update from other weights."""
     centres, points = points_in(region, n, seed), points_in(region, 500, seed + 1)
     rng = np.random.default_rng(seed)
     cells = MovingCells(region)
@@ -234,7 +234,7 @@ def test_every_point_of_a_power_cell_has_the_least_power_from_its_centre(region,
         assert bool(np.all(shapely.covers(layout.polygons()[power.argmin(axis=1)].tolist(), shapely.points(points))))
 
 
-def test_a_power_cell_need_not_hold_its_centre():
+def test_power_cell_may_exclude_its_centre():
     cells = MovingCells(BOX)
     cells.follow(np.array([(0.0, 0.0), (2.0, 0.0)]), np.array([0.0, 10.0]))
     layout = as_layout(*cells.rings())
@@ -244,7 +244,7 @@ def test_a_power_cell_need_not_hold_its_centre():
     assert layout.polygons()[0].bounds == (-10.0, -5.0, -1.5, 8.0)
 
 
-def test_a_centre_of_too_little_weight_has_no_cell():
+def test_centre_of_small_weight_has_no_cell():
     centres = points_in(BOX, 30, 0)
     weights = np.zeros(30)
     weights[4] = -1e3
@@ -255,18 +255,18 @@ def test_a_centre_of_too_little_weight_has_no_cell():
     assert cells.follow(centres, weights) is None
 
 
-@pytest.mark.parametrize("more", [-1e5, 1e5])
-def test_only_differences_of_weights_count(more):
+@pytest.mark.parametrize("offset", [-1e5, 1e5])
+def test_weight_offset_does_not_change_cells(offset):
     centres, weights = points_in(BOX, 30, 0), np.random.default_rng(0).random(30)
 
     np.testing.assert_allclose(
-        areas_um2(MovingCells(BOX).follow(centres, weights + more), 30),
+        areas_um2(MovingCells(BOX).follow(centres, weights + offset), 30),
         areas_um2(MovingCells(BOX).follow(centres, weights), 30),
         rtol=1e-6,
     )
 
 
-def test_edges_that_two_cells_share_are_found_from_both_sides():
+def test_shared_edges_are_paired():
     centres = points_in(STAR, 80, 3)
     edges = MovingCells(STAR).follow(centres)
     one, other = edges.twins()
@@ -285,9 +285,9 @@ def test_edges_that_two_cells_share_are_found_from_both_sides():
 
 @given(st.floats(10.0, 5000.0), st.floats(1e-3, 1e3), st.integers(1, 25))
 @relaxed
-def test_foveal_rings_tile_their_disc_without_a_blind_spot(fov_um, a_share, n_rings):
-    assume(n_rings > 1 or a_share > 0.1)
-    layout = fovi(fov_um=fov_um, a_um=a_share * fov_um, n_rings=n_rings, n_chords=1000)
+def test_foveal_rings_tile_disc_without_blind_spot(fov_um, a_fraction, n_rings):
+    assume(n_rings > 1 or a_fraction > 0.1)
+    layout = fovi(fov_um=fov_um, a_um=a_fraction * fov_um, n_rings=n_rings, n_chords=1000)
 
     assert_tiles(layout, regular_polygon_um2(1000, layout.provenance["radius_um"]))
     assert bool(shapely.contains_xy(layout.polygons()[0], 0.0, 0.0))
@@ -295,7 +295,7 @@ def test_foveal_rings_tile_their_disc_without_a_blind_spot(fov_um, a_share, n_ri
 
 @given(st.floats(10.0, 5000.0), st.floats(1.0, 100.0), st.integers(2, 20))
 @relaxed
-def test_radii_and_numbers_of_foveal_sites_follow_the_rule(fov_um, a_um, n_rings):
+def test_foveal_radii_and_counts_follow_rule(fov_um, a_um, n_rings):
     layout = fovi(fov_um=fov_um, a_um=a_um, n_rings=n_rings)
     w = np.linspace(math.log(a_um), math.log(fov_um / 2 + a_um), n_rings + 1)
     w = np.append(w, 2 * w[-1] - w[-2])
@@ -304,12 +304,12 @@ def test_radii_and_numbers_of_foveal_sites_follow_the_rule(fov_um, a_um, n_rings
 
     assert n_on_ring[0] == 1
     for i in range(1, n_rings + 1):
-        share = 2 * math.pi * r[i] / (0.5 * (r[i + 1] - r[i - 1]))
-        assert n_on_ring[i] in {math.ceil(share - 1e-6), math.ceil(share + 1e-6)}
+        ideal = 2 * math.pi * r[i] / (0.5 * (r[i + 1] - r[i - 1]))
+        assert n_on_ring[i] in {math.ceil(ideal - 1e-6), math.ceil(ideal + 1e-6)}
 
 
-def test_foveal_sites_are_as_high_as_wide_from_the_fovea_to_the_border():
-    """A site's area is the square of its ring's spacing, but for the rounding up of numbers."""
+def test_foveal_sites_are_isotropic():
+    """The area of a site is the squared spacing of its ring, except for the rounding of counts."""
     layout = fovi(fov_um=1000.0, a_um=20.0, n_rings=60)
     ring = layout.columns["ring"]
     step = math.log1p(500.0 / 20.0) / 60
@@ -321,13 +321,13 @@ def test_foveal_sites_are_as_high_as_wide_from_the_fovea_to_the_border():
     assert bool((np.diff(mean_um2[5:-1]) > 0).all())
 
 
-def test_a_fovea_larger_than_the_field_is_even():
+def test_fovea_larger_than_field_is_uniform():
     layout = fovi(fov_um=100.0, a_um=1e7, n_rings=5)
 
     assert np.bincount(layout.columns["ring"]).tolist() == [1, 7, 13, 19, 26, 32]
 
 
-def test_foveal_sites_are_numbered_ring_by_ring_from_the_axis_to_the_right():
+def test_foveal_sites_are_ordered_by_ring():
     layout = fovi(fov_um=100.0, a_um=10.0, n_rings=3)
     first = layout.columns["sector"] == 0
 
@@ -349,7 +349,7 @@ def test_foveal_sites_are_numbered_ring_by_ring_from_the_axis_to_the_right():
         ({"fov_um": 1e4, "a_um": 1e-4, "n_rings": 100}, GeometryError, "too close"),
     ],
 )
-def test_impossible_foveal_rings_are_refused(changes, error, message):
+def test_invalid_foveal_rings_raise(changes, error, message):
     with pytest.raises(error, match=message):
         fovi(**{"fov_um": 1000.0, "a_um": 20.0, "n_rings": 5, **changes})
 
@@ -365,7 +365,7 @@ def sunflower_centres(n):
 
 @given(st.integers(1, 400), st.floats(0.1, 50.0))
 @relaxed
-def test_a_sunflower_tiles_its_disc(n_sites, spacing_um):
+def test_sunflower_tiles_its_disc(n_sites, spacing_um):
     layout = sunflower(n_sites=n_sites, spacing_um=spacing_um, n_chords=720)
 
     assert layout.n_sites == n_sites
@@ -374,8 +374,8 @@ def test_a_sunflower_tiles_its_disc(n_sites, spacing_um):
 
 
 @pytest.mark.parametrize("n_sites", [4, 50, 3000])
-def test_the_closest_pair_of_a_sunflower_is_one_spacing_apart(n_sites):
-    """Measured on the cells: neighbours' centres are mirrored in the side that they share."""
+def test_closest_sunflower_sites_have_given_spacing(n_sites):
+    """The centres by the formula have this spacing, and each lies in its cell."""
     layout = sunflower(n_sites=n_sites, spacing_um=2.0)
     centres = 2.0 * sunflower_centres(n_sites)
 
@@ -383,21 +383,21 @@ def test_the_closest_pair_of_a_sunflower_is_one_spacing_apart(n_sites):
     assert bool(np.all(shapely.contains_xy(layout.polygons(), centres[:, 0], centres[:, 1])))
 
 
-def test_the_published_constant_puts_the_closest_pair_of_many_at_distance_one():
+def test_published_sunflower_constant_gives_unit_spacing():
     distance = nearest_um(sunflower_centres(100_000))
 
     assert distance.min() == pytest.approx(1.0, rel=1e-4)
     assert sorted(np.argsort(distance)[:2].tolist()) == [0, 3]
 
 
-def test_sunflower_sites_have_the_same_share_of_the_disc_inside():
+def test_inner_sunflower_sites_have_equal_area():
     layout = sunflower(n_sites=5000, spacing_um=1.0)
 
     np.testing.assert_allclose(layout.area_um2[50:4500], math.pi * 0.6242**2, rtol=0.05)
     assert layout.area_um2[50:4500].mean() == pytest.approx(math.pi * 0.6242**2, rel=1e-3)
 
 
-def test_the_spiral_turns_at_the_golden_angle():
+def test_spiral_uses_golden_angle():
     turn = sunflower(n_sites=8, spacing_um=1.0).columns["turn"]
 
     assert turn.tolist() == [int(k * 137.50776 // 360) for k in range(1, 9)]
@@ -413,7 +413,7 @@ def test_the_spiral_turns_at_the_golden_angle():
         ({"n_chords": 5}, "'n_chords' must be >= "),
     ],
 )
-def test_impossible_sunflowers_are_refused(changes, message):
+def test_invalid_sunflower_raises(changes, message):
     with pytest.raises(ParameterError, match=message):
         sunflower(**{"n_sites": 100, "spacing_um": 2.0, **changes})
 
@@ -426,14 +426,14 @@ def fovea(xy_um):
 
 
 def watson_per_um2(xy_um):
-    """Ganglion cells of the human retina on the temporal side (Watson 2014), 1° as 1 µm for a small layout."""
+    """Density of temporal human retinal ganglion cells (Watson 2014), with 1 µm per degree."""
     r = np.hypot(*xy_um.T)
     return 2 * 14804.6 / (1 + r / 41.03) * (0.9851 * (1 + r / 1.058) ** -2 + (1 - 0.9851) * np.exp(-r / 22.14))
 
 
 @given(st.integers(1, 150), regions, st.sampled_from([None, fovea]), st.integers(0, 3), seeds)
 @relaxed
-def test_density_driven_sites_tile_any_region(n_sites, region, density, n_iterations, seed):
+def test_density_driven_sites_tile_region(n_sites, region, density, n_iterations, seed):
     layout = voronoi(n_sites=n_sites, region=region, density=density, n_iterations=n_iterations, seed=seed)
 
     assert layout.n_sites == n_sites
@@ -443,29 +443,31 @@ def test_density_driven_sites_tile_any_region(n_sites, region, density, n_iterat
 
 @given(seeds)
 @settings(relaxed, max_examples=5)
-def test_one_seed_gives_one_layout_and_another_another(seed):
-    one, again, other = (voronoi(n_sites=50, size_um=(9.0, 6.0), density=fovea, seed=s) for s in (seed, seed, seed + 1))
+def test_layout_depends_only_on_seed(seed):
+    first, repeated, other = (
+        voronoi(n_sites=50, size_um=(9.0, 6.0), density=fovea, seed=s) for s in (seed, seed, seed + 1)
+    )
 
-    assert_same(one, again)
-    assert not np.array_equal(one.xy_um[:20], other.xy_um[:20])
-
-
-def test_lloyds_steps_end_with_centres_in_the_middle_of_equal_cells():
-    rough, even = (voronoi(n_sites=800, size_um=(40.0, 30.0), n_iterations=n) for n in (0, 60))
-
-    assert rough.area_um2.std() / rough.area_um2.mean() > 0.15
-    assert even.area_um2.std() / even.area_um2.mean() < 0.08
+    assert_same(first, repeated)
+    assert not np.array_equal(first.xy_um[:20], other.xy_um[:20])
 
 
-def test_evened_centres_keep_the_distance_of_blue_noise():
-    """The closest pair is no closer than 0.7 of the hexagonal packing's spacing; of random points it is about 0."""
+def test_lloyd_iterations_equalise_areas():
+    initial, converged = (voronoi(n_sites=800, size_um=(40.0, 30.0), n_iterations=n) for n in (0, 60))
+
+    assert initial.area_um2.std() / initial.area_um2.mean() > 0.15
+    assert converged.area_um2.std() / converged.area_um2.mean() < 0.08
+
+
+def test_relaxed_centres_have_blue_noise_spacing():
+    """Minimum spacing of 0.7 of hexagonal packing; that of random points is about 0."""
     layout = voronoi(n_sites=2000, size_um=(50.0, 40.0), n_iterations=40)
 
     assert nearest_um(layout.centroid_um).min() > 0.7 * math.sqrt(2 / math.sqrt(3))
 
 
-def test_the_cone_mosaic_has_the_published_density_and_spacing():
-    """249,800 cones/mm² are a spacing of 2.15 µm in hexagonal packing."""
+def test_cone_mosaic_has_published_spacing():
+    """249,800 cones/mm² correspond to a spacing of 2.15 µm in hexagonal packing."""
     n_sites = round(249_800e-6 * 100.0 * 80.0)
     layout = voronoi(n_sites=n_sites, size_um=(100.0, 80.0), n_iterations=40)
     spacing_um = np.sqrt(2 / math.sqrt(3) * layout.area_um2)
@@ -476,8 +478,8 @@ def test_the_cone_mosaic_has_the_published_density_and_spacing():
 
 
 @pytest.mark.parametrize("n_iterations", [0, 20])
-def test_sites_in_a_circle_are_as_many_as_the_density_asks(n_iterations):
-    """The integral of 1/(1 + r²/s²) over a disc is π s² ln(1 + r²/s²); off by less than the cells on the circle."""
+def test_site_counts_follow_density(n_iterations):
+    """The integral of 1/(1 + r²/s²) over a disc is π s² ln(1 + r²/s²); the tolerance is that of cells on the circle."""
     n_sites, scale_um = 4000, 5.0
     outline = disc(100.0, 720)
     layout = voronoi(n_sites=n_sites, region=outline, density=fovea, n_iterations=n_iterations)
@@ -488,8 +490,8 @@ def test_sites_in_a_circle_are_as_many_as_the_density_asks(n_iterations):
     assert layout.columns["share"].std() < (0.35, 0.08)[n_iterations > 0]
 
 
-def test_the_retinas_density_gives_the_retinas_spacing():
-    """Watson's formula over 30°: a site's spacing is sqrt(2 / (√3 d)), with d in sites per area."""
+def test_retinal_density_gives_retinal_spacing():
+    """Watson formula over 30°: the spacing is sqrt(2 / (√3 d)), with the density d in sites per area."""
     outline = disc(30.0, 360)
     layout = voronoi(n_sites=3000, region=outline, density=watson_per_um2)
     r = np.hypot(*layout.centroid_um.T)
@@ -503,7 +505,7 @@ def test_the_retinas_density_gives_the_retinas_spacing():
     assert np.median((spacing_um / np.sqrt(2 / (math.sqrt(3) * d)))[is_inside]) == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_picture_says_where_sites_are():
+def test_sites_follow_density_picture():
     picture = np.ones((20, 30))
     picture[:, 15:] = 9.0
     layout = voronoi(n_sites=1000, density=picture, density_grid=Grid.centred((20, 30), 2.0))
@@ -512,7 +514,7 @@ def test_a_picture_says_where_sites_are():
     assert (layout.centroid_um[:, 0] > 0).sum() == pytest.approx(900, abs=30)
 
 
-def test_few_sites_lie_where_a_picture_is_black():
+def test_black_areas_contain_few_sites():
     picture = np.zeros((30, 50))
     picture[5:25, 10:40] = 1.0
     layout = voronoi(n_sites=600, density=picture, density_grid=Grid.centred((30, 50), 1.0))
@@ -522,24 +524,24 @@ def test_few_sites_lie_where_a_picture_is_black():
     assert ((x < 15) & (y < 10)).sum() > 0.8 * 600
 
 
-def slope(xy_um):
+def linear(xy_um):
     return 20.0 + xy_um[:, 0] - 0.5 * xy_um[:, 1]
 
 
-def rough(region):
-    """A picture that jumps from cell to cell, over a region."""
+def random_picture(region):
+    """White-noise picture over a region."""
     low, high = np.reshape(region.bounds, (2, 2))
     pitch_um = (high - low).max() / 16
     return np.random.default_rng(8).random((16, 16)) + 0.05, Grid((16, 16), pitch_um, tuple(low))
 
 
-def of_picture(region, picture=None):
-    values, grid = rough(region)
+def picture_options(region, picture=None):
+    values, grid = random_picture(region)
     return {"density": values if picture is None else picture, "density_grid": grid}
 
 
-def picture_in(polygon, values, grid, power=1):
-    """Integrals over a polygon of a picture's power, and of that times x and y: cell by cell of the picture."""
+def integrate_picture(polygon, values, grid, power=1):
+    """Mass and first moments of a power of a picture over a polygon, cell by cell."""
     rows, columns = np.divmod(np.arange(values.size), values.shape[1])
     x0, y0 = grid.origin_um[0] + columns * grid.pitch_um, grid.origin_um[1] + rows * grid.pitch_um
     common = shapely.intersection(shapely.box(x0, y0, x0 + grid.pitch_um, y0 + grid.pitch_um), polygon)
@@ -549,8 +551,8 @@ def picture_in(polygon, values, grid, power=1):
     return weight.sum(), weight @ middle
 
 
-def function_in(ring, centre, function):
-    """The same of a function's square, by three points of each triangle of an edge and the centre."""
+def integrate_function(ring, centre, function):
+    """Mass and first moments of a squared function, by a 3-point rule on triangles."""
     mass, moment = 0.0, np.zeros(2)
     for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
         area_um2 = 0.5 * ((a - centre)[0] * (b - centre)[1] - (a - centre)[1] * (b - centre)[0])
@@ -561,61 +563,61 @@ def function_in(ring, centre, function):
     return mass, moment
 
 
-@given(regions, st.integers(1, 25), st.sampled_from(["even", "function", "picture"]), st.integers(1, 3), seeds)
+@given(regions, st.integers(1, 25), st.sampled_from(["uniform", "function", "picture"]), st.integers(1, 3), seeds)
 @settings(relaxed, max_examples=15)
-def test_lloyds_quick_steps_are_those_of_whole_cells(region, n_sites, kind, n_iterations, seed):
-    """The twin makes all cells each time, and takes them one by one."""
-    density, grid = {"even": (None, None), "function": (fovea, None), "picture": rough(region)}[kind]
+def test_lloyd_iterations_agree_with_reference(region, n_sites, kind, n_iterations, seed):
+    """The reference computes all cells in each iteration, and integrates them one by one."""
+    density, grid = {"uniform": (None, None), "function": (fovea, None), "picture": random_picture(region)}[kind]
     centres = _first_centres(n_sites, *_density(density, grid, region)[1:], region, seed)
     for _ in range(n_iterations):
         cells = as_layout(*cells_of(centres, region))
         for i, polygon in enumerate(cells.polygons()):
-            if kind == "even":
+            if kind == "uniform":
                 mass, moment = polygon.area, polygon.area * shapely.get_coordinates(polygon.centroid)[0]
             elif kind == "function":
-                mass, moment = function_in(shapely.get_coordinates(polygon)[:-1], centres[i], fovea)
+                mass, moment = integrate_function(shapely.get_coordinates(polygon)[:-1], centres[i], fovea)
             else:
-                mass, moment = picture_in(polygon, density, grid, power=2)
+                mass, moment = integrate_picture(polygon, density, grid, power=2)
             if shapely.contains_xy(region, *(moment / mass)):
                 centres[i] = moment / mass
-    twin = as_layout(*cells_of(centres, region))
+    reference = as_layout(*cells_of(centres, region))
     layout = voronoi(
         n_sites=n_sites, region=region, density=density, density_grid=grid, n_iterations=n_iterations, seed=seed
     )
 
-    np.testing.assert_allclose(layout.area_um2, twin.area_um2, rtol=1e-9)
-    np.testing.assert_allclose(layout.centroid_um, twin.centroid_um, atol=1e-8)
-    np.testing.assert_allclose(shapely.length(layout.polygons()), shapely.length(twin.polygons()), rtol=1e-9)
+    np.testing.assert_allclose(layout.area_um2, reference.area_um2, rtol=1e-9)
+    np.testing.assert_allclose(layout.centroid_um, reference.centroid_um, atol=1e-8)
+    np.testing.assert_allclose(shapely.length(layout.polygons()), shapely.length(reference.polygons()), rtol=1e-9)
 
 
 @pytest.mark.parametrize("capacity", ["free", "equal"])
-def test_shares_are_the_integrals_of_a_picture(capacity):
-    values, grid = rough(STAR)
+def test_shares_equal_picture_integrals(capacity):
+    values, grid = random_picture(STAR)
     layout = voronoi(n_sites=40, region=STAR, density=values, density_grid=grid, n_iterations=3, capacity=capacity)
-    mass = np.array([picture_in(polygon, values, grid)[0] for polygon in layout.polygons()])
+    mass = np.array([integrate_picture(polygon, values, grid)[0] for polygon in layout.polygons()])
 
     np.testing.assert_allclose(layout.columns["share"], mass / mass.mean(), rtol=1e-9)
 
 
 @pytest.mark.parametrize("capacity", ["free", "equal"])
-def test_shares_are_the_integrals_of_a_function(capacity):
-    """Of one that is linear in x and y: the area times the value in the middle."""
-    layout = voronoi(n_sites=40, region=NOTCH, density=slope, n_iterations=3, capacity=capacity)
-    mass = layout.area_um2 * slope(layout.centroid_um)
+def test_shares_equal_function_integrals(capacity):
+    """The integral of a linear function is the area times the value at the centroid."""
+    layout = voronoi(n_sites=40, region=NOTCH, density=linear, n_iterations=3, capacity=capacity)
+    mass = layout.area_um2 * linear(layout.centroid_um)
 
     np.testing.assert_allclose(layout.columns["share"], mass / mass.mean(), rtol=1e-9)
 
 
 @pytest.mark.parametrize("width_um", [0.5, 2.0, 20.0])
 @pytest.mark.parametrize("n_sites", [1, 40])
-def test_a_functions_integrals_are_right_to_seven_digits(width_um, n_sites):
-    """A bell over a box, of closed form, narrower and wider than sites."""
+def test_function_integrals_are_accurate_to_1e_7(width_um, n_sites):
+    """Gaussians over a box, narrower and wider than sites, against the closed form."""
 
-    def bell(xy_um):
+    def gaussian(xy_um):
         return np.exp(-(xy_um**2).sum(axis=1) / (2 * width_um**2))
 
     layout = voronoi(n_sites=n_sites, region=BOX, n_iterations=2)
-    field = _density(bell, None, BOX)[0]
+    field = _density(gaussian, None, BOX)[0]
     mass, _ = field.moments(edges_of_rings(layout.xy_um, layout.ring_offsets), layout.centroid_um)
     x, y = (
         math.erf(high / width_um / math.sqrt(2)) - math.erf(low / width_um / math.sqrt(2))
@@ -628,13 +630,13 @@ def test_a_functions_integrals_are_right_to_seven_digits(width_um, n_sites):
 @given(
     st.integers(1, 60),
     st.sampled_from([BOX, NOTCH, disc(7.0, 31)]),
-    st.sampled_from(["even", "fovea", "picture"]),
+    st.sampled_from(["uniform", "fovea", "picture"]),
     st.integers(0, 4),
     seeds,
 )
 @relaxed
-def test_sites_of_equal_capacity_tile_and_hold_the_same(n_sites, region, kind, n_iterations, seed):
-    density = {"even": {}, "fovea": {"density": fovea}, "picture": of_picture(region)}[kind]
+def test_equal_capacity_sites_tile_region(n_sites, region, kind, n_iterations, seed):
+    density = {"uniform": {}, "fovea": {"density": fovea}, "picture": picture_options(region)}[kind]
     layout = voronoi(n_sites=n_sites, region=region, n_iterations=n_iterations, capacity="equal", seed=seed, **density)
 
     assert layout.n_sites == n_sites
@@ -644,27 +646,27 @@ def test_sites_of_equal_capacity_tile_and_hold_the_same(n_sites, region, kind, n
 
 @pytest.mark.parametrize("region", [BOX, NOTCH, STAR, FRAME], ids=["box", "notch", "star", "frame"])
 @pytest.mark.parametrize("n_sites", [30, 300])
-def test_equal_capacity_of_an_even_density_is_equal_area(n_sites, region):
-    """With a star's notches, too, that cut cells apart: capacities jump there, and centres have to move on."""
+def test_equal_capacity_without_density_is_equal_area(n_sites, region):
+    """Including a star, whose notches divide cells: capacities are discontinuous, and centres require further moves."""
     layout = voronoi(n_sites=n_sites, region=region, capacity="equal", n_iterations=5)
 
     assert_tiles(layout, region.area)
     np.testing.assert_allclose(layout.area_um2, region.area / n_sites, rtol=1e-6)
 
 
-def test_sites_of_equal_capacity_are_as_even_as_free_ones():
-    """Closest pairs, and the perimeter of a site of unit area: of a hexagon 3.72, of a square 4."""
+def test_equal_capacity_sites_are_as_compact():
+    """Minimum spacing, and perimeter of a site of unit area: 3.72 for a hexagon, 4 for a square."""
     free, equal = (voronoi(n_sites=1000, size_um=(40.0, 25.0), capacity=capacity) for capacity in ("free", "equal"))
-    around_free, around_equal = (
+    perimeter_free, perimeter_equal = (
         np.median(shapely.length(layout.polygons()) / np.sqrt(layout.area_um2)) for layout in (free, equal)
     )
 
     assert nearest_um(equal.centroid_um).min() > 0.7 * math.sqrt(2 / math.sqrt(3))
-    assert around_equal == pytest.approx(around_free, abs=0.05)
+    assert perimeter_equal == pytest.approx(perimeter_free, abs=0.05)
     assert free.columns["share"].std() > 0.05
 
 
-def test_equal_capacity_holds_where_a_density_falls_to_a_ten_thousandth():
+def test_equal_capacity_with_large_density_range():
     layout = voronoi(
         n_sites=2000, region=disc(100.0, 360), density=lambda xy_um: fovea(5 * xy_um) ** 1.5, capacity="equal"
     )
@@ -675,18 +677,18 @@ def test_equal_capacity_holds_where_a_density_falls_to_a_ten_thousandth():
 
 
 @pytest.mark.parametrize("n_sites", [5, 40])
-def test_equal_capacity_reaches_over_black_parts_of_a_picture(n_sites):
-    """White squares on black, whose numbers of sites would not be whole."""
+def test_equal_capacity_with_black_areas(n_sites):
+    """White squares on black, none of which has the mass of an integer number of sites."""
     picture = np.zeros((16, 16))
     picture[1:4, 1:4] = picture[1:4, 11:15] = picture[10:15, 6:9] = 1.0
-    layout = voronoi(n_sites=n_sites, region=BOX, capacity="equal", n_iterations=4, **of_picture(BOX, picture))
+    layout = voronoi(n_sites=n_sites, region=BOX, capacity="equal", n_iterations=4, **picture_options(BOX, picture))
 
     assert_tiles(layout, BOX.area)
     np.testing.assert_allclose(layout.columns["share"], 1.0, atol=1e-6)
 
 
-def test_of_a_cell_that_a_notch_cuts_apart_the_heaviest_part_stays():
-    """White in the two arms of an angle: a cell's larger part may be black, and its smaller one hold all."""
+def test_divided_cell_retains_heaviest_part():
+    """White in the two arms of an angle: the larger part of a cell may be black, without any mass."""
     picture = np.zeros((60, 60))
     picture[15:50, 20:55] = 1.0
     grid = Grid((60, 60), 1 / 6)
@@ -696,14 +698,14 @@ def test_of_a_cell_that_a_notch_cuts_apart_the_heaviest_part_stays():
     np.testing.assert_allclose(layout.columns["share"], 1.0, atol=1e-6)
 
 
-def test_centres_move_on_where_they_have_no_cells_of_equal_capacity():
-    """No weights do with these first centres in a star: parts that its notches cut off are too large."""
+def test_centres_move_until_capacities_are_equal():
+    """No weights solve for the initial centres in a star: the parts that its notches separate are too large."""
     layout = voronoi(n_sites=150, region=STAR, n_iterations=0, capacity="equal", seed=1)
 
     np.testing.assert_allclose(layout.columns["share"], 1.0, atol=1e-6)
 
 
-def test_centres_come_to_lie_in_the_middle_of_cells_of_equal_capacity():
+def test_centres_converge_to_centres_of_mass():
     field = _density(fovea, None, BOX)[0]
     centres = points_in(BOX, 200, 0)
     for n_moves, furthest in ((2, 0.2), (8, 0.08)):
@@ -717,11 +719,11 @@ def test_centres_come_to_lie_in_the_middle_of_cells_of_equal_capacity():
         assert (off_um / np.sqrt(layout.area_um2)).max() < furthest
 
 
-@pytest.mark.parametrize("is_own", [True, False], ids=["own", "given"])
-@pytest.mark.parametrize("kind", ["even", "fovea", "picture"])
-def test_masses_change_with_weights_as_the_edges_sweep(kind, is_own):
-    """In a star, whose notches cut cells apart; measured by small steps of each weight."""
-    density, grid = {"even": (None, None), "fovea": (fovea, None), "picture": rough(STAR)}[kind]
+@pytest.mark.parametrize("is_own", [True, False], ids=["own", "assigned"])
+@pytest.mark.parametrize("kind", ["uniform", "fovea", "picture"])
+def test_mass_derivatives_agree_with_differences(kind, is_own):
+    """Finite differences in a star, whose notches divide cells."""
+    density, grid = {"uniform": (None, None), "fovea": (fovea, None), "picture": random_picture(STAR)}[kind]
     field = _density(density, grid, STAR)[0]
     centres, n, step_um2 = points_in(STAR, 25, 10), 25, 1e-5
     cells = MovingCells(STAR)
@@ -738,16 +740,14 @@ def test_masses_change_with_weights_as_the_edges_sweep(kind, is_own):
     np.testing.assert_allclose(slopes.sum(axis=0), 0.0, atol=1e-12)
 
 
-def test_one_seed_gives_one_layout_of_equal_capacity():
-    one, again = (voronoi(n_sites=40, region=STAR, density=fovea, capacity="equal", seed=3) for _ in range(2))
+def test_equal_capacity_layout_is_reproducible():
+    first, repeated = (voronoi(n_sites=40, region=STAR, density=fovea, capacity="equal", seed=3) for _ in range(2))
 
-    assert_same(one, again)
+    assert_same(first, repeated)
 
 
-def test_equal_capacity_of_a_function_that_jumps_is_refused():
-    with pytest.raises(
-        GeometryError, match=r"found no cells of equal capacity: the best ones differ .*a picture of it"
-    ):
+def test_equal_capacity_of_discontinuous_function_raises():
+    with pytest.raises(GeometryError, match=r"found no cells of equal capacity: the smallest .* a picture instead"):
         voronoi(
             n_sites=20,
             size_um=(10.0, 10.0),
@@ -765,7 +765,7 @@ def test_equal_capacity_of_a_function_that_jumps_is_refused():
         ({"n_iterations": -1}, "'n_iterations' must be >= 0"),
         ({"capacity": "same"}, "'capacity' must be one of 'free', 'equal'"),
         ({"seed": -1}, "'seed' must be >= 0"),
-        ({"size_um": None}, "'size_um' or 'region' or 'density_grid' must tell"),
+        ({"size_um": None}, "'size_um' or 'region' or 'density_grid' must be given"),
         ({"size_um": (1.0, 2.0, 3.0)}, "'size_um' must be two numbers"),
         ({"size_um": (1.0, 0.0)}, r"'size_um\[1\]' must be > 0"),
         ({"region": BOX}, "'region' and 'size_um' exclude each other"),
@@ -787,12 +787,12 @@ def test_equal_capacity_of_a_function_that_jumps_is_refused():
             {"density": np.zeros((2, 2)), "density_grid": Grid.centred((2, 2), 10.0)},
             "'density' must be above 0 somewhere",
         ),
-        ({"density": lambda xy: xy}, "'density' must give one value for each"),
+        ({"density": lambda xy: xy}, "'density' must return one value for each"),
         ({"density": lambda xy: xy[:, 0] - 100}, "'density' must be >= 0"),
         ({"density": lambda xy: 0 * xy[:, 0]}, "'density' must be above 0 somewhere"),
     ],
 )
-def test_impossible_densities_and_regions_are_refused(changes, message):
+def test_invalid_density_or_region_raises(changes, message):
     with pytest.raises(ParameterError, match=message):
         voronoi(**{"n_sites": 10, "size_um": (10.0, 10.0), **changes})
 
@@ -813,7 +813,7 @@ measures = st.sampled_from(["sum", "peak"])
 
 @given(pictures(), measures, st.floats(0.0, 1.0), st.floats(0.05, 50.0))
 @relaxed
-def test_the_squares_of_a_quadtree_tile_the_die(drawn, measure, limit, pitch_um):
+def test_quadtree_squares_tile_picture(drawn, measure, limit, pitch_um):
     n_levels, picture = drawn
     layout = quadtree(picture, pitch_um=pitch_um, limit=limit, n_levels=n_levels, measure=measure)
     sides = 2.0 ** (n_levels - layout.columns["level"])
@@ -825,24 +825,24 @@ def test_the_squares_of_a_quadtree_tile_the_die(drawn, measure, limit, pitch_um)
 
 @given(pictures(), measures, st.floats(0.0, 1.0))
 @relaxed
-def test_neighbours_in_a_quadtree_differ_by_one_level_at_most(drawn, measure, limit):
-    """Measured on the painted picture: the level of each pixel against those beside and above it."""
+def test_quadtree_neighbours_differ_by_one_level(drawn, measure, limit):
+    """Levels of adjacent pixels in a picture of the levels."""
     n_levels, picture = drawn
     layout = quadtree(picture, pitch_um=1.0, limit=limit, n_levels=n_levels, measure=measure)
-    painted = np.full(picture.shape, -9)
+    level_of_pixel = np.full(picture.shape, -9)
     for level, row, column in zip(*(layout.columns[name] for name in ("level", "row", "column")), strict=True):
         side = 2 ** (n_levels - level)
         assert row % side == 0
         assert column % side == 0
-        painted[row : row + side, column : column + side] = level
+        level_of_pixel[row : row + side, column : column + side] = level
 
-    assert np.abs(np.diff(painted, axis=0)).max(initial=0) <= 1
-    assert np.abs(np.diff(painted, axis=1)).max(initial=0) <= 1
+    assert np.abs(np.diff(level_of_pixel, axis=0)).max(initial=0) <= 1
+    assert np.abs(np.diff(level_of_pixel, axis=1)).max(initial=0) <= 1
 
 
 @given(pictures(), measures, st.floats(0.0, 1.0))
 @relaxed
-def test_no_square_of_a_quadtree_is_more_important_than_the_limit_unless_it_is_smallest(drawn, measure, limit):
+def test_quadtree_squares_are_below_limit(drawn, measure, limit):
     n_levels, picture = drawn
     layout = quadtree(picture, pitch_um=1.0, limit=limit, n_levels=n_levels, measure=measure)
     for level, row, column in zip(*(layout.columns[name] for name in ("level", "row", "column")), strict=True):
@@ -851,7 +851,7 @@ def test_no_square_of_a_quadtree_is_more_important_than_the_limit_unless_it_is_s
         assert side == 1 or getattr(block, {"sum": "sum", "peak": "max"}[measure])() <= limit + 1e-12
 
 
-def test_one_important_pixel_in_a_corner_takes_three_squares_of_each_side():
+def test_corner_pixel_gives_three_squares_per_level():
     picture = np.zeros((16, 16))
     picture[0, 0] = 1.0
     layout = quadtree(picture, pitch_um=1.0, limit=0.5, n_levels=4)
@@ -859,8 +859,8 @@ def test_one_important_pixel_in_a_corner_takes_three_squares_of_each_side():
     assert np.bincount(layout.columns["level"]).tolist() == [0, 3, 3, 3, 4]
 
 
-def test_balance_splits_where_nothing_is_asked():
-    """A pixel beside the middle line would leave squares of side 1 and 4 beside each other."""
+def test_balance_splits_unimportant_squares():
+    """Without balance, a pixel at the centre line would result in adjacent squares with sides 1 and 4."""
     picture = np.zeros((8, 8))
     picture[0, 3] = 1.0
     layout = quadtree(picture, pitch_um=1.0, limit=0.5, n_levels=3)
@@ -869,7 +869,7 @@ def test_balance_splits_where_nothing_is_asked():
     assert np.bincount(layout.columns["level"]).tolist() == [0, 2, 7, 4]
 
 
-def test_an_even_limit_makes_a_plain_grid():
+def test_uniform_importance_gives_grid():
     layout = quadtree(np.ones((8, 16)), pitch_um=2.0, limit=4.0, n_levels=3)
 
     assert layout.n_sites == 32
@@ -878,7 +878,7 @@ def test_an_even_limit_makes_a_plain_grid():
     assert layout.centroid_um[0].tolist() == [-14.0, -6.0]
 
 
-def test_a_corner_on_a_side_belongs_to_the_larger_square_too():
+def test_larger_square_includes_corner_on_side():
     picture = np.zeros((2, 4))
     picture[0, 0] = 1.0
     layout = quadtree(picture, pitch_um=1.0, limit=0.5, n_levels=1)
@@ -901,31 +901,31 @@ def test_a_corner_on_a_side_belongs_to_the_larger_square_too():
         ({"measure": "mean"}, "'measure' must be one of 'sum', 'peak'"),
     ],
 )
-def test_impossible_quadtrees_are_refused(changes, message):
+def test_invalid_quadtree_raises(changes, message):
     arguments = {"importance": np.ones((4, 4)), "pitch_um": 1.0, "limit": 1.0, "n_levels": 2, **changes}
     with pytest.raises(ParameterError, match=message):
         quadtree(arguments.pop("importance"), **arguments)
 
 
-# -- Penrose's rhombs ------------------------------------------------------------------------------------------------
+# -- Penrose rhombs --------------------------------------------------------------------------------------------------
 
 shapes = st.sampled_from(["disc", "square"])
 
 
 @given(st.floats(0.1, 50.0), st.floats(3.0, 40.0), shapes)
 @relaxed
-def test_penrose_rhombs_leave_no_gap_and_no_overlap(side_um, size, shape):
+def test_penrose_rhombs_tile_without_gaps(side_um, size, shape):
     layout = penrose(side_um=side_um, size_um=size * side_um, shape=shape)
-    whole = shapely.union_all(layout.polygons())
+    covered = shapely.union_all(layout.polygons())
 
-    assert_tiles(layout, whole.area)
-    assert shape == "square" or isinstance(whole, shapely.Polygon)
-    assert shapely.get_num_interior_rings(shapely.get_parts(whole)).sum() == 0
+    assert_tiles(layout, covered.area)
+    assert shape == "square" or isinstance(covered, shapely.Polygon)
+    assert shapely.get_num_interior_rings(shapely.get_parts(covered)).sum() == 0
 
 
 @given(st.floats(0.1, 50.0), shapes)
 @settings(relaxed, max_examples=8)
-def test_penrose_rhombs_have_two_shapes_with_areas_in_the_golden_ratio(side_um, shape):
+def test_penrose_areas_have_golden_ratio(side_um, shape):
     layout = penrose(side_um=side_um, size_um=25 * side_um, shape=shape)
     corners = layout.xy_um.reshape(-1, 4, 2)
     is_thick = layout.columns["is_thick"] == 1
@@ -937,20 +937,20 @@ def test_penrose_rhombs_have_two_shapes_with_areas_in_the_golden_ratio(side_um, 
 
 
 @pytest.mark.parametrize(("size", "tolerance"), [(30, 0.06), (100, 0.02), (400, 0.005)])
-def test_thick_to_thin_tends_to_the_golden_ratio(size, tolerance):
+def test_thick_to_thin_tends_to_golden_ratio(size, tolerance):
     is_thick = penrose(side_um=1.0, size_um=size, shape="square").columns["is_thick"]
 
     assert is_thick.sum() / (1 - is_thick).sum() == pytest.approx(1.618034, abs=tolerance)
 
 
-@pytest.mark.parametrize(("shape", "share"), [("disc", math.pi / 4), ("square", 1.0)])
-def test_penrose_rhombs_fill_the_size_that_was_asked_for(shape, share):
+@pytest.mark.parametrize(("shape", "fraction"), [("disc", math.pi / 4), ("square", 1.0)])
+def test_penrose_rhombs_fill_given_size(shape, fraction):
     layout = penrose(side_um=1.0, size_um=200.0, shape=shape)
 
-    assert layout.area_um2.sum() == pytest.approx(share * 200.0**2, rel=5e-3)
+    assert layout.area_um2.sum() == pytest.approx(fraction * 200.0**2, rel=5e-3)
 
 
-def test_penrose_rhombs_are_the_same_after_a_fifth_of_a_turn_and_no_less():
+def test_penrose_layout_has_fivefold_symmetry():
     layout = penrose(side_um=1.0, size_um=30.0)
     tree = cKDTree(layout.centroid_um)
 
@@ -961,8 +961,8 @@ def test_penrose_rhombs_are_the_same_after_a_fifth_of_a_turn_and_no_less():
     assert furthest(36.0) > 0.1
 
 
-def test_penrose_rhombs_meet_edge_to_edge_around_every_corner():
-    """Whole turns: the angles around an inner corner, in tenths of a turn, make ten, in one of the seven known ways."""
+def test_penrose_vertices_have_known_angles():
+    """Angles around an inner vertex add up to 360°, in one of the seven known configurations."""
     layout = penrose(side_um=1.0, size_um=40.0)
     corners = layout.xy_um.reshape(-1, 4, 2)
     before, after = np.roll(corners, 1, 1) - corners, np.roll(corners, -1, 1) - corners
@@ -978,7 +978,7 @@ def test_penrose_rhombs_meet_edge_to_edge_around_every_corner():
     assert len({tuple(sorted(around[p])) for p in np.flatnonzero(is_inner)}) <= 7
 
 
-def test_a_larger_penrose_layout_holds_every_rhomb_of_a_smaller_one_bit_for_bit():
+def test_larger_penrose_layout_contains_smaller_one():
     small, large = ({r.tobytes() for r in penrose(side_um=1.0, size_um=s).xy_um.reshape(-1, 8)} for s in (12.0, 150.0))
 
     assert small < large
@@ -989,12 +989,12 @@ def test_a_larger_penrose_layout_holds_every_rhomb_of_a_smaller_one_bit_for_bit(
     [
         ({"side_um": 0.0}, "'side_um' must be > 0"),
         ({"size_um": -2.0}, "'size_um' must be > 0"),
-        ({"size_um": 0.5}, "'size_um' leaves no rhomb"),
-        ({"side_um": 1e-3, "size_um": 1e4}, "'side_um' gives more than"),
+        ({"size_um": 0.5}, "'size_um' must enclose the centre of at least one rhomb"),
+        ({"side_um": 1e-3, "size_um": 1e4}, "'side_um' must give at most 50000000 sites"),
         ({"shape": "ring"}, "'shape' must be one of 'disc', 'square'"),
     ],
 )
-def test_impossible_penrose_layouts_are_refused(changes, message):
+def test_invalid_penrose_layout_raises(changes, message):
     with pytest.raises(ParameterError, match=message):
         penrose(**{"side_um": 1.0, "size_um": 20.0, **changes})
 
@@ -1013,32 +1013,32 @@ def test_impossible_penrose_layouts_are_refused(changes, message):
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_irregular_layouts_tell_their_origin(layout, generator):
+def test_provenance_contains_generator_and_parameters(layout, generator):
     assert layout.provenance["generator"] == generator
     assert {"n_sites", "side_um", "fov_um", "pitch_um"} & set(layout.provenance["parameters"])
 
 
-def test_the_told_origin_of_density_driven_sites_makes_the_same_sites():
+def test_provenance_reproduces_density_driven_sites():
     layout = voronoi(n_sites=30, region=STAR, n_iterations=2, seed=7)
 
     assert_same(voronoi(**layout.provenance["parameters"]), layout)
 
 
-def test_the_told_origin_of_sites_of_equal_capacity_makes_the_same_sites():
+def test_provenance_reproduces_equal_capacity_sites():
     layout = voronoi(n_sites=30, region=STAR, n_iterations=2, capacity="equal", seed=7)
 
     assert layout.provenance["parameters"]["capacity"] == "equal"
     assert_same(voronoi(**layout.provenance["parameters"]), layout)
 
 
-def test_a_region_with_a_hole_is_told_ring_by_ring():
+def test_provenance_contains_rings_of_region():
     layout = voronoi(n_sites=60, region=FRAME, n_iterations=1)
 
     assert_tiles(layout, 400 - 64)
     assert [len(ring) for ring in layout.provenance["parameters"]["region"]] == [4, 4]
 
 
-def test_density_driven_sites_tell_the_grid_of_their_picture():
+def test_provenance_contains_grid_of_picture():
     layout = voronoi(n_sites=9, density=np.ones((2, 3)), density_grid=Grid.centred((2, 3), 2.0), n_iterations=0)
     parameters = layout.provenance["parameters"]
 
@@ -1046,5 +1046,5 @@ def test_density_driven_sites_tell_the_grid_of_their_picture():
     assert Grid(**parameters["density_grid"]) == Grid.centred((2, 3), 2.0)
 
 
-def test_a_function_of_density_is_told_by_its_name():
+def test_provenance_contains_name_of_function():
     assert voronoi(n_sites=9, size_um=(9.0, 9.0), density=fovea).provenance["parameters"]["density"] == "fovea"

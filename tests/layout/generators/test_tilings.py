@@ -1,4 +1,4 @@
-"""Laws of lattices in regions, of filled foveas and of zones of any outline: exact tilings, minimum sizes, closed forms."""
+"""Tilings of regions, filled foveas and zones: exact tilings, minimum sizes, closed forms."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ REGIONS = {"notched": NOTCHED, "holed": HOLED, "two parts": TWO_PARTS}
 
 
 def assert_tiles(layout, region):
-    """Sites are simple, cover the region and nothing else, and no two of them overlap."""
+    """Assert that valid sites cover exactly the region without overlaps."""
     polygons = layout.polygons()
     a, b = shapely.STRtree(polygons).query(polygons, predicate="intersects")
     common_um2 = shapely.area(shapely.intersection(polygons[a[a < b]], polygons[b[a < b]]))
@@ -35,7 +35,7 @@ def assert_tiles(layout, region):
 
 
 def hull_disc(layout):
-    """The outer border of a round layout, without the hole that may be in it."""
+    """Outer boundary of a round layout as a polygon without holes."""
     return shapely.Polygon(shapely.union_all(layout.polygons()).exterior)
 
 
@@ -54,34 +54,34 @@ def size_um(layout):
     pitch_um=st.floats(1.2, 9.0),
     origin_um=st.tuples(st.floats(-5, 5), st.floats(-5, 5)),
 )
-def test_a_lattice_fills_any_region_to_its_border(name, cells, border, pitch_um, origin_um):
+def test_tiling_fills_region(name, cells, border, pitch_um, origin_um):
     layout = tiling(pitch_um=pitch_um, cells=cells, region=REGIONS[name], border=border, origin_um=origin_um)
 
     assert_tiles(layout, REGIONS[name])
 
 
 @relaxed
-@given(cells=st.sampled_from(["hexagons", "squares"]), pitch_um=st.floats(1.2, 6.0), share=st.floats(0.3, 1.0))
-@example(cells="squares", pitch_um=2.0000000596046448, share=1.0)
-def test_no_joined_site_is_below_the_asked_size(cells, pitch_um, share):
+@given(cells=st.sampled_from(["hexagons", "squares"]), pitch_um=st.floats(1.2, 6.0), fraction=st.floats(0.3, 1.0))
+@example(cells="squares", pitch_um=2.0000000596046448, fraction=1.0)
+def test_merged_sites_satisfy_minimum_size(cells, pitch_um, fraction):
     cell_um2 = pitch_um**2 * (1.0 if cells == "squares" else 0.5 * math.sqrt(3.0))
-    smallest_um = math.sqrt(share * cell_um2)
+    smallest_um = math.sqrt(fraction * cell_um2)
     layout = tiling(pitch_um=pitch_um, cells=cells, region=NOTCHED, min_size_um=smallest_um)
 
-    # The rule allows coordinates a rounding of 1e-6 µm.
+    # The rule has a tolerance of 1e-6 µm.
     assert size_um(layout).min() >= smallest_um - 1e-6
     assert layout.check(fs.DesignRules(min_size_um=smallest_um)).ok
     assert_tiles(layout, NOTCHED)
 
 
-def test_whole_cells_alone_are_regular_and_lie_inside():
+def test_dropping_pieces_leaves_regular_cells_inside():
     layout = tiling(pitch_um=3.0, region=NOTCHED, border="drop")
 
     assert bool(shapely.covers(NOTCHED, layout.polygons()).all())
     np.testing.assert_allclose(layout.area_um2, 9.0 * 0.5 * math.sqrt(3.0), rtol=1e-12)
 
 
-def test_a_lattice_of_squares_in_a_rectangle_is_the_grid():
+def test_square_tiling_of_rectangle_is_grid():
     layout = tiling(pitch_um=2.0, cells="squares", size_um=(12.0, 8.0), origin_um=(1.0, 1.0))
     same = grid(n_x=6, n_y=4, pitch_um=2.0)
 
@@ -89,7 +89,7 @@ def test_a_lattice_of_squares_in_a_rectangle_is_the_grid():
     assert all(layout.columns[name].tolist() == same.columns[name].tolist() for name in same.columns)
 
 
-def test_a_lattice_of_hexagons_is_the_hexagonal_layout_where_it_is_whole():
+def test_hexagonal_tiling_agrees_with_hexagonal_layout():
     layout = tiling(pitch_um=2.0, size_um=(30.0, 30.0), border="drop")
     same = hexagonal(n_columns=40, n_rows=41, pitch_um=2.0)
     centre_um = {tuple(xy) for xy in np.round(same.centroid_um - same.centroid_um[20 * 40 + 20], 9).tolist()}
@@ -97,7 +97,7 @@ def test_a_lattice_of_hexagons_is_the_hexagonal_layout_where_it_is_whole():
     assert {tuple(xy) for xy in np.round(layout.centroid_um, 9).tolist()} <= centre_um
 
 
-def test_a_mosaic_lies_on_a_lattice():
+def test_tiling_accepts_mosaic():
     layout = fs.layout.mosaic(
         tiling(pitch_um=2.0, cells="squares", size_um=(16.0, 16.0), origin_um=(1.0, 1.0)), ["RG", "GB"]
     )
@@ -108,49 +108,49 @@ def test_a_mosaic_lies_on_a_lattice():
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
-        ({"radius_um": None}, ParameterError, "'region' or 'size_um' or 'radius_um' must be given: one of them"),
-        ({"size_um": (3, 3)}, ParameterError, "'region' or 'size_um' or 'radius_um' must be given: one of them"),
+        ({"radius_um": None}, ParameterError, "'region' or 'size_um' or 'radius_um' must be given, but only one of them"),
+        ({"size_um": (3, 3)}, ParameterError, "'region' or 'size_um' or 'radius_um' must be given, but only one of them"),
         ({"pitch_um": 0.0}, ParameterError, "'pitch_um' must be > 0, got 0.0 µm"),
         ({"pitch_um": 1e-4}, ParameterError, "'n_sites' must be <= 50000000"),
         ({"cells": "triangles"}, ParameterError, "'cells' must be one of 'hexagons', 'squares', got 'triangles'"),
         ({"border": "keep"}, ParameterError, "'border' must be one of 'merge', 'cut', 'drop', got 'keep'"),
         ({"origin_um": (1, 2, 3)}, ParameterError, "'origin_um' must be two numbers"),
         ({"min_size_um": -1.0}, ParameterError, "'min_size_um' must be > 0"),
-        ({"radius_um": 0.5, "min_size_um": 3.0}, GeometryError, "the region holds no site: it is smaller than one"),
+        ({"radius_um": 0.5, "min_size_um": 3.0}, GeometryError, "the region is too small for a single site"),
         ({"radius_um": None, "region": "nowhere"}, ParameterError, "'region' must be a shapely Polygon"),
         ({"radius_um": None, "region": [(0, 0), (1, 1)]}, ParameterError, r"'region' must have the shape \(n, 2\)"),
     ],
 )  # fmt: skip
-def test_impossible_lattices_are_refused(changes, error, message):
+def test_tiling_rejects_invalid_parameters(changes, error, message):
     with pytest.raises(error, match=message):
         tiling(**{"pitch_um": 2.0, "radius_um": 20.0, **changes})
 
 
-# -- small sites and filled holes ------------------------------------------------------------------------------------
+# -- small sites and filled regions ------------------------------------------------------------------------------------
 
 
-def test_a_small_site_goes_to_the_neighbour_with_which_it_shares_most_edge():
+def test_small_site_joins_longest_shared_edge():
     parts = [shapely.box(0, 0, 4, 4), shapely.box(4, 0, 5, 4), shapely.box(4, 4, 9, 9), shapely.box(5, 0, 9, 4)]
     layout = fs.Layout.from_polygons(parts, channel=[0, 1, 2, 3])
-    joined = merge_small(layout, min_size_um=2.5)
+    merged = merge_small(layout, min_size_um=2.5)
 
-    assert joined.area_um2.tolist() == [20.0, 25.0, 16.0]
-    assert joined.channel.tolist() == [0, 2, 3]
+    assert merged.area_um2.tolist() == [20.0, 25.0, 16.0]
+    assert merged.channel.tolist() == [0, 2, 3]
 
 
-def test_a_small_site_alone_stays():
+def test_isolated_small_site_remains():
     layout = fs.Layout.from_polygons([shapely.box(0, 0, 4, 4), shapely.box(9, 9, 10, 10)])
 
     assert merge_small(layout, min_size_um=2.0).n_sites == 2
 
 
-def test_a_hole_is_filled_with_sites_of_the_minimum_size_and_the_nearest_columns():
+def test_fill_covers_gap_with_nearest_columns():
     layout = grid(n_x=20, n_y=20, pitch_um=2.0).with_columns(channel=np.repeat([0, 1], 200))
     hole = shapely.Point(0, 0).buffer(9.0)
-    punched = fs.layout.cut_out(layout, hole, cut="drop")
-    open_part = shapely.box(-20, -20, 20, 20).difference(shapely.union_all(punched.polygons()))
-    filled = fill(punched, shapely.box(-20, -20, 20, 20), size_um=1.0)
-    new = filled[punched.n_sites :]
+    remaining = fs.layout.cut_out(layout, hole, cut="drop")
+    open_part = shapely.box(-20, -20, 20, 20).difference(shapely.union_all(remaining.polygons()))
+    filled = fill(remaining, shapely.box(-20, -20, 20, 20), size_um=1.0)
+    new = filled[remaining.n_sites :]
 
     assert_tiles(filled, shapely.box(-20, -20, 20, 20))
     assert_tiles(new, open_part)
@@ -175,25 +175,25 @@ def filled_log_polar(draw):
     }
 
 
-@pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # coarse ratios end inside r_max_um
+@pytest.mark.filterwarnings("ignore::foveasim.errors.LayoutWarning")  # large ratios end below r_max_um
 @relaxed
 @given(parameters=filled_log_polar(), fovea=st.sampled_from(["rings", "linear", "hexagons"]))
-def test_a_filled_fovea_leaves_no_gap_and_no_site_below_the_minimum(parameters, fovea):
+def test_filled_fovea_tiles_with_minimum_size(parameters, fovea):
     layout = log_polar(**parameters, fovea=fovea)
     around = log_polar(**parameters)
-    blind = layout[: layout.n_sites - around.n_sites]
+    fovea_sites = layout[: layout.n_sites - around.n_sites]
 
     assert_tiles(layout, hull_disc(layout))
     assert around.n_sites < layout.n_sites
-    assert size_um(blind).min() >= parameters["min_size_um"]
-    assert layout.area_um2[blind.n_sites :].sum() + blind.area_um2.sum() == pytest.approx(
+    assert size_um(fovea_sites).min() >= parameters["min_size_um"]
+    assert layout.area_um2[fovea_sites.n_sites :].sum() + fovea_sites.area_um2.sum() == pytest.approx(
         hull_disc(layout).area, rel=1e-9
     )
     assert "blind_radius_um" not in layout.provenance
 
 
 @pytest.mark.parametrize("fovea", ["rings", "linear"])
-def test_the_rings_of_a_fovea_are_lambda_over_lambda_minus_one(fovea):
+def test_number_of_fovea_rings_follows_ratio(fovea):
     layout = log_polar(n_sectors=60, r_min_um=20.0, r_max_um=80.0, ring_ratio=1.1, fovea=fovea)
     radius_um = np.hypot(*layout.xy_um.T)
     site = np.repeat(np.arange(layout.n_sites), np.diff(layout.ring_offsets))
@@ -201,13 +201,13 @@ def test_the_rings_of_a_fovea_are_lambda_over_lambda_minus_one(fovea):
     edges_um = np.array([radius_um[ring[site] == k].max() for k in range(ring.max() + 1)])
     heights_um = np.diff(edges_um)
 
-    # λ / (λ - 1) = 11 rings of one height, ring 0 of half of it: their border lies at 10.5 heights.
+    # λ / (λ - 1) = 11 rings of equal height, ring 0 with half of it: the outer radius is 10.5 heights.
     assert edges_um[10] == pytest.approx(20.0, rel=1e-12)
     np.testing.assert_allclose(heights_um[:10], 20.0 / 10.5, rtol=1e-12)
     assert heights_um[10] == pytest.approx(2.0, rel=1e-12)
 
 
-def test_ring_rho_of_a_log_polar_fovea_holds_6_rho_sites():
+def test_log_polar_fovea_has_6_rho_sites():
     layout = log_polar(n_sectors=60, min_size_um=2.0, r_max_um=60.0, fovea="rings")
     n_sites = np.bincount(layout.columns["ring"])
     n_fovea = int(np.flatnonzero(n_sites == 60)[0])
@@ -216,7 +216,7 @@ def test_ring_rho_of_a_log_polar_fovea_holds_6_rho_sites():
     assert set(n_sites[n_fovea:].tolist()) == {60}
 
 
-def test_spokes_of_a_linear_polar_fovea_are_spokes_outside():
+def test_linear_polar_fovea_uses_outer_sectors():
     layout = log_polar(n_sectors=48, min_size_um=2.0, r_max_um=54.0, fovea="linear")
     n_sites = np.bincount(layout.columns["ring"])
 
@@ -229,7 +229,7 @@ def test_spokes_of_a_linear_polar_fovea_are_spokes_outside():
 
 @pytest.mark.parametrize("fovea", ["rings", "linear", "hexagons"])
 @pytest.mark.parametrize("chords_per_arc", [1, 2, 3, 4, 7])
-def test_giotto_1_fills_its_disc_with_any_fovea(fovea, chords_per_arc):
+def test_giotto_1_fills_disc_with_fovea(fovea, chords_per_arc):
     layout = giotto(
         n_rho=76, n_theta=128, n_fovea=20, n_across=600, unit_um=1.0, fovea=fovea, chords_per_arc=chords_per_arc
     )
@@ -240,17 +240,17 @@ def test_giotto_1_fills_its_disc_with_any_fovea(fovea, chords_per_arc):
         assert size_um(layout[layout.columns["ring"] < 20]).min() >= 1.0
 
 
-def test_hexagons_in_a_fovea_are_hexagons_of_the_minimum_size_but_at_its_border():
+def test_inner_fovea_hexagons_have_minimum_size():
     layout = log_polar(n_sectors=90, min_size_um=2.0, r_max_um=90.0, fovea="hexagons")
-    middle = layout[layout.columns["ring"] == 0]
-    is_inside = np.hypot(*middle.centroid_um.T) < 0.8 * np.hypot(*middle.centroid_um.T).max()
+    fovea = layout[layout.columns["ring"] == 0]
+    is_inside = np.hypot(*fovea.centroid_um.T) < 0.8 * np.hypot(*fovea.centroid_um.T).max()
 
-    np.testing.assert_allclose(middle.area_um2[is_inside], 4.0, rtol=1e-6)
+    np.testing.assert_allclose(fovea.area_um2[is_inside], 4.0, rtol=1e-6)
     assert is_inside.sum() > 100
 
 
-def test_a_fovea_too_small_for_a_hexagon_is_refused():
-    with pytest.raises(ParameterError, match="'fovea' leaves no room for a hexagon of 5 µm inside the first ring"):
+def test_fovea_too_small_for_hexagon_raises():
+    with pytest.raises(ParameterError, match="'fovea' must fit a hexagon of 5 µm inside the first ring"):
         log_polar(n_sectors=4, r_min_um=2.0, r_max_um=19.0, min_size_um=5.0, ring_ratio=9.0, fovea="hexagons")
 
 
@@ -265,7 +265,7 @@ def test_a_fovea_too_small_for_a_hexagon_is_refused():
     pitch_y_um=st.floats(0.5, 9.0),
     stagger=st.booleans(),
 )
-def test_staggered_rectangles_leave_nothing_open_but_at_their_ends(n_x, n_y, pitch_um, pitch_y_um, stagger):
+def test_staggered_rectangles_tile_their_rows(n_x, n_y, pitch_um, pitch_y_um, stagger):
     layout = grid(n_x=n_x, n_y=n_y, pitch_um=pitch_um, pitch_y_um=pitch_y_um, stagger=stagger)
     rows = [shapely.box(*layout[layout.columns["row"] == row].bounds_um) for row in range(n_y)]
 
@@ -275,7 +275,7 @@ def test_staggered_rectangles_leave_nothing_open_but_at_their_ends(n_x, n_y, pit
     assert high[0] - low[0] == pytest.approx(pitch_um * (n_x + 0.5 * (stagger and n_y > 1)))
 
 
-def test_every_second_row_of_a_staggered_grid_is_half_a_pitch_to_the_right():
+def test_stagger_shifts_every_second_row():
     layout = grid(n_x=3, n_y=4, pitch_um=2.0, stagger=True)
     first_um = layout.centroid_um[layout.columns["column"] == 0, 0]
 
@@ -283,7 +283,7 @@ def test_every_second_row_of_a_staggered_grid_is_half_a_pitch_to_the_right():
 
 
 @pytest.mark.parametrize(("pitch_um", "fill"), [(1.0, 0.81), (0.7, 0.734694)])
-def test_a_trench_of_100_nm_leaves_the_published_share_of_a_pixel(pitch_um, fill):
+def test_trench_gives_published_fill_factor(pitch_um, fill):
     layout = grid(n_x=5, n_y=4, pitch_um=pitch_um, trench_um=0.1)
     same = grid(n_x=5, n_y=4, pitch_um=pitch_um, fill_factor=fill)
 
@@ -293,7 +293,7 @@ def test_a_trench_of_100_nm_leaves_the_published_share_of_a_pixel(pitch_um, fill
     assert distance_um == pytest.approx(0.1, rel=1e-9)
 
 
-def test_a_trench_is_as_wide_along_both_pitches():
+def test_trench_width_is_equal_along_both_pitches():
     layout = grid(n_x=2, n_y=2, pitch_um=2.0, pitch_y_um=5.0, trench_um=0.5)
 
     assert layout.area_um2 == pytest.approx(1.5 * 4.5)
@@ -301,7 +301,7 @@ def test_a_trench_is_as_wide_along_both_pitches():
 
 
 @pytest.mark.parametrize("orientation", ["pointy", "flat"])
-def test_the_trench_of_hexagons_is_the_distance_of_their_sides(orientation):
+def test_hexagon_trench_is_distance_of_sides(orientation):
     layout = hexagonal(n_columns=2, n_rows=1, pitch_um=75.0, trench_um=5.0, orientation=orientation)
 
     assert shapely.distance(*layout.polygons()) == pytest.approx(5.0)
@@ -313,15 +313,18 @@ def test_the_trench_of_hexagons_is_the_distance_of_their_sides(orientation):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"width_um": 1.0, "trench_um": 0.1}, "'width_um' 'trench_um' and 'fill_factor' say the same; give one"),
+        (
+            {"width_um": 1.0, "trench_um": 0.1},
+            "'width_um' and 'trench_um' and 'fill_factor' exclude each other; give one",
+        ),
         ({"trench_um": 2.0}, "'trench_um' must be < 2, the pitch, got 2.0 µm"),
         ({"trench_um": -0.1}, "'trench_um' must be >= 0"),
         ({"fill_factor": 1.1}, "'fill_factor' must be <= 1"),
         ({"fill_factor": 0.0}, "'fill_factor' must be > 0"),
-        ({"pitch_y_um": 3.0, "width_um": 1.0}, "'width_um' is the side of squares; with 'pitch_y_um' give 'trench_um'"),
+        ({"pitch_y_um": 3.0, "width_um": 1.0}, "'width_um' must be replaced by 'trench_um' if 'pitch_y_um' is given"),
     ],
 )
-def test_trenches_that_cannot_be_are_refused(changes, message):
+def test_grid_rejects_invalid_trenches(changes, message):
     with pytest.raises(ParameterError, match=message):
         grid(n_x=2, n_y=2, pitch_um=2.0, **changes)
 
@@ -340,7 +343,7 @@ OUTLINES = [
     pitches_um=st.tuples(st.floats(0.8, 2.0), st.floats(1.5, 4.0), st.floats(3.0, 8.0)),
     cells=st.tuples(*[st.sampled_from(["hexagons", "squares"])] * 3),
 )
-def test_zones_of_any_outline_tile_the_outermost(pitches_um, cells):
+def test_zones_of_outlines_tile_outermost(pitches_um, cells):
     layout = zones(outlines_um=OUTLINES, pitch_um=pitches_um, cells=cells)
 
     assert_tiles(layout, OUTLINES[-1])
@@ -349,14 +352,14 @@ def test_zones_of_any_outline_tile_the_outermost(pitches_um, cells):
         assert layout.area_um2[layout.columns["zone"] == zone].sum() == pytest.approx(ring_um2, rel=1e-9)
 
 
-def test_square_zones_of_hexagons_need_not_fit_whole_pixels():
+def test_hexagons_fill_zone_of_any_side():
     layout = zones(side_um=(10.0, 33.3), pitch_um=(1.0, 3.0), cells=("squares", "hexagons"))
 
     assert_tiles(layout, shapely.box(-16.65, -16.65, 16.65, 16.65))
     np.testing.assert_allclose(layout.area_um2[layout.columns["zone"] == 0], 1.0, rtol=1e-9)
 
 
-def test_lines_of_zones_of_any_outline_are_numbered_through():
+def test_zone_lines_are_numbered_consecutively():
     layout = zones(outlines_um=OUTLINES, pitch_um=(1.0, 2.0, 4.0))
     ends = [
         (layout.readout_line[layout.columns["zone"] == k].min(), layout.readout_line[layout.columns["zone"] == k].max())
@@ -371,14 +374,14 @@ def test_lines_of_zones_of_any_outline_are_numbered_through():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"side_um": (1, 2, 3)}, "'side_um' or 'outlines_um' must be given: one of them"),
+        ({"side_um": (1, 2, 3)}, "'side_um' or 'outlines_um' must be given, but only one of them"),
         ({"outlines_um": OUTLINES[:2]}, "'outlines_um' and 'pitch_um' must have the same length of at least 1, got 2"),
         ({"outlines_um": OUTLINES[::-1]}, r"'outlines_um\[1\]' must lie around 'outlines_um\[0\]' and be larger"),
         ({"cells": "triangles"}, "'cells' must be one of 'hexagons', 'squares'"),
-        ({"cells": ("squares", "squares")}, "'cells' must be one or one for each of the 3 zones, got 2"),
+        ({"cells": ("squares", "squares")}, "'cells' must be one shape, or one for each of the 3 zones, got 2"),
         ({"cells": ("squares", "squares", "x")}, r"'cells\[2\]' must be one of 'hexagons', 'squares'"),
     ],
 )
-def test_zones_that_cannot_be_are_refused(changes, message):
+def test_zones_reject_invalid_outlines_or_cells(changes, message):
     with pytest.raises(ParameterError, match=message):
         zones(**{"outlines_um": OUTLINES, "pitch_um": (1.0, 2.0, 4.0), **changes})
