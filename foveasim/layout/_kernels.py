@@ -256,7 +256,7 @@ def _edge_to_edge(xy, a, b, c, d):
 
 @njit()
 def _edges_meeting(xy, a, b, c, d):
-    """Return the distance between edges a-b and c-d, and that apart from a common end point."""
+    """Return the distance of edges a-b and c-d, also with a common end point excluded."""
     is_ac, is_ad, is_bc, is_bd = _is_same(xy, a, c), _is_same(xy, a, d), _is_same(xy, b, c), _is_same(xy, b, d)
     if is_ac and is_bd:
         return 0.0, 0.0
@@ -335,7 +335,7 @@ def _common_edges(xy, after, box, overhang, depth, i_first, i_last, j, j_first, 
 
 @njit()
 def _nearest_edges(xy, after, box, i_first, i_last, j, j_first, j_last, nearest, reach, touching):
-    """Return the distance between outlines, and that apart from common vertices and edges."""
+    """Return the outline distance, also with common vertices and edges excluded."""
     besides = np.inf
     for a in range(i_first, i_last):
         b = after[a]
@@ -435,9 +435,7 @@ def shared_lengths(xy, after, first_vertex, first, second, max_gap):
                 if end - begin <= CORNER_UM:
                     continue
                 slope = ((cy - dy) * ex - (cx - dx) * ey) / (high - low)
-                away = (
-                    dy * ex - dx * ey - slope * low
-                )  # distance of the line of the other edge at the start of this one
+                away = dy * ex - dx * ey - slope * low  # distance of the line of the other edge at (ax, ay)
                 if abs(away + slope * begin) <= max_gap and abs(away + slope * end) <= max_gap:
                     lengths[pair] += end - begin
     return lengths

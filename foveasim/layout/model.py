@@ -335,7 +335,7 @@ class Layout:
         Raises
         ------
         ParameterError
-            When the layout has no such column, or it contains other values than integers from 0 to the maximum.
+            When the layout has no such column, or its values are not valid indices.
         """
         if name not in self.columns:
             raise ParameterError(name, f"must be a column of the layout, which has {sorted(self.columns)}")
