@@ -319,7 +319,7 @@ def test_schema_contains_parameters_of_calls():
     ):
         assert f'"{name}"' in text
     assert schema()["title"] == "foveasim settings"
-    assert "Smallest pixel that can be made" in text
+    assert "Minimum pixel size that can be manufactured" in text
     assert schema()["required"] == ["scene", "optics", "layout", "exposure_s"]
 
 
