@@ -1,4 +1,4 @@
-"""Many cameras: sweeps over the settings of a shot, here or on a dask scheduler, and searches for the best settings."""
+"""Parameter sweeps, optimisation studies and simulated image datasets."""
 
 from __future__ import annotations
 

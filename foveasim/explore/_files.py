@@ -1,4 +1,4 @@
-"""Files that results depend on, by their checksums: those that settings name, and those that these name in turn."""
+"""Checksums of the files that results depend on, including indirectly referenced files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ __all__ = ["digests"]
 
 def digests(files: Iterable[Path]) -> dict[str, str]:
     """
-    SHA-256 of files, and of those that are named in them: the picture of a density in a layout's file, say.
+    Compute the SHA-256 of files and of the files that they reference.
+
+    A layout file, for example, may reference the picture of a density.
 
     Parameters
     ----------
@@ -24,7 +26,7 @@ def digests(files: Iterable[Path]) -> dict[str, str]:
     Returns
     -------
     digests : dict of str to str
-        By the files' names; empty where there is none, which whoever reads it will tell.
+        By file path. Empty for a missing file; the reader of the file reports it.
     """
     found: dict[str, str] = {}
     left = list(files)
@@ -42,7 +44,7 @@ def _named_in(file: Path) -> list[Path]:
     named: list[Path] = []
     try:
         files_from(file.parent, read_yaml(file), found=named)
-    except ConfigError:  # whoever builds what it describes tells what is wrong
+    except ConfigError:  # reported when the settings are built
         return []
     return named
 

@@ -1,4 +1,4 @@
-"""Identity of users' functions: results are reused only where the function that gave them does the same."""
+"""Identities of user functions: stored results are reused only for equal functions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["identity_of", "own_module"]
 
 
 def own_module(thing: Any) -> str | None:
-    """Return the module of a function or class where it is the user's: the main program, or a file that is not installed."""
+    """Return the user module (main program or uninstalled file) of an object, or None."""
     name = getattr(thing, "__module__", None)
     if not isinstance(name, str) or name.partition(".")[0] == "foveasim":
         return None
@@ -32,17 +32,18 @@ def own_module(thing: Any) -> str | None:
 
 def identity_of(function: Callable[..., Any]) -> str:
     """
-    Return a function's module and name, with a token of what it does unless it is of an installed package.
+    Return the module and name of a function, with a content token for user functions.
 
     The token covers code, constants, defaults, captured values (of closures, partial functions and objects), and the functions
-    and variables of the user's own modules that it uses. It is equal in all processes and runs of one program, and changes
-    with any of these, but not with comments. Dask's own token of a function is that of its pickle, which differs from process
-    to process (hash seeds) and with line numbers, or is just the name; so functions are taken apart first.
+    and variables of user modules that the function uses. It is equal in all processes and runs of one program, changes with
+    any of these, and does not depend on comments. Functions of installed packages have no token. The token that dask computes
+    for a function is derived from its pickle, which depends on hash seeds and line numbers, or is just the name; functions
+    are therefore split into their parts first.
 
     Raises
     ------
     ParameterError
-        When dask is missing.
+        When dask is not installed.
     """
     name = f"{getattr(function, '__module__', '')}:{getattr(function, '__qualname__', type(function).__qualname__)}"
     if isinstance(function, FunctionType) and own_module(function) is None and function.__closure__ is None:
@@ -55,11 +56,11 @@ def identity_of(function: Callable[..., Any]) -> str:
 
 
 def _parts_of(thing: Any, seen: dict[int, tuple[int, Any]]) -> Any:
-    """Return nested lists of values, with a number for a part that was met before."""
+    """Return nested lists of values, with a number in place of a repeated part."""
     parts = _parts(thing)
     if parts is None:
         return thing
-    # Whether equal constants are one object depends on how the code was loaded. The rest is kept, so that its id stays.
+    # Whether equal constants are one object depends on how the code was loaded. References keep the ids of other parts valid.
     if not isinstance(thing, tuple | frozenset | CodeType):
         if id(thing) in seen:
             return ["part", seen[id(thing)][0]]
@@ -68,11 +69,11 @@ def _parts_of(thing: Any, seen: dict[int, tuple[int, Any]]) -> Any:
 
 
 def _parts(thing: Any) -> Iterator[Any] | None:
-    """Parts of a function, of what belongs to one, or of a container; None of a value, which dask has a token for."""
+    """Return the parts of a function, class or container; None for values that dask tokenizes."""
     if isinstance(thing, list | tuple):
         return iter(thing)
     if isinstance(thing, set | frozenset):
-        return iter(sorted(thing, key=repr))  # their order depends on the hash seed
+        return iter(sorted(thing, key=repr))  # the iteration order depends on the hash seed
     if isinstance(thing, dict):
         return (part for item in thing.items() for part in item)
     if isinstance(thing, functools.partial):
@@ -80,7 +81,7 @@ def _parts(thing: Any) -> Iterator[Any] | None:
     if isinstance(thing, MethodType):
         return iter((thing.__func__, thing.__self__))
     if isinstance(thing, CodeType):
-        # Names of arguments and variables, but no line numbers.
+        # Names of arguments and variables; line numbers do not change the behaviour.
         return iter((thing.co_code, thing.co_names, thing.co_consts, thing.co_varnames[: thing.co_argcount]))
     if isinstance(thing, ModuleType):
         return iter((thing.__name__,))
@@ -103,7 +104,7 @@ def _parts_of_function(function: FunctionType) -> Iterator[Any]:
             yield cell.cell_contents
         except ValueError:  # a variable without a value
             yield CellType
-    # Installed packages are known by their versions.
+    # Package versions identify installed functions.
     if own_module(function) is not None:
         yield function.__code__
         names = _global_names(function.__code__)
@@ -111,7 +112,7 @@ def _parts_of_function(function: FunctionType) -> Iterator[Any]:
 
 
 def _members(kind: type) -> Iterator[Any]:
-    """Yield names, functions and constants of a class."""
+    """Yield the names, functions and constants of a class."""
     for name, member in sorted(vars(kind).items()):
         inside = getattr(
             member, "__func__", getattr(member, "fget", member)
@@ -123,7 +124,7 @@ def _members(kind: type) -> Iterator[Any]:
 
 
 def _global_names(code: CodeType) -> Iterator[str]:
-    """Yield names of module variables in a function, and in those inside it."""
+    """Yield the names of module variables in a function and its nested functions."""
     yield from code.co_names
     for part in code.co_consts:
         if isinstance(part, CodeType):

@@ -1,4 +1,4 @@
-"""What a point of a sweep is worth, in numbers: metrics by name, and any function of a shot, its camera and its capture."""
+"""Registered metrics of a capture, and the lookup of metrics by name or function."""
 
 from __future__ import annotations
 
@@ -31,37 +31,38 @@ __all__ = [
     "with_more_metrics",
 ]
 
-#: A function of a shot, its camera and its capture, which gives a number, a mapping of names to such, or an array with labels.
+#: A function of a shot, its camera and its capture that returns a number, a mapping of names to numbers, or a labelled array.
 Metric = Callable[[Shot, Camera, Capture], Any]
 
-#: Metrics by their names. Installed packages add theirs as entry points of the group ``foveasim.metrics``.
+#: Metrics by name. Installed packages add metrics as entry points of the group ``foveasim.metrics``.
 METRICS: Registry[Metric] = Registry("metric", "foveasim.metrics")
-#: Side of the pictures that are compared.
+#: Side of the compared pictures, pixels.
 PSNR_PIXELS = 256
-#: Names that results have beside metrics.
+#: Variables and dimensions of results that are not metrics.
 RESERVED = ("seed", "error", "warning", "point", "repeat")
-#: Metrics of a sweep that names none.
+#: Default metrics of a sweep.
 DEFAULT_METRICS = ("mean_code_dn", "saturated_fraction", "snr", "n_sites")
 
 
 @METRICS.register("mean_code_dn")
 def mean_code_dn(shot: Shot, camera: Camera, capture: Capture) -> float:  # noqa: ARG001 -- the signature of metrics
-    """Mean of the codes, DN."""
+    """Return the mean code, DN."""
     return float(np.mean(capture.code))
 
 
 @METRICS.register("saturated_fraction")
 def saturated_fraction(shot: Shot, camera: Camera, capture: Capture) -> float:  # noqa: ARG001
-    """Fraction of the sites that gave the highest code."""
+    """Return the fraction of sites with the highest code."""
     return capture.saturated_fraction
 
 
 @METRICS.register("snr")
 def snr(shot: Shot, camera: Camera, capture: Capture) -> dict[str, float]:
     """
-    Signal over temporal noise, predicted without a draw: mean and median over the sites.
+    Compute the mean and median signal-to-noise ratio of the sites analytically.
 
-    The ratio of :func:`foveasim.sensor.signal_to_noise`. Saturated sites are left out; NaN where all are.
+    The ratio is that of :func:`foveasim.sensor.signal_to_noise`: signal over temporal noise. Saturated sites are excluded; the
+    result is NaN when all sites are saturated.
     """
     sensor = camera.sensor
     dark_e = sensor.expected_electrons(np.zeros(sensor.layout.n_sites), shot.exposure_s)
@@ -74,16 +75,16 @@ def snr(shot: Shot, camera: Camera, capture: Capture) -> dict[str, float]:
 
 @METRICS.register("n_sites")
 def n_sites(shot: Shot, camera: Camera, capture: Capture) -> int:  # noqa: ARG001
-    """Photosites of the layout."""
+    """Return the number of photosites of the layout."""
     return capture.layout.n_sites
 
 
 @METRICS.register("data_rate_gbit_per_s")
 def data_rate_gbit_per_s(shot: Shot, camera: Camera, capture: Capture) -> float:
     """
-    Data rate of one lane, Gbit/s.
+    Return the data rate of one lane, Gbit/s.
 
-    Of the readout in the layout's design rules; without one, of frames without a pause, one an exposure.
+    The readout of the design rules determines the rate. Without a readout, one frame per exposure time is assumed.
     """
     if shot.rules is not None and shot.rules.readout is not None:
         readout = shot.rules.readout
@@ -93,31 +94,37 @@ def data_rate_gbit_per_s(shot: Shot, camera: Camera, capture: Capture) -> float:
 
 
 def light_behind_lens(shot: Shot, camera: Camera) -> Picture:
-    """What the picture of a perfect sensor would be: of light, layout and exposure alone, and the same for any noise."""
+    """Return the noise-free picture of an ideal sensor for a scene, layout and exposure."""
     grid = raster_grid(camera.sensor.layout, PSNR_PIXELS)
     return camera.reference(shot.scene, grid, exposure_s=shot.exposure_s)
 
 
 @METRICS.register("psnr_db")
 def picture_psnr_db(shot: Shot, camera: Camera, capture: Capture, reference: Picture | None = None) -> float:
-    """PSNR of the picture of cells, in photoelectrons per µm², against the light behind the lens, dB."""
+    """
+    Compute the PSNR of the reconstructed picture against the ideal picture, dB.
+
+    Both are rasters of photoelectrons per µm²; the reference is that of :func:`light_behind_lens`.
+    """
     reference = light_behind_lens(shot, camera) if reference is None else reference
     picture = capture.picture(of="light_e", per="um2", grid=reference.grid, sensor=camera.sensor)
     return psnr_db(picture, reference)
 
 
-#: What a metric may be given beside its capture, of light, layout and exposure alone: many captures share it.
+#: Functions that compute the reference of a metric. It depends on scene, layout and exposure only, so captures share it.
 REFERENCES: dict[Callable[..., Any], Callable[[Shot, Camera], Any]] = {picture_psnr_db: light_behind_lens}
 
 
 def metric_of(name: str) -> Metric:
     """
-    The function that ``"module:function"`` names, for the command line: it imports the module, and so runs it.
+    Import the function that ``"module:function"`` names, for the command line.
+
+    The import runs the code of the module. The current directory is searched too.
 
     Raises
     ------
     ParameterError
-        When there is no such module or function.
+        When the module cannot be imported or has no such function.
     """
     module, _, function = name.partition(":")
     folder = str(Path.cwd())
@@ -125,10 +132,8 @@ def metric_of(name: str) -> Metric:
         sys.path.insert(0, folder)
     try:
         found = getattr(importlib.import_module(module), function)
-    except Exception as error:  # noqa: BLE001 -- whatever a module raises while it is imported
-        raise ParameterError(
-            "metric", f"must be module:function of a module that can be imported ({error})", name
-        ) from None
+    except Exception as error:  # noqa: BLE001 -- a module may raise anything while it is imported
+        raise ParameterError("metric", f"must be module:function of an importable module ({error})", name) from None
     if not callable(found):
         raise ParameterError("metric", "must name a function", name)
     metric: Metric = found
@@ -137,12 +142,12 @@ def metric_of(name: str) -> Metric:
 
 def named_metrics(metrics: Iterable[str | Metric] | Mapping[str, Metric] | None) -> dict[str, Metric]:
     """
-    Metrics by the names that results get.
+    Return metrics by the names of their results.
 
     Raises
     ------
     ParameterError
-        When a name is none of :data:`METRICS`, stands there twice, or a metric is no function.
+        When a name is not in :data:`METRICS` or occurs twice, or a metric is not a function.
     """
     if metrics is None:
         metrics = DEFAULT_METRICS
@@ -160,48 +165,49 @@ def named_metrics(metrics: Iterable[str | Metric] | Mapping[str, Metric] | None)
         if metric is None:
             raise ParameterError(
                 "metrics",
-                f"must be of {', '.join(sorted(METRICS))}",
+                f"must be one of {', '.join(sorted(METRICS))}",
                 name,
-                hint="functions of your own are given in Python, or with --metric module:function",
+                hint="pass other functions in Python, or with --metric module:function",
             )
         if not callable(metric):
-            raise ParameterError("metrics", "must be names or functions", metric)
+            raise ParameterError("metrics", "must be names of metrics or functions", metric)
         if not isinstance(name, str) or not name.isidentifier():
-            raise ParameterError("metrics", "must have names that are identifiers: name functions by a mapping", name)
+            raise ParameterError("metrics", "must have names that are identifiers (use a mapping of names)", name)
         if name in RESERVED:
-            raise ParameterError("metrics", f"must have names that results do not have already, not '{name}'")
+            raise ParameterError("metrics", f"must not have the reserved name '{name}'")
         if name in found:
-            raise ParameterError("metrics", "must have a name each; there are two of this one", name)
+            raise ParameterError("metrics", "must have unique names", name)
         found[name] = metric
     if not found:
-        raise ParameterError("metrics", "must be at least one")
+        raise ParameterError("metrics", "must contain at least one metric")
     return found
 
 
 def with_more_metrics(metrics: Mapping[str, Metric], names: Iterable[str]) -> dict[str, Metric]:
     """
-    Metrics of a file, and those that the command line names beside them.
+    Return the metrics of a file and those of the command line.
 
     Parameters
     ----------
     metrics : mapping of str to function
+        Metrics of the file.
     names : iterable of str
-        Names of :data:`METRICS`, or ``module:function``, which is imported and so runs.
+        Names in :data:`METRICS`, or ``module:function``. The import of a module runs its code.
 
     Raises
     ------
     ParameterError
-        When there is no such metric, or one of the same name.
+        When a metric does not exist, or its name is already used.
     """
     found = dict(metrics)
     for name in names:
         for own, metric in named_metrics([metric_of(name) if ":" in name else name]).items():
             if own in found:
-                raise ParameterError("metric", "must have a name of its own; there is one of this name already", own)
+                raise ParameterError("metric", "must have a unique name; another metric has this name", own)
             found[own] = metric
     return found
 
 
 def gives(metric: str, result: str) -> bool:
-    """Whether a metric of a name may give a result of a name: its own, or one of the numbers in a mapping that it gives."""
+    """Return whether a result name is that of a metric, or of an item of its mapping."""
     return result == metric or result.startswith(metric + "_")

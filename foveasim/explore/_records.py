@@ -1,4 +1,4 @@
-"""What points gave, as plain data; and the journal that they are written to, one by one, while a sweep runs."""
+"""Results of sweep points as plain data, and the journal file of a running sweep."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from foveasim.errors import FileError, ParameterError
 __all__ = ["ENDED_ITS_WORKER", "Journal", "Record", "Value", "check_new", "check_same_plan", "journal_of", "values_of"]
 
 FORMAT, VERSION = "foveasim sweep", 1
-#: How a journal begins: a checksum, and what it is.
+#: Beginning of a journal: a checksum and the format.
 TORN_HEAD = rb'[0-9a-f]{1,8} \{"format": "foveasim'
-#: So long a journal's lines may wait for the disk.
+#: Longest time before journal lines are synchronised to the disk, seconds.
 SYNC_S = 1.0
-#: Error of a point that ended its worker each time it was tried.
-ENDED_ITS_WORKER = "ended its worker each time: too little memory, or a crash in a metric"
-#: What a metric may give that is no array.
+#: Error of a point whose worker process ended in every attempt.
+ENDED_ITS_WORKER = "worker process ended in every attempt: out of memory, or a crash in a metric"
+#: Results of metrics other than arrays.
 Scalar = bool | int | float | str
 
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """An array of a metric, with names of its dimensions and labels of those that have some."""
+    """Array result of a metric, with dimension names and optional labels."""
 
     data: NDArray[Any]
     dims: tuple[str, ...]
@@ -45,7 +45,7 @@ class Value:
 
 @dataclass(frozen=True)
 class Record:
-    """What a point gave: values by names, what went wrong, and warnings; the texts are empty when all is well."""
+    """Values of one point by name, its error message and its warnings (empty if none)."""
 
     point: int
     values: Mapping[str, Scalar | Value]
@@ -55,12 +55,12 @@ class Record:
 
 def values_of(name: str, given: Any) -> dict[str, Scalar | Value]:
     """
-    What a metric gave, by the names of variables.
+    Convert the result of a metric to values by variable name.
 
     Raises
     ------
     ParameterError
-        When it is none of a number, a text, a mapping, an array, or an array with labels, or cannot be kept in a store.
+        When the result is not a number, string, mapping, array or labelled array, or cannot be stored.
     """
     if isinstance(given, Mapping):
         found: dict[str, Scalar | Value] = {}
@@ -78,26 +78,26 @@ def values_of(name: str, given: Any) -> dict[str, Scalar | Value]:
         labels = {str(dim): given.coords[dim].values for dim in given.dims if dim in given.coords}
         return {name: _value(name, given.values, dims, labels)}
     raise ParameterError(
-        name, f"must give a number, a text, a mapping, an array or an array with labels, got a {type(given).__name__}"
+        name, f"must return a number, a string, a mapping, an array or a labelled array, got a {type(given).__name__}"
     )
 
 
 def check_new(found: Collection[str], more: Iterable[str]) -> None:
     """
-    Whether variables have other names than those before.
+    Check that the names of new variables are not used yet.
 
     Raises
     ------
     ParameterError
-        With the name.
+        With the repeated name.
     """
     twice = next((name for name in more if name in found), None)
     if twice is not None:
-        raise ParameterError(twice, "must be the name of one result; there are two of it")
+        raise ParameterError(twice, "must be a unique result name, got two results")
 
 
 def _name(name: str) -> str:
-    """The name of a variable or a dimension, which is a folder in the store."""
+    """Return a name after checking that it is valid for an array directory of the store."""
     if (
         not name.isprintable()
         or not name.strip(". ")
@@ -105,31 +105,31 @@ def _name(name: str) -> str:
         or set(name) & {"/", "\\"}
         or len(name) > 100
     ):
-        raise ParameterError(name[:100], "cannot be the name of a result: it must be a short text without '/'")
+        raise ParameterError(name[:100], "must be a short printable string without '/', as the name of a result")
     return name
 
 
 def _value(name: str, data: Any, dims: tuple[str, ...], labels: Mapping[str, Any]) -> Scalar | Value:
-    """An array with its labels; a number or text where it has no dimensions."""
+    """Return an array with its labels, or a number or string for a 0-d array."""
     array = _simple(name, data)
     if not dims:
         return _scalar(name, array.item())
     if len(set(dims)) < len(dims):
-        raise ParameterError(name, f"must have dimensions of different names, got {', '.join(dims)}")
+        raise ParameterError(name, f"must have unique dimension names, got {', '.join(dims)}")
     simple = {dim: _simple(name, each) for dim, each in labels.items()}
     for dim, each in simple.items():
         if len(set(each.tolist())) < each.size or (each.dtype.kind == "f" and np.isnan(each).any()):
-            raise ParameterError(name, f"must have a different label for each value along '{dim}', and no NaN")
+            raise ParameterError(name, f"must have unique labels along '{dim}', without NaN")
     return Value(array, dims, simple)
 
 
 def _simple(name: str, array: Any) -> NDArray[Any]:
-    """An array of numbers or texts that any store takes."""
+    """Convert data to an array of numbers or strings that every store supports."""
     array = np.asarray(array)
     if array.dtype.kind == "T" or (array.dtype.kind == "O" and all(isinstance(item, str) for item in array.flat)):
         array = array.astype(str)
     if array.dtype.kind not in "biufU":
-        raise ParameterError(name, f"must give numbers or texts, got an array of {array.dtype}")
+        raise ParameterError(name, f"must return numbers or strings, got an array of {array.dtype}")
     if array.dtype.kind == "f" and array.dtype.itemsize > np.dtype(np.float64).itemsize:
         array = array.astype(np.float64)
     if array.dtype.kind == "U":
@@ -138,12 +138,12 @@ def _simple(name: str, array: Any) -> NDArray[Any]:
 
 
 def _scalar(name: str, given: Scalar) -> Scalar:
-    """A number or text that any store takes."""
+    """Convert a number or string to a value that every store supports."""
     if isinstance(given, str):
         try:
             given.encode()
         except UnicodeEncodeError:
-            raise ParameterError(name, "must give texts of Unicode characters, got a lone half of one", given) from None
+            raise ParameterError(name, "must return valid Unicode strings, without lone surrogates", given) from None
     elif isinstance(given, int) and given.bit_length() > 63:
         return float(given)
     return given
@@ -153,17 +153,21 @@ def _scalar(name: str, given: Scalar) -> Scalar:
 
 
 def journal_of(store: Path) -> Path:
-    """The journal beside a store: there while a sweep runs, and after one that was ended or has points that failed."""
+    """
+    Return the path of the journal of a store.
+
+    The journal exists while a sweep runs, after an interruption, and after a sweep with failed points.
+    """
     return store.with_name(store.name + ".journal")
 
 
 class Journal:
     """
-    A file of records, a line each, which is whole after any end of the program.
+    File of records, one per line, that remains valid after any interruption.
 
-    A line has a checksum, and only whole lines count: what a sudden end cut off is done again. The system has every line at
-    once, whatever becomes of the program; the disk gets lines every second, so that a power cut costs little more than the work
-    of a second, or of the last point. The file is locked while it is open, so that two programs never write it at once.
+    Every line has a checksum; truncated lines are ignored and their points computed again. Each line is passed to the operating
+    system at once, so a crash of the program loses none. Lines are synchronised to the disk every second, so a power failure
+    loses about one second of results, or the last point. The file is locked while it is open: only one program writes it.
     """
 
     def __init__(self, store: Path, plan: Mapping[str, Any]) -> None:
@@ -189,7 +193,7 @@ class Journal:
                 self.records[record.point] = record
 
     def _begin(self, head: Mapping[str, Any]) -> list[tuple[Any, int]]:
-        """The whole lines that are there, of the same plan; the head when there are none."""
+        """Return the existing lines of the same plan; write the header to a new journal."""
         if not lock(self._file):
             raise FileError(self._store, "is being written by another program that runs the same sweep")
         self._file.seek(0)
@@ -223,7 +227,7 @@ class Journal:
         Raises
         ------
         FileError
-            When the disk is full, say; what was written before is whole.
+            When writing fails, for example on a full disk. Records that were written before remain valid.
         """
         try:
             self._write(_line(record))
@@ -232,19 +236,19 @@ class Journal:
                 self._file.truncate(self._end)
             raise FileError(
                 self.path,
-                f"cannot be written: {error.strerror or error}; {len(self.records):,} points are kept in it, and the same "
-                "sweep goes on from there",
+                f"cannot be written: {error.strerror or error}; it contains {len(self.records):,} points, from which the "
+                "same sweep resumes",
             ) from None
         self.records[record.point] = record
 
     def remove(self) -> None:
-        """Take the file away: its records are in the store."""
+        """Remove the file once its records are in the store."""
         self.path.unlink(missing_ok=True)
 
     def _write(self, line: Any) -> None:
         text = json.dumps(line).encode()
         whole = b"%08x %s\n" % (zlib.crc32(text), text)
-        # Past Python's buffer: the system has the line, whatever becomes of this process.
+        # Unbuffered: the operating system has the line even when this process crashes.
         left = memoryview(whole)
         while left:
             left = left[os.write(self._file.fileno(), left) :]
@@ -253,13 +257,13 @@ class Journal:
             self._sync()
 
     def _sync(self) -> None:
-        """The lines on the disk, whatever becomes of the machine."""
+        """Synchronise the file to the disk, against power failures."""
         os.fsync(self._file.fileno())
         self._synced_s = time.monotonic()
 
 
 def _lines(file: IO[bytes]) -> Iterator[tuple[Any, int]]:
-    """What the whole lines of a journal say, None where one is broken, and their lengths; nothing of a torn last line."""
+    """Yield the data (None if corrupt) and length of each line, without a truncated last line."""
     for line in file:
         if not line.endswith(b"\n"):
             return
@@ -272,21 +276,21 @@ def _lines(file: IO[bytes]) -> Iterator[tuple[Any, int]]:
 
 
 def _is_torn_head(text: bytes) -> bool:
-    """Whether a file without a whole line is empty, or what a sudden end left of a journal that was just begun."""
+    """Return whether a file is empty or contains a truncated journal header."""
     return not text.strip(b"\0") or re.match(TORN_HEAD, text) is not None
 
 
 def _check_same(path: Path, found: Any, head: Mapping[str, Any]) -> None:
     """
-    Whether a journal is of a plan.
+    Check that a journal belongs to a plan.
 
     Raises
     ------
     FileError
-        When it is of another.
+        When it belongs to another plan.
     """
     if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise FileError(path, "is no sweep's journal")
+        raise FileError(path, "is not a sweep journal; move it, or write the results elsewhere")
     if found.get("version") != VERSION:
         raise FileError(path, f"has the format version {found.get('version')}, expected {VERSION}")
     check_same_plan(path, found.get("plan", {}), head["plan"])
@@ -294,19 +298,19 @@ def _check_same(path: Path, found: Any, head: Mapping[str, Any]) -> None:
 
 def check_same_plan(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
     """
-    Whether results are of a plan.
+    Check that results belong to a plan.
 
     Raises
     ------
     FileError
-        When they are of another.
+        When they belong to another plan.
     """
     wanted = json.loads(json.dumps(wanted))
     different = next(differences(found, wanted), None)
     if different is not None:
         raise FileError(
             path,
-            f"is of another sweep or study: '{different}' differs; write this one under another name, or remove that one",
+            f"belongs to another sweep or study: '{different}' differs; use another name, or remove the existing results",
         )
 
 

@@ -1,4 +1,4 @@
-"""JSON schemas of the files that the program reads, of the models that it reads them with."""
+"""JSON schemas of settings files, derived from the models that validate them."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from foveasim.explore.sweeps.plan import SweepSection
 
 __all__ = ["schema_of"]
 
-#: Sorts of files, with their models.
+#: Models of the file kinds.
 FILES: dict[str, Any] = {"sweep": SweepSection, "study": StudySection, "dataset": DatasetSection}
 
 
 def schema_of(kind: str) -> dict[str, Any]:
     """
-    JSON schema of a file.
+    Return the JSON schema of a file kind.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def schema_of(kind: str) -> dict[str, Any]:
     Raises
     ------
     ParameterError
-        When it is none of these.
+        When ``kind`` is none of these.
     """
     check_choice("kind", kind, ("shot", *FILES))
     return schema(FILES[kind], f"foveasim {kind}") if kind in FILES else schema()

@@ -1,4 +1,4 @@
-"""The dask that points are sent to: processes on this machine, or a scheduler that somebody started; and its workers."""
+"""Dask clusters for simulations: local worker processes, or an external scheduler."""
 
 from __future__ import annotations
 
@@ -20,39 +20,50 @@ if TYPE_CHECKING:
 
 __all__ = ["WorkerStates", "client_of", "dask_setup"]
 
-#: Time that a scheduler has to answer.
+#: Timeout of a scheduler, seconds.
 SCHEDULER_S = 10.0
-#: Seconds after which a task that waits at a paused worker is sent elsewhere; workers report every second or so.
+#: Seconds after which a task of a paused worker is sent to another worker; workers report about once per second.
 PAUSED_S = 10.0
-#: What our own workers do about memory. A worker that dask pauses may wait for ever for memory that a metric keeps; one that
-#: is ended is begun again without it.
+#: Memory limits of local workers. A worker that dask pauses may wait forever for memory that a metric occupies; a terminated
+#: worker restarts without it.
 MEMORY = {
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": 0.95,
 }
-#: Nothing of a local cluster answers over HTTP, which asks nobody for a certificate.
+#: Local clusters do not serve HTTP, which requires no certificate.
 NO_HTTP: dict[str, list[str]] = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 
 
 @contextmanager
 def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
     """
-    A client of a scheduler, or of workers on this machine that end with the block.
+    Connect to a scheduler, or to local workers that end with the context.
+
+    Parameters
+    ----------
+    scheduler : str or None
+        Address of a dask scheduler; None starts local workers.
+    n_workers : int
+        Number of local workers.
+
+    Yields
+    ------
+    client : distributed.Client
 
     Raises
     ------
     ParameterError
-        When dask or cryptography is missing, or no scheduler answers.
+        When dask or cryptography is not installed, or no scheduler answers.
     SimulationError
-        When workers do not start on this machine.
+        When local workers do not start.
 
     Notes
     -----
-    Whoever can talk to a scheduler or a worker of dask can run code with the rights of its owner. Those on this machine
-    talk TLS with a key of this run alone, which never leaves the memory of its processes, and accept nobody without it.
-    A scheduler that somebody started is met as dask's configuration says (``distributed.comm.tls``).
+    Every peer that can connect to a dask scheduler or worker can run code with the rights of its owner. Local clusters use
+    TLS with a key of this run, which stays in the memory of its processes, and reject connections without it. The
+    configuration of dask (``distributed.comm.tls``) determines the connection to an external scheduler.
     """
     try:
         import dask
@@ -73,9 +84,9 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
                     client.close(timeout=2)
         return
     if getattr(current_process(), "_inheriting", False):
-        # A worker that imports the main program came here: what began the worker tells that it did not start.
+        # A starting worker imports the main program and reaches this call; its parent reports that the worker did not start.
         raise SystemExit(1)
-    # Every item of a worker that ended is tried again, alone: not with the others of its task.
+    # Without retries by dask: items of a lost worker are retried one by one, not as the same task.
     with (
         dask.config.set(
             {"distributed.scheduler.allowed-failures": 0, "distributed.admin.large-graph-warning-threshold": "1 TB"}
@@ -91,7 +102,7 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
                     security=security,
                     threads_per_worker=1,
                     memory_limit=MEMORY_LIMIT // n_workers,
-                    # No dashboard: only so does dask not ask for the one port of another's, and warn where that has it.
+                    # No dashboard: dask would warn when another cluster uses its default port.
                     dashboard_address="127.0.0.1:0",
                     scheduler_kwargs={"dashboard": False},
                     preload=[__name__],
@@ -99,18 +110,18 @@ def client_of(scheduler: str | None, n_workers: int) -> Iterator[Client]:
                 )
             )
             client = opened.enter_context(Client(cluster, set_as_default=False))
-        except Exception as error:  # noqa: BLE001 -- a machine without memory or time for them makes them fail in many ways
+        except Exception as error:  # noqa: BLE001 -- the start fails in many ways when memory or time is short
             reason = " ".join(str(error).split()) or type(error).__name__
             raise SimulationError(
-                f"the workers did not start ({reason:.160}); try it again, or with fewer of them; a program of your own calls "
-                'it under if __name__ == "__main__": alone, for workers import that program'
+                f"the workers did not start ({reason:.160}); retry, or use fewer workers; in your own program, make the call "
+                'under if __name__ == "__main__":, because workers import the program'
             ) from None
         yield client
 
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Without what dask logs of a lost connection, which is told in a sentence."""
+    """Suppress the log messages of dask for lost connections, which are reported as errors."""
     logs = [logging.getLogger(name) for name in ("distributed.client", "distributed.core")]
     levels = [log.level for log in logs]
     for log in logs:
@@ -123,21 +134,21 @@ def _silent() -> Iterator[None]:
 
 
 def _check_answer(scheduler: str, security: Security) -> None:
-    """Ask a scheduler who it is: a client that found none would not let go of the program for a while."""
+    """Check that a scheduler answers: a client without one would block for a long time."""
     from distributed import rpc
 
     async def answer() -> Any:
         async with rpc(scheduler, connection_args=security.get_connection_args("client")) as asked:
             return await asyncio.wait_for(asked.identity(), SCHEDULER_S)
 
-    reason = "it is something else"
+    reason = "it is not a dask scheduler"
     try:
-        # In a thread of its own: a notebook has an event loop in this one.
+        # In a separate thread: in a notebook, this thread already runs an event loop.
         with ThreadPoolExecutor(1) as pool:
             is_scheduler = pool.submit(lambda: asyncio.run(answer())).result().get("type") == "Scheduler"
     except (OSError, ValueError) as error:
         is_scheduler, reason = False, " ".join(str(error).split()) or type(error).__name__
-    except Exception:  # noqa: BLE001 -- what is no scheduler may answer anything, and dask takes it for lengths and pickles
+    except Exception:  # noqa: BLE001 -- dask parses arbitrary answers of other servers as lengths and pickles
         is_scheduler = False
     if not is_scheduler:
         raise ParameterError(
@@ -148,24 +159,24 @@ def _check_answer(scheduler: str, security: Security) -> None:
 
 
 def dask_setup(_worker: Any) -> None:
-    """Prepare a worker of this machine: Ctrl-C, which all processes of a terminal get, is for the program that started it."""
+    """Ignore Ctrl-C in a local worker: the main program handles it and ends its workers."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 class WorkerStates:
     """
-    States of a scheduler's workers at the last update.
+    States of the workers of a scheduler at the last update.
 
     Attributes
     ----------
     alive : set of str
         Addresses of all workers.
     running : set of str
-        Those that start the tasks they are sent.
+        Workers that accept tasks.
     stuck : set of str
-        Those that have been paused for some time because their memory is full, and compute nothing.
+        Workers without running tasks that dask paused more than ``PAUSED_S`` seconds ago because their memory is full.
     n_executing : int
-        Tasks that all workers compute.
+        Number of tasks in execution on all workers.
     """
 
     def __init__(self, client: Client) -> None:
@@ -178,20 +189,20 @@ class WorkerStates:
 
     def update(self) -> None:
         """
-        Ask the scheduler.
+        Read the worker states from the scheduler.
 
         Raises
         ------
         SimulationError
-            When it does not answer.
+            When the scheduler does not answer.
         """
         try:
             if self._client.cluster is not None:
-                # Dask restarts a worker that ended, but not one that ends again before it has started.
+                # Dask restarts an ended worker, but not a worker that ends again during its start.
                 self._client.cluster.scale(len(self._client.cluster.worker_spec))
             found = self._client.scheduler_info(n_workers=-1)["workers"]
-        except Exception:  # noqa: BLE001 -- connections break in many ways
-            raise SimulationError("the scheduler does not answer any more") from None
+        except Exception:  # noqa: BLE001 -- connections fail in many ways
+            raise SimulationError("the scheduler no longer answers") from None
         now_s = time.monotonic()
         executing = {
             address: one["metrics"].get("task_counts", {}).get("executing", 0) for address, one in found.items()

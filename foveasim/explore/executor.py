@@ -1,4 +1,4 @@
-"""One function for many items, on the workers of dask or in this process: for sweeps, studies and datasets alike."""
+"""Parallel evaluation of a function over many items, on dask workers or in process."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ if TYPE_CHECKING:
 
 __all__ = ["KILLED", "MAX_DEATHS", "Run", "executor"]
 
-#: Result of an item that ended its worker each time it was tried.
+#: Result of an item whose worker ended in every attempt.
 KILLED: Any = object()
-#: Seconds that a worker computes before it returns results: what the end of a worker or of the program can cost.
+#: Duration of a chunk on a worker, seconds. An interruption loses at most the results of one chunk per worker.
 CHUNK_S = 0.5
-#: Chunks per second that one scheduler manages: with more workers, chunks take longer.
+#: Chunks per second that one scheduler can process: chunks are longer with more workers.
 CHUNKS_PER_S = 1000.0
-#: Items of a chunk, at most.
+#: Largest number of items per chunk.
 MAX_ITEMS = 1024
-#: Ends of workers after which an item is not tried again.
+#: Number of ended workers after which an item is not retried.
 MAX_DEATHS = 3
-#: Seconds that all workers may be absent.
+#: Longest time without any worker, seconds.
 ABSENT_S = 60.0
-#: Seconds between two updates of the list of workers.
+#: Interval between updates of the worker list, seconds.
 POLL_S = 1.0
 
-#: Computes items, and yields each with its result, or with KILLED, as they are done. The second argument has the positions, in
-#: ascending order, at which costly shared parts of the items change.
+#: Computes items and yields each with its result, or with KILLED, in order of completion. The second argument contains the
+#: positions, in ascending order, at which costly shared components of the items change.
 Run = Callable[[Sequence[Any], Sequence[int]], Iterator[tuple[Any, Any]]]
 
 
@@ -57,20 +57,20 @@ def executor(
     workers: int | None = None,
 ) -> Iterator[Run]:
     """
-    Start workers that compute one function.
+    Start workers that evaluate one function.
 
     Parameters
     ----------
     function : callable
-        Takes an item, and returns its result. Each worker process has one copy of it, which may keep what items share.
+        Function of an item that returns its result. Each worker process has one copy, which may cache shared components.
     what : str
-        What a user would change when the function cannot be pickled, for that message.
+        Name of the user objects in the function, for the message when it cannot be pickled.
     users : iterable of callables, optional
-        Functions in it that may be of users' own modules, which workers need not find.
+        User functions inside ``function``. Their modules are pickled by value, so workers need not import them.
     scheduler : str, optional
-        Address of a dask scheduler. By default processes of this machine.
+        Address of a dask scheduler; by default local worker processes.
     workers : int, optional
-        Number of those processes; None computes in this process, without dask.
+        Number of local processes; None evaluates in this process, without dask.
 
     Yields
     ------
@@ -80,18 +80,18 @@ def executor(
     Raises
     ------
     ParameterError
-        When dask is missing, or no scheduler answers.
+        When dask is not installed, or no scheduler answers.
     SimulationError
-        When workers do not start, or the function cannot be pickled; from ``run`` when the scheduler or all workers are gone,
-        or workers cannot compute the function at all.
+        When workers do not start, or the function cannot be pickled; from ``run`` when the scheduler or all workers are lost,
+        or workers cannot evaluate the function at all.
 
     Notes
     -----
-    Dask restarts workers of this machine, detects which are alive and whose tasks were lost, and copies the function to
-    each. It does not know that neighbouring items share compiled layouts and optical images: its queue would deal
-    them to all workers in turn, and each would make the same parts. So each worker gets a range of neighbours, in tasks of
-    about 0.5 s, and a worker without a range gets half of the longest: O(log n_worker) for each task. Items of a task that
-    ended its worker are tried again one by one, so that an item that crashes costs no other.
+    Dask restarts local workers, detects live workers and lost tasks, and copies the function to each worker. Its queue would
+    distribute neighbouring items, which share compiled layouts and optical images, to all workers in turn, and each worker
+    would build the same components. Each worker therefore gets a range of neighbouring items, in tasks of about 0.5 s, and a
+    worker without a range gets half of the longest range, at a cost of O(log n_worker) per task. After the loss of a worker,
+    the items of its task are retried one by one, so that an item that crashes affects no other item.
     """
     if scheduler is None and workers is None:
         yield lambda items, _cuts: ((item, function(item)) for item in items)
@@ -111,7 +111,7 @@ def _pickled(function: Callable[[Any], Any], what: str, users: Iterable[Callable
         cloudpickle.register_pickle_by_value(module)
     try:
         return bytes(cloudpickle.dumps(function))
-    except Exception as error:  # noqa: BLE001 -- objects raise anything when they are pickled
+    except Exception as error:  # noqa: BLE001 -- objects may raise anything when they are pickled
         raise SimulationError(f"{what} cannot be sent to other processes ({_line(error)})") from None
     finally:
         for module in own:
@@ -127,7 +127,7 @@ def _line(error: BaseException) -> str:
 
 @dataclass(eq=False)
 class _Range:
-    """Positions of neighbouring items that are still to be sent."""
+    """Range of consecutive item positions that are not sent yet."""
 
     start: int
     stop: int
@@ -138,29 +138,29 @@ class _Range:
 
 @dataclass(eq=False)
 class _Chunk:
-    """Positions of the items that were sent to a worker in one task."""
+    """Item positions that were sent to a worker in one task."""
 
     positions: range
     worker: str
     is_alone: bool
-    #: Seconds that its results may take to come, before the workers are counted again.
+    #: Timeout of the transfer of its results, seconds; then the worker list is updated.
     patience_s: float = POLL_S
 
 
 class _Dispatch:
     """
-    One run over items.
+    Dispatch of the items of one run.
 
     Attributes
     ----------
     ranges : dict of str to _Range
-        What each worker has still to be sent, by its address.
+        Unsent items of each worker, by address.
     free : list of _Range
         Ranges without a worker.
     heap : list of (int, int, _Range)
-        All ranges of workers, longest first: the negative of the length when it was added, and a serial number.
+        All ranges of workers, longest first: negative length at insertion, serial number, range.
     alone : deque of range
-        Items that ended a worker, to be sent one by one.
+        Items of lost workers, to be sent one by one.
     """
 
     def __init__(self, client: Client, shared: Future[Any], items: Sequence[Any], cuts: Sequence[int]) -> None:
@@ -181,7 +181,7 @@ class _Dispatch:
         self.n_left = len(items)
 
     def run(self) -> Iterator[tuple[Any, Any]]:
-        """Yield each item with its result, as they are done."""
+        """Yield each item with its result, in order of completion."""
         try:
             while self.n_left:
                 if time.monotonic() - self.polled_s > POLL_S:
@@ -205,7 +205,7 @@ class _Dispatch:
     # -- workers --------------------------------------------------------------------------------------------------------
 
     def _poll(self) -> None:
-        """Update which workers are alive, and which are idle."""
+        """Update the sets of live and idle workers."""
         self.states.update()
         self.polled_s = time.monotonic()
         self.idle = self.states.running - {chunk.worker for chunk in self.sent.values()}
@@ -217,13 +217,13 @@ class _Dispatch:
             self.alive_s = self.polled_s
         elif self.polled_s - self.alive_s > ABSENT_S:
             raise SimulationError(
-                f"the workers have computed nothing for {ABSENT_S:g} s: they are closing, or paused with their memory full"
+                f"no worker has computed anything for {ABSENT_S:g} s: all are closing, or paused because of full memory"
                 if self.states.alive
                 else f"the scheduler has had no worker for {ABSENT_S:g} s"
             )
 
     def _taken_back(self) -> Iterator[tuple[int, Any]]:
-        """Cancel the chunks of workers that ended, and those that wait at paused workers."""
+        """Cancel the chunks of lost workers, and those that wait at paused workers."""
         for future, chunk in list(self.sent.items()):
             is_dead = chunk.worker not in self.states.alive and future.status != "error"
             if is_dead or (chunk.worker in self.states.stuck and future.status == "pending"):
@@ -248,7 +248,7 @@ class _Dispatch:
                 [self.items[position] for position in chunk.positions],
                 self._chunk_s(),
                 pure=False,
-                # Where its neighbours were. When that worker ends, dask must not try the whole chunk again elsewhere.
+                # On the worker of the neighbouring items. Dask must not retry the chunk on another worker after a loss.
                 workers=[worker],
             )
             self.sent[future] = chunk
@@ -260,7 +260,7 @@ class _Dispatch:
     # -- items ----------------------------------------------------------------------------------------------------------
 
     def _next(self, worker: str) -> _Chunk | None:
-        """Take the next items for a worker: of its own range, of a free one, or of half of the longest."""
+        """Return the next chunk of a worker: of its range, a free range, or half of the longest."""
         if self.alone:
             return _Chunk(self.alone.popleft(), worker, is_alone=True)
         own = self.ranges.get(worker)
@@ -282,7 +282,7 @@ class _Dispatch:
         heapq.heappush(self.heap, (-len(own), next(self.numbers), own))
 
     def _half_of_longest(self) -> _Range | None:
-        """Cut off the second half of the longest range, at a change of shared parts where one is near."""
+        """Split the longest range in half, or at a nearby change of shared components."""
         while self.heap:
             length, _, longest = heapq.heappop(self.heap)
             if len(longest) < -length:  # items were taken since
@@ -302,7 +302,7 @@ class _Dispatch:
         return None
 
     def _put_back(self, chunk: _Chunk, n_done: int = 0) -> None:
-        """Items that were sent, and not computed."""
+        """Return the items of a chunk that were not computed to the unsent ones."""
         left = chunk.positions[n_done:]
         if not left:
             return
@@ -316,14 +316,14 @@ class _Dispatch:
             self.free.append(_Range(left.start, left.stop))
 
     def _received(self, future: Future[Any]) -> Iterator[tuple[int, Any]]:
-        """Positions and results of a chunk; those of a worker that ended are tried again."""
+        """Yield the positions and results of a chunk, or retry the items of a lost worker."""
         chunk = self.sent.pop(future, None)
-        if chunk is None:  # it was taken back
+        if chunk is None:  # cancelled before
             return
         try:
             results = self._result(future, chunk.patience_s)
         except TimeoutError:
-            # They may have gone with their worker, and dask computes them again.
+            # The results may be lost with their worker; dask then computes them again.
             self.polled_s = float("-inf")
             chunk.patience_s *= 2.0
             self.sent[future] = chunk
@@ -341,13 +341,13 @@ class _Dispatch:
         yield from zip(chunk.positions, results.values, strict=False)
 
     def _result(self, future: Future[Any], patience_s: float) -> _Results | None:
-        """Results of a chunk; None when its worker ended."""
+        """Return the results of a chunk, or None when its worker ended."""
         from distributed import KilledWorker
 
         try:
             if future.status in ("error", "cancelled"):
                 future.result()
-            # The future's own result() logs an error when it is given up.
+            # Unlike gather, Future.result() logs an error on a timeout.
             gather = partial(self.client.gather, [future], errors="skip", asynchronous=True)
             found: list[_Results] = self.client.sync(gather, callback_timeout=patience_s)
         except KilledWorker:
@@ -355,17 +355,17 @@ class _Dispatch:
         except TimeoutError:
             raise
         except (CancelledError, OSError):
-            raise SimulationError("the scheduler does not answer any more") from None
+            raise SimulationError("the scheduler no longer answers") from None
         except FoveasimError as error:
             raise error from None  # without the traceback of the worker
-        except Exception as error:  # noqa: BLE001 -- whatever a worker without the package, or without a module, raises
+        except Exception as error:  # noqa: BLE001 -- workers without the package or a module may raise anything
             raise SimulationError(f"the workers cannot compute: {_line(error)}") from None
         if not found:
             raise TimeoutError
         return found[0]
 
     def _again(self, chunk: _Chunk) -> Iterator[tuple[int, Any]]:
-        """Try items of a worker that ended again, each alone; those that were alone often enough are given up."""
+        """Retry the items of a lost worker one by one; yield KILLED for the last attempt."""
         for position in chunk.positions:
             self.deaths[position] = self.deaths.get(position, 0) + 1
             if chunk.is_alone and self.deaths[position] >= MAX_DEATHS:
@@ -376,12 +376,12 @@ class _Dispatch:
 
 # -- on a worker ------------------------------------------------------------------------------------------------------
 
-#: One item at a time in a process: a camera uses the process's threads.
+#: Serialises items within a process: a camera uses all its threads.
 _lock = Lock()
 
 
 class _Results(NamedTuple):
-    """Results of the first items of a chunk, and the seconds that they took."""
+    """Results of the first items of a chunk, and their computing time in seconds."""
 
     values: list[Any]
     took_s: float
@@ -389,9 +389,9 @@ class _Results(NamedTuple):
 
 class _Shared:
     """
-    The function that all items have in common, unpickled once in each process.
+    Function of a run, unpickled once in each process.
 
-    Dask keeps it in the memory of its workers while the run lasts, and copies it to those that come later.
+    Dask stores it in the memory of its workers for the duration of the run, and copies it to workers that join later.
     """
 
     def __init__(self, payload: bytes, of_client: Mapping[str, str]) -> None:
@@ -406,12 +406,12 @@ class _Shared:
 
     def function(self) -> Callable[[Any], Any]:
         """
-        Return the function, the same object each time.
+        Return the function, as the same object in every call.
 
         Raises
         ------
         RuntimeError
-            When this process has other versions: its results might differ.
+            When this process has other versions of the libraries: its results might differ.
         """
         import cloudpickle
 
@@ -421,13 +421,13 @@ class _Shared:
             if differing:
                 theirs = ", ".join(f"{name} {here.get(name)}" for name in differing)
                 ours = ", ".join(f"{name} {self._versions[name]}" for name in differing)
-                raise RuntimeError(f"a worker has {theirs}, and here is {ours}")
+                raise RuntimeError(f"a worker has {theirs}, but the client has {ours}")
             self._function = cloudpickle.loads(self._payload)
         return self._function
 
 
 def _compute(shared: _Shared, items: Sequence[Any], limit_s: float) -> _Results:
-    """Compute items until the time is up, at least one."""
+    """Compute at least one item, and more until the time limit."""
     with _lock:
         function = shared.function()
         begin_s = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Captures of points, with a cache of what neighbouring points share."""
+"""Captures of sweep points, with a cache of their shared components."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from foveasim.explore._records import Record, check_new, values_of
 
 __all__ = ["ShotRunner", "WorkerCache"]
 
-#: What a worker keeps of earlier points, in memory and in number. Parts inside others are counted in each.
+#: Limits of a cache: bytes, and number of components. Nested components count in every component that contains them.
 MAX_BYTES, MAX_PARTS = 1 << 30, 1024
-#: And no more than this part of a worker's memory: captures need most of it.
+#: A cache uses at most 1/4 of the memory of a worker: captures need most of it.
 FRACTION_OF_MEMORY = 4
-#: Parts that hold more as they are used.
+#: Kinds of components whose size increases with use.
 GROWING = ("camera", "images")
-#: Objects are weighed by the arrays in them, so many containers deep.
+#: Depth of nested containers whose arrays count towards the size of a component.
 DEPTH = 6
-#: Characters of a message that are kept.
+#: Longest stored message, characters.
 LONGEST_MESSAGE = 500
 
 
 @dataclass
 class _Part:
-    """A part, the warnings when it was made, and its size."""
+    """Cached component with the warnings of its construction and its size."""
 
     made: Any
     warnings: list[str]
@@ -47,14 +47,15 @@ class _Part:
 
 class WorkerCache:
     """
-    Parts of shots that were made before, up to a size in memory: layouts, scenes, lenses, cameras, images, power on sites.
+    Cache of shot components, limited in memory.
 
-    Results never depend on what is in the cache: a part is a function of its settings, and its warnings are stored with it.
+    Components are layouts, scenes, lenses, cameras, optical images and power on sites. Results do not depend on the contents of
+    the cache: a component is a function of its settings, and its warnings are stored with it.
 
     Parameters
     ----------
     max_bytes : int
-        Arrays in the parts, at most; the parts of the last point stay in any case.
+        Size limit of all arrays. Components of the last point are never removed.
     """
 
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:
@@ -65,7 +66,7 @@ class WorkerCache:
         self.n_made: dict[str, int] = {}
 
     def part(self, kind: str, settings: Any, make: Callable[[], Any]) -> Any:
-        """Return what a part's settings make, or made before."""
+        """Return the component with the given settings, from the cache or newly built."""
         key = kind, json.dumps(settings, sort_keys=True)
         if key not in self._parts:
             with warnings.catch_warnings(record=True) as caught:
@@ -79,9 +80,16 @@ class WorkerCache:
         return self._parts[key].made
 
     def end_point(self) -> list[str]:
-        """Drop the parts that were not used for longest, but none of the last point; return the warnings of those it used."""
+        """
+        Remove the least recently used components, except those of the last point.
+
+        Returns
+        -------
+        warnings : list of str
+            Warnings of the components of the last point.
+        """
         for key in self._used:
-            # Again: cameras and images grow while they are used.
+            # Measured again for cameras and images, which grow with use.
             if self._parts[key].n_bytes == 0 or key[0] in GROWING:
                 self._parts[key].n_bytes = _n_bytes(self._parts[key].made, set())
         total = sum(part.n_bytes for part in self._parts.values())
@@ -96,7 +104,7 @@ class WorkerCache:
 
 class ShotRunner:
     """
-    Captures of shots and their metrics, with a cache of what neighbouring points share.
+    Captures of shots and their metrics, with a cache of shared components.
 
     Parameters
     ----------
@@ -104,15 +112,15 @@ class ShotRunner:
         File of the settings, for messages.
     metrics : mapping of str to function
     is_geometry_varied : bool
-        Whether points differ in photosites or distortion, and so may share optical images.
+        Whether points differ in photosites or distortion; optical images are then cached.
     n_threads : int, optional
         Threads of a capture; by default those of the worker, or of this process.
     max_bytes : int
-        Of the arrays in the cache, at most; on a worker no more than a quarter of its memory.
+        Size limit of the arrays in the cache. On a worker the limit is at most a quarter of its memory.
 
     Notes
     -----
-    A runner is pickled without its cache, which begins empty in each process.
+    Pickles of a runner do not contain the cache, which starts empty in each process.
     """
 
     def __init__(
@@ -133,7 +141,7 @@ class ShotRunner:
 
     @property
     def cache(self) -> WorkerCache:
-        """Cache of this process."""
+        """Component cache of this process."""
         if self._cache is None:
             worker = _worker()
             limit = worker.memory_manager.memory_limit if worker is not None else None
@@ -143,11 +151,11 @@ class ShotRunner:
         return self._cache
 
     def __call__(self, point: tuple[int, Mapping[str, Any]]) -> Record:
-        """Return the record of a point: its number, and all its settings."""
+        """Return the record of a point, given its number and all its settings."""
         return self.record(*point)
 
     def captured(self, settings: Mapping[str, Any]) -> tuple[Shot, Capture]:
-        """Return the shot of some settings, and its capture."""
+        """Build the shot of the given settings and simulate its capture."""
         cache = self.cache
         shot = build_shot(self.source, settings, n_threads=self.n_threads, kept=cache.part)
         camera, sensor, scene = shot.camera, shot.camera.sensor, shot.scene
@@ -162,7 +170,7 @@ class ShotRunner:
         return shot, capture
 
     def _measured(self, metric: Metric, shot: Shot, capture: Capture, settings: Mapping[str, Any]) -> Any:
-        """Result of a metric; the reference of a comparison is made once for all points that share it."""
+        """Compute a metric, with a cached reference where the metric takes one."""
         compared: Callable[..., Any] = metric
         make = next((make for own, make in REFERENCES.items() if own is metric), None)
         if make is None:
@@ -172,14 +180,18 @@ class ShotRunner:
         return compared(shot, shot.camera, capture, reference)
 
     def record(self, point: int, settings: Mapping[str, Any]) -> Record:
-        """Return the metrics of a point, or its error. Nothing that a point raises ends the others."""
+        """
+        Return the metrics of a point, or its error message.
+
+        Exceptions of a point, except Ctrl-C, become error messages and do not interrupt the run.
+        """
         values: dict[str, Any] = {}
         errors = []
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
                 shot, capture = self.captured(settings)
-            except BaseException as error:  # noqa: BLE001 -- a point's settings may make anything of ours or of a library's raise
+            except BaseException as error:  # noqa: BLE001 -- settings may cause any exception of the package or a library
                 _raise_ctrl_c(error)
                 errors.append(_message(error))
             else:
@@ -188,10 +200,10 @@ class ShotRunner:
                         more = values_of(name, self._measured(metric, shot, capture, settings))
                         check_new(values, more)
                         values |= more
-                    except BaseException as error:  # noqa: BLE001 -- metrics are the user's, and may end with sys.exit()
+                    except BaseException as error:  # noqa: BLE001 -- metrics are user code, and may call sys.exit()
                         _raise_ctrl_c(error)
                         text = _message(error)
-                        # Messages of this package about a result begin with its name.
+                        # Messages of this package about a result already start with its name.
                         errors.append(text if text.startswith(f"'{name}") else f"{name}: {text}")
         texts = dict.fromkeys([*self.cache.end_point(), *(str(warning.message) for warning in caught)])
         return Record(point, values, "; ".join(errors), "; ".join(_short(text) for text in texts))
@@ -210,13 +222,17 @@ def _worker() -> Any:
 
 
 def _light(shot: Shot, settings: Mapping[str, Any]) -> list[Any]:
-    """What the light behind the lens depends on, as the sensor's filters see it."""
+    """Return the settings that determine the optical images, with the spectral responsivity."""
     response = shot.camera.sensor.responsivity_e_per_j(shot.scene.wavelength_nm)
     return [settings["scene"], settings["optics"], hashlib.sha256(response.tobytes()).hexdigest()]
 
 
 def _raise_ctrl_c(error: BaseException) -> None:
-    """Let Ctrl-C through, which comes to the main thread; elsewhere, as in a worker's tasks, a metric raised it."""
+    """
+    Raise an error again if it is Ctrl-C.
+
+    Ctrl-C interrupts the main thread. A KeyboardInterrupt in another thread, such as that of a worker, comes from a metric.
+    """
     if isinstance(error, KeyboardInterrupt) and current_thread() is main_thread():
         raise error
 
@@ -233,7 +249,7 @@ def _short(text: str) -> str:
 
 
 def _n_bytes(thing: Any, seen: set[int], depth: int = DEPTH) -> int:
-    """Bytes of the arrays in an object that were not seen before."""
+    """Return the bytes of the arrays in an object, without those in ``seen``."""
     if id(thing) in seen or depth == 0:
         return 0
     if isinstance(thing, np.ndarray):

@@ -329,7 +329,7 @@ def test_foreign_trials_are_not_changed(foveasim, folder):
     code, _, wrong = foveasim("study", "study.yaml", "-o", "own.db")
 
     assert code == 2
-    assert wrong == "error: own.db: holds a study 'study' of another program; take another name\n"
+    assert wrong == "error: own.db: contains a study 'study' of another program; use another name\n"
     assert len(stored(folder / "own.db").trials) == 1
 
 
@@ -343,7 +343,9 @@ def test_storage_failure_keeps_finished_trials(folder):
                 running.number + 1, state=optuna.trial.TrialState.FAIL
             )
 
-    with pytest.raises(FileError, match=r"study\.db: cannot be used .*already finished.*; 3 trials are kept") as caught:
+    with pytest.raises(
+        FileError, match=r"study\.db: cannot be used .*already finished.*; 3 trials are stored"
+    ) as caught:
         explore.run_study(plan, storage=folder / "study.db", progress=spoil)
     assert "\n" not in str(caught.value)
 
@@ -351,22 +353,28 @@ def test_storage_failure_keeps_finished_trials(folder):
 BAD_STUDIES = [
     ({"repeats": 3}, "bad.yaml: repeats: no such setting"),
     ({"search": {"sensor.bitz": [8]}}, "bad.yaml: with shot.yaml: sensor.bitz: no such setting"),
-    ({"search": {}}, "bad.yaml: 'search' must be ranges by settings' paths: nothing is searched"),
+    ({"search": {}}, "bad.yaml: 'search' must be a non-empty mapping of setting paths to ranges"),
     ({"search": {"sensor.bits": []}}, "bad.yaml: 'sensor.bits' must be searched in"),
     ({"search": {"sensor.bits": {"from": 8}}}, "bad.yaml: search.sensor.bits.to: is missing"),
-    ({"search": {"sensor.bits": {"from": 12, "to": 8}}}, "'sensor.bits' must have two ends, the first the smaller"),
-    ({"search": {"sensor.bits": {"from": 8, "to": 10, "step": 3}}}, "a step > 0, and no larger than the range"),
+    (
+        {"search": {"sensor.bits": {"from": 12, "to": 8}}},
+        "'sensor.bits' must have two finite bounds in ascending order",
+    ),
+    (
+        {"search": {"sensor.bits": {"from": 8, "to": 10, "step": 3}}},
+        "a step > 0 that is at most the width of the range",
+    ),
     ({"search": {"sensor.bits": {"from": 8.5, "to": 10}}}, "sensor.bits: must be a valid integer, got 8.5"),
-    ({"search": {"seed": [1, 2]}}, "'seed' cannot be searched"),
+    ({"search": {"seed": [1, 2]}}, "'seed' must not be searched"),
     ({"search": {"layout": ["x.yaml"], "layout.parameters.n_x": [3]}}, "cannot both be searched"),
     ({"objectives": {"snr_mean": "up"}}, "bad.yaml: objectives.snr_mean: must be 'maximize' or 'minimize', got \"up\""),
-    ({"objectives": {}}, "bad.yaml: 'objectives' must be names of results"),
+    ({"objectives": {}}, "bad.yaml: 'objectives' must map names of results"),
     ({"objectives": {"beauty": "maximize"}}, "bad.yaml: 'objectives' must be results of metrics ("),
     ({"constraints": {"beauty": [0, 1]}}, "bad.yaml: 'constraints' must be results of metrics ("),
     ({"constraints": {"n_sites": [None, None]}}, "'n_sites' must have limits"),
-    ({"constraints": {"n_sites": [2, 1]}}, "the first no larger than the second"),
+    ({"constraints": {"n_sites": [2, 1]}}, "must have limits (low, high) with low <= high"),
     ({"metrics": ["snr"]}, "'objectives' must be results of metrics (snr)"),
-    ({"metrics": ["own:harsh"]}, "bad.yaml: 'metrics' must be of data_rate_gbit_per_s"),
+    ({"metrics": ["own:harsh"]}, "bad.yaml: 'metrics' must be one of data_rate_gbit_per_s"),
     ({"trials": 0}, "bad.yaml: trials: must be greater than or equal to 1, got 0"),
     ({"trials": "many"}, 'bad.yaml: trials: must be a valid integer, got "many"'),
     ({"name": ""}, "bad.yaml: name: must have at least 1 character"),
@@ -393,15 +401,15 @@ def test_invalid_study_writes_nothing(foveasim, folder, change, message):
     ("options", "message"),
     [
         (["--trials", "0"], "'trials' must be >= 1, got 0"),
-        (["--out", "no/where.db"], "no/where.db: cannot be written: its folder does not exist"),
+        (["--out", "no/where.db"], "no/where.db: cannot be written: its directory does not exist"),
         (["--out", "."], ".: cannot be used as a study's storage (unable to open database file)"),
         (["--out", "a.db", "--storage", "sqlite:///b.db"], "--out and --storage exclude each other"),
         (["--storage", "b.db"], "--storage must be a URL"),
         (["--storage", "nosuch://base"], "cannot be used as a study's storage"),
         (["--storage", "nosuch://me:secret@host/base"], "error: nosuch://host/base: cannot be used"),
-        (["--metric", "none:such"], "'metric' must be module:function of a module that can be imported"),
-        (["--metric", "beauty"], "'metrics' must be of"),
-        (["--metric", "snr"], "'metric' must have a name of its own"),
+        (["--metric", "none:such"], "'metric' must be module:function of an importable module"),
+        (["--metric", "beauty"], "'metrics' must be one of"),
+        (["--metric", "snr"], "'metric' must have a unique name"),
     ],
 )
 def test_invalid_study_option_writes_nothing(foveasim, folder, options, message):
@@ -561,9 +569,9 @@ def test_warnings_of_samples_appear_once(folder):
 BAD_DATA_SETS = [
     ({"repeats": 3}, "bad.yaml: repeats: no such setting"),
     ({"pictures": None}, "bad.yaml: pictures: missing"),
-    ({"pictures": "nowhere"}, "nowhere: no such file or folder"),
-    ({"pictures": "empty"}, "empty: holds no pictures"),
-    ({"pictures": []}, "bad.yaml: 'pictures' must hold at least one picture"),
+    ({"pictures": "nowhere"}, "nowhere: no such file or directory"),
+    ({"pictures": "empty"}, "empty: contains no pictures"),
+    ({"pictures": []}, "bad.yaml: 'pictures' must contain at least one picture"),
     ({"pictures": ["skimage:nobody"]}, "bad.yaml: pictures.0: scikit-image does not contain 'nobody'"),
     ({"pictures": ["photos/none.png"]}, "none.png: no such file"),
     ({"shot": "none.yaml"}, "none.yaml: no such file"),
@@ -571,8 +579,8 @@ BAD_DATA_SETS = [
     ({"vary": {"sensor.bitz": {"choice": [8]}}}, "bad.yaml: with photographed.yaml: sensor.bitz: no such setting"),
     ({"vary": {"sensor.bits": {"chance": [8]}}}, "bad.yaml: vary.sensor.bits.chance: no such setting"),
     ({"vary": {"sensor.bits": {"integers": [8, 40]}}}, "sensor.bits: must be <= 16, got 40"),
-    ({"vary": {"sensor.bits": {"choice": []}}}, "'sensor.bits' must be chosen from at least one value"),
-    ({"vary": {"exposure_s": {"uniform": [1]}}}, "bad.yaml: 'exposure_s' uniform needs [low, high]"),
+    ({"vary": {"sensor.bits": {"choice": []}}}, "'sensor.bits' must have at least one choice"),
+    ({"vary": {"exposure_s": {"uniform": [1]}}}, "bad.yaml: 'exposure_s' must specify 'uniform' as [low, high]"),
     ({"cameras": 0}, "bad.yaml: 'cameras' must be >= 1, got 0"),
     ({"draws": "many"}, 'bad.yaml: draws: must be a valid integer, got "many"'),
     ({"recipe": "magic"}, "bad.yaml: recipe: must be 'classification' or 'denoising'"),
@@ -580,10 +588,10 @@ BAD_DATA_SETS = [
     ({"per_shard": 0}, "bad.yaml: per_shard: must be greater than or equal to 1"),
     ({"set": {"sensor.bitz": 3}}, "sensor.bitz: no such setting"),
     ({"labels": "none.csv"}, "none.csv: no such file"),
-    ({"labels": [1]}, "bad.yaml: 'labels' must have one for each of the 3 pictures, got 1"),
-    ({"boxes": "own.py"}, "own.py: holds no boxes as COCO has them (Invalid JSON"),
-    ({"masks": "flows"}, "flows: no such folder"),
-    ({"masks": "empty"}, "empty: has nothing for 3 of the 3 pictures, first 'cats/1'; it has none (.png, "),
+    ({"labels": [1]}, "bad.yaml: 'labels' must have one item for each of the 3 pictures, got 1"),
+    ({"boxes": "own.py"}, "own.py: is not a valid COCO file (Invalid JSON"),
+    ({"masks": "flows"}, "flows: no such directory"),
+    ({"masks": "empty"}, "empty: has no entry for 3 of 3 pictures, first 'cats/1'; it contains no entries (.png, "),
 ]
 
 
@@ -608,8 +616,8 @@ def test_invalid_dataset_writes_nothing(foveasim, folder, change, message):
     [
         (["--workers", "0"], "'workers' must be >= 1, got 0"),
         (["--out", "no/where"], "cannot be written: the folder"),
-        (["--out", "photos"], "photos: holds something else than a dataset"),
-        (["--out", "x.txt"], "must end in .zarr, or have no ending"),
+        (["--out", "photos"], "photos: is not a dataset of foveasim"),
+        (["--out", "x.txt"], "must have the extension .zarr, or none"),
     ],
 )
 def test_invalid_dataset_option_writes_nothing(foveasim, folder, options, message):
@@ -631,10 +639,10 @@ def test_invalid_dataset_option_writes_nothing(foveasim, folder, options, messag
     [
         ("", "must have the columns 'picture' and 'label' in its first line"),
         ("id,label\na,1\n", r"must have the columns 'picture' and 'label' in its first line, got \['id', 'label'\]"),
-        ("picture,label\na,1\n", "has nothing for 1 of the 2 pictures, first 'b'; it has 'a'"),
-        ("picture,label\na,1\nb,1\na,2\n", "has the picture 'a' twice, in line 4 again"),
-        ("picture,label\na,1\nb\n", "has 1 values in line 3, and 2 columns"),
-        ('picture,label\na,"1\n', "is no CSV file"),
+        ("picture,label\na,1\n", "has no entry for 1 of 2 pictures, first 'b'; it contains 'a'"),
+        ("picture,label\na,1\nb,1\na,2\n", "lists the picture 'a' twice, again in line 4"),
+        ("picture,label\na,1\nb\n", "has 1 values in line 3, expected 2"),
+        ('picture,label\na,"1\n', "is not a valid UTF-8 CSV file"),
     ],
 )
 def test_invalid_class_file_is_rejected(tmp_path, text, message):
@@ -653,9 +661,9 @@ def test_class_arrays_load_without_pickle(tmp_path):
 
     assert read_labels(tmp_path / "numbers.npy", ["x", "y"]) == [3, 1]
     assert read_labels(tmp_path / "texts.npy", ["x", "y"]) == ["b", "a"]
-    with pytest.raises(FileError, match="is no array that can be read"):
+    with pytest.raises(FileError, match="is not a readable array"):
         read_labels(tmp_path / "objects.npy", ["x", "y"])
-    with pytest.raises(FileError, match="of integers or of texts"):
+    with pytest.raises(FileError, match="of integers or strings"):
         read_labels(tmp_path / "reals.npy", ["x", "y"])
     with pytest.raises(FileError, match=r"must be a \.csv file"):
         read_labels(Path(__file__), ["x", "y"])
@@ -664,13 +672,13 @@ def test_class_arrays_load_without_pickle(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"images": [{"id": 1, "file_name": "b"}]}, "has nothing for 1 of the 1 pictures, first 'a'; it has 'b'"),
-        ({"images": [{"id": 1, "file_name": "a"}] * 2}, "names the picture 'a' twice"),
-        ({"images": None}, "holds no boxes as COCO has them"),
+        ({"images": [{"id": 1, "file_name": "b"}]}, "has no entry for 1 of 1 pictures, first 'a'; it contains 'b'"),
+        ({"images": [{"id": 1, "file_name": "a"}] * 2}, "lists the picture 'a' twice"),
+        ({"images": None}, "is not a valid COCO file"),
         ({"annotations": [{"image_id": 1, "category_id": 2}]}, r"annotations\.0\.bbox"),
         (
             {"annotations": [{"image_id": 1, "category_id": 2, "bbox": [1, 2, 0, 3]}]},
-            r"annotations\.0: has a box without an area: \[1\.0, 2\.0, 0\.0, 3\.0\]",
+            r"annotations\.0: must have a box with an area > 0, got \[1\.0, 2\.0, 0\.0, 3\.0\]",
         ),
     ],
 )
@@ -688,12 +696,12 @@ def test_each_picture_has_one_label_file(tmp_path):
     (tmp_path / "b.jpg").touch()
 
     assert files_of_pictures(tmp_path, ["a.jpeg"], (".png",)) == [tmp_path / "a.png"]
-    with pytest.raises(FileError, match="cannot tell two pictures apart that are called 'a'"):
+    with pytest.raises(FileError, match="one file per picture, but two pictures have the name 'a'"):
         files_of_pictures(tmp_path, ["a.jpeg", "a.png"], (".png",))
-    with pytest.raises(FileError, match=r"first 'b'; it has 'a' \(\.png\)"):
+    with pytest.raises(FileError, match=r"first 'b'; it contains 'a' \(\.png\)"):
         files_of_pictures(tmp_path, ["a.jpeg", "b.jpeg"], (".png",))
     (tmp_path / "a.bmp").touch()
-    with pytest.raises(FileError, match=r"has two files of the picture 'a': a\.bmp and a\.png"):
+    with pytest.raises(FileError, match=r"has two files for the picture 'a': a\.bmp and a\.png"):
         files_of_pictures(tmp_path, ["a.jpeg"], (".png", ".bmp"))
 
 
@@ -816,8 +824,6 @@ def test_failing_workers_print_one_line(foveasim, folder, monkeypatch):
     code, _, wrong = foveasim("sweep", "sweep.yaml", "--workers", 2)
 
     assert code == 2
-    assert wrong.startswith(
-        "error: the workers did not start (Nanny failed to start.); try it again, or with fewer of them"
-    )
+    assert wrong.startswith("error: the workers did not start (Nanny failed to start.); retry, or use fewer workers")
     assert wrong.count("\n") == 1
     assert not (folder / "results.zarr").exists()

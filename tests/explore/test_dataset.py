@@ -1,4 +1,4 @@
-"""Datasets: every sample a function of the seed and its number, labels where the light goes, files whole after any end."""
+"""Datasets: reproducible samples, labels mapped through the lens, and resumable storage."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def pictures(n, seed=0):
 
 
 def labelled(n=5, **more):
-    """A dataset with labels of every sort."""
+    """Create a dataset with labels of all kinds."""
     rng = np.random.default_rng(1)
     options = {
         "cameras": 2,
@@ -89,10 +89,10 @@ def assert_same(one, other):
         np.testing.assert_array_equal(value, other[name], err_msg=name)
 
 
-# -- the same sample always -------------------------------------------------------------------------------------------
+# -- reproducibility --------------------------------------------------------------------------------------------------
 
 
-def test_a_sample_is_the_same_in_any_order_and_alone():
+def test_samples_do_not_depend_on_order():
     data = labelled()
     forwards = [data[k] for k in range(len(data))]
 
@@ -102,7 +102,7 @@ def test_a_sample_is_the_same_in_any_order_and_alone():
         assert_same(labelled()[k], forwards[k])
 
 
-def test_a_sample_is_the_same_in_other_processes():
+def test_samples_do_not_depend_on_process():
     data = labelled()
     order = np.random.default_rng(1).permutation(len(data)).tolist()
     with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
@@ -112,7 +112,7 @@ def test_a_sample_is_the_same_in_other_processes():
         assert_same(sample, data[k])
 
 
-def test_a_pickled_data_set_takes_no_kept_parts_along():
+def test_pickled_dataset_contains_no_cache():
     data = labelled()
     size = len(pickle.dumps(data))
     list(data)
@@ -120,15 +120,15 @@ def test_a_pickled_data_set_takes_no_kept_parts_along():
     assert len(pickle.dumps(data)) == size
 
 
-def test_a_sample_is_what_the_shot_by_hand_gives():
+def test_sample_equals_capture_of_its_shot():
     data = explore.Dataset(pictures(3), SHOT, VARY, cameras=4, seed=5)
     index = 9
     settings = data.settings_of(index)
-    told = {key: value for key, value in SHOT["scene"].items() if key != "kind"}
-    flat = {key: value for key, value in told.items() if key != "peak_radiance_w_m2_sr_nm"}
-    by_hand = build_shot("by hand", settings | {"scene": FLAT | flat})
-    scene = fs.Scene.from_picture(pictures(3)[2], **told)
-    capture = by_hand.camera.capture(scene, exposure_s=by_hand.exposure_s, seed=5, frame=index)
+    options = {key: value for key, value in SHOT["scene"].items() if key != "kind"}
+    flat = {key: value for key, value in options.items() if key != "peak_radiance_w_m2_sr_nm"}
+    shot = build_shot("reference", settings | {"scene": FLAT | flat})
+    scene = fs.Scene.from_picture(pictures(3)[2], **options)
+    capture = shot.camera.capture(scene, exposure_s=shot.exposure_s, seed=5, frame=index)
 
     np.testing.assert_array_equal(data[index]["code"], capture.code)
     np.testing.assert_array_equal(data[index]["electrons"], capture.electrons)
@@ -139,7 +139,7 @@ def test_a_sample_is_what_the_shot_by_hand_gives():
     )
 
 
-def test_draws_differ_in_noise_alone_and_cameras_in_settings():
+def test_draws_of_camera_differ_in_noise():
     data = labelled()
 
     first, again, other = data[0], data[1], data[2]
@@ -151,13 +151,13 @@ def test_draws_differ_in_noise_alone_and_cameras_in_settings():
     assert first["picture"] == other["picture"] == 0
 
 
-def test_another_seed_draws_other_cameras():
+def test_seeds_give_different_cameras():
     found = [explore.Dataset(pictures(1), SHOT, VARY, seed=seed)[0]["settings"]["exposure_s"] for seed in range(20)]
 
     assert len(set(found)) == 20
 
 
-def test_another_setting_drawn_leaves_the_others_as_they_were():
+def test_random_settings_are_drawn_independently():
     few = explore.Dataset(pictures(6), SHOT, {"exposure_s": VARY["exposure_s"]})
     more = explore.Dataset(pictures(6), SHOT, VARY)
 
@@ -170,77 +170,77 @@ N_DRAWS = 4000
 
 
 @pytest.mark.parametrize(
-    ("told", "share_below"),
+    ("distribution", "cdf"),
     [
         ({"uniform": [2.0, 6.0]}, lambda x: (x - 2.0) / 4.0),
         ({"log_uniform": [1.0, 100.0]}, lambda x: np.log(x) / np.log(100.0)),
         ({"normal": [1.0, 2.0, 0.0, 4.0]}, lambda x: truncnorm(-0.5, 1.5, loc=1.0, scale=2.0).cdf(x)),
     ],
 )
-def test_a_distribution_is_the_one_it_says(told, share_below):
-    draw = explore.parse_distribution("x", told)
-    shares = np.sort([share_below(draw.at(0, k)[0]) for k in range(N_DRAWS)])
+def test_continuous_draws_follow_distribution(distribution, cdf):
+    draw = explore.parse_distribution("x", distribution)
+    quantiles = np.sort([cdf(draw.at(0, k)[0]) for k in range(N_DRAWS)])
 
-    # Kolmogorov: the largest distance of the two distributions exceeds 2.3 / sqrt(n) once in 25,000.
-    assert np.abs(shares - (np.arange(N_DRAWS) + 0.5) / N_DRAWS).max() < 2.3 / np.sqrt(N_DRAWS)
+    # Kolmogorov-Smirnov statistic: it exceeds 2.3 / sqrt(n) with a probability of 1 / 25,000.
+    assert np.abs(quantiles - (np.arange(N_DRAWS) + 0.5) / N_DRAWS).max() < 2.3 / np.sqrt(N_DRAWS)
 
 
 @pytest.mark.parametrize(
-    ("told", "chances"),
+    ("distribution", "probabilities"),
     [
         ({"integers": [-1, 2]}, {-1: 0.25, 0: 0.25, 1: 0.25, 2: 0.25}),
         ({"choice": [8, 10]}, {8: 0.5, 10: 0.5}),
         ({"choice": ["a", "b", "c"], "weights": [1, 0, 3]}, {"a": 0.25, "b": 0.0, "c": 0.75}),
     ],
 )
-def test_a_choice_has_its_chances(told, chances):
-    draw = explore.parse_distribution("x", told)
+def test_discrete_draws_follow_probabilities(distribution, probabilities):
+    draw = explore.parse_distribution("x", distribution)
     found = [draw.at(3, k)[0] for k in range(N_DRAWS)]
 
-    assert set(found) == {value for value, chance in chances.items() if chance}
-    for value, chance in chances.items():
-        assert abs(found.count(value) - chance * N_DRAWS) <= 5.0 * np.sqrt(N_DRAWS * chance * (1.0 - chance))
+    assert set(found) == {value for value, p in probabilities.items() if p}
+    for value, p in probabilities.items():
+        assert abs(found.count(value) - p * N_DRAWS) <= 5.0 * np.sqrt(N_DRAWS * p * (1.0 - p))
 
 
 @pytest.mark.parametrize("sigma", [1e-320, 1e-9, 0.1, 1e6])
-def test_a_normal_distribution_of_any_width_is_between_its_ends(sigma):
-    """Nearly even far inside a wide one, and its mean where it is narrow."""
+def test_normal_draws_are_within_bounds(sigma):
+    """A wide truncated distribution is nearly uniform; a narrow one is concentrated at its mean."""
     draw = explore.parse_distribution("x", {"normal": [1.0, sigma, 0.0, 2.0]})
     found = np.array([draw.at(0, k)[0] for k in range(N_DRAWS)])
     sigma_cut = min(sigma, np.sqrt(1.0 / 3.0))
 
     assert 0.0 <= found.min() <= found.max() <= 2.0
     assert abs(found.mean() - 1.0) <= 5.0 * sigma_cut / np.sqrt(N_DRAWS)
-    # The variance of an even and of a normal distribution, to 5 sigma of the wider spread of the normal's.
+    # Standard deviation of a uniform or normal distribution, within 5 sigma of its estimate for a normal distribution.
     assert found.std() == pytest.approx(sigma_cut, rel=5.0 / np.sqrt(2.0 * N_DRAWS))
 
 
-def test_labels_may_be_true_and_false():
+def test_boolean_labels_become_integers():
     data = explore.Dataset(pictures(2), SHOT, labels=[True, False])
 
     assert [sample["label"] for sample in data] == [1, 0]
 
 
-def test_pictures_of_all_depths_hold_the_same_light(tmp_path):
-    """One picture in 8 bits, 16 bits and floating-point numbers, in a folder, a zip file and memory."""
+def test_bit_depths_give_equal_electrons(tmp_path):
+    """One picture with 8 bits, 16 bits and floating-point numbers, in a directory, a zip file and memory."""
     picture = pictures(1)[0]
     deep, exact = picture.astype(np.uint16) * 257, (picture / 255.0).astype(np.float32)
-    folder = tmp_path / "all"
-    folder.mkdir()
+    directory = tmp_path / "all"
+    directory.mkdir()
     for name, numbers in (("1.png", picture), ("2.png", deep), ("3.tif", deep), ("4.tif", exact), ("5.exr", exact)):
-        write_picture(folder / name, numbers)
+        write_picture(directory / name, numbers)
     with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
-        for file in folder.iterdir():
+        for file in directory.iterdir():
             archive.write(file, file.name)
 
-    for source in (folder, tmp_path / "all.zip", [picture, deep, deep, exact, exact]):
+    for source in (directory, tmp_path / "all.zip", [picture, deep, deep, exact, exact]):
         found = [sample["expected_e"] for sample in explore.Dataset(source, SHOT, fields=("expected_e",))]
         assert len(found) == 5
         for each in found[1:]:
             np.testing.assert_allclose(each, found[0], rtol=1e-6)
 
 
-def test_a_box_beyond_the_picture_covers_what_of_it_is_on_it():
+def test_boxes_are_clipped_to_picture():
     boxes = [[-5, -5, N_X / 2, N_Y], [N_X + 10, 5, N_X + 20, 9], [-1e300, -1e300, 1e300, 1e300]]
     sample = explore.Dataset(pictures(1), SHOT, boxes=[boxes], fit="cover")[0]
     left = explore.Dataset(pictures(1), SHOT, boxes=[[[0, 0, N_X / 2, N_Y]]], fit="cover")[0]
@@ -251,7 +251,7 @@ def test_a_box_beyond_the_picture_covers_what_of_it_is_on_it():
     assert sample["box_covers"][2].all()
 
 
-def test_choices_that_are_no_numbers_are_told_by_their_positions():
+def test_samples_contain_indices_of_choices():
     data = explore.Dataset(pictures(20), SHOT, VARY)
     choices = VARY["sensor.qe"]["choice"]
 
@@ -259,7 +259,7 @@ def test_choices_that_are_no_numbers_are_told_by_their_positions():
         assert data.settings_of(k)["sensor"]["qe"] == choices[data[k]["settings"]["sensor.qe"]]
 
 
-def test_codes_of_all_samples_have_the_type_of_the_most_bits():
+def test_code_dtype_follows_largest_bit_depth():
     data = explore.Dataset(pictures(4), SHOT, {"sensor.bits": {"choice": [8, 12]}})
 
     assert {sample["code"].dtype for sample in data} == {np.dtype(np.uint16)}
@@ -274,9 +274,9 @@ def test_codes_of_all_samples_have_the_type_of_the_most_bits():
         {"sensor.read_noise_e": {"choice": [3, 0.5]}, "sensor.device_seed": {"choice": [2**63 - 1, 0, 7]}},
     ],
 )
-def test_stored_numbers_are_those_that_samples_were_made_with(name, vary, tmp_path):
-    """Whichever comes first, an integer or another: all have the one type, and none is cut off."""
-    is_whole_first = set()
+def test_stored_settings_are_exact(name, vary, tmp_path):
+    """The type of the first number, integer or float, does not truncate the others."""
+    is_integer_first = set()
     for seed in (0, 4, 5):
         data = explore.Dataset(pictures(12), SHOT, vary, seed=seed, fields=())
         stored = explore.write_dataset(data, tmp_path / f"{seed}{name}")
@@ -287,20 +287,20 @@ def test_stored_numbers_are_those_that_samples_were_made_with(name, vary, tmp_pa
                 assert number == data.settings_of(k)[section][key]
                 assert type(number) is type(data[0]["settings"][path])
         section, _, key = next(iter(vary)).partition(".")
-        is_whole_first.add(data.settings_of(0)[section][key] in (2, 3, 4))
-    assert is_whole_first == {True, False}
+        is_integer_first.add(data.settings_of(0)[section][key] in (2, 3, 4))
+    assert is_integer_first == {True, False}
 
 
-# -- labels where the light goes --------------------------------------------------------------------------------------
+# -- labels on the sensor ---------------------------------------------------------------------------------------------
 
 GRID = fs.Grid.centred((11, 13), 4.0)
 LENS = fs.distortion.BrownConrady(focal_um=60.0, k1=-0.25, p1=0.01, centre_um=(1.5, -2.0))
-#: Sites of many shapes, some of them partly off the picture.
+#: Sites of irregular shapes, some of them partly outside the picture.
 SITES = fs.layout.voronoi(n_sites=40, size_um=(56.0, 46.0), seed=2)
 
 
-def shared_um2(lens):
-    """Areas that every site shares with every cell, (n_site, n_y, n_x), and all its area, by shapely."""
+def intersection_um2(lens):
+    """Compute the intersection area of each site and cell, (n_site, n_y, n_x), and the outlines, by shapely."""
     outlines = SITES.polygons()
     if lens is not None:
         outlines = shapely.segmentize(outlines, 0.02)
@@ -310,14 +310,14 @@ def shared_um2(lens):
     return shapely.area(shapely.intersection(outlines[:, np.newaxis, np.newaxis], cells)), outlines
 
 
-@pytest.fixture(scope="module", params=[None, LENS], ids=["straight", "distorted"])
-def seen(request):
-    areas_um2, outlines = shared_um2(request.param)
+@pytest.fixture(scope="module", params=[None, LENS], ids=["undistorted", "distorted"])
+def reference(request):
+    areas_um2, outlines = intersection_um2(request.param)
     return request.param, fs.Integrator(SITES, GRID, distortion=request.param), areas_um2, outlines
 
 
-def test_a_site_has_the_class_of_most_of_its_area(seen):
-    _, integrator, areas_um2, outlines = seen
+def test_site_mask_is_class_with_largest_area(reference):
+    _, integrator, areas_um2, outlines = reference
     mask = np.random.default_rng(0).integers(0, 4, GRID.shape)
     found = mask_on_sites(mask[::-1], integrator)
     of_class = np.stack([(areas_um2 * (mask == k)).sum(axis=(1, 2)) for k in range(4)])
@@ -333,26 +333,26 @@ def test_a_site_has_the_class_of_most_of_its_area(seen):
 
 
 @pytest.mark.parametrize("box_px", [(3, 2, 9, 10), (0, 0, 13, 11), (2.25, 1.5, 7.0, 8.125)])
-def test_a_box_covers_the_sites_that_are_mostly_in_it(seen, box_px):
-    lens, integrator, _, outlines = seen
+def test_box_covers_sites_mostly_inside(reference, box_px):
+    lens, integrator, _, outlines = reference
     x0, y1 = GRID.origin_um[0], GRID.bounds_um[3]
     left, top, right, bottom = box_px
     box = shapely.box(x0 + 4.0 * left, y1 - 4.0 * bottom, x0 + 4.0 * right, y1 - 4.0 * top)
-    share = shapely.area(shapely.intersection(outlines, box)) / shapely.area(outlines)
+    fraction = shapely.area(shapely.intersection(outlines, box)) / shapely.area(outlines)
 
     found = boxes_on_sites(np.array([box_px], float), integrator, lens)
 
-    # Pixels that a box cuts are spread evenly.
-    is_clear = np.abs(share - 0.5) > (1e-4 if box_px == tuple(map(int, box_px)) else 0.1)
+    # Pixels on the boundary of a box count with a uniform fraction.
+    is_clear = np.abs(fraction - 0.5) > (1e-4 if box_px == tuple(map(int, box_px)) else 0.1)
     assert is_clear.sum() > 30
-    assert 5 < (share > 0.5).sum() <= 40
-    np.testing.assert_array_equal(found.covers[0][is_clear], share[is_clear] > 0.5)
-    border = shapely.get_coordinates(shapely.segmentize(box, 0.01).exterior)
-    real = border if lens is None else lens.distort(border)
+    assert 5 < (fraction > 0.5).sum() <= 40
+    np.testing.assert_array_equal(found.covers[0][is_clear], fraction[is_clear] > 0.5)
+    boundary = shapely.get_coordinates(shapely.segmentize(box, 0.01).exterior)
+    real = boundary if lens is None else lens.distort(boundary)
     np.testing.assert_allclose(found.box_um[0], [*real.min(axis=0), *real.max(axis=0)], atol=0.02)
 
 
-def test_a_box_that_the_lens_does_not_image_is_nowhere():
+def test_box_outside_image_circle_is_empty():
     far = fs.Grid.centred((100, 100), 4.0)
     found = boxes_on_sites(
         np.array([[0.0, 0.0, 5.0, 5.0], [48.0, 48.0, 52.0, 52.0]]),
@@ -366,17 +366,17 @@ def test_a_box_that_the_lens_does_not_image_is_nowhere():
     assert found.covers[1].any()
 
 
-def test_flow_of_a_site_is_the_mean_of_its_pixels(seen):
-    lens, integrator, areas_um2, _ = seen
+def test_site_flow_is_mean_over_pixels(reference):
+    lens, integrator, areas_um2, _ = reference
     rng = np.random.default_rng(4)
     flow_px = rng.normal(size=(*GRID.shape, 2))
     flow_px[2:5, 3:6] = np.nan
-    middles = np.stack(np.meshgrid(GRID.x_um, GRID.y_um), axis=-1)
+    centres = np.stack(np.meshgrid(GRID.x_um, GRID.y_um), axis=-1)
     moves = flow_px[::-1] * [4.0, -4.0]
     if lens is not None:
         with np.errstate(invalid="ignore"):
             is_known = np.isfinite(moves).all(axis=-1, keepdims=True)
-            moves = np.where(is_known, lens.distort(middles + np.nan_to_num(moves)) - lens.distort(middles), np.nan)
+            moves = np.where(is_known, lens.distort(centres + np.nan_to_num(moves)) - lens.distort(centres), np.nan)
     known_um2 = areas_um2 * np.isfinite(moves[..., 0])
     sums = np.einsum("syx,yxk->sk", known_um2, np.nan_to_num(moves))
 
@@ -391,8 +391,8 @@ def test_flow_of_a_site_is_the_mean_of_its_pixels(seen):
     assert np.isfinite(found.flow_um).all()
 
 
-def test_labels_go_where_the_camera_puts_the_light():
-    """A picture that is bright where its mask, its box and its class are: the sites that see light have the labels."""
+def test_labels_match_the_optical_image():
+    """In a picture whose bright area is its mask and box, the bright sites have the labels."""
     bright = np.zeros((N_Y, N_X), np.uint8)
     bright[30:42, 36:70] = 255
     layout = {"generator": "grid", "parameters": {"n_x": 24, "n_y": 20, "pitch_um": 4.0}}
@@ -406,22 +406,22 @@ def test_labels_go_where_the_camera_puts_the_light():
     )
     sample = data[0]
     layout = data.layout
-    light = sample["expected_e"] / layout.area_um2 > 0.5 * (sample["expected_e"] / layout.area_um2).max()
-    corners = layout.centroid_um[light]
+    is_bright = sample["expected_e"] / layout.area_um2 > 0.5 * (sample["expected_e"] / layout.area_um2).max()
+    centroids = layout.centroid_um[is_bright]
     inside = np.all(
         (layout.centroid_um > sample["box_um"][0, :2]) & (layout.centroid_um < sample["box_um"][0, 2:]), axis=1
     )
 
-    # Along the edges the lens's blur decides.
+    # Blur affects sites along the edges.
     assert (sample["mask"] == 1).sum() > 50
-    assert np.mean(light == (sample["mask"] == 1)) > 0.97
+    assert np.mean(is_bright == (sample["mask"] == 1)) > 0.97
     np.testing.assert_array_equal(sample["box_covers"][0], sample["mask"] == 1)
     assert np.all(inside[sample["mask"] == 1])
-    assert corners[:, 1].mean() > 0.0  # the upper half of the picture
+    assert centroids[:, 1].mean() > 0.0  # upper half of the picture
     assert sample["flow_um"][:, 0].min() > 0.0 > sample["flow_um"][:, 1].max()
 
 
-def test_nothing_in_a_sample_is_nan_where_sites_see_no_picture():
+def test_samples_are_finite_outside_picture():
     narrow = {"kind": "fisheye", "projection": "orthographic", "focal_um": 30.0}
     shot = SHOT | {"scene": SHOT["scene"] | {"pitch_um": 120.0}, "distortion": narrow}
     flows = np.full((1, N_Y, N_X, 2), np.nan)
@@ -437,7 +437,7 @@ def test_nothing_in_a_sample_is_nan_where_sites_see_no_picture():
 
 
 @pytest.mark.parametrize(("fit", "is_covered"), [("cover", True), ("contain", False)])
-def test_pictures_of_any_size_fit_the_layout(fit, is_covered):
+def test_fit_scales_pictures_to_layout(fit, is_covered):
     wide, high = np.full((20, 90, 3), 200, np.uint8), np.full((90, 20, 3), 200, np.uint8)
     data = explore.Dataset([wide, high], SHOT, masks=[wide[..., 0] // 200, high[..., 0] // 200], fit=fit)
     if is_covered:
@@ -452,11 +452,11 @@ def test_pictures_of_any_size_fit_the_layout(fit, is_covered):
         assert n * grid.pitch_um / 2 == pytest.approx(half_um)
 
 
-# -- where pictures come from -----------------------------------------------------------------------------------------
+# -- picture sources --------------------------------------------------------------------------------------------------
 
 
-class Made:
-    """Pictures that are made when they are asked for."""
+class Lazy:
+    """Sequence of pictures other than a list, as one that computes its items on access."""
 
     def __init__(self, items):
         self.items = items
@@ -468,7 +468,7 @@ class Made:
         return self.items[k]
 
 
-def folder_of_classes(tmp_path):
+def class_directories(tmp_path):
     for k, (name, picture) in enumerate(zip(("b/2.png", "a/10.png", "a/9.png", "b/1.png"), pictures(4), strict=True)):
         path = tmp_path / "pictures" / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -478,35 +478,35 @@ def folder_of_classes(tmp_path):
     return tmp_path / "pictures"
 
 
-def test_folders_zips_files_pairs_and_arrays_give_the_same_samples(tmp_path):
-    folder = folder_of_classes(tmp_path)
+def test_samples_do_not_depend_on_source_kind(tmp_path):
+    directory = class_directories(tmp_path)
     names = ["a/9.png", "a/10.png", "b/1.png", "b/2.png"]
     archive = tmp_path / "pictures.zip"
     with zipfile.ZipFile(archive, "w") as file:
         for name in reversed(names):
-            file.write(folder / name, name)
+            file.write(directory / name, name)
     stack = pictures(4)[[2, 1, 3, 0]]
     np.save(tmp_path / "stack.npy", stack)
     classes = ["a", "a", "b", "b"]
-    paired = [(Image.open(folder / name), label) for name, label in zip(names, classes, strict=True)]
-    made = {
-        "folder": explore.Dataset(folder, SHOT, VARY),
+    paired = [(Image.open(directory / name), label) for name, label in zip(names, classes, strict=True)]
+    datasets = {
+        "directory": explore.Dataset(directory, SHOT, VARY),
         "zip": explore.Dataset(archive, SHOT, VARY),
-        "files": explore.Dataset([folder / name for name in names], SHOT, VARY, labels=classes),
+        "files": explore.Dataset([directory / name for name in names], SHOT, VARY, labels=classes),
         "pairs": explore.Dataset(paired, SHOT, VARY),
         "array": explore.Dataset(stack, SHOT, VARY, labels=classes),
         "npy": explore.Dataset(tmp_path / "stack.npy", SHOT, VARY, labels=classes),
     }
 
-    for data in made.values():
+    for data in datasets.values():
         assert data.class_names == ["a", "b"]
-        again = pickle.loads(pickle.dumps(data)) if data is not made["pairs"] else data
+        again = pickle.loads(pickle.dumps(data)) if data is not datasets["pairs"] else data
         for k in range(4):
-            assert_same(again[k], made["folder"][k])
-    assert [sample["label"] for sample in made["zip"]] == [0, 0, 1, 1]
+            assert_same(again[k], datasets["directory"][k])
+    assert [sample["label"] for sample in datasets["zip"]] == [0, 0, 1, 1]
 
 
-def test_pictures_come_in_the_natural_order_of_their_names_however_they_are_found(tmp_path):
+def test_pictures_are_in_natural_order(tmp_path):
     names = ["a1.png", "a.png", "001.png", "01.png", "1.png", "1a.png", "2.png", "10.png"]
     names += [f"{'9' * 5000}.png", f"1{'0' * 5000}.png", "²3.png", "٣.png"]
     order = sorted(names, key=lambda name: (name[0] in "0123456789", names.index(name)))
@@ -518,16 +518,16 @@ def test_pictures_come_in_the_natural_order_of_their_names_however_they_are_foun
                 file.write(tmp_path / "a.png", names[k])
         source = source_of(archive)
         assert [source.key(k) for k in range(len(source))] == order
-    (tmp_path / "folder").mkdir()
+    (tmp_path / "directory").mkdir()
     short = [name for name in order if len(name) < 99]
     for name in reversed(short):
-        Image.fromarray(pictures(1)[0]).save(tmp_path / "folder" / name)
-    source = source_of(tmp_path / "folder")
+        Image.fromarray(pictures(1)[0]).save(tmp_path / "directory" / name)
+    source = source_of(tmp_path / "directory")
     assert [source.key(k) for k in range(len(source))] == short
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
-def test_a_name_that_a_zip_file_has_twice_is_one_picture(tmp_path):
+def test_duplicate_zip_member_is_one_picture(tmp_path):
     with zipfile.ZipFile(tmp_path / "x.zip", "w") as archive:
         for picture in pictures(2):
             Image.fromarray(picture).save(tmp_path / "a.png")
@@ -538,27 +538,27 @@ def test_a_name_that_a_zip_file_has_twice_is_one_picture(tmp_path):
     np.testing.assert_array_equal(data[0]["code"], explore.Dataset(pictures(2)[1:], SHOT)[0]["code"])
 
 
-TURNED = Image.Exif()
-TURNED[274] = 6  # the camera was held on its side
+ROTATED = Image.Exif()
+ROTATED[274] = 6  # EXIF orientation: rotated by 90 degrees
 
 
 @pytest.mark.parametrize(
-    ("ending", "convert", "note"),
+    ("extension", "convert", "exif"),
     [
         ("png", lambda image: image.quantize(16), None),
         ("png", lambda image: image.convert("1"), None),
         ("png", lambda image: image.convert("LA"), None),
         ("png", lambda image: Image.fromarray(np.asarray(image.convert("L")).astype(np.uint16) * 255), None),
-        ("png", lambda image: image, TURNED),
-        ("jpg", lambda image: image, TURNED),
+        ("png", lambda image: image, ROTATED),
+        ("jpg", lambda image: image, ROTATED),
         ("jpg", lambda image: image.convert("CMYK"), None),
-        ("tif", lambda image: image, TURNED),
+        ("tif", lambda image: image, ROTATED),
     ],
-    ids=["palette", "1", "LA", "16 bits", "turned PNG", "turned JPEG", "CMYK", "turned TIFF"],
+    ids=["palette", "1", "LA", "16 bits", "rotated PNG", "rotated JPEG", "CMYK", "rotated TIFF"],
 )
-def test_an_image_of_pillow_is_seen_as_its_file_is(ending, convert, note, tmp_path):
-    image, file = convert(Image.fromarray(pictures(1)[0])), tmp_path / f"a.{ending}"
-    image.save(file, **({} if note is None else {"exif": note}))
+def test_pillow_image_equals_its_file(extension, convert, exif, tmp_path):
+    image, file = convert(Image.fromarray(pictures(1)[0])), tmp_path / f"a.{extension}"
+    image.save(file, **({} if exif is None else {"exif": exif}))
     opened = Image.open(file)
     opened.load()
     of_file = explore.Dataset([file], SHOT)[0]
@@ -566,31 +566,31 @@ def test_an_image_of_pillow_is_seen_as_its_file_is(ending, convert, note, tmp_pa
     assert_same(explore.Dataset([Image.open(file)], SHOT)[0], of_file)
     assert_same(explore.Dataset([opened], SHOT)[0], of_file)
     assert_same(pickle.loads(pickle.dumps(explore.Dataset([opened], SHOT)))[0], of_file)
-    assert_same(explore.Dataset(Made([Image.open(file)]), SHOT)[0], of_file)
+    assert_same(explore.Dataset(Lazy([Image.open(file)]), SHOT)[0], of_file)
 
 
 @pytest.mark.parametrize("mode", ["HSV", "YCbCr", "CMYK", "RGBX"])
-def test_colours_of_an_image_of_pillow_are_seen_in_any_of_its_modes(mode):
-    """Of black and white, which all of them hold as they are."""
+def test_pillow_colour_modes_are_converted(mode):
+    """Black and white are exact in all modes."""
     grey = np.repeat(pictures(1)[0][..., :1] // 128 * 255, 3, axis=2).astype(np.uint8)
 
     assert_same(explore.Dataset([Image.fromarray(grey).convert(mode)], SHOT)[0], explore.Dataset([grey], SHOT)[0])
 
 
-def test_a_broken_image_of_pillow_is_told_in_one_sentence(tmp_path):
+def test_truncated_pillow_image_is_rejected(tmp_path):
     Image.fromarray(pictures(1)[0]).save(tmp_path / "a.png")
-    whole = (tmp_path / "a.png").read_bytes()
-    (tmp_path / "a.png").write_bytes(whole[: len(whole) // 2])
+    complete = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "a.png").write_bytes(complete[: len(complete) // 2])
 
     with (
         Image.open(tmp_path / "a.png") as image,
-        pytest.raises(FileError, match="picture 0: is no image that can be read") as caught,
+        pytest.raises(FileError, match="picture 0: is not a readable image") as caught,
     ):
         explore.Dataset([image], SHOT)
     assert "\n" not in str(caught.value)
 
 
-def test_a_mask_with_a_palette_has_its_numbers(tmp_path):
+def test_palette_mask_gives_indices(tmp_path):
     image = Image.fromarray(np.full((N_Y, N_X), 3, np.uint8), mode=None).convert("P")
     image.putpalette([200, 10, 10] * 256)
     image.putdata([3] * (N_Y * N_X))
@@ -606,12 +606,12 @@ def test_a_mask_with_a_palette_has_its_numbers(tmp_path):
 
 @pytest.mark.parametrize("name", ["data.zarr", "data"])
 @pytest.mark.parametrize("workers", [1, 2])
-def test_what_was_written_is_what_is_simulated(name, workers, tmp_path):
+def test_stored_samples_equal_simulated_samples(name, workers, tmp_path):
     data = labelled()
     progress = []
 
     stored = explore.write_dataset(
-        data, tmp_path / name, per_shard=3, workers=workers, progress=lambda *told: progress.append(told)
+        data, tmp_path / name, per_shard=3, workers=workers, progress=lambda *counts: progress.append(counts)
     )
 
     assert len(stored) == len(data)
@@ -627,7 +627,7 @@ def test_what_was_written_is_what_is_simulated(name, workers, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
-def test_tar_files_are_the_same_bytes_with_any_number_of_workers_and_read_by_their_names(tmp_path):
+def test_tar_shards_do_not_depend_on_workers(tmp_path):
     for workers in (1, 2):
         explore.write_dataset(labelled(), tmp_path / f"data{workers}", per_shard=6, workers=workers)
     shards = sorted(p.name for p in (tmp_path / "data1").glob("*.tar"))
@@ -642,7 +642,7 @@ def test_tar_files_are_the_same_bytes_with_any_number_of_workers_and_read_by_the
     assert fs.read_layout(tmp_path / "data1" / "layout.npz").n_sites == labelled().layout.n_sites
 
 
-def test_the_photosites_are_beside_the_codes(tmp_path):
+def test_zarr_store_contains_layout_and_settings(tmp_path):
     zarr = pytest.importorskip("zarr")
     data = explore.Dataset(pictures(2), SHOT, VARY)
     explore.write_dataset(data, tmp_path / "data.zarr")
@@ -653,34 +653,34 @@ def test_the_photosites_are_beside_the_codes(tmp_path):
     np.testing.assert_array_equal(group["settings/exposure_s"][:], [s["settings"]["exposure_s"] for s in data])
 
 
-def test_tar_files_hold_layouts_that_differ_and_zarr_does_not(tmp_path):
+def test_only_tar_shards_support_varied_layouts(tmp_path):
     vary = {"layout.parameters.pitch_um": {"uniform": [5.0, 7.0]}, "layout.parameters.n_rows": {"integers": [6, 9]}}
     data = explore.Dataset(pictures(5), SHOT, vary)
 
     stored = explore.write_dataset(data, tmp_path / "data", per_shard=2)
 
     assert len({sample["code"].size for sample in stored}) > 1
-    with pytest.raises(ParameterError, match="'layout' must not vary in a zarr folder"):
+    with pytest.raises(ParameterError, match="'layout' must not vary in a zarr store"):
         explore.write_dataset(data, tmp_path / "data.zarr")
-    with pytest.raises(ParameterError, match="'layout' differs from sample to sample"):
+    with pytest.raises(ParameterError, match="'layout' must be equal in all samples"):
         _ = data.layout
 
 
-def broken_folder(tmp_path):
-    """Six pictures, of which the fifth is truncated, and its whole content."""
-    folder = tmp_path / "pictures"
-    folder.mkdir()
+def corrupt_directory(tmp_path):
+    """Write six pictures, of which the fifth is truncated; return the directory and its complete contents."""
+    directory = tmp_path / "pictures"
+    directory.mkdir()
     for k, picture in enumerate(pictures(6)):
-        Image.fromarray(picture).save(folder / f"{k}.png")
-    whole = (folder / "4.png").read_bytes()
-    (folder / "4.png").write_bytes(whole[: len(whole) // 2])
-    return folder, whole
+        Image.fromarray(picture).save(directory / f"{k}.png")
+    complete = (directory / "4.png").read_bytes()
+    (directory / "4.png").write_bytes(complete[: len(complete) // 2])
+    return directory, complete
 
 
 @pytest.mark.parametrize("name", ["data.zarr", "data"])
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_broken_picture_is_named_and_writing_goes_on_from_there(name, workers, tmp_path):
-    folder, whole = broken_folder(tmp_path)
+def test_writing_resumes_after_corrupt_picture(name, workers, tmp_path):
+    directory, complete = corrupt_directory(tmp_path)
     target = tmp_path / name
     done = (
         (lambda: {p: p.stat().st_mtime_ns for p in target.glob("code/c/*/0")})
@@ -688,12 +688,12 @@ def test_a_broken_picture_is_named_and_writing_goes_on_from_there(name, workers,
         else (lambda: {p: p.stat().st_mtime_ns for p in target.glob("*.tar")})
     )
     with pytest.raises(FileError, match=r"4\.png: is corrupt or truncated"):
-        explore.write_dataset(explore.Dataset(folder, SHOT, VARY), target, per_shard=1, workers=workers)
+        explore.write_dataset(explore.Dataset(directory, SHOT, VARY), target, per_shard=1, workers=workers)
     before = done()
-    with pytest.raises(FileError, match=r"has \d of 6 shards; write the same dataset there to go on"):
+    with pytest.raises(FileError, match=r"has \d of 6 shards; write the same dataset again to resume"):
         explore.open_dataset(target)
-    (folder / "4.png").write_bytes(whole)
-    data = explore.Dataset(folder, SHOT, VARY)
+    (directory / "4.png").write_bytes(complete)
+    data = explore.Dataset(directory, SHOT, VARY)
 
     stored = explore.write_dataset(data, target, workers=workers)
 
@@ -703,7 +703,7 @@ def test_a_broken_picture_is_named_and_writing_goes_on_from_there(name, workers,
         assert_same(stored[k], data[k])
 
 
-def test_a_process_that_ends_amid_a_shard_leaves_whole_shards(tmp_path):
+def test_crash_leaves_only_complete_shards(tmp_path):
     script = tmp_path / "write.py"
     script.write_text(
         "import json, os, sys\n"
@@ -723,16 +723,16 @@ def test_a_process_that_ends_amid_a_shard_leaves_whole_shards(tmp_path):
     )
     both = [str(tmp_path / "data.zarr"), str(tmp_path / "data")]
 
-    def run(workers, how, *paths):
-        command = [sys.executable, str(script), str(workers), how, json.dumps(SHOT), *paths]
+    def run(workers, mode, *paths):
+        command = [sys.executable, str(script), str(workers), mode, json.dumps(SHOT), *paths]
         return subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
 
     for path in both:
         assert run(1, "end", path).returncode == 9
     lost = run(2, "end", both[1])
-    finished = run(1, "whole", *both)
+    finished = run(1, "complete", *both)
 
-    assert "SimulationError: a process that wrote shard 2 ended each time" in lost.stderr
+    assert "SimulationError: the process that wrote shard 2 ended in every attempt" in lost.stderr
     assert finished.returncode == 0, finished.stderr
     data = explore.Dataset([np.random.default_rng(k).integers(0, 256, (40, 48, 3), np.uint8) for k in range(8)], SHOT)
     for path in both:
@@ -741,7 +741,7 @@ def test_a_process_that_ends_amid_a_shard_leaves_whole_shards(tmp_path):
             assert_same(stored[k], data[k])
 
 
-def test_a_program_that_its_writers_cannot_import_is_told_so_and_ends(tmp_path):
+def test_missing_main_guard_is_reported(tmp_path):
     script = tmp_path / "write.py"
     script.write_text(
         "import json, sys\n"
@@ -756,10 +756,10 @@ def test_a_program_that_its_writers_cannot_import_is_told_so_and_ends(tmp_path):
 
     assert result.returncode == 1
     assert "SimulationError: the workers did not start" in result.stderr
-    assert 'under if __name__ == "__main__": alone' in result.stderr.splitlines()[-1]
+    assert 'make the call under if __name__ == "__main__":' in result.stderr.splitlines()[-1]
 
 
-def test_writers_end_with_their_program(tmp_path):
+def test_worker_processes_end_with_program(tmp_path):
     script = tmp_path / "write.py"
     script.write_text(
         "import json, multiprocessing, sys, time\n"
@@ -788,46 +788,46 @@ def test_writers_end_with_their_program(tmp_path):
     finally:
         running.kill()
 
-    # The output ends when all that can write to it have.
+    # The pipe closes when all processes that can write to it have ended.
     running.communicate(timeout=240)
 
-    # Dask's scratch directory, which its next start removes, has nothing in it.
+    # The scratch directory of dask, which its next start removes, is empty.
     assert [path for path in (tmp_path / "temporary").rglob("*") if path.is_file() and path.stat().st_size] == []
 
 
-class Homebound(Made):
-    """Pictures that another process cannot take over."""
+class Unpicklable(Lazy):
+    """Pictures that cannot be unpickled in another process."""
 
     def __setstate__(self, state):
-        raise ValueError("the pictures stay")
+        raise ValueError("cannot be unpickled")
 
 
-def test_pictures_that_cannot_go_to_other_processes_are_told_in_one_sentence(tmp_path):
-    local = Made(pictures(4))
+def test_unpicklable_pictures_are_rejected(tmp_path):
+    local = Lazy(pictures(4))
     local.key = threading.Lock()
-    for made, message in (
+    for source, message in (
         (local, r"the pictures or labels cannot be sent to other processes \(.*\)"),
-        (Homebound(pictures(4)), r"the workers cannot compute: the pictures stay"),
+        (Unpicklable(pictures(4)), r"the workers cannot compute: cannot be unpickled"),
     ):
-        data = explore.Dataset(made, SHOT)
+        data = explore.Dataset(source, SHOT)
         with pytest.raises(SimulationError, match=message) as caught:
             explore.write_dataset(data, tmp_path / "data", workers=2)
         assert "\n" not in str(caught.value)
     assert_same(explore.write_dataset(data, tmp_path / "data")[3], data[3])
 
 
-def test_processes_are_started_where_there_is_enough_to_do(tmp_path, monkeypatch):
+def test_processes_start_only_for_long_tasks(tmp_path, monkeypatch):
     started = []
 
     @contextmanager
-    def others(write, **options):
+    def recording_executor(write, **options):
         def run(left, _cuts):
             started.append((len(left), options["workers"]))
             return ((k, write(k)) for k in left)
 
         yield run
 
-    monkeypatch.setattr(store, "executor", others)
+    monkeypatch.setattr(store, "executor", recording_executor)
     monkeypatch.setattr(store, "thread_count", lambda: 5)
     data = explore.Dataset(pictures(6), SHOT)
     for name, alone_s, found in (("short", 1e6, []), ("long", 0.0, [(5, 5)])):
@@ -838,8 +838,8 @@ def test_processes_are_started_where_there_is_enough_to_do(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("name", ["data.zarr", "data"])
-def test_a_full_disk_is_one_sentence_and_no_broken_shard(name, tmp_path):
-    """The system rejects files beyond a size, as it does where no place is left."""
+def test_full_disk_leaves_no_corrupt_shard(name, tmp_path):
+    """A file size limit of the operating system simulates a full disk."""
     rng = np.random.default_rng(0)
     layout = {"generator": "grid", "parameters": {"n_x": 90, "n_y": 90, "pitch_um": 1.0}}
     data = explore.Dataset(
@@ -861,37 +861,40 @@ def test_a_full_disk_is_one_sentence_and_no_broken_shard(name, tmp_path):
     assert not list(tmp_path.rglob(".foveasim*"))
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="a system without such rights")
-def test_what_must_not_be_read_or_written_is_one_sentence():
-    """As somebody without rights of his own, whom root becomes for it."""
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="a system without POSIX permissions")
+def test_missing_permissions_are_reported():
+    """Root switches to an unprivileged user for this test."""
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)  # that others may enter, as pytest's they may not
-        folder.chmod(0o777)
+        directory = Path(name)  # accessible to other users, unlike the temporary directories of pytest
+        directory.chmod(0o777)
         data = explore.Dataset(pictures(2), SHOT)
         for kind in ("a", "a.zarr"):
-            explore.write_dataset(data, folder / kind, per_shard=1)
-        (folder / "a" / "shard-000001.tar").unlink()
-        pytest.importorskip("zarr").open_group(str(folder / "a.zarr"), mode="r+")["done"][1] = 0
-        (folder / "pictures" / "closed").mkdir(parents=True)
-        Image.fromarray(pictures(1)[0]).save(folder / "pictures" / "1.png")
+            explore.write_dataset(data, directory / kind, per_shard=1)
+        (directory / "a" / "shard-000001.tar").unlink()
+        pytest.importorskip("zarr").open_group(str(directory / "a.zarr"), mode="r+")["done"][1] = 0
+        (directory / "pictures" / "closed").mkdir(parents=True)
+        Image.fromarray(pictures(1)[0]).save(directory / "pictures" / "1.png")
         closed = [
-            folder / "pictures" / "closed",
-            *(p for p in (folder / "a.zarr").rglob("*") if p.is_dir()),
-            folder / "a",
+            directory / "pictures" / "closed",
+            *(p for p in (directory / "a.zarr").rglob("*") if p.is_dir()),
+            directory / "a",
         ]
-        for place in closed:
-            place.chmod(0o000 if place.name == "closed" else 0o555)
+        for path in closed:
+            path.chmod(0o000 if path.name == "closed" else 0o555)
         try:
             os.seteuid(os.getuid() or 65534)
             for call, message in (
-                (lambda: explore.write_dataset(data, folder / "a"), "tar: cannot be written: Permission denied"),
-                (lambda: explore.write_dataset(data, folder / "a.zarr"), "zarr: cannot be written: Permission denied"),
+                (lambda: explore.write_dataset(data, directory / "a"), "tar: cannot be written: Permission denied"),
+                (
+                    lambda: explore.write_dataset(data, directory / "a.zarr"),
+                    "zarr: cannot be written: Permission denied",
+                ),
                 (
                     lambda: explore.write_dataset(data, closed[0] / "a"),
                     "closed/a: cannot be written: Permission denied",
                 ),
                 (lambda: explore.open_dataset(closed[0] / "a"), "closed/a: cannot be read: Permission denied"),
-                (lambda: explore.Dataset(folder / "pictures", SHOT), "closed: cannot be read: Permission denied"),
+                (lambda: explore.Dataset(directory / "pictures", SHOT), "closed: cannot be read: Permission denied"),
                 (lambda: explore.Dataset(closed[0] / "a", SHOT), "closed/a: cannot be read: Permission denied"),
             ):
                 with pytest.raises(FileError, match=message) as caught:
@@ -899,11 +902,11 @@ def test_what_must_not_be_read_or_written_is_one_sentence():
                 assert "\n" not in str(caught.value)
         finally:
             os.seteuid(os.getuid())
-            for place in closed:
-                place.chmod(0o755)
+            for path in closed:
+                path.chmod(0o755)
 
 
-def test_a_store_of_something_else_is_left_alone(tmp_path):
+def test_other_stores_are_unchanged(tmp_path):
     data = explore.Dataset(pictures(2), SHOT, VARY)
     explore.write_dataset(data, tmp_path / "data", per_shard=1)
     (tmp_path / "other").mkdir()
@@ -911,9 +914,9 @@ def test_a_store_of_something_else_is_left_alone(tmp_path):
     for other, path, message in (
         (explore.Dataset(pictures(2), SHOT, VARY, seed=1), "data", "is another dataset: its 'seed' differs"),
         (explore.Dataset(pictures(3), SHOT, VARY), "data", "its 'pictures' differs"),
-        (data, "other", "holds something else than a dataset"),
-        (data, "other.zarr", "holds something else than a dataset"),
-        (data, "data.hdf", "must end in .zarr, or have no ending"),
+        (data, "other", "is not a dataset of foveasim"),
+        (data, "other.zarr", "is not a dataset of foveasim"),
+        (data, "data.hdf", "must have the extension .zarr, or none"),
         (data, "missing/data", "cannot be written: the folder .*missing does not exist"),
         (data, "data/shard-000000.tar/x", "cannot be written: the folder .* does not exist"),
     ):
@@ -922,9 +925,9 @@ def test_a_store_of_something_else_is_left_alone(tmp_path):
     with pytest.raises(FileError, match="its 'per_shard' differs"):
         explore.write_dataset(data, tmp_path / "data", per_shard=2)
     (tmp_path / "data" / "shard-000001.tar").write_bytes(b"truncated")
-    with pytest.raises(FileError, match="has a broken sample 1"):
+    with pytest.raises(FileError, match="has a corrupt sample 1"):
         explore.open_dataset(tmp_path / "data")[1]
-    with pytest.raises(FileError, match="no such folder"):
+    with pytest.raises(FileError, match="no such directory"):
         explore.open_dataset(tmp_path / "nothing")
 
 
@@ -941,7 +944,7 @@ def saved(path, each):
     return path
 
 
-def folder_of(path, each):
+def directory_of(path, each):
     path.mkdir(exist_ok=True)
     for k, picture in enumerate(each):
         Image.fromarray(picture).save(path / f"{k}.png")
@@ -949,32 +952,32 @@ def folder_of(path, each):
 
 
 def files_of(path, each):
-    folder_of(path, each)
+    directory_of(path, each)
     return [path / f"{k}.png" for k in range(len(each))]
 
 
-#: How contents become a dataset, by what holds them.
-HOLDERS = {
+#: Functions that create a dataset from pictures, by kind of the container.
+CONTAINERS = {
     "array": lambda _, each: explore.Dataset(each, SHOT),
     "list": lambda _, each: explore.Dataset(list(each), SHOT),
     "Pillow": lambda _, each: explore.Dataset([Image.fromarray(picture) for picture in each], SHOT),
     "pairs": lambda _, each: explore.Dataset([(picture, 3) for picture in each], SHOT),
-    "made": lambda _, each: explore.Dataset(Made(each), SHOT),
+    "lazy": lambda _, each: explore.Dataset(Lazy(each), SHOT),
     "array file": lambda path, each: explore.Dataset(saved(path / "x.npy", each), SHOT),
-    "folder": lambda path, each: explore.Dataset(folder_of(path / "x", each), SHOT),
+    "directory": lambda path, each: explore.Dataset(directory_of(path / "x", each), SHOT),
     "files": lambda path, each: explore.Dataset(files_of(path / "x", each), SHOT),
     "zip": lambda path, each: explore.Dataset(zipped(path / "x.zip", each), SHOT),
     "masks": lambda _, each: explore.Dataset(pictures(4), SHOT, masks=each[..., 0]),
     "mask files": lambda path, each: explore.Dataset(pictures(4), SHOT, masks=files_of(path / "x", each[..., 0])),
-    "made masks": lambda _, each: explore.Dataset(pictures(4), SHOT, masks=Made(each[..., 0])),
+    "lazy masks": lambda _, each: explore.Dataset(pictures(4), SHOT, masks=Lazy(each[..., 0])),
     "flows": lambda _, each: explore.Dataset(pictures(4), SHOT, flows=list(each[..., :2])),
 }
 
 
-@pytest.mark.parametrize("holder", HOLDERS)
-def test_samples_of_other_contents_are_never_taken_for_those_asked_for(holder, tmp_path):
-    """Under the same names: what is there stays, and what was not done yet is of the contents of now."""
-    make = partial(HOLDERS[holder], tmp_path)
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_changed_inputs_are_rejected(container, tmp_path):
+    """Complete shards of changed inputs are not overwritten; missing shards use the current inputs."""
+    make = partial(CONTAINERS[container], tmp_path)
     each = pictures(4)
     changed = np.array(each)
     changed[3] ^= 1
@@ -983,7 +986,7 @@ def test_samples_of_other_contents_are_never_taken_for_those_asked_for(holder, t
     before = (target / "shard-000001.tar").read_bytes()
     other = make(changed)
 
-    with pytest.raises(FileError, match="is of other pictures, masks or flows: those of its samples 2 to 3 hold"):
+    with pytest.raises(FileError, match="is of other pictures, masks or flows: those of samples 2 to 3 have changed"):
         explore.write_dataset(other, target)
     assert (target / "shard-000001.tar").read_bytes() == before
     (target / "shard-000001.tar").unlink()
@@ -994,14 +997,14 @@ def test_samples_of_other_contents_are_never_taken_for_those_asked_for(holder, t
     explore.write_dataset(other, target)
 
 
-def test_samples_of_other_contents_are_refused_in_zarr_too(tmp_path):
+def test_changed_inputs_are_rejected_in_zarr(tmp_path):
     explore.write_dataset(explore.Dataset(list(pictures(4)), SHOT), tmp_path / "data.zarr", per_shard=2)
 
-    with pytest.raises(FileError, match="those of its samples 0 to 1 hold something else now"):
+    with pytest.raises(FileError, match="those of samples 0 to 1 have changed"):
         explore.write_dataset(explore.Dataset(list(pictures(4, 1)), SHOT), tmp_path / "data.zarr")
 
 
-def test_a_shard_that_was_broken_is_written_anew(tmp_path):
+def test_corrupt_shard_is_rewritten(tmp_path):
     data = explore.Dataset(pictures(2), SHOT)
     explore.write_dataset(data, tmp_path / "data", per_shard=1)
     (tmp_path / "data" / "shard-000001.tar").write_bytes(b"truncated")
@@ -1009,22 +1012,22 @@ def test_a_shard_that_was_broken_is_written_anew(tmp_path):
     assert_same(explore.write_dataset(data, tmp_path / "data")[1], data[1])
 
 
-class Litter(Made):
-    """Pictures that leave open files behind, which Python tells of whenever it finds them."""
+class UnclosedFiles(Lazy):
+    """Pictures that cause a ResourceWarning on access, as unclosed files do."""
 
     def __getitem__(self, k):
         warnings.warn("unclosed file", ResourceWarning, stacklevel=2)
         return super().__getitem__(k)
 
 
-def test_what_python_tells_of_files_left_open_is_no_warning_of_a_sample():
+def test_resource_warnings_are_not_stored():
     with pytest.warns(ResourceWarning):
-        data = explore.Dataset(Litter(pictures(3)), SHOT)
+        data = explore.Dataset(UnclosedFiles(pictures(3)), SHOT)
 
     assert {sample["warning"] for sample in data} == {""}
 
 
-def test_warnings_of_samples_are_told_once_and_kept(tmp_path):
+def test_sample_warnings_are_summarised_and_stored(tmp_path):
     shot = SHOT | {"scene": SHOT["scene"] | {"pitch_um": 70.0}}
     with pytest.warns(FoveasimWarning, match="3 of the samples written have warnings, such as: sample 0: ") as caught:
         stored = explore.write_dataset(explore.Dataset(pictures(3), shot), tmp_path / "data.zarr")
@@ -1033,43 +1036,43 @@ def test_warnings_of_samples_are_told_once_and_kept(tmp_path):
     assert all("photosites lie" in sample["warning"] for sample in stored)
 
 
-# -- refusals ---------------------------------------------------------------------------------------------------------
+# -- invalid input ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("vary", "error", "message"),
     [
         ({"optics.speed": {"uniform": [1, 2]}}, ConfigError, "settings: optics.speed: no such setting"),
-        ({"exposure_s": [1, 2]}, ParameterError, "'exposure_s' must be drawn from one distribution"),
-        ({"exposure_s": {"gamma": [1, 2]}}, ParameterError, "must be drawn from one distribution"),
-        ({"exposure_s": {"uniform": [2, 1]}}, ParameterError, "must go from a lower number to a higher one"),
-        ({"exposure_s": {"uniform": [1]}}, ParameterError, r"uniform needs \[low, high\]"),
-        ({"exposure_s": {"uniform": "ab"}}, ParameterError, r"uniform needs \[low, high\], got 'ab'"),
+        ({"exposure_s": [1, 2]}, ParameterError, "'exposure_s' must have exactly one distribution"),
+        ({"exposure_s": {"gamma": [1, 2]}}, ParameterError, "must have exactly one distribution"),
+        ({"exposure_s": {"uniform": [2, 1]}}, ParameterError, "must have 'uniform' bounds in ascending order"),
+        ({"exposure_s": {"uniform": [1]}}, ParameterError, r"must specify 'uniform' as \[low, high\]"),
+        ({"exposure_s": {"uniform": "ab"}}, ParameterError, r"must specify 'uniform' as \[low, high\], got 'ab'"),
         ({"exposure_s": {"log_uniform": [0, 1]}}, ParameterError, "must be > 0"),
         ({"exposure_s": {"uniform": [0, float("inf")]}}, ParameterError, "must be finite"),
-        ({"exposure_s": {"normal": [5, 1, 0, 1]}}, ParameterError, "its mean between the ends"),
-        ({"exposure_s": {"uniform": [0, 1], "weights": [1]}}, ParameterError, "weights, which only a choice has"),
-        ({"sensor.bits": {"choice": []}}, ParameterError, "at least one value"),
-        ({"sensor.bits": {"choice": [8, 9], "weights": [1]}}, ParameterError, "needs weights for its 2 choices"),
-        ({"sensor.bits": {"choice": [8, 9], "weights": [1e308, 1e308]}}, ParameterError, "of a sum above 0"),
+        ({"exposure_s": {"normal": [5, 1, 0, 1]}}, ParameterError, "a mean between the bounds"),
+        ({"exposure_s": {"uniform": [0, 1], "weights": [1]}}, ParameterError, "must not have weights with 'uniform'"),
+        ({"sensor.bits": {"choice": []}}, ParameterError, "must have at least one choice"),
+        ({"sensor.bits": {"choice": [8, 9], "weights": [1]}}, ParameterError, "must have 2 weights"),
+        ({"sensor.bits": {"choice": [8, 9], "weights": [1e308, 1e308]}}, ParameterError, "with a finite sum > 0"),
         ({"sensor.bits": {"choice": [8, 9], "weights": [-1, 2]}}, ParameterError, "must be >= 0"),
         ({"sensor.bits": {"choice": [8, 9], "weights": "ab"}}, ParameterError, "must be an array of numbers"),
-        ({"sensor.bits": {"choice": 8}}, ParameterError, "choice needs a list of values, got 8"),
+        ({"sensor.bits": {"choice": 8}}, ParameterError, "must specify 'choice' as a list of values, got 8"),
         (
             {"sensor.device_seed": {"choice": [2**70, 1]}},
             ParameterError,
-            "of at most 64 bits, got 1180591620717411303424",
+            "must have signed 64-bit integers as choices, got 1180591620717411303424",
         ),
         ({"exposure_s": {"choice": [0.1, float("nan")]}}, ParameterError, "'exposure_s' must be finite, got nan"),
-        ({"exposure_s": {"uniform": [-1e308, 1e308]}}, ParameterError, "ends whose distance is a number"),
+        ({"exposure_s": {"uniform": [-1e308, 1e308]}}, ParameterError, "bounds with a finite difference"),
         ({"exposure_s": {"uniform": [None, 1]}}, ParameterError, "must be one number, got None"),
         ({"exposure_s": {"uniform": [True, 2]}}, ParameterError, "must be one number, got True"),
         ({"exposure_s": {"uniform": [[1, 2], [3, 4]]}}, ParameterError, r"must be one number, got \[1, 2\]"),
-        ({"exposure_s": {"uniform": {1, 2}}}, ParameterError, r"uniform needs \[low, high\]"),
-        ({"exposure_s": {"uniform": [1, 2], "integers": [1, 2]}}, ParameterError, "drawn from one distribution"),
-        ({"exposure_s": {"normal": [1, 0, 0, 2]}}, ParameterError, "a standard deviation above 0"),
-        ({"exposure_s": {"normal": [1, 1e300, 0, 2]}}, ParameterError, "a standard deviation up to 1e\\+06 times"),
-        ({"exposure_s": {"uniform": b"ab"}}, ParameterError, r"uniform needs \[low, high\]"),
+        ({"exposure_s": {"uniform": {1, 2}}}, ParameterError, r"must specify 'uniform' as \[low, high\]"),
+        ({"exposure_s": {"uniform": [1, 2], "integers": [1, 2]}}, ParameterError, "exactly one distribution"),
+        ({"exposure_s": {"normal": [1, 0, 0, 2]}}, ParameterError, "a standard deviation > 0"),
+        ({"exposure_s": {"normal": [1, 1e300, 0, 2]}}, ParameterError, r"of at most 1e\+06 \* \(high - low\)"),
+        ({"exposure_s": {"uniform": b"ab"}}, ParameterError, r"must specify 'uniform' as \[low, high\]"),
         ({"exposure_s": {"integers": [1, 2.5]}}, ParameterError, "must be an integer, got 2.5"),
         ({"": {"uniform": [1, 2]}}, ConfigError, "'' is no setting's place"),
         ({"sensor.bits": {"uniform": [8, 9.5]}}, ConfigError, "sensor.bits: "),
@@ -1079,13 +1082,13 @@ def test_warnings_of_samples_are_told_once_and_kept(tmp_path):
             ConfigError,
             "settings: optics.f_number: must be >= 0.5, got 0.1",
         ),
-        ({"seed": {"integers": [0, 9]}}, ParameterError, "'seed' cannot vary"),
-        ({"scene.picture": {"choice": ["a.png"]}}, ParameterError, "'scene.picture' cannot vary"),
+        ({"seed": {"integers": [0, 9]}}, ParameterError, "'seed' must not vary"),
+        ({"scene.picture": {"choice": ["a.png"]}}, ParameterError, "'scene.picture' must not vary"),
         ({"sensor": {"choice": [{}]}, "sensor.bits": {"choice": [8]}}, ConfigError, "cannot both vary"),
-        (["exposure_s"], ParameterError, "'vary' must be distributions by settings' paths"),
+        (["exposure_s"], ParameterError, "'vary' must be a mapping of setting paths to distributions"),
     ],
 )
-def test_a_bad_distribution_is_refused_before_the_first_sample(vary, error, message):
+def test_invalid_distribution_is_rejected_before_sampling(vary, error, message):
     with pytest.raises(error, match=message) as caught:
         explore.Dataset(pictures(2), SHOT, vary)
     assert "\n" not in str(caught.value)
@@ -1094,11 +1097,11 @@ def test_a_bad_distribution_is_refused_before_the_first_sample(vary, error, mess
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"labels": [1]}, ParameterError, "'labels' must have one for each of the 2 pictures, got 1"),
-        ({"labels": [1, "a"]}, ParameterError, "must all be integers, or all be texts"),
-        ({"labels": [1, 2.0]}, ParameterError, "must all be integers, or all be texts"),
-        ({"labels": [None, None]}, ParameterError, "must all be integers, or all be texts"),
-        ({"labels": np.zeros((2, 2), int)}, ParameterError, "must all be integers, or all be texts"),
+        ({"labels": [1]}, ParameterError, "'labels' must have one item for each of the 2 pictures, got 1"),
+        ({"labels": [1, "a"]}, ParameterError, "must all be integers, or all be strings"),
+        ({"labels": [1, 2.0]}, ParameterError, "must all be integers, or all be strings"),
+        ({"labels": [None, None]}, ParameterError, "must all be integers, or all be strings"),
+        ({"labels": np.zeros((2, 2), int)}, ParameterError, "must all be integers, or all be strings"),
         ({"labels": [2**70, 1]}, ParameterError, "'labels' must be <= 9223372036854775807"),
         ({"boxes": [[], [[1, 2, 3, 4, 1e300]]]}, ParameterError, "integers up to 9007199254740992 as classes"),
         ({"boxes": [[], [[1, 2, float("nan"), 4]]]}, ParameterError, "must be finite everywhere"),
@@ -1115,65 +1118,69 @@ def test_a_bad_distribution_is_refused_before_the_first_sample(vary, error, mess
         ({"draws": 1.5}, ParameterError, "'draws' must be an integer"),
         ({"seed": -1}, ParameterError, "'seed' must be >= 0"),
         ({"changes": {"optics.speed": 1}}, ConfigError, "optics.speed: no such setting"),
-        ({"fit": "cover", "vary": {"scene.pitch_um": {"uniform": [1, 2]}}}, ParameterError, "cannot vary beside 'fit'"),
+        ({"fit": "cover", "vary": {"scene.pitch_um": {"uniform": [1, 2]}}}, ParameterError, "must not vary with 'fit'"),
         ({"shot": SHOT | {"scene": FLAT}}, ConfigError, "scene.kind: must be 'picture'"),
         (
             {"shot": SHOT | {"exposure_s": object()}},
             ConfigError,
-            "settings: must hold numbers, texts, lists and sections",
+            "settings: must contain only numbers, strings, lists and mappings",
         ),
-        ({"shot": 5}, ParameterError, "'shot' must be a settings file, or settings, got a int"),
+        ({"shot": 5}, ParameterError, "'shot' must be a settings file or a mapping of settings, got a int"),
         ({"shot": "missing.yaml"}, ConfigError, "missing.yaml: no such file"),
         (
             {"pictures": 5},
             ParameterError,
-            "'pictures' must be a folder, a zip file, an array, or a sequence, got a int",
+            "'pictures' must be a directory, a zip file, an array, or a sequence, got a int",
         ),
-        ({"pictures": []}, ParameterError, "'pictures' must hold at least one picture"),
+        ({"pictures": []}, ParameterError, "'pictures' must contain at least one picture"),
         ({"pictures": [(pictures(1)[0], 1), ()]}, ParameterError, "must all be pairs"),
         ({"pictures": [(pictures(1)[0],)]}, ParameterError, "must all be pairs"),
-        ({"pictures": [(pictures(1)[0], None)]}, ParameterError, "must all be integers, or all be texts"),
+        ({"pictures": [(pictures(1)[0], None)]}, ParameterError, "must all be integers, or all be strings"),
         ({"pictures": np.zeros((3, 4))}, ParameterError, "'pictures' must have the shape"),
         ({"pictures": np.zeros((0, 4, 4))}, ParameterError, "'pictures' must have the shape"),
-        ({"pictures": "missing"}, FileError, "missing: no such file or folder"),
-        ({"pictures": [np.zeros((4, 4, 3), complex)]}, FileError, "picture 0: is no picture for these settings"),
+        ({"pictures": "missing"}, FileError, "missing: no such file or directory"),
+        (
+            {"pictures": [np.zeros((4, 4, 3), complex)]},
+            FileError,
+            "picture 0: is not a valid picture for these settings",
+        ),
     ],
 )
-def test_what_does_not_fit_is_refused_in_one_sentence(options, error, message):
+def test_invalid_arguments_are_rejected(options, error, message):
     arguments = {"pictures": pictures(2), "shot": SHOT} | options
     with pytest.raises(error, match=message) as caught:
         explore.Dataset(**arguments)
     assert "\n" not in str(caught.value)
 
 
-def test_folders_and_files_without_pictures_are_refused(tmp_path):
+def test_sources_without_pictures_are_rejected(tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "notes.txt").write_text("no picture")
     (tmp_path / "one.png").write_bytes(b"no zip file")
     (tmp_path / "bad.npy").write_bytes(b"no array")
     with zipfile.ZipFile(tmp_path / "empty.zip", "w") as file:
         file.writestr("notes.txt", "no picture")
-    with zipfile.ZipFile(tmp_path / "broken.zip", "w") as file:
+    with zipfile.ZipFile(tmp_path / "corrupt.zip", "w") as file:
         file.writestr("a.png", b"no picture")
     for name, message in (
-        ("empty", "empty: holds no pictures"),
-        ("empty.zip", "empty.zip: holds no pictures"),
-        ("one.png", "must be a folder of pictures, a zip file"),
-        ("bad.npy", "bad.npy: is no array that can be read"),
-        ("broken.zip", r"broken.zip!a.png: is not a picture"),
+        ("empty", "empty: contains no pictures"),
+        ("empty.zip", "empty.zip: contains no pictures"),
+        ("one.png", "must be a directory of pictures, a zip file"),
+        ("bad.npy", "bad.npy: is not a readable array"),
+        ("corrupt.zip", r"corrupt.zip!a.png: is not a picture"),
     ):
         with pytest.raises(FileError, match=message):
             explore.Dataset(tmp_path / name, SHOT)
 
 
-def test_labels_that_do_not_fit_a_picture_name_it():
+def test_label_errors_name_the_picture():
     bad = {
         "masks": ([np.zeros((N_Y, N_X), int), np.zeros((3, 3), int)], "mask of picture 1' must be integers"),
-        "flows": ([np.zeros((N_Y, N_X, 2)), np.zeros((N_Y, N_X))], "flow of picture 1' must be numbers of the shape"),
+        "flows": ([np.zeros((N_Y, N_X, 2)), np.zeros((N_Y, N_X))], "flow of picture 1' must be numbers of shape"),
     }
-    huge = [np.zeros((N_Y, N_X), int), np.full((N_Y, N_X), 2**64 - 1, np.uint64)]
-    with pytest.raises(SimulationError, match=r"sample 1 .*mask of picture 1' must be integers of 64 bits"):
-        explore.Dataset(pictures(2), SHOT, masks=huge)[1]
+    large = [np.zeros((N_Y, N_X), int), np.full((N_Y, N_X), 2**64 - 1, np.uint64)]
+    with pytest.raises(SimulationError, match=r"sample 1 .*mask of picture 1' must be signed 64-bit integers"):
+        explore.Dataset(pictures(2), SHOT, masks=large)[1]
     for name, (given, message) in bad.items():
         data = explore.Dataset(pictures(2), SHOT, **{name: given})
         data[0]
@@ -1181,19 +1188,19 @@ def test_labels_that_do_not_fit_a_picture_name_it():
             data[1]
 
 
-def test_samples_are_counted_as_of_a_sequence():
+def test_dataset_indexing_follows_sequences():
     data = explore.Dataset(pictures(2), SHOT, cameras=2, draws=3)
 
     assert len(data) == len(list(data)) == 12
     assert_same(data[-1], data[11])
     for index in (12, -13):
-        with pytest.raises(IndexError, match="there are 12 samples"):
+        with pytest.raises(IndexError, match="is out of range for 12 samples"):
             data[index]
     with pytest.raises(TypeError):
         data[1.5]
 
 
-def test_settings_in_python_may_hold_numbers_of_numpy():
+def test_settings_accept_numpy_scalars():
     shot = SHOT | {"exposure_s": np.float32(0.5), "sensor": {"bits": np.int64(9)}}
 
     assert explore.Dataset(pictures(1), shot).settings_of(0)["sensor"]["bits"] == 9
@@ -1202,7 +1209,7 @@ def test_settings_in_python_may_hold_numbers_of_numpy():
 # -- recipes ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_target_of_denoising_is_the_mean_of_its_draws():
+def test_denoising_target_is_mean_of_draws():
     n_draws = 400
     data = explore.denoising(pictures(1), SHOT, draws=n_draws)
     samples = list(data)
@@ -1219,7 +1226,7 @@ def test_the_target_of_denoising_is_the_mean_of_its_draws():
     assert off_dn[~is_noisy].max(initial=0.0) < 0.05
 
 
-def test_classification_draws_a_camera_for_every_picture_around_the_shots():
+def test_classification_draws_cameras_around_shot():
     data = explore.classification(pictures(30), SHOT, {"sensor.bits": {"choice": [6, 8]}}, labels=[0] * 30)
     drawn = [sample["settings"] for sample in data]
     f_numbers = np.array([each["optics.f_number"] for each in drawn])
@@ -1239,14 +1246,14 @@ def test_classification_draws_a_camera_for_every_picture_around_the_shots():
 # -- torch ------------------------------------------------------------------------------------------------------------
 
 
-def test_without_torch_one_sentence_says_what_to_install(monkeypatch):
+def test_missing_torch_gives_install_hint(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     _kind.cache_clear()
     with pytest.raises(ParameterError, match=r"needs torch; install it with: pip install 'foveasim\[learn\]'"):
         explore.torch_dataset(labelled(1))
 
 
-def test_torch_is_not_needed_and_not_loaded_for_a_dataset():
+def test_dataset_does_not_import_torch():
     code = "import sys; from foveasim import explore; sys.exit('torch' in sys.modules or 'zarr' in sys.modules)"
 
     assert subprocess.run([sys.executable, "-c", code], env=os.environ, check=False).returncode == 0

@@ -1,4 +1,4 @@
-"""Datasets for PyTorch: ``make test-torch`` runs them in an environment that has it, and ``make test`` skips them."""
+"""PyTorch adapter of datasets; ``make test-torch`` runs these tests, ``make test`` skips them."""
 
 from __future__ import annotations
 

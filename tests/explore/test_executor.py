@@ -1,4 +1,4 @@
-"""The executor of sweeps, studies and datasets: every item once, whatever happens to workers, at a constant cost per task."""
+"""Executor of sweeps, studies and datasets: no item is lost or repeated when workers fail."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ N_ROUNDS = int(os.environ.get("FOVEASIM_SOAK_ROUNDS", "1"))
 N_ITEMS, N_WORKERS = 400, 3
 #: Seconds between two kills, at random; a worker takes about two to start.
 KILL_S = 0.5, 3.0
-#: A round that takes longer never ends.
+#: Time limit of a round, seconds.
 LIMIT_S = 300.0
 
 SHOT = {
@@ -41,7 +41,7 @@ SHOT = {
 
 
 def logging_function(path):
-    """Return a function of an item that takes 1 to 40 ms, and writes a line before and after."""
+    """Return a function of an item that takes 1 to 40 ms and logs its begin and end."""
 
     def compute(item):
         log = os.open(path, os.O_CREAT | os.O_APPEND | os.O_WRONLY)
@@ -76,7 +76,7 @@ def test_no_item_is_lost_with_workers(seed, tmp_path):
         try:
             with executor(logging_function(log), what="the function", workers=N_WORKERS) as run:
                 found.set_result(list(run(range(N_ITEMS), range(0, N_ITEMS, 50))))
-        except BaseException as error:  # noqa: BLE001 -- raised where it is waited for
+        except BaseException as error:  # noqa: BLE001 -- raised again by the future
             found.set_exception(error)
 
     for target in (kill, compute):
@@ -95,9 +95,9 @@ def test_no_item_is_lost_with_workers(seed, tmp_path):
 
 class SimulatedClient:
     """
-    A client of n workers that need no time: what remains is the work of the executor.
+    Client of n workers with zero computing time, to measure the overhead of the executor.
 
-    Results arrive when they are asked for, in the order in which tasks were sent.
+    Results arrive on request, in the order in which tasks were sent.
     """
 
     cluster = None
@@ -139,7 +139,7 @@ class SimulatedFuture:
 
 
 def dispatch_s(n_workers, n_items, monkeypatch):
-    """Seconds per task that the executor itself takes, with tasks of one item."""
+    """Measure the overhead of the executor in seconds per task, with tasks of one item."""
     monkeypatch.setattr(module, "MAX_ITEMS", 1)
     client = SimulatedClient(n_workers)
     begin_s = time.process_time()
@@ -173,7 +173,7 @@ def test_ranges_are_cut_at_shared_parts(n_workers):
     assert set(first.values()) <= set(cuts)
 
 
-def test_item_that_kills_is_reported():
+def test_item_that_kills_workers_is_reported():
     def deadly(item):
         if item == 7:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -189,7 +189,7 @@ def test_item_that_kills_is_reported():
 
 @pytest.fixture(scope="module")
 def scheduler():
-    """A scheduler of another program's making, with two workers."""
+    """Start an external scheduler with two workers."""
     from distributed import LocalCluster
 
     options = {"threads_per_worker": 1, "dashboard_address": "127.0.0.1:0", "scheduler_kwargs": {"dashboard": False}}

@@ -1,4 +1,4 @@
-"""Checksums of functions: the same in any process, and another after any change of what they do."""
+"""Identities of functions: equal in all processes, and different after any change of behaviour."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ class Counter:
 
 
 def make(level):
-    def share(shot, camera, capture):
+    def fraction(shot, camera, capture):
         return float((capture.code > level).mean()) if camera.name in {"one", "two", "three"} else TABLE[0]
 
-    return share
+    return fraction
 
 
 def plain(shot, camera, capture, *, of=3):
@@ -72,20 +72,20 @@ print(json.dumps({name: identity_of(metric) for name, metric in own.METRICS.item
 """
 
 
-def told(folder, text, hash_seed):
-    (folder / "own.py").write_text(text)
+def identities(directory, source, hash_seed):
+    (directory / "own.py").write_text(source)
     environment = os.environ | {"PYTHONHASHSEED": str(hash_seed), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-c", COMMAND]
-    found = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    found = subprocess.run(command, cwd=directory, env=environment, capture_output=True, text=True, check=False)
     assert found.returncode == 0, found.stderr
     return json.loads(found.stdout)
 
 
-def test_a_checksum_is_the_same_in_any_process_and_another_after_a_change(tmp_path):
-    before = told(tmp_path, OWN, 1)
+def test_identity_depends_on_behaviour_only(tmp_path):
+    before = identities(tmp_path, OWN, 1)
 
     assert len(set(before.values())) == len(before)
-    assert told(tmp_path, "# a comment\n\n" + OWN, 2) == before
+    assert identities(tmp_path, "# a comment\n\n" + OWN, 2) == before
     for old, new, changed in (
         ("make(10)", "make(60)", {"closure"}),
         ("of=4", "of=5", {"partial"}),
@@ -99,15 +99,15 @@ def test_a_checksum_is_the_same_in_any_process_and_another_after_a_change(tmp_pa
         ("ping(n) + 2", "ping(n) + 3", {"both"}),
         ("n - 1", "n - 2", {"recursive"}),
     ):
-        after = told(tmp_path, OWN.replace(old, new), 3)
+        after = identities(tmp_path, OWN.replace(old, new), 3)
         assert {name for name in before if before[name] != after[name]} == changed, old
 
 
-def share(level, unit=1.0):
+def fraction_above(level, unit=1.0):
     return lambda _, __, capture: unit * float((capture.code > level).mean())
 
 
-def test_a_checksum_does_not_change_as_a_function_is_used():
+def test_identity_is_constant_during_use():
     table = np.arange(3)
 
     def often(n):
@@ -119,19 +119,19 @@ def test_a_checksum_does_not_change_as_a_function_is_used():
     assert identity_of(often) == before
 
 
-def test_the_packages_own_metrics_are_told_by_the_packages_version():
+def test_package_metrics_are_identified_by_name():
     assert identity_of(explore.METRICS["snr"]) == "foveasim.explore._metrics:snr"
 
 
 @pytest.mark.parametrize(
     "pair",
     [
-        (share(10), share(60)),
-        (share(10), share(10, unit=2.0)),
+        (fraction_above(10), fraction_above(60)),
+        (fraction_above(10), fraction_above(10, unit=2.0)),
         (functools.partial(explore.METRICS["snr"], level=1), functools.partial(explore.METRICS["snr"], level=2)),
         ("abc".count, "abd".count),
     ],
 )
-def test_functions_that_take_other_things_along_are_others(pair):
+def test_identity_depends_on_captured_values(pair):
     assert identity_of(pair[0]) == identity_of(pair[0])
     assert identity_of(pair[0]) != identity_of(pair[1])

@@ -1,4 +1,4 @@
-"""Studies: optima that are known in closed form, fronts against a slow twin, and the same search after any end."""
+"""Studies: known optima, Pareto fronts against a brute-force reference, and resuming."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ WANTED_E = 1000.0
 
 
 def off_e(_shot, _camera, capture):
-    """How far the expected charge is from what is wanted."""
+    """Return the deviation of the mean expected electrons from the target."""
     return abs(float(capture.expected_e.mean()) - WANTED_E)
 
 
-def test_a_study_finds_the_exposure_that_is_known():
-    """Without dark charge the charge is in proportion to the exposure: one capture tells which gives what is wanted."""
+def test_study_finds_known_optimal_exposure():
+    """Without dark signal, electrons are proportional to exposure time, so one capture gives the optimum."""
     shot = build_shot("known", SHOT)
     one = shot.camera.capture(shot.scene, exposure_s=1e-4, seed=0)
     known_s = 1e-4 * WANTED_E / one.expected_e.mean()
@@ -50,7 +50,7 @@ def test_a_study_finds_the_exposure_that_is_known():
         seed=1,
     )
 
-    # Of 60 draws even in the logarithm the nearest is typically 8 % off.
+    # The best of 60 log-uniform draws typically deviates by 8 %.
     assert found.best_trial.params["exposure_s"] == pytest.approx(known_s, rel=0.03)
 
 
@@ -59,7 +59,7 @@ def perimeter(_shot, _camera, capture):
     return 2.0 * (x1 - x0 + y1 - y0)
 
 
-def test_a_study_of_two_objectives_gives_the_front_within_the_constraints():
+def test_two_objectives_give_constrained_pareto_front():
     found = explore.study(
         SHOT,
         {
@@ -75,14 +75,14 @@ def test_a_study_of_two_objectives_gives_the_front_within_the_constraints():
     trials = found.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
     allowed = [t for t in trials if t.values[0] <= 80]
 
-    def is_beaten(one):
+    def is_dominated(one):
         return any(
             o.values != one.values and o.values[0] >= one.values[0] and o.values[1] <= one.values[1] for o in allowed
         )
 
     assert len(trials) == 40
     assert len(allowed) < 40
-    front = {t.number for t in allowed if not is_beaten(t)}
+    front = {t.number for t in allowed if not is_dominated(t)}
     assert {t.number for t in found.best_trials} == front
     assert len(front) > 2
     for trial in trials:
@@ -93,7 +93,7 @@ def test_a_study_of_two_objectives_gives_the_front_within_the_constraints():
         assert bits in (8, 10, 12)
 
 
-def test_a_setting_is_searched_in_the_numbers_that_it_takes_however_the_ends_are_written():
+def test_search_values_have_setting_type():
     found = explore.study(
         SHOT,
         {
@@ -118,7 +118,7 @@ def test_a_setting_is_searched_in_the_numbers_that_it_takes_however_the_ends_are
 SEARCH = {"exposure_s": (1e-5, 1e-3), "optics.emission": ["lambertian", "isotropic"]}
 
 
-def told(study):
+def outcomes(study):
     return [
         (t.params, t.values, t.user_attrs.get("error"))
         for t in study.trials
@@ -126,19 +126,19 @@ def told(study):
     ]
 
 
-def test_a_study_that_was_ended_goes_on_as_if_it_was_not(tmp_path):
+def test_interrupted_study_resumes_identically(tmp_path):
     def run(n_trials, **options):
         return explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=n_trials, seed=5, **options)
 
-    whole = run(20)
-    cut = run(13, storage=tmp_path / "study.db")
-    cut.ask()  # a program that is killed leaves a trial that runs for ever
+    complete = run(20)
+    interrupted = run(13, storage=tmp_path / "study.db")
+    interrupted.ask()  # a killed program leaves a trial in the running state
     again = run(20, storage=tmp_path / "study.db")
 
-    assert told(again) == told(whole)
+    assert outcomes(again) == outcomes(complete)
     assert len(again.trials) == 21
-    assert told(run(20, storage=f"sqlite:///{tmp_path}/study.db")) == told(whole)
-    assert told(explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=20, seed=6)) != told(whole)
+    assert outcomes(run(20, storage=f"sqlite:///{tmp_path}/study.db")) == outcomes(complete)
+    assert outcomes(explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=20, seed=6)) != outcomes(complete)
 
 
 @pytest.mark.parametrize("n_workers", [1, 2])
@@ -146,17 +146,17 @@ def test_batches_do_not_depend_on_workers(n_workers):
     def run(**options):
         return explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=24, seed=5, batch=6, **options)
 
-    assert told(run(workers=n_workers)) == told(run())
+    assert outcomes(run(workers=n_workers)) == outcomes(run())
 
 
-def test_batch_larger_than_one_changes_the_search():
+def test_batch_size_changes_the_search():
     one, many = (
         explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=24, seed=5, batch=batch) for batch in (1, 12)
     )
 
     # The first trials are random in any case.
-    assert told(one)[:10] == told(many)[:10]
-    assert told(one) != told(many)
+    assert outcomes(one)[:10] == outcomes(many)[:10]
+    assert outcomes(one) != outcomes(many)
 
 
 @pytest.mark.parametrize("stopped_at", [13, 17, 18])
@@ -164,7 +164,7 @@ def test_interrupted_batch_resumes_bit_identically(stopped_at, tmp_path, monkeyp
     def run(**options):
         return explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=24, seed=5, batch=6, **options)
 
-    whole = run()
+    complete = run()
     store_result, n_stored = study._store_result, []
 
     def interrupted(*args):
@@ -178,42 +178,43 @@ def test_interrupted_batch_resumes_bit_identically(stopped_at, tmp_path, monkeyp
         run(storage=tmp_path / "study.db")
     monkeypatch.undo()
 
-    assert told(run(storage=tmp_path / "study.db")) == told(whole)
+    assert outcomes(run(storage=tmp_path / "study.db")) == outcomes(complete)
 
 
-def test_trials_are_a_multiple_of_batch():
-    with pytest.raises(ParameterError, match="'n_trials' must be a multiple of the batch of 4, got 6"):
+def test_trials_must_be_multiple_of_batch():
+    with pytest.raises(ParameterError, match="'n_trials' must be a multiple of the batch size 4, got 6"):
         explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=6, batch=4)
 
 
-def test_two_programs_do_not_write_the_same_study(tmp_path):
+def test_study_file_is_locked(tmp_path):
     def run(file, metric):
         explore.study(SHOT, SEARCH, {"m": "maximize"}, n_trials=3, metrics={"m": metric}, storage=file)
 
-    def meddle(*_):
+    def run_second_program(*_):
         with pytest.raises(FileError, match="is being written by another program that runs a study"):
             run(f"sqlite:///{tmp_path}/s.db", len)
         return 1.0
 
-    run(tmp_path / "s.db", meddle)
+    run(tmp_path / "s.db", run_second_program)
 
     assert [path.name for path in tmp_path.iterdir()] == ["s.db"]
     found = optuna.load_study(study_name="study", storage=f"sqlite:///{tmp_path}/s.db")
     assert [trial.value for trial in found.trials] == [1.0] * 3
 
 
-def test_a_program_ends_when_another_machine_goes_on_with_its_study(tmp_path):
-    """As there: the same study is signed by another program, while a trial runs."""
+def test_writer_stops_when_replaced(tmp_path):
+    """Another program registers as the writer of the study while a trial runs."""
     calls = []
 
-    def overtaken(*_):
+    def replace_writer(*_):
         calls.append(1)
         if len(calls) == 3:
             optuna.load_study(study_name="study", storage=f"sqlite:///{tmp_path}/s.db").set_user_attr("writer", "other")
         return 1.0
 
-    with pytest.raises(FileError, match="is being written by another program, which has begun to run the same study"):
-        explore.study(SHOT, SEARCH, {"m": "maximize"}, n_trials=9, metrics={"m": overtaken}, storage=tmp_path / "s.db")
+    metrics = {"m": replace_writer}
+    with pytest.raises(FileError, match="is being written by another program, which runs the same study"):
+        explore.study(SHOT, SEARCH, {"m": "maximize"}, n_trials=9, metrics=metrics, storage=tmp_path / "s.db")
 
     found = optuna.load_study(study_name="study", storage=f"sqlite:///{tmp_path}/s.db")
     assert [trial.value for trial in explore.finished_trials(found)] == [1.0] * 2
@@ -221,7 +222,7 @@ def test_a_program_ends_when_another_machine_goes_on_with_its_study(tmp_path):
     assert all(trial.state.is_finished() for trial in found.trials)
 
 
-def test_a_study_of_another_function_of_the_same_name_is_another(tmp_path):
+def test_equally_named_metrics_are_distinguished(tmp_path):
     for level in (1.0, 2.0):
         given = {"n_trials": 1, "metrics": {"m": lambda *_, level=level: level}, "storage": tmp_path / "s.db"}
         if level == 1.0:
@@ -231,25 +232,25 @@ def test_a_study_of_another_function_of_the_same_name_is_another(tmp_path):
                 explore.study(SHOT, SEARCH, {"m": "maximize"}, **given)
 
 
-def test_a_study_ends_with_ctrl_c_and_not_with_what_else_a_metric_raises():
+def test_only_ctrl_c_interrupts_study():
     def run(kind):
-        def rude(*_):
+        def raising(*_):
             raise kind("why")
 
-        return explore.study(SHOT, SEARCH, {"m": "maximize"}, n_trials=1, metrics={"m": rude})
+        return explore.study(SHOT, SEARCH, {"m": "maximize"}, n_trials=1, metrics={"m": raising})
 
     assert run(SystemExit).trials[0].user_attrs["error"] == "m: SystemExit: why"
     with pytest.raises(KeyboardInterrupt):
         run(KeyboardInterrupt)
 
 
-def test_an_array_is_told_to_be_no_objective():
+def test_array_objective_is_rejected():
     found = explore.study(SHOT, SEARCH, {"m": "maximize"}, n_trials=1, metrics={"m": lambda *_: np.zeros(3)})
 
-    assert found.trials[0].user_attrs["error"] == "'m' is an array, no finite number"
+    assert found.trials[0].user_attrs["error"] == "'m' must be a finite number, got an array"
 
 
-def test_trials_that_fail_are_told_and_the_others_go_on():
+def test_failed_trials_are_reported():
     found = explore.study(
         SHOT,
         {"exposure_s": [1e-4, -1.0, 1.0]},
@@ -261,18 +262,18 @@ def test_trials_that_fail_are_told_and_the_others_go_on():
 
     assert np.isfinite(by_choice[1e-4].value)
     assert by_choice[-1.0].user_attrs["error"].endswith("exposure_s: must be >= 0, got -1.0 s")
-    assert by_choice[1.0].user_attrs["error"] == "'snr_mean' is nan, no finite number"
+    assert by_choice[1.0].user_attrs["error"] == "'snr_mean' must be a finite number, got nan"
     assert found.best_trial.params["exposure_s"] == "0.0001"
 
 
-def test_a_study_of_another_plan_is_left_alone(tmp_path):
+def test_study_of_other_plan_is_unchanged(tmp_path):
     explore.study(SHOT, SEARCH, {"snr_mean": "maximize"}, n_trials=2, storage=tmp_path / "s.db")
 
-    with pytest.raises(FileError, match=r"is of another sweep or study: 'search\.exposure_s' differs"):
+    with pytest.raises(FileError, match=r"belongs to another sweep or study: 'search\.exposure_s' differs"):
         explore.study(
             SHOT, SEARCH | {"exposure_s": (1e-5, 1.0)}, {"snr_mean": "maximize"}, n_trials=2, storage=tmp_path / "s.db"
         )
-    with pytest.raises(FileError, match="holds a study 'study' with other objectives"):
+    with pytest.raises(FileError, match="contains a study 'study' with other objectives"):
         explore.study(SHOT, SEARCH, {"snr_mean": "minimize"}, n_trials=2, storage=tmp_path / "s.db")
     other = explore.study(SHOT, SEARCH, {"snr_mean": "minimize"}, n_trials=2, storage=tmp_path / "s.db", name="other")
     assert len(other.trials) == 2
@@ -281,29 +282,29 @@ def test_a_study_of_another_plan_is_left_alone(tmp_path):
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"search": {}}, ParameterError, "nothing is searched"),
+        ({"search": {}}, ParameterError, "must be a non-empty mapping of setting paths to ranges"),
         ({"search": {"sensor.bitz": (8, 10)}}, ConfigError, r"sensor\.bitz: no such setting"),
         ({"search": {"sensor.bits": (8.5, 10.0)}}, ConfigError, r"sensor\.bits: must be a valid integer"),
-        ({"search": {"exposure_s": (2.0, 1.0)}}, ParameterError, "two ends, the first the smaller"),
-        ({"search": {"exposure_s": (1.0, float("inf"))}}, ParameterError, "two ends"),
+        ({"search": {"exposure_s": (2.0, 1.0)}}, ParameterError, "two finite bounds in ascending order"),
+        ({"search": {"exposure_s": (1.0, float("inf"))}}, ParameterError, "two finite bounds"),
         (
             {"search": {"exposure_s": {"from": 0, "to": 1, "spacing": "geometric"}}},
             ParameterError,
-            "above 0 for geometric",
+            "must be > 0 for geometric",
         ),
         ({"search": {"exposure_s": {"from": 0, "to": 1, "step": -1}}}, ParameterError, "a step > 0"),
         ({"search": {"exposure_s": {"from": 0, "too": 1}}}, ParameterError, "must have 'from' and 'to'"),
         ({"search": {"exposure_s": []}}, ParameterError, "must be searched in"),
-        ({"objectives": {}}, ParameterError, "'objectives' must be names"),
+        ({"objectives": {}}, ParameterError, "'objectives' must map names"),
         ({"objectives": {"snr_mean": "up"}}, ParameterError, '"maximize" or "minimize"'),
         ({"objectives": {"beauty": "maximize"}}, ParameterError, "must be results of metrics"),
         ({"constraints": {"n_sites": (None, None)}}, ParameterError, "must have limits"),
         ({"n_trials": 0}, ParameterError, "'n_trials' must be"),
-        ({"storage": "/nowhere/at/all.db"}, FileError, "its folder does not exist"),
+        ({"storage": "/nowhere/at/all.db"}, FileError, "its directory does not exist"),
         ({"storage": "nosuch://base"}, FileError, "cannot be used as a study's storage"),
     ],
 )
-def test_a_bad_study_ends_before_it_begins_in_one_sentence(change, error, message):
+def test_invalid_study_is_rejected_before_start(change, error, message):
     given = {"search": {"sensor.bits": (8, 10)}, "objectives": {"snr_mean": "maximize"}, "n_trials": 1} | change
 
     with pytest.raises(error, match=message) as caught:
@@ -311,7 +312,7 @@ def test_a_bad_study_ends_before_it_begins_in_one_sentence(change, error, messag
     assert "\n" not in str(caught.value)
 
 
-def test_a_file_that_is_no_storage_is_told_and_left_alone(tmp_path):
+def test_invalid_storage_file_is_unchanged(tmp_path):
     (tmp_path / "notes.db").write_text("my notes")
 
     with pytest.raises(FileError, match="cannot be used as a study's storage"):

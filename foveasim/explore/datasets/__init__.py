@@ -1,1 +1,1 @@
-"""Datasets: many captures with labels, for learning."""
+"""Datasets of labelled captures for machine learning."""

@@ -1,4 +1,4 @@
-"""Datasets for learning: pictures through cameras drawn at random, every sample a function of the seed and its number."""
+"""Datasets of pictures captured by random cameras, reproducible from a seed."""
 
 from __future__ import annotations
 
@@ -42,81 +42,81 @@ from foveasim.scene import Scene
 
 __all__ = ["FIELDS", "Dataset"]
 
-#: What a sample may have of each site.
+#: Quantities per site that samples may contain.
 FIELDS = ("code", "electrons", "expected_e", "expected_dn")
-#: Parts that a process keeps of each sort: those used last.
+#: Number of cached components of each kind per process, the most recently used.
 KEPT = 4
-#: Values of each setting that are tried before the first sample.
+#: Largest number of values of each setting that are checked before the first sample.
 TRIED_VALUES = 64
-#: More cameras or draws per picture than anyone can compute.
+#: Upper limit of cameras and draws, beyond any feasible computation.
 MAX_REPEATS = 10**9
-#: Settings that change which photosites there are.
+#: Setting that determines the photosites.
 LAYOUT = "layout"
 
 
 class Dataset:
     """
-    Pictures through cameras drawn at random: a sample is simulated when it is asked for.
+    Map-style dataset of pictures captured by random cameras.
 
-    Has a length and items, and so is a map-style dataset to ``torch.utils.data.DataLoader`` and others, without needing torch.
-    A sample is the same in any order, in any process, and alone.
+    A sample is simulated on access. The class implements ``__len__`` and ``__getitem__``, as ``torch.utils.data.DataLoader``
+    and other loaders require, and does not depend on torch. A sample does not depend on the order of access or the process.
 
     Parameters
     ----------
     pictures : path, (n, n_y, n_x) or (n, n_y, n_x, n_channel) array, or sequence
-        A folder of pictures and folders of them, a zip file of such, a file of one array (``.npy``); or files, arrays and
-        Pillow's images, alone or in pairs with their classes, of anything that has a length and items. Of pairs that are no
-        list all are asked for once, unless the classes are its ``targets`` as well.
+        Directory tree or zip file of pictures, ``.npy`` file of an array, or sequence of files, arrays or Pillow images, or of
+        pairs of these with their classes. All pairs of a sequence other than a list or tuple are read once for their classes,
+        unless the sequence has an attribute ``targets``.
     shot : path or mapping
-        A settings file, or settings as it has them, of a scene of the kind ``picture``, whose picture these take the place of.
+        Settings file, or mapping of settings, with a scene of the kind ``picture``. The dataset supplies its picture.
     vary : mapping of str to distribution, optional
-        By settings' paths, such as ``{"optics.f_number": {"log_uniform": [1.4, 8]}}``; see
-        :func:`foveasim.explore.parse_distribution`. Drawn again for every camera.
+        Distributions by setting path, such as ``{"optics.f_number": {"log_uniform": [1.4, 8]}}``; see
+        :func:`foveasim.explore.parse_distribution`. Every camera is an independent draw.
     cameras : int
-        Cameras that each picture is taken with.
+        Number of random cameras per picture.
     draws : int
-        Captures with each camera, which differ in their noise. Sample i is of picture ``i // (cameras * draws)`` and of camera
-        ``i // draws``.
+        Number of captures per camera, which differ in their noise. Sample i shows picture ``i // (cameras * draws)`` through
+        camera ``i // draws``.
     seed : int
-        Of the cameras and of the noise.
+        Seed of the cameras and the noise.
     fields : sequence of {"code", "electrons", "expected_e", "expected_dn"}
-        What a sample has of each site: the code, the charge, its expectation, and the mean code over all noise.
+        Quantities per site in a sample: the code, the electrons, their expectation, and the mean code over temporal noise.
     labels : sequence of int or str, optional
-        Class of each picture; by default what pairs say, or the names of the folders that pictures are in. Texts are numbered
-        in their alphabetical order.
+        Class of each picture; by default the class of each pair, or the name of the top-level directory of each picture.
+        Strings are numbered in alphabetical order.
     boxes : sequence of (n_box, 4) or (n_box, 5), optional, pixels
-        Of each picture: x0, y0, x1, y1 from its upper left corner, y down, and a class.
+        Boxes of each picture: x0, y0, x1, y1 from its upper left corner, y down, and a class.
     masks : sequence of (n_y, n_x) integers, or of files, optional
-        Classes of each picture's pixels.
+        Classes of the pixels of each picture.
     flows : sequence of (n_y, n_x, 2), or of ``.npy`` files, optional, pixels
-        How far each pixel moves, x to the right and y down; NaN where that is not known.
+        Displacement of each pixel, x to the right and y down; NaN where it is unknown.
     fit : {"cover", "contain"}, optional
-        Pictures of any size get the scene's pitch with which they just cover the layout, or just are on it, with the shot's own
-        lens. By default the pitch is the shot's.
+        Scaling of each picture with the lens of the shot: the scene pitch is chosen so that the image just covers the layout,
+        or just fits on it. By default the pitch is that of the shot.
     changes : mapping of str to value, optional
-        Settings to be replaced in all samples.
+        Settings that are replaced in all samples.
     source : path
-        What messages call settings that are no file.
+        Name of a mapping of settings in messages.
     n_threads : int
-        That a sample is computed with.
+        Number of threads per sample.
 
     Raises
     ------
     FileError
-        When there are no pictures, or the first cannot be read; for a sample, when its own cannot.
+        When there are no pictures, or the first cannot be read; on access to a sample, when its picture cannot be read.
     ParameterError, ConfigError
-        When a distribution, a path, or an end of its values is impossible, or labels do not fit the pictures.
+        When a distribution, a path or a bound is invalid, or labels do not match the pictures.
 
     Notes
     -----
-    Samples are mappings of arrays and numbers: ``index``, ``picture``, the ``fields`` (n_site,), ``settings`` (what was drawn
-    by path; of choices that are no numbers, their positions) and ``warning``; with labels ``label``; with boxes ``box_um``
-    (n_box, 4), ``box_label`` (n_box,) and ``box_covers`` (n_box, n_site), filled up with boxes of the class -1 to the same
-    number in all samples; with masks ``mask`` (n_site,), -1 off the picture; with flows ``flow_um`` (n_site, 2) and
-    ``flow_known`` (n_site,). See :mod:`foveasim.explore.datasets.labels` for what they say.
+    Samples are mappings of arrays and numbers: ``index``, ``picture``, the ``fields`` (n_site,), ``settings`` (random values by
+    path; indices for choices other than numbers) and ``warning``; with labels ``label``; with boxes ``box_um`` (n_box, 4),
+    ``box_label`` (n_box,) and ``box_covers`` (n_box, n_site), padded with boxes of class -1 to the same number in all samples;
+    with masks ``mask`` (n_site,), -1 outside the picture; with flows ``flow_um`` (n_site, 2) and ``flow_known`` (n_site,).
+    :mod:`foveasim.explore.datasets.labels` defines these labels.
 
-    Each process keeps the parts that it met last: layouts, compiled layouts, lenses, scenes, the light on the sites. Arrays in
-    memory may go to each process whole; of files, and of a ``.npy`` file, each reads what it needs.
+    Each process caches recent components: layouts, compiled layouts, lenses, scenes and the power on the sites. Arrays in
+    memory may be copied to each process; picture files and ``.npy`` files are read on demand.
 
     Examples
     --------
@@ -183,7 +183,7 @@ class Dataset:
         self._try_ends()
 
     def _begin(self) -> None:
-        """What a process has of its own."""
+        """Initialise the state of a process: caches and warnings."""
         self._kept: dict[str, OrderedDict[str, tuple[Any, list[Warning]]]] = {}
         self._told: list[Warning] = []
         self._has_warned = False
@@ -207,57 +207,61 @@ class Dataset:
         return len(self._pictures) * self.cameras * self.draws
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        """Samples, one after the other."""
+        """Iterate over all samples."""
         return (self[index] for index in range(len(self)))
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         """
-        A sample.
+        Simulate a sample.
 
         Raises
         ------
         IndexError
-            When there is none of this number.
+            When the index is out of range.
         FileError, SimulationError
-            When its picture cannot be read, or its camera not be made.
+            When the picture of the sample cannot be read, or its camera cannot be built.
         """
         return self._at(index, self._sample)
 
     def capture(self, index: int) -> Capture:
-        """The whole capture of a sample: for pictures, and for all that it was made from."""
+        """Simulate a sample and return its capture."""
         return self._at(index, lambda index: self._captured(index)[1])
 
     def shot(self, index: int) -> Shot:
-        """Camera and scene of a sample. Its noise is that of ``seed`` and the frame ``index``."""
+        """Return the camera and scene of a sample; its noise uses ``seed`` and frame ``index``."""
         return self._at(index, self._shot)
 
     def settings_of(self, index: int) -> dict[str, Any]:
-        """All settings of a sample, as a settings file has them."""
+        """Return all settings of a sample in the structure of a settings file."""
         return self._at(index, self._settings_of)
 
     @cached_property
     def layout(self) -> Layout:
         """
-        The photosites of all samples.
+        Layout of all samples.
 
         Raises
         ------
         ParameterError
-            When they differ.
+            When the samples have different layouts.
         """
         if self.is_layout_varied:
-            raise ParameterError("layout", "differs from sample to sample; take shot(index).camera.sensor.layout")
+            raise ParameterError("layout", "must be equal in all samples; use shot(index).camera.sensor.layout")
         layout = self.shot(0).camera.sensor.layout
         assert isinstance(layout, Layout)
         return layout
 
     @property
     def is_layout_varied(self) -> bool:
-        """Whether samples differ in their photosites."""
+        """Whether samples have different layouts."""
         return any(path == LAYOUT or path.startswith(LAYOUT + ".") for path in self._draws)
 
     def to_dict(self) -> dict[str, Any]:
-        """All that samples depend on, as plain data; of pictures, masks and flows not what they hold: see :meth:`digest`."""
+        """
+        Return everything that determines the samples as plain data.
+
+        The contents of pictures, masks and flows are not included; see :meth:`digest`.
+        """
         labels = {
             "labels": self._labels,
             "boxes": None if self._boxes is None else [[*map(np.ndarray.tolist, each)] for each in self._boxes],
@@ -281,9 +285,10 @@ class Dataset:
 
     def digest(self, samples: range) -> str:
         """
-        SHA-256 of what the pictures, masks and flows of some samples hold.
+        Compute the SHA-256 of the pictures, masks and flows of a range of samples.
 
-        Of those that are made when they are asked for, by what is no list, array or file, only the first's and the last's.
+        For sequences that may compute items on access (other than lists, arrays and files), only the first and the last item
+        contribute.
         """
         numbers = range(self._picture_of(samples[0]), self._picture_of(samples[-1]) + 1)
         of_pictures = self._pixels_digest if self._pictures.is_lazy else self._pictures.digest
@@ -296,16 +301,16 @@ class Dataset:
     def _pixels_digest(self, picture: int) -> str:
         try:
             return digest_of(self._pixels(picture))
-        except FoveasimError:  # its sample tells what is wrong
+        except FoveasimError:  # reported on access to the sample
             return ""
 
     # -- a sample -----------------------------------------------------------------------------------------------------
 
     def _at(self, index: int, what: Callable[[int], Any]) -> Any:
-        """Something of a sample; what goes wrong is told with its number."""
+        """Evaluate a function of a sample index, with the sample in the messages of errors."""
         place = operator.index(index)
         if not -len(self) <= place < len(self):
-            raise IndexError(f"there are {len(self)} samples, and none of the number {place}")
+            raise IndexError(f"sample index {place} is out of range for {len(self)} samples")
         place %= len(self)
         try:
             return what(place)
@@ -325,14 +330,14 @@ class Dataset:
         return index // (self.cameras * self.draws)
 
     def _drawn(self, index: int) -> dict[str, tuple[Any, int | float]]:
-        """Values and numbers of the settings of a sample's camera."""
+        """Return the random settings of a sample: value and number by path."""
         return {path: draw.at(self.seed, index // self.draws) for path, draw in self._draws.items()}
 
     def _settings_of(self, index: int) -> dict[str, Any]:
         return self._with(index, {path: value for path, (value, _) in self._drawn(index).items()})
 
     def _with(self, index: int, values: Mapping[str, Any]) -> dict[str, Any]:
-        """The settings with some values, and a sample's picture."""
+        """Return the settings with the given values and the picture of a sample."""
         data = _copied(self._settings)
         data["scene"]["picture"] = self._name_of(index)
         if self._fit is not None:
@@ -345,7 +350,11 @@ class Dataset:
         return data
 
     def _keep(self, part: str, settings: Any, make: Callable[[], Any]) -> Any:
-        """What a part's settings make, or made before; its warnings are kept with it, and so told whoever comes first."""
+        """
+        Return the component with the given settings, from the cache or newly built.
+
+        The warnings of its construction are stored with it, so that every sample that uses it reports them.
+        """
         parts = self._kept.setdefault(part, OrderedDict())
         key = json.dumps(settings, sort_keys=True)
         if key not in parts:
@@ -374,7 +383,7 @@ class Dataset:
             try:
                 return Scene.from_picture(self._pixels(picture), **values)
             except ParameterError as error:
-                raise FileError(self._name_of(index), f"is no picture for these settings: {error}") from None
+                raise FileError(self._name_of(index), f"is not a valid picture for these settings: {error}") from None
 
         def keep(part: str, told: Any, make: Callable[[], Any]) -> Any:
             return self._keep(part, [picture, told], scene) if part == "scene" else self._keep(part, told, make)
@@ -408,7 +417,7 @@ class Dataset:
         told = [*self._told, *(_warning(each.message) for each in caught)]
         if told and not self._has_warned:
             self._has_warned = True
-            text = f"sample {index}: {told[0]}; what else there is to be warned of, samples tell by their 'warning'"
+            text = f"sample {index}: {told[0]}; further warnings are in the item 'warning' of each sample"
             warnings.warn(text, type(told[0]), stacklevel=4)
         sample["settings"] = {path: number for path, (_, number) in drawn.items()}
         sample["warning"] = "; ".join(dict.fromkeys(str(each) for each in told))
@@ -418,7 +427,7 @@ class Dataset:
         if field == "code":
             return capture.code.astype(self._code_type)
         if field == "expected_dn":
-            # The same for all draws of a camera.
+            # Equal for all draws of a camera.
             predict = partial(shot.camera.sensor.predict, capture.expected_e, n_threads=self._n_threads)
             return np.array(self._keep("prediction", index // self.draws, predict)[0])
         return np.array(getattr(capture, field))
@@ -453,7 +462,7 @@ class Dataset:
     # -- before the first sample --------------------------------------------------------------------------------------
 
     def _try_ends(self) -> None:
-        """Build the first sample's shot at the ends of every setting: what cannot be is told at once."""
+        """Build the first shot at the bounds of every setting, to detect errors early."""
         try:
             base = self._built(0, self._with(0, {}) if self._fit is None else self._unfitted())
             layout, scene = base.camera.sensor.layout, base.scene
@@ -461,7 +470,7 @@ class Dataset:
                 assert isinstance(layout, Layout)
                 assert isinstance(scene, Scene)
                 if layout.n_sites == 0:
-                    raise ParameterError("fit", "needs a layout with sites")
+                    raise ParameterError("fit", "must be used with a layout that has photosites")
                 x_um, y_um = (0.0, 0.0) if base.camera.distortion is None else base.camera.distortion.centre_um
                 x0, y0, x1, y1 = layout.bounds_um
                 half_um = max(x1 - x_um, x_um - x0), max(y1 - y_um, y_um - y0)
@@ -481,7 +490,7 @@ class Dataset:
         return data
 
     def _tried(self, values: Mapping[str, Any]) -> int:
-        """Bits of the first picture's shot with some values."""
+        """Build the shot of the first picture with the given values and return its bit depth."""
         settings = self._with(0, values)
         check_settings(self._file, settings)
         return self._built(0, settings).camera.sensor.bits
@@ -495,17 +504,21 @@ def _base(
     *,
     is_fitted: bool,
 ) -> tuple[Path, Any]:
-    """The file that settings are from, for messages, and the settings with absolute files, which are added to those found."""
+    """
+    Return the file of the settings, for messages, and the settings with absolute paths.
+
+    The referenced files are appended to ``found``.
+    """
     if isinstance(shot, Mapping):
         file, data = source, _copied(shot)
     elif isinstance(shot, str | Path):
         file = Path(shot)
         data = read_settings(file)
     else:
-        raise ParameterError("shot", f"must be a settings file, or settings, got a {type(shot).__name__}")
+        raise ParameterError("shot", f"must be a settings file or a mapping of settings, got a {type(shot).__name__}")
     scene = data.get("scene")
     if not isinstance(scene, Mapping) or scene.get("kind") != "picture":
-        raise ConfigError(file, "scene.kind: must be 'picture' for a dataset, whose pictures take its place")
+        raise ConfigError(file, "scene.kind: must be 'picture' for a dataset, which supplies the pictures")
     data = files_from(
         file.parent, {**data, "scene": {key: scene[key] for key in scene if key != "picture"}}, found=found
     )
@@ -518,11 +531,11 @@ def _base(
     try:
         return file, json.loads(json.dumps(data, default=_plain))
     except (TypeError, ValueError, RecursionError) as error:
-        raise ConfigError(file, f"must hold numbers, texts, lists and sections ({error})") from None
+        raise ConfigError(file, f"must contain only numbers, strings, lists and mappings ({error})") from None
 
 
 def _plain(value: Any) -> Any:
-    """What settings in Python may hold beside plain data."""
+    """Convert numpy and path objects in settings to plain data."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     if isinstance(value, Path):
@@ -532,21 +545,21 @@ def _plain(value: Any) -> Any:
 
 def _draws(file: Path, vary: Mapping[str, Any], found: list[Path], *, is_fitted: bool) -> dict[str, Draw]:
     if not isinstance(vary, Mapping):
-        raise ParameterError("vary", "must be distributions by settings' paths", vary)
+        raise ParameterError("vary", "must be a mapping of setting paths to distributions", vary)
     draws = {str(path): parse_distribution(str(path), told) for path, told in vary.items()}
     check_apart(file, draws)
     for path, draw in draws.items():
         if draw.kind == "choice":
             draws[path] = replace(draw, values=tuple(files_from(Path(), value, path, found) for value in draw.values))
         if path in ("seed", "scene", "scene.kind", "scene.picture"):
-            raise ParameterError(path, "cannot vary: the dataset has its own seed and its own pictures")
+            raise ParameterError(path, "must not vary: the dataset has its own seed and its own pictures")
         if is_fitted and path == "scene.pitch_um":
-            raise ParameterError(path, "cannot vary beside 'fit', which chooses it")
+            raise ParameterError(path, "must not vary with 'fit', which sets it")
     return draws
 
 
 def _numbered(labels: Any, n: int) -> tuple[list[int] | None, list[str] | None]:
-    """Classes of the pictures as numbers, and their names where they have some."""
+    """Return the classes of the pictures as numbers, and the names of string classes."""
     if labels is None:
         return None, None
     each = one_a_picture("labels", labels, n)
@@ -559,23 +572,23 @@ def _numbered(labels: Any, n: int) -> tuple[list[int] | None, list[str] | None]:
         names = sorted(set(values))
         numbers = {name: k for k, name in enumerate(names)}
         return [numbers[value] for value in values], names
-    raise ParameterError("labels", "must all be integers, or all be texts", values)
+    raise ParameterError("labels", "must all be integers, or all be strings", values)
 
 
 def _ends(numbers: range) -> list[int]:
-    """The first and the last number."""
+    """Return the first and the last number."""
     return [*dict.fromkeys((numbers[0], numbers[-1]))]
 
 
 def _filled(array: NDArray[Any], n: int, value: Any) -> NDArray[Any]:
-    """An array with more rows, of one value."""
+    """Pad an array with rows of one value to ``n`` rows."""
     rest = np.full((n - len(array), *array.shape[1:]), value, array.dtype)
     return np.concatenate((array, rest))
 
 
 @contextmanager
 def _caught_warnings() -> Iterator[list[warnings.WarningMessage]]:
-    """All warnings, but those that Python gives whenever it finds a file left open."""
+    """Record all warnings except ResourceWarning, which garbage collection emits at any time."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         warnings.simplefilter("ignore", ResourceWarning)
@@ -587,5 +600,5 @@ def _warning(message: Warning | str) -> Warning:
 
 
 def _copied(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings with sections of their own; lists are shared."""
+    """Return a copy of settings with new mappings; lists are shared."""
     return {key: _copied(value) if isinstance(value, Mapping) else value for key, value in data.items()}

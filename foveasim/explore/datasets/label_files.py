@@ -1,4 +1,4 @@
-"""Labels in the files that people have: classes in CSV, boxes in COCO's JSON, masks and flows in folders of their own."""
+"""Label files: classes in CSV, boxes in COCO JSON, directories of masks and flows."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from foveasim.errors import FileError
 
 __all__ = ["FLOW_ENDINGS", "MASK_ENDINGS", "files_of_pictures", "read_boxes", "read_labels"]
 
-#: A larger file of labels is something else: the boxes of a hundred thousand photographs take half of this.
+#: Size limit of a label file, bytes: the boxes of 100,000 photographs take half of this.
 MAX_LABEL_BYTES = 1 << 30
 #: Columns of a CSV file of classes.
 PICTURE, LABEL = "picture", "label"
-#: Endings of masks, in which every pixel is as it was written, and of optical flow.
+#: Extensions of masks (lossless formats only) and of optical flow.
 MASK_ENDINGS, FLOW_ENDINGS = (".png", ".bmp", ".tif", ".tiff"), (".npy",)
 #: Left, top, width, height in pixels.
 _Box = tuple[float, float, float, float]
@@ -31,25 +31,25 @@ WHOLE = re.compile(r"[+-]?\d+")
 
 def read_labels(path: Path, pictures: Sequence[str]) -> list[int] | list[str]:
     """
-    Classes of pictures, of a CSV file or of an array.
+    Read the classes of pictures from a CSV or array file.
 
     Parameters
     ----------
     path : Path
-        ``.csv`` in UTF-8 with the columns ``picture`` and ``label`` in its first line, in any order of lines; others are not
-        looked at. ``.npy``: an array of integers or texts, one for each picture in their order.
+        ``.csv``: UTF-8 with the columns ``picture`` and ``label`` in its first line, and lines in any order; other columns are
+        ignored. ``.npy``: array of integers or strings, one per picture in the order of the pictures.
     pictures : sequence of str
-        What the file calls them; it may name others too.
+        Names of the pictures in the file, which may list others too.
 
     Returns
     -------
     labels : list of int or of str
-        Integers where all of the file's are.
+        Integers if all labels of the file are integers.
 
     Raises
     ------
     FileError
-        When it cannot be read, or has no class for a picture, or two.
+        When the file cannot be read, or does not contain exactly one class for each picture.
     """
     content = _content(path)
     if path.suffix.lower() == ".npy":
@@ -59,7 +59,7 @@ def read_labels(path: Path, pictures: Sequence[str]) -> list[int] | list[str]:
     try:
         lines = list(csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True))
     except (UnicodeDecodeError, csv.Error) as error:
-        raise FileError(path, f"is no CSV file in UTF-8 ({error})") from None
+        raise FileError(path, f"is not a valid UTF-8 CSV file ({error})") from None
     head = [name.strip() for name in lines[0]] if lines else []
     if PICTURE not in head or LABEL not in head:
         raise FileError(path, f"must have the columns '{PICTURE}' and '{LABEL}' in its first line, got {head}")
@@ -69,10 +69,10 @@ def read_labels(path: Path, pictures: Sequence[str]) -> list[int] | list[str]:
         if not line:
             continue
         if len(line) != len(head):
-            raise FileError(path, f"has {len(line)} values in line {number}, and {len(head)} columns")
+            raise FileError(path, f"has {len(line)} values in line {number}, expected {len(head)}")
         name = line[at_picture].strip()
         if name in found:
-            raise FileError(path, f"has the picture '{name}' twice, in line {number} again")
+            raise FileError(path, f"lists the picture '{name}' twice, again in line {number}")
         found[name] = line[at_label].strip()
     _check_all(path, pictures, found)
     labels = [found[name] for name in pictures]
@@ -94,7 +94,7 @@ class _CocoAnnotation(BaseModel):
 
 
 class _Coco(BaseModel):
-    """What is taken of a COCO file; what else there is, outlines and licences, is not looked at."""
+    """Keys that are read from a COCO file; others, such as outlines and licences, are ignored."""
 
     model_config = ConfigDict(extra="ignore")
     images: list[_CocoImage]
@@ -103,25 +103,25 @@ class _Coco(BaseModel):
 
 def read_boxes(path: Path, pictures: Sequence[str]) -> list[Floats]:
     """
-    Boxes of pictures, of a JSON file as COCO has it.
+    Read the boxes of pictures from a JSON file in COCO format.
 
     Parameters
     ----------
     path : Path
-        With ``images`` (``id``, ``file_name``) and ``annotations`` (``image_id``, ``category_id``, ``bbox``: left, top, width,
-        height in pixels). Annotations of crowds (``iscrowd``) are left out.
+        File with ``images`` (``id``, ``file_name``) and ``annotations`` (``image_id``, ``category_id``, ``bbox``: left, top,
+        width, height in pixels). Crowd annotations (``iscrowd``) are ignored.
     pictures : sequence of str
-        What the file calls them; it may name others too.
+        Names of the pictures in the file, which may list others too.
 
     Returns
     -------
     boxes : list of (n_box, 5) float64, pixels
-        Of each picture: x0, y0, x1, y1 from its upper left corner, y down, and the category's number.
+        For each picture: x0, y0, x1, y1 from its upper left corner, y down, and the category number.
 
     Raises
     ------
     FileError
-        When it cannot be read, does not name a picture, or a box has no area.
+        When the file cannot be read, does not list a picture, or a box has no area.
     """
     try:
         coco = TypeAdapter(_Coco).validate_json(_content(path))
@@ -129,11 +129,11 @@ def read_boxes(path: Path, pictures: Sequence[str]) -> list[Floats]:
         first = error.errors(include_url=False, include_input=False)[0]
         place = ".".join(map(str, first["loc"]))
         rule = first["msg"].replace("Input should", "must")
-        raise FileError(path, f"holds no boxes as COCO has them ({place + ': ' if place else ''}{rule})") from None
+        raise FileError(path, f"is not a valid COCO file ({place + ': ' if place else ''}{rule})") from None
     numbers: dict[str, int | str] = {}
     for image in coco.images:
         if image.file_name in numbers:
-            raise FileError(path, f"names the picture '{image.file_name}' twice")
+            raise FileError(path, f"lists the picture '{image.file_name}' twice")
         numbers[image.file_name] = image.id
     _check_all(path, pictures, numbers)
     boxes: dict[int | str, list[list[float]]] = {numbers[name]: [] for name in pictures}
@@ -142,40 +142,42 @@ def read_boxes(path: Path, pictures: Sequence[str]) -> list[Floats]:
             continue
         left, top, width, height = annotation.bbox
         if not (np.isfinite(annotation.bbox).all() and width > 0.0 and height > 0.0):
-            raise FileError(path, f"annotations.{k}: has a box without an area: {list(annotation.bbox)}")
+            raise FileError(path, f"annotations.{k}: must have a box with an area > 0, got {list(annotation.bbox)}")
         boxes[annotation.image_id].append([left, top, left + width, top + height, float(annotation.category_id)])
     return [np.array(boxes[numbers[name]], np.float64).reshape(-1, 5) for name in pictures]
 
 
 def files_of_pictures(folder: Path, pictures: Sequence[str], endings: Sequence[str]) -> list[Path]:
     """
-    A file for each picture, of the same name with another ending.
+    Return the file for each picture, with the same name and another extension.
 
     Parameters
     ----------
     folder : Path
-        With the folders in it that the pictures' own has.
+        Directory with the same subdirectories as that of the pictures.
     pictures : sequence of str
+        Names of the pictures.
     endings : sequence of str
+        Allowed extensions.
 
     Raises
     ------
     FileError
-        When there is no such folder, or not exactly one file of a picture.
+        When the directory does not exist, or does not contain exactly one file for each picture.
     """
     if not folder.is_dir():
-        raise FileError(folder, "no such folder" if not folder.exists() else "is not a folder")
+        raise FileError(folder, "no such directory" if not folder.exists() else "is not a directory")
     found: dict[str, Path] = {}
     for file in sorted(folder.rglob("*")):
         if file.suffix.lower() in endings:
             name = file.relative_to(folder).with_suffix("").as_posix()
             if name in found:
-                raise FileError(folder, f"has two files of the picture '{name}': {found[name].name} and {file.name}")
+                raise FileError(folder, f"has two files for the picture '{name}': {found[name].name} and {file.name}")
             found[name] = file
     wanted = [PurePosixPath(name).with_suffix("").as_posix() for name in pictures]
     twice = next((name for name, n in Counter(wanted).items() if n > 1), None)
     if twice is not None:
-        raise FileError(folder, f"cannot tell two pictures apart that are called '{twice}'")
+        raise FileError(folder, f"must have one file per picture, but two pictures have the name '{twice}'")
     _check_all(folder, wanted, found, f" ({', '.join(endings)})")
     return [found[name] for name in wanted]
 
@@ -184,9 +186,9 @@ def _check_all(path: Path, pictures: Sequence[str], found: Iterable[str], of: st
     names = set(found)
     missing = [name for name in pictures if name not in names]
     if missing:
-        has = f"it has '{min(names)}'" if names else "it has none"
+        has = f"it contains '{min(names)}'" if names else "it contains no entries"
         raise FileError(
-            path, f"has nothing for {len(missing):,} of the {len(pictures):,} pictures, first '{missing[0]}'; {has}{of}"
+            path, f"has no entry for {len(missing):,} of {len(pictures):,} pictures, first '{missing[0]}'; {has}{of}"
         )
 
 
@@ -194,7 +196,7 @@ def _content(path: Path) -> bytes:
     if not path.is_file():
         raise FileError(path, "no such file" if not path.exists() else "is not a file")
     if path.stat().st_size > MAX_LABEL_BYTES:
-        raise FileError(path, f"is larger than {MAX_LABEL_BYTES} bytes, and so no file of labels")
+        raise FileError(path, f"is larger than {MAX_LABEL_BYTES} bytes, the limit of label files")
     try:
         return path.read_bytes()
     except OSError as error:
@@ -205,7 +207,7 @@ def _array(path: Path) -> NDArray[np.generic]:
     try:
         array: NDArray[np.generic] = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise FileError(path, f"is no array that can be read ({error})") from None
+        raise FileError(path, f"is not a readable array ({error})") from None
     if not isinstance(array, np.ndarray) or array.ndim != 1 or array.dtype.kind not in "iuU":
-        raise FileError(path, "must be an array of one dimension, of integers or of texts")
+        raise FileError(path, "must be a one-dimensional array of integers or strings")
     return array

@@ -1,4 +1,4 @@
-"""Labels of a picture's pixels as labels of a sensor's sites: boxes, masks and optical flow, through the lens."""
+"""Mapping of picture labels (boxes, masks, optical flow) to photosites through the lens."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ __all__ = [
     "read_mask",
 ]
 
-#: Label of a site that sees mostly what lies off the picture, and of boxes that only fill up a sample.
+#: Label of a site whose area lies mostly outside the picture, and of padding boxes.
 NOTHING = -1
-#: Largest class of a box: beyond it not every integer is a float, as which boxes are given.
+#: Largest class of a box: classes are passed as float64, which represents all integers up to 2^53.
 MOST_CLASS = 2**53
-#: Points along each side of a box, whose image may be bent.
+#: Points along each side of a box, whose image may be curved.
 POINTS_A_SIDE = 65
-#: Areas that differ by less than this fraction of a site are the same up to rounding: the lower class has it.
+#: Areas that differ by less than this fraction of a site are equal up to rounding; the lower class is then assigned.
 TIE = 1e-9
 
 
@@ -48,10 +48,10 @@ class Boxes:
     Attributes
     ----------
     box_um : (n_box, 4) float64, µm
-        x_min, y_min, x_max, y_max of each box's image, y up; where the lens bends it, around the image of its outline, as much
-        of it as the lens images; 0 where it images none.
+        x_min, y_min, x_max, y_max of the image of each box, y up. With distortion: bounds of the image of the outline, as far
+        as the lens images it; 0 when the lens images none of it.
     covers : (n_box, n_site) bool
-        Sites of whose light-collecting area more than half is in the box.
+        Sites with more than half of their light-collecting area inside the box.
     """
 
     box_um: Floats
@@ -61,13 +61,14 @@ class Boxes:
 @dataclass(frozen=True, eq=False)
 class Flow:
     """
-    Optical flow on the sites.
+    Optical flow at the photosites.
 
     Attributes
     ----------
     flow_um : (n_site, 2) float64, µm
-        How far what a site sees moves on the sensor, y up: the mean over what is known of it; 0 where nothing is.
+        Displacement on the sensor, y up: the mean over the part of the site with known flow; 0 where the flow is unknown.
     is_known : (n_site,) bool
+        Whether the flow is known in any part of the site.
     """
 
     flow_um: Floats
@@ -76,19 +77,24 @@ class Flow:
 
 def boxes_on_sites(boxes_px: Floats, integrator: Integrator, lens: Lens | None) -> Boxes:
     """
-    Boxes in a picture on the sensor.
+    Map boxes of a picture to the sensor.
 
     Parameters
     ----------
     boxes_px : (n_box, 4) float64, pixels
-        x_min, y_min, x_max, y_max as image files count: from the upper left corner, y down, pixel k from k to k + 1.
+        x_min, y_min, x_max, y_max from the upper left corner, y down; pixel k extends from k to k + 1.
     integrator : Integrator
-        Of first order, of the sites on the grid that the picture's pixels are imaged on.
+        First-order integrator of the sites on the image grid of the picture.
     lens : lens of foveasim.distortion, optional
+
+    Returns
+    -------
+    Boxes
 
     Notes
     -----
-    A box that cuts a pixel has its fraction of the pixel, spread evenly over it; boxes along pixels are exact.
+    A pixel on the boundary of a box counts with its fraction inside the box, distributed uniformly over the pixel. Boxes
+    aligned with pixels are exact.
     """
     grid = integrator.grid
     n_y, n_x = grid.shape
@@ -118,23 +124,24 @@ def boxes_on_sites(boxes_px: Floats, integrator: Integrator, lens: Lens | None) 
 
 def mask_on_sites(mask: Ints, integrator: Integrator) -> Ints:
     """
-    The class that has most of each site's area, (n_site,) int64.
+    Return the class with the largest area of each site.
 
     Parameters
     ----------
     mask : (n_y, n_x) integers
-        Classes of the picture's pixels, first row on top.
+        Classes of the pixels of the picture, top row first.
     integrator : Integrator
         As for :func:`boxes_on_sites`.
 
     Returns
     -------
     classes : (n_site,) int64
-        :data:`NOTHING` where no class has more than what lies off the picture. Of classes with the same area the lowest.
+        :data:`NOTHING` where the area outside the picture is at least that of every class. Among classes with equal area, the
+        lowest.
 
     Notes
     -----
-    Areas are those from which a site collects light: of its outline carried back through the lens.
+    Areas are those of the undistorted outlines, from which sites collect light.
     """
     rows = from_file_rows(mask)[0]
     found = np.full(integrator.n_sites, NOTHING, np.int64)
@@ -150,14 +157,18 @@ def mask_on_sites(mask: Ints, integrator: Integrator) -> Ints:
 
 def flow_on_sites(flow_px: Floats, integrator: Integrator, lens: Lens | None) -> Flow:
     """
-    Optical flow of a picture on the sensor.
+    Map the optical flow of a picture to the photosites.
 
     Parameters
     ----------
     flow_px : (n_y, n_x, 2) float, pixels
-        How far each pixel moves, x to the right and y down as image files have it; NaN where it is not known.
+        Displacement of each pixel, x to the right and y down; NaN where it is unknown.
     integrator, lens
         As for :func:`boxes_on_sites`.
+
+    Returns
+    -------
+    Flow
     """
     grid = integrator.grid
     moves = np.moveaxis(from_file_rows(np.asarray(flow_px, np.float64)), 0, -1) * [grid.pitch_x_um, -grid.pitch_y_um]
@@ -176,7 +187,7 @@ def flow_on_sites(flow_px: Floats, integrator: Integrator, lens: Lens | None) ->
 
 
 def _seen_um2(integrator: Integrator) -> Floats:
-    """Area from which each site collects light, off the picture too; 0 outside the lens's image circle."""
+    """Return the light-collecting area of each site; 0 outside the image circle."""
     on_um2 = integrator(np.ones(integrator.grid.shape))
     lost = integrator.sites_outside_image_circle
     off_um2 = np.array(integrator.uncovered_um2)
@@ -185,19 +196,21 @@ def _seen_um2(integrator: Integrator) -> Floats:
 
 
 def _on_sensor(points_px: Floats, grid: Grid) -> Floats:
-    """Points (n, 2) of a picture, from its upper left corner and y down, in the sensor's plane."""
+    """Convert points (n, 2) from picture coordinates (upper left corner, y down) to sensor µm."""
     x0, _, _, y1 = grid.bounds_um
     return np.array([x0, y1]) + points_px * [grid.pitch_x_um, -grid.pitch_y_um]
 
 
 def checked_boxes(name: str, boxes: Any) -> tuple[Floats, Ints]:
     """
-    Boxes of one picture, and their classes; :data:`NOTHING` where none are given.
+    Return the boxes and classes of one picture after validation.
+
+    Classes are :data:`NOTHING` when ``boxes`` has no column of classes.
 
     Raises
     ------
     ParameterError
-        When they are not (n, 4) or (n, 5) numbers, or a box has no area.
+        When ``boxes`` is not an (n, 4) or (n, 5) array of numbers, or a box has no area.
     """
     if np.size(boxes) == 0:
         return np.zeros((0, 4)), np.zeros(0, np.int64)
@@ -219,21 +232,21 @@ def checked_boxes(name: str, boxes: Any) -> tuple[Floats, Ints]:
 
 def read_mask(mask: Any, name: str, shape: tuple[int, int]) -> Ints:
     """
-    A mask, of a file or an array, first row on top.
+    Read a mask from a file or an array, top row first.
 
     Parameters
     ----------
     mask : path or (n_y, n_x) array of integers
-        Of a file with a palette, its entries' numbers.
+        Files with a palette give the indices of its entries.
     name : str
-        For messages.
+        Name of the mask, for messages.
     shape : (n_y, n_x)
-        Of the picture.
+        Shape of the picture.
 
     Raises
     ------
     FileError, ParameterError
-        When it cannot be read, or is of another size.
+        When the mask cannot be read, or its shape differs.
     """
     if isinstance(mask, str | Path):
         name = str(mask)
@@ -247,58 +260,58 @@ def read_mask(mask: Any, name: str, shape: tuple[int, int]) -> Ints:
     if classes.dtype == np.bool_:
         classes = classes.astype(np.uint8)
     if classes.shape == shape and classes.dtype == np.uint64 and classes.max() > np.iinfo(np.int64).max:
-        raise ParameterError(name, "must be integers of 64 bits with a sign", int(classes.max()))
+        raise ParameterError(name, "must be signed 64-bit integers", int(classes.max()))
     if classes.shape != shape or classes.dtype.kind not in "iu":
         raise ParameterError(
-            name, f"must be integers of the picture's shape {shape}, got {classes.dtype} of {classes.shape}"
+            name, f"must be integers of the picture's shape {shape}, got {classes.dtype} of shape {classes.shape}"
         )
     return classes
 
 
 def _palette_numbers(path: Path) -> NDArray[Any] | None:
-    """Numbers of a picture with a palette; None of any other, which the usual reader takes or rejects."""
+    """Return the palette indices of a picture file, or None if it has no palette."""
     from PIL import Image
 
     try:
         with Image.open(path, formats=("PNG", "GIF", "BMP")) as image:
             return np.asarray(image) if image.mode == "P" else None
-    except Exception:  # noqa: BLE001 -- the usual reader tells what is wrong
+    except Exception:  # noqa: BLE001 -- read_picture reports the problem
         return None
 
 
 def read_flow(flow: Any, name: str, shape: tuple[int, int]) -> Floats:
     """
-    Optical flow, of a ``.npy`` file or an array, first row on top.
+    Read an optical flow from a ``.npy`` file or an array, top row first.
 
     Raises
     ------
     FileError, ParameterError
-        When it cannot be read, or is of another size.
+        When the flow cannot be read, or its shape differs.
     """
     if isinstance(flow, str | Path):
         name = str(flow)
         try:
             flow = np.load(flow, allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
-            raise FileError(name, f"is no array that can be read ({error})") from None
+            raise FileError(name, f"is not a readable array ({error})") from None
     moves = np.asarray(flow)
     if moves.shape != (*shape, 2) or moves.dtype.kind not in "iuf":
-        raise ParameterError(name, f"must be numbers of the shape {(*shape, 2)}, got {moves.dtype} of {moves.shape}")
+        raise ParameterError(name, f"must be numbers of shape {(*shape, 2)}, got {moves.dtype} of shape {moves.shape}")
     return moves
 
 
 def one_a_picture(name: str, given: Any, n: int) -> Sequence[Any]:
     """
-    A sequence that has something for every picture.
+    Return a sequence after checking that it has one item per picture.
 
     Raises
     ------
     ParameterError
-        When it is none, or of another length.
+        When the object is not a sequence, or has another length.
     """
     if isinstance(given, str | bytes) or not (hasattr(given, "__len__") and hasattr(given, "__getitem__")):
-        raise ParameterError(name, f"must be a sequence with one for each picture, got a {type(given).__name__}")
+        raise ParameterError(name, f"must be a sequence with one item per picture, got a {type(given).__name__}")
     if len(given) != n:
-        raise ParameterError(name, f"must have one for each of the {n} pictures, got {len(given)}")
+        raise ParameterError(name, f"must have one item for each of the {n} pictures, got {len(given)}")
     sequence: Sequence[Any] = given
     return sequence

@@ -1,4 +1,4 @@
-"""Pictures of a dataset, one at a time: of a folder, a zip file, an array, or anything that has a length and items."""
+"""Picture sources of a dataset: directories, zip files, arrays and sequences."""
 
 from __future__ import annotations
 
@@ -20,49 +20,49 @@ from foveasim.explore._files import digests
 
 __all__ = ["Source", "digest_of", "is_lazy", "source_of"]
 
-#: A packed picture that would unpack to more than this is rejected.
+#: Largest decompressed size of a picture, bytes.
 MAX_UNPACKED_BYTES = 2**30
 
 
 @runtime_checkable
 class Source(Protocol):
-    """Where pictures come from."""
+    """Sequence of pictures with names and optional classes."""
 
     def __len__(self) -> int: ...
 
     def name(self, k: int) -> str:
-        """What messages call a picture."""
+        """Return the name of a picture for messages."""
 
     def key(self, k: int) -> str:
-        """What files of labels call a picture: its name in the folder or the zip file, or its number."""
+        """Return the name of a picture in label files: relative path, or index."""
 
     def picture(self, k: int) -> NDArray[Any]:
-        """A picture as :func:`foveasim._io.images.read_picture` gives it, first row on top."""
+        """Read a picture as :func:`foveasim._io.images.read_picture`, top row first."""
 
     def labels(self) -> list[Any] | None:
-        """What the source itself says of every picture's class, or None."""
+        """Return the class of every picture if the source contains classes, else None."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data that tells the source from others, but what its pictures hold."""
+        """Return plain data that identifies the source, without the contents of its pictures."""
 
     @property
     def is_lazy(self) -> bool:
-        """Whether pictures are made when they are asked for, by whatever holds them."""
+        """Whether the items of the source may be computed on access."""
 
     def digest(self, k: int) -> str:
-        """What tells the content of a picture from others, without unpacking it."""
+        """Return a checksum of the contents of a picture, without decompressing it."""
 
 
 def source_of(pictures: Any) -> Source:
     """
-    Whatever holds pictures, as a source; a source as it is.
+    Create the source of the pictures of a dataset; return a source unchanged.
 
     Raises
     ------
     FileError
-        When there is no such file, or no picture in it.
+        When the file does not exist, or contains no pictures.
     ParameterError
-        When it is none of what a dataset takes.
+        When the type of ``pictures`` is not supported.
     """
     if isinstance(pictures, Source):
         return pictures
@@ -72,32 +72,32 @@ def source_of(pictures: Any) -> Source:
             if path.is_dir():
                 return _Folder(path)
             if not path.is_file():
-                raise FileError(path, "no such file or folder")
+                raise FileError(path, "no such file or directory")
         except OSError as error:
             raise _unreadable(error, path) from None
         if path.suffix.lower() == ".npy":
             return _ArrayFile(path)
         if zipfile.is_zipfile(path):
             return _Zip(path)
-        raise FileError(path, "must be a folder of pictures, a zip file of them, or an array (.npy)")
+        raise FileError(path, "must be a directory of pictures, a zip file of pictures, or an array (.npy)")
     if isinstance(pictures, np.ndarray):
         return _Array(pictures)
     if isinstance(pictures, Mapping) or not (hasattr(pictures, "__len__") and hasattr(pictures, "__getitem__")):
         kind = type(pictures).__name__
-        raise ParameterError("pictures", f"must be a folder, a zip file, an array, or a sequence, got a {kind}")
+        raise ParameterError("pictures", f"must be a directory, a zip file, an array, or a sequence, got a {kind}")
     return _Items(pictures)
 
 
 def is_lazy(items: Sequence[Any]) -> bool:
-    """Whether items may be made when they are asked for."""
+    """Return whether items of a sequence may be computed on access."""
     return not isinstance(items, list | tuple | np.ndarray)
 
 
 def digest_of(item: Any) -> str:
     """
-    SHA-256 of a file, or of an array, its type and its shape.
+    Compute the SHA-256 of a file, or of an array with its dtype and shape.
 
-    Empty where there is none, or none that can be read, which whoever reads it will tell.
+    The result is empty when the item cannot be read; its reader reports the error.
     """
     try:
         if isinstance(item, str | Path):
@@ -111,7 +111,7 @@ def digest_of(item: Any) -> str:
 
 
 class _Folder:
-    """Pictures of a folder and the folders in it, in the natural order of their names."""
+    """Pictures of a directory and its subdirectories, in natural order of their names."""
 
     is_lazy = False
 
@@ -120,7 +120,7 @@ class _Folder:
         found = (Path(place) / name for place, _, names in os.walk(folder, onerror=_stop) for name in names)
         self._names = picture_names(path.relative_to(folder).as_posix() for path in found)
         if not self._names:
-            raise FileError(folder, f"holds no pictures ({', '.join(PICTURE_ENDINGS)})")
+            raise FileError(folder, f"contains no pictures ({', '.join(PICTURE_ENDINGS)})")
 
     def __len__(self) -> int:
         return len(self._names)
@@ -145,7 +145,7 @@ class _Folder:
 
 
 class _Zip:
-    """Pictures of a zip file, which each process opens for itself."""
+    """Pictures of a zip file, which every process opens separately."""
 
     is_lazy = False
 
@@ -158,7 +158,7 @@ class _Zip:
             raise FileError(path, f"is corrupt ({error})") from None
         self._names = picture_names(names)
         if not self._names:
-            raise FileError(path, f"holds no pictures ({', '.join(PICTURE_ENDINGS)})")
+            raise FileError(path, f"contains no pictures ({', '.join(PICTURE_ENDINGS)})")
         self._opened: tuple[int, zipfile.ZipFile] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -176,10 +176,10 @@ class _Zip:
     def picture(self, k: int) -> NDArray[Any]:
         archive, name = self._archive(), self._names[k]
         if archive.getinfo(name).file_size > MAX_UNPACKED_BYTES:
-            raise FileError(self.name(k), f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
+            raise FileError(self.name(k), f"would decompress to more than {MAX_UNPACKED_BYTES} bytes")
         try:
             content = archive.read(name)
-        except Exception as error:  # noqa: BLE001 -- a broken member makes its reader trip over anything
+        except Exception as error:  # noqa: BLE001 -- corrupt members raise many kinds of errors
             raise FileError(self.name(k), f"is corrupt ({' '.join(str(error).split())})") from None
         with tempfile.TemporaryDirectory(prefix="foveasim-") as folder:
             file = Path(folder) / f"picture{PurePosixPath(name).suffix}"
@@ -193,7 +193,7 @@ class _Zip:
         return _folder_labels(self._names)
 
     def _archive(self) -> zipfile.ZipFile:
-        # A process that was forked shares its parent's place in the file.
+        # A forked process shares the file position of its parent.
         if self._opened is None or self._opened[0] != os.getpid():
             self._opened = os.getpid(), zipfile.ZipFile(self._path)
         return self._opened[1]
@@ -202,13 +202,13 @@ class _Zip:
         return {"kind": "zip", **_names_digest(self._names)}
 
     def digest(self, k: int) -> str:
-        # What is unpacked is checked against this sum.
+        # Decompressed data are checked against this CRC.
         item = self._archive().getinfo(self._names[k])
         return f"{item.file_size} bytes, {item.CRC:08x}"
 
 
 class _Array:
-    """Pictures (n, n_y, n_x) or (n, n_y, n_x, n_channel) in memory."""
+    """Array of pictures (n, n_y, n_x) or (n, n_y, n_x, n_channel) in memory."""
 
     is_lazy = False
 
@@ -239,7 +239,7 @@ class _Array:
 
 
 class _ArrayFile:
-    """Pictures in a file of one numpy array, of which each process reads what it needs."""
+    """Memory-mapped ``.npy`` file of pictures."""
 
     is_lazy = False
 
@@ -256,7 +256,7 @@ class _ArrayFile:
             try:
                 pictures = np.load(self._path, mmap_mode="r", allow_pickle=False)
             except (OSError, ValueError, EOFError) as error:
-                raise FileError(self._path, f"is no array that can be read ({error})") from None
+                raise FileError(self._path, f"is not a readable array ({error})") from None
             _check_stack(str(self._path), pictures)
             self._pictures = pictures
         return self._pictures
@@ -285,11 +285,11 @@ class _ArrayFile:
 
 
 class _Items:
-    """Files, arrays or Pillow's images, alone or in pairs with their classes, of anything that has a length and items."""
+    """Sequence of files, arrays or Pillow images, or of pairs of these with their classes."""
 
     def __init__(self, items: Sequence[Any]) -> None:
         if len(items) == 0:
-            raise ParameterError("pictures", "must hold at least one picture")
+            raise ParameterError("pictures", "must contain at least one picture")
         self._items = items
 
     def __len__(self) -> int:
@@ -308,7 +308,7 @@ class _Items:
         return item[0] if isinstance(item, tuple) else item
 
     def _listed(self, k: int) -> Any:
-        """The item of a list; None where it may be made when it is asked for."""
+        """Return an item of a list, or None if items may be computed on access."""
         return None if self.is_lazy else self._item(k)
 
     def picture(self, k: int) -> NDArray[Any]:
@@ -318,10 +318,8 @@ class _Items:
         if _is_image(item):
             try:
                 return pixels_of_image(item)
-            except Exception as error:  # noqa: BLE001 -- a broken image makes its reader trip over anything
-                raise FileError(
-                    self.name(k), f"is no image that can be read ({' '.join(str(error).split())})"
-                ) from None
+            except Exception as error:  # noqa: BLE001 -- corrupt images raise many kinds of errors
+                raise FileError(self.name(k), f"is not a readable image ({' '.join(str(error).split())})") from None
         try:
             return np.asarray(item)
         except ValueError:
@@ -333,7 +331,7 @@ class _Items:
             if all(is_pair):
                 return [item[1] for item in self._items]
             if any(isinstance(item, tuple) for item in self._items):
-                raise ParameterError("pictures", "must all be pairs (picture, label), or none of them")
+                raise ParameterError("pictures", "must all be pairs (picture, label), or all be pictures")
             return None
         targets = getattr(self._items, "targets", None)
         if targets is not None and len(targets) == len(self):
@@ -356,13 +354,13 @@ class _Items:
 
 
 def _is_image(item: Any) -> bool:
-    """Whether an item is one of Pillow's images; who has one has loaded Pillow."""
+    """Return whether an item is a Pillow image; without Pillow in use, none is."""
     pillow = sys.modules.get("PIL.Image")
     return pillow is not None and isinstance(item, pillow.Image)
 
 
 def _names_digest(names: Sequence[str]) -> dict[str, Any]:
-    """How many names there are, and a sum of them."""
+    """Return the number of names and their SHA-256."""
     return {"n": len(names), "sha256": hashlib.sha256("\n".join(names).encode()).hexdigest()}
 
 
@@ -371,7 +369,7 @@ def _unreadable(error: OSError, path: Path) -> FileError:
 
 
 def _stop(error: OSError) -> None:
-    """What a folder in a folder of pictures holds must not be missing unseen."""
+    """Raise errors of ``os.walk``, which would skip unreadable directories silently."""
     raise _unreadable(error, Path())
 
 
@@ -383,6 +381,6 @@ def _check_stack(name: str, pictures: NDArray[Any]) -> None:
 
 
 def _folder_labels(names: Sequence[str]) -> list[Any] | None:
-    """Names of the outermost folders that pictures are in; None when they are in none."""
+    """Return the top-level directory of each picture; None if a picture is in none."""
     folders = [PurePosixPath(name).parts[0] if "/" in name else None for name in names]
     return folders if all(folder is not None for folder in folders) else None

@@ -1,4 +1,4 @@
-"""A dataset in a YAML file: pictures, a shot, what is drawn, labels."""
+"""YAML files of datasets: pictures, shot, random settings and labels."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from foveasim.explore.sweeps.plan import telling
 
 __all__ = ["DatasetFile", "DatasetSection", "read_dataset"]
 
-#: What a file may say instead of distributions of its own.
+#: Values of the key ``recipe``.
 RECIPES: dict[str | None, Callable[..., Dataset]] = {
     None: Dataset,
     "classification": classification,
     "denoising": denoising,
 }
-#: Of a distribution, in the unit of its setting.
+#: Parameters of a distribution, in the unit of its setting.
 _Numbers = list[float]
-#: Keys that a dataset's call has too.
+#: Keys with the same name in :class:`Dataset`.
 SAME = ("cameras", "draws", "seed", "fields", "fit")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DatasetFile:
     """
-    A dataset with what its file says about it.
+    Dataset and storage options of a YAML file.
 
     Attributes
     ----------
     dataset : Dataset
     per_shard : int or None
-        Samples of a shard, where it says so.
+        Number of samples per shard, if the file specifies it.
     """
 
     dataset: Dataset
@@ -54,61 +54,61 @@ class DatasetFile:
 
 
 class _Distribution(BaseModel):
-    """What a setting is drawn from: one of these."""
+    """Distribution of a setting: exactly one kind."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     uniform: _Numbers | None = Field(None, description="[low, high]")
     log_uniform: _Numbers | None = Field(None, description="[low, high]")
-    integers: list[int] | None = Field(None, description="[low, high], both of them included")
+    integers: list[int] | None = Field(None, description="[low, high], both inclusive")
     normal: _Numbers | None = Field(None, description="[mean, standard deviation, low, high]")
-    choice: list[Any] | None = Field(None, description="values to choose from")
-    weights: _Numbers | None = Field(None, description="of a choice: its chances are in proportion to them")
+    choice: list[Any] | None = Field(None, description="list of values")
+    weights: _Numbers | None = Field(None, description="relative probabilities of the values of a choice")
 
 
 class DatasetSection(BaseModel):
-    """A dataset: pictures, a shot, what is drawn of its settings, how often, labels, shards."""
+    """Settings of a dataset: pictures, shot, distributions, labels and shards."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
-    pictures: str | list[str] = Field(description="a folder, a zip file, an array (.npy), or a list of files")
-    shot: str | dict[str, Any] = Field(description="a file beside this one, or the settings themselves")
-    set: dict[str, Any] = Field({}, description="settings to be replaced in all samples, by their paths")
+    pictures: str | list[str] = Field(description="directory, zip file, array (.npy) or list of files")
+    shot: str | dict[str, Any] = Field(description="settings file, relative to this file, or the settings")
+    set: dict[str, Any] = Field({}, description="settings that are replaced in all samples, by path")
     recipe: Literal["classification", "denoising"] | None = Field(
-        None, description="usual distributions and fields, beside those that are given"
+        None, description="default distributions and fields of a task"
     )
-    vary: dict[str, _Distribution] = Field({}, description="distributions by settings' paths")
-    cameras: int | None = Field(None, description="that each picture is taken with; 1 by default")
-    draws: int | None = Field(None, description="captures with each camera; 1 by default, and 4 for denoising")
+    vary: dict[str, _Distribution] = Field({}, description="distributions by setting path")
+    cameras: int | None = Field(None, description="random cameras per picture; 1 by default")
+    draws: int | None = Field(None, description="captures per camera; 1 by default, 4 for denoising")
     seed: int = 0
     fields: list[Literal["code", "electrons", "expected_e", "expected_dn"]] | None = Field(
-        None, description="what a sample has of each site; code and electrons by default, or those of the recipe"
+        None, description="quantities per site; by default code and electrons, or those of the recipe"
     )
-    fit: Literal["cover", "contain"] | None = Field(None, description="pictures of any size on the layout")
+    fit: Literal["cover", "contain"] | None = Field(None, description="scaling of the pictures to the layout")
     labels: str | list[int | str] | None = Field(
         None, description="a .csv file with the columns picture and label, an array (.npy), or a list"
     )
-    boxes: str | None = Field(None, description="a JSON file as COCO has it")
-    masks: str | None = Field(None, description="a folder with a .png, .bmp or .tif file of each picture's name")
-    flows: str | None = Field(None, description="a folder with a .npy file of each picture's name")
-    per_shard: int | None = Field(None, ge=1, description="samples of a shard")
+    boxes: str | None = Field(None, description="JSON file in COCO format")
+    masks: str | None = Field(None, description="directory with one .png, .bmp or .tif file per picture name")
+    flows: str | None = Field(None, description="directory with one .npy file per picture name")
+    per_shard: int | None = Field(None, ge=1, description="number of samples per shard")
 
 
 def read_dataset(path: str | Path, *, n_threads: int = 1) -> DatasetFile:
     """
-    Read a YAML file of a dataset, and make ready what it describes.
+    Read the YAML file of a dataset.
 
     Parameters
     ----------
     path : path
-        With the keys ``pictures`` (a folder, a zip file, an array, or a list of files), ``shot`` (a file beside it, or the
-        settings themselves), ``vary`` (distributions by settings' paths, as for :func:`parse_distribution`), ``recipe``
+        File with the keys ``pictures`` (a directory, zip file, array, or list of files), ``shot`` (a settings file, or the
+        settings), ``vary`` (distributions by setting path, as for :func:`parse_distribution`), ``recipe``
         (``classification`` or ``denoising``), ``cameras``, ``draws``, ``seed``, ``fields`` and ``fit`` (as for
         :class:`Dataset`), ``labels`` (a CSV file with the columns ``picture`` and ``label``, an array, or a list), ``boxes`` (a
-        JSON file as COCO has it), ``masks`` and ``flows`` (folders with a file of each picture's name), ``per_shard``, and
-        ``set`` (settings to be replaced in all samples). Files are looked for beside it; ``skimage:astronaut`` and its like are
-        the pictures that come with scikit-image. In files of labels, pictures have the names that they have in their folder,
-        and those of an array their numbers.
+        JSON file in COCO format), ``masks`` and ``flows`` (directories with one file per picture name), ``per_shard``, and
+        ``set`` (settings that are replaced in all samples). Paths are relative to the file; ``skimage:astronaut`` is an example
+        of a picture of scikit-image. Label files identify pictures by their names in the directory, or by their numbers in an
+        array.
     n_threads : int
-        That a sample is computed with.
+        Number of threads per sample.
 
     Returns
     -------
@@ -117,9 +117,9 @@ def read_dataset(path: str | Path, *, n_threads: int = 1) -> DatasetFile:
     Raises
     ------
     ConfigError
-        With the file, the place in it, what was expected and got.
+        When a setting is invalid; with the file, the key, the expected and the actual value.
     FileError
-        When pictures or labels cannot be read, or do not go together.
+        When pictures or labels cannot be read, or do not match.
     """
     path = Path(path)
     section: DatasetSection = validated(path, DatasetSection, read_yaml(path))
@@ -149,7 +149,7 @@ def _pictures(path: Path, pictures: str | list[str]) -> Source:
 
 
 def _labels(folder: Path, section: DatasetSection, pictures: Source) -> Mapping[str, Any]:
-    """What a dataset's call is given of labels."""
+    """Return the label arguments of :class:`Dataset`."""
     names = [pictures.key(k) for k in range(len(pictures))]
     found: dict[str, Any] = {}
     if isinstance(section.labels, str):
@@ -166,6 +166,6 @@ def _labels(folder: Path, section: DatasetSection, pictures: Source) -> Mapping[
 
 
 def _distribution(folder: Path, path: str, told: _Distribution) -> dict[str, Any]:
-    """A distribution as plain data, with the files that choices name beside the dataset's."""
+    """Return a distribution as plain data, with file choices relative to the dataset file."""
     given = told.model_dump(exclude_none=True)
     return {kind: files_from(folder, values, path) if kind == "choice" else values for kind, values in given.items()}

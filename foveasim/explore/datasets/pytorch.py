@@ -1,4 +1,4 @@
-"""Samples as tensors, for torch; torch is loaded when it is used."""
+"""PyTorch adapter for datasets; torch is imported on first use."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["torch_dataset"]
 
 
 class Samples(Protocol):
-    """What has a length, and mappings of arrays and numbers as items."""
+    """Sequence of samples: mappings of arrays and numbers."""
 
     def __len__(self) -> int: ...
 
@@ -24,24 +24,24 @@ class Samples(Protocol):
 
 def torch_dataset(dataset: Samples, transform: Callable[[dict[str, Any]], Any] | None = None) -> Any:
     """
-    A map-style ``torch.utils.data.Dataset`` whose samples have tensors instead of arrays.
+    Create a map-style ``torch.utils.data.Dataset`` with tensors instead of arrays.
 
     Parameters
     ----------
     dataset : Dataset or StoredSamples
-        Those need no torch, and ``DataLoader`` takes them as they are; this is for programs that ask for torch's own class.
+        ``DataLoader`` also accepts these directly; this adapter is for programs that require the class of torch.
     transform : callable, optional
-        What becomes of each sample; for workers it must be possible to pickle it.
+        Function that is applied to each sample. It must be picklable for worker processes.
 
     Returns
     -------
     torch.utils.data.Dataset
-        Codes of more than 8 bits as int32: torch has few operations for uint16.
+        Codes of more than 8 bits are int32: torch has few operations for uint16.
 
     Raises
     ------
     ParameterError
-        When torch is missing.
+        When torch is not installed.
 
     Examples
     --------
@@ -54,7 +54,7 @@ def torch_dataset(dataset: Samples, transform: Callable[[dict[str, Any]], Any] |
 
 @cache
 def _kind() -> Any:
-    """The class, made when torch is there."""
+    """Return the dataset class, which is defined on first use."""
     try:
         import torch  # type: ignore[import-not-found,unused-ignore]
     except ImportError:
@@ -66,13 +66,13 @@ def _kind() -> Any:
         return torch.from_numpy(value.astype(np.int32) if value.dtype == np.uint16 else value)
 
     class TorchDataSet(torch.utils.data.Dataset):  # type: ignore[misc,unused-ignore]
-        """Samples of another dataset with tensors instead of arrays."""
+        """Dataset with tensors instead of the arrays of another dataset."""
 
         def __init__(self, dataset: Samples, transform: Callable[[dict[str, Any]], Any] | None) -> None:
             self.dataset, self.transform = dataset, transform
 
         def __reduce__(self) -> tuple[Any, ...]:
-            # A class made in a function is not found by its name.
+            # Pickle cannot import a class that is defined in a function.
             return torch_dataset, (self.dataset, self.transform)
 
         def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""The datasets that the paper names: pictures as other cameras would take them, and noisy captures with their expectation."""
+"""Default datasets for classification and denoising."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from foveasim.explore.datasets.dataset import Dataset
 
 __all__ = ["classification", "denoising"]
 
-#: Devices to draw from: each has fixed patterns of its own.
+#: Range of random device seeds: each device has its own fixed-pattern noise.
 DEVICES = (0, 2**31 - 1)
-#: No lens in air is faster.
+#: Lower limit of the f-number of a lens in air.
 FASTEST = 0.5
 
 
@@ -30,23 +30,23 @@ def classification(
     **options: Any,
 ) -> Dataset:
     """
-    Every picture with its class through cameras drawn at random: what a classifier must not mind.
+    Create a dataset of labelled pictures captured by random cameras.
 
     Parameters
     ----------
     pictures, shot, cameras, seed
-        As for :class:`Dataset`. Classes are the names of the folders that pictures are in, or ``labels``.
+        As for :class:`Dataset`. Classes are the names of the directories of the pictures, or ``labels``.
     vary : mapping of str to distribution, optional
-        Instead of these, or beside them: the f-number from 1/1.5 to 3 times the shot's, the exposure from 1/8 to 4 times,
-        read noise from 0.5 to 20 e-, 0 to 2 % photo-response non-uniformity, 0 to 1 % offset patterns of pixels and of lines,
-        and any device.
+        Distributions that replace or extend the defaults: f-number from 1/1.5 to 3 times that of the shot (at least 0.5),
+        exposure time from 1/8 to 4 times, read noise from 0.5 to 20 e-, 0 to 2 % photo-response non-uniformity, 0 to 1 % pixel
+        and line fixed-pattern noise, and a random device seed.
     **options
-        Of :class:`Dataset`: ``labels``, ``boxes``, ``masks``, ``flows``, ``fit``, ``fields``, ``draws``, ...
+        Further parameters of :class:`Dataset`: ``labels``, ``boxes``, ``masks``, ``flows``, ``fit``, ``fields``, ``draws``, ...
 
     Returns
     -------
     Dataset
-        With the codes alone, unless ``fields`` says otherwise.
+        With the field ``code`` by default.
 
     Raises
     ------
@@ -78,23 +78,25 @@ def denoising(
     **options: Any,
 ) -> Dataset:
     """
-    Noisy captures and what they are noisy about: several draws of each picture and camera.
+    Create a dataset of noisy captures with their expectation as the target.
 
     Parameters
     ----------
     pictures, shot, draws, seed
         As for :class:`Dataset`.
     vary : mapping of str to distribution, optional
-        Instead of these, or beside them: the exposure from 1/32 of the shot's up to it, and read noise from 0.5 to 20 e-.
+        Distributions that replace or extend the defaults: exposure time from 1/32 to 1 times that of the shot, and read noise
+        from 0.5 to 20 e-.
     **options
-        Of :class:`Dataset`.
+        Further parameters of :class:`Dataset`.
 
     Returns
     -------
     Dataset
-        With the ``code`` and, as the target, ``expected_dn``: the mean of the code over all draws, computed and not averaged.
-        It has the fixed patterns of the device, which no draw differs in; give a shot without them for a target that has none.
-        Where codes are cut off at 0 the mean is above the light's; ``sensor.pedestal_v`` keeps noise about darkness.
+        With the fields ``code`` and, as the target, ``expected_dn``: the analytic mean of the code over temporal noise. The
+        target contains the fixed-pattern noise of the device, which is equal in all draws; use a shot without fixed patterns
+        for a target without them. Where codes clip at 0, the mean code is biased upwards; ``sensor.pedestal_v`` avoids
+        clipping of noise at zero irradiance.
 
     Raises
     ------
@@ -111,7 +113,7 @@ def denoising(
 
 
 def _numbers(shot: str | Path | Mapping[str, Any], options: Mapping[str, Any], *paths: str) -> list[float]:
-    """Numbers among the shot's settings, with the changes among a dataset's options."""
+    """Return numbers of the shot settings, after the ``changes`` of the dataset options."""
     file = Path(options.get("source", "settings")) if isinstance(shot, Mapping) else Path(shot)
     data = deepcopy(dict(shot)) if isinstance(shot, Mapping) else read_settings(file)
     for path, value in (options.get("changes") or {}).items():

@@ -1,4 +1,4 @@
-"""Datasets as files: shard by shard, each written whole, by as many processes as one likes, and gone on with after any end."""
+"""Storage of datasets in shards, written atomically and in parallel, and resumable."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ __all__ = ["StoredSamples", "open_dataset", "write_dataset"]
 
 FORMAT, VERSION = "foveasim dataset", 2
 ZARR, ABOUT = ".zarr", "dataset.json"
-#: Bytes of the samples of a shard, about, and how many they are at most: one process has them in memory.
+#: Default size of a shard: approximate bytes and largest number of samples. One process has a shard in memory.
 SHARD_BYTES, LARGEST_SHARD = 1 << 26, 512
-#: Shards of a dataset, at least, so that many processes can write it and little is lost with one.
+#: Smallest default number of shards: many processes can write, and an interruption loses little.
 FEWEST_SHARDS = 32
-#: Shards of a zarr folder that a process keeps when it reads: those met last.
+#: Number of shards of a zarr store that a reading process caches, the most recently used.
 KEPT_SHARDS = 4
-#: Name of the array that tells which shards are done and of what they were made, and of the group of what was drawn.
+#: Names of the array with the digest of each complete shard, and of the group of random settings.
 DONE, SETTINGS = "done", "settings"
-#: First member of a tar file, which tells of what it was made; WebDataset passes over such names.
+#: First member of a tar file, with the digest of its inputs; WebDataset skips such names.
 MADE_OF = "__made_of__"
 #: Bytes of a SHA-256.
 DIGEST_BYTES = 32
-#: What takes longer than this in one process is worth others, which take seconds to start.
+#: Remaining time in one process above which worker processes are started, seconds; their start takes seconds.
 ALONE_S = 10.0
 NEEDS_ZARR = needs("zarr", "explore")
 
-#: Told how many samples are written, of how many.
+#: Function of the number of written samples and the total number.
 Progress = Callable[[int, int], None]
 
 
@@ -59,48 +59,49 @@ def write_dataset(
     progress: Progress | None = None,
 ) -> StoredSamples:
     """
-    Simulate all samples and write them, or go on where this was ended.
+    Simulate and write all samples, or resume an interrupted call.
 
     Parameters
     ----------
     dataset : Dataset
     path : path
-        ``.zarr``: a zarr folder with an array for each part of the samples, and a chunk of it for each shard. Without an
-        ending: a folder of tar files ``shard-000000.tar`` ..., as WebDataset reads them, with the arrays (``.npz``), the rest
-        (``.json``) and, where there are labels, the class (``.cls``) of each sample. Arrays of all samples are read faster from
-        zarr, and single samples in any order from tar files, of which only they are read.
+        ``.zarr``: zarr store with an array for each item of the samples, chunked by shard. Without an extension: directory of
+        tar files ``shard-000000.tar`` ... in the format of WebDataset, with the arrays (``.npz``), the other items (``.json``)
+        and, with labels, the class (``.cls``) of each sample. Zarr is faster for arrays of all samples; tar files are faster
+        for random access to single samples, which are read individually.
     per_shard : int, optional
-        Samples of a shard; by default about 64 MiB of them, and a 32nd of all at most.
+        Number of samples per shard; by default about 64 MiB, at most 512 samples and at most 1/32 of the dataset.
     workers : int, optional
-        Processes. They import the calling program's main file: keep the call under ``if __name__ == "__main__":``. None: one a
-        core, as soon as what is left would take this process alone more than some seconds.
+        Number of processes. They import the main file of the calling program: call this function under
+        ``if __name__ == "__main__":``. None: one process per core, as soon as the estimated remaining time in this process
+        exceeds 10 s.
     scheduler : str, optional
-        Address of a dask scheduler instead, such as ``"tcp://10.0.0.1:8786"``, whose workers have this package and see the
-        pictures and the path under the same names.
+        Address of a dask scheduler instead, such as ``"tcp://10.0.0.1:8786"``. Its workers need this package, and access to
+        the pictures and ``path`` under the same names.
     progress : callable, optional
-        Called with the numbers of samples that are written and of all.
+        Called with the number of written samples and the total number.
 
     Returns
     -------
     StoredSamples
-        The same, bit for bit, with any number of workers and after any number of ends.
+        Bit-identical for any number of workers and after any interruption.
 
     Raises
     ------
     FileError
-        When the ending is none of these, something else is there, a picture cannot be read, or nothing can be written: the disk
-        is full, say. Shards that are done stay, and the same call goes on from there, unless the pictures, masks or flows that
-        they were made of hold something else now.
+        When the extension is not supported, the path contains other data, a picture cannot be read, or writing fails, for
+        example on a full disk. Complete shards remain, and the same call resumes, unless the pictures, masks or flows of
+        complete shards have changed.
     ParameterError
-        When the photosites differ from sample to sample, which only tar files can hold; when no scheduler answers.
+        When samples have different layouts, which only tar files support, or no scheduler answers.
     SimulationError
-        When a sample's camera cannot be made, a process ends again and again, the scheduler is gone, or pictures cannot be sent
-        to other processes.
+        When the camera of a sample cannot be built, a process ends repeatedly, the scheduler is lost, or pictures cannot be
+        sent to other processes.
 
     Warns
     -----
     FoveasimWarning
-        Once, when samples had warnings: ``warning`` tells each.
+        Once, when samples have warnings; the item ``warning`` of a sample contains its own.
     """
     target = Path(path).absolute()
     workers = None if workers is None else check_count("workers", workers, at_most=1024)
@@ -110,14 +111,14 @@ def write_dataset(
     if kind is _ZarrShards:
         if dataset.is_layout_varied:
             raise ParameterError(
-                "layout", "must not vary in a zarr folder, whose arrays have one length; take a folder of tar files"
+                "layout", "must not vary in a zarr store, whose arrays have one length; use a directory of tar files"
             )
         _zarr(target)
     plan = json.loads(json.dumps(dataset.to_dict()))
-    about = _about_of(target) if os.path.exists(target) else None  # noqa: PTH110 -- also where it must not be looked for
+    about = _about_of(target) if os.path.exists(target) else None  # noqa: PTH110 -- False, not an error, without permission
     if about is None:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the shard of the first sample tells them
+            warnings.simplefilter("ignore")  # reported with the shard of the first sample
             first = dataset[0]
         n_bytes = max(1, sum(value.nbytes for value in first.values() if isinstance(value, np.ndarray)))
         about = {
@@ -142,14 +143,14 @@ def _check_same(target: Path, about: Mapping[str, Any], plan: Mapping[str, Any],
         different = "per_shard"
     if different is not None:
         raise FileError(
-            target, f"is another dataset: its {different!r} differs; write this one elsewhere, or remove that one"
+            target, f"is another dataset: its {different!r} differs; use another path, or remove the existing dataset"
         )
 
 
 def _write_shards(
     dataset: Dataset, shards: _Shards, scheduler: str | None, workers: int | None, progress: Progress | None
 ) -> None:
-    """Write all shards that are not done, when those that are done are of the same pictures."""
+    """Write missing shards, after a check that the inputs of complete shards are unchanged."""
     left = []
     for k in range(shards.n_shards):
         made_of = shards.made_of(k)
@@ -159,8 +160,8 @@ def _write_shards(
             samples = shards.samples(k)
             raise FileError(
                 shards.folder,
-                f"is of other pictures, masks or flows: those of its samples {samples[0]} to {samples[-1]} hold something "
-                "else now; write this dataset elsewhere, or remove that one",
+                f"is of other pictures, masks or flows: those of samples {samples[0]} to {samples[-1]} have changed; use "
+                "another path, or remove the existing dataset",
             )
     n, n_done = shards.n_samples, shards.n_samples - sum(len(shards.samples(k)) for k in left)
     told: list[str] = []
@@ -183,7 +184,7 @@ def _write_shards(
 def _written(
     dataset: Dataset, shards: _Shards, left: Sequence[int], scheduler: str | None, workers: int | None
 ) -> Generator[tuple[int, list[str]], None, None]:
-    """Shards as they are written, with the warnings of their samples."""
+    """Write shards, and yield each with the warnings of its samples."""
     write = _ShardWriter(dataset, shards)
     begun_s = time.monotonic()
     n_done = 0
@@ -202,14 +203,14 @@ def _written(
         for k, own in run(left[n_done:], ()):
             if own is KILLED:
                 raise SimulationError(
-                    f"a process that wrote shard {k} ended each time, by too little memory or a crash; done shards stay, and "
-                    "the same call goes on from there"
+                    f"the process that wrote shard {k} ended in every attempt: out of memory, or a crash; complete shards "
+                    "remain, and the same call resumes"
                 )
             yield k, own
 
 
 class _ShardWriter:
-    """Simulates the samples of a shard and writes it, and gives their warnings."""
+    """Function that simulates and writes a shard, and returns the warnings of its samples."""
 
     def __init__(self, dataset: Dataset, shards: _Shards) -> None:
         self._dataset, self._shards = dataset, shards
@@ -217,14 +218,14 @@ class _ShardWriter:
     def __call__(self, k: int) -> list[str]:
         made_of = self._dataset.digest(self._shards.samples(k))
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # they are reported at the end, together
+            warnings.simplefilter("ignore")  # summarised at the end
             samples = [self._dataset[index] for index in self._shards.samples(k)]
         try:
             self._shards.write(k, samples, made_of)
         except OSError as error:
             raise FileError(
                 self._shards.folder,
-                f"cannot be written: {error.strerror or error}; done shards stay, and the same call goes on from there",
+                f"cannot be written: {error.strerror or error}; complete shards remain, and the same call resumes",
             ) from None
         return [f"sample {sample['index']}: {sample['warning']}" for sample in samples if sample["warning"]]
 
@@ -234,15 +235,15 @@ class _ShardWriter:
 
 class StoredSamples:
     """
-    Samples in files: the same mappings, bit for bit, as those of the :class:`Dataset` that was written.
+    Stored samples, bit-identical to those of the written :class:`Dataset`.
 
-    Has a length and items, and so is a map-style dataset too.
+    The class is a map-style dataset too, with ``__len__`` and ``__getitem__``.
 
     Attributes
     ----------
     path : Path
     about : mapping
-        Settings, distributions, seed, names of the classes, versions.
+        Settings, distributions, seed, class names and versions.
     """
 
     def __init__(self, path: Path, about: Mapping[str, Any]) -> None:
@@ -257,63 +258,63 @@ class StoredSamples:
         return self._shards.n_samples
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        """Samples, one after the other."""
+        """Iterate over all samples."""
         return (self[index] for index in range(len(self)))
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         """
-        A sample.
+        Read a sample.
 
         Raises
         ------
         IndexError
-            When there is none of this number.
+            When the index is out of range.
         FileError
-            When its shard is broken.
+            When the shard of the sample is corrupt.
         """
         place = operator.index(index)
         if not -len(self) <= place < len(self):
-            raise IndexError(f"there are {len(self)} samples, and none of the number {place}")
+            raise IndexError(f"sample index {place} is out of range for {len(self)} samples")
         place %= len(self)
         try:
             return self._shards.read(place)
-        except Exception as error:  # noqa: BLE001 -- a broken shard makes its readers trip over anything
-            raise FileError(self.path, f"has a broken sample {place} ({' '.join(str(error).split())})") from None
+        except Exception as error:  # noqa: BLE001 -- corrupt shards raise many kinds of errors
+            raise FileError(self.path, f"has a corrupt sample {place} ({' '.join(str(error).split())})") from None
 
     @property
     def class_names(self) -> list[str] | None:
-        """Names of the classes that labels number, where they have some."""
+        """Names of the classes by label, or None."""
         names: list[str] | None = self.about["class_names"]
         return names
 
 
 def open_dataset(path: str | Path) -> StoredSamples:
     """
-    Open what :func:`write_dataset` wrote; samples are read as they are asked for.
+    Open a dataset of :func:`write_dataset`; samples are read on access.
 
     Raises
     ------
     FileError
-        When there is none, it is corrupt, or not all shards are done.
+        When the dataset does not exist, is corrupt, or is incomplete.
     """
     source = Path(path).absolute()
     try:
         if not source.is_dir():
-            raise FileError(source, "is not a folder" if source.exists() else "no such folder")
+            raise FileError(source, "is not a directory" if source.exists() else "no such directory")
     except OSError as error:
         raise FileError(source, f"cannot be read: {error.strerror or error}") from None
     if source.suffix.lower() == ZARR:
         _zarr(source)
     stored = StoredSamples(source, _about_of(source))
-    shards = stored._shards  # noqa: SLF001 -- its own
+    shards = stored._shards  # noqa: SLF001 -- same module
     n_done = sum(shards.is_done(k) for k in range(shards.n_shards))
     if n_done < shards.n_shards:
-        raise FileError(source, f"has {n_done} of {shards.n_shards} shards; write the same dataset there to go on")
+        raise FileError(source, f"has {n_done} of {shards.n_shards} shards; write the same dataset again to resume")
     return stored
 
 
 def _about_of(target: Path) -> dict[str, Any]:
-    """What a folder says of its dataset."""
+    """Read the description of a stored dataset."""
     is_zarr = target.suffix.lower() == ZARR
     file = target / ("zarr.json" if is_zarr else ABOUT)
     about: Any = None
@@ -323,7 +324,7 @@ def _about_of(target: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError):
         pass
     if not isinstance(about, dict) or about.get("format") != FORMAT:
-        raise FileError(target, "holds something else than a dataset")
+        raise FileError(target, "is not a dataset of foveasim; use another path")
     if about.get("version") != VERSION:
         raise FileError(target, f"has the format version {about.get('version')}, expected {VERSION}")
     return about
@@ -333,7 +334,7 @@ def _kind_of(target: Path) -> type[_Shards]:
     if target.suffix.lower() == ZARR:
         return _ZarrShards
     if target.suffix:
-        raise FileError(target, "must end in .zarr, or have no ending, for a folder of tar files")
+        raise FileError(target, "must have the extension .zarr, or none for a directory of tar files")
     return _TarShards
 
 
@@ -349,7 +350,7 @@ def _zarr(path: Path) -> Any:
 
 
 class _Shards:
-    """Samples in a folder, so many in each shard."""
+    """Base class of stored shards with a fixed number of samples each."""
 
     def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
         self.folder = folder
@@ -359,19 +360,19 @@ class _Shards:
 
     @staticmethod
     def begin(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:
-        """Make the folder for samples like the first."""
+        """Create the store for samples with the items, types and shapes of the first."""
         raise NotImplementedError
 
     def samples(self, k: int) -> range:
-        """Numbers of a shard's samples."""
+        """Return the indices of the samples of a shard."""
         return range(k * self.per_shard, min((k + 1) * self.per_shard, self.n_samples))
 
     def is_done(self, k: int) -> bool:
-        """Whether a shard is there."""
+        """Return whether a shard is complete."""
         return self.made_of(k) != ""
 
     def made_of(self, k: int) -> str:
-        """The digest that a shard was written with; empty when it is not there, or broken."""
+        """Return the digest of the inputs of a shard; empty when it is missing or corrupt."""
         raise NotImplementedError
 
     def write(self, k: int, samples: Sequence[Mapping[str, Any]], made_of: str) -> None:
@@ -379,12 +380,12 @@ class _Shards:
         raise NotImplementedError
 
     def read(self, index: int) -> dict[str, Any]:
-        """A sample."""
+        """Read a sample."""
         raise NotImplementedError
 
 
 class _TarShards(_Shards):
-    """A tar file a shard: it is there when it is whole."""
+    """Shards as tar files, which exist only when complete."""
 
     def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
         super().__init__(folder, about)
@@ -394,7 +395,7 @@ class _TarShards(_Shards):
         return self.__dict__ | {"_places": {}}
 
     @staticmethod
-    def begin(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:  # noqa: ARG004 -- for all kinds alike
+    def begin(target: Path, about: Mapping[str, Any], dataset: Dataset, first: Mapping[str, Any]) -> None:  # noqa: ARG004 -- common signature
         with atomic_directory(target, is_ours=lambda _: False) as new:
             (new / ABOUT).write_text(json.dumps(about, indent=1), encoding="utf-8")
             if not dataset.is_layout_varied:
@@ -457,7 +458,7 @@ def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
 
 
 class _ZarrShards(_Shards):
-    """A chunk of each array a shard, and a mark behind them all when they are written."""
+    """Shards as chunks of zarr arrays, with a digest that is written after all chunks."""
 
     def __init__(self, folder: Path, about: Mapping[str, Any]) -> None:
         super().__init__(folder, about)
@@ -496,7 +497,7 @@ class _ZarrShards(_Shards):
             for name in ("xy_um", "ring_offsets", "site_offsets"):
                 group.create_array(f"layout/{name}", data=np.asarray(getattr(layout, name)))
             group.create_array("layout/filter_of_site", data=np.asarray(dataset.shot(0).camera.sensor.filter_of_site))
-            # With this the folder is a dataset.
+            # Last, because these attributes identify the directory as a dataset.
             group.attrs.update(about)
 
     def _arrays(self) -> dict[str, Any]:
@@ -511,7 +512,7 @@ class _ZarrShards(_Shards):
     def made_of(self, k: int) -> str:
         try:
             mark = np.asarray(self._arrays()[DONE][k], np.uint8)
-        except Exception:  # noqa: BLE001 -- a mark that was cut off is none
+        except Exception:  # noqa: BLE001 -- a truncated digest counts as missing
             return ""
         return mark.tobytes().hex() if mark.any() else ""
 
@@ -539,7 +540,7 @@ class _ZarrShards(_Shards):
         return sample
 
     def _rows(self, k: int) -> dict[str, NDArray[Any]]:
-        """All of a shard: a chunk is unpacked as a whole, and so is kept for its other samples."""
+        """Read all samples of a shard, which are cached: a chunk is decompressed completely."""
         if k not in self._read:
             place = slice(self.samples(k).start, self.samples(k).stop)
             rows = {name: np.asarray(array[place]) for name, array in self._arrays().items() if name != DONE}
@@ -550,6 +551,6 @@ class _ZarrShards(_Shards):
 
 
 def _flat(sample: Mapping[str, Any]) -> dict[str, NDArray[Any] | int | float | str]:
-    """A sample with what was drawn as parts of their own."""
+    """Return a sample with its random settings as separate items."""
     own = {f"{SETTINGS}/{path}": value for path, value in sample[SETTINGS].items()}
     return {name: value for name, value in sample.items() if name != SETTINGS} | own

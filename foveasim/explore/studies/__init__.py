@@ -1,1 +1,1 @@
-"""Studies: search for the best settings."""
+"""Studies: optimisation of settings."""

@@ -1,4 +1,4 @@
-"""What a study does: a shot, where its settings are searched, what is best, within which limits; and each trial's settings."""
+"""Plans of studies: search ranges, objectives, constraints, and settings of a trial."""
 
 from __future__ import annotations
 
@@ -24,44 +24,44 @@ if TYPE_CHECKING:
 
 __all__ = ["Limits", "Search", "StudyPlan", "StudySection", "plan_study", "read_study"]
 
-#: Where a setting is searched: numbers from one to another, the same with steps or spacing, or a list of choices.
+#: Search range of a setting: (low, high), a mapping with step or spacing, or a list of choices.
 Search = tuple[float, float] | Mapping[str, Any] | Sequence[Any]
-#: Lowest and highest value of results, either of them None.
+#: Lowest and highest value of results by name; either may be None.
 Limits = Mapping[str, tuple[float | None, float | None]]
-#: A value of any setting or result, in its unit; and what a file has as limits.
+#: Value of a setting or result, in its unit; and limits in a file.
 _Number = int | float
 _Limit = tuple[float | None, float | None]
-#: Keys of a range that is a mapping.
+#: Keys of a range mapping.
 RANGE_KEYS = {"from", "to", "step", "spacing"}
-#: Parts of a sweep's plan that a study does not have.
+#: Items of a sweep plan that do not apply to studies.
 NOT_OF_STUDIES = {"vary", "mode", "repeats"}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StudyPlan:
     """
-    A study before it runs.
+    Validated plan of a study.
 
     Attributes
     ----------
     base : Plan
-        Settings, seed, metrics and files, as a sweep has them.
+        Settings, seed, metrics and files, as in the plan of a sweep.
     search : mapping of str to range
-        By the settings' paths.
+        Search ranges by setting path.
     objectives : mapping of str to {"maximize", "minimize"}
-        By the names of results.
+        Directions by name of the result.
     constraints : mapping of str to (low, high)
-        Limits of results, either of them None.
+        Limits by name of the result; either limit may be None.
     n_trials : int
-        Trials that the study has at its end.
+        Total number of trials, including those of earlier runs.
     batch : int
-        Trials that are sampled together.
+        Number of trials that are sampled together.
     name : str
-        Of the study in its storage.
+        Name of the study in its storage.
     folder : Path
-        Where files that choices name are looked for.
+        Directory for relative file paths in choices.
     files : mapping of str to str
-        SHA-256 of the files that settings and choices name.
+        SHA-256 of the files that settings and choices reference.
     """
 
     base: Plan
@@ -75,7 +75,7 @@ class StudyPlan:
     files: Mapping[str, str]
 
     def settings_of(self, trial: optuna.Trial) -> dict[str, Any]:
-        """All settings of a trial, with the study's seed: what differs between trials is settings, and not noise."""
+        """Return all settings of a trial; the seed, and so the noise, is equal in all trials."""
         settings = json.loads(json.dumps(dict(self.base.settings))) | {"seed": self.base.seed}
         for path, where in self.search.items():
             value = files_from(self.folder, _suggested(trial, path, where), path)
@@ -83,7 +83,7 @@ class StudyPlan:
         return dict(settings)
 
     def to_dict(self) -> dict[str, Any]:
-        """All that trials depend on, as plain data: a study goes on where it equals."""
+        """Return everything that determines the trials as plain data; resuming requires equality."""
         base = {key: value for key, value in self.base.to_dict().items() if key not in NOT_OF_STUDIES}
         return base | {
             "files": dict(self.files),
@@ -95,63 +95,67 @@ class StudyPlan:
 
 
 class _SearchRange(BaseModel):
-    """From a number to another: integers where the setting takes no others."""
+    """Search range; integers where the setting accepts only integers."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     low: _Number = Field(alias="from")
     high: _Number = Field(alias="to")
-    step: _Number | None = Field(None, description="of the numbers; any between by default")
-    spacing: Literal["linear", "geometric"] | None = Field(None, description="linear by default; not beside a step")
+    step: _Number | None = Field(None, description="step of the values; continuous by default")
+    spacing: Literal["linear", "geometric"] | None = Field(None, description="linear by default; excludes step")
 
 
 class StudySection(BaseModel):
-    """A study: a shot, where its settings are searched, objectives, constraints, number of trials, seed, names of metrics."""
+    """Settings of a study: shot, search ranges, objectives, constraints and trials."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
-    shot: str | dict[str, Any] = Field(description="a file beside this one, or the settings themselves")
-    set: dict[str, Any] = Field({}, description="settings to be replaced in all trials, by their paths")
-    search: dict[str, _SearchRange | list[Any]] = Field(description="ranges or lists of choices, by settings' paths")
-    objectives: dict[str, Literal["maximize", "minimize"]] = Field(description="by the names of results")
-    constraints: dict[str, _Limit] = Field({}, description="[low, high] by the names of results, either of them null")
-    trials: int = Field(ge=1, le=MAX_POINTS, description="that the study has at its end")
+    shot: str | dict[str, Any] = Field(description="settings file, relative to this file, or the settings")
+    set: dict[str, Any] = Field({}, description="settings that are replaced in all trials, by path")
+    search: dict[str, _SearchRange | list[Any]] = Field(description="ranges or lists of choices, by setting path")
+    objectives: dict[str, Literal["maximize", "minimize"]] = Field(description="directions by name of the result")
+    constraints: dict[str, _Limit] = Field({}, description="[low, high] by name of the result; either may be null")
+    trials: int = Field(ge=1, le=MAX_POINTS, description="total number of trials")
     batch: int = Field(
-        1, ge=1, le=MAX_POINTS, description="trials that are sampled together; trials is a multiple of it"
+        1, ge=1, le=MAX_POINTS, description="trials that are sampled together; trials must be a multiple of it"
     )
     seed: int = 0
-    metrics: list[str] | None = Field(None, description="by default those that give the objectives and constraints")
-    name: str = Field("study", min_length=1, description="of the study in its storage")
+    metrics: list[str] | None = Field(None, description="by default those of the objectives and constraints")
+    name: str = Field("study", min_length=1, description="name of the study in its storage")
 
 
 def read_study(path: str | Path, *, metrics: Sequence[str] = (), n_trials: int | None = None) -> StudyPlan:
     """
-    Read a YAML file of a study.
+    Read the YAML file of a study.
 
     Parameters
     ----------
     path : path
-        With the keys ``shot`` (a file beside it, or the settings themselves), ``search`` (settings' paths to
-        ``{from: 2, to: 16, step: 2}``, to ``{from: 0.5, to: 4, spacing: geometric}``, or to a list of choices; of settings that
-        are integers only such are tried), ``objectives`` (results' names to ``maximize`` or
-        ``minimize``), ``trials``, ``batch``, ``constraints`` (results' names to ``[low, high]``, either of them ``null``),
-        ``seed``, ``metrics``, ``name``, and ``set`` (settings to be replaced in all trials). The file names metrics of
-        :data:`METRICS` only: a file never makes the program import code.
+        File with the keys ``shot`` (a settings file, or the settings), ``search`` (setting paths to
+        ``{from: 2, to: 16, step: 2}``, to ``{from: 0.5, to: 4, spacing: geometric}``, or to a list of choices; integer settings
+        are searched among integers), ``objectives`` (names of results to ``maximize`` or ``minimize``), ``trials``, ``batch``,
+        ``constraints`` (names of results to ``[low, high]``, either may be ``null``), ``seed``, ``metrics``, ``name``, and
+        ``set`` (settings that are replaced in all trials). Metrics in the file must be names in :data:`METRICS`, so that
+        reading a file never imports code.
     metrics : sequence of str
-        More metrics: names, or ``module:function``, which is imported.
+        Further metrics: names, or ``module:function``, which is imported.
     n_trials : int, optional
-        Instead of the file's.
+        Number of trials instead of that of the file.
+
+    Returns
+    -------
+    StudyPlan
 
     Raises
     ------
     ConfigError
-        With the file, the place in it, what was expected and got.
+        When a setting is invalid; with the file, the key, the expected and the actual value.
     ParameterError
-        When there is no such metric.
+        When a metric does not exist.
     """
     path = Path(path)
     section: StudySection = validated(path, StudySection, read_yaml(path))
     source, shot = shot_of(path, section.shot)
     with telling(path):
-        # The names that the file gives are looked up in METRICS, and never imported.
+        # Names in the file are looked up in METRICS, and never imported.
         named = _wanted([*section.objectives, *section.constraints], section.metrics)
     wanted = with_more_metrics(named, metrics)
     if n_trials is not None:
@@ -192,7 +196,7 @@ def plan_study(
     folder: str | Path = ".",
 ) -> StudyPlan:
     """
-    Plan a study, and check all that can be checked without building anything.
+    Create the plan of a study, with all checks that do not require building a camera.
 
     Parameters
     ----------
@@ -201,28 +205,32 @@ def plan_study(
     search, objectives, n_trials, constraints, metrics, seed, batch, name
         As for :func:`study`.
     folder : path
-        Where files that choices name are looked for.
+        Directory for relative file paths in choices.
+
+    Returns
+    -------
+    StudyPlan
 
     Raises
     ------
     ParameterError, ConfigError
-        When a path, a range or a name is none.
+        When a path, a range or a name is invalid.
     """
     n_trials = check_count("n_trials", n_trials, at_most=MAX_POINTS)
     batch = check_count("batch", batch, at_most=MAX_POINTS)
     if n_trials % batch:
-        raise ParameterError("n_trials", f"must be a multiple of the batch of {batch}", n_trials)
+        raise ParameterError("n_trials", f"must be a multiple of the batch size {batch}", n_trials)
     if not isinstance(name, str) or not name:
-        raise ParameterError("name", "must be a text, and not empty", name)
+        raise ParameterError("name", "must be a non-empty string", name)
     constraints = dict(constraints or {})
     _check_names(objectives, constraints)
     wanted = _wanted([*objectives, *constraints], metrics)
     for place, names in (("objectives", objectives), ("constraints", constraints)):
         _check_given(place, names, METRICS if metrics is None else wanted)
     if not isinstance(search, Mapping) or not search:
-        raise ParameterError("search", "must be ranges by settings' paths: nothing is searched", search)
+        raise ParameterError("search", "must be a non-empty mapping of setting paths to ranges", search)
     if "seed" in search:
-        raise ParameterError("seed", "cannot be searched: the noise of all trials is the same")
+        raise ParameterError("seed", "must not be searched: the noise is equal in all trials")
     plans = [
         plan_sweep(
             shot,
@@ -251,7 +259,7 @@ def plan_study(
 
 
 def _wanted(names: Sequence[str], metrics: Any) -> dict[str, Metric]:
-    """The metrics that are given; where none are, those that give the results, by their names."""
+    """Return the given metrics, or by default those with the named results."""
     if metrics is not None:
         return named_metrics(metrics)
     return {own: METRICS[own] for own in METRICS if any(gives(own, name) for name in names)}
@@ -262,15 +270,15 @@ def _check_given(place: str, names: Iterable[str], metrics: Iterable[str]) -> No
         if not any(gives(own, name) for own in metrics):
             raise ParameterError(
                 place,
-                f"must be results of metrics ({', '.join(metrics)}), or of 'metrics' that are given",
+                f"must be results of metrics ({', '.join(metrics)}), or of those in 'metrics'",
                 name,
-                hint="functions of your own are given in Python, or with --metric module:function",
+                hint="pass other functions in Python, or with --metric module:function",
             )
 
 
 def _check_names(objectives: Mapping[str, str], constraints: Limits) -> None:
     if not isinstance(objectives, Mapping) or not objectives:
-        raise ParameterError("objectives", 'must be names of results with "maximize" or "minimize"', objectives)
+        raise ParameterError("objectives", 'must map names of results to "maximize" or "minimize"', objectives)
     for name, way in objectives.items():
         if way not in ("maximize", "minimize"):
             raise ParameterError(str(name), 'must be "maximize" or "minimize"', way)
@@ -281,38 +289,38 @@ def _check_names(objectives: Mapping[str, str], constraints: Limits) -> None:
             or all(limit is None for limit in limits)
             or not all(limit is None or _is_number(limit) for limit in limits)
         ):
-            raise ParameterError(str(name), "must have limits (low, high), one of which may be None", limits)
+            raise ParameterError(str(name), "must have limits (low, high), of which one may be None", limits)
         low, high = limits
         if low is not None and high is not None and low > high:
-            raise ParameterError(str(name), "must have limits (low, high), the first no larger than the second", limits)
+            raise ParameterError(str(name), "must have limits (low, high) with low <= high", limits)
 
 
 def _ends(path: str, where: Search) -> list[Any]:
-    """Values at the ends of a range, or all choices."""
+    """Return the bounds of a range, or all choices."""
     if isinstance(where, Mapping):
         if set(where) - RANGE_KEYS or not {"from", "to"} <= set(where) or {"step", "spacing"} <= set(where):
-            raise ParameterError(path, "must have 'from' and 'to', and may have 'step' or 'spacing'", dict(where))
+            raise ParameterError(path, "must have 'from' and 'to', and optionally 'step' or 'spacing'", dict(where))
         if where.get("spacing", "linear") not in ("linear", "geometric"):
-            raise ParameterError(path, "must have a spacing that is linear or geometric", where["spacing"])
+            raise ParameterError(path, "must have a linear or geometric spacing", where["spacing"])
         ends = [where["from"], where["to"]]
     elif isinstance(where, tuple):
         ends = list(where)
     elif isinstance(where, list) and where:
         return where
     else:
-        raise ParameterError(path, "must be searched in (low, high), in a range, or in a list of choices", where)
+        raise ParameterError(path, "must be searched in (low, high), a range mapping, or a list of choices", where)
     if len(ends) != 2 or not all(map(_is_number, ends)) or not ends[0] < ends[1]:
-        raise ParameterError(path, "must have two ends, the first the smaller", where)
+        raise ParameterError(path, "must have two finite bounds in ascending order", where)
     if isinstance(where, Mapping):
         if where.get("spacing") == "geometric" and ends[0] <= 0:
-            raise ParameterError(path, "must be above 0 for geometric spacing", where["from"])
+            raise ParameterError(path, "must be > 0 for geometric spacing", where["from"])
         if "step" in where and not (_is_number(where["step"]) and 0 < where["step"] <= ends[1] - ends[0]):
-            raise ParameterError(path, "must have a step > 0, and no larger than the range", where["step"])
+            raise ParameterError(path, "must have a step > 0 that is at most the width of the range", where["step"])
     return ends
 
 
 def _as_taken(plan: Plan, path: str, where: Search) -> Search:
-    """A range in integers where the setting takes no others, and otherwise in any, however its ends are written."""
+    """Return a range with integer bounds for integer settings, and float bounds for others."""
     low, *others = _ends(path, where)
     if isinstance(where, list) or not all(isinstance(end, int) for end in (low, *others)):
         return where
@@ -329,12 +337,12 @@ def _as_taken(plan: Plan, path: str, where: Search) -> Search:
 
 def _is_number(value: Any) -> bool:
     if isinstance(value, int) and not isinstance(value, bool):
-        return abs(value) < 2**63  # Optuna stores no larger ones
+        return abs(value) < 2**63  # the range of integers that Optuna can store
     return isinstance(value, float) and math.isfinite(value)
 
 
 def _suggested(trial: optuna.Trial, path: str, where: Search) -> Any:
-    """A trial's value of a setting."""
+    """Sample the value of a setting for a trial."""
     if isinstance(where, list):
         texts = [json.dumps(choice) for choice in where]
         return json.loads(trial.suggest_categorical(path, texts))
@@ -343,7 +351,7 @@ def _suggested(trial: optuna.Trial, path: str, where: Search) -> Any:
     is_log = isinstance(where, Mapping) and where.get("spacing") == "geometric"
     is_whole = all(isinstance(number, int) for number in (low, high, step or 1))
     if step is not None:
-        # Optuna wants the end to be a step, and reckons in decimals.
+        # Optuna requires a range that is a multiple of the step, in decimal arithmetic.
         first, each = Decimal(str(low)), Decimal(str(step))
         last = first + (Decimal(str(high)) - first) // each * each
         high = int(last) if is_whole else float(last)

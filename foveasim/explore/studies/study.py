@@ -1,4 +1,4 @@
-"""Studies: the settings that make a shot best, searched by Optuna, and kept so that any end leaves them resumable."""
+"""Optimisation of settings with Optuna, in resumable studies."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["best_table", "finished_trials", "run_study", "storage_name", "study"]
 
-#: Rows of the table of the best trials, and characters of a choice in it.
+#: Limits of the table of the best trials: rows, and characters of a choice.
 MOST_ROWS, LONGEST_CHOICE = 20, 40
 #: Attributes of a study and of its trials.
 PLAN, WRITER, ERROR, IS_CUT = "plan", "writer", "error", "ended with the program"
@@ -54,56 +54,56 @@ def study(
     progress: Callable[[int, int], None] | None = None,
 ) -> optuna.Study:
     """
-    Search the settings that make a shot best.
+    Optimise settings of a shot for one or several objectives.
 
     Parameters
     ----------
     shot, changes
         As for :func:`plan_sweep`.
     search : mapping of str to range
-        By the settings' paths: ``(low, high)``, ``{"from": 1, "to": 64, "spacing": "geometric"}`` or
-        ``{"from": 0, "to": 64, "step": 8}``, in integers where the setting takes no others; or a list of choices.
+        Search ranges by setting path: ``(low, high)``, ``{"from": 1, "to": 64, "spacing": "geometric"}`` or
+        ``{"from": 0, "to": 64, "step": 8}``, in integers where the setting accepts only integers; or a list of choices.
     objectives : mapping of str to {"maximize", "minimize"}
-        By the names that results of metrics have, such as ``"snr_mean"``. Of several, the study finds the Pareto front.
+        Directions by name of a metric result, such as ``"snr_mean"``. For several objectives, the study finds the Pareto front.
     n_trials : int
-        Trials that the study has at its end, those of earlier calls with the same storage included.
+        Total number of trials, including those of earlier calls with the same storage.
     constraints : mapping of str to (low, high), optional
-        Limits of results, either of them None. Trials that break them are not among the best.
+        Limits of results; either may be None. Trials that violate a constraint are not among the best.
     metrics : names or functions, or mapping of names to functions, optional
-        By default those that give the objectives and constraints.
+        By default the metrics of the objectives and constraints.
     seed : int
-        Of the search, and of the noise of all captures, which is the same in all: differences are those of settings.
+        Seed of the search and of the noise, which is equal in all captures: differences between trials are due to the settings.
     batch : int
-        Trials that are sampled together, without each other's results, so that as many workers can compute them at once.
+        Number of trials that are sampled together, without each other's results, so that workers can compute them in parallel.
     storage : path or str, optional
-        An SQLite file, or any URL that Optuna takes. By default memory.
+        SQLite file, or storage URL of Optuna. By default the study is stored in memory.
     name : str
-        Of the study in its storage.
+        Name of the study in its storage.
     scheduler : str, optional
-        Address of a dask scheduler, whose workers have this package and see the files that the settings name.
+        Address of a dask scheduler. Its workers need this package and the files that the settings reference.
     workers : int, optional
-        Processes of this machine instead. By default trials are computed in this process.
+        Number of local processes instead. By default trials are computed in this process.
     progress : callable, optional
-        Called with the numbers of trials that are done and of all.
+        Called with the number of finished trials and the total number.
 
     Returns
     -------
     optuna.Study
-        ``best_trials`` is the Pareto front. Trials that failed have their message in ``user_attrs["error"]``, all others all
-        results of the metrics.
+        ``best_trials`` is the Pareto front. ``user_attrs`` of a trial contains the results of all metrics, or the message of a
+        failed trial under ``"error"``.
 
     Raises
     ------
     ParameterError, ConfigError
-        When a path, a range or a name is none.
+        When a path, a range or a name is invalid.
     FileError
-        When the storage cannot be used, or holds another study of this name.
+        When the storage cannot be used, or contains another study of this name.
 
     Notes
     -----
-    The sampler (tree-structured Parzen estimators) is seeded again for every trial, from the seed and the trial's number: an
-    interrupted study resumes as if it had not been, and any number of workers finds the same. One program at a time may write
-    a study.
+    The sampler (tree-structured Parzen estimator) is seeded for every trial with the seed and the number of the trial: an
+    interrupted study resumes with identical results, and results do not depend on the number of workers. Only one program at a
+    time may write a study.
     """
     plan = plan_study(
         shot,
@@ -129,7 +129,7 @@ def run_study(
     progress: Callable[[int, int], None] | None = None,
 ) -> optuna.Study:
     """
-    Run a study that was planned, or go on with one that was ended.
+    Run a planned study, or resume an interrupted one.
 
     Parameters
     ----------
@@ -145,11 +145,11 @@ def run_study(
     Raises
     ------
     ParameterError
-        When Optuna or dask is missing, or no scheduler answers.
+        When Optuna or dask is not installed, or no scheduler answers.
     FileError
-        When the storage cannot be used, or holds another study of this name.
+        When the storage cannot be used, or contains another study of this name.
     SimulationError
-        When the scheduler or all workers are gone. Trials that are done are stored.
+        When the scheduler or all workers are lost. Finished trials are stored.
     """
     if workers is not None:
         workers = min(check_count("workers", workers, at_most=1024), plan.batch)
@@ -190,21 +190,25 @@ def run_study(
 
 def finished_trials(found: optuna.Study) -> list[optuna.trial.FrozenTrial]:
     """
-    Trials of a study, without those that ended with the program that they were in.
+    Return the finished trials of a study, without trials lost in interruptions.
 
-    Those that failed have their message in ``user_attrs["error"]``.
+    Failed trials contain their message in ``user_attrs["error"]``.
     """
     trials = found.get_trials(deepcopy=False)
     return [trial for trial in trials if trial.state.is_finished() and not trial.user_attrs.get(IS_CUT)]
 
 
 def storage_name(storage: str | Path | None) -> str:
-    """What messages call a storage: its URL without the user's name and password."""
+    """Return the URL of a storage for messages, without user name and password."""
     return re.sub(r"://[^/@]*@", "://", str(storage))
 
 
 def best_table(plan: StudyPlan, found: optuna.Study) -> Table:
-    """Table of the best trials: objectives, the results that have limits, settings; the best in the first objective on top."""
+    """
+    Return a table of the best trials, sorted by the first objective.
+
+    Columns are the objectives, the results with constraints, and the settings.
+    """
     from rich.table import Table
     from rich.text import Text
 
@@ -223,17 +227,17 @@ def best_table(plan: StudyPlan, found: optuna.Study) -> Table:
     for trial in best:
         results = [*trial.values, *(trial.user_attrs[name] for name in limited)]
         chosen = [_shown(trial.params[path], where) for path, where in plan.search.items()]
-        # The same settings may have been tried twice, and gave the same.
+        # Trials with equal settings have equal results and share a row.
         rows.setdefault((*(f"{value:.6g}" for value in results), *chosen), trial.number)
     for cells, number in list(rows.items())[:MOST_ROWS]:
         table.add_row(f"{number}", *map(text_of, cells))
     if len(rows) > MOST_ROWS:
-        table.caption = f"and {len(rows) - MOST_ROWS:,} more that are as good"
+        table.caption = f"and {len(rows) - MOST_ROWS:,} further best trials"
     return table
 
 
 def _short(paths: Iterable[str]) -> list[str]:
-    """The last parts of settings' paths, as many as tell them apart."""
+    """Return the shortest unique suffixes of setting paths."""
     split = [path.split(".") for path in paths]
     return [
         next(
@@ -246,7 +250,7 @@ def _short(paths: Iterable[str]) -> list[str]:
 
 
 def _shown(value: Any, where: Search) -> str:
-    """A trial's value of a setting, for a table; of choices the text of JSON is what Optuna keeps."""
+    """Format the value of a setting for a table; Optuna stores choices as JSON strings."""
     chosen = json.loads(value) if isinstance(where, list) else value
     if isinstance(chosen, float):
         return f"{chosen:.6g}"
@@ -262,7 +266,7 @@ def _store_result(
     objectives: Sequence[str],
     constraints: Limits,
 ) -> None:
-    """Progress a study what a trial gave."""
+    """Store the results or the error of a trial in the study."""
     numbers: dict[str, float] = {}
     error = record.error
     for name in (*objectives, *constraints):
@@ -270,9 +274,9 @@ def _store_result(
         if not isinstance(value, int | float) or not math.isfinite(value):
             given = ", ".join(record.values) or "nothing"
             error = error or (
-                f"'{name}' is {'an array' if isinstance(value, Value) else repr(value):.40}, no finite number"
+                f"'{name}' must be a finite number, got {'an array' if isinstance(value, Value) else repr(value):.40}"
                 if name in record.values
-                else f"no '{name}' among {given}"
+                else f"'{name}' must be one of the results ({given})"
             )
             break
         numbers[name] = float(value)
@@ -292,18 +296,20 @@ def _store_result(
 
 
 def _opened(optuna: Any, storage: str | Path | None, url: str | None, plan: StudyPlan) -> optuna.Study:
-    """The study in its storage, or a new one."""
+    """Load the study from its storage, or create it."""
     directions = list(plan.objectives.values())
     if url is None or plan.name not in optuna.get_all_study_names(storage=url):
         return optuna.create_study(storage=url, study_name=plan.name, directions=directions)
     found = optuna.load_study(storage=url, study_name=plan.name)
     if [direction.name.lower() for direction in found.directions] != directions:
-        raise FileError(storage_name(storage), f"holds a study '{plan.name}' with other objectives; take another name")
+        raise FileError(
+            storage_name(storage), f"contains a study '{plan.name}' with other objectives; use another name"
+        )
     return found
 
 
 def _asked(optuna: Any, found: optuna.Study, plan: StudyPlan, n: int) -> optuna.Trial:
-    """Sample the settings of the n-th trial, with a sampler of its own seed."""
+    """Sample the settings of trial n, with a sampler that is seeded for this trial."""
     found.sampler = optuna.samplers.TPESampler(seed=derived_seed(plan.base.seed, n) % 2**32)
     trial = found.ask()
     plan.settings_of(trial)
@@ -314,13 +320,13 @@ def _begin(
     optuna: Any, storage: str | Path | None, found: optuna.Study, plan: StudyPlan, token: str
 ) -> list[optuna.Trial]:
     """
-    Check that a study is this one, and sign as its writer.
+    Check that the stored study has the same plan, and register this program as its writer.
 
     Returns
     -------
     trials : list of optuna.Trial
-        The rest of a batch whose results were being stored when the study was interrupted: their settings are sampled already.
-        Trials of a batch without results are given up, and sampled again.
+        Unfinished trials of a batch whose results were only partly stored at an interruption; their settings are sampled
+        already. Trials of a batch without stored results are discarded and sampled again.
     """
     plan_dict = plan.to_dict()
     before = found.user_attrs.get(PLAN)
@@ -328,13 +334,13 @@ def _begin(
         check_same_plan(Path(storage_name(storage)), before, plan_dict)
     elif found.get_trials(deepcopy=False):
         raise FileError(
-            storage_name(storage), f"holds a study '{found.study_name}' of another program; take another name"
+            storage_name(storage), f"contains a study '{found.study_name}' of another program; use another name"
         )
     else:
         found.set_user_attr(PLAN, json.loads(json.dumps(plan_dict)))
     found.set_user_attr(WRITER, token)
     running = found.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,))
-    trials = [optuna.trial.Trial(found, trial._trial_id) for trial in running]  # noqa: SLF001 -- Optuna has no other way
+    trials = [optuna.trial.Trial(found, trial._trial_id) for trial in running]  # noqa: SLF001 -- Optuna has no public way
     if len(finished_trials(found)) % plan.batch:
         return trials
     for trial in trials:
@@ -349,35 +355,37 @@ def _give_up(optuna: Any, trial: optuna.Trial) -> None:
 
 def _check_writer(optuna: Any, storage: str | Path | None, trial: optuna.Trial, token: str) -> None:
     """
-    Whether no other program has begun to write the study.
+    Check that no other program has started to write the study.
 
     Raises
     ------
     FileError
-        When one has: the trial, which the other does not know, is given up, if it was not already by the other.
+        When another program writes the study. The trial is then marked as failed, unless the other program has done so.
     """
     if trial.study.user_attrs.get(WRITER) == token:
         return
     with suppress(Exception):
         _give_up(optuna, trial)
-    raise FileError(storage_name(storage), "is being written by another program, which has begun to run the same study")
+    raise FileError(storage_name(storage), "is being written by another program, which runs the same study")
 
 
 @contextmanager
 def _alone(storage: str | Path | None, url: str | None) -> Iterator[None]:
     """
-    While no other program on this machine writes the file of a study, which no data base on another machine has.
+    Lock the SQLite file of a study against other programs on this machine.
+
+    Other storages have no lock.
 
     Raises
     ------
     FileError
-        When one does.
+        When another program has locked the file.
     """
     file = None if url is None else _file_of(url)
     if file is None:
         yield
         return
-    # Not the file itself: to close it here would end SQLite's own locks on it.
+    # A separate file: closing the database file here would release the locks of SQLite on it.
     beside = file.with_name(file.name + ".lock")
     with ExitStack() as opened:
         is_ours = False
@@ -386,39 +394,39 @@ def _alone(storage: str | Path | None, url: str | None) -> Iterator[None]:
                 held = opened.enter_context(beside.open("ab"))
                 if not lock(held):
                     raise FileError(storage_name(storage), "is being written by another program that runs a study")
-                # A program that ends takes the file away, perhaps after we opened it.
+                # Another program may remove the lock file at its end, after it was opened here.
                 is_ours = beside.exists() and os.path.samestat(beside.stat(), os.fstat(held.fileno()))
         opened.callback(partial(beside.unlink, missing_ok=True))
         yield
 
 
 def _file_of(url: str) -> Path | None:
-    """The file of an SQLite data base; None of another."""
+    """Return the file of an SQLite database; None for other databases."""
     from sqlalchemy.engine import make_url
     from sqlalchemy.exc import ArgumentError
 
     try:
         parts = make_url(url)
     except ArgumentError:
-        return None  # Optuna tells
+        return None  # reported by Optuna
     if not parts.drivername.startswith("sqlite") or parts.database in {None, "", ":memory:"}:
         return None
     return Path(str(parts.database))
 
 
 def _url(storage: str | Path | None) -> str | None:
-    """The URL of a storage; None of memory."""
+    """Return the URL of a storage; None for memory."""
     if storage is None or "://" in str(storage):
         return storage if storage is None else str(storage)
     path = Path(storage).absolute()
     if not path.parent.is_dir():
-        raise FileError(storage_name(storage), "cannot be written: its folder does not exist")
+        raise FileError(storage_name(storage), "cannot be written: its directory does not exist")
     return f"sqlite:///{path}"
 
 
 @contextmanager
 def _using(storage: str | Path | None, n_done: int | None = None) -> Iterator[None]:
-    """What goes wrong with a storage, in one sentence; with what is kept in it, once there is something."""
+    """Raise errors of a storage as FileError, with the number of stored trials."""
     try:
         yield
     except FoveasimError:
@@ -428,13 +436,13 @@ def _using(storage: str | Path | None, n_done: int | None = None) -> Iterator[No
         while cause.__cause__ is not None:
             cause = cause.__cause__
         reason = str(cause).partition("\n")[0]
-        kept = "" if n_done is None else f"; {n_done:,} trials are kept in it, and the same study goes on from there"
+        kept = "" if n_done is None else f"; {n_done:,} trials are stored, from which the same study resumes"
         raise FileError(storage_name(storage), f"cannot be used as a study's storage ({reason:.200}){kept}") from None
 
 
 @contextmanager
 def _silent(optuna: Any) -> Iterator[None]:
-    """Without what Optuna logs of a study that it makes."""
+    """Suppress the messages that Optuna logs when it creates a study."""
     verbosity = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:

@@ -1,1 +1,1 @@
-"""Sweeps: one shot at many settings."""
+"""Sweeps: captures of one shot with varied settings."""

@@ -1,4 +1,4 @@
-"""What a sweep does: a shot, the settings that vary, repeats, seed and metrics; and the numbers of its points."""
+"""Plans of sweeps: varied settings, repeats, seed and metrics, and order of the points."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ __all__ = [
     "telling",
 ]
 
-#: More points than this are a slip: of a millisecond each they would take a quarter of an hour.
+#: Largest number of points. At 1 ms each they take a quarter of an hour; more are probably a mistake.
 MAX_POINTS = 1_000_000
-#: So many values of each setting are checked before a sweep begins; what is wrong with later ones, their points tell.
+#: Number of values of each setting that are checked before a sweep starts; errors in later values appear in the results.
 CHECKED_VALUES = 1000
 #: Names of dimensions that are not settings.
 POINT, REPEAT = "point", "repeat"
-#: Settings that change where light falls on photosites, and those that change the light.
+#: Settings of the photosites and their integration areas, and settings of the optical image.
 GEOMETRY = ("layout", "distortion", "integration_order")
 LIGHT = ("scene", "optics", "sensor.qe", "sensor.filters")
 
@@ -52,25 +52,25 @@ LIGHT = ("scene", "optics", "sensor.qe", "sensor.filters")
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
     """
-    A sweep before it runs.
+    Validated plan of a sweep.
 
     Attributes
     ----------
     source : Path
-        The file that the settings are from, for messages.
+        File of the settings, for messages.
     settings : mapping
-        Of the shot, as plain data; files that they name are absolute.
+        Settings of the shot as plain data, with absolute file paths.
     values : mapping of str to list
-        Values of each setting that varies, by its path, such as ``"sensor.bits"``.
+        Values of each varied setting by path, such as ``"sensor.bits"``.
     mode : {"product", "zip"}
-        Every value with every other, or the first with the first, the second with the second.
+        All combinations of the values, or the k-th values of all settings together.
     repeats : int
         Captures of each point, which differ in their seeds.
     seed : int
-        That every point's seed is derived from.
+        Seed from which the seed of every point is derived.
     metrics : mapping of str to function
     files : mapping of str to str
-        SHA-256 of the files that the settings name, and of those that these name.
+        SHA-256 of the files that the settings reference directly or indirectly.
     """
 
     source: Path
@@ -84,49 +84,56 @@ class Plan:
 
     @cached_property
     def shape(self) -> tuple[int, ...]:
-        """Numbers of values along the results' dimensions, repeats last where there are several."""
+        """Lengths of the dimensions of the results; repeats last, if there are several."""
         counts = [len(values) for values in self.values.values()]
         own = tuple(counts) if self.mode == "product" else (counts[0],)
         return own if self.repeats == 1 else (*own, self.repeats)
 
     @property
     def dims(self) -> tuple[str, ...]:
-        """Names of the results' dimensions."""
+        """Names of the dimensions of the results."""
         own = tuple(self.values) if self.mode == "product" else (POINT,)
         return own if self.repeats == 1 else (*own, REPEAT)
 
     @property
     def n_points(self) -> int:
-        """Captures that the sweep takes."""
+        """Number of captures of the sweep."""
         return math.prod(self.shape)
 
     @cached_property
     def choices(self) -> Ints:
-        """Which value of each setting every point has, (n_point, n_setting)."""
+        """Indices of the values of each point, (n_point, n_setting)."""
         number = np.arange(self.n_points)
         if self.mode == "product":
             return np.stack(np.unravel_index(number, self.shape)[: len(self.values)], axis=1)
         return np.repeat((number // self.repeats)[:, np.newaxis], len(self.values), axis=1)
 
     def settings_of(self, point: int) -> dict[str, Any]:
-        """All settings of a point, with its seed."""
+        """Return all settings of a point, with its seed."""
         chosen = {path: values[k] for (path, values), k in zip(self.values.items(), self.choices[point], strict=True)}
         return self._changed(chosen) | {"seed": self.seed_of(point)}
 
     def seed_of(self, point: int) -> int:
-        """Seed of a point's noise: of the sweep's seed and the point's number, and of nothing else."""
+        """Return the noise seed of a point, derived from the sweep seed and the point number."""
         return derived_seed(self.seed, point)
 
     @property
     def is_geometry_varied(self) -> bool:
-        """Whether points differ in the photosites, or in where the lens puts them."""
+        """Whether points differ in the photosites or the distortion."""
         return any(_is_of(path, GEOMETRY) for path in self.values)
 
     def order(self) -> tuple[Ints, Ints]:
         """
-        Numbers of the points, those with the same layout and light beside each other, and where such groups begin.
+        Return the points grouped by layout and optical image.
 
-        Every other layout has its lights in the other order, so that the light met last is met again.
+        The order of the images alternates between layouts, so that the last image of a layout is the first of the next one.
+
+        Returns
+        -------
+        order : (n_point,) int64
+            Numbers of the points in the order of computation.
+        begins : (n_group,) int64
+            Positions in ``order`` at which groups begin.
         """
         choices = self.choices if self.mode == "product" else self._first_equal()
         groups = []
@@ -140,7 +147,7 @@ class Plan:
         return order, np.flatnonzero(is_new)
 
     def to_dict(self) -> dict[str, Any]:
-        """All that results depend on, as plain data: a store goes on where it equals."""
+        """Return everything that determines the results as plain data; resuming requires equality."""
         return {
             "settings": dict(self.settings),
             "vary": {path: list(values) for path, values in self.values.items()},
@@ -154,11 +161,11 @@ class Plan:
 
     @cached_property
     def _metrics_described(self) -> dict[str, str]:
-        # Once: what a function takes along may change while it works.
+        # Computed once: captured values of a function may change while it runs.
         return {name: identity_of(metric) for name, metric in self.metrics.items()}
 
     def _first_equal(self) -> Ints:
-        """As ``choices``, with the number of the first value that is equal instead of every value's own."""
+        """Return ``choices`` with equal values replaced by the index of the first of them."""
         columns = []
         for values, chosen in zip(self.values.values(), self.choices.T, strict=True):
             first: dict[str, int] = {}
@@ -174,12 +181,12 @@ class Plan:
 
     def check(self) -> None:
         """
-        Names and types of all settings that vary, before anything is built.
+        Check names and types of all varied settings without building a camera.
 
         Raises
         ------
         ConfigError
-            With the setting, what was expected and got.
+            When a setting is invalid; with its path, the expected and the actual value.
         """
         names = list(self.values)
         check_apart(self.source, names)
@@ -194,7 +201,7 @@ class Plan:
 
 
 class _Range(BaseModel):
-    """Numbers from one to another."""
+    """Range of ``n`` values with linear or geometric spacing."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     low: float = Field(alias="from")
@@ -204,39 +211,43 @@ class _Range(BaseModel):
 
 
 class SweepSection(BaseModel):
-    """A sweep: a shot, what varies in it, repeats, seed, names of metrics."""
+    """Settings of a sweep: shot, varied settings, repeats, seed and metrics."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
-    shot: str | dict[str, Any] = Field(description="a file beside this one, or the settings themselves")
-    set: dict[str, Any] = Field({}, description="settings to be replaced in all points, by their paths")
-    vary: dict[str, list[Any] | _Range] | None = Field(None, description="values or ranges, by settings' paths")
-    points: list[dict[str, Any]] | None = Field(None, description="instead of vary: settings of each point")
-    mode: Literal["product", "zip"] = Field("product", description="every value with every other, or side by side")
+    shot: str | dict[str, Any] = Field(description="settings file, relative to this file, or the settings")
+    set: dict[str, Any] = Field({}, description="settings that are replaced in all points, by path")
+    vary: dict[str, list[Any] | _Range] | None = Field(None, description="values or ranges, by setting path")
+    points: list[dict[str, Any]] | None = Field(None, description="settings of each point, instead of vary")
+    mode: Literal["product", "zip"] = Field("product", description="all combinations, or values in parallel")
     repeats: int = Field(1, description="captures of each point, which differ in their seeds")
     seed: int = 0
-    metrics: list[str] | None = Field(None, description="names of metrics; usual ones by default")
+    metrics: list[str] | None = Field(None, description="names of metrics; a default set if omitted")
 
 
 def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
     """
-    Read a YAML file of a sweep.
+    Read the YAML file of a sweep.
 
     Parameters
     ----------
     path : path
-        With the keys ``shot`` (a file beside it, or the settings themselves), ``vary`` (settings' paths to lists, or to
+        File with the keys ``shot`` (a settings file, or the settings), ``vary`` (setting paths to lists, or to
         ``{from: 2, to: 16, n: 8, spacing: geometric}``) or ``points`` (a list of settings), ``mode``, ``repeats``, ``seed``,
-        ``metrics``, and ``set`` (settings to be replaced in all points). The file names metrics of :data:`METRICS` only: a file
-        never makes the program import code.
+        ``metrics``, and ``set`` (settings that are replaced in all points). Metrics in the file must be names in
+        :data:`METRICS`, so that reading a file never imports code.
     metrics : sequence of str
-        More metrics: names, or ``module:function``, which is imported.
+        Further metrics: names, or ``module:function``, which is imported.
+
+    Returns
+    -------
+    Plan
 
     Raises
     ------
     ConfigError
-        With the file, the place in it, what was expected and got.
+        When a setting is invalid; with the file, the key, the expected and the actual value.
     ParameterError
-        When there is no such metric.
+        When a metric does not exist.
     """
     path = Path(path)
     section: SweepSection = validated(path, SweepSection, read_yaml(path))
@@ -250,7 +261,7 @@ def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
         }
     source, shot = shot_of(path, section.shot)
     with telling(path):
-        # The names that the file gives are looked up in METRICS, and never imported.
+        # Names in the file are looked up in METRICS, and never imported.
         named = named_metrics(section.metrics)
     wanted = with_more_metrics(named, metrics)
     with telling(path):
@@ -280,33 +291,38 @@ def plan_sweep(
     folder: str | Path = ".",
 ) -> Plan:
     """
-    Plan a sweep, and check all that can be checked without building anything.
+    Create the plan of a sweep, with all checks that do not require building a camera.
 
     Parameters
     ----------
     shot : path or mapping
-        A settings file, or settings as it has them.
+        Settings file, or mapping of settings.
     vary : mapping of str to values, or sequence of mappings
-        Values by the settings' paths, such as ``{"sensor.bits": [8, 10]}``; or a list of points, all with the same paths.
+        Values by setting path, such as ``{"sensor.bits": [8, 10]}``; or a list of points with the same paths.
     mode : {"product", "zip"}
-        Every value with every other, or the first with the first, the second with the second.
+        All combinations of the values, or the k-th values of all settings together.
     repeats : int
         Captures of each point, which differ in their seeds.
     seed : int
+        Seed from which the seed of every point is derived.
     metrics : names or functions, or mapping of names to functions, optional
-        See :data:`METRICS`. A function takes a shot, its camera and its capture, and gives a number, a text, a mapping of names
-        to such, a numpy array, or an xarray.DataArray.
+        See :data:`METRICS`. A function of a shot, its camera and its capture returns a number, a string, a mapping of names to
+        numbers or strings, a numpy array, or an xarray.DataArray.
     changes : mapping of str to value, optional
-        Settings to be replaced in all points.
+        Settings that are replaced in all points.
     source : path
-        What messages call settings that are no file.
+        Name of a mapping of settings in messages.
     folder : path
-        Where files that ``vary`` names are looked for.
+        Directory for relative file paths in ``vary``.
+
+    Returns
+    -------
+    Plan
 
     Raises
     ------
     ParameterError, ConfigError
-        When nothing varies, a path or a value is none of the shot's, or there are too many points.
+        When nothing varies, a path or a value is invalid, or there are too many points.
     """
     check_choice("mode", mode, ("product", "zip"))
     if isinstance(shot, Mapping):
@@ -321,7 +337,7 @@ def plan_sweep(
     if n_points > MAX_POINTS:
         raise ParameterError(
             "vary",
-            f"asks for {n_points:,} points, and a sweep has at most {MAX_POINTS:,}; vary fewer settings together",
+            f"must specify at most {MAX_POINTS:,} points, got {n_points:,}; vary fewer settings together",
         )
     found: list[Path] = []
     settings = files_from(source.parent, data, found=found)
@@ -340,19 +356,19 @@ def plan_sweep(
     )
     clash = next((name for name in plan.metrics if name in plan.values), None)
     if clash is not None:
-        raise ParameterError("metrics", f"must have other names than the settings that vary, not '{clash}'")
+        raise ParameterError("metrics", f"must not have the name of a varied setting, got '{clash}'")
     plan.check()
     return plan
 
 
 def shot_of(path: Path, shot: str | dict[str, Any]) -> tuple[Path, dict[str, Any]]:
     """
-    The shot that a file names, beside it, or holds: the file that its settings are from, and the settings.
+    Return the settings of the shot of a file, and the file that contains them.
 
     Raises
     ------
     ConfigError
-        When there is no such file, or it is no YAML.
+        When the file does not exist, or is not valid YAML.
     """
     if not isinstance(shot, str):
         return path, shot
@@ -361,7 +377,7 @@ def shot_of(path: Path, shot: str | dict[str, Any]) -> tuple[Path, dict[str, Any
 
 
 def coordinate(values: Iterable[Any]) -> NDArray[Any]:
-    """Values of a setting as labels: numbers, yes and no, or texts; all others as texts of JSON."""
+    """Convert values of a setting to labels: numbers, booleans or strings; JSON for others."""
     values = list(values)
     for kinds, dtype in (((bool,), np.bool_), ((int,), np.int64), ((int, float), np.float64)):
         if all(type(value) in kinds for value in values):
@@ -376,12 +392,14 @@ def coordinate(values: Iterable[Any]) -> NDArray[Any]:
 @contextmanager
 def telling(path: Path) -> Iterator[None]:
     """
-    Errors in what a file says, with the file's name; those of the shot that it names, with both.
+    Raise errors in the settings of a file with its path.
+
+    Errors in a referenced shot file are raised with both paths.
 
     Raises
     ------
     ConfigError
-        Instead of any :class:`ParameterError`, and of other files' errors.
+        Instead of any :class:`ParameterError`, or of a :class:`ConfigError` of another file.
     """
     try:
         yield
@@ -395,57 +413,59 @@ def telling(path: Path) -> Iterator[None]:
 
 def check_apart(source: Path, paths: Iterable[str], verb: str = "vary") -> None:
     """
-    Whether no setting is inside another.
+    Check that no setting contains another.
 
     Raises
     ------
     ConfigError
-        With both.
+        With the paths of both settings.
     """
     names = list(paths)
     for path in names:
         inside = next((other for other in names if other.startswith(path + ".")), None)
         if inside is not None:
-            raise ConfigError(source, f"'{path}' and '{inside}' cannot both {verb}: one holds the other")
+            raise ConfigError(source, f"'{path}' and '{inside}' cannot both {verb}: the first contains the second")
 
 
 def _by_path(vary: Any, mode: Literal["product", "zip"]) -> tuple[dict[str, list[Any]], Literal["product", "zip"]]:
-    """Values by path, of a mapping or of a list of points."""
+    """Return the values by path of a mapping or a list of points, and the mode."""
     if not isinstance(vary, Mapping):
         points = list(vary) if isinstance(vary, Iterable) and not isinstance(vary, str) else []
         if not points or not all(isinstance(point, Mapping) and point for point in points):
-            raise ParameterError("vary", "must be values by settings' paths, or a list of points, and not empty", vary)
+            raise ParameterError("vary", "must be a mapping of setting paths to values, or a list of points", vary)
         for point in points:
             if set(point) != set(points[0]):
                 raise ParameterError("points", f"must all have the settings {', '.join(points[0])}", dict(point))
         vary, mode = {path: [point[path] for point in points] for path in points[0]}, "zip"
     values: dict[str, list[Any]] = {}
     for path, each in vary.items():
-        # A set has another order in every run, and with it the points other numbers.
+        # The order of a set, and so the numbers of the points, would differ between runs.
         if not isinstance(each, Iterable) or isinstance(each, str | Mapping | set | frozenset):
             raise ParameterError(str(path), "must vary over a list of values", each)
         if isinstance(each, Sized) and len(each) > MAX_POINTS:
-            raise ParameterError(str(path), f"has {len(each):,} values, and a sweep has at most {MAX_POINTS:,} points")
+            raise ParameterError(str(path), f"must have at most {MAX_POINTS:,} values, got {len(each):,}")
         values[str(path)] = [_plain(str(path), value) for value in each]
     if not values or not all(values.values()):
         empty = next(iter(values), None)
-        raise ParameterError(empty or "vary", "must have values: nothing varies")
+        raise ParameterError(empty or "vary", "must have at least one value")
     if "seed" in values:
-        raise ParameterError("seed", "cannot vary: every point's seed is derived from the sweep's; take 'repeats'")
+        raise ParameterError("seed", "must not vary: it is derived from the seed of the sweep; use 'repeats'")
     counts = {path: len(each) for path, each in values.items()}
     if mode == "zip" and len(set(counts.values())) > 1:
         told = ", ".join(f"{path}: {n}" for path, n in counts.items())
-        raise ParameterError("vary", f"must have as many values of each setting to go side by side ({told})")
+        raise ParameterError("vary", f"must have equal numbers of values in the mode 'zip' ({told})")
     if mode == "product":
         for path, each in values.items():
             twice, n = Counter(coordinate(each).tolist()).most_common(1)[0]
             if n > 1:
-                raise ParameterError(path, f"has the value {twice} twice; take 'repeats' for more captures of a point")
+                raise ParameterError(
+                    path, f"must have unique values, got {twice} twice; use 'repeats' for more captures"
+                )
     return values, mode
 
 
 def _plain(path: str, value: Any) -> Any:
-    """A value as YAML has it."""
+    """Convert a value to plain data."""
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
     if isinstance(value, Path):
@@ -453,11 +473,11 @@ def _plain(path: str, value: Any) -> Any:
     try:
         return json.loads(json.dumps(value), parse_constant=_constant)
     except (TypeError, ValueError, RecursionError):
-        raise ParameterError(path, "must vary over numbers, texts, lists and sections", value) from None
+        raise ParameterError(path, "must vary over numbers, strings, lists and mappings", value) from None
 
 
 def _constant(text: str) -> float:
-    """Infinity, which a distance may be; no setting is NaN."""
+    """Convert infinity, which is valid for distances; NaN is not valid for any setting."""
     if text == "NaN":
         raise ValueError(text)
     return float(text)
@@ -466,12 +486,12 @@ def _constant(text: str) -> float:
 def _numbers(path: Path, name: str, between: _Range) -> list[Any]:
     if between.spacing == "geometric":
         if not between.low * between.high > 0.0:
-            raise ConfigError(path, f"vary.{name}: geometric steps need ends of one sign, and not 0")
+            raise ConfigError(path, f"vary.{name}: must have non-zero bounds of equal sign for geometric spacing")
         numbers = np.geomspace(between.low, between.high, between.n)
     else:
         numbers = np.linspace(between.low, between.high, between.n)
     if not np.isfinite(numbers).all():
-        raise ConfigError(path, f"vary.{name}: has ends that are not finite")
+        raise ConfigError(path, f"vary.{name}: must have finite bounds")
     is_whole = bool((numbers == np.rint(numbers)).all())
     return [int(number) if is_whole else float(number) for number in numbers]
 
@@ -481,5 +501,5 @@ def _is_of(path: str, parts: tuple[str, ...]) -> bool:
 
 
 def _copied(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings with sections of their own; lists are shared."""
+    """Return a copy of settings with new mappings; lists are shared."""
     return {key: _copied(value) if isinstance(value, dict) else value for key, value in data.items()}

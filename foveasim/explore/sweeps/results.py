@@ -1,4 +1,4 @@
-"""Records of points as one labelled dataset, and the zarr store that it is kept in."""
+"""Conversion of point records to a labelled xarray.Dataset, and its zarr store."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ __all__ = ["check_store", "dataset_of", "open_results", "stored_plan", "write_st
 
 #: Variables of every sweep.
 SEED, ERROR, WARNING = "seed", "error", "warning"
-#: Attributes of a store that hold texts of JSON, so that any format can keep them.
+#: Attributes of a store, as JSON strings, which every file format supports.
 PLAN, SETTINGS, VERSIONS = "plan", "settings", "versions"
 
 
 def dataset_of(plan: Plan, records: Mapping[int, Record]) -> xr.Dataset:
     """
-    The records as an xarray.Dataset, whatever the order in which they came.
+    Combine records to an xarray.Dataset, independent of their order.
 
     Parameters
     ----------
     plan : Plan
     records : mapping of int to Record
-        By the points' numbers; points without one have NaN, and the error "not done".
+        Records by point number; points without a record have NaN and the error "not done".
 
     Returns
     -------
     xarray.Dataset
-        Dimensions are the settings that vary, or ``point``, and ``repeat``. Beside the metrics: ``seed``, ``error`` (empty
-        where all is well), ``warning``. Dimensions without labels are as long as the longest, with NaN beyond.
+        Dimensions are the varied settings, or ``point``, and ``repeat``. Variables are the metrics, ``seed``, ``error`` (empty
+        without errors) and ``warning``. Unlabelled dimensions are padded with NaN to the longest array.
     """
     xr = _xarray()
     shape, dims = plan.shape, plan.dims
@@ -98,7 +98,7 @@ def _texts(values: list[str]) -> NDArray[Any]:
 
 
 def _by_name(rows: Iterable[Record]) -> dict[str, dict[int, Value]]:
-    """Values of each name, by points; numbers and texts as arrays without dimensions."""
+    """Return the values by name and point, with numbers and strings as 0-d arrays."""
     given: dict[str, dict[int, Value]] = {}
     for record in rows:
         for name, value in record.values.items():
@@ -111,18 +111,19 @@ def _alike(
     given: Mapping[str, dict[int, Value]], taken: set[str], errors: dict[int, str]
 ) -> dict[str, dict[int, Value]]:
     """
-    Values that have the same dimensions in all points.
+    Select the values with equal dimensions in all points.
 
-    What differs from most, or has the name of a setting that varies, is left out, and told in ``errors``.
+    Values with other dimensions than most points, or with the name of a varied setting, are excluded and reported in
+    ``errors``.
     """
     kept: dict[str, dict[int, Value]] = {}
     for name, values in given.items():
         kinds = Counter((value.dims, tuple(value.labels)) for value in values.values())
         most = kinds.most_common(1)[0][0]
         alike = {k: value for k, value in values.items() if (value.dims, tuple(value.labels)) == most}
-        why = f"{name}: has other dimensions or labels than in most points, with {', '.join(most[0]) or 'none'}"
+        why = f"{name}: has other dimensions or labels than in most points, which have {', '.join(most[0]) or 'none'}"
         if name in taken:
-            alike, why = {}, f"{name}: has the name of a setting or of a dimension"
+            alike, why = {}, f"{name}: must not have the name of a setting or a dimension"
         for k in sorted(values.keys() - alike.keys()):
             errors[k] = "; ".join(filter(None, (errors[k], why)))
         if alike:
@@ -132,9 +133,9 @@ def _alike(
 
 def _apart(given: Mapping[str, Mapping[int, Value]], taken: set[str]) -> dict[str, dict[int, Value]]:
     """
-    Values with names of dimensions that nothing else has.
+    Rename dimensions to unique names.
 
-    Dimensions with labels are shared by all variables that name them so; others are a variable's own.
+    Labelled dimensions are shared by all variables that use their name; unlabelled dimensions belong to one variable.
     """
     labelled = {dim for values in given.values() for dim in next(iter(values.values())).labels}
     apart: dict[str, dict[int, Value]] = {}
@@ -156,7 +157,7 @@ def _apart(given: Mapping[str, Mapping[int, Value]], taken: set[str]) -> dict[st
 
 
 def _labels(given: Mapping[str, Mapping[int, Value]]) -> dict[str, tuple[NDArray[Any], dict[Any, int]]]:
-    """Labels of each dimension that has some, and their places: sorted numbers, or texts as they came."""
+    """Return the labels of labelled dimensions (sorted numbers, or strings) and their indices."""
     found: dict[str, dict[Any, None]] = {}
     for values in given.values():
         for value in values.values():
@@ -176,7 +177,7 @@ def _labels(given: Mapping[str, Mapping[int, Value]]) -> dict[str, tuple[NDArray
 def _stacked(
     values: Mapping[int, Value], n_points: int, labels: Mapping[str, tuple[NDArray[Any], Mapping[Any, int]]]
 ) -> NDArray[Any]:
-    """A metric's values of all points, (n_point, ...), with what is not known as NaN or an empty text."""
+    """Stack the values of all points, (n_point, ...), with NaN or empty strings where missing."""
     first = next(iter(values.values()))
     shape = tuple(
         labels[dim][0].size if dim in first.labels else max(value.data.shape[axis] for value in values.values())
@@ -209,28 +210,28 @@ def _stacked(
 
 def check_store(path: Path) -> None:
     """
-    Whether results can be written there, before anything is computed.
+    Check that results can be written to a path before the computation.
 
     Raises
     ------
     FileError
-        When the folder does not exist, or something else is there.
+        When the directory does not exist, or the path contains other data.
     """
     _xarray()
     if not path.absolute().parent.is_dir():
-        raise FileError(path, f"cannot be written: the folder {path.absolute().parent} does not exist")
+        raise FileError(path, f"cannot be written: the directory {path.absolute().parent} does not exist")
     if path.exists() and not (path / "zarr.json").is_file():
-        raise FileError(path, "cannot be written: something else than a sweep's results is there")
+        raise FileError(path, "cannot be written: it exists and does not contain sweep results; use another path")
 
 
 def stored_plan(path: Path) -> dict[str, Any] | None:
     """
-    The plan of the results in a store; None where there is no store.
+    Read the plan from a store of results; None if the store does not exist.
 
     Raises
     ------
     FileError
-        When the store is corrupt, or no sweep's.
+        When the store is corrupt, or does not contain sweep results.
     """
     if not path.exists():
         return None
@@ -241,17 +242,17 @@ def stored_plan(path: Path) -> dict[str, Any] | None:
             return plan
     except (OSError, ValueError, KeyError, TypeError):
         pass
-    raise FileError(path, "holds something else than a sweep's results")
+    raise FileError(path, "does not contain sweep results")
 
 
 def open_results(path: str | Path) -> xr.Dataset:
     """
-    The results in a store, in memory.
+    Load the results of a store into memory.
 
     Raises
     ------
     FileError
-        When there is none, or it is broken.
+        When the store does not exist, or is corrupt.
     """
     path = Path(path)
     if stored_plan(path) is None:
@@ -260,27 +261,27 @@ def open_results(path: str | Path) -> xr.Dataset:
         with _xarray().open_zarr(path, consolidated=False, chunks=None) as dataset:
             loaded: xr.Dataset = dataset.load()
             return loaded
-    except Exception as error:  # noqa: BLE001 -- a broken store makes its readers trip over anything
+    except Exception as error:  # noqa: BLE001 -- corrupt stores raise many kinds of errors
         raise FileError(path, f"is corrupt ({' '.join(str(error).split()):.200})") from None
 
 
 def write_store(dataset: xr.Dataset, path: Path) -> None:
     """
-    Write a zarr folder, whole or not at all, instead of one that was there.
+    Write a zarr store atomically, replacing an existing one.
 
     Raises
     ------
     FileError
-        When nothing can be written there.
+        When the path cannot be written.
     """
     with (
         atomic_directory(path, is_ours=lambda folder: stored_plan(folder) is not None) as new,
         warnings.catch_warnings(),
     ):
-        # Zarr has it for all who open the store with xarray, and warns that others may not read it so; they need not.
+        # xarray.open_zarr reads consolidated metadata by default; the warning concerns other zarr implementations.
         warnings.filterwarnings("ignore", "Consolidated metadata is currently not part")
         dataset.to_zarr(new, mode="w", consolidated=True, zarr_format=3)
-        # On the disk before the journal is removed: a power cut leaves one of them whole.
+        # Synchronised to disk before the journal is removed: after a power failure one of them is complete.
         for file in (path for path in new.rglob("*") if path.is_file()):
             with file.open("r+b") as opened:
                 os.fsync(opened.fileno())
@@ -289,7 +290,7 @@ def write_store(dataset: xr.Dataset, path: Path) -> None:
 def _xarray() -> Any:
     try:
         import xarray
-        import zarr  # noqa: F401 -- the results' format
+        import zarr  # noqa: F401 -- format of the results
     except ImportError:
         raise ParameterError("sweep", needs("xarray")) from None
     return xarray

@@ -1,4 +1,4 @@
-"""Sweeps: the same shot with other settings, again and again, into one store of results."""
+"""Sweeps: simulation of a shot with varied settings, and a store of the results."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["run_sweep", "sweep"]
 
-#: Told how many points are done, of how many.
+#: Function of the number of finished points and the total number.
 Progress = Callable[[int, int], None]
 
 
@@ -44,7 +44,7 @@ def sweep(
     progress: Progress | None = None,
 ) -> xr.Dataset:
     """
-    Take a shot with many settings, and tabulate metrics over them.
+    Simulate a shot with varied settings, and tabulate metrics.
 
     Parameters
     ----------
@@ -61,11 +61,11 @@ def sweep(
     Raises
     ------
     ParameterError, ConfigError, FileError, SimulationError
-        As for both.
+        As for both functions.
 
     Notes
     -----
-    Workers are processes that import the calling program's main file: keep the call under ``if __name__ == "__main__":``.
+    Worker processes import the main file of the calling program: call this function under ``if __name__ == "__main__":``.
 
     Examples
     --------
@@ -88,44 +88,44 @@ def run_sweep(
     progress: Progress | None = None,
 ) -> xr.Dataset:
     """
-    Run a sweep that was planned, or go on with one that was ended.
+    Run a planned sweep, or resume an interrupted one.
 
     Parameters
     ----------
     plan : Plan
     out : path, optional
-        A zarr folder for the results. While the sweep runs, every point that is done is written to a journal beside it, from
-        which the same sweep goes on after any end of the program; the folder is written when all are done. The journal stays
-        where points failed.
+        Zarr store of the results, which is written at the end. During the sweep, every finished point is appended to a journal
+        next to the store, from which the same sweep resumes after an interruption. The journal remains if points failed.
     scheduler : str, optional
-        Address of a dask scheduler, such as ``"tcp://10.0.0.1:8786"``, whose workers have this package and see the files that
-        the settings name under the same names. By default processes on this machine.
+        Address of a dask scheduler, such as ``"tcp://10.0.0.1:8786"``. Its workers need this package, and access to the files
+        that the settings reference under the same names. By default local processes.
     workers : int, optional
-        Number of those processes; by default one per core.
+        Number of local processes; by default one per core.
     retry : bool
-        Whether points that failed before are tried again; all of them, where there is a store without its journal.
+        Whether failed points are computed again; if the store has no journal and contains errors, all points are.
     progress : callable, optional
-        Called with the numbers of points that are done and of all.
+        Called with the number of finished points and the total number.
 
     Returns
     -------
     xarray.Dataset
-        Metrics over the settings that vary; ``seed``, ``error`` and ``warning`` of every point; the plan, all settings and the
-        versions among its attributes. The same, bit for bit, with any number of workers, and after any number of ends.
+        Metrics over the varied settings; ``seed``, ``error`` and ``warning`` of every point; the plan, all settings and the
+        versions as attributes. Bit-identical for any number of workers and after any interruption.
 
     Raises
     ------
     ParameterError
-        When no scheduler answers, or a package is missing.
+        When no scheduler answers, or a package is not installed.
     FileError
-        When the store is another sweep's, or cannot be written.
+        When the store contains another sweep, or cannot be written.
     SimulationError
-        When the scheduler or its workers go away. What was done is kept.
+        When the scheduler or all workers are lost. With ``out``, finished points remain in the journal.
 
     Notes
     -----
-    A point that raises has NaN and its message among the results, and the others go on. Points with the same layout and light
-    go to the same worker, which keeps layouts, scenes, images, compiled layouts and the light on the sites.
+    An exception in a point gives NaN and an error message in the results, and does not affect other points. The same worker
+    computes points with the same layout and optical image, and caches layouts, scenes, images, compiled layouts and the power
+    on the sites.
     """
     if workers is not None:
         workers = check_count("workers", workers, at_most=1024)
@@ -140,7 +140,7 @@ def run_sweep(
         check_same_plan(store, before, plan.to_dict())
         if not journal_of(store).exists():
             complete = open_results(store)
-            # What points gave cannot be had from a store again as it was: without the journal, all are tried.
+            # Records cannot be restored exactly from a store: without the journal, all points are computed.
             if not (retry and (complete["error"] != "").any()):
                 return complete
     with Journal(store, plan.to_dict()) as journal:
@@ -163,13 +163,13 @@ def _run(
     workers: int | None,
     progress: Progress | None,
 ) -> None:
-    """Do all points that are not known."""
+    """Compute all points without a record."""
     n_left = plan.n_points - len(known)
     n_done = len(known)
     if n_left == 0:
         return
     n_workers = min(thread_count() if workers is None else workers, n_left)
-    # A worker of a scheduler has the number of threads that it was started with.
+    # The workers of a scheduler determine their own number of threads.
     n_threads = max(1, thread_count() // n_workers) if scheduler is None else None
     runner = ShotRunner(plan.source, plan.metrics, is_geometry_varied=plan.is_geometry_varied, n_threads=n_threads)
     users = list(plan.metrics.values())
@@ -189,12 +189,12 @@ def _run(
                     progress(n_done, plan.n_points)
     except SimulationError as error:
         raise SimulationError(
-            f"{error}; {n_done:,} of {plan.n_points:,} points are done, and a sweep with a store goes on from there"
+            f"{error}; {n_done:,} of {plan.n_points:,} points are done, from which a sweep with a store resumes"
         ) from None
 
 
 class _Points:
-    """Records of a plan's points by their numbers."""
+    """Function that computes the record of a point from its number."""
 
     def __init__(self, plan: Plan, runner: ShotRunner) -> None:
         self._plan, self._runner = plan, runner
