@@ -282,7 +282,7 @@ class _Dispatch:
         heapq.heappush(self.heap, (-len(own), next(self.numbers), own))
 
     def _half_of_longest(self) -> _Range | None:
-        """Split the longest range in half, or at a nearby change of shared components."""
+        """Cut off the second half of the longest range, near a change of shared components."""
         while self.heap:
             length, _, longest = heapq.heappop(self.heap)
             if len(longest) < -length:  # items were taken since
@@ -302,7 +302,7 @@ class _Dispatch:
         return None
 
     def _put_back(self, chunk: _Chunk, n_done: int = 0) -> None:
-        """Return the items of a chunk that were not computed to the unsent ones."""
+        """Move the uncomputed items of a chunk back to the unsent ranges."""
         left = chunk.positions[n_done:]
         if not left:
             return

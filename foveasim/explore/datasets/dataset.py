@@ -203,7 +203,7 @@ class Dataset:
         )
 
     def __len__(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return len(self._pictures) * self.cameras * self.draws
 
     def __iter__(self) -> Iterator[dict[str, Any]]:

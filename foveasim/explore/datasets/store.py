@@ -254,7 +254,7 @@ class StoredSamples:
         return f"StoredSamples({len(self)} in {self.path})"
 
     def __len__(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return self._shards.n_samples
 
     def __iter__(self) -> Iterator[dict[str, Any]]:

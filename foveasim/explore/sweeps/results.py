@@ -278,7 +278,7 @@ def write_store(dataset: xr.Dataset, path: Path) -> None:
         atomic_directory(path, is_ours=lambda folder: stored_plan(folder) is not None) as new,
         warnings.catch_warnings(),
     ):
-        # xarray.open_zarr reads consolidated metadata by default; the warning concerns other zarr implementations.
+        # For xarray.open_zarr. The warning concerns other zarr implementations, which do not need consolidated metadata.
         warnings.filterwarnings("ignore", "Consolidated metadata is currently not part")
         dataset.to_zarr(new, mode="w", consolidated=True, zarr_format=3)
         # Synchronised to disk before the journal is removed: after a power failure one of them is complete.
