@@ -1,4 +1,4 @@
-"""Executor of sweeps, studies and datasets: no item is lost or repeated when workers fail."""
+"""Executor of sweeps, studies and datasets: complete results despite failing workers."""
 
 from __future__ import annotations
 
