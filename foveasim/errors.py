@@ -1,21 +1,21 @@
 """
-Every error and warning that foveasim raises on purpose.
+Errors and warnings of foveasim.
 
 ::
 
     FoveasimError
-    ├── ParameterError   (ValueError)    one value is wrong: .name .value .unit
-    ├── GeometryError    (ValueError)    outlines that are no photosites: .site_ids
+    ├── ParameterError   (ValueError)    an invalid value: .name .value .unit
+    ├── GeometryError    (ValueError)    outlines that are not valid photosites: .site_ids
     ├── FileError        (ValueError)    a file that cannot be read or written: .path
-    │   └── ConfigError                  a settings file with a wrong key or value
-    └── SimulationError  (RuntimeError)  parts that do not fit together, found while running
+    │   └── ConfigError                  a settings file with an invalid key or value
+    └── SimulationError  (RuntimeError)  incompatible parts, detected during a simulation
 
     FoveasimWarning (UserWarning)
-    ├── SamplingWarning                  the discretisation is coarser than the physics asks for
-    ├── CoverageWarning                  photosites lie off the picture
-    └── LayoutWarning                    a layout covers less of its field than its parameters ask for
+    ├── SamplingWarning                  the sampling is too coarse for the physics
+    ├── CoverageWarning                  photosites lie outside the power map
+    └── LayoutWarning                    a layout covers less of its field than its parameters specify
 
-Each message says what is wrong, where, what was got, what was expected, and the hint.
+Each message gives the name of the parameter or the path of the file, the rule, the value and a hint.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ __all__ = [
 ]
 
 
-#: No value is to be shown; None is a value.
+#: Default for "no value": None is a value that messages show.
 _UNSAID = object()
 
 
 class FoveasimError(Exception):
-    """Base of all errors of the package; they go from process to process as they are."""
+    """Base class of all errors of the package; pickling preserves instances."""
 
     def __init__(self, message: str = "", *, prefix: str = "") -> None:
         super().__init__(prefix + _shortened(message))
@@ -57,12 +57,12 @@ class FoveasimError(Exception):
     def __reduce__(self) -> tuple[Any, ...]:
         state = dict(self.__dict__)
         if not isinstance(state.get("value"), str | int | float | None):
-            state["value"] = shown(state["value"])  # which may be anything
+            state["value"] = shown(state["value"])  # arbitrary objects may not be picklable
         return _restored, (type(self), self.args, state)
 
 
 class ParameterError(FoveasimError, ValueError):
-    """One parameter has a value that cannot be: raise it where a value enters the package."""
+    """Invalid value of a parameter, raised where the value enters the package."""
 
     def __init__(self, name: str, rule: str, value: object = _UNSAID, unit: str = "", hint: str = "") -> None:
         self.name = name
@@ -75,7 +75,7 @@ class ParameterError(FoveasimError, ValueError):
 
 
 class GeometryError(FoveasimError, ValueError):
-    """Outlines that are no photosites; ``site_ids`` are the positions of the bad ones."""
+    """Outlines that are not valid photosites; ``site_ids`` are the indices of the invalid ones."""
 
     def __init__(self, message: str, site_ids: tuple[int, ...] = ()) -> None:
         self.site_ids = site_ids
@@ -83,7 +83,7 @@ class GeometryError(FoveasimError, ValueError):
 
 
 class FileError(FoveasimError, ValueError):
-    """A file that is missing, broken, of the wrong kind, or too large."""
+    """A file that is missing, corrupt, of another format, or too large."""
 
     def __init__(self, path: str | Path, message: str) -> None:
         self.path = Path(path)
@@ -91,46 +91,46 @@ class FileError(FoveasimError, ValueError):
 
 
 class ConfigError(FileError):
-    """A settings file with an unknown key, a wrong type, or an impossible value."""
+    """A settings file with an unknown key, a wrong type, or an invalid value."""
 
 
 class SimulationError(FoveasimError, RuntimeError):
-    """Parts that are right alone and do not fit together."""
+    """Parts that are valid separately and incompatible with each other."""
 
 
 class FoveasimWarning(UserWarning):
-    """Base of all warnings of the package."""
+    """Base class of all warnings of the package."""
 
 
 class SamplingWarning(FoveasimWarning):
-    """The picture or the grid is too coarse or too small for the optics it meets."""
+    """A picture or grid that is too coarse or too small for the optics."""
 
 
 class CoverageWarning(FoveasimWarning):
-    """Photosites lie partly or wholly off the map of light and receive less, or nothing."""
+    """Photosites that are partly or completely outside the power map."""
 
 
 class LayoutWarning(FoveasimWarning):
-    """A generated layout covers less of its field than its parameters ask for."""
+    """A generated layout that covers less of its field than its parameters specify."""
 
 
 def _restored(kind: type[FoveasimError], args: tuple[Any, ...], state: dict[str, Any]) -> FoveasimError:
-    """An error that was pickled: its message is made, and must not be made again."""
+    """Return an unpickled error; its message is complete and must not be built a second time."""
     error = kind.__new__(kind)
     error.args = args
     error.__dict__.update(state)
     return error
 
 
-#: Characters of a value in a message, of a word in one, of a message, and of a file's path before it.
+#: Most characters of a value in a message, of a word in a message, of a message, and of the file path before it.
 LONGEST_VALUE, LONGEST_WORD, LONGEST_MESSAGE, LONGEST_PATH = 80, 240, 2000, 1000
-#: Containers are written out to this depth, with this many elements each: no message costs more than its length.
+#: Depth and number of elements of containers in messages: limits the cost of formatting large values.
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlong = 3, 2 * LONGEST_VALUE
 _SHORT.maxstring = _SHORT.maxother = LONGEST_VALUE
 for _kind in ("tuple", "list", "array", "dict", "set", "frozenset", "deque"):
     setattr(_SHORT, f"max{_kind}", 8)
-#: Errors of the system that mean that the disk, and not the data, ended the writing.
+#: System errors that report a failure of the disk, not of the data.
 DISK_ERRNOS = frozenset(
     getattr(errno, name) for name in ("ENOSPC", "EDQUOT", "EFBIG", "EROFS", "EIO") if hasattr(errno, name)
 )
@@ -143,24 +143,24 @@ def shown(value: Any, *, at_most: int = LONGEST_VALUE) -> str:
     Parameters
     ----------
     value : object
-        Of any size and depth.
+        Object of any size and depth.
     at_most : int
-        Number of characters.
+        Maximum number of characters.
 
     Returns
     -------
     text : str
-        Printable characters only; what exceeds the limit is replaced by ``...``.
+        Printable characters only; ``...`` replaces the characters above the limit.
     """
     try:
         text = printable(" ".join(_SHORT.repr(value).split()))
     except Exception:  # noqa: BLE001 -- the repr of any object may raise, and Python rejects very long integers
-        return f"one of type {type(value).__name__}"
+        return f"an object of type {type(value).__name__}"
     return text if len(text) <= at_most else text[: at_most - 3] + "..."
 
 
 def _shortened(message: str) -> str:
-    """Return a message without the middle of what is too long in it, whichever value that came from."""
+    """Replace the central part of long words and of a long message with ``...``."""
     words = re.sub(rf"\S{{{LONGEST_WORD + 1},}}", lambda word: _without_middle(word[0], LONGEST_VALUE), message)
     return _without_middle(words, LONGEST_MESSAGE)
 
@@ -172,14 +172,14 @@ def _without_middle(text: str, at_most: int) -> str:
 
 def printable(text: object, *, keep: str = "") -> str:
     r"""
-    Return a text with every character that a terminal does not print as an escape, such as ``\n`` and ``\x1b``.
+    Return a string with unprintable characters as escapes, such as ``\n`` and ``\x1b``.
 
     Parameters
     ----------
     text : object
-        A string or a path, from wherever.
+        A string or a path; may be untrusted.
     keep : str
-        Characters that stay as they are.
+        Characters that are not escaped.
 
     Returns
     -------
@@ -198,15 +198,16 @@ def printable(text: object, *, keep: str = "") -> str:
 
 def disk_problem(error: BaseException) -> str:
     """
-    Return the system's reason when the disk ended the writing: full, over a limit, read-only, failed; else ``""``.
+    Return the system's message when the disk caused a write error, else ``""``.
 
-    Libraries wrap the system's error in their own, so causes and contexts are inspected too.
+    Causes are a full disk, an exceeded quota or file size limit, a read-only file system and an input/output error. Libraries
+    wrap the system error in their own exceptions, so causes and contexts are also inspected.
     """
     seen: set[int] = set()
     found: BaseException | None = error
     while found is not None and id(found) not in seen:
         seen.add(id(found))
-        # KLayout, Arrow and HDF5 have the number in their messages.
+        # KLayout, Arrow and HDF5 report the error number only in their messages.
         number = re.search(r"errno ?=? ?(\d+)", str(found))
         for code in (getattr(found, "errno", None), number and int(number[1])):
             if code is not None and code in DISK_ERRNOS:

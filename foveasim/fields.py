@@ -1,9 +1,9 @@
 """
-The carriers that rooms hand to each other: the grid, the power map, and what a scene and a set of outlines are.
+Shared data types: grids, power maps, and protocols of scenes, lenses and outlines.
 
-One right-handed frame: origin on the optical axis, x to the right, y **up**. Row 0 of every array is its lowest
-y, and a picture file's first row is its highest: :func:`from_file_rows` and :func:`to_file_rows` are the only
-places where rows are turned over.
+All coordinates are in one right-handed frame: origin on the optical axis, x to the right, y **up**. Row 0 of every array has
+the lowest y. Picture files store the top row first; only :func:`from_file_rows` and :func:`to_file_rows` convert between the
+two orders.
 """
 
 from __future__ import annotations
@@ -41,39 +41,47 @@ __all__ = [
     "to_file_rows",
 ]
 
-#: Sides of a cell: one length of a square, or (along x, along y).
+#: Cell size: one length for square cells, or (along x, along y).
 Pitch: TypeAlias = float | tuple[float, float]
 
 
 class PackedRings(Protocol):
-    """Outlines as the integrator needs them; :class:`foveasim.Layout` is one."""
+    """Outlines that the integrator accepts, such as :class:`foveasim.Layout`."""
 
     @property
     def xy_um(self) -> Floats:
-        """Vertices (n_vertex, 2), rings one after the other, first vertex not repeated."""
+        """Vertices (n_vertex, 2) of consecutive rings; the first vertex is not repeated."""
 
     @property
     def ring_offsets(self) -> Ints:
-        """Ring r has the vertices ``ring_offsets[r] : ring_offsets[r + 1]``; (n_ring + 1,)."""
+        """Offsets (n_ring + 1,): ring r is ``xy_um[ring_offsets[r] : ring_offsets[r + 1]]``."""
 
     @property
     def site_offsets(self) -> Ints:
-        """Site s has the rings ``site_offsets[s] : site_offsets[s + 1]``, outer ones counter-clockwise; (n_site + 1,)."""
+        """
+        Offsets of the sites in the rings, (n_site + 1,).
+
+        Site s has the rings ``site_offsets[s] : site_offsets[s + 1]``; outer rings are counter-clockwise.
+        """
 
 
 class PointMap(Protocol):
-    """A lens as the integrator needs it; the models of :mod:`foveasim.distortion` are such."""
+    """Lens distortion that the integrator accepts; see :mod:`foveasim.distortion`."""
 
     def undistort(self, xy_um: ArrayLike, *, outside: Any = "error") -> Floats:
-        """Where an ideal lens would put what this one puts at (..., 2) points, µm; with "mask" NaN where there is no light."""
+        """
+        Return the undistorted image positions of (..., 2) points, µm.
+
+        With ``outside="mask"``, points outside the image circle become NaN.
+        """
 
 
 class SceneLike(Protocol):
     """
-    Light from a plane in front of the lens, as the optics needs it; :class:`foveasim.Scene` is one.
+    Planar scene that the optics accepts, such as :class:`foveasim.Scene`.
 
     The spectral radiance of pixel [iy, ix] at wavelength k is ``sum_b basis[b, iy, ix] * spectrum[b, k]`` in
-    W/(m² sr nm), and every wavelength stands for a band of ``band_width_nm[k]``.
+    W/(m² sr nm). Each wavelength represents a band of width ``band_width_nm[k]``.
     """
 
     @property
@@ -82,7 +90,7 @@ class SceneLike(Protocol):
 
     @property
     def spectrum_w_m2_sr_nm(self) -> Floats:
-        """Their spectra (n_basis, n_wavelength)."""
+        """Spectra of the basis images (n_basis, n_wavelength)."""
 
     @property
     def wavelength_nm(self) -> Floats:
@@ -90,15 +98,15 @@ class SceneLike(Protocol):
 
     @property
     def band_width_nm(self) -> Floats:
-        """Widths of the wavelengths' bands (n_wavelength,)."""
+        """Widths of the wavelength bands (n_wavelength,)."""
 
     @property
     def pitch_um(self) -> float:
-        """Distance of two pixels in the scene."""
+        """Pixel pitch in the scene plane."""
 
     @property
     def distance_m(self) -> float:
-        """Distance of the scene from the pupil."""
+        """Distance between the scene and the pupil."""
 
 
 @dataclass(frozen=True)
@@ -111,15 +119,15 @@ class Grid:
     shape : (n_y, n_x)
         Numbers of rows and columns.
     pitch_um : float, or (pitch_x, pitch_y), µm
-        Side of a square cell, or width and height of a rectangular one. Two equal numbers become one: ``pitch_um`` is a float
-        for square cells and a tuple for others; ``pitch_x_um`` and ``pitch_y_um`` are floats for both.
+        Side of square cells, or width and height of rectangular cells. Two equal numbers are stored as one: ``pitch_um`` is a
+        float for square cells and a tuple for others; ``pitch_x_um`` and ``pitch_y_um`` are floats for both.
     origin_um : (x0, y0), µm
         Lower left corner of cell [0, 0].
 
     Raises
     ------
     ParameterError
-        When a number is out of range.
+        When a value is out of range.
 
     Examples
     --------
@@ -145,39 +153,39 @@ class Grid:
 
     @classmethod
     def centred(cls, shape: tuple[int, int], pitch_um: Pitch) -> Grid:
-        """Grid whose middle lies on the optical axis; arguments as for the class."""
+        """Return a grid centred on the optical axis; parameters as for the class."""
         n_y, n_x = check_shape("shape", shape)
         pitch_x_um, pitch_y_um = check_pitch_um("pitch_um", pitch_um)
         return cls(shape, pitch_um, (-0.5 * n_x * pitch_x_um, -0.5 * n_y * pitch_y_um))
 
     @property
     def pitch_x_um(self) -> float:
-        """Width of a cell in µm."""
+        """Cell width in µm."""
         return self.pitch_um[0] if isinstance(self.pitch_um, tuple) else self.pitch_um
 
     @property
     def pitch_y_um(self) -> float:
-        """Height of a cell in µm."""
+        """Cell height in µm."""
         return self.pitch_um[1] if isinstance(self.pitch_um, tuple) else self.pitch_um
 
     @property
     def pitch_xy_um(self) -> Floats:
-        """Width and height of a cell, (2,) µm."""
+        """Cell width and height, (2,) µm."""
         return np.array([self.pitch_x_um, self.pitch_y_um])
 
     @property
     def is_square(self) -> bool:
-        """Whether cells are as wide as they are high."""
+        """Whether the cells are square."""
         return not isinstance(self.pitch_um, tuple)
 
     @property
     def cell_area_um2(self) -> float:
-        """Area of a cell in µm²."""
+        """Cell area in µm²."""
         return self.pitch_x_um * self.pitch_y_um
 
     @property
     def bounds_um(self) -> tuple[float, float, float, float]:
-        """The grid's (x_min, y_min, x_max, y_max) in µm."""
+        """Bounds (x_min, y_min, x_max, y_max) in µm."""
         x0, y0 = self.origin_um
         return x0, y0, x0 + self.shape[1] * self.pitch_x_um, y0 + self.shape[0] * self.pitch_y_um
 
@@ -195,22 +203,22 @@ class Grid:
 @dataclass(frozen=True, eq=False)
 class PowerMap:
     """
-    Light on the sensor plane.
+    Irradiance in the sensor plane, per wavelength band.
 
     Parameters
     ----------
     data : (n_band, n_y, n_x) float32 or float64, W/m² per band
-        Mean irradiance of each cell, within the band of each wavelength. Copied, so that later edits of the array do not
-        change the map; an array that is read-only already, with all that it is a view of, is shared.
+        Mean irradiance of each cell within each band. The array is copied, so that later edits do not change the map; an
+        array that is read-only together with its base arrays is shared.
     grid : Grid
-        Where the cells are.
+        Grid of the cells.
     wavelength_nm : (n_band,) float64, nm
-        The bands' wavelengths.
+        Wavelength of each band.
 
     Raises
     ------
     ParameterError
-        When the shapes do not fit together, cells are masked, or a wavelength is not positive.
+        When shapes do not match, cells are masked, or a wavelength is not positive.
     """
 
     data: Images
@@ -246,20 +254,20 @@ class PowerMap:
         top_row_first: bool = False,
     ) -> PowerMap:
         """
-        Map of a plain array.
+        Return a power map of a plain array.
 
         Parameters
         ----------
         data : (n_y, n_x) or (n_band, n_y, n_x), W/m² per band
-            Mean irradiance of each cell; two dimensions are one band.
+            Mean irradiance of each cell; a two-dimensional array is one band.
         pitch_um : float, or (pitch_x, pitch_y), µm
-            Side of a square cell, or width and height of a rectangular one.
+            Side of square cells, or width and height of rectangular cells.
         wavelength_nm : number or (n_band,), nm
-            The bands' wavelengths.
+            Wavelength of each band.
         origin_um : (x0, y0), optional, µm
-            Lower left corner of the lowest row's first cell; by default the map's middle lies on the optical axis.
+            Lower left corner of the first cell of the lowest row; by default the map is centred on the optical axis.
         top_row_first : bool
-            Whether the first row is the one on top, as in pictures; by default it is the lowest.
+            Whether the first row is the top row, as in pictures; by default it is the lowest.
 
         Returns
         -------
@@ -268,7 +276,7 @@ class PowerMap:
         Raises
         ------
         ParameterError
-            When the array has another number of dimensions or no real numbers, or does not fit the wavelengths.
+            When the array has another number of dimensions, is not real, or does not match the wavelengths.
 
         Examples
         --------
@@ -293,22 +301,30 @@ class PowerMap:
 
 
 def from_file_rows(picture: NDArray[Any]) -> NDArray[Any]:
-    """(n_y, n_x) or (n_y, n_x, n_channel), first row on top, to (n_channel, n_y, n_x), first row lowest (a view)."""
+    """
+    Convert a picture with the top row first to channels with the lowest row first.
+
+    The shape (n_y, n_x) or (n_y, n_x, n_channel) becomes (n_channel, n_y, n_x). Returns a view.
+    """
     channels = picture[np.newaxis] if picture.ndim == 2 else np.moveaxis(picture, -1, 0)
     return channels[:, ::-1, :]
 
 
 def to_file_rows(picture: ArrayLike) -> NDArray[Any]:
-    """(n_y, n_x) or (n_channel, n_y, n_x), first row lowest, to (n_y, n_x[, n_channel]), first row on top (a view)."""
+    """
+    Convert channels with the lowest row first to a picture with the top row first.
+
+    The shape (n_y, n_x) or (n_channel, n_y, n_x) becomes (n_y, n_x[, n_channel]). Returns a view.
+    """
     picture = np.asarray(unmasked("picture", picture))
     return picture[::-1] if picture.ndim == 2 else np.moveaxis(picture, 0, -1)[::-1]
 
 
 def rising(images: NDArray[Any], *, is_x_falling: bool = False, is_y_falling: bool = False) -> NDArray[Any]:
     """
-    (..., n_y, n_x) along axes that fall or rise, to axes that rise: lowest row first, leftmost column first.
+    Return images (..., n_y, n_x) on ascending axes: lowest row and leftmost column first.
 
-    Contiguous; read-only where that takes a copy.
+    The result is contiguous, and read-only if it is a copy.
     """
     turned = images[..., :: -1 if is_y_falling else 1, :: -1 if is_x_falling else 1]
     contiguous = np.ascontiguousarray(turned)

@@ -1,5 +1,5 @@
 """
-Physical constants and the conversions between the units that names in this package carry.
+Physical constants, and conversions between the units that suffixes of names specify.
 
 Constants are the exact values of the 2019 SI (CODATA 2018).
 """
@@ -33,52 +33,52 @@ BOLTZMANN_J_PER_K = 1.380649e-23
 
 
 def m_from_um(length_um: Floats | float) -> Floats:
-    """Metres from micrometres."""
+    """Convert micrometres to metres."""
     return as_numbers("length_um", length_um) * 1e-6
 
 
 def m_from_mm(length_mm: Floats | float) -> Floats:
-    """Metres from millimetres."""
+    """Convert millimetres to metres."""
     return as_numbers("length_mm", length_mm) * 1e-3
 
 
 def m_from_nm(length_nm: Floats | float) -> Floats:
-    """Metres from nanometres."""
+    """Convert nanometres to metres."""
     return as_numbers("length_nm", length_nm) * 1e-9
 
 
 def um_from_m(length_m: Floats | float) -> Floats:
-    """Micrometres from metres."""
+    """Convert metres to micrometres."""
     return as_numbers("length_m", length_m) * 1e6
 
 
 def um_from_nm(length_nm: Floats | float) -> Floats:
-    """Micrometres from nanometres."""
+    """Convert nanometres to micrometres."""
     return as_numbers("length_nm", length_nm) * 1e-3
 
 
 def per_um_from_per_mm(frequency_per_mm: Floats | float) -> Floats:
-    """Line pairs per micrometre from line pairs per millimetre."""
+    """Convert line pairs per millimetre to line pairs per micrometre."""
     return as_numbers("frequency_per_mm", frequency_per_mm) * 1e-3
 
 
 def per_mm_from_per_um(frequency_per_um: Floats | float) -> Floats:
-    """Line pairs per millimetre from line pairs per micrometre."""
+    """Convert line pairs per micrometre to line pairs per millimetre."""
     return as_numbers("frequency_per_um", frequency_per_um) * 1e3
 
 
 def w_from_w_m2_um2(power_w_m2_um2: Floats | float) -> Floats:
-    """Watts from (W/m²)·µm², the unit of a map in W/m² integrated over an area in µm²."""
+    """Convert (W/m²)·µm², irradiance in W/m² integrated over an area in µm², to watts."""
     return as_numbers("power_w_m2_um2", power_w_m2_um2) * 1e-12
 
 
 def photon_energy_j(wavelength_nm: Floats | float) -> Floats:
     """
-    Energy of one photon, ``h c / wavelength``.
+    Return the energy of a photon in joules, ``h c / wavelength``.
 
     Examples
     --------
-    1 W/m² on 1 µm² for 1 s at 550 nm is 2.769 million photons:
+    An irradiance of 1 W/m² on 1 µm² for 1 s at 550 nm corresponds to 2.769 million photons:
 
     >>> float(round(1e-12 / photon_energy_j(550.0)))
     2768764.0
@@ -87,10 +87,10 @@ def photon_energy_j(wavelength_nm: Floats | float) -> Floats:
 
 
 def electrons_to_volts(charge_e: Floats | float, capacitance_f: Floats | float) -> Floats:
-    """Voltage of a charge on a capacitance, ``q n / C``."""
+    """Convert a charge in electrons on a capacitance to a voltage, ``q n / C``."""
     return ELEMENTARY_CHARGE_C * as_numbers("charge_e", charge_e) / as_numbers("capacitance_f", capacitance_f)
 
 
 def volts_to_electrons(voltage_v: Floats | float, capacitance_f: Floats | float) -> Floats:
-    """Charge that makes a voltage on a capacitance, ``C U / q``, in electrons."""
+    """Convert a voltage on a capacitance to a charge in electrons, ``C U / q``."""
     return as_numbers("voltage_v", voltage_v) * as_numbers("capacitance_f", capacitance_f) / ELEMENTARY_CHARGE_C

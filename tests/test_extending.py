@@ -97,7 +97,7 @@ def test_name_is_registered_once():
     registry.register("one", int)
 
     assert registry.register("one", int) is int
-    with pytest.raises(ParameterError, match="'name' must be new: there is another thing of this name, got 'one'"):
+    with pytest.raises(ParameterError, match="'name' must be new: another thing has this name, got 'one'"):
         registry.register("one", float)
 
 

@@ -37,7 +37,7 @@ def test_absurd_shapes_are_rejected_before_allocation(make):
     # The oracle is arithmetic: 1e12 float32 are 4e12 bytes, 3,725 GiB.
     with pytest.raises(
         ParameterError,
-        match=r"must give 3 arrays of 3,725 GiB that fit in the memory of .* GiB, got \(1000000, 1000000\)",
+        match=r"must fit in memory: 3 arrays of 3,725 GiB exceed .* GiB, got \(1000000, 1000000\)",
     ):
         make()
 
@@ -46,7 +46,7 @@ def test_absurd_shapes_are_rejected_before_allocation(make):
 def test_absurd_charts_are_rejected_before_allocation(name):
     chart = getattr(charts, name)
     parameters = [k for k, p in inspect.signature(chart).parameters.items() if p.default is p.empty]
-    with pytest.raises(ParameterError, match=r"'shape' must give 3 arrays of 3,725 GiB"):
+    with pytest.raises(ParameterError, match=r"'shape' must fit in memory: 3 arrays of 3,725 GiB"):
         chart(**LIT, **{name: 1.0 for name in parameters if name not in LIT})
 
 

@@ -1,1 +1,1 @@
-"""What every part uses: checks of arguments, packed rings, random streams, threads, compiled kernels, provenance."""
+"""Shared code: validation, packed rings, random streams, threads, kernels, provenance."""

@@ -1,8 +1,9 @@
 """
-Random numbers by place: Philox generators, which turn a counter and a key into words, and Gaussian numbers from them.
+Counter-based random numbers: Philox generators, and Gaussian numbers from their words.
 
-J. K. Salmon, M. A. Moraes, R. O. Dror and D. E. Shaw, Parallel random numbers: as easy as 1, 2, 3 (SC11), section 3.3.
-All have ten rounds. Words of 32 bits are held in 64-bit numbers.
+A Philox generator maps a counter and a key to random words: J. K. Salmon, M. A. Moraes, R. O. Dror and D. E. Shaw, Parallel
+random numbers: as easy as 1, 2, 3 (SC11), section 3.3. All generators use ten rounds. Words of 32 bits are stored in 64-bit
+integers.
 """
 
 from __future__ import annotations
@@ -16,18 +17,18 @@ from foveasim._core.jit import njit
 
 __all__ = ["philox_2x32", "philox_4x32", "philox_4x64", "standard_normal", "uniform"]
 
-#: Philox 4x64: multipliers and Weyl steps.
+#: Multipliers and Weyl increments of Philox 4x64.
 _M0, _M1 = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
 _W0, _W1 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBB67AE8584CAA73B)
-#: Philox 4x32 and 2x32.
+#: Multipliers and Weyl increments of Philox 4x32 and 2x32.
 _M0_32, _M1_32 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
 _W0_32, _W1_32 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
 _M_32 = np.uint64(0xD256D193)
 _LOW, _32, _11 = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(11)
 _ONE_IN_2_53, _ONE_IN_2_32, _ONE_IN_2_64, _2_31 = 2.0**-53, 2.0**-32, 2.0**-64, 2.0**31
-#: Pairs of Gaussian numbers per pass through all steps: their buffers fit the L1 cache.
+#: Pairs of Gaussian numbers per block: the buffers of a block fit in the L1 cache.
 PIECE = 512
-#: A float64's exponent begins at this bit; bits of 1.0, of sqrt(1/2), and those of a mantissa.
+#: Lowest bit of the exponent of a float64; bit patterns of 1.0 and sqrt(1/2); mask of the mantissa.
 _EXPONENT = 52
 _ONE = np.float64(1.0).view(np.int64)
 _SQRT_HALF = np.float64(math.sqrt(0.5)).view(np.int64)
@@ -35,7 +36,7 @@ _MANTISSA = np.int64((1 << _EXPONENT) - 1)
 _BIAS = 1023
 _LN_2 = math.log(2.0)
 _HALF_PI_IN_2_32 = 0.5 * math.pi * _ONE_IN_2_32
-#: Taylor series: sine and cosine up to pi / 4 to 2e-14, and twice the inverse hyperbolic tangent up to 0.172 to 1e-14.
+#: Taylor series of sine and cosine, error 2e-14 up to pi / 4, and of 2 artanh, error 1e-14 up to 0.172.
 _S3, _S5, _S7, _S9, _S11, _S13 = ((-1.0) ** k / math.factorial(2 * k + 1) for k in range(1, 7))
 _C2, _C4, _C6, _C8, _C10, _C12, _C14 = ((-1.0) ** k / math.factorial(2 * k) for k in range(1, 8))
 _L1, _L3, _L5, _L7, _L9, _L11, _L13, _L15, _L17 = (2.0 / k for k in range(1, 18, 2))
@@ -43,7 +44,7 @@ _L1, _L3, _L5, _L7, _L9, _L11, _L13, _L15, _L17 = (2.0 / k for k in range(1, 18,
 
 @njit(inline="always")
 def _high_word(a, b):
-    """Upper half of the product of two 64-bit numbers."""
+    """Return the upper 64 bits of the product of two 64-bit integers."""
     a_low, a_high, b_low, b_high = a & _LOW, a >> _32, b & _LOW, b >> _32
     middle = a_high * b_low + ((a_low * b_low) >> _32)
     low = (middle & _LOW) + a_low * b_high
@@ -52,7 +53,7 @@ def _high_word(a, b):
 
 @njit()
 def philox_4x64(key_0, key_1, c0, c1, c2, c3):
-    """Four random words of 64 bits."""
+    """Return four random words of 64 bits."""
     for _ in range(10):
         high_0, low_0 = _high_word(_M0, c0), _M0 * c0
         high_1, low_1 = _high_word(_M1, c2), _M1 * c2
@@ -64,7 +65,11 @@ def philox_4x64(key_0, key_1, c0, c1, c2, c3):
 
 @njit(inline="always")
 def philox_4x32(key_0, key_1, c0, c1, c2, c3):
-    """Four random words of 32 bits. A loop over counters is vectorised."""
+    """
+    Return four random words of 32 bits.
+
+    The compiler vectorises a loop over counters.
+    """
     for _ in range(10):
         first, second = _M0_32 * c0, _M1_32 * c2
         c0, c1, c2, c3 = (second >> _32) ^ c1 ^ key_0, second & _LOW, (first >> _32) ^ c3 ^ key_1, first & _LOW
@@ -75,7 +80,11 @@ def philox_4x32(key_0, key_1, c0, c1, c2, c3):
 
 @njit(inline="always")
 def philox_2x32(key, c0, c1):
-    """Two random words of 32 bits, at a fifth of the cost of Philox 4x64. A loop over counters is vectorised."""
+    """
+    Return two random words of 32 bits, at a fifth of the cost of Philox 4x64.
+
+    The compiler vectorises a loop over counters.
+    """
     for _ in range(10):
         product = _M_32 * c0
         c0, c1 = (product >> _32) ^ key ^ c1, product & _LOW
@@ -85,24 +94,24 @@ def philox_2x32(key, c0, c1):
 
 @njit(inline="always")
 def uniform(word):
-    """Number between 0 and 1, neither of them, of a word of 64 bits."""
+    """Convert a word of 64 bits to a number in the open interval (0, 1)."""
     return (np.float64(word >> _11) + 0.5) * _ONE_IN_2_53
 
 
 @njit(types.void(types.uint64, types.float64[::1]), error_model="numpy")
 def standard_normal(key, out):
     """
-    Fill an array with standard Gaussian numbers; number ``i`` depends on the key and ``i`` alone.
+    Fill an array with standard Gaussian numbers.
 
-    Counter ``i // 2`` of Philox 4x32 gives a pair by the method of G. E. P. Box and M. E. Muller, A note on the generation of
-    random normal deviates (Ann. Math. Statist. 29, 1958): the radius ``sqrt(-2 ln u)``, u from 64 bits, at an angle in the
-    first quadrant, and two random signs.
+    Number ``i`` depends only on the key and ``i``. Counter ``i // 2`` of Philox 4x32 gives a pair of numbers by the method of
+    G. E. P. Box and M. E. Muller, A note on the generation of random normal deviates (Ann. Math. Statist. 29, 1958): the radius
+    is ``sqrt(-2 ln u)`` with u from 64 bits, the angle is in the first quadrant, and two bits give the signs.
 
     Notes
     -----
-    With the angle ``pi/4 + a`` and ``r = sqrt(-ln u)``, the pair is ``r (cos a + sin a)`` and ``r (cos a - sin a)``: sine and
-    cosine of at most pi/4 need no reduction. Logarithm, sine and cosine are sums and products only, in a fixed order, so that
-    the compiler vectorises them and every machine gives the same bits.
+    With the angle ``pi/4 + a`` and ``r = sqrt(-ln u)``, the pair is ``r (cos a + sin a)`` and ``r (cos a - sin a)``: ``a`` is
+    at most pi/4, so sine and cosine need no range reduction. Logarithm, sine and cosine are evaluated by sums and products in a
+    fixed order: the compiler vectorises them, and results are bit-identical on every machine.
     """
     u, angle, signs = np.empty(PIECE), np.empty(PIECE), np.empty(PIECE, np.int32)
     mantissa, exponent = np.empty(PIECE), np.empty(PIECE)
@@ -114,7 +123,7 @@ def standard_normal(key, out):
         for j in range(n):
             counter = np.uint64(first + j)
             a, b, c, d = philox_4x32(key_0, key_1, counter & _LOW, counter >> _32, zero, zero)
-            # Signed words of 32 bits become floating-point numbers in one vector instruction.
+            # One vector instruction converts signed 32-bit integers to floating-point numbers.
             low = (np.float64(np.int32(b)) + (_2_31 + 0.5)) * _ONE_IN_2_64
             u[j] = (np.float64(np.int32(a)) + _2_31) * _ONE_IN_2_32 + low
             angle[j] = (np.float64(np.int32(c)) + 0.5) * _HALF_PI_IN_2_32

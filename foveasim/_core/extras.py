@@ -1,4 +1,4 @@
-"""Optional libraries: which extra of the package brings each, and the message where one is missing."""
+"""Optional libraries: the extra that installs each, and the message for a missing one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from foveasim.errors import FileError
 
 __all__ = ["EXTRA_OF", "install_hint", "library", "needs"]
 
-#: Extra of each optional module, the smallest that brings it.
+#: Smallest extra that installs each optional module.
 EXTRA_OF = {
     "OpenEXR": "pictures",
     "astropy": "maps",
@@ -36,7 +36,7 @@ EXTRA_OF = {
 
 
 def install_hint(module: str, extra: str | None = None) -> str:
-    """Return the command that installs a module, with the extra that brings it or another that does."""
+    """Return the command that installs a module, by default with its smallest extra."""
     return f"install it with: pip install 'foveasim[{extra or EXTRA_OF[module]}]'"
 
 
@@ -47,12 +47,12 @@ def needs(module: str, extra: str | None = None) -> str:
 
 def library(path: Path, module: str) -> Any:
     """
-    Import a module that files of a kind need.
+    Import an optional module that a file requires.
 
     Raises
     ------
     FileError
-        When it is not installed, with the path of the file.
+        When the module is not installed; the message contains the path of the file.
     """
     try:
         return import_module(module)

@@ -1,8 +1,8 @@
 """
 Compilation of numba kernels, with machine code cached on disk.
 
-Kernels lie in modules of their own, ``_kernels.py``, which are imported where they are called: numba takes half a second
-to load and compiling takes seconds, so neither happens at ``import foveasim``.
+Kernels are defined in separate modules, ``_kernels.py``, which are imported by the functions that call them: importing numba
+takes half a second and compilation takes seconds, so neither happens at ``import foveasim``.
 """
 
 from __future__ import annotations
@@ -22,30 +22,31 @@ from foveasim.errors import FileError
 __all__ = ["njit"]
 
 _log = logging.getLogger("foveasim")
-#: Reads and writes machine code on disk; its objects have a ``cache_path``.
+#: Module of numba that reads and writes machine code on disk; its objects have a ``cache_path``.
 CACHING = "numba.core.caching"
-#: Modules whose compilation was announced.
+#: Modules whose compilation has been logged.
 _announced: set[str] = set()
 
 
 def njit(signature: Any = None, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """
-    Decorate a kernel: :func:`numba.njit` that releases the GIL and caches machine code on disk.
+    Decorate a kernel with :func:`numba.njit`, with machine code cached on disk.
 
-    A first compilation is announced. If no directory can store the machine code, the temporary one does. Machine code on
-    disk that numba cannot read, as a full disk or a crash leaves it, is deleted and compiled again.
+    The kernel releases the GIL. The first compilation is logged. If the default cache directories are not writeable, machine
+    code is stored in the temporary directory. Machine code that numba cannot read, for example after a full disk or a crash, is
+    deleted and compiled again.
 
     Parameters
     ----------
     signature : numba type or list of them, optional
-        Compile at once for these arguments; without it, when a kernel that calls it is compiled.
+        Argument types to compile for at import; by default the kernel is compiled with the kernel that calls it.
     **options
         Further options of :func:`numba.njit`.
 
     Raises
     ------
     FileError
-        When machine code can be neither read from disk nor replaced there; it names the directory to delete.
+        When cached machine code can be neither read nor replaced; the message names the directory to delete.
     """
     import numba
 
@@ -77,7 +78,11 @@ def njit(signature: Any = None, **options: Any) -> Callable[[Callable[..., Any]]
 
 
 def _is_cached(function: Callable[..., Any]) -> bool:
-    """Whether machine code is next to the source, or may be elsewhere because the source's directory cannot be written."""
+    """
+    Whether machine code is cached next to the source.
+
+    True also where the cache may be in another directory: ``NUMBA_CACHE_DIR`` is set, or the source directory is read-only.
+    """
     source = Path(inspect.getfile(function))
     is_elsewhere = bool(os.environ.get("NUMBA_CACHE_DIR")) or not os.access(source.parent, os.W_OK)
     pattern = f"{source.stem}.*py{sys.version_info.major}{sys.version_info.minor}*.nbi"
@@ -85,7 +90,7 @@ def _is_cached(function: Callable[..., Any]) -> bool:
 
 
 def _cache_of(error: BaseException | None) -> Path | None:
-    """Directory of the cache in which an error was raised, or one that it followed; None where it was raised elsewhere."""
+    """Return the cache directory in which an error or its cause was raised, or None."""
     while error is not None:
         for frame, _ in traceback.walk_tb(error.__traceback__):
             path = getattr(frame.f_locals.get("self"), "cache_path", None)
@@ -96,7 +101,7 @@ def _cache_of(error: BaseException | None) -> Path | None:
 
 
 def _empty(directory: Path) -> None:
-    """Delete the machine code in a directory; numba has one for each directory of sources."""
+    """Delete the machine code in a cache directory; numba creates one per source directory."""
     try:
         for path in directory.glob("*.nb[ic]"):
             path.unlink(missing_ok=True)
@@ -106,7 +111,7 @@ def _empty(directory: Path) -> None:
 
 def _unusable(directory: Path, error: Exception) -> FileError:
     reason = " ".join(str(error).split()) or type(error).__name__
-    hint = "delete this directory, or name another one in NUMBA_CACHE_DIR"
+    hint = "delete this directory, or set NUMBA_CACHE_DIR to another one"
     return FileError(
         directory, f"contains compiled kernels that can be neither read nor replaced ({reason:.200}); {hint}"
     )

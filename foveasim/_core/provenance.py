@@ -1,4 +1,4 @@
-"""What a result was made from, as plain data that can be written to a file and compared: settings and versions."""
+"""Provenance of results: settings and versions as plain data."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from foveasim._version import __version__
 
 __all__ = ["copied", "differences", "to_plain_data", "versions"]
 
-#: Arrays up to this size are written out; of longer ones the shape and a checksum are kept.
+#: Arrays up to this size are stored as lists; larger arrays as shape, dtype and checksum.
 WRITTEN_OUT = 64
 _ATOMS = frozenset({str, int, float, bool, type(None)})
 
 
 def to_plain_data(value: Any) -> Any:
     """
-    Plain data (numbers, text, lists, dicts) that tells what an object is.
+    Convert an object to plain data: numbers, strings, lists and dicts.
 
-    A dataclass becomes a dict of its fields and its class; a long array its shape, type and SHA-256.
+    A dataclass becomes a dict of its class name and public fields; a large array becomes its shape, dtype and SHA-256.
     """
     if value is None or isinstance(value, bool | int | float | str):
         return value
@@ -50,8 +50,8 @@ def to_plain_data(value: Any) -> Any:
 
 
 def copied(value: Any) -> Any:
-    """Plain data as new dicts and lists all the way down: editing the copy leaves the original as it was."""
-    # Plain classes first: the general ones take several times as long, and every frame of a video has such data.
+    """Return a deep copy of plain data; editing the copy does not change the original."""
+    # Concrete types first: checks of abstract types take several times as long, and every video frame has such data.
     if type(value) in _ATOMS:
         return value
     if isinstance(value, dict | Mapping):
@@ -64,7 +64,7 @@ def copied(value: Any) -> Any:
 
 
 def differences(one: Any, other: Any, place: str = "") -> Iterator[str]:
-    """Dotted names of the places in which plain data differ: ``optics.f_number``."""
+    """Yield the dotted names of the entries in which plain data differ: ``optics.f_number``."""
     if isinstance(one, dict) and isinstance(other, dict):
         for key in dict.fromkeys([*one, *other]):
             inside = f"{place}.{key}" if place else str(key)
@@ -83,5 +83,5 @@ def _versions() -> dict[str, str]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of the package, of Python, and of the libraries that results depend on."""
+    """Return the versions of the package, of Python, and of the libraries that affect results."""
     return dict(_versions())

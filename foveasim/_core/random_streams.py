@@ -1,4 +1,8 @@
-"""Random numbers: one stream for each effect, named, so that an effect more or less leaves all others as they were."""
+"""
+Random number streams, one per named effect.
+
+Adding or removing an effect does not change the numbers of the others.
+"""
 
 from __future__ import annotations
 
@@ -13,22 +17,22 @@ __all__ = ["Streams", "derived_seed", "device_key", "standard_normal"]
 
 
 def device_key(seed: int, effect: str) -> tuple[np.uint64, np.uint64]:
-    """Key of a counter-based generator for what is fixed in a device: an effect's numbers, of the device's seed."""
+    """Return the generator key for the fixed pattern of an effect in a device."""
     words = np.random.SeedSequence(seed, spawn_key=(crc32(effect.encode()),)).generate_state(2, np.uint64)
     return words[0], words[1]
 
 
 def derived_seed(seed: int, index: int) -> int:
-    """Seed below 2**63 of one run among many: it depends on the seed of them all and the run's number alone."""
+    """Return a seed below 2**63 that depends only on a common seed and the index of the run."""
     return int(np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 def standard_normal(rng: np.random.Generator, n: int) -> Floats:
     """
-    Standard Gaussian numbers, at less than half the cost of the generator's own.
+    Return standard Gaussian numbers, at less than half the cost of ``rng.standard_normal``.
 
-    One word of the generator is the key of a counter-based generator, whose numbers are turned into Gaussian ones by the
-    method of Box and Muller: see :func:`foveasim._core._kernels.standard_normal`.
+    One word of the generator is the key of a counter-based generator, and the Box-Muller method converts its numbers to
+    Gaussian numbers: see :func:`foveasim._core._kernels.standard_normal`.
 
     Returns
     -------
@@ -44,29 +48,29 @@ def standard_normal(rng: np.random.Generator, n: int) -> Floats:
 @dataclass(frozen=True, slots=True)
 class Streams:
     """
-    The random streams of one frame.
+    Random streams of one frame.
 
     Parameters
     ----------
     seed : int
-        Of the whole run, at least 0.
+        Seed of the run, at least 0.
     frame : int
-        Number of the frame, at least 0.
+        Index of the frame, at least 0.
 
     Raises
     ------
     ParameterError
-        When a number is negative or not whole.
+        When a value is negative or not an integer.
 
     Notes
     -----
-    A stream depends on (seed, frame, name of the effect) and on nothing else: not on the order of calls, nor on the
-    number of threads or processes.
+    A stream depends only on (seed, frame, name of the effect), not on the order of calls or on the number of threads or
+    processes.
 
-    Stability: with the same versions of this package and of numpy a seed gives the same numbers, bit for bit, on any machine;
-    every capture records both versions. Between versions numbers may change (numpy promises the raw words of its generators,
-    not what its distributions make of them); where ours do, the changelog says so. Gaussian noise and what is fixed in a
-    device come from published counter-based generators.
+    Stability: with the same versions of this package and of numpy, a seed gives bit-identical numbers on any machine; every
+    capture records both versions. Numbers may change between versions: numpy guarantees the raw words of its generators, not
+    the numbers that its distributions draw from them. The changelog lists changes of this package. Gaussian noise and the
+    fixed pattern of a device come from published counter-based generators.
     """
 
     seed: int
@@ -77,6 +81,6 @@ class Streams:
         object.__setattr__(self, "frame", check_count("frame", self.frame, at_least=0))
 
     def of(self, effect: str, block: int | None = None) -> np.random.Generator:
-        """A fresh generator of the effect's stream, at its beginning; of one of its blocks, where it has several."""
+        """Return a new generator at the start of the stream of an effect, or of one of its blocks."""
         key = (self.frame, crc32(effect.encode())) if block is None else (self.frame, crc32(effect.encode()), block)
         return np.random.Generator(np.random.PCG64DXSM(np.random.SeedSequence(self.seed, spawn_key=key)))

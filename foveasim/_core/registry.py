@@ -1,4 +1,4 @@
-"""Registries: what the package offers by name, with what users and installed packages add."""
+"""Registries of named objects, extensible by users and installed packages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,11 @@ __all__ = ["Registry", "import_all"]
 
 
 def import_all(package: str, path: Iterable[str], *, skip: str = "_kernels") -> None:
-    """Import the modules of a package, so that what they contain is registered, but those whose names begin with ``skip``."""
+    """
+    Import the modules of a package, so that their objects are registered.
+
+    Modules whose names begin with ``skip`` are not imported.
+    """
     for module in iter_modules(path):
         if not module.name.startswith(skip):
             import_module(f"{package}.{module.name}")
@@ -29,22 +33,22 @@ _log = logging.getLogger("foveasim")
 
 class Registry(Mapping[str, T], Generic[T]):
     """
-    Objects of one kind by name: our own, those that a program registers, and entry points of installed packages.
+    Objects of one kind by name: built-in, registered by users, or from entry points.
 
     Parameters
     ----------
     kind : str
-        What the objects are, for messages: "layout family".
+        Kind of the objects, for messages: "layout family".
     group : str
-        Group of entry points, such as "foveasim.layouts"; the name of an entry point is that of its object. They are loaded
-        when the registry is first read. One that fails to load is reported as a warning and left out.
+        Group of entry points, such as "foveasim.layouts"; the name of an entry point is the name of its object. Entry points
+        are loaded when the registry is first read. An entry point that fails to load is logged as a warning and skipped.
     """
 
     def __init__(self, kind: str, group: str) -> None:
         self.kind, self.group = kind, group
         self._objects: dict[str, T] = {}
         self._is_complete = False
-        #: Number of registrations so far: what is derived from a registry is rebuilt when it changes.
+        #: Number of registrations so far; data derived from a registry are rebuilt when it changes.
         self.version = 0
 
     @overload
@@ -55,18 +59,18 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def register(self, name: str, item: Any = None) -> Any:
         """
-        Add an object, or decorate one.
+        Register an object, or return a decorator that does.
 
         Parameters
         ----------
         name : str
         item : object, optional
-            Without it, a decorator is returned.
+            Object to register; by default a decorator is returned.
 
         Raises
         ------
         ParameterError
-            When the name is taken by another object.
+            When another object has this name.
         """
         if item is None:
             return lambda decorated: self.register(name, decorated)
@@ -75,7 +79,7 @@ class Registry(Mapping[str, T], Generic[T]):
             getattr(item, "__module__", 1),
             getattr(item, "__qualname__", 1),
         ):
-            raise ParameterError("name", f"must be new: there is another {self.kind} of this name", name)
+            raise ParameterError("name", f"must be new: another {self.kind} has this name", name)
         self._objects[name] = item
         self.version += 1
         return item
@@ -110,7 +114,7 @@ class Registry(Mapping[str, T], Generic[T]):
         }
 
     def attributes_of(self, module: str) -> Callable[[str], T]:
-        """Return a module's ``__getattr__``, which gives registered objects by their names."""
+        """Return a ``__getattr__`` for a module that looks up registered objects by name."""
 
         def attribute(name: str) -> T:
             if not name.startswith("_") and name in self:
@@ -121,16 +125,16 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def find(self, parameter: str, name: object) -> T:
         """
-        Return the object of a name that a user gives.
+        Return the object with a given name.
 
         Raises
         ------
         ParameterError
-            When there is none; with the closest name.
+            When no object has this name; the message suggests the closest name.
         """
         objects = self._all()
         if isinstance(name, str) and name in objects:
             return objects[name]
         closest = get_close_matches(str(name), objects, n=1)
-        hint = f"did you mean '{closest[0]}'?" if closest else f"there are {', '.join(self) or 'none'}"
+        hint = f"did you mean '{closest[0]}'?" if closest else f"available: {', '.join(self) or 'none'}"
         raise ParameterError(parameter, f"must be the name of a {self.kind}", name, hint=hint)

@@ -1,9 +1,9 @@
 """
-Measures of packed rings, vectorised over any number of sites.
+Measurements of packed rings, vectorised over sites.
 
-Rings lie one after the other in ``xy_um`` (n_vertex, 2); ring r has the vertices ``ring_offsets[r] :
+Rings are stored consecutively in ``xy_um`` (n_vertex, 2); ring r has the vertices ``ring_offsets[r] :
 ring_offsets[r + 1]`` and site s the rings ``site_offsets[s] : site_offsets[s + 1]``. The first vertex is not repeated.
-Outer rings are counter-clockwise and holes clockwise, so that signed areas simply add up.
+Outer rings are counter-clockwise and holes clockwise, so that the area of a site is the sum of signed ring areas.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ __all__ = [
     "to_frame",
 ]
 
-#: Turns (rad) below this may be rounding errors.
+#: Turning angles (rad) below this may be rounding errors.
 SMALLEST_TURN = 1e-12
 
 
 def next_vertex(ring_offsets: Ints) -> Ints:
-    """Index of the vertex after each one in its ring, (n_vertex,)."""
+    """Return the index of the next vertex in the ring of each vertex, (n_vertex,)."""
     after = np.arange(1, ring_offsets[-1] + 1)
     after[ring_offsets[1:] - 1] = ring_offsets[:-1]
     return after
@@ -42,9 +42,9 @@ def next_vertex(ring_offsets: Ints) -> Ints:
 
 def to_frame(xy: Floats, origin: ArrayLike, unit: ArrayLike) -> Floats:
     """
-    Return points (n, 2) in a frame with another origin and unit of each axis, ``(xy - origin) / unit``.
+    Return ``(xy - origin) / unit`` of points (n, 2), with an origin and a unit per axis.
 
-    Column by column: five times as fast as broadcasting over the last axis, which numpy does in steps of two numbers.
+    Computed column by column: five times as fast as broadcasting over the last axis of length 2.
     """
     out = np.empty(xy.shape)
     for axis, (shift, scale) in enumerate(zip(*_pairs(origin, unit), strict=True)):
@@ -63,17 +63,21 @@ def from_frame(xy: Floats, origin: ArrayLike, unit: ArrayLike) -> Floats:
 
 
 def _pairs(origin: ArrayLike, unit: ArrayLike) -> tuple[Floats, Floats]:
-    """Origin and unit, two numbers each."""
+    """Return origin and unit as arrays of shape (2,)."""
     return np.broadcast_to(np.asarray(origin, float), (2,)), np.broadcast_to(np.asarray(unit, float), (2,))
 
 
 def positions_in_runs(lengths: Ints) -> Ints:
-    """0, 1, 2, ... within each of several runs, one run after the other: (sum of lengths,)."""
+    """Return the concatenation of ``arange(n)`` for each run length, (sum of lengths,)."""
     return np.arange(int(lengths.sum())) - np.repeat(np.cumsum(lengths) - lengths, lengths)
 
 
 def _local_edges(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats, Floats, Floats]:
-    """Both ends of every edge, x, y, x_after, y_after, from its ring's first vertex: column by column, as :func:`to_frame`."""
+    """
+    Return the end points of every edge: x, y, x_after, y_after.
+
+    Coordinates are relative to the first vertex of the ring. Computed column by column, as in :func:`to_frame`.
+    """
     after, lengths = next_vertex(ring_offsets), np.diff(ring_offsets)
     x, y = (xy_um[:, axis] - np.repeat(xy_um[ring_offsets[:-1], axis], lengths) for axis in (0, 1))
     return x, y, x[after], y[after]
@@ -81,18 +85,18 @@ def _local_edges(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats, Flo
 
 def ring_moments(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats]:
     """
-    Signed area and first moments of every ring.
+    Return the signed area and the first moments of every ring.
 
     Returns
     -------
     area_um2 : (n_ring,) float64, µm²
-        Shoelace sum; positive when counter-clockwise.
+        Shoelace formula; positive for counter-clockwise rings.
     moment_um3 : (n_ring, 2) float64, µm³
         Integral of x and y over the ring: centroid times area.
 
     Notes
     -----
-    Measured from each ring's first vertex, so that a small ring far from the origin keeps its digits.
+    Computed relative to the first vertex of each ring, which avoids cancellation for small rings far from the origin.
     """
     if ring_offsets.size == 1:
         return np.zeros(0), np.zeros((0, 2))
@@ -109,7 +113,11 @@ def ring_moments(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Floats]:
 
 
 def ring_spread_um2(xy_um: Floats, ring_offsets: Ints) -> Floats:
-    """Sum of the areas of each ring's triangles with its first vertex, all counted positive, (n_ring,): 0 for a line."""
+    """
+    Return the sum of the unsigned areas of the triangles with each ring's first vertex.
+
+    The sum, (n_ring,), is 0 for collinear vertices.
+    """
     if ring_offsets.size == 1:
         return np.zeros(0)
     x, y, x_after, y_after = _local_edges(xy_um, ring_offsets)
@@ -118,12 +126,12 @@ def ring_spread_um2(xy_um: Floats, ring_offsets: Ints) -> Floats:
 
 def are_convex(xy_um: Floats, ring_offsets: Ints) -> Bools:
     """
-    Whether each ring is a strictly convex polygon, of either winding, (n_ring,) bool.
+    Return whether each ring is strictly convex, (n_ring,) bool, in either orientation.
 
     Notes
     -----
-    A closed line that turns to the same side at every vertex, and once around in all, is convex, and so meets itself nowhere.
-    Turns below 1e-12 rad may be rounding errors: rings with such a vertex count as not convex.
+    A closed polyline whose turning angles have one sign and add up to a single revolution is convex, and so does not intersect
+    itself. Turning angles below 1e-12 rad may be rounding errors: rings with such a vertex are not counted as convex.
     """
     if ring_offsets.size == 1:
         return np.zeros(0, bool)
@@ -140,7 +148,7 @@ def are_convex(xy_um: Floats, ring_offsets: Ints) -> Bools:
 
 
 def same_rings(one: Any, other: Any) -> bool:
-    """Return whether two objects with packed rings have the same outlines in the same order, bit for bit."""
+    """Return whether two objects have bit-identical packed rings in the same order."""
     if one is other:
         return True
     pairs = [(getattr(one, name), getattr(other, name)) for name in ("site_offsets", "ring_offsets", "xy_um")]
@@ -148,7 +156,7 @@ def same_rings(one: Any, other: Any) -> bool:
 
 
 def site_moments(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> tuple[Floats, Floats]:
-    """Area (n_site,) µm² and centroid (n_site, 2) µm of every site, holes taken off."""
+    """Return the area (n_site,) µm² and centroid (n_site, 2) µm of every site, without holes."""
     if site_offsets.size == 1:
         return np.zeros(0), np.zeros((0, 2))
     area_um2, moment_um3 = ring_moments(xy_um, ring_offsets)
@@ -157,7 +165,7 @@ def site_moments(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> tuple
 
 
 def site_area_um2(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floats:
-    """Area of every site, holes taken off, (n_site,) µm²; negative when its outline is clockwise."""
+    """Return the area of every site without holes, (n_site,) µm², negative if clockwise."""
     if site_offsets.size == 1:
         return np.zeros(0)
     x, y, x_after, y_after = _local_edges(xy_um, ring_offsets)
@@ -165,7 +173,7 @@ def site_area_um2(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floa
 
 
 def site_bounds_um(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints) -> Floats:
-    """(x_min, y_min, x_max, y_max) of every site, (n_site, 4) µm."""
+    """Return the bounds (x_min, y_min, x_max, y_max) of every site, (n_site, 4) µm."""
     if site_offsets.size == 1:
         return np.zeros((0, 4))
     starts = ring_offsets[site_offsets[:-1]]

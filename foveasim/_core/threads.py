@@ -1,4 +1,4 @@
-"""Threads: how many there are, and one way to spread independent pieces of work over them."""
+"""Thread count, and execution of independent tasks on threads."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from foveasim._core.validation import check_count
 
 __all__ = ["each", "in_order", "thread_count"]
 
-#: Threads that there may be at least, for who asks for more than there are cores.
+#: Smallest size of the thread pool: users may request more threads than there are cores.
 LEAST_THREADS = 8
-#: More than machines have cores.
+#: Upper limit, above the number of cores of any machine.
 MAX_THREADS = 4096
 
 _Item = TypeVar("_Item")
@@ -24,12 +24,12 @@ _Result = TypeVar("_Result")
 
 def thread_count(n_threads: int | None = None) -> int:
     """
-    The number of threads to use: the one asked for, or all the cores that this process may use.
+    Return the number of threads to use, by default all cores available to this process.
 
     Raises
     ------
     ParameterError
-        When it is not an integer from 1 to 4096.
+        When ``n_threads`` is not an integer from 1 to 4096.
     """
     if n_threads is not None:
         return check_count("n_threads", n_threads, at_most=MAX_THREADS)
@@ -40,12 +40,12 @@ def thread_count(n_threads: int | None = None) -> int:
 
 def each(work: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: int) -> list[_Result]:
     """
-    ``[work(item) for item in items]`` on several threads; the first error is raised.
+    Return ``[work(item) for item in items]``, computed on several threads.
 
-    The pieces must not depend on each other, nor their sizes on ``n_threads``: that is what makes results the
-    same, bit for bit, for any number of threads.
+    The first error is raised. Items must not depend on each other, and their sizes must not depend on ``n_threads``: results
+    are then bit-identical for any number of threads.
 
-    The calling thread works too, so that pieces may spread work in their turn: no thread waits for one that is not there.
+    The calling thread also processes items, so that ``work`` may call this function without deadlock.
     """
     items = list(items)
     n_helpers = min(n_threads, len(items)) - 1
@@ -59,7 +59,7 @@ def each(work: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: in
         while waiting:
             try:
                 number, item = waiting.popleft()
-            except IndexError:  # another thread took the last one
+            except IndexError:  # another thread took the last item
                 return
             try:
                 results[number] = work(item)
@@ -72,7 +72,7 @@ def each(work: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: in
         some()
     finally:
         waiting.clear()
-        # One that no thread has begun has nothing left to do.
+        # Helpers that have not started have no items left and are cancelled.
         wait([helper for helper in helpers if not helper.cancel()])
     if errors:
         raise errors[min(errors)]
@@ -81,12 +81,12 @@ def each(work: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: in
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    """The threads of this process: they stay, as starting them takes as long as a small piece of work."""
+    """Return the thread pool of this process; starting threads takes as long as a small task."""
     return ThreadPoolExecutor(max(thread_count(), LEAST_THREADS), thread_name_prefix="foveasim")
 
 
 if hasattr(os, "register_at_fork"):
-    # A child process has none of its parent's threads.
+    # A forked process does not inherit the threads of its parent.
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
@@ -94,10 +94,10 @@ def in_order(
     work: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: int, n_ahead: int
 ) -> Iterator[_Result]:
     """
-    ``work(item) for item in items``, lazily, with so many items worked on before they are asked for.
+    Yield ``work(item) for item in items`` in order, computed in advance on threads.
 
-    The first one is worked on alone: it may make what the others share. With none ahead no thread is started, and each item is
-    taken when its result is asked for.
+    At most ``n_ahead`` results are computed in advance. The first item is processed alone: it may create data that the others
+    share. With ``n_ahead=0`` no thread is started, and each item is processed when its result is requested.
     """
     remaining = iter(items)
     if n_ahead == 0:

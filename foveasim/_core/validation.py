@@ -1,11 +1,11 @@
 """
-Array types, and the shared checks that every value passes once, where it enters the package.
+Array types, and validation of values where they enter the package.
 
-Masked arrays (:mod:`numpy.ma`) lose their mask in ``np.asarray``, and with it what they say about missing data. Every array
-from outside therefore goes through :func:`unmasked`, as :func:`as_numbers` and :func:`finite_array` do: a mask that hides
-nothing is taken off; masked values are rejected, or become NaN where NaN stands for no data.
+``np.asarray`` drops the mask of masked arrays (:mod:`numpy.ma`), and with it the information about missing data. Every array
+from outside the package is therefore passed to :func:`unmasked`, also by :func:`as_numbers` and :func:`finite_array`: an empty
+mask is removed; masked values are rejected, or become NaN where NaN represents missing data.
 
-Arrays that an object of the package holds go through :func:`own`: later edits of the caller's array do not reach it.
+Arrays that an object of the package stores are passed to :func:`own`: later edits of the caller's array do not change them.
 """
 
 from __future__ import annotations
@@ -54,24 +54,24 @@ __all__ = [
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-#: Pictures and maps: (n_band, n_y, n_x), float32 unless float64 was asked for.
+#: Images and power maps: (n_band, n_y, n_x), float32 unless float64 is requested.
 Images = NDArray[np.floating[Any]]
 
 _Array = TypeVar("_Array", bound=NDArray[Any])
 
-#: Lengths on a sensor outside this range are a slip of units: less than an atom, more than ten metres.
+#: Lengths on a sensor outside this range indicate wrong units: smaller than an atom, larger than ten metres.
 MIN_LENGTH_UM, MAX_LENGTH_UM = 1e-4, 1e7
-#: More photosites than this are a slip in a generator's parameters.
+#: More photosites than this indicate an error in the parameters of a generator.
 MAX_SITES = 50_000_000
-#: Arrays of a picture's size that an image of it takes.
+#: Arrays of the size of a picture that are in memory during imaging.
 ARRAYS_IN_FLIGHT = 3
-#: Memory where the system does not specify it: more than machines have. And where containers have theirs.
+#: Memory where the system does not report it, above that of any machine; files that contain the limit of a container.
 UNKNOWN_MEMORY_BYTES = 2**42
 CONTAINER_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
-#: Wavelengths outside this range are, too: from hard ultraviolet to a millimetre.
+#: Wavelengths outside this range indicate wrong units: hard ultraviolet to one millimetre.
 MIN_WAVELENGTH_NM, MAX_WAVELENGTH_NM = 10.0, 1e6
 
-#: Suffixes of names, longest first, and the unit that each stands for in messages.
+#: Units for messages by suffix of the name, longest suffix first.
 UNIT_SUFFIXES = {
     "_fraction": "",
     "_dn_per_ph": "DN per photon",
@@ -114,7 +114,7 @@ UNIT_SUFFIXES = {
 
 @lru_cache(maxsize=1024)
 def unit_of(name: str) -> str:
-    """Unit that a name carries, ``""`` for a dimensionless one."""
+    """Return the unit that the suffix of a name specifies, ``""`` if dimensionless."""
     return next((unit for suffix, unit in UNIT_SUFFIXES.items() if name.lower().endswith(suffix)), "")
 
 
@@ -128,12 +128,12 @@ def check_number(
     hint: str = "",
 ) -> float:
     """
-    The value as a finite float within its bounds.
+    Return the value as a finite float within bounds.
 
     Raises
     ------
     ParameterError
-        When it is no number, not finite, or out of bounds.
+        When the value is not a number, not finite, or out of bounds.
     """
     value = unmasked(name, value)
     try:
@@ -143,7 +143,7 @@ def check_number(
     except (TypeError, ValueError):
         raise ParameterError(name, "must be one number", value, hint=hint) from None
     except OverflowError:
-        raise ParameterError(name, "is larger than any floating-point number", hint=hint) from None
+        raise ParameterError(name, "must fit in a 64-bit float", hint=hint) from None
     unit = unit_of(name)
     got = value if isinstance(value, int) else number
     if not np.isfinite(number):
@@ -159,15 +159,15 @@ def check_number(
 
 def check_count(name: str, value: object, *, at_least: int = 1, at_most: int | None = None, hint: str = "") -> int:
     """
-    The value as an integer within its bounds.
+    Return the value as an integer within bounds.
 
     Raises
     ------
     ParameterError
-        When it is not an integer, or out of bounds.
+        When the value is not an integer, or out of bounds.
     """
     if isinstance(value, int | np.integer) and not isinstance(value, bool):
-        number = int(value)  # of any size: seeds have more digits than a float
+        number = int(value)  # not through float: seeds may have more digits
     else:
         floating = check_number(name, value, hint=hint)
         number = int(floating)
@@ -182,12 +182,12 @@ def check_count(name: str, value: object, *, at_least: int = 1, at_most: int | N
 
 def check_shape(name: str, value: object) -> tuple[int, int]:
     """
-    The value as the shape (n_y, n_x) of a picture or a grid, one array of which fits in this machine's memory.
+    Return the value as the shape (n_y, n_x) of a picture or grid.
 
     Raises
     ------
     ParameterError
-        When it is not two integers of at least 1, or an array of float32 of that shape needs more memory than there is.
+        When the value is not a pair of integers of at least 1, or float32 arrays of this shape do not fit in memory.
     """
     if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or len(value) != 2:
         raise ParameterError(name, "must be two integers (n_y, n_x)", value)
@@ -198,27 +198,31 @@ def check_shape(name: str, value: object) -> tuple[int, int]:
 
 def check_memory(name: str, n_bytes: int, value: object, hint: str = "") -> None:
     """
-    Check that an array and what is made of it fit in memory, before the system ends the program for want of it.
+    Check that an array and the arrays computed from it fit in memory.
+
+    Otherwise the operating system may kill the process.
 
     Parameters
     ----------
     name : str
-        Of the parameter that asks for it.
+        Name of the parameter that determines the size.
     n_bytes : int
-        Of one array; nothing is made of it with fewer than three of its size.
+        Size of one array; every computation needs at least three arrays of this size.
     value : object
-        Of that parameter, for the message.
+        Value of the parameter, for the message.
+    hint : str
+        Hint of the message; by default to take fewer pixels.
 
     Raises
     ------
     ParameterError
-        When three such arrays are larger than this machine's memory.
+        When three such arrays exceed the memory of this machine.
     """
     memory = memory_bytes()
     if ARRAYS_IN_FLIGHT * n_bytes > memory:
         raise ParameterError(
             name,
-            f"must give {ARRAYS_IN_FLIGHT} arrays of {n_bytes / 2**30:,.4g} GiB that fit in the memory of "
+            f"must fit in memory: {ARRAYS_IN_FLIGHT} arrays of {n_bytes / 2**30:,.4g} GiB exceed "
             f"{memory / 2**30:.3g} GiB",
             value,
             hint=hint or "take fewer pixels",
@@ -227,7 +231,7 @@ def check_memory(name: str, n_bytes: int, value: object, hint: str = "") -> None
 
 @lru_cache(maxsize=1)
 def memory_bytes() -> int:
-    """Memory of this machine, or of the container that the program runs in."""
+    """Return the memory of this machine, or of the container that the process runs in."""
     limits = [UNKNOWN_MEMORY_BYTES]
     with suppress(AttributeError, ValueError, OSError):
         limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
@@ -239,12 +243,12 @@ def memory_bytes() -> int:
 
 def check_length_um(name: str, value: object, *, at_most: float | None = None, hint: str = "") -> float:
     """
-    The value as a length on a sensor, in µm.
+    Return the value as a length on a sensor, in µm.
 
     Raises
     ------
     ParameterError
-        When it is no number, not positive, longer than allowed, or of a size that no sensor has.
+        When the value is not a positive number, or outside the range of lengths on a sensor or the given limit.
     """
     length_um = check_number(name, value, above=0.0, at_most=at_most, hint=hint)
     return check_number(
@@ -254,12 +258,12 @@ def check_length_um(name: str, value: object, *, at_most: float | None = None, h
 
 def check_pitch_um(name: str, value: object) -> tuple[float, float]:
     """
-    The value as the distances of cells along x and along y, in µm.
+    Return the value as cell pitches along x and y, in µm.
 
     Raises
     ------
     ParameterError
-        When it is neither one length nor a pair of lengths (along x, along y).
+        When the value is neither one length nor a pair of lengths (along x, along y).
     """
     value = unmasked(name, value)
     if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or getattr(value, "ndim", 1) == 0:
@@ -273,24 +277,24 @@ def check_pitch_um(name: str, value: object) -> tuple[float, float]:
 
 def check_sites(n_sites: int) -> int:
     """
-    A number of sites that a generator is about to make.
+    Return the number of sites that a generator is about to create.
 
     Raises
     ------
     ParameterError
-        When there would be too many.
+        When the number exceeds ``MAX_SITES``.
     """
     return check_count("n_sites", n_sites, at_most=MAX_SITES, hint="take fewer or larger photosites")
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> str:
     """
-    The value, when it is one of the choices.
+    Return the value if it is one of the choices.
 
     Raises
     ------
     ParameterError
-        When it is none of them; the message names them all.
+        When the value is not one of the choices; the message lists them.
     """
     if not isinstance(value, str) or value not in choices:
         raise ParameterError(name, f"must be one of {', '.join(repr(c) for c in choices)}", value)
@@ -299,28 +303,28 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> str:
 
 def unmasked(name: str, value: Any, *, missing_is_nan: bool = False) -> Any:
     """
-    Return the value without numpy's masks, which ``np.asarray`` would drop in silence.
+    Return the value without masks of numpy, which ``np.asarray`` would drop silently.
 
     Parameters
     ----------
     name : str
-        Of the parameter, for the message.
+        Name of the parameter, for the message.
     value : any
-        Masked arrays, also in lists, are looked for; anything else is returned as it is.
+        Masked arrays, also in lists, are converted; other objects are returned unchanged.
     missing_is_nan : bool
         Whether masked values become NaN (float64 unless the array is floating-point already); by default they are rejected.
 
     Raises
     ------
     ParameterError
-        When values are masked and NaN does not stand for missing data.
+        When values are masked and ``missing_is_nan`` is not set.
     """
     if not _has_mask(value):
         return value
     try:
         data, mask = np.asarray(_parts(value, np.ma.getdata)), np.asarray(_parts(value, np.ma.getmaskarray))
     except ValueError:
-        return value  # ragged: whoever makes an array of it says so
+        return value  # ragged: conversion to an array reports the error
     n_masked = int(np.count_nonzero(mask))
     if n_masked == 0:
         return data
@@ -334,7 +338,7 @@ def unmasked(name: str, value: Any, *, missing_is_nan: bool = False) -> Any:
 
 
 def _parts(value: Any, part_of: Callable[[Any], Any]) -> Any:
-    """The data or the masks of masked arrays in lists."""
+    """Return the data or the masks of masked arrays in nested lists."""
     return [_parts(item, part_of) for item in value] if isinstance(value, list | tuple) else part_of(value)
 
 
@@ -349,12 +353,12 @@ def _has_mask(value: object) -> bool:
 
 def as_numbers(name: str, value: ArrayLike, *, keep_type: bool = False, missing_is_nan: bool = False) -> NDArray[Any]:
     """
-    The value as an array of real numbers: float64, or as it is.
+    Return the value as an array of real numbers: float64, or its own dtype (``keep_type``).
 
     Raises
     ------
     ParameterError
-        When it is ragged, or has other than real numbers, or masked values and ``missing_is_nan`` is not set.
+        When the value is ragged, contains data other than real numbers, or is masked and ``missing_is_nan`` is not set.
     """
     value = unmasked(name, value, missing_is_nan=missing_is_nan)
     try:
@@ -370,13 +374,13 @@ def finite_array(
     name: str, value: ArrayLike, *, ndim: int | None = None, at_least: float | None = None, above: float | None = None
 ) -> Floats:
     """
-    The value as a float64 array of finite numbers.
+    Return the value as a float64 array of finite numbers.
 
     Raises
     ------
     ParameterError
-        When it is not numeric, has another number of dimensions, or a value that is not finite or out of bounds;
-        the message gives the first such value's position.
+        When the value is not numeric, has another number of dimensions, or contains a number that is not finite or out of
+        bounds; the message gives the index of the first such number.
     """
     array = as_numbers(name, value)
     if ndim is not None and array.ndim != ndim:
@@ -395,9 +399,9 @@ def finite_array(
 
 def exact_integers(values: Sequence[int]) -> NDArray[Any] | None:
     """
-    Return integers as an int64 array, or as uint64 where that is needed; None where neither contains them all.
+    Return integers as an int64 or uint64 array, or None if neither can represent them.
 
-    numpy makes floating-point numbers, which differ, of a list with integers of more than 63 bits.
+    numpy converts lists with integers above 63 bits to floating-point numbers, which loses digits.
     """
     low, high = min(values), max(values)
     if low >= -(2**63) and high < 2**63:
@@ -407,12 +411,12 @@ def exact_integers(values: Sequence[int]) -> NDArray[Any] | None:
 
 def wavelengths_nm(name: str, value: ArrayLike) -> Floats:
     """
-    The value as a read-only list of wavelengths, (n,) nm.
+    Return the value as a read-only array of wavelengths, (n,) nm.
 
     Raises
     ------
     ParameterError
-        When it is no list of numbers, or one is no wavelength of light in nm.
+        When the value is not a list of numbers, is empty, or contains a number outside the range of wavelengths in nm.
     """
     waves_nm = finite_array(name, np.atleast_1d(as_numbers(name, value)), ndim=1, above=0.0)
     is_odd = (waves_nm < MIN_WAVELENGTH_NM) | (waves_nm > MAX_WAVELENGTH_NM)
@@ -428,13 +432,17 @@ def wavelengths_nm(name: str, value: ArrayLike) -> Floats:
 
 
 def read_only(array: _Array) -> _Array:
-    """The same array, no longer writeable."""
+    """Return the same array, marked as read-only."""
     array.flags.writeable = False
     return array
 
 
 def handed_over(array: _Array) -> _Array:
-    """The same array, with all that it is a view of no longer writeable: for memory that nobody outside the package knows."""
+    """
+    Return the same array, with its base arrays also marked as read-only.
+
+    For memory that the package has allocated and that no caller can access.
+    """
     base: Any = array
     while isinstance(base, np.ndarray):
         base.flags.writeable = False
@@ -444,10 +452,10 @@ def handed_over(array: _Array) -> _Array:
 
 def own(array: _Array) -> _Array:
     """
-    Return the values as a read-only array that later edits of the caller's array do not change.
+    Return the values as a read-only array, independent of the caller's array.
 
-    An array that is read-only already, with all that it is a view of, is returned as it is, so that objects of the package
-    share memory and large maps are not doubled; any other is copied.
+    An array that is read-only together with its base arrays is returned unchanged, so that objects of the package share memory
+    and large maps are not duplicated; other arrays are copied.
     """
     base: Any = array
     while isinstance(base, np.ndarray) and not base.flags.writeable:
