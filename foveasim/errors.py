@@ -75,7 +75,7 @@ class ParameterError(FoveasimError, ValueError):
 
 
 class GeometryError(FoveasimError, ValueError):
-    """Outlines that are not valid photosites; ``site_ids`` are the indices of the invalid ones."""
+    """Outlines that are not valid photosites; ``site_ids`` are their indices."""
 
     def __init__(self, message: str, site_ids: tuple[int, ...] = ()) -> None:
         self.site_ids = site_ids

@@ -328,13 +328,16 @@ def test_zero_filter_gives_finite_white():
     ("spoil", "message"),
     [
         (lambda p: p.unlink(), "no such file"),
-        (lambda p: p.write_bytes(b""), "is corrupt, or no foveasim capture"),
-        (lambda p: p.write_bytes(b"PK\x03\x04 and nothing else"), "is corrupt, or no foveasim capture"),
-        (lambda p: p.write_bytes(p.read_bytes()[:-200]), "is corrupt, or no foveasim capture"),
-        (lambda p: p.write_bytes(p.read_bytes()[: p.stat().st_size // 2]), "is corrupt, or no foveasim capture"),
-        (lambda p: np.savez(p, code=np.zeros(3)), "is no foveasim capture"),
-        (lambda p: np.savez(p, about=np.array('{"format": "other"}')), "is no foveasim capture"),
-        (lambda p: np.savez(p, about=np.array({"a": 1}, dtype=object)), "is corrupt, or no foveasim capture"),
+        (lambda p: p.write_bytes(b""), "is corrupt or not a valid foveasim capture"),
+        (lambda p: p.write_bytes(b"PK\x03\x04 and nothing else"), "is corrupt or not a valid foveasim capture"),
+        (lambda p: p.write_bytes(p.read_bytes()[:-200]), "is corrupt or not a valid foveasim capture"),
+        (
+            lambda p: p.write_bytes(p.read_bytes()[: p.stat().st_size // 2]),
+            "is corrupt or not a valid foveasim capture",
+        ),
+        (lambda p: np.savez(p, code=np.zeros(3)), "is not a valid foveasim capture"),
+        (lambda p: np.savez(p, about=np.array('{"format": "other"}')), "is not a valid foveasim capture"),
+        (lambda p: np.savez(p, about=np.array({"a": 1}, dtype=object)), "is corrupt or not a valid foveasim capture"),
     ],
 )
 def test_corrupt_capture_files_are_rejected(capture, tmp_path, spoil, message):
@@ -382,7 +385,7 @@ def test_failed_save_leaves_no_file(capture, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "message"), [("c.txt", "must end in .npz"), ("no/such/c.npz", "the folder .* does not exist")]
+    ("name", "message"), [("c.txt", "must end in .npz"), ("no/such/c.npz", "the directory .* does not exist")]
 )
 def test_invalid_targets_are_rejected(capture, tmp_path, name, message):
     with pytest.raises(FileError, match=message):
@@ -395,7 +398,7 @@ def test_decompression_bombs_are_rejected(capture, tmp_path, monkeypatch):
         size = sum(item.file_size for item in archive.infolist())
     monkeypatch.setattr("foveasim._io.npz.MAX_UNPACKED_BYTES", size - 1)
 
-    with pytest.raises(FileError, match="would unpack to more than"):
+    with pytest.raises(FileError, match="would decompress to more than"):
         fs.Capture.load(tmp_path / "c.npz")
 
 

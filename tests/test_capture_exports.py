@@ -182,7 +182,7 @@ def test_store_replaces_captures_only(capture, tmp_path):
     (tmp_path / "file.zarr").write_text("mine")
     (tmp_path / "folder.zarr").mkdir()
     for name in ("foreign", "file", "folder"):
-        with pytest.raises(FileError, match="something else is there"):
+        with pytest.raises(FileError, match="the path contains other data"):
             capture.save(tmp_path / f"{name}.zarr")
     assert (tmp_path / "file.zarr").read_text() == "mine"
     with pytest.raises(FileError, match="does not exist"):

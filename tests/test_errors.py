@@ -1,4 +1,4 @@
-"""Errors: what their messages say, and that they reach other processes as they are."""
+"""Errors: messages and pickling."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ import pytest
 from foveasim.errors import ConfigError, FileError, GeometryError, ParameterError, SimulationError, printable, shown
 
 ERRORS = [
-    ParameterError("pitch_um", "must be > 0", -1.0, "µm", "take a larger one"),
+    ParameterError("pitch_um", "must be > 0", -1.0, "µm", "use a larger one"),
     ParameterError("white", "must be something", None),
     ParameterError("layout", "must be a Layout", lambda: None),
-    GeometryError("site 3 is no photosite", (3,)),
-    FileError("a/file.npz", "is broken"),
-    ConfigError(Path("shot.yaml"), "optics: must be there"),
-    SimulationError("parts do not fit"),
+    GeometryError("site 3 is not a valid photosite", (3,)),
+    FileError("a/file.npz", "is corrupt"),
+    ConfigError(Path("shot.yaml"), "optics: must be given"),
+    SimulationError("parts are incompatible"),
 ]
 
 
-def test_a_message_has_name_rule_value_unit_and_cure():
-    assert str(ERRORS[0]) == "'pitch_um' must be > 0, got -1.0 µm; take a larger one"
-    assert str(ParameterError("height", ERRORS[0].detail)) == "'height' must be > 0, got -1.0 µm; take a larger one"
-    assert str(ParameterError("white", "must be there")) == "'white' must be there"
+def test_message_contains_rule_value_unit_hint():
+    assert str(ERRORS[0]) == "'pitch_um' must be > 0, got -1.0 µm; use a larger one"
+    assert str(ParameterError("height", ERRORS[0].detail)) == "'height' must be > 0, got -1.0 µm; use a larger one"
+    assert str(ParameterError("white", "must be given")) == "'white' must be given"
     assert len(str(ParameterError("data", "must be short", np.zeros((500, 500))))) < 120
 
-    assert str(ParameterError("n", "must be less", 10**5000)) == "'n' must be less, got one of type int"
+    assert str(ParameterError("n", "must be less", 10**5000)) == "'n' must be less, got an object of type int"
 
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
@@ -42,15 +42,15 @@ def test_errors_survive_pickling(error):
         assert vars(found) == vars(error)
 
 
-def _fails(_: int) -> None:
+def _raise_parameter_error(_: int) -> None:
     raise ParameterError("pitch_um", "must be > 0", -1.0, "µm")
 
 
-def test_errors_reach_the_process_that_waits_for_them():
+def test_errors_reach_waiting_parent_process():
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        waiting = pool.apply_async(_fails, (1,))
+        result = pool.apply_async(_raise_parameter_error, (1,))
         with pytest.raises(ParameterError, match=r"'pitch_um' must be > 0, got -1\.0 µm"):
-            waiting.get(timeout=120.0)
+            result.get(timeout=120.0)
 
 
 def deep_list():
@@ -74,7 +74,7 @@ def deep_list():
     ],
     ids=["deep", "list", "string", "bytes", "array", "integer", "value", "dict"],
 )
-def test_long_values_are_short_in_messages(value):
+def test_long_values_are_shortened_in_messages(value):
     assert len(shown(value)) <= 80
     assert len(str(ParameterError("name", "must be short", value))) < 120
     for error in (FileError, ConfigError):
@@ -85,7 +85,7 @@ def test_long_values_are_short_in_messages(value):
         assert len(str(error("a.yaml", f"is wrong, got {text}"))) <= 2010
 
 
-def test_paths_stay_whole_in_messages():
+def test_paths_are_complete_in_messages():
     path = "/".join(["a long directory"] * 20)
 
     assert str(FileError(path, "no such file")) == f"{path}: no such file"

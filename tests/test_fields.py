@@ -1,4 +1,4 @@
-"""Carriers: the grid's geometry, the power map's fit, and the one place where rows are turned over."""
+"""Grids, power maps, and conversion of the row order."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import foveasim as fs
 from foveasim.errors import ParameterError
 from foveasim.fields import from_file_rows, to_file_rows
 
-#: An F in file order: the first row is on top, the arms point to the right.
+#: The letter F in file order: top row first, arms to the right.
 F = np.array([[1, 1, 1], [1, 0, 0], [1, 1, 0], [1, 0, 0], [1, 0, 0]])
 
 
-def test_the_first_row_of_a_file_is_the_highest_y():
+def test_first_file_row_has_highest_y():
     assert from_file_rows(F)[0, -1].tolist() == [1, 1, 1]
     assert from_file_rows(F)[0, 0].tolist() == [1, 0, 0]
 
 
 @pytest.mark.parametrize("picture", [F, np.stack([F, 2 * F, 3 * F], axis=-1)])
-def test_turning_rows_there_and_back_changes_nothing(picture):
-    there = from_file_rows(picture)
+def test_row_order_conversion_is_invertible(picture):
+    channels = from_file_rows(picture)
 
-    assert np.array_equal(to_file_rows(there[0] if picture.ndim == 2 else there), picture)
+    assert np.array_equal(to_file_rows(channels[0] if picture.ndim == 2 else channels), picture)
 
 
-def test_cell_centres_lie_half_a_pitch_inside_the_borders():
+def test_cell_centres_are_inside_bounds():
     grid = fs.Grid(shape=(2, 3), pitch_um=0.5, origin_um=(10.0, -4.0))
 
     assert grid.x_um.tolist() == [10.25, 10.75, 11.25]
@@ -34,7 +34,7 @@ def test_cell_centres_lie_half_a_pitch_inside_the_borders():
     assert grid.cell_area_um2 == 0.25
 
 
-def test_a_centred_grid_has_its_middle_on_the_axis():
+def test_centred_grid_is_centred_on_axis():
     grid = fs.Grid.centred((5, 8), 0.3)
 
     assert grid.x_um.sum() == pytest.approx(0.0, abs=1e-12)
@@ -54,7 +54,7 @@ def test_a_centred_grid_has_its_middle_on_the_axis():
         ({"origin_um": (1, 2, 3)}, r"'origin_um' must be two numbers"),
     ],
 )
-def test_a_grid_that_cannot_be_is_refused(values, message):
+def test_invalid_grid_is_rejected(values, message):
     with pytest.raises(ParameterError, match=message):
         fs.Grid(**{"shape": (4, 5), "pitch_um": 1.0, **values})
 
@@ -69,12 +69,12 @@ def test_a_grid_that_cannot_be_is_refused(values, message):
         (np.ones((1, 4, 5)), [float("nan")], r"'wavelength_nm' must be finite everywhere, got nan nm at \[0\]"),
     ],
 )
-def test_a_power_map_that_does_not_fit_is_refused(data, wavelength_nm, message):
+def test_mismatched_power_map_is_rejected(data, wavelength_nm, message):
     with pytest.raises(ParameterError, match=message):
         fs.PowerMap(data, fs.Grid((4, 5), 1.0), np.array(wavelength_nm))
 
 
-def test_a_power_map_is_read_only_and_leaves_the_callers_array_alone():
+def test_power_map_copies_writeable_array():
     data = np.ones((1, 4, 5))
     power_map = fs.PowerMap(data, fs.Grid((4, 5), 1.0), np.array([550.0]))
 

@@ -1,1 +1,1 @@
-"""Reading and writing: atomic files, npz, YAML, zarr, images, one sandbox for untrusted readers, the terminal."""
+"""Input and output: atomic files, npz, YAML, zarr, images, reader sandbox, terminal."""

@@ -1,8 +1,8 @@
 """
-The sandbox process: reads one file through a library that a malformed file can crash.
+Main module of the sandbox process, which reads one untrusted file.
 
-:mod:`foveasim._io.sandbox` starts it with a task as JSON on standard input. It loads nothing of the package by itself, so that
-it starts quickly and its limits are those of the reader.
+:mod:`foveasim._io.sandbox` starts the process and sends a task as JSON to its standard input. The process imports no module of
+the package before the reader, so that it starts quickly and its limits apply to the reader.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from typing import Any
 
 __all__ = ["limit"]
 
-#: Names of the errors by which readers reject a file; any other means that it is corrupt.
+#: Names of the exceptions that readers raise to reject a file; other exceptions mean that the file is corrupt.
 REJECTIONS = {"FoveasimError", "FormatError"}
 
 
 def limit(kind: str, most: int) -> None:
-    """Set a limit of memory ("RLIMIT_AS"), time ("RLIMIT_CPU") or others, where the system has them."""
+    """Set a resource limit, such as memory ("RLIMIT_AS") or time ("RLIMIT_CPU"), if supported."""
     try:
         import resource
     except ImportError:
@@ -46,12 +46,12 @@ def _answer(task: dict[str, Any]) -> dict[str, Any]:
             module = importlib.util.module_from_spec(spec)
             spec.loader.exec_module(module)
             told, arrays = getattr(module, task["reader"])(task["path"], limit=limit, **task["args"])
-        with open(task["arrays"], "wb") as file:  # noqa: PTH123 -- a plain name from the task
+        with open(task["arrays"], "wb") as file:  # noqa: PTH123 -- a string from the task
             for array in arrays:
                 np.save(file, np.ascontiguousarray(array), allow_pickle=False)
     except MemoryError:
-        return {"rejected": "is malformed: it asks for more memory than a file of its size needs"}
-    except Exception as error:  # noqa: BLE001 -- whatever a malformed file makes its reader raise
+        return {"rejected": "is malformed: reading it needs more memory than a valid file of its size"}
+    except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on malformed files
         if REJECTIONS & {kind.__name__ for kind in type(error).__mro__}:
             return {"rejected": str(error).removeprefix(f"{task['path']}: ")}
         reason = " ".join(str(error).split()) or type(error).__name__
@@ -65,7 +65,7 @@ def _main() -> None:
         limit(kind, most)
     sys.path[:] = task["sys_path"]
     warnings.simplefilter("ignore")
-    # Libraries print on standard output what they find wrong with a file.
+    # Libraries print problems of a file on standard output.
     with os.fdopen(os.dup(1), "w") as answer, open(task["printed"], "w") as printed:  # noqa: PTH123
         os.dup2(printed.fileno(), 1)
         answer.write(json.dumps(_answer(task)))

@@ -1,4 +1,4 @@
-"""Files and folders written whole or not at all, and locks on them."""
+"""Atomic writes of files and directories, and file locks."""
 
 from __future__ import annotations
 
@@ -16,68 +16,71 @@ from foveasim.errors import FileError, disk_problem
 
 __all__ = ["atomic_directory", "atomic_write", "check_room", "lock", "remove_folder"]
 
-#: A disk with less space than a block is full.
+#: A disk with less free space than one block is full.
 FULL_DISK_BYTES = 4096
-#: A folder is removed once more after each of these times.
+#: Waiting times before each attempt to remove a directory.
 RETRY_S = (0.0, 0.05, 0.25)
 
 
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """
-    A temporary name in the target's folder, renamed to the target when the block ends well, removed otherwise.
+    Yield a temporary path that replaces the target if the block succeeds.
 
-    The temporary name keeps the target's ending, by which libraries choose a format.
+    If the block fails, the temporary file is removed. The temporary path is in the same directory and has the same extension as
+    the target, because libraries choose the format by extension.
 
     Raises
     ------
     FileError
-        When the folder does not exist, or writing fails: the disk is full, say, whatever a library makes of that.
+        When the directory does not exist, or writing fails, for example on a full disk.
     """
     target = Path(path)
     temporary = target.with_name(f".foveasim-{secrets.token_hex(8)}{target.suffix}")
     try:
         if not target.parent.is_dir():
-            raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
+            raise FileError(target, f"cannot be written: the directory {target.parent} does not exist")
         if target.is_dir():
-            raise FileError(target, "cannot be written: it is a folder")
+            raise FileError(target, "cannot be written: it is a directory")
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
-        if reason := _full(temporary):  # some libraries do not notice, and leave half a file
+        if reason := _full(temporary):  # some libraries ignore a full disk and leave a truncated file
             raise FileError(target, f"cannot be written: {reason}")
         temporary.replace(target)
     except Exception as error:
         _raise_reason(error, target, temporary)
         raise
     finally:
-        with suppress(OSError):  # a name too long for the system was never made
+        with suppress(OSError):  # a name too long for the system was never created
             temporary.unlink(missing_ok=True)
 
 
 @contextmanager
 def atomic_directory(target: Path, *, is_ours: Callable[[Path], bool]) -> Iterator[Path]:
     """
-    A temporary folder, renamed to the target when the block ends well, removed otherwise.
+    Yield a temporary directory that replaces the target if the block succeeds.
+
+    If the block fails, the temporary directory is removed.
 
     Raises
     ------
     FileError
-        When something is there that is not ours, the folder around it does not exist, or writing fails.
+        When the target exists and ``is_ours`` is false for it, its parent directory does not exist, or writing fails.
     """
     token = secrets.token_hex(8)
     new, old = (target.with_name(f".foveasim-{token}-{which}{target.suffix}") for which in ("new", "old"))
     try:
         if target.exists() and not is_ours(target):
-            raise FileError(target, "cannot be written: something else is there")
+            raise FileError(target, "cannot be written: the path contains other data; choose another path")
         if not target.parent.is_dir():
-            raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
+            raise FileError(target, f"cannot be written: the directory {target.parent} does not exist")
         new.mkdir()
         yield new
         if target.exists():
             target.rename(old)
         new.rename(target)
     except Exception as error:
-        with suppress(OSError):  # no permission for the folder
+        with suppress(OSError):  # no permission for the directory
             if old.exists() and not target.exists():
                 old.rename(target)
         _raise_reason(error, target, new)
@@ -89,13 +92,13 @@ def atomic_directory(target: Path, *, is_ours: Callable[[Path], bool]) -> Iterat
 
 def remove_folder(folder: Path) -> None:
     """
-    Remove a folder with its contents, if it exists; ignore what the system does not let us remove.
+    Remove a directory and its contents if it exists; ignore errors of the system.
 
-    The threads of zarr may still write for a moment after an error, and create the folder again.
+    After an error, threads of zarr may continue to write for a short time and create the directory again.
     """
     try:
         is_there = folder.exists()
-    except OSError:  # no permission for the parent
+    except OSError:  # no permission for the parent directory
         is_there = False
     for wait_s in RETRY_S if is_there else ():
         time.sleep(wait_s)
@@ -104,19 +107,19 @@ def remove_folder(folder: Path) -> None:
 
 def check_room(path: Path, n_bytes: int) -> None:
     """
-    Check that a file may grow to a size, before a library that does not survive a full disk writes it.
+    Check that the disk has space for a file, before a library that crashes on a full disk.
 
     Parameters
     ----------
     path : Path
-        The file, which exists.
+        An existing file.
     n_bytes : int
-        Its size when it is written.
+        Size of the file after writing.
 
     Raises
     ------
     OSError
-        When the disk has not as much space left, or the process may not write files of that size.
+        When the disk has too little free space, or the size exceeds the file size limit of the process.
     """
     if n_bytes > _file_size_limit():
         raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
@@ -125,7 +128,7 @@ def check_room(path: Path, n_bytes: int) -> None:
 
 
 def _raise_reason(error: Exception, target: Path, temporary: Path) -> None:
-    """Raise the system's reason for an error in writing, where there is one."""
+    """Raise a FileError with the reason of the system for a write error, if there is one."""
     reason = disk_problem(error) or _full(temporary)
     if not reason and isinstance(error, OSError):
         reason = error.strerror or str(error)
@@ -134,7 +137,7 @@ def _raise_reason(error: Exception, target: Path, temporary: Path) -> None:
 
 
 def _full(temporary: Path) -> str:
-    """Reason of the system why a file did not grow: some libraries do not pass it on."""
+    """Return the system's message for a full disk or too large a file, else ``""``."""
     with suppress(OSError):
         if temporary.is_file() and temporary.stat().st_size >= _file_size_limit():
             return os.strerror(errno.EFBIG)
@@ -144,7 +147,7 @@ def _full(temporary: Path) -> str:
 
 
 def _free_bytes(folder: Path) -> int:
-    """Space that this process may use on a disk: some is kept for the superuser."""
+    """Return the free space of a disk; the superuser may also use the reserved space."""
     if hasattr(os, "statvfs") and os.geteuid() == 0:
         disk = os.statvfs(folder)
         return disk.f_bfree * disk.f_frsize
@@ -152,20 +155,20 @@ def _free_bytes(folder: Path) -> int:
 
 
 def _file_size_limit() -> float:
-    """Size in bytes that a file of this process may have."""
+    """Return the file size limit of this process in bytes."""
     try:
         import resource
-    except ImportError:  # a system without such limits
+    except ImportError:  # the system has no resource limits
         return float("inf")
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
     return float("inf") if limit == resource.RLIM_INFINITY else limit
 
 
 def lock(file: IO[bytes]) -> bool:
-    """Lock an open file until it is closed, whatever ends the program; False when another has it."""
+    """Lock an open file until it is closed; return False if another process has the lock."""
     try:
         import fcntl
-    except ImportError:  # a system without such locks
+    except ImportError:  # the system has no file locks
         return True
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""What the numbers of a picture stand for: light from encoded values, and encoded values from light."""
+"""Transfer functions of pictures: relative radiance from encoded values, and the inverse."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ from foveasim._core.validation import Floats
 
 __all__ = ["Encoding", "decoded", "encoded_srgb"]
 
-#: sRGB (photographs), the square root of the radiance (the paper), the radiance itself.
+#: sRGB (photographs), the square root of the radiance (the paper), linear radiance.
 Encoding = Literal["srgb", "sqrt", "linear"]
 
 
 def decoded(values: Floats, encoding: Encoding) -> Floats:
-    """Relative radiance of encoded values from 0; sRGB as in IEC 61966-2-1, continued above 1."""
+    """
+    Decode values >= 0 to relative radiance.
+
+    sRGB as in IEC 61966-2-1, extrapolated above 1.
+    """
     if encoding == "sqrt":
         return values * values
     if encoding == "srgb":
@@ -24,5 +28,5 @@ def decoded(values: Floats, encoding: Encoding) -> Floats:
 
 
 def encoded_srgb(values: Floats) -> Floats:
-    """Values of relative radiance from 0 as a screen expects them, IEC 61966-2-1."""
+    """Encode relative radiance >= 0 in sRGB, IEC 61966-2-1."""
     return np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1.0 / 2.4) - 0.055)

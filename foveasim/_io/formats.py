@@ -1,4 +1,4 @@
-"""File formats: how a format is recognised, read and written, and which options it has."""
+"""File formats: detection, readers, writers and options."""
 
 from __future__ import annotations
 
@@ -21,41 +21,41 @@ __all__ = [
     "writing_format",
 ]
 
-#: A file of more bytes is not read.
+#: Size limit of files that are read.
 MAX_FILE_BYTES = 8 * 2**30
 HEAD_BYTES = 1024
-#: Characters of a message, of this package and of others, that are kept.
+#: Most characters of a message of this package, and of other packages.
 MAX_MESSAGE, MAX_REASON = 500, 300
-#: Beginnings of files that are recognised without being a format, and what to do with them.
+#: Messages for files of unsupported types, by their first bytes.
 _HINTS = {
-    b"\x1f\x8b": "is compressed with gzip; unpack it first",
-    b"<": "is markup; an SVG drawing is written and not read",
+    b"\x1f\x8b": "is compressed with gzip; decompress it first",
+    b"<": "is markup; SVG files can be written but not read",
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class FileFormat:
     """
-    One format: a line of a table of formats.
+    A file format; entry of a table of formats.
 
     Parameters
     ----------
     title : str
         Name in messages.
     suffixes : tuple of str
-        File extensions with the dot, in lower case; the first is the usual one.
+        File extensions with the dot, in lower case; the first is the default.
     signatures : tuple of bytes
         First bytes of files of the format.
     matches : callable, optional
-        Called with the path and the first bytes, whether a file is of the format: where signatures do not tell.
+        Function of the path and the first bytes that returns whether a file is of the format; used instead of signatures.
     read, write : callable, optional
-        None for formats that are only written, or only read.
+        Reader and writer; None if the format is not read or not written.
     read_options, write_options : tuple of str
-        Keywords of ``read`` and ``write`` that users may give.
+        Keywords of ``read`` and ``write`` that users may set.
     is_sandboxed : bool
-        Whether files are read in the sandbox process: those of libraries that a malformed file can crash.
+        Whether files are read in the sandbox process, because malformed files can crash the library.
     is_directory : bool
-        Whether the format is a directory, which ``write`` writes atomically itself.
+        Whether the format is a directory, which ``write`` itself writes atomically.
     """
 
     title: str
@@ -70,28 +70,34 @@ class FileFormat:
     is_directory: bool = False
 
     def is_of(self, path: Path, head: bytes) -> bool:
-        """Whether a file with these first bytes is of the format."""
+        """Return whether a file with these first bytes is of the format."""
         if self.matches is not None:
             return self.matches(path, head)
         return bool(self.signatures) and head.startswith(self.signatures)
 
 
 class FormatError(Exception):
-    """The content of a file is invalid, with a message that follows the file's name."""
+    """Invalid content of a file; the message does not contain the path."""
 
 
 @contextmanager
 def as_file_error(path: Path, what: str, *, passes: tuple[type[FoveasimError], ...] = ()) -> Iterator[None]:
     """
-    Raise whatever a malformed file makes its readers raise as one FileError with a message of one line.
+    Convert exceptions of readers of malformed files to a FileError with a one-line message.
 
     Parameters
     ----------
     path : Path
+        The file.
     what : str
-        What the file should be, for messages: ``"power map"``.
+        Expected kind of the file, for messages: ``"power map"``.
     passes : tuple of exception types
-        Errors that are not about the file.
+        Exceptions that are raised unchanged.
+
+    Raises
+    ------
+    FileError
+        When the block raises another exception.
     """
     try:
         yield
@@ -100,14 +106,14 @@ def as_file_error(path: Path, what: str, *, passes: tuple[type[FoveasimError], .
     except (FormatError, FoveasimError) as error:
         raise FileError(path, one_line(str(error).removeprefix(f"{path}: "), MAX_MESSAGE)) from None
     except MemoryError:
-        raise FileError(path, "asks for more memory than there is") from None
-    except Exception as error:  # noqa: BLE001 -- readers raise anything on malformed files
+        raise FileError(path, "needs more memory than is available") from None
+    except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on malformed files
         reason = one_line(str(error), MAX_REASON) or type(error).__name__
-        raise FileError(path, f"is corrupt, or no {what} ({reason})") from None
+        raise FileError(path, f"is corrupt or not a valid {what} ({reason})") from None
 
 
 def one_line(text: str, max_characters: int) -> str:
-    """Return a message of another program, or with names from a file, in one printable line of limited length."""
+    """Return an untrusted message as one printable line of limited length."""
     line = " ".join("".join(c if c.isprintable() else " " for c in text[: 2 * max_characters]).split())
     return line if len(line) <= max_characters else line[: max_characters - 3] + "..."
 
@@ -119,14 +125,14 @@ def head_of(path: Path) -> bytes:
     Raises
     ------
     FileError
-        When it is missing, unreadable, empty or too large.
+        When the file is missing, unreadable, empty or too large.
     """
     try:
         if not path.is_file():
             raise FileError(path, "is not a file" if path.exists() else "no such file")
         n_bytes = path.stat().st_size
         if n_bytes > MAX_FILE_BYTES:
-            raise FileError(path, f"has {n_bytes} bytes, more than the {MAX_FILE_BYTES} that are read")
+            raise FileError(path, f"has {n_bytes} bytes, more than the limit of {MAX_FILE_BYTES}")
         with path.open("rb") as file:
             head = file.read(HEAD_BYTES)
     except FileError:
@@ -140,12 +146,12 @@ def head_of(path: Path) -> bytes:
 
 def format_of(path: Path, formats: Mapping[str, FileFormat], what: str) -> tuple[str, FileFormat]:
     """
-    Return the format of a file by its content, and its name in a table.
+    Return the name and the entry of a file's format in a table, detected by content.
 
     Raises
     ------
     FileError
-        When it cannot be read, or is of no format of the table that is read.
+        When the file cannot be read, or no readable format of the table matches.
     """
     head = b"" if path.is_dir() else head_of(path)
     for name, found in formats.items():
@@ -157,17 +163,17 @@ def format_of(path: Path, formats: Mapping[str, FileFormat], what: str) -> tuple
         if text.startswith(beginning):
             raise FileError(path, hint)
     titles = sorted({found.title for found in formats.values() if found.read is not None}, key=str.lower)
-    raise FileError(path, f"is no {what}: expected {', '.join(titles[:-1])} or {titles[-1]}")
+    raise FileError(path, f"is not a valid {what}: expected {', '.join(titles[:-1])} or {titles[-1]}")
 
 
 def writing_format(path: Path, formats: Mapping[str, FileFormat]) -> FileFormat:
     """
-    Return the format that a file's extension names.
+    Return the format that has a file's extension.
 
     Raises
     ------
     FileError
-        When no format of the table that is written has it.
+        When no writable format of the table has this extension.
     """
     by_suffix = {suffix: found for found in formats.values() if found.write is not None for suffix in found.suffixes}
     try:
@@ -180,21 +186,23 @@ def chosen_options(
     options: Mapping[str, Any], known: tuple[str, ...], formats: Mapping[str, FileFormat], of: str
 ) -> dict[str, Any]:
     """
-    Return the options that are given, without those that are None.
+    Return the options that are not None.
 
     Parameters
     ----------
     options : mapping
+        Options of the user by name.
     known : tuple of str
-        Options of the file's format.
+        Names of the options of the file's format.
     formats : mapping
         Table of all formats, for messages.
     of : {"read_options", "write_options"}
+        Attribute of the formats that lists the options, for messages.
 
     Raises
     ------
     ParameterError
-        When one does not belong to the format.
+        When the format does not have an option.
     """
     given = {name: value for name, value in options.items() if value is not None}
     for name, value in given.items():

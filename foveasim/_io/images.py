@@ -1,7 +1,7 @@
 """
-Picture files, in and out: what a photograph's file holds as an array, and arrays as files.
+Reading and writing of picture files.
 
-Arrays here are as one sees the picture: (n_y, n_x) or (n_y, n_x, n_channel), the first row on top.
+Arrays have the shape (n_y, n_x) or (n_y, n_x, n_channel), top row first.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ __all__ = [
 
 #: Larger pictures are rejected: 2**28 pixels are 3 GiB as three float32 channels.
 MAX_PIXELS = 2**28
-#: What a small EXR may unpack to, and for each byte of a larger one: deflate packs no better.
+#: Limits of decompressed EXR data: for small files, and per byte of larger ones, the maximum ratio of deflate.
 MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**28, 1032
-#: Formats that Pillow is asked for; its other readers are for files that are no pictures of scenes.
+#: Formats that are read with Pillow; its other formats are not photographs.
 PILLOW_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "PPM", "JPEG2000", "TGA")
-#: Pillow's modes that hold the numbers of the file as they are, and what others are converted to.
+#: Modes of Pillow that are read unchanged, and conversions of other modes.
 PLAIN_MODES = ("L", "LA", "RGB", "RGBA", "F")
 CONVERTED_MODES = {
     "1": "L",
@@ -57,19 +57,23 @@ CONVERTED_MODES = {
     "I;16L": "I",
     "I": "I",
 }
-#: Beginnings of PNG and of what is packed in JPEG 2000, and what ends that, and JPEG.
+#: Signatures of PNG and of the JPEG 2000 codestream; end marker of JPEG and JPEG 2000.
 PNG_MAGIC, JPEG2000_MAGIC, END_MARKER = b"\x89PNG\r\n\x1a\n", b"\xff\x4f\xff\x51", b"\xff\xd9"
-#: Marker of JPEG behind whose segment the numbers begin, and the length of a marker.
+#: JPEG marker before the image data, and length of a marker.
 START_OF_SCAN, MARKER_BYTES = 0xDA, 2
-#: Tag of TIFF and EXIF that tells how the camera was held.
+#: Orientation tag of TIFF and EXIF.
 ORIENTATION_TAG = 274
 TIFF_ENDINGS = (".tif", ".tiff")
-#: Endings of the pictures that a folder is searched for.
+#: Extensions of picture files in directories.
 PICTURE_ENDINGS = (".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga", *TIFF_ENDINGS, ".webp")
 
 
 def picture_names(names: Iterable[str]) -> list[str]:
-    """Those that are pictures', in their natural order, ``2.png`` before ``10.png``; hidden files are none."""
+    """
+    Return the names of pictures in natural order, ``2.png`` before ``10.png``.
+
+    Hidden files are skipped.
+    """
     pictures = (
         name
         for name in names
@@ -78,7 +82,7 @@ def picture_names(names: Iterable[str]) -> list[str]:
     )
 
     def key(name: str) -> tuple[list[tuple[int, str]], str]:
-        # Of integers without the zeros before them the longer is the larger; where all are equal, the names decide.
+        # Without leading zeros, integers compare by length and then digits; equal keys compare by name.
         pieces = enumerate(re.split(r"([0-9]+)", name))
         return [(len(n := p.lstrip("0")), n) if k % 2 else (-1, p) for k, p in pieces if p], name
 
@@ -87,7 +91,7 @@ def picture_names(names: Iterable[str]) -> list[str]:
 
 def read_picture(path: str | Path) -> NDArray[Any]:
     """
-    The numbers in a picture file.
+    Read a picture file.
 
     Parameters
     ----------
@@ -97,18 +101,18 @@ def read_picture(path: str | Path) -> NDArray[Any]:
     Returns
     -------
     picture : (n_y, n_x) or (n_y, n_x, n_channel), uint8, uint16 or float32
-        First row on top; 1 to 4 channels: grey, grey and alpha, colour, colour and alpha. Palettes are resolved, and a
-        camera's note of how it was held is followed.
+        Top row first; 1 to 4 channels: grey, grey and alpha, colour, colour and alpha. Palettes are converted to colours, and
+        the orientation tag is applied.
 
     Raises
     ------
     FileError
-        When the file is missing, no picture, truncated, too large, or holds several pictures.
+        When the file is missing, not a picture, truncated, too large, or contains several pictures.
 
     Notes
     -----
-    A changed bit is found where the format has checksums: in PNG, and in EXR and TIFF packed with deflate. EXR is read by a
-    program of its own, which a broken file can end.
+    Bit errors are detected in formats with checksums: PNG, and EXR and TIFF with deflate compression. EXR is read in the
+    sandbox process, because corrupt files can crash its library.
     """
     path = Path(path)
     try:
@@ -122,7 +126,7 @@ def read_picture(path: str | Path) -> NDArray[Any]:
         picture = _reader_of(head)(path)
     except FileError:
         raise
-    except Exception as error:  # noqa: BLE001 -- readers raise whatever a broken file made them trip over
+    except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on corrupt files
         raise FileError(
             path, f"is corrupt or truncated ({' '.join(str(error).split()) or type(error).__name__})"
         ) from None
@@ -132,7 +136,7 @@ def read_picture(path: str | Path) -> NDArray[Any]:
 
 
 def _reader_of(head: bytes) -> Any:
-    """The reader for a file that begins with these bytes."""
+    """Return the reader for a file that begins with these bytes."""
     if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return _read_tiff
     if head[:8] == PNG_MAGIC and head[24:25] == b"\x10":
@@ -144,7 +148,7 @@ def _reader_of(head: bytes) -> Any:
     return _read_with_pillow
 
 
-# -- readers: each gives the numbers of the file, upright, or raises anything ----------------------------------------
+# -- readers: return the upright picture, or raise any exception ----------------------------------------------------
 
 
 def _read_with_pillow(path: Path) -> NDArray[Any]:
@@ -152,30 +156,32 @@ def _read_with_pillow(path: Path) -> NDArray[Any]:
 
     try:
         with _pillow_limit(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about notes beside the picture
+            warnings.simplefilter("ignore")  # invalid metadata
             with Image.open(path, formats=PILLOW_FORMATS) as image:
                 check_picture_size(path, image.width, image.height)
                 n_pictures = getattr(image, "n_frames", 1)
-                if n_pictures > 1 and image.format != "MPO":  # phones put small pictures behind the photograph
-                    raise FileError(path, f"holds {n_pictures} pictures; give a file with one")
+                if (
+                    n_pictures > 1 and image.format != "MPO"
+                ):  # MPO files of phones contain previews after the photograph
+                    raise FileError(path, f"contains {n_pictures} pictures; provide a file with one picture")
                 _check_whole(path, str(image.format))
                 return pixels_of_image(image)
     except UnidentifiedImageError:
-        raise FileError(path, "is not a picture in a format that can be read") from None
+        raise FileError(path, "is not a picture in a supported format") from None
     except Image.DecompressionBombError:
         raise FileError(path, f"has more than {MAX_PIXELS} pixels") from None
 
 
 def pixels_of_image(image: Image.Image) -> NDArray[Any]:
     """
-    The numbers of one of Pillow's images, as :func:`read_picture` gives them.
+    Convert an image of Pillow to an array as in :func:`read_picture`.
 
     Raises
     ------
     Exception
-        Whatever a broken file, or a mode that has no colours, makes Pillow trip over.
+        Of any type, when the file is corrupt or the mode cannot be converted.
     """
-    image.load()  # Pillow turns TIFF by itself, and then takes the note away
+    image.load()  # Pillow applies the orientation of TIFF on load and removes the tag
     orientation = _orientation(image)
     plain = _plain(image)
     numbers = np.asarray(plain)
@@ -186,7 +192,7 @@ def pixels_of_image(image: Image.Image) -> NDArray[Any]:
 
 
 def _check_whole(path: Path, kind: str) -> None:
-    """Reject what Pillow takes for whole: it passes over the sums of PNG, and does not always miss an end."""
+    """Reject corrupt files that Pillow accepts: wrong checksums of PNG, missing end markers."""
     if kind not in ("PNG", "JPEG", "MPO", "JPEG2000"):
         return
     content = path.read_bytes()
@@ -194,14 +200,14 @@ def _check_whole(path: Path, kind: str) -> None:
         is_whole = _has_true_sums(content)
     else:
         begin = content.find(JPEG2000_MAGIC) if kind == "JPEG2000" else _first_scan(content)
-        # Packed numbers are so written that they never hold the marker.
+        # Compressed image data never contain the end marker.
         is_whole = content.find(END_MARKER, max(begin, 0)) >= 0
     if not is_whole:
         raise FileError(path, "is corrupt or truncated")
 
 
 def _has_true_sums(content: bytes) -> bool:
-    """Whether the chunks of a PNG that hold its picture have the checksums that they tell."""
+    """Return whether the checksums of the image data chunks of a PNG are correct."""
     place, view = len(PNG_MAGIC), memoryview(content)
     while place + 12 <= len(content):
         begin = place + 4
@@ -214,7 +220,7 @@ def _has_true_sums(content: bytes) -> bool:
 
 
 def _first_scan(content: bytes) -> int:
-    """Where the numbers of a JPEG begin, behind its notes, which may hold another JPEG."""
+    """Return the offset of the image data of a JPEG, after metadata, which may contain a JPEG."""
     place = MARKER_BYTES
     while content[place : place + 1] == b"\xff" and content[place + 1] != START_OF_SCAN:
         is_filler = content[place + 1] == 0xFF
@@ -223,23 +229,23 @@ def _first_scan(content: bytes) -> int:
 
 
 def _plain(image: Image.Image) -> Image.Image:
-    """The image in a mode whose numbers are those of the file, with transparency as a channel."""
+    """Return the image in a mode that preserves the values, with transparency as a channel."""
     if "transparency" in image.info and image.mode in ("1", "L", "RGB", "P"):
         return image.convert("LA" if image.mode in ("1", "L") else "RGBA")
     return image if image.mode in PLAIN_MODES else image.convert(CONVERTED_MODES.get(image.mode, "RGB"))
 
 
 def _orientation(image: Image.Image) -> Any:
-    """The camera's note of how it was held; 1, upright, where the note is broken."""
+    """Return the orientation tag; 1, upright, where the metadata are corrupt."""
     try:
         return image.getexif().get(ORIENTATION_TAG, 1)
-    except Exception:  # noqa: BLE001 -- a broken note does not make a broken picture
+    except Exception:  # noqa: BLE001 -- the picture may be valid although its metadata are corrupt
         return 1
 
 
 @contextmanager
 def _pillow_limit() -> Iterator[None]:
-    """Pillow's own limit of pixels set to ours."""
+    """Set the pixel limit of Pillow to the limit of this module, inside the block."""
     from PIL import Image
 
     before = Image.MAX_IMAGE_PIXELS
@@ -256,7 +262,7 @@ def _read_tiff(path: Path) -> NDArray[Any]:
 
     with tifffile.TiffFile(path) as file:
         if len(file.pages) != 1:
-            raise FileError(path, f"holds {len(file.pages)} pictures; give a file with one")
+            raise FileError(path, f"contains {len(file.pages)} pictures; provide a file with one picture")
         page = file.pages[0]
         check_picture_size(path, page.imagewidth, page.imagelength)
         if page.photometric not in (
@@ -266,7 +272,7 @@ def _read_tiff(path: Path) -> NDArray[Any]:
             PHOTOMETRIC.PALETTE,
         ):
             name = getattr(page.photometric, "name", page.photometric)
-            raise FileError(path, f"is a TIFF in {name}; save it as grey or RGB")
+            raise FileError(path, f"is a TIFF with the colour space {name}; save it as grey or RGB")
         if page.samplesperpixel > 4:
             raise FileError(path, f"must be one picture of 1 to 4 channels, got {page.samplesperpixel}")
         picture = pixels_of_page(path, page)
@@ -280,28 +286,29 @@ def _read_tiff(path: Path) -> NDArray[Any]:
     if picture.dtype == np.bool_:
         picture = picture.astype(np.uint8) * np.uint8(255)
     if picture.dtype not in (np.uint8, np.uint16) and picture.dtype.kind != "f":
-        raise FileError(path, f"must hold 8-bit, 16-bit or floating-point numbers, got {picture.dtype}")
+        raise FileError(path, f"must contain 8-bit, 16-bit or floating-point numbers, got {picture.dtype}")
     if is_inverted:
         picture = (1 if picture.dtype.kind == "f" else np.iinfo(picture.dtype).max) - picture
     if has_dimmed_colours and picture.ndim == 3:
-        picture = picture[..., :-1]  # its colours are over black already
+        picture = picture[..., :-1]  # premultiplied alpha: the colours are already composed with black
     return _upright(picture.astype(np.float32) if picture.dtype.kind == "f" else picture, orientation)
 
 
 def pixels_of_page(path: Path, page: Any) -> NDArray[Any]:
     """
-    The numbers of a TIFF's page, all of which the file holds.
+    Return the pixels of a TIFF page, after checking that the file contains all of them.
 
     Parameters
     ----------
     path : Path
+        The file.
     page : tifffile.TiffPage
-        Of the open file; what it lacks would be 0.
+        Page of the open file; tifffile would read missing data as 0.
 
     Raises
     ------
     FileError
-        When a strip or tile lies outside the file, or none is told.
+        When a strip or tile is outside the file or missing in the metadata.
     """
     n_bytes = path.stat().st_size
     segments = list(zip(page.dataoffsets, page.databytecounts, strict=False))
@@ -317,7 +324,7 @@ def pixels_of_page(path: Path, page: Any) -> NDArray[Any]:
 
 
 def _read_deep_png(path: Path) -> NDArray[Any]:
-    """PNG of 16 bits, which Pillow would cut to 8 in colour."""
+    """Read a 16-bit PNG, which Pillow would reduce to 8 bits in colour."""
     imagecodecs = library(path, "imagecodecs")
     content = path.read_bytes()
     check_picture_size(path, *struct.unpack(">II", content[16:24]))
@@ -335,7 +342,7 @@ def _read_radiance(path: Path) -> NDArray[Any]:
 
 
 def _read_exr(path: Path) -> NDArray[Any]:
-    # OpenEXR prints what it could not read, and may go on without it.
+    # OpenEXR prints read errors and may continue without the data.
     return read_in_sandbox(_openexr, path, kind="EXR", max_unpacked=_max_unpacked, is_silent=True)[1][0]
 
 
@@ -344,12 +351,12 @@ def _max_unpacked(n_bytes: int) -> int:
 
 
 def _openexr(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
-    """The picture of an EXR, as the sandbox process reads it."""
+    """Read the picture of an EXR file, in the sandbox process."""
     path = Path(name)
     OpenEXR = library(path, "OpenEXR")
     with OpenEXR.File(str(path), header_only=True) as file:
         if len(file.parts) != 1:
-            raise FileError(path, f"holds {len(file.parts)} pictures; give a file with one")
+            raise FileError(path, f"contains {len(file.parts)} pictures; provide a file with one picture")
         low, high = (np.asarray(corner, dtype=np.int64) for corner in file.header()["dataWindow"])
         n_x, n_y = (high - low + 1).tolist()
         check_picture_size(path, n_x, n_y)
@@ -364,7 +371,7 @@ def _openexr(name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
 
 
 def _upright(picture: NDArray[Any], orientation: object) -> NDArray[Any]:
-    """A picture turned as its note says (EXIF and TIFF, tag 274); other values than 2 to 8 mean upright."""
+    """Apply the orientation tag 274 of EXIF and TIFF; values other than 2 to 8 mean upright."""
     match orientation:
         case 2:
             return picture[:, ::-1]
@@ -385,12 +392,12 @@ def _upright(picture: NDArray[Any], orientation: object) -> NDArray[Any]:
 
 def check_picture_size(path: Path, width: int, height: int) -> None:
     """
-    Check the size that a file claims for its picture, before memory is taken for it.
+    Check the picture size in a file header, before memory is allocated.
 
     Raises
     ------
     FileError
-        When it has more pixels than any picture of a scene.
+        When the number of pixels exceeds ``MAX_PIXELS``.
     """
     if width * height > MAX_PIXELS:
         raise FileError(path, f"has {width} x {height} pixels, more than the limit of {MAX_PIXELS}")
@@ -401,20 +408,20 @@ def check_picture_size(path: Path, width: int, height: int) -> None:
 
 def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
     """
-    Write a picture file, whole or not at all.
+    Write a picture file atomically.
 
     Parameters
     ----------
     path : path
-        Its ending chooses the format: ``.png`` and ``.tif`` keep every number of uint8 and uint16, ``.tif`` and, with the extra
-        ``pictures``, ``.exr`` those of float32, NaN included; others hold uint8, more or less.
+        The extension selects the format: ``.png`` and ``.tif`` store uint8 and uint16 losslessly; ``.tif`` and, with the extra
+        ``pictures``, ``.exr`` store float32 losslessly, including NaN; other formats store uint8, some with lossy compression.
     picture : (n_y, n_x) or (n_y, n_x, n_channel) uint8, uint16 or float32
-        First row on top; grey, grey and alpha, colour, or colour and alpha.
+        Top row first; grey, grey and alpha, colour, or colour and alpha.
 
     Raises
     ------
     FileError
-        When the ending names no known format, the array is no picture that it holds, or nothing can be written.
+        When the extension is unknown, the format does not support the array, or the file cannot be written.
     """
     from PIL import Image
 
@@ -422,9 +429,7 @@ def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
     ending = target.suffix.lower()
     is_pillow = Image.registered_extensions().get(ending) in PILLOW_FORMATS
     if not is_pillow and ending not in (*TIFF_ENDINGS, ".exr"):
-        raise FileError(
-            target, "must end in .png, .webp, .jpg, .bmp, .tga, .ppm, .jp2, .tif or .exr; .png keeps every number"
-        )
+        raise FileError(target, "must end in .png, .webp, .jpg, .bmp, .tga, .ppm, .jp2, .tif or .exr; .png is lossless")
     if picture.ndim == 3 and picture.shape[2] == 1:
         picture = picture[..., 0]
     held = (
@@ -440,7 +445,7 @@ def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
     ):
         raise FileError(
             target,
-            f"cannot hold an array of the shape {picture.shape} and type {picture.dtype}, only 1 to 4 channels of "
+            f"cannot store an array of the shape {picture.shape} and type {picture.dtype}, only 1 to 4 channels of "
             f"{' or '.join(held)}",
         )
     picture = np.ascontiguousarray(unmasked("picture", picture))
@@ -454,7 +459,7 @@ def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
                 imagecodecs = library(target, "imagecodecs")
                 temporary.write_bytes(imagecodecs.png_encode(picture))
             else:
-                # In memory: on a full disk Pillow's encoders leave half a file, or never end.
+                # Encode in memory: on a full disk, encoders of Pillow leave a truncated file or never return.
                 encoded = io.BytesIO()
                 Image.fromarray(picture).save(encoded, Image.registered_extensions()[ending])
                 temporary.write_bytes(encoded.getbuffer())
@@ -463,7 +468,7 @@ def write_picture(path: str | Path, picture: NDArray[Any]) -> None:
         except (OSError, ValueError, RuntimeError) as error:
             if disk_problem(error):
                 raise
-            raise FileError(target, f"cannot be written in this format ({error}); take .png") from None
+            raise FileError(target, f"cannot be written in this format ({error}); use .png") from None
 
 
 def _write_tiff(path: Path, picture: NDArray[Any]) -> None:

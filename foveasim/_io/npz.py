@@ -1,4 +1,4 @@
-"""Arrays and words about them in one ``.npz`` file: written whole, read within limits, and never unpickled."""
+"""Arrays with JSON metadata in ``.npz`` files: atomic writes, size limits, no unpickling."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from foveasim.errors import FileError
 
 __all__ = ["opened_archive", "read_archive", "read_array", "write_archive", "zip_members"]
 
-#: Name of the text beside the arrays.
+#: Name of the array that contains the metadata as JSON.
 ABOUT = "about"
 SUFFIX = ".npy"
 #: numpy before 2.2 stores the argument of this name as one more array; readers ignore it.
 STRAY = "allow_pickle"
-#: A file that would unpack to more than this is rejected.
+#: Files that would decompress to more than this are rejected.
 MAX_UNPACKED_BYTES = 8 * 2**30
-#: Bytes that are read at once.
+#: Bytes per read call.
 PIECE_BYTES = 2**20
 
 
@@ -36,28 +36,29 @@ def write_archive(
     path: str | Path, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], *, is_packed: bool = True
 ) -> None:
     """
-    Write arrays, and what is to be known about them, whole or not at all.
+    Write arrays and metadata atomically.
 
     Parameters
     ----------
     path : path
-        ``.npz``.
+        File with the extension ``.npz``.
     about : mapping
-        Plain data, as JSON holds them.
+        Metadata: plain data that JSON can represent.
     arrays : mapping of str to array
+        Arrays by name.
     is_packed : bool
-        Whether to write fewer bytes in more time.
+        Whether to compress the arrays: smaller files, slower writes.
 
     Raises
     ------
     FileError
-        When the ending is another, an array contains Python objects, or nothing can be written there.
+        When the extension is not ``.npz``, an array contains Python objects, or the file cannot be written.
     """
     target = Path(path)
     if target.suffix.lower() != ".npz":
         raise FileError(target, "must end in .npz")
     pickled = [name for name, array in arrays.items() if array.dtype.hasobject]
-    if pickled:  # not by allow_pickle=False, which is an array's name to numpy before 2.2
+    if pickled:  # numpy before 2.2 would store the argument allow_pickle=False as an array
         raise FileError(target, f"{pickled[0]!r:.40} must contain numbers or strings, got Python objects")
     members: dict[str, Any] = {ABOUT: np.array(json.dumps(about)), **arrays}
     with atomic_write(target) as temporary, temporary.open("wb") as file:
@@ -67,20 +68,20 @@ def write_archive(
 
 def read_archive(path: Path, *, max_bytes: int | None = None) -> tuple[Any, dict[str, NDArray[Any]]]:
     """
-    What :func:`write_archive` wrote: the words, or None where there are none, and the arrays.
+    Read the metadata, None if there are none, and the arrays of :func:`write_archive`.
 
     Raises
     ------
     FileError
-        When it would unpack to too much, or is packed as numpy never packs.
+        When the file would decompress to too many bytes, or has a compression method that numpy does not use.
     Exception
-        Of any kind, when it is broken; :func:`opened_archive` tells it in one sentence.
+        Of any type, when the file is corrupt; :func:`opened_archive` converts it to a FileError.
     """
     limit = MAX_UNPACKED_BYTES if max_bytes is None else max_bytes
     arrays = {}
     with zip_members(path) as (archive, items):
         if sum(item.file_size for item in archive.infolist()) > limit:
-            raise FileError(path, f"would unpack to more than {limit} bytes")
+            raise FileError(path, f"would decompress to more than {limit} bytes")
         for name, item in items.items():
             if name != STRAY:
                 with archive.open(item) as file:
@@ -93,20 +94,21 @@ def opened_archive(
     path: str | Path, what: str, file_format: str, version: int
 ) -> Iterator[tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
     """
-    What a file says, and its arrays; whatever the block trips over in them is told in one sentence.
+    Yield the metadata and the arrays of a file; exceptions of the block become FileErrors.
 
     Parameters
     ----------
     path : path
+        File that :func:`write_archive` wrote.
     what : str
-        What the file should hold, for messages: ``"foveasim capture"``.
+        Expected kind of the file, for messages: ``"foveasim capture"``.
     file_format, version
-        What it must say under ``format`` and ``version``.
+        Required values of ``format`` and ``version`` in the metadata.
 
     Raises
     ------
     FileError
-        When the file is missing, too large, broken, or of another format.
+        When the file is missing, too large, corrupt, or of another format.
     """
     source = Path(path)
     if not source.is_file():
@@ -114,7 +116,7 @@ def opened_archive(
     with as_file_error(source, what, passes=(FileError,)):
         about, arrays = read_archive(source)
         if not isinstance(about, dict) or about.get("format") != file_format:
-            raise FileError(source, f"is no {what}")
+            raise FileError(source, f"is not a valid {what}")
         if about.get("version") != version:
             raise FileError(source, f"has the format version {about.get('version')!r:.40}, expected {version}")
         yield about, arrays
@@ -123,17 +125,17 @@ def opened_archive(
 @contextmanager
 def zip_members(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, zipfile.ZipInfo]]]:
     """
-    Open a zip archive of arrays, with its members by the names of the arrays.
+    Open a zip archive of arrays; yield it with its members by array name.
 
     Raises
     ------
     FileError
-        When a member is compressed as numpy never does.
+        When a member has a compression method that numpy does not use.
     """
     with zipfile.ZipFile(path) as archive:
         items = {item.filename.removesuffix(SUFFIX): item for item in archive.infolist()}
         if not {item.compress_type for item in items.values()} <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
-            raise FileError(path, "is packed in a way that numpy does not use")
+            raise FileError(path, "has a compression method that numpy does not use")
         yield archive, items
 
 
@@ -141,35 +143,37 @@ def read_array(
     file: IO[bytes], n_bytes: int, check: Callable[[tuple[int, ...], np.dtype[Any]], None] | None = None
 ) -> NDArray[Any]:
     """
-    Read one array, after its header was found to fit what follows it: no array is made larger than the file is.
+    Read an array in the ``.npy`` format, after checking its header against the file size.
+
+    The check prevents allocations larger than the file.
 
     Parameters
     ----------
     file : binary file
-        In the ``.npy`` format.
+        File in the ``.npy`` format.
     n_bytes : int
-        Length of the file.
+        Size of the file.
     check : callable, optional
-        Gets shape and dtype before anything is allocated, and may raise.
+        Function that receives shape and dtype before memory is allocated, and may raise.
 
     Raises
     ------
     ValueError
-        When the header is invalid, or the array has Python objects or another size.
+        When the header is invalid or does not match the size, or the array contains Python objects.
     """
     version = npy.read_magic(file)
     if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"array format {version}")
+        raise ValueError(f"unsupported array format {version}")
     read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
     shape, is_fortran, dtype = read_header(file)
     if check is not None:
         check(shape, dtype)
     if dtype.hasobject:
-        raise ValueError("an array of objects")
+        raise ValueError("an array of Python objects")
     n, left = math.prod(shape), n_bytes - file.tell()
-    # Items of no bytes could be there any number of times.
+    # The file size does not limit the number of items of zero bytes.
     if n * dtype.itemsize != left or min(shape, default=0) < 0 or n > max(n_bytes, MAX_SITES):
-        raise ValueError("an array of another size than its header tells")
+        raise ValueError("the size of an array does not match its header")
     if not dtype.itemsize:
         return np.zeros(shape, dtype)
     data = np.empty(left, np.uint8)

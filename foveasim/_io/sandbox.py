@@ -1,4 +1,4 @@
-"""Reading through libraries that a malformed file can crash: in a sandbox process, with limits of memory and time."""
+"""Sandbox process with resource limits, for libraries that malformed files can crash."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from foveasim.errors import FileError
 
 __all__ = ["PATIENCE", "read_in_sandbox", "run_in_sandbox"]
 
-#: Memory of the process and its libraries, and how often the numbers are copied on their way.
+#: Memory of the process and its libraries, and number of copies of the data in memory.
 BASE_BYTES, COPIES = 2**31, 3
 MAX_CPU_S, BYTES_PER_S = 10, 2**22
-#: Wall time over processor time: on a busy computer the same takes longer.
+#: Ratio of the wall time limit to the processor time limit, for busy machines.
 PATIENCE = 5
 CHILD = Path(__file__).with_name("_sandboxed.py")
 
-#: What a reader returns: plain data, and arrays.
+#: Result of a reader: plain data, and arrays.
 Answer = tuple[dict[str, Any], list[NDArray[Any]]]
 
 
@@ -40,27 +40,27 @@ def read_in_sandbox(
     **args: Any,
 ) -> Answer:
     """
-    Run a reader of the package in the sandbox process, with limits by the size of the file.
+    Run a reader of the package in the sandbox process, with limits by file size.
 
     Parameters
     ----------
     reader : function
-        Of a module, by its name: of the path as a string and ``args``, to what the file tells, as JSON has it, and arrays.
+        Module-level function of the path as a string and ``args``; returns plain data that JSON can represent, and arrays.
     path : Path
-        A file, or a directory.
+        A file or a directory.
     kind : str
-        Of the file, for messages.
+        Kind of the file, for messages.
     max_unpacked : function
-        Bytes of the numbers that a file of so many bytes may hold.
+        Function of the file size in bytes that returns the maximum size of the decompressed data in bytes.
     is_silent : bool
-        Whether the reader prints nothing for a valid file.
+        Whether output of the reader on standard output means that the file is corrupt.
     **args
-        Plain data.
+        Keywords of the reader, plain data.
 
     Raises
     ------
     FileError
-        When the reader rejects the file, fails, crashes, prints though it is silent, or takes too much memory or time.
+        When the reader rejects the file, fails, crashes, prints although ``is_silent`` is set, or exceeds a limit.
     """
     n_bytes = path.stat().st_size if path.is_file() else _directory_bytes(path)
     return run_in_sandbox(
@@ -91,21 +91,21 @@ def run_in_sandbox(
     Parameters
     ----------
     reader, path, kind, is_silent
-        As for :func:`read_in_sandbox`.
+        As in :func:`read_in_sandbox`.
     args : mapping
         Keywords of the reader, plain data.
     max_cpu_s : int, s
-        Processor time; ``PATIENCE`` times as much wall time.
+        Processor time limit; the wall time limit is ``PATIENCE`` times as long.
     max_bytes : int
-        Address space.
+        Limit of the address space.
     is_standalone : bool
-        Whether the reader's module imports nothing of the package. It is loaded by itself, which is faster and needs less
-        memory, and the reader gets a keyword ``limit``, the function that sets limits.
+        Whether the module of the reader imports no other module of the package. It is then loaded without the package, which is
+        faster and needs less memory, and the reader receives the keyword ``limit``, the function that sets resource limits.
 
     Raises
     ------
     FileError
-        As for :func:`read_in_sandbox`.
+        As in :func:`read_in_sandbox`.
     """
     with tempfile.TemporaryDirectory(prefix="foveasim-") as folder:
         arrays, printed = Path(folder) / "arrays.npy", Path(folder) / "printed.txt"
@@ -122,14 +122,14 @@ def run_in_sandbox(
             "max_bytes": max_bytes,
         }
         try:
-            done = subprocess.run(  # noqa: S603 -- our own program
+            done = subprocess.run(  # noqa: S603 -- a script of this package
                 [sys.executable, "-P", str(CHILD)],
                 input=json.dumps(task).encode(),
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 timeout=PATIENCE * max_cpu_s,
                 check=False,
-                # Each thread of a library reserves memory of its own.
+                # Each thread of a library reserves memory.
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::"},
             )
             is_late = done.returncode == -getattr(signal, "SIGXCPU", 0)

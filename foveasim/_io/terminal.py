@@ -1,9 +1,8 @@
 """
-Consoles that print text from outside as it is: no markup, no control characters, and plain characters where needed.
+Consoles that print untrusted text without interpreting markup or control characters.
 
-Paths, names in files and values in messages may contain anything. A console of this module interprets none of it as
-markup or emoji codes and prints control characters as escapes. A stream that cannot encode a character gets one that
-looks like it, or its escape.
+Paths, names in files and values in messages are untrusted. The consoles of this module do not interpret them as markup or emoji
+codes, and print control characters as escapes. Characters that a stream cannot encode are replaced by similar ones or escapes.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ from foveasim.errors import printable
 
 __all__ = ["PlainConsole", "plain_streams", "spinner_of", "text_of"]
 
-#: Name of the error handler of streams.
+#: Name of the encoding error handler of streams.
 HANDLER = "foveasim.plain"
-#: ASCII for the characters that this package and rich print; one for one where possible, so that tables keep their columns.
+#: ASCII replacements of characters that this package and rich print, of equal length where possible to align tables.
 LOOK_ALIKES = {
     "u": "µμ",
     "x": "×",
@@ -40,7 +39,7 @@ LOOK_ALIKES = {
     "#": "█▉▊▋▌▐",
     "=": "▍▎▏▇▆▅▄",
     "_": "▃▂▁",
-    "*": "•" + "".join(map(chr, range(0x2800, 0x2900))),  # and the braille of spinners
+    "*": "•" + "".join(map(chr, range(0x2800, 0x2900))),  # braille characters of spinners
     "...": "…",
     "+-": "±",
     "deg": "°",
@@ -55,21 +54,25 @@ PLAIN_CHARACTERS = {character: plain for plain, characters in LOOK_ALIKES.items(
 
 
 class PlainConsole(Console):
-    """A rich console for text from outside; strings are printed as they are, styled parts are ``rich.text.Text``."""
+    """
+    A rich console for untrusted text.
+
+    Strings are printed without interpretation of markup; styled parts are ``rich.text.Text``.
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Return the string as text, control characters but line ends as escapes."""
+        """Return a string as rich text, with control characters except line breaks as escapes."""
         return super().render_str(printable(text, keep="\n"), **options)
 
 
 def text_of(value: object) -> Text:
     """
-    Return a value from outside as a text that no console interprets, in one line.
+    Return an untrusted value as rich text on one line, without interpretation of markup.
 
-    For tables that users print on consoles of their own, and for parts of rich that interpret strings as markup always.
+    For tables that users print on their own consoles, and for parts of rich that always interpret strings as markup.
     """
     return Text(printable(value))
 
@@ -81,7 +84,7 @@ def spinner_of(console: Console) -> str:
 
 @contextmanager
 def plain_streams() -> Iterator[None]:
-    """Let standard output and error print a similar character, or an escape, for what they cannot encode."""
+    """Replace characters that standard output and error cannot encode, inside the block."""
     with ExitStack() as changed:
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, TextIOWrapper):
@@ -91,7 +94,7 @@ def plain_streams() -> Iterator[None]:
 
 
 def _plain(error: UnicodeError) -> tuple[str, int]:
-    """Replace what a stream cannot encode."""
+    """Replace characters that a stream cannot encode by similar ones or escapes."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     bad = error.object[error.start : error.end]

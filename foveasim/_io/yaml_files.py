@@ -1,4 +1,4 @@
-"""YAML from strangers: with limits, without tags and anchors, and nothing evaluated."""
+"""Safe reading of untrusted YAML, with size limits and without tags and anchors."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ from foveasim.errors import ConfigError
 
 __all__ = ["MAX_FILE_BYTES", "parsed", "read_text", "read_yaml"]
 
-#: A settings file is written by hand; a longer one is something else.
+#: Size limit: settings files are written by hand.
 MAX_FILE_BYTES = 1 << 20
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML without tags, anchors and repeated keys, with 1e-13 as a number, and with all keys as texts, as JSON has them."""
+    """
+    Loader of YAML without tags, anchors and duplicate keys.
+
+    1e-13 is a number, and all keys are strings, as in JSON.
+    """
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         event = self.peek_event()  # type: ignore[no-untyped-call]
@@ -31,9 +35,9 @@ class _Loader(yaml.SafeLoader):
             key = self.construct_object(key_node, deep=True)
             line = key_node.start_mark.line + 1
             if not isinstance(key, str) and (not isinstance(key, int) or isinstance(key, bool)):
-                raise yaml.YAMLError(f"the key {key!r} must be a text or an integer (line {line})")
+                raise yaml.YAMLError(f"the key {key!r} must be a string or an integer (line {line})")
             if str(key) in seen:
-                raise yaml.YAMLError(f"the key '{key}' stands there twice (line {line})")
+                raise yaml.YAMLError(f"duplicate key '{key}' (line {line})")
             seen.add(str(key))
         return {str(key): value for key, value in super().construct_mapping(node, deep).items()}
 
@@ -51,12 +55,12 @@ _Loader.add_implicit_resolver(
 
 def parsed(path: Path, text: str) -> Any:
     """
-    What a text says, told as part of a file.
+    Parse a YAML string; errors name the file.
 
     Raises
     ------
     ConfigError
-        When it is no YAML, or uses more of it than settings need.
+        When the string is not YAML, or contains tags, anchors, duplicate keys or deep nesting.
     """
     try:
         return yaml.load(text, _Loader)  # noqa: S506 -- a SafeLoader
@@ -66,41 +70,41 @@ def parsed(path: Path, text: str) -> Any:
         line = "" if error.problem_mark is None else f", line {error.problem_mark.line + 1}"
         raise ConfigError(path, f"is not YAML{line}: {error.problem}") from None
     except (yaml.YAMLError, ValueError) as error:
-        raise ConfigError(path, f"is not YAML as settings need it: {' '.join(str(error).split())}") from None
+        raise ConfigError(path, f"is not valid YAML for settings: {' '.join(str(error).split())}") from None
 
 
 def read_text(path: Path) -> str:
     """
-    A text that was written by hand or by a small program.
+    Read a small UTF-8 text file.
 
     Raises
     ------
     ConfigError
-        When it is no file, too large, or no text in UTF-8.
+        When the file is missing, too large, or not UTF-8 text.
     """
     if not path.is_file():
         raise ConfigError(path, "no such file" if not path.exists() else "is not a file")
     if path.stat().st_size > MAX_FILE_BYTES:
-        raise ConfigError(path, f"is larger than {MAX_FILE_BYTES} bytes, and so no settings file")
+        raise ConfigError(path, f"is larger than {MAX_FILE_BYTES} bytes, the limit of settings files")
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
-        raise ConfigError(path, "is no text file in UTF-8") from None
+        raise ConfigError(path, "is not a UTF-8 text file") from None
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
     """
-    The settings in a file.
+    Read a settings file.
 
     Raises
     ------
     ConfigError
-        When it is no file, too large, no text, no YAML, or no mapping.
+        When the file is missing, too large, not UTF-8 text, not YAML, or not a mapping.
     """
     text = read_text(path)
     data = parsed(path, text)
     if not isinstance(data, dict):
         raise ConfigError(
-            path, f"must hold settings as 'key: value', got {'nothing' if data is None else repr(data)[:60]}"
+            path, f"must contain settings as 'key: value', got {'nothing' if data is None else repr(data)[:60]}"
         )
     return data

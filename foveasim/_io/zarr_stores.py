@@ -1,8 +1,8 @@
 """
-Zarr stores from anywhere: opened without running what they name, and read only where every number is there.
+Safe reading of untrusted zarr stores, and writing of arrays to stores.
 
-Metadata of a zarr array name the codecs that decompress its chunks, a chunk that is missing reads as a fill value, and a
-few bytes of metadata can claim any size. What reads a store of ours therefore checks the metadata first.
+The metadata of a zarr array name the codecs that decompress its chunks, a missing chunk is read as a fill value, and a few
+bytes of metadata can claim any size. Readers of the package therefore check the metadata before they read data.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ __all__ = [
 ]
 
 ZARR = ".zarr"
-#: Metadata of a group or an array are text; a longer file is something else.
+#: Size limit of the metadata of a group or an array.
 MAX_METADATA_BYTES = 2**26
-#: Longest name of an array: names of files have 255 bytes.
+#: Maximum length of an array name: file names are limited to 255 bytes.
 LONGEST_NAME = 60
 
 
 @dataclass(frozen=True)
 class Variable:
-    """An array with the names of its dimensions and its attributes, its unit among them."""
+    """An array with its dimension names and attributes, including its unit."""
 
     dims: tuple[str, ...]
     data: NDArray[Any]
@@ -51,7 +51,7 @@ class Variable:
 
 def free_name(name: str, taken: Collection[str]) -> str:
     """
-    Return a name for an array that zarr, netCDF and xarray take: letters, digits and ``_``, and not yet taken.
+    Return an unused array name that zarr, netCDF and xarray accept: letters, digits, ``_``.
 
     Examples
     --------
@@ -67,15 +67,15 @@ def free_name(name: str, taken: Collection[str]) -> str:
 
 def write_variables(group: Any, variables: Mapping[str, Variable]) -> None:
     """
-    Write arrays into an open group, each uncompressed in one chunk, with the names of its dimensions.
+    Write arrays to an open group, each uncompressed in one chunk, with dimension names.
 
     Raises
     ------
     FileError
-        When this version of zarr has no array of that type.
+        When the installed version of zarr does not support the type of an array.
     """
     with warnings.catch_warnings():
-        # Zarr has text of a fixed length for all who open the store with xarray, and warns that others may not read it.
+        # zarr warns that fixed-length strings are not portable; xarray reads them.
         warnings.simplefilter("ignore")
         for name, variable in variables.items():
             values = np.asarray(variable.data, order="C")
@@ -93,14 +93,14 @@ def write_variables(group: Any, variables: Mapping[str, Variable]) -> None:
             )
             if array.dtype != values.dtype:
                 raise FileError(
-                    Path(str(group.store_path)), f"cannot hold '{name}' of the type {values.dtype}; update zarr"
+                    Path(str(group.store_path)), f"cannot store '{name}' of the type {values.dtype}; update zarr"
                 )
             if values.size:
                 array[...] = values
 
 
 def store_format(path: Path) -> str | None:
-    """Return what the root of a zarr store specifies as its format, None where there is no store of zarr 3."""
+    """Return the ``format`` attribute of the root of a zarr 3 store, or None."""
     try:
         return str(_metadata(path / "zarr.json")["attributes"]["format"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
@@ -109,22 +109,24 @@ def store_format(path: Path) -> str | None:
 
 def check_codecs(source: Path, allowed: Collection[str], what: str) -> None:
     """
-    Check that metadata name no other codecs for the chunks than the allowed ones.
+    Check that the metadata of a store name only allowed codecs.
 
     Raises
     ------
     FileError
-        When they do.
+        When the metadata name another codec, or storage transformers.
     ValueError, KeyError, AttributeError, OSError
         When the metadata are corrupt.
     """
     for path in (*source.glob("zarr.json"), *source.glob("*/zarr.json"), *source.glob("*/*/zarr.json")):
         metadata = _metadata(path)
         if metadata.get("storage_transformers"):
-            raise FileError(source, f"is packed in a way that no {what} is")
+            raise FileError(source, f"has storage transformers, which are not valid in a {what}")
         for codec in metadata.get("codecs", []):
             if codec.get("name") not in allowed:
-                raise FileError(source, f"is packed with {shown(codec.get('name'), at_most=40)}, as no {what} is")
+                raise FileError(
+                    source, f"has the codec {shown(codec.get('name'), at_most=40)}, which is not valid in a {what}"
+                )
 
 
 @contextmanager
@@ -132,28 +134,28 @@ def opened_store(
     path: Path, what: str, file_format: str, version: int
 ) -> Iterator[tuple[Mapping[str, Any], Mapping[str, Any]]]:
     """
-    Open a store that :func:`write_variables` wrote; any error in the block that its contents cause is a FileError.
+    Open a store of :func:`write_variables`; exceptions of the block become FileErrors.
 
     Parameters
     ----------
     path : Path
-        A directory.
+        Directory of the store.
     what : str
-        What the store should hold, for messages: ``"foveasim capture"``.
+        Expected kind of the store, for messages: ``"foveasim capture"``.
     file_format, version
-        What its attributes must specify.
+        Required values of ``format`` and ``version`` in the attributes.
 
     Yields
     ------
     attributes : mapping
-        Of the root.
+        Attributes of the root.
     arrays : mapping of str to zarr array
-        By path, such as ``"code"`` and ``"layout/xy_um"``; every one has all its numbers.
+        Arrays by path, such as ``"code"`` and ``"layout/xy_um"``; all chunks are complete.
 
     Raises
     ------
     FileError
-        When zarr is missing, or the store is missing, corrupt, incomplete or of another format.
+        When zarr is not installed, or the store is missing, corrupt, incomplete or of another format.
     """
     zarr = library(path, "zarr")
     if not path.is_dir():
@@ -178,7 +180,7 @@ def opened_store(
         yield attributes, arrays
     except FileError:
         raise
-    except Exception as error:  # noqa: BLE001 -- corrupt contents make their readers raise anything
+    except Exception as error:  # noqa: BLE001 -- readers raise arbitrary exceptions on corrupt stores
         reason = " ".join(str(error).split()) or type(error).__name__
         raise FileError(path, f"is corrupt or not a {what} ({reason:.200})") from None
 
@@ -190,12 +192,12 @@ def _metadata(path: Path) -> Any:
 
 
 def _check_plain_files(path: Path) -> None:
-    """Check that nothing in a store leads out of it."""
+    """Check that a store contains only regular files and directories, no links."""
     for folder, folders, files in os.walk(path, followlinks=False):
         for name in (*folders, *files):
             found = Path(folder) / name
             if found.is_symlink() or not (found.is_file() or found.is_dir()):
-                raise FileError(path, f"holds {shown(name)}, which is neither a file nor a directory of its own")
+                raise FileError(path, f"contains {shown(name)}, which is neither a regular file nor a directory")
 
 
 def _bytes_of_chunks(folder: Path) -> int:

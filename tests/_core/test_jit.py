@@ -1,4 +1,4 @@
-"""Compiled kernels: corrupt machine code on disk is compiled again; what cannot be replaced is named."""
+"""Compiled kernels: corrupt machine code on disk is compiled again, or its directory is reported."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import foveasim
 from foveasim._core.jit import njit
 
 PACKAGE = Path(foveasim.__file__).parent
-#: Load the smallest kernels, and walk the GDSII records HEADER and ENDLIB, 6 and 4 bytes.
+#: Load a small kernel module, and parse the GDSII records HEADER and ENDLIB, 6 and 4 bytes.
 PROGRAM = """
 import sys
 import numpy as np
@@ -73,7 +73,7 @@ def test_corrupt_machine_code_is_compiled_again(filled_cache, tmp_path, extensio
     assert load_kernels(cache) == ("(10, 1024)", "")
 
 
-def test_irreplaceable_machine_code_is_named(filled_cache, tmp_path):
+def test_irreplaceable_machine_code_is_reported(filled_cache, tmp_path):
     cache = shutil.copytree(filled_cache, tmp_path / "numba")
     for path in cache.rglob("*.nbi"):
         path.unlink()

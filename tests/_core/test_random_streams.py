@@ -1,4 +1,4 @@
-"""Streams of random numbers, which depend on seed, frame and effect alone; generators by counter; Gaussian numbers."""
+"""Random streams by seed, frame and effect; counter-based generators; Gaussian numbers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def draws(seed, frame, effect):
 
 
 @pytest.mark.parametrize("key", KEYS, ids=str)
-def test_the_same_key_gives_the_same_numbers(key):
+def test_same_key_gives_same_numbers(key):
     np.testing.assert_array_equal(draws(*key), draws(*key))
 
 
@@ -36,7 +36,7 @@ def test_streams_of_different_keys_are_uncorrelated():
     assert np.abs(off_diagonal).max() < 5.0 / math.sqrt(N_DRAWS)
 
 
-def test_no_two_keys_share_a_number():
+def test_different_keys_give_different_numbers():
     all_draws = np.concatenate(
         [Streams(seed, frame).of(effect).integers(2**63, size=100) for seed, frame, effect in KEYS]
     )
@@ -47,7 +47,7 @@ def test_seed_and_frame_are_not_interchangeable():
     assert Streams(1, 0).of("shot").integers(2**63) != Streams(0, 1).of("shot").integers(2**63)
 
 
-def test_a_stream_begins_anew_whatever_was_drawn_before():
+def test_stream_is_independent_of_previous_draws():
     streams = Streams(7, 3)
     first = streams.of("read").standard_normal(10)
     for effect in ("shot", "read", "shot_gaussian"):
@@ -55,7 +55,7 @@ def test_a_stream_begins_anew_whatever_was_drawn_before():
     np.testing.assert_array_equal(streams.of("read").standard_normal(10), first)
 
 
-def test_another_process_draws_the_same_numbers():
+def test_other_process_draws_same_numbers():
     program = "from foveasim._core.random_streams import Streams; print(Streams(5, 2).of('shot').integers(2**63))"
     here = int(Streams(5, 2).of("shot").integers(2**63))
     for hash_seed in ("1", "2"):
@@ -67,8 +67,8 @@ def test_another_process_draws_the_same_numbers():
 
 
 @pytest.mark.parametrize("seed", [2**53, 2**64, 2**127], ids=["2^53", "2^64", "2^127"])
-def test_large_seeds_that_differ_by_one_give_different_numbers(seed):
-    # numpy's own seeds have 128 bits.
+def test_large_seeds_are_distinguished(seed):
+    # Default seeds of numpy have 128 bits.
     values = {int(Streams(s).of("shot").integers(2**63)) for s in (seed, seed + 1)}
     assert len(values) == 2
 
@@ -86,19 +86,19 @@ def test_large_seeds_that_differ_by_one_give_different_numbers(seed):
         ([1, 2], "must be one number"),
     ],
 )
-def test_a_seed_or_frame_that_is_no_count_is_refused(name, index, value, rule):
+def test_invalid_seed_or_frame_is_rejected(name, index, value, rule):
     arguments = [0, 0]
     arguments[index] = value
     with pytest.raises(ParameterError, match=f"^'{name}' {rule}"):
         Streams(*arguments)
 
 
-def test_whole_numbers_of_any_type_mean_the_same_seed():
+def test_integers_of_any_type_are_equal_seeds():
     values = [Streams(seed).of("shot").integers(2**63) for seed in (3, 3.0, np.int64(3), np.uint8(3))]
     assert all(a == b for a, b in itertools.pairwise(values))
 
 
-# -- generators by counter --------------------------------------------------------------------------------------------
+# -- counter-based generators -----------------------------------------------------------------------------------------
 
 MASK_32 = 2**32 - 1
 
@@ -116,8 +116,8 @@ def known(generator, key, counter):
         ((0x13198A2E,), (0x243F6A88, 0x85A308D3), (0xDD7CE038, 0xF62A4C12)),
     ],
 )
-def test_philox_2x32_gives_published_answers(key, counter, words):
-    """Known-answer tests that Salmon et al. publish with Random123."""
+def test_philox_2x32_matches_published_values(key, counter, words):
+    """Known-answer tests of Random123, Salmon et al."""
     assert known(_kernels.philox_2x32, key, counter) == words
 
 
@@ -133,8 +133,8 @@ def test_philox_2x32_gives_published_answers(key, counter, words):
         ),
     ],
 )
-def test_philox_4x32_gives_published_answers(key, counter, words):
-    """Known-answer tests that Salmon et al. publish with Random123."""
+def test_philox_4x32_matches_published_values(key, counter, words):
+    """Known-answer tests of Random123, Salmon et al."""
     assert known(_kernels.philox_4x32, key, counter) == words
 
 
@@ -148,7 +148,7 @@ def normals(key, n):
 
 
 def reference_pair(key, counter):
-    """Box and Muller's pair by the functions of the math module."""
+    """Return a pair of Gaussian numbers by the Box-Muller method with functions of the math module."""
     key_0, key_1 = key & MASK_32, key >> 32
     c0, c1, c2, c3 = known(_kernels.philox_4x32, (key_0, key_1), (counter & MASK_32, counter >> 32, 0, 0))
     # The words are read as signed; adding 2**31 modulo 2**32 makes them positive.
@@ -161,14 +161,14 @@ def reference_pair(key, counter):
 
 
 @pytest.mark.parametrize("key", [0, 1, 2**63, 2**64 - 1])
-def test_gaussian_numbers_follow_box_and_muller(key):
+def test_gaussian_numbers_match_box_muller_method(key):
     expected = np.ravel([reference_pair(key, counter) for counter in range(1500)])
     np.testing.assert_allclose(normals(key, 3000), expected, rtol=1e-7, atol=1e-9)
     assert np.abs(normals(key, 3000) - expected).max() < 1e-12
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 1023, 1024, 1025, 3001])
-def test_shorter_draws_begin_equally(n):
+def test_shorter_draws_are_prefixes(n):
     np.testing.assert_array_equal(normals(5, n), normals(5, 5000)[:n])
 
 
@@ -183,11 +183,11 @@ def test_gaussian_numbers_have_gaussian_moments():
 def test_gaussian_numbers_have_gaussian_tails():
     n = 4_000_000
     z = standard_normal(Streams(12).of("read"), n)
-    borders = np.array([-np.inf, -4.5, -4.0, -3.0, -2.0, -1.0, -0.1, 0.0, 0.1, 1.0, 2.0, 3.0, 4.0, 4.5, np.inf])
-    expected = n * np.diff(scipy.stats.norm.cdf(borders))
-    # norm.cdf near 1 loses digits that its mirror image has.
+    edges = np.array([-np.inf, -4.5, -4.0, -3.0, -2.0, -1.0, -0.1, 0.0, 0.1, 1.0, 2.0, 3.0, 4.0, 4.5, np.inf])
+    expected = n * np.diff(scipy.stats.norm.cdf(edges))
+    # Cancellation near 1: use the symmetric tail.
     expected[-3:] = expected[2::-1]
-    assert scipy.stats.chisquare(np.histogram(z, borders)[0], expected).pvalue > 1e-6
+    assert scipy.stats.chisquare(np.histogram(z, edges)[0], expected).pvalue > 1e-6
     assert scipy.stats.kstest(z[:500_000], "norm").pvalue > 1e-6
 
 

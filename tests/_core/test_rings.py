@@ -1,4 +1,4 @@
-"""Laws of the measures of packed rings, against exact rational arithmetic, closed forms and plain loops."""
+"""Measurements of packed rings against exact rational arithmetic, closed forms and plain loops."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from foveasim._core.rings import are_convex, next_vertex, positions_in_runs, rin
 
 relaxed = settings(deadline=None, derandomize=True, max_examples=60)
 
-#: Multiples of 2^-16 µm, which stay exact under shifts by whole µm.
+#: Multiples of 2^-16 µm, which shifts by integer µm preserve exactly.
 dyadic = st.integers(-(2**20), 2**20).map(lambda k: k / 2**16)
 points = st.tuples(dyadic, dyadic)
 rings = st.lists(points, min_size=3, max_size=9)
@@ -23,7 +23,7 @@ sites = st.lists(st.lists(rings, min_size=1, max_size=3), min_size=1, max_size=5
 
 
 def packed(nested):
-    """Packed rings of sites given as nested lists."""
+    """Convert sites as nested lists to packed rings."""
     all_rings = [ring for site in nested for ring in site]
     xy_um = np.array([point for ring in all_rings for point in ring], float).reshape(-1, 2)
     ring_offsets = np.cumsum([0, *map(len, all_rings)])
@@ -31,7 +31,7 @@ def packed(nested):
 
 
 def exact_area_and_moment(ring):
-    """Signed area and first moments of a ring as fractions: sums over the triangles of its edges with (1, 2)."""
+    """Return signed area and first moments of a ring as fractions, from triangles with the point (1, 2)."""
     px, py = Fraction(1), Fraction(2)
     area, moment = Fraction(0), [Fraction(0), Fraction(0)]
     exact = [(Fraction(x), Fraction(y)) for x, y in ring]
@@ -53,13 +53,13 @@ def exact_area_and_moment(ring):
         ((4, 1, 3), [1, 2, 3, 0, 4, 6, 7, 5]),
     ],
 )
-def test_next_vertex_closes_each_ring_on_itself(lengths, after):
+def test_next_vertex_closes_each_ring(lengths, after):
     assert next_vertex(np.cumsum([0, *lengths])).tolist() == after
 
 
 @given(sites)
 @relaxed
-def test_ring_moments_are_those_of_exact_arithmetic(nested):
+def test_ring_moments_match_exact_arithmetic(nested):
     xy_um, ring_offsets, _ = packed(nested)
     area_um2, moment_um3 = ring_moments(xy_um, ring_offsets)
     expected = [exact_area_and_moment(ring) for site in nested for ring in site]
@@ -70,7 +70,7 @@ def test_ring_moments_are_those_of_exact_arithmetic(nested):
 
 @given(rings)
 @relaxed
-def test_a_reversed_ring_has_the_opposite_area(ring):
+def test_reversed_ring_has_negated_area(ring):
     offsets = np.array([0, len(ring)])
     forward, _ = ring_moments(np.array(ring), offsets)
     backward, _ = ring_moments(np.array(ring[::-1]), offsets)
@@ -80,17 +80,17 @@ def test_a_reversed_ring_has_the_opposite_area(ring):
 
 @given(sites, st.integers(-(10**7), 10**7), st.integers(-(10**7), 10**7))
 @relaxed
-def test_areas_keep_all_their_digits_far_from_the_origin(nested, dx_um, dy_um):
+def test_areas_are_exact_far_from_origin(nested, dx_um, dy_um):
     xy_um, ring_offsets, _ = packed(nested)
-    here, _ = ring_moments(xy_um, ring_offsets)
-    there, _ = ring_moments(xy_um + np.array([dx_um, dy_um]), ring_offsets)
+    near, _ = ring_moments(xy_um, ring_offsets)
+    far, _ = ring_moments(xy_um + np.array([dx_um, dy_um]), ring_offsets)
 
-    assert there.tolist() == here.tolist()
+    assert far.tolist() == near.tolist()
 
 
 @given(st.lists(rings, min_size=1, max_size=6))
 @relaxed
-def test_the_measures_of_a_ring_do_not_depend_on_its_neighbours(all_rings):
+def test_ring_moments_are_independent_of_other_rings(all_rings):
     xy_um, ring_offsets, _ = packed([all_rings])
     area_um2, moment_um3 = ring_moments(xy_um, ring_offsets)
     alone = [ring_moments(np.array(ring), np.array([0, len(ring)])) for ring in all_rings]
@@ -106,10 +106,13 @@ def test_the_measures_of_a_ring_do_not_depend_on_its_neighbours(all_rings):
         pytest.param([[(0, 0), (6, 0), (0, 3)]], 9.0, (2.0, 1.0), id="triangle"),
         pytest.param([[(0, 0), (3, 0), (3, 1), (1, 1), (1, 3), (0, 3)]], 5.0, (1.1, 1.1), id="L"),
         pytest.param(
-            [[(0, 0), (4, 0), (4, 4), (0, 4)], [(1, 1), (1, 3), (3, 3), (3, 1)]], 12.0, (2.0, 2.0), id="middle hole"
+            [[(0, 0), (4, 0), (4, 4), (0, 4)], [(1, 1), (1, 3), (3, 3), (3, 1)]], 12.0, (2.0, 2.0), id="central hole"
         ),
         pytest.param(
-            [[(0, 0), (4, 0), (4, 4), (0, 4)], [(0, 0), (0, 4), (2, 4), (2, 0)]], 8.0, (3.0, 2.0), id="left half open"
+            [[(0, 0), (4, 0), (4, 4), (0, 4)], [(0, 0), (0, 4), (2, 4), (2, 0)]],
+            8.0,
+            (3.0, 2.0),
+            id="left half removed",
         ),
         pytest.param(
             [
@@ -130,10 +133,10 @@ def test_area_and_centroid_of_known_shapes(site, area_um2, centroid_um):
     assert centroid[0].tolist() == pytest.approx(centroid_um, rel=1e-14)
 
 
-def test_the_parts_of_a_split_site_add_up_to_the_whole():
-    whole = [(0, 0), (7, 1), (9, 6), (3, 8), (-2, 4)]
-    parts = [[whole[0], whole[1], whole[2]], [whole[0], whole[2], whole[3]], [whole[0], whole[3], whole[4]]]
-    area, centroid = site_moments(*packed([[whole]]))
+def test_parts_of_site_sum_to_total():
+    site = [(0, 0), (7, 1), (9, 6), (3, 8), (-2, 4)]
+    parts = [[site[0], site[1], site[2]], [site[0], site[2], site[3]], [site[0], site[3], site[4]]]
+    area, centroid = site_moments(*packed([[site]]))
     part_area, part_centroid = site_moments(*packed([[part] for part in parts]))
 
     assert part_area.sum() == pytest.approx(area[0], rel=1e-14)
@@ -142,7 +145,7 @@ def test_the_parts_of_a_split_site_add_up_to_the_whole():
 
 @given(sites)
 @relaxed
-def test_bounds_are_the_extremes_of_the_vertices(nested):
+def test_bounds_are_vertex_extremes(nested):
     bounds = site_bounds_um(*packed(nested))
     expected = []
     for site in nested:
@@ -153,15 +156,15 @@ def test_bounds_are_the_extremes_of_the_vertices(nested):
     assert bounds.tolist() == expected
 
 
-def test_no_rings_have_no_measures():
-    nothing = np.zeros((0, 2)), np.zeros(1, np.int64)
+def test_empty_rings_give_empty_measurements():
+    empty = np.zeros((0, 2)), np.zeros(1, np.int64)
 
-    assert [a.shape for a in ring_moments(*nothing)] == [(0,), (0, 2)]
-    assert [a.shape for a in site_moments(*nothing, np.zeros(1, np.int64))] == [(0,), (0, 2)]
-    assert site_bounds_um(*nothing, np.zeros(1, np.int64)).shape == (0, 4)
+    assert [a.shape for a in ring_moments(*empty)] == [(0,), (0, 2)]
+    assert [a.shape for a in site_moments(*empty, np.zeros(1, np.int64))] == [(0,), (0, 2)]
+    assert site_bounds_um(*empty, np.zeros(1, np.int64)).shape == (0, 4)
 
 
-def test_measures_accept_read_only_arrays_and_leave_them_unchanged():
+def test_measurements_accept_read_only_arrays():
     arrays = packed([[[(0, 0), (2, 0), (2, 2)]], [[(5, 5), (6, 5), (6, 7), (5, 7)]]])
     before = [array.copy() for array in arrays]
     for array in arrays:
@@ -172,7 +175,7 @@ def test_measures_accept_read_only_arrays_and_leave_them_unchanged():
     assert all(np.array_equal(a, b) for a, b in zip(arrays, before, strict=True))
 
 
-def test_positions_in_runs_count_from_0_in_each_run():
+def test_positions_in_runs_restart_at_zero():
     assert positions_in_runs(np.array([3, 0, 1, 2])).tolist() == [0, 1, 2, 0, 0, 1]
 
 
@@ -189,7 +192,7 @@ def test_convex_rings_equal_their_hulls(all_rings):
         return
     xy_um, ring_offsets, _ = packed([[ring] for ring in all_rings])
     polygons = [shapely.Polygon(ring) for ring in all_rings]
-    # Each vertex is a corner of the hull, and none stands twice.
+    # Every vertex is a corner of the hull, without duplicates.
     expected = [
         p.is_valid and p.convex_hull.geom_type == "Polygon" and len(p.convex_hull.exterior.coords) == len(ring) + 1
         for p, ring in zip(polygons, all_rings, strict=True)

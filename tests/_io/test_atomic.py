@@ -1,4 +1,4 @@
-"""Atomic writes of folders."""
+"""Atomic writes of directories."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from foveasim._io.atomic import atomic_directory, remove_folder
 from foveasim.errors import FileError
 
 
-def test_removal_outlasts_late_writers(tmp_path):
-    folder = tmp_path / "store.zarr"
-    has_begun = threading.Event()
+def test_removal_waits_for_late_writers(tmp_path):
+    directory = tmp_path / "store.zarr"
+    has_started = threading.Event()
 
-    def write_on():
+    def write_chunks():
         for k in range(10):
-            with suppress(OSError):  # the folder has just been removed
-                (folder / "c").mkdir(parents=True, exist_ok=True)
-                (folder / "c" / str(k)).write_bytes(b"chunk")
-            has_begun.set()
+            with suppress(OSError):  # the directory has just been removed
+                (directory / "c").mkdir(parents=True, exist_ok=True)
+                (directory / "c" / str(k)).write_bytes(b"chunk")
+            has_started.set()
             time.sleep(0.002)
 
-    late_writer = threading.Thread(target=write_on)
+    late_writer = threading.Thread(target=write_chunks)
     late_writer.start()
-    has_begun.wait()
-    remove_folder(folder)
+    has_started.wait()
+    remove_folder(directory)
     late_writer.join()
 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_removing_absent_folder_does_nothing(tmp_path):
+def test_removing_missing_directory_does_nothing(tmp_path):
     remove_folder(tmp_path / "absent")
 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_failed_folder_write_leaves_nothing(tmp_path):
+def test_failed_directory_write_leaves_nothing(tmp_path):
     def write():
         with atomic_directory(tmp_path / "a", is_ours=bool) as new:
             (new / "b").write_bytes(b"half")

@@ -1,4 +1,4 @@
-"""Files when the disk ends the writing: the system's reason, and nothing or the former file is left."""
+"""Write errors of the disk: the message contains the reason, and no partial file is left."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from foveasim._io.atomic import atomic_write, check_room
 from foveasim.errors import FileError, disk_problem
 
-#: Every writer of the package, in a process that may write files of 1000 bytes.
+#: Call every writer of the package with a file size limit of 1000 bytes.
 PROGRAM = """
 import json, resource, sys, warnings
 from pathlib import Path
@@ -66,7 +66,7 @@ print(json.dumps([found, sorted(path.name for path in folder.iterdir())]))
 """
 
 
-def test_every_writer_gives_the_reason_and_leaves_nothing(tmp_path):
+def test_writers_report_reason_and_leave_nothing(tmp_path):
     pytest.importorskip("resource")
     (tmp_path / "out").mkdir()
     done = subprocess.run(
@@ -88,7 +88,7 @@ def test_every_writer_gives_the_reason_and_leaves_nothing(tmp_path):
     ],
     ids=["system", "message", "cause"],
 )
-def test_disk_errors_are_found_in_other_errors(error, tmp_path):
+def test_disk_errors_are_found_in_wrapping_errors(error, tmp_path):
     if isinstance(error, ValueError):
         error.__context__ = OSError(errno.ENOSPC, "")
         error.__suppress_context__ = True
@@ -103,14 +103,14 @@ def test_disk_errors_are_found_in_other_errors(error, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["x.npz"]
 
 
-def test_other_errors_keep_their_message(tmp_path):
+def test_other_errors_are_unchanged(tmp_path):
     assert disk_problem(RuntimeError("errno=2")) == ""
-    for error in (ValueError("a wrong value"), FileError("y.npz", "cannot hold that")):
+    for error in (ValueError("a wrong value"), FileError("y.npz", "cannot store the array")):
         with pytest.raises(type(error), match=str(error)), atomic_write(tmp_path / "x.npz"):
             raise error
 
 
-def test_room_is_that_of_the_disk(tmp_path):
+def test_check_room_compares_free_space(tmp_path):
     file = tmp_path / "x"
     file.write_bytes(bytes(10))
     check_room(file, 1000)

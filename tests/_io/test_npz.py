@@ -1,4 +1,4 @@
-"""Archives of arrays: the given arrays and no others, also in files with a stray member of old numpy versions."""
+"""Archives of arrays, also with the stray member of old numpy versions."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from foveasim.layout import hexagonal, read_layout, write_layout
 
 
 def add_stray_member(path):
-    """Store ``allow_pickle`` as an array, as numpy before 2.2 stores the argument of that name."""
+    """Store ``allow_pickle`` as an array, as numpy before 2.2 does."""
     with zipfile.ZipFile(path, "a") as archive, archive.open("allow_pickle.npy", "w") as file:
         np.lib.format.write_array(file, np.array(False))
 
 
 @pytest.mark.parametrize("is_packed", [False, True])
-def test_archive_contains_given_arrays_only(tmp_path, is_packed):
+def test_archive_contains_only_given_arrays(tmp_path, is_packed):
     write_archive(tmp_path / "a.npz", {"format": "x"}, {"n": np.arange(3)}, is_packed=is_packed)
 
     with np.load(tmp_path / "a.npz", allow_pickle=False) as arrays:
@@ -34,7 +34,7 @@ def test_layout_with_stray_member_is_read(tmp_path):
     np.testing.assert_array_equal(read_layout(tmp_path / "a.npz").xy_um, layout.xy_um)
 
 
-def test_stray_member_is_not_an_array(tmp_path):
+def test_stray_member_is_ignored(tmp_path):
     write_archive(tmp_path / "a.npz", {}, {"n": np.arange(3)})
     add_stray_member(tmp_path / "a.npz")
 

@@ -131,11 +131,11 @@ def test_invalid_settings_print_one_line(folder, change, words):
     ("spoil", "words"),
     [
         (lambda p: p.unlink(), "no such file"),
-        (lambda p: p.write_text("I am no picture"), "is not a picture in a format that can be read"),
-        (lambda p: p.write_bytes(b""), "is not a picture in a format that can be read"),
+        (lambda p: p.write_text("I am no picture"), "is not a picture in a supported format"),
+        (lambda p: p.write_bytes(b""), "is not a picture in a supported format"),
         (lambda p: p.write_bytes(p.read_bytes()[:20_000]), "is corrupt or truncated"),
         (lambda p: (p.unlink(), p.mkdir()), "is not a file"),
-        (lambda p: Image.new("RGB", (9, 9)).save(p, "GIF", save_all=True, append_images=[Image.new("RGB", (9, 9), "red")]), "holds 2 pictures"),
+        (lambda p: Image.new("RGB", (9, 9)).save(p, "GIF", save_all=True, append_images=[Image.new("RGB", (9, 9), "red")]), "contains 2 pictures"),
         (lambda p: p.write_bytes(huge_png(p.read_bytes())), "has 65536 x 65536 pixels, more than the limit|has more than"),
     ],
 )  # fmt: skip
@@ -200,7 +200,7 @@ def test_converted_gds_file_is_checked(tmp_path):
         (("check", "rings.yaml", "--rules", "none.yaml"), "none.yaml: no such file"),
         (("check", "rings.yaml", "--rules", "wrong.yaml"), "wrong.yaml: min_sise_um: no such setting"),
         (("convert", "rings.yaml", "rings.docx"), "rings.docx: "),
-        (("convert", "wrong.gds", "rings.npz"), "wrong.gds: is no layout file"),
+        (("convert", "wrong.gds", "rings.npz"), "wrong.gds: is not a valid layout file"),
     ],
 )
 def test_invalid_layout_files_print_one_line(tmp_path, arguments, words):

@@ -615,7 +615,7 @@ def test_invalid_dataset_writes_nothing(foveasim, folder, change, message):
     ("options", "message"),
     [
         (["--workers", "0"], "'workers' must be >= 1, got 0"),
-        (["--out", "no/where"], "cannot be written: the folder"),
+        (["--out", "no/where"], "cannot be written: the directory"),
         (["--out", "photos"], "photos: is not a dataset of foveasim"),
         (["--out", "x.txt"], "must have the extension .zarr, or none"),
     ],

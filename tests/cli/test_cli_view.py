@@ -91,7 +91,7 @@ def test_view_writes_page_of_any_file(view, tmp_path, arguments, words):
     ("arguments", "sentence"),
     [
         (["nothing.gds"], "nothing.gds: no such file"),
-        (["text.txt"], "text.txt: is no layout file"),
+        (["text.txt"], "text.txt: is not a valid layout file"),
         (["capture.npz", "--out", "page.txt"], "page.txt: must end in .html"),
         (["capture.npz", "--out", "nowhere/page.html"], "the directory nowhere does not exist"),
         (["capture.npz", "--out", "a.html", "--serve"], "--out and --serve exclude each other"),
@@ -130,7 +130,7 @@ def test_page_over_directory_is_rejected(view, tmp_path):
     code, _, complaint = view("layout.npz", "--out", str(tmp_path / "out.html"))
 
     assert code == 2
-    assert "it is a folder" in complaint
+    assert "it is a directory" in complaint
     assert [p.name for p in tmp_path.iterdir()] == ["out.html"]
 
 

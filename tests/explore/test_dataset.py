@@ -917,8 +917,8 @@ def test_other_stores_are_unchanged(tmp_path):
         (data, "other", "is not a dataset of foveasim"),
         (data, "other.zarr", "is not a dataset of foveasim"),
         (data, "data.hdf", "must have the extension .zarr, or none"),
-        (data, "missing/data", "cannot be written: the folder .*missing does not exist"),
-        (data, "data/shard-000000.tar/x", "cannot be written: the folder .* does not exist"),
+        (data, "missing/data", "cannot be written: the directory .*missing does not exist"),
+        (data, "data/shard-000000.tar/x", "cannot be written: the directory .* does not exist"),
     ):
         with pytest.raises(FileError, match=message):
             explore.write_dataset(other, tmp_path / path)

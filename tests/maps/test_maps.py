@@ -179,7 +179,7 @@ def test_failed_write_leaves_no_file(tmp_path, extension, monkeypatch):
     def full(*_args, **_options):
         raise OSError(28, "No space left on device")
 
-    with pytest.raises(FileError, match=r"the folder .* does not exist"):
+    with pytest.raises(FileError, match=r"the directory .* does not exist"):
         write_power_map(letter_map(), tmp_path / "nowhere" / f"map.{extension}")
     monkeypatch.setattr(_dataset, "to_xarray", full)
     monkeypatch.setattr("foveasim.maps._npy.np.savez", full)
@@ -196,7 +196,7 @@ def test_zarr_does_not_replace_other_directories(tmp_path):
     (tmp_path / "map.zarr").mkdir()
     (tmp_path / "map.zarr" / "thesis.txt").write_text("years of work")
 
-    with pytest.raises(FileError, match="something else is there"):
+    with pytest.raises(FileError, match="the path contains other data"):
         write_power_map(letter_map(), tmp_path / "map.zarr")
 
     assert (tmp_path / "map.zarr" / "thesis.txt").read_text() == "years of work"

@@ -682,7 +682,7 @@ def test_float_file_is_relative_to_white(tmp_path):
         (1, "p.tif", {"encode_srgb": True}, ParameterError, "'encode_srgb' must be False for floating-point files"),
         (2, "p.tif", {}, ParameterError, "'data' must have 1 or 3 channels to be saved, got 2"),
         (2, "p.png", {}, ParameterError, "'data' must have 1 or 3 channels to be shown, got 2"),
-        (1, "nowhere/p.exr", {}, fs.errors.FileError, "the folder .*nowhere does not exist"),
+        (1, "nowhere/p.exr", {}, fs.errors.FileError, "the directory .*nowhere does not exist"),
     ],
 )
 def test_unsupported_files_raise_without_output(tmp_path, n_channels, name, options, error, message):

@@ -402,7 +402,7 @@ def test_other_files_preserve_faces_and_volume(made, extension, tmp_path):
 def test_unknown_extension_raises_without_output(made, tmp_path):
     with pytest.raises(FileError, match=r"must end in \.glb, \.stl"):
         made.write(tmp_path / "sensor.step")
-    with pytest.raises(FileError, match=r"the folder .* does not exist"):
+    with pytest.raises(FileError, match=r"the directory .* does not exist"):
         made.write(tmp_path / "none" / "sensor.glb")
     assert not list(tmp_path.iterdir())
 

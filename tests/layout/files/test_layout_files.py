@@ -799,7 +799,7 @@ def test_corrupt_oasis_with_valid_checksum_terminates(small, tmp_path):
     [
         (b"", "is empty"),
         (b"hello", "layout file"),
-        (b"<svg/>", "an SVG drawing is written and not read"),
+        (b"<svg/>", "SVG files can be written but not read"),
         (b"\x1f\x8b\x08", "compressed with gzip"),
         (b"{", "GeoJSON"),
         (b'{"type": "Topology"}', "not a GeoJSON FeatureCollection"),
@@ -920,7 +920,7 @@ def test_huge_npz_array_rejected_before_allocation(tmp_path):
                 new.writestr(name, buffer.getvalue() + bytes(48))
             else:
                 new.writestr(name, old.read(name))
-    with pytest.raises(FileError, match="another size than its header tells"):
+    with pytest.raises(FileError, match="size of an array does not match its header"):
         read_layout(tmp_path / "b.npz")
 
 
