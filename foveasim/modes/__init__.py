@@ -1,5 +1,5 @@
 """
-Ways of acquisition beyond one exposure of all sites at once: rolling shutters, events, spikes.
+Acquisition modes other than global exposures: rolling shutters, events, spikes.
 
 ::
 

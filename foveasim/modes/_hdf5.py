@@ -1,4 +1,4 @@
-"""Events in HDF5: the arrays that event tools read, and beside them the sites that tools do not know."""
+"""Events in HDF5: the arrays that event tools read, with photosites and layout."""
 
 from __future__ import annotations
 
@@ -20,30 +20,31 @@ from foveasim.layout.packed import packed_layout, unpacked_layout
 __all__ = ["EventFile", "most_bytes", "read_events"]
 
 FORMAT, VERSION = "foveasim events", 2
-#: Events, and milliseconds, of one chunk.
+#: Events, or milliseconds, per chunk.
 CHUNK = 1 << 16
-#: At most as much of a file is neither events nor the layout.
+#: Upper bound of the file size without events and layout.
 METADATA_BYTES = 1 << 16
-#: The table of milliseconds holds one number for each: those of more than a day are a slip, of a clock that began long ago.
+#: Size limit of the table of milliseconds: times of more than a day indicate times since an epoch, not since the start.
 MAX_MS = 100_000_000
-#: Bytes in memory that one byte in a file may become: what deflate can do at most; and how many any file may.
+#: Limits of decompressed data: per byte of the file, the maximum ratio of deflate, and in total.
 UNPACKED_PER_BYTE, MAX_UNPACKED_BYTES = 1032, 8 * 2**30
-#: Kinds of columns that HDF5 has numbers for; text is kept as its bytes.
+#: Kinds of numeric columns, and of strings, which are stored as bytes.
 NUMBERS, TEXT = "biuf", "US"
 KINDS = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8, "site": np.int32}
 
 
 def most_bytes(layout: Layout, n_before: int, t_us: Ints) -> int:
     """
-    Upper bound of a file's size once events are added: that of its numbers, not compressed.
+    Return an upper bound of the file size after adding events: the uncompressed size.
 
     Parameters
     ----------
     layout : Layout
+        Layout of the photosites.
     n_before : int
         Number of events in the file.
     t_us : (n,) int64, µs
-        Times of those to add.
+        Times of the events to add.
     """
     per_event = sum(np.dtype(kind).itemsize for kind in KINDS.values())
     n_chunks = min(int(t_us[-1]) // 1000 + 1, MAX_MS) // CHUNK + 1 if t_us.size else 1
@@ -54,14 +55,16 @@ def most_bytes(layout: Layout, n_before: int, t_us: Ints) -> int:
 
 class EventFile:
     """
-    A file that events are added to, of an open HDF5 group.
+    Writer of events to an open HDF5 file.
 
     Parameters
     ----------
     file : h5py.File
+        File that is open for writing.
     layout : Layout
+        Layout of the photosites.
     x, y : (n_site,) uint16
-        Each site's address.
+        Address of each site.
     """
 
     def __init__(self, file: Any, layout: Layout, x: NDArray[np.uint16], y: NDArray[np.uint16]) -> None:
@@ -79,24 +82,27 @@ class EventFile:
             file[f"sites/{name}"] = values
         for name, values in packed_layout(layout).items():
             if values.dtype.kind not in NUMBERS + TEXT:
-                raise ParameterError("batches", f"have a layout whose {name} is of {values.dtype}, which HDF5 has not")
+                raise ParameterError(
+                    "batches",
+                    f"must have a layout with columns that HDF5 supports, got '{name}' of dtype {values.dtype}",
+                )
             file[f"layout/{name}"] = np.char.encode(values, "utf-8") if values.dtype.kind == "U" else values
         provenance = json.dumps(to_plain_data(dict(layout.provenance)))
         file["layout/provenance"] = np.frombuffer(provenance.encode(), np.uint8)
         file.attrs.update({"format": FORMAT, "version": VERSION})
 
     def add(self, t_us: Ints, site: NDArray[np.int32], polarity: NDArray[np.int8]) -> None:
-        """Add events, all later than those before."""
+        """Append events, all later than the previous ones."""
         if t_us.size == 0:
             return
         n_ms = int(t_us[-1]) // 1000 + 1
         if n_ms > MAX_MS:
             raise ParameterError(
                 "batches",
-                f"must end before {MAX_MS // 1000:,} s, as HDF5 has a table of the milliseconds",
+                f"must end before {MAX_MS // 1000:,} s, the limit of the table of milliseconds",
                 float(t_us[-1]) * 1e-6,
                 "s",
-                "take off what the clock showed when the recording began",
+                "subtract the start time of the recording",
             )
         values: dict[str, NDArray[Any]] = {
             "t": t_us,
@@ -107,25 +113,27 @@ class EventFile:
         }
         for name in KINDS:
             _append(self._file[f"events/{name}"], values[name])
-        # Of the milliseconds that begin behind all events before.
+        # Milliseconds that begin after the previous events.
         for begin in range(self._n_ms, n_ms, CHUNK):
             begins_us = 1000 * np.arange(begin, min(begin + CHUNK, n_ms))
             _append(self._file["ms_to_idx"], self.n_events + np.searchsorted(t_us, begins_us))
         self.n_events, self._n_ms = self.n_events + t_us.size, n_ms
 
     def end(self) -> None:
-        """Write what comes behind the last event."""
+        """Write the entry of the table of milliseconds after the last event."""
         _append(self._file["ms_to_idx"], np.array([self.n_events]))
 
 
 def read_events(path: Path) -> tuple[Floats, NDArray[np.int32], NDArray[np.int8], Layout]:
     """
-    Times to the microsecond below, sites, polarities and layout of a file that :class:`EventFile` wrote.
+    Read times, sites, polarities and layout of a file that :class:`EventFile` wrote.
+
+    Times are rounded down to microseconds.
 
     Raises
     ------
     FileError
-        When the file is corrupt, malformed, or holds something else.
+        When the file is corrupt, malformed, or contains other data.
     """
     told, found = read_in_sandbox(_read, path, kind="HDF5", max_unpacked=_max_unpacked)
     arrays = dict(zip(told["names"], found, strict=True))
@@ -135,7 +143,7 @@ def read_events(path: Path) -> tuple[Floats, NDArray[np.int32], NDArray[np.int8]
         if name.startswith("layout/") and name != "layout/provenance"
     }
     layout = unpacked_layout(outlines, json.loads(arrays["layout/provenance"].tobytes()))
-    # In one step from the integer: 0.3 s is 300,000 µs, and comes back as 0.3.
+    # A single division of the integer is correctly rounded: 300,000 µs gives 0.3 s.
     t_s = arrays["events/t"] / 1e6
     return t_s, arrays["events/site"], (2 * arrays["events/p"].astype(np.int8) - 1).astype(np.int8), layout
 
@@ -146,7 +154,7 @@ def _append(dataset: Any, values: NDArray[Any]) -> None:
     dataset[n:] = values
 
 
-# -- the other program ------------------------------------------------------------------------------------------------
+# -- in the sandbox process ------------------------------------------------------------------------------------------
 
 
 def _max_unpacked(n_bytes: int) -> int:
@@ -154,20 +162,20 @@ def _max_unpacked(n_bytes: int) -> int:
 
 
 def _read(file_name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
-    """The arrays of a file, and their names."""
+    """Read the arrays of a file, and their names."""
     import h5py
 
     path = Path(file_name)
     with h5py.File(path, "r") as file:
         if file.attrs.get("format") != FORMAT:
-            raise FileError(path, "holds no events of foveasim; make them with Events.from_addresses")
+            raise FileError(path, "does not contain events of foveasim; create them with Events.from_addresses")
         if file.attrs.get("version") != VERSION:
             raise FileError(path, f"has the format version {file.attrs.get('version')!s:.40}, expected {VERSION}")
         found = {f"events/{name}": _dataset(path, file, "events", name) for name in ("t", "site", "p")}
         for name in _group(path, file, "layout"):
             found[f"layout/{name}"] = _dataset(path, file, "layout", name)
         if sum(part.size * part.dtype.itemsize for part in found.values()) > _max_unpacked(path.stat().st_size):
-            raise FileError(path, "would unpack to more than a file of its size holds")
+            raise FileError(path, "would decompress to more than a file of its size can contain")
         arrays = [np.ascontiguousarray(part[()]) for part in found.values()]
     return {"names": list(found)}, arrays
 
@@ -176,17 +184,17 @@ def _group(path: Path, file: Any, name: str) -> Mapping[str, Any]:
     import h5py
 
     if not isinstance(file.get(name, getlink=True), h5py.HardLink) or not isinstance(file[name], h5py.Group):
-        raise FileError(path, f"has no group {name!r} of its own")
+        raise FileError(path, f"must contain the group {name!r}, not a link")
     group: Mapping[str, Any] = file[name]
     return group
 
 
 def _dataset(path: Path, file: Any, group: str, name: str) -> Any:
-    """A dataset of numbers or text that lies in this file."""
+    """Return a dataset of numbers or strings that is stored in this file."""
     import h5py
 
     parts: Any = _group(path, file, group)
     part = parts[name] if isinstance(parts.get(name, getlink=True), h5py.HardLink) else None
     if not isinstance(part, h5py.Dataset) or part.external or part.is_virtual or part.dtype.kind not in NUMBERS + "S":
-        raise FileError(path, f"has no numbers '{group}/{name}' of its own")
+        raise FileError(path, f"must contain the numbers '{group}/{name}', not a link or external data")
     return part

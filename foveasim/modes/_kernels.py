@@ -1,15 +1,15 @@
 """
-Numba kernels of asynchronous photosites: events of changes of log light, and spikes of collected charge.
+Numba kernels of asynchronous photosites: change events, and spikes of collected charge.
 
-They know arrays only, release the interpreter lock, and are compiled for explicit types when this module is imported. Each
-takes some sites through some frames, one frame after the other, and changes what it remembers of every site. Events go to
-arrays in that order, site by site in each frame; ``ends`` tells behind which the frames end. Where the arrays are full, events
-are only counted, so that the caller can begin again with longer ones; behind ``n_most`` there is no counting on.
+The kernels use arrays only, release the GIL, and are compiled for explicit types when this module is imported. Each kernel
+processes some sites frame by frame and updates the state of every site. Events are written to arrays in this order, site by
+site in each frame; ``ends`` contains the number of events up to the end of each frame. When the arrays are full, events are
+only counted, so that the caller can repeat the call with longer arrays; counting stops above ``n_most``.
 
-An event that times, as floating-point numbers, would put into another frame than its own has the nearest time of its own:
-changes belong to ``(begin, end]`` of a frame, spikes to ``[begin, end)``. So frames follow each other, however they are taken.
+An event whose time would be rounded to another frame is moved to the nearest time in its own frame: change events are in
+``(begin, end]`` of a frame, spikes in ``[begin, end)``. The order of events therefore does not depend on the batches.
 
-Random numbers hang on the key, the site and how many the site drew before: not on how frames come in batches.
+Random numbers depend on the key, the site and the number of previous draws of the site, not on the batches.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from foveasim._core.jit import njit
 
 __all__ = ["DIFFERENCE", "HAZARD", "HELD", "LEVEL", "MISSING", "change_events", "charge_spikes"]
 
-#: What is remembered of a site that tells changes: the level behind the low pass, how far it is from the last event's, until
-#: when the site is held, and the noise that is still to come before an event of it.
+#: State of a change-detecting site: low-pass level, its difference from the level of the last event, end of the refractory
+#: time, and integrated noise rate until the next noise event.
 LEVEL, DIFFERENCE, HELD, HAZARD = range(4)
-#: Of a site that collects charge: what is missing to the next spike, and HELD.
+#: State of an integrating site: charge until the next spike; and HELD, as above.
 MISSING = 0
-#: Behind a low pass, light is taken in parts whose logarithms change by at most this: each part has one time constant.
+#: With a low pass, frames are divided into parts in which the log current changes by at most this: one time constant each.
 PART_CHANGE = 0.25
-#: Where logarithms change by less than this, the mean of the ends is the mean of the light to 1e-9.
+#: For smaller changes of the logarithm, the mean of both ends is the mean current to 1e-9.
 LEAST_CHANGE = 1e-4
-#: Steps that find a crossing to its last bits, where Newton's are kept within brackets.
+#: Maximum steps of the bracketed Newton method, enough to find a crossing to machine precision.
 STEPS = 80
 
 _bytes, _sites, _counts = types.int8[::1], types.int32[::1], types.int64[::1]
@@ -48,7 +48,7 @@ def _words(key_0, key_1, site, number):
 
 @njit()
 def _risen(slope, swing, tau, begin, end):
-    """Rise of ``slope * u + swing * exp(-u / tau)`` from one time to another; without swing where tau is 0."""
+    """Return the rise of ``slope * u + swing * exp(-u / tau)``; without swing if tau is 0."""
     rise = slope * (end - begin)
     if tau > 0.0:
         rise += swing * math.exp(-begin / tau) * math.expm1(-(end - begin) / tau)
@@ -57,8 +57,12 @@ def _risen(slope, swing, tau, begin, end):
 
 @njit()
 def _crossing(slope, swing, tau, begin, difference, on, off, end):
-    """First time from ``begin`` to ``end`` at which the difference reaches ``on`` or ``-off``, and which; beyond it if none."""
-    # What rounding left behind the last frame.
+    """
+    Return the first time at which the difference reaches a threshold, and the polarity.
+
+    The thresholds are ``on`` and ``-off``. The time is between ``begin`` and ``end``, or later if there is no crossing.
+    """
+    # Rounding may have left the difference above a threshold at the end of the last frame.
     if difference >= on:
         return begin, 1
     if difference <= -off:
@@ -69,7 +73,7 @@ def _crossing(slope, swing, tau, begin, difference, on, off, end):
         if slope < 0.0:
             return begin - (off + difference) / slope, -1
         return math.inf, 0
-    # Where it turns, at most once.
+    # The difference has at most one extremum.
     turn = end
     ratio = slope * tau / swing if swing != 0.0 else 0.0
     if ratio > 0.0:
@@ -111,10 +115,11 @@ def change_events(
     key_0, key_1, first_site, n_most, memory, n_drawn, ends, t_s, site, polarity,
 ):  # fmt: skip
     """
-    Events of some sites from the first to the last of some frames; how many, written or not.
+    Compute the change events of some sites between the first and the last of some frames.
 
-    ``log_light`` and ``current`` are (n_frame, n_site); frame k is that of ``(first_frame + k) * frame_s``. Between frames the
-    logarithm of the light is a straight line. ``tau_e`` over the current is the time constant of the low pass, 0 for none.
+    ``log_light`` and ``current`` are (n_frame, n_site); frame k is at ``(first_frame + k) * frame_s``. The log current is
+    interpolated linearly between frames. ``tau_e`` divided by the current is the time constant of the low pass; 0 disables it.
+    Returns the number of events, including those that did not fit the arrays.
     """
     n = 0
     for k in range(log_light.shape[0] - 1):
@@ -127,7 +132,7 @@ def change_events(
                 n_drawn[i] = 1
                 word_0, word_1, _, _ = _words(key_0, key_1, first_site + i, 0)
                 memory[i, HAZARD] = -math.log(uniform(word_0))
-                # A leaking site is anywhere between two events when the light begins.
+                # The initial phase of the leak is uniformly distributed between two events.
                 memory[i, DIFFERENCE] = uniform(word_1) * up if leak > 0.0 else 0.0
             change = log_light[k + 1, i] - log_light[k, i]
             slope = change / frame_s
@@ -141,7 +146,7 @@ def change_events(
                 begin_current, end_current = end_current, current[k + 1, i]
                 if part < n_parts - 1:
                     end_current = current[k, i] * math.exp((part + 1) * part_change)
-                # The mean of light whose logarithm is a straight line: with it the low pass decays as it should.
+                # Mean of a current with linear logarithm; with it the low pass decays correctly.
                 mean = 0.5 * (begin_current + end_current)
                 if abs(part_change) > LEAST_CHANGE:
                     mean = (end_current - begin_current) / part_change
@@ -181,7 +186,7 @@ def change_events(
 @njit()
 def _gamma(shape, key_0, key_1, site, number):
     """
-    Draw of the gamma distribution of a shape of at least 1, and how many numbers were drawn then.
+    Draw from a gamma distribution of shape >= 1; return the number and the new draw count.
 
     G. Marsaglia and W. W. Tsang, A simple method for generating gamma variables (ACM Trans. Math. Softw. 26, 363, 2000).
     """
@@ -207,10 +212,11 @@ def charge_spikes(
     n_most, memory, n_drawn, ends, t_s, site, polarity,
 ):  # fmt: skip
     """
-    Spikes of some sites during some frames; how many, written or not.
+    Compute the spikes of some sites during some frames.
 
-    ``current`` is (n_frame, n_site), and stays from each frame to the next. With noise, a charge comes electron by electron,
-    and the time to a threshold of N of them follows the gamma distribution of the shape N.
+    ``current`` is (n_frame, n_site) and constant during each frame. With noise, electrons arrive as a Poisson process, and the
+    time to a threshold of N electrons follows the gamma distribution of shape N. Returns the number of spikes, including those
+    that did not fit the arrays.
     """
     n = 0
     for k in range(current.shape[0]):
@@ -225,7 +231,7 @@ def charge_spikes(
                     memory[i, MISSING] = threshold
                     if is_noisy:
                         memory[i, MISSING], n_drawn[i] = _gamma(threshold, key_0, key_1, first_site + i, n_drawn[i])
-                # A charge that is missing by less than nothing was complete when the frame before ended.
+                # A negative missing charge is due to rounding: it was complete at the end of the last frame.
                 at = u + max(memory[i, MISSING], 0.0) / rate if rate > 0.0 else math.inf
                 if at >= frame_s:
                     memory[i, MISSING] -= rate * (frame_s - u)

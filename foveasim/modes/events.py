@@ -1,4 +1,4 @@
-"""Events: when, where, and whether brighter or darker, as arrays and files."""
+"""Events of photosites: times, sites and polarities, as arrays and files."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ __all__ = ["Events", "write_events"]
 
 FORMAT, VERSION = "foveasim events", 1
 HDF5_ENDINGS = (".h5", ".hdf5")
-#: Addresses in files for event tools are 16-bit numbers, in some with a sign.
+#: Addresses in files of event tools are unsigned or signed 16-bit integers.
 MAX_ADDRESS, MAX_SIGNED_ADDRESS = 2**16 - 1, 2**15 - 1
-#: What tools call an event: address, time in µs, and whether brighter.
+#: Event record of event tools: address, time in µs, and polarity (true for ON).
 STRUCTURE = np.dtype([("x", "<i2"), ("y", "<i2"), ("t", "<i8"), ("p", "?")])
-#: Later than this a floating-point number does not tell microseconds.
+#: Above this time float64 does not resolve microseconds.
 MAX_T_S = 2.0**53 / 1e6
-#: Counts of more bins and sites than this are a slip.
+#: Size limit of histograms.
 MAX_COUNTS = 1 << 30
-#: Neighbours' distances have rounding errors of this share.
+#: Relative rounding error of distances between neighbours.
 ROUNDING = 1e-9
 POLARITIES = (1, -1)
 ARRAYS = ("t_s", "site", "polarity")
@@ -44,22 +44,23 @@ ARRAYS = ("t_s", "site", "polarity")
 @dataclass(frozen=True, eq=False)
 class Events:
     """
-    What photosites told of themselves, in the order of time.
+    Events of photosites in temporal order.
 
     Parameters
     ----------
     t_s : (n_event,) float64, s
-        At least 0, and rising; events of the same time in the order of their sites.
+        Times, at least 0 and in ascending order; simultaneous events are in the order of their sites.
     site : (n_event,) int32
+        Indices of the photosites.
     polarity : (n_event,) int8
-        1 for brighter, -1 for darker; spikes are all 1.
+        1 for ON, -1 for OFF events; 1 for spikes.
     layout : Layout
-        The photosites.
+        Layout of the photosites.
 
     Raises
     ------
     ParameterError
-        When times do not rise, a site is none of the layout's, or a polarity is neither 1 nor -1.
+        When times are not in ascending order, a site is not in the layout, or a polarity is neither 1 nor -1.
     """
 
     t_s: Floats
@@ -81,16 +82,18 @@ class Events:
             if values.size and not np.can_cast(values.dtype, kind, "same_kind"):
                 raise ParameterError(name, f"must be integers, got {values.dtype}")
         if t_s.size:
-            # Whatever is not a number is not later than any.
+            # Written so that NaN fails the comparison.
             if not (t_s[0] >= 0.0 and np.all(t_s[1:] >= t_s[:-1]) and t_s[-1] < np.inf):
-                raise ParameterError("t_s", "must be finite, at least 0, and rising", t_s, "s", "sort events by time")
+                raise ParameterError(
+                    "t_s", "must be finite, at least 0, and ascending", t_s, "s", "sort the events by time"
+                )
             n_sites = self.layout.n_sites
             if site.min() < 0 or site.max() >= n_sites:
                 bad = site[(site < 0) | (site >= n_sites)]
                 raise ParameterError("site", f"must be from 0 to {n_sites - 1}, the sites of the layout", int(bad[0]))
             if not np.all(np.abs(polarity) == 1):
                 bad = polarity[np.abs(polarity) != 1]
-                raise ParameterError("polarity", "must be 1 or -1", int(bad[0]), hint="of 0 and 1 make 2 * p - 1")
+                raise ParameterError("polarity", "must be 1 or -1", int(bad[0]), hint="convert 0 and 1 with 2 * p - 1")
         for name, values, kept in zip(ARRAYS, (t_s, site, polarity), (np.float64, np.int32, np.int8), strict=True):
             object.__setattr__(self, name, own(values.astype(kept, copy=False)))
 
@@ -102,20 +105,20 @@ class Events:
         return int(self.t_s.size)
 
     def counts(self, *, polarity: int | None = None) -> Ints:
-        """How many events each site gave, (n_site,); of one polarity, or of both."""
+        """Return the number of events per site, (n_site,), of one polarity or both."""
         sites = self.site if polarity is None else self.site[self._is_of(polarity)]
         return np.bincount(sites, minlength=self.layout.n_sites).astype(np.int64)
 
     def histogram(self, edges_s: ArrayLike, *, polarity: int | None = None) -> Ints:
         """
-        How many events each site gave in each of some spans of time.
+        Return the number of events per time bin and site.
 
         Parameters
         ----------
         edges_s : (n_bin + 1,) float64, s
-            Rising; each bin lasts from one to before the next, as of :meth:`between`.
+            Bin edges in ascending order; bins include their lower edge, as in :meth:`between`.
         polarity : {1, -1}, optional
-            Of one polarity; of both by default.
+            Count events of one polarity; by default of both.
 
         Returns
         -------
@@ -124,14 +127,17 @@ class Events:
         Raises
         ------
         ParameterError
-            When edges do not rise, or there are more bins and sites than fit the memory.
+            When edges are not in ascending order, or the counts do not fit in memory.
         """
         edges = finite_array("edges_s", edges_s, ndim=1)
         if edges.size < 2 or np.any(np.diff(edges) <= 0.0):
-            raise ParameterError("edges_s", "must be two or more times, each later than the one before", edges, "s")
+            raise ParameterError("edges_s", "must be two or more times in ascending order", edges, "s")
         n_bins, n_sites = edges.size - 1, self.layout.n_sites
         if n_bins * n_sites > MAX_COUNTS:
-            raise ParameterError("edges_s", f"make {n_bins:,} bins of {n_sites:,} sites, more than fit the memory")
+            raise ParameterError(
+                "edges_s",
+                f"must give counts that fit in memory, got {n_bins:,} bins of {n_sites:,} sites; use fewer bins",
+            )
         ends = np.searchsorted(self.t_s, edges)
         span = slice(ends[0], ends[-1])
         cell = np.repeat(n_sites * np.arange(n_bins), np.diff(ends)) + self.site[span]
@@ -145,17 +151,17 @@ class Events:
         return np.asarray(self.polarity == polarity)
 
     def between(self, start_s: float, stop_s: float) -> Events:
-        """The events from one time to before another."""
+        """Return the events with ``start_s <= t_s < stop_s``."""
         start_s, stop_s = check_number("start_s", start_s), check_number("stop_s", stop_s)
         part = slice(*np.searchsorted(self.t_s, (start_s, stop_s)))
         return Events(self.t_s[part], self.site[part], self.polarity[part], self.layout)
 
     @classmethod
     def concatenate(cls, parts: Iterable[Events]) -> Events:
-        """Events of batches that follow each other, as one."""
+        """Concatenate consecutive batches of events."""
         batches = list(_following("parts", parts))
         if not batches:
-            raise ParameterError("parts", "must hold at least one batch of events")
+            raise ParameterError("parts", "must contain at least one batch of events")
         t_s, site, polarity = (read_only(np.concatenate([getattr(b, name) for b in batches])) for name in ARRAYS)
         return cls(t_s, site, polarity, batches[0].layout)
 
@@ -171,25 +177,30 @@ class Events:
         pitch_um: float | None = None,
     ) -> Events:
         """
-        Events of a recording that knows columns and rows: the other way round than :meth:`addresses`.
+        Create events from column and row addresses: the inverse of :meth:`addresses`.
 
         Parameters
         ----------
         t_s : (n_event,) float64, s
-            Rising.
+            Times in ascending order.
         x, y : (n_event,) int
-            Column and row of each, row 0 on top.
+            Column and row of each event; row 0 is the top row.
         polarity : (n_event,) int
             1 or -1.
         layout : Layout
-            ``foveasim.layout.grid(n_x=640, n_y=480, pitch_um=...)`` for a recording of 640 x 480 pixels.
+            Layout of the photosites: ``foveasim.layout.grid(n_x=640, n_y=480, pitch_um=...)`` for a recording of 640 x 480
+            pixels.
         pitch_um : float, optional, µm
-            As of :meth:`addresses`.
+            As in :meth:`addresses`.
+
+        Returns
+        -------
+        Events
 
         Raises
         ------
         ParameterError
-            When there is no site at an address, or more than one; and as for the class.
+            When an address does not have exactly one site; and as for the class.
         """
         none = np.zeros(0)
         site_x, site_y = cls(none, none.astype(np.int32), none.astype(np.int8), layout).addresses(pitch_um)
@@ -198,7 +209,7 @@ class Events:
         places = [as_numbers(name, values, keep_type=True) for name, values in (("x", x), ("y", y))]
         for name, values in zip("xy", places, strict=True):
             if values.ndim != 1 or values.shape != places[0].shape or (values.size and values.dtype.kind not in "iu"):
-                raise ParameterError(name, f"must be one integer an event, got {values.dtype}{values.shape}")
+                raise ParameterError(name, f"must be one integer per event, got {values.dtype}{values.shape}")
             if values.size and not 0 <= values.min() <= values.max() <= MAX_ADDRESS:
                 raise ParameterError(name, f"must be from 0 to {MAX_ADDRESS}", (int(values.min()), int(values.max())))
         wanted = places[0].astype(np.int64) * (MAX_ADDRESS + 1) + places[1].astype(np.int64)
@@ -212,19 +223,23 @@ class Events:
 
     def addresses(self, pitch_um: float | None = None) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
         """
-        Column and row of every site on a raster, (n_site,) each: where tools that know rows and columns only may put it.
+        Return column and row of every site on a raster, for tools that require pixel addresses.
 
         Parameters
         ----------
         pitch_um : float, optional, µm
-            Of the raster. By default sites have the numbers of their layout's columns ``column`` and ``row``, where these are
-            theirs alone; else the raster is as fine as it takes that no two sites with different centres share an address.
-            Row 0 is on top, as in pictures.
+            Pitch of the raster. By default the columns ``column`` and ``row`` of the layout are the addresses if they are
+            unique; otherwise the raster is so fine that sites with different centres have different addresses. Row 0 is the top
+            row, as in pictures.
+
+        Returns
+        -------
+        x, y : (n_site,) uint16
 
         Warns
         -----
         FoveasimWarning
-            When sites share an address.
+            When several sites have the same address.
         """
         places = _numbered(self.layout) if pitch_um is None else None
         if places is None:
@@ -232,8 +247,8 @@ class Events:
         n_distinct = np.unique(places[0] * (MAX_ADDRESS + 1) + places[1]).size
         if n_distinct < self.layout.n_sites:
             warnings.warn(
-                f"{self.layout.n_sites:,} sites have {n_distinct:,} addresses on the raster, so that some share theirs: take "
-                "a smaller 'pitch_um', or tell sites by their numbers",
+                f"{self.layout.n_sites:,} sites have only {n_distinct:,} addresses on the raster; use a smaller 'pitch_um', "
+                "or identify sites by their indices",
                 FoveasimWarning,
                 stacklevel=2,
             )
@@ -241,23 +256,28 @@ class Events:
 
     def structured(self, *, pitch_um: float | None = None) -> NDArray[Any]:
         """
-        The events as event tools have them, such as Tonic.
+        Return the events as a structured array for event tools such as Tonic.
 
         Parameters
         ----------
         pitch_um : float, optional, µm
-            As of :meth:`addresses`.
+            As in :meth:`addresses`.
 
         Returns
         -------
         events : (n_event,) structured
-            Of ``x`` and ``y`` (int16, row 0 on top), ``t`` (int64, whole µs, rounded down) and ``p`` (bool, true for brighter).
+            Fields ``x`` and ``y`` (int16, row 0 is the top row), ``t`` (int64, µs, rounded down) and ``p`` (bool, true for ON).
+
+        Raises
+        ------
+        ParameterError
+            When an address or a time does not fit the data type.
         """
         x, y = self.addresses(pitch_um)
         if max(x.max(initial=0), y.max(initial=0)) > MAX_SIGNED_ADDRESS:
             raise ParameterError(
                 "pitch_um",
-                f"gives more than {MAX_SIGNED_ADDRESS + 1} columns or rows, which such arrays have no numbers for",
+                f"must give at most {MAX_SIGNED_ADDRESS + 1} columns and rows, the range of int16 addresses",
                 pitch_um,
                 "µm",
             )
@@ -268,21 +288,21 @@ class Events:
 
     def save(self, path: str | Path, *, pitch_um: float | None = None) -> None:
         """
-        Write the events to a file, whole or not at all.
+        Write the events to a file atomically.
 
         Parameters
         ----------
         path : path
-            ``.npz``: the arrays and the layout, to the last bit. ``.h5`` or ``.hdf5``: as :func:`write_events`. Both are read
-            by :meth:`load`. For other tools, and without the layout, ``.npy``: the array of :meth:`structured`; ``.txt``: a
-            line ``t x y p`` for each event, t in seconds and p 0 or 1.
+            The extension selects the format. ``.npz``: arrays and layout, lossless. ``.h5`` or ``.hdf5``: as
+            :func:`write_events`. :meth:`load` reads both. Formats for other tools, without the layout: ``.npy``, the array of
+            :meth:`structured`; ``.txt``, a line ``t x y p`` per event, with t in seconds and p 0 or 1.
         pitch_um : float, optional, µm
-            Of the raster of :meth:`addresses`, which all but ``.npz`` have.
+            Pitch of the raster of :meth:`addresses`, for all formats except ``.npz``.
 
         Raises
         ------
         FileError
-            When the ending is none of these, h5py is missing, or nothing can be written there.
+            When the extension is not one of these, h5py is not installed, or the file cannot be written.
         """
         target = Path(path)
         ending = target.suffix.lower()
@@ -307,59 +327,60 @@ class Events:
     @classmethod
     def load(cls, path: str | Path) -> Events:
         """
-        Read events that :meth:`save` wrote as ``.npz``, or :func:`write_events` as HDF5: then times are whole microseconds.
+        Read events from ``.npz`` or HDF5 files of :meth:`save` or :func:`write_events`.
+
+        Times from HDF5 are rounded down to microseconds.
 
         Raises
         ------
         FileError
-            When the file is missing, broken, or holds no events.
+            When the file is missing, corrupt, or does not contain events.
         """
         source = Path(path)
         if source.suffix.lower() in HDF5_ENDINGS:
             _needs_h5py(source)
             if not source.is_file():
                 raise FileError(source, "is not a file" if source.exists() else "no such file")
-            with as_file_error(source, "file of events"):
+            with as_file_error(source, "event file"):
                 return cls(*_hdf5.read_events(source))
-        with opened_archive(source, "file of events", FORMAT, VERSION) as (about, arrays):
+        with opened_archive(source, "event file", FORMAT, VERSION) as (about, arrays):
             layout = unpacked_layout(arrays, about.get("provenance", {}))
             return cls(arrays["t_s"], arrays["site"], arrays["polarity"], layout)
 
 
 def write_events(batches: Iterable[Events], path: str | Path, *, pitch_um: float | None = None) -> int:
     """
-    Write events to an HDF5 file as they come, whole or not at all.
+    Write batches of events to an HDF5 file incrementally and atomically.
 
     Parameters
     ----------
     batches : iterable of Events
-        That follow each other, as :meth:`foveasim.modes.EventPixels.stream` gives them.
+        Consecutive batches, as from :meth:`foveasim.modes.EventPixels.stream`.
     path : path
-        ``.h5`` or ``.hdf5``; needs the extra ``video``.
+        File with the extension ``.h5`` or ``.hdf5``; needs the extra ``video``.
     pitch_um : float, optional, µm
-        Of the raster of :meth:`Events.addresses`.
+        Pitch of the raster of :meth:`Events.addresses`.
 
     Returns
     -------
     n_events : int
-        How many were written.
+        Number of events written.
 
     Raises
     ------
     FileError
-        When the ending is none of these, h5py is missing, or nothing can be written there.
+        When the extension is not one of these, h5py is not installed, or the file cannot be written.
     ParameterError
-        When there is no batch, one begins before the end of the one before it or has another layout, or events are later
-        than a day.
+        When there is no batch, batches overlap in time or have different layouts, or events are later than about a day.
 
     Notes
     -----
-    HDF5 as of the dataset DSEC (Gehrig et al., IEEE Robotics and Automation Letters 6, 4947, 2021), and of the tools that
-    read it, such as its own loaders and RVT: the group ``events`` with the arrays ``t`` (µs, int64), ``x`` and ``y`` (uint16,
-    row 0 on top) and ``p`` (uint8, 0 or 1), and beside it ``ms_to_idx``, the first event of each millisecond, and ``t_offset``
-    of 0. It is neither the one array (n, 4) that v2e writes, nor the HDF5 of Metavision. Moreover ``events/site``, and the
-    sites' ``sites/x_um``, ``sites/y_um``, ``sites/area_um2``, ``sites/x`` and ``sites/y``, since sites may share an address;
-    and the ``layout``, with which :meth:`Events.load` reads all of it back.
+    The format is that of the dataset DSEC (Gehrig et al., IEEE Robotics and Automation Letters 6, 4947, 2021) and of tools that
+    read it, such as RVT: the group ``events`` with the arrays ``t`` (µs, int64), ``x`` and ``y`` (uint16, row 0 is the top row)
+    and ``p`` (uint8, 0 or 1), the array ``ms_to_idx``, the first event of each millisecond, and ``t_offset`` of 0. It is
+    neither the single array (n, 4) of v2e nor the HDF5 format of Metavision. Additional arrays are ``events/site``, and
+    ``sites/x_um``, ``sites/y_um``, ``sites/area_um2``, ``sites/x`` and ``sites/y``, because several sites may have the same
+    address; and ``layout``, with which :meth:`Events.load` restores the events.
     """
     target = Path(path)
     if target.suffix.lower() not in HDF5_ENDINGS:
@@ -379,7 +400,7 @@ def write_events(batches: Iterable[Events], path: str | Path, *, pitch_um: float
                 file = _hdf5.EventFile(hdf5, batch.layout, *batch.addresses(pitch_um))
             file.add(t_us, batch.site, batch.polarity)
         if file is None:
-            raise ParameterError("batches", "must hold at least one batch of events")
+            raise ParameterError("batches", "must contain at least one batch of events")
         file.end()
         return file.n_events
 
@@ -388,9 +409,9 @@ def write_events(batches: Iterable[Events], path: str | Path, *, pitch_um: float
 
 
 def _following(name: str, batches: Iterable[Events]) -> Iterator[Events]:
-    """Batches of one layout that follow each other."""
+    """Yield batches after checking that they have one layout and are consecutive."""
     if isinstance(batches, Events) or not isinstance(batches, Iterable):
-        cure = "put it into a list" if isinstance(batches, Events) else ""
+        cure = "pass a list of batches" if isinstance(batches, Events) else ""
         raise ParameterError(name, f"must be batches of events, got a {type(batches).__name__}", hint=cure)
     layout: Layout | None = None
     last_s = 0.0
@@ -402,18 +423,23 @@ def _following(name: str, batches: Iterable[Events]) -> Iterator[Events]:
         elif batch.layout is not layout and not all(
             np.array_equal(getattr(batch.layout, part), getattr(layout, part)) for part in OUTLINES
         ):
-            raise ParameterError(name, f"must be of one layout, got {layout!r} and {batch.layout!r}")
+            raise ParameterError(name, f"must have the same layout, got {layout!r} and {batch.layout!r}")
         if len(batch):
             if batch.t_s[0] < last_s:
                 raise ParameterError(
-                    name, f"must follow each other, got one that begins at {batch.t_s[0]:g} s, before {last_s:g} s"
+                    name,
+                    f"must be consecutive in time, got a batch that begins at {batch.t_s[0]:g} s, before {last_s:g} s",
                 )
             last_s = float(batch.t_s[-1])
         yield batch
 
 
 def _numbered(layout: Layout) -> tuple[Ints, Ints] | None:
-    """Column and row of each site by its layout's own numbers; None where they run otherwise, or sites share them."""
+    """
+    Return column and row of each site from the columns of the layout.
+
+    Returns None if the columns are missing, not aligned with the axes, or not unique.
+    """
     centred_um = layout.centroid_um - layout.centroid_um.mean(axis=0) if layout.n_sites else layout.centroid_um
     places = []
     for axis, name in enumerate(("column", "row")):
@@ -435,7 +461,7 @@ def _numbered(layout: Layout) -> tuple[Ints, Ints] | None:
 
 
 def _on_raster(layout: Layout, pitch_um: float | None) -> tuple[Ints, Ints]:
-    """Column and row of each site's centre on a raster from the left and from the top."""
+    """Return column and row of each centroid on a raster, counted from the top left."""
     from scipy.spatial import cKDTree
 
     centroid_um = layout.centroid_um
@@ -443,7 +469,7 @@ def _on_raster(layout: Layout, pitch_um: float | None) -> tuple[Ints, Ints]:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     low_um, high_um = centroid_um.min(axis=0), centroid_um.max(axis=0)
     if pitch_um is None:
-        # Centres that lie further apart than this along either axis fall into different columns or rows.
+        # Centroids with a larger distance along either axis are in different columns or rows.
         distance_um = np.asarray(cKDTree(centroid_um).query(centroid_um, k=2, p=np.inf)[0])[:, 1]
         nearest_um = float(distance_um[distance_um > 0.0].min(initial=np.inf))
         finest_um = float((high_um - low_um).max()) / MAX_ADDRESS
@@ -454,7 +480,7 @@ def _on_raster(layout: Layout, pitch_um: float | None) -> tuple[Ints, Ints]:
     if max(column.max(), row.max()) > MAX_ADDRESS:
         raise ParameterError(
             "pitch_um",
-            f"gives more than {MAX_ADDRESS + 1} columns or rows, which files have no numbers for",
+            f"must give at most {MAX_ADDRESS + 1} columns and rows, the range of uint16 addresses",
             pitch_um,
             "µm",
         )
@@ -462,11 +488,11 @@ def _on_raster(layout: Layout, pitch_um: float | None) -> tuple[Ints, Ints]:
 
 
 def _whole_us(t_s: Floats) -> Ints:
-    """Microseconds, rounded down."""
+    """Convert times to microseconds, rounded down."""
     if t_s.size and t_s[-1] > MAX_T_S:
         raise ParameterError("t_s", f"must be at most {MAX_T_S:.3g} for microseconds", float(t_s[-1]), "s")
     t_us = np.floor(t_s * 1e6)
-    # The product may be rounded past an integer: what was read from whole microseconds stays as it is.
+    # The product may be rounded across an integer: times that were read from microseconds must not change.
     t_us += (t_us + 1.0) / 1e6 <= t_s
     t_us -= t_us / 1e6 > t_s
     return t_us.astype(np.int64)

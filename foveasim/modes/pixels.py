@@ -1,8 +1,8 @@
 """
-Photosites that speak for themselves: those that tell changes of light, and those that spike when they have collected a charge.
+Asynchronous photosites: change detection (event cameras) and integrate-and-fire.
 
-Both are fed the light of frames, as :meth:`foveasim.Camera.rates` gives it, and remember what was before: a video may come in
-batches of any size, and gives the same events.
+Both process the photoelectron rates of frames, as from :meth:`foveasim.Camera.rates`, and store their state between frames:
+events do not depend on the size of the batches of a video.
 """
 
 from __future__ import annotations
@@ -29,47 +29,49 @@ from foveasim.units import BOLTZMANN_J_PER_K, ELEMENTARY_CHARGE_C
 
 __all__ = ["EventPixels", "SpikingPixels"]
 
-#: A site's threshold is at least this fraction of the mean, whatever its mismatch.
+#: Smallest threshold of a site as a fraction of the mean, for any mismatch.
 LEAST_THRESHOLD = 0.1
-#: Sites that one thread works on at a time; fixed, so that results do not depend on the number of threads.
+#: Sites per task; fixed, so that results do not depend on the number of threads.
 PIECE_SITES = 2048
-#: More events of one batch than this are a slip: of a threshold, or of the light's unit.
+#: More events per batch than this indicate a wrong threshold or a wrong unit of the rates.
 MAX_EVENTS = 1 << 27
 
-#: A kernel for some sites: of their positions and the most events, and where what they remember and their events are.
+#: Kernel call for some sites: slice of sites, maximum number of events, state arrays, output arrays.
 Work = Callable[[slice, int, NDArray[Any], Ints, Ints, Floats, NDArray[np.int32], NDArray[np.int8]], int]
-#: Events of some sites, frame by frame: behind which each frame ends, and their times, sites and polarities.
+#: Events of some sites, frame by frame: number of events up to the end of each frame, times, sites, polarities.
 Piece = tuple[Ints, Floats, NDArray[np.int32], NDArray[np.int8]]
 
 
 @dataclass(frozen=True, eq=False)
 class EventPixels:
     """
-    Photosites of an event camera (dynamic vision sensor): each tells when the logarithm of its light has changed enough.
+    Photosites of an event camera (dynamic vision sensor), which detect contrast changes.
 
     Parameters
     ----------
     sensor : Sensor
-        Its photosites: areas, sensitivities, PRNU, dark current and crosstalk count, and the device's seed.
+        Sensor with the photosites. Areas, sensitivities, PRNU, dark current, crosstalk and the device seed are used.
     contrast_on, contrast_off : float
-        Change of the natural logarithm of the photocurrent that gives an event: 0.2 are 22 % brighter, or 18 % darker.
+        Contrast thresholds: change of the natural logarithm of the photocurrent per event. 0.2 is an increase by 22 % or a
+        decrease by 18 %.
     mismatch_fraction : float
-        Standard deviation of the sites' thresholds over their mean, fixed in the device; at most 0.3.
+        Threshold mismatch: relative standard deviation of the thresholds, fixed in the device; at most 0.3.
     refractory_s : float, s
-        How long a site is held after an event, while its reference follows the light.
+        Refractory time after an event, in which the reference follows the photoreceptor level.
     capacitance_f : float, F
-        Of the photoreceptor's node: 1e-14 F is usual, 0 has no low pass. See the notes.
+        Capacitance of the photoreceptor node: 1e-14 F is typical, 0 disables the low pass. See the notes.
     temperature_k : float, K
+        Temperature, which affects the low pass.
     leak_per_s : float, 1/s
-        Events of brightening that a site gives each second in constant light, by leakage.
+        Rate of ON events of a site at constant irradiance, due to leakage.
     leak_spread_fraction : float
-        Standard deviation of the sites' leaks over their mean, a log-normal distribution, fixed in the device.
+        Relative standard deviation of the leak rates, a log-normal distribution, fixed in the device.
     noise_per_s : float, 1/s
-        Events of shot noise, of either polarity alike, that a site gives each second in darkness ...
+        Rate of shot noise events of a site at zero photocurrent, with equal probabilities of both polarities.
     noise_half_e_per_s : float, e-/s
-        ... and half as many at this photocurrent: ``noise_per_s / (1 + I / noise_half)``.
+        Photocurrent at which the noise rate is half: ``noise_per_s / (1 + I / noise_half)``.
     floor_e_per_s : float, e-/s
-        Added to every site's photocurrent, so that darkness has a logarithm.
+        Rate added to the photocurrent of every site, so that the logarithm is finite at zero irradiance.
 
     Raises
     ------
@@ -78,22 +80,21 @@ class EventPixels:
 
     Notes
     -----
-    Between frames the logarithm of the photocurrent I is a straight line L(t), and events have the times at which the
-    thresholds are crossed, to the last bits. The photoreceptor follows it as a low pass, ``dV/dt = (L - V) / tau`` with
-    ``tau = C (kT/q) / I``, the corner frequency ``1 / (2 pi tau)`` in proportion to the light; I is the mean current of each
-    part of a frame in which L changes by at most a quarter. An event sets the site's reference to its level at the end of the
-    refractory time; leakage lowers the reference. Frames should follow each other so fast that L changes little between them:
-    what the light did meanwhile nobody told.
+    The logarithm L(t) of the photocurrent I is interpolated linearly between frames, and event times are the threshold
+    crossings to machine precision. The photoreceptor is a low pass, ``dV/dt = (L - V) / tau`` with ``tau = C (kT/q) / I``, so
+    its corner frequency ``1 / (2 pi tau)`` is proportional to the photocurrent; I is the mean current of each part of a frame
+    in which L changes by at most 0.25. An event sets the reference of the site to its level at the end of the refractory time;
+    leakage lowers the reference. The frame rate should be so high that L changes little between frames.
 
-    A leaking site is anywhere between two events of its leak when the light begins, at a place drawn with the noise: sites do
-    not tell in chorus. An event at the border of two frames is of the first.
+    The initial phase of the leak of each site is random, drawn with the noise, so that leak events of different sites are not
+    synchronous. An event at the boundary of two frames belongs to the first.
 
-    Noise is that of a Poisson process with the refractory time as its dead time; a noise event sets the reference like any
-    other.
+    Noise events are a Poisson process with the refractory time as dead time; a noise event sets the reference like other
+    events.
 
     Examples
     --------
-    A site whose light grows from 100 to 1000 e-/s, ln 10 = 2.303, at thresholds of 0.5:
+    A site with a photocurrent that increases from 100 to 1000 e-/s, ln 10 = 2.303, at thresholds of 0.5:
 
     >>> import foveasim as fs
     >>> sensor = fs.Sensor(fs.layout.grid(n_x=1, n_y=1, pitch_um=10.0))
@@ -128,7 +129,7 @@ class EventPixels:
 
     @cached_property
     def thresholds(self) -> tuple[Floats, Floats]:
-        """Every site's thresholds for brighter and for darker, (n_site,) or (1,) each."""
+        """ON and OFF thresholds of every site, (n_site,) or (1,) each."""
         means = self.contrast_on, self.contrast_off
         if not self.mismatch_fraction:
             return read_only(np.full(1, means[0])), read_only(np.full(1, means[1]))
@@ -141,7 +142,7 @@ class EventPixels:
 
     @cached_property
     def leaks_per_s(self) -> Floats:
-        """Events that every site's leakage gives each second, (n_site,) or (1,)."""
+        """Leak rate of every site in events per second, (n_site,) or (1,)."""
         if not self.leak_spread_fraction:
             return read_only(np.full(1, self.leak_per_s))
         return read_only(self.leak_per_s * self.sensor.device.log_normals("event leak", self.leak_spread_fraction))
@@ -156,32 +157,32 @@ class EventPixels:
         n_threads: int | None = None,
     ) -> Iterator[Events]:
         """
-        Events, some frames at a time.
+        Yield the events of successive batches of frames.
 
         Parameters
         ----------
         rates : iterable of (n_site,), e-/s
-            The frames' photoelectrons, as :meth:`foveasim.Camera.rates` gives them.
+            Photoelectron rates of the frames, as from :meth:`foveasim.Camera.rates`.
         frame_s : float, s
-            From one frame to the next; the first is at 0 s.
+            Frame period; the first frame is at 0 s.
         seed : int
-            Of the noise.
+            Seed of the noise.
         batch : int
-            Frames at a time; the events do not depend on it.
+            Frames per batch; events do not depend on it.
         n_threads : int, optional
-            All cores by default. Events do not depend on it.
+            Number of threads, by default all cores. Events do not depend on it.
 
         Yields
         ------
         Events
-            Of each batch, all later than those before.
+            Events of a batch, all later than those of previous batches.
 
         Raises
         ------
         ParameterError
-            At once, when a number is out of range; later, when a frame has not one rate of at least 0 a site.
+            Immediately when a value is out of range; during iteration when a frame does not have one rate >= 0 per site.
         SimulationError
-            When a site has no current at all, or there are more events than fit the memory.
+            When the current of a site is zero, or the events do not fit in memory.
         """
         _check_rates(rates)
         frame_s = check_plausible("frame_s", frame_s)
@@ -190,7 +191,7 @@ class EventPixels:
         return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
 
     def events(self, rates: Iterable[ArrayLike], *, frame_s: float, seed: int, n_threads: int | None = None) -> Events:
-        """All events as one; as :meth:`stream`."""
+        """Return all events at once; parameters as for :meth:`stream`."""
         return _all(self.stream(rates, frame_s=frame_s, seed=seed, n_threads=n_threads), self.sensor)
 
     def _stream(
@@ -209,7 +210,7 @@ class EventPixels:
             if not current.min(initial=np.inf) > 0.0:
                 site = int(np.flatnonzero((current <= 0.0).any(axis=0))[0])
                 raise SimulationError(
-                    f"site {site} has no current, and so no logarithm: give 'floor_e_per_s', or the sensor a dark current"
+                    f"the current of site {site} is zero, and its logarithm infinite; set 'floor_e_per_s' or a dark current"
                 )
             if before is None:
                 memory[:, _kernels.LEVEL] = np.log(current[0])
@@ -222,7 +223,7 @@ class EventPixels:
             def work(sites: slice, n_most: int, *out: NDArray[Any]) -> int:
                 return int(
                     _kernels.change_events(
-                        np.ascontiguousarray(log_light[:, sites]),  # noqa: B023 -- is called at once
+                        np.ascontiguousarray(log_light[:, sites]),  # noqa: B023 -- called in this iteration
                         np.ascontiguousarray(frames[:, sites]),  # noqa: B023
                         frame_s,
                         first,  # noqa: B023
@@ -248,17 +249,17 @@ class EventPixels:
 @dataclass(frozen=True, eq=False)
 class SpikingPixels:
     """
-    Photosites that integrate and fire: each collects charge, and gives a spike when it has a threshold of it.
+    Integrate-and-fire photosites with a charge threshold.
 
     Parameters
     ----------
     sensor : Sensor
-        Its photosites: areas, sensitivities, PRNU, dark current and crosstalk count. Without its shot noise charge flows
-        evenly.
+        Sensor with the photosites. Areas, sensitivities, PRNU, dark current and crosstalk are used. If its shot noise is off,
+        the charge increases uniformly.
     threshold_e : float or (n_site,), e-
-        Charge of a spike, at least 1.
+        Charge per spike, at least 1.
     refractory_s : float, s
-        After a spike, while charge is lost.
+        Refractory time after a spike, during which charge is lost.
 
     Raises
     ------
@@ -267,10 +268,10 @@ class SpikingPixels:
 
     Notes
     -----
-    Without noise the rate of spikes is ``1 / (N_th / I + refractory)`` for a current of I electrons per second. With it the
-    time to a threshold of N electrons follows the gamma distribution of shape N, drawn exactly, so that intervals
-    vary by ``1 / sqrt(N)`` of their mean. A charge that is collected stays from frame to frame. Light stays as it is from each
-    frame to the next: frame k lasts from ``k frame_s`` to ``(k + 1) frame_s``.
+    Without noise, the spike rate is ``1 / (N_th / I + refractory)`` for a current of I electrons per second. With noise, the
+    time to a threshold of N electrons follows the gamma distribution of shape N, which is sampled exactly; the relative
+    standard deviation of intervals is ``1 / sqrt(N)``. Collected charge is retained between frames. Rates are constant during
+    each frame: frame k lasts from ``k frame_s`` to ``(k + 1) frame_s``.
 
     Examples
     --------
@@ -307,32 +308,32 @@ class SpikingPixels:
         n_threads: int | None = None,
     ) -> Iterator[Events]:
         """
-        Spikes, some frames at a time.
+        Yield the spikes of successive batches of frames.
 
         Parameters
         ----------
         rates : iterable of (n_site,), e-/s
-            The frames' photoelectrons, as :meth:`foveasim.Camera.rates` gives them.
+            Photoelectron rates of the frames, as from :meth:`foveasim.Camera.rates`.
         frame_s : float, s
-            How long each frame lasts; the first begins at 0 s.
+            Frame period; the first frame begins at 0 s.
         seed : int
-            Of the shot noise.
+            Seed of the shot noise.
         batch : int
-            Frames at a time; the spikes do not depend on it.
+            Frames per batch; spikes do not depend on it.
         n_threads : int, optional
-            All cores by default. Spikes do not depend on it.
+            Number of threads, by default all cores. Spikes do not depend on it.
 
         Yields
         ------
         Events
-            Of each batch, all of the polarity 1, all later than those before.
+            Spikes of a batch, all of polarity 1 and later than those of previous batches.
 
         Raises
         ------
         ParameterError
-            At once, when a number is out of range; later, when a frame has not one rate of at least 0 a site.
+            Immediately when a value is out of range; during iteration when a frame does not have one rate >= 0 per site.
         SimulationError
-            When there are more spikes than fit the memory.
+            When the spikes do not fit in memory.
         """
         _check_rates(rates)
         frame_s = check_plausible("frame_s", frame_s)
@@ -341,7 +342,7 @@ class SpikingPixels:
         return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
 
     def events(self, rates: Iterable[ArrayLike], *, frame_s: float, seed: int, n_threads: int | None = None) -> Events:
-        """All spikes as one; as :meth:`stream`."""
+        """Return all spikes at once; parameters as for :meth:`stream`."""
         return _all(self.stream(rates, frame_s=frame_s, seed=seed, n_threads=n_threads), self.sensor)
 
     def _stream(
@@ -357,14 +358,14 @@ class SpikingPixels:
             expected = current / (threshold_e + self.refractory_s * current) * frame_s
             if expected.sum() > MAX_EVENTS:
                 raise SimulationError(
-                    f"{expected.sum():.3g} spikes of {current.shape[0]} frames do not fit the memory: take fewer frames a "
-                    "batch, a higher threshold_e, or less light"
+                    f"{expected.sum():.3g} spikes in {current.shape[0]} frames do not fit in memory; use a smaller 'batch', a "
+                    "higher 'threshold_e' or lower rates"
                 )
 
             def work(sites: slice, n_most: int, *out: NDArray[Any]) -> int:
                 return int(
                     _kernels.charge_spikes(
-                        np.ascontiguousarray(current[:, sites]),  # noqa: B023 -- is called at once
+                        np.ascontiguousarray(current[:, sites]),  # noqa: B023 -- called in this iteration
                         frame_s,
                         first,  # noqa: B023
                         _part(threshold_e, sites),
@@ -395,18 +396,22 @@ def _check_rates(rates: object) -> None:
     if not isinstance(rates, Iterable):
         raise ParameterError(
             "rates",
-            f"must be frames of one rate a site each, got a {type(rates).__name__}",
-            hint="foveasim.Camera.rates makes them of light",
+            f"must be an iterable of frames with one rate per site, got a {type(rates).__name__}",
+            hint="foveasim.Camera.rates computes them from scenes",
         )
 
 
 def _part(values: Floats, sites: slice) -> Floats:
-    """Values of some sites, or the one of all."""
+    """Return the values of some sites, or the common value of all."""
     return values[sites] if values.size > 1 else values
 
 
 def _batches(sensor: Sensor, rates: Iterable[ArrayLike], batch: int) -> Iterator[Floats]:
-    """Currents of some frames at a time, (n_frame, n_site) e-/s: photoelectrons and dark charge, with crosstalk."""
+    """
+    Yield the currents of batches of frames, (n_frame, n_site) e-/s.
+
+    Currents include dark signal and crosstalk.
+    """
     n_sites = sensor.layout.n_sites
     remaining = iter(rates)
     while rows := list(islice(remaining, batch)):
@@ -420,7 +425,7 @@ def _batches(sensor: Sensor, rates: Iterable[ArrayLike], batch: int) -> Iterator
 
 
 def _gathered(work: Work, n_frames: int, memory: NDArray[Any], n_drawn: Ints, sensor: Sensor, n_threads: int) -> Events:
-    """What a kernel makes of all sites, in the order of time."""
+    """Run a kernel on all sites and return the events in temporal order."""
     n_found = 0
     adding = Lock()
 
@@ -450,7 +455,7 @@ def _gathered(work: Work, n_frames: int, memory: NDArray[Any], n_drawn: Ints, se
     begins = np.concatenate(([0], sum((ends for ends, *_ in pieces), np.zeros(n_frames, np.int64))))
 
     def frame(k: int) -> None:
-        # The events of a frame: later than those of the frame before, site by site, and of each site in the order of time.
+        # Events of a frame are later than those of previous frames, and ordered by site, then by time.
         parts = [[array[ends[k - 1] if k else 0 : ends[k]] for array in (s, i, p)] for ends, s, i, p in pieces]
         found_s, sites, signs = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         order = _rising(found_s)
@@ -465,13 +470,13 @@ def _gathered(work: Work, n_frames: int, memory: NDArray[Any], n_drawn: Ints, se
 
 def _too_many(n_frames: int) -> SimulationError:
     return SimulationError(
-        f"more than {MAX_EVENTS:,} events of {n_frames} frames do not fit the memory: take fewer frames a batch, higher "
-        "thresholds, less light or less noise"
+        f"more than {MAX_EVENTS:,} events in {n_frames} frames do not fit in memory; use a smaller 'batch', higher thresholds, "
+        "lower rates or less noise"
     )
 
 
 def _rising(values: Floats) -> Ints:
-    """Places of values in rising order, equal ones as they come: four times as fast as a stable sort."""
+    """Return the indices of a stable sort, four times as fast as a stable sort of numpy."""
     order = np.argsort(values)
     in_order = values[order]
     is_tied = np.zeros(values.size, bool)

@@ -1,8 +1,8 @@
 """
-Rolling shutters: which frames of light each photosite's exposure covers, and how much of each.
+Rolling shutters: overlap of the exposure of each photosite with the frames of a scene.
 
-A site begins its exposure ``readout_order * line_s`` after the first. Light is given in frames, ``frame_s`` apart: it stays as
-it is until the next one, or goes over into it in a straight line.
+The exposure of a site begins ``readout_order * line_s`` after the first. Irradiance is given in frames, ``frame_s`` apart: it
+is constant until the next frame, or interpolated linearly between frames.
 """
 
 from __future__ import annotations
@@ -19,37 +19,38 @@ from foveasim.sensor.limits import check_plausible
 
 __all__ = ["Between", "Exposure", "Shutter"]
 
-#: What light does between frames: it holds until the next, or goes over into it in a straight line.
+#: Irradiance between frames: constant until the next frame, or linear interpolation.
 Between = Literal["hold", "linear"]
-#: An exposure that ends this fraction of a frame behind one ends with it: the rounding of times.
+#: Tolerance for rounding of times, in frames: an exposure that ends later than a frame by less ends with it.
 TIME_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Shutter:
     """
-    When the sites expose, within frames of light.
+    Exposure timing of the sites relative to the frames of a scene.
 
     Parameters
     ----------
     layout : Layout
-        With the column ``readout_order``, where lines differ in time.
+        Layout of the photosites, with the column ``readout_order`` if ``line_s`` is not 0.
     frame_s : float, s
-        From one frame of light to the next.
+        Frame period of the scene.
     line_s : float, s
-        From the begin of one line's exposure to the next one's; 0 for a global shutter.
+        Line time, between the starts of exposure of successive lines; 0 for a global shutter.
     between : {"hold", "linear"}
+        Irradiance between frames: constant until the next frame, or linear interpolation.
 
     Raises
     ------
     ParameterError
-        When a time is out of range, or the layout is none.
+        When a time is out of range, or ``layout`` is not a Layout.
     SimulationError
-        When lines differ in time, and the layout does not say which site is on which.
+        When ``line_s`` is not 0 and the layout has no column ``readout_order``.
 
     Examples
     --------
-    Of an exposure of 2 s that begins with a frame of 1.5 s, or half a second later:
+    Two lines with an exposure of 2 s, frames of 1.5 s, and a line time of 0.5 s:
 
     >>> import foveasim as fs
     >>> layout = fs.layout.grid(n_x=1, n_y=2, pitch_um=2.0).with_columns(readout_order=np.array([0, 1]))
@@ -71,24 +72,28 @@ class Shutter:
         check_choice("between", self.between, ("hold", "linear"))
         if self.line_s and "readout_order" not in self.layout.columns:
             raise SimulationError(
-                "lines are exposed one after the other, but the layout does not say which site is on which; give it a column "
-                "'readout_order', for example with foveasim.layout.readout_by or nearest_bus"
+                "a rolling shutter needs the line of each site; add a column 'readout_order' to the layout, for example with "
+                "foveasim.layout.readout_by or nearest_bus"
             )
 
     @property
     def delay_s(self) -> Floats:
-        """From the begin of the first line's exposure to that of each site's, (n_site,) s; (1,) of a global shutter."""
+        """Start of the exposure of each site after the first line, (n_site,) s; (1,) if global."""
         if not self.line_s:
             return np.zeros(1)
         order = np.asarray(self.layout.columns["readout_order"], np.float64)
         return self.line_s * (order - order.min(initial=np.inf))
 
     def overlap_fraction(self, frame: int, exposure_s: float) -> Floats:
-        """Fraction of each site's exposure that a frame lights, (n_site,) or (1,); frame 0 begins with the first line."""
+        """
+        Return the weight of a frame in the exposure of each site, (n_site,) or (1,).
+
+        Frame 0 begins with the first line.
+        """
         frame = check_count("frame", frame, at_least=0)
         exposure_s = check_plausible("exposure_s", exposure_s)
         delay_s = self.delay_s
-        if not exposure_s:  # a moment
+        if not exposure_s:  # instantaneous exposure
             return np.where((delay_s >= frame * self.frame_s) & (delay_s < (frame + 1) * self.frame_s), 1.0, 0.0)
         if self.between == "hold":
             before, after = (np.clip((k * self.frame_s - delay_s) / exposure_s, 0.0, 1.0) for k in (frame, frame + 1))
@@ -97,7 +102,7 @@ class Shutter:
         return np.asarray((end - begin) * (self.frame_s / exposure_s))
 
     def last_frame(self, exposure_s: float) -> int:
-        """The last frame that lights any site's exposure."""
+        """Return the last frame that overlaps the exposure of any site."""
         exposure_s = check_plausible("exposure_s", exposure_s)
         end = (float(self.delay_s.max(initial=0.0)) + exposure_s) / self.frame_s
         frames = int(np.ceil(end - TIME_ROUNDING))
@@ -106,18 +111,19 @@ class Shutter:
 
 class Exposure:
     """
-    One exposure in the making: frames of light are added as they come.
+    Incremental integration of one exposure from frames.
 
     Parameters
     ----------
     shutter : Shutter
+        Exposure timing.
     exposure_s : float, s
-        0 for a moment.
+        Exposure time; 0 for an instantaneous exposure.
 
     Raises
     ------
     ParameterError
-        When the time is out of range, or light is not one finite number of at least 0 a site.
+        When the time is out of range, or rates are not finite numbers >= 0, one per site.
     """
 
     def __init__(self, shutter: Shutter, exposure_s: float) -> None:
@@ -132,11 +138,11 @@ class Exposure:
 
     @property
     def is_complete(self) -> bool:
-        """Whether no frame to come lights any site."""
+        """Whether all frames that overlap the exposure have been added."""
         return self._n_seen > self._last
 
     def add(self, rate_e_per_s: Floats) -> None:
-        """Add the next frame's light, (n_site,) e-/s."""
+        """Add the photoelectron rates of the next frame, (n_site,) e-/s."""
         rate_e_per_s = self._light("rate_e_per_s", rate_e_per_s)
         if not self.is_complete:
             share = self._shutter.overlap_fraction(self._n_seen, self.exposure_s)
@@ -145,7 +151,11 @@ class Exposure:
         self._n_seen += 1
 
     def mean_e_per_s(self, last_e_per_s: Floats) -> Floats:
-        """Mean light over every site's exposure, (n_site,) e-/s; the last frame's light stays until all are over."""
+        """
+        Return the mean photoelectron rate during the exposure of every site, (n_site,) e-/s.
+
+        The rate of the last frame is used for the rest of an incomplete exposure.
+        """
         last_e_per_s = self._light("last_e_per_s", last_e_per_s)
         if self.is_complete:
             return self._rate_e_per_s
@@ -159,6 +169,6 @@ class Exposure:
 
 
 def _hat_integral(x: Floats) -> Floats:
-    """Integral up to x of the hat that rises from 0 at -1 to 1 at 0 and falls to 0 at 1."""
+    """Return the integral up to x of the triangular function of unit height on [-1, 1]."""
     x = np.clip(x, -1.0, 1.0)
     return np.where(x < 0.0, 0.5 * (1.0 + x) ** 2, 1.0 - 0.5 * (1.0 - x) ** 2)

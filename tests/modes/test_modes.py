@@ -1,4 +1,4 @@
-"""Photosites that speak for themselves: closed forms of events and spikes, and what must not change them."""
+"""Asynchronous photosites: closed forms of events and spikes, invariance, and files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def pixels_of(n_sites=1, sensor=None, **changes):
 
 
 def walk(n_frames, n_sites, seed=0, step=0.3):
-    """Light whose logarithm goes at random."""
+    """Return rates whose logarithm is a random walk."""
     steps = step * np.random.default_rng(seed).standard_normal((n_frames, n_sites))
     return 1e6 * np.exp(np.cumsum(steps, axis=0))
 
@@ -46,7 +46,7 @@ def test_constant_light_gives_no_events(capacitance_f):
 
 @pytest.mark.parametrize("contrast", [0.1, 0.23, 0.5])
 @pytest.mark.parametrize("change", [0.05, 0.3, 1.0, 2.7, -0.3, -1.0, -2.7])
-def test_a_step_of_log_light_gives_its_whole_thresholds(change, contrast):
+def test_log_step_gives_one_event_per_threshold(change, contrast):
     pixels = pixels_of(contrast_on=contrast, contrast_off=contrast)
     events = pixels.events([[100.0], [100.0 * math.exp(change * 1.000001)]], frame_s=1.0, seed=0)
 
@@ -54,16 +54,16 @@ def test_a_step_of_log_light_gives_its_whole_thresholds(change, contrast):
     assert np.all(events.polarity == np.sign(change))
 
 
-def test_thresholds_for_brighter_and_darker_are_their_own():
+def test_on_and_off_thresholds_are_independent():
     pixels = pixels_of(contrast_on=0.3, contrast_off=0.15)
     events = pixels.events([[100.0], [100.0 * math.exp(1.0)], [100.0]], frame_s=1.0, seed=0)
 
-    # Up: 0.3, 0.6, 0.9 with 0.1 left over; down from there by 1, of which 0.1 goes back to the last event's level.
+    # Up: 0.3, 0.6, 0.9 with a remainder of 0.1; down by 1, of which 0.1 returns to the level of the last event.
     assert events.counts(polarity=1).tolist() == [3]
     assert events.counts(polarity=-1).tolist() == [6]
 
 
-def test_a_ramp_of_log_light_gives_evenly_spaced_times():
+def test_log_ramp_gives_equidistant_times():
     slope_per_s, contrast, n = 3.0, 0.25, 41
     rates = 100.0 * np.exp(slope_per_s * 0.01 * np.arange(n))[:, None]
     events = pixels_of(contrast_on=contrast).events(rates, frame_s=0.01, seed=0)
@@ -72,7 +72,7 @@ def test_a_ramp_of_log_light_gives_evenly_spaced_times():
     assert len(events) == 4
 
 
-def test_light_of_another_strength_gives_the_same_events():
+def test_scaled_light_gives_same_events():
     rates = walk(30, 5)
     pixels = pixels_of(5)
 
@@ -81,7 +81,7 @@ def test_light_of_another_strength_gives_the_same_events():
     assert np.allclose(weak.t_s, strong.t_s, rtol=1e-9)
 
 
-def test_the_low_pass_follows_a_step_with_a_time_constant_in_inverse_proportion_to_the_light():
+def test_low_pass_is_faster_at_higher_current():
     capacitance_f, contrast = 2e-14, 0.13
     light = np.array([2e5, 8e5])
     tau_s = capacitance_f * BOLTZMANN_J_PER_K * 300.0 / (ELEMENTARY_CHARGE_C**2 * math.e * light)
@@ -91,21 +91,21 @@ def test_the_low_pass_follows_a_step_with_a_time_constant_in_inverse_proportion_
     for site in (0, 1):
         times_s = events.t_s[events.site == site]
         late = times_s[times_s > frame_s]
-        # Behind the ramp V = 1 - a exp(-(t - frame) / tau): the time from level to level is tau ln of the distances' ratio.
+        # After the ramp V = 1 - a exp(-(t - frame) / tau): the time between two levels is tau ln of the ratio of distances to 1.
         level = 1.0 - contrast * (np.arange(len(times_s))[times_s > frame_s] + 1)
         steps = np.log(level[:-1] / level[1:])
         assert len(times_s) == 7
         assert np.allclose(np.diff(late), tau_s[site] * steps, rtol=1e-9)
 
 
-def test_a_change_much_faster_than_the_low_pass_is_not_seen():
+def test_change_faster_than_low_pass_is_undetected():
     pixels = pixels_of(capacitance_f=2e-14)
 
     assert len(pixels.events([[1e5], [1e6], [1e5]], frame_s=1e-9, seed=0)) == 0
 
 
 @pytest.mark.parametrize(("step", "seed", "n_least"), [(0.5, 5, 25), (2.0, 6, 1000)])
-def test_the_low_pass_agrees_with_small_steps_of_its_equation(step, seed, n_least):
+def test_low_pass_matches_small_step_integration(step, seed, n_least):
     capacitance_f, frame_s, contrast = 3e-14, 2e-3, 0.06
     rates = walk(40, 1, seed=seed, step=step)[:, 0]
     events = pixels_of(contrast_on=contrast, contrast_off=contrast, capacitance_f=capacitance_f).events(
@@ -119,7 +119,7 @@ def test_the_low_pass_agrees_with_small_steps_of_its_equation(step, seed, n_leas
         dt_s = frame_s / n
         for j in range(n):
             light = log_light[k] + (log_light[k + 1] - log_light[k]) * (j + 0.5) / n
-            # Of the light at this very moment.
+            # Time constant of the instantaneous current.
             tau_s = capacitance_f * BOLTZMANN_J_PER_K * 300.0 / (ELEMENTARY_CHARGE_C**2 * math.exp(light))
             level = light + (level - light) * math.exp(-dt_s / tau_s)
             if abs(level - reference) >= contrast:
@@ -128,13 +128,13 @@ def test_the_low_pass_agrees_with_small_steps_of_its_equation(step, seed, n_leas
 
     assert len(expected) > n_least
     assert events.polarity.tolist() == [p for _, p in expected]
-    # Parts of a frame have one time constant each, and where the level hardly moves, times tell small differences of it.
+    # Each part of a frame has one time constant; where the level changes slowly, times are sensitive to small differences.
     assert np.allclose(events.t_s, [t_s for t_s, _ in expected], rtol=0.0, atol=0.15 * frame_s)
 
 
 @pytest.mark.parametrize("noise_per_s", [0.0, 1e4])
 @pytest.mark.parametrize("capacitance_f", [0.0, 1e-14])
-def test_the_rate_never_passes_the_inverse_of_the_refractory_time(noise_per_s, capacitance_f):
+def test_event_rate_is_limited_by_refractory_time(noise_per_s, capacitance_f):
     refractory_s = 2e-3
     pixels = pixels_of(
         8, refractory_s=refractory_s, noise_per_s=noise_per_s, noise_half_e_per_s=1e12, capacitance_f=capacitance_f
@@ -148,16 +148,16 @@ def test_the_rate_never_passes_the_inverse_of_the_refractory_time(noise_per_s, c
         assert np.diff(times_s).min() >= refractory_s * (1 - 1e-9)
 
 
-def test_after_an_event_the_reference_follows_until_the_refractory_time_is_over():
+def test_reference_follows_level_during_refractory_time():
     slope_per_s, contrast, refractory_s = 2.0, 0.2, 0.05
     rates = 100.0 * np.exp(slope_per_s * np.arange(3))[:, None]
     events = pixels_of(contrast_on=contrast, refractory_s=refractory_s).events(rates, frame_s=1.0, seed=0)
 
-    # 0.1 s to a threshold and 0.05 s of rest.
+    # 0.1 s to a threshold, and 0.05 s of refractory time.
     assert np.allclose(np.diff(events.t_s), 0.15, rtol=1e-12)
 
 
-def test_leakage_gives_its_rate_of_brightening_in_constant_light():
+def test_leakage_gives_on_events_at_rate():
     events = pixels_of(2, leak_per_s=5.0).events([[1e3, 1e4]] * 21, frame_s=0.1, seed=0)
 
     assert events.counts(polarity=-1).tolist() == [0, 0]
@@ -168,18 +168,18 @@ def test_leakage_gives_its_rate_of_brightening_in_constant_light():
         assert np.allclose(np.diff(times_s), 0.2, rtol=1e-12)
 
 
-def test_leaking_sites_do_not_tell_in_chorus():
+def test_leak_events_of_sites_are_asynchronous():
     n_sites, leak_per_s = 10_000, 0.1
     pixels = pixels_of(sensor=fs.Sensor(fs.layout.grid(n_x=100, n_y=100, pitch_um=4.0)), leak_per_s=leak_per_s)
     one, other = (pixels.events(np.full((11, n_sites), 1e4), frame_s=1.0, seed=s) for s in (0, 1))
 
-    # In one period each site tells once, at any time alike: the distance of Kolmogorov's test at 5 sigma.
+    # In one period each site emits one event at a uniformly distributed time: distance of the Kolmogorov test at 5 sigma.
     assert np.array_equal(np.sort(one.site), np.arange(n_sites))
     assert np.abs(one.t_s * leak_per_s - np.arange(n_sites) / n_sites).max() < 2.7 / math.sqrt(n_sites)
     assert abs(np.corrcoef(one.t_s[np.argsort(one.site)], other.t_s[np.argsort(other.site)])[0, 1]) < 0.05
 
 
-def test_the_spread_of_leaks_is_fixed_in_the_device_and_keeps_their_mean():
+def test_leak_spread_is_fixed_and_preserves_mean():
     n_sites, spread = 40_000, 0.5
     layout = fs.layout.grid(n_x=200, n_y=200, pitch_um=4.0)
     one, other = (
@@ -189,7 +189,7 @@ def test_the_spread_of_leaks_is_fixed_in_the_device_and_keeps_their_mean():
 
     assert leaks.min() > 0.0
     assert abs(leaks.mean() - 2.0) < 5.0 * 2.0 * spread / math.sqrt(n_sites)
-    # The kurtosis of a log-normal distribution: for w = 1 + 0.5², w⁴ + 2w³ + 3w² - 3.
+    # Kurtosis of a log-normal distribution: for w = 1 + 0.5², w⁴ + 2w³ + 3w² - 3.
     w = 1.0 + spread**2
     kurtosis = w**4 + 2.0 * w**3 + 3.0 * w**2 - 3.0
     assert abs(leaks.var() / (2.0 * spread) ** 2 - 1.0) < 5.0 * math.sqrt((kurtosis - 1.0) / n_sites)
@@ -200,7 +200,7 @@ def test_the_spread_of_leaks_is_fixed_in_the_device_and_keeps_their_mean():
         assert np.allclose(np.diff(events.t_s[events.site == site]), 1.0 / leaks[site], rtol=1e-9)
 
 
-def test_noise_events_are_a_poisson_process_that_light_halves():
+def test_noise_is_poisson_process_halved_by_light():
     noise_per_s, n_sites = 20.0, 2000
     pixels = pixels_of(n_sites, noise_per_s=noise_per_s, noise_half_e_per_s=1000.0)
     light = np.where(np.arange(n_sites) < 1000, 1e-3, 1000.0)
@@ -209,13 +209,13 @@ def test_noise_events_are_a_poisson_process_that_light_halves():
     counts = events.counts()
     for part, mean in ((counts[:1000], 20.0), (counts[1000:], 10.0)):
         assert abs(part.mean() - mean) < 5.0 * math.sqrt(mean / 1000)
-        # The variance of a variance of Poisson's distribution: (mean + 2 mean²) / n.
+        # Variance of the sample variance of a Poisson distribution: (mean + 2 mean²) / n.
         assert abs(part.var() - mean) < 5.0 * math.sqrt((mean + 2.0 * mean**2) / 1000)
     ups = (events.polarity == 1).sum()
     assert abs(ups - 0.5 * len(events)) < 5.0 * 0.5 * math.sqrt(len(events))
 
 
-def test_mismatch_is_fixed_in_the_device():
+def test_threshold_mismatch_is_fixed_in_device():
     layout = fs.layout.grid(n_x=60, n_y=50, pitch_um=4.0)
     one, same_device, other = (
         EventPixels(fs.Sensor(layout, device_seed=seed), mismatch_fraction=0.1).thresholds for seed in (1, 1, 2)
@@ -241,7 +241,7 @@ NOISY = {
 
 
 def doubling(n_frames, n_sites):
-    """Light whose events of ln 2 fall on the borders of frames."""
+    """Return rates whose events at a threshold of ln 2 are at frame boundaries."""
     return np.repeat(100.0 * 2.0 ** np.arange(n_frames)[:, None], n_sites, axis=1)
 
 
@@ -251,42 +251,42 @@ def doubling(n_frames, n_sites):
     [
         ({}, walk),
         (NOISY, walk),
-        # Steps of leakage that take as long as a frame, and of light: at the borders, but for rounding.
+        # Events of leakage, and of doubled rates, at frame boundaries apart from rounding errors.
         ({"leak_per_s": 10.0, "mismatch_fraction": 0.1}, lambda n, m: np.full((3 * n, m), 1e4)),
         ({"contrast_on": math.log(2.0), "refractory_s": 1e-9}, doubling),
     ],
 )
-def test_batches_of_any_size_give_the_same_events(batch, changes, light):
+def test_events_are_independent_of_batch_size(batch, changes, light):
     pixels = pixels_of(30, **changes)
     rates = light(25, 30)
     frame_s = 0.1 if light is not walk else 0.01
-    whole = pixels.events(rates, frame_s=frame_s, seed=4)
+    expected = pixels.events(rates, frame_s=frame_s, seed=4)
 
-    assert len(whole) > 500
-    assert same(Events.concatenate(pixels.stream(rates, frame_s=frame_s, seed=4, batch=batch)), whole)
+    assert len(expected) > 500
+    assert same(Events.concatenate(pixels.stream(rates, frame_s=frame_s, seed=4, batch=batch)), expected)
 
 
-def test_events_of_a_frame_are_of_the_batch_that_it_ends():
+def test_boundary_events_belong_to_earlier_frame():
     pixels = pixels_of(30, contrast_on=math.log(2.0))
     for k, events in enumerate(pixels.stream(doubling(25, 30), frame_s=0.1, seed=0, batch=1)):
         assert np.all((events.t_s > (k - 1) * 0.1) & (events.t_s <= k * 0.1))
 
 
 @pytest.mark.parametrize("batch", [1, 2, 7])
-def test_spikes_at_the_borders_of_frames_are_in_the_same_order_in_all_batches(batch):
+def test_boundary_spikes_are_independent_of_batch_size(batch):
     sensor = sensor_of(40, shot_noise="off")
     threshold_e = 100.0 * (1.0 + 0.037 * np.arange(40))
-    # Three spikes a frame, the last of them at its end, but for rounding.
+    # Three spikes per frame, the last of them at its end apart from rounding errors.
     pixels = SpikingPixels(sensor, threshold_e=threshold_e)
     rates = [30.0 * threshold_e] * 41
-    whole = pixels.events(rates, frame_s=0.1, seed=4)
+    expected = pixels.events(rates, frame_s=0.1, seed=4)
 
-    assert len(whole) >= 3 * 40 * 40
-    assert same(Events.concatenate(pixels.stream(rates, frame_s=0.1, seed=4, batch=batch)), whole)
+    assert len(expected) >= 3 * 40 * 40
+    assert same(Events.concatenate(pixels.stream(rates, frame_s=0.1, seed=4, batch=batch)), expected)
 
 
-def test_events_of_the_same_time_are_in_the_order_of_their_sites():
-    # All sites cross at the same times, the odd ones twice as often.
+def test_simultaneous_events_are_in_site_order():
+    # All sites cross at the same times, the odd sites twice as often.
     pixels = pixels_of(500)
     rates = np.full((3, 500), 100.0)
     rates[1:] *= np.where(np.arange(500) % 2, math.exp(1.6), math.exp(0.8))
@@ -297,16 +297,16 @@ def test_events_of_the_same_time_are_in_the_order_of_their_sites():
     assert np.array_equal(order, np.arange(len(events)))
 
 
-def test_threads_and_pieces_change_nothing(monkeypatch):
+def test_events_are_independent_of_threads_and_pieces(monkeypatch):
     pixels = pixels_of(50, **NOISY)
     rates = walk(25, 50)
-    whole = pixels.events(rates, frame_s=0.01, seed=4, n_threads=1)
+    expected = pixels.events(rates, frame_s=0.01, seed=4, n_threads=1)
     monkeypatch.setattr(sys.modules[EventPixels.__module__], "PIECE_SITES", 7)
 
-    assert same(pixels.events(rates, frame_s=0.01, seed=4, n_threads=2), whole)
+    assert same(pixels.events(rates, frame_s=0.01, seed=4, n_threads=2), expected)
 
 
-def test_a_seed_gives_the_same_noise_and_another_another():
+def test_noise_depends_on_seed():
     pixels = pixels_of(5, noise_per_s=50.0)
     one, again, other = (pixels.events([[100.0] * 5] * 10, frame_s=0.1, seed=s) for s in (1, 1, 2))
 
@@ -314,7 +314,7 @@ def test_a_seed_gives_the_same_noise_and_another_another():
     assert not same(one, other)
 
 
-def test_larger_sites_of_even_light_tell_the_same_changes():
+def test_events_are_independent_of_site_area():
     layout = fs.layout.log_polar(n_sectors=16, n_rings=6, r_min_um=5.0, r_max_um=40.0)
     grid = fs.Grid.centred((200, 200), 0.5)
     camera = fs.Camera(optics=fs.Optics(focal_length_mm=22.0, f_number=4.0), sensor=fs.Sensor(layout))
@@ -323,7 +323,7 @@ def test_larger_sites_of_even_light_tell_the_same_changes():
     events = pixels.events(camera.rates(lights), frame_s=0.1, seed=0)
 
     assert events.counts().tolist() == [4] * layout.n_sites
-    # With the low pass larger sites are faster.
+    # With the low pass, larger sites respond faster.
     slow = EventPixels(camera.sensor, contrast_on=0.3, capacitance_f=1e-12).events(
         camera.rates([*lights, *[lights[-1]] * 20]), frame_s=1e-3, seed=0
     )
@@ -331,7 +331,7 @@ def test_larger_sites_of_even_light_tell_the_same_changes():
     assert np.corrcoef(np.log(layout.area_um2), first_s)[0, 1] < -0.9
 
 
-def test_darkness_without_a_floor_is_told():
+def test_zero_current_without_floor_is_rejected():
     with pytest.raises(SimulationError, match="floor_e_per_s"):
         pixels_of(2).events([[1.0, 0.0]], frame_s=0.1, seed=0)
     assert len(EventPixels(sensor_of(2)).events([[0.0, 0.0]] * 3, frame_s=0.1, seed=0)) == 0
@@ -340,7 +340,7 @@ def test_darkness_without_a_floor_is_told():
 # -- spikes -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_rate_of_spikes_is_the_current_over_the_charge_of_one():
+def test_spike_rate_is_current_per_threshold():
     currents = np.array([0.0, 701.0, 12_345.0, 1.00013e6])
     sensor = sensor_of(4, shot_noise="off")
     spikes = SpikingPixels(sensor, threshold_e=250.0).events([currents] * 10, frame_s=1.0, seed=0)
@@ -350,17 +350,17 @@ def test_the_rate_of_spikes_is_the_current_over_the_charge_of_one():
     assert np.allclose(times_s, 250.0 / 12_345.0 * np.arange(1, times_s.size + 1), rtol=1e-12)
 
 
-def test_charge_stays_from_frame_to_frame():
+def test_charge_is_retained_between_frames():
     sensor = sensor_of(1, shot_noise="off")
     spikes = SpikingPixels(sensor, threshold_e=100.0).events(
         [[30.0], [40.0], [50.0], [0.0], [80.0]], frame_s=1.0, seed=0
     )
 
-    # 30 + 40, 30 of 50 in 0.6 s; 20 left, and 80 more exactly at the end of the last frame, which is not of it.
+    # 30 + 40, then 30 of 50 in 0.6 s; the remaining 20 and 80 reach 100 at the end of the last frame, which is excluded.
     assert np.allclose(spikes.t_s, [2.6])
 
 
-def test_the_refractory_time_adds_to_every_interval():
+def test_refractory_time_is_added_to_intervals():
     sensor = sensor_of(1, shot_noise="off")
     pixels = SpikingPixels(sensor, threshold_e=100.0, refractory_s=0.013)
     spikes = pixels.events([[2000.0]] * 100, frame_s=0.01 * math.sqrt(2.0), seed=0)
@@ -369,12 +369,12 @@ def test_the_refractory_time_adds_to_every_interval():
 
 
 @pytest.mark.parametrize("threshold_e", [1.0, 3.0, 400.0])
-def test_intervals_follow_the_gamma_law(threshold_e):
+def test_intervals_follow_gamma_distribution(threshold_e):
     n_sites, rate = 500, 1000.0 * threshold_e
     pixels = SpikingPixels(sensor_of(n_sites), threshold_e=threshold_e)
     spikes = pixels.events([np.full(n_sites, rate)] * 7, frame_s=0.01, seed=2)
     mean_s = threshold_e / rate
-    # Spikes that begin an interval in the first half have its end in the second.
+    # The first 30 of about 70 intervals per site: no bias towards short intervals.
     intervals = np.concatenate([np.diff(spikes.t_s[spikes.site == s])[:30] for s in range(n_sites)]) / mean_s
 
     n = intervals.size
@@ -385,27 +385,27 @@ def test_intervals_follow_the_gamma_law(threshold_e):
 
 
 @pytest.mark.parametrize("batch", [1, 3, 50])
-def test_batches_of_any_size_give_the_same_spikes(batch):
+def test_spikes_are_independent_of_batch_size(batch):
     pixels = SpikingPixels(sensor_of(20), threshold_e=50.0, refractory_s=1e-4)
     rates = walk(20, 20)
-    whole = pixels.events(rates, frame_s=0.01, seed=4)
+    expected = pixels.events(rates, frame_s=0.01, seed=4)
 
-    assert len(whole) > 1000
-    assert same(Events.concatenate(pixels.stream(rates, frame_s=0.01, seed=4, batch=batch)), whole)
+    assert len(expected) > 1000
+    assert same(Events.concatenate(pixels.stream(rates, frame_s=0.01, seed=4, batch=batch)), expected)
 
 
-def test_each_site_may_have_its_own_threshold():
+def test_threshold_may_differ_per_site():
     sensor = sensor_of(3, shot_noise="off")
     spikes = SpikingPixels(sensor, threshold_e=np.array([10.0, 20.0, 40.0])).events([[401.0] * 3], frame_s=1.0, seed=0)
 
     assert spikes.counts().tolist() == [40, 20, 10]
 
 
-def test_events_beyond_the_most_are_not_counted_on(monkeypatch):
-    """A site that would count for hours, and pieces that hold too many only together."""
+def test_too_many_events_stop_early(monkeypatch):
+    """Test a site that would take hours to count, and pieces that exceed the limit only in total."""
     monkeypatch.setattr(sys.modules[EventPixels.__module__], "MAX_EVENTS", 1000)
     endless = pixels_of(1, noise_per_s=1e9)
-    with pytest.raises(SimulationError, match=r"more than 1,000 events of 1 frames do not fit the memory"):
+    with pytest.raises(SimulationError, match=r"more than 1,000 events in 1 frames do not fit in memory"):
         endless.events([[1e-3]] * 2, frame_s=1.0, seed=0)
     monkeypatch.setattr(sys.modules[EventPixels.__module__], "PIECE_SITES", 10)
     pixels = pixels_of(50, noise_per_s=30.0)
@@ -415,12 +415,12 @@ def test_events_beyond_the_most_are_not_counted_on(monkeypatch):
             pixels.events([[1e-3] * 50] * 2, frame_s=1.0, seed=0, n_threads=n_threads)
 
 
-def test_more_spikes_than_memory_are_told():
-    with pytest.raises(SimulationError, match="do not fit the memory"):
+def test_too_many_spikes_are_rejected():
+    with pytest.raises(SimulationError, match="do not fit in memory"):
         SpikingPixels(sensor_of(1), threshold_e=1.0).events([[1e12]], frame_s=1.0, seed=0)
 
 
-# -- what both reject -------------------------------------------------------------------------------------------------
+# -- invalid arguments -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -451,7 +451,7 @@ def test_more_spikes_than_memory_are_told():
         (SpikingPixels, {"refractory_s": 1e300}),
     ],
 )
-def test_parameters_out_of_range_are_told(kind, change):
+def test_parameters_out_of_range_are_rejected(kind, change):
     with pytest.raises(ParameterError, match=next(iter(change))):
         kind(sensor_of(3), **change)
     with pytest.raises(ParameterError, match="sensor"):
@@ -459,7 +459,7 @@ def test_parameters_out_of_range_are_told(kind, change):
 
 
 @pytest.mark.parametrize("kind", [EventPixels, SpikingPixels])
-def test_wrong_calls_are_told_at_once_and_wrong_frames_when_they_come(kind):
+def test_invalid_stream_arguments_are_rejected(kind):
     pixels = kind(sensor_of(3))
     for wrong in ({"frame_s": 0.0}, {"seed": -1}, {"batch": 0}):
         with pytest.raises(ParameterError, match=next(iter(wrong))):
@@ -468,7 +468,7 @@ def test_wrong_calls_are_told_at_once_and_wrong_frames_when_they_come(kind):
         with pytest.raises(ParameterError, match="rates"):
             pixels.events([frame], frame_s=0.1, seed=0)
     for rates in (None, 3.0):
-        with pytest.raises(ParameterError, match=r"'rates' must be frames of one rate a site each"):
+        with pytest.raises(ParameterError, match=r"'rates' must be an iterable of frames"):
             pixels.stream(rates, frame_s=0.1, seed=0)
     assert len(pixels.events([], frame_s=0.1, seed=0)) == 0
 
@@ -482,7 +482,7 @@ def some_events():
     return pixels.events(walk(30, 24), frame_s=0.01, seed=1)
 
 
-def test_events_come_back_from_npz_to_the_last_bit(tmp_path):
+def test_npz_round_trip_is_exact(tmp_path):
     events = some_events()
     events.save(tmp_path / "e.npz")
     read = Events.load(tmp_path / "e.npz")
@@ -492,7 +492,7 @@ def test_events_come_back_from_npz_to_the_last_bit(tmp_path):
     assert np.array_equal(read.layout.columns["readout_order"], np.arange(24))
 
 
-def test_hdf5_has_the_arrays_of_event_tools(tmp_path):
+def test_hdf5_contains_arrays_of_event_tools(tmp_path):
     h5py = pytest.importorskip("h5py")
     events = some_events()
     events.save(tmp_path / "e.h5")
@@ -503,7 +503,7 @@ def test_hdf5_has_the_arrays_of_event_tools(tmp_path):
         assert np.array_equal(file["events/site"][:], events.site)
     centroid_um = events.layout.centroid_um[events.site]
     assert np.array_equal(t_us, np.floor(events.t_s * 1e6))
-    # Sites of a grid are its columns and rows, the top row first.
+    # Addresses of grid sites are columns and rows, top row first.
     assert np.array_equal(x, np.rint((centroid_um[:, 0] + 10.0) / 4.0))
     assert np.array_equal(y, np.rint((6.0 - centroid_um[:, 1]) / 4.0))
     assert set(p) == {0, 1}
@@ -512,16 +512,16 @@ def test_hdf5_has_the_arrays_of_event_tools(tmp_path):
         assert ms_to_idx[ms] == np.count_nonzero(t_us < 1000 * ms)
 
 
-def test_batches_make_the_same_hdf5_as_all_events_at_once(tmp_path):
+def test_hdf5_is_independent_of_batches(tmp_path):
     h5py = pytest.importorskip("h5py")
     layout = fs.layout.grid(n_x=6, n_y=4, pitch_um=4.0)
     pixels = EventPixels(fs.Sensor(layout), noise_per_s=40.0)
-    # In the middle no event for 100 ms.
+    # Constant rates for 100 ms in between.
     rates = np.concatenate((walk(30, 24), np.repeat(walk(30, 24)[-1:], 10, axis=0), walk(20, 24)))
-    whole = pixels.events(rates, frame_s=0.01, seed=1)
-    whole.save(tmp_path / "whole.h5")
+    expected = pixels.events(rates, frame_s=0.01, seed=1)
+    expected.save(tmp_path / "single.h5")
 
-    assert write_events(pixels.stream(rates, frame_s=0.01, seed=1, batch=3), tmp_path / "batches.h5") == len(whole)
+    assert write_events(pixels.stream(rates, frame_s=0.01, seed=1, batch=3), tmp_path / "batches.h5") == len(expected)
     names = [
         "events/t",
         "events/x",
@@ -533,16 +533,16 @@ def test_batches_make_the_same_hdf5_as_all_events_at_once(tmp_path):
         "sites/x_um",
         "sites/area_um2",
     ]
-    with h5py.File(tmp_path / "whole.h5") as a, h5py.File(tmp_path / "batches.h5") as b:
+    with h5py.File(tmp_path / "single.h5") as a, h5py.File(tmp_path / "batches.h5") as b:
         for name in names:
             assert np.array_equal(a[name][()], b[name][()])
             assert a[name].dtype == b[name].dtype
 
 
-def test_hdf5_of_no_events_or_of_batches_that_do_not_follow_each_other(tmp_path):
+def test_hdf5_rejects_unordered_or_missing_batches(tmp_path):
     h5py = pytest.importorskip("h5py")
     events = some_events()
-    with pytest.raises(ParameterError, match="follow each other"):
+    with pytest.raises(ParameterError, match="must be consecutive in time"):
         write_events([events, events], tmp_path / "e.h5")
     with pytest.raises(ParameterError, match="at least one batch"):
         write_events([], tmp_path / "e.h5")
@@ -554,7 +554,7 @@ def test_hdf5_of_no_events_or_of_batches_that_do_not_follow_each_other(tmp_path)
         assert file["ms_to_idx"][:].tolist() == [0]
 
 
-def test_hdf5_comes_back_to_the_microsecond(tmp_path):
+def test_hdf5_round_trip_rounds_to_microseconds(tmp_path):
     pytest.importorskip("h5py")
     events = some_events()
     events = Events(
@@ -578,90 +578,90 @@ def test_hdf5_comes_back_to_the_microsecond(tmp_path):
     assert same(Events.load(tmp_path / "again.h5"), read)
 
 
-def broken_hdf5(path, how):
+def write_corrupt_hdf5(path, defect):
     h5py = pytest.importorskip("h5py")
     some_events().save(path)
-    if how == "cut":
+    if defect == "truncated":
         path.write_bytes(path.read_bytes()[:3000])
         return
     with h5py.File(path, "a") as file:
-        if how == "stranger":
+        if defect == "other format":
             del file.attrs["format"]
-        elif how == "version":
+        elif defect == "version":
             file.attrs["version"] = 7
-        elif how == "link":
+        elif defect == "link":
             del file["events/t"]
             file["events/t"] = h5py.ExternalLink("other.h5", "/t")
-        elif how == "external":
+        elif defect == "external":
             del file["events/t"]
             file.create_dataset("events/t", (8,), "i8", external=[("/etc/passwd", 0, 64)])
-        elif how == "text":
+        elif defect == "text":
             del file["events/t"]
             file["events/t"] = "now"
-        elif how == "order":
+        elif defect == "order":
             file["events/t"][0] = 10**9
-        elif how == "site":
+        elif defect == "site":
             file["events/site"][3] = 24
-        elif how == "group":
+        elif defect == "group":
             del file["layout"]
-        elif how == "large":
+        elif defect == "large":
             del file["events/p"]
             file.create_dataset("events/p", (10**11,), "u1", chunks=(10**6,), compression="gzip")
 
 
 @pytest.mark.parametrize(
-    ("how", "told"),
+    ("defect", "message"),
     [
-        ("cut", "is broken"),
-        ("stranger", "holds no events of foveasim; make them with Events.from_addresses"),
+        ("truncated", "is corrupt"),
+        ("other format", "does not contain events of foveasim; create them with Events.from_addresses"),
         ("version", "has the format version 7, expected 2"),
-        ("link", "has no numbers 'events/t' of its own"),
-        ("external", "has no numbers 'events/t' of its own"),
-        ("text", "has no numbers 'events/t' of its own"),
-        ("order", "e.h5: 't_s' must be finite, at least 0, and rising"),
+        ("link", "must contain the numbers 'events/t', not a link"),
+        ("external", "must contain the numbers 'events/t', not a link or external data"),
+        ("text", "must contain the numbers 'events/t'"),
+        ("order", "e.h5: 't_s' must be finite, at least 0, and ascending"),
         ("site", "e.h5: 'site' must be from 0 to 23"),
-        ("group", "has no group 'layout' of its own"),
-        ("large", "would unpack to more than a file of its size holds"),
+        ("group", "must contain the group 'layout'"),
+        ("large", "would decompress to more than a file of its size can contain"),
     ],
 )
-def test_hdf5_of_strangers_is_told_in_one_sentence(tmp_path, how, told):
-    broken_hdf5(tmp_path / "e.h5", how)
-    with pytest.raises(FileError, match=told):
+def test_malformed_hdf5_is_rejected(tmp_path, defect, message):
+    write_corrupt_hdf5(tmp_path / "e.h5", defect)
+    with pytest.raises(FileError, match=message):
         Events.load(tmp_path / "e.h5")
 
 
-def test_hdf5_has_no_table_of_a_clock_that_began_long_ago(tmp_path):
+def test_hdf5_rejects_times_since_epoch(tmp_path):
     pytest.importorskip("h5py")
     layout = fs.layout.grid(n_x=2, n_y=1, pitch_um=4.0)
-    with pytest.raises(ParameterError, match=r"must end before 100,000 s.*take off what the clock showed"):
+    with pytest.raises(ParameterError, match=r"must end before 100,000 s.*subtract the start time"):
         Events([1e9], [0], [1], layout).save(tmp_path / "e.h5")
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("join", [Events.concatenate, lambda parts: write_events(parts, "nowhere/e.h5")])
-def test_batches_of_several_layouts_or_no_batches_are_told(join, tmp_path, monkeypatch):
+@pytest.mark.parametrize("join", [Events.concatenate, lambda parts: write_events(parts, "out/e.h5")])
+def test_mismatched_or_missing_batches_are_rejected(join, tmp_path, monkeypatch):
     pytest.importorskip("h5py")
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "nowhere").mkdir()
+    (tmp_path / "out").mkdir()
     layout, other = (fs.layout.grid(n_x=2, n_y=1, pitch_um=pitch) for pitch in (4.0, 5.0))
     one = Events([1.0], [0], [1], layout)
-    for parts, told in (
-        ([one, Events([2.0], [0], [1], other)], "must be of one layout"),
-        ([one, Events([0.5], [0], [1], layout)], "must follow each other"),
-        (one, "got a Events; put it into a list"),
+    for parts, message in (
+        ([one, Events([2.0], [0], [1], other)], "must have the same layout"),
+        ([one, Events([0.5], [0], [1], layout)], "must be consecutive in time"),
+        (one, "got a Events; pass a list of batches"),
         (None, "got a NoneType"),
         ([one, 3], "must be Events, got a int"),
         ([], "at least one batch"),
     ):
-        with pytest.raises(ParameterError, match=told):
+        with pytest.raises(ParameterError, match=message):
             join(parts)
-    assert list((tmp_path / "nowhere").iterdir()) == []
-    # A layout that came from a file is the same one.
+    assert list((tmp_path / "out").iterdir()) == []
+    # Equal layouts need not be identical objects.
     again = fs.layout.grid(n_x=2, n_y=1, pitch_um=4.0)
     join([one, Events([1.0], [1], [1], again)])
 
 
-def test_arrays_for_event_tools(tmp_path):
+def test_structured_array_matches_events(tmp_path):
     events = some_events()
     x, y = events.addresses()
     found = events.structured()
@@ -680,30 +680,30 @@ def test_arrays_for_event_tools(tmp_path):
     assert np.array_equal(p, found["p"])
 
 
-def test_arrays_for_event_tools_without_numbers_for_it_are_told():
+def test_structured_array_out_of_range_is_rejected():
     layout = fs.layout.grid(n_x=40_000, n_y=1, pitch_um=1.0)
-    with pytest.raises(ParameterError, match="more than 32768 columns or rows"):
+    with pytest.raises(ParameterError, match="at most 32768 columns and rows"):
         Events([1.0], [0], [1], layout).structured()
     with pytest.raises(ParameterError, match="'t_s' must be at most"):
         Events([1e12], [0], [1], fs.layout.grid(n_x=2, n_y=1, pitch_um=1.0)).structured()
 
 
-def test_recordings_with_addresses_are_events_of_a_layout():
+def test_events_from_addresses_match_layout():
     events = some_events()
     found = events.structured()
     read = Events.from_addresses(events.t_s, found["x"], found["y"], 2 * found["p"] - 1, events.layout)
 
     assert same(read, events)
-    # Row 0 is on top.
+    # Row 0 is the top row.
     layout = fs.layout.grid(n_x=3, n_y=2, pitch_um=4.0)
     (site,) = Events.from_addresses([0.1], [2], [0], [1], layout).site
     assert layout.centroid_um[site].tolist() == [4.0, 2.0]
-    for x, y, told in (
+    for x, y, message in (
         ([3], [0], "got 0 at"),
-        ([0.5], [0], "'x' must be one whole"),
+        ([0.5], [0], "'x' must be one integer per event"),
         ([0], [-1], "'y' must be from 0"),
     ):
-        with pytest.raises(ParameterError, match=told):
+        with pytest.raises(ParameterError, match=message):
             Events.from_addresses([0.1], x, y, [1], layout)
 
 
@@ -718,12 +718,12 @@ LATTICES = {
 
 
 @pytest.mark.parametrize("name", LATTICES)
-def test_sites_of_a_lattice_are_addressed_by_their_columns_and_rows(name):
+def test_lattice_addresses_are_columns_and_rows(name):
     layout = LATTICES[name]()
     order = np.random.default_rng(0).permutation(80)
     for sites, upwards in ((np.arange(80), 1.0), (order, 1.0), (order[:40], 1.0), (np.arange(80), -1.0)):
         part = layout[sites]
-        if upwards < 0:  # upside down: the lowest row is on top
+        if upwards < 0:  # flipped: the lowest row becomes the top row
             part = Layout(part.xy_um * [1.0, -1.0], part.ring_offsets, part.site_offsets, part.columns)
         x, y = Events([], [], [], part).addresses()
         row = sites // 10
@@ -732,7 +732,7 @@ def test_sites_of_a_lattice_are_addressed_by_their_columns_and_rows(name):
 
 
 @pytest.mark.parametrize("name", LATTICES)
-def test_without_columns_no_two_sites_share_an_address(name):
+def test_addresses_without_columns_are_unique(name):
     layout = LATTICES[name]()
     layout = Layout(layout.xy_um, layout.ring_offsets, layout.site_offsets)
     x, y = Events([], [], [], layout).addresses()
@@ -742,7 +742,7 @@ def test_without_columns_no_two_sites_share_an_address(name):
         assert (x.max(), y.max()) == (9, 7)
 
 
-def test_every_site_of_rings_has_its_own_address_and_picture_order():
+def test_ring_addresses_are_unique_and_ordered():
     layout = fs.layout.log_polar(n_sectors=64, min_size_um=4.0, r_max_um=150.0)
     x, y = Events([], [], [], layout).addresses()
 
@@ -751,15 +751,15 @@ def test_every_site_of_rings_has_its_own_address_and_picture_order():
     assert np.corrcoef(y, layout.centroid_um[:, 1])[0, 1] < -0.999
 
 
-def test_shared_addresses_are_told():
+def test_duplicate_addresses_give_warning():
     layout = fs.layout.grid(n_x=10, n_y=8, pitch_um=4.0)
     events = Events([], [], [], layout)
-    with pytest.warns(FoveasimWarning, match="80 sites have 1 addresses on the raster, so that some share theirs"):
+    with pytest.warns(FoveasimWarning, match="80 sites have only 1 addresses on the raster"):
         events.addresses(100.0)
     assert [a.size for a in Events([], [], [], layout[:0]).addresses()] == [0, 0]
 
 
-def test_counts_in_spans_of_time_are_those_of_the_spans(monkeypatch):
+def test_histogram_matches_counts_of_intervals(monkeypatch):
     events = some_events()
     monkeypatch.setattr(sys.modules[Events.__module__], "MAX_COUNTS", 100 * 24)
     edges_s = np.array([0.01, 0.02, 0.05, 0.25, 9.0])
@@ -779,39 +779,39 @@ def test_counts_in_spans_of_time_are_those_of_the_spans(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("t_s", "site", "polarity", "told"),
+    ("t_s", "site", "polarity", "message"),
     [
         ([math.nan], [0], [1], "t_s"),
         ([math.inf], [0], [1], "t_s"),
         ([1.0, math.nan, 2.0], [0, 0, 0], [1, 1, 1], "t_s"),
-        ([-1.0], [0], [1], "'t_s' must be finite, at least 0, and rising"),
-        ([2.0, 1.0], [0, 0], [1, 1], "sort events by time"),
+        ([-1.0], [0], [1], "'t_s' must be finite, at least 0, and ascending"),
+        ([2.0, 1.0], [0, 0], [1, 1], "sort the events by time"),
         ([1.0], [7], [1], "'site' must be from 0 to 2, the sites of the layout, got 7"),
         ([1.0], [-1], [1], "site"),
         ([1.0], [2**33], [1], "got 8589934592"),
         ([1.0], [0.0], [1], "'site' must be integers"),
-        ([1.0], [0], [0], "'polarity' must be 1 or -1, got 0; of 0 and 1 make 2"),
+        ([1.0], [0], [0], "'polarity' must be 1 or -1, got 0; convert 0 and 1"),
         ([1.0], [0], [257], "polarity"),
         ([1.0], [0, 1], [1], "'site' must be one number for each of 1 times"),
         ([[1.0]], [0], [1], "t_s"),
     ],
 )
-def test_events_that_cannot_be_are_told(t_s, site, polarity, told, tmp_path):
+def test_invalid_events_are_rejected(t_s, site, polarity, message, tmp_path):
     layout = fs.layout.grid(n_x=3, n_y=1, pitch_um=4.0)
-    with pytest.raises(ParameterError, match=told):
+    with pytest.raises(ParameterError, match=message):
         Events(t_s, site, polarity, layout)
     with pytest.raises(ParameterError, match="layout"):
         Events([1.0], [0], [1], None)
-    # Nor from a file.
+    # The same from a file.
     Events([1.0], [0], [1], layout).save(tmp_path / "e.npz")
     with np.load(tmp_path / "e.npz") as file:
         arrays = dict(file) | {"t_s": np.array(t_s), "site": np.array(site), "polarity": np.array(polarity)}
     np.savez(tmp_path / "e.npz", **arrays)
-    with pytest.raises(FileError, match=f"e.npz: .*{told}"):
+    with pytest.raises(FileError, match=f"e.npz: .*{message}"):
         Events.load(tmp_path / "e.npz")
 
 
-def test_events_are_theirs_alone():
+def test_events_copy_writeable_arrays():
     t_s, site, polarity = np.array([1.0, 2.0]), np.array([0, 1], np.int32), np.array([1, -1], np.int8)
     window = t_s[:]
     window.flags.writeable = False
@@ -822,17 +822,17 @@ def test_events_are_theirs_alone():
     assert one.t_s.tolist() == other.t_s.tolist() == [1.0, 2.0]
     assert not one.t_s.flags.writeable
     assert t_s.flags.writeable
-    # What nobody can write to is not copied.
+    # Read-only arrays are not copied.
     assert np.shares_memory(one.between(0.0, 1.5).t_s, one.t_s)
 
 
-def test_a_missing_hdf5_library_is_told(tmp_path, monkeypatch):
+def test_missing_hdf5_library_is_reported(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(FileError, match=r"pip install 'foveasim\[video\]'"):
         some_events().save(tmp_path / "e.h5")
 
 
-def test_parts_in_time_are_whole_and_disjoint():
+def test_intervals_partition_events():
     events = some_events()
     parts = [events.between(a, b) for a, b in itertools.pairwise([-1.0, 0.05, 0.1, 9.0])]
 
@@ -840,20 +840,20 @@ def test_parts_in_time_are_whole_and_disjoint():
     assert np.array_equal(events.counts(polarity=1) + events.counts(polarity=-1), events.counts())
 
 
-def test_events_that_would_unpack_to_too_much_are_refused(tmp_path, monkeypatch):
+def test_oversized_npz_is_rejected(tmp_path, monkeypatch):
     some_events().save(tmp_path / "e.npz")
     monkeypatch.setattr("foveasim._io.npz.MAX_UNPACKED_BYTES", 1000)
-    with pytest.raises(FileError, match="would unpack to more"):
+    with pytest.raises(FileError, match="would decompress to more"):
         Events.load(tmp_path / "e.npz")
 
 
-def test_files_that_hold_no_events_are_told(tmp_path):
+def test_files_without_events_are_rejected(tmp_path):
     with pytest.raises(FileError, match="must end in"):
         some_events().save(tmp_path / "e.mat")
     with pytest.raises(FileError, match="no such file"):
         Events.load(tmp_path / "none.npz")
     (tmp_path / "bad.npz").write_bytes(b"no zip")
-    with pytest.raises(FileError, match="is corrupt, or no file of events"):
+    with pytest.raises(FileError, match="is corrupt or not a valid event file"):
         Events.load(tmp_path / "bad.npz")
     with pytest.raises(ParameterError, match="pitch_um"):
         some_events().addresses(1e-6)
