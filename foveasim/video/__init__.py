@@ -1,5 +1,5 @@
 """
-Videos: frames of light from pictures, files and moving gazes; captures as zarr folders, pictures and video files.
+Videos: scenes from pictures and gaze paths; recordings of captures and video files.
 
 ::
 

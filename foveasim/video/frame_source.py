@@ -1,4 +1,4 @@
-"""Frame sources: pictures in a row, from memory, a directory or a video file, as scenes."""
+"""Frame sources: scenes from sequences of pictures in memory, directories and video files."""
 
 from __future__ import annotations
 
@@ -22,40 +22,41 @@ from foveasim.scene import Scene
 
 __all__ = ["FrameSource", "pictures_in"]
 
-#: Any wavelengths: they are left off again.
+#: Placeholder wavelengths, which the spectra of the template replace.
 GREY_NM, COLOUR_NM = (550.0,), (620.0, 550.0, 450.0)
-#: More frames than anyone has.
+#: Upper limit of frame indices.
 MAX_FRAMES = 2**31
 NEEDS_PYAV = needs("av")
 
 
 class FrameSource:
     """
-    Frames of light from pictures; iterating gives a Scene for each, read when it is asked for.
+    Iterable of scenes from a sequence of pictures, read lazily.
 
     Parameters
     ----------
     source : path, or iterable of paths or arrays
-        A folder of pictures, in the natural order of their names (``frame 2`` before ``frame 10``); a video file, with the
-        extra ``video``; or the pictures themselves, as :meth:`foveasim.Scene.from_picture` takes them. An iterator gives
-        them once, and the footage can be iterated once then.
+        A directory of pictures, in the natural order of their names (``frame 2`` before ``frame 10``); a video file, with the
+        extra ``video``; or pictures as :meth:`foveasim.Scene.from_picture` accepts them. If the source is an iterator, the
+        frames can be iterated only once.
     start, stop, step : int
-        Which of the frames: as of a slice.
+        Selection of frames, as in a slice.
     frame_s : float, optional, s
-        From one frame to the next; by default what the video file says.
+        Frame period; by default that of the video file.
     template : Scene, optional
-        A scene whose pitch, distance and spectra the frames have, with the pictures in place of its own: colours are made grey
-        for a scene of one basis image, and grey is made colour for one of three.
+        Scene that specifies pitch, distance and spectra of the frames; the pictures replace its basis images. Colours are
+        converted to grey for a template with one basis image, and grey to colour for a template with three.
     **scene
-        Of :meth:`foveasim.Scene.from_picture`: ``pitch_um``, ``distance_m``, ``peak_radiance_w_m2_sr_nm``, and others; beside
-        ``template`` the ``encoding`` alone.
+        Parameters of :meth:`foveasim.Scene.from_picture`: ``pitch_um``, ``distance_m``, ``peak_radiance_w_m2_sr_nm``, and
+        others; with ``template`` only ``encoding``.
 
     Raises
     ------
     FileError
-        When there is no such file, a folder holds no pictures, or, as frames are read, one is broken or of another size.
+        When the file is missing or a directory contains no pictures; during iteration when a frame is corrupt or of another
+        size.
     ParameterError
-        When a value is out of range, a setting of the scene is missing or unknown, or there is no frame at all.
+        When a value is out of range, a parameter of the scene is missing or unknown, or there are no frames.
 
     Examples
     --------
@@ -82,12 +83,10 @@ class FrameSource:
         if template is not None and not isinstance(template, Scene):
             raise ParameterError("template", f"must be a Scene, got a {type(template).__name__}")
         if template is not None and template.basis.shape[0] not in (1, 3):
-            raise ParameterError(
-                "template", f"must have 1 or 3 basis images, as pictures have, got {template.basis.shape[0]}"
-            )
+            raise ParameterError("template", f"must have 1 or 3 basis images, got {template.basis.shape[0]}")
         if template is not None and set(scene) - {"encoding"}:
             raise ParameterError(
-                min(set(scene) - {"encoding"}), "is that of the scene 'template', and cannot be given beside it"
+                min(set(scene) - {"encoding"}), "must not be given with 'template', which specifies it"
             )
         if template is None:
             _check_settings(scene)
@@ -108,17 +107,18 @@ class FrameSource:
                 self._source = _VideoFile(path)
                 self._n_source, told_s = self._source.n_frames, self._source.frame_s
             else:
-                raise FileError(path, "no such file or folder")
+                raise FileError(path, "no such file or directory")
         elif isinstance(source, Iterable):
             self._source = _Once(source) if isinstance(source, Iterator) else source
             self._n_source = len(source) if isinstance(source, Sized) else None
         else:
-            raise ParameterError("source", f"must be a path, or pictures, got a {type(source).__name__}")
+            raise ParameterError("source", f"must be a path or an iterable of pictures, got a {type(source).__name__}")
         if frame_s is not None:
             told_s = check_number("frame_s", frame_s, above=0.0)
         self._frame_s = None if told_s is None else told_s * (self._step if frame_s is None else 1)
         self._may_be_empty = False
-        if self._n_source is not None and not isinstance(self._source, _VideoFile):  # whose number is an estimate
+        # The frame count of video files is an estimate.
+        if self._n_source is not None and not isinstance(self._source, _VideoFile):
             self._check_some(self.n_frames)
 
     def __repr__(self) -> str:
@@ -126,12 +126,12 @@ class FrameSource:
 
     @property
     def frame_s(self) -> float | None:
-        """Seconds from one frame to the next; None where nobody said."""
+        """Frame period in seconds; None if unknown."""
         return self._frame_s
 
     @property
     def n_frames(self) -> int | None:
-        """How many frames there are; None where that is not known before the last."""
+        """Number of frames; None if unknown before the last frame has been read."""
         if self._n_source is None:
             return None
         return len(
@@ -140,11 +140,12 @@ class FrameSource:
 
     def from_frame(self, n: int) -> FrameSource:
         """
-        The same frames without the first ``n``, which are passed over and not made into scenes.
+        Return a source without the first ``n`` frames, which are not converted to scenes.
 
         Parameters
         ----------
         n : int
+            Number of frames to skip.
 
         Returns
         -------
@@ -153,31 +154,32 @@ class FrameSource:
         Raises
         ------
         ParameterError
-            When ``n`` is negative or not whole.
+            When ``n`` is negative or not an integer.
         """
         rest = copy.copy(self)
-        rest._start += check_count("n", n, at_least=0, at_most=MAX_FRAMES) * self._step  # noqa: SLF001 -- its own
+        rest._start += check_count("n", n, at_least=0, at_most=MAX_FRAMES) * self._step  # noqa: SLF001 -- same class
         rest._may_be_empty = True  # noqa: SLF001
         return rest
 
     def _check_some(self, n_frames: int | None) -> None:
         if n_frames == 0 and not self._may_be_empty:
-            told = "any number of" if self._n_source is None else f"{self._n_source:,}"
-            until = "" if self._stop is None else f" to before {self._stop}"
-            raise ParameterError("source", f"has no frame from {self._start}{until}, of {told} pictures")
+            told = "an unknown number of" if self._n_source is None else f"{self._n_source:,}"
+            until = "" if self._stop is None else f" and below {self._stop}"
+            raise ParameterError("source", f"must have a frame from {self._start}{until}, got {told} pictures")
 
     def __iter__(self) -> Iterator[Scene]:
-        """Scenes, one after the other."""
+        """Iterate over the scenes."""
         shape: tuple[int, ...] | None = None
         pictures: Iterator[Any] = islice(iter(self._source), self._start, self._stop, self._step)
-        if isinstance(self._source, _VideoFile):  # frames that are passed over are decoded, and no more
+        if isinstance(self._source, _VideoFile):  # skipped frames are decoded but not converted to pixels
             pictures = _pixels(self._source.path, pictures)
         for k, picture in enumerate(pictures):
             scene = Scene.from_picture(picture, **self._scene) if self._template is None else self._made_like(picture)
             if shape is not None and scene.basis.shape != shape:
                 where = picture if isinstance(picture, str | Path) else f"frame {self._start + k * self._step}"
                 raise FileError(
-                    where, f"has the shape {scene.basis.shape}, and the frames before it {shape}: all must be alike"
+                    where,
+                    f"has the shape {scene.basis.shape}, but previous frames have {shape}; use frames of equal shape",
                 )
             shape = scene.basis.shape
             yield scene
@@ -192,7 +194,7 @@ class FrameSource:
             pitch_um=template.pitch_um,
             distance_m=template.distance_m,
             peak_radiance_w_m2_sr_nm=1.0,
-            # One wavelength makes colours grey. The spectra are those of the other scene.
+            # A single wavelength converts colours to grey. The template specifies the spectra.
             wavelength_nm=GREY_NM if n_basis == 1 else COLOUR_NM,
             band_width_nm=1.0,
             **self._scene,
@@ -202,29 +204,29 @@ class FrameSource:
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """The pictures of a folder, in the natural order of their names."""
+    """Return the paths of the pictures in a directory in natural order."""
     names = picture_names(path.name for path in folder.iterdir() if path.is_file())
     if not names:
-        raise FileError(folder, f"holds no pictures ({', '.join(PICTURE_ENDINGS)})")
+        raise FileError(folder, f"contains no pictures ({', '.join(PICTURE_ENDINGS)})")
     return [folder / name for name in names]
 
 
 def _check_settings(scene: dict[str, Any]) -> None:
-    """Reject settings that Scene.from_picture does not take, and lack those that it needs, before the first picture is read."""
+    """Reject unknown and missing parameters of Scene.from_picture before a picture is read."""
     parameters = list(inspect.signature(Scene.from_picture).parameters.values())[1:]
     names = [p.name for p in parameters]
     for name in scene:
         if name not in names:
-            raise ParameterError(name, f"is no setting of a scene from a picture; there are {', '.join(names)}")
+            raise ParameterError(name, f"is not a parameter of Scene.from_picture; available: {', '.join(names)}")
     for parameter in parameters:
         if parameter.default is parameter.empty and parameter.name not in scene:
             raise ParameterError(
-                parameter.name, "is missing: a scene from a picture needs it, or give a scene as 'template'"
+                parameter.name, "is missing; Scene.from_picture requires it unless 'template' is given"
             )
 
 
 class _Once:
-    """What an iterator gives, for who begins first."""
+    """Items of an iterator, which can be iterated only once."""
 
     def __init__(self, pictures: Iterator[Any]) -> None:
         self._pictures: Iterator[Any] | None = pictures
@@ -232,14 +234,14 @@ class _Once:
     def __iter__(self) -> Iterator[Any]:
         if self._pictures is None:
             raise ParameterError(
-                "source", "was an iterator, whose pictures are gone after the first time", hint="give a list of them"
+                "source", "was an iterator and has been consumed by the first iteration", hint="pass a list of pictures"
             )
         pictures, self._pictures = self._pictures, None
         return pictures
 
 
 class _VideoFile:
-    """Frames of a video file as the decoder gives them, which become (n_y, n_x, 3) uint8, first row on top."""
+    """Decoded frames of a video file, before conversion to pixels."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -264,11 +266,15 @@ class _VideoFile:
                 yield frame
                 n_read += 1
             if n_read == 0:
-                raise FileError(self.path, "holds no frames")
+                raise FileError(self.path, "contains no frames")
 
 
 def _pixels(path: Path, frames: Iterator[Any]) -> Iterator[NDArray[np.uint8]]:
-    """Decode frames to pixels; a size that a corrupt file claims is checked before memory is taken for it."""
+    """
+    Convert frames to pixels, (n_y, n_x, 3) uint8, top row first.
+
+    The size is checked before memory is allocated, because corrupt files may claim any size.
+    """
     for frame in frames:
         check_picture_size(path, frame.width, frame.height)
         with _readable(path, "is corrupt"):
@@ -281,23 +287,21 @@ def _opened(path: Path) -> Any:
         import av
     except ImportError:
         raise FileError(path, NEEDS_PYAV) from None
-    with _readable(path, "is no video file that can be read"):
-        # Titles and the like are not used: one that is corrupt does not matter.
+    with _readable(path, "is not a readable video file"):
+        # Metadata such as titles are not used and may be corrupt.
         container = av.open(str(path), metadata_errors="replace")
     if not container.streams.video:
         container.close()
-        raise FileError(path, "holds no pictures that move")
-    if (
-        container.streams.video[0].codec_context is None
-    ):  # some versions of PyAV crash where they are asked to decode it
+        raise FileError(path, "contains no video stream")
+    if container.streams.video[0].codec_context is None:  # some versions of PyAV crash on decoding
         container.close()
-        raise FileError(path, "holds pictures in a coding that is unknown here")
+        raise FileError(path, "has a video stream with an unsupported codec")
     return container
 
 
 @contextmanager
 def _readable(path: Path, problem: str) -> Iterator[None]:
-    """What the video library raises in the block, as a FileError: a corrupt file makes it raise anything."""
+    """Convert exceptions of the video library, which may be of any type, to FileErrors."""
     try:
         yield
     except FileError:

@@ -1,4 +1,4 @@
-"""Gazes that move: paths of saccades and drift, and frames of light seen along them."""
+"""Gaze paths of saccades and drift, and frames of scenes along a path."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from foveasim.scene import Scene
 
 __all__ = ["GazePath", "pan_camera", "saccades", "shift_sensor"]
 
-#: Shape of the law of fixations' durations (a gamma distribution): their standard deviation is half their mean.
+#: Shape of the gamma distribution of fixation durations: the standard deviation is half the mean.
 FIXATION_SHAPE = 4.0
-#: A shortest fixation, as a fraction of the mean.
+#: Shortest fixation as a fraction of the mean.
 SHORTEST_FIXATION = 0.2
-#: Longer paths are a slip of units.
+#: Upper limit of points; longer paths indicate wrong units.
 MAX_POINTS = 10**8
 
 
 @dataclass(frozen=True, eq=False)
 class GazePath:
     """
-    Where a gaze is when.
+    Gaze positions as a function of time.
 
     Parameters
     ----------
     t_s : (n,) float64, s
-        Rising.
+        Times in strictly ascending order.
     xy_um : (n, 2) float64, µm
-        Places on the sensor plane, in the image of the whole picture: what is there falls on the sensor's middle.
+        Gaze positions in the sensor plane, in the image of the complete picture: points that are imaged on the sensor centre.
 
     Raises
     ------
     ParameterError
-        When times do not rise, or there is not one place a time.
+        When times are not strictly ascending, or there is not one position per time.
     """
 
     t_s: Floats
@@ -50,14 +50,20 @@ class GazePath:
     def __post_init__(self) -> None:
         t_s, xy_um = finite_array("t_s", self.t_s, ndim=1), finite_array("xy_um", self.xy_um, ndim=2)
         if t_s.size == 0 or np.any(np.diff(t_s) <= 0.0):
-            raise ParameterError("t_s", "must be one or more times, each later than the one before", t_s, "s")
+            raise ParameterError("t_s", "must be one or more times in strictly ascending order", t_s, "s")
         if xy_um.shape != (t_s.size, 2):
-            raise ParameterError("xy_um", f"must have the shape ({t_s.size}, 2), one place a time, got {xy_um.shape}")
+            raise ParameterError(
+                "xy_um", f"must have the shape ({t_s.size}, 2), one position per time, got {xy_um.shape}"
+            )
         object.__setattr__(self, "t_s", read_only(t_s.copy()))
         object.__setattr__(self, "xy_um", read_only(xy_um.copy()))
 
     def at(self, t_s: ArrayLike) -> Floats:
-        """Places at some times, (..., 2) µm: straight lines between the path's, and its ends beyond them."""
+        """
+        Return the positions at given times, (..., 2) µm, by linear interpolation.
+
+        Before the first and after the last point the position is constant.
+        """
         times_s = finite_array("t_s", t_s)
         return np.stack([np.interp(times_s, self.t_s, self.xy_um[:, axis]) for axis in (0, 1)], axis=-1)
 
@@ -73,27 +79,28 @@ def saccades(
     drift_um_per_root_s: float = 0.0,
 ) -> GazePath:
     """
-    A gaze that jumps from place to place, and drifts while it rests.
+    Generate a random gaze path of saccades, and fixations with drift.
 
     Parameters
     ----------
     duration_s, frame_s : float, s
-        How long it lasts, and from one point of the path to the next.
+        Duration of the path, and time step between its points.
     size_um : (width, height), µm
-        Rectangle about the axis that all its targets lie in, each place as likely as the other; it begins on the axis.
+        Size of the rectangle about the axis in which the targets are uniformly distributed; the path begins on the axis.
     seed : int
+        Seed of the path.
     fixation_s : float, s
-        Mean duration of a rest: gamma distribution with a standard deviation of half of it.
+        Mean duration of a fixation: gamma distribution with a standard deviation of half the mean.
     saccade_s : float, s
-        Duration of a jump, which is the smoothest one (least jerk): ``10 u³ - 15 u⁴ + 6 u⁵``.
+        Duration of a saccade, a minimum-jerk movement ``10 u³ - 15 u⁴ + 6 u⁵``.
     drift_um_per_root_s : float, µm / sqrt(s)
-        Standard deviation, along either axis, of the drift of a rest after one second: a random walk that begins again
-        with each rest.
+        Standard deviation of the drift along either axis one second after the start of a fixation: a random walk that restarts
+        with each fixation.
 
     Returns
     -------
     GazePath
-        With ``round(duration_s / frame_s)`` points, the first at 0 s.
+        Path of ``round(duration_s / frame_s)`` points, the first at 0 s.
 
     Raises
     ------
@@ -140,15 +147,17 @@ def saccades(
 
 def shift_sensor(light: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Scene | PowerMap, tuple[float, float]]]:
     """
-    Frames of a still light that a sensor is moved over, for :meth:`foveasim.Camera.video`.
+    Yield frames of a static scene for a sensor that moves behind a fixed lens.
 
-    The lens stays, and with it falloff and aberrations: the sensor moves behind it. So the image is computed once, and each
-    frame is its integral over the moved outlines, exact for any shift.
+    The frames are for :meth:`foveasim.Camera.video`. Relative illumination and aberrations do not move with the sensor. The
+    image is computed once, and each frame is its integral over the shifted outlines, exact for any shift.
 
     Parameters
     ----------
     light : Scene or PowerMap
+        Static scene or power map.
     path : GazePath
+        Positions of the sensor.
 
     Yields
     ------
@@ -157,7 +166,7 @@ def shift_sensor(light: Scene | PowerMap, path: GazePath) -> Iterator[tuple[Scen
     Raises
     ------
     ParameterError
-        When an argument is none of these.
+        When an argument is of another class.
     """
     _check_kinds(("light", light, (Scene, PowerMap)), ("path", path, (GazePath,)))
     return ((light, (float(x_um), float(y_um))) for x_um, y_um in path.xy_um)
@@ -167,20 +176,22 @@ def pan_camera(
     scene: Scene, path: GazePath, optics: Optics, *, shape: tuple[int, int]
 ) -> Iterator[tuple[Scene, tuple[float, float]]]:
     """
-    Frames of a large picture that the whole camera moves before, for :meth:`foveasim.Camera.video`.
+    Yield frames of a large scene for a camera that moves in front of it.
 
-    Of the picture the part that the lens sees is cut out at whole pixels, and the rest of the shift, half a pixel at most,
-    moves the photosites: no picture is resampled. Falloff and aberrations are the lens's, about the gaze, to that half pixel.
+    The frames are for :meth:`foveasim.Camera.video`. The scene is cropped at integer pixel positions, and the remaining shift
+    of at most half a pixel moves the photosites, so that pictures are not resampled. Relative illumination and aberrations are
+    centred on the gaze to within this half pixel.
 
     Parameters
     ----------
     scene : Scene
-        The whole picture.
+        The complete scene.
     path : GazePath
-        On the sensor plane, as the lens images the whole picture.
+        Gaze positions in the sensor plane, in the image of the complete scene.
     optics : Optics
+        Lens of the camera.
     shape : (n_y, n_x)
-        Of the part that is cut out.
+        Shape of the cropped part in pixels.
 
     Yields
     ------
@@ -189,31 +200,32 @@ def pan_camera(
     Raises
     ------
     ParameterError
-        At once, when an argument is none of these, or the part larger than the picture; later, when it would reach beyond.
+        Immediately when an argument is of another class or the part is larger than the scene; during iteration when the part
+        extends beyond the scene.
     """
     _check_kinds(("scene", scene, (Scene,)), ("path", path, (GazePath,)), ("optics", optics, (Optics,)))
     n_y, n_x = check_shape("shape", shape)
     if n_y > scene.basis.shape[1] or n_x > scene.basis.shape[2]:
-        raise ParameterError("shape", f"must be within the picture's {scene.basis.shape[1:]}", (n_y, n_x))
+        raise ParameterError("shape", f"must not exceed the shape of the scene, {scene.basis.shape[1:]}", (n_y, n_x))
     return _parts(scene, path, optics.grid(scene).pitch_x_um, n_y, n_x)
 
 
 def _parts(
     scene: Scene, path: GazePath, cell_um: float, n_y: int, n_x: int
 ) -> Iterator[tuple[Scene, tuple[float, float]]]:
-    """The parts of a picture along a path."""
+    """Yield the cropped parts of a scene along a path, and the remaining shifts."""
     free_y, free_x = scene.basis.shape[1] - n_y, scene.basis.shape[2] - n_x
     before: tuple[int, int] | None = None
     part = scene
     for t_s, place_um in zip(path.t_s, path.xy_um, strict=True):
-        # The part's middle: half a pixel off where the numbers of free pixels are odd.
+        # The centre of the part is off by half a pixel if the number of free pixels is odd.
         left, bottom = (
             round(float(at_um) / cell_um + 0.5 * free) for at_um, free in zip(place_um, (free_x, free_y), strict=True)
         )
         if not (0 <= left <= free_x and 0 <= bottom <= free_y):
             raise ParameterError(
                 "path",
-                f"leaves the picture at {t_s:g} s: the part of {n_x} x {n_y} pixels may be moved by at most "
+                f"must stay within the scene, but leaves it at {t_s:g} s: a part of {n_x} x {n_y} pixels can move by at most "
                 f"({0.5 * free_x * cell_um:.4g}, {0.5 * free_y * cell_um:.4g}) µm",
                 tuple(float(at_um) for at_um in place_um),
                 "µm",
@@ -232,4 +244,4 @@ def _check_kinds(*arguments: tuple[str, object, tuple[type, ...]]) -> None:
     for name, value, kinds in arguments:
         if not isinstance(value, kinds):
             told = " or ".join(kind.__name__ for kind in kinds)
-            raise ParameterError(name, f"must be of the class {told}, got a {type(value).__name__}")
+            raise ParameterError(name, f"must be a {told}, got a {type(value).__name__}")

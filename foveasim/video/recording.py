@@ -1,4 +1,4 @@
-"""Videos of captures as zarr folders that hold every code: written frame by frame, gone on with after any end, and read."""
+"""Recordings: videos of all codes in zarr stores, written frame by frame and resumable."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ __all__ = [
 ]
 
 FORMAT, VERSION = "foveasim video", 1
-#: Codes that one chunk of a zarr folder holds, at least one frame of them: what is kept in memory while writing.
+#: Codes per chunk of a zarr store, but at least one frame; one chunk is in memory while writing.
 CHUNK_CODES = 1 << 22
-#: A recording that can be gone on with is written at least so often, whether a chunk is full or not: what a sudden end costs.
+#: Resumable recordings are written at this interval or earlier: upper limit of the loss after a crash.
 WRITE_S = 10.0
-#: What packs the numbers, as zarr does unless told otherwise; and a folder with more numbers beside the codes is rejected.
+#: Allowed codecs, the defaults of zarr; and size limit of the arrays other than the codes.
 CODECS = ("bytes", "zstd")
 MAX_UNPACKED_BYTES = 8 * 2**30
-#: Arrays of the layout, and those that grow frame by frame: the numbers come last, and tell which frames are whole.
+#: Arrays of the layout, and arrays that grow frame by frame: frame numbers are written last and mark complete frames.
 GEOMETRY, GROWING = ("xy_um", "ring_offsets", "site_offsets"), ("code", "exposure_s", "frame")
-#: Instead of a frame's number until the frame is whole.
+#: Fill value of frame numbers, for incomplete frames.
 NO_FRAME = -1
-#: What may differ between captures of one recording, whatever else does not.
+#: Settings that may always differ between captures of one recording.
 OWN_SETTINGS = frozenset({"exposure_s", "frame", "light.source", "place_um"})
-#: A file that is locked while a recording grows, and the ending of zarr's files that are not written to their end.
+#: File that is locked while a recording is written, and extension of incomplete files of zarr.
 LOCK, TORN = "lock", ".partial"
 
 
@@ -60,22 +60,28 @@ LOCK, TORN = "lock", ".partial"
 @dataclass(frozen=True, eq=False)
 class Recording:
     """
-    A video in a zarr folder.
+    A video of captures in a zarr store.
 
     Attributes
     ----------
     code : zarr array (n_frame, n_site) uint8 or uint16, DN
-        Read as it is indexed: ``code[k]`` is a frame, ``code[:, site]`` what a site saw.
+        Codes, read lazily: ``code[k]`` is a frame, ``code[:, site]`` the time series of a site.
     exposure_s : (n_frame,) float64, s
+        Exposure times.
     frame : (n_frame,) int64
-        Numbers of the frames, which their noise is of.
+        Frame numbers, which select the random streams of the noise.
     layout : Layout
+        Layout of the photosites.
     filter_names : tuple of str
+        Names of the colour filters.
     filter_of_site : (n_site,) int64
+        Index of the filter of each site.
     bits : int
+        Bit depth of the codes.
     white_dn : (n_filter,) float64, DN
+        White level per filter.
     settings : mapping
-        Of the first frame.
+        Settings of the first frame.
     """
 
     code: Any
@@ -99,17 +105,17 @@ class Recording:
 
 def read_recording(path: str | Path) -> Recording:
     """
-    Open a zarr folder that :func:`write_video` wrote; codes are read as they are asked for.
+    Open a zarr store that :func:`write_video` wrote; codes are read lazily.
 
     Raises
     ------
     FileError
-        When it is missing, broken, or no video of captures.
+        When the store is missing, corrupt, or not a video of captures.
     """
     source = Path(path)
     library(source, "zarr")
     if not source.is_dir():
-        raise FileError(source, "is not a folder" if source.exists() else "no such folder")
+        raise FileError(source, "is not a directory" if source.exists() else "no such directory")
     with _trusted(source) as group:
         about = group.attrs
         columns = {name: values[:] for name, values in group["columns"].arrays()}
@@ -129,33 +135,37 @@ def read_recording(path: str | Path) -> Recording:
 
 
 def partial_path(path: str | Path) -> Path:
-    """The folder beside a recording in which it grows: there after an end of the program, until the last frame is in."""
+    """
+    Return the path of the directory in which a resumable recording is written.
+
+    It is in the same directory as the recording, and exists until the last frame is written.
+    """
     target = Path(path)
     return target.with_name(target.name + ".partial")
 
 
 def count_recorded_frames(path: str | Path) -> int:
     """
-    How many frames of a recording are there, of one that was ended or one that is finished.
+    Return the number of frames of a finished or interrupted recording.
 
     Parameters
     ----------
     path : path
-        Of the recording, as :func:`write_video` was given it with ``resume``.
+        Path of the recording, as for :func:`write_video` with ``resume``.
 
     Returns
     -------
     n_frames : int
-        0 where nothing is there.
+        0 if there is no recording.
 
     Raises
     ------
     FileError
-        When something else is there, or it is broken.
+        When the path contains other data, or the recording is corrupt.
     """
     target = Path(path)
     if target.suffix.lower() != ZARR:
-        raise FileError(target, "is no .zarr folder, and others keep no frames")
+        raise FileError(target, "must end in .zarr; other formats cannot be resumed")
     library(target, "zarr")
     if target.exists():
         with _trusted(target) as group:
@@ -166,20 +176,20 @@ def count_recorded_frames(path: str | Path) -> int:
 
 @contextmanager
 def _trusted(source: Path, mode: str = "r") -> Iterator[Any]:
-    """The group of a recording; what its folder holds may be anything, and whatever that breaks is told in one sentence."""
+    """Open the group of an untrusted recording; exceptions of the block become FileErrors."""
     zarr = library(source, "zarr")
     with as_file_error(source, "video of captures", passes=(FileError,)):
         check_codecs(source, CODECS, "video of captures")
-        group = zarr.open_group(str(source), mode=mode, use_consolidated=False)  # which is not what was checked
+        group = zarr.open_group(str(source), mode=mode, use_consolidated=False)  # consolidated metadata are not checked
         if group.attrs.get("format") != FORMAT:
-            raise FileError(source, "is no video of captures")
+            raise FileError(source, "is not a video of captures")
         if group.attrs.get("version") != VERSION:
             raise FileError(source, f"has the format version {group.attrs.get('version')}, expected {VERSION}")
         names = (*GEOMETRY, "filter_of_site", "exposure_s", "frame")
         arrays = [group[name] for name in names if name in group]
         arrays += [array for _, array in group["columns"].arrays()] if "columns" in group else []
         if sum(array.nbytes for array in arrays) > MAX_UNPACKED_BYTES:
-            raise FileError(source, f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
+            raise FileError(source, f"would decompress to more than {MAX_UNPACKED_BYTES} bytes")
         yield group
 
 
@@ -187,7 +197,7 @@ def _is_recording(folder: Path) -> bool:
     zarr = library(folder, "zarr")
     try:
         return zarr.open_group(str(folder), mode="r", use_consolidated=False).attrs.get("format") == FORMAT
-    except Exception:  # noqa: BLE001 -- whatever else it is
+    except Exception:  # noqa: BLE001 -- other data may raise any exception
         return False
 
 
@@ -196,12 +206,12 @@ def _is_recording(folder: Path) -> bool:
 
 def alike(captures: Iterable[Capture], *, n_before: int = 0) -> Iterator[Capture]:
     """
-    The captures, as they come.
+    Yield the captures after checking that they have the same number of sites and bits.
 
     Raises
     ------
     ParameterError
-        When they are not all of one layout and as many bits, or none comes where none was before.
+        When captures differ, or there are neither captures nor ``n_before`` previous ones.
     """
     first: tuple[int, int] | None = None
     for capture in captures:
@@ -210,14 +220,14 @@ def alike(captures: Iterable[Capture], *, n_before: int = 0) -> Iterator[Capture
         kind = capture.layout.n_sites, capture.bits
         first = kind if first is None else first
         if kind != first:
-            raise ParameterError("captures", f"must be of the same layout and bits, got {capture!r}")
+            raise ParameterError("captures", f"must have the same layout and bits, got {capture!r}")
         yield capture
     if first is None and n_before == 0:
-        raise ParameterError("captures", "must hold at least one capture")
+        raise ParameterError("captures", "must contain at least one capture")
 
 
 def record(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | None) -> int:
-    """Write captures to a zarr folder, whole or not at all; their number."""
+    """Write captures to a zarr store atomically; return their number."""
     library(target, "zarr")
     with atomic_directory(target, is_ours=_is_recording) as folder:
         frames = _Frames(folder, plan)
@@ -228,7 +238,7 @@ def record(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | 
 
 
 def resume_recording(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | None) -> int:
-    """Write captures to a zarr folder after those that are kept; the number of all."""
+    """Append captures to a resumable recording; return the total number of frames."""
     library(target, "zarr")
     if target.exists():
         return _finished(captures, target, plan)
@@ -252,43 +262,43 @@ def resume_recording(captures: Iterable[Capture], target: Path, plan: Mapping[st
             with suppress(Exception):
                 frames.write()
             if frames.n_whole:
-                error.add_note(f"{frames.n_whole:,} frames are kept in {folder}, from which the same recording goes on")
+                error.add_note(f"{frames.n_whole:,} frames are stored in {folder}; the same call resumes the recording")
             raise
     return frames.n_whole
 
 
 def _finished(captures: Iterable[Capture], target: Path, plan: Mapping[str, Any] | None) -> int:
-    """The number of frames of a finished recording, after which nothing may come."""
+    """Return the number of frames of a finished recording; reject further captures."""
     if not _is_recording(target):
-        raise FileError(target, "cannot be written: something else is there")
+        raise FileError(target, "cannot be written: the path contains other data; choose another path")
     _check_plan(target, plan)
     n = count_recorded_frames(target)
-    # Of the same plan nothing more can come; who gives none says so by captures of which none is left.
+    # The same plan has no further captures; without a plan, check that there are none.
     if plan is None and next(iter(captures), None) is not None:
         raise FileError(
             target,
-            f"is finished, with {n:,} frames, and nothing is put after them; write this one under another name, or remove "
-            "that one",
+            f"is a finished recording of {n:,} frames, to which captures cannot be appended; choose another path, or delete "
+            "the recording",
         )
     return n
 
 
 @contextmanager
 def _growing(target: Path) -> Iterator[Path]:
-    """The folder in which a recording grows, locked; it stays after the block unless no frame is in it."""
+    """Lock the directory of a recording; delete it after the block if it has no frames."""
     folder = partial_path(target)
     if not target.parent.is_dir():
-        raise FileError(target, f"cannot be written: the folder {target.parent} does not exist")
+        raise FileError(target, f"cannot be written: the directory {target.parent} does not exist")
     if folder.exists() and not (folder.is_dir() and _is_ours(folder)):
-        raise FileError(folder, "cannot be written: something else is there")
+        raise FileError(folder, "cannot be written: the path contains other data; choose another path")
     with _full_disks_told(target):
         folder.mkdir(exist_ok=True)
         file = (folder / LOCK).open("ab")
     with file:
         with _full_disks_told(target):
-            # A folder that another program finished or began meanwhile is not the one that was locked.
+            # Another process may have finished the recording, or replaced the directory, before it was locked.
             if not lock(file) or not _is_at(file, folder / LOCK):
-                raise FileError(target, "is being written by another program")
+                raise FileError(target, "is being written by another process")
             for torn in folder.rglob(f"*{TORN}"):
                 torn.unlink()
         try:
@@ -307,7 +317,7 @@ def _full_disks_told(target: Path) -> Iterator[None]:
 
 
 def _is_ours(folder: Path) -> bool:
-    """Whether a recording grows in a folder, or was about to."""
+    """Return whether a directory contains an unfinished recording, possibly without frames."""
     return all(path.name == LOCK or path.suffix == TORN for path in folder.iterdir()) or _is_recording(folder)
 
 
@@ -319,7 +329,7 @@ def _is_at(file: IO[bytes], path: Path) -> bool:
 
 
 def _n_whole(folder: Path) -> int:
-    """How many frames of a growing recording are whole."""
+    """Return the number of complete frames of an unfinished recording."""
     if not (folder / "frame" / "zarr.json").exists():
         return 0
     with _trusted(folder) as group:
@@ -328,7 +338,7 @@ def _n_whole(folder: Path) -> int:
 
 
 def _check_plan(path: Path, plan: Mapping[str, Any] | None) -> None:
-    """Reject a recording that was made after another plan."""
+    """Reject a recording that has another plan."""
     with _trusted(path) as group:
         found = group.attrs.get("plan")
     _refuse(path, differences(found, _plain(plan)))
@@ -338,15 +348,16 @@ def _refuse(path: Path, different: Iterable[str]) -> None:
     for name in different:
         raise FileError(
             path,
-            f"is another recording: '{name}' differs; write this one under another name, or remove that one",
+            f"is another recording: '{name}' differs; choose another path, or delete that recording",
         )
 
 
 def _following(captures: Iterable[Capture], folder: Path, n_before: int) -> Iterator[Capture]:
     """
-    The captures, which must be numbered one after the other, and go on with those that the folder holds.
+    Yield the captures after checking that they continue the frames in the directory.
 
-    What differed between captures of the recording before may differ again; anything else that does is another recording.
+    Frame numbers must be consecutive. Settings that differed between earlier frames of the recording may differ again; other
+    differences mean that it is another recording.
     """
     first: dict[str, Any] | None = None
     may_differ, next_frame = set(OWN_SETTINGS), None
@@ -360,8 +371,8 @@ def _following(captures: Iterable[Capture], folder: Path, n_before: int) -> Iter
         if next_frame is not None and frame != next_frame:
             raise ParameterError(
                 "captures",
-                f"must be numbered one after the other to be gone on with: after {k:,} frames comes the number "
-                f"{next_frame}; leave out the light of the first {k:,}, and number the captures from there on (first_frame)",
+                f"must have consecutive frame numbers for a resumable recording: expected {next_frame} after {k:,} frames; "
+                f"skip the scenes of the first {k:,} frames, and set 'first_frame'",
                 frame,
             )
         first = settings if first is None else first
@@ -380,7 +391,7 @@ def _following(captures: Iterable[Capture], folder: Path, n_before: int) -> Iter
 
 
 def _other_parts(folder: Path, capture: Capture) -> Iterator[str]:
-    """Names of what a capture has otherwise than a recording, beside settings."""
+    """Yield the names of properties (not settings) that differ from those of a recording."""
     found = read_recording(folder)
     there, here = packed_layout(found.layout), packed_layout(capture.layout)
     if there.keys() != here.keys() or any(not np.array_equal(there[name], here[name]) for name in here):
@@ -393,23 +404,23 @@ def _other_parts(folder: Path, capture: Capture) -> Iterator[str]:
 
 
 def _plain(data: Mapping[str, Any] | None) -> Any:
-    """Data as they come back from a file."""
+    """Return data after a JSON round trip, as read from a file."""
     return json.loads(json.dumps(None if data is None else dict(data)))
 
 
 class _Frames:
     """
-    The frames of a recording in a folder, and those of the last chunk, not yet full, in memory.
+    Writer of frames to a recording, with the last incomplete chunk in memory.
 
-    A chunk is written again when frames come to it, and every file of it whole or not at all: what the folder tells that it
-    holds is there after any end of the program.
+    A chunk is written again when frames are added to it, and each of its files is written atomically: frames that are marked
+    complete are preserved if the process ends at any time.
     """
 
     def __init__(self, folder: Path, plan: Mapping[str, Any] | None, n_whole: int = 0) -> None:
         self._folder, self._plan = folder, plan
         self._arrays: dict[str, Any] = {}
         self._n_chunk = 1
-        # How many frames are before the chunk, and its frames: together, so that Ctrl-C never finds one without the other.
+        # Number of frames before the chunk, and its frames: one tuple, so that Ctrl-C cannot leave them inconsistent.
         self._chunk: tuple[int, list[tuple[Any, ...]]] = 0, []
         self.n_whole, self.written_s = n_whole, time.monotonic()
         if n_whole:
@@ -419,14 +430,14 @@ class _Frames:
                 self._n_chunk = code.chunks[0]
                 n_before = n_whole - n_whole % self._n_chunk
                 if (n_whole - n_before) * code.shape[1] * code.dtype.itemsize > MAX_UNPACKED_BYTES:
-                    raise FileError(folder, f"would unpack to more than {MAX_UNPACKED_BYTES} bytes")
+                    raise FileError(folder, f"would decompress to more than {MAX_UNPACKED_BYTES} bytes")
                 values = (array[n_before:n_whole] for array in self._arrays.values())
                 self._chunk = n_before, list(zip(*values, strict=True))
             for array in self._arrays.values():
                 array.resize((n_whole, *array.shape[1:]))
 
     def add(self, capture: Capture) -> None:
-        """Add a frame; a chunk that is full is written."""
+        """Add a frame, and write the chunk if it is full."""
         if not self._arrays:
             self._begin(capture)
         n_before, frames = self._chunk
@@ -437,7 +448,7 @@ class _Frames:
             self._chunk = self.n_whole, []
 
     def write(self) -> None:
-        """Write the frames that are in memory alone."""
+        """Write the frames that are only in memory."""
         n_before, frames = self._chunk
         n = n_before + len(frames)
         if n > self.n_whole:
@@ -450,7 +461,7 @@ class _Frames:
     def _begin(self, capture: Capture) -> None:
         layout, n_sites = capture.layout, capture.layout.n_sites
         arrays = {}
-        for path in self._folder.iterdir():  # of one that was ended before its first frame
+        for path in self._folder.iterdir():  # of a recording that was interrupted before its first frame
             if path.is_dir():
                 shutil.rmtree(path)
             elif path.name != LOCK:

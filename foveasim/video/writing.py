@@ -1,4 +1,4 @@
-"""Videos of captures as files: zarr folders that hold every code, pictures in a row, and video files to look at."""
+"""Writing of videos: zarr stores of all codes, picture sequences, and video files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from foveasim.video.recording import alike, count_recorded_frames, record, resum
 __all__ = ["write_video"]
 
 VIDEO_ENDINGS = (".mp4", ".mkv", ".mov", ".webm")
-#: Grey behind what no photosite sees, as a fraction of white.
+#: Background grey where there are no photosites, as a fraction of white.
 BEHIND = 0.12
 
 
@@ -43,55 +43,56 @@ def write_video(
     plan: Mapping[str, Any] | None = None,
 ) -> int:
     """
-    Write captures as they come: whole or not at all, or so that an ended recording can be gone on with.
+    Write captures to a file or directory incrementally, atomically or resumably.
 
     Parameters
     ----------
     captures : iterable of Capture
-        Of the same layout, as :meth:`foveasim.Camera.video` gives them.
+        Captures of the same layout, as from :meth:`foveasim.Camera.video`.
     path : path
-        ``.zarr``: a folder with every code, which :func:`read_recording` reads. ``.mp4``, ``.mkv``, ``.mov``, ``.webm`` (with
-        the extra ``video``) and ``.gif``: pictures to look at. Without an ending: a folder of pictures ``frame_000000.png`` ...
+        The extension selects the format. ``.zarr``: a store of all codes, which :func:`read_recording` reads. ``.mp4``,
+        ``.mkv``, ``.mov``, ``.webm`` (with the extra ``video``) and ``.gif``: pictures for viewing. Without an extension: a
+        directory of pictures ``frame_000000.png`` ...
     frame_s : float, s
-        How long a frame is shown.
+        Display time of a frame.
     max_pixels : int
         Length of the longer side of pictures.
     n_frames : int, optional
-        How many there will be in all, for the progress.
+        Total number of frames, for the progress bar.
     progress : bool
-        Whether to show how far it is, and how long it will still take.
+        Whether to show a progress bar with the remaining time.
     resume : bool
-        Whether a ``.zarr`` folder keeps its frames beside the target, in :func:`partial_path` it, until the last one is in, and
-        goes on with those that are there: ``captures`` are the ones after :func:`count_recorded_frames`.
+        Whether an interrupted ``.zarr`` recording can be resumed. Frames are stored in :func:`partial_path` of the target until
+        the last frame is written. If it contains frames, ``captures`` must begin after :func:`count_recorded_frames` of them.
     plan : mapping, optional
-        Plain data that tell what is recorded, kept in a ``.zarr`` folder: what was begun after another plan is not gone on
-        with, and of a finished recording of the same plan no capture is taken.
+        Plain data that describe the recording, stored in the ``.zarr`` store. A recording with another plan is not resumed; for
+        a finished recording with the same plan, ``captures`` is not iterated.
 
     Returns
     -------
     n_frames : int
-        How many are written, those that were kept among them.
+        Number of frames in the target, including those of earlier calls.
 
     Raises
     ------
     FileError
-        When the ending names no format, a library is missing, nothing can be written there, or something else is there: with
-        ``resume`` another recording, or one that another program is writing.
+        When the extension is unknown, a library is missing, the target cannot be written, or the path contains other data;
+        with ``resume`` also when it is another recording or another process is writing it.
     ParameterError
-        When there is no capture, one that does not follow the frames that are kept, or a value is out of range.
+        When there are no captures, captures do not continue the recorded frames, or a value is out of range.
 
     Notes
     -----
-    In memory are a chunk of codes, or a frame, however long the video is. Until the last frame is written the target is not
-    there, or is what it was before.
+    Memory contains one chunk of codes or one frame, for any length of the video. The target is created or replaced after the
+    last frame is written.
 
-    With ``resume``, Ctrl-C, an error in a frame and a full disk lose no frame, and a sudden end of the program those of the
-    last 10 seconds. What is gone on with is the same recording: its captures are numbered on, and all their settings are those
-    of the first, but for what told captures before apart.
+    With ``resume``, no frame is lost after Ctrl-C, an error in a frame or a full disk; after a crash of the process, the frames
+    of the last 10 seconds are lost. A resumed recording must be the same recording: frame numbers continue, and all settings
+    equal those of the first frame, except settings that already differed between frames.
 
     Examples
     --------
-    The same lines begin a recording, go on with it after any end, and leave it when it is finished::
+    The same lines start a recording, resume it after an interruption, and do nothing when it is finished::
 
         n = count_recorded_frames("long.zarr")
         captures = camera.video(footage.from_frame(n), exposure_s=0.01, seed=0, first_frame=n)
@@ -104,7 +105,7 @@ def write_video(
     if ending != ZARR and (resume or plan is not None):
         raise ParameterError(
             "resume" if resume else "plan",
-            f"is for .zarr folders; others, as {target.name}, are written whole or not at all",
+            f"is supported for .zarr stores only; {target.name} is written atomically",
         )
     if progress:
         captures = _with_progress(captures, n_frames, count_recorded_frames(target) if resume else 0)
@@ -116,7 +117,8 @@ def write_video(
         return _write_film(captures, target, frame_s, max_pixels)
     if ending:
         raise FileError(
-            target, f"must end in .zarr, .gif, {', '.join(VIDEO_ENDINGS)}, or have no ending, for a folder of pictures"
+            target,
+            f"must end in .zarr, .gif, {', '.join(VIDEO_ENDINGS)}, or have no extension for a directory of pictures",
         )
     return _write_pictures(captures, target, max_pixels)
 
@@ -130,7 +132,7 @@ def _with_progress(captures: Iterable[Capture], n_frames: int | None, n_before: 
     spinner = SpinnerColumn(spinner_of(console))
     columns = (spinner, *Progress.get_default_columns()[:-1], TimeRemainingColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bar:
-        # The time left is told by the frames that are made now: those that were kept took none.
+        # The remaining time is estimated from new frames only.
         task = bar.add_task("frames", total=n_frames, completed=n_before)
         for capture in captures:
             yield capture
@@ -141,18 +143,18 @@ def _with_progress(captures: Iterable[Capture], n_frames: int | None, n_before: 
 
 
 class _Raster:
-    """Pictures of captures of one layout: its overlaps with the pixels are computed once."""
+    """Renderer of captures of one layout, with the overlaps of sites and pixels computed once."""
 
     def __init__(self, layout: Layout, max_pixels: int, *, is_even: bool = False) -> None:
         grid = raster_grid(layout, max_pixels)
-        if is_even:  # video formats halve the colours' pixels
+        if is_even:  # chroma subsampling of video formats needs even sizes
             grid = Grid(tuple(n + n % 2 for n in grid.shape), grid.pitch_um, grid.origin_um)  # type: ignore[arg-type]
         self._layout, self._integrator = layout, Integrator(layout, grid)
         self._share = covered_share(self._integrator)
         self._covered_um2 = np.where(self._share > 0.0, self._share, np.nan) * grid.cell_area_um2
 
     def image(self, capture: Capture) -> NDArray[np.uint8]:
-        """Colours as a screen expects them, and coverage, (n_y, n_x, 2 or 4), first row on top."""
+        """Return sRGB values and coverage, (n_y, n_x, 2 or 4), top row first."""
         values = capture.code.astype(np.float64)[np.newaxis]
         n_filters = len(capture.filter_names)
         if n_filters > 1:
@@ -166,7 +168,7 @@ class _Raster:
         return np.asarray(picture.to_image(white, encode_srgb=True), np.uint8)
 
     def flat(self, capture: Capture) -> NDArray[np.uint8]:
-        """Colours over a dark grey, (n_y, n_x, 3)."""
+        """Return sRGB values over a dark grey background, (n_y, n_x, 3)."""
         image = self.image(capture).astype(np.float64)
         colours, cover = image[..., :-1], image[..., -1:] / 255.0
         colours = colours * cover + 255.0 * BEHIND * (1.0 - cover)

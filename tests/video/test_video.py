@@ -1,4 +1,4 @@
-"""Videos: frames after one another are single captures, gazes shift exactly, shutters roll, files come back."""
+"""Videos: frames, gaze paths, rolling shutters, frame sources, recordings and the command."""
 
 from __future__ import annotations
 
@@ -65,34 +65,34 @@ def camera_of(layout, **sensor):
 
 
 def map_camera(layout, **sensor):
-    """A camera for maps of light, one electron a photon, its charges not rounded by noise."""
+    """Return a camera for power maps without shot noise, one electron per photon."""
     return fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout, shot_noise="off", **sensor))
 
 
 def bar_map(grid, left_um, width_um=3.0):
-    """A bright bar over all rows, exactly where it is told to be."""
+    """Return a power map with a bright vertical bar, with partial coverage at its edges."""
     edges = grid.origin_um[0] + grid.pitch_um * np.arange(grid.shape[1] + 1)
-    share = np.diff(np.clip(edges, left_um, left_um + width_um)) / grid.pitch_um
-    return fs.PowerMap(np.broadcast_to(share, (1, *grid.shape)).copy(), grid, np.array([550.0]))
+    covered = np.diff(np.clip(edges, left_um, left_um + width_um)) / grid.pitch_um
+    return fs.PowerMap(np.broadcast_to(covered, (1, *grid.shape)).copy(), grid, np.array([550.0]))
 
 
-# -- frames after one another ------------------------------------------------------------------------------------------
+# -- successive frames -------------------------------------------------------------------------------------------------
 
 
-def test_every_frame_of_a_video_is_the_single_capture_of_its_number():
+def test_video_frames_equal_single_captures():
     scenes = [scene_of(p) for p in pictures(3)]
     camera = camera_of(rows_layout())
 
     captures = list(camera.video(scenes, exposure_s=0.01, seed=5, first_frame=7))
 
     for k, (scene, capture) in enumerate(zip(scenes, captures, strict=True)):
-        alone = camera_of(rows_layout()).capture(scene, exposure_s=0.01, seed=5, frame=7 + k)
-        assert np.array_equal(capture.code, alone.code)
-        assert np.array_equal(capture.electrons, alone.electrons)
-        assert capture.settings == alone.settings
+        single = camera_of(rows_layout()).capture(scene, exposure_s=0.01, seed=5, frame=7 + k)
+        assert np.array_equal(capture.code, single.code)
+        assert np.array_equal(capture.electrons, single.electrons)
+        assert capture.settings == single.settings
 
 
-def test_a_still_scene_keeps_its_fixed_pattern_and_changes_its_noise():
+def test_static_scene_changes_only_temporal_noise():
     scene = scene_of(pictures(1)[0])
     first, second = camera_of(rows_layout()).video([scene, scene], exposure_s=0.01, seed=5)
 
@@ -100,7 +100,7 @@ def test_a_still_scene_keeps_its_fixed_pattern_and_changes_its_noise():
     assert np.mean(first.electrons != second.electrons) > 0.9
 
 
-def test_the_image_of_the_same_object_is_computed_once():
+def test_image_of_same_object_is_computed_once():
     scene = scene_of(pictures(1)[0])
     first, second, third = camera_of(rows_layout()).video(
         [scene, scene, scene_of(pictures(1)[0])], exposure_s=0.01, seed=5
@@ -117,7 +117,7 @@ def test_the_image_of_the_same_object_is_computed_once():
     "changes", [{}, {"pupil": fs.optics.Blades(6), "zernike": fs.optics.Zernike(coefficients={7: 0.05})}]
 )
 @pytest.mark.parametrize("pitch_um", [10.0, 60.0])
-def test_what_is_kept_of_the_lens_for_later_frames_changes_no_bit(changes, precision, pitch_um):
+def test_cached_lens_gives_bit_identical_maps(changes, precision, pitch_um):
     scenes = [
         fs.Scene.from_picture(np.stack([p, p.T, 1 - p], axis=-1), **(LIGHT | {"pitch_um": pitch_um}))
         for p in pictures(4, (130, 130))
@@ -127,14 +127,14 @@ def test_what_is_kept_of_the_lens_for_later_frames_changes_no_bit(changes, preci
     def lens():
         return fs.Optics(focal_length_mm=22.0, f_number=4.0, precision=precision, **changes)
 
-    kept = lens()
+    cached = lens()
     for scene in scenes:
         fresh = [cells.tobytes() for cells in lens().weighted_maps(scene, weights)]
-        assert [cells.tobytes() for cells in kept.weighted_maps(scene, weights)] == fresh
-    assert sum(factor is not None for factor in kept._cache._factors.values()) == 6
+        assert [cells.tobytes() for cells in cached.weighted_maps(scene, weights)] == fresh
+    assert sum(factor is not None for factor in cached._cache._factors.values()) == 6
 
 
-def test_factors_of_a_lens_are_kept_within_their_room(monkeypatch):
+def test_lens_cache_size_is_limited(monkeypatch):
     from foveasim.optics import otf
 
     small, large = (scene_of(np.ones(shape, np.float32)) for shape in ((120, 160), (240, 320)))
@@ -151,39 +151,39 @@ def test_factors_of_a_lens_are_kept_within_their_room(monkeypatch):
     (of_small,) = kept_sizes(small, small, optics=lens())
     (of_large,) = kept_sizes(large, large, optics=lens())
     assert len(kept_sizes(small, small, large, large, optics=lens())) == 2
-    # Room for one: the one used before gives way; and room for none.
+    # A limit for one factor evicts the earlier one; then a limit for none.
     monkeypatch.setattr(otf, "MAX_FACTOR_SIZE", of_small + of_large - 1)
     assert kept_sizes(small, small, large, large, optics=lens()) == [of_large]
     monkeypatch.setattr(otf, "MAX_FACTOR_SIZE", of_small - 1)
     assert kept_sizes(small, small, small, optics=lens()) == []
 
 
-def test_the_layout_is_compiled_once_for_all_frames():
+def test_layout_is_compiled_once_for_video():
     camera = camera_of(rows_layout())
     list(camera.video([scene_of(p) for p in pictures(3)], exposure_s=0.01, seed=5))
 
     assert len(camera._integrators) == 1
 
 
-def test_frames_are_asked_for_one_at_a_time():
-    asked = []
+def test_frames_are_requested_lazily():
+    requested = []
 
     def frames():
         for k, picture in enumerate(pictures(3)):
-            asked.append(k)
+            requested.append(k)
             yield scene_of(picture)
 
     video = camera_of(rows_layout()).video(frames(), exposure_s=0.01, seed=0)
 
-    assert asked == []
+    assert requested == []
     next(video)
-    assert asked == [0]
+    assert requested == [0]
     next(video)
-    assert asked == [0, 1]
+    assert requested == [0, 1]
 
 
 @pytest.mark.parametrize("ahead", [1, 2, 5])
-def test_frames_computed_ahead_are_the_same(ahead):
+def test_frames_computed_ahead_are_identical(ahead):
     scenes = [scene_of(p) for p in pictures(4)]
     frames = [
         scenes[0],
@@ -195,11 +195,11 @@ def test_frames_computed_ahead_are_the_same(ahead):
         scenes[3],
     ]
     times = {"exposure_s": 0.01, "seed": 3}
-    for how in ({}, {"frame_s": 0.011, "line_s": 1e-3}):
-        plain = list(camera_of(rows_layout()).video(frames, **times, **how))
-        fast = list(camera_of(rows_layout()).video(frames, **times, **how, ahead=ahead))
-        assert len(fast) == 7
-        for a, b in zip(plain, fast, strict=True):
+    for options in ({}, {"frame_s": 0.011, "line_s": 1e-3}):
+        expected = list(camera_of(rows_layout()).video(frames, **times, **options))
+        captures = list(camera_of(rows_layout()).video(frames, **times, **options, ahead=ahead))
+        assert len(captures) == 7
+        for a, b in zip(expected, captures, strict=True):
             assert np.array_equal(a.code, b.code)
             assert np.array_equal(a.expected_e, b.expected_e)
             assert a.settings == b.settings
@@ -207,33 +207,33 @@ def test_frames_computed_ahead_are_the_same(ahead):
     assert np.array_equal(list(rates), list(camera_of(rows_layout()).rates(frames)))
 
 
-def test_only_so_many_frames_are_taken_ahead_and_none_before_the_first():
-    asked = []
+def test_limited_number_of_frames_is_requested_ahead():
+    requested = []
 
     def frames():
         for k, picture in enumerate(pictures(6)):
-            asked.append(k)
+            requested.append(k)
             yield scene_of(picture)
 
     video = camera_of(rows_layout()).video(frames(), exposure_s=0.01, seed=0, ahead=2)
     next(video)
-    assert asked == [0]
+    assert requested == [0]
     next(video)
-    assert asked == [0, 1, 2, 3]
+    assert requested == [0, 1, 2, 3]
     video.close()
-    assert asked == [0, 1, 2, 3]
+    assert requested == [0, 1, 2, 3]
 
 
-def test_an_error_ahead_comes_in_its_turn():
-    good = scene_of(pictures(1)[0])
-    video = camera_of(rows_layout()).video([good, good, "no light"], exposure_s=0.01, seed=0, ahead=2)
+def test_error_ahead_is_raised_in_order():
+    scene = scene_of(pictures(1)[0])
+    video = camera_of(rows_layout()).video([scene, scene, "not a scene"], exposure_s=0.01, seed=0, ahead=2)
 
     next(video)
     with pytest.raises(ParameterError, match="Scene or a PowerMap"):
         list(video)
 
 
-def test_rates_are_the_photoelectrons_of_each_frame():
+def test_rates_equal_photoelectrons_per_frame():
     scenes = [scene_of(p) for p in pictures(2)]
     camera = camera_of(rows_layout())
 
@@ -241,7 +241,7 @@ def test_rates_are_the_photoelectrons_of_each_frame():
         assert np.array_equal(rate, camera.photoelectrons_per_s(scene))
 
 
-def test_rates_of_equal_frames_cannot_be_changed_through_each_other():
+def test_rates_of_equal_frames_are_read_only():
     camera, scene = camera_of(rows_layout()), scene_of(pictures(1)[0])
     truth = camera.photoelectrons_per_s(scene)
     for rate in camera.rates([scene] * 3):
@@ -250,7 +250,7 @@ def test_rates_of_equal_frames_cannot_be_changed_through_each_other():
             np.multiply(rate, 2.0, out=rate)
 
 
-def test_a_bracket_takes_its_exposures_in_turns_and_merges_to_the_light():
+def test_bracket_cycles_exposures_and_merges():
     layout = rows_layout()
     camera = camera_of(layout, read_noise_e=0.0, prnu_fraction=0.0)
     scene = scene_of(pictures(1)[0])
@@ -260,22 +260,20 @@ def test_a_bracket_takes_its_exposures_in_turns_and_merges_to_the_light():
     assert [c.settings["exposure_s"] for c in captures] == exposures_s * 2
     rates = merge_exposures([c.code for c in captures[:2]], exposures_s, camera.sensor)
     truth = camera.photoelectrons_per_s(scene)
-    seen = np.isfinite(rates.rate_e_per_s)
-    assert seen.all()
+    assert np.isfinite(rates.rate_e_per_s).all()
     assert np.abs((rates.rate_e_per_s - truth) / rates.sigma_e_per_s).max() < 5.0
 
 
 @pytest.mark.parametrize("first", [1, 2, 3])
 @pytest.mark.parametrize("shutter", [{}, {"frame_s": 0.004, "line_s": 1e-3, "every": 2}])
-def test_a_video_gone_on_with_is_the_rest_of_the_whole_one(first, shutter):
+def test_resumed_video_equals_rest_of_video(first, shutter):
     lights = [scene_of(p) for p in pictures(9)]
-    how = {"exposure_s": [0.002, 0.008, 0.005], "seed": 1} | shutter
-    whole = list(camera_of(rows_layout()).video(lights, **how))
-    begun = lights[first * shutter.get("every", 1) :]
-    rest = list(camera_of(rows_layout()).video(begun, **how, first_frame=first))
+    options = {"exposure_s": [0.002, 0.008, 0.005], "seed": 1} | shutter
+    expected = list(camera_of(rows_layout()).video(lights, **options))[first:]
+    remaining = lights[first * shutter.get("every", 1) :]
+    found = list(camera_of(rows_layout()).video(remaining, **options, first_frame=first))
 
-    assert len(rest) == len(whole) - first
-    for one, other in zip(rest, whole[first:], strict=True):
+    for one, other in zip(found, expected, strict=True):
         assert np.array_equal(one.code, other.code)
         assert np.array_equal(one.expected_e, other.expected_e)
         assert one.settings == other.settings
@@ -298,12 +296,12 @@ def test_a_video_gone_on_with_is_the_rest_of_the_whole_one(first, shutter):
         ({"frame_s": 1.0, "between": "cubic"}, "between"),
     ],
 )
-def test_a_wrong_argument_is_told_before_the_first_frame(change, name):
+def test_invalid_argument_is_rejected_immediately(change, name):
     with pytest.raises(ParameterError, match=name):
         camera_of(rows_layout()).video([], **({"exposure_s": 0.01, "seed": 0} | change))
 
 
-def test_frames_that_are_no_light_are_told():
+def test_frames_of_other_types_are_rejected():
     camera = camera_of(rows_layout())
     with pytest.raises(ParameterError, match="iterable"):
         camera.video(3, exposure_s=0.01, seed=0)
@@ -324,101 +322,100 @@ def test_no_frames_give_no_captures():
     assert list(camera.video([], exposure_s=0.01, seed=0, frame_s=0.1)) == []
 
 
-# -- gazes ------------------------------------------------------------------------------------------------------------
+# -- gaze paths-------------------------------------------------------------------------------------------------------
 
 
-def test_a_gaze_of_whole_cells_is_the_picture_moved_by_whole_pixels():
+def test_gaze_by_integer_cells_shifts_picture():
     grid = fs.Grid.centred((60, 80), 0.5)
     data = np.random.default_rng(3).random((1, 60, 80))
     light = fs.PowerMap(data, grid, np.array([550.0]))
     camera = map_camera(rows_layout(n_x=5, n_y=4))
-    # The gaze goes to +x and +y: what lay there comes to the middle.
-    moved = fs.PowerMap(np.roll(data, (-4, -7), axis=(1, 2)), grid, np.array([550.0]))
+    # A gaze towards +x and +y shifts the picture towards -x and -y.
+    shifted = fs.PowerMap(np.roll(data, (-4, -7), axis=(1, 2)), grid, np.array([550.0]))
 
-    gazed, plain = camera.rates([(light, (3.5, 2.0)), moved])
+    found, expected = camera.rates([(light, (3.5, 2.0)), shifted])
 
-    assert np.allclose(gazed, plain, rtol=1e-12)
+    assert np.allclose(found, expected, rtol=1e-12)
 
 
-def test_a_gaze_of_any_part_of_a_cell_is_exact_on_a_linear_field():
+def test_subcell_gaze_is_exact_on_linear_field():
     grid = fs.Grid.centred((60, 80), 0.5)
     x_um, y_um = np.meshgrid(grid.x_um, grid.y_um)
     light = fs.PowerMap((100.0 + 2.0 * x_um - 3.0 * y_um)[np.newaxis], grid, np.array([550.0]))
     layout = rows_layout(n_x=5, n_y=4)
     camera = fs.Camera(optics=OPTICS, sensor=fs.Sensor(layout), order=2)
 
-    still, gazed = camera.rates([light, (light, (0.123, -0.217))])
+    centred, shifted = camera.rates([light, (light, (0.123, -0.217))])
     plane = 100.0 + 2.0 * layout.centroid_um[:, 0] - 3.0 * layout.centroid_um[:, 1]
 
-    assert np.allclose(gazed / still, (plane + 2.0 * 0.123 + 3.0 * 0.217) / plane, rtol=1e-12)
+    assert np.allclose(shifted / centred, (plane + 2.0 * 0.123 + 3.0 * 0.217) / plane, rtol=1e-12)
 
 
-def test_a_moving_camera_sees_a_part_of_the_picture_where_it_looks():
-    whole = scene_of(pictures(1, (200, 260))[0])
-    cell_um = OPTICS.grid(whole).pitch_um
+def test_panned_camera_crops_scene_at_gaze():
+    scene = scene_of(pictures(1, (200, 260))[0])
+    cell_um = OPTICS.grid(scene).pitch_um
     layout = rows_layout(n_x=6, n_y=5)
     camera = camera_of(layout)
     path = GazePath(np.array([0.0, 1.0]), cell_um * np.array([[0.0, 0.0], [12.25, -7.5]]))
-    parts = list(pan_camera(whole, path, OPTICS, shape=(120, 160)))
+    parts = list(pan_camera(scene, path, OPTICS, shape=(120, 160)))
 
-    (first, place), (second, rest) = parts
+    (first, shift), (second, rest) = parts
 
-    assert place == (0.0, 0.0)
-    assert np.array_equal(first.basis, whole.basis[:, 40:160, 50:210])
-    assert np.array_equal(second.basis[0, 0, :3], whole.basis[0, 32, 62:65])
+    assert shift == (0.0, 0.0)
+    assert np.array_equal(first.basis, scene.basis[:, 40:160, 50:210])
+    assert np.array_equal(second.basis[0, 0, :3], scene.basis[0, 32, 62:65])
     assert rest[0] == pytest.approx(0.25 * cell_um)
     assert abs(rest[1]) == pytest.approx(0.5 * cell_um)
-    # The sensor moved behind the lens sees the same, up to falloff over these few pixels.
-    around, behind = list(camera.rates(parts))[1], list(camera.rates(shift_sensor(whole, path)))[1]
-    assert np.allclose(around, behind, rtol=2e-3)
+    # A sensor shifted behind the lens measures the same apart from relative illumination over these few pixels.
+    panned, shifted = list(camera.rates(parts))[1], list(camera.rates(shift_sensor(scene, path)))[1]
+    assert np.allclose(panned, shifted, rtol=2e-3)
 
 
-def test_parts_of_odd_differences_are_centred_to_half_a_pixel():
-    whole = scene_of(pictures(1, (121, 161))[0])
-    cell_um = OPTICS.grid(whole).pitch_um
-    ((_, rest),) = pan_camera(whole, GazePath(np.zeros(1), np.zeros((1, 2))), OPTICS, shape=(100, 140))
+def test_odd_crop_is_centred_to_half_pixel():
+    scene = scene_of(pictures(1, (121, 161))[0])
+    cell_um = OPTICS.grid(scene).pitch_um
+    ((_, rest),) = pan_camera(scene, GazePath(np.zeros(1), np.zeros((1, 2))), OPTICS, shape=(100, 140))
 
     assert np.allclose(np.abs(rest), 0.5 * cell_um)
 
 
-def test_a_gaze_beyond_the_picture_is_told_with_its_time():
-    whole = scene_of(pictures(1)[0])
+def test_gaze_outside_scene_reports_time():
+    scene = scene_of(pictures(1)[0])
     path = GazePath(np.array([0.0, 0.5]), np.array([[0.0, 0.0], [1000.0, 0.0]]))
-    with pytest.raises(ParameterError, match=r"leaves the picture at 0\.5 s"):
-        list(pan_camera(whole, path, OPTICS, shape=(100, 100)))
+    with pytest.raises(ParameterError, match=r"leaves it at 0\.5 s"):
+        list(pan_camera(scene, path, OPTICS, shape=(100, 100)))
 
 
-def test_saccades_stay_in_their_field_and_rest_between_jumps():
+def test_saccades_stay_in_field_with_fixations():
     path = saccades(duration_s=20.0, frame_s=1e-3, size_um=(200.0, 80.0), seed=3, saccade_s=0.04)
     speed = np.linalg.norm(np.diff(path.xy_um, axis=0), axis=1)
 
     assert path.xy_um.shape == (20_000, 2)
     assert np.all(np.abs(path.xy_um) <= [100.0, 40.0])
-    # About a rest of 0.3 s and a jump of 0.04 s at a time: 59 jumps, each at most 40 steps.
-    share = np.mean(speed > 0)
-    assert share == pytest.approx(0.04 / 0.34, rel=0.25)
+    # Fixations of 0.3 s on average and saccades of 0.04 s: 59 saccades of at most 40 steps.
+    assert np.mean(speed > 0) == pytest.approx(0.04 / 0.34, rel=0.25)
 
 
-def test_drift_spreads_as_the_root_of_time():
+def test_drift_variance_is_proportional_to_time():
     paths = [
         saccades(duration_s=0.5, frame_s=1e-3, size_um=(0.0, 0.0), seed=k, fixation_s=100.0, drift_um_per_root_s=10.0)
         for k in range(400)
     ]
     ends_um = np.array([path.xy_um[-1] for path in paths])
 
-    # Variance 100 µm²/s for 0.499 s, from 800 numbers: relative standard error sqrt(2/800) = 0.05.
+    # Variance 100 µm²/s for 0.499 s, from 800 samples: relative standard error sqrt(2/800) = 0.05.
     assert ends_um.var() == pytest.approx(49.9, rel=0.25)
 
 
-def test_a_seed_gives_the_same_gaze_and_another_another():
+def test_gaze_path_depends_on_seed():
     one, same, other = (saccades(duration_s=2.0, frame_s=0.01, size_um=(50.0, 50.0), seed=s) for s in (1, 1, 2))
 
     assert np.array_equal(one.xy_um, same.xy_um)
     assert not np.array_equal(one.xy_um, other.xy_um)
 
 
-def test_a_gaze_rests_and_jumps_at_the_times_that_its_numbers_tell():
-    """A slow twin, which asks every point of the path."""
+def test_gaze_path_matches_reference_implementation():
+    """Compare the fixations with a slow reference implementation that evaluates every point of the path."""
     frame_s, n, seed = 0.01, 400, 5
     path = saccades(duration_s=n * frame_s, frame_s=frame_s, size_um=(60.0, 20.0), seed=seed, drift_um_per_root_s=3.0)
     rests, targets, walk = (Streams(seed).of(f"gaze {what}") for what in ("rests", "targets", "drift"))
@@ -437,30 +434,30 @@ def test_a_gaze_rests_and_jumps_at_the_times_that_its_numbers_tell():
     assert n_rests > 8
 
 
-def test_gazes_that_cannot_be_are_told():
+def test_invalid_gaze_arguments_are_rejected():
     with pytest.raises(ParameterError, match=r"'duration_s' must be 1 to 100,000,000 frames of 0.01 s, got 0.001 s"):
         saccades(duration_s=0.001, frame_s=0.01, size_um=(1.0, 1.0), seed=0)
     with pytest.raises(ParameterError, match="duration_s"):
         saccades(duration_s=1e300, frame_s=1e-300, size_um=(1.0, 1.0), seed=0)
     scene, path = scene_of(pictures(1)[0]), GazePath(np.zeros(1), np.zeros((1, 2)))
-    for light, gaze, told in (
-        (None, path, "'light' must be of the class Scene or PowerMap"),
-        (scene, None, "'path' must be of the class Gaze"),
+    for light, gaze, message in (
+        (None, path, "'light' must be a Scene or PowerMap"),
+        (scene, None, "'path' must be a GazePath"),
     ):
-        with pytest.raises(ParameterError, match=told):
+        with pytest.raises(ParameterError, match=message):
             shift_sensor(light, gaze)
-    for change, told in (
-        ({"scene": None}, "'scene' must be of the class Scene"),
-        ({"path": 3}, "'path' must be of the class GazePath"),
-        ({"optics": None}, "'optics' must be of the class Optics"),
+    for change, message in (
+        ({"scene": None}, "'scene' must be a Scene"),
+        ({"path": 3}, "'path' must be a GazePath"),
+        ({"optics": None}, "'optics' must be a Optics"),
         ({"shape": 5}, "'shape' must be two integers"),
-        ({"shape": (121, 160)}, r"'shape' must be within the picture's \(120, 160\)"),
+        ({"shape": (121, 160)}, r"'shape' must not exceed the shape of the scene, \(120, 160\)"),
     ):
-        with pytest.raises(ParameterError, match=told):
+        with pytest.raises(ParameterError, match=message):
             pan_camera(**({"scene": scene, "path": path, "optics": OPTICS, "shape": (10, 10)} | change))
 
 
-def test_a_path_is_straight_between_its_points():
+def test_gaze_path_is_interpolated_linearly():
     path = GazePath(np.array([0.0, 2.0]), np.array([[0.0, 4.0], [10.0, 0.0]]))
 
     assert path.at(0.5).tolist() == [2.5, 3.0]
@@ -474,7 +471,7 @@ def test_a_path_is_straight_between_its_points():
 # -- shutters ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_rolling_shutter_of_no_delay_is_the_global_one_bit_for_bit():
+def test_rolling_shutter_without_delay_is_global():
     scenes = [scene_of(p) for p in pictures(3)]
     plain = camera_of(rows_layout()).video(scenes, exposure_s=0.01, seed=5)
     rolled = camera_of(rows_layout()).video(scenes, exposure_s=0.01, seed=5, frame_s=0.01, line_s=0.0)
@@ -484,20 +481,20 @@ def test_a_rolling_shutter_of_no_delay_is_the_global_one_bit_for_bit():
         assert np.array_equal(a.expected_e, b.expected_e)
 
 
-def test_a_still_scene_looks_the_same_through_every_shutter():
+def test_static_scene_is_independent_of_shutter():
     scene = scene_of(pictures(1)[0])
     camera = camera_of(rows_layout())
-    plain = next(camera.video([scene], exposure_s=0.01, seed=5)).expected_e
+    expected = next(camera.video([scene], exposure_s=0.01, seed=5)).expected_e
     for between in ("hold", "linear"):
         times = {"frame_s": 0.004, "line_s": 1.3e-3, "every": 3, "between": between}
         rolled = list(camera.video([scene] * 7, exposure_s=0.01, seed=5, **times))
         assert len(rolled) == 3
         for capture in rolled:
-            assert np.allclose(capture.expected_e, plain, rtol=1e-12)
+            assert np.allclose(capture.expected_e, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("between", ["hold", "linear"])
-def test_a_moving_bar_leans_by_its_speed_times_the_time_of_a_line(between):
+def test_moving_bar_is_skewed_by_line_time(between):
     layout = rows_layout(n_x=60, n_y=20, pitch_um=1.0)
     grid = fs.Grid.centred((40, 160), 0.5)
     speed_um_per_frame, frame_s, line_s = 0.1, 1e-4, 1e-3
@@ -506,13 +503,13 @@ def test_a_moving_bar_leans_by_its_speed_times_the_time_of_a_line(between):
         frames, exposure_s=frame_s, seed=0, frame_s=frame_s, line_s=line_s, every=1000, between=between
     )
     light = capture.expected_e.reshape(20, 60)
-    middle_um = light @ layout.centroid_um[:60, 0] / light.sum(axis=1)
+    centre_um = light @ layout.centroid_um[:60, 0] / light.sum(axis=1)
 
-    # v t_line = 0.1 µm / 1e-4 s * 1e-3 s = 1 µm a line.
-    assert np.allclose(np.diff(middle_um), 1.0, atol=1e-9)
+    # v t_line = 0.1 µm / 1e-4 s * 1e-3 s = 1 µm per line.
+    assert np.allclose(np.diff(centre_um), 1.0, atol=1e-9)
 
 
-def test_motion_during_the_exposure_blurs_over_the_way():
+def test_motion_blur_has_expected_variance():
     layout = rows_layout(n_x=60, n_y=2, pitch_um=1.0)
     grid = fs.Grid.centred((8, 160), 0.5)
     frames = (bar_map(grid, -20.0 + 0.5 * k, width_um=1.0) for k in range(40))
@@ -521,11 +518,11 @@ def test_motion_during_the_exposure_blurs_over_the_way():
     x_um = layout.centroid_um[:60, 0]
     variance = light @ x_um**2 - (light @ x_um) ** 2
 
-    # Twenty places 0.5 µm apart, 0.25 µm² (20² - 1) / 12, and bars that straddle two sites of 1 µm every other time: 1/8 µm².
+    # Twenty positions 0.5 µm apart, 0.25 µm² (20² - 1) / 12, and every second bar covers two sites of 1 µm: 1/8 µm².
     assert variance == pytest.approx(0.25 * 399 / 12 + 0.125, abs=1e-3)
 
 
-def test_a_line_sees_each_frame_for_as_long_as_it_is_exposed_to_it():
+def test_lines_weight_frames_by_overlap():
     layout = rows_layout(n_x=1, n_y=3, pitch_um=1.0)
     grid = fs.Grid.centred((8, 8), 0.5)
     levels = np.array([1.0, 3.0, 10.0, 40.0])
@@ -537,13 +534,13 @@ def test_a_line_sees_each_frame_for_as_long_as_it_is_exposed_to_it():
 
     # 1 for 1 s and 3 for 0.5 s; 1 for 0.5 s and 3 for 1 s; 3 for 1 s and 10 for 0.5 s.
     assert np.allclose(held.expected_e / per_level, [2.5, 3.5, 8.0], rtol=1e-12)
-    # The broken line through 1, 3, 10 and 40 at 0, 1, 2 and 3 s, summed by trapezia.
+    # Piecewise linear interpolation of 1, 3, 10 and 40 at 0, 1, 2 and 3 s, integrated by the trapezoidal rule.
     table = np.interp(np.linspace(0, 3, 300_001), np.arange(4), levels)
     sums = [np.trapezoid(table[round(a * 1e5) : round((a + 1.5) * 1e5) + 1], dx=1e-5) for a in (0.0, 0.5, 1.0)]
     assert np.allclose(line.expected_e / per_level, sums, rtol=1e-9)
 
 
-def test_the_last_light_stays_until_all_lines_are_done():
+def test_last_frame_is_held_for_remaining_lines():
     layout = rows_layout(n_x=1, n_y=3, pitch_um=1.0)
     grid = fs.Grid.centred((8, 8), 0.5)
     lights = [fs.PowerMap(np.full((1, 8, 8), level), grid, np.array([550.0])) for level in (1.0, 3.0)]
@@ -554,13 +551,13 @@ def test_the_last_light_stays_until_all_lines_are_done():
     assert [np.round(c.expected_e / per_level, 12).tolist() for c in captures] == [[1.0, 3.0, 3.0], [3.0, 3.0, 3.0]]
 
 
-def test_a_shutter_without_an_order_of_lines_is_told():
+def test_rolling_shutter_without_readout_order_is_rejected():
     layout = fs.layout.grid(n_x=4, n_y=4, pitch_um=2.0)
     with pytest.raises(SimulationError, match="readout_order"):
         camera_of(layout).video([], exposure_s=0.01, seed=0, frame_s=0.1, line_s=1e-3)
 
 
-def test_every_so_many_frames_begin_an_exposure():
+def test_every_nth_frame_starts_exposure():
     lights = [scene_of(p) for p in pictures(7)]
     camera = camera_of(rows_layout())
     captures = list(camera.video(lights, exposure_s=0.01, seed=0, frame_s=0.01, every=3))
@@ -570,17 +567,17 @@ def test_every_so_many_frames_begin_an_exposure():
         assert np.array_equal(capture.expected_e, camera.capture(lights[3 * k], exposure_s=0.01, seed=0).expected_e)
 
 
-def test_exposures_that_no_photosite_can_make_are_told():
+def test_overlapping_exposures_give_warning():
     camera, lights = camera_of(rows_layout()), [scene_of(pictures(1)[0])] * 4
     with pytest.warns(
         FoveasimWarning, match=r"the exposure of 1 s is longer than the 0.1 s between the starts of exposures"
     ):
         camera.video(lights, exposure_s=[0.05, 1.0], seed=0, frame_s=0.1)
-    # One behind the other, though times are rounded.
+    # Consecutive exposures, apart from rounding errors.
     assert len(list(camera.video(lights, exposure_s=0.1 + 0.2, seed=0, frame_s=0.1, every=3))) == 2
 
 
-def test_exposures_in_the_making_refuse_what_is_no_time_or_no_light():
+def test_invalid_shutter_arguments_are_rejected():
     shutter = Shutter(rows_layout(), frame_s=0.1, line_s=0.01)
     for call, name in (
         (lambda: Shutter(None, 1.0), "layout"),
@@ -601,13 +598,13 @@ def test_exposures_in_the_making_refuse_what_is_no_time_or_no_light():
             call()
 
 
-# -- footage ----------------------------------------------------------------------------------------------------------
+# -- frame sources ----------------------------------------------------------------------------------------------------
 
 
-def test_pictures_of_a_folder_come_in_natural_order(tmp_path):
+def test_directory_pictures_are_in_natural_order(tmp_path):
     for k in (10, 2, 1):
         write_picture(tmp_path / f"frame {k}.png", np.full((8, 8), k, np.uint8))
-    (tmp_path / "notes.txt").write_text("no picture")
+    (tmp_path / "notes.txt").write_text("not a picture")
     footage = FrameSource(tmp_path, **LIGHT)
 
     assert footage.n_frames == 3
@@ -615,7 +612,7 @@ def test_pictures_of_a_folder_come_in_natural_order(tmp_path):
     assert [round(float(s.basis.max()) * 255) for s in FrameSource(tmp_path, start=1, step=1, **LIGHT)] == [2, 10]
 
 
-def test_footage_may_be_seen_again():
+def test_frame_source_can_be_iterated_again():
     footage = FrameSource(pictures(3), **LIGHT)
 
     assert [s.basis.sum() for s in footage] == [s.basis.sum() for s in footage]
@@ -624,65 +621,67 @@ def test_footage_may_be_seen_again():
     assert FrameSource(pictures(5), start=1, stop=9, step=2, **LIGHT).n_frames == 2
 
 
-def test_names_with_digits_that_are_no_numbers_are_ordered_too(tmp_path):
+def test_non_ascii_digits_in_names_are_ordered(tmp_path):
     names = ["٣.png", "01.png", "1.png", "2.png", "2²3.png", "10.png"]
     for name in reversed(names):
         write_picture(tmp_path / name, np.zeros((8, 8), np.uint8))
     assert [path.name for path in pictures_in(tmp_path)] == names
 
 
-def test_pictures_of_an_iterator_are_given_once():
+def test_iterator_source_is_consumed_once():
     footage = FrameSource(iter(pictures(3)), **LIGHT)
     assert len(list(footage)) == 3
     for again in (footage, footage.from_frame(1)):
-        with pytest.raises(ParameterError, match=r"'source' was an iterator, whose pictures are gone.*give a list"):
+        with pytest.raises(ParameterError, match=r"'source' was an iterator and has been consumed.*pass a list"):
             list(again)
     assert len(list(FrameSource(iter(pictures(3)), **LIGHT).from_frame(1))) == 2
 
 
-def test_footage_without_any_frame_is_told():
-    for source, how in (([], {}), (pictures(3), {"start": 3}), (pictures(3), {"start": 1, "stop": 1})):
-        with pytest.raises(ParameterError, match="'source' has no frame from"):
-            FrameSource(source, **how, **LIGHT)
-    for source, how in (((), {}), (pictures(3), {"start": 3})):
-        footage = FrameSource(iter(source), **how, **LIGHT)
-        with pytest.raises(ParameterError, match=r"'source' has no frame from .*, of any number of pictures"):
+def test_empty_frame_source_is_rejected():
+    for source, options in (([], {}), (pictures(3), {"start": 3}), (pictures(3), {"start": 1, "stop": 1})):
+        with pytest.raises(ParameterError, match="'source' must have a frame from"):
+            FrameSource(source, **options, **LIGHT)
+    for source, options in (((), {}), (pictures(3), {"start": 3})):
+        footage = FrameSource(iter(source), **options, **LIGHT)
+        with pytest.raises(
+            ParameterError, match=r"'source' must have a frame from .*, got an unknown number of pictures"
+        ):
             list(footage)
-    # Of a video that is gone on with nothing may be left.
+    # A resumed video may have no remaining frames.
     assert list(FrameSource(pictures(3), **LIGHT).from_frame(3)) == []
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
-        ({"pich_um": 3.0}, "'pich_um' is no setting of a scene from a picture; there are pitch_um, distance_m"),
+        ({"pich_um": 3.0}, "'pich_um' is not a parameter of Scene.from_picture; available: pitch_um, distance_m"),
         ({"pitch_um": None}, "'pitch_um' is missing"),
     ],
 )
-def test_settings_of_scenes_are_checked_before_a_picture_is_read(changes, told):
+def test_scene_parameters_are_checked_before_reading(changes, message):
     settings = {name: value for name, value in (LIGHT | changes).items() if value is not None}
-    with pytest.raises(ParameterError, match=told):
+    with pytest.raises(ParameterError, match=message):
         FrameSource(["nowhere.png"], **settings)
 
 
-def test_frames_of_another_size_are_told():
+def test_frames_of_different_size_are_rejected():
     with pytest.raises(FileError, match="frame 1: has the shape"):
         list(FrameSource([np.ones((4, 4)), np.ones((4, 5))], **LIGHT))
 
 
-def test_footage_that_is_not_there_is_told(tmp_path):
-    with pytest.raises(FileError, match="no such file or folder"):
+def test_missing_frame_source_is_rejected(tmp_path):
+    with pytest.raises(FileError, match="no such file or directory"):
         FrameSource(tmp_path / "none.mp4", **LIGHT)
-    with pytest.raises(FileError, match="holds no pictures"):
+    with pytest.raises(FileError, match="contains no pictures"):
         FrameSource(tmp_path, **LIGHT)
     with pytest.raises(ParameterError, match="source"):
         FrameSource(3, **LIGHT)
-    (tmp_path / "text.mp4").write_text("this is no video")
-    with pytest.raises(FileError, match="no video file that can be read"):
+    (tmp_path / "text.mp4").write_text("this is not a video")
+    with pytest.raises(FileError, match="is not a readable video file"):
         FrameSource(tmp_path / "text.mp4", **LIGHT)
 
 
-def test_a_missing_reader_is_told_in_one_sentence(tmp_path, monkeypatch):
+def test_missing_video_library_gives_install_command(tmp_path, monkeypatch):
     (tmp_path / "clip.mp4").write_bytes(b"0")
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(FileError, match=r"pip install 'foveasim\[video\]'"):
@@ -700,7 +699,7 @@ def captures_of(n, **sensor):
     return camera_of(rows_layout(), **sensor).video([scene_of(p) for p in pictures(n)], exposure_s=0.01, seed=5)
 
 
-def test_a_zarr_folder_holds_every_code(tmp_path, monkeypatch):
+def test_zarr_recording_contains_all_codes(tmp_path, monkeypatch):
     monkeypatch.setattr(sys.modules[read_recording.__module__], "CHUNK_CODES", 250)
     captures = list(captures_of(5))
 
@@ -722,45 +721,45 @@ def test_a_zarr_folder_holds_every_code(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("resume", [False, True])
 @pytest.mark.parametrize("other", [{"bits": 8}, {"n_x": 11}])
-def test_captures_of_other_sites_or_bits_do_not_come_into_the_same_video(tmp_path, other, resume):
+def test_captures_of_different_sensors_are_rejected(tmp_path, other, resume):
     sensor = {"bits": other["bits"]} if "bits" in other else {}
     camera = camera_of(rows_layout(n_x=other.get("n_x", 12)), **sensor)
     captures = [*captures_of(2), camera.capture(scene_of(pictures(1)[0]), exposure_s=0.01, seed=0, frame=2)]
-    with pytest.raises(ParameterError, match="must be of the same layout and bits"):
+    with pytest.raises(ParameterError, match="must have the same layout and bits"):
         write_video(captures, tmp_path / "v.zarr", resume=resume)
     assert count_recorded_frames(tmp_path / "v.zarr") == (2 if resume else 0)
 
 
-def test_what_ends_early_leaves_what_was_there(tmp_path):
+def test_failed_write_leaves_existing_files(tmp_path):
     def failing():
         yield from captures_of(2)
-        raise RuntimeError("the light went out")
+        raise RuntimeError("the source failed")
 
     write_video(captures_of(3), tmp_path / "v.zarr")
     for name in ("v.zarr", "pictures", "v.gif", "v.mp4"):
-        with pytest.raises(RuntimeError, match="the light went out"):
+        with pytest.raises(RuntimeError, match="the source failed"):
             write_video(failing(), tmp_path / name)
 
     assert [p.name for p in tmp_path.iterdir()] == ["v.zarr"]
     assert read_recording(tmp_path / "v.zarr").n_frames == 3
 
 
-def test_a_recording_may_be_written_anew_and_nothing_else_is_written_over(tmp_path):
+def test_only_recordings_are_overwritten(tmp_path):
     write_video(captures_of(3), tmp_path / "v.zarr")
     write_video(captures_of(2), tmp_path / "v.zarr")
     assert read_recording(tmp_path / "v.zarr").n_frames == 2
 
-    (tmp_path / "kept").mkdir()
-    (tmp_path / "kept" / "thesis.txt").write_text("years of work")
-    (tmp_path / "kept.zarr").mkdir()
-    (tmp_path / "kept.zarr" / "thesis.txt").write_text("years of work")
-    for name in ("kept", "kept.zarr"):
-        with pytest.raises(FileError, match="something else is there"):
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").write_text("text")
+    (tmp_path / "other.zarr").mkdir()
+    (tmp_path / "other.zarr" / "notes.txt").write_text("text")
+    for name in ("other", "other.zarr"):
+        with pytest.raises(FileError, match="the path contains other data"):
             write_video(captures_of(1), tmp_path / name)
-        assert (tmp_path / name / "thesis.txt").read_text() == "years of work"
+        assert (tmp_path / name / "notes.txt").read_text() == "text"
 
 
-def test_pictures_are_those_of_the_captures(tmp_path):
+def test_written_pictures_match_captures(tmp_path):
     from foveasim._io.images import read_picture
 
     captures = list(captures_of(2))
@@ -771,8 +770,8 @@ def test_pictures_are_those_of_the_captures(tmp_path):
         assert np.array_equal(read_picture(tmp_path / "pictures" / f"frame_{k:06d}.png"), expected)
 
 
-@pytest.mark.parametrize("ending", ["mp4", "webm", "mkv"])
-def test_a_film_comes_back_through_footage(tmp_path, ending):
+@pytest.mark.parametrize("extension", ["mp4", "webm", "mkv"])
+def test_video_file_round_trip_preserves_levels(tmp_path, extension):
     layout = rows_layout()
     grid = fs.Grid.centred((80, 90), 0.5)
     levels = np.linspace(0.1, 0.9, 6)
@@ -780,17 +779,17 @@ def test_a_film_comes_back_through_footage(tmp_path, ending):
     full = float(camera.photoelectrons_per_s(fs.PowerMap(np.ones((1, 80, 90)), grid, np.array([550.0]))).max())
     exposure_s = 1.872e6 / full
     lights = [fs.PowerMap(np.full((1, 80, 90), level), grid, np.array([550.0])) for level in levels]
-    path = tmp_path / f"film.{ending}"
+    path = tmp_path / f"film.{extension}"
 
     assert write_video(camera.video(lights, exposure_s=exposure_s, seed=0), path, max_pixels=64, frame_s=0.1) == 6
     footage = FrameSource(path, **(LIGHT | {"encoding": "srgb", "wavelength_nm": (550.0,)}))
 
     assert footage.frame_s == pytest.approx(0.1)
-    seen = [float(np.median(scene.basis)) for scene in footage]
-    assert np.allclose(seen, levels, atol=0.03)
+    found = [float(np.median(scene.basis)) for scene in footage]
+    assert np.allclose(found, levels, atol=0.03)
 
 
-def test_a_gif_has_all_its_frames(tmp_path):
+def test_gif_contains_all_frames(tmp_path):
     from PIL import Image
 
     write_video(captures_of(4), tmp_path / "v.gif", frame_s=0.1, max_pixels=40)
@@ -799,7 +798,7 @@ def test_a_gif_has_all_its_frames(tmp_path):
         assert gif.info["duration"] == 100
 
 
-def test_other_endings_and_no_captures_are_told(tmp_path):
+def test_unknown_extension_or_no_captures_is_rejected(tmp_path):
     with pytest.raises(FileError, match="must end in"):
         write_video(captures_of(1), tmp_path / "v.txt")
     for name in ("v.zarr", "v.gif", "v.mp4", "pictures"):
@@ -808,100 +807,100 @@ def test_other_endings_and_no_captures_are_told(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_that_is_no_recording_is_told(tmp_path):
-    with pytest.raises(FileError, match="no such folder"):
+def test_directory_without_recording_is_rejected(tmp_path):
+    with pytest.raises(FileError, match="no such directory"):
         read_recording(tmp_path / "none.zarr")
     (tmp_path / "empty.zarr").mkdir()
-    with pytest.raises(FileError, match="broken, or no video"):
+    with pytest.raises(FileError, match="is corrupt or not a valid video"):
         read_recording(tmp_path / "empty.zarr")
 
 
-def test_a_recording_that_names_other_programs_is_refused(tmp_path):
+def test_recording_with_unknown_codec_is_rejected(tmp_path):
     write_video(captures_of(2), tmp_path / "v.zarr")
     path = tmp_path / "v.zarr" / "code" / "zarr.json"
     path.write_text(path.read_text().replace('"zstd"', '"numcodecs.pickle"'))
-    with pytest.raises(FileError, match=r"packed with 'numcodecs\.pickle'"):
+    with pytest.raises(FileError, match=r"has the codec 'numcodecs\.pickle'"):
         read_recording(tmp_path / "v.zarr")
 
 
-def test_a_recording_of_impossible_size_is_refused(tmp_path):
+def test_recording_of_excessive_size_is_rejected(tmp_path):
     write_video(captures_of(2), tmp_path / "v.zarr")
     path = tmp_path / "v.zarr" / "xy_um" / "zarr.json"
     text = path.read_text()
     path.write_text(text.replace("480", str(10**10), 1))
     assert path.read_text() != text
-    with pytest.raises(FileError, match="would unpack to more"):
+    with pytest.raises(FileError, match="would decompress to more"):
         read_recording(tmp_path / "v.zarr")
 
 
-def test_progress_counts_the_frames(tmp_path, capsys):
+def test_progress_bar_counts_frames(tmp_path, capsys):
     write_video(captures_of(2), tmp_path / "v.zarr", progress=True, n_frames=2)
 
     assert "frames" in capsys.readouterr().out
 
 
-# -- recordings that were ended ---------------------------------------------------------------------------------------
+# -- interrupted recordings -------------------------------------------------------------------------------------------
 
-#: A rolling shutter, a bracket, and two frames of light from capture to capture.
+#: A rolling shutter, an exposure bracket, and two frames per capture.
 ROLLING = {"exposure_s": [0.002, 0.008, 0.005], "seed": 5, "frame_s": 0.004, "line_s": 1e-3, "every": 2}
 
 
-class LightsOutError(Exception):
-    """What ends a recording."""
+class InterruptionError(Exception):
+    """Interrupts a recording."""
 
 
 def rolling(n_before, n_frames=22, **sensor):
-    """Captures after those that are kept."""
+    """Return the captures after ``n_before`` recorded ones."""
     footage = FrameSource(pictures(n_frames), **LIGHT).from_frame(2 * n_before)
     return camera_of(rows_layout(), **sensor).video(footage, **ROLLING, first_frame=n_before)
 
 
-def cut(captures, n):
-    """So many captures, and an error instead of the next."""
+def interrupted(captures, n):
+    """Yield ``n`` captures, then raise an error."""
     yield from islice(captures, n)
-    raise LightsOutError
+    raise InterruptionError
 
 
-def files_of(folder):
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+def files_of(directory):
+    return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
 
 
 @pytest.fixture
 def small_chunks(monkeypatch):
-    """Four frames of 120 sites a chunk."""
+    """Set chunks of four frames of 120 sites."""
     monkeypatch.setattr(sys.modules[read_recording.__module__], "CHUNK_CODES", 500)
 
 
 @pytest.mark.usefixtures("small_chunks")
-@pytest.mark.parametrize("ends", [(0, 3), (4, 1, 4), (5, 6), (11,), (1, 0, 1)])
-def test_a_recording_that_was_ended_goes_on_and_is_the_whole_one_to_the_byte(tmp_path, ends):
+@pytest.mark.parametrize("n_added", [(0, 3), (4, 1, 4), (5, 6), (11,), (1, 0, 1)])
+def test_interrupted_recording_resumes_bit_identically(tmp_path, n_added):
     path, n = tmp_path / "v.zarr", 0
-    for more in ends:
+    for more in n_added:
         assert count_recorded_frames(path) == n
-        with pytest.raises(LightsOutError) as ended:
-            write_video(cut(rolling(n), more), path, resume=True)
+        with pytest.raises(InterruptionError) as caught:
+            write_video(interrupted(rolling(n), more), path, resume=True)
         n += more
-        notes = [f"{n} frames are kept in {partial_path(path)}, from which the same recording goes on"] if n else []
-        assert getattr(ended.value, "__notes__", []) == notes
+        notes = [f"{n} frames are stored in {partial_path(path)}; the same call resumes the recording"] if n else []
+        assert getattr(caught.value, "__notes__", []) == notes
         assert [p.name for p in tmp_path.iterdir()] == (["v.zarr.partial"] if n else [])
 
     assert write_video(rolling(n), path, resume=True) == 11
-    write_video(rolling(0), tmp_path / "whole.zarr")
+    write_video(rolling(0), tmp_path / "expected.zarr")
 
-    assert files_of(path) == files_of(tmp_path / "whole.zarr")
+    assert files_of(path) == files_of(tmp_path / "expected.zarr")
     assert not partial_path(path).exists()
     assert count_recorded_frames(path) == read_recording(path).n_frames == 11
     assert write_video(rolling(count_recorded_frames(path)), path, resume=True) == 11
 
 
 @pytest.mark.usefixtures("small_chunks")
-def test_ctrl_c_keeps_every_frame(tmp_path):
-    def interrupted():
+def test_ctrl_c_preserves_all_frames(tmp_path):
+    def ctrl_c():
         yield from islice(rolling(0), 6)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_video(interrupted(), tmp_path / "v.zarr", resume=True)
+        write_video(ctrl_c(), tmp_path / "v.zarr", resume=True)
 
     assert count_recorded_frames(tmp_path / "v.zarr") == 6
 
@@ -930,28 +929,28 @@ def wait_for(condition, limit_s=60.0):
         time.sleep(0.005)
 
 
-def test_a_program_that_is_killed_leaves_its_recording_whole(tmp_path, monkeypatch):
+def test_killed_process_leaves_valid_recording(tmp_path, monkeypatch):
     script, path = tmp_path / "record.py", tmp_path / "v.zarr"
     script.write_text(f"TESTS = {str(Path(__file__).parent)!r}\n{RECORDER}")
-    kept = 0
+    n_recorded = 0
     for more in (2, 3):
         running = subprocess.Popen([sys.executable, script], cwd=tmp_path)
-        wait_for(lambda enough=kept + more: count_recorded_frames(path) >= enough)
+        wait_for(lambda n_expected=n_recorded + more: count_recorded_frames(path) >= n_expected)
         running.kill()
         assert running.wait() == -signal.SIGKILL
-        assert kept + more <= count_recorded_frames(path) < 11
-        kept = count_recorded_frames(path)
+        assert n_recorded + more <= count_recorded_frames(path) < 11
+        n_recorded = count_recorded_frames(path)
 
     monkeypatch.setattr(sys.modules[read_recording.__module__], "CHUNK_CODES", 500)
-    assert write_video(rolling(kept), path, resume=True) == 11
-    write_video(rolling(0), tmp_path / "whole.zarr")
-    assert files_of(path) == files_of(tmp_path / "whole.zarr")
+    assert write_video(rolling(n_recorded), path, resume=True) == 11
+    write_video(rolling(0), tmp_path / "expected.zarr")
+    assert files_of(path) == files_of(tmp_path / "expected.zarr")
 
 
 @pytest.mark.usefixtures("small_chunks")
-def test_a_disk_that_is_full_at_any_file_is_told_and_loses_no_whole_frame(tmp_path, monkeypatch):
-    write_video(rolling(0), tmp_path / "whole.zarr")
-    whole, replace, n_full = files_of(tmp_path / "whole.zarr"), Path.replace, 0
+def test_full_disk_loses_no_complete_frame(tmp_path, monkeypatch):
+    write_video(rolling(0), tmp_path / "expected.zarr")
+    expected, replace, n_full = files_of(tmp_path / "expected.zarr"), Path.replace, 0
     monkeypatch.setattr(sys.modules[read_recording.__module__], "WRITE_S", 0.0)
 
     def fill_after(n_files):
@@ -971,75 +970,76 @@ def test_a_disk_that_is_full_at_any_file_is_told_and_loses_no_whole_frame(tmp_pa
             write_video(rolling(0), path, resume=True)
         except FileError as error:
             n_full += 1
-            assert "cannot be written: No space left on device" in str(error)  # noqa: PT017 -- some come through
+            assert "cannot be written: No space left on device" in str(error)  # noqa: PT017 -- some calls succeed
         monkeypatch.setattr(Path, "replace", replace)
-        kept = count_recorded_frames(path)
-        if kept:
-            assert np.array_equal(codes_of(path, kept), read_recording(tmp_path / "whole.zarr").code[:kept])
-        assert write_video(rolling(kept), path, resume=True) == 11
-        assert files_of(path) == whole
+        n_recorded = count_recorded_frames(path)
+        if n_recorded:
+            codes = read_recording(tmp_path / "expected.zarr").code[:n_recorded]
+            assert np.array_equal(codes_of(path, n_recorded), codes)
+        assert write_video(rolling(n_recorded), path, resume=True) == 11
+        assert files_of(path) == expected
     assert n_full > 8
 
 
 def codes_of(path, n):
-    """The first codes of a recording, finished or not."""
+    """Return the codes of the first frames of a finished or interrupted recording."""
     import zarr
 
     return zarr.open_array(str(path if path.exists() else partial_path(path)), path="code", mode="r")[:n]
 
 
-def test_frames_are_kept_every_few_seconds_though_no_chunk_is_full(tmp_path, monkeypatch):
-    path, kept = tmp_path / "v.zarr", []
+def test_frames_are_written_at_time_intervals(tmp_path, monkeypatch):
+    path, n_recorded = tmp_path / "v.zarr", []
 
     def watched():
         for capture in rolling(0):
-            kept.append(count_recorded_frames(path))
+            n_recorded.append(count_recorded_frames(path))
             yield capture
 
     monkeypatch.setattr(sys.modules[read_recording.__module__], "WRITE_S", 0.0)
     write_video(watched(), path, resume=True)
 
-    assert kept == list(range(11))
+    assert n_recorded == list(range(11))
 
 
 @pytest.mark.usefixtures("small_chunks")
-def test_another_recording_is_not_gone_on_with(tmp_path):
+def test_different_recording_is_not_resumed(tmp_path):
     path = tmp_path / "v.zarr"
-    with pytest.raises(LightsOutError):
-        write_video(cut(rolling(0), 5), path, resume=True, plan={"gaze": {"seed": 1}})
+    with pytest.raises(InterruptionError):
+        write_video(interrupted(rolling(0), 5), path, resume=True, plan={"gaze": {"seed": 1}})
     before = files_of(partial_path(path))
 
-    def other(how=None, light=None, plan=1, **sensor):
+    def message_of(options=None, light=None, plan=1, **sensor):
         layout = sensor.pop("layout", rows_layout())
         footage = FrameSource(pictures(22), **(LIGHT | (light or {}))).from_frame(10)
-        captures = camera_of(layout, **sensor).video(footage, **(ROLLING | {"first_frame": 5} | (how or {})))
+        captures = camera_of(layout, **sensor).video(footage, **(ROLLING | {"first_frame": 5} | (options or {})))
         with pytest.raises((FileError, ParameterError)) as rejected:
             write_video(captures, path, resume=True, plan={"gaze": {"seed": plan}})
         assert files_of(partial_path(path)) == before
         return str(rejected.value)
 
     columns = rows_layout().with_columns(zone=np.arange(120))
-    moved = rows_layout().translate(0.1, 0.0)
+    shifted = rows_layout().translate(0.1, 0.0)
     for name, changes in {
         "gaze.seed": {"plan": 2},
         "bits": {"bits": 8},
         "sensor.read_noise_e": {"read_noise_e": 3.0},
-        "layout": {"layout": moved},
-        "seed": {"how": {"seed": 6}},
-        "line_s": {"how": {"line_s": 2e-3}},
-        "every": {"how": {"every": 3}},
+        "layout": {"layout": shifted},
+        "seed": {"options": {"seed": 6}},
+        "line_s": {"options": {"line_s": 2e-3}},
+        "every": {"options": {"every": 3}},
         "light.pitch_um": {"light": {"pitch_um": 11.0}},
         "light.spectrum_w_m2_sr_nm": {"light": {"peak_radiance_w_m2_sr_nm": 0.2}},
     }.items():
-        assert f"is another recording: '{name}' differs; write this one under another name" in other(**changes)
-    assert "'layout' differs" in other(layout=columns)
+        assert f"is another recording: '{name}' differs; choose another path" in message_of(**changes)
+    assert "'layout' differs" in message_of(layout=columns)
     for first_frame in (0, 4, 6):
-        told = other(how={"first_frame": first_frame})
-        assert "after 5 frames comes the number 5; leave out the light of the first 5" in told
-        assert f"got {first_frame}" in told
+        message = message_of(options={"first_frame": first_frame})
+        assert "expected 5 after 5 frames; skip the scenes of the first 5 frames" in message
+        assert f"got {first_frame}" in message
 
 
-def test_a_recording_through_other_filters_is_another_one(tmp_path):
+def test_recording_with_different_filters_is_rejected(tmp_path):
     layout = rows_layout()
     layout = layout.with_columns(channel=np.arange(layout.n_sites) % 3)
     for filters, rejection in ((None, None), ("rgb", "'filters' differs")):
@@ -1047,48 +1047,48 @@ def test_a_recording_through_other_filters_is_another_one(tmp_path):
         captures = camera_of(layout, filters=filters).video(
             [scene_of(p) for p in pictures(3)[n:]], exposure_s=0.01, seed=5, first_frame=n
         )
-        with pytest.raises(LightsOutError if rejection is None else FileError, match=rejection):
-            write_video(cut(captures, 2), tmp_path / "v.zarr", resume=True)
+        with pytest.raises(InterruptionError if rejection is None else FileError, match=rejection):
+            write_video(interrupted(captures, 2), tmp_path / "v.zarr", resume=True)
 
 
-def test_what_differed_between_frames_before_may_differ_after(tmp_path):
-    """A zoom: the distance is another one in every frame."""
+def test_settings_that_varied_may_vary_after_resuming(tmp_path):
+    """The distance differs between frames."""
     path = tmp_path / "v.zarr"
     scenes = [fs.Scene.from_picture(p, **(LIGHT | {"distance_m": 0.5 - 0.02 * k})) for k, p in enumerate(pictures(4))]
 
-    def zoomed(n, **sensor):
+    def moving(n, **sensor):
         return camera_of(rows_layout(), **sensor).video(scenes[n:], exposure_s=0.01, seed=1, first_frame=n)
 
-    with pytest.raises(LightsOutError):
-        write_video(cut(zoomed(0), 2), path, resume=True)
+    with pytest.raises(InterruptionError):
+        write_video(interrupted(moving(0), 2), path, resume=True)
     with pytest.raises(FileError, match=r"sensor\.read_noise_e"):
-        write_video(zoomed(2, read_noise_e=3.0), path, resume=True)
-    assert write_video(zoomed(2), path, resume=True) == 4
-    assert np.array_equal(read_recording(path).code[:], [c.code for c in zoomed(0)])
+        write_video(moving(2, read_noise_e=3.0), path, resume=True)
+    assert write_video(moving(2), path, resume=True) == 4
+    assert np.array_equal(read_recording(path).code[:], [c.code for c in moving(0)])
 
 
-def test_frames_that_are_not_numbered_one_after_the_other_are_told_before_they_are_lost(tmp_path):
+def test_nonconsecutive_frames_cannot_be_recorded_resumably(tmp_path):
     captures = [next(captures_of(1)) for _ in range(2)]
-    with pytest.raises(ParameterError, match="numbered one after the other"):
+    with pytest.raises(ParameterError, match="must have consecutive frame numbers"):
         write_video(captures, tmp_path / "v.zarr", resume=True)
     assert write_video(captures, tmp_path / "v.zarr") == 2
 
 
-def test_two_programs_do_not_write_the_same_recording(tmp_path):
+def test_recording_is_locked_while_writing(tmp_path):
     path = tmp_path / "v.zarr"
 
-    def meddled():
+    def concurrent():
         for k, capture in enumerate(rolling(0)):
             if k in (0, 3):
-                with pytest.raises(FileError, match="is being written by another program"):
+                with pytest.raises(FileError, match="is being written by another process"):
                     write_video(rolling(0), path, resume=True)
             yield capture
 
-    assert write_video(meddled(), path, resume=True) == 11
+    assert write_video(concurrent(), path, resume=True) == 11
     assert np.array_equal(read_recording(path).code[:], [c.code for c in rolling(0)])
 
 
-def test_a_finished_recording_is_left_as_it_is(tmp_path):
+def test_finished_recording_is_unchanged(tmp_path):
     path = tmp_path / "v.zarr"
     write_video(rolling(0), path, resume=True, plan={"a": 1})
     before = files_of(path)
@@ -1101,61 +1101,61 @@ def test_a_finished_recording_is_left_as_it_is(tmp_path):
     with pytest.raises(FileError, match="is another recording: 'a' differs"):
         write_video(never(), path, resume=True, plan={"a": 2})
     write_video(rolling(0), tmp_path / "w.zarr")
-    with pytest.raises(FileError, match="is finished, with 11 frames, and nothing is put after them"):
+    with pytest.raises(FileError, match="is a finished recording of 11 frames, to which captures cannot be appended"):
         write_video(rolling(10), tmp_path / "w.zarr", resume=True)
     assert files_of(path) == before
 
 
-def test_something_else_in_the_place_of_a_recording_is_left_alone(tmp_path):
-    for name, place in (("a", "a.zarr"), ("b", "b.zarr.partial")):
-        (tmp_path / place).mkdir()
-        (tmp_path / place / "thesis.txt").write_text("years of work")
-        with pytest.raises(FileError, match="something else is there"):
+def test_other_data_are_not_overwritten(tmp_path):
+    for name, existing in (("a", "a.zarr"), ("b", "b.zarr.partial")):
+        (tmp_path / existing).mkdir()
+        (tmp_path / existing / "notes.txt").write_text("text")
+        with pytest.raises(FileError, match="the path contains other data"):
             write_video(rolling(0), tmp_path / f"{name}.zarr", resume=True)
-        assert files_of(tmp_path / place) == {"thesis.txt": b"years of work"}
-    (tmp_path / "c.zarr.partial").write_text("years of work")
-    with pytest.raises(FileError, match="something else is there"):
+        assert files_of(tmp_path / existing) == {"notes.txt": b"text"}
+    (tmp_path / "c.zarr.partial").write_text("text")
+    with pytest.raises(FileError, match="the path contains other data"):
         write_video(rolling(0), tmp_path / "c.zarr", resume=True)
     with pytest.raises(FileError, match="does not exist"):
         write_video(rolling(0), tmp_path / "none" / "c.zarr", resume=True)
 
 
-def test_only_zarr_folders_are_gone_on_with(tmp_path):
+def test_only_zarr_recordings_can_be_resumed(tmp_path):
     for name in ("v.mp4", "v.gif", "pictures"):
-        with pytest.raises(ParameterError, match=r"'resume' is for \.zarr folders"):
+        with pytest.raises(ParameterError, match=r"'resume' is supported for \.zarr stores only"):
             write_video(rolling(0), tmp_path / name, resume=True)
-        with pytest.raises(FileError, match=r"is no \.zarr folder"):
+        with pytest.raises(FileError, match=r"must end in \.zarr"):
             count_recorded_frames(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.usefixtures("small_chunks")
-def test_progress_goes_on_from_the_frames_that_are_kept(tmp_path, capsys):
-    with pytest.raises(LightsOutError):
-        write_video(cut(rolling(0), 6), tmp_path / "v.zarr", resume=True, progress=True, n_frames=11)
+def test_progress_bar_continues_after_resuming(tmp_path, capsys):
+    with pytest.raises(InterruptionError):
+        write_video(interrupted(rolling(0), 6), tmp_path / "v.zarr", resume=True, progress=True, n_frames=11)
     assert "55%" in capsys.readouterr().out
     write_video(rolling(6), tmp_path / "v.zarr", resume=True, progress=True, n_frames=11)
     assert "100%" in capsys.readouterr().out
 
 
-def test_footage_from_a_frame_on_is_the_rest_of_it(tmp_path):
+def test_frame_source_from_frame_is_remainder(tmp_path):
     film = tmp_path / "film.mp4"
     write_video(captures_of(7), film, max_pixels=64, frame_s=0.1)
     for source in (film, pictures(7)):
         footage = FrameSource(source, start=1, step=2, **(LIGHT | {"wavelength_nm": (550.0,)}))
-        whole = [scene.basis for scene in footage]
-        assert len(whole) == 3
+        expected = [scene.basis for scene in footage]
+        assert len(expected) == 3
         for n in range(5):
-            rest = footage.from_frame(n)
-            assert rest.n_frames == max(3 - n, 0)
-            assert rest.frame_s == footage.frame_s
-            assert [b.tobytes() for b in whole[n:]] == [scene.basis.tobytes() for scene in rest]
+            remaining = footage.from_frame(n)
+            assert remaining.n_frames == max(3 - n, 0)
+            assert remaining.frame_s == footage.frame_s
+            assert [b.tobytes() for b in expected[n:]] == [scene.basis.tobytes() for scene in remaining]
     with pytest.raises(ParameterError, match="'n'"):
         footage.from_frame(-1)
 
 
-def test_metadata_that_were_put_together_are_not_what_is_opened(tmp_path):
-    """Zarr may keep all metadata in one place, where those of an array may name another program than in their own."""
+def test_consolidated_metadata_are_ignored(tmp_path):
+    """Consolidated metadata of zarr could name a codec that the metadata of the array do not name."""
     path = tmp_path / "v.zarr"
     codes = [c.code for c in captures_of(2)]
     write_video(captures_of(2), path)
@@ -1171,7 +1171,7 @@ def test_metadata_that_were_put_together_are_not_what_is_opened(tmp_path):
     assert np.array_equal(read_recording(path).code[:], codes)
 
 
-# -- the command ------------------------------------------------------------------------------------------------------
+# -- command line -----------------------------------------------------------------------------------------------------
 
 SHOT = """
 scene: {kind: picture, picture: photo.png, pitch_um: 100, distance_m: 1.0, peak_radiance_w_m2_sr_nm: 0.2}
@@ -1182,7 +1182,7 @@ exposure_s: 0.01
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
+def directory(tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     (tmp_path / "shot.yaml").write_text(SHOT)
     (tmp_path / "frames").mkdir()
@@ -1194,99 +1194,100 @@ def folder(tmp_path, monkeypatch):
 
 
 def command(*arguments):
-    """Exit code of the command video, in this process."""
+    """Run the command ``video`` in this process and return its exit code."""
     from foveasim.cli import main
 
     before, sys.argv = sys.argv, ["foveasim", "video", *arguments]
     try:
         main()
-    except SystemExit as ended:
-        return ended.code or 0
+    except SystemExit as error:
+        return error.code or 0
     finally:
         sys.argv = before
     return 0
 
 
-def test_the_command_takes_a_folder_with_the_camera_of_a_shot(folder, capsys):
+def test_command_records_directory_with_shot_camera(directory, capsys):
     assert command("shot.yaml", "--frames", "frames", "--out", "v.zarr") == 0
-    recording = read_recording(folder / "v.zarr")
+    recording = read_recording(directory / "v.zarr")
 
     assert recording.n_frames == 3
     assert "3 frames" in capsys.readouterr().out
     from foveasim.config import read_shot
 
     shot = read_shot("shot.yaml", ["scene.picture=frames/2.png"])
-    alone = shot.camera.capture(shot.scene, exposure_s=0.01, seed=0, frame=2)
-    assert np.array_equal(recording.code[2], alone.code)
+    single = shot.camera.capture(shot.scene, exposure_s=0.01, seed=0, frame=2)
+    assert np.array_equal(recording.code[2], single.code)
 
 
-def test_the_command_stops_after_so_many_frames(folder):
+def test_command_stops_after_given_frames(directory):
     assert command("shot.yaml", "--frames", "frames", "--out", "pictures", "--stop", "2") == 0
 
-    assert sorted(p.name for p in (folder / "pictures").iterdir()) == ["frame_000000.png", "frame_000001.png"]
+    assert sorted(p.name for p in (directory / "pictures").iterdir()) == ["frame_000000.png", "frame_000001.png"]
 
 
-def run_command(*arguments, **how):
+def run_command(*arguments, **options):
     return subprocess.Popen(
         [sys.executable, "-m", "foveasim.cli", "video", "shot.yaml", "--frames", "frames", *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        **how,
+        **options,
     )
 
 
-def test_the_command_goes_on_where_it_was_stopped(folder, capsys):
-    frames, out = folder / "frames", folder / "v.zarr"
+def test_stopped_command_resumes(directory, capsys):
+    frames, out = directory / "frames", directory / "v.zarr"
     for k in range(3, 400):
         os.link(frames / f"{k % 3}.png", frames / f"{k}.png")
-    kept = 0
-    for later_s in (0.1, 0.3, 1.0):  # the first frame may not be taken yet
-        running = run_command("--out", "v.zarr", cwd=folder)
+    n_recorded = 0
+    for delay_s in (0.1, 0.3, 1.0):  # the first frame may not be recorded yet
+        running = run_command("--out", "v.zarr", cwd=directory)
         wait_for((partial_path(out) / "frame" / "zarr.json").exists)
-        time.sleep(later_s)
+        time.sleep(delay_s)
         running.send_signal(signal.SIGINT)
-        _, told = running.communicate(timeout=60)
+        _, message = running.communicate(timeout=60)
         assert running.returncode == 130
-        kept = count_recorded_frames(out)
-        if kept:
+        n_recorded = count_recorded_frames(out)
+        if n_recorded:
             break
-        assert told == "stopped\n"
+        assert message == "stopped\n"
 
-    assert told == f"stopped; {kept} frames are kept beside v.zarr, and the same command goes on from there\n"
-    assert 0 < kept < 400
+    assert message.startswith("stopped; ")
+    assert f"{n_recorded} frames" in message
+    assert 0 < n_recorded < 400
     assert not out.exists()
 
-    asked = ("shot.yaml", "--frames", "frames", "--out", "v.zarr")
-    assert command(*asked, "--set", "sensor.read_noise_e=9") == 2
+    arguments = ("shot.yaml", "--frames", "frames", "--out", "v.zarr")
+    assert command(*arguments, "--set", "sensor.read_noise_e=9") == 2
     assert "is another recording: 'sensor.read_noise_e' differs" in capsys.readouterr().err
-    assert command(*asked) == 0
+    assert command(*arguments) == 0
     assert "wrote v.zarr: 400 frames" in capsys.readouterr().out
-    assert command("shot.yaml", "--frames", "frames", "--out", "whole.zarr") == 0
-    assert files_of(out) == files_of(folder / "whole.zarr")
+    assert command("shot.yaml", "--frames", "frames", "--out", "expected.zarr") == 0
+    assert files_of(out) == files_of(directory / "expected.zarr")
 
 
-def test_a_frame_that_cannot_be_read_costs_none_of_those_that_were_taken(folder, capsys):
-    good = (folder / "frames" / "2.png").read_bytes()
-    (folder / "frames" / "2.png").write_bytes(good[:-100].ljust(len(good), b"\0"))
-    asked = ("shot.yaml", "--frames", "frames", "--out", "v.zarr")
+def test_corrupt_frame_loses_no_recorded_frame(directory, capsys):
+    good = (directory / "frames" / "2.png").read_bytes()
+    (directory / "frames" / "2.png").write_bytes(good[:-100].ljust(len(good), b"\0"))
+    arguments = ("shot.yaml", "--frames", "frames", "--out", "v.zarr")
 
-    assert command(*asked) == 2
-    # One may be read, and not yet seen by the sensor, when the next cannot be.
+    assert command(*arguments) == 2
+    # The error may be raised while the previous frame has been read but not captured.
     assert 1 <= count_recorded_frames("v.zarr") <= 2
-    assert " frames are kept in v.zarr.partial, from which the same recording goes on" in capsys.readouterr().err
-    (folder / "frames" / "2.png").write_bytes(good)
-    assert command(*asked) == 0
-    assert read_recording(folder / "v.zarr").frame.tolist() == [0, 1, 2]
+    assert " frames are stored in v.zarr.partial; the same call resumes the recording" in capsys.readouterr().err
+    (directory / "frames" / "2.png").write_bytes(good)
+    assert command(*arguments) == 0
+    assert read_recording(directory / "v.zarr").frame.tolist() == [0, 1, 2]
 
 
-def test_the_command_does_a_finished_recording_not_again_and_another_one_not_over_it(folder, capsys):
-    asked = ("shot.yaml", "--frames", "frames", "--out", "v.zarr")
-    assert command(*asked) == 0
-    before = files_of(folder / "v.zarr")
+def test_command_leaves_finished_recordings_unchanged(directory, capsys):
+    arguments = ("shot.yaml", "--frames", "frames", "--out", "v.zarr")
+    assert command(*arguments) == 0
+    before = files_of(directory / "v.zarr")
     capsys.readouterr()
 
-    assert command(*asked) == 0
+    assert command(*arguments) == 0
     assert "v.zarr was finished before: 3 frames" in capsys.readouterr().out
     for changes, name in (
         (("--set", "optics.f_number=4"), "optics.f_number"),
@@ -1294,37 +1295,37 @@ def test_the_command_does_a_finished_recording_not_again_and_another_one_not_ove
         (("--set", "layout.parameters.pitch_um=2.9"), "layout.parameters.pitch_um"),
         (("--set", "exposure_s=0.02"), "exposure_s"),
     ):
-        assert command(*asked, *changes) == 2
+        assert command(*arguments, *changes) == 2
         assert f"is another recording: '{name}' differs" in capsys.readouterr().err
-    write_picture(folder / "frames" / "3.png", np.zeros((120, 160, 3), np.uint8))
-    assert command(*asked) == 2
+    write_picture(directory / "frames" / "3.png", np.zeros((120, 160, 3), np.uint8))
+    assert command(*arguments) == 2
     assert "is another recording: 'frames' differs" in capsys.readouterr().err
-    assert files_of(folder / "v.zarr") == before
-    # Pictures to look at are made again, as ever.
+    assert files_of(directory / "v.zarr") == before
+    # Other formats are written again.
     for k in ("2", "3"):
         assert command("shot.yaml", "--frames", "frames", "--out", "v.gif", "--stop", k) == 0
 
 
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    ("arguments", "message"),
     [
-        (("--frames", "none"), "no such file or folder"),
+        (("--frames", "none"), "no such file or directory"),
         (("--frames", "frames", "--fps", "0"), "--fps must be > 0"),
         (("--frames", "frames", "--line-s", "1e-4"), "frame_s"),
         (("--frames", "frames", "--line-s", "1e-4", "--fps", "30"), "readout_order"),
         (("--frames", "frames", "--out", "v.txt"), "must end in"),
     ],
 )
-@pytest.mark.usefixtures("folder")
-def test_the_command_tells_what_is_wrong_in_one_sentence(capsys, arguments, sentence):
+@pytest.mark.usefixtures("directory")
+def test_command_errors_are_one_line(capsys, arguments, message):
     assert command("shot.yaml", *arguments) == 2
     error = capsys.readouterr().err
 
-    assert sentence in error
+    assert message in error
     assert "Traceback" not in error
 
 
-def test_frames_like_a_scene_have_its_light():
+def test_template_scene_specifies_frame_settings():
     grey, colour = (
         fs.Scene.from_picture(p, **(LIGHT | {"peak_radiance_w_m2_sr_nm": 0.3, "wavelength_nm": w}))
         for p, w in ((np.ones((4, 5)), (500.0,)), (np.ones((4, 5, 3)), (600.0, 550.0, 500.0)))

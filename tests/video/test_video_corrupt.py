@@ -1,4 +1,4 @@
-"""Video files with flipped bits: their frames, or one of our errors."""
+"""Corrupt video files: frames or FileErrors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ av = pytest.importorskip("av")
 SCENE = {"pitch_um": 1.0, "distance_m": 1.0, "peak_radiance_w_m2_sr_nm": 1.0}
 
 
-def film(path, codec):
+def write_film(path, codec):
     with av.open(str(path), mode="w") as container:
         container.metadata["title"] = "a title"
         stream = container.add_stream(codec, rate=Fraction(25))
@@ -28,7 +28,7 @@ def film(path, codec):
 
 
 def flipped(content, seed):
-    """The content with some bits flipped, every tenth also truncated."""
+    """Return the content with some bits flipped; every tenth is also truncated."""
     draw = random.Random(seed)
     bad = bytearray(content if seed % 10 else content[: draw.randrange(1, len(content))])
     for _ in range(draw.choice((1, 1, 2, 5, 40))):
@@ -38,7 +38,7 @@ def flipped(content, seed):
 
 @pytest.mark.parametrize(("name", "codec"), [("a.mp4", "libx264"), ("a.mkv", "ffv1")])
 def test_flipped_bits_give_frames_or_file_errors(tmp_path, name, codec):
-    content = film(tmp_path / name, codec)
+    content = write_film(tmp_path / name, codec)
     bad = tmp_path / f"bad{name}"
     n_read, messages = 0, set()
     for seed in range(200):
@@ -55,8 +55,8 @@ def test_flipped_bits_give_frames_or_file_errors(tmp_path, name, codec):
     assert all(len(message) < 300 and message.isprintable() for message in messages)
 
 
-def test_metadata_outside_utf8_are_no_reason_to_reject(tmp_path):
-    content = film(tmp_path / "a.mp4", "libx264")
+def test_non_utf8_metadata_are_ignored(tmp_path):
+    content = write_film(tmp_path / "a.mp4", "libx264")
     bad = content.replace(b"a title", b"\xe1 t\xff\xfeit")
     assert bad != content
     (tmp_path / "bad.mp4").write_bytes(bad)
