@@ -891,7 +891,7 @@ def npz(path, **changes):
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"column_evil": np.array([{"a": 1}], dtype=object)}, "array of objects"),
+        ({"column_evil": np.array([{"a": 1}], dtype=object)}, "array of Python objects"),
         ({"xy_um": np.array([[0.0, 0], [0, 1], [1, 0]])}, "wound the wrong way"),
         ({"xy_um": np.array([[0.0, 0], [np.nan, 1], [1, 0]])}, "finite"),
         ({"ring_offsets": np.array([0, 9])}, "ring_offsets"),
@@ -926,7 +926,7 @@ def test_huge_npz_array_rejected_before_allocation(tmp_path):
 
 def test_npz_decompression_limit_is_enforced(tmp_path, monkeypatch):
     monkeypatch.setattr("foveasim.layout.files._common.MAX_UNPACKED_BYTES", 1000)
-    with pytest.raises(FileError, match="would unpack to more than 1000 bytes"):
+    with pytest.raises(FileError, match="would decompress to more than 1000 bytes"):
         read_layout(npz(tmp_path / "a.npz", column_a=np.zeros(200)))
 
 
@@ -961,7 +961,7 @@ def test_parquet_decompression_limit_is_enforced(small, tmp_path, monkeypatch):
 def test_too_large_files_are_rejected(small, tmp_path, monkeypatch):
     write_layout(small, tmp_path / "a.npz")
     monkeypatch.setattr("foveasim._io.formats.MAX_FILE_BYTES", 100)
-    with pytest.raises(FileError, match="more than the 100 that are read"):
+    with pytest.raises(FileError, match="more than the limit of 100"):
         read_layout(tmp_path / "a.npz")
 
 
