@@ -208,6 +208,8 @@ def chosen_options(
     for name, value in given.items():
         if name not in known:
             titles = sorted({found.title for found in formats.values() if name in getattr(found, of)})
-            belongs = f"belongs to {' and '.join(titles)} files" if titles else "is not an option of any format"
-            raise ParameterError(name, belongs, value, hint="leave it out")
+            belongs = (
+                f"is an option of {' and '.join(titles)} files only" if titles else "is not an option of any format"
+            )
+            raise ParameterError(name, belongs, value, hint="omit it")
     return given

@@ -476,7 +476,7 @@ def _too_many(n_frames: int) -> SimulationError:
 
 
 def _rising(values: Floats) -> Ints:
-    """Return the indices of a stable sort, four times as fast as a stable sort of numpy."""
+    """Return the indices of a stable sort, four times as fast as numpy."""
     order = np.argsort(values)
     in_order = values[order]
     is_tied = np.zeros(values.size, bool)

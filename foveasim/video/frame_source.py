@@ -122,7 +122,7 @@ class FrameSource:
             self._check_some(self.n_frames)
 
     def __repr__(self) -> str:
-        return f"FrameSource({self.n_frames or 'any number of'} frames)"
+        return f"FrameSource({self.n_frames or 'unknown number of'} frames)"
 
     @property
     def frame_s(self) -> float | None:

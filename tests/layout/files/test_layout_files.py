@@ -683,13 +683,13 @@ def test_layer_and_cell_must_be_selected(tmp_path):
 def test_options_of_other_formats_are_rejected(zoo, tmp_path, options, extension):
     (name,) = options
     belongs = "SVG" if name == "colours" else "GDSII and OASIS"
-    with pytest.raises(ParameterError, match=f"'{name}' belongs to {belongs} files, got .*; leave it out"):
+    with pytest.raises(ParameterError, match=f"'{name}' is an option of {belongs} files only, got .*; omit it"):
         write_layout(zoo, tmp_path / f"a.{extension}", **options)
 
 
 def test_gdsii_read_option_rejected_for_npz(zoo, tmp_path):
     write_layout(zoo, tmp_path / "a.npz")
-    with pytest.raises(ParameterError, match="'layer' belongs to GDSII and OASIS files"):
+    with pytest.raises(ParameterError, match="'layer' is an option of GDSII and OASIS files"):
         read_layout(tmp_path / "a.npz", layer=1)
 
 
