@@ -32,7 +32,7 @@ from video import bench_video
 import foveasim as fs
 from foveasim._core.random_streams import Streams
 from foveasim._core.threads import thread_count
-from foveasim.sensor.blocks import in_blocks
+from foveasim.sensor.blocks import for_each_block
 from layouts import bench_layouts
 
 #: The largest picture of the paper.
@@ -253,7 +253,7 @@ def bench_sensor(report: Report, n_side: int) -> None:
     def numbers() -> None:
         # Shot, reset and read noise.
         for effect in ("shot", "reset", "read"):
-            in_blocks(
+            for_each_block(
                 layout.n_sites, lambda k, sites, e=effect: Streams(1).of(e, k).standard_normal(sites.stop - sites.start)
             )
 

@@ -16,12 +16,12 @@ from foveasim._core.provenance import copied, to_plain_data
 from foveasim._core.rings import same_rings
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, own, read_only, unit_of, unmasked
 from foveasim._io.atomic import atomic_directory
-from foveasim._io.npz import opened_archive, write_archive
-from foveasim._io.zarr_stores import ZARR, Variable, free_name, opened_store, store_format, write_variables
+from foveasim._io.npz import open_archive, write_archive
+from foveasim._io.zarr_stores import ZARR, Variable, free_name, open_store, store_format, write_variables
 from foveasim.errors import FileError, ParameterError
 from foveasim.fields import Grid
 from foveasim.layout import Layout
-from foveasim.layout.packed import packed_layout, unpacked_layout
+from foveasim.layout.packed import layout_from_arrays, layout_to_arrays
 from foveasim.reconstruct import (
     Picture,
     SiteEstimates,
@@ -432,7 +432,7 @@ class Capture:
             "provenance": to_plain_data(dict(self.layout.provenance)),
         }
         arrays = {name: getattr(self, name) for name in ARRAYS}
-        write_archive(path, about, arrays | packed_layout(self.layout))
+        write_archive(path, about, arrays | layout_to_arrays(self.layout))
 
     def _save_store(self, target: Path) -> None:
         zarr = library(target, "zarr")
@@ -474,9 +474,9 @@ class Capture:
         source = Path(path)
         if source.is_dir() or (source.suffix.lower() == ZARR and not source.exists()):
             return cls._load_store(source)
-        with opened_archive(source, "foveasim capture", FILE_FORMAT, FILE_VERSION) as (about, arrays):
+        with open_archive(source, "foveasim capture", FILE_FORMAT, FILE_VERSION) as (about, arrays):
             return cls(
-                layout=unpacked_layout(arrays, about["provenance"]),
+                layout=layout_from_arrays(arrays, about["provenance"]),
                 code=arrays["code"],
                 electrons=arrays["electrons"],
                 expected_e=arrays["expected_e"],
@@ -489,7 +489,7 @@ class Capture:
 
     @classmethod
     def _load_store(cls, source: Path) -> Capture:
-        with opened_store(source, "foveasim capture", FILE_FORMAT, FILE_VERSION) as (about, arrays):
+        with open_store(source, "foveasim capture", FILE_FORMAT, FILE_VERSION) as (about, arrays):
             xy_um, ring_offsets, site_offsets = (
                 arrays[f"{LAYOUT_GROUP}/{name}"][...] for name in ("xy_um", "ring_offsets", "site_offsets")
             )

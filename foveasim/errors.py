@@ -45,7 +45,7 @@ __all__ = [
 
 
 #: Default for "no value": None is a value that messages show.
-_UNSAID = object()
+_NO_VALUE = object()
 
 
 class FoveasimError(Exception):
@@ -64,11 +64,11 @@ class FoveasimError(Exception):
 class ParameterError(FoveasimError, ValueError):
     """Invalid value of a parameter, raised where the value enters the package."""
 
-    def __init__(self, name: str, rule: str, value: object = _UNSAID, unit: str = "", hint: str = "") -> None:
+    def __init__(self, name: str, rule: str, value: object = _NO_VALUE, unit: str = "", hint: str = "") -> None:
         self.name = name
-        self.value = None if value is _UNSAID else value
+        self.value = None if value is _NO_VALUE else value
         self.unit = unit
-        got = f", got {shown(value)}{' ' + unit if unit else ''}" if value is not _UNSAID else ""
+        got = f", got {shown(value)}{' ' + unit if unit else ''}" if value is not _NO_VALUE else ""
         #: The message without the name.
         self.detail = f"{rule}{got}{'; ' + hint if hint else ''}"
         super().__init__(f"'{name}' {self.detail}")

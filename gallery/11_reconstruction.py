@@ -18,7 +18,7 @@ import skimage.data
 from matplotlib.figure import Figure
 
 import foveasim as fs
-from foveasim._io.encodings import encoded_srgb
+from foveasim._io.encodings import encode_srgb_values
 from foveasim.metrics import psnr_db, ssim
 from foveasim.view import save_figure
 
@@ -75,7 +75,7 @@ def main(out_dir: Path) -> None:
     panels = {"light on the sensor": light, **pictures}
     left, bottom, right, top = grid.bounds_um
     for column, (name, picture) in enumerate(panels.items()):
-        shown = encoded_srgb(np.clip(picture.data[0] / white, 0.0, 1.0))
+        shown = encode_srgb_values(np.clip(picture.data[0] / white, 0.0, 1.0))
         for place in axes[:, column]:
             place.set_facecolor("tab:blue")  # no data
             place.imshow(

@@ -17,7 +17,7 @@ import skimage.data
 
 import foveasim as fs
 from foveasim import view
-from foveasim._io.encodings import decoded, encoded_srgb
+from foveasim._io.encodings import decoded, encode_srgb_values
 
 WAVELENGTH_NM = 550.0
 EXPOSURE_S = 0.01
@@ -63,7 +63,7 @@ def main(out_dir: Path) -> None:
 
     # %% Each column in the mean colour of what its site looks at.
     of_sites = fs.Integrator(layout, light.grid)(np.moveaxis(rgb[::-1], -1, 0)) / layout.area_um2
-    colours = encoded_srgb(BRIGHTENING * of_sites).T
+    colours = encode_srgb_values(BRIGHTENING * of_sites).T
     columns = view.prisms(capture, by=colours, max_height_um=TALLEST_UM)
 
     # %% The whole retina, and its fovea; without OpenGL without the shade of corners.

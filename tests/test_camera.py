@@ -396,7 +396,7 @@ def test_decompression_bombs_are_rejected(capture, tmp_path, monkeypatch):
     capture.save(tmp_path / "c.npz")
     with zipfile.ZipFile(tmp_path / "c.npz") as archive:
         size = sum(item.file_size for item in archive.infolist())
-    monkeypatch.setattr("foveasim._io.npz.MAX_UNPACKED_BYTES", size - 1)
+    monkeypatch.setattr("foveasim._io.npz.MAX_DECOMPRESSED_BYTES", size - 1)
 
     with pytest.raises(FileError, match="would decompress to more than"):
         fs.Capture.load(tmp_path / "c.npz")

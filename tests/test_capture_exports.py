@@ -16,7 +16,7 @@ import zarr
 
 import foveasim as fs
 from foveasim.errors import FileError, ParameterError
-from foveasim.layout.packed import packed_layout
+from foveasim.layout.packed import layout_to_arrays
 
 #: Names of columns that are reserved, invalid in files, or paths.
 ODD_NAMES = ("code", "site", "x_um", "a/b", "..", "zarr.json", "__x", "with space", "é", "x" * 300, "area_um2")
@@ -61,7 +61,7 @@ def assert_same(one, other):
     for name in ("code", "electrons", "expected_e", "filter_of_site", "white_dn"):
         a, b = getattr(one, name), getattr(other, name)
         assert (a.dtype, a.tobytes()) == (b.dtype, b.tobytes()), name
-    parts, others = packed_layout(one.layout), packed_layout(other.layout)
+    parts, others = layout_to_arrays(one.layout), layout_to_arrays(other.layout)
     assert list(parts) == list(others)
     for name, part in parts.items():
         assert (part.dtype, part.tobytes()) == (others[name].dtype, others[name].tobytes()), name

@@ -13,10 +13,10 @@ import numpy as np
 
 from foveasim._core.validation import Floats, check_count
 
-__all__ = ["Streams", "derived_seed", "device_key", "standard_normal"]
+__all__ = ["Streams", "derived_seed", "fixed_pattern_key", "standard_normal"]
 
 
-def device_key(seed: int, effect: str) -> tuple[np.uint64, np.uint64]:
+def fixed_pattern_key(seed: int, effect: str) -> tuple[np.uint64, np.uint64]:
     """Return the generator key for the fixed pattern of an effect in a device."""
     words = np.random.SeedSequence(seed, spawn_key=(crc32(effect.encode()),)).generate_state(2, np.uint64)
     return words[0], words[1]

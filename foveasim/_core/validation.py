@@ -42,7 +42,7 @@ __all__ = [
     "check_sites",
     "exact_integers",
     "finite_array",
-    "handed_over",
+    "hand_over",
     "memory_bytes",
     "own",
     "read_only",
@@ -437,7 +437,7 @@ def read_only(array: _Array) -> _Array:
     return array
 
 
-def handed_over(array: _Array) -> _Array:
+def hand_over(array: _Array) -> _Array:
     """
     Return the same array, with its base arrays also marked as read-only.
 

@@ -38,14 +38,14 @@ def _answer(task: dict[str, Any]) -> dict[str, Any]:
     try:
         if task["file"] is None:
             module = importlib.import_module(task["module"])
-            told, arrays = getattr(module, task["reader"])(task["path"], **task["args"])
+            metadata, arrays = getattr(module, task["reader"])(task["path"], **task["args"])
         else:
             spec = importlib.util.spec_from_file_location(task["module"], task["file"])
             assert spec is not None
             assert spec.loader is not None
             module = importlib.util.module_from_spec(spec)
             spec.loader.exec_module(module)
-            told, arrays = getattr(module, task["reader"])(task["path"], limit=limit, **task["args"])
+            metadata, arrays = getattr(module, task["reader"])(task["path"], limit=limit, **task["args"])
         with open(task["arrays"], "wb") as file:  # noqa: PTH123 -- a string from the task
             for array in arrays:
                 np.save(file, np.ascontiguousarray(array), allow_pickle=False)
@@ -56,7 +56,7 @@ def _answer(task: dict[str, Any]) -> dict[str, Any]:
             return {"rejected": str(error).removeprefix(f"{task['path']}: ")}
         reason = " ".join(str(error).split()) or type(error).__name__
         return {"rejected": f"is corrupt or truncated ({reason:.200})"}
-    return {"told": told, "n_arrays": len(arrays)}
+    return {"metadata": metadata, "n_arrays": len(arrays)}
 
 
 def _main() -> None:

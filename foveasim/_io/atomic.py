@@ -14,7 +14,7 @@ from typing import IO
 
 from foveasim.errors import FileError, disk_problem
 
-__all__ = ["atomic_directory", "atomic_write", "check_room", "lock", "remove_folder"]
+__all__ = ["atomic_directory", "atomic_write", "check_free_space", "lock", "remove_directory"]
 
 #: A disk with less free space than one block is full.
 FULL_DISK_BYTES = 4096
@@ -87,10 +87,10 @@ def atomic_directory(target: Path, *, is_ours: Callable[[Path], bool]) -> Iterat
         raise
     finally:
         for folder in (new, old):
-            remove_folder(folder)
+            remove_directory(folder)
 
 
-def remove_folder(folder: Path) -> None:
+def remove_directory(folder: Path) -> None:
     """
     Remove a directory and its contents if it exists; ignore errors of the system.
 
@@ -105,7 +105,7 @@ def remove_folder(folder: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def check_room(path: Path, n_bytes: int) -> None:
+def check_free_space(path: Path, n_bytes: int) -> None:
     """
     Check that the disk has space for a file, before a library that crashes on a full disk.
 

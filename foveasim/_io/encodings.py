@@ -8,7 +8,7 @@ import numpy as np
 
 from foveasim._core.validation import Floats
 
-__all__ = ["Encoding", "decoded", "encoded_srgb"]
+__all__ = ["Encoding", "decoded", "encode_srgb_values"]
 
 #: sRGB (photographs), the square root of the radiance (the paper), linear radiance.
 Encoding = Literal["srgb", "sqrt", "linear"]
@@ -27,6 +27,6 @@ def decoded(values: Floats, encoding: Encoding) -> Floats:
     return values
 
 
-def encoded_srgb(values: Floats) -> Floats:
+def encode_srgb_values(values: Floats) -> Floats:
     """Encode relative radiance >= 0 in sRGB, IEC 61966-2-1."""
     return np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1.0 / 2.4) - 0.055)

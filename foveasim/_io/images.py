@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
 __all__ = [
-    "PICTURE_ENDINGS",
+    "PICTURE_EXTENSIONS",
     "check_picture_size",
     "picture_names",
     "pixels_of_image",
@@ -65,7 +65,7 @@ START_OF_SCAN, MARKER_BYTES = 0xDA, 2
 ORIENTATION_TAG = 274
 TIFF_ENDINGS = (".tif", ".tiff")
 #: Extensions of picture files in directories.
-PICTURE_ENDINGS = (".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga", *TIFF_ENDINGS, ".webp")
+PICTURE_EXTENSIONS = (".bmp", ".exr", ".hdr", ".jp2", ".jpeg", ".jpg", ".png", ".ppm", ".tga", *TIFF_ENDINGS, ".webp")
 
 
 def picture_names(names: Iterable[str]) -> list[str]:
@@ -77,7 +77,7 @@ def picture_names(names: Iterable[str]) -> list[str]:
     pictures = (
         name
         for name in names
-        if PurePosixPath(name).suffix.lower() in PICTURE_ENDINGS
+        if PurePosixPath(name).suffix.lower() in PICTURE_EXTENSIONS
         and not any(part.startswith((".", "__MACOSX")) for part in PurePosixPath(name).parts)
     )
 
@@ -343,10 +343,12 @@ def _read_radiance(path: Path) -> NDArray[Any]:
 
 def _read_exr(path: Path) -> NDArray[Any]:
     # OpenEXR prints read errors and may continue without the data.
-    return read_in_sandbox(_openexr, path, kind="EXR", max_unpacked=_max_unpacked, is_silent=True)[1][0]
+    return read_in_sandbox(_openexr, path, kind="EXR", max_decompressed_bytes=_max_decompressed_bytes, is_silent=True)[
+        1
+    ][0]
 
 
-def _max_unpacked(n_bytes: int) -> int:
+def _max_decompressed_bytes(n_bytes: int) -> int:
     return min(MIN_UNPACKED_BYTES + UNPACKED_PER_BYTE * n_bytes, 16 * MAX_PIXELS)
 
 

@@ -19,7 +19,7 @@ from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import as_file_error
 from foveasim.errors import FileError
 
-__all__ = ["opened_archive", "read_archive", "read_array", "write_archive", "zip_members"]
+__all__ = ["open_archive", "read_archive", "read_array", "write_archive", "zip_members"]
 
 #: Name of the array that contains the metadata as JSON.
 ABOUT = "about"
@@ -27,13 +27,13 @@ SUFFIX = ".npy"
 #: numpy before 2.2 stores the argument of this name as one more array; readers ignore it.
 STRAY = "allow_pickle"
 #: Files that would decompress to more than this are rejected.
-MAX_UNPACKED_BYTES = 8 * 2**30
+MAX_DECOMPRESSED_BYTES = 8 * 2**30
 #: Bytes per read call.
 PIECE_BYTES = 2**20
 
 
 def write_archive(
-    path: str | Path, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], *, is_packed: bool = True
+    path: str | Path, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], *, is_compressed: bool = True
 ) -> None:
     """
     Write arrays and metadata atomically.
@@ -46,7 +46,7 @@ def write_archive(
         Metadata: plain data that JSON can represent.
     arrays : mapping of str to array
         Arrays by name.
-    is_packed : bool
+    is_compressed : bool
         Whether to compress the arrays: smaller files, slower writes.
 
     Raises
@@ -62,7 +62,7 @@ def write_archive(
         raise FileError(target, f"{pickled[0]!r:.40} must contain numbers or strings, got Python objects")
     members: dict[str, Any] = {ABOUT: np.array(json.dumps(about)), **arrays}
     with atomic_write(target) as temporary, temporary.open("wb") as file:
-        write = np.savez_compressed if is_packed else np.savez
+        write = np.savez_compressed if is_compressed else np.savez
         write(file, **members)
 
 
@@ -75,9 +75,9 @@ def read_archive(path: Path, *, max_bytes: int | None = None) -> tuple[Any, dict
     FileError
         When the file would decompress to too many bytes, or has a compression method that numpy does not use.
     Exception
-        Of any type, when the file is corrupt; :func:`opened_archive` converts it to a FileError.
+        Of any type, when the file is corrupt; :func:`open_archive` converts it to a FileError.
     """
-    limit = MAX_UNPACKED_BYTES if max_bytes is None else max_bytes
+    limit = MAX_DECOMPRESSED_BYTES if max_bytes is None else max_bytes
     arrays = {}
     with zip_members(path) as (archive, items):
         if sum(item.file_size for item in archive.infolist()) > limit:
@@ -90,7 +90,7 @@ def read_archive(path: Path, *, max_bytes: int | None = None) -> tuple[Any, dict
 
 
 @contextmanager
-def opened_archive(
+def open_archive(
     path: str | Path, what: str, file_format: str, version: int
 ) -> Iterator[tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
     """

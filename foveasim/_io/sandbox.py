@@ -35,7 +35,7 @@ def read_in_sandbox(
     path: Path,
     *,
     kind: str,
-    max_unpacked: Callable[[int], int],
+    max_decompressed_bytes: Callable[[int], int],
     is_silent: bool = False,
     **args: Any,
 ) -> Answer:
@@ -50,7 +50,7 @@ def read_in_sandbox(
         A file or a directory.
     kind : str
         Kind of the file, for messages.
-    max_unpacked : function
+    max_decompressed_bytes : function
         Function of the file size in bytes that returns the maximum size of the decompressed data in bytes.
     is_silent : bool
         Whether output of the reader on standard output means that the file is corrupt.
@@ -69,7 +69,7 @@ def read_in_sandbox(
         args,
         kind=kind,
         max_cpu_s=MAX_CPU_S + n_bytes // BYTES_PER_S,
-        max_bytes=BASE_BYTES + COPIES * max_unpacked(n_bytes),
+        max_bytes=BASE_BYTES + COPIES * max_decompressed_bytes(n_bytes),
         is_silent=is_silent,
     )
 
@@ -145,7 +145,7 @@ def run_in_sandbox(
         if "rejected" in answer:
             raise FileError(path, answer["rejected"])
         with arrays.open("rb") as file:
-            return answer["told"], [np.load(file, allow_pickle=False) for _ in range(answer["n_arrays"])]
+            return answer["metadata"], [np.load(file, allow_pickle=False) for _ in range(answer["n_arrays"])]
 
 
 def _directory_bytes(path: Path) -> int:

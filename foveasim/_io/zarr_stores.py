@@ -28,7 +28,7 @@ __all__ = [
     "Variable",
     "check_codecs",
     "free_name",
-    "opened_store",
+    "open_store",
     "store_format",
     "write_variables",
 ]
@@ -130,7 +130,7 @@ def check_codecs(source: Path, allowed: Collection[str], what: str) -> None:
 
 
 @contextmanager
-def opened_store(
+def open_store(
     path: Path, what: str, file_format: str, version: int
 ) -> Iterator[tuple[Mapping[str, Any], Mapping[str, Any]]]:
     """

@@ -7,7 +7,7 @@ Each section names a call of the package and its parameters: file and Python hav
 from __future__ import annotations
 
 from foveasim.config._objects import (
-    YAML_ENDINGS,
+    YAML_EXTENSIONS,
     LayoutFile,
     Shot,
     build_shot,
@@ -38,7 +38,7 @@ from foveasim.config._viewing import Viewable, read_viewable
 from foveasim.layout import shipped_layouts
 
 __all__ = [
-    "YAML_ENDINGS",
+    "YAML_EXTENSIONS",
     "LayoutFile",
     "Result",
     "Shot",

@@ -28,7 +28,7 @@ from foveasim.scene import Scene
 from foveasim.sensor import Sensor
 
 __all__ = [
-    "YAML_ENDINGS",
+    "YAML_EXTENSIONS",
     "LayoutFile",
     "Shot",
     "build_shot",
@@ -48,7 +48,7 @@ __all__ = [
 #: Prefix of the names of pictures that scikit-image contains.
 BUNDLED_PICTURE = "skimage:"
 #: Extensions of settings files; the format of other layout files follows from their content.
-YAML_ENDINGS = (".yaml", ".yml")
+YAML_EXTENSIONS = (".yaml", ".yml")
 #: Settings whose value may be a file.
 FILE_SETTINGS = ("density", "importance", "layout", "path", "picture")
 #: Tolerance of the aspect ratio of a picture and the rectangle that it covers.
@@ -316,7 +316,7 @@ def read_any_layout(
         When the format of the file does not have an option.
     """
     path = layout_path(path, folder)
-    if path.suffix.lower() in YAML_ENDINGS:
+    if path.suffix.lower() in YAML_EXTENSIONS:
         check_no_options(layer=layer, cell=cell, **options)
         return read_layout_file(path)
     return LayoutFile(layout=read_sites(path, layer=layer, cell=cell, **options), rules=None, source=str(path))

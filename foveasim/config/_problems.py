@@ -27,7 +27,7 @@ def validated(path: Path, kind: Any, data: dict[str, Any]) -> Any:
         With the file, the path of the key, and the expected and actual value.
     """
     try:
-        return TypeAdapter(kind).validate_json(json.dumps(data, default=_refuse), strict=True)
+        return TypeAdapter(kind).validate_json(json.dumps(data, default=_reject), strict=True)
     except ValidationError as error:
         problems = _problems(data, error)
         shown = "; ".join(problems[:SHOWN_PROBLEMS])
@@ -37,7 +37,7 @@ def validated(path: Path, kind: Any, data: dict[str, Any]) -> Any:
         raise ConfigError(path, f"contains an unreadable value ({error})") from None
 
 
-def _refuse(value: object) -> None:
+def _reject(value: object) -> None:
     raise ValueError(f"a {type(value).__name__} is not a number, string, list or section")
 
 

@@ -19,7 +19,7 @@ from foveasim.config import Shot
 from foveasim.errors import FileError, printable
 from foveasim.layout import Layout, Report
 from foveasim.view import plot_capture, prisms, render, save_figure
-from foveasim.view.renderer import what_to_install
+from foveasim.view.renderer import missing_software
 
 __all__ = ["Result", "check_folder", "demo_settings", "results_table", "run_shot", "write_results"]
 
@@ -134,7 +134,7 @@ def write_3d_picture(result: Result, folder: str | Path) -> Path | None:
     FileError
         When the directory cannot be written.
     """
-    if what_to_install():
+    if missing_software():
         return None
     path = check_folder(folder) / f"{result.shot.name}_3d.png"
     render(prisms(result.capture, "code"), path, renderer="pyvista")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from foveasim._core.registry import import_all
-from foveasim.explore._metrics import METRICS, Metric, metric_of
+from foveasim.explore._metrics import METRICS, Metric, import_metric
 from foveasim.explore._schemas import schema_of
 from foveasim.explore.datasets.dataset import Dataset
 from foveasim.explore.datasets.distributions import parse_distribution
@@ -29,7 +29,7 @@ __all__ = [
     "classification",
     "denoising",
     "finished_trials",
-    "metric_of",
+    "import_metric",
     "open_dataset",
     "open_results",
     "parse_distribution",

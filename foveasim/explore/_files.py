@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from foveasim._io.yaml_files import read_yaml
-from foveasim.config import YAML_ENDINGS, files_from
+from foveasim.config import YAML_EXTENSIONS, files_from
 from foveasim.errors import ConfigError
 
 __all__ = ["digests"]
@@ -35,7 +35,7 @@ def digests(files: Iterable[Path]) -> dict[str, str]:
         if str(file) in found:
             continue
         found[str(file)] = _digest(file)
-        if file.suffix.lower() in YAML_ENDINGS and file.is_file():
+        if file.suffix.lower() in YAML_EXTENSIONS and file.is_file():
             left += _named_in(file)
     return found
 

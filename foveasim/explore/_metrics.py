@@ -26,7 +26,7 @@ __all__ = [
     "REFERENCES",
     "Metric",
     "gives",
-    "metric_of",
+    "import_metric",
     "named_metrics",
     "with_more_metrics",
 ]
@@ -93,7 +93,7 @@ def data_rate_gbit_per_s(shot: Shot, camera: Camera, capture: Capture) -> float:
     return readout.gbit_per_s(capture.layout.n_sites)
 
 
-def light_behind_lens(shot: Shot, camera: Camera) -> Picture:
+def ideal_picture(shot: Shot, camera: Camera) -> Picture:
     """Return the noise-free picture of an ideal sensor for a scene, layout and exposure."""
     grid = raster_grid(camera.sensor.layout, PSNR_PIXELS)
     return camera.reference(shot.scene, grid, exposure_s=shot.exposure_s)
@@ -104,18 +104,18 @@ def picture_psnr_db(shot: Shot, camera: Camera, capture: Capture, reference: Pic
     """
     Compute the PSNR of the reconstructed picture against the ideal picture, dB.
 
-    Both are rasters of photoelectrons per µm²; the reference is that of :func:`light_behind_lens`.
+    Both are rasters of photoelectrons per µm²; the reference is that of :func:`ideal_picture`.
     """
-    reference = light_behind_lens(shot, camera) if reference is None else reference
+    reference = ideal_picture(shot, camera) if reference is None else reference
     picture = capture.picture(of="light_e", per="um2", grid=reference.grid, sensor=camera.sensor)
     return psnr_db(picture, reference)
 
 
 #: Functions that compute the reference of a metric. It depends on scene, layout and exposure only, so captures share it.
-REFERENCES: dict[Callable[..., Any], Callable[[Shot, Camera], Any]] = {picture_psnr_db: light_behind_lens}
+REFERENCES: dict[Callable[..., Any], Callable[[Shot, Camera], Any]] = {picture_psnr_db: ideal_picture}
 
 
-def metric_of(name: str) -> Metric:
+def import_metric(name: str) -> Metric:
     """
     Import the function that ``"module:function"`` names, for the command line.
 
@@ -201,7 +201,7 @@ def with_more_metrics(metrics: Mapping[str, Metric], names: Iterable[str]) -> di
     """
     found = dict(metrics)
     for name in names:
-        for own, metric in named_metrics([metric_of(name) if ":" in name else name]).items():
+        for own, metric in named_metrics([import_metric(name) if ":" in name else name]).items():
             if own in found:
                 raise ParameterError("metric", "must have a unique name; another metric has this name", own)
             found[own] = metric

@@ -21,15 +21,15 @@ from foveasim._core.provenance import differences
 from foveasim._io.atomic import lock
 from foveasim.errors import FileError, ParameterError
 
-__all__ = ["ENDED_ITS_WORKER", "Journal", "Record", "Value", "check_new", "check_same_plan", "journal_of", "values_of"]
+__all__ = ["WORKER_LOST", "Journal", "Record", "Value", "check_new", "check_same_plan", "journal_of", "values_of"]
 
 FORMAT, VERSION = "foveasim sweep", 1
 #: Beginning of a journal: a checksum and the format.
-TORN_HEAD = rb'[0-9a-f]{1,8} \{"format": "foveasim'
+TRUNCATED_HEADER = rb'[0-9a-f]{1,8} \{"format": "foveasim'
 #: Longest time before journal lines are synchronised to the disk, seconds.
 SYNC_S = 1.0
 #: Error of a point whose worker process ended in every attempt.
-ENDED_ITS_WORKER = "worker process ended in every attempt: out of memory, or a crash in a metric"
+WORKER_LOST = "worker process ended in every attempt: out of memory, or a crash in a metric"
 #: Results of metrics other than arrays.
 Scalar = bool | int | float | str
 
@@ -277,7 +277,7 @@ def _lines(file: IO[bytes]) -> Iterator[tuple[Any, int]]:
 
 def _is_torn_head(text: bytes) -> bool:
     """Return whether a file is empty or contains a truncated journal header."""
-    return not text.strip(b"\0") or re.match(TORN_HEAD, text) is not None
+    return not text.strip(b"\0") or re.match(TRUNCATED_HEADER, text) is not None
 
 
 def _check_same(path: Path, found: Any, head: Mapping[str, Any]) -> None:
@@ -335,9 +335,9 @@ def _line(record: Record) -> dict[str, Any]:
 def _record(line: Mapping[str, Any]) -> Record:
     values = {
         name: Value(
-            _unpacked(value["data"]),
+            _decompressed(value["data"]),
             tuple(value["dims"]),
-            {dim: _unpacked(packed) for dim, packed in value["labels"].items()},
+            {dim: _decompressed(packed) for dim, packed in value["labels"].items()},
         )
         if isinstance(value, dict)
         else value
@@ -350,6 +350,6 @@ def _packed(array: NDArray[Any]) -> list[Any]:
     return [array.dtype.str, array.shape, base64.b64encode(array.tobytes()).decode("ascii")]
 
 
-def _unpacked(packed: Any) -> NDArray[Any]:
+def _decompressed(packed: Any) -> NDArray[Any]:
     dtype, shape, text = packed
     return np.frombuffer(base64.b64decode(text), np.dtype(dtype)).reshape(shape)

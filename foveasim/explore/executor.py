@@ -186,7 +186,7 @@ class _Dispatch:
             while self.n_left:
                 if time.monotonic() - self.polled_s > POLL_S:
                     self._poll()
-                    yield from self._yielded(self._taken_back())
+                    yield from self._yielded(self._cancel_lost())
                 self._send()
                 try:
                     future = self.done.get(timeout=POLL_S)
@@ -222,7 +222,7 @@ class _Dispatch:
                 else f"the scheduler has had no worker for {ABSENT_S:g} s"
             )
 
-    def _taken_back(self) -> Iterator[tuple[int, Any]]:
+    def _cancel_lost(self) -> Iterator[tuple[int, Any]]:
         """Cancel the chunks of lost workers, and those that wait at paused workers."""
         for future, chunk in list(self.sent.items()):
             is_dead = chunk.worker not in self.states.alive and future.status != "error"

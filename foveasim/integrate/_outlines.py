@@ -15,7 +15,7 @@ __all__ = ["Outlines", "UndistortedOutlines", "outlines_of"]
 
 #: Maximum deviation of an undistorted edge from its chords, as a fraction of a cell; exceeded a few times by edges that are
 #: longer than a step of the grid below or need more than the maximum number of pieces.
-CHORD_SHARE = 0.002
+CHORD_TOLERANCE = 0.002
 #: Number of points along either axis of the layout at which the curvature of undistorted lines is sampled.
 BEND_POINTS = 65
 #: Maximum number of pieces per edge; edges that need more reach the boundary of the image circle.
@@ -64,7 +64,7 @@ class UndistortedOutlines:
 
     def __init__(self, layout: PackedRings, lens: PointMap, pitch_um: float) -> None:
         self._layout, self._lens = layout, lens
-        self._bends = _Bends(layout.xy_um, lens, CHORD_SHARE * pitch_um) if layout.xy_um.size else None
+        self._bends = _Bends(layout.xy_um, lens, CHORD_TOLERANCE * pitch_um) if layout.xy_um.size else None
 
     def __call__(self, first: int, last: int) -> Outlines:
         """Return the outlines of the sites ``first`` to ``last - 1``."""

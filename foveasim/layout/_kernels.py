@@ -9,7 +9,15 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = ["aspect_ratios", "colour_greedily", "contacts", "meeting_boxes", "min_widths", "overhangs", "shared_lengths"]
+__all__ = [
+    "aspect_ratios",
+    "colour_greedily",
+    "contacts",
+    "intersecting_boxes",
+    "min_widths",
+    "overhangs",
+    "shared_lengths",
+]
 
 _ints = types.Array(types.int64, 1, "C", readonly=True)
 _floats = types.Array(types.float64, 1, "C", readonly=True)
@@ -32,7 +40,7 @@ def _point_to_edge(px, py, ax, ay, bx, by):
 
 
 @njit()
-def _across_from_inward_corner(xy, a, b, after, first, last):
+def _width_at_reflex_vertex(xy, a, b, after, first, last):
     """Return the distance across the site from reflex vertex b to the nearest edge, else inf."""
     bx, by = xy[b, 0], xy[b, 1]
     in_x, in_y = bx - xy[a, 0], by - xy[a, 1]
@@ -99,7 +107,7 @@ def min_widths(xy, after, before, ring_offsets, site_offsets):
                 near = min(near, _point_to_edge(dx, dy, ax, ay, bx, by))
                 smallest = min(smallest, near)
         for b in range(first, last):
-            smallest = min(smallest, _across_from_inward_corner(xy, before[b], b, after, first, last))
+            smallest = min(smallest, _width_at_reflex_vertex(xy, before[b], b, after, first, last))
         widths[site] = smallest
     return widths
 
@@ -165,7 +173,7 @@ def aspect_ratios(xy, ring_offsets, site_offsets):
 
 
 @njit(types.int64[::1](_points, _ints))
-def meeting_boxes(box, order):
+def intersecting_boxes(box, order):
     """
     Return the pairs (i, j), i < j, of boxes that intersect or touch, encoded as i n + j.
 

@@ -11,13 +11,13 @@ import shapely
 from foveasim._core.validation import MAX_LENGTH_UM, as_numbers, check_length_um, finite_array
 from foveasim.errors import ParameterError
 
-__all__ = ["as_region", "disc", "one_region", "told_region"]
+__all__ = ["as_region", "disc", "parse_region", "region_as_plain_data"]
 
 #: Vertices of a polygonal disc, by default: its area is that of the circle within 7 ppm.
 DISC_CORNERS = 960
 
 
-def one_region(*, size_um: Any = None, radius_um: float | None = None, region: Any = None) -> Any:
+def parse_region(*, size_um: Any = None, radius_um: float | None = None, region: Any = None) -> Any:
     """
     Return the specified region as a shapely Polygon or MultiPolygon in µm.
 
@@ -80,7 +80,7 @@ def disc(radius_um: float, n_chords: int) -> shapely.Polygon:
     return shapely.Polygon(radius_um * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1))
 
 
-def told_region(region: Any) -> Any:
+def region_as_plain_data(region: Any) -> Any:
     """Convert a region to plain data: its vertices, or the well-known text of a geometry."""
     if isinstance(region, str):
         return region

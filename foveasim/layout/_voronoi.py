@@ -149,7 +149,7 @@ class MovingCells:
         is_inside = self._sure_inside(centres_um)
         self.centres_um, self._weights_um2 = centres_um, weights_um2
         diagram = self._diagram()
-        parts, is_inside = _border_parts(diagram, is_inside, self.region, self._mass_of)
+        parts, is_inside = _boundary_parts(diagram, is_inside, self.region, self._mass_of)
         inner, self._is_inside = _edges_around(diagram, is_inside), is_inside
         if parts is None:
             return inner
@@ -179,7 +179,7 @@ class MovingCells:
             When centres are too close for float64, or a cell encloses a hole of the region.
         """
         diagram = _without_short_edges(self._diagram())
-        whole = _whole_rings(diagram, self.centres_um if self._weights_um2 is None else _middles_um(diagram))
+        whole = _whole_rings(diagram, self.centres_um if self._weights_um2 is None else _centres_um(diagram))
         return _clipped(diagram, *whole, self._is_inside, self.region, self._mass_of)
 
     def _diagram(self) -> _Diagram:
@@ -294,7 +294,7 @@ def _edges_around(diagram: _Diagram, is_inside: Bools) -> CellEdges:
     return CellEdges(cell, cell, both.xy_um.take(start, 0), both.xy_um.take(stop, 0), both.sites.shape[0])
 
 
-def _middles_um(diagram: _Diagram) -> Floats:
+def _centres_um(diagram: _Diagram) -> Floats:
     """Return the mean (n, 2) of the corners of each cell, a point inside it."""
     n = diagram.centres_um.shape[0]
     middle_um = diagram.xy_um[diagram.corners].mean(axis=1)
@@ -354,7 +354,7 @@ def _clipped(
     mass_of: MassOf | None = None,
 ) -> tuple[Floats, Ints]:
     """Return packed rings of the cells within the region: those not inside are clipped."""
-    parts, is_inside = _border_parts(diagram, is_inside, region, mass_of)
+    parts, is_inside = _boundary_parts(diagram, is_inside, region, mass_of)
     border = np.flatnonzero(~is_inside)
     rings_um, ring_offsets = np.zeros((0, 2)), np.zeros(1, np.int64)
     if parts is not None:
@@ -393,7 +393,7 @@ class _Parts:
         return np.asarray(shapely.orient_polygons(cells))
 
 
-def _border_parts(
+def _boundary_parts(
     diagram: _Diagram, is_inside: Bools, region: shapely.Polygon, mass_of: MassOf | None
 ) -> tuple[_Parts | None, Bools]:
     """Return the parts of boundary cells, or None, and a mask of the unaffected inner cells."""

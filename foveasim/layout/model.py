@@ -54,7 +54,7 @@ __all__ = ["Layout"]
 #: A smaller extent of a layout indicates wrong units.
 MIN_LAYOUT_UM = 1e-3
 #: Area of a ring, relative to its bounding box, below which it is degenerate in float64.
-ZERO_AREA_SHARE = 1e-14
+ZERO_AREA_FRACTION = 1e-14
 #: Columns of indices, of filters and of lines: values above MAX_SITES indicate an overflow.
 INDEX_NAMES = ("channel", "readout_line")
 #: Valid ranges of integer columns.
@@ -259,7 +259,7 @@ class Layout:
         if isinstance(polygons, tuple) and len(polygons) == 3 and not isinstance(polygons[0], shapely.Geometry):
             xy_um, ring_offsets, site_offsets = _packed(*polygons)
         else:
-            xy_um, ring_offsets, site_offsets = _unpacked(polygons)
+            xy_um, ring_offsets, site_offsets = _decompressed(polygons)
         _require(_per_site(~np.isfinite(xy_um), ring_offsets, site_offsets), "has a coordinate that is not finite")
         _require(
             _per_site(np.abs(xy_um) > MAX_LENGTH_UM, ring_offsets, site_offsets),
@@ -277,7 +277,7 @@ class Layout:
         )
         box = site_bounds_um(xy_um, ring_offsets, np.arange(ring_offsets.size))
         box_um2 = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])
-        rounding_um2 = ZERO_AREA_SHARE * np.maximum(box_um2, np.finfo(np.float64).tiny)
+        rounding_um2 = ZERO_AREA_FRACTION * np.maximum(box_um2, np.finfo(np.float64).tiny)
         is_line = ring_spread_um2(xy_um, ring_offsets) <= rounding_um2
         _require(np.logical_or.reduceat(is_line, site_offsets[:-1]), "has a ring with zero area")
         _require_valid(Layout._derived(xy_um, ring_offsets, site_offsets, {}, {}))
@@ -595,7 +595,7 @@ def _packed(xy_um: ArrayLike, ring_offsets: ArrayLike, site_offsets: ArrayLike) 
     return xy, rings, _offsets("site_offsets", site_offsets, 1, rings.size - 1, "rings")
 
 
-def _unpacked(polygons: Any) -> tuple[Floats, Ints, Ints]:
+def _decompressed(polygons: Any) -> tuple[Floats, Ints, Ints]:
     """Return packed rings of shapely polygons, closing vertices included."""
     items = polygons.geoms if hasattr(polygons, "geoms") else polygons
     if isinstance(items, str | bytes | shapely.Geometry) or not isinstance(items, Iterable):

@@ -10,20 +10,20 @@ from numpy.typing import NDArray
 
 from foveasim.layout.model import Layout
 
-__all__ = ["is_of_layout", "packed_layout", "unpacked_layout"]
+__all__ = ["is_of_layout", "layout_from_arrays", "layout_to_arrays"]
 
 OUTLINES = ("xy_um", "ring_offsets", "site_offsets")
 #: Prefix of the array name of a column.
 COLUMN_PREFIX = "column_"
 
 
-def packed_layout(layout: Layout) -> dict[str, NDArray[Any]]:
+def layout_to_arrays(layout: Layout) -> dict[str, NDArray[Any]]:
     """Return the outlines and columns of a layout as arrays by name."""
     arrays = {name: np.asarray(getattr(layout, name)) for name in OUTLINES}
     return arrays | {COLUMN_PREFIX + name: values for name, values in layout.columns.items()}
 
 
-def unpacked_layout(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str, Any]) -> Layout:
+def layout_from_arrays(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str, Any]) -> Layout:
     """
     Build a layout from named arrays; only structure and holes of the outlines are checked.
 

@@ -26,7 +26,7 @@ from pathlib import Path
 from numpy.typing import ArrayLike
 
 from foveasim._core.registry import import_all
-from foveasim._core.validation import handed_over
+from foveasim._core.validation import hand_over
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import as_file_error, format_of, writing_format
 from foveasim.errors import FileError, ParameterError
@@ -113,7 +113,7 @@ def read_power_map(
     with as_file_error(path, "power map", passes=(ParameterError,)):
         kind, _ = format_of(path, MAP_FORMATS, "power map")
         found = read_found(path, kind, name)
-        handed_over(found.data)
+        hand_over(found.data)
         return finished(found, given)
 
 

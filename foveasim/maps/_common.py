@@ -30,11 +30,11 @@ __all__ = [
     "check_numbers",
     "check_size",
     "finished",
-    "max_unpacked",
+    "max_decompressed_bytes",
     "pitch_of_axes",
 ]
 
-MAX_UNPACKED_BYTES = 8 * 2**30
+MAX_DECOMPRESSED_BYTES = 8 * 2**30
 #: Limit of the decompressed size: a constant plus a factor of the file size.
 MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**28, 256
 MAX_BANDS = 4096
@@ -98,9 +98,9 @@ class Given:
             Grid((1, 1), 1.0, self.origin_um)
 
 
-def max_unpacked(n_bytes: int) -> int:
+def max_decompressed_bytes(n_bytes: int) -> int:
     """Return the limit of the decompressed size of a file of ``n_bytes``."""
-    return min(MIN_UNPACKED_BYTES + UNPACKED_PER_BYTE * n_bytes, MAX_UNPACKED_BYTES)
+    return min(MIN_UNPACKED_BYTES + UNPACKED_PER_BYTE * n_bytes, MAX_DECOMPRESSED_BYTES)
 
 
 def check_size(shape: Sequence[int], itemsize: int, n_bytes: int) -> None:
@@ -115,11 +115,11 @@ def check_size(shape: Sequence[int], itemsize: int, n_bytes: int) -> None:
     size = itemsize
     for n in shape:
         size *= int(n)
-    if size > max_unpacked(n_bytes):
-        told = " x ".join(map(str, shape[:5]))
+    if size > max_decompressed_bytes(n_bytes):
+        dimensions = " x ".join(map(str, shape[:5]))
         raise FormatError(
-            f"contains an array of {told} elements, more than the limit of {max_unpacked(n_bytes)} bytes for a file of "
-            "this size; write the map uncompressed"
+            f"contains an array of {dimensions} elements, more than the limit of {max_decompressed_bytes(n_bytes)} bytes "
+            "for a file of this size; write the map uncompressed"
         )
 
 

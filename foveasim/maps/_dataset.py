@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foveasim._core.extras import needs
-from foveasim._io.atomic import atomic_directory, check_room
+from foveasim._io.atomic import atomic_directory, check_free_space
 from foveasim._io.formats import FileFormat, FormatError
 from foveasim.errors import FileError
 from foveasim.fields import PowerMap
@@ -67,7 +67,7 @@ def write_netcdf(power_map: PowerMap, path: Path) -> None:
     """Write an uncompressed netCDF 4 file."""
     _needs(path, "h5netcdf")
     # HDF5 crashes if the disk is full.
-    check_room(path, power_map.data.nbytes + 8 * sum(power_map.data.shape) + NETCDF_BYTES)
+    check_free_space(path, power_map.data.nbytes + 8 * sum(power_map.data.shape) + NETCDF_BYTES)
     to_xarray(power_map).to_dataset().to_netcdf(path, engine="h5netcdf", encoding={NAME: {"_FillValue": None}})
 
 
@@ -142,8 +142,10 @@ def _chosen(dataset: xr.Dataset, name: str | None) -> str:
     for candidates in (with_axes, maps):
         if len(candidates) == 1:
             return candidates[0]
-    told = f"contains {len(maps)} numeric arrays with rows and columns"
-    raise FormatError(f"{told}: {', '.join(n[:40] for n in maps[:5])}; select the map with name=" if maps else told)
+    summary = f"contains {len(maps)} numeric arrays with rows and columns"
+    raise FormatError(
+        f"{summary}: {', '.join(n[:40] for n in maps[:5])}; select the map with name=" if maps else summary
+    )
 
 
 # -- checks of untrusted files ----------------------------------------------------------------------------------------

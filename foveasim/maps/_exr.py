@@ -22,7 +22,7 @@ from foveasim.errors import FileError, ParameterError
 from foveasim.fields import PowerMap, to_file_rows
 from foveasim.maps._common import MAX_BANDS, Found, check_size
 from foveasim.maps._formats import MAP_FORMATS
-from foveasim.maps._text import about_map, found_in_text
+from foveasim.maps._text import about_map, found_in_metadata
 
 __all__ = ["MAGIC", "read", "write"]
 
@@ -89,7 +89,7 @@ def read(path: Path, name: str | None) -> Found:
         raise FormatError("has subsampled channels; write all bands at full resolution")
     with exr.File(str(path), separate_channels=True) as file:
         pixels = file.channels()
-        ours = found_in_text(text or "", np.empty((1, 1)), is_y_falling=True)
+        ours = found_in_metadata(text or "", np.empty((1, 1)), is_y_falling=True)
         if ours.wavelength_nm is not None:
             order = [_channel_name(wavelength) for wavelength in ours.wavelength_nm]
             if sorted(order) != sorted(bands):

@@ -23,7 +23,7 @@ from foveasim.errors import FileError
 from foveasim.fields import PowerMap
 from foveasim.maps._common import UNEVEN, Found, check_size
 from foveasim.maps._formats import MAP_FORMATS
-from foveasim.maps._text import about_map, found_in_text
+from foveasim.maps._text import about_map, found_in_metadata
 from foveasim.maps._units import length_in_um
 
 __all__ = ["MAGIC", "read", "write"]
@@ -76,7 +76,7 @@ def read(path: Path, name: str | None) -> Found:
         data = np.asarray(hdu.data)
         n_axes = data.ndim
         text = header.get(KEYWORD)
-        found = found_in_text(text if isinstance(text, str) else "", data, is_y_falling=False)
+        found = found_in_metadata(text if isinstance(text, str) else "", data, is_y_falling=False)
         if found.pitch_um is not None:
             return found
         return replace(found, **_header_values(header, data.shape, n_axes))

@@ -14,7 +14,7 @@ from foveasim._core.registry import Registry
 from foveasim._io import sandbox
 from foveasim._io.formats import FileFormat, FormatError, as_file_error
 from foveasim.errors import ParameterError
-from foveasim.maps._common import Found, as_images, max_unpacked
+from foveasim.maps._common import Found, as_images, max_decompressed_bytes
 
 __all__ = ["MAP_FORMATS", "read_found"]
 
@@ -47,7 +47,13 @@ def read_found(path: Path, kind: str, name: str | None) -> Found:
         return found
     # OpenEXR prints read errors and can return incomplete data: any output counts as an error.
     told, (data,) = sandbox.read_in_sandbox(
-        _read, path, kind=form.title, max_unpacked=max_unpacked, is_silent=kind == "exr", format_name=kind, name=name
+        _read,
+        path,
+        kind=form.title,
+        max_decompressed_bytes=max_decompressed_bytes,
+        is_silent=kind == "exr",
+        format_name=kind,
+        name=name,
     )
     about: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in told.items()}
     return Found(data=data, **about)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from foveasim._io.formats import FileFormat, FormatError
 from foveasim.fields import from_file_rows
-from foveasim.maps._common import Found, check_size, max_unpacked
+from foveasim.maps._common import Found, check_size, max_decompressed_bytes
 from foveasim.maps._formats import MAP_FORMATS
 
 __all__ = ["MAT5_MAGIC", "MAT73_MAGIC", "read_mat5", "read_mat73"]
@@ -45,7 +45,7 @@ def read_mat5(path: Path, name: str | None) -> Found:
     """Read a MAT file of version 5 or 7."""
     from scipy.io import loadmat, whosmat
 
-    unpacked: Any = BytesIO(_unpacked(path))
+    unpacked: Any = BytesIO(_decompressed(path))
     names = [str(variable[0]) for variable in whosmat(unpacked)]
     unpacked.seek(0)
     struct = _struct(names, name)
@@ -97,8 +97,8 @@ def _struct(names: list[str], name: str | None) -> str | None:
             return one
     if name is None and {"data", "photons"} & set(names):
         return None
-    told = ", ".join(n[:40] for n in names[:5])
-    raise FormatError(f"contains no optical image {name or 'oi'!r:.40}; available variables: {told or 'none'}")
+    available = ", ".join(n[:40] for n in names[:5])
+    raise FormatError(f"contains no optical image {name or 'oi'!r:.40}; available variables: {available or 'none'}")
 
 
 def _found(field: Field) -> Found:
@@ -150,10 +150,10 @@ def _number(values: NDArray[Any] | None) -> float | None:
 # -- decompression with a limit -----------------------------------------------------------------------------------------
 
 
-def _unpacked(path: Path) -> bytes:
+def _decompressed(path: Path) -> bytes:
     """Return the file with decompressed elements, up to the size limit."""
     n_bytes = path.stat().st_size
-    most = max_unpacked(n_bytes)
+    most = max_decompressed_bytes(n_bytes)
     with path.open("rb") as file:
         header = file.read(HEADER_BYTES)
         order = "little" if header[126:128] == b"IM" else "big"

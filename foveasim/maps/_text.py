@@ -12,7 +12,7 @@ from foveasim._io.formats import FormatError
 from foveasim.fields import PowerMap
 from foveasim.maps._common import Found
 
-__all__ = ["about_map", "found_in_text"]
+__all__ = ["about_map", "found_in_metadata"]
 
 FILE_FORMAT = "foveasim power map"
 FILE_VERSION = 1
@@ -32,7 +32,7 @@ def about_map(power_map: PowerMap) -> dict[str, Any]:
     }
 
 
-def found_in_text(text: str, data: NDArray[Any], *, is_y_falling: bool) -> Found:
+def found_in_metadata(text: str, data: NDArray[Any], *, is_y_falling: bool) -> Found:
     """
     Return the map with the metadata of a string that foveasim wrote.
 

@@ -18,7 +18,7 @@ from foveasim._io.images import pixels_of_page
 from foveasim.fields import PowerMap, to_file_rows
 from foveasim.maps._common import MAX_BANDS, Found, check_size
 from foveasim.maps._formats import MAP_FORMATS
-from foveasim.maps._text import about_map, found_in_text
+from foveasim.maps._text import about_map, found_in_metadata
 
 __all__ = ["MAGICS", "read", "write"]
 
@@ -75,7 +75,7 @@ def read(path: Path, name: str | None) -> Found:
         description = str(first.description)
     if orientation not in (ON_TOP, BELOW):
         raise FormatError(f"has the unsupported orientation {orientation!s:.10}; save it with orientation 1 or 4")
-    return found_in_text(description, data, is_y_falling=orientation == ON_TOP)
+    return found_in_metadata(description, data, is_y_falling=orientation == ON_TOP)
 
 
 def _samples_first(data: NDArray[Any], page: Any, tifffile: Any) -> NDArray[Any]:

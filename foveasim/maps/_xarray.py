@@ -132,8 +132,8 @@ def found_in_array(array: xr.DataArray) -> Found:
     x, y = _one_of(names, X), _one_of(names, Y)
     rest = [d for d in names if d not in (x, y)]
     if x is None or y is None or len(rest) > 1:
-        told = ", ".join(str(d)[:20] for d in names[:6])
-        raise FormatError(f"has the dimensions ({told}), expected (wavelength, y, x); rename them")
+        dims = ", ".join(str(d)[:20] for d in names[:6])
+        raise FormatError(f"has the dimensions ({dims}), expected (wavelength, y, x); rename them")
     array = array.transpose(*rest, y, x)
     along_x, along_y = (_coordinate(array, d) for d in (x, y))
     if along_x is None or along_y is None:
@@ -166,21 +166,21 @@ def _coordinate(array: xr.DataArray, name: Hashable) -> Floats | None:
 def _place(array: xr.DataArray, x: Floats, y: Floats, names: tuple[Hashable, Hashable]) -> dict[str, Any]:
     """Return axis directions, and pitch and origin if the coordinates have units of length."""
     step_x, step_y = pitch_of_axes(x, y)
-    told: dict[str, Any] = {"is_x_falling": (step_x or 1.0) < 0.0, "is_y_falling": (step_y or 1.0) < 0.0}
+    metadata: dict[str, Any] = {"is_x_falling": (step_x or 1.0) < 0.0, "is_y_falling": (step_y or 1.0) < 0.0}
     per = [_per_um(array.coords[name], name) for name in names]
     if None in per:
-        return told
+        return metadata
     per_x, per_y = (p for p in per if p is not None)
     exact = _exact(array, x * per_x, y * per_y)
     if exact is not None:
-        return {**told, "pitch_um": (exact.pitch_x_um, exact.pitch_y_um), "origin_um": exact.origin_um}
+        return {**metadata, "pitch_um": (exact.pitch_x_um, exact.pitch_y_um), "origin_um": exact.origin_um}
     if step_x is None and step_y is None:
-        return told
+        return metadata
     pitch_x = abs(step_x) * per_x if step_x is not None else None
     pitch_y = abs(step_y) * per_y if step_y is not None else None
     pitch = (pitch_x or pitch_y or 0.0, pitch_y or pitch_x or 0.0)
     low = (float(x.min()) * per_x - 0.5 * pitch[0], float(y.min()) * per_y - 0.5 * pitch[1])
-    return {**told, "pitch_um": pitch, "origin_um": low}
+    return {**metadata, "pitch_um": pitch, "origin_um": low}
 
 
 def _per_um(coordinate: xr.DataArray, name: Hashable) -> float | None:

@@ -62,7 +62,7 @@ class Emva1288:
         Temporal dark noise including quantisation; extrapolated to exposure 0 if a dark series is given. At least sqrt(0.24).
     dark_noise_e : (n_class,) float64, e-
         Dark noise without quantisation: ``sqrt(dark_noise_dn**2 - 1/12) / K``.
-    is_hidden : (n_class,) bool
+    is_quantisation_limited : (n_class,) bool
         Whether quantisation masks the dark noise (variance below 0.24 DN²), which is then an upper bound.
     saturation_ph : (n_class,) float64, photons
         Saturation: photons at the level of the highest temporal variance.
@@ -95,7 +95,7 @@ class Emva1288:
     qe: Floats
     dark_noise_dn: Floats
     dark_noise_e: Floats
-    is_hidden: Bools
+    is_quantisation_limited: Bools
     saturation_ph: Floats
     threshold_ph: Floats
     linearity_error_min_fraction: Floats
@@ -227,7 +227,7 @@ def emva1288(
         "qe": qe,
         "dark_noise_dn": dark_noise_dn,
         "dark_noise_e": np.sqrt(dark_noise_dn**2 - QUANTISATION_DN2) / gain_dn_per_e,
-        "is_hidden": noise_dn2 < LEAST_DARK_DN2,
+        "is_quantisation_limited": noise_dn2 < LEAST_DARK_DN2,
         "saturation_ph": level_ph[top, each],
         "threshold_ph": (dark_noise_dn / gain_dn_per_e + 0.5) / qe,
         "linearity_error_min_fraction": linearity_min,

@@ -68,7 +68,7 @@ class FlowBound:
     @property
     def sigma_um(self) -> Floats:
         """Smallest standard deviations of u and v, (n_region, 2) µm; infinite if unobservable."""
-        left = np.stack([_rest_per_um2(self.information_per_um2, axis) for axis in (0, 1)], axis=1)
+        left = np.stack([_marginal_information(self.information_per_um2, axis) for axis in (0, 1)], axis=1)
         with np.errstate(divide="ignore"):
             return np.asarray(1.0 / np.sqrt(left))
 
@@ -343,7 +343,7 @@ def _bound(gradient: Floats, variance_e2: Floats, groups: _Regions, is_counted: 
     )
 
 
-def _rest_per_um2(information_per_um2: Floats, axis: int) -> Floats:
+def _marginal_information(information_per_um2: Floats, axis: int) -> Floats:
     """Return the marginal information of u or v, (n_region,); 0 below rounding error."""
     own, other = information_per_um2[:, axis, axis], information_per_um2[:, 1 - axis, 1 - axis]
     shared = information_per_um2[:, 0, 1] ** 2 / np.where(other > 0.0, other, 1.0)

@@ -416,7 +416,7 @@ def _binned(
         )
     is_in = (k >= -n_sides) & (k < n_sides)
     n_narrow = int(np.ceil(max(NARROW_PITCHES * pitch_um, NARROW_WIDTHS * width_um) / bin_um))
-    borders = _widening_borders(n_narrow, n_sides)
+    borders = _bin_edges(n_narrow, n_sides)
     position = np.searchsorted(borders, k[is_in], side="right") - 1
     weights, value = area_um2[is_in], values[is_in]
     total = np.bincount(position, weights=weights)
@@ -438,7 +438,7 @@ def _binned(
     )
 
 
-def _widening_borders(n_narrow: int, n_sides: int) -> Ints:
+def _bin_edges(n_narrow: int, n_sides: int) -> Ints:
     """Return the bin edges from -n_sides to n_sides, in units of the narrow bin width."""
     side = list(range(min(n_narrow, n_sides) + 1))
     while side[-1] < n_sides:

@@ -15,7 +15,7 @@ from foveasim._core.validation import Floats, Ints
 from foveasim._io.sandbox import read_in_sandbox
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout import Layout
-from foveasim.layout.packed import packed_layout, unpacked_layout
+from foveasim.layout.packed import layout_from_arrays, layout_to_arrays
 
 __all__ = ["EventFile", "most_bytes", "read_events"]
 
@@ -27,7 +27,7 @@ METADATA_BYTES = 1 << 16
 #: Size limit of the table of milliseconds: times of more than a day indicate times since an epoch, not since the start.
 MAX_MS = 100_000_000
 #: Limits of decompressed data: per byte of the file, the maximum ratio of deflate, and in total.
-UNPACKED_PER_BYTE, MAX_UNPACKED_BYTES = 1032, 8 * 2**30
+UNPACKED_PER_BYTE, MAX_DECOMPRESSED_BYTES = 1032, 8 * 2**30
 #: Kinds of numeric columns, and of strings, which are stored as bytes.
 NUMBERS, TEXT = "biuf", "US"
 KINDS = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8, "site": np.int32}
@@ -48,7 +48,7 @@ def most_bytes(layout: Layout, n_before: int, t_us: Ints) -> int:
     """
     per_event = sum(np.dtype(kind).itemsize for kind in KINDS.values())
     n_chunks = min(int(t_us[-1]) // 1000 + 1, MAX_MS) // CHUNK + 1 if t_us.size else 1
-    of_layout = sum(values.nbytes for values in packed_layout(layout).values()) + 32 * layout.n_sites
+    of_layout = sum(values.nbytes for values in layout_to_arrays(layout).values()) + 32 * layout.n_sites
     about = len(json.dumps(to_plain_data(dict(layout.provenance))))
     return per_event * (n_before + t_us.size) + 8 * CHUNK * n_chunks + of_layout + about + METADATA_BYTES
 
@@ -80,7 +80,7 @@ class EventFile:
         sites = {"x_um": centroid_um[:, 0], "y_um": centroid_um[:, 1], "area_um2": layout.area_um2, "x": x, "y": y}
         for name, values in sites.items():
             file[f"sites/{name}"] = values
-        for name, values in packed_layout(layout).items():
+        for name, values in layout_to_arrays(layout).items():
             if values.dtype.kind not in NUMBERS + TEXT:
                 raise ParameterError(
                     "batches",
@@ -135,14 +135,14 @@ def read_events(path: Path) -> tuple[Floats, NDArray[np.int32], NDArray[np.int8]
     FileError
         When the file is corrupt, malformed, or contains other data.
     """
-    told, found = read_in_sandbox(_read, path, kind="HDF5", max_unpacked=_max_unpacked)
+    told, found = read_in_sandbox(_read, path, kind="HDF5", max_decompressed_bytes=_max_decompressed_bytes)
     arrays = dict(zip(told["names"], found, strict=True))
     outlines = {
         name.removeprefix("layout/"): np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values
         for name, values in arrays.items()
         if name.startswith("layout/") and name != "layout/provenance"
     }
-    layout = unpacked_layout(outlines, json.loads(arrays["layout/provenance"].tobytes()))
+    layout = layout_from_arrays(outlines, json.loads(arrays["layout/provenance"].tobytes()))
     # A single division of the integer is correctly rounded: 300,000 µs gives 0.3 s.
     t_s = arrays["events/t"] / 1e6
     return t_s, arrays["events/site"], (2 * arrays["events/p"].astype(np.int8) - 1).astype(np.int8), layout
@@ -157,8 +157,8 @@ def _append(dataset: Any, values: NDArray[Any]) -> None:
 # -- in the sandbox process ------------------------------------------------------------------------------------------
 
 
-def _max_unpacked(n_bytes: int) -> int:
-    return min(UNPACKED_PER_BYTE * n_bytes, MAX_UNPACKED_BYTES)
+def _max_decompressed_bytes(n_bytes: int) -> int:
+    return min(UNPACKED_PER_BYTE * n_bytes, MAX_DECOMPRESSED_BYTES)
 
 
 def _read(file_name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
@@ -174,7 +174,9 @@ def _read(file_name: str) -> tuple[dict[str, Any], list[NDArray[Any]]]:
         found = {f"events/{name}": _dataset(path, file, "events", name) for name in ("t", "site", "p")}
         for name in _group(path, file, "layout"):
             found[f"layout/{name}"] = _dataset(path, file, "layout", name)
-        if sum(part.size * part.dtype.itemsize for part in found.values()) > _max_unpacked(path.stat().st_size):
+        if sum(part.size * part.dtype.itemsize for part in found.values()) > _max_decompressed_bytes(
+            path.stat().st_size
+        ):
             raise FileError(path, "would decompress to more than a file of its size can contain")
         arrays = [np.ascontiguousarray(part[()]) for part in found.values()]
     return {"names": list(found)}, arrays

@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.extras import needs
 from foveasim._core.provenance import to_plain_data
 from foveasim._core.validation import Floats, Ints, as_numbers, check_number, finite_array, own, read_only
-from foveasim._io.atomic import atomic_write, check_room
+from foveasim._io.atomic import atomic_write, check_free_space
 from foveasim._io.formats import as_file_error
-from foveasim._io.npz import opened_archive, write_archive
+from foveasim._io.npz import open_archive, write_archive
 from foveasim.errors import FileError, FoveasimWarning, ParameterError
 from foveasim.layout import Layout
-from foveasim.layout.packed import OUTLINES, packed_layout, unpacked_layout
+from foveasim.layout.packed import OUTLINES, layout_from_arrays, layout_to_arrays
 from foveasim.modes import _hdf5
 
 __all__ = ["Events", "write_events"]
@@ -320,7 +320,7 @@ class Events:
         elif ending == ".npz":
             arrays = {name: np.asarray(getattr(self, name)) for name in ARRAYS}
             about = {"format": FORMAT, "version": VERSION, "provenance": to_plain_data(dict(self.layout.provenance))}
-            write_archive(target, about, arrays | packed_layout(self.layout))
+            write_archive(target, about, arrays | layout_to_arrays(self.layout))
         else:
             raise FileError(target, "must end in .npz, .h5, .hdf5, .npy or .txt")
 
@@ -343,8 +343,8 @@ class Events:
                 raise FileError(source, "is not a file" if source.exists() else "no such file")
             with as_file_error(source, "event file"):
                 return cls(*_hdf5.read_events(source))
-        with opened_archive(source, "event file", FORMAT, VERSION) as (about, arrays):
-            layout = unpacked_layout(arrays, about.get("provenance", {}))
+        with open_archive(source, "event file", FORMAT, VERSION) as (about, arrays):
+            layout = layout_from_arrays(arrays, about.get("provenance", {}))
             return cls(arrays["t_s"], arrays["site"], arrays["polarity"], layout)
 
 
@@ -394,7 +394,7 @@ def write_events(batches: Iterable[Events], path: str | Path, *, pitch_um: float
             t_us = _whole_us(batch.t_s)
             # HDF5 crashes on a full disk.
             n_bytes = _hdf5.most_bytes(batch.layout, 0 if file is None else file.n_events, t_us)
-            check_room(temporary, n_bytes)
+            check_free_space(temporary, n_bytes)
             if file is None:
                 hdf5 = opened.enter_context(h5py.File(temporary, "w"))
                 file = _hdf5.EventFile(hdf5, batch.layout, *batch.addresses(pitch_um))

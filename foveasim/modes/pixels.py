@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foveasim._core.random_streams import device_key
+from foveasim._core.random_streams import fixed_pattern_key
 from foveasim._core.threads import each, thread_count
 from foveasim._core.validation import Floats, Ints, check_count, finite_array, read_only
 from foveasim.errors import ParameterError, SimulationError
@@ -187,7 +187,7 @@ class EventPixels:
         _check_rates(rates)
         frame_s = check_plausible("frame_s", frame_s)
         batch = check_count("batch", batch)
-        key = device_key(check_count("seed", seed, at_least=0), "change events")
+        key = fixed_pattern_key(check_count("seed", seed, at_least=0), "change events")
         return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
 
     def events(self, rates: Iterable[ArrayLike], *, frame_s: float, seed: int, n_threads: int | None = None) -> Events:
@@ -243,7 +243,7 @@ class EventPixels:
 
             n_before += current.shape[0]
             before = current[-1:].copy()
-            yield _gathered(work, frames.shape[0] - 1, memory, n_drawn, self.sensor, n_threads)
+            yield _collect_events(work, frames.shape[0] - 1, memory, n_drawn, self.sensor, n_threads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,7 +338,7 @@ class SpikingPixels:
         _check_rates(rates)
         frame_s = check_plausible("frame_s", frame_s)
         batch = check_count("batch", batch)
-        key = device_key(check_count("seed", seed, at_least=0), "spikes")
+        key = fixed_pattern_key(check_count("seed", seed, at_least=0), "spikes")
         return self._stream(rates, frame_s, key, batch, thread_count(n_threads))
 
     def events(self, rates: Iterable[ArrayLike], *, frame_s: float, seed: int, n_threads: int | None = None) -> Events:
@@ -378,7 +378,7 @@ class SpikingPixels:
                     )
                 )
 
-            yield _gathered(work, current.shape[0], memory, n_drawn, self.sensor, n_threads)
+            yield _collect_events(work, current.shape[0], memory, n_drawn, self.sensor, n_threads)
             first += current.shape[0]
 
 
@@ -424,7 +424,9 @@ def _batches(sensor: Sensor, rates: Iterable[ArrayLike], batch: int) -> Iterator
         yield current
 
 
-def _gathered(work: Work, n_frames: int, memory: NDArray[Any], n_drawn: Ints, sensor: Sensor, n_threads: int) -> Events:
+def _collect_events(
+    work: Work, n_frames: int, memory: NDArray[Any], n_drawn: Ints, sensor: Sensor, n_threads: int
+) -> Events:
     """Run a kernel on all sites and return the events in temporal order."""
     n_found = 0
     adding = Lock()

@@ -131,7 +131,7 @@ class Aperture:
             raise ParameterError(name, f"must return amplitudes <= 1 at {wavelength_nm:g} nm", highest)
         return values
 
-    def _share_slope_edge(self, wavelength_nm: float) -> tuple[float, float, float]:
+    def _transmittance_slope_edge(self, wavelength_nm: float) -> tuple[float, float, float]:
         """Return transmittance, phase slope in waves per radius, and relative edge length."""
         key = 0.0 if self.is_grey else wavelength_nm
         if key not in self._kept:
@@ -161,11 +161,11 @@ class Aperture:
         ParameterError
             When no power is transmitted.
         """
-        return self._share_slope_edge(wavelength_nm)[0] if self.pupils else 1.0
+        return self._transmittance_slope_edge(wavelength_nm)[0] if self.pupils else 1.0
 
     def edge(self, wavelength_nm: float) -> float:
         """Return the edge length per area of the pupil, relative to a clear circle; at least 1."""
-        return self._share_slope_edge(wavelength_nm)[2] if self.pupils else 1.0
+        return self._transmittance_slope_edge(wavelength_nm)[2] if self.pupils else 1.0
 
     def path_um(self, x: Floats, y: Floats, wavelength_nm: float, field_um: tuple[float, float]) -> Floats:
         """Return the total path difference in µm, defocus included, at points of the aperture."""
@@ -176,7 +176,7 @@ class Aperture:
 
     def blur_lambda_n(self, wavelength_nm: float, field_um: tuple[float, float]) -> float:
         """Return the largest geometric ray displacement in units of λN: twice the slope in waves."""
-        slope = self._share_slope_edge(wavelength_nm)[1] if self.pupils else 0.0
+        slope = self._transmittance_slope_edge(wavelength_nm)[1] if self.pupils else 0.0
         key = wavelength_nm, field_um
         if (self.wavefronts or self.defocus_um) and key not in self._kept:
             at = np.linspace(-1.0, 1.0, SLOPE_POINTS)

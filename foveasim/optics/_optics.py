@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 __all__ = ["Optics"]
 
 #: Fraction of the PSF energy outside the default padding radius.
-LOST_SHARE = 0.01
+LOST_FRACTION = 0.01
 #: Fraction of the PSF energy that an isoplanatic patch may displace.
-PATCH_LOST_SHARE = 0.002
+PATCH_LOST_FRACTION = 0.002
 #: Factor by which the aperture radius should exceed H λ / (p0 min(M, N)); the paper's Eq. 5 requires "much larger".
 MUCH_LARGER = 10.0
 #: Largest number of cells along a source pixel.
@@ -367,7 +367,7 @@ class Optics(PointImages):
         if not self._is_clear_circle(aperture):
             for wave_nm in scene.wavelength_nm:
                 aperture.transmittance(float(wave_nm))
-                for place_um in self._places_um(grid):
+                for place_um in self._field_points_um(grid):
                     aperture.n_across(float(wave_nm), place_um)
 
     # -- irradiance -----------------------------------------------------------------------------------------------
@@ -488,10 +488,10 @@ class Optics(PointImages):
             falloff_power=4 if self.emission == "lambertian" else 3,
             grid=pixels,
             padding=self.padding,
-            pad=self._reach(scene, pixels, aperture, lambda_n_um, LOST_SHARE)
+            pad=self._reach(scene, pixels, aperture, lambda_n_um, LOST_FRACTION)
             if self.padding_cells is None
             else self.padding_cells,
-            guard=self._reach(scene, pixels, aperture, lambda_n_um, PATCH_LOST_SHARE),
+            guard=self._reach(scene, pixels, aperture, lambda_n_um, PATCH_LOST_FRACTION),
             blur_cells=self._blur_um(scene, pixels, aperture, lambda_n_um) / pixels.pitch_x_um,
             f_max_per_um=1.0 / float(lambda_n_um.min()),
             is_square_source=self.source_pixel == "square",
@@ -583,7 +583,7 @@ class Optics(PointImages):
     def _lambda_n_um(self, scene: SceneLike) -> Floats:
         return np.asarray(um_from_nm(scene.wavelength_nm) * self.working_f_number(scene.distance_m))
 
-    def _places_um(self, grid: Grid) -> list[tuple[float, float]]:
+    def _field_points_um(self, grid: Grid) -> list[tuple[float, float]]:
         """Return the field points with the strongest aberrations."""
         half_x_um, half_y_um = (0.5 * n * grid.pitch_x_um for n in grid.shape[::-1])
         corners = [(sx * half_x_um, sy * half_y_um) for sx in (-1, 1) for sy in (-1, 1)]
@@ -594,7 +594,7 @@ class Optics(PointImages):
         return max(
             aperture.blur_lambda_n(float(wave_nm), place_um) * float(near_um)
             for wave_nm, near_um in zip(scene.wavelength_nm, lambda_n_um, strict=True)
-            for place_um in self._places_um(grid)
+            for place_um in self._field_points_um(grid)
         )
 
     def _reach(self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats, share: float) -> int:
@@ -610,7 +610,7 @@ class Optics(PointImages):
                 grid.pitch_x_um,
             )
             for wave_nm, near_um in zip(scene.wavelength_nm, lambda_n_um, strict=True)
-            for place_um in self._places_um(grid)
+            for place_um in self._field_points_um(grid)
         )
 
     def _real_type(self) -> type[np.floating[Any]]:

@@ -8,7 +8,7 @@ from foveasim._core.rings import site_moments
 from foveasim._core.validation import Floats, Ints, finite_array, read_only
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
-from foveasim.reconstruct.picture import Picture, covered_share
+from foveasim.reconstruct.picture import Picture, coverage_fraction
 
 __all__ = ["cells", "fill_channels"]
 
@@ -37,7 +37,7 @@ def cells(layout: PackedRings, values: Floats, grid: Grid, *, n_threads: int | N
     """
     integrator = Integrator(layout, grid, n_threads=n_threads)
     channels = np.atleast_2d(finite_array("values", values))
-    share = covered_share(integrator)
+    share = coverage_fraction(integrator)
     covered_um2 = np.where(share > 0.0, share, np.nan) * grid.cell_area_um2
     data = integrator.spread(channels) / covered_um2
     return Picture(read_only(data.astype(np.float32)), read_only(share.astype(np.float32)), grid)

@@ -17,7 +17,7 @@ from foveasim._core.validation import Floats, Ints, as_numbers, read_only
 from foveasim.errors import ParameterError
 from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
-from foveasim.reconstruct.picture import Picture, covered_share
+from foveasim.reconstruct.picture import Picture, coverage_fraction
 
 __all__ = ["linear", "natural", "site_values"]
 
@@ -108,7 +108,7 @@ def _interpolated(
     integrator = Integrator(layout, grid, n_threads=n_threads)
     channels = site_values(values, integrator.n_sites)
     _, centroid_um = site_moments(layout.xy_um, layout.ring_offsets, layout.site_offsets)
-    share = covered_share(integrator)
+    share = coverage_fraction(integrator)
     row, column = np.nonzero(share)
     points_um = np.stack((grid.x_um[column], grid.y_um[row]), axis=1)
     data = np.full((channels.shape[0], *grid.shape), np.nan)

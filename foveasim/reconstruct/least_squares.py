@@ -23,7 +23,7 @@ from foveasim.fields import Grid, PackedRings
 from foveasim.integrate import Integrator
 from foveasim.reconstruct._bounded import least_nonnegative
 from foveasim.reconstruct.interpolation import site_values
-from foveasim.reconstruct.picture import Picture, covered_share
+from foveasim.reconstruct.picture import Picture, coverage_fraction
 
 __all__ = ["least_squares"]
 
@@ -121,7 +121,7 @@ def least_squares(
         raise ParameterError("mu", "must be a number without 'variance', as both rules depend on the noise")
     tolerance = check_number("tolerance", tolerance, above=0.0, at_most=0.1)
     max_steps = check_count("max_steps", max_steps)
-    share = covered_share(integrator)
+    share = coverage_fraction(integrator)
     kernel_of = _kernels_of(blur, n_channels)
     pad = tuple(n // 2 for n in kernel_of[0].shape) if kernel_of else (0, 0)
     shape = tuple(_fast(n + 2 * p) if p else n for n, p in zip(grid.shape, pad, strict=True))

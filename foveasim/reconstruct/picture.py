@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foveasim._core.validation import Floats, Images, check_count, finite_array, own, unmasked
-from foveasim._io.encodings import encoded_srgb
+from foveasim._io.encodings import encode_srgb_values
 from foveasim._io.images import write_picture
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid, PackedRings, to_file_rows
 from foveasim.integrate import Integrator
 
-__all__ = ["Picture", "covered_share", "raster_grid"]
+__all__ = ["Picture", "coverage_fraction", "raster_grid"]
 
 #: Coverage below this fraction is rounding error.
 NO_COVERAGE = 1e-9
@@ -83,7 +83,7 @@ class Picture:
             white = float(np.nanmax(self.data, initial=0.0)) or 1.0
         share = np.clip(np.nan_to_num(self.data) / self._levels(white), 0.0, 1.0)
         if encode_srgb:
-            share = encoded_srgb(share)
+            share = encode_srgb_values(share)
         layers = np.concatenate((share, np.clip(self.coverage, 0.0, 1.0)[np.newaxis]))
         image: NDArray[Any] = np.rint((2**bits - 1) * to_file_rows(layers))
         return np.ascontiguousarray(image.astype(np.uint8 if bits == 8 else np.uint16))
@@ -154,7 +154,7 @@ def raster_grid(layout: PackedRings, max_pixels: int) -> Grid:
     return Grid((n_y, n_x), pitch_um, origin_um)
 
 
-def covered_share(integrator: Integrator) -> Floats:
+def coverage_fraction(integrator: Integrator) -> Floats:
     """
     Compute the exact fraction of each pixel that photosites cover, (n_y, n_x).
 

@@ -17,7 +17,7 @@ from foveasim._core.validation import (
     check_number,
     check_shape,
     finite_array,
-    handed_over,
+    hand_over,
     own,
     read_only,
     unmasked,
@@ -213,7 +213,7 @@ class Scene:
                 "for other wavelengths pass 'spectrum', the spectrum of each channel",
             )
         return cls(
-            handed_over(channels),
+            hand_over(channels),
             peak * relative,
             waves_nm,
             band_widths_nm(waves_nm, band_width_nm),

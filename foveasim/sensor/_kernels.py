@@ -22,12 +22,12 @@ __all__ = [
     "ADC_LOG",
     "ADC_ROOT",
     "ADC_TABLE",
-    "bend_voltages",
+    "apply_nonlinearity",
     "convert",
+    "count_ray_intersections",
     "device_uniforms",
     "draw_poisson",
     "predict_codes",
-    "rays_met",
 ]
 
 #: ADC transfer functions, as numbered by ``ConversionTables.way``.
@@ -78,7 +78,7 @@ def device_uniforms(key_0, key_1, first, second):
 
 
 @njit(types.int64[::1](_points, _ints, _ints, _points, _points))
-def rays_met(xy, ring_offsets, site_offsets, centroid, directions):
+def count_ray_intersections(xy, ring_offsets, site_offsets, centroid, directions):
     """
     Count the rays from each site's centroid that intersect the site's outline.
 
@@ -162,16 +162,16 @@ def _companded(share, adc):
 
 
 @njit(inline="always")
-def _bent(v, bend, v_sat_v):
+def _apply_nonlinearity(v, bend, v_sat_v):
     """Return the voltage after the nonlinearity."""
     return v * (1.0 - bend * min(max(v / v_sat_v, 0.0), 1.0))
 
 
 @njit(types.void(types.float64[::1], types.float64, types.float64), error_model="numpy")
-def bend_voltages(voltage_v, bend, v_sat_v):
+def apply_nonlinearity(voltage_v, bend, v_sat_v):
     """Apply the nonlinearity in place; ``bend`` is the relative signal loss at full range."""
     for i in range(voltage_v.size):
-        voltage_v[i] = _bent(voltage_v[i], bend, v_sat_v)
+        voltage_v[i] = _apply_nonlinearity(voltage_v[i], bend, v_sat_v)
 
 
 @njit(inline="always")
@@ -192,7 +192,7 @@ def _with_inl(value, n_codes, inl):
 def _value(charge, site, adc):
     """Return the unquantised code; ``site`` is (v_per_e, sense_v, scale, output_v, bend)."""
     per_e, sense_v, scale, output_v, bend = site
-    v = _bent(charge * per_e + sense_v, bend, adc.v_sat_v) * scale + output_v
+    v = _apply_nonlinearity(charge * per_e + sense_v, bend, adc.v_sat_v) * scale + output_v
     value = _companded(_share(v, adc.v_sat_v), adc) * adc.n_codes
     return _with_inl(value, adc.n_codes, adc.inl) if adc.inl.size > 1 else value
 

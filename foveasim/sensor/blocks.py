@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 from foveasim._core.threads import each, thread_count
 
-__all__ = ["BLOCK_SITES", "in_blocks", "pieces"]
+__all__ = ["BLOCK_SITES", "for_each_block", "pieces"]
 
 #: Number of sites per random stream of an effect. It is fixed so that draws do not depend on the number of threads.
 BLOCK_SITES = 1 << 16
@@ -15,7 +15,7 @@ BLOCK_SITES = 1 << 16
 PIECE_SITES = 1 << 15
 
 
-def in_blocks(n_sites: int, work: Callable[[int, slice], None], n_threads: int | None = None) -> None:
+def for_each_block(n_sites: int, work: Callable[[int, slice], None], n_threads: int | None = None) -> None:
     """Call a function with the number and the slice of each block of sites, in threads."""
     n_blocks = -(-n_sites // BLOCK_SITES)
     each(

@@ -84,7 +84,7 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
     temporal = dict.fromkeys(TEMPORAL, np.zeros(1))
     fixed = dict.fromkeys(FIXED, np.zeros(1))
     temporal["quantisation"] = math.sqrt(sensor.converter.noise_dn2) * step_e
-    any_device = sensor.sites.of_any_device()
+    any_device = sensor.sites.without_device()
     for effect in sensor.chain:
         if effect.stage == "collection":
             if sensor.shot.is_drawn:
@@ -93,7 +93,7 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
         elif effect.is_temporal or effect.is_local:
             values, e_per_unit = nominal[effect.stage]
             sites = sensor.sites if effect.is_temporal else any_device
-            mean, variance = effect.checked_moments(values, np.zeros(1), sites)
+            mean, variance = effect.validated_moments(values, np.zeros(1), sites)
             lines = temporal if effect.is_temporal else fixed
             lines[effect.name] = np.sqrt(variance + (mean - values) ** 2) * e_per_unit
     return {name: np.broadcast_to(line, n_sites).copy() for name, line in (temporal | fixed).items()}

@@ -33,7 +33,7 @@ SIGMA_PER_MAD = 1.482602218505602
 #: Probability that a site with typical noise is classified as noisy, for the given number of frames.
 FALSE_ALARM = 1e-6
 #: Maximum distance, in steps of adjacency, of the neighbours that replace a defective site.
-FURTHEST_STEPS = 3
+MAX_FILL_STEPS = 3
 
 
 # -- inversion of the ADC transfer function ---------------------------------------------------------------------------
@@ -346,7 +346,7 @@ class Calibration:
         relative = np.where(is_good, values / self.expected_dn, 0.0).T
         found = np.full((bad.size, values.shape[0]), np.nan)
         within = _pattern(neighbours[bad])
-        for _ in range(FURTHEST_STEPS):
+        for _ in range(MAX_FILL_STEPS):
             near = within.copy()
             if kinds is not None:
                 of_bad = np.repeat(kinds[bad], np.diff(near.indptr))

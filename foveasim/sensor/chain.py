@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Floats
 from foveasim.errors import ParameterError, SimulationError
-from foveasim.sensor.blocks import in_blocks, pieces
+from foveasim.sensor.blocks import for_each_block, pieces
 from foveasim.sensor.effects import STAGES, STANDARD, Effect, FixedFactor, FixedOffset, Sites
 
 __all__ = ["Factor", "Nonlinearity", "Offset", "Step", "check_effects", "check_names", "merged", "ordered", "run"]
@@ -76,7 +76,7 @@ class Nonlinearity(_Deterministic):
         from foveasim.sensor import _kernels
 
         _ = sites, rng
-        _kernels.bend_voltages(values, self.bend, self.v_sat_v)
+        _kernels.apply_nonlinearity(values, self.bend, self.v_sat_v)
         return values
 
 
@@ -258,5 +258,5 @@ def _pass(
             else:
                 last(part, some, out[index])
 
-    in_blocks(out.size, block, n_threads)
+    for_each_block(out.size, block, n_threads)
     return out

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._core.random_streams import device_key
+from foveasim._core.random_streams import fixed_pattern_key
 from foveasim._core.rings import positions_in_runs, site_moments
 from foveasim._core.validation import Floats, Ints, read_only
 from foveasim.errors import ParameterError
@@ -78,7 +78,7 @@ class Device:
         _, centroid_um = site_moments(*rings)
         place = np.rint(centroid_um / PLACE_UM).astype(np.int64).T
         x, y = (words.view(np.uint64) for words in np.ascontiguousarray(place))
-        n_met = _kernels.rays_met(*rings, np.ascontiguousarray(centroid_um), RAYS)
+        n_met = _kernels.count_ray_intersections(*rings, np.ascontiguousarray(centroid_um), RAYS)
         is_around = n_met >= FEWEST_RAYS_AROUND
         if np.any((n_met > 0) & ~is_around):
             _, which, n_here = np.unique(place, axis=1, return_inverse=True, return_counts=True)
@@ -89,7 +89,7 @@ class Device:
 
     def key(self, effect: str) -> tuple[np.uint64, np.uint64]:
         """Return the generator key of an effect."""
-        return device_key(self.seed, effect)
+        return fixed_pattern_key(self.seed, effect)
 
     def uniforms(self, effect: str) -> Floats:
         """Return a uniform number in (0, 1) for each site, (n_site,)."""

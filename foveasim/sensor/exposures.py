@@ -27,7 +27,7 @@ __all__ = ["Ramp", "Rates", "fit_ramp", "merge_exposures", "non_destructive_read
 #: A read counts as saturated within this number of read-noise standard deviations of the full well.
 MARGIN_SIGMAS = 5.0
 #: Final fraction of the range over which weights taper to 0: wide compared with shot noise for charges above 400 e-.
-TAPER_SHARE = 0.25
+TAPER_FRACTION = 0.25
 #: Number of iterations of the weights from the merged estimate.
 N_PASSES = 2
 
@@ -175,7 +175,7 @@ def merge_exposures(
     is_used = (codes < 2.0**sensor.bits - 1.0) & (linear_dn < top_dn) & np.isfinite(charge_e) & (top_e > 0.0)
     t_s = times_s[:, None]
     rates = np.where(is_used, charge_e, 0.0) / t_s
-    width = TAPER_SHARE * np.where(is_used, top_e, 1.0) / t_s
+    width = TAPER_FRACTION * np.where(is_used, top_e, 1.0) / t_s
     taper = np.where(is_used, np.clip((np.where(is_used, top_e, 0.0) / t_s - rates) / width, 0.0, 1.0), 0.0)
     falling = np.where((taper > 0.0) & (taper < 1.0), -1.0 / width, 0.0)
     is_known = taper.any(axis=0)
@@ -343,7 +343,7 @@ def fit_ramp(
     rise_e = np.where(is_used[1:], np.diff(charge_e, axis=0), 0.0)
     diagonal = np.where(is_used[1:], np.maximum(rate, 0.0) * dt_s + noise_e2[:-1] + noise_e2[1:], 1.0)
     beside = np.where(is_used[2:], -noise_e2[1:-1], 0.0)
-    weights = _solved(diagonal, beside, dt_s)
+    weights = _solve_tridiagonal(diagonal, beside, dt_s)
     information = (weights * dt_s).sum(axis=0)
     is_known = n_used >= 2
     information = np.where(is_known, information, 1.0)
@@ -406,7 +406,7 @@ def _saturation_dn(sensor: Sensor) -> Floats:
     return np.minimum(top_dn, well_dn - MARGIN_SIGMAS * noise_dn - 1.0)
 
 
-def _solved(diagonal: Floats, beside: Floats, right: Floats) -> Floats:
+def _solve_tridiagonal(diagonal: Floats, beside: Floats, right: Floats) -> Floats:
     """Solve symmetric tridiagonal systems, one per column, by the Thomas algorithm."""
     n = diagonal.shape[0]
     pivot, solved = diagonal.copy(), right.copy()

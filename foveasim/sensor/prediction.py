@@ -93,7 +93,7 @@ class _Linear:
         self.noise, self.half_step2 = np.zeros(1), np.zeros(1)
         self.mean, self.variance = mean, variance
         for effect in effects:
-            mean, variance = effect.checked_moments(self.mean, self.variance, sites)
+            mean, variance = effect.validated_moments(self.mean, self.variance, sites)
             factor = effect.moments(self.mean + 1.0, self.variance, sites=sites)[0] - mean
             added = np.zeros(1)
             if effect.is_temporal:

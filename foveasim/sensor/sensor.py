@@ -14,7 +14,7 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, check_number, read_only, unmasked
 from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.adc import Companding, ConversionTables, Converter
-from foveasim.sensor.blocks import in_blocks
+from foveasim.sensor.blocks import for_each_block
 from foveasim.sensor.chain import Factor, Nonlinearity, Offset, Step, check_effects, check_names, merged, ordered, run
 from foveasim.sensor.device import Device
 from foveasim.sensor.effects import EFFECTS, STANDARD, Effect, Photosites, Sites, dark_current_factor
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["PerSite", "Photosites", "Sensor"]
 
 #: Maximum mean of exact Poisson draws by inversion, the cost of which is proportional to the mean.
-MOST_INVERTED_E = 700.0
+MAX_INVERSION_MEAN_E = 700.0
 #: Parameters with one value or one per site, and parameters with one value only.
 _PER_SITE = ("sensitivity", "dark_e_per_s", "full_well_e", "read_noise_e", "capacitance_f")
 _NUMBERS = (
@@ -189,7 +189,7 @@ class Sensor:
         numbers: dict[str, float] = {
             **{name: check_plausible(name, getattr(self, name)) for name in _NUMBERS},
             "gaussian_above_e": check_number(
-                "gaussian_above_e", self.gaussian_above_e, at_least=10.0, at_most=MOST_INVERTED_E
+                "gaussian_above_e", self.gaussian_above_e, at_least=10.0, at_most=MAX_INVERSION_MEAN_E
             ),
             "device_seed": check_count("device_seed", self.device_seed, at_least=0),
         }
@@ -203,7 +203,7 @@ class Sensor:
             )
         for name, number in numbers.items():
             object.__setattr__(self, name, number)
-        hottest_e_per_s = self.heat * float(np.max(self.dark_e_per_s, initial=0.0) + self.hot_e_per_s)
+        hottest_e_per_s = self.dark_current_ratio * float(np.max(self.dark_e_per_s, initial=0.0) + self.hot_e_per_s)
         if hottest_e_per_s > LIMITS["dark_e_per_s"].high:
             raise ParameterError(
                 "dark_e_per_s",
@@ -480,7 +480,7 @@ class Sensor:
     @property
     def nominal_dark_e_per_s(self) -> Floats:
         """Nominal dark current at the sensor's temperature, (n_site,) or (1,) e-/s."""
-        return np.atleast_1d(np.asarray(self.dark_e_per_s, np.float64)) * self.heat
+        return np.atleast_1d(np.asarray(self.dark_e_per_s, np.float64)) * self.dark_current_ratio
 
     def _fixed(self, values: PerSite | Floats, stage: str) -> Floats:
         """Return the values of all sites after the effects of a stage."""
@@ -490,7 +490,7 @@ class Sensor:
         return read_only(run(effects, np.broadcast_to(values, self.layout.n_sites), sites=self.sites))
 
     @property
-    def heat(self) -> float:
+    def dark_current_ratio(self) -> float:
         """Ratio of the dark current at ``temperature_k`` to that at ``dark_reference_k``."""
         return dark_current_factor(self.temperature_k, self.dark_reference_k, self.dark_doubling_k)
 
@@ -592,7 +592,7 @@ class Sensor:
             raise ParameterError(name, f"must be >= {at_least:g} everywhere", float(np.min(charges)), "e-")
         return charges
 
-    def checked_charges(self, name: str, charge_e: ArrayLike) -> Floats:
+    def validate_charges(self, name: str, charge_e: ArrayLike) -> Floats:
         """
         Return charges as an array (n_site,) float64, e-, after validation.
 
@@ -638,7 +638,7 @@ class Sensor:
             self._at("output"),
             mean_e=mean_e,
             variance_e2=variance_e2,
-            sites=self.sites if is_device_known else self.sites.of_any_device(),
+            sites=self.sites if is_device_known else self.sites.without_device(),
             v_per_e=self.v_per_e,
             bend=self.nonlinearity_fraction,
             v_sat_v=self.v_sat_v,
@@ -676,7 +676,7 @@ class Sensor:
         """
         from foveasim.sensor import _kernels
 
-        expected_e = self.checked_charges("expected_e", expected_e)
+        expected_e = self.validate_charges("expected_e", expected_e)
         mean_dn, variance_dn2 = np.empty(expected_e.size), np.empty(expected_e.size)
         well_e, is_drawn = self.well_e, self.shot.is_drawn
         drawn_e, drawn_e2 = expected_e, np.zeros(1)
@@ -717,7 +717,7 @@ class Sensor:
                 variance_dn2[sites],
             )
 
-        in_blocks(expected_e.size, block, n_threads)
+        for_each_block(expected_e.size, block, n_threads)
         return mean_dn, variance_dn2
 
 

@@ -116,7 +116,7 @@ def signal_to_noise(sensor: Sensor, expected_e: ArrayLike, dark_e: ArrayLike) ->
     """
     n_sites = sensor.layout.n_sites
     charge_e, dark = (
-        sensor.checked_charges(name, values) for name, values in (("expected_e", expected_e), ("dark_e", dark_e))
+        sensor.validate_charges(name, values) for name, values in (("expected_e", expected_e), ("dark_e", dark_e))
     )
     shot, well_e = sensor.shot, sensor.well_e
     is_saturated = charge_e + CUT_OFF_SIGMAS * np.sqrt(charge_e * shot.is_drawn) >= well_e

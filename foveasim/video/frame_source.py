@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foveasim._core.extras import needs
 from foveasim._core.validation import check_count, check_number
-from foveasim._io.images import PICTURE_ENDINGS, check_picture_size, picture_names
+from foveasim._io.images import PICTURE_EXTENSIONS, check_picture_size, picture_names
 from foveasim.errors import FileError, ParameterError, printable
 from foveasim.scene import Scene
 
@@ -109,7 +109,7 @@ class FrameSource:
             else:
                 raise FileError(path, "no such file or directory")
         elif isinstance(source, Iterable):
-            self._source = _Once(source) if isinstance(source, Iterator) else source
+            self._source = _SinglePass(source) if isinstance(source, Iterator) else source
             self._n_source = len(source) if isinstance(source, Sized) else None
         else:
             raise ParameterError("source", f"must be a path or an iterable of pictures, got a {type(source).__name__}")
@@ -163,9 +163,9 @@ class FrameSource:
 
     def _check_some(self, n_frames: int | None) -> None:
         if n_frames == 0 and not self._may_be_empty:
-            told = "an unknown number of" if self._n_source is None else f"{self._n_source:,}"
+            n_pictures = "an unknown number of" if self._n_source is None else f"{self._n_source:,}"
             until = "" if self._stop is None else f" and below {self._stop}"
-            raise ParameterError("source", f"must have a frame from {self._start}{until}, got {told} pictures")
+            raise ParameterError("source", f"must have a frame from {self._start}{until}, got {n_pictures} pictures")
 
     def __iter__(self) -> Iterator[Scene]:
         """Iterate over the scenes."""
@@ -207,7 +207,7 @@ def pictures_in(folder: Path) -> list[Path]:
     """Return the paths of the pictures in a directory in natural order."""
     names = picture_names(path.name for path in folder.iterdir() if path.is_file())
     if not names:
-        raise FileError(folder, f"contains no pictures ({', '.join(PICTURE_ENDINGS)})")
+        raise FileError(folder, f"contains no pictures ({', '.join(PICTURE_EXTENSIONS)})")
     return [folder / name for name in names]
 
 
@@ -225,7 +225,7 @@ def _check_settings(scene: dict[str, Any]) -> None:
             )
 
 
-class _Once:
+class _SinglePass:
     """Items of an iterator, which can be iterated only once."""
 
     def __init__(self, pictures: Iterator[Any]) -> None:

@@ -243,5 +243,5 @@ def _parts(
 def _check_kinds(*arguments: tuple[str, object, tuple[type, ...]]) -> None:
     for name, value, kinds in arguments:
         if not isinstance(value, kinds):
-            told = " or ".join(kind.__name__ for kind in kinds)
-            raise ParameterError(name, f"must be a {told}, got a {type(value).__name__}")
+            class_names = " or ".join(kind.__name__ for kind in kinds)
+            raise ParameterError(name, f"must be a {class_names}, got a {type(value).__name__}")

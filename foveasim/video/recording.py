@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from foveasim._core.extras import library
 from foveasim._core.provenance import differences, to_plain_data
 from foveasim._core.validation import Floats, check_count
-from foveasim._io.atomic import atomic_directory, lock, remove_folder
+from foveasim._io.atomic import atomic_directory, lock, remove_directory
 from foveasim._io.formats import as_file_error
 from foveasim._io.zarr_stores import ZARR, check_codecs
 from foveasim.capture import Capture
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout import Layout
-from foveasim.layout.packed import packed_layout
+from foveasim.layout.packed import layout_to_arrays
 
 __all__ = [
     "Recording",
@@ -43,7 +43,7 @@ CHUNK_CODES = 1 << 22
 WRITE_S = 10.0
 #: Allowed codecs, the defaults of zarr; and size limit of the arrays other than the codes.
 CODECS = ("bytes", "zstd")
-MAX_UNPACKED_BYTES = 8 * 2**30
+MAX_DECOMPRESSED_BYTES = 8 * 2**30
 #: Arrays of the layout, and arrays that grow frame by frame: frame numbers are written last and mark complete frames.
 GEOMETRY, GROWING = ("xy_um", "ring_offsets", "site_offsets"), ("code", "exposure_s", "frame")
 #: Fill value of frame numbers, for incomplete frames.
@@ -171,7 +171,7 @@ def count_recorded_frames(path: str | Path) -> int:
         with _trusted(target) as group:
             return int(group["code"].shape[0])
     folder = partial_path(target)
-    return _n_whole(folder) if folder.exists() else 0
+    return _count_complete(folder) if folder.exists() else 0
 
 
 @contextmanager
@@ -188,8 +188,8 @@ def _trusted(source: Path, mode: str = "r") -> Iterator[Any]:
         names = (*GEOMETRY, "filter_of_site", "exposure_s", "frame")
         arrays = [group[name] for name in names if name in group]
         arrays += [array for _, array in group["columns"].arrays()] if "columns" in group else []
-        if sum(array.nbytes for array in arrays) > MAX_UNPACKED_BYTES:
-            raise FileError(source, f"would decompress to more than {MAX_UNPACKED_BYTES} bytes")
+        if sum(array.nbytes for array in arrays) > MAX_DECOMPRESSED_BYTES:
+            raise FileError(source, f"would decompress to more than {MAX_DECOMPRESSED_BYTES} bytes")
         yield group
 
 
@@ -243,18 +243,18 @@ def resume_recording(captures: Iterable[Capture], target: Path, plan: Mapping[st
     if target.exists():
         return _finished(captures, target, plan)
     with _growing(target) as folder:
-        n_before = _n_whole(folder)
+        n_before = _count_complete(folder)
         if n_before:
             _check_plan(folder, plan)
-        with _full_disks_told(target):
+        with _disk_errors(target):
             frames = _Frames(folder, plan, n_before)
         try:
             for capture in _following(alike(captures, n_before=n_before), folder, n_before):
-                with _full_disks_told(target):
+                with _disk_errors(target):
                     frames.add(capture)
                     if time.monotonic() - frames.written_s > WRITE_S:
                         frames.write()
-            with _full_disks_told(target):
+            with _disk_errors(target):
                 frames.write()
                 folder.rename(target)
                 (target / LOCK).unlink(missing_ok=True)
@@ -291,11 +291,11 @@ def _growing(target: Path) -> Iterator[Path]:
         raise FileError(target, f"cannot be written: the directory {target.parent} does not exist")
     if folder.exists() and not (folder.is_dir() and _is_ours(folder)):
         raise FileError(folder, "cannot be written: the path contains other data; choose another path")
-    with _full_disks_told(target):
+    with _disk_errors(target):
         folder.mkdir(exist_ok=True)
         file = (folder / LOCK).open("ab")
     with file:
-        with _full_disks_told(target):
+        with _disk_errors(target):
             # Another process may have finished the recording, or replaced the directory, before it was locked.
             if not lock(file) or not _is_at(file, folder / LOCK):
                 raise FileError(target, "is being written by another process")
@@ -304,12 +304,12 @@ def _growing(target: Path) -> Iterator[Path]:
         try:
             yield folder
         finally:
-            if folder.exists() and not _n_whole(folder):
-                remove_folder(folder)
+            if folder.exists() and not _count_complete(folder):
+                remove_directory(folder)
 
 
 @contextmanager
-def _full_disks_told(target: Path) -> Iterator[None]:
+def _disk_errors(target: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
@@ -328,7 +328,7 @@ def _is_at(file: IO[bytes], path: Path) -> bool:
         return False
 
 
-def _n_whole(folder: Path) -> int:
+def _count_complete(folder: Path) -> int:
     """Return the number of complete frames of an unfinished recording."""
     if not (folder / "frame" / "zarr.json").exists():
         return 0
@@ -341,10 +341,10 @@ def _check_plan(path: Path, plan: Mapping[str, Any] | None) -> None:
     """Reject a recording that has another plan."""
     with _trusted(path) as group:
         found = group.attrs.get("plan")
-    _refuse(path, differences(found, _plain(plan)))
+    _reject(path, differences(found, _plain(plan)))
 
 
-def _refuse(path: Path, different: Iterable[str]) -> None:
+def _reject(path: Path, different: Iterable[str]) -> None:
     for name in different:
         raise FileError(
             path,
@@ -378,13 +378,13 @@ def _following(captures: Iterable[Capture], folder: Path, n_before: int) -> Iter
         first = settings if first is None else first
         different = [name for name in differences(first, settings) if name not in may_differ]
         if n_before and k == n_before:
-            _refuse(folder, _other_parts(folder, capture))
-            _refuse(folder, different)
+            _reject(folder, _other_parts(folder, capture))
+            _reject(folder, different)
         elif different:
             may_differ |= set(different)
             with _trusted(folder, "r+") as group:
                 pass
-            with _full_disks_told(folder):
+            with _disk_errors(folder):
                 group.attrs["varied"] = sorted(may_differ - OWN_SETTINGS)
         next_frame = frame + 1
         yield capture
@@ -393,7 +393,7 @@ def _following(captures: Iterable[Capture], folder: Path, n_before: int) -> Iter
 def _other_parts(folder: Path, capture: Capture) -> Iterator[str]:
     """Yield the names of properties (not settings) that differ from those of a recording."""
     found = read_recording(folder)
-    there, here = packed_layout(found.layout), packed_layout(capture.layout)
+    there, here = layout_to_arrays(found.layout), layout_to_arrays(capture.layout)
     if there.keys() != here.keys() or any(not np.array_equal(there[name], here[name]) for name in here):
         yield "layout"
     if found.bits != capture.bits or found.code.dtype != capture.code.dtype:
@@ -429,8 +429,8 @@ class _Frames:
                 code = self._arrays["code"]
                 self._n_chunk = code.chunks[0]
                 n_before = n_whole - n_whole % self._n_chunk
-                if (n_whole - n_before) * code.shape[1] * code.dtype.itemsize > MAX_UNPACKED_BYTES:
-                    raise FileError(folder, f"would decompress to more than {MAX_UNPACKED_BYTES} bytes")
+                if (n_whole - n_before) * code.shape[1] * code.dtype.itemsize > MAX_DECOMPRESSED_BYTES:
+                    raise FileError(folder, f"would decompress to more than {MAX_DECOMPRESSED_BYTES} bytes")
                 values = (array[n_before:n_whole] for array in self._arrays.values())
                 self._chunk = n_before, list(zip(*values, strict=True))
             for array in self._arrays.values():

@@ -21,7 +21,7 @@ from foveasim.fields import Grid
 from foveasim.integrate import Integrator
 from foveasim.layout import Layout
 from foveasim.reconstruct import Picture, fill_channels, raster_grid
-from foveasim.reconstruct.picture import covered_share
+from foveasim.reconstruct.picture import coverage_fraction
 from foveasim.video.recording import alike, count_recorded_frames, record, resume_recording
 
 __all__ = ["write_video"]
@@ -150,7 +150,7 @@ class _Raster:
         if is_even:  # chroma subsampling of video formats needs even sizes
             grid = Grid(tuple(n + n % 2 for n in grid.shape), grid.pitch_um, grid.origin_um)  # type: ignore[arg-type]
         self._layout, self._integrator = layout, Integrator(layout, grid)
-        self._share = covered_share(self._integrator)
+        self._share = coverage_fraction(self._integrator)
         self._covered_um2 = np.where(self._share > 0.0, self._share, np.nan) * grid.cell_area_um2
 
     def image(self, capture: Capture) -> NDArray[np.uint8]:

@@ -426,7 +426,7 @@ def _delaunay(layout: Layout, sites: Ints) -> tuple[Ints, Ints, Ints, Ints]:
 
 def _polydata(points_um: Floats, offsets: Indices, corners: Indices) -> PolyData:
     """Return PolyData of polygons."""
-    pyvista = imported_pyvista()
+    pyvista = import_pyvista()
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonDataModel import vtkCellArray
 
@@ -438,7 +438,7 @@ def _polydata(points_um: Floats, offsets: Indices, corners: Indices) -> PolyData
     return mesh
 
 
-def imported_pyvista() -> Any:
+def import_pyvista() -> Any:
     """
     Import and return PyVista.
 

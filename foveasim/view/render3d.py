@@ -20,8 +20,8 @@ from foveasim._core.threads import each, thread_count
 from foveasim._core.validation import Floats, check_choice, check_count, check_number, check_shape, finite_array
 from foveasim._io.images import write_picture
 from foveasim.errors import FoveasimWarning, GeometryError, ParameterError, SimulationError
-from foveasim.view.meshes import Mesh, imported_pyvista
-from foveasim.view.renderer import ON_SCREEN, begin_rendering, find_renderer, what_to_install
+from foveasim.view.meshes import Mesh, import_pyvista
+from foveasim.view.renderer import ON_SCREEN, begin_rendering, find_renderer, missing_software
 
 if TYPE_CHECKING:
     from pyvista import Plotter
@@ -186,7 +186,7 @@ def render(
     n_x, n_y = _size(size_px, oversampling)
     if finite_array("background", background).shape != (3,) or not all(0 <= part <= 255 for part in background):
         raise ParameterError("background", "must be three numbers from 0 to 255", background)
-    missing = "" if renderer == "software" else what_to_install()
+    missing = "" if renderer == "software" else missing_software()
     if missing and renderer == "pyvista":
         raise SimulationError(missing)
     if missing:
@@ -245,7 +245,7 @@ def show(scene: Shown, *, viewpoint: Viewpoint | None = None, size_px: tuple[int
     """
     meshes = _meshes(scene)
     size = _size(size_px, 1)
-    missing = what_to_install()
+    missing = missing_software()
     if missing:
         raise SimulationError(missing)
     if find_renderer() not in ON_SCREEN:
@@ -438,7 +438,7 @@ def _plotter(
     One light source and, off screen, no multisampling are several times as fast as the defaults of PyVista.
     """
     begin_rendering()
-    pyvista = imported_pyvista()
+    pyvista = import_pyvista()
     plotter = pyvista.Plotter(off_screen=off_screen, window_size=list(size_px), lighting="none")
     plotter.render_window.SetMultiSamples(0 if off_screen else 4)
     plotter.set_background([part / 255.0 for part in background])

@@ -17,15 +17,15 @@ from importlib.util import find_spec
 
 from foveasim._core.extras import install_hint
 
-__all__ = ["ON_SCREEN", "begin_rendering", "find_renderer", "what_to_install"]
+__all__ = ["ON_SCREEN", "begin_rendering", "find_renderer", "missing_software"]
 
 #: Environment variable that selects VTK's window class, and names of these classes.
 VTK_CHOICE = "VTK_DEFAULT_OPENGL_WINDOW"
 X11, EGL, OSMESA = "vtkXOpenGLRenderWindow", "vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow"
 #: Systems whose native windows VTK always supports.
-OF_SYSTEM = {"darwin": "vtkCocoaRenderWindow", "win32": "vtkWin32OpenGLRenderWindow"}
+NATIVE_WINDOWS = {"darwin": "vtkCocoaRenderWindow", "win32": "vtkWin32OpenGLRenderWindow"}
 #: Window classes that display on a screen.
-ON_SCREEN = frozenset({X11, *OF_SYSTEM.values()})
+ON_SCREEN = frozenset({X11, *NATIVE_WINDOWS.values()})
 #: From the EGL headers: a display without a screen (EGL_MESA_platform_surfaceless).
 EGL_PLATFORM_SURFACELESS_MESA = 0x31DD
 #: Time limit of a trial.
@@ -80,7 +80,7 @@ def begin_rendering() -> None:
         os.environ[VTK_CHOICE] = found
 
 
-def what_to_install() -> str:
+def missing_software() -> str:
     """Return a message on the software that PyVista rendering lacks; empty if it is complete."""
     if any(find_spec(module) is None for module in ("pyvista", "vtkmodules")):
         return f"PyVista is not installed; {install_hint('pyvista')}"
@@ -93,8 +93,8 @@ def _candidates() -> Iterator[str]:
     """Yield the window classes whose libraries are available and respond, the best first."""
     if os.environ.get(VTK_CHOICE):
         yield os.environ[VTK_CHOICE]
-    if sys.platform in OF_SYSTEM:
-        yield OF_SYSTEM[sys.platform]
+    if sys.platform in NATIVE_WINDOWS:
+        yield NATIVE_WINDOWS[sys.platform]
         return
     if os.environ.get("DISPLAY") and _opens_display():
         yield X11

@@ -78,7 +78,7 @@ def plot_report(
         corners.append(shapely.total_bounds(markers))
         _draw_result(ax, result, markers, k)
         if n_violations <= MOST_TEXTS:
-            for violation, place_um in zip(shown, _middles_um(markers), strict=True):
+            for violation, place_um in zip(shown, _centres_um(markers), strict=True):
                 text = f"{violation.value:.3g} {violation.unit}".strip()
                 _write(ax, text, place_um, k)
     if layout is None and corners:
@@ -114,7 +114,7 @@ def _draw_result(ax: Axes, result: RuleResult, markers: NDArray[Any], k: int) ->
     solid = [shapely.get_coordinates(ring) for ring in shapely.get_exterior_ring(parts[is_area])]
     ax.add_collection(PolyCollection(solid, facecolors=colour, edgecolors="none", alpha=0.3, zorder=3))
     ax.add_collection(LineCollection(outlines + lines, colors=colour, linewidths=1.0, linestyles=style, zorder=4))
-    x_um, y_um = _middles_um(markers).T
+    x_um, y_um = _centres_um(markers).T
     shown = "" if len(result) == len(markers) else f" (the worst {len(markers):,} are drawn)"
     ax.scatter(
         x_um, y_um, s=(CIRCLE_PT + k * CIRCLE_STEP_PT) ** 2, facecolors="none", edgecolors=colour, linewidths=1.4,
@@ -122,7 +122,7 @@ def _draw_result(ax: Axes, result: RuleResult, markers: NDArray[Any], k: int) ->
     )  # fmt: skip
 
 
-def _middles_um(markers: NDArray[Any]) -> NDArray[np.float64]:
+def _centres_um(markers: NDArray[Any]) -> NDArray[np.float64]:
     """Return the marker centroids, as in the records of the report, (n, 2)."""
     return np.asarray(shapely.get_coordinates(shapely.centroid(markers)))
 

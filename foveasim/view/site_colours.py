@@ -54,7 +54,7 @@ BORDER: Rgb = (64, 64, 64)
 #: Sites without a value (NaN): in none of the colour maps in use.
 NO_DATA: Rgb = (217, 140, 150)
 #: Colour maps of measured signals, and of other columns: the latter is perceptually uniform and colour-blind safe.
-PHOTOGRAPH, EVEN_STEPS = "gray", "viridis"
+PHOTOGRAPH, VIRIDIS = "gray", "viridis"
 #: Exponent of values before they scale a filter colour on a mosaic, so that dark sites are distinguishable.
 DISPLAY_GAMMA = 1.0 / 2.2
 #: Integers with more distinct values are shown on a scale, and strings without a legend.
@@ -165,7 +165,7 @@ def colours_of(data: Layout | Capture, by: str | ArrayLike | None = None, *, lab
     if not isinstance(layout, Layout):
         raise ParameterError("data", f"must be a Layout or a Capture, got a {type(data).__name__}")
     if by is None and capture is None:
-        return SiteColours(np.array(SHADES, np.uint8)[_strewn(layout.n_sites, len(SHADES))])
+        return SiteColours(np.array(SHADES, np.uint8)[_pseudo_random(layout.n_sites, len(SHADES))])
     by = "code" if by is None else by
     if not isinstance(by, str):
         return _of_array(by, layout.n_sites, label)
@@ -177,7 +177,7 @@ def colours_of(data: Layout | Capture, by: str | ArrayLike | None = None, *, lab
     values = _column(layout, by, capture is not None)
     title = label or _title(by)
     is_kind = by == "readout_line" or _is_kind(values)
-    return _kinds(values, title) if is_kind else _sizes(values.astype(np.float64), title, EVEN_STEPS)
+    return _kinds(values, title) if is_kind else _sizes(values.astype(np.float64), title, VIRIDIS)
 
 
 def _column(layout: Layout, by: str, is_capture: bool) -> NDArray[Any]:
@@ -215,7 +215,7 @@ def _of_array(by: ArrayLike, n_sites: int, label: str) -> SiteColours:
         return SiteColours(np.rint(255.0 * given).astype(np.uint8), label, has_borders=False)
     if array.dtype.kind == "U" or _is_kind(array):
         return _kinds(array, label)
-    return _sizes(as_numbers("by", array), label, EVEN_STEPS)
+    return _sizes(as_numbers("by", array), label, VIRIDIS)
 
 
 def _photograph(capture: Capture, values: Floats, title: str) -> SiteColours:
@@ -291,7 +291,7 @@ def _sizes(values: Floats, title: str, colour_map: str) -> SiteColours:
     return SiteColours(table[step.astype(np.int64)], title, values, scale, has_borders=colour_map != PHOTOGRAPH)
 
 
-def _strewn(n: int, n_kinds: int) -> Ints:
+def _pseudo_random(n: int, n_kinds: int) -> Ints:
     """Return reproducible pseudo-random integers below ``n_kinds`` (MurmurHash3 finaliser)."""
     mixed = np.arange(n, dtype=np.uint64)
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35), (16, 1)):

@@ -228,7 +228,7 @@ class Solids:
                 for name, one in made.items()
             ),
             overlap_um3={
-                (a, b): (made[a] ^ made[b]).volume() if _share_height(self.parts[a], self.parts[b]) else 0.0
+                (a, b): (made[a] ^ made[b]).volume() if _overlap_in_height(self.parts[a], self.parts[b]) else 0.0
                 for a, b in combinations(made, 2)
             },
         )
@@ -494,7 +494,7 @@ def _lenses(layout: Layout, floor_um: float, sensor_stack: SensorStack, look: _C
     caps = triangulated(layout)
     n, n_sites, n_steps = layout.xy_um.shape[0], layout.n_sites, sensor_stack.n_lens_steps
     site = np.repeat(np.arange(n_sites), np.diff(layout.ring_offsets[layout.site_offsets]))
-    middle_um = _middles(layout, site)
+    middle_um = _centres(layout, site)
     arm_um = layout.xy_um - middle_um[site]
     # Steps of equal angle from the rim (1) to the apex (0), where a fan closes the cap.
     share = np.cos(0.5 * np.pi * np.arange(n_steps) / n_steps)[:, np.newaxis]
@@ -561,7 +561,7 @@ def _cap_height_um(radius_um: Floats, height_um: float, share: Floats) -> Floats
     return np.where(share < 1.0, rise_um, 0.0)
 
 
-def _middles(layout: Layout, site: Ints) -> Floats:
+def _centres(layout: Layout, site: Ints) -> Floats:
     """
     Return a point in every site about which its outline is star-shaped, (n_site, 2) µm.
 
@@ -603,7 +603,7 @@ def _manifold(points_um: Floats, triangles: NDArray[np.integer[Any]]) -> Any:
     return manifold3d.Manifold(manifold3d.Mesh64(np.ascontiguousarray(points_um), triangles.astype(np.uint64)))
 
 
-def _share_height(one: Mesh, other: Mesh) -> bool:
+def _overlap_in_height(one: Mesh, other: Mesh) -> bool:
     """Return whether two parts overlap in height; otherwise no boolean operation is needed."""
     if not (one.triangles.size and other.triangles.size):
         return False

@@ -8,7 +8,7 @@ from contextlib import suppress
 
 import pytest
 
-from foveasim._io.atomic import atomic_directory, remove_folder
+from foveasim._io.atomic import atomic_directory, remove_directory
 from foveasim.errors import FileError
 
 
@@ -27,14 +27,14 @@ def test_removal_waits_for_late_writers(tmp_path):
     late_writer = threading.Thread(target=write_chunks)
     late_writer.start()
     has_started.wait()
-    remove_folder(directory)
+    remove_directory(directory)
     late_writer.join()
 
     assert list(tmp_path.iterdir()) == []
 
 
 def test_removing_missing_directory_does_nothing(tmp_path):
-    remove_folder(tmp_path / "absent")
+    remove_directory(tmp_path / "absent")
 
     assert list(tmp_path.iterdir()) == []
 

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from foveasim._io.atomic import atomic_write, check_room
+from foveasim._io.atomic import atomic_write, check_free_space
 from foveasim.errors import FileError, disk_problem
 
 #: Call every writer of the package with a file size limit of 1000 bytes.
@@ -113,6 +113,6 @@ def test_other_errors_are_unchanged(tmp_path):
 def test_check_room_compares_free_space(tmp_path):
     file = tmp_path / "x"
     file.write_bytes(bytes(10))
-    check_room(file, 1000)
+    check_free_space(file, 1000)
     with pytest.raises(OSError, match="No space left on device"):
-        check_room(file, 2**62)
+        check_free_space(file, 2**62)

@@ -18,9 +18,9 @@ def add_stray_member(path):
         np.lib.format.write_array(file, np.array(False))
 
 
-@pytest.mark.parametrize("is_packed", [False, True])
-def test_archive_contains_only_given_arrays(tmp_path, is_packed):
-    write_archive(tmp_path / "a.npz", {"format": "x"}, {"n": np.arange(3)}, is_packed=is_packed)
+@pytest.mark.parametrize("is_compressed", [False, True])
+def test_archive_contains_only_given_arrays(tmp_path, is_compressed):
+    write_archive(tmp_path / "a.npz", {"format": "x"}, {"n": np.arange(3)}, is_compressed=is_compressed)
 
     with np.load(tmp_path / "a.npz", allow_pickle=False) as arrays:
         assert sorted(arrays) == ["about", "n"]

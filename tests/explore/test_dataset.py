@@ -1074,7 +1074,7 @@ def test_sample_warnings_are_summarised_and_stored(tmp_path):
         ({"exposure_s": {"normal": [1, 1e300, 0, 2]}}, ParameterError, r"of at most 1e\+06 \* \(high - low\)"),
         ({"exposure_s": {"uniform": b"ab"}}, ParameterError, r"must specify 'uniform' as \[low, high\]"),
         ({"exposure_s": {"integers": [1, 2.5]}}, ParameterError, "must be an integer, got 2.5"),
-        ({"": {"uniform": [1, 2]}}, ConfigError, "'' is no setting's place"),
+        ({"": {"uniform": [1, 2]}}, ConfigError, "'' must be the path of a setting"),
         ({"sensor.bits": {"uniform": [8, 9.5]}}, ConfigError, "sensor.bits: "),
         ({"sensor.bits": {"choice": [8, 40]}}, ConfigError, "sensor.bits: must be <= "),
         (

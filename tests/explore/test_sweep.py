@@ -446,11 +446,14 @@ def interrupt(number, directory, n_points):
 
 
 def test_interrupted_sweep_resumes_without_repetition(directory):
-    code, told, after_stop = interrupt(signal.SIGINT, directory, 10)
+    code, printed, after_stop = interrupt(signal.SIGINT, directory, 10)
     n_stop = len(executions(directory))
 
     assert code == 130
-    assert told == "stopped; what is done is kept beside results.zarr, and the same command goes on from there\n"
+    assert (
+        printed
+        == "interrupted; finished points are stored next to results.zarr, run the same command again to resume\n"
+    )
     assert 10 <= len(after_stop) < 30
 
     code, _, after_kill = interrupt(signal.SIGKILL, directory, 30)
@@ -877,9 +880,9 @@ def test_camera_reuses_images_and_compiled_layout():
             {"exposure_s.x": [8]},
             {},
             ConfigError,
-            r"'exposure_s\.x=8' cannot be set: exposure_s is no section but 0\.01",
+            r"'exposure_s\.x=8' cannot be set: exposure_s must be a section, got 0\.01",
         ),
-        ({"sensor.": [8]}, {}, ConfigError, r"'sensor\.' is no setting's place"),
+        ({"sensor.": [8]}, {}, ConfigError, r"'sensor\.' must be the path of a setting"),
         ({}, {}, ParameterError, "'vary' must have at least one value"),
         ([], {}, ParameterError, "'vary' must be a mapping of setting paths to values, or a list of points"),
         ({"sensor.bits": []}, {}, ParameterError, r"'sensor\.bits' must have at least one value"),

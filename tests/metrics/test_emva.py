@@ -171,7 +171,7 @@ def test_dark_noise_matches_read_noise(result):
     error_e = np.hypot(error_dn2 / (2.0 * GAIN_DN_PER_E**2 * READ_E), READ_E * relative_error_of_gain())
 
     assert_within(result.dark_noise_e, READ_E, error_e)
-    assert not result.is_hidden.any()
+    assert not result.is_quantisation_limited.any()
     error_dn = error_dn2 / (2.0 * GAIN_DN_PER_E * READ_E)
     assert_within(result.dark_noise_dn, np.sqrt((GAIN_DN_PER_E * READ_E) ** 2 + 1 / 12), error_dn)
 
@@ -468,7 +468,7 @@ def test_quantisation_dominates_with_eight_bits():
         for k, e in enumerate(light)
     ]
     result = emva1288(frames, [draw_frames(sensor, 10.5 * code_e, seed=9)], light)
-    assert result.is_hidden[0]
+    assert result.is_quantisation_limited[0]
     assert result.dark_noise_e[0] == pytest.approx(math.sqrt(0.24 - 1 / 12) / result.gain_dn_per_e[0])
 
 

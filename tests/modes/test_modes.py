@@ -842,7 +842,7 @@ def test_intervals_partition_events():
 
 def test_oversized_npz_is_rejected(tmp_path, monkeypatch):
     some_events().save(tmp_path / "e.npz")
-    monkeypatch.setattr("foveasim._io.npz.MAX_UNPACKED_BYTES", 1000)
+    monkeypatch.setattr("foveasim._io.npz.MAX_DECOMPRESSED_BYTES", 1000)
     with pytest.raises(FileError, match="would decompress to more"):
         Events.load(tmp_path / "e.npz")
 

@@ -119,7 +119,7 @@ def test_draws_moments_and_budget_agree(name):
     quiet, noisy = make_sensor(), make_sensor(name)
     (effect,) = (e for e in noisy.chain if e.name == name)
     dark_e = float(np.mean(noisy.nominal_dark_e_per_s)) * EXPOSURE_S
-    sites = noisy.sites if effect.is_temporal else noisy.sites.of_any_device()
+    sites = noisy.sites if effect.is_temporal else noisy.sites.without_device()
     e_per_unit = {"photo": EXPOSURE_S, "dark": EXPOSURE_S, "sense_node": 65_536 / 3.0, "output": 65_536 / 3.0}
     unit = 1.0 / e_per_unit.get(effect.stage, 1.0)
     nominal = {"photo": PHOTO_E, "dark": dark_e}.get(effect.stage, PHOTO_E + dark_e)

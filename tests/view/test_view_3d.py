@@ -436,7 +436,7 @@ def test_show_raises_without_screen(monkeypatch):
 
 
 def test_missing_renderer_warns_and_uses_software(monkeypatch):
-    monkeypatch.setattr(render3d, "what_to_install", lambda: "this machine has no OpenGL; install it")
+    monkeypatch.setattr(render3d, "missing_software", lambda: "this machine has no OpenGL; install it")
     columns = prisms(ODD_LAYOUT)
 
     with pytest.warns(FoveasimWarning, match="no OpenGL; install it; the software renderer is used"):
@@ -520,7 +520,7 @@ def test_missing_libraries_give_no_candidates(monkeypatch):
 def test_missing_pyvista_message_names_command(monkeypatch):
     monkeypatch.setattr(renderer, "find_spec", lambda _: None)
 
-    assert renderer.what_to_install() == "PyVista is not installed; install it with: pip install 'foveasim[view]'"
+    assert renderer.missing_software() == "PyVista is not installed; install it with: pip install 'foveasim[view]'"
     assert renderer.find_renderer.__wrapped__() is None
 
 

@@ -28,15 +28,15 @@ from foveasim.explore.datasets.distributions import LEAST, MOST, Draw, parse_dis
 from foveasim.explore.datasets.labels import (
     NOTHING,
     boxes_on_sites,
-    checked_boxes,
+    check_per_picture,
     flow_on_sites,
     mask_on_sites,
-    one_a_picture,
     read_flow,
     read_mask,
+    validate_boxes,
 )
 from foveasim.explore.datasets.pictures import digest_of, is_lazy, source_of
-from foveasim.explore.sweeps.plan import check_apart
+from foveasim.explore.sweeps.plan import check_disjoint
 from foveasim.layout import Layout
 from foveasim.scene import Scene
 
@@ -167,10 +167,10 @@ class Dataset:
         self._labels, self.class_names = _numbered(self._pictures.labels() if labels is None else labels, n)
         self._boxes = None
         if boxes is not None:
-            each = one_a_picture("boxes", boxes, n)
-            self._boxes = [checked_boxes(f"boxes[{k}]", each[k]) for k in range(n)]
-        self._masks = None if masks is None else one_a_picture("masks", masks, n)
-        self._flows = None if flows is None else one_a_picture("flows", flows, n)
+            each = check_per_picture("boxes", boxes, n)
+            self._boxes = [validate_boxes(f"boxes[{k}]", each[k]) for k in range(n)]
+        self._masks = None if masks is None else check_per_picture("masks", masks, n)
+        self._flows = None if flows is None else check_per_picture("flows", flows, n)
         if fit is not None:
             check_choice("fit", fit, ("cover", "contain"))
         self._fit = fit
@@ -547,7 +547,7 @@ def _draws(file: Path, vary: Mapping[str, Any], found: list[Path], *, is_fitted:
     if not isinstance(vary, Mapping):
         raise ParameterError("vary", "must be a mapping of setting paths to distributions", vary)
     draws = {str(path): parse_distribution(str(path), told) for path, told in vary.items()}
-    check_apart(file, draws)
+    check_disjoint(file, draws)
     for path, draw in draws.items():
         if draw.kind == "choice":
             draws[path] = replace(draw, values=tuple(files_from(Path(), value, path, found) for value in draw.values))
@@ -562,7 +562,7 @@ def _numbered(labels: Any, n: int) -> tuple[list[int] | None, list[str] | None]:
     """Return the classes of the pictures as numbers, and the names of string classes."""
     if labels is None:
         return None, None
-    each = one_a_picture("labels", labels, n)
+    each = check_per_picture("labels", labels, n)
     values = [value.item() if isinstance(value, np.generic) else value for value in (each[k] for k in range(n))]
     if all(isinstance(value, int) for value in values):
         for value in values:

@@ -103,7 +103,7 @@ class Draw:
         return {self.kind: list(self.values)} | ({} if self.weights is None else {"weights": list(self.weights)})
 
 
-def parse_distribution(path: str, told: Any) -> Draw:
+def parse_distribution(path: str, spec: Any) -> Draw:
     """
     Create the distribution of a setting from plain data.
 
@@ -111,7 +111,7 @@ def parse_distribution(path: str, told: Any) -> Draw:
     ----------
     path : str
         Path of the setting, for the random stream and messages.
-    told : mapping
+    spec : mapping
         ``{"uniform": [low, high]}``; ``{"log_uniform": [low, high]}``, uniform in the logarithm; ``{"integers": [low, high]}``,
         both inclusive; ``{"normal": [mean, standard deviation, low, high]}``, truncated at the bounds; or
         ``{"choice": [...]}``, optionally with ``"weights"``, the relative probabilities.
@@ -133,16 +133,16 @@ def parse_distribution(path: str, told: Any) -> Draw:
     True
     """
     known = "; ".join(f"{kind}: {form}" for kind, form in FORMS.items())
-    kinds = set(told) - {"weights"} if isinstance(told, Mapping) else set()
-    if not isinstance(told, Mapping) or len(kinds) != 1 or not kinds <= set(FORMS):
-        raise ParameterError(path, f"must have exactly one distribution ({known})", told)
+    kinds = set(spec) - {"weights"} if isinstance(spec, Mapping) else set()
+    if not isinstance(spec, Mapping) or len(kinds) != 1 or not kinds <= set(FORMS):
+        raise ParameterError(path, f"must have exactly one distribution ({known})", spec)
     (kind,) = kinds
-    values = told[kind]
+    values = spec[kind]
     if not isinstance(values, Sequence | np.ndarray) or isinstance(values, str | bytes):
         raise ParameterError(path, f"must specify '{kind}' as {FORMS[kind]}", values)
     if kind == "choice":
-        return _choice(path, values, told.get("weights"))
-    if "weights" in told:
+        return _choice(path, values, spec.get("weights"))
+    if "weights" in spec:
         raise ParameterError(path, f"must not have weights with '{kind}', only with 'choice'")
     if len(values) != (4 if kind == "normal" else 2):
         raise ParameterError(path, f"must specify '{kind}' as {FORMS[kind]}", list(values))
@@ -160,9 +160,9 @@ def parse_distribution(path: str, told: Any) -> Draw:
         mean, sigma = numbers[:2]
         # With a mean outside the bounds, rounding would leave few distinct values between them.
         if not (sigma > 0.0 and low <= mean <= high):
-            raise ParameterError(path, "must have a standard deviation > 0 and a mean between the bounds", told)
+            raise ParameterError(path, "must have a standard deviation > 0 and a mean between the bounds", spec)
         if (high - low) * WIDEST < sigma:
-            raise ParameterError(path, f"must have a standard deviation of at most {WIDEST:g} * (high - low)", told)
+            raise ParameterError(path, f"must have a standard deviation of at most {WIDEST:g} * (high - low)", spec)
     return Draw(path, kind, numbers)
 
 

@@ -22,12 +22,12 @@ __all__ = [
     "Boxes",
     "Flow",
     "boxes_on_sites",
-    "checked_boxes",
+    "check_per_picture",
     "flow_on_sites",
     "mask_on_sites",
-    "one_a_picture",
     "read_flow",
     "read_mask",
+    "validate_boxes",
 ]
 
 #: Label of a site whose area lies mostly outside the picture, and of padding boxes.
@@ -201,7 +201,7 @@ def _on_sensor(points_px: Floats, grid: Grid) -> Floats:
     return np.array([x0, y1]) + points_px * [grid.pitch_x_um, -grid.pitch_y_um]
 
 
-def checked_boxes(name: str, boxes: Any) -> tuple[Floats, Ints]:
+def validate_boxes(name: str, boxes: Any) -> tuple[Floats, Ints]:
     """
     Return the boxes and classes of one picture after validation.
 
@@ -300,7 +300,7 @@ def read_flow(flow: Any, name: str, shape: tuple[int, int]) -> Floats:
     return moves
 
 
-def one_a_picture(name: str, given: Any, n: int) -> Sequence[Any]:
+def check_per_picture(name: str, given: Any, n: int) -> Sequence[Any]:
     """
     Return a sequence after checking that it has one item per picture.
 

@@ -14,14 +14,14 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from foveasim._io.images import PICTURE_ENDINGS, picture_names, pixels_of_image, read_picture
+from foveasim._io.images import PICTURE_EXTENSIONS, picture_names, pixels_of_image, read_picture
 from foveasim.errors import FileError, ParameterError
 from foveasim.explore._files import digests
 
 __all__ = ["Source", "digest_of", "is_lazy", "source_of"]
 
 #: Largest decompressed size of a picture, bytes.
-MAX_UNPACKED_BYTES = 2**30
+MAX_DECOMPRESSED_BYTES = 2**30
 
 
 @runtime_checkable
@@ -120,7 +120,7 @@ class _Folder:
         found = (Path(place) / name for place, _, names in os.walk(folder, onerror=_stop) for name in names)
         self._names = picture_names(path.relative_to(folder).as_posix() for path in found)
         if not self._names:
-            raise FileError(folder, f"contains no pictures ({', '.join(PICTURE_ENDINGS)})")
+            raise FileError(folder, f"contains no pictures ({', '.join(PICTURE_EXTENSIONS)})")
 
     def __len__(self) -> int:
         return len(self._names)
@@ -158,7 +158,7 @@ class _Zip:
             raise FileError(path, f"is corrupt ({error})") from None
         self._names = picture_names(names)
         if not self._names:
-            raise FileError(path, f"contains no pictures ({', '.join(PICTURE_ENDINGS)})")
+            raise FileError(path, f"contains no pictures ({', '.join(PICTURE_EXTENSIONS)})")
         self._opened: tuple[int, zipfile.ZipFile] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -175,8 +175,8 @@ class _Zip:
 
     def picture(self, k: int) -> NDArray[Any]:
         archive, name = self._archive(), self._names[k]
-        if archive.getinfo(name).file_size > MAX_UNPACKED_BYTES:
-            raise FileError(self.name(k), f"would decompress to more than {MAX_UNPACKED_BYTES} bytes")
+        if archive.getinfo(name).file_size > MAX_DECOMPRESSED_BYTES:
+            raise FileError(self.name(k), f"would decompress to more than {MAX_DECOMPRESSED_BYTES} bytes")
         try:
             content = archive.read(name)
         except Exception as error:  # noqa: BLE001 -- corrupt members raise many kinds of errors

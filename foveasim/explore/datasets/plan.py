@@ -21,7 +21,7 @@ from foveasim.explore.datasets.label_files import (
 )
 from foveasim.explore.datasets.pictures import Source, source_of
 from foveasim.explore.datasets.recipes import classification, denoising
-from foveasim.explore.sweeps.plan import telling
+from foveasim.explore.sweeps.plan import with_file_context
 
 __all__ = ["DatasetFile", "DatasetSection", "read_dataset"]
 
@@ -127,7 +127,7 @@ def read_dataset(path: str | Path, *, n_threads: int = 1) -> DatasetFile:
     source = _pictures(path, section.pictures)
     options = {name: value for name in SAME if (value := getattr(section, name)) is not None}
     labels = _labels(folder, section, source)
-    with telling(path):
+    with with_file_context(path):
         dataset = RECIPES[section.recipe](
             source,
             folder / section.shot if isinstance(section.shot, str) else section.shot,
@@ -142,7 +142,7 @@ def read_dataset(path: str | Path, *, n_threads: int = 1) -> DatasetFile:
 
 
 def _pictures(path: Path, pictures: str | list[str]) -> Source:
-    with telling(path):
+    with with_file_context(path):
         if isinstance(pictures, str):
             return source_of(path.parent / pictures)
         return source_of([picture_path(path, name, f"pictures.{k}").absolute() for k, name in enumerate(pictures)])

@@ -17,7 +17,7 @@ from foveasim._io.yaml_files import read_yaml
 from foveasim.config import check_settings, files_from, put_setting, validated
 from foveasim.errors import ConfigError, ParameterError
 from foveasim.explore._metrics import METRICS, Metric, gives, named_metrics, with_more_metrics
-from foveasim.explore.sweeps.plan import MAX_POINTS, Plan, check_apart, plan_sweep, shot_of, telling
+from foveasim.explore.sweeps.plan import MAX_POINTS, Plan, check_disjoint, plan_sweep, shot_of, with_file_context
 
 if TYPE_CHECKING:
     import optuna
@@ -154,13 +154,13 @@ def read_study(path: str | Path, *, metrics: Sequence[str] = (), n_trials: int |
     path = Path(path)
     section: StudySection = validated(path, StudySection, read_yaml(path))
     source, shot = shot_of(path, section.shot)
-    with telling(path):
+    with with_file_context(path):
         # Names in the file are looked up in METRICS, and never imported.
         named = _wanted([*section.objectives, *section.constraints], section.metrics)
     wanted = with_more_metrics(named, metrics)
     if n_trials is not None:
         n_trials = check_count("trials", n_trials, at_most=MAX_POINTS)
-    with telling(path):
+    with with_file_context(path):
         return plan_study(
             shot,
             {
@@ -244,7 +244,7 @@ def plan_study(
         )
         for path, where in search.items()
     ]
-    check_apart(plans[0].source, search, "be searched")
+    check_disjoint(plans[0].source, search, "be searched")
     return StudyPlan(
         base=plans[0],
         search={path: _as_taken(plan, path, search[path]) for path, plan in zip(search, plans, strict=True)},

@@ -19,7 +19,7 @@ from foveasim._core.validation import check_count
 from foveasim._io.atomic import lock
 from foveasim.errors import FileError, FoveasimError, ParameterError, printable
 from foveasim.explore._metrics import Metric
-from foveasim.explore._records import ENDED_ITS_WORKER, Record, Value, check_same_plan
+from foveasim.explore._records import WORKER_LOST, Record, Value, check_same_plan
 from foveasim.explore.executor import KILLED, executor
 from foveasim.explore.studies.plan import Limits, Search, StudyPlan, plan_study
 from foveasim.explore.worker_cache import ShotRunner
@@ -172,7 +172,7 @@ def run_study(
                     _check_writer(optuna, storage, trials[-1], token)
                     points = [(trial.number, plan.settings_of(trial)) for trial in trials]
                 records = {
-                    number: Record(number, {}, ENDED_ITS_WORKER) if record is KILLED else record
+                    number: Record(number, {}, WORKER_LOST) if record is KILLED else record
                     for (number, _), record in run(points, ())
                 }
                 with _using(storage, n_done):

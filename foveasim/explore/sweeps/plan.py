@@ -30,12 +30,12 @@ __all__ = [
     "MAX_POINTS",
     "Plan",
     "SweepSection",
-    "check_apart",
+    "check_disjoint",
     "coordinate",
     "plan_sweep",
     "read_sweep",
     "shot_of",
-    "telling",
+    "with_file_context",
 ]
 
 #: Largest number of points. At 1 ms each they take a quarter of an hour; more are probably a mistake.
@@ -189,7 +189,7 @@ class Plan:
             When a setting is invalid; with its path, the expected and the actual value.
         """
         names = list(self.values)
-        check_apart(self.source, names)
+        check_disjoint(self.source, names)
         if self.mode == "zip":
             for k in range(min(len(self.values[names[0]]), CHECKED_VALUES)):
                 check_settings(self.source, self._changed({path: values[k] for path, values in self.values.items()}))
@@ -260,11 +260,11 @@ def read_sweep(path: str | Path, *, metrics: Sequence[str] = ()) -> Plan:
             for name, values in section.vary.items()
         }
     source, shot = shot_of(path, section.shot)
-    with telling(path):
+    with with_file_context(path):
         # Names in the file are looked up in METRICS, and never imported.
         named = named_metrics(section.metrics)
     wanted = with_more_metrics(named, metrics)
-    with telling(path):
+    with with_file_context(path):
         return plan_sweep(
             shot,
             vary,
@@ -390,7 +390,7 @@ def coordinate(values: Iterable[Any]) -> NDArray[Any]:
 
 
 @contextmanager
-def telling(path: Path) -> Iterator[None]:
+def with_file_context(path: Path) -> Iterator[None]:
     """
     Raise errors in the settings of a file with its path.
 
@@ -411,7 +411,7 @@ def telling(path: Path) -> Iterator[None]:
         raise ConfigError(path, f"with {error.path.name}: {str(error).removeprefix(f'{error.path}: ')}") from None
 
 
-def check_apart(source: Path, paths: Iterable[str], verb: str = "vary") -> None:
+def check_disjoint(source: Path, paths: Iterable[str], verb: str = "vary") -> None:
     """
     Check that no setting contains another.
 

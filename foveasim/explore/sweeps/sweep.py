@@ -13,7 +13,7 @@ from foveasim._core.threads import thread_count
 from foveasim._core.validation import check_count
 from foveasim.errors import SimulationError
 from foveasim.explore._metrics import Metric
-from foveasim.explore._records import ENDED_ITS_WORKER, Journal, Record, check_same_plan, journal_of
+from foveasim.explore._records import WORKER_LOST, Journal, Record, check_same_plan, journal_of
 from foveasim.explore.executor import KILLED, executor
 from foveasim.explore.sweeps.plan import Plan, plan_sweep
 from foveasim.explore.sweeps.results import check_store, dataset_of, open_results, stored_plan, write_store
@@ -183,7 +183,7 @@ def _run(
             if progress is not None:
                 progress(n_done, plan.n_points)
             for point, record in run(points[is_left].tolist(), np.unique(cuts).tolist()):
-                add(Record(point, {}, ENDED_ITS_WORKER) if record is KILLED else record)
+                add(Record(point, {}, WORKER_LOST) if record is KILLED else record)
                 n_done += 1
                 if progress is not None:
                     progress(n_done, plan.n_points)

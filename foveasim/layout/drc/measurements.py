@@ -33,7 +33,7 @@ AREA_ROUNDING = 1e-9
 #: A selection of fewer than one site in FEW is converted to polygons separately, without converting all sites.
 FEW = 10
 #: Pairs per task of a thread.
-PAIRS_A_PIECE = 100_000
+PAIRS_PER_TASK = 100_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +167,7 @@ class Case:
 
 def _pieces(n: int) -> list[slice]:
     """Return slices of pairs for several threads."""
-    return [slice(start, start + PAIRS_A_PIECE) for start in range(0, max(n, 1), PAIRS_A_PIECE)]
+    return [slice(start, start + PAIRS_PER_TASK) for start in range(0, max(n, 1), PAIRS_PER_TASK)]
 
 
 def _near_pairs(box_um: Floats, reach_um: float) -> tuple[Ints, Ints]:
@@ -175,7 +175,7 @@ def _near_pairs(box_um: Floats, reach_um: float) -> tuple[Ints, Ints]:
     from foveasim.layout import _kernels
 
     grown_um = box_um + 0.5 * reach_um * np.array([-1.0, -1.0, 1.0, 1.0])
-    pairs = _kernels.meeting_boxes(grown_um, np.argsort(grown_um[:, 0]))
+    pairs = _kernels.intersecting_boxes(grown_um, np.argsort(grown_um[:, 0]))
     first, second = np.divmod(np.sort(pairs), max(box_um.shape[0], 1))
     return first, second
 
@@ -354,7 +354,7 @@ def _gaps(case: Case) -> Measured:
 
     def markers(positions: Ints) -> list[Any]:
         contents = _grouped(face, site, faces.size)
-        return [_punched(faces[k], contents[k], case) for k in gaps[positions]]
+        return [_cut_out(faces[k], contents[k], case) for k in gaps[positions]]
 
     return Measured(open_um2[gaps], sites, markers)
 
@@ -425,7 +425,7 @@ def _grouped(key: Ints, values: Ints, n_keys: int) -> list[Ints]:
     return np.split(values[np.argsort(key, kind="stable")], stops) if n_keys else []
 
 
-def _punched(face: Any, sites: Ints, case: Case) -> Any:
+def _cut_out(face: Any, sites: Ints, case: Case) -> Any:
     """Return a polygon with the isolated sites within it cut out."""
     if sites.size == 0:
         return face

@@ -86,7 +86,7 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> t
     given = layout
     if repair == "merge":
         layout, now = _merged(layout, active, now, changes)
-    layout, now = _without_guilty(layout, active, now, changes)
+    layout, now = _drop_violating_sites(layout, active, now, changes)
     if repair == "refill":
         layout = _refilled(layout, given, active, changes)
     rest = layout.check(rules.only(lambda name: RULES[name].mended_by is None))
@@ -95,13 +95,13 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> t
     return layout, tuple(changes)
 
 
-def _without_guilty(layout: Layout, rules: DesignRules, now: Ints, changes: list[Change]) -> tuple[Layout, Ints]:
+def _drop_violating_sites(layout: Layout, rules: DesignRules, now: Ints, changes: list[Change]) -> tuple[Layout, Ints]:
     """Remove sites that violate a rule until none remain."""
     report = layout.check(rules)
     while not report.ok:
         gone = np.zeros(layout.n_sites, bool)
         for result in report.results:
-            new = _guilty(layout, result, gone)
+            new = _sites_to_remove(layout, result, gone)
             gone[new] = True
             ids = np.flatnonzero(np.isin(now, new))
             if ids.size:
@@ -114,7 +114,7 @@ def _without_guilty(layout: Layout, rules: DesignRules, now: Ints, changes: list
 
 def _refilled(layout: Layout, given: Layout, rules: DesignRules, changes: list[Change]) -> Layout:
     """Fill the area of dropped sites that were too small with hexagons of the minimum size."""
-    is_small = [change.action == "dropped" and _is_of_smallness(change.rule) for change in changes]
+    is_small = [change.action == "dropped" and _is_minimum_rule(change.rule) for change in changes]
     gone = np.array([i for change, small in zip(changes, is_small, strict=True) if small for i in change.site_ids], int)
     if gone.size == 0:
         return layout
@@ -125,7 +125,7 @@ def _refilled(layout: Layout, given: Layout, rules: DesignRules, changes: list[C
     filled = fill(layout, room, size_um=_smallest_size_um(rules), columns_of=dropped)
     # Sites at the boundary may be narrower than a hexagon, or violate other rules.
     new, _ = _merged(filled[n_kept:], rules, np.arange(filled.n_sites - n_kept), [])
-    layout, _ = _without_guilty(union([layout, new]), rules, np.zeros(0, np.int64), [])
+    layout, _ = _drop_violating_sites(union([layout, new]), rules, np.zeros(0, np.int64), [])
     for k, (change, small) in enumerate(zip(changes, is_small, strict=True)):
         if small:
             changes[k] = replace(change, action="replaced")
@@ -144,7 +144,7 @@ def _smallest_size_um(rules: DesignRules) -> float:
     return max(rules.min_size_um or 0.0, math.sqrt(rules.min_area_um2 or 0.0), across_um)
 
 
-def _guilty(layout: Layout, result: RuleResult, gone: Bools) -> Ints:
+def _sites_to_remove(layout: Layout, result: RuleResult, gone: Bools) -> Ints:
     """
     Return further sites that must be removed to satisfy a rule.
 
@@ -162,7 +162,7 @@ def _guilty(layout: Layout, result: RuleResult, gone: Bools) -> Ints:
 
 def _merged(layout: Layout, rules: DesignRules, now: Ints, changes: list[Change]) -> tuple[Layout, Ints]:
     """Merge sites that are too small with their neighbours, in rounds."""
-    smallness = rules.only(_is_of_smallness)
+    smallness = rules.only(_is_minimum_rule)
     for _ in range(MAX_ROUNDS):
         report = layout.check(smallness)
         if report.ok:
@@ -187,6 +187,6 @@ def _broken(report: Report) -> str:
     return "; ".join(str(result) for result in report.results if not result.ok)
 
 
-def _is_of_smallness(name: str) -> bool:
+def _is_minimum_rule(name: str) -> bool:
     """Return whether merging a site with a neighbour repairs violations of the rule."""
     return RULES[name].mended_by == "merge"

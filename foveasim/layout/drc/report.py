@@ -32,7 +32,7 @@ FOUND = re.compile(r"photosite (?P<sites>\d+(?:, \d+)*): (?P<value>\S+) ?(?P<uni
 POINTS = re.compile(r"\(([^()]*)\)")
 
 #: Description, limit and unit of a rule; sites, value and marker of a violation.
-_Told: TypeAlias = tuple[str, float, str]
+_RuleInfo: TypeAlias = tuple[str, float, str]
 _Found: TypeAlias = tuple[tuple[int, ...], float, Any]
 
 
@@ -143,7 +143,7 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
     if root.tag != "report-database":
         raise FileError(source, "is not a KLayout report database")
     found: dict[str, list[_Found]] = {}
-    about: dict[str, _Told] = {}
+    about: dict[str, _RuleInfo] = {}
     for name, category in _categories(root):
         told = LIMIT.match(category.findtext("description") or "")
         about[name] = (told["description"], _number(told["limit"]), told["unit"]) if told else (name, np.nan, "")
@@ -161,7 +161,7 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
     )
 
 
-def _result(name: str, about: _Told, items: list[_Found]) -> Any:
+def _result(name: str, about: _RuleInfo, items: list[_Found]) -> Any:
     from foveasim.layout.drc.rules import RuleResult
 
     description, limit, unit = about

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from foveasim._core.validation import Bools, exact_integers
 from foveasim.layout.model import Layout
 
-__all__ = ["CHANNEL", "MAX_COLUMN_BYTES", "columns_of", "kept_columns", "texts_of"]
+__all__ = ["CHANNEL", "MAX_COLUMN_BYTES", "column_strings", "columns_of", "kept_columns"]
 
 #: Column that GDSII and OASIS store as the datatype.
 CHANNEL = "channel"
@@ -83,7 +83,7 @@ def kept_columns(
     return kept, tuple(sorted(lost))
 
 
-def texts_of(kept: dict[str, list[Any]]) -> list[str]:
+def column_strings(kept: dict[str, list[Any]]) -> list[str]:
     """Return the string of each site."""
     words = [[f"{key}={value}" for value in values] for key, values in kept.items()]
     return list(map(" ".join, zip(*words, strict=True)))

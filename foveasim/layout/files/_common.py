@@ -19,14 +19,14 @@ from foveasim.layout.model import Layout
 
 __all__ = [
     "WrittenLayout",
+    "check_decompressed",
     "check_header",
     "check_sites_of",
     "check_sizes",
-    "check_unpacked",
     "checked_layout",
     "header",
     "lossless",
-    "max_unpacked",
+    "max_decompressed_bytes",
     "restored_column",
     "rounding",
     "texts",
@@ -35,7 +35,7 @@ __all__ = [
 #: Identifier in every file that contains columns and provenance.
 FILE_FORMAT = "foveasim layout"
 FILE_VERSION = 1
-MAX_UNPACKED_BYTES = 8 * 2**30
+MAX_DECOMPRESSED_BYTES = 8 * 2**30
 #: Maximum decompressed size of a small file, and per byte of a larger one (regular grids: 30 bytes per byte).
 MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**26, 128
 #: A string column requires the memory of its longest string in every row: maximum, and maximum per character.
@@ -100,12 +100,12 @@ def rounding(layout: Layout, rounded_um: Floats, path: Path, dropped_columns: tu
     )
 
 
-def max_unpacked(path: Path) -> int:
+def max_decompressed_bytes(path: Path) -> int:
     """Return the maximum decompressed size of a file in bytes, which depends on its size."""
-    return min(MIN_UNPACKED_BYTES + UNPACKED_PER_BYTE * path.stat().st_size, MAX_UNPACKED_BYTES)
+    return min(MIN_UNPACKED_BYTES + UNPACKED_PER_BYTE * path.stat().st_size, MAX_DECOMPRESSED_BYTES)
 
 
-def check_unpacked(path: Path, n_bytes: int) -> None:
+def check_decompressed(path: Path, n_bytes: int) -> None:
     """
     Reject a file that would decompress to too many bytes.
 
@@ -114,8 +114,8 @@ def check_unpacked(path: Path, n_bytes: int) -> None:
     FileError
         When the size exceeds the limit of the file.
     """
-    if n_bytes > max_unpacked(path):
-        raise FileError(path, f"would decompress to more than the maximum of {max_unpacked(path)} bytes")
+    if n_bytes > max_decompressed_bytes(path):
+        raise FileError(path, f"would decompress to more than the maximum of {max_decompressed_bytes(path)} bytes")
 
 
 def check_sites_of(path: Path, n_sites: int) -> None:

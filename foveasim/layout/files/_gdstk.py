@@ -124,7 +124,7 @@ def read(
         raise FormatError(f"has the invalid database unit {dbu_um:g} µm")
     cells = {cell.name: cell for cell in library.cells}
     top = _top(cells, cell)
-    order = _from_the_bottom(cells, top)
+    order = _post_order(cells, top)
     _check_numbers(cells, order, max_sites, max_memory_bytes)
     # Memory and time of the following steps are bounded.
     limit("RLIMIT_AS", max_memory_bytes)
@@ -162,7 +162,7 @@ def _top(cells: dict[str, Any], wanted: str | None) -> str:
     return tops[0]
 
 
-def _from_the_bottom(cells: dict[str, Any], top: str) -> list[str]:
+def _post_order(cells: dict[str, Any], top: str) -> list[str]:
     """Return the names of a cell and its hierarchy, subcells before their parents."""
     order: list[str] = []
     is_open = {top: True}

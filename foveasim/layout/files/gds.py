@@ -38,7 +38,7 @@ from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, as_file_error
 from foveasim._io.sandbox import PATIENCE, run_in_sandbox
 from foveasim.errors import FileError, GeometryError, ParameterError
-from foveasim.layout.files._columns import MAX_COLUMN_BYTES, columns_of, kept_columns, texts_of
+from foveasim.layout.files._columns import MAX_COLUMN_BYTES, column_strings, columns_of, kept_columns
 from foveasim.layout.files._common import (
     WrittenLayout,
     check_sites_of,
@@ -146,7 +146,7 @@ def _set_gds_properties(
     ]
     longest = max(map(len, numbers), default=0)
     kept, lost = kept_columns(layout, min(MAX_GDS_TEXT, MAX_GDS_PROPERTIES - longest - longest % 2))
-    texts = texts_of(kept)
+    texts = column_strings(kept)
     if texts:
         # gdstk writes properties in reverse order of setting.
         for polygon, s in zip(polygons, site, strict=True):

@@ -21,14 +21,14 @@ from foveasim._io.formats import FileFormat, as_file_error
 from foveasim.errors import FileError, ParameterError
 from foveasim.layout.files._common import (
     WrittenLayout,
+    check_decompressed,
     check_header,
     check_sites_of,
-    check_unpacked,
     checked_layout,
     dtype_text,
     header,
     lossless,
-    max_unpacked,
+    max_decompressed_bytes,
     plain_columns,
     restored_column,
     texts,
@@ -108,7 +108,7 @@ def read(path: Path) -> Layout:
     pa, parquet = _pyarrow(path)
     with as_file_error(path, "GeoParquet layout"), parquet.ParquetFile(path, page_checksum_verification=True) as file:
         check_sites_of(path, file.metadata.num_rows)
-        check_unpacked(path, sum(file.metadata.row_group(i).total_byte_size for i in range(file.num_row_groups)))
+        check_decompressed(path, sum(file.metadata.row_group(i).total_byte_size for i in range(file.num_row_groups)))
         metadata = file.metadata.metadata or {}
         if b"geo" not in metadata:
             raise FileError(path, "is a Parquet table without geometry: it has no metadata 'geo'")
@@ -169,13 +169,13 @@ def _table(path: Path, pa: Any, file: Any) -> Any:
 
     A small file may repeat one long value in very many rows.
     """
-    batches, n_bytes, most = [], 0, max_unpacked(path)
+    batches, n_bytes, most = [], 0, max_decompressed_bytes(path)
     for batch in file.iter_batches(batch_size=_rows_at_a_time(path, file.metadata), use_threads=False):
         n_bytes += batch.nbytes
         if n_bytes > most:
             break
         batches.append(batch)
-    check_unpacked(path, n_bytes)
+    check_decompressed(path, n_bytes)
     return pa.Table.from_batches(batches, schema=file.schema_arrow).combine_chunks()
 
 
@@ -187,7 +187,7 @@ def _rows_at_a_time(path: Path, metadata: Any) -> int:
     """
     # Metadata of single columns are not read: pyarrow aborts the process where they are invalid.
     longest = max((metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups)), default=1)
-    return int(min(max(max_unpacked(path) // max(longest, 1), 1), BATCH))
+    return int(min(max(max_decompressed_bytes(path) // max(longest, 1), 1), BATCH))
 
 
 def _polygons(path: Path, outlines: NDArray[Any]) -> NDArray[Any]:

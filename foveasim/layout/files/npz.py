@@ -20,11 +20,11 @@ from foveasim.layout.files._common import (
     check_sites_of,
     header,
     lossless,
-    max_unpacked,
+    max_decompressed_bytes,
 )
 from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout
-from foveasim.layout.packed import is_of_layout, packed_layout, unpacked_layout
+from foveasim.layout.packed import is_of_layout, layout_from_arrays, layout_to_arrays
 
 __all__ = ["MAGICS", "read", "write"]
 
@@ -41,7 +41,7 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     FileError
         When the file cannot be written.
     """
-    write_archive(path, header(layout), packed_layout(layout), is_packed=False)
+    write_archive(path, header(layout), layout_to_arrays(layout), is_compressed=False)
     return lossless(layout, path)
 
 
@@ -55,7 +55,7 @@ def read(path: Path) -> Layout:
         When the file is corrupt, too large, or not a layout.
     """
     with as_file_error(path, "npz layout"):
-        about, arrays = read_archive(path, max_bytes=max_unpacked(path))
+        about, arrays = read_archive(path, max_bytes=max_decompressed_bytes(path))
         if about is None:
             raise FileError(path, "is not a foveasim layout")
         provenance = check_header(path, about)
@@ -63,7 +63,7 @@ def read(path: Path) -> Layout:
         if unknown:
             raise FileError(path, f"is corrupt: {unknown[0]!r:.40} is not an array of a layout")
         check_sites_of(path, arrays["site_offsets"].size - 1)
-        layout = unpacked_layout(arrays, provenance)
+        layout = layout_from_arrays(arrays, provenance)
         _check_winding(path, layout)
         return layout
 

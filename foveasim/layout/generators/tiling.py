@@ -11,7 +11,7 @@ import shapely
 
 from foveasim._core.validation import Floats, check_choice, check_length_um, check_sites, finite_array
 from foveasim.errors import GeometryError, LayoutWarning, ParameterError
-from foveasim.layout._regions import as_region, one_region, told_region
+from foveasim.layout._regions import as_region, parse_region, region_as_plain_data
 from foveasim.layout.drc.measurements import is_below_size
 from foveasim.layout.edits import clip, merge_small, union
 from foveasim.layout.families import layout_family
@@ -28,7 +28,7 @@ CORNERS = {
     "hexagons": np.array([(1, -1), (1, 1), (0, 2), (-1, 1), (-1, -1), (0, -2)]),
 }
 #: Default fraction of a cell below which a piece is merged into a neighbour.
-SMALL_SHARE = 0.5
+SMALL_FRACTION = 0.5
 #: Fraction of the region below which uncovered area is rounding.
 AREA_ROUNDING = 1e-9
 
@@ -102,7 +102,7 @@ def tiling(
     >>> layout.n_sites, round(float(layout.area_um2.sum()), 1), round(float(layout.area_um2.min()), 1)
     (571, 7853.9, 7.0)
     """
-    outline = one_region(size_um=size_um, radius_um=radius_um, region=region)
+    outline = parse_region(size_um=size_um, radius_um=radius_um, region=region)
     pitch_um = check_length_um("pitch_um", pitch_um)
     check_choice("cells", cells, get_args(Cells))
     check_choice("border", border, get_args(Border))
@@ -130,7 +130,7 @@ def tiling(
         )
     layout = clip(lattice, outline, cut="drop" if border == "drop" else "pieces")
     if border == "merge":
-        smallest_um = math.sqrt(SMALL_SHARE * lattice.area_um2[0]) if min_size_um is None else min_size_um
+        smallest_um = math.sqrt(SMALL_FRACTION * lattice.area_um2[0]) if min_size_um is None else min_size_um
         pieces_um2 = float(layout.area_um2.sum())
         layout = _merged(layout, smallest_um)
         open_um2 = pieces_um2 - float(layout.area_um2.sum())
@@ -150,7 +150,10 @@ def tiling(
         layout.site_offsets,
         {"row": row, "column": column, "readout_line": column},
         {
-            "parameters": {"region": None if region is None else told_region(region), "origin_um": origin.tolist()},
+            "parameters": {
+                "region": None if region is None else region_as_plain_data(region),
+                "origin_um": origin.tolist(),
+            },
         },
     )
 

@@ -24,7 +24,7 @@ from foveasim._core.validation import (
 )
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid
-from foveasim.layout._regions import one_region
+from foveasim.layout._regions import parse_region
 from foveasim.layout._voronoi import CellEdges, MovingCells, edges_of_rings
 from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
@@ -60,7 +60,7 @@ LINE_POINTS = (0.211324865405187118, 0.788675134594812882)
 #: Small numbers of triangles and lines, which are large ones, are subdivided up to these numbers at negligible cost.
 LEAST_TRIANGLES, LEAST_LINE_POINTS = 2048, 1024
 #: Fraction of the mean mass below which a cell counts as empty.
-EMPTY_SHARE = 1e-9
+EMPTY_FRACTION = 1e-9
 #: Largest relative deviation of equal capacities from their mean; Newton iteration ends at a tenth of it.
 CAPACITY_ERROR = 1e-6
 #: Lloyd iterations with cells of equal capacity, and additional ones if no such cells are found.
@@ -206,7 +206,7 @@ def _region(size_um: tuple[float, float] | None, region: Any, density_grid: Grid
         if density_grid is None:
             raise ParameterError("size_um", "or 'region' or 'density_grid' must be given, to define the region")
         return shapely.box(*density_grid.bounds_um)
-    outline = one_region(size_um=size_um, region=region)
+    outline = parse_region(size_um=size_um, region=region)
     if not isinstance(outline, shapely.Polygon):
         raise ParameterError("region", "must be one polygon, got several")
     return outline
@@ -229,7 +229,7 @@ def _density(
     shape = (max(1, math.ceil((y1 - y0) / pitch_um)), max(1, math.ceil((x1 - x0) / pitch_um)))
     grid = Grid(shape=shape, pitch_um=max(pitch_um, 1e-4), origin_um=(x0, y0))
     if density is None:
-        return _EvenField(), np.ones(shape), grid
+        return _UniformField(), np.ones(shape), grid
     field = _FunctionField(_checked(density))
     x_um, y_um = np.meshgrid(grid.x_um, grid.y_um)
     return field, _positive(field.at(np.stack((x_um.ravel(), y_um.ravel()), axis=1)).reshape(shape)), grid
@@ -308,7 +308,7 @@ def _edges(cells: MovingCells, centres_um: Floats, weights_um2: Floats | None = 
 
 def _moved(centres_um: Floats, mass: Any, moment: Any, outline: shapely.Polygon) -> Floats:
     """Move centres to the centres of mass, except of empty cells and to points outside."""
-    has_mass = mass > EMPTY_SHARE * mass.mean()
+    has_mass = mass > EMPTY_FRACTION * mass.mean()
     moved_um = np.where(has_mass[:, np.newaxis], moment / np.where(has_mass, mass, 1.0)[:, np.newaxis], centres_um)
     is_inside = shapely.contains_xy(outline, moved_um)
     return np.where(is_inside[:, np.newaxis], moved_um, centres_um)
@@ -318,7 +318,7 @@ def _moments(edges: CellEdges, n_cells: int, field: _Integrals) -> tuple[Any, An
     """Return the mass (n,) and first moments (n, 2) of each cell, from its triangles."""
     corners_um = np.zeros((n_cells, 2))
     corners_um[edges.cell] = edges.start_um
-    area_um2, moment_um3 = _EvenField().moments(edges, corners_um)
+    area_um2, moment_um3 = _UniformField().moments(edges, corners_um)
     return field.moments(edges, moment_um3 / area_um2[:, np.newaxis])
 
 
@@ -495,7 +495,7 @@ class _Field(_Integrals, Protocol):
         """Return the square of the density."""
 
 
-class _EvenField:
+class _UniformField:
     """Uniform density of 1, integrated exactly."""
 
     def squared(self) -> _Field:
@@ -626,11 +626,11 @@ class _FadedField:
 
     def moments(self, edges: CellEdges, anchors_um: Floats, *, is_rough: bool = False) -> tuple[Any, Any]:
         mass, moment = self.field.moments(edges, anchors_um, is_rough=is_rough)
-        even_mass, even_moment = _EvenField().moments(edges, anchors_um)
+        even_mass, even_moment = _UniformField().moments(edges, anchors_um)
         return mass + self.even * even_mass, moment + self.even * even_moment
 
     def along(self, start_um: Floats, stop_um: Floats) -> Any:
-        return self.field.along(start_um, stop_um) + self.even * _EvenField().along(start_um, stop_um)
+        return self.field.along(start_um, stop_um) + self.even * _UniformField().along(start_um, stop_um)
 
 
 def _area_um2(a_um: Floats, b_um: Floats) -> Any:

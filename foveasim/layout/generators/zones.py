@@ -11,7 +11,7 @@ import shapely
 
 from foveasim._core.validation import MAX_LENGTH_UM, Floats, Ints, check_choice, finite_array
 from foveasim.errors import ParameterError
-from foveasim.layout._regions import as_region, told_region
+from foveasim.layout._regions import as_region, region_as_plain_data
 from foveasim.layout.edits import union
 from foveasim.layout.families import layout_family
 from foveasim.layout.generators.grid import square_corners_um
@@ -105,7 +105,9 @@ def zones(
         layout = _tiled(outlines, pitches_um, shapes)
     if outlines_um is None:
         return layout
-    return layout.with_provenance({"parameters": {"outlines_um": [told_region(outline) for outline in outlines_um]}})
+    return layout.with_provenance(
+        {"parameters": {"outlines_um": [region_as_plain_data(outline) for outline in outlines_um]}}
+    )
 
 
 def _sides(side_um: Sequence[float], pitches_um: Floats) -> Floats:

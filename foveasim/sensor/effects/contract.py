@@ -110,7 +110,7 @@ class Sites:
         """Return a block of the layout's sites."""
         return replace(self, index=index, n_threads=n_threads)
 
-    def of_any_device(self) -> Sites:
+    def without_device(self) -> Sites:
         """Return the same sites without a device, for moments over all devices of the kind."""
         return replace(self, known_device=None)
 
@@ -237,7 +237,7 @@ class Effect(ABC):
             With a device, its fixed patterns are known constants; without one, moments are over all devices.
         """
 
-    def checked_moments(self, mean: Floats, variance: Floats, sites: Sites) -> tuple[Floats, Floats]:
+    def validated_moments(self, mean: Floats, variance: Floats, sites: Sites) -> tuple[Floats, Floats]:
         """
         Return the result of :meth:`moments` after checking its shape.
 

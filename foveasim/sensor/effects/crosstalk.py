@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 __all__ = ["CrosstalkOperator", "Diffusion", "InterPixelCapacitance", "KernelCrosstalk", "Neighbourhood"]
 
 #: Maximum fraction of charge that a site loses in one step; larger fractions would make the exchange oscillate.
-LARGEST_SHARE = 0.5
+MAX_STEP_FRACTION = 0.5
 #: Maximum number of steps; more would take seconds per frame for a million sites.
-MAX_EXCHANGES = 1000
+MAX_STEPS = 1000
 #: Up to this ratio of spread to distance, charge crosses at most one boundary (to float64); above it, a Fourier series is used.
 SHORT_SPREAD = 0.125
 #: Number of terms of that series: the next one is below 1e-16.
@@ -307,7 +307,7 @@ class Diffusion(_Crosstalk):
         """
         from scipy.optimize import brentq
 
-        share = check_number("neighbour_fraction", neighbour_fraction, at_least=0.0, at_most=LARGEST_SHARE)
+        share = check_number("neighbour_fraction", neighbour_fraction, at_least=0.0, at_most=MAX_STEP_FRACTION)
         pitch_um = check_length_um("pitch_um", pitch_um)
         # Upper bracket: with a spread equal to the pitch a pixel loses far more than half.
         steps = float(brentq(lambda s: 2.0 * float(_squared_steps(np.array(s))) - share, 0.0, 1.0, xtol=1e-15))
@@ -347,17 +347,17 @@ class Diffusion(_Crosstalk):
         matrix = _like(shared_um, shared_um.data * width_um / layout.area_um2[site])
         loss = _column_sums(matrix)
         largest = float(loss.max(initial=0.0))
-        if not largest <= LARGEST_SHARE * MAX_EXCHANGES:
+        if not largest <= MAX_STEP_FRACTION * MAX_STEPS:
             smallest = int(np.argmax(loss))
             raise ParameterError(
                 "spread_um",
                 f"must be shorter for site {smallest} with an area of only {layout.area_um2[smallest]:.3g} µm²",
                 self.spread_um,
                 "µm",
-                f"the diffusion would need more than {MAX_EXCHANGES} steps",
+                f"the diffusion would need more than {MAX_STEPS} steps",
             )
         # Tolerance for computed fractions of exactly one half.
-        n_steps = max(1, math.ceil(largest / LARGEST_SHARE - 1e-9))
+        n_steps = max(1, math.ceil(largest / MAX_STEP_FRACTION - 1e-9))
         return CrosstalkOperator(_with_rest(matrix, loss, n_steps), n_steps)
 
 
@@ -453,7 +453,7 @@ class KernelCrosstalk(_Crosstalk):
         if n_sites and (ordered[1:] == ordered[:-1]).any():
             twin = order[int(np.flatnonzero(ordered[1:] == ordered[:-1])[0]) + 1]
             raise SimulationError(
-                f"the layout is not a grid: site {twin} has the same position as another site; {_OTHER_WAY}"
+                f"the layout is not a grid: site {twin} has the same position as another site; {_ALTERNATIVE}"
             )
         source, target, share = [], [], []
         kept = np.zeros(n_sites)
@@ -533,7 +533,7 @@ class InterPixelCapacitance(_Crosstalk):
         return self.compile(sites.layout, capacitance_f=sites.capacitance_f if sites.capacitance_f.size > 1 else None)
 
     def __post_init__(self) -> None:
-        share = check_number("neighbour_fraction", self.neighbour_fraction, at_least=0.0, at_most=LARGEST_SHARE)
+        share = check_number("neighbour_fraction", self.neighbour_fraction, at_least=0.0, at_most=MAX_STEP_FRACTION)
         object.__setattr__(self, "neighbour_fraction", share)
         if self.edge_um is not None:
             object.__setattr__(self, "edge_um", check_length_um("edge_um", self.edge_um))
@@ -586,7 +586,7 @@ class InterPixelCapacitance(_Crosstalk):
         matrix = _like(shared_um, shared_um.data * (self.neighbour_fraction / edge_um) * ratio[shared_um.indices])
         loss = _column_sums(matrix)
         largest = float(loss.max(initial=0.0))
-        if largest > LARGEST_SHARE * (1.0 + KERNEL_ROUNDING):
+        if largest > MAX_STEP_FRACTION * (1.0 + KERNEL_ROUNDING):
             raise ParameterError(
                 "neighbour_fraction",
                 f"must be smaller: site {int(np.argmax(loss))} would couple {largest:.3g} of its charge to its neighbours, "
@@ -599,7 +599,7 @@ class InterPixelCapacitance(_Crosstalk):
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
 
-_OTHER_WAY = "use Diffusion, which supports sites of any shape"
+_ALTERNATIVE = "use Diffusion, which supports sites of any shape"
 
 
 def _gap_um(max_gap_um: object) -> float | None:
@@ -687,7 +687,7 @@ def _grid_places(layout: Neighbourhood, pitch_um: Any) -> tuple[Ints, Ints]:
     if abs(area_um2[odd] - typical_um2) > AREA_ROUNDING * typical_um2:
         raise SimulationError(
             f"the layout is not a grid: site {odd} has an area of {area_um2[odd]:.4g} µm², the median is "
-            f"{typical_um2:.4g} µm²; {_OTHER_WAY}"
+            f"{typical_um2:.4g} µm²; {_ALTERNATIVE}"
         )
     same_um = SAME_LINE * math.sqrt(typical_um2)
     centre_um = layout.centroid_um
@@ -702,7 +702,7 @@ def _grid_places(layout: Neighbourhood, pitch_um: Any) -> tuple[Ints, Ints]:
             if not math.isfinite(step_um):
                 raise SimulationError(
                     f"the layout is not a grid of known pitch: there are several {name}, but no two sites are side by "
-                    f"side; {_OTHER_WAY}, or set 'pitch_um' if sites are missing"
+                    f"side; {_ALTERNATIVE}, or set 'pitch_um' if sites are missing"
                 )
             steps = np.diff(at_um) / step_um
             is_odd = ~(np.abs(steps - np.rint(steps)) <= PLACE_ROUNDING) | (np.rint(steps) < 1)
@@ -712,7 +712,7 @@ def _grid_places(layout: Neighbourhood, pitch_um: Any) -> tuple[Ints, Ints]:
             if is_odd.any() or is_off.any():
                 raise SimulationError(
                     f"the layout is not a grid parallel to the axes: its {name} do not have equal steps of {step_um:.6g} "
-                    f"µm; {_OTHER_WAY}, or set 'pitch_um' if sites are missing"
+                    f"µm; {_ALTERNATIVE}, or set 'pitch_um' if sites are missing"
                 )
         places.append(place[line])
     return places[0], places[1]
@@ -733,7 +733,7 @@ def _lines(position_um: Floats, same_um: float) -> tuple[Ints, Floats]:
     ends = np.append(starts[1:], position_um.size) - 1
     if np.any(rising_um[ends] - rising_um[starts] > same_um):
         raise SimulationError(
-            f"the layout is not a grid parallel to the axes: its sites are not in rows and columns; {_OTHER_WAY}"
+            f"the layout is not a grid parallel to the axes: its sites are not in rows and columns; {_ALTERNATIVE}"
         )
     return line, np.add.reduceat(rising_um, starts) / (ends + 1 - starts)
 

@@ -86,7 +86,7 @@ class HotSites(FixedOffset):
     def from_sensor(cls, sensor: Any) -> Self | None:
         """Return the effect that a sensor's keywords specify, or None."""
         is_on = sensor.hot_fraction and sensor.hot_e_per_s
-        return cls(sensor.hot_fraction, sensor.hot_e_per_s * sensor.heat) if is_on else None
+        return cls(sensor.hot_fraction, sensor.hot_e_per_s * sensor.dark_current_ratio) if is_on else None
 
     def pattern(self, sites: Sites) -> Floats:
         """Return the additional dark current, (n,) e-/s."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from foveasim._core.random_streams import Streams, standard_normal
 from foveasim._core.validation import Floats, Ints, unmasked
-from foveasim.sensor.blocks import in_blocks, pieces
+from foveasim.sensor.blocks import for_each_block, pieces
 from foveasim.sensor.effects.contract import Effect, Sites, Stage
 
 __all__ = ["LARGEST_CHARGE_E", "ShotChoice", "ShotNoise", "draw_shot_noise"]
@@ -110,5 +110,5 @@ def draw_shot_noise(
         for piece in pieces(sites):
             electrons[piece] = shot.apply(expected_e[piece], sites=None, rng=rng)
 
-    in_blocks(expected_e.size, block, n_threads)
+    for_each_block(expected_e.size, block, n_threads)
     return electrons

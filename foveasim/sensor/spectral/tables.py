@@ -18,7 +18,7 @@ __all__ = ["Beyond", "PolynomialCurve", "SplineCurve", "StepCurve", "TableCurve"
 
 #: Values outside the table: raise an error, 0, or the value at the end.
 Beyond = Literal["raise", "zero", "hold"]
-BEYOND_CURE = "set beyond='zero' or beyond='hold' to extrapolate"
+BEYOND_HINT = "set beyond='zero' or beyond='hold' to extrapolate"
 
 
 @CURVES.register("polynomial")
@@ -221,7 +221,7 @@ def _inside(wavelength_nm: ArrayLike, table_nm: Sequence[float], beyond: Beyond)
     low_nm, high_nm = table_nm[0], table_nm[-1]
     waves_nm = as_numbers("wavelength_nm", wavelength_nm)
     if beyond == "raise":
-        check_within(waves_nm, low_nm, high_nm, "the table", BEYOND_CURE)
+        check_within(waves_nm, low_nm, high_nm, "the table", BEYOND_HINT)
     check_within(waves_nm, 0.0, np.finfo(np.float64).max, "the spectrum")
     inside_nm = np.clip(waves_nm, low_nm, high_nm)
     return inside_nm, (inside_nm == waves_nm) | (beyond != "zero")

@@ -925,7 +925,7 @@ def test_huge_npz_array_rejected_before_allocation(tmp_path):
 
 
 def test_npz_decompression_limit_is_enforced(tmp_path, monkeypatch):
-    monkeypatch.setattr("foveasim.layout.files._common.MAX_UNPACKED_BYTES", 1000)
+    monkeypatch.setattr("foveasim.layout.files._common.MAX_DECOMPRESSED_BYTES", 1000)
     with pytest.raises(FileError, match="would decompress to more than 1000 bytes"):
         read_layout(npz(tmp_path / "a.npz", column_a=np.zeros(200)))
 
@@ -940,7 +940,7 @@ def test_too_many_sites_are_rejected(small, tmp_path, monkeypatch, extension):
 
 def test_parquet_decompression_limit_is_enforced(small, tmp_path, monkeypatch):
     pa = pytest.importorskip("pyarrow")
-    monkeypatch.setattr("foveasim.layout.files._common.MAX_UNPACKED_BYTES", 2**26)
+    monkeypatch.setattr("foveasim.layout.files._common.MAX_DECOMPRESSED_BYTES", 2**26)
     write_layout(small, tmp_path / "a.parquet")
     metadata = pq.read_table(tmp_path / "a.parquet").schema.metadata
     values = pa.DictionaryArray.from_arrays(pa.array(np.zeros(10**6, np.int32)), pa.array([bytes(10**5)]))
