@@ -125,14 +125,14 @@ def layouts() -> None:
     """List the bundled layouts, by name, and the layout generators."""
     from rich.table import Table
 
-    from foveasim.config import read_layout_file, shipped_layouts
+    from foveasim.config import bundled_layouts, read_layout_file
     from foveasim.layout import LAYOUTS
 
     table = Table(box=None)
     for heading in ("name", "photosites", "field / µm", "pixel size / µm", "generator"):
         table.add_column(heading, justify="left" if heading in {"name", "generator"} else "right")
     with _status("reading layouts"):
-        for name, path in shipped_layouts().items():
+        for name, path in bundled_layouts().items():
             found = read_layout_file(path).layout.describe()
             x0, y0, x1, y1 = found.bounds_um
             sizes = f"{found.size_um[0]:.3g} to {found.size_um[-1]:.3g}"

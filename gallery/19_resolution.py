@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import foveasim as fs
-from foveasim.config import read_any_layout, shipped_layouts
+from foveasim.config import bundled_layouts, read_any_layout
 from foveasim.metrics import (
     AliasingSpectrum,
     SamplingSpectrum,
@@ -111,7 +111,7 @@ def main(out_dir: Path) -> None:
     axes[0].legend(fontsize=8)
 
     # %% How finely the layouts that come with the package sample, from their middle outwards.
-    layouts = {name: read_any_layout(path).layout for name, path in shipped_layouts().items()}
+    layouts = {name: read_any_layout(path).layout for name, path in bundled_layouts().items()}
     is_foveal = {}
     for name, layout in layouts.items():
         table = nyquist_vs_eccentricity(layout, n_bins=40, per_channel=True)

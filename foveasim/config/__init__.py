@@ -35,7 +35,7 @@ from foveasim.config._shots import (
 )
 from foveasim.config._video import run_video
 from foveasim.config._viewing import Viewable, read_viewable
-from foveasim.layout import shipped_layouts
+from foveasim.layout import bundled_layouts
 
 __all__ = [
     "YAML_EXTENSIONS",
@@ -44,6 +44,7 @@ __all__ = [
     "Shot",
     "Viewable",
     "build_shot",
+    "bundled_layouts",
     "check_folder",
     "check_settings",
     "demo_settings",
@@ -61,7 +62,6 @@ __all__ = [
     "run_shot",
     "run_video",
     "schema",
-    "shipped_layouts",
     "validated",
     "write_3d_picture",
     "write_results",

@@ -20,7 +20,7 @@ from foveasim.config._models import PerArea, call_of, models
 from foveasim.config._problems import validated
 from foveasim.errors import ConfigError, FoveasimError, ParameterError
 from foveasim.fields import Grid, PowerMap
-from foveasim.layout import LAYOUTS, PRESETS, DesignRules, Layout, inset, mosaic, shipped_layouts, snap
+from foveasim.layout import LAYOUTS, PRESETS, DesignRules, Layout, bundled_layouts, inset, mosaic, snap
 from foveasim.layout.files import check_no_options, layout_path
 from foveasim.layout.files import read_layout as read_sites
 from foveasim.optics import Optics
@@ -504,7 +504,7 @@ def files_from(folder: Path, value: Any, key: str = "", found: list[Path] | None
     name = key.rpartition(".")[2]
     if name not in FILE_SETTINGS or not isinstance(value, str) or value.startswith(BUNDLED_PICTURE):
         return value
-    if name == "layout" and value in shipped_layouts():
+    if name == "layout" and value in bundled_layouts():
         return value
     file = (folder / value).absolute()
     if found is not None:

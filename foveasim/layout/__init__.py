@@ -13,7 +13,7 @@ from foveasim.layout.drc.routing import Readout, Routing, track_demand
 from foveasim.layout.drc.rules import DesignRules, Report, RuleResult, Violation, min_width_um
 from foveasim.layout.edits import clip, cut_out, inset, merge, merge_small, node, snap, split, union
 from foveasim.layout.families import LAYOUTS, layout_family
-from foveasim.layout.files import FORMATS, FileFormat, WrittenLayout, read_layout, shipped_layouts, write_layout
+from foveasim.layout.files import FORMATS, FileFormat, WrittenLayout, bundled_layouts, read_layout, write_layout
 from foveasim.layout.generators.foveal_cartesian import foveal_cartesian
 from foveasim.layout.generators.fovi import fovi
 from foveasim.layout.generators.giotto import giotto, giotto_ratio
@@ -51,6 +51,7 @@ __all__ = [
     "Violation",
     "WrittenLayout",
     "adjacency",
+    "bundled_layouts",
     "clip",
     "cut_out",
     "describe",
@@ -79,7 +80,6 @@ __all__ = [
     "read_layout",
     "readout_by",
     "readout_order",
-    "shipped_layouts",
     "snap",
     "split",
     "square_ring_ratio",

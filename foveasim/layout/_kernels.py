@@ -27,7 +27,7 @@ _flags = types.Array(types.boolean, 1, "C")
 #: Cosine of the largest angle (26 degrees) between antiparallel edges that face each other across the site. With 45 degrees,
 #: corners of octagons and the almost right angles between a chord and a side would count as widths. No two edges of a regular
 #: polygon enclose an angle with this cosine.
-MIN_OPPOSITION = 0.9
+MIN_FACING_COSINE = 0.9
 
 
 @njit()
@@ -95,7 +95,7 @@ def min_widths(xy, after, before, ring_offsets, site_offsets):
                 dx, dy = xy[after[k], 0], xy[after[k], 1]
                 other = np.hypot(dx - cx, dy - cy)
                 fx, fy = (dx - cx) / other, (dy - cy) / other
-                if ex * fx + ey * fy > -MIN_OPPOSITION:
+                if ex * fx + ey * fy > -MIN_FACING_COSINE:
                     continue
                 # The interior is to the left of each edge: each edge must extend to the left side of the other.
                 if max(ex * (cy - ay) - ey * (cx - ax), ex * (dy - ay) - ey * (dx - ax)) <= 0.0:
@@ -113,7 +113,7 @@ def min_widths(xy, after, before, ring_offsets, site_offsets):
 
 
 #: Relative difference of area below which two rectangles count as equal.
-EQUAL_AREAS = 1e-9
+AREA_RTOL = 1e-9
 
 
 @njit()
@@ -163,7 +163,7 @@ def aspect_ratios(xy, ring_offsets, site_offsets):
                 low, high, depth = min(low, along), max(high, along), max(depth, ex * ky - ey * kx)
             area = (high - low) * depth
             shape = max(high - low, depth) / min(high - low, depth)
-            if area < (1.0 - EQUAL_AREAS) * smallest or (area < (1.0 + EQUAL_AREAS) * smallest and shape < ratio):
+            if area < (1.0 - AREA_RTOL) * smallest or (area < (1.0 + AREA_RTOL) * smallest and shape < ratio):
                 smallest, ratio = min(area, smallest), shape
             corner = beyond
             if corner == start:
@@ -263,7 +263,7 @@ def _edge_to_edge(xy, a, b, c, d):
 
 
 @njit()
-def _edges_meeting(xy, a, b, c, d):
+def _edge_distances(xy, a, b, c, d):
     """Return the distance of edges a-b and c-d, also with a common end point excluded."""
     is_ac, is_ad, is_bc, is_bd = _is_same(xy, a, c), _is_same(xy, a, d), _is_same(xy, b, c), _is_same(xy, b, d)
     if is_ac and is_bd:
@@ -311,16 +311,16 @@ def _has_edge_inside(xy, after, box, i_first, i_last, j, j_first, j_last):
 
 
 @njit()
-def _is_parted(xy, after, overhang, depth, i_first, i_last, j_first, j_last):
+def _is_separated(xy, after, overhang, depth, i_first, i_last, j_first, j_last):
     """Return whether an edge of the first site separates both sites, up to a strip."""
     for a in range(i_first, i_last):
         if overhang[a] > depth:
             continue
         ex, ey = xy[after[a], 0] - xy[a, 0], xy[after[a], 1] - xy[a, 1]
-        least = 0.0
+        lowest = 0.0
         for c in range(j_first, j_last):
-            least = min(least, ey * (xy[c, 0] - xy[a, 0]) - ex * (xy[c, 1] - xy[a, 1]))
-        if overhang[a] - least / np.hypot(ex, ey) <= depth:
+            lowest = min(lowest, ey * (xy[c, 0] - xy[a, 0]) - ex * (xy[c, 1] - xy[a, 1]))
+        if overhang[a] - lowest / np.hypot(ex, ey) <= depth:
             return True
     return False
 
@@ -328,23 +328,23 @@ def _is_parted(xy, after, overhang, depth, i_first, i_last, j_first, j_last):
 @njit()
 def _common_edges(xy, after, box, overhang, depth, i_first, i_last, j, j_first, j_last, is_shared):
     """Return whether sites share a vertex and a separating edge; flag shared edges."""
-    is_met, is_parted = False, False
+    shares_vertex, is_separated = False, False
     for a in range(i_first, i_last):
         if not _is_in_box(xy[a, 0], xy[a, 1], box, j):
             continue
         for c in range(j_first, j_last):
             if _is_same(xy, a, after[c]):
-                is_met = True
+                shares_vertex = True
                 if _is_same(xy, after[a], c):
                     is_shared[a] = is_shared[c] = True
-                    is_parted = is_parted or overhang[a] + overhang[c] <= depth
-    return is_met, is_parted
+                    is_separated = is_separated or overhang[a] + overhang[c] <= depth
+    return shares_vertex, is_separated
 
 
 @njit()
 def _nearest_edges(xy, after, box, i_first, i_last, j, j_first, j_last, nearest, reach, touching):
     """Return the outline distance, also with common vertices and edges excluded."""
-    besides = np.inf
+    nearest_other = np.inf
     for a in range(i_first, i_last):
         b = after[a]
         within = max(min(reach, nearest), touching)
@@ -359,9 +359,9 @@ def _nearest_edges(xy, after, box, i_first, i_last, j, j_first, j_last, nearest,
             if min(xy[c, 1], xy[d, 1]) > high or max(xy[c, 1], xy[d, 1]) < low:
                 continue
             if not (_is_same(xy, a, d) and _is_same(xy, b, c)):
-                near, beside = _edges_meeting(xy, a, b, c, d)
-                nearest, besides = min(nearest, near), min(besides, beside)
-    return nearest, besides
+                near, near_other = _edge_distances(xy, a, b, c, d)
+                nearest, nearest_other = min(nearest, near), min(nearest_other, near_other)
+    return nearest, nearest_other
 
 
 @njit(
@@ -381,24 +381,24 @@ def contacts(xy, after, first_vertex, box, overhang, depth, first, second, reach
     Edges that coincide with a reversed edge of the other site are flagged in ``is_shared``.
     """
     distances = np.zeros(first.size)
-    is_apart = np.ones(first.size, np.bool_)
+    is_non_overlapping = np.ones(first.size, np.bool_)
     for pair in range(first.size):
         i, j = first[pair], second[pair]
         i_first, i_last, j_first, j_last = first_vertex[i], first_vertex[i + 1], first_vertex[j], first_vertex[j + 1]
         strip = min(depth[i], depth[j])
-        is_met, is_parted = _common_edges(
+        shares_vertex, is_separated = _common_edges(
             xy, after, box, overhang, strip, i_first, i_last, j, j_first, j_last, is_shared
         )
         for _ in range(2):
-            if is_met and not is_parted:
-                is_parted = _is_parted(xy, after, overhang, strip, i_first, i_last, j_first, j_last)
+            if shares_vertex and not is_separated:
+                is_separated = _is_separated(xy, after, overhang, strip, i_first, i_last, j_first, j_last)
             i, i_first, i_last, j, j_first, j_last = j, j_first, j_last, i, i_first, i_last
-        if is_met and is_parted:
+        if shares_vertex and is_separated:
             continue
-        nearest, besides = _nearest_edges(
-            xy, after, box, i_first, i_last, j, j_first, j_last, 0.0 if is_met else np.inf, reach, touching
+        nearest, nearest_other = _nearest_edges(
+            xy, after, box, i_first, i_last, j, j_first, j_last, 0.0 if shares_vertex else np.inf, reach, touching
         )
-        is_clean = besides > touching
+        is_clean = nearest_other > touching
         for _ in range(2):
             if nearest > touching:
                 x, y = xy[i_first, 0], xy[i_first, 1]
@@ -406,16 +406,16 @@ def contacts(xy, after, first_vertex, box, overhang, depth, first, second, reach
                     nearest, is_clean = 0.0, False
             elif is_clean:
                 is_clean = not _has_edge_inside(xy, after, box, i_first, i_last, j, j_first, j_last)
-            elif not is_parted:
-                is_parted = _is_parted(xy, after, overhang, strip, i_first, i_last, j_first, j_last)
+            elif not is_separated:
+                is_separated = _is_separated(xy, after, overhang, strip, i_first, i_last, j_first, j_last)
             i, i_first, i_last, j, j_first, j_last = j, j_first, j_last, i, i_first, i_last
-        is_apart[pair] = is_parted or is_clean
+        is_non_overlapping[pair] = is_separated or is_clean
         distances[pair] = nearest if nearest <= reach else np.inf
-    return distances, is_apart
+    return distances, is_non_overlapping
 
 
 #: Common length, in µm, up to which edges count as touching in a corner only: the rounding of coordinates.
-CORNER_UM = 1e-6
+MIN_SHARED_LENGTH_UM = 1e-6
 
 
 @njit(types.float64[::1](_points, _ints, _ints, _ints, _ints, types.float64))
@@ -440,7 +440,7 @@ def shared_lengths(xy, after, first_vertex, first, second, max_gap):
                 high = cx * ex + cy * ey  # the other edge has the opposite direction
                 low = dx * ex + dy * ey
                 begin, end = max(low, 0.0), min(high, length)
-                if end - begin <= CORNER_UM:
+                if end - begin <= MIN_SHARED_LENGTH_UM:
                     continue
                 slope = ((cy - dy) * ex - (cx - dx) * ey) / (high - low)
                 away = dy * ex - dx * ey - slope * low  # distance of the line of the other edge at (ax, ay)
@@ -462,7 +462,7 @@ def colour_greedily(first, neighbour, shared, n_colours):
     colour = np.full(n_sites, -1, np.int64)
     used = np.zeros(n_colours, np.int64)
     conflict = np.empty(n_colours)
-    seen = np.zeros(n_sites, np.uint64)  # bit mask of the colours of the neighbours
+    neighbour_colours = np.zeros(n_sites, np.uint64)  # bit mask of the colours of the neighbours
     variety = np.zeros(n_sites, np.int64)  # number of different colours of the neighbours
     queue = [(0, s) for s in range(n_sites)]
     while len(queue) > 0:
@@ -482,8 +482,8 @@ def colour_greedily(first, neighbour, shared, n_colours):
         bit = np.uint64(1) << np.uint64(best)
         for k in range(first[site], first[site + 1]):
             other = neighbour[k]
-            if colour[other] < 0 and not seen[other] & bit:
-                seen[other] |= bit
+            if colour[other] < 0 and not neighbour_colours[other] & bit:
+                neighbour_colours[other] |= bit
                 variety[other] += 1
                 heappush(queue, (-variety[other], other))
     return colour

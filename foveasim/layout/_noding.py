@@ -7,7 +7,7 @@ import shapely
 
 from foveasim._core.validation import Floats, Ints
 
-__all__ = ["ON_EDGE_UM", "noded_edges", "points_on_edges"]
+__all__ = ["ON_EDGE_UM", "node_edges", "points_on_edges"]
 
 #: Tolerance within which a point lies on an edge, and two points are the same.
 ON_EDGE_UM = 1e-6
@@ -25,20 +25,20 @@ def points_on_edges(points_um: Floats, begin_um: Floats, end_um: Floats) -> tupl
     Returns
     -------
     edge, point : (n,) int64
-    share : (n,) float64
+    fraction : (n,) float64
         Position along the edge, from 0 to 1.
     """
     edges = shapely.linestrings(np.stack((begin_um, end_um), axis=1))
     edge, point = shapely.STRtree(shapely.points(points_um)).query(edges, predicate="dwithin", distance=ON_EDGE_UM)
     along = end_um[edge] - begin_um[edge]
     length2 = np.einsum("ij,ij->i", along, along)
-    share = np.einsum("ij,ij->i", points_um[point] - begin_um[edge], along) / length2
+    fraction = np.einsum("ij,ij->i", points_um[point] - begin_um[edge], along) / length2
     margin = ON_EDGE_UM / np.sqrt(length2)
-    is_inside = (share > margin) & (share < 1.0 - margin)
-    return edge[is_inside], point[is_inside], share[is_inside]
+    is_inside = (fraction > margin) & (fraction < 1.0 - margin)
+    return edge[is_inside], point[is_inside], fraction[is_inside]
 
 
-def noded_edges(begin_um: Floats, end_um: Floats) -> tuple[Floats, Floats]:
+def node_edges(begin_um: Floats, end_um: Floats) -> tuple[Floats, Floats]:
     """
     Return edges with coincident end points merged, split at end points of other edges.
 
@@ -50,22 +50,22 @@ def noded_edges(begin_um: Floats, end_um: Floats) -> tuple[Floats, Floats]:
     -------
     begin_um, end_um : (n, 2) float64, µm
     """
-    points, ends = _one_point_each(np.concatenate((begin_um, end_um)))
+    points, ends = _merge_coincident_points(np.concatenate((begin_um, end_um)))
     first, last = np.split(ends, 2)
     is_edge = first != last
     first, last = first[is_edge], last[is_edge]
     if first.size == 0:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    edge, point, share = points_on_edges(points, points[first], points[last])
+    edge, point, fraction = points_on_edges(points, points[first], points[last])
     # Each edge becomes a run of points: its start, the points on it in order, its end.
     owner = np.concatenate((np.arange(first.size), edge, np.arange(first.size)))
-    order = np.lexsort((np.concatenate((np.full(first.size, -1.0), share, np.full(first.size, 2.0))), owner))
+    order = np.lexsort((np.concatenate((np.full(first.size, -1.0), fraction, np.full(first.size, 2.0))), owner))
     run = np.concatenate((first, point, last))[order]
     is_step = np.diff(owner[order]) == 0
     return points[run[:-1][is_step]], points[run[1:][is_step]]
 
 
-def _one_point_each(xy_um: Floats) -> tuple[Floats, Ints]:
+def _merge_coincident_points(xy_um: Floats) -> tuple[Floats, Ints]:
     """Return the points without duplicates within rounding, and the index of each in them."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from foveasim._core.rings import next_vertex, ring_moments
 from foveasim._core.validation import Bools, Floats, Ints
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.layout._power import N_FAR, PowerDiagram, far_points_um
+from foveasim.layout._power import N_AUXILIARY, PowerDiagram, auxiliary_points_um
 from foveasim.layout.model import Layout
 
-__all__ = ["CellEdges", "MovingCells", "cells_of", "edges_of_rings"]
+__all__ = ["CellEdges", "IncrementalCells", "ring_edges", "voronoi_cells"]
 
 #: Edges shorter than this fraction of the distance of their centres are one corner split by rounding, as on a square grid.
 SHORT_EDGE = 1e-9
@@ -24,7 +24,7 @@ SHORT_EDGE = 1e-9
 AREA_ROUNDING = 1e-9
 
 
-def cells_of(centres_um: Floats, region: shapely.Polygon) -> tuple[Floats, Ints]:
+def voronoi_cells(centres_um: Floats, region: shapely.Polygon) -> tuple[Floats, Ints]:
     """
     Compute the Voronoi cells of points, clipped to a region, one per point in their order.
 
@@ -54,11 +54,11 @@ def cells_of(centres_um: Floats, region: shapely.Polygon) -> tuple[Floats, Ints]
     of the region separates from its cell is assigned to the neighbour with which it shares the longest boundary.
     """
     centres_um = np.ascontiguousarray(centres_um, np.float64)
-    _require_apart_and_inside(centres_um, region)
+    _check_centres(centres_um, region)
     diagram = _voronoi(centres_um, region)
-    whole = _whole_rings(diagram, centres_um)
+    unclipped = _unclipped_rings(diagram, centres_um)
     shapely.prepare(region)
-    return _clipped(diagram, *whole, shapely.contains_properly(region, _polygons(*whole)), region)
+    return _clip(diagram, *unclipped, shapely.contains_properly(region, _polygons(*unclipped)), region)
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class CellEdges:
         return np.concatenate((one, rest[at])), np.concatenate((other, rest[at + 1]))
 
 
-def edges_of_rings(xy_um: Floats, ring_offsets: Ints) -> CellEdges:
+def ring_edges(xy_um: Floats, ring_offsets: Ints) -> CellEdges:
     """Return the edges of cells given as packed rings."""
     cell = np.repeat(np.arange(ring_offsets.size - 1), np.diff(ring_offsets))
     return CellEdges(cell, cell, xy_um, xy_um[next_vertex(ring_offsets)])
@@ -107,12 +107,12 @@ def edges_of_rings(xy_um: Floats, ring_offsets: Ints) -> CellEdges:
 MassOf: TypeAlias = Callable[[CellEdges, int], Any]
 
 
-class MovingCells:
+class IncrementalCells:
     """
     Voronoi or power cells in a region, updated incrementally as unordered edges.
 
     Unordered edges are sufficient for areas and masses, and faster to compute than rings. Parts of cells that notches of the
-    region separate are assigned to neighbours as in :func:`cells_of`, and have edges of their own.
+    region separate are assigned to neighbours as in :func:`voronoi_cells`, and have edges of their own.
 
     Parameters
     ----------
@@ -137,23 +137,23 @@ class MovingCells:
         shapely.prepare(self.region)
         shapely.prepare(self._boundary)
 
-    def follow(self, centres_um: Floats, weights_um2: Floats | None = None) -> CellEdges | None:
+    def update(self, centres_um: Floats, weights_um2: Floats | None = None) -> CellEdges | None:
         """
         Compute the edges of the Voronoi or power cells of centres (n, 2) inside the region.
 
         With weights (n,) a point x belongs to the centre c of the least power ``|x - c|² - weight``. The result is None if a
         centre has no cell in the region; :meth:`rings` is not available then.
         """
-        if not self._power.follow(centres_um, weights_um2):
+        if not self._power.update(centres_um, weights_um2):
             return None
-        is_inside = self._sure_inside(centres_um)
+        is_inside = self._certainly_inside(centres_um)
         self.centres_um, self._weights_um2 = centres_um, weights_um2
         diagram = self._diagram()
         parts, is_inside = _boundary_parts(diagram, is_inside, self.region, self._mass_of)
-        inner, self._is_inside = _edges_around(diagram, is_inside), is_inside
+        inner, self._is_inside = _inner_edges(diagram, is_inside), is_inside
         if parts is None:
             return inner
-        if parts.lost.size:
+        if parts.missing.size:
             return None
         outer = parts.edges
         return CellEdges(
@@ -166,7 +166,7 @@ class MovingCells:
 
     def rings(self) -> tuple[Floats, Ints]:
         """
-        Return the last cells as packed rings, like :func:`cells_of`.
+        Return the last cells as packed rings, like :func:`voronoi_cells`.
 
         Returns
         -------
@@ -179,14 +179,16 @@ class MovingCells:
             When centres are too close for float64, or a cell encloses a hole of the region.
         """
         diagram = _without_short_edges(self._diagram())
-        whole = _whole_rings(diagram, self.centres_um if self._weights_um2 is None else _centres_um(diagram))
-        return _clipped(diagram, *whole, self._is_inside, self.region, self._mass_of)
+        unclipped = _unclipped_rings(
+            diagram, self.centres_um if self._weights_um2 is None else _inner_points_um(diagram)
+        )
+        return _clip(diagram, *unclipped, self._is_inside, self.region, self._mass_of)
 
     def _diagram(self) -> _Diagram:
         power = self._power
         return _Diagram(self.centres_um, self._weights_um2, power.points_um, power.corners_um, power.sites, power.ends)
 
-    def _sure_inside(self, centres_um: Floats) -> Bools:
+    def _certainly_inside(self, centres_um: Floats) -> Bools:
         """Return whether each cell certainly is inside: its corners are closer than the boundary."""
         reach_um = self._power.reach_um()
         if self.centres_um.shape == centres_um.shape:
@@ -199,7 +201,7 @@ class MovingCells:
         return np.asarray(reach_um < (1.0 - SHORT_EDGE) * self._clearance_um)
 
 
-def _require_apart_and_inside(centres_um: Floats, region: shapely.Polygon) -> None:
+def _check_centres(centres_um: Floats, region: shapely.Polygon) -> None:
     if centres_um.ndim != 2 or centres_um.shape[1] != 2 or centres_um.shape[0] == 0:
         raise ParameterError("centres_um", f"must have the shape (n, 2) with n >= 1, got {centres_um.shape}")
     shapely.prepare(region)
@@ -222,7 +224,7 @@ class _Diagram:
     """
     Edges of Voronoi or power cells, not clipped.
 
-    Fields: centres (n, 2), weights (n,), centres and auxiliary points (n + N_FAR, 2), corners of cells (n_corner, 2), and
+    Fields: centres (n, 2), weights (n,), centres and auxiliary points (n + N_AUXILIARY, 2), corners of cells (n_corner, 2), and
     for each edge the points on its two sides (n_edge, 2) and the corners at its ends (n_edge, 2).
     """
 
@@ -241,16 +243,16 @@ def _voronoi(centres_um: Floats, region: shapely.Polygon) -> _Diagram:
     from scipy.spatial import Voronoi
 
     low, high = np.reshape(region.bounds, (2, 2))
-    middle = 0.5 * (low + high)
-    found = Voronoi(np.concatenate((centres_um - middle, far_points_um(low, high))))
+    centre = 0.5 * (low + high)
+    found = Voronoi(np.concatenate((centres_um - centre, auxiliary_points_um(low, high))))
     sites = np.asarray(found.ridge_points, dtype=np.int64)
     corners = np.asarray(found.ridge_vertices, dtype=np.int64)
     # Edges between two auxiliary points belong to no cell, and only these can be infinite.
-    is_ours = (sites < centres_um.shape[0]).any(axis=1)
-    if (corners[is_ours] < 0).any():
+    has_centre = (sites < centres_um.shape[0]).any(axis=1)
+    if (corners[has_centre] < 0).any():
         raise GeometryError("the centres are too close together for float64; increase their distances")
-    diagram = _Diagram(centres_um, None, found.points, found.vertices, sites[is_ours], corners[is_ours])
-    return replace(_without_short_edges(diagram), xy_um=found.vertices + middle)
+    diagram = _Diagram(centres_um, None, found.points, found.vertices, sites[has_centre], corners[has_centre])
+    return replace(_without_short_edges(diagram), xy_um=found.vertices + centre)
 
 
 def _without_short_edges(diagram: _Diagram) -> _Diagram:
@@ -274,17 +276,17 @@ def _without_short_edges(diagram: _Diagram) -> _Diagram:
     return replace(diagram, corners=corners).with_edges(corners[:, 0] != corners[:, 1])
 
 
-def _at_border(diagram: _Diagram, is_inside: Bools) -> tuple[_Diagram, _Diagram]:
+def _split_at_boundary(diagram: _Diagram, is_inside: Bools) -> tuple[_Diagram, _Diagram]:
     """Split the diagram into edges of boundary cells and edges between inner cells."""
-    is_inner = np.append(is_inside, np.zeros(N_FAR, bool))
+    is_inner = np.append(is_inside, np.zeros(N_AUXILIARY, bool))
     is_both = np.asarray(is_inner[diagram.sites[:, 0]] & is_inner[diagram.sites[:, 1]])
     return _without_short_edges(diagram.with_edges(~is_both)), diagram.with_edges(is_both)
 
 
-def _edges_around(diagram: _Diagram, is_inside: Bools) -> CellEdges:
+def _inner_edges(diagram: _Diagram, is_inside: Bools) -> CellEdges:
     """Return the edges around inner cells: paired ones, then those to boundary cells."""
-    one, both = _at_border(diagram, is_inside)
-    is_inner = np.append(is_inside, np.zeros(N_FAR, bool))
+    one, both = _split_at_boundary(diagram, is_inside)
+    is_inner = np.append(is_inside, np.zeros(N_AUXILIARY, bool))
     first, second = is_inner[one.sites[:, 0]], is_inner[one.sites[:, 1]]
     cell = np.concatenate((both.sites[:, 0], both.sites[:, 1], one.sites[first, 0], one.sites[second, 1]))
     start, stop = (
@@ -294,33 +296,33 @@ def _edges_around(diagram: _Diagram, is_inside: Bools) -> CellEdges:
     return CellEdges(cell, cell, both.xy_um.take(start, 0), both.xy_um.take(stop, 0), both.sites.shape[0])
 
 
-def _centres_um(diagram: _Diagram) -> Floats:
+def _inner_points_um(diagram: _Diagram) -> Floats:
     """Return the mean (n, 2) of the corners of each cell, a point inside it."""
     n = diagram.centres_um.shape[0]
-    middle_um = diagram.xy_um[diagram.corners].mean(axis=1)
+    midpoint_um = diagram.xy_um[diagram.corners].mean(axis=1)
     total_um, count = np.zeros((n, 2)), np.zeros(n)
     for site in diagram.sites.T:
-        is_ours = site < n
-        count += np.bincount(site[is_ours], minlength=n)
+        is_centre = site < n
+        count += np.bincount(site[is_centre], minlength=n)
         for i in (0, 1):
-            total_um[:, i] += np.bincount(site[is_ours], middle_um[is_ours, i], minlength=n)
+            total_um[:, i] += np.bincount(site[is_centre], midpoint_um[is_centre, i], minlength=n)
     return total_um / np.maximum(count, 1.0)[:, np.newaxis]
 
 
-def _whole_rings(diagram: _Diagram, inside_um: Floats) -> tuple[Floats, Ints]:
+def _unclipped_rings(diagram: _Diagram, inside_um: Floats) -> tuple[Floats, Ints]:
     """Return packed rings of the unclipped cells, given a point (n, 2) inside each."""
-    site, start, stop = _walks(inside_um, diagram.xy_um, diagram.sites, diagram.corners)
+    site, start, stop = _sort_edges(inside_um, diagram.xy_um, diagram.sites, diagram.corners)
     offsets = np.concatenate(([0], np.cumsum(np.bincount(site, minlength=inside_um.shape[0]))))
     _require_closed(start, stop, offsets)
     return diagram.xy_um[start], offsets
 
 
-def _walks(inside_um: Floats, xy_um: Floats, sites: Ints, corners: Ints) -> tuple[Ints, Ints, Ints]:
+def _sort_edges(inside_um: Floats, xy_um: Floats, sites: Ints, corners: Ints) -> tuple[Ints, Ints, Ints]:
     """Sort all edges by cell and counter-clockwise: cell, first corner, second corner."""
     site = sites.ravel()
     start, stop = np.repeat(corners, 2, axis=0).T
-    is_ours = site < inside_um.shape[0]
-    site, start, stop = site[is_ours], start[is_ours], stop[is_ours]
+    is_centre = site < inside_um.shape[0]
+    site, start, stop = site[is_centre], start[is_centre], stop[is_centre]
     a, b = xy_um[start] - inside_um[site], xy_um[stop] - inside_um[site]
     is_clockwise = a[:, 0] * b[:, 1] < a[:, 1] * b[:, 0]
     start, stop = np.where(is_clockwise, stop, start), np.where(is_clockwise, start, stop)
@@ -345,9 +347,9 @@ def _polygons(xy_um: Floats, offsets: Ints) -> NDArray[Any]:
     return Layout(xy_um, offsets, np.arange(offsets.size)).polygons()
 
 
-def _clipped(
+def _clip(
     diagram: _Diagram,
-    whole_um: Floats,
+    unclipped_um: Floats,
     offsets: Ints,
     is_inside: Bools,
     region: shapely.Polygon,
@@ -355,15 +357,15 @@ def _clipped(
 ) -> tuple[Floats, Ints]:
     """Return packed rings of the cells within the region: those not inside are clipped."""
     parts, is_inside = _boundary_parts(diagram, is_inside, region, mass_of)
-    border = np.flatnonzero(~is_inside)
+    boundary = np.flatnonzero(~is_inside)
     rings_um, ring_offsets = np.zeros((0, 2)), np.zeros(1, np.int64)
     if parts is not None:
-        if parts.lost.size:
+        if parts.missing.size:
             raise GeometryError(
-                f"centre {parts.lost[0]} is too close to another centre for float64", tuple(parts.lost.tolist())
+                f"centre {parts.missing[0]} is too close to another centre for float64", tuple(parts.missing.tolist())
             )
-        rings_um, ring_offsets = _rings(parts.joined(border), border)
-    return _merged(whole_um, offsets, rings_um, ring_offsets, border, float(region.area))
+        rings_um, ring_offsets = _rings(parts.join(boundary), boundary)
+    return _merge_rings(unclipped_um, offsets, rings_um, ring_offsets, boundary, float(region.area))
 
 
 @dataclass(frozen=True)
@@ -379,16 +381,16 @@ class _Parts:
     owner: Ints
     cell: Ints
     edges: CellEdges
-    lost: Ints
+    missing: Ints
 
-    def joined(self, border: Ints) -> NDArray[Any]:
+    def join(self, boundary: Ints) -> NDArray[Any]:
         """Return the cells with these indices, each a single polygon if its parts touch."""
         order = np.argsort(self.cell, kind="stable")
         polygons, cell = self.polygons[order], self.cell[order]
         is_first = np.append(True, cell[1:] != cell[:-1])
         cells = polygons[is_first]
         for i in np.flatnonzero(~is_first):
-            at = int(np.searchsorted(border, cell[i]))
+            at = int(np.searchsorted(boundary, cell[i]))
             cells[at] = shapely.union(cells[at], polygons[i])
         return np.asarray(shapely.orient_polygons(cells))
 
@@ -399,21 +401,21 @@ def _boundary_parts(
     """Return the parts of boundary cells, or None, and a mask of the unaffected inner cells."""
     if is_inside.all():
         return None, is_inside
-    parts = _parts(_at_border(diagram, is_inside)[0], region, ~is_inside, mass_of)
+    parts = _parts(_split_at_boundary(diagram, is_inside)[0], region, ~is_inside, mass_of)
     if np.unique(parts.owner).size < parts.owner.size:
         owner, count = np.unique(parts.owner, return_counts=True)
-        is_apart = np.zeros(diagram.points_um.shape[0], bool)
-        is_apart[owner[count > 1]] = True
-        beside = np.unique(diagram.sites[is_apart[diagram.sites[:, 0]] | is_apart[diagram.sites[:, 1]]])
-        beside = beside[beside < is_inside.size]
-        if is_inside[beside].any():
+        is_divided = np.zeros(diagram.points_um.shape[0], bool)
+        is_divided[owner[count > 1]] = True
+        neighbours = np.unique(diagram.sites[is_divided[diagram.sites[:, 0]] | is_divided[diagram.sites[:, 1]]])
+        neighbours = neighbours[neighbours < is_inside.size]
+        if is_inside[neighbours].any():
             is_inside = is_inside.copy()
-            is_inside[beside] = False
-            parts = _parts(_at_border(diagram, is_inside)[0], region, ~is_inside, mass_of)
+            is_inside[neighbours] = False
+            parts = _parts(_split_at_boundary(diagram, is_inside)[0], region, ~is_inside, mass_of)
     return parts, is_inside
 
 
-def _parts(diagram: _Diagram, region: shapely.Polygon, is_border: Bools, mass_of: MassOf | None) -> _Parts:
+def _parts(diagram: _Diagram, region: shapely.Polygon, is_boundary: Bools, mass_of: MassOf | None) -> _Parts:
     """Return the faces between the edges of boundary cells and the outline of the region."""
     ends = np.unique(np.sort(diagram.corners, axis=1), axis=0)
     lines = np.append(shapely.linestrings(diagram.xy_um[ends]), region.boundary)
@@ -421,9 +423,9 @@ def _parts(diagram: _Diagram, region: shapely.Polygon, is_border: Bools, mass_of
     points = shapely.point_on_surface(faces)
     is_inside = shapely.contains(region, points)
     faces, points = faces[is_inside], points[is_inside]
-    owner = _least_power(shapely.get_coordinates(points), diagram)
-    is_ours = is_border[owner]
-    faces, owner = shapely.orient_polygons(faces[is_ours]), owner[is_ours]
+    owner = _least_power_centre(shapely.get_coordinates(points), diagram)
+    is_boundary_part = is_boundary[owner]
+    faces, owner = shapely.orient_polygons(faces[is_boundary_part]), owner[is_boundary_part]
     # The first face of each owner contains its centre, or is the heaviest; the outline separates the others from it.
     edges = _edges_of(faces)
     if mass_of is None:
@@ -434,10 +436,12 @@ def _parts(diagram: _Diagram, region: shapely.Polygon, is_border: Bools, mass_of
     is_first = np.append(True, np.diff(owner[order]) != 0)
     cell = np.full(faces.size, -1)
     cell[order[is_first]] = owner[order[is_first]]
-    return _Parts(faces, owner, _adopted(cell, owner, edges), edges, np.setdiff1d(np.flatnonzero(is_border), owner))
+    return _Parts(
+        faces, owner, _assign_parts(cell, owner, edges), edges, np.setdiff1d(np.flatnonzero(is_boundary), owner)
+    )
 
 
-def _least_power(points_um: Floats, diagram: _Diagram) -> Ints:
+def _least_power_centre(points_um: Floats, diagram: _Diagram) -> Ints:
     """Return the centre of least power for each point, of those with edges in the diagram."""
     from scipy.spatial import cKDTree
 
@@ -452,21 +456,21 @@ def _least_power(points_um: Floats, diagram: _Diagram) -> Ints:
     return np.asarray(near[cKDTree(centres_um).query(points_um)[1]], dtype=np.int64)
 
 
-def _adopted(cell: Ints, owner: Ints, edges: CellEdges) -> Ints:
+def _assign_parts(cell: Ints, owner: Ints, edges: CellEdges) -> Ints:
     """Assign each part without a cell (-1) to the neighbour with the longest shared boundary."""
     cell = cell.copy()
     if (cell >= 0).all():
         return cell
     one, other = edges.twins()
     length_um = np.hypot(*(edges.stop_um[one] - edges.start_um[one]).T)
-    part, beside = edges.cell[np.stack((np.append(one, other), np.append(other, one)))]
+    part, neighbour = edges.cell[np.stack((np.append(one, other), np.append(other, one)))]
     length_um = np.append(length_um, length_um)
     while True:
         # A part may touch only other parts: in each round, the parts with an assigned neighbour come first.
-        is_open = (cell[part] < 0) & (cell[beside] >= 0)
+        is_open = (cell[part] < 0) & (cell[neighbour] >= 0)
         if not is_open.any():
             return np.where(cell < 0, owner, cell)
-        pairs, number = np.unique(np.stack((part, cell[beside])).T[is_open], axis=0, return_inverse=True)
+        pairs, number = np.unique(np.stack((part, cell[neighbour])).T[is_open], axis=0, return_inverse=True)
         shared_um = np.bincount(number.ravel(), length_um[is_open])
         at = int(shared_um.argmax())
         cell[pairs[at, 0]] = pairs[at, 1]
@@ -497,20 +501,20 @@ def _rings(polygons: NDArray[Any], ids: Ints) -> tuple[Floats, Ints]:
     return closed_um[~is_last], np.concatenate(([0], np.cumsum(counts)))
 
 
-def _merged(
-    xy_um: Floats, offsets: Ints, border_um: Floats, border_offsets: Ints, border: Ints, region_um2: float
+def _merge_rings(
+    xy_um: Floats, offsets: Ints, boundary_um: Floats, boundary_offsets: Ints, boundary: Ints, region_um2: float
 ) -> tuple[Floats, Ints]:
     """Return packed rings of all cells, with those at the boundary replaced."""
     counts = np.diff(offsets)
     is_inside = np.ones(counts.size, bool)
-    is_inside[border] = False
+    is_inside[boundary] = False
     new_counts = counts.copy()
-    new_counts[border] = np.diff(border_offsets)
+    new_counts[boundary] = np.diff(boundary_offsets)
     merged_offsets = np.concatenate(([0], np.cumsum(new_counts)))
     merged_um = np.empty((int(merged_offsets[-1]), 2))
     is_from_inside = np.repeat(is_inside, new_counts)
     merged_um[is_from_inside] = xy_um[np.repeat(is_inside, counts)]
-    merged_um[~is_from_inside] = border_um
+    merged_um[~is_from_inside] = boundary_um
     area_um2, _ = ring_moments(merged_um, merged_offsets)
     bad = np.flatnonzero(area_um2 <= 0.0)
     if bad.size or abs(area_um2.sum() - region_um2) > AREA_ROUNDING * region_um2:

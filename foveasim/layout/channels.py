@@ -98,8 +98,8 @@ def random_channels(layout: Layout, fractions: ArrayLike, *, seed: int) -> Layou
     parts = finite_array("fractions", fractions, ndim=1, at_least=0.0)
     if not parts.sum() > 0.0:
         raise ParameterError("fractions", "must not all be 0", fractions)
-    borders = np.round(np.cumsum(parts) / parts.sum() * layout.n_sites).astype(np.int64)
-    ordered = np.repeat(np.arange(parts.size), np.diff(borders, prepend=0))
+    boundaries = np.round(np.cumsum(parts) / parts.sum() * layout.n_sites).astype(np.int64)
+    ordered = np.repeat(np.arange(parts.size), np.diff(boundaries, prepend=0))
     return layout.with_columns(channel=Streams(seed).of("layout channels").permutation(ordered))
 
 

@@ -61,11 +61,11 @@ def union(layouts: Sequence[Layout]) -> Layout:
         raise ParameterError("layouts", "must be one or more layouts", layouts)
     check_sites(sum(layout.n_sites for layout in layouts) or 1)
     names = set.intersection(*(set(layout.columns) for layout in layouts))
-    return Layout._derived(  # noqa: SLF001 -- of the same subpackage
+    return Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
         np.concatenate([layout.xy_um for layout in layouts]),
-        _joined([layout.ring_offsets for layout in layouts]),
-        _joined([layout.site_offsets for layout in layouts]),
-        {name: _joined_columns(name, [layout.columns[name] for layout in layouts]) for name in sorted(names)},
+        _concatenate_offsets([layout.ring_offsets for layout in layouts]),
+        _concatenate_offsets([layout.site_offsets for layout in layouts]),
+        {name: _concatenate_columns(name, [layout.columns[name] for layout in layouts]) for name in sorted(names)},
         {"made_by": "union", "parts": [dict(layout.provenance) for layout in layouts]},
     )
 
@@ -91,7 +91,9 @@ def clip(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "piece
     ParameterError
         When the region is not a valid polygon.
     """
-    return _kept(layout, as_region("region", region), shapely.intersection, shapely.covers, cut, "clipped to a region")
+    return _clip_sites(
+        layout, as_region("region", region), shapely.intersection, shapely.covers, cut, "clipped to a region"
+    )
 
 
 def cut_out(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "pieces") -> Layout:
@@ -106,7 +108,7 @@ def cut_out(layout: Layout, region: Any, *, cut: Literal["pieces", "drop"] = "pi
     cut : {"pieces", "drop"}
         As for :func:`clip`.
     """
-    return _kept(layout, as_region("region", region), shapely.difference, shapely.disjoint, cut, "region cut out")
+    return _clip_sites(layout, as_region("region", region), shapely.difference, shapely.disjoint, cut, "region cut out")
 
 
 def inset(layout: Layout, margin_um: ArrayLike) -> Layout:
@@ -134,14 +136,14 @@ def inset(layout: Layout, margin_um: ArrayLike) -> Layout:
     if margins_um.ndim > 1 or (margins_um.ndim == 1 and margins_um.size != layout.n_sites):
         raise ParameterError("margin_um", f"must be one number, or one for each of the {layout.n_sites} sites")
     shrunk = shapely.buffer(layout.polygons(), -margins_um, join_style="mitre", mitre_limit=100.0)
-    gone = np.flatnonzero(shapely.is_empty(shrunk) | (shapely.get_type_id(shrunk) != shapely.GeometryType.POLYGON))
-    if gone.size:
+    bad = np.flatnonzero(shapely.is_empty(shrunk) | (shapely.get_type_id(shrunk) != shapely.GeometryType.POLYGON))
+    if bad.size:
         raise GeometryError(
-            f"site {gone[0]} would vanish or split into parts{f' (and {gone.size - 1} more)' if gone.size > 1 else ''}: it is "
+            f"site {bad[0]} would vanish or split into parts{f' (and {bad.size - 1} more)' if bad.size > 1 else ''}: it is "
             "too narrow for the margin",
-            tuple(int(i) for i in gone),
+            tuple(int(i) for i in bad),
         )
-    return _rebuilt(layout, shrunk, np.arange(layout.n_sites), "inset")
+    return _rebuild(layout, shrunk, np.arange(layout.n_sites), "inset")
 
 
 def merge(layout: Layout, groups: ArrayLike) -> Layout:
@@ -175,16 +177,16 @@ def merge(layout: Layout, groups: ArrayLike) -> Layout:
     rows = np.full((count.size, int(count.max(initial=1))), None, dtype=object)
     rows[group[order], positions_in_runs(count)] = layout.polygons()[order]
     joined = shapely.union_all(rows, axis=1) if count.size else np.zeros(0, dtype=object)
-    apart = shapely.get_type_id(joined) != shapely.GeometryType.POLYGON
+    is_disconnected = shapely.get_type_id(joined) != shapely.GeometryType.POLYGON
     # Edges separated by a cut coincide only within rounding: on a fine grid they are equal.
-    joined[apart] = shapely.union_all(rows[apart], axis=1, grid_size=TOUCHING_UM)
-    apart = shapely.get_type_id(joined) != shapely.GeometryType.POLYGON
-    if apart.any():
-        bad = np.flatnonzero(apart[group])
+    joined[is_disconnected] = shapely.union_all(rows[is_disconnected], axis=1, grid_size=TOUCHING_UM)
+    is_disconnected = shapely.get_type_id(joined) != shapely.GeometryType.POLYGON
+    if is_disconnected.any():
+        bad = np.flatnonzero(is_disconnected[group])
         raise GeometryError(
             f"site {bad[0]} must be connected to the other sites of its group", tuple(int(i) for i in bad)
         )
-    return _rebuilt(layout, joined, first, "merged by groups")
+    return _rebuild(layout, joined, first, "merged by groups")
 
 
 def merge_small(layout: Layout, *, min_size_um: float) -> Layout:
@@ -228,15 +230,15 @@ def joining_groups(layout: Layout, small: Ints) -> Ints:
     if small.size == 0:
         return groups
     shared_um = adjacency(layout)
-    is_taken = np.zeros(layout.n_sites, bool)
+    is_joined = np.zeros(layout.n_sites, bool)
     for site in small.tolist():
         row = slice(shared_um.indptr[site], shared_um.indptr[site + 1])
         others, lengths_um = shared_um.indices[row], shared_um.data[row]
-        is_free = ~is_taken[others]
-        if is_taken[site] or not is_free.any():
+        is_free = ~is_joined[others]
+        if is_joined[site] or not is_free.any():
             continue
         partner = int(others[is_free][lengths_um[is_free].argmax()])
-        is_taken[[site, partner]] = True
+        is_joined[[site, partner]] = True
         groups[max(site, partner)] = min(site, partner)
     return groups
 
@@ -274,7 +276,9 @@ def split(layout: Layout, *, n_x: int = 2, n_y: int = 1) -> Layout:
     frames = shapely.box(x[:, 0, ix], y[:, 0, iy], x[:, 0, ix + 1], y[:, 0, iy + 1])
     parts = shapely.intersection(layout.polygons()[:, np.newaxis], frames)
     parent, part = (index.ravel() for index in np.indices(parts.shape))
-    return _pieces(layout.with_columns(parent=np.arange(layout.n_sites)), parts.ravel(), parent, "split", part=part)
+    return _separate_parts(
+        layout.with_columns(parent=np.arange(layout.n_sites)), parts.ravel(), parent, "split", part=part
+    )
 
 
 def node(layout: Layout) -> Layout:
@@ -299,12 +303,12 @@ def node(layout: Layout) -> Layout:
     owner = np.concatenate((np.arange(begin.shape[0]), edge))
     order = np.lexsort((np.concatenate((np.zeros(begin.shape[0]), t)), owner))
     n_new = np.bincount(edge, minlength=begin.shape[0])
-    return Layout._derived(  # noqa: SLF001 -- of the same subpackage
+    return Layout._from_checked(  # noqa: SLF001 -- of the same subpackage
         np.concatenate((begin, points[point]))[order],
         np.concatenate(([0], np.cumsum(n_new + 1)))[layout.ring_offsets],
         layout.site_offsets,
         layout.columns,
-        layout._then("noded"),  # noqa: SLF001 -- of the same subpackage
+        layout._extend_provenance("noded"),  # noqa: SLF001 -- of the same subpackage
     )
 
 
@@ -340,19 +344,19 @@ def snap(layout: Layout, grid_um: float) -> Layout:
         snapped.ring_offsets,
         snapped.site_offsets,
         layout.columns,
-        layout._then(f"snapped to {grid_um:g} µm"),  # noqa: SLF001 -- of the same subpackage
+        layout._extend_provenance(f"snapped to {grid_um:g} µm"),  # noqa: SLF001 -- of the same subpackage
     )
 
 
 # -- parts ---------------------------------------------------------------------------------------------------------------
 
 
-def _joined(offsets: Sequence[Ints]) -> Ints:
+def _concatenate_offsets(offsets: Sequence[Ints]) -> Ints:
     steps = np.concatenate([np.diff(part) for part in offsets])
     return np.concatenate(([0], np.cumsum(steps)))
 
 
-def _joined_columns(name: str, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+def _concatenate_columns(name: str, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Concatenate parts of a column; signed and unsigned integers remain exact."""
     if {part.dtype.kind for part in parts} == {"i", "u"} and np.result_type(*parts).kind == "f":
         used = [part for part in parts if part.size]
@@ -363,33 +367,34 @@ def _joined_columns(name: str, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
     return np.concatenate(parts)
 
 
-def _kept(layout: Layout, region: Any, operation: Any, keeps_whole: Any, cut: str, step: str) -> Layout:
+def _clip_sites(layout: Layout, region: Any, operation: Any, predicate: Any, cut: str, step: str) -> Layout:
     check_choice("cut", cut, ("pieces", "drop"))
     shapely.prepare(region)
     polygons = layout.polygons()
-    is_whole = keeps_whole(region, polygons)
+    is_complete = predicate(region, polygons)
     if cut == "drop":
-        return layout[is_whole]
+        return layout[is_complete]
     pieces = polygons.copy()
-    pieces[~is_whole] = operation(polygons[~is_whole], region)
-    return _pieces(layout, pieces, np.arange(layout.n_sites), step)
+    pieces[~is_complete] = operation(polygons[~is_complete], region)
+    return _separate_parts(layout, pieces, np.arange(layout.n_sites), step)
 
 
-def _pieces(layout: Layout, shapes: NDArray[Any], parent: Ints, step: str, **columns: NDArray[Any]) -> Layout:
+def _separate_parts(layout: Layout, shapes: NDArray[Any], parent: Ints, step: str, **columns: NDArray[Any]) -> Layout:
     """Return the layout of all polygons of the shapes, each with the columns of its parent."""
     parts, shape = shapely.get_parts(shapes, return_index=True)
     is_real = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (
         shapely.area(parts) > SLIVER * layout.area_um2[parent[shape]]
     )
     own = {name: values[shape[is_real]] for name, values in columns.items()}
-    rebuilt = _rebuilt(layout, parts[is_real], parent[shape[is_real]], step)
-    return Layout._derived(  # noqa: SLF001
+    rebuilt = _rebuild(layout, parts[is_real], parent[shape[is_real]], step)
+    return Layout._from_checked(  # noqa: SLF001
         rebuilt.xy_um, rebuilt.ring_offsets, rebuilt.site_offsets, {**rebuilt.columns, **own}, rebuilt.provenance
     )
 
 
-def _rebuilt(layout: Layout, polygons: NDArray[Any], parent: Ints, step: str) -> Layout:
+def _rebuild(layout: Layout, polygons: NDArray[Any], parent: Ints, step: str) -> Layout:
     """Return the layout of these polygons, each with the columns of its parent site."""
     rings = Layout.from_polygons(polygons)
     columns = {name: values[parent] for name, values in layout.columns.items()}
-    return Layout._derived(rings.xy_um, rings.ring_offsets, rings.site_offsets, columns, layout._then(step))  # noqa: SLF001
+    provenance = layout._extend_provenance(step)  # noqa: SLF001
+    return Layout._from_checked(rings.xy_um, rings.ring_offsets, rings.site_offsets, columns, provenance)  # noqa: SLF001

@@ -64,7 +64,7 @@ def layout_family(
             given.apply_defaults()
             own = dict(layout.provenance)
             own.pop("made_by", None)
-            parameters = {key: _plain(value) for key, value in given.arguments.items()} | own.pop("parameters", {})
+            parameters = {key: _to_plain(value) for key, value in given.arguments.items()} | own.pop("parameters", {})
             return layout.with_provenance({"generator": name, "parameters": parameters, **own})
 
         family.example, family.picture = dict(example), picture  # type: ignore[attr-defined]
@@ -73,7 +73,7 @@ def layout_family(
     return decorate
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     """Convert a parameter to the plain data of a settings file."""
     if isinstance(value, shapely.Geometry):
         return shapely.to_wkt(value, rounding_precision=-1)

@@ -65,7 +65,7 @@ HOLE_REASONS = {
     "Holes are nested": "has a hole inside another hole",
 }
 #: Number of invalid sites that a message lists.
-SHOWN_SITES = 5
+MAX_LISTED = 5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -113,10 +113,10 @@ class Layout:
 
     def __post_init__(self) -> None:
         self._store()
-        _require_sound_holes(self)
+        _require_valid_holes(self)
 
     @classmethod
-    def _derived(cls, *fields: Any) -> Layout:
+    def _from_checked(cls, *fields: Any) -> Layout:
         """Build a layout without hole checks, from sites selected or mapped from a checked layout."""
         layout = object.__new__(cls)
         names = ("xy_um", "ring_offsets", "site_offsets", "columns", "provenance")
@@ -257,9 +257,9 @@ class Layout:
         (2, 4.0)
         """
         if isinstance(polygons, tuple) and len(polygons) == 3 and not isinstance(polygons[0], shapely.Geometry):
-            xy_um, ring_offsets, site_offsets = _packed(*polygons)
+            xy_um, ring_offsets, site_offsets = _check_packed(*polygons)
         else:
-            xy_um, ring_offsets, site_offsets = _decompressed(polygons)
+            xy_um, ring_offsets, site_offsets = _pack_polygons(polygons)
         _require(_per_site(~np.isfinite(xy_um), ring_offsets, site_offsets), "has a coordinate that is not finite")
         _require(
             _per_site(np.abs(xy_um) > MAX_LENGTH_UM, ring_offsets, site_offsets),
@@ -280,15 +280,15 @@ class Layout:
         rounding_um2 = ZERO_AREA_FRACTION * np.maximum(box_um2, np.finfo(np.float64).tiny)
         is_line = ring_spread_um2(xy_um, ring_offsets) <= rounding_um2
         _require(np.logical_or.reduceat(is_line, site_offsets[:-1]), "has a ring with zero area")
-        _require_valid(Layout._derived(xy_um, ring_offsets, site_offsets, {}, {}))
+        _require_valid(Layout._from_checked(xy_um, ring_offsets, site_offsets, {}, {}))
         area_um2, _ = ring_moments(xy_um, ring_offsets)
         is_outline = np.zeros(area_um2.size, bool)
         is_outline[site_offsets[:-1]] = True
-        xy_um = _wound(xy_um, ring_offsets, (area_um2 > 0) != is_outline)
+        xy_um = _reverse_rings(xy_um, ring_offsets, (area_um2 > 0) != is_outline)
         for name, values in (("channel", channel), ("readout_line", readout_line)):
             if values is not None:
                 columns = {name: values, **columns}
-        return cls._derived(
+        return cls._from_checked(
             xy_um,
             ring_offsets,
             site_offsets,
@@ -309,7 +309,7 @@ class Layout:
     def __reduce__(self) -> tuple[Any, ...]:
         # Read-only mappings cannot be pickled.
         fields = (self.xy_um, self.ring_offsets, self.site_offsets, dict(self.columns), dict(self.provenance))
-        return Layout._derived, fields
+        return Layout._from_checked, fields
 
     def __repr__(self) -> str:
         origin = self.provenance.get("generator", self.provenance.get("made_by", "packed rings"))
@@ -394,12 +394,12 @@ class Layout:
             raise ParameterError("selection", f"must be a mask, a slice or a list of sites, got {ids.ndim} dimensions")
         rings = _ranges(self.site_offsets[ids], self.site_offsets[ids + 1])
         vertices = _ranges(self.ring_offsets[rings], self.ring_offsets[rings + 1])
-        return Layout._derived(
+        return Layout._from_checked(
             self.xy_um[vertices],
             np.concatenate(([0], np.cumsum(np.diff(self.ring_offsets)[rings]))),
             np.concatenate(([0], np.cumsum(np.diff(self.site_offsets)[ids]))),
             {name: column[ids] for name, column in self.columns.items()},
-            self._then(f"selected {ids.size} of {self.n_sites} sites"),
+            self._extend_provenance(f"selected {ids.size} of {self.n_sites} sites"),
         )
 
     def sort_by(self, *keys: str | ArrayLike, descending: bool = False) -> Layout:
@@ -444,8 +444,12 @@ class Layout:
             raise ParameterError("keys", "must be one or more columns or arrays")
         names = ", ".join(key if isinstance(key, str) else "values" for key in keys)
         ordered = self[np.lexsort(values[::-1])]
-        return Layout._derived(
-            ordered.xy_um, ordered.ring_offsets, ordered.site_offsets, ordered.columns, self._then(f"sorted by {names}")
+        return Layout._from_checked(
+            ordered.xy_um,
+            ordered.ring_offsets,
+            ordered.site_offsets,
+            ordered.columns,
+            self._extend_provenance(f"sorted by {names}"),
         )
 
     def with_columns(self, **columns: ArrayLike) -> Layout:
@@ -454,12 +458,14 @@ class Layout:
 
     def _with_columns(self, columns: Mapping[str, ArrayLike], step: str) -> Layout:
         merged = {**self.columns, **{name: _column(name, values) for name, values in columns.items()}}
-        return Layout._derived(self.xy_um, self.ring_offsets, self.site_offsets, merged, self._then(step))
+        return Layout._from_checked(
+            self.xy_um, self.ring_offsets, self.site_offsets, merged, self._extend_provenance(step)
+        )
 
     def translate(self, dx_um: float, dy_um: float) -> Layout:
         """Translate the layout by (dx, dy) in µm."""
         step = np.array([check_number("dx_um", dx_um), check_number("dy_um", dy_um)])
-        return self._moved(self.xy_um + step, f"translated by ({dx_um:g}, {dy_um:g}) µm")
+        return self._with_vertices(self.xy_um + step, f"translated by ({dx_um:g}, {dy_um:g}) µm")
 
     def rotate(self, angle_deg: float, origin_um: tuple[float, float] = (0.0, 0.0)) -> Layout:
         """Rotate counter-clockwise about a point; multiples of 90° about the origin are exact."""
@@ -469,19 +475,21 @@ class Layout:
         c, s = exact if rest == 0.0 else (np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg)))
         centre = _point("origin_um", origin_um)
         # (A @ xy) row by row: x' = c x - s y, y' = s x + c y
-        turned = (self.xy_um - centre) @ np.array([[c, s], [-s, c]]) + centre
-        return self._moved(turned, f"rotated by {angle_deg:g} degrees")
+        rotated = (self.xy_um - centre) @ np.array([[c, s], [-s, c]]) + centre
+        return self._with_vertices(rotated, f"rotated by {angle_deg:g} degrees")
 
     def scale(self, factor: float, origin_um: tuple[float, float] = (0.0, 0.0)) -> Layout:
         """Scale the layout about a point."""
         factor = check_number("factor", factor, above=0.0)
         centre = _point("origin_um", origin_um)
-        return self._moved((self.xy_um - centre) * factor + centre, f"scaled by {factor:g}")
+        return self._with_vertices((self.xy_um - centre) * factor + centre, f"scaled by {factor:g}")
 
-    def _moved(self, xy_um: Floats, step: str) -> Layout:
-        return Layout._derived(xy_um, self.ring_offsets, self.site_offsets, self.columns, self._then(step))
+    def _with_vertices(self, xy_um: Floats, step: str) -> Layout:
+        return Layout._from_checked(
+            xy_um, self.ring_offsets, self.site_offsets, self.columns, self._extend_provenance(step)
+        )
 
-    def _then(self, step: str) -> dict[str, Any]:
+    def _extend_provenance(self, step: str) -> dict[str, Any]:
         return {**self.provenance, "steps": [*self.provenance.get("steps", []), step]}
 
     def write(self, path: str | Path, **options: Any) -> WrittenLayout:
@@ -536,18 +544,18 @@ class Layout:
 # -- validation of input polygons --------------------------------------------------------------------------------
 
 
-def _offsets(name: str, offsets: ArrayLike, at_least: int, total: int, of_what: str) -> Ints:
+def _offsets(name: str, offsets: ArrayLike, at_least: int, total: int, item_name: str) -> Ints:
     """Return offsets as int64 after checks of their range and smallest step."""
     array = np.array(unmasked(name, offsets))
     if array.ndim != 1 or array.size < 1 or array.dtype.kind not in "iu":
         raise ParameterError(name, "must be a list of integers", offsets)
     array = array.astype(np.int64)
     if array[0] != 0 or array[-1] != total:
-        raise ParameterError(name, f"must begin at 0 and end at {total}, the number of {of_what}", array)
+        raise ParameterError(name, f"must begin at 0 and end at {total}, the number of {item_name}", array)
     small = np.flatnonzero(np.diff(array) < at_least)
     if small.size:
         raise ParameterError(
-            name, f"must assign at least {at_least} {of_what} to each item, but item {small[0]} has fewer", array
+            name, f"must assign at least {at_least} {item_name} to each item, but item {small[0]} has fewer", array
         )
     return array
 
@@ -587,7 +595,7 @@ def _point(name: str, value: ArrayLike) -> Floats:
     return point
 
 
-def _packed(xy_um: ArrayLike, ring_offsets: ArrayLike, site_offsets: ArrayLike) -> tuple[Floats, Ints, Ints]:
+def _check_packed(xy_um: ArrayLike, ring_offsets: ArrayLike, site_offsets: ArrayLike) -> tuple[Floats, Ints, Ints]:
     xy = as_numbers("xy_um", xy_um)
     if xy.ndim != 2 or xy.shape[1] != 2:
         raise ParameterError("xy_um", f"must have the shape (n_vertex, 2), got {xy.shape}")
@@ -595,7 +603,7 @@ def _packed(xy_um: ArrayLike, ring_offsets: ArrayLike, site_offsets: ArrayLike) 
     return xy, rings, _offsets("site_offsets", site_offsets, 1, rings.size - 1, "rings")
 
 
-def _decompressed(polygons: Any) -> tuple[Floats, Ints, Ints]:
+def _pack_polygons(polygons: Any) -> tuple[Floats, Ints, Ints]:
     """Return packed rings of shapely polygons, closing vertices included."""
     items = polygons.geoms if hasattr(polygons, "geoms") else polygons
     if isinstance(items, str | bytes | shapely.Geometry) or not isinstance(items, Iterable):
@@ -631,12 +639,12 @@ def _require(is_bad_site: Bools, what: str) -> None:
     bad = np.flatnonzero(is_bad_site)
     if bad.size:
         others = (
-            f" (and {bad.size - 1} more: {', '.join(map(str, bad[1:SHOWN_SITES]))}{', ...' * (bad.size > SHOWN_SITES)})"
+            f" (and {bad.size - 1} more: {', '.join(map(str, bad[1:MAX_LISTED]))}{', ...' * (bad.size > MAX_LISTED)})"
         )
         raise GeometryError(f"site {bad[0]} {what}{others if bad.size > 1 else ''}", tuple(int(i) for i in bad))
 
 
-def _require_sound_holes(layout: Layout) -> None:
+def _require_valid_holes(layout: Layout) -> None:
     """Check that sites with holes are valid, and that their holes are wound clockwise."""
     if layout.ring_offsets.size == layout.site_offsets.size:
         return
@@ -686,13 +694,13 @@ def _without_repeats(xy_um: Floats, ring_offsets: Ints) -> tuple[Floats, Ints]:
     return xy_um[is_new], np.concatenate(([0], np.cumsum(n_left)))
 
 
-def _wound(xy_um: Floats, ring_offsets: Ints, is_reversed: Bools) -> Floats:
+def _reverse_rings(xy_um: Floats, ring_offsets: Ints, is_reversed: Bools) -> Floats:
     """Reverse some rings, without change of their first vertices."""
     n_vertices = np.diff(ring_offsets)
     ring_of = np.repeat(np.arange(n_vertices.size), n_vertices)
     position = positions_in_runs(n_vertices)
-    turned = np.where(is_reversed[ring_of], -position % n_vertices[ring_of], position)
-    return xy_um[ring_offsets[:-1][ring_of] + turned]
+    index = np.where(is_reversed[ring_of], -position % n_vertices[ring_of], position)
+    return xy_um[ring_offsets[:-1][ring_of] + index]
 
 
 def _ranges(starts: Ints, stops: Ints) -> Ints:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from foveasim.layout.model import Layout
 
-__all__ = ["is_of_layout", "layout_from_arrays", "layout_to_arrays"]
+__all__ = ["is_layout_array", "layout_from_arrays", "layout_to_arrays"]
 
 OUTLINES = ("xy_um", "ring_offsets", "site_offsets")
 #: Prefix of the array name of a column.
@@ -46,6 +46,6 @@ def layout_from_arrays(arrays: Mapping[str, NDArray[Any]], provenance: Mapping[s
     return Layout(xy_um, ring_offsets, site_offsets, columns, provenance)
 
 
-def is_of_layout(name: str) -> bool:
+def is_layout_array(name: str) -> bool:
     """Return whether an array of this name belongs to a layout."""
     return name in OUTLINES or name.startswith(COLUMN_PREFIX)

@@ -69,7 +69,7 @@ class Summary:
     def rows(self) -> list[tuple[str, str]]:
         """Return names and values as strings, in the order of the table."""
         x0, y0, x1, y1 = self.bounds_um
-        low, lower, middle, upper, high = self.size_um
+        low, lower, median, upper, high = self.size_um
         rows = [
             ("origin", self.origin),
             ("photosites", f"{self.n_sites:,}"),
@@ -77,7 +77,7 @@ class Summary:
             ("field", f"{x1 - x0:.6g} x {y1 - y0:.6g} µm, from ({x0:.6g}, {y0:.6g}) to ({x1:.6g}, {y1:.6g})"),
             ("area", f"{self.area_um2:,.6g} µm²"),
             ("fill factor", f"{100.0 * self.fill_factor:.4g} % of the convex hull"),
-            ("pixel size", f"{low:.4g} to {high:.4g} µm, median {middle:.4g}, quartiles {lower:.4g} and {upper:.4g}"),
+            ("pixel size", f"{low:.4g} to {high:.4g} µm, median {median:.4g}, quartiles {lower:.4g} and {upper:.4g}"),
             ("channels", ", ".join(f"{channel}: {n:,}" for channel, n in self.channels.items())),
             ("readout lines", f"{self.n_lines:,}"),
         ]
@@ -114,9 +114,9 @@ class Summary:
         for heading in ("from µm", "to µm", "sites"):
             sizes.add_column(heading, justify="right")
         sizes.add_column("")
-        most = max((int(n) for n in self.size_counts), default=0)
+        max_count = max((int(n) for n in self.size_counts), default=0)
         for row in self.records():
-            bar = "█" * max(int(row["n_sites"] > 0), round(BAR_WIDTH * row["n_sites"] / max(most, 1)))
+            bar = "█" * max(int(row["n_sites"] > 0), round(BAR_WIDTH * row["n_sites"] / max(max_count, 1)))
             sizes.add_row(f"{row['from_um']:.4g}", f"{row['to_um']:.4g}", f"{row['n_sites']:,}", bar)
         return Group(facts, sizes)
 
@@ -148,7 +148,7 @@ def describe(layout: Layout, readout: Readout | None = None) -> Summary:
     bounds_um = layout.bounds_um
     hull_um2 = float(shapely.MultiPoint(layout.xy_um).convex_hull.area)
     size_um = np.sqrt(layout.area_um2)
-    edges_um = _classes_um(float(size_um.min()), float(size_um.max()))
+    edges_um = _size_edges_um(float(size_um.min()), float(size_um.max()))
     channel, counts = np.unique(layout.channel, return_counts=True)
     return Summary(
         n_sites=layout.n_sites,
@@ -166,7 +166,7 @@ def describe(layout: Layout, readout: Readout | None = None) -> Summary:
     )
 
 
-def _classes_um(low_um: float, high_um: float) -> Floats:
+def _size_edges_um(low_um: float, high_um: float) -> Floats:
     """Return class limits of equal ratios that contain all sizes; one class for equal sizes."""
     if high_um <= low_um * (1.0 + SIZE_ROUNDING):
         return np.array([low_um * (1.0 - SIZE_ROUNDING), high_um * (1.0 + SIZE_ROUNDING)])

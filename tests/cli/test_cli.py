@@ -17,7 +17,7 @@ from PIL import Image
 
 import foveasim as fs
 from foveasim._io.images import read_picture
-from foveasim.config import shipped_layouts
+from foveasim.config import bundled_layouts
 from foveasim.view import find_renderer
 
 SHOT = """
@@ -243,7 +243,7 @@ def test_layouts_lists_bundled_layouts(tmp_path):
     result = foveasim("layouts", cwd=tmp_path)
 
     assert result.returncode == 0, result.stderr
-    assert all(name in result.stdout for name in shipped_layouts())
+    assert all(name in result.stdout for name in bundled_layouts())
     assert "243,712" in result.stdout
 
 

@@ -11,7 +11,7 @@ import yaml
 
 import foveasim as fs
 from foveasim._io.images import read_picture, write_picture
-from foveasim.config import demo_settings, read_any_layout, read_layout_file, read_shot, schema, shipped_layouts
+from foveasim.config import bundled_layouts, demo_settings, read_any_layout, read_layout_file, read_shot, schema
 from foveasim.errors import ConfigError, FileError
 from foveasim.view import plot_layout, save_figure
 
@@ -341,7 +341,7 @@ SHIPPED = {
 
 
 def test_all_bundled_layouts_are_listed():
-    assert list(shipped_layouts()) == sorted(SHIPPED)
+    assert list(bundled_layouts()) == sorted(SHIPPED)
 
 
 @pytest.mark.parametrize("name", SHIPPED)

@@ -11,7 +11,7 @@ import pytest
 import foveasim as fs
 from foveasim.config import read_any_layout, read_shot
 from foveasim.errors import FileError, ParameterError
-from foveasim.layout import shipped_layouts
+from foveasim.layout import bundled_layouts
 
 SHOT = """
 scene: {kind: flat, shape: [40, 40], pitch_um: 100, distance_m: 1.0, radiance_w_m2_sr_nm: 0.1, band_width_nm: 10}
@@ -44,7 +44,7 @@ def test_read_layout_finds_bundled_layouts_by_name(name, tmp_path, monkeypatch):
     layout = fs.read_layout(name)
 
     assert isinstance(layout, fs.Layout)
-    assert np.array_equal(layout.xy_um, read_any_layout(shipped_layouts()[name]).layout.xy_um)
+    assert np.array_equal(layout.xy_um, read_any_layout(bundled_layouts()[name]).layout.xy_um)
 
 
 def test_read_layout_reads_files_of_any_format(tmp_path, two_sites):

@@ -141,7 +141,7 @@ def test_all_lines_cross_first_ring():
     first_um = np.hypot(*layout.xy_um[: layout.ring_offsets[1]].T).max()
 
     assert found.n_nets.tolist() == [120]
-    assert found.place_um == pytest.approx(first_um)
+    assert found.position_um == pytest.approx(first_um)
     assert found.n_tracks.tolist() == [math.floor(2 * math.pi * first_um / 0.28)]
     assert sorted(found.first_sites.tolist()) == list(range(120))
 
@@ -164,16 +164,16 @@ def test_track_demand_agrees_with_counting(n_sectors, fovea, pitch_um, n_layers)
         ends[line] = min(ends.get(line, math.inf), end_um)
 
     assert found.n_nets[-1] == len(ends)
-    for place_um, n_nets, n_tracks in zip(found.place_um, found.n_nets, found.n_tracks, strict=True):
-        assert n_nets == sum(end_um <= place_um + 1e-5 for end_um in ends.values())
-        assert n_tracks == n_layers * int(2 * math.pi * place_um / pitch_um + 1e-9)
+    for position_um, n_nets, n_tracks in zip(found.position_um, found.n_nets, found.n_tracks, strict=True):
+        assert n_nets == sum(end_um <= position_um + 1e-5 for end_um in ends.values())
+        assert n_tracks == n_layers * int(2 * math.pi * position_um / pitch_um + 1e-9)
 
 
 def test_upward_columns_cross_layout_width():
     layout = grid(n_x=50, n_y=4, pitch_um=1.0)
     found = track_demand(layout, Routing(width_um=0.25, space_um=0.25, n_layers=2, direction="upwards"))
 
-    assert (found.place_um.tolist(), found.n_nets.tolist(), found.n_tracks.tolist()) == ([-1.0], [50], [200])
+    assert (found.position_um.tolist(), found.n_nets.tolist(), found.n_tracks.tolist()) == ([-1.0], [50], [200])
 
 
 def test_routing_requires_readout_lines():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import shapely
 import skimage.data
-from reference.neighbours import stolen_shares
+from reference.neighbours import sibson_weights
 from skimage.color import rgb2gray
 from skimage.transform import resize
 
@@ -166,7 +166,7 @@ def test_natural_neighbours_match_voronoi_reference():
     for _ in range(12):
         point = rng.uniform(-0.55, 0.55, 2) * np.abs(xy).max()
         picture = natural(layout, values, grid_through(point))
-        assert picture.data[0, 0, 0] == pytest.approx(stolen_shares(xy, point) @ values, rel=1e-6)
+        assert picture.data[0, 0, 0] == pytest.approx(sibson_weights(xy, point) @ values, rel=1e-6)
 
 
 def test_natural_neighbours_symmetric_on_square_grid():

@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 
 
-def track_demand(rings, y):
+def row_crossings(rings, y):
     """Return the crossings of a row with edges, which include their lower and exclude their upper end, as fractions."""
     found = []
     for ring in rings:
@@ -27,7 +27,7 @@ def id_map(sites, x_um, y_um):
     ids = np.full((len(y_um), len(x_um)), -1)
     for site, rings in enumerate(sites):
         for iy, y in enumerate(y_um):
-            beyond = track_demand(rings, Fraction(float(y)))
+            beyond = row_crossings(rings, Fraction(float(y)))
             for ix, x in enumerate(x_um):
                 if sum(crossing <= x for crossing in beyond) % 2:
                     ids[iy, ix] = site

@@ -23,8 +23,8 @@ def cell_of(point, others, side=1e3):
     return cell
 
 
-def stolen_shares(xy, point):
+def sibson_weights(xy, point):
     """Return the fractions of the Voronoi cell of a new point that belonged to each site, (n_site,)."""
     new = cell_of(point, xy)
-    stolen = np.array([cell_of(site, np.delete(xy, k, axis=0)).intersection(new).area for k, site in enumerate(xy)])
-    return stolen / new.area
+    taken = np.array([cell_of(site, np.delete(xy, k, axis=0)).intersection(new).area for k, site in enumerate(xy)])
+    return taken / new.area

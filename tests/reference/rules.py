@@ -252,7 +252,7 @@ def counts(layout, _rules):
 
 
 #: Reference implementation of every rule.
-TWINS = {
+REFERENCES = {
     "min_size_um": sizes,
     "max_size_um": sizes,
     "min_area_um2": areas,
@@ -383,13 +383,13 @@ def _moved(rng, polygons):
         k = int(rng.integers(len(polygons)))
         vertex = rng.choice(shapely.get_coordinates(polygons[k]))
         move = rng.uniform(-0.3, 0.3, 2) * math.sqrt(polygons[k].area)
-        is_alone = bool(rng.integers(2))
+        is_single = bool(rng.integers(2))
 
         def change(xy, vertex=vertex, move=move):
             return np.where((xy == vertex).all(axis=1, keepdims=True), xy + move, xy)
 
         moved = [
-            shapely.transform(polygon, change) if i == k or not is_alone else polygon
+            shapely.transform(polygon, change) if i == k or not is_single else polygon
             for i, polygon in enumerate(polygons)
         ]
         if all(polygon.is_valid for polygon in moved):

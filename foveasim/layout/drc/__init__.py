@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from foveasim._core.registry import import_all
-from foveasim.layout.drc.measurements import RULES, Case, Measured, Rule
+from foveasim.layout.drc.measurements import RULES, Case, Measurement, Rule
 from foveasim.layout.drc.presets import PRESETS, Preset
 from foveasim.layout.drc.repair import Change, enforce
 from foveasim.layout.drc.routing import Readout, Routing, track_demand
@@ -15,7 +15,7 @@ __all__ = [
     "Case",
     "Change",
     "DesignRules",
-    "Measured",
+    "Measurement",
     "Preset",
     "Readout",
     "Report",

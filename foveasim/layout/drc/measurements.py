@@ -16,7 +16,7 @@ from foveasim._core.registry import Registry
 from foveasim._core.rings import next_vertex, positions_in_runs, ring_moments
 from foveasim._core.threads import each, thread_count
 from foveasim._core.validation import Bools, Floats, Ints
-from foveasim.layout._noding import noded_edges
+from foveasim.layout._noding import node_edges
 from foveasim.layout.adjacency import TOUCHING_UM
 from foveasim.layout.drc.routing import track_demand
 from foveasim.layout.model import Layout
@@ -24,14 +24,14 @@ from foveasim.layout.model import Layout
 if TYPE_CHECKING:
     from foveasim.layout.drc.rules import DesignRules
 
-__all__ = ["RULES", "Case", "Measured", "Rule", "is_below_size", "min_width_um"]
+__all__ = ["RULES", "Case", "Measurement", "Rule", "is_below_size", "min_width_um"]
 
 #: Tolerance of length comparisons: a thousandth of the finest manufacturing grid (1 nm).
 LENGTH_ROUNDING_UM = 1e-6
 #: Overlaps and gaps below this fraction of a site's area are due to the rounding of its vertices.
 AREA_ROUNDING = 1e-9
-#: A selection of fewer than one site in FEW is converted to polygons separately, without converting all sites.
-FEW = 10
+#: A selection of fewer than one site in SMALL_SELECTION_RATIO is converted to polygons separately, without all other sites.
+SMALL_SELECTION_RATIO = 10
 #: Pairs per task of a thread.
 PAIRS_PER_TASK = 100_000
 
@@ -47,7 +47,7 @@ class Contacts:
         Indices of the sites, first < second.
     distance_um : (n_pair,) float64, µm
         0 for overlapping sites, infinite beyond the requested distance.
-    is_apart : (n_pair,) bool
+    is_non_overlapping : (n_pair,) bool
         Whether the two certainly do not overlap, apart from rounding.
     is_shared : (n_vertex,) bool
         Whether the edge that begins at a vertex is also, bit for bit, an edge of another site.
@@ -56,10 +56,10 @@ class Contacts:
     first: Ints
     second: Ints
     distance_um: Floats
-    is_apart: Bools
+    is_non_overlapping: Bools
     is_shared: Bools
 
-    def of(self, pairs: Any) -> Ints:
+    def sites_of(self, pairs: Any) -> Ints:
         """Return the sites of the given pairs, (n, 2)."""
         return np.stack((self.first[pairs], self.second[pairs]), axis=1)
 
@@ -78,7 +78,11 @@ class Case:
 
     def shapes(self, sites: Ints) -> NDArray[Any]:
         """Return the given sites as shapely polygons."""
-        return self.layout[sites].polygons() if FEW * sites.size < self.layout.n_sites else self.polygons[sites]
+        return (
+            self.layout[sites].polygons()
+            if SMALL_SELECTION_RATIO * sites.size < self.layout.n_sites
+            else self.polygons[sites]
+        )
 
     def sites_near(self, box_um: Floats, reach_um: float = 0.0) -> tuple[Ints, Ints]:
         """
@@ -100,8 +104,8 @@ class Case:
         geometry, site = self.sites_near(shapely.bounds(geometries), reach_um)
         geometry, site = geometry[among[site]], site[among[site]]
         shapely.prepare(geometries)
-        is_met = shapely.dwithin(geometries[geometry], self.shapes(site), reach_um)
-        return geometry[is_met], site[is_met]
+        is_near = shapely.dwithin(geometries[geometry], self.shapes(site), reach_um)
+        return geometry[is_near], site[is_near]
 
     @cached_property
     def after(self) -> Ints:
@@ -126,15 +130,15 @@ class Case:
         overhang_um = _kernels.overhangs(layout.xy_um, self.after, self.first_vertex)
         is_shared = np.zeros(layout.xy_um.shape[0], bool)
 
-        def meet(piece: slice) -> tuple[Floats, Bools]:
+        def find_contacts(piece: slice) -> tuple[Floats, Bools]:
             return _kernels.contacts(
                 layout.xy_um, self.after, self.first_vertex, box, overhang_um, depth_um, first[piece], second[piece],
                 reach_um, LENGTH_ROUNDING_UM, is_shared,
             )  # fmt: skip
 
-        found = each(meet, _pieces(first.size), thread_count())
-        distance_um, is_apart = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        return Contacts(first, second, distance_um, is_apart, is_shared)
+        found = each(find_contacts, _task_slices(first.size), thread_count())
+        distance_um, is_non_overlapping = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return Contacts(first, second, distance_um, is_non_overlapping, is_shared)
 
     @cached_property
     def windows(self) -> tuple[Floats, Floats, Floats]:
@@ -151,8 +155,8 @@ class Case:
         starts, lines = [], []
         for i in (0, 1):
             # The last window of a row ends at the boundary of the die.
-            room_um = field[i + 2] - field[i] - sides_um[i]
-            n = math.ceil(room_um / (0.5 * sides_um[i]) - LENGTH_ROUNDING_UM) + 1
+            free_um = field[i + 2] - field[i] - sides_um[i]
+            n = math.ceil(free_um / (0.5 * sides_um[i]) - LENGTH_ROUNDING_UM) + 1
             starts.append(np.minimum(field[i] + 0.5 * sides_um[i] * np.arange(n), field[i + 2] - sides_um[i]))
             lines.append(np.unique(np.concatenate((starts[i], starts[i] + sides_um[i]))))
         total_um2 = np.zeros((lines[1].size, lines[0].size))
@@ -165,7 +169,7 @@ class Case:
         return low, low + sides_um, np.maximum(filled_um2, 0.0)
 
 
-def _pieces(n: int) -> list[slice]:
+def _task_slices(n: int) -> list[slice]:
     """Return slices of pairs for several threads."""
     return [slice(start, start + PAIRS_PER_TASK) for start in range(0, max(n, 1), PAIRS_PER_TASK)]
 
@@ -181,7 +185,7 @@ def _near_pairs(box_um: Floats, reach_um: float) -> tuple[Ints, Ints]:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class Measurement:
     """
     Measured values, with functions that return their sites and markers.
 
@@ -206,25 +210,25 @@ class Rule:
     unit : str
         Unit of values and limit.
     measure : callable
-        Function from a :class:`Case` to one value per site, (n_site,), or to :class:`Measured`.
+        Function from a :class:`Case` to one value per site, (n_site,), or to :class:`Measurement`.
     is_upper : bool
         Whether values above the limit are violations; otherwise values below it.
     is_deviation : bool
         Whether values are deviations, compared with 0; the limit is then a step or a field.
     rounding : float
         Values beyond the limit by no more than this satisfy the rule.
-    mended_by : {"drop", "merge", None}
+    repair : {"drop", "merge", None}
         Repair of a violation: ``"drop"`` drops its site, or the smaller site of a pair; ``"merge"`` merges the site with a
         neighbour, or drops it; None where neither helps.
     """
 
     description: str
     unit: str
-    measure: Callable[[Case], Measured | Floats]
+    measure: Callable[[Case], Measurement | Floats]
     is_upper: bool = False
     is_deviation: bool = False
     rounding: float = LENGTH_ROUNDING_UM
-    mended_by: Literal["drop", "merge"] | None = "drop"
+    repair: Literal["drop", "merge"] | None = "drop"
 
     def excess(self, values: Floats, limit: float) -> Floats:
         """
@@ -235,21 +239,21 @@ class Rule:
         return values - limit if self.is_upper else limit - values
 
 
-def _sizes(case: Case) -> Measured:
-    return Measured(np.sqrt(case.layout.area_um2))
+def _sizes(case: Case) -> Measurement:
+    return Measurement(np.sqrt(case.layout.area_um2))
 
 
-def _areas(case: Case) -> Measured:
-    return Measured(case.layout.area_um2)
+def _areas(case: Case) -> Measurement:
+    return Measurement(case.layout.area_um2)
 
 
-def _widths(case: Case) -> Measured:
-    return Measured(min_width_um(case.layout))
+def _widths(case: Case) -> Measurement:
+    return Measurement(min_width_um(case.layout))
 
 
-def _holes(case: Case) -> Measured:
+def _holes(case: Case) -> Measurement:
     if case.layout.ring_offsets.size == case.layout.site_offsets.size:
-        return Measured(np.zeros(0))
+        return Measurement(np.zeros(0))
     area_um2, _moments = ring_moments(case.layout.xy_um, case.layout.ring_offsets)
     holes = np.flatnonzero(area_um2 < 0.0)
     site = np.searchsorted(case.layout.site_offsets, holes, side="right") - 1
@@ -258,49 +262,49 @@ def _holes(case: Case) -> Measured:
         starts, stops = case.layout.ring_offsets[holes[positions]], case.layout.ring_offsets[holes[positions] + 1]
         return [shapely.Polygon(case.layout.xy_um[a:b]) for a, b in zip(starts, stops, strict=True)]
 
-    return Measured(-area_um2[holes], site[:, np.newaxis].__getitem__, markers)
+    return Measurement(-area_um2[holes], site[:, np.newaxis].__getitem__, markers)
 
 
-def _spaces(case: Case) -> Measured:
+def _spaces(case: Case) -> Measurement:
     found = case.contacts
     # Abutting sites share their boundary; with a manufacturing grid, to within one grid step.
-    is_apart = found.distance_um > max(LENGTH_ROUNDING_UM, case.rules.grid_um or 0.0)
-    near = np.flatnonzero(is_apart & (found.distance_um <= float(case.rules.min_space_um or 0.0)))
-    return Measured(
+    is_spaced = found.distance_um > max(LENGTH_ROUNDING_UM, case.rules.grid_um or 0.0)
+    near = np.flatnonzero(is_spaced & (found.distance_um <= float(case.rules.min_space_um or 0.0)))
+    return Measurement(
         found.distance_um[near],
-        lambda k: found.of(near[k]),
+        lambda k: found.sites_of(near[k]),
         lambda k: shapely.shortest_line(case.shapes(found.first[near[k]]), case.shapes(found.second[near[k]])),
     )
 
 
-def _aspect_ratios(case: Case) -> Measured:
+def _aspect_ratios(case: Case) -> Measurement:
     from foveasim.layout import _kernels
 
     layout = case.layout
-    return Measured(_kernels.aspect_ratios(layout.xy_um, layout.ring_offsets, layout.site_offsets))
+    return Measurement(_kernels.aspect_ratios(layout.xy_um, layout.ring_offsets, layout.site_offsets))
 
 
-def _corner_angles(case: Case) -> Measured:
+def _corner_angles(case: Case) -> Measurement:
     out = case.layout.xy_um[case.after] - case.layout.xy_um
     into = np.empty_like(out)
     into[case.after] = out
     turn_rad = np.arctan2(into[:, 0] * out[:, 1] - into[:, 1] * out[:, 0], np.einsum("ij,ij->i", into, out))
-    return Measured(_per_site(np.minimum, 180.0 - np.degrees(turn_rad), case.layout))
+    return Measurement(_per_site(np.minimum, 180.0 - np.degrees(turn_rad), case.layout))
 
 
-def _edge_angles(case: Case) -> Measured:
+def _edge_angles(case: Case) -> Measurement:
     step_deg = float(case.rules.edge_angle_step_deg or 90.0)
     along = case.layout.xy_um[case.after] - case.layout.xy_um
     # Edges are undirected: 180 degrees are equivalent to 0.
     angle_deg = np.degrees(np.arctan2(along[:, 1], along[:, 0])) % 180.0
     off_deg = np.minimum(np.abs(angle_deg - step_deg * np.round(angle_deg / step_deg)), 180.0 - angle_deg)
-    return Measured(_per_site(np.maximum, off_deg, case.layout))
+    return Measurement(_per_site(np.maximum, off_deg, case.layout))
 
 
-def _grid_deviations(case: Case) -> Measured:
+def _grid_deviations(case: Case) -> Measurement:
     step_um = float(case.rules.grid_um or 1.0)
     off_um = np.abs(case.layout.xy_um - step_um * np.round(case.layout.xy_um / step_um)).max(axis=1)
-    return Measured(_per_site(np.maximum, off_um, case.layout))
+    return Measurement(_per_site(np.maximum, off_um, case.layout))
 
 
 def _per_site(reduction: np.ufunc, per_vertex: Floats, layout: Layout) -> Floats:
@@ -310,16 +314,16 @@ def _per_site(reduction: np.ufunc, per_vertex: Floats, layout: Layout) -> Floats
     return np.asarray(reduction.reduceat(per_vertex, layout.ring_offsets[layout.site_offsets[:-1]]))
 
 
-def _overlaps(case: Case) -> Measured:
+def _overlaps(case: Case) -> Measurement:
     found, area_um2 = case.contacts, case.layout.area_um2
-    pairs = found.of(~found.is_apart)
+    pairs = found.sites_of(~found.is_non_overlapping)
     common = shapely.intersection(case.shapes(pairs[:, 0]), case.shapes(pairs[:, 1]))
     common_um2 = shapely.area(common)
     is_real = common_um2 > AREA_ROUNDING * area_um2[pairs].min(axis=1, initial=np.inf)
-    return Measured(common_um2[is_real], pairs[is_real].__getitem__, common[is_real].take)
+    return Measurement(common_um2[is_real], pairs[is_real].__getitem__, common[is_real].take)
 
 
-def _gaps(case: Case) -> Measured:
+def _gaps(case: Case) -> Measurement:
     """
     Measure the areas that no site covers, within the die or enclosed by sites.
 
@@ -328,38 +332,38 @@ def _gaps(case: Case) -> Measured:
     """
     layout = case.layout
     area_um2 = layout.area_um2
-    least_um2 = AREA_ROUNDING * float(area_um2.min()) if layout.n_sites else 0.0
-    if _open_um2(case) <= max(least_um2, float(case.rules.max_gap_um2 or 0.0)):
-        return Measured(np.zeros(0))
-    is_alone = _is_alone(case)
-    border = np.flatnonzero(~case.contacts.is_shared & ~np.repeat(is_alone, np.diff(case.first_vertex)))
-    border_um = np.stack((layout.xy_um[border], layout.xy_um[case.after[border]]), axis=1)
+    min_um2 = AREA_ROUNDING * float(area_um2.min()) if layout.n_sites else 0.0
+    if _gap_area_bound_um2(case) <= max(min_um2, float(case.rules.max_gap_um2 or 0.0)):
+        return Measurement(np.zeros(0))
+    is_isolated = _is_isolated(case)
+    boundary = np.flatnonzero(~case.contacts.is_shared & ~np.repeat(is_isolated, np.diff(case.first_vertex)))
+    boundary_um = np.stack((layout.xy_um[boundary], layout.xy_um[case.after[boundary]]), axis=1)
     # A corner on a rotated edge misses it by rounding; without noding, the faces on both sides would merge.
-    lines = shapely.linestrings(np.stack(noded_edges(border_um[:, 0], border_um[:, 1]), axis=1))
+    lines = shapely.linestrings(np.stack(node_edges(boundary_um[:, 0], boundary_um[:, 1]), axis=1))
     if case.rules.die_um is not None:
         lines = np.append(lines, shapely.box(*case.rules.die_um).exterior)
     faces = shapely.get_parts(shapely.polygonize([shapely.union_all(lines)]))
-    faces = _open_faces(faces[shapely.area(faces) > least_um2], is_alone, case)
+    faces = _uncovered_faces(faces[shapely.area(faces) > min_um2], is_isolated, case)
 
-    face, site = _contents(faces, is_alone, case)
+    face, site = _isolated_sites_within(faces, is_isolated, case)
     open_um2 = shapely.area(faces) - np.bincount(face, area_um2[site], faces.size)
-    gaps = np.flatnonzero(open_um2 > least_um2)
+    gaps = np.flatnonzero(open_um2 > min_um2)
 
     def sites(positions: Ints) -> list[Ints]:
-        is_rim = is_alone.copy()
-        rim_um = np.concatenate((border_um.min(axis=1), border_um.max(axis=1)), axis=1)
+        is_rim = is_isolated.copy()
+        rim_um = np.concatenate((boundary_um.min(axis=1), boundary_um.max(axis=1)), axis=1)
         is_rim[case.sites_near(rim_um, LENGTH_ROUNDING_UM)[1]] = True
         gap, around = case.sites_at(faces[gaps[positions]], is_rim, LENGTH_ROUNDING_UM)
-        return _grouped(gap, around, positions.size)
+        return _group_by_key(gap, around, positions.size)
 
     def markers(positions: Ints) -> list[Any]:
-        contents = _grouped(face, site, faces.size)
+        contents = _group_by_key(face, site, faces.size)
         return [_cut_out(faces[k], contents[k], case) for k in gaps[positions]]
 
-    return Measured(open_um2[gaps], sites, markers)
+    return Measurement(open_um2[gaps], sites, markers)
 
 
-def _open_um2(case: Case) -> float:
+def _gap_area_bound_um2(case: Case) -> float:
     """
     Return an upper bound of the total gap area, in µm².
 
@@ -367,7 +371,7 @@ def _open_um2(case: Case) -> float:
     where sites may overlap or leave the die.
     """
     layout = case.layout
-    if not case.contacts.is_apart.all():
+    if not case.contacts.is_non_overlapping.all():
         return np.inf
     if case.rules.die_um is None:
         field = np.asarray(layout.bounds_um if layout.n_sites else np.zeros(4))
@@ -378,27 +382,27 @@ def _open_um2(case: Case) -> float:
     return float((field[2:] - field[:2]).prod() - layout.area_um2.sum())
 
 
-def _is_alone(case: Case) -> Bools:
+def _is_isolated(case: Case) -> Bools:
     """Return the sites without holes that touch neither another site nor the die boundary."""
     found, box = case.contacts, case.layout.site_bounds_um
-    touching = found.of(found.distance_um <= LENGTH_ROUNDING_UM)
-    is_alone = np.diff(case.layout.site_offsets) == 1
-    is_alone[touching.ravel()] = False
+    touching = found.sites_of(found.distance_um <= LENGTH_ROUNDING_UM)
+    is_isolated = np.diff(case.layout.site_offsets) == 1
+    is_isolated[touching.ravel()] = False
     if case.rules.die_um is not None:
         die = np.asarray(case.rules.die_um)
         is_within = _reach_beyond_die(case).values < -LENGTH_ROUNDING_UM
         is_outside = np.maximum(die[:2] - box[:, 2:], box[:, :2] - die[2:]).max(axis=1) > LENGTH_ROUNDING_UM
-        is_alone &= is_within | is_outside
-    return is_alone
+        is_isolated &= is_within | is_outside
+    return is_isolated
 
 
-def _open_faces(faces: NDArray[Any], is_alone: Bools, case: Case) -> NDArray[Any]:
+def _uncovered_faces(faces: NDArray[Any], is_isolated: Bools, case: Case) -> NDArray[Any]:
     """Return the faces within the die that no site covers, ignoring isolated sites."""
     inner = _inner_points(faces)
     is_open = np.ones(faces.size, bool)
     if case.rules.die_um is not None:
         is_open = np.asarray(shapely.contains(shapely.box(*case.rules.die_um), inner))
-    is_open[case.sites_at(inner, ~is_alone)[0]] = False
+    is_open[case.sites_at(inner, ~is_isolated)[0]] = False
     return faces[is_open]
 
 
@@ -410,16 +414,16 @@ def _inner_points(faces: NDArray[Any]) -> NDArray[Any]:
     return inner
 
 
-def _contents(faces: NDArray[Any], is_alone: Bools, case: Case) -> tuple[Ints, Ints]:
+def _isolated_sites_within(faces: NDArray[Any], is_isolated: Bools, case: Case) -> tuple[Ints, Ints]:
     """Return pairs of faces and the isolated sites within them."""
     face, site = case.sites_near(shapely.bounds(faces))
-    face, site = face[is_alone[site]], site[is_alone[site]]
+    face, site = face[is_isolated[site]], site[is_isolated[site]]
     shapely.prepare(faces)
     is_inside = shapely.contains_xy(faces[face], case.layout.xy_um[case.first_vertex[site]])
     return face[is_inside], site[is_inside]
 
 
-def _grouped(key: Ints, values: Ints, n_keys: int) -> list[Ints]:
+def _group_by_key(key: Ints, values: Ints, n_keys: int) -> list[Ints]:
     """Return the values of each key, in their order."""
     stops = np.cumsum(np.bincount(key, minlength=n_keys))[:-1]
     return np.split(values[np.argsort(key, kind="stable")], stops) if n_keys else []
@@ -432,13 +436,13 @@ def _cut_out(face: Any, sites: Ints, case: Case) -> Any:
     return shapely.Polygon(face.exterior, [*face.interiors, *shapely.get_exterior_ring(case.shapes(sites))])
 
 
-def _reach_beyond_die(case: Case) -> Measured:
+def _reach_beyond_die(case: Case) -> Measurement:
     die = np.asarray(case.rules.die_um)
     box = case.layout.site_bounds_um
-    return Measured(np.maximum(die[:2] - box[:, :2], box[:, 2:] - die[2:]).max(axis=1, initial=-np.inf))
+    return Measurement(np.maximum(die[:2] - box[:, :2], box[:, 2:] - die[2:]).max(axis=1, initial=-np.inf))
 
 
-def _growths(case: Case) -> Measured:
+def _growths(case: Case) -> Measurement:
     """
     Measure the ratio of mean site sizes of each ring and the next inner one.
 
@@ -448,10 +452,12 @@ def _growths(case: Case) -> Measured:
     size_um = np.bincount(ring, np.sqrt(case.layout.area_um2)) / np.bincount(ring) if rings.size else np.zeros(0)
     order = np.argsort(ring, kind="stable")
     members = np.split(order, np.cumsum(np.bincount(ring))[:-1])[1:] if rings.size else []
-    return Measured(size_um[1:] / size_um[:-1], lambda k: [members[i] for i in k], lambda k: case.shapes(first[1:][k]))
+    return Measurement(
+        size_um[1:] / size_um[:-1], lambda k: [members[i] for i in k], lambda k: case.shapes(first[1:][k])
+    )
 
 
-def _neighbour_ratios(case: Case) -> Measured:
+def _neighbour_ratios(case: Case) -> Measurement:
     from foveasim.layout import _kernels
 
     found, layout = case.contacts, case.layout
@@ -461,30 +467,32 @@ def _neighbour_ratios(case: Case) -> Measured:
     def shared_um(piece: slice) -> Floats:
         return _kernels.shared_lengths(layout.xy_um, case.after, case.first_vertex, a[piece], b[piece], TOUCHING_UM)
 
-    pairs = touching[np.concatenate(each(shared_um, _pieces(a.size), thread_count())) > 0.0]
+    pairs = touching[np.concatenate(each(shared_um, _task_slices(a.size), thread_count())) > 0.0]
     size_um = np.sqrt(layout.area_um2)
     ratio = size_um[found.first[pairs]] / size_um[found.second[pairs]]
-    return Measured(
+    return Measurement(
         np.maximum(ratio, 1.0 / ratio),
-        lambda k: found.of(pairs[k]),
-        lambda k: shapely.linestrings(layout.centroid_um[found.of(pairs[k])]),
+        lambda k: found.sites_of(pairs[k]),
+        lambda k: shapely.linestrings(layout.centroid_um[found.sites_of(pairs[k])]),
     )
 
 
-def _counts(case: Case) -> Measured:
-    return Measured(np.array([float(case.layout.n_sites)]), lambda _k: [()], lambda _k: [_everything(case)])
+def _counts(case: Case) -> Measurement:
+    return Measurement(np.array([float(case.layout.n_sites)]), lambda _k: [()], lambda _k: [_bounding_box(case)])
 
 
-def _everything(case: Case) -> Any:
+def _bounding_box(case: Case) -> Any:
     """Return the bounding box of all sites."""
     return shapely.box(*(case.layout.bounds_um if case.layout.n_sites else (0.0, 0.0, 0.0, 0.0)))
 
 
-def _densities(case: Case) -> Measured:
+def _densities(case: Case) -> Measurement:
     """Measure the fill factor of windows that advance over the die by half their side."""
     low, high, filled_um2 = case.windows
-    share = filled_um2 / np.maximum((high - low).prod(axis=1), np.finfo(np.float64).tiny)
-    return Measured(share, lambda k: [()] * k.size, lambda k: shapely.box(low[k, 0], low[k, 1], high[k, 0], high[k, 1]))
+    density = filled_um2 / np.maximum((high - low).prod(axis=1), np.finfo(np.float64).tiny)
+    return Measurement(
+        density, lambda k: [()] * k.size, lambda k: shapely.box(low[k, 0], low[k, 1], high[k, 0], high[k, 1])
+    )
 
 
 def _filled_um2(layout: Layout, x_um: Floats, y_um: Floats) -> Floats:
@@ -494,14 +502,14 @@ def _filled_um2(layout: Layout, x_um: Floats, y_um: Floats) -> Floats:
     first_x, last_x = (np.clip(np.searchsorted(x_um, box[:, i], "right") - 1, 0, columns - 1) for i in (0, 2))
     first_y, last_y = (np.clip(np.searchsorted(y_um, box[:, i], "right") - 1, 0, rows - 1) for i in (1, 3))
     inside = (box[:, 0] >= x_um[0]) & (box[:, 2] <= x_um[-1]) & (box[:, 1] >= y_um[0]) & (box[:, 3] <= y_um[-1])
-    is_whole = inside & (first_x == last_x) & (first_y == last_y)
-    cell, area_um2 = (first_y * columns + first_x)[is_whole], layout.area_um2[is_whole]
+    is_in_one_cell = inside & (first_x == last_x) & (first_y == last_y)
+    cell, area_um2 = (first_y * columns + first_x)[is_in_one_cell], layout.area_um2[is_in_one_cell]
     # The other sites are clipped to every cell that their bounding boxes reach.
-    cut = np.flatnonzero(~is_whole)
+    cut = np.flatnonzero(~is_in_one_cell)
     wide, high = (last_x - first_x + 1)[cut], (last_y - first_y + 1)[cut]
-    place = positions_in_runs(wide * high)
+    position = positions_in_runs(wide * high)
     owner = np.repeat(np.arange(cut.size), wide * high)
-    ix, iy = first_x[cut][owner] + place % wide[owner], first_y[cut][owner] + place // wide[owner]
+    ix, iy = first_x[cut][owner] + position % wide[owner], first_y[cut][owner] + position // wide[owner]
     pieces = shapely.intersection(
         layout[cut].polygons()[owner], shapely.box(x_um[ix], y_um[iy], x_um[ix + 1], y_um[iy + 1])
     )
@@ -510,14 +518,16 @@ def _filled_um2(layout: Layout, x_um: Floats, y_um: Floats) -> Floats:
     return np.asarray(filled.reshape(rows, columns), dtype=np.float64)
 
 
-def _data_rates(case: Case) -> Measured:
+def _data_rates(case: Case) -> Measurement:
     assert case.rules.readout is not None
-    return Measured(
-        np.array([case.rules.readout.gbit_per_s(case.layout.n_sites)]), lambda _k: [()], lambda _k: [_everything(case)]
+    return Measurement(
+        np.array([case.rules.readout.gbit_per_s(case.layout.n_sites)]),
+        lambda _k: [()],
+        lambda _k: [_bounding_box(case)],
     )
 
 
-def _track_uses(case: Case) -> Measured:
+def _track_utilisations(case: Case) -> Measurement:
     """Measure the readout lines per available track of every strip where lines begin."""
     assert case.rules.routing is not None
     found = track_demand(case.layout, case.rules.routing)
@@ -526,10 +536,10 @@ def _track_uses(case: Case) -> Measured:
     def markers(positions: Ints) -> list[Any]:
         if case.rules.routing is not None and case.rules.routing.direction == "upwards":
             x0, _, x1, _ = case.layout.bounds_um
-            return [shapely.LineString([(x0, y), (x1, y)]) for y in found.place_um[positions]]
-        return [shapely.Point(0.0, 0.0).buffer(r).exterior for r in found.place_um[positions]]
+            return [shapely.LineString([(x0, y), (x1, y)]) for y in found.position_um[positions]]
+        return [shapely.Point(0.0, 0.0).buffer(r).exterior for r in found.position_um[positions]]
 
-    return Measured(use, lambda k: [found.first_sites[found.strip == i] for i in k], markers)
+    return Measurement(use, lambda k: [found.first_sites[found.strip == i] for i in k], markers)
 
 
 #: Rules by name. The built-in rules are fields of :class:`foveasim.layout.DesignRules`. Limits of other rules, registered by
@@ -537,14 +547,14 @@ def _track_uses(case: Case) -> Measured:
 RULES: Registry[Rule] = Registry("design rule", "foveasim.rules")
 for _name, _rule in {
     "min_size_um": Rule(
-        "the size of a site, the square root of its area, is at least the limit", "µm", _sizes, mended_by="merge"
+        "the size of a site, the square root of its area, is at least the limit", "µm", _sizes, repair="merge"
     ),
     "max_size_um": Rule(
         "the size of a site, the square root of its area, is at most the limit", "µm", _sizes, is_upper=True
     ),
-    "min_area_um2": Rule("the area of a site is at least the limit", "µm²", _areas, mended_by="merge"),
+    "min_area_um2": Rule("the area of a site is at least the limit", "µm²", _areas, repair="merge"),
     "min_hole_um2": Rule("the area of a hole in a site is at least the limit", "µm²", _holes),
-    "min_width_um": Rule("the width of a site is at least the limit", "µm", _widths, mended_by="merge"),
+    "min_width_um": Rule("the width of a site is at least the limit", "µm", _widths, repair="merge"),
     "min_space_um": Rule("the space between sites that do not touch is at least the limit", "µm", _spaces),
     "max_aspect_ratio": Rule("the aspect ratio of a site is at most the limit", "", _aspect_ratios, is_upper=True),
     "min_angle_deg": Rule("the interior angle of a corner is at least the limit", "degrees", _corner_angles),
@@ -561,12 +571,12 @@ for _name, _rule in {
         "the overlap of two sites is at most the limit", "µm²", _overlaps, is_upper=True, rounding=0.0
     ),
     "max_gap_um2": Rule(
-        "the area of a gap is at most the limit", "µm²", _gaps, is_upper=True, rounding=0.0, mended_by=None
+        "the area of a gap is at most the limit", "µm²", _gaps, is_upper=True, rounding=0.0, repair=None
     ),
     "die_um": Rule("sites lie within the die", "µm", _reach_beyond_die, is_upper=True, is_deviation=True),
-    "min_growth": Rule("the size ratio of successive rings is at least the limit", "", _growths, mended_by=None),
+    "min_growth": Rule("the size ratio of successive rings is at least the limit", "", _growths, repair=None),
     "max_growth": Rule(
-        "the size ratio of successive rings is at most the limit", "", _growths, is_upper=True, mended_by=None
+        "the size ratio of successive rings is at most the limit", "", _growths, is_upper=True, repair=None
     ),
     "max_neighbour_ratio": Rule(
         "the size ratio of neighbouring sites is at most the limit",
@@ -574,13 +584,13 @@ for _name, _rule in {
         _neighbour_ratios,
         is_upper=True,
         rounding=1e-9,
-        mended_by=None,
+        repair=None,
     ),
     "max_sites": Rule(
-        "the number of sites is at most the limit", "", _counts, is_upper=True, rounding=0.0, mended_by=None
+        "the number of sites is at most the limit", "", _counts, is_upper=True, rounding=0.0, repair=None
     ),
     "min_density": Rule(
-        "the fill factor of every window is at least the limit", "", _densities, rounding=AREA_ROUNDING, mended_by=None
+        "the fill factor of every window is at least the limit", "", _densities, rounding=AREA_ROUNDING, repair=None
     ),
     "max_density": Rule(
         "the fill factor of every window is at most the limit",
@@ -588,7 +598,7 @@ for _name, _rule in {
         _densities,
         is_upper=True,
         rounding=AREA_ROUNDING,
-        mended_by=None,
+        repair=None,
     ),
     "max_data_rate_gbit_per_s": Rule(
         "the data rate of a lane is at most the limit",
@@ -596,15 +606,15 @@ for _name, _rule in {
         _data_rates,
         is_upper=True,
         rounding=0.0,
-        mended_by=None,
+        repair=None,
     ),
     "max_track_utilisation": Rule(
         "the number of readout lines per track is at most the limit",
         "",
-        _track_uses,
+        _track_utilisations,
         is_upper=True,
         rounding=0.0,
-        mended_by=None,
+        repair=None,
     ),
 }.items():
     RULES.register(_name, _rule)

@@ -80,51 +80,57 @@ def enforce(layout: Layout, rules: DesignRules, *, repair: Repair = "drop") -> t
     """
     check_choice("repair", repair, get_args(Repair))
     waivers = rules.waivers or {}
-    active = rules.only(lambda name: RULES[name].mended_by is not None and name not in waivers)
-    now = np.arange(layout.n_sites)  # current index of each input site, -1 for dropped sites
+    active = rules.only(lambda name: RULES[name].repair is not None and name not in waivers)
+    current_index = np.arange(layout.n_sites)  # current index of each input site, -1 for dropped sites
     changes: list[Change] = []
-    given = layout
+    original = layout
     if repair == "merge":
-        layout, now = _merged(layout, active, now, changes)
-    layout, now = _drop_violating_sites(layout, active, now, changes)
+        layout, current_index = _merge_small(layout, active, current_index, changes)
+    layout, current_index = _drop_violating_sites(layout, active, current_index, changes)
     if repair == "refill":
-        layout = _refilled(layout, given, active, changes)
-    rest = layout.check(rules.only(lambda name: RULES[name].mended_by is None))
+        layout = _refill(layout, original, active, changes)
+    rest = layout.check(rules.only(lambda name: RULES[name].repair is None))
     if not rest.ok:
-        raise GeometryError(f"the layout violates rules that removing sites cannot repair: {_broken(rest)}")
+        raise GeometryError(f"the layout violates rules that removing sites cannot repair: {_format_violations(rest)}")
     return layout, tuple(changes)
 
 
-def _drop_violating_sites(layout: Layout, rules: DesignRules, now: Ints, changes: list[Change]) -> tuple[Layout, Ints]:
+def _drop_violating_sites(
+    layout: Layout, rules: DesignRules, current_index: Ints, changes: list[Change]
+) -> tuple[Layout, Ints]:
     """Remove sites that violate a rule until none remain."""
     report = layout.check(rules)
     while not report.ok:
-        gone = np.zeros(layout.n_sites, bool)
+        is_dropped = np.zeros(layout.n_sites, bool)
         for result in report.results:
-            new = _sites_to_remove(layout, result, gone)
-            gone[new] = True
-            ids = np.flatnonzero(np.isin(now, new))
+            new = _sites_to_remove(layout, result, is_dropped)
+            is_dropped[new] = True
+            ids = np.flatnonzero(np.isin(current_index, new))
             if ids.size:
                 changes.append(Change(result.rule, "dropped", tuple(int(i) for i in ids)))
-        now = np.where((now >= 0) & ~gone[now], (np.cumsum(~gone) - 1)[now], -1)
-        layout = layout[~gone]
+        current_index = np.where(
+            (current_index >= 0) & ~is_dropped[current_index], (np.cumsum(~is_dropped) - 1)[current_index], -1
+        )
+        layout = layout[~is_dropped]
         report = layout.check(rules)
-    return layout, now
+    return layout, current_index
 
 
-def _refilled(layout: Layout, given: Layout, rules: DesignRules, changes: list[Change]) -> Layout:
+def _refill(layout: Layout, original: Layout, rules: DesignRules, changes: list[Change]) -> Layout:
     """Fill the area of dropped sites that were too small with hexagons of the minimum size."""
     is_small = [change.action == "dropped" and _is_minimum_rule(change.rule) for change in changes]
-    gone = np.array([i for change, small in zip(changes, is_small, strict=True) if small for i in change.site_ids], int)
-    if gone.size == 0:
+    dropped_ids = np.array(
+        [i for change, small in zip(changes, is_small, strict=True) if small for i in change.site_ids], int
+    )
+    if dropped_ids.size == 0:
         return layout
-    dropped = given[np.sort(gone)]
-    room = shapely.get_parts(shapely.union_all(dropped.polygons()))
-    room = shapely.union_all(shapely.polygons(shapely.get_exterior_ring(room)))
-    n_kept = layout.n_sites
-    filled = fill(layout, room, size_um=_smallest_size_um(rules), columns_of=dropped)
+    dropped = original[np.sort(dropped_ids)]
+    area = shapely.get_parts(shapely.union_all(dropped.polygons()))
+    area = shapely.union_all(shapely.polygons(shapely.get_exterior_ring(area)))
+    n_remaining = layout.n_sites
+    filled = fill(layout, area, size_um=_smallest_size_um(rules), columns_of=dropped)
     # Sites at the boundary may be narrower than a hexagon, or violate other rules.
-    new, _ = _merged(filled[n_kept:], rules, np.arange(filled.n_sites - n_kept), [])
+    new, _ = _merge_small(filled[n_remaining:], rules, np.arange(filled.n_sites - n_remaining), [])
     layout, _ = _drop_violating_sites(union([layout, new]), rules, np.zeros(0, np.int64), [])
     for k, (change, small) in enumerate(zip(changes, is_small, strict=True)):
         if small:
@@ -134,7 +140,7 @@ def _refilled(layout: Layout, given: Layout, rules: DesignRules, changes: list[C
         layout.ring_offsets,
         layout.site_offsets,
         layout.columns,
-        given._then("refilled by rules"),  # noqa: SLF001
+        original._extend_provenance("refilled by rules"),  # noqa: SLF001
     )
 
 
@@ -144,49 +150,49 @@ def _smallest_size_um(rules: DesignRules) -> float:
     return max(rules.min_size_um or 0.0, math.sqrt(rules.min_area_um2 or 0.0), across_um)
 
 
-def _sites_to_remove(layout: Layout, result: RuleResult, gone: Bools) -> Ints:
+def _sites_to_remove(layout: Layout, result: RuleResult, is_dropped: Bools) -> Ints:
     """
     Return further sites that must be removed to satisfy a rule.
 
-    Of a pair, the smaller site is removed, unless one of the two is already in ``gone``.
+    Of a pair, the smaller site is removed, unless one of the two is already in ``is_dropped``.
     """
-    going = set(np.flatnonzero(gone).tolist())
+    removed = set(np.flatnonzero(is_dropped).tolist())
     new = set()
     for violation in result.violations:
         site = min(violation.site_ids, key=lambda i: float(layout.area_um2[i]))
-        if not going & set(violation.site_ids):
+        if not removed & set(violation.site_ids):
             new.add(site)
-            going.add(site)
+            removed.add(site)
     return np.array(sorted(new), dtype=np.int64)
 
 
-def _merged(layout: Layout, rules: DesignRules, now: Ints, changes: list[Change]) -> tuple[Layout, Ints]:
+def _merge_small(layout: Layout, rules: DesignRules, current_index: Ints, changes: list[Change]) -> tuple[Layout, Ints]:
     """Merge sites that are too small with their neighbours, in rounds."""
-    smallness = rules.only(_is_minimum_rule)
+    minimum_rules = rules.only(_is_minimum_rule)
     for _ in range(MAX_ROUNDS):
-        report = layout.check(smallness)
+        report = layout.check(minimum_rules)
         if report.ok:
             break
         rule_of = {v.site_ids[0]: result.rule for result in reversed(report.results) for v in result.violations}
         group = joining_groups(layout, np.array(list(rule_of), dtype=np.int64))
         if np.array_equal(group, np.arange(layout.n_sites)):
             break
-        kept, label = np.unique(group, return_inverse=True)
-        layout, now = merge(layout, label), label[now]
-        order = np.argsort(now, kind="stable")
-        borders = np.searchsorted(now[order], np.arange(kept.size + 1))
+        groups, label = np.unique(group, return_inverse=True)
+        layout, current_index = merge(layout, label), label[current_index]
+        order = np.argsort(current_index, kind="stable")
+        boundaries = np.searchsorted(current_index[order], np.arange(groups.size + 1))
         is_joined = np.bincount(label) > 1
         rule_of_group = {int(label[site]): rule for site, rule in rule_of.items()}
         for k in np.flatnonzero(is_joined).tolist():
-            ids = order[borders[k] : borders[k + 1]]
+            ids = order[boundaries[k] : boundaries[k + 1]]
             changes.append(Change(rule_of_group[k], "merged", tuple(sorted(int(i) for i in ids))))
-    return layout, now
+    return layout, current_index
 
 
-def _broken(report: Report) -> str:
+def _format_violations(report: Report) -> str:
     return "; ".join(str(result) for result in report.results if not result.ok)
 
 
 def _is_minimum_rule(name: str) -> bool:
     """Return whether merging a site with a neighbour repairs violations of the rule."""
-    return RULES[name].mended_by == "merge"
+    return RULES[name].repair == "merge"

@@ -26,14 +26,14 @@ MAX_BYTES = 2**29
 #: Number of first bytes that are searched for the root element.
 HEAD_BYTES = 512
 #: Patterns of the category descriptions and item texts of write_lyrdb.
-LIMIT = re.compile(r"^(?P<description>.*) \(limit (?P<limit>\S+) ?(?P<unit>[^)]*)\)$", re.DOTALL)
-FOUND = re.compile(r"photosite (?P<sites>\d+(?:, \d+)*): (?P<value>\S+) ?(?P<unit>[^']*)")
+DESCRIPTION = re.compile(r"^(?P<description>.*) \(limit (?P<limit>\S+) ?(?P<unit>[^)]*)\)$", re.DOTALL)
+VIOLATION = re.compile(r"photosite (?P<sites>\d+(?:, \d+)*): (?P<value>\S+) ?(?P<unit>[^']*)")
 #: Points of one ring, edge or box of a marker.
 POINTS = re.compile(r"\(([^()]*)\)")
 
 #: Description, limit and unit of a rule; sites, value and marker of a violation.
 _RuleInfo: TypeAlias = tuple[str, float, str]
-_Found: TypeAlias = tuple[tuple[int, ...], float, Any]
+_Item: TypeAlias = tuple[tuple[int, ...], float, Any]
 
 
 def write_lyrdb(report: Report, path: str | Path) -> None:
@@ -142,11 +142,11 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
         raise FileError(source, f"is corrupt, or not a KLayout report database ({error})") from None
     if root.tag != "report-database":
         raise FileError(source, "is not a KLayout report database")
-    found: dict[str, list[_Found]] = {}
+    found: dict[str, list[_Item]] = {}
     about: dict[str, _RuleInfo] = {}
     for name, category in _categories(root):
-        told = LIMIT.match(category.findtext("description") or "")
-        about[name] = (told["description"], _number(told["limit"]), told["unit"]) if told else (name, np.nan, "")
+        match = DESCRIPTION.match(category.findtext("description") or "")
+        about[name] = (match["description"], _number(match["limit"]), match["unit"]) if match else (name, np.nan, "")
         found[name] = []
     for item in root.iterfind("items/item"):
         name = (item.findtext("category") or "").strip().strip("'")
@@ -161,13 +161,13 @@ def read_lyrdb(path: str | Path, n_sites: int) -> Report:
     )
 
 
-def _result(name: str, about: _RuleInfo, items: list[_Found]) -> Any:
+def _result(name: str, about: _RuleInfo, items: list[_Item]) -> Any:
     from foveasim.layout.drc.rules import RuleResult
 
     description, limit, unit = about
     values = np.array([value for _, value, _ in items], dtype=np.float64)
-    places = ([sites for sites, _, _ in items], [marker for _, _, marker in items])
-    return RuleResult(name, description, limit, unit, values, None, lambda: places)
+    locations = ([sites for sites, _, _ in items], [marker for _, _, marker in items])
+    return RuleResult(name, description, limit, unit, values, None, lambda: locations)
 
 
 def _categories(root: Any, parent: str = "") -> list[tuple[str, Any]]:
@@ -179,7 +179,7 @@ def _categories(root: Any, parent: str = "") -> list[tuple[str, Any]]:
     return found
 
 
-def _item(source: Path, item: Any) -> _Found:
+def _item(source: Path, item: Any) -> _Item:
     """Return the sites, value and marker of an item."""
     sites: tuple[int, ...] = ()
     value = np.nan
@@ -187,9 +187,9 @@ def _item(source: Path, item: Any) -> _Found:
     for element in item.iterfind("values/value"):
         # A tag in brackets may precede the type: "[#name] polygon: (...)".
         kind, colon, text = (element.text or "").strip().removeprefix("[").partition(":")
-        told = FOUND.search(text)
-        if kind.endswith("text") and told:
-            sites, value = tuple(map(int, told["sites"].split(", "))), _number(told["value"])
+        match = VIOLATION.search(text)
+        if kind.endswith("text") and match:
+            sites, value = tuple(map(int, match["sites"].split(", "))), _number(match["value"])
         elif colon and kind.split(" ")[-1] in {"polygon", "edge", "edge-pair", "box", "path"}:
             try:
                 shapes += _geometries(kind.split(" ")[-1], text)

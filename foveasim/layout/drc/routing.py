@@ -14,7 +14,7 @@ from foveasim.layout.model import Layout
 __all__ = ["Readout", "Routing", "TrackDemand", "track_demand"]
 
 #: Lines whose first sites end within this distance of each other begin at the same strip.
-TOGETHER_UM = 1e-6
+SAME_STRIP_UM = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,7 +112,7 @@ class TrackDemand(NamedTuple):
 
     Attributes
     ----------
-    place_um : (n_strip,) float64, µm
+    position_um : (n_strip,) float64, µm
         Radius of the circle, or y of the horizontal line, that is the strip.
     n_nets, n_tracks : (n_strip,) int64
         Lines that cross the strip, and available tracks.
@@ -122,7 +122,7 @@ class TrackDemand(NamedTuple):
         Index of the strip where each line begins.
     """
 
-    place_um: Floats
+    position_um: Floats
     n_nets: Ints
     n_tracks: Ints
     first_sites: Ints
@@ -150,16 +150,18 @@ def track_demand(layout: Layout, routing: Routing) -> TrackDemand:
     """
     line = layout.index_column("readout_line")
     if line.size == 0:
-        nothing = np.zeros(0, np.int64)
-        return TrackDemand(np.zeros(0), nothing, nothing, nothing, nothing)
+        empty = np.zeros(0, np.int64)
+        return TrackDemand(np.zeros(0), empty, empty, empty, empty)
     reach_um = np.hypot(*layout.xy_um.T) if routing.direction == "outwards" else layout.xy_um[:, 1]
     end_um = np.maximum.reduceat(reach_um, layout.ring_offsets[layout.site_offsets[:-1]])
     order = np.lexsort((end_um, line))
     first_sites = order[np.unique(line[order], return_index=True)[1]]
     start_um = np.sort(end_um[first_sites])
-    place_um = start_um[np.append(np.diff(start_um) > TOGETHER_UM, True)]
-    strip = np.searchsorted(place_um, end_um[first_sites] - TOGETHER_UM)
-    n_nets = np.cumsum(np.bincount(strip, minlength=place_um.size))
+    position_um = start_um[np.append(np.diff(start_um) > SAME_STRIP_UM, True)]
+    strip = np.searchsorted(position_um, end_um[first_sites] - SAME_STRIP_UM)
+    n_nets = np.cumsum(np.bincount(strip, minlength=position_um.size))
     x_min, _, x_max, _ = layout.bounds_um
-    strips_um = 2.0 * math.pi * place_um if routing.direction == "outwards" else np.full(place_um.size, x_max - x_min)
-    return TrackDemand(place_um, n_nets, routing.n_tracks(strips_um), first_sites, strip)
+    strips_um = (
+        2.0 * math.pi * position_um if routing.direction == "outwards" else np.full(position_um.size, x_max - x_min)
+    )
+    return TrackDemand(position_um, n_nets, routing.n_tracks(strips_um), first_sites, strip)

@@ -17,7 +17,7 @@ import numpy as np
 
 from foveasim._core.validation import Floats, check_choice, check_number, finite_array
 from foveasim.errors import GeometryError, ParameterError
-from foveasim.layout.drc.measurements import RULES, Case, Measured, Rule, min_width_um
+from foveasim.layout.drc.measurements import RULES, Case, Measurement, Rule, min_width_um
 from foveasim.layout.drc.presets import PRESETS
 from foveasim.layout.drc.routing import Readout, Routing
 from foveasim.layout.model import Layout
@@ -30,12 +30,12 @@ __all__ = ["RULES", "DesignRules", "Report", "RuleResult", "Violation", "check",
 
 
 #: Parameters that are not numbers.
-NOT_NUMBERS = {"custom", "die_um", "readout", "routing", "waivers"}
+NON_NUMERIC = {"custom", "die_um", "readout", "routing", "waivers"}
 #: Upper bounds of limits, and limits that must be positive.
-MOST = {"min_angle_deg": 180.0, "edge_angle_step_deg": 180.0, "min_density": 1.0, "max_density": 1.0}
-ABOVE_ZERO = ("min_angle_deg", "edge_angle_step_deg", "grid_um", "density_window_um")
+UPPER_BOUNDS = {"min_angle_deg": 180.0, "edge_angle_step_deg": 180.0, "min_density": 1.0, "max_density": 1.0}
+POSITIVE = ("min_angle_deg", "edge_angle_step_deg", "grid_um", "density_window_um")
 #: Further parameter that a rule requires, and its type.
-NEEDS: dict[str, tuple[str, type | None]] = {
+REQUIRED: dict[str, tuple[str, type | None]] = {
     "min_density": ("density_window_um", None),
     "max_density": ("density_window_um", None),
     "max_data_rate_gbit_per_s": ("readout", Readout),
@@ -149,20 +149,20 @@ class DesignRules:
                     object.__setattr__(self, name, limit)
         for rule in fields(self):
             value = getattr(self, rule.name)
-            if value is not None and rule.name not in NOT_NUMBERS:
+            if value is not None and rule.name not in NON_NUMERIC:
                 object.__setattr__(self, rule.name, check_number(rule.name, value, at_least=0.0))
-        for name, most in MOST.items():
+        for name, upper_bound in UPPER_BOUNDS.items():
             if getattr(self, name) is not None:
-                check_number(name, getattr(self, name), at_most=most)
-        for name in ABOVE_ZERO:
+                check_number(name, getattr(self, name), at_most=upper_bound)
+        for name in POSITIVE:
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), above=0.0)
-        for name, (needed, kind) in NEEDS.items():
-            value = getattr(self, needed)
+        for name, (required, kind) in REQUIRED.items():
+            value = getattr(self, required)
             if value is None and getattr(self, name) is not None:
-                raise ParameterError(needed, f"must be given for '{name}'")
+                raise ParameterError(required, f"must be given for '{name}'")
             if kind is not None and value is not None and not isinstance(value, kind):
-                raise ParameterError(needed, f"must be a {kind.__name__}", value)
+                raise ParameterError(required, f"must be a {kind.__name__}", value)
         if self.die_um is not None:
             die = finite_array("die_um", self.die_um, ndim=1)
             if die.size != 4 or not (die[0] < die[2] and die[1] < die[3]):
@@ -251,14 +251,14 @@ class RuleResult:
     unit: str
     values: Floats
     waiver: str | None
-    _places: Callable[[], tuple[Any, Any]]
+    _locate: Callable[[], tuple[Any, Any]]
 
     @cached_property
     def violations(self) -> tuple[Violation, ...]:
         """Violations of the rule, the worst first; computed on first access."""
         if self.values.size == 0:
             return ()
-        sites, markers = self._places()
+        sites, markers = self._locate()
         return tuple(
             Violation(self.rule, tuple(int(site) for site in ids), value, self.limit, self.unit, marker)
             for ids, value, marker in zip(sites, self.values.tolist(), markers, strict=True)
@@ -270,9 +270,9 @@ class RuleResult:
     def __reduce__(self) -> tuple[Any, ...]:
         # Sites and markers are functions of the layout; only their results can be pickled.
         found = self.violations
-        places = ([v.site_ids for v in found], [v.marker for v in found])
+        locations = ([v.site_ids for v in found], [v.marker for v in found])
         return RuleResult, (
-            self.rule, self.description, self.limit, self.unit, self.values, self.waiver, partial(tuple, places)
+            self.rule, self.description, self.limit, self.unit, self.values, self.waiver, partial(tuple, locations)
         )  # fmt: skip
 
     @property
@@ -330,9 +330,9 @@ class Report:
             With the results of all violated rules, and the sites in ``.site_ids``.
         """
         if not self.ok:
-            broken = [result for result in self.results if not result.ok]
-            lines = [str(result) for result in broken]
-            ids = sorted({site for result in broken for violation in result.violations for site in violation.site_ids})
+            failed = [result for result in self.results if not result.ok]
+            lines = [str(result) for result in failed]
+            ids = sorted({site for result in failed for violation in result.violations for site in violation.site_ids})
             raise GeometryError("the layout violates its design rules: " + "; ".join(lines), tuple(ids))
 
     def records(self) -> list[dict[str, Any]]:
@@ -414,16 +414,16 @@ def check(layout: Layout, rules: DesignRules) -> Report:
     for name, limit in rules.limits().items():
         rule = RULES[name]
         bound = 0.0 if rule.is_deviation else float(limit)
-        values, places = _broken(rule, _measured(name, rule, case), bound, case)
+        values, locate = _violations(rule, _measure(name, rule, case), bound, case)
         waiver = (rules.waivers or {}).get(name)
-        results.append(RuleResult(name, rule.description, bound, rule.unit, values, waiver, places))
+        results.append(RuleResult(name, rule.description, bound, rule.unit, values, waiver, locate))
     return Report(layout.n_sites, tuple(results))
 
 
-def _measured(name: str, rule: Rule, case: Case) -> Measured:
+def _measure(name: str, rule: Rule, case: Case) -> Measurement:
     """Return the measurements of a rule; arrays must have one value per site."""
     found = rule.measure(case)
-    if isinstance(found, Measured):
+    if isinstance(found, Measurement):
         return found
     values = finite_array(name, found)
     if values.shape != (case.layout.n_sites,):
@@ -431,19 +431,21 @@ def _measured(name: str, rule: Rule, case: Case) -> Measured:
         raise ParameterError(
             "custom", f"rule '{name}' must return one value for each of the {n_sites} sites", values.shape
         )
-    return Measured(values)
+    return Measurement(values)
 
 
-def _broken(rule: Rule, found: Measured, limit: float, case: Case) -> tuple[Floats, Callable[[], tuple[Any, Any]]]:
+def _violations(
+    rule: Rule, found: Measurement, limit: float, case: Case
+) -> tuple[Floats, Callable[[], tuple[Any, Any]]]:
     """Return the values beyond the limit, worst first, and a getter of sites and markers."""
     beyond = rule.excess(found.values, limit)
     bad = np.flatnonzero(beyond > rule.rounding)
     bad = bad[np.argsort(-beyond[bad], kind="stable")]
 
-    def places() -> tuple[Any, Any]:
+    def locate() -> tuple[Any, Any]:
         return (
             bad[:, np.newaxis] if found.sites is None else found.sites(bad),
             case.shapes(bad) if found.markers is None else found.markers(bad),
         )
 
-    return found.values[bad], places
+    return found.values[bad], locate

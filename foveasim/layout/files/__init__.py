@@ -25,7 +25,7 @@ from typing import Any
 from foveasim._core.registry import import_all
 from foveasim._io.formats import FileFormat, chosen_options, format_of, writing_format
 from foveasim.errors import FileError
-from foveasim.layout.files._bundled import layout_path, shipped_layouts
+from foveasim.layout.files._bundled import bundled_layouts, layout_path
 from foveasim.layout.files._common import WrittenLayout
 from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout
@@ -34,10 +34,10 @@ __all__ = [
     "FORMATS",
     "FileFormat",
     "WrittenLayout",
+    "bundled_layouts",
     "check_no_options",
     "layout_path",
     "read_layout",
-    "shipped_layouts",
     "write_layout",
 ]
 
@@ -75,7 +75,7 @@ def read_layout(path: str | Path, *, layer: int | None = None, cell: str | None 
         When an option does not belong to the file's format.
     """
     path = Path(path)
-    if str(path) in shipped_layouts() and not path.exists():
+    if str(path) in bundled_layouts() and not path.exists():
         raise FileError(path, "no such file; foveasim.read_layout reads the bundled layout of this name")
     _, found = format_of(path, FORMATS, "layout file")
     assert found.read is not None

@@ -7,18 +7,18 @@ from pathlib import Path
 
 from foveasim.errors import FileError
 
-__all__ = ["layout_path", "shipped_layouts"]
+__all__ = ["bundled_layouts", "layout_path"]
 
 
-def shipped_layouts() -> dict[str, Path]:
+def bundled_layouts() -> dict[str, Path]:
     """Return the files of the bundled layouts by name: real sensors and those of the paper."""
     package = Path(__file__).parents[2]
     # They are inside an installed package, and next to the package in a repository checkout.
-    folder = next(place / "layouts" for place in (package, package.parent) if (place / "layouts").is_dir())
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    directory = next(root / "layouts" for root in (package, package.parent) if (root / "layouts").is_dir())
+    return {path.stem: path for path in sorted(directory.glob("*.yaml"))}
 
 
-def layout_path(name: str | Path, folder: str | Path = ".") -> Path:
+def layout_path(name: str | Path, directory: str | Path = ".") -> Path:
     """
     Return the file of a layout, from its path or from the name of a bundled layout.
 
@@ -26,7 +26,7 @@ def layout_path(name: str | Path, folder: str | Path = ".") -> Path:
     ----------
     name : path or str
         A file in the directory takes precedence over a bundled layout of the same name.
-    folder : path
+    directory : path
         Directory of relative paths; the working directory by default.
 
     Raises
@@ -34,8 +34,8 @@ def layout_path(name: str | Path, folder: str | Path = ".") -> Path:
     FileError
         When a name without extension is neither; the message contains the closest name and all names.
     """
-    file = Path(folder) / name
-    bundled = shipped_layouts()
+    file = Path(directory) / name
+    bundled = bundled_layouts()
     if file.is_file() or Path(name).name != str(name):
         return file
     if str(name) in bundled:

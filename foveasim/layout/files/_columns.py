@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from foveasim._core.validation import Bools, exact_integers
 from foveasim.layout.model import Layout
 
-__all__ = ["CHANNEL", "MAX_COLUMN_BYTES", "column_strings", "columns_of", "kept_columns"]
+__all__ = ["CHANNEL", "MAX_COLUMN_BYTES", "column_strings", "parse_columns", "storable_columns"]
 
 #: Column that GDSII and OASIS store as the datatype.
 CHANNEL = "channel"
 #: Maximum number of columns of a file.
 MAX_COLUMNS = 64
 #: Default limit of distinct strings in a column, above the number of sites of any layout.
-MAX_TEXTS = 2**62
+MAX_STRINGS = 2**62
 #: Maximum number of distinct key sets in a file; more do not form columns.
 MAX_KINDS = 64
 #: Memory limit of a column: in a small file, a repeated cell with long strings could require more than all outlines.
@@ -37,7 +37,7 @@ MAX_COLUMN_BYTES = 2**28
 PLAIN_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.:-]*")
 #: Escapes of blanks and equal signs in quoted strings.
 ESCAPES = str.maketrans({" ": "\\u0020", "=": "\\u003d"})
-TRUTHS = {b"true": True, b"false": False}
+BOOLEANS = {b"true": True, b"false": False}
 QUOTED = re.compile(rb'"(?:[^"\\]|\\.)*"')
 _VALUE = re.compile(rb"=\S*")
 
@@ -45,8 +45,8 @@ _VALUE = re.compile(rb"=\S*")
 # -- writing ----------------------------------------------------------------------------------------------------------
 
 
-def kept_columns(
-    layout: Layout, max_chars: int, max_texts: int = MAX_TEXTS
+def storable_columns(
+    layout: Layout, max_chars: int, max_strings: int = MAX_STRINGS
 ) -> tuple[dict[str, list[Any]], tuple[str, ...]]:
     """
     Return the columns that fit into one string per site, except the channel.
@@ -56,36 +56,36 @@ def kept_columns(
     layout : Layout
     max_chars : int
         Maximum length of a string.
-    max_texts : int
+    max_strings : int
         Maximum number of distinct string values of a column.
 
     Returns
     -------
-    kept : dict of str to list
+    stored : dict of str to list
         Values by key: integers, floating-point numbers, and strings.
-    lost : tuple of str
+    dropped : tuple of str
         Names of the dropped columns, sorted.
     """
-    kept: dict[str, list[Any]] = {}
-    lost = []
+    stored: dict[str, list[Any]] = {}
+    dropped = []
     n_chars = np.full(layout.n_sites, -1)
     for name, column in layout.columns.items():
         if name == CHANNEL:
             continue
-        values = _values(column) if layout.n_sites and len(kept) < MAX_COLUMNS else None
+        values = _values(column) if layout.n_sites and len(stored) < MAX_COLUMNS else None
         if values is not None:
-            key = name if PLAIN_NAME.fullmatch(name) else _quoted(name)
+            key = name if PLAIN_NAME.fullmatch(name) else _quote(name)
             longer = n_chars + len(key) + 2 + np.fromiter(map(len, map(str, values)), np.int64, len(values))
-            if longer.max() <= max_chars and len({v for v in values if isinstance(v, str)}) <= max_texts:
-                kept[key], n_chars = values, longer
+            if longer.max() <= max_chars and len({v for v in values if isinstance(v, str)}) <= max_strings:
+                stored[key], n_chars = values, longer
                 continue
-        lost.append(name)
-    return kept, tuple(sorted(lost))
+        dropped.append(name)
+    return stored, tuple(sorted(dropped))
 
 
-def column_strings(kept: dict[str, list[Any]]) -> list[str]:
+def column_strings(stored: dict[str, list[Any]]) -> list[str]:
     """Return the string of each site."""
-    words = [[f"{key}={value}" for value in values] for key, values in kept.items()]
+    words = [[f"{key}={value}" for value in values] for key, values in stored.items()]
     return list(map(" ".join, zip(*words, strict=True)))
 
 
@@ -95,7 +95,7 @@ def _values(column: NDArray[Any]) -> list[Any] | None:
     if kind == "b":
         return np.where(column, "true", "false").tolist()
     if kind == "U":
-        return [_quoted(text) for text in column.tolist()]
+        return [_quote(text) for text in column.tolist()]
     if kind not in "iuf" or column.dtype.itemsize > 8:
         return None
     numbers = column if kind in "iu" else column.astype(np.float64)
@@ -120,63 +120,63 @@ def _is_exact_in_oasis(numbers: NDArray[Any]) -> Bools:
     return np.asarray(~is_other & ~np.isinf(numbers) & ~((numbers == 0.0) & np.signbit(numbers)))
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     return json.dumps(text).translate(ESCAPES)
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
 
 
-def columns_of(texts: bytes) -> dict[str, NDArray[Any]]:
+def parse_columns(lines: bytes) -> dict[str, NDArray[Any]]:
     """
     Return the columns that every string contains.
 
     Parameters
     ----------
-    texts : bytes
+    lines : bytes
         One string per line, in printable ASCII; untrusted.
     """
     columns: dict[str, NDArray[Any]] = {}
-    for key, values in (_values_of_like_texts(texts) or _values_of_texts(texts)).items():
+    for key, values in (_parse_uniform_lines(lines) or _parse_mixed_lines(lines)).items():
         name, column = _name(key), _column(values)
         if name is not None and column is not None and name != CHANNEL:
             columns[name] = column
     return columns
 
 
-def _values_of_like_texts(texts: bytes) -> dict[bytes, Sequence[bytes]]:
+def _parse_uniform_lines(lines: bytes) -> dict[bytes, Sequence[bytes]]:
     """
     Return values by key where all strings have the same keys, else an empty dict.
 
     Strings that foveasim wrote have the same keys.
     """
-    keys = [word.partition(b"=")[0] for word in texts.split(b"\n", 1)[0].split()]
+    keys = [word.partition(b"=")[0] for word in lines.split(b"\n", 1)[0].split()]
     if len({*keys}) != len(keys) or len(keys) > MAX_COLUMNS:
         return {}
     # With the additional empty group, findall returns tuples even for a single key.
-    text = rb" ".join(re.escape(key) + rb"=(\S*)" for key in keys) + rb"()"
-    rows = re.findall(b"^" + text + b"$", texts, re.MULTILINE)
-    return dict(zip(keys, zip(*rows, strict=True), strict=False)) if len(rows) == texts.count(b"\n") + 1 else {}
+    pattern = rb" ".join(re.escape(key) + rb"=(\S*)" for key in keys) + rb"()"
+    rows = re.findall(b"^" + pattern + b"$", lines, re.MULTILINE)
+    return dict(zip(keys, zip(*rows, strict=True), strict=False)) if len(rows) == lines.count(b"\n") + 1 else {}
 
 
-def _values_of_texts(texts: bytes) -> dict[bytes, Sequence[bytes]]:
+def _parse_mixed_lines(lines: bytes) -> dict[bytes, Sequence[bytes]]:
     """Return the values of the keys that every string contains exactly once."""
-    keys_of_text = _VALUE.sub(b"", texts).split(b"\n")
-    kinds = {keys: i for i, keys in enumerate(dict.fromkeys(keys_of_text))}
+    keys_of_line = _VALUE.sub(b"", lines).split(b"\n")
+    kinds = {keys: i for i, keys in enumerate(dict.fromkeys(keys_of_line))}
     if len(kinds) > MAX_KINDS:
         return {}
     keys_of_kind = [keys.split() for keys in kinds]
-    kind = np.fromiter(map(kinds.__getitem__, keys_of_text), np.int64, len(keys_of_text))
+    kind = np.fromiter(map(kinds.__getitem__, keys_of_line), np.int64, len(keys_of_line))
     n_words = np.array([len(keys) for keys in keys_of_kind])[kind]
-    words = texts.split()
+    words = lines.split()
     if n_words.sum() != len(words):
         return {}
     first = np.cumsum(n_words) - n_words
     values: dict[bytes, Sequence[bytes]] = {}
     for key in keys_of_kind[0][:MAX_COLUMNS]:
         if all(keys.count(key) == 1 for keys in keys_of_kind):
-            at = first + np.array([keys.index(key) for keys in keys_of_kind])[kind]
-            values[key] = [words[i][len(key) + 1 :] for i in at.tolist()]
+            index = first + np.array([keys.index(key) for keys in keys_of_kind])[kind]
+            values[key] = [words[i][len(key) + 1 :] for i in index.tolist()]
     return values
 
 
@@ -193,10 +193,10 @@ def _name(key: bytes) -> str | None:
 def _column(values: Sequence[bytes]) -> NDArray[Any] | None:
     """Return the values as an array, or None for values of several types."""
     try:
-        if values[0] in TRUTHS:
-            return np.array([TRUTHS[value] for value in values])
+        if values[0] in BOOLEANS:
+            return np.array([BOOLEANS[value] for value in values])
         if values[0].startswith(b'"'):
-            return _texts(values)
+            return _strings(values)
         return _numbers(values)
     except (KeyError, ValueError, OverflowError):
         return None
@@ -209,8 +209,8 @@ def _numbers(values: Sequence[bytes]) -> NDArray[Any] | None:
         return np.array(list(map(float, values)))
 
 
-def _texts(values: Sequence[bytes]) -> NDArray[Any] | None:
+def _strings(values: Sequence[bytes]) -> NDArray[Any] | None:
     if not all(map(QUOTED.fullmatch, values)):
         return None
-    texts = json.loads(b"[" + b",".join(values) + b"]")
-    return np.array(texts) if 4 * max(map(len, texts)) * len(texts) <= MAX_COLUMN_BYTES else None
+    strings = json.loads(b"[" + b",".join(values) + b"]")
+    return np.array(strings) if 4 * max(map(len, strings)) * len(strings) <= MAX_COLUMN_BYTES else None

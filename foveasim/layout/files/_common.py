@@ -21,15 +21,15 @@ __all__ = [
     "WrittenLayout",
     "check_decompressed",
     "check_header",
-    "check_sites_of",
+    "check_site_count",
     "check_sizes",
-    "checked_layout",
     "header",
-    "lossless",
+    "layout_from_untrusted",
+    "lossless_report",
     "max_decompressed_bytes",
-    "restored_column",
-    "rounding",
-    "texts",
+    "restore_column",
+    "rounding_report",
+    "string_column",
 ]
 
 #: Identifier in every file that contains columns and provenance.
@@ -37,9 +37,9 @@ FILE_FORMAT = "foveasim layout"
 FILE_VERSION = 1
 MAX_DECOMPRESSED_BYTES = 8 * 2**30
 #: Maximum decompressed size of a small file, and per byte of a larger one (regular grids: 30 bytes per byte).
-MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE = 2**26, 128
+MIN_DECOMPRESSED_BYTES, DECOMPRESSED_PER_BYTE = 2**26, 128
 #: A string column requires the memory of its longest string in every row: maximum, and maximum per character.
-MIN_TEXT_BYTES, TEXT_BYTES_PER_LETTER = 2**28, 64
+MIN_STRING_BYTES, STRING_BYTES_PER_CHAR = 2**28, 64
 #: Rings and edges of a site are tested in pairs for intersection: maximum number of pairs, and maximum per ring or vertex.
 MAX_RING_PAIRS, PAIRS_PER_RING = 2_000_000, 100
 MAX_VERTEX_PAIRS, PAIRS_PER_VERTEX = 1_000_000_000, 1000
@@ -73,7 +73,7 @@ class WrittenLayout:
     dropped_columns: tuple[str, ...]
 
 
-def lossless(layout: Layout, path: Path, dropped_columns: tuple[str, ...] = ()) -> WrittenLayout:
+def lossless_report(layout: Layout, path: Path, dropped_columns: tuple[str, ...] = ()) -> WrittenLayout:
     """Return the report of a lossless format."""
     return WrittenLayout(
         path=path,
@@ -84,17 +84,19 @@ def lossless(layout: Layout, path: Path, dropped_columns: tuple[str, ...] = ()) 
     )
 
 
-def rounding(layout: Layout, rounded_um: Floats, path: Path, dropped_columns: tuple[str, ...] = ()) -> WrittenLayout:
+def rounding_report(
+    layout: Layout, rounded_um: Floats, path: Path, dropped_columns: tuple[str, ...] = ()
+) -> WrittenLayout:
     """Return the report of a format with rounded vertices and dropped columns."""
     if layout.n_sites == 0:
-        return lossless(layout, path, dropped_columns)
-    move_um = np.hypot(*(rounded_um - layout.xy_um).T)
+        return lossless_report(layout, path, dropped_columns)
+    displacement_um = np.hypot(*(rounded_um - layout.xy_um).T)
     area_um2 = layout.area_um2
     error = site_area_um2(rounded_um, layout.ring_offsets, layout.site_offsets) / area_um2 - 1.0
     return WrittenLayout(
         path=path,
         n_sites=layout.n_sites,
-        max_displacement_um=float(move_um.max()),
+        max_displacement_um=float(displacement_um.max()),
         worst_area_error=float(np.abs(error).max()),
         dropped_columns=dropped_columns,
     )
@@ -102,7 +104,7 @@ def rounding(layout: Layout, rounded_um: Floats, path: Path, dropped_columns: tu
 
 def max_decompressed_bytes(path: Path) -> int:
     """Return the maximum decompressed size of a file in bytes, which depends on its size."""
-    return min(MIN_UNPACKED_BYTES + UNPACKED_PER_BYTE * path.stat().st_size, MAX_DECOMPRESSED_BYTES)
+    return min(MIN_DECOMPRESSED_BYTES + DECOMPRESSED_PER_BYTE * path.stat().st_size, MAX_DECOMPRESSED_BYTES)
 
 
 def check_decompressed(path: Path, n_bytes: int) -> None:
@@ -118,7 +120,7 @@ def check_decompressed(path: Path, n_bytes: int) -> None:
         raise FileError(path, f"would decompress to more than the maximum of {max_decompressed_bytes(path)} bytes")
 
 
-def check_sites_of(path: Path, n_sites: int) -> None:
+def check_site_count(path: Path, n_sites: int) -> None:
     """
     Reject a file with too many sites.
 
@@ -142,16 +144,16 @@ def check_sizes(n_rings: NDArray[Any], n_vertices: NDArray[Any]) -> None:
     GeometryError
         When the number of pairs of rings or vertices exceeds the limit.
     """
-    for what, n, at_most, more in (
+    for what, n, at_most, at_most_per_item in (
         ("rings", n_rings, MAX_RING_PAIRS, PAIRS_PER_RING),
         ("vertices", n_vertices, MAX_VERTEX_PAIRS, PAIRS_PER_VERTEX),
     ):
-        if np.sum(n.astype(np.float64) ** 2) > at_most + more * n.sum():
+        if np.sum(n.astype(np.float64) ** 2) > at_most + at_most_per_item * n.sum():
             site = int(np.argmax(n))
             raise GeometryError(f"site {site} has {n[site]} {what}, too many for a photosite", (site,))
 
 
-def checked_layout(
+def layout_from_untrusted(
     polygons: NDArray[Any] | tuple[NDArray[Any], NDArray[Any], NDArray[Any]],
     columns: Mapping[str, NDArray[Any]],
     provenance: Mapping[str, Any],
@@ -170,7 +172,7 @@ def checked_layout(
     else:
         check_sizes(shapely.get_num_interior_rings(polygons) + 1, shapely.get_num_coordinates(polygons))
     bare = Layout.from_polygons(polygons)
-    return Layout._derived(bare.xy_um, bare.ring_offsets, bare.site_offsets, columns, provenance)  # noqa: SLF001
+    return Layout._from_checked(bare.xy_um, bare.ring_offsets, bare.site_offsets, columns, provenance)  # noqa: SLF001
 
 
 # -- provenance and types of columns in the file ----------------------------------------------------------------------
@@ -222,17 +224,17 @@ def plain_columns(layout: Layout, format_name: str) -> dict[str, NDArray[Any]]:
     return dict(layout.columns)
 
 
-def dtype_text(layout: Layout) -> dict[str, str]:
+def dtype_strings(layout: Layout) -> dict[str, str]:
     """Return the type of each column as a string, such as ``<i8``."""
     return {name: column.dtype.str for name, column in layout.columns.items()}
 
 
-def restored_column(values: NDArray[Any], dtype: object) -> NDArray[Any]:
+def restore_column(values: NDArray[Any], dtype: object) -> NDArray[Any]:
     """Return a column in the type that the file specifies, where the conversion is exact."""
     if not isinstance(dtype, str) or len(dtype) > 16 or dtype[1:2] not in PLAIN_KINDS:
         return values
     try:
-        if np.dtype(dtype).itemsize * values.size > max(2 * values.nbytes, MIN_TEXT_BYTES):
+        if np.dtype(dtype).itemsize * values.size > max(2 * values.nbytes, MIN_STRING_BYTES):
             return values
         with np.errstate(all="ignore"):
             restored = values.astype(np.dtype(dtype))
@@ -245,8 +247,8 @@ def restored_column(values: NDArray[Any], dtype: object) -> NDArray[Any]:
     return restored if is_same and np.array_equal(again, values, equal_nan=is_floating) else values
 
 
-def texts(values: Sequence[str]) -> NDArray[Any] | None:
+def string_column(values: Sequence[str]) -> NDArray[Any] | None:
     """Return a string column, or None where a long string makes it exceed the memory limit."""
-    n_letters = list(map(len, values))
-    n_bytes = 4 * max(n_letters, default=0) * len(n_letters)
-    return np.array(values, dtype=str) if n_bytes <= MIN_TEXT_BYTES + TEXT_BYTES_PER_LETTER * sum(n_letters) else None
+    n_chars = list(map(len, values))
+    n_bytes = 4 * max(n_chars, default=0) * len(n_chars)
+    return np.array(values, dtype=str) if n_bytes <= MIN_STRING_BYTES + STRING_BYTES_PER_CHAR * sum(n_chars) else None

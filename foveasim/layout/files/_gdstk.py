@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 __all__ = ["FormatError", "read"]
 
 #: Prefix of cells that KLayout adds for its own metadata.
-KLAYOUT_NOTES = "$$$CONTEXT_INFO$$$"
+KLAYOUT_METADATA = "$$$CONTEXT_INFO$$$"
 #: Number of names in a message.
-SHOWN = 5
+MAX_LISTED = 5
 #: Memory in bytes per vertex and per polygon while cells are flattened: source, copies and concatenation.
 VERTEX_BYTES, POLYGON_BYTES = 48, 192
 #: Limit of the polygons copied between cells, as a multiple of the maximum number of sites.
-COPIES = 2
+MAX_COPY_RATIO = 2
 #: Attributes of the GDSII properties for the number of a photosite and for its columns.
 NUMBER_PROPERTY, COLUMNS_PROPERTY = 1, 2
 NUMBER = re.compile(r"photosite ([0-9]{1,9})(?: part ([0-9]{1,9}) of ([0-9]{1,9}))?\0*")
@@ -61,13 +61,13 @@ class Shapes:
         self.tags = tags
         self.n_placements = n
 
-    def placed(self, matrix: NDArray[np.float64], offsets: NDArray[np.float64]) -> Shapes:
+    def place(self, matrix: NDArray[np.float64], offsets: NDArray[np.float64]) -> Shapes:
         """Return copies at all offsets, transformed by the matrix."""
         import numpy as np
 
         k = len(offsets)
-        turned = self.xy @ matrix.T
-        xy = (turned[np.newaxis] + offsets[:, np.newaxis]).reshape(-1, 2)
+        transformed = self.xy @ matrix.T
+        xy = (transformed[np.newaxis] + offsets[:, np.newaxis]).reshape(-1, 2)
         tags = np.tile(self.tags, (k, 1))
         tags[:, 5] += np.repeat(np.arange(k) * self.n_placements, len(self.tags))
         return Shapes(xy, np.tile(self.counts, k), tags, k * self.n_placements)
@@ -123,7 +123,7 @@ def read(
     if not (math.isfinite(dbu_um) and 1e-9 <= dbu_um <= 1e3 and 1e-12 <= library.unit <= 1.0):
         raise FormatError(f"has the invalid database unit {dbu_um:g} µm")
     cells = {cell.name: cell for cell in library.cells}
-    top = _top(cells, cell)
+    top = _top_cell(cells, cell)
     order = _post_order(cells, top)
     _check_numbers(cells, order, max_sites, max_memory_bytes)
     # Memory and time of the following steps are bounded.
@@ -131,34 +131,34 @@ def read(
     limit("RLIMIT_CPU", max_cpu_s)
     flat: dict[str, Shapes] = {}
     lines: list[str] = []
-    last_use = {child: name for name in order for child in _held(cells, name)}
+    last_use = {child: name for name in order for child in _children(cells, name)}
     for name in order:
-        flat[name] = _flat(cells[name], flat, lines, library.unit * 1e6, dbu_um)
-        for child in _held(cells, name):
+        flat[name] = _flatten(cells[name], flat, lines, library.unit * 1e6, dbu_um)
+        for child in _children(cells, name):
             if last_use[child] == name:
                 del flat[child]
-    shapes = _on_one_layer(flat[top], layer)
-    text = _text_of_columns(shapes, lines, max_text_bytes)
+    shapes = _select_layer(flat[top], layer)
+    text = _column_lines(shapes, lines, max_text_bytes)
     return {"dbu_um": dbu_um, "cell": top}, [shapes.xy, shapes.counts, shapes.tags, text]
 
 
 # -- cells ------------------------------------------------------------------------------------------------------------
 
 
-def _top(cells: dict[str, Any], wanted: str | None) -> str:
+def _top_cell(cells: dict[str, Any], wanted: str | None) -> str:
     """Return the name of the cell to read."""
     if wanted is not None:
         if wanted not in cells:
-            raise FormatError(f"has no cell {wanted!r}; its cells are {_listed(cells)}")
+            raise FormatError(f"has no cell {wanted!r}; its cells are {_format_names(cells)}")
         return wanted
     below = {reference.cell_name for cell in cells.values() for reference in cell.references}
-    tops = [n for n, c in cells.items() if n not in below and not n.startswith(KLAYOUT_NOTES)]
+    tops = [n for n, c in cells.items() if n not in below and not n.startswith(KLAYOUT_METADATA)]
     if len(tops) > 1:
-        tops = [name for name in tops if _own(cells[name]) or cells[name].references] or tops[:1]
+        tops = [name for name in tops if _has_shapes(cells[name]) or cells[name].references] or tops[:1]
     if not tops:
         raise FormatError("has no top cell: it is empty, or its cells contain each other")
     if len(tops) > 1:
-        raise FormatError(f"has several top cells, {_listed(tops)}; select one with cell=")
+        raise FormatError(f"has several top cells, {_format_names(tops)}; select one with cell=")
     return tops[0]
 
 
@@ -166,23 +166,23 @@ def _post_order(cells: dict[str, Any], top: str) -> list[str]:
     """Return the names of a cell and its hierarchy, subcells before their parents."""
     order: list[str] = []
     is_open = {top: True}
-    stack: list[tuple[str, Iterator[str]]] = [(top, _held(cells, top))]
+    stack: list[tuple[str, Iterator[str]]] = [(top, _children(cells, top))]
     while stack:
-        name, held = stack[-1]
-        child = next(held, None)
+        name, children = stack[-1]
+        child = next(children, None)
         if child is None:
             stack.pop()
             order.append(name)
             is_open[name] = False
         elif child not in is_open:
             is_open[child] = True
-            stack.append((child, _held(cells, child)))
+            stack.append((child, _children(cells, child)))
         elif is_open[child]:
             raise FormatError(f"has a cell that contains itself, {child!r}")
     return order
 
 
-def _held(cells: dict[str, Any], name: str) -> Iterator[str]:
+def _children(cells: dict[str, Any], name: str) -> Iterator[str]:
     for child in dict.fromkeys(reference.cell_name for reference in cells[name].references):
         if child not in cells:
             raise FormatError(f"references the cell {child!r}, which it does not contain")
@@ -197,33 +197,33 @@ def _check_numbers(cells: dict[str, Any], order: list[str], max_sites: int, max_
     n_copied = 0
     for name in order:
         cell = cells[name]
-        references = [(r.cell_name, _times(r)) for r in cell.references]
-        own = sum(map(_times, cell.polygons)) + sum(map(_times, cell.paths))
+        references = [(r.cell_name, _n_copies(r)) for r in cell.references]
+        own = sum(map(_n_copies, cell.polygons)) + sum(map(_n_copies, cell.paths))
         n_polygons[name] = own + sum(k * n_polygons[c] for c, k in references)
         n_copied += n_polygons[name]
         # References to empty cells require time, too.
-        if max(n_polygons[name], sum(k for _, k in references)) > max_sites or n_copied > COPIES * max_sites:
+        if max(n_polygons[name], sum(k for _, k in references)) > max_sites or n_copied > MAX_COPY_RATIO * max_sites:
             raise FormatError(f"has more than the maximum of {max_sites} sites")
-        n_vertices[name] = _own_vertices(cell, max_vertices) + sum(k * n_vertices[c] for c, k in references)
+        n_vertices[name] = _count_vertices(cell, max_vertices) + sum(k * n_vertices[c] for c, k in references)
         if VERTEX_BYTES * n_vertices[name] + POLYGON_BYTES * n_polygons[name] > max_memory_bytes:
             raise FormatError("would flatten to more sites and vertices than the maximum for a file of its size")
 
 
-def _own_vertices(cell: Any, most: int) -> int:
+def _count_vertices(cell: Any, max_vertices: int) -> int:
     """
     Count the vertices of a cell's polygons and paths.
 
-    Counting stops when the number exceeds ``most``, as paths may have very many vertices.
+    Counting stops when the number exceeds ``max_vertices``, as paths may have very many vertices.
     """
-    n = sum(p.size * _times(p) for p in cell.polygons)
+    n = sum(p.size * _n_copies(p) for p in cell.polygons)
     for path in cell.paths:
-        if n > most:
+        if n > max_vertices:
             break
-        n += _times(path) * sum(p.size for p in path.to_polygons())
+        n += _n_copies(path) * sum(p.size for p in path.to_polygons())
     return n
 
 
-def _times(element: Any) -> int:
+def _n_copies(element: Any) -> int:
     """
     Return the number of repetitions of an element.
 
@@ -234,19 +234,19 @@ def _times(element: Any) -> int:
     return max(1, n)
 
 
-def _listed(names: Any) -> str:
+def _format_names(names: Any) -> str:
     shown = list(names)
-    return ", ".join(f"{n!r:.40}" for n in shown[:SHOWN]) + (", ..." if len(shown) > SHOWN else "")
+    return ", ".join(f"{n!r:.40}" for n in shown[:MAX_LISTED]) + (", ..." if len(shown) > MAX_LISTED else "")
 
 
 # -- shapes -----------------------------------------------------------------------------------------------------------
 
 
-def _own(cell: Any) -> bool:
+def _has_shapes(cell: Any) -> bool:
     return bool(cell.polygons or cell.paths)
 
 
-def _flat(cell: Any, flat: dict[str, Shapes], lines: list[str], unit_um: float, dbu_um: float) -> Shapes:
+def _flatten(cell: Any, flat: dict[str, Shapes], lines: list[str], unit_um: float, dbu_um: float) -> Shapes:
     """
     Return the polygons of a cell and its hierarchy, in database units.
 
@@ -262,9 +262,9 @@ def _flat(cell: Any, flat: dict[str, Shapes], lines: list[str], unit_um: float, 
         offsets = offsets if len(offsets) else np.zeros((1, 2))
         key = (r.cell_name, r.rotation or 0.0, r.magnification or 1.0, bool(r.x_reflection))
         groups.setdefault(key, []).append(np.asarray(r.origin) + offsets)
-    for (name, angle_rad, magnification, is_mirrored), places in groups.items():
-        matrix = _turn(angle_rad) @ np.diag([magnification, -magnification if is_mirrored else magnification])
-        copies = flat[name].placed(matrix, np.rint(np.concatenate(places) * (unit_um / dbu_um)))
+    for (name, angle_rad, magnification, is_mirrored), origins in groups.items():
+        matrix = _rotation(angle_rad) @ np.diag([magnification, -magnification if is_mirrored else magnification])
+        copies = flat[name].place(matrix, np.rint(np.concatenate(origins) * (unit_um / dbu_um)))
         copies.tags[:, 5] += n_placements
         n_placements += copies.n_placements
         parts.append(copies)
@@ -279,7 +279,7 @@ def _flat(cell: Any, flat: dict[str, Shapes], lines: list[str], unit_um: float, 
     )
 
 
-def _turn(angle_rad: float) -> NDArray[np.float64]:
+def _rotation(angle_rad: float) -> NDArray[np.float64]:
     """Return the matrix of a counter-clockwise rotation, exact for multiples of 90°."""
     import numpy as np
 
@@ -308,9 +308,9 @@ def _own_shapes(cell: Any, lines: list[str], unit_um: float, dbu_um: float) -> S
     xy *= unit_um / dbu_um
     np.rint(xy, out=xy)
     tags = np.array([(p.layer, p.datatype, *_site(p), 0, -1) for p in polygons], np.int64).reshape(-1, 7)
-    told = [_columns(p) for p in polygons]
-    tags[:, 6] = np.where(list(map(bool, told)), len(lines) + np.arange(len(told)), -1)
-    lines += told
+    strings = [_columns(p) for p in polygons]
+    tags[:, 6] = np.where(list(map(bool, strings)), len(lines) + np.arange(len(strings)), -1)
+    lines += strings
     return Shapes(xy, counts, tags, 1)
 
 
@@ -333,15 +333,15 @@ def _columns(polygon: Any) -> str:
         values = polygon.get_property("columns")
         if not values or len(values) % 2 or len(values) > MAX_WORDS:
             return ""
-        told = [v.decode("ascii", "replace") if isinstance(v, bytes) else str(v) for v in values]
-        text = " ".join(map("=".join, zip(told[::2], told[1::2], strict=True)))
+        words = [v.decode("ascii", "replace") if isinstance(v, bytes) else str(v) for v in values]
+        text = " ".join(map("=".join, zip(words[::2], words[1::2], strict=True)))
     if not isinstance(text, str):
         return ""
     text = text.rstrip("\0")
     return text if len(text) <= MAX_CHARS and text.isascii() and text.isprintable() else ""
 
 
-def _text_of_columns(shapes: Shapes, lines: list[str], max_bytes: int) -> NDArray[np.uint8]:
+def _column_lines(shapes: Shapes, lines: list[str], max_bytes: int) -> NDArray[np.uint8]:
     """
     Return the distinct column strings of the shapes, one per line.
 
@@ -349,26 +349,28 @@ def _text_of_columns(shapes: Shapes, lines: list[str], max_bytes: int) -> NDArra
     """
     import numpy as np
 
-    told, tags = np.unique(shapes.tags[:, 6], return_inverse=True)
+    used, tags = np.unique(shapes.tags[:, 6], return_inverse=True)
     shapes.tags[:, 6] = tags
-    if told.size == 0 or told[0] < 0:
+    if used.size == 0 or used[0] < 0:
         return np.zeros(0, np.uint8)
-    kept = lines if told.size == len(lines) else [lines[i] for i in told.tolist()]
-    n_bytes = sum(map(len, kept)) + len(kept)
-    return np.frombuffer("\n".join(kept).encode(), np.uint8) if n_bytes <= max_bytes else np.zeros(0, np.uint8)
+    used_lines = lines if used.size == len(lines) else [lines[i] for i in used.tolist()]
+    n_bytes = sum(map(len, used_lines)) + len(used_lines)
+    return np.frombuffer("\n".join(used_lines).encode(), np.uint8) if n_bytes <= max_bytes else np.zeros(0, np.uint8)
 
 
-def _on_one_layer(shapes: Shapes, wanted: int | None) -> Shapes:
+def _select_layer(shapes: Shapes, wanted: int | None) -> Shapes:
     """Return the polygons on the layer of the photosites."""
     import numpy as np
 
     layers = np.unique(shapes.tags[:, 0])
     if wanted is None and layers.size > 1:
-        raise FormatError(f"has shapes on several layers, {_listed(layers.tolist())}; select one with layer=")
+        raise FormatError(f"has shapes on several layers, {_format_names(layers.tolist())}; select one with layer=")
     if wanted is None or layers.tolist() == [wanted]:
         return shapes
     if wanted not in layers:
-        raise FormatError(f"has no shape on layer {wanted}; its layers with shapes are {_listed(layers.tolist())}")
+        raise FormatError(
+            f"has no shape on layer {wanted}; its layers with shapes are {_format_names(layers.tolist())}"
+        )
     is_wanted = shapes.tags[:, 0] == wanted
-    is_kept_vertex = np.repeat(is_wanted, shapes.counts)
-    return Shapes(shapes.xy[is_kept_vertex], shapes.counts[is_wanted], shapes.tags[is_wanted], shapes.n_placements)
+    is_selected_vertex = np.repeat(is_wanted, shapes.counts)
+    return Shapes(shapes.xy[is_selected_vertex], shapes.counts[is_wanted], shapes.tags[is_wanted], shapes.n_placements)

@@ -38,13 +38,13 @@ from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat, as_file_error
 from foveasim._io.sandbox import PATIENCE, run_in_sandbox
 from foveasim.errors import FileError, GeometryError, ParameterError
-from foveasim.layout.files._columns import MAX_COLUMN_BYTES, column_strings, columns_of, kept_columns
+from foveasim.layout.files._columns import MAX_COLUMN_BYTES, column_strings, parse_columns, storable_columns
 from foveasim.layout.files._common import (
     WrittenLayout,
-    check_sites_of,
+    check_site_count,
     check_sizes,
-    checked_layout,
-    rounding,
+    layout_from_untrusted,
+    rounding_report,
 )
 from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout, valid_sites
@@ -58,15 +58,15 @@ OASIS_MAGIC = b"%SEMI-OASIS\r\n"
 
 DEFAULT_DBU_UM = 1e-4
 #: Maximum layer and datatype: some programs read them as signed 16-bit integers.
-MAX_NUMBER = 32767
+MAX_LAYER = 32767
 #: Maximum vertices of a GDSII polygon, without the closing one: gdstk warns of incompatibility above 8,190 in total.
 MAX_GDS_VERTICES = 8189
 #: Maximum bytes of a GDSII property, and of all properties of a polygon, that all programs read.
-MAX_GDS_TEXT, MAX_GDS_PROPERTIES = 126, 128
+MAX_GDS_STRING, MAX_GDS_PROPERTIES = 126, 128
 #: Maximum bytes of the columns of a site in OASIS.
-MAX_OASIS_TEXT = 1024
+MAX_OASIS_STRING = 1024
 #: Comparisons in about a second: gdstk compares each string of an OASIS file with all previous distinct ones.
-OASIS_TEXT_STEPS = 4e8
+OASIS_STRING_COMPARISONS = 4e8
 #: Coordinates are signed 32-bit integers.
 MAX_DBU = 2**31 - 1
 #: Constant timestamp, for reproducible files.
@@ -76,7 +76,7 @@ CELL_NAME = "SENSOR"
 #: Limits of the sandbox process: memory while gdstk reads, and in total; column strings; time; larger for large files.
 MIN_READING_BYTES, READING_PER_BYTE = 2**30, 256
 MIN_MEMORY_BYTES, MEMORY_PER_BYTE, MAX_MEMORY_BYTES = 2**31, 256, 2**35
-MIN_TEXT_BYTES, TEXT_PER_BYTE = 2**27, 32
+MIN_STRING_BYTES, STRING_BYTES_PER_BYTE = 2**27, 32
 MAX_CPU_S, BYTES_PER_S = 5, 2**20
 #: GDSII record types by data type: none, bit array, 16-bit, 32-bit, 64-bit floating point, string.
 RECORDS_OF_TYPE = {
@@ -89,7 +89,7 @@ RECORDS_OF_TYPE = {
 }
 END_OF_LIBRARY = 0x0400
 #: Maximum number of vertices after noding an outline with slits, as a multiple of its own.
-MAX_STOPS = 16
+MAX_NODING_RATIO = 16
 #: OASIS: size and type of the END record, which ends the file, and number of the validation scheme CRC-32.
 OASIS_END_BYTES = 256
 OASIS_END = 2
@@ -113,18 +113,18 @@ def write(layout: Layout, path: Path, *, layer: int = 1, dbu_um: float = DEFAULT
         When gdstk is not installed, or the file cannot be written.
     """
     gdstk = _gdstk(path)
-    layer = check_count("layer", layer, at_least=0, at_most=MAX_NUMBER)
+    layer = check_count("layer", layer, at_least=0, at_most=MAX_LAYER)
     dbu_um = check_number("dbu_um", dbu_um, at_least=1e-9, at_most=1e3)
     channel = layout.channel
-    if channel.size and channel.max() > MAX_NUMBER:
-        raise ParameterError("channel", f"must be <= {MAX_NUMBER} in GDSII and OASIS", int(channel.max()))
+    if channel.size and channel.max() > MAX_LAYER:
+        raise ParameterError("channel", f"must be <= {MAX_LAYER} in GDSII and OASIS", int(channel.max()))
     is_oasis = path.suffix.lower() in (".oas", ".oasis")
-    snapped = _snapped(layout, dbu_um)
-    report = rounding(layout, snapped.xy_um, path)
-    site, part, n_parts, rings_um = _pieces(snapped, None if is_oasis else MAX_GDS_VERTICES)
+    snapped = _snap_to_grid(layout, dbu_um)
+    report = rounding_report(layout, snapped.xy_um, path)
+    site, part, n_parts, rings_um = _hole_free_rings(snapped, None if is_oasis else MAX_GDS_VERTICES)
     polygons = [gdstk.Polygon(r, layer, c) for r, c in zip(rings_um, channel[site].tolist(), strict=True)]
     set_properties = _set_oasis_properties if is_oasis else _set_gds_properties
-    lost = set_properties(polygons, layout, site.tolist(), part.tolist(), n_parts.tolist())
+    dropped = set_properties(polygons, layout, site.tolist(), part.tolist(), n_parts.tolist())
     library = gdstk.Library("FOVEASIM", unit=1e-6, precision=dbu_um * 1e-6)
     library.new_cell(CELL_NAME).add(*polygons)
     with atomic_write(path) as temporary:
@@ -132,8 +132,8 @@ def write(layout: Layout, path: Path, *, layer: int = 1, dbu_um: float = DEFAULT
             library.write_oas(temporary, validation="crc32")
         else:
             library.write_gds(temporary, max_points=0, timestamp=TIMESTAMP)
-        _check_end(temporary, is_oasis)
-    return replace(report, dropped_columns=lost)
+        _check_complete(temporary, is_oasis)
+    return replace(report, dropped_columns=dropped)
 
 
 def _set_gds_properties(
@@ -145,29 +145,31 @@ def _set_gds_properties(
         for s, k, n in zip(site, part, n_parts, strict=True)
     ]
     longest = max(map(len, numbers), default=0)
-    kept, lost = kept_columns(layout, min(MAX_GDS_TEXT, MAX_GDS_PROPERTIES - longest - longest % 2))
-    texts = column_strings(kept)
-    if texts:
+    columns, dropped = storable_columns(layout, min(MAX_GDS_STRING, MAX_GDS_PROPERTIES - longest - longest % 2))
+    strings = column_strings(columns)
+    if strings:
         # gdstk writes properties in reverse order of setting.
         for polygon, s in zip(polygons, site, strict=True):
-            polygon.set_gds_property(2, texts[s])
+            polygon.set_gds_property(2, strings[s])
     for polygon, number in zip(polygons, numbers, strict=True):
         polygon.set_gds_property(1, number)
-    return lost
+    return dropped
 
 
 def _set_oasis_properties(
     polygons: list[Any], layout: Layout, site: list[int], part: list[int], n_parts: list[int]
 ) -> tuple[str, ...]:
     """Set the number and columns of each polygon's site; return the dropped columns."""
-    kept, lost = kept_columns(layout, MAX_OASIS_TEXT, int(OASIS_TEXT_STEPS // max(len(polygons), 1)))
-    rows = list(zip(*chain.from_iterable((repeat(key), values) for key, values in kept.items()), strict=False))
+    columns, dropped = storable_columns(
+        layout, MAX_OASIS_STRING, int(OASIS_STRING_COMPARISONS // max(len(polygons), 1))
+    )
+    rows = list(zip(*chain.from_iterable((repeat(key), values) for key, values in columns.items()), strict=False))
     if rows:
         for polygon, s in zip(polygons, site, strict=True):
             polygon.set_property("columns", rows[s])
     for polygon, s, k, n in zip(polygons, site, part, n_parts, strict=True):
         polygon.set_property("photosite", [s] if n == 0 else [s, k, n])
-    return lost
+    return dropped
 
 
 def _gdstk(path: Path) -> Any:
@@ -178,14 +180,14 @@ def _gdstk(path: Path) -> Any:
     return gdstk
 
 
-def _in_um(xy_dbu: NDArray[Any], dbu_um: float) -> Floats:
+def _to_um(xy_dbu: NDArray[Any], dbu_um: float) -> Floats:
     """Convert to µm; correctly rounded where 1 µm is an integer number of database units."""
     per_um = round(1.0 / dbu_um)
-    is_whole = per_um >= 1 and abs(per_um * dbu_um - 1.0) < 1e-12
-    return np.asarray(xy_dbu / per_um if is_whole else xy_dbu * dbu_um, dtype=np.float64)
+    is_integer = per_um >= 1 and abs(per_um * dbu_um - 1.0) < 1e-12
+    return np.asarray(xy_dbu / per_um if is_integer else xy_dbu * dbu_um, dtype=np.float64)
 
 
-def _snapped(layout: Layout, dbu_um: float) -> Layout:
+def _snap_to_grid(layout: Layout, dbu_um: float) -> Layout:
     """Round the vertices of a layout to the database grid, and check the photosites."""
     xy_dbu = np.rint(layout.xy_um / dbu_um)
     if xy_dbu.size and np.abs(xy_dbu).max() > MAX_DBU:
@@ -193,7 +195,7 @@ def _snapped(layout: Layout, dbu_um: float) -> Layout:
             "dbu_um", f"must be >= {np.abs(layout.xy_um).max() / MAX_DBU:.3g} for this layout", dbu_um, "µm"
         )
     # The holes are checked below.
-    snapped = Layout._derived(_in_um(xy_dbu, dbu_um), layout.ring_offsets, layout.site_offsets, {}, {})  # noqa: SLF001
+    snapped = Layout._from_checked(_to_um(xy_dbu, dbu_um), layout.ring_offsets, layout.site_offsets, {}, {})  # noqa: SLF001
     if layout.n_sites:
         area_um2 = ring_moments(snapped.xy_um, snapped.ring_offsets)[0]
         is_hole = np.ones(area_um2.size, bool)
@@ -210,18 +212,18 @@ def _snapped(layout: Layout, dbu_um: float) -> Layout:
     return snapped
 
 
-def _check_end(path: Path, is_oasis: bool) -> None:
+def _check_complete(path: Path, is_oasis: bool) -> None:
     """Check that a file is complete, as gdstk does not report a full disk."""
     data = path.read_bytes()[-OASIS_END_BYTES:]
-    is_whole = data[:1] == bytes([OASIS_END]) if is_oasis else data[-4:] == b"\x00\x04\x04\x00"
-    if not is_whole:
+    is_complete = data[:1] == bytes([OASIS_END]) if is_oasis else data[-4:] == b"\x00\x04\x04\x00"
+    if not is_complete:
         raise OSError("the written file is incomplete")
 
 
 # -- sites as polygons without holes ----------------------------------------------------------------------------------
 
 
-def _pieces(layout: Layout, max_vertices: int | None) -> tuple[Ints, Ints, Ints, list[Floats]]:
+def _hole_free_rings(layout: Layout, max_vertices: int | None) -> tuple[Ints, Ints, Ints, list[Floats]]:
     """
     Return hole-free rings of all sites, in their order.
 
@@ -249,7 +251,7 @@ def _pieces(layout: Layout, max_vertices: int | None) -> tuple[Ints, Ints, Ints,
     n_rings = np.maximum(n_parts, 1)
     site = np.repeat(np.arange(layout.n_sites), n_rings)
     part = positions_in_runs(n_rings) + 1
-    pieces = [ring for s, whole in enumerate(rings_um) for ring in parts_of.get(s, [whole])]
+    pieces = [ring for s, undivided in enumerate(rings_um) for ring in parts_of.get(s, [undivided])]
     return site, np.where(n_parts[site] > 0, part, 0), n_parts[site], pieces
 
 
@@ -266,23 +268,23 @@ def _hole_free_parts(polygon: Any, max_vertices: int | None) -> list[Floats]:
     corners = shapely.get_coordinates(shapely.normalize(triangles)).reshape(-1, 4, 2)[:, :3]
     points, ids = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
     corner_ids = ids.reshape(-1, 3).tolist()
-    beside: dict[tuple[int, int], list[int]] = {}
+    neighbours: dict[tuple[int, int], list[int]] = {}
     for t, (a, b, c) in enumerate(corner_ids):
         for u, v in ((a, b), (b, c), (c, a)):
-            beside.setdefault((min(u, v), max(u, v)), []).append(t)
+            neighbours.setdefault((min(u, v), max(u, v)), []).append(t)
     is_free = [True] * len(corner_ids)
     parts = []
     for first in range(len(corner_ids)):
         if is_free[first]:
             is_free[first] = False
-            parts.append(points[_grown(first, corner_ids, beside, is_free, max_vertices)])
+            parts.append(points[_grow_part(first, corner_ids, neighbours, is_free, max_vertices)])
     return parts
 
 
-def _grown(
+def _grow_part(
     first: int,
     corner_ids: list[list[int]],
-    beside: dict[tuple[int, int], list[int]],
+    neighbours: dict[tuple[int, int], list[int]],
     is_free: list[bool],
     max_vertices: int | None,
 ) -> list[int]:
@@ -291,7 +293,7 @@ def _grown(
     edges = list(after.items())
     while edges and (max_vertices is None or len(after) < max_vertices):
         u, v = edges.pop()
-        for t in beside[min(u, v), max(u, v)]:
+        for t in neighbours[min(u, v), max(u, v)]:
             apex = next(w for w in corner_ids[t] if w not in (u, v))
             if is_free[t] and apex not in after:
                 is_free[t] = False
@@ -329,11 +331,11 @@ def read(path: Path, *, layer: int | None = None, cell: str | None = None) -> La
         (_check_oasis if is_oasis else _check_records)(path, data)
         n_bytes = len(data)
         del data
-        answer, xy_dbu, counts, tags, texts = _isolated(path, is_oasis, layer, cell, n_bytes)
-        check_sites_of(path, counts.size)
-        xy_um = _in_um(xy_dbu, answer["dbu_um"])
-        pieces, piece, first = _sites(path, xy_um, counts, tags)
-        columns = {"channel": tags[piece[first], 1], **_columns(texts, tags[piece, 6], first)}
+        answer, xy_dbu, counts, tags, lines = _read_in_sandbox(path, is_oasis, layer, cell, n_bytes)
+        check_site_count(path, counts.size)
+        xy_um = _to_um(xy_dbu, answer["dbu_um"])
+        pieces, piece, first = _group_by_site(path, xy_um, counts, tags)
+        columns = {"channel": tags[piece[first], 1], **_columns(lines, tags[piece, 6], first)}
         about = {
             "made_by": "read_layout",
             "file": path.name,
@@ -342,12 +344,12 @@ def read(path: Path, *, layer: int | None = None, cell: str | None = None) -> La
             "dbu_um": float(f"{answer['dbu_um']:.12g}"),
         }
         check_sizes(np.ones(counts.size), counts)
-        is_whole = first.size == piece.size
+        is_undivided = first.size == piece.size
         packed = (pieces.xy_um, pieces.ring_offsets, pieces.site_offsets)
         try:
-            return checked_layout(packed if is_whole else _outlines(pieces, first), columns, about)
+            return layout_from_untrusted(packed if is_undivided else _merge_parts(pieces, first), columns, about)
         except GeometryError:
-            return checked_layout(_without_keyholes(_outlines(pieces, first)), columns, about)
+            return layout_from_untrusted(_without_keyholes(_merge_parts(pieces, first)), columns, about)
 
 
 def _check_records(path: Path, data: bytes) -> None:
@@ -375,7 +377,7 @@ def _check_oasis(path: Path, data: bytes) -> None:
         raise FileError(path, "is corrupt: its CRC-32 does not match its content")
 
 
-def _isolated(
+def _read_in_sandbox(
     path: Path, is_oasis: bool, layer: int | None, cell: str | None, n_bytes: int
 ) -> tuple[dict[str, Any], Floats, Ints, Ints, bytes]:
     """Read the file with gdstk in the sandbox process, which a malformed file may crash."""
@@ -389,10 +391,10 @@ def _isolated(
         "cell": cell,
         "max_sites": MAX_SITES,
         "max_memory_bytes": max_memory_bytes,
-        "max_text_bytes": max(MIN_TEXT_BYTES, TEXT_PER_BYTE * n_bytes),
+        "max_text_bytes": max(MIN_STRING_BYTES, STRING_BYTES_PER_BYTE * n_bytes),
         "max_cpu_s": PATIENCE * max_cpu_s,
     }
-    told, (xy_dbu, counts, tags, texts) = run_in_sandbox(
+    answer, (xy_dbu, counts, tags, lines) = run_in_sandbox(
         _gdstk.read,
         path,
         args,
@@ -401,10 +403,10 @@ def _isolated(
         max_bytes=min(MIN_READING_BYTES + READING_PER_BYTE * n_bytes, max_memory_bytes),
         is_standalone=True,
     )
-    return told, xy_dbu, counts, tags, texts.tobytes()
+    return answer, xy_dbu, counts, tags, lines.tobytes()
 
 
-def _sites(path: Path, xy_um: Floats, counts: Ints, tags: Ints) -> tuple[Layout, Ints, Ints]:
+def _group_by_site(path: Path, xy_um: Floats, counts: Ints, tags: Ints) -> tuple[Layout, Ints, Ints]:
     """
     Sort the polygons of the file by site number, and group the parts of divided sites.
 
@@ -440,30 +442,30 @@ def _sites(path: Path, xy_um: Floats, counts: Ints, tags: Ints) -> tuple[Layout,
     return pieces, order, first
 
 
-def _outlines(pieces: Layout, first: Ints) -> NDArray[Any]:
+def _merge_parts(pieces: Layout, first: Ints) -> NDArray[Any]:
     """Merge the pieces of each site into one polygon."""
     polygons = pieces.polygons()
-    whole = polygons[first]
+    merged = polygons[first]
     size = np.diff(np.append(first, polygons.size))
     for i in np.flatnonzero(size > 1):
-        whole[i] = shapely.coverage_union_all(polygons[first[i] : first[i] + size[i]])
-    return whole
+        merged[i] = shapely.coverage_union_all(polygons[first[i] : first[i] + size[i]])
+    return merged
 
 
-def _columns(texts: bytes, line: Ints, first: Ints) -> dict[str, NDArray[Any]]:
+def _columns(lines: bytes, line: Ints, first: Ints) -> dict[str, NDArray[Any]]:
     """
     Return the columns with a value for all pieces, equal for all pieces of a site.
 
-    ``line`` is the line of each piece in ``texts``.
+    ``line`` is the line of each piece in ``lines``.
     """
     columns = {}
     size = np.diff(np.append(first, line.size))
-    for name, told in columns_of(texts).items() if texts else ():
-        if told.itemsize * line.size > MAX_COLUMN_BYTES:
+    for name, values in parse_columns(lines).items() if lines else ():
+        if values.itemsize * line.size > MAX_COLUMN_BYTES:
             continue
-        pieces = told[line]
+        pieces = values[line]
         column = pieces[first]
-        if np.array_equal(np.repeat(column, size), pieces, equal_nan=told.dtype.kind == "f"):
+        if np.array_equal(np.repeat(column, size), pieces, equal_nan=values.dtype.kind == "f"):
             columns[name] = column
     return columns
 
@@ -474,75 +476,75 @@ def _without_keyholes(polygons: NDArray[Any]) -> NDArray[Any]:
 
     Other programs write holes as keyholes: the outline reaches the hole through a slit of zero width.
     """
-    walks = np.flatnonzero(~shapely.is_valid(polygons) & (shapely.get_num_interior_rings(polygons) == 0))
-    mended = np.full(len(polygons), None)
-    for i in walks:
-        mended[i] = _of_loops(
-            _loops(_with_all_vertices(list(map(tuple, shapely.get_coordinates(polygons[i]).tolist()))))
+    invalid = np.flatnonzero(~shapely.is_valid(polygons) & (shapely.get_num_interior_rings(polygons) == 0))
+    repaired = np.full(len(polygons), None)
+    for i in invalid:
+        repaired[i] = _polygon_from_rings(
+            _split_into_rings(_node_path(list(map(tuple, shapely.get_coordinates(polygons[i]).tolist()))))
         )
-    check_sizes(np.maximum(shapely.get_num_interior_rings(mended), 0) + 1, shapely.get_num_coordinates(mended))
-    return np.where(shapely.is_valid(mended), mended, polygons)
+    check_sizes(np.maximum(shapely.get_num_interior_rings(repaired), 0) + 1, shapely.get_num_coordinates(repaired))
+    return np.where(shapely.is_valid(repaired), repaired, polygons)
 
 
-def _with_all_vertices(walk: list[Point]) -> list[Point]:
+def _node_path(path: list[Point]) -> list[Point]:
     """Node a closed path: insert its vertices that lie on its horizontal and vertical edges."""
-    stops: tuple[dict[float, list[float]], ...] = ({}, {})
-    for axis, of_line in enumerate(stops):
-        for vertex in set(walk):
+    nodes: tuple[dict[float, list[float]], ...] = ({}, {})
+    for axis, of_line in enumerate(nodes):
+        for vertex in set(path):
             of_line.setdefault(vertex[axis], []).append(vertex[1 - axis])
         for values in of_line.values():
             values.sort()
-    whole = walk[:1]
-    for a, b in pairwise(walk):
+    noded = path[:1]
+    for a, b in pairwise(path):
         axis = 0 if a[0] == b[0] else 1
         # A path with too many nodes is not a valid outline.
-        if a[axis] == b[axis] and len(whole) < MAX_STOPS * len(walk):
-            values, (low, high) = stops[axis][a[axis]], sorted((a[1 - axis], b[1 - axis]))
+        if a[axis] == b[axis] and len(noded) < MAX_NODING_RATIO * len(path):
+            values, (low, high) = nodes[axis][a[axis]], sorted((a[1 - axis], b[1 - axis]))
             passed = values[bisect_right(values, low) : bisect_left(values, high)]
             on_line = [(a[0], v) if axis == 0 else (v, a[1]) for v in passed]
-            whole += on_line if a < b else on_line[::-1]
-        whole.append(b)
-    return whole
+            noded += on_line if a < b else on_line[::-1]
+        noded.append(b)
+    return noded
 
 
-def _loops(walk: list[Point]) -> list[list[Point]]:
+def _split_into_rings(closed_path: list[Point]) -> list[list[Point]]:
     """Return the rings of a closed path without the edges traversed in both directions."""
-    n_times = Counter(pairwise(walk))
-    ways: dict[Point, list[Point]] = {}
+    n_times = Counter(pairwise(closed_path))
+    successors: dict[Point, list[Point]] = {}
     for (a, b), n in n_times.items():
         if a != b:
-            ways.setdefault(a, []).extend([b] * (n - n_times[b, a]))
-    loops = []
-    for start in ways:
-        path, place = [start], {start: 0}
-        while ways[path[-1]]:
-            vertex = ways[path[-1]].pop()
-            at = place.setdefault(vertex, len(path))
+            successors.setdefault(a, []).extend([b] * (n - n_times[b, a]))
+    rings = []
+    for start in successors:
+        path, index_of = [start], {start: 0}
+        while successors[path[-1]]:
+            vertex = successors[path[-1]].pop()
+            at = index_of.setdefault(vertex, len(path))
             if at == len(path):
                 path.append(vertex)
                 continue
-            loops.append(path[at:])
+            rings.append(path[at:])
             for passed in path[at + 1 :]:
-                del place[passed]
+                del index_of[passed]
             del path[at + 1 :]
-    return loops
+    return rings
 
 
-def _of_loops(loops: list[list[Point]]) -> Any:
+def _polygon_from_rings(rings: list[list[Point]]) -> Any:
     """
     Return the polygon of the largest ring, with the others as holes.
 
     The result is None if another ring has the same winding order as the largest.
     """
-    if not loops:
+    if not rings:
         return None
-    offsets = np.cumsum([0, *map(len, loops)])
-    area_um2 = ring_moments(np.array([vertex for loop in loops for vertex in loop]), offsets)[0]
+    offsets = np.cumsum([0, *map(len, rings)])
+    area_um2 = ring_moments(np.array([vertex for ring in rings for vertex in ring]), offsets)[0]
     outline = int(np.argmax(np.abs(area_um2)))
     is_hole = area_um2 * area_um2[outline] < 0.0
-    if np.count_nonzero(is_hole) != len(loops) - 1:
+    if np.count_nonzero(is_hole) != len(rings) - 1:
         return None
-    return shapely.Polygon(loops[outline], [loop for loop, is_in in zip(loops, is_hole, strict=True) if is_in])
+    return shapely.Polygon(rings[outline], [ring for ring, is_in in zip(rings, is_hole, strict=True) if is_in])
 
 
 for _name, _title, _suffixes, _magic in (

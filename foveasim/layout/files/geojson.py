@@ -27,14 +27,14 @@ from foveasim.errors import FileError
 from foveasim.layout.files._common import (
     WrittenLayout,
     check_header,
-    check_sites_of,
-    checked_layout,
-    dtype_text,
+    check_site_count,
+    dtype_strings,
     header,
-    lossless,
+    layout_from_untrusted,
+    lossless_report,
     plain_columns,
-    restored_column,
-    texts,
+    restore_column,
+    string_column,
 )
 from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout
@@ -45,7 +45,7 @@ __all__ = ["read", "write"]
 CHUNK = 10_000
 #: JSON has no infinity, but numbers beyond the range of float64 are read as infinity.
 INFINITY = "1e999"
-NUMBERS = {int, float}
+NUMBER_TYPES = {int, float}
 #: Integers up to the first are exact in float64; integers above the second are not supported.
 MAX_EXACT, MAX_FLOAT = 2**53, 2**1023
 #: With more property names, only properties of all features are columns, as names could differ for every feature.
@@ -65,31 +65,33 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
         When the file cannot be written.
     """
     columns = plain_columns(layout, "GeoJSON")
-    about = {**header(layout), "columns": dtype_text(layout)}
+    about = {**header(layout), "columns": dtype_strings(layout)}
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(f'{{"type": "FeatureCollection", "foveasim": {json.dumps(about)}, "features": [')
         for start in range(0, layout.n_sites, CHUNK):
             file.write(",\n" if start else "\n")
             file.write(",\n".join(_features(layout[start : start + CHUNK], columns, start)))
         file.write("\n]}\n")
-    return lossless(layout, path)
+    return lossless_report(layout, path)
 
 
 def _features(layout: Layout, columns: Mapping[str, NDArray[Any]], start: int) -> Iterator[str]:
     geometries = shapely.to_geojson(layout.polygons())
     stop = start + layout.n_sites
-    texts = [[f"{json.dumps(name)}: {t}" for t in _texts(values[start:stop])] for name, values in columns.items()]
-    properties = map(", ".join, zip(*texts, strict=True)) if texts else iter([""] * layout.n_sites)
+    members = [
+        [f"{json.dumps(name)}: {t}" for t in _json_strings(values[start:stop])] for name, values in columns.items()
+    ]
+    properties = map(", ".join, zip(*members, strict=True)) if members else iter([""] * layout.n_sites)
     for i, (geometry, line) in enumerate(zip(geometries, properties, strict=True), start):
         yield f'{{"type": "Feature", "id": {i}, "properties": {{{line}}}, "geometry": {geometry}}}'
 
 
-def _texts(values: NDArray[Any]) -> list[str]:
+def _json_strings(values: NDArray[Any]) -> list[str]:
     """Return the values of a column as JSON, NaN as null."""
     # The shortest digits of a float32 are not exact in float64.
     plain = values.astype(np.float64) if values.dtype.kind == "f" else values
-    texts = [json.dumps(v) for v in plain.tolist()]
-    return [{"NaN": "null", "Infinity": INFINITY, "-Infinity": "-" + INFINITY}.get(t, t) for t in texts]
+    strings = [json.dumps(v) for v in plain.tolist()]
+    return [{"NaN": "null", "Infinity": INFINITY, "-Infinity": "-" + INFINITY}.get(t, t) for t in strings]
 
 
 def read(path: Path) -> Layout:
@@ -113,10 +115,10 @@ def read(path: Path) -> Layout:
         if about is not None:
             provenance = check_header(path, about)
             types = about.get("columns")
-        columns, left_out = document.columns(types if isinstance(types, dict) else {})
-        if left_out:
-            provenance = {**provenance, "left_out_properties": left_out}
-        return checked_layout(polygons, columns, provenance)
+        columns, dropped = document.columns(types if isinstance(types, dict) else {})
+        if dropped:
+            provenance = {**provenance, "left_out_properties": dropped}
+        return layout_from_untrusted(polygons, columns, provenance)
 
 
 class _Document:
@@ -147,7 +149,7 @@ class _Document:
     def _add(self, feature: Any) -> None:
         """Add the outline and the properties of a feature."""
         i = len(self._rows)
-        check_sites_of(self.path, i + 1)
+        check_site_count(self.path, i + 1)
         geometry = feature.get("geometry") if isinstance(feature, dict) else None
         kind = geometry.get("type") if isinstance(geometry, dict) else None
         rings = geometry.get("coordinates") if isinstance(geometry, dict) else None
@@ -164,7 +166,11 @@ class _Document:
             self._vertices_of_ring.append(len(ring))
             for position in ring:
                 # type() instead of isinstance(), as booleans are integers in Python.
-                if type(position) is not list or not 2 <= len(position) <= 3 or not {*map(type, position)} <= NUMBERS:
+                if (
+                    type(position) is not list
+                    or not 2 <= len(position) <= 3
+                    or not {*map(type, position)} <= NUMBER_TYPES
+                ):
                     raise FileError(self.path, f"feature {i} has a position that is not two or three numbers")
                 self._xy.append(position[0])
                 self._xy.append(position[1])
@@ -181,15 +187,15 @@ class _Document:
         """Return the columns of the properties, and the names of unsupported properties."""
         n_rows = Counter(chain.from_iterable(self._rows))
         names = dict.fromkeys(chain(types, n_rows))
-        columns, left_out = {}, []
+        columns, dropped = {}, []
         for name in names:
-            is_looked_at = len(names) <= MAX_NAMES or n_rows[name] == len(self._rows)
-            column = _column([row.get(name) for row in self._rows], types.get(name)) if is_looked_at else None
+            is_candidate = len(names) <= MAX_NAMES or n_rows[name] == len(self._rows)
+            column = _column([row.get(name) for row in self._rows], types.get(name)) if is_candidate else None
             if column is None:
-                left_out.append(name)
+                dropped.append(name)
             else:
                 columns[name] = column
-        return columns, left_out
+        return columns, dropped
 
 
 def _members(text: str, add: Callable[[Any], None]) -> Iterator[tuple[str, Any]]:
@@ -239,19 +245,19 @@ def _column(values: list[Any], dtype: Any) -> NDArray[Any] | None:
     kinds = {type(v) for v in values}
     plain = kinds - {type(None)}
     if not values:
-        return restored_column(np.zeros(0), dtype)
+        return restore_column(np.zeros(0), dtype)
     if plain == {str}:
-        text = texts(["" if v is None else v for v in values])
-        return None if text is None else restored_column(text, dtype)
+        text = string_column(["" if v is None else v for v in values])
+        return None if text is None else restore_column(text, dtype)
     if kinds == {bool}:
-        return restored_column(np.array(values), dtype)
+        return restore_column(np.array(values), dtype)
     if kinds == {int}:
         column = exact_integers(values)
-        return None if column is None else restored_column(column, dtype)
+        return None if column is None else restore_column(column, dtype)
     if not all(_is_exact(v) for v in values):
         return None
     if (plain and plain <= {int, float}) or (not plain and str(dtype)[1:2] == "f"):
-        return restored_column(np.array([np.nan if v is None else v for v in values], dtype=np.float64), dtype)
+        return restore_column(np.array([np.nan if v is None else v for v in values], dtype=np.float64), dtype)
     return None
 
 

@@ -23,15 +23,15 @@ from foveasim.layout.files._common import (
     WrittenLayout,
     check_decompressed,
     check_header,
-    check_sites_of,
-    checked_layout,
-    dtype_text,
+    check_site_count,
+    dtype_strings,
     header,
-    lossless,
+    layout_from_untrusted,
+    lossless_report,
     max_decompressed_bytes,
     plain_columns,
-    restored_column,
-    texts,
+    restore_column,
+    string_column,
 )
 from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout
@@ -47,7 +47,7 @@ BATCH = 4096
 POLYGON, MULTIPOLYGON = 3, 6
 WITH_SRID = 1 << 29
 #: First five bytes of both, in either byte order, with or without z, m and flags.
-HEADS = {
+WKB_HEADERS = {
     kind: {
         bytes([is_little]) + number.to_bytes(4, "little" if is_little else "big"): number
         for is_little in (0, 1)
@@ -84,7 +84,7 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     if layout.n_sites:
         column["bbox"] = list(layout.bounds_um)
     geo = {"version": VERSION, "primary_column": GEOMETRY, "columns": {GEOMETRY: column}}
-    about = {**header(layout), "columns": dtype_text(layout)}
+    about = {**header(layout), "columns": dtype_strings(layout)}
     outlines = pa.array(shapely.to_wkb(layout.polygons(), byte_order=1), type=pa.binary())
     # Arrow supports only the native byte order; numpy's fixed-width strings have no null.
     native = {name: values.astype(values.dtype.newbyteorder("=")) for name, values in columns.items()}
@@ -93,7 +93,7 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
     with atomic_write(path) as temporary:
         # Outlines are distinct, so that a dictionary would not reduce their size.
         parquet.write_table(table, temporary, compression="zstd", use_dictionary=[*columns], write_page_checksum=True)
-    return lossless(layout, path)
+    return lossless_report(layout, path)
 
 
 def read(path: Path) -> Layout:
@@ -107,7 +107,7 @@ def read(path: Path) -> Layout:
     """
     pa, parquet = _pyarrow(path)
     with as_file_error(path, "GeoParquet layout"), parquet.ParquetFile(path, page_checksum_verification=True) as file:
-        check_sites_of(path, file.metadata.num_rows)
+        check_site_count(path, file.metadata.num_rows)
         check_decompressed(path, sum(file.metadata.row_group(i).total_byte_size for i in range(file.num_row_groups)))
         metadata = file.metadata.metadata or {}
         if b"geo" not in metadata:
@@ -133,7 +133,7 @@ def read(path: Path) -> Layout:
             provenance = check_header(path, about)
             types = about.get("columns")
         types = types if isinstance(types, dict) else {}
-        columns, left_out = {}, []
+        columns, dropped = {}, []
         for other in table.column_names:
             kind = table.schema.field(other).type
             if other == name:
@@ -142,16 +142,16 @@ def read(path: Path) -> Layout:
             is_text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
             has_null = table.column(other).null_count > 0
             if not (is_number or is_text) or (has_null and not pa.types.is_floating(kind)):
-                left_out.append(other)
+                dropped.append(other)
                 continue
-            values = texts(table.column(other).to_pylist()) if is_text else table.column(other).to_numpy()
+            values = string_column(table.column(other).to_pylist()) if is_text else table.column(other).to_numpy()
             if values is None:
-                left_out.append(other)
+                dropped.append(other)
             else:
-                columns[other] = restored_column(values, types.get(other))
-        if left_out:
-            provenance = {**provenance, "left_out_columns": left_out}
-        return checked_layout(polygons, columns, provenance)
+                columns[other] = restore_column(values, types.get(other))
+        if dropped:
+            provenance = {**provenance, "left_out_columns": dropped}
+        return layout_from_untrusted(polygons, columns, provenance)
 
 
 def _pyarrow(path: Path) -> tuple[Any, Any]:
@@ -169,17 +169,17 @@ def _table(path: Path, pa: Any, file: Any) -> Any:
 
     A small file may repeat one long value in very many rows.
     """
-    batches, n_bytes, most = [], 0, max_decompressed_bytes(path)
-    for batch in file.iter_batches(batch_size=_rows_at_a_time(path, file.metadata), use_threads=False):
+    batches, n_bytes, max_bytes = [], 0, max_decompressed_bytes(path)
+    for batch in file.iter_batches(batch_size=_rows_per_batch(path, file.metadata), use_threads=False):
         n_bytes += batch.nbytes
-        if n_bytes > most:
+        if n_bytes > max_bytes:
             break
         batches.append(batch)
     check_decompressed(path, n_bytes)
     return pa.Table.from_batches(batches, schema=file.schema_arrow).combine_chunks()
 
 
-def _rows_at_a_time(path: Path, metadata: Any) -> int:
+def _rows_per_batch(path: Path, metadata: Any) -> int:
     """
     Return the number of rows that stay within the maximum decompressed size.
 
@@ -192,7 +192,7 @@ def _rows_at_a_time(path: Path, metadata: Any) -> int:
 
 def _polygons(path: Path, outlines: NDArray[Any]) -> NDArray[Any]:
     """Convert WKB to polygons; multipolygons of one polygon are supported."""
-    plain = HEADS[POLYGON]
+    plain = WKB_HEADERS[POLYGON]
     others = [row for row, wkb in enumerate(outlines) if wkb is None or wkb[:5] not in plain]
     for row in others:
         # Deeply nested collections would crash GEOS.
@@ -204,12 +204,12 @@ def _polygons(path: Path, outlines: NDArray[Any]) -> NDArray[Any]:
 
 
 def _is_multipolygon_of_one(wkb: bytes | None) -> bool:
-    number = None if wkb is None else HEADS[MULTIPOLYGON].get(wkb[:5])
+    number = None if wkb is None else WKB_HEADERS[MULTIPOLYGON].get(wkb[:5])
     if wkb is None or number is None:
         return False
     at = 9 if number & WITH_SRID else 5
     n_parts = int.from_bytes(wkb[at : at + 4], "little" if wkb[0] else "big")
-    return n_parts == 1 and wkb[at + 4 : at + 9] in HEADS[POLYGON]
+    return n_parts == 1 and wkb[at + 4 : at + 9] in WKB_HEADERS[POLYGON]
 
 
 FORMATS.register(

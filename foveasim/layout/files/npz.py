@@ -17,14 +17,14 @@ from foveasim.errors import FileError
 from foveasim.layout.files._common import (
     WrittenLayout,
     check_header,
-    check_sites_of,
+    check_site_count,
     header,
-    lossless,
+    lossless_report,
     max_decompressed_bytes,
 )
 from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout
-from foveasim.layout.packed import is_of_layout, layout_from_arrays, layout_to_arrays
+from foveasim.layout.packed import is_layout_array, layout_from_arrays, layout_to_arrays
 
 __all__ = ["MAGICS", "read", "write"]
 
@@ -42,7 +42,7 @@ def write(layout: Layout, path: Path) -> WrittenLayout:
         When the file cannot be written.
     """
     write_archive(path, header(layout), layout_to_arrays(layout), is_compressed=False)
-    return lossless(layout, path)
+    return lossless_report(layout, path)
 
 
 def read(path: Path) -> Layout:
@@ -59,10 +59,10 @@ def read(path: Path) -> Layout:
         if about is None:
             raise FileError(path, "is not a foveasim layout")
         provenance = check_header(path, about)
-        unknown = [name for name in arrays if not is_of_layout(name)]
+        unknown = [name for name in arrays if not is_layout_array(name)]
         if unknown:
             raise FileError(path, f"is corrupt: {unknown[0]!r:.40} is not an array of a layout")
-        check_sites_of(path, arrays["site_offsets"].size - 1)
+        check_site_count(path, arrays["site_offsets"].size - 1)
         layout = layout_from_arrays(arrays, provenance)
         _check_winding(path, layout)
         return layout

@@ -16,7 +16,7 @@ from foveasim._core.validation import check_count
 from foveasim._io.atomic import atomic_write
 from foveasim._io.formats import FileFormat
 from foveasim.errors import ParameterError
-from foveasim.layout.files._common import WrittenLayout, rounding
+from foveasim.layout.files._common import WrittenLayout, rounding_report
 from foveasim.layout.files._formats import FORMATS
 from foveasim.layout.model import Layout
 
@@ -25,7 +25,7 @@ __all__ = ["write"]
 #: Decimal places of coordinates in µm: a resolution of a tenth of a nanometre.
 DIGITS = 4
 #: Longer side of the drawing, in CSS pixels.
-SHOWN_PX = 1000
+DRAWING_PX = 1000
 DEFAULT_COLOUR = "#9a9a9a"
 #: CSS colour names, #rgb and #rrggbb; quotation marks would end the XML attribute.
 COLOUR = re.compile(r"#[0-9a-fA-F]{3}|#[0-9a-fA-F]{6}|[a-zA-Z]{3,24}")
@@ -44,10 +44,10 @@ def write(layout: Layout, path: Path, *, colours: Mapping[int, str] | None = Non
     FileError
         When the file cannot be written.
     """
-    colours = _checked(colours or {})
+    colours = _validate_colours(colours or {})
     x_min, y_min, x_max, y_max = layout.bounds_um if layout.n_sites else (0.0, 0.0, 1.0, 1.0)
     width_um, height_um = x_max - x_min, y_max - y_min
-    px_per_um = SHOWN_PX / max(width_um, height_um)
+    px_per_um = DRAWING_PX / max(width_um, height_um)
     fills = [colours.get(c, DEFAULT_COLOUR) for c in layout.channel.tolist()]
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(
@@ -58,14 +58,14 @@ def write(layout: Layout, path: Path, *, colours: Mapping[int, str] | None = Non
             '<g transform="scale(1,-1)" fill-rule="evenodd" stroke="none">\n'
         )
         for start in range(0, layout.n_sites, CHUNK):
-            outlines = _outlines(layout[start : start + CHUNK])
+            outlines = _path_data(layout[start : start + CHUNK])
             file.writelines(f'<path id="site{i}" fill="{fills[i]}" d="{d}"/>\n' for i, d in enumerate(outlines, start))
         file.write("</g>\n</svg>\n")
-    return rounding(layout, np.round(layout.xy_um, DIGITS), path, tuple(sorted(layout.columns)))
+    return rounding_report(layout, np.round(layout.xy_um, DIGITS), path, tuple(sorted(layout.columns)))
 
 
-def _checked(colours: Mapping[int, str]) -> dict[int, str]:
-    checked = {}
+def _validate_colours(colours: Mapping[int, str]) -> dict[int, str]:
+    validated = {}
     for channel, colour in colours.items():
         if not isinstance(colour, str) or not COLOUR.fullmatch(colour):
             raise ParameterError(
@@ -74,11 +74,11 @@ def _checked(colours: Mapping[int, str]) -> dict[int, str]:
                 colour,
                 hint='use "#c23b22" or "green"',
             )
-        checked[check_count("colours", channel, at_least=0)] = colour
-    return checked
+        validated[check_count("colours", channel, at_least=0)] = colour
+    return validated
 
 
-def _outlines(layout: Layout) -> list[str]:
+def _path_data(layout: Layout) -> list[str]:
     """Return the path data of each site, with all rings closed."""
     n_vertices = layout.xy_um.shape[0]
     point = f"%.{DIGITS}f %.{DIGITS}f"

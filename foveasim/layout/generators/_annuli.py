@@ -22,7 +22,7 @@ class Ring(NamedTuple):
     """Number of sites of a ring, rotation in half sectors, and number of chords per arc."""
 
     n_sites: int
-    turn: int
+    rotation: int
     n_chords: int
 
 
@@ -68,7 +68,9 @@ def annuli(radii_um: Floats, rings: Sequence[Ring]) -> Annuli:
             outlines.append(outer.xy_um)
             n_vertices.append(np.array([len(outer.xy_um)]))
         else:
-            xy_um, counts = ring_outlines(outer.xy_um, *_ends(outer, ring), inner.xy_um, *_ends(inner, ring))
+            xy_um, counts = ring_outlines(
+                outer.xy_um, *_corner_positions(outer, ring), inner.xy_um, *_corner_positions(inner, ring)
+            )
             outlines.append(xy_um)
             n_vertices.append(counts)
         inner = outer
@@ -107,10 +109,10 @@ def fovea_rings(
     else:
         divisors = np.array([d for d in range(1, n_sectors + 1) if n_sectors % d == 0])
         rho = np.arange(n_rings)
-        place = np.searchsorted(divisors, 2.0 * math.pi * rho, side="right") - 1
+        position = np.searchsorted(divisors, 2.0 * math.pi * rho, side="right") - 1
         # With fewer than 3ρ corners, the inner circle of a ring would cross its outer one.
-        place = np.where(divisors[place] < MIN_SITES_PER_RHO * rho, place + 1, place)
-        counts = divisors[np.minimum(place, divisors.size - 1)]
+        position = np.where(divisors[position] < MIN_SITES_PER_RHO * rho, position + 1, position)
+        counts = divisors[np.minimum(position, divisors.size - 1)]
     counts[0] = 1
     return radii, [Ring(int(n), 0, n_chords) for n in counts]
 
@@ -139,37 +141,37 @@ def ring_outlines(
     n_outer = outer_last - outer_first + 1
     n_vertices = n_outer + inner_last - inner_first + 1
     site = np.repeat(np.arange(n_vertices.size), n_vertices)
-    place = np.arange(site.size) - (np.cumsum(n_vertices) - n_vertices)[site]
-    is_inner = place >= n_outer[site]
+    position = np.arange(site.size) - (np.cumsum(n_vertices) - n_vertices)[site]
+    is_inner = position >= n_outer[site]
     point = np.where(
         is_inner,
-        len(outer_um) + (inner_last[site] - place + n_outer[site]) % len(inner_um),
-        (outer_first[site] + place) % len(outer_um),
+        len(outer_um) + (inner_last[site] - position + n_outer[site]) % len(inner_um),
+        (outer_first[site] + position) % len(outer_um),
     )
     return np.concatenate((outer_um, inner_um))[point], n_vertices
 
 
 def _circle(radius_um: float, rings: Sequence[Ring]) -> _Circle:
     """Return a circle with the distinct corners and chord ends of the rings on both sides."""
-    meeting = [ring for ring in rings if ring.n_sites > 1]
-    if radius_um <= 0.0 or not meeting:
+    adjacent = [ring for ring in rings if ring.n_sites > 1]
+    if radius_um <= 0.0 or not adjacent:
         return _Circle(np.zeros((1, 2)), np.zeros(1, np.int64), 1)
-    n_steps = math.lcm(*(2 * ring.n_sites * ring.n_chords for ring in meeting))
+    n_steps = math.lcm(*(2 * ring.n_sites * ring.n_chords for ring in adjacent))
     steps = []
-    for n_sites, turn, n_chords in meeting:
-        half_chords = 2 * np.arange(n_sites * n_chords) + turn * n_chords
+    for n_sites, rotation, n_chords in adjacent:
+        half_chords = 2 * np.arange(n_sites * n_chords) + rotation * n_chords
         steps.append(half_chords * (n_steps // (2 * n_sites * n_chords)) % n_steps)
     step = np.unique(np.concatenate(steps))
     angle_rad = (2.0 * math.pi) * (step / n_steps)
     return _Circle(radius_um * np.stack((np.cos(angle_rad), np.sin(angle_rad)), axis=1), step, n_steps)
 
 
-def _ends(circle: _Circle, ring: Ring) -> tuple[Ints, Ints]:
+def _corner_positions(circle: _Circle, ring: Ring) -> tuple[Ints, Ints]:
     """Return the positions of the first and last corner of each site of a ring on a circle."""
     if circle.n_steps == 1:  # the axis
-        nowhere = np.zeros(ring.n_sites, np.int64)
-        return nowhere, nowhere
-    half_sectors = 2 * np.arange(ring.n_sites + 1) + ring.turn
-    turns, corner = np.divmod(half_sectors * (circle.n_steps // (2 * ring.n_sites)), circle.n_steps)
-    position = np.searchsorted(circle.step, corner) + turns * circle.step.size
+        zeros = np.zeros(ring.n_sites, np.int64)
+        return zeros, zeros
+    half_sectors = 2 * np.arange(ring.n_sites + 1) + ring.rotation
+    revolutions, corner = np.divmod(half_sectors * (circle.n_steps // (2 * ring.n_sites)), circle.n_steps)
+    position = np.searchsorted(circle.step, corner) + revolutions * circle.step.size
     return position[:-1], position[1:]

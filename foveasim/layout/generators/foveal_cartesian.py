@@ -103,7 +103,7 @@ def foveal_cartesian(*, n_rings: int, ring_ratio: float, pitch_um: float, n_fove
     n_sectors = np.maximum(1, 8 * np.arange(n_rings))
     ring = np.repeat(np.arange(n_rings), n_sectors)
     sector = np.arange(ring.size) - (np.cumsum(n_sectors) - n_sectors)[ring]
-    row, column = (n_rings - 1 + place for place in _places(ring, sector))
+    row, column = (n_rings - 1 + index for index in _row_and_column(ring, sector))
     return Layout(
         xy_um,
         np.concatenate(([0], np.cumsum(n_vertices))),
@@ -112,7 +112,7 @@ def foveal_cartesian(*, n_rings: int, ring_ratio: float, pitch_um: float, n_fove
     )
 
 
-def _places(ring: Ints, sector: Ints) -> tuple[Ints, Ints]:
+def _row_and_column(ring: Ints, sector: Ints) -> tuple[Ints, Ints]:
     """Return the row and column of each site, relative to the centre."""
     side, along = np.divmod(sector, np.maximum(1, 2 * ring))
     along = along - ring
@@ -133,7 +133,7 @@ def _outlines(n_rings: int, ring_ratio: float, pitch_um: float, n_fovea: int) ->
     for r in range(n_rings):
         # Side of the outer square: corners of this ring and of the next ring, equal where they coincide.
         cuts_um = np.concatenate((-half_um[r : r + 1], inner_cuts_um, half_um[r : r + 1]))
-        next_cuts_um = _snapped(half_um[r] * (2 * np.arange(2 * r + 2) - (2 * r + 1)) / (2 * r + 1), cuts_um)
+        next_cuts_um = _snap(half_um[r] * (2 * np.arange(2 * r + 2) - (2 * r + 1)) / (2 * r + 1), cuts_um)
         side_um = np.unique(np.concatenate((cuts_um, next_cuts_um) if r + 1 < n_rings else (cuts_um,)))
         outer_um = _square_loop(side_um)
         if r == 0:
@@ -151,7 +151,7 @@ def _outlines(n_rings: int, ring_ratio: float, pitch_um: float, n_fovea: int) ->
     return np.concatenate(outlines), np.concatenate(n_vertices)
 
 
-def _snapped(values_um: Floats, to_um: Floats) -> Floats:
+def _snap(values_um: Floats, to_um: Floats) -> Floats:
     """Snap values to the elements of a sorted array from which they differ only by rounding."""
     after = np.clip(np.searchsorted(to_um, values_um), 1, to_um.size - 1)
     nearest_um = np.where(values_um - to_um[after - 1] < to_um[after] - values_um, to_um[after - 1], to_um[after])

@@ -10,7 +10,7 @@ from foveasim._core.rings import positions_in_runs
 from foveasim._core.validation import Floats, Ints, check_count, check_length_um, check_sites
 from foveasim.errors import ParameterError
 from foveasim.layout._regions import disc
-from foveasim.layout._voronoi import cells_of
+from foveasim.layout._voronoi import voronoi_cells
 from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
 
@@ -78,7 +78,7 @@ def fovi(*, fov_um: float, a_um: float, n_rings: int, n_chords: int | None = Non
     # e^w - a with w = ln a + i step, without cancellation
     r_um = a_um * np.expm1(step * np.arange(n_rings + 2))
     r_um[n_rings] = 0.5 * fov_um
-    counts = _counts(r_um)
+    counts = _sites_per_ring(r_um)
     check_sites(int(counts.sum()))
     ring = np.repeat(np.arange(n_rings + 1), counts)
     sector = positions_in_runs(counts)
@@ -87,10 +87,10 @@ def fovi(*, fov_um: float, a_um: float, n_rings: int, n_chords: int | None = Non
 
     radius_um = a_um * math.expm1(step * (n_rings + 0.5))
     if n_chords is None:
-        n_sides = max(CHORDS_PER_SITE * int(counts[-1]), _fewest_chords(0.5 * fov_um, radius_um))
+        n_sides = max(CHORDS_PER_SITE * int(counts[-1]), _min_chords(0.5 * fov_um, radius_um))
     else:
-        n_sides = check_count("n_chords", n_chords, at_least=_fewest_chords(0.5 * fov_um, radius_um), at_most=10**6)
-    xy_um, offsets = cells_of(centres_um, disc(radius_um, n_sides))
+        n_sides = check_count("n_chords", n_chords, at_least=_min_chords(0.5 * fov_um, radius_um), at_most=10**6)
+    xy_um, offsets = voronoi_cells(centres_um, disc(radius_um, n_sides))
     return Layout(
         xy_um,
         offsets,
@@ -102,7 +102,7 @@ def fovi(*, fov_um: float, a_um: float, n_rings: int, n_chords: int | None = Non
     )
 
 
-def _counts(r_um: Floats) -> Ints:
+def _sites_per_ring(r_um: Floats) -> Ints:
     """Return the sites per ring; the last radius only defines the spacing before it."""
     spacing_um = 0.5 * (r_um[2:] - r_um[:-2])
     if not (np.diff(r_um) > 0.0).all():
@@ -110,6 +110,6 @@ def _counts(r_um: Floats) -> Ints:
     return np.concatenate(([1], np.ceil(2.0 * math.pi * r_um[1:-1] / spacing_um).astype(np.int64)))
 
 
-def _fewest_chords(inner_um: float, outer_um: float) -> int:
+def _min_chords(inner_um: float, outer_um: float) -> int:
     """Return the minimum number of outer chords that do not cut the inner circle."""
     return max(3, math.floor(math.pi / math.acos(inner_um / outer_um)) + 1)

@@ -72,14 +72,14 @@ def grid(
         pitch_y_um = check_length_um("pitch_y_um", pitch_y_um)
         if width_um is not None:
             raise ParameterError("width_um", "must be replaced by 'trench_um' if 'pitch_y_um' is given", width_um)
-    shares = [
+    fractions = [
         linear_fill_factor(p_um, width_um, trench_um, fill_factor)
         for p_um in (pitch_um, pitch_um if pitch_y_um is None else pitch_y_um)
     ]
     check_sites(n_x * n_y)
     row, column = (index.ravel() for index in np.divmod(np.arange(n_y * n_x), n_x))
     shift = 0.5 * (row % 2) - 0.25 * (n_y > 1) if stagger else 0.0
-    corners = square_corners_um(column - 0.5 * n_x + shift, row - 0.5 * n_y, pitch_um, pitch_y_um, shares)
+    corners = square_corners_um(column - 0.5 * n_x + shift, row - 0.5 * n_y, pitch_um, pitch_y_um, fractions)
     return Layout.from_equal_rings(
         corners,
         {"row": row, "column": column, "readout_line": column},
@@ -117,7 +117,7 @@ def square_corners_um(
     y: Floats,
     pitch_um: float,
     pitch_y_um: float | None = None,
-    shares: Sequence[float | None] = (None, None),
+    fractions: Sequence[float | None] = (None, None),
 ) -> Floats:
     """
     Return the corners (n, 4, 2) µm of grid cells, or of a centred fraction of each cell.
@@ -125,7 +125,7 @@ def square_corners_um(
     ``x`` and ``y`` are the lower left corners of the cells in pitches. Corners that neighbours share are bit-identical when
     cells tile.
     """
-    margins = [0.0 if share is None else 0.5 * (1.0 - share) for share in shares]
+    margins = [0.0 if fraction is None else 0.5 * (1.0 - fraction) for fraction in fractions]
     (x0, y0), (x1, y1) = margins, [1.0 - margin for margin in margins]
     steps = np.stack([np.stack((x + dx, y + dy), axis=-1) for dx, dy in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], 1)
     return np.asarray(steps * np.array([pitch_um, pitch_um if pitch_y_um is None else pitch_y_um]))

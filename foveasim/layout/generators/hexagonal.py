@@ -65,16 +65,16 @@ def hexagonal(
     """
     n_columns, n_rows = check_count("n_columns", n_columns), check_count("n_rows", n_rows)
     pitch_um = check_length_um("pitch_um", pitch_um)
-    share = linear_fill_factor(pitch_um, width_um, trench_um, fill_factor)
+    fraction = linear_fill_factor(pitch_um, width_um, trench_um, fill_factor)
     check_choice("orientation", orientation, ("pointy", "flat"))
     check_sites(n_columns * n_rows)
     row, column = (index.ravel() for index in np.divmod(np.arange(n_rows * n_columns), n_columns))
     # All corners lie on a lattice of half pitches and half sides, so shared corners are bit-identical.
     half_um = np.array([0.5 * pitch_um, 0.5 * pitch_um / math.sqrt(3.0)])
     centre = np.stack((2 * column + row % 2, 3 * row), axis=1)
-    middle = np.array([n_columns - 1 + 0.5 * (n_rows > 1), 1.5 * (n_rows - 1)])
+    layout_centre = np.array([n_columns - 1 + 0.5 * (n_rows > 1), 1.5 * (n_rows - 1)])
     corners = np.array([(1, -1), (1, 1), (0, 2), (-1, 1), (-1, -1), (0, -2)])
-    rings_um = ((centre - middle)[:, np.newaxis] + (1.0 if share is None else share) * corners) * half_um
+    rings_um = ((centre - layout_centre)[:, np.newaxis] + (1.0 if fraction is None else fraction) * corners) * half_um
     if orientation == "flat":
         rings_um = np.stack((-rings_um[..., 1], rings_um[..., 0]), axis=-1)
     return Layout.from_equal_rings(

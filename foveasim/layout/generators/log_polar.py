@@ -197,7 +197,7 @@ def _with_fovea(
         )
         inside_um = heights * (radii_um[0] / heights[-1])
         # Corners of the fovea on the surrounding ring reduce its area, to zero or less if chords are coarse.
-        if _are_sites(annuli(np.concatenate((inside_um, radii_um[1:2])), [*inside, rings[0]]), min_size_um):
+        if _are_valid_sites(annuli(np.concatenate((inside_um, radii_um[1:2])), [*inside, rings[0]]), min_size_um):
             all_rings = [*inside, *rings]
             n_sites = np.array([ring.n_sites for ring in all_rings])
             check_sites(int(n_sites.sum()))
@@ -208,7 +208,7 @@ def _with_fovea(
     )  # fmt: skip
 
 
-def _are_sites(sites: Annuli, min_size_um: float) -> bool:
+def _are_valid_sites(sites: Annuli, min_size_um: float) -> bool:
     """Return whether all outlines are simple and none is below the minimum size."""
     area_um2, _ = ring_moments(sites.xy_um, sites.ring_offsets)
     if area_um2.min() <= 0.0 or math.sqrt(area_um2.min()) < min_size_um:
@@ -231,13 +231,13 @@ def _radius_per_size(n_sectors: int, ratio: float, n_chords: int, fovea: Fovea, 
     if fovea == "rings":
         # Corners of the fovea on the inner circle may remove the area between its chords and its arc from the site. Where
         # that is most of the site, the fovea must have fewer corners instead.
-        least = triangles * ratio**2 - 0.5 * sector_rad
-        area = least if least > 0.5 * area else area
-    needs = [1.0 / math.sqrt(area), 1.0 / (ratio - 1.0), 2.0 / (sector_rad * (1.0 + ratio))]
+        min_area = triangles * ratio**2 - 0.5 * sector_rad
+        area = min_area if min_area > 0.5 * area else area
+    radii_per_size = [1.0 / math.sqrt(area), 1.0 / (ratio - 1.0), 2.0 / (sector_rad * (1.0 + ratio))]
     if fovea != "none" and not is_given:
-        needs.append(1.0 / math.sqrt(n_sectors * triangles))  # the disc contains at least one site
+        radii_per_size.append(1.0 / math.sqrt(n_sectors * triangles))  # the disc contains at least one site
     # Margin for the rounding of the corners.
-    return max(needs) * (1.0 + COORDINATE_ROUNDING * (n_sectors + ratio / (ratio - 1.0)))
+    return max(radii_per_size) * (1.0 + COORDINATE_ROUNDING * (n_sectors + ratio / (ratio - 1.0)))
 
 
 def _ring_radii_um(

@@ -97,12 +97,12 @@ def octagonal(
     x_um, y_um = (
         (pitch_um * (np.arange(n + 1) - 0.5 * n)[:, np.newaxis] + (-half_um, 0.0, half_um)).ravel() for n in (n_x, n_y)
     )
-    row, column = _places(n_y, n_x)
+    row, column = _row_and_column(n_y, n_x)
     octagon = 3 * np.stack((column, row), axis=1)[:, np.newaxis] + OCTAGON
     first = 0 if border == "cut" else 1
-    diamond_row, diamond_column = _places(n_y + 1 - 2 * first, n_x + 1 - 2 * first)
+    diamond_row, diamond_column = _row_and_column(n_y + 1 - 2 * first, n_x + 1 - 2 * first)
     diamond = 3 * (np.stack((diamond_column, diamond_row), axis=1)[:, np.newaxis] + first) + DIAMOND
-    diamond, is_corner = _cut(diamond, n_x, n_y)
+    diamond, is_corner = _clip_diamonds(diamond, n_x, n_y)
     corner = np.concatenate((octagon.reshape(-1, 2), diamond[is_corner]))
     n_vertices = np.concatenate((np.full(row.size, len(OCTAGON)), np.count_nonzero(is_corner, axis=1)))
     return Layout(
@@ -118,13 +118,13 @@ def octagonal(
     )
 
 
-def _places(n_rows: int, n_columns: int) -> tuple[Ints, Ints]:
+def _row_and_column(n_rows: int, n_columns: int) -> tuple[Ints, Ints]:
     """Return the row and column of each site of a grid, row by row."""
     row, column = np.divmod(np.arange(n_rows * n_columns), max(1, n_columns))
     return row, column
 
 
-def _cut(diamond: Ints, n_x: int, n_y: int) -> tuple[Ints, Bools]:
+def _clip_diamonds(diamond: Ints, n_x: int, n_y: int) -> tuple[Ints, Bools]:
     """
     Clip diamonds (n, 4, 2) to the octagon cells; return them with a corner mask (n, 4).
 

@@ -18,7 +18,7 @@ GOLDEN_RATIO = (1.0 + math.sqrt(5.0)) / 2.0
 #: Mean area of a rhomb in squared sides: in the plane, the number ratio of thick to thin rhombs is the golden ratio.
 MEAN_AREA = (GOLDEN_RATIO * math.sin(math.radians(72.0)) + math.sin(math.radians(36.0))) / (GOLDEN_RATIO + 1.0)
 #: Corners are integer combinations of the powers 0 to 3 of a rotation by 72°: exact, and therefore equal for neighbours.
-FIFTH_TURNS = np.stack(
+FIFTH_ROTATIONS = np.stack(
     ([math.cos(2.0 * math.pi * k / 5.0) for k in range(4)], [math.sin(2.0 * math.pi * k / 5.0) for k in range(4)])
 )
 #: Multiplication of the four integers of a corner by the golden ratio: rows -(z² + z³) z^k with z⁴ = -1 - z - z² - z³.
@@ -28,7 +28,7 @@ PERIOD = 4
 #: Weights that combine four integers of magnitude below 2**15 into one.
 KEY = 2 ** np.array((48, 32, 16, 0), np.int64)
 #: Ratio of inradius to circumradius of the first decagon.
-DECAGON_INSIDE = math.cos(math.pi / 10.0)
+DECAGON_INRADIUS_RATIO = math.cos(math.pi / 10.0)
 
 
 @layout_family(example={"side_um": 2.0, "size_um": 30.0})
@@ -96,10 +96,10 @@ def _rhombs(side_um: float, size_um: float, is_disc: bool) -> tuple[Floats, Bool
     half = 0.5 * size_um / side_um  # all further lengths are in sides
     reach = half * (1.0 if is_disc else math.sqrt(2.0))
     # The triangles have the side 1, scaled by the golden ratio in each subdivision.
-    n_cuts = PERIOD * math.ceil(math.log((reach + 2.0) / DECAGON_INSIDE, GOLDEN_RATIO) / PERIOD)
+    n_cuts = PERIOD * math.ceil(math.log((reach + 2.0) / DECAGON_INRADIUS_RATIO, GOLDEN_RATIO) / PERIOD)
     triangles, is_thick = _decagon()
     for left in range(n_cuts - 1, -1, -1):
-        triangles, is_thick = _cut(triangles, is_thick)
+        triangles, is_thick = _subdivide(triangles, is_thick)
         # The remaining subdivisions stay inside a triangle, and no triangle has the length 2.
         is_near = np.abs(_points(triangles[:, 0])).max(axis=1) <= half * GOLDEN_RATIO**-left + 2.0
         triangles, is_thick = triangles[is_near], is_thick[is_near]
@@ -118,11 +118,13 @@ def _rhombs(side_um: float, size_um: float, is_disc: bool) -> tuple[Floats, Bool
     return side_um * corners[order], is_thick[order]
 
 
-def _points(whole: Ints) -> Floats:
+def _points(integers: Ints) -> Floats:
     """Convert corners from integers (n, 4) to sides (n, 2), with a fixed summation order."""
     x, y = (
-        whole[:, 0] * turn[0] + whole[:, 1] * turn[1] + (whole[:, 2] * turn[2] + whole[:, 3] * turn[3])
-        for turn in FIFTH_TURNS
+        integers[:, 0] * rotation[0]
+        + integers[:, 1] * rotation[1]
+        + (integers[:, 2] * rotation[2] + integers[:, 3] * rotation[3])
+        for rotation in FIFTH_ROTATIONS
     )
     return np.stack((x, y), axis=1)
 
@@ -138,7 +140,7 @@ def _decagon() -> tuple[Ints, Bools]:
     return triangles, np.zeros(10, bool)
 
 
-def _cut(triangles: Ints, is_thick: Bools) -> tuple[Ints, Bools]:
+def _subdivide(triangles: Ints, is_thick: Bools) -> tuple[Ints, Bools]:
     """Subdivide Robinson triangles and scale them by the golden ratio, so that sides remain 1."""
     a, b, c = np.moveaxis(triangles[~is_thick], 1, 0)
     ga, gb, gc = a @ TIMES_GOLDEN, b @ TIMES_GOLDEN, c @ TIMES_GOLDEN

@@ -111,8 +111,8 @@ def quadtree(
     pitch_um = check_length_um("pitch_um", pitch_um)
     limit = check_number("limit", limit, at_least=0.0)
     check_choice("measure", measure, ("sum", "peak"))
-    splits = [*_splits(picture, limit, n_levels, measure), np.zeros(picture.shape, bool)]
-    level, row, column, has_middle = _leaves(splits)
+    splits = [*_split_masks(picture, limit, n_levels, measure), np.zeros(picture.shape, bool)]
+    level, row, column, has_midpoint = _leaves(splits)
 
     # Corners and midpoints of sides, counter-clockwise from the lower left, in half sides.
     outline = np.array([(0, 0), (1, 0), (2, 0), (2, 1), (2, 2), (1, 2), (0, 2), (0, 1)])
@@ -120,10 +120,10 @@ def quadtree(
     # Only squares with an even side have midpoints.
     steps = outline * side[:, np.newaxis, np.newaxis] // 2 + np.stack((column, row), axis=1)[:, np.newaxis]
     is_vertex = np.ones((level.size, 8), bool)
-    is_vertex[:, 1::2] = has_middle
-    middle = 0.5 * np.array(picture.shape[::-1])
+    is_vertex[:, 1::2] = has_midpoint
+    centre = 0.5 * np.array(picture.shape[::-1])
     return Layout(
-        (steps[is_vertex] - middle) * pitch_um,
+        (steps[is_vertex] - centre) * pitch_um,
         np.concatenate(([0], np.cumsum(is_vertex.sum(axis=1)))),
         np.arange(level.size + 1),
         {"level": level, "row": row, "column": column, "readout_line": column},
@@ -139,7 +139,7 @@ def _blocks(values: Floats | Bools) -> Floats | Bools:
     return np.moveaxis(values.reshape(n_y // 2, 2, n_x // 2, 2), 1, 2).reshape(n_y // 2, n_x // 2, 4)
 
 
-def _splits(values: Floats, limit: float, n_levels: int, measure: str) -> list[Bools]:
+def _split_masks(values: Floats, limit: float, n_levels: int, measure: str) -> list[Bools]:
     """Return masks of split squares per level, the largest first, balanced between neighbours."""
     splits: list[Bools] = []
     finer = np.zeros(values.shape, bool)
@@ -148,8 +148,8 @@ def _splits(values: Floats, limit: float, n_levels: int, measure: str) -> list[B
         values = np.asarray(blocks.sum(axis=2) if measure == "sum" else blocks.max(axis=2))
         # A split square requires neighbours of at least its own size, so their parents are split as well.
         padded = np.pad(finer, 1)
-        needs = finer | padded[2:, 1:-1] | padded[:-2, 1:-1] | padded[1:-1, 2:] | padded[1:-1, :-2]
-        finer = (values > limit) | np.asarray(_blocks(needs).any(axis=2))
+        is_required = finer | padded[2:, 1:-1] | padded[:-2, 1:-1] | padded[1:-1, 2:] | padded[1:-1, :-2]
+        finer = (values > limit) | np.asarray(_blocks(is_required).any(axis=2))
         splits.append(finer)
     return splits[::-1]
 
@@ -162,10 +162,10 @@ def _leaves(splits: list[Bools]) -> tuple[Ints, Ints, Ints, Bools]:
         row, column = np.nonzero(exists & ~split)
         around = np.pad(split, 1)
         # Below, right, above, left: a split neighbour has two squares along this side.
-        has_middle = np.stack([around[row + dy, column + dx] for dy, dx in ((0, 1), (1, 2), (2, 1), (1, 0))], axis=1)
+        has_midpoint = np.stack([around[row + dy, column + dx] for dy, dx in ((0, 1), (1, 2), (2, 1), (1, 0))], axis=1)
         side = 2 ** (len(splits) - 1 - level)
-        parts.append((np.full(row.size, level), row * side, column * side, has_middle))
+        parts.append((np.full(row.size, level), row * side, column * side, has_midpoint))
         exists = np.repeat(np.repeat(split, 2, axis=0), 2, axis=1)
-    levels, rows, columns, middles = (np.concatenate(part) for part in zip(*parts, strict=True))
+    levels, rows, columns, has_midpoints = (np.concatenate(part) for part in zip(*parts, strict=True))
     order = np.lexsort((columns, rows))
-    return levels[order], rows[order], columns[order], middles[order]
+    return levels[order], rows[order], columns[order], has_midpoints[order]

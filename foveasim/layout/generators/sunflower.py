@@ -8,7 +8,7 @@ import numpy as np
 
 from foveasim._core.validation import Floats, Ints, check_count, check_length_um, check_sites
 from foveasim.layout._regions import disc
-from foveasim.layout._voronoi import cells_of
+from foveasim.layout._voronoi import voronoi_cells
 from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
 
@@ -17,7 +17,7 @@ __all__ = ["sunflower"]
 #: Angle between consecutive sites: 360° / φ² = 137.5°, with the golden ratio φ.
 GOLDEN_ANGLE_RAD = math.pi * (3.0 - math.sqrt(5.0))
 #: Radius of site 1 for which the closest pair, sites 1 and 4, has the distance 1: 0.6242.
-C = 1.0 / math.sqrt(5.0 - 4.0 * math.cos(3.0 * GOLDEN_ANGLE_RAD))
+SPIRAL_FACTOR = 1.0 / math.sqrt(5.0 - 4.0 * math.cos(3.0 * GOLDEN_ANGLE_RAD))
 #: Minimum number of chords of the default outline.
 MIN_CHORDS = 64
 
@@ -68,14 +68,16 @@ def sunflower(*, n_sites: int, spacing_um: float, n_chords: int | None = None) -
     n_sites = check_sites(check_count("n_sites", n_sites))
     spacing_um = check_length_um("spacing_um", spacing_um)
     k = np.arange(1, n_sites + 1)
-    radius_um = check_length_um("radius_um", C * spacing_um * math.sqrt(n_sites + 0.5), hint="take fewer sites")
+    radius_um = check_length_um(
+        "radius_um", SPIRAL_FACTOR * spacing_um * math.sqrt(n_sites + 0.5), hint="take fewer sites"
+    )
     # The outermost centre must lie inside the chords.
-    fewest = max(3, math.floor(math.pi / math.acos(math.sqrt(n_sites / (n_sites + 0.5)))) + 1)
+    min_chords = max(3, math.floor(math.pi / math.acos(math.sqrt(n_sites / (n_sites + 0.5)))) + 1)
     if n_chords is None:
-        n_sides = max(MIN_CHORDS, 4 * fewest)
+        n_sides = max(MIN_CHORDS, 4 * min_chords)
     else:
-        n_sides = check_count("n_chords", n_chords, at_least=fewest, at_most=10**6)
-    xy_um, offsets = cells_of(_spiral_um(k, spacing_um), disc(radius_um, n_sides))
+        n_sides = check_count("n_chords", n_chords, at_least=min_chords, at_most=10**6)
+    xy_um, offsets = voronoi_cells(_spiral_um(k, spacing_um), disc(radius_um, n_sides))
     return Layout(
         xy_um,
         offsets,
@@ -88,5 +90,5 @@ def sunflower(*, n_sites: int, spacing_um: float, n_chords: int | None = None) -
 
 
 def _spiral_um(k: Ints, spacing_um: float) -> Floats:
-    r_um, angle_rad = C * spacing_um * np.sqrt(k), GOLDEN_ANGLE_RAD * k
+    r_um, angle_rad = SPIRAL_FACTOR * spacing_um * np.sqrt(k), GOLDEN_ANGLE_RAD * k
     return np.stack((r_um * np.cos(angle_rad), r_um * np.sin(angle_rad)), axis=1)

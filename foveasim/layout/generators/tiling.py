@@ -132,7 +132,7 @@ def tiling(
     if border == "merge":
         smallest_um = math.sqrt(SMALL_FRACTION * lattice.area_um2[0]) if min_size_um is None else min_size_um
         pieces_um2 = float(layout.area_um2.sum())
-        layout = _merged(layout, smallest_um)
+        layout = _merge_small_pieces(layout, smallest_um)
         open_um2 = pieces_um2 - float(layout.area_um2.sum())
         if layout.n_sites and open_um2 > AREA_ROUNDING * pieces_um2:
             warnings.warn(
@@ -185,10 +185,10 @@ def fill(layout: Layout, region: Any, *, size_um: float, columns_of: Layout | No
         When the region is not a valid polygon, or the size is out of range.
     """
     size_um = check_length_um("size_um", size_um)
-    open_region = _open_part(layout, as_region("region", region))
+    open_region = _uncovered_part(layout, as_region("region", region))
     if open_region.is_empty:
         return layout
-    return _joined(layout, _hexagons(open_region, size_um), layout if columns_of is None else columns_of, size_um)
+    return _append_sites(layout, _hexagons(open_region, size_um), layout if columns_of is None else columns_of, size_um)
 
 
 def with_hexagons(layout: Layout, size_um: float, n_lines: int) -> Layout:
@@ -196,17 +196,21 @@ def with_hexagons(layout: Layout, size_um: float, n_lines: int) -> Layout:
     ring = layout.columns["ring"]
     first = int(ring.min())
     around = shapely.coverage_union_all(layout[ring == first].polygons())
-    middle = _hexagons(shapely.Polygon(around.interiors[0]), size_um)
-    if middle.n_sites == 0:
+    hexagons = _hexagons(shapely.Polygon(around.interiors[0]), size_um)
+    if hexagons.n_sites == 0:
         raise ParameterError("fovea", f"must fit a hexagon of {size_um:g} µm inside the first ring", "hexagons")
-    angle_rad = np.arctan2(middle.centroid_um[:, 1], middle.centroid_um[:, 0]) % (2.0 * math.pi)
+    angle_rad = np.arctan2(hexagons.centroid_um[:, 1], hexagons.centroid_um[:, 0]) % (2.0 * math.pi)
     line = np.floor(angle_rad * n_lines / (2.0 * math.pi)).astype(np.int64) % n_lines
     shift = 1 if first == 0 else 0
     inside = Layout(
-        middle.xy_um,
-        middle.ring_offsets,
-        middle.site_offsets,
-        {"ring": np.full(middle.n_sites, first - 1 + shift), "sector": np.arange(middle.n_sites), "readout_line": line},
+        hexagons.xy_um,
+        hexagons.ring_offsets,
+        hexagons.site_offsets,
+        {
+            "ring": np.full(hexagons.n_sites, first - 1 + shift),
+            "sector": np.arange(hexagons.n_sites),
+            "readout_line": line,
+        },
     )
     both = union([inside, layout.with_columns(ring=ring + shift)])
     return Layout(both.xy_um, both.ring_offsets, both.site_offsets, both.columns, layout.provenance)
@@ -216,10 +220,10 @@ def _hexagons(region: Any, size_um: float) -> Layout:
     """Tile a region with hexagons of an area of size², and larger sites at the boundary."""
     # The factor above 1 compensates for the rounding of areas.
     pitch_um = size_um * math.sqrt(2.0 / math.sqrt(3.0)) * (1.0 + 1e-9)
-    return _merged(clip(_lattice(region.bounds, pitch_um, "hexagons", np.zeros(2)), region), size_um)
+    return _merge_small_pieces(clip(_lattice(region.bounds, pitch_um, "hexagons", np.zeros(2)), region), size_um)
 
 
-def _merged(pieces: Layout, min_size_um: float) -> Layout:
+def _merge_small_pieces(pieces: Layout, min_size_um: float) -> Layout:
     """Merge small pieces into their neighbours; omit those without neighbours."""
     layout = merge_small(pieces, min_size_um=min_size_um)
     return layout[~is_below_size(layout.area_um2, min_size_um)]
@@ -246,14 +250,14 @@ def _lattice(bounds_um: tuple[float, float, float, float], pitch_um: float, cell
     )
 
 
-def _open_part(layout: Layout, region: Any) -> Any:
+def _uncovered_part(layout: Layout, region: Any) -> Any:
     """Return the part of a region that no site covers."""
     polygons = layout.polygons()
     near = polygons[shapely.STRtree(polygons).query(region)]
     return shapely.difference(region, shapely.union_all(near)) if near.size else region
 
 
-def _joined(layout: Layout, new: Layout, source: Layout, size_um: float) -> Layout:
+def _append_sites(layout: Layout, new: Layout, source: Layout, size_um: float) -> Layout:
     from scipy.spatial import cKDTree
 
     if new.n_sites and source.n_sites:
@@ -262,4 +266,4 @@ def _joined(layout: Layout, new: Layout, source: Layout, size_um: float) -> Layo
         new = Layout(new.xy_um, new.ring_offsets, new.site_offsets, columns)
     both = union([layout, new])
     step = f"filled with {new.n_sites} sites of at least {size_um:g} µm"
-    return Layout(both.xy_um, both.ring_offsets, both.site_offsets, both.columns, layout._then(step))  # noqa: SLF001 -- of the same subpackage
+    return Layout(both.xy_um, both.ring_offsets, both.site_offsets, both.columns, layout._extend_provenance(step))  # noqa: SLF001 -- of the same subpackage

@@ -25,7 +25,7 @@ from foveasim._core.validation import (
 from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid
 from foveasim.layout._regions import parse_region
-from foveasim.layout._voronoi import CellEdges, MovingCells, edges_of_rings
+from foveasim.layout._voronoi import CellEdges, IncrementalCells, ring_edges
 from foveasim.layout.families import layout_family
 from foveasim.layout.model import Layout
 
@@ -58,7 +58,7 @@ TRIANGLE_ERROR, MAX_QUARTERINGS = 1e-8, 9
 #: Gauss points of a line as fractions of its length, of equal weight: exact up to degree 3.
 LINE_POINTS = (0.211324865405187118, 0.788675134594812882)
 #: Small numbers of triangles and lines, which are large ones, are subdivided up to these numbers at negligible cost.
-LEAST_TRIANGLES, LEAST_LINE_POINTS = 2048, 1024
+MIN_TRIANGLES, MIN_LINE_POINTS = 2048, 1024
 #: Fraction of the mean mass below which a cell counts as empty.
 EMPTY_FRACTION = 1e-9
 #: Largest relative deviation of equal capacities from their mean; Newton iteration ends at a tenth of it.
@@ -66,9 +66,9 @@ CAPACITY_ERROR = 1e-6
 #: Lloyd iterations with cells of equal capacity, and additional ones if no such cells are found.
 EQUAL_STEPS, MORE_STEPS = 2, 20
 #: Maximum number of Newton steps, and the smallest damping factor.
-MAX_NEWTON_STEPS, SMALLEST_PART = 30, 0.01
-#: If Newton iteration fails, a uniform density is added: the mean density, reduced by this factor in each of N_FADINGS steps.
-FADING, N_FADINGS = 0.25, 16
+MAX_NEWTON_STEPS, MIN_DAMPING = 30, 0.01
+#: If Newton iteration fails, a uniform density is added: the mean density, reduced by this factor in each of several steps.
+REGULARISATION_FACTOR, N_REGULARISATIONS = 0.25, 16
 
 
 @layout_family(example={"n_sites": 200, "size_um": (32.0, 32.0), "n_iterations": 20}, picture="density")
@@ -157,29 +157,29 @@ def voronoi(
     is_equal = check_choice("capacity", capacity, ("free", "equal")) == "equal"
     field, table, grid = _density(density, density_grid, outline)
     centres_um = _first_centres(n_sites, table, grid, outline, seed)
-    cells = MovingCells(outline, (lambda edges, n: _moments(edges, n, field)[0]) if is_equal else None)
+    cells = IncrementalCells(outline, (lambda edges, n: _moments(edges, n, field)[0]) if is_equal else None)
     n_equal = min(EQUAL_STEPS, n_iterations) if is_equal else 0
     squared = field.squared()
     for _ in range(n_iterations - n_equal):
         mass, moment = squared.moments(_edges(cells, centres_um), centres_um, is_rough=True)
-        centres_um = _moved(centres_um, mass, moment, outline)
+        centres_um = _move_to_centroids(centres_um, mass, moment, outline)
     if is_equal:
-        _follow_equal(cells, centres_um, field, n_equal)
+        _equalise_capacities(cells, centres_um, field, n_equal)
     else:
         _edges(cells, centres_um)
     xy_um, offsets = cells.rings()
-    mass, _ = _moments(edges_of_rings(xy_um, offsets), n_sites, field)
-    share = mass * (n_sites / mass.sum())
+    mass, _ = _moments(ring_edges(xy_um, offsets), n_sites, field)
+    relative_mass = mass * (n_sites / mass.sum())
     if is_equal:
-        _require_equal(float(np.abs(share - 1.0).max()))
+        _require_equal(float(np.abs(relative_mass - 1.0).max()))
     return Layout(
         xy_um,
         offsets,
         np.arange(offsets.size),
-        {"share": share},
+        {"share": relative_mass},
         {
             "parameters": {
-                "density": _described(density),
+                "density": _describe_density(density),
                 "density_grid": None if density_grid is None else asdict(density_grid),
                 "region": None if region is None else _rings_um(outline),
             },
@@ -187,7 +187,7 @@ def voronoi(
     )
 
 
-def _described(density: Density | None) -> str | None:
+def _describe_density(density: Density | None) -> str | None:
     if density is None:
         return None
     return getattr(density, "__name__", "function") if callable(density) else f"picture of {np.shape(density)} cells"
@@ -222,7 +222,7 @@ def _density(
         picture = finite_array("density", density, ndim=2, at_least=0.0)
         if picture.shape != density_grid.shape:
             raise ParameterError("density", f"must have the grid's shape {density_grid.shape}, got {picture.shape}")
-        table = _positive(_covering(picture, density_grid, outline))
+        table = _positive(_crop_to_region(picture, density_grid, outline))
         return _PictureField(picture, density_grid), table, density_grid
     x0, y0, x1, y1 = outline.bounds
     pitch_um = max(x1 - x0, y1 - y0) / TABLE_CELLS
@@ -230,7 +230,7 @@ def _density(
     grid = Grid(shape=shape, pitch_um=max(pitch_um, 1e-4), origin_um=(x0, y0))
     if density is None:
         return _UniformField(), np.ones(shape), grid
-    field = _FunctionField(_checked(density))
+    field = _FunctionField(_with_value_check(density))
     x_um, y_um = np.meshgrid(grid.x_um, grid.y_um)
     return field, _positive(field.at(np.stack((x_um.ravel(), y_um.ravel()), axis=1)).reshape(shape)), grid
 
@@ -241,7 +241,7 @@ def _positive(values: Floats) -> Floats:
     return values
 
 
-def _covering(values: Floats, grid: Grid, outline: shapely.Polygon) -> Floats:
+def _crop_to_region(values: Floats, grid: Grid, outline: shapely.Polygon) -> Floats:
     """Set the picture to 0 outside the region; check that its grid covers the region."""
     x0, y0, x1, y1 = grid.bounds_um
     low_x, low_y, high_x, high_y = outline.bounds
@@ -254,7 +254,7 @@ def _covering(values: Floats, grid: Grid, outline: shapely.Polygon) -> Floats:
     return np.where(is_near_y[:, np.newaxis] & is_near_x, values, 0.0)
 
 
-def _checked(density: Callable[[Any], ArrayLike]) -> Callable[[Any], Any]:
+def _with_value_check(density: Callable[[Any], ArrayLike]) -> Callable[[Any], Any]:
     """Wrap the function with a check of its values."""
 
     def at_points(xy_um: Any) -> Any:
@@ -299,14 +299,14 @@ def _first_centres(n_sites: int, weight: Floats, grid: Grid, outline: shapely.Po
 # -- Lloyd iteration ---------------------------------------------------------------------------------------------------
 
 
-def _edges(cells: MovingCells, centres_um: Floats, weights_um2: Floats | None = None) -> CellEdges:
-    edges = cells.follow(centres_um, weights_um2)
+def _edges(cells: IncrementalCells, centres_um: Floats, weights_um2: Floats | None = None) -> CellEdges:
+    edges = cells.update(centres_um, weights_um2)
     if edges is None:
         raise GeometryError("the centres are too close together for float64; take fewer sites")
     return edges
 
 
-def _moved(centres_um: Floats, mass: Any, moment: Any, outline: shapely.Polygon) -> Floats:
+def _move_to_centroids(centres_um: Floats, mass: Any, moment: Any, outline: shapely.Polygon) -> Floats:
     """Move centres to the centres of mass, except of empty cells and to points outside."""
     has_mass = mass > EMPTY_FRACTION * mass.mean()
     moved_um = np.where(has_mass[:, np.newaxis], moment / np.where(has_mass, mass, 1.0)[:, np.newaxis], centres_um)
@@ -335,17 +335,17 @@ class _Capacities:
     moment: Any
 
     @property
-    def share(self) -> Any:
+    def relative_mass(self) -> Any:
         """Masses (n,) relative to their mean."""
         return self.mass * (self.mass.size / self.mass.sum())
 
     @property
     def worst(self) -> float:
         """Largest deviation of the relative masses from 1."""
-        return float(np.abs(self.share - 1.0).max())
+        return float(np.abs(self.relative_mass - 1.0).max())
 
 
-def _follow_equal(cells: MovingCells, centres_um: Floats, field: _Integrals, n_moves: int) -> None:
+def _equalise_capacities(cells: IncrementalCells, centres_um: Floats, field: _Integrals, n_moves: int) -> None:
     """
     Update cells to equal capacity, after moves of the centres to their centres of mass.
 
@@ -356,16 +356,16 @@ def _follow_equal(cells: MovingCells, centres_um: Floats, field: _Integrals, n_m
     worst = np.inf
     for move in range(n_moves + MORE_STEPS + 1):
         own = _with_own_parts(cells, centres_um, field)
-        found = given = _capacities(own.edges, own.weights_um2, field, is_own=False)
-        if given.worst > CAPACITY_ERROR:
-            found = _newton(cells, centres_um, field, given, is_own=False)
+        found = initial = _capacities(own.edges, own.weights_um2, field, is_own=False)
+        if initial.worst > CAPACITY_ERROR:
+            found = _newton(cells, centres_um, field, initial, is_own=False)
         worst = min(worst, found.worst)
         if found.worst > CAPACITY_ERROR:
-            found = given
+            found = initial
         elif move >= n_moves:
-            cells.follow(centres_um, found.weights_um2)
+            cells.update(centres_um, found.weights_um2)
             return
-        centres_um = _moved(centres_um, found.mass, found.moment, cells.region)
+        centres_um = _move_to_centroids(centres_um, found.mass, found.moment, cells.region)
     _require_equal(worst)
 
 
@@ -377,7 +377,7 @@ def _require_equal(worst: Any) -> None:
         )
 
 
-def _with_own_parts(cells: MovingCells, centres_um: Floats, field: _Integrals) -> _Capacities:
+def _with_own_parts(cells: IncrementalCells, centres_um: Floats, field: _Integrals) -> _Capacities:
     """Return cells of equal capacity that retain the parts separated by the region."""
     weights_um2 = np.zeros(centres_um.shape[0])
     start = _capacities(_edges(cells, centres_um, weights_um2), weights_um2, field, is_own=True)
@@ -386,10 +386,10 @@ def _with_own_parts(cells: MovingCells, centres_um: Floats, field: _Integrals) -
         return found
     # Masses have no gradient where the density is almost 0: start with a uniform density.
     mean = start.mass.sum() / cells.region.area
-    for even in (*(mean * FADING**i for i in range(N_FADINGS)), 0.0):
-        faded = _FadedField(field, even)
-        start = _capacities(_edges(cells, centres_um, weights_um2), weights_um2, faded, is_own=True)
-        found = _newton(cells, centres_um, faded, start, is_own=True)
+    for uniform in (*(mean * REGULARISATION_FACTOR**i for i in range(N_REGULARISATIONS)), 0.0):
+        regularised = _RegularisedField(field, uniform)
+        start = _capacities(_edges(cells, centres_um, weights_um2), weights_um2, regularised, is_own=True)
+        found = _newton(cells, centres_um, regularised, start, is_own=True)
         _require_equal(found.worst)
         weights_um2 = found.weights_um2
     return found
@@ -397,39 +397,48 @@ def _with_own_parts(cells: MovingCells, centres_um: Floats, field: _Integrals) -
 
 def _capacities(edges: CellEdges, weights_um2: Floats, field: _Integrals, *, is_own: bool) -> _Capacities:
     """Return the masses of cells, with their own separated parts or with assigned ones."""
-    whole = replace(edges, cell=edges.owner) if is_own else edges
-    return _Capacities(weights_um2, edges, *_moments(whole, weights_um2.size, field))
+    owned = replace(edges, cell=edges.owner) if is_own else edges
+    return _Capacities(weights_um2, edges, *_moments(owned, weights_um2.size, field))
 
 
 def _newton(
-    cells: MovingCells, centres_um: Floats, field: _Integrals, found: _Capacities, *, is_own: bool
+    cells: IncrementalCells, centres_um: Floats, field: _Integrals, found: _Capacities, *, is_own: bool
 ) -> _Capacities:
     """Return the cells after a damped Newton iteration, converged or not."""
     for _ in range(MAX_NEWTON_STEPS):
         if found.worst <= 0.1 * CAPACITY_ERROR:
             break
         step_um2 = _newton_step_um2(centres_um, field, found, is_own=is_own)
-        better = None if step_um2 is None else _damped(cells, centres_um, field, found, step_um2, is_own=is_own)
+        better = None if step_um2 is None else _damped_step(cells, centres_um, field, found, step_um2, is_own=is_own)
         if better is None:
             break
         found = better
     return found
 
 
-def _damped(
-    cells: MovingCells, centres_um: Floats, field: _Integrals, found: _Capacities, step_um2: Floats, *, is_own: bool
+def _damped_step(
+    cells: IncrementalCells,
+    centres_um: Floats,
+    field: _Integrals,
+    found: _Capacities,
+    step_um2: Floats,
+    *,
+    is_own: bool,
 ) -> _Capacities | None:
     """Return the cells after the largest damped step that improves the masses, or None."""
-    least, before = 0.5 * min(found.share.min(), 1.0), np.linalg.norm(found.share - 1.0)
-    part = 1.0
-    while part >= SMALLEST_PART:
-        weights_um2 = found.weights_um2 + part * step_um2
-        edges = cells.follow(centres_um, weights_um2)
+    min_mass, before = 0.5 * min(found.relative_mass.min(), 1.0), np.linalg.norm(found.relative_mass - 1.0)
+    damping = 1.0
+    while damping >= MIN_DAMPING:
+        weights_um2 = found.weights_um2 + damping * step_um2
+        edges = cells.update(centres_um, weights_um2)
         if edges is not None:
             new = _capacities(edges, weights_um2, field, is_own=is_own)
-            if new.share.min() >= least and np.linalg.norm(new.share - 1.0) <= (1.0 - 0.5 * part) * before:
+            if (
+                new.relative_mass.min() >= min_mass
+                and np.linalg.norm(new.relative_mass - 1.0) <= (1.0 - 0.5 * damping) * before
+            ):
                 return new
-        part *= 0.5
+        damping *= 0.5
     return None
 
 
@@ -464,7 +473,7 @@ def _slopes(centres_um: Floats, field: _Integrals, edges: CellEdges, *, is_own: 
     p, q = edges.owner[one], edges.owner[other]
     to, of = (p, q) if is_own else (edges.cell[one], edges.cell[other])
     distance_um = np.hypot(*(centres_um[p] - centres_um[q]).T)
-    swept = field.along(edges.start_um[one], edges.stop_um[one]) / (2.0 * distance_um)
+    swept = field.line_integrals(edges.start_um[one], edges.stop_um[one]) / (2.0 * distance_um)
     rows, columns = np.concatenate((to, to, of, of)), np.concatenate((p, q, p, q))
     n = centres_um.shape[0]
     return coo_array((np.concatenate((swept, -swept, -swept, swept)), (rows, columns)), shape=(n, n)).tocsc()
@@ -484,7 +493,7 @@ class _Integrals(Protocol):
         error that is negligible for centres of mass.
         """
 
-    def along(self, start_um: Floats, stop_um: Floats) -> Any:
+    def line_integrals(self, start_um: Floats, stop_um: Floats) -> Any:
         """Return the line integrals (n,) of the density."""
 
 
@@ -510,7 +519,7 @@ class _UniformField:
         third = [np.bincount(edges.cell, (a[:, i] + b[:, i]) * (area_um2 / 3.0), minlength=n) for i in (0, 1)]
         return mass, np.stack(third, axis=1) + mass[:, np.newaxis] * anchors_um
 
-    def along(self, start_um: Floats, stop_um: Floats) -> Any:
+    def line_integrals(self, start_um: Floats, stop_um: Floats) -> Any:
         return np.hypot(*(stop_um - start_um).T)
 
 
@@ -532,16 +541,16 @@ class _FunctionField:
             sums, coarse = self._sums(origin, corners, THREE_POINTS if is_rough else SEVEN_POINTS)
             limit = limit or TRIANGLE_ERROR * abs(float(sums[0].sum())) / n
             # The relative error of a rule of twice the order is about the square of that of the coarse rule.
-            is_bent = (sums[0] - coarse) ** 2 > limit * np.abs(sums[0])
-            is_bent |= cell.size < LEAST_TRIANGLES
-            is_bent &= depth < MAX_QUARTERINGS and not is_rough
-            total += [np.bincount(cell[~is_bent], x[~is_bent], minlength=n) for x in sums]
-            if not is_bent.any():
+            is_inaccurate = (sums[0] - coarse) ** 2 > limit * np.abs(sums[0])
+            is_inaccurate |= cell.size < MIN_TRIANGLES
+            is_inaccurate &= depth < MAX_QUARTERINGS and not is_rough
+            total += [np.bincount(cell[~is_inaccurate], x[~is_inaccurate], minlength=n) for x in sums]
+            if not is_inaccurate.any():
                 break
-            a, b, c = (x[is_bent] for x in corners)
+            a, b, c = (x[is_inaccurate] for x in corners)
             ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
             corners = [np.concatenate(x) for x in ((a, ab, ca, ab), (ab, b, bc, bc), (ca, bc, c, ca))]
-            cell, origin = np.tile(cell[is_bent], 4), np.tile(origin[is_bent], (4, 1))
+            cell, origin = np.tile(cell[is_inaccurate], 4), np.tile(origin[is_inaccurate], (4, 1))
         return total[0], total[1:].T + total[0][:, np.newaxis] * anchors_um
 
     def _sums(self, origin: Any, corners: Any, rule: Any) -> tuple[Any, Any]:
@@ -558,11 +567,11 @@ class _FunctionField:
                 sums[i] += x
         return sums, coarse
 
-    def along(self, start_um: Floats, stop_um: Floats) -> Any:
-        n_parts = 1 + LEAST_LINE_POINTS // max(1, start_um.shape[0])
-        way = ((np.arange(n_parts)[:, np.newaxis] + LINE_POINTS) / n_parts).reshape(-1, 1, 1)
-        points_um = start_um + way * (stop_um - start_um)
-        values = self.at(points_um.reshape(-1, 2)).reshape(way.size, -1)
+    def line_integrals(self, start_um: Floats, stop_um: Floats) -> Any:
+        n_parts = 1 + MIN_LINE_POINTS // max(1, start_um.shape[0])
+        fraction = ((np.arange(n_parts)[:, np.newaxis] + LINE_POINTS) / n_parts).reshape(-1, 1, 1)
+        points_um = start_um + fraction * (stop_um - start_um)
+        values = self.at(points_um.reshape(-1, 2)).reshape(fraction.size, -1)
         return values.mean(axis=0) * np.hypot(*(stop_um - start_um).T)
 
 
@@ -603,7 +612,7 @@ class _PictureField:
             self.grid.origin_um
         )
 
-    def along(self, start_um: Floats, stop_um: Floats) -> Any:
+    def line_integrals(self, start_um: Floats, stop_um: Floats) -> Any:
         edge, start, stop, at = self._pieces(start_um, stop_um)
         length_um = np.hypot(*((stop - start) * self.grid.pitch_xy_um[:, np.newaxis]))
         return np.bincount(edge, self.values[at] * length_um, minlength=start_um.shape[0])
@@ -611,26 +620,28 @@ class _PictureField:
     def _pieces(self, start_um: Floats, stop_um: Floats) -> tuple[Ints, Any, Any, tuple[Ints, Ints]]:
         """Split lines at cell boundaries: line, ends (2, n) in cells, row and column."""
         start, stop = ((xy_um - np.array(self.grid.origin_um)) / self.grid.pitch_xy_um for xy_um in (start_um, stop_um))
-        line, start, stop = _cut(start, stop, axis=1)
-        piece, start, stop = _cut(start, stop, axis=0)
-        middle = np.floor(0.5 * (start + stop)).astype(np.int64)
-        column, row = (np.clip(middle[:, i], 0, self.values.shape[1 - i] - 1) for i in (0, 1))
+        line, start, stop = _split_at_integers(start, stop, axis=1)
+        piece, start, stop = _split_at_integers(start, stop, axis=0)
+        centre = np.floor(0.5 * (start + stop)).astype(np.int64)
+        column, row = (np.clip(centre[:, i], 0, self.values.shape[1 - i] - 1) for i in (0, 1))
         return line[piece], start.T, stop.T, (row, column)
 
 
-class _FadedField:
+class _RegularisedField:
     """Sum of a density and a uniform density."""
 
-    def __init__(self, field: _Integrals, even: Any) -> None:
-        self.field, self.even = field, even
+    def __init__(self, field: _Integrals, uniform: Any) -> None:
+        self.field, self.uniform = field, uniform
 
     def moments(self, edges: CellEdges, anchors_um: Floats, *, is_rough: bool = False) -> tuple[Any, Any]:
         mass, moment = self.field.moments(edges, anchors_um, is_rough=is_rough)
-        even_mass, even_moment = _UniformField().moments(edges, anchors_um)
-        return mass + self.even * even_mass, moment + self.even * even_moment
+        uniform_mass, uniform_moment = _UniformField().moments(edges, anchors_um)
+        return mass + self.uniform * uniform_mass, moment + self.uniform * uniform_moment
 
-    def along(self, start_um: Floats, stop_um: Floats) -> Any:
-        return self.field.along(start_um, stop_um) + self.even * _UniformField().along(start_um, stop_um)
+    def line_integrals(self, start_um: Floats, stop_um: Floats) -> Any:
+        return self.field.line_integrals(start_um, stop_um) + self.uniform * _UniformField().line_integrals(
+            start_um, stop_um
+        )
 
 
 def _area_um2(a_um: Floats, b_um: Floats) -> Any:
@@ -638,7 +649,7 @@ def _area_um2(a_um: Floats, b_um: Floats) -> Any:
     return 0.5 * (a_um[:, 0] * b_um[:, 1] - a_um[:, 1] * b_um[:, 0])
 
 
-def _cut(start: Any, stop: Any, axis: int) -> tuple[Ints, Any, Any]:
+def _split_at_integers(start: Any, stop: Any, axis: int) -> tuple[Ints, Any, Any]:
     """Split lines (n, 2) at integer values of a coordinate: line index and ends of the pieces."""
     a, b = start[:, axis], stop[:, axis]
     first = np.floor(np.minimum(a, b)) + 1.0
@@ -646,11 +657,11 @@ def _cut(start: Any, stop: Any, axis: int) -> tuple[Ints, Any, Any]:
     line, position = np.repeat(np.arange(a.size), n_cuts + 1), positions_in_runs(n_cuts + 1)
     is_cut = position < n_cuts[line]
     of, k = line[is_cut], position[is_cut]
-    whole = first[of] + np.where(a[of] < b[of], k, n_cuts[of] - 1 - k)
-    way = (whole - a[of]) / (b[of] - a[of])
+    integer = first[of] + np.where(a[of] < b[of], k, n_cuts[of] - 1 - k)
+    fraction = (integer - a[of]) / (b[of] - a[of])
     stops = stop[line]
-    stops[is_cut, axis] = whole
-    stops[is_cut, 1 - axis] = start[of, 1 - axis] + way * (stop[of, 1 - axis] - start[of, 1 - axis])
+    stops[is_cut, axis] = integer
+    stops[is_cut, 1 - axis] = start[of, 1 - axis] + fraction * (stop[of, 1 - axis] - start[of, 1 - axis])
     starts = np.roll(stops, 1, axis=0)
     starts[position == 0] = start
     return line, starts, stops

@@ -23,7 +23,7 @@ __all__ = ["zones"]
 #: Maximum number of pixels along the side of a zone.
 MAX_PIXELS = 2**14
 #: Tolerance of integer ratios of lengths.
-WHOLE_NUMBER_ROUNDING = 1e-9
+INTEGER_ROUNDING = 1e-9
 
 
 @layout_family(example={"side_um": (8.0, 16.0, 32.0), "pitch_um": (1.0, 2.0, 4.0)})
@@ -102,7 +102,7 @@ def zones(
             outlines = [
                 shapely.box(-0.5 * s, -0.5 * s, 0.5 * s, 0.5 * s) for s in (() if sides_um is None else sides_um)
             ]
-        layout = _tiled(outlines, pitches_um, shapes)
+        layout = _tile_zones(outlines, pitches_um, shapes)
     if outlines_um is None:
         return layout
     return layout.with_provenance(
@@ -142,12 +142,12 @@ def _squares(sides_um: Floats, pitches_um: Floats) -> tuple[Floats, dict[str, In
     n_lines = 0
     inner_um = 0.0
     for zone, (outer_um, p_um) in enumerate(zip(sides_um, pitches_um, strict=True)):
-        n = _whole(f"side_um[{zone}]", outer_um, p_um, outer_um / p_um)
-        border = 0
+        n = _integer_ratio(f"side_um[{zone}]", outer_um, p_um, outer_um / p_um)
+        width = 0
         if zone > 0:
-            border = _whole(f"pitch_um[{zone}]", p_um, outer_um - inner_um, 0.5 * (outer_um - inner_um) / p_um)
+            width = _integer_ratio(f"pitch_um[{zone}]", p_um, outer_um - inner_um, 0.5 * (outer_um - inner_um) / p_um)
         row, column = (index.ravel() for index in np.divmod(np.arange(n * n), n))
-        is_inside = (np.minimum(row, column) >= border) & (np.maximum(row, column) < n - border)
+        is_inside = (np.minimum(row, column) >= width) & (np.maximum(row, column) < n - width)
         if inner_um > 0.0:
             row, column = row[~is_inside], column[~is_inside]
         corners.append(square_corners_um(column - 0.5 * n, row - 0.5 * n, float(p_um)))
@@ -158,7 +158,7 @@ def _squares(sides_um: Floats, pitches_um: Floats) -> tuple[Floats, dict[str, In
     return np.concatenate(corners), dict(zip(names, np.concatenate(columns, axis=1), strict=True))
 
 
-def _tiled(outlines: Sequence[Any], pitches_um: Floats, shapes: Sequence[Cells]) -> Layout:
+def _tile_zones(outlines: Sequence[Any], pitches_um: Floats, shapes: Sequence[Cells]) -> Layout:
     """Return zones of arbitrary outlines, clipped from their lattices."""
     parts = []
     n_lines = 0
@@ -173,10 +173,10 @@ def _tiled(outlines: Sequence[Any], pitches_um: Floats, shapes: Sequence[Cells])
     return union(parts)
 
 
-def _whole(name: str, value: float, of_um: float, ratio: float) -> int:
+def _integer_ratio(name: str, value: float, of_um: float, ratio: float) -> int:
     if ratio > MAX_PIXELS:
         raise ParameterError(name, f"must give at most {MAX_PIXELS} pixels in a row, got {ratio:g}")
-    if round(ratio) < 1 or abs(ratio - round(ratio)) > WHOLE_NUMBER_ROUNDING * max(ratio, 1.0):
+    if round(ratio) < 1 or abs(ratio - round(ratio)) > INTEGER_ROUNDING * max(ratio, 1.0):
         raise ParameterError(
             name,
             f"must give an integer number of pixels between zone boundaries ({of_um:g} µm gives {ratio:g} pixels)",

@@ -10,7 +10,7 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference.rules import TWINS, layouts
+from reference.rules import REFERENCES, layouts
 from shapely.affinity import rotate
 
 import foveasim as fs
@@ -61,7 +61,7 @@ def limited(rule, layout, fraction, has_field):
     if rule == "die_um":
         return fs.DesignRules(**field)
     other = {"max_gap_um2": field, "min_space_um": {"grid_um": 0.7}}.get(rule, {}) if has_field else {}
-    limit = between([value for _, value in TWINS[rule](layout, fs.DesignRules(**other))], fraction)
+    limit = between([value for _, value in REFERENCES[rule](layout, fs.DesignRules(**other))], fraction)
     return fs.DesignRules(**{rule: min(limit, 180.0) if rule == "min_angle_deg" else limit}, **other)
 
 
@@ -69,7 +69,7 @@ def compare(rule, layout, rules):
     """Compare sites and values of the violations with the reference implementation."""
     is_upper = rule.startswith("max_") or rule in DEVIATIONS
     limit = DEVIATIONS.get(rule, getattr(rules, rule))
-    measured = TWINS[rule](layout, rules)
+    measured = REFERENCES[rule](layout, rules)
     unclear = {sites for sites, value in measured if math.isnan(value)}
     expected = sorted((s, v) for s, v in measured if s not in unclear and (v > limit if is_upper else v < limit))
     (result,) = [result for result in layout.check(rules).results if result.rule == rule]
@@ -89,10 +89,10 @@ FIELD_RULES = {"min_density", "max_density", "max_data_rate_gbit_per_s", "max_tr
 
 
 def test_every_rule_has_reference_implementation():
-    assert set(TWINS) | FIELD_RULES == set(RULES)
+    assert set(REFERENCES) | FIELD_RULES == set(RULES)
 
 
-@pytest.mark.parametrize("rule", sorted(set(TWINS) - {"max_gap_um2"}))
+@pytest.mark.parametrize("rule", sorted(set(REFERENCES) - {"max_gap_um2"}))
 @given(layout=layouts(), fraction=fractions, has_field=st.booleans())
 @relaxed
 def test_violations_match_reference_implementation(rule, layout, fraction, has_field):
@@ -109,7 +109,7 @@ def test_gaps_match_reference_without_rotation(layout, fraction, has_field):
 @relaxed
 def test_gap_areas_match_reference_with_rotation(layout, fraction, has_field):
     rules = limited("max_gap_um2", layout, fraction, has_field)
-    expected = [area_um2 for _, area_um2 in TWINS["max_gap_um2"](layout, rules) if area_um2 > rules.max_gap_um2]
+    expected = [area_um2 for _, area_um2 in REFERENCES["max_gap_um2"](layout, rules) if area_um2 > rules.max_gap_um2]
     found = [violation.value for violation in layout.check(rules).violations if violation.rule == "max_gap_um2"]
 
     assert found == pytest.approx(sorted(expected, reverse=True), rel=1e-6, abs=1e-5)

@@ -98,8 +98,8 @@ def test_klayout_finds_same_narrow_giotto_sites(giotto, tmp_path):
     pairs = region.width_check(round(6.8 / dbu_um), False, kdb.Region.Projection, 80.0, None, None)
     # A pair of edges belongs to the site that contains its centre.
     centre_lines = [kdb.Edge(pair.first.bbox().center(), pair.second.bbox().center()) for pair in pairs.each()]
-    places = shapely.transform([edge_centre(edge) for edge in centre_lines], lambda xy: xy * dbu_um)
-    pair, site = shapely.STRtree(giotto.polygons()).query(places, predicate="intersects")
+    midpoints = shapely.transform([edge_centre(edge) for edge in centre_lines], lambda xy: xy * dbu_um)
+    pair, site = shapely.STRtree(giotto.polygons()).query(midpoints, predicate="intersects")
     narrow = {violation.site_ids[0] for violation in giotto.check(fs.DesignRules(min_width_um=6.8)).violations}
 
     assert region.count() == giotto.n_sites == 27_720

@@ -15,12 +15,19 @@ from foveasim.errors import GeometryError, ParameterError
 from foveasim.fields import Grid
 from foveasim.layout import Layout
 from foveasim.layout._regions import disc
-from foveasim.layout._voronoi import MovingCells, cells_of, edges_of_rings
+from foveasim.layout._voronoi import IncrementalCells, ring_edges, voronoi_cells
 from foveasim.layout.generators.fovi import fovi
 from foveasim.layout.generators.penrose import penrose
 from foveasim.layout.generators.quadtree import quadtree
 from foveasim.layout.generators.sunflower import sunflower
-from foveasim.layout.generators.voronoi import _capacities, _density, _first_centres, _follow_equal, _slopes, voronoi
+from foveasim.layout.generators.voronoi import (
+    _capacities,
+    _density,
+    _equalise_capacities,
+    _first_centres,
+    _slopes,
+    voronoi,
+)
 
 relaxed = settings(deadline=None, derandomize=True, max_examples=30)
 GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
@@ -80,7 +87,7 @@ def nearest_um(points):
 @relaxed
 def test_cells_tile_region_one_per_centre(region, n, seed):
     centres = points_in(region, n, seed)
-    layout = as_layout(*cells_of(centres, region))
+    layout = as_layout(*voronoi_cells(centres, region))
 
     assert layout.n_sites == centres.shape[0]
     assert_tiles(layout, region.area)
@@ -91,7 +98,7 @@ def test_cells_tile_region_one_per_centre(region, n, seed):
 @relaxed
 def test_cell_points_are_nearest_to_centre(region, n, seed):
     centres = points_in(region, n, seed)
-    layout = as_layout(*cells_of(centres, region))
+    layout = as_layout(*voronoi_cells(centres, region))
     points = points_in(region, 500, seed + 1)
     _, nearest = cKDTree(centres).query(points)
 
@@ -107,7 +114,7 @@ def test_cells_of_square_grid_are_squares(n_x, n_y, pitch_um, x0_um):
     """Four cells meet in every corner, which rounding may split in two."""
     x, y = np.meshgrid((np.arange(n_x) + 0.5) * pitch_um + x0_um, (np.arange(n_y) + 0.5) * pitch_um)
     region = shapely.box(x0_um, 0, x0_um + n_x * pitch_um, n_y * pitch_um)
-    layout = as_layout(*cells_of(np.stack((x.ravel(), y.ravel()), axis=1), region))
+    layout = as_layout(*voronoi_cells(np.stack((x.ravel(), y.ravel()), axis=1), region))
 
     assert_tiles(layout, region.area)
     np.testing.assert_allclose(layout.area_um2, pitch_um**2, rtol=1e-6)
@@ -116,7 +123,7 @@ def test_cells_of_square_grid_are_squares(n_x, n_y, pitch_um, x0_um):
 def test_inner_cells_of_hexagonal_packing_are_hexagons():
     row, column = np.divmod(np.arange(400), 20)
     centres = np.stack((column + 0.5 * (row % 2), row * math.sqrt(3) / 2), axis=1)
-    layout = as_layout(*cells_of(centres, shapely.box(-1, -1, 21, 18)))
+    layout = as_layout(*voronoi_cells(centres, shapely.box(-1, -1, 21, 18)))
     is_inside = (row > 0) & (row < 19) & (column > 0) & (column < 19)
 
     assert set(np.diff(layout.ring_offsets)[is_inside].tolist()) == {6}
@@ -126,7 +133,7 @@ def test_inner_cells_of_hexagonal_packing_are_hexagons():
 def test_separated_part_is_assigned_to_neighbour():
     """Arms of a U: the centre in the left arm is also nearest to the end of the right arm."""
     u = shapely.Polygon([(0, 0), (10, 0), (10, 10), (6, 10), (6, 1), (4, 1), (4, 10), (0, 10)])
-    layout = as_layout(*cells_of(np.array([(3.9, 9.0), (9.9, 0.5)]), u))
+    layout = as_layout(*voronoi_cells(np.array([(3.9, 9.0), (9.9, 0.5)]), u))
 
     assert layout.n_sites == 2
     assert_tiles(layout, u.area)
@@ -145,26 +152,26 @@ def test_separated_part_joins_longest_shared_boundary(region, n, seed):
     assume(is_separated.sum() == 1)
     part, mains = parts[is_separated][0], parts[~is_separated]
     shared_um = shapely.length(shapely.intersection(shapely.buffer(part, 1e-6), shapely.boundary(mains)))
-    layout = as_layout(*cells_of(centres, region))
+    layout = as_layout(*voronoi_cells(centres, region))
     assume(np.diff(np.sort(shared_um)[-2:])[0] > 1e-3)
 
     assert bool(shapely.contains(layout.polygons()[shared_um.argmax()], part.point_on_surface()))
 
 
 def test_single_cell_is_the_region():
-    layout = as_layout(*cells_of(np.array([(0.3, -0.2)]), STAR))
+    layout = as_layout(*voronoi_cells(np.array([(0.3, -0.2)]), STAR))
 
     assert shapely.equals(layout.polygons()[0], STAR)
 
 
 def test_cells_tile_region_with_hole():
-    layout = as_layout(*cells_of(points_in(FRAME, 60, 1), FRAME))
+    layout = as_layout(*voronoi_cells(points_in(FRAME, 60, 1), FRAME))
 
     assert_tiles(layout, 400 - 64)
 
 
 def test_100000_cells_tile():
-    layout = as_layout(*cells_of(points_in(BOX, 100_000, 2), BOX))
+    layout = as_layout(*voronoi_cells(points_in(BOX, 100_000, 2), BOX))
 
     assert layout.n_sites == 100_000
     assert layout.area_um2.sum() == pytest.approx(BOX.area, rel=1e-12)
@@ -185,7 +192,7 @@ def test_100000_cells_tile():
 )
 def test_centres_without_cell_raise(centres, region, error, message):
     with pytest.raises(error, match=message):
-        cells_of(np.array(centres, float), region)
+        voronoi_cells(np.array(centres, float), region)
 
 
 # -- incrementally updated cells -----------------------------------------------------------------------------------------
@@ -202,15 +209,15 @@ def areas_um2(edges, n):
 def test_updated_cells_equal_new_cells(region, n, step_fraction, seed):
     """Including cells divided by notches, and both small and large displacements of centres."""
     centres, targets = points_in(region, n, seed), points_in(region, n, seed + 1)
-    cells = MovingCells(region)
+    cells = IncrementalCells(region)
     for _ in range(4):
-        edges = cells.follow(centres)
-        expected = as_layout(*cells_of(centres, region)) if region is not FRAME else None
+        edges = cells.update(centres)
+        expected = as_layout(*voronoi_cells(centres, region)) if region is not FRAME else None
         tolerance_um2 = 1e-9 * region.area / n
 
         assert areas_um2(edges, n).sum() == pytest.approx(region.area, rel=1e-9)
         np.testing.assert_allclose(
-            areas_um2(edges, n), areas_um2(MovingCells(region).follow(centres), n), atol=tolerance_um2
+            areas_um2(edges, n), areas_um2(IncrementalCells(region).update(centres), n), atol=tolerance_um2
         )
         if expected is not None:
             np.testing.assert_allclose(areas_um2(edges, n), expected.area_um2, atol=tolerance_um2)
@@ -225,10 +232,10 @@ def test_power_cell_points_have_least_power(region, n, spread, seed):
     """For the first weights and for an update from other weights."""
     centres, points = points_in(region, n, seed), points_in(region, 500, seed + 1)
     rng = np.random.default_rng(seed)
-    cells = MovingCells(region)
+    cells = IncrementalCells(region)
     for _ in range(2):
         weights = rng.random(n) * spread * region.area / n
-        if cells.follow(centres, weights) is None:
+        if cells.update(centres, weights) is None:
             continue
         layout = as_layout(*cells.rings())
         power = ((points[:, np.newaxis] - centres) ** 2).sum(axis=2) - weights
@@ -238,8 +245,8 @@ def test_power_cell_points_have_least_power(region, n, spread, seed):
 
 
 def test_power_cell_may_exclude_its_centre():
-    cells = MovingCells(BOX)
-    cells.follow(np.array([(0.0, 0.0), (2.0, 0.0)]), np.array([0.0, 10.0]))
+    cells = IncrementalCells(BOX)
+    cells.update(np.array([(0.0, 0.0), (2.0, 0.0)]), np.array([0.0, 10.0]))
     layout = as_layout(*cells.rings())
 
     # |x|² = (x - 2)² - 10 at x = -1.5, left of the first centre
@@ -251,11 +258,11 @@ def test_centre_of_small_weight_has_no_cell():
     centres = points_in(BOX, 30, 0)
     weights = np.zeros(30)
     weights[4] = -1e3
-    cells = MovingCells(BOX)
+    cells = IncrementalCells(BOX)
 
-    assert cells.follow(centres, weights) is None
-    assert cells.follow(centres) is not None
-    assert cells.follow(centres, weights) is None
+    assert cells.update(centres, weights) is None
+    assert cells.update(centres) is not None
+    assert cells.update(centres, weights) is None
 
 
 @pytest.mark.parametrize("offset", [-1e5, 1e5])
@@ -263,15 +270,15 @@ def test_weight_offset_does_not_change_cells(offset):
     centres, weights = points_in(BOX, 30, 0), np.random.default_rng(0).random(30)
 
     np.testing.assert_allclose(
-        areas_um2(MovingCells(BOX).follow(centres, weights + offset), 30),
-        areas_um2(MovingCells(BOX).follow(centres, weights), 30),
+        areas_um2(IncrementalCells(BOX).update(centres, weights + offset), 30),
+        areas_um2(IncrementalCells(BOX).update(centres, weights), 30),
         rtol=1e-6,
     )
 
 
 def test_shared_edges_are_paired():
     centres = points_in(STAR, 80, 3)
-    edges = MovingCells(STAR).follow(centres)
+    edges = IncrementalCells(STAR).update(centres)
     one, other = edges.twins()
     is_shared = np.zeros(edges.cell.size, bool)
     is_shared[one] = is_shared[other] = True
@@ -573,7 +580,7 @@ def test_lloyd_iterations_agree_with_reference(region, n_sites, kind, n_iteratio
     density, grid = {"uniform": (None, None), "function": (fovea, None), "picture": random_picture(region)}[kind]
     centres = _first_centres(n_sites, *_density(density, grid, region)[1:], region, seed)
     for _ in range(n_iterations):
-        cells = as_layout(*cells_of(centres, region))
+        cells = as_layout(*voronoi_cells(centres, region))
         for i, polygon in enumerate(cells.polygons()):
             if kind == "uniform":
                 mass, moment = polygon.area, polygon.area * shapely.get_coordinates(polygon.centroid)[0]
@@ -583,7 +590,7 @@ def test_lloyd_iterations_agree_with_reference(region, n_sites, kind, n_iteratio
                 mass, moment = integrate_picture(polygon, density, grid, power=2)
             if shapely.contains_xy(region, *(moment / mass)):
                 centres[i] = moment / mass
-    reference = as_layout(*cells_of(centres, region))
+    reference = as_layout(*voronoi_cells(centres, region))
     layout = voronoi(
         n_sites=n_sites, region=region, density=density, density_grid=grid, n_iterations=n_iterations, seed=seed
     )
@@ -621,7 +628,7 @@ def test_function_integrals_are_accurate_to_1e_7(width_um, n_sites):
 
     layout = voronoi(n_sites=n_sites, region=BOX, n_iterations=2)
     field = _density(gaussian, None, BOX)[0]
-    mass, _ = field.moments(edges_of_rings(layout.xy_um, layout.ring_offsets), layout.centroid_um)
+    mass, _ = field.moments(ring_edges(layout.xy_um, layout.ring_offsets), layout.centroid_um)
     x, y = (
         math.erf(high / width_um / math.sqrt(2)) - math.erf(low / width_um / math.sqrt(2))
         for low, high in ((-10, 20), (-5, 8))
@@ -712,10 +719,10 @@ def test_centres_converge_to_centres_of_mass():
     field = _density(fovea, None, BOX)[0]
     centres = points_in(BOX, 200, 0)
     for n_moves, furthest in ((2, 0.2), (8, 0.08)):
-        cells = MovingCells(BOX)
-        _follow_equal(cells, centres, field, n_moves)
+        cells = IncrementalCells(BOX)
+        _equalise_capacities(cells, centres, field, n_moves)
         layout = as_layout(*cells.rings())
-        mass, moment = field.moments(edges_of_rings(layout.xy_um, layout.ring_offsets), layout.centroid_um)
+        mass, moment = field.moments(ring_edges(layout.xy_um, layout.ring_offsets), layout.centroid_um)
         off_um = np.hypot(*(moment / mass[:, np.newaxis] - cells.centres_um).T)
 
         np.testing.assert_allclose(mass, mass.mean(), rtol=1e-6)
@@ -729,15 +736,15 @@ def test_mass_derivatives_agree_with_differences(kind, is_own):
     density, grid = {"uniform": (None, None), "fovea": (fovea, None), "picture": random_picture(STAR)}[kind]
     field = _density(density, grid, STAR)[0]
     centres, n, step_um2 = points_in(STAR, 25, 10), 25, 1e-5
-    cells = MovingCells(STAR)
+    cells = IncrementalCells(STAR)
 
     def mass(weights):
-        edges = cells.follow(centres, weights)
+        edges = cells.update(centres, weights)
         assert (edges.cell != edges.owner).any()
         return _capacities(edges, weights, field, is_own=is_own).mass
 
     measured = np.stack([mass(w) - mass(-w) for w in step_um2 * np.eye(n)], axis=1) / (2 * step_um2)
-    slopes = _slopes(centres, field, cells.follow(centres, np.zeros(n)), is_own=is_own).toarray()
+    slopes = _slopes(centres, field, cells.update(centres, np.zeros(n)), is_own=is_own).toarray()
 
     np.testing.assert_allclose(slopes, measured, atol=1e-3 * np.abs(slopes).max())
     np.testing.assert_allclose(slopes.sum(axis=0), 0.0, atol=1e-12)
