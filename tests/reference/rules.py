@@ -124,8 +124,8 @@ def aspect_ratios(layout, _rules):
         for edge in pairwise(polygon.convex_hull.exterior.coords):
             x0, y0, x1, y1 = rotate(polygon, -_heading_rad(edge), origin=(0, 0), use_radians=True).bounds
             boxes.append(((x1 - x0) * (y1 - y0), max(x1 - x0, y1 - y0) / min(x1 - x0, y1 - y0)))
-        least = min(boxes)[0]
-        measured.append(((i,), min(ratio for area, ratio in boxes if math.isclose(area, least, rel_tol=1e-9))))
+        min_area = min(boxes)[0]
+        measured.append(((i,), min(ratio for area, ratio in boxes if math.isclose(area, min_area, rel_tol=1e-9))))
     return measured
 
 

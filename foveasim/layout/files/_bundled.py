@@ -45,7 +45,7 @@ def layout_path(name: str | Path, directory: str | Path = ".") -> Path:
         if closest and not file.exists():
             raise FileError(file, f"no such file; '{closest[0]}' is a bundled layout")
         return file
-    meant = f"did you mean '{closest[0]}'? " if closest else ""
+    suggestion = f"did you mean '{closest[0]}'? " if closest else ""
     raise FileError(
-        file, f"no such file, and not the name of a bundled layout; {meant}the names are {', '.join(bundled)}"
+        file, f"no such file, and not the name of a bundled layout; {suggestion}the names are {', '.join(bundled)}"
     )

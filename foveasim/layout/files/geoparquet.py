@@ -139,12 +139,12 @@ def read(path: Path) -> Layout:
             if other == name:
                 continue
             is_number = pa.types.is_boolean(kind) or pa.types.is_integer(kind) or pa.types.is_floating(kind)
-            is_text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
+            is_string = pa.types.is_string(kind) or pa.types.is_large_string(kind)
             has_null = table.column(other).null_count > 0
-            if not (is_number or is_text) or (has_null and not pa.types.is_floating(kind)):
+            if not (is_number or is_string) or (has_null and not pa.types.is_floating(kind)):
                 dropped.append(other)
                 continue
-            values = string_column(table.column(other).to_pylist()) if is_text else table.column(other).to_numpy()
+            values = string_column(table.column(other).to_pylist()) if is_string else table.column(other).to_numpy()
             if values is None:
                 dropped.append(other)
             else:

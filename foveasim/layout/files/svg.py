@@ -23,7 +23,7 @@ from foveasim.layout.model import Layout
 __all__ = ["write"]
 
 #: Decimal places of coordinates in µm: a resolution of a tenth of a nanometre.
-DIGITS = 4
+DECIMALS = 4
 #: Longer side of the drawing, in CSS pixels.
 DRAWING_PX = 1000
 DEFAULT_COLOUR = "#9a9a9a"
@@ -53,7 +53,7 @@ def write(layout: Layout, path: Path, *, colours: Mapping[int, str] | None = Non
         file.write(
             f'<svg xmlns="http://www.w3.org/2000/svg" width="{width_um * px_per_um:.3f}" '
             f'height="{height_um * px_per_um:.3f}" '
-            f'viewBox="{x_min:.{DIGITS}f} {-y_max:.{DIGITS}f} {width_um:.{DIGITS}f} {height_um:.{DIGITS}f}">\n'
+            f'viewBox="{x_min:.{DECIMALS}f} {-y_max:.{DECIMALS}f} {width_um:.{DECIMALS}f} {height_um:.{DECIMALS}f}">\n'
             f"<title>{layout.n_sites} photosites, 1 unit is 1 µm</title>\n"
             '<g transform="scale(1,-1)" fill-rule="evenodd" stroke="none">\n'
         )
@@ -61,7 +61,7 @@ def write(layout: Layout, path: Path, *, colours: Mapping[int, str] | None = Non
             outlines = _path_data(layout[start : start + CHUNK])
             file.writelines(f'<path id="site{i}" fill="{fills[i]}" d="{d}"/>\n' for i, d in enumerate(outlines, start))
         file.write("</g>\n</svg>\n")
-    return rounding_report(layout, np.round(layout.xy_um, DIGITS), path, tuple(sorted(layout.columns)))
+    return rounding_report(layout, np.round(layout.xy_um, DECIMALS), path, tuple(sorted(layout.columns)))
 
 
 def _validate_colours(colours: Mapping[int, str]) -> dict[int, str]:
@@ -81,13 +81,13 @@ def _validate_colours(colours: Mapping[int, str]) -> dict[int, str]:
 def _path_data(layout: Layout) -> list[str]:
     """Return the path data of each site, with all rings closed."""
     n_vertices = layout.xy_um.shape[0]
-    point = f"%.{DIGITS}f %.{DIGITS}f"
+    point = f"%.{DECIMALS}f %.{DECIMALS}f"
     parts = np.full(n_vertices, "L" + point, dtype=object)
     parts[layout.ring_offsets[:-1]] = "M" + point
     parts[layout.ring_offsets[1:] - 1] += "Z"
     parts[layout.ring_offsets[layout.site_offsets[1:]] - 1] += "\n"
     # Adding 0 converts -0 to 0.
-    numbers = np.round(layout.xy_um, DIGITS) + 0.0
+    numbers = np.round(layout.xy_um, DECIMALS) + 0.0
     return ("".join(parts) % tuple(numbers.ravel().tolist())).splitlines()
 
 

@@ -127,14 +127,14 @@ def squares():
     """99,999 squares of 2 µm, spaced or abutting, with rows as rings and a 3 × 3 vacancy in the centre of row 108."""
     n_x, n_y = 463, 216
     row, column = np.divmod(np.arange(n_x * n_y), n_x)
-    is_kept = (np.abs(row - RING) > 1) | (np.abs(column - 231) > 1)
+    is_unchanged = (np.abs(row - RING) > 1) | (np.abs(column - 231) > 1)
     return {
-        name: fs.layout.grid(n_x=n_x, n_y=n_y, pitch_um=pitch_um, width_um=2.0).with_columns(ring=row)[is_kept]
+        name: fs.layout.grid(n_x=n_x, n_y=n_y, pitch_um=pitch_um, width_um=2.0).with_columns(ring=row)[is_unchanged]
         for name, pitch_um in PITCH_UM.items()
     }
 
 
-def alone(_layout):
+def planted_site(_layout):
     return (PLANT,)
 
 
@@ -168,19 +168,19 @@ GROWTH = (460 + 1.5) / 461
 #: For each rule: the squares, the planted site around the centre of the vacancy (10 µm wide between spaced squares, 6 µm
 #: between abutting ones), the limit, and the expected sites and value.
 PLANTS = {
-    "min_size_um": ("spaced", square(1), 1.5, alone, 1.0),
-    "max_size_um": ("spaced", square(3), 2.5, alone, 3.0),
-    "min_area_um2": ("spaced", square(1.5), 3.0, alone, 2.25),
-    "min_hole_um2": ("spaced", FRAME, 1.0, alone, 0.5),
-    "min_width_um": ("spaced", DUMBBELL, 1.0, alone, 0.5),
+    "min_size_um": ("spaced", square(1), 1.5, planted_site, 1.0),
+    "max_size_um": ("spaced", square(3), 2.5, planted_site, 3.0),
+    "min_area_um2": ("spaced", square(1.5), 3.0, planted_site, 2.25),
+    "min_hole_um2": ("spaced", FRAME, 1.0, planted_site, 0.5),
+    "min_width_um": ("spaced", DUMBBELL, 1.0, planted_site, 0.5),
     "min_space_um": ("spaced", shapely.box(-4.6, -1, -2.6, 1), 0.8, with_site_at(-6, 1.5), 0.4),
-    "max_aspect_ratio": ("spaced", rotate(shapely.box(-3, -1, 3, 1), 33), 2.0, alone, 3.0),
-    "min_angle_deg": ("spaced", RIGHT_TRIANGLE, 60.0, alone, 45.0),
-    "edge_angle_step_deg": ("spaced", FLAT_TRIANGLE, 45.0, alone, 45.0 - math.degrees(math.atan2(3, 4))),
-    "grid_um": ("spaced", shapely.box(-1, -1, 1.002, 1), 0.5, alone, 0.002),
+    "max_aspect_ratio": ("spaced", rotate(shapely.box(-3, -1, 3, 1), 33), 2.0, planted_site, 3.0),
+    "min_angle_deg": ("spaced", RIGHT_TRIANGLE, 60.0, planted_site, 45.0),
+    "edge_angle_step_deg": ("spaced", FLAT_TRIANGLE, 45.0, planted_site, 45.0 - math.degrees(math.atan2(3, 4))),
+    "grid_um": ("spaced", shapely.box(-1, -1, 1.002, 1), 0.5, planted_site, 0.002),
     "max_overlap_um2": ("abutting", square(6).union(shapely.box(3, -0.25, 4, 0.25)), 0.0, with_site_at(4, 1), 0.5),
     "max_gap_um2": ("abutting", square(6).difference(shapely.box(-3, -0.25, -2, 0.25)), 0.0, with_site_at(-4, 1), 0.5),
-    "die_um": ("spaced", shapely.box(694.5, 0, 696.5, 2), (-695.0, -325.0, 695.0, 325.0), alone, 1.5),
+    "die_um": ("spaced", shapely.box(694.5, 0, 696.5, 2), (-695.0, -325.0, 695.0, 325.0), planted_site, 1.5),
     "min_growth": ("spaced", square(3), 0.9999, ring(RING + 1), 1 / GROWTH),
     "max_growth": ("spaced", square(3), 1.0001, ring(RING), GROWTH),
     "max_neighbour_ratio": ("abutting", shapely.box(-3, -0.5, -2, 0.5), 1.5, with_site_at(-4, 1), 2.0),

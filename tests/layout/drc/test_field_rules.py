@@ -33,8 +33,8 @@ def test_periodic_layout_density_equals_fill_factor():
 
 def test_low_density_found_only_around_hole():
     squares = grid(n_x=320, n_y=320, pitch_um=2.0, width_um=1.0)
-    gone = (np.abs(squares.centroid_um - np.array([103.0, -51.0])) < 4.5).all(axis=1)
-    report = squares[~gone].check(
+    is_removed = (np.abs(squares.centroid_um - np.array([103.0, -51.0])) < 4.5).all(axis=1)
+    report = squares[~is_removed].check(
         DesignRules(min_density=0.249, density_window_um=20.0, die_um=(-320.0, -320.0, 320.0, 320.0))
     )
     hole = shapely.box(98, -56, 108, -46)  # 25 cells
@@ -42,8 +42,8 @@ def test_low_density_found_only_around_hole():
     assert report.n_sites == 102_400 - 25
     assert len(report.violations) == 9
     assert all(shapely.intersects(violation.marker, hole) for violation in report.violations)
-    lost = [shapely.area(shapely.intersection(v.marker, hole)) / 4.0 / 400.0 for v in report.violations]
-    assert [0.25 - v.value for v in report.violations] == pytest.approx(lost)
+    removed_fraction = [shapely.area(shapely.intersection(v.marker, hole)) / 4.0 / 400.0 for v in report.violations]
+    assert [0.25 - v.value for v in report.violations] == pytest.approx(removed_fraction)
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)

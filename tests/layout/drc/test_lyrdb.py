@@ -111,13 +111,13 @@ def test_invalid_report_is_rejected(tmp_path, content, n_sites, message):
     path = tmp_path / "report.lyrdb"
     LAYOUT.check(RULES).write(path)
     complete = path.read_text()
-    texts = {
+    strings = {
         "truncated": complete[: len(complete) // 2],
         "complete": complete,
         "marker": complete.replace("polygon: (", "polygon: (x"),
     }
     path.unlink()
     if content is not None:
-        path.write_text(texts.get(content, content))
+        path.write_text(strings.get(content, content))
     with pytest.raises(FileError, match=message):
         read_lyrdb(path, n_sites)

@@ -68,15 +68,15 @@ def test_repair_satisfies_rules_and_preserves_rest(seed, repair):
     untouched = [i for i in range(30) if i not in changed(changes)]
 
     assert legal.check(rules).ok
-    kept = {polygon.normalize() for polygon in legal.polygons()}
-    assert {polygon.normalize() for polygon in layout.polygons()[untouched]} <= kept
+    remaining = {polygon.normalize() for polygon in legal.polygons()}
+    assert {polygon.normalize() for polygon in layout.polygons()[untouched]} <= remaining
 
 
 def test_refill_covers_blind_spot():
     rules = fs.DesignRules(min_size_um=1.0, max_overlap_um2=0.0, max_gap_um2=0.0)
     legal, changes = RINGS.enforce(rules, repair="refill")
-    n_kept = int((np.sqrt(RINGS.area_um2) >= 1.0).sum())
-    new = legal[n_kept:]
+    n_remaining = int((np.sqrt(RINGS.area_um2) >= 1.0).sum())
+    new = legal[n_remaining:]
 
     assert legal.check(rules).ok
     assert [(change.rule, change.action) for change in changes] == [("min_size_um", "replaced")]
@@ -84,7 +84,7 @@ def test_refill_covers_blind_spot():
     assert legal.area_um2.sum() == pytest.approx(shapely.Polygon(shapely.union_all(RINGS.polygons()).exterior).area)
     assert np.median(new.area_um2) == pytest.approx(1.0, rel=1e-6)
     assert set(legal.columns) == set(RINGS.columns)
-    assert new.columns["ring"].max() < legal.columns["ring"][:n_kept].min()
+    assert new.columns["ring"].max() < legal.columns["ring"][:n_remaining].min()
     assert legal.provenance["generator"] == "log_polar"
 
 

@@ -70,7 +70,7 @@ def trenched(seed):
     hexagon = shapely.Polygon(np.stack((np.cos(angle), np.sin(angle)), axis=1))
     is_rotated = rng.random() < 0.7
     polygons = []
-    for place in np.stack(np.meshgrid(np.arange(6), np.arange(5)), axis=2).reshape(-1, 2) * 3.0:
+    for position in np.stack(np.meshgrid(np.arange(6), np.arange(5)), axis=2).reshape(-1, 2) * 3.0:
         half = rng.uniform(0.3, 0.95, 2)
         shape = (
             shapely.box(*-half, *half)
@@ -78,7 +78,7 @@ def trenched(seed):
             else shapely.transform(hexagon, lambda xy, r=half[0] * 1.4: xy * r)
         )
         shape = rotate(shape, rng.uniform(0, 360), origin=(0, 0)) if is_rotated else shape
-        move = place + rng.uniform(-0.1, 0.1, 2)
+        move = position + rng.uniform(-0.1, 0.1, 2)
         polygons.append(shapely.transform(shape, lambda xy, move=move: xy + move))
     return on_grid(polygons)
 
@@ -163,10 +163,10 @@ def test_gds_areas_match_within_vertex_rounding(family, dbu_um, tmp_path):
     for polygon in region.each():
         area_um2[int(polygon.property(1).split()[1])] = polygon.area2() / 2 * dbu_um**2
     # A vertex moves by at most half a unit along x and y.
-    most_um2 = shapely.length(layout.polygons()) * dbu_um / math.sqrt(2.0)
+    max_um2 = shapely.length(layout.polygons()) * dbu_um / math.sqrt(2.0)
 
     assert read_dbu_um == pytest.approx(dbu_um)
-    assert np.all(np.abs(area_um2 - layout.area_um2) <= most_um2)
+    assert np.all(np.abs(area_um2 - layout.area_um2) <= max_um2)
 
 
 # -- overlaps -----------------------------------------------------------------------------------------------------------

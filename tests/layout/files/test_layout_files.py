@@ -243,17 +243,17 @@ def test_divided_sites_round_trip_columns(zoo, tmp_path, extension):
         np.testing.assert_array_equal(column, zoo.columns[name], err_msg=name)
 
 
-@pytest.mark.parametrize(("n_chars", "lost"), [(101, ()), (102, ("long",))])
-def test_column_exceeding_gds_property_is_dropped(tmp_path, capfd, n_chars, lost):
+@pytest.mark.parametrize(("n_chars", "dropped"), [(101, ()), (102, ("long",))])
+def test_column_exceeding_gds_property_is_dropped(tmp_path, capfd, n_chars, dropped):
     square_um = np.stack((np.arange(10.0) * 2, np.zeros(10)), 1)
     layout = Layout.from_rectangles(square_um, 1.0, first=np.arange(10), long=["a" * n_chars] + ["a"] * 9)
     report = write_layout(layout, tmp_path / "a.gds")
     polygons = gdstk.read_gds(tmp_path / "a.gds").cells[0].polygons
     n_bytes = max(sum(2 * -(-len(v[2].rstrip(b"\0")) // 2) for v in p.properties) for p in polygons)
 
-    assert report.dropped_columns == lost
-    assert {*read_layout(tmp_path / "a.gds").columns} == {"channel", "first", "long"} - {*lost}
-    assert n_bytes == (128 if not lost else 20)
+    assert report.dropped_columns == dropped
+    assert {*read_layout(tmp_path / "a.gds").columns} == {"channel", "first", "long"} - {*dropped}
+    assert n_bytes == (128 if not dropped else 20)
     # gdstk warns of properties that exceed the format limit.
     assert capfd.readouterr().err == ""
     assert write_layout(layout, tmp_path / "a.oas").dropped_columns == ()
@@ -274,10 +274,10 @@ def test_dropped_columns_are_reported(tmp_path, extension):
     layout = hexagonal(pitch_um=3.3, n_columns=2, n_rows=2).with_columns(
         when=np.array(["2020-01-01"] * 4, "M8[D]"), z=np.arange(4) * 1j, raw=np.array([b"a"] * 4), a=np.arange(4)
     )
-    kept = () if extension == "svg" else ("a", "column", "readout_line", "row")
+    stored = () if extension == "svg" else ("a", "column", "readout_line", "row")
 
     assert write_layout(layout, tmp_path / f"a.{extension}").dropped_columns == tuple(
-        sorted({*layout.columns} - {*kept})
+        sorted({*layout.columns} - {*stored})
     )
     # Without shapes, the file contains no columns.
     assert write_layout(layout[:0], tmp_path / f"a.{extension}").dropped_columns == tuple(sorted(layout.columns))

@@ -506,8 +506,8 @@ def test_retinal_density_gives_retinal_spacing():
     layout = voronoi(n_sites=3000, region=outline, density=watson_per_um2)
     r = np.hypot(*layout.centroid_um.T)
     edges = np.linspace(0.0, 30.0, 300_001)
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    total = (2 * math.pi * middle * watson_per_um2(np.stack((middle, 0 * middle), axis=1))).sum() * 1e-4
+    centre = 0.5 * (edges[1:] + edges[:-1])
+    total = (2 * math.pi * centre * watson_per_um2(np.stack((centre, 0 * centre), axis=1))).sum() * 1e-4
     d = 3000 / total * watson_per_um2(layout.centroid_um)
     is_inside = (r > 1.0) & (r < 28.0)
     spacing_um = np.sqrt(2 / math.sqrt(3) * layout.area_um2)
@@ -556,9 +556,9 @@ def integrate_picture(polygon, values, grid, power=1):
     x0, y0 = grid.origin_um[0] + columns * grid.pitch_um, grid.origin_um[1] + rows * grid.pitch_um
     common = shapely.intersection(shapely.box(x0, y0, x0 + grid.pitch_um, y0 + grid.pitch_um), polygon)
     weight = values.ravel() ** power * shapely.area(common)
-    middle = np.where(weight[:, np.newaxis] > 0, shapely.get_coordinates(shapely.centroid(polygon)), 0.0)
-    middle[weight > 0] = shapely.get_coordinates(shapely.centroid(common[weight > 0]))
-    return weight.sum(), weight @ middle
+    centre = np.where(weight[:, np.newaxis] > 0, shapely.get_coordinates(shapely.centroid(polygon)), 0.0)
+    centre[weight > 0] = shapely.get_coordinates(shapely.centroid(common[weight > 0]))
+    return weight.sum(), weight @ centre
 
 
 def integrate_function(ring, centre, function):
