@@ -151,7 +151,7 @@ class Camera:
 
     def oversample(self, light: Scene | PowerMap) -> int:
         """Return the number of map cells along a source pixel; 1 for power maps."""
-        return 1 if isinstance(light, PowerMap) else int(self._optics.resolved(light).oversample)
+        return 1 if isinstance(light, PowerMap) else int(self._optics.resolve_oversample(light).oversample)
 
     def order(self, light: Scene | PowerMap) -> Literal[1, 2]:
         """Return the order of integration for a scene or power map."""
@@ -202,7 +202,7 @@ class Camera:
         ParameterError, SimulationError
             When the distance of the scene is at most the focal length, or the result is not finite.
         """
-        power_map = self._optics.resolved(scene).power_map(scene, n_threads=self._n_threads)
+        power_map = self._optics.resolve_oversample(scene).power_map(scene, n_threads=self._n_threads)
         return PowerMap(power_map.data, self._placed(power_map.grid), power_map.wavelength_nm)
 
     def _placed(self, grid: Grid) -> Grid:
@@ -670,7 +670,7 @@ class Camera:
             maps, grids = self._bands(light), [light.grid]
         else:
             # Lateral chromatic aberration gives images of several sizes, each with its own grid.
-            optics = self._optics.resolved(light)
+            optics = self._optics.resolve_oversample(light)
             images = optics.image_grids(light)
             maps, grids = self._images(light, optics, images, clock, kept), [self._placed(grid) for grid, _ in images]
         with clock.stage("compile layout"):

@@ -31,11 +31,11 @@ ACROSS_PER_BLUR = 16
 #: Upper limit of the samples across the aperture, which limits the geometric blur to 128 λN.
 MAX_ACROSS = 2048
 #: Points across the aperture at which pupil callables are evaluated; odd, so that edges at simple fractions lie between points.
-FINE = 1535
+PUPIL_POINTS = 1535
 #: Points across the aperture at which the wavefront slope is evaluated.
 SLOPE_POINTS = 193
 #: Power transmittance below which a pupil counts as empty.
-CLOSED = 1e-9
+MIN_TRANSMITTANCE = 1e-9
 
 
 class Wavefront(Protocol):
@@ -62,12 +62,12 @@ def overlaps(n_to: int, to_step: float, n_from: int, from_step: float) -> Any:
     to_edges = (np.arange(n_to + 1) - 0.5 * n_to) * to_step
     from_edges = (np.arange(n_from + 1) - 0.5 * n_from) * from_step
     cuts = np.unique(np.concatenate((to_edges, from_edges)))
-    middles, lengths = 0.5 * (cuts[1:] + cuts[:-1]), np.diff(cuts)
-    row = np.searchsorted(to_edges, middles) - 1
-    column = np.searchsorted(from_edges, middles) - 1
+    centres, lengths = 0.5 * (cuts[1:] + cuts[:-1]), np.diff(cuts)
+    row = np.searchsorted(to_edges, centres) - 1
+    column = np.searchsorted(from_edges, centres) - 1
     is_both = (row >= 0) & (row < n_to) & (column >= 0) & (column < n_from)
-    shares = coo_array((lengths[is_both], (row[is_both], column[is_both])), shape=(n_to, n_from))
-    return diags_array(np.full(n_to, 1.0 / to_step)) @ shares.tocsr()
+    lengths_of_overlap = coo_array((lengths[is_both], (row[is_both], column[is_both])), shape=(n_to, n_from))
+    return diags_array(np.full(n_to, 1.0 / to_step)) @ lengths_of_overlap.tocsr()
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,30 +90,30 @@ class Aperture:
     defocus_um: float
 
     @cached_property
-    def is_grey(self) -> bool:
+    def is_achromatic(self) -> bool:
         """Whether all pupils are known to be independent of the wavelength."""
         plain = (Annulus, Blades, Slit, Spider)
         return all(isinstance(p, plain) or (isinstance(p, PupilImage) and p.wavefront_um is None) for p in self.pupils)
 
     @cached_property
-    def _kept(self) -> dict[Any, Any]:
+    def _cache(self) -> dict[Any, Any]:
         """Cache: the last sampled shape, and transmittance and slope per wavelength."""
         return {}
 
-    def _shape(self, wavelength_nm: float, n: int) -> NDArray[Any]:
+    def _sample_pupil(self, wavelength_nm: float, n: int) -> NDArray[Any]:
         """Sample the amplitudes on an (n, n) grid over the square around the aperture."""
-        key = "shape", 0.0 if self.is_grey else wavelength_nm, n
-        if self._kept.get("shape of", None) != key:
+        key = "shape", 0.0 if self.is_achromatic else wavelength_nm, n
+        if self._cache.get("shape of", None) != key:
             at: Floats = np.asarray((np.arange(n) + 0.5) * (2.0 / n) - 1.0, np.float64)
             x, y = at[np.newaxis, :], at[:, np.newaxis]
             disc = x * x + y * y <= 1.0
             shape: NDArray[Any] = disc.astype(np.float64)
             for i, pupil in enumerate(self.pupils):
-                shape = shape * self._amplitudes(i, pupil, x, y, wavelength_nm, disc)
-            self._kept["shape of"], self._kept["shape"] = key, shape
-        return np.asarray(self._kept["shape"])
+                shape = shape * self._evaluate_pupil(i, pupil, x, y, wavelength_nm, disc)
+            self._cache["shape of"], self._cache["shape"] = key, shape
+        return np.asarray(self._cache["shape"])
 
-    def _amplitudes(
+    def _evaluate_pupil(
         self, i: int, pupil: Pupil, x: Floats, y: Floats, wavelength_nm: float, disc: Bools
     ) -> NDArray[Any]:
         name = "pupil" if len(self.pupils) == 1 else f"pupil[{i}]"
@@ -133,24 +133,28 @@ class Aperture:
 
     def _transmittance_slope_edge(self, wavelength_nm: float) -> tuple[float, float, float]:
         """Return transmittance, phase slope in waves per radius, and relative edge length."""
-        key = 0.0 if self.is_grey else wavelength_nm
-        if key not in self._kept:
-            shape = self._shape(wavelength_nm, FINE)
-            at = (np.arange(FINE) + 0.5) * (2.0 / FINE) - 1.0
-            share = float(np.sum(np.abs(shape) ** 2) / np.count_nonzero(at**2 + at[:, np.newaxis] ** 2 <= 1.0))
-            if share < CLOSED:
+        key = 0.0 if self.is_achromatic else wavelength_nm
+        if key not in self._cache:
+            shape = self._sample_pupil(wavelength_nm, PUPIL_POINTS)
+            at = (np.arange(PUPIL_POINTS) + 0.5) * (2.0 / PUPIL_POINTS) - 1.0
+            transmittance = float(np.sum(np.abs(shape) ** 2) / np.count_nonzero(at**2 + at[:, np.newaxis] ** 2 <= 1.0))
+            if transmittance < MIN_TRANSMITTANCE:
                 raise ParameterError("pupil", f"must transmit power, got an empty pupil at {wavelength_nm:g} nm")
             slope = 0.0
             for a, b in ((shape[1:], shape[:-1]), (shape[:, 1:], shape[:, :-1])) if np.iscomplexobj(shape) else ():
-                turn = np.abs(np.angle(a * np.conj(b)))[(a != 0.0) & (b != 0.0)]
+                phase_step = np.abs(np.angle(a * np.conj(b)))[(a != 0.0) & (b != 0.0)]
                 # The 99 % quantile excludes phase steps, which diffract but do not displace the PSF.
-                slope += float(np.quantile(turn, 0.99)) / (2.0 * np.pi) * 0.5 * FINE if turn.size else 0.0
+                slope += (
+                    float(np.quantile(phase_step, 0.99)) / (2.0 * np.pi) * 0.5 * PUPIL_POINTS
+                    if phase_step.size
+                    else 0.0
+                )
             # Crofton: the steps along both axes count an edge of random direction 4/π times its length.
             steps = sum(float(np.sum(np.abs(np.diff(shape, axis=axis)) ** 2)) for axis in (0, 1))
-            edge = 0.25 * np.pi * steps * (2.0 / FINE) / (share * np.pi)
-            self._kept[key] = share, slope, max(0.5 * edge, 1.0)
-        share, slope, edge = self._kept[key]
-        return share, slope, edge
+            edge = 0.25 * np.pi * steps * (2.0 / PUPIL_POINTS) / (transmittance * np.pi)
+            self._cache[key] = transmittance, slope, max(0.5 * edge, 1.0)
+        transmittance, slope, edge = self._cache[key]
+        return transmittance, slope, edge
 
     def transmittance(self, wavelength_nm: float) -> float:
         """
@@ -178,13 +182,13 @@ class Aperture:
         """Return the largest geometric ray displacement in units of λN: twice the slope in waves."""
         slope = self._transmittance_slope_edge(wavelength_nm)[1] if self.pupils else 0.0
         key = wavelength_nm, field_um
-        if (self.wavefronts or self.defocus_um) and key not in self._kept:
+        if (self.wavefronts or self.defocus_um) and key not in self._cache:
             at = np.linspace(-1.0, 1.0, SLOPE_POINTS)
             x, y = at[np.newaxis, :], at[:, np.newaxis]
             step_waves = (at[1] - at[0]) * float(um_from_nm(wavelength_nm))
             dy, dx = np.gradient(self.path_um(x, y, wavelength_nm, field_um) / step_waves)
-            self._kept[key] = float(np.hypot(dx, dy)[x * x + y * y <= 1.0].max())
-        return 2.0 * (slope + float(self._kept.get(key, 0.0)))
+            self._cache[key] = float(np.hypot(dx, dy)[x * x + y * y <= 1.0].max())
+        return 2.0 * (slope + float(self._cache.get(key, 0.0)))
 
     def n_across(self, wavelength_nm: float, field_um: tuple[float, float]) -> int:
         """
@@ -227,7 +231,7 @@ class Aperture:
         """
         n = math.ceil(n_across)
         pitch = 2.0 / n_across
-        fine = self._shape(wavelength_nm, max(FINE, n))
+        fine = self._sample_pupil(wavelength_nm, max(PUPIL_POINTS, n))
         mean = overlaps(n, pitch, fine.shape[0], 2.0 / fine.shape[0])
         amplitude = mean @ (mean @ fine).T
         at: Floats = np.asarray((np.arange(n) - 0.5 * (n - 1)) * pitch, np.float64)
@@ -239,7 +243,7 @@ class Aperture:
         )
         return amplitude, at, self.transmittance(wavelength_nm) * np.pi / pitch**2
 
-    def transfer(
+    def compute_otf(
         self,
         wavelength_nm: float,
         n_across: float,
@@ -262,17 +266,17 @@ class Aperture:
         size = scipy.fft.next_fast_len(2 * n)
         complex_type = np.result_type(real, np.complex64)
         wave = scipy.fft.fft2(amplitude.astype(complex_type), (size, size), overwrite_x=True)
-        pattern = wave.real**2 + wave.imag**2
-        otf = scipy.fft.fft2(pattern, overwrite_x=True)
+        psf = wave.real**2 + wave.imag**2
+        otf = scipy.fft.fft2(psf, overwrite_x=True)
         otf /= size * size * power
         k = min(n_lags, n - 1)
-        whole = np.zeros((2 * n_lags + 1, 2 * n_lags + 1), complex_type)
+        table = np.zeros((2 * n_lags + 1, 2 * n_lags + 1), complex_type)
         lags = np.arange(-k, k + 1)
-        whole[n_lags - k : n_lags + k + 1, n_lags - k : n_lags + k + 1] = otf[np.ix_(lags, lags)]
-        whole[n_lags, n_lags] = 1.0  # conserves energy exactly
-        return whole
+        table[n_lags - k : n_lags + k + 1, n_lags - k : n_lags + k + 1] = otf[np.ix_(lags, lags)]
+        table[n_lags, n_lags] = 1.0  # conserves energy exactly
+        return table
 
-    def pattern_per_um2(
+    def psf_per_um2(
         self, wavelength_nm: float, lambda_n_um: float, x_um: Floats, y_um: Floats, field_um: tuple[float, float]
     ) -> Floats:
         """Sample the PSF, normalised to unit energy, at the points (y, x); (n_y, n_x), 1/µm²."""

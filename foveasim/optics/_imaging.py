@@ -24,12 +24,12 @@ from foveasim.optics._aperture import Aperture
 from foveasim.optics._transform import Transform, source_pixels
 from foveasim.optics.otf import Tables
 
-__all__ = ["Imaging", "isoplanatic_error", "patchwork", "reach_cells"]
+__all__ = ["Imaging", "isoplanatic_error", "isoplanatic_maps", "reach_cells"]
 
 #: Callable of (weights of a sum, transform, tables) that returns the cached factor on a spectrum, or None.
-Kept = Callable[[Floats, Transform, Tables], NDArray[Any] | None]
+FactorLookup = Callable[[Floats, Transform, Tables], NDArray[Any] | None]
 #: Comparison of the PSFs of neighbouring patches: points along either axis, and margin in λN beyond the geometric blur.
-COMPARED_POINTS, COMPARED_LAMBDA_N = 257, 5.0
+COMPARISON_POINTS, COMPARISON_LAMBDA_N = 257, 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ class Imaging:
     Attributes
     ----------
     basis : (n_basis, n_y, n_x)
-    light_w_m2 : (n_basis, n_wavelength)
+    irradiance_w_m2 : (n_basis, n_wavelength)
         On-axis irradiance in each band for an image value of 1, W/m².
     weights : (n_output, n_wavelength)
     tangent2_x, tangent2_y : (n_x,), (n_y,)
@@ -64,12 +64,12 @@ class Imaging:
         Map cells along a side of a source pixel.
     real : float32 or float64
     n_threads : int
-    kept : callable
+    cached_factor : callable
         Look-up of cached factors.
     """
 
     basis: Images
-    light_w_m2: Floats
+    irradiance_w_m2: Floats
     weights: Floats
     tangent2_x: Floats
     tangent2_y: Floats
@@ -84,17 +84,21 @@ class Imaging:
     oversample: int
     real: type[np.floating[Any]]
     n_threads: int
-    kept: Kept
+    cached_factor: FactorLookup
 
     def is_needed(self) -> Bools:
         """Return whether each basis image contributes to each output, (n_output, n_basis)."""
         return np.array(
-            [[bool(np.any(output * light_w_m2)) for light_w_m2 in self.light_w_m2] for output in self.weights], bool
+            [
+                [bool(np.any(output * irradiance_w_m2)) for irradiance_w_m2 in self.irradiance_w_m2]
+                for output in self.weights
+            ],
+            bool,
         )
 
     def sums(self) -> list[Floats]:
         """Return the wavelength weights of all required tables."""
-        return [self.weights[c] * self.light_w_m2[b] for c, b in np.argwhere(self.is_needed())]
+        return [self.weights[c] * self.irradiance_w_m2[b] for c, b in np.argwhere(self.is_needed())]
 
     def sources(self) -> tuple[Ints, Ints]:
         """Return the picture rows and columns of the padded rows and columns; -1 for zero."""
@@ -123,14 +127,14 @@ class Imaging:
         def spectrum(b: int) -> NDArray[Any]:
             return transform.forward(self.basis[b], self.tangent2_x, self.tangent2_y, self.falloff_power)
 
-        return self._maps(transform, spectrum, table_of, self.kept)
+        return self._maps(transform, spectrum, table_of, self.cached_factor)
 
     def _maps(
         self,
         transform: Transform,
         spectrum_of: Callable[[int], NDArray[Any]],
         table_of: Tables,
-        kept: Kept | None = None,
+        cached_factor: FactorLookup | None = None,
     ) -> Iterator[NDArray[Any]]:
         is_needed = self.is_needed()
         spectra: dict[int, NDArray[Any]] = {}
@@ -148,8 +152,8 @@ class Imaging:
                     del spectra[b]
                 if total is None:
                     total = spectrum if is_free else np.empty_like(spectrum)
-                weight = output * self.light_w_m2[b]
-                factor = kept and kept(weight, transform, table_of)
+                weight = output * self.irradiance_w_m2[b]
+                factor = cached_factor and cached_factor(weight, transform, table_of)
                 if factor is None:
                     transform.multiply(spectrum, *table_of(weight), total, is_added=not is_first_term)
                 else:
@@ -157,45 +161,45 @@ class Imaging:
                 del spectrum
             yield np.zeros(transform.map_shape, self.real) if total is None else transform.inverse(total)
 
-    def patch_maps(self, rows: _Piece, columns: _Piece, table_of: Tables) -> Iterator[NDArray[Any]]:
+    def patch_maps(self, rows: _PatchExtent, columns: _PatchExtent, table_of: Tables) -> Iterator[NDArray[Any]]:
         """Yield the contribution of a patch to every map, over the cells that its PSF reaches."""
         shape = rows.cells.size, columns.cells.size
         transform = self.transform(np.arange(shape[0]), np.arange(shape[1]), shape)
         x2, y2 = self.tangent2_x[columns.sources], self.tangent2_y[rows.sources]
-        window = np.outer(rows.fade, columns.fade) * (1.0 + x2 + y2[:, np.newaxis]) ** (-0.5 * self.falloff_power)
+        window = np.outer(rows.weight, columns.weight) * (1.0 + x2 + y2[:, np.newaxis]) ** (-0.5 * self.falloff_power)
         picture = np.zeros(shape, self.real)
-        lit = picture[rows.lit, columns.lit]
+        inner = picture[rows.pixels, columns.pixels]
         on_axis = np.zeros(shape[1]), np.zeros(shape[0])
 
         def spectrum(b: int) -> NDArray[Any]:
-            lit[:] = self.basis[b][np.ix_(rows.sources, columns.sources)] * window
+            inner[:] = self.basis[b][np.ix_(rows.sources, columns.sources)] * window
             return transform.forward(picture, *on_axis, self.falloff_power)
 
         return self._maps(transform, spectrum, table_of)
 
 
 @dataclass(frozen=True)
-class _Piece:
+class _PatchExtent:
     """
     Extent of an isoplanatic patch along one axis.
 
     Attributes
     ----------
-    sources, fade : (n_lit,)
+    sources, weight : (n_pixel,)
         Indices of the picture pixels of the patch, and their linear weights.
-    lit : slice
+    pixels : slice
         Position of these pixels among the cells.
     cells : (n_cell,)
         Indices of the picture cells that the patch reaches, in order; negative or beyond the picture in the padding.
     """
 
     sources: Ints
-    fade: Floats
-    lit: slice
+    weight: Floats
+    pixels: slice
     cells: Ints
 
 
-def patchwork(
+def isoplanatic_maps(
     imaging: Imaging, n_patches: tuple[int, int], tables_at: Callable[[tuple[float, float]], Tables]
 ) -> Iterator[NDArray[Any]]:
     """
@@ -209,15 +213,15 @@ def patchwork(
     maps = np.zeros((len(imaging.weights), k * n_y, k * n_x), imaging.real)
     node_y_um, node_x_um = _nodes_um(imaging.grid, n_patches)
     row_sources, column_sources = imaging.sources()
-    all_rows = _pieces(imaging, row_sources, imaging.grid.shape[0], node_y_um)
-    all_columns = _pieces(imaging, column_sources, imaging.grid.shape[1], node_x_um)
+    all_rows = _patch_extents(imaging, row_sources, imaging.grid.shape[0], node_y_um)
+    all_columns = _patch_extents(imaging, column_sources, imaging.grid.shape[1], node_x_um)
     for y_um, rows in zip(node_y_um, all_rows, strict=True):
         for x_um, columns in zip(node_x_um, all_columns, strict=True):
-            fine = [(k * piece.cells[:, np.newaxis] + np.arange(k)).ravel() for piece in (rows, columns)]
-            seen = [(cells >= 0) & (cells < n) for cells, n in zip(fine, maps.shape[1:], strict=True)]
-            to = np.ix_(fine[0][seen[0]], fine[1][seen[1]])
-            for c, given in enumerate(imaging.patch_maps(rows, columns, tables_at((float(x_um), float(y_um))))):
-                maps[c][to] += given[np.ix_(*seen)]
+            fine = [(k * extent.cells[:, np.newaxis] + np.arange(k)).ravel() for extent in (rows, columns)]
+            is_inside = [(cells >= 0) & (cells < n) for cells, n in zip(fine, maps.shape[1:], strict=True)]
+            to = np.ix_(fine[0][is_inside[0]], fine[1][is_inside[1]])
+            for c, patch_map in enumerate(imaging.patch_maps(rows, columns, tables_at((float(x_um), float(y_um))))):
+                maps[c][to] += patch_map[np.ix_(*is_inside)]
     yield from maps
 
 
@@ -232,22 +236,22 @@ def isoplanatic_error(
     node_y_um, node_x_um = _nodes_um(grid, n_patches)
     if n_patches == (1, 1):
         half_y_um, half_x_um = (0.5 * n * grid.pitch_x_um for n in grid.shape)
-        wrong_um = [(sx * half_x_um, sy * half_y_um) for sx in (-1, 1) for sy in (-1, 1)]
+        midpoints_um = [(sx * half_x_um, sy * half_y_um) for sx in (-1, 1) for sy in (-1, 1)]
         known_um = [[(0.0, 0.0)]] * 4
     else:
         steps = [(y, x) for y in itertools.pairwise(node_y_um) for x in itertools.pairwise(node_x_um)]
         known_um = [[(float(x), float(y)) for y in ys for x in xs] for ys, xs in steps]
-        wrong_um = [(float(np.mean(xs)), float(np.mean(ys))) for ys, xs in steps]
-    places_um = {place for places in (wrong_um, *known_um) for place in places}
+        midpoints_um = [(float(np.mean(xs)), float(np.mean(ys))) for ys, xs in steps]
+    points_um = {point for points in (midpoints_um, *known_um) for point in points}
     reach_um = lambda_n_um * (
-        COMPARED_LAMBDA_N + max(aperture.blur_lambda_n(wavelength_nm, place) for place in places_um)
+        COMPARISON_LAMBDA_N + max(aperture.blur_lambda_n(wavelength_nm, point) for point in points_um)
     )
-    at_um = np.linspace(-reach_um, reach_um, COMPARED_POINTS)
-    share = {place: aperture.pattern_per_um2(wavelength_nm, lambda_n_um, at_um, at_um, place) for place in places_um}
+    at_um = np.linspace(-reach_um, reach_um, COMPARISON_POINTS)
+    psf = {point: aperture.psf_per_um2(wavelength_nm, lambda_n_um, at_um, at_um, point) for point in points_um}
     cell_um2 = float(at_um[1] - at_um[0]) ** 2
     return max(
-        0.5 * cell_um2 * float(np.abs(share[there] - sum(share[node] for node in nodes) / len(nodes)).sum())
-        for there, nodes in zip(wrong_um, known_um, strict=True)
+        0.5 * cell_um2 * float(np.abs(psf[midpoint] - sum(psf[node] for node in nodes) / len(nodes)).sum())
+        for midpoint, nodes in zip(midpoints_um, known_um, strict=True)
     )
 
 
@@ -260,30 +264,30 @@ def _nodes_um(grid: Grid, n_patches: tuple[int, int]) -> tuple[Floats, Floats]:
     return y, x
 
 
-def _pieces(imaging: Imaging, sources: Ints, n: int, node_um: Floats) -> list[_Piece]:
+def _patch_extents(imaging: Imaging, sources: Ints, n: int, node_um: Floats) -> list[_PatchExtent]:
     """Return the patch of each node along one axis."""
     first = -((sources.size - n) // 2)
     half_um = 0.5 * n * imaging.grid.pitch_x_um
     at_um = np.clip((first + np.arange(sources.size) + 0.5) * imaging.grid.pitch_x_um - half_um, -half_um, half_um)
-    pieces = []
+    extents = []
     for k in range(node_um.size):
-        fade = np.ones(sources.size)
+        weight = np.ones(sources.size)
         if node_um.size > 1:
-            fade = np.interp(at_um, node_um, np.arange(node_um.size) == k)
-        used = np.flatnonzero((fade > 0.0) & (sources >= 0))
+            weight = np.interp(at_um, node_um, np.arange(node_um.size) == k)
+        used = np.flatnonzero((weight > 0.0) & (sources >= 0))
         low, high = (int(used[0]), int(used[-1]) + 1) if used.size else (0, 1)
-        fade = np.where(sources >= 0, fade, 0.0)[low:high]
+        weight = np.where(sources >= 0, weight, 0.0)[low:high]
         size = int(scipy.fft.next_fast_len(high - low + 2 * imaging.guard, real=True))
         if size >= sources.size:  # the complete padded picture, which is periodic
             size, begin = sources.size, 0
         else:
             begin = low - (size - (high - low)) // 2
         cells = (begin + np.arange(size)) % sources.size + first
-        pieces.append(_Piece(np.maximum(sources[low:high], 0), fade, slice(low - begin, high - begin), cells))
-    return pieces
+        extents.append(_PatchExtent(np.maximum(sources[low:high], 0), weight, slice(low - begin, high - begin), cells))
+    return extents
 
 
-def reach_cells(share: float, lambda_n_um: float, blur_lambda_n: float, edge: float, pitch_um: float) -> int:
+def reach_cells(lost_fraction: float, lambda_n_um: float, blur_lambda_n: float, edge: float, pitch_um: float) -> int:
     """Return the radius in cells that contains all but a fraction of the PSF energy."""
     # Beyond r λN lies 2 / (π² r) of the Airy energy; other pupils scale with their edge length. Geometric blur adds up.
-    return math.ceil((2.0 / math.pi**2 / share * edge + blur_lambda_n) * lambda_n_um / pitch_um)
+    return math.ceil((2.0 / math.pi**2 / lost_fraction * edge + blur_lambda_n) * lambda_n_um / pitch_um)

@@ -12,7 +12,15 @@ from numba import types
 
 from foveasim._core.jit import njit
 
-__all__ = ["alias_sum", "alias_sum_plane", "expose", "multiply", "replicate", "transfer", "transfer_plane"]
+__all__ = [
+    "alias_sum",
+    "alias_sum_plane",
+    "apply_falloff",
+    "multiply",
+    "multiply_otf",
+    "multiply_otf_plane",
+    "replicate",
+]
 
 _floats = types.Array(types.float64, 1, "C", readonly=True)
 
@@ -33,33 +41,33 @@ _floats = types.Array(types.float64, 1, "C", readonly=True)
     ],
     error_model="numpy",
 )
-def expose(rows, x2, y2, power, source_column, before, out):
+def apply_falloff(rows, x2, y2, power, source_column, n_before, out):
     """
     Write rows of a picture times ``cos(theta) ** power``, padded on both sides.
 
     ``x2`` and ``y2`` are (x0/H)² of the picture columns and (y0/H)² of the rows, so that ``cos² = 1 / (1 + x2 + y2)``.
     ``source_column`` contains the picture column of each column of ``out``, -1 for zero. Picture column 0 is written to
-    column ``before``.
+    column ``n_before``.
     """
     n_x = rows.shape[1]
     one = x2.dtype.type(1.0)
     for row in range(out.shape[0]):
         source = rows[row]
         line = out[row]
-        middle = line[before : before + n_x]
+        inner = line[n_before : n_before + n_x]
         base = one + y2[row]
         if power == 4:
             for ix in range(n_x):
                 cos2 = one / (base + x2[ix])
-                middle[ix] = source[ix] * (cos2 * cos2)
+                inner[ix] = source[ix] * (cos2 * cos2)
         else:
             for ix in range(n_x):
                 cos2 = one / (base + x2[ix])
-                middle[ix] = source[ix] * (cos2 * np.sqrt(cos2))
-        for column in range(before):
-            line[column] = middle[source_column[column]] if source_column[column] >= 0 else 0.0
-        for column in range(before + n_x, line.size):
-            line[column] = middle[source_column[column]] if source_column[column] >= 0 else 0.0
+                inner[ix] = source[ix] * (cos2 * np.sqrt(cos2))
+        for column in range(n_before):
+            line[column] = inner[source_column[column]] if source_column[column] >= 0 else 0.0
+        for column in range(n_before + n_x, line.size):
+            line[column] = inner[source_column[column]] if source_column[column] >= 0 else 0.0
 
 
 @njit(
@@ -114,7 +122,7 @@ def replicate(spectrum, n_columns, phase_x, phase_y, first_row, last_row, out):
         for c, r in ((types.complex64, types.float32), (types.complex128, types.float64))
     ],
 )
-def transfer(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is_added, first_row, last_row, out):
+def multiply_otf(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is_added, first_row, last_row, out):
     """
     Compute ``out = spectrum * H`` or ``out += spectrum * H`` over a range of rows.
 
@@ -174,7 +182,7 @@ def multiply(spectrum, factor, is_added, first_row, last_row, out):
     """
     Compute ``out = spectrum * factor`` or ``out += spectrum * factor`` for some rows.
 
-    The order of operations is that of :func:`transfer`, so that results are bit-identical.
+    The order of operations is that of :func:`multiply_otf`, so that results are bit-identical.
     """
     for row in range(first_row, last_row):
         if is_added:
@@ -186,7 +194,7 @@ def multiply(spectrum, factor, is_added, first_row, last_row, out):
 
 
 @njit(inline="always")
-def _in_plane(table, u, v):
+def _interpolate_plane(table, u, v):
     """
     Interpolate a table over (f_y, f_x) bilinearly; 0 outside.
 
@@ -227,8 +235,10 @@ def _in_plane(table, u, v):
         for c, r in ((types.complex64, types.float32), (types.complex128, types.float64))
     ],
 )
-def transfer_plane(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is_added, first_row, last_row, out):
-    """Compute :func:`transfer` for a square complex table over (f_y, f_x)."""
+def multiply_otf_plane(
+    spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far_y, is_added, first_row, last_row, out
+):
+    """Compute :func:`multiply_otf` for a square complex table over (f_y, f_x)."""
     n_alias, n_x = fx.shape
     half = table.shape[0] // 2
     h = np.empty(n_x, table.dtype)
@@ -243,7 +253,7 @@ def transfer_plane(spectrum, table, per_step, fx, fy, gain_x, gain_y, far_x, far
                 continue
             for kx in range(n_alias):
                 for ix in range(n_x):
-                    h[ix] += _in_plane(table, fx[kx, ix] * per_step, v) * (gain_x[kx, ix] * gain_y[ky, row])
+                    h[ix] += _interpolate_plane(table, fx[kx, ix] * per_step, v) * (gain_x[kx, ix] * gain_y[ky, row])
         if is_added:
             for ix in range(n_x):
                 out[row, ix] += spectrum[row, ix] * h[ix]
@@ -291,7 +301,7 @@ def alias_sum_plane(table, per_step, cycles, n_alias, source_cells, is_alternati
             for i in range(n):
                 v = (cycles[i] + k[a]) * per_step
                 for j in range(n):
-                    total[i, j] += gain[a, i] * gain[b, j] * _in_plane(table, (cycles[j] + k[b]) * per_step, v)
+                    total[i, j] += gain[a, i] * gain[b, j] * _interpolate_plane(table, (cycles[j] + k[b]) * per_step, v)
     return total
 
 

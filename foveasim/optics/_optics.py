@@ -42,7 +42,7 @@ LOST_FRACTION = 0.01
 #: Fraction of the PSF energy that an isoplanatic patch may displace.
 PATCH_LOST_FRACTION = 0.002
 #: Factor by which the aperture radius should exceed H λ / (p0 min(M, N)); the paper's Eq. 5 requires "much larger".
-MUCH_LARGER = 10.0
+MIN_RADIUS_RATIO = 10.0
 #: Largest number of cells along a source pixel.
 MAX_OVERSAMPLE = 16
 #: Cells per λN for which the energy of a point in a photosite of side λN is within 1e-3 at second order, for any position of
@@ -297,10 +297,10 @@ class Optics(PointImages):
         """
         grid = self.grid(scene)
         if self.lateral_colour is None:
-            return [(self._refined(grid), np.ones(scene.wavelength_nm.size, bool))]
+            return [(self._refine(grid), np.ones(scene.wavelength_nm.size, bool))]
         sizes = self.lateral_colour.at(scene.wavelength_nm)
         return [
-            (self._refined(Grid.centred(grid.shape, grid.pitch_x_um * float(size))), sizes == size)
+            (self._refine(Grid.centred(grid.shape, grid.pitch_x_um * float(size))), sizes == size)
             for size in np.unique(sizes)
         ]
 
@@ -309,12 +309,12 @@ class Optics(PointImages):
         """Map cells along a side of a source pixel."""
         return 1 if self.oversample == "auto" else self.oversample
 
-    def _refined(self, grid: Grid) -> Grid:
+    def _refine(self, grid: Grid) -> Grid:
         """Return the grid of map cells for a grid of source pixels."""
         n_y, n_x = grid.shape
         return Grid((self._n_fine * n_y, self._n_fine * n_x), grid.pitch_x_um / self._n_fine, grid.origin_um)
 
-    def resolved(self, scene: SceneLike) -> Optics:
+    def resolve_oversample(self, scene: SceneLike) -> Optics:
         """
         Return a lens with a numerical ``oversample``, chosen for a scene if it is "auto".
 
@@ -367,8 +367,8 @@ class Optics(PointImages):
         if not self._is_clear_circle(aperture):
             for wave_nm in scene.wavelength_nm:
                 aperture.transmittance(float(wave_nm))
-                for place_um in self._field_points_um(grid):
-                    aperture.n_across(float(wave_nm), place_um)
+                for point_um in self._field_points_um(grid):
+                    aperture.n_across(float(wave_nm), point_um)
 
     # -- irradiance -----------------------------------------------------------------------------------------------
 
@@ -393,7 +393,7 @@ class Optics(PointImages):
         ParameterError, SimulationError
             When the scene is too near or not finite.
         """
-        grid = self._refined(self.grid(scene))
+        grid = self._refine(self.grid(scene))
         n_bands = scene.wavelength_nm.size
         data = np.empty((n_bands, *grid.shape), self._real_type())
         for band, cells in enumerate(self.weighted_maps(scene, np.eye(n_bands), n_threads=n_threads)):
@@ -428,7 +428,7 @@ class Optics(PointImages):
         therefore B forward transforms, and one inverse transform per output, for any number of wavelengths. This cost applies
         to each image size with lateral chromatic aberration, and to each isoplanatic patch with field-dependent aberrations.
         """
-        common = self._refined(self.grid(scene))
+        common = self._refine(self.grid(scene))
         weights = finite_array("weights", weights, ndim=2)
         if weights.shape[1] != scene.wavelength_nm.size:
             raise ParameterError(
@@ -447,7 +447,7 @@ class Optics(PointImages):
         return self._maps_on_one_grid(scene, weights, thread_count(n_threads))
 
     def _maps_on_one_grid(self, scene: SceneLike, weights: Floats, n_threads: int) -> Iterator[NDArray[Any]]:
-        to = self._refined(self.grid(scene))
+        to = self._refine(self.grid(scene))
         groups = self.image_grids(scene)
         onto = [[overlaps(n, to.pitch_x_um, n, grid.pitch_x_um) for n in to.shape] for grid, _ in groups]
         for output in weights:
@@ -459,7 +459,7 @@ class Optics(PointImages):
             yield total.astype(self._real_type())
 
     def _maps(self, scene: SceneLike, weights: Floats, grid: Grid, n_threads: int) -> Iterator[NDArray[Any]]:
-        from foveasim.optics._imaging import Imaging, patchwork
+        from foveasim.optics._imaging import Imaging, isoplanatic_maps
 
         lambda_n_um = self._lambda_n_um(scene)
         aperture = self._aperture(scene.distance_m)
@@ -467,51 +467,55 @@ class Optics(PointImages):
         pixels = Grid.centred((scene.basis.shape[1], scene.basis.shape[2]), grid.pitch_x_um * self._n_fine)
         if is_clear_circle:
             lambda_n_um = np.maximum(lambda_n_um, grid.pitch_x_um / MAX_ALIASES)
-        share = np.array([aperture.transmittance(float(w)) for w in scene.wavelength_nm])
-        light_w_m2 = (
-            scene.spectrum_w_m2_sr_nm * scene.band_width_nm * share * self.irradiance_per_radiance(scene.distance_m)
+        transmittance = np.array([aperture.transmittance(float(w)) for w in scene.wavelength_nm])
+        irradiance_w_m2 = (
+            scene.spectrum_w_m2_sr_nm
+            * scene.band_width_nm
+            * transmittance
+            * self.irradiance_per_radiance(scene.distance_m)
         )
         tangent2_x, tangent2_y = self._squared_tangents(scene)
         # Cache key: a factor depends on these, the lens and the weights.
-        light = scene.wavelength_nm.tobytes(), scene.distance_m, grid.shape, grid.pitch_x_um, self._n_fine
+        spectrum_key = scene.wavelength_nm.tobytes(), scene.distance_m, grid.shape, grid.pitch_x_um, self._n_fine
 
-        def kept(weight: Floats, transform: Transform, table_of: Tables) -> NDArray[Any] | None:
+        def cached_factor(weight: Floats, transform: Transform, table_of: Tables) -> NDArray[Any] | None:
             n_numbers = math.prod(transform.spectrum_shape) * (1 if is_clear_circle else 2)
-            return self._cache.factor(light, weight, n_numbers, lambda: transform.factor(*table_of(weight)))
+            return self._cache.factor(spectrum_key, weight, n_numbers, lambda: transform.factor(*table_of(weight)))
 
         imaging = Imaging(
             basis=scene.basis,
-            light_w_m2=light_w_m2 * (scene.pitch_um * self.magnification(scene.distance_m) / pixels.pitch_x_um) ** 2,
+            irradiance_w_m2=irradiance_w_m2
+            * (scene.pitch_um * self.magnification(scene.distance_m) / pixels.pitch_x_um) ** 2,
             weights=weights,
             tangent2_x=tangent2_x,
             tangent2_y=tangent2_y,
             falloff_power=4 if self.emission == "lambertian" else 3,
             grid=pixels,
             padding=self.padding,
-            pad=self._reach(scene, pixels, aperture, lambda_n_um, LOST_FRACTION)
+            pad=self._reach_cells(scene, pixels, aperture, lambda_n_um, LOST_FRACTION)
             if self.padding_cells is None
             else self.padding_cells,
-            guard=self._reach(scene, pixels, aperture, lambda_n_um, PATCH_LOST_FRACTION),
+            guard=self._reach_cells(scene, pixels, aperture, lambda_n_um, PATCH_LOST_FRACTION),
             blur_cells=self._blur_um(scene, pixels, aperture, lambda_n_um) / pixels.pitch_x_um,
             f_max_per_um=1.0 / float(lambda_n_um.min()),
             is_square_source=self.source_pixel == "square",
             oversample=self._n_fine,
             real=self._real_type(),
             n_threads=n_threads,
-            kept=kept,
+            cached_factor=cached_factor,
         )
         if is_clear_circle:
             return imaging.maps(RadialTables(1.0 / lambda_n_um, self._real_type()))
 
         def tables_at(field_um: tuple[float, float]) -> Tables:
-            def made() -> PlaneTables:
+            def create() -> PlaneTables:
                 return PlaneTables(aperture, scene.wavelength_nm, lambda_n_um, field_um, self._real_type())
 
-            return self._cache.prepared(light[:2], field_um, made, imaging.sums())
+            return self._cache.prepare(spectrum_key[:2], field_um, create, imaging.sums())
 
         if not self._is_varying():
             return imaging.maps(tables_at((0.0, 0.0)))
-        return patchwork(imaging, (self.field_patches, self.field_patches), tables_at)
+        return isoplanatic_maps(imaging, (self.field_patches, self.field_patches), tables_at)
 
     def isoplanatic_error(self, scene: SceneLike) -> float:
         """
@@ -528,7 +532,7 @@ class Optics(PointImages):
 
         Returns
         -------
-        share : float
+        fraction : float
             Maximum over wavelengths and neighbouring patches; 0 for a constant PSF.
         """
         from foveasim.optics._imaging import isoplanatic_error
@@ -547,8 +551,8 @@ class Optics(PointImages):
         if distance_m is None:
             distance_m = float("inf") if self.focus_distance_m is None else self.focus_distance_m
         distance_m = self._check_distance("distance_m", distance_m)
-        place = finite_array("field_um", field_um, ndim=1)
-        if place.size != 2:
+        position = finite_array("field_um", field_um, ndim=1)
+        if position.size != 2:
             raise ParameterError("field_um", "must be two numbers (x, y)", field_um, "µm")
         n = self.f_number * self._image_distance_mm(distance_m) / self.focal_length_mm
         aperture = self._aperture(distance_m)
@@ -557,7 +561,7 @@ class Optics(PointImages):
             is_clear_circle=self._is_clear_circle(aperture),
             wavelength_nm=wave_nm,
             lambda_n_um=float(um_from_nm(wave_nm)) * n,
-            field_um=(float(place[0]), float(place[1])),
+            field_um=(float(position[0]), float(position[1])),
         )
 
     # -- parts ----------------------------------------------------------------------------------------------------
@@ -592,25 +596,27 @@ class Optics(PointImages):
     def _blur_um(self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats) -> float:
         """Return the largest geometric ray displacement on the sensor."""
         return max(
-            aperture.blur_lambda_n(float(wave_nm), place_um) * float(near_um)
+            aperture.blur_lambda_n(float(wave_nm), point_um) * float(near_um)
             for wave_nm, near_um in zip(scene.wavelength_nm, lambda_n_um, strict=True)
-            for place_um in self._field_points_um(grid)
+            for point_um in self._field_points_um(grid)
         )
 
-    def _reach(self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats, share: float) -> int:
+    def _reach_cells(
+        self, scene: SceneLike, grid: Grid, aperture: Aperture, lambda_n_um: Floats, lost_fraction: float
+    ) -> int:
         """Return the radius in cells that contains all but a fraction of the PSF energy."""
         from foveasim.optics._imaging import reach_cells
 
         return max(
             reach_cells(
-                share,
+                lost_fraction,
                 float(near_um),
-                aperture.blur_lambda_n(float(wave_nm), place_um),
+                aperture.blur_lambda_n(float(wave_nm), point_um),
                 aperture.edge(float(wave_nm)),
                 grid.pitch_x_um,
             )
             for wave_nm, near_um in zip(scene.wavelength_nm, lambda_n_um, strict=True)
-            for place_um in self._field_points_um(grid)
+            for point_um in self._field_points_um(grid)
         )
 
     def _real_type(self) -> type[np.floating[Any]]:
@@ -621,7 +627,7 @@ class Optics(PointImages):
         # In sensor coordinates the ratio of both sides of Eq. 5 is min(M, N) p / (2 λ N).
         widest_um = float(max(lambda_n_um.max(), grid.pitch_x_um / MAX_ALIASES))
         ratio = 0.5 * min(grid.shape) * grid.pitch_x_um / widest_um
-        if ratio < MUCH_LARGER:
+        if ratio < MIN_RADIUS_RATIO:
             height, width = (n * grid.pitch_x_um for n in grid.shape)
             warnings.warn(
                 f"the image of the scene is only {width:.4g} x {height:.4g} µm, and the Airy disc has a diameter of "

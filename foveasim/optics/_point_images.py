@@ -27,7 +27,7 @@ POINT_ACROSS = 384
 #: Radial and angular quadratures of the ensquared energy: minimum number of nodes, and additional nodes per λN of the side.
 QUADRATURE_NODES, NODES_PER_LAMBDA_N = 64, 8
 #: Side (λN) above which the asymptotic PSF gives the ensquared energy to 1e-5.
-FAR_SIDE = 100.0
+MIN_ASYMPTOTIC_SIDE = 100.0
 #: Largest circle or square (λN) for a sampled pupil, whose PSF repeats at eight times this distance.
 MAX_EXTENT = 256.0
 
@@ -61,17 +61,17 @@ class Point:
     lambda_n_um: float
     field_um: tuple[float, float]
 
-    def pattern_per_um2(self, x_um: Floats, y_um: Floats) -> Floats:
+    def psf_per_um2(self, x_um: Floats, y_um: Floats) -> Floats:
         """Sample the PSF at the points (y, x), (n_y, n_x)."""
         if not self.is_clear_circle:
-            return self.aperture.pattern_per_um2(self.wavelength_nm, self.lambda_n_um, x_um, y_um, self.field_um)
+            return self.aperture.psf_per_um2(self.wavelength_nm, self.lambda_n_um, x_um, y_um, self.field_um)
         from scipy.special import j1
 
         v = np.pi * np.hypot(x_um[np.newaxis, :], y_um[:, np.newaxis]) / self.lambda_n_um
         v = np.maximum(v, 1e-9)
         return np.asarray(0.25 * np.pi * (2.0 * j1(v) / v) ** 2 / self.lambda_n_um**2)
 
-    def transfer(self, s_x: Floats, s_y: Floats) -> NDArray[np.complex128]:
+    def compute_otf(self, s_x: Floats, s_y: Floats) -> NDArray[np.complex128]:
         """Return the OTF at frequencies in units of 1/λN."""
         if self.is_clear_circle:
             return circular_otf(np.hypot(s_x, s_y)).astype(np.complex128)
@@ -82,7 +82,7 @@ class Point:
         real, imaginary = (map_coordinates(part, at, order=1, mode="constant") for part in (otf.real, otf.imag))
         return np.asarray(real + 1j * imaginary).reshape(np.shape(s_x))
 
-    def in_circles(self, radius_um: Floats) -> Floats:
+    def encircled_energy(self, radius_um: Floats) -> Floats:
         """Return the encircled energy."""
         from scipy.special import j0, j1
 
@@ -94,10 +94,12 @@ class Point:
         s = np.arange(-n, n + 1) / n
         frequency = np.maximum(np.hypot(s[:, np.newaxis], s), 1e-9)
         # Fourier transform of a disc of radius R: R J1(2π R f) / f.
-        shares = [np.sum(otf.real * (r * j1(2.0 * np.pi * r * frequency) / frequency)) / n**2 for r in radius.ravel()]
-        return np.array(shares).reshape(radius.shape)
+        fractions = [
+            np.sum(otf.real * (r * j1(2.0 * np.pi * r * frequency) / frequency)) / n**2 for r in radius.ravel()
+        ]
+        return np.array(fractions).reshape(radius.shape)
 
-    def in_squares(self, side_um: Floats) -> Floats:
+    def ensquared_energy(self, side_um: Floats) -> Floats:
         """Return the ensquared energy of squares parallel to the axes."""
         side = side_um / self.lambda_n_um
         if self.is_clear_circle:
@@ -114,7 +116,7 @@ class Point:
             )
         # Sampling in frequency makes the PSF periodic: the period must exceed ``extent`` (λN) by a wide margin.
         n = max(POINT_ACROSS, self.aperture.n_across(self.wavelength_nm, self.field_um), int(8.0 * extent))
-        return self.aperture.transfer(self.wavelength_nm, n, n, self.field_um, np.float64), n
+        return self.aperture.compute_otf(self.wavelength_nm, n, n, self.field_um, np.float64), n
 
 
 def _airy_in_square(side: float) -> float:
@@ -123,14 +125,14 @@ def _airy_in_square(side: float) -> float:
 
     By Parseval's theorem, this is the integral of the OTF times the transform of the square, in polar coordinates.
     """
-    if side > FAR_SIDE:
+    if side > MIN_ASYMPTOTIC_SIDE:
         # Asymptotic mean of the Airy pattern: 1 / (π³ r³), integrated outside the square.
         return 1.0 - 8.0 * math.sqrt(2.0) / (math.pi**3 * side)
     nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_NODES + int(NODES_PER_LAMBDA_N * side))
     s, ds = 0.5 * (nodes + 1.0), 0.5 * weights
-    angle, turn = 0.25 * np.pi * 0.5 * (nodes + 1.0), 0.25 * np.pi * 0.5 * weights  # an eighth of the circle
+    angle, angle_weights = 0.25 * np.pi * 0.5 * (nodes + 1.0), 0.25 * np.pi * 0.5 * weights  # an eighth of the circle
     square = np.sinc(side * np.outer(s, np.cos(angle))) * np.sinc(side * np.outer(s, np.sin(angle)))
-    return float(8.0 * side**2 * (circular_otf(s) * s * ds) @ square @ turn)
+    return float(8.0 * side**2 * (circular_otf(s) * s * ds) @ square @ angle_weights)
 
 
 class PointImages:
@@ -183,7 +185,7 @@ class PointImages:
         n_points = check_count("n_points", n_points, at_most=8192)
         grid = Grid.centred((n_points, n_points), pitch_um)
         return PointSpread(
-            psf_per_um2=point.pattern_per_um2(grid.x_um, grid.y_um), grid=grid, wavelength_nm=point.wavelength_nm
+            psf_per_um2=point.psf_per_um2(grid.x_um, grid.y_um), grid=grid, wavelength_nm=point.wavelength_nm
         )
 
     def otf(
@@ -220,7 +222,7 @@ class PointImages:
         point = self._point(wavelength_nm, distance_m, field_um)
         s = finite_array("frequency_per_mm", frequency_per_mm) * 1e-3 * point.lambda_n_um
         angle = math.radians(check_number("angle_deg", angle_deg))
-        return point.transfer(s * math.cos(angle), s * math.sin(angle))
+        return point.compute_otf(s * math.cos(angle), s * math.sin(angle))
 
     def mtf(
         self,
@@ -269,10 +271,10 @@ class PointImages:
 
         Returns
         -------
-        share : array of the same shape, float64
+        fraction : array of the same shape, float64
         """
         point = self._point(wavelength_nm, distance_m, field_um)
-        return point.in_circles(finite_array("radius_um", radius_um, at_least=0.0))
+        return point.encircled_energy(finite_array("radius_um", radius_um, at_least=0.0))
 
     def ensquared_energy(
         self,
@@ -293,7 +295,7 @@ class PointImages:
 
         Returns
         -------
-        share : array of the same shape, float64
+        fraction : array of the same shape, float64
         """
         point = self._point(wavelength_nm, distance_m, field_um)
-        return point.in_squares(finite_array("side_um", side_um, at_least=0.0))
+        return point.ensquared_energy(finite_array("side_um", side_um, at_least=0.0))

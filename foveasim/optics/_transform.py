@@ -40,7 +40,7 @@ ALIAS_ACCURACY = 1e-9
 #: Largest width of a padded picture in cells; a wider one indicates a far too small aperture or a wrong unit.
 MAX_PADDED = 1 << 17
 #: Rows per task of a thread.
-ROWS_PER_PIECE = 64
+ROWS_PER_BLOCK = 64
 #: Arguments of ``numpy.pad`` for each padding; index -1 denotes zero.
 NUMPY_PADDING: dict[str, dict[str, Any]] = {
     "reflect": {"mode": "reflect"},
@@ -120,7 +120,7 @@ class Transform:
         return self._oversample * n_y, self._oversample * n_x
 
     @property
-    def _before(self) -> tuple[int, int]:
+    def _n_before(self) -> tuple[int, int]:
         """Numbers of padding rows and columns before the picture."""
         n_y, n_x = self._picture_shape
         return (self._rows.size - n_y) // 2, (self._columns.size - n_x) // 2
@@ -151,39 +151,39 @@ class Transform:
         rank = int(np.searchsorted(-sizes, -ALIAS_ACCURACY * max(float(zero.real), 0.0)))
         to_coefficients = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, n_nodes - 1))
 
-        def at(cycles: Floats, modes: NDArray[Any]) -> NDArray[Any]:
-            place = 4.0 * np.abs(cycles) - 1.0 if is_radial else 2.0 * cycles
-            polynomials = np.polynomial.chebyshev.chebvander(place, n_nodes - 1)
+        def evaluate(cycles: Floats, modes: NDArray[Any]) -> NDArray[Any]:
+            position = 4.0 * np.abs(cycles) - 1.0 if is_radial else 2.0 * cycles
+            polynomials = np.polynomial.chebyshev.chebvander(position, n_nodes - 1)
             return np.ascontiguousarray((polynomials @ (to_coefficients @ modes)).T.astype(table.dtype))
 
-        far_x = at(self._cycles_x, x_modes[:rank].T)
-        far_y = at(self._cycles_y, y_modes[:, :rank] * sizes[:rank])
+        far_x = evaluate(self._cycles_x, x_modes[:rank].T)
+        far_y = evaluate(self._cycles_y, y_modes[:, :rank] * sizes[:rank])
         # Every alias is 0 at zero frequency: one more product cancels the interpolation error there, which conserves energy.
         dc_x, dc_y = np.zeros((1, far_x.shape[1]), table.dtype), np.zeros((1, far_y.shape[1]), table.dtype)
         dc_x[0, 0], dc_y[0, 0] = 1.0, -(far_x[:, 0] @ far_y[:, 0])
         return np.concatenate((far_x, dc_x)), np.concatenate((far_y, dc_y))
 
-    def _each_rows(self, work: Callable[[int, int], None], n_rows: int) -> None:
+    def _for_each_row_block(self, work: Callable[[int, int], None], n_rows: int) -> None:
         each(
-            lambda first: work(first, min(first + ROWS_PER_PIECE, n_rows)),
-            range(0, n_rows, ROWS_PER_PIECE),
+            lambda first: work(first, min(first + ROWS_PER_BLOCK, n_rows)),
+            range(0, n_rows, ROWS_PER_BLOCK),
             self._n_threads,
         )
 
     def forward(self, image: Images, x2: Floats, y2: Floats, falloff_power: int) -> NDArray[Any]:
         """Return the spectrum of a picture with relative illumination and padding."""
-        (n_y, _), (top, left) = self._picture_shape, self._before
+        (n_y, _), (top, left) = self._picture_shape, self._n_before
         n_columns = min(self._n_columns, self._columns.size // 2 + 1)
         spectrum = np.empty((self._rows.size, n_columns), np.result_type(self._real, np.complex64))
         x2, y2 = x2.astype(self._real), y2.astype(self._real)
 
-        def some_rows(first: int, last: int) -> None:
+        def process_rows(first: int, last: int) -> None:
             padded = np.empty((last - first, self._columns.size), self._real)
             rows = np.ascontiguousarray(image[first:last])
-            self._kernels.expose(rows, x2, y2[first:last], falloff_power, self._columns, left, padded)
+            self._kernels.apply_falloff(rows, x2, y2[first:last], falloff_power, self._columns, left, padded)
             spectrum[top + first : top + last] = scipy.fft.rfft(padded, axis=1, overwrite_x=True)[:, :n_columns]
 
-        self._each_rows(some_rows, n_y)
+        self._for_each_row_block(process_rows, n_y)
         for row in (*range(top), *range(top + n_y, self._rows.size)):
             spectrum[row] = spectrum[top + self._rows[row]] if self._rows[row] >= 0 else 0.0
         spectrum = scipy.fft.fft(spectrum, axis=0, overwrite_x=True, workers=self._n_threads)
@@ -205,7 +205,7 @@ class Transform:
             for cycles in (self._cycles_x, self._cycles_y)
         )
         out = np.empty(self.spectrum_shape, spectrum.dtype)
-        self._each_rows(
+        self._for_each_row_block(
             lambda first, last: self._kernels.replicate(
                 spectrum, self._columns.size, phase_x, phase_y, first, last, out
             ),
@@ -223,9 +223,9 @@ class Transform:
         ``per_step`` steps per 1/µm.
         """
         far_x, far_y = self._far_aliases(table, per_step)
-        kernel = self._kernels.transfer if table.ndim == 1 else self._kernels.transfer_plane
+        kernel = self._kernels.multiply_otf if table.ndim == 1 else self._kernels.multiply_otf_plane
 
-        def some_rows(first: int, last: int) -> None:
+        def process_rows(first: int, last: int) -> None:
             kernel(
                 spectrum,
                 table,
@@ -242,7 +242,7 @@ class Transform:
                 out,
             )
 
-        self._each_rows(some_rows, spectrum.shape[0])
+        self._for_each_row_block(process_rows, spectrum.shape[0])
 
     @property
     def spectrum_shape(self) -> tuple[int, int]:
@@ -257,20 +257,20 @@ class Transform:
 
     def multiply_by(self, spectrum: NDArray[Any], factor: NDArray[Any], out: NDArray[Any], *, is_added: bool) -> None:
         """Compute :meth:`multiply` with a precomputed factor; bit-identical."""
-        self._each_rows(
+        self._for_each_row_block(
             lambda first, last: self._kernels.multiply(spectrum, factor, is_added, first, last, out), spectrum.shape[0]
         )
 
     def inverse(self, spectrum: NDArray[Any]) -> NDArray[Any]:
         """Return the picture of a spectrum without padding; overwrites the spectrum."""
         n_y, n_x = self.map_shape
-        top, left = (self._oversample * before for before in self._before)
+        top, left = (self._oversample * before for before in self._n_before)
         lines = scipy.fft.ifft(spectrum, axis=0, overwrite_x=True, workers=self._n_threads)
         image = np.empty(self.map_shape, self._real)
 
-        def some_rows(first: int, last: int) -> None:
+        def process_rows(first: int, last: int) -> None:
             padded = scipy.fft.irfft(lines[top + first : top + last], n=self._oversample * self._columns.size, axis=1)
             image[first:last] = padded[:, left : left + n_x]
 
-        self._each_rows(some_rows, n_y)
+        self._for_each_row_block(process_rows, n_y)
         return image

@@ -24,15 +24,15 @@ MAX_ALIASES = 128
 #: is at most 2.4e-7 of the value at zero frequency in float32 and 3.0e-8 in float64, near the cut-off.
 TABLE_POINTS = {np.float32: 1 << 13, np.float64: 1 << 15}
 #: Largest number of cached apertures, one per scene distance.
-KEPT_APERTURES = 4
+MAX_CACHED_APERTURES = 4
 #: Memory limit of the tables of all wavelengths, in numbers (128 MiB); beyond it, their step increases.
 MAX_TABLE_SIZE = 1 << 24
 #: Memory limit of the tables cached per lens, in complex numbers (512 MiB in single precision).
-MAX_KEPT_SIZE = 1 << 26
+MAX_CACHE_SIZE = 1 << 26
 #: Memory limit of the cached factors on spectra, in numbers (128 MiB in single precision); fits a colour video at 1080p.
 MAX_FACTOR_SIZE = 1 << 25
 #: Largest number of sums with recorded requests; the oldest entry is removed first.
-REMEMBERED_SUMS = 64
+MAX_RECORDED_SUMS = 64
 
 
 def circular_otf(s: ArrayLike) -> Floats:
@@ -70,8 +70,8 @@ class RadialTables:
     def __init__(self, cutoff_per_um: Floats, real: type[np.floating[Any]]) -> None:
         f_max_per_um = float(cutoff_per_um.max())
         self._real = real
-        wanted = TABLE_POINTS[real] * float(f_max_per_um / cutoff_per_um.min())
-        n_points = max(TABLE_POINTS[real], int(min(wanted, MAX_TABLE_SIZE / cutoff_per_um.size)))
+        n_wanted = TABLE_POINTS[real] * float(f_max_per_um / cutoff_per_um.min())
+        n_points = max(TABLE_POINTS[real], int(min(n_wanted, MAX_TABLE_SIZE / cutoff_per_um.size)))
         self._f_per_um, self._cutoff_per_um = np.linspace(0.0, f_max_per_um, n_points), cutoff_per_um
         self._per_step = (n_points - 1) / f_max_per_um
 
@@ -101,7 +101,7 @@ class PlaneTables:
     ) -> None:
         self._aperture, self._field_um, self._real = aperture, field_um, real
         self._wavelength_nm, self._lambda_n_um = wavelength_nm, lambda_n_um
-        self._kept: dict[bytes, NDArray[Any]] = {}
+        self._cache: dict[bytes, NDArray[Any]] = {}
 
     @cached_property
     def _per_step(self) -> float:
@@ -111,31 +111,33 @@ class PlaneTables:
     def prepare(self, weights: Sequence[Floats]) -> None:
         """Compute the tables of several sums in one pass over the wavelengths."""
         n_lags = math.ceil(self._per_step / float(self._lambda_n_um.min()))
-        n_kept = max(1, MAX_TABLE_SIZE // (2 * n_lags + 1) ** 2)
-        weights = [w for w in weights if w.tobytes() not in self._kept][:n_kept]
-        if len(self._kept) + len(weights) > n_kept:
-            self._kept.clear()
+        max_cached = max(1, MAX_TABLE_SIZE // (2 * n_lags + 1) ** 2)
+        weights = [w for w in weights if w.tobytes() not in self._cache][:max_cached]
+        if len(self._cache) + len(weights) > max_cached:
+            self._cache.clear()
         if not weights:
             return
         sums = np.zeros((len(weights), 2 * n_lags + 1, 2 * n_lags + 1), np.result_type(self._real, np.complex64))
         for k in np.flatnonzero(np.any(weights, axis=0)):
             n_across = self._per_step / float(self._lambda_n_um[k])
-            otf = self._aperture.transfer(float(self._wavelength_nm[k]), n_across, n_lags, self._field_um, self._real)
+            otf = self._aperture.compute_otf(
+                float(self._wavelength_nm[k]), n_across, n_lags, self._field_um, self._real
+            )
             for i, weight in enumerate(weights):
                 if weight[k]:
                     sums[i] += self._real(weight[k]) * otf
-        self._kept |= {weight.tobytes(): total for weight, total in zip(weights, sums, strict=True)}
+        self._cache |= {weight.tobytes(): total for weight, total in zip(weights, sums, strict=True)}
 
     def __call__(self, weight: Floats) -> tuple[NDArray[Any], float]:
         """Return the table, and its steps per frequency (µm)."""
-        if weight.tobytes() not in self._kept:
+        if weight.tobytes() not in self._cache:
             self.prepare([weight])
-        return self._kept[weight.tobytes()], self._per_step
+        return self._cache[weight.tobytes()], self._per_step
 
     @property
     def size(self) -> int:
         """Number of cached values."""
-        return sum(table.size for table in self._kept.values())
+        return sum(table.size for table in self._cache.values())
 
 
 class TableCache:
@@ -148,44 +150,44 @@ class TableCache:
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._made: dict[tuple[Hashable, tuple[float, float]], PlaneTables] = {}
+        self._tables: dict[tuple[Hashable, tuple[float, float]], PlaneTables] = {}
         self._apertures: dict[float, Aperture] = {}
         self._factors: dict[tuple[Hashable, bytes], NDArray[Any] | None] = {}
 
     def __reduce__(self) -> tuple[type[TableCache], tuple[()]]:
         return TableCache, ()
 
-    def aperture(self, distance_m: float, made: Callable[[], Aperture]) -> Aperture:
+    def aperture(self, distance_m: float, create: Callable[[], Aperture]) -> Aperture:
         """Return the aperture for a scene distance; the most recently used ones are cached."""
         with self._lock:
-            aperture = self._apertures.pop(distance_m) if distance_m in self._apertures else made()
+            aperture = self._apertures.pop(distance_m) if distance_m in self._apertures else create()
             self._apertures[distance_m] = aperture
-            while len(self._apertures) > KEPT_APERTURES:
+            while len(self._apertures) > MAX_CACHED_APERTURES:
                 del self._apertures[next(iter(self._apertures))]
             return aperture
 
-    def prepared(
+    def prepare(
         self,
-        light: Hashable,
+        spectrum: Hashable,
         field_um: tuple[float, float],
-        made: Callable[[], PlaneTables],
+        create: Callable[[], PlaneTables],
         weights: Sequence[Floats],
     ) -> PlaneTables:
         """Return tables for a spectrum and a field point, with the given weighted sums computed."""
         with self._lock:
-            tables = self._made.get((light, field_um)) or made()
+            tables = self._tables.get((spectrum, field_um)) or create()
         tables.prepare(weights)
         with self._lock:
-            self._made[light, field_um] = tables
-            for other in [key for key in self._made if key[0] != light]:
-                if self._size() > MAX_KEPT_SIZE:
-                    del self._made[other]
-            if len(self._made) > 1 and self._size() > MAX_KEPT_SIZE:
-                del self._made[light, field_um]
+            self._tables[spectrum, field_um] = tables
+            for other in [key for key in self._tables if key[0] != spectrum]:
+                if self._size() > MAX_CACHE_SIZE:
+                    del self._tables[other]
+            if len(self._tables) > 1 and self._size() > MAX_CACHE_SIZE:
+                del self._tables[spectrum, field_um]
         return tables
 
     def factor(
-        self, light: Hashable, weight: Floats, n_numbers: int, made: Callable[[], NDArray[Any]]
+        self, spectrum: Hashable, weight: Floats, n_numbers: int, create: Callable[[], NDArray[Any]]
     ) -> NDArray[Any] | None:
         """
         Return the cached factor on spectra for a weighted sum, from the second request on.
@@ -193,20 +195,20 @@ class TableCache:
         Return None at the first request, since caching does not pay for a single picture, and if the memory limit is reached.
         Factors of other spectra or picture sizes are evicted first.
         """
-        key = light, weight.tobytes()
+        key = spectrum, weight.tobytes()
         with self._lock:
             is_new = key not in self._factors
             found = self._factors.setdefault(key, None)
-            while len(self._factors) > REMEMBERED_SUMS:
+            while len(self._factors) > MAX_RECORDED_SUMS:
                 del self._factors[next(iter(self._factors))]
             if is_new or found is not None:
                 return found
-            for other in [other for other in self._factors if other[0] != light]:
+            for other in [other for other in self._factors if other[0] != spectrum]:
                 if self._factor_size() + n_numbers > MAX_FACTOR_SIZE:
                     del self._factors[other]
             if self._factor_size() + n_numbers > MAX_FACTOR_SIZE:
                 return None
-        found = made()
+        found = create()
         with self._lock:
             self._factors[key] = found
         return found
@@ -215,4 +217,4 @@ class TableCache:
         return sum(f.size * (2 if np.iscomplexobj(f) else 1) for f in self._factors.values() if f is not None)
 
     def _size(self) -> int:
-        return sum(tables.size for tables in self._made.values())
+        return sum(tables.size for tables in self._tables.values())

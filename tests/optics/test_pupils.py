@@ -483,8 +483,8 @@ def test_non_numeric_pupil_image_raises(picture):
 
 def test_otf_tables_are_cached_between_frames(monkeypatch):
     calls = []
-    transfer = Aperture.transfer
-    monkeypatch.setattr(Aperture, "transfer", lambda self, *a: calls.append(a) or transfer(self, *a))
+    compute_otf = Aperture.compute_otf
+    monkeypatch.setattr(Aperture, "compute_otf", lambda self, *a: calls.append(a) or compute_otf(self, *a))
     optics = lens(pupil=Blades(5), precision="single")
     scene = point_scene(optics, n=64, wavelength_nm=np.linspace(400.0, 700.0, 7))
     weights = np.random.default_rng(0).random((3, 7))
