@@ -23,9 +23,9 @@ from foveasim.metrics.photon_transfer import SiteClasses, codes_of
 from foveasim.metrics.sampling import require_layout
 from foveasim.scene import Scene
 from foveasim.sensor import Sensor, SiteSignals, signal_to_noise
-from foveasim.sensor.adc import QUANTISATION_DN2, Converter
+from foveasim.sensor.adc import ADC, QUANTISATION_DN2
 from foveasim.sensor.limits import check_plausible
-from foveasim.sensor.signal_to_noise import CUT_OFF_SIGMAS
+from foveasim.sensor.signal_to_noise import CLIPPING_SIGMAS
 
 __all__ = ["SnrTable", "measured_snr_by_class", "relative_exposure_at_snr_fraction", "size_classes_um", "snr_by_class"]
 
@@ -336,18 +336,18 @@ def measured_snr_by_class(
     if well_e is not None:
         mean_e = np.mean([capture.electrons for capture in captures], axis=0)
         is_saturated |= _is_near(mean_e, mean_e, well_e)
-    converter = _converter(captures, bits)
-    linear_dn, dark_dn = (np.interp(some, np.arange(2.0**bits), converter.linear_dn) for some in (codes, dark_codes))
-    floor_dn2 = QUANTISATION_DN2 * np.square(converter.width_of_code_dn(codes.mean(axis=0)))
+    adc = _build_adc(captures, bits)
+    linear_dn, dark_dn = (np.interp(some, np.arange(2.0**bits), adc.linear_dn) for some in (codes, dark_codes))
+    floor_dn2 = QUANTISATION_DN2 * np.square(adc.width_of_code_dn(codes.mean(axis=0)))
     noise_dn2 = np.maximum(linear_dn.var(axis=0, ddof=1), floor_dn2)
     return _table(groups, layout.area_um2, linear_dn.mean(axis=0) - dark_dn.mean(axis=0), noise_dn2, is_saturated)
 
 
-def _converter(captures: Sequence[Capture], bits: int) -> Converter:
+def _build_adc(captures: Sequence[Capture], bits: int) -> ADC:
     """Return the ADC specified by the settings of the captures, or a linear one."""
     settings = captures[0].settings.get("sensor", {}) if captures else {}
     names = ("companding", "log_strength", "companding_table", "inl_dn")
-    return Converter(bits=bits, **{name: settings[name] for name in names if name in settings})
+    return ADC(bits=bits, **{name: settings[name] for name in names if name in settings})
 
 
 def _sensor_and_layout(camera: Camera) -> tuple[Sensor, Layout]:
@@ -381,7 +381,7 @@ def _full_well_e(captures: Sequence[Capture], full_well_e: ArrayLike | None, n_s
 
 def _is_near(value: Floats, variance: Floats, limit: Floats | float) -> Bools:
     """Return whether a value is above a limit or within some standard deviations below it."""
-    return np.asarray(value + CUT_OFF_SIGMAS * np.sqrt(variance) >= limit)
+    return np.asarray(value + CLIPPING_SIGMAS * np.sqrt(variance) >= limit)
 
 
 def _linear_codes(found: SiteSignals) -> tuple[Floats, Floats, Bools]:

@@ -105,9 +105,9 @@ def estimate_from_code(code: ArrayLike, sensor: Sensor, exposure_s: float) -> Si
     full_e = electrons_per_code(sensor) * 2.0**sensor.bits
     charge = share * full_e
     read_e = estimate_from_charge(charge, sensor, exposure_s)
-    step_e = sensor.converter.width_of_code_dn(codes) / slope * electrons_per_code(sensor)
+    step_e = sensor.adc.width_of_code_dn(codes) / slope * electrons_per_code(sensor)
     readout = sensor.readout_model(np.maximum(charge, 0.0), is_device_known=False)
-    noise_e2 = readout.noise_e2 + step_e**2 * sensor.converter.noise_dn2
+    noise_e2 = readout.noise_e2 + step_e**2 * sensor.adc.noise_dn2
     is_saturated = read_e.is_saturated | (codes >= 2**sensor.bits - 1)
     return SiteEstimates(light_e=read_e.light_e, variance_e2=read_e.variance_e2 + noise_e2, is_saturated=is_saturated)
 

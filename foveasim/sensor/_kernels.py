@@ -30,7 +30,7 @@ __all__ = [
     "predict_codes",
 ]
 
-#: ADC transfer functions, as numbered by ``ConversionTables.way``.
+#: ADC transfer functions, as numbered by ``ConversionTables.companding_index``.
 ADC_LINEAR, ADC_ROOT, ADC_LOG, ADC_TABLE = range(4)
 #: Tolerance of code transitions, in codes: covers the rounding error of a division.
 CODE_ROUNDING = 1e-9
@@ -39,13 +39,13 @@ ROUNDING_VARIANCE = 1.0 / 12.0
 #: Quadratic coefficient of the Poisson approximation and its 1/λ correction: see foveasim.sensor.effects.ShotNoise.
 QUADRATIC, QUADRATIC_CORRECTION = 1.0 / 6.0, 11.0 / 648.0
 #: Upper limit of charges: 2**62 fits int64 with headroom for sums.
-LARGEST_CHARGE_E = 2.0**62
+MAX_CHARGE_E = 2.0**62
 #: Upper limit of a Poisson draw above its mean: this many standard deviations plus this many electrons.
-FAR_SIGMAS, FAR_ELECTRONS = 12.0, 40
+MAX_DRAW_SIGMAS, MAX_DRAW_MARGIN_E = 12.0, 40
 #: Probabilities further than this many standard deviations from the mean are neglected.
-REACH_SIGMAS = 9.0
+RANGE_SIGMAS = 9.0
 #: Maximum number of nodes of a discrete charge distribution; smallest probability included; tolerance of integer charges.
-MOST_NODES, TINY, WHOLE = 2048, 1e-18, 1e-6
+MAX_NODES, MIN_PROBABILITY, INTEGER_TOLERANCE = 2048, 1e-18, 1e-6
 #: Sites per pass through all readout steps: their buffers fit the L1 cache.
 PIECE = 1024
 #: Bisections that determine a float64 to its last bit.
@@ -84,8 +84,8 @@ def count_ray_intersections(xy, ring_offsets, site_offsets, centroid, directions
 
     The count is 0 for sites that contain their centroid (even-odd rule along the first ray). ``directions`` are unit vectors.
     """
-    met = np.zeros(site_offsets.size - 1, np.int64)
-    for i in range(met.size):
+    n_intersecting = np.zeros(site_offsets.size - 1, np.int64)
+    for i in range(n_intersecting.size):
         for d in range(directions.shape[0]):
             cos, sin = directions[d, 0], directions[d, 1]
             n_crossed = 0
@@ -101,22 +101,22 @@ def count_ray_intersections(xy, ring_offsets, site_offsets, centroid, directions
                     u, v = next_u, next_v
             if d == 0 and n_crossed % 2 == 1:
                 break
-            met[i] += n_crossed > 0
-    return met
+            n_intersecting[i] += n_crossed > 0
+    return n_intersecting
 
 
 @njit(inline="always")
 def _poisson(mean, z):
     """Invert the Poisson distribution at the cumulative probability of a Gaussian number."""
-    share = 0.5 * math.erfc(-z * math.sqrt(0.5))
-    chance = math.exp(-mean)
-    reached = chance
+    wanted = 0.5 * math.erfc(-z * math.sqrt(0.5))
+    probability = math.exp(-mean)
+    cumulated = probability
     n = 0
-    last = int(mean + FAR_SIGMAS * math.sqrt(mean)) + FAR_ELECTRONS
-    while share > reached and n < last:
+    last = int(mean + MAX_DRAW_SIGMAS * math.sqrt(mean)) + MAX_DRAW_MARGIN_E
+    while wanted > cumulated and n < last:
         n += 1
-        chance *= mean / n
-        reached += chance
+        probability *= mean / n
+        cumulated += probability
     return n
 
 
@@ -137,143 +137,143 @@ def draw_poisson(expected_e, z, gaussian_above_e, electrons):
             c = QUADRATIC + QUADRATIC_CORRECTION / mean
             deviation = math.sqrt(mean - ROUNDING_VARIANCE - 2.0 * c * c)
             drawn = mean + deviation * normals[j] + c * (normals[j] * normals[j] - 1.0)
-            charge[j] = np.rint(min(max(drawn, 0.0), LARGEST_CHARGE_E))
+            charge[j] = np.rint(min(max(drawn, 0.0), MAX_CHARGE_E))
         for j in range(means.size):
             out[j] = _poisson(means[j], normals[j]) if means[j] <= gaussian_above_e else int(charge[j])
 
 
 @njit(inline="always")
-def _at(values, i):
+def _value_of_site(values, i):
     return values[i] if values.size > 1 else values[0]
 
 
 @njit(inline="always")
-def _companded(share, adc):
+def _compand(fraction, adc):
     """Map a fraction of the voltage range to a fraction of the code range."""
-    if adc.way == ADC_ROOT:
-        return math.sqrt(share)
-    if adc.way == ADC_LOG:
-        return math.log1p(adc.log_strength * share) / math.log1p(adc.log_strength)
-    if adc.way == ADC_TABLE:
-        place = share * (adc.curve.size - 1)
-        k = min(int(place), adc.curve.size - 2)
-        return adc.curve[k] + (place - k) * (adc.curve[k + 1] - adc.curve[k])
-    return share
+    if adc.companding_index == ADC_ROOT:
+        return math.sqrt(fraction)
+    if adc.companding_index == ADC_LOG:
+        return math.log1p(adc.log_strength * fraction) / math.log1p(adc.log_strength)
+    if adc.companding_index == ADC_TABLE:
+        position = fraction * (adc.curve.size - 1)
+        k = min(int(position), adc.curve.size - 2)
+        return adc.curve[k] + (position - k) * (adc.curve[k + 1] - adc.curve[k])
+    return fraction
 
 
 @njit(inline="always")
-def _apply_nonlinearity(v, bend, v_sat_v):
+def _apply_nonlinearity(v, nonlinearity, v_sat_v):
     """Return the voltage after the nonlinearity."""
-    return v * (1.0 - bend * min(max(v / v_sat_v, 0.0), 1.0))
+    return v * (1.0 - nonlinearity * min(max(v / v_sat_v, 0.0), 1.0))
 
 
 @njit(types.void(types.float64[::1], types.float64, types.float64), error_model="numpy")
-def apply_nonlinearity(voltage_v, bend, v_sat_v):
-    """Apply the nonlinearity in place; ``bend`` is the relative signal loss at full range."""
+def apply_nonlinearity(voltage_v, nonlinearity, v_sat_v):
+    """Apply the nonlinearity in place; ``nonlinearity`` is the relative signal loss at full range."""
     for i in range(voltage_v.size):
-        voltage_v[i] = _apply_nonlinearity(voltage_v[i], bend, v_sat_v)
+        voltage_v[i] = _apply_nonlinearity(voltage_v[i], nonlinearity, v_sat_v)
 
 
 @njit(inline="always")
-def _share(v, v_sat_v):
+def _relative_voltage(v, v_sat_v):
     """Return the fraction of the voltage range, clipped to 0 .. 1."""
     return min(max(v / v_sat_v, 0.0), 1.0)
 
 
 @njit(inline="always")
-def _with_inl(value, n_codes, inl):
+def _add_inl(value, n_codes, inl):
     """Add the integral nonlinearity to an unquantised code."""
-    place = min(value / n_codes, 1.0) * (inl.size - 1)
-    k = np.uint32(min(int(place), inl.size - 2))  # unsigned: avoids the check for negative indices
-    return value + (inl[k] + (place - k) * (inl[k + 1] - inl[k]))
+    position = min(value / n_codes, 1.0) * (inl.size - 1)
+    k = np.uint32(min(int(position), inl.size - 2))  # unsigned: avoids the check for negative indices
+    return value + (inl[k] + (position - k) * (inl[k + 1] - inl[k]))
 
 
 @njit(inline="always")
-def _value(charge, site, adc):
-    """Return the unquantised code; ``site`` is (v_per_e, sense_v, scale, output_v, bend)."""
-    per_e, sense_v, scale, output_v, bend = site
-    v = _apply_nonlinearity(charge * per_e + sense_v, bend, adc.v_sat_v) * scale + output_v
-    value = _companded(_share(v, adc.v_sat_v), adc) * adc.n_codes
-    return _with_inl(value, adc.n_codes, adc.inl) if adc.inl.size > 1 else value
+def _unquantised_code(charge, site, adc):
+    """Return the unquantised code; ``site`` is (v_per_e, sense_v, scale, output_v, nonlinearity)."""
+    per_e, sense_v, scale, output_v, nonlinearity = site
+    v = _apply_nonlinearity(charge * per_e + sense_v, nonlinearity, adc.v_sat_v) * scale + output_v
+    value = _compand(_relative_voltage(v, adc.v_sat_v), adc) * adc.n_codes
+    return _add_inl(value, adc.n_codes, adc.inl) if adc.inl.size > 1 else value
 
 
 @njit(inline="always")
-def _dnl_place(key, line, code, n_quantiles):
+def _dnl_position(key, line, code, n_quantiles):
     """Return the fractional index into the Gaussian quantiles for a readout line and a code."""
     word, _ = philox_2x32(key, np.uint64(line) & _LOW, np.uint64(code))
     return np.float64(word) * (_ONE_IN_2_32 * (n_quantiles - 1))
 
 
 @njit(inline="always")
-def _between(quantiles, place):
+def _interpolate(quantiles, position):
     """Interpolate quantiles linearly."""
-    k = np.uint32(place)
-    return quantiles[k] + (place - k) * (quantiles[k + 1] - quantiles[k])
+    k = np.uint32(position)
+    return quantiles[k] + (position - k) * (quantiles[k + 1] - quantiles[k])
 
 
 @njit(inline="always")
 def _dnl_normal(key, line, code, quantiles):
     """Return the standard Gaussian DNL number of a readout line and a code."""
-    return _between(quantiles, _dnl_place(key, line, code, quantiles.size))
+    return _interpolate(quantiles, _dnl_position(key, line, code, quantiles.size))
 
 
 @njit(inline="always")
-def _whole(value, n_codes):
+def _quantise(value, n_codes):
     """Quantise to a code in float64."""
     return np.float64(int(min(max(value + CODE_ROUNDING, 0.0), n_codes - 1.0)))
 
 
 @njit(inline="always")
-def _code(value, line, adc):
+def _quantise_with_dnl(value, line, adc):
     """Quantise to a code, with differential nonlinearity."""
-    code = _whole(value, adc.n_codes)
+    code = _quantise(value, adc.n_codes)
     if adc.dnl_dn > 0.0:
-        code = _whole(value + adc.dnl_dn * _dnl_normal(adc.dnl_key, line, code, adc.quantiles), adc.n_codes)
+        code = _quantise(value + adc.dnl_dn * _dnl_normal(adc.dnl_key, line, code, adc.quantiles), adc.n_codes)
     return code
 
 
 @njit()
-def _charge(value, site, adc):
-    """Invert :func:`_value`; codes outside the range give infinite charges."""
-    per_e, sense_v, scale, output_v, bend = site
+def _charge_at_code(value, site, adc):
+    """Invert :func:`_unquantised_code`; codes outside the range give infinite charges."""
+    per_e, sense_v, scale, output_v, nonlinearity = site
     v_sat_v, inl = adc.v_sat_v, adc.inl
-    share_of_codes = value / adc.n_codes
+    code_fraction = value / adc.n_codes
     if inl.size > 1:
         low, high = 0.0, 1.0
         for _ in range(BISECTIONS):
-            middle = 0.5 * (low + high)
-            place = middle * (inl.size - 1)
-            k = min(int(place), inl.size - 2)
-            if middle * adc.n_codes + inl[k] + (place - k) * (inl[k + 1] - inl[k]) < value:
-                low = middle
+            centre = 0.5 * (low + high)
+            position = centre * (inl.size - 1)
+            k = min(int(position), inl.size - 2)
+            if centre * adc.n_codes + inl[k] + (position - k) * (inl[k + 1] - inl[k]) < value:
+                low = centre
             else:
-                high = middle
-        share_of_codes = high if high < 1.0 else 1.0 + TINY
+                high = centre
+        code_fraction = high if high < 1.0 else 1.0 + MIN_PROBABILITY
         if low == 0.0:
-            share_of_codes = 0.0
-    if share_of_codes <= 0.0:
+            code_fraction = 0.0
+    if code_fraction <= 0.0:
         return -np.inf
-    if share_of_codes > 1.0:
+    if code_fraction > 1.0:
         return np.inf
-    share = share_of_codes
-    if adc.way == ADC_ROOT:
-        share = share_of_codes * share_of_codes
-    elif adc.way == ADC_LOG:
-        share = math.expm1(share_of_codes * math.log1p(adc.log_strength)) / adc.log_strength
-    elif adc.way == ADC_TABLE:
+    fraction = code_fraction
+    if adc.companding_index == ADC_ROOT:
+        fraction = code_fraction * code_fraction
+    elif adc.companding_index == ADC_LOG:
+        fraction = math.expm1(code_fraction * math.log1p(adc.log_strength)) / adc.log_strength
+    elif adc.companding_index == ADC_TABLE:
         low, high = 0.0, 1.0
         for _ in range(BISECTIONS):
-            share = 0.5 * (low + high)
-            if _companded(share, adc) < share_of_codes:
-                low = share
+            fraction = 0.5 * (low + high)
+            if _compand(fraction, adc) < code_fraction:
+                low = fraction
             else:
-                high = share
-    v = (share * v_sat_v - output_v) / scale
-    if bend > 0.0 and v > 0.0:
+                high = fraction
+    v = (fraction * v_sat_v - output_v) / scale
+    if nonlinearity > 0.0 and v > 0.0:
         v = (
-            0.5 * v_sat_v * (1.0 - math.sqrt(1.0 - 4.0 * bend * v / v_sat_v)) / bend
-            if v < v_sat_v * (1.0 - bend)
-            else v / (1.0 - bend)
+            0.5 * v_sat_v * (1.0 - math.sqrt(1.0 - 4.0 * nonlinearity * v / v_sat_v)) / nonlinearity
+            if v < v_sat_v * (1.0 - nonlinearity)
+            else v / (1.0 - nonlinearity)
         )
     return (v - sense_v) / per_e
 
@@ -287,33 +287,33 @@ def convert(voltage_v, line, adc, code):
     """
     # One short loop per step over buffers that fit the cache. The compiler vectorises the loops because numpy's error model
     # does not check divisions.
-    value, place = np.empty(PIECE), np.empty(PIECE)
+    value, position = np.empty(PIECE), np.empty(PIECE)
     n_codes, inl, dnl, quantiles = adc.n_codes, adc.inl, adc.dnl_dn, adc.quantiles
     for first in range(0, voltage_v.size, PIECE):
         n = min(PIECE, voltage_v.size - first)
         sites = slice(first, first + n)
         volts, lines, codes = voltage_v[sites], line[sites], code[sites]
         for j in range(n):
-            value[j] = _share(volts[j], adc.v_sat_v)
-        if adc.way != ADC_LINEAR:
+            value[j] = _relative_voltage(volts[j], adc.v_sat_v)
+        if adc.companding_index != ADC_LINEAR:
             for j in range(n):
-                value[j] = _companded(value[j], adc)
+                value[j] = _compand(value[j], adc)
         for j in range(n):
             value[j] *= n_codes
         if inl.size > 1:
             for j in range(n):
-                value[j] = _with_inl(value[j], n_codes, inl)
+                value[j] = _add_inl(value[j], n_codes, inl)
         for j in range(n):
-            codes[j] = int(_whole(value[j], n_codes))
+            codes[j] = int(_quantise(value[j], n_codes))
         if dnl > 0.0:
             for j in range(n):
-                place[j] = _dnl_place(adc.dnl_key, lines[j], codes[j], quantiles.size)
+                position[j] = _dnl_position(adc.dnl_key, lines[j], codes[j], quantiles.size)
             for j in range(n):
-                codes[j] = int(_whole(value[j] + dnl * _between(quantiles, place[j]), n_codes))
+                codes[j] = int(_quantise(value[j] + dnl * _interpolate(quantiles, position[j]), n_codes))
 
 
 @njit(inline="always")
-def _normal_below(x, skewness):
+def _edgeworth_cdf(x, skewness):
     """Return the standardised Gaussian CDF with the first Edgeworth term (skewness)."""
     gaussian = 0.5 * math.erfc(-x * SQRT_HALF)
     if skewness == 0.0:
@@ -322,7 +322,7 @@ def _normal_below(x, skewness):
 
 
 @njit(inline="always")
-def _below(q, nodes, weights, n_nodes, mean, deviation, third, well_e, sigma, half_step):
+def _probability_below(q, nodes, weights, n_nodes, mean, deviation, third, well_e, sigma, half_step):
     """
     Return the probability that a charge plus readout noise is below ``q``.
 
@@ -339,50 +339,50 @@ def _below(q, nodes, weights, n_nodes, mean, deviation, third, well_e, sigma, ha
                 total += 1.0
             else:
                 spread = math.sqrt(deviation**2 + sigma**2)
-                total += _normal_below((at - mean) / spread, third / spread**3)
+                total += _edgeworth_cdf((at - mean) / spread, third / spread**3)
         else:
             for j in range(n_nodes):
                 if sigma == 0.0:
-                    total += weights[j] if nodes[j] < at - WHOLE else 0.0
+                    total += weights[j] if nodes[j] < at - INTEGER_TOLERANCE else 0.0
                 else:
                     total += weights[j] * 0.5 * math.erfc((nodes[j] - at) / sigma * SQRT_HALF)
     return total / n_states
 
 
 @njit()
-def _mixture(mean, is_poisson, well_e, quadrature, nodes, weights):
+def _discretise_charge(mean, is_poisson, well_e, quadrature, nodes, weights):
     """
     Compute nodes and probabilities of a Poisson charge clipped at the full well.
 
     Returns the number of nodes. They are integers for ``is_poisson``; otherwise quadrature points of the Edgeworth series.
     """
-    points, shares = quadrature
+    points, gauss = quadrature
     n = 0
     rest = 1.0
     if is_poisson:
-        chance = math.exp(-mean)
+        probability = math.exp(-mean)
         k = 0
-        last = int(mean + FAR_SIGMAS * math.sqrt(mean)) + FAR_ELECTRONS
+        last = int(mean + MAX_DRAW_SIGMAS * math.sqrt(mean)) + MAX_DRAW_MARGIN_E
         while k <= last and k < well_e and n < nodes.size - 1:
-            if chance > TINY:
-                nodes[n], weights[n] = k, chance
+            if probability > MIN_PROBABILITY:
+                nodes[n], weights[n] = k, probability
                 n += 1
-            rest -= chance
+            rest -= probability
             k += 1
-            chance *= mean / k
+            probability *= mean / k
         if k >= well_e:
             nodes[n], weights[n] = well_e, max(rest, 0.0)
             n += 1
         return n
     deviation = math.sqrt(mean)
-    low, high = mean - REACH_SIGMAS * deviation, min(well_e, mean + REACH_SIGMAS * deviation)
+    low, high = mean - RANGE_SIGMAS * deviation, min(well_e, mean + RANGE_SIGMAS * deviation)
     if high > low:
         for j in range(points.size):
             charge = low + 0.5 * (points[j] + 1.0) * (high - low)
             z = (charge - mean) / deviation
             nodes[n] = charge
             edgeworth = 1.0 + (z * z - 3.0) * z / (6.0 * deviation)
-            weights[n] = 0.5 * (high - low) * shares[j] * edgeworth * math.exp(-0.5 * z * z) / (deviation * SQRT_TWO_PI)
+            weights[n] = 0.5 * (high - low) * gauss[j] * edgeworth * math.exp(-0.5 * z * z) / (deviation * SQRT_TWO_PI)
             rest -= weights[n]
             n += 1
     nodes[n], weights[n] = well_e, max(rest, 0.0)
@@ -397,45 +397,53 @@ def predict_codes(charges, transfer, line, adc, quadrature, mean_dn, variance_dn
     With ``charges.is_drawn``, charges are Poisson-distributed and clipped at the full well. Otherwise they are Gaussian with
     variance ``variance_e2``, or equal to their mean where the variance is 0.
     """
-    nodes, weights = np.empty(MOST_NODES), np.empty(MOST_NODES)
-    n_codes, bend = adc.n_codes, transfer.bend
+    nodes, weights = np.empty(MAX_NODES), np.empty(MAX_NODES)
+    n_codes, nonlinearity = adc.n_codes, transfer.nonlinearity_fraction
     for i in range(charges.mean_e.size):
-        mean, well = charges.mean_e[i], _at(charges.well_e, i)
-        sigma, half_step = _at(charges.sigma_e, i), _at(charges.half_step_e, i)
+        mean, well = charges.mean_e[i], _value_of_site(charges.well_e, i)
+        sigma, half_step = _value_of_site(charges.sigma_e, i), _value_of_site(charges.half_step_e, i)
         third = 0.0
         n_nodes = 0
-        deviation = math.sqrt(_at(charges.variance_e2, i))
+        deviation = math.sqrt(_value_of_site(charges.variance_e2, i))
         if charges.is_drawn:
             deviation, third = math.sqrt(mean), mean
             if mean <= charges.poisson_below_e:
-                n_nodes = _mixture(mean, True, well, quadrature, nodes, weights)
-            elif well < mean + REACH_SIGMAS * deviation and sigma > 0.0:
-                n_nodes = _mixture(mean, False, well, quadrature, nodes, weights)
+                n_nodes = _discretise_charge(mean, True, well, quadrature, nodes, weights)
+            elif well < mean + RANGE_SIGMAS * deviation and sigma > 0.0:
+                n_nodes = _discretise_charge(mean, False, well, quadrature, nodes, weights)
         elif deviation == 0.0:
             n_nodes = 1
             nodes[0], weights[0] = min(mean, well), 1.0
         site = (
-            _at(transfer.v_per_e, i), _at(transfer.sense_v, i), _at(transfer.scale, i), _at(transfer.output_v, i), bend,
-        )  # fmt: skip
+            _value_of_site(transfer.v_per_e, i),
+            _value_of_site(transfer.sense_v, i),
+            _value_of_site(transfer.scale, i),
+            _value_of_site(transfer.output_v, i),
+            nonlinearity,
+        )
         if site[0] * site[2] == 0.0:
-            mean_dn[i], variance_dn2[i] = _code(_value(0.0, site, adc), line[i], adc), 0.0
+            mean_dn[i], variance_dn2[i] = _quantise_with_dnl(_unquantised_code(0.0, site, adc), line[i], adc), 0.0
             continue
-        reach = REACH_SIGMAS * math.sqrt(deviation**2 + sigma**2) + half_step + (FAR_ELECTRONS if n_nodes > 1 else 1.0)
+        reach = (
+            RANGE_SIGMAS * math.sqrt(deviation**2 + sigma**2) + half_step + (MAX_DRAW_MARGIN_E if n_nodes > 1 else 1.0)
+        )
         low, high = min(mean, well) - reach, min(mean, well) + reach
-        first, last = _value(low, site, adc), _value(high, site, adc)
+        first, last = _unquantised_code(low, site, adc), _unquantised_code(high, site, adc)
         # Closed form for a linear ADC where noise exceeds one code and nothing is clipped: quantisation lowers the mean by
         # 1/2 DN and adds a variance of 1/12 DN², to 1e-8.
         dn_per_e = site[0] * site[2] / adc.v_sat_v * n_codes
         smooth_dn = dn_per_e * (sigma if n_nodes > 0 else math.sqrt(deviation**2 + sigma**2))
-        is_even = adc.way == ADC_LINEAR and adc.inl.size == 1 and adc.dnl_dn == 0.0 and bend == 0.0
-        if is_even and smooth_dn >= 1.0 and first > 0.0 and last < n_codes and mean + reach < well:
+        is_uniform = (
+            adc.companding_index == ADC_LINEAR and adc.inl.size == 1 and adc.dnl_dn == 0.0 and nonlinearity == 0.0
+        )
+        if is_uniform and smooth_dn >= 1.0 and first > 0.0 and last < n_codes and mean + reach < well:
             offset_v = site[1] * site[2] + site[3]
             mean_dn[i] = mean * dn_per_e + offset_v / adc.v_sat_v * n_codes - 0.5
             variance_dn2[i] = (deviation**2 + sigma**2 + half_step**2) * dn_per_e**2 + 1.0 / 12.0
             continue
         k_first, k_last = max(math.floor(first) - 1, 0), min(math.floor(last) + 1, n_codes - 1)
         total, squares = 0.0, 0.0
-        at, reached = low, 0.0
+        at, cumulated = low, 0.0
         for k in range(k_first, k_last + 1):
             # DNL adds at most one transition inside each code interval.
             jump = 1.0
@@ -443,10 +451,10 @@ def predict_codes(charges, transfer, line, adc, quadrature, mean_dn, variance_dn
                 moved = adc.dnl_dn * _dnl_normal(adc.dnl_key, line[i], k, adc.quantiles)
                 jump = math.ceil(k + moved) - (k + moved)
             for part in range(2):
-                border = k + jump if part == 0 else k + 1.0
+                transition = k + jump if part == 0 else k + 1.0
                 if part == 1 and jump == 1.0:
                     continue
-                end = _charge(border, site, adc)
+                end = _charge_at_code(transition, site, adc)
                 if k == k_last and (part == 1 or jump == 1.0):
                     end = np.inf
                 if end <= at:
@@ -454,12 +462,14 @@ def predict_codes(charges, transfer, line, adc, quadrature, mean_dn, variance_dn
                 below = (
                     1.0
                     if end == np.inf
-                    else _below(end, nodes, weights, n_nodes, mean, deviation, third, well, sigma, half_step)
+                    else _probability_below(
+                        end, nodes, weights, n_nodes, mean, deviation, third, well, sigma, half_step
+                    )
                 )
-                middle = 0.5 * (at + end) if end < np.inf else max(at, high) + 1.0
-                code = _code(_value(middle, site, adc), line[i], adc)
-                total += code * (below - reached)
-                squares += code * code * (below - reached)
-                at, reached = end, below
+                centre = 0.5 * (at + end) if end < np.inf else max(at, high) + 1.0
+                code = _quantise_with_dnl(_unquantised_code(centre, site, adc), line[i], adc)
+                total += code * (below - cumulated)
+                squares += code * code * (below - cumulated)
+                at, cumulated = end, below
         mean_dn[i] = total
         variance_dn2[i] = max(squares - total * total, 0.0)

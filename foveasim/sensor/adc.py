@@ -14,7 +14,7 @@ from foveasim._core.validation import Floats, check_choice, check_count, finite_
 from foveasim.errors import ParameterError
 from foveasim.sensor.limits import check_plausible, check_plausible_array
 
-__all__ = ["QUANTISATION_DN2", "Companding", "ConversionTables", "Converter"]
+__all__ = ["ADC", "QUANTISATION_DN2", "Companding", "ConversionTables"]
 
 #: Transfer functions from fraction of the voltage range to fraction of the code range.
 Companding = Literal["linear", "root", "log", "table"]
@@ -29,7 +29,7 @@ class ConversionTables(NamedTuple):
     """ADC parameters for the kernels: numbers and read-only float64 arrays."""
 
     v_sat_v: float
-    way: int
+    companding_index: int
     log_strength: float
     curve: Floats
     n_codes: int
@@ -40,7 +40,7 @@ class ConversionTables(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Converter:
+class ADC:
     """
     Analogue-to-digital converter with companding and nonlinearity.
 
@@ -103,7 +103,7 @@ class Converter:
         return int(2**self.bits)
 
     @property
-    def way(self) -> int:
+    def companding_index(self) -> int:
         """Number of the companding in the kernels."""
         return COMPANDINGS.index(self.companding)
 
@@ -118,35 +118,35 @@ class Converter:
         return read_only(np.array(self.inl_dn or [0.0]))
 
     @cached_property
-    def borders(self) -> Floats:
+    def transition_levels(self) -> Floats:
         """
         Code transition levels as fractions of the voltage range, (n_codes + 1,).
 
         The levels are non-decreasing, and the last level is 1. Codes that are missing because of INL or the companding table
         have zero width.
         """
-        border = np.arange(self.n_codes + 1) / self.n_codes
+        levels = np.arange(self.n_codes + 1) / self.n_codes
         if self.inl.size > 1:
             nodes = np.linspace(0.0, 1.0, self.inl.size)
-            border = _first_at(nodes + self.inl / self.n_codes, nodes, border)
+            levels = _invert_piecewise_linear(nodes + self.inl / self.n_codes, nodes, levels)
         if self.companding == "root":
-            border = border**2
+            levels = levels**2
         elif self.companding == "log":
-            border = np.expm1(border * np.log1p(self.log_strength)) / self.log_strength
+            levels = np.expm1(levels * np.log1p(self.log_strength)) / self.log_strength
         elif self.companding == "table":
-            border = _first_at(self.curve, np.linspace(0.0, 1.0, self.curve.size), border)
-        border[-1] = 1.0  # the highest code extends to the end of the range
-        return read_only(border)
+            levels = _invert_piecewise_linear(self.curve, np.linspace(0.0, 1.0, self.curve.size), levels)
+        levels[-1] = 1.0  # the highest code extends to the end of the range
+        return read_only(levels)
 
     @cached_property
     def linear_dn(self) -> Floats:
         """Linear code of each code, (n_codes,) DN: the centre of its voltage interval."""
-        return read_only(0.5 * (self.borders[:-1] + self.borders[1:]) * self.n_codes - 0.5)
+        return read_only(0.5 * (self.transition_levels[:-1] + self.transition_levels[1:]) * self.n_codes - 0.5)
 
     @cached_property
     def widths_dn(self) -> Floats:
         """Width of each code in linear codes, (n_codes,) DN; 1 for a linear ADC."""
-        return read_only(np.diff(self.borders) * self.n_codes)
+        return read_only(np.diff(self.transition_levels) * self.n_codes)
 
     def width_of_code_dn(self, code: ArrayLike) -> Floats:
         """Interpolate the code width at given codes, (...) DN in linear codes."""
@@ -175,7 +175,7 @@ class Converter:
         """Return the kernel arguments for a full range in V and a device's DNL key."""
         return ConversionTables(
             v_sat_v=v_sat_v,
-            way=self.way,
+            companding_index=self.companding_index,
             log_strength=self.log_strength,
             curve=self.curve,
             n_codes=self.n_codes,
@@ -193,7 +193,7 @@ class Converter:
         return read_only(np.asarray(ndtri((np.arange(N_QUANTILES) + 0.5) / N_QUANTILES)))
 
 
-def _first_at(values: Floats, at_fraction: Floats, wanted_fraction: Floats) -> Floats:
+def _invert_piecewise_linear(values: Floats, at_fraction: Floats, wanted_fraction: Floats) -> Floats:
     """
     Invert a piecewise linear function.
 
@@ -204,5 +204,5 @@ def _first_at(values: Floats, at_fraction: Floats, wanted_fraction: Floats) -> F
     inside = np.clip(after, 1, values.size - 1)
     low, high = rising[inside - 1], rising[inside]
     step = np.where(high > low, (wanted_fraction - low) / np.where(high > low, high - low, 1.0), 0.0)
-    place = at_fraction[inside - 1] + np.clip(step, 0.0, 1.0) * (at_fraction[inside] - at_fraction[inside - 1])
-    return np.where(after == 0, at_fraction[0], np.where(after >= values.size, at_fraction[-1], place))
+    position = at_fraction[inside - 1] + np.clip(step, 0.0, 1.0) * (at_fraction[inside] - at_fraction[inside - 1])
+    return np.where(after == 0, at_fraction[0], np.where(after >= values.size, at_fraction[-1], position))

@@ -10,7 +10,7 @@ from foveasim._core.validation import Floats, as_numbers
 from foveasim.errors import ParameterError
 from foveasim.sensor.effects import STANDARD
 from foveasim.sensor.limits import check_plausible
-from foveasim.sensor.prediction import LEAST_SLOPE
+from foveasim.sensor.prediction import MIN_SLOPE
 from foveasim.sensor.sensor import Sensor
 from foveasim.sensor.signal_to_noise import local_step_e
 
@@ -69,8 +69,8 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
     charge_e = (photo + dark) * exposure_s
     volts = charge_e * sensor.v_per_e
     fraction = np.clip(volts / sensor.v_sat_v, 0.0, 1.0)
-    bend = sensor.nonlinearity_fraction
-    slope = np.maximum(1.0 - 2.0 * bend * fraction, LEAST_SLOPE)
+    nonlinearity = sensor.nonlinearity_fraction
+    slope = np.maximum(1.0 - 2.0 * nonlinearity * fraction, MIN_SLOPE)
     # Nominal values at each stage, and the number of electrons per unit of that stage.
     nominal = {
         "photo": (photo, exposure_s),
@@ -78,12 +78,12 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
         "expected": (charge_e, 1.0),
         "charge": (charge_e, 1.0),
         "sense_node": (volts, 1.0 / sensor.v_per_e),
-        "output": (volts * (1.0 - bend * fraction) + sensor.pedestal_v, 1.0 / (sensor.v_per_e * slope)),
+        "output": (volts * (1.0 - nonlinearity * fraction) + sensor.pedestal_v, 1.0 / (sensor.v_per_e * slope)),
     }
     step_e = local_step_e(sensor, charge_e, sensor.v_per_e, np.full(1, sensor.pedestal_v))
     temporal = dict.fromkeys(TEMPORAL, np.zeros(1))
     fixed = dict.fromkeys(FIXED, np.zeros(1))
-    temporal["quantisation"] = math.sqrt(sensor.converter.noise_dn2) * step_e
+    temporal["quantisation"] = math.sqrt(sensor.adc.noise_dn2) * step_e
     any_device = sensor.sites.without_device()
     for effect in sensor.chain:
         if effect.stage == "collection":
@@ -93,7 +93,7 @@ def noise_budget(sensor: Sensor, photo_e_per_s: Floats, exposure_s: float) -> di
         elif effect.is_temporal or effect.is_local:
             values, e_per_unit = nominal[effect.stage]
             sites = sensor.sites if effect.is_temporal else any_device
-            mean, variance = effect.validated_moments(values, np.zeros(1), sites)
-            lines = temporal if effect.is_temporal else fixed
-            lines[effect.name] = np.sqrt(variance + (mean - values) ** 2) * e_per_unit
-    return {name: np.broadcast_to(line, n_sites).copy() for name, line in (temporal | fixed).items()}
+            mean, variance = effect.validate_moments(values, np.zeros(1), sites)
+            entries = temporal if effect.is_temporal else fixed
+            entries[effect.name] = np.sqrt(variance + (mean - values) ** 2) * e_per_unit
+    return {name: np.broadcast_to(entry, n_sites).copy() for name, entry in (temporal | fixed).items()}

@@ -31,7 +31,7 @@ __all__ = ["Calibration", "calibrate", "linearise", "nominal_e_per_dn"]
 #: Ratio of the standard deviation of a Gaussian distribution to its median absolute deviation.
 SIGMA_PER_MAD = 1.482602218505602
 #: Probability that a site with typical noise is classified as noisy, for the given number of frames.
-FALSE_ALARM = 1e-6
+FALSE_ALARM_PROBABILITY = 1e-6
 #: Maximum distance, in steps of adjacency, of the neighbours that replace a defective site.
 MAX_FILL_STEPS = 3
 
@@ -74,7 +74,7 @@ def linearise(code: ArrayLike, sensor: Sensor) -> Floats:
     [-0.5, 64.0, 254.5]
     """
     _require_sensor(sensor)
-    return _interpolate(code, sensor.converter.linear_dn, 2.0**sensor.bits - 1.0)
+    return _interpolate(code, sensor.adc.linear_dn, 2.0**sensor.bits - 1.0)
 
 
 def nominal_e_per_dn(sensor: Sensor) -> Floats:
@@ -228,11 +228,11 @@ class Calibration:
         table = None if linear_dn is None else finite_array("linear_dn", linear_dn, ndim=1)
         stacks = {"dark": _Frames(highest_dn, table), "flat": _Frames(highest_dn, table)}
         for name, frames, at_least in (("dark", dark, 2), ("flat", flat, 1)):
-            stacks[name].add_all(name, _stack(name, frames, at_least))
+            stacks[name].add_all(name, _validate_frames(name, frames, at_least))
         stack_long = None
         if dark_long is not None:
             stack_long = _Frames(highest_dn, table)
-            stack_long.add_all("dark_long", _stack("dark_long", dark_long, 1))
+            stack_long.add_all("dark_long", _validate_frames("dark_long", dark_long, 1))
         return _calibration(
             stacks["dark"],
             stacks["flat"],
@@ -322,9 +322,9 @@ class Calibration:
         values = np.where(is_usable, (linear_dn - self.offset_at(exposure_s)) / gain, np.nan)
         if fill is None:
             return values
-        return self._filled(values.reshape(-1, self.n_sites), fill, kind, max_gap_um).reshape(codes.shape)
+        return self._replace_defects(values.reshape(-1, self.n_sites), fill, kind, max_gap_um).reshape(codes.shape)
 
-    def _filled(
+    def _replace_defects(
         self, values: Floats, layout: Neighbourhood, kind: ArrayLike | None, max_gap_um: float | None
     ) -> Floats:
         """Replace defective sites in frames (n_frame, n_site) by their nearest good neighbours."""
@@ -336,7 +336,7 @@ class Calibration:
         bad = np.flatnonzero(self.defective)
         if bad.size == 0:
             return values
-        neighbours = _pattern(layout.adjacency(max_gap_um=max_gap_um))
+        neighbours = _sparsity_pattern(layout.adjacency(max_gap_um=max_gap_um))
         if neighbours.nnz == 0:
             raise SimulationError(
                 "no two sites of the layout share an edge, so defective sites have no neighbours; for sites separated by "
@@ -344,20 +344,20 @@ class Calibration:
             )
         is_good = np.isfinite(values) & ~self.defective
         relative = np.where(is_good, values / self.expected_dn, 0.0).T
-        found = np.full((bad.size, values.shape[0]), np.nan)
-        within = _pattern(neighbours[bad])
+        replacements = np.full((bad.size, values.shape[0]), np.nan)
+        reachable = _sparsity_pattern(neighbours[bad])
         for _ in range(MAX_FILL_STEPS):
-            near = within.copy()
+            usable = reachable.copy()
             if kinds is not None:
-                of_bad = np.repeat(kinds[bad], np.diff(near.indptr))
-                near.data = (of_bad == kinds[near.indices]).astype(np.float64)
-            count = near @ is_good.T.astype(np.float64)
-            mean = (near @ relative) / np.where(count > 0.0, count, 1.0)
-            found = np.where(np.isnan(found) & (count > 0.0), mean, found)
-            if not np.isnan(found).any():
+                kinds_of_bad = np.repeat(kinds[bad], np.diff(usable.indptr))
+                usable.data = (kinds_of_bad == kinds[usable.indices]).astype(np.float64)
+            count = usable @ is_good.T.astype(np.float64)
+            mean = (usable @ relative) / np.where(count > 0.0, count, 1.0)
+            replacements = np.where(np.isnan(replacements) & (count > 0.0), mean, replacements)
+            if not np.isnan(replacements).any():
                 break
-            within = _pattern(within @ neighbours + within)
-        values[:, bad] = found.T * self.expected_dn[bad]
+            reachable = _sparsity_pattern(reachable @ neighbours + reachable)
+        values[:, bad] = replacements.T * self.expected_dn[bad]
         return values
 
 
@@ -429,21 +429,23 @@ def calibrate(
     n_frames = check_count("n_frames", n_frames, at_least=2)
     n_sites = sensor.layout.n_sites
     flat = np.ascontiguousarray(_one_or_per_site("flat_e", check_plausible_array("flat_e", flat_e), n_sites, above=0.0))
-    meant = sensor.nominal()
-    darkness = np.zeros(n_sites)
-    dark_e = meant.expected_electrons(darkness, exposure_s)
-    signal_e = meant.expected_electrons(flat / exposure_s, exposure_s) - dark_e
+    nominal = sensor.nominal()
+    zero_e = np.zeros(n_sites)
+    dark_e = nominal.expected_electrons(zero_e, exposure_s)
+    signal_e = nominal.expected_electrons(flat / exposure_s, exposure_s) - dark_e
     # RTS noise counts as a defect (noisy site), so the nominal noise excludes it.
-    quiet = meant.without(*(effect.name for effect in meant.chain if effect.half_step(meant.sites) is not None))
+    without_rts = nominal.without(
+        *(effect.name for effect in nominal.chain if effect.half_step(nominal.sites) is not None)
+    )
     dark_e2 = dark_e if sensor.shot.is_drawn else np.zeros(1)
-    noise_e2 = dark_e2 + quiet.readout_model(dark_e).noise_e2
-    signal_e, dark_e = (meant.readout_model(part).mean_e for part in (signal_e, dark_e))
+    noise_e2 = dark_e2 + without_rts.readout_model(dark_e).noise_e2
+    signal_e, dark_e = (nominal.readout_model(part).mean_e for part in (signal_e, dark_e))
     e_per_dn = nominal_e_per_dn(sensor)
-    table = None if sensor.companding == "linear" and not sensor.inl_dn else sensor.converter.linear_dn
+    table = None if sensor.companding == "linear" and not sensor.inl_dn else sensor.adc.linear_dn
 
-    def frames(light_e: Floats, exposure_s: float, kind: int) -> _Frames:
+    def frames(photo_e: Floats, exposure_s: float, kind: int) -> _Frames:
         stack = _Frames(2.0**sensor.bits - 1.0, table)
-        expected_e = sensor.expected_electrons(light_e / exposure_s, exposure_s)
+        expected_e = sensor.expected_electrons(photo_e / exposure_s, exposure_s)
         for frame in range(kind * n_frames, (kind + 1) * n_frames):
             streams = Streams(seed, frame)
             electrons = sensor.collect(expected_e, streams=streams, n_threads=n_threads)
@@ -454,9 +456,9 @@ def calibrate(
         check_plausible("long_exposure_s", long_exposure_s)
         long_exposure_s = check_number("long_exposure_s", long_exposure_s, above=exposure_s)
     return _calibration(
-        frames(darkness, exposure_s, 0),
+        frames(zero_e, exposure_s, 0),
         frames(flat, exposure_s, 1),
-        None if long_exposure_s is None else frames(darkness, long_exposure_s, 2),
+        None if long_exposure_s is None else frames(zero_e, long_exposure_s, 2),
         exposure_s=exposure_s,
         long_exposure_s=long_exposure_s,
         expected_dn=signal_e / e_per_dn,
@@ -526,24 +528,24 @@ def _calibration(
     hot_sigmas = check_plausible("hot_sigmas", hot_sigmas)
     dead_fraction = check_number("dead_fraction", dead_fraction, at_least=0.0, at_most=1.0)
     noisy_ratio = check_plausible("noisy_ratio", check_number("noisy_ratio", noisy_ratio, at_least=1.0))
-    most_clipped = check_number("max_clipped_fraction", max_clipped_fraction, at_least=0.0, at_most=1.0)
+    max_clipped_fraction = check_number("max_clipped_fraction", max_clipped_fraction, at_least=0.0, at_most=1.0)
     expected = _one_or_per_site("expected_dn", expected_dn, n_sites, above=0.0)
-    meant_rate = _one_or_per_site("expected_dark_dn_per_s", expected_dark_dn_per_s, n_sites, above=None)
-    meant_noise = _one_or_per_site("expected_noise_dn", expected_noise_dn, n_sites, above=0.0)
+    expected_rate = _one_or_per_site("expected_dark_dn_per_s", expected_dark_dn_per_s, n_sites, above=None)
+    expected_noise = _one_or_per_site("expected_noise_dn", expected_noise_dn, n_sites, above=0.0)
     if exposure_s is not None:
         exposure_s = check_plausible("exposure_s", exposure_s)
-    elif dark_long is not None or meant_rate.any():
+    elif dark_long is not None or expected_rate.any():
         raise ParameterError("exposure_s", "must be given with 'dark_long' or 'expected_dark_dn_per_s'", None)
     if (dark_long is None) != (long_exposure_s is None):
         raise ParameterError("long_exposure_s", "must be given if and only if 'dark_long' is", long_exposure_s)
 
-    is_saturated = flat.n_highest > most_clipped * flat.n_frames
+    is_saturated = flat.n_highest > max_clipped_fraction * flat.n_frames
     if is_saturated.mean() > 0.5:
         raise SimulationError(
             f"the flat frames saturate {100 * is_saturated.mean():.0f} % of the sites, so their response is unknown; reduce "
             "the flat signal"
         )
-    is_clipped = is_saturated | (dark.n_lowest > most_clipped * dark.n_frames)
+    is_clipped = is_saturated | (dark.n_lowest > max_clipped_fraction * dark.n_frames)
     response = (flat.mean_dn - dark.mean_dn) / expected
     typical = float(np.median(response[~is_saturated]))
     if not typical > 0.0:
@@ -551,15 +553,15 @@ def _calibration(
             "the flat signal is not above the dark signal, so the response is unknown; increase the flat signal"
         )
 
-    is_hot = _outliers(dark.mean_dn - meant_rate * (exposure_s or 0.0), hot_sigmas, np.sqrt(QUANTISATION_DN2))
+    is_hot = _find_outliers(dark.mean_dn - expected_rate * (exposure_s or 0.0), hot_sigmas, np.sqrt(QUANTISATION_DN2))
     rate: Floats | None = None
     if dark_long is not None and exposure_s is not None:
         longer_s = check_number("long_exposure_s", long_exposure_s, above=exposure_s) - exposure_s
         rate = (dark_long.mean_dn - dark.mean_dn) / longer_s
-        is_hot |= _outliers(rate - meant_rate, hot_sigmas, np.sqrt(QUANTISATION_DN2) / longer_s)
+        is_hot |= _find_outliers(rate - expected_rate, hot_sigmas, np.sqrt(QUANTISATION_DN2) / longer_s)
     is_dead = (response < dead_fraction * typical) & ~is_saturated
     noise_dn = np.sqrt(dark.squares_dn2 / (dark.n_frames - 1))
-    is_noisy = _noisy(noise_dn, meant_noise, _rounding_dn(dark), dark.n_frames, noisy_ratio)
+    is_noisy = _find_noisy(noise_dn, expected_noise, _rounding_dn(dark), dark.n_frames, noisy_ratio)
     is_good = ~(is_hot | is_dead | is_noisy | is_clipped)
     if not is_good.any():
         # Without a pedestal all sites clip in dark frames; the mean is then over all sites that are not defective.
@@ -582,14 +584,14 @@ def _calibration(
     )
 
 
-def _outliers(values: Floats, hot_sigmas: float, smallest_dn: float) -> Bools:
+def _find_outliers(values: Floats, hot_sigmas: float, smallest_dn: float) -> Bools:
     """Return the mask of values above the median by many robust standard deviations."""
     median = np.median(values)
     sigma = max(SIGMA_PER_MAD * float(np.median(np.abs(values - median))), float(smallest_dn))
     return np.asarray(values > median + hot_sigmas * sigma)
 
 
-def _noisy(noise_dn: Floats, meant_dn: Floats, rounding_dn: Floats, n_frames: int, noisy_ratio: float) -> Bools:
+def _find_noisy(noise_dn: Floats, expected_dn: Floats, rounding_dn: Floats, n_frames: int, noisy_ratio: float) -> Bools:
     """
     Return the mask of sites whose temporal noise is above the typical noise.
 
@@ -598,9 +600,11 @@ def _noisy(noise_dn: Floats, meant_dn: Floats, rounding_dn: Floats, n_frames: in
     from scipy.stats import chi2
 
     n_free = n_frames - 1
-    typical = float(np.median((noise_dn / meant_dn) ** 2)) * n_free / float(chi2.median(n_free))
-    lucky = float(chi2.isf(FALSE_ALARM, n_free)) / n_free
-    return np.asarray(noise_dn**2 > max(noisy_ratio**2, lucky) * np.maximum(typical * meant_dn**2, rounding_dn**2))
+    typical = float(np.median((noise_dn / expected_dn) ** 2)) * n_free / float(chi2.median(n_free))
+    max_chance_ratio = float(chi2.isf(FALSE_ALARM_PROBABILITY, n_free)) / n_free
+    return np.asarray(
+        noise_dn**2 > max(noisy_ratio**2, max_chance_ratio) * np.maximum(typical * expected_dn**2, rounding_dn**2)
+    )
 
 
 def _rounding_dn(frames: _Frames) -> Floats:
@@ -611,7 +615,7 @@ def _rounding_dn(frames: _Frames) -> Floats:
     return np.interp(frames.mean_dn, table, np.gradient(table)) * np.sqrt(QUANTISATION_DN2)
 
 
-def _stack(name: str, frames: ArrayLike, at_least: int) -> Floats:
+def _validate_frames(name: str, frames: ArrayLike, at_least: int) -> Floats:
     stack = finite_array(name, frames, ndim=2)
     if stack.shape[0] < at_least or stack.shape[1] == 0:
         raise ParameterError(
@@ -635,7 +639,7 @@ def _per_site(name: str, values: ArrayLike, n_sites: int) -> Floats:
     return array
 
 
-def _pattern(matrix: Any) -> csr_array[Any]:
+def _sparsity_pattern(matrix: Any) -> csr_array[Any]:
     """Return the sparsity pattern of a matrix, with ones as values."""
     from scipy.sparse import csr_array
 

@@ -15,14 +15,24 @@ from foveasim.errors import ParameterError, SimulationError
 from foveasim.sensor.blocks import for_each_block, pieces
 from foveasim.sensor.effects import STAGES, STANDARD, Effect, FixedFactor, FixedOffset, Sites
 
-__all__ = ["Factor", "Nonlinearity", "Offset", "Step", "check_effects", "check_names", "merged", "ordered", "run"]
+__all__ = [
+    "Factor",
+    "Nonlinearity",
+    "Offset",
+    "Step",
+    "apply_steps",
+    "check_effects",
+    "check_names",
+    "merge_steps",
+    "sort_by_stage",
+]
 
 #: Stages before collection, which have no random stream.
 FIXED_STAGES = ("photo", "dark", "expected")
 #: Names of the effects that keywords build.
-BUILT = frozenset({"crosstalk", "ipc", "shot", *(cls.name for cls in STANDARD)})
+BUILTIN_NAMES = frozenset({"crosstalk", "ipc", "shot", *(cls.name for cls in STANDARD)})
 #: Entries of the noise budget that are not effect names.
-RESERVED = ("photon_shot", "dark_shot", "quantisation")
+RESERVED_NAMES = ("photon_shot", "dark_shot", "quantisation")
 
 
 class _Deterministic:
@@ -46,7 +56,7 @@ class Factor(_Deterministic):
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
         """Return the product."""
         _ = rng
-        values *= sites.of(self.values)
+        values *= sites.select(self.values)
         return values
 
 
@@ -56,7 +66,7 @@ class Offset(_Deterministic):
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
         """Return the sum."""
         _ = rng
-        values += sites.of(self.values)
+        values += sites.select(self.values)
         return values
 
 
@@ -69,14 +79,14 @@ class Nonlinearity(_Deterministic):
 
     def __init__(self, fraction: float, v_sat_v: float) -> None:
         super().__init__(fraction)
-        self.bend, self.v_sat_v = fraction, v_sat_v
+        self.fraction, self.v_sat_v = fraction, v_sat_v
 
     def apply(self, values: Floats, *, sites: Sites, rng: Any) -> Floats:
         """Return the voltages after the nonlinearity."""
         from foveasim.sensor import _kernels
 
         _ = sites, rng
-        _kernels.apply_nonlinearity(values, self.bend, self.v_sat_v)
+        _kernels.apply_nonlinearity(values, self.fraction, self.v_sat_v)
         return values
 
 
@@ -84,30 +94,30 @@ class Nonlinearity(_Deterministic):
 Step: TypeAlias = Effect | _Deterministic
 
 
-def merged(steps: Iterable[Step], sites: Sites) -> tuple[Step, ...]:
+def merge_steps(steps: Iterable[Step], sites: Sites) -> tuple[Step, ...]:
     """
     Merge consecutive factors, and consecutive offsets, into single steps.
 
     The result is the same to rounding. Merging avoids passes over the sites and reads of patterns from memory.
     """
-    done: list[Step] = []
+    steps_merged: list[Step] = []
     for step in steps:
-        fixed: Step = step
+        current: Step = step
         if isinstance(step, FixedFactor):
-            fixed = Factor(sites.pattern(step, step.pattern))
+            current = Factor(sites.pattern(step, step.pattern))
         elif isinstance(step, FixedOffset):
-            fixed = Offset(sites.pattern(step, step.pattern))
-        before = done[-1] if done else None
-        if isinstance(fixed, Factor) and isinstance(before, Factor):
-            done[-1] = Factor(before.values * fixed.values)
-        elif isinstance(fixed, Offset) and isinstance(before, Offset):
-            done[-1] = Offset(before.values + fixed.values)
+            current = Offset(sites.pattern(step, step.pattern))
+        previous = steps_merged[-1] if steps_merged else None
+        if isinstance(current, Factor) and isinstance(previous, Factor):
+            steps_merged[-1] = Factor(previous.values * current.values)
+        elif isinstance(current, Offset) and isinstance(previous, Offset):
+            steps_merged[-1] = Offset(previous.values + current.values)
         else:
-            done.append(fixed)
-    return tuple(done)
+            steps_merged.append(current)
+    return tuple(steps_merged)
 
 
-def ordered(effects: Iterable[Effect]) -> tuple[Effect, ...]:
+def sort_by_stage(effects: Iterable[Effect]) -> tuple[Effect, ...]:
     """Sort effects by stage; effects of the same stage stay in their order."""
     order = list(STAGES)
     return tuple(sorted(effects, key=lambda effect: order.index(effect.stage)))
@@ -124,7 +134,7 @@ def check_effects(added: Any) -> tuple[Effect, ...]:
     """
     if not isinstance(added, list | tuple):
         raise ParameterError("effects", "must be a list of Effect objects", added)
-    taken = {*BUILT, *RESERVED}
+    names = {*BUILTIN_NAMES, *RESERVED_NAMES}
     for effect in added:
         if not isinstance(effect, Effect):
             raise ParameterError("effects", "must contain only foveasim.sensor.effects.Effect objects", effect)
@@ -133,9 +143,9 @@ def check_effects(added: Any) -> tuple[Effect, ...]:
                 raise ParameterError(
                     "effects", f"must define the class attribute '{attribute}' of type {kind.__name__}", effect
                 )
-        if effect.name in taken:
+        if effect.name in names:
             raise ParameterError("effects", f"must have unique names, got '{effect.name}' twice")
-        taken.add(effect.name)
+        names.add(effect.name)
         if effect.stage not in STAGES or effect.stage == "collection":
             stages = ", ".join(stage for stage in STAGES if stage != "collection")
             raise ParameterError("effects", f"must have a stage from {stages}; '{effect.name}' has '{effect.stage}'")
@@ -159,7 +169,7 @@ def check_names(names: Any, effects: Iterable[Effect]) -> tuple[str, ...]:
     """
     if isinstance(names, str):
         names = (names,)
-    known = sorted({*BUILT, *(effect.name for effect in effects)})
+    known = sorted({*BUILTIN_NAMES, *(effect.name for effect in effects)})
     try:
         names = tuple(names)
     except TypeError:
@@ -172,7 +182,7 @@ def check_names(names: Any, effects: Iterable[Effect]) -> tuple[str, ...]:
     return names
 
 
-def run(
+def apply_steps(
     steps: Iterable[Step],
     values: Any,
     *,
@@ -206,24 +216,26 @@ def run(
     out : (n_site,)
     """
     local: list[Step] = []
-    is_ours = False
+    is_own = False
     for step in steps:
         if step.is_local:
             local.append(step)
             continue
         if local:
-            values = _pass(local, values, np.empty(sites.n_sites), None, sites, streams, n_threads)
-            is_ours = True
+            values = _apply_local_steps(local, values, np.empty(sites.n_sites), None, sites, streams, n_threads)
+            is_own = True
         rng: Any = streams.of(step.name) if step.is_temporal and streams is not None else None
-        whole = sites.block(slice(None), n_threads=n_threads)
-        mine = values if is_ours else np.array(values, np.float64)
-        values, local, is_ours = _applied(step, mine, whole, rng), [], True
+        all_sites = sites.block(slice(None), n_threads=n_threads)
+        own_values = values if is_own else np.array(values, np.float64)
+        values, local, is_own = _apply_step(step, own_values, all_sites, rng), [], True
     if not local and out is None:
         return np.asarray(values)
-    return _pass(local, values, np.empty(sites.n_sites) if out is None else out, last, sites, streams, n_threads)
+    return _apply_local_steps(
+        local, values, np.empty(sites.n_sites) if out is None else out, last, sites, streams, n_threads
+    )
 
 
-def _applied(step: Step, values: Any, sites: Sites, rng: Any) -> Any:
+def _apply_step(step: Step, values: Any, sites: Sites, rng: Any) -> Any:
     """Apply a step and check the shape of its result."""
     found = step.apply(values, sites=sites, rng=rng)
     if getattr(found, "shape", None) != values.shape:
@@ -234,7 +246,7 @@ def _applied(step: Step, values: Any, sites: Sites, rng: Any) -> Any:
     return found
 
 
-def _pass(
+def _apply_local_steps(
     steps: Sequence[Step],
     values: Any,
     out: NDArray[Any],
@@ -245,18 +257,18 @@ def _pass(
 ) -> NDArray[Any]:
     """Apply local steps piece by piece, so that each piece stays in the cache for all steps."""
 
-    def block(number: int, whole: slice) -> None:
+    def block(number: int, block_slice: slice) -> None:
         rngs: list[Any] = [
             streams.of(step.name, number) if step.is_temporal and streams is not None else None for step in steps
         ]
-        for index in pieces(whole):
-            part, some = values[index].astype(np.float64), sites.block(index)
+        for index in pieces(block_slice):
+            part, part_sites = values[index].astype(np.float64), sites.block(index)
             for step, rng in zip(steps, rngs, strict=True):
-                part = _applied(step, part, some, rng)
+                part = _apply_step(step, part, part_sites, rng)
             if last is None:
                 out[index] = part
             else:
-                last(part, some, out[index])
+                last(part, part_sites, out[index])
 
     for_each_block(out.size, block, n_threads)
     return out

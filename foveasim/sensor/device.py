@@ -36,12 +36,12 @@ __all__ = ["SITE_ID", "Device"]
 #: Name of an integer column that identifies sites instead of their positions.
 SITE_ID = "site_id"
 #: Resolution of the centroids and vertices that identify sites.
-PLACE_UM = 1e-4
+POSITION_UM = 1e-4
 #: Unit vectors of eight rays, off the axes because the openings of C shapes are often on an axis.
 _ANGLES_RAD = 2.0 * np.pi * np.arange(8) / 8.0 + 0.3
 RAYS = read_only(np.stack((np.cos(_ANGLES_RAD), np.sin(_ANGLES_RAD)), axis=1))
 #: Minimum number of rays from the centroid that intersect a surrounding site; a thin arc of 180 degrees covers 245 of 360.
-FEWEST_RAYS_AROUND = 6
+MIN_RAYS_AROUND = 6
 
 Words = NDArray[np.uint64]
 
@@ -69,20 +69,20 @@ class Device:
 
         columns: Any = getattr(self.layout, "columns", {})
         if SITE_ID in columns:
-            given = columns[SITE_ID]
-            if given.dtype.kind not in "iu":
-                raise ParameterError(SITE_ID, f"must be a layout column of integers, got {given.dtype}")
-            ids = np.ascontiguousarray(given).astype(np.int64)
+            site_ids = columns[SITE_ID]
+            if site_ids.dtype.kind not in "iu":
+                raise ParameterError(SITE_ID, f"must be a layout column of integers, got {site_ids.dtype}")
+            ids = np.ascontiguousarray(site_ids).astype(np.int64)
             return ids.view(np.uint64), np.full(ids.size, 1 << 63, np.uint64)
         rings = self.layout.xy_um, self.layout.ring_offsets, self.layout.site_offsets
         _, centroid_um = site_moments(*rings)
-        place = np.rint(centroid_um / PLACE_UM).astype(np.int64).T
-        x, y = (words.view(np.uint64) for words in np.ascontiguousarray(place))
-        n_met = _kernels.count_ray_intersections(*rings, np.ascontiguousarray(centroid_um), RAYS)
-        is_around = n_met >= FEWEST_RAYS_AROUND
-        if np.any((n_met > 0) & ~is_around):
-            _, which, n_here = np.unique(place, axis=1, return_inverse=True, return_counts=True)
-            is_around |= (n_met > 0) & (n_here[which.ravel()] > 1)
+        position = np.rint(centroid_um / POSITION_UM).astype(np.int64).T
+        x, y = (words.view(np.uint64) for words in np.ascontiguousarray(position))
+        n_intersecting = _kernels.count_ray_intersections(*rings, np.ascontiguousarray(centroid_um), RAYS)
+        is_around = n_intersecting >= MIN_RAYS_AROUND
+        if np.any((n_intersecting > 0) & ~is_around):
+            _, which, n_here = np.unique(position, axis=1, return_inverse=True, return_counts=True)
+            is_around |= (n_intersecting > 0) & (n_here[which.ravel()] > 1)
         around = np.flatnonzero(is_around)
         x[around], y[around] = _outline_words(*rings, around)
         return x, y
@@ -135,16 +135,16 @@ def _outline_words(xy_um: Floats, ring_offsets: Ints, site_offsets: Ints, sites:
     if not sites.size:
         return np.zeros(0, np.uint64), np.zeros(0, np.uint64)
     vertices = np.repeat(begins, lengths) + positions_in_runs(lengths)
-    place = np.rint(xy_um[vertices] / PLACE_UM).astype(np.int64).view(np.uint64)
+    position = np.rint(xy_um[vertices] / POSITION_UM).astype(np.int64).view(np.uint64)
     firsts = np.concatenate(([0], np.cumsum(lengths)[:-1]))
     one, other = (
-        np.add.reduceat(_mixed(_mixed(place[:, 0] * factor) + place[:, 1] * _FACTORS[2]), firsts)
+        np.add.reduceat(_mix(_mix(position[:, 0] * factor) + position[:, 1] * _FACTORS[2]), firsts)
         for factor in _FACTORS[:2]
     )
     return one, other
 
 
-def _mixed(words: Words) -> Words:
+def _mix(words: Words) -> Words:
     """Mix the bits of words: finaliser of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014)."""
     words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -17,8 +17,8 @@ from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Floats, Ints, as_numbers, own, unmasked
 from foveasim.errors import ParameterError
 from foveasim.sensor.calibration import Calibration, linearise, nominal_e_per_dn
-from foveasim.sensor.chain import run
-from foveasim.sensor.effects.shot import LARGEST_CHARGE_E, ROUNDING_E2, draw_shot_noise
+from foveasim.sensor.chain import apply_steps
+from foveasim.sensor.effects.shot import MAX_CHARGE_E, ROUNDING_E2, draw_shot_noise
 from foveasim.sensor.limits import check_plausible_array
 from foveasim.sensor.sensor import Sensor
 
@@ -52,7 +52,7 @@ class Rates:
     n_used: Ints
 
     def __post_init__(self) -> None:
-        _protect(self)
+        _make_read_only(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class Ramp:
     code: NDArray[Any]
 
     def __post_init__(self) -> None:
-        _protect(self)
+        _make_read_only(self)
 
 
 # -- HDR merge --------------------------------------------------------------------------------------------------------
@@ -155,7 +155,7 @@ def merge_exposures(
     50000.0
     """
     times_s = check_plausible_array("exposures_s", exposures_s, ndim=1)
-    codes, linear_dn, e_per_dn = _readings(code, times_s.size, sensor, "exposure")
+    codes, linear_dn, e_per_dn = _linearise_reads(code, times_s.size, sensor, "exposure")
     n_sites = sensor.layout.n_sites
     dark_e_per_s = np.zeros(1)
     gain = np.ones(1)
@@ -179,17 +179,17 @@ def merge_exposures(
     taper = np.where(is_used, np.clip((np.where(is_used, top_e, 0.0) / t_s - rates) / width, 0.0, 1.0), 0.0)
     falling = np.where((taper > 0.0) & (taper < 1.0), -1.0 / width, 0.0)
     is_known = taper.any(axis=0)
-    whole = np.where(is_known, (taper * t_s).sum(axis=0), 1.0)
-    rate = (taper * rates * t_s).sum(axis=0) / whole
-    share = taper
+    total = np.where(is_known, (taper * t_s).sum(axis=0), 1.0)
+    rate = (taper * rates * t_s).sum(axis=0) / total
+    fraction = taper
     for _ in range(N_PASSES):
-        readings = sensor.readout_model(*sensor.shot.moments((np.maximum(rate, 0.0) + dark_e_per_s) * t_s, np.zeros(1)))
-        information = t_s**2 / (readings.variance_e2 + readings.noise_e2 + conversion_e2)
-        whole = np.where(is_known, (taper * information).sum(axis=0), 1.0)
-        share = taper * information / whole
-        rate = (share * rates).sum(axis=0)
-    slope = share + falling * information / whole * (rates - rate)
-    rate = rate - (falling * (1.0 - share)).sum(axis=0) / whole
+        model = sensor.readout_model(*sensor.shot.moments((np.maximum(rate, 0.0) + dark_e_per_s) * t_s, np.zeros(1)))
+        information = t_s**2 / (model.variance_e2 + model.noise_e2 + conversion_e2)
+        total = np.where(is_known, (taper * information).sum(axis=0), 1.0)
+        fraction = taper * information / total
+        rate = (fraction * rates).sum(axis=0)
+    slope = fraction + falling * information / total * (rates - rate)
+    rate = rate - (falling * (1.0 - fraction)).sum(axis=0) / total
     variance = (slope**2 / information).sum(axis=0)
     return Rates(
         rate_e_per_s=np.where(is_known, rate, np.nan),
@@ -242,19 +242,19 @@ def non_destructive_reads(
     >>> non_destructive_reads(sensor, [100.0, 300.0], [1.0, 2.0, 3.0], streams=Streams(0)).electrons.tolist()
     [[100, 300], [200, 500], [300, 500]]
     """
-    times = _rising("times_s", times_s)
+    times = _check_increasing("times_s", times_s)
     if not isinstance(sensor, Sensor):
         raise ParameterError("sensor", f"must be a foveasim.Sensor, got a {type(sensor).__name__}")
     n_sites = sensor.layout.n_sites
-    light = check_plausible_array("photo_e_per_s", photo_e_per_s)
-    if light.shape not in ((), (n_sites,)):
+    photo = check_plausible_array("photo_e_per_s", photo_e_per_s)
+    if photo.shape not in ((), (n_sites,)):
         raise ParameterError(
-            "photo_e_per_s", f"must be one number, or one for each of the {n_sites} sites, got the shape {light.shape}"
+            "photo_e_per_s", f"must be one number, or one for each of the {n_sites} sites, got the shape {photo.shape}"
         )
-    per_s = sensor.expected_electrons(np.broadcast_to(light, n_sites), 1.0)
-    well_e = np.minimum(sensor.well_e, LARGEST_CHARGE_E).astype(np.int64)
+    per_s = sensor.expected_electrons(np.broadcast_to(photo, n_sites), 1.0)
+    well_e = np.minimum(sensor.well_e, MAX_CHARGE_E).astype(np.int64)
     at_reset = [effect for effect in sensor.chain if effect.is_drawn_at_reset]
-    reset_e = run(at_reset, np.zeros(n_sites), sites=sensor.sites, streams=streams, n_threads=n_threads)
+    reset_e = apply_steps(at_reset, np.zeros(n_sites), sites=sensor.sites, streams=streams, n_threads=n_threads)
     # Noise drawn at the reset is already part of the charge.
     reader = sensor.without(*(effect.name for effect in at_reset)) if at_reset else sensor
     electrons = np.empty((times.size, n_sites), np.int64)
@@ -314,10 +314,10 @@ def fit_ramp(
 
     Reads are used up to the first saturated one (highest code, or within five standard deviations of the full well).
     """
-    times = _rising("times_s", times_s)
+    times = _check_increasing("times_s", times_s)
     if times.size < 2:
         raise ParameterError("times_s", "must have at least two values", times_s, "s")
-    codes, linear_dn, e_per_dn = _readings(code, times.size, sensor, "read")
+    codes, linear_dn, e_per_dn = _linearise_reads(code, times.size, sensor, "read")
     n_sites = sensor.layout.n_sites
     charge_e = linear_dn * e_per_dn
     noise_e2 = _conversion_noise_e2(sensor, codes, e_per_dn) + sensor.readout_model(charge_e, is_reset=False).noise_e2
@@ -327,10 +327,10 @@ def fit_ramp(
     is_used = np.logical_and.accumulate(is_below, axis=0)
     n_used = np.count_nonzero(is_used, axis=0).astype(np.int64)
     last = np.maximum(n_used - 1, 0)
-    lasted_s = times[last] - times[0]
+    duration_s = times[last] - times[0]
     if weight_rate_e_per_s is None:
         rise_e = charge_e[last, np.arange(n_sites)] - charge_e[0]
-        rate = np.divide(rise_e, lasted_s, out=np.zeros(n_sites), where=lasted_s > 0.0)
+        rate = np.divide(rise_e, duration_s, out=np.zeros(n_sites), where=duration_s > 0.0)
     else:
         rate = check_plausible_array("weight_rate_e_per_s", weight_rate_e_per_s)
         if rate.shape not in ((), (n_sites,)):
@@ -342,8 +342,8 @@ def fit_ramp(
     dt_s = np.where(is_used[1:], np.diff(times)[:, None], 0.0)
     rise_e = np.where(is_used[1:], np.diff(charge_e, axis=0), 0.0)
     diagonal = np.where(is_used[1:], np.maximum(rate, 0.0) * dt_s + noise_e2[:-1] + noise_e2[1:], 1.0)
-    beside = np.where(is_used[2:], -noise_e2[1:-1], 0.0)
-    weights = _solve_tridiagonal(diagonal, beside, dt_s)
+    off_diagonal = np.where(is_used[2:], -noise_e2[1:-1], 0.0)
+    weights = _solve_tridiagonal(diagonal, off_diagonal, dt_s)
     information = (weights * dt_s).sum(axis=0)
     is_known = n_used >= 2
     information = np.where(is_known, information, 1.0)
@@ -357,27 +357,27 @@ def fit_ramp(
 # -- helpers ----------------------------------------------------------------------------------------------------------
 
 
-def _protect(carrier: Any) -> None:
-    for field in fields(carrier):
-        values = unmasked(field.name, getattr(carrier, field.name))
-        object.__setattr__(carrier, field.name, own(np.asarray(values)))
+def _make_read_only(instance: Any) -> None:
+    for field in fields(instance):
+        values = unmasked(field.name, getattr(instance, field.name))
+        object.__setattr__(instance, field.name, own(np.asarray(values)))
 
 
-def _rising(name: str, times_s: ArrayLike) -> Floats:
+def _check_increasing(name: str, times_s: ArrayLike) -> Floats:
     times = check_plausible_array(name, times_s, ndim=1)
     if times.size == 0 or np.any(np.diff(times) <= 0.0):
         raise ParameterError(name, "must be one or more strictly increasing times", times_s, "s")
     return times
 
 
-def _readings(code: ArrayLike, n_readings: int, sensor: Sensor, what: str) -> tuple[Floats, Floats, Floats]:
+def _linearise_reads(code: ArrayLike, n_reads: int, sensor: Sensor, kind: str) -> tuple[Floats, Floats, Floats]:
     """Return codes (n_reading, n_site), linear codes, and electrons per linear code."""
     linear_dn = linearise(code, sensor)
     codes = as_numbers("code", code)
-    if codes.shape != (n_readings, sensor.layout.n_sites):
+    if codes.shape != (n_reads, sensor.layout.n_sites):
         raise ParameterError(
             "code",
-            f"must have one row per {what} and one column per site, {(n_readings, sensor.layout.n_sites)}, "
+            f"must have one row per {kind} and one column per site, {(n_reads, sensor.layout.n_sites)}, "
             f"got the shape {codes.shape}",
         )
     return codes, linear_dn, nominal_e_per_dn(sensor)
@@ -385,8 +385,8 @@ def _readings(code: ArrayLike, n_readings: int, sensor: Sensor, what: str) -> tu
 
 def _conversion_noise_e2(sensor: Sensor, codes: NDArray[Any], e_per_dn: Floats) -> Floats:
     """Return the variance of conversion from the width of each code, (n_reading, n_site) e-²."""
-    step_e = sensor.converter.width_of_code_dn(codes) * e_per_dn
-    return np.asarray(step_e**2 * sensor.converter.noise_dn2)
+    step_e = sensor.adc.width_of_code_dn(codes) * e_per_dn
+    return np.asarray(step_e**2 * sensor.adc.noise_dn2)
 
 
 def _saturation_dn(sensor: Sensor) -> Floats:
@@ -399,22 +399,24 @@ def _saturation_dn(sensor: Sensor) -> Floats:
     top_dn = np.full(n_sites, float(linearise(2**sensor.bits - 1, sensor)))
     if sensor.full_well_e is None:
         return top_dn
-    still = sensor.without(*(e.name for e in sensor.chain if e.is_temporal or (e.stage == "charge" and not e.is_local)))
-    well_e = np.broadcast_to(np.minimum(sensor.well_e, LARGEST_CHARGE_E), n_sites).astype(np.int64)
-    well_dn = linearise(still.read(well_e, streams=Streams(0)), sensor)
+    without_noise = sensor.without(
+        *(e.name for e in sensor.chain if e.is_temporal or (e.stage == "charge" and not e.is_local))
+    )
+    well_e = np.broadcast_to(np.minimum(sensor.well_e, MAX_CHARGE_E), n_sites).astype(np.int64)
+    well_dn = linearise(without_noise.read(well_e, streams=Streams(0)), sensor)
     noise_dn = np.sqrt(sensor.readout_model(sensor.well_e).noise_e2) / nominal_e_per_dn(sensor)
     return np.minimum(top_dn, well_dn - MARGIN_SIGMAS * noise_dn - 1.0)
 
 
-def _solve_tridiagonal(diagonal: Floats, beside: Floats, right: Floats) -> Floats:
+def _solve_tridiagonal(diagonal: Floats, off_diagonal: Floats, right: Floats) -> Floats:
     """Solve symmetric tridiagonal systems, one per column, by the Thomas algorithm."""
     n = diagonal.shape[0]
     pivot, solved = diagonal.copy(), right.copy()
     for k in range(1, n):
-        factor = beside[k - 1] / pivot[k - 1]
-        pivot[k] -= factor * beside[k - 1]
+        factor = off_diagonal[k - 1] / pivot[k - 1]
+        pivot[k] -= factor * off_diagonal[k - 1]
         solved[k] -= factor * solved[k - 1]
     solved[-1] /= pivot[-1]
     for k in range(n - 2, -1, -1):
-        solved[k] = (solved[k] - beside[k] * solved[k + 1]) / pivot[k]
+        solved[k] = (solved[k] - off_diagonal[k] * solved[k + 1]) / pivot[k]
     return solved

@@ -56,8 +56,8 @@ class Limits:
         """Rule of the range for error messages."""
         if self.low == 0.0:
             return f"must be <= {self.high:g}"
-        is_apart = self.low > 0.0 and not self.is_positive
-        return f"must be {'0, or ' if is_apart else ''}from {self.low:g} to {self.high:g}"
+        is_zero_separate = self.low > 0.0 and not self.is_positive
+        return f"must be {'0, or ' if is_zero_separate else ''}from {self.low:g} to {self.high:g}"
 
 
 _FRACTION = Limits(high=1.0, hint="fractions are from 0 to 1")
@@ -176,8 +176,8 @@ def check_plausible_array(name: str, value: ArrayLike, *, ndim: int | None = Non
         If a value is not finite, or outside the range; the message states the index of the first such value.
     """
     limits = LIMITS[name]
-    least = 0.0 if limits.low >= 0.0 else None
-    array = finite_array(name, value, ndim=ndim, at_least=least, above=0.0 if limits.is_positive else None)
+    at_least = 0.0 if limits.low >= 0.0 else None
+    array = finite_array(name, value, ndim=ndim, at_least=at_least, above=0.0 if limits.is_positive else None)
     _check_range(name, array, limits)
     return array
 
@@ -188,9 +188,9 @@ def _check_range(name: str, values: NDArray[np.float64], limits: Limits) -> None
         is_outside &= values != 0.0
     if not np.any(is_outside):
         return
-    where = tuple(int(i) for i in np.argwhere(is_outside)[0])
-    place = f" at [{', '.join(map(str, where))}]" if where else ""
+    position = tuple(int(i) for i in np.argwhere(is_outside)[0])
+    index = f" at [{', '.join(map(str, position))}]" if position else ""
     everywhere = " everywhere" if values.ndim else ""
     raise ParameterError(
-        name, limits.rule + everywhere, float(values[where]), (unit_of(name) + place).strip(), limits.hint
+        name, limits.rule + everywhere, float(values[position]), (unit_of(name) + index).strip(), limits.hint
     )

@@ -11,12 +11,20 @@ import numpy as np
 from foveasim._core.validation import Floats, read_only
 from foveasim.sensor.effects.contract import Effect, Sites
 
-__all__ = ["ChargeDistributions", "Quadrature", "ReadoutModel", "Transfer", "cut_off", "quadrature", "readout_model"]
+__all__ = [
+    "ChargeDistributions",
+    "Quadrature",
+    "ReadoutModel",
+    "Transfer",
+    "clipped_gaussian_moments",
+    "quadrature",
+    "readout_model",
+]
 
 #: Number of quadrature nodes for charges clipped at the full well.
 QUADRATURE_NODES = 96
 #: Minimum slope of a nonlinear response, relative to the slope at zero signal.
-LEAST_SLOPE = 1e-6
+MIN_SLOPE = 1e-6
 
 
 class ChargeDistributions(NamedTuple):
@@ -43,7 +51,7 @@ class Transfer(NamedTuple):
     sense_v: Floats
     scale: Floats
     output_v: Floats
-    bend: float
+    nonlinearity_fraction: float
     v_sat_v: float
 
 
@@ -85,7 +93,7 @@ class ReadoutModel(NamedTuple):
         return np.asarray(self.gaussian_e2 + self.half_step_e**2)
 
 
-class _Linear:
+class _LinearModel:
     """First-order model of a stage: ``factor * value + offset``, Gaussian and RTS noise."""
 
     def __init__(self, effects: Iterable[Effect], mean: Floats, variance: Floats, sites: Sites) -> None:
@@ -93,7 +101,7 @@ class _Linear:
         self.noise, self.half_step2 = np.zeros(1), np.zeros(1)
         self.mean, self.variance = mean, variance
         for effect in effects:
-            mean, variance = effect.validated_moments(self.mean, self.variance, sites)
+            mean, variance = effect.validate_moments(self.mean, self.variance, sites)
             factor = effect.moments(self.mean + 1.0, self.variance, sites=sites)[0] - mean
             added = np.zeros(1)
             if effect.is_temporal:
@@ -119,7 +127,7 @@ def readout_model(
     variance_e2: Floats,
     sites: Sites,
     v_per_e: Floats,
-    bend: float,
+    nonlinearity_fraction: float,
     v_sat_v: float,
     pedestal_v: float,
 ) -> ReadoutModel:
@@ -136,7 +144,7 @@ def readout_model(
         All sites, with a device or without.
     v_per_e : (n_site,) or (1,), V/e-
         Nominal conversion gain.
-    bend : float
+    nonlinearity_fraction : float
         Response nonlinearity: relative signal loss at full range.
     v_sat_v, pedestal_v : float, V
     """
@@ -146,14 +154,18 @@ def readout_model(
         if effect.is_local or effect.is_temporal:
             local.append(effect)
             continue
-        before = _Linear(local, mean_e, variance_e2, sites)
+        before = _LinearModel(local, mean_e, variance_e2, sites)
         mean_e, variance_e2 = effect.moments(before.mean, before.variance + before.half_step2, sites=sites)
         is_mixed, local = True, []
-    charges = _Linear(local, mean_e, variance_e2, sites)
-    sense = _Linear(sense_node, charges.mean * v_per_e, (charges.variance + charges.half_step2) * v_per_e**2, sites)
+    charges = _LinearModel(local, mean_e, variance_e2, sites)
+    sense = _LinearModel(
+        sense_node, charges.mean * v_per_e, (charges.variance + charges.half_step2) * v_per_e**2, sites
+    )
     fraction = np.clip(sense.mean / v_sat_v, 0.0, 1.0)
-    slope = np.maximum(1.0 - 2.0 * bend * fraction, LEAST_SLOPE)
-    last = _Linear(output, sense.mean * (1.0 - bend * fraction) + pedestal_v, sense.variance * slope**2, sites)
+    slope = np.maximum(1.0 - 2.0 * nonlinearity_fraction * fraction, MIN_SLOPE)
+    last = _LinearModel(
+        output, sense.mean * (1.0 - nonlinearity_fraction * fraction) + pedestal_v, sense.variance * slope**2, sites
+    )
     total_v_per_e = charges.factor * v_per_e * sense.factor
     per_v2 = np.divide(1.0, total_v_per_e**2, out=np.zeros(np.shape(total_v_per_e)), where=total_v_per_e != 0.0)
     noise_v2 = charges.noise * (v_per_e * sense.factor) ** 2 + sense.noise
@@ -169,7 +181,7 @@ def readout_model(
             sense_v=charges.offset * v_per_e * sense.factor + sense.offset,
             scale=last.factor,
             output_v=pedestal_v * last.factor + last.offset,
-            bend=bend,
+            nonlinearity_fraction=nonlinearity_fraction,
             v_sat_v=v_sat_v,
         ),
         gaussian_e2=(noise_v2 + last.noise * per_output2) * per_v2,
@@ -187,16 +199,16 @@ def quadrature() -> Quadrature:
     return Quadrature(*(read_only(part) for part in np.polynomial.legendre.leggauss(QUADRATURE_NODES)))
 
 
-def cut_off(mean_e: Floats, variance_e2: Floats, end_e: Floats) -> tuple[Floats, Floats]:
+def clipped_gaussian_moments(mean_e: Floats, variance_e2: Floats, limit_e: Floats) -> tuple[Floats, Floats]:
     """Compute mean and variance of a Gaussian variable clipped at an upper limit."""
     from scipy.special import ndtr
 
     deviation = np.sqrt(np.maximum(variance_e2, 1e-12))
-    z = np.clip((end_e - mean_e) / deviation, -40.0, 40.0)
+    z = np.clip((limit_e - mean_e) / deviation, -40.0, 40.0)
     below, at = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
     # First and second moments of the distance to the limit; without clipping, the Gaussian moments themselves.
-    short = deviation * (z * below + at)
-    short2 = deviation**2 * ((1.0 + z * z) * below + z * at)
-    is_free = z >= 40.0
-    cut = np.where(is_free, mean_e, np.where(is_free, 0.0, end_e) - short)
-    return cut, np.where(is_free, variance_e2, np.maximum(short2 - short**2, 0.0))
+    distance = deviation * (z * below + at)
+    distance2 = deviation**2 * ((1.0 + z * z) * below + z * at)
+    is_unclipped = z >= 40.0
+    clipped_mean = np.where(is_unclipped, mean_e, np.where(is_unclipped, 0.0, limit_e) - distance)
+    return clipped_mean, np.where(is_unclipped, variance_e2, np.maximum(distance2 - distance**2, 0.0))

@@ -13,16 +13,32 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.random_streams import Streams
 from foveasim._core.validation import Floats, Ints, check_choice, check_count, check_number, read_only, unmasked
 from foveasim.errors import ParameterError, SimulationError
-from foveasim.sensor.adc import Companding, ConversionTables, Converter
+from foveasim.sensor.adc import ADC, Companding, ConversionTables
 from foveasim.sensor.blocks import for_each_block
-from foveasim.sensor.chain import Factor, Nonlinearity, Offset, Step, check_effects, check_names, merged, ordered, run
+from foveasim.sensor.chain import (
+    Factor,
+    Nonlinearity,
+    Offset,
+    Step,
+    apply_steps,
+    check_effects,
+    check_names,
+    merge_steps,
+    sort_by_stage,
+)
 from foveasim.sensor.device import Device
 from foveasim.sensor.effects import EFFECTS, STANDARD, Effect, Photosites, Sites, dark_current_factor
 from foveasim.sensor.effects.contract import FixedFactor, FixedOffset
 from foveasim.sensor.effects.crosstalk import Diffusion, InterPixelCapacitance, KernelCrosstalk
-from foveasim.sensor.effects.shot import LARGEST_CHARGE_E, ShotChoice, ShotNoise
+from foveasim.sensor.effects.shot import MAX_CHARGE_E, ShotChoice, ShotNoise
 from foveasim.sensor.limits import LIMITS, check_plausible, check_plausible_array
-from foveasim.sensor.prediction import ChargeDistributions, ReadoutModel, cut_off, quadrature, readout_model
+from foveasim.sensor.prediction import (
+    ChargeDistributions,
+    ReadoutModel,
+    clipped_gaussian_moments,
+    quadrature,
+    readout_model,
+)
 from foveasim.sensor.spectral.curves import CurveError
 from foveasim.sensor.spectral.response import ConstantCurve, Curve, FilterSet, rgb_filters
 from foveasim.units import electrons_to_volts, photon_energy_j
@@ -113,7 +129,7 @@ class Sensor:
     v_sat_v : float, V
         Saturation voltage, at the end of the ADC range; higher voltages are clipped.
     bits, companding, log_strength, companding_table, inl_dn, dnl_dn
-        ADC parameters: see :class:`foveasim.sensor.adc.Converter`.
+        ADC parameters: see :class:`foveasim.sensor.adc.ADC`.
     device_seed : int
         Seed of the fixed patterns, which identifies one device among all devices of this kind.
     effects : sequence of Effect
@@ -224,7 +240,7 @@ class Sensor:
         object.__setattr__(self, "disabled", check_names(self.disabled, self.effects))
         _ = self._filters_and_qe
         for name in ("bits", "companding_table", "inl_dn"):
-            object.__setattr__(self, name, getattr(self.converter, name))
+            object.__setattr__(self, name, getattr(self.adc, name))
         if (self.line_fpn_fraction or self.dnl_dn) and "readout_line" not in self.layout.columns:
             raise SimulationError(
                 "column FPN and DNL require a readout line for each site, but the layout has no column 'readout_line'; add it, "
@@ -363,9 +379,9 @@ class Sensor:
     # -- ADC and device ------------------------------------------------------------------------------------------------
 
     @cached_property
-    def converter(self) -> Converter:
+    def adc(self) -> ADC:
         """Analogue-to-digital converter (ADC)."""
-        return Converter(
+        return ADC(
             bits=self.bits,
             companding=self.companding,
             log_strength=self.log_strength,
@@ -391,7 +407,7 @@ class Sensor:
         ]
         # Inter-pixel capacitance precedes the readout noise.
         standard.sort(key=lambda effect: effect.is_local)
-        chain = ordered((*standard, *self.effects))
+        chain = sort_by_stage((*standard, *self.effects))
         return tuple(effect for effect in chain if effect.name not in self.disabled or effect.stage == "collection")
 
     def without(self, *names: str) -> Sensor:
@@ -487,7 +503,7 @@ class Sensor:
         effects, values = self._at(stage), np.atleast_1d(np.asarray(values, np.float64))
         if not effects:
             return read_only(values.copy())
-        return read_only(run(effects, np.broadcast_to(values, self.layout.n_sites), sites=self.sites))
+        return read_only(apply_steps(effects, np.broadcast_to(values, self.layout.n_sites), sites=self.sites))
 
     @property
     def dark_current_ratio(self) -> float:
@@ -510,7 +526,7 @@ class Sensor:
 
     @cached_property
     def _before_exposure(self) -> tuple[Step, ...]:
-        return merged((Factor(self.sensitivity), *self._at("photo"), Offset(self.dark_rate_e_per_s)), self.sites)
+        return merge_steps((Factor(self.sensitivity), *self._at("photo"), Offset(self.dark_rate_e_per_s)), self.sites)
 
     @cached_property
     def _after_collection(self) -> tuple[Step, ...]:
@@ -519,7 +535,7 @@ class Sensor:
             steps.append(Nonlinearity(self.nonlinearity_fraction, self.v_sat_v))
         if self.pedestal_v:
             steps.append(Offset(self.pedestal_v))
-        return merged((*steps, *self._at("output")), self.sites)
+        return merge_steps((*steps, *self._at("output")), self.sites)
 
     def expected_electrons(self, photo_e_per_s: Floats, exposure_s: float, *, n_threads: int | None = None) -> Floats:
         """
@@ -535,26 +551,26 @@ class Sensor:
         exposure_s = check_plausible("exposure_s", exposure_s)
         photo = np.broadcast_to(np.asarray(unmasked("photo_e_per_s", photo_e_per_s)), self.layout.n_sites)
         steps = (*self._before_exposure, Factor(exposure_s), *self._at("expected"))
-        return run(steps, photo, sites=self.sites, n_threads=n_threads)
+        return apply_steps(steps, photo, sites=self.sites, n_threads=n_threads)
 
     def collect(self, expected_e: Floats, *, streams: Streams, n_threads: int | None = None) -> Ints:
         """Draw the collected charge, (n_site,) int64 e-: shot noise, then full well."""
-        expected_e = self._checked_charges("expected_e", expected_e)
-        well_e = np.minimum(self.well_e, LARGEST_CHARGE_E).astype(np.int64)
+        expected_e = self._validate_charges("expected_e", expected_e)
+        well_e = np.minimum(self.well_e, MAX_CHARGE_E).astype(np.int64)
 
-        def cut_off_by_well(electrons: Ints, sites: Sites, out: Ints) -> None:
-            np.minimum(electrons, sites.of(well_e), out=out)
+        def clip_at_full_well(electrons: Ints, sites: Sites, out: Ints) -> None:
+            np.minimum(electrons, sites.select(well_e), out=out)
 
         electrons = np.empty(expected_e.size, np.int64)
         steps = [self.shot]
-        return run(
+        return apply_steps(
             steps,
             expected_e,
             sites=self.sites,
             streams=streams,
             n_threads=n_threads,
             out=electrons,
-            last=cut_off_by_well,
+            last=clip_at_full_well,
         )
 
     def read(self, electrons: Ints, *, streams: Streams, n_threads: int | None = None) -> NDArray[Any]:
@@ -567,22 +583,24 @@ class Sensor:
         """
         from foveasim.sensor import _kernels
 
-        electrons = self._checked_charges("electrons", electrons, at_least=-np.inf)
+        electrons = self._validate_charges("electrons", electrons, at_least=-np.inf)
         line = np.ascontiguousarray(self.layout.readout_line)
         tables = self._tables
 
         def convert(voltage_v: Floats, sites: Sites, code: NDArray[Any]) -> None:
-            _kernels.convert(voltage_v, sites.of(line), tables, code)
+            _kernels.convert(voltage_v, sites.select(line), tables, code)
 
         code = np.empty(electrons.size, np.uint8 if self.bits <= 8 else np.uint16)
         steps = self._after_collection
-        return run(steps, electrons, sites=self.sites, streams=streams, n_threads=n_threads, out=code, last=convert)
+        return apply_steps(
+            steps, electrons, sites=self.sites, streams=streams, n_threads=n_threads, out=code, last=convert
+        )
 
     @cached_property
     def _tables(self) -> ConversionTables:
-        return self.converter.tables(self.v_sat_v, self.device.key("dnl")[0])
+        return self.adc.tables(self.v_sat_v, self.device.key("dnl")[0])
 
-    def _checked_charges(self, name: str, charge_e: ArrayLike, at_least: float = 0.0) -> NDArray[Any]:
+    def _validate_charges(self, name: str, charge_e: ArrayLike, at_least: float = 0.0) -> NDArray[Any]:
         charges = np.asarray(unmasked(name, charge_e))
         if charges.shape != (self.layout.n_sites,):
             raise ParameterError(
@@ -601,7 +619,7 @@ class Sensor:
         ParameterError
             If the number of charges is not the number of sites, or a charge is negative.
         """
-        return np.ascontiguousarray(self._checked_charges(name, charge_e), np.float64)
+        return np.ascontiguousarray(self._validate_charges(name, charge_e), np.float64)
 
     def calibrate(
         self, *, exposure_s: float, flat_e: ArrayLike, n_frames: int, seed: int, **options: Any
@@ -640,7 +658,7 @@ class Sensor:
             variance_e2=variance_e2,
             sites=self.sites if is_device_known else self.sites.without_device(),
             v_per_e=self.v_per_e,
-            bend=self.nonlinearity_fraction,
+            nonlinearity_fraction=self.nonlinearity_fraction,
             v_sat_v=self.v_sat_v,
             pedestal_v=self.pedestal_v,
         )
@@ -682,17 +700,17 @@ class Sensor:
         drawn_e, drawn_e2 = expected_e, np.zeros(1)
         if not is_drawn:
             drawn_e = np.minimum(np.rint(expected_e), well_e)
-        model = self.readout_model(*cut_off(drawn_e, drawn_e if is_drawn else np.zeros(1), well_e))
+        model = self.readout_model(*clipped_gaussian_moments(drawn_e, drawn_e if is_drawn else np.zeros(1), well_e))
         if model.is_mixed:
             # Mixed charges, after clipping at the full well, are approximated as Gaussian.
             drawn_e, drawn_e2 = model.mean_e, model.variance_e2
             is_drawn, well_e = False, np.array([np.inf])
-        sigma_e, way = np.sqrt(model.gaussian_e2), model.transfer
+        sigma_e, transfer = np.sqrt(model.gaussian_e2), model.transfer
         line = np.ascontiguousarray(self.layout.readout_line)
 
         def block(_: int, sites: slice) -> None:
             def part(values: Floats) -> Floats:
-                return read_only(self.sites.block(sites).of(values).view())
+                return read_only(self.sites.block(sites).select(values).view())
 
             _kernels.predict_codes(
                 ChargeDistributions(
@@ -704,11 +722,11 @@ class Sensor:
                     poisson_below_e=self.gaussian_above_e,
                     is_drawn=is_drawn,
                 ),
-                way._replace(
-                    v_per_e=part(way.v_per_e),
-                    sense_v=part(way.sense_v),
-                    scale=part(way.scale),
-                    output_v=part(way.output_v),
+                transfer._replace(
+                    v_per_e=part(transfer.v_per_e),
+                    sense_v=part(transfer.sense_v),
+                    scale=part(transfer.scale),
+                    output_v=part(transfer.output_v),
                 ),
                 line[sites],
                 self._tables,

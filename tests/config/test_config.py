@@ -97,8 +97,8 @@ def test_exponents_without_point_are_numbers(shot_file):
             "sensor.coupling={neighbour_fraction: 0.01}",
             lambda s: s.camera.sensor.coupling == fs.sensor.InterPixelCapacitance(neighbour_fraction=0.01),
         ),
-        ("sensor.companding=root", lambda s: s.camera.sensor.converter.companding == "root"),
-        ("sensor.inl_dn=[0, 1, 0]", lambda s: s.camera.sensor.converter.inl_dn == (0.0, 1.0, 0.0)),
+        ("sensor.companding=root", lambda s: s.camera.sensor.adc.companding == "root"),
+        ("sensor.inl_dn=[0, 1, 0]", lambda s: s.camera.sensor.adc.inl_dn == (0.0, 1.0, 0.0)),
         ("sensor.ktc_noise=true", lambda s: "reset" in [effect.name for effect in s.camera.sensor.chain]),
         (
             "sensor={filters: rgb, qe: [0.3, {kind: constant, value: 0.5}, 0.4]}; layout.mosaic=[RG, GB]",

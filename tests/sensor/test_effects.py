@@ -345,8 +345,8 @@ def test_block_contains_its_sites():
     block = sites.block(slice(10, 20))
 
     assert block.n_sites == 10
-    assert np.array_equal(block.of(np.arange(N)), np.arange(10, 20))
-    assert block.of(3.0) == 3.0
+    assert np.array_equal(block.select(np.arange(N)), np.arange(10, 20))
+    assert block.select(3.0) == 3.0
 
 
 def test_settings_describe_registered_effects():

@@ -98,7 +98,7 @@ class Sites:
     capacitance_f: Floats
     index: slice = field(default_factory=lambda: slice(None))
     n_threads: int | None = None
-    _known: dict[Any, Any] = field(default_factory=dict, repr=False)
+    _cache: dict[Any, Any] = field(default_factory=dict, repr=False)
     _lock: Any = field(default_factory=RLock, repr=False)
 
     @property
@@ -130,7 +130,7 @@ class Sites:
             )
         return self.known_device
 
-    def of(self, values: ArrayLike) -> Any:
+    def select(self, values: ArrayLike) -> Any:
         """
         Return the elements of an array (n_site, ...) that belong to these sites.
 
@@ -139,7 +139,7 @@ class Sites:
         array = np.asarray(values)
         return array[self.index] if array.ndim and array.shape[0] > 1 else array
 
-    def once(self, key: Any, compute: Callable[[Sites], T]) -> T:
+    def cached(self, key: Any, compute: Callable[[Sites], T]) -> T:
         """
         Return the cached result of a function of all sites, computed at the first call.
 
@@ -151,11 +151,11 @@ class Sites:
             Called with all sites of the layout.
         """
         key = tuple(map(id, key)) if isinstance(key, tuple) else id(key)
-        if key not in self._known:
+        if key not in self._cache:
             with self._lock:
-                if key not in self._known:
-                    self._known[key] = compute(replace(self, index=slice(None)))
-        return self._known[key]
+                if key not in self._cache:
+                    self._cache[key] = compute(replace(self, index=slice(None)))
+        return self._cache[key]
 
     def pattern(self, effect: Any, compute: Callable[[Sites], ArrayLike]) -> Floats:
         """
@@ -169,17 +169,17 @@ class Sites:
             If the array has another shape, or a number is not finite.
         """
 
-        def computed(sites: Sites) -> Floats:
-            found = np.atleast_1d(np.asarray(compute(sites), np.float64))
-            if found.shape not in ((1,), (sites.n_sites,)) or not np.isfinite(found).all():
+        def compute_array(sites: Sites) -> Floats:
+            array = np.atleast_1d(np.asarray(compute(sites), np.float64))
+            if array.shape not in ((1,), (sites.n_sites,)) or not np.isfinite(array).all():
                 name = getattr(effect, "name", type(effect).__name__)
                 raise SimulationError(
                     f"the effect '{name}' must return one finite number, or one for each of the {sites.n_sites} sites, "
-                    f"got an array of shape {found.shape}"
+                    f"got an array of shape {array.shape}"
                 )
-            return read_only(found.copy())
+            return read_only(array.copy())
 
-        return self.of(self.once(effect, computed))
+        return self.select(self.cached(effect, compute_array))
 
 
 class Effect(ABC):
@@ -237,7 +237,7 @@ class Effect(ABC):
             With a device, its fixed patterns are known constants; without one, moments are over all devices.
         """
 
-    def validated_moments(self, mean: Floats, variance: Floats, sites: Sites) -> tuple[Floats, Floats]:
+    def validate_moments(self, mean: Floats, variance: Floats, sites: Sites) -> tuple[Floats, Floats]:
         """
         Return the result of :meth:`moments` after checking its shape.
 
@@ -298,7 +298,7 @@ class FixedFactor(_FixedPattern):
         if sites.known_device is not None:
             factor = sites.pattern(self, self.pattern)
             return mean * factor, variance * factor**2
-        centre, spread2 = (sites.of(part) for part in self.pattern_moments(replace(sites, index=slice(None))))
+        centre, spread2 = (sites.select(part) for part in self.pattern_moments(replace(sites, index=slice(None))))
         return mean * centre, variance * (centre**2 + spread2) + mean**2 * spread2
 
 
@@ -315,7 +315,7 @@ class FixedOffset(_FixedPattern):
         """Compute the moments of a sum of independent terms."""
         if sites.known_device is not None:
             return mean + sites.pattern(self, self.pattern), variance
-        centre, spread2 = (sites.of(part) for part in self.pattern_moments(replace(sites, index=slice(None))))
+        centre, spread2 = (sites.select(part) for part in self.pattern_moments(replace(sites, index=slice(None))))
         return mean + centre, variance + spread2
 
 

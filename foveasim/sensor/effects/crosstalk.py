@@ -41,17 +41,17 @@ MAX_STEP_FRACTION = 0.5
 #: Maximum number of steps; more would take seconds per frame for a million sites.
 MAX_STEPS = 1000
 #: Up to this ratio of spread to distance, charge crosses at most one boundary (to float64); above it, a Fourier series is used.
-SHORT_SPREAD = 0.125
+MAX_SINGLE_CROSSING_SPREAD = 0.125
 #: Number of terms of that series: the next one is below 1e-16.
 N_TERMS = 10
 #: Upper limit of the spread; squares of much larger values overflow float64.
-LARGEST_SPREAD_UM = 1e4
+MAX_SPREAD_UM = 1e4
 #: Rounding tolerance for the sum of a kernel.
 KERNEL_ROUNDING = 1e-9
 #: Maximum relative difference in area between sites of a grid: rounding to a manufacturing grid.
 AREA_ROUNDING = 0.02
 #: Maximum deviation of grid positions and steps, relative to the pitch.
-PLACE_ROUNDING = 0.05
+POSITION_ROUNDING = 0.05
 #: Maximum difference between coordinates in the same row or column, relative to the side of a site.
 SAME_LINE = 0.02
 
@@ -174,11 +174,11 @@ class CrosstalkOperator:
             )
         values = self._per_site("variance", variance)
         columns = np.moveaxis(values, -1, 0)
-        mixed = self._squared @ columns.reshape(columns.shape[0], -1)
+        mixed = self._squared_matrix @ columns.reshape(columns.shape[0], -1)
         return np.ascontiguousarray(np.moveaxis(mixed.reshape(columns.shape), 0, -1))
 
     @cached_property
-    def _squared(self) -> csr_array[Any]:
+    def _squared_matrix(self) -> csr_array[Any]:
         return self.matrix.power(2)
 
     def _per_site(self, name: str, values: ArrayLike) -> Floats:
@@ -197,18 +197,18 @@ class _Crosstalk(Effect):
     is_temporal: ClassVar[bool] = False
     is_local: ClassVar[bool] = False
 
-    def compiled_for(self, sites: Sites) -> CrosstalkOperator:
+    def compile_for(self, sites: Sites) -> CrosstalkOperator:
         """Return the operator for all sites of the layout."""
         raise NotImplementedError
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """Return the charges after crosstalk, (n_site,)."""
         _ = rng
-        return sites.once(self, self.compiled_for).apply(values, n_threads=sites.n_threads)
+        return sites.cached(self, self.compile_for).apply(values, n_threads=sites.n_threads)
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites) -> tuple[Floats, Floats]:
         """Compute the moments of independent charges after crosstalk, (..., n_site)."""
-        operator = sites.once(self, self.compiled_for)
+        operator = sites.cached(self, self.compile_for)
         mean, variance = (
             np.broadcast_to(part, np.broadcast_shapes(np.shape(part), (sites.n_sites,))) for part in (mean, variance)
         )
@@ -273,12 +273,12 @@ class Diffusion(_Crosstalk):
     spread_um: float
     max_gap_um: float | None = None
 
-    def compiled_for(self, sites: Sites) -> CrosstalkOperator:
+    def compile_for(self, sites: Sites) -> CrosstalkOperator:
         """Return the operator for all sites of the layout."""
         return self.compile(sites.layout)
 
     def __post_init__(self) -> None:
-        spread_um = check_number("spread_um", self.spread_um, at_least=0.0, at_most=LARGEST_SPREAD_UM)
+        spread_um = check_number("spread_um", self.spread_um, at_least=0.0, at_most=MAX_SPREAD_UM)
         object.__setattr__(self, "spread_um", spread_um)
         object.__setattr__(self, "max_gap_um", _gap_um(self.max_gap_um))
 
@@ -307,10 +307,10 @@ class Diffusion(_Crosstalk):
         """
         from scipy.optimize import brentq
 
-        share = check_number("neighbour_fraction", neighbour_fraction, at_least=0.0, at_most=MAX_STEP_FRACTION)
+        fraction = check_number("neighbour_fraction", neighbour_fraction, at_least=0.0, at_most=MAX_STEP_FRACTION)
         pitch_um = check_length_um("pitch_um", pitch_um)
         # Upper bracket: with a spread equal to the pitch a pixel loses far more than half.
-        steps = float(brentq(lambda s: 2.0 * float(_squared_steps(np.array(s))) - share, 0.0, 1.0, xtol=1e-15))
+        steps = float(brentq(lambda s: 2.0 * float(_mean_square_steps(np.array(s))) - fraction, 0.0, 1.0, xtol=1e-15))
         return cls(spread_um=steps * pitch_um, max_gap_um=max_gap_um)
 
     def compile(self, layout: Neighbourhood, *, shared_um: csr_array[Any] | None = None) -> CrosstalkOperator:
@@ -343,8 +343,8 @@ class Diffusion(_Crosstalk):
             edges_um = shared_um.sum(axis=1)
             depth_um = layout.area_um2 / np.where(edges_um > 0.0, edges_um, 1.0)
             distance_um = np.maximum(distance_um, 0.5 * (depth_um[site] + depth_um[neighbour]))
-        width_um = 0.5 * distance_um * _squared_steps(self.spread_um / distance_um)
-        matrix = _like(shared_um, shared_um.data * width_um / layout.area_um2[site])
+        width_um = 0.5 * distance_um * _mean_square_steps(self.spread_um / distance_um)
+        matrix = _with_values(shared_um, shared_um.data * width_um / layout.area_um2[site])
         loss = _column_sums(matrix)
         largest = float(loss.max(initial=0.0))
         if not largest <= MAX_STEP_FRACTION * MAX_STEPS:
@@ -358,7 +358,7 @@ class Diffusion(_Crosstalk):
             )
         # Tolerance for computed fractions of exactly one half.
         n_steps = max(1, math.ceil(largest / MAX_STEP_FRACTION - 1e-9))
-        return CrosstalkOperator(_with_rest(matrix, loss, n_steps), n_steps)
+        return CrosstalkOperator(_add_remainder(matrix, loss, n_steps), n_steps)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -404,7 +404,7 @@ class KernelCrosstalk(_Crosstalk):
     border: Literal["kept", "lost"] = "kept"
     pitch_um: float | tuple[float, float] | None = None
 
-    def compiled_for(self, sites: Sites) -> CrosstalkOperator:
+    def compile_for(self, sites: Sites) -> CrosstalkOperator:
         """Return the operator for all sites of the layout."""
         return self.compile(sites.layout)
 
@@ -414,7 +414,7 @@ class KernelCrosstalk(_Crosstalk):
             raise ParameterError("kernel", f"must have odd numbers of rows and columns, got the shape {kernel.shape}")
         if kernel.sum() > 1.0 + KERNEL_ROUNDING:
             raise ParameterError("kernel", "must have a sum of at most 1", float(kernel.sum()))
-        object.__setattr__(self, "kernel", tuple(tuple(float(share) for share in row) for row in kernel))
+        object.__setattr__(self, "kernel", tuple(tuple(float(fraction) for fraction in row) for row in kernel))
         check_choice("border", self.border, ("kept", "lost"))
         if self.pitch_um is not None:
             object.__setattr__(self, "pitch_um", check_pitch_um("pitch_um", self.pitch_um))
@@ -442,36 +442,40 @@ class KernelCrosstalk(_Crosstalk):
 
         _require_layout(layout)
         n_sites = layout.n_sites
-        column, row = _grid_places(layout, self.pitch_um)
+        column, row = _grid_positions(layout, self.pitch_um)
         kernel = np.array(self.kernel)
         half_y, half_x = kernel.shape[0] // 2, kernel.shape[1] // 2
         # Linear index with padding at the ends of rows, so that the kernel does not wrap into the next row.
         stride = int(column.max(initial=0)) + 1 + 2 * half_x
-        place = row * stride + column
-        order = np.argsort(place, kind="stable")
-        ordered = place[order]
+        position = row * stride + column
+        order = np.argsort(position, kind="stable")
+        ordered = position[order]
         if n_sites and (ordered[1:] == ordered[:-1]).any():
-            twin = order[int(np.flatnonzero(ordered[1:] == ordered[:-1])[0]) + 1]
+            duplicate = order[int(np.flatnonzero(ordered[1:] == ordered[:-1])[0]) + 1]
             raise SimulationError(
-                f"the layout is not a grid: site {twin} has the same position as another site; {_ALTERNATIVE}"
+                f"the layout is not a grid: site {duplicate} has the same position as another site; {_ALTERNATIVE}"
             )
-        source, target, share = [], [], []
-        kept = np.zeros(n_sites)
+        source, target, fraction = [], [], []
+        retained = np.zeros(n_sites)
         for j, i in np.argwhere(kernel > 0.0):
-            wanted = ordered + (j - half_y) * stride + (i - half_x)
-            at = np.minimum(np.searchsorted(ordered, wanted), max(n_sites - 1, 0))
-            is_there = ordered[at] == wanted
+            wanted_position = ordered + (j - half_y) * stride + (i - half_x)
+            at = np.minimum(np.searchsorted(ordered, wanted_position), max(n_sites - 1, 0))
+            is_there = ordered[at] == wanted_position
             source.append(order[is_there])
             target.append(order[at[is_there]])
-            share.append(np.full(source[-1].size, kernel[j, i]))
-            kept[order[~is_there]] += kernel[j, i]
+            fraction.append(np.full(source[-1].size, kernel[j, i]))
+            retained[order[~is_there]] += kernel[j, i]
         if self.border == "kept":
-            is_kept = np.flatnonzero(kept)
-            source, target, share = [*source, is_kept], [*target, is_kept], [*share, kept[is_kept]]
+            is_retained = np.flatnonzero(retained)
+            source, target, fraction = (
+                [*source, is_retained],
+                [*target, is_retained],
+                [*fraction, retained[is_retained]],
+            )
         if not source:
             return CrosstalkOperator(coo_array((n_sites, n_sites)).tocsr())
         pairs = (np.concatenate(target).astype(np.int32), np.concatenate(source).astype(np.int32))
-        return CrosstalkOperator(coo_array((np.concatenate(share), pairs), shape=(n_sites, n_sites)).tocsr())
+        return CrosstalkOperator(coo_array((np.concatenate(fraction), pairs), shape=(n_sites, n_sites)).tocsr())
 
 
 # -- after the draw ---------------------------------------------------------------------------------------------------
@@ -528,13 +532,13 @@ class InterPixelCapacitance(_Crosstalk):
     edge_um: float | None = None
     max_gap_um: float | None = None
 
-    def compiled_for(self, sites: Sites) -> CrosstalkOperator:
+    def compile_for(self, sites: Sites) -> CrosstalkOperator:
         """Return the operator for all sites of the layout and their sense-node capacitances."""
         return self.compile(sites.layout, capacitance_f=sites.capacitance_f if sites.capacitance_f.size > 1 else None)
 
     def __post_init__(self) -> None:
-        share = check_number("neighbour_fraction", self.neighbour_fraction, at_least=0.0, at_most=MAX_STEP_FRACTION)
-        object.__setattr__(self, "neighbour_fraction", share)
+        fraction = check_number("neighbour_fraction", self.neighbour_fraction, at_least=0.0, at_most=MAX_STEP_FRACTION)
+        object.__setattr__(self, "neighbour_fraction", fraction)
         if self.edge_um is not None:
             object.__setattr__(self, "edge_um", check_length_um("edge_um", self.edge_um))
         object.__setattr__(self, "max_gap_um", _gap_um(self.max_gap_um))
@@ -583,7 +587,9 @@ class InterPixelCapacitance(_Crosstalk):
                     f"must be one number, or one for each of the {layout.n_sites} sites, got the shape {node_f.shape}",
                 )
             ratio = np.median(node_f) / np.broadcast_to(node_f, layout.n_sites)
-        matrix = _like(shared_um, shared_um.data * (self.neighbour_fraction / edge_um) * ratio[shared_um.indices])
+        matrix = _with_values(
+            shared_um, shared_um.data * (self.neighbour_fraction / edge_um) * ratio[shared_um.indices]
+        )
         loss = _column_sums(matrix)
         largest = float(loss.max(initial=0.0))
         if largest > MAX_STEP_FRACTION * (1.0 + KERNEL_ROUNDING):
@@ -594,7 +600,7 @@ class InterPixelCapacitance(_Crosstalk):
                 self.neighbour_fraction,
                 hint="the model is valid for weak coupling only",
             )
-        return CrosstalkOperator(_with_rest(matrix, loss, 1))
+        return CrosstalkOperator(_add_remainder(matrix, loss, 1))
 
 
 # -- helpers ----------------------------------------------------------------------------------------------------------
@@ -635,7 +641,7 @@ def _shared_um(layout: Neighbourhood, shared_um: csr_array[Any] | None, max_gap_
     return shared_um
 
 
-def _squared_steps(spread: Floats) -> Floats:
+def _mean_square_steps(spread: Floats) -> Floats:
     """
     Compute the mean square number of cells that charge moves in a row of cells.
 
@@ -645,7 +651,7 @@ def _squared_steps(spread: Floats) -> Floats:
     ``-cos(2 pi n z) / (pi n)²``.
     """
     n = np.arange(1, N_TERMS + 1) * math.pi
-    is_long = spread > SHORT_SPREAD
+    is_long = spread > MAX_SINGLE_CROSSING_SPREAD
     steps = np.asarray(spread * math.sqrt(2.0 / math.pi))
     if np.any(is_long):
         long = np.asarray(spread)[is_long]
@@ -659,7 +665,7 @@ def _rows(matrix: csr_array[Any]) -> Ints:
     return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
 
 
-def _like(matrix: csr_array[Any], values: Floats) -> csr_array[Any]:
+def _with_values(matrix: csr_array[Any], values: Floats) -> csr_array[Any]:
     from scipy.sparse import csr_array
 
     return csr_array((values, matrix.indices, matrix.indptr), shape=matrix.shape)
@@ -669,14 +675,14 @@ def _column_sums(matrix: csr_array[Any]) -> Floats:
     return np.bincount(matrix.indices, weights=matrix.data, minlength=matrix.shape[0]).astype(np.float64)
 
 
-def _with_rest(matrix: csr_array[Any], share: Floats, n_steps: int) -> csr_array[Any]:
+def _add_remainder(matrix: csr_array[Any], loss: Floats, n_steps: int) -> csr_array[Any]:
     """Return the matrix of one of several equal steps; the diagonal is the remaining fraction."""
     from scipy.sparse import csr_array, diags_array
 
-    return csr_array(matrix / n_steps + diags_array(1.0 - share / n_steps))
+    return csr_array(matrix / n_steps + diags_array(1.0 - loss / n_steps))
 
 
-def _grid_places(layout: Neighbourhood, pitch_um: Any) -> tuple[Ints, Ints]:
+def _grid_positions(layout: Neighbourhood, pitch_um: Any) -> tuple[Ints, Ints]:
     """Return column and row of each site in the underlying grid, from 0."""
     n_sites = layout.n_sites
     if n_sites == 0:
@@ -692,12 +698,12 @@ def _grid_places(layout: Neighbourhood, pitch_um: Any) -> tuple[Ints, Ints]:
     same_um = SAME_LINE * math.sqrt(typical_um2)
     centre_um = layout.centroid_um
     lines = [_lines(centre_um[:, axis], same_um) for axis in (0, 1)]
-    places = []
+    positions = []
     for axis, name in ((0, "columns"), (1, "rows")):
         line, at_um = lines[axis]
-        given_um = None if pitch_um is None else pitch_um[axis]
-        step_um = _smallest_step_um(line, at_um, lines[1 - axis][0]) if given_um is None else given_um
-        place = np.zeros(at_um.size, np.int64)
+        known_pitch_um = None if pitch_um is None else pitch_um[axis]
+        step_um = _smallest_step_um(line, at_um, lines[1 - axis][0]) if known_pitch_um is None else known_pitch_um
+        position = np.zeros(at_um.size, np.int64)
         if at_um.size > 1:
             if not math.isfinite(step_um):
                 raise SimulationError(
@@ -705,17 +711,17 @@ def _grid_places(layout: Neighbourhood, pitch_um: Any) -> tuple[Ints, Ints]:
                     f"side; {_ALTERNATIVE}, or set 'pitch_um' if sites are missing"
                 )
             steps = np.diff(at_um) / step_um
-            is_odd = ~(np.abs(steps - np.rint(steps)) <= PLACE_ROUNDING) | (np.rint(steps) < 1)
-            place[1:] = np.cumsum(np.where(is_odd, 0.0, np.rint(steps)).astype(np.int64))
-            fitted = np.polyval(np.polyfit(place, at_um, 1), place) if not is_odd.any() else at_um
-            is_off = np.abs(fitted - at_um) > PLACE_ROUNDING * step_um
+            is_odd = ~(np.abs(steps - np.rint(steps)) <= POSITION_ROUNDING) | (np.rint(steps) < 1)
+            position[1:] = np.cumsum(np.where(is_odd, 0.0, np.rint(steps)).astype(np.int64))
+            fitted = np.polyval(np.polyfit(position, at_um, 1), position) if not is_odd.any() else at_um
+            is_off = np.abs(fitted - at_um) > POSITION_ROUNDING * step_um
             if is_odd.any() or is_off.any():
                 raise SimulationError(
                     f"the layout is not a grid parallel to the axes: its {name} do not have equal steps of {step_um:.6g} "
                     f"µm; {_ALTERNATIVE}, or set 'pitch_um' if sites are missing"
                 )
-        places.append(place[line])
-    return places[0], places[1]
+        positions.append(position[line])
+    return positions[0], positions[1]
 
 
 def _lines(position_um: Floats, same_um: float) -> tuple[Ints, Floats]:

@@ -102,14 +102,14 @@ class TelegraphNoise(Effect):
         """Return half the difference between the states, 0 on other sites, (n,) e-."""
         return sites.pattern(
             self,
-            lambda every: np.where(every.device.uniforms(self.name) < self.rts_fraction, 0.5 * self.rts_e, 0.0),
+            lambda all_sites: np.where(all_sites.device.uniforms(self.name) < self.rts_fraction, 0.5 * self.rts_e, 0.0),
         )
 
     def apply(self, values: Floats, *, sites: Sites, rng: np.random.Generator) -> Floats:
         """Return the values plus or minus half the difference of the states on RTS sites."""
-        every = sites.once((self, "sites"), lambda whole: np.flatnonzero(self.half_step(whole)))
+        rts_sites = sites.cached((self, "sites"), lambda all_sites: np.flatnonzero(self.half_step(all_sites)))
         first, end, _ = sites.index.indices(sites.layout.n_sites)
-        where = every[slice(*np.searchsorted(every, (first, end)))] - first
+        where = rts_sites[slice(*np.searchsorted(rts_sites, (first, end)))] - first
         values[where] += np.copysign(0.5 * self.rts_e, rng.random(where.size) - 0.5)
         return values
 

@@ -12,14 +12,14 @@ from foveasim._core.validation import Floats, Ints, unmasked
 from foveasim.sensor.blocks import for_each_block, pieces
 from foveasim.sensor.effects.contract import Effect, Sites, Stage
 
-__all__ = ["LARGEST_CHARGE_E", "ShotChoice", "ShotNoise", "draw_shot_noise"]
+__all__ = ["MAX_CHARGE_E", "ShotChoice", "ShotNoise", "draw_shot_noise"]
 
 ShotChoice = Literal["auto", "exact", "off"]
 
 #: Limit of numpy's Poisson generator. Larger expectations are rounded: their relative shot noise is below 1e-9.
-LARGEST_EXACT_E = 1e18
+MAX_EXACT_E = 1e18
 #: Upper limit of charges: 2**62 fits int64 with headroom for sums.
-LARGEST_CHARGE_E = 2.0**62
+MAX_CHARGE_E = 2.0**62
 #: Variance of rounding to integers.
 ROUNDING_E2 = 1.0 / 12.0
 
@@ -64,14 +64,14 @@ class ShotNoise(Effect):
 
         _ = sites
         if self.how == "off":
-            return np.rint(np.clip(values, 0.0, LARGEST_CHARGE_E)).astype(np.int64)
+            return np.rint(np.clip(values, 0.0, MAX_CHARGE_E)).astype(np.int64)
         if self.how == "auto":
             electrons = np.empty(values.size, np.int64)
             _kernels.draw_poisson(values, standard_normal(rng, values.size), self.gaussian_above_e, electrons)
             return electrons
-        is_beyond = values > LARGEST_EXACT_E
+        is_beyond = values > MAX_EXACT_E
         electrons = rng.poisson(np.where(is_beyond, 0.0, values))
-        electrons[is_beyond] = np.rint(np.minimum(values[is_beyond], LARGEST_CHARGE_E)).astype(np.int64)
+        electrons[is_beyond] = np.rint(np.minimum(values[is_beyond], MAX_CHARGE_E)).astype(np.int64)
         return electrons
 
     def moments(self, mean: Floats, variance: Floats, *, sites: Sites | None = None) -> tuple[Floats, Floats]:

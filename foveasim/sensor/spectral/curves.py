@@ -387,7 +387,7 @@ def curve_values(curve: Curve, wavelength_nm: ArrayLike) -> Floats:
     return np.broadcast_to(values.astype(np.float64, copy=False), np.shape(wavelength_nm))
 
 
-def check_within(wavelength_nm: ArrayLike, low_nm: float, high_nm: float, what: str, cure: str = "") -> None:
+def check_within(wavelength_nm: ArrayLike, low_nm: float, high_nm: float, what: str, hint: str = "") -> None:
     """
     Reject wavelengths outside a range, including NaN.
 
@@ -400,5 +400,5 @@ def check_within(wavelength_nm: ArrayLike, low_nm: float, high_nm: float, what: 
     outside = waves_nm[~((waves_nm >= low_nm) & (waves_nm <= high_nm))]
     if outside.size:
         raise ParameterError(
-            "wavelength_nm", f"must be within {what}, {low_nm:g} to {high_nm:g} nm", float(outside[0]), "nm", cure
+            "wavelength_nm", f"must be within {what}, {low_nm:g} to {high_nm:g} nm", float(outside[0]), "nm", hint
         )

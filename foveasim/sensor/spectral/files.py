@@ -34,7 +34,7 @@ MAX_FILE_BYTES = 4 << 20
 MAX_ROWS, MAX_COLUMNS = 100_000, 1000
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 #: Non-finite numbers, which do not count as column names.
-NO_NAME = re.compile(r"[-+]?(nan|inf|infinity)", re.IGNORECASE)
+NON_FINITE = re.compile(r"[-+]?(nan|inf|infinity)", re.IGNORECASE)
 #: Wavelength units in the header, in nm.
 UNITS_NM = {
     **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), 1.0),
@@ -166,11 +166,11 @@ def _read(path: Path, wavelength_unit: WavelengthUnit | None, value_unit: ValueU
         check_choice("wavelength_unit", wavelength_unit, get_args(WavelengthUnit))
     if value_unit is not None:
         check_choice("value_unit", value_unit, get_args(ValueUnit))
-    rows = list(_rows(path, _text(path)))
+    rows = list(_rows(path, _read_string(path)))
     if not rows:
         raise FileError(path, "contains no table, only comments and empty lines")
     first = rows[0][1][0]
-    header = None if NUMBER.fullmatch(first) or NO_NAME.fullmatch(first) else rows.pop(0)[1]
+    header = None if NUMBER.fullmatch(first) or NON_FINITE.fullmatch(first) else rows.pop(0)[1]
     if len(rows) < 2:
         raise FileError(path, f"must have at least 2 rows of numbers, got {len(rows)}")
     n_columns = len(rows[0][1]) if header is None else len(header)
@@ -179,17 +179,17 @@ def _read(path: Path, wavelength_unit: WavelengthUnit | None, value_unit: ValueU
             path, f"must have 2 to {MAX_COLUMNS} columns, wavelengths and values, got {n_columns} in its first row"
         )
     numbers = np.array([_numbers(path, line, cells, n_columns) for line, cells in rows])
-    scale_nm, is_percent, names = _said(path, header, n_columns - 1)
+    scale_nm, is_percent, names = _parse_header(path, header, n_columns - 1)
     if wavelength_unit is not None:
         scale_nm = UNITS_NM[wavelength_unit]
     if value_unit is not None:
         is_percent[:] = value_unit == "percent"
     lines = [line for line, _ in rows]
-    waves_nm = _checked_wavelengths_nm(path, lines, numbers[:, 0] * scale_nm, scale_nm)
-    return _Table(names, waves_nm, _checked_values(path, lines, names, numbers[:, 1:], is_percent))
+    waves_nm = _validate_wavelengths_nm(path, lines, numbers[:, 0] * scale_nm, scale_nm)
+    return _Table(names, waves_nm, _validate_values(path, lines, names, numbers[:, 1:], is_percent))
 
 
-def _text(path: Path) -> str:
+def _read_string(path: Path) -> str:
     try:
         if not path.is_file():
             raise FileError(path, "is not a file" if path.exists() else "no such file")
@@ -204,11 +204,11 @@ def _text(path: Path) -> str:
         raise FileError(path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
-def _rows(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
+def _rows(path: Path, string: str) -> Iterator[tuple[int, list[str]]]:
     """Yield line number and cells of each line with content."""
     numbered = [
         (k, line)
-        for k, line in enumerate(text.splitlines(), start=1)
+        for k, line in enumerate(string.splitlines(), start=1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
     if len(numbered) > MAX_ROWS:
@@ -228,12 +228,12 @@ def _numbers(path: Path, line: int, cells: list[str], n_columns: int) -> list[fl
         raise FileError(path, f"line {line} must have {n_columns} columns, as in the first row, got {len(cells)}")
     for k, cell in enumerate(cells, start=1):
         if not NUMBER.fullmatch(cell):
-            cure = "; use a decimal point" if re.fullmatch(r"[-+]?\d+,\d+", cell) else ""
-            raise FileError(path, f"line {line}, column {k}: must be a number, got {cell[:40]!r}{cure}")
+            hint = "; use a decimal point" if re.fullmatch(r"[-+]?\d+,\d+", cell) else ""
+            raise FileError(path, f"line {line}, column {k}: must be a number, got {cell[:40]!r}{hint}")
     return [float(cell) for cell in cells]
 
 
-def _said(path: Path, header: list[str] | None, n_values: int) -> tuple[float, np.ndarray, tuple[str, ...]]:
+def _parse_header(path: Path, header: list[str] | None, n_values: int) -> tuple[float, np.ndarray, tuple[str, ...]]:
     """Parse the header: nm per wavelength unit, mask of percent columns, and column names."""
     is_percent = np.zeros(n_values, np.bool_)
     if header is None:
@@ -252,11 +252,11 @@ def _said(path: Path, header: list[str] | None, n_values: int) -> tuple[float, n
     return (scales or [1.0])[0], is_percent, names
 
 
-def _checked_wavelengths_nm(path: Path, lines: list[int], waves_nm: Floats, scale_nm: float) -> Floats:
+def _validate_wavelengths_nm(path: Path, lines: list[int], waves_nm: Floats, scale_nm: float) -> Floats:
     is_odd = ~((waves_nm >= MIN_WAVELENGTH_NM) & (waves_nm <= MAX_WAVELENGTH_NM))
     if is_odd.any():
         k = int(np.argmax(is_odd))
-        cure = (
+        hint = (
             "; for wavelengths in µm set wavelength_unit='um'"
             if scale_nm == 1.0 and waves_nm[k] < MIN_WAVELENGTH_NM
             else ""
@@ -264,7 +264,7 @@ def _checked_wavelengths_nm(path: Path, lines: list[int], waves_nm: Floats, scal
         raise FileError(
             path,
             f"line {lines[k]}: the wavelength must be from {MIN_WAVELENGTH_NM:g} to {MAX_WAVELENGTH_NM:g} nm, "
-            f"got {waves_nm[k]:g}{cure}",
+            f"got {waves_nm[k]:g}{hint}",
         )
     order = np.argsort(waves_nm, kind="stable")
     repeated = np.flatnonzero(np.diff(waves_nm[order]) == 0.0)
@@ -274,7 +274,7 @@ def _checked_wavelengths_nm(path: Path, lines: list[int], waves_nm: Floats, scal
     return waves_nm
 
 
-def _checked_values(
+def _validate_values(
     path: Path, lines: list[int], names: tuple[str, ...], values: Floats, is_percent: np.ndarray
 ) -> Floats:
     for is_bad, rule in (

@@ -61,8 +61,8 @@ def camera_filters() -> FilterSet:
     for curve in measured.curves:
         assert isinstance(curve, TableCurve)
         per_photon = np.asarray(curve.value) / np.asarray(curve.wavelength_nm)
-        shares = (per_photon / per_photon.max()).tolist()
-        curves.append(TableCurve(wavelength_nm=curve.wavelength_nm, value=shares, source=curve.source))
+        fractions = (per_photon / per_photon.max()).tolist()
+        curves.append(TableCurve(wavelength_nm=curve.wavelength_nm, value=fractions, source=curve.source))
     return FilterSet(curves, measured.names)
 
 

@@ -94,7 +94,7 @@ class TableCurve(Multiplied):
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Return the values at the wavelengths, of the same shape."""
-        waves_nm, is_known = _inside(wavelength_nm, self.wavelength_nm, self.beyond)
+        waves_nm, is_known = _clip_to_table(wavelength_nm, self.wavelength_nm, self.beyond)
         return np.where(is_known, np.interp(waves_nm, self.wavelength_nm, self.value), 0.0)
 
 
@@ -134,15 +134,15 @@ class SplineCurve(Multiplied):
         check_choice("beyond", self.beyond, get_args(Beyond))
 
     @cached_property
-    def _pieces(self) -> Any:
+    def _interpolator(self) -> Any:
         from scipy.interpolate import PchipInterpolator
 
         return PchipInterpolator(self.wavelength_nm, self.value)
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Return the values at the wavelengths, of the same shape."""
-        waves_nm, is_known = _inside(wavelength_nm, self.wavelength_nm, self.beyond)
-        return np.where(is_known, np.clip(self._pieces(waves_nm), 0.0, 1.0), 0.0)
+        waves_nm, is_known = _clip_to_table(wavelength_nm, self.wavelength_nm, self.beyond)
+        return np.where(is_known, np.clip(self._interpolator(waves_nm), 0.0, 1.0), 0.0)
 
 
 @CURVES.register("step")
@@ -175,7 +175,7 @@ class StepCurve(Multiplied):
     source: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
-        values = _shares(self.value)
+        values = _check_fractions(self.value)
         edges_nm = wavelengths_nm("edge_nm", self.edge_nm)
         if values.size < 1 or edges_nm.size != values.size + 1:
             raise ParameterError(
@@ -189,12 +189,12 @@ class StepCurve(Multiplied):
 
     def __call__(self, wavelength_nm: ArrayLike, /) -> Floats:
         """Return the values at the wavelengths, of the same shape."""
-        waves_nm, is_known = _inside(wavelength_nm, self.edge_nm, self.beyond)
+        waves_nm, is_known = _clip_to_table(wavelength_nm, self.edge_nm, self.beyond)
         step = np.minimum(np.searchsorted(self.edge_nm, waves_nm, side="right") - 1, len(self.value) - 1)
         return np.where(is_known, np.asarray(self.value)[step], 0.0)
 
 
-def _shares(value: ArrayLike) -> Floats:
+def _check_fractions(value: ArrayLike) -> Floats:
     """Return validated values (n,) from 0 to 1."""
     values = finite_array("value", value, ndim=1, at_least=0.0)
     if values.size and values.max() > 1.0:
@@ -205,7 +205,7 @@ def _shares(value: ArrayLike) -> Floats:
 def _set_table(curve: PolynomialCurve | TableCurve | SplineCurve) -> None:
     """Validate the table of a curve, and store it in ascending order as tuples."""
     waves_nm = finite_array("wavelength_nm", curve.wavelength_nm, ndim=1, above=0.0)
-    values = _shares(curve.value)
+    values = _check_fractions(curve.value)
     if values.size != waves_nm.size or values.size < 2:
         raise ParameterError("value", f"must have the same length as 'wavelength_nm', at least 2, got {values.size}")
     waves_nm = wavelengths_nm("wavelength_nm", waves_nm)
@@ -216,7 +216,7 @@ def _set_table(curve: PolynomialCurve | TableCurve | SplineCurve) -> None:
     object.__setattr__(curve, "value", tuple(values[order].tolist()))
 
 
-def _inside(wavelength_nm: ArrayLike, table_nm: Sequence[float], beyond: Beyond) -> tuple[Floats, Any]:
+def _clip_to_table(wavelength_nm: ArrayLike, table_nm: Sequence[float], beyond: Beyond) -> tuple[Floats, Any]:
     """Return wavelengths clipped to the table, and the mask of those that are not set to 0."""
     low_nm, high_nm = table_nm[0], table_nm[-1]
     waves_nm = as_numbers("wavelength_nm", wavelength_nm)
