@@ -16,7 +16,7 @@ _points = types.Array(types.float64, 2, "C", readonly=True)
 #: Angle (rad) below which the truncated series of sin(v)/v - 1 is exact to float64.
 SERIES_BELOW = 1e-2
 #: Phase (rad) across a site below which the normalised transform is 1.
-STILL = 1e-140
+MIN_PHASE = 1e-140
 
 
 @njit()
@@ -46,7 +46,7 @@ def polygon_transforms(xy, ring_offsets, site_offsets, centre, area, wave):
         for w in range(wave.shape[0]):
             kx, ky = wave[w, 0], wave[w, 1]
             k = np.hypot(kx, ky)
-            if k * size < STILL:
+            if k * size < MIN_PHASE:
                 out[site, w] = 1.0
                 continue
             nx, ny = kx / k, ky / k

@@ -33,13 +33,13 @@ from foveasim.units import per_mm_from_per_um, per_um_from_per_mm
 __all__ = ["AliasingSpectrum", "SamplingSpectrum", "aliasing_spectrum", "sampling_spectrum"]
 
 #: Frequency steps per inverse diameter of the region; a peak of the window is approximately four steps wide.
-STEPS = 2
+STEPS_PER_INVERSE_DIAMETER = 2
 #: Largest number of frequencies per axis; requires 2 GB of memory.
-MOST_FREQUENCIES = 4096
+MAX_FREQUENCIES = 4096
 #: Default highest frequency in median Nyquist frequencies; the first peaks of a lattice are at 2.
-REACH_NYQUISTS = 4.0
+DEFAULT_MAX_NYQUISTS = 4.0
 #: Minimum number of sites for a spectrum.
-LEAST_SITES = 16
+MIN_SITES = 16
 #: Nonuniform FFT: width of the spreading kernel in cells of a grid with twofold oversampling, and its shape parameter (Barnett,
 #: Magland, af Klinteberg 2019, "exponential of semicircle"). The error is 1e-7 of the sum of the weights.
 SPREAD_CELLS, SPREAD_SHAPE = 8, 2.30 * 8
@@ -48,7 +48,7 @@ BLOCK_POINTS = 1 << 16
 #: Radius of a peak with its first ring, in inverse radii of the disc; beyond it, the transform of cos² is below 0.6 %.
 PEAK_RADII = 1.6
 #: Iterations that refine the position of a peak; the step is divided by 4 in each.
-N_REFINED = 4
+N_REFINEMENTS = 4
 
 
 class _Region(NamedTuple):
@@ -106,7 +106,7 @@ class SamplingSpectrum:
         ParameterError
             When ``n_bins`` is not an integer from 1 to 4096.
         """
-        n_bins = check_count("n_bins", n_bins, at_most=MOST_FREQUENCIES)
+        n_bins = check_count("n_bins", n_bins, at_most=MAX_FREQUENCIES)
         f = self.frequency_per_mm
         r = np.hypot(f, f[:, np.newaxis]).ravel()
         edges = np.linspace(0.0, f[-1], n_bins + 1)
@@ -261,17 +261,17 @@ def aliasing_spectrum(
     amplitude = np.abs(_point_transform(region.xy_um, sample, frequency))
 
     fx, fy = np.meshgrid(frequency, frequency)
-    is_false = (np.hypot(fx, fy) <= nyquist) & (np.hypot(fx - wave[0], fy - wave[1]) > peak)
-    false, at = 0.0, np.full(2, np.nan)
-    if is_false.any():
-        best = np.unravel_index(np.where(is_false, amplitude, -1.0).argmax(), amplitude.shape)
+    is_alias = (np.hypot(fx, fy) <= nyquist) & (np.hypot(fx - wave[0], fy - wave[1]) > peak)
+    alias, alias_at = 0.0, np.full(2, np.nan)
+    if is_alias.any():
+        best = np.unravel_index(np.where(is_alias, amplitude, -1.0).argmax(), amplitude.shape)
         first = np.array([frequency[best[1]], frequency[best[0]]])
-        false, at = _refined(region.xy_um, sample, first, float(frequency[1] - frequency[0]), wave, peak)
+        alias, alias_at = _refine_peak(region.xy_um, sample, first, float(frequency[1] - frequency[0]), wave, peak)
     # Parseval: the mean of |amplitude|² over a reciprocal cell, whose area is the site density, is Σ |sample|².
     step = per_um_from_per_mm(float(frequency[1] - frequency[0]))
-    power = float(np.square(amplitude[is_false]).sum() * step**2)
+    power = float(np.square(amplitude[is_alias]).sum() * step**2)
     density_per_um2 = float(region.weight.sum() / (region.weight * layout.area_um2[region.sites]).sum())
-    own = float(np.square(np.abs(sample)).sum()) * density_per_um2
+    total = float(np.square(np.abs(sample)).sum()) * density_per_um2
     return AliasingSpectrum(
         wave_per_mm=read_only(wave.copy()),
         frequency_per_mm=read_only(frequency),
@@ -279,9 +279,9 @@ def aliasing_spectrum(
         nyquist_per_mm=nyquist,
         peak_per_mm=peak,
         baseband_fraction=float(np.abs(np.sum(weight * otf))),
-        alias_fraction=false,
-        alias_per_mm=read_only(at),
-        noise_fraction=power / own,
+        alias_fraction=alias,
+        alias_per_mm=read_only(alias_at),
+        noise_fraction=power / total,
     )
 
 
@@ -300,9 +300,9 @@ def _region(layout: Layout, centre_um: tuple[float, float] | None, radius_um: fl
     xy_um = layout.centroid_um - centre
     r_um = np.hypot(*xy_um.T)
     sites = np.flatnonzero(r_um < radius_um)
-    if sites.size < LEAST_SITES:
+    if sites.size < MIN_SITES:
         raise ParameterError(
-            "radius_um", f"must enclose at least {LEAST_SITES} sites, encloses {sites.size}", radius_um, "µm"
+            "radius_um", f"must enclose at least {MIN_SITES} sites, encloses {sites.size}", radius_um, "µm"
         )
     return _Region(sites, xy_um[sites], np.cos(0.5 * np.pi * r_um[sites] / radius_um) ** 2, radius_um)
 
@@ -320,13 +320,15 @@ def _peak_per_mm(region: _Region) -> float:
 
 def _frequencies_per_mm(region: _Region, limit_per_mm: float, max_per_mm: float | None) -> Floats:
     """Return equally spaced frequencies from -max to max, including 0."""
-    highest = REACH_NYQUISTS * limit_per_mm if max_per_mm is None else check_number("max_per_mm", max_per_mm, above=0.0)
-    step = float(per_mm_from_per_um(1.0 / (STEPS * 2.0 * region.radius_um)))
+    highest = (
+        DEFAULT_MAX_NYQUISTS * limit_per_mm if max_per_mm is None else check_number("max_per_mm", max_per_mm, above=0.0)
+    )
+    step = float(per_mm_from_per_um(1.0 / (STEPS_PER_INVERSE_DIAMETER * 2.0 * region.radius_um)))
     n = int(np.ceil(highest / step * (1.0 - 1e-12)))
-    if 2 * n + 1 > MOST_FREQUENCIES:
+    if 2 * n + 1 > MAX_FREQUENCIES:
         raise ParameterError(
             "max_per_mm",
-            f"must be at most {MOST_FREQUENCIES // 2 * step:.4g} for a region of this size",
+            f"must be at most {MAX_FREQUENCIES // 2 * step:.4g} for a region of this size",
             highest,
             "1/mm",
             "reduce radius_um or max_per_mm",
@@ -354,34 +356,34 @@ def _point_transform(xy_um: Floats, weight: NDArray[np.inexact], frequency_per_m
     for start in range(0, len(xy_um), BLOCK_POINTS):
         part = slice(start, start + BLOCK_POINTS)
         # Positions in grid cells; the period of the grid is the inverse frequency step.
-        place = xy_um[part] * (step * n_grid)
-        first = np.ceil(place - 0.5 * SPREAD_CELLS).astype(np.int64)
+        position_cells = xy_um[part] * (step * n_grid)
+        first = np.ceil(position_cells - 0.5 * SPREAD_CELLS).astype(np.int64)
         near = first[..., np.newaxis] + np.arange(SPREAD_CELLS)
-        share = _semicircle((near - place[..., np.newaxis]) / (0.5 * SPREAD_CELLS))
+        factors = _spreading_kernel((near - position_cells[..., np.newaxis]) / (0.5 * SPREAD_CELLS))
         column, row = near[:, 0] % n_grid, near[:, 1] % n_grid
         position = (row[:, :, np.newaxis] * n_grid + column[:, np.newaxis, :]).ravel()
         spread = (
-            weight[part, np.newaxis, np.newaxis] * share[:, 1, :, np.newaxis] * share[:, 0, np.newaxis, :]
+            weight[part, np.newaxis, np.newaxis] * factors[:, 1, :, np.newaxis] * factors[:, 0, np.newaxis, :]
         ).ravel()
         cells += np.bincount(position, weights=spread.real, minlength=cells.size)
         if np.iscomplexobj(spread):
             cells += 1j * np.bincount(position, weights=spread.imag, minlength=cells.size)
-    whole = scipy.fft.fft2(cells.reshape(n_grid, n_grid), overwrite_x=True)
+    transform = scipy.fft.fft2(cells.reshape(n_grid, n_grid), overwrite_x=True)
     modes = np.arange(-n_half, n_half + 1)
     nodes, node_weights = np.polynomial.legendre.leggauss(64)
     waves = np.cos(np.pi * SPREAD_CELLS / n_grid * np.multiply.outer(modes, nodes))
-    kernel = 0.5 * SPREAD_CELLS * (waves @ (node_weights * _semicircle(nodes)))
-    return np.asarray(whole[np.ix_(modes % n_grid, modes % n_grid)] / np.multiply.outer(kernel, kernel))
+    kernel = 0.5 * SPREAD_CELLS * (waves @ (node_weights * _spreading_kernel(nodes)))
+    return np.asarray(transform[np.ix_(modes % n_grid, modes % n_grid)] / np.multiply.outer(kernel, kernel))
 
 
-def _semicircle(share: Floats) -> Floats:
+def _spreading_kernel(fraction: Floats) -> Floats:
     """Evaluate the spreading kernel at fractions of its half width."""
     return np.asarray(
-        np.exp(SPREAD_SHAPE * (np.sqrt(np.maximum(1.0 - share * share, 0.0)) - 1.0)) * (np.abs(share) <= 1.0)
+        np.exp(SPREAD_SHAPE * (np.sqrt(np.maximum(1.0 - fraction * fraction, 0.0)) - 1.0)) * (np.abs(fraction) <= 1.0)
     )
 
 
-def _refined(
+def _refine_peak(
     xy_um: Floats,
     sample: NDArray[np.complex128],
     at_per_mm: Floats,
@@ -391,7 +393,7 @@ def _refined(
 ) -> tuple[float, Floats]:
     """Return height and position of an alias peak, by direct sums on successively finer grids."""
     height, half_per_mm = 0.0, 0.5 * step_per_mm
-    for _ in range(N_REFINED):
+    for _ in range(N_REFINEMENTS):
         off = half_per_mm * np.arange(-2, 3)
         near = at_per_mm + np.stack(np.meshgrid(off, off), axis=-1).reshape(-1, 2)
         # The central point lies outside the peak of the wave, so at least one point remains.

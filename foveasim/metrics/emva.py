@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from foveasim._core.validation import Bools, Floats, finite_array, read_only
 from foveasim.errors import FoveasimWarning, ParameterError
 from foveasim.metrics.photon_transfer import (
-    LEAST_DARK_DN2,
+    MIN_DARK_DN2,
     PhotonTransfer,
     SiteClasses,
     above_dark,
@@ -38,9 +38,9 @@ LINEARITY_FRACTIONS = (0.05, 0.95)
 #: Level of the PRNU in fractions of saturation.
 PRNU_FRACTION = 0.5
 #: Largest permitted fraction of dark codes that are clipped at 0.
-MOST_UNDERFLOW_FRACTION = 0.005
+MAX_UNDERFLOW_FRACTION = 0.005
 #: Minimum number of points of a straight-line fit: exposures for the dark current, levels for the linearity error.
-LEAST_EXPOSURES = 3
+MIN_POINTS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class Emva1288:
     prnu_fraction : (n_class,) float64
         PRNU1288: spatial standard deviation at the level closest to half saturation, less the dark variance, over the
         dark-corrected mean; NaN if the estimated variance is negative.
-    dark_current_e_per_s, dark_current_of_variance_e_per_s : (n_class,) float64, e-/s
+    dark_current_e_per_s, dark_current_from_variance_e_per_s : (n_class,) float64, e-/s
         Dark current from the mean and from the variance of dark frames against exposure; NaN without a dark series.
     underflow_fraction : (n_class,) float64
         Fraction of dark codes that are 0.
@@ -103,7 +103,7 @@ class Emva1288:
     dsnu_e: Floats
     prnu_fraction: Floats
     dark_current_e_per_s: Floats
-    dark_current_of_variance_e_per_s: Floats
+    dark_current_from_variance_e_per_s: Floats
     underflow_fraction: Floats
     transfer: PhotonTransfer
     dark: PhotonTransfer
@@ -191,34 +191,34 @@ def emva1288(
             raise ParameterError(name, f"must be a list of levels, got a {type(levels).__name__}")
     frames, dark = list(frames), list(dark)
     transfer = photon_transfer(frames, classes=classes)
-    darkness = photon_transfer(dark, classes=classes)
+    dark_transfer = photon_transfer(dark, classes=classes)
     groups = SiteClasses(classes, int(transfer.n_sites.sum()))
-    mean_dn, variance_dn2 = above_dark(transfer, darkness)
+    mean_dn, variance_dn2 = above_dark(transfer, dark_transfer)
     level_ph = _photons(photons, groups, len(frames))
-    top, each = transfer.saturation_level, np.arange(transfer.classes.size)
-    if np.any(top == len(frames) - 1):
+    i_saturation, i_class = transfer.saturation_level, np.arange(transfer.classes.size)
+    if np.any(i_saturation == len(frames) - 1):
         warnings.warn(
-            f"the variance is highest at the last level for {np.count_nonzero(top == len(frames) - 1)} of {top.size} classes: "
+            f"the variance is highest at the last level for {np.count_nonzero(i_saturation == len(frames) - 1)} of {i_saturation.size} classes: "
             "saturation is not reached and is underestimated; add levels of higher irradiance",
             FoveasimWarning,
             stacklevel=2,
         )
-    saturation_dn = mean_dn[top, each]
+    saturation_dn = mean_dn[i_saturation, i_class]
 
-    is_used = is_linear(mean_dn, top)
+    is_used = is_linear(mean_dn, i_saturation)
     gain_dn_per_e = slopes("frames", mean_dn, variance_dn2, is_used)
     responsivity = slopes("photons", level_ph, mean_dn, is_used)
     qe = responsivity / gain_dn_per_e
 
-    dark_current, dark_current_of_variance, noise_dn2 = _dark_current(
-        dark_series, exposure_s, classes, gain_dn_per_e, darkness.temporal_variance_dn2[0]
+    dark_current, dark_current_from_variance, noise_dn2 = _dark_current(
+        dark_series, exposure_s, classes, gain_dn_per_e, dark_transfer.temporal_variance_dn2[0]
     )
-    dark_noise_dn = np.sqrt(np.maximum(noise_dn2, LEAST_DARK_DN2))
+    dark_noise_dn = np.sqrt(np.maximum(noise_dn2, MIN_DARK_DN2))
 
     half = np.abs(mean_dn - PRNU_FRACTION * saturation_dn).argmin(axis=0)
-    dark_half = np.minimum(half, darkness.n_frames.size - 1)
-    dark_spatial_dn2 = darkness.spatial_variance_dn2[dark_half, each]
-    light_spatial_dn2 = transfer.spatial_variance_dn2[half, each] - dark_spatial_dn2
+    dark_half = np.minimum(half, dark_transfer.n_frames.size - 1)
+    dark_spatial_dn2 = dark_transfer.spatial_variance_dn2[dark_half, i_class]
+    bright_spatial_dn2 = transfer.spatial_variance_dn2[half, i_class] - dark_spatial_dn2
     linearity_min, linearity_max = _linearity(level_ph, mean_dn, saturation_dn)
     parameters: dict[str, NDArray[Any]] = {
         "classes": transfer.classes,
@@ -227,19 +227,19 @@ def emva1288(
         "qe": qe,
         "dark_noise_dn": dark_noise_dn,
         "dark_noise_e": np.sqrt(dark_noise_dn**2 - QUANTISATION_DN2) / gain_dn_per_e,
-        "is_quantisation_limited": noise_dn2 < LEAST_DARK_DN2,
-        "saturation_ph": level_ph[top, each],
+        "is_quantisation_limited": noise_dn2 < MIN_DARK_DN2,
+        "saturation_ph": level_ph[i_saturation, i_class],
         "threshold_ph": (dark_noise_dn / gain_dn_per_e + 0.5) / qe,
         "linearity_error_min_fraction": linearity_min,
         "linearity_error_max_fraction": linearity_max,
-        "dsnu_e": _root(dark_spatial_dn2) / gain_dn_per_e,
-        "prnu_fraction": _root(light_spatial_dn2) / mean_dn[half, each],
+        "dsnu_e": _standard_deviation(dark_spatial_dn2) / gain_dn_per_e,
+        "prnu_fraction": _standard_deviation(bright_spatial_dn2) / mean_dn[half, i_class],
         "dark_current_e_per_s": dark_current,
-        "dark_current_of_variance_e_per_s": dark_current_of_variance,
-        "underflow_fraction": _underflow(dark[0], groups),
+        "dark_current_from_variance_e_per_s": dark_current_from_variance,
+        "underflow_fraction": _underflow_fraction(dark[0], groups),
     }
     return Emva1288(
-        **{name: read_only(values) for name, values in parameters.items()}, transfer=transfer, dark=darkness
+        **{name: read_only(values) for name, values in parameters.items()}, transfer=transfer, dark=dark_transfer
     )
 
 
@@ -276,10 +276,10 @@ def _dark_current(
         raise ParameterError("dark_series", "must be given together with exposure_s")
     series = photon_transfer(dark_series, classes=classes)
     times_s = finite_array("exposure_s", exposure_s, ndim=1, at_least=0.0)
-    if times_s.size != series.n_frames.size or np.unique(times_s).size < LEAST_EXPOSURES:
+    if times_s.size != series.n_frames.size or np.unique(times_s).size < MIN_POINTS:
         raise ParameterError(
             "exposure_s",
-            f"must have one exposure for each of {series.n_frames.size} levels, at least {LEAST_EXPOSURES} of them different",
+            f"must have one exposure for each of {series.n_frames.size} levels, at least {MIN_POINTS} of them different",
             times_s.tolist(),
             "s",
         )
@@ -302,7 +302,7 @@ def _linearity(level_ph: Floats, mean_dn: Floats, saturation_dn: Floats) -> tupl
         last = np.where(is_below, level, -1).max()
         chosen = slice(first, last + 1)
         x, y = level_ph[chosen, c], y[chosen]
-        if y.size < LEAST_EXPOSURES or y.min() <= 0.0 or np.ptp(x) == 0.0:
+        if y.size < MIN_POINTS or y.min() <= 0.0 or np.ptp(x) == 0.0:
             continue
         slope, offset = np.linalg.lstsq(np.column_stack((x / y, 1.0 / y)), np.ones(y.size), rcond=None)[0]
         deviation = y / (slope * x + offset) - 1.0
@@ -310,19 +310,19 @@ def _linearity(level_ph: Floats, mean_dn: Floats, saturation_dn: Floats) -> tupl
     return lowest, highest
 
 
-def _root(variance_dn2: Floats) -> Floats:
+def _standard_deviation(variance_dn2: Floats) -> Floats:
     """Return the standard deviation in DN; NaN for a negative variance estimate."""
     return np.sqrt(np.where(variance_dn2 >= 0.0, variance_dn2, np.nan))
 
 
-def _underflow(dark: Any, groups: SiteClasses) -> Floats:
+def _underflow_fraction(dark: Any, groups: SiteClasses) -> Floats:
     """Return the fraction of codes that are 0; warn if it is too large."""
-    share = groups.mean((codes_of("dark[0]", dark) == 0).mean(axis=0))
-    if share.max() > MOST_UNDERFLOW_FRACTION:
+    fraction = groups.mean((codes_of("dark[0]", dark) == 0).mean(axis=0))
+    if fraction.max() > MAX_UNDERFLOW_FRACTION:
         warnings.warn(
-            f"{100 * share.max():.1f} % of the dark codes are 0, which clips the noise: dark noise and DSNU are "
+            f"{100 * fraction.max():.1f} % of the dark codes are 0, which clips the noise: dark noise and DSNU are "
             "underestimated; raise the dark level above 0, for example by a pedestal",
             FoveasimWarning,
             stacklevel=3,
         )
-    return share
+    return fraction

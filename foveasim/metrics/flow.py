@@ -32,9 +32,9 @@ from foveasim.metrics.sampling import require_layout
 __all__ = ["FlowBound", "FlowEstimate", "estimate_flow", "flow_bound", "site_gradients_e_per_um"]
 
 #: Relative information below which a direction is unobservable.
-LEAST_INFORMATION = 1e-12
+MIN_INFORMATION = 1e-12
 #: Largest uncovered area fraction of a usable site.
-OFF_SHARE = 1e-9
+MAX_UNCOVERED_FRACTION = 1e-9
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -130,7 +130,7 @@ def site_gradients_e_per_um(
         When sites lie partly or entirely off the map.
     """
     require_layout(layout)
-    cells = _checked_map(map_e_per_um2, grid)
+    cells = _validate_map(map_e_per_um2, grid)
     integrator = Integrator(layout, grid, order=2, n_threads=n_threads)
     is_on = _is_on_map(integrator, layout)
     if not is_on.all():
@@ -232,7 +232,7 @@ def estimate_flow(
     outlines lie partly or entirely off the map are excluded, because their expected value is unknown.
     """
     require_layout(layout)
-    cells = _checked_map(map_e_per_um2, grid)
+    cells = _validate_map(map_e_per_um2, grid)
     maps = np.concatenate((cells[np.newaxis], _gradients(cells, grid)))
     values = _per_site("values_e", finite_array("values_e", values_e), layout.n_sites)
     variance = _per_site("variance_e2", finite_array("variance_e2", variance_e2, above=0.0), layout.n_sites)
@@ -243,10 +243,10 @@ def estimate_flow(
     flow_um = np.zeros((groups.labels.size, 2))
     for step in range(n_steps + 1):
         # A site samples the image displaced by u like a site displaced by -u samples the original image.
-        moved_um = np.repeat(groups.of_sites(flow_um), vertices_of_site, axis=0)
-        carried = Layout(layout.xy_um - moved_um, layout.ring_offsets, layout.site_offsets)
-        integrator = Integrator(carried, grid, order=2, n_threads=n_threads)
-        is_on = _is_on_map(integrator, carried)
+        moved_um = np.repeat(groups.to_sites(flow_um), vertices_of_site, axis=0)
+        displaced = Layout(layout.xy_um - moved_um, layout.ring_offsets, layout.site_offsets)
+        integrator = Integrator(displaced, grid, order=2, n_threads=n_threads)
+        is_on = _is_on_map(integrator, displaced)
         expected, *gradient = integrator(maps)
         slope = np.where(is_on[:, np.newaxis], np.stack(gradient, axis=1), 0.0)
         residual = np.where(is_on, values - expected, 0.0)
@@ -254,9 +254,9 @@ def estimate_flow(
         if step == n_steps:
             break
         score = -groups.sums(slope * (residual / variance)[:, np.newaxis])
-        is_seen = np.isfinite(bound.covariance_um2).all(axis=(1, 2))
+        is_observable = np.isfinite(bound.covariance_um2).all(axis=(1, 2))
         change_um = np.zeros_like(flow_um)
-        change_um[is_seen] = np.einsum("rij,rj->ri", bound.covariance_um2[is_seen], score[is_seen])
+        change_um[is_observable] = np.einsum("rij,rj->ri", bound.covariance_um2[is_observable], score[is_observable])
         flow_um += change_um
         if n_steps > 1 and np.abs(change_um).max(initial=0.0) <= tolerance_um:
             break
@@ -292,14 +292,14 @@ class _Regions:
         ]
         return np.stack(columns, axis=1)
 
-    def of_sites(self, values: Floats) -> Floats:
+    def to_sites(self, values: Floats) -> Floats:
         """Assign region values to sites: (n_site, k) from (n_region, k); 0 for excluded sites."""
-        spread = np.zeros((self._n_all, values.shape[1]))
-        spread[self._used] = values[self._position]
-        return spread
+        out = np.zeros((self._n_all, values.shape[1]))
+        out[self._used] = values[self._position]
+        return out
 
 
-def _checked_map(map_e_per_um2: ArrayLike, grid: Grid) -> Floats:
+def _validate_map(map_e_per_um2: ArrayLike, grid: Grid) -> Floats:
     cells = finite_array("map_e_per_um2", map_e_per_um2, ndim=2)
     if not isinstance(grid, Grid) or cells.shape != grid.shape or min(cells.shape) < 5:
         raise ParameterError(
@@ -327,7 +327,7 @@ def _gradients(values: Floats, grid: Grid) -> Floats:
 
 def _is_on_map(integrator: Integrator, layout: Layout) -> Bools:
     """Return whether sites lie entirely within the map, (n_site,)."""
-    return np.asarray(integrator.uncovered_um2 <= OFF_SHARE * layout.area_um2)
+    return np.asarray(integrator.uncovered_um2 <= MAX_UNCOVERED_FRACTION * layout.area_um2)
 
 
 def _bound(gradient: Floats, variance_e2: Floats, groups: _Regions, is_counted: Bools) -> FlowBound:
@@ -347,14 +347,14 @@ def _marginal_information(information_per_um2: Floats, axis: int) -> Floats:
     """Return the marginal information of u or v, (n_region,); 0 below rounding error."""
     own, other = information_per_um2[:, axis, axis], information_per_um2[:, 1 - axis, 1 - axis]
     shared = information_per_um2[:, 0, 1] ** 2 / np.where(other > 0.0, other, 1.0)
-    return np.where(own - shared > LEAST_INFORMATION * own, own - shared, 0.0)
+    return np.where(own - shared > MIN_INFORMATION * own, own - shared, 0.0)
 
 
 def _inverse(information_per_um2: Floats) -> Floats:
     """Invert symmetric matrices (n, 2, 2); infinite if singular to float64."""
     xx, xy, yy = (information_per_um2[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     determinant = xx * yy - xy * xy
-    is_good = determinant > LEAST_INFORMATION * xx * yy
+    is_good = determinant > MIN_INFORMATION * xx * yy
     adjugate = np.stack((np.stack((yy, -xy), axis=1), np.stack((-xy, xx), axis=1)), axis=1)
     return np.where(
         is_good[:, np.newaxis, np.newaxis],

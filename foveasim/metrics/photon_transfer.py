@@ -48,7 +48,7 @@ __all__ = [
 #: Upper limit of the levels used for the gain, in fractions of saturation (EMVA 1288).
 LINEAR_FRACTION = 0.7
 #: Variance in DN² below which quantisation masks the dark noise (EMVA 1288).
-LEAST_DARK_DN2 = 0.24
+MIN_DARK_DN2 = 0.24
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ class PhotonTransfer:
             As for :meth:`gain_dn_per_e`.
         """
         variance_dn2 = (self if dark is None else dark).temporal_variance_dn2[0]
-        return np.sqrt(np.maximum(variance_dn2, LEAST_DARK_DN2) - QUANTISATION_DN2) / self.gain_dn_per_e(dark)
+        return np.sqrt(np.maximum(variance_dn2, MIN_DARK_DN2) - QUANTISATION_DN2) / self.gain_dn_per_e(dark)
 
 
 class SiteClasses:
@@ -151,20 +151,20 @@ class SiteClasses:
         labels = np.zeros(n_sites, np.int64) if classes is None else np.asarray(unmasked("classes", classes))
         if labels.shape != (n_sites,):
             raise ParameterError("classes", f"must have one label for each of the {n_sites} sites, got {labels.shape}")
-        self.labels, self.of_site = np.unique(labels, return_inverse=True)
-        self.n_sites = np.bincount(self.of_site).astype(np.int64)
+        self.labels, self.class_index = np.unique(labels, return_inverse=True)
+        self.n_sites = np.bincount(self.class_index).astype(np.int64)
         if self.n_sites.min(initial=n_sites) < 2:
             few = self.labels[self.n_sites < 2].tolist()
             raise ParameterError("classes", "must have at least two sites each", few)
 
     def mean(self, values: Floats) -> Floats:
         """Compute the mean over the sites of each class: (n_class,) from (n_site,)."""
-        return np.bincount(self.of_site, weights=values) / self.n_sites
+        return np.bincount(self.class_index, weights=values) / self.n_sites
 
     def variance(self, values: Floats) -> Floats:
         """Compute the sample variance over the sites of each class: (n_class,) from (n_site,)."""
-        off = values - self.mean(values)[self.of_site]
-        return np.bincount(self.of_site, weights=off * off) / (self.n_sites - 1)
+        off = values - self.mean(values)[self.class_index]
+        return np.bincount(self.class_index, weights=off * off) / (self.n_sites - 1)
 
 
 def draw_frames(
@@ -321,11 +321,11 @@ def predicted_photon_transfer(
         As for :func:`photon_transfer`.
     """
     groups = SiteClasses(classes, sensor.layout.n_sites)
-    told = []
+    levels_dn = []
     for level_e in _levels(expected_e, sensor.layout.n_sites):
         mean_dn, variance_dn2 = sensor.predict(level_e, n_threads=n_threads)
-        told.append((groups.mean(mean_dn), groups.mean(variance_dn2), groups.variance(mean_dn)))
-    return _transfer(groups, [0] * len(told), told)
+        levels_dn.append((groups.mean(mean_dn), groups.mean(variance_dn2), groups.variance(mean_dn)))
+    return _transfer(groups, [0] * len(levels_dn), levels_dn)
 
 
 def codes_of(name: str, frames: Any) -> NDArray[Any]:

@@ -14,7 +14,7 @@ from foveasim.reconstruct import Picture
 __all__ = ["psnr_db", "ssim"]
 
 #: Default minimum fraction of a pixel's area that photosites cover.
-COVERED = 0.5
+DEFAULT_MIN_COVERAGE = 0.5
 
 
 def psnr_db(
@@ -22,7 +22,7 @@ def psnr_db(
     reference: Picture | ArrayLike,
     data_range: float | None = None,
     *,
-    min_coverage: float = COVERED,
+    min_coverage: float = DEFAULT_MIN_COVERAGE,
 ) -> float:
     """
     Compute the peak signal-to-noise ratio (PSNR).
@@ -51,9 +51,9 @@ def psnr_db(
     >>> float(round(psnr_db([[1.0, 2.0], [3.0, np.nan]], [[1.1, 2.1], [2.9, 7.0]], data_range=1.0), 6))
     20.0
     """
-    one, other, counts = _compared(picture, reference, min_coverage)
-    difference2 = float(np.mean((one - other)[:, counts] ** 2))
-    peak = _range(other[:, counts], data_range)
+    one, other, is_compared = _prepare_comparison(picture, reference, min_coverage)
+    difference2 = float(np.mean((one - other)[:, is_compared] ** 2))
+    peak = _data_range(other[:, is_compared], data_range)
     return math.inf if difference2 == 0.0 else 10.0 * math.log10(peak * peak / difference2)
 
 
@@ -62,7 +62,7 @@ def ssim(
     reference: Picture | ArrayLike,
     data_range: float | None = None,
     *,
-    min_coverage: float = COVERED,
+    min_coverage: float = DEFAULT_MIN_COVERAGE,
     window: int = 7,
 ) -> float:
     """
@@ -90,16 +90,16 @@ def ssim(
     from scipy.ndimage import minimum_filter
     from skimage.metrics import structural_similarity
 
-    one, other, counts = _compared(picture, reference, min_coverage)
+    one, other, is_compared = _prepare_comparison(picture, reference, min_coverage)
     window = check_count("window", window, at_least=3)
     if window % 2 == 0:
         raise ParameterError("window", "must be odd", window)
-    fits = minimum_filter(counts, size=window, mode="constant", cval=0)
+    fits = minimum_filter(is_compared, size=window, mode="constant", cval=0)
     if not fits.any():
         raise ParameterError("window", "must fit within the compared pixels", window)
-    peak = _range(other[:, counts], data_range)
+    peak = _data_range(other[:, is_compared], data_range)
     one, other = (
-        np.where(counts, plane, 0.0) for plane in (one, other)
+        np.where(is_compared, plane, 0.0) for plane in (one, other)
     )  # scikit-image requires numbers also in excluded pixels
     maps = [
         structural_similarity(a, b, win_size=window, data_range=peak, full=True)[1]
@@ -108,7 +108,7 @@ def ssim(
     return float(np.mean(np.array(maps)[:, fits]))
 
 
-def _compared(
+def _prepare_comparison(
     picture: Picture | ArrayLike, reference: Picture | ArrayLike, min_coverage: float
 ) -> tuple[Floats, Floats, Bools]:
     """Return both images as (n_channel, n_y, n_x), and the mask of compared pixels."""
@@ -132,21 +132,21 @@ def _compared(
         and not np.allclose(picture.grid.bounds_um, reference.grid.bounds_um, rtol=1e-9, atol=1e-6)
     ):
         raise ParameterError("reference", "must have the same grid as the picture", reference.grid.bounds_um)
-    counts = ~np.isnan(planes).any(axis=(0, 1)) & covered[0] & covered[1]
-    if not counts.any():
+    is_compared = ~np.isnan(planes).any(axis=(0, 1)) & covered[0] & covered[1]
+    if not is_compared.any():
         raise ParameterError("picture", "must have at least one pixel in common with the reference")
     for name, plane in zip(("picture", "reference"), planes, strict=True):
-        n_infinite = int(np.count_nonzero(np.isinf(plane).any(axis=0) & counts))
+        n_infinite = int(np.count_nonzero(np.isinf(plane).any(axis=0) & is_compared))
         if n_infinite:
             raise ParameterError(
                 name,
-                f"must be finite, got infinity in {n_infinite:,} of {np.count_nonzero(counts):,} compared pixels",
+                f"must be finite, got infinity in {n_infinite:,} of {np.count_nonzero(is_compared):,} compared pixels",
                 hint="mark unknown pixels by NaN",
             )
-    return planes[0], planes[1], np.asarray(counts)
+    return planes[0], planes[1], np.asarray(is_compared)
 
 
-def _range(values: Floats, data_range: float | None) -> float:
+def _data_range(values: Floats, data_range: float | None) -> float:
     if data_range is not None:
         return check_number("data_range", data_range, above=0.0)
     peak = float(np.ptp(values))

@@ -23,10 +23,10 @@ __all__ = [
 
 #: Sine of the minimum angle (30 degrees) between the directions of both neighbours; it is 60 degrees or more in the reduced
 #: basis of a lattice.
-LEAST_SINE = 0.5
+MIN_SINE = 0.5
 #: Number of candidate neighbours: initial value, multiplied by 4 up to the largest value, which suffices for rectangles of an
 #: aspect ratio of 300.
-FIRST_NEIGHBOURS, MOST_NEIGHBOURS = 12, 768
+INITIAL_NEIGHBOURS, MAX_NEIGHBOURS = 12, 768
 #: Pairs of sites per block; limits the memory.
 BLOCK_PAIRS = 1 << 18
 #: Relative difference below which sizes are equal.
@@ -117,23 +117,23 @@ def _spacing_um(xy_um: Floats) -> tuple[Floats, Floats]:
     if n < 2:
         return nearest_um, row_um
     tree = cKDTree(xy_um)
-    left, k = np.arange(n), FIRST_NEIGHBOURS
-    while left.size and k <= MOST_NEIGHBOURS:
+    remaining, k = np.arange(n), INITIAL_NEIGHBOURS
+    while remaining.size and k <= MAX_NEIGHBOURS:
         block = BLOCK_PAIRS // k
-        for start in range(0, left.size, block):
-            sites = left[start : start + block]
+        for start in range(0, remaining.size, block):
+            sites = remaining[start : start + block]
             # k = 1 is the site itself; missing neighbours have infinite distances.
             distance_um, ids = map(np.asarray, tree.query(xy_um[sites], k=list(range(2, min(k, n) + 1))))
             step_um = xy_um[ids] - xy_um[sites, np.newaxis]
             along = step_um[:, 0] / np.maximum(distance_um[:, :1], np.finfo(float).tiny)
             off_um = np.abs(along[:, :1] * step_um[..., 1] - along[:, 1:] * step_um[..., 0])
             # A coincident site does not define a direction.
-            is_beside = (off_um >= LEAST_SINE * distance_um) & (distance_um[:, :1] > 0.0)
-            first = is_beside.argmax(axis=1)
+            is_other_row = (off_um >= MIN_SINE * distance_um) & (distance_um[:, :1] > 0.0)
+            first = is_other_row.argmax(axis=1)
             nearest_um[sites] = distance_um[:, 0]
             found = np.arange(sites.size)
-            row_um[sites] = np.where(is_beside[found, first], off_um[found, first], np.nan)
-        left = left[np.isnan(row_um[left])] if k < n else left[:0]
+            row_um[sites] = np.where(is_other_row[found, first], off_um[found, first], np.nan)
+        remaining = remaining[np.isnan(row_um[remaining])] if k < n else remaining[:0]
         k *= 4
     return nearest_um, row_um
 
@@ -249,11 +249,11 @@ def nyquist_vs_eccentricity(
     rounding_um = SIZE_ROUNDING * float(size_um.mean())
     slope = 0.0 if abs(slope) * np.ptp(r_um) <= rounding_um else slope
     at_centre_um = 0.0 if abs(at_centre_um) <= rounding_um else at_centre_um
-    low, middle, high = _low_middle_high(nyquist, position, n_bins)
+    low, median, high = _min_median_max(nyquist, position, n_bins)
     return EccentricityTable(
         edges_um=read_only(edges_um),
         n_sites=read_only(counts.astype(np.int64)),
-        nyquist_per_mm=read_only(middle),
+        nyquist_per_mm=read_only(median),
         nyquist_min_per_mm=read_only(low),
         nyquist_max_per_mm=read_only(high),
         size_um=read_only(np.where(counts > 0, sums_um / np.maximum(counts, 1), np.nan)),
@@ -275,7 +275,7 @@ def require_layout(layout: object) -> None:
         raise ParameterError("layout", f"must be a foveasim.Layout, got a {type(layout).__name__}")
 
 
-def _low_middle_high(values: Floats, position: NDArray[np.intp], n_bins: int) -> tuple[Floats, Floats, Floats]:
+def _min_median_max(values: Floats, position: NDArray[np.intp], n_bins: int) -> tuple[Floats, Floats, Floats]:
     """Return lowest, median and highest value of each bin; NaN for empty bins."""
     is_known = np.isfinite(values)
     values, position = values[is_known], position[is_known]

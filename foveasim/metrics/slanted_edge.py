@@ -35,26 +35,26 @@ __all__ = ["EdgeMtf", "slanted_edge_mtf"]
 #: Bins per pitch, as in the standard.
 BINS_PER_PITCH = 4
 #: Minimum number of sites, and minimum extent of the ESF on each side in pitches.
-LEAST_SITES, LEAST_REACH_PITCHES = 50, 5.0
+MIN_SITES, MIN_REACH_PITCHES = 50, 5.0
 #: Minimum contrast (white - black) / (white + black).
-LEAST_CONTRAST = 0.02
+MIN_CONTRAST = 0.02
 #: Sum of black and white, as a fraction of their difference, below which it is rounding error.
-NO_SUM = 1e-9
+MIN_SUM_RATIO = 1e-9
 #: Minimum fraction of the variance of the values that one straight edge explains.
-LEAST_EXPLAINED = 0.3
+MIN_EXPLAINED_FRACTION = 0.3
 #: Extent of bins of constant width, in pitches and in widths of the edge; beyond it, the bin width increases by this fraction
 #: of the distance. The ESF is smooth there, and noise at high frequencies would dominate the MTF.
-NARROW_PITCHES, NARROW_WIDTHS, WIDENING = 3.0, 2.0, 0.5
+NARROW_PITCHES, NARROW_WIDTHS, GROWTH = 3.0, 2.0, 0.5
 #: Minimum extent of the ESF in widths of the error function; a shorter one would end on the slope of the edge.
-LEAST_REACH_WIDTHS = 2.0
+MIN_REACH_WIDTHS = 2.0
 #: Neighbouring bins on either side that contribute to the noise estimate of a bin.
 SCATTER_BINS = 4
 #: Minimum number of bins per period; aliases are below 1 % for 4 bins, and 18 % for 2 bins.
 BINS_PER_PERIOD = 4
 #: Largest edge width as a fraction of the region; a wider transition is a ramp.
-WIDEST_SHARE = 0.25
+MAX_WIDTH_FRACTION = 0.25
 #: Residual, as a fraction of the step, above which the robust loss reduces its weight (defects, other edges at the boundary).
-SOFT_SHARE = 0.1
+SOFT_LOSS_FRACTION = 0.1
 #: Default number of frequencies, up to one line pair per pitch, twice the Nyquist frequency of a square grid.
 N_FREQUENCIES = 101
 #: Levels of the histogram that separates black from white.
@@ -85,7 +85,7 @@ class EdgeMtf:
         Bin width near the edge, and the reference pitch: the median distance between a site and its nearest neighbour.
     distance_um : (n_bin,) float64, µm
         Mean distance of the sites in each bin from the edge, black first.
-    profile : (n_bin,) float64
+    esf : (n_bin,) float64
         Edge spread function (ESF): mean of the sites in each bin, in the unit of the values.
     n_sites : int
         Number of sites in the bins.
@@ -100,7 +100,7 @@ class EdgeMtf:
     bin_um: float
     pitch_um: float
     distance_um: Floats
-    profile: Floats
+    esf: Floats
     n_sites: int
 
     def __repr__(self) -> str:
@@ -116,8 +116,8 @@ class EdgeMtf:
         if below.size == 0 or below[0] == 0:
             return float("nan")
         last = below[0] - 1
-        share = (self.mtf[last] - 0.5) / (self.mtf[last] - self.mtf[last + 1])
-        return float((1.0 - share) * self.frequency_per_mm[last] + share * self.frequency_per_mm[last + 1])
+        fraction = (self.mtf[last] - 0.5) / (self.mtf[last] - self.mtf[last + 1])
+        return float((1.0 - fraction) * self.frequency_per_mm[last] + fraction * self.frequency_per_mm[last + 1])
 
 
 def slanted_edge_mtf(
@@ -198,18 +198,18 @@ def slanted_edge_mtf(
     is_used = np.isfinite(site_values) & _mask(where, layout.n_sites)
     check_choice("window", window, ("tukey", "hamming", "none"))
     n_used = int(np.count_nonzero(is_used))
-    if n_used < LEAST_SITES:
-        raise ParameterError("where", f"must select at least {LEAST_SITES} sites", n_used)
-    xy_um, light, area_um2 = layout.centroid_um[is_used], site_values[is_used], layout.area_um2[is_used]
+    if n_used < MIN_SITES:
+        raise ParameterError("where", f"must select at least {MIN_SITES} sites", n_used)
+    xy_um, used_values, area_um2 = layout.centroid_um[is_used], site_values[is_used], layout.area_um2[is_used]
     pitch_um = _pitch_um(xy_um)
     if bin_um is None:
         bin_um = pitch_um / BINS_PER_PITCH
     else:
         bin_um = check_length_um("bin_um", bin_um, at_most=pitch_um, hint="the limit is one pitch")
     frequency = _frequencies_per_mm(frequency_per_mm, bin_um, pitch_um)
-    edge = _find_edge(xy_um, light, pitch_um)
+    edge = _find_edge(xy_um, used_values, pitch_um)
     across = np.array([np.cos(edge.angle_rad), np.sin(edge.angle_rad)])
-    bins = _binned(xy_um @ across - edge.offset_um, light, area_um2, bin_um, reach_um, pitch_um, edge.width_um)
+    bins = _bin_esf(xy_um @ across - edge.offset_um, used_values, area_um2, bin_um, reach_um, pitch_um, edge.width_um)
     mtf, sigma = _mtf(bins, window, per_um_from_per_mm(frequency))
     return EdgeMtf(
         frequency_per_mm=read_only(frequency),
@@ -221,7 +221,7 @@ def slanted_edge_mtf(
         bin_um=bin_um,
         pitch_um=pitch_um,
         distance_um=read_only(bins.distance_um),
-        profile=read_only(bins.profile),
+        esf=read_only(bins.esf),
         n_sites=bins.n_sites,
     )
 
@@ -262,7 +262,7 @@ def _pitch_um(xy_um: Floats) -> float:
 
 def _mtf(bins: _Bins, window: str, cycles_per_um: Floats) -> tuple[Floats, Floats]:
     """Compute the MTF and its standard deviation, (n_frequency,)."""
-    rise, step_um = np.diff(bins.profile), np.diff(bins.distance_um)
+    rise, step_um = np.diff(bins.esf), np.diff(bins.distance_um)
     at_um = 0.5 * (bins.distance_um[1:] + bins.distance_um[:-1])
     weight = _window(window, at_um / max(-bins.distance_um[0], bins.distance_um[-1]))
     # Transfer factor of a difference over a step; averaged over constant bins, weighted by the differences.
@@ -299,58 +299,58 @@ def _find_edge(xy_um: Floats, values: Floats, pitch_um: float) -> _Edge:
     from scipy.optimize import least_squares
     from scipy.special import erf
 
-    middle_um, extent_um = xy_um.mean(axis=0), float(np.hypot(*np.ptp(xy_um, axis=0)))
-    level = _level_between(values)
+    centre_um, extent_um = xy_um.mean(axis=0), float(np.hypot(*np.ptp(xy_um, axis=0)))
+    level = _otsu_threshold(values)
     is_white = values > level
     n_white = int(np.count_nonzero(is_white))
     if n_white in (0, values.size):
         raise SimulationError("no edge found: all values are equal; use a region with one edge")
     black, white = float(np.median(values[~is_white])), float(np.median(values[is_white]))
     # Initial line: linear discriminant of black and white sites, with as many sites on its black side as there are black ones.
-    xy = (xy_um - middle_um) / extent_um
-    towards = np.linalg.solve(np.cov(xy.T), xy.T @ (is_white - is_white.mean()))
-    angle = float(np.arctan2(towards[1], towards[0]))
+    xy = (xy_um - centre_um) / extent_um
+    normal = np.linalg.solve(np.cov(xy.T), xy.T @ (is_white - is_white.mean()))
+    angle = float(np.arctan2(normal[1], normal[0]))
     offset = float(np.quantile(xy @ [np.cos(angle), np.sin(angle)], 1.0 - n_white / values.size))
-    share = (values - black) / (white - black)
+    relative = (values - black) / (white - black)
 
     def residuals(x: Floats) -> Floats:
         angle, offset, width, low, high = x
         distance = xy @ [np.cos(angle), np.sin(angle)] - offset
-        return np.asarray(low + (high - low) * 0.5 * (1.0 + erf(distance / width)) - share)
+        return np.asarray(low + (high - low) * 0.5 * (1.0 + erf(distance / width)) - relative)
 
     start, narrowest = np.array([angle, offset, 0.05, 0.0, 1.0]), 0.01 * pitch_um / extent_um
     bounds = ([-np.inf, -2.0, narrowest, -np.inf, -np.inf], [np.inf, 2.0, 10.0, np.inf, np.inf])
     fit = least_squares(
-        residuals, start, bounds=bounds, loss="soft_l1", f_scale=SOFT_SHARE, x_scale=[0.1, 0.1, 0.05, 1, 1]
+        residuals, start, bounds=bounds, loss="soft_l1", f_scale=SOFT_LOSS_FRACTION, x_scale=[0.1, 0.1, 0.05, 1, 1]
     )
     angle, offset, width, low, high = fit.x.tolist()
     if high < low:
         angle, offset, low, high = angle + np.pi, -offset, high, low
-    explained = 1.0 - float(np.square(residuals(fit.x)).mean()) / float(share.var())
-    if explained < LEAST_EXPLAINED:
+    explained = 1.0 - float(np.square(residuals(fit.x)).mean()) / float(relative.var())
+    if explained < MIN_EXPLAINED_FRACTION:
         raise SimulationError(
             f"no edge found: a straight edge explains {100.0 * max(explained, 0.0):.0f} % of the variance of the values, less "
-            f"than {100.0 * LEAST_EXPLAINED:.0f} %; use a region with one edge and less noise"
+            f"than {100.0 * MIN_EXPLAINED_FRACTION:.0f} %; use a region with one edge and less noise"
         )
-    if width > WIDEST_SHARE:
+    if width > MAX_WIDTH_FRACTION:
         raise SimulationError(
             f"no edge found: the fit is {width * extent_um:.4g} µm wide, more than a quarter of the region; use a larger region"
         )
     low, high = black + (white - black) * low, black + (white - black) * high
     # The contrast of values symmetric about 0 is undefined.
-    contrast = (high - low) / (high + low) if abs(high + low) > NO_SUM * (high - low) else np.inf
+    contrast = (high - low) / (high + low) if abs(high + low) > MIN_SUM_RATIO * (high - low) else np.inf
     contrast = abs(contrast)
-    if contrast < LEAST_CONTRAST:
+    if contrast < MIN_CONTRAST:
         raise SimulationError(
-            f"the contrast of the edge must be at least {LEAST_CONTRAST:g}, got {contrast:.2g} (black {low:.4g}, white "
+            f"the contrast of the edge must be at least {MIN_CONTRAST:g}, got {contrast:.2g} (black {low:.4g}, white "
             f"{high:.4g})"
         )
     angle = float((angle + np.pi) % (2.0 * np.pi) - np.pi)
     direction = np.array([np.cos(angle), np.sin(angle)])
-    return _Edge(angle, float(offset * extent_um + middle_um @ direction), float(width * extent_um), contrast)
+    return _Edge(angle, float(offset * extent_um + centre_um @ direction), float(width * extent_um), contrast)
 
 
-def _level_between(values: Floats) -> float:
+def _otsu_threshold(values: Floats) -> float:
     """Return the threshold that best separates two classes of values (Otsu 1979)."""
     counts, edges = np.histogram(values, N_LEVELS)
     n_below = np.cumsum(counts)
@@ -373,13 +373,13 @@ class _Bins(NamedTuple):
     """Mean distances, ESF, its variance, mask of bins of constant width, and number of sites."""
 
     distance_um: Floats
-    profile: Floats
+    esf: Floats
     variance: Floats
     is_narrow: Bools
     n_sites: int
 
 
-def _binned(
+def _bin_esf(
     distance_um: Floats,
     values: Floats,
     area_um2: Floats,
@@ -398,42 +398,42 @@ def _binned(
     low = int(empty[empty < 0].max(initial=first - 1)) + 1
     high = int(empty[empty >= 0].min(initial=int(k.max()) + 1)) - 1
     n_sides = min(-low, high + 1)
-    least_um = max(LEAST_REACH_PITCHES * pitch_um, LEAST_REACH_WIDTHS * width_um)
+    min_reach_um = max(MIN_REACH_PITCHES * pitch_um, MIN_REACH_WIDTHS * width_um)
     if reach_um is not None:
         hint = f"the minimum is five pitches of {pitch_um:.3g} µm and two edge widths of {width_um:.3g} µm"
-        least_um = check_number("reach_um", reach_um, at_least=float(f"{least_um:.3g}"), hint=hint)
-        n_sides = min(n_sides, int(np.ceil(least_um / bin_um)))
-    if n_sides * bin_um < least_um * (1.0 - 1e-9):
+        min_reach_um = check_number("reach_um", reach_um, at_least=float(f"{min_reach_um:.3g}"), hint=hint)
+        n_sides = min(n_sides, int(np.ceil(min_reach_um / bin_um)))
+    if n_sides * bin_um < min_reach_um * (1.0 - 1e-9):
         far_um = min(-distance_um.min(), distance_um.max())
         raise SimulationError(
-            f"the edge spread function must extend to {least_um:.4g} µm without empty bins, "
+            f"the edge spread function must extend to {min_reach_um:.4g} µm without empty bins, "
             f"got {max(n_sides, 0) * bin_um:.4g} µm; "
             + (
                 "the edge is too close to the boundary of the region"
-                if far_um < least_um
+                if far_um < min_reach_um
                 else "rotate the edge by a few degrees from the rows of sites, or use a larger region or wider bins (bin_um)"
             )
         )
     is_in = (k >= -n_sides) & (k < n_sides)
     n_narrow = int(np.ceil(max(NARROW_PITCHES * pitch_um, NARROW_WIDTHS * width_um) / bin_um))
-    borders = _bin_edges(n_narrow, n_sides)
-    position = np.searchsorted(borders, k[is_in], side="right") - 1
+    bin_edges = _bin_edges(n_narrow, n_sides)
+    position = np.searchsorted(bin_edges, k[is_in], side="right") - 1
     weights, value = area_um2[is_in], values[is_in]
     total = np.bincount(position, weights=weights)
     mean_um = np.bincount(position, weights=weights * distance_um[is_in]) / total
     off_um = distance_um[is_in] - mean_um[position]
     variance_um2 = np.bincount(position, weights=weights * np.square(off_um)) / total
-    profile = np.bincount(position, weights=weights * value) / total
+    esf = np.bincount(position, weights=weights * value) / total
     # The bin mean differs from the ESF at the mean distance by half the variance of the distances times the curvature.
-    profile -= 0.5 * variance_um2 * _curvature(mean_um, profile)
+    esf -= 0.5 * variance_um2 * _curvature(mean_um, esf)
     # Noise: deviation of the values from a local parabola through the ESF.
-    slope, bend = np.gradient(profile, mean_um), 0.5 * _curvature(mean_um, profile)
-    noise = value - (profile[position] + (slope[position] + bend[position] * off_um) * off_um)
+    slope, half_curvature = np.gradient(esf, mean_um), 0.5 * _curvature(mean_um, esf)
+    noise = value - (esf[position] + (slope[position] + half_curvature[position] * off_um) * off_um)
     return _Bins(
         mean_um,
-        profile,
+        esf,
         _scatter(noise, position) * np.bincount(position, weights=np.square(weights)) / np.square(total),
-        np.maximum(-borders[:-1], borders[1:]) <= n_narrow,
+        np.maximum(-bin_edges[:-1], bin_edges[1:]) <= n_narrow,
         int(np.count_nonzero(is_in)),
     )
 
@@ -442,7 +442,7 @@ def _bin_edges(n_narrow: int, n_sides: int) -> Ints:
     """Return the bin edges from -n_sides to n_sides, in units of the narrow bin width."""
     side = list(range(min(n_narrow, n_sides) + 1))
     while side[-1] < n_sides:
-        step, rest = round(1.0 + max(0.0, WIDENING * (side[-1] - n_narrow))), n_sides - side[-1]
+        step, rest = round(1.0 + max(0.0, GROWTH * (side[-1] - n_narrow))), n_sides - side[-1]
         side.append(side[-1] + (step if rest >= 2 * step else rest))
     return np.concatenate((-np.array(side[:0:-1], np.int64), np.array(side, np.int64)))
 
@@ -459,16 +459,16 @@ def _scatter(values: Floats, position: NDArray[np.intp]) -> Floats:
     return np.asarray(squares / np.where(freedom > 0.5, freedom, np.nan))
 
 
-def _curvature(distance_um: Floats, profile: Floats) -> Floats:
+def _curvature(distance_um: Floats, esf: Floats) -> Floats:
     """Compute the second derivative of the ESF by second differences; 0 at both ends."""
-    step_um, rise = np.diff(distance_um), np.diff(profile)
+    step_um, rise = np.diff(distance_um), np.diff(esf)
     slope = rise / step_um
     return np.pad(2.0 * np.diff(slope) / (step_um[1:] + step_um[:-1]), 1)
 
 
-def _window(window: str, share: Floats) -> Floats:
+def _window(window: str, fraction: Floats) -> Floats:
     """Return the window at fractions of the reach, from -1 to 1."""
-    share = np.minimum(np.abs(share), 1.0)
+    fraction = np.minimum(np.abs(fraction), 1.0)
     if window == "tukey":
-        return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.maximum(2.0 * share - 1.0, 0.0)))
-    return 0.54 + 0.46 * np.cos(np.pi * share) if window == "hamming" else np.ones_like(share)
+        return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.maximum(2.0 * fraction - 1.0, 0.0)))
+    return 0.54 + 0.46 * np.cos(np.pi * fraction) if window == "hamming" else np.ones_like(fraction)

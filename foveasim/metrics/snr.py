@@ -32,10 +32,10 @@ __all__ = ["SnrTable", "measured_snr_by_class", "relative_exposure_at_snr_fracti
 #: Relative difference below which sizes form one class.
 SIZE_ROUNDING = 1e-6
 #: Search range of the relative exposure, and relative tolerance of the result.
-LEAST_SHARE, MOST_SHARE, SHARE_ROUNDING = 1e-12, 1e12, 1e-6
+MIN_FRACTION, MAX_FRACTION, FRACTION_ROUNDING = 1e-12, 1e12, 1e-6
 #: Maximum number of iterations, interval of the bisection steps (clipping makes the SNR nonlinear), and slope limits of the
 #: secant steps.
-MOST_STEPS, HALVED_EVERY, SLOPES = 200, 4, (0.25, 4.0)
+MAX_STEPS, BISECT_EVERY, SLOPES = 200, 4, (0.25, 4.0)
 #: Separator between the columns of a printed table.
 GAP = "  "
 
@@ -210,7 +210,7 @@ def relative_exposure_at_snr_fraction(
 
     Returns
     -------
-    share : (n_class,) float64
+    fraction : (n_class,) float64
         Values in the order of the sorted labels; above 1 if the given exposure is too low. NaN if the SNR is not reached at any
         exposure: half of the sites saturate before (:attr:`SnrTable.saturated_fraction`), or the sites have no signal.
 
@@ -231,17 +231,17 @@ def relative_exposure_at_snr_fraction(
     dark_e = sensor.expected_electrons(np.zeros(layout.n_sites), exposure_s)
     search = _Search(groups.n_sites.size)
     is_saturated = np.zeros(groups.n_sites.size, bool)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         if search.is_done.all():
             break
         fraction = np.exp(search.at)
-        expected_e = dark_e + fraction[groups.of_site] * (full_e - dark_e)
-        signal_dn, noise_dn2, is_cut = _linear_codes(signal_to_noise(sensor, expected_e, dark_e))
+        expected_e = dark_e + fraction[groups.class_index] * (full_e - dark_e)
+        signal_dn, noise_dn2, is_clipped = _linear_codes(signal_to_noise(sensor, expected_e, dark_e))
         signal_dn, noise_dn = groups.mean(signal_dn), np.sqrt(groups.mean(noise_dn2))
-        does = ~search.is_done & (signal_dn > 0.0) & (signal_dn >= snr * noise_dn * (1.0 - SHARE_ROUNDING))
-        is_saturated = np.where(does, groups.mean(is_cut.astype(np.float64)) >= 0.5, is_saturated)
-        too_little = np.maximum(snr * noise_dn, np.finfo(float).tiny)
-        search.step(np.log(np.clip(signal_dn, 1e-3 * too_little, 1e3 * too_little) / too_little))
+        is_reached = ~search.is_done & (signal_dn > 0.0) & (signal_dn >= snr * noise_dn * (1.0 - FRACTION_ROUNDING))
+        is_saturated = np.where(is_reached, groups.mean(is_clipped.astype(np.float64)) >= 0.5, is_saturated)
+        required_dn = np.maximum(snr * noise_dn, np.finfo(float).tiny)
+        search.step(np.log(np.clip(signal_dn, 1e-3 * required_dn, 1e3 * required_dn) / required_dn))
     return np.where(search.is_found & ~is_saturated, np.exp(search.high), np.nan)
 
 
@@ -250,20 +250,20 @@ class _Search:
 
     def __init__(self, n: int) -> None:
         self.at = np.zeros(n)
-        self.low, self.high = np.full(n, np.log(LEAST_SHARE)), np.full(n, np.log(MOST_SHARE))
+        self.low, self.high = np.full(n, np.log(MIN_FRACTION)), np.full(n, np.log(MAX_FRACTION))
         self.is_found, self.is_done = np.zeros(n, bool), np.zeros(n, bool)
         self._last: tuple[Floats, Floats] | None = None
         self._n_steps = 0
 
     def step(self, value: Floats) -> None:
         """Update the brackets from the values at ``at``, and choose the next points."""
-        at, goes = self.at, ~self.is_done
-        is_above = value >= -SHARE_ROUNDING
-        self.is_found |= goes & is_above
-        self.high = np.where(goes & is_above, at, self.high)
-        self.low = np.where(goes & ~is_above, at, self.low)
-        is_root = np.abs(value) <= SHARE_ROUNDING
-        self.is_done |= is_root | (self.high - self.low <= SHARE_ROUNDING)
+        at, is_active = self.at, ~self.is_done
+        is_above = value >= -FRACTION_ROUNDING
+        self.is_found |= is_active & is_above
+        self.high = np.where(is_active & is_above, at, self.high)
+        self.low = np.where(is_active & ~is_above, at, self.low)
+        is_root = np.abs(value) <= FRACTION_ROUNDING
+        self.is_done |= is_root | (self.high - self.low <= FRACTION_ROUNDING)
         # Without clipping, the SNR is proportional to the exposure (slope 1) or to its square root (slope 1/2).
         slope = np.ones(at.size)
         if self._last is not None:
@@ -272,7 +272,7 @@ class _Search:
         self._last = at, value
         self._n_steps += 1
         guess = at - value / np.clip(slope, *SLOPES)
-        is_in = (guess > self.low) & (guess < self.high) & (self._n_steps % HALVED_EVERY != 0)
+        is_in = (guess > self.low) & (guess < self.high) & (self._n_steps % BISECT_EVERY != 0)
         self.at = np.where(self.is_done, at, np.where(is_in, guess, 0.5 * (self.low + self.high)))
 
 

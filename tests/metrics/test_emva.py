@@ -185,7 +185,9 @@ def test_dark_current_from_mean_and_variance(result):
 
     assert_within(result.dark_current_e_per_s, DARK_E_PER_S, by_mean)
     assert_within(
-        result.dark_current_of_variance_e_per_s, DARK_E_PER_S, np.hypot(by_variance, DARK_E_PER_S * DSNU / N_SITES**0.5)
+        result.dark_current_from_variance_e_per_s,
+        DARK_E_PER_S,
+        np.hypot(by_variance, DARK_E_PER_S * DSNU / N_SITES**0.5),
     )
 
 

@@ -225,8 +225,8 @@ def test_edge_mtf_of_gaussian_blur():
     assert found.offset_um == pytest.approx(7.0, abs=1e-3)
     assert found.contrast == pytest.approx(0.5, abs=1e-3)
     assert np.abs(found.mtf - np.exp(-2.0 * (np.pi * 3e-3 * f) ** 2)).max() < 5e-4
-    assert found.profile[0] == pytest.approx(100.0)
-    assert found.profile[-1] == pytest.approx(300.0)
+    assert found.esf[0] == pytest.approx(100.0)
+    assert found.esf[-1] == pytest.approx(300.0)
 
 
 def test_edge_mtf_varies_little_with_window():

@@ -675,11 +675,11 @@ def _column_sums(matrix: csr_array[Any]) -> Floats:
     return np.bincount(matrix.indices, weights=matrix.data, minlength=matrix.shape[0]).astype(np.float64)
 
 
-def _add_remainder(matrix: csr_array[Any], loss: Floats, n_steps: int) -> csr_array[Any]:
+def _add_remainder(matrix: csr_array[Any], fraction: Floats, n_steps: int) -> csr_array[Any]:
     """Return the matrix of one of several equal steps; the diagonal is the remaining fraction."""
     from scipy.sparse import csr_array, diags_array
 
-    return csr_array(matrix / n_steps + diags_array(1.0 - loss / n_steps))
+    return csr_array(matrix / n_steps + diags_array(1.0 - fraction / n_steps))
 
 
 def _grid_positions(layout: Neighbourhood, pitch_um: Any) -> tuple[Ints, Ints]:
