@@ -201,7 +201,7 @@ def test_negative_site_values_warn_on_coarse_cells():
     cell_um = LAMBDA_N_UM / 0.8
     layout = fs.layout.grid(n_x=40, n_y=40, pitch_um=0.25 * cell_um).translate(0.5 * cell_um, 0.5 * cell_um)
     camera = fs.Camera(optics=replace(OPTICS, padding="reflect"), sensor=fs.Sensor(layout), order=2)
-    with pytest.warns(SamplingWarning, match=r"negative, [\d.]+ % of all, .* take order=1, or finer cells"):
+    with pytest.warns(SamplingWarning, match=r"negative, [\d.]+ % of all, .* use order=1, or smaller cells"):
         rate = camera.photoelectrons_per_s(scene)
 
     assert rate.min() == 0.0

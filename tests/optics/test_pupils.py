@@ -140,7 +140,7 @@ def test_measured_tilt_displaces_psf():
 @pytest.mark.parametrize("n_across", [192.0, 200.3, 333.3, 512.0])
 def test_sampled_circle_otf_matches_closed_form(n_across):
     n = int(np.ceil(n_across))
-    otf = Aperture([clear], [], 0.0).transfer(550.0, n_across, n + 3, (0.0, 0.0), np.float64)
+    otf = Aperture([clear], [], 0.0).compute_otf(550.0, n_across, n + 3, (0.0, 0.0), np.float64)
     s = np.arange(-n - 3, n + 4) / n_across
 
     assert otf == pytest.approx(circular_otf(np.hypot(s[:, np.newaxis], s)), abs=7e-4)
