@@ -49,7 +49,7 @@ def _limit(camera: fs.Camera, scene: fs.Scene) -> tuple[str, Callable[[], None]]
     pad = int(np.ceil(20.3 * 0.55 * camera.optics.working_f_number(DISTANCE_M) / pixels.pitch_um))
     padded = tuple(int(scipy.fft.next_fast_len(n + 2 * pad, real=True)) for n in SHAPE)
     fine = tuple(k * n for n in padded)
-    ((grid, _),) = camera.optics.resolved(scene).image_grids(scene)
+    ((grid, _),) = camera.optics.resolve_oversample(scene).image_grids(scene)
     cells, picture = (np.random.default_rng(0).random(s, dtype=np.float32) for s in (grid.shape, padded))
     integrator = camera.integrator(grid, order=camera.order(scene))
 

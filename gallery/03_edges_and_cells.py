@@ -61,7 +61,7 @@ def worst_error(cells: float, k: int | str) -> float:
     """Find the largest error of the fraction of a point's energy in squares of side wavelength x f-number around it."""
     n = int(40 * cells) | 1
     scene = point(cells, n)
-    optics = replace(OPTICS, oversample=k).resolved(scene)
+    optics = replace(OPTICS, oversample=k).resolve_oversample(scene)
     power_map = optics.power_map(scene)
     centre = np.random.default_rng(1).uniform(-1.5, 1.5, (300, 2))
     squares = fs.Layout.from_rectangles(centre * LAMBDA_N_UM, LAMBDA_N_UM)

@@ -124,7 +124,7 @@ class EventPixels:
             *("leak_spread_fraction", "noise_per_s", "noise_half_e_per_s", "floor_e_per_s"),
         ):
             object.__setattr__(self, name, check_plausible(name, getattr(self, name)))
-        capacitance_f = check_plausible("capacitance_f", self.capacitance_f, of="EventPixels")
+        capacitance_f = check_plausible("capacitance_f", self.capacitance_f, class_name="EventPixels")
         object.__setattr__(self, "capacitance_f", capacitance_f)
 
     @cached_property

@@ -135,7 +135,7 @@ LIMITS: Mapping[str, Limits] = MappingProxyType(
 )
 
 
-def check_plausible(name: str, value: object, *, of: str = "") -> float:
+def check_plausible(name: str, value: object, *, class_name: str = "") -> float:
     """
     Return the value as a float after checking its plausible range.
 
@@ -144,7 +144,7 @@ def check_plausible(name: str, value: object, *, of: str = "") -> float:
     name : str
         Keyword, a key of :data:`LIMITS`.
     value : object
-    of : str
+    class_name : str
         Class of the keyword, for keywords that are prefixed with their class in the table.
 
     Raises
@@ -152,7 +152,7 @@ def check_plausible(name: str, value: object, *, of: str = "") -> float:
     ParameterError
         If the value is not one finite number, or outside the range; the message states range and unit.
     """
-    limits = LIMITS[f"{of}.{name}" if of else name]
+    limits = LIMITS[f"{class_name}.{name}" if class_name else name]
     number = check_number(name, value, above=0.0 if limits.is_positive else None, at_least=0.0, hint=limits.hint)
     _check_range(name, np.asarray(number), limits)
     return number

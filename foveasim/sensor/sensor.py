@@ -442,7 +442,7 @@ class Sensor:
         capacitance_f = read_only(np.atleast_1d(np.asarray(self.capacitance_f, np.float64)).copy())
         return Sites(self.layout, self.device, capacitance_f)
 
-    def _at(self, *stages: str) -> list[Effect]:
+    def _effects_at(self, *stages: str) -> list[Effect]:
         return [effect for effect in self.chain if effect.stage in stages]
 
     def pattern(self, name: str) -> Floats:
@@ -500,7 +500,7 @@ class Sensor:
 
     def _fixed(self, values: PerSite | Floats, stage: str) -> Floats:
         """Return the values of all sites after the effects of a stage."""
-        effects, values = self._at(stage), np.atleast_1d(np.asarray(values, np.float64))
+        effects, values = self._effects_at(stage), np.atleast_1d(np.asarray(values, np.float64))
         if not effects:
             return read_only(values.copy())
         return read_only(apply_steps(effects, np.broadcast_to(values, self.layout.n_sites), sites=self.sites))
@@ -526,16 +526,16 @@ class Sensor:
 
     @cached_property
     def _before_exposure(self) -> tuple[Step, ...]:
-        return merge_steps((Factor(self.sensitivity), *self._at("photo"), Offset(self.dark_rate_e_per_s)), self.sites)
+        return merge_steps((Factor(self.sensitivity), *self._effects_at("photo"), Offset(self.dark_rate_e_per_s)), self.sites)
 
     @cached_property
     def _after_collection(self) -> tuple[Step, ...]:
-        steps: list[Step] = [*self._at("charge"), Factor(self.v_per_e), *self._at("sense_node")]
+        steps: list[Step] = [*self._effects_at("charge"), Factor(self.v_per_e), *self._effects_at("sense_node")]
         if self.nonlinearity_fraction:
             steps.append(Nonlinearity(self.nonlinearity_fraction, self.v_sat_v))
         if self.pedestal_v:
             steps.append(Offset(self.pedestal_v))
-        return merge_steps((*steps, *self._at("output")), self.sites)
+        return merge_steps((*steps, *self._effects_at("output")), self.sites)
 
     def expected_electrons(self, photo_e_per_s: Floats, exposure_s: float, *, n_threads: int | None = None) -> Floats:
         """
@@ -550,7 +550,7 @@ class Sensor:
         """
         exposure_s = check_plausible("exposure_s", exposure_s)
         photo = np.broadcast_to(np.asarray(unmasked("photo_e_per_s", photo_e_per_s)), self.layout.n_sites)
-        steps = (*self._before_exposure, Factor(exposure_s), *self._at("expected"))
+        steps = (*self._before_exposure, Factor(exposure_s), *self._effects_at("expected"))
         return apply_steps(steps, photo, sites=self.sites, n_threads=n_threads)
 
     def collect(self, expected_e: Floats, *, streams: Streams, n_threads: int | None = None) -> Ints:
@@ -651,9 +651,9 @@ class Sensor:
         """
         mean_e, variance_e2 = (np.atleast_1d(np.asarray(part, np.float64)) for part in (mean_e, variance_e2))
         return readout_model(
-            [effect for effect in self._at("charge") if is_reset or not effect.is_drawn_at_reset],
-            self._at("sense_node"),
-            self._at("output"),
+            [effect for effect in self._effects_at("charge") if is_reset or not effect.is_drawn_at_reset],
+            self._effects_at("sense_node"),
+            self._effects_at("output"),
             mean_e=mean_e,
             variance_e2=variance_e2,
             sites=self.sites if is_device_known else self.sites.without_device(),
