@@ -27,7 +27,7 @@ __all__ = [
     "CurveError",
     "Factor",
     "GaussianCurve",
-    "Multiplied",
+    "CurveBase",
     "PassBand",
     "ProductCurve",
     "SiliconQE",
@@ -52,7 +52,7 @@ class Curve(Protocol):
 Factor = Curve | float
 
 
-class Multiplied(ABC):
+class CurveBase(ABC):
     """Base class of curves that defines products: ``curve * curve`` and ``0.9 * curve``."""
 
     #: Makes numpy scalars defer multiplication to the curve.
@@ -78,7 +78,7 @@ CURVES: Registry[Callable[..., Any]] = Registry("curve", "foveasim.curves")
 
 @CURVES.register("constant")
 @dataclass(frozen=True)
-class ConstantCurve(Multiplied):
+class ConstantCurve(CurveBase):
     """
     Constant curve.
 
@@ -105,7 +105,7 @@ class ConstantCurve(Multiplied):
 
 @CURVES.register("gaussian")
 @dataclass(frozen=True, kw_only=True)
-class GaussianCurve(Multiplied):
+class GaussianCurve(CurveBase):
     """
     Gaussian band.
 
@@ -139,7 +139,7 @@ class GaussianCurve(Multiplied):
 
 @CURVES.register("pass_band")
 @dataclass(frozen=True, kw_only=True)
-class PassBand(Multiplied):
+class PassBand(CurveBase):
     """
     Band-pass, long-pass or short-pass (infrared-cut) filter.
 
@@ -210,7 +210,7 @@ SILICON_ABSORPTION_UM = (
 
 @CURVES.register("silicon")
 @dataclass(frozen=True, kw_only=True)
-class SiliconQE(Multiplied):
+class SiliconQE(CurveBase):
     """
     Quantum efficiency of a silicon layer: its absorbed fraction of the photons.
 
@@ -248,7 +248,7 @@ class SiliconQE(Multiplied):
 
 
 @dataclass(frozen=True)
-class ProductCurve(Multiplied):
+class ProductCurve(CurveBase):
     """
     Product of curves, such as stacked filters and a quantum efficiency.
 
@@ -284,7 +284,7 @@ class ProductCurve(Multiplied):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BandMean(Multiplied):
+class BandMean(CurveBase):
     """
     Mean of a curve over a band around each wavelength, for scenes with few broad bands.
 
@@ -387,7 +387,7 @@ def curve_values(curve: Curve, wavelength_nm: ArrayLike) -> Floats:
     return np.broadcast_to(values.astype(np.float64, copy=False), np.shape(wavelength_nm))
 
 
-def check_within(wavelength_nm: ArrayLike, low_nm: float, high_nm: float, what: str, hint: str = "") -> None:
+def check_within(wavelength_nm: ArrayLike, low_nm: float, high_nm: float, domain: str, hint: str = "") -> None:
     """
     Reject wavelengths outside a range, including NaN.
 
@@ -400,5 +400,5 @@ def check_within(wavelength_nm: ArrayLike, low_nm: float, high_nm: float, what: 
     outside = waves_nm[~((waves_nm >= low_nm) & (waves_nm <= high_nm))]
     if outside.size:
         raise ParameterError(
-            "wavelength_nm", f"must be within {what}, {low_nm:g} to {high_nm:g} nm", float(outside[0]), "nm", hint
+            "wavelength_nm", f"must be within {domain}, {low_nm:g} to {high_nm:g} nm", float(outside[0]), "nm", hint
         )

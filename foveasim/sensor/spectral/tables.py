@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from foveasim._core.validation import Floats, as_numbers, check_choice, check_count, finite_array, wavelengths_nm
 from foveasim.errors import ParameterError
-from foveasim.sensor.spectral.curves import CURVES, Multiplied, check_within
+from foveasim.sensor.spectral.curves import CURVES, CurveBase, check_within
 
 __all__ = ["Beyond", "PolynomialCurve", "SplineCurve", "StepCurve", "TableCurve"]
 
@@ -23,7 +23,7 @@ BEYOND_HINT = "set beyond='zero' or beyond='hold' to extrapolate"
 
 @CURVES.register("polynomial")
 @dataclass(frozen=True, kw_only=True)
-class PolynomialCurve(Multiplied):
+class PolynomialCurve(CurveBase):
     """
     Least-squares polynomial fit of a table, as for the paper's quantum efficiency (Fig. 5).
 
@@ -64,7 +64,7 @@ class PolynomialCurve(Multiplied):
 
 @CURVES.register("table")
 @dataclass(frozen=True, kw_only=True)
-class TableCurve(Multiplied):
+class TableCurve(CurveBase):
     """
     Table with linear interpolation.
 
@@ -100,7 +100,7 @@ class TableCurve(Multiplied):
 
 @CURVES.register("spline")
 @dataclass(frozen=True, kw_only=True)
-class SplineCurve(Multiplied):
+class SplineCurve(CurveBase):
     """
     Table with shape-preserving (monotone) cubic interpolation.
 
@@ -147,7 +147,7 @@ class SplineCurve(Multiplied):
 
 @CURVES.register("step")
 @dataclass(frozen=True, kw_only=True)
-class StepCurve(Multiplied):
+class StepCurve(CurveBase):
     """
     Piecewise constant curve, the simplest model of a quantum efficiency.
 
